@@ -1,0 +1,14 @@
+#include "bindings.h"
+#include "parallel.h"
+
+namespace etsplat {
+}  // namespace etsplat
+
+NB_MODULE(_native, m) {
+    using namespace etsplat;
+    m.doc() = "CPU engine of etsplat.";
+    m.def("num_threads", &num_threads);
+    m.def("set_num_threads", &set_num_threads);
+    m.def("parallel_seconds", &parallel_seconds);
+    m.def("reset_parallel_seconds", &reset_parallel_seconds);
+}

@@ -1,0 +1,182 @@
+#include "parallel.h"
+
+#include <algorithm>
+#include <atomic>
+#include <chrono>
+#include <condition_variable>
+#include <exception>
+#include <mutex>
+#include <thread>
+#include <vector>
+
+#if defined(__linux__)
+#include <sched.h>
+#endif
+#if defined(__x86_64__) || defined(_M_X64)
+#include <immintrin.h>
+#endif
+#if !defined(_WIN32)
+#include <unistd.h>
+#endif
+
+namespace etsplat {
+namespace {
+
+int usable_cores() {
+#if defined(__linux__)
+    cpu_set_t set;
+    if (sched_getaffinity(0, sizeof set, &set) == 0) return std::max(1, CPU_COUNT(&set));
+#endif
+    return std::max(1u, std::thread::hardware_concurrency());
+}
+
+inline void pause_briefly() {
+#if defined(__x86_64__) || defined(_M_X64)
+    _mm_pause();
+#endif
+}
+
+thread_local bool inside_parallel_region = false;
+
+struct Job {
+    const RangeBody* body = nullptr;
+    int64_t n = 0, grain = 1;
+    std::atomic<int64_t> next{0};
+    std::atomic<bool> failed{false};
+    std::exception_ptr error;
+
+    void run() {
+        inside_parallel_region = true;
+        for (;;) {
+            const int64_t begin = next.fetch_add(grain, std::memory_order_relaxed);
+            if (begin >= n || failed.load(std::memory_order_relaxed)) break;
+            try {
+                (*body)(begin, std::min(n, begin + grain));
+            } catch (...) {
+                if (!failed.exchange(true)) error = std::current_exception();
+            }
+        }
+        inside_parallel_region = false;
+    }
+};
+
+// Workers spin for a moment after a job, since the next stage of a render follows within microseconds, then sleep.
+class Pool {
+public:
+    explicit Pool(int workers) {
+        for (int i = 0; i < workers; ++i) threads_.emplace_back([this] { work(); });
+    }
+    ~Pool() {
+        {
+            std::lock_guard lock(mutex_);
+            stop_ = true;
+            generation_.fetch_add(1);
+        }
+        wake_.notify_all();
+        for (auto& thread : threads_) thread.join();
+    }
+    int workers() const { return static_cast<int>(threads_.size()); }
+
+    void run(Job& job) {
+        job_ = &job;
+        pending_.store(workers(), std::memory_order_relaxed);
+        {
+            std::lock_guard lock(mutex_);
+            generation_.fetch_add(1, std::memory_order_release);
+        }
+        wake_.notify_all();
+        job.run();
+        while (pending_.load(std::memory_order_acquire) != 0) pause_briefly();
+    }
+
+private:
+    void work() {
+        uint64_t seen = 0;
+        for (;;) {
+            for (int i = 0; i < 20000 && generation_.load(std::memory_order_acquire) == seen; ++i) pause_briefly();
+            if (generation_.load(std::memory_order_acquire) == seen) {
+                std::unique_lock lock(mutex_);
+                wake_.wait(lock, [&] { return generation_.load(std::memory_order_relaxed) != seen; });
+            }
+            seen = generation_.load(std::memory_order_acquire);
+            if (stop_) return;
+            job_->run();
+            pending_.fetch_sub(1, std::memory_order_release);
+        }
+    }
+
+    std::vector<std::thread> threads_;
+    std::mutex mutex_;
+    std::condition_variable wake_;
+    std::atomic<uint64_t> generation_{0};
+    std::atomic<int> pending_{0};
+    Job* job_ = nullptr;
+    bool stop_ = false;
+};
+
+std::mutex pool_mutex;  // one parallel region at a time; other callers wait
+Pool* pool = nullptr;
+long pool_process = 0;
+int wanted_threads = 0;
+std::atomic<int64_t> parallel_nanoseconds{0};
+
+long process_id() {
+#if defined(_WIN32)
+    return 0;
+#else
+    return static_cast<long>(getpid());
+#endif
+}
+
+Pool& current_pool() {
+    // After fork() the workers do not exist in the child: leak the old pool and make a new one.
+    const int workers = num_threads() - 1;
+    if (pool && pool_process != process_id()) pool = nullptr;
+    if (pool && pool->workers() != workers) {
+        delete pool;
+        pool = nullptr;
+    }
+    if (!pool) {
+        pool = new Pool(workers);
+        pool_process = process_id();
+    }
+    return *pool;
+}
+
+}  // namespace
+
+int num_threads() { return wanted_threads > 0 ? wanted_threads : usable_cores(); }
+
+void set_num_threads(int n) {
+    std::lock_guard lock(pool_mutex);
+    wanted_threads = n;
+}
+
+void parallel_for(int64_t n, int64_t grain, const RangeBody& body) {
+    if (n <= 0) return;
+    grain = std::max<int64_t>(1, grain);
+    if (inside_parallel_region) {
+        body(0, n);
+        return;
+    }
+    const auto start = std::chrono::steady_clock::now();
+    Job job;
+    job.body = &body;
+    job.n = n;
+    job.grain = grain;
+    {
+        std::lock_guard lock(pool_mutex);
+        if (n <= grain || num_threads() == 1) {
+            job.run();
+        } else {
+            current_pool().run(job);
+        }
+    }
+    if (job.error) std::rethrow_exception(job.error);
+    parallel_nanoseconds += std::chrono::nanoseconds(std::chrono::steady_clock::now() - start).count();
+}
+
+double parallel_seconds() { return 1e-9 * static_cast<double>(parallel_nanoseconds.load()); }
+void reset_parallel_seconds() { parallel_nanoseconds = 0; }
+
+}  // namespace etsplat

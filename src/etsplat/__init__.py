@@ -1,0 +1,1 @@
+"""Differentiable triangle splatting: posed images in, triangles out."""
