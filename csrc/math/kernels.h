@@ -1,0 +1,132 @@
+// The kernels G(x) of the paper (section 3.2) with their derivatives and visible supports.
+//
+// x is the normalised distance: 0 at the triangle's centre, 1 on its edge. A kernel is a struct of static functions;
+// ETSPLAT_KERNELS lists them once, in the order of etsplat.core.kernels.KERNELS. What depends on sigma alone is computed
+// once per triangle (KernelCoefficients), so that a pixel costs two exp2 and one log2 at most.
+#pragma once
+
+#include "portable.h"
+
+namespace etsplat {
+
+#define ETSPLAT_KERNELS(X) X(SingleSided) X(Bilateral) X(Elastic) X(Hard)
+
+struct KernelCoefficients {
+    float exponent;
+    float scale;
+};
+
+template <class T>
+struct KernelValue {
+    T value;
+    T dx;      // dG/dx
+    T dsigma;  // dG/dsigma
+};
+
+// Floors that keep unbounded derivatives finite: dG/dx of the elastic kernel at x = 0 for sigma > 2, of the
+// single-sided kernel at x = 1 for sigma < 1.
+constexpr float kMinDistance = 1e-6f;
+constexpr float kMinInnerDistance = 1e-4f;
+
+constexpr float kLog2E = 1.44269504088896f;
+constexpr float kLn2 = 0.693147180559945f;
+
+// G = max(1 - x, 0)^sigma
+struct SingleSided {
+    ETSPLAT_FN static KernelCoefficients coefficients(float sigma) { return {sigma, 0.0f}; }
+
+    template <class T>
+    ETSPLAT_FN static T value(T x, T sigma, T) {
+        const T inner = T(1.0f) - x;
+        return vselect(inner > T(0.0f), vexp2(sigma * vlog2(vmax(inner, T(1e-20f)))), T(0.0f));
+    }
+
+    template <class T>
+    ETSPLAT_FN static KernelValue<T> gradient(T x, T sigma, T) {
+        const T inner = T(1.0f) - x;
+        const T floored = vmax(inner, T(kMinInnerDistance));
+        const T log_floored = vlog2(floored);
+        const T inside = vselect(inner > T(0.0f), T(1.0f), T(0.0f));
+        KernelValue<T> g;
+        g.value = value(x, sigma, sigma);
+        g.dx = T(0.0f) - inside * sigma * vexp2((sigma - T(1.0f)) * log_floored);
+        g.dsigma = g.value * log_floored * T(kLn2);
+        return g;
+    }
+
+    // Largest x with o G(x) >= alpha_min; `ratio` = o / alpha_min > 1.
+    ETSPLAT_FN static float support(float ratio, float sigma) { return 1.0f - vexp2(-vlog2(ratio) / sigma); }
+};
+
+// G = exp(-x^(2/sigma) / 2)
+struct Bilateral {
+    ETSPLAT_FN static KernelCoefficients coefficients(float sigma) { return {2.0f / sigma, -0.5f * kLog2E}; }
+
+    template <class T>
+    ETSPLAT_FN static T value(T x, T exponent, T scale) {
+        return vexp2(scale * vexp2(exponent * vlog2(vmax(x, T(kMinDistance)))));
+    }
+
+    template <class T>
+    ETSPLAT_FN static KernelValue<T> gradient(T x, T exponent, T scale) {
+        const T floored = vmax(x, T(kMinDistance));
+        const T log_x = vlog2(floored);
+        const T power = vexp2(exponent * log_x);
+        KernelValue<T> g;
+        g.value = vexp2(scale * power);
+        const T decay = g.value * power;
+        g.dx = T(-0.5f) * exponent * decay / floored;
+        g.dsigma = decay * log_x * (exponent * exponent) * T(0.125f * kLn2);
+        return g;
+    }
+
+    ETSPLAT_FN static float support(float ratio, float sigma) {
+        return vexp2(0.5f * sigma * vlog2(2.0f * kLn2 * vlog2(ratio)));
+    }
+};
+
+// G = exp(-sigma x^(2/sigma))
+struct Elastic {
+    ETSPLAT_FN static KernelCoefficients coefficients(float sigma) { return {2.0f / sigma, -sigma * kLog2E}; }
+
+    template <class T>
+    ETSPLAT_FN static T value(T x, T exponent, T scale) {
+        return Bilateral::value(x, exponent, scale);
+    }
+
+    template <class T>
+    ETSPLAT_FN static KernelValue<T> gradient(T x, T exponent, T scale) {
+        const T floored = vmax(x, T(kMinDistance));
+        const T log_x = vlog2(floored);
+        const T power = vexp2(exponent * log_x);
+        KernelValue<T> g;
+        g.value = vexp2(scale * power);
+        const T decay = g.value * power;
+        g.dx = T(-2.0f) * decay / floored;
+        g.dsigma = decay * vfma(exponent * T(kLn2), log_x, T(-1.0f));
+        return g;
+    }
+
+    ETSPLAT_FN static float support(float ratio, float sigma) {
+        return vexp2(0.5f * sigma * vlog2(kLn2 * vlog2(ratio) / sigma));
+    }
+};
+
+// G = 1 inside, 0 outside
+struct Hard {
+    ETSPLAT_FN static KernelCoefficients coefficients(float) { return {0.0f, 0.0f}; }
+
+    template <class T>
+    ETSPLAT_FN static T value(T x, T, T) {
+        return vselect(x <= T(1.0f), T(1.0f), T(0.0f));
+    }
+
+    template <class T>
+    ETSPLAT_FN static KernelValue<T> gradient(T x, T exponent, T scale) {
+        return {value(x, exponent, scale), T(0.0f), T(0.0f)};
+    }
+
+    ETSPLAT_FN static float support(float, float) { return 1.0f; }
+};
+
+}  // namespace etsplat

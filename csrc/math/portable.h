@@ -1,0 +1,37 @@
+// What the shared formulas in csrc/math need from the compiler and the number type.
+//
+// The formulas are templates over T. The CPU engine instantiates them with 16-lane vectors (csrc/cpu/simd), scalar code
+// with float, the GPU engine with float. A number type brings the operators + - * / and the functions below; comparisons
+// give its mask type.
+#pragma once
+
+#if defined(__CUDACC__) || defined(__CUDACC_RTC__)
+#define ETSPLAT_FN __device__ __forceinline__
+#elif defined(_MSC_VER)
+#define ETSPLAT_FN __forceinline
+#include <cmath>
+#else
+#define ETSPLAT_FN inline __attribute__((always_inline))
+#include <cmath>
+#endif
+
+namespace etsplat {
+
+ETSPLAT_FN float vmin(float a, float b) { return a < b ? a : b; }
+ETSPLAT_FN float vmax(float a, float b) { return a > b ? a : b; }
+ETSPLAT_FN float vabs(float a) { return a < 0.0f ? -a : a; }
+ETSPLAT_FN float vselect(bool mask, float a, float b) { return mask ? a : b; }
+
+#if defined(__CUDACC__) || defined(__CUDACC_RTC__)
+ETSPLAT_FN float vfma(float a, float b, float c) { return fmaf(a, b, c); }
+ETSPLAT_FN float vlog2(float a) { return __log2f(a); }
+ETSPLAT_FN float vexp2(float a) { return exp2f(a); }
+ETSPLAT_FN float vsqrt(float a) { return sqrtf(a); }
+#else
+ETSPLAT_FN float vfma(float a, float b, float c) { return a * b + c; }
+ETSPLAT_FN float vlog2(float a) { return std::log2(a); }
+ETSPLAT_FN float vexp2(float a) { return std::exp2(a); }
+ETSPLAT_FN float vsqrt(float a) { return std::sqrt(a); }
+#endif
+
+}  // namespace etsplat
