@@ -4,6 +4,7 @@
 #include <atomic>
 #include <chrono>
 #include <condition_variable>
+#include <cstdlib>
 #include <exception>
 #include <mutex>
 #include <thread>
@@ -22,7 +23,10 @@
 namespace etsplat {
 namespace {
 
-int usable_cores() {
+// ETSPLAT_NUM_THREADS, where it is a positive number; else the cores this process may run on.
+int default_threads() {
+    const char* text = std::getenv("ETSPLAT_NUM_THREADS");
+    if (const int threads = text ? std::atoi(text) : 0; threads > 0) return threads;
 #if defined(__linux__)
     cpu_set_t set;
     if (sched_getaffinity(0, sizeof set, &set) == 0) return std::max(1, CPU_COUNT(&set));
@@ -145,7 +149,10 @@ Pool& current_pool() {
 
 }  // namespace
 
-int num_threads() { return wanted_threads > 0 ? wanted_threads : usable_cores(); }
+int num_threads() {
+    static const int by_default = default_threads();
+    return wanted_threads > 0 ? wanted_threads : by_default;
+}
 
 void set_num_threads(int n) {
     std::lock_guard lock(pool_mutex);

@@ -1,1 +1,1 @@
-
+"""Topology, subdivision plans, surface sampling and distances: no parameters, no losses."""

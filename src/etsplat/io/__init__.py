@@ -1,1 +1,1 @@
-
+"""Mesh files, images and the run directory."""

@@ -1,1 +1,1 @@
-
+"""Image and geometry metrics, each with its convention."""

@@ -1,1 +1,1 @@
-
+"""One module per differentiable operation, its reference and its native calls side by side."""

@@ -1,1 +1,1 @@
-
+"""Learnable triangles, and posed views with their loaders."""

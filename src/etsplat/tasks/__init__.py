@@ -1,1 +1,1 @@
-
+"""A config goes in, a run directory comes out."""

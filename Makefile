@@ -1,0 +1,96 @@
+# Everything below works on a fresh clone with Python 3.10+ (pip, venv) and a C++20 compiler; cmake and ninja come from
+# PyPI. Each target does its own set-up, once: stamps under .venv and build remember what is done.
+#
+#   PYTHON=python3.12 make setup    another interpreter
+#   make test PYTEST_ARGS="-k cli"  part of the tests
+
+PYTHON ?= python3
+CXX ?= c++
+PYTEST_ARGS ?=
+
+VENV := .venv
+PY := $(VENV)/bin/python
+PIP := $(PY) -m pip --disable-pip-version-check install --quiet
+TOOLS := $(VENV)/.stamp-tools
+INSTALLED := $(VENV)/.stamp-installed
+SANITIZED := build/sanitize/.stamp
+# Folders are listed too: their time changes when a file is added or removed.
+NATIVE := CMakeLists.txt $(shell find csrc)
+
+.PHONY: help setup demo test lint format bench sanitize wheel check-wheel clean
+
+help:
+	@echo "make setup        create .venv and build the package into it"
+	@echo "make demo         reconstruct a built-in object into runs/demo"
+	@echo "make test         run the tests"
+	@echo "make lint         ruff, pyright, import-linter"
+	@echo "make bench        measure the CPU engine"
+	@echo "make sanitize     run the tests of the C++ under ASan and UBSan (GCC, Linux)"
+	@echo "make check-wheel  build the wheel, install it into an empty environment, run a tiny demo"
+	@echo "make clean        remove .venv, build, dist and caches"
+
+# The pinned torch goes first and alone, so that no later call has a reason to bring another build of it.
+$(TOOLS): constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' || \
+		{ echo "etsplat needs Python 3.10 or newer; choose one with: make PYTHON=python3.12" >&2; exit 1; }
+	test -x $(PY) || $(PYTHON) -m venv $(VENV)
+	$(PIP) -c constraints.txt torch
+	$(PIP) -c constraints.txt scikit-build-core nanobind cmake ninja
+	@touch $@
+
+# No build isolation: the build folder then survives, and a changed C++ file is rebuilt in seconds.
+$(INSTALLED): $(TOOLS) pyproject.toml $(NATIVE)
+	$(PIP) -c constraints.txt --no-build-isolation -e '.[dev]'
+	@touch $@
+
+setup: $(INSTALLED)
+
+demo: setup
+	$(VENV)/bin/etsplat demo --out runs/demo --overwrite
+
+test: setup
+	$(PY) -m pytest -n auto $(PYTEST_ARGS)
+
+lint: setup
+	$(VENV)/bin/ruff check .
+	$(VENV)/bin/ruff format --check .
+	$(VENV)/bin/pyright
+	$(VENV)/bin/lint-imports --no-cache
+
+format: setup
+	$(VENV)/bin/ruff check --fix .
+	$(VENV)/bin/ruff format .
+
+bench: setup
+	$(PY) -m benchmarks.rasterizer
+
+# A second build, beside the first. `python -S` leaves out the editable install, so that `etsplat` is the sanitized one.
+# libstdc++ is preloaded too: ASan looks for the exception functions when it starts.
+SITE = $(shell $(PY) -c 'import sysconfig; print(sysconfig.get_path("purelib"))')
+$(SANITIZED): $(INSTALLED) $(shell find src -name '*.py')
+	$(PIP) --no-build-isolation --no-deps --upgrade --target build/sanitize/site \
+		--config-settings=build-dir=build/sanitize/cmake --config-settings=cmake.define.ETSPLAT_SANITIZE=ON .
+	@touch $@
+
+sanitize: $(SANITIZED)
+	LD_PRELOAD="$$($(CXX) -print-file-name=libasan.so) $$($(CXX) -print-file-name=libstdc++.so)" \
+	ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1 \
+	PYTHONPATH="$(CURDIR)/build/sanitize/site:$(SITE)" $(PY) -S -m pytest -p no:cacheprovider -m sanitize $(PYTEST_ARGS)
+
+wheel: $(TOOLS)
+	rm -rf dist
+	$(PY) -m pip --disable-pip-version-check wheel --quiet --no-deps --wheel-dir dist .
+
+# What a user gets: the wheel alone, in an environment with nothing else, away from the source tree.
+check-wheel: wheel
+	rm -rf build/wheel-check
+	$(PYTHON) -m venv build/wheel-check/venv
+	build/wheel-check/venv/bin/pip --disable-pip-version-check install --quiet -c constraints.txt torch
+	build/wheel-check/venv/bin/pip --disable-pip-version-check install --quiet -c constraints.txt dist/*.whl
+	cd build/wheel-check && venv/bin/etsplat doctor
+	cd build/wheel-check && venv/bin/etsplat demo --out demo --iterations 20 --resolution 64 --max-faces 6000
+	test -s build/wheel-check/demo/report.html
+
+clean:
+	rm -rf $(VENV) build dist .pytest_cache .ruff_cache .hypothesis
+	find src tests benchmarks examples -name __pycache__ -type d -prune -exec rm -rf {} +
