@@ -1,0 +1,145 @@
+"""Pinhole cameras: world-to-camera matrices with OpenCV axes and intrinsics in pixels (docs/conventions.md)."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Cameras:
+    """B pinhole cameras with one image size.
+
+    Attributes:
+        viewmats: (B, 4, 4) world to camera; x right, y down, z forward.
+        Ks: (B, 3, 3) intrinsics in pixels; pixel (i, j) has its centre at (j + 0.5, i + 0.5).
+        width: Image width in pixels.
+        height: Image height in pixels.
+    """
+
+    viewmats: Float[Tensor, "B 4 4"]
+    Ks: Float[Tensor, "B 3 3"]
+    width: int
+    height: int
+
+    def __post_init__(self) -> None:
+        batch = self.viewmats.shape[0] if self.viewmats.ndim == 3 else -1
+        if self.viewmats.shape != (batch, 4, 4):
+            raise ValueError(f"viewmats must have shape (B, 4, 4), got {tuple(self.viewmats.shape)}")
+        if self.Ks.shape != (batch, 3, 3):
+            raise ValueError(f"Ks must have shape ({batch}, 3, 3), one per viewmat, got {tuple(self.Ks.shape)}")
+        if self.width < 1 or self.height < 1:
+            raise ValueError(f"width and height must be at least 1, got {self.width} x {self.height}")
+
+    def __len__(self) -> int:
+        return self.viewmats.shape[0]
+
+    def __getitem__(self, index: int | slice | Sequence[int] | Tensor) -> "Cameras":
+        """The chosen cameras, always as a batch: an int gives a batch of one."""
+        chosen = [index] if isinstance(index, int) else index
+        return Cameras(self.viewmats[chosen], self.Ks[chosen], self.width, self.height)
+
+    @property
+    def centers(self) -> Float[Tensor, "B 3"]:
+        """Camera positions in world space, -R^T t."""
+        rotation, translation = self.viewmats[:, :3, :3], self.viewmats[:, :3, 3]
+        return -torch.einsum("bji,bj->bi", rotation, translation)
+
+    def scaled(self, factor: float) -> "Cameras":
+        """The same cameras with images ``factor`` times as large, rounded to whole pixels (at least one)."""
+        width, height = max(1, round(self.width * factor)), max(1, round(self.height * factor))
+        ratio = self.Ks.new_tensor([width / self.width, height / self.height, 1.0])
+        return Cameras(self.viewmats, self.Ks * ratio[:, None], width, height)
+
+    def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> "Cameras":
+        """The same cameras on another device or in another precision."""
+        return Cameras(
+            self.viewmats.to(device=device, dtype=dtype),
+            self.Ks.to(device=device, dtype=dtype),
+            self.width,
+            self.height,
+        )
+
+
+def look_at(
+    eye: Float[Tensor, "*batch 3"], target: Float[Tensor, "*#batch 3"], up: Float[Tensor, "*#batch 3"]
+) -> Float[Tensor, "*batch 4 4"]:
+    """World-to-camera matrices of cameras at ``eye`` that look at ``target``.
+
+    Args:
+        eye: (..., 3) camera positions.
+        target: (..., 3) or (3,) points that land on the optical axis.
+        up: (..., 3) or (3,) directions that point up in the image; any length.
+
+    Returns:
+        (..., 4, 4) with OpenCV axes.
+
+    Raises:
+        ValueError: ``eye`` coincides with ``target``, or ``up`` is parallel to the line of sight.
+    """
+    forward = torch.as_tensor(target, dtype=eye.dtype, device=eye.device) - eye
+    distance = forward.norm(dim=-1, keepdim=True)
+    if not bool((distance > 0).all()):
+        raise ValueError("eye must differ from target")
+    forward = forward / distance
+    up = torch.as_tensor(up, dtype=eye.dtype, device=eye.device).expand_as(forward)
+    right = torch.linalg.cross(forward, up / up.norm(dim=-1, keepdim=True))
+    length = right.norm(dim=-1, keepdim=True)
+    if not bool((length > 1e-6).all()):
+        raise ValueError("up must not be parallel to the line of sight from eye to target")
+    right = right / length
+    down = torch.linalg.cross(forward, right)
+    rotation = torch.stack([right, down, forward], dim=-2)
+    viewmats = torch.zeros(*eye.shape[:-1], 4, 4, dtype=eye.dtype, device=eye.device)
+    viewmats[..., :3, :3] = rotation
+    viewmats[..., :3, 3] = -(rotation @ eye[..., None])[..., 0]
+    viewmats[..., 3, 3] = 1.0
+    return viewmats
+
+
+def intrinsics(
+    fov_y_degrees: float, width: int, height: int, dtype: torch.dtype = torch.float32
+) -> Float[Tensor, "3 3"]:
+    """Intrinsics of a camera with square pixels and a centred principal point.
+
+    Args:
+        fov_y_degrees: Vertical field of view in degrees, between 0 and 180.
+        width: Image width in pixels.
+        height: Image height in pixels.
+        dtype: Floating-point type of the result.
+
+    Raises:
+        ValueError: The field of view is outside (0, 180).
+    """
+    if not 0.0 < fov_y_degrees < 180.0:
+        raise ValueError(f"fov_y_degrees must be between 0 and 180, got {fov_y_degrees}")
+    focal = 0.5 * height / math.tan(math.radians(fov_y_degrees) / 2)
+    return torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]], dtype=dtype)
+
+
+def sphere_grid(
+    elevations: Sequence[float], azimuths: Sequence[float], distance: float, dtype: torch.dtype = torch.float32
+) -> Float[Tensor, "B 3"]:
+    """Points on a sphere about the origin, for ``look_at(points, origin, up=(0, 1, 0))``.
+
+    Args:
+        elevations: Degrees above the xz-plane, +90 on +y.
+        azimuths: Degrees about +y; 0 is on +z, 90 on +x.
+        distance: Radius of the sphere.
+        dtype: Floating-point type of the result.
+
+    Returns:
+        (len(elevations) * len(azimuths), 3); the azimuth varies fastest.
+    """
+    elevation, azimuth = torch.meshgrid(
+        torch.deg2rad(torch.as_tensor(elevations, dtype=torch.float64)),
+        torch.deg2rad(torch.as_tensor(azimuths, dtype=torch.float64)),
+        indexing="ij",
+    )
+    points = torch.stack(
+        [elevation.cos() * azimuth.sin(), elevation.sin(), elevation.cos() * azimuth.cos()], dim=-1
+    ).reshape(-1, 3)
+    return (distance * points).to(dtype)

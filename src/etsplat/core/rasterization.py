@@ -1,0 +1,90 @@
+"""What goes into and comes out of the rasterizer, shared by its engines."""
+
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+# Depths that the distortion maps to [0, 1]; those of 2DGS and Triangle Splatting.
+DISTORTION_NEAR = 0.2
+DISTORTION_FAR = 100.0
+
+
+class Cutoffs(NamedTuple):
+    """Where compositing stops caring. ``Cutoffs(0, 1, inf, 0)`` switches all of them off.
+
+    Attributes:
+        alpha_min: A pixel skips a triangle whose alpha is below this; such a triangle is invisible where even its
+            opacity is below.
+        alpha_max: Alpha is clamped to this, with zero gradient where the clamp acts.
+        x_max: A pixel skips a triangle whose distance x exceeds this.
+        transmittance_min: A pixel stops for good, without drawing, at the first triangle that would bring the
+            transmittance below this. Not 1e-4, because two layers clamped at 0.99 land exactly there.
+    """
+
+    alpha_min: float = 1 / 255
+    alpha_max: float = 0.99
+    x_max: float = 2.0
+    transmittance_min: float = 0.99e-4
+
+
+DEFAULT_CUTOFFS = Cutoffs()
+
+
+@dataclass(frozen=True)
+class RasterizeSettings:
+    """The arguments of ``etsplat.rasterize`` that are not tensors; see there."""
+
+    width: int
+    height: int
+    kernel: str
+    distance: str
+    near_plane: float = 0.01
+    freeze_incentre: bool = False
+    depth: Literal["none", "plane", "centroid"] = "none"
+    median_depth: bool = False
+    normals: bool = False
+    distortion: bool = False
+    statistics: bool = False
+    cutoffs: Cutoffs = DEFAULT_CUTOFFS
+
+
+@dataclass
+class TriangleStatistics:
+    """Per view and triangle, without gradients; all 0 where ``visible`` is False.
+
+    Attributes:
+        max_weight: Largest blend weight alpha T over the pixels of the view.
+        screen_size: Largest distance from the mean of the projected vertices to one of them, in pixels.
+        inradius: Radius of the incircle of the projected triangle, in pixels.
+        visible: Passes the culls, and the box of its visible support meets the image.
+    """
+
+    max_weight: Float[Tensor, "B N"]
+    screen_size: Float[Tensor, "B N"]
+    inradius: Float[Tensor, "B N"]
+    visible: Bool[Tensor, "B N"]
+
+
+@dataclass
+class Rasterization:
+    """Images of ``etsplat.rasterize``; what was not asked for is None.
+
+    Attributes:
+        color: Sum of w c, plus T times the background.
+        alpha: 1 - T, the opacity of the pixel.
+        depth: Sum of w z / max(alpha, 1e-8); 0 where the pixel is empty.
+        median_depth: z of the triangle at which T falls from above 0.5 to 0.5 or less; 0 where that never happens.
+        normal: Sum of w n, unit normals in world space that face the camera; not renormalised.
+        distortion: Sum over pairs of w_i w_j (m_i - m_j)^2 with m the depth mapped to [0, 1] between 0.2 and 100.
+        statistics: Per-triangle statistics.
+    """
+
+    color: Float[Tensor, "B H W C"]
+    alpha: Float[Tensor, "B H W 1"]
+    depth: Float[Tensor, "B H W 1"] | None = None
+    median_depth: Float[Tensor, "B H W 1"] | None = None
+    normal: Float[Tensor, "B H W 3"] | None = None
+    distortion: Float[Tensor, "B H W 1"] | None = None
+    statistics: TriangleStatistics | None = None

@@ -1,0 +1,48 @@
+"""Fixtures shared by all tests."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from etsplat.core.kernels import DISTANCES, KERNELS
+from etsplat.ops.engines import ENGINES
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        "--engine", choices=ENGINES, default=None, help="run the engine-parameterised tests on this engine only"
+    )
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    if "engine" in metafunc.fixturenames:
+        only = metafunc.config.getoption("--engine")
+        metafunc.parametrize("engine", [only] if only else ENGINES)
+
+
+@pytest.fixture(params=list(KERNELS))
+def kernel(request: pytest.FixtureRequest) -> str:
+    return request.param
+
+
+@pytest.fixture(params=DISTANCES)
+def distance(request: pytest.FixtureRequest) -> str:
+    return request.param
+
+
+@pytest.fixture
+def rng() -> torch.Generator:
+    """A generator that starts alike in every test."""
+    return torch.Generator().manual_seed(20261121)
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """Folder of the real input, or a skip that says where it is looked for."""
+    path = REPOSITORY.parent / "shared" / "data"
+    if not path.is_dir():
+        pytest.skip("real input ../shared/data is not there")
+    return path
