@@ -2,6 +2,7 @@
 #include "parallel.h"
 
 namespace etsplat {
+void bind_geometry(nb::module_& m);
 }  // namespace etsplat
 
 NB_MODULE(_native, m) {
@@ -11,4 +12,5 @@ NB_MODULE(_native, m) {
     m.def("set_num_threads", &set_num_threads);
     m.def("parallel_seconds", &parallel_seconds);
     m.def("reset_parallel_seconds", &reset_parallel_seconds);
+    bind_geometry(m);
 }

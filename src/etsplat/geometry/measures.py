@@ -1,0 +1,26 @@
+"""Areas, volume and size of triangle meshes."""
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+
+def face_areas(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> Float[Tensor, " F"]:
+    """The area of each face, in the dtype of the vertices; zero where a face repeats a vertex."""
+    a, b, c = vertices[faces].unbind(1)
+    return 0.5 * torch.linalg.cross(b - a, c - a).norm(dim=1)
+
+
+def enclosed_volume(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> float:
+    """The volume inside a closed oriented mesh, positive if its normals point outwards: sum of a . (b x c) / 6."""
+    corners = vertices[faces].double()
+    corners = corners - corners.mean(dim=(0, 1))
+    a, b, c = corners.unbind(1)
+    return float((a * torch.linalg.cross(b, c)).sum()) / 6
+
+
+def bounding_ball(vertices: Float[Tensor, "V 3"]) -> tuple[Float[Tensor, " 3"], float]:
+    """The centre of the bounding box and the largest distance of a vertex from it (normalisation divides by it)."""
+    points = vertices.double()
+    center = 0.5 * (points.amin(dim=0) + points.amax(dim=0))
+    return center, float((points - center).norm(dim=1).max())
