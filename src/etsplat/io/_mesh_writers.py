@@ -1,0 +1,83 @@
+"""PLY, OBJ and GLB writers: small enough to own, so that colours are exactly what the format's viewers expect."""
+
+import json
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from etsplat.io.srgb import linear_from_srgb
+
+
+def write_ply(path: Path, vertices: np.ndarray, faces: np.ndarray, colors: np.ndarray | None) -> None:
+    """Binary little-endian PLY. `colors` (F, 3) in [0, 1] per face, stored in 8 bits."""
+    color_header = "property uchar red\nproperty uchar green\nproperty uchar blue\n" if colors is not None else ""
+    header = (
+        "ply\nformat binary_little_endian 1.0\n"
+        f"element vertex {len(vertices)}\nproperty float x\nproperty float y\nproperty float z\n"
+        f"element face {len(faces)}\nproperty list uchar int vertex_indices\n{color_header}end_header\n"
+    )
+    fields = [("count", "u1"), ("indices", "<i4", 3)] + ([("rgb", "u1", 3)] if colors is not None else [])
+    rows = np.empty(len(faces), dtype=fields)
+    rows["count"], rows["indices"] = 3, faces
+    if colors is not None:
+        rows["rgb"] = np.floor(colors * 255 + 0.5)
+    path.write_bytes(header.encode() + vertices.astype("<f4").tobytes() + rows.tobytes())
+
+
+def write_obj(path: Path, vertices: np.ndarray, faces: np.ndarray, colors: np.ndarray | None) -> None:
+    """Wavefront OBJ; `colors` (V, 3) follow the coordinates, the extension that MeshLab and Blender read."""
+    rows = vertices if colors is None else np.hstack([vertices, colors.astype(np.float32)])
+    line = "v " + " ".join(["%.9g"] * 3 + ["%.6g"] * (rows.shape[1] - 3))
+    with open(path, "w", encoding="ascii", newline="\n") as file:
+        np.savetxt(file, rows, fmt=line)
+        np.savetxt(file, faces + 1, fmt="f %d %d %d")
+
+
+def write_glb(path: Path, vertices: np.ndarray, faces: np.ndarray, colors: np.ndarray | None) -> None:
+    """Binary glTF 2.0, one primitive. `colors` (V, 3) display values become linear COLOR_0 under an unlit material."""
+    arrays = [(vertices.astype("<f4"), 34962), (faces.astype("<u4").reshape(-1), 34963)]
+    if colors is not None:
+        arrays.append((linear_from_srgb(colors).astype("<f4"), 34962))
+    views, accessors, offset = [], [], 0
+    for array, target in arrays:
+        views.append({"buffer": 0, "byteOffset": offset, "byteLength": array.nbytes, "target": target})
+        kind = {"componentType": 5125, "type": "SCALAR"} if array.ndim == 1 else {"componentType": 5126, "type": "VEC3"}
+        accessors.append({"bufferView": len(accessors), "count": len(array), **kind})
+        offset += array.nbytes
+    accessors[0] |= {"min": vertices.min(axis=0).tolist(), "max": vertices.max(axis=0).tolist()}
+    attributes = {"POSITION": 0} | ({"COLOR_0": 2} if colors is not None else {})
+    primitive = {"attributes": attributes, "indices": 1, "mode": 4, "material": 0}
+    material = {"doubleSided": True, "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0}}
+    # The colours already hold the scene's light, so a viewer must not light them again.
+    unlit = {"extensionsUsed": ["KHR_materials_unlit"]} if colors is not None else {}
+    if unlit:
+        material["extensions"] = {"KHR_materials_unlit": {}}
+    document = {
+        "asset": {"version": "2.0", "generator": "etsplat"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [primitive]}],
+        "materials": [material],
+        "buffers": [{"byteLength": offset}],
+        "bufferViews": views,
+        "accessors": accessors,
+        **unlit,
+    }
+    text = json.dumps(document, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    data = b"".join(array.tobytes() for array, _ in arrays)  # every array is a multiple of 4 bytes
+    with open(path, "wb") as file:
+        file.write(struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + len(data)))
+        file.write(struct.pack("<I4s", len(text), b"JSON") + text)
+        file.write(struct.pack("<I4s", len(data), b"BIN\0") + data)
+
+
+WRITERS: dict[str, Callable[[Path, np.ndarray, np.ndarray, np.ndarray | None], None]] = {
+    ".ply": write_ply,
+    ".obj": write_obj,
+    ".glb": write_glb,
+}
+"""Writers by suffix: (path, vertices (V, 3) float32, faces (F, 3), colours per face (PLY) or vertex, or None)."""

@@ -1,0 +1,144 @@
+"""Images on disk (8-bit PNG and JPEG) and in memory (float32, channels last, values in [0, 1])."""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from PIL import Image, UnidentifiedImageError
+from torch import Tensor
+
+from etsplat.core.errors import InputError
+from etsplat.io.atomic import atomic_write
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
+"""File name endings, lower case, that are tried when a scene names an image without one."""
+
+
+def load_image(path: Path | str) -> Float[Tensor, "H W C"]:
+    """Read an image as stored: straight (not premultiplied) colours, EXIF orientation not applied.
+
+    Orientation is left alone because poses refer to the pixels as stored.
+
+    Args:
+        path: a file that Pillow reads. Grey becomes RGB; palettes and CMYK become RGB or RGBA.
+
+    Returns:
+        float32 in [0, 1], 4 channels when the file has transparency, else 3.
+
+    Raises:
+        InputError: the file is missing, empty, cut short, or not an image.
+    """
+    with _open_image(path) as image:
+        mode = "RGBA" if image.mode in ("RGBA", "LA", "PA", "La", "RGBa") or "transparency" in image.info else "RGB"
+        # 16-bit grey has no direct conversion to RGB in Pillow (it would clip instead of scale).
+        if image.mode.startswith("I") or image.mode == "F":
+            return _scaled_grey(path, image)[..., None].repeat(1, 1, 3)
+        return _to_float(_decode(path, image, mode))
+
+
+def load_mask(path: Path | str) -> Float[Tensor, "H W"]:
+    """Read a mask, 1 inside the object: the alpha channel where it varies, else the grey level.
+
+    Args:
+        path: a file that Pillow reads.
+
+    Returns:
+        float32 in [0, 1].
+
+    Raises:
+        InputError: as `load_image`.
+    """
+    image = load_image(path)
+    if image.shape[-1] == 4 and image[..., 3].min() < 1:
+        return image[..., 3].contiguous()
+    return image[..., :3].mean(dim=-1)
+
+
+def image_size(path: Path | str) -> tuple[int, int]:
+    """(width, height) of an image file, from its header alone. Raises InputError as `load_image`."""
+    with _open_image(path) as image:
+        return image.size
+
+
+def save_image(path: Path | str, image: Float[Tensor, "H W C"]) -> None:
+    """Write an image, rounded to 8 bits; the suffix of `path` chooses the format. Atomic.
+
+    Args:
+        path: ends in .png, .jpg or .jpeg.
+        image: 1, 3 or 4 channels (straight alpha; JPEG has none), values in [0, 1] (others are clamped).
+
+    Raises:
+        ValueError: wrong shape, or values that are not finite.
+        InputError: the file cannot be written.
+    """
+    path = Path(path)
+    channels = (1, 3) if path.suffix.lower() in (".jpg", ".jpeg") else (1, 3, 4)
+    if path.suffix.lower() not in IMAGE_SUFFIXES:
+        raise ValueError(f"path: expected one of the suffixes {', '.join(IMAGE_SUFFIXES)}, got {path.name}")
+    if image.ndim != 3 or image.shape[-1] not in channels:
+        raise ValueError(f"image: expected shape (H, W, C) with C in {channels}, got {tuple(image.shape)}")
+    pixels = Image.fromarray(to_8_bit(image).cpu().numpy().squeeze(axis=-1 if image.shape[-1] == 1 else ()))
+    with atomic_write(path) as temporary:
+        pixels.save(temporary, quality=95, subsampling=0)  # PNG ignores both
+
+
+def to_8_bit(image: Float[Tensor, "..."]) -> UInt8[Tensor, "..."]:
+    """Round values in [0, 1] (others are clamped) to uint8, half up. Raises ValueError for NaN and Inf."""
+    if not bool(torch.isfinite(image).all()):
+        raise ValueError("image: expected finite values, got NaN or Inf")
+    return (image.detach().clamp(0, 1) * 255 + 0.5).to(torch.uint8)
+
+
+def premultiply(image: Float[Tensor, "*B H W C"]) -> Float[Tensor, "*B H W 4"]:
+    """Straight RGB or RGBA to premultiplied RGBA; RGB counts as fully opaque."""
+    if image.shape[-1] == 3:
+        return torch.cat([image, torch.ones_like(image[..., :1])], dim=-1)
+    alpha = image[..., 3:]
+    return torch.cat([image[..., :3] * alpha, alpha], dim=-1)
+
+
+def over_background(
+    image: Float[Tensor, "*B H W 4"], background: Float[Tensor, "#*B #H #W 3"] | float
+) -> Float[Tensor, "*B H W 3"]:
+    """Premultiplied RGBA over a background: rgb + (1 - alpha) background."""
+    return image[..., :3] + (1 - image[..., 3:]) * background
+
+
+def resize_image(image: Float[Tensor, "H W C"], width: int, height: int) -> Float[Tensor, "H2 W2 C"]:
+    """Shrink or enlarge with a triangle filter as wide as the scale; no ringing. Premultiply RGBA first."""
+    planes = image.movedim(-1, 0)[None]
+    resized = torch.nn.functional.interpolate(planes, size=(height, width), mode="bilinear", antialias=True)
+    return resized[0].movedim(0, -1).clamp(0, 1).contiguous()
+
+
+def _open_image(path: Path | str) -> Image.Image:
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"image {path}: no such file; check the path")
+    if path.stat().st_size == 0:
+        raise InputError(f"image {path}: the file is empty; copy it again")
+    try:
+        return Image.open(path)
+    except UnidentifiedImageError as error:
+        raise InputError(f"image {path}: not an image that can be read; convert it to PNG or JPEG") from error
+    except (OSError, Image.DecompressionBombError) as error:
+        raise InputError(f"image {path}: cannot be opened ({error}); convert it to PNG or JPEG") from error
+
+
+def _decode(path: Path | str, image: Image.Image, mode: str | None) -> np.ndarray:
+    try:
+        return np.asarray(image.convert(mode) if mode else image)
+    except (OSError, ValueError, SyntaxError) as error:  # Pillow reports a damaged PNG chunk as a SyntaxError
+        detail = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InputError(f"image {path}: damaged or cut short ({detail}); copy it again") from error
+
+
+def _scaled_grey(path: Path | str, image: Image.Image) -> Float[Tensor, "H W"]:
+    scale = 1.0 if image.mode == "F" else 65535.0
+    values = torch.from_numpy(_decode(path, image, None).astype(np.float32)) / scale
+    return values.clamp(0, 1)
+
+
+def _to_float(pixels: np.ndarray) -> Float[Tensor, "H W C"]:
+    return torch.from_numpy(pixels.copy()).to(torch.float32) / 255

@@ -1,0 +1,104 @@
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from etsplat.core.errors import InputError
+from etsplat.io.images import (
+    image_size,
+    load_image,
+    load_mask,
+    over_background,
+    premultiply,
+    resize_image,
+    save_image,
+)
+
+
+@pytest.fixture
+def picture():
+    return torch.randint(0, 256, (7, 5, 4), generator=torch.Generator().manual_seed(3)).float() / 255
+
+
+@pytest.mark.parametrize("channels", [3, 4])
+def test_png_keeps_8_bit_values_exactly(tmp_path, picture, channels):
+    save_image(tmp_path / "a.png", picture[..., :channels])
+    assert torch.equal(load_image(tmp_path / "a.png"), picture[..., :channels])
+    assert image_size(tmp_path / "a.png") == (5, 7)
+
+
+def test_jpeg_keeps_a_smooth_image_within_two_steps(tmp_path):
+    ramp = torch.linspace(0, 1, 64)[None, :, None].expand(64, 64, 3)
+    save_image(tmp_path / "a.jpg", ramp)
+    assert (load_image(tmp_path / "a.jpg") - ramp).abs().max() < 2.5 / 255
+
+
+def test_values_outside_the_unit_interval_are_clamped(tmp_path):
+    save_image(tmp_path / "a.png", torch.tensor([[[-1.0, 0.5, 3.0]]]))
+    assert torch.equal(load_image(tmp_path / "a.png"), torch.tensor([[[0.0, 128 / 255, 1.0]]]))
+
+
+def test_non_finite_pixels_are_refused_and_the_old_file_stays(tmp_path, picture):
+    save_image(tmp_path / "a.png", picture)
+    with pytest.raises(ValueError, match="finite"):
+        save_image(tmp_path / "a.png", torch.full((2, 2, 3), torch.nan))
+    assert torch.equal(load_image(tmp_path / "a.png"), picture)
+
+
+@pytest.mark.parametrize("shape", [(4, 4), (4, 4, 2), (1, 4, 4, 3)])
+def test_wrong_shapes_name_the_argument(tmp_path, shape):
+    with pytest.raises(ValueError, match="image: expected shape"):
+        save_image(tmp_path / "a.png", torch.zeros(shape))
+
+
+def test_grey_palette_and_16_bit_files_become_rgb(tmp_path):
+    grey = np.arange(12, dtype=np.uint8).reshape(3, 4) * 20
+    Image.fromarray(grey).save(tmp_path / "grey.png")
+    Image.fromarray(grey).convert("P").save(tmp_path / "palette.png")
+    Image.fromarray(grey.astype(np.uint16) * 257).save(tmp_path / "deep.png")
+    expected = torch.from_numpy(grey).float()[..., None].expand(3, 4, 3) / 255
+    for name in ("grey", "palette", "deep"):
+        torch.testing.assert_close(load_image(tmp_path / f"{name}.png"), expected)
+
+
+def test_mask_is_alpha_where_it_varies_and_grey_otherwise(tmp_path, picture):
+    save_image(tmp_path / "rgba.png", picture)
+    assert torch.equal(load_mask(tmp_path / "rgba.png"), picture[..., 3])
+    save_image(tmp_path / "grey.png", picture[..., :1])
+    torch.testing.assert_close(load_mask(tmp_path / "grey.png"), picture[..., 0])
+
+
+@pytest.mark.parametrize(
+    ("content", "message"), [(None, "no such file"), (b"", "empty"), (b"not a picture", "not an image")]
+)
+def test_missing_empty_and_foreign_files_are_input_errors(tmp_path, content, message):
+    path = tmp_path / "a.png"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(InputError, match=message):
+        load_image(path)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+def test_a_file_cut_short_is_an_input_error(tmp_path, suffix):
+    noise = torch.rand(64, 64, 3, generator=torch.Generator().manual_seed(0))
+    path = tmp_path / f"a{suffix}"
+    save_image(path, noise)
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    with pytest.raises(InputError, match="cut short"):
+        load_image(path)
+
+
+def test_premultiplied_over_background_equals_the_straight_blend(picture):
+    background = torch.tensor([0.2, 0.5, 0.9])
+    expected = picture[..., :3] * picture[..., 3:] + background * (1 - picture[..., 3:])
+    torch.testing.assert_close(over_background(premultiply(picture), background), expected)
+    assert torch.equal(premultiply(picture[..., :3])[..., 3], torch.ones(7, 5))
+
+
+def test_shrinking_keeps_constants_and_the_mean():
+    image = torch.rand(64, 48, 4, generator=torch.Generator().manual_seed(0))
+    small = resize_image(image, 12, 16)
+    assert small.shape == (16, 12, 4)
+    torch.testing.assert_close(small.mean(), image.mean(), atol=5e-3, rtol=0)
+    torch.testing.assert_close(resize_image(torch.full((9, 9, 3), 0.3), 4, 5), torch.full((5, 4, 3), 0.3))

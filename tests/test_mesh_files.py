@@ -1,0 +1,213 @@
+import json
+import struct
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from etsplat.core.errors import InputError
+from etsplat.geometry.icosphere import icosphere
+from etsplat.io.mesh_files import load_mesh, save_mesh, weld_vertices
+from etsplat.io.srgb import linear_from_srgb, srgb_from_linear
+
+PLY_HEADER = (
+    "ply\nformat ascii 1.0\nelement vertex {}\nproperty float x\nproperty float y\nproperty float z\n"
+    "element face {}\nproperty list uchar int vertex_indices\nend_header\n"
+)
+
+
+@pytest.fixture
+def ball():
+    vertices, faces = icosphere(2)
+    colors = torch.randint(0, 256, (len(faces), 3), generator=torch.Generator().manual_seed(1)).float() / 255
+    return vertices, faces, colors
+
+
+def glb_json(path):
+    data = path.read_bytes()
+    return json.loads(data[20 : 20 + struct.unpack("<I", data[12:16])[0]])
+
+
+def test_ply_returns_the_same_mesh_and_8_bit_face_colours_exactly(tmp_path, ball):
+    save_mesh(tmp_path / "a.ply", *ball)
+    mesh = load_mesh(tmp_path / "a.ply")
+    assert torch.equal(mesh.vertices, ball[0])
+    assert torch.equal(mesh.faces, ball[1])
+    assert mesh.face_colors is not None
+    torch.testing.assert_close(mesh.face_colors, ball[2], atol=1e-7, rtol=0)
+    assert mesh.notes == ()
+
+
+@pytest.mark.parametrize("suffix", [".obj", ".glb"])
+def test_welded_export_keeps_connectivity_and_averages_colours_by_area(tmp_path, ball, suffix):
+    vertices, faces, colors = ball
+    save_mesh(tmp_path / f"a{suffix}", vertices, faces, colors)
+    mesh = load_mesh(tmp_path / f"a{suffix}")
+    assert torch.equal(mesh.faces, faces)
+    torch.testing.assert_close(mesh.vertices, vertices, atol=1e-7, rtol=0)
+    corners = vertices[faces]
+    area = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).norm(dim=1)
+    touches = (faces == 7).any(dim=1)
+    expected = (colors * area[:, None])[touches].sum(0) / area[touches].sum()
+    assert mesh.vertex_colors is not None
+    torch.testing.assert_close(mesh.vertex_colors[7], expected, atol=0.02 if suffix == ".glb" else 1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("suffix", [".obj", ".glb"])
+def test_split_export_has_three_vertices_per_face_in_its_exact_colour(tmp_path, ball, suffix):
+    vertices, faces, colors = ball
+    bright = 0.3 + 0.7 * colors  # trimesh reads GLB colours in 8 bits of linear light, coarse where dark
+    save_mesh(tmp_path / f"a{suffix}", vertices, faces, bright, split=True)
+    mesh = load_mesh(tmp_path / f"a{suffix}")
+    assert len(mesh.vertices) == 3 * len(faces)
+    assert mesh.vertex_colors is not None
+    torch.testing.assert_close(mesh.vertices[mesh.faces], vertices[faces], atol=1e-7, rtol=0)
+    torch.testing.assert_close(
+        mesh.vertex_colors[mesh.faces],
+        bright[:, None].expand(-1, 3, 3),
+        atol=0.005 if suffix == ".glb" else 1e-5,
+        rtol=0,
+    )
+
+
+def test_glb_holds_linear_colours_under_an_unlit_two_sided_material(tmp_path, ball):
+    """Viewers apply the sRGB curve to COLOR_0, so that 0.5 as displayed is stored as 0.214."""
+    save_mesh(tmp_path / "a.glb", ball[0], ball[1], torch.full_like(ball[2], 0.5))
+    document = glb_json(tmp_path / "a.glb")
+    offset = 28 + struct.unpack("<I", (tmp_path / "a.glb").read_bytes()[12:16])[0]
+    view = document["bufferViews"][document["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"]]
+    stored = np.frombuffer((tmp_path / "a.glb").read_bytes(), "<f4", 3, offset + view["byteOffset"])
+    np.testing.assert_allclose(stored, 0.2140411, atol=1e-6)
+    assert document["materials"][0]["doubleSided"]
+    assert "KHR_materials_unlit" in document["materials"][0]["extensions"]
+
+
+def test_the_srgb_curves_are_inverse_to_each_other_and_meet_known_values():
+    values = np.linspace(0, 1, 1001)
+    np.testing.assert_allclose(srgb_from_linear(linear_from_srgb(values)), values, atol=1e-7)
+    np.testing.assert_allclose(
+        linear_from_srgb(np.array([0.0, 0.04045, 0.5, 1.0])), [0, 0.0031308, 0.2140411, 1], atol=1e-7
+    )
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".obj", ".glb"])
+def test_a_mesh_without_colours_returns_without_colours(tmp_path, ball, suffix):
+    save_mesh(tmp_path / f"a{suffix}", *ball[:2])
+    mesh = load_mesh(tmp_path / f"a{suffix}")
+    assert mesh.face_colors is None
+    assert mesh.vertex_colors is None or bool((mesh.vertex_colors == mesh.vertex_colors[0]).all())
+    assert (
+        "COLOR_0" not in glb_json(tmp_path / "a.glb")["meshes"][0]["primitives"][0]["attributes"]
+        if suffix == ".glb"
+        else 1
+    )
+
+
+@pytest.mark.parametrize("name", ["a.stl", "ascii.stl", "a.off", "a.ply", "ascii.ply", "a.glb", "a.obj"])
+def test_files_of_other_writers_are_read(tmp_path, ball, name):
+    solid = trimesh.Trimesh(ball[0].numpy(), ball[1].numpy(), process=False)
+    if name == "ascii.ply":
+        solid.export(tmp_path / name, encoding="ascii")
+    else:
+        solid.export(tmp_path / name, file_type="stl_ascii" if name == "ascii.stl" else None)
+    mesh = weld_vertices(load_mesh(tmp_path / name))
+    assert mesh.faces.shape == ball[1].shape
+    assert mesh.vertices.shape == ball[0].shape
+    torch.testing.assert_close(mesh.vertices[mesh.faces], ball[0][ball[1]], atol=1e-6, rtol=0)
+
+
+def test_obj_with_texture_indices_and_negative_indices_keeps_its_connectivity(tmp_path):
+    (tmp_path / "a.obj").write_text(
+        "# a comment\nmtllib absent.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nvt 0 0\nvt 1 1\nvn 0 0 1\n"
+        "f 1/1/1 2/2/1 3/1/1\nf -4 -1 -3\nf 1//1 3//1 4//1\n"
+    )
+    mesh = load_mesh(tmp_path / "a.obj")
+    assert mesh.faces.tolist() == [[0, 1, 2], [0, 3, 1], [0, 2, 3]]
+
+
+@pytest.mark.parametrize("name", ["quad.obj", "quad.ply"])
+def test_polygons_are_cut_into_triangles_and_the_note_says_so(tmp_path, name):
+    points = ["0 0 0", "1 0 0", "1 1 0", "0 1 0"]
+    if name == "quad.obj":
+        (tmp_path / name).write_text("".join(f"v {p}\n" for p in points) + "f 1 2 3 4\n")
+    else:
+        (tmp_path / name).write_text(PLY_HEADER.format(4, 1) + "\n".join(points) + "\n4 0 1 2 3\n")
+    mesh = load_mesh(tmp_path / name)
+    assert mesh.faces.shape == (2, 3)
+    assert "cut into 2 triangles" in mesh.notes[0]
+
+
+def test_faces_without_area_repeated_faces_and_loose_vertices_are_dropped_with_notes(tmp_path):
+    (tmp_path / "a.obj").write_text("v 9 9 9\nv 0 0 0\nv 1 0 0\nv 0 1 0\nv 2 0 0\nf 2 3 4\nf 3 4 2\nf 2 3 5\nf 2 2 3\n")
+    mesh = load_mesh(tmp_path / "a.obj")
+    assert mesh.faces.tolist() == [[0, 1, 2]]
+    assert mesh.vertices.shape == (3, 3)
+    assert [note.split()[0] for note in mesh.notes] == ["2", "1", "2"]
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("absent.ply", None, "no such file"),
+        ("a.ply", "", "empty"),
+        ("a.obj", "", "empty"),
+        ("a.xyz", "0 0 0", "unknown kind"),
+        ("a.obj", "# nothing\n", "no vertices"),
+        ("a.obj", "v 0 0 0\nv 1 0 0\n", "point cloud"),
+        ("a.ply", PLY_HEADER.format(2, 0) + "0 0 0\n1 0 0\n", "point cloud"),
+        ("a.obj", "v 0 0 0\nv 1 0 nan\nv 0 1 0\nf 1 2 3\n", "1 of 3 vertices are not finite"),
+        ("a.obj", "v 0 0 0\nv 1 0 1e300\nv 0 1 0\nf 1 2 3\n", "not finite"),
+        ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 4\n", "there are 3 vertices"),
+        ("a.ply", PLY_HEADER.format(3, 1) + "0 0 0\n1 0 0\n0 1 0\n3 0 1 7\n", "there are 3 vertices"),
+        ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 0\n", "count from 1"),
+        ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\nf 1 2", "line 5"),
+        ("a.obj", "v 0 0 0\nv 1 0", "line 2"),
+        ("a.obj", "v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "zero area"),
+        ("a.ply", "ply\nformat ascii 1.0\nelement ver", "cannot be read as PLY"),
+        ("a.glb", "no glb at all, just some text", "cannot be read as GLB"),
+        ("a.off", "OFF\n3 1 0\n0 0 0\n1 0", "cannot be read as OFF"),
+    ],
+)
+def test_bad_files_are_one_line_input_errors(tmp_path, name, content, message):
+    if content is not None:
+        (tmp_path / name).write_text(content)
+    with pytest.raises(InputError, match=message) as raised:
+        load_mesh(tmp_path / name)
+    assert "\n" not in str(raised.value)
+    assert name in str(raised.value)
+
+
+@pytest.mark.parametrize("name", ["a.ply", "ascii.ply", "a.stl", "a.off", "a.glb"])
+@pytest.mark.parametrize("part", [0.02, 0.3, 0.6, 0.99])
+def test_a_file_cut_anywhere_is_an_input_error(tmp_path, ball, name, part):
+    solid = trimesh.Trimesh(ball[0].numpy(), ball[1].numpy(), process=False)
+    solid.export(tmp_path / name, **({"encoding": "ascii"} if name == "ascii.ply" else {}))
+    data = (tmp_path / name).read_bytes()
+    (tmp_path / name).write_bytes(data[: int(len(data) * part)])
+    with pytest.raises(InputError) as raised:
+        load_mesh(tmp_path / name)
+    assert "\n" not in str(raised.value)
+
+
+def test_a_folder_is_an_input_error(tmp_path):
+    with pytest.raises(InputError, match="is a folder"):
+        load_mesh(tmp_path)
+
+
+def test_save_mesh_names_the_wrong_argument(tmp_path, ball):
+    vertices, faces, colors = ball
+    with pytest.raises(ValueError, match="vertices: expected finite"):
+        save_mesh(tmp_path / "a.ply", vertices * torch.nan, faces)
+    with pytest.raises(ValueError, match="faces: expected indices"):
+        save_mesh(tmp_path / "a.ply", vertices[:5], faces)
+    with pytest.raises(ValueError, match="face_colors: expected shape"):
+        save_mesh(tmp_path / "a.ply", vertices, faces, colors[:-1])
+    with pytest.raises(ValueError, match="path: expected one of the suffixes"):
+        save_mesh(tmp_path / "a.xyz", vertices, faces)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_shared_meshes_load_without_repairs(shared_data):
+    for path in sorted((shared_data / "famous").glob("*.obj"))[:3]:
+        assert load_mesh(path).notes == ()
