@@ -1,0 +1,266 @@
+"""The folder that holds a run: what may become one, and how its files are written.
+
+A folder is a run's if it holds a config.json that says so. Files are written whole or not at all, except history.jsonl,
+which grows by a line at a time; a line that a kill cut short is ignored and, on resume, removed.
+"""
+
+import contextlib
+import json
+import math
+import os
+import secrets
+import shutil
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from etsplat.core.errors import InputError
+from etsplat.io.atomic import atomic_write, write_error
+
+FORMAT = "etsplat run 1"
+
+_README = """\
+This folder is a run of etsplat ({task}).
+
+report.html     the whole result on one page; opens in any browser, without a network
+mesh.ply        the result with exact face colours
+mesh.obj        the same with vertex colours (also mesh.glb, which most viewers open)
+metrics.json    how good it is; docs/conventions.md of etsplat says how each number is measured
+test/           held-out views: NNN_render.png (splatted), NNN_truth.png, NNN_mesh.png (the mesh drawn opaque)
+history.jsonl   one line per log step: iteration, seconds of optimisation, loss, faces, sigma, and what was evaluated
+convergence.png the same as curves
+config.json     the settings that made it
+checkpoints/    where an interrupted run continues with --resume; safe to delete once the run is done
+"""
+
+_FILES = ("metrics.json", "history.jsonl", "convergence.png", "report.html", "README.txt", "config.json")
+_FOLDERS = ("test", "checkpoints")
+
+
+@dataclass(frozen=True)
+class RunDirectory:
+    """Paths and files of one run. Make it with `create` or `resume`; `RunDirectory(path)` is for reading.
+
+    Attributes:
+        path: the folder.
+    """
+
+    path: Path
+
+    @property
+    def config_path(self) -> Path:
+        """config.json: the settings, the input's fingerprint, versions."""
+        return self.path / "config.json"
+
+    @property
+    def metrics_path(self) -> Path:
+        """metrics.json: final metrics; there once the run is done."""
+        return self.path / "metrics.json"
+
+    @property
+    def history_path(self) -> Path:
+        """history.jsonl: one JSON object per line."""
+        return self.path / "history.jsonl"
+
+    @property
+    def checkpoints(self) -> Path:
+        """Folder of the checkpoints."""
+        return self.path / "checkpoints"
+
+    @property
+    def test(self) -> Path:
+        """Folder of the test views' pictures."""
+        return self.path / "test"
+
+    def mesh_path(self, suffix: str) -> Path:
+        """mesh.ply, mesh.obj or mesh.glb."""
+        return self.path / f"mesh{suffix}"
+
+    @staticmethod
+    def check_free(path: Path | str, *, overwrite: bool = False) -> None:
+        """Refuses a folder in which `create` would fail, without writing anything into it that stays.
+
+        Cheap, so that a run can ask before it prepares its input.
+
+        Args:
+            path: need not exist; an existing folder must be empty, or with `overwrite` hold a run.
+            overwrite: whether an earlier run may be replaced.
+
+        Raises:
+            InputError: `path` is a file, cannot be written to, holds something that is not a run, or holds a run and
+                `overwrite` is off.
+        """
+        path = Path(path)
+        if path.exists() and not path.is_dir():
+            raise InputError(f"{path}: is a file; choose a folder for the results")
+        if path.is_dir() and any(path.iterdir()):
+            if not is_run(path):
+                raise InputError(f"{path}: is not empty and not a run of etsplat; choose another or a new folder")
+            if not overwrite:
+                raise InputError(
+                    f"{path}: holds a run already; continue it with --resume, replace it with --overwrite, or choose "
+                    "another folder"
+                )
+        _check_writable(path)
+
+    @classmethod
+    def create(cls, path: Path | str, config: Mapping[str, Any], *, overwrite: bool = False) -> "RunDirectory":
+        """Makes `path` the folder of a new run: with config.json, README.txt and nothing else of a run.
+
+        Args:
+            path: as in `check_free`.
+            config: what config.json holds, JSON-serialisable, with the key "task".
+            overwrite: whether an earlier run may be replaced. Only files that a run writes are removed.
+
+        Raises:
+            InputError: as in `check_free`; or the disk is full.
+        """
+        cls.check_free(path, overwrite=overwrite)
+        run = cls(Path(path))
+        with _explained(run.path):
+            run.path.mkdir(parents=True, exist_ok=True)
+            run._remove_results()
+            run.checkpoints.mkdir()
+            run.test.mkdir()
+        _write_json(run.config_path, {"format": FORMAT, **config})
+        _write_text(run.path / "README.txt", _README.format(task=config["task"]))
+        return run
+
+    @classmethod
+    def resume(cls, path: Path | str, config: Mapping[str, Any]) -> "RunDirectory":
+        """Opens the folder of a run that is to be continued.
+
+        Args:
+            path: of the folder.
+            config: as given to `create`. What it holds under "config" and "source" must be the same as then.
+
+        Raises:
+            InputError: `path` holds no run, a run with other settings or input, or cannot be written to.
+        """
+        path = Path(path)
+        if not is_run(path):
+            raise InputError(f"{path}: holds no run to resume; start it without --resume")
+        run = cls(path)
+        stored = run.read_config()
+        for section in ("task", "config", "source"):
+            differences = _differences(stored.get(section), _as_json(config.get(section)))
+            if differences:
+                raise InputError(
+                    f"{path}: was started with {'; '.join(differences)}; resume with the same, or choose another folder"
+                )
+        _check_writable(path)
+        with _explained(path):
+            run.checkpoints.mkdir(exist_ok=True)
+            run.test.mkdir(exist_ok=True)
+        return run
+
+    def read_config(self) -> dict[str, Any]:
+        """What config.json holds.
+
+        Raises:
+            InputError: it is missing or not JSON.
+        """
+        return _read_json(self.config_path)
+
+    def read_metrics(self) -> dict[str, Any]:
+        """What metrics.json holds.
+
+        Raises:
+            InputError: it is missing (the run is not done) or not JSON.
+        """
+        return _read_json(self.metrics_path)
+
+    def write_metrics(self, metrics: Mapping[str, Any]) -> None:
+        """Writes metrics.json, whole or not at all. NaN and infinity, which JSON has not, become null."""
+        _write_json(self.metrics_path, {key: _null_if_not_finite(value) for key, value in metrics.items()})
+
+    def append_history(self, line: Mapping[str, Any]) -> None:
+        """Appends one line to history.jsonl."""
+        with _explained(self.history_path), open(self.history_path, "a", encoding="utf-8") as file:
+            file.write(json.dumps(line) + "\n")
+
+    def read_history(self) -> list[dict[str, Any]]:
+        """The lines of history.jsonl; empty if there is none yet. A last line that a kill cut short is left out."""
+        if not self.history_path.exists():
+            return []
+        lines = self.history_path.read_text(encoding="utf-8").split("\n")[:-1]  # what follows the last \n is cut short
+        try:
+            return [json.loads(line) for line in lines]
+        except json.JSONDecodeError as error:
+            raise InputError(f"{self.history_path}: is damaged ({error}); delete the file") from error
+
+    def truncate_history(self, iteration: int) -> None:
+        """Keeps only the lines up to an iteration: what came after the checkpoint will be done again."""
+        kept = [line for line in self.read_history() if line["iteration"] <= iteration]
+        _write_text(self.history_path, "".join(json.dumps(line) + "\n" for line in kept))
+
+    def _remove_results(self) -> None:
+        # config.json goes last: until then the folder still says whose it is.
+        for name in [f"mesh{suffix}" for suffix in (".ply", ".obj", ".glb")] + list(_FILES):
+            (self.path / name).unlink(missing_ok=True)
+        for name in _FOLDERS:
+            if (self.path / name).is_dir():
+                shutil.rmtree(self.path / name)
+
+
+def is_run(path: Path | str) -> bool:
+    """Whether a folder holds a run of etsplat, finished or not."""
+    try:
+        return json.loads((Path(path) / "config.json").read_text(encoding="utf-8")).get("format") == FORMAT
+    except (OSError, ValueError, AttributeError):
+        return False
+
+
+def _check_writable(path: Path) -> None:
+    folder = path
+    while not folder.exists():
+        folder = folder.parent
+    if not folder.is_dir():
+        raise InputError(f"{path}: {folder} is a file; choose a folder for the results")
+    probe = folder / f".etsplat-{secrets.token_hex(4)}"
+    with _explained(path):
+        os.close(os.open(probe, os.O_CREAT | os.O_EXCL | os.O_WRONLY))
+        probe.unlink()
+
+
+@contextlib.contextmanager
+def _explained(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise write_error(path, error) from error
+
+
+def _write_text(path: Path, text: str) -> None:
+    with atomic_write(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def _write_json(path: Path, value: Mapping[str, Any]) -> None:
+    _write_text(path, json.dumps(value, indent=2, allow_nan=False) + "\n")
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); is the run done?") from error
+    except ValueError as error:
+        raise InputError(f"{path}: is not JSON ({error}); delete it and run again") from error
+
+
+def _null_if_not_finite(value: Any) -> Any:
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _as_json(value: object) -> Any:
+    return json.loads(json.dumps(value))
+
+
+def _differences(stored: Any, given: Any) -> list[str]:
+    """What differs, as "key=stored (not given)"."""
+    if not isinstance(stored, dict) or not isinstance(given, dict):
+        return [] if stored == given else [f"{stored} (not {given})"]
+    keys = [*stored, *(key for key in given if key not in stored)]
+    return [f"{key}={stored.get(key)} (not {given.get(key)})" for key in keys if stored.get(key) != given.get(key)]

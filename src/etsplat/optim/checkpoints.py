@@ -1,0 +1,96 @@
+"""Checkpoints: one safetensors file each, written whole or not at all, bound to the run that wrote it."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from etsplat.core.errors import InputError
+from etsplat.io.atomic import atomic_write
+
+FORMAT = "etsplat checkpoint 1"
+KEEP = 2
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """What a checkpoint file holds.
+
+    Attributes:
+        path: the file.
+        iteration: iterations done.
+        tensors: by name, on the CPU, with the bits they were saved with.
+    """
+
+    path: Path
+    iteration: int
+    tensors: dict[str, Tensor]
+
+
+def checkpoint_path(folder: Path, iteration: int) -> Path:
+    """Where the checkpoint of an iteration lies; names sort by iteration."""
+    return folder / f"step_{iteration:06d}.safetensors"
+
+
+def save_checkpoint(folder: Path, iteration: int, tensors: Mapping[str, Tensor], run_hash: str) -> Path:
+    """Writes a checkpoint atomically, then deletes all but the last two of the folder.
+
+    Args:
+        folder: created if it does not exist.
+        iteration: iterations done.
+        tensors: everything that the rest of the run depends on.
+        run_hash: identifies the run's settings and input; `load_checkpoint` insists on the same.
+
+    Raises:
+        InputError: the folder cannot be written to, or the disk is full; earlier checkpoints are left as they were.
+    """
+    path = checkpoint_path(folder, iteration)
+    metadata = {"format": FORMAT, "iteration": str(iteration), "run_hash": run_hash}
+    whole = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+    with atomic_write(path) as temporary:
+        try:
+            save_file(whole, temporary, metadata=metadata)
+        except SafetensorError as error:  # how safetensors reports what the system said, a full disk among it
+            raise OSError(f"{error}".splitlines()[0]) from error
+    for old in list_checkpoints(folder)[:-KEEP]:
+        old.unlink(missing_ok=True)
+    return path
+
+
+def list_checkpoints(folder: Path) -> list[Path]:
+    """Checkpoint files of a folder, oldest first; empty if the folder does not exist."""
+    return sorted(folder.glob("step_*.safetensors"), key=lambda path: (len(path.name), path.name))
+
+
+def load_latest_checkpoint(folder: Path, run_hash: str) -> Checkpoint | None:
+    """Reads the newest checkpoint of a folder, or None if it has none.
+
+    Raises:
+        InputError: the file is damaged, or of a run with other settings or input. The message names the checkpoint
+            before it where there is one: a run never falls back to it by itself.
+    """
+    paths = list_checkpoints(folder)
+    if not paths:
+        return None
+    path, earlier = paths[-1], paths[:-1]
+    remedy = f"delete it to resume from {earlier[-1].name}" if earlier else "delete it and resume to start again"
+    try:
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a mapping)
+    except (SafetensorError, OSError, ValueError) as error:
+        raise InputError(f"{path}: cut short or damaged ({_first_line(error)}); {remedy}") from error
+    if metadata.get("format") != FORMAT:
+        raise InputError(f"{path}: not a checkpoint of this version of etsplat; {remedy}")
+    if metadata.get("run_hash") != run_hash:
+        raise InputError(
+            f"{path}: belongs to a run with other settings or input; resume with the same, or choose another folder"
+        )
+    return Checkpoint(path, int(metadata["iteration"]), tensors)
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error) or type(error).__name__).splitlines()[0]

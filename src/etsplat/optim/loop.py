@@ -1,0 +1,279 @@
+"""The optimization loop: it drives a problem and yields events; it knows nothing about triangles.
+
+Everything that happens at an iteration (step, refinement) is done before its events are yielded, so a consumer always
+sees, and a checkpoint always holds, the state between two iterations.
+"""
+
+import math
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from etsplat.optim.checkpoints import list_checkpoints
+
+
+class DivergedError(RuntimeError):
+    """The loss or a parameter became NaN or infinite. The message is one line that says when and what is left."""
+
+
+@dataclass(frozen=True)
+class StepEvent:
+    """Every `log_every` iterations, at every evaluation, and at the last iteration.
+
+    Attributes:
+        iteration: iterations done.
+        iterations: length of the run.
+        seconds: time spent optimising so far (steps and refinements), over all parts of a resumed run. Evaluation,
+            checkpoints and callbacks are not in it.
+        loss: mean over the iterations since the last event of this kind.
+        faces: number of faces.
+        sigma: softness.
+        metrics: what was evaluated at this iteration ("psnr", "chamfer"), or empty.
+    """
+
+    iteration: int
+    iterations: int
+    seconds: float
+    loss: float
+    faces: int
+    sigma: float
+    metrics: dict[str, float]
+
+
+@dataclass(frozen=True)
+class RefineEvent:
+    """Primitives were added or removed after this iteration's step.
+
+    Attributes:
+        iteration: iterations done.
+        faces: number of faces now.
+        added: how many more than before.
+    """
+
+    iteration: int
+    faces: int
+    added: int
+
+
+@dataclass(frozen=True)
+class EvaluateEvent:
+    """The state after this iteration was evaluated; the same numbers are in the StepEvent.
+
+    Attributes:
+        iteration: iterations done.
+        metrics: by name.
+    """
+
+    iteration: int
+    metrics: dict[str, float]
+
+
+@dataclass(frozen=True)
+class CheckpointEvent:
+    """A checkpoint was written.
+
+    Attributes:
+        iteration: iterations done.
+        path: the file.
+    """
+
+    iteration: int
+    path: Path
+
+
+@dataclass(frozen=True)
+class DoneEvent:
+    """All iterations are done; nothing is yielded after this.
+
+    Attributes:
+        iteration: iterations done.
+        seconds: as in StepEvent.
+    """
+
+    iteration: int
+    seconds: float
+
+
+Event = StepEvent | RefineEvent | EvaluateEvent | CheckpointEvent | DoneEvent
+
+
+class Problem(Protocol):
+    """What the loop drives: parameters, their optimizer, and the data they are fitted to."""
+
+    @property
+    def faces(self) -> int:
+        """Number of primitives."""
+        ...
+
+    @property
+    def sigma(self) -> float:
+        """Softness."""
+        ...
+
+    def step(self, iteration: int) -> float:
+        """Makes one optimizer step and returns the loss before it."""
+        ...
+
+    def refine(self, iteration: int) -> int:
+        """Adds or removes primitives if this iteration is one for that; returns how many were added."""
+        ...
+
+    def evaluate(self) -> dict[str, float]:
+        """Cheap metrics of the present state. Changes nothing."""
+        ...
+
+    def is_finite(self) -> bool:
+        """Whether no parameter holds NaN or infinity."""
+        ...
+
+
+@dataclass
+class Progress:
+    """Where a run stands; part of a checkpoint.
+
+    Attributes:
+        iteration: iterations done.
+        seconds: time spent on them.
+        loss_sum: sum of the losses since the last StepEvent.
+        loss_count: how many.
+    """
+
+    iteration: int = 0
+    seconds: float = 0.0
+    loss_sum: float = 0.0
+    loss_count: int = 0
+
+
+@dataclass(frozen=True)
+class LoopSettings:
+    """When things happen.
+
+    Attributes:
+        iterations: length of the run, >= 1.
+        log_every: iterations between StepEvents, >= 1.
+        evaluate_every: iterations between evaluations; 0 for none before the last iteration, which always has one.
+        checkpoint_every: iterations between checkpoints; 0 for none before the last iteration, which always has one.
+    """
+
+    iterations: int
+    log_every: int
+    evaluate_every: int
+    checkpoint_every: int
+
+
+def optimize(
+    problem: Problem, settings: LoopSettings, progress: Progress, save: Callable[[Progress], Path], folder: Path
+) -> Iterator[Event]:
+    """Runs `problem` from `progress` to the last iteration.
+
+    Ctrl-C finishes the iteration at hand, saves a checkpoint, and then raises KeyboardInterrupt; a second Ctrl-C
+    raises at once.
+
+    Args:
+        problem: what to optimise; changed in place.
+        settings: when things happen.
+        progress: where the run stands; changed in place.
+        save: writes a checkpoint and returns its path.
+        folder: of the checkpoints, named in the error of a diverged run.
+
+    Yields:
+        Events in the order of `Event`; of one iteration, those that apply.
+
+    Raises:
+        DivergedError: the loss or a parameter is not finite.
+        KeyboardInterrupt: after Ctrl-C.
+    """
+    with _deferred_interrupt() as interrupted:
+        while progress.iteration < settings.iterations:
+            added = _advance(problem, progress, folder)
+            iteration = progress.iteration
+            last = iteration == settings.iterations
+            evaluating = last or _due(iteration, settings.evaluate_every)
+            stopping = interrupted()
+            saving = last or stopping or _due(iteration, settings.checkpoint_every)
+            logging = evaluating or _due(iteration, settings.log_every)
+            if (logging or saving) and not problem.is_finite():
+                raise DivergedError(f"a parameter is not finite at iteration {iteration}; {_what_is_left(folder)}")
+            if logging:
+                metrics = problem.evaluate() if evaluating else {}
+                yield _step_event(problem, settings, progress, metrics)
+                if evaluating:
+                    yield EvaluateEvent(iteration, metrics)
+            if added:
+                yield RefineEvent(iteration, problem.faces, added)
+            if saving:
+                yield CheckpointEvent(iteration, save(progress))
+            if stopping:
+                raise KeyboardInterrupt
+        if interrupted():
+            raise KeyboardInterrupt
+    yield DoneEvent(progress.iteration, progress.seconds)
+
+
+def _advance(problem: Problem, progress: Progress, folder: Path) -> int:
+    start = time.perf_counter()
+    iteration = progress.iteration + 1
+    loss = problem.step(iteration)
+    if not math.isfinite(loss):
+        raise DivergedError(f"the loss is {loss} at iteration {iteration}; {_what_is_left(folder)}")
+    added = problem.refine(iteration)
+    progress.iteration = iteration
+    progress.loss_sum += loss
+    progress.loss_count += 1
+    progress.seconds += time.perf_counter() - start
+    return added
+
+
+def _step_event(problem: Problem, settings: LoopSettings, progress: Progress, metrics: dict[str, float]) -> StepEvent:
+    loss = progress.loss_sum / progress.loss_count
+    progress.loss_sum, progress.loss_count = 0.0, 0
+    return StepEvent(
+        iteration=progress.iteration,
+        iterations=settings.iterations,
+        seconds=progress.seconds,
+        loss=loss,
+        faces=problem.faces,
+        sigma=problem.sigma,
+        metrics=metrics,
+    )
+
+
+def _due(iteration: int, every: int) -> bool:
+    return every > 0 and iteration % every == 0
+
+
+def _what_is_left(folder: Path) -> str:
+    saved = list_checkpoints(folder)
+    if not saved:
+        return "no checkpoint was written yet; lower the learning rates and start again"
+    return f"the last good checkpoint is {saved[-1]}; lower the learning rates and start again in another folder"
+
+
+@contextmanager
+def _deferred_interrupt() -> Iterator[Callable[[], bool]]:
+    """Within the block the first Ctrl-C only sets what the yielded function returns; a second one raises as usual.
+
+    An exception in the middle of a step would leave parameters and moments of different iterations, from which a
+    resumed run could not end with the same bits. Outside the main thread Python delivers no signals, so there is
+    nothing to do.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield lambda: False
+        return
+    pressed = threading.Event()
+    previous = signal.getsignal(signal.SIGINT) or signal.default_int_handler
+
+    def on_interrupt(*_: object) -> None:
+        pressed.set()
+        signal.signal(signal.SIGINT, previous)
+
+    signal.signal(signal.SIGINT, on_interrupt)
+    try:
+        yield pressed.is_set
+    finally:
+        signal.signal(signal.SIGINT, previous)

@@ -1,0 +1,46 @@
+"""In which order a run sees its views, and every other random choice of the run."""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+class ViewSampler:
+    """Shuffled epochs: each view once, without replacement, then all again in a new order.
+
+    Owns the run's only random generator, so that a checkpoint of this object fixes all that is random in the rest.
+    """
+
+    def __init__(self, views: Sequence[int], seed: int) -> None:
+        self._views = torch.tensor(list(views), dtype=torch.int64)
+        self._generator = torch.Generator().manual_seed(seed)
+        self._order = self._views[:0]
+        self._position = 0
+
+    def next_view(self) -> int:
+        """The index of the next view."""
+        if self._position == len(self._order):
+            self._order = self._views[torch.randperm(len(self._views), generator=self._generator)]
+            self._position = 0
+        self._position += 1
+        return int(self._order[self._position - 1])
+
+    def background(self) -> Float[Tensor, "1 3"]:
+        """A random colour, uniform in [0, 1)^3."""
+        return torch.rand(1, 3, generator=self._generator)
+
+    def state(self) -> dict[str, Tensor]:
+        """Everything that decides what comes next."""
+        return {
+            "generator": self._generator.get_state(),
+            "order": self._order,
+            "position": torch.tensor(self._position),
+        }
+
+    def load_state(self, state: dict[str, Tensor]) -> None:
+        """Continues where `state` was taken."""
+        self._generator.set_state(state["generator"])
+        self._order = state["order"]
+        self._position = int(state["position"])

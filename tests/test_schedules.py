@@ -1,0 +1,53 @@
+"""Schedules of weights, learning rates and views."""
+
+import math
+
+import pytest
+
+from etsplat.optim.schedules import exponential_decay, regularization_weight
+from etsplat.optim.view_sampler import ViewSampler
+
+
+def test_regularization_is_full_until_step_500_and_nothing_at_the_last_step() -> None:
+    """The paper's numbers: 1 up to step 500, 0 at step 30,000, halfway between the two one half."""
+    assert [regularization_weight(t, 30_000, 500) for t in (1, 499, 500)] == [1.0, 1.0, 1.0]
+    assert regularization_weight(15_250, 30_000, 500) == pytest.approx(0.5)
+    assert regularization_weight(30_000, 30_000, 500) == 0.0
+
+
+def test_regularization_follows_a_cosine() -> None:
+    """A quarter of the way down, gamma is (1 + cos(pi / 4)) / 2."""
+    assert regularization_weight(500 + 29_500 // 4, 30_000, 500) == pytest.approx(0.5 * (1 + math.cos(math.pi / 4)))
+
+
+def test_regularization_of_a_run_shorter_than_the_hold_stays_full() -> None:
+    """A run of 100 steps with hold 500 keeps gamma = 1 and divides by nothing."""
+    assert regularization_weight(100, 100, 500) == 1.0
+
+
+def test_learning_rates_fall_exponentially() -> None:
+    """The factor is 1 at the first step, the ratio at the last, and its logarithm is linear between."""
+    factors = [exponential_decay(t, 101, 0.01) for t in (1, 51, 101)]
+    assert factors == pytest.approx([1.0, 0.1, 0.01])
+    assert exponential_decay(1, 1, 0.01) == 1.0
+
+
+def test_every_epoch_shows_each_view_once_in_a_new_order() -> None:
+    """Three epochs are three different permutations of the views."""
+    views = [3, 5, 8, 13, 21, 34, 55, 89]
+    sampler = ViewSampler(views, seed=0)
+    epochs = [tuple(sampler.next_view() for _ in views) for _ in range(3)]
+    assert all(sorted(epoch) == views for epoch in epochs)
+    assert len(set(epochs)) == 3
+
+
+def test_a_sampler_continues_from_its_state_in_the_middle_of_an_epoch() -> None:
+    """After loading a state, views and backgrounds are those that would have come, to the bit."""
+    sampler = ViewSampler(range(7), seed=1)
+    for _ in range(10):
+        sampler.next_view()
+    state = {name: tensor.clone() for name, tensor in sampler.state().items()}
+    expected = [(sampler.next_view(), sampler.background().tolist()) for _ in range(20)]
+    other = ViewSampler(range(7), seed=2)
+    other.load_state(state)
+    assert [(other.next_view(), other.background().tolist()) for _ in range(20)] == expected
