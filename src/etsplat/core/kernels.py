@@ -8,7 +8,8 @@ Three floors keep values and derivatives finite, alike in every engine:
 * x is raised to ``X_FLOOR``: dG/dx of the smooth kernels is unbounded at 0 for sigma > 2, and round-off can make x
   negative.
 * sigma is raised to ``SIGMA_FLOOR``, below which float32 cannot tell a kernel from a step.
-* 1 - x is raised to ``RIM_FLOOR`` in the slope of the single-sided kernel, which is unbounded at x = 1 for sigma < 1.
+* 1 - x is raised to ``RIM_FLOOR`` in the derivatives of the single-sided kernel, whose slope is unbounded at x = 1 for
+  sigma < 1.
 
 The floors are passed straight through: the derivative at a floored argument is the one at the floor, not zero.
 """
@@ -133,14 +134,13 @@ def _single_sided(x: Tensor, sigma: Tensor) -> Tensor:
 
 
 def _single_sided_dx(x: Tensor, sigma: Tensor) -> Tensor:
-    inside = (1.0 - x.clamp(min=X_FLOOR)).clamp(min=RIM_FLOOR)
-    return -sigma.clamp(min=SIGMA_FLOOR) * _single_sided(x, sigma) / inside
+    rim, sigma = (1.0 - x.clamp(min=X_FLOOR)).clamp(min=RIM_FLOOR), sigma.clamp(min=SIGMA_FLOOR)
+    return torch.where(x < 1.0, -sigma * rim ** (sigma - 1.0), 0.0)
 
 
 def _single_sided_dsigma(x: Tensor, sigma: Tensor) -> Tensor:
-    # The smallest normal number: where 1 - x is 0, G is 0 and so is the product.
-    inside = (1.0 - x.clamp(min=X_FLOOR)).clamp(min=torch.finfo(x.dtype).tiny)
-    return _single_sided(x, sigma) * inside.log()
+    rim = (1.0 - x.clamp(min=X_FLOOR)).clamp(min=RIM_FLOOR)
+    return _single_sided(x, sigma) * rim.log()
 
 
 def _single_sided_support(log_ratio: Tensor, sigma: Tensor) -> Tensor:
