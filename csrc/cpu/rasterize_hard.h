@@ -1,0 +1,36 @@
+// Z-buffer rasterization of opaque triangles: ground truth, previews, the sharp rendering of a finished mesh.
+#pragma once
+
+#include <cstdint>
+
+namespace etsplat {
+
+struct HardMesh {
+    const float* vertices;  // (num_vertices, 3)
+    const int32_t* faces;   // (num_faces, 3)
+    int64_t num_vertices;
+    int64_t num_faces;
+};
+
+struct HardCamera {
+    const float* viewmat;  // (4, 4) world to camera
+    const float* K;        // (3, 3) in pixels
+    float near_plane;
+    int32_t width, height;
+};
+
+struct HardColors {
+    const float* faces;     // (num_faces, channels), or null
+    const float* vertices;  // (num_vertices, channels), used if `faces` is null
+    int32_t channels;
+};
+
+// The nearest triangle of every pixel centre (-1: none), its perspective-correct barycentrics and its depth.
+void rasterize_hard(const HardMesh& mesh, const HardCamera& camera, int32_t* triangle, float* barycentrics,
+                    float* depth);
+
+// Mean over supersampling^2 samples a pixel: premultiplied colour and coverage, (height, width, channels + 1).
+void render_opaque(const HardMesh& mesh, const HardCamera& camera, const HardColors& colors, int32_t supersampling,
+                   bool cull_backfaces, float* image);
+
+}  // namespace etsplat
