@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from etsplat.optim.schedules import exponential_decay, regularization_weight
+from etsplat.optim.schedules import exponential_decay, face_budgets, regularization_weight
 from etsplat.optim.view_sampler import ViewSampler
 
 
@@ -51,3 +51,22 @@ def test_a_sampler_continues_from_its_state_in_the_middle_of_an_epoch() -> None:
     other = ViewSampler(range(7), seed=2)
     other.load_state(state)
     assert [(other.next_view(), other.background().tolist()) for _ in range(20)] == expected
+
+
+def test_faces_grow_by_the_same_factor_up_to_the_limit() -> None:
+    """Four subdivisions from 100 to 1600 faces double them, at evenly spaced iterations."""
+    budgets = face_budgets(1000, steps=4, first=0.1, last=0.7, start_faces=100, max_faces=1600)
+    assert budgets == {100: 200, 300: 400, 500: 800, 700: 1600}
+
+
+def test_a_mesh_with_enough_faces_is_not_subdivided() -> None:
+    """At or above the limit there is no subdivision, and none if none is asked for."""
+    assert face_budgets(1000, steps=4, first=0.1, last=0.7, start_faces=2000, max_faces=1600) == {}
+    assert face_budgets(1000, steps=0, first=0.1, last=0.7, start_faces=100, max_faces=1600) == {}
+
+
+def test_subdivisions_of_a_very_short_run_stay_within_it() -> None:
+    """With more subdivisions than iterations, iterations stay in 1..2 and the last budget is the limit."""
+    budgets = face_budgets(2, steps=10, first=0.0, last=1.0, start_faces=100, max_faces=1600)
+    assert list(budgets) == [1, 2]
+    assert budgets[2] == 1600

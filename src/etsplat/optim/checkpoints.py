@@ -39,7 +39,7 @@ def save_checkpoint(folder: Path, iteration: int, tensors: Mapping[str, Tensor],
     """Writes a checkpoint atomically, then deletes all but the last two of the folder.
 
     Args:
-        folder: created if it does not exist.
+        folder: must exist.
         iteration: iterations done.
         tensors: everything that the rest of the run depends on.
         run_hash: identifies the run's settings and input; `load_checkpoint` insists on the same.

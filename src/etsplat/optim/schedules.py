@@ -30,3 +30,30 @@ def exponential_decay(iteration: int, iterations: int, ratio: float) -> float:
     if iterations <= 1:
         return 1.0
     return ratio ** ((iteration - 1) / (iterations - 1))
+
+
+def face_budgets(
+    iterations: int, *, steps: int, first: float, last: float, start_faces: int, max_faces: int
+) -> dict[int, int]:
+    """When to subdivide, and to how many faces: evenly spaced, each time by the same factor.
+
+    The k-th of n subdivisions may grow the mesh to start_faces (max_faces / start_faces)^(k / n) faces.
+
+    Args:
+        iterations: length of the run.
+        steps: n, >= 0; no subdivision at 0.
+        first: when the first one happens, as a fraction of the run in [0, 1].
+        last: when the last one happens, as a fraction of the run in [first, 1].
+        start_faces: faces before the first.
+        max_faces: faces after the last, at most. No subdivision if there are as many already.
+
+    Returns:
+        Budget by iteration, ascending. Where several fall on one iteration it has the largest of their budgets.
+    """
+    budgets = {}
+    if max_faces > start_faces:
+        for k in range(1, steps + 1):
+            fraction = first + (last - first) * (k - 1) / max(steps - 1, 1)
+            iteration = min(max(round(fraction * iterations), 1), iterations)
+            budgets[iteration] = round(start_faces * (max_faces / start_faces) ** (k / steps))
+    return budgets

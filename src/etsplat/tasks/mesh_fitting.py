@@ -1,0 +1,163 @@
+"""The problem that the loop drives in shape reconstruction: a mesh, its optimizer, and the views it is fitted to."""
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from etsplat.geometry.measures import face_areas
+from etsplat.geometry.subdivision import longest_edge_plan
+from etsplat.geometry.topology import MeshTopology
+from etsplat.ops.adam import Adam
+from etsplat.ops.rasterize import rasterize
+from etsplat.optim.edit import apply_subdivision
+from etsplat.optim.loop import Progress
+from etsplat.optim.objectives import MeshWeights, mesh_objective
+from etsplat.optim.schedules import exponential_decay, face_budgets, regularization_weight
+from etsplat.optim.view_sampler import ViewSampler
+from etsplat.scene.triangle_mesh import TriangleMesh
+from etsplat.scene.views import PosedViews
+from etsplat.tasks.reconstruct_config import ReconstructConfig
+
+
+class MeshFitting:
+    """One run's state, and what changes it: steps and subdivisions. Implements `optim.loop.Problem`.
+
+    Attributes:
+        mesh: the mesh as it is now.
+        adam: its optimizer.
+    """
+
+    def __init__(
+        self,
+        mesh: TriangleMesh,
+        views: PosedViews,
+        config: ReconstructConfig,
+        evaluate: Callable[[TriangleMesh], dict[str, float]],
+    ) -> None:
+        """Starts a run.
+
+        Args:
+            mesh: the start; changed in place.
+            views: what it is fitted to (those in `views.train`).
+            config: settings.
+            evaluate: cheap metrics of a mesh.
+        """
+        self.mesh = mesh
+        self._views = views
+        self._config = config
+        self._evaluate = evaluate
+        self._sampler = ViewSampler(views.train, config.seed)
+        self._rates = {
+            "vertices": config.lr_vertices,
+            "colors": config.lr_colors,
+            "opacity_logits": config.lr_opacities,
+            "log_sigma": config.lr_sigma,
+        }
+        self._weights = MeshWeights(
+            edge=config.lambda_edge,
+            normal=config.lambda_normal,
+            laplacian=config.lambda_laplacian,
+            softness=config.lambda_sigma,
+            edge_power=config.edge_power,
+        )
+        self._budgets = face_budgets(
+            config.iterations,
+            steps=config.subdivide_steps,
+            first=config.subdivide_from,
+            last=config.subdivide_until,
+            start_faces=len(mesh.faces),
+            max_faces=config.max_faces,
+        )
+        self.adam = Adam(mesh.parameters(), dict(self._rates))
+
+    @property
+    def faces(self) -> int:
+        """Number of faces."""
+        return len(self.mesh.faces)
+
+    @property
+    def sigma(self) -> float:
+        """Softness."""
+        return float(self.mesh.sigma.detach())
+
+    def step(self, iteration: int) -> float:
+        """One view over one random background, one step of Adam; returns the loss before it."""
+        config, mesh, cameras = self._config, self.mesh, self._views.cameras
+        view = self._sampler.next_view()
+        background = self._sampler.background()
+        rendering = rasterize(
+            mesh.vertices,
+            mesh.colors,
+            mesh.opacities,
+            mesh.sigma,
+            cameras.viewmats[view : view + 1],
+            cameras.Ks[view : view + 1],
+            cameras.width,
+            cameras.height,
+            faces=mesh.faces,
+            kernel=config.kernel,
+            distance=config.distance,
+            backgrounds=background,
+            validate=False,  # the loop checks the loss at every step, and the parameters before each checkpoint
+            engine=config.engine,
+        )
+        gamma = regularization_weight(iteration, config.iterations, config.gamma_hold)
+        target = self._views.images[view : view + 1]
+        loss = mesh_objective(rendering.color, target, background, mesh, self._weights, gamma, engine=config.engine)
+        self.adam.zero_grad()
+        loss.backward()
+        decay = exponential_decay(iteration, config.iterations, config.lr_vertices_final)
+        self.adam.learning_rates["vertices"] = self._rates["vertices"] * decay
+        self.adam.step()
+        return float(loss.detach())
+
+    def refine(self, iteration: int) -> int:
+        """Subdivides the largest faces if it is time to (paper, appendix Adaptive Refinement)."""
+        if iteration not in self._budgets:
+            return 0
+        mesh = self.mesh
+        before = len(mesh.faces)
+        vertices = mesh.vertices.detach()
+        plan = longest_edge_plan(vertices, mesh.topology, face_areas(vertices, mesh.faces), self._budgets[iteration])
+        carried = apply_subdivision(
+            plan, self.adam, per_vertex=TriangleMesh.VERTEX_PARAMETERS, per_face=TriangleMesh.FACE_PARAMETERS
+        )
+        for name, parameter in carried.items():
+            setattr(mesh, name, parameter)
+        mesh.topology = MeshTopology.from_faces(plan.faces, len(mesh.vertices))
+        return len(mesh.faces) - before
+
+    def evaluate(self) -> dict[str, float]:
+        """Cheap metrics of the present state."""
+        return self._evaluate(self.mesh)
+
+    def is_finite(self) -> bool:
+        """Whether no parameter holds NaN or infinity."""
+        return self.mesh.is_finite()
+
+    def state(self, progress: Progress) -> dict[str, Tensor]:
+        """Everything that the rest of the run depends on, by name, for a checkpoint."""
+        state = {"mesh.faces": self.mesh.faces}
+        for name, parameter in self.mesh.parameters().items():
+            state[f"mesh.{name}"] = parameter.detach()
+            state[f"adam.first.{name}"] = self.adam.first_moments[name]
+            state[f"adam.second.{name}"] = self.adam.second_moments[name]
+        state["adam.step_count"] = torch.tensor(self.adam.step_count)
+        state |= {f"sampler.{name}": tensor for name, tensor in self._sampler.state().items()}
+        numbers = [progress.seconds, progress.loss_sum, progress.loss_count]
+        state["progress"] = torch.tensor(numbers, dtype=torch.float64)
+        return state
+
+    def load_state(self, state: dict[str, Tensor], iteration: int) -> Progress:
+        """Continues where `state` was taken; returns where that was."""
+        mesh = self.mesh
+        for name in TriangleMesh.PARAMETERS:
+            parameter = state[f"mesh.{name}"].requires_grad_(True)
+            setattr(mesh, name, parameter)
+            self.adam.replace(name, parameter, state[f"adam.first.{name}"], state[f"adam.second.{name}"])
+        self.adam.step_count = int(state["adam.step_count"])
+        mesh.topology = MeshTopology.from_faces(state["mesh.faces"], len(mesh.vertices))
+        self._sampler.load_state({name: state[f"sampler.{name}"] for name in self._sampler.state()})
+        seconds, loss_sum, loss_count = state["progress"].tolist()
+        return Progress(iteration, seconds, loss_sum, int(loss_count))

@@ -1,0 +1,165 @@
+"""Settings of shape reconstruction: every choice that the result depends on, with its presets."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+from etsplat.core.errors import InputError
+
+Method = Literal["elastic", "bilateral", "single-sided"]
+
+
+@dataclass(frozen=True)
+class ReconstructConfig:
+    """Settings of `etsplat.reconstruct`; the defaults are preset "paper"."""
+
+    preset: str = "paper"
+    """Name of the preset these settings started from; for the record only."""
+    method: Method = "elastic"
+    """Kernel of the triangles: elastic (the paper's), bilateral (2DTS) or single-sided (Triangle Splatting)."""
+    distance: Literal["barycentric", "sdf"] = "barycentric"
+    """How far a pixel is from a triangle: by barycentric coordinates or by signed distance."""
+    seed: int = 0
+    """Of the order of views, the backgrounds, and the points that metrics sample."""
+    engine: Literal["cpu", "reference"] | None = None
+    """What computes: cpu, reference (plain PyTorch, slow), or None for the fastest there is."""
+
+    resolution: int = 1024
+    """Side of the pictures taken of a mesh; images of a scene are scaled down to this width if they are wider. Pixels."""
+    supersampling: int = 4
+    """Pictures of a mesh average this many samples squared per pixel."""
+    iterations: int = 30_000
+    """Optimization steps; each sees one view."""
+
+    start_level: int = 4
+    """The start is a sphere of 20 * 4^level faces."""
+    start_radius: float = 1.05
+    """Radius of that sphere, as a multiple of the radius of a sphere around the object."""
+    start_color: float = 0.5
+    """Grey of all faces at the start."""
+    start_opacity: float = 0.9
+    """Opacity of all faces at the start."""
+    start_sigma: float = 1.0
+    """Softness at the start; small is sharp."""
+
+    lr_vertices: float = 2e-3
+    """Adam learning rate of positions, in units of the object's radius."""
+    lr_vertices_final: float = 0.02
+    """Ratio of that rate's last value to its first; it falls exponentially."""
+    lr_colors: float = 1e-2
+    """Adam learning rate of colours."""
+    lr_opacities: float = 2e-2
+    """Adam learning rate of opacities, before their sigmoid."""
+    lr_sigma: float = 1e-3
+    """Adam learning rate of the logarithm of sigma."""
+
+    lambda_edge: float = 1.5
+    """Weight of the mean edge length."""
+    lambda_normal: float = 0.01
+    """Weight of the angle between neighbouring faces."""
+    lambda_laplacian: float = 0.5
+    """Weight of the distance of vertices from the mean of their neighbours."""
+    lambda_sigma: float = 1e-4
+    """Weight of sigma^-2; the paper uses 1e-3 and 1e-4."""
+    edge_power: Literal[1, 2] = 1
+    """1: mean edge length, as the paper prints it; 2: mean squared length."""
+    gamma_hold: int = 500
+    """The weights above are multiplied by a cosine that falls from 1 at this iteration to 0 at the last."""
+
+    max_faces: int = 100_000
+    """Subdivision stops here."""
+    subdivide_from: float = 0.1
+    """First subdivision, as a fraction of the iterations."""
+    subdivide_until: float = 0.6
+    """Last subdivision, as a fraction of the iterations."""
+    subdivide_steps: int = 30
+    """Number of subdivisions between these two; each adds the same fraction of faces, so that the last reaches
+    `max_faces`."""
+
+    log_every: int = 50
+    """Iterations between lines of history.jsonl."""
+    evaluate_every: int = 1000
+    """Iterations between evaluations for history.jsonl; 0 for one at the end only."""
+    checkpoint_every: int = 1000
+    """Iterations between checkpoints; 0 for one at the end only."""
+    chamfer_samples: int = 100_000
+    """Points per surface for the Chamfer distance."""
+    lpips_weights: Path | None = None
+    """Weights file for LPIPS; None looks where they usually are and goes without."""
+
+    def __post_init__(self) -> None:
+        _check_choice(self, "method", ("elastic", "bilateral", "single-sided"))
+        _check_choice(self, "distance", ("barycentric", "sdf"))
+        _check_choice(self, "engine", (None, "cpu", "reference"))
+        _check_choice(self, "edge_power", (1, 2))
+        for name in ("resolution", "supersampling", "iterations", "log_every", "chamfer_samples", "max_faces"):
+            _check_range(self, name, 1)
+        for name in ("start_level", "gamma_hold", "subdivide_steps", "evaluate_every", "checkpoint_every", "seed"):
+            _check_range(self, name, 0)
+        for name in ("lr_vertices", "lr_colors", "lr_opacities", "lr_sigma"):
+            _check_range(self, name, 0.0)
+        for name in ("lambda_edge", "lambda_normal", "lambda_laplacian", "lambda_sigma"):
+            _check_range(self, name, 0.0)
+        for name in ("subdivide_from", "subdivide_until", "start_color"):
+            _check_range(self, name, 0.0, 1.0)
+        for name in ("start_radius", "start_sigma", "lr_vertices_final"):
+            _check_range(self, name, 1e-6)
+        _check_range(self, "start_opacity", 0.01, 0.999)
+        if self.subdivide_from > self.subdivide_until:
+            raise InputError("subdivide_from: is after subdivide_until; make it smaller")
+
+    @property
+    def kernel(self) -> str:
+        """The rasterizer's name of the method."""
+        return self.method.replace("-", "_")
+
+
+def _check_choice(config: ReconstructConfig, name: str, choices: tuple[object, ...]) -> None:
+    value = getattr(config, name)
+    if value not in choices:
+        raise InputError(f"{name}: is {value!r}; choose one of {', '.join(str(choice) for choice in choices)}")
+
+
+def _check_range(config: ReconstructConfig, name: str, low: float, high: float = float("inf")) -> None:
+    value = getattr(config, name)
+    if not low <= value <= high or value == float("inf"):
+        bound = f"at least {low}" if high == float("inf") else f"between {low} and {high}"
+        raise InputError(f"{name}: is {value}; it must be {bound}")
+
+
+_PAPER = ReconstructConfig()
+_QUICK = replace(
+    _PAPER,
+    preset="quick",
+    resolution=320,
+    iterations=2000,
+    gamma_hold=50,
+    max_faces=20_000,
+    lr_vertices=5e-3,
+    subdivide_steps=10,
+    evaluate_every=200,
+    checkpoint_every=500,
+)
+
+PRESETS: dict[str, ReconstructConfig] = {
+    "paper": _PAPER,
+    "quick": _QUICK,
+    "demo": replace(_QUICK, preset="demo"),
+    "tiny": replace(
+        _QUICK,
+        preset="tiny",
+        resolution=64,
+        supersampling=2,
+        iterations=200,
+        start_level=2,
+        gamma_hold=20,
+        max_faces=1000,
+        lr_vertices=2e-2,
+        subdivide_steps=4,
+        log_every=20,
+        evaluate_every=100,
+        checkpoint_every=50,
+        chamfer_samples=20_000,
+    ),
+}
+"""paper: the paper's setting. quick: about a minute on four cores. demo: `etsplat demo`. tiny: seconds, for tests."""

@@ -1,0 +1,135 @@
+"""Which folders may hold a run, and that its files survive kills."""
+
+import errno
+import json
+import os
+from pathlib import Path
+
+import pytest
+
+from etsplat.core.errors import InputError
+from etsplat.io.run_directory import RunDirectory, is_run
+
+CONFIG = {"task": "reconstruct", "config": {"seed": 0, "method": "elastic"}, "source": {"fingerprint": "abc"}}
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def assert_one_line(error: pytest.ExceptionInfo[InputError], *words: str) -> None:
+    message = str(error.value)
+    assert "\n" not in message
+    assert all(word in message for word in words), message
+
+
+def test_a_new_folder_is_made_with_its_parents_and_explains_itself(tmp_path: Path) -> None:
+    """A run creates its folder, config.json and a README.txt that names every other file of the layout."""
+    run = RunDirectory.create(tmp_path / "a" / "b", CONFIG)
+    assert is_run(run.path)
+    assert run.read_config()["config"] == CONFIG["config"]
+    readme = (run.path / "README.txt").read_text()
+    for name in ("report.html", "mesh.ply", "metrics.json", "history.jsonl", "checkpoints", "--resume"):
+        assert name in readme
+
+
+def test_an_empty_folder_is_used(tmp_path: Path) -> None:
+    """An existing empty folder becomes the run's."""
+    assert RunDirectory.create(tmp_path, CONFIG).config_path.exists()
+
+
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_a_folder_with_other_things_is_refused_and_left_alone(tmp_path: Path, overwrite: bool) -> None:
+    """A folder that holds files of somebody else is never written to, not even with overwrite."""
+    (tmp_path / "thesis.tex").write_text("years of work")
+    before = contents(tmp_path)
+    with pytest.raises(InputError) as error:
+        RunDirectory.create(tmp_path, CONFIG, overwrite=overwrite)
+    assert_one_line(error, str(tmp_path), "not a run", "choose")
+    assert contents(tmp_path) == before
+
+
+def test_a_folder_with_a_run_is_refused_and_left_alone(tmp_path: Path) -> None:
+    """An earlier run is kept unless it is to be overwritten."""
+    RunDirectory.create(tmp_path, CONFIG).write_metrics({"psnr": 40.0})
+    before = contents(tmp_path)
+    with pytest.raises(InputError) as error:
+        RunDirectory.create(tmp_path, CONFIG)
+    assert_one_line(error, "--resume", "--overwrite")
+    assert contents(tmp_path) == before
+
+
+def test_overwrite_removes_what_a_run_writes_and_nothing_else(tmp_path: Path) -> None:
+    """Replacing a run deletes its results; a file that somebody put beside them stays."""
+    run = RunDirectory.create(tmp_path, CONFIG)
+    run.write_metrics({"psnr": 40.0})
+    (run.checkpoints / "step_000001.safetensors").write_text("old")
+    (tmp_path / "notes.txt").write_text("mine")
+    RunDirectory.create(tmp_path, {**CONFIG, "config": {"seed": 1}}, overwrite=True)
+    assert run.read_config()["config"] == {"seed": 1}
+    assert not run.metrics_path.exists()
+    assert list(run.checkpoints.iterdir()) == []
+    assert (tmp_path / "notes.txt").read_text() == "mine"
+
+
+def test_a_file_in_the_way_is_named(tmp_path: Path) -> None:
+    """An output path that is a file, or lies below one, is an error of one line."""
+    (tmp_path / "file").write_text("")
+    for path in (tmp_path / "file", tmp_path / "file" / "run"):
+        with pytest.raises(InputError) as error:
+            RunDirectory.check_free(path)
+        assert_one_line(error, str(path), "is a file")
+
+
+@pytest.mark.parametrize("code", [errno.EROFS, errno.EACCES, errno.ENOSPC])
+def test_a_folder_that_cannot_be_written_to_is_named(
+    tmp_path: Path, code: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Read-only, forbidden and full: one line with the system's reason. (Simulated: tests may run as root.)"""
+
+    def refuse(*_: object, **__: object) -> int:
+        raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr(os, "open", refuse)
+    with pytest.raises(InputError) as error:
+        RunDirectory.check_free(tmp_path / "run")
+    assert_one_line(error, str(tmp_path / "run"), os.strerror(code))
+
+
+def test_resume_wants_a_run(tmp_path: Path) -> None:
+    """Resuming a folder that does not exist or holds no run is an error that says to start it."""
+    with pytest.raises(InputError) as error:
+        RunDirectory.resume(tmp_path / "run", CONFIG)
+    assert_one_line(error, "no run to resume", "without --resume")
+
+
+def test_resume_wants_the_same_settings_and_input(tmp_path: Path) -> None:
+    """A resume with another seed or another input names what differs; the same ones are accepted."""
+    RunDirectory.create(tmp_path, CONFIG)
+    RunDirectory.resume(tmp_path, CONFIG)
+    with pytest.raises(InputError) as error:
+        RunDirectory.resume(tmp_path, {**CONFIG, "config": {"seed": 7, "method": "elastic"}})
+    assert_one_line(error, "seed=0 (not 7)")
+    with pytest.raises(InputError) as error:
+        RunDirectory.resume(tmp_path, {**CONFIG, "source": {"fingerprint": "xyz"}})
+    assert_one_line(error, "fingerprint=abc (not xyz)")
+
+
+def test_history_survives_a_kill_in_the_middle_of_a_line(tmp_path: Path) -> None:
+    """A half-written last line is ignored when reading and gone after a resume."""
+    run = RunDirectory.create(tmp_path, CONFIG)
+    for iteration in (50, 100, 150):
+        run.append_history({"iteration": iteration, "loss": 1.0 / iteration})
+    with open(run.history_path, "a") as file:
+        file.write('{"iteration": 200, "lo')
+    assert [line["iteration"] for line in run.read_history()] == [50, 100, 150]
+    run.truncate_history(100)
+    run.append_history({"iteration": 150, "loss": 0.5})
+    assert [json.loads(line)["iteration"] for line in run.history_path.read_text().splitlines()] == [50, 100, 150]
+
+
+def test_metrics_are_valid_json_whatever_they_are(tmp_path: Path) -> None:
+    """An infinite PSNR becomes null, which JSON has; infinity it has not."""
+    run = RunDirectory.create(tmp_path, CONFIG)
+    run.write_metrics({"psnr": float("inf"), "chamfer": 1e-3})
+    assert run.read_metrics() == {"psnr": None, "chamfer": 1e-3}
