@@ -29,12 +29,20 @@ mesh.obj        the same with vertex colours (also mesh.glb, which most viewers 
 metrics.json    how good it is; docs/conventions.md of etsplat says how each number is measured
 test/           held-out views: NNN_render.png (splatted), NNN_truth.png, NNN_mesh.png (the mesh drawn opaque)
 history.jsonl   one line per log step: iteration, seconds of optimisation, loss, faces, sigma, and what was evaluated
-convergence.png the same as curves
+convergence.png how loss, quality and the number of faces went; overview.png shows test views
 config.json     the settings that made it
 checkpoints/    where an interrupted run continues with --resume; safe to delete once the run is done
 """
 
-_FILES = ("metrics.json", "history.jsonl", "convergence.png", "report.html", "README.txt", "config.json")
+_FILES = (
+    "metrics.json",
+    "history.jsonl",
+    "convergence.png",
+    "overview.png",
+    "report.html",
+    "README.txt",
+    "config.json",
+)
 _FOLDERS = ("test", "checkpoints")
 
 

@@ -1,0 +1,147 @@
+"""Convergence curves: which quantities are shown and how, thinned for display; drawn as inline SVG."""
+
+import math
+from dataclasses import dataclass
+from html import escape
+
+from etsplat.report.data import Run
+
+MAX_POINTS = 400
+"""Longer series are shown as this many bucket means with the range of each bucket behind."""
+
+WIDTH, HEIGHT = 400, 200
+LEFT, RIGHT, TOP, BOTTOM = 46, 12, 10, 24
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A history key, its title, whether its axis is logarithmic, and the metric that is its lower bound, if any."""
+
+    key: str
+    title: str
+    logarithmic: bool
+    floor_key: str | None = None
+
+
+QUANTITIES = (
+    Quantity("loss", "Training loss", True),
+    Quantity("psnr", "PSNR of test views, dB", False),
+    Quantity("chamfer", "Chamfer distance", True, floor_key="chamfer_floor"),
+    Quantity("sigma", "Softness σ", True),
+    Quantity("faces", "Faces", False),
+)
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A thinned series, ready to draw: means, and the lowest and highest value in each bucket."""
+
+    quantity: Quantity
+    x: list[float]
+    mean: list[float]
+    low: list[float]
+    high: list[float]
+    floor: float | None
+
+    @property
+    def logarithmic(self) -> bool:
+        """A logarithmic axis where asked for and possible."""
+        return self.quantity.logarithmic and min(self.low) > 0
+
+
+def curves_of(run: Run) -> list[Curve]:
+    """The curves that the run's history has at least two points of."""
+    curves = []
+    for quantity in QUANTITIES:
+        x, y = run.series(quantity.key)
+        if len(x) >= 2:
+            floor = run.metrics.get(quantity.floor_key) if quantity.floor_key else None
+            curves.append(Curve(quantity, *_thin(x, y), floor=floor))
+    return curves
+
+
+def draw_svg(curve: Curve) -> str:
+    """One chart as an SVG element, coloured by the page's style sheet."""
+    values = curve.low + curve.high + ([curve.floor] if curve.floor else [])
+    ticks = log_ticks(min(values), max(values)) if curve.logarithmic else linear_ticks(min(values), max(values))
+    warp = math.log10 if curve.logarithmic else float
+    bottom, top = warp(min(*values, *ticks)), warp(max(*values, *ticks))
+    start, end = curve.x[0], curve.x[-1]
+
+    def px(x: float) -> float:
+        return LEFT + (WIDTH - LEFT - RIGHT) * (x - start) / (end - start)
+
+    def py(y: float) -> float:
+        return TOP + (HEIGHT - TOP - BOTTOM) * (1 - (warp(y) - bottom) / ((top - bottom) or 1))
+
+    parts = []
+    for tick in ticks:
+        y = py(tick)
+        parts.append(f'<line class="grid" x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{y:.1f}" y2="{y:.1f}"/>')
+        parts.append(f'<text x="{LEFT - 6}" y="{y + 4:.1f}" text-anchor="end">{short_number(tick)}</text>')
+    for tick in linear_ticks(start, end, 4):
+        if start <= tick <= end:
+            parts.append(f'<text x="{px(tick):.1f}" y="{HEIGHT - 6}" text-anchor="middle">{short_number(tick)}</text>')
+    if curve.floor:
+        y = py(curve.floor)
+        parts.append(f'<line class="floor" x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{y:.1f}" y2="{y:.1f}"/>')
+        parts.append(
+            f'<text class="floor-name" x="{WIDTH - RIGHT}" y="{y - 5:.1f}" text-anchor="end">sampling floor</text>'
+        )
+    upper = [(px(x), py(y)) for x, y in zip(curve.x, curve.high, strict=True)]
+    lower = [(px(x), py(y)) for x, y in zip(curve.x, curve.low, strict=True)]
+    parts.append(f'<path class="band" d="{_path(upper + lower[::-1])}Z"/>')
+    line = [(px(x), py(y)) for x, y in zip(curve.x, curve.mean, strict=True)]
+    parts.append(f'<path class="line" d="{_path(line)}"/>')
+    label = escape(f"{curve.quantity.title}: from {short_number(curve.mean[0])} to {short_number(curve.mean[-1])}")
+    return f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{label}">{"".join(parts)}</svg>'
+
+
+def linear_ticks(low: float, high: float, count: int = 5) -> list[float]:
+    """Round values, about `count`, that cover [low, high]."""
+    span = (high - low) or abs(high) or 1.0
+    raw = span / max(count - 1, 1)
+    unit = 10.0 ** math.floor(math.log10(raw))
+    step = next(factor * unit for factor in (1, 2, 2.5, 5, 10) if factor * unit >= raw * (1 - 1e-9))
+    first, last = math.floor(low / step + 1e-9), math.ceil(high / step - 1e-9)
+    return [round(k * step, 12) for k in range(first, last + 1)]
+
+
+def log_ticks(low: float, high: float) -> list[float]:
+    """1, 2, 5 times powers of ten inside [low, high], thinned to at most six; its ends if there are fewer than two."""
+    decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
+    for factors in ((1, 2, 5), (1, 3), (1,)):
+        ticks = [f * 10.0**d for d in decades for f in factors if low <= f * 10.0**d <= high]
+        if len(ticks) <= 6:
+            break
+    return ticks if len(ticks) >= 2 else [low, high]
+
+
+def short_number(value: float) -> str:
+    """At most three significant digits, thousands as k, small ones as powers of ten."""
+    if value == 0:
+        return "0"
+    if abs(value) >= 1e6:
+        return f"{value / 1e6:.3g}M"
+    if abs(value) >= 1e4 or (abs(value) >= 1000 and value % 100 == 0):
+        return f"{value / 1e3:.3g}k"
+    if abs(value) >= 100:
+        return f"{value:.0f}"
+    if abs(value) >= 1e-3:
+        return f"{value:.3g}"
+    return f"{value:.1e}".replace(".0e", "e").replace("e-0", "e-")
+
+
+def _thin(x: list[float], y: list[float]) -> tuple[list[float], list[float], list[float], list[float]]:
+    size = max(1, math.ceil(len(x) / MAX_POINTS))
+    buckets = [slice(start, start + size) for start in range(0, len(x), size)]
+    return (
+        [x[b][-1] for b in buckets],
+        [sum(y[b]) / len(y[b]) for b in buckets],
+        [min(y[b]) for b in buckets],
+        [max(y[b]) for b in buckets],
+    )
+
+
+def _path(points: list[tuple[float, float]]) -> str:
+    return "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in points)

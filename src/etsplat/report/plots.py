@@ -1,0 +1,81 @@
+"""Pictures of a run: convergence.png and overview.png."""
+
+from pathlib import Path
+
+from matplotlib.figure import Figure
+from matplotlib.ticker import NullLocator
+from PIL import Image, ImageDraw, ImageFont
+
+from etsplat.io.atomic import atomic_write
+from etsplat.report.curves import curves_of, log_ticks, short_number
+from etsplat.report.data import Run, TestView
+
+OVERVIEW_VIEWS = 4
+TILE = 360
+CAPTION = 34
+GAP = 4
+
+
+def plot_convergence(run: Run, path: Path) -> None:
+    """Draw the run's curves as one PNG."""
+    curves = curves_of(run)
+    columns = min(3, len(curves)) or 1
+    rows = -(-len(curves) // columns) or 1
+    figure = Figure(figsize=(4.2 * columns, 3.1 * rows), layout="constrained")
+    for index, curve in enumerate(curves):
+        axes = figure.add_subplot(rows, columns, index + 1)
+        axes.fill_between(curve.x, curve.low, curve.high, color="#2060a8", alpha=0.18, linewidth=0)
+        axes.plot(curve.x, curve.mean, color="#2060a8", linewidth=1.6)
+        if curve.floor:
+            axes.axhline(curve.floor, color="#a4502a", linestyle="--", linewidth=1.1, label="sampling floor")
+            axes.legend(frameon=False, fontsize=8)
+        axes.set_title(curve.quantity.title, fontsize=10, loc="left")
+        axes.set_xlabel("iteration", fontsize=9)
+        if curve.logarithmic:
+            axes.set_yscale("log")
+            axes.yaxis.set_minor_locator(NullLocator())
+            axes.set_yticks(log_ticks(*axes.get_ylim()))
+        axes.yaxis.set_major_formatter(lambda value, _: short_number(value))
+        axes.grid(color="#e4e6e8", linewidth=0.8)
+        axes.tick_params(labelsize=8, colors="#5b6570")
+        axes.spines[["top", "right"]].set_visible(False)
+    if not curves:
+        figure.text(0.5, 0.5, "no history", ha="center", va="center")
+    with atomic_write(path) as temporary:
+        figure.savefig(temporary, dpi=130)
+
+
+def draw_overview(run: Run, path: Path) -> None:
+    """Draw the contact sheet: a column for each of up to four test views; rows truth, render, mesh."""
+    views = spread(run.views, OVERVIEW_VIEWS)
+    if not views:
+        return
+    rows = ("truth", "render", "mesh")
+    width = CAPTION + len(views) * (TILE + GAP)
+    sheet = Image.new("RGB", (width, CAPTION // 3 + len(rows) * (TILE + GAP)), "#14171a")
+    font = ImageFont.load_default(size=17)
+    for row, kind in enumerate(rows):
+        top = CAPTION // 3 + row * (TILE + GAP)
+        label = Image.new("RGB", (TILE, CAPTION), "#14171a")
+        ImageDraw.Draw(label).text((TILE / 2, CAPTION / 2), kind, fill="#c6ccd2", font=font, anchor="mm")
+        sheet.paste(label.transpose(Image.Transpose.ROTATE_90), (0, top))
+        for column, view in enumerate(views):
+            tile = _tile(getattr(view, kind))
+            left = CAPTION + column * (TILE + GAP)
+            sheet.paste(tile, (left + (TILE - tile.width) // 2, top + (TILE - tile.height) // 2))
+    with atomic_write(path) as temporary:
+        sheet.save(temporary)
+
+
+def spread(views: list[TestView], count: int) -> list[TestView]:
+    """At most `count` of the views, evenly spaced, the first one among them."""
+    step = max(1.0, len(views) / count)
+    return [views[int(index * step)] for index in range(min(count, len(views)))]
+
+
+def _tile(path: Path) -> Image.Image:
+    with Image.open(path) as image:
+        image = image.convert("RGB")
+    scale = TILE / max(image.size)
+    size = (max(1, round(image.width * scale)), max(1, round(image.height * scale)))
+    return image.resize(size, Image.Resampling.LANCZOS if scale < 1 else Image.Resampling.NEAREST)

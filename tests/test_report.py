@@ -1,0 +1,208 @@
+"""The report: a page and pictures made from the files of a run alone."""
+
+import json
+import math
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from etsplat.core.errors import InputError
+from etsplat.geometry.icosphere import icosphere
+from etsplat.io.mesh_files import save_mesh
+from etsplat.io.run_directory import RunDirectory
+from etsplat.report import write_report
+from etsplat.report.curves import MAX_POINTS, Curve, curves_of, draw_svg, linear_ticks, log_ticks, short_number
+from etsplat.report.data import read_run
+
+METRICS = {
+    "chamfer": 6.4e-5,
+    "chamfer_floor": 5.1e-5,
+    "chamfer_exact": 9.0e-6,
+    "f_score": 0.987,
+    "psnr": 38.21,
+    "psnr_mesh": 37.5,
+    "ssim": 0.9912,
+    "lpips": None,
+    "lpips_reason": "no weights: give --lpips-weights FILE",
+    "faces": 5120,
+    "vertices": 2562,
+    "degenerate_faces": 0,
+    "self_intersections": 3,
+    "iterations": 3000,
+    "seconds": 61.7,
+    "seconds_per_iteration": 0.0206,
+    "engine": "cpu",
+    "method": "elastic",
+    "preset": "quick",
+    "seed": 0,
+    "versions": {"etsplat": "0.1.0", "torch": "2.13.0"},
+}
+
+
+def write_run(folder: Path, views: int = 3, steps: int = 300) -> Path:
+    """A finished run of `steps` log lines: a bumpy sphere, and disks for its pictures."""
+    config = {"task": "reconstruct", "source": {"path": "meshes/bunny <&> co.ply"}, "config": {"iterations": 3000}}
+    run = RunDirectory.create(folder, config)
+    run.write_metrics(METRICS)
+    for step in range(1, steps + 1):
+        decay = math.exp(-4 * step / steps)
+        line = {"iteration": 10 * step, "seconds": 0.2 * step, "loss": 0.01 + 0.2 * decay * (1 + 0.1 * math.sin(step))}
+        line |= {"faces": 1280 * 4 ** (3 * step // (steps + 1)), "sigma": 0.05 + decay}
+        if step % 20 == 0:
+            line |= {"psnr": 38 - 20 * decay, "chamfer": 6e-5 + 0.1 * decay**2}
+        run.append_history(line)
+    vertices, faces = icosphere(4)
+    vertices = vertices * (1 + 0.15 * torch.sin(6 * vertices[:, :1]) * torch.cos(5 * vertices[:, 1:2]))
+    colors = 0.5 + 0.5 * vertices[faces].mean(dim=1).clamp(-1, 1)
+    save_mesh(run.mesh_path(".ply"), vertices, faces, colors)
+    for view in range(views):
+        for kind, radius in (("truth", 0.8), ("render", 0.79), ("mesh", 0.78)):
+            _disk(radius, view).save(run.test / f"{5 * view + 2:03d}_{kind}.png")
+    return folder
+
+
+def _disk(radius: float, view: int, size: int = 256) -> Image.Image:
+    y, x = (np.mgrid[0:size, 0:size] + 0.5) / (size / 2) - 1
+    z = np.sqrt(np.maximum(radius**2 - x**2 - y**2, 0)) / radius
+    light = z * (0.6 + 0.4 * np.cos(3 * x + view))
+    return Image.fromarray(np.uint8(255 * np.clip(light[..., None] * [1, 0.95, 0.9], 0, 1)))
+
+
+@pytest.fixture
+def run_dir(tmp_path: Path) -> Path:
+    return write_run(tmp_path / "run")
+
+
+class References(HTMLParser):
+    """Collects what a page would load or link to, and checks that tags are closed."""
+
+    VOID = ("meta", "img", "input")
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: list[str] = []
+        self.open: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.found += [value or "" for name, value in attrs if name in ("src", "href", "data-render", "data-mesh")]
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        """`<line ... />` of an SVG closes itself."""
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+
+def test_page_needs_no_network(run_dir: Path) -> None:
+    """Everything the page shows is inside it: no address but data URLs, no import, no fetch."""
+    page = write_report(run_dir).read_text(encoding="utf-8")
+    parser = References()
+    parser.feed(page)
+    assert parser.open == []
+    assert len(parser.found) == 3 * 4
+    assert all(reference.startswith("data:image/png;base64,") for reference in parser.found)
+    assert not re.search(r"https?://|@import|url\(|fetch\(|XMLHttpRequest", page)
+
+
+def test_page_says_what_the_run_says(run_dir: Path) -> None:
+    """Metrics with their floor, the reason for a missing one, and the input's name are on the page, escaped."""
+    page = write_report(run_dir).read_text(encoding="utf-8")
+    for text in (
+        "38.21",
+        "0.0640",
+        "about 0.0510",
+        "98.7",
+        "3 self-intersecting faces",
+        "no weights: give --lpips-weights",
+    ):
+        assert text in page
+    assert "bunny &lt;&amp;&gt; co" in page
+    assert "bunny <&> co" not in page
+
+
+def test_pictures_are_written(run_dir: Path) -> None:
+    """convergence.png and overview.png are there beside the page and can be read."""
+    write_report(run_dir)
+    for name in ("convergence.png", "overview.png"):
+        with Image.open(run_dir / name) as image:
+            assert min(image.size) > 200
+
+
+def test_report_of_sparse_run(tmp_path: Path) -> None:
+    """A run without test views, ground truth or history still gets its page, which says what is missing."""
+    run_dir = write_run(tmp_path / "run", views=0, steps=0)
+    absent = dict.fromkeys(("chamfer", "chamfer_floor", "chamfer_exact", "f_score", "psnr", "psnr_mesh", "ssim"))
+    (run_dir / "metrics.json").write_text(json.dumps(METRICS | absent))
+    page = write_report(run_dir).read_text(encoding="utf-8")
+    assert "no ground-truth mesh" in page
+    assert 'id="views"' not in page
+
+
+def test_report_again_replaces(run_dir: Path) -> None:
+    """Writing the report twice gives the same page and leaves no temporary file."""
+    first = write_report(run_dir).read_bytes()
+    names = sorted(path.name for path in run_dir.iterdir())
+    assert write_report(run_dir).read_bytes() == first
+    assert sorted(path.name for path in run_dir.iterdir()) == names
+
+
+def test_unfinished_or_foreign_folder_is_an_input_error(tmp_path: Path, run_dir: Path) -> None:
+    """A folder that is no run, and a run without metrics, are refused in one line that says what to do."""
+    with pytest.raises(InputError, match="is not a run of etsplat"):
+        write_report(tmp_path)
+    (run_dir / "metrics.json").unlink()
+    with pytest.raises(InputError, match="has not finished; continue it with --resume"):
+        write_report(run_dir)
+
+
+def test_long_history_is_thinned(tmp_path: Path) -> None:
+    """A curve keeps at most MAX_POINTS points, ends at the last iteration, and its band holds every value."""
+    run = read_run(write_run(tmp_path / "run", views=0, steps=2000))
+    loss = next(curve for curve in curves_of(run) if curve.quantity.key == "loss")
+    assert len(loss.x) <= MAX_POINTS
+    assert loss.x[-1] == 20000
+    _, values = run.series("loss")
+    assert (min(loss.low), max(loss.high)) == (min(values), max(values))
+
+
+@pytest.mark.parametrize("key", ["loss", "psnr", "chamfer", "sigma", "faces"])
+def test_curve_stays_inside_its_chart(run_dir: Path, key: str) -> None:
+    """All points of the drawn line lie inside the SVG's view box."""
+    curve: Curve = next(curve for curve in curves_of(read_run(run_dir)) if curve.quantity.key == key)
+    line = re.search(r'class="line" d="M([^"]+)"', draw_svg(curve))
+    assert line
+    points = [tuple(map(float, point.split())) for point in line[1].split("L")]
+    assert all(0 <= x <= 400 and 0 <= y <= 200 for x, y in points)
+
+
+def test_ticks_are_round_and_cover() -> None:
+    """Linear ticks are round and enclose the range; logarithmic ones lie inside it."""
+    assert linear_ticks(0, 97, 5) == [0, 25, 50, 75, 100]
+    assert linear_ticks(3, 3)[0] <= 3 <= linear_ticks(3, 3)[-1]
+    assert log_ticks(0.011, 0.9) == [0.02, 0.05, 0.1, 0.2, 0.5]
+    assert log_ticks(2.1, 2.9) == [2.1, 2.9]
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (0, "0"),
+        (20480, "20.5k"),
+        (3000, "3k"),
+        (1280, "1280"),
+        (0.05, "0.05"),
+        (6e-5, "6e-5"),
+        (2e6, "2M"),
+        (-31.6, "-31.6"),
+    ],
+)
+def test_short_number(value: float, text: str) -> None:
+    """Numbers on axes are short."""
+    assert short_number(value) == text
