@@ -25,7 +25,7 @@ class ReconstructConfig:
     """What computes: cpu, reference (plain PyTorch, slow), or None for the fastest there is."""
 
     resolution: int = 1024
-    """Side of the pictures taken of a mesh; images of a scene are scaled down to this width if they are wider. Pixels."""
+    """Side of the pictures taken of a mesh, in pixels; wider images of a scene are scaled down to this width."""
     supersampling: int = 4
     """Pictures of a mesh average this many samples squared per pixel."""
     iterations: int = 30_000

@@ -1,0 +1,142 @@
+"""The loop: which events come when, what stops it, and that it stops only between iterations."""
+
+import signal
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from etsplat.optim.loop import (
+    CheckpointEvent,
+    DivergedError,
+    DoneEvent,
+    EvaluateEvent,
+    Event,
+    LoopSettings,
+    Progress,
+    RefineEvent,
+    StepEvent,
+    optimize,
+)
+
+SETTINGS = LoopSettings(iterations=10, log_every=4, evaluate_every=5, checkpoint_every=6)
+
+
+class Counting:
+    """A problem whose loss is the iteration; it refines at iteration 3."""
+
+    def __init__(self) -> None:
+        self.faces = 20
+        self.sigma = 1.0
+        self.done: list[str] = []
+        self.finite = True
+        self.on_step: Callable[[int], float] = float
+
+    def step(self, iteration: int) -> float:
+        self.done.append(f"step {iteration}")
+        return self.on_step(iteration)
+
+    def refine(self, iteration: int) -> int:
+        self.done.append(f"refine {iteration}")
+        added = 10 if iteration == 3 else 0
+        self.faces += added
+        return added
+
+    def evaluate(self) -> dict[str, float]:
+        return {"psnr": 30.0}
+
+    def is_finite(self) -> bool:
+        return self.finite
+
+
+def events_of(problem: Counting, folder: Path, progress: Progress | None = None) -> list[Event]:
+    return list(optimize(problem, SETTINGS, progress or Progress(), lambda _: folder / "file", folder))
+
+
+def test_events_come_when_the_settings_say(tmp_path: Path) -> None:
+    """Logs at 4, 8; evaluations at 5 and the end, logged too; a refinement at 3; checkpoints at 6 and the end."""
+    events = events_of(Counting(), tmp_path)
+    at = {kind: [e.iteration for e in events if isinstance(e, kind)] for kind in {type(e) for e in events}}
+    assert at == {
+        StepEvent: [4, 5, 8, 10],
+        EvaluateEvent: [5, 10],
+        RefineEvent: [3],
+        CheckpointEvent: [6, 10],
+        DoneEvent: [10],
+    }
+    assert isinstance(events[-1], DoneEvent)
+
+
+def test_the_logged_loss_is_the_mean_since_the_last_log(tmp_path: Path) -> None:
+    """With loss = iteration: mean of 1..4, of 5, of 6..8, of 9..10."""
+    steps = [event for event in events_of(Counting(), tmp_path) if isinstance(event, StepEvent)]
+    assert [event.loss for event in steps] == [2.5, 5.0, 7.0, 9.5]
+    assert [event.faces for event in steps] == [30] * 4
+    assert [event.metrics for event in steps] == [{}, {"psnr": 30.0}, {}, {"psnr": 30.0}]
+
+
+def test_a_continued_loop_yields_the_rest(tmp_path: Path) -> None:
+    """From the progress saved at iteration 6 on, losses and events are those of the whole run."""
+    whole = [e for e in events_of(Counting(), tmp_path) if isinstance(e, StepEvent)]
+    rest = [e for e in events_of(Counting(), tmp_path, Progress(6, 1.0, 6.0, 1)) if isinstance(e, StepEvent)]
+    assert [(e.iteration, e.loss) for e in rest] == [(e.iteration, e.loss) for e in whole[2:]]
+    assert rest[0].seconds > 1.0
+
+
+@pytest.mark.parametrize("loss", [float("nan"), float("inf")])
+def test_a_loss_that_is_not_finite_stops_the_run(tmp_path: Path, loss: float) -> None:
+    """The error is one line with the iteration and the last good checkpoint."""
+    (tmp_path / "step_000006.safetensors").touch()
+    problem = Counting()
+    problem.on_step = lambda iteration: loss if iteration == 7 else 1.0
+    with pytest.raises(DivergedError) as error:
+        events_of(problem, tmp_path)
+    assert "\n" not in str(error.value)
+    assert "iteration 7" in str(error.value)
+    assert "step_000006.safetensors" in str(error.value)
+
+
+def test_a_parameter_that_is_not_finite_never_reaches_a_checkpoint(tmp_path: Path) -> None:
+    """Parameters are looked at before a log or a checkpoint; without an earlier checkpoint the error says so."""
+    problem = Counting()
+    problem.finite = False
+    saved: list[int] = []
+    with pytest.raises(DivergedError, match=r"iteration 4; no checkpoint"):
+        for _ in optimize(problem, SETTINGS, Progress(), lambda p: saved.append(p.iteration) or tmp_path, tmp_path):
+            pass
+    assert saved == []
+
+
+def test_ctrl_c_finishes_the_iteration_and_leaves_a_checkpoint(tmp_path: Path) -> None:
+    """An interrupt in the middle of step 2 ends after refine 2, with a checkpoint of iteration 2."""
+    problem = Counting()
+
+    def press(iteration: int) -> float:
+        if iteration == 2:
+            signal.raise_signal(signal.SIGINT)
+        return 1.0
+
+    problem.on_step = press
+    saved: list[int] = []
+    before = signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt):
+        for _ in optimize(problem, SETTINGS, Progress(), lambda p: saved.append(p.iteration) or tmp_path, tmp_path):
+            pass
+    assert problem.done[-1] == "refine 2"
+    assert saved == [2]
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_ctrl_c_during_the_last_iteration_is_not_lost(tmp_path: Path) -> None:
+    """An interrupt in a callback after the last step still raises, after the last checkpoint."""
+    seen: list[Event] = []
+
+    def watch() -> None:
+        for event in optimize(Counting(), SETTINGS, Progress(), lambda _: tmp_path, tmp_path):
+            seen.append(event)
+            if isinstance(event, CheckpointEvent) and event.iteration == 10:
+                signal.raise_signal(signal.SIGINT)
+
+    with pytest.raises(KeyboardInterrupt):
+        watch()
+    assert isinstance(seen[-1], CheckpointEvent)
