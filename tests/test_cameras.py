@@ -1,0 +1,102 @@
+"""Cameras follow the conventions of docs/conventions.md."""
+
+import math
+
+import pytest
+import torch
+
+from etsplat import Cameras, intrinsics, look_at, sphere_grid
+
+UP = torch.tensor([0.0, 1.0, 0.0])
+ORIGIN = torch.zeros(3)
+
+
+def project(viewmat, K, point):
+    in_view = viewmat[:3, :3] @ point + viewmat[:3, 3]
+    pixel = K @ (in_view / in_view[2])
+    return pixel[:2], in_view[2]
+
+
+@pytest.fixture
+def cameras() -> Cameras:
+    eyes = torch.tensor([[0.0, 0.0, 4.0], [3.0, 1.0, 0.0], [0.0, -2.0, -2.0]])
+    return Cameras(look_at(eyes, ORIGIN, UP), intrinsics(40, 64, 48).expand(3, 3, 3), 64, 48)
+
+
+def test_target_lands_in_the_middle_of_the_image(cameras):
+    for viewmat, K, center in zip(cameras.viewmats, cameras.Ks, cameras.centers, strict=True):
+        pixel, z = project(viewmat, K, ORIGIN)
+        torch.testing.assert_close(pixel, torch.tensor([32.0, 24.0]))
+        assert float(z) == pytest.approx(float(center.norm()), rel=1e-6)
+
+
+def test_axes_are_opencvs():
+    """From +z, world +x is to the right of the image and world +y is up, which is a smaller row."""
+    viewmat = look_at(torch.tensor([0.0, 0.0, 4.0]), ORIGIN, UP)
+    K = intrinsics(40, 64, 48)
+    assert project(viewmat, K, torch.tensor([1.0, 0.0, 0.0]))[0][0] > 32
+    assert project(viewmat, K, torch.tensor([0.0, 1.0, 0.0]))[0][1] < 24
+
+
+def test_rotations_are_proper(cameras):
+    rotation = cameras.viewmats[:, :3, :3]
+    torch.testing.assert_close(rotation @ rotation.mT, torch.eye(3).expand(3, 3, 3), atol=1e-6, rtol=0)
+    torch.testing.assert_close(torch.linalg.det(rotation), torch.ones(3))
+
+
+def test_centers_are_the_eyes(cameras):
+    expected = torch.tensor([[0.0, 0.0, 4.0], [3.0, 1.0, 0.0], [0.0, -2.0, -2.0]])
+    torch.testing.assert_close(cameras.centers, expected, atol=1e-6, rtol=0)
+
+
+def test_intrinsics_span_the_field_of_view():
+    """A ray at half the vertical field of view meets the image border."""
+    K = intrinsics(40, 64, 48)
+    ray = torch.tensor([0.0, math.tan(math.radians(20)), 1.0])
+    torch.testing.assert_close((K @ ray)[1], torch.tensor(48.0))
+    assert K[0, 0] == K[1, 1]
+
+
+def test_indexing_always_gives_a_batch(cameras):
+    assert len(cameras[1]) == 1
+    assert len(cameras[1:]) == 2
+    chosen = cameras[[2, 0]]
+    torch.testing.assert_close(chosen.viewmats, cameras.viewmats[[2, 0]])
+    assert (chosen.width, chosen.height) == (64, 48)
+
+
+def test_scaling_keeps_what_is_seen(cameras):
+    """A point keeps its relative place in the image, also where sizes are rounded."""
+    scaled = cameras.scaled(0.3)
+    assert (scaled.width, scaled.height) == (19, 14)
+    point = torch.tensor([0.3, 0.2, 0.1])
+    before, _ = project(cameras.viewmats[0], cameras.Ks[0], point)
+    after, _ = project(scaled.viewmats[0], scaled.Ks[0], point)
+    torch.testing.assert_close(before / torch.tensor([64.0, 48.0]), after / torch.tensor([19.0, 14.0]))
+
+
+def test_to_changes_the_dtype(cameras):
+    assert cameras.to(dtype=torch.float64).viewmats.dtype == torch.float64
+    assert cameras.to(dtype=torch.float64).Ks.dtype == torch.float64
+
+
+def test_sphere_grid_orders_azimuth_fastest_and_turns_about_y():
+    points = sphere_grid([0, 90], [0, 90], 2.0)
+    expected = torch.tensor([[0.0, 0, 2], [2, 0, 0], [0, 2, 0], [0, 2, 0]])
+    torch.testing.assert_close(points, expected, atol=1e-6, rtol=0)
+
+
+def test_bad_cameras_are_refused_by_name():
+    K, viewmats = intrinsics(40, 4, 4)[None], torch.eye(4)[None]
+    with pytest.raises(ValueError, match="viewmats"):
+        Cameras(torch.eye(4), K, 4, 4)
+    with pytest.raises(ValueError, match="Ks"):
+        Cameras(viewmats, K.expand(2, 3, 3), 4, 4)
+    with pytest.raises(ValueError, match="width"):
+        Cameras(viewmats, K, 0, 4)
+    with pytest.raises(ValueError, match="up"):
+        look_at(torch.tensor([0.0, 2.0, 0.0]), ORIGIN, UP)
+    with pytest.raises(ValueError, match="eye"):
+        look_at(ORIGIN, ORIGIN, UP)
+    with pytest.raises(ValueError, match="fov_y_degrees"):
+        intrinsics(180, 4, 4)
