@@ -24,3 +24,24 @@ def bounding_ball(vertices: Float[Tensor, "V 3"]) -> tuple[Float[Tensor, " 3"], 
     points = vertices.double()
     center = 0.5 * (points.amin(dim=0) + points.amax(dim=0))
     return center, float((points - center).norm(dim=1).max())
+
+
+def native_mesh(
+    vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]
+) -> tuple[Float[Tensor, "V 3"], Int[Tensor, "F 3"]]:
+    """The mesh as the native geometry code reads it: contiguous float64 and int64 on the CPU, checked.
+
+    Raises:
+        ValueError: a shape is wrong, a coordinate is not finite, or an index is out of range.
+    """
+    if vertices.ndim != 2 or vertices.shape[1] != 3:
+        raise ValueError(f"vertices: got {tuple(vertices.shape)}, want (V, 3)")
+    if faces.ndim != 2 or faces.shape[1] != 3 or faces.is_floating_point():
+        raise ValueError(f"faces: got {faces.dtype} {tuple(faces.shape)}, want integers (F, 3)")
+    vertices = vertices.detach().cpu().double().contiguous()
+    faces = faces.cpu().to(torch.int64).contiguous()
+    if not bool(vertices.isfinite().all()):
+        raise ValueError("vertices: got a coordinate that is NaN or infinite, want finite ones")
+    if len(faces) and (int(faces.min()) < 0 or int(faces.max()) >= len(vertices)):
+        raise ValueError(f"faces: got indices {int(faces.min())}..{int(faces.max())}, want 0..{len(vertices) - 1}")
+    return vertices, faces

@@ -1,0 +1,111 @@
+#include "bvh.h"
+
+#include <limits>
+#include <numeric>
+#include <utility>
+
+namespace etsplat {
+namespace {
+
+constexpr double infinity = std::numeric_limits<double>::infinity();
+constexpr Box nothing{{infinity, infinity, infinity}, {-infinity, -infinity, -infinity}};
+
+Box join(const Box& a, const Box& b) { return {min(a.low, b.low), max(a.high, b.high)}; }
+
+double component(Vec3 v, int axis) { return axis == 0 ? v.x : axis == 1 ? v.y : v.z; }
+
+double segment_squared_distance(Vec3 a, Vec3 b, Vec3 p) {
+    const Vec3 along = b - a, offset = p - a;
+    const double length2 = dot(along, along);
+    const double t = length2 > 0 ? std::clamp(dot(offset, along) / length2, 0.0, 1.0) : 0.0;
+    const Vec3 gap = offset - t * along;
+    return dot(gap, gap);
+}
+
+}  // namespace
+
+Box bounds(const Triangle& t) {
+    return {min(min(t.corner[0], t.corner[1]), t.corner[2]), max(max(t.corner[0], t.corner[1]), t.corner[2])};
+}
+
+double squared_distance(const Triangle& t, Vec3 p) {
+    const auto& [a, b, c] = t.corner;
+    const Vec3 ab = b - a, ac = c - a, bc = c - b, ap = p - a;
+    const Vec3 normal = cross(ab, ac);
+    const double normal2 = dot(normal, normal);
+    const double longest2 = std::max({dot(ab, ab), dot(ac, ac), dot(bc, bc)});
+    // A triangle of relative height below 1e-12 has no direction to trust; its edges are as near as its inside.
+    if (normal2 > 1e-24 * longest2 * longest2) {
+        const double weight_b = dot(cross(ap, ac), normal), weight_c = dot(cross(ab, ap), normal);
+        if (weight_b >= 0 && weight_c >= 0 && weight_b + weight_c <= normal2) {
+            const double height = dot(ap, normal);
+            return height * height / normal2;
+        }
+    }
+    return std::min({segment_squared_distance(a, b, p), segment_squared_distance(b, c, p),
+                     segment_squared_distance(c, a, p)});
+}
+
+Bvh::Bvh(const double* vertices, const int64_t* faces, int64_t num_faces) : faces_(num_faces) {
+    std::vector<Box> boxes(num_faces);
+    for (int64_t f = 0; f < num_faces; ++f) boxes[f] = bounds(triangle(vertices, faces + 3 * f));
+    std::iota(faces_.begin(), faces_.end(), int64_t{0});
+    nodes_.reserve(num_faces);
+    build(0, num_faces, boxes);
+    triangles_.reserve(num_faces);
+    for (const int64_t f : faces_) triangles_.push_back(triangle(vertices, faces + 3 * f));
+}
+
+int32_t Bvh::build(int64_t begin, int64_t end, const std::vector<Box>& boxes) {
+    const auto twice_center = [&](int64_t face) { return boxes[face].low + boxes[face].high; };
+    const int32_t index = static_cast<int32_t>(nodes_.size());
+    Box box = nothing, centers = nothing;
+    for (int64_t slot = begin; slot < end; ++slot) {
+        const Vec3 center = twice_center(faces_[slot]);
+        box = join(box, boxes[faces_[slot]]);
+        centers = join(centers, {center, center});
+    }
+    nodes_.push_back({box, static_cast<int32_t>(begin), static_cast<int32_t>(end), 0});
+    if (end - begin <= leaf_size) return index;
+
+    const Vec3 extent = centers.high - centers.low;
+    const int axis = extent.x >= extent.y && extent.x >= extent.z ? 0 : extent.y >= extent.z ? 1 : 2;
+    const int64_t middle = begin + (end - begin) / 2;
+    std::nth_element(faces_.begin() + begin, faces_.begin() + middle, faces_.begin() + end,
+                     [&](int64_t a, int64_t b) {
+                         return std::pair(component(twice_center(a), axis), a) <
+                                std::pair(component(twice_center(b), axis), b);
+                     });
+    build(begin, middle, boxes);
+    nodes_[index].right = build(middle, end, boxes);
+    return index;
+}
+
+Bvh::Nearest Bvh::nearest(Vec3 p) const {
+    std::pair<double, int32_t> stack[max_depth];
+    int depth = 0;
+    stack[depth++] = {nodes_[0].box.squared_distance(p), 0};
+    Nearest best{infinity, -1};
+    while (depth > 0) {
+        const auto [bound, index] = stack[--depth];
+        if (bound > best.squared_distance) continue;
+        const Node& node = nodes_[index];
+        if (node.right) {
+            std::pair<double, int32_t> near{nodes_[index + 1].box.squared_distance(p), index + 1};
+            std::pair<double, int32_t> far{nodes_[node.right].box.squared_distance(p), node.right};
+            if (far.first < near.first) std::swap(near, far);
+            stack[depth++] = far;
+            stack[depth++] = near;
+            continue;
+        }
+        for (int32_t slot = node.begin; slot < node.end; ++slot) {
+            const Nearest found{squared_distance(triangles_[slot], p), faces_[slot]};
+            if (std::pair(found.squared_distance, found.face) < std::pair(best.squared_distance, best.face)) {
+                best = found;
+            }
+        }
+    }
+    return best;
+}
+
+}  // namespace etsplat

@@ -1,0 +1,42 @@
+"""Small meshes for tests, and a reader that keeps a shared OBJ as it is written."""
+
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from etsplat.geometry.icosphere import icosphere
+from etsplat.geometry.measures import bounding_ball
+
+TETRAHEDRON_FACES = torch.tensor([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
+TETRAHEDRON = torch.tensor([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]), TETRAHEDRON_FACES.flip(1)
+
+FAMOUS = "armadillo boot bunny_hr cow-low-resolution goathead hand_closed human_neutral koala mushroom springer".split()
+
+
+def bumpy_sphere(level: int, seed: int, amplitude: float = 0.3) -> tuple[Tensor, Tensor]:
+    """An icosphere whose vertices are displaced at random, by about `amplitude` edge lengths."""
+    vertices, faces = icosphere(level)
+    noise = torch.randn(vertices.shape, generator=torch.Generator().manual_seed(seed))
+    return vertices + amplitude * noise * 2.0**-level, faces
+
+
+def read_obj(path: Path) -> tuple[Tensor, Tensor]:
+    """Vertices (float64) and triangles of an OBJ, vertices shared as in the file, normalised to radius 1."""
+    vertices, faces = [], []
+    for line in path.read_text().splitlines():
+        if line.startswith("v "):
+            vertices.append([float(value) for value in line.split()[1:4]])
+        elif line.startswith("f "):
+            faces.append([int(corner.split("/")[0]) - 1 for corner in line.split()[1:4]])
+    points = torch.tensor(vertices, dtype=torch.float64)
+    center, radius = bounding_ball(points)
+    return (points - center) / radius, torch.tensor(faces)
+
+
+def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
+    """Unit normals, faces weighted by area."""
+    a, b, c = vertices[faces].unbind(1)
+    normal = torch.linalg.cross(b - a, c - a)
+    total = torch.zeros_like(vertices).index_add(0, faces.reshape(-1), normal.repeat_interleave(3, dim=0))
+    return torch.nn.functional.normalize(total, dim=1)
