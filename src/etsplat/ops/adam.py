@@ -1,0 +1,179 @@
+"""Adam over named parameters, all of them in one native call.
+
+The update is that of ``torch.optim.Adam`` without weight decay, on every element, also where the gradient is zero.
+Moments are plain tensors under the parameter's name, so that structural edits can carry them over (``optim/edit.py``).
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from etsplat import _native
+from etsplat.core.checks import check_matches, check_shape
+from etsplat.ops.engines import resolve_engine
+
+
+class Adam:
+    """Adam (Kingma and Ba 2015).
+
+        m <- m + (1 - b1) (g - m)
+        v <- b2 v + (1 - b2) g^2
+        p <- p - lr / (1 - b1^t) * m / (sqrt(v) / sqrt(1 - b2^t) + eps)
+
+    Attributes:
+        parameters: The tensors that are updated in place, by name.
+        learning_rates: One per parameter; change them freely between steps.
+        betas: Decay of the first and second moments.
+        eps: Added to the square root.
+        first_moments: m, shaped as the parameters.
+        second_moments: v, shaped as the parameters.
+        step_count: t, the number of steps taken.
+    """
+
+    def __init__(
+        self,
+        parameters: Mapping[str, Tensor],
+        learning_rates: Mapping[str, float],
+        *,
+        betas: tuple[float, float] = (0.9, 0.999),
+        eps: float = 1e-15,
+        engine: str | None = None,
+    ) -> None:
+        """Start with zero moments.
+
+        Args:
+            parameters: Leaf tensors by name.
+            learning_rates: One for each name, at least 0.
+            betas: Both in [0, 1).
+            eps: At least 0.
+            engine: "cpu", "reference" or None (by dtype and device, for each parameter).
+
+        Raises:
+            ValueError: Names that do not match, or a number out of its range.
+        """
+        if set(parameters) != set(learning_rates):
+            raise ValueError(f"learning_rates must name {sorted(parameters)}, got {sorted(learning_rates)}")
+        if not all(0 <= beta < 1 for beta in betas):
+            raise ValueError(f"betas must be in [0, 1), got {betas}")
+        if eps < 0:
+            raise ValueError(f"eps must be at least 0, got {eps}")
+        self.parameters = dict(parameters)
+        self.learning_rates = dict(learning_rates)
+        self.betas = betas
+        self.eps = eps
+        self.step_count = 0
+        self.first_moments = {name: _zeros(parameter) for name, parameter in self.parameters.items()}
+        self.second_moments = {name: _zeros(parameter) for name, parameter in self.parameters.items()}
+        self._engines = {name: resolve_engine(engine, parameter) for name, parameter in self.parameters.items()}
+
+    @torch.no_grad()
+    def step(self) -> None:
+        """Update every parameter from its gradient.
+
+        Raises:
+            ValueError: A parameter without gradient; nothing is updated then.
+        """
+        for name, parameter in self.parameters.items():
+            if parameter.grad is None:
+                raise ValueError(f"parameter {name} has no gradient: call backward() before step()")
+        self.step_count += 1
+        native = [name for name, engine in self._engines.items() if engine == "cpu"]
+        if native:
+            self._step_native(native)
+        for name, engine in self._engines.items():
+            if engine == "reference":
+                self._step_reference(name)
+
+    def zero_grad(self) -> None:
+        """Drop all gradients."""
+        for parameter in self.parameters.values():
+            parameter.grad = None
+
+    def replace(self, name: str, parameter: Tensor, first: Tensor, second: Tensor) -> None:
+        """Put another tensor, with its moments, in the place of a parameter (structural edits only).
+
+        Raises:
+            ValueError: An unknown name, or moments that do not fit the parameter.
+        """
+        if name not in self.parameters:
+            raise ValueError(f"name must be one of {sorted(self.parameters)}, got {name!r}")
+        for moment_name, moment in (("first", first), ("second", second)):
+            check_shape(moment_name, moment, tuple(parameter.shape))
+            check_matches(moment_name, moment, parameter)
+        check_matches("parameter", parameter, self.parameters[name])
+        self.parameters[name] = parameter
+        self.first_moments[name] = first.contiguous()
+        self.second_moments[name] = second.contiguous()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything but the parameters themselves; tensors are shared, not copied."""
+        return {
+            "step_count": self.step_count,
+            "learning_rates": dict(self.learning_rates),
+            "betas": self.betas,
+            "eps": self.eps,
+            "first_moments": dict(self.first_moments),
+            "second_moments": dict(self.second_moments),
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue from a ``state_dict`` of an optimizer over parameters of the same names and shapes.
+
+        Raises:
+            ValueError: Other names or shapes; nothing is changed then.
+        """
+        for key in ("learning_rates", "first_moments", "second_moments"):
+            if set(state[key]) != set(self.parameters):
+                raise ValueError(f"{key} must name {sorted(self.parameters)}, got {sorted(state[key])}")
+        for key in ("first_moments", "second_moments"):
+            for name, moment in state[key].items():
+                check_shape(f"{key}[{name}]", moment, tuple(self.parameters[name].shape))
+                check_matches(f"{key}[{name}]", moment, self.parameters[name])
+        self.step_count = int(state["step_count"])
+        self.learning_rates = dict(state["learning_rates"])
+        self.betas = tuple(state["betas"])
+        self.eps = float(state["eps"])
+        self.first_moments = {name: _dense_copy(state["first_moments"][name]) for name in self.parameters}
+        self.second_moments = {name: _dense_copy(state["second_moments"][name]) for name in self.parameters}
+
+    def _step_native(self, names: list[str]) -> None:
+        parameters = [self.parameters[name] for name in names]
+        dense = [parameter.contiguous() for parameter in parameters]
+        gradients = [parameter.grad.contiguous() for parameter in parameters if parameter.grad is not None]
+        _native.adam_step(
+            [tensor.data_ptr() for tensor in dense],
+            [tensor.data_ptr() for tensor in gradients],
+            [self.first_moments[name].data_ptr() for name in names],
+            [self.second_moments[name].data_ptr() for name in names],
+            [tensor.numel() for tensor in dense],
+            [self.learning_rates[name] for name in names],
+            *self.betas,
+            self.eps,
+            self.step_count,
+        )
+        for parameter, updated in zip(parameters, dense, strict=True):
+            if updated is parameter:
+                torch.autograd.graph.increment_version(parameter)  # so that a stale graph fails loudly in backward
+            else:
+                parameter.copy_(updated)
+
+    def _step_reference(self, name: str) -> None:
+        parameter, first, second = self.parameters[name], self.first_moments[name], self.second_moments[name]
+        gradient = parameter.grad
+        assert gradient is not None
+        beta1, beta2 = self.betas
+        first += (1 - beta1) * (gradient - first)
+        second.mul_(beta2).add_((1 - beta2) * gradient * gradient)
+        root = second.sqrt() / (1 - beta2**self.step_count) ** 0.5
+        parameter -= self.learning_rates[name] / (1 - beta1**self.step_count) * (first / (root + self.eps))
+
+
+def _zeros(parameter: Tensor) -> Tensor:
+    """A moment: dense whatever the strides of the parameter."""
+    return torch.zeros(parameter.shape, dtype=parameter.dtype, device=parameter.device)
+
+
+def _dense_copy(moment: Tensor) -> Tensor:
+    return moment.detach().clone(memory_format=torch.contiguous_format)

@@ -1,0 +1,152 @@
+import pytest
+import torch
+
+from etsplat.ops.adam import Adam
+from etsplat.ops.engines import num_threads, set_num_threads
+
+SHAPES = {"vertices": (1001, 3), "colors": (20011, 3), "sigma": (), "empty": (0, 3)}
+RATES = {"vertices": 1e-3, "colors": 5e-2, "sigma": 2e-2, "empty": 1.0}
+
+
+def parameters(rng: torch.Generator, dtype: torch.dtype = torch.float32) -> dict[str, torch.Tensor]:
+    return {name: torch.randn(shape, generator=rng, dtype=dtype).requires_grad_() for name, shape in SHAPES.items()}
+
+
+def copies(tensors: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    return {name: tensor.detach().clone().requires_grad_() for name, tensor in tensors.items()}
+
+
+def set_gradients(rng: torch.Generator, *families: dict[str, torch.Tensor]) -> None:
+    for name, parameter in families[0].items():
+        gradient = torch.randn(parameter.shape, generator=rng) * 10 ** torch.randn(parameter.shape, generator=rng)
+        gradient[torch.rand(parameter.shape, generator=rng) < 0.3] = 0
+        for family in families:
+            family[name].grad = gradient.to(family[name].dtype)
+
+
+@pytest.mark.sanitize
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_equals_torch_adam_within_rounding(engine, rng, dtype):
+    """Several steps, with rows of zero gradient and a learning rate that changes, match torch.optim.Adam."""
+    if engine == "cpu" and dtype == torch.float64:
+        pytest.skip("the native engine computes in float32")
+    ours = parameters(rng, dtype)
+    theirs = copies(ours)
+    adam = Adam(ours, RATES, engine=engine)
+    expected = torch.optim.Adam([{"params": [theirs[n]], "lr": RATES[n], "name": n} for n in theirs], eps=1e-15)
+    for step in range(12):
+        set_gradients(rng, ours, theirs)
+        if step == 6:
+            adam.learning_rates["colors"] = expected.param_groups[1]["lr"] = 1e-2
+        adam.step()
+        expected.step()
+    assert adam.step_count == 12
+    tolerance = {"rtol": 2e-5, "atol": 2e-6} if dtype == torch.float32 else {"rtol": 1e-12, "atol": 1e-12}
+    for name in SHAPES:
+        torch.testing.assert_close(ours[name], theirs[name], **tolerance)
+        torch.testing.assert_close(adam.first_moments[name], expected.state[theirs[name]]["exp_avg"], **tolerance)
+
+
+def test_first_step_moves_by_the_learning_rate(engine):
+    """After one step every element with a gradient has moved by lr against its sign, whatever its size."""
+    parameter = torch.zeros(5, requires_grad=True)
+    parameter.grad = torch.tensor([1e-6, -3.0, 0.0, 1e4, -1e-3])
+    Adam({"p": parameter}, {"p": 0.25}, engine=engine).step()
+    torch.testing.assert_close(parameter.detach(), torch.tensor([-0.25, 0.25, 0.0, -0.25, 0.25]))
+
+
+@pytest.mark.sanitize
+def test_same_bits_for_any_number_of_threads(rng):
+    """Elements are independent of one another and of the threads."""
+    start = parameters(rng)
+    before = num_threads()
+    results = []
+    for count in (1, 2, 5):
+        set_num_threads(count)
+        ours = copies(start)
+        adam = Adam(ours, RATES)
+        generator = torch.Generator().manual_seed(1)
+        for _ in range(3):
+            set_gradients(generator, ours)
+            adam.step()
+        results.append(ours)
+    set_num_threads(before)
+    assert all(torch.equal(result[name], results[0][name]) for result in results[1:] for name in SHAPES)
+
+
+def test_state_dict_continues_to_the_bit(rng):
+    """An optimizer restored in the middle ends where the uninterrupted one does."""
+    ours = parameters(rng)
+    adam = Adam(ours, RATES)
+    set_gradients(rng, ours)
+    adam.step()
+    resumed = copies(ours)
+    second = Adam(resumed, dict.fromkeys(RATES, 1.0))
+    second.load_state_dict(adam.state_dict())
+    set_gradients(rng, ours, resumed)
+    adam.step()
+    second.step()
+    assert second.step_count == 2
+    assert all(torch.equal(ours[name], resumed[name]) for name in SHAPES)
+
+
+def test_replace_puts_in_other_tensors_with_their_moments(rng):
+    """After a structural edit the new rows step with the moments that were handed over."""
+    ours = {"p": torch.randn((4, 3), generator=rng).requires_grad_()}
+    adam = Adam(ours, {"p": 0.1})
+    ours["p"].grad = torch.randn((4, 3), generator=rng)
+    adam.step()
+    index = torch.tensor([0, 2, 2, 3, 1])
+    grown = ours["p"].detach()[index].requires_grad_()
+    adam.replace("p", grown, adam.first_moments["p"][index], adam.second_moments["p"][index])
+    gradient = torch.randn((4, 3), generator=rng)
+    grown.grad = gradient[index]
+    adam.step()
+    assert torch.equal(grown[1], grown[2])
+    with pytest.raises(ValueError, match="first"):
+        adam.replace("p", grown, torch.zeros(4, 3), torch.zeros(5, 3))
+    with pytest.raises(ValueError, match="name"):
+        adam.replace("q", grown, torch.zeros(5, 3), torch.zeros(5, 3))
+
+
+def test_non_contiguous_parameters_and_gradients(rng):
+    """A transposed parameter with a strided gradient is updated as its contiguous copy is."""
+    storage = torch.randn((3, 50), generator=rng)
+    gradient = torch.randn((50, 6), generator=rng)[:, ::2]
+    strided, plain = storage.T.clone(memory_format=torch.preserve_format), storage.T.contiguous()
+    assert not strided.is_contiguous()
+    for parameter in (strided, plain):
+        parameter.requires_grad_()
+        parameter.grad = gradient
+        Adam({"p": parameter}, {"p": 0.1}).step()
+    assert torch.equal(strided, plain)
+
+
+def test_a_stale_graph_fails_loudly(rng):
+    """Backward through values that a step has overwritten is an error, not a wrong gradient."""
+    parameter = torch.randn((5,), generator=rng).requires_grad_()
+    loss = (parameter**2).sum()
+    loss.backward(retain_graph=True)
+    Adam({"p": parameter}, {"p": 0.1}).step()
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        loss.backward()
+
+
+def test_missing_gradients_and_wrong_names_are_errors(rng):
+    """A parameter without gradient stops the step before anything is changed."""
+    ours = parameters(rng)
+    with pytest.raises(ValueError, match="learning_rates"):
+        Adam(ours, {"vertices": 0.1})
+    with pytest.raises(ValueError, match="betas"):
+        Adam(ours, RATES, betas=(0.9, 1.0))
+    adam = Adam(ours, RATES)
+    set_gradients(rng, ours)
+    ours["sigma"].grad = None
+    start = ours["vertices"].detach().clone()
+    with pytest.raises(ValueError, match="sigma has no gradient"):
+        adam.step()
+    assert torch.equal(start, ours["vertices"])
+    adam.zero_grad()
+    assert all(parameter.grad is None for parameter in ours.values())
+    with pytest.raises(ValueError, match="first_moments"):
+        adam.load_state_dict({**adam.state_dict(), "first_moments": {}})
