@@ -11,7 +11,18 @@ from etsplat.geometry.measures import bounding_ball
 TETRAHEDRON_FACES = torch.tensor([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
 TETRAHEDRON = torch.tensor([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]), TETRAHEDRON_FACES.flip(1)
 
-FAMOUS = "armadillo boot bunny_hr cow-low-resolution goathead hand_closed human_neutral koala mushroom springer".split()
+FAMOUS = [
+    "armadillo",
+    "boot",
+    "bunny_hr",
+    "cow-low-resolution",
+    "goathead",
+    "hand_closed",
+    "human_neutral",
+    "koala",
+    "mushroom",
+    "springer",
+]
 
 
 def bumpy_sphere(level: int, seed: int, amplitude: float = 0.3) -> tuple[Tensor, Tensor]:

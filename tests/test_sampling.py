@@ -52,7 +52,7 @@ def test_density_is_uniform_in_area():
 def test_surface_without_area_is_refused():
     """No faces, only degenerate faces, or NaN vertices raise instead of returning garbage."""
     for vertices, faces in [(SQUARE, FACES[:0]), (SQUARE, FACES[1:2]), (SQUARE / 0, FACES)]:
-        with pytest.raises(ValueError, match="want a surface to draw points from"):
+        with pytest.raises(ValueError, match="vertices and faces must be a"):
             sample_surface(vertices, faces, 10, 0)
     points, face = sample_surface(SQUARE, FACES, 0, 0)
     assert points.shape == (0, 3)

@@ -5,6 +5,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from etsplat import _native
+from etsplat.core.checks import check_shape
 from etsplat.geometry.measures import native_mesh
 
 
@@ -28,14 +29,13 @@ def closest_points(
     Raises:
         ValueError: a shape is wrong, a coordinate is not finite, an index is out of range, or there are no faces.
     """
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise ValueError(f"points: got {tuple(points.shape)}, want (N, 3)")
-    points = points.detach().cpu().double().contiguous()
+    check_shape("points", points, ("N", 3))
     if not bool(points.isfinite().all()):
-        raise ValueError("points: got a coordinate that is NaN or infinite, want finite ones")
+        raise ValueError("points must be finite, got NaN or infinity")
+    points = points.detach().cpu().double().contiguous()
     vertices, faces = native_mesh(vertices, faces)
     if len(faces) == 0:
-        raise ValueError("faces: got none, want at least one")
+        raise ValueError("faces must not be empty")
     squared = torch.empty(len(points), dtype=torch.float64)
     nearest = torch.empty(len(points), dtype=torch.int64)
     _native.closest_faces(

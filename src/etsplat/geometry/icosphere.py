@@ -23,7 +23,7 @@ def icosphere(level: int) -> tuple[Float[Tensor, "V 3"], Int[Tensor, "F 3"]]:
         ValueError: `level` is negative.
     """
     if level < 0:
-        raise ValueError(f"level: got {level}, want an integer >= 0")
+        raise ValueError(f"level must be at least 0, got {level}")
     vertices, faces = _icosahedron()
     for _ in range(level):
         topology = MeshTopology.from_faces(faces, len(vertices))

@@ -4,6 +4,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from etsplat.core.checks import check_indices, check_shape
+
 
 def face_areas(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> Float[Tensor, " F"]:
     """The area of each face, in the dtype of the vertices; zero where a face repeats a vertex."""
@@ -34,14 +36,9 @@ def native_mesh(
     Raises:
         ValueError: a shape is wrong, a coordinate is not finite, or an index is out of range.
     """
-    if vertices.ndim != 2 or vertices.shape[1] != 3:
-        raise ValueError(f"vertices: got {tuple(vertices.shape)}, want (V, 3)")
-    if faces.ndim != 2 or faces.shape[1] != 3 or faces.is_floating_point():
-        raise ValueError(f"faces: got {faces.dtype} {tuple(faces.shape)}, want integers (F, 3)")
-    vertices = vertices.detach().cpu().double().contiguous()
-    faces = faces.cpu().to(torch.int64).contiguous()
+    check_shape("vertices", vertices, ("V", 3))
+    check_shape("faces", faces, ("F", 3))
+    check_indices("faces", faces, len(vertices))
     if not bool(vertices.isfinite().all()):
-        raise ValueError("vertices: got a coordinate that is NaN or infinite, want finite ones")
-    if len(faces) and (int(faces.min()) < 0 or int(faces.max()) >= len(vertices)):
-        raise ValueError(f"faces: got indices {int(faces.min())}..{int(faces.max())}, want 0..{len(vertices) - 1}")
-    return vertices, faces
+        raise ValueError("vertices must be finite, got NaN or infinity")
+    return vertices.detach().cpu().double().contiguous(), faces.cpu().to(torch.int64).contiguous()

@@ -36,7 +36,7 @@ def sample_surface(
     origin, side1, side2 = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     cumulative = np.cumsum(_cross_lengths(side1, side2))
     if cumulative[-1] == 0:
-        raise ValueError("vertices, faces: all faces have zero area, want a surface to draw points from")
+        raise ValueError("vertices and faces must be a surface with area, got zero area")
     rng = np.random.default_rng(seed)
     # Scaling may round up to the total itself, where the search would land behind the last face or on an empty one.
     position = np.minimum(rng.random(count) * cumulative[-1], np.nextafter(cumulative[-1], 0))

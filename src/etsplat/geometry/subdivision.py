@@ -10,6 +10,7 @@ from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
 from etsplat import _native
+from etsplat.core.checks import check_shape
 from etsplat.geometry.topology import MeshTopology
 
 
@@ -40,14 +41,14 @@ class SubdivisionPlan:
     def interpolate(self, values: Float[Tensor, " V *rest"]) -> Float[Tensor, " V_new *rest"]:
         """Values per old vertex, followed by the means of the two ends for each new one."""
         if len(values) != self.num_vertices:
-            raise ValueError(f"values: got {len(values)} rows, want one for each of the {self.num_vertices} vertices")
+            raise ValueError(f"values must have a row for each of {self.num_vertices} vertices, got {len(values)}")
         first, second = self.new_vertices.to(values.device).unbind(1)
         return torch.cat([values, 0.5 * (values[first] + values[second])])
 
     def inherit(self, values: Shaped[Tensor, " F *rest"]) -> Shaped[Tensor, " F_new *rest"]:
         """Values per old face, copied to the faces that replace it."""
         if len(values) != self.num_faces:
-            raise ValueError(f"values: got {len(values)} rows, want one for each of the {self.num_faces} faces")
+            raise ValueError(f"values must have a row for each of {self.num_faces} faces, got {len(values)}")
         return values[self.parent_face.to(values.device)]
 
 
@@ -88,12 +89,10 @@ def longest_edge_plan(
 
 
 def _check(vertices: Tensor, topology: MeshTopology, scores: Tensor) -> None:
-    if vertices.shape != (topology.num_vertices, 3):
-        raise ValueError(f"vertices: got {tuple(vertices.shape)}, want ({topology.num_vertices}, 3) as the topology")
-    if scores.shape != (topology.num_faces,):
-        raise ValueError(f"scores: got {tuple(scores.shape)}, want ({topology.num_faces},), one per face")
+    check_shape("vertices", vertices, (topology.num_vertices, 3))
+    check_shape("scores", scores, (topology.num_faces,))
     if not bool(scores.isfinite().all()):
-        raise ValueError("scores: got a value that is NaN or infinite, want finite ones (are the vertices finite?)")
+        raise ValueError("scores must be finite, got NaN or infinity: are the vertices finite?")
 
 
 def _longest_edges(vertices: Float[Tensor, "V 3"], topology: MeshTopology) -> Int[Tensor, " F"]:

@@ -15,6 +15,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
+from etsplat.core.checks import check_indices, check_shape
+
 
 class NativeTopology(NamedTuple):
     """What the mesh energies need, as contiguous int32 for the native code."""
@@ -155,17 +157,13 @@ class MeshTopology:
 
 
 def _checked_faces(faces: Tensor, num_vertices: int) -> Int[Tensor, "F 3"]:
-    if faces.ndim != 2 or faces.shape[1] != 3 or faces.dtype not in (torch.int32, torch.int64):
-        raise ValueError(f"faces: got {faces.dtype} {tuple(faces.shape)}, want int32 or int64 (F, 3)")
+    check_shape("faces", faces, ("F", 3))
+    check_indices("faces", faces, num_vertices)
     faces = faces.to(torch.int64).contiguous()
-    if faces.numel() and not (int(faces.min()) >= 0 and int(faces.max()) < num_vertices):
-        raise ValueError(
-            f"faces: got indices {int(faces.min())}..{int(faces.max())}, want 0..{num_vertices - 1} (num_vertices - 1)"
-        )
     repeated = (faces == faces.roll(-1, dims=1)).any(dim=1)
     if bool(repeated.any()):
         first = int(repeated.int().argmax())
-        raise ValueError(f"faces: face {first} repeats a vertex {faces[first].tolist()}, want three different ones")
+        raise ValueError(f"faces must have three different vertices, got {faces[first].tolist()} for face {first}")
     return faces
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from etsplat.geometry.distance import closest_points
@@ -82,8 +82,8 @@ def sample_pair(
 
 def chamfer(surface: Surface, truth: Surface) -> float:
     """Mean squared distance to the nearest sample of the other surface, summed over both directions."""
-    to_truth, _ = cKDTree(truth.points.numpy()).query(surface.points.numpy(), workers=-1)
-    to_surface, _ = cKDTree(surface.points.numpy()).query(truth.points.numpy(), workers=-1)
+    to_truth, _ = KDTree(truth.points.numpy()).query(surface.points.numpy(), workers=-1)
+    to_surface, _ = KDTree(surface.points.numpy()).query(truth.points.numpy(), workers=-1)
     return float(np.mean(to_truth**2) + np.mean(to_surface**2))
 
 
@@ -97,7 +97,7 @@ def chamfer_floor(truth: Surface) -> float:
 
 
 def exact_squared_distances(surface: Surface, truth: Surface) -> tuple[np.ndarray, np.ndarray]:
-    """Squared distances (N,) from the samples of each surface to the other surface itself; exact, not to its samples."""
+    """Squared distances (N,) from each surface's samples to the other surface itself, not to its samples."""
     to_truth, _ = closest_points(surface.points, truth.vertices, truth.faces)
     to_surface, _ = closest_points(truth.points, surface.vertices, surface.faces)
     return to_truth.numpy(), to_surface.numpy()

@@ -44,15 +44,15 @@ def apply_subdivision(
     rows = dict.fromkeys(per_vertex, plan.num_vertices) | dict.fromkeys(per_face, plan.num_faces)
     statistics = statistics or {}
     if len(carry) != len(per_vertex) + len(per_face):
-        raise ValueError(f"per_vertex, per_face: got a name twice in {[*per_vertex, *per_face]}")
+        raise ValueError(f"per_vertex and per_face must name each tensor once, got {[*per_vertex, *per_face]}")
     for name, count in rows.items():
         tensor = adam.parameters.get(name, statistics.get(name))
         if tensor is None:
-            raise ValueError(f"per_vertex, per_face: {name!r} is neither a parameter nor among the statistics")
+            raise ValueError(f"per_vertex and per_face must name parameters or statistics, got {name!r}")
         if tensor.ndim == 0 or len(tensor) != count:
-            raise ValueError(f"{name}: got shape {tuple(tensor.shape)}, want {count} rows as the plan")
+            raise ValueError(f"{name} must have {count} rows as the plan, got shape {tuple(tensor.shape)}")
     if missing := set(statistics) - set(carry):
-        raise ValueError(f"statistics: {sorted(missing)} named neither in per_vertex nor in per_face")
+        raise ValueError(f"per_vertex or per_face must name every statistic, got none of {sorted(missing)}")
     return {name: _carry(name, move, adam, statistics) for name, move in carry.items()}
 
 
