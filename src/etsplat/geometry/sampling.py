@@ -30,9 +30,7 @@ def sample_surface(
     """
     corners = vertices.detach().cpu().double().numpy()[faces.cpu().numpy()]
     if len(corners) == 0 or not np.isfinite(corners).all():
-        raise ValueError(
-            "vertices, faces: no faces or vertices that are not finite, want a surface to draw points from"
-        )
+        raise ValueError("vertices and faces must be a finite surface, got no faces, NaN or infinity")
     origin, side1, side2 = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     cumulative = np.cumsum(_cross_lengths(side1, side2))
     if cumulative[-1] == 0:
