@@ -83,8 +83,9 @@ def _feet(p: np.ndarray) -> np.ndarray:
 
 
 def _plinth(p: np.ndarray) -> np.ndarray:
+    # A corner points forward: the sides then take the light differently from the top.
     sector = np.pi / 4
-    angle = (np.arctan2(p[:, 0], p[:, 2]) + sector / 2) % sector - sector / 2
+    angle = np.arctan2(p[:, 0], p[:, 2]) % sector - sector / 2
     octagon = np.hypot(p[:, 0], p[:, 2]) * np.cos(angle)
     upper = np.maximum(octagon - 0.63, np.abs(p[:, 1] + 0.89) - 0.08)
     lower = np.maximum(octagon - 0.78, np.abs(p[:, 1] + 1.03) - 0.1)
