@@ -112,14 +112,15 @@ def test_empty_mesh_has_empty_tables():
     assert len(topology.components()) == 0
 
 
-def test_native_copies_are_int32_and_made_once():
-    """The int32 copies hold the same indices, are contiguous, and the second call returns the first one's."""
+def test_connectivity_is_int32_and_made_once():
+    """The arrays for the mesh energies hold the same indices, are contiguous, and are made on the first use only."""
     topology = MeshTopology.from_faces(TETRAHEDRON, 4)
-    for tensor, name in zip(topology.native, topology.native._fields, strict=True):
+    for name in ("edges", "face_pairs", "faces", "neighbor_offsets", "neighbor_indices"):
+        tensor = getattr(topology.connectivity, name)
         assert tensor.dtype == torch.int32
         assert tensor.is_contiguous()
         assert tensor.tolist() == getattr(topology, name).tolist()
-    assert topology.native is topology.native
+    assert topology.connectivity is topology.connectivity
 
 
 @pytest.mark.parametrize(

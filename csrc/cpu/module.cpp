@@ -3,6 +3,7 @@
 
 namespace etsplat {
 void bind_geometry(nb::module_& m);
+void bind_mesh_energies(nb::module_& m);
 void bind_optimizer(nb::module_& m);
 void bind_rasterize_hard(nb::module_& m);
 }  // namespace etsplat
@@ -15,6 +16,7 @@ NB_MODULE(_native, m) {
     m.def("parallel_seconds", &parallel_seconds);
     m.def("reset_parallel_seconds", &reset_parallel_seconds);
     bind_geometry(m);
+    bind_mesh_energies(m);
     bind_optimizer(m);
     bind_rasterize_hard(m);
 }

@@ -6,7 +6,6 @@ of face f; all half-edges with the same two ends are one edge, whichever way the
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -16,16 +15,7 @@ from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from etsplat.core.checks import check_indices, check_shape
-
-
-class NativeTopology(NamedTuple):
-    """What the mesh energies need, as contiguous int32 for the native code."""
-
-    edges: Int[Tensor, "E 2"]
-    face_pairs: Int[Tensor, "P 2"]
-    faces: Int[Tensor, "F 3"]
-    neighbor_offsets: Int[Tensor, " V+1"]
-    neighbor_indices: Int[Tensor, " 2E"]
+from etsplat.ops.mesh_energies import MeshConnectivity
 
 
 @dataclass(frozen=True)
@@ -102,10 +92,11 @@ class MeshTopology:
         return self.edge_face_offsets.diff()
 
     @cached_property
-    def native(self) -> NativeTopology:
-        """The int32 copies for native code, made on the first use."""
-        tensors = self.edges, self.face_pairs, self.faces, self.neighbor_offsets, self.neighbor_indices
-        return NativeTopology(*(tensor.to(torch.int32).contiguous() for tensor in tensors))
+    def connectivity(self) -> MeshConnectivity:
+        """What the mesh energies need, as int32, made on the first use."""
+        return MeshConnectivity.build(
+            self.edges, self.face_pairs, self.faces, self.neighbor_offsets, self.neighbor_indices
+        )
 
     def is_closed(self) -> bool:
         """No boundary: every edge has at least two faces."""

@@ -59,17 +59,7 @@ def mesh_objective(
     photometric = l1_over_background(color, target, backgrounds, engine=engine)
     if gamma == 0.0:
         return photometric
-    topology = mesh.topology
-    energies = mesh_energies(
-        mesh.vertices,
-        topology.edges,
-        topology.face_pairs,
-        topology.faces,
-        topology.neighbor_offsets,
-        topology.neighbor_indices,
-        edge_power=weights.edge_power,
-        engine=engine,
-    )
+    energies = mesh_energies(mesh.vertices, mesh.topology.connectivity, edge_power=weights.edge_power, engine=engine)
     regularization = (
         weights.edge * energies.edge
         + weights.normal * energies.normal
