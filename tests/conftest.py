@@ -8,6 +8,9 @@ import torch
 from etsplat.core.kernels import DISTANCES, KERNELS
 from etsplat.ops.engines import ENGINES
 
+# Tests run side by side, on small tensors: torch's own threads would only wait for each other.
+torch.set_num_threads(1)
+
 REPOSITORY = Path(__file__).resolve().parent.parent
 
 
