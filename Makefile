@@ -5,7 +5,6 @@
 #   make test PYTEST_ARGS="-k cli"  part of the tests
 
 PYTHON ?= python3
-CXX ?= c++
 PYTEST_ARGS ?=
 
 VENV := .venv

@@ -1,5 +1,6 @@
 """Fixtures shared by all tests."""
 
+import os
 from pathlib import Path
 
 import pytest
@@ -18,6 +19,14 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--engine", choices=ENGINES, default=None, help="run the engine-parameterised tests on this engine only"
     )
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    # Workers side by side, each with a thread per core, would wait for each other. Subprocesses inherit the variables.
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        os.environ.setdefault("ETSPLAT_NUM_THREADS", "2")
+        os.environ.setdefault("OMP_NUM_THREADS", "1")
+        torch.set_num_threads(1)
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:

@@ -7,14 +7,15 @@ from typing import Literal
 from etsplat.core.errors import InputError
 
 Method = Literal["elastic", "bilateral", "single-sided"]
+Preset = Literal["paper", "quick", "demo", "tiny"]
 
 
 @dataclass(frozen=True)
 class ReconstructConfig:
     """Settings of `etsplat.reconstruct`; the defaults are preset "paper"."""
 
-    preset: str = "paper"
-    """Name of the preset these settings started from; for the record only."""
+    preset: Preset = "paper"
+    """Where the other settings start from. For the record only: in Python, start from `PRESETS[name]`."""
     method: Method = "elastic"
     """Kernel of the triangles: elastic (the paper's), bilateral (2DTS) or single-sided (Triangle Splatting)."""
     distance: Literal["barycentric", "sdf"] = "barycentric"

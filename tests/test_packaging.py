@@ -1,0 +1,78 @@
+"""What is installed is what the sources say, and holds together."""
+
+import re
+import subprocess
+import sys
+from importlib.metadata import requires, version
+from importlib.resources import files
+from pathlib import Path
+
+import pytest
+
+from etsplat import _native
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+
+
+def test_version_is_the_same_everywhere() -> None:
+    """pyproject.toml, the installed package and the newest heading of CHANGELOG.md name one version."""
+    project = re.search(r'^version = "(.+)"$', (REPOSITORY / "pyproject.toml").read_text(), re.MULTILINE)
+    changelog = re.search(r"^## (\S+)", (REPOSITORY / "CHANGELOG.md").read_text(), re.MULTILINE)
+    assert project
+    assert changelog
+    assert version("etsplat") == project[1] == changelog[1]
+
+
+def test_layers_hold() -> None:
+    """No layer imports a higher one (the contract in pyproject.toml)."""
+    command = [sys.executable, "-c", "from importlinter.cli import lint_imports; raise SystemExit(lint_imports())"]
+    result = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stdout
+
+
+def test_report_assets_are_installed() -> None:
+    """The report's page, style and scripts come with the package, and so does the typing marker."""
+    for name in ("page.html", "page.css", "page.js", "viewer.js"):
+        assert (files("etsplat.report") / "assets" / name).is_file()
+    assert (files("etsplat") / "py.typed").is_file()
+
+
+def test_torch_range_stays_wide() -> None:
+    """The package asks for torch 2.6 or newer and pins nothing: constraints.txt does that for the checks alone."""
+    needs = {re.split(r"[<>=!~; \[]", need, maxsplit=1)[0]: need for need in requires("etsplat") or []}
+    assert needs["torch"] == "torch>=2.6"
+
+
+def test_nothing_local_is_committed() -> None:
+    """No tracked text file holds an absolute path of a home, work or temporary folder."""
+    listed = subprocess.run(["git", "ls-files", "-z"], cwd=REPOSITORY, capture_output=True, text=True, check=False)
+    if listed.returncode != 0:
+        pytest.skip("not a git checkout")
+    local = re.compile(rb"/(?:work|home|root|Users|tmp)/\w")
+    found = [name for name in listed.stdout.split("\0")[:-1] if local.search((REPOSITORY / name).read_bytes())]
+    assert [name for name in found if name != "tests/test_packaging.py"] == []
+
+
+@pytest.mark.sanitize
+@pytest.mark.parametrize("threads", [1, 2, 5])
+def test_thread_count_can_be_set(threads: int) -> None:
+    """The native pool takes any number of threads, and 0 goes back to the default."""
+    default = _native.num_threads()
+    _native.set_num_threads(threads)
+    assert _native.num_threads() == threads
+    _native.set_num_threads(0)
+    assert _native.num_threads() == default
+
+
+def test_thread_count_from_the_environment() -> None:
+    """ETSPLAT_NUM_THREADS sets the default; what is no positive number is ignored."""
+    program = "from etsplat import _native; print(_native.num_threads())"
+
+    def threads(value: str) -> int:
+        result = subprocess.run(
+            [sys.executable, "-c", program], env={"ETSPLAT_NUM_THREADS": value}, capture_output=True, check=True
+        )
+        return int(result.stdout)
+
+    assert threads("3") == 3
+    assert threads("none") == threads("-1") >= 1
