@@ -76,7 +76,7 @@ struct Bilateral {
         g.value = vexp2(scale * power);
         const T decay = g.value * power;
         g.dx = T(-0.5f) * exponent * decay / floored;
-        g.dsigma = decay * log_x * (exponent * exponent) * T(0.125f * kLn2);
+        g.dsigma = decay * log_x * (exponent * exponent) * T(0.25f * kLn2);
         return g;
     }
 

@@ -1,0 +1,37 @@
+#include <nanobind/stl/shared_ptr.h>
+
+#include "bindings.h"
+#include "instruction_set.h"
+#include "raster.h"
+
+namespace etsplat {
+
+void bind_rasterize(nb::module_& m) {
+    m.def("available_instruction_sets", &available_instruction_sets);
+    m.def("instruction_set", &instruction_set);
+    m.def("set_instruction_set", &set_instruction_set, nb::arg("name"));
+
+#define FIELD(name) .def_rw(#name, &RasterCall::name)
+    nb::class_<RasterCall>(m, "RasterCall")
+        .def(nb::init<>()) FIELD(vertices) FIELD(faces) FIELD(num_triangles) FIELD(num_vertices) FIELD(flat_colors)
+        FIELD(corner_colors) FIELD(flat_channels) FIELD(corner_channels) FIELD(opacities) FIELD(sigmas)
+        FIELD(shared_sigma) FIELD(viewmat) FIELD(K) FIELD(background) FIELD(width) FIELD(height) FIELD(kernel)
+        FIELD(distance) FIELD(freeze_incentre) FIELD(near_plane) FIELD(alpha_min) FIELD(alpha_max) FIELD(x_max)
+        FIELD(transmittance_min) FIELD(distortion_near) FIELD(distortion_far) FIELD(centroid_depth)
+        FIELD(keep_for_backward) FIELD(color) FIELD(alpha) FIELD(distortion) FIELD(distortion_totals)
+        FIELD(median_depth) FIELD(max_weight) FIELD(screen_size) FIELD(inradius) FIELD(visible);
+#undef FIELD
+#define FIELD(name) .def_rw(#name, &RasterGradients::name)
+    nb::class_<RasterGradients>(m, "RasterGradients")
+        .def(nb::init<>()) FIELD(grad_color) FIELD(grad_alpha) FIELD(grad_distortion) FIELD(corner_offsets)
+        FIELD(corner_indices) FIELD(vertices) FIELD(flat_colors) FIELD(corner_colors) FIELD(opacities) FIELD(sigmas)
+        FIELD(background) FIELD(viewmat);
+#undef FIELD
+    nb::class_<RasterState>(m, "RasterState")
+        .def_prop_ro("bytes", &RasterState::bytes)
+        .def_prop_ro("num_pairs", [](const RasterState& state) { return state.num_slots; });
+    m.def("raster_forward", &raster_forward, nb::arg("call"), NoGil());
+    m.def("raster_backward", &raster_backward, nb::arg("state"), nb::arg("gradients"), NoGil());
+}
+
+}  // namespace etsplat

@@ -1,0 +1,17 @@
+// Which compiled path of the tile loops runs: the widest that this processor has, unless told otherwise.
+#pragma once
+
+#include <string>
+#include <vector>
+
+#include "raster_pass.h"
+
+namespace etsplat {
+
+std::vector<std::string> available_instruction_sets();  // widest first
+std::string instruction_set();
+void set_instruction_set(const std::string& name);  // "" for the widest; throws std::invalid_argument
+
+const RasterKernels& active_raster_kernels();
+
+}  // namespace etsplat

@@ -1,0 +1,167 @@
+// Forward and backward passes of one view as sequences of stages.
+#include "raster.h"
+
+#include <mutex>
+#include <stdexcept>
+#include <vector>
+
+#include "instruction_set.h"
+
+namespace etsplat {
+namespace {
+
+// States are recycled: their buffers are warm, and a step of training makes no large allocation.
+std::mutex free_mutex;
+std::vector<std::unique_ptr<RasterState>> free_states;
+constexpr size_t kMostFreeStates = 2;
+
+std::shared_ptr<RasterState> acquire_state() {
+    std::unique_ptr<RasterState> state;
+    {
+        std::lock_guard lock(free_mutex);
+        if (!free_states.empty()) {
+            state = std::move(free_states.back());
+            free_states.pop_back();
+        }
+    }
+    if (!state) state = std::make_unique<RasterState>();
+    return {state.release(), [](RasterState* done) {
+                std::unique_ptr<RasterState> owned(done);
+                std::lock_guard lock(free_mutex);
+                if (free_states.size() < kMostFreeStates) free_states.push_back(std::move(owned));
+            }};
+}
+
+PinholeCamera camera_of(const RasterCall& call) {
+    const auto* v = reinterpret_cast<const float*>(call.viewmat);
+    const auto* k = reinterpret_cast<const float*>(call.K);
+    PinholeCamera camera;
+    for (int i = 0; i < 3; ++i) {
+        for (int j = 0; j < 3; ++j) camera.rotation[3 * i + j] = v[4 * i + j];
+        camera.translation[i] = v[4 * i + 3];
+    }
+    camera.fx = k[0];
+    camera.skew = k[1];
+    camera.cx = k[2];
+    camera.fy = k[4];
+    camera.cy = k[5];
+    return camera;
+}
+
+void fill_pass(RasterState& state) {
+    const RasterCall& call = state.call;
+    RasterPass pass;
+    pass.width = call.width;
+    pass.height = call.height;
+    pass.tiles_x = (call.width + kTile - 1) / kTile;
+    pass.tiles_y = (call.height + kTile - 1) / kTile;
+    pass.kernel = call.kernel;
+    pass.flat_channels = call.flat_channels;
+    pass.corner_channels = call.corner_channels;
+    pass.want_distortion = call.distortion != 0;
+    pass.want_median = call.median_depth != 0;
+    if (pass.want_distortion || pass.want_median)
+        pass.distortion_depth = call.centroid_depth ? DistortionDepth::kCentroid : DistortionDepth::kPlane;
+    pass.attributes = call.corner_channels > 0 || pass.distortion_depth == DistortionDepth::kPlane;
+    pass.alpha_min = call.alpha_min;
+    pass.alpha_max = call.alpha_max;
+    pass.transmittance_min = call.transmittance_min;
+    pass.distortion_near = call.distortion_near;
+    pass.distortion_far = call.distortion_far;
+    pass.flat_colors = reinterpret_cast<const float*>(call.flat_colors);
+    pass.corner_colors = reinterpret_cast<const float*>(call.corner_colors);
+    pass.background = reinterpret_cast<const float*>(call.background);
+    pass.color = reinterpret_cast<float*>(call.color);
+    pass.alpha = reinterpret_cast<float*>(call.alpha);
+    pass.distortion = reinterpret_cast<float*>(call.distortion);
+    pass.distortion_totals = reinterpret_cast<float*>(call.distortion_totals);
+    pass.median_depth = reinterpret_cast<float*>(call.median_depth);
+    pass.slot_layout.flat_channels = call.flat_channels;
+    pass.slot_layout.corner_channels = call.corner_channels;
+    pass.slot_layout.attributes = pass.attributes;
+    pass.slot_layout.centroid_z = pass.want_distortion && call.centroid_depth;
+    state.pass = pass;
+}
+
+void run_tiles(RasterState& state, const TileFunction function) {
+    const RasterPass& pass = state.pass;
+    // a little scratch per range of tiles: ranges are few enough to keep it all
+    constexpr int64_t kRange = 4;
+    const int64_t tiles = int64_t{pass.tiles_x} * pass.tiles_y;
+    parallel_for(tiles, kRange, [&](int64_t begin, int64_t end) {
+        thread_local Buffer<float> scratch;
+        scratch.resize(pass.scratch_size());
+        for (int64_t tile = begin; tile < end; ++tile) function(pass, static_cast<int>(tile), scratch.data());
+    });
+}
+
+void reduce_weights(RasterState& state) {
+    auto* out = reinterpret_cast<float*>(state.call.max_weight);
+    parallel_for(state.call.num_triangles, 4096, [&](int64_t begin, int64_t end) {
+        for (int64_t i = begin; i < end; ++i) {
+            float largest = 0.0f;
+            for (int32_t s = state.slot_begin[i]; s < state.slot_begin[i + 1]; ++s)
+                largest = vmax(largest, state.slot_weight[s]);
+            out[i] = largest;
+        }
+    });
+}
+
+}  // namespace
+
+int64_t RasterState::bytes() const {
+    return records.bytes() + attributes.bytes() + keys.bytes() + keys_swap.bytes() + order.bytes() + order_swap.bytes() +
+           tile_count.bytes() + slot_begin.bytes() + slot_tile.bytes() + histogram.bytes() + tile_begin.bytes() +
+           entries.bytes() + hits.bytes() + slot_weight.bytes() + slots.bytes() + corner_gradients.bytes() +
+           tile_background.bytes() + touched.bytes();
+}
+
+std::shared_ptr<RasterState> raster_forward(const RasterCall& call) {
+    auto state = acquire_state();
+    state->call = call;
+    state->camera = camera_of(call);
+    fill_pass(*state);
+    RasterPass& pass = state->pass;
+    state->attributes.resize(pass.attributes || pass.distortion_depth != DistortionDepth::kNone ? call.num_triangles : 0);
+    project_triangles(*state);
+    bin_triangles(*state);
+    pass.records = state->records.data();
+    pass.attribute_records = state->attributes.data();
+    pass.tile_begin = state->tile_begin.data();
+    pass.entries = state->entries.data();
+    if (call.keep_for_backward) {
+        state->hits.resize(state->num_slots);
+        state->hits.fill_zero();
+        pass.hits = state->hits.data();
+    }
+    if (call.max_weight) {
+        state->slot_weight.resize(state->num_slots);
+        state->slot_weight.fill_zero();
+        pass.slot_weight = state->slot_weight.data();
+    }
+    run_tiles(*state, active_raster_kernels().forward[pass.kernel][pass.general()]);
+    if (call.max_weight) reduce_weights(*state);
+    return state;
+}
+
+void raster_backward(RasterState& state, const RasterGradients& gradients) {
+    RasterPass& pass = state.pass;
+    if (!pass.hits) throw std::logic_error("rasterize: this render was made without keep_for_backward");
+    pass.grad_color = reinterpret_cast<const float*>(gradients.grad_color);
+    pass.grad_alpha = reinterpret_cast<const float*>(gradients.grad_alpha);
+    pass.grad_distortion = reinterpret_cast<const float*>(gradients.grad_distortion);
+    state.slots.resize(state.num_slots * pass.slot_layout.stride());
+    state.touched.resize(state.num_slots);
+    state.touched.fill_zero();
+    pass.slots = state.slots.data();
+    pass.touched = state.touched.data();
+    pass.tile_background = nullptr;
+    if (gradients.background) {
+        state.tile_background.resize(int64_t{pass.tiles_x} * pass.tiles_y * pass.channels());
+        pass.tile_background = state.tile_background.data();
+    }
+    run_tiles(state, active_raster_kernels().backward[pass.kernel][pass.general()]);
+    reduce_gradients(state, gradients);
+}
+
+}  // namespace etsplat

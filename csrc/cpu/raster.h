@@ -1,0 +1,80 @@
+// The CPU rasterizer: one call renders one view.
+//
+//   raster_project.cpp   vertices -> TriangleRecord, visibility, statistics
+//   raster_bin.cpp       depth sort, then a stable counting sort of (triangle, tile) pairs by tile
+//   simd/                the tile loops
+//   raster.cpp           forward and backward as sequences of these stages
+//   raster_reduce.cpp    sums of the slots of each triangle -> gradients of vertices, colours, ...
+#pragma once
+
+#include <cstdint>
+#include <memory>
+
+#include "buffer.h"
+#include "math/triangle.h"
+#include "raster_pass.h"
+
+namespace etsplat {
+
+// Everything a call needs, by address; the Python side owns the memory. 0 where an optional tensor is absent.
+struct RasterCall {
+    uintptr_t vertices = 0;  // (N, 3, 3), or (V, 3) with faces
+    uintptr_t faces = 0;     // (N, 3) int32
+    int64_t num_triangles = 0, num_vertices = 0;
+    uintptr_t flat_colors = 0, corner_colors = 0;  // (N, flat_channels), (N, 3, corner_channels)
+    int flat_channels = 0, corner_channels = 0;
+    uintptr_t opacities = 0, sigmas = 0;  // (N), (N) or one
+    bool shared_sigma = false;
+    uintptr_t viewmat = 0, K = 0;   // 16 and 9 floats, row-major
+    uintptr_t background = 0;       // (channels)
+    int width = 0, height = 0, kernel = 0, distance = 0;
+    bool freeze_incentre = false;
+    float near_plane = 0.01f, alpha_min = 0, alpha_max = 1, x_max = 2, transmittance_min = 0;
+    float distortion_near = 0.2f, distortion_far = 100.0f;
+    bool centroid_depth = false;  // depth of distortion and median: the centroid's, not the pixel's
+    bool keep_for_backward = false;
+
+    uintptr_t color = 0, alpha = 0;
+    uintptr_t distortion = 0, distortion_totals = 0, median_depth = 0;
+    uintptr_t max_weight = 0, screen_size = 0, inradius = 0, visible = 0;  // (N) float, float, float, bool
+};
+
+// Gradients in and out; outputs are added to.
+struct RasterGradients {
+    uintptr_t grad_color = 0, grad_alpha = 0, grad_distortion = 0;
+    uintptr_t corner_offsets = 0, corner_indices = 0;  // of each vertex, with faces: where it is used, as 3 face + corner
+    uintptr_t vertices = 0, flat_colors = 0, corner_colors = 0, opacities = 0, sigmas = 0, background = 0;
+    uintptr_t viewmat = 0;  // 16 floats
+};
+
+struct RasterState {
+    RasterCall call;
+    PinholeCamera camera;
+    RasterPass pass;
+    Buffer<TriangleRecord> records;
+    Buffer<AttributeRecord> attributes;
+    Buffer<uint32_t> keys, keys_swap;         // depth bits of the visible triangles
+    Buffer<int32_t> order, order_swap;        // visible triangles, front to back
+    Buffer<int32_t> tile_count, slot_begin;   // per triangle
+    Buffer<int32_t> slot_tile;                // per slot
+    Buffer<int32_t> histogram, tile_begin;
+    Buffer<TileEntry> entries;
+    Buffer<uint16_t> hits;
+    Buffer<float> slot_weight, slots, corner_gradients, tile_background, scratch;
+    Buffer<uint8_t> touched;
+    int64_t num_slots = 0;
+
+    int64_t bytes() const;
+};
+
+void project_triangles(RasterState& state);
+void bin_triangles(RasterState& state);
+void reduce_gradients(RasterState& state, const RasterGradients& gradients);
+
+// The projected triangle, from which reduce_gradients starts again. view: (3, 3).
+bool load_triangle(const RasterState& state, int64_t index, float* view, Triangle2D& triangle);
+
+std::shared_ptr<RasterState> raster_forward(const RasterCall& call);
+void raster_backward(RasterState& state, const RasterGradients& gradients);
+
+}  // namespace etsplat

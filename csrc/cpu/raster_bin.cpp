@@ -1,0 +1,185 @@
+// Stage 2: visible triangles sorted by depth, then their (triangle, tile) pairs by tile, stably.
+//
+// Both sorts are counting sorts over chunks: each chunk counts, the counts are scanned in a fixed order, each chunk
+// scatters. A stable sort has one result, so neither the number of chunks nor of threads can show.
+// Slots (one per pair) are numbered triangle by triangle, so that a triangle's gradients lie together.
+#include <algorithm>
+#include <limits>
+
+#include "raster.h"
+#include "raster_tiles.h"
+
+namespace etsplat {
+namespace {
+
+int chunk_count(int64_t n) { return static_cast<int>(std::clamp<int64_t>(n / 8192, 1, 4 * num_threads())); }
+
+struct Chunks {
+    int64_t n;
+    int count;
+    int64_t begin(int c) const { return n * c / count; }
+};
+
+template <class F>
+void for_chunks(const Chunks& chunks, F&& body) {
+    parallel_for(chunks.count, 1, [&](int64_t first, int64_t last) {
+        for (int64_t c = first; c < last; ++c)
+            body(static_cast<int>(c), chunks.begin(static_cast<int>(c)), chunks.begin(static_cast<int>(c) + 1));
+    });
+}
+
+// Exclusive scan of counts laid out [chunk][bin] into positions, bin-major: all chunks of bin 0, then of bin 1, ...
+// Returns the total; totals of the bins go to bin_begin (bins + 1) if given.
+int64_t scan_counts(int32_t* counts, int chunks, int bins, int32_t* bin_begin) {
+    // groups of bins in parallel: totals of the groups first, then positions inside
+    const int group_size = 512, groups = (bins + group_size - 1) / group_size;
+    std::vector<int64_t> group_total(static_cast<size_t>(groups) + 1, 0);
+    parallel_for(groups, 1, [&](int64_t first, int64_t last) {
+        for (int64_t g = first; g < last; ++g) {
+            const int b0 = static_cast<int>(g) * group_size, b1 = std::min(bins, b0 + group_size);
+            int64_t total = 0;
+            for (int c = 0; c < chunks; ++c)
+                for (int b = b0; b < b1; ++b) total += counts[int64_t{c} * bins + b];
+            group_total[static_cast<size_t>(g) + 1] = total;
+        }
+    });
+    for (int g = 0; g < groups; ++g) group_total[static_cast<size_t>(g) + 1] += group_total[static_cast<size_t>(g)];
+    parallel_for(groups, 1, [&](int64_t first, int64_t last) {
+        for (int64_t g = first; g < last; ++g) {
+            const int b0 = static_cast<int>(g) * group_size, b1 = std::min(bins, b0 + group_size);
+            int32_t position = static_cast<int32_t>(group_total[static_cast<size_t>(g)]);
+            for (int b = b0; b < b1; ++b) {
+                if (bin_begin) bin_begin[b] = position;
+                for (int c = 0; c < chunks; ++c) {
+                    int32_t& count = counts[int64_t{c} * bins + b];
+                    const int32_t n = count;
+                    count = position;
+                    position += n;
+                }
+            }
+        }
+    });
+    const int64_t total = group_total[static_cast<size_t>(groups)];
+    if (bin_begin) bin_begin[bins] = static_cast<int32_t>(total);
+    return total;
+}
+
+// Numbers the slots and compacts the visible triangles, in index order.
+int64_t number_slots(RasterState& state) {
+    const Chunks chunks{state.call.num_triangles, chunk_count(state.call.num_triangles)};
+    std::vector<int64_t> slots(static_cast<size_t>(chunks.count) + 1, 0), visible(slots);
+    for_chunks(chunks, [&](int c, int64_t begin, int64_t end) {
+        int64_t tiles = 0, seen = 0;
+        for (int64_t i = begin; i < end; ++i) {
+            tiles += state.tile_count[i];
+            seen += state.tile_count[i] > 0 ? 1 : 0;
+        }
+        slots[static_cast<size_t>(c) + 1] = tiles;
+        visible[static_cast<size_t>(c) + 1] = seen;
+    });
+    for (int c = 0; c < chunks.count; ++c) {
+        slots[static_cast<size_t>(c) + 1] += slots[static_cast<size_t>(c)];
+        visible[static_cast<size_t>(c) + 1] += visible[static_cast<size_t>(c)];
+    }
+    state.num_slots = slots.back();
+    if (state.num_slots > std::numeric_limits<int32_t>::max())
+        throw std::length_error("rasterize: more than 2^31 (triangle, tile) pairs; render fewer triangles or a smaller image");
+    state.slot_begin.resize(chunks.n + 1);
+    state.slot_tile.resize(state.num_slots);
+    state.order.resize(visible.back());
+    state.keys_swap.resize(visible.back());
+    for_chunks(chunks, [&](int c, int64_t begin, int64_t end) {
+        int32_t slot = static_cast<int32_t>(slots[static_cast<size_t>(c)]);
+        int64_t rank = visible[static_cast<size_t>(c)];
+        for (int64_t i = begin; i < end; ++i) {
+            state.slot_begin[i] = slot;
+            if (state.tile_count[i] == 0) continue;
+            state.order[rank] = static_cast<int32_t>(i);
+            state.keys_swap[rank++] = state.keys[i];
+            for_each_tile(state.records[i], state.pass, [&](int tile) { state.slot_tile[slot++] = tile; });
+        }
+    });
+    state.slot_begin[chunks.n] = static_cast<int32_t>(state.num_slots);
+    state.keys.swap(state.keys_swap);
+    return visible.back();
+}
+
+// Stable radix sort of order by key. Only the bits that differ are sorted by.
+void sort_by_depth(RasterState& state, int64_t n) {
+    if (n < 2) return;
+    const Chunks chunks{n, chunk_count(n)};
+    std::vector<uint32_t> lows(static_cast<size_t>(chunks.count)), highs(lows);
+    for_chunks(chunks, [&](int c, int64_t begin, int64_t end) {
+        uint32_t low = ~0u, high = 0;
+        for (int64_t i = begin; i < end; ++i) {
+            low = std::min(low, state.keys[i]);
+            high = std::max(high, state.keys[i]);
+        }
+        lows[static_cast<size_t>(c)] = low;
+        highs[static_cast<size_t>(c)] = high;
+    });
+    const uint32_t low = *std::min_element(lows.begin(), lows.end());
+    const uint32_t range = *std::max_element(highs.begin(), highs.end()) - low;
+    int bits = 0;
+    while (bits < 32 && (range >> bits) != 0) ++bits;
+    if (bits == 0) return;
+    const int passes = (bits + 10) / 11, digit = (bits + passes - 1) / passes, bins = 1 << digit;
+    state.keys_swap.resize(n);
+    state.order_swap.resize(n);
+    state.histogram.resize(int64_t{chunks.count} * bins);
+    for (int p = 0; p < passes; ++p) {
+        const int shift = p * digit;
+        const auto digit_of = [&](uint32_t key) { return ((key - low) >> shift) & static_cast<uint32_t>(bins - 1); };
+        for_chunks(chunks, [&](int c, int64_t begin, int64_t end) {
+            int32_t* counts = state.histogram.data() + int64_t{c} * bins;
+            std::fill(counts, counts + bins, 0);
+            for (int64_t i = begin; i < end; ++i) ++counts[digit_of(state.keys[i])];
+        });
+        scan_counts(state.histogram.data(), chunks.count, bins, nullptr);
+        for_chunks(chunks, [&](int c, int64_t begin, int64_t end) {
+            int32_t* position = state.histogram.data() + int64_t{c} * bins;
+            for (int64_t i = begin; i < end; ++i) {
+                const int32_t to = position[digit_of(state.keys[i])]++;
+                state.keys_swap[to] = state.keys[i];
+                state.order_swap[to] = state.order[i];
+            }
+        });
+        state.keys.swap(state.keys_swap);
+        state.order.swap(state.order_swap);
+    }
+}
+
+void sort_by_tile(RasterState& state, int64_t n) {
+    const int tiles = state.pass.tiles_x * state.pass.tiles_y;
+    const Chunks chunks{n, chunk_count(n)};
+    state.histogram.resize(int64_t{chunks.count} * tiles);
+    state.tile_begin.resize(tiles + 1);
+    state.entries.resize(state.num_slots);
+    for_chunks(chunks, [&](int c, int64_t begin, int64_t end) {
+        int32_t* counts = state.histogram.data() + int64_t{c} * tiles;
+        std::fill(counts, counts + tiles, 0);
+        for (int64_t r = begin; r < end; ++r) {
+            const int32_t i = state.order[r];
+            for (int32_t slot = state.slot_begin[i]; slot < state.slot_begin[i + 1]; ++slot) ++counts[state.slot_tile[slot]];
+        }
+    });
+    scan_counts(state.histogram.data(), chunks.count, tiles, state.tile_begin.data());
+    for_chunks(chunks, [&](int c, int64_t begin, int64_t end) {
+        int32_t* position = state.histogram.data() + int64_t{c} * tiles;
+        for (int64_t r = begin; r < end; ++r) {
+            const int32_t i = state.order[r];
+            for (int32_t slot = state.slot_begin[i]; slot < state.slot_begin[i + 1]; ++slot)
+                state.entries[position[state.slot_tile[slot]]++] = {i, slot};
+        }
+    });
+}
+
+}  // namespace
+
+void bin_triangles(RasterState& state) {
+    const int64_t visible = number_slots(state);
+    sort_by_depth(state, visible);
+    sort_by_tile(state, visible);
+}
+
+}  // namespace etsplat

@@ -1,0 +1,105 @@
+// What the tile loops (simd/raster_kernels.cpp) read and write: one view, after projection, sorting and binning.
+//
+// The image is cut into tiles of 16x16 pixels, a tile into 16 blocks of 4x4. Both distances of the paper have the form
+// x(p) = max_k g_k . (p - q), so a tile loop knows nothing of vertices: it needs q and the three g_k.
+#pragma once
+
+#include <cstdint>
+
+namespace etsplat {
+
+constexpr int kTile = 16;
+constexpr int kBlocks = 16;  // blocks in a tile, and lanes in a block
+constexpr int kMaxFastChannels = 3;
+
+// One cache line.
+struct alignas(64) TriangleRecord {
+    float qx, qy;                    // the point where x = 0: mean of the vertices, or incentre
+    float gx[3], gy[3];              // x(p) = max_k g_k . (p - q)
+    float extent;                    // largest visible x
+    float opacity;
+    float exponent, scale;           // KernelCoefficients
+    float left, right, top, bottom;  // bounding box of {x <= extent}, relative to q
+};
+
+// For what is interpolated over a triangle: a_k(p) = 1/3 + grad a_k . (p - c), c the mean of the vertices.
+struct alignas(64) AttributeRecord {
+    float ax[3], ay[3];        // grad a_k
+    float inverse_z[3];        // 1 / view depth of the vertices
+    float offset_x, offset_y;  // q - c
+    float centroid_z;
+    float padding[4];
+};
+
+struct TileEntry {
+    int32_t triangle;
+    int32_t slot;  // of the gradients; a triangle's slots are consecutive
+};
+
+enum class DistortionDepth : int { kNone, kPlane, kCentroid };
+
+// Where a slot keeps its sums over pixels. With dx = dL/dx of a pixel at p whose largest form is k:
+// moment[k] = sum dx, moment_x/y[k] = sum dx (p - q).
+struct SlotLayout {
+    static constexpr int kMoment = 0, kMomentX = 3, kMomentY = 6, kOpacity = 9, kSigma = 10, kFlat = 11;
+    int flat_channels = 0, corner_channels = 0;
+    bool attributes = false, centroid_z = false;
+
+    // the same three moments of dL/d a_k, then dL/d(1/z_k), then the corner colours, corner-major
+    int barycentric() const { return kFlat + flat_channels; }
+    int inverse_z() const { return barycentric() + 9; }
+    int corner() const { return inverse_z() + 3; }
+    int depth() const { return attributes ? corner() + 3 * corner_channels : kFlat + flat_channels; }
+    int size() const { return depth() + (centroid_z ? 1 : 0); }
+    int stride() const { return (size() + 15) / 16 * 16; }
+};
+
+struct RasterPass {
+    int width = 0, height = 0, tiles_x = 0, tiles_y = 0;
+    int kernel = 0;
+    int flat_channels = 0, corner_channels = 0;
+    bool attributes = false;  // anything interpolated: corner colours, or distortion with per-pixel depth
+    DistortionDepth distortion_depth = DistortionDepth::kNone;
+    bool want_distortion = false, want_median = false;
+    float alpha_min = 0, alpha_max = 1, transmittance_min = 0;
+    float distortion_near = 0.2f, distortion_far = 100.0f;
+
+    const TriangleRecord* records = nullptr;
+    const AttributeRecord* attribute_records = nullptr;
+    const float* flat_colors = nullptr;    // (N, flat_channels)
+    const float* corner_colors = nullptr;  // (N, 3, corner_channels)
+    const float* background = nullptr;     // (channels) or null for black
+    const int32_t* tile_begin = nullptr;   // (tiles + 1)
+    const TileEntry* entries = nullptr;    // by tile, front to back
+    uint16_t* hits = nullptr;              // per slot: blocks in which the triangle was drawn or stopped a pixel
+    float* slot_weight = nullptr;          // per slot: largest blend weight, or null
+
+    float* color = nullptr;                   // (H, W, flat + corner channels)
+    float* alpha = nullptr;                   // (H, W)
+    float* distortion = nullptr;              // (H, W) or null
+    float* distortion_totals = nullptr;       // (H, W, 2): sum w m, sum w m^2
+    float* median_depth = nullptr;            // (H, W) or null
+
+    // backward
+    const float* grad_color = nullptr;
+    const float* grad_alpha = nullptr;       // or null
+    const float* grad_distortion = nullptr;  // or null
+    SlotLayout slot_layout;
+    float* slots = nullptr;                  // (slots, stride)
+    uint8_t* touched = nullptr;              // per slot: did the backward pass write it?
+    float* tile_background = nullptr;        // (tiles, channels) or null
+
+    int channels() const { return flat_channels + corner_channels; }
+    bool general() const { return channels() != kMaxFastChannels || corner_channels > 0 || want_distortion || want_median; }
+    // floats of scratch memory that a tile loop needs
+    int64_t scratch_size() const { return 16384 + int64_t{768} * channels() + 64 * slot_layout.stride(); }
+};
+
+using TileFunction = void (*)(const RasterPass& pass, int tile, float* scratch);
+
+struct RasterKernels {
+    TileFunction forward[4][2];  // [kernel][general]
+    TileFunction backward[4][2];
+};
+
+}  // namespace etsplat

@@ -1,0 +1,48 @@
+// AVX2 + FMA registers for pack.h: eight lanes in a register, masks in registers.
+#pragma once
+
+#include <immintrin.h>
+
+namespace etsplat::avx2 {
+
+constexpr int kRegisters = 2;
+using Register = __m256;
+using Mask = __m256;
+
+ETSPLAT_FN Register r_set(float a) { return _mm256_set1_ps(a); }
+ETSPLAT_FN Register r_load(const float* p) { return _mm256_loadu_ps(p); }
+ETSPLAT_FN void r_store(float* p, Register a) { _mm256_storeu_ps(p, a); }
+ETSPLAT_FN Register r_add(Register a, Register b) { return _mm256_add_ps(a, b); }
+ETSPLAT_FN Register r_sub(Register a, Register b) { return _mm256_sub_ps(a, b); }
+ETSPLAT_FN Register r_mul(Register a, Register b) { return _mm256_mul_ps(a, b); }
+ETSPLAT_FN Register r_div(Register a, Register b) { return _mm256_div_ps(a, b); }
+ETSPLAT_FN Register r_fma(Register a, Register b, Register c) { return _mm256_fmadd_ps(a, b, c); }
+ETSPLAT_FN Register r_min(Register a, Register b) { return _mm256_min_ps(a, b); }
+ETSPLAT_FN Register r_max(Register a, Register b) { return _mm256_max_ps(a, b); }
+ETSPLAT_FN Register r_round(Register a) { return _mm256_round_ps(a, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC); }
+ETSPLAT_FN Mask r_lt(Register a, Register b) { return _mm256_cmp_ps(a, b, _CMP_LT_OQ); }
+ETSPLAT_FN Mask r_le(Register a, Register b) { return _mm256_cmp_ps(a, b, _CMP_LE_OQ); }
+ETSPLAT_FN Register r_select(Mask m, Register a, Register b) { return _mm256_blendv_ps(b, a, m); }
+ETSPLAT_FN Register r_keep(Mask m, Register a) { return _mm256_and_ps(m, a); }
+ETSPLAT_FN Mask m_and(Mask a, Mask b) { return _mm256_and_ps(a, b); }
+ETSPLAT_FN Mask m_or(Mask a, Mask b) { return _mm256_or_ps(a, b); }
+ETSPLAT_FN Mask m_andnot(Mask a, Mask b) { return _mm256_andnot_ps(b, a); }
+ETSPLAT_FN unsigned m_bits(Mask a) { return static_cast<unsigned>(_mm256_movemask_ps(a)); }
+ETSPLAT_FN Mask m_from_bits(unsigned bits) {
+    const __m256i lane_bit = _mm256_setr_epi32(1, 2, 4, 8, 16, 32, 64, 128);
+    const __m256i set = _mm256_and_si256(_mm256_set1_epi32(static_cast<int>(bits)), lane_bit);
+    return _mm256_castsi256_ps(_mm256_cmpeq_epi32(set, lane_bit));
+}
+
+ETSPLAT_FN void r_split(Register x, Register& mantissa, Register& exponent) {
+    const __m256i bits = _mm256_castps_si256(x);
+    const __m256i e = _mm256_srai_epi32(_mm256_sub_epi32(bits, _mm256_set1_epi32(0x3f400000)), 23);
+    mantissa = _mm256_castsi256_ps(_mm256_sub_epi32(bits, _mm256_slli_epi32(e, 23)));
+    exponent = _mm256_cvtepi32_ps(e);
+}
+ETSPLAT_FN Register r_scale(Register a, Register n) {
+    return _mm256_castsi256_ps(
+        _mm256_add_epi32(_mm256_castps_si256(a), _mm256_slli_epi32(_mm256_cvtps_epi32(n), 23)));
+}
+
+}  // namespace etsplat::avx2

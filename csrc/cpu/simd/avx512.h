@@ -1,0 +1,59 @@
+// AVX-512 registers for pack.h: sixteen lanes in one register, masks in mask registers.
+#pragma once
+
+#include <immintrin.h>
+
+namespace etsplat::avx512 {
+
+constexpr int kRegisters = 1;
+using Register = __m512;
+using Mask = __mmask16;
+
+ETSPLAT_FN Register r_set(float a) { return _mm512_set1_ps(a); }
+ETSPLAT_FN Register r_load(const float* p) { return _mm512_loadu_ps(p); }
+ETSPLAT_FN void r_store(float* p, Register a) { _mm512_storeu_ps(p, a); }
+ETSPLAT_FN Register r_add(Register a, Register b) { return _mm512_add_ps(a, b); }
+ETSPLAT_FN Register r_sub(Register a, Register b) { return _mm512_sub_ps(a, b); }
+ETSPLAT_FN Register r_mul(Register a, Register b) { return _mm512_mul_ps(a, b); }
+ETSPLAT_FN Register r_div(Register a, Register b) { return _mm512_div_ps(a, b); }
+ETSPLAT_FN Register r_fma(Register a, Register b, Register c) { return _mm512_fmadd_ps(a, b, c); }
+ETSPLAT_FN Register r_min(Register a, Register b) { return _mm512_min_ps(a, b); }
+ETSPLAT_FN Register r_max(Register a, Register b) { return _mm512_max_ps(a, b); }
+ETSPLAT_FN Register r_round(Register a) { return _mm512_roundscale_ps(a, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC); }
+ETSPLAT_FN Mask r_lt(Register a, Register b) { return _mm512_cmp_ps_mask(a, b, _CMP_LT_OQ); }
+ETSPLAT_FN Mask r_le(Register a, Register b) { return _mm512_cmp_ps_mask(a, b, _CMP_LE_OQ); }
+ETSPLAT_FN Register r_select(Mask m, Register a, Register b) { return _mm512_mask_blend_ps(m, b, a); }
+ETSPLAT_FN Register r_keep(Mask m, Register a) { return _mm512_maskz_mov_ps(m, a); }
+ETSPLAT_FN Mask m_and(Mask a, Mask b) { return static_cast<Mask>(a & b); }
+ETSPLAT_FN Mask m_or(Mask a, Mask b) { return static_cast<Mask>(a | b); }
+ETSPLAT_FN Mask m_andnot(Mask a, Mask b) { return static_cast<Mask>(a & ~b); }
+ETSPLAT_FN unsigned m_bits(Mask a) { return a; }
+ETSPLAT_FN Mask m_from_bits(unsigned bits) { return static_cast<Mask>(bits); }
+
+// x = mantissa 2^exponent with mantissa in [3/4, 3/2]
+ETSPLAT_FN void r_split(Register x, Register& mantissa, Register& exponent) {
+    exponent = _mm512_getexp_ps(_mm512_mul_ps(x, _mm512_set1_ps(4.0f / 3.0f)));
+    mantissa = _mm512_scalef_ps(x, _mm512_sub_ps(_mm512_setzero_ps(), exponent));
+}
+// a 2^n for an integral n
+ETSPLAT_FN Register r_scale(Register a, Register n) { return _mm512_scalef_ps(a, n); }
+
+// Sums of the lanes of sixteen vectors, in order.
+ETSPLAT_FN Register r_column_sums(const Register v[16]) {
+    Register pairs[8], quads[4], halves[2];
+    for (int i = 0; i < 8; ++i)
+        pairs[i] = _mm512_add_ps(_mm512_unpacklo_ps(v[2 * i], v[2 * i + 1]), _mm512_unpackhi_ps(v[2 * i], v[2 * i + 1]));
+    for (int i = 0; i < 4; ++i) {
+        const __m512d a = _mm512_castps_pd(pairs[2 * i]), b = _mm512_castps_pd(pairs[2 * i + 1]);
+        quads[i] = _mm512_add_ps(_mm512_castpd_ps(_mm512_unpacklo_pd(a, b)), _mm512_castpd_ps(_mm512_unpackhi_pd(a, b)));
+    }
+    // quads[i] holds, in each 128-bit part, partial sums of vectors 4i .. 4i+3.
+    for (int i = 0; i < 2; ++i) {
+        const Register a = quads[2 * i], b = quads[2 * i + 1];
+        halves[i] = _mm512_add_ps(_mm512_shuffle_f32x4(a, b, 0x88), _mm512_shuffle_f32x4(a, b, 0xdd));
+    }
+    return _mm512_add_ps(_mm512_shuffle_f32x4(halves[0], halves[1], 0x88),
+                         _mm512_shuffle_f32x4(halves[0], halves[1], 0xdd));
+}
+
+}  // namespace etsplat::avx512

@@ -1,0 +1,51 @@
+// AArch64 NEON registers for pack.h: four lanes in a register, masks in integer registers.
+#pragma once
+
+#include <arm_neon.h>
+
+namespace etsplat::neon {
+
+constexpr int kRegisters = 4;
+using Register = float32x4_t;
+struct Mask {
+    uint32x4_t v;
+};
+
+ETSPLAT_FN Register r_set(float a) { return vdupq_n_f32(a); }
+ETSPLAT_FN Register r_load(const float* p) { return vld1q_f32(p); }
+ETSPLAT_FN void r_store(float* p, Register a) { vst1q_f32(p, a); }
+ETSPLAT_FN Register r_add(Register a, Register b) { return vaddq_f32(a, b); }
+ETSPLAT_FN Register r_sub(Register a, Register b) { return vsubq_f32(a, b); }
+ETSPLAT_FN Register r_mul(Register a, Register b) { return vmulq_f32(a, b); }
+ETSPLAT_FN Register r_div(Register a, Register b) { return vdivq_f32(a, b); }
+ETSPLAT_FN Register r_fma(Register a, Register b, Register c) { return vfmaq_f32(c, a, b); }
+ETSPLAT_FN Register r_min(Register a, Register b) { return vminq_f32(a, b); }
+ETSPLAT_FN Register r_max(Register a, Register b) { return vmaxq_f32(a, b); }
+ETSPLAT_FN Register r_round(Register a) { return vrndnq_f32(a); }
+ETSPLAT_FN Mask r_lt(Register a, Register b) { return {vcltq_f32(a, b)}; }
+ETSPLAT_FN Mask r_le(Register a, Register b) { return {vcleq_f32(a, b)}; }
+ETSPLAT_FN Register r_select(Mask m, Register a, Register b) { return vbslq_f32(m.v, a, b); }
+ETSPLAT_FN Register r_keep(Mask m, Register a) {
+    return vreinterpretq_f32_u32(vandq_u32(m.v, vreinterpretq_u32_f32(a)));
+}
+ETSPLAT_FN Mask m_and(Mask a, Mask b) { return {vandq_u32(a.v, b.v)}; }
+ETSPLAT_FN Mask m_or(Mask a, Mask b) { return {vorrq_u32(a.v, b.v)}; }
+ETSPLAT_FN Mask m_andnot(Mask a, Mask b) { return {vbicq_u32(a.v, b.v)}; }
+ETSPLAT_FN uint32x4_t lane_bits() {
+    const uint32_t bits[4] = {1, 2, 4, 8};
+    return vld1q_u32(bits);
+}
+ETSPLAT_FN unsigned m_bits(Mask a) { return vaddvq_u32(vandq_u32(a.v, lane_bits())); }
+ETSPLAT_FN Mask m_from_bits(unsigned bits) { return {vtstq_u32(vdupq_n_u32(bits), lane_bits())}; }
+
+ETSPLAT_FN void r_split(Register x, Register& mantissa, Register& exponent) {
+    const int32x4_t bits = vreinterpretq_s32_f32(x);
+    const int32x4_t e = vshrq_n_s32(vsubq_s32(bits, vdupq_n_s32(0x3f400000)), 23);
+    mantissa = vreinterpretq_f32_s32(vsubq_s32(bits, vshlq_n_s32(e, 23)));
+    exponent = vcvtq_f32_s32(e);
+}
+ETSPLAT_FN Register r_scale(Register a, Register n) {
+    return vreinterpretq_f32_s32(vaddq_s32(vreinterpretq_s32_f32(a), vshlq_n_s32(vcvtnq_s32_f32(n), 23)));
+}
+
+}  // namespace etsplat::neon

@@ -1,0 +1,165 @@
+// Sixteen float lanes on every instruction set: one AVX-512 register, two of AVX2, four of NEON, or plain C++.
+//
+// The engine is written once against Vec and VecMask. ETSPLAT_SIMD names the instruction set that this translation unit
+// is compiled for (CMakeLists.txt); everything lives in the namespace of that name, so that no function compiled for a
+// wide instruction set can be linked into a narrow one. For the same reason these headers use no std:: templates.
+#pragma once
+
+#include "math/portable.h"
+
+#define ETSPLAT_STRING_(x) #x
+#define ETSPLAT_STRING(x) ETSPLAT_STRING_(x)
+#define ETSPLAT_SIMD_HEADER(x) ETSPLAT_STRING(x.h)
+#include ETSPLAT_SIMD_HEADER(ETSPLAT_SIMD)
+
+namespace etsplat::ETSPLAT_SIMD {
+
+constexpr int kLanes = 16;
+constexpr int kLanesPerRegister = kLanes / kRegisters;
+
+struct VecMask {
+    Mask m[kRegisters];
+
+    ETSPLAT_FN unsigned bits() const {
+        unsigned bits = 0;
+        for (int i = 0; i < kRegisters; ++i) bits |= m_bits(m[i]) << (i * kLanesPerRegister);
+        return bits;
+    }
+    ETSPLAT_FN static VecMask from_bits(unsigned bits) {
+        VecMask mask;
+        for (int i = 0; i < kRegisters; ++i) mask.m[i] = m_from_bits(bits >> (i * kLanesPerRegister));
+        return mask;
+    }
+};
+
+struct Vec {
+    Register r[kRegisters];
+
+    Vec() = default;
+    ETSPLAT_FN explicit Vec(float a) {
+        for (int i = 0; i < kRegisters; ++i) r[i] = r_set(a);
+    }
+    ETSPLAT_FN static Vec load(const float* p) {
+        Vec v;
+        for (int i = 0; i < kRegisters; ++i) v.r[i] = r_load(p + i * kLanesPerRegister);
+        return v;
+    }
+    ETSPLAT_FN void store(float* p) const {
+        for (int i = 0; i < kRegisters; ++i) r_store(p + i * kLanesPerRegister, r[i]);
+    }
+};
+
+#define ETSPLAT_LANEWISE(name, op)                                          \
+    ETSPLAT_FN Vec name(Vec a, Vec b) {                                     \
+        for (int i = 0; i < kRegisters; ++i) a.r[i] = op(a.r[i], b.r[i]);   \
+        return a;                                                           \
+    }
+ETSPLAT_LANEWISE(operator+, r_add)
+ETSPLAT_LANEWISE(operator-, r_sub)
+ETSPLAT_LANEWISE(operator*, r_mul)
+ETSPLAT_LANEWISE(operator/, r_div)
+ETSPLAT_LANEWISE(vmin, r_min)
+ETSPLAT_LANEWISE(vmax, r_max)
+#undef ETSPLAT_LANEWISE
+
+#define ETSPLAT_COMPARE(name, op)                                           \
+    ETSPLAT_FN VecMask name(Vec a, Vec b) {                                 \
+        VecMask mask;                                                       \
+        for (int i = 0; i < kRegisters; ++i) mask.m[i] = op(a.r[i], b.r[i]); \
+        return mask;                                                        \
+    }
+ETSPLAT_COMPARE(operator<, r_lt)
+ETSPLAT_COMPARE(operator<=, r_le)
+#undef ETSPLAT_COMPARE
+ETSPLAT_FN VecMask operator>(Vec a, Vec b) { return b < a; }
+ETSPLAT_FN VecMask operator>=(Vec a, Vec b) { return b <= a; }
+
+#define ETSPLAT_MASKWISE(name, op)                                          \
+    ETSPLAT_FN VecMask name(VecMask a, VecMask b) {                         \
+        for (int i = 0; i < kRegisters; ++i) a.m[i] = op(a.m[i], b.m[i]);   \
+        return a;                                                           \
+    }
+ETSPLAT_MASKWISE(operator&, m_and)
+ETSPLAT_MASKWISE(operator|, m_or)
+ETSPLAT_MASKWISE(and_not, m_andnot)
+#undef ETSPLAT_MASKWISE
+
+// a b + c, with one rounding where the instruction set has it
+ETSPLAT_FN Vec vfma(Vec a, Vec b, Vec c) {
+    for (int i = 0; i < kRegisters; ++i) c.r[i] = r_fma(a.r[i], b.r[i], c.r[i]);
+    return c;
+}
+ETSPLAT_FN Vec vselect(VecMask mask, Vec a, Vec b) {
+    for (int i = 0; i < kRegisters; ++i) a.r[i] = r_select(mask.m[i], a.r[i], b.r[i]);
+    return a;
+}
+// a where mask, else 0
+ETSPLAT_FN Vec keep(VecMask mask, Vec a) {
+    for (int i = 0; i < kRegisters; ++i) a.r[i] = r_keep(mask.m[i], a.r[i]);
+    return a;
+}
+ETSPLAT_FN Vec vround(Vec a) {
+    for (int i = 0; i < kRegisters; ++i) a.r[i] = r_round(a.r[i]);
+    return a;
+}
+
+// log2 of a positive normal number: minimax polynomial of log2(1 + t) / t on [-1/4, 1/2], relative error 1.8e-7.
+ETSPLAT_FN Vec vlog2(Vec x) {
+    Vec mantissa, exponent;
+    for (int i = 0; i < kRegisters; ++i) r_split(x.r[i], mantissa.r[i], exponent.r[i]);
+    const Vec t = mantissa - Vec(1.0f);
+    Vec p = Vec(-0.0958695665f);
+    p = vfma(p, t, Vec(0.203868653f));
+    p = vfma(p, t, Vec(-0.250627248f));
+    p = vfma(p, t, Vec(0.290098712f));
+    p = vfma(p, t, Vec(-0.36033908f));
+    p = vfma(p, t, Vec(0.480846831f));
+    p = vfma(p, t, Vec(-0.721350623f));
+    p = vfma(p, t, Vec(1.44269525f));
+    return vfma(p, t, exponent);
+}
+
+// 2^x with x clamped to [-126, 126]: minimax polynomial on [-1/2, 1/2], relative error 1e-7.
+ETSPLAT_FN Vec vexp2(Vec x) {
+    x = vmin(vmax(x, Vec(-126.0f)), Vec(126.0f));
+    const Vec n = vround(x);
+    const Vec f = x - n;
+    Vec p = Vec(0.00132764188f);
+    p = vfma(p, f, Vec(0.00967554163f));
+    p = vfma(p, f, Vec(0.0555071344f));
+    p = vfma(p, f, Vec(0.240221197f));
+    p = vfma(p, f, Vec(0.693146967f));
+    p = vfma(p, f, Vec(1.00000007f));
+    for (int i = 0; i < kRegisters; ++i) p.r[i] = r_scale(p.r[i], n.r[i]);
+    return p;
+}
+
+ETSPLAT_FN float lane_sum(Vec a) {
+    float lanes[kLanes];
+    a.store(lanes);
+    for (int width = kLanes / 2; width > 0; width /= 2)
+        for (int i = 0; i < width; ++i) lanes[i] += lanes[i + width];
+    return lanes[0];
+}
+
+ETSPLAT_FN float lane_max(Vec a) {
+    float lanes[kLanes];
+    a.store(lanes);
+    for (int width = kLanes / 2; width > 0; width /= 2)
+        for (int i = 0; i < width; ++i) lanes[i] = etsplat::vmax(lanes[i], lanes[i + width]);
+    return lanes[0];
+}
+
+// out[i] = sum of the lanes of v[i], i < 16. (A template, so that r_column_sums is needed only where it exists.)
+template <class R = Register>
+ETSPLAT_FN void column_sums(const Vec v[kLanes], float* out) {
+    if constexpr (kRegisters == 1) {
+        R registers[kLanes];
+        for (int i = 0; i < kLanes; ++i) registers[i] = v[i].r[0];
+        r_store(out, r_column_sums(registers));
+    } else {
+        for (int i = 0; i < kLanes; ++i) out[i] = lane_sum(v[i]);
+    }
+}
+
+}  // namespace etsplat::ETSPLAT_SIMD

@@ -1,0 +1,17 @@
+// The tile loops for one instruction set. CMake compiles this file once for each (ETSPLAT_SIMD).
+#include "raster_kernels.h"
+
+#include "tile_backward.h"
+#include "tile_forward.h"
+
+namespace etsplat::ETSPLAT_SIMD {
+
+RasterKernels raster_kernels() {
+#define ETSPLAT_FORWARD(K) {forward_tile<K, false>, forward_tile<K, true>},
+#define ETSPLAT_BACKWARD(K) {backward_tile<K, false>, backward_tile<K, true>},
+    return {{ETSPLAT_KERNELS(ETSPLAT_FORWARD)}, {ETSPLAT_KERNELS(ETSPLAT_BACKWARD)}};
+#undef ETSPLAT_FORWARD
+#undef ETSPLAT_BACKWARD
+}
+
+}  // namespace etsplat::ETSPLAT_SIMD

@@ -1,0 +1,131 @@
+// Geometry of a tile in lanes: which pixels a block holds, and which blocks a triangle can touch.
+#pragma once
+
+#include "cpu/raster_pass.h"
+#include "math/kernels.h"
+#include "pack.h"
+
+namespace etsplat::ETSPLAT_SIMD {
+
+// Offsets of the lanes in a block and of the block centres in a tile, in pixels from the first pixel centre.
+alignas(64) constexpr float kLaneX[16] = {-1.5f, -.5f, .5f, 1.5f, -1.5f, -.5f, .5f, 1.5f,
+                                          -1.5f, -.5f, .5f, 1.5f, -1.5f, -.5f, .5f, 1.5f};
+alignas(64) constexpr float kLaneY[16] = {-1.5f, -1.5f, -1.5f, -1.5f, -.5f, -.5f, -.5f, -.5f,
+                                          .5f,   .5f,   .5f,   .5f,   1.5f, 1.5f, 1.5f, 1.5f};
+alignas(64) constexpr float kBlockX[16] = {1.5f, 5.5f, 9.5f, 13.5f, 1.5f, 5.5f, 9.5f, 13.5f,
+                                           1.5f, 5.5f, 9.5f, 13.5f, 1.5f, 5.5f, 9.5f, 13.5f};
+alignas(64) constexpr float kBlockY[16] = {1.5f, 1.5f, 1.5f,  1.5f,  5.5f,  5.5f,  5.5f,  5.5f,
+                                           9.5f, 9.5f, 9.5f, 9.5f, 13.5f, 13.5f, 13.5f, 13.5f};
+constexpr float kBlockReach = 1.5f;
+
+struct TileFrame {
+    int x0, y0;           // first pixel
+    int columns, rows;    // pixels inside the image
+
+    ETSPLAT_FN TileFrame(const RasterPass& pass, int tile)
+        : x0(tile % pass.tiles_x * kTile), y0(tile / pass.tiles_x * kTile) {
+        columns = pass.width - x0 < kTile ? pass.width - x0 : kTile;
+        rows = pass.height - y0 < kTile ? pass.height - y0 : kTile;
+    }
+    ETSPLAT_FN bool whole() const { return columns == kTile && rows == kTile; }
+    // Lanes of a block that lie inside the image
+    ETSPLAT_FN unsigned inside(int block) const {
+        unsigned bits = 0;
+        for (int lane = 0; lane < 16; ++lane) {
+            const bool in = block % 4 * 4 + lane % 4 < columns && block / 4 * 4 + lane / 4 < rows;
+            bits |= (in ? 1u : 0u) << lane;
+        }
+        return bits;
+    }
+    // Index of the first pixel of a block row in an image of the given width
+    ETSPLAT_FN long pixel(int block, int row, int width) const {
+        return static_cast<long>(y0 + block / 4 * 4 + row) * width + x0 + block % 4 * 4;
+    }
+    ETSPLAT_FN int row_count(int block) const { return clamp4(rows - block / 4 * 4); }
+    ETSPLAT_FN int column_count(int block) const { return clamp4(columns - block % 4 * 4); }
+
+private:
+    ETSPLAT_FN static int clamp4(int n) { return n < 0 ? 0 : n > 4 ? 4 : n; }
+};
+
+// The three forms g_k . (p - q) of a triangle over one tile.
+struct TriangleForms {
+    float at_block[3][16];  // values at the block centres
+    Vec in_block[3];        // differences of the lanes to the block centre
+    float center_x, center_y;  // first pixel centre - q
+
+    // Returns the blocks that the triangle can touch: where the smallest value that each form takes in the block is
+    // within the extent, and the bounding boxes overlap. Conservative.
+    ETSPLAT_FN unsigned blocks(const TriangleRecord& record, const TileFrame& frame) {
+        center_x = static_cast<float>(frame.x0) + 0.5f - record.qx;
+        center_y = static_cast<float>(frame.y0) + 0.5f - record.qy;
+        const Vec x = Vec::load(kBlockX) + Vec(center_x);
+        const Vec y = Vec::load(kBlockY) + Vec(center_y);
+        const Vec reach(kBlockReach);
+        VecMask mask = (x + reach >= Vec(record.left)) & (x - reach <= Vec(record.right)) &
+                       (y + reach >= Vec(record.top)) & (y - reach <= Vec(record.bottom));
+        for (int k = 0; k < 3; ++k) {
+            const Vec form = vfma(Vec(record.gx[k]), x, Vec(record.gy[k]) * y);
+            const float slack = kBlockReach * (etsplat::vabs(record.gx[k]) + etsplat::vabs(record.gy[k]));
+            mask = mask & (form - Vec(slack) <= Vec(record.extent));
+            form.store(at_block[k]);
+        }
+        return mask.bits();
+    }
+    ETSPLAT_FN void prepare_lanes(const TriangleRecord& record) {
+        const Vec x = Vec::load(kLaneX), y = Vec::load(kLaneY);
+        for (int k = 0; k < 3; ++k) in_block[k] = vfma(Vec(record.gx[k]), x, Vec(record.gy[k]) * y);
+    }
+    ETSPLAT_FN Vec value(int k, int block) const { return Vec(at_block[k][block]) + in_block[k]; }
+    // p - q of the lanes
+    ETSPLAT_FN Vec dx(int block) const { return Vec::load(kLaneX) + Vec(center_x + kBlockX[block]); }
+    ETSPLAT_FN Vec dy(int block) const { return Vec::load(kLaneY) + Vec(center_y + kBlockY[block]); }
+};
+
+// What is interpolated: clamped, renormalised, perspective-correct barycentrics and the depth of the plane.
+struct Interpolation {
+    Vec clamped[3];  // max(a_k, 0)
+    VecMask positive[3];
+    Vec inverse_z_sum;  // U = sum max(a_k, 0) / z_k
+    Vec sum;            // A = sum max(a_k, 0)
+    Vec weight[3];      // b_k = max(a_k, 0) / z_k / U
+
+    ETSPLAT_FN void evaluate(const AttributeRecord& record, Vec dx, Vec dy) {
+        const Vec x = dx + Vec(record.offset_x), y = dy + Vec(record.offset_y);
+        sum = Vec(0.0f);
+        inverse_z_sum = Vec(0.0f);
+        for (int k = 0; k < 3; ++k) {
+            const Vec a = vfma(Vec(record.ax[k]), x, vfma(Vec(record.ay[k]), y, Vec(1.0f / 3.0f)));
+            positive[k] = a > Vec(0.0f);
+            clamped[k] = vmax(a, Vec(0.0f));
+            weight[k] = clamped[k] * Vec(record.inverse_z[k]);
+            sum = sum + clamped[k];
+            inverse_z_sum = inverse_z_sum + weight[k];
+        }
+        for (int k = 0; k < 3; ++k) weight[k] = weight[k] / inverse_z_sum;
+    }
+    ETSPLAT_FN Vec depth() const { return sum / inverse_z_sum; }
+};
+
+// Depth mapped to [0, 1] for the distortion: m = far / (far - near) (1 - near / z).
+ETSPLAT_FN Vec distortion_coordinate(const RasterPass& pass, Vec inverse_z) {
+    const float scale = pass.distortion_far / (pass.distortion_far - pass.distortion_near);
+    return vfma(Vec(-scale * pass.distortion_near), inverse_z, Vec(scale));
+}
+
+template <class F>
+ETSPLAT_FN void for_each_bit(unsigned bits, F&& body) {
+    while (bits != 0) {
+#if defined(_MSC_VER) && !defined(__clang__)
+        unsigned long index;
+        _BitScanForward(&index, bits);
+        const int block = static_cast<int>(index);
+#else
+        const int block = __builtin_ctz(bits);
+#endif
+        bits &= bits - 1;
+        body(block);
+    }
+}
+
+}  // namespace etsplat::ETSPLAT_SIMD

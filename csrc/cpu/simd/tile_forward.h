@@ -1,0 +1,159 @@
+// Front-to-back compositing of one tile (paper, equation 1).
+//
+// For each triangle of the tile's list, one vector test over the 16 blocks finds those it can touch; then each of these
+// blocks is one vector of 16 pixels. Colour and transmittance of the tile stay in the first-level cache. A pixel whose
+// next transmittance would fall below the limit is dead from then on; dead blocks, then the dead tile, end the work.
+#pragma once
+
+#include "tile.h"
+
+namespace etsplat::ETSPLAT_SIMD {
+
+// Per-pixel state of a tile during the forward pass, in blocks of 16 lanes.
+struct ForwardTile {
+    float transmittance[kBlocks][16];
+    float weighted_depth[kBlocks][16];   // sum w m and sum w m^2 of the distortion
+    float weighted_square[kBlocks][16];
+    float distortion[kBlocks][16];
+    float median[kBlocks][16];
+    uint16_t alive[kBlocks];
+    unsigned alive_blocks;
+    float* color;  // [channel][block][16]
+
+    ETSPLAT_FN float* channel(int c, int block) { return color + (c * kBlocks + block) * 16; }
+};
+
+ETSPLAT_FN void begin(ForwardTile& tile, const TileFrame& frame, int channels, bool general) {
+    tile.alive_blocks = 0;
+    for (int block = 0; block < kBlocks; ++block) {
+        Vec(1.0f).store(tile.transmittance[block]);
+        const unsigned inside = frame.whole() ? 0xffffu : frame.inside(block);
+        tile.alive[block] = static_cast<uint16_t>(inside);
+        tile.alive_blocks |= (inside != 0 ? 1u : 0u) << block;
+        for (int c = 0; c < channels; ++c) Vec(0.0f).store(tile.channel(c, block));
+        if (general) {
+            Vec(0.0f).store(tile.weighted_depth[block]);
+            Vec(0.0f).store(tile.weighted_square[block]);
+            Vec(0.0f).store(tile.distortion[block]);
+            Vec(0.0f).store(tile.median[block]);
+        }
+    }
+}
+
+// Interpolated channels, distortion and median depth of the pixels of one block, drawn with weights w (0 elsewhere).
+ETSPLAT_FN void draw_extras(const RasterPass& pass, ForwardTile& tile, const TriangleForms& forms, int triangle, int block,
+                            Vec transmittance, Vec w) {
+    if (!pass.attributes && !pass.want_distortion && !pass.want_median) return;
+    const AttributeRecord& record = pass.attribute_records[triangle];
+    Interpolation at;
+    Vec z(record.centroid_z);
+    if (pass.attributes) {
+        at.evaluate(record, forms.dx(block), forms.dy(block));
+        if (pass.distortion_depth == DistortionDepth::kPlane) z = at.depth();
+        const float* corners = pass.corner_colors + int64_t{3} * triangle * pass.corner_channels;
+        for (int c = 0; c < pass.corner_channels; ++c) {
+            Vec value = at.weight[0] * Vec(corners[c]);
+            value = vfma(at.weight[1], Vec(corners[pass.corner_channels + c]), value);
+            value = vfma(at.weight[2], Vec(corners[2 * pass.corner_channels + c]), value);
+            float* out = tile.channel(pass.flat_channels + c, block);
+            vfma(w, value, Vec::load(out)).store(out);
+        }
+    }
+    const VecMask drawn = w > Vec(0.0f);
+    if (pass.want_median) {
+        const VecMask before_half = drawn & (transmittance > Vec(0.5f));
+        vselect(before_half, z, Vec::load(tile.median[block])).store(tile.median[block]);
+    }
+    if (pass.want_distortion) {
+        const Vec m = distortion_coordinate(pass, Vec(1.0f) / z);
+        const Vec wm = keep(drawn, w * m);
+        const Vec first = Vec::load(tile.weighted_depth[block]), second = Vec::load(tile.weighted_square[block]);
+        const Vec accumulated = Vec(1.0f) - transmittance;
+        const Vec spread = vfma(m * m, accumulated, second) - Vec(2.0f) * m * first;
+        (Vec::load(tile.distortion[block]) + keep(drawn, w * spread)).store(tile.distortion[block]);
+        (first + wm).store(tile.weighted_depth[block]);
+        (second + keep(drawn, wm * m)).store(tile.weighted_square[block]);
+    }
+}
+
+template <class Kernel, bool General>
+ETSPLAT_FN void draw(const RasterPass& pass, ForwardTile& tile, const TileFrame& frame, const TileEntry& entry) {
+    const TriangleRecord& record = pass.records[entry.triangle];
+    TriangleForms forms;
+    const unsigned blocks = forms.blocks(record, frame) & tile.alive_blocks;
+    if (blocks == 0) return;
+    forms.prepare_lanes(record);
+
+    const int flat = General ? pass.flat_channels : kMaxFastChannels;
+    const float* color = pass.flat_colors + int64_t{entry.triangle} * flat;
+    const Vec exponent(record.exponent), scale(record.scale), opacity(record.opacity), extent(record.extent);
+    const Vec alpha_min(pass.alpha_min), alpha_max(pass.alpha_max), transmittance_min(pass.transmittance_min);
+    Vec largest(0.0f);
+    unsigned hits = 0;
+    for_each_bit(blocks, [&](int block) {
+        const Vec x = vmax(forms.value(0, block), vmax(forms.value(1, block), forms.value(2, block)));
+        VecMask mask = (x <= extent) & VecMask::from_bits(tile.alive[block]);
+        if (mask.bits() == 0) return;
+        const Vec alpha = vmin(opacity * Kernel::value(x, exponent, scale), alpha_max);
+        const Vec transmittance = Vec::load(tile.transmittance[block]);
+        mask = mask & (alpha >= alpha_min);
+        Vec w = alpha * transmittance;
+        const VecMask stop = mask & (transmittance - w < transmittance_min);
+        const unsigned mask_bits = mask.bits(), stop_bits = stop.bits();
+        hits |= (mask_bits != 0 ? 1u : 0u) << block;
+        if (stop_bits != 0) {
+            tile.alive[block] = static_cast<uint16_t>(tile.alive[block] & ~stop_bits);
+            if (tile.alive[block] == 0) tile.alive_blocks &= ~(1u << block);
+        }
+        w = keep(and_not(mask, stop), w);
+        (transmittance - w).store(tile.transmittance[block]);
+        for (int c = 0; c < flat; ++c) {
+            float* out = tile.channel(c, block);
+            vfma(w, Vec(color[c]), Vec::load(out)).store(out);
+        }
+        if (pass.slot_weight) largest = vmax(largest, w);
+        if constexpr (General) draw_extras(pass, tile, forms, entry.triangle, block, transmittance, w);
+    });
+    if (pass.hits) pass.hits[entry.slot] = static_cast<uint16_t>(hits);
+    if (pass.slot_weight) pass.slot_weight[entry.slot] = lane_max(largest);
+}
+
+ETSPLAT_FN void finish(const RasterPass& pass, ForwardTile& tile, const TileFrame& frame) {
+    const int channels = pass.channels();
+    for (int block = 0; block < kBlocks; ++block) {
+        const int columns = frame.column_count(block);
+        for (int row = 0; row < frame.row_count(block); ++row) {
+            const long pixel = frame.pixel(block, row, pass.width);
+            const float* t = tile.transmittance[block] + 4 * row;
+            float* out = pass.color + pixel * channels;
+            for (int c = 0; c < channels; ++c) {
+                const float* in = tile.channel(c, block) + 4 * row;
+                const float background = pass.background ? pass.background[c] : 0.0f;
+                for (int i = 0; i < columns; ++i) out[i * channels + c] = in[i] + t[i] * background;
+            }
+            for (int i = 0; i < columns; ++i) pass.alpha[pixel + i] = 1.0f - t[i];
+            if (pass.want_median)
+                for (int i = 0; i < columns; ++i) pass.median_depth[pixel + i] = tile.median[block][4 * row + i];
+            if (pass.want_distortion)
+                for (int i = 0; i < columns; ++i) {
+                    pass.distortion[pixel + i] = tile.distortion[block][4 * row + i];
+                    pass.distortion_totals[2 * (pixel + i)] = tile.weighted_depth[block][4 * row + i];
+                    pass.distortion_totals[2 * (pixel + i) + 1] = tile.weighted_square[block][4 * row + i];
+                }
+        }
+    }
+}
+
+template <class Kernel, bool General>
+void forward_tile(const RasterPass& pass, int index, float* scratch) {
+    const TileFrame frame(pass, index);
+    ForwardTile tile;
+    tile.color = scratch;
+    begin(tile, frame, pass.channels(), General);
+    const int end = pass.tile_begin[index + 1];
+    for (int i = pass.tile_begin[index]; i < end && tile.alive_blocks != 0; ++i)
+        draw<Kernel, General>(pass, tile, frame, pass.entries[i]);
+    finish(pass, tile, frame);
+}
+
+}  // namespace etsplat::ETSPLAT_SIMD
