@@ -5,12 +5,14 @@ namespace etsplat {
 void bind_geometry(nb::module_& m);
 void bind_mesh_energies(nb::module_& m);
 void bind_optimizer(nb::module_& m);
+void bind_rasterize(nb::module_& m);
 void bind_rasterize_hard(nb::module_& m);
 }  // namespace etsplat
 
 NB_MODULE(_native, m) {
     using namespace etsplat;
     m.doc() = "CPU engine of etsplat.";
+    nb::set_leak_warnings(false);  // tensors alive at interpreter exit keep their render states, which is no leak
     m.def("num_threads", &num_threads);
     m.def("set_num_threads", &set_num_threads);
     m.def("parallel_seconds", &parallel_seconds);
@@ -18,5 +20,6 @@ NB_MODULE(_native, m) {
     bind_geometry(m);
     bind_mesh_energies(m);
     bind_optimizer(m);
+    bind_rasterize(m);
     bind_rasterize_hard(m);
 }

@@ -5,6 +5,8 @@
 // Slots (one per pair) are numbered triangle by triangle, so that a triangle's gradients lie together.
 #include <algorithm>
 #include <limits>
+#include <stdexcept>
+#include <vector>
 
 #include "raster.h"
 #include "raster_tiles.h"

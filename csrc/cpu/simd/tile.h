@@ -107,10 +107,16 @@ struct Interpolation {
     ETSPLAT_FN Vec depth() const { return sum / inverse_z_sum; }
 };
 
-// Depth mapped to [0, 1] for the distortion: m = far / (far - near) (1 - near / z).
-ETSPLAT_FN Vec distortion_coordinate(const RasterPass& pass, Vec inverse_z) {
+// Depth of the distortion, m = far / (far - near) (1 - near / z), less its value at the tile's first triangle: the
+// distortion sees differences only, and small numbers keep them precise.
+ETSPLAT_FN Vec distortion_coordinate(const RasterPass& pass, float first_inverse_z, Vec inverse_z) {
     const float scale = pass.distortion_far / (pass.distortion_far - pass.distortion_near);
-    return vfma(Vec(-scale * pass.distortion_near), inverse_z, Vec(scale));
+    return Vec(-scale * pass.distortion_near) * (inverse_z - Vec(first_inverse_z));
+}
+ETSPLAT_FN float first_inverse_depth(const RasterPass& pass, int tile) {
+    const int first = pass.tile_begin[tile];
+    if (!pass.want_distortion || first == pass.tile_begin[tile + 1]) return 0.0f;
+    return 1.0f / pass.attribute_records[pass.entries[first].triangle].centroid_z;
 }
 
 template <class F>

@@ -20,6 +20,7 @@ struct BackwardTile {
     float total_weight[kBlocks][16];
     uint16_t alive[kBlocks];
     unsigned alive_blocks;
+    float first_inverse_z;
     float* grad_color;  // [channel][block][16]
     float* sums;        // lanes of the sums of a slot, general pass only
 
@@ -122,7 +123,7 @@ struct ExtraGradients {
             for (int k = 0; k < 3; ++k) result = vfma(at.weight[k], grad_value[k], result);
         }
         if (pass.grad_distortion) {
-            const Vec m = distortion_coordinate(pass, inverse_z);
+            const Vec m = distortion_coordinate(pass, tile.first_inverse_z, inverse_z);
             const Vec spread = vfma(m * m, Vec::load(tile.total_weight[block]), Vec::load(tile.total_second[block])) -
                                Vec(2.0f) * m * Vec::load(tile.total_first[block]);
             result = vfma(Vec::load(tile.grad_distortion[block]), spread, result);
@@ -134,7 +135,7 @@ struct ExtraGradients {
         const SlotLayout& layout = pass.slot_layout;
         Vec grad_inverse_z(0.0f);
         if (pass.grad_distortion) {
-            const Vec m = distortion_coordinate(pass, inverse_z);
+            const Vec m = distortion_coordinate(pass, tile.first_inverse_z, inverse_z);
             const Vec slope = m * Vec::load(tile.total_weight[block]) - Vec::load(tile.total_first[block]);
             const float dm = -pass.distortion_near * pass.distortion_far / (pass.distortion_far - pass.distortion_near);
             grad_inverse_z = keep(drawn, Vec(2.0f * dm) * Vec::load(tile.grad_distortion[block]) * w * slope);
@@ -258,6 +259,7 @@ void backward_tile(const RasterPass& pass, int index, float* scratch) {
     const TileFrame frame(pass, index);
     BackwardTile tile;
     tile.grad_color = scratch;
+    if constexpr (General) tile.first_inverse_z = first_inverse_depth(pass, index);
     tile.sums = scratch + 256 * pass.channels();
     begin(pass, tile, frame);
     if (pass.tile_background) background_gradient(pass, tile, frame, pass.tile_background + int64_t{index} * pass.channels());

@@ -18,6 +18,7 @@ struct ForwardTile {
     float median[kBlocks][16];
     uint16_t alive[kBlocks];
     unsigned alive_blocks;
+    float first_inverse_z;
     float* color;  // [channel][block][16]
 
     ETSPLAT_FN float* channel(int c, int block) { return color + (c * kBlocks + block) * 16; }
@@ -61,11 +62,11 @@ ETSPLAT_FN void draw_extras(const RasterPass& pass, ForwardTile& tile, const Tri
     }
     const VecMask drawn = w > Vec(0.0f);
     if (pass.want_median) {
-        const VecMask before_half = drawn & (transmittance > Vec(0.5f));
-        vselect(before_half, z, Vec::load(tile.median[block])).store(tile.median[block]);
+        const VecMask crosses = drawn & (transmittance > Vec(0.5f)) & (transmittance - w <= Vec(0.5f));
+        vselect(crosses, z, Vec::load(tile.median[block])).store(tile.median[block]);
     }
     if (pass.want_distortion) {
-        const Vec m = distortion_coordinate(pass, Vec(1.0f) / z);
+        const Vec m = distortion_coordinate(pass, tile.first_inverse_z, Vec(1.0f) / z);
         const Vec wm = keep(drawn, w * m);
         const Vec first = Vec::load(tile.weighted_depth[block]), second = Vec::load(tile.weighted_square[block]);
         const Vec accumulated = Vec(1.0f) - transmittance;
@@ -149,6 +150,7 @@ void forward_tile(const RasterPass& pass, int index, float* scratch) {
     const TileFrame frame(pass, index);
     ForwardTile tile;
     tile.color = scratch;
+    if constexpr (General) tile.first_inverse_z = first_inverse_depth(pass, index);
     begin(tile, frame, pass.channels(), General);
     const int end = pass.tile_begin[index + 1];
     for (int i = pass.tile_begin[index]; i < end && tile.alive_blocks != 0; ++i)
