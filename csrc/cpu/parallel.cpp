@@ -65,6 +65,8 @@ struct Job {
 };
 
 // Workers spin for a moment after a job, since the next stage of a render follows within microseconds, then sleep.
+// A job does not wait for workers that are late (asleep, or without a processor on a busy machine): the calling thread
+// takes part, closes the job when no range is left, and waits only for those who entered.
 class Pool {
 public:
     explicit Pool(int workers) {
@@ -83,29 +85,48 @@ public:
 
     void run(Job& job) {
         job_ = &job;
-        pending_.store(workers(), std::memory_order_relaxed);
+        entered_.store(kOpen, std::memory_order_release);
         {
             std::lock_guard lock(mutex_);
             generation_.fetch_add(1, std::memory_order_release);
         }
-        wake_.notify_all();
+        if (sleeping_.load() > 0) wake_.notify_all();
         job.run();
-        while (pending_.load(std::memory_order_acquire) != 0) pause_briefly();
+        entered_.fetch_and(~kOpen, std::memory_order_acq_rel);
+        for (int i = 0; entered_.load(std::memory_order_acquire) != 0; ++i) {
+            if (i < kSpins)
+                pause_briefly();
+            else
+                std::this_thread::yield();
+        }
     }
 
 private:
+    static constexpr uint32_t kOpen = 1u << 31;
+    static constexpr int kSpins = 4000;
+
+    bool enter() {
+        uint32_t count = entered_.load(std::memory_order_acquire);
+        while (count & kOpen)
+            if (entered_.compare_exchange_weak(count, count + 1, std::memory_order_acq_rel)) return true;
+        return false;
+    }
+
     void work() {
         uint64_t seen = 0;
         for (;;) {
-            for (int i = 0; i < 20000 && generation_.load(std::memory_order_acquire) == seen; ++i) pause_briefly();
+            for (int i = 0; i < kSpins && generation_.load(std::memory_order_acquire) == seen; ++i) pause_briefly();
             if (generation_.load(std::memory_order_acquire) == seen) {
                 std::unique_lock lock(mutex_);
+                sleeping_.fetch_add(1);
                 wake_.wait(lock, [&] { return generation_.load(std::memory_order_relaxed) != seen; });
+                sleeping_.fetch_sub(1);
             }
             seen = generation_.load(std::memory_order_acquire);
             if (stop_) return;
+            if (!enter()) continue;
             job_->run();
-            pending_.fetch_sub(1, std::memory_order_release);
+            entered_.fetch_sub(1, std::memory_order_release);
         }
     }
 
@@ -113,7 +134,8 @@ private:
     std::mutex mutex_;
     std::condition_variable wake_;
     std::atomic<uint64_t> generation_{0};
-    std::atomic<int> pending_{0};
+    std::atomic<uint32_t> entered_{0};  // workers inside the job, and whether more may enter
+    std::atomic<int> sleeping_{0};
     Job* job_ = nullptr;
     bool stop_ = false;
 };
