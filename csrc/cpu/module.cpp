@@ -7,6 +7,7 @@ void bind_mesh_energies(nb::module_& m);
 void bind_optimizer(nb::module_& m);
 void bind_rasterize(nb::module_& m);
 void bind_rasterize_hard(nb::module_& m);
+void bind_spherical_harmonics(nb::module_& m);
 }  // namespace etsplat
 
 NB_MODULE(_native, m) {
@@ -22,4 +23,5 @@ NB_MODULE(_native, m) {
     bind_optimizer(m);
     bind_rasterize(m);
     bind_rasterize_hard(m);
+    bind_spherical_harmonics(m);
 }

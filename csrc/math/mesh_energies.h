@@ -8,17 +8,8 @@
 
 namespace etsplat {
 
-constexpr float kMinLength = 1e-12f;
 constexpr float kMinShape = 1e-6f;
 constexpr float kMaxSquare = 3e38f;
-
-// d / |d|, or 0; `length` receives |d|.
-template <class T>
-ETSPLAT_FN Vector3<T> direction(Vector3<T> d, T& length) {
-    length = vsqrt(dot(d, d));
-    const T inverse = vselect(length > T(kMinLength), T(1.0f) / vmax(length, T(kMinLength)), T(0.0f));
-    return inverse * d;
-}
 
 // |a - b|^Power and its derivative by a.
 template <int Power, class T>

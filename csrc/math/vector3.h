@@ -35,4 +35,14 @@ ETSPLAT_FN Vector3<T> cross(Vector3<T> a, Vector3<T> b) {
     return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
 }
 
+constexpr float kMinLength = 1e-12f;  // up to here a vector has no direction
+
+// d / |d|, or 0; `length` receives |d|.
+template <class T>
+ETSPLAT_FN Vector3<T> direction(Vector3<T> d, T& length) {
+    length = vsqrt(dot(d, d));
+    const T inverse = vselect(length > T(kMinLength), T(1.0f) / vmax(length, T(kMinLength)), T(0.0f));
+    return inverse * d;
+}
+
 }  // namespace etsplat
