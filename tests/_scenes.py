@@ -38,11 +38,14 @@ def cameras(width: int, height: int, views: int = 2) -> Scene:
 
 
 def soup(rng: torch.Generator, count: int, width: int = 48, height: int = 40, **options: Any) -> Scene:
-    """Random separate triangles around the origin; options: size, channels, views."""
-    size, channels, views = options.get("size", 0.3), options.get("channels", 3), options.get("views", 2)
+    """Random separate triangles around the origin, none of them a sliver; options: size, channels, views."""
+    size, channels, views = options.get("size", 0.5), options.get("channels", 3), options.get("views", 2)
     centres = torch.randn(count, 1, 3, generator=rng) * 0.7
+    angles = torch.tensor([0.0, 2.1, 4.2]) + 0.5 * torch.randn(count, 3, generator=rng).clamp(-1, 1)
+    frames = torch.linalg.qr(torch.randn(count, 3, 3, generator=rng))[0][:, :2]
+    corners = torch.stack([angles.cos(), angles.sin()], dim=-1) @ frames
     return {
-        "vertices": centres + size * torch.randn(count, 3, 3, generator=rng),
+        "vertices": centres + size * torch.rand(count, 1, 1, generator=rng) * corners,
         "colors": torch.rand(count, channels, generator=rng),
         "opacities": 0.2 + 0.75 * torch.rand(count, generator=rng),
         "sigma": 0.15 + torch.rand(count, generator=rng),

@@ -1,0 +1,135 @@
+"""Every engine agrees with the float64 reference, in values and gradients, on random soups and on a mesh."""
+
+import pytest
+import torch
+
+from _scenes import EVERYTHING, IMAGES, gradients, mesh, soup
+from _tolerances import assert_close_to_scale
+
+# Rounding, and pixels that float32 decides differently at alpha = 1/255, at x = 2 or between almost equal depths.
+IMAGE_TOLERANCE = {"tolerance": 2e-5, "outliers": 2e-3, "outlier_tolerance": 2e-2}
+GRADIENT_TOLERANCE = {"tolerance": 1e-4, "outliers": 5e-3, "outlier_tolerance": 1e-3}
+# The gradient of x grows as the triangle gets thinner, and with it the scale and the rounding.
+GEOMETRY_TOLERANCE = {"tolerance": 5e-4, "outliers": 5e-3, "outlier_tolerance": 5e-3}
+
+
+# One sigma for all: a sum over all triangles of terms of both signs.
+SHARED_SIGMA_TOLERANCE = {"tolerance": 5e-3}
+
+
+def gradient_tolerance(name, expected, looseness=1.0):
+    if name == "sigma" and expected.ndim == 0:
+        chosen = SHARED_SIGMA_TOLERANCE
+    else:
+        chosen = GEOMETRY_TOLERANCE if name in ("vertices", "viewmats") else GRADIENT_TOLERANCE
+    return {key: value if key == "outliers" else looseness * value for key, value in chosen.items()}
+
+
+def compare(scene, engine, rng, images=IMAGES, looseness=1.0, **options):
+    """Same images, statistics and gradients under random cotangents as the oracle has."""
+    if options.get("kernel") == "single_sided":
+        # Below 1 its slope at the edge is unbounded, and rounding decides the gradient of a pixel there.
+        scene = {**scene, "sigma": scene["sigma"] + 1.0}
+    shape = (len(scene["viewmats"]), scene["height"], scene["width"])
+    colors = scene.get("colors", scene.get("corner_colors"))
+    widths = {"color": colors.shape[-1], "normal": 3}
+    cotangents = {name: torch.randn(*shape, widths.get(name, 1), generator=rng) for name in images}
+    dtype = torch.float32
+    out, grads = gradients(scene, engine, cotangents, dtype, **options)
+    oracle, oracle_grads = gradients(scene, "reference", cotangents, torch.float64, **options)
+    for name in images:
+        assert_close_to_scale(getattr(out, name), getattr(oracle, name), **IMAGE_TOLERANCE, name=name)
+    for name, expected in oracle_grads.items():
+        assert_close_to_scale(
+            grads[name], expected, **gradient_tolerance(name, expected, looseness), name=f"gradient of {name}"
+        )
+    if options.get("statistics"):
+        assert (out.statistics.visible != oracle.statistics.visible).sum() <= 1
+        for name in ("max_weight", "screen_size", "inradius"):
+            actual, expected = getattr(out.statistics, name), getattr(oracle.statistics, name)
+            assert_close_to_scale(actual, expected, 1e-4, outliers=0.01, outlier_tolerance=0.1, name=name)
+
+
+def test_soup(engine, kernel, distance, rng):
+    compare(soup(rng, 150), engine, rng, kernel=kernel, distance=distance, **EVERYTHING)
+
+
+def test_mesh(engine, kernel, distance, rng):
+    compare(mesh(rng), engine, rng, kernel=kernel, distance=distance, **EVERYTHING)
+
+
+def test_colors_alone(engine, kernel, distance, rng):
+    """The path that shape reconstruction takes: no image but the colour."""
+    compare(mesh(rng), engine, rng, images=("color",), kernel=kernel, distance=distance)
+
+
+@pytest.mark.parametrize("image", IMAGES)
+def test_each_image_alone(engine, image, rng):
+    """Also when an image is asked for that no cotangent reaches."""
+    options = {**EVERYTHING, "depth": "centroid"} if image != "color" else EVERYTHING
+    compare(soup(rng, 80), engine, rng, images=(image,), **options)
+
+
+@pytest.mark.parametrize("channels", [1, 4, 5, 9])
+def test_channels(engine, channels, rng):
+    compare(soup(rng, 60, channels=channels), engine, rng, images=("color", "alpha"))
+
+
+@pytest.mark.parametrize("layout", ["per_view", "per_corner", "per_vertex"])
+def test_color_layouts(engine, layout, rng):
+    scene = mesh(rng) if layout == "per_vertex" else soup(rng, 80)
+    if layout == "per_view":
+        scene["colors"] = torch.rand(2, 80, 3, generator=rng)
+    else:
+        del scene["colors"]
+        shape = (len(scene["vertices"]), 3) if layout == "per_vertex" else (80, 3, 3)
+        scene["corner_colors"] = torch.rand(shape, generator=rng)
+    compare(scene, engine, rng, **EVERYTHING)
+
+
+@pytest.mark.parametrize("depth", ["plane", "centroid"])
+def test_depth_modes(engine, depth, distance, rng):
+    compare(soup(rng, 80), engine, rng, distance=distance, **{**EVERYTHING, "depth": depth})
+
+
+def test_frozen_incentre(engine, kernel, rng):
+    compare(soup(rng, 80), engine, rng, kernel=kernel, distance="sdf", freeze_incentre=True, images=("color",))
+
+
+@pytest.mark.parametrize("sigma", [0.02, 0.1, 2.5])
+def test_softness_from_sharp_to_flat(engine, kernel, sigma, rng):
+    scene = {**soup(rng, 80), "sigma": torch.tensor(sigma)}
+    # Sharp, x is raised to the power of 100 with its rounding.
+    compare(scene, engine, rng, kernel=kernel, images=("color", "alpha"), looseness=max(1.0, 0.3 / sigma))
+
+
+@pytest.mark.parametrize("size", [0.01, 3.0])
+def test_triangles_smaller_than_a_pixel_and_larger_than_the_image(engine, kernel, distance, size, rng):
+    # The corners of a triangle of a tenth of a pixel are known to 1e-5 of its size.
+    looseness = 10.0 if size < 0.1 else 1.0
+    options = {"kernel": kernel, "distance": distance, "images": ("color", "alpha"), "looseness": looseness}
+    compare(soup(rng, 60, size=size), engine, rng, **options)
+
+
+def test_opaque_stack_saturates(engine, kernel, rng):
+    """Pixels that stop: clamped layers of opacity 1."""
+    scene = soup(rng, 120, size=1.5)
+    scene["opacities"] = torch.ones(120)
+    compare(scene, engine, rng, kernel=kernel, **EVERYTHING)
+
+
+def test_shifting_the_principal_point_shifts_the_image(engine, kernel, distance, rng):
+    """Tiles leave no trace: a shift by whole pixels moves colours and gradients with it."""
+    scene = soup(rng, 60, width=83, height=75, views=1)
+    moved = {**scene, "Ks": scene["Ks"].clone()}
+    moved["Ks"][:, :2, 2] += torch.tensor([5.0, 11.0])
+    cotangent = torch.zeros(1, 75, 83, 3)
+    cotangent[:, 20:50, 20:60] = torch.randn(1, 30, 40, 3, generator=rng)
+    options = {"kernel": kernel, "distance": distance}
+    before, before_grads = gradients(scene, engine, {"color": cotangent}, **options)
+    after, after_grads = gradients(moved, engine, {"color": cotangent.roll((11, 5), dims=(1, 2))}, **options)
+    assert_close_to_scale(after.color[:, 11:, 5:], before.color[:, :-11, :-5], **IMAGE_TOLERANCE)
+    for name in ("vertices", "colors", "opacities", "sigma"):
+        assert_close_to_scale(
+            after_grads[name], before_grads[name], **gradient_tolerance(name, before_grads[name]), name=name
+        )
