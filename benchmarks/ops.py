@@ -1,0 +1,128 @@
+"""Milliseconds of the operations beside the rasterizer, at the size of a full reconstruction step.
+
+    python -m benchmarks.ops --threads 4
+"""
+
+import argparse
+import math
+import statistics
+import time
+from collections.abc import Callable
+
+import torch
+from rich.console import Console
+from rich.table import Table
+
+from etsplat.core.cameras import intrinsics, look_at
+from etsplat.geometry.topology import MeshTopology
+from etsplat.ops.adam import Adam
+from etsplat.ops.engines import num_threads, set_num_threads
+from etsplat.ops.mesh_energies import mesh_energies
+from etsplat.ops.photometric import l1_over_background
+from etsplat.ops.rasterize_hard import rasterize_hard, render_opaque
+from etsplat.ops.spherical_harmonics import spherical_harmonics
+
+Operation = tuple[str, str, Callable[[], object]]
+
+
+def torus(rings: int, sides: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """A closed mesh with 2 rings sides faces that fills the view."""
+    u, v = (torch.arange(n) * (2 * math.pi / n) for n in (rings, sides))
+    u, v = torch.meshgrid(u, v, indexing="ij")
+    radius = 0.65 + (0.35 + 0.02 * torch.sin(9 * u) * torch.cos(5 * v)) * v.cos()
+    vertices = torch.stack([radius * u.cos(), radius * u.sin(), 0.35 * v.sin()], dim=-1).reshape(-1, 3)
+    i, j = torch.meshgrid(torch.arange(rings), torch.arange(sides), indexing="ij")
+    a, b, c, d = (
+        ((i + di) % rings * sides + (j + dj) % sides).reshape(-1) for di, dj in [(0, 0), (1, 0), (1, 1), (0, 1)]
+    )
+    return vertices, torch.cat([torch.stack([a, b, c], 1), torch.stack([a, c, d], 1)])
+
+
+def rendering(size: int, vertices: torch.Tensor, faces: torch.Tensor) -> list[Operation]:
+    viewmats = look_at(torch.tensor([[0.3, 0.4, 3.2]]), torch.zeros(3), torch.tensor([0.0, 1.0, 0.0])).float()
+    view = viewmats, intrinsics(40.0, size, size).float()[None], size, size
+    colors, vertex_colors = torch.rand(len(faces), 3), torch.rand(len(vertices), 3)
+    shape = f"{size} x {size}, {len(faces):,} faces"
+    return [
+        ("rasterize_hard", shape, lambda: rasterize_hard(vertices, *view, faces=faces)),
+        ("render_opaque 4 x 4", shape, lambda: render_opaque(vertices, *view, faces=faces, face_colors=colors)),
+        (
+            "render_opaque 4 x 4, vertex colours",
+            shape,
+            lambda: render_opaque(vertices, *view, faces=faces, vertex_colors=vertex_colors),
+        ),
+    ]
+
+
+def training(size: int, vertices: torch.Tensor, faces: torch.Tensor) -> list[Operation]:
+    color = torch.rand(1, size, size, 3).requires_grad_()
+    target, backgrounds = torch.rand(1, size, size, 4), torch.rand(1, 3)
+    points = vertices.clone().requires_grad_()
+    connectivity = MeshTopology.from_faces(faces, len(vertices)).connectivity
+    parameters = {
+        "vertices": torch.rand(len(vertices), 3),
+        "colors": torch.rand(len(faces), 3),
+        "opacities": torch.rand(len(faces)),
+        "sigma": torch.rand(()),
+    }
+    for parameter in parameters.values():
+        parameter.requires_grad_().grad = torch.rand(parameter.shape)
+    adam = Adam(parameters, dict.fromkeys(parameters, 1e-3))
+    elements = sum(parameter.numel() for parameter in parameters.values())
+    coefficients = torch.rand(len(faces), 16, 3).requires_grad_()
+    directions = torch.randn(len(faces), 3).requires_grad_()
+
+    def photometric() -> None:
+        color.grad = None
+        l1_over_background(color, target, backgrounds).backward()
+
+    def energies() -> None:
+        points.grad = None
+        edge, normal, laplacian = mesh_energies(points, connectivity)
+        (1.5 * edge + 0.01 * normal + 0.5 * laplacian).backward()
+
+    def harmonics() -> None:
+        coefficients.grad = directions.grad = None
+        spherical_harmonics(coefficients, directions, 3).sum().backward()
+
+    return [
+        ("l1_over_background, with gradient", f"{size} x {size}", photometric),
+        ("mesh_energies, with gradient", f"{len(faces):,} faces", energies),
+        ("Adam.step", f"{elements:,} elements", adam.step),
+        ("spherical_harmonics 3, with gradient", f"{len(faces):,} points", harmonics),
+    ]
+
+
+def milliseconds(operation: Callable[[], object], repeats: int) -> list[float]:
+    operation()
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        operation()
+        times.append(1e3 * (time.perf_counter() - start))
+    return times
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--threads", type=int, default=0, help="threads of the native engine; 0: all cores")
+    parser.add_argument("--size", type=int, default=1024, help="width and height of the image in pixels")
+    parser.add_argument("--rings", type=int, default=224, help="the mesh has 2 rings^2 faces")
+    parser.add_argument("--repeats", type=int, default=20)
+    arguments = parser.parse_args()
+    set_num_threads(arguments.threads)
+    torch.manual_seed(0)
+    vertices, faces = torus(arguments.rings, arguments.rings)
+
+    table = Table(title=f"Operations beside the rasterizer, {num_threads()} threads, {arguments.repeats} runs each")
+    for name, justify in [("operation", "left"), ("size", "left"), ("median ms", "right"), ("best ms", "right")]:
+        table.add_column(name, justify=justify, no_wrap=True)
+    for build in (rendering, training):
+        for name, shape, operation in build(arguments.size, vertices, faces):
+            times = milliseconds(operation, arguments.repeats)
+            table.add_row(name, shape, f"{statistics.median(times):.2f}", f"{min(times):.2f}")
+    Console().print(table)
+
+
+if __name__ == "__main__":
+    main()
