@@ -63,12 +63,13 @@ format: setup
 bench: setup
 	$(PY) -m benchmarks.rasterizer
 
-# A second build, beside the first. `python -S` leaves out the editable install, so that `etsplat` is the sanitized one.
+# A second build, beside the first, with assertions and line numbers. `python -S` leaves out the editable install, so that `etsplat` is the sanitized one.
 # libstdc++ is preloaded too: ASan looks for the exception functions when it starts.
 SITE = $(shell $(PY) -c 'import sysconfig; print(sysconfig.get_path("purelib"))')
 $(SANITIZED): $(INSTALLED) $(shell find src -name '*.py')
 	$(PIP) --no-build-isolation --no-deps --upgrade --target build/sanitize/site \
-		--config-settings=build-dir=build/sanitize/cmake --config-settings=cmake.define.ETSPLAT_SANITIZE=ON .
+		--config-settings=build-dir=build/sanitize/cmake --config-settings=cmake.define.ETSPLAT_SANITIZE=ON \
+		--config-settings=cmake.build-type=Debug --config-settings=install.strip=false .
 	@touch $@
 
 sanitize: $(SANITIZED)

@@ -1,0 +1,3 @@
+"""The `etsplat` command: options, progress, errors in one line."""
+
+from etsplat.cli.main import main as main

@@ -1,0 +1,89 @@
+"""Shows how a run goes: a live bar on a terminal, now and then a line elsewhere."""
+
+from types import TracebackType
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    SpinnerColumn,
+    TaskID,
+    TextColumn,
+    TimeRemainingColumn,
+)
+
+from etsplat.optim.loop import DoneEvent, Event, StepEvent
+from etsplat.tasks.reconstruct import PrepareEvent
+
+LINES = 10
+"""Without a terminal, so many lines tell of the optimization."""
+
+
+class RunProgress:
+    """A callback for `reconstruct`, and the context in which its bar is alive."""
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+        self._progress = Progress(
+            SpinnerColumn(),
+            TextColumn("{task.description}"),
+            BarColumn(bar_width=None),
+            MofNCompleteColumn(),
+            TextColumn("eta"),
+            TimeRemainingColumn(compact=True),
+            TextColumn("{task.fields[state]}"),
+            console=console,
+            disable=not console.is_terminal,
+            speed_estimate_period=60,
+            expand=True,
+        )
+        self._task: TaskID | None = None
+        self._phase = ""
+        self._psnr = ""
+        self._lines = 0
+
+    def __enter__(self) -> "RunProgress":
+        self._progress.start()
+        self.say("Reading the input")
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        if self._task is not None:
+            self._progress.remove_task(self._task)
+        self._progress.stop()
+
+    def __call__(self, event: Event | PrepareEvent) -> None:
+        """Take in an event of the run."""
+        if isinstance(event, PrepareEvent):
+            self._show("Taking pictures", event.done, event.total)
+        elif isinstance(event, StepEvent):
+            self._step(event)
+        elif isinstance(event, DoneEvent):
+            self.say("Measuring the result")
+
+    def say(self, phase: str) -> None:
+        """Enter a phase of unknown length."""
+        self._show(phase, 0, None)
+
+    def _step(self, event: StepEvent) -> None:
+        if "psnr" in event.metrics:
+            self._psnr = f" · {event.metrics['psnr']:.2f} dB"
+        state = f"loss {event.loss:.4f}{self._psnr} · {event.faces:,} faces · σ {event.sigma:.3f}"
+        self._show("Optimizing", event.iteration, event.iterations, state)
+        if not self._console.is_terminal and event.iteration * LINES >= self._lines * event.iterations:
+            self._lines = event.iteration * LINES // event.iterations + 1
+            print(f"  {event.iteration}/{event.iterations} · {event.seconds:.0f} s · {state}", flush=True)
+
+    def _show(self, phase: str, done: int, total: int | None, state: str = "") -> None:
+        if phase != self._phase or self._task is None:
+            if self._task is not None:
+                self._progress.remove_task(self._task)
+            # A new task starts with what is done already, so that a resumed run's rate counts from here.
+            self._task = self._progress.add_task(phase, total=total, completed=done, state=state)
+            self._phase = phase
+            if not self._console.is_terminal:
+                print(phase, flush=True)
+        self._progress.update(self._task, completed=done, total=total, state=state)
