@@ -99,6 +99,7 @@ Bvh::Nearest Bvh::nearest(Vec3 p) const {
             continue;
         }
         for (int32_t slot = node.begin; slot < node.end; ++slot) {
+            if (bounds(triangles_[slot]).squared_distance(p) > best.squared_distance) continue;
             const Nearest found{squared_distance(triangles_[slot], p), faces_[slot]};
             if (std::pair(found.squared_distance, found.face) < std::pair(best.squared_distance, best.face)) {
                 best = found;

@@ -57,7 +57,7 @@ private:
         int32_t begin, end;  // its slots
         int32_t right;       // index of the right child; 0 in a leaf
     };
-    static constexpr int leaf_size = 4;
+    static constexpr int leaf_size = 8;
     static constexpr int max_depth = 64;  // halving 2^31 slots takes 31
 
     int32_t build(int64_t begin, int64_t end, const std::vector<Box>& boxes);
