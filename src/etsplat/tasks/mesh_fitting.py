@@ -69,7 +69,7 @@ class MeshFitting:
             start_faces=len(mesh.faces),
             max_faces=config.max_faces,
         )
-        self.adam = Adam(mesh.parameters(), dict(self._rates))
+        self.adam = Adam(mesh.parameters(), self._rates, engine=config.engine)
 
     @property
     def faces(self) -> int:

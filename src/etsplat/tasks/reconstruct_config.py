@@ -21,7 +21,7 @@ class ReconstructConfig:
     distance: Literal["barycentric", "sdf"] = "barycentric"
     """How far a pixel is from a triangle: by barycentric coordinates or by signed distance."""
     seed: int = 0
-    """Of the order of views, the backgrounds, and the points that metrics sample."""
+    """Of the order of views and the backgrounds. (Metrics always sample with the same seed.)"""
     engine: Literal["cpu", "reference"] | None = None
     """What computes: cpu, reference (plain PyTorch, slow), or None for the fastest there is."""
 
@@ -151,12 +151,17 @@ PRESETS: dict[str, ReconstructConfig] = {
         preset="tiny",
         resolution=64,
         supersampling=2,
-        iterations=200,
+        iterations=300,
         start_level=2,
+        start_sigma=0.5,
         gamma_hold=20,
-        max_faces=1000,
+        edge_power=2,
+        max_faces=2000,
         lr_vertices=2e-2,
-        subdivide_steps=4,
+        lr_vertices_final=0.05,
+        lr_colors=2e-2,
+        lr_sigma=1e-2,
+        subdivide_steps=5,
         log_every=20,
         evaluate_every=100,
         checkpoint_every=50,

@@ -1,0 +1,123 @@
+"""How good a reconstruction is: on the test views and against the true mesh."""
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from etsplat.geometry.intersections import count_degenerate_faces, count_self_intersections
+from etsplat.io.images import save_image
+from etsplat.metrics.geometry import chamfer, geometry_metrics, sample_pair
+from etsplat.metrics.image import find_lpips_weights, psnr, ssim
+from etsplat.ops.rasterize import rasterize
+from etsplat.ops.rasterize_hard import render_opaque
+from etsplat.scene.triangle_mesh import TriangleMesh
+from etsplat.tasks.reconstruct_config import ReconstructConfig
+from etsplat.tasks.sources import Subject
+
+
+class Scorer:
+    """Measures meshes of one subject. Measuring changes nothing and draws no random number of the run.
+
+    Images are compared over black, in float, renders clamped to [0, 1].
+    """
+
+    def __init__(self, subject: Subject, config: ReconstructConfig) -> None:
+        self._views = subject.views
+        self._truth = subject.truth
+        self._config = config
+
+    def cheap(self, mesh: TriangleMesh) -> dict[str, float]:
+        """For the history: "psnr" if there are test views, "chamfer" if there is a true mesh."""
+        scores: dict[str, float] = {}
+        if self._views.test:
+            scores["psnr"] = _mean([psnr(self._splatted(mesh, view), self._photo(view)) for view in self._views.test])
+        if self._truth is not None:
+            truth, samples = self._truth, self._config.chamfer_samples
+            pair = sample_pair(mesh.vertices, mesh.faces, truth.vertices, truth.faces, samples)
+            scores["chamfer"] = chamfer(*pair)
+        return scores
+
+    def full(self, mesh: TriangleMesh, folder: Path) -> dict[str, Any]:
+        """For metrics.json; draws the test views into `folder` on the way.
+
+        Args:
+            mesh: what to measure.
+            folder: gets NNN_render.png, NNN_truth.png and NNN_mesh.png for every test view.
+
+        Returns:
+            Every key that there is; null where there are no test views or no true mesh.
+        """
+        return {
+            **self._geometry(mesh),
+            **self._images(mesh, folder),
+            "faces": len(mesh.faces),
+            "vertices": len(mesh.vertices),
+        }
+
+    def _geometry(self, mesh: TriangleMesh) -> dict[str, Any]:
+        vertices, truth = mesh.vertices.detach(), self._truth
+        if truth is not None:
+            samples = self._config.chamfer_samples
+            return asdict(geometry_metrics(vertices, mesh.faces, truth.vertices, truth.faces, samples=samples))
+        return {
+            **dict.fromkeys(("chamfer", "chamfer_floor", "chamfer_exact", "f_score")),
+            "degenerate_faces": count_degenerate_faces(vertices, mesh.faces),
+            "self_intersections": count_self_intersections(vertices, mesh.faces),
+        }
+
+    def _images(self, mesh: TriangleMesh, folder: Path) -> dict[str, Any]:
+        weights = find_lpips_weights(self._config.lpips_weights)
+        scores: dict[str, list[float]] = {"psnr": [], "psnr_mesh": [], "ssim": [], "lpips": []}
+        for number, view in enumerate(self._views.test):
+            photo, splatted, opaque = self._photo(view), self._splatted(mesh, view), self._opaque(mesh, view)
+            scores["psnr"].append(psnr(splatted, photo))
+            scores["psnr_mesh"].append(psnr(opaque, photo))
+            scores["ssim"].append(ssim(splatted, photo))
+            for kind, image in (("truth", photo), ("render", splatted), ("mesh", opaque)):
+                save_image(folder / f"{number:03d}_{kind}.png", image)
+        return {name: _mean(values) if values else None for name, values in scores.items()}
+
+    def _photo(self, view: int) -> Float[Tensor, "H W 3"]:
+        return self._views.images[view, ..., :3]
+
+    @torch.no_grad()
+    def _splatted(self, mesh: TriangleMesh, view: int) -> Float[Tensor, "H W 3"]:
+        camera, config = self._views.cameras[view], self._config
+        rendering = rasterize(
+            mesh.vertices,
+            mesh.colors,
+            mesh.opacities,
+            mesh.sigma,
+            camera.viewmats,
+            camera.Ks,
+            camera.width,
+            camera.height,
+            faces=mesh.faces,
+            kernel=config.kernel,
+            distance=config.distance,
+            engine=config.engine,
+        )
+        return rendering.color[0].clamp(0.0, 1.0)
+
+    def _opaque(self, mesh: TriangleMesh, view: int) -> Float[Tensor, "H W 3"]:
+        camera, config = self._views.cameras[view], self._config
+        image = render_opaque(
+            mesh.vertices.detach(),
+            camera.viewmats,
+            camera.Ks,
+            camera.width,
+            camera.height,
+            faces=mesh.faces,
+            face_colors=mesh.display_colors,
+            supersampling=config.supersampling,
+            engine=config.engine,
+        )
+        return image[0, ..., :3]
+
+
+def _mean(values: list[float]) -> float:
+    return sum(values) / len(values)

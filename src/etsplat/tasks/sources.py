@@ -1,0 +1,122 @@
+"""What can be reconstructed: a mesh, which is photographed, or views; and the mesh that the run starts from."""
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from etsplat.core.errors import InputError
+from etsplat.geometry.icosphere import icosphere
+from etsplat.io.mesh_files import MeshFile, load_mesh, weld_vertices
+from etsplat.scene.demo_object import demo_object
+from etsplat.scene.load import load_views
+from etsplat.scene.photograph import normalize_mesh, photograph
+from etsplat.scene.triangle_mesh import TriangleMesh
+from etsplat.scene.views import PosedViews
+from etsplat.tasks.reconstruct_config import ReconstructConfig
+
+Source = str | Path | MeshFile | PosedViews
+
+DEMO = "demo:owl"
+"""Names the object that is built in code."""
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A source made ready: the object fills the unit sphere around the origin.
+
+    Attributes:
+        views: images and cameras in that frame; `views.normalization` leads back to the input's units.
+        truth: the mesh that was photographed, in that frame, or None if there is none.
+    """
+
+    views: PosedViews
+    truth: MeshFile | None
+
+
+def load_source(source: Source, config: ReconstructConfig) -> MeshFile | PosedViews:
+    """Reads a mesh file or a scene folder, or makes the demo's object; objects are passed through.
+
+    Raises:
+        InputError: there is nothing at the path, or what is there cannot be used.
+    """
+    if isinstance(source, MeshFile | PosedViews):
+        return source
+    if str(source) == DEMO:
+        return demo_object()
+    path = Path(source)
+    if path.is_dir():
+        return load_views(path, width=config.resolution)
+    if path.is_file():
+        return load_mesh(path)
+    raise InputError(f"{path}: no such file or folder; name a mesh file or a folder with posed images")
+
+
+def make_subject(
+    source: MeshFile | PosedViews, config: ReconstructConfig, progress: Callable[[int, int], None]
+) -> Subject:
+    """Photographs a mesh; views are ready as they are (loaders put the object into the unit sphere).
+
+    Args:
+        source: from `load_source`.
+        config: resolution and supersampling.
+        progress: called with (views done, views in all) while photographing.
+
+    Raises:
+        InputError: the mesh has no extent, or there are no views to train on.
+    """
+    if isinstance(source, MeshFile):
+        views = photograph(
+            source, config.resolution, config.resolution, supersampling=config.supersampling, progress=progress
+        )
+        return Subject(views, normalize_mesh(source)[0])
+    if not source.train:
+        raise InputError("views: none to train on; name some in `train`")
+    return Subject(source, None)
+
+
+def load_start(start: str | Path | MeshFile | None) -> MeshFile | None:
+    """Reads the mesh to start from and merges vertices at equal positions, so that neighbours move together."""
+    if start is None:
+        return None
+    return weld_vertices(start if isinstance(start, MeshFile) else load_mesh(start))
+
+
+def make_start(start: MeshFile | None, views: PosedViews, config: ReconstructConfig) -> TriangleMesh:
+    """The mesh that a run starts from, in the unit frame: an icosphere around the object, or the given mesh.
+
+    Args:
+        start: from `load_start`, in the input's units; its face colours are used if it has them.
+        views: of the unit frame.
+        config: level, radius, colour, opacity and softness.
+    """
+    if start is None:
+        vertices, faces = icosphere(config.start_level)
+        vertices = vertices * config.start_radius
+        colors: Tensor | float = config.start_color
+    else:
+        vertices, faces = views.normalization.apply(start.vertices), start.faces
+        colors = config.start_color if start.face_colors is None else start.face_colors
+    return TriangleMesh.from_mesh(
+        vertices, faces, colors=colors, opacity=config.start_opacity, sigma=config.start_sigma
+    )
+
+
+def fingerprint(source: MeshFile | PosedViews | None) -> str | None:
+    """A short hash of everything in a source that a run depends on."""
+    if source is None:
+        return None
+    if isinstance(source, MeshFile):
+        tensors = [source.vertices, source.faces, source.face_colors]
+    else:
+        split = torch.tensor([*source.train, -1, *source.test])
+        tensors = [source.cameras.viewmats, source.cameras.Ks, split, *source.images]
+    digest = hashlib.sha256()
+    for tensor in tensors:
+        if tensor is not None:
+            digest.update(str(tuple(tensor.shape)).encode())
+            digest.update(tensor.contiguous().cpu().numpy().data)
+    return digest.hexdigest()[:16]
