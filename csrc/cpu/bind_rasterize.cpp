@@ -19,7 +19,7 @@ void bind_rasterize(nb::module_& m) {
         FIELD(distance) FIELD(freeze_incentre) FIELD(near_plane) FIELD(alpha_min) FIELD(alpha_max) FIELD(x_max)
         FIELD(transmittance_min) FIELD(distortion_near) FIELD(distortion_far) FIELD(centroid_depth)
         FIELD(keep_for_backward) FIELD(color) FIELD(alpha) FIELD(distortion) FIELD(distortion_totals)
-        FIELD(median_depth) FIELD(max_weight) FIELD(screen_size) FIELD(inradius) FIELD(visible);
+        FIELD(median_triangle) FIELD(max_weight) FIELD(screen_size) FIELD(inradius) FIELD(visible);
 #undef FIELD
 #define FIELD(name) .def_rw(#name, &RasterGradients::name)
     nb::class_<RasterGradients>(m, "RasterGradients")

@@ -1,6 +1,7 @@
 // Forward and backward passes of one view as sequences of stages.
 #include "raster.h"
 
+#include <limits>
 #include <mutex>
 #include <stdexcept>
 #include <vector>
@@ -59,12 +60,13 @@ void fill_pass(RasterState& state) {
     pass.flat_channels = call.flat_channels;
     pass.corner_channels = call.corner_channels;
     pass.want_distortion = call.distortion != 0;
-    pass.want_median = call.median_depth != 0;
-    if (pass.want_distortion || pass.want_median)
+    pass.want_median = call.median_triangle != 0;
+    if (pass.want_distortion)
         pass.distortion_depth = call.centroid_depth ? DistortionDepth::kCentroid : DistortionDepth::kPlane;
     pass.attributes = call.corner_channels > 0 || pass.distortion_depth == DistortionDepth::kPlane;
-    pass.alpha_min = call.alpha_min;
-    pass.alpha_max = call.alpha_max;
+    // With the cut-offs off, too: where alpha is 0 x^(2/sigma) may have overflowed, and the backward divides by 1 - alpha.
+    pass.alpha_min = vmax(call.alpha_min, std::numeric_limits<float>::min());
+    pass.alpha_max = vmin(call.alpha_max, 1.0f - 1e-6f);
     pass.transmittance_min = call.transmittance_min;
     pass.distortion_near = call.distortion_near;
     pass.distortion_far = call.distortion_far;
@@ -75,7 +77,7 @@ void fill_pass(RasterState& state) {
     pass.alpha = reinterpret_cast<float*>(call.alpha);
     pass.distortion = reinterpret_cast<float*>(call.distortion);
     pass.distortion_totals = reinterpret_cast<float*>(call.distortion_totals);
-    pass.median_depth = reinterpret_cast<float*>(call.median_depth);
+    pass.median_triangle = reinterpret_cast<int32_t*>(call.median_triangle);
     pass.slot_layout.flat_channels = call.flat_channels;
     pass.slot_layout.corner_channels = call.corner_channels;
     pass.slot_layout.attributes = pass.attributes;
@@ -146,7 +148,7 @@ std::shared_ptr<RasterState> raster_forward(const RasterCall& call) {
 
 void raster_backward(RasterState& state, const RasterGradients& gradients) {
     RasterPass& pass = state.pass;
-    if (!pass.hits) throw std::logic_error("rasterize: this render was made without keep_for_backward");
+    if (!state.call.keep_for_backward) throw std::logic_error("rasterize: this render was made without keep_for_backward");
     pass.grad_color = reinterpret_cast<const float*>(gradients.grad_color);
     pass.grad_alpha = reinterpret_cast<const float*>(gradients.grad_alpha);
     pass.grad_distortion = reinterpret_cast<const float*>(gradients.grad_distortion);

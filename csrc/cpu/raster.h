@@ -31,11 +31,11 @@ struct RasterCall {
     bool freeze_incentre = false;
     float near_plane = 0.01f, alpha_min = 0, alpha_max = 1, x_max = 2, transmittance_min = 0;
     float distortion_near = 0.2f, distortion_far = 100.0f;
-    bool centroid_depth = false;  // depth of distortion and median: the centroid's, not the pixel's
+    bool centroid_depth = false;  // depth of the distortion: the centroid's, not the pixel's
     bool keep_for_backward = false;
 
     uintptr_t color = 0, alpha = 0;
-    uintptr_t distortion = 0, distortion_totals = 0, median_depth = 0;
+    uintptr_t distortion = 0, distortion_totals = 0, median_triangle = 0;
     uintptr_t max_weight = 0, screen_size = 0, inradius = 0, visible = 0;  // (N) float, float, float, bool
 };
 

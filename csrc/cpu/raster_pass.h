@@ -78,7 +78,7 @@ struct RasterPass {
     float* alpha = nullptr;                   // (H, W)
     float* distortion = nullptr;              // (H, W) or null
     float* distortion_totals = nullptr;       // (H, W, 2): sum w m, sum w m^2
-    float* median_depth = nullptr;            // (H, W) or null
+    int32_t* median_triangle = nullptr;       // (H, W) or null: 1 + index, 0 where T stays above one half
 
     // backward
     const float* grad_color = nullptr;

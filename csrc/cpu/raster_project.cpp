@@ -45,7 +45,7 @@ float visible_extent(const RasterCall& call, float opacity, float sigma) {
     if (call.alpha_min > 0.0f) {
         const float ratio = opacity / call.alpha_min;
         if (!(ratio >= 1.0f)) return -1.0f;
-        const float support = kernel_support(call.kernel, std::max(ratio, 1.0f + 1e-6f), sigma);
+        const float support = kernel_support(call.kernel, std::max(ratio, 1.0f + 1e-6f), std::max(sigma, kMinSigma));
         extent = std::min(extent, support * kSupportMargin + 1e-5f);
     } else if (call.kernel == 0 || call.kernel == 3) {
         extent = std::min(extent, 1.0f);
@@ -134,7 +134,7 @@ float project_one(RasterState& state, const Inputs& in, int64_t i, Triangle2D& t
     write_record(record, t, extent);
     if (!meets_image(record, call.width, call.height)) return -1.0f;
     record.opacity = opacity;
-    const KernelCoefficients coefficients = kernel_coefficients(call.kernel, sigma);
+    const KernelCoefficients coefficients = kernel_coefficients(call.kernel, std::max(sigma, kMinSigma));
     record.exponent = coefficients.exponent;
     record.scale = coefficients.scale;
     if (state.attributes.size() > 0) write_attributes(state.attributes[i], t, view, record.qx, record.qy);

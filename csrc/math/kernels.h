@@ -27,6 +27,7 @@ struct KernelValue {
 // single-sided kernel at x = 1 for sigma < 1.
 constexpr float kMinDistance = 1e-6f;
 constexpr float kMinInnerDistance = 1e-4f;
+constexpr float kMinSigma = 1e-6f;  // below, float cannot tell a kernel from a step; callers raise sigma to this
 
 constexpr float kLog2E = 1.44269504088896f;
 constexpr float kLn2 = 0.693147180559945f;

@@ -5,6 +5,8 @@
 // next transmittance would fall below the limit is dead from then on; dead blocks, then the dead tile, end the work.
 #pragma once
 
+#include <bit>
+
 #include "tile.h"
 
 namespace etsplat::ETSPLAT_SIMD {
@@ -15,7 +17,7 @@ struct ForwardTile {
     float weighted_depth[kBlocks][16];   // sum w m and sum w m^2 of the distortion
     float weighted_square[kBlocks][16];
     float distortion[kBlocks][16];
-    float median[kBlocks][16];
+    float median[kBlocks][16];  // bits of an int32: 1 + triangle at which T falls to one half, 0 if none
     uint16_t alive[kBlocks];
     unsigned alive_blocks;
     float first_inverse_z;
@@ -41,10 +43,16 @@ ETSPLAT_FN void begin(ForwardTile& tile, const TileFrame& frame, int channels, b
     }
 }
 
-// Interpolated channels, distortion and median depth of the pixels of one block, drawn with weights w (0 elsewhere).
+// Interpolated channels, distortion and median triangle of the pixels of one block, drawn with weights w (0 elsewhere).
 ETSPLAT_FN void draw_extras(const RasterPass& pass, ForwardTile& tile, const TriangleForms& forms, int triangle, int block,
                             Vec transmittance, Vec w) {
-    if (!pass.attributes && !pass.want_distortion && !pass.want_median) return;
+    const VecMask drawn = w > Vec(0.0f);
+    if (pass.want_median) {
+        const VecMask crosses = drawn & (transmittance > Vec(0.5f)) & (transmittance - w <= Vec(0.5f));
+        const Vec bits(std::bit_cast<float>(triangle + 1));  // moved about, never computed with
+        vselect(crosses, bits, Vec::load(tile.median[block])).store(tile.median[block]);
+    }
+    if (!pass.attributes && !pass.want_distortion) return;
     const AttributeRecord& record = pass.attribute_records[triangle];
     Interpolation at;
     Vec z(record.centroid_z);
@@ -59,11 +67,6 @@ ETSPLAT_FN void draw_extras(const RasterPass& pass, ForwardTile& tile, const Tri
             float* out = tile.channel(pass.flat_channels + c, block);
             vfma(w, value, Vec::load(out)).store(out);
         }
-    }
-    const VecMask drawn = w > Vec(0.0f);
-    if (pass.want_median) {
-        const VecMask crosses = drawn & (transmittance > Vec(0.5f)) & (transmittance - w <= Vec(0.5f));
-        vselect(crosses, z, Vec::load(tile.median[block])).store(tile.median[block]);
     }
     if (pass.want_distortion) {
         const Vec m = distortion_coordinate(pass, tile.first_inverse_z, Vec(1.0f) / z);
@@ -134,7 +137,8 @@ ETSPLAT_FN void finish(const RasterPass& pass, ForwardTile& tile, const TileFram
             }
             for (int i = 0; i < columns; ++i) pass.alpha[pixel + i] = 1.0f - t[i];
             if (pass.want_median)
-                for (int i = 0; i < columns; ++i) pass.median_depth[pixel + i] = tile.median[block][4 * row + i];
+                for (int i = 0; i < columns; ++i)
+                    pass.median_triangle[pixel + i] = std::bit_cast<int32_t>(tile.median[block][4 * row + i]);
             if (pass.want_distortion)
                 for (int i = 0; i < columns; ++i) {
                     pass.distortion[pixel + i] = tile.distortion[block][4 * row + i];

@@ -20,6 +20,7 @@ from etsplat.core.rasterization import (
     RasterizeSettings,
     TriangleStatistics,
 )
+from etsplat.ops._rasterize_reference import barycentrics, perspective_weights, to_screen
 
 
 def rasterize_cpu(
@@ -40,17 +41,18 @@ def rasterize_cpu(
     if settings.depth != "none" or settings.normals:
         channels.add_geometry(mesh, viewmats, settings)
     if backgrounds is not None and channels.count > channels.colors:
-        backgrounds = torch.nn.functional.pad(backgrounds, (0, channels.count - channels.colors))
+        first = channels.first_color
+        backgrounds = torch.nn.functional.pad(backgrounds, (first, channels.count - channels.colors - first))
 
     plan = _Plan(settings, mesh, channels.flat_per_view)
-    color, alpha, distortion, median = _Rasterize.apply(
+    color, alpha, distortion, median_triangle = _Rasterize.apply(
         vertices, channels.flat, channels.corner, opacities, sigma, viewmats, Ks, backgrounds, plan
     )
     result = Rasterization(color=color, alpha=alpha, statistics=plan.statistics)
     if settings.distortion:
         result.distortion = distortion
     if settings.median_depth:
-        result.median_depth = median
+        result.median_depth = _median_depth(median_triangle, mesh, viewmats, Ks, settings)
     channels.split(result)
     return result
 
@@ -72,8 +74,9 @@ class _Mesh:
         self.faces32, self.corner_offsets, self.corner_indices = _face_arrays(faces, vertices.shape[0])
 
     def corners(self) -> Tensor:
-        """Corner positions (N, 3, 3), differentiable."""
-        return self.vertices if self.faces is None else self.vertices[self.faces.long()]
+        """Corner positions (N, 3, 3), differentiable; 0 for triangles that are not finite, which are never drawn."""
+        corners = self.vertices if self.faces is None else self.vertices[self.faces.long()]
+        return torch.where(corners.isfinite().all(dim=2).all(dim=1)[:, None, None], corners, 0.0)
 
 
 def _face_arrays(faces: Tensor | None, num_vertices: int) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
@@ -94,7 +97,7 @@ def _face_arrays(faces: Tensor | None, num_vertices: int) -> tuple[Tensor | None
 
 
 class _Channels:
-    """Flat (N, F) or (B, N, F) and corner (N, 3, K) or (B, N, 3, K) channels; colours first, then depth, then normal."""
+    """Flat (N, F) or (B, N, F) and corner (N, 3, K) or (B, N, 3, K) channels; in each, colours come first."""
 
     def __init__(self, colors: Tensor | None, corner_colors: Tensor | None) -> None:
         self.flat = colors
@@ -112,9 +115,16 @@ class _Channels:
     def count(self) -> int:
         return sum(t.shape[-1] for t in (self.flat, self.corner) if t is not None)
 
+    @property
+    def first_color(self) -> int:
+        """Flat channels come first in an image, so a normal or a depth may precede interpolated colours."""
+        return 0 if self.flat_is_color or self.flat is None else self.flat.shape[-1]
+
     def add_geometry(self, mesh: _Mesh, viewmats: Tensor, settings: RasterizeSettings) -> None:
         corners = mesh.corners()
         batch = viewmats.shape[0]
+        # A camera that is not finite sees nothing, and must not spoil the gradients of the others.
+        viewmats = torch.where(viewmats.isfinite().all(dim=2).all(dim=1)[:, None, None], viewmats, 0.0)
         z = torch.einsum("bi,nki->bnk", viewmats[:, 2, :3], corners) + viewmats[:, 2, 3, None, None]
         flat: list[Tensor] = []
         if settings.depth == "centroid":
@@ -148,13 +158,33 @@ class _Channels:
 
 def _facing_normals(corners: Tensor, viewmats: Tensor) -> Tensor:
     """Unit normals (B, N, 3) in world space, turned towards each camera; 0 for a triangle without area."""
-    normal = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], dim=-1)
+    edges = corners[:, 1:] - corners[:, :1]
+    # Brought near 1 first: the squares of very long or short edges leave the range of float32.
+    size = edges.detach().abs().amax(dim=(1, 2), keepdim=True)
+    edges = edges / torch.where((size > 0) & size.isfinite(), size, torch.inf)
+    normal = torch.linalg.cross(edges[:, 0], edges[:, 1], dim=-1)
     length = normal.norm(dim=-1, keepdim=True)
     normal = torch.where(length > 0, normal / length.clamp_min(1e-30), torch.zeros_like(normal))
     centers = -torch.einsum("bij,bi->bj", viewmats[:, :3, :3], viewmats[:, :3, 3])
     towards = corners.mean(1)[None] - centers[:, None]
     away = (towards * normal).sum(-1, keepdim=True) > 0
     return torch.where(away, -normal[None], normal[None])
+
+
+def _median_depth(triangle: Tensor, mesh: _Mesh, viewmats: Tensor, Ks: Tensor, settings: RasterizeSettings) -> Tensor:
+    """Depth (B, H, W, 1) at each pixel of the triangle whose index + 1 is given, 0 where that is 0; differentiable."""
+    corners = mesh.corners()
+    images = []
+    for view, chosen in enumerate(triangle):
+        row, column = chosen.nonzero(as_tuple=True)
+        screen, z = to_screen(corners[chosen[row, column].long() - 1], viewmats[view], Ks[view])
+        if settings.depth == "centroid":
+            depth = z.mean(dim=-1)
+        else:
+            pixels = torch.stack([column, row], dim=-1) + 0.5
+            depth = (perspective_weights(barycentrics(pixels, screen), z) * z).sum(dim=-1)
+        images.append(torch.zeros(chosen.shape).index_put((row, column), depth))
+    return torch.stack(images)[..., None]
 
 
 @dataclass
@@ -168,7 +198,7 @@ class _Plan:
 
 
 class _Rasterize(torch.autograd.Function):
-    """(colour of all channels, alpha, distortion, median depth); the latter two are empty unless asked for."""
+    """(colour of all channels, alpha, distortion, median triangle); the latter two are empty unless asked for."""
 
     @staticmethod
     def forward(  # type: ignore[override]
@@ -194,9 +224,9 @@ class _Rasterize(torch.autograd.Function):
         # The native state refers to these by address, so they must live as long as it does.
         ctx.totals = outputs.distortion_totals
         ctx.save_for_backward(*inputs, outputs.color, outputs.alpha, outputs.distortion)
-        ctx.mark_non_differentiable(outputs.median_depth)
+        ctx.mark_non_differentiable(outputs.median_triangle)
         ctx.set_materialize_grads(False)
-        return outputs.color, outputs.alpha, outputs.distortion, outputs.median_depth
+        return outputs.color, outputs.alpha, outputs.distortion, outputs.median_triangle
 
     @staticmethod
     @once_differentiable
@@ -239,7 +269,7 @@ class _Outputs:
         self.alpha = torch.empty(*image, 1)
         self.distortion = torch.empty(*image, 1) if settings.distortion else torch.empty(0)
         self.distortion_totals = torch.empty(*image, 2) if settings.distortion else None
-        self.median_depth = torch.empty(*image, 1) if settings.median_depth else torch.empty(0)
+        self.median_triangle = torch.empty(image if settings.median_depth else 0, dtype=torch.int32)
         self.statistics = None
         if settings.statistics:
             n = (batch, plan.mesh.count)
@@ -285,7 +315,7 @@ def _native_call(b: int, inputs: list[Tensor | None], outputs: _Outputs, plan: _
         call.distortion = _address(outputs.distortion, b)
         call.distortion_totals = _address(outputs.distortion_totals, b)
     if settings.median_depth:
-        call.median_depth = _address(outputs.median_depth, b)
+        call.median_triangle = _address(outputs.median_triangle, b)
     if outputs.statistics is not None:
         call.max_weight = _address(outputs.statistics.max_weight, b)
         call.screen_size = _address(outputs.statistics.screen_size, b)

@@ -99,7 +99,7 @@ def _project(
 ) -> _Projected:
     """Cull, sort by the depth of the centroid (ties by index), and project."""
     with torch.no_grad():
-        corners, corner_depths = _to_screen(triangles, viewmat, K)
+        corners, corner_depths = to_screen(triangles, viewmat, K)
         centre, inradius, screen_size = _shape(corners, settings.distance)
         support = KERNELS[settings.kernel].support(opacities, sigma, settings.cutoffs.alpha_min)
         reach = support.clamp(max=settings.cutoffs.x_max)
@@ -116,7 +116,7 @@ def _project(
         order = torch.argsort(corner_depths[candidates].mean(dim=-1), stable=True)
         index = candidates[order]
 
-    corners, corner_depths = _to_screen(triangles[index], viewmat, K)
+    corners, corner_depths = to_screen(triangles[index], viewmat, K)
     return _Projected(
         index=index,
         corners=corners,
@@ -132,7 +132,7 @@ def _project(
     )
 
 
-def _to_screen(triangles: Tensor, viewmat: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
+def to_screen(triangles: Tensor, viewmat: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
     """Pixel coordinates (..., 2) and view-space z of world points (..., 3)."""
     in_view = triangles @ viewmat[:3, :3].T + viewmat[:3, 3]
     z = in_view[..., 2]
@@ -215,7 +215,7 @@ def _composite(
     Returns:
         (P, K) channels in the order of ``_assemble``, and (len(near),) largest weights without gradient.
     """
-    barycentric = _barycentrics(pixels, triangles.corners[near])
+    barycentric = barycentrics(pixels[:, None], triangles.corners[near])
     x = _distance(barycentric, triangles.corners[near], settings)
     gain = _KernelValue.apply(x, triangles.sigma[near].expand_as(x), KERNELS[settings.kernel])
     cutoffs = settings.cutoffs
@@ -229,7 +229,7 @@ def _composite(
     before, after = transmittance[:, :-1], transmittance[:, 1:]
     weight = alpha * before
 
-    z_weights = _perspective_weights(barycentric, triangles.corner_depths[near])
+    z_weights = perspective_weights(barycentric, triangles.corner_depths[near])
     colors = triangles.colors[near]
     if colors.ndim == 2:
         channels = [weight @ colors]
@@ -252,11 +252,14 @@ def _composite(
     return torch.cat(channels, dim=1), weight.detach().amax(dim=0)
 
 
-def _barycentrics(pixels: Tensor, corners: Tensor) -> Tensor:
-    """Affine screen-space barycentrics (P, M, 3): signed areas opposite to each corner over the triangle's."""
-    to_corners = corners - pixels[:, None, None]
+def barycentrics(pixels: Tensor, corners: Tensor) -> Tensor:
+    """Affine screen-space barycentrics (..., 3) of points (..., 2) in triangles (..., 3, 2).
+
+    Signed areas opposite to each corner over the triangle's.
+    """
+    to_corners = corners - pixels[..., None, :]
     doubled = _cross(to_corners.roll(-1, dims=-2), to_corners.roll(-2, dims=-2))
-    return doubled / _doubled_area(corners)[:, None]
+    return doubled / _doubled_area(corners)[..., None]
 
 
 def _distance(barycentric: Tensor, corners: Tensor, settings: RasterizeSettings) -> Tensor:
@@ -302,8 +305,8 @@ def _transmittance(alpha: Tensor) -> Tensor:
     return torch.cat([alpha.new_ones(len(alpha), 1), torch.cumprod(1.0 - alpha, dim=1)], dim=1)
 
 
-def _perspective_weights(barycentric: Tensor, corner_depths: Tensor) -> Tensor:
-    """Weights (P, M, 3) of the corners' attributes; clamped, so that nothing extrapolates outside of the triangle."""
+def perspective_weights(barycentric: Tensor, corner_depths: Tensor) -> Tensor:
+    """Weights (..., 3) of the corners' attributes; clamped, so that nothing extrapolates outside of the triangle."""
     over_z = barycentric.clamp(min=0.0) / corner_depths
     return over_z / over_z.sum(dim=-1, keepdim=True)
 
