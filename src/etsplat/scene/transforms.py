@@ -1,0 +1,190 @@
+"""Captures described by `transforms*.json`: the Blender (NeRF-synthetic) and nerfstudio layouts.
+
+Both give camera-to-world matrices with OpenGL axes (x right, y up, the camera looks along -z); flipping y and z and
+inverting gives our world-to-camera matrices with OpenCV axes.
+"""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from etsplat.core.errors import InputError
+from etsplat.io.images import IMAGE_SUFFIXES, image_size
+from etsplat.scene.frames import Frame, find_mask, load_frames
+from etsplat.scene.views import PosedViews, every_eighth
+
+_DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+_PINHOLE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE")
+_UNDISTORT = "undistort the images first (e.g. `colmap image_undistorter`) and export the poses again"
+
+
+def load_transforms(folder: Path | str, *, width: int | None = None) -> PosedViews:
+    """Read a scene folder with `transforms.json`, or with `transforms_train.json` and `transforms_test.json`.
+
+    Images may be RGBA; otherwise a frame's `mask_path`, or a folder `masks/` with a file for every image, separates
+    the object. With one `transforms.json` its `train_filenames` and `test_filenames` make the split; without them,
+    every 8th image by name is test. `transforms_val.json` is not used.
+
+    Args:
+        folder: the scene.
+        width: shrink the images to this many pixels across (never enlarges).
+
+    Returns:
+        Views in the capture's own units.
+
+    Raises:
+        InputError: a file is missing, damaged or of another layout; cameras with lens distortion; images as
+            `etsplat.scene.frames.load_frames`.
+    """
+    folder = Path(folder)
+    if (folder / "transforms.json").is_file():
+        return _load_single(folder, width)
+    train_file, test_file = folder / "transforms_train.json", folder / "transforms_test.json"
+    if not train_file.is_file():
+        raise InputError(
+            f"scene {folder}: neither transforms.json nor transforms_train.json; choose the scene's folder"
+        )
+    frames = _frames(train_file)
+    train_count = len(frames)
+    if not test_file.is_file():
+        train, test = every_eighth([frame.name for frame in frames])
+        return load_frames(folder, frames, train, test, width=width)
+    frames += _frames(test_file)
+    return load_frames(folder, frames, list(range(train_count)), list(range(train_count, len(frames))), width=width)
+
+
+def _load_single(folder: Path, width: int | None) -> PosedViews:
+    path = folder / "transforms.json"
+    frames = sorted(_frames(path), key=lambda frame: frame.name)
+    document = _read(path)
+    if "train_filenames" not in document or "test_filenames" not in document:
+        train, test = every_eighth([frame.name for frame in frames])
+        return load_frames(folder, frames, train, test, width=width)
+    train_names, test_names = _name_set(path, document, "train_filenames"), _name_set(path, document, "test_filenames")
+    train = [index for index, frame in enumerate(frames) if frame.name in train_names]
+    test = [index for index, frame in enumerate(frames) if frame.name in test_names - train_names]
+    if not train:
+        raise InputError(f"scene {path}: train_filenames names none of the frames; correct or remove it")
+    return load_frames(folder, frames, train, test, width=width)
+
+
+def _name_set(path: Path, document: dict[str, Any], key: str) -> set[str]:
+    names = document[key]
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise InputError(f"scene {path}: {key} is not a list of file names; correct or remove it")
+    return {_plain(name) for name in names}
+
+
+def _plain(name: str) -> str:
+    """A path as frames are named: forward slashes, nothing before the first folder."""
+    return name.replace("\\", "/").removeprefix("./")
+
+
+def _frames(path: Path) -> list[Frame]:
+    document = _read(path)
+    entries = document.get("frames")
+    if not isinstance(entries, list) or not entries:
+        raise InputError(f"scene {path}: no list `frames`; is it a NeRF capture? Export the poses again")
+    masks = path.parent / "masks"
+    return [_frame(path, document, entry, masks if masks.is_dir() else None) for entry in entries]
+
+
+def _frame(path: Path, document: dict[str, Any], entry: dict[str, Any], masks: Path | None) -> Frame:
+    if not isinstance(entry, dict) or not isinstance(entry.get("file_path"), str):
+        raise InputError(f"scene {path}: a frame without `file_path`; export the poses again")
+    name = _plain(entry["file_path"])
+    image = _image_file(path.parent, name)
+    settings = {**document, **entry}
+    _refuse_distortion(path, name, settings)
+    size = _size(path, name, settings, image)
+    mask = None
+    if isinstance(entry.get("mask_path"), str):
+        mask = path.parent / _plain(entry["mask_path"])
+    elif masks is not None:
+        mask = find_mask(masks, image.name)
+    return Frame(name, image, mask, _viewmat(path, name, entry), _intrinsics(path, name, settings, size), size)
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, OSError) as error:
+        raise InputError(
+            f"scene {path}: not valid JSON ({str(error).splitlines()[0]}); export the poses again"
+        ) from error
+    if not isinstance(document, dict):
+        raise InputError(f"scene {path}: expected a JSON object with a list `frames`; export the poses again")
+    return document
+
+
+def _image_file(folder: Path, name: str) -> Path:
+    """The file as named, or with the ending that Blender exports leave out; as named if none exists."""
+    for candidate in [name, *(name + suffix for suffix in IMAGE_SUFFIXES)]:
+        if (folder / candidate).is_file():
+            return folder / candidate
+    return folder / name
+
+
+def _refuse_distortion(path: Path, name: str, settings: dict[str, Any]) -> None:
+    model = settings.get("camera_model", "OPENCV")
+    if model not in _PINHOLE_MODELS:
+        raise InputError(f"scene {path}: {name} has a {model} camera; {_UNDISTORT}")
+    distorted = [key for key in _DISTORTION if _number(path, name, settings, key, 0.0) != 0]
+    if distorted:
+        raise InputError(f"scene {path}: {name} has lens distortion ({', '.join(distorted)}); {_UNDISTORT}")
+
+
+def _size(path: Path, name: str, settings: dict[str, Any], image: Path) -> tuple[int, int]:
+    if "w" in settings and "h" in settings:
+        size = int(_number(path, name, settings, "w", 0)), int(_number(path, name, settings, "h", 0))
+        if min(size) < 1:
+            raise InputError(f"scene {path}: {name} has the size {size[0]}x{size[1]}; correct w and h")
+        return size
+    # A missing image is reported later, together with all others.
+    return image_size(image) if image.is_file() else (1, 1)
+
+
+def _intrinsics(path: Path, name: str, settings: dict[str, Any], size: tuple[int, int]) -> Float[Tensor, "3 3"]:
+    def focal(key: str, angle_key: str, extent: int, default: float | None) -> float | None:
+        if key in settings:
+            return _number(path, name, settings, key, 0.0)
+        if angle_key in settings:
+            return 0.5 * extent / math.tan(0.5 * _number(path, name, settings, angle_key, 0.0))
+        return default
+
+    fx = focal("fl_x", "camera_angle_x", size[0], None)
+    if fx is None:
+        raise InputError(f"scene {path}: {name} has neither fl_x nor camera_angle_x; export the poses again")
+    fy = focal("fl_y", "camera_angle_y", size[1], fx)
+    cx = _number(path, name, settings, "cx", size[0] / 2)
+    cy = _number(path, name, settings, "cy", size[1] / 2)
+    if fy is None or min(fx, fy) <= 0 or not all(math.isfinite(value) for value in (fx, fy, cx, cy)):
+        raise InputError(f"scene {path}: {name} has a focal length that is not positive; export the poses again")
+    return torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
+
+
+def _viewmat(path: Path, name: str, entry: dict[str, Any]) -> Float[Tensor, "4 4"]:
+    try:
+        matrix = torch.tensor(entry.get("transform_matrix"), dtype=torch.float64)
+    except (TypeError, ValueError, RuntimeError):
+        matrix = torch.empty(0)
+    if tuple(matrix.shape) not in ((4, 4), (3, 4)) or not bool(torch.isfinite(matrix).all()):
+        raise InputError(f"scene {path}: {name} has no 4x4 transform_matrix of finite numbers; export the poses again")
+    camera_to_world = torch.eye(4, dtype=torch.float64)
+    camera_to_world[:3] = matrix[:3]
+    rotation = camera_to_world[:3, :3]
+    if not torch.allclose(rotation.T @ rotation, torch.eye(3, dtype=torch.float64), atol=1e-3) or rotation.det() < 0:
+        raise InputError(f"scene {path}: the transform_matrix of {name} scales or mirrors; export rigid poses")
+    return torch.linalg.inv(camera_to_world * torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
+
+
+def _number(path: Path, name: str, settings: dict[str, Any], key: str, default: float) -> float:
+    value = settings.get(key, default)
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise InputError(f"scene {path}: {name} has {key} = {value!r}, which is not a number; export the poses again")
+    return float(value)
