@@ -1,6 +1,6 @@
 """Milliseconds of the operations beside the rasterizer, at the size of a full reconstruction step.
 
-    python -m benchmarks.ops --threads 4
+python -m benchmarks.ops --threads 4
 """
 
 import argparse
@@ -121,7 +121,7 @@ def main() -> None:
         for name, shape, operation in build(arguments.size, vertices, faces):
             times = milliseconds(operation, arguments.repeats)
             table.add_row(name, shape, f"{statistics.median(times):.2f}", f"{min(times):.2f}")
-    Console().print(table)
+    Console(width=110).print(table)
 
 
 if __name__ == "__main__":

@@ -136,8 +136,8 @@ def test_bad_arguments_are_refused_by_name(engine, case, scene):
 @pytest.mark.parametrize(
     ("faces", "message"),
     [
-        (torch.full((5, 3), 15), "faces must index the 15 vertices, got indices from 15 to 15"),
-        (torch.full((5, 3), -1), "faces must index the 15 vertices, got indices from -1 to -1"),
+        (torch.full((5, 3), 15), "faces must be indices from 0 to 14, got indices from 15 to 15"),
+        (torch.full((5, 3), -1), "faces must be indices from 0 to 14, got indices from -1 to -1"),
         (torch.zeros(5, 3), "faces must be int32 or int64, got torch.float32"),
     ],
 )

@@ -66,8 +66,8 @@ Projected project(const HardCamera& camera, int32_t samples, const float* p) {
     }
     Projected v;
     v.inverse_depth = 1.0 / c[2];
-    v.x = samples * ((k[0] * c[0] + k[1] * c[1]) * v.inverse_depth + k[2]);
-    v.y = samples * ((k[3] * c[0] + k[4] * c[1]) * v.inverse_depth + k[5]);
+    v.x = samples * (k[0] * c[0] * v.inverse_depth + k[2]);
+    v.y = samples * (k[4] * c[1] * v.inverse_depth + k[5]);
     const bool drawn = c[2] > static_cast<double>(camera.near_plane) && std::isfinite(v.x) && std::isfinite(v.y);
     if (!drawn) v.inverse_depth = std::numeric_limits<double>::quiet_NaN();
     return v;

@@ -8,18 +8,19 @@ from torch import Tensor
 Shape = tuple[str | int, ...]
 
 
-def check_shape(name: str, tensor: Tensor, shapes: Sequence[Shape], sizes: dict[str, int]) -> None:
+def check_shape(name: str, tensor: Tensor, *shapes: Shape, sizes: dict[str, int] | None = None) -> None:
     """Match ``tensor`` to one of ``shapes`` and remember the sizes of the letters in it.
 
     Args:
         name: The argument, for the message.
         tensor: What was given.
         shapes: Acceptable shapes; a letter stands for a size.
-        sizes: Letters with known sizes; letters first met here are added.
+        sizes: Letters with known sizes, shared by the checks of several arguments; letters first met here are added.
 
     Raises:
         ValueError: It is no tensor, or no shape matches.
     """
+    sizes = {} if sizes is None else sizes
     wanted = " or ".join("(" + ", ".join(map(str, shape)) + ("," if len(shape) == 1 else "") + ")" for shape in shapes)
     if not isinstance(tensor, Tensor):
         raise ValueError(f"{name} must be a tensor of shape {wanted}, got {type(tensor).__name__}")
@@ -51,15 +52,15 @@ def check_device(name: str, tensor: Tensor, other_name: str, other: Tensor) -> N
         raise ValueError(f"{name} must be on {other.device} like {other_name}, got {tensor.device}")
 
 
-def check_faces(name: str, faces: Tensor, num_vertices: int) -> None:
-    """Raise ValueError unless ``faces`` are int32 or int64 indices into ``num_vertices`` vertices."""
-    if faces.dtype not in (torch.int32, torch.int64):
-        raise ValueError(f"{name} must be int32 or int64, got {faces.dtype}")
-    if faces.numel() == 0:
+def check_indices(name: str, indices: Tensor, count: int) -> None:
+    """Raise ValueError unless ``indices`` are int32 or int64, from 0 to ``count`` - 1."""
+    if indices.dtype not in (torch.int32, torch.int64):
+        raise ValueError(f"{name} must be int32 or int64, got {indices.dtype}")
+    if indices.numel() == 0:
         return
-    low, high = (int(value) for value in torch.aminmax(faces))
-    if low < 0 or high >= num_vertices:
-        raise ValueError(f"{name} must index the {num_vertices} vertices, got indices from {low} to {high}")
+    low, high = (int(value) for value in torch.aminmax(indices))
+    if low < 0 or high >= count:
+        raise ValueError(f"{name} must be indices from 0 to {count - 1}, got indices from {low} to {high}")
 
 
 def check_finite(name: str, tensor: Tensor) -> None:
@@ -67,6 +68,14 @@ def check_finite(name: str, tensor: Tensor) -> None:
     finite = torch.isfinite(tensor)
     if not bool(finite.all()):
         raise ValueError(f"{name} must be finite, got {int((~finite).sum())} NaN or infinite values")
+
+
+def check_intrinsics(name: str, Ks: Tensor) -> None:
+    """Raise ValueError unless every matrix of ``Ks`` (B, 3, 3) is a pinhole camera without skew."""
+    pinhole = torch.diag_embed(Ks.diagonal(dim1=-2, dim2=-1))
+    pinhole[:, :2, 2] = Ks[:, :2, 2]
+    if not bool((Ks == pinhole).all() and (Ks[:, 2, 2] == 1).all()):
+        raise ValueError(f"{name} must have the form [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]; skew is not supported")
 
 
 def check_choice(name: str, value: object, choices: Sequence[object]) -> None:

@@ -5,7 +5,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from etsplat import _native
-from etsplat.core.checks import check_shape
+from etsplat.core.validation import check_shape
 from etsplat.geometry.measures import native_mesh
 
 

@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from etsplat.core.checks import check_indices, check_shape
+from etsplat.core.validation import check_indices, check_shape
 
 
 def face_areas(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> Float[Tensor, " F"]:

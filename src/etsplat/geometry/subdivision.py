@@ -10,7 +10,7 @@ from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
 from etsplat import _native
-from etsplat.core.checks import check_shape
+from etsplat.core.validation import check_shape
 from etsplat.geometry.topology import MeshTopology
 
 

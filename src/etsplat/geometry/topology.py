@@ -14,7 +14,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
-from etsplat.core.checks import check_indices, check_shape
+from etsplat.core.validation import check_indices, check_shape
 from etsplat.ops.mesh_energies import MeshConnectivity
 
 

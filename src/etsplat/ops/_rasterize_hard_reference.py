@@ -73,7 +73,7 @@ def _project(points: Tensor, triangles: Tensor, view: View) -> tuple[Tensor, Ten
     camera = points.double() @ viewmat[:3, :3].T + viewmat[:3, 3]
     z = camera[:, 2]
     inverse_depth = 1 / z
-    screen = (camera[:, :2] @ K[:2, :2].T) * inverse_depth[:, None] + K[:2, 2]
+    screen = camera[:, :2] * K.diagonal()[:2] * inverse_depth[:, None] + K[:2, 2]
     usable = (z > view.near_plane) & screen.isfinite().all(dim=1) & z.isfinite()
     chosen = triangles.long()
     corners = screen[chosen]

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from etsplat import _native
-from etsplat.core.checks import check_matches, check_shape
+from etsplat.core.validation import check_like, check_shape
 from etsplat.ops.engines import resolve_engine
 
 
@@ -101,8 +101,8 @@ class Adam:
             raise ValueError(f"name must be one of {sorted(self.parameters)}, got {name!r}")
         for moment_name, moment in (("first", first), ("second", second)):
             check_shape(moment_name, moment, tuple(parameter.shape))
-            check_matches(moment_name, moment, parameter)
-        check_matches("parameter", parameter, self.parameters[name])
+            check_like(moment_name, moment, "parameter", parameter)
+        check_like("parameter", parameter, f"parameters[{name}]", self.parameters[name])
         self.parameters[name] = parameter
         self.first_moments[name] = first.contiguous()
         self.second_moments[name] = second.contiguous()
@@ -130,7 +130,7 @@ class Adam:
         for key in ("first_moments", "second_moments"):
             for name, moment in state[key].items():
                 check_shape(f"{key}[{name}]", moment, tuple(self.parameters[name].shape))
-                check_matches(f"{key}[{name}]", moment, self.parameters[name])
+                check_like(f"{key}[{name}]", moment, f"parameters[{name}]", self.parameters[name])
         self.step_count = int(state["step_count"])
         self.learning_rates = dict(state["learning_rates"])
         self.betas = tuple(state["betas"])

@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from etsplat import _native
-from etsplat.core.checks import check_indices, check_shape
+from etsplat.core.validation import check_indices, check_shape
 from etsplat.ops.engines import resolve_engine
 
 _MIN_LENGTH = 1e-12

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from etsplat import _native
-from etsplat.core.checks import check_matches, check_shape
+from etsplat.core.validation import check_like, check_shape
 from etsplat.ops.engines import resolve_engine
 
 
@@ -42,7 +42,7 @@ def l1_over_background(
     check_shape("target", target, (*color.shape[:3], 4))
     check_shape("backgrounds", backgrounds, (color.shape[0], 3))
     for name, constant in (("target", target), ("backgrounds", backgrounds)):
-        check_matches(name, constant, color)
+        check_like(name, constant, "color", color)
         if constant.requires_grad:
             raise ValueError(f"{name} receives no gradient from this loss: pass {name}.detach()")
     if color.numel() == 0:

@@ -12,8 +12,9 @@ from etsplat.core.validation import (
     Shape,
     check_choice,
     check_device,
-    check_faces,
     check_finite,
+    check_indices,
+    check_intrinsics,
     check_like,
     check_shape,
 )
@@ -150,7 +151,7 @@ def _check_tensors(given: dict[str, Tensor], faces: Tensor | None) -> None:
         raise ValueError(f"exactly one of colors and corner_colors must be given, got {got}")
     sizes: dict[str, int] = {}
     if faces is not None:
-        check_shape("faces", faces, [("N", 3)], sizes)
+        check_shape("faces", faces, ("N", 3), sizes=sizes)
     shapes: dict[str, list[Shape]] = {
         "vertices": [("N", 3, 3)] if faces is None else [("V", 3)],
         "opacities": [("N",)],
@@ -163,7 +164,7 @@ def _check_tensors(given: dict[str, Tensor], faces: Tensor | None) -> None:
     }
     for name, alternatives in shapes.items():
         if name in given:
-            check_shape(name, given[name], alternatives, sizes)
+            check_shape(name, given[name], *alternatives, sizes=sizes)
             check_like(name, given[name], "vertices", given["vertices"])
     if sizes["B"] < 1:
         raise ValueError("viewmats must hold at least one camera, got 0")
@@ -171,7 +172,7 @@ def _check_tensors(given: dict[str, Tensor], faces: Tensor | None) -> None:
         raise ValueError("colors must have at least one channel, got 0")
     if faces is not None:
         check_device("faces", faces, "vertices", given["vertices"])
-        check_faces("faces", faces, sizes["V"])
+        check_indices("faces", faces, sizes["V"])
 
 
 def _check_values(given: dict[str, Tensor]) -> None:
@@ -179,8 +180,4 @@ def _check_values(given: dict[str, Tensor]) -> None:
         check_finite(name, tensor)
     if not bool((given["sigma"] > 0).all()):
         raise ValueError(f"sigma must be positive, got {float(given['sigma'].min())}")
-    Ks = given["Ks"]
-    pinhole = torch.diag_embed(Ks.diagonal(dim1=-2, dim2=-1))
-    pinhole[:, :2, 2] = Ks[:, :2, 2]
-    if not bool((Ks == pinhole).all() and (Ks[:, 2, 2] == 1).all()):
-        raise ValueError("Ks must have the form [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]; skew is not supported")
+    check_intrinsics("Ks", given["Ks"])

@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from etsplat import _native
-from etsplat.core.checks import check_indices, check_matches, check_shape
+from etsplat.core.validation import check_device, check_indices, check_intrinsics, check_like, check_shape
 from etsplat.ops._rasterize_hard_reference import View, rasterize_hard_reference, render_opaque_reference
 from etsplat.ops.engines import resolve_engine
 
@@ -52,18 +52,18 @@ def rasterize_hard(
     Args:
         vertices: (V, 3) with ``faces``, or (N, 3, 3) without.
         viewmats: (B, 4, 4) world to camera, OpenCV axes.
-        Ks: (B, 3, 3) intrinsics in pixels.
+        Ks: (B, 3, 3) intrinsics [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels.
         width: Image width in pixels.
         height: Image height in pixels.
         faces: (F, 3) vertex indices, int32 or int64.
-        near_plane: Triangles with a vertex at this depth or nearer are dropped.
+        near_plane: Triangles with a vertex at this depth or nearer are dropped; > 0.
         engine: "cpu", "reference" or None (by dtype and device).
 
     Raises:
         ValueError: Wrong shape, dtype, device or index; the message names the argument.
     """
     points, triangles = _check_mesh(vertices, faces)
-    viewmats, Ks = _check_views(vertices, viewmats, Ks, width, height)
+    viewmats, Ks = _check_views(vertices, viewmats, Ks, width, height, near_plane)
     views = len(viewmats)
     triangle = torch.empty((views, height, width), dtype=torch.int32, device=vertices.device)
     barycentrics = vertices.new_empty((views, height, width, 3))
@@ -96,14 +96,14 @@ def render_opaque(
     Args:
         vertices: (V, 3) with ``faces``, or (N, 3, 3) without.
         viewmats: (B, 4, 4) world to camera, OpenCV axes.
-        Ks: (B, 3, 3) intrinsics in pixels.
+        Ks: (B, 3, 3) intrinsics [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels.
         width: Image width in pixels.
         height: Image height in pixels.
         faces: (F, 3) vertex indices, int32 or int64.
         face_colors: (F, C), one colour per triangle. Exactly one of the two colours is given.
         vertex_colors: (V, C), or (3 N, C) without faces, interpolated perspective-correctly.
         supersampling: Samples along each axis of a pixel, 1 to 16.
-        near_plane: Triangles with a vertex at this depth or nearer are dropped.
+        near_plane: Triangles with a vertex at this depth or nearer are dropped; > 0.
         cull_backfaces: Drop triangles whose vertices run clockwise as seen from the camera.
         engine: "cpu", "reference" or None (by dtype and device).
 
@@ -114,7 +114,7 @@ def render_opaque(
         ValueError: Wrong shape, dtype, device or index; the message names the argument.
     """
     points, triangles = _check_mesh(vertices, faces)
-    viewmats, Ks = _check_views(vertices, viewmats, Ks, width, height)
+    viewmats, Ks = _check_views(vertices, viewmats, Ks, width, height, near_plane)
     colors = _check_colors(vertices, points, triangles, face_colors, vertex_colors)
     if not 1 <= supersampling <= MAX_SUPERSAMPLING:
         raise ValueError(f"supersampling must be from 1 to {MAX_SUPERSAMPLING}, got {supersampling}")
@@ -135,18 +135,22 @@ def _check_mesh(vertices: Tensor, faces: Tensor | None) -> tuple[Tensor, Tensor]
     check_shape("vertices", vertices, ("V", 3))
     check_shape("faces", faces, ("F", 3))
     check_indices("faces", faces, len(vertices))
-    if faces.device != vertices.device:
-        raise ValueError(f"faces must be on {vertices.device} as vertices, got {faces.device}")
+    check_device("faces", faces, "vertices", vertices)
     return vertices.detach().contiguous(), faces.to(torch.int32).contiguous()
 
 
-def _check_views(vertices: Tensor, viewmats: Tensor, Ks: Tensor, width: int, height: int) -> tuple[Tensor, Tensor]:
+def _check_views(
+    vertices: Tensor, viewmats: Tensor, Ks: Tensor, width: int, height: int, near_plane: float
+) -> tuple[Tensor, Tensor]:
     check_shape("viewmats", viewmats, ("B", 4, 4))
     check_shape("Ks", Ks, (len(viewmats), 3, 3))
-    check_matches("viewmats", viewmats, vertices)
-    check_matches("Ks", Ks, vertices)
+    check_like("viewmats", viewmats, "vertices", vertices)
+    check_like("Ks", Ks, "vertices", vertices)
+    check_intrinsics("Ks", Ks)
     if width < 1 or height < 1:
         raise ValueError(f"width and height must be at least 1, got {width} x {height}")
+    if not 0.0 < near_plane < float("inf"):
+        raise ValueError(f"near_plane must be positive and finite, got {near_plane}")
     return viewmats.detach().contiguous(), Ks.detach().contiguous()
 
 
@@ -155,11 +159,11 @@ def _check_colors(
 ) -> Tensor:
     if face_colors is not None and vertex_colors is None:
         check_shape("face_colors", face_colors, (len(triangles), "C"))
-        check_matches("face_colors", face_colors, vertices)
+        check_like("face_colors", face_colors, "vertices", vertices)
         return face_colors.detach().contiguous()
     if vertex_colors is not None and face_colors is None:
         check_shape("vertex_colors", vertex_colors, (len(points), "C"))
-        check_matches("vertex_colors", vertex_colors, vertices)
+        check_like("vertex_colors", vertex_colors, "vertices", vertices)
         return vertex_colors.detach().contiguous()
     raise ValueError("exactly one of face_colors and vertex_colors must be given")
 

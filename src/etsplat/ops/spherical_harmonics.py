@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from etsplat import _native
-from etsplat.core.checks import check_matches, check_shape
+from etsplat.core.validation import check_like, check_shape
 from etsplat.ops.engines import resolve_engine
 
 MAX_DEGREE = 3
@@ -51,7 +51,7 @@ def spherical_harmonics(
         )
     batch = ("B",) if directions.ndim == 3 else ()
     check_shape("directions", directions, (*batch, len(coefficients), 3))
-    check_matches("directions", directions, coefficients)
+    check_like("directions", directions, "coefficients", coefficients)
     if resolve_engine(engine, coefficients) == "cpu":
         colors: Any = _SphericalHarmonics.apply(coefficients, directions, degree)
         return colors
