@@ -3,7 +3,10 @@
 import json
 import math
 import re
+import shlex
+from dataclasses import replace
 from html.parser import HTMLParser
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -16,8 +19,10 @@ from etsplat.geometry.icosphere import icosphere
 from etsplat.io.mesh_files import save_mesh
 from etsplat.io.run_directory import RunDirectory
 from etsplat.report import write_report
+from etsplat.report.command import reproduce_command
 from etsplat.report.curves import MAX_POINTS, Curve, curves_of, draw_svg, linear_ticks, log_ticks, short_number
 from etsplat.report.data import read_run
+from etsplat.tasks.reconstruct_config import PRESETS
 
 METRICS = {
     "chamfer": 6.4e-5,
@@ -43,11 +48,18 @@ METRICS = {
     "versions": {"etsplat": "0.1.0", "torch": "2.13.0"},
 }
 
+CONFIG = {
+    "task": "reconstruct",
+    "config": vars(replace(PRESETS["quick"], iterations=3000, method="bilateral")),
+    "source": {"fingerprint": "0123456789abcdef", "init_mesh": None},
+    "paths": {"source": "meshes/bunny <&> co.ply", "init_mesh": None},
+    "versions": {"etsplat": version("etsplat"), "torch": "2.13.0"},
+}
+
 
 def write_run(folder: Path, views: int = 3, steps: int = 300) -> Path:
     """A finished run of `steps` log lines: a bumpy sphere, and disks for its pictures."""
-    config = {"task": "reconstruct", "source": {"path": "meshes/bunny <&> co.ply"}, "config": {"iterations": 3000}}
-    run = RunDirectory.create(folder, config)
+    run = RunDirectory.create(folder, CONFIG)
     run.write_metrics(METRICS)
     for step in range(1, steps + 1):
         decay = math.exp(-4 * step / steps)
@@ -206,3 +218,24 @@ def test_ticks_are_round_and_cover() -> None:
 def test_short_number(value: float, text: str) -> None:
     """Numbers on axes are short."""
     assert short_number(value) == text
+
+
+def test_command_repeats_the_run() -> None:
+    """The command names the source and what differs from the preset; all settings if the run is another version's."""
+    here = version("etsplat")
+    command = reproduce_command(CONFIG, here)
+    assert command is not None
+    words = shlex.split(command.replace("\\\n", ""))
+    assert words[:4] == ["etsplat", "reconstruct", "meshes/bunny <&> co.ply", "--out"]
+    assert words[5:] == ["--preset", "quick", "--method", "bilateral", "--iterations", "3000"]
+    older = reproduce_command(CONFIG | {"versions": {"etsplat": "0.0.1"}}, here)
+    assert older is not None
+    assert "--max-faces" in older
+
+
+def test_no_command_for_objects_from_python() -> None:
+    """A run that was handed a mesh or views from Python has no command line."""
+    here = version("etsplat")
+    assert reproduce_command(CONFIG | {"paths": {"source": None, "init_mesh": None}}, here) is None
+    start = {"source": {"fingerprint": "1", "init_mesh": "2"}}
+    assert reproduce_command(CONFIG | start, here) is None

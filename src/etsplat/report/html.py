@@ -3,7 +3,6 @@
 import base64
 import io
 import json
-import shlex
 from html import escape
 from importlib.metadata import version
 from importlib.resources import files
@@ -17,6 +16,7 @@ from PIL import Image
 
 from etsplat.io.atomic import atomic_write
 from etsplat.io.mesh_files import load_mesh
+from etsplat.report.command import reproduce_command
 from etsplat.report.curves import curves_of, draw_svg, short_number
 from etsplat.report.data import Run, TestView, read_run
 from etsplat.report.metrics import Metric, describe
@@ -71,7 +71,8 @@ def _asset(name: str) -> str:
 
 
 def _title(run: Run) -> str:
-    return Path(run.config["source"]["path"]).stem
+    path = run.config["paths"]["source"]
+    return "A mesh given from Python" if path is None else Path(path.removeprefix("demo:")).stem
 
 
 def _subtitle(run: Run) -> str:
@@ -136,25 +137,19 @@ aria-pressed="false">Difference × 4</button></div>
 <div class="group" id="compare-with"><button type="button" value="render" aria-pressed="true">Splatted
 render</button><button type="button" value="mesh" aria-pressed="false">Exported mesh</button></div>
 </div>
-<div id="views" data-mode="slide" data-shown="render">{"".join(_comparison(run, view) for view in views)}</div>
+<div id="views" data-mode="slide" data-shown="render">{"".join(_comparison(view) for view in views)}</div>
 </section>"""
 
 
-def _comparison(run: Run, view: TestView) -> str:
+def _comparison(view: TestView) -> str:
     name = escape(view.name)
     truth, render, mesh = (_picture(path) for path in (view.truth, view.render, view.mesh))
-    psnr = _view_psnr(run, view.name)
     return f"""<figure class="card"><div class="compare">
 <img src="{truth}" alt="View {name}: photograph">
 <img class="shown" src="{render}" data-render="{render}" data-mesh="{mesh}" alt="View {name}: render">
 <input type="range" min="0" max="100" value="50" aria-label="Where the photograph ends and the render begins">
 <span class="edge"></span><span class="tag truth">photograph</span><span class="tag other"></span>
-</div><figcaption><span>View {name}</span><span>{psnr}</span></figcaption></figure>"""
-
-
-def _view_psnr(run: Run, name: str) -> str:
-    value = run.metrics.get("views", {}).get(name, {}).get("psnr")
-    return "" if value is None else f"{value:.2f} dB"
+</div><figcaption>View {name}</figcaption></figure>"""
 
 
 def _picture(path: Path) -> str:
@@ -183,18 +178,17 @@ range.</p>
 
 
 def _reproduce_section(run: Run) -> str:
+    command = reproduce_command(run.config, version("etsplat"))
+    shown = (
+        f"<pre>{escape(command)}</pre>" if command else "<p>This run was started from Python, with a mesh or views.</p>"
+    )
     versions = ", ".join(f"{name} {number}" for name, number in run.metrics["versions"].items())
     return f"""<section>
 <h2>Run it again</h2>
-<pre>{escape(reproduce_command(run.config))}</pre>
-<p class="note">Made with {escape(versions)}, engine {escape(str(run.metrics["engine"]))}. The same command on the same
-machine, torch and thread count gives the same bits.</p>
+{shown}
+<p class="note">Made with {escape(versions)}, engine {escape(str(run.metrics["engine"]))}. The same settings on the same
+machine, torch and number of threads give the same bits.</p>
 </section>"""
-
-
-def reproduce_command(config: dict[str, Any]) -> str:
-    """The command line of a run, from its config.json, one option a line."""
-    return f"etsplat reconstruct {shlex.quote(config['source']['path'])} --out DIR"
 
 
 def _config_section(run: Run) -> str:
