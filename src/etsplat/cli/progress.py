@@ -5,7 +5,6 @@ from types import TracebackType
 from rich.console import Console
 from rich.progress import (
     BarColumn,
-    MofNCompleteColumn,
     Progress,
     SpinnerColumn,
     TaskID,
@@ -29,8 +28,7 @@ class RunProgress:
             SpinnerColumn(),
             TextColumn("{task.description}"),
             BarColumn(bar_width=None),
-            MofNCompleteColumn(),
-            TextColumn("eta"),
+            TextColumn("{task.fields[count]}"),
             TimeRemainingColumn(compact=True),
             TextColumn("{task.fields[state]}"),
             console=console,
@@ -78,12 +76,13 @@ class RunProgress:
             print(f"  {event.iteration}/{event.iterations} · {event.seconds:.0f} s · {state}", flush=True)
 
     def _show(self, phase: str, done: int, total: int | None, state: str = "") -> None:
+        count = "" if total is None else f"{done}/{total} eta"
         if phase != self._phase or self._task is None:
             if self._task is not None:
                 self._progress.remove_task(self._task)
             # A new task starts with what is done already, so that a resumed run's rate counts from here.
-            self._task = self._progress.add_task(phase, total=total, completed=done, state=state)
+            self._task = self._progress.add_task(phase, total=total, completed=done, count=count, state=state)
             self._phase = phase
             if not self._console.is_terminal:
                 print(phase, flush=True)
-        self._progress.update(self._task, completed=done, total=total, state=state)
+        self._progress.update(self._task, completed=done, total=total, count=count, state=state)

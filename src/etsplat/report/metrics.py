@@ -103,7 +103,7 @@ def _fixed(digits: int) -> Callable[[float], str]:
 
 
 def _thousandths(value: float) -> str:
-    return f"{1000 * value:.4f}" if value < 1e-3 else f"{1000 * value:.3g}"
+    return f"{1000 * value:.4f}" if value < 1e-3 else f"{1000 * value:#.3g}"
 
 
 def _percent(value: float) -> str:
