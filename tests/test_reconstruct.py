@@ -118,12 +118,13 @@ def test_a_run_directory_holds_everything(owl: tuple[ReconstructResult, list[Eve
 
 
 def test_history_has_a_line_for_every_log_step(owl: tuple[ReconstructResult, list[Event | PrepareEvent]]) -> None:
-    """Every 20 iterations, with PSNR and Chamfer distance every 100; the last Chamfer is the one of metrics.json."""
+    """Every 20 iterations, with PSNR and Chamfer distance every 100; the last ones are those of metrics.json,
+    Chamfer up to its estimation."""
     history = RunDirectory(owl[0].path).read_history()
     assert [line["iteration"] for line in history] == list(range(20, 301, 20))
     assert [line["iteration"] for line in history if "psnr" in line and "chamfer" in line] == [100, 200, 300]
     assert all(line.keys() >= {"iteration", "seconds", "loss", "faces", "sigma"} for line in history)
-    assert history[-1]["chamfer"] == owl[0].metrics["chamfer"]
+    assert history[-1]["chamfer"] == pytest.approx(owl[0].metrics["chamfer"], rel=0.2)
     assert history[-1]["psnr"] == pytest.approx(owl[0].metrics["psnr"])
 
 

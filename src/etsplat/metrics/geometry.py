@@ -80,10 +80,17 @@ def sample_pair(
     return surfaces[0], surfaces[1]
 
 
-def chamfer(surface: Surface, truth: Surface) -> float:
-    """Mean squared distance to the nearest sample of the other surface, summed over both directions."""
-    to_truth, _ = KDTree(truth.points.numpy()).query(surface.points.numpy(), workers=-1)
-    to_surface, _ = KDTree(surface.points.numpy()).query(truth.points.numpy(), workers=-1)
+def chamfer(surface: Surface, truth: Surface, queries: int | None = None) -> float:
+    """Mean squared distance to the nearest sample of the other surface, summed over both directions.
+
+    Args:
+        surface: the reconstructed one.
+        truth: the true one.
+        queries: look from this many samples of each side only (still at all of the other side): an estimate of the
+            same number in less time, which matters for surfaces that are far apart, where a k-d tree prunes little.
+    """
+    to_truth, _ = KDTree(truth.points.numpy()).query(surface.points[:queries].numpy(), workers=-1)
+    to_surface, _ = KDTree(surface.points.numpy()).query(truth.points[:queries].numpy(), workers=-1)
     return float(np.mean(to_truth**2) + np.mean(to_surface**2))
 
 
