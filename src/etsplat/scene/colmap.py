@@ -126,8 +126,8 @@ def read_images(model: Path) -> list[ColmapImage]:
         try:
             if len(words) < 10:
                 raise ValueError("too few numbers")
-            w, x, y, z, *translation = (float(word) for word in words[1:8])
-            images.append(ColmapImage(words[9], int(words[8]), (w, x, y, z), (*translation,)))  # type: ignore[arg-type]
+            w, x, y, z, tx, ty, tz = (float(word) for word in words[1:8])
+            images.append(ColmapImage(words[9], int(words[8]), (w, x, y, z), (tx, ty, tz)))
         except ValueError as error:
             raise InputError(f"scene {path}: malformed line `{line[:60]}` ({error}); export it again") from error
     return images

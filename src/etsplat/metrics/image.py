@@ -1,0 +1,247 @@
+"""How alike two images are: PSNR, SSIM in both conventions, LPIPS (VGG) in both conventions.
+
+All take float images (H, W, 3) with values in [0, 1] and no transparency; ours are composited over black first.
+Numbers of different papers are comparable only in the same convention, so every function says which it is.
+"""
+
+import math
+import pickle
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from safetensors import SafetensorError
+from safetensors.torch import load_file
+from torch import Tensor, nn
+
+from etsplat.core.errors import InputError
+
+_C1, _C2 = 0.01**2, 0.03**2
+_WINDOW, _SIGMA = 11, 1.5
+
+_VGG16 = (64, 64, "pool", 128, 128, "pool", 256, 256, 256, "pool", 512, 512, 512, "pool", 512, 512, 512)
+_TAPS = (3, 8, 15, 22, 29)
+"""Layers of torchvision's vgg16.features whose output LPIPS compares: relu1_2, 2_2, 3_3, 4_3, 5_3."""
+
+_CACHED = ("vgg16-397923af.pth", "vgg.pth")
+_SOURCES = (
+    "https://download.pytorch.org/models/vgg16-397923af.pth",
+    "https://raw.githubusercontent.com/richzhang/PerceptualSimilarity/master/lpips/weights/v0.1/vgg.pth",
+)
+
+
+def psnr(image: Float[Tensor, "H W C"], truth: Float[Tensor, "H W C"]) -> float:
+    """Peak signal-to-noise ratio in dB, -10 log10 mean((image - truth)^2), peak 1, in float (no rounding to 8 bits).
+
+    Infinite for equal images. For several views the field takes the mean of their PSNRs.
+
+    Raises:
+        ValueError: shapes differ or are not (H, W, C).
+    """
+    _check_pair(image, truth)
+    error = float(((image.double() - truth.double()) ** 2).mean())
+    return math.inf if error == 0 else -10 * math.log10(error)
+
+
+def ssim(image: Float[Tensor, "H W C"], truth: Float[Tensor, "H W C"], *, interior: bool = False) -> float:
+    """Structural similarity (Wang et al. 2004): 11x11 Gaussian window of sigma 1.5, C1 = 0.01^2, C2 = 0.03^2, peak 1.
+
+    Per channel, mean over channels and pixels, in float64.
+
+    Args:
+        image: values in [0, 1].
+        truth: values in [0, 1].
+        interior: False as 3DGS and its followers: zeros beyond the border, mean over the whole image. True as
+            torchmetrics (gsplat): the mean over the pixels whose window lies inside the image.
+
+    Raises:
+        ValueError: shapes differ or are not (H, W, C); with `interior`, an image smaller than the window.
+    """
+    _check_pair(image, truth)
+    if interior and min(image.shape[:2]) < _WINDOW:
+        raise ValueError(f"image: expected at least {_WINDOW} pixels a side for the interior SSIM, got {image.shape}")
+    x, y = image.double().movedim(-1, 0), truth.double().movedim(-1, 0)
+    moments = _blur(torch.stack([x, y, x * x, y * y, x * y]), 0 if interior else _WINDOW // 2)
+    mean_x, mean_y, square_x, square_y, product = moments
+    variance_x, variance_y = square_x - mean_x**2, square_y - mean_y**2
+    covariance = product - mean_x * mean_y
+    similarity = ((2 * mean_x * mean_y + _C1) * (2 * covariance + _C2)) / (
+        (mean_x**2 + mean_y**2 + _C1) * (variance_x + variance_y + _C2)
+    )
+    return float(similarity.mean())
+
+
+class Lpips(nn.Module):
+    """LPIPS v0.1 with the VGG16 trunk (Zhang et al. 2018): a weighted distance between deep features.
+
+    At five layers l of VGG16 the features of both images are scaled to unit length at every pixel, subtracted, squared,
+    weighted per channel by w_l >= 0 and averaged over pixels; LPIPS is the sum over the layers:
+    sum_l mean_hw sum_c w_lc (f_lc(a) / |f_l(a)| - f_lc(b) / |f_l(b)|)^2.
+
+    The state dict has exactly these entries (float32), which are torchvision's and LPIPS's own names:
+    `features.{0,2,5,7,10,12,14,17,19,21,24,26,28}.{weight,bias}` (3x3 convolutions of torchvision's vgg16 with weights
+    IMAGENET1K_V1) and `lin{0..4}.model.1.weight`, (1, C, 1, 1) with C = 64, 128, 256, 512, 512 (LPIPS v0.1's vgg.pth).
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        layers: list[nn.Module] = []
+        channels = 3
+        for width in _VGG16:
+            if isinstance(width, str):
+                layers.append(nn.MaxPool2d(2))
+            else:
+                layers += [nn.Conv2d(channels, width, 3, padding=1), nn.ReLU()]
+                channels = width
+        self.features = nn.Sequential(*layers)
+        for index, width in enumerate((64, 128, 256, 512, 512)):
+            # The first entry stands where LPIPS has a dropout, so that the names agree.
+            linear = nn.ModuleDict({"model": nn.Sequential(nn.Identity(), nn.Conv2d(width, 1, 1, bias=False))})
+            self.add_module(f"lin{index}", linear)
+        self.requires_grad_(False)
+
+    @staticmethod
+    def from_weights(*paths: Path | str) -> "Lpips":
+        """The metric with weights from one or more files that hold all entries together (others are ignored).
+
+        One file for `--lpips-weights` is made from the two usual ones by
+        `torch.save(torch.load("vgg16-397923af.pth") | torch.load("vgg.pth"), "lpips_vgg16.pth")`.
+
+        Args:
+            paths: `.safetensors`, or `.pth`/`.pt` state dicts (read without running code from the file).
+
+        Raises:
+            InputError: a file is missing or unreadable, an entry is missing or has another shape.
+        """
+        entries: dict[str, Tensor] = {}
+        for path in paths:
+            entries |= _read_weights(Path(path))
+        names = ", ".join(str(path) for path in paths)
+        lpips = Lpips()
+        expected = lpips.state_dict()
+        missing = [key for key in expected if key not in entries]
+        if missing:
+            raise InputError(
+                f"LPIPS weights {names}: {len(missing)} entries are missing (first: {missing[0]}); the file must hold"
+                " torchvision's vgg16 and LPIPS's v0.1 linear weights together"
+            )
+        for key, value in expected.items():
+            if entries[key].shape != value.shape:
+                shapes = f"{tuple(entries[key].shape)} instead of {tuple(value.shape)}"
+                raise InputError(f"LPIPS weights {names}: {key} has shape {shapes}; use the VGG16 weights of v0.1")
+        lpips.load_state_dict({key: entries[key].float() for key in expected})
+        return lpips
+
+    @torch.no_grad()
+    def forward(self, image: Float[Tensor, "H W 3"], truth: Float[Tensor, "H W 3"], *, rescale: bool = True) -> Tensor:
+        """The distance, a scalar tensor; 0 for equal images.
+
+        Args:
+            image: values in [0, 1].
+            truth: values in [0, 1].
+            rescale: True maps [0, 1] to [-1, 1], the range that the network's input normalisation was made for
+                (lpips package, torchmetrics with normalize=True). False feeds [0, 1] as it is, the convention of 3DGS,
+                2DGS and Triangle Splatting ("lpips_3dgs"); its values are not comparable with the former.
+
+        Raises:
+            ValueError: shapes differ, are not (H, W, 3), or are below 16 pixels a side.
+        """
+        _check_pair(image, truth)
+        if image.shape[-1] != 3 or min(image.shape[:2]) < 16:
+            raise ValueError(f"image: expected shape (H, W, 3) of at least 16 pixels a side, got {tuple(image.shape)}")
+        pair = torch.stack([image, truth]).to(next(self.parameters())).movedim(-1, 1)
+        pair = 2 * pair - 1 if rescale else pair
+        shift = pair.new_tensor([-0.030, -0.088, -0.188]).view(3, 1, 1)
+        scale = pair.new_tensor([0.458, 0.448, 0.450]).view(3, 1, 1)
+        features, total = (pair - shift) / scale, pair.new_zeros(())
+        for index, layer in enumerate(self.features):
+            features = layer(features)
+            if index in _TAPS:
+                unit = features / (features.square().sum(dim=1, keepdim=True).sqrt() + 1e-10)
+                weigh = self.get_submodule(f"lin{_TAPS.index(index)}.model")
+                total = total + weigh((unit[:1] - unit[1:]).square()).mean()
+        return total
+
+
+@dataclass(frozen=True)
+class LpipsWeights:
+    """Where the weights are.
+
+    Attributes:
+        paths: files for `Lpips.from_weights`, none if there are no weights.
+        reason: why there are none, in a sentence; None if there are.
+    """
+
+    paths: tuple[Path, ...]
+    reason: str | None
+
+
+def find_lpips_weights(option: Path | str | None = None) -> LpipsWeights:
+    """Resolve the option `--lpips-weights`.
+
+    Args:
+        option: a file; the word "download", which fetches the two usual files (torchvision's VGG16, 528 MB, and LPIPS's
+            linear weights) into torch's cache unless they are there; or None, which uses them if they are there and
+            never touches the network.
+
+    Raises:
+        InputError: the file does not exist, or the download failed.
+    """
+    folder = Path(torch.hub.get_dir()) / "checkpoints"
+    cached = tuple(folder / name for name in _CACHED)
+    if option is None:
+        absent = [path.name for path in cached if not path.is_file()]
+        if not absent:
+            return LpipsWeights(cached, None)
+        return LpipsWeights((), f"no weights ({' and '.join(absent)} not in {folder}); give --lpips-weights")
+    if str(option) == "download":
+        for path, url in zip(cached, _SOURCES, strict=True):
+            if not path.is_file():
+                _download(url, path)
+        return LpipsWeights(cached, None)
+    if not Path(option).is_file():
+        raise InputError(f"LPIPS weights {option}: no such file; check the path, or say `download`")
+    return LpipsWeights((Path(option),), None)
+
+
+def _check_pair(image: Tensor, truth: Tensor) -> None:
+    if image.ndim != 3:
+        raise ValueError(f"image: expected shape (H, W, C), got {tuple(image.shape)}")
+    if image.shape != truth.shape:
+        raise ValueError(f"truth: expected the image's shape {tuple(image.shape)}, got {tuple(truth.shape)}")
+
+
+def _blur(planes: Float[Tensor, "M C H W"], padding: int) -> Float[Tensor, "M C H2 W2"]:
+    """Separable Gaussian window; beyond the border there are zeros."""
+    offsets = torch.arange(_WINDOW, dtype=planes.dtype, device=planes.device) - _WINDOW // 2
+    window = torch.exp(-(offsets**2) / (2 * _SIGMA**2))
+    window = window / window.sum()
+    flat = planes.reshape(-1, 1, *planes.shape[-2:])
+    flat = nn.functional.conv2d(flat, window.view(1, 1, -1, 1), padding=(padding, 0))
+    flat = nn.functional.conv2d(flat, window.view(1, 1, 1, -1), padding=(0, padding))
+    return flat.reshape(*planes.shape[:2], *flat.shape[-2:])
+
+
+def _read_weights(path: Path) -> Mapping[str, Tensor]:
+    if not path.is_file():
+        raise InputError(f"LPIPS weights {path}: no such file; check the path")
+    try:
+        if path.suffix == ".safetensors":
+            return load_file(path)
+        entries = torch.load(path, map_location="cpu", weights_only=True)
+    except (SafetensorError, RuntimeError, OSError, EOFError, ValueError, pickle.UnpicklingError) as error:
+        detail = (str(error) or type(error).__name__).splitlines()[0]
+        raise InputError(f"LPIPS weights {path}: not a readable weights file ({detail}); download it again") from error
+    if not isinstance(entries, dict) or not all(isinstance(value, Tensor) for value in entries.values()):
+        raise InputError(f"LPIPS weights {path}: not a state dict of tensors; see the documentation of Lpips")
+    return entries
+
+
+def _download(url: str, path: Path) -> None:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        torch.hub.download_url_to_file(url, str(path), progress=False)
+    except OSError as error:  # a refused connection, no route, a full disk
+        raise InputError(f"LPIPS weights: {url} cannot be downloaded ({error}); give a file instead") from error
