@@ -1,7 +1,7 @@
 // How it is scheduled. Four parallel passes, each writing only its own elements: (1) faces: unit normals; (2) vertices:
 // the edge energy of their edges, the direction of their Laplacian; (3) faces: the normal energy with their neighbours,
-// pulled back to their corners; (4) vertices: gather of the Laplacian from neighbours, of the normals from corners. Every
-// edge and pair is visited from both sides; its value counts half. Values are summed in double over fixed pieces.
+// pulled back to their corners; (4) vertices: gather of the Laplacian from neighbours, of the normals from corners.
+// Every edge and pair is visited from both sides; its value counts half. Values are summed in double over fixed pieces.
 // About 90 bytes of buffers a face; no atomics, so that results do not depend on the threads.
 #include <algorithm>
 #include <vector>

@@ -1,7 +1,7 @@
 // Adam and the photometric loss: both stream through memory once.
 //
-// Adam: all parameters of a step in one call, cut into pieces of kAdamPiece elements that threads take one by one; every
-// element is independent. Photometric loss: pieces of kPixels pixels; each leaves its sum, the sums are added in order.
+// Adam: all parameters of a step in one call, cut into pieces of kAdamPiece elements that threads take one by one;
+// every element is independent. Photometric loss: pieces of kPixels pixels leave their sums, which are added in order.
 #include <algorithm>
 #include <cmath>
 #include <vector>

@@ -1,13 +1,13 @@
-// How it is scheduled. One view at a time: (1) vertices are projected and triangles set up in parallel, in double; (2) a
-// stable counting sort puts the triangles into square tiles of about 64 x 64 samples, over fixed chunks of triangles, so
-// that each tile sees them in ascending index; (3) tiles run in parallel, each with its own z-buffer (32 KiB, in the L1
-// cache), and are resolved to final pixels at once: no buffer of the supersampled size exists. Strips of tile rows bound
-// the memory of (2). Nothing depends on which thread runs what.
+// How it is scheduled. One view at a time: (1) vertices are projected and triangles set up in parallel, in double; (2)
+// a stable counting sort, over fixed chunks of triangles, puts the triangles into square tiles of about 64 x 64 samples,
+// so that each tile sees them in ascending index; (3) tiles run in parallel, each with its own z-buffer (32 KiB, in the
+// L1 cache), and are resolved to final pixels at once: no buffer of the supersampled size exists. Strips of tile rows
+// bound the memory of (2). Nothing depends on which thread runs what.
 //
 // Coverage is the top-left rule by scan conversion. On the row of samples at height y, the edge from its upper end a to
 // its lower end b crosses at x = a.x + (y - a.y) slope; it is active for a.y <= y < b.y, and a sample lies right of it
-// if sample.x >= x. A triangle fills between the two edges active on a row. Neighbours compute the same number for their
-// common edge, so that their spans meet without crack, whatever the rounding.
+// if sample.x >= x. A triangle fills between the two edges active on a row. Neighbours compute the same number for
+// their common edge, so that their spans meet without crack, whatever the rounding.
 #include "rasterize_hard.h"
 
 #include <algorithm>
@@ -269,7 +269,8 @@ void for_each_tile(const Screen& screen, const Resolve& resolve) {
     }
 }
 
-// Perspective-correct barycentrics b_k = (a_k / z_k) / sum_j (a_j / z_j), a clamped at 0, of the sample in column x, row y.
+// Perspective-correct barycentrics b_k = (a_k / z_k) / sum_j (a_j / z_j), a clamped at 0, of the sample at column x and
+// row y.
 void barycentrics_at(const HardMesh& mesh, const Screen& screen, int32_t face, int32_t x, int32_t y, float out[3]) {
     Projected v[3];
     for (int k = 0; k < 3; ++k) {
@@ -305,7 +306,8 @@ struct Shader {
         barycentrics_at(mesh, screen, face, x, y, b);
         const float* color[3];
         for (int k = 0; k < 3; ++k) {
-            color[k] = colors.vertices + static_cast<int64_t>(mesh.faces[3 * static_cast<int64_t>(face) + k]) * channels;
+            const int64_t vertex = mesh.faces[3 * static_cast<int64_t>(face) + k];
+            color[k] = colors.vertices + vertex * channels;
         }
         for (int32_t c = 0; c < channels; ++c) sum[c] += b[0] * color[0][c] + b[1] * color[1][c] + b[2] * color[2][c];
     }

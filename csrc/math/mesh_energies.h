@@ -1,7 +1,7 @@
 // Element formulas of the mesh energies L_e, L_n, L_lap (paper, section 3.3) with their derivatives.
 //
-// Lengths and areas too small to have a direction give zero gradient: lengths up to kMinLength, faces whose doubled area
-// is at most kMinShape times their longest edge squared (below that the float32 cross product is rounding noise).
+// Lengths and areas too small to have a direction give zero gradient: lengths up to kMinLength, faces whose doubled
+// area is at most kMinShape times their longest edge squared (below that the float32 cross product is rounding noise).
 #pragma once
 
 #include "vector3.h"
@@ -42,8 +42,8 @@ ETSPLAT_FN FaceNormal<T> face_normal(Vector3<T> a, Vector3<T> b, Vector3<T> c) {
     return {inverse * n, inverse};
 }
 
-// 1 - n0 . n1 = |n1 - n0|^2 / 2 (exact where the normals nearly agree), 0 if a face is degenerate; and its derivative by
-// the cross product that n0 is the direction of.
+// 1 - n0 . n1 = |n1 - n0|^2 / 2 (exact where the normals nearly agree), 0 if a face is degenerate; and its derivative
+// by the cross product that n0 is the direction of.
 template <class T>
 ETSPLAT_FN Vector3<T> normal_energy(const FaceNormal<T>& f0, const FaceNormal<T>& f1, T& value) {
     const bool usable = f0.inverse_norm > T(0.0f) && f1.inverse_norm > T(0.0f);

@@ -1,5 +1,5 @@
-// Real spherical harmonics up to degree 3 as 3D Gaussian splatting orders and signs them: band l holds m = -l..l, with the
-// Condon-Shortley sign, as polynomials of a unit direction.
+// Real spherical harmonics up to degree 3 as 3D Gaussian splatting orders and signs them: band l holds m = -l..l, with
+// the Condon-Shortley sign, as polynomials of a unit direction.
 #pragma once
 
 #include "vector3.h"
@@ -9,8 +9,8 @@ namespace etsplat {
 constexpr int kMaxShDegree = 3;
 constexpr int kMaxShBases = (kMaxShDegree + 1) * (kMaxShDegree + 1);
 
-constexpr float kSh0 = 0.28209479177387814f;   // sqrt(1 / (4 pi))
-constexpr float kSh1 = 0.4886025119029199f;    // sqrt(3 / (4 pi))
+constexpr float kSh0 = 0.28209479177387814f;       // sqrt(1 / (4 pi))
+constexpr float kSh1 = 0.4886025119029199f;        // sqrt(3 / (4 pi))
 constexpr float kSh2Mixed = 1.0925484305920792f;   // sqrt(15 / (4 pi))
 constexpr float kSh2Zonal = 0.31539156525252005f;  // sqrt(5 / (16 pi))
 constexpr float kSh2Square = 0.5462742152960396f;  // sqrt(15 / (16 pi))
