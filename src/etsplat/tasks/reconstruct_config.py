@@ -86,7 +86,7 @@ class ReconstructConfig:
     chamfer_samples: int = 100_000
     """Points per surface for the Chamfer distance."""
     lpips_weights: Path | None = None
-    """Weights file for LPIPS; None looks where they usually are and goes without."""
+    """Weights file for LPIPS; "download" fetches it; None uses the one in torch's cache or goes without."""
 
     def __post_init__(self) -> None:
         _check_choice(self, "method", ("elastic", "bilateral", "single-sided"))

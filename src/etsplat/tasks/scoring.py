@@ -11,7 +11,7 @@ from torch import Tensor
 from etsplat.geometry.intersections import count_degenerate_faces, count_self_intersections
 from etsplat.io.images import save_image
 from etsplat.metrics.geometry import chamfer, geometry_metrics, sample_pair
-from etsplat.metrics.image import find_lpips_weights, psnr, ssim
+from etsplat.metrics.image import Lpips, find_lpips_weights, psnr, ssim
 from etsplat.ops.rasterize import rasterize
 from etsplat.ops.rasterize_hard import render_opaque
 from etsplat.scene.triangle_mesh import TriangleMesh
@@ -26,9 +26,20 @@ class Scorer:
     """
 
     def __init__(self, subject: Subject, config: ReconstructConfig) -> None:
+        """Loads what measuring needs.
+
+        Raises:
+            InputError: `config.lpips_weights` is given and cannot be used.
+        """
         self._views = subject.views
         self._truth = subject.truth
         self._config = config
+        # Now rather than after the run, so that a file that cannot be used is found before hours are spent.
+        weights = find_lpips_weights(config.lpips_weights)
+        self._lpips = Lpips.from_weights(*weights.paths) if weights.paths else None
+        self._lpips_reason = weights.reason
+        if min(self._views.cameras.width, self._views.cameras.height) < 16:
+            self._lpips, self._lpips_reason = None, "the images are smaller than 16 pixels"
 
     def cheap(self, mesh: TriangleMesh) -> dict[str, float]:
         """For the history: "psnr" if there are test views, "chamfer" (an estimate) if there is a true mesh."""
@@ -70,16 +81,18 @@ class Scorer:
         }
 
     def _images(self, mesh: TriangleMesh, folder: Path) -> dict[str, Any]:
-        weights = find_lpips_weights(self._config.lpips_weights)
         scores: dict[str, list[float]] = {"psnr": [], "psnr_mesh": [], "ssim": [], "lpips": []}
         for number, view in enumerate(self._views.test):
             photo, splatted, opaque = self._photo(view), self._splatted(mesh, view), self._opaque(mesh, view)
             scores["psnr"].append(psnr(splatted, photo))
             scores["psnr_mesh"].append(psnr(opaque, photo))
             scores["ssim"].append(ssim(splatted, photo))
+            if self._lpips is not None:
+                scores["lpips"].append(float(self._lpips(splatted, photo)))
             for kind, image in (("truth", photo), ("render", splatted), ("mesh", opaque)):
                 save_image(folder / f"{number:03d}_{kind}.png", image)
-        return {name: _mean(values) if values else None for name, values in scores.items()}
+        means = {name: _mean(values) if values else None for name, values in scores.items()}
+        return {**means, "lpips_reason": self._lpips_reason if self._views.test else "no test views"}
 
     def _photo(self, view: int) -> Float[Tensor, "H W 3"]:
         return self._views.images[view, ..., :3]
