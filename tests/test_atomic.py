@@ -3,9 +3,13 @@ import subprocess
 import sys
 
 import pytest
+import torch
 
 from etsplat.core.errors import InputError
+from etsplat.geometry.icosphere import icosphere
 from etsplat.io.atomic import atomic_write
+from etsplat.io.images import save_image
+from etsplat.io.mesh_files import save_mesh
 
 resource = pytest.importorskip("resource")
 
@@ -60,6 +64,31 @@ def test_a_write_beyond_the_file_size_limit_keeps_the_old_file(tmp_path):
     assert "\n" not in str(raised.value)
     assert path.read_bytes() == b"old"
     assert os.listdir(tmp_path) == ["a.bin"]
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.jpg", "a.ply", "a.obj", "a.glb"])
+def test_every_writer_keeps_the_old_file_when_the_disk_refuses_the_new_one(tmp_path, name, rng):
+    """Images and meshes larger than the limit on the file size."""
+    (tmp_path / name).write_bytes(b"old")
+    image, ball = torch.rand(64, 64, 3, generator=rng), icosphere(3)
+
+    def write():
+        if name in ("a.png", "a.jpg"):
+            save_image(tmp_path / name, image)
+        else:
+            save_mesh(tmp_path / name, *ball)
+
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (2000, hard))
+    try:
+        with pytest.raises(InputError) as raised:
+            write()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert str(tmp_path / name) in str(raised.value)
+    assert "\n" not in str(raised.value)
+    assert (tmp_path / name).read_bytes() == b"old"
+    assert os.listdir(tmp_path) == [name]
 
 
 def test_a_killed_writer_leaves_the_old_file(tmp_path):

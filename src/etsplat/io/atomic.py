@@ -52,8 +52,7 @@ def atomic_write(path: Path | str) -> Iterator[Path]:
 
 def write_error(path: Path | str, error: OSError) -> InputError:
     """The one-line InputError for a failed write to `path`: what the system said, and what to do."""
-    # Image writers raise OSError without a number when the disk is full: keep their words.
-    reason = error.strerror or str(error) or type(error).__name__
+    reason = error.strerror or str(error) or type(error).__name__  # some libraries raise OSError without a number
     remedy = _REMEDIES.get(error.errno or 0, "check the disk and the folder's permissions")
     return InputError(f"cannot write {path}: {reason}; {remedy} (an earlier version of the file is unchanged)")
 

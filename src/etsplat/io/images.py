@@ -1,5 +1,6 @@
 """Images on disk (8-bit PNG and JPEG) and in memory (float32, channels last, values in [0, 1])."""
 
+import io
 from pathlib import Path
 
 import numpy as np
@@ -79,8 +80,12 @@ def save_image(path: Path | str, image: Float[Tensor, "H W C"]) -> None:
     if image.ndim != 3 or image.shape[-1] not in channels:
         raise ValueError(f"image: expected shape (H, W, C) with C in {channels}, got {tuple(image.shape)}")
     pixels = Image.fromarray(to_8_bit(image).cpu().numpy().squeeze(axis=-1 if image.shape[-1] == 1 else ()))
+    # Encoded in memory first: Pillow's JPEG encoder does not notice when a full disk takes only a part.
+    encoded = io.BytesIO()
+    kind = "PNG" if path.suffix.lower() == ".png" else "JPEG"
+    pixels.save(encoded, format=kind, quality=95, subsampling=0)  # PNG ignores the last two
     with atomic_write(path) as temporary:
-        pixels.save(temporary, quality=95, subsampling=0)  # PNG ignores both
+        temporary.write_bytes(encoded.getvalue())
 
 
 def to_8_bit(image: Float[Tensor, "..."]) -> UInt8[Tensor, "..."]:
