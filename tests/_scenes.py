@@ -2,7 +2,6 @@
 
 from typing import Any
 
-import pytest
 import torch
 from torch import Tensor
 
@@ -101,11 +100,6 @@ def accuracy(engine: str) -> float:
     return 2e-5 if engine == "cpu" else 1e-11
 
 
-def require(engine: str) -> None:
-    if engine == "cpu":
-        pytest.importorskip("etsplat.ops._rasterize_cpu", reason="the native rasterizer is not built yet")
-
-
 def prepare(scene: Scene, engine: str, dtype: torch.dtype | None = None, requires_grad: bool = False) -> Scene:
     """The scene in the engine's precision; its floating-point tensors are fresh leaves."""
     prepared = dict(scene)
@@ -117,7 +111,6 @@ def prepare(scene: Scene, engine: str, dtype: torch.dtype | None = None, require
 
 
 def render(scene: Scene, engine: str, **options: Any) -> Rasterization:
-    require(engine)
     arguments = {"colors": None, **prepare(scene, engine), **options}
     return rasterize(**arguments, engine=engine)
 
@@ -126,7 +119,6 @@ def gradients(
     scene: Scene, engine: str, cotangents: dict[str, Tensor], dtype: torch.dtype | None = None, **options: Any
 ) -> tuple[Rasterization, dict[str, Tensor]]:
     """Run forward and backward; ``cotangents`` are dL/d(image) by the image's name."""
-    require(engine)
     prepared = prepare(scene, engine, dtype, requires_grad=True)
     out = rasterize(**{"colors": None, **prepared, **options}, engine=engine)
     loss = sum(

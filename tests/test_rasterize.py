@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from _scenes import EVERYTHING, IMAGES, accuracy, dtype_of, mesh, prepare, render, require, soup
+from _scenes import EVERYTHING, IMAGES, accuracy, dtype_of, mesh, prepare, render, soup
 from etsplat import Cutoffs, rasterize
 from etsplat.ops.engines import resolve_engine
 
@@ -123,7 +123,6 @@ BAD_ARGUMENTS = {
 
 @pytest.mark.parametrize("case", BAD_ARGUMENTS)
 def test_bad_arguments_are_refused_by_name(engine, case, scene):
-    require(engine)
     bad, message = BAD_ARGUMENTS[case]
     converted = {
         name: value.to(dtype_of(engine)) if isinstance(value, torch.Tensor) and value.dtype == torch.float32 else value
@@ -143,7 +142,6 @@ def test_bad_arguments_are_refused_by_name(engine, case, scene):
 )
 def test_bad_faces_are_refused_even_without_validation(engine, faces, message, scene):
     """An index out of range would crash a native engine."""
-    require(engine)
     prepared = prepare(scene, engine)
     prepared["vertices"] = prepared["vertices"].reshape(15, 3)
     with pytest.raises(ValueError, match=message):

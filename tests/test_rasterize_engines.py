@@ -5,6 +5,7 @@ import torch
 
 from _scenes import EVERYTHING, IMAGES, gradients, mesh, soup
 from _tolerances import assert_close_to_scale
+from etsplat import num_threads, set_num_threads
 
 # Rounding, and pixels that float32 decides differently at alpha = 1/255, at x = 2 or between almost equal depths.
 IMAGE_TOLERANCE = {"tolerance": 2e-5, "outliers": 2e-3, "outlier_tolerance": 2e-2}
@@ -133,3 +134,21 @@ def test_shifting_the_principal_point_shifts_the_image(engine, kernel, distance,
         assert_close_to_scale(
             after_grads[name], before_grads[name], **gradient_tolerance(name, before_grads[name]), name=name
         )
+
+
+def test_images_and_gradients_do_not_depend_on_the_number_of_threads(kernel, rng):
+    """To the bit."""
+    scene = soup(rng, 150, width=100, height=90)
+    cotangents = {"color": torch.randn(2, 90, 100, 3, generator=rng), "distortion": torch.ones(2, 90, 100, 1)}
+    before = num_threads()
+    try:
+        results = []
+        for threads in (1, 2, 3, 7):
+            set_num_threads(threads)
+            results.append(gradients(scene, "cpu", cotangents, kernel=kernel, **EVERYTHING))
+    finally:
+        set_num_threads(before)
+    first, first_grads = results[0]
+    for out, grads in results[1:]:
+        assert all(torch.equal(getattr(out, name), getattr(first, name)) for name in IMAGES)
+        assert all(torch.equal(grads[name], first_grads[name]) for name in grads)

@@ -20,7 +20,7 @@ from etsplat.core.rasterization import (
     RasterizeSettings,
     TriangleStatistics,
 )
-from etsplat.ops._rasterize_reference import barycentrics, perspective_weights, to_screen
+from etsplat.ops._rasterize_reference import barycentrics, perspective_weights, to_screen, unit_normals
 
 
 def rasterize_cpu(
@@ -158,13 +158,7 @@ class _Channels:
 
 def _facing_normals(corners: Tensor, viewmats: Tensor) -> Tensor:
     """Unit normals (B, N, 3) in world space, turned towards each camera; 0 for a triangle without area."""
-    edges = corners[:, 1:] - corners[:, :1]
-    # Brought near 1 first: the squares of very long or short edges leave the range of float32.
-    size = edges.detach().abs().amax(dim=(1, 2), keepdim=True)
-    edges = edges / torch.where((size > 0) & size.isfinite(), size, torch.inf)
-    normal = torch.linalg.cross(edges[:, 0], edges[:, 1], dim=-1)
-    length = normal.norm(dim=-1, keepdim=True)
-    normal = torch.where(length > 0, normal / length.clamp_min(1e-30), torch.zeros_like(normal))
+    normal = unit_normals(corners)
     centers = -torch.einsum("bij,bi->bj", viewmats[:, :3, :3], viewmats[:, :3, 3])
     towards = corners.mean(1)[None] - centers[:, None]
     away = (towards * normal).sum(-1, keepdim=True) > 0
@@ -230,7 +224,9 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *cotangents: Tensor | None) -> tuple[Tensor | None, ...]:
+    def backward(  # pyright: ignore[reportIncompatibleMethodOverride] -- once_differentiable hides the name
+        ctx: Any, *cotangents: Tensor | None
+    ) -> tuple[Tensor | None, ...]:
         *inputs, color, _, _ = ctx.saved_tensors
         grad_color, grad_alpha, grad_distortion = (_contiguous(g) for g in cotangents[:3])
         if grad_color is None:

@@ -23,6 +23,9 @@ from etsplat.core.rasterization import (
 )
 
 _BLOCK = 32  # pixels along a side of a block
+# Beyond these, squares and products leave the range of float32; alike in every engine.
+_FARTHEST_PIXEL = 1e15
+_LARGEST = 1e30  # of depths, and of squared lengths in pixels
 
 
 def rasterize_reference(
@@ -108,6 +111,7 @@ def _project(
         everywhere = box.new_tensor([-torch.inf, -torch.inf, torch.inf, torch.inf])
         box = torch.where(reach[:, None].isinf(), everywhere, box)  # also along an axis without extent
         visible = _has_area(corners) & (corner_depths > settings.near_plane).all(dim=-1)
+        visible &= (corner_depths < _LARGEST).all(dim=-1)
         visible &= (opacities >= settings.cutoffs.alpha_min) & (sigma > 0)
         visible &= (box[:, 0] <= settings.width) & (box[:, 2] >= 0) & (box[:, 1] <= settings.height) & (box[:, 3] >= 0)
         for data in (triangles, corner_depths, colors, opacities, sigma):
@@ -164,18 +168,28 @@ def _edge_lengths(corners: Tensor) -> Tensor:
 
 
 def _has_area(corners: Tensor) -> Tensor:
-    """Whether the projected triangle is wide enough to have a well-defined x; False where anything is not finite."""
+    """Whether the projected triangle is wide enough to have a well-defined x, and small enough for float32 sums."""
     longest = (corners - corners.roll(1, dims=-2)).square().sum(dim=-1).amax(dim=-1)
     doubled_area = _doubled_area(corners).abs()
-    return (doubled_area > (1e-6 * longest).clamp(min=1e-12)) & doubled_area.isfinite() & longest.isfinite()
+    in_range = (corners.abs() < _FARTHEST_PIXEL).all(dim=-1).all(dim=-1) & (longest < _LARGEST)
+    return (doubled_area > (1e-6 * longest).clamp(min=1e-12)) & in_range
+
+
+def unit_normals(triangles: Tensor) -> Tensor:
+    """Unit normals (N, 3) of triangles (N, 3, 3) by the right-hand rule; 0 for one without area or too long."""
+    edges = triangles[:, 1:] - triangles[:, :1]
+    # Brought near 1 first: the squares of very long or short edges leave the range of float32.
+    size = edges.detach().abs().amax(dim=(1, 2), keepdim=True)
+    usable = (size > 0) & size.isfinite()
+    edges = torch.where(usable, edges, 0.0) / torch.where(usable, size, 1.0)
+    normal = torch.linalg.cross(edges[:, 0], edges[:, 1])
+    length = normal.norm(dim=-1, keepdim=True)
+    return torch.where(length > 0, normal / length.clamp(min=torch.finfo(normal.dtype).tiny), 0.0)
 
 
 def _facing_normal(triangles: Tensor, viewmat: Tensor) -> Tensor:
     """Unit normals (M, 3) in world space with n . (centroid - camera centre) <= 0."""
-    normal = torch.linalg.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    # Squares of the components of a tiny triangle would underflow.
-    normal = normal / normal.detach().abs().amax(dim=-1, keepdim=True)
-    normal = normal / normal.norm(dim=-1, keepdim=True)
+    normal = unit_normals(triangles)
     with torch.no_grad():
         camera = -viewmat[:3, :3].T @ viewmat[:3, 3]
         away = (normal * (triangles.mean(dim=1) - camera)).sum(dim=-1, keepdim=True) > 0
