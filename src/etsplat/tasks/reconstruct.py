@@ -93,7 +93,8 @@ def reconstruct(
         RunDirectory.check_free(out, overwrite=overwrite)
 
     loaded, start = load_source(source, config), load_start(init_mesh)
-    record = _record(config, source, fingerprint(loaded), fingerprint(start))
+    hashes = {"fingerprint": fingerprint(loaded), "init_mesh": fingerprint(start)}
+    record = _record(config, hashes, {"source": _path_of(source), "init_mesh": _path_of(init_mesh)})
     if resume:
         RunDirectory.resume(out, record)
 
@@ -169,18 +170,14 @@ def _finish(
     return ReconstructResult(run.path, result, run.read_metrics())
 
 
-def _record(
-    config: ReconstructConfig, source: Source, source_hash: str | None, start_hash: str | None
-) -> dict[str, Any]:
-    """What config.json holds."""
+def _record(config: ReconstructConfig, hashes: dict[str, str | None], paths: dict[str, str | None]) -> dict[str, Any]:
+    """What config.json holds. Inputs are identified by their hashes; paths are for the reader."""
     settings = {name: str(value) if isinstance(value, Path) else value for name, value in vars(config).items()}
-    return {
-        "task": "reconstruct",
-        "config": settings,
-        "source": {"fingerprint": source_hash, "init_mesh": start_hash},
-        "source_path": str(source) if isinstance(source, str | Path) else None,
-        "versions": _versions(),
-    }
+    return {"task": "reconstruct", "config": settings, "source": hashes, "paths": paths, "versions": _versions()}
+
+
+def _path_of(source: object) -> str | None:
+    return str(source) if isinstance(source, str | Path) else None
 
 
 def _hash(record: dict[str, Any]) -> str:
