@@ -88,7 +88,7 @@ check-wheel: wheel
 	build/wheel-check/venv/bin/pip --disable-pip-version-check install --quiet -c constraints.txt torch
 	build/wheel-check/venv/bin/pip --disable-pip-version-check install --quiet -c constraints.txt dist/*.whl
 	cd build/wheel-check && venv/bin/etsplat doctor
-	cd build/wheel-check && venv/bin/etsplat demo --out demo --iterations 20 --resolution 64 --max-faces 6000
+	cd build/wheel-check && venv/bin/etsplat demo --out demo --preset tiny
 	test -s build/wheel-check/demo/report.html
 
 clean:

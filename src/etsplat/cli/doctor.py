@@ -26,7 +26,7 @@ def examine(console: Console) -> bool:
     for name, value in _versions():
         table.add_row(name, Text(value))
     table.add_section()
-    table.add_row("engine", "cpu (native); reference (plain PyTorch, slow) with --engine reference")
+    table.add_row("engine", "cpu (native)")
     table.add_row(
         "instruction set", f"{_native.instruction_set()} of {', '.join(_native.available_instruction_sets())}"
     )
@@ -79,8 +79,9 @@ def _threads() -> str:
 
 def _optional() -> list[tuple[str, str]]:
     weights = find_lpips_weights(None)
+    found = ", ".join(map(str, weights.paths)) or f"missing, so lpips in metrics.json is null: {weights.reason}"
     return [
-        ("LPIPS weights", str(weights)),
-        ("compiler", "not needed: the engine is compiled already"),
+        ("LPIPS weights", found),
+        ("compiler", "not needed: the native engine is compiled already"),
         ("CUDA", "not in this release: tensors stay on the CPU"),
     ]

@@ -1,0 +1,179 @@
+"""The `etsplat` command, run as users run it."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from etsplat.cli.main import resume_line
+from etsplat.cli.options import Demo, Reconstruct, parse
+from etsplat.geometry.icosphere import icosphere
+from etsplat.io.mesh_files import save_mesh
+from etsplat.tasks.reconstruct_config import PRESETS
+
+PROGRAM = [sys.executable, "-c", "from etsplat.cli import main; main()"]
+
+
+def etsplat(*arguments: str, cwd: Path | None = None) -> "subprocess.CompletedProcess[str]":
+    return subprocess.run([*PROGRAM, *arguments], cwd=cwd, capture_output=True, text=True, check=False)
+
+
+def assert_one_line_error(result: "subprocess.CompletedProcess[str]", *words: str) -> None:
+    """Status 2, nothing but one line on standard error, which holds the words."""
+    assert result.returncode == 2, result.stderr
+    assert result.stderr.startswith("etsplat: ")
+    assert result.stderr.count("\n") == 1
+    assert all(word in result.stderr for word in words), result.stderr
+
+
+@pytest.fixture
+def sphere(tmp_path: Path) -> Path:
+    """A small mesh file."""
+    vertices, faces = icosphere(2)
+    save_mesh(tmp_path / "sphere.ply", vertices, faces)
+    return tmp_path / "sphere.ply"
+
+
+@pytest.mark.parametrize("arguments", [[], ["--help"]])
+def test_help_lists_the_commands(arguments: list[str]) -> None:
+    """Without arguments and with --help, the commands and an example are shown."""
+    result = etsplat(*arguments)
+    assert result.returncode == 0
+    for word in ("demo", "reconstruct", "doctor", "etsplat reconstruct bunny.obj --out runs/bunny"):
+        assert word in result.stdout
+
+
+def test_help_of_a_command_teaches() -> None:
+    """Each setting is an option with its help and the preset's default, and there are examples."""
+    result = etsplat("reconstruct", "--help", "--preset", "paper")
+    assert result.returncode == 0
+    for word in ("--lambda-sigma", "--max-faces", "30000)", "--resume", "Examples:"):
+        assert word in result.stdout
+
+
+def test_help_does_not_wait_for_torch() -> None:
+    """Parsing options imports neither torch nor the native engine."""
+    program = "import sys; from etsplat.cli.options import parse; parse(['demo']); print('torch' in sys.modules)"
+    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert result.stdout == "False\n"
+
+
+def test_version() -> None:
+    """--version prints the version and nothing else."""
+    assert etsplat("--version").stdout == "etsplat 0.1.0\n"
+
+
+def test_doctor_tells_what_there_is() -> None:
+    """Engine, instruction set, threads, versions and what is missing are named; a sound installation ends with 0."""
+    result = etsplat("doctor")
+    assert result.returncode == 0, result.stderr
+    for word in ("engine", "instruction set", "threads", "torch", "agrees with the reference", "LPIPS", "CUDA"):
+        assert word in result.stdout
+
+
+def test_preset_sets_the_defaults_and_options_change_them() -> None:
+    """--preset chooses the settings, other options change single ones, and each command has its own default preset."""
+    command = parse(["reconstruct", "a.ply", "--out", "b", "--preset=paper", "--iterations", "7", "--engine", "cpu"])
+    assert isinstance(command, Reconstruct)
+    assert (command.settings.iterations, command.settings.engine) == (7, "cpu")
+    assert command.settings.resolution == PRESETS["paper"].resolution
+    demo = parse(["demo"])
+    assert isinstance(demo, Demo)
+    assert demo.settings == PRESETS["demo"]
+    quick = parse(["reconstruct", "a.ply", "--out", "b"])
+    assert isinstance(quick, Reconstruct)
+    assert quick.settings == PRESETS["quick"]
+
+
+@pytest.mark.parametrize(
+    "arguments", [["demo", "--preset", "huge"], ["demo", "--iterations", "many"], ["reconstruct"], ["paint"]]
+)
+def test_wrong_options_end_with_status_2(arguments: list[str]) -> None:
+    """What is no option or no value of one is refused without a traceback."""
+    result = etsplat(*arguments)
+    assert result.returncode == 2
+    assert "Traceback" not in result.stderr
+
+
+def test_setting_out_of_range() -> None:
+    """A value out of its range is an error in one line that names the setting."""
+    assert_one_line_error(etsplat("demo", "--iterations", "0"), "iterations", "at least 1")
+
+
+def test_missing_mesh(tmp_path: Path) -> None:
+    """A missing input is named, nothing is written."""
+    result = etsplat("reconstruct", "no.ply", "--out", "run", cwd=tmp_path)
+    assert_one_line_error(result, "no.ply", "no such file")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_truncated_mesh(sphere: Path) -> None:
+    """A mesh file that was cut short is refused."""
+    sphere.write_bytes(sphere.read_bytes()[:3000])
+    assert_one_line_error(etsplat("reconstruct", str(sphere), "--out", "run", cwd=sphere.parent), "sphere.ply")
+
+
+def test_folder_of_something_else_stays_untouched(sphere: Path, tmp_path: Path) -> None:
+    """An output folder with other files is refused, also with --overwrite."""
+    folder = tmp_path / "thesis"
+    folder.mkdir()
+    (folder / "chapter1.txt").write_text("It was a dark and stormy night.")
+    for extra in ([], ["--overwrite"]):
+        result = etsplat("reconstruct", str(sphere), "--out", str(folder), "--preset", "tiny", *extra)
+        assert_one_line_error(result, "thesis", "not empty")
+    assert [path.name for path in folder.iterdir()] == ["chapter1.txt"]
+
+
+def test_debug_shows_the_traceback() -> None:
+    """--debug shows where an error came from."""
+    result = etsplat("reconstruct", "no.ply", "--out", "run", "--debug")
+    assert result.returncode != 0
+    assert "Traceback" in result.stderr
+
+
+def test_demo_end_to_end_then_refuses_then_overwrites(tmp_path: Path) -> None:
+    """A tiny demo prints metrics and paths and writes every result; a second one needs --overwrite."""
+    tiny = ["demo", "--preset", "tiny", "--iterations", "20", "--out", "run"]
+    result = etsplat(*tiny, cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    for word in ("Optimizing", "PSNR", "Chamfer", "report.html", "overview.png", "mesh.glb"):
+        assert word in result.stdout
+    names = {path.name for path in (tmp_path / "run").iterdir()}
+    assert names >= {"mesh.ply", "mesh.obj", "mesh.glb", "metrics.json", "config.json", "history.jsonl"}
+    assert names >= {"report.html", "overview.png", "convergence.png", "test", "checkpoints", "README.txt"}
+    assert "etsplat reconstruct demo:owl --out DIR" in (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
+    assert_one_line_error(etsplat(*tiny, cwd=tmp_path), "--resume", "--overwrite")
+    assert etsplat(*tiny, "--overwrite", cwd=tmp_path).returncode == 0
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGINT for one subprocess")
+def test_interrupted_run_says_how_to_resume_and_resumes(sphere: Path, tmp_path: Path) -> None:
+    """Ctrl-C ends with status 130 and the command that continues; that command finishes the run."""
+    run = tmp_path / "run"
+    options = ["reconstruct", str(sphere), "--out", str(run), "--preset", "tiny", "--iterations", "1500"]
+    options += ["--max-faces", "400", "--checkpoint-every", "0"]
+    process = subprocess.Popen([*PROGRAM, *options], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    history = run / "history.jsonl"
+    deadline = time.monotonic() + 60
+    while not (history.exists() and history.stat().st_size) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 130, errors
+    assert errors.count("\n") == 1
+    assert errors.endswith("--resume\n")
+    assert "continue with: etsplat reconstruct" in errors
+    result = etsplat(*options, "--resume")
+    assert result.returncode == 0, result.stderr
+    assert json.loads((run / "metrics.json").read_text())["iterations"] == 1500
+
+
+def test_resume_line_keeps_the_options() -> None:
+    """The suggested command quotes what needs it, says --resume once, and never --overwrite."""
+    line = resume_line(["demo", "--out", "my run", "--overwrite", "--resume"])
+    assert line == "etsplat demo --out 'my run' --resume"
