@@ -135,6 +135,8 @@ std::shared_ptr<RasterState> raster_forward(const RasterCall& call) {
         state->hits.resize(state->num_slots);
         state->hits.fill_zero();
         pass.hits = state->hits.data();
+        state->tile_done.resize(int64_t{pass.tiles_x} * pass.tiles_y);
+        pass.tile_done = state->tile_done.data();
     }
     if (call.max_weight) {
         state->slot_weight.resize(state->num_slots);

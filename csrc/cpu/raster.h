@@ -57,7 +57,7 @@ struct RasterState {
     Buffer<int32_t> order, order_swap;        // visible triangles, front to back
     Buffer<int32_t> tile_count, slot_begin;   // per triangle
     Buffer<int32_t> slot_tile;                // per slot
-    Buffer<int32_t> histogram, tile_begin;
+    Buffer<int32_t> histogram, tile_begin, tile_done;
     Buffer<TileEntry> entries;
     Buffer<uint16_t> hits;
     Buffer<float> slot_weight, slots, corner_gradients, tile_background, scratch;

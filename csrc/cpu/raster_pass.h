@@ -72,6 +72,7 @@ struct RasterPass {
     const int32_t* tile_begin = nullptr;   // (tiles + 1)
     const TileEntry* entries = nullptr;    // by tile, front to back
     uint16_t* hits = nullptr;              // per slot: blocks in which the triangle was drawn or stopped a pixel
+    int32_t* tile_done = nullptr;          // per tile: end of the entries that were looked at
     float* slot_weight = nullptr;          // per slot: largest blend weight, or null
 
     float* color = nullptr;                   // (H, W, flat + corner channels)

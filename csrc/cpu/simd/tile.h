@@ -50,33 +50,34 @@ private:
 
 // The three forms g_k . (p - q) of a triangle over one tile.
 struct TriangleForms {
-    float at_block[3][16];  // values at the block centres
-    Vec in_block[3];        // differences of the lanes to the block centre
+    float at_block[3][16];     // values at the block centres
+    float in_block[3][16];     // differences of the lanes to the block centre
     float center_x, center_y;  // first pixel centre - q
 
-    // Returns the blocks that the triangle can touch: where the smallest value that each form takes in the block is
-    // within the extent, and the bounding boxes overlap. Conservative.
-    ETSPLAT_FN unsigned blocks(const TriangleRecord& record, const TileFrame& frame) {
+    ETSPLAT_FN void prepare(const TriangleRecord& record, const TileFrame& frame) {
         center_x = static_cast<float>(frame.x0) + 0.5f - record.qx;
         center_y = static_cast<float>(frame.y0) + 0.5f - record.qy;
-        const Vec x = Vec::load(kBlockX) + Vec(center_x);
-        const Vec y = Vec::load(kBlockY) + Vec(center_y);
-        const Vec reach(kBlockReach);
-        VecMask mask = (x + reach >= Vec(record.left)) & (x - reach <= Vec(record.right)) &
-                       (y + reach >= Vec(record.top)) & (y - reach <= Vec(record.bottom));
+        const Vec block_x = Vec::load(kBlockX) + Vec(center_x), block_y = Vec::load(kBlockY) + Vec(center_y);
+        const Vec lane_x = Vec::load(kLaneX), lane_y = Vec::load(kLaneY);
         for (int k = 0; k < 3; ++k) {
-            const Vec form = vfma(Vec(record.gx[k]), x, Vec(record.gy[k]) * y);
-            const float slack = kBlockReach * (etsplat::vabs(record.gx[k]) + etsplat::vabs(record.gy[k]));
-            mask = mask & (form - Vec(slack) <= Vec(record.extent));
-            form.store(at_block[k]);
+            vfma(Vec(record.gx[k]), block_x, Vec(record.gy[k]) * block_y).store(at_block[k]);
+            vfma(Vec(record.gx[k]), lane_x, Vec(record.gy[k]) * lane_y).store(in_block[k]);
+        }
+    }
+    // The blocks that the triangle can touch: where the smallest value that each form takes in the block is within the
+    // extent, and the bounding boxes overlap. Conservative.
+    ETSPLAT_FN unsigned blocks(const TriangleRecord& record) const {
+        const Vec x = Vec::load(kBlockX) + Vec(center_x), y = Vec::load(kBlockY) + Vec(center_y);
+        const float reach = kBlockReach;
+        VecMask mask = (x >= Vec(record.left - reach)) & (x <= Vec(record.right + reach)) &
+                       (y >= Vec(record.top - reach)) & (y <= Vec(record.bottom + reach));
+        for (int k = 0; k < 3; ++k) {
+            const float slack = reach * (etsplat::vabs(record.gx[k]) + etsplat::vabs(record.gy[k]));
+            mask = mask & (Vec::load(at_block[k]) <= Vec(record.extent + slack));
         }
         return mask.bits();
     }
-    ETSPLAT_FN void prepare_lanes(const TriangleRecord& record) {
-        const Vec x = Vec::load(kLaneX), y = Vec::load(kLaneY);
-        for (int k = 0; k < 3; ++k) in_block[k] = vfma(Vec(record.gx[k]), x, Vec(record.gy[k]) * y);
-    }
-    ETSPLAT_FN Vec value(int k, int block) const { return Vec(at_block[k][block]) + in_block[k]; }
+    ETSPLAT_FN Vec value(int k, int block) const { return Vec(at_block[k][block]) + Vec::load(in_block[k]); }
     // p - q of the lanes
     ETSPLAT_FN Vec dx(int block) const { return Vec::load(kLaneX) + Vec(center_x + kBlockX[block]); }
     ETSPLAT_FN Vec dy(int block) const { return Vec::load(kLaneY) + Vec(center_y + kBlockY[block]); }
@@ -118,6 +119,9 @@ ETSPLAT_FN float first_inverse_depth(const RasterPass& pass, int tile) {
     if (!pass.want_distortion || first == pass.tile_begin[tile + 1]) return 0.0f;
     return 1.0f / pass.attribute_records[pass.entries[first].triangle].centroid_z;
 }
+
+// 1 if any of the 16 bits is set, without a branch.
+ETSPLAT_FN unsigned any_bit(unsigned bits) { return (bits + 0xffffu) >> 16; }
 
 template <class F>
 ETSPLAT_FN void for_each_bit(unsigned bits, F&& body) {

@@ -19,7 +19,6 @@ struct BackwardTile {
     float total_second[kBlocks][16];
     float total_weight[kBlocks][16];
     uint16_t alive[kBlocks];
-    unsigned alive_blocks;
     float first_inverse_z;
     float* grad_color;  // [channel][block][16]
     float* sums;        // lanes of the sums of a slot, general pass only
@@ -69,11 +68,8 @@ ETSPLAT_FN void load_distortion(const RasterPass& pass, BackwardTile& tile, cons
 }
 
 ETSPLAT_FN void begin(const RasterPass& pass, BackwardTile& tile, const TileFrame& frame) {
-    tile.alive_blocks = 0;
     for (int block = 0; block < kBlocks; ++block) {
-        const unsigned inside = frame.whole() ? 0xffffu : frame.inside(block);
-        tile.alive[block] = static_cast<uint16_t>(inside);
-        tile.alive_blocks |= (inside != 0 ? 1u : 0u) << block;
+        tile.alive[block] = static_cast<uint16_t>(frame.whole() ? 0xffffu : frame.inside(block));
         Vec(1.0f).store(tile.transmittance[block]);
         load_block(pass, tile, frame, block);
         if (pass.grad_distortion) load_distortion(pass, tile, frame, block);
@@ -169,12 +165,11 @@ struct ExtraGradients {
 
 template <class Kernel, bool General>
 ETSPLAT_FN void differentiate(const RasterPass& pass, BackwardTile& tile, const TileFrame& frame, const TileEntry& entry) {
-    const unsigned blocks = pass.hits[entry.slot] & tile.alive_blocks;
+    const unsigned blocks = pass.hits[entry.slot];
     if (blocks == 0) return;
     const TriangleRecord& record = pass.records[entry.triangle];
     TriangleForms forms;
-    forms.blocks(record, frame);
-    forms.prepare_lanes(record);
+    forms.prepare(record, frame);
 
     const int flat = General ? pass.flat_channels : kMaxFastChannels;
     const float* color = pass.flat_colors + int64_t{entry.triangle} * flat;
@@ -188,20 +183,15 @@ ETSPLAT_FN void differentiate(const RasterPass& pass, BackwardTile& tile, const 
     for_each_bit(blocks, [&](int block) {
         const Vec form0 = forms.value(0, block), form1 = forms.value(1, block), form2 = forms.value(2, block);
         const Vec x = vmax(form0, vmax(form1, form2));
-        VecMask mask = (x <= extent) & VecMask::from_bits(tile.alive[block]);
-        if (mask.bits() == 0) return;
         const KernelValue<Vec> kernel = Kernel::gradient(x, exponent, scale);
         const Vec raw_alpha = opacity * kernel.value;
         const Vec alpha = vmin(raw_alpha, alpha_max);
         const Vec transmittance = Vec::load(tile.transmittance[block]);
-        mask = mask & (alpha >= alpha_min);
+        const unsigned alive = tile.alive[block];
+        const VecMask mask = (x <= extent) & (alpha >= alpha_min) & VecMask::from_bits(alive);
         Vec w = alpha * transmittance;
         const VecMask stop = mask & (transmittance - w < transmittance_min);
-        const unsigned stop_bits = stop.bits();
-        if (stop_bits != 0) {
-            tile.alive[block] = static_cast<uint16_t>(tile.alive[block] & ~stop_bits);
-            if (tile.alive[block] == 0) tile.alive_blocks &= ~(1u << block);
-        }
+        tile.alive[block] = static_cast<uint16_t>(alive & ~stop.bits());
         const VecMask drawn = and_not(mask, stop);
         w = keep(drawn, w);
         (transmittance - w).store(tile.transmittance[block]);
@@ -263,8 +253,7 @@ void backward_tile(const RasterPass& pass, int index, float* scratch) {
     tile.sums = scratch + 256 * pass.channels();
     begin(pass, tile, frame);
     if (pass.tile_background) background_gradient(pass, tile, frame, pass.tile_background + int64_t{index} * pass.channels());
-    const int end = pass.tile_begin[index + 1];
-    for (int i = pass.tile_begin[index]; i < end && tile.alive_blocks != 0; ++i)
+    for (int i = pass.tile_begin[index]; i < pass.tile_done[index]; ++i)
         differentiate<Kernel, General>(pass, tile, frame, pass.entries[i]);
 }
 

@@ -1,12 +1,16 @@
 // Front-to-back compositing of one tile (paper, equation 1).
 //
-// For each triangle of the tile's list, one vector test over the 16 blocks finds those it can touch; then each of these
-// blocks is one vector of 16 pixels. Colour and transmittance of the tile stay in the first-level cache. A pixel whose
-// next transmittance would fall below the limit is dead from then on; dead blocks, then the dead tile, end the work.
+// Triangles come in batches. For each, one vector test over the 16 blocks finds those it can touch; the (triangle, block)
+// pairs of the batch are listed, and each is one vector of 16 pixels. The list keeps the loop over pairs free of
+// branches that depend on what was just computed: a mispredicted one would wait for the whole chain of a kernel
+// evaluation (some 150 cycles) before work on the next pair could start. For the same reason dead pixels are masked at
+// the end of that chain, and dead blocks drop out between batches only.
+// Colour and transmittance of the tile stay in the first-level cache.
 #pragma once
 
 #include <bit>
 
+#include "block_list.h"
 #include "tile.h"
 
 namespace etsplat::ETSPLAT_SIMD {
@@ -19,20 +23,22 @@ struct ForwardTile {
     float distortion[kBlocks][16];
     float median[kBlocks][16];  // bits of an int32: 1 + triangle at which T falls to one half, 0 if none
     uint16_t alive[kBlocks];
-    unsigned alive_blocks;
     float first_inverse_z;
     float* color;  // [channel][block][16]
+
+    ETSPLAT_FN unsigned alive_blocks() const {
+        unsigned blocks = 0;
+        for (int block = 0; block < kBlocks; ++block) blocks |= any_bit(alive[block]) << block;
+        return blocks;
+    }
 
     ETSPLAT_FN float* channel(int c, int block) { return color + (c * kBlocks + block) * 16; }
 };
 
 ETSPLAT_FN void begin(ForwardTile& tile, const TileFrame& frame, int channels, bool general) {
-    tile.alive_blocks = 0;
     for (int block = 0; block < kBlocks; ++block) {
         Vec(1.0f).store(tile.transmittance[block]);
-        const unsigned inside = frame.whole() ? 0xffffu : frame.inside(block);
-        tile.alive[block] = static_cast<uint16_t>(inside);
-        tile.alive_blocks |= (inside != 0 ? 1u : 0u) << block;
+        tile.alive[block] = static_cast<uint16_t>(frame.whole() ? 0xffffu : frame.inside(block));
         for (int c = 0; c < channels; ++c) Vec(0.0f).store(tile.channel(c, block));
         if (general) {
             Vec(0.0f).store(tile.weighted_depth[block]);
@@ -80,46 +86,56 @@ ETSPLAT_FN void draw_extras(const RasterPass& pass, ForwardTile& tile, const Tri
     }
 }
 
-template <class Kernel, bool General>
-ETSPLAT_FN void draw(const RasterPass& pass, ForwardTile& tile, const TileFrame& frame, const TileEntry& entry) {
-    const TriangleRecord& record = pass.records[entry.triangle];
-    TriangleForms forms;
-    const unsigned blocks = forms.blocks(record, frame) & tile.alive_blocks;
-    if (blocks == 0) return;
-    forms.prepare_lanes(record);
+constexpr int kBatch = 16;
 
+struct Batch {
+    TriangleForms forms[kBatch];
+    Vec largest_weight[kBatch];
+    TileEntry entries[kBatch];
+    unsigned hits[kBatch];
+    PairList pairs;
+};
+
+ETSPLAT_FN void prepare(const RasterPass& pass, const TileFrame& frame, unsigned alive_blocks, const TileEntry* entries,
+                        int count, Batch& batch) {
+    batch.pairs.clear();
+    for (int i = 0; i < count; ++i) {
+        const TriangleRecord& record = pass.records[entries[i].triangle];
+        batch.entries[i] = entries[i];
+        batch.hits[i] = 0;
+        batch.largest_weight[i] = Vec(0.0f);
+        batch.forms[i].prepare(record, frame);
+        batch.pairs.append(i, batch.forms[i].blocks(record) & alive_blocks);
+    }
+}
+
+// One triangle over one block.
+template <class Kernel, bool General>
+ETSPLAT_FN void draw(const RasterPass& pass, ForwardTile& tile, Batch& batch, int i, int block) {
+    const TriangleForms& forms = batch.forms[i];
+    const int triangle = batch.entries[i].triangle;
+    const TriangleRecord& record = pass.records[triangle];
     const int flat = General ? pass.flat_channels : kMaxFastChannels;
-    const float* color = pass.flat_colors + int64_t{entry.triangle} * flat;
-    const Vec exponent(record.exponent), scale(record.scale), opacity(record.opacity), extent(record.extent);
-    const Vec alpha_min(pass.alpha_min), alpha_max(pass.alpha_max), transmittance_min(pass.transmittance_min);
-    Vec largest(0.0f);
-    unsigned hits = 0;
-    for_each_bit(blocks, [&](int block) {
-        const Vec x = vmax(forms.value(0, block), vmax(forms.value(1, block), forms.value(2, block)));
-        VecMask mask = (x <= extent) & VecMask::from_bits(tile.alive[block]);
-        if (mask.bits() == 0) return;
-        const Vec alpha = vmin(opacity * Kernel::value(x, exponent, scale), alpha_max);
-        const Vec transmittance = Vec::load(tile.transmittance[block]);
-        mask = mask & (alpha >= alpha_min);
-        Vec w = alpha * transmittance;
-        const VecMask stop = mask & (transmittance - w < transmittance_min);
-        const unsigned mask_bits = mask.bits(), stop_bits = stop.bits();
-        hits |= (mask_bits != 0 ? 1u : 0u) << block;
-        if (stop_bits != 0) {
-            tile.alive[block] = static_cast<uint16_t>(tile.alive[block] & ~stop_bits);
-            if (tile.alive[block] == 0) tile.alive_blocks &= ~(1u << block);
-        }
-        w = keep(and_not(mask, stop), w);
-        (transmittance - w).store(tile.transmittance[block]);
-        for (int c = 0; c < flat; ++c) {
-            float* out = tile.channel(c, block);
-            vfma(w, Vec(color[c]), Vec::load(out)).store(out);
-        }
-        if (pass.slot_weight) largest = vmax(largest, w);
-        if constexpr (General) draw_extras(pass, tile, forms, entry.triangle, block, transmittance, w);
-    });
-    if (pass.hits) pass.hits[entry.slot] = static_cast<uint16_t>(hits);
-    if (pass.slot_weight) pass.slot_weight[entry.slot] = lane_max(largest);
+    const float* color = pass.flat_colors + int64_t{triangle} * flat;
+
+    const Vec x = vmax(forms.value(0, block), vmax(forms.value(1, block), forms.value(2, block)));
+    const Vec kernel = Kernel::value(x, Vec(record.exponent), Vec(record.scale));
+    const Vec alpha = vmin(Vec(record.opacity) * kernel, Vec(pass.alpha_max));
+    const Vec transmittance = Vec::load(tile.transmittance[block]);
+    const unsigned alive = tile.alive[block];
+    const VecMask mask = (x <= Vec(record.extent)) & (alpha >= Vec(pass.alpha_min)) & VecMask::from_bits(alive);
+    Vec w = alpha * transmittance;
+    const VecMask stop = mask & (transmittance - w < Vec(pass.transmittance_min));
+    w = keep(and_not(mask, stop), w);
+    (transmittance - w).store(tile.transmittance[block]);
+    tile.alive[block] = static_cast<uint16_t>(alive & ~stop.bits());
+    batch.hits[i] |= any_bit(mask.bits()) << block;
+    for (int c = 0; c < flat; ++c) {
+        float* out = tile.channel(c, block);
+        vfma(w, Vec(color[c]), Vec::load(out)).store(out);
+    }
+    if (pass.slot_weight) batch.largest_weight[i] = vmax(batch.largest_weight[i], w);
+    if constexpr (General) draw_extras(pass, tile, forms, triangle, block, transmittance, w);
 }
 
 ETSPLAT_FN void finish(const RasterPass& pass, ForwardTile& tile, const TileFrame& frame) {
@@ -156,9 +172,23 @@ void forward_tile(const RasterPass& pass, int index, float* scratch) {
     tile.color = scratch;
     if constexpr (General) tile.first_inverse_z = first_inverse_depth(pass, index);
     begin(tile, frame, pass.channels(), General);
+    Batch batch;
     const int end = pass.tile_begin[index + 1];
-    for (int i = pass.tile_begin[index]; i < end && tile.alive_blocks != 0; ++i)
-        draw<Kernel, General>(pass, tile, frame, pass.entries[i]);
+    int next = pass.tile_begin[index];
+    while (next < end) {
+        const unsigned alive_blocks = tile.alive_blocks();
+        if (alive_blocks == 0) break;
+        const int count = end - next < kBatch ? end - next : kBatch;
+        prepare(pass, frame, alive_blocks, pass.entries + next, count, batch);
+        for (int p = 0; p < batch.pairs.count; ++p)
+            draw<Kernel, General>(pass, tile, batch, batch.pairs.triangle[p], batch.pairs.block[p]);
+        for (int i = 0; i < count; ++i) {
+            if (pass.hits) pass.hits[batch.entries[i].slot] = static_cast<uint16_t>(batch.hits[i]);
+            if (pass.slot_weight) pass.slot_weight[batch.entries[i].slot] = lane_max(batch.largest_weight[i]);
+        }
+        next += count;
+    }
+    if (pass.tile_done) pass.tile_done[index] = next;
     finish(pass, tile, frame);
 }
 
