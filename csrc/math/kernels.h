@@ -29,6 +29,9 @@ constexpr float kMinDistance = 1e-6f;
 constexpr float kMinInnerDistance = 1e-4f;
 constexpr float kMinSigma = 1e-6f;  // below, float cannot tell a kernel from a step; callers raise sigma to this
 
+// x^(2/sigma) overflows for small sigma; G is 0 long before this power of two.
+constexpr float kMaxLog2Power = 30.0f;
+
 constexpr float kLog2E = 1.44269504088896f;
 constexpr float kLn2 = 0.693147180559945f;
 
@@ -65,14 +68,14 @@ struct Bilateral {
 
     template <class T>
     ETSPLAT_FN static T value(T x, T exponent, T scale) {
-        return vexp2(scale * vexp2(exponent * vlog2(vmax(x, T(kMinDistance)))));
+        return vexp2(scale * vexp2(vmin(exponent * vlog2(vmax(x, T(kMinDistance))), T(kMaxLog2Power))));
     }
 
     template <class T>
     ETSPLAT_FN static KernelValue<T> gradient(T x, T exponent, T scale) {
         const T floored = vmax(x, T(kMinDistance));
         const T log_x = vlog2(floored);
-        const T power = vexp2(exponent * log_x);
+        const T power = vexp2(vmin(exponent * log_x, T(kMaxLog2Power)));
         KernelValue<T> g;
         g.value = vexp2(scale * power);
         const T decay = g.value * power;
@@ -99,7 +102,7 @@ struct Elastic {
     ETSPLAT_FN static KernelValue<T> gradient(T x, T exponent, T scale) {
         const T floored = vmax(x, T(kMinDistance));
         const T log_x = vlog2(floored);
-        const T power = vexp2(exponent * log_x);
+        const T power = vexp2(vmin(exponent * log_x, T(kMaxLog2Power)));
         KernelValue<T> g;
         g.value = vexp2(scale * power);
         const T decay = g.value * power;
