@@ -2,7 +2,7 @@
 
 A view is rendered in two steps. ``_project`` picks the visible triangles and brings them to the image in drawing order;
 invisible ones are dropped here, before any arithmetic that has a gradient, so that nothing of theirs can turn into NaN.
-``_composite`` evaluates equation (2) of the paper for a block of pixels against the triangles that can reach it. Blocks
+``_composite`` evaluates equation (1) of the paper for a block of pixels against the triangles that can reach it. Blocks
 are checkpointed: the backward pass recomputes them one at a time, and memory stays that of one block.
 """
 
@@ -224,7 +224,7 @@ def _render(projected: _Projected, settings: RasterizeSettings) -> tuple[Tensor,
 def _composite(
     pixels: Tensor, triangles: _Projected, near: Tensor, settings: RasterizeSettings
 ) -> tuple[Tensor, Tensor]:
-    """Front-to-back compositing of P pixels (paper, equation (2)) over the triangles ``near`` in drawing order.
+    """Front-to-back compositing of P pixels (paper, equation (1)) over the triangles ``near`` in drawing order.
 
     Returns:
         (P, K) channels in the order of ``_assemble``, and (len(near),) largest weights without gradient.
