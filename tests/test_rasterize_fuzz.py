@@ -135,7 +135,7 @@ def test_any_faces(engine, faces):
             SIZE,
         )
         if bad:
-            with pytest.raises(ValueError, match="faces must index the 4 vertices"):
+            with pytest.raises(ValueError, match="faces must be indices from 0 to 3"):
                 rasterize(*arguments, faces=tensor, engine=engine, validate=False)
         else:
             assert rasterize(*arguments, faces=tensor, engine=engine).color.isfinite().all()
