@@ -1,12 +1,20 @@
+#include <nanobind/ndarray.h>
 #include <nanobind/stl/shared_ptr.h>
 
 #include "bindings.h"
 #include "instruction_set.h"
+#include "pool.h"
 #include "raster.h"
 
 namespace etsplat {
 
 void bind_rasterize(nb::module_& m) {
+    m.def("pooled_floats", [](size_t count) {
+        float* block = pool_acquire(count);
+        nb::capsule owner(block, [](void* p) noexcept { pool_release(static_cast<float*>(p)); });
+        return nb::ndarray<nb::numpy, float, nb::ndim<1>>(block, {count}, owner);
+    }, nb::arg("count"));
+    m.def("pool_idle_bytes", &pool_idle_bytes);
     m.def("available_instruction_sets", &available_instruction_sets);
     m.def("instruction_set", &instruction_set);
     m.def("set_instruction_set", &set_instruction_set, nb::arg("name"));

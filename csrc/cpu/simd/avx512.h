@@ -56,4 +56,31 @@ ETSPLAT_FN Register r_column_sums(const Register v[16]) {
                          _mm512_shuffle_f32x4(halves[0], halves[1], 0xdd));
 }
 
+// Sixteen pixels of three channels to one register per channel, and back.
+ETSPLAT_FN void r_deinterleave3(const float* in, Register out[3]) {
+    const Register a = _mm512_loadu_ps(in), b = _mm512_loadu_ps(in + 16), c = _mm512_loadu_ps(in + 32);
+    alignas(64) static constexpr int kFromAB[3][16] = {{0, 3, 6, 9, 12, 15, 18, 21, 24, 27, 30, 0, 0, 0, 0, 0},
+                                                       {1, 4, 7, 10, 13, 16, 19, 22, 25, 28, 31, 0, 0, 0, 0, 0},
+                                                       {2, 5, 8, 11, 14, 17, 20, 23, 26, 29, 0, 0, 0, 0, 0, 0}};
+    alignas(64) static constexpr int kWithC[3][16] = {{0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 17, 20, 23, 26, 29},
+                                                      {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 18, 21, 24, 27, 30},
+                                                      {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 16, 19, 22, 25, 28, 31}};
+    for (int k = 0; k < 3; ++k) {
+        const Register ab = _mm512_permutex2var_ps(a, _mm512_load_si512(kFromAB[k]), b);
+        out[k] = _mm512_permutex2var_ps(ab, _mm512_load_si512(kWithC[k]), c);
+    }
+}
+ETSPLAT_FN void r_interleave3(const Register in[3], float* out) {
+    alignas(64) static constexpr int kFromAB[3][16] = {{0, 16, 0, 1, 17, 0, 2, 18, 0, 3, 19, 0, 4, 20, 0, 5},
+                                                       {21, 0, 6, 22, 0, 7, 23, 0, 8, 24, 0, 9, 25, 0, 10, 26},
+                                                       {0, 11, 27, 0, 12, 28, 0, 13, 29, 0, 14, 30, 0, 15, 31, 0}};
+    alignas(64) static constexpr int kWithC[3][16] = {{0, 1, 16, 3, 4, 17, 6, 7, 18, 9, 10, 19, 12, 13, 20, 15},
+                                                      {0, 21, 2, 3, 22, 5, 6, 23, 8, 9, 24, 11, 12, 25, 14, 15},
+                                                      {26, 1, 2, 27, 4, 5, 28, 7, 8, 29, 10, 11, 30, 13, 14, 31}};
+    for (int k = 0; k < 3; ++k) {
+        const Register ab = _mm512_permutex2var_ps(in[0], _mm512_load_si512(kFromAB[k]), in[1]);
+        _mm512_storeu_ps(out + 16 * k, _mm512_permutex2var_ps(ab, _mm512_load_si512(kWithC[k]), in[2]));
+    }
+}
+
 }  // namespace etsplat::avx512

@@ -163,4 +163,39 @@ ETSPLAT_FN void column_sums(const Vec v[kLanes], float* out) {
     }
 }
 
+// Sixteen pixels of three channels to one vector per channel, and back.
+template <class R = Register>
+ETSPLAT_FN void deinterleave3(const float* in, Vec out[3]) {
+    if constexpr (kRegisters == 1) {
+        R registers[3];
+        r_deinterleave3(in, registers);
+        for (int c = 0; c < 3; ++c) out[c].r[0] = registers[c];
+    } else {
+        float planes[3][kLanes];
+        for (int i = 0; i < kLanes; ++i)
+            for (int c = 0; c < 3; ++c) planes[c][i] = in[3 * i + c];
+        for (int c = 0; c < 3; ++c) out[c] = Vec::load(planes[c]);
+    }
+}
+template <class R = Register>
+ETSPLAT_FN void interleave3(const Vec in[3], float* out) {
+    if constexpr (kRegisters == 1) {
+        const R registers[3] = {in[0].r[0], in[1].r[0], in[2].r[0]};
+        r_interleave3(registers, out);
+    } else {
+        float planes[3][kLanes];
+        for (int c = 0; c < 3; ++c) in[c].store(planes[c]);
+        for (int i = 0; i < kLanes; ++i)
+            for (int c = 0; c < 3; ++c) out[3 * i + c] = planes[c][i];
+    }
+}
+
+ETSPLAT_FN void prefetch(const void* p) {
+#if defined(_MSC_VER) && !defined(__clang__)
+    (void)p;
+#else
+    __builtin_prefetch(p);
+#endif
+}
+
 }  // namespace etsplat::ETSPLAT_SIMD

@@ -1,6 +1,8 @@
 // Geometry of a tile in lanes: which pixels a block holds, and which blocks a triangle can touch.
 #pragma once
 
+#include <string.h>
+
 #include "cpu/raster_pass.h"
 #include "math/kernels.h"
 #include "pack.h"
@@ -47,6 +49,20 @@ struct TileFrame {
 private:
     ETSPLAT_FN static int clamp4(int n) { return n < 0 ? 0 : n > 4 ? 4 : n; }
 };
+
+// A tile row of 16 pixels lies in four blocks, four lanes each: to and from that layout. `plane` is [block][16].
+ETSPLAT_FN void store_row(float* plane, int row, Vec values) {
+    float lanes[16];
+    values.store(lanes);
+    float* out = plane + row / 4 * 64 + row % 4 * 4;
+    for (int column = 0; column < 4; ++column) memcpy(out + 16 * column, lanes + 4 * column, 16);
+}
+ETSPLAT_FN Vec load_row(const float* plane, int row) {
+    float lanes[16];
+    const float* in = plane + row / 4 * 64 + row % 4 * 4;
+    for (int column = 0; column < 4; ++column) memcpy(lanes + 4 * column, in + 16 * column, 16);
+    return Vec::load(lanes);
+}
 
 // The three forms g_k . (p - q) of a triangle over one tile.
 struct TriangleForms {

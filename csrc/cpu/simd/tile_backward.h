@@ -51,6 +51,24 @@ ETSPLAT_FN void load_block(const RasterPass& pass, BackwardTile& tile, const Til
     }
 }
 
+// Whole tiles of the fast pass, a row of pixels at a time.
+ETSPLAT_FN void load_rows(const RasterPass& pass, BackwardTile& tile, const TileFrame& frame) {
+    for (int row = 0; row < kTile; ++row) {
+        const long pixel = static_cast<long>(frame.y0 + row) * pass.width + frame.x0;
+        Vec color[3], grad[3];
+        deinterleave3(pass.color + 3 * pixel, color);
+        deinterleave3(pass.grad_color + 3 * pixel, grad);
+        Vec remaining = color[0] * grad[0];
+        for (int c = 0; c < 3; ++c) {
+            if (c > 0) remaining = vfma(color[c], grad[c], remaining);
+            store_row(tile.grad_color + c * kBlocks * 16, row, grad[c]);
+        }
+        if (pass.grad_alpha)
+            remaining = remaining - Vec::load(pass.grad_alpha + pixel) * (Vec(1.0f) - Vec::load(pass.alpha + pixel));
+        store_row(tile.remaining[0], row, remaining);
+    }
+}
+
 ETSPLAT_FN void load_distortion(const RasterPass& pass, BackwardTile& tile, const TileFrame& frame, int block) {
     Vec(0.0f).store(tile.grad_distortion[block]);
     const int columns = frame.column_count(block);
@@ -67,11 +85,13 @@ ETSPLAT_FN void load_distortion(const RasterPass& pass, BackwardTile& tile, cons
     }
 }
 
-ETSPLAT_FN void begin(const RasterPass& pass, BackwardTile& tile, const TileFrame& frame) {
+ETSPLAT_FN void begin(const RasterPass& pass, BackwardTile& tile, const TileFrame& frame, bool general) {
+    const bool rows = !general && frame.whole();
+    if (rows) load_rows(pass, tile, frame);
     for (int block = 0; block < kBlocks; ++block) {
         tile.alive[block] = static_cast<uint16_t>(frame.whole() ? 0xffffu : frame.inside(block));
         Vec(1.0f).store(tile.transmittance[block]);
-        load_block(pass, tile, frame, block);
+        if (!rows) load_block(pass, tile, frame, block);
         if (pass.grad_distortion) load_distortion(pass, tile, frame, block);
     }
 }
@@ -251,10 +271,17 @@ void backward_tile(const RasterPass& pass, int index, float* scratch) {
     tile.grad_color = scratch;
     if constexpr (General) tile.first_inverse_z = first_inverse_depth(pass, index);
     tile.sums = scratch + 256 * pass.channels();
-    begin(pass, tile, frame);
+    begin(pass, tile, frame, General);
     if (pass.tile_background) background_gradient(pass, tile, frame, pass.tile_background + int64_t{index} * pass.channels());
-    for (int i = pass.tile_begin[index]; i < pass.tile_done[index]; ++i)
+    constexpr int kAhead = 8;
+    const int end = pass.tile_done[index];
+    for (int i = pass.tile_begin[index]; i < end; ++i) {
+        const TileEntry& coming = pass.entries[i + kAhead < end ? i + kAhead : end - 1];
+        prefetch(pass.records + coming.triangle);
+        prefetch(pass.hits + coming.slot);
+        prefetch(pass.flat_colors + int64_t{coming.triangle} * pass.flat_channels);
         differentiate<Kernel, General>(pass, tile, frame, pass.entries[i]);
+    }
 }
 
 }  // namespace etsplat::ETSPLAT_SIMD

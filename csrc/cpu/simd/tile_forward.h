@@ -97,8 +97,13 @@ struct Batch {
 };
 
 ETSPLAT_FN void prepare(const RasterPass& pass, const TileFrame& frame, unsigned alive_blocks, const TileEntry* entries,
-                        int count, Batch& batch) {
+                        int count, int ahead, Batch& batch) {
     batch.pairs.clear();
+    // the records of the next batch are on their way while this one is drawn
+    for (int i = count; i < ahead; ++i) {
+        prefetch(pass.records + entries[i].triangle);
+        prefetch(pass.flat_colors + int64_t{entries[i].triangle} * pass.flat_channels);
+    }
     for (int i = 0; i < count; ++i) {
         const TriangleRecord& record = pass.records[entries[i].triangle];
         batch.entries[i] = entries[i];
@@ -136,6 +141,20 @@ ETSPLAT_FN void draw(const RasterPass& pass, ForwardTile& tile, Batch& batch, in
     }
     if (pass.slot_weight) batch.largest_weight[i] = vmax(batch.largest_weight[i], w);
     if constexpr (General) draw_extras(pass, tile, forms, triangle, block, transmittance, w);
+}
+
+// Whole tiles of the fast pass, a row of pixels at a time.
+ETSPLAT_FN void finish_rows(const RasterPass& pass, ForwardTile& tile, const TileFrame& frame) {
+    Vec background[3];
+    for (int c = 0; c < 3; ++c) background[c] = Vec(pass.background ? pass.background[c] : 0.0f);
+    for (int row = 0; row < kTile; ++row) {
+        const long pixel = static_cast<long>(frame.y0 + row) * pass.width + frame.x0;
+        const Vec t = load_row(tile.transmittance[0], row);
+        Vec color[3];
+        for (int c = 0; c < 3; ++c) color[c] = vfma(t, background[c], load_row(tile.channel(c, 0), row));
+        interleave3(color, pass.color + 3 * pixel);
+        (Vec(1.0f) - t).store(pass.alpha + pixel);
+    }
 }
 
 ETSPLAT_FN void finish(const RasterPass& pass, ForwardTile& tile, const TileFrame& frame) {
@@ -179,7 +198,8 @@ void forward_tile(const RasterPass& pass, int index, float* scratch) {
         const unsigned alive_blocks = tile.alive_blocks();
         if (alive_blocks == 0) break;
         const int count = end - next < kBatch ? end - next : kBatch;
-        prepare(pass, frame, alive_blocks, pass.entries + next, count, batch);
+        const int ahead = end - next < 2 * kBatch ? end - next : 2 * kBatch;
+        prepare(pass, frame, alive_blocks, pass.entries + next, count, ahead, batch);
         for (int p = 0; p < batch.pairs.count; ++p)
             draw<Kernel, General>(pass, tile, batch, batch.pairs.triangle[p], batch.pairs.block[p]);
         for (int i = 0; i < count; ++i) {
@@ -189,7 +209,10 @@ void forward_tile(const RasterPass& pass, int index, float* scratch) {
         next += count;
     }
     if (pass.tile_done) pass.tile_done[index] = next;
-    finish(pass, tile, frame);
+    if (!General && frame.whole())
+        finish_rows(pass, tile, frame);
+    else
+        finish(pass, tile, frame);
 }
 
 }  // namespace etsplat::ETSPLAT_SIMD

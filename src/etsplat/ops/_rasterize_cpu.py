@@ -21,6 +21,7 @@ from etsplat.core.rasterization import (
     TriangleStatistics,
 )
 from etsplat.ops._rasterize_reference import barycentrics, perspective_weights, to_screen, unit_normals
+from etsplat.ops.pool import empty_image
 
 
 def rasterize_cpu(
@@ -261,10 +262,10 @@ class _Outputs:
     def __init__(self, plan: _Plan, batch: int, channels: int) -> None:
         settings = plan.settings
         image = (batch, settings.height, settings.width)
-        self.color = torch.empty(*image, channels)
-        self.alpha = torch.empty(*image, 1)
-        self.distortion = torch.empty(*image, 1) if settings.distortion else torch.empty(0)
-        self.distortion_totals = torch.empty(*image, 2) if settings.distortion else None
+        self.color = empty_image(*image, channels)
+        self.alpha = empty_image(*image, 1)
+        self.distortion = empty_image(*image, 1) if settings.distortion else torch.empty(0)
+        self.distortion_totals = empty_image(*image, 2) if settings.distortion else None
         self.median_triangle = torch.empty(image if settings.median_depth else 0, dtype=torch.int32)
         self.statistics = None
         if settings.statistics:
