@@ -57,7 +57,7 @@ def _face(bird: np.ndarray, p: np.ndarray) -> np.ndarray:
     """Cut the facial discs, then put in eyes and beak."""
     cut = np.maximum(bird, -_sphere(p, (0.235, 0.62, 0.62), 0.3))
     eye = _sphere(p, (0.225, 0.63, 0.33), 0.13)
-    beak = _round_cone(p, (0, 0.54, 0.42), (0, 0.33, 0.58), 0.13, 0.035)
+    beak = _round_cone(p, (0, 0.54, 0.42), (0, 0.35, 0.56), 0.13, 0.035)
     return np.minimum(np.minimum(cut, eye), beak)
 
 
@@ -70,11 +70,11 @@ def _wing(p: np.ndarray) -> np.ndarray:
 
 
 def _tail(p: np.ndarray) -> np.ndarray:
-    angle = 0.5
-    y = (p[:, 1] + 0.62) * np.cos(angle) - (p[:, 2] + 0.5) * np.sin(angle)
-    z = (p[:, 2] + 0.5) * np.cos(angle) + (p[:, 1] + 0.62) * np.sin(angle)
+    angle = -0.55  # the tip behind and below
+    y = (p[:, 1] + 0.5) * np.cos(angle) - (p[:, 2] + 0.5) * np.sin(angle)
+    z = (p[:, 2] + 0.5) * np.cos(angle) + (p[:, 1] + 0.5) * np.sin(angle)
     x = p[:, 0] * (1 + 0.6 * y)  # wider at the tip
-    return _box(np.stack([x, y, z], axis=1), (0.2, 0.34, 0.075))
+    return _box(np.stack([x, y, z], axis=1), (0.19, 0.27, 0.08))
 
 
 def _feet(p: np.ndarray) -> np.ndarray:
