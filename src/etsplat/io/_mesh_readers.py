@@ -91,6 +91,8 @@ def _read_with_trimesh(path: Path) -> RawMesh:
         parts = [_placed(scene, node) for node in scene.graph.nodes_geometry]
     except Exception as error:
         detail = (str(error) or type(error).__name__).splitlines()[0]
+        if isinstance(error, ImportError):  # it wanted a module that guesses encodings
+            detail = "neither its binary form nor text"
         kind = path.suffix[1:].upper()
         raise InputError(
             f"mesh {path}: cannot be read as {kind} ({detail}); is the file cut short? Export it again"
