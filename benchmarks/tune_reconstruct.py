@@ -72,7 +72,7 @@ def read_rows(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def show(rows: list[dict[str, str]], console: Console) -> None:
+def show(rows: list[dict[str, str]], base: str, console: Console) -> None:
     """Means over the meshes for each setting; Chamfer distances x 1e-3."""
     table = Table("setting", "meshes", "chamfer", "median", "exact", "psnr", "psnr mesh", "self-int. %", "sigma", "s")
     groups: dict[str, list[dict[str, float]]] = {}
@@ -87,7 +87,7 @@ def show(rows: list[dict[str, str]], console: Console) -> None:
         cut = statistics.fmean(row["self_intersections"] / row["faces"] for row in group)
         distances = [mean("chamfer", group), median, mean("chamfer_exact", group)]
         table.add_row(
-            setting or "(base)",
+            setting.removeprefix(base).lstrip(",") or "(base)",
             str(len(group)),
             *(f"{1e3 * distance:.3f}" for distance in distances),
             *(f"{mean(name, group):.2f}" for name in ("psnr", "psnr_mesh")),
@@ -125,10 +125,11 @@ def main() -> None:
         for row in search(new, options.preset, options.out, options.jobs):
             writer.writerow(row)
             file.flush()
-            console.print(f"{row['mesh']:20} {1e3 * row['chamfer']:8.3f} {row['psnr']:6.2f}  {row['setting']}")
+            setting = row["setting"].removeprefix(options.base)
+            console.print(f"{row['mesh']:20} {1e3 * row['chamfer']:8.3f} {row['psnr']:6.2f}  {setting}")
     stems = {Path(mesh).stem for mesh in options.meshes}
     wanted = [row for row in read_rows(path) if row["mesh"] in stems and row["preset"] == options.preset]
-    show([row for row in wanted if row["setting"] in settings], console)
+    show([row for row in wanted if row["setting"] in settings], options.base, console)
 
 
 if __name__ == "__main__":

@@ -75,12 +75,12 @@ def untimed(run: Path) -> dict[str, object]:
 
 
 def test_a_small_shape_is_reconstructed(owl: tuple[ReconstructResult, list[Event | PrepareEvent]]) -> None:
-    """From a sphere with a Chamfer distance of about 0.2, the owl at 64 x 64 gets below 0.008, and looks like it."""
+    """From a sphere with a Chamfer distance of about 0.4, the owl at 64 x 64 gets below 0.01, and looks like it."""
     metrics = owl[0].metrics
-    assert metrics["chamfer"] < 0.008
+    assert metrics["chamfer"] < 0.01
     assert metrics["chamfer_exact"] < metrics["chamfer"]
-    assert metrics["psnr"] > 20
-    assert metrics["psnr_mesh"] > 20
+    assert metrics["psnr"] > 18
+    assert metrics["psnr_mesh"] > 18
     assert TINY.max_faces - 4 <= metrics["faces"] <= TINY.max_faces
     assert metrics["degenerate_faces"] == 0
 

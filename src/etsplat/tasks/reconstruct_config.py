@@ -40,7 +40,7 @@ class ReconstructConfig:
     """Grey of all faces at the start."""
     start_opacity: float = 0.9
     """Opacity of all faces at the start."""
-    start_sigma: float = 1.0
+    start_sigma: float = 0.5
     """Softness at the start; small is sharp."""
 
     lr_vertices: float = 2e-3
@@ -49,7 +49,7 @@ class ReconstructConfig:
     """Ratio of that rate's last value to its first; it falls exponentially."""
     lr_colors: float = 1e-2
     """Adam learning rate of colours."""
-    lr_opacities: float = 2e-2
+    lr_opacities: float = 1e-3
     """Adam learning rate of opacities, before their sigmoid."""
     lr_sigma: float = 1e-3
     """Adam learning rate of the logarithm of sigma."""
@@ -62,7 +62,7 @@ class ReconstructConfig:
     """Weight of the distance of vertices from the mean of their neighbours."""
     lambda_sigma: float = 1e-4
     """Weight of sigma^-2; the paper uses 1e-3 and 1e-4."""
-    edge_power: Literal[1, 2] = 1
+    edge_power: Literal[1, 2] = 2
     """1: mean edge length, as the paper prints it; 2: mean squared length."""
     gamma_hold: int = 500
     """The weights above are multiplied by a cosine that falls from 1 at this iteration to 0 at the last."""
@@ -136,7 +136,7 @@ _QUICK = replace(
     iterations=2000,
     gamma_hold=50,
     max_faces=20_000,
-    lr_vertices=5e-3,
+    lr_vertices=2e-2,
     subdivide_steps=10,
     evaluate_every=200,
     checkpoint_every=500,
@@ -153,13 +153,11 @@ PRESETS: dict[str, ReconstructConfig] = {
         supersampling=2,
         iterations=300,
         start_level=2,
-        start_sigma=0.5,
         gamma_hold=20,
-        edge_power=2,
         max_faces=2000,
-        lr_vertices=2e-2,
         lr_vertices_final=0.05,
         lr_colors=2e-2,
+        lr_opacities=2e-2,
         lr_sigma=1e-2,
         subdivide_steps=5,
         log_every=20,
