@@ -225,6 +225,14 @@ def test_views_can_be_handed_over(pebble: MeshFile, tmp_path: Path) -> None:
     assert "chamfer" not in RunDirectory(tmp_path).read_history()[-1]
 
 
+@pytest.mark.shared_data
+def test_a_scene_folder_is_reconstructed(shared_data: Path, tmp_path: Path) -> None:
+    """NeRF-synthetic lego at 64 x 64: the silhouette is found, and the exported mesh draws like the splats."""
+    metrics = reconstruct(shared_data / "scenes" / "lego_blender", tmp_path, TINY).metrics
+    assert metrics["psnr"] > 17
+    assert metrics["psnr_mesh"] > metrics["psnr"] - 2
+
+
 def test_a_finished_run_is_not_overwritten_unasked(pebble: MeshFile, tmp_path: Path) -> None:
     """A second run into the same folder is refused and changes nothing; with overwrite it replaces the first."""
     config = replace(SHORT, iterations=4)
