@@ -5,6 +5,7 @@
 #include "instruction_set.h"
 #include "pool.h"
 #include "raster.h"
+#include "raster_diagnostics.h"
 
 namespace etsplat {
 
@@ -37,7 +38,23 @@ void bind_rasterize(nb::module_& m) {
 #undef FIELD
     nb::class_<RasterState>(m, "RasterState")
         .def_prop_ro("bytes", &RasterState::bytes)
-        .def_prop_ro("num_pairs", [](const RasterState& state) { return state.num_slots; });
+        .def_prop_ro("num_pairs", [](const RasterState& state) { return state.num_slots; })
+        .def_prop_ro("stage_seconds", [](const RasterState& state) {  // stage -> (wall, inside parallel_for)
+            nb::dict seconds;
+            for (int i = 0; i < kStages; ++i)
+                seconds[kStageNames[i]] = nb::make_tuple(state.stages[i].wall, state.stages[i].parallel);
+            return seconds;
+        });
+    nb::class_<TileCounts>(m, "TileCounts")
+        .def_ro("pairs", &TileCounts::pairs)
+        .def_ro("forward_vectors", &TileCounts::forward_vectors)
+        .def_ro("backward_vectors", &TileCounts::backward_vectors)
+        .def_ro("drawn", &TileCounts::drawn);
+    nb::class_<KernelNanoseconds>(m, "KernelNanoseconds")
+        .def_ro("value", &KernelNanoseconds::value)
+        .def_ro("gradient", &KernelNanoseconds::gradient);
+    m.def("count_tiles", &count_tiles, nb::arg("state"), NoGil());
+    m.def("time_kernel", &time_kernel, nb::arg("kernel"), nb::arg("sigma"), NoGil());
     m.def("raster_forward", &raster_forward, nb::arg("call"), NoGil());
     m.def("raster_backward", &raster_backward, nb::arg("state"), nb::arg("gradients"), NoGil());
 }

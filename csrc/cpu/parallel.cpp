@@ -202,6 +202,7 @@ void parallel_for(int64_t n, int64_t grain, const RangeBody& body) {
         }
     }
     if (job.error) std::rethrow_exception(job.error);
+    if (n <= grain) return;  // one range cannot be shared: serial work
     parallel_nanoseconds += std::chrono::nanoseconds(std::chrono::steady_clock::now() - start).count();
 }
 

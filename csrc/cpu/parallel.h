@@ -18,8 +18,8 @@ void set_num_threads(int n);  // n >= 1; n == 0 means all cores this process may
 
 void parallel_for(int64_t n, int64_t grain, const RangeBody& body);
 
-// Seconds spent inside parallel_for since the last reset, as wall time of the calling thread (benchmarks/ uses it to
-// report the serial fraction).
+// Seconds spent inside parallel_for since the last reset, as wall time of the calling thread, leaving out calls too small
+// to share (benchmarks/ uses it to report the serial part).
 double parallel_seconds();
 void reset_parallel_seconds();
 

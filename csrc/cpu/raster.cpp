@@ -120,13 +120,16 @@ int64_t RasterState::bytes() const {
 
 std::shared_ptr<RasterState> raster_forward(const RasterCall& call) {
     auto state = acquire_state();
+    StageClock clock(state->stages);
     state->call = call;
     state->camera = camera_of(call);
     fill_pass(*state);
     RasterPass& pass = state->pass;
     state->attributes.resize(pass.attributes || pass.distortion_depth != DistortionDepth::kNone ? call.num_triangles : 0);
     project_triangles(*state);
+    clock.lap(Stage::kProject);
     bin_triangles(*state);
+    clock.lap(Stage::kBin);
     pass.records = state->records.data();
     pass.attribute_records = state->attributes.data();
     pass.tile_begin = state->tile_begin.data();
@@ -145,10 +148,12 @@ std::shared_ptr<RasterState> raster_forward(const RasterCall& call) {
     }
     run_tiles(*state, active_raster_kernels().forward[pass.kernel][pass.general()]);
     if (call.max_weight) reduce_weights(*state);
+    clock.lap(Stage::kForward);
     return state;
 }
 
 void raster_backward(RasterState& state, const RasterGradients& gradients) {
+    StageClock clock(state.stages);
     RasterPass& pass = state.pass;
     if (!state.call.keep_for_backward) throw std::logic_error("rasterize: this render was made without keep_for_backward");
     pass.grad_color = reinterpret_cast<const float*>(gradients.grad_color);
@@ -165,7 +170,9 @@ void raster_backward(RasterState& state, const RasterGradients& gradients) {
         pass.tile_background = state.tile_background.data();
     }
     run_tiles(state, active_raster_kernels().backward[pass.kernel][pass.general()]);
+    clock.lap(Stage::kBackward);
     reduce_gradients(state, gradients);
+    clock.lap(Stage::kReduce);
 }
 
 }  // namespace etsplat

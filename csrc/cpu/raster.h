@@ -13,6 +13,7 @@
 #include "buffer.h"
 #include "math/triangle.h"
 #include "raster_pass.h"
+#include "stage_clock.h"
 
 namespace etsplat {
 
@@ -63,6 +64,7 @@ struct RasterState {
     Buffer<float> slot_weight, slots, corner_gradients, tile_background, scratch;
     Buffer<uint8_t> touched;
     int64_t num_slots = 0;
+    StageSeconds stages[kStages];
 
     int64_t bytes() const;
 };

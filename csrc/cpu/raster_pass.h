@@ -98,9 +98,22 @@ struct RasterPass {
 
 using TileFunction = void (*)(const RasterPass& pass, int tile, float* scratch);
 
+// For benchmarks: work of the tile loops.
+struct TileCounts {
+    int64_t pairs = 0;             // (triangle, tile) pairs looked at before the tile was full
+    int64_t forward_vectors = 0;   // blocks of 16 pixels in which the forward pass evaluates a triangle
+    int64_t backward_vectors = 0;  // ... the backward pass
+    int64_t drawn = 0;             // pixels in which a triangle is drawn
+};
+using TileCounter = void (*)(const RasterPass& pass, int tile, float* scratch, TileCounts& counts);
+using EvaluationLoop = void (*)(const float* x, int count, float exponent, float scale, float* out);
+
 struct RasterKernels {
     TileFunction forward[4][2];  // [kernel][general]
     TileFunction backward[4][2];
+    // diagnostics [kernel]
+    TileCounter count[4];
+    EvaluationLoop value_loop[4], gradient_loop[4];
 };
 
 }  // namespace etsplat
