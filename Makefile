@@ -62,6 +62,7 @@ format: setup
 
 bench: setup
 	$(PY) -m benchmarks.rasterizer
+	$(PY) -m benchmarks.ops
 
 # A second build, beside the first, with assertions and line numbers. `python -S` leaves out the editable install, so that `etsplat` is the sanitized one.
 # libstdc++ is preloaded too: ASan looks for the exception functions when it starts.

@@ -1,0 +1,169 @@
+"""Times and counts of one scene on one instruction set and number of threads."""
+
+import statistics
+import time
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+
+from benchmarks.machine import cores
+from benchmarks.memory import resident_growth
+from benchmarks.prototype import Prototype
+from benchmarks.scenes import Scene
+from etsplat import _native
+from etsplat.core.kernels import KERNELS
+
+STAGES = ("project", "bin", "forward", "backward", "reduce")
+SAMPLES = 3  # timed repetitions a turn, as many as the prototype makes
+
+
+@dataclass
+class Timings:
+    """Milliseconds of every repetition."""
+
+    forward: list[float] = field(default_factory=list)
+    backward: list[float] = field(default_factory=list)
+    stages: dict[str, list[float]] = field(default_factory=lambda: {name: [] for name in STAGES})
+    parallel: list[float] = field(default_factory=list)  # inside parallel_for
+
+    @property
+    def total(self) -> list[float]:
+        """Of forward and backward together."""
+        return [a + b for a, b in zip(self.forward, self.backward, strict=True)]
+
+
+def repetition(scene: Scene, timings: Timings) -> None:
+    """A training step's rendering, from tensors to gradients."""
+    for leaf in scene.leaves:
+        leaf.grad = None
+    start = time.perf_counter()
+    out = scene.render()
+    middle = time.perf_counter()
+    out.color.backward(scene.cotangent)
+    end = time.perf_counter()
+    timings.forward.append(1e3 * (middle - start))
+    timings.backward.append(1e3 * (end - middle))
+    seconds = native_state(out).stage_seconds
+    for name in STAGES:
+        timings.stages[name].append(1e3 * seconds[name][0])
+    timings.parallel.append(1e3 * sum(parallel for _, parallel in seconds.values()))
+
+
+def native_state(out: Any) -> Any:
+    """The native state of a render whose only image is the colour: what its autograd node keeps."""
+    return out.color.grad_fn.states[0]
+
+
+def count(scene: Scene) -> dict[str, int]:
+    """Work of one render, and the bytes that it holds besides its inputs."""
+    out = scene.render()
+    state = native_state(out)
+    counts = _native.count_tiles(state)
+    out.color.backward(scene.cotangent)
+    held = [out.color, out.alpha] + [leaf.grad for leaf in scene.leaves]
+    return {
+        "pairs": state.num_pairs,
+        "pairs_seen": counts.pairs,
+        "forward_vectors": counts.forward_vectors,
+        "backward_vectors": counts.backward_vectors,
+        "useful": counts.drawn,
+        "bytes": state.bytes + sum(t.numel() * t.element_size() for t in held if t is not None),
+    }
+
+
+def check_same_picture(scene: Scene, prototype: Prototype) -> float:
+    """Mean difference to the prototype's picture, in levels of 255."""
+    ours = (255 * scene.render().color[0].detach().clamp(0, 1)).numpy()
+    difference = float(np.abs(ours - prototype.picture()).mean())
+    if difference > 1.0:
+        raise RuntimeError(f"{scene.name}: the prototype drew another picture, {difference:.1f} levels off on average")
+    return difference
+
+
+def measure(
+    scene: Scene, threads: int, instruction_set: str, repeats: int, prototype: Prototype, memory: bool
+) -> dict[str, Any]:
+    """One entry of the JSON file."""
+    level = int(scene.name[6:]) if scene.name.startswith("sphere") else None
+    compare = prototype.program is not None and level is not None and instruction_set == "avx512"
+    ours, turns, theirs, ratios = Timings(), [], [], []
+    for _ in range(repeats):
+        if compare:
+            theirs.append(prototype.milliseconds(level, threads))
+        turn = Timings()
+        for warm in range(SAMPLES + 1):
+            repetition(scene, turn if warm else Timings())
+        turns.append(turn)
+        if compare:
+            ratios.append(statistics.median(turn.total) / statistics.median(theirs[-1]))
+    for turn in turns:
+        ours.forward += turn.forward
+        ours.backward += turn.backward
+        ours.parallel += turn.parallel
+        for name in STAGES:
+            ours.stages[name] += turn.stages[name]
+    entry: dict[str, Any] = {
+        "scene": scene.name,
+        "triangles": len(scene.opacities),
+        "instruction_set": instruction_set,
+        "threads": threads,
+        "milliseconds": summary(ours.total),
+        "forward": summary(ours.forward),
+        "backward": summary(ours.backward),
+        "stages": {name: summary(values) for name, values in ours.stages.items()},
+    }
+    if compare:
+        flat = [value for values in theirs for value in values]
+        ratio = entry["milliseconds"]["median"] / statistics.median(flat)
+        entry["prototype"] = summary(flat)
+        entry["ratio"] = {"median": ratio, "low": min(ratios), "high": max(ratios)}
+        entry["picture_difference"] = check_same_picture(scene, prototype)
+    derive(entry, ours, count(scene), min(threads, cores()))
+    if memory:
+        entry["resident_growth_mib"] = resident_growth(scene.name, threads, instruction_set)
+    return entry
+
+
+def summary(values: list[float]) -> dict[str, float]:
+    ordered = sorted(values)
+    quarter = len(ordered) // 4
+    return {
+        "median": statistics.median(ordered),
+        "best": ordered[0],
+        "low": ordered[quarter],
+        "high": ordered[-1 - quarter],
+        "runs": len(ordered),
+    }
+
+
+def derive(entry: dict[str, Any], timings: Timings, counts: dict[str, int], workers: int) -> None:
+    """What follows from times and counts. The scene is one of the elastic kernel."""
+    kernel = _native.time_kernel(list(KERNELS).index("elastic"), 0.5)
+    stage = {name: entry["stages"][name]["median"] for name in STAGES}
+    native = [sum(values) for values in zip(*timings.stages.values(), strict=True)]
+    entry["counts"] = counts
+    entry["kernel_nanoseconds"] = {"value": kernel.value, "gradient": kernel.gradient}
+    entry["serial"] = {
+        "native": statistics.median(
+            (n - p) / t for n, p, t in zip(native, timings.parallel, timings.total, strict=True)
+        ),
+        "python": statistics.median((t - n) / t for n, t in zip(native, timings.total, strict=True)),
+    }
+    useful = max(1, counts["useful"])
+    entry["nanoseconds_per_useful_pair"] = 1e6 * entry["milliseconds"]["median"] / useful
+    entry["lane_utilisation"] = {
+        name: useful / max(1, 16 * counts[f"{name}_vectors"]) for name in ("forward", "backward")
+    }
+    floor = {
+        "forward": 1e-6 * counts["forward_vectors"] * kernel.value / workers,
+        "backward": 1e-6 * counts["backward_vectors"] * kernel.gradient / workers,
+    }
+    entry["kernel_share"] = {name: floor[name] / stage[name] for name in floor}
+
+
+def use(threads: int, instruction_set: str) -> None:
+    torch.set_num_threads(threads)
+    _native.set_num_threads(threads)
+    _native.set_instruction_set(instruction_set)

@@ -1,0 +1,89 @@
+"""The numbers that the benchmarks report mean what they say."""
+
+import json
+
+import pytest
+import torch
+
+from _scenes import mesh
+from benchmarks import rasterizer, tables
+from benchmarks.measure import native_state
+from etsplat import _native, rasterize
+
+
+def render(scene):
+    return rasterize(**{**scene, "vertices": scene["vertices"].requires_grad_()})
+
+
+@pytest.mark.sanitize
+def test_useful_pairs_are_the_pixels_in_which_triangles_are_drawn(rng):
+    """One triangle: the pixels with alpha; its copy behind it draws in the same ones; vectors hold 16 pixels."""
+    triangle = torch.tensor([[[-0.5, -0.4, 3.0], [0.6, -0.3, 3.0], [0.1, 0.7, 3.0]]])
+    camera = torch.eye(4)[None], torch.tensor([[[60.0, 0, 40.0], [0, 60.0, 30.0], [0, 0, 1]]])
+    drawn = []
+    for copies in (1, 2):
+        vertices = triangle.repeat(copies, 1, 1).requires_grad_()
+        out = rasterize(
+            vertices, torch.ones(copies, 3), torch.full((copies,), 0.5), torch.tensor(0.5), *camera, width=83, height=61
+        )
+        counts = _native.count_tiles(native_state(out))
+        assert counts.backward_vectors <= counts.forward_vectors
+        assert counts.drawn <= 16 * counts.backward_vectors
+        assert counts.pairs == native_state(out).num_pairs
+        assert copies * int((out.alpha > 0).sum()) == counts.drawn
+        drawn.append(counts.drawn)
+    assert drawn[1] == 2 * drawn[0] > 0
+
+
+@pytest.mark.sanitize
+@pytest.mark.parametrize("options", [{}, {"distortion": True, "median_depth": True, "depth": "plane"}])
+def test_counting_changes_nothing(options, rng):
+    out = render({**mesh(rng), **options})
+    before = out.alpha.clone()
+    state = out.alpha.grad_fn.states[0]
+    counts = [_native.count_tiles(state) for _ in range(2)]
+    assert counts[0].drawn == counts[1].drawn > 0
+    assert torch.equal(out.alpha, before)
+
+
+def test_stages_add_up_and_their_parallel_part_is_no_larger(rng):
+    out = render(mesh(rng))
+    out.color.sum().backward()
+    for wall, parallel in native_state(out).stage_seconds.values():
+        assert 0 <= parallel <= wall < 60
+
+
+@pytest.mark.parametrize("instruction_set", _native.available_instruction_sets())
+def test_a_tight_loop_takes_time_and_derivatives_more(instruction_set):
+    before = _native.instruction_set()
+    try:
+        _native.set_instruction_set(instruction_set)
+        times = _native.time_kernel(2, 0.5)
+    finally:
+        _native.set_instruction_set(before)
+    assert 0.1 < times.value < 1e4
+    assert 0.1 < times.gradient < 1e4
+
+
+def test_the_benchmark_writes_its_results_and_the_document_takes_them(tmp_path, monkeypatch):
+    """A tiny scene from the command line to the table in a document."""
+    before = _native.num_threads(), torch.get_num_threads()
+    result, document = tmp_path / "result.json", tmp_path / "document.md"
+    options = ["--scene", "soup100", "--threads", "1", "--repeats", "1", "--no-prototype", "--no-memory"]
+    try:
+        rasterizer.main([*options, "--json", str(result)])
+    finally:
+        _native.set_num_threads(before[0])
+        torch.set_num_threads(before[1])
+    entry = json.loads(result.read_text())["results"][0]
+    assert entry["triangles"] == 100
+    assert entry["counts"]["useful"] > 0
+    assert entry["nanoseconds_per_useful_pair"] > 0
+    document.write_text(f"before\n{tables.BEGIN}\nold\n{tables.END}\nafter\n")
+    monkeypatch.setattr("sys.argv", ["tables", str(result), "--into", str(document)])
+    tables.main()
+    text = document.read_text()
+    assert "soup100" in text
+    assert "old" not in text
+    assert text.startswith("before\n")
+    assert text.endswith("after\n")
