@@ -79,7 +79,7 @@ struct Bilateral {
         KernelValue<T> g;
         g.value = vexp2(scale * power);
         const T decay = g.value * power;
-        g.dx = T(-0.5f) * exponent * decay / floored;
+        g.dx = T(-0.5f) * exponent * decay * vreciprocal(floored);
         g.dsigma = decay * log_x * (exponent * exponent) * T(0.25f * kLn2);
         return g;
     }
@@ -106,7 +106,7 @@ struct Elastic {
         KernelValue<T> g;
         g.value = vexp2(scale * power);
         const T decay = g.value * power;
-        g.dx = T(-2.0f) * decay / floored;
+        g.dx = T(-2.0f) * decay * vreciprocal(floored);
         g.dsigma = decay * vfma(exponent * T(kLn2), log_x, T(-1.0f));
         return g;
     }

@@ -20,6 +20,7 @@ namespace etsplat {
 ETSPLAT_FN float vmin(float a, float b) { return a < b ? a : b; }
 ETSPLAT_FN float vmax(float a, float b) { return a > b ? a : b; }
 ETSPLAT_FN float vabs(float a) { return a < 0.0f ? -a : a; }
+ETSPLAT_FN float vreciprocal(float a) { return 1.0f / a; }
 ETSPLAT_FN float vselect(bool mask, float a, float b) { return mask ? a : b; }
 
 #if defined(__CUDACC__) || defined(__CUDACC_RTC__)

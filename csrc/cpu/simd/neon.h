@@ -18,6 +18,7 @@ ETSPLAT_FN Register r_add(Register a, Register b) { return vaddq_f32(a, b); }
 ETSPLAT_FN Register r_sub(Register a, Register b) { return vsubq_f32(a, b); }
 ETSPLAT_FN Register r_mul(Register a, Register b) { return vmulq_f32(a, b); }
 ETSPLAT_FN Register r_div(Register a, Register b) { return vdivq_f32(a, b); }
+ETSPLAT_FN Register r_reciprocal(Register a) { return vdivq_f32(vdupq_n_f32(1.0f), a); }
 ETSPLAT_FN Register r_fma(Register a, Register b, Register c) { return vfmaq_f32(c, a, b); }
 ETSPLAT_FN Register r_min(Register a, Register b) { return vminq_f32(a, b); }
 ETSPLAT_FN Register r_max(Register a, Register b) { return vmaxq_f32(a, b); }

@@ -98,6 +98,10 @@ ETSPLAT_FN Vec keep(VecMask mask, Vec a) {
     for (int i = 0; i < kRegisters; ++i) a.r[i] = r_keep(mask.m[i], a.r[i]);
     return a;
 }
+ETSPLAT_FN Vec vreciprocal(Vec a) {
+    for (int i = 0; i < kRegisters; ++i) a.r[i] = r_reciprocal(a.r[i]);
+    return a;
+}
 ETSPLAT_FN Vec vround(Vec a) {
     for (int i = 0; i < kRegisters; ++i) a.r[i] = r_round(a.r[i]);
     return a;

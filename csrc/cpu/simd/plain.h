@@ -18,6 +18,7 @@ ETSPLAT_FN Register r_add(Register a, Register b) { return a + b; }
 ETSPLAT_FN Register r_sub(Register a, Register b) { return a - b; }
 ETSPLAT_FN Register r_mul(Register a, Register b) { return a * b; }
 ETSPLAT_FN Register r_div(Register a, Register b) { return a / b; }
+ETSPLAT_FN Register r_reciprocal(Register a) { return 1.0f / a; }
 ETSPLAT_FN Register r_fma(Register a, Register b, Register c) { return a * b + c; }
 ETSPLAT_FN Register r_min(Register a, Register b) { return a < b ? a : b; }
 ETSPLAT_FN Register r_max(Register a, Register b) { return a > b ? a : b; }

@@ -236,7 +236,7 @@ ETSPLAT_FN void differentiate(const RasterPass& pass, BackwardTile& tile, const 
         }
         const Vec remaining = Vec::load(tile.remaining[block]) - w * cotangent;
         remaining.store(tile.remaining[block]);
-        Vec grad_alpha = transmittance * cotangent - remaining / (Vec(1.0f) - alpha);
+        Vec grad_alpha = transmittance * cotangent - remaining * vreciprocal(Vec(1.0f) - alpha);
         grad_alpha = keep(drawn & (raw_alpha < alpha_max), grad_alpha);
 
         sums[SlotLayout::kOpacity] = vfma(grad_alpha, kernel.value, sums[SlotLayout::kOpacity]);
