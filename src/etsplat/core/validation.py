@@ -5,6 +5,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from etsplat import _native
+
 Shape = tuple[str | int, ...]
 
 
@@ -58,16 +60,40 @@ def check_indices(name: str, indices: Tensor, count: int) -> None:
         raise ValueError(f"{name} must be int32 or int64, got {indices.dtype}")
     if indices.numel() == 0:
         return
-    low, high = (int(value) for value in torch.aminmax(indices))
+    if _is_plain(indices):
+        found = _native.index_range(indices.data_ptr(), indices.numel(), indices.dtype == torch.int64)
+        low, high = found.low, found.high
+    else:
+        low, high = (int(value) for value in torch.aminmax(indices))
     if low < 0 or high >= count:
         raise ValueError(f"{name} must be indices from 0 to {count - 1}, got indices from {low} to {high}")
 
 
 def check_finite(name: str, tensor: Tensor) -> None:
     """Raise ValueError if ``tensor`` holds NaN or infinity; the message says how many."""
-    finite = torch.isfinite(tensor)
-    if not bool(finite.all()):
-        raise ValueError(f"{name} must be finite, got {int((~finite).sum())} NaN or infinite values")
+    if _is_plain(tensor) and tensor.dtype == torch.float32:
+        bad = _native.scan_floats(tensor.data_ptr(), tensor.numel()).nonfinite
+    else:
+        bad = int((~torch.isfinite(tensor)).sum())
+    if bad:
+        raise ValueError(f"{name} must be finite, got {bad} NaN or infinite values")
+
+
+def check_positive(name: str, tensor: Tensor) -> None:
+    """Raise ValueError if a value of ``tensor``, which is finite, is 0 or less."""
+    if tensor.numel() == 0:
+        return
+    if _is_plain(tensor) and tensor.dtype == torch.float32:
+        lowest = _native.scan_floats(tensor.data_ptr(), tensor.numel()).minimum
+    else:
+        lowest = float(tensor.detach().min())
+    if not lowest > 0:
+        raise ValueError(f"{name} must be positive, got {lowest}")
+
+
+def _is_plain(tensor: Tensor) -> bool:
+    """Whether native code can read it where it lies."""
+    return tensor.device.type == "cpu" and tensor.is_contiguous()
 
 
 def check_intrinsics(name: str, Ks: Tensor) -> None:

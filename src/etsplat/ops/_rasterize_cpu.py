@@ -21,7 +21,7 @@ from etsplat.core.rasterization import (
     TriangleStatistics,
 )
 from etsplat.ops._rasterize_reference import barycentrics, perspective_weights, to_screen, unit_normals
-from etsplat.ops.pool import empty_image
+from etsplat.ops.pool import empty_image, zeros_like
 
 
 def rasterize_cpu(
@@ -231,10 +231,10 @@ class _Rasterize(torch.autograd.Function):
         *inputs, color, _, _ = ctx.saved_tensors
         grad_color, grad_alpha, grad_distortion = (_contiguous(g) for g in cotangents[:3])
         if grad_color is None:
-            grad_color = torch.zeros_like(color)
+            grad_color = zeros_like(color)
         mesh = ctx.plan.mesh
         grads = [
-            torch.zeros_like(t) if needed and t is not None else None
+            zeros_like(t) if needed and t is not None else None
             for t, needed in zip(inputs, ctx.needs_input_grad, strict=False)
         ]
         grads[6] = None  # Ks are not differentiated

@@ -1,4 +1,4 @@
-"""Uninitialised image tensors from recycled memory."""
+"""Tensors from recycled memory."""
 
 import math
 
@@ -20,3 +20,10 @@ def empty_image(*shape: int) -> Tensor:
     if count < _SMALLEST:
         return torch.empty(shape)
     return torch.from_numpy(_native.pooled_floats(count)).view(shape)
+
+
+def zeros_like(tensor: Tensor) -> Tensor:
+    """``torch.zeros_like`` for a contiguous float32 CPU tensor, from the pool and zeroed by the engine's threads."""
+    zeros = empty_image(*tensor.shape)
+    _native.zero_floats(zeros.data_ptr(), zeros.numel())
+    return zeros

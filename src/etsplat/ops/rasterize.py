@@ -16,6 +16,7 @@ from etsplat.core.validation import (
     check_indices,
     check_intrinsics,
     check_like,
+    check_positive,
     check_shape,
 )
 from etsplat.ops.engines import resolve_engine
@@ -178,6 +179,5 @@ def _check_tensors(given: dict[str, Tensor], faces: Tensor | None) -> None:
 def _check_values(given: dict[str, Tensor]) -> None:
     for name, tensor in given.items():
         check_finite(name, tensor)
-    if not bool((given["sigma"] > 0).all()):
-        raise ValueError(f"sigma must be positive, got {float(given['sigma'].min())}")
+    check_positive("sigma", given["sigma"])
     check_intrinsics("Ks", given["Ks"])

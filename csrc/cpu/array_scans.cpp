@@ -1,0 +1,69 @@
+#include "array_scans.h"
+
+#include <algorithm>
+#include <bit>
+#include <limits>
+#include <vector>
+
+#include "parallel.h"
+
+namespace etsplat {
+namespace {
+
+constexpr int64_t kChunk = int64_t{1} << 15;
+
+template <class Part, class F>
+std::vector<Part> chunkwise(int64_t count, F&& scan) {
+    std::vector<Part> parts(static_cast<size_t>((count + kChunk - 1) / kChunk));
+    parallel_for(static_cast<int64_t>(parts.size()), 1, [&](int64_t first, int64_t last) {
+        for (int64_t c = first; c < last; ++c)
+            parts[static_cast<size_t>(c)] = scan(c * kChunk, std::min(count, (c + 1) * kChunk));
+    });
+    return parts;
+}
+
+}  // namespace
+
+FloatScan scan_floats(const float* values, int64_t count) {
+    constexpr float kInfinity = std::numeric_limits<float>::infinity();
+    const auto parts = chunkwise<FloatScan>(count, [values](int64_t begin, int64_t end) {
+        int32_t nonfinite = 0;
+        float minimum = kInfinity;
+        for (int64_t i = begin; i < end; ++i) {
+            const bool finite = (std::bit_cast<uint32_t>(values[i]) & 0x7f800000u) != 0x7f800000u;
+            nonfinite += finite ? 0 : 1;
+            const float value = finite ? values[i] : kInfinity;
+            minimum = value < minimum ? value : minimum;
+        }
+        return FloatScan{nonfinite, minimum};
+    });
+    FloatScan total{0, kInfinity};
+    for (const FloatScan& part : parts) {
+        total.nonfinite += part.nonfinite;
+        total.minimum = std::min(total.minimum, part.minimum);
+    }
+    return total;
+}
+
+template <class T>
+IndexRange index_range(const T* values, int64_t count) {
+    const auto parts = chunkwise<IndexRange>(count, [values](int64_t begin, int64_t end) {
+        T low = values[begin], high = values[begin];
+        for (int64_t i = begin; i < end; ++i) {
+            low = std::min(low, values[i]);
+            high = std::max(high, values[i]);
+        }
+        return IndexRange{low, high};
+    });
+    IndexRange total = parts.front();
+    for (const IndexRange& part : parts) total = {std::min(total.low, part.low), std::max(total.high, part.high)};
+    return total;
+}
+template IndexRange index_range(const int32_t*, int64_t);
+template IndexRange index_range(const int64_t*, int64_t);
+
+void zero_floats(float* values, int64_t count) {
+    parallel_for(count, kChunk, [values](int64_t begin, int64_t end) { std::fill(values + begin, values + end, 0.0f); });
+}
+
+}  // namespace etsplat

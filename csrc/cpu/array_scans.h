@@ -1,0 +1,23 @@
+// Checks and fills of whole arrays on the engine's own threads. Torch's pool beside ours would have twice as many threads
+// as cores, and its barriers wait for every one of them: on a busy machine that cost ten times a whole render.
+#pragma once
+
+#include <cstdint>
+
+namespace etsplat {
+
+struct FloatScan {
+    int64_t nonfinite;  // how many NaN and infinities
+    float minimum;      // of the finite values; infinity if there is none
+};
+FloatScan scan_floats(const float* values, int64_t count);
+
+struct IndexRange {
+    int64_t low, high;
+};
+template <class T>
+IndexRange index_range(const T* values, int64_t count);  // count > 0; T is int32_t or int64_t
+
+void zero_floats(float* values, int64_t count);
+
+}  // namespace etsplat

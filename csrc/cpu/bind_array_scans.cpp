@@ -1,0 +1,24 @@
+#include "array_scans.h"
+#include "bindings.h"
+
+namespace etsplat {
+
+void bind_array_scans(nb::module_& m) {
+    nb::class_<FloatScan>(m, "FloatScan").def_ro("nonfinite", &FloatScan::nonfinite).def_ro("minimum", &FloatScan::minimum);
+    nb::class_<IndexRange>(m, "IndexRange").def_ro("low", &IndexRange::low).def_ro("high", &IndexRange::high);
+    // Addresses of contiguous arrays of `count` float32, int32 or int64; indices must not be empty.
+    m.def(
+        "scan_floats", [](Address values, int64_t count) { return scan_floats(pointer<const float>(values), count); },
+        NoGil());
+    m.def(
+        "index_range",
+        [](Address values, int64_t count, bool wide) {
+            return wide ? index_range(pointer<const int64_t>(values), count)
+                        : index_range(pointer<const int32_t>(values), count);
+        },
+        NoGil());
+    m.def(
+        "zero_floats", [](Address values, int64_t count) { zero_floats(pointer<float>(values), count); }, NoGil());
+}
+
+}  // namespace etsplat

@@ -1,0 +1,67 @@
+"""Values of arguments are checked the same on native arrays and on any other tensor."""
+
+import pytest
+import torch
+
+from etsplat.core.validation import check_finite, check_indices, check_positive
+from etsplat.ops.pool import zeros_like
+
+LARGE = 100_000  # several ranges of the native scans
+
+
+def layouts(tensor):
+    """Read natively, and by torch: another dtype, another layout."""
+    wide = torch.int64 if tensor.dtype == torch.int32 else torch.float64
+    return [tensor, tensor.to(wide), torch.stack([tensor, tensor], dim=1)[:, 0]]
+
+
+@pytest.mark.sanitize
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
+def test_values_that_are_not_finite_are_counted(bad):
+    values = torch.linspace(-1e38, 1e38, LARGE)
+    for tensor in layouts(values):
+        check_finite("x", tensor)
+    values[[0, 40_000, LARGE - 1]] = bad
+    for tensor in layouts(values):
+        with pytest.raises(ValueError, match="x must be finite, got 3 NaN or infinite values"):
+            check_finite("x", tensor)
+
+
+@pytest.mark.sanitize
+@pytest.mark.parametrize("place", [0, 40_000, LARGE - 1])
+def test_the_smallest_value_decides_whether_all_are_positive(place):
+    values = torch.full((LARGE,), 0.5)
+    for tensor in layouts(values):
+        check_positive("x", tensor)
+    values[place] = -0.25
+    for tensor in layouts(values):
+        with pytest.raises(ValueError, match="x must be positive, got -0.25"):
+            check_positive("x", tensor)
+
+
+@pytest.mark.sanitize
+@pytest.mark.parametrize(("place", "index"), [(0, -1), (40_000, 7), (LARGE - 1, -5)])
+def test_indices_out_of_range_are_found(place, index):
+    indices = torch.arange(LARGE, dtype=torch.int32) % 7
+    for tensor in layouts(indices):
+        check_indices("faces", tensor, 7)
+    indices[place] = index
+    message = f"got indices from {min(index, 0)} to {max(index, 6)}"
+    for tensor in layouts(indices):
+        with pytest.raises(ValueError, match=message):
+            check_indices("faces", tensor, 7)
+
+
+def test_empty_tensors_pass():
+    check_finite("x", torch.empty(0))
+    check_positive("x", torch.empty(0))
+    check_indices("x", torch.empty(0, dtype=torch.int32), 0)
+
+
+@pytest.mark.parametrize("shape", [(), (3,), (LARGE, 3)])
+def test_recycled_memory_is_zeroed(shape):
+    for _ in range(3):
+        zeros = zeros_like(torch.empty(shape))
+        assert zeros.shape == shape
+        assert torch.equal(zeros, torch.zeros(shape))
+        zeros += 1
