@@ -16,7 +16,7 @@ SANITIZED := build/sanitize/.stamp
 # Folders are listed too: their time changes when a file is added or removed.
 NATIVE := CMakeLists.txt $(shell find csrc)
 
-.PHONY: help setup demo test lint format bench sanitize wheel check-wheel clean
+.PHONY: help setup demo test lint format bench sanitize check-neon wheel check-wheel clean
 
 help:
 	@echo "make setup        create .venv and build the package into it"
@@ -25,6 +25,7 @@ help:
 	@echo "make lint         ruff, pyright, import-linter"
 	@echo "make bench        measure the CPU engine"
 	@echo "make sanitize     run the tests of the C++ under ASan and UBSan (GCC, Linux)"
+	@echo "make check-neon   run the rasterizer's NEON path under QEMU (AArch64 cross compiler)"
 	@echo "make check-wheel  build the wheel, install it into an empty environment, run a tiny demo"
 	@echo "make clean        remove .venv, build, dist and caches"
 
@@ -77,6 +78,10 @@ sanitize: $(SANITIZED)
 	LD_PRELOAD="$$($(CXX) -print-file-name=libasan.so) $$($(CXX) -print-file-name=libstdc++.so)" \
 	ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1 \
 	PYTHONPATH="$(CURDIR)/build/sanitize/site:$(SITE)" $(PY) -S -m pytest -p no:cacheprovider -m sanitize $(PYTEST_ARGS)
+
+# The NEON path under an emulator, where there is no ARM machine (Debian: g++-aarch64-linux-gnu qemu-user).
+check-neon:
+	tests/native/run.sh neon
 
 wheel: $(TOOLS)
 	rm -rf dist

@@ -35,7 +35,7 @@ def test_the_smallest_value_decides_whether_all_are_positive(place):
         check_positive("x", tensor)
     values[place] = -0.25
     for tensor in layouts(values):
-        with pytest.raises(ValueError, match="x must be positive, got -0.25"):
+        with pytest.raises(ValueError, match=r"x must be positive, got -0\.25"):
             check_positive("x", tensor)
 
 

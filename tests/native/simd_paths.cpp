@@ -1,0 +1,168 @@
+// Renders one soup with every instruction set of this processor and compares images and gradients with the plain path.
+// A program of its own, so that a path can be checked under an emulator where there is no Python: tests/native/run.sh.
+#include <algorithm>
+#include <cmath>
+#include <cstdio>
+#include <random>
+#include <string>
+#include <vector>
+
+#include "cpu/instruction_set.h"
+#include "cpu/raster.h"
+
+using namespace etsplat;
+
+namespace {
+
+constexpr int kWidth = 75, kHeight = 50, kTriangles = 200;  // partial tiles on two sides
+constexpr int kCorner = 2;
+
+struct Scene {
+    std::vector<float> vertices, flat, corner, opacities, sigmas, background{0.1f, 0.4f, 0.7f, 0.2f, 0.9f};
+    std::vector<float> viewmat{1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 4, 0, 0, 0, 1};
+    std::vector<float> K{60, 0, 37.3f, 0, 55, 25.2f, 0, 0, 1};
+    std::vector<float> grad_color, grad_alpha, grad_distortion;
+
+    Scene() {
+        std::mt19937 random(1);
+        std::uniform_real_distribution<float> unit(0.0f, 1.0f);
+        const auto fill = [&](std::vector<float>& out, int n, float low, float high) {
+            for (int i = 0; i < n; ++i) out.push_back(low + (high - low) * unit(random));
+        };
+        for (int i = 0; i < kTriangles; ++i) {
+            float center[3];
+            for (float& c : center) c = 3.0f * unit(random) - 1.5f;
+            for (int k = 0; k < 9; ++k) vertices.push_back(center[k % 3] + 0.8f * unit(random) - 0.4f);
+        }
+        fill(flat, 3 * kTriangles, 0, 1);
+        fill(corner, 3 * kCorner * kTriangles, 0, 1);
+        fill(opacities, kTriangles, 0.1f, 1);
+        fill(sigmas, kTriangles, 0.2f, 1.5f);
+        fill(grad_color, 5 * kWidth * kHeight, -1, 1);
+        fill(grad_alpha, kWidth * kHeight, -1, 1);
+        fill(grad_distortion, kWidth * kHeight, -1, 1);
+    }
+};
+
+struct Result {
+    std::vector<float> color, alpha, distortion, median, weights;
+    std::vector<float> vertices, flat, corner, opacities, sigmas, background, viewmat;
+};
+
+uintptr_t address(std::vector<float>& v) { return reinterpret_cast<uintptr_t>(v.data()); }
+
+Result render(Scene& scene, int kernel, int distance, bool general) {
+    const int channels = general ? 3 + kCorner : 3, pixels = kWidth * kHeight;
+    Result r;
+    const auto make = [](std::vector<float>& v, int n) { v.assign(static_cast<size_t>(n), 0.0f); };
+    make(r.color, channels * pixels), make(r.alpha, pixels), make(r.distortion, pixels), make(r.weights, kTriangles);
+    make(r.vertices, 9 * kTriangles), make(r.flat, 3 * kTriangles), make(r.corner, 3 * kCorner * kTriangles);
+    make(r.opacities, kTriangles), make(r.sigmas, kTriangles), make(r.background, channels), make(r.viewmat, 16);
+    std::vector<float> totals(static_cast<size_t>(2 * pixels)), sizes(kTriangles), inradii(kTriangles);
+    std::vector<int32_t> median(static_cast<size_t>(pixels));
+    std::vector<uint8_t> visible(kTriangles);
+
+    RasterCall call;
+    call.vertices = address(scene.vertices);
+    call.num_triangles = kTriangles;
+    call.num_vertices = 3 * kTriangles;
+    call.flat_colors = address(scene.flat);
+    call.flat_channels = 3;
+    call.opacities = address(scene.opacities);
+    call.sigmas = address(scene.sigmas);
+    call.viewmat = address(scene.viewmat);
+    call.K = address(scene.K);
+    call.background = address(scene.background);
+    call.width = kWidth;
+    call.height = kHeight;
+    call.kernel = kernel;
+    call.distance = distance;
+    call.alpha_min = 1.0f / 255.0f;
+    call.alpha_max = 0.99f;
+    call.transmittance_min = 0.99e-4f;
+    call.keep_for_backward = true;
+    call.color = address(r.color);
+    call.alpha = address(r.alpha);
+    RasterGradients gradients;
+    if (general) {
+        call.corner_colors = address(scene.corner);
+        call.corner_channels = kCorner;
+        call.distortion = address(r.distortion);
+        call.distortion_totals = address(totals);
+        call.median_triangle = reinterpret_cast<uintptr_t>(median.data());
+        call.max_weight = address(r.weights);
+        call.screen_size = address(sizes);
+        call.inradius = address(inradii);
+        call.visible = reinterpret_cast<uintptr_t>(visible.data());
+        gradients.grad_distortion = address(scene.grad_distortion);
+        gradients.corner_colors = address(r.corner);
+    }
+    gradients.grad_color = address(scene.grad_color);
+    gradients.grad_alpha = address(scene.grad_alpha);
+    gradients.vertices = address(r.vertices);
+    gradients.flat_colors = address(r.flat);
+    gradients.opacities = address(r.opacities);
+    gradients.sigmas = address(r.sigmas);
+    gradients.background = address(r.background);
+    gradients.viewmat = address(r.viewmat);
+    const auto state = raster_forward(call);
+    raster_backward(*state, gradients);
+    for (const int32_t triangle : median) r.median.push_back(static_cast<float>(triangle));
+    return r;
+}
+
+// The share of values that differ by more than `tolerance` of the largest one; NaN differs from everything.
+double outliers(const std::vector<float>& a, const std::vector<float>& b, float tolerance) {
+    float scale = 1e-30f;
+    for (const float v : b) scale = std::max(scale, std::abs(v));
+    size_t count = 0;
+    for (size_t i = 0; i < a.size(); ++i) count += std::abs(a[i] - b[i]) <= tolerance * scale ? 0 : 1;
+    return static_cast<double>(count) / static_cast<double>(std::max<size_t>(1, a.size()));
+}
+
+int compare(const char* what, const std::string& path, int kernel, int distance, bool general,
+            const std::vector<float>& a, const std::vector<float>& b, float tolerance) {
+    const double share = outliers(a, b, tolerance);
+    // pixels on a cut-off may fall on either side of it
+    if (share <= 0.005) return 0;
+    std::printf("FAILED %s: %s, kernel %d, distance %d, %s pass: %.2f %% differ from plain\n", path.c_str(), what, kernel,
+                distance, general ? "general" : "fast", 100 * share);
+    return 1;
+}
+
+}  // namespace
+
+int main() {
+    Scene scene;
+    int failures = 0;
+    for (const std::string& path : available_instruction_sets()) {
+        int comparisons = 0;
+        for (int kernel = 0; kernel < 4; ++kernel)
+            for (int distance = 0; distance < 2; ++distance)
+                for (const bool general : {false, true}) {
+                    set_instruction_set("plain");
+                    const Result expected = render(scene, kernel, distance, general);
+                    const bool drawn = *std::max_element(expected.alpha.begin(), expected.alpha.end()) > 0.5f;
+                    if (!drawn) std::printf("FAILED: the scene is empty\n"), ++failures;
+                    set_instruction_set(path);
+                    const Result actual = render(scene, kernel, distance, general);
+#define COMPARE(field, tolerance) \
+    failures += compare(#field, path, kernel, distance, general, actual.field, expected.field, tolerance), ++comparisons
+                    COMPARE(color, 1e-5f);
+                    COMPARE(alpha, 1e-5f);
+                    COMPARE(distortion, 1e-5f);
+                    COMPARE(median, 0.0f);
+                    COMPARE(weights, 1e-5f);
+                    COMPARE(vertices, 1e-4f);
+                    COMPARE(flat, 1e-4f);
+                    COMPARE(corner, 1e-4f);
+                    COMPARE(opacities, 1e-4f);
+                    COMPARE(sigmas, 1e-4f);
+                    COMPARE(background, 1e-4f);
+                    COMPARE(viewmat, 1e-3f);
+#undef COMPARE
+                }
+        std::printf("%s: %d images and gradients compared with plain\n", path.c_str(), comparisons);
+    }
+    return failures == 0 ? 0 : 1;
+}
