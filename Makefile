@@ -65,8 +65,8 @@ bench: setup
 	$(PY) -m benchmarks.rasterizer
 	$(PY) -m benchmarks.ops
 
-# A second build, beside the first, with assertions and line numbers. `python -S` leaves out the editable install, so that `etsplat` is the sanitized one.
-# libstdc++ is preloaded too: ASan looks for the exception functions when it starts.
+# A second build, beside the first, with assertions and line numbers. `python -S` leaves out the editable install, so that
+# `etsplat` is the sanitized one. libstdc++ is preloaded too: ASan looks for the exception functions when it starts.
 SITE = $(shell $(PY) -c 'import sysconfig; print(sysconfig.get_path("purelib"))')
 $(SANITIZED): $(INSTALLED) $(shell find src -name '*.py')
 	$(PIP) --no-build-isolation --no-deps --upgrade --target build/sanitize/site \
