@@ -4,6 +4,7 @@
 #include <stdexcept>
 
 #include "simd/raster_kernels.h"
+#include "simd/triangle_kernels.h"
 
 #if defined(ETSPLAT_X86) && defined(_MSC_VER)
 #include <intrin.h>
@@ -14,7 +15,8 @@ namespace {
 
 struct Path {
     std::string name;
-    RasterKernels kernels;
+    RasterKernels raster;
+    TriangleKernels triangles;
 };
 
 #if defined(ETSPLAT_X86)
@@ -45,12 +47,12 @@ const std::vector<Path>& paths() {
     static const std::vector<Path> all = [] {
         std::vector<Path> found;
 #if defined(ETSPLAT_X86)
-        if (has_avx512()) found.push_back({"avx512", avx512::raster_kernels()});
-        if (has_avx2()) found.push_back({"avx2", avx2::raster_kernels()});
+        if (has_avx512()) found.push_back({"avx512", avx512::raster_kernels(), avx512::triangle_kernels()});
+        if (has_avx2()) found.push_back({"avx2", avx2::raster_kernels(), avx2::triangle_kernels()});
 #elif defined(ETSPLAT_ARM64)
-        found.push_back({"neon", neon::raster_kernels()});
+        found.push_back({"neon", neon::raster_kernels(), neon::triangle_kernels()});
 #endif
-        found.push_back({"plain", plain::raster_kernels()});
+        found.push_back({"plain", plain::raster_kernels(), plain::triangle_kernels()});
         return found;
     }();
     return all;
@@ -89,6 +91,8 @@ void set_instruction_set(const std::string& name) {
     throw std::invalid_argument("instruction set '" + name + "' is not available here; choose one of: " + known);
 }
 
-const RasterKernels& active_raster_kernels() { return active().kernels; }
+const RasterKernels& active_raster_kernels() { return active().raster; }
+
+const TriangleKernels& active_triangle_kernels() { return active().triangles; }
 
 }  // namespace etsplat

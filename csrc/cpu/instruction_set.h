@@ -1,10 +1,11 @@
-// Which compiled path of the tile loops runs: the widest that this processor has, unless told otherwise.
+// Which compiled path of the tile and triangle loops runs: the widest that this processor has, unless told otherwise.
 #pragma once
 
 #include <string>
 #include <vector>
 
 #include "raster_pass.h"
+#include "triangle_pass.h"
 
 namespace etsplat {
 
@@ -13,5 +14,6 @@ std::string instruction_set();
 void set_instruction_set(const std::string& name);  // "" for the widest; throws std::invalid_argument
 
 const RasterKernels& active_raster_kernels();
+const TriangleKernels& active_triangle_kernels();
 
 }  // namespace etsplat

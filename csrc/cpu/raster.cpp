@@ -85,6 +85,45 @@ void fill_pass(RasterState& state) {
     state.pass = pass;
 }
 
+void fill_triangles(RasterState& state) {
+    const RasterCall& call = state.call;
+    TrianglePass pass;
+    pass.count = call.num_triangles;
+    pass.camera = camera_of(call);
+    pass.distance = static_cast<Distance>(call.distance);
+    pass.freeze_incentre = call.freeze_incentre;
+    pass.shared_sigma = call.shared_sigma;
+    pass.near_plane = call.near_plane;
+    pass.support_alpha = call.alpha_min;
+    pass.x_max = call.x_max;
+    pass.vertices = reinterpret_cast<const float*>(call.vertices);
+    pass.faces = reinterpret_cast<const int32_t*>(call.faces);
+    pass.opacities = reinterpret_cast<const float*>(call.opacities);
+    pass.sigmas = reinterpret_cast<const float*>(call.sigmas);
+    pass.screen_size = reinterpret_cast<float*>(call.screen_size);
+    pass.inradius = reinterpret_cast<float*>(call.inradius);
+    pass.visible = reinterpret_cast<bool*>(call.visible);
+    state.records.resize(pass.count);
+    state.attributes.resize(
+        state.pass.attributes || state.pass.distortion_depth != DistortionDepth::kNone ? pass.count : 0);
+    state.keys.resize(pass.count);
+    state.spans.resize(pass.count);
+    pass.records = state.records.data();
+    pass.attributes = state.attributes.size() > 0 ? state.attributes.data() : nullptr;
+    pass.keys = state.keys.data();
+    pass.spans = state.spans.data();
+    state.triangles = pass;
+}
+
+void project_triangles(RasterState& state, const TriangleKernels& kernels) {
+    const TriangleKernels::Project project = kernels.project[state.pass.kernel];
+    const int64_t n = state.triangles.count;
+    state.chunk_totals.resize(static_cast<size_t>((n + kTriangleChunk - 1) / kTriangleChunk));
+    parallel_for(n, kTriangleChunk, [&](int64_t begin, int64_t end) {
+        state.chunk_totals[static_cast<size_t>(begin / kTriangleChunk)] = project(state.pass, state.triangles, begin, end);
+    });
+}
+
 void run_tiles(RasterState& state, const TileFunction function) {
     const RasterPass& pass = state.pass;
     // a little scratch per range of tiles: ranges are few enough to keep it all
@@ -113,7 +152,7 @@ void reduce_weights(RasterState& state) {
 
 int64_t RasterState::bytes() const {
     return records.bytes() + attributes.bytes() + keys.bytes() + keys_swap.bytes() + order.bytes() + order_swap.bytes() +
-           tile_count.bytes() + slot_begin.bytes() + slot_tile.bytes() + histogram.bytes() + tile_begin.bytes() +
+           spans.bytes() + slot_begin.bytes() + slot_tile.bytes() + histogram.bytes() + tile_begin.bytes() +
            entries.bytes() + hits.bytes() + slot_weight.bytes() + slots.bytes() + corner_gradients.bytes() +
            tile_background.bytes() + touched.bytes();
 }
@@ -122,13 +161,13 @@ std::shared_ptr<RasterState> raster_forward(const RasterCall& call) {
     auto state = acquire_state();
     StageClock clock(state->stages);
     state->call = call;
-    state->camera = camera_of(call);
     fill_pass(*state);
+    fill_triangles(*state);
     RasterPass& pass = state->pass;
-    state->attributes.resize(pass.attributes || pass.distortion_depth != DistortionDepth::kNone ? call.num_triangles : 0);
-    project_triangles(*state);
+    const TriangleKernels& kernels = active_triangle_kernels();
+    project_triangles(*state, kernels);
     clock.lap(Stage::kProject);
-    bin_triangles(*state);
+    bin_triangles(*state, kernels);
     clock.lap(Stage::kBin);
     pass.records = state->records.data();
     pass.attribute_records = state->attributes.data();

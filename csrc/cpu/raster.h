@@ -1,19 +1,22 @@
 // The CPU rasterizer: one call renders one view.
 //
-//   raster_project.cpp   vertices -> TriangleRecord, visibility, statistics
+//   simd/project.h       vertices -> TriangleRecord, visibility, statistics, tiles
 //   raster_bin.cpp       depth sort, then a stable counting sort of (triangle, tile) pairs by tile
-//   simd/                the tile loops
+//   simd/tile_*.h        the tile loops
+//   simd/reduce.h        sums of the slots of each triangle -> gradients of vertices, colours, ...
+//   raster_reduce.cpp    sums over triangles, vertices and tiles
 //   raster.cpp           forward and backward as sequences of these stages
-//   raster_reduce.cpp    sums of the slots of each triangle -> gradients of vertices, colours, ...
 #pragma once
 
 #include <cstdint>
 #include <memory>
+#include <vector>
 
 #include "buffer.h"
 #include "math/triangle.h"
 #include "raster_pass.h"
 #include "stage_clock.h"
+#include "triangle_pass.h"
 
 namespace etsplat {
 
@@ -50,13 +53,15 @@ struct RasterGradients {
 
 struct RasterState {
     RasterCall call;
-    PinholeCamera camera;
     RasterPass pass;
+    TrianglePass triangles;
+    std::vector<ChunkTotals> chunk_totals;  // of projection
     Buffer<TriangleRecord> records;
     Buffer<AttributeRecord> attributes;
     Buffer<uint32_t> keys, keys_swap;         // depth bits of the visible triangles
     Buffer<int32_t> order, order_swap;        // visible triangles, front to back
-    Buffer<int32_t> tile_count, slot_begin;   // per triangle
+    Buffer<TileSpan> spans;                   // per triangle
+    Buffer<int32_t> slot_begin;
     Buffer<int32_t> slot_tile;                // per slot
     Buffer<int32_t> histogram, tile_begin, tile_done;
     Buffer<TileEntry> entries;
@@ -69,12 +74,8 @@ struct RasterState {
     int64_t bytes() const;
 };
 
-void project_triangles(RasterState& state);
-void bin_triangles(RasterState& state);
+void bin_triangles(RasterState& state, const TriangleKernels& kernels);
 void reduce_gradients(RasterState& state, const RasterGradients& gradients);
-
-// The projected triangle, from which reduce_gradients starts again. view: (3, 3).
-bool load_triangle(const RasterState& state, int64_t index, float* view, Triangle2D& triangle);
 
 std::shared_ptr<RasterState> raster_forward(const RasterCall& call);
 void raster_backward(RasterState& state, const RasterGradients& gradients);

@@ -6,10 +6,10 @@
 #include <algorithm>
 #include <limits>
 #include <stdexcept>
+#include <utility>
 #include <vector>
 
 #include "raster.h"
-#include "raster_tiles.h"
 
 namespace etsplat {
 namespace {
@@ -66,62 +66,45 @@ int64_t scan_counts(int32_t* counts, int chunks, int bins, int32_t* bin_begin) {
     return total;
 }
 
-// Numbers the slots and compacts the visible triangles, in index order.
-int64_t number_slots(RasterState& state) {
-    const Chunks chunks{state.call.num_triangles, chunk_count(state.call.num_triangles)};
-    std::vector<int64_t> slots(static_cast<size_t>(chunks.count) + 1, 0), visible(slots);
-    for_chunks(chunks, [&](int c, int64_t begin, int64_t end) {
-        int64_t tiles = 0, seen = 0;
-        for (int64_t i = begin; i < end; ++i) {
-            tiles += state.tile_count[i];
-            seen += state.tile_count[i] > 0 ? 1 : 0;
-        }
-        slots[static_cast<size_t>(c) + 1] = tiles;
-        visible[static_cast<size_t>(c) + 1] = seen;
-    });
-    for (int c = 0; c < chunks.count; ++c) {
-        slots[static_cast<size_t>(c) + 1] += slots[static_cast<size_t>(c)];
-        visible[static_cast<size_t>(c) + 1] += visible[static_cast<size_t>(c)];
+// Numbers the slots and compacts the visible triangles, in index order. Returns the totals of all chunks.
+ChunkTotals number_slots(RasterState& state, const TriangleKernels& kernels) {
+    ChunkTotals total{0, 0, ~0u, 0u};
+    std::vector<ChunkTotals>& chunks = state.chunk_totals;
+    for (ChunkTotals& chunk : chunks) {  // pairs and triangles become those of the chunks before
+        const int64_t pairs = total.pairs, triangles = total.triangles;
+        total.pairs += std::exchange(chunk.pairs, pairs);
+        total.triangles += std::exchange(chunk.triangles, triangles);
+        total.lowest_key = std::min(total.lowest_key, chunk.lowest_key);
+        total.highest_key = std::max(total.highest_key, chunk.highest_key);
     }
-    state.num_slots = slots.back();
-    if (state.num_slots > std::numeric_limits<int32_t>::max())
+    if (total.pairs > std::numeric_limits<int32_t>::max())
         throw std::length_error("rasterize: more than 2^31 (triangle, tile) pairs; render fewer triangles or a smaller image");
-    state.slot_begin.resize(chunks.n + 1);
-    state.slot_tile.resize(state.num_slots);
-    state.order.resize(visible.back());
-    state.keys_swap.resize(visible.back());
-    for_chunks(chunks, [&](int c, int64_t begin, int64_t end) {
-        int32_t slot = static_cast<int32_t>(slots[static_cast<size_t>(c)]);
-        int64_t rank = visible[static_cast<size_t>(c)];
-        for (int64_t i = begin; i < end; ++i) {
-            state.slot_begin[i] = slot;
-            if (state.tile_count[i] == 0) continue;
-            state.order[rank] = static_cast<int32_t>(i);
-            state.keys_swap[rank++] = state.keys[i];
-            for_each_tile(state.records[i], state.pass, [&](int tile) { state.slot_tile[slot++] = tile; });
-        }
+    TrianglePass& pass = state.triangles;
+    state.num_slots = total.pairs;
+    state.slot_begin.resize(pass.count + 1);
+    state.slot_tile.resize(total.pairs);
+    state.order.resize(total.triangles);
+    state.keys_swap.resize(total.triangles);
+    pass.slot_begin = state.slot_begin.data();
+    pass.slot_tile = state.slot_tile.data();
+    pass.order = state.order.data();
+    pass.ordered_keys = state.keys_swap.data();
+    parallel_for(pass.count, kTriangleChunk, [&](int64_t begin, int64_t end) {
+        const ChunkTotals& before = chunks[static_cast<size_t>(begin / kTriangleChunk)];
+        kernels.number(state.pass, pass, begin, end, static_cast<int32_t>(before.pairs),
+                       static_cast<int32_t>(before.triangles));
     });
-    state.slot_begin[chunks.n] = static_cast<int32_t>(state.num_slots);
+    state.slot_begin[pass.count] = static_cast<int32_t>(total.pairs);
     state.keys.swap(state.keys_swap);
-    return visible.back();
+    return total;
 }
 
 // Stable radix sort of order by key. Only the bits that differ are sorted by.
-void sort_by_depth(RasterState& state, int64_t n) {
+void sort_by_depth(RasterState& state, const ChunkTotals& total) {
+    const int64_t n = total.triangles;
     if (n < 2) return;
     const Chunks chunks{n, chunk_count(n)};
-    std::vector<uint32_t> lows(static_cast<size_t>(chunks.count)), highs(lows);
-    for_chunks(chunks, [&](int c, int64_t begin, int64_t end) {
-        uint32_t low = ~0u, high = 0;
-        for (int64_t i = begin; i < end; ++i) {
-            low = std::min(low, state.keys[i]);
-            high = std::max(high, state.keys[i]);
-        }
-        lows[static_cast<size_t>(c)] = low;
-        highs[static_cast<size_t>(c)] = high;
-    });
-    const uint32_t low = *std::min_element(lows.begin(), lows.end());
-    const uint32_t range = *std::max_element(highs.begin(), highs.end()) - low;
+    const uint32_t low = total.lowest_key, range = total.highest_key - low;
     int bits = 0;
     while (bits < 32 && (range >> bits) != 0) ++bits;
     if (bits == 0) return;
@@ -178,10 +161,10 @@ void sort_by_tile(RasterState& state, int64_t n) {
 
 }  // namespace
 
-void bin_triangles(RasterState& state) {
-    const int64_t visible = number_slots(state);
-    sort_by_depth(state, visible);
-    sort_by_tile(state, visible);
+void bin_triangles(RasterState& state, const TriangleKernels& kernels) {
+    const ChunkTotals total = number_slots(state, kernels);
+    sort_by_depth(state, total);
+    sort_by_tile(state, total.triangles);
 }
 
 }  // namespace etsplat

@@ -6,9 +6,10 @@
 
 #include <cstdint>
 
+#include "math/tiles.h"
+
 namespace etsplat {
 
-constexpr int kTile = 16;
 constexpr int kBlocks = 16;  // blocks in a tile, and lanes in a block
 constexpr int kMaxFastChannels = 3;
 

@@ -11,9 +11,10 @@ namespace etsplat {
 
 #define ETSPLAT_KERNELS(X) X(SingleSided) X(Bilateral) X(Elastic) X(Hard)
 
+template <class T>
 struct KernelCoefficients {
-    float exponent;
-    float scale;
+    T exponent;
+    T scale;
 };
 
 template <class T>
@@ -37,7 +38,11 @@ constexpr float kLn2 = 0.693147180559945f;
 
 // G = max(1 - x, 0)^sigma
 struct SingleSided {
-    ETSPLAT_FN static KernelCoefficients coefficients(float sigma) { return {sigma, 0.0f}; }
+    static constexpr bool kEndsAtOne = true;  // G(x) = 0 for x > 1
+    template <class T>
+    ETSPLAT_FN static KernelCoefficients<T> coefficients(T sigma) {
+        return {sigma, T(0.0f)};
+    }
 
     template <class T>
     ETSPLAT_FN static T value(T x, T sigma, T) {
@@ -59,12 +64,19 @@ struct SingleSided {
     }
 
     // Largest x with o G(x) >= alpha_min; `ratio` = o / alpha_min > 1.
-    ETSPLAT_FN static float support(float ratio, float sigma) { return 1.0f - vexp2(-vlog2(ratio) / sigma); }
+    template <class T>
+    ETSPLAT_FN static T support(T ratio, T sigma) {
+        return T(1.0f) - vexp2(T(0.0f) - vlog2(ratio) / sigma);
+    }
 };
 
 // G = exp(-x^(2/sigma) / 2)
 struct Bilateral {
-    ETSPLAT_FN static KernelCoefficients coefficients(float sigma) { return {2.0f / sigma, -0.5f * kLog2E}; }
+    static constexpr bool kEndsAtOne = false;
+    template <class T>
+    ETSPLAT_FN static KernelCoefficients<T> coefficients(T sigma) {
+        return {T(2.0f) / sigma, T(-0.5f * kLog2E)};
+    }
 
     template <class T>
     ETSPLAT_FN static T value(T x, T exponent, T scale) {
@@ -84,14 +96,19 @@ struct Bilateral {
         return g;
     }
 
-    ETSPLAT_FN static float support(float ratio, float sigma) {
-        return vexp2(0.5f * sigma * vlog2(2.0f * kLn2 * vlog2(ratio)));
+    template <class T>
+    ETSPLAT_FN static T support(T ratio, T sigma) {
+        return vexp2(vmin(T(0.5f) * sigma * vlog2(T(2.0f * kLn2) * vlog2(ratio)), T(kMaxLog2Power)));
     }
 };
 
 // G = exp(-sigma x^(2/sigma))
 struct Elastic {
-    ETSPLAT_FN static KernelCoefficients coefficients(float sigma) { return {2.0f / sigma, -sigma * kLog2E}; }
+    static constexpr bool kEndsAtOne = false;
+    template <class T>
+    ETSPLAT_FN static KernelCoefficients<T> coefficients(T sigma) {
+        return {T(2.0f) / sigma, sigma * T(-kLog2E)};
+    }
 
     template <class T>
     ETSPLAT_FN static T value(T x, T exponent, T scale) {
@@ -111,14 +128,20 @@ struct Elastic {
         return g;
     }
 
-    ETSPLAT_FN static float support(float ratio, float sigma) {
-        return vexp2(0.5f * sigma * vlog2(kLn2 * vlog2(ratio) / sigma));
+    template <class T>
+    ETSPLAT_FN static T support(T ratio, T sigma) {
+        const T power = vmax(T(kLn2) * vlog2(ratio) / sigma, T(1e-30f));  // x^(2/sigma), a normal number
+        return vexp2(vmin(T(0.5f) * sigma * vlog2(power), T(kMaxLog2Power)));
     }
 };
 
 // G = 1 inside, 0 outside
 struct Hard {
-    ETSPLAT_FN static KernelCoefficients coefficients(float) { return {0.0f, 0.0f}; }
+    static constexpr bool kEndsAtOne = true;
+    template <class T>
+    ETSPLAT_FN static KernelCoefficients<T> coefficients(T) {
+        return {T(0.0f), T(0.0f)};
+    }
 
     template <class T>
     ETSPLAT_FN static T value(T x, T, T) {
@@ -130,7 +153,28 @@ struct Hard {
         return {value(x, exponent, scale), T(0.0f), T(0.0f)};
     }
 
-    ETSPLAT_FN static float support(float, float) { return 1.0f; }
+    template <class T>
+    ETSPLAT_FN static T support(T, T) {
+        return T(1.0f);
+    }
 };
+
+constexpr float kSupportMargin = 1.0f + 1e-4f;  // the alpha test decides; the extent only bounds the work
+constexpr float kLargestExtent = 1e6f;
+
+// Largest visible x of a triangle, or a negative number if nothing is visible. alpha_min = 0: there is no such test.
+template <class Kernel, class T>
+ETSPLAT_FN T visible_extent(T opacity, T sigma, float alpha_min, float x_max) {
+    T extent(vmin(x_max, kLargestExtent));
+    if (alpha_min > 0.0f) {
+        const T ratio = opacity / T(alpha_min);
+        const T support = Kernel::support(vmin(vmax(ratio, T(1.0f + 1e-6f)), T(1e30f)), vmax(sigma, T(kMinSigma)));
+        extent = vmin(extent, support * T(kSupportMargin) + T(1e-5f));
+        extent = vselect(ratio >= T(1.0f), extent, T(-1.0f));
+    } else if (Kernel::kEndsAtOne) {
+        extent = vmin(extent, T(1.0f));
+    }
+    return extent;
+}
 
 }  // namespace etsplat

@@ -24,6 +24,8 @@ ETSPLAT_FN Register r_reciprocal(Register a) {
 ETSPLAT_FN Register r_fma(Register a, Register b, Register c) { return _mm256_fmadd_ps(a, b, c); }
 ETSPLAT_FN Register r_min(Register a, Register b) { return _mm256_min_ps(a, b); }
 ETSPLAT_FN Register r_max(Register a, Register b) { return _mm256_max_ps(a, b); }
+ETSPLAT_FN Register r_sqrt(Register a) { return _mm256_sqrt_ps(a); }
+ETSPLAT_FN Register r_floor(Register a) { return _mm256_round_ps(a, _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC); }
 ETSPLAT_FN Register r_round(Register a) { return _mm256_round_ps(a, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC); }
 ETSPLAT_FN Mask r_lt(Register a, Register b) { return _mm256_cmp_ps(a, b, _CMP_LT_OQ); }
 ETSPLAT_FN Mask r_le(Register a, Register b) { return _mm256_cmp_ps(a, b, _CMP_LE_OQ); }

@@ -24,6 +24,8 @@ ETSPLAT_FN Register r_reciprocal(Register a) {
 ETSPLAT_FN Register r_fma(Register a, Register b, Register c) { return _mm512_fmadd_ps(a, b, c); }
 ETSPLAT_FN Register r_min(Register a, Register b) { return _mm512_min_ps(a, b); }
 ETSPLAT_FN Register r_max(Register a, Register b) { return _mm512_max_ps(a, b); }
+ETSPLAT_FN Register r_sqrt(Register a) { return _mm512_sqrt_ps(a); }
+ETSPLAT_FN Register r_floor(Register a) { return _mm512_roundscale_ps(a, _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC); }
 ETSPLAT_FN Register r_round(Register a) { return _mm512_roundscale_ps(a, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC); }
 ETSPLAT_FN Mask r_lt(Register a, Register b) { return _mm512_cmp_ps_mask(a, b, _CMP_LT_OQ); }
 ETSPLAT_FN Mask r_le(Register a, Register b) { return _mm512_cmp_ps_mask(a, b, _CMP_LE_OQ); }
@@ -59,6 +61,30 @@ ETSPLAT_FN Register r_column_sums(const Register v[16]) {
     }
     return _mm512_add_ps(_mm512_shuffle_f32x4(halves[0], halves[1], 0x88),
                          _mm512_shuffle_f32x4(halves[0], halves[1], 0xdd));
+}
+
+// rows[i] lane j = columns[j] lane i
+ETSPLAT_FN void r_transpose(const Register columns[16], Register rows[16]) {
+    Register quads[16];  // quads[4 i + j], 128-bit part p: lane 4 p + j of columns 4 i .. 4 i + 3
+    for (int i = 0; i < 4; ++i)
+        for (int half = 0; half < 2; ++half) {
+            const Register* c = columns + 4 * i;
+            const Register a = half ? _mm512_unpackhi_ps(c[0], c[1]) : _mm512_unpacklo_ps(c[0], c[1]);
+            const Register b = half ? _mm512_unpackhi_ps(c[2], c[3]) : _mm512_unpacklo_ps(c[2], c[3]);
+            const __m512d low = _mm512_castps_pd(a), high = _mm512_castps_pd(b);
+            quads[4 * i + 2 * half] = _mm512_castpd_ps(_mm512_unpacklo_pd(low, high));
+            quads[4 * i + 2 * half + 1] = _mm512_castpd_ps(_mm512_unpackhi_pd(low, high));
+        }
+    for (int j = 0; j < 4; ++j) {
+        const Register even_low = _mm512_shuffle_f32x4(quads[j], quads[4 + j], 0x88);
+        const Register even_high = _mm512_shuffle_f32x4(quads[8 + j], quads[12 + j], 0x88);
+        const Register odd_low = _mm512_shuffle_f32x4(quads[j], quads[4 + j], 0xdd);
+        const Register odd_high = _mm512_shuffle_f32x4(quads[8 + j], quads[12 + j], 0xdd);
+        rows[j] = _mm512_shuffle_f32x4(even_low, even_high, 0x88);
+        rows[4 + j] = _mm512_shuffle_f32x4(odd_low, odd_high, 0x88);
+        rows[8 + j] = _mm512_shuffle_f32x4(even_low, even_high, 0xdd);
+        rows[12 + j] = _mm512_shuffle_f32x4(odd_low, odd_high, 0xdd);
+    }
 }
 
 // Sixteen pixels of three channels to one register per channel, and back.

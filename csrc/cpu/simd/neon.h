@@ -22,6 +22,8 @@ ETSPLAT_FN Register r_reciprocal(Register a) { return vdivq_f32(vdupq_n_f32(1.0f
 ETSPLAT_FN Register r_fma(Register a, Register b, Register c) { return vfmaq_f32(c, a, b); }
 ETSPLAT_FN Register r_min(Register a, Register b) { return vminq_f32(a, b); }
 ETSPLAT_FN Register r_max(Register a, Register b) { return vmaxq_f32(a, b); }
+ETSPLAT_FN Register r_sqrt(Register a) { return vsqrtq_f32(a); }
+ETSPLAT_FN Register r_floor(Register a) { return vrndmq_f32(a); }
 ETSPLAT_FN Register r_round(Register a) { return vrndnq_f32(a); }
 ETSPLAT_FN Mask r_lt(Register a, Register b) { return {vcltq_f32(a, b)}; }
 ETSPLAT_FN Mask r_le(Register a, Register b) { return {vcleq_f32(a, b)}; }

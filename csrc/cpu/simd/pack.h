@@ -106,6 +106,15 @@ ETSPLAT_FN Vec vround(Vec a) {
     for (int i = 0; i < kRegisters; ++i) a.r[i] = r_round(a.r[i]);
     return a;
 }
+ETSPLAT_FN Vec vfloor(Vec a) {
+    for (int i = 0; i < kRegisters; ++i) a.r[i] = r_floor(a.r[i]);
+    return a;
+}
+ETSPLAT_FN Vec vsqrt(Vec a) {
+    for (int i = 0; i < kRegisters; ++i) a.r[i] = r_sqrt(a.r[i]);
+    return a;
+}
+ETSPLAT_FN Vec vabs(Vec a) { return vmax(a, Vec(0.0f) - a); }
 
 // log2 of a positive normal number: minimax polynomial of log2(1 + t) / t on [-1/4, 1/2], relative error 1.8e-7.
 ETSPLAT_FN Vec vlog2(Vec x) {
@@ -164,6 +173,23 @@ ETSPLAT_FN void column_sums(const Vec v[kLanes], float* out) {
         r_store(out, r_column_sums(registers));
     } else {
         for (int i = 0; i < kLanes; ++i) out[i] = lane_sum(v[i]);
+    }
+}
+
+// out[16 i + j] = lane i of v[j]
+template <class R = Register>
+ETSPLAT_FN void store_transposed(const Vec v[kLanes], float* out) {
+    if constexpr (kRegisters == 1) {
+        R columns[kLanes], rows[kLanes];
+        for (int i = 0; i < kLanes; ++i) columns[i] = v[i].r[0];
+        r_transpose(columns, rows);
+        for (int i = 0; i < kLanes; ++i) r_store(out + kLanes * i, rows[i]);
+    } else {
+        float lanes[kLanes];
+        for (int j = 0; j < kLanes; ++j) {
+            v[j].store(lanes);
+            for (int i = 0; i < kLanes; ++i) out[kLanes * i + j] = lanes[i];
+        }
     }
 }
 

@@ -22,6 +22,8 @@ ETSPLAT_FN Register r_reciprocal(Register a) { return 1.0f / a; }
 ETSPLAT_FN Register r_fma(Register a, Register b, Register c) { return a * b + c; }
 ETSPLAT_FN Register r_min(Register a, Register b) { return a < b ? a : b; }
 ETSPLAT_FN Register r_max(Register a, Register b) { return a > b ? a : b; }
+ETSPLAT_FN Register r_sqrt(Register a) { return std::sqrt(a); }
+ETSPLAT_FN Register r_floor(Register a) { return std::floor(a); }
 ETSPLAT_FN Register r_round(Register a) { return std::nearbyint(a); }
 ETSPLAT_FN Mask r_lt(Register a, Register b) { return a < b; }
 ETSPLAT_FN Mask r_le(Register a, Register b) { return a <= b; }

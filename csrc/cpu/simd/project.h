@@ -1,0 +1,196 @@
+// Stage 1 for sixteen triangles at a time: vertices to records, depth, statistics and the tiles that are touched.
+#pragma once
+
+#include <string.h>
+
+#include <bit>
+
+#include "math/kernels.h"
+#include "triangles.h"
+
+namespace etsplat::ETSPLAT_SIMD {
+
+// Lanes whose `size` consecutive values are all finite.
+ETSPLAT_FN unsigned finite_rows(const float* values, int size, const LaneRange& range) {
+    if (size == 0) return range.bits();
+    const float* first = values + range.first * size;
+    const int total = size * range.count;
+    Vec sum(0.0f);  // Inf and NaN survive a sum of (value - value)
+    int j = 0;
+    for (; j + kLanes <= total; j += kLanes) sum = sum + (Vec::load(first + j) - Vec::load(first + j));
+    float rest = 0.0f;
+    for (; j < total; ++j) rest += first[j] - first[j];
+    if (lane_sum(sum) + rest == 0.0f) return range.bits();
+    unsigned bits = 0;
+    for (int i = 0; i < range.count; ++i) {
+        float row = 0.0f;
+        for (int c = 0; c < size; ++c) row += first[i * size + c] - first[i * size + c];
+        bits |= (row == 0.0f ? 1u : 0u) << i;
+    }
+    return bits;
+}
+
+struct Projected {
+    Vec view[9];
+    Triangle2D<Vec> triangle;
+    DistanceForms<Vec> forms;
+    SupportBox<Vec> box;
+    Vec extent, depth, opacity, sigma;
+    VecMask visible;
+
+    template <class Kernel>
+    ETSPLAT_FN void project(const RasterPass& pass, const TrianglePass& triangles, const LaneRange& range) {
+        const Vec largest(3.402823466e38f);
+        opacity = range.load(triangles.opacities);
+        sigma = triangles.shared_sigma ? Vec(*triangles.sigmas) : range.load(triangles.sigmas);
+        visible = (opacity > Vec(0.0f)) & (opacity <= largest) & (sigma > Vec(0.0f)) & (sigma <= largest);
+        opacity = vselect(visible, opacity, Vec(1.0f));  // no NaN may enter the kernels' integer arithmetic
+        sigma = vselect(visible, sigma, Vec(1.0f));
+        extent = visible_extent<Kernel>(opacity, sigma, triangles.support_alpha, triangles.x_max);
+        Vec world[9];
+        load_corners(triangles, range, world);
+        visible = visible & (extent > Vec(0.0f)) &
+                  project_triangle(triangles.camera, triangles.near_plane, triangles.distance, world, view, triangle);
+        forms = distance_forms(triangle);
+        box = support_box(triangle, forms.qx, forms.qy, extent);
+        depth = centroid_depth(view);
+        const unsigned rows = finite_rows(pass.flat_colors, pass.flat_channels, range) &
+                              finite_rows(pass.corner_colors, 3 * pass.corner_channels, range);
+        visible = visible & (depth > Vec(0.0f)) & meets_image(box, forms.qx, forms.qy, pass.width, pass.height) & VecMask::from_bits(rows);
+    }
+};
+
+// Sixteen rows of sixteen floats, the rows past the range not written.
+ETSPLAT_FN void store_rows(const Vec columns[16], const LaneRange& range, void* out) {
+    if (range.count == kLanes) {
+        store_transposed(columns, static_cast<float*>(out));
+    } else {
+        float rows[16 * kLanes];
+        store_transposed(columns, rows);
+        memcpy(out, rows, sizeof(float) * 16 * static_cast<size_t>(range.count));
+    }
+}
+
+template <class Kernel>
+ETSPLAT_FN void write_records(const TrianglePass& triangles, const LaneRange& range, const Projected& p) {
+    static_assert(sizeof(TriangleRecord) == 64 && sizeof(AttributeRecord) == 64);
+    const DistanceForms<Vec>& f = p.forms;
+    const KernelCoefficients<Vec> c = Kernel::coefficients(vmax(p.sigma, Vec(kMinSigma)));
+    const Vec record[16] = {f.qx,     f.qy,      f.gx[0],    f.gx[1], f.gx[2],    f.gy[0],     f.gy[1],   f.gy[2],
+                            p.extent, p.opacity, c.exponent, c.scale, p.box.left, p.box.right, p.box.top, p.box.bottom};
+    store_rows(record, range, triangles.records + range.first);
+    if (!triangles.attributes) return;
+    const Triangle2D<Vec>& t = p.triangle;
+    Vec offset_x, offset_y;
+    offset_from_mean(t, f.qx, f.qy, offset_x, offset_y);
+    const Vec one(1.0f), none(0.0f);
+    const Vec attributes[16] = {t.ax[0], t.ax[1], t.ax[2], t.ay[0], t.ay[1], t.ay[2],
+                                one / p.view[2], one / p.view[5], one / p.view[8],
+                                offset_x, offset_y, p.depth, none, none, none, none};
+    store_rows(attributes, range, triangles.attributes + range.first);
+}
+
+ETSPLAT_FN uint32_t tile_count(const RasterPass& pass, const TriangleRecord& record) {
+    uint32_t count = 0;
+    for_each_patch(pass, record, [&](int, int, unsigned bits) { for_each_bit(bits, [&](int) { ++count; }); });
+    return count;
+}
+
+ETSPLAT_FN void write_spans(const RasterPass& pass, const TrianglePass& triangles, const LaneRange& range,
+                            const Projected& p, ChunkTotals& totals) {
+    const TileRange<Vec> tiles(p.box, p.forms.qx, p.forms.qy, pass.width, pass.height);
+    const TileTest<Vec> test(p.forms, p.extent);
+    const Vec one(1.0f), right = tiles.left + one, below = tiles.top + one;
+    const VecMask seen = p.visible & tiles.any;
+    const VecMask wide = seen & (tiles.right > tiles.left), high = seen & (tiles.bottom > tiles.top);
+    const VecMask many = seen & ((tiles.right > right) | (tiles.bottom > below));
+    const VecMask touched[4] = {seen & test.touches(tiles.left, tiles.top), wide & test.touches(right, tiles.top),
+                                high & test.touches(tiles.left, below), wide & high & test.touches(right, below)};
+    Vec pattern(0.0f), count(0.0f);
+    for (int i = 0; i < 4; ++i) {
+        pattern = pattern + keep(touched[i], Vec(static_cast<float>(1 << i)));
+        count = count + keep(touched[i], one);
+    }
+    float lanes[4][kLanes];
+    keep(seen, tiles.left).store(lanes[0]);
+    keep(seen, tiles.top).store(lanes[1]);
+    pattern.store(lanes[2]);
+    count.store(lanes[3]);
+    TileSpan spans[kLanes];
+    for (int i = 0; i < kLanes; ++i) {
+        spans[i].first = static_cast<int32_t>(lanes[1][i]) * pass.tiles_x + static_cast<int32_t>(lanes[0][i]);
+        spans[i].pattern = static_cast<uint32_t>(static_cast<int32_t>(lanes[2][i])) & 15u;
+        spans[i].count = static_cast<uint32_t>(static_cast<int32_t>(lanes[3][i])) & 15u;
+    }
+    const unsigned searched = many.bits();
+    if (searched != 0)
+        for (int i = 0; i < range.count; ++i)
+            if (searched >> i & 1) {
+                spans[i].pattern = 0;
+                spans[i].count = tile_count(pass, triangles.records[range.first + i]) & 0xfffffffu;
+            }
+    for (int i = 0; i < kLanes; ++i) {
+        totals.pairs += spans[i].count;
+        totals.triangles += spans[i].count != 0 ? 1 : 0;
+    }
+    memcpy(triangles.spans + range.first, spans, sizeof(TileSpan) * static_cast<size_t>(range.count));
+}
+
+// Keys of invisible triangles mean nothing.
+ETSPLAT_FN void write_keys(const TrianglePass& triangles, const LaneRange& range, const Projected& p, ChunkTotals& totals) {
+    // positive floats are ordered like their bits
+    const float low = 0.0f - lane_max(vselect(p.visible, Vec(0.0f) - p.depth, Vec(-3e38f)));
+    const float high = lane_max(keep(p.visible, p.depth));
+    const uint32_t lowest = std::bit_cast<uint32_t>(low), highest = std::bit_cast<uint32_t>(high);
+    totals.lowest_key = lowest < totals.lowest_key ? lowest : totals.lowest_key;
+    totals.highest_key = highest > totals.highest_key ? highest : totals.highest_key;
+    float lanes[kLanes];
+    p.depth.store(lanes);
+    memcpy(triangles.keys + range.first, lanes, sizeof(float) * static_cast<size_t>(range.count));
+}
+
+ETSPLAT_FN void write_statistics(const TrianglePass& triangles, const LaneRange& range, const Projected& p) {
+    range.store(triangles.screen_size, keep(p.visible, screen_size(p.triangle)));
+    range.store(triangles.inradius, keep(p.visible, inradius(p.triangle)));
+    const unsigned bits = p.visible.bits();
+    for (int i = 0; i < range.count; ++i) triangles.visible[range.first + i] = (bits >> i & 1) != 0;
+}
+
+template <class Kernel>
+ChunkTotals project_chunk(const RasterPass& pass, const TrianglePass& triangles, int64_t begin, int64_t end) {
+    ChunkTotals totals{0, 0, ~0u, 0u};
+    for (int64_t i = begin; i < end; i += kLanes) {
+        const LaneRange range(i, end);
+        Projected p;
+        p.project<Kernel>(pass, triangles, range);
+        write_records<Kernel>(triangles, range, p);
+        write_spans(pass, triangles, range, p, totals);
+        write_keys(triangles, range, p, totals);
+        if (triangles.visible) write_statistics(triangles, range, p);
+    }
+    return totals;
+}
+
+// Numbers the slots of a chunk from `slot` on and lists its triangles that touch any tile, from place `rank` on.
+inline void number_chunk(const RasterPass& pass, const TrianglePass& triangles, int64_t begin, int64_t end, int32_t slot,
+                         int32_t rank) {
+    const int32_t offsets[4] = {0, 1, pass.tiles_x, pass.tiles_x + 1};
+    for (int64_t i = begin; i < end; ++i) {
+        const TileSpan span = triangles.spans[i];
+        triangles.slot_begin[i] = slot;
+        if (span.count == 0) continue;
+        triangles.order[rank] = static_cast<int32_t>(i);
+        triangles.ordered_keys[rank++] = triangles.keys[i];
+        if (span.pattern != 0) {
+            for (int b = 0; b < 4; ++b)
+                if (span.pattern >> b & 1) triangles.slot_tile[slot++] = span.first + offsets[b];
+        } else {
+            for_each_patch(pass, triangles.records[i], [&](int column, int row, unsigned bits) {
+                const int first = row * pass.tiles_x + column;
+                for_each_bit(bits, [&](int b) { triangles.slot_tile[slot++] = first + b / 4 * pass.tiles_x + b % 4; });
+            });
+        }
+    }
+}
+
+}  // namespace etsplat::ETSPLAT_SIMD

@@ -1,0 +1,171 @@
+// Last stage of the backward pass for sixteen triangles at a time: the slots of each triangle are added up in order, and
+// the sums become gradients.
+#pragma once
+
+#include <string.h>
+
+#include "triangles.h"
+
+namespace etsplat::ETSPLAT_SIMD {
+
+// Sums the touched slots of each triangle into rows (16, stride); returns the lanes that have any.
+ETSPLAT_FN unsigned sum_slots(const RasterPass& pass, const TrianglePass& triangles, const LaneRange& range, float* rows) {
+    const int stride = pass.slot_layout.stride();
+    unsigned any = 0;
+    for (int i = 0; i < range.count; ++i) {
+        float* row = rows + i * stride;
+        const int32_t* begin = triangles.slot_begin + range.first + i;
+        for (int32_t s = begin[0]; s < begin[1]; ++s) {
+            if (!pass.touched[s]) continue;
+            const float* slot = pass.slots + int64_t{s} * stride;
+            const bool first = (any >> i & 1) == 0;
+            for (int j = 0; j < stride; j += kLanes)
+                (first ? Vec::load(slot + j) : Vec::load(row + j) + Vec::load(slot + j)).store(row + j);
+            any |= 1u << i;
+        }
+    }
+    if (any != 0)
+        for (int i = 0; i < kLanes; ++i)
+            if ((any >> i & 1) == 0) memset(rows + i * stride, 0, sizeof(float) * static_cast<size_t>(stride));
+    return any;
+}
+
+// Sums of sixteen triangles with one lane each.
+struct LaneSums {
+    const float* planes;  // (stride, 16)
+
+    ETSPLAT_FN Vec operator[](int j) const { return Vec::load(planes + kLanes * j); }
+    ETSPLAT_FN void get3(int first, Vec out[3]) const {
+        for (int k = 0; k < 3; ++k) out[k] = (*this)[first + k];
+    }
+};
+
+// Camera-space gradient (3, 3) of the vertices.
+ETSPLAT_FN void view_gradient(const RasterPass& pass, const TrianglePass& triangles, const LaneSums& sums, const Vec* view,
+                              const Triangle2D<Vec>& t, Vec grad_view[9]) {
+    const SlotLayout& layout = pass.slot_layout;
+    Vec gx[3], gy[3], s[3], rx[3], ry[3];
+    for (int k = 0; k < 3; ++k) gx[k] = gy[k] = Vec(0.0f);
+    for (int k = 0; k < 9; ++k) grad_view[k] = Vec(0.0f);
+    sums.get3(SlotLayout::kMoment, s);
+    sums.get3(SlotLayout::kMomentX, rx);
+    sums.get3(SlotLayout::kMomentY, ry);
+    distance_backward(t, triangles.distance, triangles.freeze_incentre, s, rx, ry, gx, gy);
+    if (layout.attributes) {
+        const DistanceForms<Vec> forms = distance_forms(t);
+        Vec offset_x, offset_y, a_at_q[3];
+        offset_from_mean(t, forms.qx, forms.qy, offset_x, offset_y);
+        for (int m = 0; m < 3; ++m) a_at_q[m] = Vec(1.0f / 3.0f) + t.ax[m] * offset_x + t.ay[m] * offset_y;
+        sums.get3(layout.barycentric(), s);
+        sums.get3(layout.barycentric() + 3, rx);
+        sums.get3(layout.barycentric() + 6, ry);
+        barycentric_backward(t, a_at_q, s, rx, ry, gx, gy);
+        for (int k = 0; k < 3; ++k) {
+            const Vec inverse_z = Vec(1.0f) / view[3 * k + 2];
+            grad_view[3 * k + 2] = grad_view[3 * k + 2] - sums[layout.inverse_z() + k] * inverse_z * inverse_z;
+        }
+    }
+    if (layout.centroid_z)
+        for (int k = 0; k < 3; ++k) grad_view[3 * k + 2] = grad_view[3 * k + 2] + sums[layout.depth()] / Vec(3.0f);
+    for (int k = 0; k < 3; ++k)
+        project_backward(triangles.camera, view + 3 * k, t.x[k], t.y[k], gx[k], gy[k], grad_view + 3 * k);
+}
+
+ETSPLAT_FN double lane_total(Vec v) {
+    float lanes[kLanes];
+    v.store(lanes);
+    double total = 0.0;
+    for (int i = 0; i < kLanes; ++i) total += static_cast<double>(lanes[i]);
+    return total;
+}
+
+ETSPLAT_FN void add_camera_gradient(const Vec* world, const Vec* grad_view, ChunkSums& chunk) {
+    for (int row = 0; row < 3; ++row) {
+        for (int column = 0; column < 3; ++column) {
+            Vec sum = grad_view[row] * world[column];
+            for (int k = 1; k < 3; ++k) sum = vfma(grad_view[3 * k + row], world[3 * k + column], sum);
+            chunk.viewmat[4 * row + column] += lane_total(sum);
+        }
+        chunk.viewmat[4 * row + 3] += lane_total(grad_view[row] + grad_view[3 + row] + grad_view[6 + row]);
+    }
+}
+
+ETSPLAT_FN void write_vertex_gradients(const TrianglePass& triangles, const LaneRange& range, const Vec world[9]) {
+    float lanes[9][kLanes];
+    for (int j = 0; j < 9; ++j) world[j].store(lanes[j]);
+    if (triangles.grad_corners) {
+        float* out = triangles.grad_corners + 9 * range.first;
+        for (int i = 0; i < range.count; ++i)
+            for (int j = 0; j < 9; ++j) out[9 * i + j] = lanes[j][i];
+    } else {
+        float* out = triangles.grad_vertices + 9 * range.first;
+        for (int i = 0; i < range.count; ++i)
+            for (int j = 0; j < 9; ++j) out[9 * i + j] += lanes[j][i];
+    }
+}
+
+ETSPLAT_FN void geometry_gradients(const RasterPass& pass, const TrianglePass& triangles, const LaneRange& range,
+                                   const LaneSums& sums, VecMask any, ChunkSums& chunk) {
+    Vec corners[9], view[9], grad_view[9], grad_world[9];
+    Triangle2D<Vec> t;
+    load_corners(triangles, range, corners);
+    project_triangle(triangles.camera, triangles.near_plane, triangles.distance, corners, view, t);
+    view_gradient(pass, triangles, sums, view, t, grad_view);
+    for (int k = 0; k < 9; ++k) {
+        grad_view[k] = keep(any, grad_view[k]);  // other lanes may not even be finite
+        corners[k] = keep(any, corners[k]);
+    }
+    if (triangles.want_camera) add_camera_gradient(corners, grad_view, chunk);
+    if (!triangles.grad_corners && !triangles.grad_vertices) return;
+    for (int k = 0; k < 3; ++k) to_world_gradient(triangles.camera, grad_view + 3 * k, grad_world + 3 * k);
+    write_vertex_gradients(triangles, range, grad_world);
+}
+
+// The sums that are gradients already.
+ETSPLAT_FN void add_direct_gradients(const RasterPass& pass, const TrianglePass& triangles, const LaneRange& range,
+                                     const float* rows, unsigned any) {
+    const SlotLayout& layout = pass.slot_layout;
+    const int flat = pass.flat_channels, corner = 3 * pass.corner_channels, stride = layout.stride();
+    for (int i = 0; i < range.count; ++i) {
+        if ((any >> i & 1) == 0) continue;
+        const float* row = rows + i * stride;
+        const int64_t triangle = range.first + i;
+        if (triangles.grad_flat)
+            for (int c = 0; c < flat; ++c) triangles.grad_flat[triangle * flat + c] += row[SlotLayout::kFlat + c];
+        if (triangles.grad_corner_colors)
+            for (int c = 0; c < corner; ++c) triangles.grad_corner_colors[triangle * corner + c] += row[layout.corner() + c];
+    }
+}
+
+// scratch: reduce_scratch_size floats
+inline ChunkSums reduce_chunk(const RasterPass& pass, const TrianglePass& triangles, int64_t begin, int64_t end,
+                              float* scratch) {
+    const int stride = pass.slot_layout.stride();
+    float* rows = scratch;
+    float* planes = scratch + kLanes * stride;
+    const bool want_geometry = triangles.want_camera || triangles.grad_corners || triangles.grad_vertices;
+    ChunkSums chunk{};
+    for (int64_t first = begin; first < end; first += kLanes) {
+        const LaneRange range(first, end);
+        const unsigned any = sum_slots(pass, triangles, range, rows);
+        if (any == 0) {
+            if (triangles.grad_corners)
+                memset(triangles.grad_corners + 9 * first, 0, sizeof(float) * 9 * static_cast<size_t>(range.count));
+            continue;
+        }
+        for (int j = 0; j < stride; j += kLanes) {
+            Vec columns[kLanes];
+            for (int i = 0; i < kLanes; ++i) columns[i] = Vec::load(rows + i * stride + j);
+            store_transposed(columns, planes + kLanes * j);
+        }
+        const LaneSums sums{planes};
+        add_direct_gradients(pass, triangles, range, rows, any);
+        if (triangles.grad_opacities) range.add(triangles.grad_opacities, sums[SlotLayout::kOpacity]);
+        if (triangles.grad_sigmas) range.add(triangles.grad_sigmas, sums[SlotLayout::kSigma]);
+        chunk.sigma += lane_total(sums[SlotLayout::kSigma]);
+        if (want_geometry) geometry_gradients(pass, triangles, range, sums, VecMask::from_bits(any), chunk);
+    }
+    return chunk;
+}
+
+}  // namespace etsplat::ETSPLAT_SIMD
