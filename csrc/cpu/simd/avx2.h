@@ -52,4 +52,12 @@ ETSPLAT_FN Register r_scale(Register a, Register n) {
         _mm256_add_epi32(_mm256_castps_si256(a), _mm256_slli_epi32(_mm256_cvtps_epi32(n), 23)));
 }
 
+// Sums of the lanes of eight vectors, in order.
+ETSPLAT_FN Register r_column_sums(const Register v[8]) {
+    // quads hold, in each half, partial sums of four vectors
+    const Register quad0 = _mm256_hadd_ps(_mm256_hadd_ps(v[0], v[1]), _mm256_hadd_ps(v[2], v[3]));
+    const Register quad1 = _mm256_hadd_ps(_mm256_hadd_ps(v[4], v[5]), _mm256_hadd_ps(v[6], v[7]));
+    return _mm256_add_ps(_mm256_permute2f128_ps(quad0, quad1, 0x20), _mm256_permute2f128_ps(quad0, quad1, 0x31));
+}
+
 }  // namespace etsplat::avx2

@@ -51,4 +51,9 @@ ETSPLAT_FN Register r_scale(Register a, Register n) {
     return vreinterpretq_f32_s32(vaddq_s32(vreinterpretq_s32_f32(a), vshlq_n_s32(vcvtnq_s32_f32(n), 23)));
 }
 
+// Sums of the lanes of four vectors, in order.
+ETSPLAT_FN Register r_column_sums(const Register v[4]) {
+    return vpaddq_f32(vpaddq_f32(v[0], v[1]), vpaddq_f32(v[2], v[3]));
+}
+
 }  // namespace etsplat::neon

@@ -164,16 +164,14 @@ ETSPLAT_FN float lane_max(Vec a) {
     return lanes[0];
 }
 
-// out[i] = sum of the lanes of v[i], i < 16. (A template, so that r_column_sums is needed only where it exists.)
-template <class R = Register>
+// out[i] = sum of the lanes of v[i], i < 16.
 ETSPLAT_FN void column_sums(const Vec v[kLanes], float* out) {
-    if constexpr (kRegisters == 1) {
-        R registers[kLanes];
-        for (int i = 0; i < kLanes; ++i) registers[i] = v[i].r[0];
-        r_store(out, r_column_sums(registers));
-    } else {
-        for (int i = 0; i < kLanes; ++i) out[i] = lane_sum(v[i]);
+    Register sums[kLanes];
+    for (int i = 0; i < kLanes; ++i) {
+        sums[i] = v[i].r[0];
+        for (int j = 1; j < kRegisters; ++j) sums[i] = r_add(sums[i], v[i].r[j]);
     }
+    for (int i = 0; i < kLanes; i += kLanesPerRegister) r_store(out + i, r_column_sums(sums + i));
 }
 
 // out[16 i + j] = lane i of v[j]
