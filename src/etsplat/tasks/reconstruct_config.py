@@ -38,7 +38,7 @@ class ReconstructConfig:
     """Radius of that sphere, as a multiple of the radius of a sphere around the object."""
     start_color: float = 0.5
     """Grey of all faces at the start."""
-    start_opacity: float = 0.9
+    start_opacity: float = 0.98
     """Opacity of all faces at the start."""
     start_sigma: float = 0.5
     """Softness at the start; small is sharp."""
@@ -62,7 +62,7 @@ class ReconstructConfig:
     """Weight of the distance of vertices from the mean of their neighbours."""
     lambda_sigma: float = 1e-4
     """Weight of sigma^-2; the paper uses 1e-3 and 1e-4."""
-    edge_power: Literal[1, 2] = 2
+    edge_power: Literal[1, 2] = 1
     """1: mean edge length, as the paper prints it; 2: mean squared length."""
     gamma_hold: int = 500
     """The weights above are multiplied by a cosine that falls from 1 at this iteration to 0 at the last."""
@@ -132,10 +132,10 @@ _PAPER = ReconstructConfig()
 _QUICK = replace(
     _PAPER,
     preset="quick",
-    resolution=320,
-    iterations=2000,
+    resolution=448,
+    iterations=2500,
     gamma_hold=50,
-    max_faces=20_000,
+    max_faces=25_000,
     lr_vertices=2e-2,
     subdivide_steps=10,
     evaluate_every=200,
