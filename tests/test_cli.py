@@ -118,6 +118,17 @@ def test_truncated_mesh(sphere: Path) -> None:
     assert_one_line_error(etsplat("reconstruct", str(sphere), "--out", "run", cwd=sphere.parent), "sphere.ply")
 
 
+def test_repairs_of_the_input_are_told(tmp_path: Path) -> None:
+    """Polygons that were cut into triangles are mentioned, and the run goes on."""
+    corners = [(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)]
+    quads = ["1 2 4 3", "5 7 8 6", "1 5 6 2", "3 4 8 7", "1 3 7 5", "2 6 8 4"]
+    lines = [f"v {x} {y} {z}" for x, y, z in corners] + [f"f {quad}" for quad in quads]
+    (tmp_path / "cube.obj").write_text("\n".join(lines) + "\n")
+    result = etsplat("reconstruct", "cube.obj", "--out", "run", "--preset", "tiny", "--iterations", "5", cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert "source: 6 polygons were cut into 12 triangles" in result.stdout
+
+
 def test_folder_of_something_else_stays_untouched(sphere: Path, tmp_path: Path) -> None:
     """An output folder with other files is refused, also with --overwrite."""
     folder = tmp_path / "thesis"

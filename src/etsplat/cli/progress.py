@@ -13,7 +13,7 @@ from rich.progress import (
 )
 
 from etsplat.optim.loop import DoneEvent, Event, StepEvent
-from etsplat.tasks.reconstruct import PrepareEvent
+from etsplat.tasks.reconstruct import NoteEvent, PrepareEvent
 
 LINES = 10
 """Without a terminal, so many lines tell of the optimization."""
@@ -53,10 +53,12 @@ class RunProgress:
             self._progress.remove_task(self._task)
         self._progress.stop()
 
-    def __call__(self, event: Event | PrepareEvent) -> None:
+    def __call__(self, event: Event | PrepareEvent | NoteEvent) -> None:
         """Take in an event of the run."""
         if isinstance(event, PrepareEvent):
             self._show("Taking pictures", event.done, event.total)
+        elif isinstance(event, NoteEvent):
+            self._console.print(f"  {event.text}", highlight=False, markup=False, soft_wrap=True)
         elif isinstance(event, StepEvent):
             self._step(event)
         elif isinstance(event, DoneEvent):

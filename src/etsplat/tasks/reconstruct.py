@@ -37,6 +37,17 @@ class PrepareEvent:
 
 
 @dataclass(frozen=True)
+class NoteEvent:
+    """Something about the input that its owner should know, such as a repair made while reading it.
+
+    Attributes:
+        text: a sentence.
+    """
+
+    text: str
+
+
+@dataclass(frozen=True)
 class ReconstructResult:
     """What a run gives back; all of it is in the run directory too.
 
@@ -51,7 +62,7 @@ class ReconstructResult:
     metrics: dict[str, Any]
 
 
-Callback = Callable[[Event | PrepareEvent], None]
+Callback = Callable[[Event | PrepareEvent | NoteEvent], None]
 
 
 def reconstruct(
@@ -98,10 +109,13 @@ def reconstruct(
     if resume:
         RunDirectory.resume(out, record)
 
-    def announce(event: Event | PrepareEvent) -> None:
+    def announce(event: Event | PrepareEvent | NoteEvent) -> None:
         for callback in callbacks:
             callback(event)
 
+    for name, mesh in (("source", loaded), ("init_mesh", start)):
+        for note in mesh.notes if isinstance(mesh, MeshFile) else ():
+            announce(NoteEvent(f"{name}: {note}"))
     subject = make_subject(loaded, config, lambda done, total: announce(PrepareEvent(done, total)))
     scorer = Scorer(subject, config)
     fitting = MeshFitting(make_start(start, subject.views, config), subject.views, config, scorer.cheap)
