@@ -26,7 +26,8 @@ class Timings:
     forward: list[float] = field(default_factory=list)
     backward: list[float] = field(default_factory=list)
     stages: dict[str, list[float]] = field(default_factory=lambda: {name: [] for name in STAGES})
-    parallel: list[float] = field(default_factory=list)  # inside parallel_for
+    parallel: list[float] = field(default_factory=list)  # inside parallel_for, in the stages
+    all_parallel: list[float] = field(default_factory=list)  # ... in all of the call
 
     @property
     def total(self) -> list[float]:
@@ -38,6 +39,7 @@ def repetition(scene: Scene, timings: Timings) -> None:
     """A training step's rendering, from tensors to gradients."""
     for leaf in scene.leaves:
         leaf.grad = None
+    before = _native.parallel_seconds()
     start = time.perf_counter()
     out = scene.render()
     middle = time.perf_counter()
@@ -45,6 +47,7 @@ def repetition(scene: Scene, timings: Timings) -> None:
     end = time.perf_counter()
     timings.forward.append(1e3 * (middle - start))
     timings.backward.append(1e3 * (end - middle))
+    timings.all_parallel.append(1e3 * (_native.parallel_seconds() - before))
     seconds = native_state(out).stage_seconds
     for name in STAGES:
         timings.stages[name].append(1e3 * seconds[name][0])
@@ -102,6 +105,7 @@ def measure(
         ours.forward += turn.forward
         ours.backward += turn.backward
         ours.parallel += turn.parallel
+        ours.all_parallel += turn.all_parallel
         for name in STAGES:
             ours.stages[name] += turn.stages[name]
     entry: dict[str, Any] = {
@@ -145,11 +149,12 @@ def derive(entry: dict[str, Any], timings: Timings, counts: dict[str, int], work
     native = [sum(values) for values in zip(*timings.stages.values(), strict=True)]
     entry["counts"] = counts
     entry["kernel_nanoseconds"] = {"value": kernel.value, "gradient": kernel.gradient}
+    entry["outside_stages"] = statistics.median(t - n for n, t in zip(native, timings.total, strict=True))
     entry["serial"] = {
-        "native": statistics.median(
+        "stages": statistics.median(
             (n - p) / t for n, p, t in zip(native, timings.parallel, timings.total, strict=True)
         ),
-        "python": statistics.median((t - n) / t for n, t in zip(native, timings.total, strict=True)),
+        "all": statistics.median((t - p) / t for p, t in zip(timings.all_parallel, timings.total, strict=True)),
     }
     useful = max(1, counts["useful"])
     entry["nanoseconds_per_useful_pair"] = 1e6 * entry["milliseconds"]["median"] / useful

@@ -30,19 +30,28 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--threads", type=int, nargs="+", default=sorted({1, machine.cores()}), help="default: 1, all")
     parser.add_argument("--repeats", type=int, default=5, help="turns of three repetitions")
     parser.add_argument("--scene", nargs="+", default=list(scenes.NAMES), help="sphere<level>, soup<triangles>")
-    parser.add_argument("--instruction-set", choices=[*sets, "all"], default=sets[0])
+    parser.add_argument(
+        "--instruction-set", choices=[*sets, "all"], help="default: the widest, and the others on sphere6 alone"
+    )
     parser.add_argument("--no-prototype", action="store_true", help="measure the engine alone")
     parser.add_argument("--no-memory", action="store_true", help="leave out the growth of a fresh process")
     parser.add_argument("--json", type=Path, help="default: benchmarks/results/rasterizer_<date>_<commit>.json")
     return parser.parse_args(arguments)
 
 
+def plan(options: argparse.Namespace) -> list[tuple[str, list[str]]]:
+    """Instruction sets, and the scenes to measure on each."""
+    widest, *others = _native.available_instruction_sets()
+    if options.instruction_set is None:
+        return [(widest, options.scene), *((name, [s for s in options.scene if s == "sphere6"]) for name in others)]
+    chosen = [widest, *others] if options.instruction_set == "all" else [options.instruction_set]
+    return [(name, options.scene) for name in chosen]
+
+
 def run(options: argparse.Namespace, prototype: Prototype, console: Console) -> list[dict[str, Any]]:
-    sets = _native.available_instruction_sets()
-    chosen = sets if options.instruction_set == "all" else [options.instruction_set]
     entries = []
-    for instruction_set in chosen:
-        for name in options.scene:
+    for instruction_set, names in plan(options):
+        for name in names:
             scene = scenes.load(name)
             for threads in options.threads:
                 use(threads, instruction_set)

@@ -71,13 +71,13 @@ def stages(entries: list[dict[str, Any]]) -> Table:
             [
                 *label(e),
                 *(f"{e['stages'][name]['median']:.2f}" for name in e["stages"]),
-                f"{e['serial']['python'] * e['milliseconds']['median']:.2f}",
-                f"{100 * e['serial']['native']:.1f} %",
-                f"{100 * (e['serial']['native'] + e['serial']['python']):.1f} %",
+                f"{e['outside_stages']:.2f}",
+                f"{100 * e['serial']['stages']:.1f} %",
+                f"{100 * e['serial']['all']:.1f} %",
             ]
         )
     columns = ["scene", "instructions", "threads", *(entries[0]["stages"] if entries else [])]
-    columns += ["Python, torch", "serial, native", "serial, all"]
+    columns += ["around them", "serial in stages", "serial in all"]
     return Table("Milliseconds of each stage, and the serial part of the whole time", columns, rows)
 
 

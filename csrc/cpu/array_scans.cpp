@@ -11,6 +11,7 @@ namespace etsplat {
 namespace {
 
 constexpr int64_t kChunk = int64_t{1} << 15;
+constexpr int32_t kInfinity = 0x7f800000;  // its bits; the exponent's bits of any float that is not finite
 
 template <class Part, class F>
 std::vector<Part> chunkwise(int64_t count, F&& scan) {
@@ -22,22 +23,25 @@ std::vector<Part> chunkwise(int64_t count, F&& scan) {
     return parts;
 }
 
+// Bits of a float to an integer of the same order, and back.
+int32_t in_order(int32_t bits) { return bits ^ ((bits >> 31) & 0x7fffffff); }
+
 }  // namespace
 
 FloatScan scan_floats(const float* values, int64_t count) {
-    constexpr float kInfinity = std::numeric_limits<float>::infinity();
     const auto parts = chunkwise<FloatScan>(count, [values](int64_t begin, int64_t end) {
-        int32_t nonfinite = 0;
-        float minimum = kInfinity;
+        // On integers in the order of the floats, which the compiler may reorder and so vectorise
+        int32_t nonfinite = 0, lowest = kInfinity;
         for (int64_t i = begin; i < end; ++i) {
-            const bool finite = (std::bit_cast<uint32_t>(values[i]) & 0x7f800000u) != 0x7f800000u;
+            const int32_t bits = std::bit_cast<int32_t>(values[i]);
+            const bool finite = (bits & kInfinity) != kInfinity;
+            const int32_t ordered = finite ? in_order(bits) : kInfinity;
             nonfinite += finite ? 0 : 1;
-            const float value = finite ? values[i] : kInfinity;
-            minimum = value < minimum ? value : minimum;
+            lowest = ordered < lowest ? ordered : lowest;
         }
-        return FloatScan{nonfinite, minimum};
+        return FloatScan{nonfinite, std::bit_cast<float>(in_order(lowest))};
     });
-    FloatScan total{0, kInfinity};
+    FloatScan total{0, std::numeric_limits<float>::infinity()};
     for (const FloatScan& part : parts) {
         total.nonfinite += part.nonfinite;
         total.minimum = std::min(total.minimum, part.minimum);

@@ -98,9 +98,7 @@ def _is_plain(tensor: Tensor) -> bool:
 
 def check_intrinsics(name: str, Ks: Tensor) -> None:
     """Raise ValueError unless every matrix of ``Ks`` (B, 3, 3) is a pinhole camera without skew."""
-    pinhole = torch.diag_embed(Ks.diagonal(dim1=-2, dim2=-1))
-    pinhole[:, :2, 2] = Ks[:, :2, 2]
-    if not bool((Ks == pinhole).all() and (Ks[:, 2, 2] == 1).all()):
+    if any((k[0][1], k[1][0], *k[2]) != (0, 0, 0, 0, 1) for k in Ks.tolist()):
         raise ValueError(f"{name} must have the form [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]; skew is not supported")
 
 
