@@ -132,7 +132,7 @@ def test_page_says_what_the_run_says(run_dir: Path) -> None:
         "about 0.0510",
         "98.7",
         "3 self-intersecting faces",
-        "no weights: give --lpips-weights",
+        "Not measured: no weights: give --lpips-weights",
     ):
         assert text in page
     assert "bunny &lt;&amp;&gt; co" in page

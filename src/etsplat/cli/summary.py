@@ -28,8 +28,8 @@ def print_summary(console: Console, run_dir: Path) -> None:
             console.print(half_blocks(image, min(PICTURE_COLUMNS, console.width)))
     metrics = Table(box=None, show_header=False, pad_edge=False)
     for metric in describe(run.metrics):
-        value = "-" if metric.value is None else metric.value
-        metrics.add_row(metric.title, Text(value, justify="right"), Text(metric.unit))
+        unit = metric.unit if metric.value is not None else "not measured; report.html says why"
+        metrics.add_row(metric.title, Text(metric.value or "-", justify="right"), Text(unit))
     console.print(metrics)
     console.print()
     for name, meaning in _FILES:

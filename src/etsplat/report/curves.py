@@ -15,18 +15,19 @@ LEFT, RIGHT, TOP, BOTTOM = 46, 12, 10, 24
 
 @dataclass(frozen=True)
 class Quantity:
-    """A history key, its title, whether its axis is logarithmic, and the metric that is its lower bound, if any."""
+    """A history key, its title, whether its axis is logarithmic, the metric that is its lower bound, and its scale."""
 
     key: str
     title: str
     logarithmic: bool
     floor_key: str | None = None
+    scale: float = 1.0
 
 
 QUANTITIES = (
     Quantity("loss", "Training loss", True),
     Quantity("psnr", "PSNR of test views, dB", False),
-    Quantity("chamfer", "Chamfer distance", True, floor_key="chamfer_floor"),
+    Quantity("chamfer", "Chamfer distance × 10⁻³", True, floor_key="chamfer_floor", scale=1000.0),
     Quantity("sigma", "Softness σ", True),
     Quantity("faces", "Faces", False),
 )
@@ -56,7 +57,8 @@ def curves_of(run: Run) -> list[Curve]:
         x, y = run.series(quantity.key)
         if len(x) >= 2:
             floor = run.metrics.get(quantity.floor_key) if quantity.floor_key else None
-            curves.append(Curve(quantity, *_thin(x, y), floor=floor))
+            thinned = _thin(x, [quantity.scale * value for value in y])
+            curves.append(Curve(quantity, *thinned, floor=quantity.scale * floor if floor else None))
     return curves
 
 

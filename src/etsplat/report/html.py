@@ -90,7 +90,7 @@ def _metrics_section(cards: list[Metric]) -> str:
 
 def _card(metric: Metric) -> str:
     if metric.value is None:
-        value = f'<div class="value missing">{escape(metric.unit)}</div>'
+        value = '<div class="value missing">not measured</div>'
     else:
         value = f'<div class="value">{escape(metric.value)} <small>{escape(metric.unit)}</small></div>'
     return f'<div class="card metric"><h3>{escape(metric.title)}</h3>{value}<p>{escape(metric.meaning)}</p></div>'
@@ -200,7 +200,7 @@ def _config_section(run: Run) -> str:
 def _flatten(value: Any, prefix: str = "") -> list[tuple[str, str]]:
     if isinstance(value, dict):
         return [row for key, item in value.items() for row in _flatten(item, f"{prefix}.{key}" if prefix else str(key))]
-    return [(prefix, json.dumps(value, ensure_ascii=False))]
+    return [(prefix, value if isinstance(value, str) else json.dumps(value))]
 
 
 def _base64(content: bytes) -> str:

@@ -7,7 +7,7 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Metric:
-    """One card of the report: title, formatted value, unit, and what it means. `value` None: `unit` says why not."""
+    """One card of the report: title, formatted value (None if not measured), unit, and what it means."""
 
     title: str
     value: str | None
@@ -25,7 +25,7 @@ def describe(metrics: dict[str, Any]) -> list[Metric]:
         _number(metrics, "f_score", "F-score at 0.005", "%", _percent, _F_SCORE, no_mesh),
         _number(metrics, "chamfer_exact", "Exact Chamfer", "× 10⁻³", _thousandths, _EXACT, no_mesh),
         _number(metrics, "ssim", "SSIM", "", _fixed(4), _SSIM, "no test views"),
-        _number(metrics, "lpips", "LPIPS", "", _fixed(4), _LPIPS, metrics.get("lpips_reason") or "not measured"),
+        _number(metrics, "lpips", "LPIPS", "", _fixed(4), _LPIPS, metrics.get("lpips_reason") or "no weights"),
         Metric("Mesh", f"{metrics['faces']:,}", "faces", _mesh_meaning(metrics)),
         Metric("Time", *_duration(metrics["seconds"]), _time_meaning(metrics)),
     ]
@@ -95,7 +95,9 @@ def _number(
     absent: str,
 ) -> Metric:
     value = metrics.get(key)
-    return Metric(title, None, absent, meaning) if value is None else Metric(title, show(value), unit, meaning)
+    if value is None:
+        return Metric(title, None, "", f"{meaning} Not measured: {absent}.")
+    return Metric(title, show(value), unit, meaning)
 
 
 def _fixed(digits: int) -> Callable[[float], str]:

@@ -38,7 +38,7 @@ void main() {
         vec3 line = smoothstep(vec3(0.0), 1.1 * width, corner);
         // Where triangles are smaller than a few pixels the lines would fill them: fade out.
         float density = max(width.x, max(width.y, width.z));
-        float ink = (1.0 - min(line.x, min(line.y, line.z))) * 0.75 * (1.0 - smoothstep(0.25, 0.9, density));
+        float ink = (1.0 - min(line.x, min(line.y, line.z))) * 0.6 * (1.0 - smoothstep(0.25, 0.9, density));
         surface = mix(surface, inkColor, ink);
     }
     pixel = vec4(surface, 1.0);
