@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from benchmarks.machine import cores
-from benchmarks.memory import resident_growth
+from benchmarks.memory import memory
 from benchmarks.prototype import Prototype
 from benchmarks.scenes import Scene
 from etsplat import _native
@@ -60,19 +60,15 @@ def native_state(out: Any) -> Any:
 
 
 def count(scene: Scene) -> dict[str, int]:
-    """Work of one render, and the bytes that it holds besides its inputs."""
-    out = scene.render()
-    state = native_state(out)
+    """Work of one render."""
+    state = native_state(scene.render())
     counts = _native.count_tiles(state)
-    out.color.backward(scene.cotangent)
-    held = [out.color, out.alpha] + [leaf.grad for leaf in scene.leaves]
     return {
         "pairs": state.num_pairs,
         "pairs_seen": counts.pairs,
         "forward_vectors": counts.forward_vectors,
         "backward_vectors": counts.backward_vectors,
         "useful": counts.drawn,
-        "bytes": state.bytes + sum(t.numel() * t.element_size() for t in held if t is not None),
     }
 
 
@@ -86,7 +82,7 @@ def check_same_picture(scene: Scene, prototype: Prototype) -> float:
 
 
 def measure(
-    scene: Scene, threads: int, instruction_set: str, repeats: int, prototype: Prototype, memory: bool
+    scene: Scene, threads: int, instruction_set: str, repeats: int, prototype: Prototype, with_memory: bool
 ) -> dict[str, Any]:
     """One entry of the JSON file."""
     level = int(scene.name[6:]) if scene.name.startswith("sphere") else None
@@ -125,8 +121,8 @@ def measure(
         entry["ratio"] = {"median": ratio, "low": min(ratios), "high": max(ratios)}
         entry["picture_difference"] = check_same_picture(scene, prototype)
     derive(entry, ours, count(scene), min(threads, cores()))
-    if memory:
-        entry["resident_growth_mib"] = resident_growth(scene.name, threads, instruction_set)
+    if with_memory:
+        entry["memory"] = memory(scene.name, threads, instruction_set)
     return entry
 
 

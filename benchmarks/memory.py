@@ -1,42 +1,18 @@
-"""Growth of a fresh process's resident memory over one forward and backward pass.
-
-A process of its own, because the engine keeps the memory of earlier renders. Linux only: elsewhere there is no peak
-that can be reset.
-"""
+"""Memory of a forward and a backward pass, in a fresh process: the engine recycles that of earlier renders."""
 
 import multiprocessing
+from multiprocessing.queues import SimpleQueue
 from pathlib import Path
 
 from benchmarks import scenes
-from etsplat.ops.engines import set_num_threads
+from etsplat import _native
 
 STATUS = Path("/proc/self/status")
-RESET = Path("/proc/self/clear_refs")
+RESET = Path("/proc/self/clear_refs")  # Linux; elsewhere there is no peak that can be reset
 
 
-def _kilobytes(field: str) -> int:
-    line = next(line for line in STATUS.read_text(encoding="utf-8").splitlines() if line.startswith(field))
-    return int(line.split()[1])
-
-
-def _measure(name: str, threads: int, instruction_set: str, answer: "multiprocessing.SimpleQueue[float]") -> None:
-    from etsplat import _native
-
-    set_num_threads(threads)
-    _native.set_instruction_set(instruction_set)
-    small = scenes.load("soup10")  # loads libraries, starts threads
-    small.render().color[:, :8].sum().backward()
-    scene = scenes.load(name)
-    RESET.write_text("5", encoding="utf-8")
-    before = _kilobytes("VmRSS")
-    scene.render().color.backward(scene.cotangent)
-    answer.put((_kilobytes("VmHWM") - before) / 1024)
-
-
-def resident_growth(name: str, threads: int, instruction_set: str) -> float | None:
-    """MiB, or None where it cannot be measured."""
-    if not RESET.exists():
-        return None
+def memory(name: str, threads: int, instruction_set: str) -> dict[str, float | None]:
+    """MiB that a render holds besides its inputs, and by which the process grew at its peak (None: cannot tell)."""
     context = multiprocessing.get_context("spawn")
     answer = context.SimpleQueue()
     process = context.Process(target=_measure, args=(name, threads, instruction_set, answer))
@@ -44,4 +20,33 @@ def resident_growth(name: str, threads: int, instruction_set: str) -> float | No
     process.join()
     if process.exitcode != 0:
         raise RuntimeError(f"measuring the memory of {name} failed")
-    return answer.get()
+    held, grown = answer.get()
+    return {"held_mib": held, "grown_mib": grown}
+
+
+def _measure(name: str, threads: int, instruction_set: str, answer: "SimpleQueue[tuple[float, float | None]]") -> None:
+    _native.set_num_threads(threads)
+    _native.set_instruction_set(instruction_set)
+    small = scenes.load("soup10")  # loads libraries, starts threads
+    small.render().color[:, :8].sum().backward()
+    scene = scenes.load(name)
+    before = _reset_peak()
+    out = scene.render()
+    state = out.color.grad_fn.states[0]  # pyright: ignore[reportOptionalMemberAccess]
+    out.color.backward(scene.cotangent)
+    grown = None if before is None else (_kibibytes("VmHWM") - before) / 1024
+    outputs = [out.color, out.alpha, *(leaf.grad for leaf in scene.leaves)]
+    held = state.bytes + sum(t.numel() * t.element_size() for t in outputs if t is not None)
+    answer.put((held / 2**20, grown))
+
+
+def _reset_peak() -> int | None:
+    if not RESET.exists():
+        return None
+    RESET.write_text("5", encoding="utf-8")
+    return _kibibytes("VmRSS")
+
+
+def _kibibytes(field: str) -> int:
+    line = next(line for line in STATUS.read_text(encoding="utf-8").splitlines() if line.startswith(field))
+    return int(line.split()[1])

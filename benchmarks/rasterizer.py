@@ -55,8 +55,8 @@ def run(options: argparse.Namespace, prototype: Prototype, console: Console) -> 
             scene = scenes.load(name)
             for threads in options.threads:
                 use(threads, instruction_set)
-                memory = not options.no_memory and threads == max(options.threads)
-                entry = measure(scene, threads, instruction_set, options.repeats, prototype, memory)
+                with_memory = not options.no_memory and threads == max(options.threads)
+                entry = measure(scene, threads, instruction_set, options.repeats, prototype, with_memory)
                 entries.append(entry)
                 ratio = f", {entry['ratio']['median']:.2f} of the prototype" if "ratio" in entry else ""
                 ms = entry["milliseconds"]["median"]

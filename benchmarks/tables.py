@@ -85,7 +85,7 @@ def work(entries: list[dict[str, Any]]) -> Table:
     rows = []
     for e in entries:
         use, share, kernel = e["lane_utilisation"], e["kernel_share"], e["kernel_nanoseconds"]
-        growth = e.get("resident_growth_mib")
+        memory = e.get("memory", {})
         rows.append(
             [
                 *label(e),
@@ -94,8 +94,7 @@ def work(entries: list[dict[str, Any]]) -> Table:
                 f"{100 * use['forward']:.0f} / {100 * use['backward']:.0f} %",
                 f"{kernel['value']:.1f} / {kernel['gradient']:.1f}",
                 f"{100 * share['forward']:.0f} / {100 * share['backward']:.0f} %",
-                f"{e['counts']['bytes'] / 2**20:.0f}",
-                "" if growth is None else f"{growth:.0f}",
+                *(f"{memory[key]:.0f}" if memory.get(key) else "" for key in ("held_mib", "grown_mib")),
             ]
         )
     columns = ["scene", "instructions", "threads", "10^6 useful pairs", "ns per useful pair", "lanes used"]
