@@ -4,6 +4,7 @@ import hashlib
 import json
 import platform
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -14,7 +15,7 @@ import torch
 from etsplat.core.errors import InputError
 from etsplat.io.mesh_files import MeshFile, save_mesh
 from etsplat.io.run_directory import RunDirectory, is_run
-from etsplat.ops.engines import num_threads, resolve_engine
+from etsplat.ops.engines import num_threads, one_torch_thread, resolve_engine
 from etsplat.optim.checkpoints import load_latest_checkpoint, save_checkpoint
 from etsplat.optim.loop import Event, LoopSettings, Progress, StepEvent, optimize
 from etsplat.tasks.mesh_fitting import MeshFitting
@@ -120,7 +121,9 @@ def reconstruct(
     scorer = Scorer(subject, config)
     fitting = MeshFitting(make_start(start, subject.views, config), subject.views, config, scorer.cheap)
     run = RunDirectory.resume(out, record) if resume else RunDirectory.create(out, record, overwrite=overwrite)
-    progress = _fit(fitting, run, config, _hash(record), announce)
+    native = resolve_engine(config.engine, fitting.mesh.vertices) == "cpu"
+    with one_torch_thread() if native else nullcontext():
+        progress = _fit(fitting, run, config, _hash(record), announce)
     return _finish(fitting, progress, run, scorer, subject.views.normalization.invert, config)
 
 
