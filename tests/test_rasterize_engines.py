@@ -5,7 +5,8 @@ import torch
 
 from _scenes import EVERYTHING, IMAGES, gradients, mesh, soup
 from _tolerances import assert_close_to_scale
-from etsplat import _native, num_threads, set_num_threads
+from etsplat import _native, num_threads, rasterize, set_num_threads
+from etsplat.geometry.icosphere import icosphere
 
 # Rounding, and pixels that float32 decides differently at alpha = 1/255, at x = 2 or between almost equal depths.
 IMAGE_TOLERANCE = {"tolerance": 2e-5, "outliers": 2e-3, "outlier_tolerance": 2e-2}
@@ -152,6 +153,29 @@ def test_images_and_gradients_do_not_depend_on_the_number_of_threads(kernel, rng
     for out, grads in results[1:]:
         assert all(torch.equal(getattr(out, name), getattr(first, name)) for name in IMAGES)
         assert all(torch.equal(grads[name], first_grads[name]) for name in grads)
+
+
+def test_chunks_of_triangles_do_not_depend_on_the_number_of_threads():
+    """To the bit, with enough triangles for several chunks of projection, sorting and reduction."""
+    vertices, faces = icosphere(5)
+    viewmat = torch.eye(4)
+    viewmat[2, 3] = 3.0
+    K = torch.tensor([[200.0, 0.0, 70.0], [0.0, 200.0, 60.0], [0.0, 0.0, 1.0]])
+    before = num_threads()
+    results = []
+    try:
+        for threads in (1, 3, 4):
+            set_num_threads(threads)
+            leaves = [vertices, torch.rand(len(faces), 3, generator=torch.Generator().manual_seed(0)), viewmat[None]]
+            leaves = [leaf.clone().requires_grad_() for leaf in leaves]
+            opacities, sigma = torch.full((len(faces),), 0.7), torch.tensor(0.5, requires_grad=True)
+            out = rasterize(leaves[0], leaves[1], opacities, sigma, leaves[2], K[None], 130, 120, faces=faces)
+            grads = torch.autograd.grad(out.color.square().sum(), [*leaves, sigma])
+            results.append([out.color.detach(), *grads])
+    finally:
+        set_num_threads(before)
+    for result in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(result, results[0], strict=True))
 
 
 @pytest.mark.parametrize("instruction_set", _native.available_instruction_sets())

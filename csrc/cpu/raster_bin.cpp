@@ -9,6 +9,7 @@
 #include <utility>
 #include <vector>
 
+#include "prefetch.h"
 #include "raster.h"
 
 namespace etsplat {
@@ -134,27 +135,61 @@ void sort_by_depth(RasterState& state, const ChunkTotals& total) {
     }
 }
 
+// Calls body(tile, taken) for the tiles of a triangle: 1 for those it touches, 0 for the rest of its pattern. No branch
+// depends on the pattern, which no processor could predict.
+template <class F>
+void for_each_tile(const RasterState& state, const TileSpan span, int32_t slot, F&& body) {
+    const int32_t row = state.pass.tiles_x;
+    if (const uint32_t pattern = span.pattern(); pattern != 0) {
+        body(span.first, pattern & 1);
+        body(span.first + 1, pattern >> 1 & 1);
+        body(span.first + row, pattern >> 2 & 1);
+        body(span.first + row + 1, pattern >> 3);
+    } else {
+        for (uint32_t j = 0; j < span.count(); ++j) body(state.slot_tile[slot + static_cast<int32_t>(j)], 1u);
+    }
+}
+
+// In order of depth, triangles lie anywhere in memory.
+void prefetch_coming(const RasterState& state, int64_t r, int64_t end) {
+    const int32_t coming = state.order[std::min(r + 24, end - 1)];
+    prefetch(&state.spans[coming]);
+    prefetch(&state.slot_begin[coming]);
+}
+
 void sort_by_tile(RasterState& state, int64_t n) {
     const int tiles = state.pass.tiles_x * state.pass.tiles_y;
+    const int bins = tiles + state.pass.tiles_x + 1;  // a pattern may reach past the last tile, with nothing there
     const Chunks chunks{n, chunk_count(n)};
-    state.histogram.resize(int64_t{chunks.count} * tiles);
-    state.tile_begin.resize(tiles + 1);
-    state.entries.resize(state.num_slots);
+    state.histogram.resize(int64_t{chunks.count} * bins);
+    state.tile_begin.resize(bins + 1);
+    // behind the entries each chunk has a cache line for what is not taken
+    constexpr int64_t kLine = 16;
+    state.entries.resize(state.num_slots + kLine * (chunks.count + 1));
     for_chunks(chunks, [&](int c, int64_t begin, int64_t end) {
-        int32_t* counts = state.histogram.data() + int64_t{c} * tiles;
-        std::fill(counts, counts + tiles, 0);
+        int32_t* counts = state.histogram.data() + int64_t{c} * bins;
+        std::fill(counts, counts + bins, 0);
         for (int64_t r = begin; r < end; ++r) {
             const int32_t i = state.order[r];
-            for (int32_t slot = state.slot_begin[i]; slot < state.slot_begin[i + 1]; ++slot) ++counts[state.slot_tile[slot]];
+            prefetch_coming(state, r, end);
+            for_each_tile(state, state.spans[i], state.slot_begin[i],
+                          [&](int32_t tile, uint32_t taken) { counts[tile] += static_cast<int32_t>(taken); });
         }
     });
-    scan_counts(state.histogram.data(), chunks.count, tiles, state.tile_begin.data());
+    scan_counts(state.histogram.data(), chunks.count, bins, state.tile_begin.data());
     for_chunks(chunks, [&](int c, int64_t begin, int64_t end) {
-        int32_t* position = state.histogram.data() + int64_t{c} * tiles;
+        int32_t* position = state.histogram.data() + int64_t{c} * bins;
+        const int64_t nowhere = state.num_slots + kLine * (c + 1);
         for (int64_t r = begin; r < end; ++r) {
             const int32_t i = state.order[r];
-            for (int32_t slot = state.slot_begin[i]; slot < state.slot_begin[i + 1]; ++slot)
-                state.entries[position[state.slot_tile[slot]]++] = {i, slot};
+            prefetch_coming(state, r, end);
+            int32_t slot = state.slot_begin[i];
+            for_each_tile(state, state.spans[i], slot, [&](int32_t tile, uint32_t taken) {
+                const int64_t to = position[tile];
+                state.entries[nowhere ^ ((nowhere ^ to) & -int64_t{taken})] = {i, slot};
+                position[tile] += static_cast<int32_t>(taken);
+                slot += static_cast<int32_t>(taken);
+            });
         }
     });
 }

@@ -11,12 +11,15 @@ namespace etsplat {
 
 constexpr int64_t kTriangleChunk = 1024;
 
-// The tiles that the visible support of a triangle touches. Where two rows and two columns hold them, bit 2 r + c of
-// `pattern` tells of the tile r rows and c columns after tile `first`; else pattern is 0, and they are to be searched.
+// The tiles that the visible support of a triangle touches. Where two rows and two columns hold them, bit 2 r + c of the
+// pattern tells of the tile r rows and c columns after tile `first`; else the pattern is 0, and slot_tile lists them.
 struct TileSpan {
     int32_t first;
-    uint32_t pattern : 4;
-    uint32_t count : 28;
+    uint32_t tiles;
+
+    static constexpr uint32_t kCountUnit = 16;
+    uint32_t pattern() const { return tiles % kCountUnit; }
+    uint32_t count() const { return tiles / kCountUnit; }
 };
 
 struct ChunkTotals {
@@ -51,7 +54,7 @@ struct TrianglePass {
 
     // numbering
     int32_t* slot_begin = nullptr;
-    int32_t* slot_tile = nullptr;
+    int32_t* slot_tile = nullptr;     // of triangles without a pattern
     int32_t* order = nullptr;         // triangles with any tile, in order
     uint32_t* ordered_keys = nullptr;
 

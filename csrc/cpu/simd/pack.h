@@ -5,6 +5,7 @@
 // wide instruction set can be linked into a narrow one. For the same reason these headers use no std:: templates.
 #pragma once
 
+#include "cpu/prefetch.h"
 #include "math/portable.h"
 
 #define ETSPLAT_STRING_(x) #x
@@ -216,14 +217,6 @@ ETSPLAT_FN void interleave3(const Vec in[3], float* out) {
         for (int i = 0; i < kLanes; ++i)
             for (int c = 0; c < 3; ++c) out[3 * i + c] = planes[c][i];
     }
-}
-
-ETSPLAT_FN void prefetch(const void* p) {
-#if defined(_MSC_VER) && !defined(__clang__)
-    (void)p;
-#else
-    __builtin_prefetch(p);
-#endif
 }
 
 }  // namespace etsplat::ETSPLAT_SIMD

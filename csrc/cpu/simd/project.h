@@ -12,15 +12,14 @@ namespace etsplat::ETSPLAT_SIMD {
 
 // Lanes whose `size` consecutive values are all finite.
 ETSPLAT_FN unsigned finite_rows(const float* values, int size, const LaneRange& range) {
-    if (size == 0) return range.bits();
     const float* first = values + range.first * size;
     const int total = size * range.count;
-    Vec sum(0.0f);  // Inf and NaN survive a sum of (value - value)
+    Vec differences(0.0f);  // value - value: NaN for Inf and NaN
     int j = 0;
-    for (; j + kLanes <= total; j += kLanes) sum = sum + (Vec::load(first + j) - Vec::load(first + j));
+    for (; j + kLanes <= total; j += kLanes) differences = differences + (Vec::load(first + j) - Vec::load(first + j));
     float rest = 0.0f;
     for (; j < total; ++j) rest += first[j] - first[j];
-    if (lane_sum(sum) + rest == 0.0f) return range.bits();
+    if ((differences <= Vec(0.0f)).bits() == 0xffffu && rest == 0.0f) return range.bits();
     unsigned bits = 0;
     for (int i = 0; i < range.count; ++i) {
         float row = 0.0f;
@@ -56,7 +55,8 @@ struct Projected {
         depth = centroid_depth(view);
         const unsigned rows = finite_rows(pass.flat_colors, pass.flat_channels, range) &
                               finite_rows(pass.corner_colors, 3 * pass.corner_channels, range);
-        visible = visible & (depth > Vec(0.0f)) & meets_image(box, forms.qx, forms.qy, pass.width, pass.height) & VecMask::from_bits(rows);
+        visible = visible & VecMask::from_bits(rows) & (depth > Vec(0.0f)) &
+                  meets_image(box, forms.qx, forms.qy, pass.width, pass.height);
     }
 };
 
@@ -90,9 +90,9 @@ ETSPLAT_FN void write_records(const TrianglePass& triangles, const LaneRange& ra
     store_rows(attributes, range, triangles.attributes + range.first);
 }
 
-ETSPLAT_FN uint32_t tile_count(const RasterPass& pass, const TriangleRecord& record) {
-    uint32_t count = 0;
-    for_each_patch(pass, record, [&](int, int, unsigned bits) { for_each_bit(bits, [&](int) { ++count; }); });
+ETSPLAT_FN int32_t tile_count(const RasterPass& pass, const TriangleRecord& record) {
+    int32_t count = 0;
+    search_tiles(pass, record, [&](const int32_t*, unsigned bits) { for_each_bit(bits, [&](int) { ++count; }); });
     return count;
 }
 
@@ -106,44 +106,50 @@ ETSPLAT_FN void write_spans(const RasterPass& pass, const TrianglePass& triangle
     const VecMask many = seen & ((tiles.right > right) | (tiles.bottom > below));
     const VecMask touched[4] = {seen & test.touches(tiles.left, tiles.top), wide & test.touches(right, tiles.top),
                                 high & test.touches(tiles.left, below), wide & high & test.touches(right, below)};
-    Vec pattern(0.0f), count(0.0f);
-    for (int i = 0; i < 4; ++i) {
-        pattern = pattern + keep(touched[i], Vec(static_cast<float>(1 << i)));
-        count = count + keep(touched[i], one);
-    }
-    float lanes[4][kLanes];
+    Vec word(0.0f);
+    for (int i = 0; i < 4; ++i)
+        word = word + keep(touched[i], Vec(static_cast<float>((1 << i) + static_cast<int>(TileSpan::kCountUnit))));
+    float lanes[3][kLanes];
     keep(seen, tiles.left).store(lanes[0]);
     keep(seen, tiles.top).store(lanes[1]);
-    pattern.store(lanes[2]);
-    count.store(lanes[3]);
+    word.store(lanes[2]);
+    int32_t first[kLanes], words[kLanes];
+    for (int i = 0; i < kLanes; ++i) {
+        first[i] = static_cast<int32_t>(lanes[1][i]) * pass.tiles_x + static_cast<int32_t>(lanes[0][i]);
+        words[i] = static_cast<int32_t>(lanes[2][i]);
+    }
+    for_each_bit(many.bits(), [&](int i) {
+        words[i] = tile_count(pass, triangles.records[range.first + i]) * static_cast<int32_t>(TileSpan::kCountUnit);
+    });
+    int32_t pairs = 0, some = 0;
+    for (int i = 0; i < kLanes; ++i) {
+        pairs += words[i] / static_cast<int32_t>(TileSpan::kCountUnit);
+        some += words[i] != 0 ? 1 : 0;
+    }
+    totals.pairs += pairs;
+    totals.triangles += some;
     TileSpan spans[kLanes];
-    for (int i = 0; i < kLanes; ++i) {
-        spans[i].first = static_cast<int32_t>(lanes[1][i]) * pass.tiles_x + static_cast<int32_t>(lanes[0][i]);
-        spans[i].pattern = static_cast<uint32_t>(static_cast<int32_t>(lanes[2][i])) & 15u;
-        spans[i].count = static_cast<uint32_t>(static_cast<int32_t>(lanes[3][i])) & 15u;
-    }
-    const unsigned searched = many.bits();
-    if (searched != 0)
-        for (int i = 0; i < range.count; ++i)
-            if (searched >> i & 1) {
-                spans[i].pattern = 0;
-                spans[i].count = tile_count(pass, triangles.records[range.first + i]) & 0xfffffffu;
-            }
-    for (int i = 0; i < kLanes; ++i) {
-        totals.pairs += spans[i].count;
-        totals.triangles += spans[i].count != 0 ? 1 : 0;
-    }
+    for (int i = 0; i < kLanes; ++i) spans[i] = {first[i], static_cast<uint32_t>(words[i])};
     memcpy(triangles.spans + range.first, spans, sizeof(TileSpan) * static_cast<size_t>(range.count));
 }
 
+// Smallest and largest depth of visible triangles.
+struct DepthRange {
+    Vec low{3e38f}, high{0.0f};
+
+    ETSPLAT_FN void include(const Projected& p) {
+        low = vmin(low, vselect(p.visible, p.depth, low));
+        high = vmax(high, keep(p.visible, p.depth));
+    }
+    // Positive floats are ordered like their bits.
+    ETSPLAT_FN void store(ChunkTotals& totals) const {
+        totals.lowest_key = std::bit_cast<uint32_t>(0.0f - lane_max(Vec(0.0f) - low));
+        totals.highest_key = std::bit_cast<uint32_t>(lane_max(high));
+    }
+};
+
 // Keys of invisible triangles mean nothing.
-ETSPLAT_FN void write_keys(const TrianglePass& triangles, const LaneRange& range, const Projected& p, ChunkTotals& totals) {
-    // positive floats are ordered like their bits
-    const float low = 0.0f - lane_max(vselect(p.visible, Vec(0.0f) - p.depth, Vec(-3e38f)));
-    const float high = lane_max(keep(p.visible, p.depth));
-    const uint32_t lowest = std::bit_cast<uint32_t>(low), highest = std::bit_cast<uint32_t>(high);
-    totals.lowest_key = lowest < totals.lowest_key ? lowest : totals.lowest_key;
-    totals.highest_key = highest > totals.highest_key ? highest : totals.highest_key;
+ETSPLAT_FN void write_keys(const TrianglePass& triangles, const LaneRange& range, const Projected& p) {
     float lanes[kLanes];
     p.depth.store(lanes);
     memcpy(triangles.keys + range.first, lanes, sizeof(float) * static_cast<size_t>(range.count));
@@ -158,38 +164,38 @@ ETSPLAT_FN void write_statistics(const TrianglePass& triangles, const LaneRange&
 
 template <class Kernel>
 ChunkTotals project_chunk(const RasterPass& pass, const TrianglePass& triangles, int64_t begin, int64_t end) {
-    ChunkTotals totals{0, 0, ~0u, 0u};
+    ChunkTotals totals{};
+    DepthRange depths;
     for (int64_t i = begin; i < end; i += kLanes) {
         const LaneRange range(i, end);
         Projected p;
         p.project<Kernel>(pass, triangles, range);
         write_records<Kernel>(triangles, range, p);
         write_spans(pass, triangles, range, p, totals);
-        write_keys(triangles, range, p, totals);
+        write_keys(triangles, range, p);
+        depths.include(p);
         if (triangles.visible) write_statistics(triangles, range, p);
     }
+    depths.store(totals);
     return totals;
 }
 
 // Numbers the slots of a chunk from `slot` on and lists its triangles that touch any tile, from place `rank` on.
-inline void number_chunk(const RasterPass& pass, const TrianglePass& triangles, int64_t begin, int64_t end, int32_t slot,
-                         int32_t rank) {
-    const int32_t offsets[4] = {0, 1, pass.tiles_x, pass.tiles_x + 1};
+inline void number_chunk(const RasterPass& pass, const TrianglePass& triangles, int64_t begin, int64_t end,
+                         int32_t slot, int32_t rank) {
     for (int64_t i = begin; i < end; ++i) {
         const TileSpan span = triangles.spans[i];
         triangles.slot_begin[i] = slot;
-        if (span.count == 0) continue;
+        if (span.tiles == 0) continue;
         triangles.order[rank] = static_cast<int32_t>(i);
         triangles.ordered_keys[rank++] = triangles.keys[i];
-        if (span.pattern != 0) {
-            for (int b = 0; b < 4; ++b)
-                if (span.pattern >> b & 1) triangles.slot_tile[slot++] = span.first + offsets[b];
-        } else {
-            for_each_patch(pass, triangles.records[i], [&](int column, int row, unsigned bits) {
-                const int first = row * pass.tiles_x + column;
-                for_each_bit(bits, [&](int b) { triangles.slot_tile[slot++] = first + b / 4 * pass.tiles_x + b % 4; });
+        if (span.pattern() == 0) {
+            int32_t* tile = triangles.slot_tile + slot;
+            search_tiles(pass, triangles.records[i], [&](const int32_t* tiles, unsigned bits) {
+                for_each_bit(bits, [&](int b) { *tile++ = tiles[b]; });
             });
         }
+        slot += static_cast<int32_t>(span.count());
     }
 }
 

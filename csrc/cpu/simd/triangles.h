@@ -31,6 +31,8 @@ struct LaneRange {
     ETSPLAT_FN void add(float* values, Vec v) const { store(values, load(values) + v); }
 };
 
+alignas(64) constexpr float kLaneNumber[kLanes] = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
+
 // World positions of the corners, (3, 3).
 ETSPLAT_FN void load_corners(const TrianglePass& triangles, const LaneRange& range, Vec world[9]) {
     alignas(64) float lanes[9][kLanes];
@@ -45,12 +47,10 @@ ETSPLAT_FN void load_corners(const TrianglePass& triangles, const LaneRange& ran
     for (int j = 0; j < 9; ++j) world[j] = Vec::load(lanes[j]);
 }
 
-// Calls body(column, row, bits) for patches of 4x4 tiles that hold all tiles touched by a triangle: bit 4 r + c tells
-// whether it touches the tile r rows and c columns further.
+// Calls body(tiles, bits) for the tiles in the bounding box of a triangle's visible support, sixteen at a time: where a
+// bit is set, the triangle touches the tile of that place.
 template <class F>
-ETSPLAT_FN void for_each_patch(const RasterPass& pass, const TriangleRecord& record, F&& body) {
-    alignas(64) static constexpr float kColumns[16] = {0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3};
-    alignas(64) static constexpr float kRows[16] = {0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3};
+ETSPLAT_FN void search_tiles(const RasterPass& pass, const TriangleRecord& record, F&& body) {
     const SupportBox<float> box{record.left, record.right, record.top, record.bottom};
     const TileRange<float> range(box, record.qx, record.qy, pass.width, pass.height);
     if (!range.any) return;
@@ -60,12 +60,24 @@ ETSPLAT_FN void for_each_patch(const RasterPass& pass, const TriangleRecord& rec
         forms.gy[k] = Vec(record.gy[k]);
     }
     const TileTest<Vec> test(forms, Vec(record.extent));
-    for (float row = range.top; row <= range.bottom; row += 4.0f)
-        for (float column = range.left; column <= range.right; column += 4.0f) {
-            const Vec x = Vec::load(kColumns) + Vec(column), y = Vec::load(kRows) + Vec(row);
-            const VecMask touched = test.touches(x, y) & (x <= Vec(range.right)) & (y <= Vec(range.bottom));
-            body(static_cast<int>(column), static_cast<int>(row), touched.bits());
-        }
+    // row by row: the next sixteen are sixteen columns to the right, less whole rows
+    const float columns = range.right - range.left + 1.0f;
+    const Vec width(columns), per_width(1.0f / columns), left(range.left), bottom(range.bottom);
+    Vec column = Vec::load(kLaneNumber), row(range.top);
+    for (float done = 0.0f; done < columns * (range.bottom - range.top + 1.0f); done += static_cast<float>(kLanes)) {
+        const Vec whole = vfloor((column + Vec(0.5f)) * per_width);
+        column = column - whole * width;
+        row = row + whole;
+        const VecMask touched = test.touches(left + column, row) & (row <= bottom);
+        float lanes[2][kLanes];
+        (left + column).store(lanes[0]);
+        row.store(lanes[1]);
+        int32_t tiles[kLanes];
+        for (int i = 0; i < kLanes; ++i)
+            tiles[i] = static_cast<int32_t>(lanes[1][i]) * pass.tiles_x + static_cast<int32_t>(lanes[0][i]);
+        body(tiles, touched.bits());
+        column = column + Vec(static_cast<float>(kLanes));
+    }
 }
 
 }  // namespace etsplat::ETSPLAT_SIMD
