@@ -6,12 +6,16 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import pytest
 
-from etsplat.cli.main import resume_line
-from etsplat.cli.options import Demo, Reconstruct, parse
+from etsplat.cli.command import Command, resume_line
+from etsplat.cli.parse import COMMANDS, Group, parse
+from etsplat.cli.reconstruct import Demo, Reconstruct
 from etsplat.geometry.icosphere import icosphere
 from etsplat.io.mesh_files import save_mesh
 from etsplat.tasks.reconstruct_config import PRESETS
@@ -58,7 +62,7 @@ def test_help_of_a_command_teaches() -> None:
 
 def test_help_does_not_wait_for_torch() -> None:
     """Parsing options imports neither torch nor the native engine."""
-    program = "import sys; from etsplat.cli.options import parse; parse(['demo']); print('torch' in sys.modules)"
+    program = "import sys; from etsplat.cli.parse import parse; parse(['demo']); print('torch' in sys.modules)"
     result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert result.stdout == "False\n"
 
@@ -188,3 +192,28 @@ def test_resume_line_keeps_the_options() -> None:
     """The suggested command quotes what needs it, says --resume once, and never --overwrite."""
     line = resume_line(["demo", "--out", "my run", "--overwrite", "--resume"])
     assert line == "etsplat demo --out 'my run' --resume"
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Paint(Command):
+    """Paint."""
+
+    EXAMPLES: ClassVar[str] = "etsplat studio paint --color red"
+    color: str = "blue"
+    """Of the paint."""
+
+    @classmethod
+    def defaults(cls, arguments: Sequence[str]) -> "_Paint":
+        return cls()
+
+
+def test_groups_of_commands(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """A group's commands follow its name, with their own options and examples."""
+    monkeypatch.setitem(COMMANDS, "studio", Group("Art.", {"paint": _Paint}))
+    assert parse(["studio", "paint", "--color", "red"]) == _Paint(color="red")
+    with pytest.raises(SystemExit):
+        parse(["studio", "paint", "--help"])
+    assert "etsplat studio paint --color red" in capsys.readouterr().out
+    with pytest.raises(SystemExit):
+        parse(["studio", "--help"])
+    assert "paint" in capsys.readouterr().out

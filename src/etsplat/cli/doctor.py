@@ -1,87 +1,24 @@
-"""`etsplat doctor`: what this installation can do, and what is missing for what."""
+"""`etsplat doctor`."""
 
-import os
-import platform
-from importlib.metadata import version
+from collections.abc import Sequence
+from dataclasses import dataclass
 
-import torch
-from rich.console import Console
-from rich.table import Table
-from rich.text import Text
-
-from etsplat import _native
-from etsplat.core.cameras import intrinsics
-from etsplat.metrics.image import find_lpips_weights
-from etsplat.ops.engines import num_threads
-from etsplat.ops.rasterize import rasterize
-
-TOLERANCE = 1e-4
+from etsplat.cli.command import FAILED, Command
 
 
-def examine(console: Console) -> bool:
-    """Print the state of the installation; whether everything that must work does."""
-    difference = engine_difference()
-    sound = difference <= TOLERANCE
-    table = Table(box=None, show_header=False, pad_edge=False)
-    for name, value in _versions():
-        table.add_row(name, Text(value))
-    table.add_section()
-    table.add_row("engine", "cpu (native)")
-    table.add_row(
-        "instruction set", f"{_native.instruction_set()} of {', '.join(_native.available_instruction_sets())}"
-    )
-    table.add_row("threads", Text(_threads()))
-    verdict = f"agrees with the reference to {difference:.0e}" if sound else f"WRONG: differs by {difference:.0e}"
-    table.add_row("self-check", Text(verdict, style="" if sound else "bold red"))
-    table.add_section()
-    for name, value in _optional():
-        table.add_row(name, Text(value))
-    console.print(table)
-    if not sound:
-        console.print("The native engine computes wrong pictures here: reinstall etsplat, or use --engine reference.")
-    return sound
+@dataclass(frozen=True, kw_only=True)
+class Doctor(Command):
+    """Say what this installation can do: engine, instruction set, threads, versions, and what is missing for what."""
 
+    @classmethod
+    def defaults(cls, arguments: Sequence[str]) -> "Doctor":
+        """Nothing depends on the arguments."""
+        return cls()
 
-def engine_difference() -> float:
-    """Largest difference between the two engines' pictures of one soft triangle."""
-    vertices = torch.tensor([[[-0.8, -0.6, 2.0], [0.9, -0.4, 2.5], [0.1, 0.8, 3.0]]])
-    pictures = [
-        rasterize(
-            vertices,
-            torch.tensor([[0.9, 0.5, 0.2]]),
-            torch.tensor([0.8]),
-            torch.tensor(0.5),
-            torch.eye(4)[None],
-            intrinsics(60.0, 32, 32)[None],
-            32,
-            32,
-            engine=engine,
-        ).color
-        for engine in ("cpu", "reference")
-    ]
-    return float((pictures[0] - pictures[1]).abs().max())
+    def run(self, arguments: Sequence[str]) -> int:
+        """Prints the state of the installation; fails if what must work does not."""
+        from rich.console import Console
 
+        from etsplat.cli.examine import examine
 
-def _versions() -> list[tuple[str, str]]:
-    return [
-        ("etsplat", version("etsplat")),
-        ("python", f"{platform.python_version()} on {platform.system()} {platform.machine()}"),
-        ("torch", str(torch.__version__)),
-        ("numpy", version("numpy")),
-    ]
-
-
-def _threads() -> str:
-    variable = os.environ.get("ETSPLAT_NUM_THREADS")
-    origin = f"ETSPLAT_NUM_THREADS={variable}" if variable else "all usable cores; set ETSPLAT_NUM_THREADS to change"
-    return f"{num_threads()} ({origin})"
-
-
-def _optional() -> list[tuple[str, str]]:
-    weights = find_lpips_weights(None)
-    found = ", ".join(map(str, weights.paths)) or f"missing, so lpips in metrics.json is null: {weights.reason}"
-    return [
-        ("LPIPS weights", found),
-        ("compiler", "not needed: the native engine is compiled already"),
-        ("CUDA", "not in this release: tensors stay on the CPU"),
-    ]
+        return 0 if examine(Console()) else FAILED

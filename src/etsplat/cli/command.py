@@ -1,0 +1,62 @@
+"""What every command of the command line is: a dataclass whose fields are its options, with a method that runs it."""
+
+import shlex
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar, NoReturn, TypeVar
+
+FAILED, WRONG_INPUT, INTERRUPTED = 1, 2, 130
+
+
+@dataclass(frozen=True, kw_only=True)
+class Command:
+    """Base of the commands. The docstring of a subclass is its help, those of its fields are theirs.
+
+    A module that defines commands imports no torch at its top, so that `--help` is fast.
+    """
+
+    EXAMPLES: ClassVar[str] = ""
+    """Command lines, one each line, for the command's own help."""
+
+    debug: bool = False
+    """Show the traceback of an error."""
+
+    @classmethod
+    def defaults(cls, arguments: Sequence[str]) -> "Command":
+        """The command before its options are applied; where a preset is an option, `arguments` name it."""
+        raise NotImplementedError
+
+    def run(self, arguments: Sequence[str]) -> int:
+        """Does what the command is for; `arguments` are the command line. Returns the process's exit status.
+
+        Raises:
+            InputError: the input or an option cannot be used.
+        """
+        raise NotImplementedError
+
+
+Settings = TypeVar("Settings")
+
+
+def preset_of(arguments: Sequence[str], presets: dict[str, Settings], default: str) -> Settings:
+    """The settings of the preset that the arguments name: the defaults of all other options depend on it."""
+    name = default
+    for position, argument in enumerate(arguments):
+        if argument == "--preset":
+            name = "".join(arguments[position + 1 : position + 2])
+        elif argument.startswith("--preset="):
+            name = argument.removeprefix("--preset=")
+    return presets.get(name, presets[default])  # tyro refuses an unknown name
+
+
+def resume_line(arguments: Sequence[str]) -> str:
+    """The command line that continues an interrupted one."""
+    kept = [argument for argument in arguments if argument not in ("--overwrite", "--resume")]
+    return shlex.join(["etsplat", *kept, "--resume"])
+
+
+def fail(message: str, code: int) -> NoReturn:
+    """Ends the process with one line on standard error."""
+    print(f"etsplat: {' '.join(message.split())}", file=sys.stderr)
+    sys.exit(code)

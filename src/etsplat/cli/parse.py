@@ -1,0 +1,71 @@
+"""The list of commands, and which of them a command line asks for. Imports no torch, so that help is fast."""
+
+import inspect
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, make_dataclass
+from typing import Annotated, Any, Union
+
+import tyro
+
+from etsplat.cli.command import Command
+from etsplat.cli.doctor import Doctor
+from etsplat.cli.reconstruct import Demo, Reconstruct
+
+
+@dataclass(frozen=True)
+class Group:
+    """Commands under a common word, as in `etsplat data download`.
+
+    Attributes:
+        help: what they have in common.
+        commands: by name.
+    """
+
+    help: str
+    commands: dict[str, type[Command]]
+
+
+COMMANDS: dict[str, type[Command] | Group] = {"demo": Demo, "reconstruct": Reconstruct, "doctor": Doctor}
+
+# tyro joins the lines of a paragraph, except indented ones.
+_ETSPLAT = """Differentiable triangle splatting: posed images in, triangles out.
+
+    etsplat demo                                      see it work
+    etsplat reconstruct bunny.obj --out runs/bunny    reconstruct a mesh from pictures of it
+    etsplat reconstruct --help                        every option
+"""
+
+
+def parse(arguments: Sequence[str]) -> Command:
+    """The command that the arguments ask for. `--help` and wrong options end the process, as tyro does.
+
+    Raises:
+        InputError: a setting is out of its range.
+    """
+    commands: Any = _union(COMMANDS, arguments, 0)
+    parsed = tyro.cli(
+        commands,
+        prog="etsplat",
+        description=_ETSPLAT,
+        args=list(arguments) or ["--help"],
+        config=(tyro.conf.FlagCreatePairsOff, tyro.conf.OmitSubcommandPrefixes),
+    )
+    return parsed if isinstance(parsed, Command) else parsed.command
+
+
+def _union(commands: Mapping[str, type[Command] | Group], arguments: Sequence[str], depth: int) -> Any:
+    """A type that tyro reads as one of the commands."""
+    asked = arguments[depth] if depth < len(arguments) else ""
+    return Union[tuple(_member(name, entry, arguments, name == asked, depth) for name, entry in commands.items())]  # noqa: UP007
+
+
+def _member(name: str, entry: type[Command] | Group, arguments: Sequence[str], asked: bool, depth: int) -> Any:
+    if isinstance(entry, Group):
+        members = _union(entry.commands, arguments, depth + 1)
+        group = make_dataclass(name, [("command", members)], frozen=True)
+        return Annotated[group, tyro.conf.OmitArgPrefixes, tyro.conf.subcommand(name, description=entry.help)]
+    description = inspect.cleandoc(entry.__doc__ or "")
+    if asked and entry.EXAMPLES:  # the list of all commands has no room for them
+        examples = inspect.cleandoc(entry.EXAMPLES).splitlines()
+        description += "\n\nExamples:\n" + "\n".join(f"    {line}" for line in examples)
+    return Annotated[entry, tyro.conf.subcommand(name, default=entry.defaults(arguments), description=description)]
