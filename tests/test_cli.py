@@ -14,6 +14,7 @@ from typing import ClassVar
 import pytest
 
 from etsplat.cli.command import Command, resume_line
+from etsplat.cli.doctor import Doctor
 from etsplat.cli.parse import COMMANDS, Group, parse
 from etsplat.cli.reconstruct import Demo, Reconstruct
 from etsplat.geometry.icosphere import icosphere
@@ -209,7 +210,7 @@ class _Paint(Command):
 
 def test_groups_of_commands(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """A group's commands follow its name, with their own options and examples."""
-    monkeypatch.setitem(COMMANDS, "studio", Group("Art.", {"paint": _Paint}))
+    monkeypatch.setitem(COMMANDS, "studio", Group("Art.", {"doctor": Doctor, "paint": _Paint}))
     assert parse(["studio", "paint", "--color", "red"]) == _Paint(color="red")
     with pytest.raises(SystemExit):
         parse(["studio", "paint", "--help"])

@@ -18,7 +18,7 @@ class Group:
 
     Attributes:
         help: what they have in common.
-        commands: by name.
+        commands: by name; two at least, or tyro sees no choice to make.
     """
 
     help: str
