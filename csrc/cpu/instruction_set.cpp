@@ -3,6 +3,7 @@
 #include <atomic>
 #include <stdexcept>
 
+#include "simd/photometric_kernels.h"
 #include "simd/raster_kernels.h"
 #include "simd/triangle_kernels.h"
 
@@ -17,6 +18,7 @@ struct Path {
     std::string name;
     RasterKernels raster;
     TriangleKernels triangles;
+    PhotometricKernels photometric;
 };
 
 #if defined(ETSPLAT_X86)
@@ -43,16 +45,19 @@ bool has_avx512() {
 #endif
 #endif
 
+#define ETSPLAT_PATH(name) \
+    Path { #name, name::raster_kernels(), name::triangle_kernels(), name::photometric_kernels() }
+
 const std::vector<Path>& paths() {
     static const std::vector<Path> all = [] {
         std::vector<Path> found;
 #if defined(ETSPLAT_X86)
-        if (has_avx512()) found.push_back({"avx512", avx512::raster_kernels(), avx512::triangle_kernels()});
-        if (has_avx2()) found.push_back({"avx2", avx2::raster_kernels(), avx2::triangle_kernels()});
+        if (has_avx512()) found.push_back(ETSPLAT_PATH(avx512));
+        if (has_avx2()) found.push_back(ETSPLAT_PATH(avx2));
 #elif defined(ETSPLAT_ARM64)
-        found.push_back({"neon", neon::raster_kernels(), neon::triangle_kernels()});
+        found.push_back(ETSPLAT_PATH(neon));
 #endif
-        found.push_back({"plain", plain::raster_kernels(), plain::triangle_kernels()});
+        found.push_back(ETSPLAT_PATH(plain));
         return found;
     }();
     return all;
@@ -94,5 +99,7 @@ void set_instruction_set(const std::string& name) {
 const RasterKernels& active_raster_kernels() { return active().raster; }
 
 const TriangleKernels& active_triangle_kernels() { return active().triangles; }
+
+const PhotometricKernels& active_photometric_kernels() { return active().photometric; }
 
 }  // namespace etsplat

@@ -1,9 +1,10 @@
-// Which compiled path of the tile and triangle loops runs: the widest that this processor has, unless told otherwise.
+// Which compiled path of the tile, triangle and image loops runs: the widest that this processor has, unless told otherwise.
 #pragma once
 
 #include <string>
 #include <vector>
 
+#include "photometric_pass.h"
 #include "raster_pass.h"
 #include "triangle_pass.h"
 
@@ -15,5 +16,6 @@ void set_instruction_set(const std::string& name);  // "" for the widest; throws
 
 const RasterKernels& active_raster_kernels();
 const TriangleKernels& active_triangle_kernels();
+const PhotometricKernels& active_photometric_kernels();
 
 }  // namespace etsplat

@@ -115,8 +115,8 @@ class TriangleSoup:
         """Colours in [0, 1], detached.
 
         Args:
-            direction: from the camera to the triangles, one for all or one each, of any length; None for the part of the
-                colour that is the same from every side.
+            direction: from the camera to the triangles, one for all or one each, of any length; None for the part of
+                the colour that is the same from every side.
         """
         if direction is None:
             return (0.5 + SH_CONSTANT * self.sh_dc[:, 0]).clamp(0.0, 1.0)

@@ -1,0 +1,10 @@
+// The photometric loops for one instruction set. CMake compiles this file once for each (ETSPLAT_SIMD).
+#include "photometric_kernels.h"
+
+#include "photometric.h"
+
+namespace etsplat::ETSPLAT_SIMD {
+
+PhotometricKernels photometric_kernels() { return {photometric_band}; }
+
+}  // namespace etsplat::ETSPLAT_SIMD
