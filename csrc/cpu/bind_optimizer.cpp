@@ -8,6 +8,7 @@
 
 #include "bindings.h"
 #include "math/adam.h"
+#include "math/photometric.h"
 #include "parallel.h"
 
 namespace etsplat {
@@ -63,14 +64,14 @@ double l1_block(const float* color, const float* target, const float* background
     float composited[3 * kBlock];
     for (int64_t p = 0; p < pixels; ++p) {
         const float rest = 1.0f - target[4 * p + 3];
-        for (int c = 0; c < 3; ++c) composited[3 * p + c] = target[4 * p + c] + rest * background[c];
+        for (int c = 0; c < 3; ++c) composited[3 * p + c] = over_background(target[4 * p + c], rest, background[c]);
     }
     float lanes[kLanes] = {};
     const int64_t values = 3 * pixels, whole = values / kLanes * kLanes;
     const auto add = [&](int64_t i, float& sum) {
         const float difference = color[i] - composited[i];
         sum += std::fabs(difference);
-        if constexpr (WithGradient) gradient[i] = difference > 0.0f ? scale : difference < 0.0f ? -scale : 0.0f;
+        if constexpr (WithGradient) gradient[i] = l1_gradient(difference, scale);
     };
     for (int64_t i = 0; i < whole; i += kLanes) {
         for (int lane = 0; lane < kLanes; ++lane) add(i + lane, lanes[lane]);

@@ -20,12 +20,6 @@ struct ShProblem {
     int degree;
 };
 
-// Normalises; a direction without length keeps only the constant band.
-int usable_degree(const ShProblem& problem, Vector raw, Vector& unit, float& length) {
-    unit = direction(raw, length);
-    return length > kMinLength ? problem.degree : 0;
-}
-
 // Channels = 0 reads the number of channels from the problem.
 template <int Channels>
 void forward(const ShProblem& p, float* colors) {
@@ -36,7 +30,7 @@ void forward(const ShProblem& p, float* colors) {
         for (int64_t n = begin; n < end; ++n) {
             const float* coefficients = p.coefficients + n * p.bases * channels;
             for (int64_t view = 0; view < p.views; ++view) {
-                const int degree = usable_degree(p, p.directions[view * p.points + n], unit, length);
+                const int degree = sh_direction(p.degree, p.directions[view * p.points + n], unit, length);
                 sh_basis(degree, unit, basis);
                 float* color = colors + (view * p.points + n) * channels;
                 for (int64_t c = 0; c < channels; ++c) {
@@ -66,7 +60,7 @@ void backward(const ShProblem& p, const float* colors, const float* grad_colors,
             std::fill(sums, sums + p.bases * channels, 0.0f);
             for (int64_t view = 0; view < p.views; ++view) {
                 const int64_t at = view * p.points + n;
-                const int degree = usable_degree(p, p.directions[at], unit, length);
+                const int degree = sh_direction(p.degree, p.directions[at], unit, length);
                 sh_basis(degree, unit, basis);
                 for (int64_t c = 0; c < channels; ++c) {
                     cotangent[c] = colors[at * channels + c] > 0.0f ? grad_colors[at * channels + c] : 0.0f;
@@ -79,8 +73,7 @@ void backward(const ShProblem& p, const float* colors, const float* grad_colors,
                     }
                 }
                 const Vector g = sh_basis_backward(degree, unit, along);
-                const float inverse = degree > 0 ? 1.0f / length : 0.0f;
-                grad_directions[at] = inverse * (g - dot(g, unit) * unit);  // through the normalisation
+                grad_directions[at] = sh_direction_backward(degree, unit, length, g);
             }
         }
     });

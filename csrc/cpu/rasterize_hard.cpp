@@ -3,19 +3,13 @@
 // so that each tile sees them in ascending index; (3) tiles run in parallel, each with its own z-buffer (32 KiB, in the
 // L1 cache), and are resolved to final pixels at once: no buffer of the supersampled size exists. Strips of tile rows
 // bound the memory of (2). Nothing depends on which thread runs what.
-//
-// Coverage is the top-left rule by scan conversion. On the row of samples at height y, the edge from its upper end a to
-// its lower end b crosses at x = a.x + (y - a.y) slope; it is active for a.y <= y < b.y, and a sample lies right of it
-// if sample.x >= x. A triangle fills between the two edges active on a row. Neighbours compute the same number for
-// their common edge, so that their spans meet without crack, whatever the rounding.
 #include "rasterize_hard.h"
 
 #include <algorithm>
-#include <cmath>
-#include <limits>
 #include <utility>
 #include <vector>
 
+#include "math/hard_triangle.h"
 #include "parallel.h"
 
 namespace etsplat {
@@ -24,95 +18,12 @@ namespace {
 constexpr int kTileSamples = 64;
 constexpr int64_t kStripEntries = 8'000'000;  // (tile, triangle) pairs in memory at a time
 
-struct Projected {
-    double x, y, inverse_depth;  // in samples; inverse_depth is NaN where the vertex cannot be drawn
-};
-
-struct Edge {
-    double x, y, slope, x_low, x_high;
-
-    // Column of the first sample on the right side of the edge, clamped to [0, width].
-    int32_t first_right(double sample_y, int32_t width) const {
-        double at = x + (sample_y - y) * slope;
-        at = at > x_low ? at : x_low;  // the edge's own range, so that both neighbours clamp alike (also a NaN)
-        at = at < x_high ? at : x_high;
-        at = std::min(std::max(at - 0.5, -1.0), static_cast<double>(width));
-        const auto truncated = static_cast<int32_t>(at);
-        return std::max(truncated + (at > truncated ? 1 : 0), 0);
-    }
-};
-
-struct Triangle {
-    Edge whole, upper, lower;  // from the top vertex to the bottom one, top to middle, middle to bottom
-    double inverse_depth, inverse_depth_dx, inverse_depth_dy;  // plane, at the top vertex
-    float inverse_depth_min, inverse_depth_max;
-    int32_t x_begin, x_end, y_begin, y_end;  // samples; empty where the triangle draws nothing
-};
-
 struct Screen {
-    std::vector<Projected> vertices;
-    std::vector<Triangle> triangles;
+    std::vector<HardVertex> vertices;
+    std::vector<HardTriangle> triangles;
     int32_t width, height;  // in samples
     int32_t tile, tiles_x, tiles_y;
 };
-
-Projected project(const HardCamera& camera, int32_t samples, const float* p) {
-    const float* m = camera.viewmat;
-    const float* k = camera.K;
-    double c[3];
-    for (int r = 0; r < 3; ++r) {
-        c[r] = static_cast<double>(m[4 * r]) * p[0] + static_cast<double>(m[4 * r + 1]) * p[1] +
-               static_cast<double>(m[4 * r + 2]) * p[2] + m[4 * r + 3];
-    }
-    Projected v;
-    v.inverse_depth = 1.0 / c[2];
-    v.x = samples * (k[0] * c[0] * v.inverse_depth + k[2]);
-    v.y = samples * (k[4] * c[1] * v.inverse_depth + k[5]);
-    const bool drawn = c[2] > static_cast<double>(camera.near_plane) && std::isfinite(v.x) && std::isfinite(v.y);
-    if (!drawn) v.inverse_depth = std::numeric_limits<double>::quiet_NaN();
-    return v;
-}
-
-Edge make_edge(const Projected& upper, const Projected& lower) {
-    return {upper.x, upper.y, (lower.x - upper.x) / (lower.y - upper.y), std::min(upper.x, lower.x),
-            std::max(upper.x, lower.x)};
-}
-
-int32_t first_sample(double coordinate, int32_t size) {
-    return static_cast<int32_t>(std::min(std::max(std::ceil(coordinate - 0.5), 0.0), static_cast<double>(size)));
-}
-
-// Empty (x_end = 0) if it cannot be drawn: a vertex behind the near plane or not finite, no area, facing away.
-Triangle set_up(const Projected* in, int32_t width, int32_t height, bool cull_backfaces) {
-    Triangle t;
-    t.x_begin = t.x_end = t.y_begin = t.y_end = 0;
-    Projected v[3] = {in[0], in[1], in[2]};
-    const double facing = (v[1].x - v[0].x) * (v[2].y - v[0].y) - (v[2].x - v[0].x) * (v[1].y - v[0].y);
-    if (cull_backfaces && !(facing < 0.0)) return t;  // y points down: counter-clockwise is negative
-    std::sort(v, v + 3, [](const Projected& a, const Projected& b) { return a.y < b.y || (a.y == b.y && a.x < b.x); });
-
-    const double x1 = v[1].x - v[0].x, y1 = v[1].y - v[0].y, x2 = v[2].x - v[0].x, y2 = v[2].y - v[0].y;
-    const double w1 = v[1].inverse_depth - v[0].inverse_depth, w2 = v[2].inverse_depth - v[0].inverse_depth;
-    const double area = x1 * y2 - x2 * y1;
-    t.inverse_depth = v[0].inverse_depth;
-    t.inverse_depth_dx = (w1 * y2 - w2 * y1) / area;
-    t.inverse_depth_dy = (x1 * w2 - x2 * w1) / area;
-    if (!std::isfinite(t.inverse_depth_dx) || !std::isfinite(t.inverse_depth_dy)) return t;
-
-    const auto [low, high] = std::minmax({v[0].inverse_depth, v[1].inverse_depth, v[2].inverse_depth});
-    t.inverse_depth_min = static_cast<float>(low);
-    t.inverse_depth_max = static_cast<float>(high);
-    t.whole = make_edge(v[0], v[2]);
-    t.upper = make_edge(v[0], v[1]);
-    t.lower = make_edge(v[1], v[2]);
-    t.y_begin = first_sample(v[0].y, height);
-    t.y_end = first_sample(v[2].y, height);
-    t.x_begin = first_sample(std::min(t.whole.x_low, v[1].x), width);
-    t.x_end = first_sample(std::max(t.whole.x_high, v[1].x), width);
-    return t;
-}
-
-bool draws(const Triangle& t) { return t.x_begin < t.x_end && t.y_begin < t.y_end; }
 
 Screen set_up_screen(const HardMesh& mesh, const HardCamera& camera, int32_t samples, bool cull_backfaces) {
     Screen screen;
@@ -123,14 +34,17 @@ Screen set_up_screen(const HardMesh& mesh, const HardCamera& camera, int32_t sam
     screen.tiles_y = (screen.height + screen.tile - 1) / screen.tile;
     screen.vertices.resize(mesh.num_vertices);
     parallel_for(mesh.num_vertices, 4096, [&](int64_t begin, int64_t end) {
-        for (int64_t v = begin; v < end; ++v) screen.vertices[v] = project(camera, samples, mesh.vertices + 3 * v);
+        for (int64_t v = begin; v < end; ++v) {
+            screen.vertices[v] =
+                project_hard(camera.viewmat, camera.K, camera.near_plane, samples, mesh.vertices + 3 * v);
+        }
     });
     screen.triangles.resize(mesh.num_faces);
     parallel_for(mesh.num_faces, 2048, [&](int64_t begin, int64_t end) {
         for (int64_t f = begin; f < end; ++f) {
             const int32_t* k = mesh.faces + 3 * f;
-            const Projected v[3] = {screen.vertices[k[0]], screen.vertices[k[1]], screen.vertices[k[2]]};
-            screen.triangles[f] = set_up(v, screen.width, screen.height, cull_backfaces);
+            const HardVertex v[3] = {screen.vertices[k[0]], screen.vertices[k[1]], screen.vertices[k[2]]};
+            screen.triangles[f] = set_up_hard(v, screen.width, screen.height, cull_backfaces);
         }
     });
     return screen;
@@ -139,8 +53,8 @@ Screen set_up_screen(const HardMesh& mesh, const HardCamera& camera, int32_t sam
 // Ends of strips of tile rows that hold at most kStripEntries pairs each, or are one row high.
 std::vector<int32_t> strip_ends(const Screen& screen) {
     std::vector<int64_t> change(screen.tiles_y + 1, 0);
-    for (const Triangle& t : screen.triangles) {
-        if (!draws(t)) continue;
+    for (const HardTriangle& t : screen.triangles) {
+        if (!t.draws()) continue;
         const int64_t columns = (t.x_end - 1) / screen.tile - t.x_begin / screen.tile + 1;
         change[t.y_begin / screen.tile] += columns;
         change[(t.y_end - 1) / screen.tile + 1] -= columns;
@@ -172,8 +86,8 @@ Bins bin_strip(const Screen& screen, int32_t row_begin, int32_t row_end) {
 
     const auto for_each_pair = [&](int64_t c, auto&& visit) {
         for (int64_t f = c * chunk; f < std::min(n, (c + 1) * chunk); ++f) {
-            const Triangle& t = screen.triangles[f];
-            if (!draws(t)) continue;
+            const HardTriangle& t = screen.triangles[f];
+            if (!t.draws()) continue;
             const int32_t y0 = std::max(t.y_begin / screen.tile, row_begin);
             const int32_t y1 = std::min((t.y_end - 1) / screen.tile + 1, row_end);
             for (int32_t y = y0; y < y1; ++y) {
@@ -222,25 +136,22 @@ struct TileBuffer {
 
 // Triangles come in ascending index: a strict comparison lets the smaller index win a tie.
 void draw(const Screen& screen, int32_t index, TileBuffer& tile) {
-    const Triangle& t = screen.triangles[index];
+    const HardTriangle& t = screen.triangles[index];
     const auto slope = static_cast<float>(t.inverse_depth_dx);
     const int32_t y_end = std::min(t.y_end, tile.y1);
     for (int32_t y = std::max(t.y_begin, tile.y0); y < y_end; ++y) {
-        const double sample_y = y + 0.5;
-        const int32_t a = t.whole.first_right(sample_y, screen.width);
-        const int32_t b = (sample_y < t.lower.y ? t.upper : t.lower).first_right(sample_y, screen.width);
-        const int32_t begin = std::max(std::min(a, b), tile.x0), end = std::min(std::max(a, b), tile.x1);
+        int32_t begin, end;
+        t.span(y, screen.width, begin, end);
+        begin = std::max(begin, tile.x0);
+        end = std::min(end, tile.x1);
         if (begin >= end) continue;
-        const auto row = static_cast<float>(t.inverse_depth + t.inverse_depth_dy * (sample_y - t.whole.y) +
-                                            t.inverse_depth_dx * (t.x_begin + 0.5 - t.whole.x));
+        const float row = t.row_inverse_depth(y);
         const int64_t place = static_cast<int64_t>(y - tile.y0) * tile.stride + (begin - tile.x0);
         float* depths = tile.inverse_depth.data() + place;
         int32_t* owners = tile.triangle.data() + place;
         const int32_t count = end - begin, offset = begin - t.x_begin;
         for (int32_t i = 0; i < count; ++i) {
-            float w = row + slope * static_cast<float>(offset + i);  // the same number in every tile
-            w = w < t.inverse_depth_min ? t.inverse_depth_min : w;   // slivers must not extrapolate
-            w = w > t.inverse_depth_max ? t.inverse_depth_max : w;
+            const float w = t.inverse_depth_at(row, slope, offset + i);
             const bool nearer = w > depths[i];
             depths[i] = nearer ? w : depths[i];
             owners[i] = nearer ? index : owners[i];
@@ -269,24 +180,10 @@ void for_each_tile(const Screen& screen, const Resolve& resolve) {
     }
 }
 
-// Perspective-correct barycentrics b_k = (a_k / z_k) / sum_j (a_j / z_j), a clamped at 0, of the sample at column x and
-// row y.
 void barycentrics_at(const HardMesh& mesh, const Screen& screen, int32_t face, int32_t x, int32_t y, float out[3]) {
-    Projected v[3];
-    for (int k = 0; k < 3; ++k) {
-        v[k] = screen.vertices[mesh.faces[3 * static_cast<int64_t>(face) + k]];
-        v[k].x -= x + 0.5;
-        v[k].y -= y + 0.5;
-    }
-    double weight[3];
-    for (int k = 0; k < 3; ++k) {
-        const Projected &p = v[(k + 1) % 3], &q = v[(k + 2) % 3];
-        weight[k] = p.x * q.y - q.x * p.y;
-    }
-    const double sign = weight[0] + weight[1] + weight[2] < 0.0 ? -1.0 : 1.0;
-    for (int k = 0; k < 3; ++k) weight[k] = std::max(sign * weight[k], 0.0) * v[k].inverse_depth;
-    const double total = weight[0] + weight[1] + weight[2];
-    for (int k = 0; k < 3; ++k) out[k] = total > 0.0 ? static_cast<float>(weight[k] / total) : 1.0f / 3.0f;
+    const int32_t* k = mesh.faces + 3 * static_cast<int64_t>(face);
+    const HardVertex v[3] = {screen.vertices[k[0]], screen.vertices[k[1]], screen.vertices[k[2]]};
+    hard_barycentrics(v, x, y, out);
 }
 
 // Adds a sample's colour to `sum` (channels).

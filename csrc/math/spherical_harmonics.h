@@ -73,4 +73,16 @@ ETSPLAT_FN Vector3<T> sh_basis_backward(int degree, Vector3<T> d, const T* g) {
                                 g14 * (xx - yy)};
 }
 
+// Normalises. Returns the degree to use: a direction without length shows the constant band only.
+ETSPLAT_FN int sh_direction(int degree, Vector3<float> raw, Vector3<float>& unit, float& length) {
+    unit = direction(raw, length);
+    return length > kMinLength ? degree : 0;
+}
+
+// From the gradient g by the polynomials' argument to that by the direction as it was given.
+ETSPLAT_FN Vector3<float> sh_direction_backward(int degree, Vector3<float> unit, float length, Vector3<float> g) {
+    const float inverse = degree > 0 ? 1.0f / length : 0.0f;
+    return inverse * (g - dot(g, unit) * unit);
+}
+
 }  // namespace etsplat

@@ -1,0 +1,18 @@
+// One value of the photometric loss of shape reconstruction: a channel against a premultiplied target over a background.
+#pragma once
+
+#include "portable.h"
+
+namespace etsplat {
+
+// `rest` = 1 - alpha.
+ETSPLAT_FN float over_background(float premultiplied, float rest, float background) {
+    return premultiplied + rest * background;
+}
+
+// Derivative of scale |difference| by the difference, 0 at 0.
+ETSPLAT_FN float l1_gradient(float difference, float scale) {
+    return difference > 0.0f ? scale : difference < 0.0f ? -scale : 0.0f;
+}
+
+}  // namespace etsplat
