@@ -9,6 +9,7 @@ void bind_optimizer(nb::module_& m);
 void bind_photometric(nb::module_& m);
 void bind_rasterize(nb::module_& m);
 void bind_rasterize_hard(nb::module_& m);
+void bind_soup_colors(nb::module_& m);
 void bind_spherical_harmonics(nb::module_& m);
 }  // namespace etsplat
 
@@ -27,5 +28,6 @@ NB_MODULE(_native, m) {
     bind_photometric(m);
     bind_rasterize(m);
     bind_rasterize_hard(m);
+    bind_soup_colors(m);
     bind_spherical_harmonics(m);
 }

@@ -1,0 +1,114 @@
+// Colours of separate triangles as cameras see them: view direction of the centroid and spherical harmonics in one sweep.
+// Triangles run in parallel; a triangle's views run in order, so that sums over views do not depend on the threads.
+#include <algorithm>
+
+#include "bindings.h"
+#include "math/spherical_harmonics.h"
+#include "parallel.h"
+
+namespace etsplat {
+namespace {
+
+using Vector = Vector3<float>;
+
+constexpr int64_t kTriangles = 512;  // that a thread takes at a time
+
+struct SoupColors {
+    const Vector* corners;  // (N, 3)
+    const float* dc;        // (N, 1, 3)
+    const float* rest;      // (N, bases, 3)
+    const Vector* centers;  // (views)
+    int64_t triangles, views, bases;
+    int degree;
+};
+
+Vector centroid(const SoupColors& p, int64_t n) {
+    const Vector* corner = p.corners + 3 * n;
+    return (1.0f / 3.0f) * (corner[0] + corner[1] + corner[2]);
+}
+
+void forward(const SoupColors& p, float* colors) {
+    const int bases = (p.degree + 1) * (p.degree + 1);
+    parallel_for(p.triangles, kTriangles, [&](int64_t begin, int64_t end) {
+        float basis[kMaxShBases] = {}, length;
+        for (int64_t n = begin; n < end; ++n) {
+            const float* rest = p.rest + 3 * p.bases * n;
+            const Vector middle = centroid(p, n);
+            for (int64_t view = 0; view < p.views; ++view) {
+                const Vector unit = direction(middle - p.centers[view], length);
+                const int used = length > kMinLength ? bases : 1;
+                sh_basis(p.degree, unit, basis);
+                float sum[3];
+                for (int c = 0; c < 3; ++c) sum[c] = 0.5f + kSh0 * p.dc[3 * n + c];
+                for (int k = 1; k < used; ++k)
+                    for (int c = 0; c < 3; ++c) sum[c] += basis[k] * rest[3 * (k - 1) + c];
+                float* color = colors + 3 * (view * p.triangles + n);
+                for (int c = 0; c < 3; ++c) color[c] = vmax(sum[c], 0.0f);
+            }
+        }
+    });
+}
+
+// A colour of 0 was clamped and passes no gradient. The bands above `degree` get zero.
+void backward(const SoupColors& p, const float* colors, const float* grad_colors, Vector* grad_corners, float* grad_dc,
+              float* grad_rest) {
+    const int bases = (p.degree + 1) * (p.degree + 1);
+    parallel_for(p.triangles, kTriangles, [&](int64_t begin, int64_t end) {
+        float basis[kMaxShBases] = {}, along[kMaxShBases] = {}, length;
+        std::fill(grad_rest + 3 * p.bases * begin, grad_rest + 3 * p.bases * end, 0.0f);
+        for (int64_t n = begin; n < end; ++n) {
+            const float* rest = p.rest + 3 * p.bases * n;
+            float *sums = grad_rest + 3 * p.bases * n, *dc = grad_dc + 3 * n;
+            const Vector middle = centroid(p, n);
+            Vector moved{0.0f, 0.0f, 0.0f};
+            for (int c = 0; c < 3; ++c) dc[c] = 0.0f;
+            for (int64_t view = 0; view < p.views; ++view) {
+                const int64_t at = 3 * (view * p.triangles + n);
+                float cotangent[3];
+                for (int c = 0; c < 3; ++c) cotangent[c] = colors[at + c] > 0.0f ? grad_colors[at + c] : 0.0f;
+                if (cotangent[0] == 0.0f && cotangent[1] == 0.0f && cotangent[2] == 0.0f) continue;  // out of view
+                for (int c = 0; c < 3; ++c) dc[c] += kSh0 * cotangent[c];
+                const Vector unit = direction(middle - p.centers[view], length);
+                if (p.degree == 0 || length <= kMinLength) continue;
+                sh_basis(p.degree, unit, basis);
+                for (int k = 1; k < bases; ++k) {
+                    along[k] = 0.0f;
+                    for (int c = 0; c < 3; ++c) {
+                        sums[3 * (k - 1) + c] += cotangent[c] * basis[k];
+                        along[k] += cotangent[c] * rest[3 * (k - 1) + c];
+                    }
+                }
+                const Vector g = sh_basis_backward(p.degree, unit, along);
+                moved = moved + (1.0f / length) * (g - dot(g, unit) * unit);  // through the normalisation
+            }
+            for (int corner = 0; corner < 3; ++corner) grad_corners[3 * n + corner] = (1.0f / 3.0f) * moved;
+        }
+    });
+}
+
+}  // namespace
+
+void bind_soup_colors(nb::module_& m) {
+    // corners (N, 3, 3), dc (N, 1, 3), rest (N, bases, 3), centers (views, 3), colors (views, N, 3), all float32.
+    m.def(
+        "soup_colors",
+        [](Address corners, Address dc, Address rest, Address centers, int64_t triangles, int64_t views, int64_t bases,
+           int degree, Address colors) {
+            forward({pointer<const Vector>(corners), pointer<const float>(dc), pointer<const float>(rest),
+                     pointer<const Vector>(centers), triangles, views, bases, degree},
+                    pointer<float>(colors));
+        },
+        NoGil());
+    m.def(
+        "soup_colors_backward",
+        [](Address corners, Address dc, Address rest, Address centers, int64_t triangles, int64_t views, int64_t bases,
+           int degree, Address colors, Address grad_colors, Address grad_corners, Address grad_dc, Address grad_rest) {
+            backward({pointer<const Vector>(corners), pointer<const float>(dc), pointer<const float>(rest),
+                      pointer<const Vector>(centers), triangles, views, bases, degree},
+                     pointer<const float>(colors), pointer<const float>(grad_colors), pointer<Vector>(grad_corners),
+                     pointer<float>(grad_dc), pointer<float>(grad_rest));
+        },
+        NoGil());
+}
+
+}  // namespace etsplat

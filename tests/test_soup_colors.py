@@ -1,0 +1,62 @@
+import pytest
+import torch
+
+from etsplat.ops.soup_colors import soup_colors
+from etsplat.ops.spherical_harmonics import spherical_harmonics
+
+
+def problem(rng: torch.Generator, triangles: int, views: int, bases: int = 15):
+    vertices = torch.randn((triangles, 3, 3), generator=rng)
+    dc = torch.randn((triangles, 1, 3), generator=rng)
+    rest = 0.5 * torch.randn((triangles, bases, 3), generator=rng)
+    return vertices, dc, rest, torch.randn((views, 3), generator=rng)
+
+
+def gradients(inputs, degree, cotangent, engine):
+    leaves = [tensor.clone().requires_grad_() for tensor in inputs[:3]]
+    colors = soup_colors(*leaves, inputs[3], degree, engine=engine)
+    colors.backward(cotangent)
+    return colors.detach(), [torch.zeros_like(leaf) if leaf.grad is None else leaf.grad for leaf in leaves]
+
+
+@pytest.mark.sanitize
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_native_agrees_with_float64_reference(rng, degree):
+    """Colours and all gradients agree for every degree, also where stored bands are above it."""
+    inputs = problem(rng, 700, 2)
+    cotangent = torch.randn((2, 700, 3), generator=rng)
+    cotangent[0, ::3] = 0
+    colors, grads = gradients(inputs, degree, cotangent, "cpu")
+    exact, exact_grads = gradients([t.double() for t in inputs], degree, cotangent.double(), "reference")
+    torch.testing.assert_close(colors.double(), exact, rtol=1e-5, atol=2e-6)
+    clamp = (exact.abs() < 1e-5).any(dim=-1).any(dim=0)  # float32 may clamp where float64 does not
+    for grad, exact_grad in zip(grads, exact_grads, strict=True):
+        scale = float(exact_grad.abs().max())
+        torch.testing.assert_close(grad.double()[~clamp], exact_grad[~clamp], rtol=1e-4, atol=1e-6 * scale)
+
+
+def test_direction_is_from_the_camera_to_the_centroid(engine, rng):
+    """The colours are the spherical harmonics of that direction."""
+    vertices, dc, rest, centers = problem(rng, 20, 1)
+    expected = spherical_harmonics(torch.cat([dc, rest], dim=1), vertices.mean(dim=1) - centers, 3)
+    torch.testing.assert_close(soup_colors(vertices, dc, rest, centers, 3, engine=engine)[0], expected)
+
+
+def test_camera_at_the_centroid_sees_the_constant_band(engine, rng):
+    """Without a direction there is neither NaN nor a gradient to the corners."""
+    _, dc, rest, _ = problem(rng, 1, 1)
+    vertices, centers = torch.tensor([[[1.0, 0, 0], [-1, 1, 0], [0, -1, 0]]]), torch.zeros(1, 3)
+    colors, grads = gradients((vertices, dc, rest, centers), 3, torch.ones(1, 1, 3), engine)
+    torch.testing.assert_close(colors[0], (0.5 + 0.28209479 * dc[:, 0]).clamp_min(0), rtol=1e-4, atol=1e-5)
+    assert bool(grads[0].isfinite().all())
+
+
+def test_wrong_arguments_are_named(rng):
+    """A wrong shape or degree is a ValueError that names the argument."""
+    vertices, dc, rest, centers = problem(rng, 4, 1, bases=8)
+    with pytest.raises(ValueError, match="sh_rest"):
+        soup_colors(vertices, dc, rest, centers, 3)
+    with pytest.raises(ValueError, match="degree"):
+        soup_colors(vertices, dc, rest, centers, 4)
+    with pytest.raises(ValueError, match="centers"):
+        soup_colors(vertices, dc, rest, centers.double(), 1)
