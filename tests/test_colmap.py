@@ -5,13 +5,22 @@ import torch
 
 from etsplat.core.errors import InputError
 from etsplat.io.images import save_image
-from etsplat.scene.colmap import load_colmap
+from etsplat.scene.colmap import read_colmap
 from etsplat.scene.demo_object import demo_object
+from etsplat.scene.frames import posed_views
 from etsplat.scene.load import load_views
 from etsplat.scene.photograph import photograph
-from etsplat.scene.transforms import load_transforms
+from etsplat.scene.transforms import read_transforms
 
 NAMES = [f"photo {k:02d}.png" for k in range(10)]
+
+
+def load_colmap(folder, masks=None, width=None):
+    return posed_views(read_colmap(folder, masks), width=width)
+
+
+def load_transforms(folder, width=None):
+    return posed_views(read_transforms(folder), width=width)
 
 
 @pytest.fixture(scope="module")

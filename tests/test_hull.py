@@ -9,9 +9,10 @@ from etsplat.geometry.icosphere import icosphere
 from etsplat.io.mesh_files import MeshFile
 from etsplat.ops.rasterize_hard import render_opaque
 from etsplat.scene.demo_object import demo_object
+from etsplat.scene.frames import posed_views
 from etsplat.scene.hull import axes_meeting_point, bounding_sphere
 from etsplat.scene.photograph import photograph
-from etsplat.scene.transforms import load_transforms
+from etsplat.scene.transforms import read_transforms
 from etsplat.scene.views import Normalization, PosedViews
 
 
@@ -62,7 +63,7 @@ def test_the_sphere_follows_units_and_place():
 
 def test_the_sphere_of_the_shared_lego_covers_every_silhouette(shared_data):
     """A mask pixel is explained by the sphere only if its viewing ray passes through it: true of all of them."""
-    views = load_transforms(shared_data / "scenes" / "lego_blender", width=100)
+    views = posed_views(read_transforms(shared_data / "scenes" / "lego_blender"), width=100)
     center, radius = bounding_sphere(views)
     assert 1.1 < radius < 1.6  # the model's farthest corner is about 1.4 from the origin
     for index in range(0, len(views), 5):

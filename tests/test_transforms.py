@@ -7,11 +7,16 @@ import torch
 from etsplat.core.errors import InputError
 from etsplat.io.images import save_image
 from etsplat.scene.demo_object import demo_object
+from etsplat.scene.frames import posed_views
 from etsplat.scene.load import load_views
 from etsplat.scene.photograph import photograph
-from etsplat.scene.transforms import load_transforms
+from etsplat.scene.transforms import read_transforms
 
 FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
+
+
+def load_transforms(folder, width=None):
+    return posed_views(read_transforms(folder), width=width)
 
 
 @pytest.fixture(scope="module")

@@ -31,11 +31,50 @@ def load_image(path: Path | str) -> Float[Tensor, "H W C"]:
         InputError: the file is missing, empty, cut short, or not an image.
     """
     with _open_image(path) as image:
-        mode = "RGBA" if image.mode in ("RGBA", "LA", "PA", "La", "RGBa") or "transparency" in image.info else "RGB"
         # 16-bit grey has no direct conversion to RGB in Pillow (it would clip instead of scale).
         if image.mode.startswith("I") or image.mode == "F":
             return _scaled_grey(path, image)[..., None].repeat(1, 1, 3)
-        return _to_float(_decode(path, image, mode))
+        return _to_float(np.asarray(_converted(path, image, _color_mode(image))))
+
+
+def load_pixels(path: Path | str, width: int, height: int) -> UInt8[Tensor, "H W C"]:
+    """Read an image as 8-bit pixels of the given size: RGB, or premultiplied RGBA where some pixel is transparent.
+
+    Sizes are changed with Pillow's bicubic filter, as 3DGS does.
+
+    Raises:
+        InputError: as `load_image`.
+    """
+    with _open_image(path) as image:
+        if image.mode.startswith("I") or image.mode == "F":
+            pixels = (_scaled_grey(path, image) * 255 + 0.5).to(torch.uint8).numpy()
+            loaded = Image.fromarray(pixels).convert("RGB")
+        else:
+            loaded = _converted(path, image, _color_mode(image))
+    if loaded.mode == "RGBA":
+        opaque = loaded.getextrema()[3][0] == 255
+        loaded = loaded.convert("RGB" if opaque else "RGBa")
+    if loaded.size != (width, height):
+        loaded = loaded.resize((width, height), Image.Resampling.BICUBIC)
+    pixels = np.array(loaded)
+    if pixels.shape[2] == 4:  # bicubic overshoots: premultiplied colours stay below alpha
+        pixels[..., :3] = np.minimum(pixels[..., :3], pixels[..., 3:])
+    return torch.from_numpy(pixels)
+
+
+def load_mask_pixels(path: Path | str, width: int, height: int) -> UInt8[Tensor, "H W"]:
+    """Read a mask as 8-bit levels of the given size, 255 inside; see `load_mask`.
+
+    Raises:
+        InputError: as `load_image`, or the mask has another shape than width : height.
+    """
+    mask = load_mask(path)
+    H, W = mask.shape
+    if abs(H * width / W - height) > 2:
+        raise InputError(f"mask {path}: is {W}x{H}, its image is {width}x{height}; resize the mask")
+    if (width, height) != (W, H):
+        mask = resize_image(mask[..., None], width, height)[..., 0]
+    return to_8_bit(mask)
 
 
 def load_mask(path: Path | str) -> Float[Tensor, "H W"]:
@@ -131,9 +170,15 @@ def _open_image(path: Path | str) -> Image.Image:
         raise InputError(f"image {path}: cannot be opened ({error}); convert it to PNG or JPEG") from error
 
 
-def _decode(path: Path | str, image: Image.Image, mode: str | None) -> np.ndarray:
+def _color_mode(image: Image.Image) -> str:
+    transparent = image.mode in ("RGBA", "LA", "PA", "La", "RGBa") or "transparency" in image.info
+    return "RGBA" if transparent else "RGB"
+
+
+def _converted(path: Path | str, image: Image.Image, mode: str) -> Image.Image:
+    """The decoded image in another mode."""
     try:
-        return np.asarray(image.convert(mode) if mode else image)
+        return image.convert(mode)
     except (OSError, ValueError, SyntaxError) as error:  # Pillow reports a damaged PNG chunk as a SyntaxError
         detail = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(f"image {path}: damaged or cut short ({detail}); copy it again") from error
@@ -141,7 +186,7 @@ def _decode(path: Path | str, image: Image.Image, mode: str | None) -> np.ndarra
 
 def _scaled_grey(path: Path | str, image: Image.Image) -> Float[Tensor, "H W"]:
     scale = 1.0 if image.mode == "F" else 65535.0
-    values = torch.from_numpy(_decode(path, image, None).astype(np.float32)) / scale
+    values = torch.from_numpy(np.asarray(_converted(path, image, image.mode)).astype(np.float32)) / scale
     return values.clamp(0, 1)
 
 

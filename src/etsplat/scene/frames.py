@@ -1,6 +1,7 @@
-"""From a loader's list of frames (file, pose, intrinsics, mask) to posed views: what all capture formats share."""
+"""What all capture formats share: frames (file, pose, intrinsics, mask) with split and points; views made of them."""
 
 import os
+from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -12,7 +13,7 @@ from torch import Tensor
 
 from etsplat.core.cameras import Cameras
 from etsplat.core.errors import InputError
-from etsplat.io.images import image_size, load_image, load_mask, premultiply, resize_image
+from etsplat.io.images import IMAGE_SUFFIXES, image_size, load_image, load_mask, premultiply, resize_image
 from etsplat.scene.views import Normalization, PosedViews
 
 _MASK_SUFFIXES = (".png", ".jpg", ".jpeg")
@@ -39,24 +40,58 @@ class Frame:
     size: tuple[int, int]
 
 
-def load_frames(
-    source: Path, frames: Sequence[Frame], train: list[int], test: list[int], *, width: int | None = None
-) -> PosedViews:
+@dataclass(frozen=True)
+class FrameSet:
+    """What a reader finds in a capture; no image has been decoded yet.
+
+    Attributes:
+        source: the capture's folder, for error messages.
+        frames: at least one; their names are unique.
+        train: indices of the frames to optimise on, ascending.
+        test: indices of the frames held out, ascending.
+        points: (P, 3) float64, P > 0, in the units of the poses; or None.
+        point_colors: (P, 3) float32 in [0, 1] as displayed; or None without points.
+    """
+
+    source: Path
+    frames: list[Frame]
+    train: list[int]
+    test: list[int]
+    points: Float[Tensor, "P 3"] | None = None
+    point_colors: Float[Tensor, "P 3"] | None = None
+
+    def __post_init__(self) -> None:
+        name, count = Counter(frame.name for frame in self.frames).most_common(1)[0]
+        if count > 1:
+            raise InputError(f"scene {self.source}: {count} frames have the image {name}; keep one of them")
+        missing = [frame for frame in self.frames if not frame.image.is_file()]
+        if missing:
+            raise InputError(
+                f"scene {self.source}: {len(missing)} of {len(self.frames)} images are missing"
+                f" (first: {missing[0].image}); copy them there or remove their poses"
+            )
+
+    @property
+    def view_names(self) -> list[str]:
+        """Names fit for files: folders joined by underscores, endings dropped unless that made two alike."""
+        full = [frame.name.removeprefix("./").replace("/", "_") for frame in self.frames]
+        short = [PurePosixPath(name).stem for name in full]
+        return short if len(set(short)) == len(short) else full
+
+
+def posed_views(frame_set: FrameSet, *, width: int | None = None) -> PosedViews:
     """Decode the images of all frames, in parallel, and set up their cameras in the capture's own units.
 
     Args:
-        source: the capture, for error messages.
-        frames: at least two.
-        train: indices of the frames to optimise on.
-        test: indices of the frames held out.
+        frame_set: at least two frames.
         width: shrink the images to this many pixels across (never enlarges).
 
     Raises:
-        InputError: fewer than two frames, missing or damaged images, images of different sizes, or of another shape
-            than the intrinsics say; masks of another size than their images.
+        InputError: fewer than two frames, damaged images, images of different sizes, or of another shape than the
+            intrinsics say; masks of another size than their images.
     """
-    if len(frames) < 2:
-        raise InputError(f"scene {source}: has {len(frames)} posed images; at least 2 are needed, better 20")
+    source, frames = frame_set.source, frame_set.frames
+    check_count(source, frames)
     if width is not None and width < 1:
         raise ValueError(f"width: expected at least 1, got {width}")
     size = _common_size(source, frames)
@@ -69,10 +104,24 @@ def load_frames(
 
     with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
         list(pool.map(decode, range(len(frames))))  # list() re-raises the first error
-    Ks = torch.stack([_scaled_intrinsics(source, frame, size, target) for frame in frames])
+    Ks = torch.stack([scaled_intrinsics(source, frame, size, target) for frame in frames])
     viewmats = torch.stack([frame.viewmat for frame in frames])
     cameras = Cameras(viewmats.float(), Ks.float(), *target)
-    return PosedViews(cameras, images, _view_names(frames), train, test, Normalization.identity())
+    return PosedViews(cameras, images, frame_set.view_names, frame_set.train, frame_set.test, Normalization.identity())
+
+
+def check_count(source: Path, frames: Sequence[Frame]) -> None:
+    """Raises InputError for fewer than two frames: one to learn from, one to test."""
+    if len(frames) < 2:
+        raise InputError(f"scene {source}: has {len(frames)} posed images; at least 2 are needed, better 20")
+
+
+def find_image(folder: Path, name: str) -> Path:
+    """The file of image `name` in a folder, or one that differs in its ending; as named if there is none."""
+    path = folder / name
+    endings = [ending for suffix in IMAGE_SUFFIXES for ending in (suffix, suffix.upper())]
+    candidates = [path, *(path.with_suffix(ending) for ending in endings), *(Path(f"{path}{s}") for s in endings)]
+    return next((candidate for candidate in candidates if candidate.is_file()), path)
 
 
 def find_mask(folder: Path, name: str) -> Path:
@@ -90,12 +139,6 @@ def find_mask(folder: Path, name: str) -> Path:
 
 
 def _common_size(source: Path, frames: Sequence[Frame]) -> tuple[int, int]:
-    missing = [frame for frame in frames if not frame.image.is_file()]
-    if missing:
-        raise InputError(
-            f"scene {source}: {len(missing)} of {len(frames)} images are missing (first: {missing[0].image});"
-            " copy them there or remove their poses"
-        )
     first = image_size(frames[0].image)
     for frame in frames:
         size = image_size(frame.image)
@@ -120,8 +163,14 @@ def _masked_image(frame: Frame) -> Float[Tensor, "H W 4"]:
     return image * mask[..., None]
 
 
-def _scaled_intrinsics(source: Path, frame: Frame, size: tuple[int, int], target: tuple[int, int]) -> Tensor:
-    """K for images of `target` pixels, when files have `size` and K refers to `frame.size`."""
+def scaled_intrinsics(
+    source: Path, frame: Frame, size: tuple[int, int], target: tuple[int, int]
+) -> Float[Tensor, "3 3"]:
+    """K for images of `target` pixels, when the file has `size` and K refers to `frame.size`; float64.
+
+    Raises:
+        InputError: the file has another shape than K's image.
+    """
     scale = size[0] / frame.size[0]
     if abs(frame.size[1] * scale - size[1]) > 2:  # downscaled copies are rounded to whole pixels
         raise InputError(
@@ -130,10 +179,3 @@ def _scaled_intrinsics(source: Path, frame: Frame, size: tuple[int, int], target
         )
     ratio = torch.tensor([target[0] / frame.size[0], target[1] / frame.size[1], 1.0], dtype=torch.float64)
     return frame.K * ratio[:, None]
-
-
-def _view_names(frames: Sequence[Frame]) -> list[str]:
-    """Names fit for files: folders joined by underscores, endings dropped unless that made two alike."""
-    full = [frame.name.removeprefix("./").replace("/", "_") for frame in frames]
-    short = [PurePosixPath(name).stem for name in full]
-    return short if len(set(short)) == len(short) else full

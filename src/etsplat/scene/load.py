@@ -3,31 +3,56 @@
 from pathlib import Path
 
 from etsplat.core.errors import InputError
-from etsplat.scene.colmap import load_colmap
+from etsplat.io.images import IMAGE_SUFFIXES
+from etsplat.scene.colmap import read_colmap
+from etsplat.scene.frames import FrameSet, posed_views
 from etsplat.scene.hull import bounding_sphere
-from etsplat.scene.transforms import load_transforms
+from etsplat.scene.transforms import read_transforms
 from etsplat.scene.views import PosedViews
+
+
+def read_scene(path: Path | str, masks: Path | str | None = None, *, images: str | None = None) -> FrameSet:
+    """Read what a capture says about its images, without decoding them.
+
+    Args:
+        path: folder with `transforms.json` or `transforms_train.json` (`etsplat.scene.transforms`), or with `images/`
+            and `sparse/` (`etsplat.scene.colmap`).
+        masks: folder with a mask for every image, instead of the scene's own.
+        images: folder in the scene to take the images from (`images_4`).
+
+    Raises:
+        InputError: no such folder, neither layout, or what the layouts' readers refuse.
+    """
+    path = Path(path)
+    if not path.is_dir():
+        raise InputError(f"scene {path}: no such folder; check the path")
+    if images is not None and not (path / images).is_dir():
+        raise InputError(f"scene {path}: no folder {images} in it; choose another or leave it out")
+    if any((path / name).is_file() for name in ("transforms.json", "transforms_train.json")):
+        return read_transforms(path, masks, images=images)
+    if (path / "sparse").is_dir():
+        return read_colmap(path, masks, images=images)
+    raise InputError(
+        f"scene {path}: neither transforms.json nor sparse/ in it; choose the scene's folder{_offer(path)}"
+    )
 
 
 def load_views(path: Path | str, width: int | None = None) -> PosedViews:
     """Read a capture of an object and move it into the unit frame: the object lies inside the unit sphere.
 
     Args:
-        path: folder with `transforms.json` or `transforms_train.json` (`etsplat.scene.transforms`), or with `images/`
-            and `sparse/` (`etsplat.scene.colmap`). Needs RGBA images or masks.
+        path: as `read_scene`. Needs RGBA images or masks.
         width: shrink the images to this many pixels across (never enlarges).
 
     Raises:
-        InputError: no such folder, neither layout, anything that the layouts' loaders or
-            `etsplat.scene.hull.bounding_sphere` refuse.
+        InputError: as `read_scene`, `etsplat.scene.frames.posed_views` and `etsplat.scene.hull.bounding_sphere`.
     """
-    path = Path(path)
-    if not path.is_dir():
-        raise InputError(f"scene {path}: no such folder; check the path")
-    if any((path / name).is_file() for name in ("transforms.json", "transforms_train.json")):
-        views = load_transforms(path, width=width)
-    elif (path / "sparse").is_dir():
-        views = load_colmap(path, width=width)
-    else:
-        raise InputError(f"scene {path}: neither transforms.json nor sparse/ in it; choose the scene's folder")
+    views = posed_views(read_scene(path), width=width)
     return views.renormalized(*bounding_sphere(views))
+
+
+def _offer(path: Path) -> str:
+    """For a folder of photos: how to find the cameras."""
+    if any(file.suffix.lower() in IMAGE_SUFFIXES for file in path.iterdir()):
+        return f", or find the cameras of these photos: etsplat data sfm {path} --out SCENE"
+    return ""

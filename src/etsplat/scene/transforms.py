@@ -6,6 +6,7 @@ inverting gives our world-to-camera matrices with OpenCV axes.
 
 import json
 import math
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,63 +15,87 @@ from jaxtyping import Float
 from torch import Tensor
 
 from etsplat.core.errors import InputError
-from etsplat.io.images import IMAGE_SUFFIXES, image_size
-from etsplat.scene.frames import Frame, find_mask, load_frames
-from etsplat.scene.views import PosedViews, every_eighth
+from etsplat.io.images import image_size
+from etsplat.io.point_clouds import load_points
+from etsplat.scene.frames import Frame, FrameSet, find_image, find_mask
+from etsplat.scene.views import every_eighth
 
 _DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 _PINHOLE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE")
 _UNDISTORT = "undistort the images first (e.g. `colmap image_undistorter`) and export the poses again"
 
 
-def load_transforms(folder: Path | str, *, width: int | None = None) -> PosedViews:
+def read_transforms(folder: Path | str, masks: Path | str | None = None, *, images: str | None = None) -> FrameSet:
     """Read a scene folder with `transforms.json`, or with `transforms_train.json` and `transforms_test.json`.
 
     Images may be RGBA; otherwise a frame's `mask_path`, or a folder `masks/` with a file for every image, separates
     the object. With one `transforms.json` its `train_filenames` and `test_filenames` make the split; without them,
-    every 8th image by name is test. `transforms_val.json` is not used.
+    every 8th image by name is test. `transforms_val.json` is not used. `ply_file_path` names the points.
 
     Args:
         folder: the scene.
-        width: shrink the images to this many pixels across (never enlarges).
+        masks: folder with a mask for every image, in place of what the files name.
+        images: a folder in the scene that replaces the first folder of each image's path (`images_4`).
 
     Returns:
-        Views in the capture's own units.
+        Frames in the capture's own units.
 
     Raises:
-        InputError: a file is missing, damaged or of another layout; cameras with lens distortion; images as
-            `etsplat.scene.frames.load_frames`.
+        InputError: a file is missing, damaged or of another layout; cameras with lens distortion.
     """
     folder = Path(folder)
+    if masks is not None and not Path(masks).is_dir():
+        raise InputError(f"masks {masks}: no such folder; check the path")
+    where = _Folders(images, Path(masks) if masks is not None else None)
     if (folder / "transforms.json").is_file():
-        return _load_single(folder, width)
+        return _read_single(folder, where)
     train_file, test_file = folder / "transforms_train.json", folder / "transforms_test.json"
     if not train_file.is_file():
         raise InputError(
             f"scene {folder}: neither transforms.json nor transforms_train.json; choose the scene's folder"
         )
-    frames = _frames(train_file)
+    frames = _frames(train_file, where)
     train_count = len(frames)
-    if not test_file.is_file():
+    if test_file.is_file():
+        frames += _frames(test_file, where)
+        train, test = list(range(train_count)), list(range(train_count, len(frames)))
+    else:
         train, test = every_eighth([frame.name for frame in frames])
-        return load_frames(folder, frames, train, test, width=width)
-    frames += _frames(test_file)
-    return load_frames(folder, frames, list(range(train_count)), list(range(train_count, len(frames))), width=width)
+    return FrameSet(folder, frames, train, test, *_points(train_file))
 
 
-def _load_single(folder: Path, width: int | None) -> PosedViews:
+def _read_single(folder: Path, where: "_Folders") -> FrameSet:
     path = folder / "transforms.json"
-    frames = sorted(_frames(path), key=lambda frame: frame.name)
+    frames = sorted(_frames(path, where), key=lambda frame: frame.name)
     document = _read(path)
     if "train_filenames" not in document or "test_filenames" not in document:
         train, test = every_eighth([frame.name for frame in frames])
-        return load_frames(folder, frames, train, test, width=width)
+        return FrameSet(folder, frames, train, test, *_points(path))
     train_names, test_names = _name_set(path, document, "train_filenames"), _name_set(path, document, "test_filenames")
     train = [index for index, frame in enumerate(frames) if frame.name in train_names]
     test = [index for index, frame in enumerate(frames) if frame.name in test_names - train_names]
     if not train:
         raise InputError(f"scene {path}: train_filenames names none of the frames; correct or remove it")
-    return load_frames(folder, frames, train, test, width=width)
+    return FrameSet(folder, frames, train, test, *_points(path))
+
+
+@dataclass(frozen=True)
+class _Folders:
+    """What the caller wants instead of the folders that the file names."""
+
+    images: str | None
+    masks: Path | None
+
+
+def _points(path: Path) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "P 3"]] | tuple[None, None]:
+    """The points of `ply_file_path`, in the frame of the poses."""
+    name = _read(path).get("ply_file_path")
+    if name is None:
+        return None, None
+    if not isinstance(name, str):
+        raise InputError(f"scene {path}: ply_file_path = {name!r} is not a file name; correct or remove it")
+    points, colors = load_points(path.parent / _plain(name))
+    return (points, colors) if len(points) else (None, None)
 
 
 def _name_set(path: Path, document: dict[str, Any], key: str) -> set[str]:
@@ -85,28 +110,29 @@ def _plain(name: str) -> str:
     return name.replace("\\", "/").removeprefix("./")
 
 
-def _frames(path: Path) -> list[Frame]:
+def _frames(path: Path, where: _Folders) -> list[Frame]:
     document = _read(path)
     entries = document.get("frames")
     if not isinstance(entries, list) or not entries:
         raise InputError(f"scene {path}: no list `frames`; is it a NeRF capture? Export the poses again")
-    masks = path.parent / "masks"
-    return [_frame(path, document, entry, masks if masks.is_dir() else None) for entry in entries]
+    return [_frame(path, document, entry, where) for entry in entries]
 
 
-def _frame(path: Path, document: dict[str, Any], entry: dict[str, Any], masks: Path | None) -> Frame:
+def _frame(path: Path, document: dict[str, Any], entry: dict[str, Any], where: _Folders) -> Frame:
     if not isinstance(entry, dict) or not isinstance(entry.get("file_path"), str):
         raise InputError(f"scene {path}: a frame without `file_path`; export the poses again")
     name = _plain(entry["file_path"])
-    image = _image_file(path.parent, name)
+    image = find_image(path.parent, name if where.images is None else _moved(name, where.images))
     settings = {**document, **entry}
     _refuse_distortion(path, name, settings)
     size = _size(path, name, settings, image)
     mask = None
-    if isinstance(entry.get("mask_path"), str):
+    if where.masks is not None:
+        mask = find_mask(where.masks, image.name)
+    elif isinstance(entry.get("mask_path"), str):
         mask = path.parent / _plain(entry["mask_path"])
-    elif masks is not None:
-        mask = find_mask(masks, image.name)
+    elif (path.parent / "masks").is_dir():
+        mask = find_mask(path.parent / "masks", image.name)
     return Frame(name, image, mask, _viewmat(path, name, entry), _intrinsics(path, name, settings, size), size)
 
 
@@ -122,12 +148,9 @@ def _read(path: Path) -> dict[str, Any]:
     return document
 
 
-def _image_file(folder: Path, name: str) -> Path:
-    """The file as named, or with the ending that Blender exports leave out; as named if none exists."""
-    for candidate in [name, *(name + suffix for suffix in IMAGE_SUFFIXES)]:
-        if (folder / candidate).is_file():
-            return folder / candidate
-    return folder / name
+def _moved(name: str, images: str) -> str:
+    """`name` with its first folder replaced."""
+    return f"{images}/{name.split('/', 1)[-1]}"
 
 
 def _refuse_distortion(path: Path, name: str, settings: dict[str, Any]) -> None:
