@@ -1,12 +1,15 @@
 """The only place that adds or removes primitives.
 
-An edit is a plan (which rows come from which) carried out on everything that has a row per vertex or per face: the
-parameters, Adam's two moments, and statistics. None of them can be forgotten, because all go through `_carry`.
+An edit is a plan (which rows come from which) carried out on everything that has a row per vertex, per face or per
+triangle: the parameters, Adam's two moments, and statistics. None of them can be forgotten, because all go through
+`_carry`.
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 
 import torch
+from jaxtyping import Bool, Int
 from torch import Tensor
 
 from etsplat.geometry.subdivision import SubdivisionPlan
@@ -53,14 +56,90 @@ def apply_subdivision(
             raise ValueError(f"{name} must have {count} rows as the plan, got shape {tuple(tensor.shape)}")
     if missing := set(statistics) - set(carry):
         raise ValueError(f"per_vertex or per_face must name every statistic, got none of {sorted(missing)}")
-    return {name: _carry(name, move, adam, statistics) for name, move in carry.items()}
+    return {name: _carry(name, move, move, adam, statistics) for name, move in carry.items()}
+
+
+@dataclass(frozen=True)
+class RowPlan:
+    """How N separate primitives become M.
+
+    Attributes:
+        num_rows: N.
+        source: (M,) the old row that each new row is or is made from.
+        fresh: (M,) whether the row is made by this edit: it starts with zero moments and statistics.
+        values: by name of a parameter, its values in the fresh rows, in their order. The parameters that are not named
+            are copied from the source.
+    """
+
+    num_rows: int
+    source: Int[Tensor, " M"]
+    fresh: Bool[Tensor, " M"]
+    values: Mapping[str, Tensor] = field(default_factory=dict)
+
+    @staticmethod
+    def keeping(kept: Bool[Tensor, " N"]) -> "RowPlan":
+        """The plan that removes all other rows."""
+        source = kept.nonzero()[:, 0]
+        return RowPlan(len(kept), source, torch.zeros(len(source), dtype=torch.bool, device=kept.device))
+
+
+def apply_rows(
+    plan: RowPlan, adam: Adam, statistics: Mapping[str, Tensor]
+) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """Adds, removes and reorders primitives. Every parameter of `adam` and every statistic has a row for each.
+
+    Args:
+        plan: which rows there are afterwards.
+        adam: the optimizer; its parameters and moments are replaced in place.
+        statistics: tensors that are not parameters but have rows too.
+
+    Returns:
+        The new parameters (leaf tensors with the old requires_grad) and statistics, by name.
+
+    Raises:
+        ValueError: a tensor does not have the plan's number of rows, or values do not fit. Nothing has been changed
+            then.
+    """
+    for name, tensor in [*adam.parameters.items(), *statistics.items()]:
+        if tensor.ndim == 0 or len(tensor) != plan.num_rows:
+            raise ValueError(f"{name} must have {plan.num_rows} rows as the plan, got shape {tuple(tensor.shape)}")
+    count = int(plan.fresh.sum())
+    for name, values in plan.values.items():
+        if name not in adam.parameters:
+            raise ValueError(f"values must name parameters, got {name!r}")
+        expected = (count, *adam.parameters[name].shape[1:])
+        if tuple(values.shape) != expected:
+            raise ValueError(f"values of {name} must have shape {expected}, got {tuple(values.shape)}")
+
+    def start_at_zero(tensor: Tensor) -> Tensor:
+        moved = tensor[plan.source]
+        moved[plan.fresh] = 0
+        return moved
+
+    def set_values(name: str) -> Callable[[Tensor], Tensor]:
+        def move(tensor: Tensor) -> Tensor:
+            moved = tensor[plan.source]
+            if name in plan.values:
+                moved[plan.fresh] = plan.values[name].to(moved)
+            return moved
+
+        return move
+
+    parameters = {name: _carry(name, set_values(name), start_at_zero, adam, {}) for name in list(adam.parameters)}
+    return parameters, {name: start_at_zero(tensor) for name, tensor in statistics.items()}
 
 
 @torch.no_grad()
-def _carry(name: str, move: Callable[[Tensor], Tensor], adam: Adam, statistics: Mapping[str, Tensor]) -> Tensor:
+def _carry(
+    name: str,
+    move: Callable[[Tensor], Tensor],
+    move_moment: Callable[[Tensor], Tensor],
+    adam: Adam,
+    statistics: Mapping[str, Tensor],
+) -> Tensor:
     if name in statistics:
         return move(statistics[name])
     old = adam.parameters[name]
     new = move(old.detach()).requires_grad_(old.requires_grad)
-    adam.replace(name, new, move(adam.first_moments[name]), move(adam.second_moments[name]))
+    adam.replace(name, new, move_moment(adam.first_moments[name]), move_moment(adam.second_moments[name]))
     return new
