@@ -2,6 +2,7 @@
 #include "parallel.h"
 
 namespace etsplat {
+void bind_antialias(nb::module_& m);
 void bind_array_scans(nb::module_& m);
 void bind_geometry(nb::module_& m);
 void bind_mesh_energies(nb::module_& m);
@@ -21,6 +22,7 @@ NB_MODULE(_native, m) {
     m.def("set_num_threads", &set_num_threads);
     m.def("parallel_seconds", &parallel_seconds);
     m.def("reset_parallel_seconds", &reset_parallel_seconds);
+    bind_antialias(m);
     bind_array_scans(m);
     bind_geometry(m);
     bind_mesh_energies(m);

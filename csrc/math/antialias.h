@@ -1,0 +1,61 @@
+// Formulas of antialiased z-buffer rasterization with their derivatives: where a silhouette crosses the line between two
+// pixel centres, and how interpolated values change with the corners of their triangle.
+//
+// The T of the CPU engine is double here: a crossing decides between pixels, and a triangle's view matrix is nearly
+// singular where the triangle is small.
+#pragma once
+
+#include "vector3.h"
+
+namespace etsplat {
+
+// Where the line from a to b meets the row (or column) at `across`. Coordinates along it, and across it.
+template <class T>
+struct Crossing {
+    T position;  // along
+    T fraction;  // from a (0) to b (1)
+    T slope;     // d along / d across
+};
+
+template <class T>
+ETSPLAT_FN Crossing<T> crossing(T a_along, T a_across, T b_along, T b_across, T across) {
+    const T slope = (b_along - a_along) / (b_across - a_across);
+    return {a_along + (across - a_across) * slope, (across - a_across) / (b_across - a_across), slope};
+}
+
+// d position / d (a_along, a_across, b_along, b_across): moving an end across slides the line along its slope.
+template <class T>
+ETSPLAT_FN void crossing_derivative(const Crossing<T>& c, T* derivative) {
+    derivative[0] = T(1.0f) - c.fraction;
+    derivative[1] = T(0.0f) - (T(1.0f) - c.fraction) * c.slope;
+    derivative[2] = c.fraction;
+    derivative[3] = T(0.0f) - c.fraction * c.slope;
+}
+
+// A triangle as seen from the camera's centre: its barycentrics at the pixel with ray r are b = beta / sum(beta), where
+// V beta = r and V has the corners, relative to the centre, as columns. Row k of V^-1:
+template <class T>
+struct ViewInverse {
+    Vector3<T> row[3];
+};
+
+// Rows of 0 for a triangle seen edge on.
+template <class T>
+ETSPLAT_FN ViewInverse<T> view_inverse(const Vector3<T>* corner) {
+    const Vector3<T> normal = cross(corner[1], corner[2]);
+    const T determinant = dot(corner[0], normal);
+    const T inverse = determinant != T(0.0f) ? T(1.0f) / determinant : T(0.0f);
+    return {{inverse * normal, inverse * cross(corner[2], corner[0]), inverse * cross(corner[0], corner[1])}};
+}
+
+// With cotangents g_k of b_k: dL/dv_m = -b_m u. From V beta = r follows d beta = -V^-1 dV beta, and from b = beta /
+// sum(beta) that u = V^-T (g - sum_j b_j g_j).
+template <class T>
+ETSPLAT_FN Vector3<T> interpolation_derivative(const ViewInverse<T>& inverse, const T* barycentrics, const T* cotangent) {
+    const T mean =
+        barycentrics[0] * cotangent[0] + barycentrics[1] * cotangent[1] + barycentrics[2] * cotangent[2];
+    return (cotangent[0] - mean) * inverse.row[0] + (cotangent[1] - mean) * inverse.row[1] +
+           (cotangent[2] - mean) * inverse.row[2];
+}
+
+}  // namespace etsplat
