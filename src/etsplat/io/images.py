@@ -52,7 +52,7 @@ def load_pixels(path: Path | str, width: int, height: int) -> UInt8[Tensor, "H W
         else:
             loaded = _converted(path, image, _color_mode(image))
     if loaded.mode == "RGBA":
-        opaque = loaded.getextrema()[3][0] == 255
+        opaque = np.asarray(loaded)[..., 3].min() == 255
         loaded = loaded.convert("RGB" if opaque else "RGBa")
     if loaded.size != (width, height):
         loaded = loaded.resize((width, height), Image.Resampling.BICUBIC)

@@ -89,7 +89,7 @@ def _ascii_table(path: Path, text: bytes, dtype: np.dtype, count: int) -> np.nda
     rows = text.decode("ascii", errors="replace").splitlines()[:count]
     try:
         values = np.array([[float(word) for word in row.split()] for row in rows], dtype=np.float64)
-        if values.shape != (count, len(dtype)):
+        if values.shape != (count, len(dtype.names or ())):
             raise ValueError("rows are missing or of different lengths")
     except ValueError as error:
         raise InputError(f"points {path}: the vertices cannot be read ({error}); export it again") from error
