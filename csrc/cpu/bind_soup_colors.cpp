@@ -28,22 +28,12 @@ Vector centroid(const SoupColors& p, int64_t n) {
 }
 
 void forward(const SoupColors& p, float* colors) {
-    const int bases = (p.degree + 1) * (p.degree + 1);
     parallel_for(p.triangles, kTriangles, [&](int64_t begin, int64_t end) {
-        float basis[kMaxShBases] = {}, length;
         for (int64_t n = begin; n < end; ++n) {
-            const float* rest = p.rest + 3 * p.bases * n;
             const Vector middle = centroid(p, n);
             for (int64_t view = 0; view < p.views; ++view) {
-                const Vector unit = direction(middle - p.centers[view], length);
-                const int used = length > kMinLength ? bases : 1;
-                sh_basis(p.degree, unit, basis);
-                float sum[3];
-                for (int c = 0; c < 3; ++c) sum[c] = 0.5f + kSh0 * p.dc[3 * n + c];
-                for (int k = 1; k < used; ++k)
-                    for (int c = 0; c < 3; ++c) sum[c] += basis[k] * rest[3 * (k - 1) + c];
-                float* color = colors + 3 * (view * p.triangles + n);
-                for (int c = 0; c < 3; ++c) color[c] = vmax(sum[c], 0.0f);
+                soup_color(p.degree, middle - p.centers[view], p.dc + 3 * n, p.rest + 3 * p.bases * n,
+                           colors + 3 * (view * p.triangles + n));
             }
         }
     });
@@ -52,34 +42,19 @@ void forward(const SoupColors& p, float* colors) {
 // A colour of 0 was clamped and passes no gradient. The bands above `degree` get zero.
 void backward(const SoupColors& p, const float* colors, const float* grad_colors, Vector* grad_corners, float* grad_dc,
               float* grad_rest) {
-    const int bases = (p.degree + 1) * (p.degree + 1);
     parallel_for(p.triangles, kTriangles, [&](int64_t begin, int64_t end) {
-        float basis[kMaxShBases] = {}, along[kMaxShBases] = {}, length;
         std::fill(grad_rest + 3 * p.bases * begin, grad_rest + 3 * p.bases * end, 0.0f);
         for (int64_t n = begin; n < end; ++n) {
-            const float* rest = p.rest + 3 * p.bases * n;
-            float *sums = grad_rest + 3 * p.bases * n, *dc = grad_dc + 3 * n;
             const Vector middle = centroid(p, n);
             Vector moved{0.0f, 0.0f, 0.0f};
-            for (int c = 0; c < 3; ++c) dc[c] = 0.0f;
+            for (int c = 0; c < 3; ++c) grad_dc[3 * n + c] = 0.0f;
             for (int64_t view = 0; view < p.views; ++view) {
                 const int64_t at = 3 * (view * p.triangles + n);
                 float cotangent[3];
                 for (int c = 0; c < 3; ++c) cotangent[c] = colors[at + c] > 0.0f ? grad_colors[at + c] : 0.0f;
                 if (cotangent[0] == 0.0f && cotangent[1] == 0.0f && cotangent[2] == 0.0f) continue;  // out of view
-                for (int c = 0; c < 3; ++c) dc[c] += kSh0 * cotangent[c];
-                const Vector unit = direction(middle - p.centers[view], length);
-                if (p.degree == 0 || length <= kMinLength) continue;
-                sh_basis(p.degree, unit, basis);
-                for (int k = 1; k < bases; ++k) {
-                    along[k] = 0.0f;
-                    for (int c = 0; c < 3; ++c) {
-                        sums[3 * (k - 1) + c] += cotangent[c] * basis[k];
-                        along[k] += cotangent[c] * rest[3 * (k - 1) + c];
-                    }
-                }
-                const Vector g = sh_basis_backward(p.degree, unit, along);
-                moved = moved + (1.0f / length) * (g - dot(g, unit) * unit);  // through the normalisation
+                moved = moved + soup_color_backward(p.degree, middle - p.centers[view], p.rest + 3 * p.bases * n,
+                                                    cotangent, grad_dc + 3 * n, grad_rest + 3 * p.bases * n);
             }
             for (int corner = 0; corner < 3; ++corner) grad_corners[3 * n + corner] = (1.0f / 3.0f) * moved;
         }

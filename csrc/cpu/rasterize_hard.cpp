@@ -136,7 +136,7 @@ struct TileBuffer {
 
 // Triangles come in ascending index: a strict comparison lets the smaller index win a tie.
 void draw(const Screen& screen, int32_t index, TileBuffer& tile) {
-    const HardTriangle& t = screen.triangles[index];
+    const HardTriangle t = screen.triangles[index];  // a copy, which no store can alias
     const auto slope = static_cast<float>(t.inverse_depth_dx);
     const int32_t y_end = std::min(t.y_end, tile.y1);
     for (int32_t y = std::max(t.y_begin, tile.y0); y < y_end; ++y) {

@@ -85,4 +85,36 @@ ETSPLAT_FN Vector3<float> sh_direction_backward(int degree, Vector3<float> unit,
     return inverse * (g - dot(g, unit) * unit);
 }
 
+// Colour of a triangle seen along `toward`, of any length; its coefficients are split: the constant band and the rest.
+ETSPLAT_FN void soup_color(int degree, Vector3<float> toward, const float* dc, const float* rest, float* color) {
+    float basis[kMaxShBases] = {}, length, sum[3];
+    const Vector3<float> unit = direction(toward, length);
+    sh_basis(degree, unit, basis);
+    for (int c = 0; c < 3; ++c) sum[c] = 0.5f + kSh0 * dc[c];
+    if (length > kMinLength) {
+        for (int k = 1; k < (degree + 1) * (degree + 1); ++k)
+            for (int c = 0; c < 3; ++c) sum[c] += basis[k] * rest[3 * (k - 1) + c];
+    }
+    for (int c = 0; c < 3; ++c) color[c] = vmax(sum[c], 0.0f);
+}
+
+// From the gradient by the colour before its clamp: adds to those by dc and rest, returns that by `toward`.
+ETSPLAT_FN Vector3<float> soup_color_backward(int degree, Vector3<float> toward, const float* rest,
+                                              const float* cotangent, float* grad_dc, float* grad_rest) {
+    float basis[kMaxShBases] = {}, along[kMaxShBases] = {}, length;
+    for (int c = 0; c < 3; ++c) grad_dc[c] += kSh0 * cotangent[c];
+    const Vector3<float> unit = direction(toward, length);
+    if (degree == 0 || length <= kMinLength) return {0.0f, 0.0f, 0.0f};
+    sh_basis(degree, unit, basis);
+    for (int k = 1; k < (degree + 1) * (degree + 1); ++k) {
+        along[k] = 0.0f;
+        for (int c = 0; c < 3; ++c) {
+            grad_rest[3 * (k - 1) + c] += cotangent[c] * basis[k];
+            along[k] += cotangent[c] * rest[3 * (k - 1) + c];
+        }
+    }
+    const Vector3<float> g = sh_basis_backward(degree, unit, along);
+    return (1.0f / length) * (g - dot(g, unit) * unit);  // through the normalisation
+}
+
 }  // namespace etsplat

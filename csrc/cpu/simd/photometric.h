@@ -11,21 +11,17 @@
 #include <cstring>
 
 #include "cpu/photometric_pass.h"
+#include "math/photometric.h"
+#include "math/ssim.h"
 
 namespace etsplat::ETSPLAT_SIMD {
 namespace {
 
-constexpr int kReach = 5, kTaps = 2 * kReach + 1, kPad = 3 * kReach;
-constexpr float kC1 = 0.01f * 0.01f, kC2 = 0.03f * 0.03f;
-// exp(-k^2 / (2 1.5^2)) for k = 0..5, divided by the sum over -5..5.
-constexpr float kWindow[kReach + 1] = {0.26601172486179436f, 0.2130055377112537f,   0.10936068950970002f,
-                                       0.03600077212843083f, 0.007598758135239185f, 0.00102838008447911f};
+constexpr int kReach = kSsimReach, kTaps = kSsimTaps, kPad = 3 * kReach;
 
 inline void blur_row(const float* __restrict in, float* __restrict out, int64_t n) {
     for (int64_t i = 0; i < n; ++i) {
-        float sum = kWindow[0] * in[i];
-        for (int k = 1; k <= kReach; ++k) sum += kWindow[k] * (in[i - 3 * k] + in[i + 3 * k]);
-        out[i] = sum;
+        out[i] = ssim_blur([=](int k) { return in[i + 3 * k]; });
     }
 }
 
@@ -38,9 +34,7 @@ public:
         const float* __restrict r[kTaps];
         for (int k = 0; k < kTaps; ++k) r[k] = row(y + k - kReach);
         for (int64_t i = 0; i < n_; ++i) {
-            float sum = kWindow[0] * r[kReach][i];
-            for (int k = 1; k <= kReach; ++k) sum += kWindow[k] * (r[kReach - k][i] + r[kReach + k][i]);
-            out[i] = sum;
+            out[i] = ssim_blur([&r, i](int k) { return r[kReach + k][i]; });
         }
     }
 
@@ -49,8 +43,6 @@ private:
     int64_t n_;
 };
 
-// SSIM = (2 mx my + C1) (2 cov + C2) / ((mx^2 + my^2 + C1) (var x + var y + C2)) from the moments mx = E x, my = E y,
-// square = E (x^2 + y^2), product = E x y; and its derivatives by mx, by E x^2 and by E x y.
 struct Moments {
     const float *x, *y, *square, *product;
 };
@@ -60,34 +52,26 @@ inline void similarity_row(const Moments& m, float* __restrict similarity, float
     const float *__restrict mx_row = m.x, *__restrict my_row = m.y;
     const float *__restrict square_row = m.square, *__restrict product_row = m.product;
     for (int64_t i = 0; i < n; ++i) {
-        const float mx = mx_row[i], my = my_row[i], cross = mx * my, squares = mx * mx + my * my;
-        const float a1 = 2.0f * cross + kC1, a2 = 2.0f * (product_row[i] - cross) + kC2;
-        const float b1 = squares + kC1, b2 = square_row[i] - squares + kC2;
-        const float inverse = 1.0f / (b1 * b2), s = a1 * a2 * inverse;
-        const float over_b2 = s * b1 * inverse, over_b1 = s * b2 * inverse;  // s / b2, s / b1
-        similarity[i] = s;
-        by_mean[i] = 2.0f * (my * (a2 - a1) * inverse + mx * (over_b2 - over_b1));
-        by_square[i] = -over_b2;
-        by_product[i] = 2.0f * a1 * inverse;
+        const Similarity s = ::etsplat::similarity(mx_row[i], my_row[i], square_row[i], product_row[i]);
+        similarity[i] = s.value;
+        by_mean[i] = s.by_mean;
+        by_square[i] = s.by_square;
+        by_product[i] = s.by_product;
     }
-}
-
-template <class Byte>
-inline float unit(Byte value) {
-    if constexpr (sizeof(Byte) == 1) return static_cast<float>(value) * (1.0f / 255.0f);
-    return static_cast<float>(value);
 }
 
 // One row of the target over its background: y.
 template <class Value>
 void target_row(const PhotometricPass& pass, const Value* __restrict in, const float* background, float* __restrict y) {
     if (pass.channels == 3) {
-        for (int64_t i = 0; i < 3 * pass.width; ++i) y[i] = unit(in[i]);
+        for (int64_t i = 0; i < 3 * pass.width; ++i) y[i] = unit_value(in[i]);
         return;
     }
     for (int64_t p = 0; p < pass.width; ++p) {
-        const float rest = 1.0f - unit(in[4 * p + 3]);
-        for (int c = 0; c < 3; ++c) y[3 * p + c] = unit(in[4 * p + c]) + (background ? rest * background[c] : 0.0f);
+        const float rest = 1.0f - unit_value(in[4 * p + 3]);
+        for (int c = 0; c < 3; ++c) {
+            y[3 * p + c] = over_background(unit_value(in[4 * p + c]), rest, background ? background[c] : 0.0f);
+        }
     }
 }
 
@@ -137,7 +121,7 @@ double pixel_row(const PhotometricPass& pass, const float* __restrict x, const f
     if (gradient && pass.squared) {
         for (int64_t i = 0; i < n; ++i) gradient[i] = 2.0f * weight * (x[i] - y[i]);
     } else if (gradient) {
-        for (int64_t i = 0; i < n; ++i) gradient[i] = x[i] > y[i] ? weight : x[i] < y[i] ? -weight : 0.0f;
+        for (int64_t i = 0; i < n; ++i) gradient[i] = l1_gradient(x[i] - y[i], weight);
     }
     if (pass.squared) return lane_sum(n, [&](int64_t i) { return (x[i] - y[i]) * (x[i] - y[i]); });
     return lane_sum(n, [&](int64_t i) { return std::fabs(x[i] - y[i]); });
@@ -206,8 +190,8 @@ PhotometricSums photometric_band(const PhotometricPass& pass, int64_t view, int6
         float* __restrict gradient = pass.gradient + (view * pass.height + done) * n;
         const float *__restrict x_done = xs.row(done) + kPad, *__restrict y_done = ys.row(done) + kPad;
         for (int64_t i = 0; i < n; ++i) {
-            const float slope = blurred[0][i] + 2.0f * x_done[i] * blurred[1][i] + y_done[i] * blurred[2][i];
-            gradient[i] -= pass.ssim_weight * slope;
+            gradient[i] -= pass.ssim_weight *
+                           similarity_slope(blurred[0][i], blurred[1][i], blurred[2][i], x_done[i], y_done[i]);
         }
         mask_row(pass, (view * pass.height + done) * pass.width, gradient);
     }
