@@ -26,8 +26,7 @@ class Counting:
     """A problem whose loss is the iteration; it refines at iteration 3."""
 
     def __init__(self) -> None:
-        self.faces = 20
-        self.sigma = 1.0
+        self.count = 20
         self.done: list[str] = []
         self.finite = True
         self.on_step: Callable[[int], float] = float
@@ -39,14 +38,17 @@ class Counting:
     def refine(self, iteration: int) -> int:
         self.done.append(f"refine {iteration}")
         added = 10 if iteration == 3 else 0
-        self.faces += added
+        self.count += added
         return added
 
     def evaluate(self) -> dict[str, float]:
         return {"psnr": 30.0}
 
-    def is_finite(self) -> bool:
-        return self.finite
+    def describe(self) -> dict[str, float]:
+        return {"faces": self.count}
+
+    def first_not_finite(self) -> str | None:
+        return None if self.finite else "colors"
 
 
 def events_of(problem: Counting, folder: Path, progress: Progress | None = None) -> list[Event]:
@@ -71,7 +73,7 @@ def test_the_logged_loss_is_the_mean_since_the_last_log(tmp_path: Path) -> None:
     """With loss = iteration: mean of 1..4, of 5, of 6..8, of 9..10."""
     steps = [event for event in events_of(Counting(), tmp_path) if isinstance(event, StepEvent)]
     assert [event.loss for event in steps] == [2.5, 5.0, 7.0, 9.5]
-    assert [event.faces for event in steps] == [30] * 4
+    assert [event.state["faces"] for event in steps] == [30] * 4
     assert [event.metrics for event in steps] == [{}, {"psnr": 30.0}, {}, {"psnr": 30.0}]
 
 

@@ -19,8 +19,9 @@ from etsplat.optim.loop import CheckpointEvent, DivergedError, DoneEvent, Event,
 from etsplat.scene.demo_object import demo_object
 from etsplat.scene.photograph import photograph
 from etsplat.tasks.mesh_fitting import MeshFitting
-from etsplat.tasks.reconstruct import PrepareEvent, ReconstructResult, reconstruct
+from etsplat.tasks.reconstruct import ReconstructResult, reconstruct
 from etsplat.tasks.reconstruct_config import PRESETS, ReconstructConfig
+from etsplat.tasks.running import PrepareEvent
 
 TINY = PRESETS["tiny"]
 # Shorter still, with subdivisions at iterations 4, 14, 24, 34 and checkpoints at 10, 20, ...
@@ -136,7 +137,7 @@ def test_callbacks_see_all_events_in_order(owl: tuple[ReconstructResult, list[Ev
     assert prepared == [PrepareEvent(n, 40) for n in range(1, 41)]
     assert events[:40] == prepared
     assert [event.iteration for event in rest] == sorted(event.iteration for event in rest)
-    faces = [320] + [event.faces for event in rest if isinstance(event, RefineEvent)]
+    faces = [320] + [event.count for event in rest if isinstance(event, RefineEvent)]
     assert len(faces) == 6
     assert faces == sorted(faces)
     assert [event.iteration for event in rest if isinstance(event, CheckpointEvent)] == list(range(50, 301, 50))

@@ -36,15 +36,6 @@ def test_colors_depend_on_the_direction_once_the_bands_do(rng):
     assert bool((front > back).all())
 
 
-def test_a_value_that_is_not_finite_is_named(rng):
-    """NaN and infinity are found, and the parameter is named."""
-    start = soup(rng)
-    assert start.is_finite()
-    start.sigma_raw.data[3] = torch.inf
-    assert start.first_not_finite() == "sigma_raw"
-    assert not start.is_finite()
-
-
 def test_wrong_shapes_are_refused(rng):
     """A tensor with another number of rows or bands is named."""
     parts = {name: value.detach() for name, value in soup(rng).parameters().items()}

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from etsplat.core.validation import check_finite, check_indices, check_positive
+from etsplat.core.validation import check_finite, check_indices, check_positive, first_not_finite
 from etsplat.ops.pool import zeros_like
 
 LARGE = 100_000  # several ranges of the native scans
@@ -65,3 +65,11 @@ def test_recycled_memory_is_zeroed(shape):
         assert zeros.shape == shape
         assert torch.equal(zeros, torch.zeros(shape))
         zeros += 1
+
+
+def test_a_tensor_that_is_not_finite_is_named():
+    """NaN and infinity are found in any precision; the first name is given."""
+    tensors = {"a": torch.ones(3), "b": torch.tensor([1.0, torch.inf]), "c": torch.full((2,), torch.nan).double()}
+    assert first_not_finite(tensors) == "b"
+    assert first_not_finite({"a": tensors["a"], "c": tensors["c"]}) == "c"
+    assert first_not_finite({"a": tensors["a"]}) is None

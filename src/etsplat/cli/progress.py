@@ -13,17 +13,18 @@ from rich.progress import (
 )
 
 from etsplat.optim.loop import DoneEvent, Event, StepEvent
-from etsplat.tasks.reconstruct import NoteEvent, PrepareEvent
+from etsplat.tasks.running import NoteEvent, PrepareEvent
 
 LINES = 10
 """Without a terminal, so many lines tell of the optimization."""
 
 
 class RunProgress:
-    """A callback for `reconstruct`, and the context in which its bar is alive."""
+    """A callback for a task, and the context in which its bar is alive."""
 
-    def __init__(self, console: Console) -> None:
+    def __init__(self, console: Console, *, preparing: str = "Taking pictures") -> None:
         self._console = console
+        self._preparing = preparing
         self._progress = Progress(
             SpinnerColumn(),
             TextColumn("{task.description}"),
@@ -56,7 +57,7 @@ class RunProgress:
     def __call__(self, event: Event | PrepareEvent | NoteEvent) -> None:
         """Take in an event of the run."""
         if isinstance(event, PrepareEvent):
-            self._show("Taking pictures", event.done, event.total)
+            self._show(self._preparing, event.done, event.total)
         elif isinstance(event, NoteEvent):
             self._console.print(f"  {event.text}", highlight=False, markup=False, soft_wrap=True)
         elif isinstance(event, StepEvent):
@@ -71,7 +72,8 @@ class RunProgress:
     def _step(self, event: StepEvent) -> None:
         if "psnr" in event.metrics:
             self._psnr = f" · {event.metrics['psnr']:.2f} dB"
-        state = f"loss {event.loss:.4f}{self._psnr} · {event.faces:,} faces · σ {event.sigma:.3f}"
+        counts = "".join(f" · {event.state[name]:,} {name}" for name in ("faces", "triangles") if name in event.state)
+        state = f"loss {event.loss:.4f}{self._psnr}{counts} · σ {event.state['sigma']:.3f}"
         self._show("Optimizing", event.iteration, event.iterations, state)
         if not self._console.is_terminal and event.iteration * LINES >= self._lines * event.iterations:
             self._lines = event.iteration * LINES // event.iterations + 1

@@ -1,6 +1,6 @@
 """Checks of tensor arguments; every failure is a ValueError that names the argument, what it got and what it wants."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -71,12 +71,19 @@ def check_indices(name: str, indices: Tensor, count: int) -> None:
 
 def check_finite(name: str, tensor: Tensor) -> None:
     """Raise ValueError if ``tensor`` holds NaN or infinity; the message says how many."""
-    if _is_plain(tensor) and tensor.dtype == torch.float32:
-        bad = _native.scan_floats(tensor.data_ptr(), tensor.numel()).nonfinite
-    else:
-        bad = int((~torch.isfinite(tensor)).sum())
-    if bad:
+    if bad := _count_not_finite(tensor):
         raise ValueError(f"{name} must be finite, got {bad} NaN or infinite values")
+
+
+def first_not_finite(tensors: Mapping[str, Tensor]) -> str | None:
+    """The name of the first tensor that holds NaN or infinity, or None."""
+    return next((name for name, tensor in tensors.items() if _count_not_finite(tensor)), None)
+
+
+def _count_not_finite(tensor: Tensor) -> int:
+    if _is_plain(tensor) and tensor.dtype == torch.float32:
+        return _native.scan_floats(tensor.data_ptr(), tensor.numel()).nonfinite
+    return int((~torch.isfinite(tensor)).sum())
 
 
 def check_positive(name: str, tensor: Tensor) -> None:

@@ -24,17 +24,35 @@ _README = """\
 This folder is a run of etsplat ({task}).
 
 report.html     the whole result on one page; opens in any browser, without a network
-mesh.ply        the result with exact face colours
-mesh.obj        the same with vertex colours (also mesh.glb, which most viewers open)
+{results}
 metrics.json    how good it is; docs/conventions.md of etsplat says how each number is measured
-test/           held-out views: NNN_render.png (splatted), NNN_truth.png, NNN_mesh.png (the mesh drawn opaque)
-history.jsonl   one line per log step: iteration, seconds of optimisation, loss, faces, sigma, and what was evaluated
-convergence.png how loss, quality and the number of faces went; overview.png shows test views
+{test}
+history.jsonl   one line per log step: iteration, seconds of optimisation, loss, state, and what was evaluated
+convergence.png how loss, quality and the number of triangles went; overview.png shows test views
 config.json     the settings that made it
 checkpoints/    where an interrupted run continues with --resume; safe to delete once the run is done
 """
 
+_RESULTS = {
+    "reconstruct": """\
+mesh.ply        the result with exact face colours
+mesh.obj        the same with vertex colours (also mesh.glb, which most viewers open)""",
+    "train": """\
+soup.safetensors  the result: triangles with opacity, softness and view-dependent colour; etsplat export converts it""",
+}
+
+_TEST = {
+    "reconstruct": """\
+test/           held-out views: NNN_render.png (splatted), NNN_truth.png, NNN_mesh.png (the mesh drawn opaque)""",
+    "train": """\
+test/           held-out views: NNN_render.png (splatted), NNN_truth.png, NNN_opaque.png (drawn opaque)""",
+}
+
 _FILES = (
+    "mesh.ply",
+    "mesh.obj",
+    "mesh.glb",
+    "soup.safetensors",
     "metrics.json",
     "history.jsonl",
     "convergence.png",
@@ -85,6 +103,11 @@ class RunDirectory:
         """mesh.ply, mesh.obj or mesh.glb."""
         return self.path / f"mesh{suffix}"
 
+    @property
+    def soup_path(self) -> Path:
+        """soup.safetensors."""
+        return self.path / "soup.safetensors"
+
     @staticmethod
     def check_free(path: Path | str, *, overwrite: bool = False) -> None:
         """Refuses a folder in which `create` would fail, without writing anything into it that stays.
@@ -118,7 +141,7 @@ class RunDirectory:
 
         Args:
             path: as in `check_free`.
-            config: what config.json holds, JSON-serialisable, with the key "task".
+            config: what config.json holds, JSON-serialisable, with the key "task": "reconstruct" or "train".
             overwrite: whether an earlier run may be replaced. Only files that a run writes are removed.
 
         Raises:
@@ -132,7 +155,8 @@ class RunDirectory:
             run.checkpoints.mkdir()
             run.test.mkdir()
         _write_json(run.config_path, {"format": FORMAT, **config})
-        _write_text(run.path / "README.txt", _README.format(task=config["task"]))
+        task = config["task"]
+        _write_text(run.path / "README.txt", _README.format(task=task, results=_RESULTS[task], test=_TEST[task]))
         return run
 
     @classmethod
@@ -205,7 +229,7 @@ class RunDirectory:
 
     def _remove_results(self) -> None:
         # config.json goes last: until then the folder still says whose it is.
-        for name in [f"mesh{suffix}" for suffix in (".ply", ".obj", ".glb")] + list(_FILES):
+        for name in _FILES:
             (self.path / name).unlink(missing_ok=True)
         for name in _FOLDERS:
             if (self.path / name).is_dir():

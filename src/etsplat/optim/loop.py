@@ -31,8 +31,7 @@ class StepEvent:
         seconds: time spent optimising so far (steps and refinements), over all parts of a resumed run. Evaluation,
             checkpoints and callbacks are not in it.
         loss: mean over the iterations since the last event of this kind.
-        faces: number of faces.
-        sigma: softness.
+        state: what the problem says of itself, such as "faces" and "sigma".
         metrics: what was evaluated at this iteration ("psnr", "chamfer"), or empty.
     """
 
@@ -40,8 +39,7 @@ class StepEvent:
     iterations: int
     seconds: float
     loss: float
-    faces: int
-    sigma: float
+    state: dict[str, float]
     metrics: dict[str, float]
 
 
@@ -51,12 +49,12 @@ class RefineEvent:
 
     Attributes:
         iteration: iterations done.
-        faces: number of faces now.
-        added: how many more than before.
+        count: number of primitives now.
+        added: how many more than before; negative if there are fewer.
     """
 
     iteration: int
-    faces: int
+    count: int
     added: int
 
 
@@ -106,13 +104,12 @@ class Problem(Protocol):
     """What the loop drives: parameters, their optimizer, and the data they are fitted to."""
 
     @property
-    def faces(self) -> int:
+    def count(self) -> int:
         """Number of primitives."""
         ...
 
-    @property
-    def sigma(self) -> float:
-        """Softness."""
+    def describe(self) -> dict[str, float]:
+        """A few numbers about the present state for the log, by name. Changes nothing."""
         ...
 
     def step(self, iteration: int) -> float:
@@ -127,8 +124,8 @@ class Problem(Protocol):
         """Cheap metrics of the present state. Changes nothing."""
         ...
 
-    def is_finite(self) -> bool:
-        """Whether no parameter holds NaN or infinity."""
+    def first_not_finite(self) -> str | None:
+        """The name of a parameter that holds NaN or infinity, or None."""
         ...
 
 
@@ -197,15 +194,15 @@ def optimize(
             stopping = interrupted()
             saving = last or stopping or _due(iteration, settings.checkpoint_every)
             logging = evaluating or _due(iteration, settings.log_every)
-            if (logging or saving) and not problem.is_finite():
-                raise DivergedError(f"a parameter is not finite at iteration {iteration}; {_what_is_left(folder)}")
+            if (logging or saving) and (name := problem.first_not_finite()):
+                raise DivergedError(f"{name} is not finite at iteration {iteration}; {_what_is_left(folder)}")
             if logging:
                 metrics = problem.evaluate() if evaluating else {}
                 yield _step_event(problem, settings, progress, metrics)
                 if evaluating:
                     yield EvaluateEvent(iteration, metrics)
             if added:
-                yield RefineEvent(iteration, problem.faces, added)
+                yield RefineEvent(iteration, problem.count, added)
             if saving:
                 yield CheckpointEvent(iteration, save(progress))
             if stopping:
@@ -237,8 +234,7 @@ def _step_event(problem: Problem, settings: LoopSettings, progress: Progress, me
         iterations=settings.iterations,
         seconds=progress.seconds,
         loss=loss,
-        faces=problem.faces,
-        sigma=problem.sigma,
+        state=problem.describe(),
         metrics=metrics,
     )
 

@@ -91,7 +91,3 @@ class TriangleMesh:
     def display_colors(self) -> Float[Tensor, "F 3"]:
         """(F, 3) in [0, 1], detached: the colours that an exported mesh carries."""
         return self.colors.detach().clamp(0.0, 1.0)
-
-    def is_finite(self) -> bool:
-        """Whether no parameter holds NaN or infinity."""
-        return all(bool(torch.isfinite(parameter).all()) for parameter in self.parameters().values())

@@ -123,14 +123,3 @@ class TriangleSoup:
         directions = direction.to(self.sh_dc).expand(len(self), 3)
         coefficients = torch.cat([self.sh_dc, self.sh_rest], dim=1)
         return spherical_harmonics(coefficients, directions, self.sh_degree).clamp(0.0, 1.0)
-
-    def is_finite(self) -> bool:
-        """Whether no parameter holds NaN or infinity."""
-        return self.first_not_finite() is None
-
-    def first_not_finite(self) -> str | None:
-        """The name of a parameter that holds NaN or infinity, or None."""
-        for name, parameter in self.parameters().items():
-            if not bool(torch.isfinite(parameter.sum())) and not bool(torch.isfinite(parameter).all()):
-                return name
-        return None

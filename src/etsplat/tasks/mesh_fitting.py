@@ -5,6 +5,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from etsplat.core.validation import first_not_finite
 from etsplat.geometry.measures import face_areas
 from etsplat.geometry.subdivision import longest_edge_plan
 from etsplat.geometry.topology import MeshTopology
@@ -18,6 +19,7 @@ from etsplat.optim.view_sampler import ViewSampler
 from etsplat.scene.triangle_mesh import TriangleMesh
 from etsplat.scene.views import PosedViews
 from etsplat.tasks.reconstruct_config import ReconstructConfig
+from etsplat.tasks.running import progress_tensor, read_progress
 
 
 class MeshFitting:
@@ -72,14 +74,13 @@ class MeshFitting:
         self.adam = Adam(mesh.parameters(), self._rates, engine=config.engine)
 
     @property
-    def faces(self) -> int:
+    def count(self) -> int:
         """Number of faces."""
         return len(self.mesh.faces)
 
-    @property
-    def sigma(self) -> float:
-        """Softness."""
-        return float(self.mesh.sigma.detach())
+    def describe(self) -> dict[str, float]:
+        """For the log: number of faces and softness."""
+        return {"faces": self.count, "sigma": float(self.mesh.sigma.detach())}
 
     def step(self, iteration: int) -> float:
         """One view over one random background, one step of Adam; returns the loss before it."""
@@ -132,9 +133,9 @@ class MeshFitting:
         """Cheap metrics of the present state."""
         return self._evaluate(self.mesh)
 
-    def is_finite(self) -> bool:
-        """Whether no parameter holds NaN or infinity."""
-        return self.mesh.is_finite()
+    def first_not_finite(self) -> str | None:
+        """The name of a parameter that holds NaN or infinity, or None."""
+        return first_not_finite(self.mesh.parameters())
 
     def state(self, progress: Progress) -> dict[str, Tensor]:
         """Everything that the rest of the run depends on, by name, for a checkpoint."""
@@ -145,8 +146,7 @@ class MeshFitting:
             state[f"adam.second.{name}"] = self.adam.second_moments[name]
         state["adam.step_count"] = torch.tensor(self.adam.step_count)
         state |= {f"sampler.{name}": tensor for name, tensor in self._sampler.state().items()}
-        numbers = [progress.seconds, progress.loss_sum, progress.loss_count]
-        state["progress"] = torch.tensor(numbers, dtype=torch.float64)
+        state["progress"] = progress_tensor(progress)
         return state
 
     def load_state(self, state: dict[str, Tensor], iteration: int) -> Progress:
@@ -159,5 +159,4 @@ class MeshFitting:
         self.adam.step_count = int(state["adam.step_count"])
         mesh.topology = MeshTopology.from_faces(state["mesh.faces"], len(mesh.vertices))
         self._sampler.load_state({name: state[f"sampler.{name}"] for name in self._sampler.state()})
-        seconds, loss_sum, loss_count = state["progress"].tolist()
-        return Progress(iteration, seconds, loss_sum, int(loss_count))
+        return read_progress(state["progress"], iteration)

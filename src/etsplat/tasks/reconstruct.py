@@ -1,12 +1,8 @@
 """Shape reconstruction (paper section 3.3): posed images of an object in, a run directory with its mesh out."""
 
-import hashlib
-import json
-import platform
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -16,36 +12,21 @@ from etsplat.core.errors import InputError
 from etsplat.io.mesh_files import MeshFile, save_mesh
 from etsplat.io.run_directory import RunDirectory, is_run
 from etsplat.ops.engines import num_threads, one_torch_thread, resolve_engine
-from etsplat.optim.checkpoints import load_latest_checkpoint, save_checkpoint
-from etsplat.optim.loop import Event, LoopSettings, Progress, StepEvent, optimize
+from etsplat.optim.loop import Event, LoopSettings, Progress
 from etsplat.tasks.mesh_fitting import MeshFitting
 from etsplat.tasks.reconstruct_config import ReconstructConfig
+from etsplat.tasks.running import (
+    Callback,
+    NoteEvent,
+    PrepareEvent,
+    fit,
+    hash_record,
+    make_record,
+    path_of,
+    versions,
+)
 from etsplat.tasks.scoring import Scorer
 from etsplat.tasks.sources import Source, fingerprint, load_source, load_start, make_start, make_subject
-
-
-@dataclass(frozen=True)
-class PrepareEvent:
-    """While a mesh is photographed, before the first step.
-
-    Attributes:
-        done: views taken.
-        total: views to take.
-    """
-
-    done: int
-    total: int
-
-
-@dataclass(frozen=True)
-class NoteEvent:
-    """Something about the input that its owner should know, such as a repair made while reading it.
-
-    Attributes:
-        text: a sentence.
-    """
-
-    text: str
 
 
 @dataclass(frozen=True)
@@ -61,9 +42,6 @@ class ReconstructResult:
     path: Path
     mesh: MeshFile
     metrics: dict[str, Any]
-
-
-Callback = Callable[[Event | PrepareEvent | NoteEvent], None]
 
 
 def reconstruct(
@@ -106,7 +84,8 @@ def reconstruct(
 
     loaded, start = load_source(source, config), load_start(init_mesh)
     hashes = {"fingerprint": fingerprint(loaded), "init_mesh": fingerprint(start)}
-    record = _record(config, hashes, {"source": _path_of(source), "init_mesh": _path_of(init_mesh)})
+    paths = {"source": path_of(source), "init_mesh": path_of(init_mesh)}
+    record = make_record("reconstruct", config, hashes, paths)
     if resume:
         RunDirectory.resume(out, record)
 
@@ -123,38 +102,9 @@ def reconstruct(
     run = RunDirectory.resume(out, record) if resume else RunDirectory.create(out, record, overwrite=overwrite)
     native = resolve_engine(config.engine, fitting.mesh.vertices) == "cpu"
     with one_torch_thread() if native else nullcontext():
-        progress = _fit(fitting, run, config, _hash(record), announce)
+        settings = LoopSettings(config.iterations, config.log_every, config.evaluate_every, config.checkpoint_every)
+        progress = fit(fitting, run, settings, hash_record(record), announce)
     return _finish(fitting, progress, run, scorer, subject.views.normalization.invert, config)
-
-
-def _fit(
-    fitting: MeshFitting, run: RunDirectory, config: ReconstructConfig, run_hash: str, announce: Callback
-) -> Progress:
-    """Runs the loop from the last checkpoint, or from the start, to the end."""
-    progress = Progress()
-    checkpoint = load_latest_checkpoint(run.checkpoints, run_hash)
-    if checkpoint is not None:
-        progress = fitting.load_state(checkpoint.tensors, checkpoint.iteration)
-    run.truncate_history(progress.iteration)
-    settings = LoopSettings(config.iterations, config.log_every, config.evaluate_every, config.checkpoint_every)
-
-    def save(at: Progress) -> Path:
-        return save_checkpoint(run.checkpoints, at.iteration, fitting.state(at), run_hash)
-
-    for event in optimize(fitting, settings, progress, save, run.checkpoints):
-        if isinstance(event, StepEvent):
-            run.append_history(
-                {
-                    "iteration": event.iteration,
-                    "seconds": round(event.seconds, 3),
-                    "loss": event.loss,
-                    "faces": event.faces,
-                    "sigma": event.sigma,
-                    **event.metrics,
-                }
-            )
-        announce(event)
-    return progress
 
 
 def _finish(
@@ -181,27 +131,7 @@ def _finish(
         "method": config.method,
         "preset": config.preset,
         "seed": config.seed,
-        "versions": _versions(),
+        "versions": versions(),
     }
     run.write_metrics(metrics)
     return ReconstructResult(run.path, result, run.read_metrics())
-
-
-def _record(config: ReconstructConfig, hashes: dict[str, str | None], paths: dict[str, str | None]) -> dict[str, Any]:
-    """What config.json holds. Inputs are identified by their hashes; paths are for the reader."""
-    settings = {name: str(value) if isinstance(value, Path) else value for name, value in vars(config).items()}
-    return {"task": "reconstruct", "config": settings, "source": hashes, "paths": paths, "versions": _versions()}
-
-
-def _path_of(source: object) -> str | None:
-    return str(source) if isinstance(source, str | Path) else None
-
-
-def _hash(record: dict[str, Any]) -> str:
-    """Identifies all that the result depends on."""
-    relevant = {key: record[key] for key in ("task", "config", "source")}
-    return hashlib.sha256(json.dumps(relevant, sort_keys=True).encode()).hexdigest()
-
-
-def _versions() -> dict[str, str]:
-    return {"etsplat": version("etsplat"), "torch": torch.__version__, "python": platform.python_version()}
