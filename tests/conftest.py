@@ -1,13 +1,16 @@
 """Fixtures shared by all tests."""
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import torch
 
 from etsplat.core.kernels import DISTANCES, KERNELS
+from etsplat.cuda.launch import use_backend
 from etsplat.ops.engines import ENGINES
+from simt.build import Simt
 
 # Tests run side by side, on small tensors: torch's own threads would only wait for each other.
 torch.set_num_threads(1)
@@ -42,6 +45,14 @@ def kernel(request: pytest.FixtureRequest) -> str:
 @pytest.fixture(params=DISTANCES)
 def distance(request: pytest.FixtureRequest) -> str:
     return request.param
+
+
+@pytest.fixture
+def simt() -> Iterator[Simt]:
+    """CUDA kernels run on CPU tensors, by the shim; engine "cuda" takes these."""
+    backend = Simt()
+    with use_backend(backend):
+        yield backend
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""The one error of the package's own."""
+"""Errors of the package's own."""
 
 
 class InputError(ValueError):
@@ -7,3 +7,7 @@ class InputError(ValueError):
     The message is one line that names the file or argument, says what is wrong and what to do. The command line prints
     it without a traceback. Wrong shapes, dtypes and devices of tensors are plain ``ValueError``.
     """
+
+
+class EngineUnavailableError(InputError):
+    """An engine was asked for that cannot run here; the line says what is missing and how to get it."""

@@ -1,0 +1,118 @@
+"""Launching kernels on tensors: ``launch(program, "name", grid, block, args)``.
+
+Arguments are converted by their Python type, so that the call reads like the kernel's parameter list:
+
+    Tensor   pointer to its data (contiguous)      None     null pointer
+    int      int                                   bool     bool
+    float    float                                 ctypes   as it is (c_int64, Structure for a struct by value)
+
+On a device the kernel goes to torch's current stream of the current device; nothing waits for it. Tests put another
+``Backend`` in place (tests/simt), which runs the same sources on CPU tensors.
+"""
+
+import ctypes
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, Protocol
+
+from torch import Tensor
+
+from etsplat.cuda.program import Program
+
+Dim = int | tuple[int, ...]
+
+
+class Backend(Protocol):
+    """What runs kernels, on tensors of one type of device."""
+
+    device_type: str
+
+    def launch(
+        self,
+        program: Program,
+        name: str,
+        grid: tuple[int, int, int],
+        block: tuple[int, int, int],
+        parameters: Any,
+    ) -> None:
+        """Run kernel ``name``; ``parameters`` is a ctypes array of pointers to the arguments (may be reused after)."""
+        ...
+
+
+_backend: Backend | None = None
+
+
+def backend() -> Backend:
+    """What runs kernels now.
+
+    Raises:
+        EngineUnavailableError: There is no usable GPU, driver, torch or NVRTC; the message says which.
+    """
+    global _backend
+    if _backend is None:
+        from etsplat.cuda.device import Device
+
+        _backend = Device()
+    return _backend
+
+
+@contextmanager
+def use_backend(other: Backend) -> Iterator[None]:
+    """Within the block kernels run on ``other``."""
+    global _backend
+    before, _backend = _backend, other
+    try:
+        yield
+    finally:
+        _backend = before
+
+
+def device_type() -> str:
+    """Type of the device whose tensors the engine computes on: "cuda", or "cpu" under the tests' backend."""
+    return "cuda" if _backend is None else _backend.device_type
+
+
+def launch(program: Program, name: str, grid: Dim, block: Dim, args: Sequence[Any]) -> None:
+    """Start kernel ``name`` of ``program`` on the current stream; no launch if the grid is empty.
+
+    Args:
+        program: What the kernel is compiled from.
+        name: The kernel's ``extern "C"`` name.
+        grid: Number of blocks: x, or up to (x, y, z).
+        block: Threads of a block: x, or up to (x, y, z).
+        args: The kernel's arguments in order; see above.
+    """
+    grid, block = _three(grid), _three(block)
+    if 0 in grid:
+        return
+    values = [_argument(arg) for arg in args]
+    pointers = (ctypes.c_void_p * len(values))(*(ctypes.addressof(value) for value in values))
+    backend().launch(program, name, grid, block, pointers)
+
+
+def blocks(count: int, size: int) -> int:
+    """Number of blocks of ``size`` that hold ``count`` items."""
+    return -(-count // size)
+
+
+def _three(dim: Dim) -> tuple[int, int, int]:
+    if isinstance(dim, int):
+        return dim, 1, 1
+    return (*dim, 1, 1)[:3]  # type: ignore[return-value]
+
+
+def _argument(value: Any) -> Any:
+    if value is None:
+        return ctypes.c_void_p(0)
+    if isinstance(value, Tensor):
+        assert value.is_contiguous(), "kernels get contiguous tensors only"
+        return ctypes.c_void_p(value.data_ptr())
+    if isinstance(value, bool):
+        return ctypes.c_bool(value)
+    if isinstance(value, int):
+        if not -(2**31) <= value < 2**31:
+            raise ValueError(f"{value} does not fit into an int: pass ctypes.c_int64")
+        return ctypes.c_int32(value)
+    if isinstance(value, float):
+        return ctypes.c_float(value)
+    return value

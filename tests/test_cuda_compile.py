@@ -1,0 +1,102 @@
+"""Every kernel compiles for every supported architecture, without a GPU; the cache of compiled kernels is safe."""
+
+from concurrent.futures import ThreadPoolExecutor
+from multiprocessing import get_context
+
+import pytest
+
+from etsplat.core.errors import EngineUnavailableError
+from etsplat.cuda import device
+from etsplat.cuda.compile import cache_folder, compile_program, compile_without_cache
+from etsplat.cuda.program import Program, source_root
+
+ARCHITECTURES = ("sm_75", "sm_80", "sm_86", "sm_89", "sm_90", "sm_100", "sm_120")
+PROGRAMS = [Program("fill.cu")]
+ELF = b"\x7fELF"
+
+
+@pytest.mark.parametrize("program", PROGRAMS, ids=str)
+def test_compiles_for_every_architecture(program):
+    with ThreadPoolExecutor(2) as pool:
+        for cubin in pool.map(lambda architecture: compile_without_cache(program, architecture), ARCHITECTURES):
+            assert cubin.startswith(ELF)
+
+
+def test_every_file_is_checked():
+    """A new .cu file belongs into the list above."""
+    assert {program.file for program in PROGRAMS} == {path.name for path in (source_root() / "cuda").glob("*.cu")}
+
+
+def test_errors_name_file_and_line():
+    broken = Program("fill.cu", (("count", "missing +"),))
+    with pytest.raises(RuntimeError, match=r"cuda/fill\.cu\(4\): error"):
+        compile_without_cache(broken, "sm_90")
+
+
+def test_cache_keeps_and_recognises(tmp_path, monkeypatch, capfd):
+    """Compiled once per source and architecture; a damaged file is compiled anew; a folder that cannot be written to
+    costs the cache only."""
+    monkeypatch.setenv("ETSPLAT_CACHE_DIR", str(tmp_path / "kernels"))
+    first = compile_program(Program("fill.cu"), "sm_90")
+    assert compile_program(Program("fill.cu"), "sm_90") == first
+    assert capfd.readouterr().err.count("compiled fill.cu for sm_90") == 1
+    compile_program(Program("fill.cu"), "sm_80")
+    compile_program(Program("fill.cu", (("UNUSED", 1),)), "sm_90")
+    files = list(cache_folder().iterdir())
+    assert len(files) == 3
+    for file in files:
+        file.write_bytes(file.read_bytes()[:-1])
+    assert compile_program(Program("fill.cu"), "sm_90") == first
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("ETSPLAT_CACHE_DIR", str(tmp_path / "file"))
+    assert compile_program(Program("fill.cu"), "sm_90") == first
+    assert "set ETSPLAT_CACHE_DIR" in capfd.readouterr().err
+
+
+def _compile_into(folder):
+    import os
+
+    os.environ["ETSPLAT_CACHE_DIR"] = folder
+    return compile_program(Program("fill.cu"), "sm_90")
+
+
+def test_processes_share_the_cache(tmp_path):
+    """Several at once get the same kernels, and leave one file and no parts."""
+    with get_context("fork").Pool(3) as pool:
+        results = pool.map(_compile_into, [str(tmp_path)] * 6)
+    assert len(set(results)) == 1
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+class TestErrors:
+    """Each missing piece has its line."""
+
+    def test_torch_without_cuda(self, monkeypatch):
+        monkeypatch.setattr(device.torch, "__version__", "2.13.0+cpu")
+        monkeypatch.setattr(device.torch.version, "cuda", None)
+        with pytest.raises(EngineUnavailableError, match="built without CUDA"):
+            device.check_torch()
+
+    def test_old_torch(self, monkeypatch):
+        monkeypatch.setattr(device.torch, "__version__", "2.9.1+cu128")
+        with pytest.raises(EngineUnavailableError, match=r"needs torch 2\.11 or newer, found 2\.9\.1\+cu128"):
+            device.check_torch()
+
+    def test_no_gpu(self, monkeypatch):
+        monkeypatch.setattr(device.torch, "__version__", "2.11.0+cu130")
+        monkeypatch.setattr(device.torch.version, "cuda", "13.0")
+        monkeypatch.setattr(device.torch.cuda, "is_available", lambda: False)
+        with pytest.raises(EngineUnavailableError, match="finds no usable GPU"):
+            device.check_torch()
+
+    def test_old_driver(self):
+        class Driver:
+            class CUresult:
+                CUDA_SUCCESS = 0
+
+            @staticmethod
+            def cuDriverGetVersion():  # noqa: N802
+                return 0, 12040
+
+        with pytest.raises(EngineUnavailableError, match=r"supports CUDA 12\.4 .* NVRTC 13"):
+            device.check_driver(Driver)
