@@ -133,19 +133,19 @@ _QUICK = replace(
     _PAPER,
     preset="quick",
     resolution=448,
-    iterations=2500,
+    iterations=5000,
     gamma_hold=50,
     max_faces=25_000,
-    lr_vertices=2e-2,
+    lr_vertices=1e-2,
     subdivide_steps=10,
-    evaluate_every=200,
+    evaluate_every=250,
     checkpoint_every=500,
 )
 
 PRESETS: dict[str, ReconstructConfig] = {
     "paper": _PAPER,
     "quick": _QUICK,
-    "demo": replace(_QUICK, preset="demo"),
+    "demo": replace(_QUICK, preset="demo", iterations=2500, lr_vertices=2e-2),
     "tiny": replace(
         _QUICK,
         preset="tiny",
@@ -157,6 +157,7 @@ PRESETS: dict[str, ReconstructConfig] = {
         gamma_hold=20,
         edge_power=2,
         max_faces=2000,
+        lr_vertices=2e-2,
         lr_vertices_final=0.05,
         lr_colors=2e-2,
         lr_opacities=2e-2,
