@@ -8,6 +8,7 @@ from typing import Annotated, Any, Union
 import tyro
 
 from etsplat.cli.command import Command
+from etsplat.cli.data import Download, Sfm
 from etsplat.cli.doctor import Doctor
 from etsplat.cli.reconstruct import Demo, Reconstruct
 
@@ -25,7 +26,14 @@ class Group:
     commands: dict[str, type[Command]]
 
 
-COMMANDS: dict[str, type[Command] | Group] = {"demo": Demo, "reconstruct": Reconstruct, "doctor": Doctor}
+COMMANDS: dict[str, type[Command] | Group] = {
+    "demo": Demo,
+    "reconstruct": Reconstruct,
+    "data": Group(
+        "Where captures come from: find the cameras of photos, fetch data sets.", {"sfm": Sfm, "download": Download}
+    ),
+    "doctor": Doctor,
+}
 
 # tyro joins the lines of a paragraph, except indented ones.
 _ETSPLAT = """Differentiable triangle splatting: posed images in, triangles out.

@@ -1,0 +1,92 @@
+"""`etsplat data ...`: where captures come from."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar, Literal
+
+import tyro
+
+from etsplat.cli.command import Command
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sfm(Command):
+    """Find the cameras of photos (structure from motion, on the CPU), so that they can be trained on.
+
+    Needs pycolmap: pip install 'etsplat[sfm]'.
+    """
+
+    EXAMPLES: ClassVar[str] = """
+    etsplat data sfm photos/ --out my_scene
+    etsplat data sfm video_frames/ --out my_scene --matching sequential
+    """
+
+    photos: tyro.conf.Positional[Path]
+    """Folder of JPEG or PNG files, taken with one camera while walking around; 20 to 300 are good."""
+    out: Path
+    """Folder for the scene: images/ without lens distortion and sparse/0/."""
+    matching: Literal["auto", "exhaustive", "sequential"] = "auto"
+    """Compare every pair of photos; or only those near in order of names, as for video. Auto: every pair up to 120."""
+    max_size: int = 1600
+    """Longer sides are shrunk to this many pixels."""
+
+    @classmethod
+    def defaults(cls, arguments: Sequence[str]) -> "Sfm":
+        """Nothing depends on the arguments."""
+        return cls(photos=tyro.MISSING, out=tyro.MISSING)
+
+    def run(self, arguments: Sequence[str]) -> int:
+        """Writes the scene and says which photos have no place in it."""
+        from rich.console import Console
+
+        from etsplat.cli.phases import PhaseBar
+        from etsplat.scene.structure_from_motion import find_cameras
+
+        console = Console()
+        with PhaseBar(console) as bar:
+            found = find_cameras(
+                self.photos, self.out, matching=self.matching, max_size=self.max_size, progress=bar.show
+            )
+        count = len(found.placed) + len(found.unplaced)
+        print(f"{len(found.placed)} of {count} photos placed, {found.points:,} points; scene in {found.scene}")
+        if found.unplaced:
+            shown = ", ".join(found.unplaced[:8]) + (", ..." if len(found.unplaced) > 8 else "")
+            print(f"Without a place, and left out: {shown}")
+        if len(found.placed) < count / 2:
+            print("That is less than half: the scene will have gaps. Let photos overlap by two thirds.")
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Download(Command):
+    """Fetch the captures of the paper's tables: Mip-NeRF 360, Tanks and Temples, Deep Blending."""
+
+    EXAMPLES: ClassVar[str] = """
+    etsplat data download tandt-db --out data
+    etsplat bench nvs --scenes data/tandt/truck data/tandt/train --out runs/nvs
+    """
+
+    name: tyro.conf.Positional[Literal["mipnerf360", "mipnerf360-extra", "tandt-db"]]
+    """Which: mipnerf360 (7 scenes, 12.5 GB), mipnerf360-extra (flowers and treehill, 3 GB), tandt-db (4, 0.7 GB)."""
+    out: Path = Path("data")
+    """Folder for the scenes."""
+
+    @classmethod
+    def defaults(cls, arguments: Sequence[str]) -> "Download":
+        """Nothing depends on the arguments."""
+        return cls(name=tyro.MISSING)
+
+    def run(self, arguments: Sequence[str]) -> int:
+        """Fetches and unpacks."""
+        from rich.console import Console
+
+        from etsplat.cli.phases import PhaseBar
+        from etsplat.io.datasets import download_dataset
+
+        with PhaseBar(Console()) as bar:
+            scenes = download_dataset(
+                self.name, self.out, progress=lambda done, total: bar.show("Fetching MB", done >> 20, total >> 20)
+            )
+        print("\n".join(str(scene) for scene in scenes))
+        return 0

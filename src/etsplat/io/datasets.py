@@ -1,0 +1,100 @@
+"""The captures of the paper's tables, fetched from where their authors keep them."""
+
+import shutil
+import urllib.error
+import urllib.request
+import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from etsplat.core.errors import InputError
+from etsplat.io.atomic import write_error
+
+_CHUNK = 1 << 20
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """An archive of captures.
+
+    Attributes:
+        url: of the zip file.
+        scenes: folders in it that are scenes.
+        gigabytes: about how large the archive is.
+    """
+
+    url: str
+    scenes: tuple[str, ...]
+    gigabytes: float
+
+
+DATASETS = {
+    "mipnerf360": Dataset(
+        "https://storage.googleapis.com/gresearch/refraw360/360_v2.zip",
+        ("bicycle", "garden", "stump", "room", "counter", "kitchen", "bonsai"),
+        12.5,
+    ),
+    "mipnerf360-extra": Dataset(
+        "https://storage.googleapis.com/gresearch/refraw360/360_extra_scenes.zip", ("flowers", "treehill"), 3.0
+    ),
+    "tandt-db": Dataset(
+        "https://repo-sam.inria.fr/fungraph/3d-gaussian-splatting/datasets/input/tandt_db.zip",
+        ("tandt/train", "tandt/truck", "db/drjohnson", "db/playroom"),
+        0.7,
+    ),
+}
+"""By name: Mip-NeRF 360 in its two archives; Tanks and Temples with Deep Blending as 3DGS prepared them."""
+
+
+def download_dataset(
+    name: str, folder: Path | str, *, progress: Callable[[int, int], None] | None = None
+) -> list[Path]:
+    """Fetch and unpack a data set, unless its scenes are there already.
+
+    Args:
+        name: a key of DATASETS.
+        folder: gets the scenes.
+        progress: called with (bytes fetched, bytes in all; 0 if the server does not tell).
+
+    Returns:
+        The folders of the scenes.
+
+    Raises:
+        InputError: there is no network or no such file any more; the disk is full; the archive is damaged.
+    """
+    dataset, folder = DATASETS[name], Path(folder)
+    scenes = [folder / scene for scene in dataset.scenes]
+    if all((scene / "sparse").is_dir() for scene in scenes):
+        return scenes
+    archive = folder / f".{name}.zip"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        _fetch(dataset.url, archive, progress)
+        with zipfile.ZipFile(archive) as file:
+            file.extractall(folder)
+    except (urllib.error.URLError, TimeoutError, ConnectionError) as error:
+        reason = getattr(error, "reason", error)
+        raise InputError(
+            f"data set {name}: cannot reach {dataset.url} ({reason}); fetch it ({dataset.gigabytes:g} GB) where there"
+            f" is a network and unpack it into {folder}"
+        ) from error
+    except zipfile.BadZipFile as error:
+        raise InputError(f"data set {name}: {dataset.url} is damaged or not a zip file; try again") from error
+    except OSError as error:
+        raise write_error(folder, error) from error
+    finally:
+        archive.unlink(missing_ok=True)
+    return scenes
+
+
+def _fetch(url: str, path: Path, progress: Callable[[int, int], None] | None) -> None:
+    with urllib.request.urlopen(url, timeout=30) as response, open(path, "wb") as file:
+        total, done = int(response.headers.get("Content-Length") or 0), 0
+        if total and shutil.disk_usage(path.parent).free < 2 * total:
+            raise OSError(f"{2 * total >> 30} GB are needed for the archive and what is in it")
+        while chunk := response.read(_CHUNK):
+            file.write(chunk)
+            done += len(chunk)
+            if progress is not None:
+                progress(done, total)

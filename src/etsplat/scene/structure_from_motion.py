@@ -1,0 +1,210 @@
+"""Cameras for a folder of photos: structure from motion with pycolmap (an extra), on the CPU."""
+
+import contextlib
+import os
+import shutil
+import sqlite3
+import tempfile
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from etsplat.core.errors import InputError
+from etsplat.io.atomic import write_error
+from etsplat.io.images import IMAGE_SUFFIXES, image_size
+
+Matching = Literal["auto", "exhaustive", "sequential"]
+Progress = Callable[[str, int, int], None]
+
+EXHAUSTIVE_UP_TO = 120
+"""With matching "auto", every pair of so many photos is compared; of more, only those near in order of names."""
+
+NEIGHBOURS = 15
+LEAST_SHARE = 0.25
+"""If fewer of the photos can be placed, something is wrong with them, and there is no scene."""
+LEAST_COUNT = 3
+
+
+@dataclass(frozen=True)
+class Placement:
+    """What structure from motion found.
+
+    Attributes:
+        scene: folder with images/ and sparse/0/, undistorted.
+        placed: names of the photos with a camera.
+        unplaced: names of those without.
+        points: how many points were triangulated.
+    """
+
+    scene: Path
+    placed: list[str]
+    unplaced: list[str]
+    points: int
+
+
+def find_cameras(
+    photos: Path | str,
+    out: Path | str,
+    *,
+    matching: Matching = "auto",
+    max_size: int = 1600,
+    threads: int | None = None,
+    progress: Progress | None = None,
+) -> Placement:
+    """Find where photos were taken from, and write an undistorted COLMAP scene.
+
+    Args:
+        photos: folder of JPEG or PNG files, of one camera with one lens setting at best.
+        out: folder of the scene; must not exist or be empty.
+        matching: which photos are compared with each other.
+        max_size: longer sides are shrunk to this many pixels, for finding features and in the scene.
+        threads: None for all cores.
+        progress: called with (phase, done, of how many).
+
+    Raises:
+        InputError: pycolmap is missing; too few photos; too few of them could be placed; `out` cannot be used.
+    """
+    pycolmap = _import_pycolmap()
+    photos, out = Path(photos), Path(out)
+    names = _photo_names(photos)
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InputError(f"{out}: is there already and not empty; choose another folder for the scene")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    report = progress or (lambda phase, done, total: None)
+    with tempfile.TemporaryDirectory(prefix=".sfm-", dir=out.parent) as work:
+        model = _reconstruct(pycolmap, photos, names, Path(work), matching, max_size, threads or -1, report)
+        placed = sorted(image.name for image in model.images.values() if image.has_pose)
+        if len(placed) < max(LEAST_COUNT, LEAST_SHARE * len(names)):
+            raise InputError(_too_few(photos, len(placed), len(names)))
+        report("Removing lens distortion", 0, 0)
+        _undistort(pycolmap, model, photos, placed, Path(work), max_size)
+        try:
+            os.replace(_arranged(Path(work) / "scene"), out)
+        except OSError as error:
+            raise write_error(out, error) from error
+    unplaced = [name for name in names if name not in set(placed)]
+    return Placement(out, placed, unplaced, len(model.points3D))
+
+
+def _reconstruct(
+    pycolmap: Any,
+    photos: Path,
+    names: list[str],
+    work: Path,
+    matching: Matching,
+    max_size: int,
+    threads: int,
+    report: Progress,
+) -> Any:
+    """The largest model, or an empty one."""
+    pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
+    database = work / "database.db"
+    one_size = len({image_size(photos / name) for name in names}) == 1
+    mode = pycolmap.CameraMode.SINGLE if one_size else pycolmap.CameraMode.AUTO
+    options = pycolmap.FeatureExtractionOptions(max_image_size=max_size, num_threads=threads, use_gpu=False)
+    with _polled(database, "keypoints", "Finding features", len(names), report):
+        pycolmap.extract_features(
+            database, photos, names, camera_mode=mode, extraction_options=options, device=pycolmap.Device.cpu
+        )
+    pairing: dict[str, Any] = {
+        "matching_options": pycolmap.FeatureMatchingOptions(num_threads=threads, use_gpu=False),
+        "device": pycolmap.Device.cpu,
+    }
+    if matching == "exhaustive" or (matching == "auto" and len(names) <= EXHAUSTIVE_UP_TO):
+        pairs, match = len(names) * (len(names) - 1) // 2, pycolmap.match_exhaustive
+    else:
+        pairs, match = len(names) * NEIGHBOURS, pycolmap.match_sequential
+        pairing["pairing_options"] = pycolmap.SequentialPairingOptions(overlap=NEIGHBOURS, loop_detection=False)
+    with _polled(database, "matches", "Comparing photos", pairs, report):
+        match(database, **pairing)
+    count = 0
+
+    def placed_one() -> None:
+        nonlocal count
+        count += 1
+        report("Placing cameras", min(count + 1, len(names)), len(names))
+
+    report("Placing cameras", 0, len(names))
+    (work / "models").mkdir()
+    models = pycolmap.incremental_mapping(
+        database,
+        photos,
+        work / "models",
+        options=pycolmap.IncrementalPipelineOptions(num_threads=threads),
+        next_image_callback=placed_one,
+    )
+    return max(models.values(), key=lambda model: model.num_reg_images(), default=pycolmap.Reconstruction())
+
+
+def _undistort(pycolmap: Any, model: Any, photos: Path, placed: list[str], work: Path, max_size: int) -> None:
+    (work / "model").mkdir()
+    model.write(work / "model")
+    options = pycolmap.UndistortCameraOptions(max_image_size=max_size)
+    pycolmap.undistort_images(work / "scene", work / "model", photos, placed, undistort_options=options)
+
+
+def _arranged(scene: Path) -> Path:
+    """Leaves images/ and sparse/0/ of what COLMAP writes for its dense reconstruction."""
+    for entry in scene.iterdir():
+        if entry.name == "stereo":
+            shutil.rmtree(entry)
+        elif entry.is_file():
+            entry.unlink()
+    (scene / "sparse").rename(scene / "0")
+    (scene / "sparse").mkdir()
+    (scene / "0").rename(scene / "sparse" / "0")
+    return scene
+
+
+@contextlib.contextmanager
+def _polled(database: Path, table: str, phase: str, total: int, report: Progress) -> Iterator[None]:
+    """Reports rows of a table of COLMAP's database every half second: its functions tell nothing themselves."""
+    finished = threading.Event()
+
+    def poll() -> None:
+        while not finished.wait(0.5):
+            # The database may not be there yet, or be locked: then the next poll tells.
+            with contextlib.suppress(sqlite3.Error):
+                connection = sqlite3.connect(f"file:{database}?mode=ro", uri=True, timeout=0.1)
+                try:
+                    rows = connection.execute(f"SELECT count(*) FROM {table}").fetchone()[0]
+                finally:
+                    connection.close()
+                report(phase, min(rows, total), total)
+
+    report(phase, 0, total)
+    thread = threading.Thread(target=poll, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        finished.set()
+        thread.join()
+
+
+def _photo_names(photos: Path) -> list[str]:
+    if not photos.is_dir():
+        raise InputError(f"photos {photos}: no such folder; check the path")
+    names = sorted(path.name for path in photos.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES)
+    if len(names) < LEAST_COUNT:
+        raise InputError(f"photos {photos}: {len(names)} JPEG or PNG files; at least 3 are needed, better 20 or more")
+    return names
+
+
+def _too_few(photos: Path, placed: int, count: int) -> str:
+    return (
+        f"photos {photos}: only {placed} of {count} could be placed in one scene; take more photos, each overlapping"
+        " its neighbours by two thirds, sharp, of something that stands still, walking around it rather than turning"
+    )
+
+
+def _import_pycolmap() -> Any:
+    try:
+        import pycolmap
+    except ImportError as error:
+        raise InputError(
+            "structure from motion needs pycolmap: pip install 'etsplat[sfm]' (or use COLMAP itself)"
+        ) from error
+    return pycolmap
