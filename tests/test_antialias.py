@@ -10,6 +10,7 @@ from etsplat.core.cameras import intrinsics, look_at
 from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.topology import MeshTopology
 from etsplat.ops.antialias import rasterize_antialiased
+from etsplat.ops.antialias_nvdiffrast import rasterize_nvdiffrast
 from etsplat.ops.engines import num_threads, set_num_threads
 from etsplat.ops.mesh_energies import MeshConnectivity
 from etsplat.ops.rasterize_hard import render_opaque
@@ -195,6 +196,24 @@ def test_unusable_vertices_harm_nothing(engine):
     image.square().sum().backward()
     assert leaf.grad is not None
     assert bool(leaf.grad[3:].isfinite().all())
+
+
+@KINDS
+def test_nvdiffrast_agrees(kind, rng):
+    """Where nvdiffrast is there: the same image and vertex gradients, but for pixels that only one of them blends."""
+    pytest.importorskip("nvdiffrast.torch")
+    if not torch.cuda.is_available():
+        pytest.skip("nvdiffrast needs a CUDA device")
+    vertices, faces = dented(rng)
+    connectivity, colors = connect(faces, vertices), colors_of(kind, vertices, faces, rng)
+    results = []
+    for draw in (rasterize_antialiased, rasterize_nvdiffrast):
+        leaf = vertices.clone().requires_grad_(True)
+        image = draw(leaf, connectivity, *views(256, 256), 256, 256, **{kind: colors})
+        image.square().sum().backward()
+        results.append((image.detach(), leaf.grad))
+    for name, ours, theirs in zip(("image", "vertices"), *results, strict=True):
+        assert_close_to_scale(ours, theirs, 1e-3, outliers=0.02, outlier_tolerance=1.0, name=name)
 
 
 @pytest.mark.parametrize(

@@ -200,11 +200,38 @@ def test_another_seed_gives_another_result(pebble: MeshFile, whole_run: Reconstr
     assert not torch.equal(result.mesh.vertices, whole_run.mesh.vertices)
 
 
-@pytest.mark.parametrize("method", ["bilateral", "single-sided"])
-def test_the_other_kernels_run_too(pebble: MeshFile, tmp_path: Path, method: str) -> None:
-    """Both baselines go through the same call and record their name."""
+@pytest.mark.parametrize("method", ["bilateral", "single-sided", "raster-face", "raster-vertex"])
+def test_the_other_methods_run_too(pebble: MeshFile, tmp_path: Path, method: str) -> None:
+    """All baselines go through the same call, record their name, and resume to the same bits."""
     config = replace(SHORT, method=method)
-    assert reconstruct(pebble, tmp_path, config).metrics["method"] == method
+    metrics = reconstruct(pebble, tmp_path / "whole", config).metrics
+    assert metrics["method"] == method
+    with pytest.raises(KilledError):
+        reconstruct(pebble, tmp_path / "killed", config, callbacks=[kill_at(27)])
+    reconstruct(pebble, tmp_path / "killed", config, resume=True)
+    assert untimed(tmp_path / "killed") == untimed(tmp_path / "whole")
+
+
+@pytest.mark.parametrize("settings", [{"method": "raster-vertex"}, {"colors": "vertex"}])
+def test_vertex_colors_reach_the_files(tmp_path: Path, settings: dict[str, str]) -> None:
+    """The mesh and its files have a colour per vertex, and the mesh looks like the truth more than a sphere does."""
+    result = reconstruct(demo_object(), tmp_path, replace(TINY, **settings))
+    assert result.metrics["psnr_mesh"] > 12
+    assert result.mesh.face_colors is None
+    assert result.mesh.vertex_colors is not None
+    for suffix in (".ply", ".obj", ".glb"):
+        saved = load_mesh(RunDirectory(tmp_path).mesh_path(suffix))
+        assert saved.vertex_colors is not None
+        assert torch.allclose(saved.vertex_colors, result.mesh.vertex_colors, atol=0.01)
+
+
+def test_a_backend_that_is_missing_is_named(pebble: MeshFile, tmp_path: Path) -> None:
+    """Without nvdiffrast or CUDA the run ends before it starts, in one line; soft triangles have no such backend."""
+    with pytest.raises(InputError, match="choose --method raster-face"):
+        replace(SHORT, backend="nvdiffrast")
+    if not torch.cuda.is_available():
+        with pytest.raises(InputError, match="needs a CUDA device"):
+            reconstruct(pebble, tmp_path, replace(SHORT, method="raster-face", backend="nvdiffrast"))
 
 
 def test_a_given_mesh_is_the_start(pebble: MeshFile, tmp_path: Path) -> None:

@@ -9,34 +9,49 @@ import numpy as np
 
 from etsplat.io.srgb import linear_from_srgb
 
+Colors = np.ndarray | None
 
-def write_ply(path: Path, vertices: np.ndarray, faces: np.ndarray, colors: np.ndarray | None) -> None:
-    """Binary little-endian PLY. `colors` (F, 3) in [0, 1] per face, stored in 8 bits."""
-    color_header = "property uchar red\nproperty uchar green\nproperty uchar blue\n" if colors is not None else ""
+
+def write_ply(path: Path, vertices: np.ndarray, faces: np.ndarray, face_colors: Colors, vertex_colors: Colors) -> None:
+    """Binary little-endian PLY; colours (F, 3) or (V, 3) in [0, 1] are stored in 8 bits."""
+    rgb = "property uchar red\nproperty uchar green\nproperty uchar blue\n"
     header = (
         "ply\nformat binary_little_endian 1.0\n"
         f"element vertex {len(vertices)}\nproperty float x\nproperty float y\nproperty float z\n"
-        f"element face {len(faces)}\nproperty list uchar int vertex_indices\n{color_header}end_header\n"
+        f"{'' if vertex_colors is None else rgb}"
+        f"element face {len(faces)}\nproperty list uchar int vertex_indices\n"
+        f"{'' if face_colors is None else rgb}end_header\n"
     )
-    fields = [("count", "u1"), ("indices", "<i4", 3)] + ([("rgb", "u1", 3)] if colors is not None else [])
-    rows = np.empty(len(faces), dtype=fields)
-    rows["count"], rows["indices"] = 3, faces
+    points = _ply_rows({"position": ("<f4", vertices)}, vertex_colors)
+    triangles = _ply_rows({"count": ("u1", np.full((len(faces), 1), 3)), "indices": ("<i4", faces)}, face_colors)
+    path.write_bytes(header.encode() + points + triangles)
+
+
+def _ply_rows(columns: dict[str, tuple[str, np.ndarray]], colors: Colors) -> bytes:
+    """An element of a binary PLY: (type, values (N, k)) side by side, colours last."""
     if colors is not None:
-        rows["rgb"] = np.floor(colors * 255 + 0.5)
-    path.write_bytes(header.encode() + vertices.astype("<f4").tobytes() + rows.tobytes())
+        columns = {**columns, "rgb": ("u1", np.floor(colors * 255 + 0.5))}
+    count = len(next(iter(columns.values()))[1])
+    rows = np.empty(count, dtype=[(name, kind, values.shape[1]) for name, (kind, values) in columns.items()])
+    for name, (_, values) in columns.items():
+        rows[name] = values
+    return rows.tobytes()
 
 
-def write_obj(path: Path, vertices: np.ndarray, faces: np.ndarray, colors: np.ndarray | None) -> None:
-    """Wavefront OBJ; `colors` (V, 3) follow the coordinates, the extension that MeshLab and Blender read."""
-    rows = vertices if colors is None else np.hstack([vertices, colors.astype(np.float32)])
+def write_obj(path: Path, vertices: np.ndarray, faces: np.ndarray, face_colors: Colors, vertex_colors: Colors) -> None:
+    """Wavefront OBJ; vertex colours follow the coordinates, the extension that MeshLab and Blender read."""
+    assert face_colors is None, "OBJ has no colours per face"
+    rows = vertices if vertex_colors is None else np.hstack([vertices, vertex_colors.astype(np.float32)])
     line = "v " + " ".join(["%.9g"] * 3 + ["%.6g"] * (rows.shape[1] - 3))
     with open(path, "w", encoding="ascii", newline="\n") as file:
         np.savetxt(file, rows, fmt=line)
         np.savetxt(file, faces + 1, fmt="f %d %d %d")
 
 
-def write_glb(path: Path, vertices: np.ndarray, faces: np.ndarray, colors: np.ndarray | None) -> None:
-    """Binary glTF 2.0, one primitive. `colors` (V, 3) display values become linear COLOR_0 under an unlit material."""
+def write_glb(path: Path, vertices: np.ndarray, faces: np.ndarray, face_colors: Colors, vertex_colors: Colors) -> None:
+    """Binary glTF 2.0, one primitive. Vertex colours, display values, become linear COLOR_0 under an unlit material."""
+    assert face_colors is None, "glTF has no colours per face"
+    colors = vertex_colors
     arrays = [(vertices.astype("<f4"), 34962), (faces.astype("<u4").reshape(-1), 34963)]
     if colors is not None:
         arrays.append((linear_from_srgb(colors).astype("<f4"), 34962))
@@ -75,9 +90,9 @@ def write_glb(path: Path, vertices: np.ndarray, faces: np.ndarray, colors: np.nd
         file.write(struct.pack("<I4s", len(data), b"BIN\0") + data)
 
 
-WRITERS: dict[str, Callable[[Path, np.ndarray, np.ndarray, np.ndarray | None], None]] = {
+WRITERS: dict[str, Callable[[Path, np.ndarray, np.ndarray, Colors, Colors], None]] = {
     ".ply": write_ply,
     ".obj": write_obj,
     ".glb": write_glb,
 }
-"""Writers by suffix: (path, vertices (V, 3) float32, faces (F, 3), colours per face (PLY) or vertex, or None)."""
+"""Writers by suffix: (path, vertices (V, 3) float32, faces (F, 3), colours per face (PLY alone), per vertex)."""

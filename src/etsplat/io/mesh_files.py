@@ -69,12 +69,13 @@ def save_mesh(
     faces: Int64[Tensor, "F 3"],
     face_colors: Float[Tensor, "F 3"] | None = None,
     *,
+    vertex_colors: Float[Tensor, "V 3"] | None = None,
     split: bool = False,
 ) -> None:
-    """Write a triangle mesh with face colours. Atomic.
+    """Write a triangle mesh with colours per face or per vertex. Atomic.
 
-    PLY holds a colour per face. OBJ and GLB know only colours per vertex: the welded mesh gets at each vertex the
-    area-weighted mean of its faces' colours, with `split` no vertex is shared and each face keeps its exact colour.
+    PLY holds either. OBJ and GLB know only colours per vertex: for colours per face the welded mesh gets at each vertex
+    the area-weighted mean of its faces' colours, with `split` no vertex is shared and each face keeps its exact colour.
     Colours are display values (sRGB) in PLY and OBJ; glTF wants linear light, so GLB is converted, and its material is
     unlit: a viewer shows the colours of the render.
 
@@ -82,7 +83,8 @@ def save_mesh(
         path: ends in .ply, .obj or .glb.
         vertices: finite positions.
         faces: indices into `vertices`.
-        face_colors: display values in [0, 1] (others are clamped), or None for a mesh without colours.
+        face_colors: display values in [0, 1] (others are clamped); at most one of the two kinds of colours.
+        vertex_colors: the same for vertices.
         split: unshare all vertices. In PLY this changes the connectivity only.
 
     Raises:
@@ -93,16 +95,17 @@ def save_mesh(
     suffix = path.suffix.lower()
     if suffix not in WRITERS:
         raise ValueError(f"path: expected one of the suffixes {', '.join(WRITERS)}, got {path.name}")
-    _check_arguments(vertices, faces, face_colors)
+    _check_arguments(vertices, faces, face_colors, vertex_colors)
     v = vertices.detach().to("cpu", torch.float64).numpy()
     f = faces.detach().to("cpu", torch.int64).numpy()
-    colors = None if face_colors is None else face_colors.detach().to("cpu", torch.float64).clamp(0, 1).numpy()
+    per_face, per_vertex = _display_values(face_colors), _display_values(vertex_colors)
     if split:
+        per_vertex = None if per_vertex is None else per_vertex[f].reshape(-1, 3)
         v, f = v[f].reshape(-1, 3), np.arange(f.size).reshape(-1, 3)
-    if colors is not None and suffix != ".ply":
-        colors = np.repeat(colors, 3, axis=0) if split else _vertex_means(v, f, colors)
+    if per_face is not None and suffix != ".ply":
+        per_face, per_vertex = None, np.repeat(per_face, 3, axis=0) if split else _vertex_means(v, f, per_face)
     with atomic_write(path) as temporary:
-        WRITERS[suffix](temporary, v.astype(np.float32), f, colors)
+        WRITERS[suffix](temporary, v.astype(np.float32), f, per_face, per_vertex)
 
 
 def weld_vertices(mesh: MeshFile) -> MeshFile:
@@ -202,16 +205,26 @@ def _drop_loose_vertices(mesh: MeshFile) -> MeshFile:
     )
 
 
-def _check_arguments(vertices: Tensor, faces: Tensor, face_colors: Tensor | None) -> None:
+def _display_values(colors: Tensor | None) -> np.ndarray | None:
+    return None if colors is None else colors.detach().to("cpu", torch.float64).clamp(0, 1).numpy()
+
+
+def _check_arguments(vertices: Tensor, faces: Tensor, face_colors: Tensor | None, vertex_colors: Tensor | None) -> None:
     if vertices.ndim != 2 or vertices.shape[1] != 3:
         raise ValueError(f"vertices: expected shape (V, 3), got {tuple(vertices.shape)}")
     if faces.ndim != 2 or faces.shape[1] != 3 or len(faces) == 0:
         raise ValueError(f"faces: expected shape (F, 3) with F > 0, got {tuple(faces.shape)}")
     if int(faces.min()) < 0 or int(faces.max()) >= len(vertices):
         raise ValueError(f"faces: expected indices in [0, {len(vertices)})")
-    if face_colors is not None and tuple(face_colors.shape) != (len(faces), 3):
-        raise ValueError(f"face_colors: expected shape {(len(faces), 3)}, got {tuple(face_colors.shape)}")
-    for name, values in (("vertices", vertices), ("face_colors", face_colors)):
+    if face_colors is not None and vertex_colors is not None:
+        raise ValueError("face_colors, vertex_colors: expected one of them at most, got both")
+    for name, colors, count in (
+        ("face_colors", face_colors, len(faces)),
+        ("vertex_colors", vertex_colors, len(vertices)),
+    ):
+        if colors is not None and tuple(colors.shape) != (count, 3):
+            raise ValueError(f"{name}: expected shape {(count, 3)}, got {tuple(colors.shape)}")
+    for name, values in (("vertices", vertices), ("face_colors", face_colors), ("vertex_colors", vertex_colors)):
         if values is not None and not bool(torch.isfinite(values).all()):
             raise ValueError(f"{name}: expected finite values, got NaN or Inf")
 

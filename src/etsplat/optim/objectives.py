@@ -42,7 +42,7 @@ def mesh_objective(
     """The paper's training objective of shape reconstruction (section 3.3, L_mesh).
 
     L_mesh = L_c + gamma (lambda_e L_e + lambda_n L_n + lambda_lap L_lap + lambda_sigma sigma^-2), with L_c the mean
-    absolute difference to the target over the same background.
+    absolute difference to the target over the same background. A mesh of opaque triangles has no sigma term.
 
     Args:
         color: (B, H, W, 3) rendered over `backgrounds`.
@@ -61,9 +61,8 @@ def mesh_objective(
         return photometric
     energies = mesh_energies(mesh.vertices, mesh.topology.connectivity, edge_power=weights.edge_power, engine=engine)
     regularization = (
-        weights.edge * energies.edge
-        + weights.normal * energies.normal
-        + weights.laplacian * energies.laplacian
-        + weights.softness * mesh.sigma.pow(-2)
+        weights.edge * energies.edge + weights.normal * energies.normal + weights.laplacian * energies.laplacian
     )
+    if mesh.log_sigma is not None:
+        regularization = regularization + weights.softness * mesh.sigma.pow(-2)
     return photometric + gamma * regularization

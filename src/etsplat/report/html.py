@@ -99,6 +99,8 @@ def _card(metric: Metric) -> str:
 def _mesh_section(run: Run) -> str:
     mesh = load_mesh(run.mesh)
     colors = torch.full((len(mesh.faces), 3), 0.8) if mesh.face_colors is None else mesh.face_colors
+    if mesh.vertex_colors is not None:
+        colors = mesh.vertex_colors[mesh.faces].mean(dim=1)
     data = {
         "vertices": _base64(mesh.vertices.numpy().astype("<f4").tobytes()),
         "faces": _base64(mesh.faces.numpy().astype("<u4").tobytes()),

@@ -10,12 +10,12 @@ from etsplat.geometry.measures import face_areas
 from etsplat.geometry.subdivision import longest_edge_plan
 from etsplat.geometry.topology import MeshTopology
 from etsplat.ops.adam import Adam
-from etsplat.ops.rasterize import rasterize
 from etsplat.optim.edit import apply_subdivision
 from etsplat.optim.loop import Progress
 from etsplat.optim.objectives import MeshWeights, mesh_objective
 from etsplat.optim.schedules import exponential_decay, face_budgets, regularization_weight
 from etsplat.optim.view_sampler import ViewSampler
+from etsplat.scene.mesh_rendering import render_mesh
 from etsplat.scene.triangle_mesh import TriangleMesh
 from etsplat.scene.views import PosedViews
 from etsplat.tasks.reconstruct_config import ReconstructConfig
@@ -71,7 +71,8 @@ class MeshFitting:
             start_faces=len(mesh.faces),
             max_faces=config.max_faces,
         )
-        self.adam = Adam(mesh.parameters(), self._rates, engine=config.engine)
+        parameters = mesh.parameters()
+        self.adam = Adam(parameters, {name: self._rates[name] for name in parameters}, engine=config.engine)
 
     @property
     def count(self) -> int:
@@ -79,33 +80,18 @@ class MeshFitting:
         return len(self.mesh.faces)
 
     def describe(self) -> dict[str, float]:
-        """For the log: number of faces and softness."""
+        """For the log: number of faces and softness (0 for opaque triangles)."""
         return {"faces": self.count, "sigma": float(self.mesh.sigma.detach())}
 
     def step(self, iteration: int) -> float:
         """One view over one random background, one step of Adam; returns the loss before it."""
-        config, mesh, cameras = self._config, self.mesh, self._views.cameras
+        config, mesh = self._config, self.mesh
         view = self._sampler.next_view()
         background = self._sampler.background()
-        rendering = rasterize(
-            mesh.vertices,
-            mesh.colors,
-            mesh.opacities,
-            mesh.sigma,
-            cameras.viewmats[view : view + 1],
-            cameras.Ks[view : view + 1],
-            cameras.width,
-            cameras.height,
-            faces=mesh.faces,
-            kernel=config.kernel,
-            distance=config.distance,
-            backgrounds=background,
-            validate=False,  # the loop checks the loss at every step, and the parameters before each checkpoint
-            engine=config.engine,
-        )
+        color = render_mesh(mesh, self._views.cameras[view], config.appearance, backgrounds=background)
         gamma = regularization_weight(iteration, config.iterations, config.gamma_hold)
         target = self._views.images[view : view + 1]
-        loss = mesh_objective(rendering.color, target, background, mesh, self._weights, gamma, engine=config.engine)
+        loss = mesh_objective(color, target, background, mesh, self._weights, gamma, engine=config.engine)
         self.adam.zero_grad()
         loss.backward()
         decay = exponential_decay(iteration, config.iterations, config.lr_vertices_final)
@@ -121,9 +107,7 @@ class MeshFitting:
         before = len(mesh.faces)
         vertices = mesh.vertices.detach()
         plan = longest_edge_plan(vertices, mesh.topology, face_areas(vertices, mesh.faces), self._budgets[iteration])
-        carried = apply_subdivision(
-            plan, self.adam, per_vertex=TriangleMesh.VERTEX_PARAMETERS, per_face=TriangleMesh.FACE_PARAMETERS
-        )
+        carried = apply_subdivision(plan, self.adam, per_vertex=mesh.vertex_parameters, per_face=mesh.face_parameters)
         for name, parameter in carried.items():
             setattr(mesh, name, parameter)
         mesh.topology = MeshTopology.from_faces(plan.faces, len(mesh.vertices))
@@ -152,7 +136,7 @@ class MeshFitting:
     def load_state(self, state: dict[str, Tensor], iteration: int) -> Progress:
         """Continues where `state` was taken; returns where that was."""
         mesh = self.mesh
-        for name in TriangleMesh.PARAMETERS:
+        for name in mesh.parameters():
             parameter = state[f"mesh.{name}"].requires_grad_(True)
             setattr(mesh, name, parameter)
             self.adam.replace(name, parameter, state[f"adam.first.{name}"], state[f"adam.second.{name}"])

@@ -11,6 +11,7 @@ import torch
 from etsplat.core.errors import InputError
 from etsplat.io.mesh_files import MeshFile, save_mesh
 from etsplat.io.run_directory import RunDirectory, is_run
+from etsplat.ops.antialias_nvdiffrast import load_nvdiffrast
 from etsplat.ops.engines import num_threads, one_torch_thread, resolve_engine
 from etsplat.optim.loop import Event, LoopSettings, Progress
 from etsplat.tasks.mesh_fitting import MeshFitting
@@ -35,7 +36,7 @@ class ReconstructResult:
 
     Attributes:
         path: the run directory.
-        mesh: the result with face colours, in the units of the input.
+        mesh: the result with its colours, in the units of the input.
         metrics: as in metrics.json.
     """
 
@@ -97,6 +98,8 @@ def reconstruct(
         for note in mesh.notes if isinstance(mesh, MeshFile) else ():
             announce(NoteEvent(f"{name}: {note}"))
     subject = make_subject(loaded, config, lambda done, total: announce(PrepareEvent(done, total)))
+    if config.backend == "nvdiffrast":
+        load_nvdiffrast()  # now rather than at the first step
     scorer = Scorer(subject, config)
     fitting = MeshFitting(make_start(start, subject.views, config), subject.views, config, scorer.cheap)
     run = RunDirectory.resume(out, record) if resume else RunDirectory.create(out, record, overwrite=overwrite)
@@ -118,9 +121,10 @@ def _finish(
     """Exports the mesh, draws the test views, measures everything."""
     mesh = fitting.mesh
     vertices = mesh.vertices.detach()
-    result = MeshFile(to_input_units(vertices), mesh.faces, face_colors=mesh.display_colors)
+    colors = mesh.named(mesh.display_colors)
+    result = MeshFile(to_input_units(vertices), mesh.faces, **colors)
     for suffix in (".ply", ".obj", ".glb"):
-        save_mesh(run.mesh_path(suffix), result.vertices, result.faces, result.face_colors)
+        save_mesh(run.mesh_path(suffix), result.vertices, result.faces, **colors)
     metrics = {
         **scorer.full(mesh, run.test),
         "iterations": progress.iteration,

@@ -2,11 +2,15 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal, get_args
 
 from etsplat.core.errors import InputError
 
-Method = Literal["elastic", "bilateral", "single-sided"]
+if TYPE_CHECKING:
+    from etsplat.scene.mesh_rendering import MeshAppearance
+
+Method = Literal["elastic", "bilateral", "single-sided", "raster-face", "raster-vertex"]
+METHODS: tuple[Method, ...] = get_args(Method)
 Preset = Literal["paper", "quick", "demo", "tiny"]
 
 
@@ -17,7 +21,12 @@ class ReconstructConfig:
     preset: Preset = "paper"
     """Where the other settings start from. For the record only: in Python, start from `PRESETS[name]`."""
     method: Method = "elastic"
-    """Kernel of the triangles: elastic (the paper's), bilateral (2DTS) or single-sided (Triangle Splatting)."""
+    """Kernel of soft triangles: elastic (the paper's), bilateral (2DTS) or single-sided (Triangle Splatting). Or opaque
+    triangles with antialiased silhouettes: raster-face (a colour per face) or raster-vertex (a colour per vertex)."""
+    colors: Literal["face", "vertex"] = "face"
+    """Colours of soft triangles: one for each face, or one for each vertex, interpolated between."""
+    backend: Literal["etsplat", "nvdiffrast"] = "etsplat"
+    """Whose rasterizer the raster methods use; nvdiffrast must be installed and wants a CUDA device."""
     distance: Literal["barycentric", "sdf"] = "barycentric"
     """How far a pixel is from a triangle: by barycentric coordinates or by signed distance."""
     seed: int = 0
@@ -89,7 +98,11 @@ class ReconstructConfig:
     """Weights file for LPIPS; "download" fetches it; None uses the one in torch's cache or goes without."""
 
     def __post_init__(self) -> None:
-        _check_choice(self, "method", ("elastic", "bilateral", "single-sided"))
+        _check_choice(self, "method", METHODS)
+        _check_choice(self, "colors", ("face", "vertex"))
+        _check_choice(self, "backend", ("etsplat", "nvdiffrast"))
+        if self.backend == "nvdiffrast" and self.splats:
+            raise InputError("backend: nvdiffrast draws opaque triangles; choose --method raster-face or raster-vertex")
         _check_choice(self, "distance", ("barycentric", "sdf"))
         _check_choice(self, "engine", (None, "cpu", "reference"))
         _check_choice(self, "edge_power", (1, 2))
@@ -110,9 +123,22 @@ class ReconstructConfig:
             raise InputError("subdivide_from: is after subdivide_until; make it smaller")
 
     @property
-    def kernel(self) -> str:
-        """The rasterizer's name of the method."""
-        return self.method.replace("-", "_")
+    def splats(self) -> bool:
+        """Whether triangles are soft."""
+        return not self.method.startswith("raster")
+
+    @property
+    def vertex_colored(self) -> bool:
+        """Whether colours belong to vertices."""
+        return self.colors == "vertex" if self.splats else self.method == "raster-vertex"
+
+    @property
+    def appearance(self) -> "MeshAppearance":
+        """How the mesh is drawn."""
+        from etsplat.scene.mesh_rendering import MeshAppearance  # imports torch
+
+        kernel = self.method.replace("-", "_") if self.splats else None
+        return MeshAppearance(kernel, self.distance, self.backend, self.engine)
 
 
 def _check_choice(config: ReconstructConfig, name: str, choices: tuple[object, ...]) -> None:

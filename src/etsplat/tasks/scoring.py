@@ -12,8 +12,7 @@ from etsplat.geometry.intersections import count_degenerate_faces, count_self_in
 from etsplat.io.images import save_image
 from etsplat.metrics.geometry import chamfer, geometry_metrics, sample_pair
 from etsplat.metrics.image import Lpips, find_lpips_weights, psnr, ssim
-from etsplat.ops.rasterize import rasterize
-from etsplat.ops.rasterize_hard import render_opaque
+from etsplat.scene.mesh_rendering import render_exported, render_mesh
 from etsplat.scene.triangle_mesh import TriangleMesh
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.sources import Subject
@@ -99,35 +98,12 @@ class Scorer:
 
     @torch.no_grad()
     def _splatted(self, mesh: TriangleMesh, view: int) -> Float[Tensor, "H W 3"]:
-        camera, config = self._views.cameras[view], self._config
-        rendering = rasterize(
-            mesh.vertices,
-            mesh.colors,
-            mesh.opacities,
-            mesh.sigma,
-            camera.viewmats,
-            camera.Ks,
-            camera.width,
-            camera.height,
-            faces=mesh.faces,
-            kernel=config.kernel,
-            distance=config.distance,
-            engine=config.engine,
-        )
-        return rendering.color[0].clamp(0.0, 1.0)
+        return render_mesh(mesh, self._views.cameras[view], self._config.appearance)[0].clamp(0.0, 1.0)
 
     def _opaque(self, mesh: TriangleMesh, view: int) -> Float[Tensor, "H W 3"]:
-        camera, config = self._views.cameras[view], self._config
-        image = render_opaque(
-            mesh.vertices.detach(),
-            camera.viewmats,
-            camera.Ks,
-            camera.width,
-            camera.height,
-            faces=mesh.faces,
-            face_colors=mesh.display_colors,
-            supersampling=config.supersampling,
-            engine=config.engine,
+        config = self._config
+        image = render_exported(
+            mesh, self._views.cameras[view], supersampling=config.supersampling, engine=config.engine
         )
         return image[0, ..., :3]
 

@@ -89,7 +89,7 @@ def make_start(start: MeshFile | None, views: PosedViews, config: ReconstructCon
     """The mesh that a run starts from, in the unit frame: an icosphere around the object, or the given mesh.
 
     Args:
-        start: from `load_start`, in the input's units; its face colours are used if it has them.
+        start: from `load_start`, in the input's units; its colours are used if it has the kind that is optimised.
         views: of the unit frame.
         config: level, radius, colour, opacity and softness.
     """
@@ -99,9 +99,15 @@ def make_start(start: MeshFile | None, views: PosedViews, config: ReconstructCon
         colors: Tensor | float = config.start_color
     else:
         vertices, faces = views.normalization.apply(start.vertices), start.faces
-        colors = config.start_color if start.face_colors is None else start.face_colors
+        given = start.vertex_colors if config.vertex_colored else start.face_colors
+        colors = config.start_color if given is None else given
     return TriangleMesh.from_mesh(
-        vertices, faces, colors=colors, opacity=config.start_opacity, sigma=config.start_sigma
+        vertices,
+        faces,
+        colors=colors,
+        opacity=config.start_opacity if config.splats else None,
+        sigma=config.start_sigma if config.splats else None,
+        vertex_colored=config.vertex_colored,
     )
 
 
@@ -110,7 +116,7 @@ def fingerprint(source: MeshFile | PosedViews | None) -> str | None:
     if source is None:
         return None
     if isinstance(source, MeshFile):
-        tensors = [source.vertices, source.faces, source.face_colors]
+        tensors = [source.vertices, source.faces, source.face_colors, source.vertex_colors]
     else:
         split = torch.tensor([*source.train, -1, *source.test])
         tensors = [source.cameras.viewmats, source.cameras.Ks, split, *source.images]
