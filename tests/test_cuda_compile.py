@@ -11,7 +11,12 @@ from etsplat.cuda.compile import cache_folder, compile_program, compile_without_
 from etsplat.cuda.program import Program, source_root
 
 ARCHITECTURES = ("sm_75", "sm_80", "sm_86", "sm_89", "sm_90", "sm_100", "sm_120")
-PROGRAMS = [Program("fill.cu")]
+PROGRAMS = [
+    Program("fill.cu"),
+    *(Program(file, contract=False) for file in ("adam.cu", "mesh_energies.cu", "photometric.cu")),
+    *(Program(file, contract=False) for file in ("rasterize_hard.cu", "ssim.cu")),
+    Program("spherical_harmonics.cu"),
+]
 ELF = b"\x7fELF"
 
 

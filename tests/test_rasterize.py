@@ -111,7 +111,7 @@ BAD_ARGUMENTS = {
     "height": ({"height": 7.0}, "height must be a positive integer, got 7.0"),
     "near plane": ({"near_plane": 0.0}, "near_plane must be positive"),
     "cutoffs": ({"cutoffs": Cutoffs(alpha_min=0.5, alpha_max=0.4)}, "cutoffs must satisfy"),
-    "engine": ({"engine": "metal"}, "engine must be one of reference, cpu or None, got 'metal'"),
+    "engine": ({"engine": "metal"}, "engine must be one of reference, cpu, cuda or None, got 'metal'"),
     "sigma range": ({"sigma": torch.zeros(5)}, "sigma must be positive, got 0.0"),
     "skew": ({"Ks": torch.ones(2, 3, 3)}, "Ks must have the form"),
     "NaN vertices": ({"vertices": torch.full((5, 3, 3), torch.nan)}, "vertices must be finite, got 45 NaN"),

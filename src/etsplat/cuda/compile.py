@@ -13,7 +13,6 @@ from etsplat.core.errors import EngineUnavailableError
 from etsplat.cuda.program import Program
 
 INSTALL = "pip install 'etsplat[cuda]'"
-# Contraction stays on: what forward and backward must compute alike is written with vfma (csrc/math/portable.h).
 OPTIONS = ("--std=c++17",)
 _DIGEST_SIZE = 32
 
@@ -41,7 +40,7 @@ def compile_without_cache(program: Program, architecture: str) -> bytes:
     nvrtc = import_nvrtc()
     handle = _checked(nvrtc, nvrtc.nvrtcCreateProgram(program.source.encode(), program.file.encode(), 0, [], []))
     try:
-        options = [option.encode() for option in (*OPTIONS, f"--gpu-architecture={architecture}")]
+        options = [option.encode() for option in _options(program, architecture)]
         (status,) = nvrtc.nvrtcCompileProgram(handle, len(options), options)
         if status != nvrtc.nvrtcResult.NVRTC_SUCCESS:
             log = b" " * _checked(nvrtc, nvrtc.nvrtcGetProgramLogSize(handle))
@@ -90,8 +89,14 @@ def cache_folder() -> Path:
     return base / "etsplat" / "kernels"
 
 
+def _options(program: Program, architecture: str) -> tuple[str, ...]:
+    # Where contraction is on, what forward and backward must compute alike is written with vfma (csrc/math/portable.h).
+    contraction = "true" if program.contract else "false"
+    return (*OPTIONS, f"--fmad={contraction}", f"--gpu-architecture={architecture}")
+
+
 def _key(program: Program, architecture: str, version: tuple[int, int]) -> str:
-    parts = (program.source, *OPTIONS, architecture, str(version))
+    parts = (program.source, *_options(program, architecture), str(version))
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()
 
 

@@ -17,10 +17,13 @@ class Program:
     Attributes:
         file: Name in csrc/cuda, such as "fill.cu". Its kernels are ``extern "C" __global__``.
         defines: (name, value) pairs; constants that the compiler should know.
+        contract: Whether a b + c may be rounded once. Without, results are those of the CPU engine to the bit; that
+            costs nothing where bytes are the bound.
     """
 
     file: str
     defines: tuple[tuple[str, int | str], ...] = ()
+    contract: bool = True
 
     @property
     def source(self) -> str:

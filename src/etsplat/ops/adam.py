@@ -4,7 +4,7 @@ The update is that of ``torch.optim.Adam`` without weight decay, on every elemen
 Moments are plain tensors under the parameter's name, so that structural edits can carry them over (``optim/edit.py``).
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -12,6 +12,8 @@ from torch import Tensor
 
 from etsplat import _native
 from etsplat.core.validation import check_like, check_shape
+from etsplat.cuda.transfer import upload
+from etsplat.ops._adam_cuda import adam_step_cuda
 from etsplat.ops.engines import resolve_engine
 
 
@@ -48,7 +50,7 @@ class Adam:
             learning_rates: One for each name, at least 0.
             betas: Both in [0, 1).
             eps: At least 0.
-            engine: "cpu", "reference" or None (by dtype and device, for each parameter).
+            engine: "cpu", "cuda", "reference" or None (by dtype and device, for each parameter).
 
         Raises:
             ValueError: Names that do not match, or a number out of its range.
@@ -79,12 +81,17 @@ class Adam:
             if parameter.grad is None:
                 raise ValueError(f"parameter {name} has no gradient: call backward() before step()")
         self.step_count += 1
-        native = [name for name, engine in self._engines.items() if engine == "cpu"]
-        if native:
-            self._step_native(native)
-        for name, engine in self._engines.items():
-            if engine == "reference":
-                self._step_reference(name)
+        if names := self._of_engine("cpu"):
+            self._step_cpu(names)
+        if names := self._of_engine("cuda"):
+            self._step_cuda(names, upload(self.rates(names), self.parameters[names[0]].device), None)
+        for name in self._of_engine("reference"):
+            self._step_reference(name)
+
+    def rates(self, names: Sequence[str]) -> list[float]:
+        """What step t = `step_count` needs: lr / (1 - b1^t) of each named parameter, then sqrt(1 - b2^t)."""
+        first, second = (1 - beta**self.step_count for beta in self.betas)
+        return [*(self.learning_rates[name] / first for name in names), second**0.5]
 
     def zero_grad(self) -> None:
         """Drop all gradients."""
@@ -138,26 +145,57 @@ class Adam:
         self.first_moments = {name: _dense_copy(state["first_moments"][name]) for name in self.parameters}
         self.second_moments = {name: _dense_copy(state["second_moments"][name]) for name in self.parameters}
 
-    def _step_native(self, names: list[str]) -> None:
-        parameters = [self.parameters[name] for name in names]
-        dense = [parameter.contiguous() for parameter in parameters]
-        gradients = [parameter.grad.contiguous() for parameter in parameters if parameter.grad is not None]
+    @torch.no_grad()
+    def step_on_device(self, rates: Tensor, halted: Tensor | None) -> None:
+        """A step of engine "cuda" that a CUDA graph can capture and repeat; it leaves `step_count` to the caller.
+
+        Args:
+            rates: (P + 1,) float32 in device memory, of `rates`.
+            halted: () int32 in device memory: nothing is updated where it is not 0. None never halts.
+        """
+        self._step_cuda(list(self.parameters), rates, halted)
+
+    def _of_engine(self, engine: str) -> list[str]:
+        return [name for name, chosen in self._engines.items() if chosen == engine]
+
+    def _step_cpu(self, names: list[str]) -> None:
+        groups = self._dense(names)
+        values, gradients, firsts, seconds = zip(*groups, strict=True)
         _native.adam_step(
-            [tensor.data_ptr() for tensor in dense],
+            [tensor.data_ptr() for tensor in values],
             [tensor.data_ptr() for tensor in gradients],
-            [self.first_moments[name].data_ptr() for name in names],
-            [self.second_moments[name].data_ptr() for name in names],
-            [tensor.numel() for tensor in dense],
+            [tensor.data_ptr() for tensor in firsts],
+            [tensor.data_ptr() for tensor in seconds],
+            [tensor.numel() for tensor in values],
             [self.learning_rates[name] for name in names],
             *self.betas,
             self.eps,
             self.step_count,
         )
-        for parameter, updated in zip(parameters, dense, strict=True):
-            if updated is parameter:
+        self._store(names, values)
+
+    def _step_cuda(self, names: list[str], rates: Tensor, halted: Tensor | None) -> None:
+        groups = self._dense(names)
+        adam_step_cuda(groups, rates, self.betas, self.eps, halted)
+        self._store(names, [group[0] for group in groups])
+
+    def _dense(self, names: list[str]) -> list[tuple[Tensor, Tensor, Tensor, Tensor]]:
+        """Value, gradient and moments of each parameter, contiguous."""
+        groups = []
+        for name in names:
+            parameter = self.parameters[name]
+            assert parameter.grad is not None
+            value, gradient = parameter.contiguous(), parameter.grad.contiguous()
+            groups.append((value, gradient, self.first_moments[name], self.second_moments[name]))
+        return groups
+
+    def _store(self, names: list[str], updated: Sequence[Tensor]) -> None:
+        for name, value in zip(names, updated, strict=True):
+            parameter = self.parameters[name]
+            if value is parameter:
                 torch.autograd.graph.increment_version(parameter)  # so that a stale graph fails loudly in backward
             else:
-                parameter.copy_(updated)
+                parameter.copy_(value)
 
     def _step_reference(self, name: str) -> None:
         parameter, first, second = self.parameters[name], self.first_moments[name], self.second_moments[name]

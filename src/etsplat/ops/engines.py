@@ -1,4 +1,4 @@
-"""Which engine runs an operation: ``reference`` (plain PyTorch, any dtype) or ``cpu`` (native, float32)."""
+"""Which engine runs an operation: ``reference`` (plain PyTorch), ``cpu`` or ``cuda`` (native, float32)."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -7,16 +7,19 @@ import torch
 from torch import Tensor
 
 from etsplat import _native
+from etsplat.cuda.launch import device_type
 
-ENGINES = ("reference", "cpu")
+ENGINES = ("reference", "cpu", "cuda")
+
+_deterministic = False
 
 
 def resolve_engine(engine: str | None, tensor: Tensor) -> str:
     """The engine for an operation on ``tensor``.
 
     Args:
-        engine: "reference", "cpu", or None for the fastest that computes in the tensor's precision: cpu for float32,
-            reference for float64.
+        engine: "reference", "cpu", "cuda", or None for the fastest that computes in the tensor's precision on its
+            device: cpu or cuda for float32, reference for float64.
         tensor: Decides by its device and dtype.
 
     Raises:
@@ -24,17 +27,30 @@ def resolve_engine(engine: str | None, tensor: Tensor) -> str:
     """
     if engine is not None and engine not in ENGINES:
         raise ValueError(f"engine must be one of {', '.join(ENGINES)} or None, got {engine!r}")
-    if tensor.device.type == "cuda" and engine is None:
-        raise ValueError("the GPU engine is not part of this release: move the tensors to the CPU with .cpu()")
     if tensor.dtype not in (torch.float32, torch.float64):
         raise ValueError(f"tensors must be float32 or float64, got {tensor.dtype}")
     if engine is None:
-        return "cpu" if tensor.dtype == torch.float32 and tensor.device.type == "cpu" else "reference"
-    if engine == "cpu" and tensor.device.type != "cpu":
-        raise ValueError(f"engine cpu needs tensors on the CPU, got {tensor.device}")
-    if engine == "cpu" and tensor.dtype != torch.float32:
-        raise ValueError(f"engine cpu computes in float32, got {tensor.dtype}: use engine='reference' or .float()")
+        native = tensor.dtype == torch.float32 and tensor.device.type in ("cpu", "cuda")
+        return tensor.device.type if native else "reference"
+    if engine == "reference":
+        return engine
+    device, name = ("cpu", "the CPU") if engine == "cpu" else (device_type(), "a GPU")
+    if tensor.device.type != device:
+        raise ValueError(f"engine {engine} needs tensors on {name}, got {tensor.device}")
+    if tensor.dtype != torch.float32:
+        raise ValueError(f"engine {engine} computes in float32, got {tensor.dtype}: use engine='reference' or .float()")
     return engine
+
+
+def is_deterministic() -> bool:
+    """Whether engine cuda gives the same bits in every run; engine cpu always does."""
+    return _deterministic
+
+
+def set_deterministic(wanted: bool) -> None:
+    """Make engine cuda give the same bits in every run, or let it add gradients in any order, which is faster."""
+    global _deterministic
+    _deterministic = wanted
 
 
 def num_threads() -> int:

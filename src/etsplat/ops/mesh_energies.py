@@ -17,6 +17,7 @@ from torch import Tensor
 
 from etsplat import _native
 from etsplat.core.validation import check_indices, check_shape
+from etsplat.ops._mesh_energies_cuda import MeshEnergiesCuda
 from etsplat.ops.engines import resolve_engine
 
 _MIN_LENGTH = 1e-12
@@ -125,10 +126,11 @@ def mesh_energies(
         vertices: (V, 3).
         connectivity: Of the mesh; ``MeshTopology.connectivity``.
         edge_power: 1 for the mean length of the edges (the paper's formula), 2 for the mean squared length.
-        engine: "cpu", "reference" or None (by dtype and device).
+        engine: "cpu", "cuda", "reference" or None (by dtype and device).
 
     Returns:
-        The three scalars. The native engine's values and gradients are the same bits for any number of threads.
+        The three scalars. The native engines' values and gradients are the same bits in every run, for any number of
+        threads.
 
     Raises:
         ValueError: Wrong shape, dtype or device, or another power.
@@ -138,10 +140,12 @@ def mesh_energies(
         raise ValueError(f"connectivity must be on {vertices.device}, got {connectivity.faces.device}")
     if edge_power not in (1, 2):
         raise ValueError(f"edge_power must be 1 or 2, got {edge_power}")
-    if resolve_engine(engine, vertices) == "cpu":
-        energies: Any = _MeshEnergies.apply(vertices, connectivity, edge_power)
-        return MeshEnergies(*energies)
-    return _mesh_energies_reference(vertices, connectivity, edge_power)
+    chosen = resolve_engine(engine, vertices)
+    if chosen == "reference":
+        return _mesh_energies_reference(vertices, connectivity, edge_power)
+    native = MeshEnergiesCuda if chosen == "cuda" else _MeshEnergies
+    energies: Any = native.apply(vertices, connectivity, edge_power)
+    return MeshEnergies(*energies)
 
 
 class _MeshEnergies(torch.autograd.Function):

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from etsplat import _native
 from etsplat.core.validation import check_like, check_shape
+from etsplat.ops._photometric_cuda import L1OverBackgroundCuda
 from etsplat.ops.engines import resolve_engine
 
 
@@ -30,10 +31,10 @@ def l1_over_background(
             where the difference is.
         target: (B, H, W, 4) premultiplied RGBA in [0, 1].
         backgrounds: (B, 3), one colour per view.
-        engine: "cpu", "reference" or None (by dtype and device).
+        engine: "cpu", "cuda", "reference" or None (by dtype and device).
 
     Returns:
-        The mean, a scalar. The native engine adds in a fixed order: the same bits for any number of threads.
+        The mean, a scalar. The native engines add in a fixed order: the same bits in every run.
 
     Raises:
         ValueError: Wrong shape, dtype or device; an empty image; a target or background that wants a gradient.
@@ -47,8 +48,10 @@ def l1_over_background(
             raise ValueError(f"{name} receives no gradient from this loss: pass {name}.detach()")
     if color.numel() == 0:
         raise ValueError(f"color must hold at least one pixel, got shape {tuple(color.shape)}")
-    if resolve_engine(engine, color) == "cpu":
-        loss: Any = _L1OverBackground.apply(color, target, backgrounds)
+    chosen = resolve_engine(engine, color)
+    if chosen != "reference":
+        native = L1OverBackgroundCuda if chosen == "cuda" else _L1OverBackground
+        loss: Any = native.apply(color, target, backgrounds)
         return loss
     composited = target[..., :3] + (1 - target[..., 3:]) * backgrounds[:, None, None, :]
     return (color - composited).abs().mean()

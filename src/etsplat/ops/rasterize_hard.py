@@ -14,6 +14,7 @@ from torch import Tensor
 
 from etsplat import _native
 from etsplat.core.validation import check_device, check_indices, check_intrinsics, check_like, check_shape
+from etsplat.ops._rasterize_hard_cuda import rasterize_hard_cuda, render_opaque_cuda
 from etsplat.ops._rasterize_hard_reference import View, rasterize_hard_reference, render_opaque_reference
 from etsplat.ops.engines import resolve_engine
 
@@ -57,7 +58,7 @@ def rasterize_hard(
         height: Image height in pixels.
         faces: (F, 3) vertex indices, int32 or int64.
         near_plane: Triangles with a vertex at this depth or nearer are dropped; > 0.
-        engine: "cpu", "reference" or None (by dtype and device).
+        engine: "cpu", "cuda", "reference" or None (by dtype and device).
 
     Raises:
         ValueError: Wrong shape, dtype, device or index; the message names the argument.
@@ -68,7 +69,7 @@ def rasterize_hard(
     triangle = torch.empty((views, height, width), dtype=torch.int32, device=vertices.device)
     barycentrics = vertices.new_empty((views, height, width, 3))
     depth = vertices.new_empty((views, height, width))
-    rasterize_view = _rasterize_cpu if resolve_engine(engine, vertices) == "cpu" else rasterize_hard_reference
+    rasterize_view = _RASTERIZE[resolve_engine(engine, vertices)]
     for b in range(views):
         view = View(viewmats[b], Ks[b], width, height, near_plane)
         rasterize_view(points, triangles, view, triangle[b], barycentrics[b], depth[b])
@@ -105,7 +106,7 @@ def render_opaque(
         supersampling: Samples along each axis of a pixel, 1 to 16.
         near_plane: Triangles with a vertex at this depth or nearer are dropped; > 0.
         cull_backfaces: Drop triangles whose vertices run clockwise as seen from the camera.
-        engine: "cpu", "reference" or None (by dtype and device).
+        engine: "cpu", "cuda", "reference" or None (by dtype and device).
 
     Returns:
         (B, H, W, C + 1): colour premultiplied by the coverage, then the coverage in [0, 1].
@@ -119,7 +120,7 @@ def render_opaque(
     if not 1 <= supersampling <= MAX_SUPERSAMPLING:
         raise ValueError(f"supersampling must be from 1 to {MAX_SUPERSAMPLING}, got {supersampling}")
     image = vertices.new_empty((len(viewmats), height, width, colors.shape[1] + 1))
-    render_view = _render_cpu if resolve_engine(engine, vertices) == "cpu" else render_opaque_reference
+    render_view = _RENDER[resolve_engine(engine, vertices)]
     for b in range(len(viewmats)):
         view = View(viewmats[b], Ks[b], width, height, near_plane)
         render_view(points, triangles, view, colors, face_colors is not None, supersampling, cull_backfaces, image[b])
@@ -209,3 +210,7 @@ def _addresses(points: Tensor, triangles: Tensor, view: View) -> tuple[int | flo
         view.width,
         view.height,
     )
+
+
+_RASTERIZE = {"reference": rasterize_hard_reference, "cpu": _rasterize_cpu, "cuda": rasterize_hard_cuda}
+_RENDER = {"reference": render_opaque_reference, "cpu": _render_cpu, "cuda": render_opaque_cuda}

@@ -8,9 +8,12 @@ from torch import Tensor
 
 from etsplat import _native
 from etsplat.core.validation import check_like, check_shape
+from etsplat.ops._spherical_harmonics_cuda import SoupColorsCuda
 from etsplat.ops.engines import resolve_engine
 from etsplat.ops.pool import empty_image
 from etsplat.ops.spherical_harmonics import MAX_DEGREE, spherical_harmonics
+
+_MAX_REST = (MAX_DEGREE + 1) ** 2 - 1
 
 
 def soup_colors(
@@ -30,7 +33,7 @@ def soup_colors(
         sh_rest: (N, R, 3) those of the other bands, R >= (degree + 1)^2 - 1; bands above ``degree`` get zero gradient.
         centers: (B, 3) camera positions; they receive no gradient.
         degree: 0 to 3.
-        engine: "cpu", "reference" or None (by dtype and device).
+        engine: "cpu", "cuda", "reference" or None (by dtype and device).
 
     Returns:
         (B, N, 3), at least 0. Gradients reach the first three tensors; there is none where the colour was clamped.
@@ -49,8 +52,10 @@ def soup_colors(
         check_like(name, tensor, "vertices", vertices)
     if sh_rest.shape[1] < (degree + 1) ** 2 - 1:
         raise ValueError(f"sh_rest must have {(degree + 1) ** 2 - 1} bases for degree {degree}, got {sh_rest.shape[1]}")
-    if resolve_engine(engine, vertices) == "cpu":
-        colors: Any = _SoupColors.apply(vertices, sh_dc, sh_rest, centers, degree)
+    chosen = resolve_engine(engine, vertices)
+    if chosen != "reference":
+        native = SoupColorsCuda if chosen == "cuda" else _SoupColors
+        colors: Any = native.apply(vertices, sh_dc, sh_rest[:, :_MAX_REST], centers, degree)
         return colors
     directions = vertices.mean(dim=1) - centers[:, None].detach()
     return spherical_harmonics(torch.cat([sh_dc, sh_rest], dim=1), directions, degree, engine=engine)

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from etsplat import _native
 from etsplat.core.validation import check_like, check_shape
+from etsplat.ops._spherical_harmonics_cuda import SphericalHarmonicsCuda
 from etsplat.ops.engines import resolve_engine
 
 MAX_DEGREE = 3
@@ -33,7 +34,7 @@ def spherical_harmonics(
         directions: (N, 3), or (B, N, 3) for B views: from the camera to the primitive, of any length. One of length
             1e-12 or less shows the constant band only and gets zero gradient.
         degree: 0 to 3.
-        engine: "cpu", "reference" or None (by dtype and device).
+        engine: "cpu", "cuda", "reference" or None (by dtype and device).
 
     Returns:
         (N, C) or (B, N, C), at least 0. Gradients reach both tensors; there is none where the colour was clamped.
@@ -52,8 +53,10 @@ def spherical_harmonics(
     batch = ("B",) if directions.ndim == 3 else ()
     check_shape("directions", directions, (*batch, len(coefficients), 3))
     check_like("directions", directions, "coefficients", coefficients)
-    if resolve_engine(engine, coefficients) == "cpu":
-        colors: Any = _SphericalHarmonics.apply(coefficients, directions, degree)
+    chosen = resolve_engine(engine, coefficients)
+    if chosen != "reference":
+        native = SphericalHarmonicsCuda if chosen == "cuda" else _SphericalHarmonics
+        colors: Any = native.apply(coefficients, directions, degree)
         return colors
     basis = _basis(directions, degree)
     return torch.relu(0.5 + torch.einsum("...nk,nkc->...nc", basis, coefficients[:, : basis.shape[-1]]))

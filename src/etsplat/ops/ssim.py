@@ -16,6 +16,7 @@ from torch import Tensor
 
 from etsplat import _native
 from etsplat.core.validation import check_choice, check_device, check_like, check_shape
+from etsplat.ops._ssim_cuda import PhotometricLossCuda
 from etsplat.ops.engines import resolve_engine
 from etsplat.ops.pool import empty_image
 
@@ -42,10 +43,10 @@ def photometric_loss(
         mask: (B, H, W) in [0, 1]: how much each pixel counts. None for all.
         backgrounds: (B, 3), one colour per view, behind a target with alpha; None for black.
         pixel: "l1" for the mean absolute difference, "l2" for the mean square.
-        engine: "cpu", "reference" or None (by dtype and device).
+        engine: "cpu", "cuda", "reference" or None (by dtype and device).
 
     Returns:
-        A scalar. The native engine adds in a fixed order: the same bits for any number of threads.
+        A scalar. The native engines add in a fixed order: the same bits in every run.
 
     Raises:
         ValueError: Wrong shape, dtype, device or range; an empty image; a constant that wants a gradient.
@@ -54,7 +55,11 @@ def photometric_loss(
     check_choice("pixel", pixel, ("l1", "l2"))
     if not 0.0 <= dssim_weight <= 1.0:
         raise ValueError(f"dssim_weight must be from 0 to 1, got {dssim_weight}")
-    if resolve_engine(engine, color) == "cpu":
+    chosen = resolve_engine(engine, color)
+    if chosen == "cuda":
+        on_device: Any = PhotometricLossCuda.apply(color, target, mask, backgrounds, dssim_weight, pixel == "l2")
+        return on_device
+    if chosen == "cpu":
         settings = _Settings(dssim_weight, pixel == "l2")
         loss: Any = _PhotometricLoss.apply(color, target, mask, backgrounds, settings)
         return loss

@@ -1,0 +1,75 @@
+"""The GPU engine's side of ``photometric_loss``: csrc/cuda/ssim.cu."""
+
+import ctypes
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from etsplat.cuda.launch import blocks, launch
+from etsplat.cuda.program import Program
+
+_PROGRAM = Program("ssim.cu", contract=False)
+_TILE = 16
+_THREADS = _TILE * _TILE
+
+
+class _Photometric(ctypes.Structure):
+    _fields_ = (
+        *((name, ctypes.c_void_p) for name in ("color", "target", "backgrounds", "mask")),
+        *((name, ctypes.c_int) for name in ("views", "height", "width", "channels", "bytes", "squared")),
+        ("dssim_weight", ctypes.c_float),
+    )
+
+
+class PhotometricLossCuda(torch.autograd.Function):
+    """Forward keeps the derivatives of SSIM by its moments, which backward blurs once more."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        color: Tensor,
+        target: Tensor,
+        mask: Tensor | None,
+        backgrounds: Tensor | None,
+        dssim_weight: float,
+        squared: bool,
+    ) -> Tensor:
+        """See ``photometric_loss``."""
+        images = [None if image is None else image.contiguous() for image in (color, target, backgrounds, mask)]
+        B, H, W = color.shape[:3]
+        maps = color.new_empty((B, 3, 3, H, W)) if ctx.needs_input_grad[0] else None
+        grid = _grid(color)
+        sums = color.new_empty((grid[0] * grid[1] * grid[2], 2), dtype=torch.float64)
+        loss = color.new_empty(())
+        problem = _problem(images, dssim_weight, squared)
+        launch(_PROGRAM, "ssim_sums", grid, _THREADS, (problem, maps, sums))
+        launch(_PROGRAM, "ssim_loss", 1, _THREADS, (problem, sums, ctypes.c_int64(len(sums)), loss))
+        if maps is not None:
+            ctx.save_for_backward(*images, maps)
+            ctx.settings = dssim_weight, squared
+        return loss
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad_loss: Tensor) -> tuple[Tensor, None, None, None, None, None]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """``grad_loss`` stays in device memory."""
+        *images, maps = ctx.saved_tensors
+        gradient = torch.empty_like(images[0])
+        arguments = (_problem(images, *ctx.settings), maps, grad_loss, gradient)
+        launch(_PROGRAM, "ssim_backward", _grid(gradient), _THREADS, arguments)
+        return gradient, None, None, None, None, None
+
+
+def _problem(images: list[Any], dssim_weight: float, squared: bool) -> _Photometric:
+    """Of color, target, backgrounds, mask; the latter two may be None."""
+    color, target = images[:2]
+    addresses = (None if image is None else image.data_ptr() for image in images)
+    return _Photometric(
+        *addresses, *color.shape[:3], target.shape[-1], target.dtype == torch.uint8, squared, dssim_weight
+    )
+
+
+def _grid(color: Tensor) -> tuple[int, int, int]:
+    return blocks(color.shape[2], _TILE), blocks(color.shape[1], _TILE), len(color)
