@@ -10,6 +10,7 @@ import tyro
 from etsplat.cli.command import Command
 from etsplat.cli.data import Download, Sfm
 from etsplat.cli.doctor import Doctor
+from etsplat.cli.export import Export
 from etsplat.cli.reconstruct import Demo, Reconstruct
 
 
@@ -32,6 +33,7 @@ COMMANDS: dict[str, type[Command] | Group] = {
     "data": Group(
         "Where captures come from: find the cameras of photos, fetch data sets.", {"sfm": Sfm, "download": Download}
     ),
+    "export": Export,
     "doctor": Doctor,
 }
 

@@ -72,7 +72,9 @@ def read_ply(path: Path) -> RawMesh:
 
 def read_off(path: Path) -> RawMesh:
     """OFF through trimesh; a file with fewer faces than its header announces is an error."""
-    return _with_announced_faces(path, _read_with_trimesh(path), _announced_off_faces(path))
+    mesh = _with_announced_faces(path, _read_with_trimesh(path), _announced_off_faces(path))
+    mesh.face_colors = _off_face_colors(path, len(mesh.faces))  # trimesh leaves them out
+    return mesh
 
 
 def read_gltf(path: Path) -> RawMesh:
@@ -158,6 +160,18 @@ def _announced_off_faces(path: Path) -> int:
     with open(path, encoding="utf-8", errors="replace") as file:
         words = [word for line in file for word in line.split("#")[0].split()][:4]
     return int(words[2])
+
+
+def _off_face_colors(path: Path, count: int) -> np.ndarray | None:
+    """Colours behind the corners of every face, as whole numbers up to 255 or fractions; None if a face has none."""
+    with open(path, encoding="utf-8", errors="replace") as file:
+        lines = [words for line in file if (words := line.split("#")[0].split())]
+    rows = lines[-count:]
+    if not rows or any(row[0] != "3" or len(row) < 7 for row in rows):
+        return None
+    colors = np.array([[float(word) for word in row[4:7]] for row in rows])
+    whole = all(word.isdigit() for row in rows for word in row[4:7])
+    return np.clip(colors / 255 if whole else colors, 0, 1)
 
 
 READERS: dict[str, Callable[[Path], RawMesh]] = {

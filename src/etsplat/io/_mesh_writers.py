@@ -1,4 +1,4 @@
-"""PLY, OBJ and GLB writers: small enough to own, so that colours are exactly what the format's viewers expect."""
+"""PLY, OBJ, OFF and GLB writers: small enough to own, so that colours are exactly what the format's viewers expect."""
 
 import json
 import struct
@@ -48,23 +48,47 @@ def write_obj(path: Path, vertices: np.ndarray, faces: np.ndarray, face_colors: 
         np.savetxt(file, faces + 1, fmt="f %d %d %d")
 
 
+def write_off(path: Path, vertices: np.ndarray, faces: np.ndarray, colors: Colors) -> None:
+    """OFF; `colors` (F, 3) or (F, 4) per face follow the corners as whole numbers from 0 to 255."""
+    rows = np.hstack([np.full((len(faces), 1), 3), faces])
+    if colors is not None:
+        rows = np.hstack([rows, np.floor(colors * 255 + 0.5).astype(np.int64)])
+    with open(path, "w", encoding="ascii", newline="\n") as file:
+        file.write(f"OFF\n{len(vertices)} {len(faces)} 0\n")
+        np.savetxt(file, vertices, fmt="%.9g")
+        np.savetxt(file, rows, fmt="%d")
+
+
 def write_glb(path: Path, vertices: np.ndarray, faces: np.ndarray, face_colors: Colors, vertex_colors: Colors) -> None:
-    """Binary glTF 2.0, one primitive. Vertex colours, display values, become linear COLOR_0 under an unlit material."""
+    """Binary glTF 2.0, one primitive. Vertex colours, display values, become linear COLOR_0 under an unlit material.
+
+    With (V, 4) the last channel is alpha, and the material blends.
+    """
     assert face_colors is None, "glTF has no colours per face"
     colors = vertex_colors
     arrays = [(vertices.astype("<f4"), 34962), (faces.astype("<u4").reshape(-1), 34963)]
     if colors is not None:
-        arrays.append((linear_from_srgb(colors).astype("<f4"), 34962))
+        linear = np.hstack([linear_from_srgb(colors[:, :3]), colors[:, 3:]])
+        arrays.append((linear.astype("<f4"), 34962))
     views, accessors, offset = [], [], 0
     for array, target in arrays:
         views.append({"buffer": 0, "byteOffset": offset, "byteLength": array.nbytes, "target": target})
-        kind = {"componentType": 5125, "type": "SCALAR"} if array.ndim == 1 else {"componentType": 5126, "type": "VEC3"}
+        kind = (
+            {"componentType": 5125, "type": "SCALAR"}
+            if array.ndim == 1
+            else {
+                "componentType": 5126,
+                "type": f"VEC{array.shape[1]}",
+            }
+        )
         accessors.append({"bufferView": len(accessors), "count": len(array), **kind})
         offset += array.nbytes
     accessors[0] |= {"min": vertices.min(axis=0).tolist(), "max": vertices.max(axis=0).tolist()}
     attributes = {"POSITION": 0} | ({"COLOR_0": 2} if colors is not None else {})
     primitive = {"attributes": attributes, "indices": 1, "mode": 4, "material": 0}
     material = {"doubleSided": True, "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0}}
+    if colors is not None and colors.shape[1] == 4:
+        material["alphaMode"] = "BLEND"
     # The colours already hold the scene's light, so a viewer must not light them again.
     unlit = {"extensionsUsed": ["KHR_materials_unlit"]} if colors is not None else {}
     if unlit:

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from etsplat.core.errors import InputError
-from etsplat.io.ply_tables import read_ply_table
+from etsplat.io.ply_tables import read_ply_tables
 
 GREY = 0.5
 """The colour of points without one."""
@@ -20,9 +20,9 @@ def load_points(path: Path | str) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "
     Points that are not finite are left out.
 
     Raises:
-        InputError: as `etsplat.io.ply_tables.read_ply_table`, or there are no coordinates.
+        InputError: as `etsplat.io.ply_tables.read_ply_tables`, or there are no coordinates.
     """
-    table = read_ply_table(path)
+    table = read_ply_tables(path)["vertex"]
     names = table.dtype.names or ()
     if not {"x", "y", "z"} <= set(names):
         raise InputError(f"points {path}: vertices without x, y and z; export it again")

@@ -106,6 +106,7 @@ def load_capture(
     width: int | None = None,
     masks: Path | str | None = None,
     memory: int | None = None,
+    preload: bool = True,
     progress: Callable[[int, int], None] | None = None,
 ) -> Capture:
     """Read a COLMAP, nerfstudio or Blender scene in its own units, and decode its images in parallel.
@@ -116,6 +117,7 @@ def load_capture(
         width: shrink images to this many pixels across (never enlarges); None shrinks those wider than 1600 to 1600.
         masks: folder with a mask for every image, white where pixels count; None for the scene's own, if any.
         memory: bytes that decoded images may take, beyond which they are streamed; None for half of what is free.
+        preload: decode the images now, so that damaged ones are found; else each when it is first asked for.
         progress: called with (images decoded, images in all) while loading.
 
     Raises:
@@ -129,7 +131,8 @@ def load_capture(
     Ks, sizes = _intrinsics_and_sizes(frames, width)
     limit = available_memory() // 2 if memory is None else memory
     pictures = CaptureImages(frames.frames, sizes, limit)
-    pictures.preload(progress)
+    if preload:
+        pictures.preload(progress)
     return Capture(
         viewmats=torch.stack([frame.viewmat for frame in frames.frames]),
         Ks=Ks,

@@ -1,0 +1,56 @@
+"""`etsplat export`."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, ClassVar, Literal
+
+import tyro
+
+from etsplat.cli.command import Command
+from etsplat.tasks.export_config import ExportConfig
+
+Settings = Annotated[ExportConfig, tyro.conf.arg(name=""), tyro.conf.OmitArgPrefixes]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Export(Command):
+    """Write a trained soup for Blender, MeshLab, three.js or Unity; or turn another program's file into a soup."""
+
+    EXAMPLES: ClassVar[str] = """
+    etsplat export runs/kitchen --format glb
+    etsplat export runs/kitchen --format ply --colors keep --min-opacity 0 --up keep
+    etsplat export point_cloud_state_dict.pt --format safetensors
+    """
+
+    run_dir: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(name="dir")]
+    """A run of `etsplat train`; or a file: .safetensors, .pt of Triangle Splatting, Gaussian .ply, or a mesh."""
+    format: Literal["ply", "obj", "off", "glb", "safetensors"] = "glb"
+    """Kind of file. Unity and three.js take glb, Blender and MeshLab all but the last."""
+    out: Path | None = None
+    """The file to write; by default soup.FORMAT in the run's folder."""
+    scene: Path | None = None
+    """The capture's folder, if it has moved or a file is given: for colours as the cameras saw them, and for up."""
+    settings: Settings = field(default_factory=ExportConfig)
+
+    @classmethod
+    def defaults(cls, arguments: Sequence[str]) -> "Export":
+        """Nothing depends on the arguments."""
+        return cls(run_dir=tyro.MISSING)
+
+    def run(self, arguments: Sequence[str]) -> int:
+        """Writes the file and says what is in it."""
+        from etsplat.core.errors import InputError
+        from etsplat.tasks.export_soup import export_soup
+        from etsplat.tasks.soup_run import open_run
+
+        opened = open_run(self.run_dir, self.scene)
+        out = self.out or opened.folder / f"soup.{self.format}"
+        if out.suffix != f".{self.format}":
+            raise InputError(f"--out {out}: does not end in .{self.format}; rename it or change --format")
+        read = self.run_dir / "soup.safetensors" if self.run_dir.is_dir() else self.run_dir
+        if out.resolve() == read.resolve():
+            raise InputError(f"--out {out}: is what is read; choose another file")
+        written = export_soup(opened, out, self.settings)
+        print(f"{written.path}: {written.triangles:,} triangles, {written.dropped:,} fainter ones left out")
+        return 0

@@ -1,0 +1,104 @@
+"""Separate triangles with a colour each, as Blender, MeshLab, three.js and Unity read them."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from torch import Tensor
+
+from etsplat.io._mesh_writers import write_glb, write_obj, write_off
+from etsplat.io.atomic import atomic_write
+from etsplat.io.ply_tables import CORNERS, encode_ply
+
+TRIANGLE_SUFFIXES = (".ply", ".obj", ".off", ".glb")
+
+
+def save_triangles(
+    path: Path | str,
+    vertices: Float[Tensor, "N 3 3"],
+    colors: Float[Tensor, "N C"],
+    *,
+    weld: bool = False,
+    numbers: Mapping[str, Float[Tensor, " N"]] | None = None,
+    comment: str | None = None,
+) -> None:
+    """Write triangles, each in exactly its colour. Atomic.
+
+    OBJ and GLB know only colours of vertices, and Blender reads no others from PLY: PLY has them twice, at its vertices
+    and at its faces. Colours are display values (sRGB); glTF wants linear light, so GLB is converted, and its material
+    is unlit. Colours have 8 bits in PLY and OFF.
+
+    Args:
+        path: ends in .ply, .obj, .off or .glb.
+        vertices: (N, 3, 3) finite positions.
+        colors: (N, 3), or (N, 4) with alpha, which OBJ leaves out; in [0, 1] (others are clamped).
+        weld: triangles share vertices at equal positions, where their colours are equal too (OFF: all of them).
+        numbers: further values per face, by name; only PLY holds them.
+        comment: a line of text; only PLY holds it.
+
+    Raises:
+        ValueError: another suffix or wrong shapes.
+        InputError: the file cannot be written.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix not in TRIANGLE_SUFFIXES:
+        raise ValueError(f"path: expected one of the suffixes {', '.join(TRIANGLE_SUFFIXES)}, got {path.name}")
+    if vertices.shape[1:] != (3, 3) or colors.shape not in ((len(vertices), 3), (len(vertices), 4)):
+        raise ValueError(f"vertices, colors: expected (N, 3, 3), (N, 3|4); got {vertices.shape}, {colors.shape}")
+    corners = vertices.detach().cpu().numpy().astype(np.float32).reshape(-1, 3)
+    face_colors = colors.detach().cpu().double().clamp(0, 1).numpy()
+    if suffix == ".off":
+        points, faces, _ = _indexed(corners, None, weld)
+        with atomic_write(path) as temporary:
+            write_off(temporary, points, faces, face_colors)
+        return
+    points, faces, point_colors = _indexed(corners, np.repeat(face_colors, 3, axis=0), weld)
+    assert point_colors is not None
+    with atomic_write(path) as temporary:
+        if suffix == ".ply":
+            extra = {name: value.detach().cpu().numpy() for name, value in (numbers or {}).items()}
+            temporary.write_bytes(_ply(points, faces, point_colors, face_colors, extra, comment))
+        elif suffix == ".obj":
+            write_obj(temporary, points, faces, None, point_colors[:, :3])
+        else:
+            write_glb(temporary, points, faces, None, point_colors)
+
+
+def _indexed(
+    corners: np.ndarray, colors: np.ndarray | None, weld: bool
+) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """Points (V, 3), faces (N, 3) and colours (V, C) of corners (3 N, 3)."""
+    if not weld:
+        return corners, np.arange(len(corners)).reshape(-1, 3), colors
+    keys = corners if colors is None else np.hstack([corners, colors.astype(np.float32)])
+    _, first, inverse = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    order = np.argsort(first)  # keep the order of the corners
+    rank = np.empty(len(order), dtype=np.int64)
+    rank[order] = np.arange(len(order))
+    kept = first[order]
+    return corners[kept], rank[inverse.reshape(-1)].reshape(-1, 3), None if colors is None else colors[kept]
+
+
+def _ply(
+    points: np.ndarray,
+    faces: np.ndarray,
+    point_colors: np.ndarray,
+    face_colors: np.ndarray,
+    numbers: Mapping[str, np.ndarray],
+    comment: str | None,
+) -> bytes:
+    channels = ("red", "green", "blue", "alpha")[: face_colors.shape[1]]
+    byte_fields = [(name, "u1") for name in channels]
+    vertex = np.empty(len(points), [("x", "f4"), ("y", "f4"), ("z", "f4"), *byte_fields])
+    face = np.empty(len(faces), [(CORNERS, "i4", (3,)), *byte_fields, *((name, "f4") for name in numbers)])
+    for index, axis in enumerate("xyz"):
+        vertex[axis] = points[:, index]
+    for index, name in enumerate(channels):
+        vertex[name] = np.floor(point_colors[:, index] * 255 + 0.5)
+        face[name] = np.floor(face_colors[:, index] * 255 + 0.5)
+    face[CORNERS] = faces
+    for name, values in numbers.items():
+        face[name] = values
+    return encode_ply({"vertex": vertex, "face": face}, comment)

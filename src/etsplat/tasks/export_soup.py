@@ -1,0 +1,105 @@
+"""A soup as a file for other programs: colours baked, faint triangles dropped, up along +y."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from etsplat.core.cameras import Cameras
+from etsplat.core.errors import InputError
+from etsplat.io.triangle_files import save_triangles
+from etsplat.ops.soup_colors import soup_colors
+from etsplat.scene.soup_files import save_soup
+from etsplat.scene.soup_rendering import OPAQUE_FROM, SoupAppearance, render_soup
+from etsplat.scene.triangle_soup import TriangleSoup
+from etsplat.tasks.export_config import Bake, ExportConfig
+from etsplat.tasks.soup_run import SoupRun, rotation_to_y_up, training_cameras, world_up
+
+BAKING_WIDTH = 400
+"""Training views are drawn this wide to find how much each shows of a triangle."""
+
+
+@dataclass(frozen=True)
+class Export:
+    """What was written: the file, how many triangles, and how many were left out as too faint."""
+
+    path: Path
+    triangles: int
+    dropped: int
+
+
+def export_soup(run: SoupRun, path: Path | str, config: ExportConfig) -> Export:
+    """Write a soup to `path`, whose suffix chooses the format: .ply, .obj, .off, .glb, .safetensors.
+
+    Raises:
+        InputError: settings that contradict each other; nothing is left; the file cannot be written.
+    """
+    path = Path(path)
+    if path.suffix == ".safetensors":
+        save_soup(path, run.file)
+        return Export(path, len(run.file.soup), 0)
+    if config.colors == "keep" and (path.suffix != ".ply" or config.up == "y"):
+        raise InputError("colours that depend on the direction (--colors keep) need --format ply and --up keep")
+    soup, appearance = run.file.soup, run.file.appearance
+    opacities = appearance.opacities(soup).detach()
+    kept = opacities >= (OPAQUE_FROM if config.min_opacity is None else config.min_opacity)
+    if not bool(kept.any()):
+        raise InputError(
+            f"{run.path}: no triangle is opaque enough; lower --min-opacity, or train with --finish opaque"
+        )
+    colors = _baked(run, config.colors)[kept]
+    vertices = soup.vertices.detach()[kept]
+    rotation = _rotation(run, config)
+    if rotation is not None:
+        vertices = (vertices.double() @ rotation.T).float()
+    if config.alpha:
+        colors = torch.cat([colors, opacities[kept, None]], dim=1)
+    numbers = {"opacity": opacities[kept], "sigma": appearance.sigma(soup).detach()[kept]}
+    if config.colors == "keep":
+        numbers |= _coefficients(soup, kept)
+    comment = f"etsplat {appearance.kernel} {appearance.distance}"
+    save_triangles(path, vertices, colors, weld=config.weld, numbers=numbers, comment=comment)
+    return Export(path, len(vertices), int((~kept).sum()))
+
+
+@torch.no_grad()
+def bake_colors(
+    soup: TriangleSoup, appearance: SoupAppearance, cameras: list[Cameras], *, engine: str | None = None
+) -> Float[Tensor, "N 3"]:
+    """One colour for every triangle: the mean of what the cameras see, weighted by how much each sees of it.
+
+    The weight is the largest blend weight of any pixel. A triangle that nobody sees has the part of its colour that is
+    the same from every side.
+    """
+    total, weight = torch.zeros(len(soup), 3), torch.zeros(len(soup), 1)
+    degree = soup.sh_degree if appearance.sh_degree is None else min(appearance.sh_degree, soup.sh_degree)
+    for camera in cameras:
+        small = camera.scaled(min(1.0, BAKING_WIDTH / camera.width))
+        seen = render_soup(soup, small, appearance, statistics=True, engine=engine).statistics
+        assert seen is not None
+        colors = soup_colors(soup.vertices, soup.sh_dc, soup.sh_rest, camera.centers, degree, engine=engine)[0]
+        total += seen.max_weight[0, :, None] * colors.clamp(0, 1)
+        weight += seen.max_weight[0, :, None]
+    return torch.where(weight > 0, total / weight.clamp_min(1e-12), soup.display_colors())
+
+
+def _baked(run: SoupRun, bake: Bake) -> Float[Tensor, "N 3"]:
+    if bake == "mean" and run.capture is not None:
+        return bake_colors(run.file.soup, run.file.appearance, training_cameras(run.capture))
+    return run.file.soup.display_colors()
+
+
+def _rotation(run: SoupRun, config: ExportConfig) -> Float[Tensor, "3 3"] | None:
+    if config.up == "keep" or config.colors == "keep" or run.capture is None:
+        return None
+    up = world_up(run.capture.viewmats)
+    return None if up is None else rotation_to_y_up(up)
+
+
+def _coefficients(soup: TriangleSoup, kept: Tensor) -> dict[str, Tensor]:
+    """The harmonics by the names that Gaussian scenes use: f_rest lists all of red, then green, then blue."""
+    dc, rest = soup.sh_dc.detach()[kept, 0], soup.sh_rest.detach()[kept].transpose(1, 2).flatten(1)
+    named = {f"f_dc_{channel}": dc[:, channel] for channel in range(3)}
+    return named | {f"f_rest_{index}": rest[:, index] for index in range(rest.shape[1])}

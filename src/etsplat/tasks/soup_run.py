@@ -1,0 +1,109 @@
+"""A trained soup with the capture it was trained on: what every command that comes after training starts from."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from etsplat.core.cameras import Cameras
+from etsplat.core.errors import InputError
+from etsplat.io.run_directory import RunDirectory, is_run
+from etsplat.scene.captures import Capture, load_capture
+from etsplat.scene.soup_files import SoupFile, load_soup
+from etsplat.scene.soup_import import open_soup
+
+SOUP_NAME = "soup.safetensors"
+
+
+@dataclass(frozen=True)
+class SoupRun:
+    """A soup and, where it is known, its capture; both in the capture's own units.
+
+    Attributes:
+        path: what was opened: a run directory or a file.
+        file: the soup and how it is drawn.
+        capture: cameras and photos; images are decoded when they are asked for. None for a file without its scene.
+    """
+
+    path: Path
+    file: SoupFile
+    capture: Capture | None
+
+    @property
+    def folder(self) -> Path:
+        """Where results go unless told otherwise: the run directory, or the folder of the file."""
+        return self.path if self.path.is_dir() else self.path.parent
+
+    def needed_capture(self) -> Capture:
+        """The capture.
+
+        Raises:
+            InputError: it is not known.
+        """
+        if self.capture is None:
+            raise InputError(f"{self.path}: a file does not say which scene it shows; name the scene with --scene")
+        return self.capture
+
+
+def open_run(path: Path | str, scene: Path | str | None = None) -> SoupRun:
+    """Open the run directory of `etsplat train`, or any file that `etsplat.scene.soup_import.open_soup` reads.
+
+    Args:
+        path: of the run or the file.
+        scene: the capture's folder, where it has moved or is not known.
+
+    Raises:
+        InputError: neither a run with a soup nor a readable file; the capture has gone.
+    """
+    path = Path(path)
+    if path.is_dir():
+        return _open_directory(path, scene)
+    return SoupRun(path, open_soup(path), None if scene is None else load_capture(scene, preload=False))
+
+
+def world_up(viewmats: Float[Tensor, "B 4 4"]) -> Float[Tensor, "3"] | None:
+    """Where up is in the world: the mean of the cameras' own up directions; None if they contradict each other."""
+    up = -viewmats[:, 1, :3].double().mean(dim=0)
+    length = float(up.norm())
+    return up / length if length > 0.3 else None
+
+
+def training_cameras(capture: Capture) -> list[Cameras]:
+    """The single cameras of the training views."""
+    cameras = capture.cameras
+    return [cameras[index] for index in capture.train]
+
+
+def _open_directory(path: Path, scene: Path | str | None) -> SoupRun:
+    if not is_run(path):
+        raise InputError(f"{path}: is not a run of etsplat; name a folder that was given to --out, or a soup's file")
+    if not (path / SOUP_NAME).is_file():
+        raise InputError(f"{path}: has no {SOUP_NAME} (yet); name a run of `etsplat train` that got to a checkpoint")
+    config = RunDirectory(path).read_config()
+    settings = config.get("config", {})
+    source = scene or config.get("paths", {}).get("source")
+    if source is None:
+        return SoupRun(path, load_soup(path / SOUP_NAME), None)
+    if not Path(source).is_dir():
+        raise InputError(f"{path}: its scene {source} has gone; name where it is now with --scene")
+    capture = load_capture(
+        source,
+        images=settings.get("images"),
+        width=settings.get("width"),
+        masks=settings.get("masks"),
+        preload=False,
+    )
+    return SoupRun(path, load_soup(path / SOUP_NAME), capture)
+
+
+def rotation_to_y_up(up: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
+    """The smallest rotation that takes the unit vector `up` to +y, float64."""
+    target = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
+    axis, cosine = torch.linalg.cross(up.double(), target), float(up.double() @ target)
+    if cosine < -1 + 1e-9:  # upside down: half a turn about x
+        return torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
+    x, y, z = axis.tolist()
+    skew = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
+    return torch.eye(3, dtype=torch.float64) + skew + skew @ skew / (1 + cosine)
