@@ -60,15 +60,17 @@ class Sfm(Command):
 
 @dataclass(frozen=True, kw_only=True)
 class Download(Command):
-    """Fetch the captures of the paper's tables: Mip-NeRF 360, Tanks and Temples, Deep Blending."""
+    """Fetch the captures and meshes of the paper's tables: Mip-NeRF 360, Tanks and Temples, Deep Blending, FAMOUS."""
 
     EXAMPLES: ClassVar[str] = """
     etsplat data download tandt-db --out data
+    etsplat data download famous --out data
     etsplat bench nvs --scenes data/tandt/truck data/tandt/train --out runs/nvs
     """
 
-    name: tyro.conf.Positional[Literal["mipnerf360", "mipnerf360-extra", "tandt-db"]]
-    """Which: mipnerf360 (7 scenes, 12.5 GB), mipnerf360-extra (flowers and treehill, 3 GB), tandt-db (4, 0.7 GB)."""
+    name: tyro.conf.Positional[Literal["mipnerf360", "mipnerf360-extra", "tandt-db", "famous"]]
+    """Which: mipnerf360 (7 scenes, 12.5 GB), mipnerf360-extra (flowers and treehill, 3 GB), tandt-db (4, 0.7 GB),
+    famous (the meshes of shape reconstruction, 0.4 GB)."""
     out: Path = Path("data")
     """Folder for the scenes."""
 

@@ -7,6 +7,7 @@ from typing import Annotated, Any, Union
 
 import tyro
 
+from etsplat.cli.bench import Distance, Famous, Regularizers, Settings
 from etsplat.cli.command import Command
 from etsplat.cli.data import Download, Sfm
 from etsplat.cli.doctor import Doctor
@@ -34,6 +35,10 @@ COMMANDS: dict[str, type[Command] | Group] = {
         "Where captures come from: find the cameras of photos, fetch data sets.", {"sfm": Sfm, "download": Download}
     ),
     "export": Export,
+    "bench": Group(
+        "The paper's studies as grids of runs, with tables and figures.",
+        {"famous": Famous, "regularizers": Regularizers, "distance": Distance, "settings": Settings},
+    ),
     "doctor": Doctor,
 }
 

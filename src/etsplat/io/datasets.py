@@ -1,4 +1,4 @@
-"""The captures of the paper's tables, fetched from where their authors keep them."""
+"""The captures and meshes of the paper's tables, fetched from where their authors keep them."""
 
 import shutil
 import urllib.error
@@ -16,11 +16,11 @@ _CHUNK = 1 << 20
 
 @dataclass(frozen=True)
 class Dataset:
-    """An archive of captures.
+    """An archive of captures or meshes.
 
     Attributes:
         url: of the zip file.
-        scenes: folders in it that are scenes.
+        scenes: folders in it that are scenes, or mesh files.
         gigabytes: about how large the archive is.
     """
 
@@ -28,6 +28,31 @@ class Dataset:
     scenes: tuple[str, ...]
     gigabytes: float
 
+
+_FAMOUS = (
+    "armadillo/armadillo",
+    "boot/boot",
+    "brucewick/brucewick",
+    "bunny/bunny_hr",
+    "cat/cat-low-resolution",
+    "cow/cow-low-resolution",
+    "demosthenes/demosthenes",
+    "falconstatue/falconstatue",
+    "goathead/goathead",
+    "hand/hand_closed",
+    "house/house",
+    "human/human_neutral",
+    "koala/koala",
+    "mushroom/mushroom",
+    "nefertiti/nefertiti-lowres",
+    "scorpion/scorpion",
+    "skull/skull",
+    "springer/springer",
+    "strawberry/strawberry",
+    "stuffedtoy/stuffedtoy",
+    "tree/tree_closed",
+)
+"""The paper's 21 objects, in the layout of the repository."""
 
 DATASETS = {
     "mipnerf360": Dataset(
@@ -43,8 +68,14 @@ DATASETS = {
         ("tandt/train", "tandt/truck", "db/drjohnson", "db/playroom"),
         0.7,
     ),
+    "famous": Dataset(
+        "https://github.com/odedstein/meshes/archive/refs/heads/master.zip",
+        tuple(f"meshes-master/objects/{path}.obj" for path in _FAMOUS),
+        0.4,
+    ),
 }
-"""By name: Mip-NeRF 360 in its two archives; Tanks and Temples with Deep Blending as 3DGS prepared them."""
+"""By name: Mip-NeRF 360 in its two archives; Tanks and Temples with Deep Blending as 3DGS prepared them; the meshes of
+the table famous (each with its own licence in its folder, several of them non-commercial)."""
 
 
 def download_dataset(
@@ -58,14 +89,14 @@ def download_dataset(
         progress: called with (bytes fetched, bytes in all; 0 if the server does not tell).
 
     Returns:
-        The folders of the scenes.
+        The folders of the scenes, or the mesh files.
 
     Raises:
         InputError: there is no network or no such file any more; the disk is full; the archive is damaged.
     """
     dataset, folder = DATASETS[name], Path(folder)
     scenes = [folder / scene for scene in dataset.scenes]
-    if all((scene / "sparse").is_dir() for scene in scenes):
+    if all(scene.is_file() or (scene / "sparse").is_dir() for scene in scenes):
         return scenes
     archive = folder / f".{name}.zip"
     try:

@@ -1,0 +1,108 @@
+"""A grid's pictures: convergence of every variant, and reconstructions beside the truth."""
+
+import statistics
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from etsplat.bench.grid import Cell
+from etsplat.geometry.measures import bounding_ball
+from etsplat.io.atomic import atomic_write
+from etsplat.io.mesh_files import load_mesh
+from etsplat.io.run_directory import RunDirectory
+from etsplat.ops.rasterize_hard import render_opaque
+from etsplat.scene.photograph import orbit_cameras, shade_faces
+
+TILE = 360
+OBJECTS = 6
+"""At most so many objects in the qualitative figure."""
+
+_VIEW = 17
+"""Of the orbit: at the height of the object, turned by 45 degrees; a test view."""
+
+
+def plot_convergence(cells: Sequence[Cell], variants: Sequence[str], path: Path) -> None:
+    """Chamfer distance and PSNR, geometric and plain mean over the objects, against iterations and seconds."""
+    figure = Figure(figsize=(10, 7), layout="constrained")
+    axes = figure.subplots(2, 2)
+    for variant in variants:
+        histories = [
+            [line for line in RunDirectory(cell.folder).read_history() if "psnr" in line]
+            for cell in cells
+            if cell.variant == variant and cell.state == "done"
+        ]
+        if not histories:
+            continue
+        common = set.intersection(*({line["iteration"] for line in history} for history in histories))
+        lines = [[line for line in history if line["iteration"] in common] for history in histories]
+        iterations = sorted(common)
+        seconds = [statistics.fmean(line["seconds"] for line in step) for step in zip(*lines, strict=True)]
+        for row, (key, mean) in enumerate((("chamfer", statistics.geometric_mean), ("psnr", statistics.fmean))):
+            if not all(key in line for history in lines for line in history):
+                continue
+            scale = 1e3 if key == "chamfer" else 1.0
+            values = [mean([scale * line[key] for line in step]) for step in zip(*lines, strict=True)]
+            for column, x in enumerate((iterations, seconds)):
+                axes[row, column].plot(x, values, label=variant, linewidth=1.5)
+    for row, title in enumerate(("Chamfer distance × 10³, geometric mean", "PSNR on test views, dB")):
+        for column, unit in enumerate(("iteration", "seconds of optimisation")):
+            axes[row, column].set_title(title, loc="left", fontsize=10)
+            axes[row, column].set_xlabel(unit)
+            axes[row, column].grid(color="#e4e6e8")
+            axes[row, column].spines[["top", "right"]].set_visible(False)
+        axes[0, row].set_yscale("log")
+    axes[0, 0].legend(frameon=False, fontsize=8)
+    with atomic_write(path) as temporary:
+        figure.savefig(temporary, dpi=130)
+
+
+def draw_qualitative(cells: Sequence[Cell], variants: Sequence[str], path: Path) -> None:
+    """Reconstructed meshes in the photographs' light, and their normals, with the truth at the left."""
+    objects = list(dict.fromkeys(cell.object for cell in cells if cell.state == "done"))[:OBJECTS]
+    figure = Figure(figsize=(2.0 * (len(variants) + 1), 4.0 * len(objects)), layout="constrained")
+    grid: Any = figure.subplots(2 * len(objects), len(variants) + 1, squeeze=False)
+    for row, name in enumerate(objects):
+        done = {cell.variant: cell for cell in reversed(cells) if cell.object == name and cell.state == "done"}
+        truth = load_mesh(next(iter(done.values())).mesh)
+        center, radius = bounding_ball(truth.vertices)
+        columns = {"truth": (truth.vertices, truth.faces)}
+        for variant in variants:
+            if variant in done:
+                mesh = load_mesh(RunDirectory(done[variant].folder).mesh_path(".ply"))
+                columns[variant] = (mesh.vertices, mesh.faces)
+        for column, title in enumerate(["truth", *variants]):
+            for half in range(2):
+                axis = grid[2 * row + half, column]
+                axis.axis("off")
+                if title in columns:
+                    vertices, faces = columns[title]
+                    unit = ((vertices.double() - center) / radius).float()
+                    axis.imshow(_draw(unit, faces, normals=half == 1).numpy())
+                if row == 0 and half == 0:
+                    axis.set_title(title, fontsize=9)
+        grid[2 * row, 0].text(
+            -0.05, 0.5, name, rotation=90, va="center", ha="right", transform=grid[2 * row, 0].transAxes
+        )
+    with atomic_write(path) as temporary:
+        figure.savefig(temporary, dpi=100)
+
+
+def _draw(vertices: Tensor, faces: Tensor, *, normals: bool) -> Float[Tensor, "H W 3"]:
+    """One picture over white, of the shape in the photographs' light or of its normals as colours."""
+    camera = orbit_cameras(TILE, TILE)[_VIEW]
+    if normals:
+        corners = vertices[faces].double()
+        cross = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        in_view = torch.nn.functional.normalize(cross, dim=1).float() @ camera.viewmats[0, :3, :3].T
+        colors = 0.5 + 0.5 * in_view * torch.tensor([1.0, -1.0, -1.0])
+    else:
+        colors = shade_faces(vertices, faces)
+    image = render_opaque(
+        vertices, camera.viewmats, camera.Ks, TILE, TILE, faces=faces, face_colors=colors, supersampling=3
+    )[0]
+    return (image[..., :3] + 1 - image[..., 3:]).clamp(0, 1)

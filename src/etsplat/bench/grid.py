@@ -1,0 +1,157 @@
+"""Runs of a grid (objects x variants x seeds), in processes beside each other, each resumable.
+
+A run is a run directory OUT/runs/OBJECT/VARIANT[ seed N]. One that is finished is not repeated, one that was cut short
+goes on from its last checkpoint. As many processes run as there are cores, each with its share of them: a run on one
+thread wastes nothing on waiting for others, so the grid as a whole is fastest that way, though no single run is.
+"""
+
+import json
+import multiprocessing
+import os
+import signal
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from etsplat.bench.variants import Variant
+from etsplat.core.errors import InputError
+from etsplat.io.run_directory import RunDirectory, is_run
+from etsplat.tasks.reconstruct_config import ReconstructConfig
+
+_POLL_SECONDS = 0.5
+
+
+@dataclass
+class Cell:
+    """One run of a grid, and how it stands.
+
+    Attributes:
+        object: name of the mesh.
+        mesh: its file.
+        variant: name of the variant.
+        config: settings.
+        folder: run directory.
+        state: "waiting", "running", "done" or "failed".
+        error: why it failed, in one line.
+    """
+
+    object: str
+    mesh: Path
+    variant: str
+    config: ReconstructConfig
+    folder: Path
+    state: str = "waiting"
+    error: str = ""
+    _process: Any = field(default=None, repr=False)
+
+    def progress(self) -> dict[str, Any]:
+        """The last line of the run's history; empty before the first."""
+        history = RunDirectory(self.folder).read_history()
+        return history[-1] if history else {}
+
+    def metrics(self) -> dict[str, Any]:
+        """Those of the finished run."""
+        return RunDirectory(self.folder).read_metrics()
+
+
+def make_cells(
+    meshes: dict[str, Path], variants: Sequence[Variant], base: ReconstructConfig, seeds: Sequence[int], out: Path
+) -> list[Cell]:
+    """All runs of a grid, object by object; those that are finished are "done".
+
+    Raises:
+        InputError: two variants have the same name.
+    """
+    if len({variant.name for variant in variants}) < len(variants):
+        raise InputError("variants: one is named twice; leave one out")
+    cells = []
+    for name, mesh in meshes.items():
+        for seed in seeds:
+            for variant in variants:
+                folder = out / "runs" / name / (variant.name if len(seeds) == 1 else f"{variant.name} seed {seed}")
+                cell = Cell(name, mesh, variant.name, variant.config(base, seed), folder)
+                cell.state = "done" if _is_finished(cell) else "waiting"
+                cells.append(cell)
+    return cells
+
+
+def run_grid(cells: Sequence[Cell], jobs: int, show: Callable[[], None]) -> None:
+    """Runs every cell that is waiting. Ctrl-C lets the runs save a checkpoint, then raises KeyboardInterrupt.
+
+    Args:
+        cells: changed in place.
+        jobs: processes beside each other; they share the cores evenly.
+        show: called about twice a second, and after every change.
+    """
+    waiting = [cell for cell in cells if cell.state == "waiting"]
+    jobs = max(1, min(jobs, len(waiting)))
+    threads = max(1, len(os.sched_getaffinity(0)) // jobs)
+    running: list[Cell] = []
+    context = multiprocessing.get_context("spawn")
+    try:
+        while waiting or running:
+            while waiting and len(running) < jobs:
+                cell = waiting.pop(0)
+                cell.folder.parent.mkdir(parents=True, exist_ok=True)
+                _error_file(cell).unlink(missing_ok=True)
+                cell._process = context.Process(target=_work, args=(cell.mesh, cell.folder, cell.config, threads))
+                cell._process.start()
+                cell.state = "running"
+                running.append(cell)
+            show()
+            time.sleep(_POLL_SECONDS)
+            for cell in [cell for cell in running if not cell._process.is_alive()]:
+                running.remove(cell)
+                _conclude(cell)
+    except KeyboardInterrupt:
+        for cell in running:
+            os.kill(cell._process.pid, signal.SIGINT)
+        for cell in running:
+            cell._process.join()
+        raise
+    finally:
+        show()
+
+
+def _conclude(cell: Cell) -> None:
+    if cell._process.exitcode == 0 and _is_finished(cell):
+        cell.state = "done"
+        return
+    cell.state = "failed"
+    path = _error_file(cell)
+    cell.error = path.read_text(encoding="utf-8") if path.exists() else f"ended with status {cell._process.exitcode}"
+
+
+def _work(mesh: Path, folder: Path, config: ReconstructConfig, threads: int) -> None:
+    """One run, in a process of its own."""
+    from etsplat.ops.engines import set_num_threads
+    from etsplat.tasks.reconstruct import reconstruct
+
+    os.setpgrp()  # Ctrl-C in a terminal reaches the parent alone, which passes it on once: twice would kill
+    set_num_threads(threads)
+    try:
+        reconstruct(mesh, folder, config, resume=is_run(folder))
+    except KeyboardInterrupt:
+        raise SystemExit(130) from None
+    except Exception as error:
+        _error_path(folder).write_text(" ".join(str(error).split()) or repr(error), encoding="utf-8")
+        raise SystemExit(1) from None
+
+
+def _error_file(cell: Cell) -> Path:
+    return _error_path(cell.folder)
+
+
+def _error_path(folder: Path) -> Path:
+    return folder.parent / f"{folder.name}.error.txt"
+
+
+def _is_finished(cell: Cell) -> bool:
+    """Whether the folder holds a finished run with these settings."""
+    run = RunDirectory(cell.folder)
+    if not is_run(cell.folder) or not run.metrics_path.exists():
+        return False
+    settings = {name: str(value) if isinstance(value, Path) else value for name, value in vars(cell.config).items()}
+    return run.read_config()["config"] == json.loads(json.dumps(settings))

@@ -1,0 +1,71 @@
+"""How a grid stands: a live table on a terminal, a line for every finished run elsewhere."""
+
+from collections.abc import Sequence
+from types import TracebackType
+
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from etsplat.bench.grid import Cell
+
+
+class LiveTable:
+    """Objects by variants: Chamfer distance times 1000 of finished runs, percent done of running ones."""
+
+    def __init__(self, console: Console, cells: Sequence[Cell]) -> None:
+        self._console = console
+        self._cells = cells
+        self._told: set[int] = set()
+        self._live = Live(console=console, auto_refresh=False) if console.is_terminal else None
+
+    def __enter__(self) -> "LiveTable":
+        if self._live is not None:
+            self._live.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        if self._live is not None:
+            self._live.stop()
+
+    def update(self) -> None:
+        """Shows how the cells stand now."""
+        if self._live is not None:
+            self._live.update(self._table(), refresh=True)
+            return
+        ended = [index for index, cell in enumerate(self._cells) if cell.state in ("done", "failed")]
+        for index in ended:
+            if index not in self._told:
+                self._told.add(index)
+                cell = self._cells[index]
+                name = f"{cell.object}, {cell.variant}, seed {cell.config.seed}"
+                print(f"  {len(ended)}/{len(self._cells)} {name}: {_result(cell)}", flush=True)
+
+    def _table(self) -> Table:
+        variants = list(dict.fromkeys(cell.variant for cell in self._cells))
+        table = Table("object", *variants, box=None, title="Chamfer distance x 1000", title_justify="left")
+        for name in dict.fromkeys(cell.object for cell in self._cells):
+            row = []
+            for variant in variants:
+                cells = [cell for cell in self._cells if cell.object == name and cell.variant == variant]
+                row.append(Text(" ").join(_short(cell) for cell in cells))
+            table.add_row(name, *row)
+        return table
+
+
+def _result(cell: Cell) -> str:
+    if cell.state == "failed":
+        return f"failed: {cell.error}"
+    metrics = cell.metrics()
+    return f"Chamfer {1e3 * metrics['chamfer']:.3f}, {metrics['psnr']:.2f} dB, {metrics['seconds']:.0f} s"
+
+
+def _short(cell: Cell) -> Text:
+    if cell.state == "done":
+        return Text(f"{1e3 * cell.metrics()['chamfer']:.3f}", style="bold")
+    if cell.state == "running":
+        return Text(f"{100 * cell.progress().get('iteration', 0) / cell.config.iterations:.0f} %", style="cyan")
+    return Text("failed", style="red") if cell.state == "failed" else Text("·", style="dim")
