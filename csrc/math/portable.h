@@ -8,6 +8,7 @@
 
 #if defined(__CUDACC__) || defined(__CUDACC_RTC__)
 #define ETSPLAT_FN __device__ __forceinline__
+#define ETSPLAT_CONSTEXPR_FN __device__ constexpr
 #elif defined(_MSC_VER)
 #define ETSPLAT_FN __forceinline
 #include <cmath>
@@ -17,6 +18,9 @@
 #else
 #define ETSPLAT_FN inline __attribute__((always_inline))
 #include <cmath>
+#endif
+#ifndef ETSPLAT_CONSTEXPR_FN
+#define ETSPLAT_CONSTEXPR_FN constexpr
 #endif
 
 namespace etsplat {

@@ -35,41 +35,7 @@ struct LaneSums {
     const float* planes;  // (stride, 16)
 
     ETSPLAT_FN Vec operator[](int j) const { return Vec::load(planes + kLanes * j); }
-    ETSPLAT_FN void get3(int first, Vec out[3]) const {
-        for (int k = 0; k < 3; ++k) out[k] = (*this)[first + k];
-    }
 };
-
-// Camera-space gradient (3, 3) of the vertices.
-ETSPLAT_FN void view_gradient(const RasterPass& pass, const TrianglePass& triangles, const LaneSums& sums, const Vec* view,
-                              const Triangle2D<Vec>& t, Vec grad_view[9]) {
-    const SlotLayout& layout = pass.slot_layout;
-    Vec gx[3], gy[3], s[3], rx[3], ry[3];
-    for (int k = 0; k < 3; ++k) gx[k] = gy[k] = Vec(0.0f);
-    for (int k = 0; k < 9; ++k) grad_view[k] = Vec(0.0f);
-    sums.get3(SlotLayout::kMoment, s);
-    sums.get3(SlotLayout::kMomentX, rx);
-    sums.get3(SlotLayout::kMomentY, ry);
-    distance_backward(t, triangles.distance, triangles.freeze_incentre, s, rx, ry, gx, gy);
-    if (layout.attributes) {
-        const DistanceForms<Vec> forms = distance_forms(t);
-        Vec offset_x, offset_y, a_at_q[3];
-        offset_from_mean(t, forms.qx, forms.qy, offset_x, offset_y);
-        for (int m = 0; m < 3; ++m) a_at_q[m] = Vec(1.0f / 3.0f) + t.ax[m] * offset_x + t.ay[m] * offset_y;
-        sums.get3(layout.barycentric(), s);
-        sums.get3(layout.barycentric() + 3, rx);
-        sums.get3(layout.barycentric() + 6, ry);
-        barycentric_backward(t, a_at_q, s, rx, ry, gx, gy);
-        for (int k = 0; k < 3; ++k) {
-            const Vec inverse_z = Vec(1.0f) / view[3 * k + 2];
-            grad_view[3 * k + 2] = grad_view[3 * k + 2] - sums[layout.inverse_z() + k] * inverse_z * inverse_z;
-        }
-    }
-    if (layout.centroid_z)
-        for (int k = 0; k < 3; ++k) grad_view[3 * k + 2] = grad_view[3 * k + 2] + sums[layout.depth()] / Vec(3.0f);
-    for (int k = 0; k < 3; ++k)
-        project_backward(triangles.camera, view + 3 * k, t.x[k], t.y[k], gx[k], gy[k], grad_view + 3 * k);
-}
 
 ETSPLAT_FN double lane_total(Vec v) {
     float lanes[kLanes];
@@ -110,7 +76,7 @@ ETSPLAT_FN void geometry_gradients(const RasterPass& pass, const TrianglePass& t
     Triangle2D<Vec> t;
     load_corners(triangles, range, corners);
     project_triangle(triangles.camera, triangles.near_plane, triangles.distance, corners, view, t);
-    view_gradient(pass, triangles, sums, view, t, grad_view);
+    view_gradient(triangles.camera, triangles.distance, triangles.freeze_incentre, pass.slot_layout, sums, view, t, grad_view);
     for (int k = 0; k < 9; ++k) {
         grad_view[k] = keep(any, grad_view[k]);  // other lanes may not even be finite
         corners[k] = keep(any, corners[k]);

@@ -4,6 +4,7 @@
 #include <string.h>
 
 #include "cpu/raster_pass.h"
+#include "math/interpolation.h"
 #include "math/kernels.h"
 #include "pack.h"
 
@@ -99,37 +100,6 @@ struct TriangleForms {
     ETSPLAT_FN Vec dy(int block) const { return Vec::load(kLaneY) + Vec(center_y + kBlockY[block]); }
 };
 
-// What is interpolated: clamped, renormalised, perspective-correct barycentrics and the depth of the plane.
-struct Interpolation {
-    Vec clamped[3];  // max(a_k, 0)
-    VecMask positive[3];
-    Vec inverse_z_sum;  // U = sum max(a_k, 0) / z_k
-    Vec sum;            // A = sum max(a_k, 0)
-    Vec weight[3];      // b_k = max(a_k, 0) / z_k / U
-
-    ETSPLAT_FN void evaluate(const AttributeRecord& record, Vec dx, Vec dy) {
-        const Vec x = dx + Vec(record.offset_x), y = dy + Vec(record.offset_y);
-        sum = Vec(0.0f);
-        inverse_z_sum = Vec(0.0f);
-        for (int k = 0; k < 3; ++k) {
-            const Vec a = vfma(Vec(record.ax[k]), x, vfma(Vec(record.ay[k]), y, Vec(1.0f / 3.0f)));
-            positive[k] = a > Vec(0.0f);
-            clamped[k] = vmax(a, Vec(0.0f));
-            weight[k] = clamped[k] * Vec(record.inverse_z[k]);
-            sum = sum + clamped[k];
-            inverse_z_sum = inverse_z_sum + weight[k];
-        }
-        for (int k = 0; k < 3; ++k) weight[k] = weight[k] / inverse_z_sum;
-    }
-    ETSPLAT_FN Vec depth() const { return sum / inverse_z_sum; }
-};
-
-// Depth of the distortion, m = far / (far - near) (1 - near / z), less its value at the tile's first triangle: the
-// distortion sees differences only, and small numbers keep them precise.
-ETSPLAT_FN Vec distortion_coordinate(const RasterPass& pass, float first_inverse_z, Vec inverse_z) {
-    const float scale = pass.distortion_far / (pass.distortion_far - pass.distortion_near);
-    return Vec(-scale * pass.distortion_near) * (inverse_z - Vec(first_inverse_z));
-}
 ETSPLAT_FN float first_inverse_depth(const RasterPass& pass, int tile) {
     const int first = pass.tile_begin[tile];
     if (!pass.want_distortion || first == pass.tile_begin[tile + 1]) return 0.0f;

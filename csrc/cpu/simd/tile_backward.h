@@ -120,7 +120,7 @@ struct ExtraGradients {
     const RasterPass& pass;
     const AttributeRecord& record;
     const float* corners;
-    Interpolation at;
+    Interpolation<Vec> at;
     Vec inverse_z;
     Vec grad_value[3];  // sum over channels of g_c (colour of corner k)
 
@@ -139,46 +139,42 @@ struct ExtraGradients {
             for (int k = 0; k < 3; ++k) result = vfma(at.weight[k], grad_value[k], result);
         }
         if (pass.grad_distortion) {
-            const Vec m = distortion_coordinate(pass, tile.first_inverse_z, inverse_z);
-            const Vec spread = vfma(m * m, Vec::load(tile.total_weight[block]), Vec::load(tile.total_second[block])) -
-                               Vec(2.0f) * m * Vec::load(tile.total_first[block]);
+            const Vec spread = distortion_spread(coordinate(tile), Vec::load(tile.total_weight[block]),
+                                                 Vec::load(tile.total_first[block]), Vec::load(tile.total_second[block]));
             result = vfma(Vec::load(tile.grad_distortion[block]), spread, result);
         }
         return result;
+    }
+
+    ETSPLAT_FN Vec coordinate(const BackwardTile& tile) const {
+        return distortion_coordinate(pass.distortion_near, pass.distortion_far, tile.first_inverse_z, inverse_z);
     }
 
     ETSPLAT_FN void accumulate(BackwardTile& tile, const TriangleForms& forms, int block, VecMask drawn, Vec w) {
         const SlotLayout& layout = pass.slot_layout;
         Vec grad_inverse_z(0.0f);
         if (pass.grad_distortion) {
-            const Vec m = distortion_coordinate(pass, tile.first_inverse_z, inverse_z);
-            const Vec slope = m * Vec::load(tile.total_weight[block]) - Vec::load(tile.total_first[block]);
-            const float dm = -pass.distortion_near * pass.distortion_far / (pass.distortion_far - pass.distortion_near);
-            grad_inverse_z = keep(drawn, Vec(2.0f * dm) * Vec::load(tile.grad_distortion[block]) * w * slope);
+            const Vec slope = distortion_slope(pass.distortion_near, pass.distortion_far, coordinate(tile), w,
+                                               Vec::load(tile.total_weight[block]), Vec::load(tile.total_first[block]));
+            grad_inverse_z = keep(drawn, Vec::load(tile.grad_distortion[block]) * slope);
             if (pass.distortion_depth == DistortionDepth::kCentroid)
                 add_lanes(tile.sums, layout.depth(), Vec(0.0f) - grad_inverse_z * inverse_z * inverse_z);
         }
         if (!pass.attributes) return;
-        Vec mean(0.0f);
-        for (int k = 0; k < 3; ++k) mean = vfma(at.weight[k], grad_value[k], mean);
+        InterpolationGradient<Vec> gradient;
         const bool plane = pass.grad_distortion && pass.distortion_depth == DistortionDepth::kPlane;
+        gradient.evaluate(record, at, w, grad_value, plane, grad_inverse_z, inverse_z);
         const Vec dx = forms.dx(block), dy = forms.dy(block);
         for (int k = 0; k < 3; ++k) {
             for (int c = 0; c < pass.corner_channels; ++c) {
                 const Vec g = Vec::load(tile.channel(pass.flat_channels + c, block));
                 add_lanes(tile.sums, layout.corner() + k * pass.corner_channels + c, keep(drawn, w * at.weight[k] * g));
             }
-            Vec grad_product = w * (grad_value[k] - mean) / at.inverse_z_sum;  // of max(a_k, 0) / z_k
-            Vec grad_clamped(0.0f);
-            if (plane) {
-                grad_product = grad_product + grad_inverse_z / at.sum;
-                grad_clamped = Vec(0.0f) - grad_inverse_z * inverse_z / at.sum;
-            }
-            add_lanes(tile.sums, layout.inverse_z() + k, keep(drawn, grad_product * at.clamped[k]));
-            grad_clamped = keep(drawn & at.positive[k], vfma(grad_product, Vec(record.inverse_z[k]), grad_clamped));
-            add_lanes(tile.sums, layout.barycentric() + k, grad_clamped);
-            add_lanes(tile.sums, layout.barycentric() + 3 + k, grad_clamped * dx);
-            add_lanes(tile.sums, layout.barycentric() + 6 + k, grad_clamped * dy);
+            const Vec grad_a = keep(drawn, gradient.barycentric[k]);
+            add_lanes(tile.sums, layout.inverse_z() + k, keep(drawn, gradient.inverse_z[k]));
+            add_lanes(tile.sums, layout.barycentric() + k, grad_a);
+            add_lanes(tile.sums, layout.barycentric() + 3 + k, grad_a * dx);
+            add_lanes(tile.sums, layout.barycentric() + 6 + k, grad_a * dy);
         }
     }
 };

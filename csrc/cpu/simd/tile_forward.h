@@ -60,7 +60,7 @@ ETSPLAT_FN void draw_extras(const RasterPass& pass, ForwardTile& tile, const Tri
     }
     if (!pass.attributes && !pass.want_distortion) return;
     const AttributeRecord& record = pass.attribute_records[triangle];
-    Interpolation at;
+    Interpolation<Vec> at;
     Vec z(record.centroid_z);
     if (pass.attributes) {
         at.evaluate(record, forms.dx(block), forms.dy(block));
@@ -75,11 +75,11 @@ ETSPLAT_FN void draw_extras(const RasterPass& pass, ForwardTile& tile, const Tri
         }
     }
     if (pass.want_distortion) {
-        const Vec m = distortion_coordinate(pass, tile.first_inverse_z, Vec(1.0f) / z);
+        const Vec m = distortion_coordinate(pass.distortion_near, pass.distortion_far, tile.first_inverse_z, Vec(1.0f) / z);
         const Vec wm = keep(drawn, w * m);
         const Vec first = Vec::load(tile.weighted_depth[block]), second = Vec::load(tile.weighted_square[block]);
         const Vec accumulated = Vec(1.0f) - transmittance;
-        const Vec spread = vfma(m * m, accumulated, second) - Vec(2.0f) * m * first;
+        const Vec spread = distortion_spread(m, accumulated, first, second);
         (Vec::load(tile.distortion[block]) + keep(drawn, w * spread)).store(tile.distortion[block]);
         (first + wm).store(tile.weighted_depth[block]);
         (second + keep(drawn, wm * m)).store(tile.weighted_square[block]);
