@@ -3,6 +3,7 @@ import math
 import pytest
 import torch
 
+from etsplat.core.cameras import look_at, sphere_grid
 from etsplat.core.validation import first_not_finite
 from etsplat.scene.soup_init import StartPoints, fibonacci_sphere, random_points, spacing, start_soup
 
@@ -10,6 +11,20 @@ from etsplat.scene.soup_init import StartPoints, fibonacci_sphere, random_points
 def start(points: StartPoints, scale: float = 2.23):
     generator = torch.Generator().manual_seed(5)
     return start_soup(points, generator, scale=scale, opacity=0.28, sigma=1.16, sh_degree=3)
+
+
+def cube(count: int) -> StartPoints:
+    """Random points about the origin, seen from four sides at a distance of 4.03."""
+    eyes = sphere_grid([20.0], [0.0, 90, 180, 270], 4.03, torch.float64)
+    viewmats = look_at(eyes, torch.zeros(3), torch.tensor([0.0, 1, 0]))
+    return random_points(count, viewmats, torch.Generator().manual_seed(0))
+
+
+def test_random_points_fill_what_the_cameras_look_at():
+    """Cameras of a NeRF-synthetic scene get its cube, with half side 1.3."""
+    positions = cube(2000).positions
+    assert float(positions.abs().max()) == pytest.approx(1.3, abs=0.01)
+    assert float(positions.mean(dim=0).abs().max()) < 0.1
 
 
 def test_spacing_is_the_mean_square_of_the_three_nearest():
@@ -23,7 +38,7 @@ def test_spacing_is_the_mean_square_of_the_three_nearest():
 @pytest.mark.parametrize("count", [0, 1, 2])
 def test_few_points_still_give_a_soup(count):
     """With fewer than four points there are fewer neighbours, and no NaN."""
-    soup = start(random_points(count, 1.0, torch.Generator().manual_seed(0)))
+    soup = start(cube(count))
     assert len(soup) == count
     assert first_not_finite(soup.parameters()) is None
 
@@ -33,9 +48,9 @@ def test_coincident_points_have_a_size():
     assert float(spacing(torch.zeros(5, 3)).min()) == pytest.approx(math.sqrt(1e-7))
 
 
-def test_triangles_are_right_angled_isosceles_about_their_points(rng):
+def test_triangles_are_right_angled_isosceles_about_their_points():
     """Legs sqrt(2) r, hypotenuse 2 r about the point, where r is the scaled spacing."""
-    points = random_points(50, 1.0, rng)
+    points = cube(50)
     soup = start(points)
     radius = 2.23 * spacing(points.positions)
     a, b, c = soup.vertices.detach().unbind(dim=1)
@@ -45,9 +60,9 @@ def test_triangles_are_right_angled_isosceles_about_their_points(rng):
     torch.testing.assert_close(soup.display_colors(), points.colors)
 
 
-def test_sky_reaches_the_farthest_coordinate_and_is_white(rng):
+def test_sky_reaches_the_farthest_coordinate_and_is_white():
     """Five percent more points on a sphere about the origin, in front of the others."""
-    points = random_points(100, 2.0, rng)
+    points = cube(100)
     with_sky = points.with_sky()
     assert len(with_sky) == 105
     torch.testing.assert_close(with_sky.positions[:5].norm(dim=1), points.positions.abs().max().expand(5))

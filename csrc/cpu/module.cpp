@@ -12,6 +12,7 @@ void bind_rasterize(nb::module_& m);
 void bind_rasterize_hard(nb::module_& m);
 void bind_soup_colors(nb::module_& m);
 void bind_spherical_harmonics(nb::module_& m);
+void bind_triangle_area(nb::module_& m);
 }  // namespace etsplat
 
 NB_MODULE(_native, m) {
@@ -32,4 +33,5 @@ NB_MODULE(_native, m) {
     bind_rasterize_hard(m);
     bind_soup_colors(m);
     bind_spherical_harmonics(m);
+    bind_triangle_area(m);
 }

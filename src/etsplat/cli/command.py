@@ -41,13 +41,18 @@ Settings = TypeVar("Settings")
 
 def preset_of(arguments: Sequence[str], presets: dict[str, Settings], default: str) -> Settings:
     """The settings of the preset that the arguments name: the defaults of all other options depend on it."""
-    name = default
+    return presets.get(option_value(arguments, "--preset") or default, presets[default])  # tyro refuses other names
+
+
+def option_value(arguments: Sequence[str], option: str) -> str | None:
+    """What the arguments say for an option, the last time that they do, before they are parsed."""
+    value = None
     for position, argument in enumerate(arguments):
-        if argument == "--preset":
-            name = "".join(arguments[position + 1 : position + 2])
-        elif argument.startswith("--preset="):
-            name = argument.removeprefix("--preset=")
-    return presets.get(name, presets[default])  # tyro refuses an unknown name
+        if argument == option:
+            value = "".join(arguments[position + 1 : position + 2])
+        elif argument.startswith(f"{option}="):
+            value = argument.removeprefix(f"{option}=")
+    return value
 
 
 def resume_line(arguments: Sequence[str]) -> str:

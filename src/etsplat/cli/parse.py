@@ -13,6 +13,7 @@ from etsplat.cli.data import Download, Sfm
 from etsplat.cli.doctor import Doctor
 from etsplat.cli.export import Export
 from etsplat.cli.reconstruct import Demo, Reconstruct
+from etsplat.cli.train import DemoScene, Train
 
 
 @dataclass(frozen=True)
@@ -31,6 +32,7 @@ class Group:
 COMMANDS: dict[str, type[Command] | Group] = {
     "demo": Demo,
     "reconstruct": Reconstruct,
+    "train": Train,
     "data": Group(
         "Where captures come from: find the cameras of photos, fetch data sets.", {"sfm": Sfm, "download": Download}
     ),
@@ -46,8 +48,10 @@ COMMANDS: dict[str, type[Command] | Group] = {
 _ETSPLAT = """Differentiable triangle splatting: posed images in, triangles out.
 
     etsplat demo                                      see it work
+    etsplat demo scene                                the same on a scene, as a triangle soup
     etsplat reconstruct bunny.obj --out runs/bunny    reconstruct a mesh from pictures of it
-    etsplat reconstruct --help                        every option
+    etsplat train my_scene/ --out runs/scene          fit a triangle soup to photos
+    etsplat train --help                              every option
 """
 
 
@@ -57,7 +61,9 @@ def parse(arguments: Sequence[str]) -> Command:
     Raises:
         InputError: a setting is out of its range.
     """
-    commands: Any = _union(COMMANDS, arguments, 0)
+    # `demo` with and without "scene" are two commands with options of their own.
+    demo = {"demo": DemoScene} if list(arguments[:2]) == ["demo", "scene"] else {}
+    commands: Any = _union({**COMMANDS, **demo}, arguments, 0)
     parsed = tyro.cli(
         commands,
         prog="etsplat",

@@ -61,7 +61,7 @@ _FILES = (
     "README.txt",
     "config.json",
 )
-_FOLDERS = ("test", "checkpoints")
+_FOLDERS = ("test", "checkpoints", "tensorboard")
 
 
 @dataclass(frozen=True)

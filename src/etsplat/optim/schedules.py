@@ -57,3 +57,10 @@ def face_budgets(
             iteration = min(max(round(fraction * iterations), 1), iterations)
             budgets[iteration] = round(start_faces * (max_faces / start_faces) ** (k / steps))
     return budgets
+
+
+def ramp(iteration: int, first: int, last: int) -> float:
+    """Rises linearly from 0 at iteration `first` to 1 at `last`, and is constant before and after."""
+    if iteration <= first:
+        return 0.0
+    return min(1.0, (iteration - first) / max(last - first, 1))

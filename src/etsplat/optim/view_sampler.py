@@ -13,9 +13,9 @@ class ViewSampler:
     Owns the run's only random generator, so that a checkpoint of this object fixes all that is random in the rest.
     """
 
-    def __init__(self, views: Sequence[int], seed: int) -> None:
+    def __init__(self, views: Sequence[int], generator: torch.Generator) -> None:
         self._views = torch.tensor(list(views), dtype=torch.int64)
-        self._generator = torch.Generator().manual_seed(seed)
+        self._generator = generator
         self._order = self._views[:0]
         self._position = 0
 
@@ -26,6 +26,20 @@ class ViewSampler:
             self._position = 0
         self._position += 1
         return int(self._order[self._position - 1])
+
+    @property
+    def epoch_starts(self) -> bool:
+        """Whether the view that `next_view` gave last is the first of an epoch."""
+        return self._position == 1
+
+    @property
+    def generator(self) -> torch.Generator:
+        """For whatever else the run chooses at random."""
+        return self._generator
+
+    def upcoming(self, count: int) -> list[int]:
+        """At most `count` of the views that come next in this epoch."""
+        return self._order[self._position : self._position + count].tolist()
 
     def background(self) -> Float[Tensor, "1 3"]:
         """A random colour, uniform in [0, 1)^3."""

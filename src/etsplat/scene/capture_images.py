@@ -121,6 +121,33 @@ class CaptureImages:
             return self._kept[index]
 
 
+class StoredImages:
+    """Images that are in memory already, with the interface of `CaptureImages`."""
+
+    streamed = False
+
+    def __init__(self, pixels: Sequence[UInt8[Tensor, "H W C"]]) -> None:
+        self._pixels = list(pixels)
+        self.sizes = [(image.shape[1], image.shape[0]) for image in self._pixels]
+        self.total_bytes = sum(image.numel() for image in self._pixels)
+
+    def __len__(self) -> int:
+        return len(self._pixels)
+
+    def __getitem__(self, index: int) -> UInt8[Tensor, "H W C"]:
+        """(H, W, 3), or (H, W, 4) premultiplied."""
+        return self._pixels[index]
+
+    def __iter__(self) -> Iterator[UInt8[Tensor, "H W C"]]:
+        return iter(self._pixels)
+
+    def mask(self, index: int) -> None:
+        """All pixels count."""
+
+    def expect(self, indices: Sequence[int]) -> None:
+        """Nothing to prepare."""
+
+
 def _size_in_bytes(frame: Frame, size: tuple[int, int]) -> int:
     """An upper bound: PNG files may turn out to have no transparency."""
     channels = (4 if frame.image.suffix.lower() == ".png" else 3) + (frame.mask is not None)

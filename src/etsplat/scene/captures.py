@@ -11,7 +11,7 @@ from torch import Tensor
 from etsplat.core.cameras import Cameras
 from etsplat.io.images import image_size
 from etsplat.io.memory import available_memory
-from etsplat.scene.capture_images import CaptureImages
+from etsplat.scene.capture_images import CaptureImages, StoredImages
 from etsplat.scene.frames import FrameSet, check_count, scaled_intrinsics
 from etsplat.scene.load import read_scene
 from etsplat.scene.views import Normalization
@@ -44,7 +44,7 @@ class Capture:
 
     viewmats: Float[Tensor, "B 4 4"]
     Ks: Float[Tensor, "B 3 3"]
-    images: CaptureImages
+    images: CaptureImages | StoredImages
     names: list[str]
     train: list[int]
     test: list[int]

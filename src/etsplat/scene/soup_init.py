@@ -12,7 +12,9 @@ from etsplat.scene.triangle_soup import TriangleSoup
 
 NEIGHBOURS = 3
 SKY_FRACTION = 0.05
-RANDOM_HALF_SIDE = 1.3
+VIEWED_FRACTION = 1.3 / 4.03
+"""Half the side of the cube that is filled with random points, relative to the distance of the cameras from its centre:
+that of the NeRF-synthetic scenes, whose cube reaches to 1.3 and whose cameras are 4.03 away."""
 _SMALLEST_SQUARE = 1e-7
 
 
@@ -40,10 +42,22 @@ class StartPoints:
         return StartPoints(torch.cat([sky, self.positions]), torch.cat([white, self.colors]))
 
 
-def random_points(count: int, half_side: float, generator: torch.Generator) -> StartPoints:
-    """Grey points, uniform in the cube [-half_side, half_side]^3: for captures without a sparse reconstruction."""
-    positions = (2 * torch.rand((count, 3), generator=generator) - 1) * half_side
-    return StartPoints(positions, torch.full((count, 3), 0.5))
+def random_points(count: int, viewmats: Float[Tensor, "B 4 4"], generator: torch.Generator) -> StartPoints:
+    """Grey points, uniform in a cube about the place that the cameras look at: for captures without points.
+
+    Args:
+        count: how many.
+        viewmats: (B, 4, 4) float64, world to camera.
+        generator: of the positions.
+    """
+    forward = viewmats[:, 2, :3]
+    centers = -torch.einsum("bji,bj->bi", viewmats[:, :3, :3], viewmats[:, :3, 3])
+    # The point nearest to all optical axes: sum (I - f f^T) (p - c) = 0. Axes that are parallel leave a direction open.
+    across = torch.eye(3, dtype=viewmats.dtype) - forward[:, :, None] * forward[:, None, :]
+    middle = torch.linalg.pinv(across.sum(dim=0), rtol=1e-6) @ torch.einsum("bij,bj->i", across, centers)
+    half_side = VIEWED_FRACTION * (centers - middle).norm(dim=1).mean()
+    unit = 2 * torch.rand((count, 3), generator=generator) - 1
+    return StartPoints((middle + half_side * unit.double()).float(), torch.full((count, 3), 0.5))
 
 
 def fibonacci_sphere(count: int) -> Float[Tensor, "N 3"]:

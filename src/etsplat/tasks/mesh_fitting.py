@@ -49,7 +49,7 @@ class MeshFitting:
         self._views = views
         self._config = config
         self._evaluate = evaluate
-        self._sampler = ViewSampler(views.train, config.seed)
+        self._sampler = ViewSampler(views.train, torch.Generator().manual_seed(config.seed))
         self._rates = {
             "vertices": config.lr_vertices,
             "colors": config.lr_colors,

@@ -1,0 +1,260 @@
+"""Novel-view synthesis (paper section 3.4): photos in, a run directory with a triangle soup out."""
+
+import hashlib
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from etsplat.core.errors import InputError
+from etsplat.io.memory import available_memory
+from etsplat.io.run_directory import RunDirectory, is_run
+from etsplat.ops.engines import num_threads, one_torch_thread, resolve_engine
+from etsplat.optim.loop import LoopSettings, Progress
+from etsplat.scene.captures import Capture, load_capture
+from etsplat.scene.demo_scene import demo_scene
+from etsplat.scene.soup_files import SoupFile, save_soup
+from etsplat.scene.soup_init import StartPoints, random_points, start_soup
+from etsplat.scene.triangle_soup import TriangleSoup
+from etsplat.tasks.running import (
+    Callback,
+    NoteEvent,
+    PrepareEvent,
+    fit,
+    hash_record,
+    make_record,
+    path_of,
+    versions,
+)
+from etsplat.tasks.soup_fitting import SoupFitting
+from etsplat.tasks.soup_scoring import SoupScorer
+from etsplat.tasks.train_config import TrainConfig, train_settings
+
+DEMO = "demo:scene"
+"""Names the scene that is built in code."""
+
+BYTES_PER_TRIANGLE = 1500
+"""Parameters, gradients, moments, statistics, what the rasterizer keeps, and the copies while triangles multiply."""
+
+BYTES_PER_PIXEL = 400
+"""Of the step's images and the rasterizer's lists."""
+
+LARGE_SPAN = 300.0
+"""Above this many units across, Triangle Splatting compares outdoor scenes by squares."""
+
+USUAL_EXTENT = (0.5, 50.0)
+"""Extents of the scenes that the paper's absolute settings were made for, generously."""
+
+
+@dataclass(frozen=True)
+class TrainResult:
+    """What a run gives back; all of it is in the run directory too.
+
+    Attributes:
+        path: the run directory.
+        soup: the triangles, in the units of the input.
+        metrics: as in metrics.json.
+    """
+
+    path: Path
+    soup: TriangleSoup
+    metrics: dict[str, Any]
+
+
+def train(
+    source: str | Path | Capture,
+    out: str | Path,
+    config: TrainConfig | None = None,
+    *,
+    images: str | None = None,
+    masks: str | Path | None = None,
+    callbacks: Sequence[Callback] = (),
+    resume: bool = False,
+    overwrite: bool = False,
+) -> TrainResult:
+    """Fits a triangle soup to the photos of a scene.
+
+    A run ends with the same bits on the same machine, torch and number of threads, also if it was killed and resumed
+    any number of times. Ctrl-C leaves a checkpoint of the last whole iteration.
+
+    Args:
+        source: a folder with posed photos (COLMAP, nerfstudio, Blender), a `Capture` in its own units, or "demo:scene".
+        out: the run directory; made if it does not exist. README.txt in it explains what is there.
+        config: settings; None for `train_settings("quick")`.
+        images: folder in the scene to take the photos from, such as "images_4".
+        masks: folder with a mask for every photo, white where pixels count.
+        callbacks: each is called with every event, in the thread of the caller.
+        resume: continue the run in `out`, which must have been started with the same source and settings.
+        overwrite: replace a run in `out`. Nothing but files of a run is ever removed.
+
+    Raises:
+        InputError: something handed in cannot be used; earlier results in `out` are as they were.
+        DivergedError: the optimization went to NaN or infinity.
+    """
+    config = config or train_settings("quick")
+    out = Path(out)
+    if resume and not is_run(out):
+        raise InputError(f"{out}: holds no run to resume; start it without --resume")
+    if not resume:
+        RunDirectory.check_free(out, overwrite=overwrite)
+
+    def announce(event: Any) -> None:
+        for callback in callbacks:
+            callback(event)
+
+    own = _load(source, config, images, masks, lambda done, total: announce(PrepareEvent(done, total)))
+    capture = own.normalized() if config.normalize else own
+    for note in _check(own, config):
+        announce(NoteEvent(note))
+    record = make_record("train", config, {"fingerprint": _fingerprint(own)}, {"source": path_of(source)})
+    generator = torch.Generator().manual_seed(config.seed)
+    points = _start_points(capture, config, generator)
+    soup = start_soup(
+        points,
+        generator,
+        scale=config.start_scale,
+        opacity=config.start_opacity,
+        sigma=config.start_sigma,
+        sh_degree=config.sh_degree,
+    )
+    background = torch.full((3,), 1.0 if config.background == "white" else 0.0)
+    scorer = SoupScorer(capture, background, config.engine)
+    squared = config.scene_type == "outdoor" and not config.normalize and _span(points) > LARGE_SPAN
+    fitting = SoupFitting(soup, capture, config, generator, scorer.cheap, squared=squared)
+    run = RunDirectory.resume(out, record) if resume else RunDirectory.create(out, record, overwrite=overwrite)
+    native = resolve_engine(config.engine, soup.vertices) == "cpu"
+    settings = LoopSettings(config.iterations, config.log_every, config.evaluate_every, config.checkpoint_every)
+    with one_torch_thread() if native else nullcontext():
+        progress = fit(fitting, run, settings, hash_record(record), announce)
+    return _finish(fitting, progress, run, scorer, capture, config)
+
+
+def predicted_bytes(capture: Capture, config: TrainConfig) -> int:
+    """Memory that a run may come to need, beyond the program itself."""
+    pixels = max(width * height for width, height in capture.images.sizes)
+    triangles = max(config.max_triangles, _start_count(capture, config))
+    pictures = 0 if capture.images.streamed else capture.images.total_bytes
+    return triangles * BYTES_PER_TRIANGLE + pixels * BYTES_PER_PIXEL + pictures
+
+
+def _load(
+    source: str | Path | Capture,
+    config: TrainConfig,
+    images: str | None,
+    masks: str | Path | None,
+    progress: Callable[[int, int], None],
+) -> Capture:
+    if isinstance(source, Capture):
+        return source
+    if str(source) == DEMO:
+        return demo_scene(progress=progress)
+    return load_capture(source, images=images, width=config.width, masks=masks, progress=progress)
+
+
+def _check(capture: Capture, config: TrainConfig) -> list[str]:
+    """Refuses what cannot work; returns what its owner should know."""
+    if not capture.train:
+        raise InputError("capture: has no view to train on; name some in its split")
+    needed, free = predicted_bytes(capture, config), available_memory()
+    if needed > free:
+        fitting = max(1000, int(config.max_triangles - (needed - free) / BYTES_PER_TRIANGLE))
+        raise InputError(
+            f"max_triangles: {config.max_triangles:,} triangles may need {needed / 2**30:.1f} GiB and "
+            f"{free / 2**30:.1f} GiB are free; set it to {fitting} or less"
+        )
+    notes = [f"{len(capture.train)} photos to train on, {len(capture.test)} to test; at most {_gib(needed)} of memory"]
+    if capture.images.streamed:
+        notes.append("the photos do not fit into memory: they are decoded anew whenever they are needed")
+    if capture.exact_points is None:
+        notes.append(f"no points in the capture: starting from {config.start_points:,} random ones")
+    low, high = USUAL_EXTENT
+    if not config.normalize and not low <= capture.extent <= high:
+        notes.append(
+            f"the cameras are spread over {capture.extent:.3g} units, far from what the learning rates are made for "
+            f"({low:g} to {high:g}): --normalize scales the scene"
+        )
+    return notes
+
+
+def _gib(count: int) -> str:
+    return f"{count / 2**30:.1f} GiB"
+
+
+def _start_count(capture: Capture, config: TrainConfig) -> int:
+    return config.start_points if capture.exact_points is None else len(capture.exact_points)
+
+
+def _start_points(capture: Capture, config: TrainConfig, generator: torch.Generator) -> StartPoints:
+    """The capture's points, or random ones in a cube that holds what the cameras look at."""
+    positions, colors = capture.points, capture.point_colors
+    if positions is None:
+        points = random_points(config.start_points, capture.viewmats[capture.train], generator)
+    else:
+        grey = torch.full_like(positions, 0.5)
+        points = StartPoints(positions, grey if colors is None else colors)
+    return points.with_sky() if config.sky_dome else points
+
+
+def _span(points: StartPoints) -> float:
+    """Longest side of the box around the points."""
+    return float((points.positions.amax(dim=0) - points.positions.amin(dim=0)).max()) if len(points) else 0.0
+
+
+def _fingerprint(capture: Capture) -> str:
+    """A short hash of what a run depends on: cameras, split, points, names and sizes, and the first photo's pixels."""
+    digest = hashlib.sha256()
+    split = torch.tensor([*capture.train, -1, *capture.test])
+    for tensor in (capture.viewmats, capture.Ks, split, capture.exact_points, capture.point_colors, capture.images[0]):
+        if tensor is not None:
+            digest.update(str(tuple(tensor.shape)).encode())
+            digest.update(tensor.contiguous().numpy().tobytes())
+    digest.update(repr((capture.names, capture.images.sizes)).encode())
+    return digest.hexdigest()[:16]
+
+
+def _finish(
+    fitting: SoupFitting,
+    progress: Progress,
+    run: RunDirectory,
+    scorer: SoupScorer,
+    capture: Capture,
+    config: TrainConfig,
+) -> TrainResult:
+    """Writes the soup in the input's units, draws the test views, measures everything."""
+    soup, appearance = fitting.finished()
+    scores = scorer.full(soup, appearance, run.test)
+    own = capture.normalization
+    result = replace(soup, vertices=own.invert(soup.vertices.double()).float())
+    background = (1.0, 1.0, 1.0) if config.background == "white" else (0.0, 0.0, 0.0)
+    file = SoupFile(
+        result,
+        replace(appearance, near_plane=appearance.near_plane * own.radius),
+        background,
+        {"iteration": str(progress.iteration), "method": config.method, "preset": config.preset},
+    )
+    save_soup(run.soup_path, file)
+    metrics = {
+        **scores,
+        "psnr_opaque_loss": None if scores["psnr"] is None else scores["psnr"] - scores["psnr_opaque"],
+        "triangles": len(soup),
+        **fitting.describe(),
+        "iterations": progress.iteration,
+        "seconds": progress.seconds,
+        "seconds_per_iteration": progress.seconds / progress.iteration,
+        "width": capture.images.sizes[0][0],
+        "height": capture.images.sizes[0][1],
+        "train_views": len(capture.train),
+        "engine": resolve_engine(config.engine, soup.vertices),
+        "threads": num_threads(),
+        "method": config.method,
+        "preset": config.preset,
+        "scene_type": config.scene_type,
+        "finish": config.finish,
+        "seed": config.seed,
+        "versions": versions(),
+    }
+    run.write_metrics(metrics)
+    return TrainResult(run.path, result, run.read_metrics())
