@@ -13,6 +13,7 @@ from etsplat.cli.data import Download, Sfm
 from etsplat.cli.doctor import Doctor
 from etsplat.cli.export import Export
 from etsplat.cli.reconstruct import Demo, Reconstruct
+from etsplat.cli.render import Render
 from etsplat.cli.train import DemoScene, Train
 
 
@@ -36,6 +37,7 @@ COMMANDS: dict[str, type[Command] | Group] = {
     "data": Group(
         "Where captures come from: find the cameras of photos, fetch data sets.", {"sfm": Sfm, "download": Download}
     ),
+    "render": Render,
     "export": Export,
     "bench": Group(
         "The paper's studies as grids of runs, with tables and figures.",

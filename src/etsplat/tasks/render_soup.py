@@ -1,0 +1,163 @@
+"""Pictures and videos of a trained soup."""
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from matplotlib import colormaps
+from torch import Tensor
+
+from etsplat.core.cameras import Cameras
+from etsplat.core.errors import InputError
+from etsplat.io.atomic import atomic_write, write_error
+from etsplat.io.images import save_image
+from etsplat.io.videos import VideoSink, open_video
+from etsplat.scene.camera_paths import PATHS
+from etsplat.scene.captures import Capture
+from etsplat.scene.soup_files import SoupFile
+from etsplat.scene.soup_rendering import render_soup, render_soup_opaque
+from etsplat.tasks.render_config import RenderConfig
+from etsplat.tasks.soup_run import SoupRun, world_up
+
+_NEAREST = 0.02
+"""Quantile of depths that is shown as nearest, and as farthest from the other end."""
+
+_PROBE_WIDTH = 160
+
+
+def render_run(
+    run: SoupRun, out: Path | str, config: RenderConfig, *, progress: Callable[[int, int], None] | None = None
+) -> list[Path]:
+    """Draw views or a path of a run into a folder.
+
+    Args:
+        run: with its capture.
+        out: folder; made if it does not exist. Gets NAME_color.png (and _depth.png, _depth.npy, _normal.png) or
+            PATH_color.mp4 and so on.
+        config: what, from where, how.
+        progress: called with (pictures drawn, pictures in all).
+
+    Returns:
+        The files written.
+
+    Raises:
+        InputError: the run has no capture or no views of that kind; MP4 cannot be written; the disk is full.
+    """
+    out = Path(out)
+    names, cameras = views_of(run.needed_capture(), config)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise write_error(out, error) from error
+    written: list[Path] = []
+    span = _path_span(run.file, cameras) if config.video and config.depth else None
+    with ExitStack() as stack:
+        sinks: dict[str, VideoSink] = {}
+        for index, (name, camera) in enumerate(zip(names, cameras, strict=True)):
+            pictures = draw(run.file, camera, config)
+            if "depth" in pictures:
+                depth = pictures["depth"]
+                if not config.video:
+                    written.append(_save_array(out / f"{name}_depth.npy", depth))
+                pictures["depth"] = color_depth(depth, span or depth_span(depth))
+            for kind, picture in pictures.items():
+                if not config.video:
+                    written.append(out / f"{name}_{kind}.png")
+                    save_image(written[-1], picture)
+                    continue
+                if kind not in sinks:
+                    written.append(out / f"{config.path}_{kind}.mp4")
+                    sinks[kind] = stack.enter_context(open_video(written[-1], config.fps))
+                sinks[kind](picture)
+            if progress is not None:
+                progress(index + 1, len(names))
+    return written
+
+
+def views_of(capture: Capture, config: RenderConfig) -> tuple[list[str], list[Cameras]]:
+    """Names and single cameras of what is to be drawn.
+
+    Raises:
+        InputError: the capture has no test views.
+    """
+    if config.path in ("test", "train"):
+        chosen = capture.test if config.path == "test" else capture.train
+        if not chosen:
+            raise InputError(f"--path {config.path}: the capture has no such views; draw a path instead")
+        cameras = capture.cameras
+        return [capture.names[index] for index in chosen], [_sized(cameras[index], config.width) for index in chosen]
+    up = world_up(capture.viewmats)
+    if up is None:  # the cameras contradict each other: take the first one's
+        up = -capture.viewmats[0, 1, :3]
+    viewmats = PATHS[config.path](capture.viewmats[capture.train], up, config.frames).float()
+    first = _sized(capture.cameras[capture.train[0]], config.width)
+    names = [f"{config.path}_{index:04d}" for index in range(config.frames)]
+    return names, [replace(first, viewmats=viewmats[index : index + 1]) for index in range(config.frames)]
+
+
+@torch.no_grad()
+def draw(file: SoupFile, camera: Cameras, config: RenderConfig) -> dict[str, Float[Tensor, "H W *C"]]:
+    """The images of one camera by kind: color (H, W, 3); depth (H, W), 0 where nothing is; normal (H, W, 3)."""
+    background = torch.tensor(file.background)
+    soup, appearance = file.soup, file.appearance
+    pictures: dict[str, Tensor] = {}
+    if config.opaque:
+        color = render_soup_opaque(soup, camera, appearance, background=background)[0]
+        pictures["color"] = color.clamp(0, 1)
+    if config.opaque and not (config.depth or config.normals):
+        return pictures
+    rendering = render_soup(
+        soup,
+        camera,
+        appearance,
+        backgrounds=background[None],
+        depth="plane" if config.depth else None,
+        normals=config.normals,
+    )
+    pictures.setdefault("color", rendering.color[0].clamp(0, 1))
+    if rendering.depth is not None:
+        pictures["depth"] = rendering.depth[0, ..., 0]
+    if rendering.normal is not None:
+        normals = torch.nn.functional.normalize(rendering.normal[0], dim=-1)
+        pictures["normal"] = (0.5 + 0.5 * normals) * rendering.alpha[0]
+    return pictures
+
+
+def depth_span(depth: Float[Tensor, "H W"]) -> tuple[float, float]:
+    """The nearest and farthest depth that get a colour of their own."""
+    seen = depth[depth > 0]
+    if not len(seen):
+        return 0.5, 1.0
+    kept = seen[:: max(1, len(seen) // 100_000)].double()
+    near, far = torch.quantile(kept, _NEAREST).item(), torch.quantile(kept, 1 - _NEAREST).item()
+    return near, max(far, near * 1.001)
+
+
+def color_depth(depth: Float[Tensor, "H W"], span: tuple[float, float]) -> Float[Tensor, "H W 3"]:
+    """False colours by inverse depth, red near and blue far; black where nothing is."""
+    near, far = span
+    inverse = 1 / depth.clamp_min(1e-12)
+    level = ((inverse - 1 / far) / (1 / near - 1 / far)).clamp(0, 1)
+    colors = torch.from_numpy(colormaps["turbo"](level.numpy())[..., :3]).float()
+    return torch.where(depth[..., None] > 0, colors, 0.0)
+
+
+def _path_span(file: SoupFile, cameras: list[Cameras]) -> tuple[float, float]:
+    """One span for all frames of a video, from some of them drawn small: colours do not flicker."""
+    probes = [cameras[index].scaled(_PROBE_WIDTH / cameras[index].width) for index in range(0, len(cameras), 8)]
+    depths = [draw(file, probe, RenderConfig(depth=True))["depth"] for probe in probes]
+    return depth_span(torch.cat(depths))
+
+
+def _sized(camera: Cameras, width: int | None) -> Cameras:
+    return camera if width is None else camera.scaled(width / camera.width)
+
+
+def _save_array(path: Path, values: Tensor) -> Path:
+    with atomic_write(path) as temporary:
+        np.save(temporary, values.numpy())
+    return path
