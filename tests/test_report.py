@@ -23,6 +23,7 @@ from etsplat.report.command import reproduce_command
 from etsplat.report.curves import MAX_POINTS, Curve, curves_of, draw_svg, linear_ticks, log_ticks, short_number
 from etsplat.report.data import read_run
 from etsplat.tasks.reconstruct_config import PRESETS
+from etsplat.tasks.train_config import train_settings
 
 METRICS = {
     "chamfer": 6.4e-5,
@@ -239,3 +240,74 @@ def test_no_command_for_objects_from_python() -> None:
     assert reproduce_command(CONFIG | {"paths": {"source": None, "init_mesh": None}}, here) is None
     start = {"source": {"fingerprint": "1", "init_mesh": "2"}}
     assert reproduce_command(CONFIG | start, here) is None
+
+
+def write_soup_run(folder: Path) -> Path:
+    """A finished run of `etsplat train`, with grey pictures."""
+    config = {
+        "task": "train",
+        "config": vars(replace(train_settings("quick", "indoor"), iterations=500)),
+        "source": {"fingerprint": "0123456789abcdef"},
+        "paths": {"source": "scenes/my kitchen", "images": "images_2", "masks": None},
+        "versions": {"etsplat": version("etsplat"), "torch": "2.13.0"},
+    }
+    run = RunDirectory.create(folder, config)
+    shared = ("iterations", "seconds", "seconds_per_iteration", "engine", "preset", "seed", "versions")
+    run.write_metrics(
+        {
+            **{key: METRICS[key] for key in shared},
+            "psnr": 27.1,
+            "ssim": 0.81,
+            "psnr_opaque": 25.9,
+            "triangles": 98765,
+            "threads": 4,
+            "method": "elastic",
+            "sigma": 0.4,
+            "sigma_10": 0.1,
+            "sigma_90": 0.9,
+            "opacity": 0.6,
+            "opacity_10": 0.2,
+            "opacity_90": 0.99,
+        }
+    )
+    for step in range(1, 30):
+        spread = {"sigma": 1 / step, "sigma_10": 0.5 / step, "sigma_90": 2 / step, "triangles": 100 * step}
+        run.append_history({"iteration": 10 * step, "seconds": step, "loss": 1 / step, **spread})
+    run.soup_path.write_bytes(b"soup")
+    for kind in ("truth", "render", "opaque"):
+        Image.new("RGB", (32, 24), "#808080").save(run.test / f"000_{kind}.png")
+    return folder
+
+
+def test_the_page_of_a_soup_has_no_mesh_but_opaque_pictures_and_bands(tmp_path: Path) -> None:
+    page = write_report(write_soup_run(tmp_path / "run")).read_text(encoding="utf-8")
+    assert 'id="mesh-data"' not in page
+    assert 'data-opaque="data:image' in page
+    assert "98,765" in page
+    assert "10 to 90 %: 0.1 to 0.9" in page
+    run = read_run(tmp_path / "run")
+    sigma = next(curve for curve in curves_of(run) if curve.quantity.key == "sigma")
+    assert (sigma.low[3], sigma.mean[3], sigma.high[3]) == (0.125, 0.25, 0.5)
+    assert (tmp_path / "run" / "overview.png").is_file()
+
+
+def test_what_eval_measured_is_on_the_page(tmp_path: Path) -> None:
+    folder = write_soup_run(tmp_path / "run")
+    assert "not measured" in write_report(folder).read_text(encoding="utf-8")
+    RunDirectory(folder).write_evaluation({"fps": 12.34, "ms_per_million": 820.4, "lpips_3dgs": 0.2345})
+    page = write_report(folder).read_text(encoding="utf-8")
+    assert "not measured" not in page
+    assert "12.3" in page
+    assert "0.2345" in page
+
+
+def test_the_command_of_a_soup_names_scene_photos_and_changes(tmp_path: Path) -> None:
+    config = read_run(write_soup_run(tmp_path / "run")).config
+    command = reproduce_command(config, version("etsplat"))
+    assert command is not None
+    words = shlex.split(command.replace("\\\n", ""))
+    assert words[:4] == ["etsplat", "train", "scenes/my kitchen", "--out"]
+    assert words[5:] == [
+        *["--images", "images_2", "--preset", "quick", "--scene-type", "indoor"],
+        *["--iterations", "500"],
+    ]

@@ -7,14 +7,15 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from etsplat.report.cards import cards_of
 from etsplat.report.data import read_run
-from etsplat.report.metrics import describe
 
 PICTURE_COLUMNS = 96
 
 _FILES = (
-    ("report.html", "everything on one page, with the mesh to turn around"),
-    ("overview.png", "test views: truth, render, mesh"),
+    ("report.html", "everything on one page"),
+    ("overview.png", "test views: truth, render, and as opaque triangles"),
+    ("soup.safetensors", "the soup: etsplat view, render, export and eval take its folder"),
     ("mesh.glb", "the mesh for viewers (also mesh.obj; mesh.ply has exact face colours)"),
     ("metrics.json", "the numbers above and more"),
 )
@@ -27,7 +28,7 @@ def print_summary(console: Console, run_dir: Path) -> None:
         with Image.open(run_dir / "overview.png") as image:
             console.print(half_blocks(image, min(PICTURE_COLUMNS, console.width)))
     metrics = Table(box=None, show_header=False, pad_edge=False)
-    for metric in describe(run.metrics):
+    for metric in cards_of(run):
         unit = metric.unit if metric.value is not None else "not measured; report.html says why"
         metrics.add_row(metric.title, Text(metric.value or "-", justify="right"), Text(unit))
     console.print(metrics)

@@ -54,6 +54,7 @@ _FILES = (
     "mesh.glb",
     "soup.safetensors",
     "metrics.json",
+    "evaluation.json",
     "history.jsonl",
     "convergence.png",
     "overview.png",
@@ -83,6 +84,11 @@ class RunDirectory:
     def metrics_path(self) -> Path:
         """metrics.json: final metrics; there once the run is done."""
         return self.path / "metrics.json"
+
+    @property
+    def evaluation_path(self) -> Path:
+        """evaluation.json: what `etsplat eval` measured; there once it did."""
+        return self.path / "evaluation.json"
 
     @property
     def history_path(self) -> Path:
@@ -206,6 +212,14 @@ class RunDirectory:
     def write_metrics(self, metrics: Mapping[str, Any]) -> None:
         """Writes metrics.json, whole or not at all. NaN and infinity, which JSON has not, become null."""
         _write_json(self.metrics_path, {key: _null_if_not_finite(value) for key, value in metrics.items()})
+
+    def read_evaluation(self) -> dict[str, Any]:
+        """What evaluation.json holds; empty if nobody evaluated the run after it was done."""
+        return _read_json(self.evaluation_path) if self.evaluation_path.is_file() else {}
+
+    def write_evaluation(self, evaluation: Mapping[str, Any]) -> None:
+        """Writes evaluation.json as `write_metrics` does."""
+        _write_json(self.evaluation_path, {key: _null_if_not_finite(value) for key, value in evaluation.items()})
 
     def append_history(self, line: Mapping[str, Any]) -> None:
         """Appends one line to history.jsonl."""

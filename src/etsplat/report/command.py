@@ -4,6 +4,7 @@ import shlex
 from typing import Any
 
 from etsplat.tasks.reconstruct_config import PRESETS
+from etsplat.tasks.train_config import train_settings
 
 
 def reproduce_command(config: dict[str, Any], version: str) -> str | None:
@@ -13,16 +14,35 @@ def reproduce_command(config: dict[str, Any], version: str) -> str | None:
         config: the run's config.json.
         version: of this etsplat. Settings that the preset implies are left out if the run was made with the same.
     """
-    paths, source = config["paths"], config["source"]
-    if paths["source"] is None or (source["init_mesh"] and paths["init_mesh"] is None):
+    settings, same = config["config"], config["versions"]["etsplat"] == version
+    if config["paths"]["source"] is None:
         return None
+    if config["task"] == "train":
+        words, implied = _train_words(config["paths"], settings)
+    else:
+        if config["source"]["init_mesh"] and config["paths"]["init_mesh"] is None:
+            return None
+        words, implied = _reconstruct_words(config["paths"], settings)
+    for name, value in settings.items():
+        if name not in ("preset", "scene_type") and (not same or name not in implied or implied[name] != value):
+            words.append(f"--{name.replace('_', '-')} {shlex.quote(str(value))}")
+    return " \\\n    ".join(words)
+
+
+def _reconstruct_words(paths: dict[str, Any], settings: dict[str, Any]) -> tuple[list[str], dict[str, Any]]:
+    """How the command begins, and the settings that its preset implies."""
     words = [f"etsplat reconstruct {shlex.quote(paths['source'])} --out DIR"]
     if paths["init_mesh"]:
         words.append(f"--init-mesh {shlex.quote(paths['init_mesh'])}")
-    settings = config["config"]
-    words.append(f"--preset {settings['preset']}")
-    implied = vars(PRESETS[settings["preset"]]) if config["versions"]["etsplat"] == version else {}
-    for name, value in settings.items():
-        if name != "preset" and (name not in implied or implied[name] != value):
-            words.append(f"--{name.replace('_', '-')} {shlex.quote(str(value))}")
-    return " \\\n    ".join(words)
+    return [*words, f"--preset {settings['preset']}"], vars(PRESETS[settings["preset"]])
+
+
+def _train_words(paths: dict[str, Any], settings: dict[str, Any]) -> tuple[list[str], dict[str, Any]]:
+    """The same for a soup."""
+    source = paths["source"]
+    words = [f"etsplat train {shlex.quote(source)} --out DIR"]
+    if source == "demo:scene":
+        words = ["etsplat demo scene --out DIR"]
+    words += [f"--{name} {shlex.quote(paths[name])}" for name in ("images", "masks") if paths.get(name)]
+    words += [f"--preset {settings['preset']}", f"--scene-type {settings['scene_type']}"]
+    return words, vars(train_settings(settings["preset"], settings["scene_type"]))

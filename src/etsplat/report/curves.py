@@ -15,21 +15,27 @@ LEFT, RIGHT, TOP, BOTTOM = 46, 12, 10, 24
 
 @dataclass(frozen=True)
 class Quantity:
-    """A history key, its title, whether its axis is logarithmic, the metric that is its lower bound, and its scale."""
+    """A history key, its title, whether its axis is logarithmic, the metric that is its lower bound, and its scale.
+
+    `band` names two further keys, whose range is shown around the line.
+    """
 
     key: str
     title: str
     logarithmic: bool
     floor_key: str | None = None
     scale: float = 1.0
+    band: tuple[str, str] | None = None
 
 
 QUANTITIES = (
     Quantity("loss", "Training loss", True),
     Quantity("psnr", "PSNR of test views, dB", False),
     Quantity("chamfer", "Chamfer distance × 10⁻³", True, floor_key="chamfer_floor", scale=1000.0),
-    Quantity("sigma", "Softness σ", True),
+    Quantity("sigma", "Softness σ", True, band=("sigma_10", "sigma_90")),
+    Quantity("opacity", "Opacity", False, band=("opacity_10", "opacity_90")),
     Quantity("faces", "Faces", False),
+    Quantity("triangles", "Triangles", False),
 )
 
 
@@ -57,8 +63,12 @@ def curves_of(run: Run) -> list[Curve]:
         x, y = run.series(quantity.key)
         if len(x) >= 2:
             floor = run.metrics.get(quantity.floor_key) if quantity.floor_key else None
-            thinned = _thin(x, [quantity.scale * value for value in y])
-            curves.append(Curve(quantity, *thinned, floor=quantity.scale * floor if floor else None))
+            x, mean, low, high = _thin(x, [quantity.scale * value for value in y])
+            if quantity.band is not None:
+                (_, lower), (_, upper) = (run.series(key) for key in quantity.band)
+                if len(lower) == len(upper) == len(y):
+                    low, high = _thin(lower, lower)[2], _thin(upper, upper)[3]
+            curves.append(Curve(quantity, x, mean, low, high, floor=quantity.scale * floor if floor else None))
     return curves
 
 

@@ -11,12 +11,12 @@ from etsplat.io.run_directory import RunDirectory, is_run
 
 @dataclass(frozen=True)
 class TestView:
-    """The pictures of one test view: paths of PNG files; `mesh` is the exported mesh drawn opaque."""
+    """The pictures of one test view: paths of PNG files; `opaque` is the result as a mesh viewer draws it."""
 
     name: str
     truth: Path
     render: Path
-    mesh: Path
+    opaque: Path
 
 
 @dataclass(frozen=True)
@@ -26,10 +26,10 @@ class Run:
     Attributes:
         folder: the run directory.
         config: `config.json`.
-        metrics: `metrics.json`.
+        metrics: `metrics.json`, with what `etsplat eval` added to it.
         history: one record per logged step, iterations increasing.
         views: test views that have all three pictures, by name.
-        mesh: path of `mesh.ply`.
+        mesh: path of `mesh.ply`; None for a soup.
     """
 
     folder: Path
@@ -37,7 +37,12 @@ class Run:
     metrics: dict[str, Any]
     history: list[dict[str, Any]]
     views: list[TestView]
-    mesh: Path
+    mesh: Path | None
+
+    @property
+    def task(self) -> str:
+        """What was run: "reconstruct" or "train"."""
+        return self.config["task"]
 
     def series(self, key: str) -> tuple[list[float], list[float]]:
         """Iterations and values of the history records that have a finite `key`."""
@@ -55,22 +60,24 @@ def read_run(run_dir: Path | str) -> Run:
     directory = RunDirectory(folder)
     if not is_run(folder):
         raise InputError(f"{folder}: is not a run of etsplat; name a folder that was given to --out")
-    if not directory.metrics_path.is_file() or not directory.mesh_path(".ply").is_file():
+    config = directory.read_config()
+    mesh = directory.mesh_path(".ply") if config["task"] == "reconstruct" else None
+    if not directory.metrics_path.is_file() or not (mesh or directory.soup_path).is_file():
         raise InputError(f"{folder}: this run has not finished; continue it with --resume")
     return Run(
         folder=folder,
-        config=directory.read_config(),
-        metrics=directory.read_metrics(),
+        config=config,
+        metrics={**directory.read_metrics(), **directory.read_evaluation()},
         history=directory.read_history(),
-        views=_find_views(directory.test),
-        mesh=directory.mesh_path(".ply"),
+        views=_find_views(directory.test, "opaque" if mesh is None else "mesh"),
+        mesh=mesh,
     )
 
 
-def _find_views(folder: Path) -> list[TestView]:
+def _find_views(folder: Path, kind: str) -> list[TestView]:
     names = sorted(path.name.removesuffix("_render.png") for path in folder.glob("*_render.png"))
-    views = [TestView(name, *(folder / f"{name}_{kind}.png" for kind in ("truth", "render", "mesh"))) for name in names]
-    return [view for view in views if view.truth.is_file() and view.mesh.is_file()]
+    views = [TestView(name, *(folder / f"{name}_{k}.png" for k in ("truth", "render", kind))) for name in names]
+    return [view for view in views if view.truth.is_file() and view.opaque.is_file()]
 
 
 def _is_finite(value: object) -> bool:

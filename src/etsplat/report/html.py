@@ -16,10 +16,11 @@ from PIL import Image
 
 from etsplat.io.atomic import atomic_write
 from etsplat.io.mesh_files import load_mesh
+from etsplat.report.cards import cards_of
 from etsplat.report.command import reproduce_command
 from etsplat.report.curves import curves_of, draw_svg, short_number
 from etsplat.report.data import Run, TestView, read_run
-from etsplat.report.metrics import Metric, describe
+from etsplat.report.metrics import Metric
 from etsplat.report.plots import draw_overview, plot_convergence, spread
 
 MAX_VIEWS = 12
@@ -57,8 +58,8 @@ def render_page(run: Run) -> str:
         style=_asset("page.css"),
         viewer_script=_asset("viewer.js"),
         page_script=_asset("page.js"),
-        metrics=_metrics_section(describe(run.metrics)),
-        mesh=_mesh_section(run),
+        metrics=_metrics_section(cards_of(run)),
+        mesh="" if run.mesh is None else _mesh_section(run.mesh),
         views=_views_section(run),
         curves=_curves_section(run),
         reproduce=_reproduce_section(run),
@@ -72,11 +73,17 @@ def _asset(name: str) -> str:
 
 def _title(run: Run) -> str:
     path = run.config["paths"]["source"]
-    return "A mesh given from Python" if path is None else Path(path.removeprefix("demo:")).stem
+    return "Given from Python" if path is None else Path(path.removeprefix("demo:")).stem
 
 
 def _subtitle(run: Run) -> str:
     m = run.metrics
+    if run.task == "train":
+        return (
+            "A triangle soup for novel-view synthesis, from photographs by differentiable triangle splatting: "
+            f"{m['method']} kernel, preset {m['preset']}, {m['iterations']:,} iterations, "
+            f"{m['triangles']:,} triangles, seed {m['seed']}."
+        )
     return (
         "Reconstructed from pictures by differentiable triangle splatting: "
         f"{m['method']} kernel, preset {m['preset']}, {m['iterations']:,} iterations, {m['faces']:,} faces, "
@@ -96,8 +103,8 @@ def _card(metric: Metric) -> str:
     return f'<div class="card metric"><h3>{escape(metric.title)}</h3>{value}<p>{escape(metric.meaning)}</p></div>'
 
 
-def _mesh_section(run: Run) -> str:
-    mesh = load_mesh(run.mesh)
+def _mesh_section(path: Path) -> str:
+    mesh = load_mesh(path)
     colors = torch.full((len(mesh.faces), 3), 0.8) if mesh.face_colors is None else mesh.face_colors
     if mesh.vertex_colors is not None:
         colors = mesh.vertex_colors[mesh.faces].mean(dim=1)
@@ -127,6 +134,7 @@ def _views_section(run: Run) -> str:
     views = spread(run.views, MAX_VIEWS)
     if not views:
         return ""
+    opaque, label = ("opaque", "Opaque triangles") if run.mesh is None else ("mesh", "Exported mesh")
     shown = "" if len(views) == len(run.views) else f" {len(views)} of {len(run.views)} are shown."
     return f"""<section>
 <h2>Test views</h2>
@@ -137,18 +145,18 @@ originals are in <code>test/</code>.</p>
 type="button" value="side" aria-pressed="false">Side by side</button><button type="button" value="difference"
 aria-pressed="false">Difference × 4</button></div>
 <div class="group" id="compare-with"><button type="button" value="render" aria-pressed="true">Splatted
-render</button><button type="button" value="mesh" aria-pressed="false">Exported mesh</button></div>
+render</button><button type="button" value="{opaque}" aria-pressed="false">{label}</button></div>
 </div>
-<div id="views" data-mode="slide" data-shown="render">{"".join(_comparison(view) for view in views)}</div>
+<div id="views" data-mode="slide" data-shown="render">{"".join(_comparison(view, opaque) for view in views)}</div>
 </section>"""
 
 
-def _comparison(view: TestView) -> str:
+def _comparison(view: TestView, kind: str) -> str:
     name = escape(view.name)
-    truth, render, mesh = (_picture(path) for path in (view.truth, view.render, view.mesh))
+    truth, render, opaque = (_picture(path) for path in (view.truth, view.render, view.opaque))
     return f"""<figure class="card"><div class="compare">
 <img src="{truth}" alt="View {name}: photograph">
-<img class="shown" src="{render}" data-render="{render}" data-mesh="{mesh}" alt="View {name}: render">
+<img class="shown" src="{render}" data-render="{render}" data-{kind}="{opaque}" alt="View {name}: render">
 <input type="range" min="0" max="100" value="50" aria-label="Where the photograph ends and the render begins">
 <span class="edge"></span><span class="tag truth">photograph</span><span class="tag other"></span>
 </div><figcaption>View {name}</figcaption></figure>"""

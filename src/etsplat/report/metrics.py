@@ -19,15 +19,15 @@ def describe(metrics: dict[str, Any]) -> list[Metric]:
     """The cards for a metrics.json, most telling first."""
     no_mesh = "no ground-truth mesh to compare with"
     return [
-        _number(metrics, "psnr", "PSNR", "dB", _fixed(2), _PSNR, "no test views"),
-        _number(metrics, "chamfer", "Chamfer distance", "× 10⁻³", _thousandths, _chamfer_meaning(metrics), no_mesh),
-        _number(metrics, "psnr_mesh", "PSNR of the mesh", "dB", _fixed(2), _PSNR_MESH, "no test views"),
-        _number(metrics, "f_score", "F-score at 0.005", "%", _percent, _F_SCORE, no_mesh),
-        _number(metrics, "chamfer_exact", "Exact Chamfer", "× 10⁻³", _thousandths, _EXACT, no_mesh),
-        _number(metrics, "ssim", "SSIM", "", _fixed(4), _SSIM, "no test views"),
-        _number(metrics, "lpips", "LPIPS", "", _fixed(4), _LPIPS, metrics.get("lpips_reason") or "no weights"),
+        number_card(metrics, "psnr", "PSNR", "dB", fixed(2), _PSNR, "no test views"),
+        number_card(metrics, "chamfer", "Chamfer distance", "× 10⁻³", _thousandths, _chamfer_meaning(metrics), no_mesh),
+        number_card(metrics, "psnr_mesh", "PSNR of the mesh", "dB", fixed(2), _PSNR_MESH, "no test views"),
+        number_card(metrics, "f_score", "F-score at 0.005", "%", _percent, _F_SCORE, no_mesh),
+        number_card(metrics, "chamfer_exact", "Exact Chamfer", "× 10⁻³", _thousandths, _EXACT, no_mesh),
+        number_card(metrics, "ssim", "SSIM", "", fixed(4), _SSIM, "no test views"),
+        number_card(metrics, "lpips", "LPIPS", "", fixed(4), _LPIPS, metrics.get("lpips_reason") or "no weights"),
         Metric("Mesh", f"{metrics['faces']:,}", "faces", _mesh_meaning(metrics)),
-        Metric("Time", *_duration(metrics["seconds"]), _time_meaning(metrics)),
+        time_card(metrics),
     ]
 
 
@@ -71,6 +71,11 @@ def _mesh_meaning(metrics: dict[str, Any]) -> str:
     return f"{vertices}{degenerate}, {count('self_intersections', 'self-intersecting faces')}."
 
 
+def time_card(metrics: dict[str, Any]) -> Metric:
+    """How long the optimization took."""
+    return Metric("Time", *_duration(metrics["seconds"]), _time_meaning(metrics))
+
+
 def _time_meaning(metrics: dict[str, Any]) -> str:
     return (
         f"{metrics['iterations']:,} iterations at {1000 * metrics['seconds_per_iteration']:.1f} ms on the engine "
@@ -85,7 +90,7 @@ def _duration(seconds: float) -> tuple[str, str]:
     return (f"{minutes}", "min") if minutes < 120 else (f"{seconds / 3600:.1f}", "h")
 
 
-def _number(
+def number_card(
     metrics: dict[str, Any],
     key: str,
     title: str,
@@ -94,13 +99,15 @@ def _number(
     meaning: str,
     absent: str,
 ) -> Metric:
+    """The card of one number, or of its absence."""
     value = metrics.get(key)
     if value is None:
         return Metric(title, None, "", f"{meaning} Not measured: {absent}.")
     return Metric(title, show(value), unit, meaning)
 
 
-def _fixed(digits: int) -> Callable[[float], str]:
+def fixed(digits: int) -> Callable[[float], str]:
+    """A format with so many digits behind the point."""
     return lambda value: f"{value:.{digits}f}"
 
 

@@ -46,18 +46,18 @@ def plot_convergence(run: Run, path: Path) -> None:
 
 
 def draw_overview(run: Run, path: Path) -> None:
-    """Draw the contact sheet: a column for each of up to four test views; rows truth, render, mesh."""
+    """Draw the contact sheet: a column for each of up to four test views; rows truth, render, mesh or opaque."""
     views = spread(run.views, OVERVIEW_VIEWS)
     if not views:
         return
-    rows = ("truth", "render", "mesh")
+    rows = {"truth": "truth", "render": "render", "opaque": "opaque" if run.mesh is None else "mesh"}
     width = CAPTION + len(views) * (TILE + GAP)
     sheet = Image.new("RGB", (width, CAPTION // 3 + len(rows) * (TILE + GAP)), "#14171a")
     font = ImageFont.load_default(size=17)
-    for row, kind in enumerate(rows):
+    for row, (kind, title) in enumerate(rows.items()):
         top = CAPTION // 3 + row * (TILE + GAP)
         label = Image.new("RGB", (TILE, CAPTION), "#14171a")
-        ImageDraw.Draw(label).text((TILE / 2, CAPTION / 2), kind, fill="#c6ccd2", font=font, anchor="mm")
+        ImageDraw.Draw(label).text((TILE / 2, CAPTION / 2), title, fill="#c6ccd2", font=font, anchor="mm")
         sheet.paste(label.transpose(Image.Transpose.ROTATE_90), (0, top))
         for column, view in enumerate(views):
             tile = _tile(getattr(view, kind))
