@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from etsplat import Cutoffs, Rasterization, intrinsics, look_at, rasterize
+from etsplat.cuda.launch import device_type
 from etsplat.geometry.icosphere import icosphere
 
 NO_CUTOFFS = Cutoffs(alpha_min=0.0, alpha_max=1.0, x_max=float("inf"), transmittance_min=0.0)
@@ -92,21 +93,27 @@ def stacked(*scenes: Scene) -> Scene:
 
 
 def dtype_of(engine: str) -> torch.dtype:
-    return torch.float32 if engine == "cpu" else torch.float64
+    return torch.float64 if engine == "reference" else torch.float32
+
+
+def device_of(engine: str) -> str:
+    return device_type() if engine == "cuda" else "cpu"
 
 
 def accuracy(engine: str) -> float:
     """Relative error that a well-conditioned image may have."""
-    return 2e-5 if engine == "cpu" else 1e-11
+    return 1e-11 if engine == "reference" else 2e-5
 
 
 def prepare(scene: Scene, engine: str, dtype: torch.dtype | None = None, requires_grad: bool = False) -> Scene:
-    """The scene in the engine's precision; its floating-point tensors are fresh leaves."""
+    """The scene in the engine's precision, on its device; its floating-point tensors are fresh leaves."""
     prepared = dict(scene)
     for name, value in scene.items():
         if isinstance(value, Tensor) and value.is_floating_point():
-            value = value.detach().clone().to(dtype or dtype_of(engine))
+            value = value.detach().clone().to(device_of(engine), dtype or dtype_of(engine))
             prepared[name] = value.requires_grad_(requires_grad and name in DIFFERENTIABLE)
+        elif isinstance(value, Tensor):
+            prepared[name] = value.to(device_of(engine))
     return prepared
 
 
@@ -122,7 +129,7 @@ def gradients(
     prepared = prepare(scene, engine, dtype, requires_grad=True)
     out = rasterize(**{"colors": None, **prepared, **options}, engine=engine)
     loss = sum(
-        (getattr(out, name) * cotangent.to(prepared["vertices"].dtype)).sum() for name, cotangent in cotangents.items()
+        (getattr(out, name) * cotangent.to(prepared["vertices"])).sum() for name, cotangent in cotangents.items()
     )
     assert isinstance(loss, Tensor)
     loss.backward()

@@ -16,7 +16,7 @@ def error_to_scale(actual: Tensor, expected: Tensor, scale: float | None = None)
     """|actual - expected| over ``scale``, by default the largest |expected|; infinite where actual is not finite."""
     assert actual.shape == expected.shape, f"shape {tuple(actual.shape)} is not {tuple(expected.shape)}"
     assert expected.isfinite().all(), "the expected tensor itself is not finite"
-    actual, expected = actual.detach().double(), expected.detach().double()
+    actual, expected = actual.detach().double().cpu(), expected.detach().double()
     if expected.numel() == 0:
         return expected
     unit = expected.abs().max() if scale is None else expected.new_tensor(scale)

@@ -57,6 +57,18 @@ def simt() -> Iterator[Simt]:
         yield backend
 
 
+@pytest.fixture(params=["simt", pytest.param("device", marks=pytest.mark.cuda)])
+def cuda_engine(request: pytest.FixtureRequest) -> Iterator[str]:
+    """The engine "cuda", by the shim and, where there is one, on a GPU."""
+    if request.param == "device":
+        if not torch.cuda.is_available():
+            pytest.skip("no GPU")
+        yield "cuda"
+    else:
+        with use_backend(Simt()):
+            yield "cuda"
+
+
 @pytest.fixture
 def rng() -> torch.Generator:
     """A generator that starts alike in every test."""

@@ -11,11 +11,30 @@ from etsplat.cuda.compile import cache_folder, compile_program, compile_without_
 from etsplat.cuda.program import Program, source_root
 
 ARCHITECTURES = ("sm_75", "sm_80", "sm_86", "sm_89", "sm_90", "sm_100", "sm_120")
+
+
+def tile_loops(kernel: str, *values: int) -> tuple[tuple[str, int | str], ...]:
+    names = ("FLAT", "CORNER", "DISTORTION", "MEDIAN", "WEIGHTS")
+    return (("KERNEL", kernel), *zip(names, values, strict=True))
+
+
 PROGRAMS = [
+    Program("raster_project.cu"),
+    Program("radix_sort.cu"),
+    Program("raster_forward.cu", tile_loops("Elastic", 3, 0, 0, 0, 0)),
+    Program("raster_backward.cu", tile_loops("Elastic", 3, 0, 0, 0, 0)),
+    Program("raster_reduce.cu", tile_loops("Elastic", 3, 0, 0, 0, 0)[1:]),
     Program("fill.cu"),
     *(Program(file, contract=False) for file in ("adam.cu", "mesh_energies.cu", "photometric.cu")),
     *(Program(file, contract=False) for file in ("rasterize_hard.cu", "ssim.cu")),
     Program("spherical_harmonics.cu"),
+]
+# Other definitions of what is compiled above, for the oldest architecture and a recent one.
+VARIANTS = [
+    Program("raster_forward.cu", tile_loops("SingleSided", 6, 1, 1, 1, 1)),
+    Program("raster_backward.cu", tile_loops("Bilateral", 16, 0, 2, 0, 0)),
+    Program("raster_backward.cu", tile_loops("Hard", 0, 16, 1, 0, 0)),
+    Program("raster_reduce.cu", tile_loops("Elastic", 6, 1, 1, 0, 0)[1:]),
 ]
 ELF = b"\x7fELF"
 
@@ -25,6 +44,12 @@ def test_compiles_for_every_architecture(program):
     with ThreadPoolExecutor(2) as pool:
         for cubin in pool.map(lambda architecture: compile_without_cache(program, architecture), ARCHITECTURES):
             assert cubin.startswith(ELF)
+
+
+@pytest.mark.parametrize("program", VARIANTS, ids=str)
+@pytest.mark.parametrize("architecture", ["sm_75", "sm_90"])
+def test_variants_compile(program, architecture):
+    assert compile_without_cache(program, architecture).startswith(ELF)
 
 
 def test_every_file_is_checked():

@@ -46,7 +46,7 @@ def compare(scene, engine, rng, images=IMAGES, looseness=1.0, **options):
             grads[name], expected, **gradient_tolerance(name, expected, looseness), name=f"gradient of {name}"
         )
     if options.get("statistics"):
-        assert (out.statistics.visible != oracle.statistics.visible).sum() <= 1
+        assert (out.statistics.visible.cpu() != oracle.statistics.visible).sum() <= 1
         for name in ("max_weight", "screen_size", "inradius"):
             actual, expected = getattr(out.statistics, name), getattr(oracle.statistics, name)
             assert_close_to_scale(actual, expected, 1e-4, outliers=0.01, outlier_tolerance=0.1, name=name)

@@ -7,7 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from _scenes import EVERYTHING, IMAGES, NO_CUTOFFS, facing, gradients
+from _scenes import EVERYTHING, IMAGES, NO_CUTOFFS, dtype_of, facing, gradients
 from etsplat import Cutoffs, rasterize
 from etsplat.core.kernels import DISTANCES, KERNELS
 
@@ -65,7 +65,7 @@ def test_any_triangles(engine, vertices, opacity, sigma, color, options):
     """Images and all gradients stay finite: what is not finite is invisible, and invisible things have gradient 0."""
     scene = with_good(vertices, opacity, sigma, color)
     cotangents = cotangents_for(options)
-    for dtype in {torch.float32, torch.float32 if engine == "cpu" else torch.float64}:
+    for dtype in {torch.float32, dtype_of(engine)}:
         out, grads = gradients(scene, engine, cotangents, dtype, validate=False, statistics=True, **options)
         for name in cotangents:
             assert getattr(out, name).isfinite().all(), name

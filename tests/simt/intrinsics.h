@@ -73,6 +73,16 @@ inline unsigned __ballot_sync(unsigned mask, int predicate) {
         if (mask >> i & 1) ballot |= static_cast<unsigned>(values[i]) << i;
     return ballot;
 }
+template <class T>
+unsigned __match_any_sync(unsigned mask, T value) {
+    uint64_t bits = 0;
+    memcpy(&bits, &value, sizeof value);
+    const uint64_t* values = simt::exchange(mask, bits, "__match_any_sync");
+    unsigned equal = 0;
+    for (int i = 0; i < 32; ++i)
+        if (mask >> i & 1) equal |= (values[i] == bits ? 1u : 0u) << i;
+    return equal;
+}
 inline int __any_sync(unsigned mask, int predicate) { return __ballot_sync(mask, predicate) != 0; }
 inline int __all_sync(unsigned mask, int predicate) { return __ballot_sync(mask, predicate) == mask; }
 

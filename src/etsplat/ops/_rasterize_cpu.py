@@ -1,8 +1,4 @@
-"""The native engine's side of ``rasterize``: one autograd function around csrc/cpu/raster.cpp.
-
-The native code composites channels of two kinds: flat ones, constant over a triangle, and corner ones, interpolated
-over it. Depth and normals are channels as well, so their gradients need no code of their own.
-"""
+"""The native engine's side of ``rasterize``: one autograd function around csrc/cpu/raster.cpp."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -20,7 +16,7 @@ from etsplat.core.rasterization import (
     RasterizeSettings,
     TriangleStatistics,
 )
-from etsplat.ops._rasterize_reference import barycentrics, perspective_weights, to_screen, unit_normals
+from etsplat.ops._rasterize_channels import Channels, finite_corners, median_depth
 from etsplat.ops.pool import empty_image, zeros_like
 
 
@@ -38,13 +34,10 @@ def rasterize_cpu(
 ) -> Rasterization:
     """Render with the native engine; arguments as ``etsplat.rasterize`` has checked them."""
     mesh = _Mesh(vertices, faces)
-    channels = _Channels(colors, _per_corner(corner_colors, faces))
+    channels = Channels(colors, corner_colors, faces)
     if settings.depth != "none" or settings.normals:
-        channels.add_geometry(mesh, viewmats, settings)
-    if backgrounds is not None and channels.count > channels.colors:
-        first = channels.first_color
-        backgrounds = torch.nn.functional.pad(backgrounds, (first, channels.count - channels.colors - first))
-
+        channels.add_geometry(finite_corners(vertices, faces), viewmats, settings)
+    backgrounds = channels.pad_backgrounds(backgrounds)
     plan = _Plan(settings, mesh, channels.flat_per_view)
     color, alpha, distortion, median_triangle = _Rasterize.apply(
         vertices, channels.flat, channels.corner, opacities, sigma, viewmats, Ks, backgrounds, plan
@@ -53,31 +46,17 @@ def rasterize_cpu(
     if settings.distortion:
         result.distortion = distortion
     if settings.median_depth:
-        result.median_depth = _median_depth(median_triangle, mesh, viewmats, Ks, settings)
+        result.median_depth = median_depth(median_triangle, finite_corners(vertices, faces), viewmats, Ks, settings)
     channels.split(result)
     return result
-
-
-def _per_corner(corner_colors: Tensor | None, faces: Tensor | None) -> Tensor | None:
-    if corner_colors is None or corner_colors.dim() == 3:
-        return corner_colors
-    assert faces is not None
-    return corner_colors[faces.long()]
 
 
 class _Mesh:
     """Triangles with the index arrays that the native code wants: int32 faces and the corners at each vertex."""
 
     def __init__(self, vertices: Tensor, faces: Tensor | None) -> None:
-        self.vertices = vertices
-        self.faces = faces
         self.count = vertices.shape[0] if faces is None else faces.shape[0]
         self.faces32, self.corner_offsets, self.corner_indices = _face_arrays(faces, vertices.shape[0])
-
-    def corners(self) -> Tensor:
-        """Corner positions (N, 3, 3), differentiable; 0 for triangles that are not finite, which are never drawn."""
-        corners = self.vertices if self.faces is None else self.vertices[self.faces.long()]
-        return torch.where(corners.isfinite().all(dim=2).all(dim=1)[:, None, None], corners, 0.0)
 
 
 def _face_arrays(faces: Tensor | None, num_vertices: int) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
@@ -95,91 +74,6 @@ def _face_arrays(faces: Tensor | None, num_vertices: int) -> tuple[Tensor | None
         cached = (key, faces32, offsets, indices)
         setattr(faces, "_etsplat_face_arrays", cached)  # noqa: B010
     return cached[1], cached[2], cached[3]
-
-
-class _Channels:
-    """Flat (N, F) or (B, N, F) and corner (N, 3, K) or (B, N, 3, K) channels; in each, colours come first."""
-
-    def __init__(self, colors: Tensor | None, corner_colors: Tensor | None) -> None:
-        self.flat = colors
-        self.corner = corner_colors
-        self.flat_is_color = colors is not None
-        self.colors = colors.shape[-1] if colors is not None else corner_colors.shape[-1]  # type: ignore[union-attr]
-        self.flat_names: list[str] = []
-        self.corner_names: list[str] = []
-
-    @property
-    def flat_per_view(self) -> bool:
-        return self.flat is not None and self.flat.dim() == 3
-
-    @property
-    def count(self) -> int:
-        return sum(t.shape[-1] for t in (self.flat, self.corner) if t is not None)
-
-    @property
-    def first_color(self) -> int:
-        """Flat channels come first in an image, so a normal or a depth may precede interpolated colours."""
-        return 0 if self.flat_is_color or self.flat is None else self.flat.shape[-1]
-
-    def add_geometry(self, mesh: _Mesh, viewmats: Tensor, settings: RasterizeSettings) -> None:
-        corners = mesh.corners()
-        batch = viewmats.shape[0]
-        # A camera that is not finite sees nothing, and must not spoil the gradients of the others.
-        viewmats = torch.where(viewmats.isfinite().all(dim=2).all(dim=1)[:, None, None], viewmats, 0.0)
-        z = torch.einsum("bi,nki->bnk", viewmats[:, 2, :3], corners) + viewmats[:, 2, 3, None, None]
-        flat: list[Tensor] = []
-        if settings.depth == "centroid":
-            flat.append(z.mean(-1, keepdim=True))
-            self.flat_names.append("depth")
-        if settings.normals:
-            flat.append(_facing_normals(corners, viewmats))
-            self.flat_names.append("normal")
-        if flat:
-            own = [] if self.flat is None else [self.flat if self.flat.dim() == 3 else self.flat.expand(batch, -1, -1)]
-            self.flat = torch.cat(own + flat, dim=-1)
-        if settings.depth == "plane":
-            own = [] if self.corner is None else [self.corner.expand(batch, -1, -1, -1)]
-            self.corner = torch.cat([*own, z[..., None]], dim=-1)
-            self.corner_names.append("depth")
-
-    def split(self, result: Rasterization) -> None:
-        """Hand the channels of ``result.color`` to the fields they belong to."""
-        image = result.color
-        if image.shape[-1] == self.colors:
-            return
-        names = [*(["color"] if self.flat_is_color else []), *self.flat_names]
-        names += [*([] if self.flat_is_color else ["color"]), *self.corner_names]
-        sizes = [{"color": self.colors, "depth": 1, "normal": 3}[name] for name in names]
-        parts = dict(zip(names, torch.split(image, sizes, dim=-1), strict=True))
-        result.color = parts["color"]
-        result.normal = parts.get("normal")
-        if "depth" in parts:
-            result.depth = parts["depth"] / result.alpha.clamp_min(1e-8)
-
-
-def _facing_normals(corners: Tensor, viewmats: Tensor) -> Tensor:
-    """Unit normals (B, N, 3) in world space, turned towards each camera; 0 for a triangle without area."""
-    normal = unit_normals(corners)
-    centers = -torch.einsum("bij,bi->bj", viewmats[:, :3, :3], viewmats[:, :3, 3])
-    towards = corners.mean(1)[None] - centers[:, None]
-    away = (towards * normal).sum(-1, keepdim=True) > 0
-    return torch.where(away, -normal[None], normal[None])
-
-
-def _median_depth(triangle: Tensor, mesh: _Mesh, viewmats: Tensor, Ks: Tensor, settings: RasterizeSettings) -> Tensor:
-    """Depth (B, H, W, 1) at each pixel of the triangle whose index + 1 is given, 0 where that is 0; differentiable."""
-    corners = mesh.corners()
-    images = []
-    for view, chosen in enumerate(triangle):
-        row, column = chosen.nonzero(as_tuple=True)
-        screen, z = to_screen(corners[chosen[row, column].long() - 1], viewmats[view], Ks[view])
-        if settings.depth == "centroid":
-            depth = z.mean(dim=-1)
-        else:
-            pixels = torch.stack([column, row], dim=-1) + 0.5
-            depth = (perspective_weights(barycentrics(pixels, screen), z) * z).sum(dim=-1)
-        images.append(torch.zeros(chosen.shape).index_put((row, column), depth))
-    return torch.stack(images)[..., None]
 
 
 @dataclass

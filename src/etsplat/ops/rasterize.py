@@ -124,6 +124,8 @@ def rasterize(
         _check_values(given)
     if chosen == "cpu":
         from etsplat.ops._rasterize_cpu import rasterize_cpu as run
+    elif chosen == "cuda":
+        from etsplat.ops._rasterize_cuda import rasterize_cuda as run
     else:
         from etsplat.ops._rasterize_reference import rasterize_reference as run
     return run(vertices, faces, colors, corner_colors, opacities, sigma, viewmats, Ks, backgrounds, settings)

@@ -1,0 +1,95 @@
+// What the rasterizer's kernels read and write. The host fills it from the declarations below (etsplat/cuda/structs.py), so
+// each member is a pointer, int or float, on one line with others of its type. Null where an optional tensor is absent.
+//
+// Views are rendered together. "Projected triangle" m = view * triangles + triangle; "tile" counts through all views.
+#pragma once
+
+#include "cuda/common.h"
+#include "math/kernels.h"
+#include "math/raster_records.h"
+#include "math/tiles.h"
+
+namespace etsplat {
+
+struct RasterPass {
+    const float *vertices, *flat_colors, *corner_colors, *opacities, *sigmas, *viewmats, *Ks, *backgrounds;
+    const int* faces;
+    int triangles, vertex_count, views, width, height, tiles_x, tiles_y, kernel, distance, freeze_incentre;
+    int shared_sigma, flat_per_view, corner_per_view, flat_channels, corner_channels, capacity;
+    float near_plane, support_alpha, alpha_min, alpha_max, x_max, transmittance_min, distortion_near, distortion_far;
+
+    // Per projected triangle: the records, the tiles it touches, its first slot.
+    float *records, *attributes;
+    unsigned *depth_keys, *spans, *slot_begin;
+    const unsigned* order;
+    // Per slot, that is (projected triangle, tile) pair, numbered in drawing order of the triangles.
+    unsigned *slot_tile, *slot_triangle;
+    unsigned char* hits;
+    // Slots by tile, front to back, with the range of each tile and the end of what its pixels looked at.
+    const unsigned *sorted_tiles, *sorted_slots;
+    int *tile_ranges, *tile_done;
+    // Device-side numbers: slots wanted, slots there are; look-back words and ticket of the scan. `overflow` outlives a call.
+    long long *wanted, *overflow;
+    unsigned *slots, *scan_ticket;
+    unsigned long long* scan_state;
+
+    float *color, *alpha, *distortion, *distortion_totals, *max_weight, *screen_size, *inradius;
+    int* median_triangle;
+    unsigned char* visible;
+
+    // Backward.
+    const float *grad_color, *grad_alpha, *grad_distortion;
+    float *slot_sums, *tile_background, *grad_corners, *grad_flat, *grad_corner_colors, *grad_opacities, *grad_sigmas;
+    double *sigma_sums, *camera_sums;
+};
+
+// A triangle's tiles as a word: up to kPatternSide rows and columns as a bit pattern (row-major, from tile `first`), or
+// their number with kMany set, where the box is larger and has to be searched.
+constexpr int kPatternSide = 4;
+constexpr unsigned kMany = 0x80000000u;
+__device__ __forceinline__ unsigned span_count(unsigned word) { return word & kMany ? word & ~kMany : __popc(word); }
+
+__device__ __forceinline__ TriangleRecord load_record(const RasterPass& pass, int m) {
+    return reinterpret_cast<const TriangleRecord*>(pass.records)[m];
+}
+
+__device__ __forceinline__ PinholeCamera load_camera(const RasterPass& pass, int view) {
+    const float* v = pass.viewmats + 16 * view;
+    const float* k = pass.Ks + 9 * view;
+    PinholeCamera camera;
+    for (int i = 0; i < 3; ++i) {
+        for (int j = 0; j < 3; ++j) camera.rotation[3 * i + j] = v[4 * i + j];
+        camera.translation[i] = v[4 * i + 3];
+    }
+    camera.fx = k[0];
+    camera.skew = k[1];
+    camera.cx = k[2];
+    camera.fy = k[4];
+    camera.cy = k[5];
+    return camera;
+}
+
+// World positions of the corners; false if an index is out of range.
+__device__ __forceinline__ bool load_corners(const RasterPass& pass, int triangle, float* world) {
+    bool valid = true;
+    for (int k = 0; k < 3; ++k) {
+        long long corner = 3ll * triangle + k;
+        if (pass.faces) {
+            const int index = pass.faces[corner];
+            valid = valid && index >= 0 && index < pass.vertex_count;
+            corner = valid ? index : 0;
+        }
+        for (int c = 0; c < 3; ++c) world[3 * k + c] = pass.vertices[3 * corner + c];
+    }
+    return valid;
+}
+
+__device__ __forceinline__ const float* flat_colors_of(const RasterPass& pass, int m) {
+    return pass.flat_colors + static_cast<long long>(pass.flat_per_view ? m : m % pass.triangles) * pass.flat_channels;
+}
+__device__ __forceinline__ const float* corner_colors_of(const RasterPass& pass, int m) {
+    const int row = pass.corner_per_view ? m : m % pass.triangles;
+    return pass.corner_colors + static_cast<long long>(row) * 3 * pass.corner_channels;
+}
+
+}  // namespace etsplat

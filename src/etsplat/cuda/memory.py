@@ -1,0 +1,53 @@
+"""Device memory for kernels: many arrays in one allocation, and numbers that come back without stopping the device."""
+
+import ctypes
+
+import torch
+from torch import Tensor
+
+_ALIGNMENT = 256
+
+
+class Arena:
+    """Uninitialised arrays in one tensor: ask for all of them, then ``allocate``.
+
+    The tensor comes from torch's allocator, which recycles it in the order of the stream and keeps it apart within a
+    captured graph.
+    """
+
+    def __init__(self) -> None:
+        self._offsets: dict[str, int] = {}
+        self._size = 0
+        self._memory = torch.empty(0)
+
+    def add(self, name: str, count: int, size: int = 4) -> None:
+        """Ask for ``count`` items of ``size`` bytes."""
+        self._offsets[name] = self._size
+        self._size += -(-count * size // _ALIGNMENT) * _ALIGNMENT
+
+    def allocate(self, device: torch.device) -> None:
+        """Make room for everything asked for."""
+        self._memory = torch.empty(self._size, dtype=torch.uint8, device=device)
+
+    def __getitem__(self, name: str) -> ctypes.c_void_p:
+        """Address of an array, as an argument of kernels."""
+        return ctypes.c_void_p(self._memory.data_ptr() + self._offsets[name])
+
+
+class PendingNumber:
+    """An int64 on its way from the device; work queued after this does not hold it up."""
+
+    def __init__(self, source: Tensor) -> None:
+        self._host = source
+        self._arrived = None
+        if source.is_cuda:
+            self._host = torch.empty(1, dtype=torch.int64, pin_memory=True)
+            self._host.copy_(source, non_blocking=True)
+            self._arrived = torch.cuda.Event()
+            self._arrived.record()
+
+    def wait(self) -> int:
+        """The number, when the device has got as far as where it was asked for."""
+        if self._arrived is not None:
+            self._arrived.synchronize()
+        return int(self._host.item())

@@ -1,0 +1,342 @@
+"""The rasterizer's launches on a GPU, and the memory that they share.
+
+A forward is a sequence of launches that nothing waits for: project, sort by depth, list (triangle, tile) pairs, sort by
+tile, composite. All views go through together. Sums over pixels are kept per pair and added in a fixed order, so
+results are the same bits every time.
+"""
+
+import ctypes
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from etsplat.core.kernels import DISTANCES, KERNELS
+from etsplat.core.rasterization import DISTORTION_FAR, DISTORTION_NEAR, RasterizeSettings, TriangleStatistics
+from etsplat.cuda.launch import blocks, launch
+from etsplat.cuda.memory import Arena, PendingNumber
+from etsplat.cuda.program import Program
+from etsplat.cuda.sort import RadixSort
+from etsplat.cuda.structs import struct_class
+from etsplat.ops._raster_capacity import capacity_for, note_capture, overflow_flag, record_need
+
+TILE = 16
+_TINY = 1.17549435e-38
+_PROJECT = Program("raster_project.cu")
+
+
+class Geometry:
+    """Triangles with the index arrays that the kernels want: int32 faces and the corners at each vertex."""
+
+    def __init__(self, vertices: Tensor, faces: Tensor | None) -> None:
+        self.vertex_count = vertices.shape[0]
+        self.count = vertices.shape[0] if faces is None else faces.shape[0]
+        self.faces, self.corner_offsets, self.corner_indices = _face_arrays(faces, vertices.shape[0])
+
+
+def _face_arrays(faces: Tensor | None, vertices: int) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
+    """int32 faces, and for each vertex the places 3 face + corner that use it (CSR); kept on the tensor."""
+    if faces is None:
+        return None, None, None
+    key = (faces._version, vertices)
+    cached = getattr(faces, "_etsplat_cuda_arrays", None)
+    if cached is None or cached[0] != key:
+        faces32 = faces.to(torch.int32).contiguous()
+        ordered, indices = torch.sort(faces32.reshape(-1), stable=True)
+        ends = torch.arange(vertices + 1, dtype=torch.int32, device=faces.device)
+        offsets = torch.searchsorted(ordered, ends, out_int32=True)
+        cached = (key, faces32, offsets, indices.to(torch.int32))
+        setattr(faces, "_etsplat_cuda_arrays", cached)  # noqa: B010
+    return cached[1], cached[2], cached[3]
+
+
+@dataclass
+class Plan:
+    """What the autograd function needs besides tensors; it leaves the statistics here."""
+
+    settings: RasterizeSettings
+    geometry: Geometry
+    views: int
+    statistics: TriangleStatistics | None = None
+
+    @property
+    def tiles(self) -> tuple[int, int]:
+        return blocks(self.settings.width, TILE), blocks(self.settings.height, TILE)
+
+    @property
+    def tile_count(self) -> int:
+        return self.views * self.tiles[0] * self.tiles[1]
+
+    @property
+    def projected(self) -> int:
+        return self.views * self.geometry.count
+
+    def distortion_kind(self, wanted: bool) -> int:
+        """0 none, 1 with the plane's depth, 2 with the centroid's."""
+        return 0 if not wanted else 2 if self.settings.depth == "centroid" else 1
+
+    def defines(self, flat: int, corner: int, distortion: int, forward: bool) -> tuple[tuple[str, int | str], ...]:
+        """Definitions that specialise the tile loops."""
+        kernel = "".join(word.capitalize() for word in self.settings.kernel.split("_"))
+        median, weights = (self.settings.median_depth, self.settings.statistics) if forward else (False, False)
+        return (
+            ("KERNEL", kernel),
+            ("FLAT", flat),
+            ("CORNER", corner),
+            ("DISTORTION", distortion),
+            ("MEDIAN", int(median)),
+            ("WEIGHTS", int(weights)),
+        )
+
+
+class Outputs:
+    """Uninitialised output images of a batch; the kernels write every element."""
+
+    def __init__(self, plan: Plan, inputs: list[Tensor | None]) -> None:
+        settings, device = plan.settings, _device(inputs)
+        image = (plan.views, settings.height, settings.width)
+        self.color = torch.empty(*image, channel_count(inputs[1]) + channel_count(inputs[2]), device=device)
+        self.alpha = torch.empty(*image, 1, device=device)
+        self.distortion = (
+            torch.empty(*image, 1, device=device) if settings.distortion else torch.empty(0, device=device)
+        )
+        self.distortion_totals = torch.empty(*image, 2, device=device) if settings.distortion else None
+        median_shape = image if settings.median_depth else (0,)
+        self.median_triangle = torch.empty(median_shape, dtype=torch.int32, device=device)
+        self.statistics = None
+        if settings.statistics:
+            values = torch.empty(3, plan.views, plan.geometry.count, device=device)
+            visible = torch.empty(values.shape[1:], dtype=torch.bool, device=device)
+            self.statistics = TriangleStatistics(values[0], values[1], values[2], visible)
+
+
+class Render:
+    """One forward pass and what its backward pass needs of it."""
+
+    def __init__(self, plan: Plan, inputs: list[Tensor | None], outputs: Outputs, keep: bool) -> None:
+        self.plan = plan
+        self.keep = keep
+        self.device = _device(inputs)
+        self.flat, self.corner = channel_count(inputs[1]), channel_count(inputs[2])
+        self.shape = (plan.views, plan.settings.width, plan.settings.height)
+        self.distortion = plan.distortion_kind(plan.settings.distortion)
+        self.arguments = struct_class("cuda/raster_pass.h", "RasterPass")()
+        self.totals = outputs.distortion_totals
+        self._fill_inputs(inputs)
+        self._fill_outputs(outputs)
+
+    def forward(self) -> None:
+        """Render; again with more room if the pairs did not fit."""
+        count, capturing = self.plan.geometry.count, _capturing(self.device)
+        if capturing:
+            note_capture(self.device, self.shape, count)
+        while True:
+            capacity = capacity_for(self.device, self.shape, count)
+            wanted = self._list_pairs(capacity)
+            pending = None if capturing else PendingNumber(wanted)
+            self._composite(capacity)
+            if pending is None:
+                return
+            pairs = pending.wait()
+            record_need(self.device, self.shape, count, pairs)
+            if pairs <= capacity:
+                return
+            overflow_flag(self.device).zero_()
+
+    def _list_pairs(self, capacity: int) -> Tensor:
+        """Project, sort by depth, list the pairs; returns the number of pairs wanted, on the device."""
+        plan, a = self.plan, self.arguments
+        m, tiles = plan.projected, plan.tile_count
+        by_depth = RadixSort(max(m, 1), 31)
+        self.by_tile = RadixSort(capacity, max(tiles - 1, 1).bit_length())
+        emit_grid = blocks(m, 1024)
+        # What has to be zero at first, in one piece; the 64-bit words first.
+        sizes = [2, 2 * emit_grid, 2, 2 * tiles, by_depth.zeros, self.by_tile.zeros]
+        self.zeros = torch.zeros(sum(sizes), dtype=torch.int32, device=self.device)
+        wanted, scan_state, counters, ranges, depth_zeros, self.tile_zeros = self.zeros.split(sizes)
+        self.state, self.temporary = _allocate(plan, capacity, self._attributes, self.keep, self.device)
+        state, temporary = self.state, self.temporary
+        a.capacity = capacity
+        a.records, a.spans, a.slot_begin = state["records"], state["spans"], state["slot_begin"]
+        a.attributes = state["attributes"] if self._attributes else 0
+        a.slot_triangle, a.hits = state["slot_triangle"], state["hits"] if self.keep else 0
+        a.tile_done, a.tile_ranges = state["tile_done"], ranges.data_ptr()
+        a.depth_keys, a.slot_tile = temporary["depth_keys"], temporary["tile_keys"]
+        a.wanted, a.slots, a.scan_ticket = wanted.data_ptr(), counters.data_ptr(), counters[1:].data_ptr()
+        a.scan_state, a.overflow = scan_state.data_ptr(), overflow_flag(self.device).data_ptr()
+        launch(_PROJECT, "raster_project", blocks(m, 128), 128, [a])
+        keys = (temporary["depth_keys"], temporary["depth_keys_2"])
+        _, order = by_depth.run(keys, (temporary["order"], temporary["order_2"]), m, depth_zeros)
+        a.order = order
+        launch(_PROJECT, "raster_emit", emit_grid, 256, [a])
+        return wanted.view(torch.int64)
+
+    def _composite(self, capacity: int) -> None:
+        """Sort the pairs by tile and go through the tiles."""
+        plan, a, temporary = self.plan, self.arguments, self.temporary
+        slots = (self.state["sorted_slots"], temporary["sorted_slots_2"])
+        if self.by_tile.passes % 2 == 1:  # the result ends up in what is kept
+            slots = (slots[1], slots[0])
+        keys = (temporary["tile_keys"], temporary["tile_keys_2"])
+        a.sorted_tiles, a.sorted_slots = self.by_tile.run(keys, slots, ctypes.c_void_p(a.slots), self.tile_zeros)
+        launch(_PROJECT, "raster_ranges", blocks(capacity, 256), 256, [a])
+        program = Program("raster_forward.cu", plan.defines(self.flat, self.corner, self.distortion, forward=True))
+        launch(program, "raster_forward", plan.tile_count, 256, [a])
+        del self.temporary, self.tile_zeros
+
+    def backward(
+        self, inputs: list[Tensor | None], cotangents: list[Tensor | None], needed: tuple[bool, ...]
+    ) -> list[Tensor | None]:
+        """Gradients of the inputs that need one, else None."""
+        plan, a = self.plan, self.arguments
+        grad_color, grad_alpha, grad_distortion = cotangents
+        distortion = self.distortion if grad_distortion is not None else 0
+        defines = plan.defines(self.flat, self.corner, distortion, forward=False)
+        stride = _stride(self.flat, self.corner, distortion)
+        reduce_grid = blocks(plan.geometry.count, 128)
+        grads = _Gradients(plan, inputs, needed, reduce_grid)
+        sums = torch.empty(a.capacity * stride, device=self.device)
+        a.grad_color, a.grad_alpha = _pointer(grad_color), _pointer(grad_alpha)
+        a.grad_distortion, a.slot_sums = _pointer(grad_distortion), sums.data_ptr()
+        grads.fill(a)
+        launch(Program("raster_backward.cu", defines), "raster_backward", plan.tile_count, 256, [a])
+        launch(Program("raster_reduce.cu", defines[1:]), "raster_reduce", reduce_grid, 128, [a])
+        return grads.finish(defines[1:])
+
+    @property
+    def _attributes(self) -> bool:
+        return self.corner > 0 or self.distortion > 0
+
+    def _fill_inputs(self, inputs: list[Tensor | None]) -> None:
+        vertices, flat, corner, opacities, sigma, viewmats, Ks, backgrounds = inputs
+        a, plan, settings = self.arguments, self.plan, self.plan.settings
+        assert sigma is not None
+        a.vertices, a.faces = _pointer(vertices), _pointer(plan.geometry.faces)
+        a.flat_colors, a.corner_colors = _pointer(flat), _pointer(corner)
+        a.opacities, a.sigmas = _pointer(opacities), _pointer(sigma)
+        a.viewmats, a.Ks, a.backgrounds = _pointer(viewmats), _pointer(Ks), _pointer(backgrounds)
+        a.triangles, a.vertex_count, a.views = plan.geometry.count, plan.geometry.vertex_count, plan.views
+        a.width, a.height = settings.width, settings.height
+        a.tiles_x, a.tiles_y = plan.tiles
+        a.kernel, a.distance = list(KERNELS).index(settings.kernel), DISTANCES.index(settings.distance)
+        a.freeze_incentre = settings.freeze_incentre
+        a.shared_sigma = sigma.dim() == 0
+        a.flat_per_view = flat is not None and flat.dim() == 3
+        a.corner_per_view = corner is not None and corner.dim() == 4
+        a.flat_channels, a.corner_channels = self.flat, self.corner
+        alpha_min, alpha_max, x_max, a.transmittance_min = settings.cutoffs
+        # With the cut-offs off, too: where alpha is 0 x^(2/sigma) may have overflowed, and the backward divides by
+        # 1 - alpha.
+        a.near_plane, a.support_alpha, a.x_max = settings.near_plane, alpha_min, x_max
+        a.alpha_min, a.alpha_max = max(alpha_min, _TINY), min(alpha_max, 1.0 - 1e-6)
+        a.distortion_near, a.distortion_far = DISTORTION_NEAR, DISTORTION_FAR
+
+    def _fill_outputs(self, outputs: Outputs) -> None:
+        a, settings = self.arguments, self.plan.settings
+        a.color, a.alpha = outputs.color.data_ptr(), outputs.alpha.data_ptr()
+        if settings.distortion:
+            a.distortion, a.distortion_totals = outputs.distortion.data_ptr(), _pointer(outputs.distortion_totals)
+        if settings.median_depth:
+            a.median_triangle = outputs.median_triangle.data_ptr()
+        if outputs.statistics is not None:
+            statistics = outputs.statistics
+            a.max_weight, a.screen_size = statistics.max_weight.data_ptr(), statistics.screen_size.data_ptr()
+            a.inradius, a.visible = statistics.inradius.data_ptr(), statistics.visible.data_ptr()
+
+
+def _allocate(plan: Plan, capacity: int, attributes: bool, keep: bool, device: torch.device) -> tuple[Arena, Arena]:
+    """What the backward pass reads, and what only the forward pass needs."""
+    m, state, temporary = plan.projected, Arena(), Arena()
+    state.add("records", 16 * m)
+    state.add("attributes", 16 * m if attributes else 0)
+    state.add("spans", 2 * m)
+    state.add("slot_begin", m)
+    state.add("slot_triangle", capacity)
+    state.add("sorted_slots", capacity)
+    state.add("hits", capacity if keep else 0, size=1)
+    state.add("tile_done", plan.tile_count)
+    for name in ("depth_keys", "depth_keys_2", "order", "order_2"):
+        temporary.add(name, m)
+    for name in ("tile_keys", "tile_keys_2", "sorted_slots_2"):
+        temporary.add(name, capacity)
+    state.allocate(device)
+    temporary.allocate(device)
+    return state, temporary
+
+
+class _Gradients:
+    """Gradients of the inputs, as the kernels write them, and what is left to add up in torch."""
+
+    def __init__(self, plan: Plan, inputs: list[Tensor | None], needed: tuple[bool, ...], reduce_grid: int) -> None:
+        self.plan, self.inputs = plan, inputs
+        vertices, flat, corner, _, sigma, _, _, backgrounds = inputs
+        assert vertices is not None
+        assert sigma is not None
+        device, views, count = vertices.device, plan.views, plan.geometry.count
+        empty = torch.empty if count > 0 else torch.zeros
+        self.corners = empty(count, 3, 3, device=device) if needed[0] else None
+        self.flat = empty(flat.shape, device=device) if needed[1] and flat is not None else None
+        self.corner = empty(corner.shape, device=device) if needed[2] and corner is not None else None
+        self.opacities = empty(count, device=device) if needed[3] else None
+        own_sigma = needed[4] and sigma.dim() == 1
+        self.sigmas = empty(count, device=device) if own_sigma else None
+        sums = torch.float64
+        self.sigma_sums = torch.empty(reduce_grid, dtype=sums, device=device) if needed[4] and not own_sigma else None
+        camera_shape = (views, reduce_grid, 12)
+        self.camera_sums = torch.empty(camera_shape, dtype=sums, device=device) if needed[5] else None
+        self.background = None
+        if needed[7] and backgrounds is not None:
+            self.background = torch.empty(views, plan.tile_count // views, backgrounds.shape[1], device=device)
+
+    def fill(self, a: Any) -> None:
+        """Hand the addresses to the kernels."""
+        a.grad_corners, a.grad_flat, a.grad_corner_colors = map(_pointer, (self.corners, self.flat, self.corner))
+        a.grad_opacities, a.grad_sigmas = _pointer(self.opacities), _pointer(self.sigmas)
+        a.sigma_sums, a.camera_sums = _pointer(self.sigma_sums), _pointer(self.camera_sums)
+        a.tile_background = _pointer(self.background)
+
+    def finish(self, defines: tuple[tuple[str, int | str], ...]) -> list[Tensor | None]:
+        """The gradients in the order of the inputs."""
+        vertices, sigma = self.corners, self.sigmas
+        geometry = self.plan.geometry
+        if vertices is not None and geometry.faces is not None:
+            count = geometry.vertex_count
+            vertices = torch.empty(count, 3, device=vertices.device)
+            arguments = [self.corners, geometry.corner_offsets, geometry.corner_indices, count, vertices]
+            launch(Program("raster_reduce.cu", defines), "raster_gather", blocks(count, 256), 256, arguments)
+        if self.sigma_sums is not None:
+            sigma = self.sigma_sums.sum().float()
+        viewmats = None
+        if self.camera_sums is not None:
+            rows = self.camera_sums.sum(1).float().view(-1, 3, 4)
+            viewmats = torch.nn.functional.pad(rows, (0, 0, 0, 1))
+        background = None if self.background is None else self.background.sum(1)
+        return [vertices, self.flat, self.corner, self.opacities, sigma, viewmats, None, background]
+
+
+def _stride(flat: int, corner: int, distortion: int) -> int:
+    """Floats of a slot: ``SlotLayout`` of csrc/math/raster_records.h."""
+    size = 11 + flat + (12 + 3 * corner if corner > 0 or distortion == 1 else 0) + (distortion == 2)
+    return blocks(size, 16) * 16
+
+
+def _capturing(device: torch.device) -> bool:
+    return device.type == "cuda" and torch.cuda.is_current_stream_capturing()
+
+
+def _device(inputs: list[Tensor | None]) -> torch.device:
+    assert inputs[0] is not None
+    return inputs[0].device
+
+
+def contiguous(tensor: Tensor | None) -> Tensor | None:
+    return None if tensor is None else tensor.detach().contiguous()
+
+
+def channel_count(tensor: Tensor | None) -> int:
+    return 0 if tensor is None else tensor.shape[-1]
+
+
+def _pointer(tensor: Tensor | None) -> int:
+    return 0 if tensor is None else tensor.data_ptr()
