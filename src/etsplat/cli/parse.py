@@ -15,6 +15,7 @@ from etsplat.cli.export import Export
 from etsplat.cli.reconstruct import Demo, Reconstruct
 from etsplat.cli.render import Render
 from etsplat.cli.train import DemoScene, Train
+from etsplat.cli.view import View
 
 
 @dataclass(frozen=True)
@@ -37,6 +38,7 @@ COMMANDS: dict[str, type[Command] | Group] = {
     "data": Group(
         "Where captures come from: find the cameras of photos, fetch data sets.", {"sfm": Sfm, "download": Download}
     ),
+    "view": View,
     "render": Render,
     "export": Export,
     "bench": Group(

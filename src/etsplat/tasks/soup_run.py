@@ -11,8 +11,10 @@ from etsplat.core.cameras import Cameras
 from etsplat.core.errors import InputError
 from etsplat.io.run_directory import RunDirectory, is_run
 from etsplat.scene.captures import Capture, load_capture
+from etsplat.scene.demo_scene import demo_scene
 from etsplat.scene.soup_files import SoupFile, load_soup
 from etsplat.scene.soup_import import open_soup
+from etsplat.tasks.train import DEMO
 
 SOUP_NAME = "soup.safetensors"
 
@@ -82,17 +84,19 @@ def _open_directory(path: Path, scene: Path | str | None) -> SoupRun:
     if not (path / SOUP_NAME).is_file():
         raise InputError(f"{path}: has no {SOUP_NAME} (yet); name a run of `etsplat train` that got to a checkpoint")
     config = RunDirectory(path).read_config()
-    settings = config.get("config", {})
-    source = scene or config.get("paths", {}).get("source")
+    paths = config["paths"]
+    source = scene or paths["source"]
     if source is None:
         return SoupRun(path, load_soup(path / SOUP_NAME), None)
+    if str(source) == DEMO:
+        return SoupRun(path, load_soup(path / SOUP_NAME), demo_scene())
     if not Path(source).is_dir():
         raise InputError(f"{path}: its scene {source} has gone; name where it is now with --scene")
     capture = load_capture(
         source,
-        images=settings.get("images"),
-        width=settings.get("width"),
-        masks=settings.get("masks"),
+        images=paths.get("images"),
+        width=config["config"]["width"],
+        masks=paths.get("masks"),
         preload=False,
     )
     return SoupRun(path, load_soup(path / SOUP_NAME), capture)

@@ -1,0 +1,60 @@
+"""`etsplat view`."""
+
+import contextlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, ClassVar
+
+import tyro
+
+from etsplat.cli.command import Command
+
+
+@dataclass(frozen=True, kw_only=True)
+class View(Command):
+    """Look around in a trained soup with a web browser; follows a run that is still going on.
+
+    Needs viser: pip install 'etsplat[viewer]'.
+    """
+
+    EXAMPLES: ClassVar[str] = """
+    etsplat view runs/kitchen
+    etsplat view runs/kitchen --port 9000 --width 1600
+    etsplat view point_cloud_state_dict.pt --scene scenes/kitchen
+    """
+
+    run_dir: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(name="dir")]
+    """A run of `etsplat train`, finished or not; or a file with a soup."""
+    scene: Path | None = None
+    """The capture's folder, if it has moved or a file is given: for its cameras."""
+    host: str = "localhost"
+    """Address to listen on; 0.0.0.0 lets other machines look too."""
+    port: int = 8080
+    """Port to listen on; the next free one if it is in use."""
+    width: int = 960
+    """Width of the picture when the camera stands still."""
+
+    @classmethod
+    def defaults(cls, arguments: Sequence[str]) -> "View":
+        """Nothing depends on the arguments."""
+        return cls(run_dir=tyro.MISSING)
+
+    def run(self, arguments: Sequence[str]) -> int:
+        """Serves until Ctrl-C."""
+        from etsplat.io.run_directory import is_run
+        from etsplat.tasks.soup_run import open_run
+        from etsplat.viewer.server import serve, wait_for_soup
+
+        if self.run_dir.is_dir() and is_run(self.run_dir):
+            wait_for_soup(self.run_dir, lambda text: print(text, flush=True))
+        opened = open_run(self.run_dir, self.scene)
+        with contextlib.suppress(KeyboardInterrupt):
+            serve(
+                opened,
+                self.host,
+                self.port,
+                self.width,
+                lambda port: print(f"http://{self.host}:{port}  (Ctrl-C ends it)", flush=True),
+            )
+        return 0

@@ -1,0 +1,1 @@
+"""An interactive view of a trained soup in a web browser."""

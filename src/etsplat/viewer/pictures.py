@@ -1,0 +1,63 @@
+"""What the viewer shows of a soup, in each of its modes."""
+
+from dataclasses import replace
+from typing import Literal, get_args
+
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from etsplat.core.cameras import Cameras
+from etsplat.io.images import to_8_bit
+from etsplat.ops.rasterize_hard import rasterize_hard
+from etsplat.ops.soup_colors import soup_colors
+from etsplat.scene.soup_files import SoupFile
+from etsplat.scene.soup_rendering import OPAQUE_FROM
+from etsplat.tasks.render_config import RenderConfig
+from etsplat.tasks.render_soup import color_depth, depth_span, draw
+
+Mode = Literal["soft", "opaque", "depth", "normal", "wireframe"]
+MODES: tuple[Mode, ...] = get_args(Mode)
+
+_LINE = 0.25
+"""How bright a triangle is where it borders on another in the wireframe."""
+
+
+@torch.no_grad()
+def picture(file: SoupFile, camera: Cameras, mode: Mode) -> UInt8[Tensor, "H W 3"]:
+    """One camera's picture, 8 bits.
+
+    Modes: soft is the splatted soup; opaque its triangles above half opacity, sharp, as a mesh viewer draws them; depth
+    in false colours, near is red; normals as (n + 1) / 2; wireframe the nearest triangles with their borders.
+    """
+    if mode == "wireframe":
+        return to_8_bit(_wireframe(file, camera))
+    config = RenderConfig(opaque=mode == "opaque", depth=mode == "depth", normals=mode == "normal")
+    pictures = draw(file, camera, config)
+    if mode == "depth":
+        return to_8_bit(color_depth(pictures["depth"], depth_span(pictures["depth"])))
+    return to_8_bit(pictures["normal" if mode == "normal" else "color"])
+
+
+def _wireframe(file: SoupFile, camera: Cameras) -> Float[Tensor, "H W 3"]:
+    """Flat triangles, dark where the triangle of the pixel to the right or below is another one."""
+    soup, appearance = file.soup, file.appearance
+    kept = appearance.opacities(soup) >= OPAQUE_FROM
+    image = torch.tensor(file.background).expand(camera.height, camera.width, 3)
+    if not bool(kept.any()):
+        return image
+    chosen = replace(soup, **{name: tensor[kept] for name, tensor in soup.parameters().items()})
+    hit = (
+        rasterize_hard(
+            chosen.vertices, camera.viewmats, camera.Ks, camera.width, camera.height, near_plane=appearance.near_plane
+        )
+        .triangle[0]
+        .long()
+    )
+    degree = soup.sh_degree if appearance.sh_degree is None else min(appearance.sh_degree, soup.sh_degree)
+    colors = soup_colors(chosen.vertices, chosen.sh_dc, chosen.sh_rest, camera.centers, degree)[0].clamp(0, 1)
+    flat = torch.where(hit[..., None] >= 0, colors[hit.clamp_min(0)], image)
+    border = torch.zeros_like(hit, dtype=torch.bool)
+    border[:, :-1] |= hit[:, 1:] != hit[:, :-1]
+    border[:-1] |= hit[1:] != hit[:-1]
+    return torch.where(border[..., None], _LINE * flat, flat)

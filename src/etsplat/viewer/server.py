@@ -1,0 +1,282 @@
+"""The web server of the viewer: viser (an extra) draws the page, our engine the pictures.
+
+Every browser has a thread of its own that waits for its camera to move. It draws small pictures while it moves, at the
+width that `Pace` allows, and one of full width as soon as it stands still.
+"""
+
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from etsplat.core.cameras import Cameras, intrinsics
+from etsplat.core.errors import InputError
+from etsplat.scene.camera_paths import focus_point
+from etsplat.scene.captures import Capture
+from etsplat.scene.soup_files import SoupFile
+from etsplat.tasks.soup_run import SoupRun, world_up
+from etsplat.viewer.follow import Followed
+from etsplat.viewer.pace import Pace
+from etsplat.viewer.pictures import MODES, picture
+
+MOVING_SECONDS = 0.08
+"""What a picture may take while the camera moves."""
+
+STILL_AFTER = 0.2
+"""Seconds without motion after which the picture is sharpened."""
+
+POLL_SECONDS = 2.0
+FRUSTUM = 0.04
+"""Size of the pictured cameras, relative to the scene's extent."""
+
+
+class Viewer:
+    """Serves one soup; `close` ends it."""
+
+    def __init__(self, run: SoupRun, host: str, port: int, width: int) -> None:
+        """Starts the server.
+
+        Args:
+            run: what to show.
+            host: address to listen on.
+            port: to listen on; the next free one is taken if it is in use.
+            width: of still pictures, at most.
+
+        Raises:
+            InputError: viser is missing, or the address cannot be used.
+        """
+        viser = _import_viser()
+        self._run, self._width = run, width
+        self._file: SoupFile = run.file
+        self._clients: dict[int, _Client] = {}
+        self._closed = threading.Event()
+        try:
+            self.server = viser.ViserServer(host=host, port=port, verbose=False)
+        except OSError as error:
+            raise InputError(
+                f"--host {host} --port {port}: cannot listen there ({error.strerror}); choose others"
+            ) from error
+        self._build_page()
+        self.server.on_client_connect(self._connected)
+        self.server.on_client_disconnect(lambda client: self._disconnected(client.client_id))
+        if run.path.is_dir():
+            threading.Thread(target=self._follow, args=(Followed(run.path),), daemon=True).start()
+
+    @property
+    def port(self) -> int:
+        """Where it listens."""
+        return self.server.get_port()
+
+    @property
+    def file(self) -> SoupFile:
+        """What is shown now."""
+        return self._file
+
+    @property
+    def mode(self) -> Any:
+        """The chosen mode."""
+        return self._mode.value
+
+    def close(self) -> None:
+        """Ends the server and its threads."""
+        self._closed.set()
+        for client in list(self._clients.values()):
+            client.close()
+        self.server.stop()
+
+    def _build_page(self) -> None:
+        gui = self.server.gui
+        self._mode = gui.add_dropdown("Mode", MODES, initial_value="soft")
+        self._show_cameras = gui.add_checkbox("Training cameras", False, disabled=self._run.capture is None)
+        self._status = gui.add_markdown(_describe(self._file))
+        self._mode.on_update(lambda _: self._refresh())
+        frusta: list[Any] = []
+        if self._run.capture is not None:
+            up = world_up(self._run.capture.viewmats)
+            if up is not None:
+                self.server.scene.set_up_direction(tuple(up.tolist()))
+            frusta = _add_frusta(self.server, self._run.capture)
+
+        def show_cameras(_: Any) -> None:
+            for frustum in frusta:
+                frustum.visible = self._show_cameras.value
+
+        self._show_cameras.on_update(show_cameras)
+
+    def _connected(self, client: Any) -> None:
+        if self._run.capture is not None:
+            _stand_at_first_camera(client, self._run.capture)
+        else:
+            _stand_before(client, self._file)
+        self._clients[client.client_id] = _Client(self, client, self._width)
+
+    def _disconnected(self, identity: int) -> None:
+        gone = self._clients.pop(identity, None)
+        if gone is not None:
+            gone.close()
+
+    def _refresh(self) -> None:
+        for client in list(self._clients.values()):
+            client.redraw()
+
+    def _follow(self, followed: Followed) -> None:
+        while not self._closed.wait(POLL_SECONDS):
+            file = followed.poll()
+            if file is not None:
+                self._file = file
+                self._refresh()
+            self._status.content = "\n\n".join(text for text in (_describe(self._file), followed.status()) if text)
+
+
+class _Client:
+    """One browser: its thread draws whenever something changed."""
+
+    def __init__(self, viewer: Viewer, client: Any, width: int) -> None:
+        self._viewer, self._client = viewer, client
+        self._pace = Pace(width, MOVING_SECONDS)
+        self._changed = threading.Event()
+        self._closed = False
+        client.camera.on_update(lambda _: self.redraw())
+        threading.Thread(target=self._work, daemon=True).start()
+        self.redraw()
+
+    def redraw(self) -> None:
+        """The camera moved, or what it sees changed."""
+        self._changed.set()
+
+    def close(self) -> None:
+        """Ends the thread."""
+        self._closed = True
+        self._changed.set()
+
+    def _work(self) -> None:
+        while True:
+            self._changed.wait()
+            while self._changed.is_set() and not self._closed:
+                self._changed.clear()
+                start = time.perf_counter()
+                self._draw(self._pace.width)
+                self._pace.took(time.perf_counter() - start)
+                self._changed.wait(STILL_AFTER)
+            if self._closed:
+                return
+            self._draw(self._pace.full_width, quality=92)
+
+    def _draw(self, width: int, quality: int = 70) -> None:
+        camera = camera_of(self._client.camera, width)
+        pixels = picture(self._viewer.file, camera, self._viewer.mode)
+        self._client.scene.set_background_image(pixels.numpy(), format="jpeg", jpeg_quality=quality)
+
+
+def camera_of(camera: Any, width: int) -> Cameras:
+    """The single camera of a browser: `wxyz` and `position` camera to world, `fov` vertical in radians, `aspect`."""
+    height = max(1, round(width / camera.aspect))
+    w, x, y, z = (float(value) for value in np.asarray(camera.wxyz) / np.linalg.norm(camera.wxyz))
+    rotation = torch.tensor(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ],
+        dtype=torch.float64,
+    )
+    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat[:3, :3] = rotation.T
+    viewmat[:3, 3] = -rotation.T @ torch.as_tensor(np.asarray(camera.position), dtype=torch.float64)
+    K = intrinsics(float(np.degrees(camera.fov)), width, height)
+    return Cameras(viewmat[None].float(), K[None], width, height)
+
+
+def serve(run: SoupRun, host: str, port: int, width: int, announce: Callable[[int], None]) -> None:
+    """Serves until Ctrl-C; `announce` is told the port."""
+    viewer = Viewer(run, host, port, width)
+    announce(viewer.port)
+    try:
+        threading.Event().wait()
+    finally:
+        viewer.close()
+
+
+def _describe(file: SoupFile) -> str:
+    iteration = file.notes.get("iteration")
+    return f"{len(file.soup):,} triangles" + (f" after {int(iteration):,} iterations" if iteration else "")
+
+
+def _add_frusta(server: Any, capture: Capture) -> list[Any]:
+    """A pyramid for every training camera, hidden; a click on one goes there."""
+    rotations = capture.viewmats[:, :3, :3].mT
+    frusta = []
+    for index in capture.train:
+        width, height = capture.images.sizes[index]
+        frustum = server.scene.add_camera_frustum(
+            f"/cameras/{capture.names[index]}",
+            fov=2 * float(torch.atan(height / (2 * capture.Ks[index, 1, 1]))),
+            aspect=width / height,
+            scale=FRUSTUM * capture.extent,
+            color=(230, 120, 40),
+            wxyz=_quaternion(rotations[index]),
+            position=capture.centers[index].numpy(),
+            visible=False,
+        )
+
+        def go(event: Any, index: int = index) -> None:
+            _stand_at(event.client, capture, index)
+
+        frustum.on_click(go)
+        frusta.append(frustum)
+    return frusta
+
+
+def _stand_at_first_camera(client: Any, capture: Capture) -> None:
+    _stand_at(client, capture, capture.train[0])
+
+
+def _stand_at(client: Any, capture: Capture, index: int) -> None:
+    position = capture.centers[index]
+    forward = capture.viewmats[index, 2, :3]
+    # The point to turn about: on the line of sight, beside what all cameras look at.
+    distance = float(((focus_point(capture.viewmats) - position) @ forward).clamp_min(0.05 * capture.extent))
+    up = world_up(capture.viewmats)
+    with client.atomic():
+        client.camera.up_direction = (-capture.viewmats[index, 1, :3] if up is None else up).numpy()
+        client.camera.position = position.numpy()
+        client.camera.look_at = (position + distance * forward).numpy()
+        client.camera.fov = 2 * float(torch.atan(capture.images.sizes[index][1] / (2 * capture.Ks[index, 1, 1])))
+
+
+def _stand_before(client: Any, file: SoupFile) -> None:
+    """Without cameras: far enough away to see nine tenths of the triangles."""
+    centers = file.soup.vertices.mean(dim=1)
+    middle = centers.median(dim=0).values
+    distance = 2.5 * float(torch.quantile((centers - middle).norm(dim=1)[:1_000_000], 0.9))
+    with client.atomic():
+        client.camera.position = (middle + torch.tensor([0.3, 0.3, 0.9]) * distance).numpy()
+        client.camera.look_at = middle.numpy()
+
+
+def _quaternion(rotation: torch.Tensor) -> np.ndarray:
+    """(w, x, y, z) of a rotation matrix."""
+    x, y, z, w = Rotation.from_matrix(rotation.numpy()).as_quat()
+    return np.array([w, x, y, z])
+
+
+def _import_viser() -> Any:
+    try:
+        import viser
+    except ImportError as error:
+        raise InputError("the viewer needs viser: pip install 'etsplat[viewer]'") from error
+    return viser
+
+
+def wait_for_soup(folder: Path, announce: Callable[[str], None]) -> None:
+    """Returns when a run that has just begun has written its first soup."""
+    path = folder / "soup.safetensors"
+    if not path.is_file():
+        announce(f"{folder}: waiting for the first checkpoint")
+    while not path.is_file():
+        time.sleep(1.0)

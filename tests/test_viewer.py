@@ -1,0 +1,111 @@
+import math
+import urllib.request
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from captures import write_colmap
+from etsplat.core.errors import InputError
+from etsplat.io.run_directory import RunDirectory
+from etsplat.scene.captures import load_capture
+from etsplat.scene.soup_files import SoupFile, save_soup
+from etsplat.scene.triangle_soup import TriangleSoup
+from etsplat.tasks.soup_run import SoupRun
+from etsplat.viewer import server
+from etsplat.viewer.follow import Followed
+from etsplat.viewer.pace import SMALLEST, Pace
+from etsplat.viewer.pictures import MODES, picture
+from etsplat.viewer.server import Viewer, camera_of
+
+
+def make_soup(count, seed=0):
+    rng = torch.Generator().manual_seed(seed)
+    return TriangleSoup.from_triangles(
+        torch.randn(count, 1, 3, generator=rng) * 0.3 + torch.randn(count, 3, 3, generator=rng) * 0.3,
+        torch.rand(count, 3, generator=rng),
+        opacity=0.9,
+        sigma=0.3,
+        sh_degree=1,
+    )
+
+
+@pytest.fixture
+def run(tmp_path):
+    write_colmap(tmp_path / "scene", [(32, 24)] * 4)
+    return SoupRun(
+        tmp_path / "soup.safetensors", SoupFile(make_soup(40)), load_capture(tmp_path / "scene", preload=False)
+    )
+
+
+def browser_camera(capture, index):
+    """A camera as viser tells it: camera to world as a quaternion (w, x, y, z) and a position."""
+    width, height = capture.images.sizes[index]
+    return SimpleNamespace(
+        wxyz=server._quaternion(capture.viewmats[index, :3, :3].T),
+        position=capture.centers[index].numpy(),
+        fov=2 * math.atan(height / (2 * float(capture.Ks[index, 1, 1]))),
+        aspect=width / height,
+    )
+
+
+def test_a_browsers_camera_is_the_captures_camera(run):
+    camera = camera_of(browser_camera(run.capture, 2), 64)
+    assert (camera.width, camera.height) == (64, 48)
+    torch.testing.assert_close(camera.viewmats, run.capture.cameras[2].viewmats, atol=1e-5, rtol=0)
+    torch.testing.assert_close(camera.Ks[0, 1, 1], 2 * run.capture.cameras[2].Ks[0, 1, 1])
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_every_mode_shows_something_else(run, mode):
+    shown = {name: picture(run.file, run.capture.cameras[1], name) for name in MODES}
+    assert shown[mode].dtype == torch.uint8
+    assert shown[mode].shape == (24, 32, 3)
+    assert float(shown[mode].float().mean()) > 5
+    assert all(not torch.equal(shown[mode], other) for name, other in shown.items() if name != mode)
+
+
+def test_pictures_shrink_until_moving_is_fluent_and_grow_back():
+    pace = Pace(960, 0.08)
+    for _ in range(20):
+        pace.took(1e-6 * pace.width**2)  # 0.1 s at a width of 320
+    assert pace.width == pytest.approx(math.sqrt(0.08 / 1e-6), rel=0.02)
+    for _ in range(20):
+        pace.took(10.0)
+    assert pace.width == SMALLEST
+    for _ in range(20):
+        pace.took(1e-4)
+    assert pace.width == 960
+
+
+def test_a_run_is_followed_through_its_files(tmp_path):
+    folder = RunDirectory.create(tmp_path / "run", {"task": "train", "config": {"iterations": 100}})
+    followed = Followed(folder.path)
+    assert followed.poll() is None
+    assert followed.status() == ""
+    save_soup(folder.soup_path, SoupFile(make_soup(3)))
+    assert len(followed.poll().soup) == 3
+    assert followed.poll() is None
+    save_soup(folder.soup_path, SoupFile(make_soup(5)))
+    assert len(followed.poll().soup) == 5
+    folder.append_history({"iteration": 50, "seconds": 1.0, "loss": 0.1, "psnr": 21.5})
+    assert followed.status() == "running: iteration 50 of 100, 21.50 dB on test views"
+    folder.soup_path.unlink()
+    assert followed.poll() is None
+
+
+def test_the_page_is_served_on_localhost(run):
+    pytest.importorskip("viser")
+    viewer = Viewer(run, "localhost", 8931, 64)
+    try:
+        with urllib.request.urlopen(f"http://localhost:{viewer.port}", timeout=10) as response:
+            assert b"<html" in response.read().lower()
+        assert viewer.server.get_host() == "localhost"
+    finally:
+        viewer.close()
+
+
+def test_without_viser_the_extra_is_named(run, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "viser", None)
+    with pytest.raises(InputError, match=r"etsplat\[viewer\]"):
+        Viewer(run, "localhost", 8932, 64)
