@@ -82,7 +82,7 @@ def draw_qualitative(cells: Sequence[Cell], variants: Sequence[str], path: Path)
                 if title in columns:
                     vertices, faces = columns[title]
                     unit = ((vertices.double() - center) / radius).float()
-                    axis.imshow(_draw(unit, faces, normals=half == 1).numpy())
+                    axis.imshow(draw_shape(unit, faces, normals=half == 1).numpy())
                 if row == 0 and half == 0:
                     axis.set_title(title, fontsize=9)
         grid[2 * row, 0].text(
@@ -92,7 +92,7 @@ def draw_qualitative(cells: Sequence[Cell], variants: Sequence[str], path: Path)
         figure.savefig(temporary, dpi=100)
 
 
-def _draw(vertices: Tensor, faces: Tensor, *, normals: bool) -> Float[Tensor, "H W 3"]:
+def draw_shape(vertices: Tensor, faces: Tensor, *, normals: bool = False) -> Float[Tensor, "H W 3"]:
     """One picture over white, of the shape in the photographs' light or of its normals as colours."""
     camera = orbit_cameras(TILE, TILE)[_VIEW]
     if normals:

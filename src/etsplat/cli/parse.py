@@ -12,6 +12,7 @@ from etsplat.cli.command import Command
 from etsplat.cli.data import Download, Sfm
 from etsplat.cli.doctor import Doctor
 from etsplat.cli.export import Export
+from etsplat.cli.figures import Figures
 from etsplat.cli.reconstruct import Demo, Reconstruct
 from etsplat.cli.render import Render
 from etsplat.cli.train import DemoScene, Train
@@ -45,6 +46,7 @@ COMMANDS: dict[str, type[Command] | Group] = {
         "The paper's studies as grids of runs, with tables and figures.",
         {"famous": Famous, "regularizers": Regularizers, "distance": Distance, "settings": Settings},
     ),
+    "figures": Figures,
     "doctor": Doctor,
 }
 

@@ -3,20 +3,22 @@
 import math
 
 
-def regularization_weight(iteration: int, iterations: int, hold: int) -> float:
-    """The global weight gamma of the regularizers, paper section 3.3: cosine decay from 1 to 0.
+def regularization_weight(iteration: int, iterations: int, hold: int, final: float = 0.0) -> float:
+    """The global weight gamma of the regularizers, paper section 3.3: cosine decay from 1 to `final`.
 
-    gamma = 1 up to iteration `hold`, then (1 + cos(pi (iteration - hold) / (iterations - hold))) / 2, which is 0 at the
-    last iteration. The paper: hold 500 of 30,000.
+    gamma = 1 up to iteration `hold`, then final + (1 - final) (1 + cos(pi (iteration - hold) / (iterations - hold)))
+    / 2, which is `final` at the last iteration. The paper: hold 500 of 30,000, final 0.
 
     Args:
         iteration: 1..iterations.
         iterations: length of the run.
         hold: last iteration at full weight, 0 <= hold. A run no longer than `hold` keeps 1 throughout.
+        final: in [0, 1].
     """
     if iteration <= hold:
         return 1.0
-    return 0.5 * (1.0 + math.cos(math.pi * (iteration - hold) / (iterations - hold)))
+    cosine = 0.5 * (1.0 + math.cos(math.pi * (iteration - hold) / (iterations - hold)))
+    return final + (1.0 - final) * cosine
 
 
 def exponential_decay(iteration: int, iterations: int, ratio: float) -> float:
@@ -30,6 +32,25 @@ def exponential_decay(iteration: int, iterations: int, ratio: float) -> float:
     if iterations <= 1:
         return 1.0
     return ratio ** ((iteration - 1) / (iterations - 1))
+
+
+def coarse_level(iteration: int, iterations: int, levels: int, until: float) -> int:
+    """How many times the pictures are halved: `levels` at first, one less after each equal part, 0 from `until` on.
+
+    Args:
+        iteration: 1..iterations.
+        iterations: length of the run.
+        levels: >= 0.
+        until: when full resolution begins, as a fraction of the run in [0, 1].
+    """
+    end = until * iterations
+    return 0 if iteration > end else math.ceil(levels * (1.0 - (iteration - 1) / end))
+
+
+def evenly(iterations: int, count: int, first: float) -> list[int]:
+    """`count` iterations, evenly spaced from the fraction `first` of the run to its last, which is one of them."""
+    fractions = [first + (1.0 - first) * (k + 1) / count for k in range(count)]
+    return [min(max(round(fraction * iterations), 1), iterations) for fraction in fractions]
 
 
 def face_budgets(

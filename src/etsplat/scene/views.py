@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import interpolate
 
 from etsplat.core.cameras import Cameras
 
@@ -76,6 +77,18 @@ class PosedViews:
     def has_masks(self) -> bool:
         """Whether any pixel is not fully opaque, that is, whether the object is separated from its background."""
         return any(bool((image[..., 3] < 1).any()) for image in self.images)
+
+    def halved(self) -> "PosedViews":
+        """The same views at half the size, each pixel the mean of those it replaces (odd sizes are rounded down)."""
+        cameras = self.cameras
+        width, height = max(1, cameras.width // 2), max(1, cameras.height // 2)
+        images = torch.empty(len(self), height, width, 4)
+        for index, image in enumerate(self.images):  # one by one: a copy of all views in another layout is large
+            images[index] = interpolate(image.movedim(-1, 0)[None], (height, width), mode="area")[0].movedim(0, -1)
+        Ks = cameras.Ks.clone()
+        Ks[:, 0] *= width / cameras.width
+        Ks[:, 1] *= height / cameras.height
+        return replace(self, cameras=replace(cameras, Ks=Ks, width=width, height=height), images=images)
 
     def renormalized(self, center: Float[Tensor, "3"], radius: float) -> "PosedViews":
         """The same views in the frame where the sphere (center, radius) of the present frame is the unit sphere.

@@ -1,5 +1,6 @@
 """The problem that the loop drives in shape reconstruction: a mesh, its optimizer, and the views it is fitted to."""
 
+import math
 from collections.abc import Callable
 
 import torch
@@ -9,11 +10,13 @@ from etsplat.core.validation import first_not_finite
 from etsplat.geometry.measures import face_areas
 from etsplat.geometry.subdivision import longest_edge_plan
 from etsplat.geometry.topology import MeshTopology
+from etsplat.geometry.untangle import untangle
 from etsplat.ops.adam import Adam
 from etsplat.optim.edit import apply_subdivision
 from etsplat.optim.loop import Progress
 from etsplat.optim.objectives import MeshWeights, mesh_objective
-from etsplat.optim.schedules import exponential_decay, face_budgets, regularization_weight
+from etsplat.optim.schedules import coarse_level, evenly, exponential_decay, face_budgets, regularization_weight
+from etsplat.optim.vertex_updates import Solve, laplacian_solver, uniform_step
 from etsplat.optim.view_sampler import ViewSampler
 from etsplat.scene.mesh_rendering import render_mesh
 from etsplat.scene.triangle_mesh import TriangleMesh
@@ -46,7 +49,6 @@ class MeshFitting:
             evaluate: cheap metrics of a mesh.
         """
         self.mesh = mesh
-        self._views = views
         self._config = config
         self._evaluate = evaluate
         self._sampler = ViewSampler(views.train, torch.Generator().manual_seed(config.seed))
@@ -71,6 +73,11 @@ class MeshFitting:
             start_faces=len(mesh.faces),
             max_faces=config.max_faces,
         )
+        self._untanglings = set(evenly(config.iterations, config.untangle_steps, config.subdivide_until))
+        self._levels = [views]  # halved 0, 1, ... times
+        for _ in range(config.coarse_levels):
+            self._levels.append(self._levels[-1].halved())
+        self._solve: Solve | None = None
         parameters = mesh.parameters()
         self.adam = Adam(parameters, {name: self._rates[name] for name in parameters}, engine=config.engine)
 
@@ -84,23 +91,46 @@ class MeshFitting:
         return {"faces": self.count, "sigma": float(self.mesh.sigma.detach())}
 
     def step(self, iteration: int) -> float:
-        """One view over one random background, one step of Adam; returns the loss before it."""
+        """Some views over random backgrounds, one optimizer step; returns the loss before it."""
         config, mesh = self._config, self.mesh
-        view = self._sampler.next_view()
-        background = self._sampler.background()
-        color = render_mesh(mesh, self._views.cameras[view], config.appearance, backgrounds=background)
-        gamma = regularization_weight(iteration, config.iterations, config.gamma_hold)
-        target = self._views.images[view : view + 1]
-        loss = mesh_objective(color, target, background, mesh, self._weights, gamma, engine=config.engine)
+        level = coarse_level(iteration, config.iterations, config.coarse_levels, config.coarse_until)
+        views = self._levels[level]
+        chosen = [self._sampler.next_view() for _ in range(config.views_per_step)]
+        backgrounds = torch.cat([self._sampler.background() for _ in chosen])
+        self._schedule_sigma(iteration)
+        color = render_mesh(mesh, views.cameras[chosen], config.appearance, backgrounds=backgrounds)
+        gamma = regularization_weight(iteration, config.iterations, config.gamma_hold, config.gamma_final)
+        target = views.images[chosen[0] : chosen[0] + 1] if len(chosen) == 1 else views.images[chosen]
+        loss = mesh_objective(color, target, backgrounds, mesh, self._weights, gamma, engine=config.engine)
         self.adam.zero_grad()
         loss.backward()
-        decay = exponential_decay(iteration, config.iterations, config.lr_vertices_final)
-        self.adam.learning_rates["vertices"] = self._rates["vertices"] * decay
-        self.adam.step()
+        self._update(iteration)
         return float(loss.detach())
 
+    def _schedule_sigma(self, iteration: int) -> None:
+        config, log_sigma = self._config, self.mesh.log_sigma
+        if config.sigma_final > 0 and log_sigma is not None:
+            fall = exponential_decay(iteration, config.iterations, config.sigma_final / config.start_sigma)
+            with torch.no_grad():
+                log_sigma.fill_(math.log(config.start_sigma * fall))
+            self.adam.learning_rates["log_sigma"] = 0.0
+
+    def _update(self, iteration: int) -> None:
+        config = self._config
+        rate = self._rates["vertices"] * exponential_decay(iteration, config.iterations, config.lr_vertices_final)
+        if config.vertex_update == "adam":
+            self.adam.learning_rates["vertices"] = rate
+            self.adam.step()
+            return
+        if config.vertex_update == "large-steps" and self._solve is None:
+            self._solve = laplacian_solver(self.mesh.topology, config.large_steps_weight)
+        uniform_step(self.adam, "vertices", rate, self._solve)
+
     def refine(self, iteration: int) -> int:
-        """Subdivides the largest faces if it is time to (paper, appendix Adaptive Refinement)."""
+        """Subdivides the largest faces if it is time to (paper, appendix Adaptive Refinement), or untangles."""
+        if iteration in self._untanglings:
+            with torch.no_grad():
+                self.mesh.vertices.copy_(untangle(self.mesh.vertices, self.mesh.topology)[0])
         if iteration not in self._budgets:
             return 0
         mesh = self.mesh
@@ -111,6 +141,7 @@ class MeshFitting:
         for name, parameter in carried.items():
             setattr(mesh, name, parameter)
         mesh.topology = MeshTopology.from_faces(plan.faces, len(mesh.vertices))
+        self._solve = None
         return len(mesh.faces) - before
 
     def evaluate(self) -> dict[str, float]:

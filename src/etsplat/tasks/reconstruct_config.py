@@ -52,6 +52,17 @@ class ReconstructConfig:
     start_sigma: float = 0.5
     """Softness at the start; small is sharp."""
 
+    views_per_step: int = 1
+    """Views that each step sees; the paper's method sees one."""
+    coarse_levels: int = 0
+    """How many times the pictures are halved at first; the resolution doubles in equal steps."""
+    coarse_until: float = 0.5
+    """When full resolution begins, as a fraction of the iterations."""
+
+    vertex_update: Literal["adam", "uniform", "large-steps"] = "adam"
+    """Adam's; Adam's with one scale for all vertices; or that, smoothed by the mesh's Laplacian."""
+    large_steps_weight: float = 10.0
+    """How far large-steps smooths: the weight of the Laplacian beside the identity."""
     lr_vertices: float = 2e-3
     """Adam learning rate of positions, in units of the object's radius."""
     lr_vertices_final: float = 0.02
@@ -71,10 +82,14 @@ class ReconstructConfig:
     """Weight of the distance of vertices from the mean of their neighbours."""
     lambda_sigma: float = 1e-4
     """Weight of sigma^-2; the paper uses 1e-3 and 1e-4."""
+    sigma_final: float = 0.0
+    """Softness at the end: sigma then falls exponentially from start_sigma and is not learned; 0 to learn it."""
     edge_power: Literal[1, 2] = 1
     """1: mean edge length, as the paper prints it; 2: mean squared length."""
     gamma_hold: int = 500
-    """The weights above are multiplied by a cosine that falls from 1 at this iteration to 0 at the last."""
+    """The weights above are multiplied by a cosine that falls from 1 at this iteration to gamma_final at the last."""
+    gamma_final: float = 0.0
+    """Where that cosine ends; the paper's ends at 0."""
 
     max_faces: int = 100_000
     """Subdivision stops here."""
@@ -85,6 +100,10 @@ class ReconstructConfig:
     subdivide_steps: int = 30
     """Number of subdivisions between these two; each adds the same fraction of faces, so that the last reaches
     `max_faces`."""
+
+    untangle_steps: int = 0
+    """How often faces that cut through others are smoothed away, evenly spaced after the last subdivision; the last
+    time is after the last step."""
 
     log_every: int = 50
     """Iterations between lines of history.jsonl."""
@@ -106,15 +125,19 @@ class ReconstructConfig:
         _check_choice(self, "distance", ("barycentric", "sdf"))
         _check_choice(self, "engine", (None, "cpu", "reference"))
         _check_choice(self, "edge_power", (1, 2))
+        _check_choice(self, "vertex_update", ("adam", "uniform", "large-steps"))
         for name in ("resolution", "supersampling", "iterations", "log_every", "chamfer_samples", "max_faces"):
             _check_range(self, name, 1)
+        _check_range(self, "views_per_step", 1)
+        for name in ("coarse_levels", "untangle_steps", "large_steps_weight", "sigma_final"):
+            _check_range(self, name, 0)
         for name in ("start_level", "gamma_hold", "subdivide_steps", "evaluate_every", "checkpoint_every", "seed"):
             _check_range(self, name, 0)
         for name in ("lr_vertices", "lr_colors", "lr_opacities", "lr_sigma"):
             _check_range(self, name, 0.0)
         for name in ("lambda_edge", "lambda_normal", "lambda_laplacian", "lambda_sigma"):
             _check_range(self, name, 0.0)
-        for name in ("subdivide_from", "subdivide_until", "start_color"):
+        for name in ("subdivide_from", "subdivide_until", "start_color", "coarse_until", "gamma_final"):
             _check_range(self, name, 0.0, 1.0)
         for name in ("start_radius", "start_sigma", "lr_vertices_final"):
             _check_range(self, name, 1e-6)

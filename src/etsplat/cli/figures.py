@@ -1,0 +1,58 @@
+"""`etsplat figures NAME`: the paper's explanatory figures, computed."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar, Literal
+
+import tyro
+
+from etsplat.cli.command import Command
+from etsplat.core.errors import InputError
+
+Name = Literal["kernels", "edges", "soft-triangle", "axes", "dead-zone", "teaser"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Figures(Command):
+    """Draw a figure of the paper from the code itself.
+
+    kernels: G(x) and its slope for several sigma. edges: the seam between two faces. soft-triangle: one triangle and
+    the level sets of x. axes: the table of kernel properties. dead-zone: from how far each kernel pulls a triangle
+    back. teaser: from the sphere to a reconstruction, of finished runs.
+    """
+
+    EXAMPLES: ClassVar[str] = """
+    etsplat figures kernels
+    etsplat figures dead-zone --out dead_zone.pdf
+    etsplat figures teaser --runs runs/bunny runs/boot
+    """
+
+    name: tyro.conf.Positional[Name]
+    """Which figure."""
+    out: Path | None = None
+    """File to write, .png, .pdf or .svg; NAME.png if not given."""
+    runs: tuple[Path, ...] = ()
+    """Finished runs that the teaser shows."""
+
+    @classmethod
+    def defaults(cls, arguments: Sequence[str]) -> "Figures":
+        """Nothing depends on the arguments."""
+        return cls(name=tyro.MISSING)
+
+    def run(self, arguments: Sequence[str]) -> int:
+        """Draws it."""
+        from etsplat.bench.drawings import FIGURES
+        from etsplat.bench.teaser import draw_teaser
+        from etsplat.io.atomic import atomic_write
+
+        path = self.out or Path(f"{self.name}.png")
+        if path.suffix not in (".png", ".pdf", ".svg"):
+            raise InputError(f"{path}: unknown kind of picture; end the name in .png, .pdf or .svg")
+        if self.name == "teaser" and not self.runs:
+            raise InputError("teaser: needs finished runs to show; name their folders with --runs")
+        figure = draw_teaser(self.runs) if self.name == "teaser" else FIGURES[self.name]()
+        with atomic_write(path) as temporary:
+            figure.savefig(temporary, dpi=150, format=path.suffix[1:])
+        print(path)
+        return 0

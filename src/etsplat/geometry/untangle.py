@@ -1,0 +1,66 @@
+"""Undoing self-intersections by smoothing where they are."""
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from etsplat.geometry.intersections import intersecting_faces
+from etsplat.geometry.topology import MeshTopology
+
+_SWEEPS = 5
+"""Smoothing sweeps between two looks for intersections."""
+
+_STEP = 0.5
+"""How far a sweep moves a vertex towards the mean of its neighbours."""
+
+
+def untangle(
+    vertices: Float[Tensor, "V 3"], topology: MeshTopology, *, rounds: int = 20
+) -> tuple[Float[Tensor, "V 3"], int]:
+    """Moves the vertices of faces that cut through others until none does, or the rounds are used up.
+
+    Each round marks the corners of intersecting faces, adds a ring of neighbours for every fourth round already done,
+    so that what resists is smoothed more widely, and moves the marked vertices to the mean of their neighbours in
+    damped sweeps. All others stay where they are. Boundary vertices may shrink inwards.
+
+    Args:
+        vertices: (V, 3) finite.
+        topology: of the mesh.
+        rounds: most looks for intersections.
+
+    Returns:
+        Moved vertices, and how many faces still intersect.
+    """
+    vertices = vertices.detach().clone()
+    for done in range(rounds):
+        marked = intersecting_faces(vertices, topology.faces)
+        if not bool(marked.any()):
+            return vertices, 0
+        _smooth(vertices, topology, _region(marked, topology, rings=done // 4))
+    return vertices, int(intersecting_faces(vertices, topology.faces).sum())
+
+
+def _region(faces: Bool[Tensor, " F"], topology: MeshTopology, rings: int) -> Bool[Tensor, " V"]:
+    """The corners of some faces, and so many rings of neighbours."""
+    region = torch.zeros(topology.num_vertices, dtype=torch.bool, device=topology.faces.device)
+    region[topology.faces[faces].reshape(-1)] = True
+    for _ in range(rings):
+        first, second = topology.edges.unbind(1)
+        grown = region.clone()
+        grown[second[region[first]]] = True
+        grown[first[region[second]]] = True
+        region = grown
+    return region
+
+
+def _smooth(vertices: Tensor, topology: MeshTopology, region: Bool[Tensor, " V"]) -> None:
+    """Damped sweeps over the vertices of a region, in place."""
+    counts = topology.neighbor_offsets.diff()
+    owner = torch.repeat_interleave(torch.arange(topology.num_vertices, device=counts.device), counts)
+    inside = region[owner]
+    owner, neighbors = owner[inside], topology.neighbor_indices[inside]
+    moved = region & (counts > 0)
+    for _ in range(_SWEEPS):
+        sums = torch.zeros_like(vertices).index_add_(0, owner, vertices[neighbors])
+        means = sums[moved] / counts[moved, None]
+        vertices[moved] += _STEP * (means - vertices[moved])

@@ -1,0 +1,60 @@
+"""Steps for vertices other than Adam's own: equal scale everywhere, and smoothed by the mesh's Laplacian.
+
+Large steps (Nicolet et al. 2021): with M = I + w L, L the combinatorial Laplacian, the gradient g by the vertices
+becomes M^-1 g by the differential coordinates u = M v, Adam's moments are taken of that, all components are divided by
+the one largest second moment (Adam divides each by its own, which would undo the smoothing), and the step goes back to
+v as M^-1 again. No u is stored: v moves by M^-1 times u's step.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.sparse import coo_array, csc_array, identity
+from scipy.sparse.linalg import splu
+from torch import Tensor
+
+from etsplat.geometry.topology import MeshTopology
+from etsplat.ops.adam import Adam
+
+Solve = Callable[[Float[Tensor, "V 3"]], Float[Tensor, "V 3"]]
+
+
+def laplacian_solver(topology: MeshTopology, weight: float) -> Solve:
+    """X -> (I + weight L)^-1 x, factorised once; float64 inside."""
+    first, second = topology.edges.cpu().numpy().T
+    V = topology.num_vertices
+    ones = np.ones(len(first))
+    adjacency = coo_array((np.tile(ones, 2), (np.r_[first, second], np.r_[second, first])), shape=(V, V))
+    degrees = coo_array((adjacency.sum(axis=1), (np.arange(V), np.arange(V))), shape=(V, V))
+    matrix = csc_array(identity(V) + weight * (degrees - adjacency))
+    factors = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+
+    def solve(x: Tensor) -> Tensor:
+        return torch.from_numpy(factors.solve(x.detach().cpu().double().numpy())).to(x)
+
+    return solve
+
+
+@torch.no_grad()
+def uniform_step(adam: Adam, name: str, rate: float, solve: Solve | None) -> None:
+    """Adam's step for all parameters, but for `name` with one scale for all of its components.
+
+        p <- p - rate M^-1 m / max(sqrt(v)),   m and v the bias-corrected moments of M^-1 g
+
+    Args:
+        adam: every parameter has its gradient.
+        name: which one.
+        rate: its learning rate.
+        solve: x -> M^-1 x, or None for no smoothing.
+    """
+    parameter = adam.parameters[name]
+    if solve is not None and parameter.grad is not None:
+        parameter.grad = solve(parameter.grad)
+    adam.learning_rates[name] = 0.0  # the moments are updated, the parameter is not
+    adam.step()
+    beta1, beta2 = adam.betas
+    scale = float(adam.second_moments[name].max()) / (1 - beta2**adam.step_count)
+    direction = adam.first_moments[name] / ((1 - beta1**adam.step_count) * (scale**0.5 + adam.eps))
+    parameter -= rate * (direction if solve is None else solve(direction))
