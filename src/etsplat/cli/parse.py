@@ -11,6 +11,7 @@ from etsplat.cli.bench import Distance, Famous, Regularizers, Settings
 from etsplat.cli.command import Command
 from etsplat.cli.data import Download, Sfm
 from etsplat.cli.doctor import Doctor
+from etsplat.cli.evaluate import Evaluate
 from etsplat.cli.export import Export
 from etsplat.cli.figures import Figures
 from etsplat.cli.reconstruct import Demo, Reconstruct
@@ -39,6 +40,7 @@ COMMANDS: dict[str, type[Command] | Group] = {
     "data": Group(
         "Where captures come from: find the cameras of photos, fetch data sets.", {"sfm": Sfm, "download": Download}
     ),
+    "eval": Evaluate,
     "view": View,
     "render": Render,
     "export": Export,

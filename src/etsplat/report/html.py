@@ -182,7 +182,7 @@ def _curves_section(run: Run) -> str:
     return f"""<section>
 <h2>Convergence</h2>
 <p class="note">Over iterations. Where many steps share a point of a curve, the line is their mean and the band their
-range.</p>
+range; for softness and opacity of a soup, the median and 10 to 90 % of the triangles.</p>
 <div class="curves">{charts}</div>
 </section>"""
 

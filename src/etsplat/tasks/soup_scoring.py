@@ -10,7 +10,7 @@ from torch import Tensor
 from etsplat.io.images import save_image
 from etsplat.metrics.image import psnr, ssim
 from etsplat.scene.captures import Capture
-from etsplat.scene.soup_rendering import SoupAppearance, render_soup, render_soup_opaque
+from etsplat.scene.soup_rendering import SoupAppearance, render_soup
 from etsplat.scene.triangle_soup import TriangleSoup
 
 SUPERSAMPLING = 4
@@ -33,7 +33,7 @@ class SoupScorer:
         """For the history: "psnr" if there are test views."""
         if not self._capture.test:
             return {}
-        values = [self._psnr(self._splatted(soup, appearance, view), view) for view in self._capture.test]
+        values = [self._psnr(self.splatted(soup, appearance, view), view) for view in self._capture.test]
         return {"psnr": sum(values) / len(values)}
 
     def full(self, soup: TriangleSoup, appearance: SoupAppearance, folder: Path) -> dict[str, Any]:
@@ -49,13 +49,13 @@ class SoupScorer:
         """
         scores: dict[str, list[float]] = {"psnr": [], "ssim": [], "psnr_opaque": [], "ssim_opaque": []}
         for number, view in enumerate(self._capture.test):
-            photo = self._photo(view)
+            photo = self.photo(view)
             pictures = {
-                "render": self._splatted(soup, appearance, view),
-                "opaque": self._opaque(soup, appearance, view),
+                "render": self.splatted(soup, appearance, view),
+                "opaque": self.opaque(soup, appearance, view),
             }
             for kind, suffix in (("render", ""), ("opaque", "_opaque")):
-                picture = self._masked(pictures[kind], photo, view)
+                picture = self.masked(pictures[kind], photo, view)
                 scores[f"psnr{suffix}"].append(psnr(picture, photo))
                 scores[f"ssim{suffix}"].append(ssim(picture, photo))
             for kind, picture in (("truth", photo), *pictures.items()):
@@ -65,25 +65,29 @@ class SoupScorer:
         return {**means, "test_views": [{"name": name, **_row(scores, i)} for i, name in enumerate(names)]}
 
     def _psnr(self, picture: Float[Tensor, "H W 3"], view: int) -> float:
-        photo = self._photo(view)
-        return psnr(self._masked(picture, photo, view), photo)
+        photo = self.photo(view)
+        return psnr(self.masked(picture, photo, view), photo)
 
-    def _photo(self, view: int) -> Float[Tensor, "H W 3"]:
+    def photo(self, view: int) -> Float[Tensor, "H W 3"]:
+        """The photograph of a view, over the background."""
         photo = self._capture.images[view].float() / 255
         return photo[..., :3] if photo.shape[-1] == 3 else photo[..., :3] + (1 - photo[..., 3:]) * self._background
 
-    def _masked(self, picture: Tensor, photo: Tensor, view: int) -> Float[Tensor, "H W 3"]:
+    def masked(self, picture: Tensor, photo: Tensor, view: int) -> Float[Tensor, "H W 3"]:
+        """The picture, with the photograph's pixels where the view's mask excludes them."""
         mask = self._capture.images.mask(view)
         return picture if mask is None else photo + mask[..., None].float() / 255 * (picture - photo)
 
     @torch.no_grad()
-    def _splatted(self, soup: TriangleSoup, appearance: SoupAppearance, view: int) -> Float[Tensor, "H W 3"]:
+    def splatted(self, soup: TriangleSoup, appearance: SoupAppearance, view: int) -> Float[Tensor, "H W 3"]:
+        """A view of the soup, clamped to [0, 1]."""
         rendering = render_soup(
             soup, self._cameras[view], appearance, backgrounds=self._background[None], engine=self._engine
         )
         return rendering.color[0].clamp(0.0, 1.0)
 
-    def _opaque(self, soup: TriangleSoup, appearance: SoupAppearance, view: int) -> Float[Tensor, "H W 3"]:
+    def opaque(self, soup: TriangleSoup, appearance: SoupAppearance, view: int) -> Float[Tensor, "H W 3"]:
+        """The same as a mesh viewer would draw it."""
         picture = render_soup_opaque(
             soup,
             self._cameras[view],
