@@ -70,4 +70,18 @@ void zero_floats(float* values, int64_t count) {
     parallel_for(count, kChunk, [values](int64_t begin, int64_t end) { std::fill(values + begin, values + end, 0.0f); });
 }
 
+void sum_groups(const float* values, const int32_t* offsets, const int32_t* members, int64_t groups, int64_t channels,
+                float* sums) {
+    parallel_for(groups, 4096, [&](int64_t begin, int64_t end) {
+        for (int64_t g = begin; g < end; ++g) {
+            float* sum = sums + g * channels;
+            for (int64_t c = 0; c < channels; ++c) sum[c] = 0.0f;
+            for (int32_t i = offsets[g]; i < offsets[g + 1]; ++i) {
+                const float* row = values + members[i] * channels;
+                for (int64_t c = 0; c < channels; ++c) sum[c] += row[c];
+            }
+        }
+    });
+}
+
 }  // namespace etsplat

@@ -20,4 +20,8 @@ IndexRange index_range(const T* values, int64_t count);  // count > 0; T is int3
 
 void zero_floats(float* values, int64_t count);
 
+// sums (groups, channels): row g is the sum of the rows `members[offsets[g]] ...` of values, in that order.
+void sum_groups(const float* values, const int32_t* offsets, const int32_t* members, int64_t groups, int64_t channels,
+                float* sums);
+
 }  // namespace etsplat

@@ -17,6 +17,15 @@ void bind_array_scans(nb::module_& m) {
                         : index_range(pointer<const int32_t>(values), count);
         },
         NoGil());
+    // values (N, C), offsets (groups + 1,), members into the rows of `values`: sums (groups, C), each in the order of its
+    // members.
+    m.def(
+        "sum_groups",
+        [](Address values, Address offsets, Address members, int64_t groups, int64_t channels, Address sums) {
+            sum_groups(pointer<const float>(values), pointer<const int32_t>(offsets), pointer<const int32_t>(members),
+                       groups, channels, pointer<float>(sums));
+        },
+        NoGil());
     m.def(
         "zero_floats", [](Address values, int64_t count) { zero_floats(pointer<float>(values), count); }, NoGil());
 }

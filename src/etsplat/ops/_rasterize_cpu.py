@@ -34,6 +34,8 @@ def rasterize_cpu(
 ) -> Rasterization:
     """Render with the native engine; arguments as ``etsplat.rasterize`` has checked them."""
     mesh = _Mesh(vertices, faces)
+    if corner_colors is not None and corner_colors.dim() == 2:
+        corner_colors = _PerCorner.apply(corner_colors, mesh)
     channels = Channels(colors, corner_colors, faces)
     if settings.depth != "none" or settings.normals:
         channels.add_geometry(finite_corners(vertices, faces), viewmats, settings)
@@ -49,6 +51,29 @@ def rasterize_cpu(
         result.median_depth = median_depth(median_triangle, finite_corners(vertices, faces), viewmats, Ks, settings)
     channels.split(result)
     return result
+
+
+class _PerCorner(torch.autograd.Function):
+    """(V, C) -> (N, 3, C). Autograd's own backward of the indexing takes longer than rasterizing."""
+
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, mesh: "_Mesh") -> Tensor:
+        ctx.mesh, ctx.shape = mesh, values.shape
+        assert mesh.faces is not None
+        return values[mesh.faces.long()]
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad_corners: Tensor) -> tuple[Tensor, None]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        sums = empty_image(*ctx.shape)
+        _native.sum_groups(
+            grad_corners.contiguous().data_ptr(),
+            _address(ctx.mesh.corner_offsets),
+            _address(ctx.mesh.corner_indices),
+            *ctx.shape,
+            sums.data_ptr(),
+        )
+        return sums, None
 
 
 class _Mesh:
