@@ -10,7 +10,7 @@ from torch import Tensor
 from etsplat.io.images import save_image
 from etsplat.metrics.image import psnr, ssim
 from etsplat.scene.captures import Capture
-from etsplat.scene.soup_rendering import SoupAppearance, render_soup
+from etsplat.scene.soup_rendering import SoupAppearance, render_soup, render_soup_opaque
 from etsplat.scene.triangle_soup import TriangleSoup
 
 SUPERSAMPLING = 4
