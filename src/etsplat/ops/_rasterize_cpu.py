@@ -59,8 +59,8 @@ class _PerCorner(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, values: Tensor, mesh: "_Mesh") -> Tensor:
         ctx.mesh, ctx.shape = mesh, values.shape
-        assert mesh.faces is not None
-        return values[mesh.faces.long()]
+        assert mesh.faces32 is not None
+        return values[mesh.faces32]
 
     @staticmethod
     @once_differentiable
