@@ -6,7 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import test_rasterize_fuzz as fuzz
-from _scenes import EVERYTHING, IMAGES, NO_CUTOFFS, gradients, mesh, soup
+from _scenes import EVERYTHING, IMAGES, NO_CUTOFFS, gradients, mesh, prepare, soup
+from etsplat import rasterize
 from etsplat.cuda.launch import use_backend
 from etsplat.ops import _raster_capacity, _raster_render_cuda
 from simt.build import Simt
@@ -155,6 +156,34 @@ def test_bits_do_not_depend_on_the_order_of_threads(rng):
         assert all(torch.equal(getattr(out, name), getattr(first, name)) for name in IMAGES)
         assert torch.equal(out.statistics.max_weight, first.statistics.max_weight)
         assert all(torch.equal(grads[name], first_grads[name]) for name in grads)
+
+
+@pytest.mark.cuda
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
+def test_a_captured_step_is_the_eager_one(rng):
+    """Forward and backward as a graph, replayed on changed vertices, give the bits of single calls."""
+    scene = prepare(soup(rng, 200), "cuda", requires_grad=True)
+    cotangent = torch.randn(2, 40, 48, 3, generator=rng).cuda()
+    leaves = [scene[name] for name in ("vertices", "colors", "opacities", "sigma")]
+
+    def step():
+        out = rasterize(**scene, engine="cuda")
+        return [out.color, *torch.autograd.grad(out.color, leaves, cotangent)]
+
+    side = torch.cuda.Stream()
+    side.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(side):
+        for _ in range(3):
+            step()
+    torch.cuda.current_stream().wait_stream(side)
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        captured = step()
+    with torch.no_grad():
+        leaves[0] += 0.05
+    graph.replay()
+    assert not _raster_capacity.repair_overflow(leaves[0].device)
+    assert all(torch.equal(a, b) for a, b in zip(captured, step(), strict=True))
 
 
 NOTHING = {"depth": None, "normals": False, "median_depth": False, "distortion": False}

@@ -23,6 +23,10 @@
 #include <utility>
 #include <vector>
 
+#ifdef __SANITIZE_ADDRESS__
+#include <sanitizer/asan_interface.h>
+#endif
+
 #if !defined(__x86_64__) || defined(SIMT_UCONTEXT)
 #define SIMT_USES_UCONTEXT 1
 #include <ucontext.h>
@@ -48,6 +52,7 @@ namespace simt {
 
 constexpr unsigned kWarpSize = 32;
 constexpr size_t kStackSize = 128 << 10;
+constexpr size_t kMostThreads = 1024;
 constexpr unsigned char kPoison = 0xff;  // NaN as a float, -1 as an int
 
 struct Fiber {
@@ -96,7 +101,6 @@ struct Machine {
     unsigned arrived = 0, generation = 0;
     int count = 0, result = 0;
     char* stacks = nullptr;
-    size_t stack_count = 0;
     unsigned order_seed = 0;
 };
 
@@ -288,15 +292,16 @@ inline const char* run_grid(const unsigned* grid, const unsigned* block, std::fu
     m.grid_size = {grid[0], grid[1], grid[2]};
     m.block_size = {block[0], block[1], block[2]};
     m.kernel = std::move(kernel);
-    m.failure.clear();
     const size_t threads = size_t{block[0]} * block[1] * block[2];
-    if (threads == 0 || threads > 1024) return "a block has 1 to 1024 threads";
-    if (m.stack_count < threads) {
-        if (m.stacks) munmap(m.stacks, m.stack_count * kStackSize);
-        m.stacks = static_cast<char*>(mmap(nullptr, threads * kStackSize, PROT_READ | PROT_WRITE,
+    if (threads == 0 || threads > kMostThreads) return "a block has 1 to 1024 threads";
+    // Never unmapped: AddressSanitizer goes on to guard what frames on them it has seen.
+    if (!m.stacks)
+        m.stacks = static_cast<char*>(mmap(nullptr, kMostThreads * kStackSize, PROT_READ | PROT_WRITE,
                                            MAP_PRIVATE | MAP_ANONYMOUS | MAP_NORESERVE, -1, 0));
-        m.stack_count = threads;
-    }
+#ifdef __SANITIZE_ADDRESS__
+    if (!m.failure.empty()) __asan_unpoison_memory_region(m.stacks, kMostThreads * kStackSize);  // frames left behind
+#endif
+    m.failure.clear();
     for (unsigned z = 0; z < grid[2]; ++z)
         for (unsigned y = 0; y < grid[1]; ++y)
             for (unsigned x = 0; x < grid[0]; ++x) {

@@ -23,6 +23,7 @@ class Device:
         self._driver = _import_driver()
         check_driver(self._driver)
         self._architectures: dict[int, str] = {}
+        self._contexts: dict[int, Any] = {}
         self._modules: dict[tuple[int, Program], Any] = {}
         self._functions: dict[tuple[int, Program, str], Any] = {}
 
@@ -41,12 +42,24 @@ class Device:
             function = self._function(device, program, name)
         stream = torch.cuda.current_stream(device).cuda_stream
         driver = self._driver
-        (status,) = driver.cuLaunchKernel(function, *grid, *block, 0, stream, ctypes.addressof(parameters), 0)
+        arguments = (function, *grid, *block, 0, stream, ctypes.addressof(parameters), 0)
+        (status,) = driver.cuLaunchKernel(*arguments)
+        if status == driver.CUresult.CUDA_ERROR_INVALID_CONTEXT:
+            self._enter_context(device)
+            (status,) = driver.cuLaunchKernel(*arguments)
         if status != driver.CUresult.CUDA_SUCCESS:
             raise RuntimeError(f"launch of {name} ({program}): {status.name}")
 
+    def _enter_context(self, device: int) -> None:
+        """Make torch's context current in this thread: in those of autograd it may not be so yet."""
+        if device not in self._contexts:
+            self._contexts[device] = self._checked(self._driver.cuDevicePrimaryCtxRetain(device), "context")
+        (status,) = self._driver.cuCtxSetCurrent(self._contexts[device])
+        if status != self._driver.CUresult.CUDA_SUCCESS:
+            raise RuntimeError(f"context of device {device}: {status.name}")
+
     def _function(self, device: int, program: Program, name: str) -> Any:
-        torch.cuda.current_stream(device).query()  # makes torch's context the current one
+        self._enter_context(device)
         module = self._modules.get((device, program))
         if module is None:
             if device not in self._architectures:
@@ -59,10 +72,10 @@ class Device:
         self._functions[device, program, name] = function
         return function
 
-    def _checked(self, result: tuple[Any, ...], program: Program) -> Any:
+    def _checked(self, result: tuple[Any, ...], what: Program | str) -> Any:
         status, value = result
         if status != self._driver.CUresult.CUDA_SUCCESS:
-            raise RuntimeError(f"{program}: {status.name}")
+            raise RuntimeError(f"{what}: {status.name}")
         return value
 
 

@@ -12,14 +12,16 @@ On a device the kernel goes to torch's current stream of the current device; not
 
 import ctypes
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Any, Protocol
 
+import torch
 from torch import Tensor
 
 from etsplat.cuda.program import Program
 
 Dim = int | tuple[int, ...]
+_NOWHERE_ELSE = nullcontext()
 
 
 class Backend(Protocol):
@@ -87,7 +89,15 @@ def launch(program: Program, name: str, grid: Dim, block: Dim, args: Sequence[An
         return
     values = [_argument(arg) for arg in args]
     pointers = (ctypes.c_void_p * len(values))(*(ctypes.addressof(value) for value in values))
-    backend().launch(program, name, grid, block, pointers)
+    with on_device_of(next((arg for arg in args if isinstance(arg, Tensor)), None)):
+        backend().launch(program, name, grid, block, pointers)
+
+
+def on_device_of(tensor: Tensor | None) -> AbstractContextManager[Any]:
+    """Within the block, launches go to the tensor's device; ``launch`` does so by itself for those that it is given."""
+    if tensor is None or not tensor.is_cuda or tensor.device.index == torch.cuda.current_device():
+        return _NOWHERE_ELSE
+    return torch.cuda.device(tensor.device)
 
 
 def blocks(count: int, size: int) -> int:
@@ -102,17 +112,27 @@ def _three(dim: Dim) -> tuple[int, int, int]:
 
 
 def _argument(value: Any) -> Any:
-    if value is None:
-        return ctypes.c_void_p(0)
-    if isinstance(value, Tensor):
-        assert value.is_contiguous(), "kernels get contiguous tensors only"
-        return ctypes.c_void_p(value.data_ptr())
-    if isinstance(value, bool):
-        return ctypes.c_bool(value)
-    if isinstance(value, int):
-        if not -(2**31) <= value < 2**31:
-            raise ValueError(f"{value} does not fit into an int: pass ctypes.c_int64")
-        return ctypes.c_int32(value)
-    if isinstance(value, float):
-        return ctypes.c_float(value)
-    return value
+    convert = _CONVERSIONS.get(type(value))
+    if convert is not None:
+        return convert(value)
+    return _pointer(value) if isinstance(value, Tensor) else value
+
+
+def _pointer(tensor: Tensor) -> ctypes.c_void_p:
+    assert tensor.is_contiguous(), "kernels get contiguous tensors only"
+    return ctypes.c_void_p(tensor.data_ptr())
+
+
+def _int(value: int) -> ctypes.c_int32:
+    if not -(2**31) <= value < 2**31:
+        raise ValueError(f"{value} does not fit into an int: pass ctypes.c_int64")
+    return ctypes.c_int32(value)
+
+
+_CONVERSIONS: dict[type, Any] = {
+    type(None): ctypes.c_void_p,
+    Tensor: _pointer,
+    bool: ctypes.c_bool,
+    int: _int,
+    float: ctypes.c_float,
+}

@@ -33,6 +33,11 @@ class Arena:
         """Address of an array, as an argument of kernels."""
         return ctypes.c_void_p(self._memory.data_ptr() + self._offsets[name])
 
+    def bytes(self, name: str, count: int) -> Tensor:
+        """The first ``count`` bytes of an array."""
+        begin = self._offsets[name]
+        return self._memory[begin : begin + count]
+
 
 class PendingNumber:
     """An int64 on its way from the device; work queued after this does not hold it up."""

@@ -1,5 +1,6 @@
 """Stable radix sort of (key, value) pairs on the device: host side of csrc/cuda/radix_sort.cu."""
 
+import ctypes
 from dataclasses import dataclass
 from typing import Any
 
@@ -52,16 +53,17 @@ class RadixSort:
         on_device, number = (None, count) if isinstance(count, int) else (count, 0)
         digit_bits = blocks(self.bits, self.passes)
         grid = blocks(self.capacity, _TILE)
-        histogram, tickets, states = zeros.split([self.passes * _DIGITS, self.passes, self.passes * _DIGITS * grid])
-        histogram_grid = min(grid, _HISTOGRAM_GRID)
-        arguments = [keys[0], on_device, number, self.passes, digit_bits, histogram]
-        launch(_PROGRAM, "radix_histogram", histogram_grid, _BLOCK, arguments)
+        # histograms, then a ticket counter and the look-back words of every pass
+        histogram = zeros.data_ptr()
+        ticket = histogram + 4 * self.passes * _DIGITS
+        state = ticket + 4 * self.passes
+        arguments = [keys[0], on_device, number, self.passes, digit_bits, ctypes.c_void_p(histogram)]
+        launch(_PROGRAM, "radix_histogram", min(grid, _HISTOGRAM_GRID), _BLOCK, arguments)
         source: Any = None
         for i in range(self.passes):
             here, there = i % 2, 1 - i % 2
-            counted = histogram[i * _DIGITS :]
-            state = states[i * _DIGITS * grid :]
+            words = (histogram + 4 * i * _DIGITS, state + 4 * i * _DIGITS * grid, ticket + 4 * i)
             arguments = [keys[here], source, keys[there], values[there], on_device, number, i * digit_bits, digit_bits]
-            launch(_PROGRAM, "radix_pass", grid, _BLOCK, [*arguments, counted, state, tickets[i:]])
+            launch(_PROGRAM, "radix_pass", grid, _BLOCK, [*arguments, *map(ctypes.c_void_p, words)])
             source = values[there]
         return keys[self.passes % 2], values[self.passes % 2]

@@ -8,6 +8,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from etsplat.core.rasterization import Rasterization, RasterizeSettings
+from etsplat.cuda.launch import on_device_of
 from etsplat.ops._raster_render_cuda import Geometry, Outputs, Plan, Render, channel_count, contiguous
 from etsplat.ops._rasterize_channels import Channels, finite_corners, median_depth
 
@@ -99,7 +100,8 @@ class _Rasterize(torch.autograd.Function):
         inputs = [contiguous(t) for t in (vertices, flat, corner, opacities, sigma, viewmats, Ks, backgrounds)]
         outputs = Outputs(plan, inputs)
         ctx.render = Render(plan, inputs, outputs, keep=any(ctx.needs_input_grad))
-        ctx.render.forward()
+        with on_device_of(vertices):
+            ctx.render.forward()
         plan.statistics = outputs.statistics
         ctx.save_for_backward(*inputs, outputs.color, outputs.alpha, outputs.distortion)
         ctx.mark_non_differentiable(outputs.median_triangle)
@@ -112,5 +114,6 @@ class _Rasterize(torch.autograd.Function):
         ctx: Any, *cotangents: Tensor | None
     ) -> tuple[Tensor | None, ...]:
         *inputs, _, _, _ = ctx.saved_tensors
-        grads = ctx.render.backward(inputs, [contiguous(g) for g in cotangents[:3]], ctx.needs_input_grad)
+        with on_device_of(inputs[0]):
+            grads = ctx.render.backward(inputs, [contiguous(g) for g in cotangents[:3]], ctx.needs_input_grad)
         return (*grads, None)

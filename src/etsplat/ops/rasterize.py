@@ -81,8 +81,9 @@ def rasterize(
         freeze_incentre: With distance "sdf", hold the inradius constant in the backward pass, as Triangle Splatting.
         cutoffs: Where compositing stops caring.
         validate: Raise on non-finite input, sigma <= 0 and malformed Ks; None means on the CPU. Without it a triangle
-            with such data is invisible and gets zero gradient.
-        engine: "reference", "cpu", or None: cpu for float32, reference for float64.
+            with such data, or on a GPU with a wrong index in ``faces``, is invisible and gets zero gradient.
+        engine: "reference", "cpu", "cuda", or None: cpu or cuda for float32, by the tensors' device, and reference for
+            float64.
 
     Returns:
         Images, channels last, in the dtype of ``vertices``; see ``Rasterization``.
@@ -92,7 +93,7 @@ def rasterize(
     """
     chosen = resolve_engine(engine, vertices)
     if not isinstance(sigma, Tensor):
-        sigma = torch.tensor(float(sigma), dtype=vertices.dtype, device=vertices.device)
+        sigma = torch.full((), float(sigma), dtype=vertices.dtype, device=vertices.device)
     settings = RasterizeSettings(
         width=width,
         height=height,
@@ -119,8 +120,10 @@ def rasterize(
         "backgrounds": backgrounds,
     }
     given = {name: tensor for name, tensor in floats.items() if tensor is not None}
-    _check_tensors(given, faces)
-    if validate or (validate is None and vertices.device.type == "cpu"):
+    # Looking at values on a GPU would mean to wait for it.
+    look = validate or (validate is None and vertices.device.type == "cpu")
+    _check_tensors(given, faces, look)
+    if look:
         _check_values(given)
     if chosen == "cpu":
         from etsplat.ops._rasterize_cpu import rasterize_cpu as run
@@ -148,7 +151,7 @@ def _check_settings(settings: RasterizeSettings) -> None:
         )
 
 
-def _check_tensors(given: dict[str, Tensor], faces: Tensor | None) -> None:
+def _check_tensors(given: dict[str, Tensor], faces: Tensor | None, look: bool) -> None:
     if ("colors" in given) == ("corner_colors" in given):
         got = "both" if "colors" in given else "neither"
         raise ValueError(f"exactly one of colors and corner_colors must be given, got {got}")
@@ -175,7 +178,8 @@ def _check_tensors(given: dict[str, Tensor], faces: Tensor | None) -> None:
         raise ValueError("colors must have at least one channel, got 0")
     if faces is not None:
         check_device("faces", faces, "vertices", given["vertices"])
-        check_indices("faces", faces, sizes["V"])
+        if look or faces.device.type == "cpu":
+            check_indices("faces", faces, sizes["V"])
 
 
 def _check_values(given: dict[str, Tensor]) -> None:

@@ -1,0 +1,77 @@
+#!/usr/bin/env bash
+# Everything that wants a GPU, on a machine with Python 3.12, a CUDA build of torch >= 2.11, nanobind, scikit-build-core and
+# ninja, and no network: builds, runs the tests marked cuda, compute-sanitizer, the benchmarks and one full-size
+# reconstruction; prints a short table last. A step that fails does not stop the others.
+#
+#   benchmarks/gpu_run.sh              all steps, about ten minutes on an H100
+#   benchmarks/gpu_run.sh test bench   some of: build test sanitize bench reconstruct
+#
+#   PYTHON=python3.12    the interpreter that has torch
+#   WHEELS=folder        wheels of packages that it lacks (nanobind-backend, tyro, trimesh, hypothesis, ...)
+#   OUT=build/gpu        logs; results go to benchmarks/results
+set -uo pipefail
+cd "$(dirname "$0")/.."
+
+PYTHON=${PYTHON:-python3}
+OUT=${OUT:-build/gpu}
+SITE=$PWD/build/gpu/site
+mkdir -p "$OUT" "$SITE"
+export PYTHONPATH=$SITE PYTHONUNBUFFERED=1 ETSPLAT_CACHE_DIR=$PWD/build/gpu/kernels
+steps=("$@")
+[ $# -gt 0 ] || steps=(build test sanitize bench reconstruct)
+summary=()
+
+step() { # name, seconds, command...
+    local name=$1 limit=$2 begin=$SECONDS status
+    shift 2
+    echo "== $name"
+    timeout "$limit" "$@" > >(tee "$OUT/$name.log") 2>&1
+    status=$?
+    summary+=("$(printf '%-28s %-9s %4d s' "$name" "$([ $status -eq 0 ] && echo ok || echo "exit $status")" $((SECONDS - begin)))")
+    return $status
+}
+
+pip_target=("$PYTHON" -m pip --disable-pip-version-check install --quiet --no-index --no-deps --upgrade --target "$SITE")
+pytest_cuda=("$PYTHON" -m pytest -p no:cacheprovider)
+
+build() {
+    [ -z "${WHEELS:-}" ] || step wheels 120 "${pip_target[@]}" "$WHEELS"/*.whl || return
+    step build 420 "${pip_target[@]}" --no-build-isolation .
+}
+
+run_tests() { step tests 540 "${pytest_cuda[@]}" -m cuda tests; }
+
+# Small scenes: memcheck makes a kernel some fifty times slower, racecheck more.
+sanitize() {
+    local tool
+    if ! command -v compute-sanitizer >/dev/null; then
+        summary+=("compute-sanitizer is not installed")
+        return
+    fi
+    for tool in memcheck racecheck; do
+        step "$tool" 540 compute-sanitizer --tool "$tool" --error-exitcode 1 "${pytest_cuda[@]}" \
+            -m "cuda and sanitize" tests/test_rasterize_cuda.py tests/test_cuda_sort.py
+    done
+}
+
+bench() { step bench 540 "$PYTHON" -m benchmarks.gpu; }
+
+etsplat=("$PYTHON" -c 'import sys; from etsplat.cli import main; sys.exit(main())')
+reconstruct() { step reconstruct 540 "${etsplat[@]}" demo --device cuda --out "$OUT/reconstruct" --overwrite; }
+
+for name in "${steps[@]}"; do
+    case $name in
+        build) build ;;
+        test) run_tests ;;
+        sanitize) sanitize ;;
+        bench) bench ;;
+        reconstruct) reconstruct ;;
+        *) echo "no step $name: choose from build test sanitize bench reconstruct" >&2; exit 2 ;;
+    esac
+done
+
+echo
+echo "== summary, $(date -u +%Y-%m-%d), $(nvidia-smi --query-gpu=name,driver_version --format=csv,noheader 2>/dev/null || echo 'no GPU')"
+printf '%s\n' "${summary[@]}"
+grep -hE "forward|backward" "$OUT/bench.log" 2>/dev/null | grep -E "sphere|soup" | tail -12
+grep -hE "passed|failed" "$OUT"/tests.log 2>/dev/null | tail -1

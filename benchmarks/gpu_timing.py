@@ -1,0 +1,120 @@
+"""Times of a scene on a GPU by events, eager and in a captured graph, and the work counted from its buffers."""
+
+import statistics
+import sys
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from benchmarks.gpu_floors import Work
+from benchmarks.gpu_scenes import GpuScene
+from etsplat.cuda.launch import use_backend
+from etsplat.ops._raster_capacity import repair_overflow
+from etsplat.ops._raster_render_cuda import TILE, Render
+
+WARM_UP = 5
+
+
+def step(scene: GpuScene) -> None:
+    """Forward and backward."""
+    for leaf in scene.leaves:
+        leaf.grad = None
+    scene.render().color.backward(scene.cotangent)
+
+
+def forward(scene: GpuScene) -> None:
+    with torch.no_grad():
+        scene.render()
+
+
+def event_times(run: Callable[[], Any], repeats: int) -> dict[str, float]:
+    """Median and quartiles in milliseconds of single calls, each between two events."""
+    for _ in range(WARM_UP):
+        run()
+    times = []
+    for _ in range(repeats):
+        begin, end = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
+        begin.record()
+        run()
+        end.record()
+        end.synchronize()
+        times.append(begin.elapsed_time(end))
+    low, median, high = statistics.quantiles(times, n=4)
+    return {"median": median, "low": low, "high": high}
+
+
+def captured(scene: GpuScene) -> torch.cuda.CUDAGraph:
+    """The step as a graph, after it ran often enough for every kernel and capacity to be known."""
+    side = torch.cuda.Stream()
+    side.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(side):
+        for _ in range(WARM_UP):
+            step(scene)
+    torch.cuda.current_stream().wait_stream(side)
+    for leaf in scene.leaves:
+        leaf.grad = None
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        step(scene)
+    graph.replay()
+    if repair_overflow(scene.vertices.device):
+        return captured(scene)
+    return graph
+
+
+def kernel_times(run: Callable[[], Any], repeats: int) -> dict[str, float]:
+    """Milliseconds per call of ``run`` that each kernel takes, by torch's profiler."""
+    run()
+    torch.cuda.synchronize()
+    with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CUDA]) as profile:
+        for _ in range(repeats):
+            run()
+        torch.cuda.synchronize()
+    return {event.key: event.device_time_total / 1e3 / repeats for event in profile.key_averages()}
+
+
+def measure(scene: GpuScene, repeats: int) -> dict[str, Any]:
+    """Everything about one scene, as plain data."""
+    milliseconds = {
+        "forward": event_times(lambda: forward(scene), repeats),
+        "forward + backward": event_times(lambda: step(scene), repeats),
+    }
+    work = count(scene)
+    kernels = kernel_times(lambda: step(scene), min(repeats, 20))
+    milliseconds["forward + backward, captured graph"] = event_times(captured(scene).replay, repeats)
+    return {"milliseconds": milliseconds, "work": asdict(work), "kernels": kernels}
+
+
+def count(scene: GpuScene) -> Work:
+    """The work of one step."""
+    out = scene.render()
+    out.color.backward(scene.cotangent)
+    render: Render = out.color.grad_fn.render  # type: ignore[union-attr]
+    slots = int(render.zeros[2 + 2 * -(-len(scene.opacities) // 1024)].item())
+    hits = render.state.bytes("hits", slots)
+    bits = sum(((hits >> bit) & 1).sum(dtype=torch.int64) for bit in range(8))
+    visible = render.state.bytes("spans", 8 * len(scene.opacities)).view(torch.int32).view(-1, 2)[:, 1] != 0
+    batch, height, width, channels = scene.cotangent.shape
+    return Work(
+        triangles=len(scene.opacities),
+        visible=int(visible.sum()),
+        vertices=0 if scene.faces is None else len(scene.vertices),
+        slots=slots,
+        hit_slots=int((hits != 0).sum()),
+        hit_pairs=int(bits),
+        pixels=batch * height * width,
+        tiles=batch * -(-height // TILE) * -(-width // TILE),
+        channels=channels,
+    )
+
+
+def count_without_gpu(scene: GpuScene) -> Work:
+    """The same numbers by the tests' SIMT shim."""
+    sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
+    from simt.build import Simt
+
+    with use_backend(Simt()):
+        return count(scene)
