@@ -9,7 +9,7 @@ from scipy.ndimage import correlate
 
 from etsplat.core.errors import InputError
 from etsplat.metrics import image as image_metrics
-from etsplat.metrics.image import Lpips, find_lpips_weights, psnr, ssim
+from etsplat.metrics.image import Lpips, find_lpips_weights, psnr, silhouette_iou, ssim
 
 
 @pytest.fixture
@@ -30,6 +30,15 @@ def weights():
         random = torch.randn(value.shape, generator=generator)
         entries[key] = random.abs() if key.startswith("lin") else random * (2 / max(value[0].numel(), 1)) ** 0.5
     return entries
+
+
+def test_silhouette_iou_counts_pixels_covered_by_half() -> None:
+    """Two of four covered pixels in common; equal and empty silhouettes give 1."""
+    ours = torch.tensor([[1.0, 0.6, 0.5], [0.4, 0.0, 0.0]])
+    theirs = torch.tensor([[1.0, 0.5, 0.0], [1.0, 0.0, 0.0]])
+    assert silhouette_iou(ours, theirs) == 0.5
+    assert silhouette_iou(ours, ours) == 1.0
+    assert silhouette_iou(torch.zeros(2, 2), torch.zeros(2, 2)) == 1.0
 
 
 def test_psnr_is_minus_10_log10_of_the_mean_squared_error(pair):

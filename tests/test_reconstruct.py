@@ -255,8 +255,13 @@ def test_views_can_be_handed_over(pebble: MeshFile, tmp_path: Path) -> None:
 
 @pytest.mark.shared_data
 def test_a_scene_folder_is_reconstructed(shared_data: Path, tmp_path: Path) -> None:
-    """NeRF-synthetic lego at 64 x 64: the silhouette is found, and the exported mesh draws like the splats."""
-    metrics = reconstruct(shared_data / "scenes" / "lego_blender", tmp_path, TINY).metrics
+    """NeRF-synthetic lego at 64 x 64: a closed mesh with about its outline, which draws like the splats."""
+    result = reconstruct(shared_data / "scenes" / "lego_blender", tmp_path, TINY)
+    metrics = result.metrics
+    assert metrics["silhouette_iou"] > 0.85
+    topology = MeshTopology.from_faces(result.mesh.faces, len(result.mesh.vertices))
+    assert topology.is_closed()
+    assert topology.is_manifold()
     assert metrics["psnr"] > 17
     assert metrics["psnr_mesh"] > metrics["psnr"] - 2
 

@@ -32,6 +32,7 @@ METRICS = {
     "f_score": 0.987,
     "psnr": 38.21,
     "psnr_mesh": 37.5,
+    "silhouette_iou": 0.981,
     "ssim": 0.9912,
     "lpips": None,
     "lpips_reason": "no weights: give --lpips-weights FILE",

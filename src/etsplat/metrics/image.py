@@ -45,6 +45,13 @@ def psnr(image: Float[Tensor, "H W C"], truth: Float[Tensor, "H W C"]) -> float:
     return math.inf if error == 0 else -10 * math.log10(error)
 
 
+def silhouette_iou(coverage: Float[Tensor, "H W"], truth: Float[Tensor, "H W"]) -> float:
+    """Intersection over union of two silhouettes: pixels that are covered by at least half. 1 where both are empty."""
+    ours, theirs = coverage >= 0.5, truth >= 0.5
+    union = int((ours | theirs).sum())
+    return int((ours & theirs).sum()) / union if union else 1.0
+
+
 def ssim(image: Float[Tensor, "H W C"], truth: Float[Tensor, "H W C"], *, interior: bool = False) -> float:
     """Structural similarity (Wang et al. 2004): 11x11 Gaussian window of sigma 1.5, C1 = 0.01^2, C2 = 0.03^2, peak 1.
 

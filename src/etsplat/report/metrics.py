@@ -24,6 +24,7 @@ def describe(metrics: dict[str, Any]) -> list[Metric]:
         number_card(metrics, "psnr_mesh", "PSNR of the mesh", "dB", fixed(2), _PSNR_MESH, "no test views"),
         number_card(metrics, "f_score", "F-score at 0.005", "%", _percent, _F_SCORE, no_mesh),
         number_card(metrics, "chamfer_exact", "Exact Chamfer", "× 10⁻³", _thousandths, _EXACT, no_mesh),
+        number_card(metrics, "silhouette_iou", "Silhouette IoU", "%", _percent, _IOU, "no masks, or no test views"),
         number_card(metrics, "ssim", "SSIM", "", fixed(4), _SSIM, "no test views"),
         number_card(metrics, "lpips", "LPIPS", "", fixed(4), _LPIPS, metrics.get("lpips_reason") or "no weights"),
         Metric("Mesh", f"{metrics['faces']:,}", "faces", _mesh_meaning(metrics)),
@@ -46,6 +47,10 @@ _F_SCORE = (
 _EXACT = (
     "The Chamfer distance measured from sampled points to the other surface itself instead of to its samples: without "
     "the sampling floor. Lower is better."
+)
+_IOU = (
+    "Pixels of the test views that the mesh and the object both cover, over those that either covers (at least half of "
+    "the pixel); mean over views. 100 % is the same outline."
 )
 _SSIM = "Structural similarity on the test views: 11 × 11 Gaussian window, σ 1.5, zero padding. 1 is identical."
 _LPIPS = "Learned perceptual distance (VGG16) on the test views. Lower is better."

@@ -11,7 +11,7 @@ from torch import Tensor
 from etsplat.geometry.intersections import count_degenerate_faces, count_self_intersections
 from etsplat.io.images import save_image
 from etsplat.metrics.geometry import chamfer, geometry_metrics, sample_pair
-from etsplat.metrics.image import Lpips, find_lpips_weights, psnr, ssim
+from etsplat.metrics.image import Lpips, find_lpips_weights, psnr, silhouette_iou, ssim
 from etsplat.scene.mesh_rendering import render_exported, render_mesh
 from etsplat.scene.triangle_mesh import TriangleMesh
 from etsplat.tasks.reconstruct_config import ReconstructConfig
@@ -31,6 +31,7 @@ class Scorer:
             InputError: `config.lpips_weights` is given and cannot be used.
         """
         self._views = subject.views
+        self._has_masks = subject.views.has_masks
         self._truth = subject.truth
         self._config = config
         # Now rather than after the run, so that a file that cannot be used is found before hours are spent.
@@ -80,12 +81,15 @@ class Scorer:
         }
 
     def _images(self, mesh: TriangleMesh, folder: Path) -> dict[str, Any]:
-        scores: dict[str, list[float]] = {"psnr": [], "psnr_mesh": [], "ssim": [], "lpips": []}
+        scores: dict[str, list[float]] = {"psnr": [], "psnr_mesh": [], "ssim": [], "lpips": [], "silhouette_iou": []}
         for number, view in enumerate(self._views.test):
-            photo, splatted, opaque = self._photo(view), self._splatted(mesh, view), self._opaque(mesh, view)
+            photo, splatted, covered = self._photo(view), self._splatted(mesh, view), self._opaque(mesh, view)
+            opaque = covered[..., :3]
             scores["psnr"].append(psnr(splatted, photo))
             scores["psnr_mesh"].append(psnr(opaque, photo))
             scores["ssim"].append(ssim(splatted, photo))
+            if self._has_masks:
+                scores["silhouette_iou"].append(silhouette_iou(covered[..., 3], self._views.images[view, ..., 3]))
             if self._lpips is not None:
                 scores["lpips"].append(float(self._lpips(splatted, photo)))
             for kind, image in (("truth", photo), ("render", splatted), ("mesh", opaque)):
@@ -100,12 +104,12 @@ class Scorer:
     def _splatted(self, mesh: TriangleMesh, view: int) -> Float[Tensor, "H W 3"]:
         return render_mesh(mesh, self._views.cameras[view], self._config.appearance)[0].clamp(0.0, 1.0)
 
-    def _opaque(self, mesh: TriangleMesh, view: int) -> Float[Tensor, "H W 3"]:
+    def _opaque(self, mesh: TriangleMesh, view: int) -> Float[Tensor, "H W 4"]:
         config = self._config
         image = render_exported(
             mesh, self._views.cameras[view], supersampling=config.supersampling, engine=config.engine
         )
-        return image[0, ..., :3]
+        return image[0]
 
 
 def _mean(values: list[float]) -> float:
