@@ -1,7 +1,9 @@
 """The loop: which events come when, what stops it, and that it stops only between iterations."""
 
+import math
 import signal
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -23,17 +25,21 @@ SETTINGS = LoopSettings(iterations=10, log_every=4, evaluate_every=5, checkpoint
 
 
 class Counting:
-    """A problem whose loss is the iteration; it refines at iteration 3."""
+    """A problem whose loss is the iteration; it refines at iteration 3, and makes up to `at_a_time` steps together."""
 
-    def __init__(self) -> None:
+    def __init__(self, at_a_time: int = 1) -> None:
         self.count = 20
         self.done: list[str] = []
         self.finite = True
         self.on_step: Callable[[int], float] = float
+        self.at_a_time = at_a_time
 
-    def step(self, iteration: int) -> float:
-        self.done.append(f"step {iteration}")
-        return self.on_step(iteration)
+    def advance(self, first: int, last: int) -> list[float]:
+        last = min(last, first + self.at_a_time - 1)
+        if first <= 3:
+            last = min(last, 3)
+        self.done.append(f"step {first}" if first == last else f"steps {first} to {last}")
+        return [self.on_step(iteration) for iteration in range(first, last + 1)]
 
     def refine(self, iteration: int) -> int:
         self.done.append(f"refine {iteration}")
@@ -75,6 +81,23 @@ def test_the_logged_loss_is_the_mean_since_the_last_log(tmp_path: Path) -> None:
     assert [event.loss for event in steps] == [2.5, 5.0, 7.0, 9.5]
     assert [event.state["faces"] for event in steps] == [30] * 4
     assert [event.metrics for event in steps] == [{}, {"psnr": 30.0}, {}, {"psnr": 30.0}]
+
+
+def test_steps_made_together_yield_the_same_events(tmp_path: Path) -> None:
+    """Steps on a device run on up to the next iteration with a refinement, log, evaluation or checkpoint."""
+    problem = Counting(at_a_time=100)
+    events = [replace(e, seconds=0) for e in events_of(problem, tmp_path) if hasattr(e, "seconds")]
+    assert events == [replace(e, seconds=0) for e in events_of(Counting(), tmp_path) if hasattr(e, "seconds")]
+    steps = [done for done in problem.done if done.startswith("step")]
+    assert steps == ["steps 1 to 3", "step 4", "step 5", "step 6", "steps 7 to 8", "steps 9 to 10"]
+
+
+def test_a_loss_among_many_is_named_by_its_iteration(tmp_path: Path) -> None:
+    """Of the steps 7 and 8, made together, the second has a loss that is not finite."""
+    problem = Counting(at_a_time=100)
+    problem.on_step = lambda iteration: math.nan if iteration == 8 else 1.0
+    with pytest.raises(DivergedError, match="the loss is nan at iteration 8"):
+        events_of(problem, tmp_path)
 
 
 def test_a_continued_loop_yields_the_rest(tmp_path: Path) -> None:

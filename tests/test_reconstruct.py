@@ -349,16 +349,16 @@ def test_a_run_that_diverges_names_the_iteration_and_the_checkpoint(
     pebble: MeshFile, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A vertex that becomes NaN after iteration 13 is found at the next log, and no checkpoint holds it."""
-    step = MeshFitting.step
+    advance = MeshFitting.advance
 
-    def poisoned(self: MeshFitting, iteration: int) -> float:
-        loss = step(self, iteration)
+    def poisoned(self: MeshFitting, iteration: int, last: int) -> list[float]:
+        losses = advance(self, iteration, last)
         if iteration == 13:
             with torch.no_grad():
                 self.mesh.colors[0] = float("nan")
-        return loss
+        return losses
 
-    monkeypatch.setattr(MeshFitting, "step", poisoned)
+    monkeypatch.setattr(MeshFitting, "advance", poisoned)
     with pytest.raises(DivergedError, match=r"iteration 1[45].*step_000010") as error:
         reconstruct(pebble, tmp_path, SHORT)
     assert "\n" not in str(error.value)

@@ -134,15 +134,15 @@ def test_nan_names_iteration_parameter_and_checkpoint(
     capture: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A parameter that is not finite stops the run with one line that says all three."""
-    honest = SoupFitting.step
+    honest = SoupFitting.advance
 
-    def poisoned(self: SoupFitting, iteration: int) -> float:
-        loss = honest(self, iteration)
+    def poisoned(self: SoupFitting, iteration: int, last: int) -> list[float]:
+        losses = honest(self, iteration, last)
         if iteration == 25:
             self.soup.sigma_raw.data[7] = float("nan")
-        return loss
+        return losses
 
-    monkeypatch.setattr(SoupFitting, "step", poisoned)
+    monkeypatch.setattr(SoupFitting, "advance", poisoned)
     with pytest.raises(DivergedError) as error:
         train(capture, tmp_path / "run", SHORT)
     message = str(error.value)

@@ -12,7 +12,7 @@ namespace {
 constexpr int32_t kRows = 16;  // of a band
 
 struct Point {
-    double x, y;
+    double at[2];  // x, y
     bool drawn;
 };
 
@@ -26,15 +26,12 @@ std::vector<Point> project_vertices(const AntialiasInput& in) {
             double view[3];
             to_camera(camera, world, view);
             Point& q = points[v];
-            project(camera, view, q.x, q.y);
-            q.drawn = view[2] > static_cast<double>(in.camera.near_plane) && std::isfinite(q.x) && std::isfinite(q.y);
+            project(camera, view, q.at[0], q.at[1]);
+            q.drawn = view[2] > static_cast<double>(in.camera.near_plane) && std::isfinite(q.at[0]) &&
+                      std::isfinite(q.at[1]);
         }
     });
     return points;
-}
-
-double side(const Point& a, const Point& b, const Point& p) {
-    return (b.x - a.x) * (p.y - a.y) - (p.x - a.x) * (b.y - a.y);
 }
 
 // Bit k of a face: its edge from corner k to k + 1 is a silhouette, that is, no face across it lies on the other side.
@@ -52,8 +49,8 @@ std::vector<uint8_t> find_silhouettes(const AntialiasInput& in, const std::vecto
                     for (int j = 0; j < 3; ++j) {
                         const int32_t p = other[j], q = other[(j + 1) % 3];
                         if ((p != a || q != b) && (p != b || q != a)) continue;
-                        const double here = side(points[a], points[b], points[own[(k + 2) % 3]]);
-                        const double there = side(points[a], points[b], points[other[(j + 2) % 3]]);
+                        const double here = side_of(points[a].at, points[b].at, points[own[(k + 2) % 3]].at);
+                        const double there = side_of(points[a].at, points[b].at, points[other[(j + 2) % 3]].at);
                         if (here * there < 0.0) found &= ~(1 << k);
                     }
                 }
@@ -91,25 +88,15 @@ public:
 private:
     bool add(const int32_t* ends, int axis, double along, double across, bool forward, int32_t first, int32_t second,
              std::vector<Blend>& blends) const {
-        const Point &a = points_[ends[0]], &b = points_[ends[1]];
-        const double a_across = axis == 0 ? a.y : a.x, b_across = axis == 0 ? b.y : b.x;
-        if ((a_across <= across) == (b_across <= across)) return false;
-        const Crossing<double> c =
-            crossing(axis == 0 ? a.x : a.y, a_across, axis == 0 ? b.x : b.y, b_across, across);
-        const double reach = forward ? c.position - along : along - c.position;  // from the nearer triangle's pixel
-        if (!(std::abs(c.slope) <= 1.0 && reach >= 0.0 && reach <= 1.0)) return false;
-        const bool overruns = reach > 0.5;  // into the other pixel's half
-        const double sign = overruns == forward ? 1.0 : -1.0;
-        double derivative[4];
-        crossing_derivative(c, derivative);
+        SilhouetteBlend found;
+        if (!silhouette_blend(points_[ends[0]].at, points_[ends[1]].at, axis, along, across, forward, found)) return false;
         Blend blend;
-        blend.to = overruns == forward ? second : first;
-        blend.from = overruns == forward ? first : second;
-        blend.weight = static_cast<float>(std::abs(reach - 0.5));
+        blend.to = found.into_second ? second : first;
+        blend.from = found.into_second ? first : second;
+        blend.weight = found.weight;
         for (int end = 0; end < 2; ++end) {
             blend.vertex[end] = ends[end];
-            blend.derivative[end][axis] = static_cast<float>(sign * derivative[2 * end]);
-            blend.derivative[end][1 - axis] = static_cast<float>(sign * derivative[2 * end + 1]);
+            for (int i = 0; i < 2; ++i) blend.derivative[end][i] = found.derivative[end][i];
         }
         blends.push_back(blend);
         return true;

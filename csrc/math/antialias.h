@@ -32,6 +32,40 @@ ETSPLAT_FN void crossing_derivative(const Crossing<T>& c, T* derivative) {
     derivative[3] = T(0.0f) - c.fraction * c.slope;
 }
 
+// On which side of the line from a to b the point p lies, by its sign.
+ETSPLAT_FN double side_of(const double* a, const double* b, const double* p) {
+    return (b[0] - a[0]) * (p[1] - a[1]) - (p[0] - a[0]) * (b[1] - a[1]);
+}
+
+// What a silhouette does between a pixel and its neighbour at the right (axis 0) or below (axis 1).
+struct SilhouetteBlend {
+    bool into_second;        // the second pixel gets weight (colour of the first - its own), or the other way round
+    float weight;
+    float derivative[2][2];  // of the weight by the screen x, y of the silhouette's ends
+};
+
+// For the silhouette from a to b of the nearer triangle, which the first pixel sees if `forward`. `along` is where the
+// nearer triangle's pixel has its centre, along the axis, `across` where both have it across. False if it does nothing.
+ETSPLAT_FN bool silhouette_blend(const double* a, const double* b, int axis, double along, double across, bool forward,
+                                 SilhouetteBlend& blend) {
+    const int other = 1 - axis;
+    if ((a[other] <= across) == (b[other] <= across)) return false;
+    const Crossing<double> c = crossing(a[axis], a[other], b[axis], b[other], across);
+    const double reach = forward ? c.position - along : along - c.position;  // from the nearer triangle's pixel
+    if (!(c.slope <= 1.0 && c.slope >= -1.0 && reach >= 0.0 && reach <= 1.0)) return false;
+    const bool overruns = reach > 0.5;  // into the other pixel's half
+    const double sign = overruns == forward ? 1.0 : -1.0;
+    double derivative[4];
+    crossing_derivative(c, derivative);
+    blend.into_second = overruns == forward;
+    blend.weight = static_cast<float>(overruns ? reach - 0.5 : 0.5 - reach);
+    for (int end = 0; end < 2; ++end) {
+        blend.derivative[end][axis] = static_cast<float>(sign * derivative[2 * end]);
+        blend.derivative[end][other] = static_cast<float>(sign * derivative[2 * end + 1]);
+    }
+    return true;
+}
+
 // A triangle as seen from the camera's centre: its barycentrics at the pixel with ray r are b = beta / sum(beta), where
 // V beta = r and V has the corners, relative to the centre, as columns. Row k of V^-1:
 template <class T>

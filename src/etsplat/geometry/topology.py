@@ -4,7 +4,7 @@ Everything comes from one stable sort of the 3F half-edges. Half-edge 3f + k run
 of face f; all half-edges with the same two ends are one edge, whichever way they run.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -80,6 +80,12 @@ class MeshTopology:
             neighbor_offsets=neighbor_offsets,
             neighbor_indices=neighbor_indices,
         )
+
+    def to(self, device: torch.device) -> "MeshTopology":
+        """The same connectivity on another device."""
+        if self.faces.device == device:
+            return self
+        return replace(self, **{name: a.to(device) for name, a in vars(self).items() if isinstance(a, Tensor)})
 
     @property
     def num_faces(self) -> int:

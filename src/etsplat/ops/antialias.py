@@ -22,6 +22,7 @@ from torch import Tensor
 
 from etsplat import _native
 from etsplat.core.validation import check_device, check_intrinsics, check_like, check_shape
+from etsplat.ops._antialias_cuda import AntialiasCuda
 from etsplat.ops._antialias_reference import antialias_reference
 from etsplat.ops.engines import resolve_engine
 from etsplat.ops.mesh_energies import MeshConnectivity
@@ -56,10 +57,10 @@ def rasterize_antialiased(
         vertex_colors: (V, C), interpolated perspective-correctly.
         backgrounds: (B, C); None is black.
         near_plane: Triangles with a vertex at this depth or nearer are dropped; > 0.
-        engine: "cpu", "reference" or None (by dtype and device).
+        engine: "cpu", "cuda", "reference" or None (by dtype and device).
 
     Returns:
-        (B, H, W, C). The native engine's image and gradients are the same bits for any number of threads.
+        (B, H, W, C). The native engines' images and gradients are the same bits in every run.
 
     Raises:
         ValueError: Wrong shape, dtype or device; the message names the argument.
@@ -73,9 +74,11 @@ def rasterize_antialiased(
         vertices, viewmats, Ks, width, height, faces=connectivity.faces, near_plane=near_plane, engine=engine
     )
     per_face = face_colors is not None
-    if resolve_engine(engine, vertices) == "cpu":
+    chosen = resolve_engine(engine, vertices)
+    if chosen != "reference":
+        native = AntialiasCuda if chosen == "cuda" else _Antialias
         view = (viewmats.detach().contiguous(), Ks.detach().contiguous(), near_plane, width, height)
-        image: Any = _Antialias.apply(vertices, colors, backgrounds, per_face, connectivity, view, seen)
+        image: Any = native.apply(vertices, colors, backgrounds, per_face, connectivity, view, seen)
         return image
     images = [
         antialias_reference(
@@ -108,7 +111,8 @@ def _check(
     check_device("connectivity", connectivity.faces, "vertices", vertices)
     check_shape("viewmats", viewmats, ("B", 4, 4))
     check_shape("Ks", Ks, (len(viewmats), 3, 3))
-    check_intrinsics("Ks", Ks)
+    if Ks.device.type == "cpu":  # reading them would wait for a GPU
+        check_intrinsics("Ks", Ks)
     if (face_colors is None) == (vertex_colors is None):
         raise ValueError("exactly one of face_colors and vertex_colors must be given")
     for name, colors, count in (

@@ -7,11 +7,10 @@ import torch
 from torch import Tensor
 
 from etsplat import _native
-from etsplat.cuda.launch import device_type
+from etsplat.core.errors import EngineUnavailableError, InputError
+from etsplat.cuda.launch import backend, device_type
 
 ENGINES = ("reference", "cpu", "cuda")
-
-_deterministic = False
 
 
 def resolve_engine(engine: str | None, tensor: Tensor) -> str:
@@ -42,15 +41,31 @@ def resolve_engine(engine: str | None, tensor: Tensor) -> str:
     return engine
 
 
-def is_deterministic() -> bool:
-    """Whether engine cuda gives the same bits in every run; engine cpu always does."""
-    return _deterministic
+def resolve_device(device: str | None, engine: str | None) -> torch.device:
+    """Where a task runs.
 
+    Args:
+        device: "cpu", "cuda", or None: where `engine` computes; if that is None too, on a GPU if there is one that
+            engine cuda can use.
+        engine: as of `resolve_engine`.
 
-def set_deterministic(wanted: bool) -> None:
-    """Make engine cuda give the same bits in every run, or let it add gradients in any order, which is faster."""
-    global _deterministic
-    _deterministic = wanted
+    Raises:
+        EngineUnavailableError: It needs a GPU, and something is missing; the message says what.
+        InputError: `device` and `engine` exclude each other.
+    """
+    if {device, engine} == {"cpu", "cuda"}:
+        raise InputError(f"engine: {engine} does not compute on device {device}; leave one of them out")
+    if device == "cpu" or (device is None and engine in ("cpu", "reference")):
+        return torch.device("cpu")
+    if device is None and engine is None:
+        if not torch.cuda.is_available():
+            return torch.device("cpu")
+        try:
+            backend()
+        except EngineUnavailableError:
+            return torch.device("cpu")
+    backend()
+    return torch.device(device_type())
 
 
 def num_threads() -> int:

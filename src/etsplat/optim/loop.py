@@ -112,8 +112,15 @@ class Problem(Protocol):
         """A few numbers about the present state for the log, by name. Changes nothing."""
         ...
 
-    def step(self, iteration: int) -> float:
-        """Makes one optimizer step and returns the loss before it."""
+    def advance(self, first: int, last: int) -> list[float]:
+        """Makes the optimizer steps of iteration `first` and of as many as it likes up to `last`.
+
+        Nothing else is asked before, so steps on a device can follow each other without the host. It must not pass an
+        iteration at which `refine` has something to do.
+
+        Returns:
+            The loss before each step made; one that is not finite ends them.
+        """
         ...
 
     def refine(self, iteration: int) -> int:
@@ -187,7 +194,7 @@ def optimize(
     """
     with _deferred_interrupt() as interrupted:
         while progress.iteration < settings.iterations:
-            added = _advance(problem, progress, folder)
+            added = _advance(problem, progress, _next_stop(settings, progress.iteration), folder)
             iteration = progress.iteration
             last = iteration == settings.iterations
             evaluating = last or _due(iteration, settings.evaluate_every)
@@ -212,18 +219,23 @@ def optimize(
     yield DoneEvent(progress.iteration, progress.seconds)
 
 
-def _advance(problem: Problem, progress: Progress, folder: Path) -> int:
+def _advance(problem: Problem, progress: Progress, stop: int, folder: Path) -> int:
     start = time.perf_counter()
-    iteration = progress.iteration + 1
-    loss = problem.step(iteration)
-    if not math.isfinite(loss):
-        raise DivergedError(f"the loss is {loss} at iteration {iteration}; {_what_is_left(folder)}")
-    added = problem.refine(iteration)
-    progress.iteration = iteration
-    progress.loss_sum += loss
-    progress.loss_count += 1
+    for loss in problem.advance(progress.iteration + 1, stop):
+        progress.iteration += 1
+        if not math.isfinite(loss):
+            raise DivergedError(f"the loss is {loss} at iteration {progress.iteration}; {_what_is_left(folder)}")
+        progress.loss_sum += loss
+        progress.loss_count += 1
+    added = problem.refine(progress.iteration)
     progress.seconds += time.perf_counter() - start
     return added
+
+
+def _next_stop(settings: LoopSettings, iteration: int) -> int:
+    """The next iteration after which something is logged, evaluated or saved."""
+    every = (settings.log_every, settings.evaluate_every, settings.checkpoint_every)
+    return min(settings.iterations, *((iteration // n + 1) * n for n in every if n > 0))
 
 
 def _step_event(problem: Problem, settings: LoopSettings, progress: Progress, metrics: dict[str, float]) -> StepEvent:

@@ -35,7 +35,7 @@ def mesh_objective(
     backgrounds: Float[Tensor, "B 3"],
     mesh: TriangleMesh,
     weights: MeshWeights,
-    gamma: float,
+    gamma: float | Float[Tensor, ""],
     *,
     engine: str | None = None,
 ) -> Float[Tensor, ""]:
@@ -50,14 +50,14 @@ def mesh_objective(
         backgrounds: (B, 3).
         mesh: whose geometry and softness are regularized.
         weights: lambda_e, lambda_n, lambda_lap, lambda_sigma and the exponent of L_e.
-        gamma: global weight of the regularizers; at 0 they are not computed.
-        engine: "reference", "cpu" or None for the one that suits the tensors.
+        gamma: global weight of the regularizers; at the number 0 they are not computed.
+        engine: "reference", "cpu", "cuda" or None for the one that suits the tensors.
 
     Returns:
         Scalar, differentiable with respect to `color` and the mesh's parameters.
     """
     photometric = l1_over_background(color, target, backgrounds, engine=engine)
-    if gamma == 0.0:
+    if not isinstance(gamma, Tensor) and gamma == 0.0:
         return photometric
     energies = mesh_energies(mesh.vertices, mesh.topology.connectivity, edge_power=weights.edge_power, engine=engine)
     regularization = (

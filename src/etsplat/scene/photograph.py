@@ -57,6 +57,7 @@ def photograph(
     azimuths: int = 8,
     supersampling: int = 4,
     progress: Callable[[int, int], None] | None = None,
+    device: torch.device | str = "cpu",
 ) -> PosedViews:
     """Normalise a mesh and take its pictures. View index is `azimuths` * elevation + azimuth.
 
@@ -68,6 +69,7 @@ def photograph(
         azimuths: number of directions around +y, evenly spaced.
         supersampling: samples per pixel side.
         progress: called after each picture with (pictures taken, pictures in all).
+        device: where the pictures are taken, and stay.
 
     Returns:
         Views in the unit frame; those with index % 5 == 2 are test views.
@@ -81,17 +83,18 @@ def photograph(
     if not all(-90 < elevation < 90 for elevation in elevations):
         raise ValueError(f"elevations: expected degrees strictly between -90 and 90, got {list(elevations)}")
     unit, normalization = normalize_mesh(mesh)
-    cameras = orbit_cameras(width, height, elevations=elevations, azimuths=azimuths)
-    colors = shade_faces(unit.vertices, unit.faces)
-    images = torch.empty(len(cameras), height, width, 4)
+    cameras = orbit_cameras(width, height, elevations=elevations, azimuths=azimuths).to(device)
+    vertices, faces = unit.vertices.to(device), unit.faces.to(device)
+    colors = shade_faces(unit.vertices, unit.faces).to(device)
+    images = torch.empty(len(cameras), height, width, 4, device=device)
     for view in range(len(cameras)):
         images[view] = render_opaque(
-            unit.vertices,
+            vertices,
             cameras.viewmats[view : view + 1],
             cameras.Ks[view : view + 1],
             width,
             height,
-            faces=unit.faces,
+            faces=faces,
             face_colors=colors,
             supersampling=supersampling,
         )[0]

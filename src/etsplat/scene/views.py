@@ -82,13 +82,17 @@ class PosedViews:
         """The same views at half the size, each pixel the mean of those it replaces (odd sizes are rounded down)."""
         cameras = self.cameras
         width, height = max(1, cameras.width // 2), max(1, cameras.height // 2)
-        images = torch.empty(len(self), height, width, 4)
+        images = self.images.new_empty(len(self), height, width, 4)
         for index, image in enumerate(self.images):  # one by one: a copy of all views in another layout is large
             images[index] = interpolate(image.movedim(-1, 0)[None], (height, width), mode="area")[0].movedim(0, -1)
         Ks = cameras.Ks.clone()
         Ks[:, 0] *= width / cameras.width
         Ks[:, 1] *= height / cameras.height
         return replace(self, cameras=replace(cameras, Ks=Ks, width=width, height=height), images=images)
+
+    def to(self, device: torch.device) -> "PosedViews":
+        """The same views with cameras and images on another device."""
+        return replace(self, cameras=self.cameras.to(device), images=self.images.to(device))
 
     def renormalized(self, center: Float[Tensor, "3"], radius: float) -> "PosedViews":
         """The same views in the frame where the sphere (center, radius) of the present frame is the unit sphere.

@@ -2,20 +2,26 @@
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
+from itertools import takewhile
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
+from etsplat.core.cameras import Cameras
 from etsplat.core.validation import first_not_finite
 from etsplat.geometry.measures import face_areas
 from etsplat.geometry.subdivision import longest_edge_plan
 from etsplat.geometry.topology import MeshTopology
 from etsplat.geometry.untangle import untangle
 from etsplat.ops.adam import Adam
+from etsplat.ops.engines import resolve_engine
 from etsplat.optim.edit import apply_subdivision
 from etsplat.optim.loop import Progress
 from etsplat.optim.objectives import MeshWeights, mesh_objective
 from etsplat.optim.schedules import coarse_level, evenly, exponential_decay, face_budgets, regularization_weight
+from etsplat.optim.step_queue import MAX_STEPS, StepQueue
 from etsplat.optim.vertex_updates import Solve, laplacian_solver, uniform_step
 from etsplat.optim.view_sampler import ViewSampler
 from etsplat.scene.mesh_rendering import render_mesh
@@ -56,7 +62,7 @@ class MeshFitting:
             "vertices": config.lr_vertices,
             "colors": config.lr_colors,
             "opacity_logits": config.lr_opacities,
-            "log_sigma": config.lr_sigma,
+            "log_sigma": config.lr_sigma if config.sigma_final == 0 else 0.0,
         }
         self._weights = MeshWeights(
             edge=config.lambda_edge,
@@ -80,6 +86,11 @@ class MeshFitting:
         self._solve: Solve | None = None
         parameters = mesh.parameters()
         self.adam = Adam(parameters, {name: self._rates[name] for name in parameters}, engine=config.engine)
+        self._queue, self._queued_level = None, self._level(1)
+        queueable = config.vertex_update == "adam" and config.backend == "etsplat"  # others need the host in a step
+        if queueable and resolve_engine(config.engine, mesh.vertices) == "cuda":
+            width = 4 * config.views_per_step + 2 + len(parameters) + 1
+            self._queue = StepQueue(self._queued_gradients, self.adam, width, mesh.vertices.device)
 
     @property
     def count(self) -> int:
@@ -90,34 +101,86 @@ class MeshFitting:
         """For the log: number of faces and softness (0 for opaque triangles)."""
         return {"faces": self.count, "sigma": float(self.mesh.sigma.detach())}
 
-    def step(self, iteration: int) -> float:
-        """Some views over random backgrounds, one optimizer step; returns the loss before it."""
-        config, mesh = self._config, self.mesh
-        level = coarse_level(iteration, config.iterations, config.coarse_levels, config.coarse_until)
-        views = self._levels[level]
-        chosen = [self._sampler.next_view() for _ in range(config.views_per_step)]
-        backgrounds = torch.cat([self._sampler.background() for _ in chosen])
-        self._schedule_sigma(iteration)
-        color = render_mesh(mesh, views.cameras[chosen], config.appearance, backgrounds=backgrounds)
-        gamma = regularization_weight(iteration, config.iterations, config.gamma_hold, config.gamma_final)
+    def advance(self, first: int, last: int) -> list[float]:
+        """Steps with some views over random backgrounds each; on a device many together."""
+        if self._queue is None:
+            return [self._step(first)]
+        stops = [i for i in (*self._budgets, *self._untanglings) if i >= first]
+        level = self._level(first)
+        if level != self._queued_level:
+            self._queued_level = level
+            self._queue.restart()
+        steps = range(first, min([last, first + MAX_STEPS - 1, *stops]) + 1)
+        return self._queue.run([self._row(i) for i in takewhile(lambda i: self._level(i) == level, steps)])
+
+    def _step(self, iteration: int) -> float:
+        views, (chosen, backgrounds) = self._levels[self._level(iteration)], self._draw()
+        self._set_sigma(self._log_sigma(iteration))
         target = views.images[chosen[0] : chosen[0] + 1] if len(chosen) == 1 else views.images[chosen]
+        backgrounds = backgrounds.to(target.device)
+        loss = self._gradients(views.cameras[chosen], target, backgrounds, self._gamma(iteration))
+        self._update(iteration)
+        return float(loss)
+
+    def _row(self, iteration: int) -> list[float]:
+        """What a queued step reads: views, backgrounds, gamma, log sigma, and last the optimizer's rates."""
+        chosen, backgrounds = self._draw()
+        self.adam.learning_rates["vertices"] = self._vertex_rate(iteration)
+        self.adam.step_count += 1
+        rates = self.adam.rates(list(self.adam.parameters))
+        scheduled = self._gamma(iteration), self._log_sigma(iteration)
+        return [*chosen, *backgrounds.reshape(-1).tolist(), *scheduled, *rates]
+
+    def _queued_gradients(self, row: Tensor) -> Tensor:
+        views, count = self._levels[self._queued_level], self._config.views_per_step
+        chosen, backgrounds = row[:count].long(), row[count : 4 * count].reshape(count, 3)
+        viewmats, Ks = (tensor.index_select(0, chosen) for tensor in (views.cameras.viewmats, views.cameras.Ks))
+        cameras = replace(views.cameras, viewmats=viewmats, Ks=Ks)
+        self._set_sigma(row[4 * count + 1])
+        return self._gradients(cameras, views.images.index_select(0, chosen), backgrounds, row[4 * count])
+
+    def _gradients(self, cameras: Cameras, target: Tensor, backgrounds: Tensor, gamma: float | Tensor) -> Tensor:
+        """Those of the objective, whose value is returned."""
+        config, mesh = self._config, self.mesh
+        color = render_mesh(mesh, cameras, config.appearance, backgrounds=backgrounds)
         loss = mesh_objective(color, target, backgrounds, mesh, self._weights, gamma, engine=config.engine)
         self.adam.zero_grad()
         loss.backward()
-        self._update(iteration)
-        return float(loss.detach())
+        return loss.detach()
 
-    def _schedule_sigma(self, iteration: int) -> None:
-        config, log_sigma = self._config, self.mesh.log_sigma
-        if config.sigma_final > 0 and log_sigma is not None:
-            fall = exponential_decay(iteration, config.iterations, config.sigma_final / config.start_sigma)
-            with torch.no_grad():
-                log_sigma.fill_(math.log(config.start_sigma * fall))
-            self.adam.learning_rates["log_sigma"] = 0.0
+    def _draw(self) -> tuple[list[int], Float[Tensor, "B 3"]]:
+        """Views and backgrounds of the next step."""
+        chosen = [self._sampler.next_view() for _ in range(self._config.views_per_step)]
+        return chosen, torch.cat([self._sampler.background() for _ in chosen])
+
+    def _level(self, iteration: int) -> int:
+        config = self._config
+        return coarse_level(iteration, config.iterations, config.coarse_levels, config.coarse_until)
+
+    def _gamma(self, iteration: int) -> float:
+        config = self._config
+        return regularization_weight(iteration, config.iterations, config.gamma_hold, config.gamma_final)
+
+    def _log_sigma(self, iteration: int) -> float:
+        """Of the schedule; 0 where there is none."""
+        config = self._config
+        if config.sigma_final == 0:
+            return 0.0
+        fall = exponential_decay(iteration, config.iterations, config.sigma_final / config.start_sigma)
+        return math.log(config.start_sigma * fall)
+
+    @torch.no_grad()
+    def _set_sigma(self, log_sigma: float | Tensor) -> None:
+        if self._config.sigma_final > 0 and self.mesh.log_sigma is not None:
+            self.mesh.log_sigma.fill_(log_sigma)
+
+    def _vertex_rate(self, iteration: int) -> float:
+        config = self._config
+        return self._rates["vertices"] * exponential_decay(iteration, config.iterations, config.lr_vertices_final)
 
     def _update(self, iteration: int) -> None:
         config = self._config
-        rate = self._rates["vertices"] * exponential_decay(iteration, config.iterations, config.lr_vertices_final)
+        rate = self._vertex_rate(iteration)
         if config.vertex_update == "adam":
             self.adam.learning_rates["vertices"] = rate
             self.adam.step()
@@ -128,20 +191,22 @@ class MeshFitting:
 
     def refine(self, iteration: int) -> int:
         """Subdivides the largest faces if it is time to (paper, appendix Adaptive Refinement), or untangles."""
-        if iteration in self._untanglings:
-            with torch.no_grad():
-                self.mesh.vertices.copy_(untangle(self.mesh.vertices, self.mesh.topology)[0])
-        if iteration not in self._budgets:
+        if iteration not in self._untanglings and iteration not in self._budgets:
             return 0
         mesh = self.mesh
+        topology = mesh.topology.to(torch.device("cpu"))
+        if iteration in self._untanglings:
+            with torch.no_grad():
+                mesh.vertices.copy_(untangle(mesh.vertices.cpu(), topology)[0])
+        if iteration not in self._budgets:
+            return 0
         before = len(mesh.faces)
-        vertices = mesh.vertices.detach()
-        plan = longest_edge_plan(vertices, mesh.topology, face_areas(vertices, mesh.faces), self._budgets[iteration])
+        vertices = mesh.vertices.detach().cpu()
+        plan = longest_edge_plan(vertices, topology, face_areas(vertices, topology.faces), self._budgets[iteration])
         carried = apply_subdivision(plan, self.adam, per_vertex=mesh.vertex_parameters, per_face=mesh.face_parameters)
         for name, parameter in carried.items():
             setattr(mesh, name, parameter)
-        mesh.topology = MeshTopology.from_faces(plan.faces, len(mesh.vertices))
-        self._solve = None
+        self._retopologize(plan.faces)
         return len(mesh.faces) - before
 
     def evaluate(self) -> dict[str, float]:
@@ -166,12 +231,19 @@ class MeshFitting:
 
     def load_state(self, state: dict[str, Tensor], iteration: int) -> Progress:
         """Continues where `state` was taken; returns where that was."""
-        mesh = self.mesh
+        mesh, device = self.mesh, self.mesh.vertices.device
         for name in mesh.parameters():
-            parameter = state[f"mesh.{name}"].requires_grad_(True)
-            setattr(mesh, name, parameter)
-            self.adam.replace(name, parameter, state[f"adam.first.{name}"], state[f"adam.second.{name}"])
+            parameter, *moments = (state[f"{kind}.{name}"].to(device) for kind in ("mesh", "adam.first", "adam.second"))
+            setattr(mesh, name, parameter.requires_grad_(True))
+            self.adam.replace(name, parameter, *moments)
         self.adam.step_count = int(state["adam.step_count"])
-        mesh.topology = MeshTopology.from_faces(state["mesh.faces"], len(mesh.vertices))
+        self._retopologize(state["mesh.faces"])
         self._sampler.load_state({name: state[f"sampler.{name}"] for name in self._sampler.state()})
         return read_progress(state["progress"], iteration)
+
+    def _retopologize(self, faces: Tensor) -> None:
+        mesh = self.mesh
+        mesh.topology = MeshTopology.from_faces(faces.to(mesh.vertices.device), len(mesh.vertices))
+        self._solve = None
+        if self._queue is not None:
+            self._queue.restart()

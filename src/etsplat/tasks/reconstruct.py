@@ -12,7 +12,7 @@ from etsplat.core.errors import InputError
 from etsplat.io.mesh_files import MeshFile, save_mesh
 from etsplat.io.run_directory import RunDirectory, is_run
 from etsplat.ops.antialias_nvdiffrast import load_nvdiffrast
-from etsplat.ops.engines import num_threads, one_torch_thread, resolve_engine
+from etsplat.ops.engines import num_threads, one_torch_thread, resolve_device, resolve_engine
 from etsplat.optim.loop import Event, LoopSettings, Progress
 from etsplat.tasks.mesh_fitting import MeshFitting
 from etsplat.tasks.reconstruct_config import ReconstructConfig
@@ -77,6 +77,7 @@ def reconstruct(
         DivergedError: the optimization went to NaN or infinity.
     """
     config = config or ReconstructConfig()
+    device = resolve_device(config.device, config.engine)
     out = Path(out)
     if resume and not is_run(out):
         raise InputError(f"{out}: holds no run to resume; start it without --resume")
@@ -97,14 +98,14 @@ def reconstruct(
     for name, mesh in (("source", loaded), ("init_mesh", start)):
         for note in mesh.notes if isinstance(mesh, MeshFile) else ():
             announce(NoteEvent(f"{name}: {note}"))
-    subject = make_subject(loaded, config, lambda done, total: announce(PrepareEvent(done, total)))
+    subject = make_subject(loaded, config, lambda done, total: announce(PrepareEvent(done, total)), device)
     if config.backend == "nvdiffrast":
         load_nvdiffrast()  # now rather than at the first step
     scorer = Scorer(subject, config)
     fitting = MeshFitting(make_start(start, subject.views, config), subject.views, config, scorer.cheap)
     run = RunDirectory.resume(out, record) if resume else RunDirectory.create(out, record, overwrite=overwrite)
-    native = resolve_engine(config.engine, fitting.mesh.vertices) == "cpu"
-    with one_torch_thread() if native else nullcontext():
+    on_cpu = resolve_engine(config.engine, fitting.mesh.vertices) == "cpu"
+    with one_torch_thread() if on_cpu else nullcontext():
         settings = LoopSettings(config.iterations, config.log_every, config.evaluate_every, config.checkpoint_every)
         progress = fit(fitting, run, settings, hash_record(record), announce)
     return _finish(fitting, progress, run, scorer, subject.views.normalization.invert, config)
@@ -120,9 +121,8 @@ def _finish(
 ) -> ReconstructResult:
     """Exports the mesh, draws the test views, measures everything."""
     mesh = fitting.mesh
-    vertices = mesh.vertices.detach()
-    colors = mesh.named(mesh.display_colors)
-    result = MeshFile(to_input_units(vertices), mesh.faces, **colors)
+    colors = mesh.named(mesh.display_colors.cpu())
+    result = MeshFile(to_input_units(mesh.vertices.detach().cpu()), mesh.faces.cpu(), **colors)
     for suffix in (".ply", ".obj", ".glb"):
         save_mesh(run.mesh_path(suffix), result.vertices, result.faces, **colors)
     metrics = {
@@ -130,7 +130,8 @@ def _finish(
         "iterations": progress.iteration,
         "seconds": progress.seconds,
         "seconds_per_iteration": progress.seconds / progress.iteration,
-        "engine": resolve_engine(config.engine, vertices),
+        "engine": resolve_engine(config.engine, mesh.vertices),
+        "device": _device_name(mesh.vertices.device),
         "threads": num_threads(),
         "method": config.method,
         "preset": config.preset,
@@ -139,3 +140,7 @@ def _finish(
     }
     run.write_metrics(metrics)
     return ReconstructResult(run.path, result, run.read_metrics())
+
+
+def _device_name(device: torch.device) -> str:
+    return torch.cuda.get_device_name(device) if device.type == "cuda" else device.type

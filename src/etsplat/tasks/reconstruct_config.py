@@ -31,8 +31,10 @@ class ReconstructConfig:
     """How far a pixel is from a triangle: by barycentric coordinates or by signed distance."""
     seed: int = 0
     """Of the order of views and the backgrounds. (Metrics always sample with the same seed.)"""
-    engine: Literal["cpu", "reference"] | None = None
-    """What computes: cpu, reference (plain PyTorch, slow), or None for the fastest there is."""
+    device: Literal["cpu", "cuda"] | None = None
+    """Where it runs: cpu, cuda (an NVIDIA GPU), or None for cuda where there is one."""
+    engine: Literal["cpu", "cuda", "reference"] | None = None
+    """What computes: cpu, cuda, reference (plain PyTorch, slow), or None for the fastest on the device."""
 
     resolution: int = 1024
     """Side of the pictures taken of a mesh, in pixels; wider images of a scene are scaled down to this width."""
@@ -123,7 +125,8 @@ class ReconstructConfig:
         if self.backend == "nvdiffrast" and self.splats:
             raise InputError("backend: nvdiffrast draws opaque triangles; choose --method raster-face or raster-vertex")
         _check_choice(self, "distance", ("barycentric", "sdf"))
-        _check_choice(self, "engine", (None, "cpu", "reference"))
+        _check_choice(self, "device", (None, "cpu", "cuda"))
+        _check_choice(self, "engine", (None, "cpu", "cuda", "reference"))
         _check_choice(self, "edge_power", (1, 2))
         _check_choice(self, "vertex_update", ("adam", "uniform", "large-steps"))
         for name in ("resolution", "supersampling", "iterations", "log_every", "chamfer_samples", "max_faces"):

@@ -38,6 +38,8 @@ class Scorer:
         weights = find_lpips_weights(config.lpips_weights)
         self._lpips = Lpips.from_weights(*weights.paths) if weights.paths else None
         self._lpips_reason = weights.reason
+        if self._lpips is not None:
+            self._lpips.to(subject.views.images.device)
         if min(self._views.cameras.width, self._views.cameras.height) < 16:
             self._lpips, self._lpips_reason = None, "the images are smaller than 16 pixels"
 
@@ -70,14 +72,14 @@ class Scorer:
         }
 
     def _geometry(self, mesh: TriangleMesh) -> dict[str, Any]:
-        vertices, truth = mesh.vertices.detach(), self._truth
+        vertices, faces, truth = mesh.vertices.detach().cpu(), mesh.faces.cpu(), self._truth
         if truth is not None:
             samples = self._config.chamfer_samples
-            return asdict(geometry_metrics(vertices, mesh.faces, truth.vertices, truth.faces, samples=samples))
+            return asdict(geometry_metrics(vertices, faces, truth.vertices, truth.faces, samples=samples))
         return {
             **dict.fromkeys(("chamfer", "chamfer_floor", "chamfer_exact", "f_score")),
-            "degenerate_faces": count_degenerate_faces(vertices, mesh.faces),
-            "self_intersections": count_self_intersections(vertices, mesh.faces),
+            "degenerate_faces": count_degenerate_faces(vertices, faces),
+            "self_intersections": count_self_intersections(vertices, faces),
         }
 
     def _images(self, mesh: TriangleMesh, folder: Path) -> dict[str, Any]:

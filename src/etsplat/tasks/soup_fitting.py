@@ -103,8 +103,11 @@ class SoupFitting:
                 state[name + suffix] = float(ordered[int(fraction * (len(ordered) - 1))])
         return state
 
-    def step(self, iteration: int) -> float:
-        """One view, one step of Adam; returns the loss before it."""
+    def advance(self, first: int, last: int) -> list[float]:
+        """One step, with one view; returns the loss before it."""
+        return [self._step(first)]
+
+    def _step(self, iteration: int) -> float:
         config, capture, soup = self._config, self._capture, self.soup
         self._iteration = iteration
         view = self._sampler.next_view()

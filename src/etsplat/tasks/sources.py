@@ -56,7 +56,10 @@ def load_source(source: Source, config: ReconstructConfig) -> MeshFile | PosedVi
 
 
 def make_subject(
-    source: MeshFile | PosedViews, config: ReconstructConfig, progress: Callable[[int, int], None]
+    source: MeshFile | PosedViews,
+    config: ReconstructConfig,
+    progress: Callable[[int, int], None],
+    device: torch.device,
 ) -> Subject:
     """Photographs a mesh; views are ready as they are (loaders put the object into the unit sphere).
 
@@ -64,18 +67,18 @@ def make_subject(
         source: from `load_source`.
         config: resolution and supersampling.
         progress: called with (views done, views in all) while photographing.
+        device: where the views are to be.
 
     Raises:
         InputError: the mesh has no extent, or there are no views to train on.
     """
     if isinstance(source, MeshFile):
-        views = photograph(
-            source, config.resolution, config.resolution, supersampling=config.supersampling, progress=progress
-        )
+        side, samples = config.resolution, config.supersampling
+        views = photograph(source, side, side, supersampling=samples, progress=progress, device=device)
         return Subject(views, normalize_mesh(source)[0])
     if not source.train:
         raise InputError("views: none to train on; name some in `train`")
-    return Subject(source, None)
+    return Subject(source.to(device), None)
 
 
 def load_start(start: str | Path | MeshFile | None) -> MeshFile | None:
@@ -92,7 +95,11 @@ def make_start(start: MeshFile | None, views: PosedViews, config: ReconstructCon
         start: from `load_start`, in the input's units; its colours are used if it has the kind that is optimised.
         views: of the unit frame.
         config: level, radius, colour, opacity and softness.
+
+    Returns:
+        The mesh, on the device of the views.
     """
+    device = views.images.device
     if start is None:
         vertices, faces = icosphere(config.start_level)
         vertices = vertices * config.start_radius
@@ -102,8 +109,8 @@ def make_start(start: MeshFile | None, views: PosedViews, config: ReconstructCon
         given = start.vertex_colors if config.vertex_colored else start.face_colors
         colors = config.start_color if given is None else given
     return TriangleMesh.from_mesh(
-        vertices,
-        faces,
+        vertices.to(device),
+        faces.to(device),
         colors=colors,
         opacity=config.start_opacity if config.splats else None,
         sigma=config.start_sigma if config.splats else None,

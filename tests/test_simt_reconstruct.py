@@ -1,0 +1,149 @@
+"""Whole steps of shape reconstruction through the host code of the GPU engine, its kernels run by the shim."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from etsplat.ops import _raster_capacity
+from etsplat.optim.loop import Progress
+from etsplat.scene.demo_object import demo_object
+from etsplat.scene.photograph import photograph
+from etsplat.scene.views import PosedViews
+from etsplat.tasks.mesh_fitting import MeshFitting
+from etsplat.tasks.reconstruct import reconstruct
+from etsplat.tasks.reconstruct_config import PRESETS, ReconstructConfig
+from etsplat.tasks.sources import make_start
+from simt.build import Simt
+
+# 320 faces, subdivided after iterations 2 and 5.
+CONFIG = replace(
+    PRESETS["tiny"],
+    resolution=32,
+    iterations=6,
+    max_faces=500,
+    subdivide_from=0.3,
+    subdivide_until=0.8,
+    subdivide_steps=2,
+    gamma_hold=2,
+    log_every=4,
+    evaluate_every=0,
+    checkpoint_every=4,
+    chamfer_samples=500,
+)
+
+
+@pytest.fixture(scope="module")
+def views() -> PosedViews:
+    return photograph(demo_object(), 32, 32, elevations=(-35.0, 35.0), azimuths=3, supersampling=2)
+
+
+def fitting(views: PosedViews, engine: str, config: ReconstructConfig = CONFIG) -> MeshFitting:
+    config = replace(config, engine=engine)
+    return MeshFitting(make_start(None, views, config), views, config, lambda _: {})
+
+
+def run(problem: MeshFitting, last: int) -> list[float]:
+    """The losses of all steps up to iteration `last`, with refinements in between."""
+    losses: list[float] = []
+    while len(losses) < last:
+        losses += problem.advance(len(losses) + 1, last)
+        problem.refine(len(losses))
+    return losses
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"method": "elastic"},
+        {"method": "single-sided", "colors": "vertex"},
+        {"method": "raster-face", "start_sigma": 0.5},
+        {"coarse_levels": 1, "coarse_until": 0.6, "views_per_step": 2, "sigma_final": 0.2, "untangle_steps": 2},
+        {"vertex_update": "large-steps"},
+    ],
+    ids=lambda settings: next(iter(settings.values())),
+)
+def test_steps_are_those_of_the_cpu_engine(simt: Simt, views: PosedViews, settings: dict[str, Any]) -> None:
+    """Six steps and two subdivisions: the same faces, losses and parameters to rounding; Adam divides small gradients
+    by small ones, so one parameter in a hundred may differ by more. All but large steps are queued."""
+    config = replace(CONFIG, **settings)
+    on_device, on_cpu = fitting(views, "cuda", config), fitting(views, "cpu", config)
+    assert run(on_device, 6) == pytest.approx(run(on_cpu, 6), rel=1e-5)
+    assert on_device.count == on_cpu.count > 320
+    expected = on_cpu.mesh.parameters()
+    for name, parameter in on_device.mesh.parameters().items():
+        difference = (parameter - expected[name]).detach().abs()
+        assert float((difference > 1e-5).float().mean()) < 0.01, name
+    assert simt.launches.count("adam_step") == 6
+    assert simt.launches.count("step_verdict") == (0 if config.vertex_update == "large-steps" else 6)
+
+
+def test_steps_queued_together_are_the_steps_one_by_one(simt: Simt, views: PosedViews) -> None:
+    """The same bits, however many steps are queued before the host looks."""
+    together, one_by_one = fitting(views, "cuda"), fitting(views, "cuda")
+    losses = together.advance(1, 2)
+    assert losses == [one_by_one.advance(i, i)[0] for i in (1, 2)]
+    for name, parameter in together.mesh.parameters().items():
+        assert torch.equal(parameter, one_by_one.mesh.parameters()[name])
+
+
+def test_a_step_whose_buffers_overflow_is_made_again(simt: Simt, views: PosedViews, monkeypatch) -> None:
+    """While the flag is set nothing changes; after the repair the queue goes on where it stopped."""
+    problem, undisturbed = fitting(views, "cuda"), fitting(views, "cuda")
+    flag = _raster_capacity.overflow_flag(problem.mesh.vertices.device)
+    steps = problem._queue
+    assert steps is not None
+    gradients, calls = steps._gradients, []
+
+    def overflowing(row: torch.Tensor) -> torch.Tensor:
+        calls.append(float(row[0]))
+        if len(calls) == 2:
+            flag.fill_(1000)
+        return gradients(row)
+
+    monkeypatch.setattr(steps, "_gradients", overflowing)
+    assert run(problem, 2) == run(undisturbed, 2)
+    assert len(calls) == 3
+    assert calls[1] == calls[2]
+    assert int(flag) == 0
+    for name, parameter in problem.mesh.parameters().items():
+        assert torch.equal(parameter, undisturbed.mesh.parameters()[name])
+
+
+def test_a_loss_that_is_not_finite_stops_the_queue(simt: Simt, views: PosedViews) -> None:
+    """The losses end with it, and no step was made from there on."""
+    problem = fitting(views, "cuda")
+    with torch.no_grad():
+        problem.mesh.vertices[0] = math.nan
+    before = problem.mesh.colors.detach().clone()
+    losses = problem.advance(1, 2)
+    assert len(losses) == 1
+    assert math.isnan(losses[0])
+    assert torch.equal(problem.mesh.colors, before)
+
+
+def test_a_resumed_run_ends_with_the_same_bits(simt: Simt, views: PosedViews) -> None:
+    """State saved after iteration 4 and loaded into a new problem leads to the same parameters."""
+    whole = fitting(views, "cuda")
+    losses = run(whole, 4)
+    state = {name: tensor.clone() for name, tensor in whole.state(Progress(4)).items()}
+    resumed = fitting(views, "cuda")
+    resumed.load_state(state, 4)
+    for problem in (whole, resumed):
+        for first, last in ((5, 5), (6, 6)):
+            losses += problem.advance(first, last)
+            problem.refine(last)
+    assert losses[4:6] == losses[6:8]
+    for name, parameter in whole.mesh.parameters().items():
+        assert torch.equal(parameter, resumed.mesh.parameters()[name])
+
+
+def test_a_whole_run_leaves_its_directory(simt: Simt, tmp_path: Path) -> None:
+    """From photographs to metrics.json, with the engine's name in it."""
+    result = reconstruct(demo_object(), tmp_path, replace(CONFIG, engine="cuda", iterations=2, resolution=16))
+    assert result.metrics["engine"] == "cuda"
+    assert result.metrics["iterations"] == 2
+    assert (tmp_path / "mesh.ply").exists()
