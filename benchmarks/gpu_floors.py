@@ -64,7 +64,7 @@ PROJECT_INSTRUCTIONS = 1500  # per 32 triangles of up to four tiles
 FORWARD_PAIR_INSTRUCTIONS = 75  # per (slot, sub-tile) pair
 FORWARD_SLOT_INSTRUCTIONS = 22  # staging, the test of eight sub-tiles, eight warps looking for theirs
 BACKWARD_PAIR_INSTRUCTIONS = 132  # per pair, 16 shuffles among them
-BACKWARD_SLOT_INSTRUCTIONS = 65  # staging, adding the warps' sums, compaction
+BACKWARD_SLOT_INSTRUCTIONS = 45  # staging, adding the warps' sums, compaction
 REDUCE_INSTRUCTIONS = 1650  # per 32 triangles
 
 

@@ -215,8 +215,8 @@ extern "C" __global__ void __launch_bounds__(256) raster_backward(const __grid_c
             for (int i = t; i < count * kStride; i += kTileThreads) {
                 const int k = i / kStride, j = i % kStride;
                 float sum = 0.0f;
-                for (int w = 0; w < kWarps; ++w)
-                    if (listed_hits[first + k] >> w & 1) sum += warp_sums[w][k][j];
+                for (unsigned bits = listed_hits[first + k]; bits != 0; bits &= bits - 1)
+                    sum += warp_sums[__ffs(static_cast<int>(bits)) - 1][k][j];
                 pass.slot_sums[static_cast<long long>(listed_slot[first + k]) * kStride + j] = sum;
             }
         }

@@ -11,6 +11,9 @@ from rich.text import Text
 
 from etsplat import _native
 from etsplat.core.cameras import intrinsics
+from etsplat.core.errors import EngineUnavailableError
+from etsplat.cuda.compile import cache_folder
+from etsplat.cuda.device import Device
 from etsplat.metrics.image import find_lpips_weights
 from etsplat.ops.engines import num_threads
 from etsplat.ops.rasterize import rasterize
@@ -77,11 +80,19 @@ def _threads() -> str:
     return f"{num_threads()} ({origin})"
 
 
+def _gpu() -> str:
+    try:
+        Device()
+    except EngineUnavailableError as reason:
+        return str(reason)
+    return f"cuda, on {torch.cuda.get_device_name()}; compiled kernels in {cache_folder()}"
+
+
 def _optional() -> list[tuple[str, str]]:
     weights = find_lpips_weights(None)
     found = ", ".join(map(str, weights.paths)) or f"missing, so lpips in metrics.json is null: {weights.reason}"
     return [
         ("LPIPS weights", found),
         ("compiler", "not needed: the native engine is compiled already"),
-        ("CUDA", "not in this release: tensors stay on the CPU"),
+        ("GPU (CUDA)", _gpu()),
     ]
