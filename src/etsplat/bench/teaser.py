@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from etsplat.bench.figures import draw_shape
+from etsplat.core.errors import InputError
 from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.measures import bounding_ball
 from etsplat.io.mesh_files import load_mesh
@@ -27,6 +28,8 @@ def draw_teaser(runs: Sequence[Path]) -> Figure:
     axes: Any = figure.subplots(len(runs), len(_COLUMNS), squeeze=False)
     for row, folder in zip(axes, runs, strict=True):
         run = read_run(folder)
+        if run.mesh is None:
+            raise InputError(f"{folder}: is a run of `etsplat train`, which has no mesh; name one of `reconstruct`")
         mesh = load_mesh(run.mesh)
         center, radius = bounding_ball(mesh.vertices)
         unit = ((mesh.vertices.double() - center) / radius).float()

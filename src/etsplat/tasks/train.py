@@ -13,7 +13,7 @@ from etsplat.core.errors import InputError
 from etsplat.io.memory import available_memory
 from etsplat.io.run_directory import RunDirectory, is_run
 from etsplat.ops.engines import num_threads, one_torch_thread, resolve_engine
-from etsplat.optim.loop import LoopSettings, Progress
+from etsplat.optim.loop import CheckpointEvent, LoopSettings, Progress
 from etsplat.scene.captures import Capture, load_capture
 from etsplat.scene.demo_scene import demo_scene
 from etsplat.scene.soup_files import SoupFile, save_soup
@@ -109,7 +109,8 @@ def train(
     capture = own.normalized() if config.normalize else own
     for note in _check(own, config):
         announce(NoteEvent(note))
-    record = make_record("train", config, {"fingerprint": _fingerprint(own)}, {"source": path_of(source)})
+    paths = {"source": path_of(source), "images": images, "masks": path_of(masks)}
+    record = make_record("train", config, {"fingerprint": _fingerprint(own)}, paths)
     generator = torch.Generator().manual_seed(config.seed)
     points = _start_points(capture, config, generator)
     soup = start_soup(
@@ -125,10 +126,16 @@ def train(
     squared = config.scene_type == "outdoor" and not config.normalize and _span(points) > LARGE_SPAN
     fitting = SoupFitting(soup, capture, config, generator, scorer.cheap, squared=squared)
     run = RunDirectory.resume(out, record) if resume else RunDirectory.create(out, record, overwrite=overwrite)
+
+    def keep(event: Any) -> None:
+        if isinstance(event, CheckpointEvent):  # so that `etsplat view` can follow
+            save_soup(run.soup_path, _soup_file(fitting, event.iteration, capture, config))
+        announce(event)
+
     native = resolve_engine(config.engine, soup.vertices) == "cpu"
     settings = LoopSettings(config.iterations, config.log_every, config.evaluate_every, config.checkpoint_every)
     with one_torch_thread() if native else nullcontext():
-        progress = fit(fitting, run, settings, hash_record(record), announce)
+        progress = fit(fitting, run, settings, hash_record(record), keep)
     return _finish(fitting, progress, run, scorer, capture, config)
 
 
@@ -226,15 +233,7 @@ def _finish(
     """Writes the soup in the input's units, draws the test views, measures everything."""
     soup, appearance = fitting.finished()
     scores = scorer.full(soup, appearance, run.test)
-    own = capture.normalization
-    result = replace(soup, vertices=own.invert(soup.vertices.double()).float())
-    background = (1.0, 1.0, 1.0) if config.background == "white" else (0.0, 0.0, 0.0)
-    file = SoupFile(
-        result,
-        replace(appearance, near_plane=appearance.near_plane * own.radius),
-        background,
-        {"iteration": str(progress.iteration), "method": config.method, "preset": config.preset},
-    )
+    file = _soup_file(fitting, progress.iteration, capture, config)
     save_soup(run.soup_path, file)
     metrics = {
         **scores,
@@ -257,4 +256,16 @@ def _finish(
         "versions": versions(),
     }
     run.write_metrics(metrics)
-    return TrainResult(run.path, result, run.read_metrics())
+    return TrainResult(run.path, file.soup, run.read_metrics())
+
+
+def _soup_file(fitting: SoupFitting, iteration: int, capture: Capture, config: TrainConfig) -> SoupFile:
+    """The soup as it is now, in the input's units."""
+    soup, appearance = fitting.finished()
+    own = capture.normalization
+    return SoupFile(
+        replace(soup, vertices=own.invert(soup.vertices.double()).float()),
+        replace(appearance, near_plane=appearance.near_plane * own.radius),
+        (1.0, 1.0, 1.0) if config.background == "white" else (0.0, 0.0, 0.0),
+        {"iteration": str(iteration), "method": config.method, "preset": config.preset},
+    )
