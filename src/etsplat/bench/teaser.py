@@ -13,7 +13,7 @@ from etsplat.core.errors import InputError
 from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.measures import bounding_ball
 from etsplat.io.mesh_files import load_mesh
-from etsplat.report.data import read_run
+from etsplat.io.run_directory import RunDirectory
 
 _COLUMNS = ("start", "shape", "normals", "splatted", "truth")
 
@@ -27,13 +27,13 @@ def draw_teaser(runs: Sequence[Path]) -> Figure:
     figure = Figure(figsize=(2.2 * len(_COLUMNS), 2.3 * len(runs)), layout="constrained")
     axes: Any = figure.subplots(len(runs), len(_COLUMNS), squeeze=False)
     for row, folder in zip(axes, runs, strict=True):
-        run = read_run(folder)
-        if run.mesh is None:
-            raise InputError(f"{folder}: is a run of `etsplat train`, which has no mesh; name one of `reconstruct`")
-        mesh = load_mesh(run.mesh)
+        run = RunDirectory(folder)
+        if not run.mesh_path(".ply").is_file() or not run.metrics_path.is_file():
+            raise InputError(f"{folder}: is not a finished run of `etsplat reconstruct`; name another")
+        mesh = load_mesh(run.mesh_path(".ply"))
         center, radius = bounding_ball(mesh.vertices)
         unit = ((mesh.vertices.double() - center) / radius).float()
-        config = run.config["config"]
+        config = run.read_config()["config"]
         start, start_faces = icosphere(config["start_level"])
         pictures = [
             draw_shape(start * min(config["start_radius"], 1.0), start_faces),
@@ -41,9 +41,10 @@ def draw_teaser(runs: Sequence[Path]) -> Figure:
             draw_shape(unit, mesh.faces, normals=True),
         ]
         pictures = [torch.as_tensor(picture).numpy() for picture in pictures]
-        if run.views:
-            view = run.views[len(run.views) // 2]
-            pictures += [Image.open(view.render), Image.open(view.truth)]
+        renders = sorted(run.test.glob("*_render.png"))
+        if renders:
+            render = renders[len(renders) // 2]
+            pictures += [Image.open(render), Image.open(render.with_name(render.name.replace("_render", "_truth")))]
         for axis, picture, title in zip(row, pictures, _COLUMNS, strict=False):
             axis.imshow(picture)
             axis.set_title(title, fontsize=9)
