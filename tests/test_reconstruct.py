@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from PIL import Image
 
 from etsplat.core.errors import InputError
 from etsplat.geometry.icosphere import icosphere
@@ -264,6 +265,30 @@ def test_a_scene_folder_is_reconstructed(shared_data: Path, tmp_path: Path) -> N
     assert topology.is_manifold()
     assert metrics["psnr"] > 17
     assert metrics["psnr_mesh"] > metrics["psnr"] - 2
+
+
+@pytest.mark.shared_data
+def test_masks_can_come_from_elsewhere_and_must_come_from_somewhere(shared_data: Path, tmp_path: Path) -> None:
+    """Photos without masks are refused in words; with a folder of masks they load; a mesh takes no masks."""
+    scene = tmp_path / "scene"
+    scene.mkdir()
+    lego = shared_data / "scenes" / "lego_blender"
+    (tmp_path / "masks").mkdir()
+    document = json.loads((lego / "transforms_train.json").read_text())
+    document["frames"] = document["frames"][::10]
+    for frame in document["frames"]:
+        image = Image.open(lego / f"{frame['file_path']}.png")
+        path = scene / f"{frame['file_path']}.png"
+        path.parent.mkdir(exist_ok=True)
+        image.convert("RGB").save(path)
+        image.getchannel("A").save(tmp_path / "masks" / path.name)
+    (scene / "transforms.json").write_text(json.dumps(document))
+    config = replace(TINY, iterations=2)
+    with pytest.raises(InputError, match="cannot be told from its background"):
+        reconstruct(scene, tmp_path / "run", config)
+    assert reconstruct(scene, tmp_path / "run", config, masks=tmp_path / "masks").metrics["silhouette_iou"] > 0.2
+    with pytest.raises(InputError, match="leave them out"):
+        reconstruct(demo_object(), tmp_path / "mesh", config, masks=tmp_path / "masks")
 
 
 def test_a_finished_run_is_not_overwritten_unasked(pebble: MeshFile, tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from etsplat.core.errors import InputError
     from etsplat.core.rasterization import Cutoffs, Rasterization, TriangleStatistics
     from etsplat.io.mesh_files import MeshFile, load_mesh, save_mesh
+    from etsplat.ops.antialias import rasterize_antialiased
     from etsplat.ops.engines import num_threads, set_num_threads
     from etsplat.ops.rasterize import rasterize
     from etsplat.ops.rasterize_hard import HardRasterization, rasterize_hard, render_opaque
@@ -24,6 +25,7 @@ _HOMES = {
     "etsplat.core.errors": ("InputError",),
     "etsplat.core.rasterization": ("Cutoffs", "Rasterization", "TriangleStatistics"),
     "etsplat.io.mesh_files": ("MeshFile", "load_mesh", "save_mesh"),
+    "etsplat.ops.antialias": ("rasterize_antialiased",),
     "etsplat.ops.engines": ("num_threads", "set_num_threads"),
     "etsplat.ops.rasterize": ("rasterize",),
     "etsplat.ops.rasterize_hard": ("HardRasterization", "rasterize_hard", "render_opaque"),
@@ -51,6 +53,7 @@ __all__ = [
     "look_at",
     "num_threads",
     "rasterize",
+    "rasterize_antialiased",
     "rasterize_hard",
     "reconstruct",
     "render_opaque",

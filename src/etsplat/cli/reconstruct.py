@@ -38,7 +38,7 @@ class Demo(Command):
 
     def run(self, arguments: Sequence[str]) -> int:
         """Reconstructs the built-in object."""
-        return _run("demo:owl", None, self, arguments)
+        return _run("demo:owl", None, None, self, arguments)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,6 +59,8 @@ class Reconstruct(Command):
     settings: Settings
     init_mesh: Path | None = None
     """Start from this mesh instead of a sphere; in the units of the source."""
+    masks: Path | None = None
+    """Folder with a mask (white inside the object) for every image; else masks/ of the source, or transparency."""
     overwrite: bool = False
     """Replace an earlier run in the folder."""
     resume: bool = False
@@ -71,10 +73,16 @@ class Reconstruct(Command):
 
     def run(self, arguments: Sequence[str]) -> int:
         """Reconstructs what the source shows."""
-        return _run(self.source, self.init_mesh, self, arguments)
+        return _run(self.source, self.init_mesh, self.masks, self, arguments)
 
 
-def _run(source: Path | str, init_mesh: Path | None, command: Demo | Reconstruct, arguments: Sequence[str]) -> int:
+def _run(
+    source: Path | str,
+    init_mesh: Path | None,
+    masks: Path | None,
+    command: Demo | Reconstruct,
+    arguments: Sequence[str],
+) -> int:
     from rich.console import Console
 
     from etsplat.cli.progress import RunProgress
@@ -92,6 +100,7 @@ def _run(source: Path | str, init_mesh: Path | None, command: Demo | Reconstruct
                 command.out,
                 command.settings,
                 init_mesh=init_mesh,
+                masks=masks,
                 callbacks=[progress],
                 resume=command.resume,
                 overwrite=command.overwrite,

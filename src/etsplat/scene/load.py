@@ -37,17 +37,18 @@ def read_scene(path: Path | str, masks: Path | str | None = None, *, images: str
     )
 
 
-def load_views(path: Path | str, width: int | None = None) -> PosedViews:
+def load_views(path: Path | str, width: int | None = None, masks: Path | str | None = None) -> PosedViews:
     """Read a capture of an object and move it into the unit frame: the object lies inside the unit sphere.
 
     Args:
         path: as `read_scene`. Needs RGBA images or masks.
         width: shrink the images to this many pixels across (never enlarges).
+        masks: folder with a mask for every image, instead of the scene's own.
 
     Raises:
         InputError: as `read_scene`, `etsplat.scene.frames.posed_views` and `etsplat.scene.hull.bounding_sphere`.
     """
-    views = posed_views(read_scene(path), width=width)
+    views = posed_views(read_scene(path, masks), width=width)
     return views.renormalized(*bounding_sphere(views))
 
 

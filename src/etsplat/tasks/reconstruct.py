@@ -51,6 +51,7 @@ def reconstruct(
     config: ReconstructConfig | None = None,
     *,
     init_mesh: str | Path | MeshFile | None = None,
+    masks: str | Path | None = None,
     callbacks: Sequence[Callback] = (),
     resume: bool = False,
     overwrite: bool = False,
@@ -67,6 +68,8 @@ def reconstruct(
         out: the run directory; made if it does not exist. README.txt in it explains what is there.
         config: settings; None for preset "paper". See `PRESETS`.
         init_mesh: a mesh to start from instead of the sphere, in the units of the source.
+        masks: folder with a mask (white inside the object) for every image of a scene folder, instead of its own masks/
+            or the images' transparency.
         callbacks: each is called with every event, in the thread of the caller.
         resume: continue the run in `out`, which must have been started with the same source and settings; from the
             beginning if it has no checkpoint yet.
@@ -84,7 +87,7 @@ def reconstruct(
     if not resume:
         RunDirectory.check_free(out, overwrite=overwrite)
 
-    loaded, start = load_source(source, config), load_start(init_mesh)
+    loaded, start = load_source(source, config, masks), load_start(init_mesh)
     hashes = {"fingerprint": fingerprint(loaded), "init_mesh": fingerprint(start)}
     paths = {"source": path_of(source), "init_mesh": path_of(init_mesh)}
     record = make_record("reconstruct", config, hashes, paths)

@@ -37,19 +37,27 @@ class Subject:
     truth: MeshFile | None
 
 
-def load_source(source: Source, config: ReconstructConfig) -> MeshFile | PosedViews:
+def load_source(source: Source, config: ReconstructConfig, masks: str | Path | None = None) -> MeshFile | PosedViews:
     """Reads a mesh file or a scene folder, or makes the demo's object; objects are passed through.
 
+    Args:
+        source: what to read.
+        config: the resolution of a scene's images.
+        masks: folder with a mask for every image of a scene folder, instead of the scene's own.
+
     Raises:
-        InputError: there is nothing at the path, or what is there cannot be used.
+        InputError: there is nothing at the path, or what is there cannot be used; masks for something else than a
+            scene folder.
     """
+    if masks is not None and (isinstance(source, MeshFile | PosedViews) or not Path(source).is_dir()):
+        raise InputError(f"masks {masks}: belong to a folder with posed images; leave them out for a mesh")
     if isinstance(source, MeshFile | PosedViews):
         return source
     if str(source) == DEMO:
         return demo_object()
     path = Path(source)
     if path.is_dir():
-        return load_views(path, width=config.resolution)
+        return load_views(path, width=config.resolution, masks=masks)
     if path.is_file():
         return load_mesh(path)
     raise InputError(f"{path}: no such file or folder; name a mesh file or a folder with posed images")
