@@ -38,10 +38,10 @@ class SoupStatistics:
     trial: Int[Tensor, " N"]
 
     @staticmethod
-    def zeros(count: int) -> "SoupStatistics":
+    def zeros(count: int, device: torch.device | str = "cpu") -> "SoupStatistics":
         """Of triangles that nobody has seen yet."""
-        whole = torch.zeros(count, dtype=torch.int32)
-        return SoupStatistics(torch.zeros(count), torch.zeros(count), whole, whole.clone())
+        number, whole = torch.zeros(count, device=device), torch.zeros(count, dtype=torch.int32, device=device)
+        return SoupStatistics(number, number.clone(), whole, whole.clone())
 
     def update(self, view: TriangleStatistics, views: int, *, epoch_starts: bool) -> None:
         """Takes in a rendering of one training view.
@@ -177,7 +177,8 @@ def _draw(weights: Float[Tensor, " N"], count: int, generator: torch.Generator) 
     Row i waits for an exponential time of rate weights[i]; the order of arrival is that of successive draws.
     """
     count = max(0, min(count, int((weights > 0).sum())))
-    arrival = torch.empty_like(weights).exponential_(generator=generator) / weights
+    random = torch.empty(weights.shape, dtype=weights.dtype, device=generator.device)
+    arrival = random.exponential_(generator=generator).to(weights.device) / weights
     return torch.topk(arrival, count, largest=False, sorted=True).indices
 
 

@@ -89,6 +89,11 @@ class TriangleSoup:
     def __len__(self) -> int:
         return len(self.vertices)
 
+    def to(self, device: torch.device) -> "TriangleSoup":
+        """The same soup on another device, its parameters leaf tensors as they are here."""
+        moved = {name: p.detach().to(device).requires_grad_(p.requires_grad) for name, p in self.parameters().items()}
+        return TriangleSoup(**moved)
+
     def parameters(self) -> dict[str, Tensor]:
         """The learnable tensors by name."""
         return {name: getattr(self, name) for name in self.PARAMETERS}

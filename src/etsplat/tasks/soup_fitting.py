@@ -16,6 +16,7 @@ from etsplat.optim.loop import DivergedError, Progress
 from etsplat.optim.schedules import exponential_decay, ramp
 from etsplat.optim.soup_objective import SoupWeights, soup_objective
 from etsplat.optim.view_sampler import ViewSampler
+from etsplat.scene.capture_views import CaptureViews
 from etsplat.scene.captures import Capture
 from etsplat.scene.soup_rendering import SoupAppearance, render_soup
 from etsplat.scene.triangle_soup import TriangleSoup
@@ -65,9 +66,10 @@ class SoupFitting:
             squared: the pixel loss is L2.
         """
         self.soup = soup
-        self.statistics = SoupStatistics.zeros(len(soup))
+        self._device = soup.vertices.device
+        self.statistics = SoupStatistics.zeros(len(soup), self._device)
         self._capture = capture
-        self._cameras = capture.cameras
+        self._views = CaptureViews(capture, self._device)
         self._config = config
         self._squared = squared
         self._evaluate = evaluate
@@ -108,15 +110,15 @@ class SoupFitting:
         return [self._step(first)]
 
     def _step(self, iteration: int) -> float:
-        config, capture, soup = self._config, self._capture, self.soup
+        config, soup = self._config, self.soup
         self._iteration = iteration
         view = self._sampler.next_view()
-        capture.images.expect([view, *self._sampler.upcoming(READ_AHEAD)])
-        background = self._background()
+        self._views.expect([view, *self._sampler.upcoming(READ_AHEAD)])
+        background, camera = self._background().to(self._device), self._views.cameras[view]
         weights, appearance = self._weights(iteration), self._appearance(iteration)
         rendering = render_soup(
             soup,
-            self._cameras[view],
+            camera,
             appearance,
             backgrounds=background,
             median_depth=weights.normal > 0,
@@ -126,15 +128,15 @@ class SoupFitting:
             statistics=True,
             engine=config.engine,
         )
-        mask = capture.images.mask(view)
+        mask = self._views.mask(view)
         loss = soup_objective(
             rendering,
-            capture.images[view][None],
+            self._views.photo(view)[None],
             None if mask is None else mask[None].float() / 255,
             background,
             soup.vertices,
             soup.opacities,
-            self._cameras[view],
+            camera,
             weights,
             engine=config.engine,
         )
@@ -201,11 +203,13 @@ class SoupFitting:
     def load_state(self, state: dict[str, Tensor], iteration: int) -> Progress:
         """Continues where `state` was taken; returns where that was."""
         for name in TriangleSoup.PARAMETERS:
-            parameter = state[f"soup.{name}"].requires_grad_(True)
-            setattr(self.soup, name, parameter)
-            self.adam.replace(name, parameter, state[f"adam.first.{name}"], state[f"adam.second.{name}"])
+            saved = (state[f"{kind}.{name}"].to(self._device) for kind in ("soup", "adam.first", "adam.second"))
+            parameter, *moments = saved
+            setattr(self.soup, name, parameter.requires_grad_(True))
+            self.adam.replace(name, parameter, *moments)
         self.adam.step_count = int(state["adam.step_count"])
-        self.statistics = SoupStatistics(**{n: state[f"statistics.{n}"] for n in self.statistics.tensors()})
+        names = self.statistics.tensors()
+        self.statistics = SoupStatistics(**{name: state[f"statistics.{name}"].to(self._device) for name in names})
         self._sampler.load_state({name: state[f"sampler.{name}"] for name in self._sampler.state()})
         self._iteration = iteration
         return read_progress(state["progress"], iteration)

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from etsplat.io.images import save_image
 from etsplat.metrics.image import psnr, ssim
+from etsplat.scene.capture_views import CaptureViews
 from etsplat.scene.captures import Capture
 from etsplat.scene.soup_rendering import SoupAppearance, render_soup, render_soup_opaque
 from etsplat.scene.triangle_soup import TriangleSoup
@@ -23,10 +24,16 @@ class SoupScorer:
     right.
     """
 
-    def __init__(self, capture: Capture, background: Float[Tensor, "3"], engine: str | None) -> None:
+    def __init__(
+        self,
+        capture: Capture,
+        background: Float[Tensor, "3"],
+        engine: str | None,
+        device: torch.device = torch.device("cpu"),  # noqa: B008 (immutable)
+    ) -> None:
         self._capture = capture
-        self._cameras = capture.cameras
-        self._background = background
+        self._views = CaptureViews(capture, device)
+        self._background = background.to(device)
         self._engine = engine
 
     def cheap(self, soup: TriangleSoup, appearance: SoupAppearance) -> dict[str, float]:
@@ -70,19 +77,19 @@ class SoupScorer:
 
     def photo(self, view: int) -> Float[Tensor, "H W 3"]:
         """The photograph of a view, over the background."""
-        photo = self._capture.images[view].float() / 255
+        photo = self._views.photo(view).float() / 255
         return photo[..., :3] if photo.shape[-1] == 3 else photo[..., :3] + (1 - photo[..., 3:]) * self._background
 
     def masked(self, picture: Tensor, photo: Tensor, view: int) -> Float[Tensor, "H W 3"]:
         """The picture, with the photograph's pixels where the view's mask excludes them."""
-        mask = self._capture.images.mask(view)
+        mask = self._views.mask(view)
         return picture if mask is None else photo + mask[..., None].float() / 255 * (picture - photo)
 
     @torch.no_grad()
     def splatted(self, soup: TriangleSoup, appearance: SoupAppearance, view: int) -> Float[Tensor, "H W 3"]:
         """A view of the soup, clamped to [0, 1]."""
         rendering = render_soup(
-            soup, self._cameras[view], appearance, backgrounds=self._background[None], engine=self._engine
+            soup, self._views.cameras[view], appearance, backgrounds=self._background[None], engine=self._engine
         )
         return rendering.color[0].clamp(0.0, 1.0)
 
@@ -90,7 +97,7 @@ class SoupScorer:
         """The same as a mesh viewer would draw it."""
         picture = render_soup_opaque(
             soup,
-            self._cameras[view],
+            self._views.cameras[view],
             appearance,
             background=self._background,
             supersampling=SUPERSAMPLING,

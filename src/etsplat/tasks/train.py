@@ -12,7 +12,7 @@ import torch
 from etsplat.core.errors import InputError
 from etsplat.io.memory import available_memory
 from etsplat.io.run_directory import RunDirectory, is_run
-from etsplat.ops.engines import num_threads, one_torch_thread, resolve_engine
+from etsplat.ops.engines import num_threads, one_torch_thread, resolve_device, resolve_engine
 from etsplat.optim.loop import CheckpointEvent, LoopSettings, Progress
 from etsplat.scene.captures import Capture, load_capture
 from etsplat.scene.demo_scene import demo_scene
@@ -95,6 +95,7 @@ def train(
         DivergedError: the optimization went to NaN or infinity.
     """
     config = config or train_settings("quick")
+    device = resolve_device(config.device, config.engine)
     out = Path(out)
     if resume and not is_run(out):
         raise InputError(f"{out}: holds no run to resume; start it without --resume")
@@ -107,7 +108,7 @@ def train(
 
     own = _load(source, config, images, masks, lambda done, total: announce(PrepareEvent(done, total)))
     capture = own.normalized() if config.normalize else own
-    for note in _check(own, config):
+    for note in _check(own, config, device):
         announce(NoteEvent(note))
     paths = {"source": path_of(source), "images": images, "masks": path_of(masks)}
     record = make_record("train", config, {"fingerprint": _fingerprint(own)}, paths)
@@ -120,9 +121,9 @@ def train(
         opacity=config.start_opacity,
         sigma=config.start_sigma,
         sh_degree=config.sh_degree,
-    )
+    ).to(device)
     background = torch.full((3,), 1.0 if config.background == "white" else 0.0)
-    scorer = SoupScorer(capture, background, config.engine)
+    scorer = SoupScorer(capture, background, config.engine, device)
     squared = config.scene_type == "outdoor" and not config.normalize and _span(points) > LARGE_SPAN
     fitting = SoupFitting(soup, capture, config, generator, scorer.cheap, squared=squared)
     run = RunDirectory.resume(out, record) if resume else RunDirectory.create(out, record, overwrite=overwrite)
@@ -161,11 +162,12 @@ def _load(
     return load_capture(source, images=images, width=config.width, masks=masks, progress=progress)
 
 
-def _check(capture: Capture, config: TrainConfig) -> list[str]:
+def _check(capture: Capture, config: TrainConfig, device: torch.device) -> list[str]:
     """Refuses what cannot work; returns what its owner should know."""
     if not capture.train:
         raise InputError("capture: has no view to train on; name some in its split")
-    needed, free = predicted_bytes(capture, config), available_memory()
+    needed = predicted_bytes(capture, config)
+    free = torch.cuda.mem_get_info(device)[0] if device.type == "cuda" else available_memory()
     if needed > free:
         fitting = max(1000, int(config.max_triangles - (needed - free) / BYTES_PER_TRIANGLE))
         raise InputError(
@@ -262,7 +264,7 @@ def _finish(
 def _soup_file(fitting: SoupFitting, iteration: int, capture: Capture, config: TrainConfig) -> SoupFile:
     """The soup as it is now, in the input's units."""
     soup, appearance = fitting.finished()
-    own = capture.normalization
+    soup, own = soup.to(torch.device("cpu")), capture.normalization
     return SoupFile(
         replace(soup, vertices=own.invert(soup.vertices.double()).float()),
         replace(appearance, near_plane=appearance.near_plane * own.radius),

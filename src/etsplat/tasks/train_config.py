@@ -27,8 +27,10 @@ class TrainConfig:
     """With single-sided, hold the inradius constant in the backward pass, as Triangle Splatting does."""
     seed: int = 0
     """Of every random choice: start, order of views, backgrounds, densification."""
-    engine: Literal["cpu", "reference"] | None = None
-    """What computes: cpu, reference (plain PyTorch, slow), or None for the fastest there is."""
+    device: Literal["cpu", "cuda"] | None = None
+    """Where it runs: cpu, cuda (an NVIDIA GPU), or None for cuda where there is one."""
+    engine: Literal["cpu", "cuda", "reference"] | None = None
+    """What computes: cpu, cuda, reference (plain PyTorch, slow), or None for the fastest on the device."""
 
     width: int | None = None
     """Wider images are scaled down to this width; None shrinks those wider than 1600 pixels to 1600."""
@@ -169,7 +171,8 @@ _RANGES = (
 _CHOICES = {
     "method": ("elastic", "bilateral", "single-sided"),
     "scene_type": ("outdoor", "indoor", "object"),
-    "engine": (None, "cpu", "reference"),
+    "device": (None, "cpu", "cuda"),
+    "engine": (None, "cpu", "cuda", "reference"),
     "background": ("black", "white", "random"),
     "sample_by": ("alternate", "opacity", "sharpness"),
     "finish": ("none", "opaque"),

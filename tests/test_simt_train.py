@@ -1,0 +1,47 @@
+"""Steps of a triangle soup through the host code of the GPU engine, its kernels run by the shim."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from etsplat.scene.captures import Capture
+from etsplat.scene.demo_scene import demo_scene
+from etsplat.scene.soup_init import StartPoints, start_soup
+from etsplat.tasks.soup_fitting import SoupFitting
+from etsplat.tasks.train_config import train_settings
+from simt.build import Simt
+
+CONFIG = replace(train_settings("tiny"), iterations=6, densify_every=15_000, densify_from=0, sh_every=5000)
+
+
+@pytest.fixture(scope="module")
+def capture() -> Capture:
+    return demo_scene(40, 32)
+
+
+def fitting(capture: Capture, engine: str) -> SoupFitting:
+    generator = torch.Generator().manual_seed(3)
+    assert capture.points is not None
+    chosen = capture.points[::150]
+    soup = start_soup(
+        StartPoints(chosen, torch.full_like(chosen, 0.5)), generator, scale=2.0, opacity=0.4, sigma=1.0, sh_degree=1
+    )
+    return SoupFitting(soup, capture, replace(CONFIG, engine=engine), generator, lambda *_: {})
+
+
+def test_steps_are_those_of_the_cpu_engine(simt: Simt, capture: Capture) -> None:
+    """Three steps, a densification and one more: the same losses, triangles and statistics to rounding."""
+    on_device, on_cpu = fitting(capture, "cuda"), fitting(capture, "cpu")
+    before = on_cpu.count
+    for iteration in range(1, 5):
+        losses = [problem.advance(iteration, 6)[0] for problem in (on_device, on_cpu)]
+        assert losses[0] == pytest.approx(losses[1], rel=1e-5)
+        assert on_device.refine(iteration) == on_cpu.refine(iteration)
+    assert on_device.count == on_cpu.count > before
+    for name, tensor in on_cpu.statistics.tensors().items():
+        torch.testing.assert_close(on_device.statistics.tensors()[name], tensor, rtol=1e-3, atol=1e-4)
+    for name, parameter in on_cpu.soup.parameters().items():
+        difference = (on_device.soup.parameters()[name] - parameter).detach().abs()
+        assert float((difference > 1e-4).float().mean()) < 0.01, name
+    assert {"soup_forward", "soup_backward", "ssim_sums", "ssim_backward", "adam_step"} <= set(simt.launches)
