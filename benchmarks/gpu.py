@@ -17,6 +17,7 @@ from rich.console import Console
 
 from benchmarks import gpu_scenes, gpu_timing, machine
 from benchmarks.gpu_floors import PEAKS, Work, floors
+from benchmarks.gpu_reconstruct import step_milliseconds
 from benchmarks.tables import Table
 
 RESULTS = Path(__file__).parent / "results"
@@ -79,14 +80,20 @@ def main(arguments: list[str] | None = None) -> None:
         results[name] = entry
         tables.append(floor_table(name, Work(**entry["work"]), options.peaks, entry["kernels"]))
     tables.append(time_table(results))
+    reconstruct = step_milliseconds(torch.device("cuda"))
     description = {**machine.description(), "gpu": torch.cuda.get_device_name(), "cuda": torch.version.cuda}
     name = f"gpu_{description['date'][:10]}_{description['commit'].rstrip('+')}.json"
     path = options.json or RESULTS / name
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps({"machine": description, "results": results}, indent=1) + "\n", encoding="utf-8")
+    path.write_text(
+        json.dumps({"machine": description, "results": results, "reconstruct_step": reconstruct}, indent=1) + "\n",
+        encoding="utf-8",
+    )
     for table in tables:
         console.print()
         console.print(table.rich())
+    step = f"{reconstruct['milliseconds']:.3f} ms at {reconstruct['faces']:,} faces, 1024 x 1024"
+    console.print(f"a whole reconstruction step: {step}", highlight=False)
     console.print(f"written to {path}", highlight=False)
 
 

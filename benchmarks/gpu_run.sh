@@ -73,5 +73,5 @@ done
 echo
 echo "== summary, $(date -u +%Y-%m-%d), $(nvidia-smi --query-gpu=name,driver_version --format=csv,noheader 2>/dev/null || echo 'no GPU')"
 printf '%s\n' "${summary[@]}"
-grep -hE "forward|backward" "$OUT/bench.log" 2>/dev/null | grep -E "sphere|soup" | tail -12
+grep -hE "forward|backward|whole reconstruction" "$OUT/bench.log" 2>/dev/null | grep -E "sphere|soup|whole" | tail -12
 grep -hE "passed|failed" "$OUT"/tests.log 2>/dev/null | tail -1

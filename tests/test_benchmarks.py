@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from _scenes import mesh
-from benchmarks import rasterizer, tables
+from benchmarks import gpu_floors, gpu_reconstruct, gpu_scenes, gpu_timing, rasterizer, scenes, tables
 from benchmarks.measure import native_state
 from etsplat import _native, rasterize
 
@@ -87,3 +87,21 @@ def test_the_benchmark_writes_its_results_and_the_document_takes_them(tmp_path, 
     assert "old" not in text
     assert text.startswith("before\n")
     assert text.endswith("after\n")
+
+
+def test_work_of_the_gpu_engine_is_counted_by_the_shim():
+    """The slots of a small scene are the pairs that the CPU engine makes of it, and every floor is positive."""
+    scene = gpu_scenes.load("sphere1", "cpu")
+    work = gpu_timing.count_without_gpu(scene)
+    state = native_state(scenes.load("sphere1").render())
+    assert work.slots == state.num_pairs
+    assert work.slots >= work.hit_slots > 0
+    assert 8 * work.hit_slots >= work.hit_pairs >= work.hit_slots
+    assert all(floor.ms > 0 for floor in gpu_floors.floors(work, gpu_floors.PEAKS["H100"]))
+
+
+def test_a_reconstruction_step_is_timed(simt):
+    """After the subdivision, over the last steps."""
+    result = gpu_reconstruct.step_milliseconds(torch.device("cpu"), resolution=24, start_level=1, faces=120, steps=3)
+    assert result["faces"] == 120
+    assert result["milliseconds"] > 0

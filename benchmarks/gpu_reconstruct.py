@@ -1,0 +1,46 @@
+"""Time of a whole step of shape reconstruction on a GPU, from the choice of a view to Adam's update."""
+
+import time
+from dataclasses import replace
+from typing import Any
+
+import torch
+
+from etsplat.scene.demo_object import demo_object
+from etsplat.scene.photograph import photograph
+from etsplat.tasks.mesh_fitting import MeshFitting
+from etsplat.tasks.reconstruct_config import PRESETS
+from etsplat.tasks.sources import make_start
+
+
+def step_milliseconds(
+    device: torch.device, resolution: int = 1024, start_level: int = 6, faces: int = 100_000, steps: int = 512
+) -> dict[str, Any]:
+    """Milliseconds a step, as the task makes them, after one subdivision to ``faces`` faces and as many steps again.
+
+    Wall time: steps are queued in the hundreds, and each batch ends with the one wait for the device.
+    """
+    warm_up = 10
+    config = replace(
+        PRESETS["paper"],
+        engine="cuda",
+        resolution=resolution,
+        start_level=start_level,
+        max_faces=faces,
+        iterations=2 * steps + warm_up,
+        subdivide_from=warm_up / (2 * steps + warm_up),
+        subdivide_until=warm_up / (2 * steps + warm_up),
+        subdivide_steps=1,
+    )
+    views = photograph(demo_object(), resolution, resolution, supersampling=1, device=device)
+    fitting = MeshFitting(make_start(None, views, config), views, config, lambda _: {})
+    _advance(fitting, 0, config.iterations - steps)
+    begin = time.perf_counter()
+    _advance(fitting, config.iterations - steps, config.iterations)
+    return {"faces": fitting.count, "milliseconds": 1e3 * (time.perf_counter() - begin) / steps}
+
+
+def _advance(fitting: MeshFitting, done: int, last: int) -> None:
+    while done < last:
+        done += len(fitting.advance(done + 1, last))
+        fitting.refine(done)
