@@ -262,6 +262,9 @@ inline void prepare(Fiber& fiber, unsigned index) {
 #else
     // Staggered, so that the stacks do not share cache sets. A return address, then six saved registers.
     uintptr_t top = reinterpret_cast<uintptr_t>(stack + kStackSize - 64 - index * 192 % 8192) & ~uintptr_t{15};
+#ifdef __SANITIZE_ADDRESS__
+    __asan_unpoison_memory_region(reinterpret_cast<char*>(top) - 4096, 4096);  // frames that run_thread was left in
+#endif
     void** slot = reinterpret_cast<void**>(top);
     *--slot = nullptr;
     *--slot = reinterpret_cast<void*>(run_thread);
