@@ -3,8 +3,8 @@
 // Forward: points projected, silhouette edges marked, pixels shaded; then each pixel looks at its four pairs of neighbours
 // and takes what their silhouettes give it, so that nothing is scattered. Backward: each pixel gathers its cotangent in
 // the same way; then cotangents go to colours and corners, many pixels to a place, as fixed-point sums (fixed_sums.h):
-// the same bits in every run. Each pair is evaluated by both its pixels: two edges at most, beside some 30 bytes a pixel
-// that bound the forward; atomics in L2, 3 a pixel for colours, bound the backward.
+// the same bits in every run. Each pair is evaluated by both its pixels, and few pairs have anything between them: some 50
+// bytes a pixel bound the forward; atomics in L2, 3 a pixel for colours, bound the backward.
 #include "cuda/fixed_sums.h"
 #include "math/antialias.h"
 #include "math/triangle.h"

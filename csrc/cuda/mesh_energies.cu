@@ -2,7 +2,7 @@
 // edges and Laplacian of the vertices, in blocks of their own; (2) pairs of faces, pulled back to their corners; (3) what
 // each vertex gathers from its neighbours and corners, while one more block adds up the sums that (1) and (2) left.
 //
-// One thread to an element, gathers instead of atomics: the same bits in every run. About 300 bytes a vertex with its two
+// One thread to an element, gathers instead of atomics: the same bits in every run. About 430 bytes a vertex with its two
 // faces are read and written, most of them through the L2 cache: launches, not bytes, bound it below a million faces.
 #include "cuda/block_sum.h"
 #include "math/mesh_energies.h"
