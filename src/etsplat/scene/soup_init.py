@@ -91,6 +91,8 @@ def start_soup(
     opacity: float,
     sigma: float,
     sh_degree: int,
+    centers: Float[Tensor, "B 3"] | None = None,
+    limit: float | None = None,
 ) -> TriangleSoup:
     """One right-angled isosceles triangle per point, turned at random, about as large as the gap to its neighbours.
 
@@ -104,9 +106,15 @@ def start_soup(
         opacity: of all.
         sigma: of all.
         sh_degree: of the colours.
+        centers: positions of the cameras, where there is a limit.
+        limit: no triangle is larger than this times its distance to the nearest camera; None for any size. Without it,
+            triangles at stray points near the cameras cover whole pictures.
     """
     count = len(points)
     radius = scale * spacing(points.positions)
+    if limit is not None and centers is not None and count:
+        distances, _ = KDTree(centers.double().numpy()).query(points.positions.double().numpy())
+        radius = torch.minimum(radius, limit * torch.from_numpy(distances).to(radius))
     axis = torch.nn.functional.normalize(torch.randn((count, 3), generator=generator), dim=1)
     angle = 2 * math.pi * torch.rand((count, 1), generator=generator)
     turned = [_rotate(torch.tensor(u).expand(count, 3), axis, angle) for u in ((0.0, 0, 1), (1.0, 0, 0), (0.0, 0, -1))]

@@ -27,11 +27,10 @@ READ_AHEAD = 8
 """Views whose photos are decoded ahead of their turn, where the capture does not fit into memory."""
 
 FINAL_FLOOR, FIRST_CEILING, FINAL_CEILING = 0.995, 1.0, 0.02
-FINISH_PRUNE_OPACITY = 0.1
-FINISH_UNTIL = 0.85
-"""The opaque finish: opacities are squeezed above a floor that rises to the first number, sigma below a ceiling that
-falls from the second to the third; triangles whose own opacity is below the fourth at its end are removed on the way.
-The last part of the run, from this fraction on, adapts to the result."""
+FINISH_UNTIL = 0.8
+"""The opaque finish: opacities are squeezed above a floor that rises to the first number, and sigma is cut at a ceiling
+that falls from the second to the third. Triangles whose own opacity falls below `prune_opacity` meanwhile are removed,
+and others multiply in their place. From this fraction of the run on the soup adapts to the result."""
 
 Evaluate = Callable[[TriangleSoup, SoupAppearance], dict[str, float]]
 
@@ -154,18 +153,19 @@ class SoupFitting:
         every = config.at(config.densify_every)
         if iteration % every or iteration <= config.at(config.densify_from) or iteration == config.iterations:
             return 0
-        first = iteration // every * every - every <= config.at(config.densify_from)
-        dead = self._dead(iteration, first=first)
-        if bool(dead.all()):
-            raise DivergedError(
-                f"no triangle is left at iteration {iteration}; lower lambda_opacity or prune_importance"
-            )
         if iteration < config.at(config.densify_until):
-            self._edit(self._densification(iteration, dead))
-        elif bool(dead.any()):
-            self._edit(RowPlan.keeping(~dead))
-        self.statistics.restart(self.statistics.judged(len(self._capture.train)))
+            self.densify(iteration)
+        else:
+            self.prune(iteration)
         return self.count - before
+
+    def densify(self, iteration: int) -> None:
+        """Removes dead triangles and lets others multiply, whatever the schedule says."""
+        self._edit(self._densification(iteration, self._dead(iteration)))
+
+    def prune(self, iteration: int) -> None:
+        """Removes dead triangles, whatever the schedule says."""
+        self._edit(RowPlan.keeping(~self._dead(iteration)))
 
     def evaluate(self) -> dict[str, float]:
         """Cheap metrics of the present state."""
@@ -224,23 +224,26 @@ class SoupFitting:
             freeze_incentre=config.freeze_incentre and config.distance == "sdf",
             near_plane=config.near_plane,
         )
-        if config.finish == "none" or iteration <= config.at(config.finish_from):
+        if not self._finishing(iteration):
             return appearance
-        done = self._finish_ramp(iteration)
+        done = ramp(iteration, config.at(config.finish_from), self._settled)
         ceiling = FIRST_CEILING * (FINAL_CEILING / FIRST_CEILING) ** done
         return replace(appearance, opacity_floor=FINAL_FLOOR * done, sigma_ceiling=ceiling)
 
-    def _finish_ramp(self, iteration: int) -> float:
-        config = self._config
-        return ramp(iteration, config.at(config.finish_from), round(FINISH_UNTIL * config.iterations))
+    def _finishing(self, iteration: int) -> bool:
+        return self._config.finish == "opaque" and iteration > self._config.at(self._config.finish_from)
+
+    @property
+    def _settled(self) -> int:
+        """When the opaque finish has made everything opaque and sharp."""
+        return round(FINISH_UNTIL * self._config.iterations)
 
     def _weights(self, iteration: int) -> SoupWeights:
         config = self._config
-        finishing = config.finish == "opaque" and iteration > config.at(config.finish_from)
         regular = iteration > config.at(config.regularize_from)
         return SoupWeights(
             dssim=config.lambda_dssim,
-            opacity=0.0 if finishing else config.lambda_opacity,
+            opacity=0.0 if config.finish == "opaque" else config.lambda_opacity,
             size=config.lambda_size if iteration < config.at(config.densify_until) else 0.0,
             normal=config.lambda_normal if regular else 0.0,
             distortion=config.lambda_distortion if regular else 0.0,
@@ -257,21 +260,27 @@ class SoupFitting:
         views = len(self._capture.train)
         self.statistics.update(rendering.statistics, views, epoch_starts=self._sampler.epoch_starts)
 
-    def _dead(self, iteration: int, *, first: bool) -> Tensor:
+    def _dead(self, iteration: int) -> Tensor:
         config = self._config
+        first = iteration <= config.at(config.densify_from) + config.at(config.densify_every)
+        finishing = self._finishing(iteration)
         densifying = iteration < config.at(config.densify_until)
         limit = config.prune_screen_size if densifying and not first else None
-        opacity = config.prune_opacity
-        if config.finish == "opaque":
-            opacity += (FINISH_PRUNE_OPACITY - opacity) * self._finish_ramp(iteration)
         rules = PruneRules(
-            opacity=opacity,
+            opacity=0.0 if finishing and iteration >= self._settled else config.prune_opacity,
             importance=config.prune_importance,
-            views=0 if first else config.prune_views,
+            views=0 if first else min(config.prune_views, len(self._capture.train)),
             screen_size=float("inf") if limit is None else limit,
         )
         with torch.no_grad():
-            return dead_triangles(self.soup.opacities, self.statistics, rules, len(self._capture.train))
+            dead = dead_triangles(
+                self.appearance.opacities(self.soup), self.statistics, rules, len(self._capture.train)
+            )
+        if bool(dead.all()):
+            raise DivergedError(
+                f"no triangle is left at iteration {iteration}; lower lambda_opacity or prune_importance"
+            )
+        return dead
 
     def _densification(self, iteration: int, dead: Tensor) -> RowPlan:
         config, soup = self._config, self.soup
@@ -295,3 +304,4 @@ class SoupFitting:
         for name, parameter in parameters.items():
             setattr(self.soup, name, parameter)
         self.statistics = SoupStatistics(**statistics)
+        self.statistics.restart(self.statistics.judged(len(self._capture.train)))

@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from etsplat.core.errors import InputError
 from etsplat.io.memory import available_memory
@@ -29,7 +31,7 @@ from etsplat.tasks.running import (
     path_of,
     versions,
 )
-from etsplat.tasks.soup_fitting import SoupFitting
+from etsplat.tasks.soup_fitting import Evaluate, SoupFitting
 from etsplat.tasks.soup_scoring import SoupScorer
 from etsplat.tasks.train_config import TrainConfig, train_settings
 
@@ -112,6 +114,33 @@ def train(
         announce(NoteEvent(note))
     paths = {"source": path_of(source), "images": images, "masks": path_of(masks)}
     record = make_record("train", config, {"fingerprint": _fingerprint(own)}, paths)
+    scorer = SoupScorer(capture, _background(config), config.engine, device)
+    fitting = start_fitting(capture, config, scorer.cheap, device)
+    run = RunDirectory.resume(out, record) if resume else RunDirectory.create(out, record, overwrite=overwrite)
+
+    def keep(event: Any) -> None:
+        if isinstance(event, CheckpointEvent):  # so that `etsplat view` can follow
+            save_soup(run.soup_path, _soup_file(fitting, event.iteration, capture, config))
+        announce(event)
+
+    native = resolve_engine(config.engine, fitting.soup.vertices) == "cpu"
+    settings = LoopSettings(config.iterations, config.log_every, config.evaluate_every, config.checkpoint_every)
+    with one_torch_thread() if native else nullcontext():
+        progress = fit(fitting, run, settings, hash_record(record), keep)
+    return _finish(fitting, progress, run, scorer, capture, config)
+
+
+def start_fitting(
+    capture: Capture, config: TrainConfig, evaluate: Evaluate, device: torch.device | None = None
+) -> SoupFitting:
+    """The start of a run: triangles at the capture's points, or at random ones.
+
+    Args:
+        capture: in the frame that is trained in.
+        config: settings.
+        evaluate: cheap metrics of a soup.
+        device: where the soup lives; None for the CPU.
+    """
     generator = torch.Generator().manual_seed(config.seed)
     points = _start_points(capture, config, generator)
     soup = start_soup(
@@ -121,23 +150,11 @@ def train(
         opacity=config.start_opacity,
         sigma=config.start_sigma,
         sh_degree=config.sh_degree,
-    ).to(device)
-    background = torch.full((3,), 1.0 if config.background == "white" else 0.0)
-    scorer = SoupScorer(capture, background, config.engine, device)
+        centers=capture.centers[capture.train],
+        limit=config.start_limit,
+    ).to(device or torch.device("cpu"))
     squared = config.scene_type == "outdoor" and not config.normalize and _span(points) > LARGE_SPAN
-    fitting = SoupFitting(soup, capture, config, generator, scorer.cheap, squared=squared)
-    run = RunDirectory.resume(out, record) if resume else RunDirectory.create(out, record, overwrite=overwrite)
-
-    def keep(event: Any) -> None:
-        if isinstance(event, CheckpointEvent):  # so that `etsplat view` can follow
-            save_soup(run.soup_path, _soup_file(fitting, event.iteration, capture, config))
-        announce(event)
-
-    native = resolve_engine(config.engine, soup.vertices) == "cpu"
-    settings = LoopSettings(config.iterations, config.log_every, config.evaluate_every, config.checkpoint_every)
-    with one_torch_thread() if native else nullcontext():
-        progress = fit(fitting, run, settings, hash_record(record), keep)
-    return _finish(fitting, progress, run, scorer, capture, config)
+    return SoupFitting(soup, capture, config, generator, evaluate, squared=squared)
 
 
 def predicted_bytes(capture: Capture, config: TrainConfig) -> int:
@@ -207,6 +224,11 @@ def _start_points(capture: Capture, config: TrainConfig, generator: torch.Genera
     return points.with_sky() if config.sky_dome else points
 
 
+def _background(config: TrainConfig) -> Float[Tensor, "3"]:
+    """Behind the pictures that are measured."""
+    return torch.full((3,), 1.0 if config.background == "white" else 0.0)
+
+
 def _span(points: StartPoints) -> float:
     """Longest side of the box around the points."""
     return float((points.positions.amax(dim=0) - points.positions.amin(dim=0)).max()) if len(points) else 0.0
@@ -264,10 +286,10 @@ def _finish(
 def _soup_file(fitting: SoupFitting, iteration: int, capture: Capture, config: TrainConfig) -> SoupFile:
     """The soup as it is now, in the input's units."""
     soup, appearance = fitting.finished()
-    soup, own = soup.to(torch.device("cpu")), capture.normalization
+    soup, own, grey = soup.to(torch.device("cpu")), capture.normalization, float(_background(config)[0])
     return SoupFile(
         replace(soup, vertices=own.invert(soup.vertices.double()).float()),
         replace(appearance, near_plane=appearance.near_plane * own.radius),
-        (1.0, 1.0, 1.0) if config.background == "white" else (0.0, 0.0, 0.0),
+        (grey, grey, grey),
         {"iteration": str(iteration), "method": config.method, "preset": config.preset},
     )

@@ -55,6 +55,8 @@ class TrainConfig:
     """So many random triangles to start from where the capture has no points."""
     start_scale: float = 2.23
     """Size of a triangle at the start, relative to the distance to its neighbours."""
+    start_limit: float | None = None
+    """Triangles start no larger than this times their distance to the nearest camera; None for any size."""
     start_opacity: float = 0.28
     """Opacity of all triangles at the start."""
     start_sigma: float = 1.16
@@ -206,11 +208,18 @@ _SCENE_TYPES: dict[str, dict[str, Any]] = {
 _QUICK: dict[str, Any] = {
     "width": 800,
     "normalize": True,
-    "near_plane": 0.02,
+    "near_plane": 0.25,
     "cull_small": False,
     "iterations": 4000,
     "max_triangles": 100_000,
-    "lr_vertices": 0.0018,
+    "start_limit": 0.4,
+    "lr_vertices": 0.004,
+    "lr_sh_dc": 0.01,
+    "lr_sh_rest": 0.0005,
+    "lr_opacities": 0.05,
+    "lr_sigma": 0.005,
+    "prune_importance": 0.005,
+    "prune_views": 0,
     "lambda_normal": 0.0,
     "lambda_distortion": 0.0,
     "lambda_size": 0.0,

@@ -1,0 +1,159 @@
+"""Milliseconds of a training step of novel-view synthesis, the rasterizer's share, and that of each other part.
+
+python -m benchmarks.train_step ../shared/data/scenes/kitchen25 --triangles 100000 --width 800
+"""
+
+import argparse
+import json
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from benchmarks.machine import description
+from etsplat.ops.engines import num_threads, one_torch_thread, set_num_threads
+from etsplat.ops.rasterize import rasterize
+from etsplat.ops.soup_colors import soup_colors
+from etsplat.ops.ssim import photometric_loss
+from etsplat.scene.captures import Capture, load_capture
+from etsplat.scene.demo_scene import demo_scene
+from etsplat.tasks.soup_fitting import SoupFitting
+from etsplat.tasks.train import start_fitting
+from etsplat.tasks.train_config import TrainConfig, train_settings
+
+WARM_UP = 60
+"""Steps before anything is timed: the soup is then no longer the start."""
+
+
+def grown(capture: Capture, config: TrainConfig) -> SoupFitting:
+    """A soup of `config.max_triangles` triangles that has taken some steps at its full degree."""
+    fitting = start_fitting(capture, config, lambda *_: {})
+    iteration = 0
+    while fitting.count < config.max_triangles or iteration < WARM_UP:
+        iteration += 1
+        fitting.step(iteration)
+        if iteration % 5 == 0:
+            fitting.densify(iteration)
+    return fitting
+
+
+def median_ms(action: Callable[[], object], repeats: int) -> float:
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        action()
+        times.append(time.perf_counter() - start)
+    return 1000 * statistics.median(times)
+
+
+def measure(fitting: SoupFitting, capture: Capture, config: TrainConfig, repeats: int) -> dict[str, float]:
+    """Medians over steps, each with another view; and of the parts, all on one view."""
+    iterations = iter(range(config.iterations - 10 * repeats, config.iterations))
+    step = median_ms(lambda: fitting.step(next(iterations)), repeats)
+    rasterizer = statistics.mean(
+        median_ms(rasterizing(fitting, capture, config, view), 3) for view in capture.train[: repeats // 2]
+    )
+    view = capture.train[0]
+    return {
+        "step": step,
+        "rasterizer": rasterizer,
+        "outside": step - rasterizer,
+        "colours": median_ms(coloring(fitting, capture, view), repeats),
+        "photometric loss": median_ms(comparing(capture, view), repeats),
+        "Adam": median_ms(fitting.adam.step, repeats),
+    }
+
+
+def rasterizing(fitting: SoupFitting, capture: Capture, config: TrainConfig, view: int) -> Callable[[], object]:
+    camera, soup = capture.cameras[view], fitting.soup
+    with torch.no_grad():
+        colors = soup_colors(soup.vertices, soup.sh_dc, soup.sh_rest, camera.centers, soup.sh_degree)
+    leaves = [t.detach().clone().requires_grad_() for t in (soup.vertices, colors, soup.opacities, soup.sigma)]
+    cotangent = torch.rand(1, camera.height, camera.width, 3)
+
+    def run() -> None:
+        for leaf in leaves:
+            leaf.grad = None
+        out = rasterize(
+            *leaves,
+            camera.viewmats,
+            camera.Ks,
+            camera.width,
+            camera.height,
+            kernel=config.kernel,
+            distance=config.distance,
+            backgrounds=torch.zeros(1, 3),
+            near_plane=config.near_plane,
+            statistics=True,
+            validate=False,
+        )
+        out.color.backward(cotangent)
+
+    return run
+
+
+def coloring(fitting: SoupFitting, capture: Capture, view: int) -> Callable[[], object]:
+    soup, centers = fitting.soup, capture.cameras[view].centers
+    cotangent = torch.rand(1, len(soup), 3)
+
+    def run() -> None:
+        for parameter in (soup.vertices, soup.sh_dc, soup.sh_rest):
+            parameter.grad = None
+        soup_colors(soup.vertices, soup.sh_dc, soup.sh_rest, centers, soup.sh_degree).backward(cotangent)
+
+    return run
+
+
+def comparing(capture: Capture, view: int) -> Callable[[], object]:
+    target = capture.images[view][None]
+    color = torch.rand((*target.shape[:3], 3)).requires_grad_()
+
+    def run() -> None:
+        color.grad = None
+        photometric_loss(color, target, 0.2).backward()
+
+    return run
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scene", type=Path, nargs="?", help="a capture; the built-in scene without one")
+    parser.add_argument("--triangles", type=int, default=100_000)
+    parser.add_argument("--width", type=int, default=800)
+    parser.add_argument("--method", default="elastic")
+    parser.add_argument("--scene-type", default="outdoor")
+    parser.add_argument("--preset", default="quick")
+    parser.add_argument("--threads", type=int, default=0)
+    parser.add_argument("--repeats", type=int, default=20)
+    parser.add_argument("--json", type=Path, help="write the result here as well")
+    options = parser.parse_args()
+    set_num_threads(options.threads)
+    loaded = load_capture(options.scene, width=options.width) if options.scene else demo_scene(options.width)
+    config = replace(
+        train_settings(options.preset, options.scene_type),
+        method=options.method,
+        max_triangles=options.triangles,
+        iterations=100_000,
+        schedule_length=30_000,
+        sh_every=1,
+        regularize_from=0,
+    )
+    capture = loaded.normalized() if config.normalize else loaded
+    with one_torch_thread():
+        fitting = grown(capture, config)
+        times = measure(fitting, capture, config, options.repeats)
+    size = capture.images.sizes[0]
+    print(f"{fitting.count:,} triangles, {size[0]}x{size[1]}, {options.method}, {num_threads()} threads")
+    for name, value in times.items():
+        print(f"  {name:18} {value:7.1f} ms")
+    if options.json:
+        result: dict[str, Any] = {"triangles": fitting.count, "size": size, "threads": num_threads(), **times}
+        options.json.write_text(json.dumps({**description(), **result}, indent=2) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
