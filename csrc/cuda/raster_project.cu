@@ -224,7 +224,7 @@ extern "C" __global__ void __launch_bounds__(256) raster_emit(const __grid_const
                 const long long wanted = static_cast<long long>(begin + total);
                 *pass.wanted = wanted;
                 *pass.slots = wanted < pass.capacity ? static_cast<unsigned>(wanted) : static_cast<unsigned>(pass.capacity);
-                if (wanted > pass.capacity && wanted > *pass.overflow) *pass.overflow = wanted;
+                if (pass.overflow && wanted > pass.capacity && wanted > *pass.overflow) *pass.overflow = wanted;
             }
         }
     }

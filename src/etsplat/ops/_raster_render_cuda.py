@@ -129,11 +129,12 @@ class Render:
     def forward(self) -> None:
         """Render; again with more room if the pairs did not fit."""
         count, capturing = self.plan.geometry.count, _capturing(self.device)
+        flag = overflow_flag(self.device)
         if capturing:
             note_capture(self.device, self.shape, count)
         while True:
             capacity = capacity_for(self.device, self.shape, count)
-            wanted = self._list_pairs(capacity)
+            wanted = self._list_pairs(capacity, flag if capturing else None)
             pending = None if capturing else PendingNumber(wanted)
             self._composite(capacity)
             if pending is None:
@@ -142,10 +143,12 @@ class Render:
             record_need(self.device, self.shape, count, pairs)
             if pairs <= capacity:
                 return
-            overflow_flag(self.device).zero_()
 
-    def _list_pairs(self, capacity: int) -> Tensor:
-        """Project, sort by depth, list the pairs; returns the number of pairs wanted, on the device."""
+    def _list_pairs(self, capacity: int, overflow: Tensor | None) -> Tensor:
+        """Project, sort by depth, list the pairs; returns the number of pairs wanted, on the device.
+
+        If they did not fit, ``overflow`` holds that number, too.
+        """
         plan, a = self.plan, self.arguments
         m, tiles = plan.projected, plan.tile_count
         by_depth = RadixSort(max(m, 1), 31)
@@ -164,7 +167,7 @@ class Render:
         a.tile_done, a.tile_ranges = state["tile_done"], ranges.data_ptr()
         a.depth_keys, a.slot_tile = temporary["depth_keys"], temporary["tile_keys"]
         a.wanted, a.slots, a.scan_ticket = wanted.data_ptr(), counters.data_ptr(), counters[1:].data_ptr()
-        a.scan_state, a.overflow = scan_state.data_ptr(), overflow_flag(self.device).data_ptr()
+        a.scan_state, a.overflow = scan_state.data_ptr(), _pointer(overflow)
         launch(_PROJECT, "raster_project", blocks(m, 128), 128, [a])
         keys = (temporary["depth_keys"], temporary["depth_keys_2"])
         _, order = by_depth.run(keys, (temporary["order"], temporary["order_2"]), m, depth_zeros)
