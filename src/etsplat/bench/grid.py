@@ -19,6 +19,7 @@ from etsplat.bench.variants import Variant
 from etsplat.core.errors import InputError
 from etsplat.io.run_directory import RunDirectory, is_run
 from etsplat.tasks.reconstruct_config import ReconstructConfig
+from etsplat.tasks.train_config import TrainConfig
 
 _POLL_SECONDS = 0.5
 
@@ -28,22 +29,24 @@ class Cell:
     """One run of a grid, and how it stands.
 
     Attributes:
-        object: name of the mesh.
-        mesh: its file.
+        object: name of the mesh or scene.
+        mesh: its file, or the scene's folder.
         variant: name of the variant.
         config: settings.
         folder: run directory.
         state: "waiting", "running", "done" or "failed".
         error: why it failed, in one line.
+        images: of a scene, the folder of its photos; None for its own.
     """
 
     object: str
     mesh: Path
     variant: str
-    config: ReconstructConfig
+    config: ReconstructConfig | TrainConfig
     folder: Path
     state: str = "waiting"
     error: str = ""
+    images: str | None = None
     _process: Any = field(default=None, repr=False)
 
     def progress(self) -> dict[str, Any]:
@@ -72,7 +75,7 @@ def make_cells(
             for variant in variants:
                 folder = out / "runs" / name / (variant.name if len(seeds) == 1 else f"{variant.name} seed {seed}")
                 cell = Cell(name, mesh, variant.name, variant.config(base, seed), folder)
-                cell.state = "done" if _is_finished(cell) else "waiting"
+                cell.state = "done" if is_finished(cell) else "waiting"
                 cells.append(cell)
     return cells
 
@@ -96,7 +99,9 @@ def run_grid(cells: Sequence[Cell], jobs: int, show: Callable[[], None]) -> None
                 cell = waiting.pop(0)
                 cell.folder.parent.mkdir(parents=True, exist_ok=True)
                 _error_file(cell).unlink(missing_ok=True)
-                cell._process = context.Process(target=_work, args=(cell.mesh, cell.folder, cell.config, threads))
+                cell._process = context.Process(
+                    target=_work, args=(cell.mesh, cell.folder, cell.config, cell.images, threads)
+                )
                 cell._process.start()
                 cell.state = "running"
                 running.append(cell)
@@ -116,7 +121,7 @@ def run_grid(cells: Sequence[Cell], jobs: int, show: Callable[[], None]) -> None
 
 
 def _conclude(cell: Cell) -> None:
-    if cell._process.exitcode == 0 and _is_finished(cell):
+    if cell._process.exitcode == 0 and is_finished(cell):
         cell.state = "done"
         return
     cell.state = "failed"
@@ -124,15 +129,19 @@ def _conclude(cell: Cell) -> None:
     cell.error = path.read_text(encoding="utf-8") if path.exists() else f"ended with status {cell._process.exitcode}"
 
 
-def _work(mesh: Path, folder: Path, config: ReconstructConfig, threads: int) -> None:
+def _work(mesh: Path, folder: Path, config: ReconstructConfig | TrainConfig, images: str | None, threads: int) -> None:
     """One run, in a process of its own."""
     from etsplat.ops.engines import set_num_threads
     from etsplat.tasks.reconstruct import reconstruct
+    from etsplat.tasks.train import train
 
     os.setpgrp()  # Ctrl-C in a terminal reaches the parent alone, which passes it on once: twice would kill
     set_num_threads(threads)
     try:
-        reconstruct(mesh, folder, config, resume=is_run(folder))
+        if isinstance(config, TrainConfig):
+            train(mesh, folder, config, images=images, resume=is_run(folder))
+        else:
+            reconstruct(mesh, folder, config, resume=is_run(folder))
     except KeyboardInterrupt:
         raise SystemExit(130) from None
     except Exception as error:
@@ -148,7 +157,7 @@ def _error_path(folder: Path) -> Path:
     return folder.parent / f"{folder.name}.error.txt"
 
 
-def _is_finished(cell: Cell) -> bool:
+def is_finished(cell: Cell) -> bool:
     """Whether the folder holds a finished run with these settings."""
     run = RunDirectory(cell.folder)
     if not is_run(cell.folder) or not run.metrics_path.exists():

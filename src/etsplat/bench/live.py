@@ -1,6 +1,7 @@
 """How a grid stands: a live table on a terminal, a line for every finished run elsewhere."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from types import TracebackType
 
 from rich.console import Console
@@ -11,11 +12,31 @@ from rich.text import Text
 from etsplat.bench.grid import Cell
 
 
-class LiveTable:
-    """Objects by variants: Chamfer distance times 1000 of finished runs, percent done of running ones."""
+@dataclass(frozen=True)
+class Headline:
+    """The number that stands for a run: its title, its key in metrics.json, a factor and a format."""
 
-    def __init__(self, console: Console, cells: Sequence[Cell]) -> None:
+    title: str
+    key: str
+    factor: float
+    form: str
+
+    def text(self, cell: Cell) -> str:
+        """Of a finished run; a dash if it was not measured."""
+        value = cell.metrics()[self.key]
+        return "-" if value is None else f"{self.factor * value:{self.form}}"
+
+
+CHAMFER = Headline("Chamfer distance x 1000", "chamfer", 1e3, ".3f")
+PSNR = Headline("PSNR, dB", "psnr", 1.0, ".2f")
+
+
+class LiveTable:
+    """Objects by variants: the headline of finished runs, percent done of running ones."""
+
+    def __init__(self, console: Console, cells: Sequence[Cell], headline: Headline = CHAMFER) -> None:
         self._console = console
+        self._headline = headline
         self._cells = cells
         self._told: set[int] = set()
         self._live = Live(console=console, auto_refresh=False) if console.is_terminal else None
@@ -42,30 +63,29 @@ class LiveTable:
                 self._told.add(index)
                 cell = self._cells[index]
                 name = f"{cell.object}, {cell.variant}, seed {cell.config.seed}"
-                print(f"  {len(ended)}/{len(self._cells)} {name}: {_result(cell)}", flush=True)
+                print(f"  {len(ended)}/{len(self._cells)} {name}: {_result(cell, self._headline)}", flush=True)
 
     def _table(self) -> Table:
         variants = list(dict.fromkeys(cell.variant for cell in self._cells))
-        table = Table("object", *variants, box=None, title="Chamfer distance x 1000", title_justify="left")
+        table = Table("object", *variants, box=None, title=self._headline.title, title_justify="left")
         for name in dict.fromkeys(cell.object for cell in self._cells):
             row = []
             for variant in variants:
                 cells = [cell for cell in self._cells if cell.object == name and cell.variant == variant]
-                row.append(Text(" ").join(_short(cell) for cell in cells))
+                row.append(Text(" ").join(_short(cell, self._headline) for cell in cells))
             table.add_row(name, *row)
         return table
 
 
-def _result(cell: Cell) -> str:
+def _result(cell: Cell, headline: Headline) -> str:
     if cell.state == "failed":
         return f"failed: {cell.error}"
-    metrics = cell.metrics()
-    return f"Chamfer {1e3 * metrics['chamfer']:.3f}, {metrics['psnr']:.2f} dB, {metrics['seconds']:.0f} s"
+    return f"{headline.title} {headline.text(cell)}, {cell.metrics()['seconds']:.0f} s"
 
 
-def _short(cell: Cell) -> Text:
+def _short(cell: Cell, headline: Headline) -> Text:
     if cell.state == "done":
-        return Text(f"{1e3 * cell.metrics()['chamfer']:.3f}", style="bold")
+        return Text(headline.text(cell), style="bold")
     if cell.state == "running":
         return Text(f"{100 * cell.progress().get('iteration', 0) / cell.config.iterations:.0f} %", style="cyan")
     return Text("failed", style="red") if cell.state == "failed" else Text("·", style="dim")

@@ -1,20 +1,14 @@
 """A grid's results as files: results.csv, results.json, results.md, results.tex."""
 
-import csv
-import io
 import json
-import platform
-import subprocess
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from datetime import date
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 from etsplat.bench.paper import paper_chamfer
 from etsplat.bench.results import Summary, chamfer_of, summarize
-from etsplat.io.atomic import atomic_write
+from etsplat.bench.writing import bold, csv_text, latex_tabular, origin_of, versions_of, write_text
 
 
 @dataclass(frozen=True)
@@ -56,22 +50,14 @@ def write_tables(rows: Sequence[dict[str, Any]], variants: Sequence[str], out: P
         command: the command line, for the record.
     """
     summaries = summarize(rows, variants)
-    origin = {"command": command, "commit": _commit(), "machine": _machine(), "date": date.today().isoformat()}
-    document = {**origin, "versions": _versions(), "rows": list(rows), "summary": [asdict(s) for s in summaries]}
+    origin = origin_of(command)
+    document = {**origin, "versions": versions_of(), "rows": list(rows), "summary": [asdict(s) for s in summaries]}
     objects = sorted({row["object"] for row in rows})
-    _write(out / "results.json", json.dumps(document, indent=2) + "\n")
-    _write(out / "results.csv", _csv(rows))
-    _write(out / "results.md", _markdown(rows, objects, variants, summaries, origin))
-    _write(out / "results.tex", _latex(rows, objects, variants, summaries))
+    write_text(out / "results.json", json.dumps(document, indent=2) + "\n")
+    write_text(out / "results.csv", csv_text(rows))
+    write_text(out / "results.md", _markdown(rows, objects, variants, summaries, origin))
+    write_text(out / "results.tex", _latex(rows, objects, variants, summaries))
     return summaries
-
-
-def _csv(rows: Sequence[dict[str, Any]]) -> str:
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return text.getvalue()
 
 
 def _markdown(
@@ -107,20 +93,6 @@ def _markdown(
 def _latex(
     rows: Sequence[dict[str, Any]], objects: Sequence[str], variants: Sequence[str], summaries: Sequence[Summary]
 ) -> str:
-    def tabular(head: Sequence[str], body: Sequence[Sequence[str]]) -> str:
-        lines = [" & ".join(_escape(cell) for cell in line) + r" \\" for line in body]
-        return "\n".join(
-            [
-                rf"\begin{{tabular}}{{l{'c' * (len(head) - 1)}}}",
-                r"\toprule",
-                " & ".join(_escape(cell) for cell in head) + r" \\",
-                r"\midrule",
-                *lines,
-                r"\bottomrule",
-                r"\end{tabular}",
-            ]
-        )
-
     shown = [column for column in _COLUMNS if any(column.value(summary) is not None for summary in summaries)]
     summary_lines = [[s.variant, *(_cell(column, s, summaries, r"\textbf") for column in shown)] for s in summaries]
     object_lines = []
@@ -131,68 +103,24 @@ def _latex(
     return "\n\n".join(
         [
             "% needs booktabs",
-            tabular(["variant", *(column.title for column in shown)], summary_lines),
-            tabular(["object", *variants], object_lines) + "\n",
+            latex_tabular(["variant", *(column.title for column in shown)], summary_lines),
+            latex_tabular(["object", *variants], object_lines) + "\n",
         ]
     )
 
 
-def _cell(column: _Column, summary: Summary, summaries: Sequence[Summary], bold: str) -> str:
+def _cell(column: _Column, summary: Summary, summaries: Sequence[Summary], mark: str) -> str:
     value = column.value(summary)
     if value is None:
         return "-"
     present = [other for s in summaries if (other := column.value(s)) is not None]
     winner = {"min": min(present), "max": max(present)}.get(column.best or "")
-    return _bold(f"{value:{column.format}}", value == winner and len(summaries) > 1, bold)
+    return bold(f"{value:{column.format}}", value == winner and len(summaries) > 1, mark)
 
 
-def _object_cell(name: str, variant: str, value: float | None, lowest: float, bold: str) -> str:
+def _object_cell(name: str, variant: str, value: float | None, lowest: float, mark: str) -> str:
     if value is None:
         return "-"
     printed = paper_chamfer(name, variant)
-    text = _bold(f"{value:.3f}", value == lowest, bold)
+    text = bold(f"{value:.3f}", value == lowest, mark)
     return text if printed is None else f"{text} ({printed:g})"
-
-
-def _bold(text: str, winner: bool, bold: str) -> str:
-    if not winner:
-        return text
-    return f"**{text}**" if bold == "**" else rf"\textbf{{{text}}}"
-
-
-def _escape(text: str) -> str:
-    return text.replace("_", r"\_").replace("%", r"\%").replace("±", r"$\pm$")
-
-
-def _commit() -> str:
-    """Of the source tree that this package runs from, or its version if it is installed."""
-    try:
-        found = subprocess.run(
-            ["git", "rev-parse", "--short", "HEAD"],
-            cwd=Path(__file__).parent,
-            capture_output=True,
-            text=True,
-            check=True,
-        )
-    except (OSError, subprocess.CalledProcessError):
-        return f"of etsplat {version('etsplat')}"
-    return found.stdout.strip()
-
-
-def _machine() -> str:
-    return f"{_cores()} cores, {platform.machine()}"
-
-
-def _cores() -> int:
-    import os
-
-    return len(os.sched_getaffinity(0))
-
-
-def _versions() -> dict[str, str]:
-    return {"etsplat": version("etsplat"), "torch": version("torch"), "python": platform.python_version()}
-
-
-def _write(path: Path, text: str) -> None:
-    with atomic_write(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")

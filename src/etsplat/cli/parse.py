@@ -8,6 +8,7 @@ from typing import Annotated, Any, Union
 import tyro
 
 from etsplat.cli.bench import Distance, Famous, Regularizers, Settings
+from etsplat.cli.bench_nvs import Nvs
 from etsplat.cli.command import Command
 from etsplat.cli.data import Download, Sfm
 from etsplat.cli.doctor import Doctor
@@ -46,7 +47,7 @@ COMMANDS: dict[str, type[Command] | Group] = {
     "export": Export,
     "bench": Group(
         "The paper's studies as grids of runs, with tables and figures.",
-        {"famous": Famous, "regularizers": Regularizers, "distance": Distance, "settings": Settings},
+        {"famous": Famous, "nvs": Nvs, "regularizers": Regularizers, "distance": Distance, "settings": Settings},
     ),
     "figures": Figures,
     "doctor": Doctor,

@@ -1,0 +1,101 @@
+"""`etsplat bench nvs`: the paper's tables and figures of novel-view synthesis."""
+
+import os
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+import tyro
+
+from etsplat.cli.command import FAILED, INTERRUPTED, Command, fail
+from etsplat.tasks.train_config import Method, SceneType, TrainPreset
+
+
+@dataclass(frozen=True, kw_only=True)
+class Nvs(Command):
+    """The paper's tables nvs, per-scene, filter and efficiency, and its figures nvs and trisoup.
+
+    Scenes of the paper get Triangle Splatting's settings for them with `--preset paper`.
+    """
+
+    EXAMPLES: ClassVar[str] = """
+    etsplat bench nvs --scenes scenes/kitchen scenes/fox --out runs/nvs
+    etsplat bench nvs --scenes scenes/fox --out runs/filter --methods elastic --culling both
+    etsplat bench nvs --scenes data/tandt/truck data/tandt/train --out runs/tandt --preset paper --culling on
+    """
+
+    scenes: tuple[Path, ...]
+    """Folders of the scenes."""
+    out: Path
+    """Folder for the runs, tables and figures; a grid that was interrupted goes on where it was."""
+    methods: tuple[Method, ...] = ("elastic", "bilateral", "single-sided")
+    """Which kernels."""
+    culling: Literal["off", "on", "both"] = "off"
+    """Leave out triangles with an inradius below a pixel: the paper's rows were measured with it on."""
+    preset: TrainPreset = "quick"
+    """Settings of all runs."""
+    scene_type: SceneType = "outdoor"
+    """Kind of the scenes that are not the paper's."""
+    iterations: int | None = None
+    """In place of the preset's."""
+    max_triangles: int | None = None
+    """In place of the preset's."""
+    width: int | None = None
+    """In place of the preset's."""
+    jobs: int = 1
+    """Runs beside each other; they share the cores evenly."""
+    lpips_weights: Path | None = None
+    """File with LPIPS's weights, or `download`."""
+
+    @classmethod
+    def defaults(cls, arguments: Sequence[str]) -> "Nvs":
+        """Nothing depends on the arguments."""
+        return cls(scenes=tyro.MISSING, out=tyro.MISSING)
+
+    def run(self, arguments: Sequence[str]) -> int:
+        """Runs what is not finished yet, measures it, then writes tables and figures."""
+        from rich.console import Console
+
+        from etsplat.bench.grid import run_grid
+        from etsplat.bench.live import PSNR, LiveTable
+        from etsplat.bench.nvs import evaluate_cells, make_nvs_cells
+        from etsplat.cli.phases import PhaseBar
+
+        given = {"iterations": self.iterations, "max_triangles": self.max_triangles, "width": self.width}
+        changes: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
+        cells = make_nvs_cells(
+            self.scenes,
+            self.methods,
+            self.out,
+            preset=self.preset,
+            culling={"off": (False,), "on": (True,), "both": (False, True)}[self.culling],
+            changes=changes,
+            scene_type=self.scene_type,
+        )
+        console = Console()
+        try:
+            with LiveTable(console, cells, PSNR) as table:
+                run_grid(cells, min(self.jobs, len(os.sched_getaffinity(0))), table.update)
+            with PhaseBar(console) as bar:
+                rows = evaluate_cells(cells, self.lpips_weights, lambda done, total: bar.show("Measuring", done, total))
+        except KeyboardInterrupt:
+            fail("interrupted; give the same command to go on", INTERRUPTED)
+        if rows:
+            self._report(cells, rows, arguments)
+        failed = [cell for cell in cells if cell.state == "failed"]
+        for cell in failed:
+            print(f"{cell.object}, {cell.variant}: failed: {cell.error}")
+        return FAILED if failed else 0
+
+    def _report(self, cells: list, rows: list[dict[str, Any]], arguments: Sequence[str]) -> None:
+        from etsplat.bench.nvs_figures import draw_nvs
+        from etsplat.bench.nvs_tables import write_nvs_tables
+
+        write_nvs_tables(rows, self.out, shlex.join(["etsplat", *arguments]))
+        variants = list(dict.fromkeys(row["variant"] for row in rows))
+        draw_nvs(cells, variants, self.out / "nvs.png")
+        draw_nvs(cells, variants, self.out / "trisoup.png", kind="opaque")
+        print((self.out / "nvs.md").read_text(encoding="utf-8"))
+        print(f"{self.out}: nvs.md, .csv, .json, .tex, nvs.png, trisoup.png; each run under runs/")

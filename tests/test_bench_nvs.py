@@ -1,0 +1,104 @@
+"""The grid of soups: runs that resume, numbers that come from the runs, tables that say what they are."""
+
+import json
+
+import pytest
+from PIL import Image
+
+from captures import write_colmap
+from etsplat.bench.grid import run_grid
+from etsplat.bench.nvs import evaluate_cells, make_nvs_cells
+from etsplat.bench.nvs_figures import draw_nvs
+from etsplat.bench.nvs_tables import nvs_tables, write_nvs_tables
+from etsplat.bench.paper_nvs import SCENES
+from etsplat.core.errors import InputError
+
+
+def row(scene, variant, psnr, **numbers):
+    known = {"ssim": 0.8, "lpips_3dgs": None, "psnr_opaque": 20.0, "minutes": 2.0, "triangles": 100, "fps": 5.0}
+    return {"scene": scene, "variant": variant, "psnr": psnr, "ms_per_million": 9.0, **known, **numbers}
+
+
+def cells_of(folder, **options):
+    settings = {"preset": "tiny", "scene_type": "outdoor", "culling": (False, True), "changes": {"iterations": 6}}
+    return make_nvs_cells([folder / "toy"], ["elastic"], folder / "out", **{**settings, **options})
+
+
+def test_a_grid_runs_is_measured_and_goes_on_where_it_was(tmp_path):
+    write_colmap(tmp_path / "toy", [(48, 36)] * 3)
+    cells = cells_of(tmp_path)
+    run_grid(cells, 2, lambda: None)
+    assert [(cell.state, cell.error) for cell in cells] == [("done", ""), ("done", "")]
+    told = []
+    rows = evaluate_cells(cells, None, lambda *state: told.append(state))
+    assert told[-1] == (2, 2)
+    assert [row["variant"] for row in rows] == ["elastic", "elastic culling"]
+    for measured, cell in zip(rows, cells, strict=True):
+        assert measured["psnr"] == pytest.approx(cell.metrics()["psnr"], abs=1e-3)
+    write_nvs_tables(rows, tmp_path / "out", "etsplat bench nvs")
+    assert json.loads((tmp_path / "out" / "nvs.json").read_text())["rows"] == rows
+    assert "**filter.**" in (tmp_path / "out" / "nvs.md").read_text()
+    draw_nvs(cells, ["elastic", "elastic culling"], tmp_path / "nvs.png")
+    assert Image.open(tmp_path / "nvs.png").width == 3 * 404
+    again = cells_of(tmp_path)
+    assert [cell.state for cell in again] == ["done", "done"]
+    assert cells_of(tmp_path, changes={"iterations": 7})[0].state == "waiting"
+
+
+def test_means_are_over_the_scenes_that_every_variant_has_and_the_best_is_bold():
+    rows = [row("a", "elastic", 20.0), row("b", "elastic", 30.0), row("a", "bilateral", 21.0)]
+    overall = nvs_tables(rows)[0]
+    assert [(title, values[0]) for title, values in overall.rows] == [("elastic", 20.0), ("bilateral", 21.0)]
+    assert overall.cells("**")[1][1] == "**21.00**"
+    assert overall.cells("**")[0][3] == "-"
+    per_scene = nvs_tables(rows)[1]
+    assert per_scene.rows == [("elastic", [20.0, 30.0]), ("bilateral", [21.0, None])]
+
+
+def test_the_papers_row_stands_beside_a_complete_data_set_only():
+    rows = [row(scene, "elastic culling", 23.0) for scene in ("truck", "train")]
+    assert ("elastic culling (paper)", [23.08, 0.858, 0.134, None]) in nvs_tables(rows)[0].rows
+    assert len(nvs_tables(rows[:1])[0].rows) == 1
+
+
+def test_table_filter_shows_the_difference():
+    rows = [row("a", "elastic", 21.5), row("a", "elastic culling", 21.0)]
+    table = next(table for table in nvs_tables(rows) if table.name == "filter")
+    assert [(title, values[0]) for title, values in table.rows] == [
+        ("elastic, culled", 21.0),
+        ("elastic, kept", 21.5),
+        ("elastic, kept - culled", 0.5),
+    ]
+
+
+def test_the_papers_scenes_get_their_settings_with_preset_paper(tmp_path):
+    (tmp_path / "garden" / "images_4").mkdir(parents=True)
+    cell = make_nvs_cells(
+        [tmp_path / "garden"],
+        ["single-sided"],
+        tmp_path / "out",
+        preset="paper",
+        culling=(True,),
+        changes={},
+        scene_type="object",
+    )[0]
+    assert (cell.config.max_triangles, cell.config.scene_type, cell.images) == (5_200_000, "outdoor", "images_4")
+    assert cell.config.cull_small
+    assert {scene.dataset for scene in SCENES.values()} == {"Mip-NeRF 360", "Tanks and Temples", "Deep Blending"}
+
+
+def test_missing_scenes_and_equal_names_are_input_errors(tmp_path):
+    with pytest.raises(InputError, match="etsplat data download"):
+        cells_of(tmp_path)
+    for folder in ("x", "y"):
+        (tmp_path / folder / "toy").mkdir(parents=True)
+    with pytest.raises(InputError, match="two are named toy"):
+        make_nvs_cells(
+            [tmp_path / "x" / "toy", tmp_path / "y" / "toy"],
+            ["elastic"],
+            tmp_path / "out",
+            preset="tiny",
+            culling=(False,),
+            changes={},
+            scene_type="outdoor",
+        )
