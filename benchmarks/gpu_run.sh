@@ -50,7 +50,7 @@ sanitize() {
     fi
     for tool in memcheck racecheck; do
         step "$tool" 540 compute-sanitizer --tool "$tool" --error-exitcode 1 "${pytest_cuda[@]}" \
-            -m "cuda and sanitize" tests/test_rasterize_cuda.py tests/test_cuda_sort.py
+            -m "cuda and sanitize" tests/test_rasterize_cuda.py tests/test_cuda_sort.py tests/test_cuda_ops.py
     done
 }
 

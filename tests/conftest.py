@@ -8,13 +8,13 @@ import pytest
 import torch
 
 from etsplat.core.kernels import DISTANCES, KERNELS
-from etsplat.cuda.launch import use_backend
+from etsplat.cuda.launch import device_type, use_backend
 from simt.build import Simt
 
 # Tests run side by side, on small tensors: torch's own threads would only wait for each other.
 torch.set_num_threads(1)
 
-# Of the engine-parameterised tests. What engine "cuda" computes is compared with these in its own (test_simt_*.py).
+# Of the engine-parameterised tests. What engine "cuda" computes is compared with these in its own (test_cuda_*.py).
 ENGINES = ("reference", "cpu")
 
 REPOSITORY = Path(__file__).resolve().parent.parent
@@ -67,6 +67,12 @@ def cuda_engine(request: pytest.FixtureRequest) -> Iterator[str]:
     else:
         with use_backend(Simt()):
             yield "cuda"
+
+
+@pytest.fixture
+def cuda_device(cuda_engine: str) -> torch.device:
+    """Where the tensors of engine "cuda" are: on a GPU, or on the CPU for the shim."""
+    return torch.device(device_type())
 
 
 @pytest.fixture
