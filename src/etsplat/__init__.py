@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from etsplat.scene.demo_object import demo_object
     from etsplat.tasks.reconstruct import ReconstructResult, reconstruct
     from etsplat.tasks.reconstruct_config import PRESETS, ReconstructConfig
+    from etsplat.tasks.train import TrainResult, train
+    from etsplat.tasks.train_config import TrainConfig, train_settings
 
 _HOMES = {
     "etsplat.core.cameras": ("Cameras", "intrinsics", "look_at", "sphere_grid"),
@@ -33,6 +35,8 @@ _HOMES = {
     "etsplat.scene.demo_object": ("demo_object",),
     "etsplat.tasks.reconstruct": ("ReconstructResult", "reconstruct"),
     "etsplat.tasks.reconstruct_config": ("PRESETS", "ReconstructConfig"),
+    "etsplat.tasks.train": ("TrainResult", "train"),
+    "etsplat.tasks.train_config": ("TrainConfig", "train_settings"),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 
@@ -46,6 +50,8 @@ __all__ = [
     "Rasterization",
     "ReconstructConfig",
     "ReconstructResult",
+    "TrainConfig",
+    "TrainResult",
     "TriangleStatistics",
     "demo_object",
     "intrinsics",
@@ -60,6 +66,8 @@ __all__ = [
     "save_mesh",
     "set_num_threads",
     "sphere_grid",
+    "train",
+    "train_settings",
     "write_report",
 ]
 
