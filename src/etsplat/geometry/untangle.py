@@ -21,7 +21,7 @@ def untangle(
 
     Each round marks the corners of intersecting faces, adds a ring of neighbours for every fourth round already done,
     so that what resists is smoothed more widely, and moves the marked vertices to the mean of their neighbours in
-    damped sweeps. All others stay where they are. Boundary vertices may shrink inwards.
+    damped sweeps. All others stay where they are. Boundary vertices may shrink inwards. Computed on the CPU.
 
     Args:
         vertices: (V, 3) finite.
@@ -31,21 +31,23 @@ def untangle(
     Returns:
         Moved vertices, and how many faces still intersect.
     """
-    vertices = vertices.detach().clone()
+    device, vertices = vertices.device, vertices.detach().cpu().clone()
+    faces = topology.faces.cpu()
+    marked = intersecting_faces(vertices, faces)
     for done in range(rounds):
-        marked = intersecting_faces(vertices, topology.faces)
         if not bool(marked.any()):
-            return vertices, 0
+            break
         _smooth(vertices, topology, _region(marked, topology, rings=done // 4))
-    return vertices, int(intersecting_faces(vertices, topology.faces).sum())
+        marked = intersecting_faces(vertices, faces)
+    return vertices.to(device), int(marked.sum())
 
 
 def _region(faces: Bool[Tensor, " F"], topology: MeshTopology, rings: int) -> Bool[Tensor, " V"]:
     """The corners of some faces, and so many rings of neighbours."""
-    region = torch.zeros(topology.num_vertices, dtype=torch.bool, device=topology.faces.device)
-    region[topology.faces[faces].reshape(-1)] = True
+    region = torch.zeros(topology.num_vertices, dtype=torch.bool)
+    region[topology.faces.cpu()[faces].reshape(-1)] = True
+    first, second = topology.edges.cpu().unbind(1)
     for _ in range(rings):
-        first, second = topology.edges.unbind(1)
         grown = region.clone()
         grown[second[region[first]]] = True
         grown[first[region[second]]] = True
@@ -55,10 +57,10 @@ def _region(faces: Bool[Tensor, " F"], topology: MeshTopology, rings: int) -> Bo
 
 def _smooth(vertices: Tensor, topology: MeshTopology, region: Bool[Tensor, " V"]) -> None:
     """Damped sweeps over the vertices of a region, in place."""
-    counts = topology.neighbor_offsets.diff()
-    owner = torch.repeat_interleave(torch.arange(topology.num_vertices, device=counts.device), counts)
+    counts = topology.neighbor_offsets.cpu().diff()
+    owner = torch.repeat_interleave(torch.arange(topology.num_vertices), counts)
     inside = region[owner]
-    owner, neighbors = owner[inside], topology.neighbor_indices[inside]
+    owner, neighbors = owner[inside], topology.neighbor_indices.cpu()[inside]
     moved = region & (counts > 0)
     for _ in range(_SWEEPS):
         sums = torch.zeros_like(vertices).index_add_(0, owner, vertices[neighbors])
