@@ -3,6 +3,7 @@
 import re
 import subprocess
 import sys
+from importlib.metadata import files as distribution_files
 from importlib.metadata import requires, version
 from importlib.resources import files
 from pathlib import Path
@@ -10,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from etsplat import _native
+from etsplat.cuda.program import source_root
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 
@@ -35,6 +37,13 @@ def test_report_assets_are_installed() -> None:
     for name in ("page.html", "page.css", "page.js", "viewer.js"):
         assert (files("etsplat.report") / "assets" / name).is_file()
     assert (files("etsplat") / "py.typed").is_file()
+
+
+def test_kernel_sources_are_installed() -> None:
+    """The GPU engine compiles its kernels from text that comes with the package."""
+    installed = {file.as_posix() for file in distribution_files("etsplat") or []}
+    assert {"etsplat/csrc/cuda/fill.cu", "etsplat/csrc/cuda/common.h", "etsplat/csrc/math/portable.h"} <= installed
+    assert (source_root() / "cuda" / "fill.cu").is_file()
 
 
 def test_torch_range_stays_wide() -> None:
