@@ -7,19 +7,22 @@ from torch import Tensor
 from etsplat.geometry.intersections import intersecting_faces
 from etsplat.geometry.topology import MeshTopology
 
-_SWEEPS = 5
-"""Smoothing sweeps between two looks for intersections."""
+_SWEEPS = 2
+"""Smoothing sweeps between two looks for intersections: more move vertices farther than they must, fewer look longer."""
+
+_WIDEN = 8
+"""Rounds after which the region grows by a ring of neighbours."""
 
 _STEP = 0.5
 """How far a sweep moves a vertex towards the mean of its neighbours."""
 
 
 def untangle(
-    vertices: Float[Tensor, "V 3"], topology: MeshTopology, *, rounds: int = 20
+    vertices: Float[Tensor, "V 3"], topology: MeshTopology, *, rounds: int = 40
 ) -> tuple[Float[Tensor, "V 3"], int]:
     """Moves the vertices of faces that cut through others until none does, or the rounds are used up.
 
-    Each round marks the corners of intersecting faces, adds a ring of neighbours for every fourth round already done,
+    Each round marks the corners of intersecting faces, adds a ring of neighbours for every eighth round already done,
     so that what resists is smoothed more widely, and moves the marked vertices to the mean of their neighbours in
     damped sweeps. All others stay where they are. Boundary vertices may shrink inwards. Computed on the CPU.
 
@@ -37,7 +40,7 @@ def untangle(
     for done in range(rounds):
         if not bool(marked.any()):
             break
-        _smooth(vertices, topology, _region(marked, topology, rings=done // 4))
+        _smooth(vertices, topology, _region(marked, topology, rings=done // _WIDEN))
         marked = intersecting_faces(vertices, faces)
     return vertices.to(device), int(marked.sum())
 
