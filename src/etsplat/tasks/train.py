@@ -127,7 +127,7 @@ def train(
     settings = LoopSettings(config.iterations, config.log_every, config.evaluate_every, config.checkpoint_every)
     with one_torch_thread() if native else nullcontext():
         progress = fit(fitting, run, settings, hash_record(record), keep)
-    return _finish(fitting, progress, run, scorer, capture, config)
+        return _finish(fitting, progress, run, scorer, capture, config)
 
 
 def start_fitting(

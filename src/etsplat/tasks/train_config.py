@@ -230,7 +230,7 @@ _QUICK: dict[str, Any] = {
 _PRESETS: dict[str, dict[str, Any]] = {
     "paper": {},
     "quick": _QUICK,
-    "demo": _QUICK,
+    "demo": {**_QUICK, "iterations": 3000, "max_triangles": 40_000},
     "tiny": {
         **_QUICK,
         "width": 64,
