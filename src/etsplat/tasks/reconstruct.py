@@ -20,6 +20,7 @@ from etsplat.tasks.running import (
     Callback,
     NoteEvent,
     PrepareEvent,
+    device_name,
     fit,
     hash_record,
     make_record,
@@ -134,7 +135,7 @@ def _finish(
         "seconds": progress.seconds,
         "seconds_per_iteration": progress.seconds / progress.iteration,
         "engine": resolve_engine(config.engine, mesh.vertices),
-        "device": _device_name(mesh.vertices.device),
+        "device": device_name(mesh.vertices.device),
         "threads": num_threads(),
         "method": config.method,
         "preset": config.preset,
@@ -143,7 +144,3 @@ def _finish(
     }
     run.write_metrics(metrics)
     return ReconstructResult(run.path, result, run.read_metrics())
-
-
-def _device_name(device: torch.device) -> str:
-    return torch.cuda.get_device_name(device) if device.type == "cuda" else device.type

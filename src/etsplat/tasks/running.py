@@ -106,6 +106,11 @@ def path_of(source: object) -> str | None:
     return str(source) if isinstance(source, str | Path) else None
 
 
+def device_name(device: torch.device) -> str:
+    """For the record: "cpu", or what the GPU is called."""
+    return torch.cuda.get_device_name(device) if device.type == "cuda" else device.type
+
+
 def versions() -> dict[str, str]:
     """Of what computes."""
     return {"etsplat": version("etsplat"), "torch": torch.__version__, "python": platform.python_version()}
