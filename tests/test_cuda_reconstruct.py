@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from etsplat.ops import _raster_capacity
 from etsplat.optim.loop import Progress
@@ -97,6 +98,31 @@ def test_steps_queued_together_are_the_steps_one_by_one(cuda_device: torch.devic
     assert losses == [one_by_one.advance(i, i)[0] for i in range(1, 6)]
     for name, parameter in together.mesh.parameters().items():
         assert torch.equal(parameter, one_by_one.mesh.parameters()[name])
+
+
+class Calls(TorchDispatchMode):
+    """Remembers which operations of torch are called."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.names: list[str] = []
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        self.names.append(str(func))
+        return func(*args, **(kwargs or {}))
+
+
+@pytest.mark.parametrize(("method", "reads"), [("elastic", 1), ("raster-vertex", 0)])
+def test_a_queued_step_reads_nothing_back(simt: Simt, views: PosedViews, method: str, reads: int) -> None:
+    """Nothing in a step waits for the device, but for the rasterizer's look at its room outside of captured graphs."""
+    problem = fitting(views, "cuda", replace(CONFIG, method=method))
+    problem.advance(1, 1)  # fills caches
+    assert problem._queue is not None
+    problem._queue._position.zero_()
+    with Calls() as calls:
+        problem._queue._step()
+    waiting = ("_local_scalar_dense", "nonzero", "masked_select", "unique", "bincount", "equal")
+    assert sum(name.split(".")[1] in waiting for name in calls.names) == reads
 
 
 def test_a_step_whose_buffers_overflow_is_made_again(simt: Simt, views: PosedViews, monkeypatch) -> None:
