@@ -1,6 +1,7 @@
 """Speed of the GPU rasterizer: event-timed on a device, with the floor of every kernel by counting.
 
 python -m benchmarks.gpu                          every scene; writes benchmarks/results/gpu_<date>_<commit>.json
+python -m benchmarks.gpu --host                   host time of a step alone: needs no GPU
 python -m benchmarks.gpu --count sphere6          the counts alone, by the tests' shim: needs no GPU, minutes
 
 Work is counted from a render's own buffers: slots ((triangle, tile) pairs), pairs of a slot and a sub-tile of 8x4
@@ -31,6 +32,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--repeats", type=int, default=50)
     parser.add_argument("--peaks", choices=list(PEAKS), default="H100")
     parser.add_argument("--count", metavar="SCENE", help="count the work of one scene without a GPU")
+    parser.add_argument("--host", action="store_true", help="time what a step costs outside of kernels, without a GPU")
     parser.add_argument("--json", type=Path, help="default: benchmarks/results/gpu_<date>_<commit>.json")
     return parser.parse_args(arguments)
 
@@ -66,6 +68,10 @@ def time_table(results: dict[str, dict[str, Any]]) -> Table:
 def main(arguments: list[str] | None = None) -> None:
     options = parse(arguments)
     console = Console(width=150)
+    if options.host:
+        milliseconds = gpu_timing.host_milliseconds(gpu_scenes.load("sphere2", "cpu"), 20 * options.repeats)
+        console.print(f"{milliseconds:.3f} ms of host time per forward and backward")
+        return
     if options.count:
         work = gpu_timing.count_without_gpu(gpu_scenes.load(options.count, "cpu"))
         console.print(work)

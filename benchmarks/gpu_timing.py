@@ -2,6 +2,7 @@
 
 import statistics
 import sys
+import time
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
@@ -109,6 +110,27 @@ def count(scene: GpuScene) -> Work:
         tiles=batch * -(-height // TILE) * -(-width // TILE),
         channels=channels,
     )
+
+
+class _Nothing:
+    """A backend whose launches do nothing."""
+
+    device_type = "cpu"
+
+    def launch(self, *arguments: Any) -> None:
+        """Nothing."""
+
+
+def host_milliseconds(scene: GpuScene, repeats: int) -> float:
+    """Processor time that a step of forward and backward takes outside of kernels, on small tensors of the CPU."""
+    scene.cotangent = scene.cotangent[:, :64, :64].contiguous()
+    with use_backend(_Nothing()):
+        for _ in range(WARM_UP):
+            step(scene)
+        begin = time.process_time()
+        for _ in range(repeats):
+            step(scene)
+        return 1e3 * (time.process_time() - begin) / repeats
 
 
 def count_without_gpu(scene: GpuScene) -> Work:

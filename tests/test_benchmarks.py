@@ -100,6 +100,10 @@ def test_work_of_the_gpu_engine_is_counted_by_the_shim():
     assert all(floor.ms > 0 for floor in gpu_floors.floors(work, gpu_floors.PEAKS["H100"]))
 
 
+def test_host_time_is_measured_without_kernels():
+    assert gpu_timing.host_milliseconds(gpu_scenes.load("sphere1", "cpu"), 2) > 0
+
+
 def test_a_reconstruction_step_is_timed(simt):
     """After the subdivision, over the last steps."""
     result = gpu_reconstruct.step_milliseconds(torch.device("cpu"), resolution=24, start_level=1, faces=120, steps=3)
