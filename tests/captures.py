@@ -61,7 +61,7 @@ def write_colmap(folder, sizes, *, poses=None, points=20, image_folder="images",
     if points:
         rng = np.random.default_rng(1)
         rows = [
-            f"{k} {' '.join(map(str, rng.normal(size=3)))} {' '.join(map(str, rng.integers(0, 256, 3)))} 0.5 0 1 1 2\n"
+            f"{k} {' '.join(map(str, rng.normal(size=3)))} {' '.join(map(str, rng.integers(0, 256, 3)))} 0.5\n"
             for k in range(points)
         ]
         (sparse / "points3D.txt").write_text("".join(rows))

@@ -5,12 +5,12 @@ import zipfile
 
 import pytest
 
-from captures import write_photo
+from captures import write_colmap, write_photo
 from etsplat.core.errors import InputError
 from etsplat.io import datasets
 from etsplat.io.datasets import Dataset, download_dataset
 from etsplat.scene.captures import load_capture
-from etsplat.scene.structure_from_motion import find_cameras
+from etsplat.scene.structure_from_motion import find_cameras, undistort_scene
 
 
 def test_without_pycolmap_the_extra_is_named(tmp_path, monkeypatch):
@@ -71,6 +71,23 @@ def test_real_photos_become_a_scene_that_loads(tmp_path, shared_data):
         "Placing cameras",
         "Removing lens distortion",
     ]
+
+
+@pytest.mark.parametrize(("model", "extra"), [("SIMPLE_RADIAL", (-0.1,)), ("RADIAL", (0.05, -0.02))])
+def test_a_distorted_scene_is_refused_with_the_remedy_and_undistorted_once(tmp_path, model, extra):
+    pytest.importorskip("pycolmap")
+    write_colmap(tmp_path / "scene", [(64, 48)] * 3, model=model, extra=extra)
+    with pytest.raises(InputError, match=rf"{model}.*etsplat data undistort"):
+        load_capture(tmp_path / "scene")
+    undistort_scene(tmp_path / "scene", tmp_path / "new")
+    capture = load_capture(tmp_path / "new")
+    assert (len(capture), len(capture.points)) == (3, 20)
+    assert all(abs(width / height - 64 / 48) < 0.2 for width, height in capture.images.sizes)
+    (tmp_path / "scene" / "images" / "0001.jpg").unlink()
+    with pytest.raises(InputError, match=r"1 images are missing \(first: 0001\.jpg\)"):
+        undistort_scene(tmp_path / "scene", tmp_path / "newer")
+    with pytest.raises(InputError, match="no sparse/0"):
+        undistort_scene(tmp_path, tmp_path / "newer")
 
 
 @pytest.fixture

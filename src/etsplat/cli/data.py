@@ -59,6 +59,38 @@ class Sfm(Command):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Undistort(Command):
+    """Write a COLMAP scene anew without lens distortion: what every other command wants.
+
+    Needs pycolmap: pip install 'etsplat[sfm]'.
+    """
+
+    EXAMPLES: ClassVar[str] = """
+    etsplat data undistort distorted_scene/ --out my_scene
+    """
+
+    source: tyro.conf.Positional[Path]
+    """Folder with images/ and sparse/0/, of any of COLMAP's camera models."""
+    out: Path
+    """Folder for the new scene."""
+    max_size: int = 1600
+    """Longer sides are shrunk to this many pixels."""
+
+    @classmethod
+    def defaults(cls, arguments: Sequence[str]) -> "Undistort":
+        """Nothing depends on the arguments."""
+        return cls(source=tyro.MISSING, out=tyro.MISSING)
+
+    def run(self, arguments: Sequence[str]) -> int:
+        """Writes the scene."""
+        from etsplat.scene.structure_from_motion import undistort_scene
+
+        done = undistort_scene(self.source, self.out, max_size=self.max_size)
+        print(f"{len(done.placed)} images without lens distortion; scene in {done.scene}")
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
 class Download(Command):
     """Fetch the captures and meshes of the paper's tables: Mip-NeRF 360, Tanks and Temples, Deep Blending, FAMOUS."""
 

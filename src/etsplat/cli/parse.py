@@ -10,7 +10,7 @@ import tyro
 from etsplat.cli.bench import Distance, Famous, Regularizers, Settings
 from etsplat.cli.bench_nvs import Nvs
 from etsplat.cli.command import Command
-from etsplat.cli.data import Download, Sfm
+from etsplat.cli.data import Download, Sfm, Undistort
 from etsplat.cli.doctor import Doctor
 from etsplat.cli.evaluate import Evaluate
 from etsplat.cli.export import Export
@@ -39,7 +39,8 @@ COMMANDS: dict[str, type[Command] | Group] = {
     "reconstruct": Reconstruct,
     "train": Train,
     "data": Group(
-        "Where captures come from: find the cameras of photos, fetch data sets.", {"sfm": Sfm, "download": Download}
+        "Where captures come from: find the cameras of photos, remove lens distortion, fetch data sets.",
+        {"sfm": Sfm, "undistort": Undistort, "download": Download},
     ),
     "eval": Evaluate,
     "view": View,

@@ -76,7 +76,7 @@ def _intrinsics(model: Path, name: str, camera: ColmapCamera) -> Float[Tensor, "
     if camera.model not in ("PINHOLE", "SIMPLE_PINHOLE"):
         raise InputError(
             f"scene {model}: {name} has a {camera.model} camera with lens distortion;"
-            " run `colmap image_undistorter` and use its output folder"
+            " run `etsplat data undistort SCENE --out NEW` or `colmap image_undistorter`, and use the new folder"
         )
     if len(camera.params) != PARAMETERS[camera.model] or camera.width < 1 or camera.height < 1:
         raise InputError(f"scene {model}: the camera of {name} is malformed; export the model again")

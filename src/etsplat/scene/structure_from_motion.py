@@ -14,6 +14,7 @@ from typing import Any, Literal
 from etsplat.core.errors import InputError
 from etsplat.io.atomic import write_error
 from etsplat.io.images import IMAGE_SUFFIXES, image_size
+from etsplat.scene.colmap import find_model
 
 Matching = Literal["auto", "exhaustive", "sequential"]
 Progress = Callable[[str, int, int], None]
@@ -69,9 +70,7 @@ def find_cameras(
     pycolmap = _import_pycolmap()
     photos, out = Path(photos), Path(out)
     names = _photo_names(photos)
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise InputError(f"{out}: is there already and not empty; choose another folder for the scene")
-    out.parent.mkdir(parents=True, exist_ok=True)
+    _check_new(out)
     report = progress or (lambda phase, done, total: None)
     with tempfile.TemporaryDirectory(prefix=".sfm-", dir=out.parent) as work:
         model = _reconstruct(pycolmap, photos, names, Path(work), matching, max_size, threads or -1, report)
@@ -80,12 +79,41 @@ def find_cameras(
             raise InputError(_too_few(photos, len(placed), len(names)))
         report("Removing lens distortion", 0, 0)
         _undistort(pycolmap, model, photos, placed, Path(work), max_size)
-        try:
-            os.replace(_arranged(Path(work) / "scene"), out)
-        except OSError as error:
-            raise write_error(out, error) from error
+        _move(_arranged(Path(work) / "scene"), out)
     unplaced = [name for name in names if name not in set(placed)]
     return Placement(out, placed, unplaced, len(model.points3D))
+
+
+def undistort_scene(scene: Path | str, out: Path | str, *, max_size: int = 1600) -> Placement:
+    """Write a COLMAP scene anew without lens distortion, images and cameras, once and for all.
+
+    Args:
+        scene: folder with `images/` and `sparse/0/` (or `sparse/`), of any of COLMAP's camera models.
+        out: folder of the new scene; must not exist or be empty.
+        max_size: longer sides are shrunk to this many pixels.
+
+    Raises:
+        InputError: pycolmap is missing; there is no model, or it cannot be read; images are missing; `out` cannot be
+            used.
+    """
+    pycolmap = _import_pycolmap()
+    scene, out = Path(scene), Path(out)
+    folder = find_model(scene)
+    if folder is None:
+        raise InputError(f"scene {scene}: no sparse/0/cameras.bin or .txt; choose a COLMAP scene")
+    _check_new(out)
+    try:
+        model = pycolmap.Reconstruction(folder)
+    except (ValueError, RuntimeError, OSError, LookupError) as error:  # what its C++ throws
+        raise InputError(f"scene {folder}: cannot be read as a model ({str(error).splitlines()[0]})") from error
+    names = sorted(image.name for image in model.images.values() if image.has_pose)
+    missing = [name for name in names if not (scene / "images" / name).is_file()]
+    if missing:
+        raise InputError(f"scene {scene}: {len(missing)} images are missing (first: {missing[0]}); copy them there")
+    with tempfile.TemporaryDirectory(prefix=".undistort-", dir=out.parent) as work:
+        _undistort(pycolmap, model, scene / "images", names, Path(work), max_size)
+        _move(_arranged(Path(work) / "scene"), out)
+    return Placement(out, names, [], len(model.points3D))
 
 
 def _reconstruct(
@@ -143,6 +171,22 @@ def _undistort(pycolmap: Any, model: Any, photos: Path, placed: list[str], work:
     model.write(work / "model")
     options = pycolmap.UndistortCameraOptions(max_image_size=max_size)
     pycolmap.undistort_images(work / "scene", work / "model", photos, placed, undistort_options=options)
+
+
+def _check_new(out: Path) -> None:
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InputError(f"{out}: is there already and not empty; choose another folder for the scene")
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise write_error(out, error) from error
+
+
+def _move(folder: Path, out: Path) -> None:
+    try:
+        os.replace(folder, out)
+    except OSError as error:
+        raise write_error(out, error) from error
 
 
 def _arranged(scene: Path) -> Path:
