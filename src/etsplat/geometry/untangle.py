@@ -8,7 +8,7 @@ from etsplat.geometry.intersections import intersecting_faces
 from etsplat.geometry.topology import MeshTopology
 
 _SWEEPS = 2
-"""Smoothing sweeps between two looks for intersections: more move vertices farther than they must, fewer look longer."""
+"""Smoothing sweeps between two looks for intersections: more move vertices farther than needed, fewer look longer."""
 
 _WIDEN = 8
 """Rounds after which the region grows by a ring of neighbours."""
