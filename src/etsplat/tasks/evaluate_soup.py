@@ -3,7 +3,7 @@
 import statistics
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +15,10 @@ from etsplat.core.errors import InputError
 from etsplat.io.atomic import write_error
 from etsplat.io.images import save_image, to_8_bit
 from etsplat.metrics.image import Lpips, find_lpips_weights, psnr, ssim
-from etsplat.ops.engines import num_threads, resolve_engine
+from etsplat.ops.engines import num_threads, resolve_device, resolve_engine
 from etsplat.scene.captures import Capture
 from etsplat.scene.soup_rendering import render_soup
+from etsplat.tasks.running import device_name
 from etsplat.tasks.soup_run import SoupRun
 from etsplat.tasks.soup_scoring import SoupScorer
 
@@ -57,7 +58,7 @@ def evaluate_run(
         Means over the test views by name: psnr and psnr_8bit (of renders rounded to 8 bits, as published numbers are),
         ssim (zero-padded), ssim_interior, lpips (inputs scaled to [-1, 1]) and lpips_3dgs (not scaled), each also with
         `_opaque` for the opaque triangles; `views`, the same for each; fps, ms_per_frame, ms_per_million and their
-        circumstances. null where something could not be measured, `lpips_reason` says why.
+        circumstances. On a GPU where there is one. null where something could not be measured, `lpips_reason` says why.
 
     Raises:
         InputError: no capture, no test views, weights that cannot be read, `pictures` cannot be written to.
@@ -72,7 +73,11 @@ def evaluate_run(
             pictures.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise write_error(pictures, error) from error
-    scorer = SoupScorer(capture, torch.tensor(run.file.background), None)
+    device = resolve_device(None, None)
+    run = replace(run, file=replace(run.file, soup=run.file.soup.to(device)))
+    if lpips is not None:
+        lpips.to(device)
+    scorer = SoupScorer(capture, torch.tensor(run.file.background), None, device)
     rows: list[dict[str, Any]] = []
     for index, view in enumerate(capture.test):
         pair = _pair(run, scorer, capture.names[view], view)
@@ -114,13 +119,16 @@ def _scores(image: Float[Tensor, "H W 3"], pair: _Pair, lpips: Lpips | None, suf
 def _speed(run: SoupRun, capture: Capture) -> dict[str, Any]:
     """Pictures of the test views one after the other, colour only; the mean over views of each one's best time."""
     cameras = [capture.cameras[view] for view in capture.test]
-    background = torch.tensor(run.file.background)[None]
+    device = run.file.soup.vertices.device
+    background = torch.tensor(run.file.background, device=device)[None]
     best = []
-    for camera in cameras:
+    for camera in (camera.to(device) for camera in cameras):
         times = []
         for repeat in range(REPEATS + 1):
             start = time.perf_counter()
             render_soup(run.file.soup, camera, run.file.appearance, backgrounds=background)
+            if device.type == "cuda":
+                torch.cuda.synchronize(device)
             if repeat:
                 times.append(time.perf_counter() - start)
         best.append(min(times))
@@ -133,6 +141,7 @@ def _speed(run: SoupRun, capture: Capture) -> dict[str, Any]:
         "width": cameras[0].width,
         "height": cameras[0].height,
         "engine": resolve_engine(None, run.file.soup.vertices),
+        "device": device_name(device),
         "threads": num_threads(),
     }
 
