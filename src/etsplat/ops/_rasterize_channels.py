@@ -106,7 +106,8 @@ def median_depth(
     """
     if len(corners) == 0:
         return torch.zeros((*triangle.shape, 1), device=corners.device)
-    stand_in = corners.new_tensor([[0.0, 0.0, 1.0], [1.0, 0.0, 1.0], [0.0, 1.0, 1.0]])
+    stand_in = torch.eye(3, device=corners.device).roll(1, dims=0)
+    stand_in[:, 2] = 1.0  # (0, 0, 1), (1, 0, 1), (0, 1, 1), made on the device
     identity = torch.eye(4, device=corners.device)
     x = torch.arange(settings.width, device=corners.device) + 0.5
     y = torch.arange(settings.height, device=corners.device) + 0.5
