@@ -1,6 +1,7 @@
 """Steps of a triangle soup on the GPU engine, by the shim and, where there is one, on a GPU."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -9,6 +10,7 @@ from etsplat.scene.captures import Capture
 from etsplat.scene.demo_scene import demo_scene
 from etsplat.scene.soup_init import StartPoints, start_soup
 from etsplat.tasks.soup_fitting import SoupFitting
+from etsplat.tasks.train import train
 from etsplat.tasks.train_config import train_settings
 
 CONFIG = replace(train_settings("tiny"), iterations=6, densify_every=15_000, densify_from=0, sh_every=5000)
@@ -43,3 +45,20 @@ def test_steps_are_those_of_the_cpu_engine(cuda_device: torch.device, capture: C
     for name, parameter in on_cpu.soup.parameters().items():
         difference = (on_device.soup.parameters()[name].cpu() - parameter).detach().abs()
         assert float((difference > 1e-4).float().mean()) < 0.01, name
+
+
+def test_a_whole_run_leaves_its_directory(cuda_device: torch.device, capture: Capture, tmp_path: Path) -> None:
+    """From photos to a soup in a file, with the engine's name beside it."""
+    assert capture.exact_points is not None
+    assert capture.point_colors is not None
+    few = replace(
+        capture,
+        exact_points=capture.exact_points[::400],
+        point_colors=capture.point_colors[::400],
+        test=capture.test[:1],
+    )
+    result = train(few, tmp_path / "run", replace(CONFIG, engine="cuda", iterations=2, sky_dome=False))
+    assert result.metrics["engine"] == "cuda"
+    assert result.metrics["psnr"] > 5
+    assert result.soup.vertices.device.type == "cpu"
+    assert (tmp_path / "run" / "soup.safetensors").exists()
