@@ -20,6 +20,7 @@ export PYTHONPATH=$SITE PYTHONUNBUFFERED=1 ETSPLAT_CACHE_DIR=$PWD/build/gpu/kern
 steps=("$@")
 [ $# -gt 0 ] || steps=(build test sanitize bench reconstruct)
 summary=()
+"$PYTHON" -c 'import sys, torch; sys.exit(not torch.cuda.is_available())' || { echo "no GPU that torch can use" >&2; exit 1; }
 
 step() { # name, seconds, command...
     local name=$1 limit=$2 begin=$SECONDS status
