@@ -1,7 +1,7 @@
 """How settings of novel-view synthesis do at a small budget: one line a setting, test and training PSNR on the way.
 
 python -m benchmarks.tune_train --width 200 --base iterations=600,max_triangles=15000 -- "" near_plane=0.02
-python -m benchmarks.tune_train --scene ../shared/data/scenes/bonsai --width 300 --scene-type indoor -- "" method=bilateral
+python -m benchmarks.tune_train --scene ../shared/data/scenes/bonsai --scene-type indoor -- "" method=bilateral
 """
 
 import argparse
