@@ -52,17 +52,13 @@ def median_ms(action: Callable[[], object], repeats: int) -> float:
 
 
 def measure(fitting: SoupFitting, capture: Capture, config: TrainConfig, repeats: int) -> dict[str, float]:
-    """Medians over steps, each with another view; and of the parts, all on one view."""
-    iterations = iter(range(config.iterations - 10 * repeats, config.iterations))
-
-    def take_step() -> None:
-        iteration = next(iterations)
+    """Means over all training views of step and rasterizer, which can then be subtracted; of the parts, on one view."""
+    first = config.iterations - 3 * len(capture.train)
+    start = time.perf_counter()
+    for iteration in range(first, first + 2 * len(capture.train)):
         fitting.advance(iteration, iteration)
-
-    step = median_ms(take_step, repeats)
-    rasterizer = statistics.mean(
-        median_ms(rasterizing(fitting, capture, config, view), 3) for view in capture.train[: repeats // 2]
-    )
+    step = 1000 * (time.perf_counter() - start) / (2 * len(capture.train))
+    rasterizer = statistics.mean(median_ms(rasterizing(fitting, capture, config, view), 3) for view in capture.train)
     view = capture.train[0]
     return {
         "step": step,
