@@ -210,7 +210,7 @@ _QUICK: dict[str, Any] = {
     "normalize": True,
     "near_plane": 0.25,
     "cull_small": False,
-    "iterations": 4000,
+    "iterations": 6000,
     "max_triangles": 100_000,
     "start_limit": 0.4,
     "lr_vertices": 0.004,
