@@ -18,9 +18,9 @@ def main() -> None:
 
     def tell(event: object) -> None:
         if isinstance(event, StepEvent):
-            print(f"iteration {event.iteration:5d}   loss {event.loss:.4f}   sigma {event.sigma:.3f}")
+            print(f"iteration {event.iteration:5d}   loss {event.loss:.4f}   sigma {event.state['sigma']:.3f}")
         elif isinstance(event, RefineEvent):
-            print(f"iteration {event.iteration:5d}   now {event.faces:,} faces")
+            print(f"iteration {event.iteration:5d}   now {event.count:,} faces")
 
     result = etsplat.reconstruct(
         etsplat.demo_object(),  # or a path: a mesh file, or a folder with posed images
