@@ -207,6 +207,9 @@ class _Paint(Command):
     def defaults(cls, arguments: Sequence[str]) -> "_Paint":
         return cls()
 
+    def run(self, arguments: Sequence[str]) -> int:
+        return 0
+
 
 def test_groups_of_commands(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """A group's commands follow its name, with their own options and examples."""

@@ -18,6 +18,7 @@ from typing import Any
 from etsplat.bench.variants import Variant
 from etsplat.core.errors import InputError
 from etsplat.io.run_directory import RunDirectory, is_run
+from etsplat.ops.engines import num_threads
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.train_config import TrainConfig
 
@@ -90,7 +91,7 @@ def run_grid(cells: Sequence[Cell], jobs: int, show: Callable[[], None]) -> None
     """
     waiting = [cell for cell in cells if cell.state == "waiting"]
     jobs = max(1, min(jobs, len(waiting)))
-    threads = max(1, len(os.sched_getaffinity(0)) // jobs)
+    threads = max(1, num_threads() // jobs)
     running: list[Cell] = []
     context = multiprocessing.get_context("spawn")
     try:

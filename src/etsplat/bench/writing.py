@@ -2,7 +2,6 @@
 
 import csv
 import io
-import os
 import platform
 import subprocess
 from collections.abc import Sequence
@@ -12,11 +11,12 @@ from pathlib import Path
 from typing import Any
 
 from etsplat.io.atomic import atomic_write
+from etsplat.ops.engines import num_threads
 
 
 def origin_of(command: str) -> dict[str, str]:
     """What a reader must know of a table: the command, the commit, the machine and the day."""
-    machine = f"{len(os.sched_getaffinity(0))} cores, {platform.machine()}"
+    machine = f"{num_threads()} cores, {platform.machine()}"
     return {"command": command, "commit": _commit(), "machine": machine, "date": date.today().isoformat()}
 
 

@@ -1,7 +1,7 @@
 """`etsplat bench ...`: the paper's studies of shape reconstruction, as grids of runs."""
 
-import os
 import shlex
+from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -49,9 +49,9 @@ class _Grid(Command):
         """Nothing depends on the arguments."""
         return cls(meshes=tyro.MISSING, out=tyro.MISSING)
 
+    @abstractmethod
     def variants(self, base: ReconstructConfig) -> list[Variant]:
         """What is compared."""
-        raise NotImplementedError
 
     def run(self, arguments: Sequence[str]) -> int:
         """Runs what is not finished yet, then writes tables and figures."""
@@ -59,13 +59,14 @@ class _Grid(Command):
 
         from etsplat.bench.grid import make_cells, run_grid
         from etsplat.bench.live import LiveTable
+        from etsplat.ops.engines import num_threads
 
         base = setting_variants(PRESETS[self.preset], [self.set])[0].config(PRESETS[self.preset], 0)
         variants = self.variants(base)
         cells = make_cells(find_meshes(self.meshes, self.objects), variants, base, self.seeds, self.out)
         try:
             with LiveTable(Console(), cells) as table:
-                run_grid(cells, self.jobs or len(os.sched_getaffinity(0)), table.update)
+                run_grid(cells, self.jobs or num_threads(), table.update)
         except KeyboardInterrupt:
             fail("interrupted; give the same command to go on", INTERRUPTED)
         self._report(cells, [variant.name for variant in variants], arguments)

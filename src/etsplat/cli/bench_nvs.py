@@ -1,6 +1,5 @@
 """`etsplat bench nvs`: the paper's tables and figures of novel-view synthesis."""
 
-import os
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -62,6 +61,7 @@ class Nvs(Command):
         from etsplat.bench.live import PSNR, LiveTable
         from etsplat.bench.nvs import evaluate_cells, make_nvs_cells
         from etsplat.cli.phases import PhaseBar
+        from etsplat.ops.engines import num_threads
 
         given = {"iterations": self.iterations, "max_triangles": self.max_triangles, "width": self.width}
         changes: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
@@ -77,7 +77,7 @@ class Nvs(Command):
         console = Console()
         try:
             with LiveTable(console, cells, PSNR) as table:
-                run_grid(cells, min(self.jobs, len(os.sched_getaffinity(0))), table.update)
+                run_grid(cells, min(self.jobs, num_threads()), table.update)
             with PhaseBar(console) as bar:
                 rows = evaluate_cells(cells, self.lpips_weights, lambda done, total: bar.show("Measuring", done, total))
         except KeyboardInterrupt:

@@ -2,6 +2,7 @@
 
 import shlex
 import sys
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar, NoReturn, TypeVar
@@ -10,7 +11,7 @@ FAILED, WRONG_INPUT, INTERRUPTED = 1, 2, 130
 
 
 @dataclass(frozen=True, kw_only=True)
-class Command:
+class Command(ABC):
     """Base of the commands. The docstring of a subclass is its help, those of its fields are theirs.
 
     A module that defines commands imports no torch at its top, so that `--help` is fast.
@@ -23,17 +24,17 @@ class Command:
     """Show the traceback of an error."""
 
     @classmethod
+    @abstractmethod
     def defaults(cls, arguments: Sequence[str]) -> "Command":
         """The command before its options are applied; where a preset is an option, `arguments` name it."""
-        raise NotImplementedError
 
+    @abstractmethod
     def run(self, arguments: Sequence[str]) -> int:
         """Does what the command is for; `arguments` are the command line. Returns the process's exit status.
 
         Raises:
             InputError: the input or an option cannot be used.
         """
-        raise NotImplementedError
 
 
 Settings = TypeVar("Settings")
