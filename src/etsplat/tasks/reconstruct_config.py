@@ -214,7 +214,7 @@ PRESETS: dict[str, ReconstructConfig] = {
         checkpoint_every=1000,
     ),
     "quick": _QUICK,
-    "demo": replace(_QUICK, preset="demo", iterations=2500, lr_vertices=2e-2),
+    "demo": replace(_QUICK, preset="demo"),
     "tiny": replace(
         _SHORT,
         preset="tiny",
