@@ -22,7 +22,7 @@ LINES = 10
 class RunProgress:
     """A callback for a task, and the context in which its bar is alive."""
 
-    def __init__(self, console: Console, *, preparing: str = "Taking pictures") -> None:
+    def __init__(self, console: Console, *, preparing: str) -> None:
         self._console = console
         self._preparing = preparing
         self._progress = Progress(

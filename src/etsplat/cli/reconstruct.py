@@ -3,12 +3,16 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import tyro
 
-from etsplat.cli.command import FAILED, INTERRUPTED, Command, fail, preset_of, resume_line
+from etsplat.cli.command import Command, preset_of
+from etsplat.cli.running import run_task
 from etsplat.tasks.reconstruct_config import PRESETS, ReconstructConfig
+
+if TYPE_CHECKING:
+    from etsplat.cli.progress import RunProgress
 
 Settings = Annotated[ReconstructConfig, tyro.conf.arg(name=""), tyro.conf.OmitArgPrefixes]
 
@@ -83,37 +87,18 @@ def _run(
     command: Demo | Reconstruct,
     arguments: Sequence[str],
 ) -> int:
-    from rich.console import Console
-
-    from etsplat.cli.progress import RunProgress
-    from etsplat.cli.summary import print_summary
-    from etsplat.io.run_directory import is_run
-    from etsplat.optim.loop import DivergedError
-    from etsplat.report import write_report
     from etsplat.tasks.reconstruct import reconstruct
 
-    console = Console()
-    try:
-        with RunProgress(console) as progress:
-            reconstruct(
-                source,
-                command.out,
-                command.settings,
-                init_mesh=init_mesh,
-                masks=masks,
-                callbacks=[progress],
-                resume=command.resume,
-                overwrite=command.overwrite,
-            )
-            progress.say("Writing the report")
-            write_report(command.out)
-    except KeyboardInterrupt:
-        if not is_run(command.out):
-            raise
-        fail(f"interrupted; continue with: {resume_line(arguments)}", INTERRUPTED)
-    except DivergedError as error:
-        if command.debug:
-            raise
-        fail(str(error), FAILED)
-    print_summary(console, command.out)
-    return 0
+    def task(progress: "RunProgress") -> None:
+        reconstruct(
+            source,
+            command.out,
+            command.settings,
+            init_mesh=init_mesh,
+            masks=masks,
+            callbacks=[progress],
+            resume=command.resume,
+            overwrite=command.overwrite,
+        )
+
+    return run_task(task, command.out, arguments, debug=command.debug, preparing="Taking pictures")

@@ -3,12 +3,16 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import tyro
 
-from etsplat.cli.command import FAILED, INTERRUPTED, Command, fail, option_value, resume_line
+from etsplat.cli.command import Command, option_value
+from etsplat.cli.running import run_task
 from etsplat.tasks.train_config import PRESET_NAMES, SCENE_TYPE_NAMES, TrainConfig, train_settings
+
+if TYPE_CHECKING:
+    from etsplat.cli.progress import RunProgress
 
 Settings = Annotated[TrainConfig, tyro.conf.arg(name=""), tyro.conf.OmitArgPrefixes]
 
@@ -92,43 +96,25 @@ class DemoScene(Command):
 
 
 def _run(source: Path | str, command: Train | DemoScene, arguments: Sequence[str]) -> int:
-    from rich.console import Console
-
-    from etsplat.cli.progress import RunProgress
-    from etsplat.cli.summary import print_summary
-    from etsplat.io.run_directory import is_run
-    from etsplat.optim.loop import DivergedError
-    from etsplat.report import write_report
     from etsplat.tasks.running import Callback
     from etsplat.tasks.train import train
 
-    console = Console()
     callbacks: list[Callback] = []
     if command.tensorboard:
         from etsplat.cli.tensorboard import TensorboardWriter
 
         callbacks.append(TensorboardWriter(command.out))
-    try:
-        with RunProgress(console, preparing="Reading the photos") as progress:
-            train(
-                source,
-                command.out,
-                command.settings,
-                images=command.images,
-                masks=command.masks,
-                callbacks=[progress, *callbacks],
-                resume=command.resume,
-                overwrite=command.overwrite,
-            )
-            progress.say("Writing the report")
-            write_report(command.out)
-    except KeyboardInterrupt:
-        if not is_run(command.out):
-            raise
-        fail(f"interrupted; continue with: {resume_line(arguments)}", INTERRUPTED)
-    except DivergedError as error:
-        if command.debug:
-            raise
-        fail(str(error), FAILED)
-    print_summary(console, command.out)
-    return 0
+
+    def task(progress: "RunProgress") -> None:
+        train(
+            source,
+            command.out,
+            command.settings,
+            images=command.images,
+            masks=command.masks,
+            callbacks=[progress, *callbacks],
+            resume=command.resume,
+            overwrite=command.overwrite,
+        )
+
+    return run_task(task, command.out, arguments, debug=command.debug, preparing="Reading the photos")
