@@ -1,4 +1,6 @@
+import json
 import math
+import struct
 
 import numpy as np
 import pytest
@@ -106,6 +108,21 @@ def test_glb_is_linear_and_blends_on_request_ply_has_colours_at_vertices_and_fac
         assert np.array_equal(tables["vertex"][name][::3], tables["face"][name])
         np.testing.assert_allclose(tables["face"][name] / 255, soup.display_colors()[:, channel], atol=0.51 / 255)
     assert float(srgb_from_linear(np.array([0.5]))[0]) > 0.7  # what the GLB test of meshes relies on
+
+
+def test_with_alpha_only_faint_faces_of_a_glb_blend(tmp_path, soup):
+    """What blends hides nothing in a viewer, so faces that are all but opaque must not."""
+    soup.opacity_logits[:] = torch.where(torch.arange(60) < 20, 9.0, 1.0)
+    export_soup(run_of(soup), tmp_path / "soup.glb", ExportConfig(colors="constant", alpha=True, min_opacity=0.0))
+    length = struct.unpack("<I", (tmp_path / "soup.glb").read_bytes()[12:16])[0]
+    document = json.loads((tmp_path / "soup.glb").read_bytes()[20 : 20 + length])
+    modes = {}
+    for part in document["meshes"][0]["primitives"]:
+        count = document["accessors"][part["indices"]]["count"]
+        modes[document["materials"][part["material"]]["alphaMode"]] = count
+    assert modes == {"OPAQUE": 3 * 20, "BLEND": 3 * 40}
+    assert all(material["doubleSided"] for material in document["materials"])
+    assert len(open_soup(tmp_path / "soup.glb").soup) == 60
 
 
 def test_baked_colours_are_what_the_cameras_see(soup):

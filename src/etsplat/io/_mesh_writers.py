@@ -4,12 +4,16 @@ import json
 import struct
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from etsplat.io.srgb import linear_from_srgb
 
 Colors = np.ndarray | None
+
+OPAQUE_ALPHA = 0.99
+"""Faces of GLB files with this alpha or more do not blend."""
 
 
 def write_ply(path: Path, vertices: np.ndarray, faces: np.ndarray, face_colors: Colors, vertex_colors: Colors) -> None:
@@ -60,58 +64,64 @@ def write_off(path: Path, vertices: np.ndarray, faces: np.ndarray, colors: Color
 
 
 def write_glb(path: Path, vertices: np.ndarray, faces: np.ndarray, face_colors: Colors, vertex_colors: Colors) -> None:
-    """Binary glTF 2.0, one primitive. Vertex colours, display values, become linear COLOR_0 under an unlit material.
+    """Binary glTF 2.0. Vertex colours, display values, become linear COLOR_0 under an unlit material.
 
-    With (V, 4) the last channel is alpha, and the material blends.
+    With (V, 4) the last channel is alpha. Faces with all corners above `OPAQUE_ALPHA` are a primitive of their own and
+    stay opaque: viewers sort what blends by mesh at best, and do not let it hide anything.
     """
     assert face_colors is None, "glTF has no colours per face"
     colors = vertex_colors
-    arrays = [(vertices.astype("<f4"), 34962), (faces.astype("<u4").reshape(-1), 34963)]
+    parts = [(faces, "OPAQUE")]
+    if colors is not None and colors.shape[1] == 4:
+        solid = (colors[:, 3] >= OPAQUE_ALPHA)[faces].all(axis=1)
+        parts = [(part, mode) for part, mode in ((faces[solid], "OPAQUE"), (faces[~solid], "BLEND")) if len(part)]
+    arrays = [("VEC3", vertices.astype("<f4"))]
+    attributes = {"POSITION": 0}
     if colors is not None:
         linear = np.hstack([linear_from_srgb(colors[:, :3]), colors[:, 3:]])
-        arrays.append((linear.astype("<f4"), 34962))
+        attributes["COLOR_0"] = len(arrays)
+        arrays.append((f"VEC{linear.shape[1]}", linear.astype("<f4")))
+    primitives = []
+    for part, _ in parts:
+        primitives.append({"attributes": attributes, "indices": len(arrays), "mode": 4, "material": len(primitives)})
+        arrays.append(("SCALAR", part.astype("<u4").reshape(-1)))
     views, accessors, offset = [], [], 0
-    for array, target in arrays:
+    for kind, array in arrays:
+        component, target = (5125, 34963) if kind == "SCALAR" else (5126, 34962)
         views.append({"buffer": 0, "byteOffset": offset, "byteLength": array.nbytes, "target": target})
-        kind = (
-            {"componentType": 5125, "type": "SCALAR"}
-            if array.ndim == 1
-            else {
-                "componentType": 5126,
-                "type": f"VEC{array.shape[1]}",
-            }
-        )
-        accessors.append({"bufferView": len(accessors), "count": len(array), **kind})
+        accessors.append({"bufferView": len(accessors), "count": len(array), "componentType": component, "type": kind})
         offset += array.nbytes
     accessors[0] |= {"min": vertices.min(axis=0).tolist(), "max": vertices.max(axis=0).tolist()}
-    attributes = {"POSITION": 0} | ({"COLOR_0": 2} if colors is not None else {})
-    primitive = {"attributes": attributes, "indices": 1, "mode": 4, "material": 0}
-    material = {"doubleSided": True, "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0}}
-    if colors is not None and colors.shape[1] == 4:
-        material["alphaMode"] = "BLEND"
-    # The colours already hold the scene's light, so a viewer must not light them again.
-    unlit = {"extensionsUsed": ["KHR_materials_unlit"]} if colors is not None else {}
-    if unlit:
-        material["extensions"] = {"KHR_materials_unlit": {}}
     document = {
         "asset": {"version": "2.0", "generator": "etsplat"},
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": [primitive]}],
-        "materials": [material],
+        "meshes": [{"primitives": primitives}],
+        "materials": [_gltf_material(mode, unlit=colors is not None) for _, mode in parts],
         "buffers": [{"byteLength": offset}],
         "bufferViews": views,
         "accessors": accessors,
-        **unlit,
     }
+    if colors is not None:
+        document["extensionsUsed"] = ["KHR_materials_unlit"]
     text = json.dumps(document, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
-    data = b"".join(array.tobytes() for array, _ in arrays)  # every array is a multiple of 4 bytes
+    data = b"".join(array.tobytes() for _, array in arrays)  # every array is a multiple of 4 bytes
     with open(path, "wb") as file:
         file.write(struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + len(data)))
         file.write(struct.pack("<I4s", len(text), b"JSON") + text)
         file.write(struct.pack("<I4s", len(data), b"BIN\0") + data)
+
+
+def _gltf_material(mode: str, *, unlit: bool) -> dict[str, Any]:
+    """Two-sided. Colours already hold the scene's light, so a viewer must not light them again: unlit."""
+    material: dict[str, Any] = {
+        "doubleSided": True,
+        "alphaMode": mode,
+        "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0},
+    }
+    return {**material, "extensions": {"KHR_materials_unlit": {}}} if unlit else material
 
 
 WRITERS: dict[str, Callable[[Path, np.ndarray, np.ndarray, Colors, Colors], None]] = {

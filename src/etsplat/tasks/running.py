@@ -102,8 +102,10 @@ def hash_record(record: dict[str, Any]) -> str:
 
 
 def path_of(source: object) -> str | None:
-    """For the record: where a source was read from, if it was."""
-    return str(source) if isinstance(source, str | Path) else None
+    """For the record: where a source was read from, if it was; absolute, so that it is found from any folder."""
+    if not isinstance(source, str | Path):
+        return None
+    return str(Path(source).resolve()) if Path(source).exists() else str(source)  # the latter: "demo:scene"
 
 
 def device_name(device: torch.device) -> str:
