@@ -90,9 +90,9 @@ def test_preset_sets_the_defaults_and_options_change_them() -> None:
     demo = parse(["demo"])
     assert isinstance(demo, Demo)
     assert demo.settings == PRESETS["demo"]
-    quick = parse(["reconstruct", "a.ply", "--out", "b"])
-    assert isinstance(quick, Reconstruct)
-    assert quick.settings == PRESETS["quick"]
+    best = parse(["reconstruct", "a.ply", "--out", "b"])
+    assert isinstance(best, Reconstruct)
+    assert best.settings == PRESETS["best"]
 
 
 @pytest.mark.parametrize(

@@ -50,9 +50,10 @@ class Reconstruct(Command):
     """Deform a sphere into the object that pictures show."""
 
     EXAMPLES: ClassVar[str] = """
+    etsplat reconstruct bunny.obj --out runs/bunny --preset quick
     etsplat reconstruct bunny.obj --out runs/bunny
-    etsplat reconstruct bunny.obj --out runs/bunny --preset paper
-    etsplat reconstruct bunny.obj --out runs/bunny --preset paper --resume
+    etsplat reconstruct bunny.obj --out runs/bunny --resume
+    etsplat reconstruct bunny.obj --out runs/paper --preset paper --method bilateral
     etsplat reconstruct my_scene/ --out runs/scene --iterations 4000
     """
 
@@ -73,7 +74,7 @@ class Reconstruct(Command):
     @classmethod
     def defaults(cls, arguments: Sequence[str]) -> "Reconstruct":
         """The preset's settings."""
-        return cls(source=tyro.MISSING, out=tyro.MISSING, settings=preset_of(arguments, PRESETS, "quick"))
+        return cls(source=tyro.MISSING, out=tyro.MISSING, settings=preset_of(arguments, PRESETS, "best"))
 
     def run(self, arguments: Sequence[str]) -> int:
         """Reconstructs what the source shows."""

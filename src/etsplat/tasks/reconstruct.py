@@ -15,7 +15,7 @@ from etsplat.ops.antialias_nvdiffrast import load_nvdiffrast
 from etsplat.ops.engines import num_threads, one_torch_thread, resolve_device, resolve_engine
 from etsplat.optim.loop import Event, LoopSettings, Progress
 from etsplat.tasks.mesh_fitting import MeshFitting
-from etsplat.tasks.reconstruct_config import ReconstructConfig
+from etsplat.tasks.reconstruct_config import PRESETS, ReconstructConfig
 from etsplat.tasks.running import (
     Callback,
     NoteEvent,
@@ -67,7 +67,7 @@ def reconstruct(
             folder with posed images and masks, or `PosedViews` with the object in the unit sphere (`renormalized` and
             `bounding_sphere` bring it there).
         out: the run directory; made if it does not exist. README.txt in it explains what is there.
-        config: settings; None for preset "paper". See `PRESETS`.
+        config: settings; None for preset "best". See `PRESETS`.
         init_mesh: a mesh to start from instead of the sphere, in the units of the source.
         masks: folder with a mask (white inside the object) for every image of a scene folder, instead of its own masks/
             or the images' transparency.
@@ -80,7 +80,7 @@ def reconstruct(
         InputError: something handed in cannot be used; earlier results in `out` are as they were.
         DivergedError: the optimization went to NaN or infinity.
     """
-    config = config or ReconstructConfig()
+    config = config or PRESETS["best"]
     device = resolve_device(config.device, config.engine)
     out = Path(out)
     if resume and not is_run(out):
