@@ -1,4 +1,5 @@
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -91,6 +92,21 @@ def test_1300_views_load(tmp_path):
     write_transforms(tmp_path, 1300, width=8, height=6)
     capture = load_capture(tmp_path)
     assert (len(capture), len(capture.test), capture.images.sizes[7]) == (1300, 163, (8, 6))
+
+
+def test_the_fingerprint_follows_the_content_of_every_photo_and_mask(tmp_path):
+    """A copy has the same, however old its files are; another pixel in any photo or mask changes it."""
+    write_colmap(tmp_path / "a", [(40, 30)] * 4)
+    for index in range(4):
+        write_photo(tmp_path / "a" / "masks" / f"{index:04d}.png", 40, 30)
+    shutil.copytree(tmp_path / "a", tmp_path / "b", copy_function=shutil.copy)
+    first = load_capture(tmp_path / "a", preload=False).fingerprint()
+    assert load_capture(tmp_path / "b", memory=1).fingerprint() == first
+    for file in ("images/0003.jpg", "masks/0002.png"):
+        write_photo(tmp_path / "b" / file, 40, 30, seed=99)
+        changed = load_capture(tmp_path / "b").fingerprint()
+        assert changed != first
+        first = changed
 
 
 def test_transparent_images_are_premultiplied_and_masks_come_apart(tmp_path):

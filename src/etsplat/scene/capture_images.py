@@ -1,17 +1,23 @@
 """The images of a capture, as bytes: decoded in parallel, all kept where they fit into memory, streamed where not."""
 
+import hashlib
 import os
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
+from pathlib import Path
 
 from jaxtyping import UInt8
 from torch import Tensor
 
+from etsplat.core.errors import InputError
 from etsplat.io.images import load_mask_pixels, load_pixels
 from etsplat.scene.frames import Frame
+
+_SAMPLE = 4096
+"""So many bytes of each file's beginning, middle and end, with its length, tell it from others."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +73,18 @@ class CaptureImages:
     def mask(self, index: int) -> UInt8[Tensor, "H W"] | None:
         """(H, W), 255 where pixels of the view count and 0 where they are to be ignored; None if all count."""
         return self._picture(index).mask
+
+    def fingerprint(self) -> bytes:
+        """What the files hold, not when they were written: the same for a copy. Decodes nothing.
+
+        Raises:
+            InputError: a file has gone.
+        """
+        digest = hashlib.sha256()
+        files = [file for frame in self._frames for file in (frame.image, frame.mask) if file is not None]
+        for sample in self._pool.map(_sample, files):
+            digest.update(sample)
+        return digest.digest()
 
     def expect(self, indices: Sequence[int]) -> None:
         """Start to decode views that are needed soon, as many as fit."""
@@ -144,6 +162,13 @@ class StoredImages:
     def mask(self, index: int) -> None:
         """All pixels count."""
 
+    def fingerprint(self) -> bytes:
+        """Of all pixels."""
+        digest = hashlib.sha256()
+        for image in self._pixels:
+            digest.update(image.contiguous().numpy().tobytes())
+        return digest.digest()
+
     def expect(self, indices: Sequence[int]) -> None:
         """Nothing to prepare."""
 
@@ -159,3 +184,18 @@ def _decode(frame: Frame, size: tuple[int, int]) -> Picture:
     if frame.mask is None:
         return Picture(pixels, None)
     return Picture(pixels, load_mask_pixels(frame.mask, *size))
+
+
+def _sample(path: Path) -> bytes:
+    """A hash of a file's length and of three parts of it."""
+    digest = hashlib.sha256()
+    try:
+        with open(path, "rb") as file:
+            size = file.seek(0, os.SEEK_END)
+            digest.update(size.to_bytes(8, "little"))
+            for start in (0, size // 2, max(0, size - _SAMPLE)):
+                file.seek(start)
+                digest.update(file.read(_SAMPLE))
+    except OSError as error:
+        raise InputError(f"image {path}: cannot be read ({error.strerror}); copy it there again") from error
+    return digest.digest()

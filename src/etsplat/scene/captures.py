@@ -1,5 +1,6 @@
 """Captures for novel-view synthesis: cameras of any size, 8-bit images, points, split and the frame they are in."""
 
+import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -77,6 +78,18 @@ class Capture:
     def extent(self) -> float:
         """1.1 times the largest distance of a training camera from the mean of them; 1 if all are at one place."""
         return self._center_and_extent()[1]
+
+    def fingerprint(self) -> str:
+        """A short hash of all that a run depends on: cameras, split, points, names, and the photos and masks."""
+        digest = hashlib.sha256()
+        split = torch.tensor([*self.train, -1, *self.test])
+        for tensor in (self.viewmats, self.Ks, split, self.exact_points, self.point_colors):
+            if tensor is not None:
+                digest.update(str(tuple(tensor.shape)).encode())
+                digest.update(tensor.contiguous().numpy().tobytes())
+        digest.update(repr((self.names, self.images.sizes)).encode())
+        digest.update(self.images.fingerprint())
+        return digest.hexdigest()[:16]
 
     def normalized(self) -> "Capture":
         """The same capture where the training cameras are centred at the origin and the extent is 1.

@@ -1,6 +1,5 @@
 """Novel-view synthesis (paper section 3.4): photos in, a run directory with a triangle soup out."""
 
-import hashlib
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
@@ -114,7 +113,7 @@ def train(
     for note in _check(own, config, device):
         announce(NoteEvent(note))
     paths = {"source": path_of(source), "images": images, "masks": path_of(masks)}
-    record = make_record("train", config, {"fingerprint": _fingerprint(own)}, paths)
+    record = make_record("train", config, {"fingerprint": own.fingerprint()}, paths)
     scorer = SoupScorer(capture, _background(config), config.engine, device)
     fitting = start_fitting(capture, config, scorer.cheap, device)
     run = RunDirectory.resume(out, record) if resume else RunDirectory.create(out, record, overwrite=overwrite)
@@ -233,18 +232,6 @@ def _background(config: TrainConfig) -> Float[Tensor, "3"]:
 def _span(points: StartPoints) -> float:
     """Longest side of the box around the points."""
     return float((points.positions.amax(dim=0) - points.positions.amin(dim=0)).max()) if len(points) else 0.0
-
-
-def _fingerprint(capture: Capture) -> str:
-    """A short hash of what a run depends on: cameras, split, points, names and sizes, and the first photo's pixels."""
-    digest = hashlib.sha256()
-    split = torch.tensor([*capture.train, -1, *capture.test])
-    for tensor in (capture.viewmats, capture.Ks, split, capture.exact_points, capture.point_colors, capture.images[0]):
-        if tensor is not None:
-            digest.update(str(tuple(tensor.shape)).encode())
-            digest.update(tensor.contiguous().numpy().tobytes())
-    digest.update(repr((capture.names, capture.images.sizes)).encode())
-    return digest.hexdigest()[:16]
 
 
 def _finish(
