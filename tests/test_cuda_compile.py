@@ -26,8 +26,8 @@ PROGRAMS = [
     Program("raster_reduce.cu", tile_loops("Elastic", 3, 0, 0, 0, 0)[1:]),
     Program("fill.cu"),
     *(Program(file, contract=False) for file in ("adam.cu", "antialias.cu", "mesh_energies.cu", "photometric.cu")),
-    *(Program(file, contract=False) for file in ("rasterize_hard.cu", "ssim.cu", "step.cu")),
-    Program("spherical_harmonics.cu"),
+    *(Program(file, contract=False) for file in ("rasterize_hard.cu", "soup_statistics.cu", "ssim.cu", "step.cu")),
+    *(Program(file) for file in ("soup_activation.cu", "spherical_harmonics.cu")),
 ]
 # Other definitions of what is compiled above, for the oldest architecture and a recent one.
 VARIANTS = [

@@ -10,6 +10,7 @@ void bind_optimizer(nb::module_& m);
 void bind_photometric(nb::module_& m);
 void bind_rasterize(nb::module_& m);
 void bind_rasterize_hard(nb::module_& m);
+void bind_soup_activation(nb::module_& m);
 void bind_soup_colors(nb::module_& m);
 void bind_spherical_harmonics(nb::module_& m);
 void bind_triangle_area(nb::module_& m);
@@ -31,6 +32,7 @@ NB_MODULE(_native, m) {
     bind_photometric(m);
     bind_rasterize(m);
     bind_rasterize_hard(m);
+    bind_soup_activation(m);
     bind_soup_colors(m);
     bind_spherical_harmonics(m);
     bind_triangle_area(m);

@@ -34,19 +34,7 @@ std::shared_ptr<RasterState> acquire_state() {
 }
 
 PinholeCamera camera_of(const RasterCall& call) {
-    const auto* v = reinterpret_cast<const float*>(call.viewmat);
-    const auto* k = reinterpret_cast<const float*>(call.K);
-    PinholeCamera camera;
-    for (int i = 0; i < 3; ++i) {
-        for (int j = 0; j < 3; ++j) camera.rotation[3 * i + j] = v[4 * i + j];
-        camera.translation[i] = v[4 * i + 3];
-    }
-    camera.fx = k[0];
-    camera.skew = k[1];
-    camera.cx = k[2];
-    camera.fy = k[4];
-    camera.cy = k[5];
-    return camera;
+    return pinhole_camera(reinterpret_cast<const float*>(call.viewmat), reinterpret_cast<const float*>(call.K));
 }
 
 void fill_pass(RasterState& state) {

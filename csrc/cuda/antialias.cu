@@ -27,17 +27,7 @@ struct ScreenPoint {
 };
 
 __device__ PinholeCamera camera_of(const AntialiasView& view) {
-    PinholeCamera camera;
-    for (int i = 0; i < 3; ++i) {
-        for (int j = 0; j < 3; ++j) camera.rotation[3 * i + j] = view.viewmat[4 * i + j];
-        camera.translation[i] = view.viewmat[4 * i + 3];
-    }
-    camera.fx = view.K[0];
-    camera.skew = view.K[1];
-    camera.cx = view.K[2];
-    camera.fy = view.K[4];
-    camera.cy = view.K[5];
-    return camera;
+    return pinhole_camera(view.viewmat, view.K);
 }
 
 __device__ long long thread_index() { return static_cast<long long>(blockIdx.x) * kThreads + threadIdx.x; }

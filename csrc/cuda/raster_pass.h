@@ -8,6 +8,7 @@
 #include "math/kernels.h"
 #include "math/raster_records.h"
 #include "math/tiles.h"
+#include "math/triangle.h"
 
 namespace etsplat {
 
@@ -54,19 +55,7 @@ __device__ __forceinline__ TriangleRecord load_record(const RasterPass& pass, in
 }
 
 __device__ __forceinline__ PinholeCamera load_camera(const RasterPass& pass, int view) {
-    const float* v = pass.viewmats + 16 * view;
-    const float* k = pass.Ks + 9 * view;
-    PinholeCamera camera;
-    for (int i = 0; i < 3; ++i) {
-        for (int j = 0; j < 3; ++j) camera.rotation[3 * i + j] = v[4 * i + j];
-        camera.translation[i] = v[4 * i + 3];
-    }
-    camera.fx = k[0];
-    camera.skew = k[1];
-    camera.cx = k[2];
-    camera.fy = k[4];
-    camera.cy = k[5];
-    return camera;
+    return pinhole_camera(pass.viewmats + 16 * view, pass.Ks + 9 * view);
 }
 
 // World positions of the corners; false if an index is out of range.

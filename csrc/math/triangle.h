@@ -20,6 +20,21 @@ struct PinholeCamera {
     float fx, skew, cx, fy, cy;
 };
 
+// Of row-major (4, 4) and (3, 3).
+ETSPLAT_FN PinholeCamera pinhole_camera(const float* viewmat, const float* K) {
+    PinholeCamera camera;
+    for (int i = 0; i < 3; ++i) {
+        for (int j = 0; j < 3; ++j) camera.rotation[3 * i + j] = viewmat[4 * i + j];
+        camera.translation[i] = viewmat[4 * i + 3];
+    }
+    camera.fx = K[0];
+    camera.skew = K[1];
+    camera.cx = K[2];
+    camera.fy = K[4];
+    camera.cy = K[5];
+    return camera;
+}
+
 template <class T>
 struct Triangle2D {
     T x[3], y[3];    // projected vertices, pixels

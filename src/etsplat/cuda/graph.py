@@ -1,6 +1,7 @@
 """A sequence of launches, captured once as a CUDA graph and repeated without Python."""
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
 
@@ -15,8 +16,16 @@ class Repeated:
     do not run on a GPU (the tests' backend), every call is a call.
     """
 
-    def __init__(self, body: Callable[[], None]) -> None:
+    def __init__(self, body: Callable[[], None], pool: Any) -> None:
+        """Captures nothing yet.
+
+        Args:
+            body: the function.
+            pool: from `memory_pool`. Graphs of one pool work in the same memory: they are replayed on one stream, and
+                none reads what another has left there.
+        """
         self._body = body
+        self._pool = pool
         self._called = False
         self._graph: torch.cuda.CUDAGraph | None = None
 
@@ -24,7 +33,7 @@ class Repeated:
         """Queue the launches; nothing waits for them."""
         if self._graph is None and self._called and device_type() == "cuda":
             graph = torch.cuda.CUDAGraph()
-            with torch.cuda.graph(graph):
+            with torch.cuda.graph(graph, pool=self._pool):
                 self._body()
             self._graph = graph
         if self._graph is not None:
@@ -32,3 +41,8 @@ class Repeated:
         else:
             self._body()
             self._called = True
+
+
+def memory_pool() -> Any:
+    """What graphs allocate from."""
+    return torch.cuda.graph_pool_handle() if device_type() == "cuda" else None

@@ -15,10 +15,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from etsplat.core.rasterization import TriangleStatistics
+from etsplat.ops.soup_statistics import update_statistics, update_statistics_on_device
 from etsplat.optim.edit import RowPlan
 
 SPLIT_PARTS = 4
-_VISIBLE_INRADIUS = 1.0
 
 
 @dataclass
@@ -43,21 +43,27 @@ class SoupStatistics:
         number, whole = torch.zeros(count, device=device), torch.zeros(count, dtype=torch.int32, device=device)
         return SoupStatistics(number, number.clone(), whole, whole.clone())
 
-    def update(self, view: TriangleStatistics, views: int, *, epoch_starts: bool) -> None:
+    def update(self, view: TriangleStatistics, views: int, *, epoch_starts: bool, engine: str | None = None) -> None:
         """Takes in a rendering of one training view.
 
         Args:
             view: its statistics, (1, N).
             views: number of training views, the length of an epoch.
             epoch_starts: whether the view is the first of an epoch.
+            engine: "cpu", "reference" or None.
         """
-        torch.maximum(self.importance, view.max_weight[0], out=self.importance)
-        torch.maximum(self.screen_size, view.screen_size[0], out=self.screen_size)
-        running = self.trial < views
-        if not epoch_starts:
-            running &= self.trial > 0
-        self.seen += running & (view.inradius[0] > _VISIBLE_INRADIUS)
-        self.trial += running
+        update_statistics(list(self.tensors().values()), view, views, epoch_starts, engine=engine)
+
+    def update_on_device(self, view: TriangleStatistics, views: int, epoch_starts: Tensor, halted: Tensor) -> None:
+        """As `update`, on engine "cuda", which can be captured in a CUDA graph.
+
+        Args:
+            view: as there.
+            views: as there.
+            epoch_starts: (1,) float32 in device memory, 0 or 1.
+            halted: () int32 in device memory: nothing is updated where it is not 0.
+        """
+        update_statistics_on_device(list(self.tensors().values()), view, views, epoch_starts, halted)
 
     def judged(self, views: int) -> Bool[Tensor, " N"]:
         """Whose trial is over."""

@@ -1,75 +1,109 @@
 """Optimization steps that run on the device one after the other, without the host looking in between."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from etsplat.cuda.graph import Repeated
+from etsplat.cuda.graph import Repeated, memory_pool
 from etsplat.cuda.launch import launch
 from etsplat.cuda.program import Program
 from etsplat.ops._raster_capacity import overflow_flag, repair_overflow
-from etsplat.ops.adam import Adam
 
 _PROGRAM = Program("step.cu", contract=False)
 MAX_STEPS = 256
 """Steps that can be queued at a time."""
 
 
+def _nothing() -> None:
+    """Where a row is all that a step needs."""
+
+
+@dataclass(frozen=True)
+class QueuedStep:
+    """A step to come.
+
+    Attributes:
+        row: the numbers that it reads.
+        kind: steps of one kind launch the same kernels on the same memory: one graph.
+        prepare: queues what the step needs besides its row, such as the upload of a photo.
+    """
+
+    row: list[float]
+    kind: Hashable = None
+    prepare: Callable[[], None] = _nothing
+
+
 class StepQueue:
-    """Repeats a step whose inputs, whatever changes from step to step, are a row of numbers each.
+    """Repeats steps whose inputs, whatever changes from step to step, are a row of numbers each.
 
     The rows are uploaded together; a step reads the row at a position in device memory, and moves the position on. A
     step that does not count (csrc/cuda/step.cu) leaves everything as it was, and so do all steps queued behind it; the
     host finds the position where it stopped.
     """
 
-    def __init__(self, gradients: Callable[[Tensor], Tensor], adam: Adam, width: int, device: torch.device) -> None:
+    def __init__(
+        self,
+        gradients: Callable[[Tensor, Hashable], Tensor],
+        commit: Callable[[Tensor, Tensor], None],
+        width: int,
+        device: torch.device,
+    ) -> None:
         """Captures nothing yet.
 
         Args:
-            gradients: computes the gradients of the optimizer's parameters from a row (width,) and returns the loss;
-                it must not wait for the device. The last numbers of a row are the optimizer's `rates`.
-            adam: the optimizer, of engine "cuda".
+            gradients: computes the gradients of the optimizer's parameters from a row (width,) for a kind of steps and
+                returns the loss; it must not wait for the device.
+            commit: takes the step, from the same row, where () int32 `halted` in device memory is 0, and changes
+                nothing where it is not.
             width: numbers in a row.
             device: where it runs.
         """
         self._gradients = gradients
-        self._adam = adam
+        self._commit = commit
         self._queued = torch.zeros((MAX_STEPS, width), pin_memory=device.type == "cuda")
         self._rows = torch.zeros((MAX_STEPS, width), device=device)
         self._position = torch.zeros(1, dtype=torch.int64, device=device)
         self._losses = torch.zeros(MAX_STEPS, device=device)
         self._halted = torch.zeros((), dtype=torch.int32, device=device)
-        self._repeated = Repeated(self._step)
+        self._pool = memory_pool()
+        self._repeated: dict[Hashable, Repeated] = {}
 
     def restart(self) -> None:
-        """To be called when a tensor that the step uses was replaced: captures anew."""
-        self._repeated = Repeated(self._step)
+        """To be called when a tensor that the steps use was replaced: captures anew."""
+        self._repeated.clear()
 
-    def run(self, rows: Sequence[Sequence[float]]) -> list[float]:
-        """Makes a step for each of at most MAX_STEPS rows.
+    def run(self, steps: Sequence[QueuedStep]) -> list[float]:
+        """Makes at most MAX_STEPS steps.
 
         Returns:
             The loss before each step. They end with one that is not finite where that happened; its step and those
             after it were not made.
         """
-        self._queued[: len(rows)] = torch.tensor(rows)
+        self._queued[: len(steps)] = torch.tensor([step.row for step in steps])
         self._rows.copy_(self._queued, non_blocking=True)
         self._position.zero_()
         done = 0
-        while done < len(rows):
-            for _ in range(done, len(rows)):
-                self._repeated()
+        while done < len(steps):
+            self._halted.zero_()
+            for step in steps[done:]:
+                step.prepare()
+                self._graph(step.kind)()
             done = int(self._position)  # waits for the device
-            if done == len(rows) or not repair_overflow(self._rows.device):
+            if done == len(steps) or not repair_overflow(self._rows.device):
                 break
             self.restart()
-        return self._losses[: min(done + 1, len(rows))].tolist()
+        return self._losses[: min(done + 1, len(steps))].tolist()
 
-    def _step(self) -> None:
+    def _graph(self, kind: Hashable) -> Repeated:
+        if kind not in self._repeated:
+            self._repeated[kind] = Repeated(lambda: self._step(kind), self._pool)
+        return self._repeated[kind]
+
+    def _step(self, kind: Hashable) -> None:
         row = self._rows.index_select(0, self._position)[0]
-        loss = self._gradients(row)
+        loss = self._gradients(row, kind)
         overflow = overflow_flag(self._rows.device)
         launch(_PROGRAM, "step_verdict", 1, 1, (loss, overflow, self._position, self._losses, self._halted))
-        self._adam.step_on_device(row[-len(self._adam.parameters) - 1 :], self._halted)
+        self._commit(row, self._halted)

@@ -13,9 +13,10 @@ from etsplat.core.errors import InputError
 from etsplat.core.kernels import DISTANCES, KERNELS
 from etsplat.io.mesh_files import load_mesh
 from etsplat.io.ply_tables import CORNERS, read_ply_header, read_ply_tables
+from etsplat.ops.soup_activation import SOUP_SIGMA_FLOOR
 from etsplat.scene.soup_files import SoupFile, check_finite_soup, load_soup
 from etsplat.scene.soup_rendering import SoupAppearance
-from etsplat.scene.triangle_soup import SIGMA_FLOOR, TriangleSoup
+from etsplat.scene.triangle_soup import TriangleSoup
 
 GAUSSIAN_SIGMA = 1.0
 """With it the elastic kernel is exp(-x^2): the profile of a Gaussian."""
@@ -112,7 +113,7 @@ def _read_exported(path: Path, comments: list[str]) -> SoupFile:
     soup = TriangleSoup(
         torch.from_numpy(points[corners]),
         torch.logit(opacity.double().clamp(1e-6, 1 - 1e-7)).float(),
-        (sigma.double() - SIGMA_FLOOR).clamp_min(1e-6).log().float(),
+        (sigma.double() - SOUP_SIGMA_FLOOR).clamp_min(1e-6).log().float(),
         dc,
         rest,
     )
@@ -143,7 +144,7 @@ def _read_gaussians(path: Path) -> SoupFile:
     angles = torch.arange(3, dtype=torch.float64) * (2 * math.pi / 3)
     circle = torch.stack([angles.cos(), angles.sin()], dim=1)
     vertices = centers[:, None] + torch.einsum("kc,nac->nka", circle, axes)
-    raw = torch.full((len(table),), math.log(GAUSSIAN_SIGMA - SIGMA_FLOOR))
+    raw = torch.full((len(table),), math.log(GAUSSIAN_SIGMA - SOUP_SIGMA_FLOOR))
     return SoupFile(TriangleSoup(vertices.float(), logits, raw, dc, rest), notes={"source": path.name})
 
 

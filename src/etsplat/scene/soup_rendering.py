@@ -4,18 +4,16 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from etsplat.core.cameras import Cameras
 from etsplat.core.rasterization import Rasterization
 from etsplat.ops.rasterize import rasterize
 from etsplat.ops.rasterize_hard import render_opaque
+from etsplat.ops.soup_activation import soup_activation
 from etsplat.ops.soup_colors import soup_colors
 from etsplat.scene.triangle_soup import TriangleSoup
-
-SMALLEST_INRADIUS = 1.0
-"""Triangle Splatting draws no triangle whose inscribed circle on the image is smaller, in pixels."""
 
 OPAQUE_FROM = 0.5
 """Where a soup is drawn opaque, fainter triangles are left out."""
@@ -61,6 +59,7 @@ def render_soup(
     cameras: Cameras,
     appearance: SoupAppearance,
     *,
+    limits: Float[Tensor, "2"] | None = None,
     backgrounds: Float[Tensor, "B 3"] | None = None,
     depth: Literal["plane", "centroid"] | None = None,
     median_depth: bool = False,
@@ -75,6 +74,7 @@ def render_soup(
         soup: N triangles.
         cameras: B cameras of one image size.
         appearance: kernel and switches.
+        limits: (2,) in place of the appearance's opacity floor and sigma ceiling, in device memory of engine "cuda".
         backgrounds: (B, 3); None is black.
         depth: as in `rasterize`, and so are the other images.
         median_depth: also return the median depth.
@@ -85,14 +85,19 @@ def render_soup(
     """
     degree = soup.sh_degree if appearance.sh_degree is None else min(appearance.sh_degree, soup.sh_degree)
     colors = soup_colors(soup.vertices, soup.sh_dc, soup.sh_rest, cameras.centers, degree, engine=engine)
-    opacities = appearance.opacities(soup)
-    if appearance.cull_small:
-        opacities = torch.where(small_triangles(soup.vertices, cameras), 0.0, opacities)
+    opacities, sigma = soup_activation(
+        soup.vertices,
+        soup.opacity_logits,
+        soup.sigma_raw,
+        (appearance.opacity_floor, appearance.sigma_ceiling) if limits is None else limits,
+        cameras if appearance.cull_small else None,
+        engine=engine,
+    )
     return rasterize(
         soup.vertices,
         colors,
         opacities,
-        appearance.sigma(soup),
+        sigma,
         cameras.viewmats,
         cameras.Ks,
         cameras.width,
@@ -152,20 +157,3 @@ def render_soup_opaque(
         behind = 0.0 if background is None else (1 - rgba[..., 3:]) * background
         images.append(rgba[..., :3] + behind)
     return torch.cat(images)
-
-
-@torch.no_grad()
-def small_triangles(vertices: Float[Tensor, "N 3 3"], cameras: Cameras) -> Bool[Tensor, " N"]:
-    """Which triangles have an inradius below one pixel in the one camera given: 2 area / perimeter, projected.
-
-    Raises:
-        ValueError: more than one camera.
-    """
-    if len(cameras) != 1:
-        raise ValueError(f"cameras must be one where small triangles are left out, got {len(cameras)}")
-    rotation, translation = cameras.viewmats[0, :3, :3], cameras.viewmats[0, :3, 3]
-    points = vertices.detach() @ rotation.T + translation
-    pixels = points[..., :2] / points[..., 2:].clamp_min(1e-6) * torch.diagonal(cameras.Ks[0])[:2]
-    edges = pixels - pixels.roll(1, dims=1)
-    doubled = (edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0]).abs()
-    return doubled < SMALLEST_INRADIUS * edges.norm(dim=-1).sum(dim=-1)

@@ -6,10 +6,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from etsplat.ops.soup_activation import SOUP_SIGMA_FLOOR
 from etsplat.ops.spherical_harmonics import MAX_DEGREE, spherical_harmonics
-
-SIGMA_FLOOR = 0.01
-"""No triangle gets sharper than this."""
 
 SH_CONSTANT = 0.28209479177387814
 """The constant basis function Y_0: a colour c is the coefficient (c - 1/2) / Y_0."""
@@ -74,7 +72,7 @@ class TriangleSoup:
         """
         N = len(vertices)
         logit = torch.logit(torch.tensor(opacity, dtype=torch.float64)).to(vertices)
-        raw = torch.tensor(sigma - SIGMA_FLOOR, dtype=torch.float64).log().to(vertices)
+        raw = torch.tensor(sigma - SOUP_SIGMA_FLOOR, dtype=torch.float64).log().to(vertices)
         soup = cls(
             vertices=vertices.detach().clone(),
             opacity_logits=logit.repeat(N),
@@ -106,7 +104,7 @@ class TriangleSoup:
     @property
     def sigma(self) -> Float[Tensor, " N"]:
         """(N,) softness, above 0.01, differentiable."""
-        return SIGMA_FLOOR + torch.exp(self.sigma_raw)
+        return SOUP_SIGMA_FLOOR + torch.exp(self.sigma_raw)
 
     @property
     def sh_degree(self) -> int:

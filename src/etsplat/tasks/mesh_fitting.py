@@ -1,7 +1,7 @@
 """The problem that the loop drives in shape reconstruction: a mesh, its optimizer, and the views it is fitted to."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from dataclasses import replace
 from itertools import takewhile
 
@@ -21,7 +21,7 @@ from etsplat.optim.edit import apply_subdivision
 from etsplat.optim.loop import Progress
 from etsplat.optim.objectives import MeshWeights, mesh_objective
 from etsplat.optim.schedules import coarse_level, evenly, exponential_decay, face_budgets, regularization_weight
-from etsplat.optim.step_queue import MAX_STEPS, StepQueue
+from etsplat.optim.step_queue import MAX_STEPS, QueuedStep, StepQueue
 from etsplat.optim.vertex_updates import Solve, laplacian_solver, uniform_step
 from etsplat.optim.view_sampler import ViewSampler
 from etsplat.scene.mesh_rendering import render_mesh
@@ -90,7 +90,7 @@ class MeshFitting:
         queueable = config.vertex_update == "adam" and config.backend == "etsplat"  # others need the host in a step
         if queueable and resolve_engine(config.engine, mesh.vertices) == "cuda":
             width = 4 * config.views_per_step + 2 + len(parameters) + 1
-            self._queue = StepQueue(self._queued_gradients, self.adam, width, mesh.vertices.device)
+            self._queue = StepQueue(self._queued_gradients, self._commit, width, mesh.vertices.device)
 
     @property
     def count(self) -> int:
@@ -111,7 +111,8 @@ class MeshFitting:
             self._queued_level = level
             self._queue.restart()
         steps = range(first, min([last, first + MAX_STEPS - 1, *stops]) + 1)
-        return self._queue.run([self._row(i) for i in takewhile(lambda i: self._level(i) == level, steps)])
+        unchanged = takewhile(lambda i: self._level(i) == level, steps)
+        return self._queue.run([QueuedStep(self._row(i)) for i in unchanged])
 
     def _step(self, iteration: int) -> float:
         views, (chosen, backgrounds) = self._levels[self._level(iteration)], self._draw()
@@ -131,7 +132,10 @@ class MeshFitting:
         scheduled = self._gamma(iteration), self._log_sigma(iteration)
         return [*chosen, *backgrounds.reshape(-1).tolist(), *scheduled, *rates]
 
-    def _queued_gradients(self, row: Tensor) -> Tensor:
+    def _commit(self, row: Tensor, halted: Tensor) -> None:
+        self.adam.step_on_device(row[-len(self.adam.parameters) - 1 :], halted)
+
+    def _queued_gradients(self, row: Tensor, kind: Hashable) -> Tensor:
         views, count = self._levels[self._queued_level], self._config.views_per_step
         chosen, backgrounds = row[:count].long(), row[count : 4 * count].reshape(count, 3)
         viewmats, Ks = (tensor.index_select(0, chosen) for tensor in (views.cameras.viewmats, views.cameras.Ks))

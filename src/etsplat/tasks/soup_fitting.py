@@ -1,36 +1,35 @@
 """The problem that the loop drives in novel-view synthesis: a soup, its optimizer, and the photos it is fitted to."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from dataclasses import replace
+from itertools import takewhile
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from etsplat.core.rasterization import Rasterization
+from etsplat.core.cameras import Cameras
+from etsplat.core.rasterization import TriangleStatistics
 from etsplat.core.validation import first_not_finite
 from etsplat.ops.adam import Adam
+from etsplat.ops.engines import resolve_engine
 from etsplat.optim.densification import PruneRules, SoupStatistics, dead_triangles, densify_plan, grown_count
 from etsplat.optim.edit import RowPlan, apply_rows
 from etsplat.optim.loop import DivergedError, Progress
-from etsplat.optim.schedules import exponential_decay, ramp
 from etsplat.optim.soup_objective import SoupWeights, soup_objective
+from etsplat.optim.step_queue import MAX_STEPS, QueuedStep, StepQueue
 from etsplat.optim.view_sampler import ViewSampler
 from etsplat.scene.capture_views import CaptureViews
 from etsplat.scene.captures import Capture
+from etsplat.scene.device_views import DeviceViews
 from etsplat.scene.soup_rendering import SoupAppearance, render_soup
 from etsplat.scene.triangle_soup import TriangleSoup
 from etsplat.tasks.running import progress_tensor, read_progress
+from etsplat.tasks.soup_schedule import SoupSchedule
 from etsplat.tasks.train_config import TrainConfig
 
 READ_AHEAD = 8
 """Views whose photos are decoded ahead of their turn, where the capture does not fit into memory."""
-
-FINAL_FLOOR, FIRST_CEILING, FINAL_CEILING = 0.995, 1.0, 0.02
-FINISH_UNTIL = 0.8
-"""The opaque finish: opacities are squeezed above a floor that rises to the first number, and sigma is cut at a ceiling
-that falls from the second to the third. Triangles whose own opacity falls below `prune_opacity` meanwhile are removed,
-and others multiply in their place. From this fraction of the run on the soup adapts to the result."""
 
 Evaluate = Callable[[TriangleSoup, SoupAppearance], dict[str, float]]
 
@@ -68,9 +67,8 @@ class SoupFitting:
         self._device = soup.vertices.device
         self.statistics = SoupStatistics.zeros(len(soup), self._device)
         self._capture = capture
-        self._views = CaptureViews(capture, self._device)
         self._config = config
-        self._squared = squared
+        self._schedule = SoupSchedule(config, squared)
         self._evaluate = evaluate
         self._sampler = ViewSampler(capture.train, generator)
         self._iteration = 0
@@ -82,6 +80,14 @@ class SoupFitting:
             "sh_rest": config.lr_sh_rest,
         }
         self.adam = Adam(soup.parameters(), rates, engine=config.engine)
+        self._queue: StepQueue | None = None
+        self._phase: tuple[SoupAppearance, SoupWeights] | None = None
+        self._drawn: TriangleStatistics | None = None  # by the step that is being captured
+        if resolve_engine(config.engine, soup.vertices) == "cuda":
+            self._device_views = DeviceViews(capture, self._device)
+            self._queue = StepQueue(self._queued_gradients, self._commit, 8 + len(rates) + 1, self._device)
+        else:
+            self._views = CaptureViews(capture, self._device)
 
     @property
     def count(self) -> int:
@@ -91,7 +97,7 @@ class SoupFitting:
     @property
     def appearance(self) -> SoupAppearance:
         """How the soup is drawn at this iteration."""
-        return self._appearance(self._iteration)
+        return self._schedule.appearance(self._iteration)
 
     def describe(self) -> dict[str, float]:
         """For the log: number of triangles, and deciles of softness and opacity as they are drawn."""
@@ -105,47 +111,99 @@ class SoupFitting:
         return state
 
     def advance(self, first: int, last: int) -> list[float]:
-        """One step, with one view; returns the loss before it."""
-        return [self._step(first)]
+        """Steps with one view each; on a device many together. Returns the losses before them."""
+        if self._queue is None:
+            return [self._step(first)]
+        phase = self._schedule.phase(first)
+        if phase != self._phase:
+            self._phase = phase
+            self._queue.restart()
+        most = READ_AHEAD if self._device_views.streamed else MAX_STEPS
+        steps = range(first, min(last, first + most - 1, self._schedule.next_edit(first)) + 1)
+        unchanged = takewhile(lambda i: self._schedule.phase(i) == phase, steps)
+        losses = self._queue.run([self._queued_step(i) for i in unchanged])
+        self._iteration = first + len(losses) - 1
+        return losses
 
     def _step(self, iteration: int) -> float:
-        config, soup = self._config, self.soup
         self._iteration = iteration
         view = self._sampler.next_view()
         self._views.expect([view, *self._sampler.upcoming(READ_AHEAD)])
-        background, camera = self._background().to(self._device), self._views.cameras[view]
-        weights, appearance = self._weights(iteration), self._appearance(iteration)
+        appearance, weights = self._schedule.appearance(iteration), self._schedule.weights(iteration)
+        mask = self._views.mask(view)
+        loss, drawn = self._gradients(
+            self._views.cameras[view],
+            self._views.photo(view)[None],
+            None if mask is None else mask[None],
+            self._background().to(self._device),
+            appearance,
+            weights,
+        )
+        self.adam.learning_rates["vertices"] = self._schedule.vertex_rate(iteration)
+        self.adam.step()
+        views, starts = len(self._capture.train), self._sampler.epoch_starts
+        self.statistics.update(drawn, views, epoch_starts=starts, engine=self._config.engine)
+        return float(loss)
+
+    def _queued_step(self, iteration: int) -> QueuedStep:
+        """A row: camera and place, background, opacity floor, sigma ceiling, whether an epoch starts, Adam's rates."""
+        view = self._sampler.next_view()
+        self._device_views.expect([view, *self._sampler.upcoming(READ_AHEAD)])
+        kind, place = self._device_views.find(view)
+        appearance = self._schedule.appearance(iteration)
+        limits = appearance.opacity_floor, appearance.sigma_ceiling
+        self.adam.learning_rates["vertices"] = self._schedule.vertex_rate(iteration)
+        self.adam.step_count += 1
+        rates = self.adam.rates(list(self.adam.parameters))
+        scheduled = *limits, float(self._sampler.epoch_starts), *rates
+        row = [*place, *self._background()[0].tolist(), *scheduled]
+        return QueuedStep(row, kind, self._device_views.upload(view))
+
+    def _queued_gradients(self, row: Tensor, kind: Hashable) -> Tensor:
+        assert self._phase is not None
+        view = self._device_views.look_up(kind, row[:2])
+        loss, self._drawn = self._gradients(*view, row[2:5][None], *self._phase, limits=row[5:7])
+        return loss
+
+    def _commit(self, row: Tensor, halted: Tensor) -> None:
+        assert self._drawn is not None
+        self.adam.step_on_device(row[8:], halted)
+        self.statistics.update_on_device(self._drawn, len(self._capture.train), row[7:8], halted)
+        self._drawn = None
+
+    def _gradients(
+        self,
+        camera: Cameras,
+        photo: UInt8[Tensor, "1 H W C"],
+        mask: UInt8[Tensor, "1 H W"] | None,
+        background: Float[Tensor, "1 3"],
+        appearance: SoupAppearance,
+        weights: SoupWeights,
+        limits: Float[Tensor, "2"] | None = None,
+    ) -> tuple[Tensor, TriangleStatistics]:
+        """Those of the objective, whose value is returned with what was seen of each triangle."""
+        soup, engine = self.soup, self._config.engine
         rendering = render_soup(
             soup,
             camera,
             appearance,
+            limits=limits,
             backgrounds=background,
             median_depth=weights.normal > 0,
             depth="centroid" if weights.normal > 0 or weights.distortion > 0 else None,
             normals=weights.normal > 0,
             distortion=weights.distortion > 0,
             statistics=True,
-            engine=config.engine,
+            engine=engine,
         )
-        mask = self._views.mask(view)
+        counts = None if mask is None else mask.float() / 255
         loss = soup_objective(
-            rendering,
-            self._views.photo(view)[None],
-            None if mask is None else mask[None].float() / 255,
-            background,
-            soup.vertices,
-            soup.opacities,
-            camera,
-            weights,
-            engine=config.engine,
+            rendering, photo, counts, background, soup.vertices, soup.opacities, camera, weights, engine=engine
         )
         self.adam.zero_grad()
         loss.backward()
-        decay = exponential_decay(iteration, config.iterations, config.lr_vertices_final)
-        self.adam.learning_rates["vertices"] = config.lr_vertices * decay
-        self.adam.step()
-        self._remember(rendering)
-        return float(loss.detach())
+        assert rendering.statistics is not None
+        return loss.detach(), rendering.statistics
 
     def refine(self, iteration: int) -> int:
         """Densifies or prunes if it is time to; returns by how many triangles the soup grew."""
@@ -212,62 +270,23 @@ class SoupFitting:
         self.statistics = SoupStatistics(**{name: state[f"statistics.{name}"].to(self._device) for name in names})
         self._sampler.load_state({name: state[f"sampler.{name}"] for name in self._sampler.state()})
         self._iteration = iteration
+        if self._queue is not None:
+            self._queue.restart()
         return read_progress(state["progress"], iteration)
-
-    def _appearance(self, iteration: int) -> SoupAppearance:
-        config = self._config
-        appearance = SoupAppearance(
-            kernel=config.kernel,
-            distance=config.distance,
-            sh_degree=min(config.sh_degree, iteration // config.at(config.sh_every)),
-            cull_small=config.cull_small,
-            freeze_incentre=config.freeze_incentre and config.distance == "sdf",
-            near_plane=config.near_plane,
-        )
-        if not self._finishing(iteration):
-            return appearance
-        done = ramp(iteration, config.at(config.finish_from), self._settled)
-        ceiling = FIRST_CEILING * (FINAL_CEILING / FIRST_CEILING) ** done
-        return replace(appearance, opacity_floor=FINAL_FLOOR * done, sigma_ceiling=ceiling)
-
-    def _finishing(self, iteration: int) -> bool:
-        return self._config.finish == "opaque" and iteration > self._config.at(self._config.finish_from)
-
-    @property
-    def _settled(self) -> int:
-        """When the opaque finish has made everything opaque and sharp."""
-        return round(FINISH_UNTIL * self._config.iterations)
-
-    def _weights(self, iteration: int) -> SoupWeights:
-        config = self._config
-        regular = iteration > config.at(config.regularize_from)
-        return SoupWeights(
-            dssim=config.lambda_dssim,
-            opacity=0.0 if config.finish == "opaque" else config.lambda_opacity,
-            size=config.lambda_size if iteration < config.at(config.densify_until) else 0.0,
-            normal=config.lambda_normal if regular else 0.0,
-            distortion=config.lambda_distortion if regular else 0.0,
-            pixel="l2" if self._squared else "l1",
-        )
 
     def _background(self) -> Float[Tensor, "1 3"]:
         if self._config.background == "random":
             return self._sampler.background()
         return torch.full((1, 3), 1.0 if self._config.background == "white" else 0.0)
 
-    def _remember(self, rendering: Rasterization) -> None:
-        assert rendering.statistics is not None
-        views = len(self._capture.train)
-        self.statistics.update(rendering.statistics, views, epoch_starts=self._sampler.epoch_starts)
-
     def _dead(self, iteration: int) -> Tensor:
         config = self._config
         first = iteration <= config.at(config.densify_from) + config.at(config.densify_every)
-        finishing = self._finishing(iteration)
+        finishing = self._schedule.finishing(iteration)
         densifying = iteration < config.at(config.densify_until)
         limit = config.prune_screen_size if densifying and not first else None
         rules = PruneRules(
-            opacity=0.0 if finishing and iteration >= self._settled else config.prune_opacity,
+            opacity=0.0 if finishing and iteration >= self._schedule.settled else config.prune_opacity,
             importance=config.prune_importance,
             views=0 if first else min(config.prune_views, len(self._capture.train)),
             screen_size=float("inf") if limit is None else limit,
@@ -305,3 +324,5 @@ class SoupFitting:
             setattr(self.soup, name, parameter)
         self.statistics = SoupStatistics(**statistics)
         self.statistics.restart(self.statistics.judged(len(self._capture.train)))
+        if self._queue is not None:
+            self._queue.restart()

@@ -1,0 +1,54 @@
+// From the parameters of a soup's triangle to the opacity and the softness that are drawn (etsplat/ops/soup_activation.py).
+#pragma once
+
+#include "triangle.h"
+
+namespace etsplat {
+
+constexpr float kSoupSigmaFloor = 0.01f;
+constexpr float kSmallestInradius = 1.0f;  // pixels
+
+struct SoupLimits {
+    float opacity_floor, sigma_ceiling;
+};
+
+struct Activated {
+    float opacity, sigma;
+};
+
+ETSPLAT_FN float natural_exp(float x) { return vexp2(x * 1.4426950408889634f); }
+
+ETSPLAT_FN Activated activate(float logit, float raw, SoupLimits limits) {
+    const float sigmoid = 1.0f / (1.0f + natural_exp(-logit));
+    return {limits.opacity_floor + (1.0f - limits.opacity_floor) * sigmoid,
+            vmin(kSoupSigmaFloor + natural_exp(raw), limits.sigma_ceiling)};
+}
+
+// From gradients by the activated numbers to those by the parameters; nothing passes the ceiling.
+ETSPLAT_FN Activated activate_backward(float logit, float raw, SoupLimits limits, Activated grad) {
+    const float sigmoid = 1.0f / (1.0f + natural_exp(-logit)), sharpness = natural_exp(raw);
+    const bool cut = kSoupSigmaFloor + sharpness > limits.sigma_ceiling;
+    return {grad.opacity * (1.0f - limits.opacity_floor) * sigmoid * (1.0f - sigmoid),
+            cut ? 0.0f : grad.sigma * sharpness};
+}
+
+// Whether the incircle of the projected triangle, 2 area / perimeter, is smaller than a pixel. Vertices behind the camera
+// are taken to lie just before it.
+ETSPLAT_FN bool is_small(const PinholeCamera& camera, const float* world) {
+    float x[3], y[3];
+    for (int k = 0; k < 3; ++k) {
+        float view[3];
+        to_camera(camera, world + 3 * k, view);
+        const float inverse_z = 1.0f / vmax(view[2], 1e-6f);
+        x[k] = view[0] * inverse_z * camera.fx;
+        y[k] = view[1] * inverse_z * camera.fy;
+    }
+    float perimeter = 0.0f;
+    for (int k = 0; k < 3; ++k) {
+        const float ex = x[(k + 1) % 3] - x[k], ey = y[(k + 1) % 3] - y[k];
+        perimeter += vsqrt(ex * ex + ey * ey);
+    }
+    return vabs((x[1] - x[0]) * (y[2] - y[0]) - (x[2] - x[0]) * (y[1] - y[0])) < kSmallestInradius * perimeter;
+}
+
+}  // namespace etsplat

@@ -1,0 +1,82 @@
+"""What is computed of every triangle of a soup in every step, besides its colour."""
+
+import pytest
+import torch
+
+from etsplat.core.cameras import Cameras, intrinsics, look_at
+from etsplat.core.rasterization import TriangleStatistics
+from etsplat.ops.soup_activation import soup_activation
+from etsplat.optim.densification import SoupStatistics
+
+pytestmark = pytest.mark.sanitize
+
+N = 700
+
+
+def camera() -> Cameras:
+    viewmats = look_at(torch.tensor([[0.3, 0.2, 3.0]]), torch.zeros(3), torch.tensor([0.0, 1.0, 0.0]))
+    return Cameras(viewmats, intrinsics(40.0, 64, 48)[None], 64, 48)
+
+
+def soup(rng: torch.Generator) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Triangles of all sizes, some of them behind the camera, and parameters of all sizes."""
+    middles, sizes = 2 * torch.randn((N, 1, 3), generator=rng), 0.2 * torch.rand((N, 1, 1), generator=rng)
+    vertices = middles + sizes * torch.randn((N, 3, 3), generator=rng)
+    return vertices, 3 * torch.randn(N, generator=rng), torch.randn(N, generator=rng) - 1
+
+
+@pytest.mark.parametrize("limits", [(0.0, float("inf")), (0.6, 0.4)])
+@pytest.mark.parametrize("culling", [True, False])
+def test_native_engines_agree_with_the_float64_reference(rng, cuda_device, limits, culling):
+    """Values and gradients; the engines leave out the same triangles."""
+    vertices, logits, raw = soup(rng)
+    cotangents = torch.randn((2, N), generator=rng)
+    results = []
+    for engine, device in (("reference", "cpu"), ("cpu", "cpu"), ("cuda", cuda_device)):
+        dtype = torch.float64 if engine == "reference" else torch.float32
+        leaves = [tensor.to(device, dtype, copy=True).requires_grad_() for tensor in (logits, raw)]
+        given = torch.tensor(limits, device=device) if engine == "cuda" else limits
+        seen = camera().to(torch.device(device), dtype=dtype) if culling else None
+        drawn = torch.stack(soup_activation(vertices.to(device, dtype), *leaves, given, seen, engine=engine))
+        (drawn * cotangents.to(device, dtype)).sum().backward()
+        results.append([tensor.detach().cpu().double() for tensor in (drawn, *(leaf.grad for leaf in leaves))])
+    exact, on_cpu, on_device = results
+    assert (exact[0][0] == 0).float().mean() > 0.2 if culling else bool((exact[0][0] > 0).all())
+    for result in (on_cpu, on_device):
+        for tensor, expected in zip(result, exact, strict=True):
+            torch.testing.assert_close(tensor, expected, rtol=2e-6, atol=1e-6)
+
+
+def test_gradients_are_finite_differences(rng):
+    """Of the reference, in float64, away from the ceiling."""
+    vertices, logits, raw = (tensor[:20].double() for tensor in soup(rng))
+    leaves = logits.requires_grad_(), raw.requires_grad_()
+    seen = camera().to(dtype=torch.float64)
+    assert torch.autograd.gradcheck(lambda *p: soup_activation(vertices, *p, (0.3, 0.45), seen), leaves)
+
+
+def random_view(rng: torch.Generator) -> TriangleStatistics:
+    weight, size = torch.rand((1, N), generator=rng), 30 * torch.rand((1, N), generator=rng)
+    return TriangleStatistics(weight, size, 2 * torch.rand((1, N), generator=rng), weight > 0)
+
+
+def test_native_statistics_are_those_of_pytorch(rng, cuda_device):
+    """The same bits over epochs of three views, with some triangles born in between, and nothing where halted."""
+    expected, on_cpu, on_device = (SoupStatistics.zeros(N, device) for device in ("cpu", "cpu", cuda_device))
+    going, halted = (torch.tensor(value, dtype=torch.int32, device=cuda_device) for value in (0, 1))
+    for step in range(8):
+        view, starts = random_view(rng), step % 3 == 0
+        moved = TriangleStatistics(*(tensor.to(cuda_device) for tensor in vars(view).values()))
+        flag = torch.tensor([float(starts)], device=cuda_device)
+        expected.update(view, 3, epoch_starts=starts, engine="reference")
+        on_cpu.update(view, 3, epoch_starts=starts)
+        on_device.update_on_device(moved, 3, flag, going)
+        on_device.update_on_device(TriangleStatistics(*(t + 5 for t in vars(moved).values())), 3, flag, halted)
+        if step == 4:
+            born = torch.arange(N) % 5 == 0
+            for statistics in (expected, on_cpu, on_device):
+                statistics.restart(born.to(statistics.seen.device))
+    assert 0 < int(expected.seen.max()) <= 3
+    for name, tensor in expected.tensors().items():
+        assert torch.equal(on_cpu.tensors()[name], tensor), name
+        assert torch.equal(on_device.tensors()[name].cpu(), tensor), name
