@@ -7,7 +7,7 @@ from PIL import Image
 
 from captures import write_colmap
 from etsplat.bench.grid import run_grid
-from etsplat.bench.nvs import evaluate_cells, make_nvs_cells
+from etsplat.bench.nvs import Scene, evaluate_cells, make_nvs_cells, read_scene_argument
 from etsplat.bench.nvs_figures import draw_nvs
 from etsplat.bench.nvs_tables import nvs_tables, write_nvs_tables
 from etsplat.bench.paper_nvs import SCENES
@@ -20,8 +20,9 @@ def row(scene, variant, psnr, **numbers):
 
 
 def cells_of(folder, **options):
-    settings = {"preset": "tiny", "scene_type": "outdoor", "culling": (False, True), "changes": {"iterations": 6}}
-    return make_nvs_cells([folder / "toy"], ["elastic"], folder / "out", **{**settings, **options})
+    settings = {"preset": "tiny", "culling": (False, True), "setting": "iterations=6"}
+    scene = read_scene_argument(f"{folder / 'toy'}:indoor,background=white")
+    return make_nvs_cells([scene], ["elastic"], folder / "out", **{**settings, **options})
 
 
 def test_a_grid_runs_is_measured_and_goes_on_where_it_was(tmp_path):
@@ -42,7 +43,7 @@ def test_a_grid_runs_is_measured_and_goes_on_where_it_was(tmp_path):
     assert Image.open(tmp_path / "nvs.png").width == 3 * 404
     again = cells_of(tmp_path)
     assert [cell.state for cell in again] == ["done", "done"]
-    assert cells_of(tmp_path, changes={"iterations": 7})[0].state == "waiting"
+    assert cells_of(tmp_path, setting="iterations=7")[0].state == "waiting"
 
 
 def test_means_are_over_the_scenes_that_every_variant_has_and_the_best_is_bold():
@@ -73,15 +74,8 @@ def test_table_filter_shows_the_difference():
 
 def test_the_papers_scenes_get_their_settings_with_preset_paper(tmp_path):
     (tmp_path / "garden" / "images_4").mkdir(parents=True)
-    cell = make_nvs_cells(
-        [tmp_path / "garden"],
-        ["single-sided"],
-        tmp_path / "out",
-        preset="paper",
-        culling=(True,),
-        changes={},
-        scene_type="object",
-    )[0]
+    garden = read_scene_argument(str(tmp_path / "garden"))
+    cell = make_nvs_cells([garden], ["single-sided"], tmp_path / "out", preset="paper", culling=(True,), setting="")[0]
     assert (cell.config.max_triangles, cell.config.scene_type, cell.images) == (5_200_000, "outdoor", "images_4")
     assert cell.config.cull_small
     assert {scene.dataset for scene in SCENES.values()} == {"Mip-NeRF 360", "Tanks and Temples", "Deep Blending"}
@@ -92,13 +86,22 @@ def test_missing_scenes_and_equal_names_are_input_errors(tmp_path):
         cells_of(tmp_path)
     for folder in ("x", "y"):
         (tmp_path / folder / "toy").mkdir(parents=True)
+    scenes = [read_scene_argument(str(tmp_path / folder / "toy")) for folder in ("x", "y")]
     with pytest.raises(InputError, match="two are named toy"):
-        make_nvs_cells(
-            [tmp_path / "x" / "toy", tmp_path / "y" / "toy"],
-            ["elastic"],
-            tmp_path / "out",
-            preset="tiny",
-            culling=(False,),
-            changes={},
-            scene_type="outdoor",
-        )
+        make_nvs_cells(scenes, ["elastic"], tmp_path / "out", preset="tiny", culling=(False,), setting="")
+
+
+def test_a_scene_says_its_kind_and_its_changes_after_a_colon(tmp_path):
+    (tmp_path / "a:b").mkdir()
+    assert read_scene_argument(f"{tmp_path}/a:b") == Scene(tmp_path / "a:b", None, "")
+    assert read_scene_argument(f"{tmp_path}/a:b:object") == Scene(tmp_path / "a:b", "object", "")
+    scene = read_scene_argument(f"{tmp_path}/a:b:indoor,width=90,background=white")
+    assert scene == Scene(tmp_path / "a:b", "indoor", "width=90,background=white")
+    cell = make_nvs_cells(
+        [scene], ["elastic"], tmp_path / "out", preset="quick", culling=(False,), setting="width=50,iterations=8"
+    )[0]
+    settings = cell.config
+    assert (settings.scene_type, settings.width, settings.iterations) == ("indoor", 90, 8)
+    assert settings.background == "white"
+    with pytest.raises(InputError, match="indoors: no such folder; .*one of outdoor, indoor, object"):
+        read_scene_argument(f"{tmp_path}/a:b:indoors")

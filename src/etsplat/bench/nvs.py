@@ -1,15 +1,16 @@
 """A grid of soups: scenes by methods, with and without culling of small triangles; and what is measured of them."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from etsplat.bench.grid import Cell, is_finished
 from etsplat.bench.paper_nvs import SCENES
+from etsplat.bench.variants import changes_of
 from etsplat.core.errors import InputError
 from etsplat.io.run_directory import RunDirectory
-from etsplat.tasks.train_config import TrainConfig, train_settings
+from etsplat.tasks.train_config import SCENE_TYPE_NAMES, TrainConfig, train_settings
 
 CULLED = "culling"
 """What is added to the name of a method whose small triangles are culled."""
@@ -27,15 +28,48 @@ METRICS = (
 )
 
 
+@dataclass(frozen=True)
+class Scene:
+    """A scene of the grid.
+
+    Attributes:
+        folder: its photos and cameras; the folder's name is the scene's.
+        scene_type: outdoor, indoor or object; None for the paper's where it is one of the paper's, else outdoor.
+        setting: changes for this scene alone, such as "background=white".
+    """
+
+    folder: Path
+    scene_type: str | None
+    setting: str
+
+    @property
+    def name(self) -> str:
+        """Of its rows and folders."""
+        return self.folder.resolve().name
+
+
+def read_scene_argument(text: str) -> Scene:
+    """A scene as it is given on the command line: FOLDER, FOLDER:indoor, or FOLDER:object,background=white.
+
+    Raises:
+        InputError: there is no such folder.
+    """
+    folder, colon, rest = text.rpartition(":")
+    scene_type, _, setting = rest.partition(",")
+    if colon and scene_type in SCENE_TYPE_NAMES:
+        scene = Scene(Path(folder), scene_type, setting)
+    else:
+        scene = Scene(Path(text), None, "")
+    if not scene.folder.is_dir():
+        raise InputError(
+            f"scene {scene.folder}: no such folder; fetch it with `etsplat data download`, or check the path; its kind "
+            f"comes after a colon: one of {', '.join(SCENE_TYPE_NAMES)}"
+        )
+    return scene
+
+
 def make_nvs_cells(
-    scenes: Sequence[Path],
-    methods: Sequence[str],
-    out: Path,
-    *,
-    preset: str,
-    culling: Sequence[bool],
-    changes: dict[str, Any],
-    scene_type: str,
+    scenes: Sequence[Scene], methods: Sequence[str], out: Path, *, preset: str, culling: Sequence[bool], setting: str
 ) -> list[Cell]:
     """All runs, scene by scene; those that are finished are "done".
 
@@ -43,31 +77,29 @@ def make_nvs_cells(
     of photos and number of triangles.
 
     Args:
-        scenes: folders; the folder's name is the scene's.
+        scenes: what is trained on.
         methods: as `TrainConfig.method`.
         out: folder; runs are in OUT/runs/SCENE/VARIANT.
         preset: of all runs.
         culling: whether small triangles are culled; one or both.
-        changes: settings for all runs.
-        scene_type: of scenes that are not the paper's.
+        setting: changes for all runs, such as "iterations=1000,width=400".
 
     Raises:
-        InputError: a scene is missing, or two have the same name.
+        InputError: two scenes have the same name, or a change is none.
     """
-    names = [scene.resolve().name for scene in scenes]
-    for scene, name in zip(scenes, names, strict=True):
-        if not scene.is_dir():
-            raise InputError(f"scene {scene}: no such folder; fetch it with `etsplat data download`, or check the path")
+    names = [scene.name for scene in scenes]
+    for name in names:
         if names.count(name) > 1:
             raise InputError(f"scenes: two are named {name}; rename a folder")
     cells = []
     for scene, name in zip(scenes, names, strict=True):
-        base, images = _settings(name, scene, preset, scene_type)
+        base, images = _settings(scene, preset)
+        changes = {**changes_of(base, setting), **changes_of(base, scene.setting)}
         for culled in culling:
             for method in methods:
                 variant = f"{method} {CULLED}" if culled else method
                 config = replace(base, **{"method": method, "cull_small": culled, **changes})
-                cell = Cell(name, scene, variant, config, out / "runs" / name / variant, images=images)
+                cell = Cell(name, scene.folder, variant, config, out / "runs" / name / variant, images=images)
                 cell.state = "done" if is_finished(cell) else "waiting"
                 cells.append(cell)
     return cells
@@ -105,9 +137,9 @@ def evaluate_cells(
     return rows
 
 
-def _settings(name: str, scene: Path, preset: str, scene_type: str) -> tuple[TrainConfig, str | None]:
-    known = SCENES.get(name) if preset == "paper" else None
-    if known is None:
-        return train_settings(preset, scene_type), None
+def _settings(scene: Scene, preset: str) -> tuple[TrainConfig, str | None]:
+    known = SCENES.get(scene.name) if preset == "paper" else None
+    if known is None or scene.scene_type is not None:
+        return train_settings(preset, scene.scene_type or "outdoor"), None
     config = replace(train_settings(preset, known.scene_type), max_triangles=known.max_triangles)
-    return config, known.images if (scene / known.images).is_dir() else None
+    return config, known.images if (scene.folder / known.images).is_dir() else None

@@ -7,6 +7,7 @@ from typing import Any
 
 from etsplat.core.errors import InputError
 from etsplat.tasks.reconstruct_config import METHODS, ReconstructConfig
+from etsplat.tasks.train_config import TrainConfig
 
 LAMBDA_SIGMAS = (1e-3, 1e-4)
 """The two softness weights of the paper's tables."""
@@ -73,10 +74,15 @@ def setting_variants(base: ReconstructConfig, settings: Sequence[str]) -> list[V
     Raises:
         InputError: not a setting, or not a value of its type.
     """
-    return [Variant(setting or "preset", _changes(base, setting)) for setting in settings]
+    return [Variant(setting or "preset", changes_of(base, setting)) for setting in settings]
 
 
-def _changes(base: ReconstructConfig, setting: str) -> dict[str, Any]:
+def changes_of(base: ReconstructConfig | TrainConfig, setting: str) -> dict[str, Any]:
+    """What a list such as "iterations=1000,colors=vertex" changes; a value has the type of the one that it replaces.
+
+    Raises:
+        InputError: as `setting_variants`.
+    """
     changes: dict[str, Any] = {}
     for item in filter(None, setting.split(",")):
         name, _, text = item.partition("=")

@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Literal
 import tyro
 
 from etsplat.cli.command import FAILED, INTERRUPTED, Command, fail
-from etsplat.tasks.train_config import Method, SceneType, TrainPreset
+from etsplat.tasks.train_config import Method, TrainPreset
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,13 +20,15 @@ class Nvs(Command):
     """
 
     EXAMPLES: ClassVar[str] = """
-    etsplat bench nvs --scenes scenes/kitchen scenes/fox --out runs/nvs
-    etsplat bench nvs --scenes scenes/fox --out runs/filter --methods elastic --culling both
+    etsplat bench nvs --scenes scenes/kitchen:indoor scenes/fountain scenes/lego:object,background=white --out runs/nvs
+    etsplat bench nvs --scenes scenes/fox:indoor --out runs/filter --methods elastic --culling both
+    etsplat bench nvs --scenes scenes/fox:indoor --out runs/small --set iterations=1000,width=300,max_triangles=20000
     etsplat bench nvs --scenes data/tandt/truck data/tandt/train --out runs/tandt --preset paper --culling on
     """
 
-    scenes: tuple[Path, ...]
-    """Folders of the scenes."""
+    scenes: tuple[str, ...]
+    """Folders of the scenes; the kind of a scene, outdoor if it is not given, and changes for it alone come after a
+    colon: FOLDER:indoor, FOLDER:object,background=white."""
     out: Path
     """Folder for the runs, tables and figures; a grid that was interrupted goes on where it was."""
     methods: tuple[Method, ...] = ("elastic", "bilateral", "single-sided")
@@ -35,14 +37,8 @@ class Nvs(Command):
     """Leave out triangles with an inradius below a pixel: the paper's rows were measured with it on."""
     preset: TrainPreset = "quick"
     """Settings of all runs."""
-    scene_type: SceneType = "outdoor"
-    """Kind of the scenes that are not the paper's."""
-    iterations: int | None = None
-    """In place of the preset's."""
-    max_triangles: int | None = None
-    """In place of the preset's."""
-    width: int | None = None
-    """In place of the preset's."""
+    set: str = ""
+    """More changes for all runs, such as iterations=1500,width=400."""
     jobs: int = 1
     """Runs beside each other; they share the cores evenly."""
     lpips_weights: Path | None = None
@@ -59,20 +55,17 @@ class Nvs(Command):
 
         from etsplat.bench.grid import run_grid
         from etsplat.bench.live import PSNR, LiveTable
-        from etsplat.bench.nvs import evaluate_cells, make_nvs_cells
+        from etsplat.bench.nvs import evaluate_cells, make_nvs_cells, read_scene_argument
         from etsplat.cli.phases import PhaseBar
         from etsplat.ops.engines import num_threads
 
-        given = {"iterations": self.iterations, "max_triangles": self.max_triangles, "width": self.width}
-        changes: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
         cells = make_nvs_cells(
-            self.scenes,
+            [read_scene_argument(scene) for scene in self.scenes],
             self.methods,
             self.out,
             preset=self.preset,
             culling={"off": (False,), "on": (True,), "both": (False, True)}[self.culling],
-            changes=changes,
-            scene_type=self.scene_type,
+            setting=self.set,
         )
         console = Console()
         try:
