@@ -3,7 +3,6 @@ import torch
 
 from etsplat.core.cameras import Cameras, intrinsics, look_at
 from etsplat.ops.engines import num_threads, set_num_threads
-from etsplat.ops.normal_consistency import depth_normals, normal_consistency
 from etsplat.ops.triangle_area import mean_area
 from etsplat.optim.soup_objective import SoupWeights, soup_objective
 from etsplat.scene.soup_rendering import SoupAppearance, render_soup
@@ -53,35 +52,6 @@ def test_mean_area_has_the_same_bits_for_any_number_of_threads(rng):
         areas.append(mean_area(vertices))
     set_num_threads(before)
     assert torch.equal(areas[0], areas[1])
-
-
-def test_depth_of_a_plane_has_its_normal():
-    """Everywhere but on the border, and towards the camera."""
-    camera = view()
-    normal = torch.nn.functional.normalize(torch.tensor([0.3, 0.2, 1.0]), dim=0)
-    rows = torch.arange(SIZE) + 0.5
-    K, rotation = camera.Ks[0], camera.viewmats[0, :3, :3]
-    rays = torch.stack(
-        torch.broadcast_tensors((rows - K[0, 2]) / K[0, 0], ((rows - K[1, 2]) / K[1, 1])[:, None], torch.tensor(1.0)),
-        dim=-1,
-    )
-    # The plane through the origin: n . (c + z R^T ray) = 0.
-    depth = -(camera.centers[0] @ normal) / (rays @ rotation @ normal)
-    found = depth_normals(depth[None, ..., None], camera.viewmats, camera.Ks)[0]
-    torch.testing.assert_close(found[1:-1, 1:-1], normal.expand(SIZE - 2, SIZE - 2, 3), rtol=0, atol=1e-3)
-    assert float(found[0].abs().max()) == 0
-
-
-def test_normal_consistency_passes_gradcheck(rng):
-    """Gradients to normals and depth are those of finite differences."""
-    camera = view().to(dtype=torch.float64)
-    camera = Cameras(camera.viewmats, camera.Ks, 5, 4)
-    normals = torch.rand((1, 4, 5, 3), generator=rng, dtype=torch.float64).requires_grad_()
-    depth = (2 + torch.rand((1, 4, 5, 1), generator=rng, dtype=torch.float64)).requires_grad_()
-    alpha = torch.rand((1, 4, 5, 1), generator=rng, dtype=torch.float64)
-    assert torch.autograd.gradcheck(
-        lambda n, d: normal_consistency(n, d, alpha, camera.viewmats, camera.Ks), (normals, depth)
-    )
 
 
 def test_every_term_adds_with_its_weight(rng, engine):

@@ -3,6 +3,7 @@
 #include <atomic>
 #include <stdexcept>
 
+#include "simd/normals_kernels.h"
 #include "simd/photometric_kernels.h"
 #include "simd/raster_kernels.h"
 #include "simd/triangle_kernels.h"
@@ -19,6 +20,7 @@ struct Path {
     RasterKernels raster;
     TriangleKernels triangles;
     PhotometricKernels photometric;
+    NormalsKernels normals;
 };
 
 #if defined(ETSPLAT_X86)
@@ -45,8 +47,10 @@ bool has_avx512() {
 #endif
 #endif
 
-#define ETSPLAT_PATH(name) \
-    Path { #name, name::raster_kernels(), name::triangle_kernels(), name::photometric_kernels() }
+#define ETSPLAT_PATH(name)                                                                                          \
+    Path {                                                                                                          \
+        #name, name::raster_kernels(), name::triangle_kernels(), name::photometric_kernels(), name::normals_kernels() \
+    }
 
 const std::vector<Path>& paths() {
     static const std::vector<Path> all = [] {
@@ -101,5 +105,7 @@ const RasterKernels& active_raster_kernels() { return active().raster; }
 const TriangleKernels& active_triangle_kernels() { return active().triangles; }
 
 const PhotometricKernels& active_photometric_kernels() { return active().photometric; }
+
+const NormalsKernels& active_normals_kernels() { return active().normals; }
 
 }  // namespace etsplat

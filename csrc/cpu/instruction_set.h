@@ -4,6 +4,7 @@
 #include <string>
 #include <vector>
 
+#include "normals_pass.h"
 #include "photometric_pass.h"
 #include "raster_pass.h"
 #include "triangle_pass.h"
@@ -17,5 +18,6 @@ void set_instruction_set(const std::string& name);  // "" for the widest; throws
 const RasterKernels& active_raster_kernels();
 const TriangleKernels& active_triangle_kernels();
 const PhotometricKernels& active_photometric_kernels();
+const NormalsKernels& active_normals_kernels();
 
 }  // namespace etsplat

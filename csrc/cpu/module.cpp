@@ -7,6 +7,7 @@ void bind_array_scans(nb::module_& m);
 void bind_geometry(nb::module_& m);
 void bind_mesh_energies(nb::module_& m);
 void bind_optimizer(nb::module_& m);
+void bind_normals(nb::module_& m);
 void bind_photometric(nb::module_& m);
 void bind_rasterize(nb::module_& m);
 void bind_rasterize_hard(nb::module_& m);
@@ -29,6 +30,7 @@ NB_MODULE(_native, m) {
     bind_geometry(m);
     bind_mesh_energies(m);
     bind_optimizer(m);
+    bind_normals(m);
     bind_photometric(m);
     bind_rasterize(m);
     bind_rasterize_hard(m);

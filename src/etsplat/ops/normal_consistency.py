@@ -6,11 +6,18 @@ over all pixels, with n the blended normals, A the coverage (held constant) and 
 world, differentiated centrally. On the border of one pixel, and where the points do not span a plane, m is 0.
 """
 
+from typing import Any
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
+from etsplat import _native
 from etsplat.core.validation import check_like, check_shape
+from etsplat.ops._normal_consistency_cuda import NormalConsistencyCuda
+from etsplat.ops.engines import resolve_engine
+from etsplat.ops.pool import empty_image
 
 
 def normal_consistency(
@@ -30,13 +37,13 @@ def normal_consistency(
         alpha: (B, H, W, 1) coverage; receives no gradient.
         viewmats: (B, 4, 4) world to camera.
         Ks: (B, 3, 3) intrinsics.
-        engine: "cpu", "reference" or None.
+        engine: "cpu", "cuda", "reference" or None (by dtype and device).
 
     Returns:
-        Scalar; gradients reach normals and depth.
+        Scalar; gradients reach normals and depth. The native engines add in a fixed order: the same bits in every run.
 
     Raises:
-        ValueError: Wrong shape, dtype or device.
+        ValueError: Wrong shape, dtype or device; an empty image.
     """
     image = tuple(normals.shape[:3])
     check_shape("normals", normals, ("B", "H", "W", 3))
@@ -48,6 +55,13 @@ def normal_consistency(
     ):
         check_shape(name, tensor, shape)
         check_like(name, tensor, "normals", normals)
+    if normals.numel() == 0:
+        raise ValueError(f"normals must hold at least one pixel, got shape {tuple(normals.shape)}")
+    chosen = resolve_engine(engine, normals)
+    if chosen != "reference":
+        native = NormalConsistencyCuda if chosen == "cuda" else _NormalConsistency
+        loss: Any = native.apply(normals, depth, alpha.detach(), viewmats.detach(), Ks.detach())
+        return loss
     facing = depth_normals(depth, viewmats, Ks)
     return (1 - (normals * facing * alpha.detach()).sum(dim=-1)).mean()
 
@@ -71,3 +85,28 @@ def depth_normals(
     unit = torch.where(usable, normal / torch.where(usable, square, 1).sqrt(), 0)
     world = torch.einsum("bji,bhwj->bhwi", viewmats[:, :3, :3], unit)
     return torch.nn.functional.pad(world, (0, 0, 1, 1, 1, 1))
+
+
+class _NormalConsistency(torch.autograd.Function):
+    """One pass computes the value and the derivatives, which wait for backward."""
+
+    @staticmethod
+    def forward(ctx: Any, *given: Tensor) -> Tensor:
+        inputs = [tensor.contiguous() for tensor in given]
+        normals, depth = inputs[:2]
+        height, width = normals.shape[1:3]
+        derivatives = [empty_image(*tensor.shape) for tensor in (normals, depth) if any(ctx.needs_input_grad)]
+        total = 0.0
+        for b in range(len(normals)):
+            views = (tensor[b].data_ptr() for tensor in inputs)
+            outputs = [tensor[b].data_ptr() for tensor in derivatives] or [0, 0]
+            total += _native.normal_agreement(*views, height, width, *outputs)
+        ctx.save_for_backward(*derivatives)
+        return normals.new_tensor(1.0 - total / depth.numel())
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad_loss: Tensor) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        by_normals, by_depth = ctx.saved_tensors
+        scale = -float(grad_loss) / by_depth.numel()
+        return by_normals * scale, by_depth * scale, None, None, None
