@@ -15,6 +15,7 @@ void bind_soup_activation(nb::module_& m);
 void bind_soup_colors(nb::module_& m);
 void bind_spherical_harmonics(nb::module_& m);
 void bind_triangle_area(nb::module_& m);
+void bind_triangle_channels(nb::module_& m);
 }  // namespace etsplat
 
 NB_MODULE(_native, m) {
@@ -38,4 +39,5 @@ NB_MODULE(_native, m) {
     bind_soup_colors(m);
     bind_spherical_harmonics(m);
     bind_triangle_area(m);
+    bind_triangle_channels(m);
 }

@@ -8,7 +8,9 @@ import torch
 from torch import Tensor
 
 from etsplat.core.rasterization import Rasterization, RasterizeSettings
-from etsplat.ops._rasterize_reference import barycentrics, perspective_weights, to_screen, unit_normals
+from etsplat.ops._rasterize_reference import barycentrics, perspective_weights, to_screen
+from etsplat.ops.pick_values import pick_values
+from etsplat.ops.triangle_channels import triangle_channels
 
 
 class Channels:
@@ -22,6 +24,7 @@ class Channels:
         self.corner = corner_colors
         self.flat_is_color = colors is not None
         self.colors = colors.shape[-1] if colors is not None else corner_colors.shape[-1]  # type: ignore[union-attr]
+        self.centroid_depth: Tensor | None = None  # (B, N)
         self.flat_names: list[str] = []
         self.corner_names: list[str] = []
 
@@ -38,23 +41,20 @@ class Channels:
         """Flat channels come first in an image, so a normal or a depth may precede interpolated colours."""
         return 0 if self.flat_is_color or self.flat is None else self.flat.shape[-1]
 
-    def add_geometry(self, corners: Tensor, viewmats: Tensor, settings: RasterizeSettings) -> None:
+    def add_geometry(self, corners: Tensor, viewmats: Tensor, settings: RasterizeSettings, engine: str) -> None:
         """Append what the settings ask for of depth and normals, differentiable by ``corners`` and ``viewmats``."""
-        batch = viewmats.shape[0]
-        # A camera that is not finite sees nothing, and must not spoil the gradients of the others.
-        viewmats = torch.where(viewmats.isfinite().all(dim=2).all(dim=1)[:, None, None], viewmats, 0.0)
-        z = torch.einsum("bi,nki->bnk", viewmats[:, 2, :3], corners) + viewmats[:, 2, 3, None, None]
-        flat: list[Tensor] = []
-        if settings.depth == "centroid":
-            flat.append(z.mean(-1, keepdim=True))
-            self.flat_names.append("depth")
-        if settings.normals:
-            flat.append(_facing_normals(corners, viewmats))
-            self.flat_names.append("normal")
-        if flat:
+        batch, centroid = viewmats.shape[0], settings.depth == "centroid"
+        if centroid or settings.normals:
+            geometry = triangle_channels(corners, viewmats, depth=centroid, normals=settings.normals, engine=engine)
+            self.flat_names += ["depth"] * centroid + ["normal"] * settings.normals
+            self.centroid_depth = geometry[..., 0] if centroid else None
             own = [] if self.flat is None else [self.flat if self.flat.dim() == 3 else self.flat.expand(batch, -1, -1)]
-            self.flat = torch.cat(own + flat, dim=-1)
+            self.flat = torch.cat([*own, geometry], dim=-1)
         if settings.depth == "plane":
+            corners = finite(corners)
+            # A camera that is not finite sees nothing, and must not spoil the gradients of the others.
+            viewmats = torch.where(viewmats.isfinite().all(dim=2).all(dim=1)[:, None, None], viewmats, 0.0)
+            z = torch.einsum("bi,nki->bnk", viewmats[:, 2, :3], corners) + viewmats[:, 2, 3, None, None]
             own = [] if self.corner is None else [self.corner.expand(batch, -1, -1, -1)]
             self.corner = torch.cat([*own, z[..., None]], dim=-1)
             self.corner_names.append("depth")
@@ -81,36 +81,38 @@ class Channels:
             result.depth = parts["depth"] / result.alpha.clamp_min(1e-8)
 
 
-def finite_corners(vertices: Tensor, faces: Tensor | None) -> Tensor:
-    """Corner positions (N, 3, 3), differentiable; 0 for triangles that are not finite, which are never drawn."""
-    corners = vertices if faces is None else vertices[faces.long()]
+def corners_of(vertices: Tensor, faces: Tensor | None) -> Tensor:
+    """Corner positions (N, 3, 3), differentiable."""
+    return vertices if faces is None else vertices[faces.long()]
+
+
+def finite(corners: Tensor) -> Tensor:
+    """With 0 for triangles that are not finite, which are never drawn."""
     return torch.where(corners.isfinite().all(dim=2).all(dim=1)[:, None, None], corners, 0.0)
 
 
-def _facing_normals(corners: Tensor, viewmats: Tensor) -> Tensor:
-    """Unit normals (B, N, 3) in world space, turned towards each camera; 0 for a triangle without area."""
-    normal = unit_normals(corners)
-    centers = -torch.einsum("bij,bi->bj", viewmats[:, :3, :3], viewmats[:, :3, 3])
-    towards = corners.mean(1)[None] - centers[:, None]
-    away = (towards * normal).sum(-1, keepdim=True) > 0
-    return torch.where(away, -normal[None], normal[None])
-
-
 def median_depth(
-    triangle: Tensor, corners: Tensor, viewmats: Tensor, Ks: Tensor, settings: RasterizeSettings
+    triangle: Tensor, channels: Channels, corners: Tensor, viewmats: Tensor, Ks: Tensor, engine: str
 ) -> Tensor:
     """Depth (B, H, W, 1) at each pixel of the triangle whose index + 1 is given, 0 where that is 0; differentiable.
 
-    Every pixel is computed, those without a triangle on a stand-in: how many there are is not asked, which on a GPU
-    would mean to wait for it.
+    The depth of the centroid where ``channels`` have it, else that of the triangle's plane at the pixel.
     """
     if len(corners) == 0:
         return torch.zeros((*triangle.shape, 1), device=corners.device)
+    if channels.centroid_depth is not None:
+        return pick_values(channels.centroid_depth, triangle, engine=engine)[..., None]
+    return _plane_depth(triangle, finite(corners), viewmats, Ks)
+
+
+def _plane_depth(triangle: Tensor, corners: Tensor, viewmats: Tensor, Ks: Tensor) -> Tensor:
+    """Every pixel is computed, those without a triangle on a stand-in: how many there are is not asked."""
     stand_in = torch.eye(3, device=corners.device).roll(1, dims=0)
     stand_in[:, 2] = 1.0  # (0, 0, 1), (1, 0, 1), (0, 1, 1), made on the device
     identity = torch.eye(4, device=corners.device)
-    x = torch.arange(settings.width, device=corners.device) + 0.5
-    y = torch.arange(settings.height, device=corners.device) + 0.5
+    height, width = triangle.shape[1:]
+    x = torch.arange(width, device=corners.device) + 0.5
+    y = torch.arange(height, device=corners.device) + 0.5
     pixels = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
     viewmats = torch.where(viewmats.isfinite(), viewmats, 0.0)
     images = []
@@ -118,9 +120,6 @@ def median_depth(
         there = chosen > 0
         picked = corners[(chosen.long() - 1).clamp_min(0)] @ viewmat[:3, :3].T + viewmat[:3, 3]
         screen, z = to_screen(torch.where(there[..., None, None], picked, stand_in), identity, K)
-        if settings.depth == "centroid":
-            depth = z.mean(dim=-1)
-        else:
-            depth = (perspective_weights(barycentrics(pixels, screen), z) * z).sum(dim=-1)
+        depth = (perspective_weights(barycentrics(pixels, screen), z) * z).sum(dim=-1)
         images.append(torch.where(there, depth, 0.0))
     return torch.stack(images)[..., None]

@@ -16,7 +16,7 @@ from etsplat.core.rasterization import (
     RasterizeSettings,
     TriangleStatistics,
 )
-from etsplat.ops._rasterize_channels import Channels, finite_corners, median_depth
+from etsplat.ops._rasterize_channels import Channels, corners_of, median_depth
 from etsplat.ops.pool import empty_image, zeros_like
 
 
@@ -38,7 +38,7 @@ def rasterize_cpu(
         corner_colors = _PerCorner.apply(corner_colors, mesh)
     channels = Channels(colors, corner_colors, faces)
     if settings.depth != "none" or settings.normals:
-        channels.add_geometry(finite_corners(vertices, faces), viewmats, settings)
+        channels.add_geometry(corners_of(vertices, faces), viewmats, settings, "cpu")
     backgrounds = channels.pad_backgrounds(backgrounds)
     plan = _Plan(settings, mesh, channels.flat_per_view)
     color, alpha, distortion, median_triangle = _Rasterize.apply(
@@ -48,7 +48,8 @@ def rasterize_cpu(
     if settings.distortion:
         result.distortion = distortion
     if settings.median_depth:
-        result.median_depth = median_depth(median_triangle, finite_corners(vertices, faces), viewmats, Ks, settings)
+        corners = corners_of(vertices, faces)
+        result.median_depth = median_depth(median_triangle, channels, corners, viewmats, Ks, "cpu")
     channels.split(result)
     return result
 

@@ -10,7 +10,7 @@ from torch.autograd.function import once_differentiable
 from etsplat.core.rasterization import Rasterization, RasterizeSettings
 from etsplat.cuda.launch import on_device_of
 from etsplat.ops._raster_render_cuda import Geometry, Outputs, Plan, Render, channel_count, contiguous
-from etsplat.ops._rasterize_channels import Channels, finite_corners, median_depth
+from etsplat.ops._rasterize_channels import Channels, corners_of, median_depth
 
 MOST_CHANNELS = 16  # of one pass; more are rendered in several
 
@@ -30,7 +30,7 @@ def rasterize_cuda(
     """Render on the GPU; arguments as ``etsplat.rasterize`` has checked them."""
     channels = Channels(colors, corner_colors, faces)
     if settings.depth != "none" or settings.normals:
-        channels.add_geometry(finite_corners(vertices, faces), viewmats, settings)
+        channels.add_geometry(corners_of(vertices, faces), viewmats, settings, "cuda")
     backgrounds = channels.pad_backgrounds(backgrounds)
     geometry = Geometry(vertices, faces)
 
@@ -48,7 +48,8 @@ def rasterize_cuda(
     if settings.distortion:
         result.distortion = distortion
     if settings.median_depth:
-        result.median_depth = median_depth(median_triangle, finite_corners(vertices, faces), viewmats, Ks, settings)
+        corners = corners_of(vertices, faces)
+        result.median_depth = median_depth(median_triangle, channels, corners, viewmats, Ks, "cuda")
     channels.split(result)
     return result
 
