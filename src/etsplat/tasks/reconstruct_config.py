@@ -51,7 +51,7 @@ class ReconstructConfig:
     """Grey of all faces at the start."""
     start_opacity: float = 0.98
     """Opacity of all faces at the start."""
-    start_sigma: float = 0.5
+    start_sigma: float = 0.25
     """Softness at the start; small is sharp."""
 
     views_per_step: int = 1
@@ -73,7 +73,7 @@ class ReconstructConfig:
     """Adam learning rate of colours."""
     lr_opacities: float = 1e-3
     """Adam learning rate of opacities, before their sigmoid."""
-    lr_sigma: float = 1e-3
+    lr_sigma: float = 1e-4
     """Adam learning rate of the logarithm of sigma."""
 
     lambda_edge: float = 1.5
@@ -182,7 +182,7 @@ def _check_range(config: ReconstructConfig, name: str, low: float, high: float =
 
 _PAPER = ReconstructConfig()
 # What measurements support beyond the paper (docs/results.md): closer to the truth, and no face cuts through another.
-_BEST: dict[str, Any] = {"coarse_levels": 2, "coarse_until": 0.3, "gamma_final": 0.03, "untangle_steps": 6}
+_BEST: dict[str, Any] = {"coarse_levels": 2, "coarse_until": 0.15, "gamma_final": 0.03, "untangle_steps": 6}
 # The paper's method at about a fifth of its budget.
 _SHORT = replace(
     _PAPER,
@@ -192,6 +192,7 @@ _SHORT = replace(
     gamma_hold=50,
     max_faces=25_000,
     lr_vertices=1e-2,
+    lr_sigma=3e-4,
     subdivide_steps=10,
     evaluate_every=250,
     checkpoint_every=500,
@@ -223,6 +224,7 @@ PRESETS: dict[str, ReconstructConfig] = {
         iterations=300,
         start_level=2,
         start_opacity=0.9,
+        start_sigma=0.5,
         gamma_hold=20,
         edge_power=2,
         max_faces=2000,
