@@ -14,6 +14,8 @@ from etsplat.ops.rasterize_hard import rasterize_hard, render_opaque
 from etsplat.ops.soup_colors import soup_colors
 from etsplat.ops.spherical_harmonics import spherical_harmonics
 from etsplat.ops.ssim import photometric_loss
+from etsplat.ops.triangle_area import mean_area
+from etsplat.ops.weighted_sum import Term, weighted_sum
 from simt.build import Simt
 
 pytestmark = pytest.mark.sanitize
@@ -59,6 +61,34 @@ def test_l1_is_that_of_the_cpu_engine(cuda_device, rng):
         results.append((loss.detach().cpu(), leaf.grad.cpu()))
     torch.testing.assert_close(results[0][0], results[1][0], rtol=1e-6, atol=0)
     same_bits(results[0][1], results[1][1])
+
+
+def test_mean_area_is_that_of_the_cpu_engine(cuda_device, rng):
+    """Over several blocks of triangles, one without area; values to rounding."""
+    vertices = torch.randn((700, 3, 3), generator=rng)
+    vertices[7] = vertices[7, :1]
+    results = []
+    for engine, device in (("cuda", cuda_device), ("cpu", CPU)):
+        leaf = vertices.to(device, copy=True).requires_grad_()
+        area = mean_area(leaf, engine=engine)
+        (2.5 * area).backward()
+        results.append((area.detach().cpu(), leaf.grad.cpu()))
+    torch.testing.assert_close(results[0], results[1], rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize("scale", [0.3, "tensor"])
+def test_weighted_sum_is_that_of_pytorch(cuda_device, scale):
+    """Value and gradients of all powers, with a scale as a number and in device memory."""
+    results = []
+    for engine, device in (("cuda", cuda_device), ("cpu", CPU)):
+        leaves = [torch.tensor(value, device=device, requires_grad=True) for value in (2.0, 0.7, 1.4, 0.2)]
+        powers = (1, -1, -2)
+        terms = [Term(0.5 + power, leaf, power) for leaf, power in zip(leaves[1:], powers, strict=True)]
+        factor = torch.tensor(0.3, device=device) if scale == "tensor" else scale
+        total = weighted_sum(leaves[0], terms, factor, engine=engine)
+        (3 * total).backward()
+        results.append(torch.stack([total.detach(), *(leaf.grad for leaf in leaves)]).cpu())
+    torch.testing.assert_close(results[0], results[1], rtol=1e-6, atol=0)
 
 
 @pytest.mark.parametrize(

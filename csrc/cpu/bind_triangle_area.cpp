@@ -1,9 +1,8 @@
 // Mean area of separate triangles with its gradient. Ranges have places of their own; their sums are added in order.
-#include <cmath>
 #include <vector>
 
 #include "bindings.h"
-#include "math/vector3.h"
+#include "math/triangle_area.h"
 #include "parallel.h"
 
 namespace etsplat {
@@ -12,17 +11,6 @@ namespace {
 using Vector = Vector3<float>;
 
 constexpr int64_t kRange = 2048;
-
-// Area of (a, b, c) and its gradient: with n the unit normal, dA/da = n x (c - b) / 2, and so on around.
-float area_with_gradient(const Vector* corner, float scale, Vector* gradient) {
-    const Vector a = corner[0], b = corner[1], c = corner[2];
-    float doubled;
-    const Vector n = direction(cross(b - a, c - a), doubled);
-    gradient[0] = 0.5f * scale * cross(n, c - b);
-    gradient[1] = 0.5f * scale * cross(n, a - c);
-    gradient[2] = 0.5f * scale * cross(n, b - a);
-    return 0.5f * doubled;
-}
 
 }  // namespace
 

@@ -1,5 +1,6 @@
 """The mean area of separate triangles, for the size loss of novel-view synthesis."""
 
+import ctypes
 from typing import Any
 
 import torch
@@ -8,8 +9,13 @@ from torch import Tensor
 
 from etsplat import _native
 from etsplat.core.validation import check_shape
+from etsplat.cuda.launch import blocks, launch
+from etsplat.cuda.program import Program
 from etsplat.ops.engines import resolve_engine
 from etsplat.ops.pool import empty_image
+
+_PROGRAM = Program("triangle_area.cu", contract=False)
+_THREADS = 256
 
 
 def mean_area(vertices: Float[Tensor, "N 3 3"], *, engine: str | None = None) -> Float[Tensor, ""]:
@@ -17,10 +23,10 @@ def mean_area(vertices: Float[Tensor, "N 3 3"], *, engine: str | None = None) ->
 
     Args:
         vertices: (N, 3, 3), N > 0. A triangle without area gets no gradient.
-        engine: "cpu", "reference" or None (by dtype and device).
+        engine: "cpu", "cuda", "reference" or None (by dtype and device).
 
     Returns:
-        Scalar. The native engine adds in a fixed order: the same bits for any number of threads.
+        Scalar. The native engines add in a fixed order: the same bits in every run.
 
     Raises:
         ValueError: Wrong shape, dtype or device; no triangle.
@@ -28,8 +34,10 @@ def mean_area(vertices: Float[Tensor, "N 3 3"], *, engine: str | None = None) ->
     check_shape("vertices", vertices, ("N", 3, 3))
     if len(vertices) == 0:
         raise ValueError("vertices must hold at least one triangle, got 0")
-    if resolve_engine(engine, vertices) == "cpu":
-        area: Any = _MeanArea.apply(vertices)
+    chosen = resolve_engine(engine, vertices)
+    if chosen != "reference":
+        native = _MeanAreaOnDevice if chosen == "cuda" else _MeanArea
+        area: Any = native.apply(vertices)
         return area
     first, second = vertices[:, 1] - vertices[:, 0], vertices[:, 2] - vertices[:, 0]
     return 0.5 * torch.linalg.cross(first, second).norm(dim=1).mean()
@@ -51,3 +59,25 @@ class _MeanArea(torch.autograd.Function):
     def backward(ctx: Any, grad_area: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
         (gradient,) = ctx.saved_tensors
         return gradient * grad_area
+
+
+class _MeanAreaOnDevice(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, vertices: Tensor) -> Tensor:
+        vertices = vertices.contiguous()
+        grid = blocks(len(vertices), _THREADS)
+        sums, mean = vertices.new_empty(grid, dtype=torch.float64), vertices.new_empty(())
+        launch(_PROGRAM, "area_sums", grid, _THREADS, (vertices, len(vertices), sums))
+        launch(_PROGRAM, "area_mean", 1, _THREADS, (sums, ctypes.c_int64(grid), len(vertices), mean))
+        ctx.save_for_backward(vertices)
+        return mean
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, grad_area: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """``grad_area`` stays in device memory."""
+        (vertices,) = ctx.saved_tensors
+        gradient = torch.empty_like(vertices)
+        arguments = (vertices, len(vertices), grad_area, gradient)
+        launch(_PROGRAM, "area_backward", blocks(len(vertices), _THREADS), _THREADS, arguments)
+        return gradient

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from etsplat.ops.mesh_energies import mesh_energies
 from etsplat.ops.photometric import l1_over_background
+from etsplat.ops.weighted_sum import Term, weighted_sum
 from etsplat.scene.triangle_mesh import TriangleMesh
 
 
@@ -60,9 +61,11 @@ def mesh_objective(
     if not isinstance(gamma, Tensor) and gamma == 0.0:
         return photometric
     energies = mesh_energies(mesh.vertices, mesh.topology.connectivity, edge_power=weights.edge_power, engine=engine)
-    regularization = (
-        weights.edge * energies.edge + weights.normal * energies.normal + weights.laplacian * energies.laplacian
-    )
+    terms = [
+        Term(weights.edge, energies.edge),
+        Term(weights.normal, energies.normal),
+        Term(weights.laplacian, energies.laplacian),
+    ]
     if mesh.log_sigma is not None:
-        regularization = regularization + weights.softness * mesh.sigma.pow(-2)
-    return photometric + gamma * regularization
+        terms.append(Term(weights.softness, mesh.sigma, -2))
+    return weighted_sum(photometric, terms, gamma, engine=engine)

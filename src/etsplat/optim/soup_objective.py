@@ -11,6 +11,7 @@ from etsplat.core.rasterization import Rasterization
 from etsplat.ops.normal_consistency import normal_consistency
 from etsplat.ops.ssim import photometric_loss
 from etsplat.ops.triangle_area import mean_area
+from etsplat.ops.weighted_sum import Term, weighted_sum
 
 
 @dataclass(frozen=True)
@@ -65,13 +66,14 @@ def soup_objective(
     Returns:
         Scalar, differentiable with respect to the rendering, the vertices and the opacities.
     """
-    loss = photometric_loss(
+    photometric = photometric_loss(
         rendering.color, target, weights.dssim, mask, backgrounds=background, pixel=weights.pixel, engine=engine
     )
+    terms = []
     if weights.opacity > 0:
-        loss = loss + weights.opacity * opacities.mean()
+        terms.append(Term(weights.opacity, opacities.mean()))
     if weights.size > 0:
-        loss = loss + weights.size / mean_area(vertices, engine=engine)
+        terms.append(Term(weights.size, mean_area(vertices, engine=engine), -1))
     if weights.normal > 0:
         assert rendering.normal is not None
         assert rendering.median_depth is not None
@@ -83,8 +85,8 @@ def soup_objective(
             camera.Ks,
             engine=engine,
         )
-        loss = loss + weights.normal * disagreement
+        terms.append(Term(weights.normal, disagreement))
     if weights.distortion > 0:
         assert rendering.distortion is not None
-        loss = loss + weights.distortion * rendering.distortion.mean()
-    return loss
+        terms.append(Term(weights.distortion, rendering.distortion.mean()))
+    return weighted_sum(photometric, terms, engine=engine)
