@@ -10,7 +10,7 @@ from etsplat.bench.grid import run_grid
 from etsplat.bench.nvs import Scene, evaluate_cells, make_nvs_cells, read_scene_argument
 from etsplat.bench.nvs_figures import draw_nvs
 from etsplat.bench.nvs_tables import nvs_tables, write_nvs_tables
-from etsplat.bench.paper_nvs import SCENES
+from etsplat.bench.paper_nvs import NVS, PER_SCENE, SCENES
 from etsplat.core.errors import InputError
 
 
@@ -62,6 +62,18 @@ def test_the_papers_row_stands_beside_a_complete_data_set_only():
     assert len(nvs_tables(rows[:1])[0].rows) == 1
 
 
+def test_per_scene_tables_have_the_papers_numbers_for_scenes_that_it_has():
+    """They average to the paper's own table of data sets, within what it rounds."""
+    rows = [row("truck", "elastic culling", 24.0), row("fox", "elastic culling", 25.0)]
+    table = next(table for table in nvs_tables(rows) if table.name == "per-scene PSNR")
+    assert table.rows == [("elastic culling", [24.0, 25.0]), ("elastic culling (paper)", [24.68, None])]
+    for (method, dataset), printed in NVS.items():
+        scenes = [values for name, values in PER_SCENE[method].items() if SCENES[name].dataset == dataset]
+        for index, value in enumerate(printed):
+            mean = sum(scene[index] for scene in scenes) / len(scenes)
+            assert mean == pytest.approx(value, abs=0.016 if index == 0 else 0.006)
+
+
 def test_table_filter_shows_the_difference():
     rows = [row("a", "elastic", 21.5), row("a", "elastic culling", 21.0)]
     table = next(table for table in nvs_tables(rows) if table.name == "filter")
@@ -103,5 +115,5 @@ def test_a_scene_says_its_kind_and_its_changes_after_a_colon(tmp_path):
     settings = cell.config
     assert (settings.scene_type, settings.width, settings.iterations) == ("indoor", 90, 8)
     assert settings.background == "white"
-    with pytest.raises(InputError, match="indoors: no such folder; .*one of outdoor, indoor, object"):
+    with pytest.raises(InputError, match=r"indoors: no such folder; .*one of outdoor, indoor, object"):
         read_scene_argument(f"{tmp_path}/a:b:indoors")

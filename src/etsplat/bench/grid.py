@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from etsplat.bench.peers import PeerConfig
 from etsplat.bench.variants import Variant
 from etsplat.core.errors import InputError
 from etsplat.io.run_directory import RunDirectory, is_run
@@ -23,6 +24,9 @@ from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.train_config import TrainConfig
 
 _POLL_SECONDS = 0.5
+
+AnyConfig = ReconstructConfig | TrainConfig | PeerConfig
+"""Settings of a run; what kind of run it is follows from them."""
 
 
 @dataclass
@@ -43,7 +47,7 @@ class Cell:
     object: str
     mesh: Path
     variant: str
-    config: ReconstructConfig | TrainConfig
+    config: AnyConfig
     folder: Path
     state: str = "waiting"
     error: str = ""
@@ -130,8 +134,9 @@ def _conclude(cell: Cell) -> None:
     cell.error = path.read_text(encoding="utf-8") if path.exists() else f"ended with status {cell._process.exitcode}"
 
 
-def _work(mesh: Path, folder: Path, config: ReconstructConfig | TrainConfig, images: str | None, threads: int) -> None:
+def _work(mesh: Path, folder: Path, config: AnyConfig, images: str | None, threads: int) -> None:
     """One run, in a process of its own."""
+    from etsplat.bench.train_peer import train_peer
     from etsplat.ops.engines import set_num_threads
     from etsplat.tasks.reconstruct import reconstruct
     from etsplat.tasks.train import train
@@ -139,7 +144,9 @@ def _work(mesh: Path, folder: Path, config: ReconstructConfig | TrainConfig, ima
     os.setpgrp()  # Ctrl-C in a terminal reaches the parent alone, which passes it on once: twice would kill
     set_num_threads(threads)
     try:
-        if isinstance(config, TrainConfig):
+        if isinstance(config, PeerConfig):
+            train_peer(mesh, folder, config, images=images)
+        elif isinstance(config, TrainConfig):
             train(mesh, folder, config, images=images, resume=is_run(folder))
         else:
             reconstruct(mesh, folder, config, resume=is_run(folder))

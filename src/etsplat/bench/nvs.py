@@ -5,8 +5,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from etsplat.bench.grid import Cell, is_finished
+from etsplat.bench.grid import AnyConfig, Cell, is_finished
 from etsplat.bench.paper_nvs import SCENES
+from etsplat.bench.peers import PEERS, Peer, PeerConfig, load_gsplat
 from etsplat.bench.variants import changes_of
 from etsplat.core.errors import InputError
 from etsplat.io.run_directory import RunDirectory
@@ -78,30 +79,36 @@ def make_nvs_cells(
 
     Args:
         scenes: what is trained on.
-        methods: as `TrainConfig.method`.
+        methods: as `TrainConfig.method`; or 3dgs and 2dgs, which have nothing to cull.
         out: folder; runs are in OUT/runs/SCENE/VARIANT.
         preset: of all runs.
         culling: whether small triangles are culled; one or both.
         setting: changes for all runs, such as "iterations=1000,width=400".
 
     Raises:
-        InputError: two scenes have the same name, or a change is none.
+        InputError: two scenes have the same name, a change is none, or peers are asked for and cannot run here.
     """
     names = [scene.name for scene in scenes]
     for name in names:
         if names.count(name) > 1:
             raise InputError(f"scenes: two are named {name}; rename a folder")
+    peers: list[Peer] = [peer for peer in PEERS if peer in methods]
+    if peers:
+        load_gsplat()
     cells = []
     for scene, name in zip(scenes, names, strict=True):
         base, images = _settings(scene, preset)
-        changes = {**changes_of(base, setting), **changes_of(base, scene.setting)}
-        for culled in culling:
-            for method in methods:
-                variant = f"{method} {CULLED}" if culled else method
-                config = replace(base, **{"method": method, "cull_small": culled, **changes})
-                cell = Cell(name, scene.folder, variant, config, out / "runs" / name / variant, images=images)
-                cell.state = "done" if is_finished(cell) else "waiting"
-                cells.append(cell)
+        base = replace(base, **{**changes_of(base, setting), **changes_of(base, scene.setting)})
+        variants: dict[str, AnyConfig] = {
+            f"{method} {CULLED}" if culled else method: replace(base, method=method, cull_small=culled)
+            for culled in culling
+            for method in methods
+            if method not in PEERS
+        }
+        for variant, config in {**variants, **{str(peer): _peer(peer, base) for peer in peers}}.items():
+            cell = Cell(name, scene.folder, variant, config, out / "runs" / name / variant, images=images)
+            cell.state = "done" if is_finished(cell) else "waiting"
+            cells.append(cell)
     return cells
 
 
@@ -112,6 +119,7 @@ def evaluate_cells(
 
     Speed is measured here, with nothing else running, and not while the grid runs.
     """
+    from etsplat.bench.train_peer import evaluate_peer
     from etsplat.tasks.evaluate_soup import evaluate_run
     from etsplat.tasks.soup_run import open_run
 
@@ -119,7 +127,11 @@ def evaluate_cells(
     for index, cell in enumerate(done):
         run = RunDirectory(cell.folder)
         if not run.evaluation_path.is_file():
-            run.write_evaluation(evaluate_run(open_run(cell.folder), lpips_weights=lpips_weights))
+            if isinstance(cell.config, PeerConfig):
+                found = evaluate_peer(cell.folder, cell.config, lpips_weights)
+            else:
+                found = evaluate_run(open_run(cell.folder), lpips_weights=lpips_weights)
+            run.write_evaluation(found)
         progress(index + 1, len(done))
         metrics, evaluation = run.read_metrics(), run.read_evaluation()
         rows.append(
@@ -143,3 +155,9 @@ def _settings(scene: Scene, preset: str) -> tuple[TrainConfig, str | None]:
         return train_settings(preset, scene.scene_type or "outdoor"), None
     config = replace(train_settings(preset, known.scene_type), max_triangles=known.max_triangles)
     return config, known.images if (scene.folder / known.images).is_dir() else None
+
+
+def _peer(peer: Peer, base: TrainConfig) -> PeerConfig:
+    """The peer at the iterations and image size of our runs."""
+    white = base.background == "white"
+    return PeerConfig(peer, base.iterations, base.schedule_length, base.width, "white" if white else "black", base.seed)

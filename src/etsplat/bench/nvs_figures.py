@@ -20,7 +20,7 @@ def draw_nvs(cells: Sequence[Cell], variants: Sequence[str], path: Path, *, kind
         cells: those that are done are shown.
         variants: columns, in order.
         path: of the PNG.
-        kind: "render" for figure nvs, "opaque" for figure trisoup.
+        kind: "render" for figure nvs, "opaque" for figure trisoup, which peers have no picture of.
     """
     rows = []
     for scene in dict.fromkeys(cell.object for cell in cells if cell.state == "done"):
@@ -29,7 +29,8 @@ def draw_nvs(cells: Sequence[Cell], variants: Sequence[str], path: Path, *, kind
         if truths:
             truth = truths[len(truths) // 2]
             name = truth.name.replace("_truth", f"_{kind}")
-            rows.append([truth, *(done[v].folder / "test" / name if v in done else None for v in variants)])
+            files = [done[variant].folder / "test" / name if variant in done else None for variant in variants]
+            rows.append([truth, *(file if file is not None and file.is_file() else None for file in files)])
     if not rows:
         return
     tiles = [[None if file is None else _tile(file) for file in row] for row in rows]

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from etsplat.bench.nvs import CULLED
-from etsplat.bench.paper_nvs import NVS, SCENES
+from etsplat.bench.paper_nvs import NVS, PER_SCENE, SCENES
 from etsplat.bench.writing import bold, csv_text, latex_tabular, origin_of, versions_of, write_text
 
 
@@ -77,14 +77,17 @@ def nvs_tables(rows: Sequence[dict[str, Any]]) -> list[Table]:
         return statistics.fmean(present) if present and len(present) == len(values) else None
 
     tables = [_overall(variants, scenes, mean)]
-    for title, key, form, best in _QUALITY:
+    everything = list(dict.fromkeys(row["scene"] for row in rows))
+    for index, (title, key, form, best) in enumerate(_QUALITY):
         if any(row[key] is not None for row in rows):
-            everything = list(dict.fromkeys(row["scene"] for row in rows))
-            body = [(variant, [mean(variant, key, [scene]) for scene in everything]) for variant in variants]
+            body = []
+            for variant in variants:
+                body.append((variant, [mean(variant, key, [scene]) for scene in everything]))
+                body += _printed_per_scene(variant, everything, index)
             tables.append(Table(f"per-scene {title}", "", [(scene, form, best) for scene in everything], body))
     if any(variant.endswith(CULLED) for variant in variants) and not all(v.endswith(CULLED) for v in variants):
         tables.append(_filter(variants, scenes, mean))
-    columns = [("minutes", ".1f", -1), ("triangles", ",.0f", 0), ("frames/s", ".1f", 1), ("ms per million", ".1f", -1)]
+    columns = [("minutes", ".1f", -1), ("primitives", ",.0f", 0), ("frames/s", ".1f", 1), ("ms per million", ".1f", -1)]
     keys = ("minutes", "triangles", "fps", "ms_per_million")
     body = [(variant, [mean(variant, key, scenes) for key in keys]) for variant in variants]
     tables.append(Table("efficiency", "Colour only, test views one after the other.", columns, body))
@@ -114,6 +117,13 @@ def _printed(variant: str, scenes: Sequence[str]) -> tuple[float, float, float] 
         if set(scenes) == {name for name, scene in SCENES.items() if scene.dataset == dataset}:
             return NVS.get((method, dataset))
     return None
+
+
+def _printed_per_scene(variant: str, scenes: Sequence[str], index: int) -> list[tuple[str, list[float | None]]]:
+    """The paper's row of a per-scene table, if the paper has any of the scenes; `index` is that of the metric."""
+    printed = PER_SCENE.get(variant.removesuffix(f" {CULLED}"), {})
+    values = [printed[scene][index] if scene in printed else None for scene in scenes]
+    return [] if all(value is None for value in values) else [(f"{variant} (paper)", values)]
 
 
 def _filter(variants: Sequence[str], scenes: Sequence[str], mean: _Mean) -> Table:

@@ -8,6 +8,7 @@ from typing import Any, ClassVar, Literal
 
 import tyro
 
+from etsplat.bench.peers import Peer
 from etsplat.cli.command import FAILED, INTERRUPTED, Command, fail
 from etsplat.tasks.train_config import Method, TrainPreset
 
@@ -24,6 +25,7 @@ class Nvs(Command):
     etsplat bench nvs --scenes scenes/fox:indoor --out runs/filter --methods elastic --culling both
     etsplat bench nvs --scenes scenes/fox:indoor --out runs/small --set iterations=1000,width=300,max_triangles=20000
     etsplat bench nvs --scenes data/tandt/truck data/tandt/train --out runs/tandt --preset paper --culling on
+    etsplat bench nvs --scenes scenes/kitchen --out runs/peers --methods elastic 3dgs 2dgs
     """
 
     scenes: tuple[str, ...]
@@ -31,8 +33,8 @@ class Nvs(Command):
     colon: FOLDER:indoor, FOLDER:object,background=white."""
     out: Path
     """Folder for the runs, tables and figures; a grid that was interrupted goes on where it was."""
-    methods: tuple[Method, ...] = ("elastic", "bilateral", "single-sided")
-    """Which kernels."""
+    methods: tuple[Method | Peer, ...] = ("elastic", "bilateral", "single-sided")
+    """Which kernels; 3dgs and 2dgs are Gaussian peers, which need gsplat (pip install 'etsplat[peers]') and a GPU."""
     culling: Literal["off", "on", "both"] = "off"
     """Leave out triangles with an inradius below a pixel: the paper's rows were measured with it on."""
     preset: TrainPreset = "quick"

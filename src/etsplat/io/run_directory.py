@@ -39,6 +39,8 @@ mesh.ply        the result with exact face colours
 mesh.obj        the same with vertex colours (also mesh.glb, which most viewers open)""",
     "train": """\
 soup.safetensors  the result: triangles with opacity, softness and view-dependent colour; etsplat export converts it""",
+    "peer": """\
+gaussians.safetensors  the result: Gaussians as gsplat has them, where the cameras are centred and their extent is 1""",
 }
 
 _TEST = {
@@ -46,6 +48,8 @@ _TEST = {
 test/           held-out views: NNN_render.png (splatted), NNN_truth.png, NNN_mesh.png (the mesh drawn opaque)""",
     "train": """\
 test/           held-out views: NNN_render.png (splatted), NNN_truth.png, NNN_opaque.png (drawn opaque)""",
+    "peer": """\
+test/           held-out views: NNN_render.png, NNN_truth.png""",
 }
 
 _FILES = (
@@ -53,6 +57,7 @@ _FILES = (
     "mesh.obj",
     "mesh.glb",
     "soup.safetensors",
+    "gaussians.safetensors",
     "metrics.json",
     "evaluation.json",
     "history.jsonl",
@@ -147,7 +152,7 @@ class RunDirectory:
 
         Args:
             path: as in `check_free`.
-            config: what config.json holds, JSON-serialisable, with the key "task": "reconstruct" or "train".
+            config: what config.json holds, JSON-serialisable, with the key "task": "reconstruct", "train" or "peer".
             overwrite: whether an earlier run may be replaced. Only files that a run writes are removed.
 
         Raises:

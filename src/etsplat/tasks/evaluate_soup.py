@@ -2,8 +2,7 @@
 
 import statistics
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,12 +10,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from etsplat.core.cameras import Cameras
 from etsplat.core.errors import InputError
 from etsplat.io.atomic import write_error
 from etsplat.io.images import save_image, to_8_bit
 from etsplat.metrics.image import Lpips, find_lpips_weights, psnr, ssim
 from etsplat.ops.engines import num_threads, resolve_device, resolve_engine
-from etsplat.scene.captures import Capture
 from etsplat.scene.soup_rendering import render_soup
 from etsplat.tasks.running import device_name
 from etsplat.tasks.soup_run import SoupRun
@@ -29,22 +28,13 @@ _SMALLEST = 16
 """Pixels a side below which LPIPS is not defined."""
 
 
-@dataclass(frozen=True)
-class _Pair:
-    """A test view: name, photograph and the same view of the soup, splatted and opaque; masked pixels agree."""
-
-    name: str
-    photo: Float[Tensor, "H W 3"]
-    soft: Float[Tensor, "H W 3"]
-    opaque: Float[Tensor, "H W 3"]
-
-
 def evaluate_run(
     run: SoupRun,
     *,
     lpips_weights: Path | str | None = None,
     pictures: Path | None = None,
     progress: Callable[[int, int], None] | None = None,
+    device: str | None = None,
 ) -> dict[str, Any]:
     """Measure a soup on the test views of its capture.
 
@@ -53,94 +43,107 @@ def evaluate_run(
         lpips_weights: as `etsplat.metrics.image.find_lpips_weights` takes it.
         pictures: folder for NAME.png of every test view: photograph, soup, opaque triangles, and the error times 4.
         progress: called with (views done, views in all).
+        device: "cpu", "cuda", or None for cuda where there is a GPU.
 
     Returns:
         Means over the test views by name: psnr and psnr_8bit (of renders rounded to 8 bits, as published numbers are),
         ssim (zero-padded), ssim_interior, lpips (inputs scaled to [-1, 1]) and lpips_3dgs (not scaled), each also with
         `_opaque` for the opaque triangles; `views`, the same for each; fps, ms_per_frame, ms_per_million and their
-        circumstances. On a GPU where there is one. null where something could not be measured, `lpips_reason` says why.
+        circumstances. null where something could not be measured, `lpips_reason` says why.
 
     Raises:
+        EngineUnavailableError: `device` asks for a GPU, and something is missing.
         InputError: no capture, no test views, weights that cannot be read, `pictures` cannot be written to.
     """
     capture = run.needed_capture()
     if not capture.test:
         raise InputError(f"{run.path}: the capture has no test views; there is nothing to measure")
-    weights = find_lpips_weights(lpips_weights)
-    lpips = Lpips.from_weights(*weights.paths) if weights.paths else None
     if pictures is not None:
         try:
             pictures.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise write_error(pictures, error) from error
-    device = resolve_device(None, None)
-    run = replace(run, file=replace(run.file, soup=run.file.soup.to(device)))
-    if lpips is not None:
-        lpips.to(device)
-    scorer = SoupScorer(capture, torch.tensor(run.file.background), None, device)
+    place = resolve_device(device, None)
+    lpips, reason = load_lpips(lpips_weights, place)
+    soup, appearance = run.file.soup.to(place), run.file.appearance
+    background = torch.tensor(run.file.background)
+    scorer = SoupScorer(capture, background, None, place)
     rows: list[dict[str, Any]] = []
     for index, view in enumerate(capture.test):
-        pair = _pair(run, scorer, capture.names[view], view)
-        soft, opaque = _scores(pair.soft, pair, lpips, ""), _scores(pair.opaque, pair, lpips, "_opaque")
-        rows.append({"name": pair.name, **soft, **opaque})
+        photo = scorer.photo(view)
+        soft = scorer.masked(scorer.splatted(soup, appearance, view), photo, view)
+        opaque = scorer.masked(scorer.opaque(soup, appearance, view), photo, view)
+        name = capture.names[view]
+        rows.append({"name": name, **image_scores(soft, photo, lpips), **image_scores(opaque, photo, lpips, "_opaque")})
         if pictures is not None:
-            error = (4 * (pair.soft - pair.photo).abs()).clamp(0, 1)
-            save_image(pictures / f"{pair.name}.png", torch.cat([pair.photo, pair.soft, pair.opaque, error], dim=1))
+            error = (4 * (soft - photo).abs()).clamp(0, 1)
+            save_image(pictures / f"{name}.png", torch.cat([photo, soft, opaque, error], dim=1))
         if progress is not None:
             progress(index + 1, len(capture.test))
-    names = [name for name in rows[0] if name != "name"]
-    means = {name: _mean([row[name] for row in rows]) for name in names}
-    return {**means, "lpips_reason": weights.reason, **_speed(run, capture), "views": rows}
+
+    def draw(camera: Cameras) -> None:
+        render_soup(soup, camera, appearance, backgrounds=background[None].to(place))
+
+    cameras = [capture.cameras[view] for view in capture.test]
+    speed = {**drawing_speed(draw, cameras, place, len(soup)), "engine": resolve_engine(None, soup.vertices)}
+    return {**mean_scores(rows), "lpips_reason": reason, **speed, "triangles": len(soup), "views": rows}
 
 
-def _pair(run: SoupRun, scorer: SoupScorer, name: str, view: int) -> _Pair:
-    soup, appearance = run.file.soup, run.file.appearance
-    photo = scorer.photo(view)
-    soft = scorer.masked(scorer.splatted(soup, appearance, view), photo, view)
-    opaque = scorer.masked(scorer.opaque(soup, appearance, view), photo, view)
-    return _Pair(name, photo, soft, opaque)
+def load_lpips(weights: Path | str | None, device: torch.device) -> tuple[Lpips | None, str | None]:
+    """The metric, or why it cannot be measured; `weights` as `etsplat.metrics.image.find_lpips_weights` takes it."""
+    found = find_lpips_weights(weights)
+    if not found.paths:
+        return None, found.reason
+    lpips = Lpips.from_weights(*found.paths)
+    lpips.to(device)
+    return lpips, found.reason
 
 
-def _scores(image: Float[Tensor, "H W 3"], pair: _Pair, lpips: Lpips | None, suffix: str) -> dict[str, float | None]:
+def image_scores(
+    image: Float[Tensor, "H W 3"], photo: Float[Tensor, "H W 3"], lpips: Lpips | None, suffix: str = ""
+) -> dict[str, float | None]:
+    """Every image metric of one view by name, with a suffix; None where it is not defined or not at hand."""
     smallest = min(image.shape[:2])
     measured = lpips if smallest >= _SMALLEST else None
     scores: dict[str, float | None] = {
-        "psnr": psnr(image, pair.photo),
-        "psnr_8bit": psnr(to_8_bit(image).float() / 255, to_8_bit(pair.photo).float() / 255),
-        "ssim": ssim(image, pair.photo),
-        "ssim_interior": ssim(image, pair.photo, interior=True) if smallest >= 11 else None,
-        "lpips": None if measured is None else float(measured(image, pair.photo)),
-        "lpips_3dgs": None if measured is None else float(measured(image, pair.photo, rescale=False)),
+        "psnr": psnr(image, photo),
+        "psnr_8bit": psnr(to_8_bit(image).float() / 255, to_8_bit(photo).float() / 255),
+        "ssim": ssim(image, photo),
+        "ssim_interior": ssim(image, photo, interior=True) if smallest >= 11 else None,
+        "lpips": None if measured is None else float(measured(image, photo)),
+        "lpips_3dgs": None if measured is None else float(measured(image, photo, rescale=False)),
     }
     return {f"{name}{suffix}": value for name, value in scores.items()}
 
 
+def mean_scores(rows: Sequence[dict[str, Any]]) -> dict[str, float | None]:
+    """Means over views, of what was measured in all of them."""
+    return {name: _mean([row[name] for row in rows]) for name in rows[0] if name != "name"}
+
+
 @torch.no_grad()
-def _speed(run: SoupRun, capture: Capture) -> dict[str, Any]:
-    """Pictures of the test views one after the other, colour only; the mean over views of each one's best time."""
-    cameras = [capture.cameras[view] for view in capture.test]
-    device = run.file.soup.vertices.device
-    background = torch.tensor(run.file.background, device=device)[None]
+def drawing_speed(
+    draw: Callable[[Cameras], object], cameras: Sequence[Cameras], device: torch.device, primitives: int
+) -> dict[str, Any]:
+    """Pictures one after the other, colour only; the mean over cameras of each one's best time."""
     best = []
     for camera in (camera.to(device) for camera in cameras):
         times = []
         for repeat in range(REPEATS + 1):
             start = time.perf_counter()
-            render_soup(run.file.soup, camera, run.file.appearance, backgrounds=background)
+            draw(camera)
             if device.type == "cuda":
                 torch.cuda.synchronize(device)
             if repeat:
                 times.append(time.perf_counter() - start)
         best.append(min(times))
-    seconds, triangles = statistics.fmean(best), len(run.file.soup)
+    seconds = statistics.fmean(best)
     return {
         "fps": 1 / seconds,
         "ms_per_frame": 1e3 * seconds,
-        "ms_per_million": 1e3 * seconds / (triangles / 1e6),
-        "triangles": triangles,
+        "ms_per_million": 1e3 * seconds / (primitives / 1e6),
         "width": cameras[0].width,
         "height": cameras[0].height,
-        "engine": resolve_engine(None, run.file.soup.vertices),
         "device": device_name(device),
         "threads": num_threads(),
     }

@@ -1,0 +1,81 @@
+"""Settings of the Gaussian peers that `etsplat bench nvs` runs beside our methods. Imports no torch."""
+
+import importlib
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal, get_args
+
+from etsplat.core.errors import InputError
+
+if TYPE_CHECKING:
+    import torch
+
+Peer = Literal["3dgs", "2dgs"]
+PEERS: tuple[Peer, ...] = get_args(Peer)
+
+
+@dataclass(frozen=True)
+class PeerConfig:
+    """3D Gaussian splatting (Kerbl et al. 2023) or 2D Gaussian splatting (Huang et al. 2024), in gsplat.
+
+    Learning rates, losses and densification are those of their papers, lengths relative to the scene's extent. What
+    happens at an iteration is given for `schedule_length` iterations and scales, as with our methods.
+    """
+
+    method: Peer
+    """Which."""
+    iterations: int = 30_000
+    """Optimization steps; each sees one view."""
+    schedule_length: int = 30_000
+    """What the iterations below refer to."""
+    width: int | None = None
+    """As in `TrainConfig`."""
+    background: Literal["black", "white"] = "black"
+    """Behind the scene."""
+    seed: int = 0
+    """Of the start and the order of the views."""
+    start_points: int = 100_000
+    """So many random Gaussians where the capture has no points."""
+
+    start_opacity: float = 0.1
+    sh_degree: int = 3
+    sh_every: int = 1000
+    """Iterations between steps of the degree, from 0."""
+    lr_means: float = 1.6e-4
+    lr_means_final: float = 0.01
+    lr_scales: float = 5e-3
+    lr_quats: float = 1e-3
+    lr_opacities: float = 5e-2
+    lr_sh_dc: float = 2.5e-3
+    lr_sh_rest: float = 1.25e-4
+    lambda_dssim: float = 0.2
+    lambda_normal: float = 0.05
+    """2dgs: weight of the angle between normals and those of the depth image."""
+    normals_from: int = 7000
+    """Where that begins."""
+    near_plane: float = 0.01
+
+    densify_from: int = 500
+    densify_until: int = 15_000
+    densify_every: int = 100
+    reset_every: int = 3000
+
+    def at(self, step: int) -> int:
+        """The iteration of this run that an iteration of the schedule falls on; at least 1."""
+        return max(1, round(step * self.iterations / self.schedule_length))
+
+
+def load_gsplat() -> "tuple[Any, torch.device]":
+    """The module gsplat, and the device that it computes on.
+
+    Raises:
+        InputError: it is not installed, or there is no GPU, without which it computes nothing.
+    """
+    try:
+        gsplat = importlib.import_module("gsplat")
+    except ImportError as error:
+        raise InputError("methods 3dgs and 2dgs need gsplat: pip install 'etsplat[peers]'") from error
+    import torch
+
+    if not torch.cuda.is_available():
+        raise InputError("methods 3dgs and 2dgs need an NVIDIA GPU, which gsplat computes on; leave them out")
+    return gsplat, torch.device("cuda")

@@ -1,0 +1,223 @@
+"""3DGS and 2DGS with gsplat on the same photos, split, iterations and metrics as our methods.
+
+gsplat draws and its DefaultStrategy densifies, both through its public functions (as of 1.5.3); the start, the order of
+views, the loss and all metrics are ours. Needs an NVIDIA GPU.
+"""
+
+import math
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from etsplat.bench.gaussians import Splatting, load_gaussians, save_gaussians, splat, start_gaussians
+from etsplat.bench.peers import PeerConfig, load_gsplat
+from etsplat.core.cameras import Cameras
+from etsplat.io.images import save_image
+from etsplat.io.run_directory import RunDirectory
+from etsplat.metrics.image import psnr, ssim
+from etsplat.ops.ssim import photometric_loss
+from etsplat.optim.loop import DivergedError
+from etsplat.optim.schedules import exponential_decay
+from etsplat.optim.view_sampler import ViewSampler
+from etsplat.scene.capture_views import CaptureViews
+from etsplat.scene.captures import Capture, load_capture
+from etsplat.scene.soup_init import StartPoints, random_points
+from etsplat.tasks.evaluate_soup import drawing_speed, image_scores, load_lpips, mean_scores
+from etsplat.tasks.running import device_name, make_record, path_of, versions
+from etsplat.tasks.soup_scoring import SoupScorer
+
+FILE = "gaussians.safetensors"
+LOG_EVERY = 50
+
+
+def train_peer(source: Path, out: Path, config: PeerConfig, images: str | None = None) -> dict[str, Any]:
+    """Fits Gaussians to the photos of a scene; returns metrics.json. A run that was cut short starts again.
+
+    Args:
+        source: the scene's folder.
+        out: the run directory; an earlier run in it is replaced.
+        config: settings.
+        images: folder in the scene to take the photos from.
+
+    Raises:
+        InputError: no gsplat, no GPU, a scene that cannot be used, a full disk.
+        DivergedError: the loss is not finite.
+    """
+    gsplat, device = load_gsplat()
+    own = load_capture(source, images=images, width=config.width)
+    capture = own.normalized()
+    record = make_record(
+        "peer", config, {"fingerprint": own.fingerprint()}, {"source": path_of(source), "images": images}
+    )
+    run = RunDirectory.create(out, record, overwrite=True)
+    fitting = _Fitting(gsplat, capture, config, device)
+    start, losses = time.perf_counter(), []
+    for iteration in range(1, config.iterations + 1):
+        losses.append(fitting.step(iteration))
+        if iteration % LOG_EVERY == 0 or iteration == config.iterations:
+            seconds = time.perf_counter() - start
+            mean = float(torch.stack(losses).mean())
+            if not math.isfinite(mean):
+                raise DivergedError(f"the loss is {mean} at iteration {iteration}; start again with another seed")
+            losses.clear()
+            run.append_history(
+                {"iteration": iteration, "seconds": round(seconds, 3), "loss": mean, "triangles": fitting.count}
+            )
+    seconds = time.perf_counter() - start
+    save_gaussians(run.path / FILE, fitting.gaussians)
+    drawing = PeerDrawing(gsplat, fitting.gaussians, capture, config, device)
+    run.write_metrics(
+        {
+            **drawing.draw_test_views(run.test),
+            "triangles": fitting.count,
+            "iterations": config.iterations,
+            "seconds": seconds,
+            "device": device_name(device),
+            "method": config.method,
+            "seed": config.seed,
+            "versions": {**versions(), "gsplat": gsplat.__version__},
+        }
+    )
+    return run.read_metrics()
+
+
+def evaluate_peer(folder: Path, config: PeerConfig, lpips_weights: Path | None) -> dict[str, Any]:
+    """The numbers of `tasks.evaluate_soup.evaluate_run` for a finished run of `train_peer`; no opaque ones."""
+    gsplat, device = load_gsplat()
+    paths = RunDirectory(folder).read_config()["paths"]
+    capture = load_capture(paths["source"], images=paths["images"], width=config.width, preload=False).normalized()
+    gaussians = load_gaussians(folder / FILE, device)
+    drawing = PeerDrawing(gsplat, gaussians, capture, config, device)
+    lpips, reason = load_lpips(lpips_weights, device)
+    rows = []
+    for view in capture.test:
+        picture, photo = drawing.pair(view)
+        rows.append({"name": capture.names[view], **image_scores(picture, photo, lpips)})
+    cameras = [capture.cameras[view] for view in capture.test]
+    speed = drawing_speed(drawing.picture, cameras, device, len(gaussians["means"]))
+    opaque = {"psnr_opaque": None, "ssim_opaque": None}
+    return {**mean_scores(rows), **opaque, "lpips_reason": reason, **speed, "engine": "gsplat", "views": rows}
+
+
+class PeerDrawing:
+    """Pictures of finished Gaussians, and how they compare with the photos of the test views."""
+
+    def __init__(
+        self, gsplat: Any, gaussians: nn.ParameterDict, capture: Capture, config: PeerConfig, device: torch.device
+    ) -> None:
+        self._gsplat, self._gaussians, self._capture, self._config = gsplat, gaussians, capture, config
+        self._background = _background(config, device)
+        self._scorer = SoupScorer(capture, self._background[0], None, device)
+        self._device = device
+
+    @torch.no_grad()
+    def picture(self, camera: Cameras) -> Tensor:
+        """(H, W, 3) in [0, 1]."""
+        splatting = splat(self._gsplat, self._gaussians, camera, self._config, self._background)
+        return splatting.color[0].clamp(0, 1)
+
+    def pair(self, view: int) -> tuple[Tensor, Tensor]:
+        """Picture and photo (H, W, 3); pixels that a mask excludes agree."""
+        photo = self._scorer.photo(view)
+        picture = self.picture(self._capture.cameras[view].to(self._device))
+        return self._scorer.masked(picture, photo, view), photo
+
+    def draw_test_views(self, folder: Path) -> dict[str, Any]:
+        """NNN_render.png and NNN_truth.png of every test view; mean PSNR and SSIM, None without test views."""
+        scores: dict[str, list[float]] = {"psnr": [], "ssim": []}
+        for number, view in enumerate(self._capture.test):
+            picture, photo = self.pair(view)
+            scores["psnr"].append(psnr(picture, photo))
+            scores["ssim"].append(ssim(picture, photo))
+            save_image(folder / f"{number:03d}_render.png", picture)
+            save_image(folder / f"{number:03d}_truth.png", photo)
+        return {name: sum(values) / len(values) if values else None for name, values in scores.items()}
+
+
+class _Fitting:
+    """Parameters, their optimizers and gsplat's strategy."""
+
+    def __init__(self, gsplat: Any, capture: Capture, config: PeerConfig, device: torch.device) -> None:
+        self._gsplat, self._config = gsplat, config
+        generator = torch.Generator().manual_seed(config.seed)
+        positions, colors = capture.points, capture.point_colors
+        if positions is None:
+            points = random_points(config.start_points, capture.viewmats[capture.train], generator)
+        else:
+            points = StartPoints(positions, torch.full_like(positions, 0.5) if colors is None else colors)
+        self.gaussians = start_gaussians(points, config, generator).to(device)
+        rates = {
+            "means": config.lr_means,
+            "scales": config.lr_scales,
+            "quats": config.lr_quats,
+            "opacities": config.lr_opacities,
+            "sh0": config.lr_sh_dc,
+            "shN": config.lr_sh_rest,
+        }
+        self._optimizers = {
+            name: torch.optim.Adam([self.gaussians[name]], lr=rate, eps=1e-15) for name, rate in rates.items()
+        }
+        self._strategy = gsplat.DefaultStrategy(
+            refine_start_iter=config.at(config.densify_from),
+            refine_stop_iter=config.at(config.densify_until),
+            refine_every=config.at(config.densify_every),
+            reset_every=config.at(config.reset_every),
+            key_for_gradient="means2d" if config.method == "3dgs" else "gradient_2dgs",
+        )
+        self._strategy.check_sanity(self.gaussians, self._optimizers)
+        self._state = self._strategy.initialize_state(scene_scale=1.0)  # the frame is normalized
+        self._views = CaptureViews(capture, device)
+        self._sampler = ViewSampler(capture.train, generator)
+        self._background = _background(config, device)
+
+    @property
+    def count(self) -> int:
+        """Number of Gaussians."""
+        return len(self.gaussians["means"])
+
+    def step(self, iteration: int) -> Tensor:
+        """One view: draws, learns, densifies; returns the loss before it, on the device."""
+        config, view = self._config, self._sampler.next_view()
+        decay = exponential_decay(iteration, config.iterations, config.lr_means_final)
+        self._optimizers["means"].param_groups[0]["lr"] = config.lr_means * decay
+        regularized = config.method == "2dgs" and iteration > config.at(config.normals_from)
+        splatting = splat(
+            self._gsplat,
+            self.gaussians,
+            self._views.cameras[view],
+            config,
+            self._background,
+            sh_degree=min(config.sh_degree, (iteration - 1) // config.at(config.sh_every)),
+            normals=regularized,
+        )
+        loss = self._loss(splatting, view)
+        step = iteration - 1  # gsplat counts from 0
+        arguments = (self.gaussians, self._optimizers, self._state, step, splatting.info)
+        self._strategy.step_pre_backward(*arguments)
+        loss.backward()
+        for optimizer in self._optimizers.values():
+            optimizer.step()
+            optimizer.zero_grad(set_to_none=True)
+        self._strategy.step_post_backward(*arguments, packed=False)
+        return loss.detach()
+
+    def _loss(self, splatting: Splatting, view: int) -> Tensor:
+        mask = self._views.mask(view)
+        loss = photometric_loss(
+            splatting.color,
+            self._views.photo(view)[None],
+            self._config.lambda_dssim,
+            None if mask is None else mask[None].float() / 255,
+            backgrounds=self._background,
+        )
+        if splatting.normals is None:
+            return loss
+        drawn, of_depth, alpha = splatting.normals
+        return loss + self._config.lambda_normal * (1 - (drawn * of_depth * alpha.detach()).sum(dim=-1)).mean()
+
+
+def _background(config: PeerConfig, device: torch.device) -> Tensor:
+    return torch.full((1, 3), 1.0 if config.background == "white" else 0.0, device=device)
