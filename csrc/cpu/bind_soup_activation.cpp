@@ -1,7 +1,6 @@
-// Opacity and softness of a soup's triangles, and what is remembered of them after a view; triangles run in parallel.
+// Opacity and softness of a soup's triangles, which run in parallel.
 #include "bindings.h"
 #include "math/soup_activation.h"
-#include "math/soup_statistics.h"
 #include "parallel.h"
 
 namespace etsplat {
@@ -50,24 +49,6 @@ void bind_soup_activation(nb::module_& m) {
                                       {opacity_floor, sigma_ceiling}, grad);
                 pointer<float>(grad_logits)[n] = result.opacity;
                 pointer<float>(grad_raw)[n] = result.sigma;
-            });
-        },
-        NoGil());
-    // max_weight, screen_size, inradius of the view; importance, largest screen size, seen, trial (N) are updated.
-    m.def(
-        "soup_statistics",
-        [](int64_t triangles, Address max_weight, Address view_screen_size, Address inradius, Address importance,
-           Address screen_size, Address seen, Address trial, int views, bool epoch_starts) {
-            for_each_triangle(triangles, [&](int64_t n) {
-                const SoupRecord before{pointer<float>(importance)[n], pointer<float>(screen_size)[n],
-                                        pointer<int>(seen)[n], pointer<int>(trial)[n]};
-                const SoupRecord record =
-                    after_view(before, pointer<const float>(max_weight)[n], pointer<const float>(view_screen_size)[n],
-                               pointer<const float>(inradius)[n], views, epoch_starts);
-                pointer<float>(importance)[n] = record.importance;
-                pointer<float>(screen_size)[n] = record.screen_size;
-                pointer<int>(seen)[n] = record.seen;
-                pointer<int>(trial)[n] = record.trial;
             });
         },
         NoGil());

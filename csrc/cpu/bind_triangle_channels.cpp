@@ -1,5 +1,4 @@
-// Centroid depths and facing normals of triangles, and values of triangles at the pixels that show them. Triangles and pixels
-// run in parallel; the sum over pixels of a value's gradient is one thread's, in the order of the pixels.
+// Centroid depths and facing normals of triangles, which run in parallel.
 #include <algorithm>
 
 #include "bindings.h"
@@ -11,7 +10,7 @@ namespace {
 
 using Vector = Vector3<float>;
 
-constexpr int64_t kTriangles = 1024, kPixels = 8192;  // that a thread takes at a time
+constexpr int64_t kTriangles = 1024;  // that a thread takes at a time
 
 }  // namespace
 
@@ -50,28 +49,6 @@ void bind_triangle_channels(nb::module_& m) {
                     }
                 }
             });
-        },
-        NoGil());
-    // Of one view: values (N), chosen (P) int32: 0 for none, or the triangle's number plus 1; image (P).
-    m.def(
-        "pick_values",
-        [](Address values, Address chosen, int64_t pixels, Address image) {
-            parallel_for(pixels, kPixels, [&](int64_t begin, int64_t end) {
-                for (int64_t p = begin; p < end; ++p) {
-                    const int32_t triangle = pointer<const int32_t>(chosen)[p];
-                    pointer<float>(image)[p] = triangle > 0 ? pointer<const float>(values)[triangle - 1] : 0.0f;
-                }
-            });
-        },
-        NoGil());
-    // Adds to grad_values (N).
-    m.def(
-        "pick_values_backward",
-        [](Address chosen, Address grad_image, int64_t pixels, Address grad_values) {
-            for (int64_t p = 0; p < pixels; ++p) {
-                const int32_t triangle = pointer<const int32_t>(chosen)[p];
-                if (triangle > 0) pointer<float>(grad_values)[triangle - 1] += pointer<const float>(grad_image)[p];
-            }
         },
         NoGil());
 }

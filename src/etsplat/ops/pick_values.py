@@ -8,12 +8,10 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from etsplat import _native
 from etsplat.core.validation import check_device, check_shape
 from etsplat.cuda.launch import blocks, launch
 from etsplat.cuda.program import Program
 from etsplat.ops.engines import resolve_engine
-from etsplat.ops.pool import empty_image, zeros_like
 
 _PROGRAM = Program("pick_values.cu", contract=False)
 _THREADS = 256
@@ -29,10 +27,10 @@ def pick_values(
     Args:
         values: (B, N).
         chosen: (B, H, W) int32 from 0 to N.
-        engine: "cpu", "cuda", "reference" or None (by dtype and device).
+        engine: "cpu", "cuda", "reference" or None (by dtype and device). Only "cuda" has anything of its own.
 
     Returns:
-        (B, H, W). The native engines add gradients in a fixed order or as integers: the same bits in every run.
+        (B, H, W). Gradients are added in a fixed order, or as integers: the same bits in every run.
 
     Raises:
         ValueError: Wrong shape, dtype or device.
@@ -42,34 +40,11 @@ def pick_values(
     check_device("chosen", chosen, "values", values)
     if chosen.dtype != torch.int32:
         raise ValueError(f"chosen must be int32, got {chosen.dtype}")
-    engine = resolve_engine(engine, values)
-    if engine != "reference":
-        native = _OnDevice if engine == "cuda" else _OnCpu
-        picked: Any = native.apply(values, chosen)
+    if resolve_engine(engine, values) == "cuda":
+        picked: Any = _OnDevice.apply(values, chosen)
         return picked
     behind = torch.cat([values.new_zeros(len(values), 1), values], dim=1)
     return behind.gather(1, chosen.long().flatten(start_dim=1)).view(chosen.shape)
-
-
-class _OnCpu(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, values: Tensor, chosen: Tensor) -> Tensor:
-        values, chosen = values.contiguous(), chosen.contiguous()
-        image = empty_image(*chosen.shape)
-        for b in range(len(values)):
-            _native.pick_values(values[b].data_ptr(), chosen[b].data_ptr(), chosen[b].numel(), image[b].data_ptr())
-        ctx.save_for_backward(values, chosen)
-        return image
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad_image: Tensor) -> tuple[Tensor, None]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        values, chosen = ctx.saved_tensors
-        given, grad_values = grad_image.contiguous(), zeros_like(values)
-        for b in range(len(values)):
-            addresses = (tensor[b].data_ptr() for tensor in (chosen, given))
-            _native.pick_values_backward(*addresses, chosen[b].numel(), grad_values[b].data_ptr())
-        return grad_values, None
 
 
 class _OnDevice(torch.autograd.Function):

@@ -11,11 +11,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from etsplat import _native
 from etsplat.core.rasterization import TriangleStatistics
 from etsplat.cuda.launch import blocks, launch
 from etsplat.cuda.program import Program
-from etsplat.ops.engines import resolve_engine
 
 _PROGRAM = Program("soup_statistics.cu", contract=False)
 _THREADS = 256
@@ -27,8 +25,6 @@ def update_statistics(
     view: TriangleStatistics,
     views: int,
     epoch_starts: bool,
-    *,
-    engine: str | None = None,
 ) -> None:
     """Take a view into the records of N triangles, in place.
 
@@ -37,14 +33,9 @@ def update_statistics(
         view: its statistics, (1, N).
         views: length of an epoch.
         epoch_starts: whether the view is the first of an epoch.
-        engine: "cpu", "reference" or None (by dtype and device).
     """
     importance, screen_size, seen, trial = records
     seen_now = view.max_weight[0], view.screen_size[0], view.inradius[0]
-    if resolve_engine(engine, importance) == "cpu":
-        addresses = [tensor.data_ptr() for tensor in (*seen_now, *records)]
-        _native.soup_statistics(len(importance), *addresses, views, epoch_starts)
-        return
     torch.maximum(importance, seen_now[0], out=importance)
     torch.maximum(screen_size, seen_now[1], out=screen_size)
     running = trial < views

@@ -43,16 +43,15 @@ class SoupStatistics:
         number, whole = torch.zeros(count, device=device), torch.zeros(count, dtype=torch.int32, device=device)
         return SoupStatistics(number, number.clone(), whole, whole.clone())
 
-    def update(self, view: TriangleStatistics, views: int, *, epoch_starts: bool, engine: str | None = None) -> None:
+    def update(self, view: TriangleStatistics, views: int, *, epoch_starts: bool) -> None:
         """Takes in a rendering of one training view.
 
         Args:
             view: its statistics, (1, N).
             views: number of training views, the length of an epoch.
             epoch_starts: whether the view is the first of an epoch.
-            engine: "cpu", "reference" or None.
         """
-        update_statistics(list(self.tensors().values()), view, views, epoch_starts, engine=engine)
+        update_statistics(list(self.tensors().values()), view, views, epoch_starts)
 
     def update_on_device(self, view: TriangleStatistics, views: int, epoch_starts: Tensor, halted: Tensor) -> None:
         """As `update`, on engine "cuda", which can be captured in a CUDA graph.

@@ -141,8 +141,7 @@ class SoupFitting:
         )
         self.adam.learning_rates["vertices"] = self._schedule.vertex_rate(iteration)
         self.adam.step()
-        views, starts = len(self._capture.train), self._sampler.epoch_starts
-        self.statistics.update(drawn, views, epoch_starts=starts, engine=self._config.engine)
+        self.statistics.update(drawn, len(self._capture.train), epoch_starts=self._sampler.epoch_starts)
         return float(loss)
 
     def _queued_step(self, iteration: int) -> QueuedStep:
