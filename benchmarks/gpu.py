@@ -16,9 +16,8 @@ from typing import Any
 import torch
 from rich.console import Console
 
-from benchmarks import gpu_scenes, gpu_timing, machine
+from benchmarks import gpu_reconstruct, gpu_scenes, gpu_timing, gpu_train, machine
 from benchmarks.gpu_floors import PEAKS, Work, floors
-from benchmarks.gpu_reconstruct import step_milliseconds
 from benchmarks.tables import Table
 
 RESULTS = Path(__file__).parent / "results"
@@ -65,6 +64,11 @@ def time_table(results: dict[str, dict[str, Any]]) -> Table:
     return Table("Event-timed milliseconds", ["scene", "what", "median", "quartiles"], rows)
 
 
+def kernel_table(preset: str, kernels: dict[str, float]) -> Table:
+    rows = [[name, f"{1e3 * ms:.1f}"] for name, ms in sorted(kernels.items(), key=lambda item: -item[1])[:30]]
+    return Table(f"Kernels of a training step, preset {preset}", ["kernel", "us a step"], rows)
+
+
 def main(arguments: list[str] | None = None) -> None:
     options = parse(arguments)
     console = Console(width=150)
@@ -86,13 +90,19 @@ def main(arguments: list[str] | None = None) -> None:
         results[name] = entry
         tables.append(floor_table(name, Work(**entry["work"]), options.peaks, entry["kernels"]))
     tables.append(time_table(results))
-    reconstruct = step_milliseconds(torch.device("cuda"))
+    device = torch.device("cuda")
+    reconstruct = gpu_reconstruct.step_milliseconds(device)
+    train = {preset: gpu_train.step_milliseconds(device, preset) for preset in ("quick", "paper")}
+    tables += [kernel_table(preset, entry["kernels"]) for preset, entry in train.items()]
     description = {**machine.description(), "gpu": torch.cuda.get_device_name(), "cuda": torch.version.cuda}
     name = f"gpu_{description['date'][:10]}_{description['commit'].rstrip('+')}.json"
     path = options.json or RESULTS / name
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(
-        json.dumps({"machine": description, "results": results, "reconstruct_step": reconstruct}, indent=1) + "\n",
+        json.dumps(
+            {"machine": description, "results": results, "reconstruct_step": reconstruct, "train_step": train}, indent=1
+        )
+        + "\n",
         encoding="utf-8",
     )
     for table in tables:
@@ -100,6 +110,9 @@ def main(arguments: list[str] | None = None) -> None:
         console.print(table.rich())
     step = f"{reconstruct['milliseconds']:.3f} ms at {reconstruct['faces']:,} faces, 1024 x 1024"
     console.print(f"a whole reconstruction step: {step}", highlight=False)
+    for preset, entry in train.items():
+        step = f"{entry['milliseconds']:.3f} ms at {entry['triangles']:,} triangles, {entry['size']}"
+        console.print(f"a whole training step, preset {preset}: {step}", highlight=False)
     console.print(f"written to {path}", highlight=False)
 
 

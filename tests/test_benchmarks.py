@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from _scenes import mesh
-from benchmarks import gpu_floors, gpu_reconstruct, gpu_scenes, gpu_timing, rasterizer, scenes, tables
+from benchmarks import gpu, gpu_floors, gpu_reconstruct, gpu_scenes, gpu_timing, gpu_train, rasterizer, scenes, tables
 from benchmarks.measure import native_state
 from etsplat import _native, rasterize
 
@@ -109,3 +109,23 @@ def test_a_reconstruction_step_is_timed(simt):
     result = gpu_reconstruct.step_milliseconds(torch.device("cpu"), resolution=24, start_level=1, faces=120, steps=3)
     assert result["faces"] == 120
     assert result["milliseconds"] > 0
+
+
+@pytest.mark.parametrize("preset", ["quick", "paper"])
+def test_a_training_step_is_timed(simt, preset):
+    """With the losses of the preset; the statistics of every step are among its kernels."""
+    result = gpu_train.step_milliseconds(torch.device("cpu"), preset, size=(24, 16), triangles=40, steps=2)
+    assert result["milliseconds"] > 0
+    assert simt.launches.count("soup_statistics") == 4
+    assert simt.launches.count("normal_backward") == (4 if preset == "paper" else 0)
+
+
+def test_the_benchmark_says_that_there_is_no_gpu(monkeypatch):
+    monkeypatch.setattr(gpu.torch.cuda, "is_available", lambda: False)
+    with pytest.raises(SystemExit, match="no GPU: --count counts the work without one"):
+        gpu.main([])
+
+
+def test_kernels_are_listed_by_their_time():
+    rows = gpu.kernel_table("quick", {"short": 0.001, "long": 2.0}).rows
+    assert rows == [["long", "2000.0"], ["short", "1.0"]]

@@ -53,7 +53,7 @@ class DeviceViews:
         self._kinds: dict[int, PhotoKind] = {}
         self._places: dict[int, int] = {}
         self._stacks: dict[PhotoKind, _Stack] = {}
-        self.streamed = self._images.streamed or not _fits(capture.images.total_bytes, device)
+        self.streamed = self._images.streamed or not stay_on(device, capture.images.total_bytes)
         if not self.streamed:
             self._keep(capture.train)
 
@@ -137,5 +137,6 @@ def _copy(source: Tensor, target: Tensor) -> None:
     target.copy_(pinned, non_blocking=True)
 
 
-def _fits(size: int, device: torch.device) -> bool:
+def stay_on(device: torch.device, size: int) -> bool:
+    """Whether photos of so many bytes in all are kept on a device rather than uploaded when they are needed."""
     return device.type != "cuda" or size <= DEVICE_SHARE * torch.cuda.mem_get_info(device)[0]

@@ -17,6 +17,7 @@ from etsplat.ops.engines import num_threads, one_torch_thread, resolve_device, r
 from etsplat.optim.loop import CheckpointEvent, LoopSettings, Progress
 from etsplat.scene.captures import Capture, load_capture
 from etsplat.scene.demo_scene import demo_scene
+from etsplat.scene.device_views import stay_on
 from etsplat.scene.soup_files import SoupFile, save_soup
 from etsplat.scene.soup_init import StartPoints, random_points, start_soup
 from etsplat.scene.triangle_soup import TriangleSoup
@@ -157,11 +158,12 @@ def start_fitting(
     return SoupFitting(soup, capture, config, generator, evaluate, squared=squared)
 
 
-def predicted_bytes(capture: Capture, config: TrainConfig) -> int:
-    """Memory that a run may come to need, beyond the program itself."""
+def predicted_bytes(capture: Capture, config: TrainConfig, device: torch.device | None = None) -> int:
+    """Memory of a device, None for the CPU, that a run may come to need, beyond the program itself."""
     pixels = max(width * height for width, height in capture.images.sizes)
     triangles = max(config.max_triangles, _start_count(capture, config))
-    pictures = 0 if capture.images.streamed else capture.images.total_bytes
+    kept = not capture.images.streamed and (device is None or stay_on(device, capture.images.total_bytes))
+    pictures = capture.images.total_bytes if kept else 0
     return triangles * BYTES_PER_TRIANGLE + pixels * BYTES_PER_PIXEL + pictures
 
 
@@ -183,7 +185,7 @@ def _check(capture: Capture, config: TrainConfig, device: torch.device) -> list[
     """Refuses what cannot work; returns what its owner should know."""
     if not capture.train:
         raise InputError("capture: has no view to train on; name some in its split")
-    needed = predicted_bytes(capture, config)
+    needed = predicted_bytes(capture, config, device)
     free = torch.cuda.mem_get_info(device)[0] if device.type == "cuda" else available_memory()
     if needed > free:
         fitting = max(1000, int(config.max_triangles - (needed - free) / BYTES_PER_TRIANGLE))

@@ -1,0 +1,68 @@
+"""Time of a whole step of novel-view synthesis on a GPU, from the choice of a view to statistics, and its kernels."""
+
+import time
+from dataclasses import replace
+from typing import Any
+
+import torch
+
+from benchmarks.gpu_timing import kernel_times
+from etsplat.scene.demo_scene import demo_scene
+from etsplat.scene.triangle_soup import TriangleSoup
+from etsplat.tasks.soup_fitting import SoupFitting
+from etsplat.tasks.train_config import train_settings
+
+SIZE = (1237, 822)
+TRIANGLES = 4_000_000
+EXTENT = 0.004
+"""Of a triangle, about six pixels across from where the cameras are."""
+
+
+def step_milliseconds(
+    device: torch.device,
+    preset: str,
+    *,
+    size: tuple[int, int] = SIZE,
+    triangles: int = TRIANGLES,
+    steps: int = 64,
+) -> dict[str, Any]:
+    """Milliseconds a step, as the task makes them, over views that take turns.
+
+    Wall time: steps are queued together, and the batch ends with the one wait for the device.
+
+    Args:
+        device: where it runs.
+        preset: "quick", or "paper" with all its losses from the first iteration on.
+        size: width and height of the photos.
+        triangles: random ones around the scene; none is added or removed.
+        steps: how many are timed; as many before them are not.
+    """
+    capture = demo_scene(*size)
+    generator = torch.Generator().manual_seed(0)
+    middles = 0.6 * torch.randn((triangles, 1, 3), generator=generator)
+    vertices = middles + EXTENT * torch.randn((triangles, 3, 3), generator=generator)
+    colors = torch.rand((triangles, 3), generator=generator)
+    soup = TriangleSoup.from_triangles(vertices, colors, opacity=0.3, sigma=0.5, sh_degree=3).to(device)
+    config = replace(
+        train_settings(preset, "indoor"),
+        engine="cuda",
+        iterations=30_000,
+        sh_every=1,
+        regularize_from=0,
+        densify_every=15_000,
+    )
+    fitting = SoupFitting(soup, capture, config, generator, lambda *_: {})
+    done = _advance(fitting, 10, 10 + steps)
+    begin = time.perf_counter()
+    done = _advance(fitting, done, done + steps)
+    milliseconds = 1e3 * (time.perf_counter() - begin) / steps
+    kernels = {}
+    if device.type == "cuda":
+        kernels = kernel_times(lambda: fitting.advance(done + 1, done + 1), 8)
+    return {"triangles": triangles, "size": size, "milliseconds": milliseconds, "kernels": kernels}
+
+
+def _advance(fitting: SoupFitting, done: int, last: int) -> int:
+    while done < last:
+        done += len(fitting.advance(done + 1, last))
+    return done
