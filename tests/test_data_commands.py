@@ -1,16 +1,22 @@
 """What `etsplat data sfm` and `etsplat data download` do."""
 
 import builtins
+import errno
+import math
 import zipfile
 
+import numpy as np
 import pytest
+import torch
+from PIL import Image
 
-from captures import write_colmap, write_photo
+from captures import circle_poses, write_colmap, write_photo, write_transforms
 from etsplat.core.errors import InputError
 from etsplat.io import datasets
 from etsplat.io.datasets import Dataset, download_dataset
 from etsplat.scene.captures import load_capture
-from etsplat.scene.structure_from_motion import find_cameras, undistort_scene
+from etsplat.scene.structure_from_motion import find_cameras
+from etsplat.scene.undistortion import undistort_scene
 
 
 def test_without_pycolmap_the_extra_is_named(tmp_path, monkeypatch):
@@ -86,8 +92,68 @@ def test_a_distorted_scene_is_refused_with_the_remedy_and_undistorted_once(tmp_p
     (tmp_path / "scene" / "images" / "0001.jpg").unlink()
     with pytest.raises(InputError, match=r"1 images are missing \(first: 0001\.jpg\)"):
         undistort_scene(tmp_path / "scene", tmp_path / "newer")
-    with pytest.raises(InputError, match="no sparse/0"):
+    with pytest.raises(InputError, match="neither sparse/0"):
         undistort_scene(tmp_path, tmp_path / "newer")
+
+
+LENSES = {
+    "OPENCV": {"k1": -0.2, "k2": 0.05, "p1": 0.01, "p2": -0.02},
+    "OPENCV_FISHEYE": {"k1": -0.05, "k2": 0.02, "k3": -0.01, "k4": 0.002},
+}
+
+
+def distorted(x, y, model, k1=0.0, k2=0.0, p1=0.0, p2=0.0, k3=0.0, k4=0.0):
+    """OpenCV's models, on the plane z = 1."""
+    r2 = x * x + y * y
+    if model == "OPENCV_FISHEYE":
+        angle = math.atan(math.sqrt(r2))
+        scale = angle * (1 + k1 * angle**2 + k2 * angle**4 + k3 * angle**6 + k4 * angle**8) / math.sqrt(r2)
+        return x * scale, y * scale
+    radial = 1 + k1 * r2 + k2 * r2 * r2
+    return x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_distortion_of_transforms_json_is_removed_once(tmp_path, model):
+    """A dot photographed through the lens is afterwards where the camera without lens sees it; the mask comes along."""
+    pytest.importorskip("pycolmap")
+    write_transforms(
+        tmp_path / "scene", 3, width=160, height=120, fl_y=150, cx=83, cy=58, camera_model=model, **LENSES[model]
+    )
+    with pytest.raises(InputError, match="etsplat data undistort"):
+        load_capture(tmp_path / "scene")
+    ray = (0.3, -0.2)
+    u, v = distorted(*ray, model, **LENSES[model])
+    rows, columns = np.mgrid[:120, :160] + 0.5
+    squares = (columns - (160 * u + 83)) ** 2 + (rows - (150 * v + 58)) ** 2
+    dot = (255 * np.exp(-squares / 8)).astype(np.uint8)
+    for index in range(3):
+        Image.fromarray(np.repeat(dot[..., None], 3, axis=2)).save(tmp_path / "scene" / "images" / f"{index:04d}.png")
+        (tmp_path / "scene" / "masks").mkdir(exist_ok=True)
+        Image.fromarray(dot).save(tmp_path / "scene" / "masks" / f"{index:04d}.png")
+    assert undistort_scene(tmp_path / "scene", tmp_path / "new") == ["0000.png", "0001.png", "0002.png"]
+    capture = load_capture(tmp_path / "new")
+    expected = (capture.Ks[1] @ torch.tensor([*ray, 1.0], dtype=torch.float64))[:2]
+    for picture in (capture.images[1][..., 0], capture.images.mask(1)):
+        weight = picture.double()
+        x = (weight.sum(dim=0) * (torch.arange(picture.shape[1]) + 0.5)).sum() / weight.sum()
+        y = (weight.sum(dim=1) * (torch.arange(picture.shape[0]) + 0.5)).sum() / weight.sum()
+        torch.testing.assert_close(torch.stack([x, y]), expected, atol=0.3, rtol=0)
+    torch.testing.assert_close(capture.viewmats[1], circle_poses(3)[1], atol=1e-6, rtol=0)
+
+
+def test_a_full_disk_while_undistorting_is_one_line_and_nothing_stays(tmp_path, monkeypatch):
+    pycolmap = pytest.importorskip("pycolmap")
+    write_colmap(tmp_path / "scene", [(64, 48)] * 3, model="SIMPLE_RADIAL", extra=(-0.1,))
+
+    def full(*args, **kwargs):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(pycolmap, "undistort_images", full)
+    with pytest.raises(InputError, match=r"No space left on device; free some space") as raised:
+        undistort_scene(tmp_path / "scene", tmp_path / "new")
+    assert "\n" not in str(raised.value)
+    assert [path.name for path in tmp_path.iterdir()] == ["scene"]
 
 
 @pytest.fixture

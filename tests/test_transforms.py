@@ -117,9 +117,9 @@ def test_load_views_moves_the_object_into_the_unit_sphere(scene, truth):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda d: d.update(k1=0.01), r"lens distortion \(k1\).*undistort"),
+        (lambda d: d.update(k1=0.01), r"lens distortion \(k1\).*etsplat data undistort"),
         (lambda d: d["frames"][3].update(p2=-0.2), r"003 has lens distortion \(p2\)"),
-        (lambda d: d.update(camera_model="OPENCV_FISHEYE"), "OPENCV_FISHEYE camera; undistort"),
+        (lambda d: d.update(camera_model="OPENCV_FISHEYE"), "OPENCV_FISHEYE camera; run `etsplat data undistort"),
         (lambda d: d.update(frames=[]), "no list `frames`"),
         (lambda d: d.pop("frames"), "no list `frames`"),
         (lambda d: d.update(frames=d["frames"][:1]), "at least 2"),

@@ -60,17 +60,19 @@ class Sfm(Command):
 
 @dataclass(frozen=True, kw_only=True)
 class Undistort(Command):
-    """Write a COLMAP scene anew without lens distortion: what every other command wants.
+    """Write a scene anew without lens distortion, in COLMAP's layout: what every other command wants.
 
     Needs pycolmap: pip install 'etsplat[sfm]'.
     """
 
     EXAMPLES: ClassVar[str] = """
     etsplat data undistort distorted_scene/ --out my_scene
+    etsplat data undistort nerfstudio_capture/ --out my_scene --max-size 1000
     """
 
     source: tyro.conf.Positional[Path]
-    """Folder with images/ and sparse/0/, of any of COLMAP's camera models."""
+    """Folder with images/ and sparse/0/, of any of COLMAP's camera models; or with transforms.json, as nerfstudio and
+    instant-ngp write it. Masks come along; every 8th image is for testing, whatever transforms.json says."""
     out: Path
     """Folder for the new scene."""
     max_size: int = 1600
@@ -83,10 +85,10 @@ class Undistort(Command):
 
     def run(self, arguments: Sequence[str]) -> int:
         """Writes the scene."""
-        from etsplat.scene.structure_from_motion import undistort_scene
+        from etsplat.scene.undistortion import undistort_scene
 
-        done = undistort_scene(self.source, self.out, max_size=self.max_size)
-        print(f"{len(done.placed)} images without lens distortion; scene in {done.scene}")
+        names = undistort_scene(self.source, self.out, max_size=self.max_size)
+        print(f"{len(names)} images without lens distortion; scene in {self.out}")
         return 0
 
 

@@ -2,9 +2,7 @@
 
 import contextlib
 import os
-import shutil
 import sqlite3
-import tempfile
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -12,9 +10,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from etsplat.core.errors import InputError
-from etsplat.io.atomic import write_error
 from etsplat.io.images import IMAGE_SUFFIXES, image_size
-from etsplat.scene.colmap import find_model
+from etsplat.scene.undistortion import check_new, import_pycolmap, undistort_model, working_folder
 
 Matching = Literal["auto", "exhaustive", "sequential"]
 Progress = Callable[[str, int, int], None]
@@ -67,53 +64,21 @@ def find_cameras(
     Raises:
         InputError: pycolmap is missing; too few photos; too few of them could be placed; `out` cannot be used.
     """
-    pycolmap = _import_pycolmap()
+    pycolmap = import_pycolmap()
     photos, out = Path(photos), Path(out)
     names = _photo_names(photos)
-    _check_new(out)
+    check_new(out)
     report = progress or (lambda phase, done, total: None)
-    with tempfile.TemporaryDirectory(prefix=".sfm-", dir=out.parent) as work:
-        model = _reconstruct(pycolmap, photos, names, Path(work), matching, max_size, threads or -1, report)
+    with working_folder(out) as work:
+        model = _reconstruct(pycolmap, photos, names, work, matching, max_size, threads or -1, report)
         placed = sorted(image.name for image in model.images.values() if image.has_pose)
         if len(placed) < max(LEAST_COUNT, LEAST_SHARE * len(names)):
             raise InputError(_too_few(photos, len(placed), len(names)))
         report("Removing lens distortion", 0, 0)
-        _undistort(pycolmap, model, photos, placed, Path(work), max_size)
-        _move(_arranged(Path(work) / "scene"), out)
+        undistort_model(pycolmap, model, photos, placed, work, max_size)
+        os.replace(work / "scene", out)
     unplaced = [name for name in names if name not in set(placed)]
     return Placement(out, placed, unplaced, len(model.points3D))
-
-
-def undistort_scene(scene: Path | str, out: Path | str, *, max_size: int = 1600) -> Placement:
-    """Write a COLMAP scene anew without lens distortion, images and cameras, once and for all.
-
-    Args:
-        scene: folder with `images/` and `sparse/0/` (or `sparse/`), of any of COLMAP's camera models.
-        out: folder of the new scene; must not exist or be empty.
-        max_size: longer sides are shrunk to this many pixels.
-
-    Raises:
-        InputError: pycolmap is missing; there is no model, or it cannot be read; images are missing; `out` cannot be
-            used.
-    """
-    pycolmap = _import_pycolmap()
-    scene, out = Path(scene), Path(out)
-    folder = find_model(scene)
-    if folder is None:
-        raise InputError(f"scene {scene}: no sparse/0/cameras.bin or .txt; choose a COLMAP scene")
-    _check_new(out)
-    try:
-        model = pycolmap.Reconstruction(folder)
-    except (ValueError, RuntimeError, OSError, LookupError) as error:  # what its C++ throws
-        raise InputError(f"scene {folder}: cannot be read as a model ({str(error).splitlines()[0]})") from error
-    names = sorted(image.name for image in model.images.values() if image.has_pose)
-    missing = [name for name in names if not (scene / "images" / name).is_file()]
-    if missing:
-        raise InputError(f"scene {scene}: {len(missing)} images are missing (first: {missing[0]}); copy them there")
-    with tempfile.TemporaryDirectory(prefix=".undistort-", dir=out.parent) as work:
-        _undistort(pycolmap, model, scene / "images", names, Path(work), max_size)
-        _move(_arranged(Path(work) / "scene"), out)
-    return Placement(out, names, [], len(model.points3D))
 
 
 def _reconstruct(
@@ -166,42 +131,6 @@ def _reconstruct(
     return max(models.values(), key=lambda model: model.num_reg_images(), default=pycolmap.Reconstruction())
 
 
-def _undistort(pycolmap: Any, model: Any, photos: Path, placed: list[str], work: Path, max_size: int) -> None:
-    (work / "model").mkdir()
-    model.write(work / "model")
-    options = pycolmap.UndistortCameraOptions(max_image_size=max_size)
-    pycolmap.undistort_images(work / "scene", work / "model", photos, placed, undistort_options=options)
-
-
-def _check_new(out: Path) -> None:
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise InputError(f"{out}: is there already and not empty; choose another folder for the scene")
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise write_error(out, error) from error
-
-
-def _move(folder: Path, out: Path) -> None:
-    try:
-        os.replace(folder, out)
-    except OSError as error:
-        raise write_error(out, error) from error
-
-
-def _arranged(scene: Path) -> Path:
-    """Leaves images/ and sparse/0/ of what COLMAP writes for its dense reconstruction."""
-    for entry in scene.iterdir():
-        if entry.name == "stereo":
-            shutil.rmtree(entry)
-        elif entry.is_file():
-            entry.unlink()
-    (scene / "sparse").rename(scene / "0")
-    (scene / "sparse").mkdir()
-    (scene / "0").rename(scene / "sparse" / "0")
-    return scene
-
-
 @contextlib.contextmanager
 def _polled(database: Path, table: str, phase: str, total: int, report: Progress) -> Iterator[None]:
     """Reports rows of a table of COLMAP's database every half second: its functions tell nothing themselves."""
@@ -242,13 +171,3 @@ def _too_few(photos: Path, placed: int, count: int) -> str:
         f"photos {photos}: only {placed} of {count} could be placed in one scene; take more photos, each overlapping"
         " its neighbours by two thirds, sharp, of something that stands still, walking around it rather than turning"
     )
-
-
-def _import_pycolmap() -> Any:
-    try:
-        import pycolmap
-    except ImportError as error:
-        raise InputError(
-            "structure from motion needs pycolmap: pip install 'etsplat[sfm]' (or use COLMAP itself)"
-        ) from error
-    return pycolmap

@@ -21,8 +21,35 @@ from etsplat.scene.frames import Frame, FrameSet, find_image, find_mask
 from etsplat.scene.views import every_eighth
 
 _DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
-_PINHOLE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE")
-_UNDISTORT = "undistort the images first (e.g. `colmap image_undistorter`) and export the poses again"
+_PERSPECTIVE, _FISHEYE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE"), ("OPENCV_FISHEYE", "FISHEYE")
+_UNDISTORT = "run `etsplat data undistort SCENE --out NEW` and use the new folder"
+
+
+@dataclass(frozen=True)
+class Lens:
+    """Distortion as COLMAP has it: the model, and its parameters after fx, fy, cx, cy."""
+
+    model: str
+    coefficients: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class DistortedFrames:
+    """Frames of `transforms.json` before their distortion is removed.
+
+    Attributes:
+        set: frames, and the points.
+        lenses: of each frame.
+        folder: of all images.
+        names: of each frame's image in it.
+        masks: the masks by these names; empty without.
+    """
+
+    set: FrameSet
+    lenses: list[Lens]
+    folder: Path
+    names: list[str]
+    masks: dict[str, Path]
 
 
 def read_transforms(folder: Path | str, masks: Path | str | None = None, *, images: str | None = None) -> FrameSet:
@@ -64,6 +91,30 @@ def read_transforms(folder: Path | str, masks: Path | str | None = None, *, imag
     return FrameSet(folder, frames, train, test, *_points(train_file))
 
 
+def read_distorted_transforms(folder: Path) -> DistortedFrames:
+    """What `transforms.json` says of images with lens distortion (k1 to k4, p1, p2, OPENCV_FISHEYE).
+
+    Raises:
+        InputError: as `read_transforms`; a lens that COLMAP does not know.
+    """
+    path = folder / "transforms.json"
+    document, where = _read(path), _Folders(None, None, distorted=True)
+    frames = sorted(_frames(path, where), key=lambda frame: frame.name)
+    entries = {_plain(entry["file_path"]): {**document, **entry} for entry in document["frames"]}
+    lenses = [_lens(path, frame.name, entries[frame.name]) for frame in frames]
+    found = FrameSet(folder, frames, list(range(len(frames))), [], *_points(path))
+    outside = [frame for frame in frames if not frame.image.is_relative_to(folder)]
+    if outside:
+        raise InputError(f"scene {path}: {outside[0].name} lies outside of the scene's folder; copy the images into it")
+    files = [frame.image.relative_to(folder) for frame in frames]
+    first = files[0].parts[0]
+    together = all(len(file.parts) > 1 and file.parts[0] == first for file in files)
+    images = folder / first if together else folder
+    names = [frame.image.relative_to(images).as_posix() for frame in frames]
+    masks = {name: frame.mask for name, frame in zip(names, frames, strict=True) if frame.mask is not None}
+    return DistortedFrames(found, lenses, images, names, masks)
+
+
 def _read_single(folder: Path, where: "_Folders") -> FrameSet:
     path = folder / "transforms.json"
     frames = sorted(_frames(path, where), key=lambda frame: frame.name)
@@ -85,6 +136,8 @@ class _Folders:
 
     images: str | None
     masks: Path | None
+    distorted: bool = False
+    """Whether lens distortion is accepted."""
 
 
 def _points(path: Path) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "P 3"]] | tuple[None, None]:
@@ -124,7 +177,8 @@ def _frame(path: Path, document: dict[str, Any], entry: dict[str, Any], where: _
     name = _plain(entry["file_path"])
     image = find_image(path.parent, name if where.images is None else _moved(name, where.images))
     settings = {**document, **entry}
-    _refuse_distortion(path, name, settings)
+    if not where.distorted:
+        _refuse_distortion(path, name, settings)
     size = _size(path, name, settings, image)
     mask = None
     if where.masks is not None:
@@ -155,11 +209,26 @@ def _moved(name: str, images: str) -> str:
 
 def _refuse_distortion(path: Path, name: str, settings: dict[str, Any]) -> None:
     model = settings.get("camera_model", "OPENCV")
-    if model not in _PINHOLE_MODELS:
+    if model not in _PERSPECTIVE or settings.get("is_fisheye"):
         raise InputError(f"scene {path}: {name} has a {model} camera; {_UNDISTORT}")
     distorted = [key for key in _DISTORTION if _number(path, name, settings, key, 0.0) != 0]
     if distorted:
         raise InputError(f"scene {path}: {name} has lens distortion ({', '.join(distorted)}); {_UNDISTORT}")
+
+
+def _lens(path: Path, name: str, settings: dict[str, Any]) -> Lens:
+    model = settings.get("camera_model", "OPENCV")
+    k1, k2, k3, k4, k5, k6, p1, p2 = (_number(path, name, settings, key, 0.0) for key in _DISTORTION)
+    if settings.get("is_fisheye") or model in _FISHEYE:  # the former is instant-ngp's
+        if p1 == p2 == k5 == k6 == 0:
+            return Lens("OPENCV_FISHEYE", (k1, k2, k3, k4))
+    elif model in _PERSPECTIVE and k4 == k5 == k6 == 0:  # of k4 on, programs disagree what it means
+        short = (k1, k2, p1, p2)
+        return Lens("OPENCV", short) if k3 == 0 else Lens("FULL_OPENCV", (*short, k3, 0.0, 0.0, 0.0))
+    raise InputError(
+        f"scene {path}: {name} has a {model} camera with coefficients that are not known here; undistort its images"
+        " with the program that made them"
+    )
 
 
 def _size(path: Path, name: str, settings: dict[str, Any], image: Path) -> tuple[int, int]:

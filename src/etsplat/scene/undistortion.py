@@ -1,0 +1,168 @@
+"""Scenes without lens distortion out of scenes with it, once and for all, with pycolmap (an extra)."""
+
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import torch
+
+from etsplat.core.errors import InputError
+from etsplat.io.atomic import write_error
+from etsplat.io.images import image_size
+from etsplat.scene.colmap import find_model
+from etsplat.scene.frames import find_mask, scaled_intrinsics
+from etsplat.scene.transforms import DistortedFrames, read_distorted_transforms
+
+
+def undistort_scene(scene: Path | str, out: Path | str, *, max_size: int = 1600) -> list[str]:
+    """Write a scene anew in COLMAP's layout without lens distortion: images, masks, cameras, points.
+
+    Args:
+        scene: folder with `images/` and `sparse/0/` (or `sparse/`), of any of COLMAP's camera models; or with
+            `transforms.json` of nerfstudio or instant-ngp. `masks/`, or the masks that it names, come along.
+        out: folder of the new scene; must not exist or be empty.
+        max_size: longer sides are shrunk to this many pixels.
+
+    Returns:
+        The names of the images. Every 8th is for testing, whatever `transforms.json` said.
+
+    Raises:
+        InputError: pycolmap is missing; there is no scene, or it cannot be read; images are missing; `out` cannot be
+            used; the disk is full.
+    """
+    pycolmap = import_pycolmap()
+    scene, out = Path(scene), Path(out)
+    colmap = find_model(scene)
+    if colmap is None and not (scene / "transforms.json").is_file():
+        raise InputError(f"scene {scene}: neither sparse/0/cameras.bin or .txt nor transforms.json; choose a scene")
+    check_new(out)
+    if colmap is not None:
+        model, photos, masks = _read_model(pycolmap, scene, colmap)
+    else:
+        frames = read_distorted_transforms(scene)
+        photos = frames.folder
+        model, masks = _make_model(pycolmap, frames), frames.masks
+    names = sorted(image.name for image in model.images.values() if image.has_pose)
+    with working_folder(out) as work:
+        undistort_model(pycolmap, model, photos, names, work, max_size)
+        if masks:
+            _undistort_masks(pycolmap, model, scene, masks, work, max_size)
+        os.replace(work / "scene", out)
+    return names
+
+
+def undistort_model(pycolmap: Any, model: Any, photos: Path, names: list[str], work: Path, max_size: int) -> None:
+    """Writes images/ and sparse/0/ of a model's images into WORK/scene."""
+    shutil.rmtree(work / "model", ignore_errors=True)
+    (work / "model").mkdir()
+    model.write(work / "model")
+    options = pycolmap.UndistortCameraOptions(max_image_size=max_size)
+    scene = work / "scene"
+    pycolmap.undistort_images(scene, work / "model", photos, names, undistort_options=options)
+    # Left of what COLMAP writes for its dense reconstruction are images/ and sparse/0/.
+    for entry in scene.iterdir():
+        if entry.name == "stereo":
+            shutil.rmtree(entry)
+        elif entry.is_file():
+            entry.unlink()
+    (scene / "sparse").rename(scene / "0")
+    (scene / "sparse").mkdir()
+    (scene / "0").rename(scene / "sparse" / "0")
+    written = sum((scene / "images" / name).is_file() for name in names)
+    if written < len(names):  # COLMAP reports nothing
+        raise InputError(f"{work.parent}: {written} of {len(names)} images could be written; is the disk full?")
+
+
+def check_new(out: Path) -> None:
+    """Raises InputError if `out` exists and is not an empty folder, or cannot be made."""
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InputError(f"{out}: is there already and not empty; choose another folder for the scene")
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise write_error(out, error) from error
+
+
+@contextmanager
+def working_folder(out: Path) -> Iterator[Path]:
+    """A folder beside `out` that is gone afterwards. What COLMAP and the system say of a full disk is an InputError."""
+    try:
+        with tempfile.TemporaryDirectory(prefix=f".{out.name}-", dir=out.parent) as work:
+            yield Path(work)
+    except OSError as error:
+        raise write_error(out, error) from error
+    except (RuntimeError, ValueError) as error:  # what pycolmap's C++ throws
+        if isinstance(error, InputError):
+            raise
+        detail = (str(error) or type(error).__name__).splitlines()[0]
+        raise InputError(f"{out}: COLMAP failed ({detail}); is the disk full?") from error
+
+
+def import_pycolmap() -> Any:
+    """The module.
+
+    Raises:
+        InputError: it is not installed.
+    """
+    try:
+        import pycolmap
+    except ImportError as error:
+        raise InputError(
+            "structure from motion and undistortion need pycolmap: pip install 'etsplat[sfm]' (or use COLMAP itself)"
+        ) from error
+    return pycolmap
+
+
+def _read_model(pycolmap: Any, scene: Path, folder: Path) -> tuple[Any, Path, dict[str, Path]]:
+    """A COLMAP scene's model, folder of images, and masks by the names of the images."""
+    try:
+        model = pycolmap.Reconstruction(folder)
+    except (ValueError, RuntimeError, OSError, LookupError) as error:  # what its C++ throws
+        raise InputError(f"scene {folder}: cannot be read as a model ({str(error).splitlines()[0]})") from error
+    names = sorted(image.name for image in model.images.values() if image.has_pose)
+    missing = [name for name in names if not (scene / "images" / name).is_file()]
+    if missing:
+        raise InputError(f"scene {scene}: {len(missing)} images are missing (first: {missing[0]}); copy them there")
+    masks = {name: find_mask(scene / "masks", name) for name in names} if (scene / "masks").is_dir() else {}
+    return model, scene / "images", masks
+
+
+def _make_model(pycolmap: Any, frames: DistortedFrames) -> Any:
+    """A model of frames with their lenses, at the size of their files, and of their points."""
+    model = pycolmap.Reconstruction()
+    for index, (name, frame, lens) in enumerate(zip(frames.names, frames.set.frames, frames.lenses, strict=True), 1):
+        size = image_size(frame.image)
+        K = scaled_intrinsics(frames.set.source, frame, size, size)
+        params = [float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]), *lens.coefficients]
+        camera = pycolmap.Camera(model=lens.model, width=size[0], height=size[1], params=params, camera_id=index)
+        model.add_camera_with_trivial_rig(camera)
+        image = pycolmap.Image(name=name, camera_id=index, image_id=index)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(frame.viewmat[:3].numpy()))
+    if frames.set.points is not None:
+        colors = frames.set.point_colors
+        bytes_ = (torch.full_like(frames.set.points, 0.5) if colors is None else colors).mul(255).round().byte()
+        for point, color in zip(frames.set.points.numpy(), bytes_.numpy(), strict=True):
+            model.add_point3D(point, pycolmap.Track(), color)
+    return model
+
+
+def _undistort_masks(pycolmap: Any, model: Any, scene: Path, masks: dict[str, Path], work: Path, max_size: int) -> None:
+    """Masks go the way of the images, under their names, into WORK/scene/masks."""
+    (work / "images").mkdir()
+    (work / "scene").rename(work / "whole")
+    named: dict[str, str] = {}
+    for image in model.images.values():
+        mask = masks[image.name]
+        named[image.name] = str(PurePosixPath(image.name).with_suffix(mask.suffix))
+        copy = work / "images" / named[image.name]
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(mask, copy)
+        image.name = named[image.name]
+    undistort_model(pycolmap, model, work / "images", sorted(named.values()), work, max_size)
+    (work / "scene" / "images").rename(work / "whole" / "masks")
+    shutil.rmtree(work / "scene")
+    (work / "whole").rename(work / "scene")
