@@ -12,6 +12,7 @@ from etsplat.bench.nvs_figures import draw_nvs
 from etsplat.bench.nvs_tables import nvs_tables, write_nvs_tables
 from etsplat.bench.paper_nvs import NVS, PER_SCENE, SCENES
 from etsplat.core.errors import InputError
+from etsplat.tasks.train_config import TrainConfig
 
 
 def row(scene, variant, psnr, **numbers):
@@ -88,6 +89,7 @@ def test_the_papers_scenes_get_their_settings_with_preset_paper(tmp_path):
     (tmp_path / "garden" / "images_4").mkdir(parents=True)
     garden = read_scene_argument(str(tmp_path / "garden"))
     cell = make_nvs_cells([garden], ["single-sided"], tmp_path / "out", preset="paper", culling=(True,), setting="")[0]
+    assert isinstance(cell.config, TrainConfig)
     assert (cell.config.max_triangles, cell.config.scene_type, cell.images) == (5_200_000, "outdoor", "images_4")
     assert cell.config.cull_small
     assert {scene.dataset for scene in SCENES.values()} == {"Mip-NeRF 360", "Tanks and Temples", "Deep Blending"}
@@ -113,6 +115,7 @@ def test_a_scene_says_its_kind_and_its_changes_after_a_colon(tmp_path):
         [scene], ["elastic"], tmp_path / "out", preset="quick", culling=(False,), setting="width=50,iterations=8"
     )[0]
     settings = cell.config
+    assert isinstance(settings, TrainConfig)
     assert (settings.scene_type, settings.width, settings.iterations) == ("indoor", 90, 8)
     assert settings.background == "white"
     with pytest.raises(InputError, match=r"indoors: no such folder; .*one of outdoor, indoor, object"):

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -20,7 +22,7 @@ def plan_for(rng, count=40, target=60, screen_size=None, dead=None, by="opacity"
         vertices,
         logits,
         sigma,
-        torch.zeros(count) if screen_size is None else screen_size,
+        torch.ones(count) if screen_size is None else screen_size,
         torch.zeros(count, dtype=torch.bool) if dead is None else dead,
         target=target,
         by=by,
@@ -86,7 +88,7 @@ def test_drawing_follows_the_weights(rng):
     for _ in range(300):
         logits, sigma = torch.tensor([0.0, -1.0986]), torch.tensor([0.3, 0.1])  # opacities 1/2 and 1/4
         vertices = torch.rand((2, 3, 3), generator=rng)
-        common = (torch.zeros(2), torch.zeros(2, dtype=torch.bool))
+        common = (torch.ones(2), torch.zeros(2, dtype=torch.bool))
         for column, by in enumerate(("opacity", "sharpness")):
             plan = densify_plan(
                 vertices, logits, sigma, *common, target=3, by=by, split_size=24, noise=1, generator=rng
@@ -191,3 +193,19 @@ def test_plans_that_do_not_fit_change_nothing(rng):
     with pytest.raises(ValueError, match="values"):
         apply_rows(plan, adam, {})
     assert adam.parameters["sigma_raw"] is value
+
+
+def test_whom_no_view_has_seen_stays_and_has_no_children(rng):
+    """With `keep_unseen` it outlives a trial in which it was never visible; without, it is useless."""
+    statistics = SoupStatistics.zeros(4)
+    seen = torch.tensor([[True, True, False, False]])
+    view = TriangleStatistics(0.5 * seen, 9.0 * seen, 4.0 * seen, seen)
+    for _ in range(3):
+        statistics.update(view, 3, epoch_starts=True)
+    opacities = torch.tensor([0.5, 0.001, 0.5, 0.001])
+    assert dead_triangles(opacities, statistics, RULES, 3).tolist() == [False, True, True, True]
+    keeping = replace(RULES, keep_unseen=True)
+    dead = dead_triangles(opacities, statistics, keeping, 3)
+    assert dead.tolist() == [False, True, False, True]
+    plan, _, _ = plan_for(rng, count=4, target=9, screen_size=statistics.screen_size, dead=dead)
+    assert set(plan.source[plan.fresh].tolist()) == {0}

@@ -87,12 +87,14 @@ class PruneRules:
         importance: its importance stays below it.
         views: it is larger than a pixel in fewer views than this.
         screen_size: it grows larger than this on some view's screen, in pixels.
+        keep_unseen: only triangles that some view saw during their trial are judged by it.
     """
 
     opacity: float
     importance: float
     views: int
     screen_size: float
+    keep_unseen: bool = False
 
 
 def dead_triangles(
@@ -109,6 +111,8 @@ def dead_triangles(
     useless = statistics.importance < rules.importance
     useless |= statistics.seen < rules.views
     useless |= statistics.screen_size > rules.screen_size
+    if rules.keep_unseen:
+        useless &= statistics.screen_size > 0
     return (opacities <= rules.opacity) | (useless & statistics.judged(views))
 
 
@@ -136,7 +140,7 @@ def densify_plan(
     Parents are drawn without replacement, with probabilities in proportion to opacity or 1/sigma. A parent that is
     larger on screen than `split_size` is split at the midpoints of its edges into four; a smaller one becomes two, one
     in its place and one shifted within its plane, both with opacity 1 - sqrt(1 - o), so that together they cover as
-    much as it did.
+    much as it did. Whom no view has seen since the last verdict has no children.
 
     Args:
         vertices: (N, 3, 3).
@@ -152,7 +156,7 @@ def densify_plan(
     """
     N = len(vertices)
     weights = torch.sigmoid(opacity_logits) if by == "opacity" else 1.0 / sigma
-    weights = torch.where(dead | ~weights.isfinite(), 0.0, weights)
+    weights = torch.where(dead | ~weights.isfinite() | (screen_size == 0), 0.0, weights)
     parents = _draw(weights, target - (N - int(dead.sum())), generator)
     large = screen_size[parents] > split_size
     cost = torch.where(large, SPLIT_PARTS - 1, 1).cumsum(0)

@@ -87,6 +87,12 @@ class TriangleSoup:
     def __len__(self) -> int:
         return len(self.vertices)
 
+    @torch.no_grad()
+    def joined(self, other: "TriangleSoup") -> "TriangleSoup":
+        """The triangles of both, in new learnable tensors."""
+        mine, theirs = self.parameters(), other.parameters()
+        return TriangleSoup(**{n: torch.cat([mine[n], theirs[n]]).requires_grad_(True) for n in self.PARAMETERS})
+
     def to(self, device: torch.device) -> "TriangleSoup":
         """The same soup on another device, its parameters leaf tensors as they are here."""
         moved = {name: p.detach().to(device).requires_grad_(p.requires_grad) for name, p in self.parameters().items()}

@@ -289,6 +289,7 @@ class SoupFitting:
             importance=config.prune_importance,
             views=0 if first else min(config.prune_views, len(self._capture.train)),
             screen_size=float("inf") if limit is None else limit,
+            keep_unseen=config.closed,
         )
         with torch.no_grad():
             dead = dead_triangles(

@@ -49,6 +49,7 @@ class SoupSchedule:
             size=config.lambda_size if iteration < config.at(config.densify_until) else 0.0,
             normal=config.lambda_normal if regular else 0.0,
             distortion=config.lambda_distortion if regular else 0.0,
+            unseen=not config.closed,
             pixel="l2" if self.squared else "l1",
         )
 

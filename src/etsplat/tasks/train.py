@@ -20,6 +20,7 @@ from etsplat.scene.demo_scene import demo_scene
 from etsplat.scene.device_views import stay_on
 from etsplat.scene.soup_files import SoupFile, save_soup
 from etsplat.scene.soup_init import StartPoints, random_points, start_soup
+from etsplat.scene.surroundings import SPHERE_TRIANGLES, surroundings
 from etsplat.scene.triangle_soup import TriangleSoup
 from etsplat.tasks.running import (
     Callback,
@@ -153,7 +154,10 @@ def start_fitting(
         sh_degree=config.sh_degree,
         centers=capture.centers[capture.train],
         limit=config.start_limit,
-    ).to(device or torch.device("cpu"))
+    )
+    if config.closed:
+        soup = soup.joined(surroundings(capture, config.sh_degree))
+    soup = soup.to(device or torch.device("cpu"))
     squared = config.scene_type == "outdoor" and not config.normalize and _span(points) > LARGE_SPAN
     return SoupFitting(soup, capture, config, generator, evaluate, squared=squared)
 
@@ -212,7 +216,8 @@ def _gib(count: int) -> str:
 
 
 def _start_count(capture: Capture, config: TrainConfig) -> int:
-    return config.start_points if capture.exact_points is None else len(capture.exact_points)
+    points = config.start_points if capture.exact_points is None else len(capture.exact_points)
+    return points + (SPHERE_TRIANGLES if config.closed else 0)
 
 
 def _start_points(capture: Capture, config: TrainConfig, generator: torch.Generator) -> StartPoints:
@@ -223,7 +228,7 @@ def _start_points(capture: Capture, config: TrainConfig, generator: torch.Genera
     else:
         grey = torch.full_like(positions, 0.5)
         points = StartPoints(positions, grey if colors is None else colors)
-    return points.with_sky() if config.sky_dome else points
+    return points.with_sky() if config.sky_dome and not config.closed else points
 
 
 def _background(config: TrainConfig) -> Float[Tensor, "3"]:

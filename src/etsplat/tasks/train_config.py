@@ -51,6 +51,8 @@ class TrainConfig:
     """Densification stops here."""
     sky_dome: bool = True
     """Start with 5 % more triangles, white, on a sphere around the scene."""
+    sky_closed: bool = False
+    """The dome is a closed, opaque sphere in the colours of the photos instead, and what no view sees stays there."""
     start_points: int = 100_000
     """So many random triangles to start from where the capture has no points."""
     start_scale: float = 2.23
@@ -150,6 +152,11 @@ class TrainConfig:
         """The rasterizer's distance that belongs to the method."""
         return "sdf" if self.method == "single-sided" else "barycentric"
 
+    @property
+    def closed(self) -> bool:
+        """Whether the scene is inside a closed sphere."""
+        return self.sky_dome and self.sky_closed
+
     def at(self, step: int) -> int:
         """The iteration of this run that an iteration of the schedule falls on."""
         return max(1, round(step * self.iterations / self.schedule_length)) if step > 0 else 0
@@ -212,6 +219,7 @@ _QUICK: dict[str, Any] = {
     "cull_small": False,
     "iterations": 6000,
     "max_triangles": 100_000,
+    "sky_closed": True,
     "start_limit": 0.4,
     "lr_vertices": 0.004,
     "lr_sh_dc": 0.01,
@@ -236,6 +244,7 @@ _PRESETS: dict[str, dict[str, Any]] = {
         "width": 64,
         "iterations": 200,
         "max_triangles": 2000,
+        "sky_closed": False,
         "start_points": 1000,
         "sh_degree": 1,
         "log_every": 20,
