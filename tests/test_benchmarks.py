@@ -1,6 +1,10 @@
 """The numbers that the benchmarks report mean what they say."""
 
 import json
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 import torch
@@ -129,3 +133,14 @@ def test_the_benchmark_says_that_there_is_no_gpu(monkeypatch):
 def test_kernels_are_listed_by_their_time():
     rows = gpu.kernel_table("quick", {"short": 0.001, "long": 2.0}).rows
     assert rows == [["long", "2000.0"], ["short", "1.0"]]
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_the_gpu_run_stops_where_there_is_no_gpu(tmp_path):
+    """Before it builds anything, with one line."""
+    script = Path(__file__).parent.parent / "benchmarks" / "gpu_run.sh"
+    environment = {**os.environ, "PYTHON": sys.executable, "OUT": str(tmp_path)}
+    result = subprocess.run(["bash", str(script)], capture_output=True, text=True, check=False, env=environment)
+    assert result.returncode == 1
+    assert result.stderr.strip() == "no GPU that torch can use"
+    assert result.stdout == ""

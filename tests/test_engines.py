@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from etsplat.core.errors import EngineUnavailableError, InputError
+from etsplat.cuda import device as cuda_device_module
 from etsplat.ops.engines import resolve_device, resolve_engine
 from simt.build import Simt
 
@@ -49,3 +50,11 @@ def test_without_a_gpu_tasks_run_on_the_cpu_unless_asked_otherwise():
     for device, engine in (("cuda", None), (None, "cuda")):
         with pytest.raises(EngineUnavailableError, match="engine='cpu'"):
             resolve_device(device, engine)
+
+
+def test_a_gpu_that_cannot_be_used_is_named_with_the_reason(monkeypatch, capsys):
+    """With a torch that is too old, say, tasks run on the CPU, and a line says why."""
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(cuda_device_module.torch, "__version__", "2.9.1+cu128")
+    assert resolve_device(None, None) == CPU
+    assert "computing on the CPU: the GPU engine needs torch 2.11 or newer, found 2.9.1" in capsys.readouterr().err

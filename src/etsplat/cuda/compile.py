@@ -116,7 +116,11 @@ def _store(path: Path, cubin: bytes) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".part", delete=False) as part:
             part.write(hashlib.sha256(cubin).digest() + cubin)
-        os.replace(part.name, path)
+        try:
+            os.replace(part.name, path)
+        except OSError:
+            os.unlink(part.name)
+            raise
     except OSError as error:
         print(f"compiled kernels cannot be kept in {path.parent} ({error}): set ETSPLAT_CACHE_DIR", file=sys.stderr)
 

@@ -1,5 +1,6 @@
 """Which engine runs an operation: ``reference`` (plain PyTorch), ``cpu`` or ``cuda`` (native, float32)."""
 
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -46,7 +47,7 @@ def resolve_device(device: str | None, engine: str | None) -> torch.device:
 
     Args:
         device: "cpu", "cuda", or None: where `engine` computes; if that is None too, on a GPU if there is one that
-            engine cuda can use.
+            engine cuda can use. Where there is one that it cannot use, a line says why.
         engine: as of `resolve_engine`.
 
     Raises:
@@ -62,7 +63,8 @@ def resolve_device(device: str | None, engine: str | None) -> torch.device:
             return torch.device("cpu")
         try:
             backend()
-        except EngineUnavailableError:
+        except EngineUnavailableError as error:
+            print(f"computing on the CPU: {error}", file=sys.stderr)
             return torch.device("cpu")
     backend()
     return torch.device(device_type())
