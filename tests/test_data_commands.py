@@ -3,6 +3,7 @@
 import builtins
 import errno
 import math
+import shutil
 import zipfile
 
 import numpy as np
@@ -43,6 +44,16 @@ def test_folders_that_cannot_be_used_are_input_errors(tmp_path):
         write_photo(tmp_path / "photos" / f"{name}.jpg", 16, 12)
     with pytest.raises(InputError, match="is there already"):
         find_cameras(tmp_path / "photos", tmp_path)
+
+
+def test_a_disk_too_small_is_found_before_it_is_full(tmp_path, monkeypatch):
+    pytest.importorskip("pycolmap")
+    for name in "abc":
+        write_photo(tmp_path / "photos" / f"{name}.jpg", 16, 12)
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=8 << 20))
+    with pytest.raises(InputError, match=r"3 photos may take 9 MiB there and 8 MiB are free"):
+        find_cameras(tmp_path / "photos", tmp_path / "scene")
 
 
 def test_photos_of_nothing_in_common_are_told_what_is_wrong_with_them(tmp_path):

@@ -8,13 +8,13 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from etsplat.bench.peers import PeerConfig
 from etsplat.core.cameras import Cameras
 from etsplat.core.errors import InputError
-from etsplat.io.atomic import atomic_write
+from etsplat.io.tensors import save_tensors
 from etsplat.scene.soup_init import StartPoints, spacing
 from etsplat.scene.triangle_soup import SH_CONSTANT
 
@@ -99,11 +99,7 @@ def splat(
 
 def save_gaussians(path: Path, gaussians: nn.ParameterDict) -> None:
     """Atomic. Raises InputError if the file cannot be written."""
-    with atomic_write(path) as temporary:
-        try:
-            save_file({name: gaussians[name].detach().cpu().contiguous() for name in NAMES}, temporary)
-        except SafetensorError as error:  # how safetensors reports what the system said, a full disk among it
-            raise OSError(f"{error}".splitlines()[0]) from error
+    save_tensors(path, {name: gaussians[name] for name in NAMES})
 
 
 def load_gaussians(path: Path, device: torch.device) -> nn.ParameterDict:

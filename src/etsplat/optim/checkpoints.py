@@ -5,11 +5,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 from torch import Tensor
 
 from etsplat.core.errors import InputError
-from etsplat.io.atomic import atomic_write
+from etsplat.io.tensors import save_tensors
 
 FORMAT = "etsplat checkpoint 1"
 KEEP = 2
@@ -49,12 +48,7 @@ def save_checkpoint(folder: Path, iteration: int, tensors: Mapping[str, Tensor],
     """
     path = checkpoint_path(folder, iteration)
     metadata = {"format": FORMAT, "iteration": str(iteration), "run_hash": run_hash}
-    whole = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    with atomic_write(path) as temporary:
-        try:
-            save_file(whole, temporary, metadata=metadata)
-        except SafetensorError as error:  # how safetensors reports what the system said, a full disk among it
-            raise OSError(f"{error}".splitlines()[0]) from error
+    save_tensors(path, tensors, metadata)
     for old in list_checkpoints(folder)[:-KEEP]:
         old.unlink(missing_ok=True)
     return path

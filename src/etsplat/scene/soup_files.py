@@ -7,10 +7,9 @@ from pathlib import Path
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 
 from etsplat.core.errors import InputError
-from etsplat.io.atomic import atomic_write
+from etsplat.io.tensors import save_tensors
 from etsplat.scene.soup_rendering import SoupAppearance
 from etsplat.scene.triangle_soup import TriangleSoup
 
@@ -51,12 +50,7 @@ def save_soup(path: Path | str, file: SoupFile) -> None:
         "appearance": json.dumps(appearance),
         "background": json.dumps(list(file.background)),
     }
-    tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in file.soup.parameters().items()}
-    with atomic_write(path) as temporary:
-        try:
-            save_file(tensors, temporary, metadata=metadata)
-        except SafetensorError as error:  # how safetensors reports what the system said, a full disk among it
-            raise OSError(f"{error}".splitlines()[0]) from error
+    save_tensors(path, file.soup.parameters(), metadata)
 
 
 def load_soup(path: Path | str) -> SoupFile:

@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import shutil
 import sqlite3
 import threading
 from collections.abc import Callable, Iterator
@@ -23,6 +24,8 @@ NEIGHBOURS = 15
 LEAST_SHARE = 0.25
 """If fewer of the photos can be placed, something is wrong with them, and there is no scene."""
 LEAST_COUNT = 3
+BYTES_PER_PHOTO = 3 << 20
+"""What COLMAP writes down of a photo at most: 8,192 features of 152 bytes, and its matches."""
 
 
 @dataclass(frozen=True)
@@ -68,6 +71,7 @@ def find_cameras(
     photos, out = Path(photos), Path(out)
     names = _photo_names(photos)
     check_new(out)
+    _check_space(photos, names, out)
     report = progress or (lambda phase, done, total: None)
     with working_folder(out) as work:
         model = _reconstruct(pycolmap, photos, names, work, matching, max_size, threads or -1, report)
@@ -164,6 +168,17 @@ def _photo_names(photos: Path) -> list[str]:
     if len(names) < LEAST_COUNT:
         raise InputError(f"photos {photos}: {len(names)} JPEG or PNG files; at least 3 are needed, better 20 or more")
     return names
+
+
+def _check_space(photos: Path, names: list[str], out: Path) -> None:
+    """COLMAP ends the whole process when its database finds the disk full, so it must not come to that."""
+    needed = len(names) * BYTES_PER_PHOTO + sum((photos / name).stat().st_size for name in names)
+    free = shutil.disk_usage(out.parent).free
+    if needed > free:
+        raise InputError(
+            f"cannot write {out}: {len(names)} photos may take {needed >> 20} MiB there and {free >> 20} MiB are free; "
+            "free some space on that disk or choose another folder"
+        )
 
 
 def _too_few(photos: Path, placed: int, count: int) -> str:

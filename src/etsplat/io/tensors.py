@@ -1,0 +1,37 @@
+"""Named tensors on disk, as safetensors files."""
+
+import os
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+from safetensors import SafetensorError
+from safetensors.torch import save_file
+from torch import Tensor
+
+from etsplat.io.atomic import atomic_write
+
+
+def save_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: dict[str, str] | None = None) -> None:
+    """Write tensors of any device under their names. Atomic.
+
+    Args:
+        path: ends in .safetensors.
+        tensors: by name.
+        metadata: text by name.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    whole = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+    with atomic_write(path) as temporary:
+        temporary.touch()
+        mode = temporary.stat().st_mode
+        try:
+            save_file(whole, temporary, metadata=metadata)
+        except SafetensorError as error:  # how safetensors reports what the system said, a full disk among it
+            number = re.search(r"os error (\d+)", str(error))
+            if number is None:
+                raise OSError(str(error).splitlines()[0]) from error
+            raise OSError(int(number[1]), os.strerror(int(number[1]))) from error
+        temporary.chmod(mode)  # safetensors makes files that only their owner may read
