@@ -125,6 +125,18 @@ def test_more_pairs_than_room(cuda_engine, rng, monkeypatch):
     assert int(_raster_capacity.overflow_flag(out.color.device)) == 0
 
 
+def test_a_repair_does_not_take_earlier_captures_for_smaller_scenes(cuda_device, monkeypatch):
+    """A graph that was captured before triangles multiplied does not multiply the room once more."""
+    for name in ("_seen", "_captured"):
+        monkeypatch.setattr(_raster_capacity, name, {})
+    shape = (1, 64, 64)
+    _raster_capacity.note_capture(cuda_device, shape, 100)
+    _raster_capacity.record_need(cuda_device, shape, 10_000, 50_000)
+    _raster_capacity.overflow_flag(cuda_device).fill_(80_000)
+    assert _raster_capacity.repair_overflow(cuda_device)
+    assert _raster_capacity.capacity_for(cuda_device, shape, 10_000) == 100_000
+
+
 def test_overflow_inside_a_graph_is_found_afterwards(simt, rng, monkeypatch):
     """Nothing is read while a graph is captured: the device remembers, and the repair makes room."""
     scene, cotangents = soup(rng, 80), {"color": torch.randn(2, 40, 48, 3, generator=rng)}

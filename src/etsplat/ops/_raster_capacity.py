@@ -24,7 +24,7 @@ _MOST = (1 << 30) - 1
 
 _seen: dict[tuple[torch.device, Shape], tuple[int, int]] = {}  # -> (triangles, pairs they needed at most)
 _overflow: dict[torch.device, Tensor] = {}
-_captured: dict[torch.device, set[tuple[Shape, int]]] = {}
+_captured: dict[torch.device, dict[Shape, int]] = {}  # -> triangles
 
 
 def capacity_for(device: torch.device, shape: Shape, triangles: int) -> int:
@@ -49,7 +49,7 @@ def record_need(device: torch.device, shape: Shape, triangles: int, pairs: int) 
 
 def note_capture(device: torch.device, shape: Shape, triangles: int) -> None:
     """A render of this shape is part of a captured graph."""
-    _captured.setdefault(device, set()).add((shape, triangles))
+    _captured.setdefault(device, {})[shape] = triangles
 
 
 def overflow_flag(device: torch.device) -> Tensor:
@@ -67,7 +67,8 @@ def repair_overflow(device: torch.device) -> bool:
     wanted = int(flag.item())
     if wanted == 0:
         return False
-    for shape, triangles in _captured.pop(device, set()):
-        record_need(device, shape, triangles, wanted)
+    for shape, triangles in _captured.pop(device, {}).items():
+        # What was captured before triangles multiplied may be gone: it must not look as if fewer needed so much.
+        record_need(device, shape, max(triangles, _seen.get((device, shape), (0, 0))[0]), wanted)
     flag.zero_()
     return True

@@ -67,12 +67,13 @@ class StepQueue:
         self._position = torch.zeros(1, dtype=torch.int64, device=device)
         self._losses = torch.zeros(MAX_STEPS, device=device)
         self._halted = torch.zeros((), dtype=torch.int32, device=device)
-        self._pool = memory_pool()
         self._repeated: dict[Hashable, Repeated] = {}
+        self.restart()
 
     def restart(self) -> None:
         """To be called when a tensor that the steps use was replaced: captures anew."""
         self._repeated.clear()
+        self._pool = memory_pool()  # torch takes no new graphs into a pool that has lost all of its own
 
     def run(self, steps: Sequence[QueuedStep]) -> list[float]:
         """Makes at most MAX_STEPS steps.
