@@ -12,8 +12,8 @@ from etsplat.scene.captures import load_capture
 from etsplat.scene.soup_files import SoupFile, save_soup
 from etsplat.scene.triangle_soup import TriangleSoup
 from etsplat.tasks.soup_run import SoupRun
-from etsplat.viewer import server
-from etsplat.viewer.follow import Followed
+from etsplat.viewer import follow, server
+from etsplat.viewer.follow import Followed, wait_for_soup
 from etsplat.viewer.pace import SMALLEST, Pace
 from etsplat.viewer.pictures import MODES, picture
 from etsplat.viewer.server import Viewer, camera_of
@@ -80,7 +80,7 @@ def test_pictures_shrink_until_moving_is_fluent_and_grow_back():
 
 def test_a_run_is_followed_through_its_files(tmp_path):
     folder = RunDirectory.create(tmp_path / "run", {"task": "train", "config": {"iterations": 100}})
-    followed = Followed(folder.path)
+    followed = Followed(folder.path, torch.device("cpu"))
     assert followed.poll() is None
     assert followed.status() == ""
     save_soup(folder.soup_path, SoupFile(make_soup(3)))
@@ -92,6 +92,31 @@ def test_a_run_is_followed_through_its_files(tmp_path):
     assert followed.status() == "running: iteration 50 of 100, 21.50 dB on test views"
     folder.soup_path.unlink()
     assert followed.poll() is None
+
+
+def test_a_run_that_is_about_to_begin_is_waited_for(tmp_path, monkeypatch):
+    """The folder appears, then the run in it, then its first soup: told what is waited for, once each."""
+    path, steps, told = tmp_path / "run", [], []
+
+    def happen(_):
+        steps.append(None)
+        if len(steps) == 2:
+            RunDirectory.create(path, {"task": "train", "config": {"iterations": 100}})
+        if len(steps) == 4:
+            save_soup(path / "soup.safetensors", SoupFile(make_soup(3)))
+
+    monkeypatch.setattr(follow.time, "sleep", happen)
+    wait_for_soup(path, told.append)
+    assert len(steps) == 4
+    waited = [text.split("waiting for ")[1] for text in told]
+    assert waited == ["`etsplat train` to begin there", "the first checkpoint"]
+    (tmp_path / "letters").mkdir()
+    (tmp_path / "letters" / "a.txt").write_text("dear")
+    with pytest.raises(InputError, match="is not a run"):
+        wait_for_soup(tmp_path / "letters", told.append)
+    RunDirectory.create(tmp_path / "mesh", {"task": "reconstruct", "config": {}})
+    with pytest.raises(InputError, match="no run of `etsplat train`"):
+        wait_for_soup(tmp_path / "mesh", told.append)
 
 
 def test_the_page_is_served_on_localhost(run):

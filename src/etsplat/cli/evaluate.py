@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import tyro
 
@@ -42,6 +42,8 @@ class Evaluate(Command):
     written anew."""
     scene: Path | None = None
     """The capture's folder, if it has moved or a file is given."""
+    device: Literal["cpu", "cuda"] | None = None
+    """Where it is drawn: cpu, cuda (an NVIDIA GPU), or None for cuda where there is one."""
     lpips_weights: Path | None = None
     """File with LPIPS's weights, or `download`; by default torch's cache is looked into."""
 
@@ -60,7 +62,7 @@ class Evaluate(Command):
         from etsplat.tasks.evaluate_soup import evaluate_run
         from etsplat.tasks.soup_run import open_run
 
-        opened = open_run(self.run_dir, self.scene)
+        opened = open_run(self.run_dir, self.scene, self.device)
         folder = RunDirectory(self.out or opened.folder)
         console = Console()
         with PhaseBar(console) as bar:

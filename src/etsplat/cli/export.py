@@ -31,6 +31,8 @@ class Export(Command):
     """The file to write; by default soup.FORMAT in the run's folder."""
     scene: Path | None = None
     """The capture's folder, if it has moved or a file is given: for colours as the cameras saw them, and for up."""
+    device: Literal["cpu", "cuda"] | None = None
+    """Where it is drawn: cpu, cuda (an NVIDIA GPU), or None for cuda where there is one."""
     settings: Settings = field(default_factory=ExportConfig)
 
     @classmethod
@@ -44,7 +46,7 @@ class Export(Command):
         from etsplat.tasks.export_soup import export_soup
         from etsplat.tasks.soup_run import open_run
 
-        opened = open_run(self.run_dir, self.scene)
+        opened = open_run(self.run_dir, self.scene, self.device)
         out = self.out or opened.folder / f"soup.{self.format}"
         if out.suffix != f".{self.format}":
             raise InputError(f"--out {out}: does not end in .{self.format}; rename it or change --format")

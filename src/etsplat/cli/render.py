@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, Literal
 
 import tyro
 
@@ -30,6 +30,8 @@ class Render(Command):
     """Folder for the pictures; by default renders/ in the run's folder."""
     scene: Path | None = None
     """The capture's folder, if it has moved or a file is given."""
+    device: Literal["cpu", "cuda"] | None = None
+    """Where it is drawn: cpu, cuda (an NVIDIA GPU), or None for cuda where there is one."""
     settings: Settings = field(default_factory=RenderConfig)
 
     @classmethod
@@ -45,7 +47,7 @@ class Render(Command):
         from etsplat.tasks.render_soup import render_run
         from etsplat.tasks.soup_run import open_run
 
-        opened = open_run(self.run_dir, self.scene)
+        opened = open_run(self.run_dir, self.scene, self.device)
         out = self.out or opened.folder / "renders"
         with PhaseBar(Console()) as bar:
             files = render_run(

@@ -4,7 +4,7 @@ import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, Literal
 
 import tyro
 
@@ -25,9 +25,11 @@ class View(Command):
     """
 
     run_dir: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(name="dir")]
-    """A run of `etsplat train`, finished or not; or a file with a soup."""
+    """A run of `etsplat train`, finished, in progress or about to begin; or a file with a soup."""
     scene: Path | None = None
     """The capture's folder, if it has moved or a file is given: for its cameras."""
+    device: Literal["cpu", "cuda"] | None = None
+    """Where it is drawn: cpu, cuda (an NVIDIA GPU), or None for cuda where there is one."""
     host: str = "localhost"
     """Address to listen on; 0.0.0.0 lets other machines look too."""
     port: int = 8080
@@ -42,13 +44,13 @@ class View(Command):
 
     def run(self, arguments: Sequence[str]) -> int:
         """Serves until Ctrl-C."""
-        from etsplat.io.run_directory import is_run
         from etsplat.tasks.soup_run import open_run
-        from etsplat.viewer.server import serve, wait_for_soup
+        from etsplat.viewer.follow import wait_for_soup
+        from etsplat.viewer.server import serve
 
-        if self.run_dir.is_dir() and is_run(self.run_dir):
-            wait_for_soup(self.run_dir, lambda text: print(text, flush=True))
-        opened = open_run(self.run_dir, self.scene)
+        if self.run_dir.is_dir() or not (self.run_dir.exists() or self.run_dir.suffix):  # a folder that is to come
+            wait_for_soup(self.run_dir, lambda text: print(f"{text} (Ctrl-C ends it)", flush=True))
+        opened = open_run(self.run_dir, self.scene, self.device)
         with contextlib.suppress(KeyboardInterrupt):
             serve(
                 opened,

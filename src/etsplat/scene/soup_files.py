@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 
 import torch
@@ -31,6 +31,10 @@ class SoupFile:
     appearance: SoupAppearance = field(default_factory=SoupAppearance)
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     notes: Mapping[str, str] = field(default_factory=dict)
+
+    def to(self, device: torch.device) -> "SoupFile":
+        """The same with its triangles on another device."""
+        return replace(self, soup=self.soup.to(device))
 
 
 def save_soup(path: Path | str, file: SoupFile) -> None:

@@ -15,7 +15,7 @@ from etsplat.core.errors import InputError
 from etsplat.io.atomic import write_error
 from etsplat.io.images import save_image, to_8_bit
 from etsplat.metrics.image import Lpips, find_lpips_weights, psnr, ssim
-from etsplat.ops.engines import num_threads, resolve_device, resolve_engine
+from etsplat.ops.engines import num_threads, resolve_engine
 from etsplat.scene.soup_rendering import render_soup
 from etsplat.tasks.running import device_name
 from etsplat.tasks.soup_run import SoupRun
@@ -34,16 +34,14 @@ def evaluate_run(
     lpips_weights: Path | str | None = None,
     pictures: Path | None = None,
     progress: Callable[[int, int], None] | None = None,
-    device: str | None = None,
 ) -> dict[str, Any]:
     """Measure a soup on the test views of its capture.
 
     Args:
-        run: with its capture.
+        run: with its capture; measured on its device.
         lpips_weights: as `etsplat.metrics.image.find_lpips_weights` takes it.
         pictures: folder for NAME.png of every test view: photograph, soup, opaque triangles, and the error times 4.
         progress: called with (views done, views in all).
-        device: "cpu", "cuda", or None for cuda where there is a GPU.
 
     Returns:
         Means over the test views by name: psnr and psnr_8bit (of renders rounded to 8 bits, as published numbers are),
@@ -52,7 +50,6 @@ def evaluate_run(
         circumstances. null where something could not be measured, `lpips_reason` says why.
 
     Raises:
-        EngineUnavailableError: `device` asks for a GPU, and something is missing.
         InputError: no capture, no test views, weights that cannot be read, `pictures` cannot be written to.
     """
     capture = run.needed_capture()
@@ -63,9 +60,8 @@ def evaluate_run(
             pictures.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise write_error(pictures, error) from error
-    place = resolve_device(device, None)
+    place, soup, appearance = run.device, run.file.soup, run.file.appearance
     lpips, reason = load_lpips(lpips_weights, place)
-    soup, appearance = run.file.soup.to(place), run.file.appearance
     background = torch.tensor(run.file.background)
     scorer = SoupScorer(capture, background, None, place)
     rows: list[dict[str, Any]] = []

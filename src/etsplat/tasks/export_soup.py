@@ -50,7 +50,7 @@ def export_soup(run: SoupRun, path: Path | str, config: ExportConfig) -> Export:
             f"{run.path}: no triangle is opaque enough; lower --min-opacity, or train with --finish opaque"
         )
     colors = _baked(run, config.colors)[kept]
-    vertices = soup.vertices.detach()[kept]
+    vertices = soup.vertices.detach()[kept].cpu()
     rotation = _rotation(run, config)
     if rotation is not None:
         vertices = (vertices.double() @ rotation.T).float()
@@ -73,13 +73,14 @@ def bake_colors(
     The weight is the largest blend weight of any pixel. A triangle that nobody sees has the part of its colour that is
     the same from every side.
     """
-    total, weight = torch.zeros(len(soup), 3), torch.zeros(len(soup), 1)
+    device = soup.vertices.device
+    total, weight = torch.zeros(len(soup), 3, device=device), torch.zeros(len(soup), 1, device=device)
     degree = soup.sh_degree if appearance.sh_degree is None else min(appearance.sh_degree, soup.sh_degree)
     for camera in cameras:
-        small = camera.scaled(min(1.0, BAKING_WIDTH / camera.width))
+        small = camera.scaled(min(1.0, BAKING_WIDTH / camera.width)).to(device)
         seen = render_soup(soup, small, appearance, statistics=True, engine=engine).statistics
         assert seen is not None
-        colors = soup_colors(soup.vertices, soup.sh_dc, soup.sh_rest, camera.centers, degree, engine=engine)[0]
+        colors = soup_colors(soup.vertices, soup.sh_dc, soup.sh_rest, small.centers, degree, engine=engine)[0]
         total += seen.max_weight[0, :, None] * colors.clamp(0, 1)
         weight += seen.max_weight[0, :, None]
     return torch.where(weight > 0, total / weight.clamp_min(1e-12), soup.display_colors())

@@ -101,15 +101,19 @@ def views_of(capture: Capture, config: RenderConfig) -> tuple[list[str], list[Ca
 
 @torch.no_grad()
 def draw(file: SoupFile, camera: Cameras, config: RenderConfig) -> dict[str, Float[Tensor, "H W *C"]]:
-    """The images of one camera by kind: color (H, W, 3); depth (H, W), 0 where nothing is; normal (H, W, 3)."""
-    background = torch.tensor(file.background)
+    """The images of one camera by kind: color (H, W, 3); depth (H, W), 0 where nothing is; normal (H, W, 3).
+
+    Drawn on the soup's device, returned on the CPU.
+    """
     soup, appearance = file.soup, file.appearance
+    device = soup.vertices.device
+    background, camera = torch.tensor(file.background, device=device), camera.to(device)
     pictures: dict[str, Tensor] = {}
     if config.opaque:
         color = render_soup_opaque(soup, camera, appearance, background=background)[0]
         pictures["color"] = color.clamp(0, 1)
     if config.opaque and not (config.depth or config.normals):
-        return pictures
+        return {"color": pictures["color"].cpu()}
     rendering = render_soup(
         soup,
         camera,
@@ -124,7 +128,7 @@ def draw(file: SoupFile, camera: Cameras, config: RenderConfig) -> dict[str, Flo
     if rendering.normal is not None:
         normals = torch.nn.functional.normalize(rendering.normal[0], dim=-1)
         pictures["normal"] = (0.5 + 0.5 * normals) * rendering.alpha[0]
-    return pictures
+    return {kind: picture.cpu() for kind, picture in pictures.items()}
 
 
 def depth_span(depth: Float[Tensor, "H W"]) -> tuple[float, float]:

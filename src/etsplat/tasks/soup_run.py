@@ -10,6 +10,7 @@ from torch import Tensor
 from etsplat.core.cameras import Cameras
 from etsplat.core.errors import InputError
 from etsplat.io.run_directory import RunDirectory, is_run
+from etsplat.ops.engines import resolve_device
 from etsplat.scene.captures import Capture, load_capture
 from etsplat.scene.demo_scene import demo_scene
 from etsplat.scene.soup_files import SoupFile, load_soup
@@ -34,6 +35,11 @@ class SoupRun:
     capture: Capture | None
 
     @property
+    def device(self) -> torch.device:
+        """Where the soup is, and pictures of it are drawn."""
+        return self.file.soup.vertices.device
+
+    @property
     def folder(self) -> Path:
         """Where results go unless told otherwise: the run directory, or the folder of the file."""
         return self.path if self.path.is_dir() else self.path.parent
@@ -49,20 +55,22 @@ class SoupRun:
         return self.capture
 
 
-def open_run(path: Path | str, scene: Path | str | None = None) -> SoupRun:
+def open_run(path: Path | str, scene: Path | str | None = None, device: str | None = None) -> SoupRun:
     """Open the run directory of `etsplat train`, or any file that `etsplat.scene.soup_import.open_soup` reads.
 
     Args:
         path: of the run or the file.
         scene: the capture's folder, where it has moved or is not known.
+        device: of the soup, and so of what is drawn of it: "cpu", "cuda", or None for cuda where there is a GPU.
 
     Raises:
+        EngineUnavailableError: `device` asks for a GPU, and something is missing.
         InputError: neither a run with a soup nor a readable file; the capture has gone.
     """
-    path = Path(path)
+    path, place = Path(path), resolve_device(device, None)
     if path.is_dir():
-        return _open_directory(path, scene)
-    return SoupRun(path, open_soup(path), None if scene is None else load_capture(scene, preload=False))
+        return _open_directory(path, scene, place)
+    return SoupRun(path, open_soup(path).to(place), None if scene is None else load_capture(scene, preload=False))
 
 
 def world_up(viewmats: Float[Tensor, "B 4 4"]) -> Float[Tensor, "3"] | None:
@@ -78,18 +86,19 @@ def training_cameras(capture: Capture) -> list[Cameras]:
     return [cameras[index] for index in capture.train]
 
 
-def _open_directory(path: Path, scene: Path | str | None) -> SoupRun:
+def _open_directory(path: Path, scene: Path | str | None, device: torch.device) -> SoupRun:
     if not is_run(path):
         raise InputError(f"{path}: is not a run of etsplat; name a folder that was given to --out, or a soup's file")
     if not (path / SOUP_NAME).is_file():
         raise InputError(f"{path}: has no {SOUP_NAME} (yet); name a run of `etsplat train` that got to a checkpoint")
+    file = load_soup(path / SOUP_NAME).to(device)
     config = RunDirectory(path).read_config()
     paths = config["paths"]
     source = scene or paths["source"]
     if source is None:
-        return SoupRun(path, load_soup(path / SOUP_NAME), None)
+        return SoupRun(path, file, None)
     if str(source) == DEMO:
-        return SoupRun(path, load_soup(path / SOUP_NAME), demo_scene())
+        return SoupRun(path, file, demo_scene())
     if not Path(source).is_dir():
         raise InputError(f"{path}: its scene {source} has gone; name where it is now with --scene")
     capture = load_capture(
@@ -99,7 +108,7 @@ def _open_directory(path: Path, scene: Path | str | None) -> SoupRun:
         masks=paths.get("masks"),
         preload=False,
     )
-    return SoupRun(path, load_soup(path / SOUP_NAME), capture)
+    return SoupRun(path, file, capture)
 
 
 def rotation_to_y_up(up: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:

@@ -1,17 +1,46 @@
 """Keeps up with a run that is still going on, through its files alone."""
 
+import time
+from collections.abc import Callable
 from pathlib import Path
 
+import torch
+
 from etsplat.core.errors import InputError
-from etsplat.io.run_directory import RunDirectory
+from etsplat.io.run_directory import RunDirectory, is_run
 from etsplat.scene.soup_files import SoupFile, load_soup
+
+WAITING_SECONDS = 1.0
+
+
+def wait_for_soup(folder: Path, announce: Callable[[str], None]) -> None:
+    """Returns when the run in a folder has written its first soup: the folder may be empty or not be there yet.
+
+    Args:
+        folder: of the run.
+        announce: told once what is waited for, and again when that changes.
+
+    Raises:
+        InputError: the folder holds something else.
+    """
+    if folder.is_dir() and any(folder.iterdir()) and not is_run(folder):
+        raise InputError(f"{folder}: is not a run of etsplat; name a folder given to --out, or a soup's file")
+    told = ""
+    while not RunDirectory(folder).soup_path.is_file():
+        begun = is_run(folder)
+        if begun and RunDirectory(folder).read_config()["task"] != "train":
+            raise InputError(f"{folder}: is no run of `etsplat train`; name another")
+        text = f"{folder}: waiting for " + ("the first checkpoint" if begun else "`etsplat train` to begin there")
+        if text != told:
+            announce(told := text)
+        time.sleep(WAITING_SECONDS)
 
 
 class Followed:
-    """The soup of a run directory, read anew whenever its file changes."""
+    """The soup of a run directory, read anew, onto a device, whenever its file changes."""
 
-    def __init__(self, folder: Path) -> None:
-        self._run = RunDirectory(folder)
+    def __init__(self, folder: Path, device: torch.device) -> None:
+        self._run, self._device = RunDirectory(folder), device
         self._seen = self._stamp()
 
     def poll(self) -> SoupFile | None:
@@ -20,7 +49,7 @@ class Followed:
         if stamp == self._seen:
             return None
         try:
-            file = load_soup(self._run.soup_path)
+            file = load_soup(self._run.soup_path).to(self._device)
         except InputError:  # the file went away in between: a run was started anew
             return None
         self._seen = stamp

@@ -31,7 +31,7 @@ def picture(file: SoupFile, camera: Cameras, mode: Mode) -> UInt8[Tensor, "H W 3
     in false colours, near is red; normals as (n + 1) / 2; wireframe the nearest triangles with their borders.
     """
     if mode == "wireframe":
-        return to_8_bit(_wireframe(file, camera))
+        return to_8_bit(_wireframe(file, camera).cpu())
     config = RenderConfig(opaque=mode == "opaque", depth=mode == "depth", normals=mode == "normal")
     pictures = draw(file, camera, config)
     if mode == "depth":
@@ -43,7 +43,8 @@ def _wireframe(file: SoupFile, camera: Cameras) -> Float[Tensor, "H W 3"]:
     """Flat triangles, dark where the triangle of the pixel to the right or below is another one."""
     soup, appearance = file.soup, file.appearance
     kept = appearance.opacities(soup) >= OPAQUE_FROM
-    image = torch.tensor(file.background).expand(camera.height, camera.width, 3)
+    camera = camera.to(soup.vertices.device)
+    image = torch.tensor(file.background).to(soup.vertices).expand(camera.height, camera.width, 3)
     if not bool(kept.any()):
         return image
     chosen = replace(soup, **{name: tensor[kept] for name, tensor in soup.parameters().items()})

@@ -7,7 +7,6 @@ width that `Pace` allows, and one of full width as soon as it stands still.
 import threading
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -65,7 +64,7 @@ class Viewer:
         self.server.on_client_connect(self._connected)
         self.server.on_client_disconnect(lambda client: self._disconnected(client.client_id))
         if run.path.is_dir():
-            threading.Thread(target=self._follow, args=(Followed(run.path),), daemon=True).start()
+            threading.Thread(target=self._follow, args=(Followed(run.path, run.device),), daemon=True).start()
 
     @property
     def port(self) -> int:
@@ -251,7 +250,7 @@ def _stand_at(client: Any, capture: Capture, index: int) -> None:
 
 def _stand_before(client: Any, file: SoupFile) -> None:
     """Without cameras: far enough away to see nine tenths of the triangles."""
-    centers = file.soup.vertices.mean(dim=1)
+    centers = file.soup.vertices.detach().mean(dim=1).cpu()
     middle = centers.median(dim=0).values
     distance = 2.5 * float(torch.quantile((centers - middle).norm(dim=1)[:1_000_000], 0.9))
     with client.atomic():
@@ -271,12 +270,3 @@ def _import_viser() -> Any:
     except ImportError as error:
         raise InputError("the viewer needs viser: pip install 'etsplat[viewer]'") from error
     return viser
-
-
-def wait_for_soup(folder: Path, announce: Callable[[str], None]) -> None:
-    """Returns when a run that has just begun has written its first soup."""
-    path = folder / "soup.safetensors"
-    if not path.is_file():
-        announce(f"{folder}: waiting for the first checkpoint")
-    while not path.is_file():
-        time.sleep(1.0)
