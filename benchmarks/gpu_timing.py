@@ -116,6 +116,15 @@ class _Nothing:
     """A backend whose launches do nothing."""
 
     device_type = "cpu"
+    capturing = False
+
+    def memory_pool(self) -> None:
+        """None."""
+
+    def capture(self, body: Callable[[], None], pool: Any) -> Callable[[], None]:
+        """The body itself."""
+        body()
+        return body
 
     def launch(self, *arguments: Any) -> None:
         """Nothing."""

@@ -9,7 +9,7 @@ import test_rasterize_fuzz as fuzz
 from _scenes import EVERYTHING, IMAGES, NO_CUTOFFS, gradients, mesh, prepare, soup
 from etsplat import rasterize
 from etsplat.cuda.launch import use_backend
-from etsplat.ops import _raster_capacity, _raster_render_cuda
+from etsplat.ops import _raster_capacity
 from simt.build import Simt
 from test_rasterize_engines import compare
 
@@ -143,8 +143,9 @@ def test_overflow_inside_a_graph_is_found_afterwards(simt, rng, monkeypatch):
     expected, _ = gradients(scene, "cuda", cotangents)
     for name, value in (("_seen", {}), ("_FIRST_ROOM", 20), ("_FIRST_PER_TRIANGLE", 0), ("_captured", {})):
         monkeypatch.setattr(_raster_capacity, name, value)
-    monkeypatch.setattr(_raster_render_cuda, "_capturing", lambda device: True)
-    gradients(scene, "cuda", cotangents)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Simt, "capturing", True)
+        gradients(scene, "cuda", cotangents)
     device = torch.device("cpu")
     assert int(_raster_capacity.overflow_flag(device)) > 20
     assert _raster_capacity.repair_overflow(device)

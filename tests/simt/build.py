@@ -7,11 +7,14 @@ import re
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+from etsplat.cuda.launch import pointers_to
 from etsplat.cuda.program import Program
+from simt.calls import Recording
 
 HERE = Path(__file__).resolve().parent
 FOLDER = HERE.parent.parent / "build" / "simt"
@@ -30,6 +33,23 @@ class Simt:
     def __init__(self, order_seed: int = 0) -> None:
         self.order_seed = order_seed
         self.launches: list[str] = []
+        self._recording: Recording | None = None
+
+    @property
+    def capturing(self) -> bool:
+        return self._recording is not None
+
+    def memory_pool(self) -> None:
+        """Recordings keep what they use."""
+
+    def capture(self, body: Callable[[], None], pool: None) -> Callable[[], None]:
+        """Records the launches and the operations of torch, on the memory that they had, while the body runs."""
+        with Recording() as self._recording:
+            try:
+                body()
+            finally:
+                recording, self._recording = self._recording, None
+        return recording.replay
 
     def launch(
         self,
@@ -37,12 +57,15 @@ class Simt:
         name: str,
         grid: tuple[int, int, int],
         block: tuple[int, int, int],
-        parameters: Any,
+        values: Sequence[Any],
     ) -> None:
+        if self._recording is not None:
+            kept = [type(value).from_buffer_copy(value) for value in values]
+            self._recording.steps.append(lambda: self.launch(program, name, grid, block, kept))
         self.launches.append(name)
         run = getattr(library(program.source), f"simt_launch_{name}")
         run.restype = ctypes.c_char_p
-        failure = run((ctypes.c_uint * 3)(*grid), (ctypes.c_uint * 3)(*block), parameters, self.order_seed)
+        failure = run((ctypes.c_uint * 3)(*grid), (ctypes.c_uint * 3)(*block), pointers_to(values), self.order_seed)
         if failure is not None:
             raise RuntimeError(f"{name} ({program}): {failure.decode()}")
 

@@ -1,8 +1,12 @@
-"""Which operations of torch a piece of code calls, and which of them would wait for a GPU."""
+"""What a piece of code calls of torch: to count it, or to do it again as a CUDA graph would."""
 
+from collections.abc import Callable
 from typing import Any
 
+import torch
+from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
 
 WAITING = ("_local_scalar_dense", "nonzero", "masked_select", "unique", "_unique2", "bincount", "equal")
 
@@ -21,3 +25,37 @@ class Calls(TorchDispatchMode):
     def waiting(self) -> int:
         """How many calls read something back."""
         return sum(name.split(".")[1] in WAITING for name in self.names)
+
+
+class Recording(TorchDispatchMode):
+    """Operations of torch within, to be done again on the memory that they had; whoever launches kernels adds these.
+
+    As in a CUDA graph numbers of the host are those of the recording, and reading something back is an error.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.steps: list[Callable[[], None]] = []
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        name, kwargs = str(func).split(".")[1], kwargs or {}
+        if name in WAITING:
+            raise RuntimeError(f"{name} waits for the device, which a graph cannot")
+        result = func(*args, **kwargs)
+
+        def again() -> None:
+            for old, new in zip(tree_leaves(result), tree_leaves(func(*args, **kwargs)), strict=True):
+                if isinstance(old, Tensor) and old.data_ptr() != new.data_ptr():
+                    old.copy_(new)
+
+        def keep(_: Any = result) -> None:
+            """Memory that was allocated is what kernels write to."""
+
+        self.steps.append(keep if "empty" in name else again)
+        return result
+
+    @torch.no_grad()
+    def replay(self) -> None:
+        """All of it in order."""
+        for step in self.steps:
+            step()

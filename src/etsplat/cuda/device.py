@@ -2,12 +2,14 @@
 
 import ctypes
 import importlib
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
 
 from etsplat.core.errors import EngineUnavailableError
 from etsplat.cuda.compile import INSTALL, compile_program, import_nvrtc, nvrtc_version
+from etsplat.cuda.launch import pointers_to
 from etsplat.cuda.program import Program
 
 OLDEST_TORCH = (2, 11)
@@ -33,7 +35,7 @@ class Device:
         name: str,
         grid: tuple[int, int, int],
         block: tuple[int, int, int],
-        parameters: Any,
+        values: Sequence[Any],
     ) -> None:
         """See ``etsplat.cuda.launch.Backend``."""
         device = torch.cuda.current_device()
@@ -41,14 +43,31 @@ class Device:
         if function is None:
             function = self._function(device, program, name)
         stream = torch.cuda.current_stream(device).cuda_stream
-        driver = self._driver
-        arguments = (function, *grid, *block, 0, stream, ctypes.addressof(parameters), 0)
+        driver, pointers = self._driver, pointers_to(values)
+        arguments = (function, *grid, *block, 0, stream, ctypes.addressof(pointers), 0)
         (status,) = driver.cuLaunchKernel(*arguments)
         if status == driver.CUresult.CUDA_ERROR_INVALID_CONTEXT:
             self._enter_context(device)
             (status,) = driver.cuLaunchKernel(*arguments)
         if status != driver.CUresult.CUDA_SUCCESS:
             raise RuntimeError(f"launch of {name} ({program}): {status.name}")
+
+    def capture(self, body: Callable[[], None], pool: Any) -> Callable[[], None]:
+        """See ``etsplat.cuda.launch.Backend``: a CUDA graph."""
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph, pool=pool):
+            body()
+        graph.replay()
+        return graph.replay
+
+    def memory_pool(self) -> Any:
+        """See ``etsplat.cuda.launch.Backend``."""
+        return torch.cuda.graph_pool_handle()
+
+    @property
+    def capturing(self) -> bool:
+        """See ``etsplat.cuda.launch.Backend``: also of graphs that others capture."""
+        return torch.cuda.is_current_stream_capturing()
 
     def _enter_context(self, device: int) -> None:
         """Make torch's context current in this thread: in those of autograd it may not be so yet."""

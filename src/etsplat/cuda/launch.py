@@ -11,7 +11,7 @@ On a device the kernel goes to torch's current stream of the current device; not
 """
 
 import ctypes
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Any, Protocol
 
@@ -35,9 +35,25 @@ class Backend(Protocol):
         name: str,
         grid: tuple[int, int, int],
         block: tuple[int, int, int],
-        parameters: Any,
+        values: Sequence[Any],
     ) -> None:
-        """Run kernel ``name``; ``parameters`` is a ctypes array of pointers to the arguments (may be reused after)."""
+        """Run kernel ``name``; ``values`` are its arguments as ctypes values, which may change afterwards."""
+        ...
+
+    def capture(self, body: Callable[[], None], pool: Any) -> Callable[[], None]:
+        """Do what ``body`` queues, once, and return what does it again without calling it.
+
+        ``pool`` is from ``memory_pool``; see ``etsplat.cuda.graph.Repeated``.
+        """
+        ...
+
+    def memory_pool(self) -> Any:
+        """Memory that captures can share."""
+        ...
+
+    @property
+    def capturing(self) -> bool:
+        """Whether a capture is under way: nothing can be read back then."""
         ...
 
 
@@ -88,9 +104,8 @@ def launch(program: Program, name: str, grid: Dim, block: Dim, args: Sequence[An
     if 0 in grid:
         return
     values = [_argument(arg) for arg in args]
-    pointers = (ctypes.c_void_p * len(values))(*(ctypes.addressof(value) for value in values))
     with on_device_of(next((arg for arg in args if isinstance(arg, Tensor)), None)):
-        backend().launch(program, name, grid, block, pointers)
+        backend().launch(program, name, grid, block, values)
 
 
 def on_device_of(tensor: Tensor | None) -> AbstractContextManager[Any]:
@@ -98,6 +113,11 @@ def on_device_of(tensor: Tensor | None) -> AbstractContextManager[Any]:
     if tensor is None or not tensor.is_cuda or tensor.device.index == torch.cuda.current_device():
         return _NOWHERE_ELSE
     return torch.cuda.device(tensor.device)
+
+
+def pointers_to(values: Sequence[Any]) -> Any:
+    """What drivers want of arguments: a ctypes array of pointers to them."""
+    return (ctypes.c_void_p * len(values))(*(ctypes.addressof(value) for value in values))
 
 
 def blocks(count: int, size: int) -> int:

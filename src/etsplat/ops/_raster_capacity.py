@@ -15,6 +15,8 @@ Kernels of such a step that change parameters should do nothing while the flag i
 import torch
 from torch import Tensor
 
+from etsplat.cuda.launch import backend
+
 Shape = tuple[int, int, int]  # views, width, height
 
 _FIRST_PER_TRIANGLE = 4
@@ -55,7 +57,7 @@ def note_capture(device: torch.device, shape: Shape, triangles: int) -> None:
 def overflow_flag(device: torch.device) -> Tensor:
     """(1,) int64 on the device: 0, or the largest number of pairs that did not fit since it was last repaired."""
     if device not in _overflow:
-        if device.type == "cuda" and torch.cuda.is_current_stream_capturing():
+        if backend().capturing:
             raise RuntimeError("rasterize: render once before capturing a graph, so that kernels and buffers are ready")
         _overflow[device] = torch.zeros(1, dtype=torch.int64, device=device)
     return _overflow[device]

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from etsplat.core.kernels import DISTANCES, KERNELS
 from etsplat.core.rasterization import DISTORTION_FAR, DISTORTION_NEAR, RasterizeSettings, TriangleStatistics
-from etsplat.cuda.launch import blocks, launch
+from etsplat.cuda.launch import backend, blocks, launch
 from etsplat.cuda.memory import Arena, PendingNumber
 from etsplat.cuda.program import Program
 from etsplat.cuda.sort import RadixSort
@@ -128,7 +128,7 @@ class Render:
 
     def forward(self) -> None:
         """Render; again with more room if the pairs did not fit."""
-        count, capturing = self.plan.geometry.count, _capturing(self.device)
+        count, capturing = self.plan.geometry.count, backend().capturing
         flag = overflow_flag(self.device)
         if capturing:
             note_capture(self.device, self.shape, count)
@@ -322,10 +322,6 @@ def _stride(flat: int, corner: int, distortion: int) -> int:
     """Floats of a slot: ``SlotLayout`` of csrc/math/raster_records.h."""
     size = 11 + flat + (12 + 3 * corner if corner > 0 or distortion == 1 else 0) + (distortion == 2)
     return blocks(size, 16) * 16
-
-
-def _capturing(device: torch.device) -> bool:
-    return device.type == "cuda" and torch.cuda.is_current_stream_capturing()
 
 
 def _device(inputs: list[Tensor | None]) -> torch.device:

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from etsplat.cuda.graph import Repeated, memory_pool
-from etsplat.cuda.launch import launch
+from etsplat.cuda.graph import Repeated
+from etsplat.cuda.launch import backend, launch
 from etsplat.cuda.program import Program
 from etsplat.ops._raster_capacity import overflow_flag, repair_overflow
 
@@ -73,7 +73,7 @@ class StepQueue:
     def restart(self) -> None:
         """To be called when a tensor that the steps use was replaced: captures anew."""
         self._repeated.clear()
-        self._pool = memory_pool()  # torch takes no new graphs into a pool that has lost all of its own
+        self._pool = backend().memory_pool()  # torch takes no new graphs into a pool that has lost all of its own
 
     def run(self, steps: Sequence[QueuedStep]) -> list[float]:
         """Makes at most MAX_STEPS steps.
