@@ -156,6 +156,7 @@ def _resize(folder):
     write_photo(folder / "images" / "0002.jpg", 16, 16)
 
 
+@pytest.mark.parametrize("memory", [None, 1])  # kept, and streamed
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
@@ -166,11 +167,11 @@ def _resize(folder):
         (lambda folder: (folder / "sparse" / "0" / "images.txt").write_text(""), "no registered image"),
     ],
 )
-def test_damaged_captures_are_one_line_input_errors(tmp_path, damage, message):
+def test_damaged_captures_are_one_line_input_errors(tmp_path, damage, message, memory):
     write_colmap(tmp_path, [(16, 12)] * 4)
     damage(tmp_path)
     with pytest.raises(InputError, match=message) as raised:
-        load_capture(tmp_path)
+        load_capture(tmp_path, memory=memory)
     assert "\n" not in str(raised.value)
 
 

@@ -24,8 +24,10 @@ class TensorboardWriter:
         """Take in an event of the run."""
         if isinstance(event, StepEvent):
             if self._writer is None:  # not before the run directory has been made
-                self._writer = self._make(str(self._folder))
+                # What a run that was killed wrote beyond its last checkpoint is hidden.
+                self._writer = self._make(str(self._folder), purge_step=event.iteration)
             for name, value in {"loss": event.loss, **event.state, **event.metrics}.items():
                 self._writer.add_scalar(name, value, event.iteration)
+            self._writer.flush()  # a run may end at any moment
         elif isinstance(event, DoneEvent) and self._writer is not None:
             self._writer.close()

@@ -96,7 +96,7 @@ class CaptureImages:
             self._future(index)
 
     def preload(self, progress: Callable[[int, int], None] | None = None) -> None:
-        """Decode everything, if it fits; so that damaged files are found now.
+        """Decode everything once, so that damaged files are found now, and keep it, if it fits.
 
         Args:
             progress: called with (images decoded, images in all).
@@ -104,10 +104,7 @@ class CaptureImages:
         Raises:
             InputError: a file is damaged.
         """
-        if self.streamed:
-            self.expect(range(len(self)))
-            return
-        futures = [self._future(index) for index in range(len(self))]
+        futures = [self._check(index) if self.streamed else self._future(index) for index in range(len(self))]
         try:
             for done, future in enumerate(as_completed(futures), 1):
                 future.result()
@@ -116,6 +113,12 @@ class CaptureImages:
         finally:
             for future in futures:
                 future.cancel()
+
+    def _check(self, index: int) -> Future[None]:
+        def decode() -> None:
+            _decode(self._frames[index], self.sizes[index])
+
+        return self._pool.submit(decode)
 
     def _picture(self, index: int) -> Picture:
         if not 0 <= index < len(self):
