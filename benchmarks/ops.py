@@ -8,19 +8,23 @@ import math
 import statistics
 import time
 from collections.abc import Callable
+from functools import partial
 
 import torch
 from rich.console import Console
 from rich.table import Table
 
-from etsplat.core.cameras import intrinsics, look_at
+from etsplat.core.cameras import Cameras, intrinsics, look_at
 from etsplat.geometry.topology import MeshTopology
 from etsplat.ops.adam import Adam
-from etsplat.ops.engines import num_threads, set_num_threads
+from etsplat.ops.engines import num_threads, one_torch_thread, set_num_threads
 from etsplat.ops.mesh_energies import mesh_energies
+from etsplat.ops.normal_consistency import normal_consistency
 from etsplat.ops.photometric import l1_over_background
 from etsplat.ops.rasterize_hard import rasterize_hard, render_opaque
+from etsplat.ops.soup_activation import soup_activation
 from etsplat.ops.spherical_harmonics import spherical_harmonics
+from etsplat.ops.triangle_channels import triangle_channels
 
 Operation = tuple[str, str, Callable[[], object]]
 
@@ -93,6 +97,37 @@ def training(size: int, vertices: torch.Tensor, faces: torch.Tensor) -> list[Ope
     ]
 
 
+def soup_losses(size: int, vertices: torch.Tensor, faces: torch.Tensor) -> list[Operation]:
+    """What preset paper of novel-view synthesis adds to a step; and in PyTorch, on one thread, as training has it."""
+    corners = vertices[faces].clone().requires_grad_()
+    viewmats = look_at(torch.tensor([[0.3, 0.4, 3.2]]), torch.zeros(3), torch.tensor([0.0, 1.0, 0.0])).float()
+    camera = Cameras(viewmats, intrinsics(40.0, size, size).float()[None], size, size)
+    normals, depth = torch.rand(1, size, size, 3).requires_grad_(), (2 + torch.rand(1, size, size, 1)).requires_grad_()
+    alpha, logits = torch.rand(1, size, size, 1), torch.randn(len(faces)).requires_grad_()
+
+    def agreement(engine: str) -> None:
+        normals.grad = depth.grad = None
+        with one_torch_thread():
+            normal_consistency(normals, depth, alpha, camera.viewmats, camera.Ks, engine=engine).backward()
+
+    def channels(engine: str) -> None:
+        corners.grad = None
+        with one_torch_thread():
+            triangle_channels(corners, viewmats, depth=True, normals=True, engine=engine).sum().backward()
+
+    def activation(engine: str) -> None:
+        logits.grad = None
+        with one_torch_thread():
+            opacities, _ = soup_activation(corners, logits, logits.detach(), (0.0, math.inf), camera, engine=engine)
+            opacities.sum().backward()
+
+    pixels, triangles = f"{size} x {size}", f"{len(faces):,} triangles"
+    named = [("normal_consistency", pixels, agreement), ("triangle_channels", triangles, channels)]
+    named.append(("soup_activation", triangles, activation))
+    engines = {"cpu": ", with gradient", "reference": ", in PyTorch"}
+    return [(name + tail, at, partial(run, engine)) for name, at, run in named for engine, tail in engines.items()]
+
+
 def milliseconds(operation: Callable[[], object], repeats: int) -> list[float]:
     operation()
     times = []
@@ -117,7 +152,7 @@ def main() -> None:
     table = Table(title=f"Operations beside the rasterizer, {num_threads()} threads, {arguments.repeats} runs each")
     for name, justify in [("operation", "left"), ("size", "left"), ("median ms", "right"), ("best ms", "right")]:
         table.add_column(name, justify=justify, no_wrap=True)
-    for build in (rendering, training):
+    for build in (rendering, training, soup_losses):
         for name, shape, operation in build(arguments.size, vertices, faces):
             times = milliseconds(operation, arguments.repeats)
             table.add_row(name, shape, f"{statistics.median(times):.2f}", f"{min(times):.2f}")

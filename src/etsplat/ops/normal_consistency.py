@@ -107,6 +107,7 @@ class _NormalConsistency(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad_loss: Tensor) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        by_normals, by_depth = ctx.saved_tensors
-        scale = -float(grad_loss) / by_depth.numel()
-        return by_normals * scale, by_depth * scale, None, None, None
+        derivatives = ctx.saved_tensors
+        scale = -float(grad_loss) / derivatives[1].numel()
+        grads = (torch.mul(tensor, scale, out=empty_image(*tensor.shape)) for tensor in derivatives)
+        return *grads, None, None, None
