@@ -22,7 +22,7 @@ struct NormalsKernels {
     using Band = double (*)(const NormalsPass&, int64_t first, int64_t last, float* scratch);
     Band band;
 
-    static int64_t scratch_size(int64_t width) { return 22 * width; }  // floats
+    static int64_t scratch_size(int64_t width) { return 18 * width; }  // floats
 };
 
 }  // namespace etsplat

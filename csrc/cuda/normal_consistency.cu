@@ -16,13 +16,13 @@ struct DepthNormals {
 __device__ long long pixel_count(const DepthNormals& p) { return static_cast<long long>(p.height) * p.width; }
 
 // Of the pixel at row and column of a view; zeros on the border and outside.
-__device__ Agreement agreement_at(const DepthNormals& p, const DepthView& view, int b, int row, int column) {
+__device__ Agreement<float> agreement_at(const DepthNormals& p, const DepthView& view, int b, int row, int column) {
     if (row < 1 || row >= p.height - 1 || column < 1 || column >= p.width - 1) return {};
     const long long at = b * pixel_count(p) + static_cast<long long>(row) * p.width + column;
-    const DepthCross z{p.depth[at - p.width], p.depth[at + p.width], p.depth[at - 1], p.depth[at + 1]};
+    const DepthCross<float> z{p.depth[at - p.width], p.depth[at + p.width], p.depth[at - 1], p.depth[at + 1]};
     const float* n = p.normals + 3 * at;
     const float y = static_cast<float>(row), x = static_cast<float>(column);
-    return agreement(view, depth_slopes(view, z, y, x), {n[0], n[1], n[2]}, p.alpha[at]);
+    return agreement(view, depth_slopes(view, z, y, x), Vector3<float>{n[0], n[1], n[2]}, p.alpha[at]);
 }
 
 // Grid: (blocks of a view, views). Sums of the agreement.

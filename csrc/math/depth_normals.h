@@ -12,18 +12,25 @@ namespace etsplat {
 struct DepthView {
     float rotation[9], inverse_fx, inverse_fy, cx, cy;
 
-    ETSPLAT_FN float ray_x(float column) const { return (column + 0.5f - cx) * inverse_fx; }
-    ETSPLAT_FN float ray_y(float row) const { return (row + 0.5f - cy) * inverse_fy; }
-
-    ETSPLAT_FN Vector3<float> to_camera(Vector3<float> v) const {
-        const float* r = rotation;
-        return {r[0] * v.x + r[1] * v.y + r[2] * v.z, r[3] * v.x + r[4] * v.y + r[5] * v.z,
-                r[6] * v.x + r[7] * v.y + r[8] * v.z};
+    template <class T>
+    ETSPLAT_FN T ray_x(T column) const {
+        return (column + T(0.5f - cx)) * T(inverse_fx);
     }
-    ETSPLAT_FN Vector3<float> to_world(Vector3<float> v) const {
+    template <class T>
+    ETSPLAT_FN T ray_y(T row) const {
+        return (row + T(0.5f - cy)) * T(inverse_fy);
+    }
+    template <class T>
+    ETSPLAT_FN Vector3<T> to_camera(Vector3<T> v) const {
         const float* r = rotation;
-        return {r[0] * v.x + r[3] * v.y + r[6] * v.z, r[1] * v.x + r[4] * v.y + r[7] * v.z,
-                r[2] * v.x + r[5] * v.y + r[8] * v.z};
+        return {T(r[0]) * v.x + T(r[1]) * v.y + T(r[2]) * v.z, T(r[3]) * v.x + T(r[4]) * v.y + T(r[5]) * v.z,
+                T(r[6]) * v.x + T(r[7]) * v.y + T(r[8]) * v.z};
+    }
+    template <class T>
+    ETSPLAT_FN Vector3<T> to_world(Vector3<T> v) const {
+        const float* r = rotation;
+        return {T(r[0]) * v.x + T(r[3]) * v.y + T(r[6]) * v.z, T(r[1]) * v.x + T(r[4]) * v.y + T(r[7]) * v.z,
+                T(r[2]) * v.x + T(r[5]) * v.y + T(r[8]) * v.z};
     }
 };
 
@@ -40,36 +47,41 @@ ETSPLAT_FN DepthView depth_view(const float* viewmat, const float* K) {
 }
 
 // Depths of the four neighbours of a pixel.
+template <class T>
 struct DepthCross {
-    float above, below, left, right;
+    T above, below, left, right;
 };
 
+template <class T>
 struct DepthSlopes {
-    Vector3<float> down, right;
+    Vector3<T> down, right;
 };
 
 // Of the points in the camera's axes.
-ETSPLAT_FN DepthSlopes depth_slopes(const DepthView& view, DepthCross z, float row, float column) {
-    const float x = view.ray_x(column), y = view.ray_y(row);
-    return {{x * (z.below - z.above), view.ray_y(row + 1.0f) * z.below - view.ray_y(row - 1.0f) * z.above,
+template <class T>
+ETSPLAT_FN DepthSlopes<T> depth_slopes(const DepthView& view, const DepthCross<T>& z, T row, T column) {
+    const T x = view.ray_x(column), y = view.ray_y(row), one(1.0f);
+    return {{x * (z.below - z.above), view.ray_y(row + one) * z.below - view.ray_y(row - one) * z.above,
              z.below - z.above},
-            {view.ray_x(column + 1.0f) * z.right - view.ray_x(column - 1.0f) * z.left, y * (z.right - z.left),
+            {view.ray_x(column + one) * z.right - view.ray_x(column - one) * z.left, y * (z.right - z.left),
              z.right - z.left}};
 }
 
+template <class T>
 struct Agreement {
-    float value;
-    Vector3<float> by_normal;  // in the world
-    DepthSlopes by_slopes;
+    T value;
+    Vector3<T> by_normal;  // in the world
+    DepthSlopes<T> by_slopes;
 };
 
-ETSPLAT_FN Agreement agreement(const DepthView& view, DepthSlopes slopes, Vector3<float> normal, float alpha) {
-    const Vector3<float> across = cross(slopes.down, slopes.right);
-    const float square = dot(across, across);
-    const float inverse = square > 0.0f ? 1.0f / vsqrt(square) : 0.0f;
-    const Vector3<float> unit = inverse * across, toward = alpha * view.to_camera(normal);
-    const float value = dot(toward, unit);
-    const Vector3<float> by_across = inverse * (toward - value * unit);
+template <class T>
+ETSPLAT_FN Agreement<T> agreement(const DepthView& view, const DepthSlopes<T>& slopes, Vector3<T> normal, T alpha) {
+    const Vector3<T> across = cross(slopes.down, slopes.right);
+    const T square = dot(across, across);
+    const T inverse = vselect(square > T(0.0f), T(1.0f) / vsqrt(vmax(square, T(1e-38f))), T(0.0f));
+    const Vector3<T> unit = inverse * across, toward = alpha * view.to_camera(normal);
+    const T value = dot(toward, unit);
+    const Vector3<T> by_across = inverse * (toward - value * unit);
     return {value, view.to_world(alpha * unit), {cross(slopes.right, by_across), cross(by_across, slopes.down)}};
 }
 
