@@ -112,3 +112,18 @@ def test_without_the_extra_frames_are_offered_and_nothing_is_left(run, tmp_path,
 def test_a_file_without_its_scene_says_what_to_name(run, tmp_path):
     with pytest.raises(InputError, match="--scene"):
         render_run(SoupRun(tmp_path / "soup.ply", run.file, None), tmp_path / "out", RenderConfig())
+
+
+def test_a_disk_that_fills_while_a_video_is_written_is_one_line_and_leaves_nothing(tmp_path, monkeypatch):
+    ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    broken = tmp_path / "ffmpeg"
+    broken.write_text("#!/bin/sh\necho 'av_interleaved_write_frame(): No space left on device' >&2\nexit 228\n")
+    broken.chmod(0o755)
+    monkeypatch.setattr(ffmpeg, "get_ffmpeg_exe", lambda: str(broken))
+    with (
+        pytest.raises(InputError, match=r"a\.mp4: No space left on device; free some space"),
+        open_video(tmp_path / "a.mp4", 30) as append,
+    ):
+        for _ in range(50):
+            append(torch.zeros(64, 64, 3))
+    assert [path.name for path in tmp_path.iterdir()] == ["ffmpeg"]

@@ -1,9 +1,13 @@
 """MP4 files, through imageio-ffmpeg (an extra)."""
 
+import errno
+import os
+import subprocess
+import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from jaxtyping import Float
@@ -35,22 +39,35 @@ def open_video(path: Path | str, fps: int) -> Iterator[VideoSink]:
         raise InputError(
             "MP4 needs imageio-ffmpeg: pip install 'etsplat[video]', or write single frames with --format frames"
         ) from error
-    writer: Any = None
-    with atomic_write(path) as temporary:
+    encoder: subprocess.Popen[bytes] | None = None
+    with atomic_write(path) as temporary, tempfile.TemporaryFile() as complaints:
 
         def append(frame: Float[Tensor, "H W 3"]) -> None:
-            nonlocal writer
+            nonlocal encoder
             height, width = (size // 2 * 2 for size in frame.shape[:2])
-            pixels = np.ascontiguousarray(to_8_bit(frame[:height, :width]).cpu().numpy())
-            if writer is None:
-                writer = imageio_ffmpeg.write_frames(
-                    str(temporary), (width, height), fps=fps, quality=8, macro_block_size=2, ffmpeg_log_level="error"
-                )
-                writer.send(None)
-            writer.send(pixels)
+            if encoder is None:
+                command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error", "-f", "rawvideo"]
+                command += ["-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", str(fps), "-i", "-"]
+                command += ["-c:v", "libx264", "-crf", "10", "-pix_fmt", "yuv420p", str(temporary)]
+                encoder = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=complaints)
+            assert encoder.stdin is not None
+            with suppress(BrokenPipeError):  # it has given up: why is told at the end
+                encoder.stdin.write(np.ascontiguousarray(to_8_bit(frame[:height, :width]).cpu().numpy()).tobytes())
 
         try:
             yield append
         finally:
-            if writer is not None:
-                writer.close()
+            if encoder is not None:
+                with suppress(BrokenPipeError):
+                    encoder.communicate()  # ends its input and waits
+        if encoder is not None and encoder.returncode != 0:
+            complaints.seek(0)
+            raise _error(complaints.read().decode(errors="replace"))
+
+
+def _error(complaints: str) -> OSError:
+    """What the encoder said, as the system's error if it is one."""
+    for number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        if os.strerror(number) in complaints:
+            return OSError(number, os.strerror(number))
+    return OSError(complaints.strip().splitlines()[-1] if complaints.strip() else "the encoder failed")
