@@ -120,10 +120,12 @@ def test_a_disk_that_fills_while_a_video_is_written_is_one_line_and_leaves_nothi
     broken.write_text("#!/bin/sh\necho 'av_interleaved_write_frame(): No space left on device' >&2\nexit 228\n")
     broken.chmod(0o755)
     monkeypatch.setattr(ffmpeg, "get_ffmpeg_exe", lambda: str(broken))
-    with (
-        pytest.raises(InputError, match=r"a\.mp4: No space left on device; free some space"),
-        open_video(tmp_path / "a.mp4", 30) as append,
-    ):
-        for _ in range(50):
-            append(torch.zeros(64, 64, 3))
+
+    def write():
+        with open_video(tmp_path / "a.mp4", 30) as append:
+            for _ in range(50):
+                append(torch.zeros(64, 64, 3))
+
+    with pytest.raises(InputError, match=r"a\.mp4: No space left on device; free some space"):
+        write()
     assert [path.name for path in tmp_path.iterdir()] == ["ffmpeg"]
