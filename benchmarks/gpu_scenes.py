@@ -23,6 +23,7 @@ class GpuScene:
     vertices: Tensor
     faces: Tensor | None
     colors: Tensor | None
+    corner_colors: Tensor | None
     sh: tuple[Tensor, Tensor] | None
     opacities: Tensor
     sigma: Tensor
@@ -33,7 +34,7 @@ class GpuScene:
     @property
     def leaves(self) -> list[Tensor]:
         """What gradients are asked for."""
-        colors = [self.colors] if self.colors is not None else list(self.sh or ())
+        colors = [t for t in (self.colors, self.corner_colors, *(self.sh or ())) if t is not None]
         return [self.vertices, *colors, self.opacities, self.sigma]
 
     def render(self) -> Rasterization:
@@ -47,7 +48,7 @@ class GpuScene:
             colors = soup_colors(self.vertices, *self.sh, centers, 3, engine=engine)
         return etsplat.rasterize(
             self.vertices, colors, self.opacities, self.sigma, self.viewmats, self.Ks, width, height, faces=self.faces,
-            validate=False, engine=engine,
+            corner_colors=self.corner_colors, validate=False, engine=engine,
         )  # fmt: skip
 
 
@@ -64,7 +65,8 @@ def load(name: str, device: str) -> GpuScene:
         name,
         leaf(scene.vertices),
         None if scene.faces is None else scene.faces.to(device),
-        leaf(scene.colors),
+        None if scene.colors is None else leaf(scene.colors),
+        None if scene.corner_colors is None else leaf(scene.corner_colors),
         None,
         leaf(scene.opacities),
         leaf(scene.sigma),
@@ -93,6 +95,7 @@ def _large_soup(device: torch.device) -> GpuScene:
     return GpuScene(
         "soup4m",
         vertices.requires_grad_(),
+        None,
         None,
         None,
         sh,

@@ -11,7 +11,7 @@ import torch
 from benchmarks.machine import cores
 from benchmarks.memory import memory
 from benchmarks.prototype import Prototype
-from benchmarks.scenes import Scene
+from benchmarks.scenes import VERTEX_COLORS, Scene, load
 from etsplat import _native
 from etsplat.core.kernels import KERNELS
 
@@ -81,22 +81,36 @@ def check_same_picture(scene: Scene, prototype: Prototype) -> float:
     return difference
 
 
+def yardstick(scene: Scene, threads: int, instruction_set: str, prototype: Prototype) -> tuple[str, Any] | None:
+    """What a scene is compared with, and a call that gives the milliseconds of one turn of it."""
+    if scene.name.endswith(VERTEX_COLORS):
+        constant = load(scene.name.removesuffix(VERTEX_COLORS))
+        return "constant colours", lambda: one_turn(constant).total
+    if prototype.program is not None and scene.name.startswith("sphere") and instruction_set == "avx512":
+        return "prototype", lambda: prototype.milliseconds(int(scene.name[6:]), threads)
+    return None
+
+
+def one_turn(scene: Scene) -> Timings:
+    """Timed repetitions after one that warms up."""
+    turn = Timings()
+    for warm in range(SAMPLES + 1):
+        repetition(scene, turn if warm else Timings())
+    return turn
+
+
 def measure(
     scene: Scene, threads: int, instruction_set: str, repeats: int, prototype: Prototype, with_memory: bool
 ) -> dict[str, Any]:
     """One entry of the JSON file."""
-    level = int(scene.name[6:]) if scene.name.startswith("sphere") else None
-    compare = prototype.program is not None and level is not None and instruction_set == "avx512"
+    other = yardstick(scene, threads, instruction_set, prototype)
     ours, turns, theirs, ratios = Timings(), [], [], []
     for _ in range(repeats):
-        if compare:
-            theirs.append(prototype.milliseconds(level, threads))
-        turn = Timings()
-        for warm in range(SAMPLES + 1):
-            repetition(scene, turn if warm else Timings())
-        turns.append(turn)
-        if compare:
-            ratios.append(statistics.median(turn.total) / statistics.median(theirs[-1]))
+        if other:
+            theirs.append(other[1]())
+        turns.append(one_turn(scene))
+        if other:
+            ratios.append(statistics.median(turns[-1].total) / statistics.median(theirs[-1]))
     for turn in turns:
         ours.forward += turn.forward
         ours.backward += turn.backward
@@ -114,12 +128,13 @@ def measure(
         "backward": summary(ours.backward),
         "stages": {name: summary(values) for name, values in ours.stages.items()},
     }
-    if compare:
+    if other:
         flat = [value for values in theirs for value in values]
         ratio = entry["milliseconds"]["median"] / statistics.median(flat)
-        entry["prototype"] = summary(flat)
+        entry["yardstick"] = {"name": other[0], **summary(flat)}
         entry["ratio"] = {"median": ratio, "low": min(ratios), "high": max(ratios)}
-        entry["picture_difference"] = check_same_picture(scene, prototype)
+        if other[0] == "prototype":
+            entry["picture_difference"] = check_same_picture(scene, prototype)
     derive(entry, ours, count(scene), min(threads, cores()))
     if with_memory:
         entry["memory"] = memory(scene.name, threads, instruction_set)

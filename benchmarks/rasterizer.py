@@ -5,6 +5,7 @@ python -m benchmarks.rasterizer --scene sphere6 --instruction-set all --repeats 
 
 Spheres are compared with the prototype in ../shared/prototypes, where that is there: it is built into build/bench and
 run in turn with the engine, so that both see the same moods of the machine. A turn is three timed repetitions of each.
+Scenes with colours at the vertices ("sphere6-vertex") are compared with themselves under constant colours, in turn too.
 Counters, memory and the serial part are described in docs/performance.md.
 """
 
@@ -29,9 +30,9 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     sets = _native.available_instruction_sets()
     parser.add_argument("--threads", type=int, nargs="+", default=sorted({1, machine.cores()}), help="default: 1, all")
     parser.add_argument("--repeats", type=int, default=5, help="turns of three repetitions")
-    parser.add_argument("--scene", nargs="+", default=list(scenes.NAMES), help="sphere<level>, soup<triangles>")
+    parser.add_argument("--scene", nargs="+", default=list(scenes.NAMES), help="see benchmarks.scenes")
     parser.add_argument(
-        "--instruction-set", choices=[*sets, "all"], help="default: the widest, and the others on sphere6 alone"
+        "--instruction-set", choices=[*sets, "all"], help="default: the widest, and the others on sphere6"
     )
     parser.add_argument("--no-prototype", action="store_true", help="measure the engine alone")
     parser.add_argument("--no-memory", action="store_true", help="leave out the growth of a fresh process")
@@ -43,7 +44,8 @@ def plan(options: argparse.Namespace) -> list[tuple[str, list[str]]]:
     """Instruction sets, and the scenes to measure on each."""
     widest, *others = _native.available_instruction_sets()
     if options.instruction_set is None:
-        return [(widest, options.scene), *((name, [s for s in options.scene if s == "sphere6"]) for name in others)]
+        few = [scene for scene in options.scene if scene.startswith("sphere6")]
+        return [(widest, options.scene), *((name, few) for name in others)]
     chosen = [widest, *others] if options.instruction_set == "all" else [options.instruction_set]
     return [(name, options.scene) for name in chosen]
 
@@ -58,7 +60,7 @@ def run(options: argparse.Namespace, prototype: Prototype, console: Console) -> 
                 with_memory = not options.no_memory and threads == max(options.threads)
                 entry = measure(scene, threads, instruction_set, options.repeats, prototype, with_memory)
                 entries.append(entry)
-                ratio = f", {entry['ratio']['median']:.2f} of the prototype" if "ratio" in entry else ""
+                ratio = f", {entry['ratio']['median']:.2f} of {entry['yardstick']['name']}" if "ratio" in entry else ""
                 ms = entry["milliseconds"]["median"]
                 console.print(f"{name} {instruction_set} {threads} threads: {ms:.1f} ms{ratio}", highlight=False)
     return entries

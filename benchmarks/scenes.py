@@ -12,7 +12,8 @@ from etsplat.core.rasterization import Rasterization
 from etsplat.geometry.icosphere import icosphere
 
 SIZE = 1024
-NAMES = ("sphere4", "sphere5", "sphere6", "sphere7", "soup100000")
+VERTEX_COLORS = "-vertex"  # at the end of a name: colours at the vertices instead of constant ones
+NAMES = ("sphere4", "sphere5", "sphere6", "sphere7", "soup100000", "sphere6-vertex")
 
 
 @dataclass
@@ -22,7 +23,8 @@ class Scene:
     name: str
     vertices: Tensor
     faces: Tensor | None
-    colors: Tensor
+    colors: Tensor | None
+    corner_colors: Tensor | None
     opacities: Tensor
     sigma: Tensor
     viewmats: Tensor
@@ -32,31 +34,46 @@ class Scene:
     @property
     def leaves(self) -> tuple[Tensor, ...]:
         """What gradients are asked for."""
-        return self.vertices, self.colors, self.opacities, self.sigma
+        colors = self.corner_colors if self.colors is None else self.colors
+        assert colors is not None
+        return self.vertices, colors, self.opacities, self.sigma
 
     def render(self) -> Rasterization:
         """One call of the public API."""
         return etsplat.rasterize(
-            self.vertices, self.colors, self.opacities, self.sigma, self.viewmats, self.Ks, SIZE, SIZE, faces=self.faces
+            self.vertices,
+            self.colors,
+            self.opacities,
+            self.sigma,
+            self.viewmats,
+            self.Ks,
+            SIZE,
+            SIZE,
+            faces=self.faces,
+            corner_colors=self.corner_colors,
         )
 
 
 def load(name: str) -> Scene:
-    """Scene "sphere<level>" or "soup<number of triangles>"."""
-    match = re.fullmatch(r"(sphere|soup)(\d+)", name)
+    """Scene "sphere<level>" or "soup<number of triangles>", "-vertex" after it or not."""
+    match = re.fullmatch(rf"(sphere|soup)(\d+)({VERTEX_COLORS})?", name)
     if match is None:
-        raise SystemExit(f"no scene {name}: choose sphere<level> or soup<number of triangles>")
+        raise SystemExit(f"no scene {name}: choose sphere<level> or soup<triangles>, {VERTEX_COLORS} after it or not")
     builder = displaced_sphere if match[1] == "sphere" else random_soup
     vertices, faces, colors, opacities, sigma = builder(int(match[2]))
-    for leaf in (vertices, colors, opacities, sigma):
-        leaf.requires_grad_()
+    corner_colors = None
+    if match[3]:
+        colors, corner_colors = None, 0.5 + 0.5 * vertices
     generator = torch.Generator().manual_seed(1)
     cotangent = torch.rand(1, SIZE, SIZE, 3, generator=generator) - 0.5
     viewmats = torch.eye(4)[None].clone()
     viewmats[0, 2, 3] = 3.0
     focal = 1.3 * SIZE
     Ks = torch.tensor([[[focal, 0.0, SIZE / 2], [0.0, focal, SIZE / 2], [0.0, 0.0, 1.0]]])
-    return Scene(name, vertices, faces, colors, opacities, sigma, viewmats, Ks, cotangent)
+    scene = Scene(name, vertices, faces, colors, corner_colors, opacities, sigma, viewmats, Ks, cotangent)
+    for leaf in scene.leaves:
+        leaf.requires_grad_()
+    return scene
 
 
 def displaced_sphere(level: int) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:

@@ -7,6 +7,7 @@ replaces what stands between the lines `<!-- results -->` and `<!-- end of resul
 
 import argparse
 import json
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -55,13 +56,15 @@ def times(entries: list[dict[str, Any]]) -> Table:
                 f"{ms['median']:.1f}",
                 f"{ms['low']:.1f}-{ms['high']:.1f}",
                 f"{ms['best']:.1f}",
-                f"{e['prototype']['median']:.1f}" if ratio else "",
+                e["yardstick"]["name"] if ratio else "",
+                f"{e['yardstick']['median']:.1f}" if ratio else "",
                 f"{ratio['median']:.2f}" if ratio else "",
                 f"{ratio['low']:.2f}-{ratio['high']:.2f}" if ratio else "",
             ]
         )
-    columns = ["scene", "instructions", "threads", "ms", "quartiles", "best", "prototype ms", "ratio", "of each turn"]
-    return Table("Forward + backward through the public API, and the prototype in turn with it", columns, rows)
+    columns = ["scene", "instructions", "threads", "ms", "quartiles", "best", "in turn with", "its ms"]
+    columns += ["ratio", "of each turn"]
+    return Table("Forward + backward through the public API, and what ran in turn with it", columns, rows)
 
 
 def stages(entries: list[dict[str, Any]]) -> Table:
@@ -114,7 +117,7 @@ def scaling(entries: list[dict[str, Any]]) -> Table:
         counts, ms = e["counts"], e["milliseconds"]["median"]
         vectors = counts["forward_vectors"] + counts["backward_vectors"]
         growth = ["", "", ""]
-        if before is not None and before["scene"][:6] == e["scene"][:6]:
+        if before is not None and _family(before["scene"]) == _family(e["scene"]):
             old = before["counts"]
             growth = [
                 f"{e['triangles'] / before['triangles']:.2f}",
@@ -137,6 +140,11 @@ def scaling(entries: list[dict[str, Any]]) -> Table:
     columns = ["scene", "triangles", "(triangle, tile) pairs", "vectors", "ms", "ns per triangle", "ns per pair"]
     columns += ["ns per vector", "growth of triangles / pairs / time"]
     return Table(f"Time against work, {first}, {threads} threads", columns, rows)
+
+
+def _family(scene: str) -> str:
+    """The name without numbers."""
+    return re.sub(r"\d", "", scene)
 
 
 def all_tables(results: dict[str, Any]) -> list[Table]:

@@ -65,6 +65,31 @@ def test_colors_alone(engine, kernel, distance, rng):
     compare(mesh(rng), engine, rng, images=("color",), kernel=kernel, distance=distance)
 
 
+def with_interpolated_colors(scene, rng):
+    """Colours at the vertices, or at the corners of separate triangles, instead of constant ones."""
+    shape = (*scene["vertices"].shape[:-1], 3)
+    return {name: value for name, value in scene.items() if name != "colors"} | {
+        "corner_colors": torch.rand(shape, generator=rng)
+    }
+
+
+@pytest.mark.parametrize("layout", ["per_corner", "per_vertex"])
+def test_interpolated_colors_alone(engine, kernel, distance, layout, rng):
+    """The same with interpolated colours, which have a path of their own."""
+    scene = with_interpolated_colors(mesh(rng) if layout == "per_vertex" else soup(rng, 150), rng)
+    compare(scene, engine, rng, images=("color",), kernel=kernel, distance=distance, statistics=True)
+
+
+@pytest.mark.parametrize("case", ["frozen incentre", "tiny", "huge", "saturated"])
+def test_interpolated_colors_at_the_extremes(engine, kernel, case, rng):
+    """Triangles of a tenth of a pixel, some larger than the image, pixels that stop; the incentre held."""
+    scene = with_interpolated_colors(soup(rng, 80, size={"tiny": 0.01, "huge": 3.0}.get(case, 1.5)), rng)
+    if case == "saturated":
+        scene["opacities"] = torch.ones(80)
+    options = {"distance": "sdf", "freeze_incentre": True} if case == "frozen incentre" else {}
+    compare(scene, engine, rng, IMAGES[:1], 10.0 if case == "tiny" else 1.0, kernel=kernel, **options)
+
+
 @pytest.mark.parametrize("image", IMAGES)
 def test_each_image_alone(engine, image, rng):
     """Also when an image is asked for that no cotangent reaches."""

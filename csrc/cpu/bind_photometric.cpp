@@ -9,12 +9,6 @@
 
 namespace etsplat {
 
-int64_t photometric_scratch_size(int64_t width) {
-    constexpr int64_t taps = 11, pad = 30;
-    const int64_t n = 3 * width;
-    return 2 * taps * (n + pad) + 7 * taps * n + 5 * (n + pad) + 5 * n;
-}
-
 namespace {
 
 PhotometricSums photometric(const PhotometricPass& pass, int64_t views) {

@@ -4,6 +4,8 @@
 
 #include <cstdint>
 
+#include "math/portable.h"
+
 namespace etsplat {
 
 constexpr int64_t kBandRows = 32;  // rows of an image that a thread takes at a time
@@ -30,6 +32,11 @@ struct PhotometricKernels {
     Band band;
 };
 
-int64_t photometric_scratch_size(int64_t width);  // floats
+// floats
+ETSPLAT_FN int64_t photometric_scratch_size(int64_t width) {
+    constexpr int64_t taps = 11, pad = 30;
+    const int64_t n = 3 * width;
+    return 2 * taps * (n + pad) + 7 * taps * n + 5 * (n + pad) + 5 * n;
+}
 
 }  // namespace etsplat

@@ -69,7 +69,7 @@ void fill_pass(RasterState& state) {
     pass.slot_layout.flat_channels = call.flat_channels;
     pass.slot_layout.corner_channels = call.corner_channels;
     pass.slot_layout.attributes = pass.attributes;
-    pass.slot_layout.centroid_z = pass.want_distortion && call.centroid_depth;
+    pass.slot_layout.depth = pass.distortion_depth;
     state.pass = pass;
 }
 
@@ -173,7 +173,7 @@ std::shared_ptr<RasterState> raster_forward(const RasterCall& call) {
         state->slot_weight.fill_zero();
         pass.slot_weight = state->slot_weight.data();
     }
-    run_tiles(*state, active_raster_kernels().forward[pass.kernel][pass.general()]);
+    run_tiles(*state, active_raster_kernels().forward[pass.kernel][static_cast<int>(pass.shape())]);
     if (call.max_weight) reduce_weights(*state);
     clock.lap(Stage::kForward);
     return state;
@@ -196,7 +196,7 @@ void raster_backward(RasterState& state, const RasterGradients& gradients) {
         state.tile_background.resize(int64_t{pass.tiles_x} * pass.tiles_y * pass.channels());
         pass.tile_background = state.tile_background.data();
     }
-    run_tiles(state, active_raster_kernels().backward[pass.kernel][pass.general()]);
+    run_tiles(state, active_raster_kernels().backward[pass.kernel][static_cast<int>(pass.shape())]);
     clock.lap(Stage::kBackward);
     reduce_gradients(state, gradients);
     clock.lap(Stage::kReduce);

@@ -12,7 +12,11 @@
 namespace etsplat {
 
 constexpr int kBlocks = 16;  // blocks in a tile, and lanes in a block
-constexpr int kMaxFastChannels = 3;
+constexpr int kFastChannels = 3;
+
+// What the tile loops are compiled for: three constant channels, three interpolated ones, or anything.
+enum class Shape : int { kFlat, kCorner, kGeneral };
+constexpr int kShapes = 3;
 
 struct TileEntry {
     int32_t triangle;
@@ -56,7 +60,10 @@ struct RasterPass {
     float* tile_background = nullptr;        // (tiles, channels) or null
 
     int channels() const { return flat_channels + corner_channels; }
-    bool general() const { return channels() != kMaxFastChannels || corner_channels > 0 || want_distortion || want_median; }
+    Shape shape() const {
+        if (channels() != kFastChannels || want_distortion || want_median) return Shape::kGeneral;
+        return corner_channels == 0 ? Shape::kFlat : flat_channels == 0 ? Shape::kCorner : Shape::kGeneral;
+    }
     // floats of scratch memory that a tile loop needs
     int64_t scratch_size() const { return 16384 + int64_t{768} * channels() + 64 * slot_layout.stride(); }
 };
@@ -74,8 +81,8 @@ using TileCounter = void (*)(const RasterPass& pass, int tile, float* scratch, T
 using EvaluationLoop = void (*)(const float* x, int count, float exponent, float scale, float* out);
 
 struct RasterKernels {
-    TileFunction forward[4][2];  // [kernel][general]
-    TileFunction backward[4][2];
+    TileFunction forward[4][kShapes];  // [kernel][shape]
+    TileFunction backward[4][kShapes];
     // diagnostics [kernel]
     TileCounter count[4];
     EvaluationLoop value_loop[4], gradient_loop[4];

@@ -41,21 +41,27 @@ __device__ __forceinline__ BackwardPixel load_pixel(const RasterPass& pass, cons
     return p;
 }
 
+__device__ __forceinline__ void add_moments(const Forms& f, int k, float grad_form, float (&sums)[kStride]) {
+    sums[SlotLayout::kMoment + k] += grad_form;
+    sums[SlotLayout::kMomentX + k] += grad_form * f.dx;
+    sums[SlotLayout::kMomentY + k] += grad_form * f.dy;
+}
+
 // The interpolated channels and the distortion at one pixel.
 struct Extras {
     Interpolation<float> at;
-    float inverse_z = 0.0f, coordinate = 0.0f, grad_value[3] = {};
+    float inverse_z = 0.0f, coordinate = 0.0f, grad_value[3] = {}, mean = 0.0f;
 
     // Their part of the cotangent of the blend weight.
     __device__ __forceinline__ float cotangent(const RasterPass& pass, const Staged& s, const Forms& f,
                                                float first_inverse_z, const BackwardPixel& p) {
         float result = 0.0f;
         if (kAttributes) {
-            at.evaluate(s.attributes.get(), f.dx, f.dy);
+            at.evaluate(s.attributes.get(), f.form);
             inverse_z = at.inverse_z_sum / at.sum;
             for (int c = 0; c < CORNER; ++c)
                 for (int k = 0; k < 3; ++k) grad_value[k] = vfma(p.grad[FLAT + c], s.corner[k * CORNER + c], grad_value[k]);
-            for (int k = 0; k < 3; ++k) result = vfma(at.weight[k], grad_value[k], result);
+            result = mean = at.mean(grad_value[0], grad_value[1], grad_value[2]);
         }
         if (DISTORTION != 0) {
             if (DISTORTION == 2) inverse_z = 1.0f / s.centroid_z;
@@ -72,17 +78,18 @@ struct Extras {
         if (DISTORTION != 0) {
             grad_inverse_z = p.grad_distortion * distortion_slope(pass.distortion_near, pass.distortion_far, coordinate, w,
                                                                   p.total_weight, p.total_first);
-            if (DISTORTION == 2) sums[kLayout.depth()] = -grad_inverse_z * inverse_z * inverse_z;
+            if (DISTORTION == 2) sums[kLayout.centroid()] = -grad_inverse_z * inverse_z * inverse_z;
         }
         if (!kAttributes) return;
         InterpolationGradient<float> gradient;
-        gradient.evaluate(s.attributes.get(), at, w, grad_value, DISTORTION == 1, grad_inverse_z, inverse_z);
+        gradient.evaluate(s.attributes.get(), at, w, grad_value, mean, DISTORTION == 1, grad_inverse_z, inverse_z);
+        const float share = w * at.inverse;
         for (int k = 0; k < 3; ++k) {
-            for (int c = 0; c < CORNER; ++c) sums[kLayout.corner() + k * CORNER + c] = w * at.weight[k] * p.grad[FLAT + c];
-            sums[kLayout.inverse_z() + k] = gradient.inverse_z[k];
-            sums[kLayout.barycentric() + k] = gradient.barycentric[k];
-            sums[kLayout.barycentric() + 3 + k] = gradient.barycentric[k] * f.dx;
-            sums[kLayout.barycentric() + 6 + k] = gradient.barycentric[k] * f.dy;
+            for (int c = 0; c < CORNER; ++c)
+                sums[kLayout.corner() + k * CORNER + c] = share * at.product[k] * p.grad[FLAT + c];
+            sums[kLayout.product() + k] = gradient.log_product[k];
+            if (DISTORTION == 1) sums[kLayout.plane() + k] = gradient.log_weight[k];
+            add_moments(f, k, gradient.form[k], sums);
         }
     }
 };
@@ -119,12 +126,7 @@ __device__ __forceinline__ void differentiate(const RasterPass& pass, const Stag
     sums[SlotLayout::kOpacity] = grad_alpha * kernel.value;
     sums[SlotLayout::kSigma] = grad_kernel * kernel.dsigma;
     const int largest = f.form[0] >= f.x ? 0 : f.form[1] >= f.x ? 1 : 2;
-    for (int k = 0; k < 3; ++k) {
-        const float part = k == largest ? grad_x : 0.0f;
-        sums[SlotLayout::kMoment + k] = part;
-        sums[SlotLayout::kMomentX + k] = part * f.dx;
-        sums[SlotLayout::kMomentY + k] = part * f.dy;
-    }
+    for (int k = 0; k < 3; ++k) add_moments(f, k, k == largest ? grad_x : 0.0f, sums);
 }
 
 // Sums over the warp of 16 values; lane 2 j gets that of values[j].

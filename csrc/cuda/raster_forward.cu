@@ -25,11 +25,9 @@ __device__ __forceinline__ void draw_extras(const RasterPass& pass, const Staged
     Interpolation<float> at;
     float inverse_z = 0.0f;
     if (kAttributes) {
-        at.evaluate(s.attributes.get(), f.dx, f.dy);
+        at.evaluate(s.attributes.get(), f.form);
         for (int c = 0; c < CORNER; ++c) {
-            float value = at.weight[0] * s.corner[c];
-            value = vfma(at.weight[1], s.corner[CORNER + c], value);
-            value = vfma(at.weight[2], s.corner[2 * CORNER + c], value);
+            const float value = at.mean(s.corner[c], s.corner[CORNER + c], s.corner[2 * CORNER + c]);
             p.color[FLAT + c] = vfma(w, value, p.color[FLAT + c]);
         }
         inverse_z = 1.0f / at.depth();

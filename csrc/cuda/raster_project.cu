@@ -67,11 +67,9 @@ __device__ __forceinline__ Projected project_one(const RasterPass& pass, int m) 
     for (int k = 0; k < 3; ++k) {
         p.record.gx[k] = forms.gx[k];
         p.record.gy[k] = forms.gy[k];
-        p.attributes.ax[k] = t.ax[k];
-        p.attributes.ay[k] = t.ay[k];
-        p.attributes.inverse_z[k] = 1.0f / view[3 * k + 2];
+        p.attributes.inverse_weight[k] = 1.0f / t.weight[k];
+        p.attributes.product[k] = p.attributes.inverse_weight[k] / view[3 * k + 2];
     }
-    offset_from_mean(t, forms.qx, forms.qy, p.attributes.offset_x, p.attributes.offset_y);
     p.attributes.centroid_z = p.depth;
     return p;
 }

@@ -15,7 +15,7 @@ constexpr int kWarps = kTileThreads / kWarp;
 constexpr int kSubWidth = 8, kSubHeight = 4;
 constexpr bool kAttributes = CORNER > 0 || DISTORTION == 1;
 constexpr int kChannels = FLAT + CORNER;
-constexpr SlotLayout kLayout{FLAT, CORNER, kAttributes, DISTORTION == 2};
+constexpr SlotLayout kLayout{FLAT, CORNER, kAttributes, static_cast<DistortionDepth>(DISTORTION)};
 constexpr int kStride = kLayout.stride();
 
 // Room for attributes only where they are needed.
@@ -31,7 +31,7 @@ struct StagedAttributes<false> {
     __device__ __forceinline__ AttributeRecord get() const { return {}; }
 };
 
-struct alignas(kAttributes ? 64 : 16) Staged {
+struct alignas(kAttributes ? 32 : 16) Staged {
     float qx, qy, extent, opacity, gx[3], exponent, gy[3], scale;
     float color[FLAT > 0 ? FLAT : 1];
     float corner[CORNER > 0 ? 3 * CORNER : 1];

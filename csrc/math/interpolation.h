@@ -1,8 +1,10 @@
 // What is interpolated over a triangle, the distortion, and the derivatives of both at one pixel.
 //
 // Attributes have perspective-correct weights b_k = max(a_k, 0) / z_k / U with U = sum max(a_k, 0) / z_k, and the plane's
-// depth is z = A / U with A = sum max(a_k, 0). The distortion sum_{i<j} w_i w_j (m_i - m_j)^2 needs W = sum w, M = sum w m
-// and Q = sum w m^2 alone.
+// depth is z = A / U with A = sum max(a_k, 0). The tile loops have the linear forms f_k of the distance at hand, and both
+// distances are such that a_k = (1 - f_k) / w_k. So the gradients by f_k join those of the distance; that a_k does not
+// depend on w_k is made good by dL/d log w_k, in view_gradient.
+// The distortion sum_{i<j} w_i w_j (m_i - m_j)^2 needs W = sum w, M = sum w m and Q = sum w m^2 alone.
 #pragma once
 
 #include "raster_records.h"
@@ -12,52 +14,55 @@ namespace etsplat {
 
 template <class T>
 struct Interpolation {
-    T clamped[3];  // max(a_k, 0)
+    T clamped[3];  // max(1 - f_k, 0)
     MaskOf<T> positive[3];
+    T product[3];     // max(a_k, 0) / z_k = b_k U
     T inverse_z_sum;  // U
+    T inverse;        // 1 / U
     T sum;            // A
-    T weight[3];      // b_k
 
-    // At the pixel q + (dx, dy).
-    ETSPLAT_FN void evaluate(const AttributeRecord& record, T dx, T dy) {
-        const T x = dx + T(record.offset_x), y = dy + T(record.offset_y);
+    ETSPLAT_FN void evaluate(const AttributeRecord& record, const T form[3]) {
         sum = T(0.0f);
         inverse_z_sum = T(0.0f);
         for (int k = 0; k < 3; ++k) {
-            const T a = vfma(T(record.ax[k]), x, vfma(T(record.ay[k]), y, T(1.0f / 3.0f)));
-            positive[k] = a > T(0.0f);
-            clamped[k] = vmax(a, T(0.0f));
-            weight[k] = clamped[k] * T(record.inverse_z[k]);
-            sum = sum + clamped[k];
-            inverse_z_sum = inverse_z_sum + weight[k];
+            positive[k] = form[k] < T(1.0f);
+            clamped[k] = vmax(T(1.0f) - form[k], T(0.0f));
+            product[k] = clamped[k] * T(record.product[k]);
+            sum = vfma(clamped[k], T(record.inverse_weight[k]), sum);
+            inverse_z_sum = inverse_z_sum + product[k];
         }
-        for (int k = 0; k < 3; ++k) weight[k] = weight[k] / inverse_z_sum;
+        inverse = vreciprocal(inverse_z_sum);
     }
-    ETSPLAT_FN T depth() const { return sum / inverse_z_sum; }
+    ETSPLAT_FN T depth() const { return sum * inverse; }
+    ETSPLAT_FN T mean(T first, T second, T third) const {
+        return vfma(product[0], first, vfma(product[1], second, product[2] * third)) * inverse;
+    }
 };
 
 // Gradients of one pixel by what Interpolation computed from.
 template <class T>
 struct InterpolationGradient {
-    T inverse_z[3];    // dL/d(1/z_k)
-    T barycentric[3];  // dL/d a_k
+    T form[3];         // dL/d f_k
+    T log_product[3];  // dL/d log(w_k z_k)
+    T log_weight[3];   // dL/d log w_k, of the plane's depth alone
 
-    // w: blend weight; grad_value[k]: sum over channels of cotangent times the colour of corner k; grad_depth: dL/d(1/z) of
-    // the plane's depth z, inverse_z = 1/z.
-    ETSPLAT_FN void evaluate(const AttributeRecord& record, const Interpolation<T>& at, T w, const T* grad_value,
+    // w: blend weight; grad_value[k]: sum over channels of cotangent times the colour of corner k, mean: their mean;
+    // grad_depth: dL/d(1/z) of the plane's depth z, inverse_z = 1/z.
+    ETSPLAT_FN void evaluate(const AttributeRecord& record, const Interpolation<T>& at, T w, const T* grad_value, T mean,
                              bool with_depth, T grad_depth, T plane_inverse_z) {
-        T mean(0.0f);
-        for (int k = 0; k < 3; ++k) mean = vfma(at.weight[k], grad_value[k], mean);
+        const T share = w * at.inverse;
+        const T grad_inverse_z_sum = with_depth ? grad_depth / at.sum : T(0.0f);
         for (int k = 0; k < 3; ++k) {
-            T grad_product = w * (grad_value[k] - mean) / at.inverse_z_sum;  // of max(a_k, 0) / z_k
-            T grad_clamped(0.0f);
+            T fall = share * (mean - grad_value[k]);  // -dL/d product[k]
+            if (with_depth) fall = fall - grad_inverse_z_sum;
+            T grad_form = fall * T(record.product[k]);
             if (with_depth) {
-                grad_product = grad_product + grad_depth / at.sum;
-                grad_clamped = T(0.0f) - grad_depth * plane_inverse_z / at.sum;
+                const T of_sum = grad_inverse_z_sum * plane_inverse_z * T(record.inverse_weight[k]);
+                grad_form = grad_form + of_sum;
+                log_weight[k] = of_sum * at.clamped[k];
             }
-            inverse_z[k] = grad_product * at.clamped[k];
-            barycentric[k] =
-                vselect(at.positive[k], vfma(grad_product, T(record.inverse_z[k]), grad_clamped), T(0.0f));
+            log_product[k] = fall * at.product[k];
+            form[k] = vselect(at.positive[k], grad_form, T(0.0f));
         }
     }
 };
@@ -85,32 +90,24 @@ template <class T, class Sums>
 ETSPLAT_FN void view_gradient(const PinholeCamera& camera, Distance distance, bool freeze_incentre,
                               const SlotLayout& layout, const Sums& sums, const T* view, const Triangle2D<T>& t,
                               T* grad_view) {
-    T gx[3], gy[3], s[3], rx[3], ry[3];
-    const auto moments = [&](int first) {
-        for (int k = 0; k < 3; ++k) {
-            s[k] = sums[first + k];
-            rx[k] = sums[first + 3 + k];
-            ry[k] = sums[first + 6 + k];
-        }
-    };
-    for (int k = 0; k < 3; ++k) gx[k] = gy[k] = T(0.0f);
-    for (int k = 0; k < 9; ++k) grad_view[k] = T(0.0f);
-    moments(SlotLayout::kMoment);
-    distance_backward(t, distance, freeze_incentre, s, rx, ry, gx, gy);
-    if (layout.attributes) {
-        const DistanceForms<T> forms = distance_forms(t);
-        T offset_x, offset_y, a_at_q[3];
-        offset_from_mean(t, forms.qx, forms.qy, offset_x, offset_y);
-        for (int m = 0; m < 3; ++m) a_at_q[m] = T(1.0f / 3.0f) + t.ax[m] * offset_x + t.ay[m] * offset_y;
-        moments(layout.barycentric());
-        barycentric_backward(t, a_at_q, s, rx, ry, gx, gy);
-        for (int k = 0; k < 3; ++k) {
-            const T inverse_z = T(1.0f) / view[3 * k + 2];
-            grad_view[3 * k + 2] = grad_view[3 * k + 2] - sums[layout.inverse_z() + k] * inverse_z * inverse_z;
-        }
+    T gx[3], gy[3], s[3], rx[3], ry[3], log_weight[3];
+    for (int k = 0; k < 3; ++k) {
+        gx[k] = gy[k] = log_weight[k] = T(0.0f);
+        s[k] = sums[SlotLayout::kMoment + k];
+        rx[k] = sums[SlotLayout::kMomentX + k];
+        ry[k] = sums[SlotLayout::kMomentY + k];
     }
-    if (layout.centroid_z)
-        for (int k = 0; k < 3; ++k) grad_view[3 * k + 2] = grad_view[3 * k + 2] + sums[layout.depth()] / T(3.0f);
+    for (int k = 0; k < 9; ++k) grad_view[k] = T(0.0f);
+    if (layout.attributes)
+        for (int k = 0; k < 3; ++k) {
+            log_weight[k] = sums[layout.product() + k];
+            grad_view[3 * k + 2] = log_weight[k] / view[3 * k + 2];
+        }
+    if (layout.depth == DistortionDepth::kPlane)
+        for (int k = 0; k < 3; ++k) log_weight[k] = log_weight[k] + sums[layout.plane() + k];
+    if (layout.depth == DistortionDepth::kCentroid)
+        for (int k = 0; k < 3; ++k) grad_view[3 * k + 2] = grad_view[3 * k + 2] + sums[layout.centroid()] / T(3.0f);
+    distance_backward(t, distance, freeze_incentre, s, rx, ry, log_weight, gx, gy);
     for (int k = 0; k < 3; ++k)
         project_backward(camera, view + 3 * k, t.x[k], t.y[k], gx[k], gy[k], grad_view + 3 * k);
 }

@@ -15,30 +15,33 @@ struct alignas(64) TriangleRecord {
     float left, right, top, bottom;  // bounding box of {x <= extent}, relative to q
 };
 
-// For what is interpolated over a triangle: a_k(p) = 1/3 + grad a_k . (p - c), c the mean of the vertices.
-struct alignas(64) AttributeRecord {
-    float ax[3], ay[3];        // grad a_k
-    float inverse_z[3];        // 1 / view depth of the vertices
-    float offset_x, offset_y;  // q - c
+// For what is interpolated over a triangle. With f_k = g_k . (p - q), a barycentric is a_k = (1 - f_k) / w_k.
+struct alignas(32) AttributeRecord {
+    float inverse_weight[3];  // 1 / w_k
+    float product[3];         // 1 / (w_k z_k), z_k the view depth of the vertex
     float centroid_z;
-    float padding[4];
+    float padding;
 };
 
 enum class DistortionDepth : int { kNone, kPlane, kCentroid };
 
-// Where a slot keeps its sums over pixels. With dx = dL/dx of a pixel at p whose largest form is k:
-// moment[k] = sum dx, moment_x/y[k] = sum dx (p - q).
+// Where a slot keeps its sums over pixels. With df_k = dL/df_k of a pixel at p: moment[k] = sum df_k,
+// moment_x/y[k] = sum df_k (p - q).
 struct SlotLayout {
     static constexpr int kMoment = 0, kMomentX = 3, kMomentY = 6, kOpacity = 9, kSigma = 10, kFlat = 11;
     int flat_channels = 0, corner_channels = 0;
-    bool attributes = false, centroid_z = false;
+    bool attributes = false;
+    DistortionDepth depth = DistortionDepth::kNone;
 
-    // the same three moments of dL/d a_k, then dL/d(1/z_k), then the corner colours, corner-major
-    ETSPLAT_CONSTEXPR_FN int barycentric() const { return kFlat + flat_channels; }
-    ETSPLAT_CONSTEXPR_FN int inverse_z() const { return barycentric() + 9; }
-    ETSPLAT_CONSTEXPR_FN int corner() const { return inverse_z() + 3; }
-    ETSPLAT_CONSTEXPR_FN int depth() const { return attributes ? corner() + 3 * corner_channels : kFlat + flat_channels; }
-    ETSPLAT_CONSTEXPR_FN int size() const { return depth() + (centroid_z ? 1 : 0); }
+    // dL/d log(w_k z_k), then the corner colours, corner-major
+    ETSPLAT_CONSTEXPR_FN int product() const { return kFlat + flat_channels; }
+    ETSPLAT_CONSTEXPR_FN int corner() const { return product() + 3; }
+    // kPlane: dL/d log w_k; kCentroid: dL/dz of the centroid
+    ETSPLAT_CONSTEXPR_FN int plane() const { return attributes ? corner() + 3 * corner_channels : product(); }
+    ETSPLAT_CONSTEXPR_FN int centroid() const { return plane(); }
+    ETSPLAT_CONSTEXPR_FN int size() const {
+        return plane() + (depth == DistortionDepth::kPlane ? 3 : depth == DistortionDepth::kCentroid ? 1 : 0);
+    }
     ETSPLAT_CONSTEXPR_FN int stride() const { return (size() + 15) / 16 * 16; }
 };
 

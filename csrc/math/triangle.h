@@ -163,13 +163,6 @@ ETSPLAT_FN MaskOf<T> meets_image(const SupportBox<T>& box, T qx, T qy, int width
            (qy + box.bottom >= T(0.0f)) & (qy + box.top <= T(static_cast<float>(height)));
 }
 
-// q - c, with c the mean of the vertices: a_k(p) = 1/3 + grad a_k . (p - c).
-template <class T>
-ETSPLAT_FN void offset_from_mean(const Triangle2D<T>& t, T qx, T qy, T& offset_x, T& offset_y) {
-    offset_x = qx - (t.x[0] + ((t.x[1] - t.x[0]) + (t.x[2] - t.x[0])) / T(3.0f));
-    offset_y = qy - (t.y[0] + ((t.y[1] - t.y[0]) + (t.y[2] - t.y[0])) / T(3.0f));
-}
-
 // Adds to grad_x/y[m] the gradient of sum over pixels of (cotangent of a_k), given for each k the moments
 // s[k] = sum cotangent and (rx, ry)[k] = sum cotangent (p - o), and a_m(o) of the point o.
 template <class T>
@@ -183,11 +176,11 @@ ETSPLAT_FN void barycentric_backward(const Triangle2D<T>& t, const T* a_at_origi
         }
 }
 
-// Gradient of sum over pixels of dx x(p) with respect to the projected vertices, from the moments of dx about q, split
-// by the form that is largest. freeze_incentre treats the inradius as a constant, as Triangle Splatting does.
+// Gradient by the projected vertices, from the moments about q of the gradients by the forms f_k = g_k . (p - q), and those
+// by log w_k on its own. freeze_incentre treats the inradius as a constant, as Triangle Splatting does.
 template <class T>
 ETSPLAT_FN void distance_backward(const Triangle2D<T>& t, Distance distance, bool freeze_incentre, const T* s,
-                                  const T* rx, const T* ry, T* grad_x, T* grad_y) {
+                                  const T* rx, const T* ry, const T* log_weight, T* grad_x, T* grad_y) {
     T a_at_q[3], cs[3], cx[3], cy[3];
     for (int k = 0; k < 3; ++k) {
         a_at_q[k] = T(1.0f) / t.weight[k];
@@ -201,7 +194,7 @@ ETSPLAT_FN void distance_backward(const Triangle2D<T>& t, Distance distance, boo
     const T perimeter = t.side[0] + t.side[1] + t.side[2];
     T grad_weight[3], shared(0.0f);
     for (int k = 0; k < 3; ++k) {
-        grad_weight[k] = T(0.0f) - (a_at_q[k] * s[k] + t.ax[k] * rx[k] + t.ay[k] * ry[k]);
+        grad_weight[k] = T(0.0f) - (a_at_q[k] * (s[k] - log_weight[k]) + t.ax[k] * rx[k] + t.ay[k] * ry[k]);
         shared = shared + grad_weight[k] / t.side[k];
     }
     for (int k = 0; k < 3; ++k) {

@@ -31,7 +31,7 @@ void count_tile(const RasterPass& pass, int index, float* scratch, TileCounts& c
         for (int p = 0; p < batch.pairs.count; ++p) {
             const int block = batch.pairs.block[p];
             const Vec before = Vec::load(tile.transmittance[block]);
-            draw<Kernel, true>(pass, tile, batch, batch.pairs.triangle[p], block);
+            draw<Kernel, Shape::kGeneral>(pass, tile, batch, batch.pairs.triangle[p], block);
             counts.drawn += count_bits((Vec::load(tile.transmittance[block]) < before).bits());
         }
         for (int i = 0; i < count; ++i) counts.backward_vectors += count_bits(batch.hits[i]);

@@ -60,34 +60,35 @@ struct Projected {
     }
 };
 
-// Sixteen rows of sixteen floats, the rows past the range not written.
-ETSPLAT_FN void store_rows(const Vec columns[16], const LaneRange& range, void* out) {
-    if (range.count == kLanes) {
+// Rows of the first `size` columns, the rows past the range not written.
+ETSPLAT_FN void store_rows(const Vec columns[16], int size, const LaneRange& range, void* out) {
+    if (size == kLanes && range.count == kLanes) {
         store_transposed(columns, static_cast<float*>(out));
-    } else {
-        float rows[16 * kLanes];
-        store_transposed(columns, rows);
-        memcpy(out, rows, sizeof(float) * 16 * static_cast<size_t>(range.count));
+        return;
     }
+    float rows[16 * kLanes];
+    store_transposed(columns, rows);
+    for (int i = 0; i < range.count; ++i)
+        memcpy(static_cast<float*>(out) + i * size, rows + i * kLanes, sizeof(float) * static_cast<size_t>(size));
 }
 
 template <class Kernel>
 ETSPLAT_FN void write_records(const TrianglePass& triangles, const LaneRange& range, const Projected& p) {
-    static_assert(sizeof(TriangleRecord) == 64 && sizeof(AttributeRecord) == 64);
+    static_assert(sizeof(TriangleRecord) == 64 && sizeof(AttributeRecord) == 32);
     const DistanceForms<Vec>& f = p.forms;
     const KernelCoefficients<Vec> c = Kernel::coefficients(vmax(p.sigma, Vec(kMinSigma)));
     const Vec record[16] = {f.qx,     f.qy,      f.gx[0],    f.gx[1], f.gx[2],    f.gy[0],     f.gy[1],   f.gy[2],
                             p.extent, p.opacity, c.exponent, c.scale, p.box.left, p.box.right, p.box.top, p.box.bottom};
-    store_rows(record, range, triangles.records + range.first);
+    store_rows(record, 16, range, triangles.records + range.first);
     if (!triangles.attributes) return;
-    const Triangle2D<Vec>& t = p.triangle;
-    Vec offset_x, offset_y;
-    offset_from_mean(t, f.qx, f.qy, offset_x, offset_y);
-    const Vec one(1.0f), none(0.0f);
-    const Vec attributes[16] = {t.ax[0], t.ax[1], t.ax[2], t.ay[0], t.ay[1], t.ay[2],
-                                one / p.view[2], one / p.view[5], one / p.view[8],
-                                offset_x, offset_y, p.depth, none, none, none, none};
-    store_rows(attributes, range, triangles.attributes + range.first);
+    Vec attributes[16];
+    for (int k = 0; k < 3; ++k) {
+        attributes[k] = Vec(1.0f) / p.triangle.weight[k];
+        attributes[3 + k] = attributes[k] / p.view[3 * k + 2];
+    }
+    attributes[6] = p.depth;
+    for (int k = 7; k < 16; ++k) attributes[k] = Vec(0.0f);
+    store_rows(attributes, 8, range, triangles.attributes + range.first);
 }
 
 ETSPLAT_FN int32_t tile_count(const RasterPass& pass, const TriangleRecord& record) {

@@ -8,8 +8,8 @@
 namespace etsplat::ETSPLAT_SIMD {
 
 RasterKernels raster_kernels() {
-#define ETSPLAT_FORWARD(K) {forward_tile<K, false>, forward_tile<K, true>},
-#define ETSPLAT_BACKWARD(K) {backward_tile<K, false>, backward_tile<K, true>},
+#define ETSPLAT_FORWARD(K) {forward_tile<K, Shape::kFlat>, forward_tile<K, Shape::kCorner>, forward_tile<K, Shape::kGeneral>},
+#define ETSPLAT_BACKWARD(K) {backward_tile<K, Shape::kFlat>, backward_tile<K, Shape::kCorner>, backward_tile<K, Shape::kGeneral>},
 #define ETSPLAT_COUNT(K) count_tile<K>,
 #define ETSPLAT_VALUE(K) value_loop<K>,
 #define ETSPLAT_GRADIENT(K) gradient_loop<K>,

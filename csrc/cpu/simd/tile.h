@@ -100,6 +100,19 @@ struct TriangleForms {
     ETSPLAT_FN Vec dy(int block) const { return Vec::load(kLaneY) + Vec(center_y + kBlockY[block]); }
 };
 
+template <Shape kShape>
+ETSPLAT_FN int flat_channels(const RasterPass& pass) {
+    return kShape == Shape::kFlat ? kFastChannels : kShape == Shape::kCorner ? 0 : pass.flat_channels;
+}
+
+ETSPLAT_FN void prefetch_colors(const RasterPass& pass, int32_t triangle) {
+    if (pass.flat_channels > 0) prefetch(pass.flat_colors + int64_t{triangle} * pass.flat_channels);
+    if (pass.corner_channels > 0) {
+        prefetch(pass.attribute_records + triangle);
+        prefetch(pass.corner_colors + int64_t{3} * triangle * pass.corner_channels);
+    }
+}
+
 ETSPLAT_FN float first_inverse_depth(const RasterPass& pass, int tile) {
     const int first = pass.tile_begin[tile];
     if (!pass.want_distortion || first == pass.tile_begin[tile + 1]) return 0.0f;
@@ -109,19 +122,19 @@ ETSPLAT_FN float first_inverse_depth(const RasterPass& pass, int tile) {
 // 1 if any of the 16 bits is set, without a branch.
 ETSPLAT_FN unsigned any_bit(unsigned bits) { return (bits + 0xffffu) >> 16; }
 
+ETSPLAT_FN int lowest_bit(unsigned bits) {
+#if defined(_MSC_VER) && !defined(__clang__)
+    unsigned long index;
+    _BitScanForward(&index, bits);
+    return static_cast<int>(index);
+#else
+    return __builtin_ctz(bits);
+#endif
+}
+
 template <class F>
 ETSPLAT_FN void for_each_bit(unsigned bits, F&& body) {
-    while (bits != 0) {
-#if defined(_MSC_VER) && !defined(__clang__)
-        unsigned long index;
-        _BitScanForward(&index, bits);
-        const int block = static_cast<int>(index);
-#else
-        const int block = __builtin_ctz(bits);
-#endif
-        bits &= bits - 1;
-        body(block);
-    }
+    for (; bits != 0; bits &= bits - 1) body(lowest_bit(bits));
 }
 
 }  // namespace etsplat::ETSPLAT_SIMD

@@ -109,36 +109,85 @@ ETSPLAT_FN void background_gradient(const RasterPass& pass, const BackwardTile& 
         }
 }
 
-ETSPLAT_FN void add_lanes(float* sums, int index, Vec value) {
-    float* out = sums + 16 * index;
-    (Vec::load(out) + value).store(out);
+template <Shape kShape>
+ETSPLAT_FN SlotLayout layout_of(const RasterPass& pass) {
+    if constexpr (kShape == Shape::kFlat) return {kFastChannels, 0, false, DistortionDepth::kNone};
+    if constexpr (kShape == Shape::kCorner) return {0, kFastChannels, true, DistortionDepth::kNone};
+    return pass.slot_layout;
 }
 
-// Interpolated channels and distortion of one block: adds their part to the cotangent of the blend weight, and sums the
-// gradients of what they were computed from.
+// What a slot will keep, lane by lane: in variables where the number is known, which may be registers, else the first of
+// them in variables and the others in memory.
+template <Shape kShape>
+struct SlotSums {
+    static constexpr bool kGeneral = kShape == Shape::kGeneral;
+    static constexpr int kVectors = kGeneral ? SlotLayout::kFlat : kShape == Shape::kFlat ? 16 : 32;
+    Vec v[kVectors];
+    float* lanes;
+
+    ETSPLAT_FN explicit SlotSums(const RasterPass& pass, float* memory) : lanes(memory) {
+        for (int i = 0; i < kVectors; ++i) v[i] = Vec(0.0f);
+        if constexpr (kGeneral)
+            for (int i = kVectors; i < pass.slot_layout.size(); ++i) Vec(0.0f).store(lanes + 16 * i);
+    }
+    // Adds a b to sum i, which is none of the first kFlat.
+    ETSPLAT_FN void add(int i, Vec a, Vec b) {
+        if constexpr (kGeneral)
+            vfma(a, b, Vec::load(lanes + 16 * i)).store(lanes + 16 * i);
+        else
+            v[i] = vfma(a, b, v[i]);
+    }
+    ETSPLAT_FN void add(int i, Vec a) {
+        if constexpr (kGeneral)
+            (Vec::load(lanes + 16 * i) + a).store(lanes + 16 * i);
+        else
+            v[i] = v[i] + a;
+    }
+
+    ETSPLAT_FN void write(const RasterPass& pass, float* slot) const {
+        if constexpr (kGeneral) {
+            for (int i = 0; i < kVectors; ++i) slot[i] = lane_sum(v[i]);
+            for (int i = kVectors; i < pass.slot_layout.size(); ++i) slot[i] = lane_sum(Vec::load(lanes + 16 * i));
+        } else {
+            for (int i = 0; i < kVectors; i += 16) column_sums(v + i, slot + i);
+        }
+    }
+};
+
+// Interpolated channels and distortion of one block: their part of the cotangent of the blend weight, and the gradients of
+// what they were computed from.
+template <Shape kShape>
 struct ExtraGradients {
+    static constexpr bool kGeneral = kShape == Shape::kGeneral;
     const RasterPass& pass;
     const AttributeRecord& record;
     const float* corners;
     Interpolation<Vec> at;
     Vec inverse_z;
-    Vec grad_value[3];  // sum over channels of g_c (colour of corner k)
+    Vec grad_value[3], mean;  // sum over channels of g_c (colour of corner k), and its mean over the corners
 
-    ETSPLAT_FN Vec cotangent(const BackwardTile& tile, const TriangleForms& forms, int block) {
-        Vec result(0.0f);
-        inverse_z = Vec(1.0f / record.centroid_z);
+    ETSPLAT_FN ExtraGradients(const RasterPass& p, int32_t triangle)
+        : pass(p), record(p.attribute_records[triangle]),
+          corners(p.corner_colors + int64_t{3} * triangle * p.corner_channels), inverse_z(1.0f / record.centroid_z) {
         for (int k = 0; k < 3; ++k) grad_value[k] = Vec(0.0f);
-        if (pass.attributes) {
-            at.evaluate(record, forms.dx(block), forms.dy(block));
-            if (pass.distortion_depth == DistortionDepth::kPlane) inverse_z = at.inverse_z_sum / at.sum;
-            for (int c = 0; c < pass.corner_channels; ++c) {
-                const Vec g = Vec::load(tile.channel(pass.flat_channels + c, block));
-                for (int k = 0; k < 3; ++k)
-                    grad_value[k] = vfma(g, Vec(corners[k * pass.corner_channels + c]), grad_value[k]);
+    }
+    ETSPLAT_FN bool interpolates() const { return !kGeneral || pass.attributes; }
+    ETSPLAT_FN bool distorts() const { return kGeneral && pass.grad_distortion; }
+    ETSPLAT_FN int channels() const { return kGeneral ? pass.corner_channels : kFastChannels; }
+
+    ETSPLAT_FN Vec cotangent(const BackwardTile& tile, const Vec form[3], int block) {
+        Vec result(0.0f);
+        if (interpolates()) {
+            at.evaluate(record, form);
+            if (kGeneral && pass.distortion_depth == DistortionDepth::kPlane) inverse_z = at.inverse_z_sum / at.sum;
+            for (int c = 0; c < channels(); ++c) {
+                const Vec g = Vec::load(tile.channel(flat_channels<kShape>(pass) + c, block));
+                for (int k = 0; k < 3; ++k) grad_value[k] = vfma(g, Vec(corners[k * channels() + c]), grad_value[k]);
             }
-            for (int k = 0; k < 3; ++k) result = vfma(at.weight[k], grad_value[k], result);
+            mean = at.mean(grad_value[0], grad_value[1], grad_value[2]);
+            result = mean;
         }
-        if (pass.grad_distortion) {
+        if (distorts()) {
             const Vec spread = distortion_spread(coordinate(tile), Vec::load(tile.total_weight[block]),
                                                  Vec::load(tile.total_first[block]), Vec::load(tile.total_second[block]));
             result = vfma(Vec::load(tile.grad_distortion[block]), spread, result);
@@ -150,55 +199,53 @@ struct ExtraGradients {
         return distortion_coordinate(pass.distortion_near, pass.distortion_far, tile.first_inverse_z, inverse_z);
     }
 
-    ETSPLAT_FN void accumulate(BackwardTile& tile, const TriangleForms& forms, int block, VecMask drawn, Vec w) {
-        const SlotLayout& layout = pass.slot_layout;
+    // Gradients by the forms go to grad_form, the others to the slot. Nothing to mask: w is 0 where nothing is drawn.
+    ETSPLAT_FN void accumulate(const BackwardTile& tile, int block, VecMask drawn, Vec w, SlotSums<kShape>& sums,
+                               Vec grad_form[3]) {
+        const SlotLayout layout = layout_of<kShape>(pass);
         Vec grad_inverse_z(0.0f);
-        if (pass.grad_distortion) {
+        if (distorts()) {
             const Vec slope = distortion_slope(pass.distortion_near, pass.distortion_far, coordinate(tile), w,
                                                Vec::load(tile.total_weight[block]), Vec::load(tile.total_first[block]));
             grad_inverse_z = keep(drawn, Vec::load(tile.grad_distortion[block]) * slope);
             if (pass.distortion_depth == DistortionDepth::kCentroid)
-                add_lanes(tile.sums, layout.depth(), Vec(0.0f) - grad_inverse_z * inverse_z * inverse_z);
+                sums.add(layout.centroid(), Vec(0.0f) - grad_inverse_z * inverse_z * inverse_z);
         }
-        if (!pass.attributes) return;
+        if (!interpolates()) return;
         InterpolationGradient<Vec> gradient;
-        const bool plane = pass.grad_distortion && pass.distortion_depth == DistortionDepth::kPlane;
-        gradient.evaluate(record, at, w, grad_value, plane, grad_inverse_z, inverse_z);
-        const Vec dx = forms.dx(block), dy = forms.dy(block);
+        const bool plane = distorts() && pass.distortion_depth == DistortionDepth::kPlane;
+        gradient.evaluate(record, at, w, grad_value, mean, plane, grad_inverse_z, inverse_z);
+        const Vec share = w * at.inverse;
         for (int k = 0; k < 3; ++k) {
-            for (int c = 0; c < pass.corner_channels; ++c) {
-                const Vec g = Vec::load(tile.channel(pass.flat_channels + c, block));
-                add_lanes(tile.sums, layout.corner() + k * pass.corner_channels + c, keep(drawn, w * at.weight[k] * g));
-            }
-            const Vec grad_a = keep(drawn, gradient.barycentric[k]);
-            add_lanes(tile.sums, layout.inverse_z() + k, keep(drawn, gradient.inverse_z[k]));
-            add_lanes(tile.sums, layout.barycentric() + k, grad_a);
-            add_lanes(tile.sums, layout.barycentric() + 3 + k, grad_a * dx);
-            add_lanes(tile.sums, layout.barycentric() + 6 + k, grad_a * dy);
+            for (int c = 0; c < channels(); ++c)
+                sums.add(layout.corner() + k * channels() + c, share * at.product[k],
+                         Vec::load(tile.channel(flat_channels<kShape>(pass) + c, block)));
+            sums.add(layout.product() + k, gradient.log_product[k]);
+            if (plane) sums.add(layout.plane() + k, gradient.log_weight[k]);
+            grad_form[k] = gradient.form[k];
         }
     }
 };
 
-template <class Kernel, bool General>
+template <class Kernel, Shape kShape>
 ETSPLAT_FN void differentiate(const RasterPass& pass, BackwardTile& tile, const TileFrame& frame, const TileEntry& entry) {
-    const unsigned blocks = pass.hits[entry.slot];
+    unsigned blocks = pass.hits[entry.slot];
     if (blocks == 0) return;
     const TriangleRecord& record = pass.records[entry.triangle];
     TriangleForms forms;
     forms.prepare(record, frame);
 
-    const int flat = General ? pass.flat_channels : kMaxFastChannels;
+    const int flat = flat_channels<kShape>(pass);
     const float* color = pass.flat_colors + int64_t{entry.triangle} * flat;
     const Vec exponent(record.exponent), scale(record.scale), opacity(record.opacity), extent(record.extent);
     const Vec alpha_min(pass.alpha_min), alpha_max(pass.alpha_max), transmittance_min(pass.transmittance_min);
-    Vec sums[16];
-    for (int i = 0; i < 16; ++i) sums[i] = Vec(0.0f);
-    if constexpr (General)
-        for (int i = 0; i < pass.slot_layout.stride(); ++i) Vec(0.0f).store(tile.sums + 16 * i);
+    SlotSums<kShape> sums(pass, tile.sums);
 
-    for_each_bit(blocks, [&](int block) {
-        const Vec form0 = forms.value(0, block), form1 = forms.value(1, block), form2 = forms.value(2, block);
-        const Vec x = vmax(form0, vmax(form1, form2));
+    // not for_each_bit: a lambda of this size would be a call, and the sums no registers
+    for (; blocks != 0; blocks &= blocks - 1) {
+        const int block = lowest_bit(blocks);
+        const Vec form[3] = {forms.value(0, block), forms.value(1, block), forms.value(2, block)};
+        const Vec x = vmax(form[0], vmax(form[1], form[2]));
         const KernelValue<Vec> kernel = Kernel::gradient(x, exponent, scale);
         const Vec raw_alpha = opacity * kernel.value;
         const Vec alpha = vmin(raw_alpha, alpha_max);
@@ -212,62 +259,53 @@ ETSPLAT_FN void differentiate(const RasterPass& pass, BackwardTile& tile, const 
         w = keep(drawn, w);
         (transmittance - w).store(tile.transmittance[block]);
 
-        // cotangent of the blend weight
-        Vec cotangent(0.0f);
+        // cotangent of the blend weight, and what else comes of colours
+        Vec cotangent(0.0f), grad_form[3] = {cotangent, cotangent, cotangent};
         for (int c = 0; c < flat; ++c) {
             const Vec g = Vec::load(tile.channel(c, block));
             cotangent = vfma(g, Vec(color[c]), cotangent);
-            if constexpr (General)
-                add_lanes(tile.sums, SlotLayout::kFlat + c, w * g);
-            else
-                sums[SlotLayout::kFlat + c] = vfma(w, g, sums[SlotLayout::kFlat + c]);
+            sums.add(SlotLayout::kFlat + c, w, g);
         }
-        if constexpr (General) {
-            if (pass.attributes || pass.grad_distortion) {
-                ExtraGradients extra{pass, pass.attribute_records[entry.triangle],
-                                     pass.corner_colors + int64_t{3} * entry.triangle * pass.corner_channels, {}, {}, {}};
-                cotangent = cotangent + extra.cotangent(tile, forms, block);
-                extra.accumulate(tile, forms, block, drawn, w);
+        if constexpr (kShape != Shape::kFlat)
+            if (kShape == Shape::kCorner || pass.attributes || pass.grad_distortion) {
+                ExtraGradients<kShape> extra(pass, entry.triangle);
+                cotangent = cotangent + extra.cotangent(tile, form, block);
+                extra.accumulate(tile, block, drawn, w, sums, grad_form);
             }
-        }
         const Vec remaining = Vec::load(tile.remaining[block]) - w * cotangent;
         remaining.store(tile.remaining[block]);
         Vec grad_alpha = transmittance * cotangent - remaining * vreciprocal(Vec(1.0f) - alpha);
         grad_alpha = keep(drawn & (raw_alpha < alpha_max), grad_alpha);
 
-        sums[SlotLayout::kOpacity] = vfma(grad_alpha, kernel.value, sums[SlotLayout::kOpacity]);
+        sums.v[SlotLayout::kOpacity] = vfma(grad_alpha, kernel.value, sums.v[SlotLayout::kOpacity]);
         const Vec grad_kernel = grad_alpha * opacity;
-        sums[SlotLayout::kSigma] = vfma(grad_kernel, kernel.dsigma, sums[SlotLayout::kSigma]);
+        sums.v[SlotLayout::kSigma] = vfma(grad_kernel, kernel.dsigma, sums.v[SlotLayout::kSigma]);
         const Vec grad_x = grad_kernel * kernel.dx;
 
         const Vec dx = forms.dx(block), dy = forms.dy(block);
-        const VecMask first = form0 >= x, second = and_not(form1 >= x, first);
+        const VecMask first = form[0] >= x, second = and_not(form[1] >= x, first);
         const Vec part[3] = {keep(first, grad_x), keep(second, grad_x), keep(and_not(and_not(drawn, first), second), grad_x)};
         for (int k = 0; k < 3; ++k) {
-            sums[SlotLayout::kMoment + k] = sums[SlotLayout::kMoment + k] + part[k];
-            sums[SlotLayout::kMomentX + k] = vfma(part[k], dx, sums[SlotLayout::kMomentX + k]);
-            sums[SlotLayout::kMomentY + k] = vfma(part[k], dy, sums[SlotLayout::kMomentY + k]);
+            grad_form[k] = grad_form[k] + part[k];
+            sums.v[SlotLayout::kMoment + k] = sums.v[SlotLayout::kMoment + k] + grad_form[k];
+            sums.v[SlotLayout::kMomentX + k] = vfma(grad_form[k], dx, sums.v[SlotLayout::kMomentX + k]);
+            sums.v[SlotLayout::kMomentY + k] = vfma(grad_form[k], dy, sums.v[SlotLayout::kMomentY + k]);
         }
-    });
-
-    float* slot = pass.slots + int64_t{entry.slot} * pass.slot_layout.stride();
-    if constexpr (General) {
-        for (int i = 0; i < SlotLayout::kFlat; ++i) sums[i].store(tile.sums + 16 * i);
-        for (int i = 0; i < pass.slot_layout.size(); ++i) slot[i] = lane_sum(Vec::load(tile.sums + 16 * i));
-    } else {
-        column_sums(sums, slot);
     }
+
+    sums.write(pass, pass.slots + int64_t{entry.slot} * pass.slot_layout.stride());
     pass.touched[entry.slot] = 1;
 }
 
-template <class Kernel, bool General>
+template <class Kernel, Shape kShape>
 void backward_tile(const RasterPass& pass, int index, float* scratch) {
     const TileFrame frame(pass, index);
     BackwardTile tile;
     tile.grad_color = scratch;
-    if constexpr (General) tile.first_inverse_z = first_inverse_depth(pass, index);
+    constexpr bool kGeneral = kShape == Shape::kGeneral;
+    if constexpr (kGeneral) tile.first_inverse_z = first_inverse_depth(pass, index);
     tile.sums = scratch + 256 * pass.channels();
-    begin(pass, tile, frame, General);
+    begin(pass, tile, frame, kGeneral);
     if (pass.tile_background) background_gradient(pass, tile, frame, pass.tile_background + int64_t{index} * pass.channels());
     constexpr int kAhead = 8;
     const int end = pass.tile_done[index];
@@ -275,8 +313,8 @@ void backward_tile(const RasterPass& pass, int index, float* scratch) {
         const TileEntry& coming = pass.entries[i + kAhead < end ? i + kAhead : end - 1];
         prefetch(pass.records + coming.triangle);
         prefetch(pass.hits + coming.slot);
-        prefetch(pass.flat_colors + int64_t{coming.triangle} * pass.flat_channels);
-        differentiate<Kernel, General>(pass, tile, frame, pass.entries[i]);
+        prefetch_colors(pass, coming.triangle);
+        differentiate<Kernel, kShape>(pass, tile, frame, pass.entries[i]);
     }
 }
 

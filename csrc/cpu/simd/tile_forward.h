@@ -49,32 +49,35 @@ ETSPLAT_FN void begin(ForwardTile& tile, const TileFrame& frame, int channels, b
     }
 }
 
-// Interpolated channels, distortion and median triangle of the pixels of one block, drawn with weights w (0 elsewhere).
-ETSPLAT_FN void draw_extras(const RasterPass& pass, ForwardTile& tile, const TriangleForms& forms, int triangle, int block,
+// Interpolated channels, and in the general pass distortion and median triangle, of the pixels of one block, drawn with
+// weights w (0 elsewhere).
+template <Shape kShape>
+ETSPLAT_FN void draw_extras(const RasterPass& pass, ForwardTile& tile, const Vec form[3], int triangle, int block,
                             Vec transmittance, Vec w) {
+    constexpr bool kGeneral = kShape == Shape::kGeneral;
     const VecMask drawn = w > Vec(0.0f);
-    if (pass.want_median) {
+    if (kGeneral && pass.want_median) {
         const VecMask crosses = drawn & (transmittance > Vec(0.5f)) & (transmittance - w <= Vec(0.5f));
         const Vec bits(std::bit_cast<float>(triangle + 1));  // moved about, never computed with
         vselect(crosses, bits, Vec::load(tile.median[block])).store(tile.median[block]);
     }
-    if (!pass.attributes && !pass.want_distortion) return;
+    if (kGeneral && !pass.attributes && !pass.want_distortion) return;
     const AttributeRecord& record = pass.attribute_records[triangle];
     Interpolation<Vec> at;
     Vec z(record.centroid_z);
-    if (pass.attributes) {
-        at.evaluate(record, forms.dx(block), forms.dy(block));
-        if (pass.distortion_depth == DistortionDepth::kPlane) z = at.depth();
-        const float* corners = pass.corner_colors + int64_t{3} * triangle * pass.corner_channels;
-        for (int c = 0; c < pass.corner_channels; ++c) {
-            Vec value = at.weight[0] * Vec(corners[c]);
-            value = vfma(at.weight[1], Vec(corners[pass.corner_channels + c]), value);
-            value = vfma(at.weight[2], Vec(corners[2 * pass.corner_channels + c]), value);
-            float* out = tile.channel(pass.flat_channels + c, block);
+    if (!kGeneral || pass.attributes) {
+        const int flat = kGeneral ? pass.flat_channels : 0, channels = kGeneral ? pass.corner_channels : kFastChannels;
+        const float* corners = pass.corner_colors + int64_t{3} * triangle * channels;
+        at.evaluate(record, form);
+        if (kGeneral && pass.distortion_depth == DistortionDepth::kPlane) z = at.depth();
+        for (int c = 0; c < channels; ++c) {
+            const float* color = corners + c;
+            float* out = tile.channel(flat + c, block);
+            const Vec value = at.mean(Vec(color[0]), Vec(color[channels]), Vec(color[2 * channels]));
             vfma(w, value, Vec::load(out)).store(out);
         }
     }
-    if (pass.want_distortion) {
+    if (kGeneral && pass.want_distortion) {
         const Vec m = distortion_coordinate(pass.distortion_near, pass.distortion_far, tile.first_inverse_z, Vec(1.0f) / z);
         const Vec wm = keep(drawn, w * m);
         const Vec first = Vec::load(tile.weighted_depth[block]), second = Vec::load(tile.weighted_square[block]);
@@ -102,7 +105,7 @@ ETSPLAT_FN void prepare(const RasterPass& pass, const TileFrame& frame, unsigned
     // the records of the next batch are on their way while this one is drawn
     for (int i = count; i < ahead; ++i) {
         prefetch(pass.records + entries[i].triangle);
-        prefetch(pass.flat_colors + int64_t{entries[i].triangle} * pass.flat_channels);
+        prefetch_colors(pass, entries[i].triangle);
     }
     for (int i = 0; i < count; ++i) {
         const TriangleRecord& record = pass.records[entries[i].triangle];
@@ -115,15 +118,16 @@ ETSPLAT_FN void prepare(const RasterPass& pass, const TileFrame& frame, unsigned
 }
 
 // One triangle over one block.
-template <class Kernel, bool General>
+template <class Kernel, Shape kShape>
 ETSPLAT_FN void draw(const RasterPass& pass, ForwardTile& tile, Batch& batch, int i, int block) {
     const TriangleForms& forms = batch.forms[i];
     const int triangle = batch.entries[i].triangle;
     const TriangleRecord& record = pass.records[triangle];
-    const int flat = General ? pass.flat_channels : kMaxFastChannels;
+    const int flat = flat_channels<kShape>(pass);
     const float* color = pass.flat_colors + int64_t{triangle} * flat;
 
-    const Vec x = vmax(forms.value(0, block), vmax(forms.value(1, block), forms.value(2, block)));
+    const Vec form[3] = {forms.value(0, block), forms.value(1, block), forms.value(2, block)};
+    const Vec x = vmax(form[0], vmax(form[1], form[2]));
     const Vec kernel = Kernel::value(x, Vec(record.exponent), Vec(record.scale));
     const Vec alpha = vmin(Vec(record.opacity) * kernel, Vec(pass.alpha_max));
     const Vec transmittance = Vec::load(tile.transmittance[block]);
@@ -140,7 +144,7 @@ ETSPLAT_FN void draw(const RasterPass& pass, ForwardTile& tile, Batch& batch, in
         vfma(w, Vec(color[c]), Vec::load(out)).store(out);
     }
     if (pass.slot_weight) batch.largest_weight[i] = vmax(batch.largest_weight[i], w);
-    if constexpr (General) draw_extras(pass, tile, forms, triangle, block, transmittance, w);
+    if constexpr (kShape != Shape::kFlat) draw_extras<kShape>(pass, tile, form, triangle, block, transmittance, w);
 }
 
 // Whole tiles of the fast pass, a row of pixels at a time.
@@ -184,13 +188,14 @@ ETSPLAT_FN void finish(const RasterPass& pass, ForwardTile& tile, const TileFram
     }
 }
 
-template <class Kernel, bool General>
+template <class Kernel, Shape kShape>
 void forward_tile(const RasterPass& pass, int index, float* scratch) {
     const TileFrame frame(pass, index);
     ForwardTile tile;
     tile.color = scratch;
-    if constexpr (General) tile.first_inverse_z = first_inverse_depth(pass, index);
-    begin(tile, frame, pass.channels(), General);
+    constexpr bool kGeneral = kShape == Shape::kGeneral;
+    if constexpr (kGeneral) tile.first_inverse_z = first_inverse_depth(pass, index);
+    begin(tile, frame, pass.channels(), kGeneral);
     Batch batch;
     const int end = pass.tile_begin[index + 1];
     int next = pass.tile_begin[index];
@@ -201,7 +206,7 @@ void forward_tile(const RasterPass& pass, int index, float* scratch) {
         const int ahead = end - next < 2 * kBatch ? end - next : 2 * kBatch;
         prepare(pass, frame, alive_blocks, pass.entries + next, count, ahead, batch);
         for (int p = 0; p < batch.pairs.count; ++p)
-            draw<Kernel, General>(pass, tile, batch, batch.pairs.triangle[p], batch.pairs.block[p]);
+            draw<Kernel, kShape>(pass, tile, batch, batch.pairs.triangle[p], batch.pairs.block[p]);
         for (int i = 0; i < count; ++i) {
             if (pass.hits) pass.hits[batch.entries[i].slot] = static_cast<uint16_t>(batch.hits[i]);
             if (pass.slot_weight) pass.slot_weight[batch.entries[i].slot] = lane_max(batch.largest_weight[i]);
@@ -209,7 +214,7 @@ void forward_tile(const RasterPass& pass, int index, float* scratch) {
         next += count;
     }
     if (pass.tile_done) pass.tile_done[index] = next;
-    if (!General && frame.whole())
+    if (!kGeneral && frame.whole())
         finish_rows(pass, tile, frame);
     else
         finish(pass, tile, frame);

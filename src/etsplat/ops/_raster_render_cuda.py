@@ -252,7 +252,7 @@ def _allocate(plan: Plan, capacity: int, attributes: bool, keep: bool, device: t
     """What the backward pass reads, and what only the forward pass needs."""
     m, state, temporary = plan.projected, Arena(), Arena()
     state.add("records", 16 * m)
-    state.add("attributes", 16 * m if attributes else 0)
+    state.add("attributes", 8 * m if attributes else 0)
     state.add("spans", 2 * m)
     state.add("slot_begin", m)
     state.add("slot_triangle", capacity)
@@ -320,7 +320,7 @@ class _Gradients:
 
 def _stride(flat: int, corner: int, distortion: int) -> int:
     """Floats of a slot: ``SlotLayout`` of csrc/math/raster_records.h."""
-    size = 11 + flat + (12 + 3 * corner if corner > 0 or distortion == 1 else 0) + (distortion == 2)
+    size = 11 + flat + (3 + 3 * corner if corner > 0 or distortion == 1 else 0) + (0, 3, 1)[distortion]
     return blocks(size, 16) * 16
 
 

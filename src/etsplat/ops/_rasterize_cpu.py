@@ -61,7 +61,8 @@ class _PerCorner(torch.autograd.Function):
     def forward(ctx: Any, values: Tensor, mesh: "_Mesh") -> Tensor:
         ctx.mesh, ctx.shape = mesh, values.shape
         assert mesh.faces32 is not None
-        return values[mesh.faces32]
+        # values[faces32] takes five times as long
+        return values.index_select(0, mesh.faces32.view(-1)).view(-1, 3, values.shape[1])
 
     @staticmethod
     @once_differentiable
