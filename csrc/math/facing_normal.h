@@ -99,7 +99,9 @@ ETSPLAT_FN void triangle_channels_backward(const DepthAxis& camera, const Vector
         const Vector3<float> share = (*grad++ * (1.0f / 3.0f)) * camera.axis;
         for (int k = 0; k < 3; ++k) grad_corner[k] = grad_corner[k] + share;
     }
-    if (normal) facing_normal_backward(camera, corner, {grad[0], grad[1], grad[2]}, grad_corner);
+    // finite corners may have infinite edges, and 0 times those is NaN; such a triangle is invisible
+    if (normal && (grad[0] != 0.0f || grad[1] != 0.0f || grad[2] != 0.0f))
+        facing_normal_backward(camera, corner, {grad[0], grad[1], grad[2]}, grad_corner);
 }
 
 }  // namespace etsplat

@@ -67,7 +67,8 @@ def triangle_channels(
 
 
 def _homogeneous_centroids(corners: Float[Tensor, "N 3 3"]) -> Float[Tensor, "N 4"]:
-    return torch.nn.functional.pad(corners.mean(dim=1), (0, 1), value=1.0)
+    centroids = (corners / 3).sum(dim=1)  # a sum before the division could be infinite, and 0 times it NaN
+    return torch.nn.functional.pad(centroids, (0, 1), value=1.0)
 
 
 def _facing_normals(corners: Float[Tensor, "N 3 3"], viewmats: Float[Tensor, "B 4 4"]) -> Float[Tensor, "B N 3"]:
