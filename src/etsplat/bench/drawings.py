@@ -34,7 +34,7 @@ def draw_kernels() -> Figure:
             sigma = torch.tensor(value, dtype=torch.float64)
             color = _shade(index)
             axes[0, column].plot(x, kernel.value(x, sigma), color=color, label=f"σ = {value:g}")
-            axes[1, column].plot(x, kernel.dvalue_dx(x, sigma).clamp(min=-6), color=color)
+            axes[1, column].plot(x, kernel.dvalue_dx(x, sigma), color=color)
             boundary = float(kernel.value(torch.ones((), dtype=torch.float64), sigma))
             axes[0, column].plot(1, boundary, "o", color=color, markersize=4)
         axes[0, column].set_title(title)
@@ -45,6 +45,7 @@ def draw_kernels() -> Figure:
         axes[1, column].set_xlabel("x  (0 centre, 1 boundary, 2 cut)")
     axes[0, 0].set_ylabel("G(x); dots: on the boundary")
     axes[1, 0].set_ylabel("dG/dx")
+    axes[1, 0].set_ylim(-6, 0.3)
     axes[0, 2].legend(frameon=False, fontsize=8)
     return figure
 
@@ -72,13 +73,13 @@ def draw_edges() -> Figure:
         axes[row, 3].set_xticks([])
         axes[row, 3].spines[["top", "right"]].set_visible(False)
     axes[0, 3].set_title("opacity across the seam", fontsize=10)
-    axes[0, 3].legend(frameon=False, fontsize=8)
+    axes[1, 3].legend(frameon=False, fontsize=8, loc="lower center")  # the row with room below its curves
     return figure
 
 
 def draw_soft_triangle() -> Figure:
     """One triangle, softened, with the level sets of x (the paper's figure softtri)."""
-    figure = Figure(figsize=(11, 3.6), layout="constrained")
+    figure = Figure(figsize=(11, 3.0), layout="constrained")
     axes: Any = figure.subplots(1, 4)
     triangle = torch.tensor([[[-0.55, -0.4], [0.6, -0.25], [-0.1, 0.55]]])
     distance = _barycentric_distance(triangle[0])

@@ -1,6 +1,7 @@
 """A grid's pictures: convergence of every variant, and reconstructions beside the truth."""
 
 import statistics
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,9 @@ from etsplat.scene.photograph import orbit_cameras, shade_faces
 TILE = 360
 OBJECTS = 6
 """At most so many objects in the qualitative figure."""
+
+_MARGIN = 8
+"""Pixels around what a picture shows."""
 
 _VIEW = 17
 """Of the orbit: at the height of the object, turned by 45 degrees; a test view."""
@@ -56,7 +60,8 @@ def plot_convergence(cells: Sequence[Cell], variants: Sequence[str], path: Path)
             axes[row, column].grid(color="#e4e6e8")
             axes[row, column].spines[["top", "right"]].set_visible(False)
         axes[0, row].set_yscale("log")
-    axes[0, 0].legend(frameon=False, fontsize=8)
+    handles, labels = axes[1, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, frameon=False, fontsize=8, loc="outside lower center", ncols=4)
     with atomic_write(path) as temporary:
         figure.savefig(temporary, dpi=130)
 
@@ -70,26 +75,47 @@ def draw_qualitative(cells: Sequence[Cell], variants: Sequence[str], path: Path)
         done = {cell.variant: cell for cell in reversed(cells) if cell.object == name and cell.state == "done"}
         truth = load_mesh(next(iter(done.values())).mesh)
         center, radius = bounding_ball(truth.vertices)
-        columns = {"truth": (truth.vertices, truth.faces)}
+        meshes = {"truth": (truth.vertices, truth.faces)}
         for variant in variants:
             if variant in done:
                 mesh = load_mesh(RunDirectory(done[variant].folder).mesh_path(".ply"))
-                columns[variant] = (mesh.vertices, mesh.faces)
+                meshes[variant] = (mesh.vertices, mesh.faces)
+        pictures = {
+            title: [
+                draw_shape(((vertices.double() - center) / radius).float(), faces, normals=half)
+                for half in (False, True)
+            ]
+            for title, (vertices, faces) in meshes.items()
+        }
+        shown = _bounds([picture for pair in pictures.values() for picture in pair])
         for column, title in enumerate(["truth", *variants]):
             for half in range(2):
                 axis = grid[2 * row + half, column]
                 axis.axis("off")
-                if title in columns:
-                    vertices, faces = columns[title]
-                    unit = ((vertices.double() - center) / radius).float()
-                    axis.imshow(draw_shape(unit, faces, normals=half == 1).numpy())
+                if title in pictures:
+                    axis.imshow(pictures[title][half][shown].numpy())
                 if row == 0 and half == 0:
-                    axis.set_title(title, fontsize=9)
+                    axis.set_title(_wrapped(title), fontsize=8)
         grid[2 * row, 0].text(
             -0.05, 0.5, name, rotation=90, va="center", ha="right", transform=grid[2 * row, 0].transAxes
         )
     with atomic_write(path) as temporary:
         figure.savefig(temporary, dpi=100)
+
+
+def _wrapped(title: str) -> str:
+    """In lines that fit above a picture; settings break at their commas."""
+    return "\n".join(line for part in title.split(",") for line in textwrap.wrap(part, 24))
+
+
+def _bounds(pictures: Sequence[Float[Tensor, "H W 3"]]) -> tuple[slice, slice]:
+    """The rows and columns where any of them is not white, and a margin."""
+    drawn = torch.stack([(picture < 1).any(dim=2) for picture in pictures]).any(dim=0)
+    slices = []
+    for line in (drawn.any(dim=1), drawn.any(dim=0)):
+        used = line.nonzero()[:, 0].tolist() or [0, TILE - 1]
+        slices.append(slice(max(0, used[0] - _MARGIN), used[-1] + 1 + _MARGIN))
+    return slices[0], slices[1]
 
 
 def draw_shape(vertices: Tensor, faces: Tensor, *, normals: bool = False) -> Float[Tensor, "H W 3"]:
