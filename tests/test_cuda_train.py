@@ -142,17 +142,24 @@ def test_streamed_photos_give_the_same_bits(cuda_device: torch.device, capture: 
     same_bits(streamed, kept)
 
 
-@pytest.mark.parametrize(("settings", "reads"), [({}, 1), ({"lambda_normal": 0.1, "cull_small": True}, 1)])
-def test_a_queued_step_reads_nothing_back(simt: Simt, capture: Capture, settings: Any, reads: int) -> None:
-    """Nothing in a step waits for the device, but for the rasterizer's look at its room outside of captured graphs."""
-    problem = fitting(capture, "cuda", config=replace(CONFIG, regularize_from=0, **settings))
+PAPER = {"cull_small": True, "lambda_normal": 0.1, "lambda_distortion": 0.1, "lambda_size": 1e-6, "regularize_from": 0}
+
+
+@pytest.mark.parametrize(("settings", "own", "kernels"), [({}, 25, 17), (PAPER, 37, 34)], ids=["quick", "paper"])
+def test_a_queued_step_reads_nothing_back(simt: Simt, settings: Any, own: int, kernels: int) -> None:
+    """Nothing in a step waits for the device, but for the rasterizer's look at its room outside of captured graphs; and
+    few small kernels of torch are left."""
+    problem = fitting(demo_scene(40, 32), "cuda", config=replace(CONFIG, **settings))
     problem.advance(1, 1)  # fills caches
     assert problem._queue is not None
     kind = next(iter(problem._queue._repeated))
     problem._queue._position.zero_()
+    simt.launches.clear()
     with Calls() as calls:
         problem._queue._step(kind)
-    assert calls.waiting() == reads
+    assert calls.waiting() == 1
+    assert len(simt.launches) == own
+    assert calls.kernels() <= kernels
 
 
 def test_a_step_whose_buffers_overflow_is_made_again(simt: Simt, capture: Capture, monkeypatch) -> None:

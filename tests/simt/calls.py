@@ -11,6 +11,10 @@ from torch.utils._pytree import tree_leaves
 WAITING = ("_local_scalar_dense", "nonzero", "masked_select", "unique", "_unique2", "bincount", "equal")
 
 
+_VIEWS = ("view", "_unsafe_view", "slice", "select", "expand", "unsqueeze", "squeeze", "permute", "transpose", "t")
+_VIEWS += ("detach", "as_strided", "alias", "split", "split_with_sizes", "unbind", "diagonal")
+
+
 class Calls(TorchDispatchMode):
     """Remembers the names of what is called within."""
 
@@ -25,6 +29,11 @@ class Calls(TorchDispatchMode):
     def waiting(self) -> int:
         """How many calls read something back."""
         return sum(name.split(".")[1] in WAITING for name in self.names)
+
+    def kernels(self) -> int:
+        """How many calls launch something: not those that give a view, allocate, or read back."""
+        names = (name.split(".")[1] for name in self.names)
+        return sum(not (name in (*WAITING, *_VIEWS) or "empty" in name) for name in names)
 
 
 class Recording(TorchDispatchMode):
