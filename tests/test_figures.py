@@ -1,13 +1,20 @@
 """The paper's explanatory figures: they are drawn, and what they show is what the kernels are."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from captures import write_colmap
 from etsplat.bench.dead_zone import pull, remaining_distance
 from etsplat.bench.drawings import FIGURES
+from etsplat.bench.teaser import draw_teaser
 from etsplat.cli.figures import Figures
 from etsplat.core.errors import InputError
+from etsplat.tasks.reconstruct import reconstruct
+from etsplat.tasks.reconstruct_config import PRESETS
+from etsplat.tasks.train import train
+from etsplat.tasks.train_config import train_settings
 
 
 @pytest.mark.parametrize("name", [name for name in FIGURES if name != "dead-zone"])
@@ -31,3 +38,19 @@ def test_wrong_requests_are_input_errors(tmp_path: Path) -> None:
         Figures(name="kernels", out=tmp_path / "kernels.bmp").run([])
     with pytest.raises(InputError, match="--runs"):
         Figures(name="teaser", out=tmp_path / "teaser.png").run([])
+
+
+def test_the_teaser_shows_a_mesh_and_a_soup(tmp_path: Path) -> None:
+    """A row each, of five pictures that are not blank."""
+    quick = {"checkpoint_every": 0, "evaluate_every": 0}
+    mesh = replace(PRESETS["tiny"], resolution=32, iterations=3, chamfer_samples=1000, **quick)
+    reconstruct("demo:owl", tmp_path / "mesh", mesh)
+    write_colmap(tmp_path / "scene", [(48, 36)] * 9)
+    train(tmp_path / "scene", tmp_path / "soup", replace(train_settings("tiny"), iterations=3, start_opacity=0.8, **quick))
+    figure = draw_teaser([tmp_path / "mesh", tmp_path / "soup"])
+    pictures = [axis.images[0].get_array() for axis in figure.axes]
+    assert len(pictures) == 10
+    assert all(float(picture.std()) > 0.02 for picture in pictures)
+    assert [axis.get_title() for axis in figure.axes[5:7]] == ["start", "opaque triangles"]
+    with pytest.raises(InputError, match="not a finished run"):
+        draw_teaser([tmp_path / "scene"])

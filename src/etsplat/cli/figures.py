@@ -19,13 +19,13 @@ class Figures(Command):
 
     kernels: G(x) and its slope for several sigma. edges: the seam between two faces. soft-triangle: one triangle and
     the level sets of x. axes: the table of kernel properties. dead-zone: from how far each kernel pulls a triangle
-    back. teaser: from the sphere to a reconstruction, of finished runs.
+    back. teaser: from the sphere to a reconstruction, and from points to a scene, of finished runs.
     """
 
     EXAMPLES: ClassVar[str] = """
     etsplat figures kernels
     etsplat figures dead-zone --out dead_zone.pdf
-    etsplat figures teaser --runs runs/bunny runs/boot
+    etsplat figures teaser --runs runs/bunny runs/kitchen
     """
 
     name: tyro.conf.Positional[Name]
@@ -33,7 +33,7 @@ class Figures(Command):
     out: Path | None = None
     """File to write, .png, .pdf or .svg; NAME.png if not given."""
     runs: tuple[Path, ...] = ()
-    """Finished runs that the teaser shows."""
+    """Finished runs of `etsplat reconstruct` and `train` that the teaser shows."""
 
     @classmethod
     def defaults(cls, arguments: Sequence[str]) -> "Figures":
