@@ -53,20 +53,22 @@ def test_gradients_are_finite_differences(rng):
 
 def test_what_is_not_finite_or_has_no_area_is_left_out(cuda_device):
     """Zeros and zero gradients, and the other triangles and cameras have theirs."""
-    corners = torch.tensor([[[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]]).repeat(4, 1, 1)
+    corners = torch.tensor([[[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]]).repeat(5, 1, 1)
+    corners[4] *= 3e38
+    corners[4, 0] = -3e38
     corners[1, 2] = torch.tensor([2.0, 0, 0])
     corners[2, 0, 0] = math.nan
     views = viewmats()
     views[1, 0, 0] = math.inf
     for engine, device in (("reference", "cpu"), ("cpu", "cpu"), ("cuda", cuda_device)):
-        cotangent = torch.ones(2, 4, 4, device=device)
+        cotangent = torch.ones(2, 5, 4, device=device)
         given = corners.to(device), views.to(device)
         channels, grad, _ = gradients(*given, cotangent, engine, depth=True, normals=True)
         assert bool(channels.isfinite().all())
         assert bool(grad.isfinite().all())
-        assert channels[0, 1, 1:].tolist() == [0, 0, 0]
+        assert channels[0, 1, 1:].tolist() == channels[0, 4, 1:].tolist() == [0, 0, 0]
         assert channels[0, 2].tolist() == [0, 0, 0, 0]
-        assert channels[1, :, 0].tolist() == [0, 0, 0, 0]
+        assert channels[1, :, 0].tolist() == [0, 0, 0, 0, 0]
         assert float(grad[2].abs().max()) == 0
         assert float(grad[3].abs().max()) > 0
 

@@ -33,7 +33,8 @@ ETSPLAT_FN bool all_finite(const Vector3<float>* corner) {
 }
 
 ETSPLAT_FN Vector3<float> centroid_of(const Vector3<float>* corner) {
-    return (1.0f / 3.0f) * (corner[0] + corner[1] + corner[2]);
+    // a sum before the division could be infinite
+    return (1.0f / 3.0f) * corner[0] + (1.0f / 3.0f) * corner[1] + (1.0f / 3.0f) * corner[2];
 }
 
 ETSPLAT_FN float centroid_depth(const DepthAxis& camera, const Vector3<float>* corner) {
@@ -49,7 +50,8 @@ struct ScaledEdges {
 ETSPLAT_FN ScaledEdges scaled_edges(const Vector3<float>* corner) {
     const Vector3<float> a = corner[1] - corner[0], b = corner[2] - corner[0];
     const float size = vmax(vmax(vmax(vabs(a.x), vabs(a.y)), vmax(vabs(a.z), vabs(b.x))), vmax(vabs(b.y), vabs(b.z)));
-    const float inverse = size > 0.0f && size < 3e38f ? 1.0f / size : 0.0f;
+    if (!(size > 0.0f && size < 3e38f)) return {};  // corners may be finite and edges not
+    const float inverse = 1.0f / size;
     return {inverse * a, inverse * b, inverse};
 }
 
@@ -99,9 +101,7 @@ ETSPLAT_FN void triangle_channels_backward(const DepthAxis& camera, const Vector
         const Vector3<float> share = (*grad++ * (1.0f / 3.0f)) * camera.axis;
         for (int k = 0; k < 3; ++k) grad_corner[k] = grad_corner[k] + share;
     }
-    // finite corners may have infinite edges, and 0 times those is NaN; such a triangle is invisible
-    if (normal && (grad[0] != 0.0f || grad[1] != 0.0f || grad[2] != 0.0f))
-        facing_normal_backward(camera, corner, {grad[0], grad[1], grad[2]}, grad_corner);
+    if (normal) facing_normal_backward(camera, corner, {grad[0], grad[1], grad[2]}, grad_corner);
 }
 
 }  // namespace etsplat
