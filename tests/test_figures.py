@@ -46,7 +46,8 @@ def test_the_teaser_shows_a_mesh_and_a_soup(tmp_path: Path) -> None:
     mesh = replace(PRESETS["tiny"], resolution=32, iterations=3, chamfer_samples=1000, **quick)
     reconstruct("demo:owl", tmp_path / "mesh", mesh)
     write_colmap(tmp_path / "scene", [(48, 36)] * 9)
-    train(tmp_path / "scene", tmp_path / "soup", replace(train_settings("tiny"), iterations=3, start_opacity=0.8, **quick))
+    soup = replace(train_settings("tiny"), iterations=3, start_opacity=0.8, **quick)
+    train(tmp_path / "scene", tmp_path / "soup", soup)
     figure = draw_teaser([tmp_path / "mesh", tmp_path / "soup"])
     pictures = [axis.images[0].get_array() for axis in figure.axes]
     assert len(pictures) == 10
