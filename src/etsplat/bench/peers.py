@@ -37,27 +37,42 @@ class PeerConfig:
     """So many random Gaussians where the capture has no points."""
 
     start_opacity: float = 0.1
+    """Of all Gaussians."""
     sh_degree: int = 3
+    """Of the view-dependent colours."""
     sh_every: int = 1000
     """Iterations between steps of the degree, from 0."""
     lr_means: float = 1.6e-4
+    """Adam learning rate of positions, where the scene's extent is 1."""
     lr_means_final: float = 0.01
+    """Ratio of that rate's last value to its first; it falls exponentially."""
     lr_scales: float = 5e-3
+    """Of log scales."""
     lr_quats: float = 1e-3
+    """Of rotations."""
     lr_opacities: float = 5e-2
+    """Of opacities, before their sigmoid."""
     lr_sh_dc: float = 2.5e-3
+    """Of the constant band of the colours."""
     lr_sh_rest: float = 1.25e-4
+    """Of the other bands."""
     lambda_dssim: float = 0.2
+    """Share of 1 - SSIM in the photometric loss; the rest is L1."""
     lambda_normal: float = 0.05
     """2dgs: weight of the angle between normals and those of the depth image."""
     normals_from: int = 7000
     """Where that begins."""
     near_plane: float = 0.01
+    """What is nearer to a camera is not drawn."""
 
     densify_from: int = 500
+    """No densification up to this iteration."""
     densify_until: int = 15_000
+    """None from this one on."""
     densify_every: int = 100
+    """Iterations between densifications."""
     reset_every: int = 3000
+    """Iterations between resets of the opacities."""
 
     def at(self, step: int) -> int:
         """The iteration of this run that an iteration of the schedule falls on; at least 1."""

@@ -39,8 +39,6 @@ mesh.ply        the result with exact face colours
 mesh.obj        the same with vertex colours (also mesh.glb, which most viewers open)""",
     "train": """\
 soup.safetensors  the result: triangles with opacity, softness and view-dependent colour; etsplat export converts it""",
-    "peer": """\
-gaussians.safetensors  the result: Gaussians as gsplat has them, where the cameras are centred and their extent is 1""",
 }
 
 _TEST = {
@@ -48,9 +46,17 @@ _TEST = {
 test/           held-out views: NNN_render.png (splatted), NNN_truth.png, NNN_mesh.png (the mesh drawn opaque)""",
     "train": """\
 test/           held-out views: NNN_render.png (splatted), NNN_truth.png, NNN_opaque.png (drawn opaque)""",
-    "peer": """\
-test/           held-out views: NNN_render.png, NNN_truth.png""",
 }
+
+_PEER_README = """\
+This folder is a run of a peer of etsplat, in gsplat.
+
+gaussians.safetensors  the result: Gaussians as gsplat has them, where the cameras are centred and their extent is 1
+metrics.json    how good it is; evaluation.json has more, and the speed
+test/           held-out views: NNN_render.png, NNN_truth.png
+history.jsonl   one line per log step: iteration, seconds of optimisation, loss, number of Gaussians
+config.json     the settings that made it
+"""
 
 _FILES = (
     "mesh.ply",
@@ -167,7 +173,8 @@ class RunDirectory:
             run.test.mkdir()
         _write_json(run.config_path, {"format": FORMAT, **config})
         task = config["task"]
-        _write_text(run.path / "README.txt", _README.format(task=task, results=_RESULTS[task], test=_TEST[task]))
+        text = _PEER_README if task == "peer" else _README.format(task=task, results=_RESULTS[task], test=_TEST[task])
+        _write_text(run.path / "README.txt", text)
         return run
 
     @classmethod
