@@ -40,6 +40,36 @@ def test_untangling_leaves_no_intersection_and_the_rest_in_place() -> None:
     assert torch.equal(clean, untangled)
 
 
+def test_untangling_moves_no_farther_than_it_must(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Vertices that smoothing moved go most of the way back, and nothing intersects for that."""
+    vertices, faces = icosphere(3)
+    vertices = vertices.clone()
+    vertices[5] *= -1.2
+    topology = MeshTopology.from_faces(faces, len(vertices))
+    untangled, _ = untangle(vertices, topology)
+    monkeypatch.setattr("etsplat.geometry.untangle._RETURNS", 0)
+    smoothed, _ = untangle(vertices, topology)
+    moved = [float((result - vertices).norm(dim=1).sum()) for result in (untangled, smoothed)]
+    assert moved[0] < 0.3 * moved[1]
+    assert count_self_intersections(untangled, faces) == 0
+
+
+def test_folds_out_of_reach_stay() -> None:
+    """A cap pushed through the far side stays where it is, as a whole, while a stray vertex elsewhere is put right."""
+    vertices, faces = icosphere(4)
+    vertices = vertices.clone()
+    topology = MeshTopology.from_faces(faces, len(vertices))
+    cap, stray = vertices[:, 2] > 0.8, int(vertices[:, 0].argmax())
+    vertices[cap, 2] -= 2.0
+    of_cap = count_self_intersections(vertices, faces)
+    vertices[stray] += torch.tensor([-0.02, 0.2, 0.0])
+    assert count_self_intersections(vertices, faces) > of_cap > 0
+    untangled, left = untangle(vertices, topology, reach=0.5)
+    assert left == count_self_intersections(untangled, faces) == of_cap
+    assert torch.equal(untangled[cap], vertices[cap])
+    assert not torch.equal(untangled[stray], vertices[stray])
+
+
 def test_the_solver_inverts_the_laplacian() -> None:
     """(I + w L) applied by hand to the solution gives back the right-hand side; constants stay as they are."""
     vertices, faces = bumpy_sphere(2, seed=1)

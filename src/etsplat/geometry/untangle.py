@@ -1,5 +1,7 @@
 """Undoing self-intersections by smoothing where they are."""
 
+import math
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -16,46 +18,116 @@ _WIDEN = 8
 _STEP = 0.5
 """How far a sweep moves a vertex towards the mean of its neighbours."""
 
+_RETURNS = 12
+"""Attempts to bring vertices back; each halves the way that is left to those that get through."""
+
+_SHORTEST = 0.02
+"""Part of the way, of all that smoothing moved a vertex, below which no attempt is worth its looks."""
+
+_HOLDS = 6
+"""Looks for intersections in an attempt, each holding more vertices in place."""
+
 
 def untangle(
-    vertices: Float[Tensor, "V 3"], topology: MeshTopology, *, rounds: int = 40
+    vertices: Float[Tensor, "V 3"], topology: MeshTopology, *, rounds: int = 40, reach: float = math.inf
 ) -> tuple[Float[Tensor, "V 3"], int]:
-    """Moves the vertices of faces that cut through others until none does, or the rounds are used up.
+    """Moves the vertices of faces that cut through others until none does, as little as possible.
 
-    Each round marks the corners of intersecting faces, adds a ring of neighbours for every eighth round already done,
-    so that what resists is smoothed more widely, and moves the marked vertices to the mean of their neighbours in
-    damped sweeps. All others stay where they are. Boundary vertices may shrink inwards. Computed on the CPU.
+    1. In rounds, the corners of intersecting faces, with a ring of neighbours for every eighth round already done, so
+       that what resists is smoothed more widely, move to the mean of their neighbours in damped sweeps.
+    2. What smoothing moved goes back towards its old place, as far as that makes no face intersect anew: folds end
+       where they touch instead of flat.
+    3. Where a vertex still ends too far away, all that moved together with it returns to its old place, intersections
+       included: folds so large hold up the shape, as where a sphere stands for an object with holes.
+
+    All other vertices stay where they are. Boundary vertices may shrink inwards. Computed on the CPU.
 
     Args:
         vertices: (V, 3) finite.
         topology: of the mesh.
-        rounds: most looks for intersections.
+        rounds: most looks for intersections in step 1.
+        reach: how far a vertex may go, in lengths of its longest edge.
 
     Returns:
         Moved vertices, and how many faces still intersect.
     """
-    device, vertices = vertices.device, vertices.detach().cpu().clone()
-    faces = topology.faces.cpu()
+    device, original, faces = vertices.device, vertices.detach().cpu(), topology.faces.cpu()
+    vertices = original.clone()
     marked = intersecting_faces(vertices, faces)
     for done in range(rounds):
         if not bool(marked.any()):
             break
         _smooth(vertices, topology, _region(marked, topology, rings=done // _WIDEN))
         marked = intersecting_faces(vertices, faces)
+    vertices = _returned(vertices, original, topology, marked)
+    lost = _too_far(vertices, original, topology, reach)
+    if bool(lost.any()):
+        vertices[lost] = original[lost]
+        marked = intersecting_faces(vertices, faces)
     return vertices.to(device), int(marked.sum())
+
+
+def _returned(
+    vertices: Float[Tensor, "V 3"], original: Float[Tensor, "V 3"], topology: MeshTopology, marked: Bool[Tensor, " F"]
+) -> Float[Tensor, "V 3"]:
+    """The vertices brought back towards `original` as far as no faces intersect but those that are marked."""
+    still = (vertices == original).all(dim=1)
+    way, step = torch.zeros(len(vertices)), torch.full((len(vertices),), 0.5)
+    for _ in range(_RETURNS):
+        aim = torch.where(still, way, way + step * (1 - way))
+        if float((aim - way).max()) < _SHORTEST:
+            break
+        held = still
+        for _ in range(_HOLDS):
+            trial = vertices.lerp(original, torch.where(held, way, aim)[:, None])
+            new = intersecting_faces(trial, topology.faces.cpu()) & ~marked
+            if not bool(new.any()):
+                break
+            corners = _region(new, topology, rings=0)
+            held = held | corners if bool((corners & ~held).any()) else _grown(held, topology)
+        else:
+            held = torch.ones_like(still)
+        way, step = torch.where(held, way, aim), torch.where(held, 0.5 * step, step)
+    return vertices.lerp(original, way[:, None])
+
+
+def _too_far(
+    vertices: Float[Tensor, "V 3"], original: Float[Tensor, "V 3"], topology: MeshTopology, reach: float
+) -> Bool[Tensor, " V"]:
+    """Vertices that moved together, by edges, with one that moved more than `reach` times its longest edge."""
+    first, second = topology.edges.cpu().unbind(1)
+    lengths = (original[first] - original[second]).norm(dim=1)
+    longest = torch.zeros(len(original))
+    for end in (first, second):
+        longest.scatter_reduce_(0, end, lengths, "amax")
+    distance = (vertices - original).norm(dim=1)
+    moved, lost = distance > 0, distance > reach * longest
+    together = moved[first] & moved[second]
+    while True:
+        grown = lost.clone()
+        grown[second[together & lost[first]]] = True
+        grown[first[together & lost[second]]] = True
+        if torch.equal(grown, lost):
+            return lost
+        lost = grown
 
 
 def _region(faces: Bool[Tensor, " F"], topology: MeshTopology, rings: int) -> Bool[Tensor, " V"]:
     """The corners of some faces, and so many rings of neighbours."""
     region = torch.zeros(topology.num_vertices, dtype=torch.bool)
     region[topology.faces.cpu()[faces].reshape(-1)] = True
-    first, second = topology.edges.cpu().unbind(1)
     for _ in range(rings):
-        grown = region.clone()
-        grown[second[region[first]]] = True
-        grown[first[region[second]]] = True
-        region = grown
+        region = _grown(region, topology)
     return region
+
+
+def _grown(region: Bool[Tensor, " V"], topology: MeshTopology) -> Bool[Tensor, " V"]:
+    """With a ring of neighbours more."""
+    first, second = topology.edges.cpu().unbind(1)
+    grown = region.clone()
+    grown[second[region[first]]] = True
+    grown[first[region[second]]] = True
+    return grown
 
 
 def _smooth(vertices: Tensor, topology: MeshTopology, region: Bool[Tensor, " V"]) -> None:

@@ -200,8 +200,10 @@ class MeshFitting:
         mesh = self.mesh
         topology = mesh.topology.to(torch.device("cpu"))
         if iteration in self._untanglings:
+            # What smoothing takes away later steps bring back, but nothing does after the last.
+            reach = 0.5 if iteration == self._config.iterations else math.inf
             with torch.no_grad():
-                mesh.vertices.copy_(untangle(mesh.vertices.cpu(), topology)[0])
+                mesh.vertices.copy_(untangle(mesh.vertices.cpu(), topology, reach=reach)[0])
         if iteration not in self._budgets:
             return 0
         before = len(mesh.faces)
