@@ -52,8 +52,13 @@ def test_a_disk_too_small_is_found_before_it_is_full(tmp_path, monkeypatch):
         write_photo(tmp_path / "photos" / f"{name}.jpg", 16, 12)
     usage = shutil.disk_usage(tmp_path)
     monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=8 << 20))
-    with pytest.raises(InputError, match=r"3 photos may take 9 MiB there and 8 MiB are free"):
+    with pytest.raises(InputError, match=r"3 images may take 10 MiB there and 8 MiB are free"):
         find_cameras(tmp_path / "photos", tmp_path / "scene")
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=1 << 20))
+    write_colmap(tmp_path / "distorted", [(64, 48)] * 3, model="SIMPLE_RADIAL", extra=(-0.1,))
+    with pytest.raises(InputError, match=r"3 images may take 1 MiB there"):
+        undistort_scene(tmp_path / "distorted", tmp_path / "new")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["distorted", "photos"]
 
 
 def test_photos_of_nothing_in_common_are_told_what_is_wrong_with_them(tmp_path):

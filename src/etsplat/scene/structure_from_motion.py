@@ -2,7 +2,6 @@
 
 import contextlib
 import os
-import shutil
 import sqlite3
 import threading
 from collections.abc import Callable, Iterator
@@ -12,7 +11,7 @@ from typing import Any, Literal
 
 from etsplat.core.errors import InputError
 from etsplat.io.images import IMAGE_SUFFIXES, image_size
-from etsplat.scene.undistortion import check_new, import_pycolmap, undistort_model, working_folder
+from etsplat.scene.undistortion import check_new, check_space, import_pycolmap, undistort_model, working_folder
 
 Matching = Literal["auto", "exhaustive", "sequential"]
 Progress = Callable[[str, int, int], None]
@@ -71,7 +70,8 @@ def find_cameras(
     photos, out = Path(photos), Path(out)
     names = _photo_names(photos)
     check_new(out)
-    _check_space(photos, names, out)
+    files = [photos / name for name in names]
+    check_space(out, files, BYTES_PER_PHOTO * len(files))
     report = progress or (lambda phase, done, total: None)
     with working_folder(out) as work:
         model = _reconstruct(pycolmap, photos, names, work, matching, max_size, threads or -1, report)
@@ -96,7 +96,6 @@ def _reconstruct(
     report: Progress,
 ) -> Any:
     """The largest model, or an empty one."""
-    pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
     database = work / "database.db"
     one_size = len({image_size(photos / name) for name in names}) == 1
     mode = pycolmap.CameraMode.SINGLE if one_size else pycolmap.CameraMode.AUTO
@@ -168,17 +167,6 @@ def _photo_names(photos: Path) -> list[str]:
     if len(names) < LEAST_COUNT:
         raise InputError(f"photos {photos}: {len(names)} JPEG or PNG files; at least 3 are needed, better 20 or more")
     return names
-
-
-def _check_space(photos: Path, names: list[str], out: Path) -> None:
-    """COLMAP ends the whole process when its database finds the disk full, so it must not come to that."""
-    needed = len(names) * BYTES_PER_PHOTO + sum((photos / name).stat().st_size for name in names)
-    free = shutil.disk_usage(out.parent).free
-    if needed > free:
-        raise InputError(
-            f"cannot write {out}: {len(names)} photos may take {needed >> 20} MiB there and {free >> 20} MiB are free; "
-            "free some space on that disk or choose another folder"
-        )
 
 
 def _too_few(photos: Path, placed: int, count: int) -> str:

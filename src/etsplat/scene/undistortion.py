@@ -3,7 +3,7 @@
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -16,6 +16,9 @@ from etsplat.io.images import image_size
 from etsplat.scene.colmap import find_model
 from etsplat.scene.frames import find_mask, scaled_intrinsics
 from etsplat.scene.transforms import DistortedFrames, read_distorted_transforms
+
+_GROWTH, _SPARE_BYTES = 4, 1 << 20
+"""COLMAP writes JPEG with few losses: files grow. Beside them lies the model."""
 
 
 def undistort_scene(scene: Path | str, out: Path | str, *, max_size: int = 1600) -> list[str]:
@@ -47,6 +50,7 @@ def undistort_scene(scene: Path | str, out: Path | str, *, max_size: int = 1600)
         photos = frames.folder
         model, masks = _make_model(pycolmap, frames), frames.masks
     names = sorted(image.name for image in model.images.values() if image.has_pose)
+    check_space(out, [*(photos / name for name in names), *masks.values(), *masks.values()])
     with working_folder(out) as work:
         undistort_model(pycolmap, model, photos, names, work, max_size)
         if masks:
@@ -87,6 +91,20 @@ def check_new(out: Path) -> None:
         raise write_error(out, error) from error
 
 
+def check_space(out: Path, images: Sequence[Path], more: int = 0) -> None:
+    """Raises InputError if images without distortion and `more` bytes may not fit beside `out`.
+
+    COLMAP ends the whole process when it finds the disk full, so it must not come to that.
+    """
+    needed = more + _SPARE_BYTES + _GROWTH * sum(image.stat().st_size for image in images)
+    free = shutil.disk_usage(out.parent).free
+    if needed > free:
+        raise InputError(
+            f"cannot write {out}: {len(images)} images may take {needed >> 20} MiB there and {free >> 20} MiB are free;"
+            " free some space on that disk or choose another folder"
+        )
+
+
 @contextmanager
 def working_folder(out: Path) -> Iterator[Path]:
     """A folder beside `out` that is gone afterwards. What COLMAP and the system say of a full disk is an InputError."""
@@ -103,7 +121,7 @@ def working_folder(out: Path) -> Iterator[Path]:
 
 
 def import_pycolmap() -> Any:
-    """The module.
+    """The module, told to be quiet.
 
     Raises:
         InputError: it is not installed.
@@ -114,6 +132,7 @@ def import_pycolmap() -> Any:
         raise InputError(
             "structure from motion and undistortion need pycolmap: pip install 'etsplat[sfm]' (or use COLMAP itself)"
         ) from error
+    pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
     return pycolmap
 
 
