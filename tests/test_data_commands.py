@@ -158,6 +158,22 @@ def test_distortion_of_transforms_json_is_removed_once(tmp_path, model):
     torch.testing.assert_close(capture.viewmats[1], circle_poses(3)[1], atol=1e-6, rtol=0)
 
 
+def test_transparency_that_undistortion_would_lose_is_refused(tmp_path):
+    pytest.importorskip("pycolmap")
+    write_transforms(tmp_path / "scene", 3, channels=4, k1=-0.1)
+    with pytest.raises(InputError, match=r"0000\.png: has transparency.*masks"):
+        undistort_scene(tmp_path / "scene", tmp_path / "new")
+
+
+def test_lenses_that_programs_disagree_about_are_refused(tmp_path):
+    pytest.importorskip("pycolmap")
+    unknown = [{"k4": 0.1}, {"is_fisheye": True, "p1": 0.1}, {"camera_model": "EQUIRECTANGULAR"}]
+    for number, settings in enumerate(unknown):
+        write_transforms(tmp_path / str(number), 3, **settings)
+        with pytest.raises(InputError, match="coefficients that are not known here"):
+            undistort_scene(tmp_path / str(number), tmp_path / "new")
+
+
 def test_a_full_disk_while_undistorting_is_one_line_and_nothing_stays(tmp_path, monkeypatch):
     pycolmap = pytest.importorskip("pycolmap")
     write_colmap(tmp_path / "scene", [(64, 48)] * 3, model="SIMPLE_RADIAL", extra=(-0.1,))

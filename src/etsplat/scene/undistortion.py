@@ -12,7 +12,7 @@ import torch
 
 from etsplat.core.errors import InputError
 from etsplat.io.atomic import write_error
-from etsplat.io.images import image_size
+from etsplat.io.images import image_size, load_pixels
 from etsplat.scene.colmap import find_model
 from etsplat.scene.frames import find_mask, scaled_intrinsics
 from etsplat.scene.transforms import DistortedFrames, read_distorted_transforms
@@ -34,8 +34,8 @@ def undistort_scene(scene: Path | str, out: Path | str, *, max_size: int = 1600)
         The names of the images. Every 8th is for testing, whatever `transforms.json` said.
 
     Raises:
-        InputError: pycolmap is missing; there is no scene, or it cannot be read; images are missing; `out` cannot be
-            used; the disk is full.
+        InputError: pycolmap is missing; there is no scene, or it cannot be read; images are missing or transparent;
+            `out` cannot be used; the disk is full.
     """
     pycolmap = import_pycolmap()
     scene, out = Path(scene), Path(out)
@@ -50,6 +50,9 @@ def undistort_scene(scene: Path | str, out: Path | str, *, max_size: int = 1600)
         photos = frames.folder
         model, masks = _make_model(pycolmap, frames), frames.masks
     names = sorted(image.name for image in model.images.values() if image.has_pose)
+    for photo in (photos / name for name in names):
+        if photo.suffix.lower() == ".png" and load_pixels(photo, *image_size(photo)).shape[2] == 4:
+            raise InputError(f"image {photo}: has transparency, which would be lost; put it into {scene}/masks")
     check_space(out, [*(photos / name for name in names), *masks.values(), *masks.values()])
     with working_folder(out) as work:
         undistort_model(pycolmap, model, photos, names, work, max_size)
