@@ -77,7 +77,7 @@ def same_bits(first: SoupFitting, second: SoupFitting) -> None:
     "settings",
     [
         {},
-        {"finish": "opaque", "finish_from": 5000, "cull_small": True},
+        {"finish": "opaque", "cull_small": True},
         {"lambda_normal": 0.05, "lambda_distortion": 0.1, "lambda_size": 1e-6, "regularize_from": 10_000},
         {"method": "single-sided", "background": "random"},
     ],
@@ -123,7 +123,7 @@ def test_steps_queued_together_are_the_steps_one_by_one(cuda_device: torch.devic
 
 def test_replayed_steps_are_those_that_are_called(cuda_device: torch.device, monkeypatch) -> None:
     """The same bits with graphs and without: all that changes from step to step is in device memory."""
-    capture, changing = demo_scene(40, 32), {"finish": "opaque", "finish_from": 100, "background": "random"}
+    capture, changing = demo_scene(40, 32), {"finish": "opaque", "background": "random"}
     config = replace(CONFIG, iterations=9, densify_every=30_000, lambda_normal=0.1, regularize_from=0, **changing)
     replayed = fitting(capture, "cuda", cuda_device, config)
     losses = run(replayed, 9, together=9)

@@ -1,5 +1,3 @@
-from dataclasses import replace
-
 import pytest
 import torch
 
@@ -195,17 +193,7 @@ def test_plans_that_do_not_fit_change_nothing(rng):
     assert adam.parameters["sigma_raw"] is value
 
 
-def test_whom_no_view_has_seen_stays_and_has_no_children(rng):
-    """With `keep_unseen` it outlives a trial in which it was never visible; without, it is useless."""
-    statistics = SoupStatistics.zeros(4)
-    seen = torch.tensor([[True, True, False, False]])
-    view = TriangleStatistics(0.5 * seen, 9.0 * seen, 4.0 * seen, seen)
-    for _ in range(3):
-        statistics.update(view, 3, epoch_starts=True)
-    opacities = torch.tensor([0.5, 0.001, 0.5, 0.001])
-    assert dead_triangles(opacities, statistics, RULES, 3).tolist() == [False, True, True, True]
-    keeping = replace(RULES, keep_unseen=True)
-    dead = dead_triangles(opacities, statistics, keeping, 3)
-    assert dead.tolist() == [False, True, False, True]
-    plan, _, _ = plan_for(rng, count=4, target=9, screen_size=statistics.screen_size, dead=dead)
-    assert set(plan.source[plan.fresh].tolist()) == {0}
+def test_whom_no_view_has_seen_has_no_children(rng):
+    """Its size on screen is unknown, and nobody would see them."""
+    plan, _, _ = plan_for(rng, count=4, target=9, screen_size=torch.tensor([5.0, 5, 0, 0]))
+    assert set(plan.source[plan.fresh].tolist()) == {0, 1}

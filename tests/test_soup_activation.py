@@ -37,7 +37,8 @@ def test_native_engines_agree_with_the_float64_reference(rng, cuda_device, limit
         leaves = [tensor.to(device, dtype, copy=True).requires_grad_() for tensor in (logits, raw)]
         given = torch.tensor(limits, device=device) if engine == "cuda" else limits
         seen = camera().to(torch.device(device), dtype=dtype) if culling else None
-        drawn = torch.stack(soup_activation(vertices.to(device, dtype), *leaves, given, seen, engine=engine))
+        sizes = {"smallest": 1.0, "largest": 20.0}
+        drawn = torch.stack(soup_activation(vertices.to(device, dtype), *leaves, given, seen, **sizes, engine=engine))
         (drawn * cotangents.to(device, dtype)).sum().backward()
         results.append([tensor.detach().cpu().double() for tensor in (drawn, *(leaf.grad for leaf in leaves))])
     exact, on_cpu, on_device = results
@@ -47,12 +48,27 @@ def test_native_engines_agree_with_the_float64_reference(rng, cuda_device, limit
             torch.testing.assert_close(tensor, expected, rtol=2e-6, atol=1e-6)
 
 
+def test_triangles_are_left_out_by_their_size():
+    """On the axis at depth 3: in pixels, legs of f s / 3, an inradius of 0.29 and a reach of 0.75 legs."""
+    legs = torch.tensor([0.01, 0.2, 1.0, 2.0])
+    corners = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    front = Cameras(torch.eye(4)[None], camera().Ks, 64, 48)
+    vertices = legs[:, None, None] * corners + torch.tensor([0.0, 0, 3])
+    pixels = float(camera().Ks[0, 0, 0]) / 3 * legs
+    for engine in ("cpu", "reference"):
+        drawn, _ = soup_activation(
+            vertices, torch.zeros(4), torch.zeros(4), (0.0, 1.0), front, smallest=1.0, largest=20.0, engine=engine
+        )
+        assert (drawn > 0).tolist() == ((0.2929 * pixels > 1) & (0.7454 * pixels < 20)).tolist()
+    assert (drawn > 0).tolist() == [False, True, True, False]
+
+
 def test_gradients_are_finite_differences(rng):
     """Of the reference, in float64, away from the ceiling."""
     vertices, logits, raw = (tensor[:20].double() for tensor in soup(rng))
     leaves = logits.requires_grad_(), raw.requires_grad_()
     seen = camera().to(dtype=torch.float64)
-    assert torch.autograd.gradcheck(lambda *p: soup_activation(vertices, *p, (0.3, 0.45), seen), leaves)
+    assert torch.autograd.gradcheck(lambda *p: soup_activation(vertices, *p, (0.3, 0.45), seen, smallest=1.0), leaves)
 
 
 def random_view(rng: torch.Generator) -> TriangleStatistics:

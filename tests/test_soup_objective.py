@@ -2,7 +2,6 @@ import pytest
 import torch
 
 from etsplat.core.cameras import Cameras, intrinsics, look_at
-from etsplat.core.rasterization import Rasterization
 from etsplat.ops.engines import num_threads, set_num_threads
 from etsplat.ops.triangle_area import mean_area
 from etsplat.optim.soup_objective import SoupWeights, soup_objective
@@ -83,24 +82,3 @@ def test_every_term_adds_with_its_weight(rng, engine):
     assert objective(**weights) == pytest.approx(plain + sum(terms.values()), rel=1e-5)
     assert terms["opacity"] == pytest.approx(0.3 * 0.6, rel=1e-4)
     assert terms["size"] == pytest.approx(0.02 / float(mean_area(start.vertices).detach()), rel=1e-4)
-
-
-def test_opacities_that_the_view_does_not_show_can_be_left_out(rng):
-    """They get no gradient then."""
-    triangles = soup(rng)
-    with torch.no_grad():
-        triangles.vertices[:12] += torch.tensor([50.0, 0, 0])
-    drawn = render_soup(triangles, view(), SoupAppearance(), statistics=True)
-    photo = torch.zeros((1, SIZE, SIZE, 3), dtype=torch.uint8)
-    gradients = []
-    for unseen in (True, False):
-        leaf = triangles.opacities.detach().requires_grad_()
-        weights = SoupWeights(dssim=0.2, opacity=2.0, size=0, normal=0, distortion=0, unseen=unseen)
-        frozen = Rasterization(drawn.color.detach(), drawn.alpha.detach(), statistics=drawn.statistics)
-        soup_objective(frozen, photo, None, torch.zeros(1, 3), triangles.vertices, leaf, view(), weights).backward()
-        gradients.append(leaf.grad)
-    torch.testing.assert_close(gradients[0], torch.full((30,), 2.0 / 30))
-    assert drawn.statistics is not None
-    visible = drawn.statistics.visible[0]
-    assert not bool(visible[:12].any())
-    torch.testing.assert_close(gradients[1], torch.where(visible, 2.0 / 30, 0.0))

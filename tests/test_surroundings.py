@@ -8,7 +8,7 @@ import torch
 from etsplat.scene.captures import Capture
 from etsplat.scene.demo_scene import demo_scene
 from etsplat.scene.soup_rendering import SoupAppearance, render_soup
-from etsplat.scene.surroundings import surroundings
+from etsplat.scene.surroundings import Surroundings
 from etsplat.scene.triangle_soup import TriangleSoup
 
 
@@ -19,7 +19,7 @@ def capture() -> Capture:
 
 @pytest.fixture(scope="module")
 def sphere(capture: Capture) -> TriangleSoup:
-    return surroundings(capture, 1)
+    return Surroundings.of(capture).soup(capture, 1)
 
 
 def test_it_surrounds_cameras_and_nearly_all_points(capture: Capture, sphere: TriangleSoup) -> None:
@@ -31,16 +31,18 @@ def test_it_surrounds_cameras_and_nearly_all_points(capture: Capture, sphere: Tr
     assert float((capture.centers.float() - middle).norm(dim=1).max()) < float(radius.min())
     stray = capture.exact_points.clone()
     stray[0] = 1e4
-    again = surroundings(replace(capture, exact_points=stray), 1)
-    torch.testing.assert_close(again.vertices, sphere.vertices, rtol=0.05, atol=0)
+    again = Surroundings.of(replace(capture, exact_points=stray))
+    assert again.radius == pytest.approx(Surroundings.of(capture).radius, rel=0.02)
+    assert bool(again.outermost(sphere.vertices).all())
+    assert not bool(again.outermost(0.8 * sphere.vertices.detach()).any())
 
 
 def test_every_view_is_covered(capture: Capture, sphere: TriangleSoup) -> None:
-    """Hardly anything of the background is left."""
+    """There is no gap, and about a third of the background shines through at the start."""
     for camera in capture.cameras[:3]:
         alpha = render_soup(sphere, camera, SoupAppearance(near_plane=0.05)).alpha.detach()
-        assert float(alpha.mean()) > 0.9
-        assert float(alpha.min()) > 0.6
+        assert float(alpha.mean()) > 0.6
+        assert float(alpha.min()) > 0.4
 
 
 def test_colours_are_those_of_the_photos_there_and_next_to_it(capture: Capture) -> None:
@@ -52,5 +54,6 @@ def test_colours_are_those_of_the_photos_there_and_next_to_it(capture: Capture) 
         def __getitem__(self, _: int) -> torch.Tensor:
             return torch.tensor([255, 0, 0], dtype=torch.uint8).expand(24, 32, 3)
 
-    colors = surroundings(replace(capture, images=Red()), 0).display_colors()  # type: ignore[arg-type]
+    red = replace(capture, images=Red())  # type: ignore[arg-type]
+    colors = Surroundings.of(red).soup(red, 0).display_colors()
     torch.testing.assert_close(colors, torch.tensor([[1.0, 0, 0]]).expand_as(colors), rtol=0, atol=1e-3)

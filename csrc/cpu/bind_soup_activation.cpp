@@ -19,17 +19,17 @@ void for_each_triangle(int64_t triangles, const Body& body) {
 
 void bind_soup_activation(nb::module_& m) {
     // vertices (N, 3, 3), logits, raw, opacities, sigma (N) float32; viewmat (4, 4) and K (3, 3) of the camera for which
-    // small triangles get opacity 0, or 0.
+    // triangles smaller or larger than this get opacity 0, or 0.
     m.def(
         "soup_activate",
         [](int64_t triangles, Address vertices, Address logits, Address raw, Address viewmat, Address K,
-           float opacity_floor, float sigma_ceiling, Address opacities, Address sigma) {
+           float smallest, float largest, float opacity_floor, float sigma_ceiling, Address opacities, Address sigma) {
             PinholeCamera camera{};
             if (viewmat) camera = pinhole_camera(pointer<const float>(viewmat), pointer<const float>(K));
             for_each_triangle(triangles, [&](int64_t n) {
                 const Activated drawn = activate(pointer<const float>(logits)[n], pointer<const float>(raw)[n],
                                                  {opacity_floor, sigma_ceiling});
-                const bool left_out = viewmat && is_small(camera, pointer<const float>(vertices) + 9 * n);
+                const bool left_out = viewmat && is_left_out(camera, pointer<const float>(vertices) + 9 * n, {smallest, largest});
                 pointer<float>(opacities)[n] = left_out ? 0.0f : drawn.opacity;
                 pointer<float>(sigma)[n] = drawn.sigma;
             });

@@ -6,10 +6,14 @@
 namespace etsplat {
 
 constexpr float kSoupSigmaFloor = 0.01f;
-constexpr float kSmallestInradius = 1.0f;  // pixels
 
 struct SoupLimits {
     float opacity_floor, sigma_ceiling;
+};
+
+// Pixels: of the incircle's radius, and of the distance from the mean of the vertices to the farthest.
+struct SoupSizes {
+    float smallest, largest;
 };
 
 struct Activated {
@@ -32,9 +36,9 @@ ETSPLAT_FN Activated activate_backward(float logit, float raw, SoupLimits limits
             cut ? 0.0f : grad.sigma * sharpness};
 }
 
-// Whether the incircle of the projected triangle, 2 area / perimeter, is smaller than a pixel. Vertices behind the camera
-// are taken to lie just before it.
-ETSPLAT_FN bool is_small(const PinholeCamera& camera, const float* world) {
+// Whether the projected triangle is too small, its incircle's radius being 2 area / perimeter, or too large. Vertices behind
+// the camera are taken to lie just before it.
+ETSPLAT_FN bool is_left_out(const PinholeCamera& camera, const float* world, SoupSizes sizes) {
     float x[3], y[3];
     for (int k = 0; k < 3; ++k) {
         float view[3];
@@ -43,12 +47,15 @@ ETSPLAT_FN bool is_small(const PinholeCamera& camera, const float* world) {
         x[k] = view[0] * inverse_z * camera.fx;
         y[k] = view[1] * inverse_z * camera.fy;
     }
-    float perimeter = 0.0f;
+    const float mean_x = (x[0] + x[1] + x[2]) * (1.0f / 3.0f), mean_y = (y[0] + y[1] + y[2]) * (1.0f / 3.0f);
+    float perimeter = 0.0f, farthest = 0.0f;
     for (int k = 0; k < 3; ++k) {
-        const float ex = x[(k + 1) % 3] - x[k], ey = y[(k + 1) % 3] - y[k];
+        const float ex = x[(k + 1) % 3] - x[k], ey = y[(k + 1) % 3] - y[k], dx = x[k] - mean_x, dy = y[k] - mean_y;
         perimeter += vsqrt(ex * ex + ey * ey);
+        farthest = vmax(farthest, dx * dx + dy * dy);
     }
-    return vabs((x[1] - x[0]) * (y[2] - y[0]) - (x[2] - x[0]) * (y[1] - y[0])) < kSmallestInradius * perimeter;
+    const float doubled_area = vabs((x[1] - x[0]) * (y[2] - y[0]) - (x[2] - x[0]) * (y[1] - y[0]));
+    return doubled_area < sizes.smallest * perimeter || vsqrt(farthest) > sizes.largest;
 }
 
 }  // namespace etsplat

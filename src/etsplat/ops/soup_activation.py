@@ -2,10 +2,11 @@
 
     o = floor + (1 - floor) / (1 + exp(-logit))      sigma = min(0.01 + exp(raw), ceiling)
 
-With a camera, o = 0 for triangles that are smaller than a pixel there, as Triangle Splatting has it.
+With a camera, o = 0 for triangles that are too small or too large there, as Triangle Splatting has it.
 """
 
 import ctypes
+import math
 from typing import Any
 
 import torch
@@ -25,9 +26,6 @@ from etsplat.ops.pool import empty_image
 SOUP_SIGMA_FLOOR = 0.01
 """No triangle of a soup gets sharper than this."""
 
-SMALLEST_INRADIUS = 1.0
-"""In pixels, of the incircle of a triangle's projection."""
-
 Limits = tuple[float, float] | Float[Tensor, "2"]
 _PROGRAM = Program("soup_activation.cu")
 _THREADS = 256
@@ -40,6 +38,8 @@ def soup_activation(
     limits: Limits,
     camera: Cameras | None = None,
     *,
+    smallest: float = 0.0,
+    largest: float = math.inf,
     engine: str | None = None,
 ) -> tuple[Float[Tensor, " N"], Float[Tensor, " N"]]:
     """Opacities and sigma as they are drawn, differentiable with respect to the logits and ``sigma_raw``.
@@ -49,7 +49,9 @@ def soup_activation(
         opacity_logits: (N,).
         sigma_raw: (N,).
         limits: Opacity floor in [0, 1) and sigma ceiling, which may be infinite; for engine "cuda" also as a tensor.
-        camera: One camera, for which triangles with an inradius below a pixel are left out; None keeps them.
+        camera: One camera, for whose image triangles are left out by their size; None keeps them.
+        smallest: In pixels: triangles with a smaller inradius are left out.
+        largest: In pixels: so are those where a vertex is farther from the mean of the projected vertices.
         engine: "cpu", "cuda", "reference" or None (by dtype and device).
 
     Returns:
@@ -64,30 +66,31 @@ def soup_activation(
         check_shape(name, tensor, (N,))
         check_like(name, tensor, "vertices", vertices)
     if camera is not None and len(camera) != 1:
-        raise ValueError(f"camera must be one where small triangles are left out, got {len(camera)}")
+        raise ValueError(f"camera must be one where triangles are left out, got {len(camera)}")
     chosen = resolve_engine(engine, vertices)
     if chosen == "reference":
         floor, ceiling = limits
         opacities = floor + (1.0 - floor) * torch.sigmoid(opacity_logits)
         if camera is not None:
-            opacities = torch.where(_small(vertices.detach(), camera), 0.0, opacities)
+            opacities = torch.where(_left_out(vertices.detach(), camera, smallest, largest), 0.0, opacities)
         return opacities, (SOUP_SIGMA_FLOOR + torch.exp(sigma_raw)).clamp_max(ceiling)
     if chosen == "cuda" and not isinstance(limits, Tensor):
         limits = upload(limits, vertices.device)
     view = (None, None) if camera is None else (camera.viewmats.contiguous(), camera.Ks.contiguous())
     native = _OnDevice if chosen == "cuda" else _OnCpu
-    drawn: Any = native.apply(vertices.detach(), opacity_logits, sigma_raw, *view, limits)
+    drawn: Any = native.apply(vertices.detach(), opacity_logits, sigma_raw, *view, (smallest, largest), limits)
     return drawn
 
 
-def _small(vertices: Float[Tensor, "N 3 3"], camera: Cameras) -> Bool[Tensor, " N"]:
-    """Which triangles have an inradius below one pixel: 2 area / perimeter, projected."""
+def _left_out(vertices: Float[Tensor, "N 3 3"], camera: Cameras, smallest: float, largest: float) -> Bool[Tensor, " N"]:
+    """Which triangles have a smaller inradius, 2 area / perimeter, or reach farther from their middle, projected."""
     rotation, translation = camera.viewmats[0, :3, :3], camera.viewmats[0, :3, 3]
     points = vertices @ rotation.T + translation
     pixels = points[..., :2] / points[..., 2:].clamp_min(1e-6) * torch.diagonal(camera.Ks[0])[:2]
     edges = pixels - pixels.roll(1, dims=1)
     doubled = (edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0]).abs()
-    return doubled < SMALLEST_INRADIUS * edges.norm(dim=-1).sum(dim=-1)
+    reach = (pixels - pixels.mean(dim=1, keepdim=True)).norm(dim=-1).amax(dim=-1)
+    return (doubled < smallest * edges.norm(dim=-1).sum(dim=-1)) | (reach > largest)
 
 
 class _OnCpu(torch.autograd.Function):
@@ -99,13 +102,14 @@ class _OnCpu(torch.autograd.Function):
         raw: Tensor,
         viewmat: Tensor | None,
         K: Tensor | None,
+        sizes: tuple[float, float],
         limits: tuple[float, float],
     ) -> tuple[Tensor, Tensor]:
         inputs = vertices.contiguous(), logits.contiguous(), raw.contiguous()
         opacities, sigma = empty_image(len(logits)), empty_image(len(logits))
         view = (0 if tensor is None else tensor.data_ptr() for tensor in (viewmat, K))
         addresses = *(tensor.data_ptr() for tensor in inputs), *view
-        _native.soup_activate(len(logits), *addresses, *limits, opacities.data_ptr(), sigma.data_ptr())
+        _native.soup_activate(len(logits), *addresses, *sizes, *limits, opacities.data_ptr(), sigma.data_ptr())
         ctx.save_for_backward(*inputs[1:], opacities)
         ctx.limits = limits
         ctx.set_materialize_grads(False)
@@ -119,7 +123,7 @@ class _OnCpu(torch.autograd.Function):
         grads = empty_image(*ctx.saved_tensors[0].shape), empty_image(*ctx.saved_tensors[0].shape)
         addresses = (0 if tensor is None else tensor.data_ptr() for tensor in (*given, *grads))
         _native.soup_activate_backward(len(grads[0]), *saved, *ctx.limits, *addresses)
-        return None, *grads, None, None, None
+        return None, *grads, None, None, None, None
 
 
 class _OnDevice(torch.autograd.Function):
@@ -131,11 +135,12 @@ class _OnDevice(torch.autograd.Function):
         raw: Tensor,
         viewmat: Tensor | None,
         K: Tensor | None,
+        sizes: tuple[float, float],
         limits: Tensor,
     ) -> tuple[Tensor, Tensor]:
         inputs = vertices.contiguous(), logits.contiguous(), raw.contiguous()
         opacities, sigma = torch.empty_like(inputs[1]), torch.empty_like(inputs[2])
-        _launch("soup_activate", len(logits), *inputs, viewmat, K, limits, opacities, sigma)
+        _launch("soup_activate", len(logits), *inputs, viewmat, K, *sizes, limits, opacities, sigma)
         ctx.save_for_backward(*inputs[1:], opacities, limits)
         ctx.set_materialize_grads(False)
         return opacities, sigma
@@ -147,8 +152,8 @@ class _OnDevice(torch.autograd.Function):
         grads = torch.empty_like(logits), torch.empty_like(logits)
         given = (None if tensor is None else tensor.contiguous() for tensor in cotangents)
         _launch("soup_activate_backward", len(logits), *ctx.saved_tensors, *given, *grads)
-        return None, *grads, None, None, None
+        return None, *grads, None, None, None, None
 
 
-def _launch(name: str, triangles: int, *arguments: Tensor | None) -> None:
+def _launch(name: str, triangles: int, *arguments: Tensor | float | None) -> None:
     launch(_PROGRAM, name, blocks(triangles, _THREADS), _THREADS, (ctypes.c_int(triangles), *arguments))

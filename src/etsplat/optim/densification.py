@@ -87,14 +87,12 @@ class PruneRules:
         importance: its importance stays below it.
         views: it is larger than a pixel in fewer views than this.
         screen_size: it grows larger than this on some view's screen, in pixels.
-        keep_unseen: only triangles that some view saw during their trial are judged by it.
     """
 
     opacity: float
     importance: float
     views: int
     screen_size: float
-    keep_unseen: bool = False
 
 
 def dead_triangles(
@@ -111,8 +109,6 @@ def dead_triangles(
     useless = statistics.importance < rules.importance
     useless |= statistics.seen < rules.views
     useless |= statistics.screen_size > rules.screen_size
-    if rules.keep_unseen:
-        useless &= statistics.screen_size > 0
     return (opacities <= rules.opacity) | (useless & statistics.judged(views))
 
 

@@ -25,7 +25,6 @@ class SoupWeights:
         normal: of the disagreement of normals.
         distortion: of the mean distortion.
         pixel: "l1", or "l2" as Triangle Splatting has it for very large outdoor scenes.
-        unseen: triangles that are invisible in the view count for the mean opacity; else theirs is taken as 0.
     """
 
     dssim: float
@@ -34,7 +33,6 @@ class SoupWeights:
     normal: float
     distortion: float
     pixel: Literal["l1", "l2"] = "l1"
-    unseen: bool = True
 
 
 def soup_objective(
@@ -54,8 +52,8 @@ def soup_objective(
     L_nvs = (1 - l) L_1 + l (1 - SSIM) + lambda_o mean o + lambda_s / mean area + lambda_n L_n + lambda_d mean D
 
     Args:
-        rendering: of one view over `background`, with normals and median depth where `weights.normal` is positive,
-            distortion where `weights.distortion` is, and statistics unless `weights.unseen`.
+        rendering: of one view over `background`, with normals and median depth where `weights.normal` is positive, and
+            distortion where `weights.distortion` is.
         target: (1, H, W, 3 or 4) bytes.
         mask: (1, H, W) in [0, 1], or None.
         background: (1, 3).
@@ -73,9 +71,6 @@ def soup_objective(
     )
     terms = []
     if weights.opacity > 0:
-        if not weights.unseen:
-            assert rendering.statistics is not None
-            opacities = opacities * rendering.statistics.visible[0]
         terms.append(Term(weights.opacity, opacities.mean()))
     if weights.size > 0:
         terms.append(Term(weights.size, mean_area(vertices, engine=engine), -1))

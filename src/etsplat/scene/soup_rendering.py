@@ -15,6 +15,9 @@ from etsplat.ops.soup_activation import soup_activation
 from etsplat.ops.soup_colors import soup_colors
 from etsplat.scene.triangle_soup import TriangleSoup
 
+SMALLEST_INRADIUS = 1.0
+"""Triangle Splatting draws no triangle whose inscribed circle on the image is smaller, in pixels."""
+
 OPAQUE_FROM = 0.5
 """Where a soup is drawn opaque, fainter triangles are left out."""
 
@@ -28,6 +31,8 @@ class SoupAppearance:
         distance: "barycentric" or "sdf".
         sh_degree: highest band of the colours that is used; None for all that the soup has.
         cull_small: leave out triangles with an inradius below one pixel, as Triangle Splatting does.
+        cull_large: leave out triangles with a vertex farther from their middle than this times the image's longer side.
+            Beside the camera triangles are stretched without bound, and would cover images that they are not in.
         freeze_incentre: with distance "sdf", hold the inradius constant in the backward pass, as Triangle Splatting.
         near_plane: triangles with a vertex at this depth or nearer are invisible.
         opacity_floor: opacities are squeezed into [floor, 1].
@@ -38,6 +43,7 @@ class SoupAppearance:
     distance: str = "barycentric"
     sh_degree: int | None = None
     cull_small: bool = False
+    cull_large: float = float("inf")
     freeze_incentre: bool = False
     near_plane: float = 0.01
     opacity_floor: float = 0.0
@@ -90,7 +96,9 @@ def render_soup(
         soup.opacity_logits,
         soup.sigma_raw,
         (appearance.opacity_floor, appearance.sigma_ceiling) if limits is None else limits,
-        cameras if appearance.cull_small else None,
+        cameras if appearance.cull_small or appearance.cull_large < float("inf") else None,
+        smallest=SMALLEST_INRADIUS if appearance.cull_small else 0.0,
+        largest=appearance.cull_large * max(cameras.width, cameras.height),
         engine=engine,
     )
     return rasterize(

@@ -23,6 +23,7 @@ from etsplat.scene.capture_views import CaptureViews
 from etsplat.scene.captures import Capture
 from etsplat.scene.device_views import DeviceViews
 from etsplat.scene.soup_rendering import SoupAppearance, render_soup
+from etsplat.scene.surroundings import Surroundings
 from etsplat.scene.triangle_soup import TriangleSoup
 from etsplat.tasks.running import progress_tensor, read_progress
 from etsplat.tasks.soup_schedule import SoupSchedule
@@ -72,6 +73,7 @@ class SoupFitting:
         self._evaluate = evaluate
         self._sampler = ViewSampler(capture.train, generator)
         self._iteration = 0
+        self._surroundings = Surroundings.of(capture).to(self._device) if config.closed else None
         rates = {
             "vertices": config.lr_vertices,
             "opacity_logits": config.lr_opacities,
@@ -196,8 +198,11 @@ class SoupFitting:
             engine=engine,
         )
         counts = None if mask is None else mask.float() / 255
+        opacities = soup.opacities
+        if self._surroundings is not None:  # where no view looks, nothing would hold against the pull to transparency
+            opacities = torch.where(self._surroundings.outermost(soup.vertices), 0.0, opacities)
         loss = soup_objective(
-            rendering, photo, counts, background, soup.vertices, soup.opacities, camera, weights, engine=engine
+            rendering, photo, counts, background, soup.vertices, opacities, camera, weights, engine=engine
         )
         self.adam.zero_grad()
         loss.backward()
@@ -281,20 +286,20 @@ class SoupFitting:
     def _dead(self, iteration: int) -> Tensor:
         config = self._config
         first = iteration <= config.at(config.densify_from) + config.at(config.densify_every)
-        finishing = self._schedule.finishing(iteration)
         densifying = iteration < config.at(config.densify_until)
         limit = config.prune_screen_size if densifying and not first else None
         rules = PruneRules(
-            opacity=0.0 if finishing and iteration >= self._schedule.settled else config.prune_opacity,
+            opacity=config.prune_opacity,
             importance=config.prune_importance,
             views=0 if first else min(config.prune_views, len(self._capture.train)),
             screen_size=float("inf") if limit is None else limit,
-            keep_unseen=config.closed,
         )
         with torch.no_grad():
             dead = dead_triangles(
                 self.appearance.opacities(self.soup), self.statistics, rules, len(self._capture.train)
             )
+        if self._surroundings is not None:
+            dead &= ~(self._surroundings.outermost(self.soup.vertices) & (self.statistics.screen_size == 0))
         if bool(dead.all()):
             raise DivergedError(
                 f"no triangle is left at iteration {iteration}; lower lambda_opacity or prune_importance"

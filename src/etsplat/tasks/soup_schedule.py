@@ -7,11 +7,11 @@ from etsplat.optim.soup_objective import SoupWeights
 from etsplat.scene.soup_rendering import SoupAppearance
 from etsplat.tasks.train_config import TrainConfig
 
-FINAL_FLOOR, FIRST_CEILING, FINAL_CEILING = 0.995, 1.0, 0.02
-FINISH_UNTIL = 0.8
-"""The opaque finish: opacities are squeezed above a floor that rises to the first number, and sigma is cut at a ceiling
-that falls from the second to the third. Triangles whose own opacity falls below `prune_opacity` meanwhile are removed,
-and others multiply in their place. From this fraction of the run on the soup adapts to the result."""
+FINAL_FLOOR, OPAQUE_AT = 0.995, 0.2
+FIRST_CEILING, FINAL_CEILING, SHARP_FROM, SHARP_AT = 1.0, 0.05, 0.3, 0.95
+"""The opaque finish, as fractions of a run: opacities are squeezed above a floor that soon has its final height, so
+that most of the run is spent on an opaque soup, while its edges still give wide gradients. Then sigma is cut at a
+ceiling that falls. What is hidden meanwhile is removed (`prune_importance`), and others multiply in its place."""
 
 
 @dataclass(frozen=True)
@@ -28,12 +28,13 @@ class SoupSchedule:
 
     def appearance(self, iteration: int) -> SoupAppearance:
         """How the soup is drawn."""
-        appearance = self._plain(iteration)
-        if not self.finishing(iteration):
+        appearance, total = self._plain(iteration), self.config.iterations
+        if self.config.finish == "none":
             return appearance
-        done = ramp(iteration, self.config.at(self.config.finish_from), self.settled)
-        ceiling = FIRST_CEILING * (FINAL_CEILING / FIRST_CEILING) ** done
-        return replace(appearance, opacity_floor=FINAL_FLOOR * done, sigma_ceiling=ceiling)
+        opaque = ramp(iteration, 0, round(OPAQUE_AT * total))
+        sharp = ramp(iteration, round(SHARP_FROM * total), round(SHARP_AT * total))
+        ceiling = FIRST_CEILING * (FINAL_CEILING / FIRST_CEILING) ** sharp
+        return replace(appearance, opacity_floor=FINAL_FLOOR * opaque, sigma_ceiling=ceiling)
 
     def phase(self, iteration: int) -> tuple[SoupAppearance, SoupWeights]:
         """What changes only a few times in a run: the appearance, without floor and ceiling, and the weights."""
@@ -49,7 +50,6 @@ class SoupSchedule:
             size=config.lambda_size if iteration < config.at(config.densify_until) else 0.0,
             normal=config.lambda_normal if regular else 0.0,
             distortion=config.lambda_distortion if regular else 0.0,
-            unseen=not config.closed,
             pixel="l2" if self.squared else "l1",
         )
 
@@ -57,15 +57,6 @@ class SoupSchedule:
         """Adam's learning rate of positions."""
         config = self.config
         return config.lr_vertices * exponential_decay(iteration, config.iterations, config.lr_vertices_final)
-
-    def finishing(self, iteration: int) -> bool:
-        """Whether triangles are being made opaque and sharp."""
-        return self.config.finish == "opaque" and iteration > self.config.at(self.config.finish_from)
-
-    @property
-    def settled(self) -> int:
-        """When the opaque finish has made everything opaque and sharp."""
-        return round(FINISH_UNTIL * self.config.iterations)
 
     def next_edit(self, iteration: int) -> int:
         """The first iteration, from this one on, after which triangles may come or go."""
@@ -79,6 +70,7 @@ class SoupSchedule:
             distance=config.distance,
             sh_degree=min(config.sh_degree, iteration // config.at(config.sh_every)),
             cull_small=config.cull_small,
+            cull_large=float("inf") if config.cull_large is None else config.cull_large,
             freeze_incentre=config.freeze_incentre and config.distance == "sdf",
             near_plane=config.near_plane,
         )

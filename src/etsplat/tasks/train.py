@@ -20,7 +20,7 @@ from etsplat.scene.demo_scene import demo_scene
 from etsplat.scene.device_views import stay_on
 from etsplat.scene.soup_files import SoupFile, save_soup
 from etsplat.scene.soup_init import StartPoints, random_points, start_soup
-from etsplat.scene.surroundings import SPHERE_TRIANGLES, surroundings
+from etsplat.scene.surroundings import SPHERE_TRIANGLES, Surroundings
 from etsplat.scene.triangle_soup import TriangleSoup
 from etsplat.tasks.running import (
     Callback,
@@ -156,7 +156,7 @@ def start_fitting(
         limit=config.start_limit,
     )
     if config.closed:
-        soup = soup.joined(surroundings(capture, config.sh_degree))
+        soup = soup.joined(Surroundings.of(capture).soup(capture, config.sh_degree))
     soup = soup.to(device or torch.device("cpu"))
     squared = config.scene_type == "outdoor" and not config.normalize and _span(points) > LARGE_SPAN
     return SoupFitting(soup, capture, config, generator, evaluate, squared=squared)

@@ -42,6 +42,8 @@ class TrainConfig:
     """Triangles with a vertex nearer than this to a camera are invisible to it."""
     cull_small: bool = True
     """Leave out triangles with an inradius below one pixel, as Triangle Splatting does."""
+    cull_large: float | None = 1.0
+    """Leave out triangles that reach farther than this from their middle, in units of the photo's longer side."""
     iterations: int = 30_000
     """Optimization steps; each sees one view."""
     schedule_length: int = 30_000
@@ -52,7 +54,7 @@ class TrainConfig:
     sky_dome: bool = True
     """Start with 5 % more triangles, white, on a sphere around the scene."""
     sky_closed: bool = False
-    """The dome is a closed, opaque sphere in the colours of the photos instead, and what no view sees stays there."""
+    """The dome is a closed sphere in the colours of the photos instead, which stays where no photo shows it."""
     start_points: int = 100_000
     """So many random triangles to start from where the capture has no points."""
     start_scale: float = 2.23
@@ -118,9 +120,7 @@ class TrainConfig:
     """Triangles larger on some view's screen than this, in pixels, are removed; None keeps them."""
 
     finish: Literal["none", "opaque"] = "none"
-    """opaque: towards the end triangles are made sharp and opaque, for engines without transparency."""
-    finish_from: int = 5000
-    """Where that begins."""
+    """opaque: triangles are made opaque, then sharp, for engines without transparency."""
 
     log_every: int = 50
     """Iterations between lines of history.jsonl."""
@@ -166,12 +166,12 @@ _INF = float("inf")
 _RANGES = (
     *((name, 1, _INF) for name in ("width", "iterations", "schedule_length", "max_triangles", "start_points")),
     *((name, 1, _INF) for name in ("log_every", "densify_every", "sh_every", "prune_screen_size")),
-    *((name, 0, _INF) for name in ("evaluate_every", "checkpoint_every", "seed", "regularize_from", "finish_from")),
+    *((name, 0, _INF) for name in ("evaluate_every", "checkpoint_every", "seed", "regularize_from")),
     *((name, 0, _INF) for name in ("densify_from", "densify_until", "split_size", "clone_noise", "prune_views")),
     *((name, 0, _INF) for name in ("lr_vertices", "lr_sh_dc", "lr_sh_rest", "lr_opacities", "lr_sigma")),
     *((name, 0, _INF) for name in ("lambda_opacity", "lambda_size", "lambda_normal", "lambda_distortion")),
     *((name, 0, 1) for name in ("lambda_dssim", "prune_opacity", "prune_importance")),
-    *((name, 1e-6, _INF) for name in ("near_plane", "start_scale", "lr_vertices_final")),
+    *((name, 1e-6, _INF) for name in ("near_plane", "cull_large", "start_scale", "lr_vertices_final")),
     ("start_opacity", 0.005, 0.999),
     ("start_sigma", 0.011, _INF),
     ("sh_degree", 0, 3),
