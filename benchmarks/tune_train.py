@@ -1,4 +1,4 @@
-"""How settings of novel-view synthesis do at a small budget: one line a setting, test and training PSNR on the way.
+"""How settings of novel-view synthesis do at a small budget: a line for each, PSNR of test and training views.
 
 python -m benchmarks.tune_train --width 200 --base iterations=600,max_triangles=15000 -- "" near_plane=0.02
 python -m benchmarks.tune_train --scene ../shared/data/scenes/bonsai --scene-type indoor -- "" method=bilateral
@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 
-from etsplat.metrics.image import psnr
+from etsplat.metrics.image import psnr, ssim
 from etsplat.ops.engines import num_threads, one_torch_thread, set_num_threads
 from etsplat.scene.captures import Capture, load_capture
 from etsplat.scene.demo_scene import demo_scene
@@ -52,6 +52,8 @@ def run(capture: Capture, config: TrainConfig) -> str:
     seconds = time.perf_counter() - start
     soup, appearance = fitting.finished()
     opaque = mean(scorer, capture.test, lambda view: scorer.opaque(soup, appearance, view))
+    likeness = [ssim(scorer.splatted(soup, appearance, view), scorer.photo(view)) for view in capture.test]
+    columns.append(f"SSIM {sum(likeness) / len(likeness):.3f}")
     return f"{' | '.join(columns)} | opaque {opaque:.2f} | {len(soup):,} triangles | {seconds:.0f} s"
 
 

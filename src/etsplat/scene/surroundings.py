@@ -81,10 +81,10 @@ def _blended(
     towards: Float[Tensor, "N 3"], colors: Float[Tensor, "N 3"], seen: Bool[Tensor, " N"]
 ) -> Float[Tensor, "M 3"]:
     """Colours of the M that are not seen: a mean of the nearest that are, by the reciprocal of their distance."""
-    few = range(1, 1 + min(_BLENDED, int(seen.sum())))
-    distance, nearest = KDTree(towards[seen].numpy()).query(towards[~seen].numpy(), k=list(few))
-    weight = 1 / torch.from_numpy(distance).float().clamp_min(1e-6)
-    return (weight[..., None] * colors[seen][torch.from_numpy(nearest)]).sum(dim=1) / weight.sum(dim=1, keepdim=True)
+    found = KDTree(towards[seen].numpy()).query(towards[~seen].numpy(), k=min(_BLENDED, int(seen.sum())))
+    distance, nearest = (torch.from_numpy(array).reshape(int((~seen).sum()), -1) for array in found)
+    weight = 1 / distance.float().clamp_min(1e-6)
+    return (weight[..., None] * colors[seen][nearest]).sum(dim=1) / weight.sum(dim=1, keepdim=True)
 
 
 def _photographed(capture: Capture, positions: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, "N 3"], Bool[Tensor, " N"]]:

@@ -238,7 +238,7 @@ _QUICK: dict[str, Any] = {
 _PRESETS: dict[str, dict[str, Any]] = {
     "paper": {},
     "quick": _QUICK,
-    "demo": {**_QUICK, "iterations": 3000, "max_triangles": 40_000},
+    "demo": {**_QUICK, "iterations": 3000, "max_triangles": 40_000, "sky_closed": False},
     "tiny": {
         **_QUICK,
         "width": 64,
