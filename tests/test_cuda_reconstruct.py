@@ -11,8 +11,6 @@ import torch
 
 from etsplat.cuda.graph import Repeated
 from etsplat.ops import _raster_capacity
-from etsplat.ops._raster_capacity import repair_overflow as repair
-from etsplat.optim import step_queue
 from etsplat.optim.loop import Progress
 from etsplat.scene.demo_object import demo_object
 from etsplat.scene.photograph import photograph
@@ -23,6 +21,7 @@ from etsplat.tasks.reconstruct_config import PRESETS, ReconstructConfig
 from etsplat.tasks.sources import make_start
 from simt.build import Simt
 from simt.calls import Calls
+from simt.room import room_for_16_pairs
 
 CPU = torch.device("cpu")
 # 320 faces, subdivided after iterations 2 and 5.
@@ -94,12 +93,7 @@ def test_steps_queued_together_are_the_steps_one_by_one(cuda_device: torch.devic
     config = replace(CONFIG, subdivide_steps=0)
     together, one_by_one = (fitting(views, "cuda", config, cuda_device) for _ in range(2))
     losses = together.advance(1, 1)
-    repairs: list[bool] = []
-    with pytest.MonkeyPatch.context() as patch:  # a step captured now has room for 16 pairs
-        patch.setattr(step_queue, "repair_overflow", lambda device: repairs.append(repair(device)) or repairs[-1])
-        patch.setattr(_raster_capacity, "_seen", {})
-        patch.setattr(_raster_capacity, "_FIRST_ROOM", 16)
-        patch.setattr(_raster_capacity, "_FIRST_PER_TRIANGLE", 0)
+    with room_for_16_pairs() as repairs:
         losses += together.advance(2, 5)
     assert any(repairs)
     assert losses == [one_by_one.advance(i, i)[0] for i in range(1, 6)]

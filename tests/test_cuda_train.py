@@ -11,8 +11,6 @@ import torch
 
 from etsplat.cuda.graph import Repeated
 from etsplat.ops import _raster_capacity
-from etsplat.ops._raster_capacity import repair_overflow as repair
-from etsplat.optim import step_queue
 from etsplat.optim.loop import Progress
 from etsplat.scene.capture_images import StoredImages
 from etsplat.scene.captures import Capture
@@ -23,6 +21,7 @@ from etsplat.tasks.train import train
 from etsplat.tasks.train_config import TrainConfig, train_settings
 from simt.build import Simt
 from simt.calls import Calls
+from simt.room import room_for_16_pairs
 
 # Densified after iteration 3; the degree rises after iteration 4.
 CONFIG = replace(train_settings("tiny"), iterations=6, densify_every=15_000, densify_from=0, sh_every=20_000)
@@ -108,12 +107,7 @@ def test_steps_queued_together_are_the_steps_one_by_one(cuda_device: torch.devic
     capture, config = demo_scene(40, 32), replace(CONFIG, densify_from=25_000)
     together, one_by_one = (fitting(capture, "cuda", cuda_device, config) for _ in range(2))
     losses = together.advance(1, 1)
-    repairs: list[bool] = []
-    with pytest.MonkeyPatch.context() as patch:  # a step captured now has room for 16 pairs
-        patch.setattr(step_queue, "repair_overflow", lambda device: repairs.append(repair(device)) or repairs[-1])
-        patch.setattr(_raster_capacity, "_seen", {})
-        patch.setattr(_raster_capacity, "_FIRST_ROOM", 16)
-        patch.setattr(_raster_capacity, "_FIRST_PER_TRIANGLE", 0)
+    with room_for_16_pairs() as repairs:
         while len(losses) < 6:
             losses += together.advance(len(losses) + 1, 6)
     assert any(repairs)

@@ -1,0 +1,28 @@
+"""Too little room for a step's pairs, so that it overflows and is repeated."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
+import torch
+
+from etsplat.ops import _raster_capacity
+from etsplat.ops._raster_capacity import repair_overflow
+from etsplat.optim import step_queue
+
+
+@contextmanager
+def room_for_16_pairs() -> Iterator[list[bool]]:
+    """Steps captured within have room for 16 pairs at first; yields whether each look for an overflow repaired one."""
+    repairs: list[bool] = []
+
+    def repair(device: torch.device) -> bool:
+        repairs.append(repair_overflow(device))
+        return repairs[-1]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(step_queue, "repair_overflow", repair)
+        patch.setattr(_raster_capacity, "_seen", {})
+        patch.setattr(_raster_capacity, "_FIRST_ROOM", 16)
+        patch.setattr(_raster_capacity, "_FIRST_PER_TRIANGLE", 0)
+        yield repairs
