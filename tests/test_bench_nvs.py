@@ -17,7 +17,7 @@ from etsplat.tasks.train_config import TrainConfig
 
 def row(scene, variant, psnr, **numbers):
     known = {"ssim": 0.8, "lpips_3dgs": None, "psnr_opaque": 20.0, "minutes": 2.0, "triangles": 100, "fps": 5.0}
-    return {"scene": scene, "variant": variant, "psnr": psnr, "ms_per_million": 9.0, **known, **numbers}
+    return {"scene": scene, "variant": variant, "seed": 0, "psnr": psnr, "ms_per_million": 9.0, **known, **numbers}
 
 
 def cells_of(folder, **options):
@@ -45,6 +45,51 @@ def test_a_grid_runs_is_measured_and_goes_on_where_it_was(tmp_path):
     again = cells_of(tmp_path)
     assert [cell.state for cell in again] == ["done", "done"]
     assert cells_of(tmp_path, setting="iterations=7")[0].state == "waiting"
+
+
+def test_settings_and_seeds_multiply_the_runs_of_our_methods(tmp_path):
+    scene = read_scene_argument("demo:scene:indoor,start_limit=0.3")
+    cells = make_nvs_cells(
+        [scene],
+        ["elastic"],
+        tmp_path,
+        preset="quick",
+        culling=(False,),
+        setting="width=40",
+        settings=("", "start_limit=none,cull_small=true"),
+        seeds=(0, 1),
+    )
+    names = ["elastic", "start_limit=none,cull_small=true elastic"]
+    assert [(cell.object, cell.variant, cell.config.seed) for cell in cells] == [
+        ("demo", variant, seed) for seed in (0, 1) for variant in names
+    ]
+    assert len({cell.folder for cell in cells}) == 4
+    limits = [cell.config.start_limit for cell in cells if isinstance(cell.config, TrainConfig)]
+    assert limits == [0.3, None, 0.3, None]
+    assert [getattr(cell.config, "cull_small", None) for cell in cells] == [False, True, False, True]
+    with pytest.raises(InputError, match=r"settings: 'sh_degree=1' is named twice"):
+        make_nvs_cells(
+            [scene], ["elastic"], tmp_path, preset="quick", culling=(False,), setting="", settings=["sh_degree=1"] * 2
+        )
+
+
+def test_means_are_over_seeds_too():
+    rows = [row("a", "elastic", 20.0), row("a", "elastic", 22.0, seed=1)]
+    overall = nvs_tables(rows)[0]
+    assert overall.rows[0][1][0] == 21.0
+    assert overall.note.startswith("Means over a and 2 seeds.")
+    assert nvs_tables(rows[:1])[0].note.startswith("Means over a. ")
+
+
+def test_the_built_in_scene_is_one_of_a_grid_in_photos_no_wider_than_asked_for(tmp_path):
+    scene = read_scene_argument("demo:scene")
+    cells = make_nvs_cells(
+        [scene], ["elastic"], tmp_path, preset="tiny", culling=(False,), setting="iterations=4,width=40"
+    )
+    run_grid(cells, 1, lambda: None)
+    measured = evaluate_cells(cells, None, lambda done, total: None)[0]
+    assert (measured["scene"], measured["width"], measured["height"]) == ("demo", 40, 30)
+    assert measured["psnr"] == pytest.approx(cells[0].metrics()["psnr"], abs=1e-3)
 
 
 def test_means_are_over_the_scenes_that_every_variant_has_and_the_best_is_bold():

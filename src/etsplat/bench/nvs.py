@@ -1,7 +1,8 @@
-"""A grid of soups: scenes by methods, with and without culling of small triangles; and what is measured of them."""
+"""A grid of soups: scenes by methods, by culling of small triangles, by settings; and what is measured of them."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from etsplat.bench.peers import PEERS, Peer, PeerConfig, load_gsplat
 from etsplat.bench.variants import changes_of
 from etsplat.core.errors import InputError
 from etsplat.io.run_directory import RunDirectory
+from etsplat.tasks.train import DEMO
 from etsplat.tasks.train_config import SCENE_TYPE_NAMES, TrainConfig, train_settings
 
 CULLED = "culling"
@@ -34,7 +36,7 @@ class Scene:
     """A scene of the grid.
 
     Attributes:
-        folder: its photos and cameras; the folder's name is the scene's.
+        folder: its photos and cameras, or "demo:scene"; the folder's name is the scene's.
         scene_type: outdoor, indoor or object; None for the paper's where it is one of the paper's, else outdoor.
         setting: changes for this scene alone, such as "background=white".
     """
@@ -46,7 +48,7 @@ class Scene:
     @property
     def name(self) -> str:
         """Of its rows and folders."""
-        return self.folder.resolve().name
+        return "demo" if self.folder == Path(DEMO) else self.folder.resolve().name
 
 
 def read_scene_argument(text: str) -> Scene:
@@ -61,7 +63,7 @@ def read_scene_argument(text: str) -> Scene:
         scene = Scene(Path(folder), scene_type, setting)
     else:
         scene = Scene(Path(text), None, "")
-    if not scene.folder.is_dir():
+    if not scene.folder.is_dir() and scene.folder != Path(DEMO):
         raise InputError(
             f"scene {scene.folder}: no such folder; fetch it with `etsplat data download`, or check the path; its kind "
             f"comes after a colon: one of {', '.join(SCENE_TYPE_NAMES)}"
@@ -70,7 +72,15 @@ def read_scene_argument(text: str) -> Scene:
 
 
 def make_nvs_cells(
-    scenes: Sequence[Scene], methods: Sequence[str], out: Path, *, preset: str, culling: Sequence[bool], setting: str
+    scenes: Sequence[Scene],
+    methods: Sequence[str],
+    out: Path,
+    *,
+    preset: str,
+    culling: Sequence[bool],
+    setting: str,
+    settings: Sequence[str] = ("",),
+    seeds: Sequence[int] = (0,),
 ) -> list[Cell]:
     """All runs, scene by scene; those that are finished are "done".
 
@@ -84,10 +94,15 @@ def make_nvs_cells(
         preset: of all runs.
         culling: whether small triangles are culled; one or both.
         setting: changes for all runs, such as "iterations=1000,width=400".
+        settings: what is compared: changes on top of that, each by every one of our methods.
+        seeds: each run is repeated with each of them.
 
     Raises:
-        InputError: two scenes have the same name, a change is none, or peers are asked for and cannot run here.
+        InputError: two scenes or settings have the same name, a change is none, or peers are asked for and cannot run
+            here.
     """
+    for repeated in (text for text in settings if settings.count(text) > 1):
+        raise InputError(f"settings: {repeated!r} is named twice; leave one out")
     names = [scene.name for scene in scenes]
     for name in names:
         if names.count(name) > 1:
@@ -100,13 +115,18 @@ def make_nvs_cells(
         base, images = _settings(scene, preset)
         base = replace(base, **{**changes_of(base, setting), **changes_of(base, scene.setting)})
         variants: dict[str, AnyConfig] = {
-            f"{method} {CULLED}" if culled else method: replace(base, method=method, cull_small=culled)
+            " ".join(filter(None, (text, method, CULLED if culled else ""))): replace(
+                base, method=method, **{"cull_small": culled, **changes_of(base, text)}
+            )
+            for text in settings
             for culled in culling
             for method in methods
             if method not in PEERS
         }
-        for variant, config in {**variants, **{str(peer): _peer(peer, base) for peer in peers}}.items():
-            cell = Cell(name, scene.folder, variant, config, out / "runs" / name / variant, images=images)
+        variants |= {str(peer): _peer(peer, base) for peer in peers}
+        for seed, (variant, config) in product(seeds, variants.items()):
+            folder = out / "runs" / name / (variant if len(seeds) == 1 else f"{variant} seed {seed}")
+            cell = Cell(name, scene.folder, variant, replace(config, seed=seed), folder, images=images)
             cell.state = "done" if is_finished(cell) else "waiting"
             cells.append(cell)
     return cells
@@ -138,6 +158,7 @@ def evaluate_cells(
             {
                 "scene": cell.object,
                 "variant": cell.variant,
+                "seed": cell.config.seed,
                 **{name: evaluation[name] for name in METRICS},
                 "triangles": metrics["triangles"],
                 "iterations": metrics["iterations"],

@@ -76,7 +76,7 @@ def nvs_tables(rows: Sequence[dict[str, Any]]) -> list[Table]:
         present = [value for value in values if value is not None]
         return statistics.fmean(present) if present and len(present) == len(values) else None
 
-    tables = [_overall(variants, scenes, mean)]
+    tables = [_overall(variants, scenes, mean, _seeds_of(rows))]
     everything = list(dict.fromkeys(row["scene"] for row in rows))
     for index, (title, key, form, best) in enumerate(_QUALITY):
         if any(row[key] is not None for row in rows):
@@ -97,7 +97,7 @@ def nvs_tables(rows: Sequence[dict[str, Any]]) -> list[Table]:
 _Mean = Callable[[str, str, Sequence[str]], float | None]
 
 
-def _overall(variants: Sequence[str], scenes: Sequence[str], mean: _Mean) -> Table:
+def _overall(variants: Sequence[str], scenes: Sequence[str], mean: _Mean, seeds: str) -> Table:
     """Table nvs, with the paper's row where a data set is complete."""
     columns = [(title, form, best) for title, _, form, best in _QUALITY] + [("PSNR opaque", ".2f", 1)]
     keys = [key for _, key, _, _ in _QUALITY] + ["psnr_opaque"]
@@ -107,8 +107,14 @@ def _overall(variants: Sequence[str], scenes: Sequence[str], mean: _Mean) -> Tab
         printed = _printed(variant, scenes)
         if printed is not None:
             body.append((f"{variant} (paper)", [*printed, None]))
-    note = f"Means over {', '.join(scenes)}. LPIPS in the convention of 3DGS."
+    note = f"Means over {', '.join(scenes)}{seeds}. LPIPS in the convention of 3DGS."
     return Table("nvs", note, columns, body)
+
+
+def _seeds_of(rows: Sequence[dict[str, Any]]) -> str:
+    """How many seeds the means are over, if there are several."""
+    count = len({row["seed"] for row in rows})
+    return f" and {count} seeds" if count > 1 else ""
 
 
 def _printed(variant: str, scenes: Sequence[str]) -> tuple[float, float, float] | None:

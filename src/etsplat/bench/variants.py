@@ -3,7 +3,8 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from types import NoneType
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from etsplat.core.errors import InputError
 from etsplat.tasks.reconstruct_config import METHODS, ReconstructConfig
@@ -78,19 +79,23 @@ def setting_variants(base: ReconstructConfig, settings: Sequence[str]) -> list[V
 
 
 def changes_of(base: ReconstructConfig | TrainConfig, setting: str) -> dict[str, Any]:
-    """What a list such as "iterations=1000,colors=vertex" changes; a value has the type of the one that it replaces.
+    """What a list such as "iterations=1000,start_limit=none" changes; a value has the type of the one that it replaces.
 
     Raises:
         InputError: as `setting_variants`.
     """
     changes: dict[str, Any] = {}
+    hints = get_type_hints(type(base))
     for item in filter(None, setting.split(",")):
         name, _, text = item.partition("=")
         if not hasattr(base, name) or not text:
             raise InputError(f"{item}: is not a setting and its value; write NAME=VALUE,NAME=VALUE")
-        kind = type(getattr(base, name))
+        types = get_args(hints[name]) if NoneType in get_args(hints[name]) else (hints[name],)
+        kind = str if get_origin(types[0]) is Literal else types[0]
         try:
-            if kind is bool:
+            if text.lower() == "none" and NoneType in types:
+                changes[name] = None
+            elif kind is bool:
                 changes[name] = {"true": True, "false": False}[text.lower()]
             else:
                 changes[name] = int(float(text)) if kind is int else kind(text)

@@ -24,19 +24,24 @@ class Nvs(Command):
     etsplat bench nvs --scenes scenes/kitchen:indoor scenes/fountain scenes/lego:object,background=white --out runs/nvs
     etsplat bench nvs --scenes scenes/fox:indoor --out runs/filter --methods elastic --culling both
     etsplat bench nvs --scenes scenes/fox:indoor --out runs/small --set iterations=1000,width=300,max_triangles=20000
+    etsplat bench nvs --scenes demo:scene --settings "" prune_views=2 start_limit=none --out runs/ablation
     etsplat bench nvs --scenes data/tandt/truck data/tandt/train --out runs/tandt --preset paper --culling on
     etsplat bench nvs --scenes scenes/kitchen --out runs/peers --methods elastic 3dgs 2dgs
     """
 
     scenes: tuple[str, ...]
-    """Folders of the scenes; the kind of a scene, outdoor if it is not given, and changes for it alone come after a
-    colon: FOLDER:indoor, FOLDER:object,background=white."""
+    """Folders of the scenes, or demo:scene for the one that is built in code; the kind of a scene, outdoor if it is not
+    given, and changes for it alone come after a colon: FOLDER:indoor, FOLDER:object,background=white."""
     out: Path
     """Folder for the runs, tables and figures; a grid that was interrupted goes on where it was."""
     methods: tuple[Method | Peer, ...] = ("elastic", "bilateral", "single-sided")
     """Which kernels; 3dgs and 2dgs are Gaussian peers, which need gsplat (pip install 'etsplat[peers]') and a GPU."""
     culling: Literal["off", "on", "both"] = "off"
     """Leave out triangles with an inradius below a pixel: the paper's rows were measured with it on."""
+    settings: tuple[str, ...] = ("",)
+    """What is compared beside methods: lists of changes such as prune_views=2,start_limit=none; "" is the preset."""
+    seeds: tuple[int, ...] = (0,)
+    """Each run is repeated with each of them; tables have the means."""
     preset: TrainPreset = "quick"
     """Settings of all runs."""
     set: str = ""
@@ -68,6 +73,8 @@ class Nvs(Command):
             preset=self.preset,
             culling={"off": (False,), "on": (True,), "both": (False, True)}[self.culling],
             setting=self.set,
+            settings=self.settings,
+            seeds=self.seeds,
         )
         console = Console()
         try:

@@ -12,10 +12,9 @@ from etsplat.core.errors import InputError
 from etsplat.io.run_directory import RunDirectory, is_run
 from etsplat.ops.engines import resolve_device
 from etsplat.scene.captures import Capture, load_capture
-from etsplat.scene.demo_scene import demo_scene
 from etsplat.scene.soup_files import SoupFile, load_soup
 from etsplat.scene.soup_import import open_soup
-from etsplat.tasks.train import DEMO
+from etsplat.tasks.train import DEMO, demo_capture
 
 SOUP_NAME = "soup.safetensors"
 
@@ -98,7 +97,7 @@ def _open_directory(path: Path, scene: Path | str | None, device: torch.device) 
     if source is None:
         return SoupRun(path, file, None)
     if str(source) == DEMO:
-        return SoupRun(path, file, demo_scene())
+        return SoupRun(path, file, demo_capture(config["config"]["width"]))
     if not Path(source).is_dir():
         raise InputError(f"{path}: its scene {source} has gone; name where it is now with --scene")
     capture = load_capture(

@@ -16,7 +16,7 @@ from etsplat.io.run_directory import RunDirectory, is_run
 from etsplat.ops.engines import num_threads, one_torch_thread, resolve_device, resolve_engine
 from etsplat.optim.loop import CheckpointEvent, LoopSettings, Progress
 from etsplat.scene.captures import Capture, load_capture
-from etsplat.scene.demo_scene import demo_scene
+from etsplat.scene.demo_scene import HEIGHT, WIDTH, demo_scene
 from etsplat.scene.device_views import stay_on
 from etsplat.scene.soup_files import SoupFile, save_soup
 from etsplat.scene.soup_init import StartPoints, random_points, start_soup
@@ -162,6 +162,12 @@ def start_fitting(
     return SoupFitting(soup, capture, config, generator, evaluate, squared=squared)
 
 
+def demo_capture(width: int | None, progress: Callable[[int, int], None] | None = None) -> Capture:
+    """The scene that is built in code, in photos no wider than a setting asks for; None for their usual width."""
+    width = min(WIDTH, width or WIDTH)
+    return demo_scene(width, max(1, round(HEIGHT * width / WIDTH)), progress=progress)
+
+
 def predicted_bytes(capture: Capture, config: TrainConfig, device: torch.device | None = None) -> int:
     """Memory of a device, None for the CPU, that a run may come to need, beyond the program itself."""
     pixels = max(width * height for width, height in capture.images.sizes)
@@ -181,7 +187,7 @@ def _load(
     if isinstance(source, Capture):
         return source
     if str(source) == DEMO:
-        return demo_scene(progress=progress)
+        return demo_capture(config.width, progress)
     return load_capture(source, images=images, width=config.width, masks=masks, progress=progress)
 
 
