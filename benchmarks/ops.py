@@ -20,7 +20,7 @@ from etsplat.ops.adam import Adam
 from etsplat.ops.engines import num_threads, one_torch_thread, set_num_threads
 from etsplat.ops.mesh_energies import mesh_energies
 from etsplat.ops.normal_consistency import normal_consistency
-from etsplat.ops.photometric import l1_over_background
+from etsplat.ops.photometric import photometric_loss
 from etsplat.ops.rasterize_hard import rasterize_hard, render_opaque
 from etsplat.ops.soup_activation import soup_activation
 from etsplat.ops.spherical_harmonics import spherical_harmonics
@@ -78,7 +78,7 @@ def training(size: int, vertices: torch.Tensor, faces: torch.Tensor) -> list[Ope
 
     def photometric() -> None:
         color.grad = None
-        l1_over_background(color, target, backgrounds).backward()
+        photometric_loss(color, target, 0.0, backgrounds=backgrounds).backward()
 
     def energies() -> None:
         points.grad = None
@@ -90,7 +90,7 @@ def training(size: int, vertices: torch.Tensor, faces: torch.Tensor) -> list[Ope
         spherical_harmonics(coefficients, directions, 3).sum().backward()
 
     return [
-        ("l1_over_background, with gradient", f"{size} x {size}", photometric),
+        ("photometric_loss without SSIM, with gradient", f"{size} x {size}", photometric),
         ("mesh_energies, with gradient", f"{len(faces):,} faces", energies),
         ("Adam.step", f"{elements:,} elements", adam.step),
         ("spherical_harmonics 3, with gradient", f"{len(faces):,} points", harmonics),

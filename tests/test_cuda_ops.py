@@ -9,11 +9,10 @@ from etsplat.geometry.topology import MeshTopology
 from etsplat.ops.adam import Adam
 from etsplat.ops.antialias import rasterize_antialiased
 from etsplat.ops.mesh_energies import mesh_energies
-from etsplat.ops.photometric import l1_over_background
+from etsplat.ops.photometric import photometric_loss
 from etsplat.ops.rasterize_hard import rasterize_hard, render_opaque
 from etsplat.ops.soup_colors import soup_colors
 from etsplat.ops.spherical_harmonics import spherical_harmonics
-from etsplat.ops.ssim import photometric_loss
 from etsplat.ops.triangle_area import mean_area
 from etsplat.ops.weighted_sum import Term, weighted_sum
 from simt.build import Simt
@@ -56,7 +55,7 @@ def test_l1_is_that_of_the_cpu_engine(cuda_device, rng):
     results = []
     for engine, device in (("cuda", cuda_device), ("cpu", CPU)):
         leaf = color.to(device, copy=True).requires_grad_()
-        loss = l1_over_background(leaf, target.to(device), backgrounds.to(device), engine=engine)
+        loss = photometric_loss(leaf, target.to(device), 0.0, backgrounds=backgrounds.to(device), engine=engine)
         (4 * loss).backward()
         results.append((loss.detach().cpu(), leaf.grad.cpu()))
     torch.testing.assert_close(results[0][0], results[1][0], rtol=1e-6, atol=0)
@@ -100,7 +99,7 @@ def test_weighted_sum_is_that_of_pytorch(cuda_device, scale):
         (3, False, False, "l2", 0.0),
     ],
 )
-def test_ssim_is_that_of_the_cpu_engine(cuda_device, rng, channels, as_bytes, masked, pixel, weight):
+def test_photometric_loss_is_that_of_the_cpu_engine(cuda_device, rng, channels, as_bytes, masked, pixel, weight):
     """Bytes and floats, with and without alpha and mask, absolute and squared, over tiles cut by the border."""
     color, target = torch.rand((2, 21, 35, 3), generator=rng), torch.rand((2, 21, 35, channels), generator=rng)
     target = (255 * target).to(torch.uint8) if as_bytes else target

@@ -2,11 +2,11 @@
 #include "parallel.h"
 
 namespace etsplat {
+void bind_adam(nb::module_& m);
 void bind_antialias(nb::module_& m);
 void bind_array_scans(nb::module_& m);
 void bind_geometry(nb::module_& m);
 void bind_mesh_energies(nb::module_& m);
-void bind_optimizer(nb::module_& m);
 void bind_normals(nb::module_& m);
 void bind_photometric(nb::module_& m);
 void bind_rasterize(nb::module_& m);
@@ -26,11 +26,11 @@ NB_MODULE(_native, m) {
     m.def("set_num_threads", &set_num_threads);
     m.def("parallel_seconds", &parallel_seconds);
     m.def("reset_parallel_seconds", &reset_parallel_seconds);
+    bind_adam(m);
     bind_antialias(m);
     bind_array_scans(m);
     bind_geometry(m);
     bind_mesh_energies(m);
-    bind_optimizer(m);
     bind_normals(m);
     bind_photometric(m);
     bind_rasterize(m);

@@ -9,6 +9,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstring>
+#include <utility>
 
 #include "cpu/photometric_pass.h"
 #include "math/photometric.h"
@@ -43,16 +44,13 @@ private:
     int64_t n_;
 };
 
-struct Moments {
-    const float *x, *y, *square, *product;
-};
-
-inline void similarity_row(const Moments& m, float* __restrict similarity, float* __restrict by_mean,
+// Similarities and their derivatives from the four moments.
+inline void similarity_row(float* const moments[4], float* __restrict similarity, float* __restrict by_mean,
                            float* __restrict by_square, float* __restrict by_product, int64_t n) {
-    const float *__restrict mx_row = m.x, *__restrict my_row = m.y;
-    const float *__restrict square_row = m.square, *__restrict product_row = m.product;
+    const float *__restrict mx = moments[0], *__restrict my = moments[1];
+    const float *__restrict square = moments[2], *__restrict product = moments[3];
     for (int64_t i = 0; i < n; ++i) {
-        const Similarity s = ::etsplat::similarity(mx_row[i], my_row[i], square_row[i], product_row[i]);
+        const Similarity s = ::etsplat::similarity(mx[i], my[i], square[i], product[i]);
         similarity[i] = s.value;
         by_mean[i] = s.by_mean;
         by_square[i] = s.by_square;
@@ -60,41 +58,33 @@ inline void similarity_row(const Moments& m, float* __restrict similarity, float
     }
 }
 
-// One row of the target over its background: y.
 template <class Value>
 void target_row(const PhotometricPass& pass, const Value* __restrict in, const float* background, float* __restrict y) {
     if (pass.channels == 3) {
         for (int64_t i = 0; i < 3 * pass.width; ++i) y[i] = unit_value(in[i]);
         return;
     }
+    float behind[3] = {};
+    if (background) std::copy_n(background, 3, behind);
     for (int64_t p = 0; p < pass.width; ++p) {
         const float rest = 1.0f - unit_value(in[4 * p + 3]);
-        for (int c = 0; c < 3; ++c) {
-            y[3 * p + c] = over_background(unit_value(in[4 * p + c]), rest, background ? background[c] : 0.0f);
-        }
+        for (int c = 0; c < 3; ++c) y[3 * p + c] = over_background(unit_value(in[4 * p + c]), rest, behind[c]);
     }
 }
 
-// One row of what is compared: y as above, and x = y + mask (color - y).
-void load_row(const PhotometricPass& pass, int64_t view, int64_t row, float* __restrict x, float* __restrict y) {
-    const int64_t n = 3 * pass.width;
-    if (row < 0 || row >= pass.height) {
-        std::memset(x, 0, static_cast<size_t>(n) * sizeof(float));
-        std::memset(y, 0, static_cast<size_t>(n) * sizeof(float));
-        return;
-    }
-    const int64_t at = (view * pass.height + row) * pass.width;
+// One row of the target over its background, y. `at` is the row's first pixel.
+void load_target(const PhotometricPass& pass, int64_t view, int64_t at, float* y) {
     const float* background = pass.backgrounds ? pass.backgrounds + 3 * view : nullptr;
     if (pass.bytes) {
         target_row(pass, static_cast<const uint8_t*>(pass.target) + pass.channels * at, background, y);
     } else {
         target_row(pass, static_cast<const float*>(pass.target) + pass.channels * at, background, y);
     }
+}
+
+// One row of what is compared with it, y + mask (color - y).
+void load_masked(const PhotometricPass& pass, int64_t at, const float* __restrict y, float* __restrict x) {
     const float* __restrict color = pass.color + 3 * at;
-    if (!pass.mask) {
-        for (int64_t i = 0; i < n; ++i) x[i] = color[i];
-        return;
-    }
     for (int64_t p = 0; p < pass.width; ++p) {
         for (int64_t i = 3 * p; i < 3 * p + 3; ++i) x[i] = y[i] + pass.mask[at + p] * (color[i] - y[i]);
     }
@@ -134,66 +124,114 @@ void mask_row(const PhotometricPass& pass, int64_t at, float* gradient) {
         for (int c = 0; c < 3; ++c) gradient[3 * p + c] *= pass.mask[at + p];
 }
 
+// Without SSIM: one row at a time.
+double pixel_band(const PhotometricPass& pass, int64_t view, int64_t first, int64_t last, float* scratch) {
+    const int64_t n = 3 * pass.width;
+    float *masked = scratch, *y = scratch + n;
+    double sum = 0.0;
+    for (int64_t row = first; row < last; ++row) {
+        const int64_t at = (view * pass.height + row) * pass.width;
+        load_target(pass, view, at, y);
+        if (pass.mask) load_masked(pass, at, y, masked);
+        float* gradient = pass.gradient ? pass.gradient + 3 * at : nullptr;
+        sum += pixel_row(pass, pass.mask ? masked : pass.color + 3 * at, y, gradient, n);
+        if (gradient) mask_row(pass, at, gradient);
+    }
+    return sum;
+}
+
+// The rows that a band keeps around the one at hand. Rows of x, y, their products and the maps have zeros on both sides.
+struct Rows {
+    Rows(float* scratch, int64_t n)
+        : memory(scratch), padded(n + 2 * kPad),
+          xs(take(kTaps * padded), padded), ys(take(kTaps * padded), padded),
+          moments{ring(n), ring(n), ring(n), ring(n)}, maps{ring(n), ring(n), ring(n)},
+          square(take(padded) + kPad), product(take(padded) + kPad), similarity(take(n)),
+          blurred{take(n), take(n), take(n), take(n)},
+          map{take(padded) + kPad, take(padded) + kPad, take(padded) + kPad} {}
+    float* take(int64_t count) { return std::exchange(memory, memory + count); }
+    Ring ring(int64_t n) { return {take(kTaps * n), n}; }
+    float* x(int64_t row) { return xs.row(row) + kPad; }
+    float* y(int64_t row) { return ys.row(row) + kPad; }
+
+    float* memory;
+    int64_t padded;
+    Ring xs, ys, moments[4], maps[3];  // the latter two blurred along x
+    float *square, *product, *similarity, *blurred[4], *map[3];
+};
+
+// Rows outside the image are zero.
+void load_row(const PhotometricPass& pass, int64_t view, int64_t row, float* x, float* y) {
+    const int64_t n = 3 * pass.width, at = (view * pass.height + row) * pass.width;
+    if (row < 0 || row >= pass.height) {
+        std::fill_n(x, n, 0.0f);
+        std::fill_n(y, n, 0.0f);
+        return;
+    }
+    load_target(pass, view, at, y);
+    if (pass.mask) {
+        load_masked(pass, at, y, x);
+    } else {
+        std::copy_n(pass.color + 3 * at, n, x);
+    }
+}
+
+void blur_moments(Rows& rows, int64_t row, int64_t n) {
+    const float *__restrict x = rows.x(row), *__restrict y = rows.y(row);
+    float *__restrict square = rows.square, *__restrict product = rows.product;
+    for (int64_t i = 0; i < n; ++i) {
+        square[i] = x[i] * x[i] + y[i] * y[i];
+        product[i] = x[i] * y[i];
+    }
+    const float* sources[4] = {x, y, square, product};
+    for (int k = 0; k < 4; ++k) blur_row(sources[k], rows.moments[k].row(row), n);
+}
+
+// The gradient of the structural part at a row whose maps are there on both sides.
+void add_slopes(const PhotometricPass& pass, Rows& rows, int64_t row, int64_t at, int64_t n) {
+    for (int k = 0; k < 3; ++k) rows.maps[k].blur(row, rows.blurred[k]);
+    float* __restrict gradient = pass.gradient + 3 * at;
+    const float *__restrict x = rows.x(row), *__restrict y = rows.y(row);
+    const float *by_mean = rows.blurred[0], *by_square = rows.blurred[1], *by_product = rows.blurred[2];
+    const float weight = pass.ssim_weight;
+    for (int64_t i = 0; i < n; ++i) {
+        gradient[i] -= weight * similarity_slope(by_mean[i], by_square[i], by_product[i], x[i], y[i]);
+    }
+    mask_row(pass, at, gradient);
+}
+
 PhotometricSums photometric_band(const PhotometricPass& pass, int64_t view, int64_t first, int64_t last,
                                  float* scratch) {
-    const int64_t n = 3 * pass.width, padded = n + 2 * kPad;
+    if (pass.ssim_weight == 0.0f) return {pixel_band(pass, view, first, last, scratch), 0.0};
+    const int64_t n = 3 * pass.width, image = view * pass.height;
     std::memset(scratch, 0, static_cast<size_t>(photometric_scratch_size(pass.width)) * sizeof(float));
-    const auto take = [&scratch](int64_t count) {
-        float* taken = scratch;
-        scratch += count;
-        return taken;
-    };
-    Ring xs(take(kTaps * padded), padded), ys(take(kTaps * padded), padded);  // as loaded, with zeros on both sides
-    Ring moments[4] = {{take(kTaps * n), n}, {take(kTaps * n), n}, {take(kTaps * n), n}, {take(kTaps * n), n}};
-    Ring maps[3] = {{take(kTaps * n), n}, {take(kTaps * n), n}, {take(kTaps * n), n}};
-    float *square = take(padded) + kPad, *product = take(padded) + kPad, *similarity = take(n);
-    float *blurred[4] = {take(n), take(n), take(n), take(n)}, *map[3];
-    for (float*& row : map) row = take(padded) + kPad;
-
+    Rows rows(scratch, n);
     PhotometricSums sums{0.0, 0.0};
-    const bool structural = pass.ssim_weight != 0.0f;
-    const int64_t reach = !structural ? 0 : pass.gradient ? 2 * kReach : kReach;
+    const int64_t reach = pass.gradient ? 2 * kReach : kReach;
     for (int64_t row = first - reach; row < last + reach; ++row) {
-        float *x = xs.row(row) + kPad, *y = ys.row(row) + kPad;
-        load_row(pass, view, row, x, y);
+        load_row(pass, view, row, rows.x(row), rows.y(row));
         if (row >= first && row < last) {
-            float* gradient = pass.gradient ? pass.gradient + (view * pass.height + row) * n : nullptr;
-            sums.pixel += pixel_row(pass, x, y, gradient, n);
-            if (!structural && gradient) mask_row(pass, (view * pass.height + row) * pass.width, gradient);
+            float* gradient = pass.gradient ? pass.gradient + (image + row) * n : nullptr;
+            sums.pixel += pixel_row(pass, rows.x(row), rows.y(row), gradient, n);
         }
-        if (!structural) continue;
-        for (int64_t i = 0; i < n; ++i) {
-            square[i] = x[i] * x[i] + y[i] * y[i];
-            product[i] = x[i] * y[i];
-        }
-        const float* sources[4] = {x, y, square, product};
-        for (int k = 0; k < 4; ++k) blur_row(sources[k], moments[k].row(row), n);
+        blur_moments(rows, row, n);
 
         const int64_t centre = row - kReach;
         if (centre < first - (reach - kReach)) continue;
-        const bool inside = centre >= 0 && centre < pass.height;
-        if (inside) {
-            for (int k = 0; k < 4; ++k) moments[k].blur(centre, blurred[k]);
-            similarity_row({blurred[0], blurred[1], blurred[2], blurred[3]}, similarity, map[0], map[1], map[2], n);
+        if (centre >= 0 && centre < pass.height) {
+            for (int k = 0; k < 4; ++k) rows.moments[k].blur(centre, rows.blurred[k]);
+            similarity_row(rows.blurred, rows.similarity, rows.map[0], rows.map[1], rows.map[2], n);
             if (centre >= first && centre < last) {
-                sums.ssim += lane_sum(n, [similarity](int64_t i) { return similarity[i]; });
+                sums.ssim += lane_sum(n, [similarity = rows.similarity](int64_t i) { return similarity[i]; });
             }
         } else {
-            for (float* m : map) std::memset(m, 0, static_cast<size_t>(n) * sizeof(float));
+            for (float* map : rows.map) std::fill_n(map, n, 0.0f);
         }
         if (!pass.gradient) continue;
-        for (int k = 0; k < 3; ++k) blur_row(map[k], maps[k].row(centre), n);
+        for (int k = 0; k < 3; ++k) blur_row(rows.map[k], rows.maps[k].row(centre), n);
 
         const int64_t done = centre - kReach;
-        if (done < first) continue;
-        for (int k = 0; k < 3; ++k) maps[k].blur(done, blurred[k]);
-        float* __restrict gradient = pass.gradient + (view * pass.height + done) * n;
-        const float *__restrict x_done = xs.row(done) + kPad, *__restrict y_done = ys.row(done) + kPad;
-        for (int64_t i = 0; i < n; ++i) {
-            gradient[i] -= pass.ssim_weight *
-                           similarity_slope(blurred[0][i], blurred[1][i], blurred[2][i], x_done[i], y_done[i]);
-        }
-        mask_row(pass, (view * pass.height + done) * pass.width, gradient);
+        if (done >= first) add_slopes(pass, rows, done, (image + done) * pass.width, n);
     }
     return sums;
 }

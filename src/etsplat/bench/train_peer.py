@@ -18,7 +18,7 @@ from etsplat.core.cameras import Cameras
 from etsplat.io.images import save_image
 from etsplat.io.run_directory import RunDirectory
 from etsplat.metrics.image import psnr, ssim
-from etsplat.ops.ssim import photometric_loss
+from etsplat.ops.photometric import photometric_loss
 from etsplat.optim.loop import DivergedError
 from etsplat.optim.schedules import exponential_decay
 from etsplat.optim.view_sampler import ViewSampler

@@ -1,4 +1,4 @@
-"""The GPU engine's side of ``l1_over_background``: csrc/cuda/photometric.cu."""
+"""The GPU engine's side of ``photometric_loss``: csrc/cuda/photometric.cu."""
 
 import ctypes
 from typing import Any
@@ -11,37 +11,64 @@ from etsplat.cuda.launch import blocks, launch
 from etsplat.cuda.program import Program
 
 _PROGRAM = Program("photometric.cu", contract=False)
-_THREADS, _PIXELS = 256, 1024
+_TILE = 16
+_THREADS = _TILE * _TILE
 
 
-class L1OverBackgroundCuda(torch.autograd.Function):
-    """Value and gradient each read the images once."""
+class _Photometric(ctypes.Structure):
+    _fields_ = (
+        *((name, ctypes.c_void_p) for name in ("color", "target", "backgrounds", "mask")),
+        *((name, ctypes.c_int) for name in ("views", "height", "width", "channels", "bytes", "squared")),
+        ("dssim_weight", ctypes.c_float),
+    )
+
+
+class PhotometricLossCuda(torch.autograd.Function):
+    """Forward keeps the derivatives of SSIM by its moments, which backward blurs once more; both read the images."""
 
     @staticmethod
-    def forward(ctx: Any, color: Tensor, target: Tensor, backgrounds: Tensor) -> Tensor:
-        """See ``l1_over_background``."""
-        images = color.contiguous(), target.contiguous(), backgrounds.contiguous()
-        grid, pixels = _grid(color)
-        sums = color.new_empty(grid[0] * grid[1], dtype=torch.float64)
-        mean = color.new_empty(())
-        launch(_PROGRAM, "l1_sums", grid, _THREADS, (*images, ctypes.c_int64(pixels), sums))
-        counts = ctypes.c_int64(sums.numel()), ctypes.c_int64(color.numel())
-        launch(_PROGRAM, "l1_mean", 1, _THREADS, (sums, *counts, mean))
-        ctx.save_for_backward(*images)
-        return mean
+    def forward(
+        ctx: Any,
+        color: Tensor,
+        target: Tensor,
+        mask: Tensor | None,
+        backgrounds: Tensor | None,
+        dssim_weight: float,
+        squared: bool,
+    ) -> Tensor:
+        """See ``photometric_loss``."""
+        images = [None if image is None else image.contiguous() for image in (color, target, backgrounds, mask)]
+        B, H, W = color.shape[:3]
+        maps = color.new_empty((B, 3, 3, H, W)) if ctx.needs_input_grad[0] and dssim_weight > 0 else None
+        grid = _grid(color)
+        sums = color.new_empty((grid[0] * grid[1] * grid[2], 2), dtype=torch.float64)
+        loss = color.new_empty(())
+        problem = _problem(images, dssim_weight, squared)
+        launch(_PROGRAM, "photometric_sums", grid, _THREADS, (problem, maps, sums))
+        launch(_PROGRAM, "photometric_loss", 1, _THREADS, (problem, sums, ctypes.c_int64(len(sums)), loss))
+        ctx.save_for_backward(*images, maps)
+        ctx.settings = dssim_weight, squared
+        return loss
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, grad_loss: Tensor) -> tuple[Tensor, None, None]:  # pyright: ignore[reportIncompatibleMethodOverride]
+    def backward(ctx: Any, grad_loss: Tensor) -> tuple[Tensor, None, None, None, None, None]:  # pyright: ignore[reportIncompatibleMethodOverride]
         """``grad_loss`` stays in device memory."""
-        images = ctx.saved_tensors
+        *images, maps = ctx.saved_tensors
         gradient = torch.empty_like(images[0])
-        grid, pixels = _grid(gradient)
-        launch(_PROGRAM, "l1_backward", grid, _THREADS, (*images, ctypes.c_int64(pixels), grad_loss, gradient))
-        return gradient, None, None
+        arguments = (_problem(images, *ctx.settings), maps, grad_loss, gradient)
+        launch(_PROGRAM, "photometric_backward", _grid(gradient), _THREADS, arguments)
+        return gradient, None, None, None, None, None
 
 
-def _grid(color: Tensor) -> tuple[tuple[int, int], int]:
-    """Blocks of a view, views; and the pixels of a view."""
-    pixels = color.shape[1] * color.shape[2]
-    return (blocks(pixels, _PIXELS), len(color)), pixels
+def _problem(images: list[Any], dssim_weight: float, squared: bool) -> _Photometric:
+    """Of color, target, backgrounds, mask; the latter two may be None."""
+    color, target = images[:2]
+    addresses = (None if image is None else image.data_ptr() for image in images)
+    return _Photometric(
+        *addresses, *color.shape[:3], target.shape[-1], target.dtype == torch.uint8, squared, dssim_weight
+    )
+
+
+def _grid(color: Tensor) -> tuple[int, int, int]:
+    return blocks(color.shape[2], _TILE), blocks(color.shape[1], _TILE), len(color)

@@ -6,7 +6,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from etsplat.ops.mesh_energies import mesh_energies
-from etsplat.ops.photometric import l1_over_background
+from etsplat.ops.photometric import photometric_loss
 from etsplat.ops.weighted_sum import Term, weighted_sum
 from etsplat.scene.triangle_mesh import TriangleMesh
 
@@ -57,7 +57,7 @@ def mesh_objective(
     Returns:
         Scalar, differentiable with respect to `color` and the mesh's parameters.
     """
-    photometric = l1_over_background(color, target, backgrounds, engine=engine)
+    photometric = photometric_loss(color, target, 0.0, backgrounds=backgrounds, engine=engine)
     if not isinstance(gamma, Tensor) and gamma == 0.0:
         return photometric
     energies = mesh_energies(mesh.vertices, mesh.topology.connectivity, edge_power=weights.edge_power, engine=engine)

@@ -9,7 +9,7 @@ from torch import Tensor
 from etsplat.core.cameras import Cameras
 from etsplat.core.rasterization import Rasterization
 from etsplat.ops.normal_consistency import normal_consistency
-from etsplat.ops.ssim import photometric_loss
+from etsplat.ops.photometric import photometric_loss
 from etsplat.ops.triangle_area import mean_area
 from etsplat.ops.weighted_sum import Term, weighted_sum
 
