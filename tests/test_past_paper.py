@@ -70,6 +70,20 @@ def test_folds_out_of_reach_stay() -> None:
     assert not torch.equal(untangled[stray], vertices[stray])
 
 
+def test_small_faces_do_not_count_as_far() -> None:
+    """A tangled patch, its edges a tenth of the others', is put right though vertices move by more than such edges."""
+    vertices, faces = icosphere(4)
+    vertices = vertices.clone()
+    topology = MeshTopology.from_faces(faces, len(vertices))
+    center = vertices[vertices[:, 2].argmax()].clone()
+    patch = (vertices - center).norm(dim=1) < 0.2
+    vertices[patch] = center + 0.1 * (vertices[patch] - center)
+    vertices[patch] += 0.01 * torch.randn(int(patch.sum()), 3, generator=torch.Generator().manual_seed(0))
+    assert count_self_intersections(vertices, faces) > 0
+    untangled, left = untangle(vertices, topology, reach=0.31)
+    assert left == count_self_intersections(untangled, faces) == 0
+
+
 def test_the_solver_inverts_the_laplacian() -> None:
     """(I + w L) applied by hand to the solution gives back the right-hand side; constants stay as they are."""
     vertices, faces = bumpy_sphere(2, seed=1)

@@ -46,7 +46,7 @@ def untangle(
         vertices: (V, 3) finite.
         topology: of the mesh.
         rounds: most looks for intersections in step 1.
-        reach: how far a vertex may go, in lengths of its longest edge.
+        reach: how far a vertex may go, in mean edge lengths of the mesh. (Its own edges are short where it is folded.)
 
     Returns:
         Moved vertices, and how many faces still intersect.
@@ -94,14 +94,11 @@ def _returned(
 def _too_far(
     vertices: Float[Tensor, "V 3"], original: Float[Tensor, "V 3"], topology: MeshTopology, reach: float
 ) -> Bool[Tensor, " V"]:
-    """Vertices that moved together, by edges, with one that moved more than `reach` times its longest edge."""
+    """Vertices that moved together, by edges, with one that moved more than `reach` times the mean edge length."""
     first, second = topology.edges.cpu().unbind(1)
-    lengths = (original[first] - original[second]).norm(dim=1)
-    longest = torch.zeros(len(original))
-    for end in (first, second):
-        longest.scatter_reduce_(0, end, lengths, "amax")
+    mean_edge = (original[first] - original[second]).norm(dim=1).mean()
     distance = (vertices - original).norm(dim=1)
-    moved, lost = distance > 0, distance > reach * longest
+    moved, lost = distance > 0, distance > reach * mean_edge
     together = moved[first] & moved[second]
     while True:
         grown = lost.clone()
