@@ -19,7 +19,9 @@ class ReconstructConfig:
     """Settings of `etsplat.reconstruct`; the defaults are preset "paper"."""
 
     preset: Preset = "paper"
-    """Where the other settings start from. For the record only: in Python, start from `PRESETS[name]`."""
+    """Where the other settings start from. best: the closest to the truth that we know, a quarter of an hour on four
+    cores; quick: the same in a minute; paper: the paper's method at its budget; study: that in two minutes, for
+    comparisons; demo, tiny: for `etsplat demo` and tests. In Python, start from `PRESETS[name]`."""
     method: Method = "elastic"
     """Kernel of soft triangles: elastic (the paper's), bilateral (2DTS) or single-sided (Triangle Splatting). Or opaque
     triangles with antialiased silhouettes: raster-face (a colour per face) or raster-vertex (a colour per vertex)."""
@@ -240,6 +242,4 @@ PRESETS: dict[str, ReconstructConfig] = {
         chamfer_samples=20_000,
     ),
 }
-"""best: the best that we know, at the paper's budget (a quarter of an hour on four cores). paper: the paper's setting.
-study: the paper's method in about two minutes, for comparisons. quick: preset best in about a minute. demo: `etsplat
-demo`. tiny: seconds, for tests."""
+"""By name; `ReconstructConfig.preset` says what each is for."""

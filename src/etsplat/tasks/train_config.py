@@ -18,9 +18,11 @@ class TrainConfig:
     """
 
     preset: TrainPreset = "paper"
-    """Where the other settings start from. For the record only: in Python, start from `train_settings(name)`."""
+    """Where the other settings start from. quick: minutes on four cores, the scene scaled to unit size; paper: Triangle
+    Splatting's settings, in the scene's own units; demo, tiny: for `etsplat demo scene` and tests. In Python, start
+    from `train_settings(name)`."""
     scene_type: SceneType = "outdoor"
-    """What is photographed, for learning rates and losses: outdoor, indoor, or an object. For the record as well."""
+    """What is photographed, for learning rates and losses: outdoor, indoor, or an object."""
     method: Method = "elastic"
     """Kernel of the triangles: elastic (the paper's), bilateral (2DTS) or single-sided (Triangle Splatting)."""
     freeze_incentre: bool = True
@@ -261,8 +263,7 @@ def train_settings(preset: str = "quick", scene_type: str = "outdoor") -> TrainC
     """The settings of a preset for a kind of scene.
 
     Args:
-        preset: paper: Triangle Splatting's settings, in the scene's own units. quick: a few minutes on four cores.
-            demo: `etsplat demo scene`. tiny: seconds, for tests.
+        preset: paper, quick, demo or tiny.
         scene_type: outdoor, indoor or object.
 
     Raises:
