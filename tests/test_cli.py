@@ -6,11 +6,12 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
+import docstring_parser
 import pytest
 
 from etsplat.cli.command import Command, resume_line
@@ -19,7 +20,8 @@ from etsplat.cli.parse import COMMANDS, Group, parse
 from etsplat.cli.reconstruct import Demo, Reconstruct
 from etsplat.geometry.icosphere import icosphere
 from etsplat.io.mesh_files import save_mesh
-from etsplat.tasks.reconstruct_config import PRESETS
+from etsplat.tasks.reconstruct_config import PRESETS, ReconstructConfig
+from etsplat.tasks.train_config import TrainConfig
 
 PROGRAM = [sys.executable, "-c", "from etsplat.cli import main; main()"]
 
@@ -51,6 +53,22 @@ def test_help_lists_the_commands(arguments: list[str]) -> None:
     assert result.returncode == 0
     for word in ("demo", "reconstruct", "doctor", "etsplat reconstruct bunny.obj --out runs/bunny"):
         assert word in result.stdout
+
+
+def test_lines_of_help_end_where_clauses_do() -> None:
+    """Help keeps the line breaks of docstrings, so that one within a clause would be seen."""
+    for settings in (*_commands(COMMANDS), ReconstructConfig, TrainConfig):
+        for option in docstring_parser.parse_from_object(settings).params:
+            for line in (option.description or "").splitlines()[:-1]:
+                assert line.endswith((".", ":", ";")), f"{settings.__name__}.{option.arg_name}: {line}"
+
+
+def _commands(entries: Mapping[str, type[Command] | Group]) -> Iterator[type[Command]]:
+    for entry in entries.values():
+        if isinstance(entry, Group):
+            yield from _commands(entry.commands)
+        else:
+            yield entry
 
 
 def test_help_of_a_command_teaches() -> None:

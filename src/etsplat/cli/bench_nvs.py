@@ -30,8 +30,8 @@ class Nvs(Command):
     """
 
     scenes: tuple[str, ...]
-    """Folders of the scenes, or demo:scene for the one that is built in code; the kind of a scene, outdoor if it is not
-    given, and changes for it alone come after a colon: FOLDER:indoor, FOLDER:object,background=white."""
+    """Folders of the scenes, or demo:scene for the one that is built in code.
+    Their kind (outdoor if not given) and changes come after a colon: FOLDER:indoor, FOLDER:object,background=white."""
     out: Path
     """Folder for the runs, tables and figures; a grid that was interrupted goes on where it was."""
     methods: tuple[Method | Peer, ...] = ("elastic", "bilateral", "single-sided")

@@ -71,8 +71,8 @@ class Undistort(Command):
     """
 
     source: tyro.conf.Positional[Path]
-    """Folder with images/ and sparse/0/, of any of COLMAP's camera models; or with transforms.json, as nerfstudio and
-    instant-ngp write it. Masks come along; every 8th image is for testing, whatever transforms.json says."""
+    """Folder with images/ and sparse/0/, of any of COLMAP's camera models; or with transforms.json of nerfstudio.
+    Masks come along; every 8th image is for testing, whatever transforms.json says."""
     out: Path
     """Folder for the new scene."""
     max_size: int = 1600
@@ -103,8 +103,8 @@ class Download(Command):
     """
 
     name: tyro.conf.Positional[Literal["mipnerf360", "mipnerf360-extra", "tandt-db", "famous"]]
-    """Which: mipnerf360 (7 scenes, 12.5 GB), mipnerf360-extra (flowers and treehill, 3 GB), tandt-db (4, 0.7 GB),
-    famous (the meshes of shape reconstruction, 0.4 GB)."""
+    """Of scenes: mipnerf360 (7, 12.5 GB), mipnerf360-extra (flowers and treehill, 3 GB), tandt-db (4, 0.7 GB).
+    Of meshes: famous (those of shape reconstruction, 0.4 GB)."""
     out: Path = Path("data")
     """Folder for the scenes."""
 

@@ -38,8 +38,7 @@ class Evaluate(Command):
     run_dir: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(name="dir")]
     """A run of `etsplat train`; or a file with a soup, with --scene."""
     out: Path | None = None
-    """Folder for evaluation.json and evaluation/ with pictures side by side; by default the run's, whose report is
-    written anew."""
+    """Folder for evaluation.json and pictures side by side; by default the run's, whose report is written anew."""
     scene: Path | None = None
     """The capture's folder, if it has moved or a file is given."""
     device: Literal["cpu", "cuda"] | None = None

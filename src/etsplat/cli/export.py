@@ -26,8 +26,8 @@ class Export(Command):
     run_dir: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(name="dir")]
     """A run of `etsplat train`; or a file: .safetensors, .pt of Triangle Splatting, Gaussian .ply, or a mesh."""
     format: Literal["ply", "obj", "off", "glb", "safetensors"] = "glb"
-    """Kind of file: glb for Blender, three.js and Unity, ply for MeshLab and Open3D (glb is too dark there), obj and
-    off for others, safetensors for etsplat."""
+    """Kind of file: glb for Blender, three.js and Unity; ply for MeshLab and Open3D (glb is too dark there);
+    obj and off for others; safetensors for etsplat."""
     out: Path | None = None
     """The file to write; by default soup.FORMAT in the run's folder."""
     scene: Path | None = None

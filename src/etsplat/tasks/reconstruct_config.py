@@ -19,12 +19,15 @@ class ReconstructConfig:
     """Settings of `etsplat.reconstruct`; the defaults are preset "paper"."""
 
     preset: Preset = "paper"
-    """Where the other settings start from. best: the closest to the truth that we know, a quarter of an hour on four
-    cores; quick: the same in a minute; paper: the paper's method at its budget; study: that in two minutes, for
-    comparisons; demo, tiny: for `etsplat demo` and tests. In Python, start from `PRESETS[name]`."""
+    """Where the other settings start from; in Python, begin with `PRESETS[name]` instead.
+    best: the closest to the truth that we know, a quarter of an hour on four cores;
+    quick: the same in a minute;
+    paper: the paper's method at its budget;
+    study: the paper's method in two minutes, for comparisons;
+    demo, tiny: for `etsplat demo` and for tests."""
     method: Method = "elastic"
-    """Kernel of soft triangles: elastic (the paper's), bilateral (2DTS) or single-sided (Triangle Splatting). Or opaque
-    triangles with antialiased silhouettes: raster-face (a colour per face) or raster-vertex (a colour per vertex)."""
+    """Kernel of soft triangles: elastic (the paper's), bilateral (2DTS) or single-sided (Triangle Splatting).
+    Opaque triangles with antialiased silhouettes: raster-face or raster-vertex (a colour per face or per vertex)."""
     colors: Literal["face", "vertex"] = "face"
     """Colours of soft triangles: one for each face, or one for each vertex, interpolated between."""
     backend: Literal["etsplat", "nvdiffrast"] = "etsplat"
@@ -102,12 +105,10 @@ class ReconstructConfig:
     subdivide_until: float = 0.6
     """Last subdivision, as a fraction of the iterations."""
     subdivide_steps: int = 30
-    """Number of subdivisions between these two; each adds the same fraction of faces, so that the last reaches
-    `max_faces`."""
+    """Number of subdivisions between these two; each adds the same fraction of faces, up to `max_faces`."""
 
     untangle_steps: int = 0
-    """How often faces that cut through others are smoothed away, evenly spaced after the last subdivision; the last
-    time is after the last step."""
+    """How often faces that cut through others are smoothed away, from the last subdivision to the last step."""
 
     log_every: int = 50
     """Iterations between lines of history.jsonl."""

@@ -18,9 +18,10 @@ class TrainConfig:
     """
 
     preset: TrainPreset = "paper"
-    """Where the other settings start from. quick: minutes on four cores, the scene scaled to unit size; paper: Triangle
-    Splatting's settings, in the scene's own units; demo, tiny: for `etsplat demo scene` and tests. In Python, start
-    from `train_settings(name)`."""
+    """Where the other settings start from; in Python, begin with `train_settings(name)` instead.
+    quick: minutes on four cores, the scene scaled to unit size;
+    paper: Triangle Splatting's settings, in the scene's own units;
+    demo, tiny: for `etsplat demo scene` and for tests."""
     scene_type: SceneType = "outdoor"
     """What is photographed, for learning rates and losses: outdoor, indoor, or an object."""
     method: Method = "elastic"
