@@ -14,7 +14,7 @@ from benchmarks.gpu_floors import Work
 from benchmarks.gpu_scenes import GpuScene
 from etsplat.cuda.launch import use_backend
 from etsplat.ops._raster_capacity import repair_overflow
-from etsplat.ops._raster_render_cuda import TILE, Render
+from etsplat.ops._raster_render_cuda import TILE, CudaRender
 
 WARM_UP = 5
 
@@ -93,7 +93,7 @@ def count(scene: GpuScene) -> Work:
     """The work of one step."""
     out = scene.render()
     out.color.backward(scene.cotangent)
-    render: Render = out.color.grad_fn.render  # type: ignore[union-attr]
+    render: CudaRender = out.color.grad_fn.render  # type: ignore[union-attr]
     slots = int(render.zeros[2 + 2 * -(-len(scene.opacities) // 1024)].item())
     hits = render.state.bytes("hits", slots)
     bits = sum(((hits >> bit) & 1).sum(dtype=torch.int64) for bit in range(8))

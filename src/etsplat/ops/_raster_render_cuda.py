@@ -6,128 +6,51 @@ results are the same bits every time.
 """
 
 import ctypes
-from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from etsplat.core.kernels import DISTANCES, KERNELS
-from etsplat.core.rasterization import DISTORTION_FAR, DISTORTION_NEAR, RasterizeSettings, TriangleStatistics
+from etsplat.core.rasterization import DISTORTION_FAR, DISTORTION_NEAR
 from etsplat.cuda.launch import backend, blocks, launch
 from etsplat.cuda.memory import Arena, PendingNumber
 from etsplat.cuda.program import Program
 from etsplat.cuda.sort import RadixSort
 from etsplat.cuda.structs import struct_class
 from etsplat.ops._raster_capacity import capacity_for, note_capture, overflow_flag, record_need
+from etsplat.ops._raster_plan import Inputs, Outputs, PerInput, Plan
 
 TILE = 16
 _TINY = 1.17549435e-38
 _PROJECT = Program("raster_project.cu")
 
 
-class Geometry:
-    """Triangles with the index arrays that the kernels want: int32 faces and the corners at each vertex."""
+class CudaRender:
+    """One forward pass of all views together, and what its backward pass needs of it."""
 
-    def __init__(self, vertices: Tensor, faces: Tensor | None) -> None:
-        self.vertex_count = vertices.shape[0]
-        self.count = vertices.shape[0] if faces is None else faces.shape[0]
-        self.faces, self.corner_offsets, self.corner_indices = _face_arrays(faces, vertices.shape[0])
+    most_channels: int | None = 16
 
-
-def _face_arrays(faces: Tensor | None, vertices: int) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
-    """int32 faces, and for each vertex the places 3 face + corner that use it (CSR); kept on the tensor."""
-    if faces is None:
-        return None, None, None
-    key = (faces._version, vertices)
-    cached = getattr(faces, "_etsplat_cuda_arrays", None)
-    if cached is None or cached[0] != key:
-        faces32 = faces.to(torch.int32).contiguous()
-        ordered, indices = torch.sort(faces32.reshape(-1), stable=True)
-        ends = torch.arange(vertices + 1, dtype=torch.int32, device=faces.device)
-        offsets = torch.searchsorted(ordered, ends, out_int32=True)
-        cached = (key, faces32, offsets, indices.to(torch.int32))
-        setattr(faces, "_etsplat_cuda_arrays", cached)  # noqa: B010
-    return cached[1], cached[2], cached[3]
-
-
-@dataclass
-class Plan:
-    """What the autograd function needs besides tensors; it leaves the statistics here."""
-
-    settings: RasterizeSettings
-    geometry: Geometry
-    views: int
-    statistics: TriangleStatistics | None = None
-
-    @property
-    def tiles(self) -> tuple[int, int]:
-        return blocks(self.settings.width, TILE), blocks(self.settings.height, TILE)
-
-    @property
-    def tile_count(self) -> int:
-        return self.views * self.tiles[0] * self.tiles[1]
-
-    @property
-    def projected(self) -> int:
-        return self.views * self.geometry.count
-
-    def distortion_kind(self, wanted: bool) -> int:
-        """0 none, 1 with the plane's depth, 2 with the centroid's."""
-        return 0 if not wanted else 2 if self.settings.depth == "centroid" else 1
-
-    def defines(self, flat: int, corner: int, distortion: int, forward: bool) -> tuple[tuple[str, int | str], ...]:
-        """Definitions that specialise the tile loops."""
-        kernel = "".join(word.capitalize() for word in self.settings.kernel.split("_"))
-        median, weights = (self.settings.median_depth, self.settings.statistics) if forward else (False, False)
-        return (
-            ("KERNEL", kernel),
-            ("FLAT", flat),
-            ("CORNER", corner),
-            ("DISTORTION", distortion),
-            ("MEDIAN", int(median)),
-            ("WEIGHTS", int(weights)),
-        )
-
-
-class Outputs:
-    """Uninitialised output images of a batch; the kernels write every element."""
-
-    def __init__(self, plan: Plan, inputs: list[Tensor | None]) -> None:
-        settings, device = plan.settings, _device(inputs)
-        image = (plan.views, settings.height, settings.width)
-        self.color = torch.empty(*image, channel_count(inputs[1]) + channel_count(inputs[2]), device=device)
-        self.alpha = torch.empty(*image, 1, device=device)
-        self.distortion = (
-            torch.empty(*image, 1, device=device) if settings.distortion else torch.empty(0, device=device)
-        )
-        self.distortion_totals = torch.empty(*image, 2, device=device) if settings.distortion else None
-        median_shape = image if settings.median_depth else (0,)
-        self.median_triangle = torch.empty(median_shape, dtype=torch.int32, device=device)
-        self.statistics = None
-        if settings.statistics:
-            values = torch.empty(3, plan.views, plan.geometry.count, device=device)
-            visible = torch.empty(values.shape[1:], dtype=torch.bool, device=device)
-            self.statistics = TriangleStatistics(values[0], values[1], values[2], visible)
-
-
-class Render:
-    """One forward pass and what its backward pass needs of it."""
-
-    def __init__(self, plan: Plan, inputs: list[Tensor | None], outputs: Outputs, keep: bool) -> None:
+    def __init__(self, plan: Plan, inputs: Inputs, outputs: Outputs, keep: bool) -> None:
+        settings = plan.settings
         self.plan = plan
         self.keep = keep
-        self.device = _device(inputs)
-        self.flat, self.corner = channel_count(inputs[1]), channel_count(inputs[2])
-        self.shape = (plan.views, plan.settings.width, plan.settings.height)
-        self.distortion = plan.distortion_kind(plan.settings.distortion)
+        self.device = inputs.vertices.device
+        self.flat, self.corner = inputs.channels
+        self.shape = (plan.views, settings.width, settings.height)
+        self.tiles = blocks(settings.width, TILE), blocks(settings.height, TILE)
+        self.tile_count = plan.views * self.tiles[0] * self.tiles[1]
+        self.projected = plan.views * plan.geometry.count
+        # 0 none, 1 with the plane's depth, 2 with the centroid's
+        self.distortion = 0 if not settings.distortion else 2 if settings.depth == "centroid" else 1
         self.arguments = struct_class("cuda/raster_pass.h", "RasterPass")()
         self.totals = outputs.distortion_totals
         self._fill_inputs(inputs)
         self._fill_outputs(outputs)
+        self._render()
 
-    def forward(self) -> None:
-        """Render; again with more room if the pairs did not fit."""
+    def _render(self) -> None:
+        """Again with more room if the pairs did not fit."""
         count, capturing = self.plan.geometry.count, backend().capturing
         flag = overflow_flag(self.device)
         if capturing:
@@ -149,8 +72,7 @@ class Render:
 
         If they did not fit, ``overflow`` holds that number, too.
         """
-        plan, a = self.plan, self.arguments
-        m, tiles = plan.projected, plan.tile_count
+        a, m, tiles = self.arguments, self.projected, self.tile_count
         by_depth = RadixSort(max(m, 1), 31)
         self.by_tile = RadixSort(capacity, max(tiles - 1, 1).bit_length())
         emit_grid = blocks(m, 1024)
@@ -158,7 +80,7 @@ class Render:
         sizes = [2, 2 * emit_grid, 2, 2 * tiles, by_depth.zeros, self.by_tile.zeros]
         self.zeros = torch.zeros(sum(sizes), dtype=torch.int32, device=self.device)
         wanted, scan_state, counters, ranges, depth_zeros, self.tile_zeros = self.zeros.split(sizes)
-        self.state, self.temporary = _allocate(plan, capacity, self._attributes, self.keep, self.device)
+        self.state, self.temporary = self._allocate(capacity)
         state, temporary = self.state, self.temporary
         a.capacity = capacity
         a.records, a.spans, a.slot_begin = state["records"], state["spans"], state["slot_begin"]
@@ -177,33 +99,53 @@ class Render:
 
     def _composite(self, capacity: int) -> None:
         """Sort the pairs by tile and go through the tiles."""
-        plan, a, temporary = self.plan, self.arguments, self.temporary
+        a, temporary = self.arguments, self.temporary
         slots = (self.state["sorted_slots"], temporary["sorted_slots_2"])
         if self.by_tile.passes % 2 == 1:  # the result ends up in what is kept
             slots = (slots[1], slots[0])
         keys = (temporary["tile_keys"], temporary["tile_keys_2"])
         a.sorted_tiles, a.sorted_slots = self.by_tile.run(keys, slots, ctypes.c_void_p(a.slots), self.tile_zeros)
         launch(_PROJECT, "raster_ranges", blocks(capacity, 256), 256, [a])
-        program = Program("raster_forward.cu", plan.defines(self.flat, self.corner, self.distortion, forward=True))
-        launch(program, "raster_forward", plan.tile_count, 256, [a])
+        settings = self.plan.settings
+        defines = self._defines(self.distortion, settings.median_depth, settings.statistics)
+        launch(Program("raster_forward.cu", defines), "raster_forward", self.tile_count, 256, [a])
         del self.temporary, self.tile_zeros
 
+    def _allocate(self, capacity: int) -> tuple[Arena, Arena]:
+        """What the backward pass reads, and what only the forward pass needs."""
+        m, state, temporary = self.projected, Arena(), Arena()
+        state.add("records", 16 * m)
+        state.add("attributes", 8 * m if self._attributes else 0)
+        state.add("spans", 2 * m)
+        state.add("slot_begin", m)
+        state.add("slot_triangle", capacity)
+        state.add("sorted_slots", capacity)
+        state.add("hits", capacity if self.keep else 0, size=1)
+        state.add("tile_done", self.tile_count)
+        for name in ("depth_keys", "depth_keys_2", "order", "order_2"):
+            temporary.add(name, m)
+        for name in ("tile_keys", "tile_keys_2", "sorted_slots_2"):
+            temporary.add(name, capacity)
+        state.allocate(self.device)
+        temporary.allocate(self.device)
+        return state, temporary
+
     def backward(
-        self, inputs: list[Tensor | None], cotangents: list[Tensor | None], needed: tuple[bool, ...]
-    ) -> list[Tensor | None]:
-        """Gradients of the inputs that need one, else None."""
-        plan, a = self.plan, self.arguments
+        self, inputs: Inputs, cotangents: tuple[Tensor | None, Tensor | None, Tensor | None], needed: PerInput
+    ) -> PerInput:
+        """See ``Render``."""
+        a = self.arguments
         grad_color, grad_alpha, grad_distortion = cotangents
         distortion = self.distortion if grad_distortion is not None else 0
-        defines = plan.defines(self.flat, self.corner, distortion, forward=False)
+        defines = self._defines(distortion, median=False, weights=False)
         stride = _stride(self.flat, self.corner, distortion)
-        reduce_grid = blocks(plan.geometry.count, 128)
-        grads = _Gradients(plan, inputs, needed, reduce_grid)
+        reduce_grid = blocks(self.plan.geometry.count, 128)
+        grads = _Gradients(self, inputs, needed, reduce_grid)
         sums = torch.empty(a.capacity * stride, device=self.device)
         a.grad_color, a.grad_alpha = _pointer(grad_color), _pointer(grad_alpha)
         a.grad_distortion, a.slot_sums = _pointer(grad_distortion), sums.data_ptr()
         grads.fill(a)
-        launch(Program("raster_backward.cu", defines), "raster_backward", plan.tile_count, 256, [a])
+        launch(Program("raster_backward.cu", defines), "raster_backward", self.tile_count, 256, [a])
         launch(Program("raster_reduce.cu", defines[1:]), "raster_reduce", reduce_grid, 128, [a])
         return grads.finish(defines[1:])
 
@@ -211,22 +153,32 @@ class Render:
     def _attributes(self) -> bool:
         return self.corner > 0 or self.distortion > 0
 
-    def _fill_inputs(self, inputs: list[Tensor | None]) -> None:
-        vertices, flat, corner, opacities, sigma, viewmats, Ks, backgrounds = inputs
+    def _defines(self, distortion: int, median: bool, weights: bool) -> tuple[tuple[str, int | str], ...]:
+        """Definitions that specialise the tile loops."""
+        kernel = "".join(word.capitalize() for word in self.plan.settings.kernel.split("_"))
+        return (
+            ("KERNEL", kernel),
+            ("FLAT", self.flat),
+            ("CORNER", self.corner),
+            ("DISTORTION", distortion),
+            ("MEDIAN", int(median)),
+            ("WEIGHTS", int(weights)),
+        )
+
+    def _fill_inputs(self, inputs: Inputs) -> None:
         a, plan, settings = self.arguments, self.plan, self.plan.settings
-        assert sigma is not None
-        a.vertices, a.faces = _pointer(vertices), _pointer(plan.geometry.faces)
-        a.flat_colors, a.corner_colors = _pointer(flat), _pointer(corner)
-        a.opacities, a.sigmas = _pointer(opacities), _pointer(sigma)
-        a.viewmats, a.Ks, a.backgrounds = _pointer(viewmats), _pointer(Ks), _pointer(backgrounds)
+        a.vertices, a.faces = _pointer(inputs.vertices), _pointer(plan.geometry.faces)
+        a.flat_colors, a.corner_colors = _pointer(inputs.flat), _pointer(inputs.corner)
+        a.opacities, a.sigmas = _pointer(inputs.opacities), _pointer(inputs.sigma)
+        a.viewmats, a.Ks, a.backgrounds = map(_pointer, (inputs.viewmats, inputs.Ks, inputs.backgrounds))
         a.triangles, a.vertex_count, a.views = plan.geometry.count, plan.geometry.vertex_count, plan.views
         a.width, a.height = settings.width, settings.height
-        a.tiles_x, a.tiles_y = plan.tiles
+        a.tiles_x, a.tiles_y = self.tiles
         a.kernel, a.distance = list(KERNELS).index(settings.kernel), DISTANCES.index(settings.distance)
         a.freeze_incentre = settings.freeze_incentre
-        a.shared_sigma = sigma.dim() == 0
-        a.flat_per_view = flat is not None and flat.dim() == 3
-        a.corner_per_view = corner is not None and corner.dim() == 4
+        a.shared_sigma = inputs.sigma.dim() == 0
+        a.flat_per_view = inputs.flat_per_view
+        a.corner_per_view = inputs.corner_per_view
         a.flat_channels, a.corner_channels = self.flat, self.corner
         alpha_min, alpha_max, x_max, a.transmittance_min = settings.cutoffs
         # With the cut-offs off, too: where alpha is 0 x^(2/sigma) may have overflowed, and the backward divides by
@@ -248,49 +200,27 @@ class Render:
             a.inradius, a.visible = statistics.inradius.data_ptr(), statistics.visible.data_ptr()
 
 
-def _allocate(plan: Plan, capacity: int, attributes: bool, keep: bool, device: torch.device) -> tuple[Arena, Arena]:
-    """What the backward pass reads, and what only the forward pass needs."""
-    m, state, temporary = plan.projected, Arena(), Arena()
-    state.add("records", 16 * m)
-    state.add("attributes", 8 * m if attributes else 0)
-    state.add("spans", 2 * m)
-    state.add("slot_begin", m)
-    state.add("slot_triangle", capacity)
-    state.add("sorted_slots", capacity)
-    state.add("hits", capacity if keep else 0, size=1)
-    state.add("tile_done", plan.tile_count)
-    for name in ("depth_keys", "depth_keys_2", "order", "order_2"):
-        temporary.add(name, m)
-    for name in ("tile_keys", "tile_keys_2", "sorted_slots_2"):
-        temporary.add(name, capacity)
-    state.allocate(device)
-    temporary.allocate(device)
-    return state, temporary
-
-
 class _Gradients:
     """Gradients of the inputs, as the kernels write them, and what is left to add up in torch."""
 
-    def __init__(self, plan: Plan, inputs: list[Tensor | None], needed: tuple[bool, ...], reduce_grid: int) -> None:
-        self.plan, self.inputs = plan, inputs
-        vertices, flat, corner, _, sigma, _, _, backgrounds = inputs
-        assert vertices is not None
-        assert sigma is not None
-        device, views, count = vertices.device, plan.views, plan.geometry.count
+    def __init__(self, render: CudaRender, inputs: Inputs, needed: PerInput, reduce_grid: int) -> None:
+        self.geometry = render.plan.geometry
+        device, views, count = render.device, render.plan.views, self.geometry.count
+        flat, corner, sigma, backgrounds = inputs.flat, inputs.corner, inputs.sigma, inputs.backgrounds
         empty = torch.empty if count > 0 else torch.zeros
-        self.corners = empty(count, 3, 3, device=device) if needed[0] else None
-        self.flat = empty(flat.shape, device=device) if needed[1] and flat is not None else None
-        self.corner = empty(corner.shape, device=device) if needed[2] and corner is not None else None
-        self.opacities = empty(count, device=device) if needed[3] else None
-        own_sigma = needed[4] and sigma.dim() == 1
-        self.sigmas = empty(count, device=device) if own_sigma else None
+        self.corners = empty(count, 3, 3, device=device) if needed.vertices else None
+        self.flat = empty(flat.shape, device=device) if needed.flat and flat is not None else None
+        self.corner = empty(corner.shape, device=device) if needed.corner and corner is not None else None
+        self.opacities = empty(count, device=device) if needed.opacities else None
+        own = sigma.dim() == 1
+        self.sigmas = empty(count, device=device) if needed.sigma and own else None
         sums = torch.float64
-        self.sigma_sums = torch.empty(reduce_grid, dtype=sums, device=device) if needed[4] and not own_sigma else None
+        self.sigma_sums = torch.empty(reduce_grid, dtype=sums, device=device) if needed.sigma and not own else None
         camera_shape = (views, reduce_grid, 12)
-        self.camera_sums = torch.empty(camera_shape, dtype=sums, device=device) if needed[5] else None
+        self.camera_sums = torch.empty(camera_shape, dtype=sums, device=device) if needed.viewmats else None
         self.background = None
-        if needed[7] and backgrounds is not None:
-            self.background = torch.empty(views, plan.tile_count // views, backgrounds.shape[1], device=device)
+        if needed.backgrounds and backgrounds is not None:
+            self.background = torch.empty(views, render.tile_count // views, backgrounds.shape[1], device=device)
 
     def fill(self, a: Any) -> None:
         """Hand the addresses to the kernels."""
@@ -299,10 +229,10 @@ class _Gradients:
         a.sigma_sums, a.camera_sums = _pointer(self.sigma_sums), _pointer(self.camera_sums)
         a.tile_background = _pointer(self.background)
 
-    def finish(self, defines: tuple[tuple[str, int | str], ...]) -> list[Tensor | None]:
-        """The gradients in the order of the inputs."""
+    def finish(self, defines: tuple[tuple[str, int | str], ...]) -> PerInput:
+        """What is left to add up."""
         vertices, sigma = self.corners, self.sigmas
-        geometry = self.plan.geometry
+        geometry = self.geometry
         if vertices is not None and geometry.faces is not None:
             count = geometry.vertex_count
             vertices = torch.empty(count, 3, device=vertices.device)
@@ -315,26 +245,13 @@ class _Gradients:
             rows = self.camera_sums.sum(1).float().view(-1, 3, 4)
             viewmats = torch.nn.functional.pad(rows, (0, 0, 0, 1))
         background = None if self.background is None else self.background.sum(1)
-        return [vertices, self.flat, self.corner, self.opacities, sigma, viewmats, None, background]
+        return PerInput(vertices, self.flat, self.corner, self.opacities, sigma, viewmats, None, background)
 
 
 def _stride(flat: int, corner: int, distortion: int) -> int:
     """Floats of a slot: ``SlotLayout`` of csrc/math/raster_records.h."""
     size = 11 + flat + (3 + 3 * corner if corner > 0 or distortion == 1 else 0) + (0, 3, 1)[distortion]
     return blocks(size, 16) * 16
-
-
-def _device(inputs: list[Tensor | None]) -> torch.device:
-    assert inputs[0] is not None
-    return inputs[0].device
-
-
-def contiguous(tensor: Tensor | None) -> Tensor | None:
-    return None if tensor is None else tensor.detach().contiguous()
-
-
-def channel_count(tensor: Tensor | None) -> int:
-    return 0 if tensor is None else tensor.shape[-1]
 
 
 def _pointer(tensor: Tensor | None) -> int:

@@ -4,22 +4,36 @@ Native code composites channels of two kinds: flat ones, constant over a triangl
 it. Depth and normals are channels as well, so their gradients need no code of their own.
 """
 
+from typing import Any
+
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
+from etsplat import _native
 from etsplat.core.rasterization import Rasterization, RasterizeSettings
+from etsplat.ops._raster_plan import Geometry
 from etsplat.ops._rasterize_reference import barycentrics, perspective_weights, to_screen
 from etsplat.ops.pick_values import pick_values
+from etsplat.ops.pool import empty_image
 from etsplat.ops.triangle_channels import triangle_channels
 
 
 class Channels:
     """Flat (N, F) or (B, N, F) and corner (N, 3, K) or (B, N, 3, K) channels; in each, colours come first."""
 
-    def __init__(self, colors: Tensor | None, corner_colors: Tensor | None, faces: Tensor | None) -> None:
+    def __init__(
+        self,
+        colors: Tensor | None,
+        corner_colors: Tensor | None,
+        faces: Tensor | None,
+        geometry: Geometry,
+        engine: str,
+    ) -> None:
         if corner_colors is not None and corner_colors.dim() == 2:
             assert faces is not None
-            corner_colors = corner_colors[faces.long()]
+            on_cpu = engine == "cpu"
+            corner_colors = _PerCorner.apply(corner_colors, geometry) if on_cpu else corner_colors[faces.long()]
         self.flat = colors
         self.corner = corner_colors
         self.flat_is_color = colors is not None
@@ -27,10 +41,6 @@ class Channels:
         self.centroid_depth: Tensor | None = None  # (B, N)
         self.flat_names: list[str] = []
         self.corner_names: list[str] = []
-
-    @property
-    def flat_per_view(self) -> bool:
-        return self.flat is not None and self.flat.dim() == 3
 
     @property
     def count(self) -> int:
@@ -79,6 +89,30 @@ class Channels:
         result.normal = parts.get("normal")
         if "depth" in parts:
             result.depth = parts["depth"] / result.alpha.clamp_min(1e-8)
+
+
+class _PerCorner(torch.autograd.Function):
+    """(V, C) -> (N, 3, C). Autograd's own backward of the indexing takes longer than rasterizing."""
+
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, geometry: Geometry) -> Tensor:
+        ctx.geometry, ctx.shape = geometry, values.shape
+        assert geometry.faces is not None
+        # values[faces] takes five times as long
+        return values.index_select(0, geometry.faces.view(-1)).view(-1, 3, values.shape[1])
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad_corners: Tensor) -> tuple[Tensor, None]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        sums = empty_image(*ctx.shape)
+        _native.sum_groups(
+            grad_corners.contiguous().data_ptr(),
+            ctx.geometry.corner_offsets.data_ptr(),
+            ctx.geometry.corner_indices.data_ptr(),
+            *ctx.shape,
+            sums.data_ptr(),
+        )
+        return sums, None
 
 
 def corners_of(vertices: Tensor, faces: Tensor | None) -> Tensor:

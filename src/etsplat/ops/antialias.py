@@ -26,7 +26,7 @@ from etsplat.ops._antialias_cuda import AntialiasCuda
 from etsplat.ops._antialias_reference import antialias_reference
 from etsplat.ops.engines import resolve_engine
 from etsplat.ops.mesh_energies import MeshConnectivity
-from etsplat.ops.pool import empty_image, zeros_like
+from etsplat.ops.pool import empty_image, zeros_image
 from etsplat.ops.rasterize_hard import HardRasterization, rasterize_hard
 
 
@@ -181,7 +181,7 @@ class _Antialias(torch.autograd.Function):
         vertices, colors, backgrounds, _, _, shaded = ctx.saved_tensors
         grad_image = grad_image.contiguous()
         grads = [
-            zeros_like(tensor) if needed else None
+            zeros_image(*tensor.shape) if needed else None
             for tensor, needed in zip((vertices, colors, backgrounds), ctx.needs_input_grad, strict=False)
         ]
         scratch = empty_image(*shaded.shape[1:])

@@ -22,8 +22,8 @@ def empty_image(*shape: int) -> Tensor:
     return torch.from_numpy(_native.pooled_floats(count)).view(shape)
 
 
-def zeros_like(tensor: Tensor) -> Tensor:
-    """``torch.zeros_like`` for a contiguous float32 CPU tensor, from the pool and zeroed by the engine's threads."""
-    zeros = empty_image(*tensor.shape)
+def zeros_image(*shape: int) -> Tensor:
+    """Like ``empty_image``, zeroed by the engine's threads."""
+    zeros = empty_image(*shape)
     _native.zero_floats(zeros.data_ptr(), zeros.numel())
     return zeros

@@ -1,5 +1,6 @@
 """Differentiable triangle splatting (paper, section "Triangle Splatting"): the public call and its checks."""
 
+from functools import partial
 from typing import Literal
 
 import torch
@@ -19,6 +20,8 @@ from etsplat.core.validation import (
     check_positive,
     check_shape,
 )
+from etsplat.ops._rasterize_native import rasterize_native
+from etsplat.ops._rasterize_reference import rasterize_reference
 from etsplat.ops.engines import resolve_engine
 
 
@@ -125,12 +128,7 @@ def rasterize(
     _check_tensors(given, faces, look)
     if look:
         _check_values(given)
-    if chosen == "cpu":
-        from etsplat.ops._rasterize_cpu import rasterize_cpu as run
-    elif chosen == "cuda":
-        from etsplat.ops._rasterize_cuda import rasterize_cuda as run
-    else:
-        from etsplat.ops._rasterize_reference import rasterize_reference as run
+    run = rasterize_reference if chosen == "reference" else partial(rasterize_native, chosen)
     return run(vertices, faces, colors, corner_colors, opacities, sigma, viewmats, Ks, backgrounds, settings)
 
 

@@ -1,4 +1,4 @@
-"""The GPU engine's side of ``rasterize``: one autograd function around the launches of _raster_render_cuda.py."""
+"""The native engines' side of ``rasterize``: one autograd function around an engine's ``Render``."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -9,13 +9,16 @@ from torch.autograd.function import once_differentiable
 
 from etsplat.core.rasterization import Rasterization, RasterizeSettings
 from etsplat.cuda.launch import on_device_of
-from etsplat.ops._raster_render_cuda import Geometry, Outputs, Plan, Render, channel_count, contiguous
+from etsplat.ops._raster_plan import Geometry, Inputs, Outputs, PerInput, Plan, Render, channel_count, contiguous
+from etsplat.ops._raster_render_cpu import CpuRender
+from etsplat.ops._raster_render_cuda import CudaRender
 from etsplat.ops._rasterize_channels import Channels, corners_of, median_depth
 
-MOST_CHANNELS = 16  # of one pass; more are rendered in several
+_RENDERS: dict[str, type[Render]] = {"cpu": CpuRender, "cuda": CudaRender}
 
 
-def rasterize_cuda(
+def rasterize_native(
+    engine: str,
     vertices: Tensor,
     faces: Tensor | None,
     colors: Tensor | None,
@@ -27,19 +30,20 @@ def rasterize_cuda(
     backgrounds: Tensor | None,
     settings: RasterizeSettings,
 ) -> Rasterization:
-    """Render on the GPU; arguments as ``etsplat.rasterize`` has checked them."""
-    channels = Channels(colors, corner_colors, faces)
-    if settings.depth != "none" or settings.normals:
-        channels.add_geometry(corners_of(vertices, faces), viewmats, settings, "cuda")
-    backgrounds = channels.pad_backgrounds(backgrounds)
+    """Render with engine "cpu" or "cuda"; arguments as ``etsplat.rasterize`` has checked them."""
     geometry = Geometry(vertices, faces)
+    channels = Channels(colors, corner_colors, faces, geometry, engine)
+    if settings.depth != "none" or settings.normals:
+        channels.add_geometry(corners_of(vertices, faces), viewmats, settings, engine)
+    backgrounds = channels.pad_backgrounds(backgrounds)
+    render = _RENDERS[engine]
 
     def run(part: _Part, part_settings: RasterizeSettings) -> tuple[tuple[Tensor, ...], Plan]:
-        plan = Plan(part_settings, geometry, viewmats.shape[0])
-        inputs = (vertices, part.flat, part.corner, opacities, sigma, viewmats, Ks, part.backgrounds)
-        return _Rasterize.apply(*inputs, plan), plan
+        plan = Plan(render, part_settings, geometry, viewmats.shape[0])
+        inputs = Inputs(vertices, part.flat, part.corner, opacities, sigma, viewmats, Ks, part.backgrounds)
+        return _Rasterize.apply(plan, *inputs), plan
 
-    first, *rest = _parts(channels.flat, channels.corner, backgrounds)
+    first, *rest = _parts(channels.flat, channels.corner, backgrounds, render.most_channels)
     (color, alpha, distortion, median_triangle), plan = run(first, settings)
     if rest:
         plain = replace(settings, statistics=False, distortion=False, median_depth=False)
@@ -49,7 +53,7 @@ def rasterize_cuda(
         result.distortion = distortion
     if settings.median_depth:
         corners = corners_of(vertices, faces)
-        result.median_depth = median_depth(median_triangle, channels, corners, viewmats, Ks, "cuda")
+        result.median_depth = median_depth(median_triangle, channels, corners, viewmats, Ks, engine)
     channels.split(result)
     return result
 
@@ -63,10 +67,9 @@ class _Part:
     backgrounds: Tensor | None
 
 
-def _parts(flat: Tensor | None, corner: Tensor | None, backgrounds: Tensor | None) -> list[_Part]:
-    """All channels, or, where they are too many, parts of them that lie next to each other in the image."""
-    sizes = [0 if t is None else t.shape[-1] for t in (flat, corner)]
-    if sum(sizes) <= MOST_CHANNELS:
+def _parts(flat: Tensor | None, corner: Tensor | None, backgrounds: Tensor | None, most: int | None) -> list[_Part]:
+    """All channels, or, where they are more than ``most``, parts that lie next to each other in the image."""
+    if most is None or channel_count(flat) + channel_count(corner) <= most:
         return [_Part(flat, corner, backgrounds)]
     # A triangle with any channel that is not finite is to be left out of every part.
     finite = torch.ones((), dtype=torch.bool, device=(flat if flat is not None else corner).device)  # type: ignore[union-attr]
@@ -74,8 +77,8 @@ def _parts(flat: Tensor | None, corner: Tensor | None, backgrounds: Tensor | Non
         finite = finite if channels is None else finite & channels.isfinite().all(dim=dims)
     parts, at = [], 0
     for channels, mask in ((flat, finite[..., None]), (corner, finite[..., None, None])):
-        for begin in range(0, channel_count(channels), MOST_CHANNELS):
-            chosen = torch.where(mask, channels[..., begin : begin + MOST_CHANNELS], torch.nan)  # type: ignore[index]
+        for begin in range(0, channel_count(channels), most):
+            chosen = torch.where(mask, channels[..., begin : begin + most], torch.nan)  # type: ignore[index]
             behind = None if backgrounds is None else backgrounds[:, at : at + chosen.shape[-1]]
             parts.append(_Part(chosen, None, behind) if channels is flat else _Part(None, chosen, behind))
             at += chosen.shape[-1]
@@ -86,24 +89,13 @@ class _Rasterize(torch.autograd.Function):
     """(colour of all channels, alpha, distortion, median triangle); the latter two are empty unless asked for."""
 
     @staticmethod
-    def forward(  # type: ignore[override]
-        ctx: Any,
-        vertices: Tensor,
-        flat: Tensor | None,
-        corner: Tensor | None,
-        opacities: Tensor,
-        sigma: Tensor,
-        viewmats: Tensor,
-        Ks: Tensor,
-        backgrounds: Tensor | None,
-        plan: Plan,
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        inputs = [contiguous(t) for t in (vertices, flat, corner, opacities, sigma, viewmats, Ks, backgrounds)]
+    def forward(ctx: Any, plan: Plan, *tensors: Tensor | None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        inputs = Inputs(*map(contiguous, tensors))  # type: ignore[arg-type]
         outputs = Outputs(plan, inputs)
-        ctx.render = Render(plan, inputs, outputs, keep=any(ctx.needs_input_grad))
-        with on_device_of(vertices):
-            ctx.render.forward()
+        with on_device_of(inputs.vertices):
+            ctx.render = plan.render(plan, inputs, outputs, keep=any(ctx.needs_input_grad))
         plan.statistics = outputs.statistics
+        # The images, too, since a render may hold their addresses.
         ctx.save_for_backward(*inputs, outputs.color, outputs.alpha, outputs.distortion)
         ctx.mark_non_differentiable(outputs.median_triangle)
         ctx.set_materialize_grads(False)
@@ -114,7 +106,8 @@ class _Rasterize(torch.autograd.Function):
     def backward(  # pyright: ignore[reportIncompatibleMethodOverride] -- once_differentiable hides the name
         ctx: Any, *cotangents: Tensor | None
     ) -> tuple[Tensor | None, ...]:
-        *inputs, _, _, _ = ctx.saved_tensors
-        with on_device_of(inputs[0]):
-            grads = ctx.render.backward(inputs, [contiguous(g) for g in cotangents[:3]], ctx.needs_input_grad)
-        return (*grads, None)
+        inputs = Inputs(*ctx.saved_tensors[: len(Inputs._fields)])
+        color, alpha, distortion, _ = map(contiguous, cotangents)
+        with on_device_of(inputs.vertices):
+            grads = ctx.render.backward(inputs, (color, alpha, distortion), PerInput(*ctx.needs_input_grad[1:]))
+        return (None, *grads)

@@ -1,0 +1,103 @@
+"""The rasterizer's calls of csrc/cpu/raster.cpp: one for each view of a batch."""
+
+from typing import Any
+
+from torch import Tensor
+
+from etsplat import _native
+from etsplat.core.kernels import DISTANCES, KERNELS
+from etsplat.core.rasterization import DISTORTION_FAR, DISTORTION_NEAR
+from etsplat.ops._raster_plan import Inputs, Outputs, PerInput, Plan
+from etsplat.ops.pool import zeros_image
+
+
+class CpuRender:
+    """One forward pass: a native state for each view."""
+
+    most_channels: int | None = None
+
+    def __init__(self, plan: Plan, inputs: Inputs, outputs: Outputs, keep: bool) -> None:
+        self.geometry = plan.geometry
+        self.color_shape = outputs.color.shape
+        self.totals = outputs.distortion_totals  # the states refer to it by address
+        self.states = [_native.raster_forward(_call(b, inputs, outputs, plan, keep)) for b in range(plan.views)]
+
+    def backward(
+        self, inputs: Inputs, cotangents: tuple[Tensor | None, Tensor | None, Tensor | None], needed: PerInput
+    ) -> PerInput:
+        """See ``Render``."""
+        grad_color, grad_alpha, grad_distortion = cotangents
+        if grad_color is None:
+            grad_color = zeros_image(*self.color_shape)
+        grads = PerInput(*map(_zeros, inputs, needed._replace(Ks=None)))  # Ks are not differentiated
+        for b, state in enumerate(self.states):
+            call = _native.RasterGradients()
+            call.grad_color = _address(grad_color, b)
+            call.grad_alpha = _address(grad_alpha, b)
+            call.grad_distortion = _address(grad_distortion, b)
+            call.corner_offsets = _address(self.geometry.corner_offsets)
+            call.corner_indices = _address(self.geometry.corner_indices)
+            call.vertices = _address(grads.vertices)
+            call.flat_colors = _address(grads.flat, b if inputs.flat_per_view else None)
+            call.corner_colors = _address(grads.corner, b if inputs.corner_per_view else None)
+            call.opacities = _address(grads.opacities)
+            call.sigmas = _address(grads.sigma)
+            call.viewmat = _address(grads.viewmats, b)
+            call.background = _address(grads.backgrounds, b)
+            _native.raster_backward(state, call)
+        return grads
+
+
+def _call(b: int, inputs: Inputs, outputs: Outputs, plan: Plan, keep: bool) -> Any:
+    settings, geometry = plan.settings, plan.geometry
+    call = _native.RasterCall()
+    call.vertices = _address(inputs.vertices)
+    call.faces = _address(geometry.faces)
+    call.num_triangles = geometry.count
+    call.num_vertices = geometry.vertex_count
+    call.flat_colors = _address(inputs.flat, b if inputs.flat_per_view else None)
+    call.corner_colors = _address(inputs.corner, b if inputs.corner_per_view else None)
+    call.flat_channels, call.corner_channels = inputs.channels
+    call.opacities = _address(inputs.opacities)
+    call.sigmas = _address(inputs.sigma)
+    call.shared_sigma = inputs.sigma.dim() == 0
+    call.viewmat = _address(inputs.viewmats, b)
+    call.K = _address(inputs.Ks, b)
+    call.background = _address(inputs.backgrounds, b)
+    call.width = settings.width
+    call.height = settings.height
+    call.kernel = list(KERNELS).index(settings.kernel)
+    call.distance = DISTANCES.index(settings.distance)
+    call.freeze_incentre = settings.freeze_incentre
+    call.near_plane = settings.near_plane
+    call.alpha_min, call.alpha_max, call.x_max, call.transmittance_min = settings.cutoffs
+    call.distortion_near = DISTORTION_NEAR
+    call.distortion_far = DISTORTION_FAR
+    call.centroid_depth = settings.depth == "centroid"
+    call.keep_for_backward = keep
+    call.color = _address(outputs.color, b)
+    call.alpha = _address(outputs.alpha, b)
+    if settings.distortion:
+        call.distortion = _address(outputs.distortion, b)
+        call.distortion_totals = _address(outputs.distortion_totals, b)
+    if settings.median_depth:
+        call.median_triangle = _address(outputs.median_triangle, b)
+    if outputs.statistics is not None:
+        call.max_weight = _address(outputs.statistics.max_weight, b)
+        call.screen_size = _address(outputs.statistics.screen_size, b)
+        call.inradius = _address(outputs.statistics.inradius, b)
+        call.visible = _address(outputs.statistics.visible, b)
+    return call
+
+
+def _zeros(tensor: Tensor | None, needed: Any) -> Any:
+    return zeros_image(*tensor.shape) if needed and tensor is not None else None
+
+
+def _address(tensor: Tensor | None, index: int | None = None) -> int:
+    """Address of a contiguous tensor, or of its ``index``-th row; 0 for None."""
+    if tensor is None:
+        return 0
+    if index is None:
+        return tensor.data_ptr()
+    return tensor.data_ptr() + index * tensor.stride(0) * tensor.element_size()
