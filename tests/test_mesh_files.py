@@ -39,6 +39,19 @@ def test_ply_returns_the_same_mesh_and_8_bit_face_colours_exactly(tmp_path, ball
     assert mesh.notes == ()
 
 
+def test_ply_with_face_colours_has_their_means_at_vertices_for_programs_that_read_no_others(tmp_path, ball):
+    """trimesh, like Blender and Open3D, shows colours of vertices where a file has both."""
+    vertices, faces, colors = ball
+    save_mesh(tmp_path / "a.ply", vertices, faces, colors)
+    shown = trimesh.load_mesh(str(tmp_path / "a.ply"), process=False).visual
+    assert shown.kind == "vertex"
+    touches = (faces == 7).any(dim=1)
+    corners = vertices[faces]
+    area = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).norm(dim=1)
+    expected = (colors * area[:, None])[touches].sum(0) / area[touches].sum()
+    np.testing.assert_allclose(shown.vertex_colors[7, :3] / 255, expected, atol=0.6 / 255)
+
+
 @pytest.mark.parametrize("suffix", [".obj", ".glb"])
 def test_welded_export_keeps_connectivity_and_averages_colours_by_area(tmp_path, ball, suffix):
     vertices, faces, colors = ball

@@ -16,7 +16,7 @@ _FILES = (
     ("report.html", "everything on one page"),
     ("overview.png", "test views: truth, render, and as opaque triangles"),
     ("soup.safetensors", "the soup: etsplat view, render, export and eval take its folder"),
-    ("mesh.glb", "the mesh for viewers (also mesh.obj; mesh.ply has exact face colours)"),
+    ("mesh.glb", "the mesh for viewers (also mesh.obj and mesh.ply)"),
     ("metrics.json", "the numbers above and more"),
 )
 

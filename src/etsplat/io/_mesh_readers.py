@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 from trimesh.visual import ColorVisuals
+from trimesh.visual.color import to_rgba
 
 from etsplat.core.errors import InputError
 from etsplat.io.srgb import srgb_from_linear
@@ -14,7 +15,10 @@ from etsplat.io.srgb import srgb_from_linear
 
 @dataclass
 class RawMesh:
-    """What a file says, unchecked: arrays of any dtype; colours (·, 3) in [0, 1] as displayed, or None."""
+    """What a file says, unchecked: arrays of any dtype; colours (·, 3) in [0, 1] as displayed, or None.
+
+    A file with colours of both kinds gives those of its faces: the others are often means of them.
+    """
 
     vertices: np.ndarray
     faces: np.ndarray
@@ -89,7 +93,7 @@ def _read_with_trimesh(path: Path) -> RawMesh:
     """All meshes of the file in one, vertices and faces as stored."""
     # trimesh's readers signal damage with whatever their parsing runs into, missing optional modules included.
     try:
-        scene = trimesh.load_scene(str(path), process=False, prefer_color="face", skip_materials=True)
+        scene = trimesh.load_scene(str(path), process=False, skip_materials=True)
         parts = [_placed(scene, node) for node in scene.graph.nodes_geometry]
     except Exception as error:
         detail = (str(error) or type(error).__name__).splitlines()[0]
@@ -111,12 +115,23 @@ def _placed(scene: trimesh.Scene, node: str) -> RawMesh:
     visual = geometry.visual
     if not isinstance(visual, ColorVisuals):  # a texture
         return RawMesh(vertices, np.asarray(geometry.faces))
+    face_colors = np.asarray(visual.face_colors)[:, :3] / 255 if visual.kind == "face" else _ply_face_colors(geometry)
+    per_vertex = visual.kind == "vertex" and face_colors is None
     return RawMesh(
         vertices,
         np.asarray(geometry.faces),
-        face_colors=np.asarray(visual.face_colors)[:, :3] / 255 if visual.kind == "face" else None,
-        vertex_colors=np.asarray(visual.vertex_colors)[:, :3] / 255 if visual.kind == "vertex" else None,
+        face_colors=face_colors,
+        vertex_colors=np.asarray(visual.vertex_colors)[:, :3] / 255 if per_vertex else None,
     )
+
+
+def _ply_face_colors(mesh: trimesh.Trimesh) -> np.ndarray | None:
+    """The colours that trimesh forgets where vertices have some too."""
+    element = mesh.metadata.get("_ply_raw", {}).get("face", {})
+    channels = [element["data"][name] for name in ("red", "green", "blue") if name in element.get("properties", {})]
+    if len(channels) < 3 or len(channels[0]) != len(mesh.faces):
+        return None
+    return to_rgba(np.column_stack(channels))[:, :3] / 255
 
 
 def _concatenated(parts: list[RawMesh]) -> RawMesh:

@@ -2,12 +2,13 @@
 
 import json
 import struct
-from collections.abc import Callable
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from etsplat.io.ply_tables import CORNERS, encode_ply
 from etsplat.io.srgb import linear_from_srgb
 
 Colors = np.ndarray | None
@@ -16,36 +17,37 @@ OPAQUE_ALPHA = 0.99
 """Faces of GLB files with this alpha or more do not blend."""
 
 
-def write_ply(path: Path, vertices: np.ndarray, faces: np.ndarray, face_colors: Colors, vertex_colors: Colors) -> None:
-    """Binary little-endian PLY; colours (F, 3) or (V, 3) in [0, 1] are stored in 8 bits."""
-    rgb = "property uchar red\nproperty uchar green\nproperty uchar blue\n"
-    header = (
-        "ply\nformat binary_little_endian 1.0\n"
-        f"element vertex {len(vertices)}\nproperty float x\nproperty float y\nproperty float z\n"
-        f"{'' if vertex_colors is None else rgb}"
-        f"element face {len(faces)}\nproperty list uchar int vertex_indices\n"
-        f"{'' if face_colors is None else rgb}end_header\n"
-    )
-    points = _ply_rows({"position": ("<f4", vertices)}, vertex_colors)
-    triangles = _ply_rows({"count": ("u1", np.full((len(faces), 1), 3)), "indices": ("<i4", faces)}, face_colors)
-    path.write_bytes(header.encode() + points + triangles)
+def write_ply(
+    path: Path,
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    vertex_colors: Colors,
+    face_colors: Colors,
+    numbers: Mapping[str, np.ndarray] | None = None,
+    comment: str | None = None,
+) -> None:
+    """Binary PLY; colours (V, 3|4) and (F, 3|4) have 8 bits. `numbers` are further values per face, by name."""
+    vertex = np.empty(len(vertices), [("x", "f4"), ("y", "f4"), ("z", "f4"), *_color_fields(vertex_colors)])
+    for axis, values in zip("xyz", vertices.T, strict=True):
+        vertex[axis] = values
+    extra = [(name, "f4") for name in numbers or {}]
+    face = np.empty(len(faces), [(CORNERS, "i4", (3,)), *_color_fields(face_colors), *extra])
+    face[CORNERS] = faces
+    for name, values in (numbers or {}).items():
+        face[name] = values
+    for table, colors in ((vertex, vertex_colors), (face, face_colors)):
+        for (name, _), values in zip(_color_fields(colors), () if colors is None else colors.T, strict=True):
+            table[name] = np.floor(values * 255 + 0.5)
+    path.write_bytes(encode_ply({"vertex": vertex, "face": face}, comment))
 
 
-def _ply_rows(columns: dict[str, tuple[str, np.ndarray]], colors: Colors) -> bytes:
-    """An element of a binary PLY: (type, values (N, k)) side by side, colours last."""
-    if colors is not None:
-        columns = {**columns, "rgb": ("u1", np.floor(colors * 255 + 0.5))}
-    count = len(next(iter(columns.values()))[1])
-    rows = np.empty(count, dtype=[(name, kind, values.shape[1]) for name, (kind, values) in columns.items()])
-    for name, (_, values) in columns.items():
-        rows[name] = values
-    return rows.tobytes()
+def _color_fields(colors: Colors) -> list[tuple[str, str]]:
+    return [] if colors is None else [(name, "u1") for name in ("red", "green", "blue", "alpha")[: colors.shape[1]]]
 
 
-def write_obj(path: Path, vertices: np.ndarray, faces: np.ndarray, face_colors: Colors, vertex_colors: Colors) -> None:
-    """Wavefront OBJ; vertex colours follow the coordinates, the extension that MeshLab and Blender read."""
-    assert face_colors is None, "OBJ has no colours per face"
-    rows = vertices if vertex_colors is None else np.hstack([vertices, vertex_colors.astype(np.float32)])
+def write_obj(path: Path, vertices: np.ndarray, faces: np.ndarray, colors: Colors) -> None:
+    """Wavefront OBJ; colours (V, 3) follow the coordinates, the extension that MeshLab and Blender read."""
+    rows = vertices if colors is None else np.hstack([vertices, colors.astype(np.float32)])
     line = "v " + " ".join(["%.9g"] * 3 + ["%.6g"] * (rows.shape[1] - 3))
     with open(path, "w", encoding="ascii", newline="\n") as file:
         np.savetxt(file, rows, fmt=line)
@@ -63,14 +65,12 @@ def write_off(path: Path, vertices: np.ndarray, faces: np.ndarray, colors: Color
         np.savetxt(file, rows, fmt="%d")
 
 
-def write_glb(path: Path, vertices: np.ndarray, faces: np.ndarray, face_colors: Colors, vertex_colors: Colors) -> None:
-    """Binary glTF 2.0. Vertex colours, display values, become linear COLOR_0 under an unlit material.
+def write_glb(path: Path, vertices: np.ndarray, faces: np.ndarray, colors: Colors) -> None:
+    """Binary glTF 2.0. Colours of vertices, display values, become linear COLOR_0 under an unlit material.
 
     With (V, 4) the last channel is alpha. Faces with all corners above `OPAQUE_ALPHA` are a primitive of their own and
     stay opaque: viewers sort what blends by mesh at best, and do not let it hide anything.
     """
-    assert face_colors is None, "glTF has no colours per face"
-    colors = vertex_colors
     parts = [(faces, "OPAQUE")]
     if colors is not None and colors.shape[1] == 4:
         solid = (colors[:, 3] >= OPAQUE_ALPHA)[faces].all(axis=1)
@@ -122,11 +122,3 @@ def _gltf_material(mode: str, *, unlit: bool) -> dict[str, Any]:
         "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0},
     }
     return {**material, "extensions": {"KHR_materials_unlit": {}}} if unlit else material
-
-
-WRITERS: dict[str, Callable[[Path, np.ndarray, np.ndarray, Colors, Colors], None]] = {
-    ".ply": write_ply,
-    ".obj": write_obj,
-    ".glb": write_glb,
-}
-"""Writers by suffix: (path, vertices (V, 3) float32, faces (F, 3), colours per face (PLY alone), per vertex)."""

@@ -10,8 +10,11 @@ from torch import Tensor
 
 from etsplat.core.errors import InputError
 from etsplat.io._mesh_readers import READERS, RawMesh
-from etsplat.io._mesh_writers import WRITERS
+from etsplat.io._mesh_writers import write_glb, write_obj, write_ply
 from etsplat.io.atomic import atomic_write
+
+MESH_SUFFIXES = (".ply", ".obj", ".glb")
+"""Kinds of files that `save_mesh` writes."""
 
 
 @dataclass(frozen=True)
@@ -74,8 +77,8 @@ def save_mesh(
 ) -> None:
     """Write a triangle mesh with colours per face or per vertex. Atomic.
 
-    PLY holds either. OBJ and GLB know only colours per vertex: for colours per face the welded mesh gets at each vertex
-    the area-weighted mean of its faces' colours, with `split` no vertex is shared and each face keeps its exact colour.
+    Of colours per face, each vertex gets the area-weighted mean of its faces'; with `split` no vertex is shared, and so
+    its face's exact colour. OBJ and GLB know no others, and many programs read no others from PLY, which has both.
     Colours are display values (sRGB) in PLY and OBJ; glTF wants linear light, so GLB is converted, and its material is
     unlit: a viewer shows the colours of the render.
 
@@ -85,7 +88,7 @@ def save_mesh(
         faces: indices into `vertices`.
         face_colors: display values in [0, 1] (others are clamped); at most one of the two kinds of colours.
         vertex_colors: the same for vertices.
-        split: unshare all vertices. In PLY this changes the connectivity only.
+        split: unshare all vertices.
 
     Raises:
         ValueError: wrong shapes, indices out of range, or values that are not finite.
@@ -93,8 +96,8 @@ def save_mesh(
     """
     path = Path(path)
     suffix = path.suffix.lower()
-    if suffix not in WRITERS:
-        raise ValueError(f"path: expected one of the suffixes {', '.join(WRITERS)}, got {path.name}")
+    if suffix not in MESH_SUFFIXES:
+        raise ValueError(f"path: expected one of the suffixes {', '.join(MESH_SUFFIXES)}, got {path.name}")
     _check_arguments(vertices, faces, face_colors, vertex_colors)
     v = vertices.detach().to("cpu", torch.float64).numpy()
     f = faces.detach().to("cpu", torch.int64).numpy()
@@ -102,10 +105,16 @@ def save_mesh(
     if split:
         per_vertex = None if per_vertex is None else per_vertex[f].reshape(-1, 3)
         v, f = v[f].reshape(-1, 3), np.arange(f.size).reshape(-1, 3)
-    if per_face is not None and suffix != ".ply":
-        per_face, per_vertex = None, np.repeat(per_face, 3, axis=0) if split else _vertex_means(v, f, per_face)
+    if per_face is not None:
+        per_vertex = np.repeat(per_face, 3, axis=0) if split else _vertex_means(v, f, per_face)
+    v = v.astype(np.float32)
     with atomic_write(path) as temporary:
-        WRITERS[suffix](temporary, v.astype(np.float32), f, per_face, per_vertex)
+        if suffix == ".ply":
+            write_ply(temporary, v, f, per_vertex, per_face)
+        elif suffix == ".obj":
+            write_obj(temporary, v, f, per_vertex)
+        else:
+            write_glb(temporary, v, f, per_vertex)
 
 
 def weld_vertices(mesh: MeshFile) -> MeshFile:

@@ -35,8 +35,8 @@ checkpoints/    where an interrupted run continues with --resume; safe to delete
 
 _RESULTS = {
     "reconstruct": """\
-mesh.ply        the result with exact face colours
-mesh.obj        the same with vertex colours (also mesh.glb, which most viewers open)""",
+mesh.glb        the result, for viewers
+mesh.obj, .ply  the same; where the colours are those of faces, mesh.ply has them exactly, the others means at vertices""",
     "train": """\
 soup.safetensors  the result: triangles with opacity, softness and view-dependent colour; etsplat export converts it""",
 }

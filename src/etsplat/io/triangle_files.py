@@ -7,9 +7,8 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
-from etsplat.io._mesh_writers import write_glb, write_obj, write_off
+from etsplat.io._mesh_writers import write_glb, write_obj, write_off, write_ply
 from etsplat.io.atomic import atomic_write
-from etsplat.io.ply_tables import CORNERS, encode_ply
 
 TRIANGLE_SUFFIXES = (".ply", ".obj", ".off", ".glb")
 
@@ -59,11 +58,11 @@ def save_triangles(
     with atomic_write(path) as temporary:
         if suffix == ".ply":
             extra = {name: value.detach().cpu().numpy() for name, value in (numbers or {}).items()}
-            temporary.write_bytes(_ply(points, faces, point_colors, face_colors, extra, comment))
+            write_ply(temporary, points, faces, point_colors, face_colors, extra, comment)
         elif suffix == ".obj":
-            write_obj(temporary, points, faces, None, point_colors[:, :3])
+            write_obj(temporary, points, faces, point_colors[:, :3])
         else:
-            write_glb(temporary, points, faces, None, point_colors)
+            write_glb(temporary, points, faces, point_colors)
 
 
 def _indexed(
@@ -79,26 +78,3 @@ def _indexed(
     rank[order] = np.arange(len(order))
     kept = first[order]
     return corners[kept], rank[inverse.reshape(-1)].reshape(-1, 3), None if colors is None else colors[kept]
-
-
-def _ply(
-    points: np.ndarray,
-    faces: np.ndarray,
-    point_colors: np.ndarray,
-    face_colors: np.ndarray,
-    numbers: Mapping[str, np.ndarray],
-    comment: str | None,
-) -> bytes:
-    channels = ("red", "green", "blue", "alpha")[: face_colors.shape[1]]
-    byte_fields = [(name, "u1") for name in channels]
-    vertex = np.empty(len(points), [("x", "f4"), ("y", "f4"), ("z", "f4"), *byte_fields])
-    face = np.empty(len(faces), [(CORNERS, "i4", (3,)), *byte_fields, *((name, "f4") for name in numbers)])
-    for index, axis in enumerate("xyz"):
-        vertex[axis] = points[:, index]
-    for index, name in enumerate(channels):
-        vertex[name] = np.floor(point_colors[:, index] * 255 + 0.5)
-        face[name] = np.floor(face_colors[:, index] * 255 + 0.5)
-    face[CORNERS] = faces
-    for name, values in numbers.items():
-        face[name] = values
-    return encode_ply({"vertex": vertex, "face": face}, comment)

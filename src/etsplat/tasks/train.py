@@ -14,7 +14,7 @@ from etsplat.core.errors import InputError
 from etsplat.io.memory import available_memory
 from etsplat.io.run_directory import RunDirectory, is_run
 from etsplat.ops.engines import num_threads, one_torch_thread, resolve_device, resolve_engine
-from etsplat.optim.loop import CheckpointEvent, LoopSettings, Progress
+from etsplat.optim.loop import CheckpointEvent, DivergedError, LoopSettings, Progress
 from etsplat.scene.captures import Capture, load_capture
 from etsplat.scene.demo_scene import HEIGHT, WIDTH, demo_scene
 from etsplat.scene.device_views import stay_on
@@ -128,7 +128,12 @@ def train(
     native = resolve_engine(config.engine, fitting.soup.vertices) == "cpu"
     settings = LoopSettings(config.iterations, config.log_every, config.evaluate_every, config.checkpoint_every)
     with one_torch_thread() if native else nullcontext():
-        progress = fit(fitting, run, settings, hash_record(record), keep)
+        try:
+            progress = fit(fitting, run, settings, hash_record(record), keep)
+        except DivergedError as error:
+            if doubt := _doubtful_scale(own, config):
+                raise DivergedError(f"{error}. But first: {doubt}") from error
+            raise
         return _finish(fitting, progress, run, scorer, capture, config)
 
 
@@ -208,13 +213,20 @@ def _check(capture: Capture, config: TrainConfig, device: torch.device) -> list[
         notes.append("the photos do not fit into memory: they are decoded anew whenever they are needed")
     if capture.exact_points is None:
         notes.append(f"no points in the capture: starting from {config.start_points:,} random ones")
-    low, high = USUAL_EXTENT
-    if not config.normalize and not low <= capture.extent <= high:
-        notes.append(
-            f"the cameras are spread over {capture.extent:.3g} units, far from what the learning rates are made for "
-            f"({low:g} to {high:g}): --normalize scales the scene"
-        )
+    if doubt := _doubtful_scale(capture, config):
+        notes.append(doubt)
     return notes
+
+
+def _doubtful_scale(capture: Capture, config: TrainConfig) -> str | None:
+    """What to do about a scene whose size the absolute settings were not made for, if it is one."""
+    low, high = USUAL_EXTENT
+    if config.normalize or low <= capture.extent <= high:
+        return None
+    return (
+        f"the cameras are spread over {capture.extent:.4g} units, and the settings are made for {low:g} to {high:g}: "
+        "start again with --normalize, which scales the scene"
+    )
 
 
 def _gib(count: int) -> str:
