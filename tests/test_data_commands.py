@@ -1,7 +1,6 @@
 """What `etsplat data sfm` and `etsplat data download` do."""
 
 import builtins
-import errno
 import math
 import shutil
 import zipfile
@@ -174,18 +173,30 @@ def test_lenses_that_programs_disagree_about_are_refused(tmp_path):
             undistort_scene(tmp_path / str(number), tmp_path / "new")
 
 
-def test_a_full_disk_while_undistorting_is_one_line_and_nothing_stays(tmp_path, monkeypatch):
-    pycolmap = pytest.importorskip("pycolmap")
-    write_colmap(tmp_path / "scene", [(64, 48)] * 3, model="SIMPLE_RADIAL", extra=(-0.1,))
+@pytest.fixture
+def file_size_limit():
+    """Makes the operating system refuse larger files, as a full disk refuses any; in new processes too."""
+    resource = pytest.importorskip("resource")
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    yield lambda size: resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
-    def full(*args, **kwargs):
-        raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(pycolmap, "undistort_images", full)
-    with pytest.raises(InputError, match=r"No space left on device; free some space") as raised:
+def test_a_disk_that_is_full_all_of_a_sudden_is_one_line_and_nothing_stays(tmp_path, file_size_limit):
+    """COLMAP ends its process where its database cannot grow, and so does libjpeg where an image cannot be written."""
+    pytest.importorskip("pycolmap")
+    for index in range(3):
+        write_photo(tmp_path / "photos" / f"{index}.png", 320, 240, seed=index)
+    write_colmap(tmp_path / "scene", [(640, 480)] * 3, model="SIMPLE_RADIAL", extra=(-0.1,))
+    file_size_limit(250_000)
+    with pytest.raises(InputError, match=r"COLMAP came to a sudden end \(exit status -6\)") as raised:
+        find_cameras(tmp_path / "photos", tmp_path / "new", threads=1)
+    assert "\n" not in str(raised.value)
+    file_size_limit(8_000)
+    with pytest.raises(InputError, match=r"the disk full|sudden end") as raised:
         undistort_scene(tmp_path / "scene", tmp_path / "new")
     assert "\n" not in str(raised.value)
-    assert [path.name for path in tmp_path.iterdir()] == ["scene"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["photos", "scene"]
 
 
 @pytest.fixture

@@ -36,7 +36,7 @@ checkpoints/    where an interrupted run continues with --resume; safe to delete
 _RESULTS = {
     "reconstruct": """\
 mesh.glb        the result, for viewers
-mesh.obj, .ply  the same; where the colours are those of faces, mesh.ply has them exactly, the others means at vertices""",
+mesh.obj, .ply  the same; colours of faces are exact in mesh.ply, and means at the vertices in all three""",
     "train": """\
 soup.safetensors  the result: triangles with opacity, softness and view-dependent colour; etsplat export converts it""",
 }

@@ -14,6 +14,7 @@ from etsplat.core.errors import InputError
 from etsplat.io.atomic import write_error
 from etsplat.io.images import image_size, load_pixels
 from etsplat.scene.colmap import find_model
+from etsplat.scene.colmap_process import import_pycolmap, run_apart, undistort_images
 from etsplat.scene.frames import find_mask, scaled_intrinsics
 from etsplat.scene.transforms import DistortedFrames, read_distorted_transforms
 
@@ -55,21 +56,20 @@ def undistort_scene(scene: Path | str, out: Path | str, *, max_size: int = 1600)
             raise InputError(f"image {photo}: has transparency, which would be lost; put it into {scene}/masks")
     check_space(out, [*(photos / name for name in names), *masks.values(), *masks.values()])
     with working_folder(out) as work:
-        undistort_model(pycolmap, model, photos, names, work, max_size)
+        undistort_model(model, photos, names, work, max_size)
         if masks:
-            _undistort_masks(pycolmap, model, scene, masks, work, max_size)
+            _undistort_masks(model, masks, work, max_size)
         os.replace(work / "scene", out)
     return names
 
 
-def undistort_model(pycolmap: Any, model: Any, photos: Path, names: list[str], work: Path, max_size: int) -> None:
+def undistort_model(model: Any, photos: Path, names: list[str], work: Path, max_size: int) -> None:
     """Writes images/ and sparse/0/ of a model's images into WORK/scene."""
     shutil.rmtree(work / "model", ignore_errors=True)
     (work / "model").mkdir()
     model.write(work / "model")
-    options = pycolmap.UndistortCameraOptions(max_image_size=max_size)
     scene = work / "scene"
-    pycolmap.undistort_images(scene, work / "model", photos, names, undistort_options=options)
+    run_apart(work, undistort_images, work / "model", photos, names, scene, max_size)
     # Left of what COLMAP writes for its dense reconstruction are images/ and sparse/0/.
     for entry in scene.iterdir():
         if entry.name == "stereo":
@@ -97,7 +97,7 @@ def check_new(out: Path) -> None:
 def check_space(out: Path, images: Sequence[Path], more: int = 0) -> None:
     """Raises InputError if images without distortion and `more` bytes may not fit beside `out`.
 
-    COLMAP ends the whole process when it finds the disk full, so it must not come to that.
+    COLMAP does not say what failed when it finds the disk full, so it should not come to that.
     """
     needed = more + _SPARE_BYTES + _GROWTH * sum(image.stat().st_size for image in images)
     free = shutil.disk_usage(out.parent).free
@@ -121,22 +121,6 @@ def working_folder(out: Path) -> Iterator[Path]:
             raise
         detail = (str(error) or type(error).__name__).splitlines()[0]
         raise InputError(f"{out}: COLMAP failed ({detail}); is the disk full?") from error
-
-
-def import_pycolmap() -> Any:
-    """The module, told to be quiet.
-
-    Raises:
-        InputError: it is not installed.
-    """
-    try:
-        import pycolmap
-    except ImportError as error:
-        raise InputError(
-            "structure from motion and undistortion need pycolmap: pip install 'etsplat[sfm]' (or use COLMAP itself)"
-        ) from error
-    pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
-    return pycolmap
 
 
 def _read_model(pycolmap: Any, scene: Path, folder: Path) -> tuple[Any, Path, dict[str, Path]]:
@@ -172,7 +156,7 @@ def _make_model(pycolmap: Any, frames: DistortedFrames) -> Any:
     return model
 
 
-def _undistort_masks(pycolmap: Any, model: Any, scene: Path, masks: dict[str, Path], work: Path, max_size: int) -> None:
+def _undistort_masks(model: Any, masks: dict[str, Path], work: Path, max_size: int) -> None:
     """Masks go the way of the images, under their names, into WORK/scene/masks."""
     (work / "images").mkdir()
     (work / "scene").rename(work / "whole")
@@ -184,7 +168,7 @@ def _undistort_masks(pycolmap: Any, model: Any, scene: Path, masks: dict[str, Pa
         copy.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(mask, copy)
         image.name = named[image.name]
-    undistort_model(pycolmap, model, work / "images", sorted(named.values()), work, max_size)
+    undistort_model(model, work / "images", sorted(named.values()), work, max_size)
     (work / "scene" / "images").rename(work / "whole" / "masks")
     shutil.rmtree(work / "scene")
     (work / "whole").rename(work / "scene")
