@@ -231,12 +231,16 @@ _QUICK: dict[str, Any] = {
     "lr_sigma": 0.005,
     "prune_importance": 0.005,
     "prune_views": 0,
+    "lambda_opacity": 0.02,
     "lambda_normal": 0.0,
     "lambda_distortion": 0.0,
     "lambda_size": 0.0,
     "evaluate_every": 500,
     "checkpoint_every": 500,
 }
+
+_QUICK_OBJECT: dict[str, Any] = {"lr_vertices": 0.001, "lambda_opacity": 0.0044}
+"""An object is small in the frame that its cameras span: at the rate of rooms its triangles never come to rest."""
 
 _PRESETS: dict[str, dict[str, Any]] = {
     "paper": {},
@@ -274,4 +278,6 @@ def train_settings(preset: str = "quick", scene_type: str = "outdoor") -> TrainC
         if name not in known:
             raise InputError(f"{option}: is {name!r}; choose one of {', '.join(known)}")
     chosen = {**_SCENE_TYPES[scene_type], **_PRESETS[preset], "preset": preset, "scene_type": scene_type}
+    if preset != "paper" and scene_type == "object":
+        chosen |= _QUICK_OBJECT
     return replace(TrainConfig(), **chosen)
