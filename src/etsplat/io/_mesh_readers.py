@@ -1,16 +1,20 @@
-"""Mesh readers by suffix. OBJ has its own (it keeps the file's connectivity); the others go through trimesh."""
+"""Mesh readers by suffix. OBJ has its own (it keeps the file's connectivity); the others go through trimesh.
+
+trimesh is imported where it is used: it takes half a second, which runs without such files need not wait for.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import trimesh
-from trimesh.visual import ColorVisuals
-from trimesh.visual.color import to_rgba
 
 from etsplat.core.errors import InputError
 from etsplat.io.srgb import srgb_from_linear
+
+if TYPE_CHECKING:
+    import trimesh
 
 
 @dataclass
@@ -91,6 +95,8 @@ def read_gltf(path: Path) -> RawMesh:
 
 def _read_with_trimesh(path: Path) -> RawMesh:
     """All meshes of the file in one, vertices and faces as stored."""
+    import trimesh
+
     # trimesh's readers signal damage with whatever their parsing runs into, missing optional modules included.
     try:
         scene = trimesh.load_scene(str(path), process=False, skip_materials=True)
@@ -106,7 +112,10 @@ def _read_with_trimesh(path: Path) -> RawMesh:
     return _concatenated(parts)
 
 
-def _placed(scene: trimesh.Scene, node: str) -> RawMesh:
+def _placed(scene: "trimesh.Scene", node: str) -> RawMesh:
+    import trimesh
+    from trimesh.visual import ColorVisuals
+
     transform, name = scene.graph[node]
     geometry = scene.geometry[name]
     vertices = trimesh.transform_points(geometry.vertices, transform)
@@ -125,8 +134,10 @@ def _placed(scene: trimesh.Scene, node: str) -> RawMesh:
     )
 
 
-def _ply_face_colors(mesh: trimesh.Trimesh) -> np.ndarray | None:
+def _ply_face_colors(mesh: "trimesh.Trimesh") -> np.ndarray | None:
     """The colours that trimesh forgets where vertices have some too."""
+    from trimesh.visual.color import to_rgba
+
     element = mesh.metadata.get("_ply_raw", {}).get("face", {})
     channels = [element["data"][name] for name in ("red", "green", "blue") if name in element.get("properties", {})]
     if len(channels) < 3 or len(channels[0]) != len(mesh.faces):
