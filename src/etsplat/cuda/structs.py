@@ -11,18 +11,19 @@ _TYPES = {
     "float": ctypes.c_float,
     "int": ctypes.c_int32,
     "unsigned": ctypes.c_uint32,
+    "long long": ctypes.c_int64,
 }
-_MEMBERS = re.compile(r"^(?:const )?(float|double|int|unsigned char|unsigned long long|long long|unsigned)\b(.+);$")
+_MEMBERS = re.compile(r"^(?:const )?(.+?) ?(\*? ?\w+(?:, \*?\w+)*);$")  # a type, and names with their stars
 
 
 @cache
-def struct_class(header: str, name: str) -> Any:
-    """A ctypes.Structure with the members of ``struct name`` in csrc/``header``.
+def struct_class(file: str, name: str) -> Any:
+    """A ctypes.Structure with the members of ``struct name`` in csrc/``file``.
 
-    The struct holds pointers, int, unsigned and float, declared on one line per type. Pointers are addresses here, 0 at
-    first like everything else.
+    The struct holds pointers, numbers and other structs of the file, one type a line. Pointers are addresses here, 0
+    at first like everything else.
     """
-    text = (source_root() / header).read_text(encoding="utf-8")
+    text = (source_root() / file).read_text(encoding="utf-8")
     body = text.split(f"struct {name} {{\n", 1)[1].split("\n};", 1)[0]
     fields: list[tuple[str, Any]] = []
     for line in body.splitlines():
@@ -30,8 +31,11 @@ def struct_class(header: str, name: str) -> Any:
         if not code:
             continue
         match = _MEMBERS.match(code)
-        assert match, f"{header}: not understood: {line}"
+        assert match, f"{file}: not understood: {line}"
         for member in match[2].split(","):
-            pointer = "*" in member
-            fields.append((member.replace("*", "").strip(), ctypes.c_void_p if pointer else _TYPES[match[1]]))
+            if "*" in member:
+                kind = ctypes.c_void_p
+            else:
+                kind = _TYPES[match[1]] if match[1] in _TYPES else struct_class(file, match[1])
+            fields.append((member.strip(" *"), kind))
     return type(name, (ctypes.Structure,), {"_fields_": fields})

@@ -9,6 +9,7 @@ from torch.autograd.function import once_differentiable
 
 from etsplat.cuda.launch import blocks, launch
 from etsplat.cuda.program import Program
+from etsplat.cuda.structs import struct_class
 
 if TYPE_CHECKING:
     from etsplat.ops.mesh_energies import MeshConnectivity
@@ -17,24 +18,6 @@ if TYPE_CHECKING:
 _PROGRAM = Program("antialias.cu", contract=False)
 _THREADS = 256
 _POINT = 3  # 64-bit words
-
-
-class _View(ctypes.Structure):
-    _fields_ = (
-        *((n, ctypes.c_void_p) for n in ("vertices", "viewmat", "K", "barycentrics", "depth", "colors", "background")),
-        *((n, ctypes.c_void_p) for n in ("faces", "pair_offsets", "paired_faces", "triangle")),
-        *((n, ctypes.c_int64) for n in ("num_vertices", "num_faces")),
-        *((n, ctypes.c_int) for n in ("width", "height", "channels", "per_face")),
-        ("near_plane", ctypes.c_float),
-    )
-
-
-class _Scene(ctypes.Structure):
-    _fields_ = (("view", _View), ("points", ctypes.c_void_p), ("silhouettes", ctypes.c_void_p))
-
-
-class _Targets(ctypes.Structure):
-    _fields_ = tuple((name, ctypes.c_void_p) for name in ("vertices", "colors", "background", "largest"))
 
 
 class AntialiasCuda(torch.autograd.Function):
@@ -87,7 +70,7 @@ class AntialiasCuda(torch.autograd.Function):
             addresses = (None if tensor is None else tensor.data_ptr() for tensor in (*sums, largest))
             scene, pixels = _scene(tensors, ctx.alive, b), shaded[b].shape[0] * shaded[b].shape[1]
             _run("antialias_unblend", pixels, (scene, grad_image[b], grad_shaded))
-            arguments = (scene, shaded[b], grad_image[b], grad_shaded, _Targets(*addresses))
+            arguments = (scene, shaded[b], grad_image[b], grad_shaded, _struct("Targets")(*addresses))
             _run("antialias_measure", pixels, arguments)
             _run("antialias_scatter", pixels, arguments)
             for i, (total, gradient) in enumerate(zip(sums, parts, strict=True)):
@@ -95,6 +78,10 @@ class AntialiasCuda(torch.autograd.Function):
                     count = gradient.numel()
                     _run("antialias_finish", count, (total, largest[i:], ctypes.c_int64(count), gradient))
         return (*grads, None, None, None, None)
+
+
+def _struct(name: str) -> Any:
+    return struct_class("cuda/antialias.cu", name)
 
 
 def _run(name: str, count: int, arguments: tuple[Any, ...]) -> None:
@@ -107,7 +94,7 @@ def _scene(tensors: tuple[Tensor, ...], alive: tuple[Any, ...], b: int) -> Any:
     connectivity, (viewmats, Ks, near_plane, width, height), seen, per_face = alive
     floats = (vertices, viewmats[b], Ks[b], seen.barycentrics[b], seen.depth[b], colors, backgrounds[b])
     integers = (connectivity.faces, connectivity.pair_offsets, connectivity.paired_faces, seen.triangle[b])
-    view = _View(
+    view = _struct("AntialiasView")(
         *(tensor.data_ptr() for tensor in (*floats, *integers)),
         len(vertices),
         len(connectivity.faces),
@@ -117,4 +104,4 @@ def _scene(tensors: tuple[Tensor, ...], alive: tuple[Any, ...], b: int) -> Any:
         per_face,
         near_plane,
     )
-    return _Scene(view, points[b].data_ptr(), silhouettes[b].data_ptr())
+    return _struct("Scene")(view, points[b].data_ptr(), silhouettes[b].data_ptr())

@@ -9,6 +9,7 @@ from torch.autograd.function import once_differentiable
 
 from etsplat.cuda.launch import blocks, launch
 from etsplat.cuda.program import Program
+from etsplat.cuda.structs import struct_class
 
 if TYPE_CHECKING:
     from etsplat.ops.mesh_energies import MeshConnectivity
@@ -16,13 +17,6 @@ if TYPE_CHECKING:
 _PROGRAM = Program("mesh_energies.cu", contract=False)
 _THREADS = 256
 _ARRAYS = ("faces", "neighbor_offsets", "neighbor_indices", "corner_offsets", "corners", "pair_offsets", "paired_faces")
-
-
-class _MeshArrays(ctypes.Structure):
-    _fields_ = (
-        *((name, ctypes.c_void_p) for name in ("vertices", *_ARRAYS)),
-        *((name, ctypes.c_int64) for name in ("num_vertices", "num_edges", "num_pairs", "num_faces")),
-    )
 
 
 class MeshEnergiesCuda(torch.autograd.Function):
@@ -36,7 +30,7 @@ class MeshEnergiesCuda(torch.autograd.Function):
         vertices, c = vertices.contiguous(), connectivity
         V, F = len(vertices), len(c.faces)
         addresses = (vertices.data_ptr(), *(getattr(c, name).data_ptr() for name in _ARRAYS))
-        mesh = _MeshArrays(*addresses, V, len(c.edges), len(c.face_pairs), F)
+        mesh = struct_class("math/mesh_energies.h", "MeshArrays")(*addresses, V, len(c.edges), len(c.face_pairs), F)
         vertex_blocks, face_blocks = blocks(V, _THREADS), blocks(F, _THREADS)
         vertex_sums = vertices.new_empty((vertex_blocks, 2), dtype=torch.float64)
         face_sums = vertices.new_empty(face_blocks, dtype=torch.float64)

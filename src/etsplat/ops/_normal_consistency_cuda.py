@@ -9,16 +9,10 @@ from torch.autograd.function import once_differentiable
 
 from etsplat.cuda.launch import blocks, launch
 from etsplat.cuda.program import Program
+from etsplat.cuda.structs import struct_class
 
 _PROGRAM = Program("normal_consistency.cu", contract=False)
 _THREADS = 256
-
-
-class _DepthNormals(ctypes.Structure):
-    _fields_ = (
-        *((name, ctypes.c_void_p) for name in ("normals", "depth", "alpha", "viewmats", "Ks")),
-        *((name, ctypes.c_int) for name in ("views", "height", "width")),
-    )
 
 
 class NormalConsistencyCuda(torch.autograd.Function):
@@ -47,8 +41,9 @@ class NormalConsistencyCuda(torch.autograd.Function):
         return *grads, None, None, None
 
 
-def _problem(inputs: Any) -> tuple[_DepthNormals, tuple[int, int]]:
+def _problem(inputs: Any) -> tuple[Any, tuple[int, int]]:
     """The kernels' struct and their grid: blocks of a view, views."""
     views, height, width = inputs[0].shape[:3]
-    struct = _DepthNormals(*(tensor.data_ptr() for tensor in inputs), views, height, width)
+    struct_of = struct_class("cuda/normal_consistency.cu", "DepthNormals")
+    struct = struct_of(*(tensor.data_ptr() for tensor in inputs), views, height, width)
     return struct, (blocks(height * width, _THREADS), views)

@@ -9,18 +9,11 @@ from torch.autograd.function import once_differentiable
 
 from etsplat.cuda.launch import blocks, launch
 from etsplat.cuda.program import Program
+from etsplat.cuda.structs import struct_class
 
 _PROGRAM = Program("photometric.cu", contract=False)
 _TILE = 16
 _THREADS = _TILE * _TILE
-
-
-class _Photometric(ctypes.Structure):
-    _fields_ = (
-        *((name, ctypes.c_void_p) for name in ("color", "target", "backgrounds", "mask")),
-        *((name, ctypes.c_int) for name in ("views", "height", "width", "channels", "bytes", "squared")),
-        ("dssim_weight", ctypes.c_float),
-    )
 
 
 class PhotometricLossCuda(torch.autograd.Function):
@@ -61,11 +54,11 @@ class PhotometricLossCuda(torch.autograd.Function):
         return gradient, None, None, None, None, None
 
 
-def _problem(images: list[Any], dssim_weight: float, squared: bool) -> _Photometric:
+def _problem(images: list[Any], dssim_weight: float, squared: bool) -> Any:
     """Of color, target, backgrounds, mask; the latter two may be None."""
     color, target = images[:2]
     addresses = (None if image is None else image.data_ptr() for image in images)
-    return _Photometric(
+    return struct_class("cuda/photometric.cu", "Photometric")(
         *addresses, *color.shape[:3], target.shape[-1], target.dtype == torch.uint8, squared, dssim_weight
     )
 

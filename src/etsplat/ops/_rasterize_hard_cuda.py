@@ -1,6 +1,5 @@
 """The GPU engine's side of ``rasterize_hard`` and ``render_opaque``: csrc/cuda/rasterize_hard.cu."""
 
-import ctypes
 from collections.abc import Iterator
 from typing import Any
 
@@ -9,22 +8,13 @@ from torch import Tensor
 
 from etsplat.cuda.launch import blocks, launch
 from etsplat.cuda.program import Program
+from etsplat.cuda.structs import struct_class
 from etsplat.ops._rasterize_hard_reference import View
 
 _PROGRAM = Program("rasterize_hard.cu", contract=False)
 _THREADS = 128
 # Samples of a strip: 16 MiB of z-buffer, which the L2 cache of most devices holds.
 _STRIP_SAMPLES = 1 << 21
-
-
-class _HardView(ctypes.Structure):
-    _fields_ = (
-        *((name, ctypes.c_void_p) for name in ("points", "faces", "viewmat", "K")),
-        *((name, ctypes.c_int64) for name in ("num_points", "num_faces")),
-        *((name, ctypes.c_int) for name in ("width", "height", "samples")),
-        ("near_plane", ctypes.c_float),
-        ("cull_backfaces", ctypes.c_int),
-    )
 
 
 def rasterize_hard_cuda(
@@ -55,10 +45,10 @@ def render_opaque_cuda(
         launch(_PROGRAM, "hard_shade", blocks(pixels, _THREADS), _THREADS, arguments)
 
 
-def _problem(points: Tensor, triangles: Tensor, view: View, samples: int, cull_backfaces: bool) -> _HardView:
+def _problem(points: Tensor, triangles: Tensor, view: View, samples: int, cull_backfaces: bool) -> Any:
     addresses = (tensor.data_ptr() for tensor in (points, triangles, view.viewmat, view.K))
     sizes = len(points), len(triangles), view.width * samples, view.height * samples, samples
-    return _HardView(*addresses, *sizes, view.near_plane, cull_backfaces)
+    return struct_class("cuda/rasterize_hard.cu", "HardView")(*addresses, *sizes, view.near_plane, cull_backfaces)
 
 
 def _drawn_strips(problem: Any, points: Tensor) -> Iterator[tuple[int, int, Tensor]]:

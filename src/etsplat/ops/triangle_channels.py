@@ -3,7 +3,6 @@
 z = (R (v0 + v1 + v2) / 3 + t)_z      n = +- normalize((v1 - v0) x (v2 - v0)),  n . (centroid - camera) <= 0
 """
 
-import ctypes
 from typing import Any
 
 import torch
@@ -15,6 +14,7 @@ from etsplat import _native
 from etsplat.core.validation import check_like, check_shape
 from etsplat.cuda.launch import blocks, launch
 from etsplat.cuda.program import Program
+from etsplat.cuda.structs import struct_class
 from etsplat.ops._rasterize_reference import unit_normals
 from etsplat.ops.engines import resolve_engine
 from etsplat.ops.pool import empty_image
@@ -105,14 +105,6 @@ class _TriangleChannels(torch.autograd.Function):
         return grad_corners, grad_viewmats, None, None, None
 
 
-class _ChannelsOf(ctypes.Structure):
-    _fields_ = (
-        ("corners", ctypes.c_void_p),
-        ("viewmats", ctypes.c_void_p),
-        *((name, ctypes.c_int) for name in ("triangles", "views", "depth", "normals")),
-    )
-
-
 def _run(
     name: str, settings: tuple[bool, bool, bool], inputs: tuple[Tensor, Tensor], outputs: tuple[Tensor, ...]
 ) -> None:
@@ -121,7 +113,8 @@ def _run(
     problem = *addresses, len(inputs[0]), len(inputs[1]), depth, normals
     if on_device:
         grid = blocks(len(inputs[0]), _THREADS)
-        launch(_PROGRAM, f"triangle_channels_{name}", grid, _THREADS, (_ChannelsOf(*problem), *outputs))
+        struct = struct_class("cuda/triangle_channels.cu", "ChannelsOf")(*problem)
+        launch(_PROGRAM, f"triangle_channels_{name}", grid, _THREADS, (struct, *outputs))
         return
     native = _native.triangle_channels if name == "forward" else _native.triangle_channels_backward
     native(*problem, *(tensor.data_ptr() for tensor in outputs))
