@@ -28,6 +28,10 @@ _HOLDS = 6
 """Looks for intersections in an attempt, each holding more vertices in place."""
 
 
+_CHANCES = 2
+"""Times that everything is tried: in the second, folds that were given up no longer join what lies beside them."""
+
+
 def untangle(
     vertices: Float[Tensor, "V 3"], topology: MeshTopology, *, rounds: int = 40, reach: float = math.inf
 ) -> tuple[Float[Tensor, "V 3"], int]:
@@ -38,7 +42,8 @@ def untangle(
     2. What smoothing moved goes back towards its old place, as far as that makes no face intersect anew: folds end
        where they touch instead of flat.
     3. Where a vertex still ends too far away, all that moved together with it returns to its old place, intersections
-       included: folds so large hold up the shape, as where a sphere stands for an object with holes.
+       included: folds so large hold up the shape, as where a sphere stands for an object with holes. What only lay
+       beside such a fold has another chance, now that the rest is put right.
 
     All other vertices stay where they are. Boundary vertices may shrink inwards. Computed on the CPU.
 
@@ -51,20 +56,28 @@ def untangle(
     Returns:
         Moved vertices, and how many faces still intersect.
     """
-    device, original, faces = vertices.device, vertices.detach().cpu(), topology.faces.cpu()
-    vertices = original.clone()
+    device, faces = vertices.device, topology.faces.cpu()
+    vertices = vertices.detach().cpu()
+    for _ in range(_CHANCES):
+        original = vertices
+        vertices = _repaired(original, topology, rounds)
+        lost = _too_far(vertices, original, topology, reach)
+        vertices[lost] = original[lost]
+        if not bool(lost.any()):
+            break
+    return vertices.to(device), int(intersecting_faces(vertices, faces).sum())
+
+
+def _repaired(original: Float[Tensor, "V 3"], topology: MeshTopology, rounds: int) -> Float[Tensor, "V 3"]:
+    """Steps 1 and 2."""
+    vertices, faces = original.clone(), topology.faces.cpu()
     marked = intersecting_faces(vertices, faces)
     for done in range(rounds):
         if not bool(marked.any()):
             break
         _smooth(vertices, topology, _region(marked, topology, rings=done // _WIDEN))
         marked = intersecting_faces(vertices, faces)
-    vertices = _returned(vertices, original, topology, marked)
-    lost = _too_far(vertices, original, topology, reach)
-    if bool(lost.any()):
-        vertices[lost] = original[lost]
-        marked = intersecting_faces(vertices, faces)
-    return vertices.to(device), int(marked.sum())
+    return _returned(vertices, original, topology, marked)
 
 
 def _returned(
