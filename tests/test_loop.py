@@ -12,7 +12,6 @@ from etsplat.optim.loop import (
     CheckpointEvent,
     DivergedError,
     DoneEvent,
-    EvaluateEvent,
     Event,
     LoopSettings,
     Progress,
@@ -62,12 +61,11 @@ def events_of(problem: Counting, folder: Path, progress: Progress | None = None)
 
 
 def test_events_come_when_the_settings_say(tmp_path: Path) -> None:
-    """Logs at 4, 8; evaluations at 5 and the end, logged too; a refinement at 3; checkpoints at 6 and the end."""
+    """Logs at 4, 8; evaluations, also logged, at 5 and the end; a refinement at 3; checkpoints at 6 and the end."""
     events = events_of(Counting(), tmp_path)
     at = {kind: [e.iteration for e in events if isinstance(e, kind)] for kind in {type(e) for e in events}}
     assert at == {
         StepEvent: [4, 5, 8, 10],
-        EvaluateEvent: [5, 10],
         RefineEvent: [3],
         CheckpointEvent: [6, 10],
         DoneEvent: [10],

@@ -66,7 +66,7 @@ struct RasterState {
     Buffer<int32_t> histogram, tile_begin, tile_done;
     Buffer<TileEntry> entries;
     Buffer<uint16_t> hits;
-    Buffer<float> slot_weight, slots, corner_gradients, tile_background, scratch;
+    Buffer<float> slot_weight, slots, corner_gradients, tile_background;
     Buffer<uint8_t> touched;
     int64_t num_slots = 0;
     StageSeconds stages[kStages];

@@ -59,19 +59,6 @@ class RefineEvent:
 
 
 @dataclass(frozen=True)
-class EvaluateEvent:
-    """The state after this iteration was evaluated; the same numbers are in the StepEvent.
-
-    Attributes:
-        iteration: iterations done.
-        metrics: by name.
-    """
-
-    iteration: int
-    metrics: dict[str, float]
-
-
-@dataclass(frozen=True)
 class CheckpointEvent:
     """A checkpoint was written.
 
@@ -97,7 +84,7 @@ class DoneEvent:
     seconds: float
 
 
-Event = StepEvent | RefineEvent | EvaluateEvent | CheckpointEvent | DoneEvent
+Event = StepEvent | RefineEvent | CheckpointEvent | DoneEvent
 
 
 class Problem(Protocol):
@@ -204,10 +191,7 @@ def optimize(
             if (logging or saving) and (name := problem.first_not_finite()):
                 raise DivergedError(f"{name} is not finite at iteration {iteration}; {_what_is_left(folder)}")
             if logging:
-                metrics = problem.evaluate() if evaluating else {}
-                yield _step_event(problem, settings, progress, metrics)
-                if evaluating:
-                    yield EvaluateEvent(iteration, metrics)
+                yield _step_event(problem, settings, progress, problem.evaluate() if evaluating else {})
             if added:
                 yield RefineEvent(iteration, problem.count, added)
             if saving:

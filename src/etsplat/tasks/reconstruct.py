@@ -8,24 +8,23 @@ from typing import Any
 
 import torch
 
-from etsplat.core.errors import InputError
 from etsplat.io.mesh_files import MeshFile, save_mesh
-from etsplat.io.run_directory import RunDirectory, is_run
+from etsplat.io.run_directory import RunDirectory
 from etsplat.ops.antialias_nvdiffrast import load_nvdiffrast
-from etsplat.ops.engines import num_threads, one_torch_thread, resolve_device, resolve_engine
-from etsplat.optim.loop import Event, LoopSettings, Progress
+from etsplat.ops.engines import one_torch_thread, resolve_device, resolve_engine
+from etsplat.optim.loop import Progress
 from etsplat.tasks.mesh_fitting import MeshFitting
 from etsplat.tasks.reconstruct_config import PRESETS, ReconstructConfig
 from etsplat.tasks.running import (
     Callback,
     NoteEvent,
+    Place,
     PrepareEvent,
-    device_name,
+    announcer,
+    common_metrics,
     fit,
-    hash_record,
     make_record,
     path_of,
-    versions,
 )
 from etsplat.tasks.scoring import Scorer
 from etsplat.tasks.sources import Source, fingerprint, load_source, load_start, make_start, make_subject
@@ -82,23 +81,14 @@ def reconstruct(
     """
     config = config or PRESETS["best"]
     device = resolve_device(config.device, config.engine)
-    out = Path(out)
-    if resume and not is_run(out):
-        raise InputError(f"{out}: holds no run to resume; start it without --resume")
-    if not resume:
-        RunDirectory.check_free(out, overwrite=overwrite)
-
+    place, announce = Place(Path(out), resume, overwrite), announcer(callbacks)
+    place.check()
     loaded, start = load_source(source, config, masks), load_start(init_mesh)
     hashes = {"fingerprint": fingerprint(loaded), "init_mesh": fingerprint(start)}
     paths = {"source": path_of(source), "init_mesh": path_of(init_mesh)}
     record = make_record("reconstruct", config, hashes, paths)
     if resume:
-        RunDirectory.resume(out, record)
-
-    def announce(event: Event | PrepareEvent | NoteEvent) -> None:
-        for callback in callbacks:
-            callback(event)
-
+        place.open(record)  # refuses another run before pictures are taken
     for name, mesh in (("source", loaded), ("init_mesh", start)):
         for note in mesh.notes if isinstance(mesh, MeshFile) else ():
             announce(NoteEvent(f"{name}: {note}"))
@@ -107,11 +97,10 @@ def reconstruct(
         load_nvdiffrast()  # now rather than at the first step
     scorer = Scorer(subject, config)
     fitting = MeshFitting(make_start(start, subject.views, config), subject.views, config, scorer.cheap)
-    run = RunDirectory.resume(out, record) if resume else RunDirectory.create(out, record, overwrite=overwrite)
+    run = place.open(record)
     on_cpu = resolve_engine(config.engine, fitting.mesh.vertices) == "cpu"
     with one_torch_thread() if on_cpu else nullcontext():
-        settings = LoopSettings(config.iterations, config.log_every, config.evaluate_every, config.checkpoint_every)
-        progress = fit(fitting, run, settings, hash_record(record), announce)
+        progress = fit(fitting, run, config, record, announce)
     return _finish(fitting, progress, run, scorer, subject.views.normalization.invert, config)
 
 
@@ -129,18 +118,5 @@ def _finish(
     result = MeshFile(to_input_units(mesh.vertices.detach().cpu()), mesh.faces.cpu(), **colors)
     for suffix in (".ply", ".obj", ".glb"):
         save_mesh(run.mesh_path(suffix), result.vertices, result.faces, **colors)
-    metrics = {
-        **scorer.full(mesh, run.test),
-        "iterations": progress.iteration,
-        "seconds": progress.seconds,
-        "seconds_per_iteration": progress.seconds / progress.iteration,
-        "engine": resolve_engine(config.engine, mesh.vertices),
-        "device": device_name(mesh.vertices.device),
-        "threads": num_threads(),
-        "method": config.method,
-        "preset": config.preset,
-        "seed": config.seed,
-        "versions": versions(),
-    }
-    run.write_metrics(metrics)
+    run.write_metrics({**scorer.full(mesh, run.test), **common_metrics(progress, config, mesh.vertices)})
     return ReconstructResult(run.path, result, run.read_metrics())

@@ -3,7 +3,7 @@
 import hashlib
 import json
 import platform
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -12,9 +12,13 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from etsplat.io.run_directory import RunDirectory
+from etsplat.core.errors import InputError
+from etsplat.io.run_directory import RunDirectory, is_run
+from etsplat.ops.engines import num_threads, resolve_engine
 from etsplat.optim.checkpoints import load_latest_checkpoint, save_checkpoint
 from etsplat.optim.loop import Event, LoopSettings, Problem, Progress, StepEvent, optimize
+from etsplat.tasks.reconstruct_config import ReconstructConfig
+from etsplat.tasks.train_config import TrainConfig
 
 
 @dataclass(frozen=True)
@@ -56,20 +60,74 @@ class Resumable(Problem, Protocol):
         ...
 
 
-def fit(problem: Resumable, run: RunDirectory, settings: LoopSettings, run_hash: str, announce: Callback) -> Progress:
+@dataclass(frozen=True)
+class Place:
+    """Where a run goes, and what happens to what is there.
+
+    Attributes:
+        path: the run directory.
+        resume: continue the run in it.
+        overwrite: replace a run in it.
+    """
+
+    path: Path
+    resume: bool
+    overwrite: bool
+
+    def check(self) -> None:
+        """Cheap, so that it comes before the input is prepared.
+
+        Raises:
+            InputError: there is no run to continue, or no place for a new one.
+        """
+        if not self.resume:
+            RunDirectory.check_free(self.path, overwrite=self.overwrite)
+        elif not is_run(self.path):
+            raise InputError(f"{self.path}: holds no run to resume; start it without --resume")
+
+    def open(self, record: dict[str, Any]) -> RunDirectory:
+        """The directory, made or with the run that goes on; ``record`` as of `make_record`.
+
+        Raises:
+            InputError: as `check`; or the run in it was started with other settings or input.
+        """
+        if self.resume:
+            return RunDirectory.resume(self.path, record)
+        return RunDirectory.create(self.path, record, overwrite=self.overwrite)
+
+
+def announcer(callbacks: Sequence[Callback]) -> Callback:
+    """Calls each with every event."""
+
+    def announce(event: Event | PrepareEvent | NoteEvent) -> None:
+        for callback in callbacks:
+            callback(event)
+
+    return announce
+
+
+def fit(
+    problem: Resumable,
+    run: RunDirectory,
+    config: ReconstructConfig | TrainConfig,
+    record: dict[str, Any],
+    announce: Callback,
+) -> Progress:
     """Runs the loop from the last checkpoint, or from the start, to the end, and keeps the history.
 
     Args:
         problem: changed in place.
         run: gets checkpoints and history.jsonl.
-        settings: when things happen.
-        run_hash: from `hash_record`.
+        config: says when things happen.
+        record: from `make_record`.
         announce: called with every event.
 
     Raises:
         DivergedError: a loss or parameter is not finite.
         InputError: the checkpoint is damaged or of another run; the disk is full.
     """
+    settings = LoopSettings(config.iterations, config.log_every, config.evaluate_every, config.checkpoint_every)
+    run_hash = hash_record(record)
     progress = Progress()
     checkpoint = load_latest_checkpoint(run.checkpoints, run_hash)
     if checkpoint is not None:
@@ -106,6 +164,28 @@ def path_of(source: object) -> str | None:
     if not isinstance(source, str | Path):
         return None
     return str(Path(source).resolve()) if Path(source).exists() else str(source)  # the latter: "demo:scene"
+
+
+def common_metrics(progress: Progress, config: ReconstructConfig | TrainConfig, result: Tensor) -> dict[str, Any]:
+    """What metrics.json says of every run: how long it took, on what, and how it was made.
+
+    Args:
+        progress: at the end.
+        config: settings.
+        result: a tensor of the result, for its device and precision.
+    """
+    return {
+        "iterations": progress.iteration,
+        "seconds": progress.seconds,
+        "seconds_per_iteration": progress.seconds / progress.iteration,
+        "engine": resolve_engine(config.engine, result),
+        "device": device_name(result.device),
+        "threads": num_threads(),
+        "method": config.method,
+        "preset": config.preset,
+        "seed": config.seed,
+        "versions": versions(),
+    }
 
 
 def device_name(device: torch.device) -> str:

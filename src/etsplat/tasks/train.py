@@ -12,9 +12,9 @@ from torch import Tensor
 
 from etsplat.core.errors import InputError
 from etsplat.io.memory import available_memory
-from etsplat.io.run_directory import RunDirectory, is_run
-from etsplat.ops.engines import num_threads, one_torch_thread, resolve_device, resolve_engine
-from etsplat.optim.loop import CheckpointEvent, DivergedError, LoopSettings, Progress
+from etsplat.io.run_directory import RunDirectory
+from etsplat.ops.engines import one_torch_thread, resolve_device, resolve_engine
+from etsplat.optim.loop import CheckpointEvent, DivergedError, Progress
 from etsplat.scene.captures import Capture, load_capture
 from etsplat.scene.demo_scene import HEIGHT, WIDTH, demo_scene
 from etsplat.scene.device_views import stay_on
@@ -25,13 +25,13 @@ from etsplat.scene.triangle_soup import TriangleSoup
 from etsplat.tasks.running import (
     Callback,
     NoteEvent,
+    Place,
     PrepareEvent,
-    device_name,
+    announcer,
+    common_metrics,
     fit,
-    hash_record,
     make_record,
     path_of,
-    versions,
 )
 from etsplat.tasks.soup_fitting import Evaluate, SoupFitting
 from etsplat.tasks.soup_scoring import SoupScorer
@@ -100,16 +100,8 @@ def train(
     """
     config = config or train_settings("quick")
     device = resolve_device(config.device, config.engine)
-    out = Path(out)
-    if resume and not is_run(out):
-        raise InputError(f"{out}: holds no run to resume; start it without --resume")
-    if not resume:
-        RunDirectory.check_free(out, overwrite=overwrite)
-
-    def announce(event: Any) -> None:
-        for callback in callbacks:
-            callback(event)
-
+    place, announce = Place(Path(out), resume, overwrite), announcer(callbacks)
+    place.check()
     own = _load(source, config, images, masks, lambda done, total: announce(PrepareEvent(done, total)))
     capture = own.normalized() if config.normalize else own
     for note in _check(own, config, device):
@@ -118,7 +110,7 @@ def train(
     record = make_record("train", config, {"fingerprint": own.fingerprint()}, paths)
     scorer = SoupScorer(capture, _background(config), config.engine, device)
     fitting = start_fitting(capture, config, scorer.cheap, device)
-    run = RunDirectory.resume(out, record) if resume else RunDirectory.create(out, record, overwrite=overwrite)
+    run = place.open(record)
 
     def keep(event: Any) -> None:
         if isinstance(event, CheckpointEvent):  # so that `etsplat view` can follow
@@ -126,10 +118,9 @@ def train(
         announce(event)
 
     native = resolve_engine(config.engine, fitting.soup.vertices) == "cpu"
-    settings = LoopSettings(config.iterations, config.log_every, config.evaluate_every, config.checkpoint_every)
     with one_torch_thread() if native else nullcontext():
         try:
-            progress = fit(fitting, run, settings, hash_record(record), keep)
+            progress = fit(fitting, run, config, record, keep)
         except DivergedError as error:
             if doubt := _doubtful_scale(own, config):
                 raise DivergedError(f"{error}. But first: {doubt}") from error
@@ -277,21 +268,12 @@ def _finish(
         "psnr_opaque_loss": None if scores["psnr"] is None else scores["psnr"] - scores["psnr_opaque"],
         "triangles": len(soup),
         **fitting.describe(),
-        "iterations": progress.iteration,
-        "seconds": progress.seconds,
-        "seconds_per_iteration": progress.seconds / progress.iteration,
         "width": capture.images.sizes[0][0],
         "height": capture.images.sizes[0][1],
         "train_views": len(capture.train),
-        "engine": resolve_engine(config.engine, soup.vertices),
-        "device": device_name(soup.vertices.device),
-        "threads": num_threads(),
-        "method": config.method,
-        "preset": config.preset,
         "scene_type": config.scene_type,
         "finish": config.finish,
-        "seed": config.seed,
-        "versions": versions(),
+        **common_metrics(progress, config, soup.vertices),
     }
     run.write_metrics(metrics)
     return TrainResult(run.path, file.soup, run.read_metrics())
