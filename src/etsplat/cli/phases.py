@@ -17,8 +17,10 @@ class PhaseBar:
             BarColumn(bar_width=None),
             TextColumn("{task.fields[count]}"),
             TimeRemainingColumn(compact=True),
+            TextColumn("{task.fields[state]}"),
             console=console,
             disable=not console.is_terminal,
+            speed_estimate_period=60,
             expand=True,
         )
         self._task: TaskID | None = None
@@ -35,14 +37,15 @@ class PhaseBar:
             self._progress.remove_task(self._task)
         self._progress.stop()
 
-    def show(self, phase: str, done: int, total: int) -> None:
-        """Say how far a phase is; `total` 0 if nobody knows."""
+    def show(self, phase: str, done: int, total: int, state: str = "") -> None:
+        """Say how far a phase is; `total` 0 if nobody knows. `state` stands beside the bar."""
+        count = f"{done}/{total} eta" if total else ""
         if phase != self._phase or self._task is None:
             if self._task is not None:
                 self._progress.remove_task(self._task)
-            self._task = self._progress.add_task(phase, total=total or None, count="")
+            # A new task starts with what is done already, so that a resumed run's rate counts from here.
+            self._task = self._progress.add_task(phase, total=total or None, completed=done, count=count, state=state)
             self._phase = phase
             if not self._console.is_terminal:
                 print(phase, flush=True)
-        count = f"{done}/{total}" if total else ""
-        self._progress.update(self._task, completed=done, total=total or None, count=count)
+        self._progress.update(self._task, completed=done, total=total or None, count=count, state=state)

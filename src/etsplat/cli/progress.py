@@ -3,15 +3,8 @@
 from types import TracebackType
 
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    Progress,
-    SpinnerColumn,
-    TaskID,
-    TextColumn,
-    TimeRemainingColumn,
-)
 
+from etsplat.cli.phases import PhaseBar
 from etsplat.optim.loop import DoneEvent, Event, StepEvent
 from etsplat.tasks.running import NoteEvent, PrepareEvent
 
@@ -25,39 +18,24 @@ class RunProgress:
     def __init__(self, console: Console, *, preparing: str) -> None:
         self._console = console
         self._preparing = preparing
-        self._progress = Progress(
-            SpinnerColumn(),
-            TextColumn("{task.description}"),
-            BarColumn(bar_width=None),
-            TextColumn("{task.fields[count]}"),
-            TimeRemainingColumn(compact=True),
-            TextColumn("{task.fields[state]}"),
-            console=console,
-            disable=not console.is_terminal,
-            speed_estimate_period=60,
-            expand=True,
-        )
-        self._task: TaskID | None = None
-        self._phase = ""
+        self._bar = PhaseBar(console)
         self._psnr = ""
         self._lines = 0
 
     def __enter__(self) -> "RunProgress":
-        self._progress.start()
+        self._bar.__enter__()
         self.say("Reading the input")
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        if self._task is not None:
-            self._progress.remove_task(self._task)
-        self._progress.stop()
+        self._bar.__exit__(kind, error, traceback)
 
     def __call__(self, event: Event | PrepareEvent | NoteEvent) -> None:
         """Take in an event of the run."""
         if isinstance(event, PrepareEvent):
-            self._show(self._preparing, event.done, event.total)
+            self._bar.show(self._preparing, event.done, event.total)
         elif isinstance(event, NoteEvent):
             self._console.print(f"  {event.text}", highlight=False, markup=False, soft_wrap=True)
         elif isinstance(event, StepEvent):
@@ -67,26 +45,14 @@ class RunProgress:
 
     def say(self, phase: str) -> None:
         """Enter a phase of unknown length."""
-        self._show(phase, 0, None)
+        self._bar.show(phase, 0, 0)
 
     def _step(self, event: StepEvent) -> None:
         if "psnr" in event.metrics:
             self._psnr = f" · {event.metrics['psnr']:.2f} dB"
         counts = "".join(f" · {event.state[name]:,} {name}" for name in ("faces", "triangles") if name in event.state)
         state = f"loss {event.loss:.4f}{self._psnr}{counts} · σ {event.state['sigma']:.3f}"
-        self._show("Optimizing", event.iteration, event.iterations, state)
+        self._bar.show("Optimizing", event.iteration, event.iterations, state)
         if not self._console.is_terminal and event.iteration * LINES >= self._lines * event.iterations:
             self._lines = event.iteration * LINES // event.iterations + 1
             print(f"  {event.iteration}/{event.iterations} · {event.seconds:.0f} s · {state}", flush=True)
-
-    def _show(self, phase: str, done: int, total: int | None, state: str = "") -> None:
-        count = "" if total is None else f"{done}/{total} eta"
-        if phase != self._phase or self._task is None:
-            if self._task is not None:
-                self._progress.remove_task(self._task)
-            # A new task starts with what is done already, so that a resumed run's rate counts from here.
-            self._task = self._progress.add_task(phase, total=total, completed=done, count=count, state=state)
-            self._phase = phase
-            if not self._console.is_terminal:
-                print(phase, flush=True)
-        self._progress.update(self._task, completed=done, total=total, count=count, state=state)
