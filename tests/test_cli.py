@@ -19,6 +19,7 @@ from etsplat.cli.doctor import Doctor
 from etsplat.cli.main import main
 from etsplat.cli.parse import COMMANDS, Group, parse
 from etsplat.cli.reconstruct import Demo, Reconstruct
+from etsplat.cli.train import Train
 from etsplat.core.errors import InputError
 from etsplat.geometry.icosphere import icosphere
 from etsplat.io.mesh_files import save_mesh
@@ -119,8 +120,30 @@ def test_doctor_tells_what_there_is(etsplat: Run) -> None:
     """Engine, instruction set, threads, versions and what is missing are named; a sound installation ends with 0."""
     result = etsplat("doctor")
     assert result.returncode == 0, result.stderr
-    for word in ("engine", "instruction set", "threads", "torch", "agrees with the reference", "LPIPS", "CUDA"):
+    for word in (
+        "engine",
+        "instruction set",
+        "threads",
+        "torch",
+        "agrees with the reference",
+        "LPIPS",
+        "CUDA",
+        "sfm",
+        "view",
+    ):
         assert word in result.stdout
+
+
+@pytest.mark.parametrize("preset", ["quick", "paper"])
+def test_a_setting_that_a_preset_may_turn_on_is_turned_on_and_off_by_name(preset: str) -> None:
+    """Whatever the preset says, --normalize and --no-normalize exist; --resume has no such pair."""
+    words = ["train", "scene", "--out", "b", "--preset", preset]
+    for flag, value in (("--normalize", True), ("--no-normalize", False)):
+        command = parse([*words, flag])
+        assert isinstance(command, Train)
+        assert command.settings.normalize is value
+    with pytest.raises(SystemExit):
+        parse([*words, "--no-resume"])
 
 
 def test_preset_sets_the_defaults_and_options_change_them() -> None:

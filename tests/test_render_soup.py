@@ -34,6 +34,14 @@ def run(tmp_path, rng):
     return SoupRun(tmp_path, SoupFile(soup, background=(0.0, 0.0, 1.0)), load_capture(tmp_path / "scene"))
 
 
+@pytest.mark.parametrize("name", ["orbit.mp4", "there.txt"])
+def test_a_file_instead_of_a_folder_is_refused(run, name):
+    """Pictures and videos have names of their own: a folder named like a video would only confuse."""
+    (run.folder / "there.txt").write_text("")
+    with pytest.raises(InputError, match=rf"{name}: .*name a folder"):
+        render_run(run, run.folder / name, RenderConfig(path="orbit", frames=2))
+
+
 @pytest.mark.parametrize("name", list(PATHS))
 @pytest.mark.parametrize("center", [0.0, 40.0])
 def test_paths_stay_near_the_cameras_and_are_rigid(name, center):

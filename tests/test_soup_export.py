@@ -8,11 +8,12 @@ import torch
 import trimesh
 
 from etsplat import intrinsics, look_at
+from etsplat.cli.parse import parse
 from etsplat.core.cameras import Cameras
 from etsplat.core.errors import InputError
 from etsplat.io.ply_tables import encode_ply, read_ply_tables
 from etsplat.io.srgb import srgb_from_linear
-from etsplat.scene.soup_files import SoupFile
+from etsplat.scene.soup_files import SoupFile, save_soup
 from etsplat.scene.soup_import import open_soup
 from etsplat.scene.soup_rendering import SoupAppearance, render_soup, render_soup_opaque
 from etsplat.scene.triangle_soup import TriangleSoup
@@ -165,8 +166,22 @@ def test_triangle_splatting_states_come_in_safely(tmp_path, soup):
     with pytest.raises(InputError, match="lacks"):
         open_soup(tmp_path / "half.pt")
     torch.save(soup, tmp_path / "code.pt")
-    with pytest.raises(InputError, match="cannot be read as a state dict"):
+    with pytest.raises(InputError, match="cannot be read as a state dict") as raised:
         open_soup(tmp_path / "code.pt")
+    assert "weights_only" not in str(raised.value)  # torch's advice is to run the code in the file
+
+
+def test_the_kind_of_file_follows_from_its_name(tmp_path, soup, capsys):
+    save_soup(tmp_path / "soup.safetensors", SoupFile(soup))
+    for arguments in (["--out", "a.ply", "--min-opacity", "0"], ["--format", "off", "--min-opacity", "0"]):
+        named = [str(tmp_path / word) if word == "a.ply" else word for word in arguments]
+        assert parse(["export", str(tmp_path / "soup.safetensors"), *named]).run([]) == 0
+    assert "left out" not in capsys.readouterr().out
+    assert {"a.ply", "soup.off"} <= {path.name for path in tmp_path.iterdir()}
+    with pytest.raises(InputError, match=r"does not end in \.glb; rename"):
+        parse(["export", str(tmp_path / "soup.safetensors"), "--format", "glb", "--out", "b.ply"]).run([])
+    with pytest.raises(InputError, match=r"does not end in \.ply or"):
+        parse(["export", str(tmp_path / "soup.safetensors"), "--out", "b.xyz"]).run([])
 
 
 def test_a_gaussian_scene_comes_in_at_its_places_with_its_size_and_colours(tmp_path):

@@ -172,6 +172,9 @@ def test_masks_that_are_missing_or_of_another_size_are_input_errors(scene, truth
 def test_folders_without_a_scene_are_input_errors(tmp_path):
     with pytest.raises(InputError, match="no such folder"):
         load_views(tmp_path / "absent")
+    (tmp_path / "mesh.obj").write_text("")
+    with pytest.raises(InputError, match=r"mesh\.obj: is a file; name the scene's folder"):
+        load_views(tmp_path / "mesh.obj")
     with pytest.raises(InputError, match="choose the scene's folder"):
         load_views(tmp_path)
     with pytest.raises(InputError, match=r"neither transforms\.json"):

@@ -7,7 +7,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar, NoReturn, TypeVar
 
+import tyro
+
 FAILED, WRONG_INPUT, INTERRUPTED = 1, 2, 130
+
+Flag = tyro.conf.FlagCreatePairsOff[bool]
+"""An option that is off unless given. Settings have a pair, --name and --no-name: a preset may turn them on."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,7 +25,7 @@ class Command(ABC):
     EXAMPLES: ClassVar[str] = ""
     """Command lines, one each line, for the command's own help."""
 
-    debug: bool = False
+    debug: Flag = False
     """Show the traceback of an error."""
 
     @classmethod

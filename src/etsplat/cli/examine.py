@@ -2,7 +2,7 @@
 
 import os
 import platform
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 
 import torch
 from rich.console import Console
@@ -88,6 +88,13 @@ def _gpu() -> str:
     return f"cuda, on {torch.cuda.get_device_name()}; compiled kernels in {cache_folder()}"
 
 
+def _extra(name: str, package: str) -> str:
+    try:
+        return f"{package} {version(package)}"
+    except PackageNotFoundError:
+        return f"missing: pip install 'etsplat[{name}]'"
+
+
 def _optional() -> list[tuple[str, str]]:
     weights = find_lpips_weights(None)
     found = ", ".join(map(str, weights.paths)) or f"missing, so lpips in metrics.json is null: {weights.reason}"
@@ -95,4 +102,8 @@ def _optional() -> list[tuple[str, str]]:
         ("LPIPS weights", found),
         ("compiler", "not needed: the native engine is compiled already"),
         ("GPU (CUDA)", _gpu()),
+        ("etsplat data sfm", _extra("sfm", "pycolmap")),
+        ("etsplat view", _extra("viewer", "viser")),
+        ("videos", _extra("video", "imageio-ffmpeg")),
+        ("--tensorboard", _extra("tensorboard", "tensorboard")),
     ]

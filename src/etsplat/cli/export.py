@@ -18,16 +18,19 @@ class Export(Command):
     """Write a trained soup for Blender, MeshLab, three.js or Unity; or turn another program's file into a soup."""
 
     EXAMPLES: ClassVar[str] = """
-    etsplat export runs/kitchen --format glb
+    etsplat export runs/kitchen
+    etsplat export runs/kitchen --out kitchen.ply
     etsplat export runs/kitchen --format ply --colors keep --min-opacity 0 --up keep
     etsplat export point_cloud_state_dict.pt --format safetensors
     """
 
     run_dir: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(name="dir")]
     """A run of `etsplat train`; or a file: .safetensors, .pt of Triangle Splatting, Gaussian .ply, or a mesh."""
-    format: Literal["ply", "obj", "off", "glb", "safetensors"] = "glb"
-    """Kind of file: glb for Blender, three.js and Unity; ply for MeshLab and Open3D (glb is too dark there);
-    obj and off for others; safetensors for etsplat."""
+    format: Literal["ply", "obj", "off", "glb", "safetensors"] | None = None
+    """Kind of file; by default what --out ends in, or glb.
+    glb: for Blender, three.js and Unity;
+    ply: for MeshLab and Open3D (glb is too dark there);
+    obj and off: for others; safetensors: for etsplat."""
     out: Path | None = None
     """The file to write; by default soup.FORMAT in the run's folder."""
     scene: Path | None = None
@@ -48,12 +51,14 @@ class Export(Command):
         from etsplat.tasks.soup_run import open_run
 
         opened = open_run(self.run_dir, self.scene, self.device)
-        out = self.out or opened.folder / f"soup.{self.format}"
-        if out.suffix != f".{self.format}":
-            raise InputError(f"--out {out}: does not end in .{self.format}; rename it or change --format")
+        out = self.out or opened.folder / f"soup.{self.format or 'glb'}"
+        kinds = [self.format] if self.format else ["ply", "obj", "off", "glb", "safetensors"]
+        if out.suffix.removeprefix(".") not in kinds:
+            raise InputError(f"--out {out}: does not end in .{' or .'.join(kinds)}; rename it or change --format")
         read = self.run_dir / "soup.safetensors" if self.run_dir.is_dir() else self.run_dir
         if out.resolve() == read.resolve():
             raise InputError(f"--out {out}: is what is read; choose another file")
         written = export_soup(opened, out, self.settings)
-        print(f"{written.path}: {written.triangles:,} triangles, {written.dropped:,} fainter ones left out")
+        left_out = f", {written.dropped:,} fainter ones left out" if written.dropped else ""
+        print(f"{written.path}: {written.triangles:,} triangles{left_out}")
         return 0

@@ -79,7 +79,7 @@ def parse(arguments: Sequence[str]) -> Command:
         prog="etsplat",
         description=_ETSPLAT,
         args=list(arguments) or ["--help"],
-        config=(tyro.conf.FlagCreatePairsOff, tyro.conf.OmitSubcommandPrefixes),
+        config=(tyro.conf.OmitSubcommandPrefixes,),
     )
     return parsed if isinstance(parsed, Command) else parsed.command
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import tyro
 
-from etsplat.cli.command import Command, preset_of
+from etsplat.cli.command import Command, Flag, preset_of
 from etsplat.cli.running import run_task
 from etsplat.tasks.reconstruct_config import PRESETS, ReconstructConfig
 
@@ -30,9 +30,9 @@ class Demo(Command):
     settings: Settings
     out: Path = Path("runs/demo")
     """Folder for the results."""
-    overwrite: bool = False
+    overwrite: Flag = False
     """Replace an earlier run in the folder."""
-    resume: bool = False
+    resume: Flag = False
     """Continue an interrupted run in the folder."""
 
     @classmethod
@@ -66,9 +66,9 @@ class Reconstruct(Command):
     """Start from this mesh instead of a sphere; in the units of the source."""
     masks: Path | None = None
     """Folder with a mask (white inside the object) for every image; else masks/ of the source, or transparency."""
-    overwrite: bool = False
+    overwrite: Flag = False
     """Replace an earlier run in the folder."""
-    resume: bool = False
+    resume: Flag = False
     """Continue an interrupted run in the folder; give the same options as then."""
 
     @classmethod

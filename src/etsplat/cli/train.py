@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import tyro
 
-from etsplat.cli.command import Command, option_value
+from etsplat.cli.command import Command, Flag, option_value
 from etsplat.cli.running import run_task
 from etsplat.tasks.train_config import PRESET_NAMES, SCENE_TYPE_NAMES, TrainConfig, train_settings
 
@@ -46,11 +46,11 @@ class Train(Command):
     """Folder in the scene to take the photos from, such as images_4."""
     masks: Path | None = None
     """Folder with a mask for every photo, white where pixels count."""
-    tensorboard: bool = False
+    tensorboard: Flag = False
     """Write curves for tensorboard into the folder as well."""
-    overwrite: bool = False
+    overwrite: Flag = False
     """Replace an earlier run in the folder."""
-    resume: bool = False
+    resume: Flag = False
     """Continue an interrupted run in the folder; give the same options as then."""
 
     @classmethod
@@ -77,9 +77,9 @@ class DemoScene(Command):
     settings: Settings
     out: Path = Path("runs/demo_scene")
     """Folder for the results."""
-    overwrite: bool = False
+    overwrite: Flag = False
     """Replace an earlier run in the folder."""
-    resume: bool = False
+    resume: Flag = False
     """Continue an interrupted run in the folder."""
     images: ClassVar[None] = None
     masks: ClassVar[None] = None

@@ -25,7 +25,8 @@ def read_scene(path: Path | str, masks: Path | str | None = None, *, images: str
     """
     path = Path(path)
     if not path.is_dir():
-        raise InputError(f"scene {path}: no such folder; check the path")
+        wrong = "is a file; name the scene's folder" if path.is_file() else "no such folder; check the path"
+        raise InputError(f"scene {path}: {wrong}")
     if images is not None and not (path / images).is_dir():
         raise InputError(f"scene {path}: no folder {images} in it; choose another or leave it out")
     if any((path / name).is_file() for name in ("transforms.json", "transforms_train.json")):

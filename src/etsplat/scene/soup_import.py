@@ -60,8 +60,8 @@ def _read_triangle_splatting(path: Path) -> SoupFile:
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
     except (RuntimeError, OSError, EOFError, ValueError, pickle.UnpicklingError) as error:
-        detail = (str(error) or type(error).__name__).splitlines()[0]
-        raise InputError(f"soup {path}: cannot be read as a state dict ({detail}); save it again") from error
+        # torch's own words would have the reader run whatever code is in the file.
+        raise InputError(f"soup {path}: cannot be read as a state dict of tensors alone; save it again") from error
     if not isinstance(state, dict) or not all(isinstance(state.get(key), Tensor) for key in _TS_KEYS):
         raise InputError(f"soup {path}: lacks keys of Triangle Splatting's point_cloud_state_dict.pt")
     points, sigma, opacity, dc, rest = (state[key].detach().float() for key in _TS_KEYS)

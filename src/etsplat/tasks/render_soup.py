@@ -48,6 +48,8 @@ def render_run(
         InputError: the run has no capture or no views of that kind; MP4 cannot be written; the disk is full.
     """
     out = Path(out)
+    if out.is_file() or out.suffix.lower() in (".mp4", ".png"):
+        raise InputError(f"{out}: pictures get names of their own; name a folder for them")
     names, cameras = views_of(run.needed_capture(), config)
     try:
         out.mkdir(parents=True, exist_ok=True)

@@ -199,7 +199,9 @@ def _check(capture: Capture, config: TrainConfig, device: torch.device) -> list[
             f"max_triangles: {config.max_triangles:,} triangles may need {needed / 2**30:.1f} GiB and "
             f"{free / 2**30:.1f} GiB are free; set it to {fitting} or less"
         )
-    notes = [f"{len(capture.train)} photos to train on, {len(capture.test)} to test; at most {_gib(needed)} of memory"]
+    notes = [
+        f"{len(capture.train)} photos to train on, {len(capture.test)} to test; at most {_amount(needed)} of memory"
+    ]
     if capture.images.streamed:
         notes.append("the photos do not fit into memory: they are decoded anew whenever they are needed")
     if capture.exact_points is None:
@@ -220,8 +222,8 @@ def _doubtful_scale(capture: Capture, config: TrainConfig) -> str | None:
     )
 
 
-def _gib(count: int) -> str:
-    return f"{count / 2**30:.1f} GiB"
+def _amount(count: int) -> str:
+    return f"{count / 2**30:.1f} GiB" if count >= 2**30 else f"{count >> 20} MiB"
 
 
 def _start_count(capture: Capture, config: TrainConfig) -> int:
