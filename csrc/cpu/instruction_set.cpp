@@ -3,10 +3,7 @@
 #include <atomic>
 #include <stdexcept>
 
-#include "simd/normals_kernels.h"
-#include "simd/photometric_kernels.h"
-#include "simd/raster_kernels.h"
-#include "simd/triangle_kernels.h"
+#include "simd/paths.h"
 
 #if defined(ETSPLAT_X86) && defined(_MSC_VER)
 #include <intrin.h>

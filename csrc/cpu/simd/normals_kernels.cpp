@@ -1,5 +1,5 @@
 // The comparison of normals for one instruction set. CMake compiles this file once for each (ETSPLAT_SIMD).
-#include "normals_kernels.h"
+#include "paths.h"
 
 #include "normals.h"
 

@@ -1,5 +1,5 @@
 // The photometric loops for one instruction set. CMake compiles this file once for each (ETSPLAT_SIMD).
-#include "photometric_kernels.h"
+#include "paths.h"
 
 #include "photometric.h"
 

@@ -1,5 +1,5 @@
 // The tile loops for one instruction set. CMake compiles this file once for each (ETSPLAT_SIMD).
-#include "raster_kernels.h"
+#include "paths.h"
 
 #include "diagnostics.h"
 #include "tile_backward.h"

@@ -1,5 +1,5 @@
 // The triangle loops for one instruction set. CMake compiles this file once for each (ETSPLAT_SIMD).
-#include "triangle_kernels.h"
+#include "paths.h"
 
 #include "project.h"
 #include "reduce.h"
