@@ -55,13 +55,6 @@ SUMMARY = {
 }
 """Table famous: PSNR, SSIM, LPIPS and Chamfer distance, means over the 21 objects."""
 
-REGULARIZERS = {
-    "lambda_edge": (0.891, 0.607, 2.097),
-    "lambda_normal": (0.648, 0.607, 0.666),
-    "lambda_laplacian": (0.694, 0.607, 1.935),
-}
-"""Table reg_ablation: Chamfer distance at 0.1, 1 and 10 times the weight, on a subset that the paper does not name."""
-
 
 def paper_chamfer(name: str, variant: str) -> float | None:
     """What table famous_cd says, times 1000; None where it says nothing."""

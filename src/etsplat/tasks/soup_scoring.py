@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from etsplat.io.images import save_image
+from etsplat.io.images import over_background, save_image
 from etsplat.metrics.image import psnr, ssim
 from etsplat.scene.capture_views import CaptureViews
 from etsplat.scene.captures import Capture
@@ -78,7 +78,7 @@ class SoupScorer:
     def photo(self, view: int) -> Float[Tensor, "H W 3"]:
         """The photograph of a view, over the background."""
         photo = self._views.photo(view).float() / 255
-        return photo[..., :3] if photo.shape[-1] == 3 else photo[..., :3] + (1 - photo[..., 3:]) * self._background
+        return photo if photo.shape[-1] == 3 else over_background(photo, self._background)
 
     def masked(self, picture: Tensor, photo: Tensor, view: int) -> Float[Tensor, "H W 3"]:
         """The picture, with the photograph's pixels where the view's mask excludes them."""
