@@ -69,6 +69,16 @@ def mesh(rng: torch.Generator, level: int = 2, width: int = 48, height: int = 40
     }
 
 
+def colored(layout: str, rng: torch.Generator) -> Scene:
+    """A scene with colours "per_view", or interpolated ones "per_corner" or, of a mesh, "per_vertex"."""
+    scene = mesh(rng) if layout == "per_vertex" else soup(rng, 80)
+    if layout == "per_view":
+        return {**scene, "colors": torch.rand(2, 80, 3, generator=rng)}
+    del scene["colors"]
+    shape = (len(scene["vertices"]), 3) if layout == "per_vertex" else (80, 3, 3)
+    return {**scene, "corner_colors": torch.rand(shape, generator=rng)}
+
+
 def facing(corners: list[tuple[float, float]], z: float = 2.0, size: int = 16, opacity: float = 0.9) -> Scene:
     """One triangle in the plane z whose projection has the given pixel coordinates, seen from the origin along +z."""
     focal, middle = float(size), size / 2

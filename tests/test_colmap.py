@@ -3,6 +3,7 @@ import struct
 import pytest
 import torch
 
+from captures import quaternion
 from etsplat.core.errors import InputError
 from etsplat.io.images import save_image
 from etsplat.scene.colmap import read_colmap
@@ -26,21 +27,6 @@ def load_transforms(folder, width=None):
 @pytest.fixture(scope="module")
 def truth():
     return photograph(demo_object(), 40, 30, elevations=(-30.0, 20.0), azimuths=5, supersampling=2)
-
-
-def quaternion(rotation):
-    """Unit quaternion (w, x, y, z) of a rotation matrix: the null vector of a symmetric 4x4 problem (Bar-Itzhack)."""
-    r = rotation.double()
-    k = torch.tensor(
-        [
-            [r[0, 0] - r[1, 1] - r[2, 2], 0, 0, 0],
-            [r[0, 1] + r[1, 0], r[1, 1] - r[0, 0] - r[2, 2], 0, 0],
-            [r[0, 2] + r[2, 0], r[1, 2] + r[2, 1], r[2, 2] - r[0, 0] - r[1, 1], 0],
-            [r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1], r[0, 0] + r[1, 1] + r[2, 2]],
-        ]
-    )
-    x, y, z, w = torch.linalg.eigh(k, UPLO="L").eigenvectors[:, -1].tolist()
-    return w, x, y, z
 
 
 def write_scene(folder, views, binary, model=("PINHOLE", 1)):

@@ -1,7 +1,6 @@
 """Whole steps of shape reconstruction on the GPU engine, by the shim and, where there is one, on a GPU."""
 
 import math
-from collections.abc import Hashable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,6 @@ import pytest
 import torch
 
 from etsplat.cuda.graph import Repeated
-from etsplat.ops import _raster_capacity
 from etsplat.optim.loop import Progress
 from etsplat.scene.demo_object import demo_object
 from etsplat.scene.photograph import photograph
@@ -21,7 +19,7 @@ from etsplat.tasks.reconstruct_config import PRESETS, ReconstructConfig
 from etsplat.tasks.sources import make_start
 from simt.build import Simt
 from simt.calls import Calls
-from simt.room import room_for_16_pairs
+from simt.room import room_for_16_pairs, second_step_overflows
 
 CPU = torch.device("cpu")
 # 320 faces, subdivided after iterations 2 and 5.
@@ -126,24 +124,13 @@ def test_a_queued_step_reads_nothing_back(simt: Simt, views: PosedViews, method:
     assert calls.kernels() <= kernels
 
 
-def test_a_step_whose_buffers_overflow_is_made_again(simt: Simt, views: PosedViews, monkeypatch) -> None:
+def test_a_step_whose_buffers_overflow_is_made_again(simt: Simt, views: PosedViews) -> None:
     """While the flag is set nothing changes; after the repair the queue goes on where it stopped."""
     problem, undisturbed = fitting(views, "cuda"), fitting(views, "cuda")
-    flag = _raster_capacity.overflow_flag(problem.mesh.vertices.device)
-    steps = problem._queue
-    assert steps is not None
-    gradients, calls = steps._gradients, []
-
-    def overflowing(row: torch.Tensor, kind: Hashable) -> torch.Tensor:
-        calls.append(kind)
-        if len(calls) == 2:
-            flag.fill_(1000)
-        return gradients(row, kind)
-
-    monkeypatch.setattr(steps, "_gradients", overflowing)
-    assert run(problem, 2) == run(undisturbed, 2)
-    assert len(calls) == 3
-    assert int(flag) == 0
+    assert problem._queue is not None
+    with second_step_overflows(problem._queue, problem.mesh.vertices.device) as steps:
+        assert run(problem, 2) == run(undisturbed, 2)
+    assert len(steps) == 3
     for name, parameter in problem.mesh.parameters().items():
         assert torch.equal(parameter, undisturbed.mesh.parameters()[name])
 

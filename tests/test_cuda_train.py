@@ -1,7 +1,6 @@
 """Steps of a triangle soup on the GPU engine, by the shim and, where there is one, on a GPU."""
 
 import math
-from collections.abc import Callable, Hashable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,6 @@ import pytest
 import torch
 
 from etsplat.cuda.graph import Repeated
-from etsplat.ops import _raster_capacity
 from etsplat.optim.loop import Progress
 from etsplat.scene.capture_images import StoredImages
 from etsplat.scene.captures import Capture
@@ -21,7 +19,7 @@ from etsplat.tasks.train import train
 from etsplat.tasks.train_config import TrainConfig, train_settings
 from simt.build import Simt
 from simt.calls import Calls
-from simt.room import room_for_16_pairs
+from simt.room import room_for_16_pairs, second_step_overflows
 
 # Densified after iteration 3; the degree rises after iteration 4.
 CONFIG = replace(train_settings("tiny"), iterations=6, densify_every=15_000, densify_from=0, sh_every=20_000)
@@ -156,25 +154,13 @@ def test_a_queued_step_reads_nothing_back(simt: Simt, settings: Any, own: int, k
     assert calls.kernels() <= kernels
 
 
-def test_a_step_whose_buffers_overflow_is_made_again(simt: Simt, capture: Capture, monkeypatch) -> None:
+def test_a_step_whose_buffers_overflow_is_made_again(simt: Simt, capture: Capture) -> None:
     """While the flag is set nothing changes; after the repair the queue goes on where it stopped."""
     problem, undisturbed = fitting(capture, "cuda"), fitting(capture, "cuda")
-    flag = _raster_capacity.overflow_flag(CPU)
-    steps = problem._queue
-    assert steps is not None
-    gradients: Callable[[torch.Tensor, Hashable], torch.Tensor] = steps._gradients
-    calls: list[Hashable] = []
-
-    def overflowing(row: torch.Tensor, kind: Hashable) -> torch.Tensor:
-        calls.append(kind)
-        if len(calls) == 2:
-            flag.fill_(1000)
-        return gradients(row, kind)
-
-    monkeypatch.setattr(steps, "_gradients", overflowing)
-    assert run(problem, 3) == run(undisturbed, 3)
-    assert len(calls) == 5  # the second and what was queued behind it, twice
-    assert int(flag) == 0
+    assert problem._queue is not None
+    with second_step_overflows(problem._queue, CPU) as steps:
+        assert run(problem, 3) == run(undisturbed, 3)
+    assert len(steps) == 5  # the second and what was queued behind it, twice
     same_bits(problem, undisturbed)
 
 

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import test_rasterize_fuzz as fuzz
-from _scenes import EVERYTHING, IMAGES, NO_CUTOFFS, gradients, mesh, prepare, soup
+from _scenes import EVERYTHING, IMAGES, NO_CUTOFFS, colored, gradients, mesh, prepare, soup
 from etsplat import rasterize
 from etsplat.cuda.launch import use_backend
 from etsplat.ops import _raster_capacity
@@ -59,14 +59,7 @@ def test_parts_of_many_channels_leave_out_the_same_triangles(cuda_engine, rng):
 
 @pytest.mark.parametrize("layout", ["per_view", "per_corner", "per_vertex"])
 def test_color_layouts(cuda_engine, layout, rng):
-    scene = mesh(rng) if layout == "per_vertex" else soup(rng, 80)
-    if layout == "per_view":
-        scene["colors"] = torch.rand(2, 80, 3, generator=rng)
-    else:
-        del scene["colors"]
-        shape = (len(scene["vertices"]), 3) if layout == "per_vertex" else (80, 3, 3)
-        scene["corner_colors"] = torch.rand(shape, generator=rng)
-    compare(scene, cuda_engine, rng, **EVERYTHING)
+    compare(colored(layout, rng), cuda_engine, rng, **EVERYTHING)
 
 
 def test_frozen_incentre(cuda_engine, kernel, rng):

@@ -6,7 +6,7 @@ In float32 the reference itself is compared on all kernels and distances alone: 
 import pytest
 import torch
 
-from _scenes import EVERYTHING, IMAGES, gradients, mesh, soup
+from _scenes import EVERYTHING, IMAGES, colored, gradients, mesh, soup
 from _tolerances import assert_close_to_scale
 from etsplat import _native, num_threads, rasterize, set_num_threads
 from etsplat.geometry.icosphere import icosphere
@@ -107,14 +107,7 @@ def test_channels(channels, rng):
 
 @pytest.mark.parametrize("layout", ["per_view", "per_corner", "per_vertex"])
 def test_color_layouts(layout, rng):
-    scene = mesh(rng) if layout == "per_vertex" else soup(rng, 80)
-    if layout == "per_view":
-        scene["colors"] = torch.rand(2, 80, 3, generator=rng)
-    else:
-        del scene["colors"]
-        shape = (len(scene["vertices"]), 3) if layout == "per_vertex" else (80, 3, 3)
-        scene["corner_colors"] = torch.rand(shape, generator=rng)
-    compare(scene, "cpu", rng, **EVERYTHING)
+    compare(colored(layout, rng), "cpu", rng, **EVERYTHING)
 
 
 @pytest.mark.parametrize("depth", ["plane", "centroid"])

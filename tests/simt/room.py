@@ -1,6 +1,6 @@
 """Too little room for a step's pairs, so that it overflows and is repeated."""
 
-from collections.abc import Iterator
+from collections.abc import Hashable, Iterator
 from contextlib import contextmanager
 
 import pytest
@@ -26,3 +26,21 @@ def room_for_16_pairs() -> Iterator[list[bool]]:
         patch.setattr(_raster_capacity, "_FIRST_ROOM", 16)
         patch.setattr(_raster_capacity, "_FIRST_PER_TRIANGLE", 0)
         yield repairs
+
+
+@contextmanager
+def second_step_overflows(queue: step_queue.StepQueue, device: torch.device) -> Iterator[list[Hashable]]:
+    """The queue's second step finds too little room; yields the kind of every step made, repeated ones included."""
+    flag, gradients = _raster_capacity.overflow_flag(device), queue._gradients
+    kinds: list[Hashable] = []
+
+    def overflowing(row: torch.Tensor, kind: Hashable) -> torch.Tensor:
+        kinds.append(kind)
+        if len(kinds) == 2:
+            flag.fill_(1000)
+        return gradients(row, kind)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(queue, "_gradients", overflowing)
+        yield kinds
+    assert int(flag) == 0
