@@ -20,6 +20,47 @@ constexpr unsigned kSortAggregate = 1u << 30, kSortPrefix = 2u << 30, kSortValue
 
 __device__ __forceinline__ unsigned digit_of(unsigned key, int shift, int bits) { return key >> shift & ((1u << bits) - 1); }
 
+// Place among the pairs of a tile of this lane's item i: a warp has consecutive pairs, an item of all its lanes after the
+// other, so ranks in that order are stable.
+__device__ __forceinline__ unsigned place_of(int i) {
+    return static_cast<unsigned>((warp_index() * kSortItems + i) * kWarp + lane_index());
+}
+
+// This lane's keys, and how many equal digits come before each in its warp; `counts` (kDigits) of the warp start at 0 and
+// end as how many there are of each. All lanes call it.
+__device__ __forceinline__ void rank_in_warp(const unsigned* keys, unsigned here, int shift, int bits, unsigned* counts,
+                                             unsigned* key, unsigned* rank) {
+    const int lane = lane_index();
+    for (int i = 0; i < kSortItems; ++i) {
+        const unsigned at = place_of(i);
+        const bool inside = at < here;
+        key[i] = inside ? keys[at] : 0;
+        const unsigned digit = inside ? digit_of(key[i], shift, bits) : kDigits;
+        const unsigned equal = __match_any_sync(kAllLanes, digit);
+        const int leader = __ffs(static_cast<int>(equal)) - 1;
+        unsigned before = 0;
+        if (lane == leader && inside) {
+            before = counts[digit];
+            counts[digit] = before + __popc(equal);
+        }
+        rank[i] = __shfl_sync(kAllLanes, before, leader) + __popc(equal & ((1u << lane) - 1));
+        __syncwarp();
+    }
+}
+
+// The decoupled look-back: how many pairs with this digit the blocks before `block` have, once they have said so.
+__device__ __forceinline__ unsigned pairs_before(volatile unsigned* words, int block, int digit) {
+    unsigned before = 0;
+    for (int other = block - 1; other >= 0;) {
+        const unsigned word = words[other * kDigits + digit];
+        if (word >> 30 == 0) continue;
+        before += word & kSortValue;
+        if (word >> 30 == 2) break;
+        --other;
+    }
+    return before;
+}
+
 }  // namespace etsplat
 
 using namespace etsplat;
@@ -56,23 +97,8 @@ extern "C" __global__ void __launch_bounds__(256) radix_pass(const unsigned* key
     if (begin >= total) return;
     const unsigned here = total - begin < kSortTile ? total - begin : kSortTile;
 
-    // A warp has consecutive pairs, an item of all its lanes after the other: ranks in that order are stable.
     unsigned key[kSortItems], rank[kSortItems];
-    for (int i = 0; i < kSortItems; ++i) {
-        const unsigned at = static_cast<unsigned>((warp * kSortItems + i) * kWarp + lane);
-        const bool inside = at < here;
-        key[i] = inside ? keys_in[begin + at] : 0;
-        const unsigned digit = inside ? digit_of(key[i], shift, bits) : kDigits;
-        const unsigned equal = __match_any_sync(kAllLanes, digit);
-        const int leader = __ffs(static_cast<int>(equal)) - 1;
-        unsigned before = 0;
-        if (lane == leader && inside) {
-            before = warp_counts[warp][digit];
-            warp_counts[warp][digit] = before + __popc(equal);
-        }
-        rank[i] = __shfl_sync(kAllLanes, before, leader) + __popc(equal & ((1u << lane) - 1));
-        __syncwarp();
-    }
+    rank_in_warp(keys_in + begin, here, shift, bits, warp_counts[warp], key, rank);
     __syncthreads();
 
     // A thread per digit: its pairs in this block, then in the blocks before, then those of smaller digits.
@@ -96,21 +122,14 @@ extern "C" __global__ void __launch_bounds__(256) radix_pass(const unsigned* key
         smaller_here += scan_totals[0][w];
         target += scan_totals[1][w];
     }
-    unsigned before_block = 0;
-    for (int other = block - 1; other >= 0;) {
-        const unsigned word = words[other * kDigits + t];
-        if (word >> 30 == 0) continue;
-        before_block += word & kSortValue;
-        if (word >> 30 == 2) break;
-        --other;
-    }
+    const unsigned before_block = pairs_before(words, block, t);
     if (block > 0) words[block * kDigits + t] = kSortPrefix | (before_block + count_here);
     digit_begin[t] = smaller_here;
     digit_target[t] = target + before_block - smaller_here;
     __syncthreads();
 
     for (int i = 0; i < kSortItems; ++i) {
-        const unsigned at = static_cast<unsigned>((warp * kSortItems + i) * kWarp + lane);
+        const unsigned at = place_of(i);
         if (at >= here) continue;
         const unsigned digit = digit_of(key[i], shift, bits);
         const unsigned place = digit_begin[digit] + warp_counts[warp][digit] + rank[i];
