@@ -229,7 +229,6 @@ _QUICK: dict[str, Any] = {
     "lr_sh_rest": 0.0005,
     "lr_opacities": 0.05,
     "lr_sigma": 0.005,
-    "prune_importance": 0.005,
     "prune_views": 0,
     "lambda_opacity": 0.02,
     "lambda_normal": 0.0,
