@@ -80,7 +80,7 @@ def test_small_faces_do_not_count_as_far() -> None:
     vertices[patch] = center + 0.1 * (vertices[patch] - center)
     vertices[patch] += 0.01 * torch.randn(int(patch.sum()), 3, generator=torch.Generator().manual_seed(0))
     assert count_self_intersections(vertices, faces) > 0
-    untangled, left = untangle(vertices, topology, reach=0.31)
+    untangled, left = untangle(vertices, topology, reach=0.155)
     assert left == count_self_intersections(untangled, faces) == 0
 
 

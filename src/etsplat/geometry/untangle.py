@@ -28,10 +28,6 @@ _HOLDS = 6
 """Looks for intersections in an attempt, each holding more vertices in place."""
 
 
-_CHANCES = 2
-"""Times that everything is tried: in the second, folds that were given up no longer join what lies beside them."""
-
-
 def untangle(
     vertices: Float[Tensor, "V 3"], topology: MeshTopology, *, rounds: int = 40, reach: float = math.inf
 ) -> tuple[Float[Tensor, "V 3"], int]:
@@ -42,8 +38,7 @@ def untangle(
     2. What smoothing moved goes back towards its old place, as far as that makes no face intersect anew: folds end
        where they touch instead of flat.
     3. Where a vertex still ends too far away, all that moved together with it returns to its old place, intersections
-       included: folds so large hold up the shape, as where a sphere stands for an object with holes. What only lay
-       beside such a fold has another chance, now that the rest is put right.
+       included: folds so large hold up the shape, as where a sphere stands for an object with holes.
 
     All other vertices stay where they are. Boundary vertices may shrink inwards. Computed on the CPU.
 
@@ -51,33 +46,26 @@ def untangle(
         vertices: (V, 3) finite.
         topology: of the mesh.
         rounds: most looks for intersections in step 1.
-        reach: how far a vertex may go, in mean edge lengths of the mesh. (Its own edges are short where it is folded.)
+        reach: how far a vertex may go, in lengths of its longest edge, or of two mean edges of the mesh if that is
+            more: where it is folded its own are short.
 
     Returns:
         Moved vertices, and how many faces still intersect.
     """
-    device, faces = vertices.device, topology.faces.cpu()
-    vertices = vertices.detach().cpu()
-    for _ in range(_CHANCES):
-        original = vertices
-        vertices = _repaired(original, topology, rounds)
-        lost = _too_far(vertices, original, topology, reach)
-        vertices[lost] = original[lost]
-        if not bool(lost.any()):
-            break
-    return vertices.to(device), int(intersecting_faces(vertices, faces).sum())
-
-
-def _repaired(original: Float[Tensor, "V 3"], topology: MeshTopology, rounds: int) -> Float[Tensor, "V 3"]:
-    """Steps 1 and 2."""
-    vertices, faces = original.clone(), topology.faces.cpu()
-    marked = intersecting_faces(vertices, faces)
+    original, faces = vertices.detach().cpu(), topology.faces.cpu()
+    moved = original.clone()
+    marked = intersecting_faces(moved, faces)
     for done in range(rounds):
         if not bool(marked.any()):
             break
-        _smooth(vertices, topology, _region(marked, topology, rings=done // _WIDEN))
-        marked = intersecting_faces(vertices, faces)
-    return _returned(vertices, original, topology, marked)
+        _smooth(moved, topology, _region(marked, topology, rings=done // _WIDEN))
+        marked = intersecting_faces(moved, faces)
+    moved = _returned(moved, original, topology, marked)
+    lost = _too_far(moved, original, topology, reach)
+    if bool(lost.any()):
+        moved[lost] = original[lost]
+        marked = intersecting_faces(moved, faces)
+    return moved.to(vertices.device), int(marked.sum())
 
 
 def _returned(
@@ -107,11 +95,14 @@ def _returned(
 def _too_far(
     vertices: Float[Tensor, "V 3"], original: Float[Tensor, "V 3"], topology: MeshTopology, reach: float
 ) -> Bool[Tensor, " V"]:
-    """Vertices that moved together, by edges, with one that moved more than `reach` times the mean edge length."""
+    """Vertices that moved together, by edges, with one that moved too far."""
     first, second = topology.edges.cpu().unbind(1)
-    mean_edge = (original[first] - original[second]).norm(dim=1).mean()
+    lengths = (original[first] - original[second]).norm(dim=1)
+    unit = (2.0 * lengths.mean()).repeat(len(original))
+    for end in (first, second):
+        unit.scatter_reduce_(0, end, lengths, "amax")
     distance = (vertices - original).norm(dim=1)
-    moved, lost = distance > 0, distance > reach * mean_edge
+    moved, lost = distance > 0, distance > reach * unit
     together = moved[first] & moved[second]
     while True:
         grown = lost.clone()

@@ -201,7 +201,7 @@ class MeshFitting:
         topology = mesh.topology.to(torch.device("cpu"))
         if iteration in self._untanglings:
             # What smoothing takes away later steps bring back, but nothing does after the last.
-            reach = 1.0 if iteration == self._config.iterations else math.inf
+            reach = 0.5 if iteration == self._config.iterations else math.inf
             with torch.no_grad():
                 mesh.vertices.copy_(untangle(mesh.vertices.cpu(), topology, reach=reach)[0])
         if iteration not in self._budgets:
