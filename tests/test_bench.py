@@ -52,6 +52,12 @@ def test_runs_end_and_failures_are_told(grid: tuple[Path, list[Cell]]) -> None:
     assert all("broken.obj" in cell.error and "\n" not in cell.error for cell in grid[1] if cell.state == "failed")
 
 
+def test_a_grid_of_nothing_is_refused() -> None:
+    """As `--seeds` without a number asks for."""
+    with pytest.raises(InputError, match="nothing to run"):
+        run_grid([], 1, lambda: None)
+
+
 def test_finished_runs_are_not_repeated(grid: tuple[Path, list[Cell]]) -> None:
     """A second grid over the same folder finds its runs done; with another setting they are not taken for its own."""
     folder, _ = grid

@@ -134,6 +134,20 @@ def test_doctor_tells_what_there_is(etsplat: Run) -> None:
         assert word in result.stdout
 
 
+@pytest.mark.parametrize(
+    ("arguments", "name"),
+    [
+        (["export", "run", "--min-opacity", "5"], "min_opacity: is 5"),
+        (["view", "run", "--width", "0"], "width: is 0"),
+        (["view", "run", "--port", "99999"], "port: is 99999"),
+    ],
+)
+def test_numbers_out_of_range_are_named(arguments: list[str], name: str) -> None:
+    """Before anything is read, let alone drawn or served."""
+    with pytest.raises(InputError, match=name):
+        parse(arguments).run([])
+
+
 @pytest.mark.parametrize("preset", ["quick", "paper"])
 def test_a_setting_that_a_preset_may_turn_on_is_turned_on_and_off_by_name(preset: str) -> None:
     """Whatever the preset says, --normalize and --no-normalize exist; --resume has no such pair."""

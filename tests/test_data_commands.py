@@ -43,6 +43,8 @@ def test_folders_that_cannot_be_used_are_input_errors(tmp_path):
         write_photo(tmp_path / "photos" / f"{name}.jpg", 16, 12)
     with pytest.raises(InputError, match="is there already"):
         find_cameras(tmp_path / "photos", tmp_path)
+    with pytest.raises(InputError, match="max_size: is 0; it must be at least 16"):
+        find_cameras(tmp_path / "photos", tmp_path / "scene", max_size=0)
 
 
 def test_a_disk_too_small_is_found_before_it_is_full(tmp_path, monkeypatch):

@@ -92,7 +92,12 @@ def run_grid(cells: Sequence[Cell], jobs: int, show: Callable[[], None]) -> None
         cells: changed in place.
         jobs: processes beside each other; they share the cores evenly.
         show: called about twice a second, and after every change.
+
+    Raises:
+        InputError: there is no cell.
     """
+    if not cells:
+        raise InputError("there is nothing to run: name at least one of everything that is compared, and one seed")
     waiting = [cell for cell in cells if cell.state == "waiting"]
     jobs = max(1, min(jobs, len(waiting)))
     threads = max(1, num_threads() // jobs)

@@ -9,6 +9,7 @@ from typing import Annotated, ClassVar, Literal
 import tyro
 
 from etsplat.cli.command import Command
+from etsplat.core.errors import InputError
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,6 +45,9 @@ class View(Command):
 
     def run(self, arguments: Sequence[str]) -> int:
         """Serves until Ctrl-C."""
+        for name, value, low, high in (("width", self.width, 16, 8192), ("port", self.port, 0, 65535)):
+            if not low <= value <= high:
+                raise InputError(f"{name}: is {value}; it must be between {low} and {high}")
         from etsplat.tasks.soup_run import open_run
         from etsplat.viewer.follow import wait_for_soup
         from etsplat.viewer.server import serve

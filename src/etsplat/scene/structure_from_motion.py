@@ -8,7 +8,7 @@ from typing import Literal
 from etsplat.core.errors import InputError
 from etsplat.io.images import IMAGE_SUFFIXES, image_size
 from etsplat.scene.colmap_process import Progress, import_pycolmap, place_photos, run_apart
-from etsplat.scene.undistortion import check_new, check_space, undistort_model, working_folder
+from etsplat.scene.undistortion import check_output, check_space, undistort_model, working_folder
 
 Matching = Literal["auto", "exhaustive", "sequential"]
 
@@ -64,7 +64,7 @@ def find_cameras(
     pycolmap = import_pycolmap()
     photos, out = Path(photos), Path(out)
     names = _photo_names(photos)
-    check_new(out)
+    check_output(out, max_size)
     files = [photos / name for name in names]
     check_space(out, files, BYTES_PER_PHOTO * len(files))
     report = progress or (lambda phase, done, total: None)

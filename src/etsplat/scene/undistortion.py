@@ -18,6 +18,9 @@ from etsplat.scene.colmap_process import import_pycolmap, run_apart, undistort_i
 from etsplat.scene.frames import find_mask, scaled_intrinsics
 from etsplat.scene.transforms import DistortedFrames, read_distorted_transforms
 
+LEAST_SIZE = 16
+"""Pixels of the longer side of an image."""
+
 _GROWTH, _SPARE_BYTES = 4, 1 << 20
 """COLMAP writes JPEG with few losses: files grow. Beside them lies the model."""
 
@@ -43,7 +46,7 @@ def undistort_scene(scene: Path | str, out: Path | str, *, max_size: int = 1600)
     colmap = find_model(scene)
     if colmap is None and not (scene / "transforms.json").is_file():
         raise InputError(f"scene {scene}: neither sparse/0/cameras.bin or .txt nor transforms.json; choose a scene")
-    check_new(out)
+    check_output(out, max_size)
     if colmap is not None:
         model, photos, masks = _read_model(pycolmap, scene, colmap)
     else:
@@ -84,8 +87,10 @@ def undistort_model(model: Any, photos: Path, names: list[str], work: Path, max_
         raise InputError(f"{work.parent}: {written} of {len(names)} images could be written; is the disk full?")
 
 
-def check_new(out: Path) -> None:
-    """Raises InputError if `out` exists and is not an empty folder, or cannot be made."""
+def check_output(out: Path, max_size: int) -> None:
+    """Raises InputError if `out` exists and is not an empty folder, or cannot be made; or if images would vanish."""
+    if max_size < LEAST_SIZE:
+        raise InputError(f"max_size: is {max_size}; it must be at least {LEAST_SIZE}")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"{out}: is there already and not empty; choose another folder for the scene")
     try:

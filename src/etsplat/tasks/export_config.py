@@ -3,6 +3,8 @@
 from dataclasses import dataclass
 from typing import Literal
 
+from etsplat.core.errors import InputError
+
 Bake = Literal["mean", "constant", "keep"]
 
 
@@ -24,4 +26,4 @@ class ExportConfig:
 
     def __post_init__(self) -> None:
         if self.min_opacity is not None and not 0 <= self.min_opacity <= 1:
-            raise ValueError(f"min_opacity: expected a number from 0 to 1, got {self.min_opacity}")
+            raise InputError(f"min_opacity: is {self.min_opacity}; it must be between 0 and 1")
