@@ -8,6 +8,7 @@ import torch
 
 from captures import write_colmap, write_photo
 from etsplat.core.errors import InputError
+from etsplat.io.run_directory import RunDirectory
 from etsplat.optim.loop import CheckpointEvent
 from etsplat.scene.soup_files import load_soup
 from etsplat.tasks.evaluate_soup import evaluate_run
@@ -57,6 +58,12 @@ def test_a_scene_that_moved_is_named_with_an_option(trained, tmp_path):
     with pytest.raises(InputError, match=r"has gone; name where it is now with --scene"):
         open_run(tmp_path / "run")
     assert len(open_run(tmp_path / "run", tmp_path / "moved").capture) == 9
+
+
+def test_a_reconstruction_is_told_where_its_mesh_is(tmp_path):
+    RunDirectory.create(tmp_path / "mesh", {"task": "reconstruct", "config": {}})
+    with pytest.raises(InputError, match=r"mesh\.glb opens in any mesh viewer.*name a run of `etsplat train`"):
+        open_run(tmp_path / "mesh")
 
 
 def test_folders_without_a_soup_are_input_errors(tmp_path, trained):

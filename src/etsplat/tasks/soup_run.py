@@ -72,6 +72,22 @@ def open_run(path: Path | str, scene: Path | str | None = None, device: str | No
     return SoupRun(path, open_soup(path).to(place), None if scene is None else load_capture(scene, preload=False))
 
 
+def check_trains(run: Path) -> None:
+    """Sees to it that a run is one that has a soup, or will have.
+
+    Raises:
+        InputError: it is another kind of run.
+    """
+    task = RunDirectory(run).read_config()["task"]
+    if task == "reconstruct":
+        raise InputError(
+            f"{run}: is a run of `etsplat reconstruct`: its mesh.glb opens in any mesh viewer, its report.html has the "
+            "numbers; name a run of `etsplat train`"
+        )
+    if task != "train":
+        raise InputError(f"{run}: is no run of `etsplat train`; name another")
+
+
 def world_up(viewmats: Float[Tensor, "B 4 4"]) -> Float[Tensor, "3"] | None:
     """Where up is in the world: the mean of the cameras' own up directions; None if they contradict each other."""
     up = -viewmats[:, 1, :3].double().mean(dim=0)
@@ -88,6 +104,7 @@ def training_cameras(capture: Capture) -> list[Cameras]:
 def _open_directory(path: Path, scene: Path | str | None, device: torch.device) -> SoupRun:
     if not is_run(path):
         raise InputError(f"{path}: is not a run of etsplat; name a folder that was given to --out, or a soup's file")
+    check_trains(path)
     if not (path / SOUP_NAME).is_file():
         raise InputError(f"{path}: has no {SOUP_NAME} (yet); name a run of `etsplat train` that got to a checkpoint")
     file = load_soup(path / SOUP_NAME).to(device)

@@ -9,6 +9,7 @@ import torch
 from etsplat.core.errors import InputError
 from etsplat.io.run_directory import RunDirectory, is_run
 from etsplat.scene.soup_files import SoupFile, load_soup
+from etsplat.tasks.soup_run import check_trains
 
 WAITING_SECONDS = 1.0
 
@@ -28,8 +29,8 @@ def wait_for_soup(folder: Path, announce: Callable[[str], None]) -> None:
     told = ""
     while not RunDirectory(folder).soup_path.is_file():
         begun = is_run(folder)
-        if begun and RunDirectory(folder).read_config()["task"] != "train":
-            raise InputError(f"{folder}: is no run of `etsplat train`; name another")
+        if begun:
+            check_trains(folder)
         text = f"{folder}: waiting for " + ("the first checkpoint" if begun else "`etsplat train` to begin there")
         if text != told:
             announce(told := text)
