@@ -231,7 +231,6 @@ _QUICK: dict[str, Any] = {
     "lr_sigma": 0.005,
     "prune_importance": 0.005,
     "prune_views": 0,
-    "lambda_opacity": 0.02,
     "lambda_normal": 0.0,
     "lambda_distortion": 0.0,
     "lambda_size": 0.0,
@@ -239,7 +238,7 @@ _QUICK: dict[str, Any] = {
     "checkpoint_every": 500,
 }
 
-_QUICK_OBJECT: dict[str, Any] = {"lr_vertices": 0.001, "lambda_opacity": 0.0044}
+_QUICK_OBJECT: dict[str, Any] = {"lr_vertices": 0.001}
 """An object is small in the frame that its cameras span: at the rate of rooms its triangles never come to rest."""
 
 _PRESETS: dict[str, dict[str, Any]] = {
