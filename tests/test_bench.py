@@ -1,7 +1,15 @@
 """Grids of runs: what is compared, that nothing is done twice, and that the tables say what the runs came to."""
 
+import contextlib
 import json
+import os
+import shutil
+import signal
 import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -30,11 +38,19 @@ VARIANTS = [Variant("elastic", {}), Variant("raster-face", {"method": "raster-fa
 
 
 @pytest.fixture(scope="module")
-def grid(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Cell]]:
+def sphere(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A mesh file."""
+    vertices, faces = icosphere(2)
+    path = tmp_path_factory.mktemp("meshes") / "ball.ply"
+    save_mesh(path, 3 * vertices, faces)
+    return path
+
+
+@pytest.fixture(scope="module")
+def grid(sphere: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Cell]]:
     """Two objects, one of them unreadable, and two methods, run by two processes."""
     folder = tmp_path_factory.mktemp("grid")
-    vertices, faces = icosphere(2)
-    save_mesh(folder / "ball.ply", 3 * vertices, faces)
+    shutil.copy(sphere, folder)
     (folder / "broken.obj").write_text("v 0 0 0\n")
     cells = make_cells(find_meshes(folder, ()), VARIANTS, SHORT, [0], folder / "out")[:3]  # a process costs seconds
     run_grid(cells, 2, lambda: None)
@@ -50,6 +66,84 @@ def test_runs_end_and_failures_are_told(grid: tuple[Path, list[Cell]]) -> None:
         ("broken", "elastic"): "failed",
     }
     assert all("broken.obj" in cell.error and "\n" not in cell.error for cell in grid[1] if cell.state == "failed")
+
+
+GRID = """
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+from etsplat.bench.grid import make_cells, run_grid
+from etsplat.bench.variants import Variant
+from etsplat.tasks.reconstruct_config import PRESETS
+
+if __name__ == "__main__":
+    config = replace(PRESETS["tiny"], iterations=1_000_000, checkpoint_every=0)
+    cells = make_cells({"ball": Path("demo:owl")}, [Variant("long", {})], config, [0], Path())
+    run_grid(cells, 1, lambda: print(cells[0]._process.pid, flush=True))
+"""
+"""A program that runs a grid, of one cell, in the folder where it is started, and prints its worker's process."""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+def test_runs_are_interrupted_when_the_grid_is(number: signal.Signals, tmp_path: Path) -> None:
+    """Also when it is killed: the worker saves a checkpoint and ends, and says nothing."""
+    (tmp_path / "grid.py").write_text(GRID)
+    program = [sys.executable, "grid.py"]
+    process = subprocess.Popen(program, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    worker = int(process.stdout.readline())
+    folder = tmp_path / "runs" / "ball" / "long"
+    try:
+        wait_until(lambda: (folder / "history.jsonl").exists())
+        process.send_signal(number)
+        _, errors = process.communicate(timeout=20)  # which waits for the worker too: it has the same standard error
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(worker, signal.SIGKILL)
+    assert [path.suffix for path in (folder / "checkpoints").iterdir()] == [".safetensors"]  # whole
+    assert errors.count("Traceback") == (1 if number == signal.SIGINT else 0)  # of the program above
+
+
+def test_an_interrupt_while_processes_start_is_quiet(tmp_path: Path) -> None:
+    """Ctrl-C in a terminal reaches a worker too, which takes seconds to start; it ends without a word."""
+    (tmp_path / "grid.py").write_text(GRID)
+    pipe = subprocess.PIPE
+    process = subprocess.Popen(
+        [sys.executable, "grid.py"], cwd=tmp_path, stdout=pipe, stderr=pipe, text=True, start_new_session=True
+    )
+    assert process.stdout is not None
+    process.stdout.readline()
+    time.sleep(0.1)  # until Python is awake in the worker
+    os.killpg(process.pid, signal.SIGINT)
+    _, errors = process.communicate(timeout=20)
+    assert errors.count("Traceback") == 1  # of the program above
+    assert not list(tmp_path.glob("runs/ball/long/checkpoints/*"))
+
+
+def test_a_run_whose_folder_is_removed_fails_in_one_line(
+    sphere: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Its worker has nowhere to write what went wrong, and says it on standard error."""
+    config = replace(SHORT, checkpoint_every=1, iterations=1_000_000)
+    cells = make_cells({"ball": sphere}, VARIANTS[:1], config, [0], tmp_path / "out")
+
+    def remove() -> None:
+        if (cells[0].folder / "history.jsonl").exists():
+            (tmp_path / "out").rename(tmp_path / "gone")  # at once: a worker makes files while they are deleted
+
+    run_grid(cells, 1, remove)
+    assert (cells[0].state, cells[0].error) == ("failed", "ended with status 1")
+    errors = capfd.readouterr().err
+    assert "cannot write" in errors
+    assert errors.count("\n") == 1
+
+
+def wait_until(happened: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + 60
+    while not happened():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
 
 
 def test_a_grid_of_nothing_is_refused() -> None:

@@ -244,8 +244,11 @@ def test_demo_end_to_end_then_refuses_then_overwrites(etsplat: Run, tmp_path: Pa
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGINT for one subprocess")
-def test_interrupted_run_says_how_to_resume_and_resumes(etsplat: Run, sphere: Path, tmp_path: Path) -> None:
-    """Ctrl-C ends with status 130 and the command that continues; that command finishes the run."""
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_interrupted_run_says_how_to_resume_and_resumes(
+    number: signal.Signals, etsplat: Run, sphere: Path, tmp_path: Path
+) -> None:
+    """Ctrl-C ends with status 130 and the command that continues; that command finishes the run. So does SIGTERM."""
     run = tmp_path / "run"
     options = ["reconstruct", str(sphere), "--out", str(run), "--preset", "tiny", "--iterations", "1500"]
     options += ["--max-faces", "400", "--checkpoint-every", "0"]
@@ -254,7 +257,7 @@ def test_interrupted_run_says_how_to_resume_and_resumes(etsplat: Run, sphere: Pa
     deadline = time.monotonic() + 60
     while not (history.exists() and history.stat().st_size) and time.monotonic() < deadline:
         time.sleep(0.02)
-    process.send_signal(signal.SIGINT)
+    process.send_signal(number)
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 130, errors
     assert errors.count("\n") == 1

@@ -1,8 +1,13 @@
 """What `etsplat data sfm` and `etsplat data download` do."""
 
 import builtins
+import contextlib
 import math
+import os
 import shutil
+import signal
+import subprocess
+import sys
 import zipfile
 
 import numpy as np
@@ -199,6 +204,38 @@ def test_a_disk_that_is_full_all_of_a_sudden_is_one_line_and_nothing_stays(tmp_p
         undistort_scene(tmp_path / "scene", tmp_path / "new")
     assert "\n" not in str(raised.value)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["photos", "scene"]
+
+
+APART = """
+import os
+import time
+from pathlib import Path
+
+from etsplat.scene.colmap_process import run_apart
+
+
+def work(report):
+    report("here", os.getpid(), 0)
+    time.sleep(100)
+
+
+if __name__ == "__main__":
+    run_apart(Path(), work, report=lambda phase, done, total: print(done, flush=True))
+"""
+
+
+def test_colmap_ends_with_the_process_that_started_it(tmp_path):
+    """Also where that is killed, and can end nothing itself."""
+    pytest.importorskip("pycolmap")
+    (tmp_path / "apart.py").write_text(APART)
+    process = subprocess.Popen([sys.executable, "apart.py"], cwd=tmp_path, stdout=subprocess.PIPE, text=True)
+    colmap = int(process.stdout.readline())
+    process.kill()
+    try:
+        process.communicate(timeout=10)  # which waits for both: they have the same standard output
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(colmap, signal.SIGKILL)
 
 
 @pytest.fixture

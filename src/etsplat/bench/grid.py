@@ -12,18 +12,21 @@ import signal
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any
 
 from etsplat.bench.peers import PeerConfig
 from etsplat.bench.variants import Variant
 from etsplat.core.errors import InputError
+from etsplat.core.processes import when_parent_ends
 from etsplat.io.run_directory import RunDirectory, is_run
 from etsplat.ops.engines import num_threads
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.train_config import TrainConfig
 
 _POLL_SECONDS = 0.5
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 AnyConfig = ReconstructConfig | TrainConfig | PeerConfig
 """Settings of a run; what kind of run it is follows from them."""
@@ -88,6 +91,8 @@ def make_cells(
 def run_grid(cells: Sequence[Cell], jobs: int, show: Callable[[], None]) -> None:
     """Runs every cell that is waiting. Ctrl-C lets the runs save a checkpoint, then raises KeyboardInterrupt.
 
+    The processes do the same of their own accord when this one is killed.
+
     Args:
         cells: changed in place.
         jobs: processes beside each other; they share the cores evenly.
@@ -102,25 +107,17 @@ def run_grid(cells: Sequence[Cell], jobs: int, show: Callable[[], None]) -> None
     jobs = max(1, min(jobs, len(waiting)))
     threads = max(1, num_threads() // jobs)
     running: list[Cell] = []
-    context = multiprocessing.get_context("spawn")
     try:
         while waiting or running:
             while waiting and len(running) < jobs:
                 cell = waiting.pop(0)
-                cell.folder.parent.mkdir(parents=True, exist_ok=True)
-                _error_file(cell).unlink(missing_ok=True)
-                cell._process = context.Process(
-                    target=_work, args=(cell.mesh, cell.folder, cell.config, cell.images, threads)
-                )
-                cell._process.start()
-                cell.state = "running"
-                running.append(cell)
+                _start(cell, running, threads)
             show()
             time.sleep(_POLL_SECONDS)
             for cell in [cell for cell in running if not cell._process.is_alive()]:
                 running.remove(cell)
                 _conclude(cell)
-    except KeyboardInterrupt:
+    except BaseException:  # Ctrl-C, above all
         for cell in running:
             os.kill(cell._process.pid, signal.SIGINT)
         for cell in running:
@@ -128,6 +125,26 @@ def run_grid(cells: Sequence[Cell], jobs: int, show: Callable[[], None]) -> None
         raise
     finally:
         show()
+
+
+def _start(cell: Cell, running: list[Cell], threads: int) -> None:
+    """Gives it a process. Signals wait until it is among the running ones; in the process, until it is ready for them.
+
+    Without that, Ctrl-C in the seconds in which processes start would end them with tracebacks.
+    """
+    cell.folder.parent.mkdir(parents=True, exist_ok=True)
+    _error_file(cell).unlink(missing_ok=True)
+    cell._process = multiprocessing.get_context("spawn").Process(
+        target=_work, args=(cell.mesh, cell.folder, cell.config, cell.images, threads)
+    )
+    resource_tracker.ensure_running()  # which lets signals through (before Python 3.12)
+    signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)
+    try:
+        cell._process.start()
+        cell.state = "running"
+        running.append(cell)
+    finally:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, _SIGNALS)
 
 
 def _conclude(cell: Cell) -> None:
@@ -140,26 +157,37 @@ def _conclude(cell: Cell) -> None:
 
 
 def _work(mesh: Path, folder: Path, config: AnyConfig, images: str | None, threads: int) -> None:
-    """One run, in a process of its own."""
+    """One run, in a process of its own, which is interrupted when the one that started it ends."""
+    os.setpgrp()  # Ctrl-C in a terminal reaches the parent alone, which passes it on once: twice would kill
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs are started with it ignored
+    try:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, _SIGNALS)
+        when_parent_ends(lambda: os.kill(os.getpid(), signal.SIGINT))
+        _run(mesh, folder, config, images, threads)
+    except KeyboardInterrupt:
+        raise SystemExit(130) from None
+    except Exception as error:
+        text = " ".join(str(error).split()) or repr(error)
+        try:
+            _error_path(folder).write_text(text, encoding="utf-8")
+        except OSError:  # somebody removed the whole grid
+            raise SystemExit(f"etsplat: {text}") from None
+        raise SystemExit(1) from None
+
+
+def _run(mesh: Path, folder: Path, config: AnyConfig, images: str | None, threads: int) -> None:
     from etsplat.bench.train_peer import train_peer
     from etsplat.ops.engines import set_num_threads
     from etsplat.tasks.reconstruct import reconstruct
     from etsplat.tasks.train import train
 
-    os.setpgrp()  # Ctrl-C in a terminal reaches the parent alone, which passes it on once: twice would kill
     set_num_threads(threads)
-    try:
-        if isinstance(config, PeerConfig):
-            train_peer(mesh, folder, config, images=images)
-        elif isinstance(config, TrainConfig):
-            train(mesh, folder, config, images=images, resume=is_run(folder))
-        else:
-            reconstruct(mesh, folder, config, resume=is_run(folder))
-    except KeyboardInterrupt:
-        raise SystemExit(130) from None
-    except Exception as error:
-        _error_path(folder).write_text(" ".join(str(error).split()) or repr(error), encoding="utf-8")
-        raise SystemExit(1) from None
+    if isinstance(config, PeerConfig):
+        train_peer(mesh, folder, config, images=images)
+    elif isinstance(config, TrainConfig):
+        train(mesh, folder, config, images=images, resume=is_run(folder))
+    else:
+        reconstruct(mesh, folder, config, resume=is_run(folder))
 
 
 def _error_file(cell: Cell) -> Path:

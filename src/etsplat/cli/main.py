@@ -1,8 +1,10 @@
 """Runs the command that was asked for and turns errors into one line."""
 
 import os
+import signal
 import sys
 from importlib.metadata import version
+from types import FrameType
 from typing import NoReturn
 
 from etsplat.cli.command import FAILED, INTERRUPTED, WRONG_INPUT, fail
@@ -14,8 +16,10 @@ def main() -> NoReturn:
     """Entry point of the `etsplat` command.
 
     The process ends with 0; 1 if a run failed; 2 if the input or the options cannot be used; 130 after Ctrl-C.
+    SIGTERM, which asks a process to end, is taken for Ctrl-C, so that a run saves a checkpoint then too.
     """
     arguments = sys.argv[1:]
+    before = signal.signal(signal.SIGTERM, _interrupt)
     try:
         if arguments == ["--version"]:
             print(f"etsplat {version('etsplat')}")
@@ -30,3 +34,11 @@ def main() -> NoReturn:
         if "--debug" in arguments:
             raise
         fail(str(error), WRONG_INPUT)
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _interrupt(_: int, frame: FrameType | None) -> None:
+    """Does what Ctrl-C would do, also where that is ignored, as in a shell's background jobs."""
+    on_interrupt = signal.getsignal(signal.SIGINT)
+    (on_interrupt if callable(on_interrupt) else signal.default_int_handler)(signal.SIGINT, frame)

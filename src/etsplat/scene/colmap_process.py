@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from etsplat.core.errors import InputError
+from etsplat.core.processes import when_parent_ends
 
 Progress = Callable[[str, int, int], None]
 Result = TypeVar("Result")
@@ -43,7 +44,7 @@ def import_pycolmap() -> Any:
 
 
 def run_apart(work: Path, function: Callable[..., Result], *arguments: Any, report: Progress | None = None) -> Result:
-    """Calls `function(report, *arguments)` in a new process, which Ctrl-C ends at once.
+    """Calls `function(report, *arguments)` in a new process, which ends at once with Ctrl-C or with this process.
 
     Args:
         work: folder that it writes to.
@@ -82,6 +83,7 @@ def _serve(sender: Connection, function: Callable[..., Any], arguments: tuple[An
     for number in (signal.SIGABRT, signal.SIGSEGV, signal.SIGBUS):  # its handlers print stack traces, and may hang
         signal.signal(number, signal.SIG_DFL)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # whoever waits for the result ends this process
+    when_parent_ends(lambda: os._exit(1))
     os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # nobody reads what the libraries below COLMAP say at their end
     try:
         answer = ("result", function(lambda *state: sender.send(("progress", state)), *arguments))
