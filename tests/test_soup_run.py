@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from captures import write_colmap, write_photo
+from etsplat.cli.parse import parse
 from etsplat.core.errors import InputError
 from etsplat.io.run_directory import RunDirectory
 from etsplat.optim.loop import CheckpointEvent
@@ -64,6 +65,22 @@ def test_a_reconstruction_is_told_where_its_mesh_is(tmp_path):
     RunDirectory.create(tmp_path / "mesh", {"task": "reconstruct", "config": {}})
     with pytest.raises(InputError, match=r"mesh\.glb opens in any mesh viewer.*name a run of `etsplat train`"):
         open_run(tmp_path / "mesh")
+
+
+@pytest.mark.parametrize("command", ["view", "eval", "render", "export"])
+def test_a_mistyped_folder_is_answered_at_once_with_what_was_meant(tmp_path, command):
+    meant = tmp_path / "runs" / "kitchen"
+    meant.mkdir(parents=True)
+    for given in (tmp_path / "runs" / "kichen", tmp_path / "rums" / "kitchen"):
+        with pytest.raises(InputError) as raised:
+            parse([command, str(given)]).run([])
+        assert str(raised.value) == f"{given}: no such file or folder; did you mean {meant}?"
+
+
+def test_a_path_like_no_other_is_to_be_checked(tmp_path):
+    for path in (tmp_path / "run", tmp_path / "no" / "where"):
+        with pytest.raises(InputError, match=f"{path}: no such file or folder; check the path"):
+            open_run(path)
 
 
 def test_folders_without_a_soup_are_input_errors(tmp_path, trained):

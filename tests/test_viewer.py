@@ -95,8 +95,9 @@ def test_a_run_is_followed_through_its_files(tmp_path):
 
 
 def test_a_run_that_is_about_to_begin_is_waited_for(tmp_path, monkeypatch):
-    """The folder appears, then the run in it, then its first soup: told what is waited for, once each."""
+    """The run appears in its folder, then its first soup: told what is waited for, once each."""
     path, steps, told = tmp_path / "run", [], []
+    path.mkdir()
 
     def happen(_):
         steps.append(None)
@@ -117,6 +118,10 @@ def test_a_run_that_is_about_to_begin_is_waited_for(tmp_path, monkeypatch):
     RunDirectory.create(tmp_path / "mesh", {"task": "reconstruct", "config": {}})
     with pytest.raises(InputError, match=r"mesh\.glb opens in any mesh viewer"):
         wait_for_soup(tmp_path / "mesh", told.append)
+    (tmp_path / "empty").mkdir()
+    monkeypatch.setattr(follow.time, "sleep", lambda _: (tmp_path / "empty").rmdir())
+    with pytest.raises(InputError, match="empty: has gone"):
+        wait_for_soup(tmp_path / "empty", told.append)
 
 
 def test_the_page_is_served_on_localhost(run):

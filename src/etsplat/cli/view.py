@@ -26,7 +26,7 @@ class View(Command):
     """
 
     run_dir: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(name="dir")]
-    """A run of `etsplat train`, finished, in progress or about to begin; or a file with a soup."""
+    """A run of `etsplat train`, finished or in progress; an empty folder in which one is to begin; or a file."""
     scene: Path | None = None
     """The capture's folder, if it has moved or a file is given: for its cameras."""
     device: Literal["cpu", "cuda"] | None = None
@@ -52,7 +52,7 @@ class View(Command):
         from etsplat.viewer.follow import wait_for_soup
         from etsplat.viewer.server import serve
 
-        if self.run_dir.is_dir() or not (self.run_dir.exists() or self.run_dir.suffix):  # a folder that is to come
+        if self.run_dir.is_dir():
             wait_for_soup(self.run_dir, lambda text: print(f"{text} (Ctrl-C ends it)", flush=True))
         opened = open_run(self.run_dir, self.scene, self.device)
         with contextlib.suppress(KeyboardInterrupt):

@@ -12,6 +12,7 @@ from etsplat.core.errors import InputError
 from etsplat.io._mesh_readers import READERS, RawMesh
 from etsplat.io._mesh_writers import write_glb, write_obj, write_ply
 from etsplat.io.atomic import atomic_write
+from etsplat.io.paths import path_remedy
 
 MESH_SUFFIXES = (".ply", ".obj", ".glb")
 """Kinds of files that `save_mesh` writes."""
@@ -54,7 +55,7 @@ def load_mesh(path: Path | str) -> MeshFile:
     """
     path = Path(path)
     if not path.exists():
-        raise InputError(f"mesh {path}: no such file; check the path")
+        raise InputError(f"mesh {path}: no such file; {path_remedy(path)}")
     if path.is_dir():
         raise InputError(f"mesh {path}: is a folder; name a mesh file ({', '.join(READERS)})")
     if path.suffix.lower() not in READERS:

@@ -4,6 +4,7 @@ from pathlib import Path
 
 from etsplat.core.errors import InputError
 from etsplat.io.images import IMAGE_SUFFIXES
+from etsplat.io.paths import path_remedy
 from etsplat.scene.colmap import read_colmap
 from etsplat.scene.frames import FrameSet, posed_views
 from etsplat.scene.hull import bounding_sphere
@@ -25,7 +26,7 @@ def read_scene(path: Path | str, masks: Path | str | None = None, *, images: str
     """
     path = Path(path)
     if not path.is_dir():
-        wrong = "is a file; name the scene's folder" if path.is_file() else "no such folder; check the path"
+        wrong = "is a file; name the scene's folder" if path.is_file() else f"no such folder; {path_remedy(path)}"
         raise InputError(f"scene {path}: {wrong}")
     if images is not None and not (path / images).is_dir():
         raise InputError(f"scene {path}: no folder {images} in it; choose another or leave it out")

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from etsplat.core.cameras import Cameras
 from etsplat.core.errors import InputError
+from etsplat.io.paths import path_remedy
 from etsplat.io.run_directory import RunDirectory, is_run
 from etsplat.ops.engines import resolve_device
 from etsplat.scene.captures import Capture, load_capture
@@ -64,9 +65,11 @@ def open_run(path: Path | str, scene: Path | str | None = None, device: str | No
 
     Raises:
         EngineUnavailableError: `device` asks for a GPU, and something is missing.
-        InputError: neither a run with a soup nor a readable file; the capture has gone.
+        InputError: nothing there, neither a run with a soup nor a readable file; the capture has gone.
     """
     path, place = Path(path), resolve_device(device, None)
+    if not path.exists():
+        raise InputError(f"{path}: no such file or folder; {path_remedy(path)}")
     if path.is_dir():
         return _open_directory(path, scene, place)
     return SoupRun(path, open_soup(path).to(place), None if scene is None else load_capture(scene, preload=False))

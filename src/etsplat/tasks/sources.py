@@ -11,6 +11,7 @@ from torch import Tensor
 from etsplat.core.errors import InputError
 from etsplat.geometry.icosphere import icosphere
 from etsplat.io.mesh_files import MeshFile, load_mesh, weld_vertices
+from etsplat.io.paths import path_remedy
 from etsplat.scene.demo_object import demo_object
 from etsplat.scene.load import load_views
 from etsplat.scene.photograph import normalize_mesh, photograph
@@ -60,7 +61,7 @@ def load_source(source: Source, config: ReconstructConfig, masks: str | Path | N
         return load_views(path, width=config.resolution, masks=masks)
     if path.is_file():
         return load_mesh(path)
-    raise InputError(f"{path}: no such file or folder; name a mesh file or a folder with posed images")
+    raise InputError(f"{path}: no such file or folder; {path_remedy(path)}")
 
 
 def make_subject(

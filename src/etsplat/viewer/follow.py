@@ -15,19 +15,21 @@ WAITING_SECONDS = 1.0
 
 
 def wait_for_soup(folder: Path, announce: Callable[[str], None]) -> None:
-    """Returns when the run in a folder has written its first soup: the folder may be empty or not be there yet.
+    """Returns when the run in a folder has written its first soup: the folder may be empty as yet.
 
     Args:
         folder: of the run.
         announce: told once what is waited for, and again when that changes.
 
     Raises:
-        InputError: the folder holds something else.
+        InputError: the folder holds something else, or goes away.
     """
     if folder.is_dir() and any(folder.iterdir()) and not is_run(folder):
         raise InputError(f"{folder}: is not a run of etsplat; name a folder given to --out, or a soup's file")
     told = ""
     while not RunDirectory(folder).soup_path.is_file():
+        if not folder.is_dir():
+            raise InputError(f"{folder}: has gone; name another folder")
         begun = is_run(folder)
         if begun:
             check_trains(folder)

@@ -1,0 +1,23 @@
+"""What to say of a path where nothing is."""
+
+import difflib
+import os
+from pathlib import Path
+
+
+def path_remedy(path: Path | str) -> str:
+    """The end of the error for a path that does not exist: what was probably meant, or to check it.
+
+    Looks beside the first part of the path that is not there, for names that are spelled alike.
+    """
+    path = Path(path)
+    missing, rest = path, Path()
+    while not missing.parent.exists():
+        missing, rest = missing.parent, missing.name / rest
+    try:
+        names = os.listdir(missing.parent)
+    except OSError:  # may not be read, or is a file
+        names = []
+    meant = [missing.with_name(name) for name in difflib.get_close_matches(missing.name, names, n=1)]
+    whole = [found / rest for found in meant if (found / rest).exists()]
+    return f"did you mean {(whole or meant)[0]}?" if meant else "check the path"
