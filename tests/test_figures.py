@@ -3,11 +3,12 @@
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from captures import write_colmap
 from etsplat.bench.dead_zone import pull, remaining_distance
-from etsplat.bench.drawings import FIGURES
+from etsplat.bench.drawings import FIGURES, draw_edges
 from etsplat.bench.teaser import draw_teaser
 from etsplat.cli.figures import Figures
 from etsplat.core.errors import InputError
@@ -23,6 +24,14 @@ def test_figures_are_written(name: str, tmp_path: Path) -> None:
     path = tmp_path / f"{name}.svg"
     assert Figures(name=name, out=path).run([]) == 0  # pyright: ignore[reportArgumentType]
     assert path.read_text().startswith("<?xml")
+
+
+def test_the_seam_of_single_sided_triangles_goes_down_to_nothing() -> None:
+    """At every sigma, however narrow: the profile has a value on the seam itself. Elastic triangles close it."""
+    axes = draw_edges().axes
+    single_sided, elastic = ([np.asarray(line.get_ydata()) for line in axes[row].get_lines()] for row in (3, 11))
+    assert [profile[len(profile) // 2] for profile in single_sided] == [0, 0, 0]
+    assert elastic[2][len(elastic[2]) // 2] > 0.99
 
 
 def test_every_kernel_pulls_an_overlapping_triangle_back() -> None:

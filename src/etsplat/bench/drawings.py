@@ -7,7 +7,6 @@ the rasterizer itself.
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from matplotlib.figure import Figure
@@ -21,6 +20,8 @@ SIGMAS = (0.05, 0.25, 0.5, 1.0, 2.0)
 TITLES = {"single_sided": "single-sided (TS)", "bilateral": "bilateral (2DTS)", "elastic": "elastic"}
 
 _SIZE = 256
+_PROFILE_SAMPLES = 10 * _SIZE + 1
+"""Odd, for one on the seam. The square's corners then are 1024 pixels away, so that no rounding displaces the seam."""
 
 
 def draw_kernels() -> Figure:
@@ -63,9 +64,9 @@ def draw_edges() -> Figure:
             axes[row, column].imshow(alpha, cmap="gray", vmin=0, vmax=1)
             axes[row, column].set_xticks([])
             axes[row, column].set_yticks([])
-            # Across the seam from the upper left to the lower right corner of the picture.
-            profile = np.diagonal(np.asarray(alpha)[:, ::-1] if _seam_rises(alpha) else np.asarray(alpha))
-            axes[row, 3].plot(profile, color=_shade(column + 1), label=f"σ = {sigma:g}")
+            axes[row, 3].plot(
+                _profile(square[faces], name, sigma).numpy(), color=_shade(column + 1), label=f"σ = {sigma:g}"
+            )
             if row == 0:
                 axes[row, column].set_title(f"σ = {sigma:g}", fontsize=10)
         axes[row, 0].set_ylabel(title)
@@ -138,22 +139,23 @@ def _shade(index: int) -> tuple[float, float, float]:
     return (0.10 + 0.80 * t, 0.25 + 0.25 * t, 0.60 - 0.45 * t)
 
 
-def _splat(triangles: Float[Tensor, "N 3 2"], kernel: str, sigma: float) -> Float[Tensor, "H W"]:
-    """Opacity of flat triangles in the square [-1, 1]^2, drawn by the rasterizer."""
+def _splat(
+    triangles: Float[Tensor, "N 3 2"], kernel: str, sigma: float, width: int = _SIZE, height: int = _SIZE
+) -> Float[Tensor, "H W"]:
+    """Opacity of flat triangles in a picture that reaches from -1 to 1 in x, drawn by the rasterizer."""
     flat = torch.cat([triangles, torch.ones(*triangles.shape[:2], 1)], dim=2)
-    half = _SIZE / 2
-    K = torch.tensor([[[half, 0, half], [0, half, half], [0, 0, 1]]])
+    scale = width // 2
+    K = torch.tensor([[[scale, 0, width / 2], [0, scale, height / 2], [0, 0, 1]]])
     ones = torch.ones(len(flat))
-    return rasterize(flat, ones[:, None], ones, sigma, torch.eye(4)[None], K, _SIZE, _SIZE, kernel=kernel).color[
+    return rasterize(flat, ones[:, None], ones, sigma, torch.eye(4)[None], K, width, height, kernel=kernel).color[
         0, ..., 0
     ]
 
 
-def _seam_rises(alpha: Tensor) -> bool:
-    """Whether the common edge runs along the main diagonal, so that the profile is to be taken along the other one."""
-    return float(alpha.diagonal()[_SIZE // 4 : -_SIZE // 4].std()) < float(
-        alpha.flip(1).diagonal()[_SIZE // 4 : -_SIZE // 4].std()
-    )
+def _profile(triangles: Float[Tensor, "N 3 2"], kernel: str, sigma: float) -> Float[Tensor, " W"]:
+    """Opacity along the diagonal that crosses the seam, from corner to corner of the picture."""
+    turned = triangles @ torch.tensor([[1.0, 1.0], [-1.0, 1.0]]) / 2  # the diagonal becomes the x axis from -1 to 1
+    return _splat(turned, kernel, sigma, width=_PROFILE_SAMPLES, height=1)[0]
 
 
 def _barycentric_distance(corners: Float[Tensor, "3 2"]) -> Float[Tensor, "H W"]:
