@@ -61,7 +61,7 @@ class DefaultStrategy:
         assert all(len(optimizer.param_groups) == 1 for optimizer in optimizers.values())
 
     def initialize_state(self, scene_scale=1.0):
-        return {"scene_scale": scene_scale}
+        return {"grad2d": None, "scene_scale": scene_scale}
 
     def step_pre_backward(self, params, optimizers, state, step, info):
         info[self.key].retain_grad()
@@ -69,6 +69,9 @@ class DefaultStrategy:
     def step_post_backward(self, params, optimizers, state, step, info, packed=False):
         assert info[self.key].grad.shape == (1, len(params["means"]), 2)
         self.steps.append(step)
+        norms = info[self.key].grad[0].norm(dim=1)
+        state["grad2d"] = norms if state["grad2d"] is None else state["grad2d"] + norms
+        self.pulls = state["grad2d"].clone()
         if step != self.schedule[0]:
             return
         for name, optimizer in optimizers.items():
@@ -77,3 +80,4 @@ class DefaultStrategy:
             optimizer.state[new] = {k: v if k == "step" else torch.cat([v, v]) for k, v in moments.items()}
             optimizer.param_groups[0]["params"] = [new]
             params[name] = new
+        state["grad2d"] = torch.zeros(len(params["means"]))

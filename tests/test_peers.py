@@ -71,6 +71,36 @@ def test_training_a_peer_brings_the_loss_down(tmp_path, gsplat):
     assert losses[-1] < 0.95 * losses[0]
 
 
+@pytest.mark.parametrize("method", ["3dgs", "2dgs"])
+def test_a_peer_that_was_interrupted_goes_on_from_its_checkpoint(tmp_path, gsplat, monkeypatch, method):
+    """Gaussians, moments, statistics of the strategy and order of views come to what they are without interruption."""
+    write_colmap(tmp_path / "toy", [(24, 18)] * 5)
+    monkeypatch.setattr(train_peer, "CHECKPOINT_EVERY", 10)
+    config = PeerConfig(method, 30, 30)
+    train_peer.train_peer(tmp_path / "toy", tmp_path / "whole", config)
+    whole = fake_gsplat.DefaultStrategy.made[-1]
+    step = train_peer._Fitting._step
+
+    def interrupted(self, iteration):
+        if iteration == 26:
+            raise KeyboardInterrupt
+        return step(self, iteration)
+
+    monkeypatch.setattr(train_peer._Fitting, "_step", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        train_peer.train_peer(tmp_path / "toy", tmp_path / "parts", config)
+    monkeypatch.setattr(train_peer._Fitting, "_step", step)
+    train_peer.train_peer(tmp_path / "toy", tmp_path / "parts", config, resume=True)
+    rest = fake_gsplat.DefaultStrategy.made[-1]
+    assert rest.steps == list(range(20, 30))
+    assert torch.equal(rest.pulls, whole.pulls)
+    expected = load_gaussians(tmp_path / "whole" / train_peer.FILE, torch.device("cpu"))
+    gaussians = load_gaussians(tmp_path / "parts" / train_peer.FILE, torch.device("cpu"))
+    assert all(torch.equal(gaussians[name], expected[name]) for name in NAMES)
+    losses = [[line["loss"] for line in RunDirectory(tmp_path / name).read_history()] for name in ("whole", "parts")]
+    assert losses[0] == losses[1]
+
+
 def test_peers_stand_once_beside_our_methods_with_and_without_culling(tmp_path, gsplat):
     write_colmap(tmp_path / "toy", [(24, 18)] * 3)
     variants = [cell.variant for cell in cells_of(tmp_path, ["elastic", "2dgs", "3dgs"])]

@@ -183,7 +183,7 @@ def _run(mesh: Path, folder: Path, config: AnyConfig, images: str | None, thread
 
     set_num_threads(threads)
     if isinstance(config, PeerConfig):
-        train_peer(mesh, folder, config, images=images)
+        train_peer(mesh, folder, config, images=images, resume=is_run(folder))
     elif isinstance(config, TrainConfig):
         train(mesh, folder, config, images=images, resume=is_run(folder))
     else:

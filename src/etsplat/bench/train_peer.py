@@ -4,46 +4,57 @@ gsplat draws and its DefaultStrategy densifies, both through its public function
 views, the loss and all metrics are ours. Needs an NVIDIA GPU.
 """
 
-import math
-import time
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from etsplat.bench.gaussians import Splatting, load_gaussians, save_gaussians, splat, start_gaussians
+from etsplat.bench.gaussians import NAMES, Splatting, load_gaussians, save_gaussians, splat, start_gaussians
 from etsplat.bench.peers import PeerConfig, load_gsplat
 from etsplat.core.cameras import Cameras
 from etsplat.io.images import save_image
 from etsplat.io.run_directory import RunDirectory
 from etsplat.metrics.image import psnr, ssim
 from etsplat.ops.photometric import photometric_loss
-from etsplat.optim.loop import DivergedError
+from etsplat.optim.loop import LoopSettings, Progress
 from etsplat.optim.schedules import exponential_decay
 from etsplat.optim.view_sampler import ViewSampler
 from etsplat.scene.capture_views import CaptureViews
 from etsplat.scene.captures import Capture, load_capture
 from etsplat.scene.soup_init import StartPoints, random_points
 from etsplat.tasks.evaluate_soup import drawing_speed, image_scores, load_lpips, mean_scores
-from etsplat.tasks.running import device_name, make_record, path_of, versions
+from etsplat.tasks.running import (
+    Place,
+    device_name,
+    fit,
+    make_record,
+    path_of,
+    progress_tensor,
+    read_progress,
+    versions,
+)
 from etsplat.tasks.soup_scoring import SoupScorer
 
 FILE = "gaussians.safetensors"
 LOG_EVERY = 50
+CHECKPOINT_EVERY = 1000
 
 
-def train_peer(source: Path, out: Path, config: PeerConfig, images: str | None = None) -> dict[str, Any]:
-    """Fits Gaussians to the photos of a scene; returns metrics.json. A run that was cut short starts again.
+def train_peer(
+    source: Path, out: Path, config: PeerConfig, images: str | None = None, *, resume: bool = False
+) -> dict[str, Any]:
+    """Fits Gaussians to the photos of a scene; returns metrics.json.
 
     Args:
         source: the scene's folder.
-        out: the run directory; an earlier run in it is replaced.
+        out: the run directory; an earlier run in it is replaced unless it is resumed.
         config: settings.
         images: folder in the scene to take the photos from.
+        resume: go on from the last checkpoint. Not to the bit: gsplat adds in any order, and draws random numbers.
 
     Raises:
-        InputError: no gsplat, no GPU, a scene that cannot be used, a full disk.
+        InputError: no gsplat, no GPU, a scene that cannot be used, a full disk; a run with other settings to resume.
         DivergedError: the loss is not finite.
     """
     gsplat, device = load_gsplat()
@@ -52,21 +63,11 @@ def train_peer(source: Path, out: Path, config: PeerConfig, images: str | None =
     record = make_record(
         "peer", config, {"fingerprint": own.fingerprint()}, {"source": path_of(source), "images": images}
     )
-    run = RunDirectory.create(out, record, overwrite=True)
+    place = Place(out, resume, overwrite=not resume)
     fitting = _Fitting(gsplat, capture, config, device)
-    start, losses = time.perf_counter(), []
-    for iteration in range(1, config.iterations + 1):
-        losses.append(fitting.step(iteration))
-        if iteration % LOG_EVERY == 0 or iteration == config.iterations:
-            seconds = time.perf_counter() - start
-            mean = float(torch.stack(losses).mean())
-            if not math.isfinite(mean):
-                raise DivergedError(f"the loss is {mean} at iteration {iteration}; start again with another seed")
-            losses.clear()
-            run.append_history(
-                {"iteration": iteration, "seconds": round(seconds, 3), "loss": mean, "triangles": fitting.count}
-            )
-    seconds = time.perf_counter() - start
+    run = place.open(record)
+    settings = LoopSettings(config.iterations, LOG_EVERY, evaluate_every=0, checkpoint_every=CHECKPOINT_EVERY)
+    progress = fit(fitting, run, settings, record, lambda event: None)
     save_gaussians(run.path / FILE, fitting.gaussians)
     drawing = PeerDrawing(gsplat, fitting.gaussians, capture, config, device)
     run.write_metrics(
@@ -74,7 +75,7 @@ def train_peer(source: Path, out: Path, config: PeerConfig, images: str | None =
             **drawing.draw_test_views(run.test),
             "triangles": fitting.count,
             "iterations": config.iterations,
-            "seconds": seconds,
+            "seconds": progress.seconds,
             "device": device_name(device),
             "method": config.method,
             "seed": config.seed,
@@ -138,10 +139,10 @@ class PeerDrawing:
 
 
 class _Fitting:
-    """Parameters, their optimizers and gsplat's strategy."""
+    """Parameters, their optimizers and gsplat's strategy: what `tasks.running.fit` drives."""
 
     def __init__(self, gsplat: Any, capture: Capture, config: PeerConfig, device: torch.device) -> None:
-        self._gsplat, self._config = gsplat, config
+        self._gsplat, self._config, self._device = gsplat, config, device
         generator = torch.Generator().manual_seed(config.seed)
         positions, colors = capture.points, capture.point_colors
         if positions is None:
@@ -178,7 +179,56 @@ class _Fitting:
         """Number of Gaussians."""
         return len(self.gaussians["means"])
 
-    def step(self, iteration: int) -> Tensor:
+    def describe(self) -> dict[str, float]:
+        """How many Gaussians there are."""
+        return {"triangles": self.count}
+
+    def advance(self, first: int, last: int) -> list[float]:
+        """All these steps; nothing waits for the device before the last."""
+        return torch.stack([self._step(iteration) for iteration in range(first, last + 1)]).tolist()
+
+    def refine(self, iteration: int) -> int:
+        """Nothing: gsplat densifies within the steps."""
+        return 0
+
+    def evaluate(self) -> dict[str, float]:
+        """Nothing before the end."""
+        return {}
+
+    def first_not_finite(self) -> str | None:
+        """The name of a parameter that holds NaN or infinity."""
+        return next((name for name in NAMES if not bool(self.gaussians[name].isfinite().all())), None)
+
+    def state(self, progress: Progress) -> dict[str, Tensor]:
+        """Everything but the random numbers of gsplat."""
+        state = {f"sampler.{name}": tensor for name, tensor in self._sampler.state().items()}
+        for name in NAMES:
+            state[f"gaussians.{name}"] = parameter = self.gaussians[name]
+            moments = self._optimizers[name].state[parameter]
+            state |= {f"adam.{name}.{kind}": tensor for kind, tensor in moments.items()}
+        strategy = {name: value for name, value in self._state.items() if isinstance(value, Tensor)}
+        state |= {f"strategy.{name}": value for name, value in strategy.items()}
+        return {**state, "progress": progress_tensor(progress)}
+
+    def load_state(self, state: dict[str, Tensor], iteration: int) -> Progress:
+        """Continues where `state` was taken; returns where that was."""
+        self._sampler.load_state({name: state[f"sampler.{name}"] for name in self._sampler.state()})
+        for name, optimizer in self._optimizers.items():
+            parameter = nn.Parameter(state[f"gaussians.{name}"].to(self._device))
+            self.gaussians[name] = parameter
+            optimizer.param_groups[0]["params"] = [parameter]
+            moments = self._under(f"adam.{name}.", state)
+            optimizer.state[parameter] = moments
+            if "step" in moments:
+                moments["step"] = moments["step"].cpu()  # where torch's Adam counts
+        self._state.update(self._under("strategy.", state))
+        return read_progress(state["progress"], iteration)
+
+    def _under(self, prefix: str, state: dict[str, Tensor]) -> dict[str, Tensor]:
+        found = {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
+        return {name: value.to(self._device) for name, value in found.items()}
+
+    def _step(self, iteration: int) -> Tensor:
         """One view: draws, learns, densifies; returns the loss before it, on the device."""
         config, view = self._config, self._sampler.next_view()
         decay = exponential_decay(iteration, config.iterations, config.lr_means_final)

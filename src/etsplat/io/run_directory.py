@@ -56,6 +56,7 @@ metrics.json    how good it is; evaluation.json has more, and the speed
 test/           held-out views: NNN_render.png, NNN_truth.png
 history.jsonl   one line per log step: iteration, seconds of optimisation, loss, number of Gaussians
 config.json     the settings that made it
+checkpoints/    where an interrupted run continues; safe to delete once the run is done
 """
 
 _FILES = (

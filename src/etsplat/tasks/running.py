@@ -109,7 +109,7 @@ def announcer(callbacks: Sequence[Callback]) -> Callback:
 def fit(
     problem: Resumable,
     run: RunDirectory,
-    config: ReconstructConfig | TrainConfig,
+    config: ReconstructConfig | TrainConfig | LoopSettings,
     record: dict[str, Any],
     announce: Callback,
 ) -> Progress:
