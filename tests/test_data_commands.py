@@ -196,11 +196,15 @@ def test_a_disk_that_is_full_all_of_a_sudden_is_one_line_and_nothing_stays(tmp_p
         write_photo(tmp_path / "photos" / f"{index}.png", 320, 240, seed=index)
     write_colmap(tmp_path / "scene", [(640, 480)] * 3, model="SIMPLE_RADIAL", extra=(-0.1,))
     file_size_limit(250_000)
-    with pytest.raises(InputError, match=r"COLMAP came to a sudden end \(exit status -6\)") as raised:
+    with pytest.raises(
+        InputError, match=r"cannot write .*/new: COLMAP failed \(a sudden end, exit status -6\)"
+    ) as raised:
         find_cameras(tmp_path / "photos", tmp_path / "new", threads=1)
     assert "\n" not in str(raised.value)
     file_size_limit(8_000)
-    with pytest.raises(InputError, match=r"the disk full|sudden end") as raised:
+    with pytest.raises(
+        InputError, match=r"cannot write .*/new: COLMAP failed \((a sudden end|\d of 3 images could)"
+    ) as raised:
         undistort_scene(tmp_path / "scene", tmp_path / "new")
     assert "\n" not in str(raised.value)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["photos", "scene"]
@@ -209,7 +213,6 @@ def test_a_disk_that_is_full_all_of_a_sudden_is_one_line_and_nothing_stays(tmp_p
 APART = """
 import os
 import time
-from pathlib import Path
 
 from etsplat.scene.colmap_process import run_apart
 
@@ -220,7 +223,7 @@ def work(report):
 
 
 if __name__ == "__main__":
-    run_apart(Path(), work, report=lambda phase, done, total: print(done, flush=True))
+    run_apart(work, report=lambda phase, done, total: print(done, flush=True))
 """
 
 

@@ -6,7 +6,6 @@ This module does not import torch, so that such a process starts soon.
 import contextlib
 import multiprocessing
 import os
-import shutil
 import signal
 import sqlite3
 import threading
@@ -23,8 +22,6 @@ Result = TypeVar("Result")
 
 NEIGHBOURS = 15
 """Photos on either side, in order of names, that one is compared with where not every pair is."""
-
-_LITTLE_SPACE = 64 << 20
 
 
 def import_pycolmap() -> Any:
@@ -43,17 +40,16 @@ def import_pycolmap() -> Any:
     return pycolmap
 
 
-def run_apart(work: Path, function: Callable[..., Result], *arguments: Any, report: Progress | None = None) -> Result:
+def run_apart(function: Callable[..., Result], *arguments: Any, report: Progress | None = None) -> Result:
     """Calls `function(report, *arguments)` in a new process, which ends at once with Ctrl-C or with this process.
 
     Args:
-        work: folder that it writes to.
         function: of a module; it, its arguments and its result can be pickled.
         arguments: all but the first.
         report: called here with what it reports there.
 
     Raises:
-        InputError: the process came to a sudden end.
+        RuntimeError: the process came to a sudden end.
         Exception: what `function` raised.
     """
     context = multiprocessing.get_context("spawn")
@@ -72,7 +68,7 @@ def run_apart(work: Path, function: Callable[..., Result], *arguments: Any, repo
                 report(*value)
     except EOFError as error:
         process.join()
-        raise _sudden_end(work, process.exitcode) from error
+        raise RuntimeError(f"a sudden end, exit status {process.exitcode}") from error
     finally:
         process.kill()
         process.join()
@@ -90,15 +86,6 @@ def _serve(sender: Connection, function: Callable[..., Any], arguments: tuple[An
     except Exception as error:
         answer = ("error", error)
     sender.send(answer)
-
-
-def _sudden_end(work: Path, status: int | None) -> InputError:
-    free = shutil.disk_usage(work).free
-    remedy = "free some space or choose another folder" if free < _LITTLE_SPACE else "it may have run out of memory"
-    return InputError(
-        f"{work.parent}: COLMAP came to a sudden end (exit status {status}), with {free >> 20} MiB free on that disk: "
-        f"{remedy}"
-    )
 
 
 def place_photos(

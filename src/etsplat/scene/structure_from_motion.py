@@ -73,7 +73,7 @@ def find_cameras(
     one_camera = len({image_size(file) for file in files}) == 1
     with working_folder(out) as work:
         found = run_apart(
-            work, place_photos, photos, names, work, exhaustive, one_camera, max_size, threads or -1, report=report
+            place_photos, photos, names, work, exhaustive, one_camera, max_size, threads or -1, report=report
         )
         model = pycolmap.Reconstruction() if found is None else pycolmap.Reconstruction(found)
         placed = sorted(image.name for image in model.images.values() if image.has_pose)

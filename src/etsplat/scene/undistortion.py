@@ -21,6 +21,8 @@ from etsplat.scene.transforms import DistortedFrames, read_distorted_transforms
 LEAST_SIZE = 16
 """Pixels of the longer side of an image."""
 
+_LITTLE_SPACE = 64 << 20
+
 _GROWTH, _SPARE_BYTES = 4, 1 << 20
 """COLMAP writes JPEG with few losses: files grow. Beside them lies the model."""
 
@@ -72,7 +74,7 @@ def undistort_model(model: Any, photos: Path, names: list[str], work: Path, max_
     (work / "model").mkdir()
     model.write(work / "model")
     scene = work / "scene"
-    run_apart(work, undistort_images, work / "model", photos, names, scene, max_size)
+    run_apart(undistort_images, work / "model", photos, names, scene, max_size)
     # Left of what COLMAP writes for its dense reconstruction are images/ and sparse/0/.
     for entry in scene.iterdir():
         if entry.name == "stereo":
@@ -84,7 +86,7 @@ def undistort_model(model: Any, photos: Path, names: list[str], work: Path, max_
     (scene / "0").rename(scene / "sparse" / "0")
     written = sum((scene / "images" / name).is_file() for name in names)
     if written < len(names):  # COLMAP reports nothing
-        raise InputError(f"{work.parent}: {written} of {len(names)} images could be written; is the disk full?")
+        raise RuntimeError(f"{written} of {len(names)} images could be written")
 
 
 def check_output(out: Path, max_size: int) -> None:
@@ -118,14 +120,24 @@ def working_folder(out: Path) -> Iterator[Path]:
     """A folder beside `out` that is gone afterwards. What COLMAP and the system say of a full disk is an InputError."""
     try:
         with tempfile.TemporaryDirectory(prefix=f".{out.name}-", dir=out.parent) as work:
-            yield Path(work)
+            try:
+                yield Path(work)
+            except InputError:
+                raise
+            except (RuntimeError, ValueError) as error:  # what pycolmap's C++ throws
+                raise _failure(out, error) from error
     except OSError as error:
         raise write_error(out, error) from error
-    except (RuntimeError, ValueError) as error:  # what pycolmap's C++ throws
-        if isinstance(error, InputError):
-            raise
-        detail = (str(error) or type(error).__name__).splitlines()[0]
-        raise InputError(f"{out}: COLMAP failed ({detail}); is the disk full?") from error
+
+
+def _failure(out: Path, error: Exception) -> InputError:
+    """Made while the working folder still takes its space."""
+    detail = (str(error) or type(error).__name__).splitlines()[0]
+    free = shutil.disk_usage(out.parent).free
+    remedy = "free some space or choose another folder" if free < _LITTLE_SPACE else "is there enough memory?"
+    return InputError(
+        f"cannot write {out}: COLMAP failed ({detail}), with {free >> 20} MiB free on that disk; {remedy}"
+    )
 
 
 def _read_model(pycolmap: Any, scene: Path, folder: Path) -> tuple[Any, Path, dict[str, Path]]:
