@@ -290,7 +290,7 @@ class SoupFitting:
         limit = config.prune_screen_size if densifying and not first else None
         rules = PruneRules(
             opacity=config.prune_opacity,
-            importance=config.prune_importance,
+            importance=self._schedule.least_importance,
             views=0 if first else min(config.prune_views, len(self._capture.train)),
             screen_size=float("inf") if limit is None else limit,
         )

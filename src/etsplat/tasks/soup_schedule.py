@@ -9,9 +9,11 @@ from etsplat.tasks.train_config import TrainConfig
 
 FINAL_FLOOR, OPAQUE_AT = 0.995, 0.2
 FIRST_CEILING, FINAL_CEILING, SHARP_FROM, SHARP_AT = 1.0, 0.05, 0.3, 0.95
+HIDDEN = 0.005
 """The opaque finish, as fractions of a run: opacities are squeezed above a floor that soon has its final height, so
 that most of the run is spent on an opaque soup, while its edges still give wide gradients. Then sigma is cut at a
-ceiling that falls. What is hidden meanwhile is removed (`prune_importance`), and others multiply in its place."""
+ceiling that falls. What is hidden meanwhile is removed (its blend weight stays below the last number), and others
+multiply in its place. The thresholds of soft soups take too much away (docs/results.md)."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +59,12 @@ class SoupSchedule:
         """Adam's learning rate of positions."""
         config = self.config
         return config.lr_vertices * exponential_decay(iteration, config.iterations, config.lr_vertices_final)
+
+    @property
+    def least_importance(self) -> float:
+        """Triangles whose blend weight stays below this are removed."""
+        least = self.config.prune_importance
+        return least if self.config.finish == "none" else min(least, HIDDEN)
 
     def next_edit(self, iteration: int) -> int:
         """The first iteration, from this one on, after which triangles may come or go."""

@@ -116,7 +116,7 @@ class TrainConfig:
     prune_opacity: float = 0.014
     """Triangles with this opacity or less are removed."""
     prune_importance: float = 0.022
-    """Triangles whose blend weight stays below this in every view are removed."""
+    """Triangles whose blend weight stays below this in every view are removed; with an opaque finish 0.005 at most."""
     prune_views: int = 2
     """Triangles larger than a pixel in fewer views than this are removed; 0 keeps small ones."""
     prune_screen_size: float | None = None
@@ -224,12 +224,11 @@ _QUICK: dict[str, Any] = {
     "max_triangles": 100_000,
     "sky_closed": True,
     "start_limit": 0.4,
-    "lr_vertices": 0.004,
+    "lr_vertices": 0.001,
     "lr_sh_dc": 0.01,
     "lr_sh_rest": 0.0005,
     "lr_opacities": 0.05,
     "lr_sigma": 0.005,
-    "prune_importance": 0.005,
     "prune_views": 0,
     "lambda_normal": 0.0,
     "lambda_distortion": 0.0,
@@ -237,9 +236,6 @@ _QUICK: dict[str, Any] = {
     "evaluate_every": 500,
     "checkpoint_every": 500,
 }
-
-_QUICK_OBJECT: dict[str, Any] = {"lr_vertices": 0.001}
-"""An object is small in the frame that its cameras span: at the rate of rooms its triangles never come to rest."""
 
 _PRESETS: dict[str, dict[str, Any]] = {
     "paper": {},
@@ -252,6 +248,7 @@ _PRESETS: dict[str, dict[str, Any]] = {
         "max_triangles": 2000,
         "sky_closed": False,
         "start_points": 1000,
+        "lr_vertices": 0.004,
         "sh_degree": 1,
         "log_every": 20,
         "evaluate_every": 100,
@@ -277,6 +274,4 @@ def train_settings(preset: str = "quick", scene_type: str = "outdoor") -> TrainC
         if name not in known:
             raise InputError(f"{option}: is {name!r}; choose one of {', '.join(known)}")
     chosen = {**_SCENE_TYPES[scene_type], **_PRESETS[preset], "preset": preset, "scene_type": scene_type}
-    if preset != "paper" and scene_type == "object":
-        chosen |= _QUICK_OBJECT
     return replace(TrainConfig(), **chosen)
