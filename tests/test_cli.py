@@ -138,6 +138,7 @@ def test_doctor_tells_what_there_is(etsplat: Run) -> None:
     ("arguments", "name"),
     [
         (["export", "run", "--min-opacity", "5"], "min_opacity: is 5"),
+        (["render", "run", "--width", "100000"], "width: is 100000"),
         (["view", "run", "--width", "0"], "width: is 0"),
         (["view", "run", "--port", "99999"], "port: is 99999"),
     ],
@@ -226,6 +227,28 @@ def test_debug_shows_the_traceback(etsplat: Run) -> None:
     """--debug lets an error through to where Python shows it."""
     with pytest.raises(InputError, match=r"no\.ply"):
         etsplat("reconstruct", "no.ply", "--out", "run", "--debug")
+
+
+def test_memory_that_is_not_there_is_one_line(etsplat: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As an allocation that fails in the native engine."""
+
+    def run(command: Doctor, arguments: Sequence[str]) -> int:
+        raise MemoryError("std::bad_alloc")
+
+    monkeypatch.setattr(Doctor, "run", run)
+    result = etsplat("doctor")
+    assert (result.returncode, result.stderr.count("\n")) == (1, 1)
+    assert "not enough memory" in result.stderr
+
+
+@pytest.mark.parametrize("command", [["train", "scene"], ["reconstruct", "mesh.ply"]])
+def test_going_on_and_starting_anew_contradict_each_other(etsplat: Run, tmp_path: Path, command: list[str]) -> None:
+    """The earlier run is not touched."""
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "config.json").write_text('{"format": "etsplat run 1"}')
+    result = etsplat(*command, "--out", "run", "--resume", "--overwrite", cwd=tmp_path)
+    assert_one_line_error(result, "--resume and --overwrite")
+    assert [path.name for path in (tmp_path / "run").iterdir()] == ["config.json"]
 
 
 def test_demo_end_to_end_then_refuses_then_overwrites(etsplat: Run, tmp_path: Path) -> None:

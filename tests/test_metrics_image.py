@@ -141,6 +141,7 @@ def test_unusable_weights_are_one_line_input_errors(tmp_path, weights):
     with pytest.raises(InputError, match="no such file"):
         Lpips.from_weights(tmp_path / "absent.pth")
     (tmp_path / "text.pth").write_text("not weights")
+    (tmp_path / "letter.pth").write_text("hi\n")
     (tmp_path / "text.safetensors").write_text("not weights")
     (tmp_path / "code.pth").write_bytes(pickle.dumps(print, protocol=2))
     torch.save([1, 2], tmp_path / "list.pth")
@@ -150,6 +151,7 @@ def test_unusable_weights_are_one_line_input_errors(tmp_path, weights):
     (tmp_path / "cut.pth").write_bytes(data[: len(data) // 2])
     for name, message in [
         ("text.pth", "not a readable"),
+        ("letter.pth", "not a readable"),
         ("text.safetensors", "not a readable"),
         ("code.pth", "not a readable"),
         ("cut.pth", "not a readable"),

@@ -169,6 +169,14 @@ def test_triangle_splatting_states_come_in_safely(tmp_path, soup):
     with pytest.raises(InputError, match="cannot be read as a state dict") as raised:
         open_soup(tmp_path / "code.pt")
     assert "weights_only" not in str(raised.value)  # torch's advice is to run the code in the file
+    (tmp_path / "letter.pt").write_text("hi\n")  # which torch's unpickler answers with a KeyError
+    with pytest.raises(InputError, match="cannot be read as a state dict"):
+        open_soup(tmp_path / "letter.pt")
+
+
+def test_a_kind_of_file_without_opacities_is_refused_with_alpha(tmp_path, soup):
+    with pytest.raises(InputError, match=r"soup\.obj: files of this kind hold no opacities"):
+        export_soup(run_of(soup), tmp_path / "soup.obj", ExportConfig(alpha=True))
 
 
 def test_the_kind_of_file_follows_from_its_name(tmp_path, soup, capsys):

@@ -11,6 +11,7 @@ from etsplat.cli.parse import parse
 from etsplat.core.errors import InputError
 from etsplat.io.run_directory import RunDirectory
 from etsplat.optim.loop import CheckpointEvent
+from etsplat.scene.captures import load_capture
 from etsplat.scene.soup_files import load_soup
 from etsplat.tasks.evaluate_soup import evaluate_run
 from etsplat.tasks.soup_run import open_run
@@ -59,6 +60,13 @@ def test_a_scene_that_moved_is_named_with_an_option(trained, tmp_path):
     with pytest.raises(InputError, match=r"has gone; name where it is now with --scene"):
         open_run(tmp_path / "run")
     assert len(open_run(tmp_path / "run", tmp_path / "moved").capture) == 9
+    with pytest.raises(InputError, match=r"scene .*/mover: no such folder; did you mean .*/moved\?"):
+        open_run(tmp_path / "run", tmp_path / "mover")
+
+
+def test_a_run_is_no_scene(trained):
+    with pytest.raises(InputError, match=r"run: neither .* choose the scene's folder that this run was made from"):
+        load_capture(trained[0] / "run")
 
 
 def test_a_reconstruction_is_told_where_its_mesh_is(tmp_path):

@@ -135,6 +135,13 @@ def test_the_page_is_served_on_localhost(run):
         viewer.close()
 
 
+def test_an_address_that_is_not_ones_own_is_an_input_error(run):
+    """viser would wait for ever: it listens in a thread, which ends with a traceback."""
+    pytest.importorskip("viser")
+    with pytest.raises(InputError, match=r"--host 192\.0\.2\.1 --port 8933: cannot listen there"):
+        Viewer(run, "192.0.2.1", 8933, 64)  # of a network for documentation
+
+
 def test_without_viser_the_extra_is_named(run, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "viser", None)
     with pytest.raises(InputError, match=r"etsplat\[viewer\]"):

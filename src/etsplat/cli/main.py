@@ -30,6 +30,10 @@ def main() -> NoReturn:
         sys.exit(FAILED)
     except KeyboardInterrupt:
         fail("interrupted", INTERRUPTED)
+    except MemoryError:
+        if "--debug" in arguments:
+            raise
+        fail("there is not enough memory for this; ask for smaller or fewer pictures or triangles", FAILED)
     except (InputError, OSError) as error:
         if "--debug" in arguments:
             raise

@@ -104,17 +104,17 @@ def check_torch() -> None:
     if tuple(int(part) for part in version.split("+")[0].split(".")[:2]) < OLDEST_TORCH:
         raise EngineUnavailableError(
             f"the GPU engine needs torch {'.'.join(map(str, OLDEST_TORCH))} or newer, found {version}: upgrade torch, "
-            "or use engine='cpu'"
+            "or compute on the CPU"
         )
     if torch.version.cuda is None:
         raise EngineUnavailableError(
             f"torch {version} is built without CUDA: install a CUDA build of torch (https://pytorch.org), "
-            "or use engine='cpu'"
+            "or compute on the CPU"
         )
     if not torch.cuda.is_available():
         raise EngineUnavailableError(
             f"torch {version} finds no usable GPU: check that nvidia-smi works and that its driver supports CUDA "
-            f"{torch.version.cuda}, or use engine='cpu'"
+            f"{torch.version.cuda}, or compute on the CPU"
         )
 
 

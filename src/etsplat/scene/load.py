@@ -5,6 +5,7 @@ from pathlib import Path
 from etsplat.core.errors import InputError
 from etsplat.io.images import IMAGE_SUFFIXES
 from etsplat.io.paths import path_remedy
+from etsplat.io.run_directory import is_run
 from etsplat.scene.colmap import read_colmap
 from etsplat.scene.frames import FrameSet, posed_views
 from etsplat.scene.hull import bounding_sphere
@@ -55,7 +56,9 @@ def load_views(path: Path | str, width: int | None = None, masks: Path | str | N
 
 
 def _offer(path: Path) -> str:
-    """For a folder of photos: how to find the cameras."""
+    """For a run: that it is one. For a folder of photos: how to find the cameras."""
+    if is_run(path):
+        return " that this run was made from"
     if any(file.suffix.lower() in IMAGE_SUFFIXES for file in path.iterdir()):
         return f", or find the cameras of these photos: etsplat data sfm {path} --out SCENE"
     return ""

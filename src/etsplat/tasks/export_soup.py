@@ -42,6 +42,8 @@ def export_soup(run: SoupRun, path: Path | str, config: ExportConfig) -> Export:
         return Export(path, len(run.file.soup), 0)
     if config.colors == "keep" and (path.suffix != ".ply" or config.up == "y"):
         raise InputError("colours that depend on the direction (--colors keep) need --format ply and --up keep")
+    if config.alpha and path.suffix == ".obj":
+        raise InputError(f"{path}: files of this kind hold no opacities; leave out --alpha, or choose another --format")
     soup, appearance = run.file.soup, run.file.appearance
     opacities = appearance.opacities(soup).detach()
     kept = opacities >= (OPAQUE_FROM if config.min_opacity is None else config.min_opacity)

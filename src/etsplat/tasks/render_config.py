@@ -35,8 +35,8 @@ class RenderConfig:
             raise InputError(f"frames: is {self.frames}; it must be at least 1")
         if not 1 <= self.fps <= 240:
             raise InputError(f"fps: is {self.fps}; it must be from 1 to 240")
-        if self.width is not None and self.width < 16:
-            raise InputError(f"width: is {self.width}; it must be at least 16")
+        if self.width is not None and not 16 <= self.width <= 8192:
+            raise InputError(f"width: is {self.width}; it must be from 16 to 8192")
 
     @property
     def video(self) -> bool:

@@ -78,8 +78,10 @@ class Place:
         """Cheap, so that it comes before the input is prepared.
 
         Raises:
-            InputError: there is no run to continue, or no place for a new one.
+            InputError: there is no run to continue, or no place for a new one; or both are asked for.
         """
+        if self.resume and self.overwrite:
+            raise InputError("--resume and --overwrite: contradict each other; give one of them")
         if not self.resume:
             RunDirectory.check_free(self.path, overwrite=self.overwrite)
         elif not is_run(self.path):

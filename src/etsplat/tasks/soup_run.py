@@ -118,7 +118,7 @@ def _open_directory(path: Path, scene: Path | str | None, device: torch.device) 
         return SoupRun(path, file, None)
     if str(source) == DEMO:
         return SoupRun(path, file, demo_capture(config["config"]["width"]))
-    if not Path(source).is_dir():
+    if scene is None and not Path(source).is_dir():
         raise InputError(f"{path}: its scene {source} has gone; name where it is now with --scene")
     capture = load_capture(
         source,

@@ -4,6 +4,8 @@ Every browser has a thread of its own that waits for its camera to move. It draw
 width that `Pace` allows, and one of full width as soon as it stands still.
 """
 
+import errno
+import socket
 import threading
 import time
 from collections.abc import Callable
@@ -54,12 +56,8 @@ class Viewer:
         self._file: SoupFile = run.file
         self._clients: dict[int, _Client] = {}
         self._closed = threading.Event()
-        try:
-            self.server = viser.ViserServer(host=host, port=port, verbose=False)
-        except OSError as error:
-            raise InputError(
-                f"--host {host} --port {port}: cannot listen there ({error.strerror}); choose others"
-            ) from error
+        _check_address(host, port)
+        self.server = viser.ViserServer(host=host, port=port, verbose=False)
         self._build_page()
         self.server.on_client_connect(self._connected)
         self.server.on_client_disconnect(lambda client: self._disconnected(client.client_id))
@@ -199,6 +197,19 @@ def serve(run: SoupRun, host: str, port: int, width: int, announce: Callable[[in
         threading.Event().wait()
     finally:
         viewer.close()
+
+
+def _check_address(host: str, port: int) -> None:
+    """Listens there for a moment: viser does so in a thread, where nobody hears of errors, and would wait for ever."""
+    try:
+        family, kind, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind) as probe:
+            probe.bind(address)
+    except OSError as error:
+        if error.errno != errno.EADDRINUSE:  # then viser takes the next one
+            raise InputError(
+                f"--host {host} --port {port}: cannot listen there ({error.strerror}); choose others"
+            ) from error
 
 
 def _describe(file: SoupFile) -> str:
