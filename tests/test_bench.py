@@ -146,6 +146,12 @@ def wait_until(happened: Callable[[], bool]) -> None:
         time.sleep(0.05)
 
 
+def test_a_file_where_the_grid_goes_is_named(sphere: Path) -> None:
+    """Before any process is started."""
+    with pytest.raises(InputError, match=r"cannot write .*ball\.ply/.*a part of the path is a file"):
+        run_grid(make_cells({"ball": sphere}, VARIANTS, SHORT, [0], sphere), 1, lambda: None)
+
+
 def test_a_grid_of_nothing_is_refused() -> None:
     """As `--seeds` without a number asks for."""
     with pytest.raises(InputError, match="nothing to run"):

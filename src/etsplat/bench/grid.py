@@ -20,6 +20,7 @@ from etsplat.bench.peers import PeerConfig
 from etsplat.bench.variants import Variant
 from etsplat.core.errors import InputError
 from etsplat.core.processes import when_parent_ends
+from etsplat.io.atomic import write_error
 from etsplat.io.run_directory import RunDirectory, is_run
 from etsplat.ops.engines import num_threads
 from etsplat.tasks.reconstruct_config import ReconstructConfig
@@ -99,7 +100,7 @@ def run_grid(cells: Sequence[Cell], jobs: int, show: Callable[[], None]) -> None
         show: called about twice a second, and after every change.
 
     Raises:
-        InputError: there is no cell.
+        InputError: there is no cell, or its folder cannot be made.
     """
     if not cells:
         raise InputError("there is nothing to run: name at least one of everything that is compared, and one seed")
@@ -132,7 +133,10 @@ def _start(cell: Cell, running: list[Cell], threads: int) -> None:
 
     Without that, Ctrl-C in the seconds in which processes start would end them with tracebacks.
     """
-    cell.folder.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        cell.folder.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise write_error(cell.folder, error) from error
     _error_file(cell).unlink(missing_ok=True)
     cell._process = multiprocessing.get_context("spawn").Process(
         target=_work, args=(cell.mesh, cell.folder, cell.config, cell.images, threads)

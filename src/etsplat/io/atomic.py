@@ -17,6 +17,7 @@ _REMEDIES = {
     errno.EACCES: "choose a folder that you may write to",
     errno.EPERM: "choose a folder that you may write to",
     errno.ENOENT: "create the folder first",
+    errno.EEXIST: "a file is in the way: choose another folder",
     errno.ENOTDIR: "a part of the path is a file: choose another folder",
     errno.EISDIR: "the path is a folder: choose a file name",
 }

@@ -1,4 +1,4 @@
-"""What to say of a path where nothing is."""
+"""What to say of a path where what was expected is not."""
 
 import difflib
 import os
@@ -6,11 +6,13 @@ from pathlib import Path
 
 
 def path_remedy(path: Path | str) -> str:
-    """The end of the error for a path that does not exist: what was probably meant, or to check it.
+    """The end of the error for a path that is not there, or no folder: what was probably meant, or to check it.
 
     Looks beside the first part of the path that is not there, for names that are spelled alike.
     """
     path = Path(path)
+    if path.is_file():
+        return "it is a file"
     missing, rest = path, Path()
     while not missing.parent.exists():
         missing, rest = missing.parent, missing.name / rest

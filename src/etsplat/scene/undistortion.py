@@ -13,6 +13,7 @@ import torch
 from etsplat.core.errors import InputError
 from etsplat.io.atomic import write_error
 from etsplat.io.images import image_size, load_pixels
+from etsplat.io.paths import path_remedy
 from etsplat.scene.colmap import find_model
 from etsplat.scene.colmap_process import import_pycolmap, run_apart, undistort_images
 from etsplat.scene.frames import find_mask, scaled_intrinsics
@@ -45,6 +46,8 @@ def undistort_scene(scene: Path | str, out: Path | str, *, max_size: int = 1600)
     """
     pycolmap = import_pycolmap()
     scene, out = Path(scene), Path(out)
+    if not scene.is_dir():
+        raise InputError(f"scene {scene}: no such folder; {path_remedy(scene)}")
     colmap = find_model(scene)
     if colmap is None and not (scene / "transforms.json").is_file():
         raise InputError(f"scene {scene}: neither sparse/0/cameras.bin or .txt nor transforms.json; choose a scene")
