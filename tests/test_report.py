@@ -20,7 +20,16 @@ from etsplat.io.mesh_files import save_mesh
 from etsplat.io.run_directory import RunDirectory
 from etsplat.report import write_report
 from etsplat.report.command import reproduce_command
-from etsplat.report.curves import MAX_POINTS, Curve, curves_of, draw_svg, linear_ticks, log_ticks, short_number
+from etsplat.report.curves import (
+    MAX_POINTS,
+    Curve,
+    curves_of,
+    draw_svg,
+    linear_ticks,
+    log_ticks,
+    short_number,
+    tick_labels,
+)
 from etsplat.report.data import read_run
 from etsplat.tasks.reconstruct_config import PRESETS
 from etsplat.tasks.train_config import train_settings
@@ -220,6 +229,13 @@ def test_ticks_are_round_and_cover() -> None:
 def test_short_number(value: float, text: str) -> None:
     """Numbers on axes are short."""
     assert short_number(value) == text
+
+
+def test_labels_of_ticks_tell_them_from_each_other() -> None:
+    """However close they are: as many digits as that takes, and no more."""
+    assert tick_labels([15_200, 15_250, 15_300, 15_350]) == ["15.2k", "15.25k", "15.3k", "15.35k"]
+    assert tick_labels([250.0, 250.5, 251.0]) == ["250.0", "250.5", "251.0"]
+    assert tick_labels([0.0, 0.25, 20_480]) == ["0", "0.25", "20.5k"]
 
 
 def test_command_repeats_the_run() -> None:

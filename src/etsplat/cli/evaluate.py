@@ -91,7 +91,8 @@ def _print(console: "Console", found: dict[str, Any]) -> None:
     console.print(table)
     if found["lpips"] is None and found["lpips_reason"]:
         console.print(f"LPIPS: {found['lpips_reason']}", soft_wrap=True)
+    threads = "1 thread" if found["threads"] == 1 else f"{found['threads']} threads"
     console.print(
         f"{found['fps']:.1f} frames/s at {found['width']}x{found['height']}, {found['ms_per_million']:.0f} ms per "
-        f"million triangles ({found['triangles']:,} triangles, engine {found['engine']}, {found['threads']} threads)"
+        f"million triangles ({found['triangles']:,} triangles, engine {found['engine']}, {threads})"
     )

@@ -55,5 +55,6 @@ def _triangles_meaning(metrics: dict[str, Any]) -> str:
 
 
 def _speed(metrics: dict[str, Any]) -> str:
-    engine = f" Engine {metrics['engine']}, {metrics['threads']} threads." if "threads" in metrics else ""
-    return _SPEED + engine
+    if "threads" not in metrics:
+        return _SPEED
+    return f"{_SPEED} Engine {metrics['engine']}, {metrics['threads']} thread{'s' * (metrics['threads'] != 1)}."

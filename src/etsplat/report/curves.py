@@ -87,10 +87,10 @@ def draw_svg(curve: Curve) -> str:
         return TOP + (HEIGHT - TOP - BOTTOM) * (1 - (warp(y) - bottom) / ((top - bottom) or 1))
 
     parts = []
-    for tick in ticks:
+    for tick, text in zip(ticks, tick_labels(ticks), strict=True):
         y = py(tick)
         parts.append(f'<line class="grid" x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{y:.1f}" y2="{y:.1f}"/>')
-        parts.append(f'<text x="{LEFT - 6}" y="{y + 4:.1f}" text-anchor="end">{short_number(tick)}</text>')
+        parts.append(f'<text x="{LEFT - 6}" y="{y + 4:.1f}" text-anchor="end">{text}</text>')
     for tick in linear_ticks(start, end, 4):
         if start <= tick <= end:
             parts.append(f'<text x="{px(tick):.1f}" y="{HEIGHT - 6}" text-anchor="middle">{short_number(tick)}</text>')
@@ -129,19 +129,29 @@ def log_ticks(low: float, high: float) -> list[float]:
     return ticks if len(ticks) >= 2 else [low, high]
 
 
-def short_number(value: float) -> str:
-    """At most three significant digits, thousands as k, small ones as powers of ten."""
+def tick_labels(ticks: list[float]) -> list[str]:
+    """Short numbers, with as many digits as it takes to tell them from each other, up to six."""
+    labels = []
+    for digits in range(3, 7):
+        labels = [short_number(tick, digits) for tick in ticks]
+        if len(set(labels)) == len(labels):
+            break
+    return labels
+
+
+def short_number(value: float, digits: int = 3) -> str:
+    """At most so many significant digits (three at least), thousands as k, small ones as powers of ten."""
     if value == 0:
         return "0"
     if abs(value) >= 1e6:
-        return f"{value / 1e6:.3g}M"
+        return f"{value / 1e6:.{digits}g}M"
     if abs(value) >= 1e4 or (abs(value) >= 1000 and value % 100 == 0):
-        return f"{value / 1e3:.3g}k"
+        return f"{value / 1e3:.{digits}g}k"
     if abs(value) >= 100:
-        return f"{value:.0f}"
+        return f"{value:.{digits - 3}f}"
     if abs(value) >= 1e-3:
-        return f"{value:.3g}"
-    return f"{value:.1e}".replace(".0e", "e").replace("e-0", "e-")
+        return f"{value:.{digits}g}"
+    return f"{value:.{digits - 2}e}".replace(".0e", "e").replace("e-0", "e-")
 
 
 def _thin(x: list[float], y: list[float]) -> tuple[list[float], list[float], list[float], list[float]]:
