@@ -241,6 +241,20 @@ def test_memory_that_is_not_there_is_one_line(etsplat: Run, monkeypatch: pytest.
     assert "not enough memory" in result.stderr
 
 
+def test_what_may_not_be_read_is_named(etsplat: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without the number that the system has for it."""
+
+    def run(command: Doctor, arguments: Sequence[str]) -> int:
+        raise PermissionError(13, "Permission denied", "secret/scene")
+
+    monkeypatch.setattr(Doctor, "run", run)
+    result = etsplat("doctor")
+    assert (result.returncode, result.stderr) == (
+        2,
+        "etsplat: secret/scene: Permission denied; check the path and its permissions\n",
+    )
+
+
 @pytest.mark.parametrize("command", [["train", "scene"], ["reconstruct", "mesh.ply"]])
 def test_going_on_and_starting_anew_contradict_each_other(etsplat: Run, tmp_path: Path, command: list[str]) -> None:
     """The earlier run is not touched."""

@@ -31,6 +31,7 @@ from etsplat.report.curves import (
     tick_labels,
 )
 from etsplat.report.data import read_run
+from etsplat.report.plots import ShortNumbers
 from etsplat.tasks.reconstruct_config import PRESETS
 from etsplat.tasks.train_config import train_settings
 
@@ -236,6 +237,7 @@ def test_labels_of_ticks_tell_them_from_each_other() -> None:
     assert tick_labels([15_200, 15_250, 15_300, 15_350]) == ["15.2k", "15.25k", "15.3k", "15.35k"]
     assert tick_labels([250.0, 250.5, 251.0]) == ["250.0", "250.5", "251.0"]
     assert tick_labels([0.0, 0.25, 20_480]) == ["0", "0.25", "20.5k"]
+    assert ShortNumbers().format_ticks([15_200, 15_250]) == ["15.2k", "15.25k"]  # of convergence.png
 
 
 def test_command_repeats_the_run() -> None:

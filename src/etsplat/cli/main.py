@@ -37,6 +37,8 @@ def main() -> NoReturn:
     except (InputError, OSError) as error:
         if "--debug" in arguments:
             raise
+        if isinstance(error, OSError) and error.filename is not None:
+            fail(f"{error.filename}: {error.strerror}; check the path and its permissions", WRONG_INPUT)
         fail(str(error), WRONG_INPUT)
     finally:
         signal.signal(signal.SIGTERM, before)

@@ -3,17 +3,29 @@
 from pathlib import Path
 
 from matplotlib.figure import Figure
-from matplotlib.ticker import NullLocator
+from matplotlib.ticker import Formatter, NullLocator
 from PIL import Image, ImageDraw, ImageFont
 
 from etsplat.io.atomic import atomic_write
-from etsplat.report.curves import curves_of, log_ticks, short_number
+from etsplat.report.curves import curves_of, log_ticks, short_number, tick_labels
 from etsplat.report.data import Run, TestView
 
 OVERVIEW_VIEWS = 4
 TILE = 360
 CAPTION = 34
 GAP = 4
+
+
+class ShortNumbers(Formatter):
+    """Labels of an axis, as the report has them."""
+
+    def __call__(self, x: float, pos: int | None = None) -> str:
+        """One by itself."""
+        return short_number(x)
+
+    def format_ticks(self, values: list[float]) -> list[str]:
+        """All of them."""
+        return tick_labels(values)
 
 
 def plot_convergence(run: Run, path: Path) -> None:
@@ -35,7 +47,7 @@ def plot_convergence(run: Run, path: Path) -> None:
             axes.set_yscale("log")
             axes.yaxis.set_minor_locator(NullLocator())
             axes.set_yticks(log_ticks(*axes.get_ylim()))
-        axes.yaxis.set_major_formatter(lambda value, _: short_number(value))
+        axes.yaxis.set_major_formatter(ShortNumbers())
         axes.grid(color="#e4e6e8", linewidth=0.8)
         axes.tick_params(labelsize=8, colors="#5b6570")
         axes.spines[["top", "right"]].set_visible(False)
