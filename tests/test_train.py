@@ -209,6 +209,8 @@ def test_presets_are_consistent() -> None:
     assert (indoor.lr_vertices, indoor.lambda_dssim, indoor.lambda_distortion) == (0.0015, 0.4, 1.0)
     assert not train_settings("paper", "object").sky_dome
     assert (train_settings("paper", "object").lr_vertices, paper.lambda_opacity) == (0.0018, 0.0055)
+    for preset in ("quick", "demo", "tiny"):
+        assert train_settings(preset, "object").lr_vertices < train_settings(preset, "indoor").lr_vertices / 3
     with pytest.raises(InputError, match="scene_type"):
         train_settings("paper", "underwater")
     with pytest.raises(InputError, match="growth"):

@@ -224,7 +224,7 @@ _QUICK: dict[str, Any] = {
     "max_triangles": 100_000,
     "sky_closed": True,
     "start_limit": 0.4,
-    "lr_vertices": 0.001,
+    "lr_vertices": 0.0015,
     "lr_sh_dc": 0.01,
     "lr_sh_rest": 0.0005,
     "lr_opacities": 0.05,
@@ -236,6 +236,9 @@ _QUICK: dict[str, Any] = {
     "evaluate_every": 500,
     "checkpoint_every": 500,
 }
+
+_QUICK_OBJECT: dict[str, Any] = {"lr_vertices": 0.0004}
+"""An object is small in the frame that its cameras span: at the rate of rooms its triangles come to rest late."""
 
 _PRESETS: dict[str, dict[str, Any]] = {
     "paper": {},
@@ -274,4 +277,6 @@ def train_settings(preset: str = "quick", scene_type: str = "outdoor") -> TrainC
         if name not in known:
             raise InputError(f"{option}: is {name!r}; choose one of {', '.join(known)}")
     chosen = {**_SCENE_TYPES[scene_type], **_PRESETS[preset], "preset": preset, "scene_type": scene_type}
+    if preset != "paper" and scene_type == "object":
+        chosen |= _QUICK_OBJECT
     return replace(TrainConfig(), **chosen)
