@@ -38,8 +38,6 @@ def read_colmap(folder: Path | str, masks: Path | str | None = None, *, images: 
         raise InputError(
             f"scene {folder}: no sparse/0/cameras.bin or .txt; run COLMAP's mapper or choose another folder"
         )
-    if masks is not None and not Path(masks).is_dir():
-        raise InputError(f"masks {masks}: no such folder; check the path")
     mask_folder = Path(masks) if masks is not None else folder / "masks"
     cameras = read_cameras(model)
     registered = sorted(read_images(model), key=lambda image: image.name)
@@ -51,7 +49,7 @@ def read_colmap(folder: Path | str, masks: Path | str | None = None, *, images: 
             raise InputError(f"scene {model}: {image.name} uses camera {image.camera}, which is missing; export again")
         camera = cameras[image.camera]
         K = _intrinsics(model, image.name, camera)
-        mask = find_mask(mask_folder, image.name) if mask_folder.is_dir() else None
+        mask = find_mask(mask_folder, image.name) if masks is not None or mask_folder.is_dir() else None
         file = find_image(folder / (images or "images"), image.name)
         frames.append(Frame(image.name, file, mask, _viewmat(image), K, (camera.width, camera.height)))
     train, test = every_eighth([frame.name for frame in frames])

@@ -14,6 +14,7 @@ from torch import Tensor
 from etsplat.core.cameras import Cameras
 from etsplat.core.errors import InputError
 from etsplat.io.images import IMAGE_SUFFIXES, image_size, load_image, load_mask, premultiply, resize_image
+from etsplat.io.paths import path_remedy
 from etsplat.scene.views import Normalization, PosedViews
 
 _MASK_SUFFIXES = (".png", ".jpg", ".jpeg")
@@ -128,8 +129,10 @@ def find_mask(folder: Path, name: str) -> Path:
     """The mask of image `name` in a folder: NAME itself, with another ending, or with .png added as COLMAP has it.
 
     Raises:
-        InputError: there is none.
+        InputError: there is none, or no folder.
     """
+    if not folder.is_dir():
+        raise InputError(f"masks {folder}: no such folder; {path_remedy(folder)}")
     path = folder / name
     candidates = [path, *(path.with_suffix(s) for s in _MASK_SUFFIXES), *(Path(f"{path}{s}") for s in _MASK_SUFFIXES)]
     for candidate in candidates:

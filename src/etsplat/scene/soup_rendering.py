@@ -55,6 +55,10 @@ class SoupAppearance:
             return soup.opacities
         return self.opacity_floor + (1.0 - self.opacity_floor) * soup.opacities
 
+    def degree(self, soup: TriangleSoup) -> int:
+        """Of the bands of the colours that are used."""
+        return soup.sh_degree if self.sh_degree is None else min(self.sh_degree, soup.sh_degree)
+
     def sigma(self, soup: TriangleSoup) -> Float[Tensor, " N"]:
         """What is drawn: the smaller of sigma and the ceiling."""
         return soup.sigma if self.sigma_ceiling == float("inf") else soup.sigma.clamp_max(self.sigma_ceiling)
@@ -89,7 +93,7 @@ def render_soup(
         statistics: also return per-triangle statistics.
         engine: "reference", "cpu" or None (by dtype and device).
     """
-    degree = soup.sh_degree if appearance.sh_degree is None else min(appearance.sh_degree, soup.sh_degree)
+    degree = appearance.degree(soup)
     colors = soup_colors(soup.vertices, soup.sh_dc, soup.sh_rest, cameras.centers, degree, engine=engine)
     opacities, sigma = soup_activation(
         soup.vertices,
@@ -145,7 +149,7 @@ def render_soup_opaque(
         supersampling: samples along each axis of a pixel.
         engine: "reference", "cpu" or None (by dtype and device).
     """
-    degree = soup.sh_degree if appearance.sh_degree is None else min(appearance.sh_degree, soup.sh_degree)
+    degree = appearance.degree(soup)
     kept = appearance.opacities(soup) >= OPAQUE_FROM
     vertices, dc, rest = (tensor.detach()[kept] for tensor in (soup.vertices, soup.sh_dc, soup.sh_rest))
     images = []

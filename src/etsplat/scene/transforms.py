@@ -71,8 +71,6 @@ def read_transforms(folder: Path | str, masks: Path | str | None = None, *, imag
         InputError: a file is missing, damaged or of another layout; cameras with lens distortion.
     """
     folder = Path(folder)
-    if masks is not None and not Path(masks).is_dir():
-        raise InputError(f"masks {masks}: no such folder; check the path")
     where = _Folders(images, Path(masks) if masks is not None else None)
     if (folder / "transforms.json").is_file():
         return _read_single(folder, where)

@@ -77,7 +77,7 @@ def bake_colors(
     """
     device = soup.vertices.device
     total, weight = torch.zeros(len(soup), 3, device=device), torch.zeros(len(soup), 1, device=device)
-    degree = soup.sh_degree if appearance.sh_degree is None else min(appearance.sh_degree, soup.sh_degree)
+    degree = appearance.degree(soup)
     for camera in cameras:
         small = camera.scaled(min(1.0, BAKING_WIDTH / camera.width)).to(device)
         seen = render_soup(soup, small, appearance, statistics=True, engine=engine).statistics

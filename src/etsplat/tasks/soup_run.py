@@ -17,8 +17,6 @@ from etsplat.scene.soup_files import SoupFile, load_soup
 from etsplat.scene.soup_import import open_soup
 from etsplat.tasks.train import DEMO, demo_capture
 
-SOUP_NAME = "soup.safetensors"
-
 
 @dataclass(frozen=True)
 class SoupRun:
@@ -108,10 +106,13 @@ def _open_directory(path: Path, scene: Path | str | None, device: torch.device) 
     if not is_run(path):
         raise InputError(f"{path}: is not a run of etsplat; name a folder that was given to --out, or a soup's file")
     check_trains(path)
-    if not (path / SOUP_NAME).is_file():
-        raise InputError(f"{path}: has no {SOUP_NAME} (yet); name a run of `etsplat train` that got to a checkpoint")
-    file = load_soup(path / SOUP_NAME).to(device)
-    config = RunDirectory(path).read_config()
+    run = RunDirectory(path)
+    if not run.soup_path.is_file():
+        raise InputError(
+            f"{path}: has no {run.soup_path.name} (yet); name a run of `etsplat train` that got to a checkpoint"
+        )
+    file = load_soup(run.soup_path).to(device)
+    config = run.read_config()
     paths = config["paths"]
     source = scene or paths["source"]
     if source is None:

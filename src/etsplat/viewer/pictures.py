@@ -55,7 +55,7 @@ def _wireframe(file: SoupFile, camera: Cameras) -> Float[Tensor, "H W 3"]:
         .triangle[0]
         .long()
     )
-    degree = soup.sh_degree if appearance.sh_degree is None else min(appearance.sh_degree, soup.sh_degree)
+    degree = appearance.degree(soup)
     colors = soup_colors(chosen.vertices, chosen.sh_dc, chosen.sh_rest, camera.centers, degree)[0].clamp(0, 1)
     flat = torch.where(hit[..., None] >= 0, colors[hit.clamp_min(0)], image)
     border = torch.zeros_like(hit, dtype=torch.bool)

@@ -173,15 +173,8 @@ class _Client:
 def camera_of(camera: Any, width: int) -> Cameras:
     """The single camera of a browser: `wxyz` and `position` camera to world, `fov` vertical in radians, `aspect`."""
     height = max(1, round(width / camera.aspect))
-    w, x, y, z = (float(value) for value in np.asarray(camera.wxyz) / np.linalg.norm(camera.wxyz))
-    rotation = torch.tensor(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ],
-        dtype=torch.float64,
-    )
+    w, x, y, z = camera.wxyz
+    rotation = torch.from_numpy(Rotation.from_quat([x, y, z, w]).as_matrix())
     viewmat = torch.eye(4, dtype=torch.float64)
     viewmat[:3, :3] = rotation.T
     viewmat[:3, 3] = -rotation.T @ torch.as_tensor(np.asarray(camera.position), dtype=torch.float64)
