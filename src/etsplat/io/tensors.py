@@ -5,7 +5,7 @@ import re
 from collections.abc import Mapping
 from pathlib import Path
 
-from safetensors import SafetensorError
+from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
@@ -35,3 +35,13 @@ def save_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: dict[str, 
                 raise OSError(str(error).splitlines()[0]) from error
             raise OSError(int(number[1]), os.strerror(int(number[1]))) from error
         temporary.chmod(mode)  # safetensors makes files that only their owner may read
+
+
+def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """What `save_tensors` wrote, on the CPU: tensors, and metadata.
+
+    Raises:
+        SafetensorError, OSError, ValueError: the file is cut short, damaged or cannot be read.
+    """
+    with safe_open(path, framework="pt") as file:
+        return {name: file.get_tensor(name) for name in file.keys()}, file.metadata() or {}  # noqa: SIM118 (no mapping)

@@ -4,11 +4,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from safetensors import SafetensorError, safe_open
+from safetensors import SafetensorError
 from torch import Tensor
 
 from etsplat.core.errors import InputError
-from etsplat.io.tensors import save_tensors
+from etsplat.io.tensors import read_tensors, save_tensors
 
 FORMAT = "etsplat checkpoint 1"
 KEEP = 2
@@ -72,9 +72,7 @@ def load_latest_checkpoint(folder: Path, run_hash: str) -> Checkpoint | None:
     path, earlier = paths[-1], paths[:-1]
     remedy = f"delete it to resume from {earlier[-1].name}" if earlier else "delete it and resume to start again"
     try:
-        with safe_open(path, framework="pt") as file:
-            metadata = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a mapping)
+        tensors, metadata = read_tensors(path)
     except (SafetensorError, OSError, ValueError) as error:
         raise InputError(f"{path}: cut short or damaged ({_first_line(error)}); {remedy}") from error
     if metadata.get("format") != FORMAT:

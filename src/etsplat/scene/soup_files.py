@@ -6,10 +6,10 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 
 import torch
-from safetensors import SafetensorError, safe_open
+from safetensors import SafetensorError
 
 from etsplat.core.errors import InputError
-from etsplat.io.tensors import save_tensors
+from etsplat.io.tensors import read_tensors, save_tensors
 from etsplat.scene.soup_rendering import SoupAppearance
 from etsplat.scene.triangle_soup import TriangleSoup
 
@@ -67,9 +67,7 @@ def load_soup(path: Path | str) -> SoupFile:
     if not path.is_file():
         raise InputError(f"soup {path}: no such file; check the path")
     try:
-        with safe_open(path, framework="pt") as file:
-            metadata = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a mapping)
+        tensors, metadata = read_tensors(path)
         if metadata.get("format") != FORMAT:
             raise ValueError("not a soup of this version of etsplat")
         soup = TriangleSoup(**{name: tensors[name].float() for name in TriangleSoup.PARAMETERS})
