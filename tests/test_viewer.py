@@ -1,4 +1,5 @@
 import math
+import threading
 import urllib.request
 from types import SimpleNamespace
 
@@ -140,6 +141,32 @@ def test_an_address_that_is_not_ones_own_is_an_input_error(run):
     pytest.importorskip("viser")
     with pytest.raises(InputError, match=r"--host 192\.0\.2\.1 --port 8933: cannot listen there"):
         Viewer(run, "192.0.2.1", 8933, 64)  # of a network for documentation
+
+
+def test_a_browser_that_is_closed_while_its_picture_is_drawn_gets_none(run, monkeypatch):
+    """One thread, which ends; a picture for nobody would be a warning of viser's on the terminal."""
+    sent, drawing, closed = [], threading.Event(), threading.Event()
+
+    def draw(*_):
+        drawing.set()
+        assert closed.wait(10)
+        return torch.zeros(2, 2, 3, dtype=torch.uint8)
+
+    monkeypatch.setattr(server, "picture", draw)
+    camera = browser_camera(run.capture, 0)
+    camera.on_update = lambda call: None
+    scene = SimpleNamespace(set_background_image=lambda *arguments, **options: sent.append(arguments))
+    before = set(threading.enumerate())
+    client = server._Client(
+        SimpleNamespace(file=run.file, mode="soft"), SimpleNamespace(camera=camera, scene=scene), 64
+    )
+    (worker,) = set(threading.enumerate()) - before
+    assert drawing.wait(10)
+    client.close()
+    closed.set()
+    worker.join(10)
+    assert not worker.is_alive()
+    assert sent == []
 
 
 def test_without_viser_the_extra_is_named(run, monkeypatch):

@@ -167,6 +167,8 @@ class _Client:
     def _draw(self, width: int, quality: int = 70) -> None:
         camera = camera_of(self._client.camera, width)
         pixels = picture(self._viewer.file, camera, self._viewer.mode)
+        if self._closed:  # while it was drawn: viser would warn that nobody gets the picture
+            return
         self._client.scene.set_background_image(pixels.numpy(), format="jpeg", jpeg_quality=quality)
 
 
