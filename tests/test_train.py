@@ -16,6 +16,7 @@ from etsplat.scene.captures import Capture
 from etsplat.scene.demo_scene import demo_scene
 from etsplat.scene.soup_files import load_soup
 from etsplat.tasks import train as train_module
+from etsplat.tasks.running import NoteEvent
 from etsplat.tasks.soup_fitting import SoupFitting
 from etsplat.tasks.train import TrainResult, predicted_bytes, train
 from etsplat.tasks.train_config import PRESET_NAMES, TrainConfig, train_settings
@@ -216,6 +217,17 @@ def test_presets_are_consistent() -> None:
     with pytest.raises(InputError, match="growth"):
         TrainConfig(growth=0.5)
     assert json.dumps(vars(paper))
+
+
+def test_few_photos_end_a_run_earlier(capture: Capture, tmp_path: Path) -> None:
+    """With `max_epochs` a run has so many iterations for each training photo, says so, and resumes with that length."""
+    config = replace(SHORT, max_epochs=1)
+    steps, events = len(capture.train), list[object]()
+    result = train(capture, tmp_path / "run", config, callbacks=[events.append])
+    assert result.metrics["iterations"] == steps < config.iterations
+    assert RunDirectory(result.path).read_config()["config"]["iterations"] == steps
+    assert any(isinstance(event, NoteEvent) and f"{steps} iterations, not 40" in event.text for event in events)
+    assert train(capture, tmp_path / "run", config, resume=True).metrics == result.metrics
 
 
 def test_the_schedule_scales_with_the_length_of_the_run() -> None:

@@ -58,10 +58,11 @@ class Cell:
     images: str | None = None
     _process: Any = field(default=None, repr=False)
 
-    def progress(self) -> dict[str, Any]:
-        """The last line of the run's history; empty before the first."""
-        history = RunDirectory(self.folder).read_history()
-        return history[-1] if history else {}
+    def progress(self) -> float:
+        """How much of the run is done, in [0, 1]."""
+        run = RunDirectory(self.folder)
+        history = run.read_history()
+        return history[-1]["iteration"] / run.read_config()["config"]["iterations"] if history else 0.0
 
     def metrics(self) -> dict[str, Any]:
         """Those of the finished run."""

@@ -87,5 +87,5 @@ def _short(cell: Cell, headline: Headline) -> Text:
     if cell.state == "done":
         return Text(headline.text(cell), style="bold")
     if cell.state == "running":
-        return Text(f"{100 * cell.progress().get('iteration', 0) / cell.config.iterations:.0f} %", style="cyan")
+        return Text(f"{100 * cell.progress():.0f} %", style="cyan")
     return Text("failed", style="red") if cell.state == "failed" else Text("·", style="dim")

@@ -180,5 +180,12 @@ def _settings(scene: Scene, preset: str) -> tuple[TrainConfig, str | None]:
 
 def _peer(peer: Peer, base: TrainConfig) -> PeerConfig:
     """The peer at the iterations and image size of our runs."""
-    white = base.background == "white"
-    return PeerConfig(peer, base.iterations, base.schedule_length, base.width, "white" if white else "black", base.seed)
+    return PeerConfig(
+        peer,
+        iterations=base.iterations,
+        max_epochs=base.max_epochs,
+        schedule_length=base.schedule_length,
+        width=base.width,
+        background="white" if base.background == "white" else "black",
+        seed=base.seed,
+    )

@@ -27,6 +27,8 @@ class PeerConfig:
     """Optimization steps; each sees one view."""
     schedule_length: int = 30_000
     """What the iterations below refer to."""
+    max_epochs: int | None = None
+    """As in `TrainConfig`."""
     width: int | None = None
     """As in `TrainConfig`."""
     background: Literal["black", "white"] = "black"

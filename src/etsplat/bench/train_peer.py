@@ -4,6 +4,7 @@ gsplat draws and its DefaultStrategy densifies, both through its public function
 views, the loss and all metrics are ours. Needs an NVIDIA GPU.
 """
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from etsplat.io.run_directory import RunDirectory
 from etsplat.metrics.image import psnr, ssim
 from etsplat.ops.photometric import photometric_loss
 from etsplat.optim.loop import LoopSettings, Progress
-from etsplat.optim.schedules import exponential_decay
+from etsplat.optim.schedules import exponential_decay, limited_iterations
 from etsplat.optim.view_sampler import ViewSampler
 from etsplat.scene.capture_views import CaptureViews
 from etsplat.scene.captures import Capture, load_capture
@@ -60,6 +61,7 @@ def train_peer(
     gsplat, device = load_gsplat()
     own = load_capture(source, images=images, width=config.width)
     capture = own.normalized()
+    config = replace(config, iterations=limited_iterations(config.iterations, config.max_epochs, len(own.train)))
     record = make_record(
         "peer", config, {"fingerprint": own.fingerprint()}, {"source": path_of(source), "images": images}
     )

@@ -21,6 +21,17 @@ def regularization_weight(iteration: int, iterations: int, hold: int, final: flo
     return final + (1.0 - final) * cosine
 
 
+def limited_iterations(iterations: int, max_epochs: int | None, views: int) -> int:
+    """The length of a run that sees no view more often than `max_epochs` times, one in each iteration.
+
+    Args:
+        iterations: at most so many.
+        max_epochs: None for no limit.
+        views: number of training views, >= 1.
+    """
+    return iterations if max_epochs is None else min(iterations, max_epochs * views)
+
+
 def exponential_decay(iteration: int, iterations: int, ratio: float) -> float:
     """Factor on a learning rate: falls exponentially from 1 at the first iteration to `ratio` at the last.
 

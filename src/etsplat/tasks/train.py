@@ -15,6 +15,7 @@ from etsplat.io.memory import available_memory
 from etsplat.io.run_directory import RunDirectory
 from etsplat.ops.engines import one_torch_thread, resolve_device, resolve_engine
 from etsplat.optim.loop import CheckpointEvent, DivergedError, Progress
+from etsplat.optim.schedules import limited_iterations
 from etsplat.scene.captures import Capture, load_capture
 from etsplat.scene.demo_scene import HEIGHT, WIDTH, demo_scene
 from etsplat.scene.device_views import stay_on
@@ -106,6 +107,7 @@ def train(
     capture = own.normalized() if config.normalize else own
     for note in _check(own, config, device):
         announce(NoteEvent(note))
+    config = replace(config, iterations=limited_iterations(config.iterations, config.max_epochs, len(own.train)))
     paths = {"source": path_of(source), "images": images, "masks": path_of(masks)}
     record = make_record("train", config, {"fingerprint": own.fingerprint()}, paths)
     scorer = SoupScorer(capture, _background(config), config.engine, device)
@@ -202,6 +204,9 @@ def _check(capture: Capture, config: TrainConfig, device: torch.device) -> list[
     notes = [
         f"{len(capture.train)} photos to train on, {len(capture.test)} to test; at most {_amount(needed)} of memory"
     ]
+    steps = limited_iterations(config.iterations, config.max_epochs, len(capture.train))
+    if steps < config.iterations:
+        notes.append(f"few photos: {steps:,} iterations, not {config.iterations:,} (max_epochs {config.max_epochs})")
     if capture.images.streamed:
         notes.append("the photos do not fit into memory: they are decoded anew whenever they are needed")
     if capture.exact_points is None:

@@ -49,6 +49,8 @@ class TrainConfig:
     """Leave out triangles that reach farther than this from their middle, in units of the photo's longer side."""
     iterations: int = 30_000
     """Optimization steps; each sees one view."""
+    max_epochs: int | None = None
+    """A run ends earlier where it would see a photo more often than this; few photos are soon learnt by heart."""
     schedule_length: int = 30_000
     """What the iterations below refer to."""
 
@@ -167,7 +169,8 @@ class TrainConfig:
 
 _INF = float("inf")
 _RANGES = (
-    *((name, 1, _INF) for name in ("width", "iterations", "schedule_length", "max_triangles", "start_points")),
+    *((name, 1, _INF) for name in ("width", "iterations", "schedule_length", "max_epochs")),
+    *((name, 1, _INF) for name in ("max_triangles", "start_points")),
     *((name, 1, _INF) for name in ("log_every", "densify_every", "sh_every", "prune_screen_size")),
     *((name, 0, _INF) for name in ("evaluate_every", "checkpoint_every", "seed", "regularize_from")),
     *((name, 0, _INF) for name in ("densify_from", "densify_until", "split_size", "clone_noise", "prune_views")),
@@ -221,6 +224,7 @@ _QUICK: dict[str, Any] = {
     "near_plane": 0.25,
     "cull_small": False,
     "iterations": 6000,
+    "max_epochs": 100,
     "max_triangles": 100_000,
     "sky_closed": True,
     "start_limit": 0.4,
