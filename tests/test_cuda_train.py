@@ -22,7 +22,14 @@ from simt.calls import Calls
 from simt.room import room_for_16_pairs, second_step_overflows
 
 # Densified after iteration 3; the degree rises after iteration 4.
-CONFIG = replace(train_settings("tiny"), iterations=6, densify_every=15_000, densify_from=0, sh_every=20_000)
+CONFIG = replace(
+    train_settings("tiny"),
+    iterations=6,
+    lr_vertices_length=None,  # so that the steps of a few iterations are no larger than those of many
+    densify_every=15_000,
+    densify_from=0,
+    sh_every=20_000,
+)
 CPU = torch.device("cpu")
 
 

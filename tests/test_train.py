@@ -18,6 +18,7 @@ from etsplat.scene.soup_files import load_soup
 from etsplat.tasks import train as train_module
 from etsplat.tasks.running import NoteEvent
 from etsplat.tasks.soup_fitting import SoupFitting
+from etsplat.tasks.soup_schedule import SoupSchedule
 from etsplat.tasks.train import TrainResult, predicted_bytes, train
 from etsplat.tasks.train_config import PRESET_NAMES, TrainConfig, train_settings
 
@@ -217,6 +218,15 @@ def test_presets_are_consistent() -> None:
     with pytest.raises(InputError, match="growth"):
         TrainConfig(growth=0.5)
     assert json.dumps(vars(paper))
+
+
+def test_shorter_runs_move_vertices_faster() -> None:
+    """By the root of how much shorter they are; the original's rate does not know the length of a run."""
+    quick, paper = train_settings("quick"), train_settings("paper")
+    for iterations, factor in ((6000, 1.0), (1500, 2.0)):
+        first = SoupSchedule(replace(quick, iterations=iterations), squared=False).vertex_rate(1)
+        assert first == pytest.approx(factor * quick.lr_vertices)
+    assert SoupSchedule(replace(paper, iterations=300), squared=False).vertex_rate(1) == paper.lr_vertices
 
 
 def test_few_photos_end_a_run_earlier(capture: Capture, tmp_path: Path) -> None:

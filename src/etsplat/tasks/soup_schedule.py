@@ -1,5 +1,6 @@
 """How drawing, losses and rates of novel-view synthesis change over a run."""
 
+import math
 from dataclasses import dataclass, replace
 
 from etsplat.optim.schedules import exponential_decay, ramp
@@ -58,7 +59,10 @@ class SoupSchedule:
     def vertex_rate(self, iteration: int) -> float:
         """Adam's learning rate of positions."""
         config = self.config
-        return config.lr_vertices * exponential_decay(iteration, config.iterations, config.lr_vertices_final)
+        first, length = config.lr_vertices, config.lr_vertices_length
+        if length is not None:
+            first *= math.sqrt(length / config.iterations)
+        return first * exponential_decay(iteration, config.iterations, config.lr_vertices_final)
 
     @property
     def least_importance(self) -> float:

@@ -77,6 +77,9 @@ class TrainConfig:
 
     lr_vertices: float = 0.0018
     """Adam learning rate of positions, in units of the frame."""
+    lr_vertices_length: int | None = None
+    """Length of the runs that this rate is for: it grows with the root of how many times shorter another run is. None
+    for the same rate whatever the length."""
     lr_vertices_final: float = 0.01
     """Ratio of that rate's last value to its first; it falls exponentially."""
     lr_sh_dc: float = 0.0025
@@ -169,7 +172,7 @@ class TrainConfig:
 
 _INF = float("inf")
 _RANGES = (
-    *((name, 1, _INF) for name in ("width", "iterations", "schedule_length", "max_epochs")),
+    *((name, 1, _INF) for name in ("width", "iterations", "schedule_length", "max_epochs", "lr_vertices_length")),
     *((name, 1, _INF) for name in ("max_triangles", "start_points")),
     *((name, 1, _INF) for name in ("log_every", "densify_every", "sh_every", "prune_screen_size")),
     *((name, 0, _INF) for name in ("evaluate_every", "checkpoint_every", "seed", "regularize_from")),
@@ -229,6 +232,7 @@ _QUICK: dict[str, Any] = {
     "sky_closed": True,
     "start_limit": 0.4,
     "lr_vertices": 0.0015,
+    "lr_vertices_length": 6000,
     "lr_sh_dc": 0.01,
     "lr_sh_rest": 0.0005,
     "lr_opacities": 0.05,
@@ -255,7 +259,6 @@ _PRESETS: dict[str, dict[str, Any]] = {
         "max_triangles": 2000,
         "sky_closed": False,
         "start_points": 1000,
-        "lr_vertices": 0.004,
         "sh_degree": 1,
         "log_every": 20,
         "evaluate_every": 100,
