@@ -21,7 +21,7 @@ def row(scene, variant, psnr, **numbers):
 
 
 def cells_of(folder, **options):
-    settings = {"preset": "tiny", "culling": (False, True), "setting": "iterations=6"}
+    settings = {"preset": "tiny", "culling": (False, True), "setting": "iterations=6,max_epochs=2"}
     scene = read_scene_argument(f"{folder / 'toy'}:indoor,background=white")
     return make_nvs_cells([scene], ["elastic"], folder / "out", **{**settings, **options})
 
@@ -31,6 +31,7 @@ def test_a_grid_runs_is_measured_and_goes_on_where_it_was(tmp_path):
     cells = cells_of(tmp_path)
     run_grid(cells, 2, lambda: None)
     assert [(cell.state, cell.error) for cell in cells] == [("done", ""), ("done", "")]
+    assert [cell.metrics()["iterations"] for cell in cells] == [4, 4]  # two epochs of two training views
     told = []
     rows = evaluate_cells(cells, None, lambda *state: told.append(state))
     assert told[-1] == (2, 2)

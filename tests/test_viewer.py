@@ -80,7 +80,7 @@ def test_pictures_shrink_until_moving_is_fluent_and_grow_back():
 
 
 def test_a_run_is_followed_through_its_files(tmp_path):
-    folder = RunDirectory.create(tmp_path / "run", {"task": "train", "config": {"iterations": 100}})
+    folder = RunDirectory.create(tmp_path / "run", {"task": "train", "iterations": 100, "config": {}})
     followed = Followed(folder.path, torch.device("cpu"))
     assert followed.poll() is None
     assert followed.status() == ""
@@ -103,7 +103,7 @@ def test_a_run_that_is_about_to_begin_is_waited_for(tmp_path, monkeypatch):
     def happen(_):
         steps.append(None)
         if len(steps) == 2:
-            RunDirectory.create(path, {"task": "train", "config": {"iterations": 100}})
+            RunDirectory.create(path, {"task": "train", "iterations": 100, "config": {}})
         if len(steps) == 4:
             save_soup(path / "soup.safetensors", SoupFile(make_soup(3)))
 

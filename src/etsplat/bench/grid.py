@@ -62,7 +62,7 @@ class Cell:
         """How much of the run is done, in [0, 1]."""
         run = RunDirectory(self.folder)
         history = run.read_history()
-        return history[-1]["iteration"] / run.read_config()["config"]["iterations"] if history else 0.0
+        return history[-1]["iteration"] / run.read_config()["iterations"] if history else 0.0
 
     def metrics(self) -> dict[str, Any]:
         """Those of the finished run."""

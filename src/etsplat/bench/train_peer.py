@@ -61,10 +61,10 @@ def train_peer(
     gsplat, device = load_gsplat()
     own = load_capture(source, images=images, width=config.width)
     capture = own.normalized()
-    config = replace(config, iterations=limited_iterations(config.iterations, config.max_epochs, len(own.train)))
-    record = make_record(
-        "peer", config, {"fingerprint": own.fingerprint()}, {"source": path_of(source), "images": images}
-    )
+    iterations = limited_iterations(config.iterations, config.max_epochs, len(own.train))
+    paths = {"source": path_of(source), "images": images}
+    record = make_record("peer", config, iterations, {"fingerprint": own.fingerprint()}, paths)
+    config = replace(config, iterations=iterations)
     place = Place(out, resume, overwrite=not resume)
     fitting = _Fitting(gsplat, capture, config, device)
     run = place.open(record)

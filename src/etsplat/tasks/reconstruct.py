@@ -86,7 +86,7 @@ def reconstruct(
     loaded, start = load_source(source, config, masks), load_start(init_mesh)
     hashes = {"fingerprint": fingerprint(loaded), "init_mesh": fingerprint(start)}
     paths = {"source": path_of(source), "init_mesh": path_of(init_mesh)}
-    record = make_record("reconstruct", config, hashes, paths)
+    record = make_record("reconstruct", config, config.iterations, hashes, paths)
     if resume:
         place.open(record)  # refuses another run before pictures are taken
     for name, mesh in (("source", loaded), ("init_mesh", start)):

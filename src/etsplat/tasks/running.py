@@ -148,11 +148,26 @@ def fit(
 
 
 def make_record(
-    task: str, config: object, hashes: dict[str, str | None], paths: dict[str, str | None]
+    task: str, config: object, iterations: int, hashes: dict[str, str | None], paths: dict[str, str | None]
 ) -> dict[str, Any]:
-    """What config.json holds. Inputs are identified by their hashes; paths are for the reader."""
+    """What config.json holds. Inputs are identified by their hashes; paths are for the reader.
+
+    Args:
+        task: name of the kind of run.
+        config: settings, as they were asked for.
+        iterations: of this run, which may be fewer.
+        hashes: of the input, by kind.
+        paths: where it was read from, by kind.
+    """
     settings = {name: str(value) if isinstance(value, Path) else value for name, value in vars(config).items()}
-    return {"task": task, "config": settings, "source": hashes, "paths": paths, "versions": versions()}
+    return {
+        "task": task,
+        "config": settings,
+        "iterations": iterations,
+        "source": hashes,
+        "paths": paths,
+        "versions": versions(),
+    }
 
 
 def hash_record(record: dict[str, Any]) -> str:

@@ -107,9 +107,10 @@ def train(
     capture = own.normalized() if config.normalize else own
     for note in _check(own, config, device):
         announce(NoteEvent(note))
-    config = replace(config, iterations=limited_iterations(config.iterations, config.max_epochs, len(own.train)))
+    iterations = limited_iterations(config.iterations, config.max_epochs, len(own.train))
     paths = {"source": path_of(source), "images": images, "masks": path_of(masks)}
-    record = make_record("train", config, {"fingerprint": own.fingerprint()}, paths)
+    record = make_record("train", config, iterations, {"fingerprint": own.fingerprint()}, paths)
+    config = replace(config, iterations=iterations)
     scorer = SoupScorer(capture, _background(config), config.engine, device)
     fitting = start_fitting(capture, config, scorer.cheap, device)
     run = place.open(record)

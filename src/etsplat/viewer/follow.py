@@ -64,7 +64,7 @@ class Followed:
         if not history:
             return ""
         last = history[-1]
-        iterations = self._run.read_config()["config"]["iterations"]
+        iterations = self._run.read_config()["iterations"]
         known = [line["psnr"] for line in history if line.get("psnr") is not None]
         quality = f", {known[-1]:.2f} dB on test views" if known else ""
         state = "done" if self._run.metrics_path.is_file() else "running"
