@@ -63,18 +63,20 @@ def draw_overview(run: Run, path: Path) -> None:
     if not views:
         return
     rows = {"truth": "truth", "render": "render", "opaque": "opaque" if run.mesh is None else "mesh"}
-    width = CAPTION + len(views) * (TILE + GAP)
-    sheet = Image.new("RGB", (width, CAPTION // 3 + len(rows) * (TILE + GAP)), "#14171a")
+    tiles = {kind: [_tile(getattr(view, kind)) for view in views] for kind in rows}
+    wide = max(tile.width for row in tiles.values() for tile in row)
+    high = max(tile.height for row in tiles.values() for tile in row)
+    size = CAPTION + len(views) * (wide + GAP), len(rows) * (high + GAP) + GAP
+    sheet = Image.new("RGB", size, "#14171a")
     font = ImageFont.load_default(size=17)
     for row, (kind, title) in enumerate(rows.items()):
-        top = CAPTION // 3 + row * (TILE + GAP)
-        label = Image.new("RGB", (TILE, CAPTION), "#14171a")
-        ImageDraw.Draw(label).text((TILE / 2, CAPTION / 2), title, fill="#c6ccd2", font=font, anchor="mm")
+        top = GAP + row * (high + GAP)
+        label = Image.new("RGB", (high, CAPTION), "#14171a")
+        ImageDraw.Draw(label).text((high / 2, CAPTION / 2), title, fill="#c6ccd2", font=font, anchor="mm")
         sheet.paste(label.transpose(Image.Transpose.ROTATE_90), (0, top))
-        for column, view in enumerate(views):
-            tile = _tile(getattr(view, kind))
-            left = CAPTION + column * (TILE + GAP)
-            sheet.paste(tile, (left + (TILE - tile.width) // 2, top + (TILE - tile.height) // 2))
+        for column, tile in enumerate(tiles[kind]):
+            left = CAPTION + column * (wide + GAP)
+            sheet.paste(tile, (left + (wide - tile.width) // 2, top + (high - tile.height) // 2))
     with atomic_write(path) as temporary:
         sheet.save(temporary)
 
