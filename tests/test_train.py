@@ -229,6 +229,13 @@ def test_shorter_runs_move_vertices_faster() -> None:
     assert SoupSchedule(replace(paper, iterations=300), squared=False).vertex_rate(1) == paper.lr_vertices
 
 
+def test_an_opaque_finish_removes_only_what_is_hidden() -> None:
+    """The threshold of soft soups would take away too much of it; a lower one stays as it is."""
+    for finish, asked, least in (("none", 0.022, 0.022), ("opaque", 0.022, 0.005), ("opaque", 0.001, 0.001)):
+        config = replace(TrainConfig(), finish=finish, prune_importance=asked)
+        assert SoupSchedule(config, squared=False).least_importance == least
+
+
 def test_few_photos_end_a_run_earlier(capture: Capture, tmp_path: Path) -> None:
     """With `max_epochs` a run has so many iterations for each training photo, says so, and resumes with that length."""
     config = replace(SHORT, max_epochs=1)
