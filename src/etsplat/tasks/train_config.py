@@ -78,8 +78,8 @@ class TrainConfig:
     lr_vertices: float = 0.0018
     """Adam learning rate of positions, in units of the frame."""
     lr_vertices_length: int | None = None
-    """Length of the runs that this rate is for: it grows with the root of how many times shorter another run is. None
-    for the same rate whatever the length."""
+    """Length of the runs that this rate is for: it grows with the root of how many times shorter another run is.
+    None for the same rate whatever the length."""
     lr_vertices_final: float = 0.01
     """Ratio of that rate's last value to its first; it falls exponentially."""
     lr_sh_dc: float = 0.0025
