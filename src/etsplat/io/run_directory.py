@@ -89,7 +89,7 @@ class RunDirectory:
 
     @property
     def config_path(self) -> Path:
-        """config.json: the settings, the input's fingerprint, versions."""
+        """config.json: the settings, how long the run is, the input's fingerprint, versions."""
         return self.path / "config.json"
 
     @property
