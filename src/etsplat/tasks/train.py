@@ -105,9 +105,9 @@ def train(
     place.check()
     own = _load(source, config, images, masks, lambda done, total: announce(PrepareEvent(done, total)))
     capture = own.normalized() if config.normalize else own
-    for note in _check(own, config, device):
-        announce(NoteEvent(note))
     iterations = limited_iterations(config.iterations, config.max_epochs, len(own.train))
+    for note in _check(own, config, iterations, device):
+        announce(NoteEvent(note))
     paths = {"source": path_of(source), "images": images, "masks": path_of(masks)}
     record = make_record("train", config, iterations, {"fingerprint": own.fingerprint()}, paths)
     config = replace(config, iterations=iterations)
@@ -190,8 +190,8 @@ def _load(
     return load_capture(source, images=images, width=config.width, masks=masks, progress=progress)
 
 
-def _check(capture: Capture, config: TrainConfig, device: torch.device) -> list[str]:
-    """Refuses what cannot work; returns what its owner should know."""
+def _check(capture: Capture, config: TrainConfig, iterations: int, device: torch.device) -> list[str]:
+    """Refuses what cannot work; returns what the owner of a run of so many iterations should know."""
     if not capture.train:
         raise InputError("capture: has no view to train on; name some in its split")
     needed = predicted_bytes(capture, config, device)
@@ -205,9 +205,10 @@ def _check(capture: Capture, config: TrainConfig, device: torch.device) -> list[
     notes = [
         f"{len(capture.train)} photos to train on, {len(capture.test)} to test; at most {_amount(needed)} of memory"
     ]
-    steps = limited_iterations(config.iterations, config.max_epochs, len(capture.train))
-    if steps < config.iterations:
-        notes.append(f"few photos: {steps:,} iterations, not {config.iterations:,} (max_epochs {config.max_epochs})")
+    if iterations < config.iterations:
+        notes.append(
+            f"few photos: {iterations:,} iterations, not {config.iterations:,} (max_epochs {config.max_epochs})"
+        )
     if capture.images.streamed:
         notes.append("the photos do not fit into memory: they are decoded anew whenever they are needed")
     if capture.exact_points is None:
