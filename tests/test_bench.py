@@ -69,7 +69,7 @@ def test_runs_end_and_failures_are_told(grid: tuple[Path, list[Cell]]) -> None:
 
 
 GRID = """
-import sys
+import signal
 from dataclasses import replace
 from pathlib import Path
 
@@ -78,6 +78,7 @@ from etsplat.bench.variants import Variant
 from etsplat.tasks.reconstruct_config import PRESETS
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored where the tests run in a shell's background
     config = replace(PRESETS["tiny"], iterations=1_000_000, checkpoint_every=0)
     cells = make_cells({"ball": Path("demo:owl")}, [Variant("long", {})], config, [0], Path())
     run_grid(cells, 1, lambda: print(cells[0]._process.pid, flush=True))
