@@ -1,6 +1,11 @@
-"""3DGS and 2DGS through a module that stands in for gsplat: the same grid, split, metrics and tables as our runs."""
+"""3DGS and 2DGS through a module that stands in for gsplat: the same grid, split, metrics and tables as our runs.
 
+Where gsplat is installed, its signatures and its densification are the real ones; its drawing needs a GPU.
+"""
+
+import inspect
 import sys
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -8,24 +13,55 @@ import torch
 import fake_gsplat
 from captures import write_colmap
 from etsplat.bench import nvs, train_peer
-from etsplat.bench.gaussians import NAMES, load_gaussians
+from etsplat.bench.gaussians import NAMES, load_gaussians, start_gaussians
 from etsplat.bench.nvs import evaluate_cells, make_nvs_cells, read_scene_argument
 from etsplat.bench.nvs_figures import draw_nvs
 from etsplat.bench.nvs_tables import nvs_tables
-from etsplat.bench.peers import PeerConfig, load_gsplat
+from etsplat.bench.peers import load_gsplat, peer_config
 from etsplat.core.errors import InputError
 from etsplat.io.run_directory import RunDirectory
+from etsplat.scene.soup_init import StartPoints
+
+
+def put_in_place(module, monkeypatch):
+    def load():
+        return module, torch.device("cpu")
+
+    monkeypatch.setattr(train_peer, "load_gsplat", load)
+    monkeypatch.setattr(nvs, "load_gsplat", load)
 
 
 @pytest.fixture
 def gsplat(monkeypatch):
-    def load():
-        return fake_gsplat, torch.device("cpu")
-
-    monkeypatch.setattr(train_peer, "load_gsplat", load)
-    monkeypatch.setattr(nvs, "load_gsplat", load)
+    put_in_place(fake_gsplat, monkeypatch)
     fake_gsplat.DefaultStrategy.made.clear()
     return fake_gsplat
+
+
+@pytest.fixture
+def real_gsplat(monkeypatch):
+    """gsplat itself, but for its two functions that draw: arguments must fit theirs, the stand-in draws."""
+    gsplat = pytest.importorskip("gsplat", reason="gsplat is not installed (extra peers)")
+
+    def drawing(name):
+        signature = inspect.signature(getattr(gsplat, name))
+
+        def draw(**arguments):
+            signature.bind(**arguments)
+            return getattr(fake_gsplat, name)(**arguments)
+
+        return draw
+
+    draw_3dgs, draw_2dgs = drawing("rasterization"), drawing("rasterization_2dgs")
+    module = SimpleNamespace(
+        __version__=gsplat.__version__,
+        rasterization=draw_3dgs,
+        rasterization_2dgs=draw_2dgs,
+        DefaultStrategy=gsplat.DefaultStrategy,
+        strategy=gsplat.strategy,
+    )
+    put_in_place(module, monkeypatch)
+    return module
 
 
 def cells_of(folder, methods):
@@ -49,6 +85,7 @@ def test_a_peer_is_trained_measured_and_tabulated_as_our_methods_are(tmp_path, g
     assert again.state == "done"
     strategy = fake_gsplat.DefaultStrategy.made[-1]
     assert strategy.schedule == (1, 15, 1, 3)  # 500, 15,000, 100 and 3,000 of 30,000 iterations
+    assert (strategy.prune_opa, strategy.key) == {"3dgs": (0.005, "means2d"), "2dgs": (0.05, "gradient_2dgs")}[method]
     assert strategy.steps == list(range(30))
     history = RunDirectory(cell.folder).read_history()
     assert (history[-1]["iteration"], history[-1]["triangles"]) == (30, 40)
@@ -66,19 +103,23 @@ def test_a_peer_is_trained_measured_and_tabulated_as_our_methods_are(tmp_path, g
 
 def test_training_a_peer_brings_the_loss_down(tmp_path, gsplat):
     write_colmap(tmp_path / "toy", [(24, 18)] * 9, points=60)
-    train_peer.train_peer(tmp_path / "toy", tmp_path / "run", PeerConfig("3dgs", 100, 100, lr_sh_dc=0.05))
+    train_peer.train_peer(
+        tmp_path / "toy", tmp_path / "run", peer_config("3dgs", iterations=100, schedule_length=100, lr_sh_dc=0.05)
+    )
     losses = [line["loss"] for line in RunDirectory(tmp_path / "run").read_history()]
     assert losses[-1] < 0.95 * losses[0]
 
 
 @pytest.mark.parametrize("method", ["3dgs", "2dgs"])
 def test_a_peer_that_was_interrupted_goes_on_from_its_checkpoint(tmp_path, gsplat, monkeypatch, method):
-    """Gaussians, moments, statistics of the strategy and order of views come to what they are without interruption."""
+    """Gaussians, moments, statistics of the strategy and order of views come to what they are without interruption: the
+    random numbers that gsplat draws before the checkpoint are those of the seed."""
     write_colmap(tmp_path / "toy", [(24, 18)] * 5)
     monkeypatch.setattr(train_peer, "CHECKPOINT_EVERY", 10)
-    config = PeerConfig(method, 30, 30)
+    config = peer_config(method, iterations=30, schedule_length=30, densify_from=5)
     train_peer.train_peer(tmp_path / "toy", tmp_path / "whole", config)
     whole = fake_gsplat.DefaultStrategy.made[-1]
+    torch.rand(1)  # what else the process draws makes no difference
     step = train_peer._Fitting._step
 
     def interrupted(self, iteration):
@@ -99,6 +140,71 @@ def test_a_peer_that_was_interrupted_goes_on_from_its_checkpoint(tmp_path, gspla
     assert all(torch.equal(gaussians[name], expected[name]) for name in NAMES)
     losses = [[line["loss"] for line in RunDirectory(tmp_path / name).read_history()] for name in ("whole", "parts")]
     assert losses[0] == losses[1]
+
+
+@pytest.mark.parametrize(("method", "opacity"), [("3dgs", 0.01), ("2dgs", 0.1)])
+def test_opacities_are_reset_which_gsplat_1_5_3_does_not_do(tmp_path, gsplat, monkeypatch, method, opacity):
+    """At steps 10, 20 and 30, counted from 0, and not at 40, where densification ends."""
+    write_colmap(tmp_path / "toy", [(24, 18)] * 3)
+    resets = []
+    reset = fake_gsplat.strategy.ops.reset_opa
+    monkeypatch.setattr(
+        fake_gsplat.strategy.ops,
+        "reset_opa",
+        lambda *arguments: resets.append(len(fake_gsplat.DefaultStrategy.made[-1].steps) - 1) or reset(*arguments),
+    )
+    schedule = {"iterations": 50, "schedule_length": 50, "reset_every": 10, "densify_until": 40}
+    config = peer_config(method, **schedule, start_opacity=0.6, lr_opacities=0.0)
+    train_peer.train_peer(tmp_path / "toy", tmp_path / "run", config)
+    assert resets == [10, 20, 30]
+    gaussians = load_gaussians(tmp_path / "run" / train_peer.FILE, torch.device("cpu"))
+    assert gaussians["opacities"].sigmoid().tolist() == pytest.approx([opacity] * len(gaussians["means"]), rel=1e-4)
+
+
+def test_a_2d_gaussian_starts_without_thickness():
+    """gsplat draws it so, but measures and splits it by all its scales."""
+    points = StartPoints(torch.rand(20, 3), torch.rand(20, 3))
+    solid, flat = (
+        start_gaussians(points, peer_config(method), torch.Generator())["scales"].detach().exp()
+        for method in ("3dgs", "2dgs")
+    )
+    assert torch.equal(solid[:, 2], solid[:, 0])
+    assert torch.equal(flat[:, :2], solid[:, :2])
+    assert (flat[:, 2] > 0).all()
+    assert (flat[:, 2] < 1e-6 * flat[:, 0]).all()
+
+
+@pytest.mark.parametrize("method", ["3dgs", "2dgs"])
+def test_gsplats_own_strategy_densifies_prunes_and_resets_our_gaussians(tmp_path, real_gsplat, monkeypatch, method):
+    """All calls fit its signatures; a run that is interrupted between two densifications goes on with it."""
+    write_colmap(tmp_path / "toy", [(24, 18)] * 5)
+    monkeypatch.setattr(train_peer, "CHECKPOINT_EVERY", 10)
+    schedule = {"densify_from": 5, "densify_until": 40, "densify_every": 8, "reset_every": 25}
+    config = peer_config(method, iterations=60, schedule_length=60, normals_from=30, **schedule)
+    step = train_peer._Fitting._step
+    counts, opaque = {}, {}
+
+    def watched(self, iteration, last=60):
+        if iteration > last:
+            raise KeyboardInterrupt
+        loss = step(self, iteration)
+        counts[iteration - 1] = self.count
+        opaque[iteration - 1] = float(self.gaussians["opacities"].detach().sigmoid().max())
+        return loss
+
+    monkeypatch.setattr(train_peer._Fitting, "_step", lambda self, iteration: watched(self, iteration, last=37))
+    with pytest.raises(KeyboardInterrupt):
+        train_peer.train_peer(tmp_path / "toy", tmp_path / "run", config)
+    monkeypatch.setattr(train_peer._Fitting, "_step", watched)
+    metrics = train_peer.train_peer(tmp_path / "toy", tmp_path / "run", config, resume=True)
+    assert counts[7] == counts[0] < counts[8]  # refined at 8, 16, 24, 32
+    assert counts[32] != counts[31]
+    assert counts[39] == counts[59] == metrics["triangles"]
+    limit = 2 * config.prune_opacity
+    assert opaque[25] == pytest.approx(limit, rel=1e-3)
+    assert opaque[24] > 1.01 * limit
+    assert opaque[59] > 1.01 * limit
+    assert metrics["versions"]["gsplat"] == real_gsplat.__version__
 
 
 def test_peers_stand_once_beside_our_methods_with_and_without_culling(tmp_path, gsplat):

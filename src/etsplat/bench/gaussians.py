@@ -20,6 +20,8 @@ from etsplat.scene.triangle_soup import SH_CONSTANT
 
 NAMES = ("means", "scales", "quats", "opacities", "sh0", "shN")
 """As gsplat's strategies want them: log scales, (w, x, y, z), opacities before their sigmoid, harmonics."""
+_LOG_THICKNESS = -23.0
+"""Of 2D Gaussians. gsplat draws them as if it were nothing, but its strategy measures and splits them by all scales."""
 
 
 @dataclass(frozen=True)
@@ -38,13 +40,16 @@ class Splatting:
 
 
 def start_gaussians(points: StartPoints, config: PeerConfig, generator: torch.Generator) -> nn.ParameterDict:
-    """A round Gaussian at each point, as large as the gap to its neighbours, turned at random."""
+    """A ball, or for 2dgs a disk, at each point, as large as the gap to its neighbours, turned at random."""
     count = len(points)
+    scales = spacing(points.positions).log()[:, None].repeat(1, 3)
+    if config.method == "2dgs":
+        scales[:, 2] = _LOG_THICKNESS
     harmonics = torch.zeros(count, (config.sh_degree + 1) ** 2, 3)
     harmonics[:, 0] = (points.colors - 0.5) / SH_CONSTANT
     values = {
         "means": points.positions,
-        "scales": spacing(points.positions).log()[:, None].repeat(1, 3),
+        "scales": scales,
         "quats": torch.rand(count, 4, generator=generator),
         "opacities": torch.full((count,), math.log(config.start_opacity / (1 - config.start_opacity))),
         "sh0": harmonics[:, :1],

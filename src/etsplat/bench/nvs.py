@@ -8,7 +8,7 @@ from typing import Any
 
 from etsplat.bench.grid import AnyConfig, Cell, is_finished
 from etsplat.bench.paper_nvs import SCENES
-from etsplat.bench.peers import PEERS, Peer, PeerConfig, load_gsplat
+from etsplat.bench.peers import PEERS, Peer, PeerConfig, load_gsplat, peer_config
 from etsplat.bench.variants import changes_of
 from etsplat.core.errors import InputError
 from etsplat.io.run_directory import RunDirectory
@@ -180,7 +180,7 @@ def _settings(scene: Scene, preset: str) -> tuple[TrainConfig, str | None]:
 
 def _peer(peer: Peer, base: TrainConfig) -> PeerConfig:
     """The peer at the iterations and image size of our runs."""
-    return PeerConfig(
+    return peer_config(
         peer,
         iterations=base.iterations,
         max_epochs=base.max_epochs,

@@ -18,7 +18,8 @@ class PeerConfig:
     """3D Gaussian splatting (Kerbl et al. 2023) or 2D Gaussian splatting (Huang et al. 2024), in gsplat.
 
     Learning rates, losses and densification are those of their papers, lengths relative to the scene's extent. What
-    happens at an iteration is given for `schedule_length` iterations and scales, as with our methods.
+    happens at an iteration is given for `schedule_length` iterations and scales, as with our methods. Made by
+    `peer_config`, which knows what differs between the two: the values here are those of 3dgs.
     """
 
     method: Peer
@@ -65,7 +66,7 @@ class PeerConfig:
     normals_from: int = 7000
     """Where that begins."""
     near_plane: float = 0.01
-    """What is nearer to a camera is not drawn."""
+    """What is nearer to a camera is not drawn; 0.2 for 2dgs, as gsplat's trainers have it."""
 
     densify_from: int = 500
     """No densification up to this iteration."""
@@ -74,11 +75,24 @@ class PeerConfig:
     densify_every: int = 100
     """Iterations between densifications."""
     reset_every: int = 3000
-    """Iterations between resets of the opacities."""
+    """Iterations between resets of the opacities, while there is densification."""
+    prune_opacity: float = 0.005
+    """Densification removes what is less opaque, a reset leaves nothing more opaque than twice this; 0.05 for 2dgs."""
 
     def at(self, step: int) -> int:
         """The iteration of this run that an iteration of the schedule falls on; at least 1."""
         return max(1, round(step * self.iterations / self.schedule_length))
+
+    def resets_after(self, iteration: int) -> bool:
+        """Whether opacities are reset at the end of an iteration, counted from 1."""
+        step = iteration - 1  # gsplat counts from 0
+        return 0 < step < self.at(self.densify_until) and step % self.at(self.reset_every) == 0
+
+
+def peer_config(method: Peer, **changes: Any) -> PeerConfig:
+    """The settings of a peer, but for what is changed."""
+    own = {"near_plane": 0.2, "prune_opacity": 0.05} if method == "2dgs" else {}
+    return PeerConfig(method, **{**own, **changes})
 
 
 def load_gsplat() -> "tuple[Any, torch.device]":

@@ -69,7 +69,9 @@ def train_peer(
     fitting = _Fitting(gsplat, capture, config, device)
     run = place.open(record)
     settings = LoopSettings(config.iterations, LOG_EVERY, evaluate_every=0, checkpoint_every=CHECKPOINT_EVERY)
-    progress = fit(fitting, run, settings, record, lambda event: None)
+    with torch.random.fork_rng([device] if device.type == "cuda" else []):
+        torch.manual_seed(config.seed)  # gsplat splits at random
+        progress = fit(fitting, run, settings, record, lambda event: None)
     save_gaussians(run.path / FILE, fitting.gaussians)
     drawing = PeerDrawing(gsplat, fitting.gaussians, capture, config, device)
     run.write_metrics(
@@ -168,6 +170,7 @@ class _Fitting:
             refine_stop_iter=config.at(config.densify_until),
             refine_every=config.at(config.densify_every),
             reset_every=config.at(config.reset_every),
+            prune_opa=config.prune_opacity,
             key_for_gradient="means2d" if config.method == "3dgs" else "gradient_2dgs",
         )
         self._strategy.check_sanity(self.gaussians, self._optimizers)
@@ -254,6 +257,9 @@ class _Fitting:
             optimizer.step()
             optimizer.zero_grad(set_to_none=True)
         self._strategy.step_post_backward(*arguments, packed=False)
+        if config.resets_after(iteration):
+            # DefaultStrategy of 1.5.3 never does (its condition is false at every step); twice is the same as once.
+            self._gsplat.strategy.ops.reset_opa(*arguments[:3], 2 * config.prune_opacity)
         return loss.detach()
 
     def _loss(self, splatting: Splatting, view: int) -> Tensor:
