@@ -1,5 +1,6 @@
 # Everything below works on a fresh clone with Python 3.10+ (pip, venv) and a C++20 compiler; cmake and ninja come from
-# PyPI. Each target does its own set-up, once: stamps under .venv and build remember what is done.
+# PyPI. Each target does its own set-up, once: stamps under .venv and build remember what is done. Byte code is left to
+# imports (--no-compile): most modules of torch and its company are never imported.
 #
 #   PYTHON=python3.12 make setup    another interpreter
 #   make test PYTEST_ARGS="-k cli"  part of the tests
@@ -9,7 +10,8 @@ PYTEST_ARGS ?=
 
 VENV := .venv
 PY := $(VENV)/bin/python
-PIP := $(PY) -m pip --disable-pip-version-check install --quiet
+INSTALL := -m pip --disable-pip-version-check install --quiet --no-compile
+PIP := $(PY) $(INSTALL)
 TOOLS := $(VENV)/.stamp-tools
 INSTALLED := $(VENV)/.stamp-installed
 SANITIZED := build/sanitize/.stamp
@@ -72,6 +74,7 @@ $(SANITIZED): $(INSTALLED) $(shell find src -name '*.py')
 	$(PIP) --no-build-isolation --no-deps --upgrade --target build/sanitize/site \
 		--config-settings=build-dir=build/sanitize/cmake --config-settings=cmake.define.ETSPLAT_SANITIZE=ON \
 		--config-settings=cmake.build-type=Debug --config-settings=install.strip=false .
+	ln -f build/sanitize/site/etsplat/_native.abi3.so build/sanitize/cmake/
 	@touch $@
 
 sanitize: $(SANITIZED)
@@ -87,15 +90,18 @@ wheel: $(TOOLS)
 	rm -rf dist
 	$(PY) -m pip --disable-pip-version-check wheel --quiet --no-deps --wheel-dir dist .
 
-# What a user gets: the wheel alone, in an environment with nothing else, away from the source tree.
+# What a user gets: the wheel alone, in an environment with nothing else, away from the source tree. That environment is
+# a gigabyte, so it goes when it has passed.
+check-wheel: export PYTHONDONTWRITEBYTECODE = 1
 check-wheel: wheel
 	rm -rf build/wheel-check
 	$(PYTHON) -m venv build/wheel-check/venv
-	build/wheel-check/venv/bin/pip --disable-pip-version-check install --quiet -c constraints.txt torch
-	build/wheel-check/venv/bin/pip --disable-pip-version-check install --quiet -c constraints.txt dist/*.whl
+	build/wheel-check/venv/bin/python $(INSTALL) -c constraints.txt torch
+	build/wheel-check/venv/bin/python $(INSTALL) -c constraints.txt dist/*.whl
 	cd build/wheel-check && venv/bin/etsplat doctor
 	cd build/wheel-check && venv/bin/etsplat demo --out demo --preset tiny
 	test -s build/wheel-check/demo/report.html
+	rm -rf build/wheel-check
 
 clean:
 	rm -rf $(VENV) build dist .pytest_cache .ruff_cache .hypothesis
