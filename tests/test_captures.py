@@ -109,6 +109,15 @@ def test_the_fingerprint_follows_the_content_of_every_photo_and_mask(tmp_path):
         first = changed
 
 
+def test_masks_are_found_whatever_the_capitals_of_their_ending(tmp_path):
+    """An image's own name with another ending, or with one added."""
+    write_transforms(tmp_path, 3)
+    for name in ("0000.PNG", "0001.JPG", "0002.png.PNG"):
+        write_photo(tmp_path / "masks" / name, 16, 12)
+    masks = load_capture(tmp_path).images
+    assert all(masks.mask(index) is not None for index in range(3))
+
+
 def test_transparent_images_are_premultiplied_and_masks_come_apart(tmp_path):
     write_transforms(tmp_path / "rgba", 3, channels=4)
     capture = load_capture(tmp_path / "rgba")

@@ -192,6 +192,24 @@ def test_the_kind_of_file_follows_from_its_name(tmp_path, soup, capsys):
         parse(["export", str(tmp_path / "soup.safetensors"), "--out", "b.xyz"]).run([])
 
 
+@pytest.mark.parametrize("kind", ["PLY", "OBJ", "OFF", "GLB", "SafeTensors"])
+def test_the_kind_of_file_does_not_depend_on_capitals(tmp_path, soup, kind):
+    """A.GLB is written like a.glb, by name and by --format, and read back."""
+    save_soup(tmp_path / "from.SAFETENSORS", SoupFile(flat(soup)))
+    for name, more in (("A", []), ("B", ["--format", kind.lower()])):
+        out = tmp_path / f"{name}.{kind}"
+        command = ["export", str(tmp_path / "from.SAFETENSORS"), "--out", str(out), "--min-opacity", "0", *more]
+        assert parse(command).run([]) == 0
+        assert torch.equal(open_soup(out).soup.vertices, soup.vertices)
+
+
+def test_what_a_kind_of_file_cannot_hold_does_not_depend_on_capitals(tmp_path, soup):
+    with pytest.raises(InputError, match=r"soup\.OBJ: files of this kind hold no opacities"):
+        export_soup(run_of(soup), tmp_path / "soup.OBJ", ExportConfig(alpha=True))
+    export_soup(run_of(soup), tmp_path / "soup.PLY", ExportConfig(colors="keep", up="keep", min_opacity=0))
+    assert open_soup(tmp_path / "soup.PLY").soup.sh_degree == 2
+
+
 def test_a_gaussian_scene_comes_in_at_its_places_with_its_size_and_colours(tmp_path):
     """A round Gaussian seen from the front blurs to the same width: the second moment of alpha agrees within 15 %."""
     names = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", *(f"f_rest_{k}" for k in range(9)), "opacity"]

@@ -7,6 +7,7 @@ from types import NoneType
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from etsplat.core.errors import InputError
+from etsplat.io.paths import kind_of
 from etsplat.tasks.reconstruct_config import METHODS, ReconstructConfig
 from etsplat.tasks.train_config import TrainConfig
 
@@ -113,7 +114,7 @@ def find_meshes(folder: Path, objects: Sequence[str]) -> dict[str, Path]:
     if not folder.is_dir():
         raise InputError(f"meshes {folder}: no such folder; fetch the paper's with `etsplat data download famous`")
     suffixes = (".obj", ".ply", ".glb", ".off", ".stl")
-    found = {path.stem: path for path in sorted(folder.rglob("*")) if path.suffix.lower() in suffixes}
+    found = {path.stem: path for path in sorted(folder.rglob("*")) if kind_of(path) in suffixes}
     if not found:
         raise InputError(f"meshes {folder}: no mesh files ({', '.join(suffixes)}) in it")
     if missing := [name for name in objects if name not in found]:

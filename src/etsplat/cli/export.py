@@ -47,13 +47,14 @@ class Export(Command):
     def run(self, arguments: Sequence[str]) -> int:
         """Writes the file and says what is in it."""
         from etsplat.core.errors import InputError
+        from etsplat.io.paths import kind_of
         from etsplat.tasks.export_soup import export_soup
         from etsplat.tasks.soup_run import open_run
 
         opened = open_run(self.run_dir, self.scene, self.device)
         out = self.out or opened.folder / f"soup.{self.format or 'glb'}"
         kinds = [self.format] if self.format else ["ply", "obj", "off", "glb", "safetensors"]
-        if out.suffix.removeprefix(".") not in kinds:
+        if kind_of(out).removeprefix(".") not in kinds:
             raise InputError(f"--out {out}: does not end in .{' or .'.join(kinds)}; rename it or change --format")
         read = self.run_dir / "soup.safetensors" if self.run_dir.is_dir() else self.run_dir
         if out.resolve() == read.resolve():

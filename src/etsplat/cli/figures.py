@@ -45,14 +45,15 @@ class Figures(Command):
         from etsplat.bench.drawings import FIGURES
         from etsplat.bench.teaser import draw_teaser
         from etsplat.io.atomic import atomic_write
+        from etsplat.io.paths import kind_of
 
         path = self.out or Path(f"{self.name}.png")
-        if path.suffix not in (".png", ".pdf", ".svg"):
+        if kind_of(path) not in (".png", ".pdf", ".svg"):
             raise InputError(f"{path}: unknown kind of picture; end the name in .png, .pdf or .svg")
         if self.name == "teaser" and not self.runs:
             raise InputError("teaser: needs finished runs to show; name their folders with --runs")
         figure = draw_teaser(self.runs) if self.name == "teaser" else FIGURES[self.name]()
         with atomic_write(path) as temporary:
-            figure.savefig(temporary, dpi=150, format=path.suffix[1:])
+            figure.savefig(temporary, dpi=150, format=kind_of(path)[1:])
         print(path)
         return 0

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from etsplat.core.errors import InputError
 from etsplat.io.atomic import atomic_write
+from etsplat.io.paths import kind_of
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 """File name endings, lower case, that are tried when a scene names an image without one."""
@@ -113,15 +114,15 @@ def save_image(path: Path | str, image: Float[Tensor, "H W C"]) -> None:
         InputError: the file cannot be written.
     """
     path = Path(path)
-    channels = (1, 3) if path.suffix.lower() in (".jpg", ".jpeg") else (1, 3, 4)
-    if path.suffix.lower() not in IMAGE_SUFFIXES:
+    channels = (1, 3) if kind_of(path) in (".jpg", ".jpeg") else (1, 3, 4)
+    if kind_of(path) not in IMAGE_SUFFIXES:
         raise ValueError(f"path: expected one of the suffixes {', '.join(IMAGE_SUFFIXES)}, got {path.name}")
     if image.ndim != 3 or image.shape[-1] not in channels:
         raise ValueError(f"image: expected shape (H, W, C) with C in {channels}, got {tuple(image.shape)}")
     pixels = Image.fromarray(to_8_bit(image).cpu().numpy().squeeze(axis=-1 if image.shape[-1] == 1 else ()))
     # Encoded in memory first: Pillow's JPEG encoder does not notice when a full disk takes only a part.
     encoded = io.BytesIO()
-    kind = "PNG" if path.suffix.lower() == ".png" else "JPEG"
+    kind = "PNG" if kind_of(path) == ".png" else "JPEG"
     pixels.save(encoded, format=kind, quality=95, subsampling=0)  # PNG ignores the last two
     with atomic_write(path) as temporary:
         temporary.write_bytes(encoded.getvalue())

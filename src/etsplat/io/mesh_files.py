@@ -12,7 +12,7 @@ from etsplat.core.errors import InputError
 from etsplat.io._mesh_readers import READERS, RawMesh
 from etsplat.io._mesh_writers import write_glb, write_obj, write_ply
 from etsplat.io.atomic import atomic_write
-from etsplat.io.paths import path_remedy
+from etsplat.io.paths import kind_of, path_remedy
 
 MESH_SUFFIXES = (".ply", ".obj", ".glb")
 """Kinds of files that `save_mesh` writes."""
@@ -58,11 +58,11 @@ def load_mesh(path: Path | str) -> MeshFile:
         raise InputError(f"mesh {path}: no such file; {path_remedy(path)}")
     if path.is_dir():
         raise InputError(f"mesh {path}: is a folder; name a mesh file ({', '.join(READERS)})")
-    if path.suffix.lower() not in READERS:
+    if kind_of(path) not in READERS:
         raise InputError(f"mesh {path}: unknown kind of file; convert it to one of {', '.join(READERS)}")
     if path.stat().st_size == 0:
         raise InputError(f"mesh {path}: the file is empty; export it again")
-    raw = READERS[path.suffix.lower()](path)
+    raw = READERS[kind_of(path)](path)
     _check(path, raw)
     return _clean(path, raw)
 
@@ -96,7 +96,7 @@ def save_mesh(
         InputError: the file cannot be written.
     """
     path = Path(path)
-    suffix = path.suffix.lower()
+    suffix = kind_of(path)
     if suffix not in MESH_SUFFIXES:
         raise ValueError(f"path: expected one of the suffixes {', '.join(MESH_SUFFIXES)}, got {path.name}")
     _check_arguments(vertices, faces, face_colors, vertex_colors)

@@ -1,8 +1,13 @@
-"""What to say of a path where what was expected is not."""
+"""What a path says: which kind of file it is, and what was probably meant where nothing is."""
 
 import difflib
 import os
 from pathlib import Path
+
+
+def kind_of(path: Path | str) -> str:
+    """The suffix of a file's name, which says what kind of file it is, in lower case: cameras write .JPG."""
+    return Path(path).suffix.lower()
 
 
 def path_remedy(path: Path | str) -> str:

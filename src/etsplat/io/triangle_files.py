@@ -9,6 +9,7 @@ from torch import Tensor
 
 from etsplat.io._mesh_writers import write_glb, write_obj, write_off, write_ply
 from etsplat.io.atomic import atomic_write
+from etsplat.io.paths import kind_of
 
 TRIANGLE_SUFFIXES = (".ply", ".obj", ".off", ".glb")
 
@@ -41,7 +42,7 @@ def save_triangles(
         InputError: the file cannot be written.
     """
     path = Path(path)
-    suffix = path.suffix.lower()
+    suffix = kind_of(path)
     if suffix not in TRIANGLE_SUFFIXES:
         raise ValueError(f"path: expected one of the suffixes {', '.join(TRIANGLE_SUFFIXES)}, got {path.name}")
     if vertices.shape[1:] != (3, 3) or colors.shape not in ((len(vertices), 3), (len(vertices), 4)):

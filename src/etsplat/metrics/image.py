@@ -15,6 +15,7 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from etsplat.core.errors import InputError
+from etsplat.io.paths import kind_of
 
 _C1, _C2 = 0.01**2, 0.03**2
 _WINDOW, _SIGMA = 11, 1.5
@@ -233,7 +234,7 @@ def _read_weights(path: Path) -> Mapping[str, Tensor]:
     if not path.is_file():
         raise InputError(f"LPIPS weights {path}: no such file; check the path")
     try:
-        if path.suffix == ".safetensors":
+        if kind_of(path) == ".safetensors":
             return load_file(path)
         entries = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # torch's unpickler raises anything, depending on the bytes

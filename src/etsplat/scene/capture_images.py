@@ -14,6 +14,7 @@ from torch import Tensor
 
 from etsplat.core.errors import InputError
 from etsplat.io.images import load_mask_pixels, load_pixels
+from etsplat.io.paths import kind_of
 from etsplat.scene.frames import Frame
 
 _SAMPLE = 4096
@@ -178,7 +179,7 @@ class StoredImages:
 
 def _size_in_bytes(frame: Frame, size: tuple[int, int]) -> int:
     """An upper bound: PNG files may turn out to have no transparency."""
-    channels = (4 if frame.image.suffix.lower() == ".png" else 3) + (frame.mask is not None)
+    channels = (4 if kind_of(frame.image) == ".png" else 3) + (frame.mask is not None)
     return size[0] * size[1] * channels
 
 

@@ -17,8 +17,6 @@ from etsplat.io.images import IMAGE_SUFFIXES, image_size, load_image, load_mask,
 from etsplat.io.paths import path_remedy
 from etsplat.scene.views import Normalization, PosedViews
 
-_MASK_SUFFIXES = (".png", ".jpg", ".jpeg")
-
 
 @dataclass(frozen=True)
 class Frame:
@@ -120,9 +118,7 @@ def check_count(source: Path, frames: Sequence[Frame]) -> None:
 def find_image(folder: Path, name: str) -> Path:
     """The file of image `name` in a folder, or one that differs in its ending; as named if there is none."""
     path = folder / name
-    endings = [ending for suffix in IMAGE_SUFFIXES for ending in (suffix, suffix.upper())]
-    candidates = [path, *(path.with_suffix(ending) for ending in endings), *(Path(f"{path}{s}") for s in endings)]
-    return next((candidate for candidate in candidates if candidate.is_file()), path)
+    return _with_any_ending(path) or path
 
 
 def find_mask(folder: Path, name: str) -> Path:
@@ -134,11 +130,17 @@ def find_mask(folder: Path, name: str) -> Path:
     if not folder.is_dir():
         raise InputError(f"masks {folder}: no such folder; {path_remedy(folder)}")
     path = folder / name
-    candidates = [path, *(path.with_suffix(s) for s in _MASK_SUFFIXES), *(Path(f"{path}{s}") for s in _MASK_SUFFIXES)]
-    for candidate in candidates:
-        if candidate.is_file():
-            return candidate
-    raise InputError(f"masks {folder}: no mask for image {name}; add {path.with_suffix('.png').name}")
+    found = _with_any_ending(path)
+    if found is None:
+        raise InputError(f"masks {folder}: no mask for image {name}; add {path.with_suffix('.png').name}")
+    return found
+
+
+def _with_any_ending(path: Path) -> Path | None:
+    """The file at a path, or one with an image's ending, small or large, in place of its own or added to it."""
+    endings = [ending for suffix in IMAGE_SUFFIXES for ending in (suffix, suffix.upper())]
+    candidates = [path, *(path.with_suffix(ending) for ending in endings), *(Path(f"{path}{s}") for s in endings)]
+    return next((candidate for candidate in candidates if candidate.is_file()), None)
 
 
 def _common_size(source: Path, frames: Sequence[Frame]) -> tuple[int, int]:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from etsplat.core.errors import InputError
 from etsplat.io.images import IMAGE_SUFFIXES
-from etsplat.io.paths import path_remedy
+from etsplat.io.paths import kind_of, path_remedy
 from etsplat.io.run_directory import is_run
 from etsplat.scene.colmap import read_colmap
 from etsplat.scene.frames import FrameSet, posed_views
@@ -59,6 +59,6 @@ def _offer(path: Path) -> str:
     """For a run: that it is one. For a folder of photos: how to find the cameras."""
     if is_run(path):
         return " that this run was made from"
-    if any(file.suffix.lower() in IMAGE_SUFFIXES for file in path.iterdir()):
+    if any(kind_of(file) in IMAGE_SUFFIXES for file in path.iterdir()):
         return f", or find the cameras of these photos: etsplat data sfm {path} --out SCENE"
     return ""

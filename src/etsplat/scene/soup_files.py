@@ -9,6 +9,7 @@ import torch
 from safetensors import SafetensorError
 
 from etsplat.core.errors import InputError
+from etsplat.io.paths import kind_of
 from etsplat.io.tensors import read_tensors, save_tensors
 from etsplat.scene.soup_rendering import SoupAppearance
 from etsplat.scene.triangle_soup import TriangleSoup
@@ -45,7 +46,7 @@ def save_soup(path: Path | str, file: SoupFile) -> None:
         InputError: the file cannot be written.
     """
     path = Path(path)
-    if path.suffix != ".safetensors":
+    if kind_of(path) != ".safetensors":
         raise ValueError(f"path: expected the suffix .safetensors, got {path.name}")
     appearance = {name: value for name, value in asdict(file.appearance).items() if value != float("inf")}
     metadata = {

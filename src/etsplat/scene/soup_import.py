@@ -11,6 +11,7 @@ from torch import Tensor
 from etsplat.core.errors import InputError
 from etsplat.core.kernels import DISTANCES, KERNELS
 from etsplat.io.mesh_files import load_mesh
+from etsplat.io.paths import kind_of
 from etsplat.io.ply_tables import CORNERS, read_ply_header, read_ply_tables
 from etsplat.ops.soup_activation import SOUP_SIGMA_FLOOR
 from etsplat.scene.soup_files import SoupFile, check_finite_soup, load_soup
@@ -47,7 +48,7 @@ def open_soup(path: Path | str) -> SoupFile:
         ".pt": _read_triangle_splatting,
         ".ply": _read_ply,
     }
-    file = readers.get(path.suffix.lower(), _read_mesh)(path)
+    file = readers.get(kind_of(path), _read_mesh)(path)
     if not len(file.soup):
         raise InputError(f"soup {path}: holds no triangle; take another file")
     check_finite_soup(path, file.soup)

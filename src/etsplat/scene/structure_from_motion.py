@@ -7,7 +7,7 @@ from typing import Literal
 
 from etsplat.core.errors import InputError
 from etsplat.io.images import IMAGE_SUFFIXES, image_size
-from etsplat.io.paths import path_remedy
+from etsplat.io.paths import kind_of, path_remedy
 from etsplat.scene.colmap_process import Progress, import_pycolmap, place_photos, run_apart
 from etsplat.scene.undistortion import check_output, check_space, undistort_model, working_folder
 
@@ -89,7 +89,7 @@ def find_cameras(
 def _photo_names(photos: Path) -> list[str]:
     if not photos.is_dir():
         raise InputError(f"photos {photos}: no such folder; {path_remedy(photos)}")
-    names = sorted(path.name for path in photos.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES)
+    names = sorted(path.name for path in photos.iterdir() if kind_of(path) in IMAGE_SUFFIXES)
     if len(names) < LEAST_COUNT:
         raise InputError(f"photos {photos}: {len(names)} JPEG or PNG files; at least 3 are needed, better 20 or more")
     return names

@@ -13,7 +13,7 @@ import torch
 from etsplat.core.errors import InputError
 from etsplat.io.atomic import write_error
 from etsplat.io.images import image_size, load_pixels
-from etsplat.io.paths import path_remedy
+from etsplat.io.paths import kind_of, path_remedy
 from etsplat.scene.colmap import find_model
 from etsplat.scene.colmap_process import import_pycolmap, run_apart, undistort_images
 from etsplat.scene.frames import find_mask, scaled_intrinsics
@@ -60,7 +60,7 @@ def undistort_scene(scene: Path | str, out: Path | str, *, max_size: int = 1600)
         model, masks = _make_model(pycolmap, frames), frames.masks
     names = sorted(image.name for image in model.images.values() if image.has_pose)
     for photo in (photos / name for name in names):
-        if photo.suffix.lower() == ".png" and load_pixels(photo, *image_size(photo)).shape[2] == 4:
+        if kind_of(photo) == ".png" and load_pixels(photo, *image_size(photo)).shape[2] == 4:
             raise InputError(f"image {photo}: has transparency, which would be lost; put it into {scene}/masks")
     check_space(out, [*(photos / name for name in names), *masks.values(), *masks.values()])
     with working_folder(out) as work:

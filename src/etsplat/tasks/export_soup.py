@@ -9,6 +9,7 @@ from torch import Tensor
 
 from etsplat.core.cameras import Cameras
 from etsplat.core.errors import InputError
+from etsplat.io.paths import kind_of
 from etsplat.io.triangle_files import save_triangles
 from etsplat.ops.soup_colors import soup_colors
 from etsplat.scene.soup_files import save_soup
@@ -37,12 +38,13 @@ def export_soup(run: SoupRun, path: Path | str, config: ExportConfig) -> Export:
         InputError: settings that contradict each other; nothing is left; the file cannot be written.
     """
     path = Path(path)
-    if path.suffix == ".safetensors":
+    kind = kind_of(path)
+    if kind == ".safetensors":
         save_soup(path, run.file)
         return Export(path, len(run.file.soup), 0)
-    if config.colors == "keep" and (path.suffix != ".ply" or config.up == "y"):
+    if config.colors == "keep" and (kind != ".ply" or config.up == "y"):
         raise InputError("colours that depend on the direction (--colors keep) need --format ply and --up keep")
-    if config.alpha and path.suffix == ".obj":
+    if config.alpha and kind == ".obj":
         raise InputError(f"{path}: files of this kind hold no opacities; leave out --alpha, or choose another --format")
     soup, appearance = run.file.soup, run.file.appearance
     opacities = appearance.opacities(soup).detach()

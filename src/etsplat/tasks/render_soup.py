@@ -15,6 +15,7 @@ from etsplat.core.cameras import Cameras
 from etsplat.core.errors import InputError
 from etsplat.io.atomic import atomic_write, write_error
 from etsplat.io.images import save_image
+from etsplat.io.paths import kind_of
 from etsplat.io.videos import VideoSink, open_video
 from etsplat.scene.camera_paths import PATHS
 from etsplat.scene.captures import Capture
@@ -48,7 +49,7 @@ def render_run(
         InputError: the run has no capture or no views of that kind; MP4 cannot be written; the disk is full.
     """
     out = Path(out)
-    if out.is_file() or out.suffix.lower() in (".mp4", ".png"):
+    if out.is_file() or kind_of(out) in (".mp4", ".png"):
         raise InputError(f"{out}: pictures get names of their own; name a folder for them")
     names, cameras = views_of(run.needed_capture(), config)
     try:
