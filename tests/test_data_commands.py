@@ -21,7 +21,7 @@ from etsplat.io import datasets
 from etsplat.io.datasets import Dataset, download_dataset
 from etsplat.scene.captures import load_capture
 from etsplat.scene.structure_from_motion import find_cameras
-from etsplat.scene.undistortion import undistort_scene
+from etsplat.scene.undistortion import undistort_scene, working_folder
 
 
 def test_without_pycolmap_the_extra_is_named(tmp_path, monkeypatch):
@@ -244,6 +244,43 @@ def test_colmap_ends_with_the_process_that_started_it(tmp_path):
     finally:
         with contextlib.suppress(ProcessLookupError):
             os.kill(colmap, signal.SIGKILL)
+
+
+ABANDONING = """
+import sys
+from pathlib import Path
+
+from etsplat.scene.undistortion import working_folder
+
+with working_folder(Path("scene")) as work:
+    (work / "database.db").write_text("large")
+    print(work, flush=True)
+    sys.stdin.read()
+"""
+
+
+def test_what_a_killed_process_left_is_removed_by_the_next_for_the_same_folder(tmp_path):
+    """And by no other; that of a living process stays, as does a hidden folder of somebody else."""
+    for name in (".scene-notes", ".other-12"):
+        (tmp_path / name).mkdir()
+    program = [sys.executable, "-c", ABANDONING]
+    pipe = subprocess.PIPE
+    killed, living = (subprocess.Popen(program, cwd=tmp_path, stdin=pipe, stdout=pipe, text=True) for _ in range(2))
+    try:
+        left, used = (tmp_path / process.stdout.readline().strip() for process in (killed, living))
+        killed.kill()
+        killed.communicate()
+        assert left.is_dir()
+        with working_folder(tmp_path / "another"):
+            assert left.is_dir()
+        with working_folder(tmp_path / "scene") as work:
+            assert not left.exists()
+            assert (used / "database.db").is_file()
+            assert sorted(tmp_path.iterdir()) == sorted([tmp_path / ".scene-notes", tmp_path / ".other-12", used, work])
+    finally:
+        killed.kill()
+        living.communicate()  # ends it
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".other-12", ".scene-notes"]
 
 
 @pytest.fixture

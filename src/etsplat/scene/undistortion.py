@@ -1,10 +1,12 @@
 """Scenes without lens distortion out of scenes with it, once and for all, with pycolmap (an extra)."""
 
+import contextlib
+import fcntl
+import glob
 import os
 import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -23,6 +25,9 @@ LEAST_SIZE = 16
 """Pixels of the longer side of an image."""
 
 _LITTLE_SPACE = 64 << 20
+
+_MARK = "etsplat-working"
+"""File of a working folder that its process keeps locked."""
 
 _GROWTH, _SPARE_BYTES = 4, 1 << 20
 """COLMAP writes JPEG with few losses: files grow. Beside them lies the model."""
@@ -118,19 +123,37 @@ def check_space(out: Path, images: Sequence[Path], more: int = 0) -> None:
         )
 
 
-@contextmanager
+@contextlib.contextmanager
 def working_folder(out: Path) -> Iterator[Path]:
-    """A folder beside `out` that is gone afterwards. What COLMAP and the system say of a full disk is an InputError."""
+    """A folder beside `out` that is gone afterwards. What COLMAP and the system say of a full disk is an InputError.
+
+    A process that is killed leaves its own behind. The next one for the same `out` removes it.
+    """
     try:
-        with tempfile.TemporaryDirectory(prefix=f".{out.name}-", dir=out.parent) as work:
+        _remove_abandoned(out)
+        with (
+            tempfile.TemporaryDirectory(prefix=f".{out.name}-", dir=out.parent) as folder,
+            open(Path(folder) / f"{_MARK}.new", "wb") as mark,
+        ):
+            with contextlib.suppress(OSError):  # a file system without locks: nobody will get one, nor remove this
+                fcntl.flock(mark, fcntl.LOCK_EX)
+            os.rename(mark.name, Path(folder) / _MARK)  # locked from the moment that it has its name
             try:
-                yield Path(work)
+                yield Path(folder)
             except InputError:
                 raise
             except (RuntimeError, ValueError) as error:  # what pycolmap's C++ throws
                 raise _failure(out, error) from error
     except OSError as error:
         raise write_error(out, error) from error
+
+
+def _remove_abandoned(out: Path) -> None:
+    """Removes working folders for `out` whose processes have ended."""
+    for mark in out.parent.glob(f".{glob.escape(out.name)}-*/{_MARK}"):
+        with contextlib.suppress(OSError), open(mark, "rb") as file:  # locked, by a living process; or just removed
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            shutil.rmtree(mark.parent)
 
 
 def _failure(out: Path, error: Exception) -> InputError:
