@@ -17,7 +17,7 @@ import pytest
 
 from etsplat.bench import paper
 from etsplat.bench.figures import draw_qualitative, plot_convergence
-from etsplat.bench.grid import Cell, make_cells, run_grid
+from etsplat.bench.grid import Cell, count_jobs, make_cells, run_grid
 from etsplat.bench.results import rows_of, summarize
 from etsplat.bench.tables import write_tables
 from etsplat.bench.variants import (
@@ -28,9 +28,12 @@ from etsplat.bench.variants import (
     regularizer_variants,
     setting_variants,
 )
+from etsplat.cli.parse import parse
 from etsplat.core.errors import InputError
 from etsplat.geometry.icosphere import icosphere
 from etsplat.io.mesh_files import save_mesh
+from etsplat.io.run_directory import RunDirectory
+from etsplat.ops.engines import num_threads
 from etsplat.tasks.reconstruct_config import METHODS, PRESETS
 
 SHORT = replace(PRESETS["tiny"], iterations=30, evaluate_every=10, chamfer_samples=2000)
@@ -157,6 +160,25 @@ def test_a_grid_of_nothing_is_refused() -> None:
     """As `--seeds` without a number asks for."""
     with pytest.raises(InputError, match="nothing to run"):
         run_grid([], 1, lambda: None)
+
+
+@pytest.mark.parametrize("grid", [["famous", "--meshes", "none"], ["nvs", "--scenes", "none"]])
+def test_a_negative_number_of_jobs_is_named(grid: list[str], tmp_path: Path) -> None:
+    """Before anything is read. 0 asks for one on each core."""
+    with pytest.raises(InputError, match="jobs: is -2; it must be at least 1, or 0 for one on each core"):
+        parse(["bench", *grid, "--out", str(tmp_path), "--jobs", "-2"]).run([])
+    assert count_jobs(0) == num_threads()
+    assert count_jobs(3) == 3
+
+
+def test_a_run_of_an_earlier_version_is_named(tmp_path: Path) -> None:
+    """One in which config.json does not say how long the run is, before any process is started."""
+    cells = make_cells({"ball": Path("demo:owl")}, VARIANTS, SHORT, [0], tmp_path)
+    run = RunDirectory.create(cells[1].folder, {"task": "reconstruct", "config": {}})
+    run.append_history({"iteration": 3})
+    with pytest.raises(InputError, match=r"config\.json: an earlier version .* lacks `iterations`; remove the folder"):
+        run_grid(cells, 1, lambda: None)
+    assert [cell.state for cell in cells] == ["waiting", "waiting"]
 
 
 def test_finished_runs_are_not_repeated(grid: tuple[Path, list[Cell]]) -> None:

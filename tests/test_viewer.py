@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from captures import write_colmap
+from etsplat.cli.parse import parse
 from etsplat.core.errors import InputError
 from etsplat.io.run_directory import RunDirectory
 from etsplat.scene.captures import load_capture
@@ -112,6 +113,10 @@ def test_a_run_that_is_about_to_begin_is_waited_for(tmp_path, monkeypatch):
     assert len(steps) == 4
     waited = [text.split("waiting for ")[1] for text in told]
     assert waited == ["`etsplat train` to begin there", "the first checkpoint"]
+    old = RunDirectory.create(tmp_path / "old", {"task": "train", "config": {}})
+    save_soup(old.soup_path, SoupFile(make_soup(3)))
+    with pytest.raises(InputError, match=r"old/config\.json: an earlier version .* lacks `iterations`; remove the"):
+        wait_for_soup(old.path, told.append)
     (tmp_path / "letters").mkdir()
     (tmp_path / "letters" / "a.txt").write_text("dear")
     with pytest.raises(InputError, match="is not a run"):
@@ -123,6 +128,23 @@ def test_a_run_that_is_about_to_begin_is_waited_for(tmp_path, monkeypatch):
     monkeypatch.setattr(follow.time, "sleep", lambda _: (tmp_path / "empty").rmdir())
     with pytest.raises(InputError, match="empty: has gone"):
         wait_for_soup(tmp_path / "empty", told.append)
+
+
+def test_a_folder_that_is_not_there_is_waited_for_on_request(tmp_path, monkeypatch, capsys):
+    """Ctrl-C ends that without a word; without the request, a mistyped name is answered with the one that was meant."""
+    (tmp_path / "kitchen").mkdir()
+    for name, remedy in (("kitchne", r"did you mean .*kitchen\?"), ("garden", "check the path")):
+        with pytest.raises(InputError, match=rf"{name}: .* folder; {remedy} \(or --wait for a run to begin there\)"):
+            parse(["view", str(tmp_path / name)]).run([])
+
+    def interrupt(_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(follow.time, "sleep", interrupt)
+    for name in ("garden", "kitchen"):
+        assert parse(["view", str(tmp_path / name), "--wait"]).run([]) == 0
+        written = capsys.readouterr().out
+        assert written == f"{tmp_path / name}: waiting for `etsplat train` to begin there (Ctrl-C ends it)\n"
 
 
 def test_the_page_is_served_on_localhost(run):

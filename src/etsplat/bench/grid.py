@@ -62,7 +62,7 @@ class Cell:
         """How much of the run is done, in [0, 1]."""
         run = RunDirectory(self.folder)
         history = run.read_history()
-        return history[-1]["iteration"] / run.read_config()["iterations"] if history else 0.0
+        return history[-1]["iteration"] / run.read_iterations() if history else 0.0
 
     def metrics(self) -> dict[str, Any]:
         """Those of the finished run."""
@@ -90,6 +90,17 @@ def make_cells(
     return cells
 
 
+def count_jobs(asked: int) -> int:
+    """How many runs go beside each other: as many as asked for, or one for each core for 0.
+
+    Raises:
+        InputError: it is negative.
+    """
+    if asked < 0:
+        raise InputError(f"jobs: is {asked}; it must be at least 1, or 0 for one on each core")
+    return asked or num_threads()
+
+
 def run_grid(cells: Sequence[Cell], jobs: int, show: Callable[[], None]) -> None:
     """Runs every cell that is waiting. Ctrl-C lets the runs save a checkpoint, then raises KeyboardInterrupt.
 
@@ -101,11 +112,14 @@ def run_grid(cells: Sequence[Cell], jobs: int, show: Callable[[], None]) -> None
         show: called about twice a second, and after every change.
 
     Raises:
-        InputError: there is no cell, or its folder cannot be made.
+        InputError: there is no cell, its folder cannot be made, or holds a run of an earlier version.
     """
     if not cells:
         raise InputError("there is nothing to run: name at least one of everything that is compared, and one seed")
     waiting = [cell for cell in cells if cell.state == "waiting"]
+    for cell in waiting:
+        if is_run(cell.folder):
+            RunDirectory(cell.folder).read_iterations()
     jobs = max(1, min(jobs, len(waiting)))
     threads = max(1, num_threads() // jobs)
     running: list[Cell] = []

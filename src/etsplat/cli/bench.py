@@ -57,16 +57,16 @@ class _Grid(Command):
         """Runs what is not finished yet, then writes tables and figures."""
         from rich.console import Console
 
-        from etsplat.bench.grid import make_cells, run_grid
+        from etsplat.bench.grid import count_jobs, make_cells, run_grid
         from etsplat.bench.live import LiveTable
-        from etsplat.ops.engines import num_threads
 
+        jobs = count_jobs(self.jobs)
         base = setting_variants(PRESETS[self.preset], [self.set])[0].config(PRESETS[self.preset], 0)
         variants = self.variants(base)
         cells = make_cells(find_meshes(self.meshes, self.objects), variants, base, self.seeds, self.out)
         try:
             with LiveTable(Console(), cells) as table:
-                run_grid(cells, self.jobs or num_threads(), table.update)
+                run_grid(cells, jobs, table.update)
         except KeyboardInterrupt:
             fail("interrupted; give the same command to go on", INTERRUPTED)
         self._report(cells, [variant.name for variant in variants], arguments)

@@ -47,7 +47,7 @@ class Nvs(Command):
     set: str = ""
     """More changes for all runs, such as iterations=1500,width=400."""
     jobs: int = 1
-    """Runs beside each other; they share the cores evenly."""
+    """Runs beside each other; 0 for one on each core. They share the cores evenly."""
     lpips_weights: Path | None = None
     """File with LPIPS's weights, or `download`."""
 
@@ -60,12 +60,13 @@ class Nvs(Command):
         """Runs what is not finished yet, measures it, then writes tables and figures."""
         from rich.console import Console
 
-        from etsplat.bench.grid import run_grid
+        from etsplat.bench.grid import count_jobs, run_grid
         from etsplat.bench.live import PSNR, LiveTable
         from etsplat.bench.nvs import evaluate_cells, make_nvs_cells, read_scene_argument
         from etsplat.cli.phases import PhaseBar
         from etsplat.ops.engines import num_threads
 
+        jobs = min(count_jobs(self.jobs), num_threads())
         cells = make_nvs_cells(
             [read_scene_argument(scene) for scene in self.scenes],
             self.methods,
@@ -79,7 +80,7 @@ class Nvs(Command):
         console = Console()
         try:
             with LiveTable(console, cells, PSNR) as table:
-                run_grid(cells, min(self.jobs, num_threads()), table.update)
+                run_grid(cells, jobs, table.update)
             with PhaseBar(console) as bar:
                 rows = evaluate_cells(cells, self.lpips_weights, lambda done, total: bar.show("Measuring", done, total))
         except KeyboardInterrupt:

@@ -8,7 +8,7 @@ from typing import Annotated, ClassVar, Literal
 
 import tyro
 
-from etsplat.cli.command import Command
+from etsplat.cli.command import Command, Flag
 from etsplat.core.errors import InputError
 
 
@@ -22,11 +22,14 @@ class View(Command):
     EXAMPLES: ClassVar[str] = """
     etsplat view runs/kitchen
     etsplat view runs/kitchen --port 9000 --width 1600
+    etsplat view runs/garden --wait
     etsplat view point_cloud_state_dict.pt --scene scenes/kitchen
     """
 
     run_dir: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(name="dir")]
     """A run of `etsplat train`, finished or in progress; an empty folder in which one is to begin; or a file."""
+    wait: Flag = False
+    """Wait for the run to begin, if its folder is not there yet."""
     scene: Path | None = None
     """The capture's folder, if it has moved or a file is given: for its cameras."""
     device: Literal["cpu", "cuda"] | None = None
@@ -48,14 +51,18 @@ class View(Command):
         for name, value, low, high in (("width", self.width, 16, 8192), ("port", self.port, 0, 65535)):
             if not low <= value <= high:
                 raise InputError(f"{name}: is {value}; it must be between {low} and {high}")
+        from etsplat.io.paths import path_remedy
         from etsplat.tasks.soup_run import open_run
         from etsplat.viewer.follow import wait_for_soup
         from etsplat.viewer.server import serve
 
-        if self.run_dir.is_dir():
-            wait_for_soup(self.run_dir, lambda text: print(f"{text} (Ctrl-C ends it)", flush=True))
-        opened = open_run(self.run_dir, self.scene, self.device)
+        if not self.run_dir.exists() and not self.wait:
+            remedy = f"{path_remedy(self.run_dir)} (or --wait for a run to begin there)"
+            raise InputError(f"{self.run_dir}: no such file or folder; {remedy}")
         with contextlib.suppress(KeyboardInterrupt):
+            if not self.run_dir.is_file():
+                wait_for_soup(self.run_dir, lambda text: print(f"{text} (Ctrl-C ends it)", flush=True))
+            opened = open_run(self.run_dir, self.scene, self.device)
             serve(
                 opened,
                 self.host,

@@ -214,6 +214,20 @@ class RunDirectory:
         """
         return _read_json(self.config_path)
 
+    def read_iterations(self) -> int:
+        """How many iterations the run will have had when it is done.
+
+        Raises:
+            InputError: config.json is missing, or does not say, as those of the first days did not.
+        """
+        config = self.read_config()
+        if "iterations" not in config:
+            raise InputError(
+                f"{self.config_path}: an earlier version of etsplat wrote it, it lacks `iterations`; "
+                "remove the folder and run again"
+            )
+        return config["iterations"]
+
     def read_metrics(self) -> dict[str, Any]:
         """What metrics.json holds.
 

@@ -15,21 +15,22 @@ WAITING_SECONDS = 1.0
 
 
 def wait_for_soup(folder: Path, announce: Callable[[str], None]) -> None:
-    """Returns when the run in a folder has written its first soup: the folder may be empty as yet.
+    """Returns when the run in a folder has written its first soup: the folder may be empty, or not be there, as yet.
 
     Args:
         folder: of the run.
         announce: told once what is waited for, and again when that changes.
 
     Raises:
-        InputError: the folder holds something else, or goes away.
+        InputError: the folder holds something else, or a run of an earlier version, or goes away.
     """
     if folder.is_dir() and any(folder.iterdir()) and not is_run(folder):
         raise InputError(f"{folder}: is not a run of etsplat; name a folder given to --out, or a soup's file")
-    told = ""
+    told, seen = "", False
     while not RunDirectory(folder).soup_path.is_file():
-        if not folder.is_dir():
+        if seen and not folder.is_dir():
             raise InputError(f"{folder}: has gone; name another folder")
+        seen = folder.is_dir()
         begun = is_run(folder)
         if begun:
             check_trains(folder)
@@ -37,6 +38,7 @@ def wait_for_soup(folder: Path, announce: Callable[[str], None]) -> None:
         if text != told:
             announce(told := text)
         time.sleep(WAITING_SECONDS)
+    RunDirectory(folder).read_iterations()  # as following it will
 
 
 class Followed:
@@ -64,7 +66,7 @@ class Followed:
         if not history:
             return ""
         last = history[-1]
-        iterations = self._run.read_config()["iterations"]
+        iterations = self._run.read_iterations()
         known = [line["psnr"] for line in history if line.get("psnr") is not None]
         quality = f", {known[-1]:.2f} dB on test views" if known else ""
         state = "done" if self._run.metrics_path.is_file() else "running"
