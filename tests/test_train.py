@@ -224,9 +224,23 @@ def test_shorter_runs_move_vertices_faster() -> None:
     """By the root of how much shorter they are; the original's rate does not know the length of a run."""
     quick, paper = train_settings("quick"), train_settings("paper")
     for iterations, factor in ((6000, 1.0), (1500, 2.0)):
-        first = SoupSchedule(replace(quick, iterations=iterations), squared=False).vertex_rate(1)
-        assert first == pytest.approx(factor * quick.lr_vertices)
-    assert SoupSchedule(replace(paper, iterations=300), squared=False).vertex_rate(1) == paper.lr_vertices
+        first = SoupSchedule(replace(quick, iterations=iterations), squared=False).rates(1)
+        assert first["vertices"] == pytest.approx(factor * quick.lr_vertices)
+    assert SoupSchedule(replace(paper, iterations=300), squared=False).rates(1)["vertices"] == paper.lr_vertices
+
+
+def test_rates_settle_towards_the_end() -> None:
+    """With `lr_settle` colours, opacities and softness come to rest like the vertices; the original's never do."""
+    paper = replace(train_settings("paper"), iterations=300)
+    quick = replace(paper, lr_settle=20_000)
+    for config, ratio, last in ((paper, 1.0, 1.0), (quick, 0.1**0.5, 0.1)):
+        schedule = SoupSchedule(config, squared=False)
+        first = schedule.rates(1)
+        for name in ("opacity_logits", "sigma_raw", "sh_dc", "sh_rest"):
+            assert schedule.rates(200)[name] == first[name]
+            assert schedule.rates(250)[name] == pytest.approx(ratio * first[name])
+            assert schedule.rates(300)[name] == pytest.approx(last * first[name])
+        assert schedule.rates(300)["vertices"] == pytest.approx(paper.lr_vertices_final * first["vertices"])
 
 
 def test_an_opaque_finish_removes_only_what_is_hidden() -> None:

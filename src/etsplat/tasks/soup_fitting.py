@@ -74,20 +74,14 @@ class SoupFitting:
         self._sampler = ViewSampler(capture.train, generator)
         self._iteration = 0
         self._surroundings = Surroundings.of(capture).to(self._device) if config.closed else None
-        rates = {
-            "vertices": config.lr_vertices,
-            "opacity_logits": config.lr_opacities,
-            "sigma_raw": config.lr_sigma,
-            "sh_dc": config.lr_sh_dc,
-            "sh_rest": config.lr_sh_rest,
-        }
-        self.adam = Adam(soup.parameters(), rates, engine=config.engine)
+        self.adam = Adam(soup.parameters(), self._schedule.rates(1), engine=config.engine)
         self._queue: StepQueue | None = None
         self._phase: tuple[SoupAppearance, SoupWeights] | None = None
         self._drawn: TriangleStatistics | None = None  # by the step that is being captured
         if resolve_engine(config.engine, soup.vertices) == "cuda":
             self._device_views = DeviceViews(capture, self._device)
-            self._queue = StepQueue(self._queued_gradients, self._commit, 8 + len(rates) + 1, self._device)
+            columns = 8 + len(self.adam.parameters) + 1
+            self._queue = StepQueue(self._queued_gradients, self._commit, columns, self._device)
         else:
             self._views = CaptureViews(capture, self._device)
 
@@ -141,7 +135,7 @@ class SoupFitting:
             appearance,
             weights,
         )
-        self.adam.learning_rates["vertices"] = self._schedule.vertex_rate(iteration)
+        self.adam.learning_rates = self._schedule.rates(iteration)
         self.adam.step()
         self.statistics.update(drawn, len(self._capture.train), epoch_starts=self._sampler.epoch_starts)
         return float(loss)
@@ -153,7 +147,7 @@ class SoupFitting:
         kind, place = self._device_views.find(view)
         appearance = self._schedule.appearance(iteration)
         limits = appearance.opacity_floor, appearance.sigma_ceiling
-        self.adam.learning_rates["vertices"] = self._schedule.vertex_rate(iteration)
+        self.adam.learning_rates = self._schedule.rates(iteration)
         self.adam.step_count += 1
         rates = self.adam.rates(list(self.adam.parameters))
         scheduled = *limits, float(self._sampler.epoch_starts), *rates

@@ -8,6 +8,9 @@ from etsplat.optim.soup_objective import SoupWeights
 from etsplat.scene.soup_rendering import SoupAppearance
 from etsplat.tasks.train_config import TrainConfig
 
+SETTLED = 0.1
+"""What is left, at the end of a run, of the learning rates that settle (`lr_settle`)."""
+
 FINAL_FLOOR, OPAQUE_AT = 0.995, 0.2
 FIRST_CEILING, FINAL_CEILING, SHARP_FROM, SHARP_AT = 1.0, 0.05, 0.3, 0.95
 HIDDEN = 0.005
@@ -56,13 +59,22 @@ class SoupSchedule:
             pixel="l2" if self.squared else "l1",
         )
 
-    def vertex_rate(self, iteration: int) -> float:
-        """Adam's learning rate of positions."""
+    def rates(self, iteration: int) -> dict[str, float]:
+        """Adam's learning rates, by parameter."""
         config = self.config
-        first, length = config.lr_vertices, config.lr_vertices_length
-        if length is not None:
-            first *= math.sqrt(length / config.iterations)
-        return first * exponential_decay(iteration, config.iterations, config.lr_vertices_final)
+        vertices = config.lr_vertices * exponential_decay(iteration, config.iterations, config.lr_vertices_final)
+        if config.lr_vertices_length is not None:
+            vertices *= math.sqrt(config.lr_vertices_length / config.iterations)
+        others = 1.0
+        if config.lr_settle is not None:
+            others = SETTLED ** ramp(iteration, config.at(config.lr_settle), config.iterations)
+        return {
+            "vertices": vertices,
+            "opacity_logits": config.lr_opacities * others,
+            "sigma_raw": config.lr_sigma * others,
+            "sh_dc": config.lr_sh_dc * others,
+            "sh_rest": config.lr_sh_rest * others,
+        }
 
     @property
     def least_importance(self) -> float:

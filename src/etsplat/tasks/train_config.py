@@ -90,6 +90,9 @@ class TrainConfig:
     """Adam learning rate of opacities, before their sigmoid."""
     lr_sigma: float = 0.0008
     """Adam learning rate of softness, before its exponential."""
+    lr_settle: int | None = None
+    """From this iteration on the rates of colours, opacities and softness fall too, to a tenth at the last one; None
+    keeps them."""
 
     lambda_dssim: float = 0.2
     """Share of 1 - SSIM in the photometric loss; the rest is L1."""
@@ -177,7 +180,7 @@ _RANGES = (
     *((name, 1, _INF) for name in ("log_every", "densify_every", "sh_every", "prune_screen_size")),
     *((name, 0, _INF) for name in ("evaluate_every", "checkpoint_every", "seed", "regularize_from")),
     *((name, 0, _INF) for name in ("densify_from", "densify_until", "split_size", "clone_noise", "prune_views")),
-    *((name, 0, _INF) for name in ("lr_vertices", "lr_sh_dc", "lr_sh_rest", "lr_opacities", "lr_sigma")),
+    *((name, 0, _INF) for name in ("lr_vertices", "lr_sh_dc", "lr_sh_rest", "lr_opacities", "lr_sigma", "lr_settle")),
     *((name, 0, _INF) for name in ("lambda_opacity", "lambda_size", "lambda_normal", "lambda_distortion")),
     *((name, 0, 1) for name in ("lambda_dssim", "prune_opacity", "prune_importance")),
     *((name, 1e-6, _INF) for name in ("near_plane", "cull_large", "start_scale", "lr_vertices_final")),
@@ -237,6 +240,7 @@ _QUICK: dict[str, Any] = {
     "lr_sh_rest": 0.0005,
     "lr_opacities": 0.05,
     "lr_sigma": 0.005,
+    "lr_settle": 20_000,
     "prune_views": 0,
     "lambda_normal": 0.0,
     "lambda_distortion": 0.0,
