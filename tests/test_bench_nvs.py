@@ -82,6 +82,14 @@ def test_means_are_over_seeds_too():
     assert nvs_tables(rows[:1])[0].note.startswith("Means over a. ")
 
 
+def test_what_another_seed_changes_stands_beside_the_means():
+    rows = [row("a", "elastic", psnr, seed=seed) for seed, psnr in enumerate((24.0, 25.0, 26.0))]
+    tables = {table.name: table for table in nvs_tables([*rows, row("b", "elastic", 30.0)])}
+    assert tables["per-scene PSNR"].rows == [("elastic", [25.0, 30.0])]
+    assert tables["per-scene PSNR, spread"].rows == [("elastic", [1.0, None])]
+    assert not any("spread" in table.name for table in nvs_tables(rows[:1]))
+
+
 def test_the_built_in_scene_is_one_of_a_grid_in_photos_no_wider_than_asked_for(tmp_path):
     scene = read_scene_argument("demo:scene")
     cells = make_nvs_cells(

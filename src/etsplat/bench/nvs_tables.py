@@ -85,6 +85,8 @@ def nvs_tables(rows: Sequence[dict[str, Any]]) -> list[Table]:
                 body.append((variant, [mean(variant, key, [scene]) for scene in everything]))
                 body += _printed_per_scene(variant, everything, index)
             tables.append(Table(f"per-scene {title}", "", [(scene, form, best) for scene in everything], body))
+            if _seeds_of(rows):
+                tables.append(_spread(rows, title, key, form))
     if any(variant.endswith(CULLED) for variant in variants) and not all(v.endswith(CULLED) for v in variants):
         tables.append(_filter(variants, scenes, mean))
     columns = [("minutes", ".1f", -1), ("primitives", ",.0f", 0), ("frames/s", ".1f", 1), ("ms per million", ".1f", -1)]
@@ -115,6 +117,19 @@ def _seeds_of(rows: Sequence[dict[str, Any]]) -> str:
     """How many seeds the means are over, if there are several."""
     count = len({row["seed"] for row in rows})
     return f" and {count} seeds" if count > 1 else ""
+
+
+def _spread(rows: Sequence[dict[str, Any]], title: str, key: str, form: str) -> Table:
+    """What another seed changes: standard deviations of a measure, over the seeds that were run."""
+    variants, scenes = (list(dict.fromkeys(row[name] for row in rows)) for name in ("variant", "scene"))
+
+    def deviation(variant: str, scene: str) -> float | None:
+        values = [row[key] for row in rows if (row["variant"], row["scene"]) == (variant, scene)]
+        return statistics.stdev(values) if len(values) > 1 and None not in values else None
+
+    body = [(variant, [deviation(variant, scene) for scene in scenes]) for variant in variants]
+    note = "Standard deviation from seed to seed."
+    return Table(f"per-scene {title}, spread", note, [(scene, form, 0) for scene in scenes], body)
 
 
 def _printed(variant: str, scenes: Sequence[str]) -> tuple[float, float, float] | None:
