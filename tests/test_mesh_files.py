@@ -85,15 +85,27 @@ def test_split_export_has_three_vertices_per_face_in_its_exact_colour(tmp_path, 
 
 
 def test_glb_holds_linear_colours_under_an_unlit_two_sided_material(tmp_path, ball):
-    """Viewers apply the sRGB curve to COLOR_0, so that 0.5 as displayed is stored as 0.214."""
+    """Viewers apply the sRGB curve to COLOR_0, so that 0.5 as displayed is stored as 0.214.
+
+    Its alpha is there and 1: programs that read with Assimp take one that is missing for 0 (assimp/assimp#3473).
+    """
     save_mesh(tmp_path / "a.glb", ball[0], ball[1], torch.full_like(ball[2], 0.5))
     document = glb_json(tmp_path / "a.glb")
     offset = 28 + struct.unpack("<I", (tmp_path / "a.glb").read_bytes()[12:16])[0]
-    view = document["bufferViews"][document["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"]]
-    stored = np.frombuffer((tmp_path / "a.glb").read_bytes(), "<f4", 3, offset + view["byteOffset"])
-    np.testing.assert_allclose(stored, 0.2140411, atol=1e-6)
+    accessor = document["accessors"][document["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"]]
+    assert accessor["type"] == "VEC4"
+    view = document["bufferViews"][accessor["bufferView"]]
+    stored = np.frombuffer((tmp_path / "a.glb").read_bytes(), "<f4", 4 * accessor["count"], offset + view["byteOffset"])
+    np.testing.assert_allclose(stored.reshape(-1, 4), [[0.2140411] * 3 + [1]] * accessor["count"], atol=1e-6)
     assert document["materials"][0]["doubleSided"]
     assert "KHR_materials_unlit" in document["materials"][0]["extensions"]
+
+
+def test_what_is_imported_from_a_glb_has_the_name_of_the_file(tmp_path, ball):
+    save_mesh(tmp_path / "kitchen.glb", *ball)
+    document = glb_json(tmp_path / "kitchen.glb")
+    assert document["nodes"][0]["name"] == document["meshes"][0]["name"] == "kitchen"
+    assert document["materials"][0]["name"] == "opaque"
 
 
 def test_the_srgb_curves_are_inverse_to_each_other_and_meet_known_values():

@@ -65,11 +65,12 @@ def write_off(path: Path, vertices: np.ndarray, faces: np.ndarray, colors: Color
         np.savetxt(file, rows, fmt="%d")
 
 
-def write_glb(path: Path, vertices: np.ndarray, faces: np.ndarray, colors: Colors) -> None:
+def write_glb(path: Path, vertices: np.ndarray, faces: np.ndarray, colors: Colors, name: str) -> None:
     """Binary glTF 2.0. Colours of vertices, display values, become linear COLOR_0 under an unlit material.
 
     With (V, 4) the last channel is alpha. Faces with all corners above `OPAQUE_ALPHA` are a primitive of their own and
-    stay opaque: viewers sort what blends by mesh at best, and do not let it hide anything.
+    stay opaque: viewers sort what blends by mesh at best, and do not let it hide anything. COLOR_0 has an alpha in any
+    case, as programs that read with Assimp take one that is missing for 0. `name` is what importers call the object.
     """
     parts = [(faces, "OPAQUE")]
     if colors is not None and colors.shape[1] == 4:
@@ -78,9 +79,10 @@ def write_glb(path: Path, vertices: np.ndarray, faces: np.ndarray, colors: Color
     arrays = [("VEC3", vertices.astype("<f4"))]
     attributes = {"POSITION": 0}
     if colors is not None:
-        linear = np.hstack([linear_from_srgb(colors[:, :3]), colors[:, 3:]])
+        linear = np.ones((len(colors), 4))
+        linear[:, : colors.shape[1]] = np.hstack([linear_from_srgb(colors[:, :3]), colors[:, 3:]])
         attributes["COLOR_0"] = len(arrays)
-        arrays.append((f"VEC{linear.shape[1]}", linear.astype("<f4")))
+        arrays.append(("VEC4", linear.astype("<f4")))
     primitives = []
     for part, _ in parts:
         primitives.append({"attributes": attributes, "indices": len(arrays), "mode": 4, "material": len(primitives)})
@@ -96,8 +98,8 @@ def write_glb(path: Path, vertices: np.ndarray, faces: np.ndarray, colors: Color
         "asset": {"version": "2.0", "generator": "etsplat"},
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": primitives}],
+        "nodes": [{"mesh": 0, "name": name}],
+        "meshes": [{"primitives": primitives, "name": name}],
         "materials": [_gltf_material(mode, unlit=colors is not None) for _, mode in parts],
         "buffers": [{"byteLength": offset}],
         "bufferViews": views,
@@ -117,6 +119,7 @@ def write_glb(path: Path, vertices: np.ndarray, faces: np.ndarray, colors: Color
 def _gltf_material(mode: str, *, unlit: bool) -> dict[str, Any]:
     """Two-sided. Colours already hold the scene's light, so a viewer must not light them again: unlit."""
     material: dict[str, Any] = {
+        "name": mode.lower(),
         "doubleSided": True,
         "alphaMode": mode,
         "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0},

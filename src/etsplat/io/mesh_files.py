@@ -115,7 +115,7 @@ def save_mesh(
         elif suffix == ".obj":
             write_obj(temporary, v, f, per_vertex)
         else:
-            write_glb(temporary, v, f, per_vertex)
+            write_glb(temporary, v, f, per_vertex, path.stem)
 
 
 def weld_vertices(mesh: MeshFile) -> MeshFile:

@@ -63,7 +63,7 @@ def save_triangles(
         elif suffix == ".obj":
             write_obj(temporary, points, faces, point_colors[:, :3])
         else:
-            write_glb(temporary, points, faces, point_colors)
+            write_glb(temporary, points, faces, point_colors, path.stem)
 
 
 def _indexed(
