@@ -15,7 +15,7 @@ Settings = Annotated[ExportConfig, tyro.conf.arg(name=""), tyro.conf.OmitArgPref
 
 @dataclass(frozen=True, kw_only=True)
 class Export(Command):
-    """Write a trained soup for Blender, MeshLab, three.js or Unity; or turn another program's file into a soup."""
+    """Write a trained soup for Blender, game engines or the web; or turn another program's file into a soup."""
 
     EXAMPLES: ClassVar[str] = """
     etsplat export runs/kitchen
@@ -28,7 +28,8 @@ class Export(Command):
     """A run of `etsplat train`; or a file: .safetensors, .pt of Triangle Splatting, Gaussian .ply, or a mesh."""
     format: Literal["ply", "obj", "off", "glb", "safetensors"] | None = None
     """Kind of file; by default what --out ends in, or glb.
-    glb: for Blender, three.js and Unity;
+    glb: for Blender, game engines and the web;
+    Unity needs the package com.unity.cloud.gltfast for it;
     ply: for MeshLab and Open3D (glb is too dark there);
     obj and off: for others; safetensors: for etsplat."""
     out: Path | None = None
