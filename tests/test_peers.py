@@ -84,7 +84,7 @@ def test_a_peer_is_trained_measured_and_tabulated_as_our_methods_are(tmp_path, g
     again = cells_of(tmp_path, [method])[0]
     assert again.state == "done"
     strategy = fake_gsplat.DefaultStrategy.made[-1]
-    assert strategy.schedule == (1, 15, 1, 3)  # 500, 15,000, 100 and 3,000 of 30,000 iterations
+    assert strategy.schedule == (1, 15, 100, 3000)  # 500 and 15,000 of 30,000 iterations; intervals stay
     assert (strategy.prune_opa, strategy.key) == {"3dgs": (0.005, "means2d"), "2dgs": (0.05, "gradient_2dgs")}[method]
     assert strategy.steps == list(range(30))
     history = RunDirectory(cell.folder).read_history()

@@ -18,8 +18,9 @@ class PeerConfig:
     """3D Gaussian splatting (Kerbl et al. 2023) or 2D Gaussian splatting (Huang et al. 2024), in gsplat.
 
     Learning rates, losses and densification are those of their papers, lengths relative to the scene's extent. What
-    happens at an iteration is given for `schedule_length` iterations and scales, as with our methods. Made by
-    `peer_config`, which knows what differs between the two: the values here are those of 3dgs.
+    happens at an iteration is given for `schedule_length` iterations and scales, as with our methods. Intervals do not:
+    Gaussians that have no time to settle are split again and again. Made by `peer_config`, which knows what differs
+    between the two: the values here are those of 3dgs.
     """
 
     method: Peer
@@ -73,9 +74,9 @@ class PeerConfig:
     densify_until: int = 15_000
     """None from this one on."""
     densify_every: int = 100
-    """Iterations between densifications."""
+    """Iterations between densifications, however long the run is."""
     reset_every: int = 3000
-    """Iterations between resets of the opacities, while there is densification."""
+    """Iterations between resets of the opacities while there is densification, however long the run is."""
     prune_opacity: float = 0.005
     """Densification removes what is less opaque, a reset leaves nothing more opaque than twice this; 0.05 for 2dgs."""
 
@@ -86,7 +87,7 @@ class PeerConfig:
     def resets_after(self, iteration: int) -> bool:
         """Whether opacities are reset at the end of an iteration, counted from 1."""
         step = iteration - 1  # gsplat counts from 0
-        return 0 < step < self.at(self.densify_until) and step % self.at(self.reset_every) == 0
+        return 0 < step < self.at(self.densify_until) and step % self.reset_every == 0
 
 
 def peer_config(method: Peer, **changes: Any) -> PeerConfig:

@@ -168,8 +168,8 @@ class _Fitting:
         self._strategy = gsplat.DefaultStrategy(
             refine_start_iter=config.at(config.densify_from),
             refine_stop_iter=config.at(config.densify_until),
-            refine_every=config.at(config.densify_every),
-            reset_every=config.at(config.reset_every),
+            refine_every=config.densify_every,
+            reset_every=config.reset_every,
             prune_opa=config.prune_opacity,
             key_for_gradient="means2d" if config.method == "3dgs" else "gradient_2dgs",
         )
