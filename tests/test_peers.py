@@ -142,6 +142,21 @@ def test_a_peer_that_was_interrupted_goes_on_from_its_checkpoint(tmp_path, gspla
     assert losses[0] == losses[1]
 
 
+@pytest.mark.parametrize(("kind", "modes"), [("outdoor", {"RGB", "RGB+ED"}), ("object", {"RGB"})])
+def test_2dgs_fits_normals_except_on_objects(tmp_path, gsplat, monkeypatch, kind, modes):
+    write_colmap(tmp_path / "toy", [(24, 18)] * 3)
+    seen = set()
+    draw = fake_gsplat.rasterization_2dgs
+    monkeypatch.setattr(
+        fake_gsplat, "rasterization_2dgs", lambda **kwargs: seen.add(kwargs["render_mode"]) or draw(**kwargs)
+    )
+    scene = read_scene_argument(f"{tmp_path / 'toy'}:{kind}")
+    setting = "iterations=30,width=24"
+    (cell,) = make_nvs_cells([scene], ["2dgs"], tmp_path / "out", preset="tiny", culling=(False,), setting=setting)
+    train_peer.train_peer(cell.mesh, cell.folder, cell.config)
+    assert seen == modes
+
+
 @pytest.mark.parametrize(("method", "opacity"), [("3dgs", 0.01), ("2dgs", 0.1)])
 def test_opacities_are_reset_which_gsplat_1_5_3_does_not_do(tmp_path, gsplat, monkeypatch, method, opacity):
     """At steps 10, 20 and 30, counted from 0, and not at 40, where densification ends."""

@@ -179,7 +179,8 @@ def _settings(scene: Scene, preset: str) -> tuple[TrainConfig, str | None]:
 
 
 def _peer(peer: Peer, base: TrainConfig) -> PeerConfig:
-    """The peer at the iterations and image size of our runs."""
+    """The peer at the iterations and image size of our runs; without normals on objects, as in the script of 2DGS."""
+    changes = {"lambda_normal": 0.0} if base.scene_type == "object" else {}
     return peer_config(
         peer,
         iterations=base.iterations,
@@ -188,4 +189,5 @@ def _peer(peer: Peer, base: TrainConfig) -> PeerConfig:
         width=base.width,
         background="white" if base.background == "white" else "black",
         seed=base.seed,
+        **changes,
     )

@@ -238,7 +238,9 @@ class _Fitting:
         config, view = self._config, self._sampler.next_view()
         decay = exponential_decay(iteration, config.iterations, config.lr_means_final)
         self._optimizers["means"].param_groups[0]["lr"] = config.lr_means * decay
-        regularized = config.method == "2dgs" and iteration > config.at(config.normals_from)
+        regularized = (
+            config.method == "2dgs" and config.lambda_normal > 0 and iteration > config.at(config.normals_from)
+        )
         splatting = splat(
             self._gsplat,
             self.gaussians,
