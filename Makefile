@@ -1,6 +1,5 @@
 # Everything below works on a fresh clone with Python 3.10+ (pip, venv) and a C++20 compiler; cmake and ninja come from
-# PyPI. Each target does its own set-up, once: stamps under .venv and build remember what is done. Byte code is left to
-# imports (--no-compile): most modules of torch and its company are never imported.
+# PyPI. Each target does its own set-up, once: stamps under .venv and build remember what is done.
 #
 #   PYTHON=python3.12 make setup    another interpreter
 #   make test PYTEST_ARGS="-k cli"  part of the tests
@@ -10,8 +9,7 @@ PYTEST_ARGS ?=
 
 VENV := .venv
 PY := $(VENV)/bin/python
-INSTALL := -m pip --disable-pip-version-check install --quiet --no-compile
-PIP := $(PY) $(INSTALL)
+PIP := $(PY) -m pip --disable-pip-version-check install --quiet
 TOOLS := $(VENV)/.stamp-tools
 INSTALLED := $(VENV)/.stamp-installed
 SANITIZED := build/sanitize/.stamp
@@ -91,8 +89,9 @@ wheel: $(TOOLS)
 	$(PY) -m pip --disable-pip-version-check wheel --quiet --no-deps --wheel-dir dist .
 
 # What a user gets: the wheel alone, in an environment with nothing else, away from the source tree. That environment is
-# a gigabyte, so it goes when it has passed.
+# a gigabyte, byte code left out, so it goes when it has passed.
 check-wheel: export PYTHONDONTWRITEBYTECODE = 1
+check-wheel: INSTALL := -m pip --disable-pip-version-check install --quiet --no-compile
 check-wheel: wheel
 	rm -rf build/wheel-check
 	$(PYTHON) -m venv build/wheel-check/venv
