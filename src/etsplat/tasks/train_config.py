@@ -91,8 +91,8 @@ class TrainConfig:
     lr_sigma: float = 0.0008
     """Adam learning rate of softness, before its exponential."""
     lr_settle: int | None = None
-    """From this iteration on the rates of colours, opacities and softness fall too, to a tenth at the last one; None
-    keeps them."""
+    """From this iteration on the rates of colours, opacities and softness fall too, to a tenth at the last one;
+    None keeps them."""
 
     lambda_dssim: float = 0.2
     """Share of 1 - SSIM in the photometric loss; the rest is L1."""
