@@ -11,6 +11,7 @@ import pytest
 import torch
 
 import fake_gsplat
+from benchmarks import gsplat_on_cpu
 from captures import write_colmap
 from etsplat.bench import nvs, train_peer
 from etsplat.bench.gaussians import NAMES, load_gaussians, start_gaussians
@@ -21,6 +22,7 @@ from etsplat.bench.peers import load_gsplat, peer_config
 from etsplat.core.errors import InputError
 from etsplat.io.run_directory import RunDirectory
 from etsplat.scene.soup_init import StartPoints
+from etsplat.scene.triangle_soup import SH_CONSTANT
 
 
 def put_in_place(module, monkeypatch):
@@ -62,6 +64,14 @@ def real_gsplat(monkeypatch):
     )
     put_in_place(module, monkeypatch)
     return module
+
+
+def rotations(quats):
+    """(N, 3, 3) of (N, 4) quaternions (w, x, y, z) of any length."""
+    w, x, y, z = torch.nn.functional.normalize(quats, dim=1).unbind(dim=1)
+    first = torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], dim=1)
+    second = torch.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], dim=1)
+    return torch.stack([first, second, torch.linalg.cross(first, second)], dim=2)
 
 
 def cells_of(folder, methods):
@@ -220,6 +230,46 @@ def test_gsplats_own_strategy_densifies_prunes_and_resets_our_gaussians(tmp_path
     assert opaque[24] > 1.01 * limit
     assert opaque[59] > 1.01 * limit
     assert metrics["versions"]["gsplat"] == real_gsplat.__version__
+
+
+@pytest.mark.parametrize("method", ["3dgs", "2dgs"])
+def test_gsplat_on_the_cpu_draws_one_gaussian_after_the_other(monkeypatch, method):
+    """benchmarks/gsplat_on_cpu.py against a loop over Gaussians; of a disk, by where each pixel's ray meets it."""
+    gsplat = pytest.importorskip("gsplat", reason="gsplat is not installed (extra peers)")
+    if gsplat.__version__ != gsplat_on_cpu.VERSION:
+        pytest.skip(f"needs gsplat {gsplat_on_cpu.VERSION}")
+    for module, name, value in gsplat_on_cpu.replacements():
+        monkeypatch.setattr(module, name, value)
+    rng = torch.Generator().manual_seed(0)
+    means, quats, scales = (torch.rand(30, size, generator=rng) for size in (3, 4, 3))
+    means, scales = means * 2 - 1 + torch.tensor([0, 0, 3.0]), scales * 0.2 + 0.05
+    opacities, colors = 0.9 * torch.rand(30, generator=rng), torch.rand(30, 1, 3, generator=rng)
+    Ks, background = torch.tensor([[[30.0, 0, 15], [0, 30, 12], [0, 0, 1]]]), torch.tensor([[0.2, 0.5, 0.9]])
+    scene = (means, quats, scales, opacities, colors, torch.eye(4)[None], Ks, 30, 24)
+    draw = gsplat.rasterization if method == "3dgs" else gsplat.rasterization_2dgs
+    drawn, covered, *_, info = draw(*scene, sh_degree=0, packed=False, backgrounds=background)
+    y, x = torch.meshgrid(torch.arange(24) + 0.5, torch.arange(30) + 0.5, indexing="ij")
+    rays = torch.stack([(x - 15) / 30, (y - 12) / 30, torch.ones_like(x)], dim=-1)
+    axes = rotations(quats) * scales[:, None]
+    color, left = torch.zeros(24, 30, 3), torch.ones(24, 30, 1)
+    for i in info["depths"][0].argsort():
+        offset = torch.stack([x, y], dim=-1) - info["means2d"][0, i]
+        if method == "3dgs":
+            a, b, c = info["conics"][0, i]
+            square = a * offset[..., 0] ** 2 + c * offset[..., 1] ** 2 + 2 * b * offset[..., 0] * offset[..., 1]
+        else:
+            sides = torch.stack([*axes[i].T[:2].expand(24, 30, 2, 3).unbind(dim=2), -rays], dim=-1)
+            on_disk = torch.linalg.solve(sides, -means[i].expand(24, 30, 3))[..., :2]
+            square = torch.minimum(on_disk.square().sum(dim=-1), 2 * offset.square().sum(dim=-1))
+        middle, reach = info["means2d"][0, i], info["radii"][0, i]
+        place = torch.stack([x, y], dim=-1) - 0.5
+        boxed = ((place >= (middle - reach).floor()) & (place < (middle + reach).ceil())).all(dim=-1)
+        alpha = opacities[i] * torch.exp(-square / 2)
+        alpha = torch.where(boxed & (alpha >= 1 / 255), alpha, 0.0)[..., None]
+        color, left = color + left * alpha * (0.5 + SH_CONSTANT * colors[i, 0]), left * (1 - alpha)
+    torch.testing.assert_close(drawn[0], color + left * background[0], atol=2e-6, rtol=0)
+    torch.testing.assert_close(covered[0], 1 - left, atol=2e-6, rtol=0)
+    assert float(covered.detach().mean()) > 0.1
 
 
 def test_peers_stand_once_beside_our_methods_with_and_without_culling(tmp_path, gsplat):
