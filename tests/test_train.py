@@ -19,7 +19,7 @@ from etsplat.tasks import train as train_module
 from etsplat.tasks.running import NoteEvent
 from etsplat.tasks.soup_fitting import SoupFitting
 from etsplat.tasks.soup_schedule import SoupSchedule
-from etsplat.tasks.train import TrainResult, predicted_bytes, train
+from etsplat.tasks.train import TrainResult, predicted_bytes, start_fitting, train
 from etsplat.tasks.train_config import PRESET_NAMES, TrainConfig, train_settings
 
 TINY = replace(train_settings("tiny"), iterations=120, log_every=10, checkpoint_every=30, evaluate_every=60)
@@ -248,6 +248,26 @@ def test_an_opaque_finish_removes_only_what_is_hidden() -> None:
     for finish, asked, least in (("none", 0.022, 0.022), ("opaque", 0.022, 0.005), ("opaque", 0.001, 0.001)):
         config = replace(TrainConfig(), finish=finish, prune_importance=asked)
         assert SoupSchedule(config, squared=False).least_importance == least
+
+
+def test_an_opaque_finish_replaces_what_it_hides() -> None:
+    for finish, asked, replaces in (("none", False, False), ("none", True, True), ("opaque", False, True)):
+        config = replace(TrainConfig(), finish=finish, replace_dead=asked)
+        assert SoupSchedule(config, squared=False).replaces_dead is replaces
+
+
+@pytest.mark.parametrize("replace_dead", [True, False])
+def test_growth_is_of_all_triangles_or_of_those_that_live(capture: Capture, replace_dead: bool) -> None:
+    """Otherwise a soup of which most triangles die in each edit would be made anew each time."""
+    fitting = start_fitting(capture, replace(TINY, max_triangles=10_000, replace_dead=replace_dead), lambda *_: {})
+    for iteration in range(1, len(capture.train)):  # no trial is over: nothing dies but what is made faint here
+        fitting.advance(iteration, iteration)
+    count, dead = fitting.count, fitting.count // 10
+    with torch.no_grad():
+        fitting.soup.opacity_logits[:dead] = -20
+    fitting.densify(len(capture.train))
+    most = int(1.3 * (count if replace_dead else count - dead))
+    assert most - 3 < fitting.count <= most  # a split that the budget does not allow is not made
 
 
 def test_few_photos_end_a_run_earlier(capture: Capture, tmp_path: Path) -> None:

@@ -304,13 +304,14 @@ class SoupFitting:
         config, soup = self._config, self.soup
         even = iteration // config.at(config.densify_every) % 2 == 0
         by = {"opacity": True, "sharpness": False, "alternate": even}[config.sample_by]
+        count = self.count if self._schedule.replaces_dead else self.count - int(dead.sum())
         return densify_plan(
             soup.vertices.detach(),
             soup.opacity_logits.detach(),
             soup.sigma.detach(),
             self.statistics.screen_size,
             dead,
-            target=grown_count(self.count, config.growth, config.max_triangles),
+            target=grown_count(count, config.growth, config.max_triangles),
             by="opacity" if by else "sharpness",
             split_size=config.split_size,
             noise=config.clone_noise,

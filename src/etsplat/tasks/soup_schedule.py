@@ -82,6 +82,11 @@ class SoupSchedule:
         least = self.config.prune_importance
         return least if self.config.finish == "none" else min(least, HIDDEN)
 
+    @property
+    def replaces_dead(self) -> bool:
+        """Whether triangles that die count in the number that densification multiplies."""
+        return self.config.replace_dead or self.config.finish == "opaque"
+
     def next_edit(self, iteration: int) -> int:
         """The first iteration, from this one on, after which triangles may come or go."""
         every = self.config.at(self.config.densify_every)

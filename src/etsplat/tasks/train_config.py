@@ -115,6 +115,9 @@ class TrainConfig:
     """Iterations between densifications, and then between prunings."""
     growth: float = 1.3
     """Each multiplies the number of triangles by this, at most."""
+    replace_dead: bool = True
+    """Triangles that die count in the number that is multiplied, so that all of them are replaced.
+    With an opaque finish they do in any case."""
     sample_by: Literal["alternate", "opacity", "sharpness"] = "alternate"
     """What makes a parent likely: its opacity, 1/sigma, or the one and the other in turn."""
     split_size: float = 24.0
@@ -241,6 +244,7 @@ _QUICK: dict[str, Any] = {
     "lr_opacities": 0.05,
     "lr_sigma": 0.005,
     "lr_settle": 20_000,
+    "replace_dead": False,
     "prune_views": 0,
     "lambda_normal": 0.0,
     "lambda_distortion": 0.0,
