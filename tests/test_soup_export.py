@@ -192,6 +192,13 @@ def test_the_kind_of_file_follows_from_its_name(tmp_path, soup, capsys):
         parse(["export", str(tmp_path / "soup.safetensors"), "--out", "b.xyz"]).run([])
 
 
+@pytest.mark.parametrize(("floor", "advised"), [("0", False), ("0.97", True)])
+def test_an_export_that_leaves_out_most_says_what_to_do(tmp_path, soup, capsys, floor, advised):
+    save_soup(tmp_path / "soup.safetensors", SoupFile(soup))
+    assert parse(["export", str(tmp_path / "soup.safetensors"), "--min-opacity", floor]).run([]) == 0
+    assert ("train with --finish opaque" in capsys.readouterr().out) is advised
+
+
 @pytest.mark.parametrize("kind", ["PLY", "OBJ", "OFF", "GLB", "SafeTensors"])
 def test_the_kind_of_file_does_not_depend_on_capitals(tmp_path, soup, kind):
     """A.GLB is written like a.glb, by name and by --format, and read back."""

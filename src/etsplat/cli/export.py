@@ -63,4 +63,6 @@ class Export(Command):
         written = export_soup(opened, out, self.settings)
         left_out = f", {written.dropped:,} fainter ones left out" if written.dropped else ""
         print(f"{written.path}: {written.triangles:,} triangles{left_out}")
+        if written.dropped > written.triangles:
+            print("Most of it is too faint to be drawn opaque; train with --finish opaque, or lower --min-opacity.")
         return 0
