@@ -1,14 +1,13 @@
 """Scenes without lens distortion out of scenes with it, once and for all, with pycolmap (an extra)."""
 
 import contextlib
-import fcntl
 import glob
 import os
 import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import IO, Any
 
 import torch
 
@@ -135,9 +134,9 @@ def working_folder(out: Path) -> Iterator[Path]:
             tempfile.TemporaryDirectory(prefix=f".{out.name}-", dir=out.parent) as folder,
             open(Path(folder) / f"{_MARK}.new", "wb") as mark,
         ):
-            with contextlib.suppress(OSError):  # a file system without locks: nobody will get one, nor remove this
-                fcntl.flock(mark, fcntl.LOCK_EX)
-            os.rename(mark.name, Path(folder) / _MARK)  # locked from the moment that it has its name
+            with contextlib.suppress(OSError):  # where there are no locks nobody finds the mark, nor removes this
+                _lock(mark)
+                os.rename(mark.name, Path(folder) / _MARK)  # locked from the moment that it has its name
             try:
                 yield Path(folder)
             except InputError:
@@ -152,8 +151,17 @@ def _remove_abandoned(out: Path) -> None:
     """Removes working folders for `out` whose processes have ended."""
     for mark in out.parent.glob(f".{glob.escape(out.name)}-*/{_MARK}"):
         with contextlib.suppress(OSError), open(mark, "rb") as file:  # locked, by a living process; or just removed
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            _lock(file)
             shutil.rmtree(mark.parent)
+
+
+def _lock(file: IO[bytes]) -> None:
+    """Until the file is closed; OSError where another process has locked it, or the system has no such locks."""
+    try:
+        import fcntl
+    except ImportError as error:
+        raise OSError("no file locks on this system") from error
+    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
 def _failure(out: Path, error: Exception) -> InputError:
