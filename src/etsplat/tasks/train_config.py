@@ -244,7 +244,6 @@ _QUICK: dict[str, Any] = {
     "lr_opacities": 0.05,
     "lr_sigma": 0.005,
     "lr_settle": 20_000,
-    "replace_dead": False,
     "prune_views": 0,
     "lambda_normal": 0.0,
     "lambda_distortion": 0.0,
