@@ -6,8 +6,8 @@ from typing import Any
 
 import torch
 
-from etsplat.scene.demo_object import demo_object
-from etsplat.scene.photograph import photograph
+from etsplat.data.demo_object import demo_object
+from etsplat.data.photograph import photograph
 from etsplat.tasks.mesh_fitting import MeshFitting
 from etsplat.tasks.reconstruct_config import PRESETS
 from etsplat.tasks.sources import make_start

@@ -51,8 +51,8 @@ sanitize() {
     fi
     for tool in memcheck racecheck; do
         step "$tool" 540 compute-sanitizer --tool "$tool" --error-exitcode 1 "${pytest_cuda[@]}" \
-            -m "cuda and sanitize" tests/test_rasterize_cuda.py tests/test_cuda_sort.py tests/test_cuda_ops.py \
-            tests/test_soup_activation.py tests/test_triangle_channels.py tests/test_normal_consistency.py
+            -m "cuda and sanitize" tests/ops/test_rasterize_cuda.py tests/cuda/test_cuda_sort.py tests/ops/test_cuda_ops.py \
+            tests/ops/test_soup_activation.py tests/ops/test_triangle_channels.py tests/ops/test_normal_consistency.py
     done
 }
 

@@ -145,7 +145,7 @@ def host_milliseconds(scene: GpuScene, repeats: int) -> float:
 def count_without_gpu(scene: GpuScene) -> Work:
     """The same numbers by the tests' SIMT shim."""
     sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
-    from simt.build import Simt
+    from helpers.simt.build import Simt
 
     with use_backend(Simt()):
         return count(scene)

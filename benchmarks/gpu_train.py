@@ -7,8 +7,8 @@ from typing import Any
 import torch
 
 from benchmarks.gpu_timing import kernel_times
-from etsplat.scene.demo_scene import demo_scene
-from etsplat.scene.triangle_soup import TriangleSoup
+from etsplat.data.demo_scene import demo_scene
+from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.tasks.soup_fitting import SoupFitting
 from etsplat.tasks.train_config import train_settings
 

@@ -15,12 +15,12 @@ from typing import Any
 import torch
 
 from benchmarks.machine import description
+from etsplat.data.captures import Capture, load_capture
+from etsplat.data.demo_scene import demo_scene
 from etsplat.ops.engines import num_threads, one_torch_thread, set_num_threads
 from etsplat.ops.photometric import photometric_loss
 from etsplat.ops.rasterize import rasterize
 from etsplat.ops.soup_colors import soup_colors
-from etsplat.scene.captures import Capture, load_capture
-from etsplat.scene.demo_scene import demo_scene
 from etsplat.tasks.soup_fitting import SoupFitting
 from etsplat.tasks.train import start_fitting
 from etsplat.tasks.train_config import TrainConfig, train_settings

@@ -9,7 +9,7 @@ import torch
 
 from etsplat.core.kernels import DISTANCES, KERNELS
 from etsplat.cuda.launch import device_type, use_backend
-from simt.build import Simt
+from helpers.simt.build import Simt
 
 # Tests run side by side, on small tensors: torch's own threads would only wait for each other.
 torch.set_num_threads(1)

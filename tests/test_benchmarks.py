@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from _scenes import mesh
 from benchmarks import gpu, gpu_floors, gpu_reconstruct, gpu_scenes, gpu_timing, gpu_train, rasterizer, scenes, tables
 from benchmarks.measure import native_state
 from etsplat import _native, rasterize
+from helpers.scenes import mesh
 
 
 def render(scene):

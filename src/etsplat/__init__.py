@@ -10,13 +10,13 @@ if TYPE_CHECKING:
     from etsplat.core.cameras import Cameras, intrinsics, look_at, sphere_grid
     from etsplat.core.errors import InputError
     from etsplat.core.rasterization import Cutoffs, Rasterization, TriangleStatistics
+    from etsplat.data.demo_object import demo_object
     from etsplat.io.mesh_files import MeshFile, load_mesh, save_mesh
     from etsplat.ops.antialias import rasterize_antialiased
     from etsplat.ops.engines import num_threads, set_num_threads
     from etsplat.ops.rasterize import rasterize
     from etsplat.ops.rasterize_hard import HardRasterization, rasterize_hard, render_opaque
     from etsplat.report.html import write_report
-    from etsplat.scene.demo_object import demo_object
     from etsplat.tasks.reconstruct import ReconstructResult, reconstruct
     from etsplat.tasks.reconstruct_config import PRESETS, ReconstructConfig
     from etsplat.tasks.train import TrainResult, train
@@ -32,7 +32,7 @@ _HOMES = {
     "etsplat.ops.rasterize": ("rasterize",),
     "etsplat.ops.rasterize_hard": ("HardRasterization", "rasterize_hard", "render_opaque"),
     "etsplat.report.html": ("write_report",),
-    "etsplat.scene.demo_object": ("demo_object",),
+    "etsplat.data.demo_object": ("demo_object",),
     "etsplat.tasks.reconstruct": ("ReconstructResult", "reconstruct"),
     "etsplat.tasks.reconstruct_config": ("PRESETS", "ReconstructConfig"),
     "etsplat.tasks.train": ("TrainResult", "train"),

@@ -14,7 +14,7 @@ from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.measures import bounding_ball
 from etsplat.io.mesh_files import load_mesh
 from etsplat.io.run_directory import RunDirectory, is_run
-from etsplat.scene.soup_rendering import render_soup
+from etsplat.model.soup_rendering import render_soup
 from etsplat.tasks.render_config import RenderConfig
 from etsplat.tasks.render_soup import draw
 from etsplat.tasks.soup_run import open_run

@@ -14,16 +14,16 @@ from torch import Tensor, nn
 from etsplat.bench.gaussians import NAMES, Splatting, load_gaussians, save_gaussians, splat, start_gaussians
 from etsplat.bench.peers import PeerConfig, load_gsplat
 from etsplat.core.cameras import Cameras
+from etsplat.data.capture_views import CaptureViews
+from etsplat.data.captures import Capture, load_capture
 from etsplat.io.images import save_image
 from etsplat.io.run_directory import RunDirectory
 from etsplat.metrics.image import psnr, ssim
+from etsplat.model.soup_init import StartPoints, random_points
 from etsplat.ops.photometric import photometric_loss
 from etsplat.optim.loop import LoopSettings, Progress
 from etsplat.optim.schedules import exponential_decay, limited_iterations
 from etsplat.optim.view_sampler import ViewSampler
-from etsplat.scene.capture_views import CaptureViews
-from etsplat.scene.captures import Capture, load_capture
-from etsplat.scene.soup_init import StartPoints, random_points
 from etsplat.tasks.evaluate_soup import drawing_speed, image_scores, load_lpips, mean_scores
 from etsplat.tasks.running import (
     Place,

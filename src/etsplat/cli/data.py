@@ -41,7 +41,7 @@ class Sfm(Command):
         from rich.console import Console
 
         from etsplat.cli.phases import PhaseBar
-        from etsplat.scene.structure_from_motion import find_cameras
+        from etsplat.data.structure_from_motion import find_cameras
 
         console = Console()
         with PhaseBar(console) as bar:
@@ -85,7 +85,7 @@ class Undistort(Command):
 
     def run(self, arguments: Sequence[str]) -> int:
         """Writes the scene."""
-        from etsplat.scene.undistortion import undistort_scene
+        from etsplat.data.undistortion import undistort_scene
 
         names = undistort_scene(self.source, self.out, max_size=self.max_size)
         print(f"{len(names)} images without lens distortion; scene in {self.out}")

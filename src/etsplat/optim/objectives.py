@@ -5,10 +5,10 @@ from dataclasses import dataclass
 from jaxtyping import Float
 from torch import Tensor
 
+from etsplat.model.triangle_mesh import TriangleMesh
 from etsplat.ops.mesh_energies import mesh_energies
 from etsplat.ops.photometric import photometric_loss
 from etsplat.ops.weighted_sum import Term, weighted_sum
-from etsplat.scene.triangle_mesh import TriangleMesh
 
 
 @dataclass(frozen=True)

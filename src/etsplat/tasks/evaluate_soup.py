@@ -15,8 +15,8 @@ from etsplat.core.errors import InputError
 from etsplat.io.atomic import write_error
 from etsplat.io.images import save_image, to_8_bit
 from etsplat.metrics.image import Lpips, find_lpips_weights, psnr, ssim
+from etsplat.model.soup_rendering import render_soup
 from etsplat.ops.engines import num_threads, resolve_engine
-from etsplat.scene.soup_rendering import render_soup
 from etsplat.tasks.running import device_name
 from etsplat.tasks.soup_run import SoupRun
 from etsplat.tasks.soup_scoring import SoupScorer

@@ -11,10 +11,10 @@ from etsplat.core.cameras import Cameras
 from etsplat.core.errors import InputError
 from etsplat.io.paths import kind_of
 from etsplat.io.triangle_files import save_triangles
+from etsplat.model.soup_files import save_soup
+from etsplat.model.soup_rendering import OPAQUE_FROM, SoupAppearance, render_soup
+from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.ops.soup_colors import soup_colors
-from etsplat.scene.soup_files import save_soup
-from etsplat.scene.soup_rendering import OPAQUE_FROM, SoupAppearance, render_soup
-from etsplat.scene.triangle_soup import TriangleSoup
 from etsplat.tasks.export_config import Bake, ExportConfig
 from etsplat.tasks.soup_run import SoupRun, rotation_to_y_up, training_cameras, world_up
 

@@ -11,10 +11,13 @@ from torch import Tensor
 
 from etsplat.core.cameras import Cameras
 from etsplat.core.validation import first_not_finite
+from etsplat.data.views import PosedViews
 from etsplat.geometry.measures import face_areas
 from etsplat.geometry.subdivision import longest_edge_plan
 from etsplat.geometry.topology import MeshTopology
 from etsplat.geometry.untangle import untangle
+from etsplat.model.mesh_rendering import render_mesh
+from etsplat.model.triangle_mesh import TriangleMesh
 from etsplat.ops.adam import Adam
 from etsplat.ops.engines import resolve_engine
 from etsplat.optim.edit import apply_subdivision
@@ -24,9 +27,6 @@ from etsplat.optim.schedules import coarse_level, evenly, exponential_decay, fac
 from etsplat.optim.step_queue import MAX_STEPS, QueuedStep, StepQueue
 from etsplat.optim.vertex_updates import Solve, laplacian_solver, uniform_step
 from etsplat.optim.view_sampler import ViewSampler
-from etsplat.scene.mesh_rendering import render_mesh
-from etsplat.scene.triangle_mesh import TriangleMesh
-from etsplat.scene.views import PosedViews
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.running import progress_tensor, read_progress
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 from etsplat.core.errors import InputError
 
 if TYPE_CHECKING:
-    from etsplat.scene.mesh_rendering import MeshAppearance
+    from etsplat.model.mesh_rendering import MeshAppearance
 
 Method = Literal["elastic", "bilateral", "single-sided", "raster-face", "raster-vertex"]
 METHODS: tuple[Method, ...] = get_args(Method)
@@ -164,7 +164,7 @@ class ReconstructConfig:
     @property
     def appearance(self) -> "MeshAppearance":
         """How the mesh is drawn."""
-        from etsplat.scene.mesh_rendering import MeshAppearance  # imports torch
+        from etsplat.model.mesh_rendering import MeshAppearance  # imports torch
 
         kernel = self.method.replace("-", "_") if self.splats else None
         return MeshAppearance(kernel, self.distance, self.backend, self.engine)

@@ -13,14 +13,14 @@ from torch import Tensor
 
 from etsplat.core.cameras import Cameras
 from etsplat.core.errors import InputError
+from etsplat.data.camera_paths import PATHS
+from etsplat.data.captures import Capture
 from etsplat.io.atomic import atomic_write, write_error
 from etsplat.io.images import save_image
 from etsplat.io.paths import kind_of
 from etsplat.io.videos import VideoSink, open_video
-from etsplat.scene.camera_paths import PATHS
-from etsplat.scene.captures import Capture
-from etsplat.scene.soup_files import SoupFile
-from etsplat.scene.soup_rendering import render_soup, render_soup_opaque
+from etsplat.model.soup_files import SoupFile
+from etsplat.model.soup_rendering import render_soup, render_soup_opaque
 from etsplat.tasks.render_config import RenderConfig
 from etsplat.tasks.soup_run import SoupRun, world_up
 

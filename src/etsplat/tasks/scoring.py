@@ -12,8 +12,8 @@ from etsplat.geometry.intersections import count_degenerate_faces, count_self_in
 from etsplat.io.images import save_image
 from etsplat.metrics.geometry import chamfer, geometry_metrics, sample_pair
 from etsplat.metrics.image import Lpips, find_lpips_weights, psnr, silhouette_iou, ssim
-from etsplat.scene.mesh_rendering import render_exported, render_mesh
-from etsplat.scene.triangle_mesh import TriangleMesh
+from etsplat.model.mesh_rendering import render_exported, render_mesh
+from etsplat.model.triangle_mesh import TriangleMesh
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.sources import Subject
 

@@ -11,6 +11,12 @@ from torch import Tensor
 from etsplat.core.cameras import Cameras
 from etsplat.core.rasterization import TriangleStatistics
 from etsplat.core.validation import first_not_finite
+from etsplat.data.capture_views import CaptureViews
+from etsplat.data.captures import Capture
+from etsplat.data.device_views import DeviceViews
+from etsplat.model.soup_rendering import SoupAppearance, render_soup
+from etsplat.model.surroundings import Surroundings
+from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.ops.adam import Adam
 from etsplat.ops.engines import resolve_engine
 from etsplat.optim.densification import PruneRules, SoupStatistics, dead_triangles, densify_plan, grown_count
@@ -19,12 +25,6 @@ from etsplat.optim.loop import DivergedError, Progress
 from etsplat.optim.soup_objective import SoupWeights, soup_objective
 from etsplat.optim.step_queue import MAX_STEPS, QueuedStep, StepQueue
 from etsplat.optim.view_sampler import ViewSampler
-from etsplat.scene.capture_views import CaptureViews
-from etsplat.scene.captures import Capture
-from etsplat.scene.device_views import DeviceViews
-from etsplat.scene.soup_rendering import SoupAppearance, render_soup
-from etsplat.scene.surroundings import Surroundings
-from etsplat.scene.triangle_soup import TriangleSoup
 from etsplat.tasks.running import progress_tensor, read_progress
 from etsplat.tasks.soup_schedule import SoupSchedule
 from etsplat.tasks.train_config import TrainConfig

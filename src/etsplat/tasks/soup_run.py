@@ -9,12 +9,12 @@ from torch import Tensor
 
 from etsplat.core.cameras import Cameras
 from etsplat.core.errors import InputError
+from etsplat.data.captures import Capture, load_capture
 from etsplat.io.paths import path_remedy
 from etsplat.io.run_directory import RunDirectory, is_run
+from etsplat.model.soup_files import SoupFile, load_soup
+from etsplat.model.soup_import import open_soup
 from etsplat.ops.engines import resolve_device
-from etsplat.scene.captures import Capture, load_capture
-from etsplat.scene.soup_files import SoupFile, load_soup
-from etsplat.scene.soup_import import open_soup
 from etsplat.tasks.train import DEMO, demo_capture
 
 
@@ -54,7 +54,7 @@ class SoupRun:
 
 
 def open_run(path: Path | str, scene: Path | str | None = None, device: str | None = None) -> SoupRun:
-    """Open the run directory of `etsplat train`, or any file that `etsplat.scene.soup_import.open_soup` reads.
+    """Open the run directory of `etsplat train`, or any file that `etsplat.model.soup_import.open_soup` reads.
 
     Args:
         path: of the run or the file.

@@ -3,9 +3,9 @@
 import math
 from dataclasses import dataclass, replace
 
+from etsplat.model.soup_rendering import SoupAppearance
 from etsplat.optim.schedules import exponential_decay, ramp
 from etsplat.optim.soup_objective import SoupWeights
-from etsplat.scene.soup_rendering import SoupAppearance
 from etsplat.tasks.train_config import TrainConfig
 
 SETTLED = 0.1

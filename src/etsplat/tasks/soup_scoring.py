@@ -7,12 +7,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from etsplat.data.capture_views import CaptureViews
+from etsplat.data.captures import Capture
 from etsplat.io.images import over_background, save_image
 from etsplat.metrics.image import psnr, ssim
-from etsplat.scene.capture_views import CaptureViews
-from etsplat.scene.captures import Capture
-from etsplat.scene.soup_rendering import SoupAppearance, render_soup, render_soup_opaque
-from etsplat.scene.triangle_soup import TriangleSoup
+from etsplat.model.soup_rendering import SoupAppearance, render_soup, render_soup_opaque
+from etsplat.model.triangle_soup import TriangleSoup
 
 SUPERSAMPLING = 4
 

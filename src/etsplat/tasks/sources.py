@@ -9,14 +9,14 @@ import torch
 from torch import Tensor
 
 from etsplat.core.errors import InputError
+from etsplat.data.demo_object import demo_object
+from etsplat.data.load import load_views
+from etsplat.data.photograph import normalize_mesh, photograph
+from etsplat.data.views import PosedViews
 from etsplat.geometry.icosphere import icosphere
 from etsplat.io.mesh_files import MeshFile, load_mesh, weld_vertices
 from etsplat.io.paths import path_remedy
-from etsplat.scene.demo_object import demo_object
-from etsplat.scene.load import load_views
-from etsplat.scene.photograph import normalize_mesh, photograph
-from etsplat.scene.triangle_mesh import TriangleMesh
-from etsplat.scene.views import PosedViews
+from etsplat.model.triangle_mesh import TriangleMesh
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 
 Source = str | Path | MeshFile | PosedViews

@@ -11,18 +11,18 @@ from jaxtyping import Float
 from torch import Tensor
 
 from etsplat.core.errors import InputError
+from etsplat.data.captures import Capture, load_capture
+from etsplat.data.demo_scene import HEIGHT, WIDTH, demo_scene
+from etsplat.data.device_views import stay_on
 from etsplat.io.memory import available_memory
 from etsplat.io.run_directory import RunDirectory
+from etsplat.model.soup_files import SoupFile, save_soup
+from etsplat.model.soup_init import StartPoints, random_points, start_soup
+from etsplat.model.surroundings import SPHERE_TRIANGLES, Surroundings
+from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.ops.engines import one_torch_thread, resolve_device, resolve_engine
 from etsplat.optim.loop import CheckpointEvent, DivergedError, Progress
 from etsplat.optim.schedules import limited_iterations
-from etsplat.scene.captures import Capture, load_capture
-from etsplat.scene.demo_scene import HEIGHT, WIDTH, demo_scene
-from etsplat.scene.device_views import stay_on
-from etsplat.scene.soup_files import SoupFile, save_soup
-from etsplat.scene.soup_init import StartPoints, random_points, start_soup
-from etsplat.scene.surroundings import SPHERE_TRIANGLES, Surroundings
-from etsplat.scene.triangle_soup import TriangleSoup
 from etsplat.tasks.running import (
     Callback,
     NoteEvent,

@@ -8,7 +8,7 @@ import torch
 
 from etsplat.core.errors import InputError
 from etsplat.io.run_directory import RunDirectory, is_run
-from etsplat.scene.soup_files import SoupFile, load_soup
+from etsplat.model.soup_files import SoupFile, load_soup
 from etsplat.tasks.soup_run import check_trains
 
 WAITING_SECONDS = 1.0

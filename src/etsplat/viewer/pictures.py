@@ -9,10 +9,10 @@ from torch import Tensor
 
 from etsplat.core.cameras import Cameras
 from etsplat.io.images import to_8_bit
+from etsplat.model.soup_files import SoupFile
+from etsplat.model.soup_rendering import OPAQUE_FROM
 from etsplat.ops.rasterize_hard import rasterize_hard
 from etsplat.ops.soup_colors import soup_colors
-from etsplat.scene.soup_files import SoupFile
-from etsplat.scene.soup_rendering import OPAQUE_FROM
 from etsplat.tasks.render_config import RenderConfig
 from etsplat.tasks.render_soup import color_depth, depth_span, draw
 

@@ -17,9 +17,9 @@ from scipy.spatial.transform import Rotation
 
 from etsplat.core.cameras import Cameras, intrinsics
 from etsplat.core.errors import InputError
-from etsplat.scene.camera_paths import focus_point
-from etsplat.scene.captures import Capture
-from etsplat.scene.soup_files import SoupFile
+from etsplat.data.camera_paths import focus_point
+from etsplat.data.captures import Capture
+from etsplat.model.soup_files import SoupFile
 from etsplat.tasks.soup_run import SoupRun, world_up
 from etsplat.viewer.follow import Followed
 from etsplat.viewer.pace import Pace

@@ -1,0 +1,126 @@
+"""Ground truth of a mesh: forty pictures from a sphere around it, drawn by the z-buffer rasterizer.
+
+The set-up (docs/conventions.md): the mesh is scaled to its bounding box's centre and a largest radius of 1; +y is up;
+five elevations from -70 to 70 degrees by eight azimuths, azimuth 0 on +z; a vertical field of view of 40 degrees; the
+silhouette of the unit sphere fills 90 % of the height; white albedo under two lights along +z and -z.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor
+
+from etsplat.core.cameras import Cameras, intrinsics, look_at, sphere_grid
+from etsplat.core.errors import InputError
+from etsplat.data.views import Normalization, PosedViews
+from etsplat.geometry.measures import bounding_ball
+from etsplat.io.mesh_files import MeshFile
+from etsplat.ops.rasterize_hard import render_opaque
+
+ELEVATIONS = (-70.0, -35.0, 0.0, 35.0, 70.0)
+"""Degrees above the horizon."""
+
+FIELD_OF_VIEW = 40.0
+"""Vertical, degrees."""
+
+FILL = 0.9
+"""Part of the image height that the unit sphere's silhouette takes."""
+
+AMBIENT, DIFFUSE = 0.4, 0.6
+
+CAMERA_DISTANCE = math.hypot(1.0, 1.0 / (FILL * math.tan(math.radians(FIELD_OF_VIEW / 2))))
+"""A sphere of radius 1 at distance d has a silhouette of half-angle asin(1/d), whose tangent is 1/sqrt(d^2 - 1)."""
+
+
+def normalize_mesh(mesh: MeshFile) -> tuple[MeshFile, Normalization]:
+    """Move the bounding box's centre to the origin and scale the farthest vertex to radius 1.
+
+    Raises:
+        InputError: all vertices coincide.
+    """
+    center, radius = bounding_ball(mesh.vertices)
+    if radius <= 0:
+        raise InputError("mesh: all vertices are at one point; there is nothing to photograph")
+    unit = ((mesh.vertices.double() - center) / radius).float()
+    return replace(mesh, vertices=unit), Normalization(center.float(), radius)
+
+
+def photograph(
+    mesh: MeshFile,
+    width: int = 1024,
+    height: int = 1024,
+    *,
+    elevations: Sequence[float] = ELEVATIONS,
+    azimuths: int = 8,
+    supersampling: int = 4,
+    progress: Callable[[int, int], None] | None = None,
+    device: torch.device | str = "cpu",
+) -> PosedViews:
+    """Normalise a mesh and take its pictures. View index is `azimuths` * elevation + azimuth.
+
+    Args:
+        mesh: the object, in any units; its own colours are not used.
+        width: image width in pixels, at least `height` (the sphere is fitted to the height).
+        height: image height in pixels.
+        elevations: degrees, strictly between -90 and 90.
+        azimuths: number of directions around +y, evenly spaced.
+        supersampling: samples per pixel side.
+        progress: called after each picture with (pictures taken, pictures in all).
+        device: where the pictures are taken, and stay.
+
+    Returns:
+        Views in the unit frame; those with index % 5 == 2 are test views.
+
+    Raises:
+        ValueError: `width` below `height`, or elevations that look along the vertical.
+        InputError: as `normalize_mesh`.
+    """
+    if width < height:
+        raise ValueError(f"width: expected at least the height ({height}), got {width}")
+    if not all(-90 < elevation < 90 for elevation in elevations):
+        raise ValueError(f"elevations: expected degrees strictly between -90 and 90, got {list(elevations)}")
+    unit, normalization = normalize_mesh(mesh)
+    cameras = orbit_cameras(width, height, elevations=elevations, azimuths=azimuths).to(device)
+    vertices, faces = unit.vertices.to(device), unit.faces.to(device)
+    colors = shade_faces(unit.vertices, unit.faces).to(device)
+    images = torch.empty(len(cameras), height, width, 4, device=device)
+    for view in range(len(cameras)):
+        images[view] = render_opaque(
+            vertices,
+            cameras.viewmats[view : view + 1],
+            cameras.Ks[view : view + 1],
+            width,
+            height,
+            faces=faces,
+            face_colors=colors,
+            supersampling=supersampling,
+        )[0]
+        if progress is not None:
+            progress(view + 1, len(cameras))
+    names = [f"{view:03d}" for view in range(len(cameras))]
+    test = [view for view in range(len(cameras)) if view % 5 == 2]
+    train = [view for view in range(len(cameras)) if view % 5 != 2]
+    return PosedViews(cameras, images, names, train, test, normalization)
+
+
+def orbit_cameras(width: int, height: int, *, elevations: Sequence[float] = ELEVATIONS, azimuths: int = 8) -> Cameras:
+    """Cameras on the sphere of radius CAMERA_DISTANCE that look at the origin, +y up; the azimuth varies fastest."""
+    degrees = [360.0 * k / azimuths for k in range(azimuths)]
+    eyes = sphere_grid(elevations, degrees, CAMERA_DISTANCE, dtype=torch.float64)
+    viewmats = look_at(eyes, torch.zeros(3, dtype=torch.float64), torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64))
+    K = intrinsics(FIELD_OF_VIEW, width, height)
+    return Cameras(viewmats.float(), K.expand(len(eyes), 3, 3).contiguous(), width, height)
+
+
+def shade_faces(vertices: Float[Tensor, "V 3"], faces: Int64[Tensor, "F 3"]) -> Float[Tensor, "F 3"]:
+    """White faces under ambient light and two directional lights along +z and -z, of which each face sees one.
+
+    The colour is 0.4 + 0.6 |n_z| in all channels, n the unit face normal, whatever the orientation of the face.
+    """
+    corners = vertices.double()[faces]
+    normals = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    lambert = normals[:, 2].abs() / normals.norm(dim=1).clamp_min(1e-300)
+    return (AMBIENT + DIFFUSE * lambert).float()[:, None].repeat(1, 3)

@@ -1,0 +1,225 @@
+"""Scenes without lens distortion out of scenes with it, once and for all, with pycolmap (an extra)."""
+
+import contextlib
+import glob
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator, Sequence
+from pathlib import Path, PurePosixPath
+from typing import IO, Any
+
+import torch
+
+from etsplat.core.errors import InputError
+from etsplat.data.colmap import find_model
+from etsplat.data.colmap_process import import_pycolmap, run_apart, undistort_images
+from etsplat.data.frames import find_mask, scaled_intrinsics
+from etsplat.data.transforms import DistortedFrames, read_distorted_transforms
+from etsplat.io.atomic import write_error
+from etsplat.io.images import image_size, load_pixels
+from etsplat.io.paths import kind_of, path_remedy
+
+LEAST_SIZE = 16
+"""Pixels of the longer side of an image."""
+
+_LITTLE_SPACE = 64 << 20
+
+_MARK = "etsplat-working"
+"""File of a working folder that its process keeps locked."""
+
+_GROWTH, _SPARE_BYTES = 4, 1 << 20
+"""COLMAP writes JPEG with few losses: files grow. Beside them lies the model."""
+
+
+def undistort_scene(scene: Path | str, out: Path | str, *, max_size: int = 1600) -> list[str]:
+    """Write a scene anew in COLMAP's layout without lens distortion: images, masks, cameras, points.
+
+    Args:
+        scene: folder with `images/` and `sparse/0/` (or `sparse/`), of any of COLMAP's camera models; or with
+            `transforms.json` of nerfstudio or instant-ngp. `masks/`, or the masks that it names, come along.
+        out: folder of the new scene; must not exist or be empty.
+        max_size: longer sides are shrunk to this many pixels.
+
+    Returns:
+        The names of the images. Every 8th is for testing, whatever `transforms.json` said.
+
+    Raises:
+        InputError: pycolmap is missing; there is no scene, or it cannot be read; images are missing or transparent;
+            `out` cannot be used; the disk is full.
+    """
+    pycolmap = import_pycolmap()
+    scene, out = Path(scene), Path(out)
+    if not scene.is_dir():
+        raise InputError(f"scene {scene}: no such folder; {path_remedy(scene)}")
+    colmap = find_model(scene)
+    if colmap is None and not (scene / "transforms.json").is_file():
+        raise InputError(f"scene {scene}: neither sparse/0/cameras.bin or .txt nor transforms.json; choose a scene")
+    check_output(out, max_size)
+    if colmap is not None:
+        model, photos, masks = _read_model(pycolmap, scene, colmap)
+    else:
+        frames = read_distorted_transforms(scene)
+        photos = frames.folder
+        model, masks = _make_model(pycolmap, frames), frames.masks
+    names = sorted(image.name for image in model.images.values() if image.has_pose)
+    for photo in (photos / name for name in names):
+        if kind_of(photo) == ".png" and load_pixels(photo, *image_size(photo)).shape[2] == 4:
+            raise InputError(f"image {photo}: has transparency, which would be lost; put it into {scene}/masks")
+    check_space(out, [*(photos / name for name in names), *masks.values(), *masks.values()])
+    with working_folder(out) as work:
+        undistort_model(model, photos, names, work, max_size)
+        if masks:
+            _undistort_masks(model, masks, work, max_size)
+        os.replace(work / "scene", out)
+    return names
+
+
+def undistort_model(model: Any, photos: Path, names: list[str], work: Path, max_size: int) -> None:
+    """Writes images/ and sparse/0/ of a model's images into WORK/scene."""
+    shutil.rmtree(work / "model", ignore_errors=True)
+    (work / "model").mkdir()
+    model.write(work / "model")
+    scene = work / "scene"
+    run_apart(undistort_images, work / "model", photos, names, scene, max_size)
+    # Left of what COLMAP writes for its dense reconstruction are images/ and sparse/0/.
+    for entry in scene.iterdir():
+        if entry.name == "stereo":
+            shutil.rmtree(entry)
+        elif entry.is_file():
+            entry.unlink()
+    (scene / "sparse").rename(scene / "0")
+    (scene / "sparse").mkdir()
+    (scene / "0").rename(scene / "sparse" / "0")
+    written = sum((scene / "images" / name).is_file() for name in names)
+    if written < len(names):  # COLMAP reports nothing
+        raise RuntimeError(f"{written} of {len(names)} images could be written")
+
+
+def check_output(out: Path, max_size: int) -> None:
+    """Raises InputError if `out` exists and is not an empty folder, or cannot be made; or if images would vanish."""
+    if max_size < LEAST_SIZE:
+        raise InputError(f"max_size: is {max_size}; it must be at least {LEAST_SIZE}")
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InputError(f"{out}: is there already and not empty; choose another folder for the scene")
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise write_error(out, error) from error
+
+
+def check_space(out: Path, images: Sequence[Path], more: int = 0) -> None:
+    """Raises InputError if images without distortion and `more` bytes may not fit beside `out`.
+
+    COLMAP does not say what failed when it finds the disk full, so it should not come to that.
+    """
+    needed = more + _SPARE_BYTES + _GROWTH * sum(image.stat().st_size for image in images)
+    free = shutil.disk_usage(out.parent).free
+    if needed > free:
+        raise InputError(
+            f"cannot write {out}: {len(images)} images may take {needed >> 20} MiB there and {free >> 20} MiB are free;"
+            " free some space on that disk or choose another folder"
+        )
+
+
+@contextlib.contextmanager
+def working_folder(out: Path) -> Iterator[Path]:
+    """A folder beside `out` that is gone afterwards. What COLMAP and the system say of a full disk is an InputError.
+
+    A process that is killed leaves its own behind. The next one for the same `out` removes it.
+    """
+    try:
+        _remove_abandoned(out)
+        with (
+            tempfile.TemporaryDirectory(prefix=f".{out.name}-", dir=out.parent) as folder,
+            open(Path(folder) / f"{_MARK}.new", "wb") as mark,
+        ):
+            with contextlib.suppress(OSError):  # where there are no locks nobody finds the mark, nor removes this
+                _lock(mark)
+                os.rename(mark.name, Path(folder) / _MARK)  # locked from the moment that it has its name
+            try:
+                yield Path(folder)
+            except InputError:
+                raise
+            except (RuntimeError, ValueError) as error:  # what pycolmap's C++ throws
+                raise _failure(out, error) from error
+    except OSError as error:
+        raise write_error(out, error) from error
+
+
+def _remove_abandoned(out: Path) -> None:
+    """Removes working folders for `out` whose processes have ended."""
+    for mark in out.parent.glob(f".{glob.escape(out.name)}-*/{_MARK}"):
+        with contextlib.suppress(OSError), open(mark, "rb") as file:  # locked, by a living process; or just removed
+            _lock(file)
+            shutil.rmtree(mark.parent)
+
+
+def _lock(file: IO[bytes]) -> None:
+    """Until the file is closed; OSError where another process has locked it, or the system has no such locks."""
+    try:
+        import fcntl
+    except ImportError as error:
+        raise OSError("no file locks on this system") from error
+    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
+def _failure(out: Path, error: Exception) -> InputError:
+    """Made while the working folder still takes its space."""
+    detail = (str(error) or type(error).__name__).splitlines()[0]
+    free = shutil.disk_usage(out.parent).free
+    remedy = "free some space or choose another folder" if free < _LITTLE_SPACE else "is there enough memory?"
+    return InputError(
+        f"cannot write {out}: COLMAP failed ({detail}), with {free >> 20} MiB free on that disk; {remedy}"
+    )
+
+
+def _read_model(pycolmap: Any, scene: Path, folder: Path) -> tuple[Any, Path, dict[str, Path]]:
+    """A COLMAP scene's model, folder of images, and masks by the names of the images."""
+    try:
+        model = pycolmap.Reconstruction(folder)
+    except (ValueError, RuntimeError, OSError, LookupError) as error:  # what its C++ throws
+        raise InputError(f"scene {folder}: cannot be read as a model ({str(error).splitlines()[0]})") from error
+    names = sorted(image.name for image in model.images.values() if image.has_pose)
+    missing = [name for name in names if not (scene / "images" / name).is_file()]
+    if missing:
+        raise InputError(f"scene {scene}: {len(missing)} images are missing (first: {missing[0]}); copy them there")
+    masks = {name: find_mask(scene / "masks", name) for name in names} if (scene / "masks").is_dir() else {}
+    return model, scene / "images", masks
+
+
+def _make_model(pycolmap: Any, frames: DistortedFrames) -> Any:
+    """A model of frames with their lenses, at the size of their files, and of their points."""
+    model = pycolmap.Reconstruction()
+    for index, (name, frame, lens) in enumerate(zip(frames.names, frames.set.frames, frames.lenses, strict=True), 1):
+        size = image_size(frame.image)
+        K = scaled_intrinsics(frames.set.source, frame, size, size)
+        params = [float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]), *lens.coefficients]
+        camera = pycolmap.Camera(model=lens.model, width=size[0], height=size[1], params=params, camera_id=index)
+        model.add_camera_with_trivial_rig(camera)
+        image = pycolmap.Image(name=name, camera_id=index, image_id=index)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(frame.viewmat[:3].numpy()))
+    if frames.set.points is not None:
+        colors = frames.set.point_colors
+        bytes_ = (torch.full_like(frames.set.points, 0.5) if colors is None else colors).mul(255).round().byte()
+        for point, color in zip(frames.set.points.numpy(), bytes_.numpy(), strict=True):
+            model.add_point3D(point, pycolmap.Track(), color)
+    return model
+
+
+def _undistort_masks(model: Any, masks: dict[str, Path], work: Path, max_size: int) -> None:
+    """Masks go the way of the images, under their names, into WORK/scene/masks."""
+    (work / "images").mkdir()
+    (work / "scene").rename(work / "whole")
+    named: dict[str, str] = {}
+    for image in model.images.values():
+        mask = masks[image.name]
+        named[image.name] = str(PurePosixPath(image.name).with_suffix(mask.suffix))
+        copy = work / "images" / named[image.name]
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(mask, copy)
+        image.name = named[image.name]
+    undistort_model(model, work / "images", sorted(named.values()), work, max_size)
+    (work / "scene" / "images").rename(work / "whole" / "masks")
+    shutil.rmtree(work / "scene")
+    (work / "whole").rename(work / "scene")

@@ -1,0 +1,185 @@
+"""Soups from files of other programs: Triangle Splatting's state, Gaussian scenes, meshes; and our own exports."""
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from etsplat.core.errors import InputError
+from etsplat.core.kernels import DISTANCES, KERNELS
+from etsplat.io.mesh_files import load_mesh
+from etsplat.io.paths import kind_of
+from etsplat.io.ply_tables import CORNERS, read_ply_header, read_ply_tables
+from etsplat.model.soup_files import SoupFile, check_finite_soup, load_soup
+from etsplat.model.soup_rendering import SoupAppearance
+from etsplat.model.triangle_soup import TriangleSoup
+from etsplat.ops.soup_activation import SOUP_SIGMA_FLOOR
+
+GAUSSIAN_SIGMA = 1.0
+"""With it the elastic kernel is exp(-x^2): the profile of a Gaussian."""
+
+GAUSSIAN_INRADIUS = math.sqrt(2 * math.pi / (3 * math.sqrt(3)))
+"""Inradius, in standard deviations, at which a triangle of that kernel covers the area of the Gaussian."""
+
+MESH_OPACITY, MESH_SIGMA = 0.999, 0.02
+"""A mesh becomes a soup that is drawn all but opaque and sharp."""
+
+_TS_KEYS = ("triangles_points", "sigma", "opacity", "features_dc", "features_rest")
+
+
+def open_soup(path: Path | str) -> SoupFile:
+    """Read triangles from any file that holds some.
+
+    Args:
+        path: `.safetensors` of `etsplat train`; `.pt` of Triangle Splatting (`point_cloud_state_dict.pt`); `.ply` that
+            `etsplat export` wrote, of a Gaussian scene or of a mesh; `.obj`, `.off`, `.glb`, `.gltf`, `.stl`.
+
+    Raises:
+        InputError: the file is missing, damaged or of another kind.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"soup {path}: no such file; check the path")
+    readers: dict[str, Callable[[Path], SoupFile]] = {
+        ".safetensors": load_soup,
+        ".pt": _read_triangle_splatting,
+        ".ply": _read_ply,
+    }
+    file = readers.get(kind_of(path), _read_mesh)(path)
+    if not len(file.soup):
+        raise InputError(f"soup {path}: holds no triangle; take another file")
+    check_finite_soup(path, file.soup)
+    return file
+
+
+def _read_triangle_splatting(path: Path) -> SoupFile:
+    """The state dict that Triangle Splatting saves; its numbers mean the same as ours. No code in it is run."""
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # torch's unpickler raises anything, depending on the bytes
+        # Its own words would have the reader run whatever code is in the file.
+        raise InputError(f"soup {path}: cannot be read as a state dict of tensors alone; save it again") from error
+    if not isinstance(state, dict) or not all(isinstance(state.get(key), Tensor) for key in _TS_KEYS):
+        raise InputError(f"soup {path}: lacks keys of Triangle Splatting's point_cloud_state_dict.pt")
+    points, sigma, opacity, dc, rest = (state[key].detach().float() for key in _TS_KEYS)
+    count = len(points)
+    try:
+        soup = TriangleSoup(
+            points.reshape(count, 3, 3),
+            opacity.reshape(count),
+            sigma.reshape(count),
+            dc.reshape(count, 1, 3),
+            rest.reshape(count, -1, 3),
+        )
+    except (RuntimeError, ValueError) as error:
+        raise InputError(f"soup {path}: its tensors do not fit together ({error}); save it again") from error
+    degree = int(state.get("active_sh_degree", soup.sh_degree))
+    # near_plane: Triangle Splatting drops triangles whose centroid is nearer than 0.2, we those with such a corner.
+    appearance = SoupAppearance("single_sided", "sdf", sh_degree=degree, cull_small=True, near_plane=0.2)
+    return SoupFile(soup, appearance, notes={"source": path.name})
+
+
+def _read_ply(path: Path) -> SoupFile:
+    header = read_ply_header(path)
+    properties = header.properties
+    if {"scale_0", "rot_0", "opacity", "f_dc_0"} <= set(properties.get("vertex", [])):
+        return _read_gaussians(path)
+    if {CORNERS, "opacity", "sigma"} <= set(properties.get("face", [])):
+        return _read_exported(path, header.comments)
+    return _read_mesh(path)
+
+
+def _read_exported(path: Path, comments: list[str]) -> SoupFile:
+    tables = read_ply_tables(path, ("vertex", "face"))
+    vertex, face = tables["vertex"], tables["face"]
+    points = np.stack([vertex[axis] for axis in "xyz"], axis=1).astype(np.float32)
+    corners = face[CORNERS].astype(np.int64)
+    if corners.size and not 0 <= corners.min() <= corners.max() < len(points):
+        raise InputError(f"soup {path}: has corners that name no vertex; export it again")
+    names = face.dtype.names or ()
+    opacity = torch.from_numpy(face["opacity"].astype(np.float32))
+    sigma = torch.from_numpy(face["sigma"].astype(np.float32))
+    if "f_dc_0" in names:
+        dc, rest = _harmonics(face)
+    else:
+        rgb = np.stack([face[name] for name in ("red", "green", "blue")], axis=1).astype(np.float32) / 255
+        start = TriangleSoup.from_triangles(
+            torch.zeros(len(face), 3, 3), torch.from_numpy(rgb), opacity=0.5, sigma=0.5, sh_degree=0
+        )
+        dc, rest = start.sh_dc.detach(), start.sh_rest.detach()
+    soup = TriangleSoup(
+        torch.from_numpy(points[corners]),
+        torch.logit(opacity.double().clamp(1e-6, 1 - 1e-7)).float(),
+        (sigma.double() - SOUP_SIGMA_FLOOR).clamp_min(1e-6).log().float(),
+        dc,
+        rest,
+    )
+    words = next((comment.split() for comment in comments if comment.startswith("etsplat ")), [])
+    known = len(words) == 3 and words[1] in KERNELS and words[2] in DISTANCES
+    appearance = SoupAppearance(words[1], words[2]) if known else SoupAppearance()
+    return SoupFile(soup, appearance, notes={"source": path.name})
+
+
+def _read_gaussians(path: Path) -> SoupFile:
+    """A triangle for each Gaussian, across its two larger axes; its third axis, the thinnest, is lost."""
+    table = read_ply_tables(path)["vertex"]
+
+    def columns(*names: str) -> Tensor:
+        return torch.from_numpy(np.stack([table[name].astype(np.float64) for name in names], axis=1))
+
+    try:
+        centers = columns("x", "y", "z")
+        scales = columns("scale_0", "scale_1", "scale_2").exp()
+        rotations = _rotations(columns("rot_0", "rot_1", "rot_2", "rot_3"))
+        logits = columns("opacity")[:, 0].float()
+        dc, rest = _harmonics(table)
+    except (KeyError, ValueError) as error:
+        raise InputError(f"soup {path}: lacks a property of a Gaussian scene ({error}); export it again") from error
+    order = scales.argsort(dim=1, descending=True)[:, :2]
+    radii = 2 * GAUSSIAN_INRADIUS * scales.gather(1, order)  # to the corners: twice the inradius
+    axes = rotations.gather(2, order[:, None].expand(-1, 3, -1)) * radii[:, None]
+    angles = torch.arange(3, dtype=torch.float64) * (2 * math.pi / 3)
+    circle = torch.stack([angles.cos(), angles.sin()], dim=1)
+    vertices = centers[:, None] + torch.einsum("kc,nac->nka", circle, axes)
+    raw = torch.full((len(table),), math.log(GAUSSIAN_SIGMA - SOUP_SIGMA_FLOOR))
+    return SoupFile(TriangleSoup(vertices.float(), logits, raw, dc, rest), notes={"source": path.name})
+
+
+def _read_mesh(path: Path) -> SoupFile:
+    mesh = load_mesh(path)
+    if mesh.face_colors is not None:
+        colors = mesh.face_colors
+    elif mesh.vertex_colors is not None:
+        colors = mesh.vertex_colors[mesh.faces].mean(dim=1)
+    else:
+        colors = torch.full((len(mesh.faces), 3), 0.8)
+    soup = TriangleSoup.from_triangles(
+        mesh.vertices[mesh.faces], colors, opacity=MESH_OPACITY, sigma=MESH_SIGMA, sh_degree=0
+    )
+    detached = TriangleSoup(**{name: tensor.detach() for name, tensor in soup.parameters().items()})
+    return SoupFile(detached, notes={"source": path.name})
+
+
+def _harmonics(table: np.ndarray) -> tuple[Tensor, Tensor]:
+    """Coefficients (N, 1, 3), (N, R, 3) from f_dc_* and f_rest_*; these hold all of red, then green, then blue."""
+    dc = np.stack([table[f"f_dc_{channel}"] for channel in range(3)], axis=1).astype(np.float32)
+    count = sum(name.startswith("f_rest_") for name in table.dtype.names or ())
+    rest = np.zeros((len(table), 0), dtype=np.float32)
+    if count:
+        rest = np.stack([table[f"f_rest_{index}"] for index in range(count)], axis=1).astype(np.float32)
+    channels_first = torch.from_numpy(rest).reshape(len(table), 3, count // 3)
+    return torch.from_numpy(dc)[:, None], channels_first.transpose(1, 2).contiguous()
+
+
+def _rotations(quaternions: Tensor) -> Tensor:
+    """(N, 3, 3) of quaternions (w, x, y, z) of any length."""
+    w, x, y, z = torch.nn.functional.normalize(quaternions, dim=1).unbind(dim=1)
+    rows = [
+        torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], dim=1),
+        torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], dim=1),
+        torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], dim=1),
+    ]
+    return torch.stack(rows, dim=1)

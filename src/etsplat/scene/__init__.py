@@ -1,1 +1,0 @@
-"""Learnable triangles, and posed views with their loaders."""

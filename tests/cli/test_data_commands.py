@@ -1,0 +1,313 @@
+"""What `etsplat data sfm` and `etsplat data download` do."""
+
+import builtins
+import contextlib
+import math
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import zipfile
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from etsplat.core.errors import InputError
+from etsplat.data.captures import load_capture
+from etsplat.data.structure_from_motion import find_cameras
+from etsplat.data.undistortion import undistort_scene, working_folder
+from etsplat.io import datasets
+from etsplat.io.datasets import Dataset, download_dataset
+from helpers.captures import circle_poses, write_colmap, write_photo, write_transforms
+
+
+def test_without_pycolmap_the_extra_is_named(tmp_path, monkeypatch):
+    real = builtins.__import__
+
+    def refuse(name, *args, **kwargs):
+        if name == "pycolmap":
+            raise ImportError(name)
+        return real(name, *args, **kwargs)
+
+    monkeypatch.setattr(builtins, "__import__", refuse)
+    with pytest.raises(InputError, match=r"etsplat\[sfm\]"):
+        find_cameras(tmp_path, tmp_path / "scene")
+
+
+def test_folders_that_cannot_be_used_are_input_errors(tmp_path):
+    pytest.importorskip("pycolmap")
+    with pytest.raises(InputError, match="no such folder"):
+        find_cameras(tmp_path / "absent", tmp_path / "scene")
+    write_photo(tmp_path / "photos" / "a.jpg", 16, 12)
+    with pytest.raises(InputError, match="1 JPEG or PNG files"):
+        find_cameras(tmp_path / "photos", tmp_path / "scene")
+    for name in "bc":
+        write_photo(tmp_path / "photos" / f"{name}.jpg", 16, 12)
+    for photos, out in (("photos", "photos/a.jpg/scene"), ("photos/a.jpg", "scene")):
+        with pytest.raises(InputError, match=r"is a file|a file is in the way"):
+            find_cameras(tmp_path / photos, tmp_path / out)
+    with pytest.raises(InputError, match=r"scene .*/photoz: no such folder; did you mean .*/photos\?"):
+        undistort_scene(tmp_path / "photoz", tmp_path / "scene")
+    with pytest.raises(InputError, match="is there already"):
+        find_cameras(tmp_path / "photos", tmp_path)
+    with pytest.raises(InputError, match="max_size: is 0; it must be at least 16"):
+        find_cameras(tmp_path / "photos", tmp_path / "scene", max_size=0)
+
+
+def test_a_disk_too_small_is_found_before_it_is_full(tmp_path, monkeypatch):
+    pytest.importorskip("pycolmap")
+    for name in "abc":
+        write_photo(tmp_path / "photos" / f"{name}.jpg", 16, 12)
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=8 << 20))
+    with pytest.raises(InputError, match=r"3 images may take 10 MiB there and 8 MiB are free"):
+        find_cameras(tmp_path / "photos", tmp_path / "scene")
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=1 << 20))
+    write_colmap(tmp_path / "distorted", [(64, 48)] * 3, model="SIMPLE_RADIAL", extra=(-0.1,))
+    with pytest.raises(InputError, match=r"3 images may take 1 MiB there"):
+        undistort_scene(tmp_path / "distorted", tmp_path / "new")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["distorted", "photos"]
+
+
+def test_photos_of_nothing_in_common_are_told_what_is_wrong_with_them(tmp_path):
+    pytest.importorskip("pycolmap")
+    for index in range(4):
+        write_photo(tmp_path / "photos" / f"{index}.jpg", 64, 48, seed=index)
+    with pytest.raises(InputError, match=r"only 0 of 4 could be placed.*overlapping"):
+        find_cameras(tmp_path / "photos", tmp_path / "scene", threads=2)
+    assert [path.name for path in tmp_path.iterdir()] == ["photos"]
+
+
+def test_real_photos_become_a_scene_that_loads(tmp_path, shared_data):
+    pytest.importorskip("pycolmap")
+    (tmp_path / "photos").mkdir()
+    for path in sorted((shared_data / "scenes" / "fountain-P11" / "images").iterdir())[2:7]:
+        (tmp_path / "photos" / path.name).write_bytes(path.read_bytes())
+    phases = []
+    found = find_cameras(
+        tmp_path / "photos",
+        tmp_path / "scene",
+        max_size=400,
+        threads=2,
+        progress=lambda phase, done, total: phases.append(phase),
+    )
+    assert (len(found.placed), found.unplaced) == (5, [])
+    capture = load_capture(found.scene)
+    assert len(capture) == 5
+    assert len(capture.points) == found.points > 100
+    assert list(dict.fromkeys(phases)) == [
+        "Finding features",
+        "Comparing photos",
+        "Placing cameras",
+        "Removing lens distortion",
+    ]
+
+
+@pytest.mark.parametrize(("model", "extra"), [("SIMPLE_RADIAL", (-0.1,)), ("RADIAL", (0.05, -0.02))])
+def test_a_distorted_scene_is_refused_with_the_remedy_and_undistorted_once(tmp_path, model, extra):
+    pytest.importorskip("pycolmap")
+    write_colmap(tmp_path / "scene", [(64, 48)] * 3, model=model, extra=extra)
+    with pytest.raises(InputError, match=rf"{model}.*etsplat data undistort"):
+        load_capture(tmp_path / "scene")
+    undistort_scene(tmp_path / "scene", tmp_path / "new")
+    capture = load_capture(tmp_path / "new")
+    assert (len(capture), len(capture.points)) == (3, 20)
+    assert all(abs(width / height - 64 / 48) < 0.2 for width, height in capture.images.sizes)
+    (tmp_path / "scene" / "images" / "0001.jpg").unlink()
+    with pytest.raises(InputError, match=r"1 images are missing \(first: 0001\.jpg\)"):
+        undistort_scene(tmp_path / "scene", tmp_path / "newer")
+    with pytest.raises(InputError, match="neither sparse/0"):
+        undistort_scene(tmp_path, tmp_path / "newer")
+
+
+LENSES = {
+    "OPENCV": {"k1": -0.2, "k2": 0.05, "p1": 0.01, "p2": -0.02},
+    "OPENCV_FISHEYE": {"k1": -0.05, "k2": 0.02, "k3": -0.01, "k4": 0.002},
+}
+
+
+def distorted(x, y, model, k1=0.0, k2=0.0, p1=0.0, p2=0.0, k3=0.0, k4=0.0):
+    """OpenCV's models, on the plane z = 1."""
+    r2 = x * x + y * y
+    if model == "OPENCV_FISHEYE":
+        angle = math.atan(math.sqrt(r2))
+        scale = angle * (1 + k1 * angle**2 + k2 * angle**4 + k3 * angle**6 + k4 * angle**8) / math.sqrt(r2)
+        return x * scale, y * scale
+    radial = 1 + k1 * r2 + k2 * r2 * r2
+    return x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_distortion_of_transforms_json_is_removed_once(tmp_path, model):
+    """A dot photographed through the lens is afterwards where the camera without lens sees it; the mask comes along."""
+    pytest.importorskip("pycolmap")
+    write_transforms(
+        tmp_path / "scene", 3, width=160, height=120, fl_y=150, cx=83, cy=58, camera_model=model, **LENSES[model]
+    )
+    with pytest.raises(InputError, match="etsplat data undistort"):
+        load_capture(tmp_path / "scene")
+    ray = (0.3, -0.2)
+    u, v = distorted(*ray, model, **LENSES[model])
+    rows, columns = np.mgrid[:120, :160] + 0.5
+    squares = (columns - (160 * u + 83)) ** 2 + (rows - (150 * v + 58)) ** 2
+    dot = (255 * np.exp(-squares / 8)).astype(np.uint8)
+    for index in range(3):
+        Image.fromarray(np.repeat(dot[..., None], 3, axis=2)).save(tmp_path / "scene" / "images" / f"{index:04d}.png")
+        (tmp_path / "scene" / "masks").mkdir(exist_ok=True)
+        Image.fromarray(dot).save(tmp_path / "scene" / "masks" / f"{index:04d}.png")
+    assert undistort_scene(tmp_path / "scene", tmp_path / "new") == ["0000.png", "0001.png", "0002.png"]
+    capture = load_capture(tmp_path / "new")
+    expected = (capture.Ks[1] @ torch.tensor([*ray, 1.0], dtype=torch.float64))[:2]
+    for picture in (capture.images[1][..., 0], capture.images.mask(1)):
+        weight = picture.double()
+        x = (weight.sum(dim=0) * (torch.arange(picture.shape[1]) + 0.5)).sum() / weight.sum()
+        y = (weight.sum(dim=1) * (torch.arange(picture.shape[0]) + 0.5)).sum() / weight.sum()
+        torch.testing.assert_close(torch.stack([x, y]), expected, atol=0.3, rtol=0)
+    torch.testing.assert_close(capture.viewmats[1], circle_poses(3)[1], atol=1e-6, rtol=0)
+
+
+def test_transparency_that_undistortion_would_lose_is_refused(tmp_path):
+    pytest.importorskip("pycolmap")
+    write_transforms(tmp_path / "scene", 3, channels=4, k1=-0.1)
+    with pytest.raises(InputError, match=r"0000\.png: has transparency.*masks"):
+        undistort_scene(tmp_path / "scene", tmp_path / "new")
+
+
+def test_lenses_that_programs_disagree_about_are_refused(tmp_path):
+    pytest.importorskip("pycolmap")
+    unknown = [{"k4": 0.1}, {"is_fisheye": True, "p1": 0.1}, {"camera_model": "EQUIRECTANGULAR"}]
+    for number, settings in enumerate(unknown):
+        write_transforms(tmp_path / str(number), 3, **settings)
+        with pytest.raises(InputError, match="coefficients that are not known here"):
+            undistort_scene(tmp_path / str(number), tmp_path / "new")
+
+
+@pytest.fixture
+def file_size_limit():
+    """Makes the operating system refuse larger files, as a full disk refuses any; in new processes too."""
+    resource = pytest.importorskip("resource")
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    yield lambda size: resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def test_a_disk_that_is_full_all_of_a_sudden_is_one_line_and_nothing_stays(tmp_path, file_size_limit):
+    """COLMAP ends its process where its database cannot grow, and so does libjpeg where an image cannot be written."""
+    pytest.importorskip("pycolmap")
+    for index in range(3):
+        write_photo(tmp_path / "photos" / f"{index}.png", 320, 240, seed=index)
+    write_colmap(tmp_path / "scene", [(640, 480)] * 3, model="SIMPLE_RADIAL", extra=(-0.1,))
+    file_size_limit(250_000)
+    with pytest.raises(
+        InputError, match=r"cannot write .*/new: COLMAP failed \(a sudden end, exit status -6\)"
+    ) as raised:
+        find_cameras(tmp_path / "photos", tmp_path / "new", threads=1)
+    assert "\n" not in str(raised.value)
+    file_size_limit(8_000)
+    with pytest.raises(
+        InputError, match=r"cannot write .*/new: COLMAP failed \((a sudden end|\d of 3 images could)"
+    ) as raised:
+        undistort_scene(tmp_path / "scene", tmp_path / "new")
+    assert "\n" not in str(raised.value)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["photos", "scene"]
+
+
+APART = """
+import os
+import time
+
+from etsplat.data.colmap_process import run_apart
+
+
+def work(report):
+    report("here", os.getpid(), 0)
+    time.sleep(100)
+
+
+if __name__ == "__main__":
+    run_apart(work, report=lambda phase, done, total: print(done, flush=True))
+"""
+
+
+def test_colmap_ends_with_the_process_that_started_it(tmp_path):
+    """Also where that is killed, and can end nothing itself."""
+    pytest.importorskip("pycolmap")
+    (tmp_path / "apart.py").write_text(APART)
+    process = subprocess.Popen([sys.executable, "apart.py"], cwd=tmp_path, stdout=subprocess.PIPE, text=True)
+    colmap = int(process.stdout.readline())
+    process.kill()
+    try:
+        process.communicate(timeout=10)  # which waits for both: they have the same standard output
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(colmap, signal.SIGKILL)
+
+
+ABANDONING = """
+import sys
+from pathlib import Path
+
+from etsplat.data.undistortion import working_folder
+
+with working_folder(Path("scene")) as work:
+    (work / "database.db").write_text("large")
+    print(work, flush=True)
+    sys.stdin.read()
+"""
+
+
+def test_what_a_killed_process_left_is_removed_by_the_next_for_the_same_folder(tmp_path):
+    """And by no other; that of a living process stays, as does a hidden folder of somebody else."""
+    for name in (".scene-notes", ".other-12"):
+        (tmp_path / name).mkdir()
+    program = [sys.executable, "-c", ABANDONING]
+    pipe = subprocess.PIPE
+    killed, living = (subprocess.Popen(program, cwd=tmp_path, stdin=pipe, stdout=pipe, text=True) for _ in range(2))
+    try:
+        left, used = (tmp_path / process.stdout.readline().strip() for process in (killed, living))
+        killed.kill()
+        killed.communicate()
+        assert left.is_dir()
+        with working_folder(tmp_path / "another"):
+            assert left.is_dir()
+        with working_folder(tmp_path / "scene") as work:
+            assert not left.exists()
+            assert (used / "database.db").is_file()
+            assert sorted(tmp_path.iterdir()) == sorted([tmp_path / ".scene-notes", tmp_path / ".other-12", used, work])
+    finally:
+        killed.kill()
+        living.communicate()  # ends it
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".other-12", ".scene-notes"]
+
+
+@pytest.fixture
+def archive(tmp_path, monkeypatch):
+    path = tmp_path / "archive.zip"
+    with zipfile.ZipFile(path, "w") as file:
+        file.writestr("truck/sparse/0/cameras.txt", "")
+    monkeypatch.setitem(datasets.DATASETS, "tiny", Dataset(path.as_uri(), ("truck",), 0.001))
+    return path
+
+
+def test_a_data_set_is_fetched_once(tmp_path, archive):
+    done = []
+    assert download_dataset("tiny", tmp_path / "data", progress=lambda *state: done.append(state)) == [
+        tmp_path / "data" / "truck"
+    ]
+    assert done[-1] == (archive.stat().st_size, archive.stat().st_size)
+    assert [path.name for path in (tmp_path / "data").iterdir()] == ["truck"]
+    archive.unlink()
+    download_dataset("tiny", tmp_path / "data")
+
+
+def test_without_a_network_the_address_is_told(tmp_path, monkeypatch):
+    monkeypatch.setitem(datasets.DATASETS, "tiny", Dataset("http://127.0.0.1:9/a.zip", ("truck",), 0.001))
+    with pytest.raises(InputError, match=r"cannot reach http://127\.0\.0\.1:9/a\.zip.*unpack it into"):
+        download_dataset("tiny", tmp_path / "data")
+    (tmp_path / "no.zip").write_text("not a zip")
+    monkeypatch.setitem(datasets.DATASETS, "tiny", Dataset((tmp_path / "no.zip").as_uri(), ("truck",), 0.001))
+    with pytest.raises(InputError, match="damaged"):
+        download_dataset("tiny", tmp_path / "data")

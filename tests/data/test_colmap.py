@@ -1,0 +1,164 @@
+import struct
+
+import pytest
+import torch
+
+from etsplat.core.errors import InputError
+from etsplat.data.colmap import read_colmap
+from etsplat.data.demo_object import demo_object
+from etsplat.data.frames import posed_views
+from etsplat.data.load import load_views
+from etsplat.data.photograph import photograph
+from etsplat.data.transforms import read_transforms
+from etsplat.io.images import save_image
+from helpers.captures import quaternion
+
+NAMES = [f"photo {k:02d}.png" for k in range(10)]
+
+
+def load_colmap(folder, masks=None, width=None):
+    return posed_views(read_colmap(folder, masks), width=width)
+
+
+def load_transforms(folder, width=None):
+    return posed_views(read_transforms(folder), width=width)
+
+
+@pytest.fixture(scope="module")
+def truth():
+    return photograph(demo_object(), 40, 30, elevations=(-30.0, 20.0), azimuths=5, supersampling=2)
+
+
+def write_scene(folder, views, binary, model=("PINHOLE", 1)):
+    """One camera per image; its numbers double those of the images, which are half-size copies."""
+    sparse = folder / "sparse" / "0"
+    sparse.mkdir(parents=True)
+    (folder / "images").mkdir()
+    K, W, H = 2 * views.cameras.Ks[0], 2 * views.cameras.width, 2 * views.cameras.height
+    params = [float(v) for v in (K[0, 0], K[1, 1], K[0, 2], K[1, 2])]
+    if model[0] == "SIMPLE_PINHOLE":
+        params = params[1:]
+    elif model[0] == "SIMPLE_RADIAL":
+        params = [*params[1:], 0.01]
+    camera_bytes, image_bytes = struct.pack("<Q", 1), struct.pack("<Q", len(views))
+    camera_text, image_text = "# cameras\n", "# images\n"
+    camera_bytes += struct.pack(f"<iiQQ{len(params)}d", 3, model[1], W, H, *params)
+    camera_text += f"3 {model[0]} {W} {H} {' '.join(repr(p) for p in params)}\n"
+    for index in reversed(range(len(views))):  # files need not be in the order of names
+        viewmat, name = views.cameras.viewmats[index], NAMES[index]
+        save_image(folder / "images" / name, views.images[index, ..., :3])
+        pose = [*quaternion(viewmat[:3, :3]), *viewmat[:3, 3].tolist()]
+        points = [(1.0, 2.0, -1), (3.0, 4.5, 7)] if index % 2 else []
+        image_bytes += struct.pack("<I7dI", index, *pose, 3) + name.encode() + b"\0" + struct.pack("<Q", len(points))
+        image_bytes += b"".join(struct.pack("<ddq", *point) for point in points)
+        image_text += (
+            f"{index} {' '.join(repr(p) for p in pose)} 3 {name}\n{' '.join(f'{a} {b} {c}' for a, b, c in points)}\n"
+        )
+    if binary:
+        (sparse / "cameras.bin").write_bytes(camera_bytes)
+        (sparse / "images.bin").write_bytes(image_bytes)
+    else:
+        (sparse / "cameras.txt").write_text(camera_text)
+        (sparse / "images.txt").write_text(image_text)
+
+
+def write_masks(folder, views):
+    folder.mkdir()
+    for name, image in zip(NAMES, views.images, strict=True):
+        save_image(folder / f"{name}.png", image[..., 3:])
+
+
+@pytest.mark.parametrize("binary", [True, False], ids=["bin", "txt"])
+@pytest.mark.parametrize("model", [("PINHOLE", 1), ("SIMPLE_PINHOLE", 0)], ids=lambda model: model[0])
+def test_cameras_images_names_and_split_return(tmp_path, truth, binary, model):
+    write_scene(tmp_path, truth, binary, model)
+    views = load_colmap(tmp_path)
+    torch.testing.assert_close(views.cameras.viewmats, truth.cameras.viewmats, atol=1e-5, rtol=0)
+    torch.testing.assert_close(views.cameras.Ks, truth.cameras.Ks)
+    torch.testing.assert_close(views.images[..., :3], truth.images[..., :3], atol=1 / 255, rtol=0)
+    assert views.test == [0, 8]
+    assert views.names == [name.removesuffix(".png") for name in NAMES]
+    assert not views.has_masks
+
+
+def test_masks_are_found_beside_the_images_or_where_told(tmp_path, truth):
+    write_scene(tmp_path / "scene", truth, True)
+    write_masks(tmp_path / "elsewhere", truth)
+    told = load_colmap(tmp_path / "scene", tmp_path / "elsewhere")
+    torch.testing.assert_close(told.images[..., 3], truth.images[..., 3], atol=1 / 255, rtol=0)
+    (tmp_path / "elsewhere").rename(tmp_path / "scene" / "masks")
+    assert torch.equal(load_colmap(tmp_path / "scene").images, told.images)
+    vertices = load_views(tmp_path / "scene").normalization.apply(truth.normalization.apply(demo_object().vertices))
+    assert float(vertices.norm(dim=1).max()) <= 1
+
+
+def test_load_views_without_masks_says_what_to_add(tmp_path, truth):
+    write_scene(tmp_path, truth, True)
+    with pytest.raises(InputError, match="add a folder masks/"):
+        load_views(tmp_path)
+
+
+@pytest.mark.parametrize("binary", [True, False], ids=["bin", "txt"])
+def test_distorted_cameras_name_the_undistorter(tmp_path, truth, binary):
+    write_scene(tmp_path, truth, binary, ("SIMPLE_RADIAL", 2))
+    with pytest.raises(InputError, match=r"SIMPLE_RADIAL.*colmap image_undistorter"):
+        load_colmap(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["cameras.bin", "images.bin"])
+@pytest.mark.parametrize("part", [0.0, 0.1, 0.5, 0.99])
+def test_binary_files_cut_anywhere_are_input_errors(tmp_path, truth, name, part):
+    write_scene(tmp_path, truth, True)
+    path = tmp_path / "sparse" / "0" / name
+    path.write_bytes(path.read_bytes()[: int(path.stat().st_size * part)])
+    with pytest.raises(InputError, match=rf"{name}.*cut short"):
+        load_colmap(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new"),
+    [
+        ("cameras.txt", "3 PINHOLE", "three PINHOLE"),
+        ("cameras.txt", "3 PINHOLE 80 60", "3 PINHOLE"),
+        ("images.txt", "9 ", "9 x "),
+        ("images.txt", " 3 photo 09.png", ""),
+    ],
+)
+def test_malformed_text_lines_are_quoted(tmp_path, truth, name, old, new):
+    write_scene(tmp_path, truth, False)
+    path = tmp_path / "sparse" / "0" / name
+    path.write_text(path.read_text().replace(old, new, 1))
+    with pytest.raises(InputError, match=rf"{name}: malformed line"):
+        load_colmap(tmp_path)
+
+
+def test_missing_parts_are_input_errors(tmp_path, truth):
+    with pytest.raises(InputError, match=r"no sparse/0/cameras\.bin"):
+        load_colmap(tmp_path)
+    write_scene(tmp_path, truth, True)
+    with pytest.raises(InputError, match=r"masks .*: no such folder"):
+        load_colmap(tmp_path, tmp_path / "absent")
+    (tmp_path / "images" / NAMES[4]).unlink()
+    with pytest.raises(InputError, match=rf"1 of 10 images are missing.*{NAMES[4]}"):
+        load_colmap(tmp_path)
+    (tmp_path / "sparse" / "0" / "images.bin").unlink()
+    with pytest.raises(InputError, match=r"images\.txt: no such file"):
+        load_colmap(tmp_path)
+
+
+@pytest.mark.parametrize(("scene", "count"), [("fountain-P11", 11), ("lund", 27), ("fox", 50)])
+def test_the_shared_captures_load(shared_data, scene, count):
+    views = load_colmap(shared_data / "scenes" / scene, width=64)
+    assert len(views) == count
+    assert views.cameras.width == 64
+    rotation = views.cameras.viewmats[:, :3, :3]
+    torch.testing.assert_close(rotation @ rotation.mT, torch.eye(3).expand(count, 3, 3), atol=1e-5, rtol=0)
+
+
+def test_the_shared_lego_has_the_same_cameras_in_both_layouts(shared_data):
+    """The COLMAP copy was made from the Blender scene; poses agree view by view."""
+    colmap = load_colmap(shared_data / "scenes" / "lego", width=16)
+    blender = load_transforms(shared_data / "scenes" / "lego_blender", width=16)
+    index = blender.names.index("train_r_7")
+    other = colmap.names.index("train_007")
+    torch.testing.assert_close(colmap.cameras.viewmats[other], blender.cameras.viewmats[index], atol=1e-4, rtol=0)

@@ -1,0 +1,104 @@
+import math
+
+import pytest
+import torch
+
+from etsplat.core.errors import InputError
+from etsplat.data.demo_object import demo_object
+from etsplat.data.photograph import CAMERA_DISTANCE, normalize_mesh, orbit_cameras, photograph, shade_faces
+from etsplat.geometry.icosphere import icosphere
+from etsplat.io.mesh_files import MeshFile, load_mesh
+
+
+@pytest.fixture(scope="module")
+def sphere():
+    return MeshFile(*icosphere(5))
+
+
+@pytest.fixture(scope="module")
+def sphere_views(sphere):
+    return photograph(sphere, 96, 96)
+
+
+def test_normalisation_centres_the_bounding_box_and_scales_the_farthest_vertex_to_1():
+    mesh = demo_object()
+    unit, normalization = normalize_mesh(mesh)
+    torch.testing.assert_close(unit.vertices.amin(0), -unit.vertices.amax(0), atol=1e-6, rtol=0)
+    assert float(unit.vertices.norm(dim=1).max()) == pytest.approx(1, abs=1e-6)
+    torch.testing.assert_close(normalization.invert(unit.vertices), mesh.vertices, atol=1e-6, rtol=0)
+    torch.testing.assert_close(normalization.apply(mesh.vertices), unit.vertices, atol=1e-6, rtol=0)
+
+
+def test_the_unit_sphere_fills_nine_tenths_of_the_height(sphere_views):
+    """Rows that the sphere covers, over the height; the centre column sees the full silhouette."""
+    column = sphere_views.images[16, :, 47:49, 3].mean(dim=1)
+    assert float(column.sum()) / 96 == pytest.approx(0.9, abs=0.005)
+    assert math.tan(math.asin(1 / CAMERA_DISTANCE)) == pytest.approx(0.9 * math.tan(math.radians(20)))
+
+
+def test_views_run_through_azimuths_first_with_plus_y_up():
+    cameras = orbit_cameras(64, 64)
+    torch.testing.assert_close(cameras.centers.norm(dim=1), torch.full((40,), CAMERA_DISTANCE))
+    elevation = torch.rad2deg(torch.asin(cameras.centers[:, 1] / CAMERA_DISTANCE)).reshape(5, 8)
+    torch.testing.assert_close(
+        elevation, torch.tensor([-70.0, -35, 0, 35, 70])[:, None].expand(5, 8), atol=1e-3, rtol=0
+    )
+    torch.testing.assert_close(cameras.centers[16], torch.tensor([0, 0, CAMERA_DISTANCE]), atol=1e-5, rtol=0)
+    torch.testing.assert_close(cameras.centers[18], torch.tensor([CAMERA_DISTANCE, 0, 0]), atol=1e-5, rtol=0)
+    down_in_image = cameras.viewmats[:, 1, :3]
+    assert bool((down_in_image[:, 1] < -0.3).all())
+
+
+def test_every_fifth_view_from_the_third_is_held_out(sphere_views):
+    assert sphere_views.test == [2, 7, 12, 17, 22, 27, 32, 37]
+    assert sphere_views.train == [view for view in range(40) if view % 5 != 2]
+    assert sphere_views.names[7] == "007"
+
+
+def test_colours_are_ambient_plus_diffuse_along_z_whatever_the_orientation(sphere):
+    vertices, faces = sphere.vertices, sphere.faces
+    shade = shade_faces(vertices, faces)
+    centroid = torch.nn.functional.normalize(vertices[faces].mean(1), dim=1)
+    torch.testing.assert_close(shade[:, 0], 0.4 + 0.6 * centroid[:, 2].abs(), atol=2e-3, rtol=0)
+    assert torch.equal(shade_faces(vertices, faces.flip(1)), shade)
+
+
+def test_pixels_are_the_shade_times_coverage(sphere_views):
+    """From +z the middle of the sphere is lit fully; from +x its middle has only the ambient light."""
+    torch.testing.assert_close(sphere_views.images[16, 48, 48], torch.ones(4), atol=2e-3, rtol=0)
+    torch.testing.assert_close(sphere_views.images[18, 48, 48], torch.tensor([0.4, 0.4, 0.4, 1]), atol=0.02, rtol=0)
+    color, alpha = sphere_views.images[..., :3], sphere_views.images[..., 3:]
+    assert bool((color <= alpha + 1e-6).all())
+    assert bool((color >= 0.4 * alpha - 1e-6).all())
+    edge = (alpha > 0) & (alpha < 1)
+    assert 0.01 < float(edge.float().mean()) < 0.1
+
+
+def test_the_picture_does_not_depend_on_units_or_place(sphere):
+    moved = MeshFile(sphere.vertices * 250 + torch.tensor([1000.0, -20, 5]), sphere.faces)
+    one = photograph(sphere, 48, 48, elevations=(10.0,), azimuths=2)
+    other = photograph(moved, 48, 48, elevations=(10.0,), azimuths=2)
+    assert float((one.images - other.images).abs().mean()) < 1e-4
+    assert other.normalization.radius == pytest.approx(250, rel=1e-4)
+
+
+def test_progress_counts_the_pictures(sphere):
+    seen = []
+    photograph(sphere, 16, 16, elevations=(0.0,), azimuths=3, progress=lambda done, total: seen.append((done, total)))
+    assert seen == [(1, 3), (2, 3), (3, 3)]
+
+
+def test_a_mesh_at_one_point_and_impossible_views_are_refused(sphere):
+    with pytest.raises(InputError, match="one point"):
+        normalize_mesh(MeshFile(torch.ones(3, 3), torch.tensor([[0, 1, 2]])))
+    with pytest.raises(ValueError, match="elevations"):
+        photograph(sphere, 16, 16, elevations=(90.0,))
+    with pytest.raises(ValueError, match="width"):
+        photograph(sphere, 16, 32)
+
+
+def test_the_shared_koala_stands_upright_in_its_front_view(shared_data):
+    """Paws at the bottom, ears at the top: the widest part of the upper half is the ears', above the middle."""
+    views = photograph(load_mesh(shared_data / "famous" / "koala.obj"), 64, 64, elevations=(0.0,), azimuths=1)
+    rows = views.images[0, :, :, 3].sum(dim=1)
+    assert int(rows.argmax()) < 32

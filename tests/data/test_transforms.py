@@ -1,0 +1,188 @@
+import json
+import math
+
+import pytest
+import torch
+
+from etsplat.core.errors import InputError
+from etsplat.data.demo_object import demo_object
+from etsplat.data.frames import posed_views
+from etsplat.data.load import load_views
+from etsplat.data.photograph import photograph
+from etsplat.data.transforms import read_transforms
+from etsplat.io.images import save_image
+
+FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
+
+
+def load_transforms(folder, width=None):
+    return posed_views(read_transforms(folder), width=width)
+
+
+@pytest.fixture(scope="module")
+def truth():
+    return photograph(demo_object(), 40, 40, elevations=(-30.0, 20.0), azimuths=5, supersampling=2)
+
+
+def opengl_pose(viewmat):
+    return (torch.linalg.inv(viewmat.double()) @ FLIP).tolist()
+
+
+def write_scene(folder, views, indices, name, straight=True, **settings):
+    """Writes the views with the given indices as RGBA PNG beside a JSON file `name`; returns the document."""
+    frames = []
+    for index in indices:
+        image = views.images[index].clone()
+        image[..., :3] /= image[..., 3:].clamp_min(1e-6)
+        (folder / "images").mkdir(exist_ok=True)
+        save_image(folder / "images" / f"{index:03d}.png", image)
+        frames.append(
+            {"file_path": f"./images/{index:03d}", "transform_matrix": opengl_pose(views.cameras.viewmats[index])}
+        )
+    document = {"camera_angle_x": math.radians(40), "frames": frames, **settings}
+    (folder / name).write_text(json.dumps(document))
+    return document
+
+
+def rewrite(folder, change):
+    """Loads transforms.json, lets `change` edit it, writes it back."""
+    document = json.loads((folder / "transforms.json").read_text())
+    change(document)
+    (folder / "transforms.json").write_text(json.dumps(document))
+
+
+@pytest.fixture
+def scene(tmp_path, truth):
+    write_scene(tmp_path, truth, range(10), "transforms.json")
+    return tmp_path
+
+
+def test_blender_layout_returns_the_cameras_and_premultiplied_images(tmp_path, truth):
+    write_scene(tmp_path, truth, range(7), "transforms_train.json")
+    write_scene(tmp_path, truth, range(7, 10), "transforms_test.json")
+    views = load_transforms(tmp_path)
+    torch.testing.assert_close(views.cameras.viewmats, truth.cameras.viewmats, atol=1e-5, rtol=0)
+    torch.testing.assert_close(views.cameras.Ks, truth.cameras.Ks, atol=1e-3, rtol=0)
+    torch.testing.assert_close(views.images, truth.images, atol=2.1 / 255, rtol=0)
+    assert (views.train, views.test) == (list(range(7)), [7, 8, 9])
+    assert views.names[3] == "images_003"
+    assert views.has_masks
+
+
+def test_nerfstudio_intrinsics_scale_with_the_files_and_the_requested_width(scene, truth):
+    """fl, cx, cy belong to w x h; files of half that size, loaded at half theirs again, quarter them."""
+
+    def change(document):
+        del document["camera_angle_x"]
+        document |= {"fl_x": 100.0, "fl_y": 110.0, "cx": 41.0, "cy": 39.0, "w": 80, "h": 80, "k1": 0.0}
+
+    rewrite(scene, change)
+    views = load_transforms(scene, width=20)
+    expected = torch.tensor([[25, 0, 10.25], [0, 27.5, 9.75], [0, 0, 1]])
+    torch.testing.assert_close(views.cameras.Ks, expected.expand(10, 3, 3))
+    assert views.images.shape == (10, 20, 20, 4)
+    torch.testing.assert_close(views.images.mean(), truth.images.mean(), atol=0.01, rtol=0)
+
+
+def test_split_is_every_eighth_by_name_or_as_the_file_says(scene):
+    assert load_transforms(scene).test == [0, 8]
+    names = [f"./images/{k:03d}" for k in range(10)]
+    rewrite(scene, lambda d: d.update(train_filenames=names[2:], test_filenames=names[:2]))
+    views = load_transforms(scene)
+    assert (views.test, views.train) == ([0, 1], list(range(2, 10)))
+
+
+def test_masks_come_from_mask_path_or_a_masks_folder(scene, truth):
+    for index in range(10):
+        save_image(scene / "images" / f"{index:03d}.png", truth.images[index, ..., :3])
+    assert not load_transforms(scene).has_masks
+    (scene / "masks").mkdir()
+    for index in range(10):
+        save_image(scene / "masks" / f"{index:03d}.png", truth.images[index, ..., 3:])
+    torch.testing.assert_close(load_transforms(scene).images[..., 3], truth.images[..., 3], atol=1 / 255, rtol=0)
+    (scene / "masks").rename(scene / "silhouettes")
+    rewrite(
+        scene,
+        lambda d: [f.update(mask_path=f["file_path"].replace("images", "silhouettes") + ".png") for f in d["frames"]],
+    )
+    torch.testing.assert_close(load_transforms(scene).images[..., 3], truth.images[..., 3], atol=1 / 255, rtol=0)
+
+
+def test_load_views_moves_the_object_into_the_unit_sphere(scene, truth):
+    views = load_views(scene)
+    vertices = views.normalization.apply(truth.normalization.apply(demo_object().vertices))
+    assert 0.7 < float(vertices.norm(dim=1).max()) <= 1
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda d: d.update(k1=0.01), r"lens distortion \(k1\).*etsplat data undistort"),
+        (lambda d: d["frames"][3].update(p2=-0.2), r"003 has lens distortion \(p2\)"),
+        (lambda d: d.update(camera_model="OPENCV_FISHEYE"), "OPENCV_FISHEYE camera; run `etsplat data undistort"),
+        (lambda d: d.update(frames=[]), "no list `frames`"),
+        (lambda d: d.pop("frames"), "no list `frames`"),
+        (lambda d: d.update(frames=d["frames"][:1]), "at least 2"),
+        (lambda d: d["frames"][2].pop("file_path"), "without `file_path`"),
+        (lambda d: d["frames"][2].update(file_path="images/absent"), "1 of 10 images are missing"),
+        (lambda d: d["frames"][2].pop("transform_matrix"), "002 has no 4x4 transform_matrix"),
+        (lambda d: d["frames"][2].update(transform_matrix=[[1, 2], [3]]), "no 4x4 transform_matrix"),
+        (lambda d: d["frames"][2]["transform_matrix"][0].__setitem__(0, float("nan")), "no 4x4 transform_matrix"),
+        (lambda d: d["frames"][2].update(transform_matrix=torch.diag(torch.tensor([2.0, 2, 2, 1])).tolist()), "scales"),
+        (lambda d: d.pop("camera_angle_x"), "neither fl_x nor camera_angle_x"),
+        (lambda d: d.update(fl_x=-3), "not positive"),
+        (lambda d: d.update(fl_x="wide"), "not a number"),
+        (lambda d: d.update(w=80, h=40), "its camera is for 80x40"),
+        (lambda d: d.update(train_filenames=["x"], test_filenames=["y"]), "names none of the frames"),
+    ],
+)
+def test_unusable_descriptions_are_one_line_input_errors(scene, change, message):
+    rewrite(scene, change)
+    with pytest.raises(InputError, match=message) as raised:
+        load_transforms(scene)
+    assert "\n" not in str(raised.value)
+
+
+def test_broken_files_are_input_errors(scene, truth):
+    (scene / "images" / "004.png").write_bytes((scene / "images" / "004.png").read_bytes()[:60])
+    with pytest.raises(InputError, match=r"004\.png"):
+        load_transforms(scene)
+    save_image(scene / "images" / "004.png", torch.zeros(40, 41, 3))
+    with pytest.raises(InputError, match="different sizes"):
+        load_transforms(scene)
+    (scene / "transforms.json").write_text('{"frames": [')
+    with pytest.raises(InputError, match="not valid JSON"):
+        load_transforms(scene)
+    (scene / "transforms.json").write_text("[]")
+    with pytest.raises(InputError, match="JSON object"):
+        load_transforms(scene)
+
+
+def test_masks_that_are_missing_or_of_another_size_are_input_errors(scene, truth):
+    (scene / "masks").mkdir()
+    for index in range(9):
+        save_image(scene / "masks" / f"{index:03d}.png", truth.images[index, ..., 3:])
+    with pytest.raises(InputError, match=r"no mask for image 009\.png"):
+        load_transforms(scene)
+    save_image(scene / "masks" / "009.png", torch.zeros(20, 20, 1))
+    with pytest.raises(InputError, match="resize the mask"):
+        load_transforms(scene)
+
+
+def test_folders_without_a_scene_are_input_errors(tmp_path):
+    with pytest.raises(InputError, match="no such folder"):
+        load_views(tmp_path / "absent")
+    (tmp_path / "mesh.obj").write_text("")
+    with pytest.raises(InputError, match=r"mesh\.obj: is a file; name the scene's folder"):
+        load_views(tmp_path / "mesh.obj")
+    with pytest.raises(InputError, match="choose the scene's folder"):
+        load_views(tmp_path)
+    with pytest.raises(InputError, match=r"neither transforms\.json"):
+        load_transforms(tmp_path)
+
+
+def test_the_shared_lego_loads_with_its_published_split(shared_data):
+    views = load_transforms(shared_data / "scenes" / "lego_blender", width=50)
+    assert views.images.shape == (125, 50, 50, 4)
+    assert (len(views.train), len(views.test)) == (100, 25)
+    torch.testing.assert_close(views.cameras.Ks[0, 0, 0], torch.tensor(0.5 * 50 / math.tan(0.6911112070083618 / 2)))

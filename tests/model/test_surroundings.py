@@ -1,0 +1,59 @@
+"""The sphere behind a capture: where it is, its colours, and that nothing shines through it."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from etsplat.data.captures import Capture
+from etsplat.data.demo_scene import demo_scene
+from etsplat.model.soup_rendering import SoupAppearance, render_soup
+from etsplat.model.surroundings import Surroundings
+from etsplat.model.triangle_soup import TriangleSoup
+
+
+@pytest.fixture(scope="module")
+def capture() -> Capture:
+    return demo_scene(32, 24).normalized()
+
+
+@pytest.fixture(scope="module")
+def sphere(capture: Capture) -> TriangleSoup:
+    return Surroundings.of(capture).soup(capture, 1)
+
+
+def test_it_surrounds_cameras_and_nearly_all_points(capture: Capture, sphere: TriangleSoup) -> None:
+    """A point that structure from motion put far away does not move it."""
+    assert capture.exact_points is not None
+    middle = capture.centers[capture.train].mean(dim=0).float()
+    radius = (sphere.vertices.detach() - middle).norm(dim=-1)
+    torch.testing.assert_close(radius, radius.mean().expand_as(radius), rtol=1e-4, atol=0)
+    assert float((capture.centers.float() - middle).norm(dim=1).max()) < float(radius.min())
+    stray = capture.exact_points.clone()
+    stray[0] = 1e4
+    again = Surroundings.of(replace(capture, exact_points=stray))
+    assert again.radius == pytest.approx(Surroundings.of(capture).radius, rel=0.02)
+    assert bool(again.outermost(sphere.vertices).all())
+    assert not bool(again.outermost(0.8 * sphere.vertices.detach()).any())
+
+
+def test_every_view_is_covered(capture: Capture, sphere: TriangleSoup) -> None:
+    """There is no gap, and about a third of the background shines through at the start."""
+    for camera in capture.cameras[:3]:
+        alpha = render_soup(sphere, camera, SoupAppearance(near_plane=0.05)).alpha.detach()
+        assert float(alpha.mean()) > 0.6
+        assert float(alpha.min()) > 0.4
+
+
+def test_colours_are_those_of_the_photos_there_and_next_to_it(capture: Capture) -> None:
+    """Red photos make a red sphere, also where none shows it."""
+
+    class Red:
+        sizes = capture.images.sizes
+
+        def __getitem__(self, _: int) -> torch.Tensor:
+            return torch.tensor([255, 0, 0], dtype=torch.uint8).expand(24, 32, 3)
+
+    red = replace(capture, images=Red())  # type: ignore[arg-type]
+    colors = Surroundings.of(red).soup(red, 0).display_colors()
+    torch.testing.assert_close(colors, torch.tensor([[1.0, 0, 0]]).expand_as(colors), rtol=0, atol=1e-3)

@@ -1,0 +1,45 @@
+import pytest
+import torch
+
+from etsplat.model.triangle_soup import TriangleSoup
+
+
+def soup(rng: torch.Generator, degree: int = 2) -> TriangleSoup:
+    return TriangleSoup.from_triangles(
+        torch.rand((5, 3, 3), generator=rng),
+        torch.rand((5, 3), generator=rng),
+        opacity=0.28,
+        sigma=1.16,
+        sh_degree=degree,
+    )
+
+
+def test_start_has_the_values_asked_for(rng):
+    """Opacity, sigma and colours come back through the activations."""
+    start = soup(rng)
+    torch.testing.assert_close(start.opacities, torch.full((5,), 0.28))
+    torch.testing.assert_close(start.sigma, torch.full((5,), 1.16))
+    rng.manual_seed(20261121)
+    torch.rand((5, 3, 3), generator=rng)
+    colors = torch.rand((5, 3), generator=rng)
+    torch.testing.assert_close(start.display_colors(), colors)
+    torch.testing.assert_close(start.display_colors(torch.tensor([0.0, 0, 2])), colors)
+    assert start.sh_degree == 2
+    assert all(parameter.requires_grad for parameter in start.parameters().values())
+
+
+def test_colors_depend_on_the_direction_once_the_bands_do(rng):
+    """A coefficient of the z band brightens one side and darkens the other."""
+    start = soup(rng)
+    start.sh_rest.data[:, 1] = 0.1
+    front, back = (start.display_colors(torch.tensor([0.0, 0.0, z])) for z in (1.0, -1.0))
+    assert bool((front > back).all())
+
+
+def test_wrong_shapes_are_refused(rng):
+    """A tensor with another number of rows or bands is named."""
+    parts = {name: value.detach() for name, value in soup(rng).parameters().items()}
+    with pytest.raises(ValueError, match="sigma_raw"):
+        TriangleSoup(**{**parts, "sigma_raw": torch.zeros(4)})
+    with pytest.raises(ValueError, match="sh_rest"):
+        TriangleSoup(**{**parts, "sh_rest": torch.zeros(5, 4, 3)})

@@ -1,0 +1,256 @@
+"""Operations of the GPU engine against the CPU engine, by the shim and, where there is one, on a GPU."""
+
+import pytest
+import torch
+
+from etsplat.core.cameras import intrinsics, look_at
+from etsplat.geometry.icosphere import icosphere
+from etsplat.geometry.topology import MeshTopology
+from etsplat.ops.adam import Adam
+from etsplat.ops.antialias import rasterize_antialiased
+from etsplat.ops.mesh_energies import mesh_energies
+from etsplat.ops.photometric import photometric_loss
+from etsplat.ops.rasterize_hard import rasterize_hard, render_opaque
+from etsplat.ops.soup_colors import soup_colors
+from etsplat.ops.spherical_harmonics import spherical_harmonics
+from etsplat.ops.triangle_area import mean_area
+from etsplat.ops.weighted_sum import Term, weighted_sum
+from helpers.simt.build import Simt
+
+pytestmark = pytest.mark.sanitize
+
+
+CPU = torch.device("cpu")
+
+
+def same_bits(actual: torch.Tensor | tuple[torch.Tensor, ...], expected: torch.Tensor | tuple[torch.Tensor, ...]):
+    torch.testing.assert_close(actual, expected, rtol=0, atol=0, check_device=False)
+
+
+def on_cpu(*tensors: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    return tuple(tensor.cpu() for tensor in tensors)
+
+
+@pytest.mark.parametrize("power", [1, 2])
+def test_mesh_energies_are_those_of_the_cpu_engine(cuda_device, rng, power):
+    """On a crumpled open mesh of several blocks the gradients are the same bits, the values to rounding."""
+    vertices, faces = icosphere(3)
+    vertices = vertices + 0.05 * torch.randn(vertices.shape, generator=rng)
+    results = []
+    for engine, device in (("cuda", cuda_device), ("cpu", CPU)):
+        connectivity = MeshTopology.from_faces(faces[5:].to(device), len(vertices)).connectivity
+        leaf = vertices.to(device, copy=True).requires_grad_()
+        energies = mesh_energies(leaf, connectivity, edge_power=power, engine=engine)
+        (1.5 * energies.edge + 0.25 * energies.normal + 0.5 * energies.laplacian).backward()
+        results.append((torch.stack(energies).detach().cpu(), leaf.grad))
+    torch.testing.assert_close(results[0][0], results[1][0], rtol=1e-6, atol=0)
+    same_bits(results[0][1], results[1][1])
+
+
+def test_l1_is_that_of_the_cpu_engine(cuda_device, rng):
+    """Two views whose pixels do not fill the last block; the gradient is scaled by what comes from above."""
+    color = torch.rand((2, 37, 41, 3), generator=rng)
+    target, backgrounds = torch.rand((2, 37, 41, 4), generator=rng), torch.rand((2, 3), generator=rng)
+    color[0, 0] = target[0, 0, :, :3] + (1 - target[0, 0, :, 3:]) * backgrounds[0]  # no difference, no gradient
+    results = []
+    for engine, device in (("cuda", cuda_device), ("cpu", CPU)):
+        leaf = color.to(device, copy=True).requires_grad_()
+        loss = photometric_loss(leaf, target.to(device), 0.0, backgrounds=backgrounds.to(device), engine=engine)
+        (4 * loss).backward()
+        results.append((loss.detach().cpu(), leaf.grad.cpu()))
+    torch.testing.assert_close(results[0][0], results[1][0], rtol=1e-6, atol=0)
+    same_bits(results[0][1], results[1][1])
+
+
+def test_mean_area_is_that_of_the_cpu_engine(cuda_device, rng):
+    """Over several blocks of triangles, one without area; values to rounding."""
+    vertices = torch.randn((700, 3, 3), generator=rng)
+    vertices[7] = vertices[7, :1]
+    results = []
+    for engine, device in (("cuda", cuda_device), ("cpu", CPU)):
+        leaf = vertices.to(device, copy=True).requires_grad_()
+        area = mean_area(leaf, engine=engine)
+        (2.5 * area).backward()
+        results.append((area.detach().cpu(), leaf.grad.cpu()))
+    torch.testing.assert_close(results[0], results[1], rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize("scale", [0.3, "tensor"])
+def test_weighted_sum_is_that_of_pytorch(cuda_device, scale):
+    """Value and gradients of all powers, with a scale as a number and in device memory."""
+    results = []
+    for engine, device in (("cuda", cuda_device), ("cpu", CPU)):
+        leaves = [torch.tensor(value, device=device, requires_grad=True) for value in (2.0, 0.7, 1.4, 0.2)]
+        powers = (1, -1, -2)
+        terms = [Term(0.5 + power, leaf, power) for leaf, power in zip(leaves[1:], powers, strict=True)]
+        factor = torch.tensor(0.3, device=device) if scale == "tensor" else scale
+        total = weighted_sum(leaves[0], terms, factor, engine=engine)
+        (3 * total).backward()
+        results.append(torch.stack([total.detach(), *(leaf.grad for leaf in leaves)]).cpu())
+    torch.testing.assert_close(results[0], results[1], rtol=1e-6, atol=0)
+
+
+@pytest.mark.parametrize(
+    ("channels", "as_bytes", "masked", "pixel", "weight"),
+    [
+        (3, True, False, "l1", 0.2),
+        (4, False, True, "l1", 0.3),
+        (4, True, True, "l2", 1.0),
+        (3, False, False, "l2", 0.0),
+    ],
+)
+def test_photometric_loss_is_that_of_the_cpu_engine(cuda_device, rng, channels, as_bytes, masked, pixel, weight):
+    """Bytes and floats, with and without alpha and mask, absolute and squared, over tiles cut by the border."""
+    color, target = torch.rand((2, 21, 35, 3), generator=rng), torch.rand((2, 21, 35, channels), generator=rng)
+    target = (255 * target).to(torch.uint8) if as_bytes else target
+    mask = torch.rand((2, 21, 35), generator=rng) if masked else None
+    backgrounds = torch.rand((2, 3), generator=rng) if channels == 4 else None
+    results = []
+    for engine, device in (("cuda", cuda_device), ("cpu", CPU)):
+        leaf = color.to(device, copy=True).requires_grad_()
+        options = {"backgrounds": None if backgrounds is None else backgrounds.to(device), "engine": engine}
+        on = None if mask is None else mask.to(device)
+        loss = photometric_loss(leaf, target.to(device), weight, on, pixel=pixel, **options)
+        (0.5 * loss).backward()
+        results.append((loss.detach().cpu(), leaf.grad.cpu()))
+    torch.testing.assert_close(results[0][0], results[1][0], rtol=1e-6, atol=0)
+    torch.testing.assert_close(results[0][1], results[1][1], rtol=1e-5, atol=1e-9)
+
+
+def test_adam_takes_the_steps_of_the_cpu_engine(cuda_device, rng):
+    """Ten parameters, one empty, one not contiguous, rates that change: the same bits after five steps."""
+    shapes = [(1200, 3), (), (0, 3), (7,), (1024,), (2, 2), (3,), (5, 1), (1025,), (40, 30)]
+    start = {f"p{i}": torch.randn(shape, generator=rng) for i, shape in enumerate(shapes)}
+    start["p9"] = start["p9"].T
+    gradients = [{name: torch.randn(p.shape, generator=rng) for name, p in start.items()} for _ in range(5)]
+    ends = []
+    for engine, device in (("cuda", cuda_device), ("cpu", CPU)):
+        parameters = {name: p.to(device, copy=True).requires_grad_() for name, p in start.items()}
+        adam = Adam(parameters, {name: 0.01 * (i + 1) for i, name in enumerate(start)}, engine=engine)
+        for step in gradients:
+            for name, p in parameters.items():
+                p.grad = step[name].to(device)
+            adam.learning_rates["p0"] *= 0.5
+            adam.step()
+        ends.append([*parameters.values(), *adam.first_moments.values(), *adam.second_moments.values()])
+    for actual, expected in zip(*ends, strict=True):
+        same_bits(actual.detach(), expected.detach())
+
+
+def test_a_halted_adam_changes_nothing(cuda_device):
+    """With the flag set, parameters and moments stay; without, they move."""
+    parameter = torch.ones(10, requires_grad=True, device=cuda_device)
+    adam = Adam({"p": parameter}, {"p": 0.1}, engine="cuda")
+    parameter.grad = torch.ones_like(parameter)
+    rates = torch.tensor([0.1, 1.0], device=cuda_device)
+    halted = torch.ones((), dtype=torch.int32, device=cuda_device)
+    adam.step_on_device(rates, halted)
+    assert bool((parameter == 1).all())
+    assert not adam.second_moments["p"].any()
+    adam.step_on_device(rates, halted.zero_())
+    assert bool((parameter < 1).all())
+
+
+@pytest.mark.parametrize(("degree", "channels", "bases"), [(0, 3, 1), (1, 3, 16), (2, 5, 9), (3, 3, 16), (3, 4, 16)])
+def test_spherical_harmonics_are_those_of_the_cpu_engine(cuda_device, rng, degree, channels, bases):
+    """Through shared memory (up to 48 numbers a point) and without, two views, one direction of no length."""
+    coefficients = torch.randn((150, bases, channels), generator=rng)
+    directions = torch.randn((2, 150, 3), generator=rng)
+    directions[1, 70] = 0
+    cotangent = torch.randn((2, 150, channels), generator=rng)
+    results = []
+    for engine, device in (("cuda", cuda_device), ("cpu", CPU)):
+        leaves = [tensor.to(device, copy=True).requires_grad_() for tensor in (coefficients, directions)]
+        colors = spherical_harmonics(*leaves, degree, engine=engine)
+        results.append(on_cpu(colors.detach(), *torch.autograd.grad(colors, leaves, cotangent.to(device))))
+    for actual, expected in zip(*results, strict=True):
+        torch.testing.assert_close(actual, expected, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_soup_colors_are_those_of_the_cpu_engine(cuda_device, rng, degree):
+    """Colours and gradients, with a whole block of triangles that no view sees, and more bases than any degree has."""
+    shapes = (150, 3, 3), (150, 1, 3), (150, 17, 3)
+    inputs = [torch.randn(shape, generator=rng) for shape in shapes]
+    centers, cotangent = torch.randn((2, 3), generator=rng), torch.randn((2, 150, 3), generator=rng)
+    cotangent[:, :64] = 0
+    results = []
+    for engine, device in (("cuda", cuda_device), ("cpu", CPU)):
+        leaves = [tensor.to(device, copy=True).requires_grad_() for tensor in inputs]
+        colors = soup_colors(*leaves, centers.to(device), degree, engine=engine)
+        results.append(on_cpu(colors.detach(), *torch.autograd.grad(colors, leaves, cotangent.to(device))))
+    for actual, expected in zip(*results, strict=True):
+        torch.testing.assert_close(actual, expected, rtol=1e-5, atol=1e-6)
+
+
+def moved(scene: dict[str, torch.Tensor], device: torch.device) -> dict[str, torch.Tensor]:
+    return {name: tensor.to(device) for name, tensor in scene.items()}
+
+
+def hard_scene(rng: torch.Generator) -> dict[str, torch.Tensor]:
+    """Two views of a sphere of small triangles within a soup of large ones, some of them behind the camera."""
+    vertices, faces = icosphere(2)
+    soup = 2 * torch.randn((40, 3), generator=rng)
+    eyes = torch.tensor([[1.0, 2.0, 3.0], [0.0, 0.3, 3.0]])
+    return {
+        "vertices": torch.cat([vertices, soup]),
+        "faces": torch.cat([faces, len(vertices) + torch.arange(39).view(-1, 3)]),
+        "viewmats": look_at(eyes, torch.zeros(3), torch.tensor([0.0, 1.0, 0.0])).float(),
+        "Ks": intrinsics(40.0, 45, 37).float().expand(2, 3, 3),
+    }
+
+
+def test_hard_rasterization_is_that_of_the_cpu_engine(cuda_device, rng, monkeypatch):
+    """Triangles, barycentrics and depths are the same bits, whatever the height of a strip."""
+    scene = hard_scene(rng)
+    expected = rasterize_hard(width=45, height=37, engine="cpu", **scene)
+    for samples in (1 << 21, 45 * 10):
+        monkeypatch.setattr("etsplat.ops._rasterize_hard_cuda._STRIP_SAMPLES", samples)
+        actual = rasterize_hard(width=45, height=37, engine="cuda", **moved(scene, cuda_device))
+        for name, image in vars(expected).items():
+            same_bits(getattr(actual, name), image)
+    assert int(expected.triangle.max()) >= 320  # some of the soup is in front
+
+
+@pytest.mark.parametrize(("colors", "channels", "cull"), [("face_colors", 3, False), ("vertex_colors", 5, True)])
+def test_opaque_pictures_are_those_of_the_cpu_engine(cuda_device, rng, monkeypatch, colors, channels, cull):
+    """Nine samples a pixel, drawn in several strips, both ways to colour: the same bits."""
+    monkeypatch.setattr("etsplat.ops._rasterize_hard_cuda._STRIP_SAMPLES", 135 * 40)
+    scene = hard_scene(rng)
+    count = len(scene["faces"] if colors == "face_colors" else scene["vertices"])
+    scene[colors] = torch.rand((count, channels), generator=rng)
+    options = {"width": 45, "height": 37, "supersampling": 3, "cull_backfaces": cull}
+    actual = render_opaque(engine="cuda", **options, **moved(scene, cuda_device))
+    same_bits(actual, render_opaque(engine="cpu", **options, **scene))
+
+
+def antialiased(kind: str, rng: torch.Generator, engine: str, device: torch.device) -> tuple[torch.Tensor, ...]:
+    """Picture of a folded mesh in two views, and its gradients by vertices, colours and backgrounds."""
+    vertices, faces = icosphere(2)
+    vertices = vertices * (1 + 0.35 * torch.sin(5 * vertices[:, :1]) * torch.cos(4 * vertices[:, 1:2]))
+    connectivity = MeshTopology.from_faces(faces.to(device), len(vertices)).connectivity
+    scene = moved(hard_scene(rng), device)
+    colors = torch.rand((len(faces) if kind == "face_colors" else len(vertices), 3), generator=rng)
+    backgrounds, cotangent = torch.rand((2, 3), generator=rng), torch.randn((2, 37, 45, 3), generator=rng)
+    leaves = [tensor.to(device, copy=True).requires_grad_() for tensor in (vertices, colors, backgrounds)]
+    shown = {kind: leaves[1], "backgrounds": leaves[2], "engine": engine}
+    image = rasterize_antialiased(leaves[0], connectivity, scene["viewmats"], scene["Ks"], 45, 37, **shown)
+    return on_cpu(image.detach(), *torch.autograd.grad(image, leaves, cotangent.to(device)))
+
+
+@pytest.mark.parametrize("kind", ["face_colors", "vertex_colors"])
+def test_antialiased_pictures_are_those_of_the_cpu_engine(cuda_device, rng, kind):
+    """The same picture to the bit, gradients to rounding."""
+    actual = antialiased(kind, rng, "cuda", cuda_device)
+    expected = antialiased(kind, rng.manual_seed(20261121), "cpu", CPU)
+    same_bits(actual[0], expected[0])
+    for gradient, exact in zip(actual[1:], expected[1:], strict=True):
+        torch.testing.assert_close(gradient, exact, rtol=1e-4, atol=1e-5 * float(exact.abs().max()))
+
+
+def test_scattered_gradients_do_not_depend_on_the_order_of_threads(simt: Simt, rng):
+    """Fixed-point sums are the same bits in whatever order their terms come."""
+    results = []
+    for simt.order_seed in (0, 5):
+        results.append(antialiased("vertex_colors", rng.manual_seed(1), "cuda", CPU))
+    same_bits(*results)

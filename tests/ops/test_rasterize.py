@@ -1,0 +1,155 @@
+"""The public call: what comes out, and one clear error for every bad argument."""
+
+import pytest
+import torch
+
+from etsplat import Cutoffs, rasterize
+from etsplat.ops.engines import resolve_engine
+from helpers.scenes import EVERYTHING, IMAGES, accuracy, dtype_of, mesh, prepare, render, soup
+
+
+@pytest.fixture
+def scene(rng):
+    return soup(rng, 5, width=9, height=7)
+
+
+def test_images_are_channels_last_in_the_dtype_of_the_vertices(engine, scene):
+    out = render(scene, engine, **EVERYTHING)
+    shapes = {name: tuple(getattr(out, name).shape) for name in IMAGES}
+    assert shapes.pop("color") == shapes.pop("normal") == (2, 7, 9, 3)
+    assert set(shapes.values()) == {(2, 7, 9, 1)}
+    assert all(getattr(out, name).dtype == dtype_of(engine) for name in IMAGES)
+    assert {tuple(value.shape) for value in vars(out.statistics).values()} == {(2, 5)}
+    assert out.statistics.visible.dtype == torch.bool
+    assert not any(value.requires_grad for value in vars(out.statistics).values())
+
+
+def test_what_was_not_asked_for_is_none(engine, scene):
+    out = render(scene, engine)
+    assert [getattr(out, name) for name in (*IMAGES[2:], "statistics")] == [None] * 5
+
+
+@pytest.mark.parametrize("channels", [1, 2, 3, 4, 5, 17])
+def test_any_number_of_channels(engine, channels, rng):
+    """Each channel is what it would be alone."""
+    scene = soup(rng, 20, channels=channels)
+    out = render(scene, engine)
+    last = {**scene, "colors": scene["colors"][:, -1:], "backgrounds": scene["backgrounds"][:, -1:]}
+    assert out.color.shape[-1] == channels
+    torch.testing.assert_close(out.color[..., -1:], render(last, engine).color, rtol=0, atol=accuracy(engine))
+
+
+def test_faces_and_soup_of_the_same_triangles_give_the_same_images(engine, rng):
+    scene = mesh(rng)
+    unshared = {**scene, "vertices": scene["vertices"][scene["faces"]], "faces": None}
+    wide = {**scene, "faces": scene["faces"].int()}
+    expected = render(scene, engine)
+    assert torch.equal(render(unshared, engine).color, expected.color)
+    assert torch.equal(render(wide, engine).color, expected.color)
+
+
+def test_colors_per_view_and_one_sigma_for_all_are_the_same_as_spelled_out(engine, scene):
+    shared = {**scene, "sigma": torch.tensor(0.5)}
+    spelled = {**scene, "sigma": torch.full((5,), 0.5), "colors": scene["colors"].expand(2, 5, 3).contiguous()}
+    expected = render(shared, engine).color
+    assert torch.equal(render(spelled, engine).color, expected)
+    assert torch.equal(render({**scene, "sigma": 0.5}, engine).color, expected)
+
+
+def test_views_of_a_batch_do_not_see_each_other(engine, scene):
+    both = render(scene, engine, **EVERYTHING)
+    for view in range(2):
+        chosen = {name: scene[name][view : view + 1] for name in ("viewmats", "Ks", "backgrounds")}
+        alone = render({**scene, **chosen}, engine, **EVERYTHING)
+        for name in IMAGES:
+            assert torch.equal(getattr(alone, name)[0], getattr(both, name)[view])
+
+
+def test_no_triangles_show_the_background(engine, scene):
+    empty = {name: scene[name][:0] for name in ("vertices", "colors", "opacities", "sigma")}
+    out = render({**scene, **empty}, engine, **EVERYTHING)
+    assert torch.equal(out.color, scene["backgrounds"].to(out.color.dtype)[:, None, None].expand_as(out.color))
+    assert all((getattr(out, name) == 0).all() for name in IMAGES[1:])
+    assert out.statistics.visible.shape == (2, 0)
+
+
+def test_non_contiguous_tensors_are_understood(engine, scene):
+    expected = render(scene, engine).color
+    prepared = prepare(scene, engine)
+    for name in ("vertices", "colors", "viewmats", "Ks", "backgrounds"):
+        prepared[name] = prepared[name].transpose(-1, -2).contiguous().transpose(-1, -2)
+    prepared["opacities"] = torch.stack([prepared["opacities"]] * 2, dim=1)[:, 0]
+    assert torch.equal(rasterize(**prepared, engine=engine).color, expected)
+
+
+def test_default_engine_follows_dtype():
+    assert resolve_engine(None, torch.zeros(1)) == "cpu"
+    assert resolve_engine(None, torch.zeros(1, dtype=torch.float64)) == "reference"
+
+
+BAD_ARGUMENTS = {
+    "vertices without faces": ({"vertices": torch.zeros(5, 3)}, r"vertices must have shape \(N, 3, 3\), got \(5, 3\)"),
+    "vertices with faces": ({"faces": torch.zeros(5, 3, dtype=torch.int64)}, r"vertices must have shape \(V, 3\)"),
+    "number of colors": ({"colors": torch.zeros(4, 3)}, r"colors must have shape .* with B=2, N=5, got \(4, 3\)"),
+    "views of colors": ({"colors": torch.zeros(3, 5, 3)}, "colors must have shape"),
+    "no channels": ({"colors": torch.zeros(5, 0), "backgrounds": None}, "colors must have at least one channel"),
+    "opacities": ({"opacities": torch.zeros(5, 1)}, r"opacities must have shape \(N,\)"),
+    "sigma": ({"sigma": torch.ones(4)}, r"sigma must have shape \(\) or \(N,\)"),
+    "viewmats": ({"viewmats": torch.eye(4)}, "viewmats must have shape"),
+    "no cameras": ({"viewmats": torch.zeros(0, 4, 4), "Ks": torch.zeros(0, 3, 3), "backgrounds": None}, "viewmats"),
+    "Ks": ({"Ks": torch.eye(3)[None]}, r"Ks must have shape \(B, 3, 3\) with B=2"),
+    "backgrounds": ({"backgrounds": torch.zeros(3)}, r"backgrounds must have shape \(B, C\)"),
+    "both colors": ({"corner_colors": torch.zeros(5, 3, 3)}, "exactly one of colors and corner_colors .* got both"),
+    "no colors": ({"colors": None}, "exactly one of colors and corner_colors .* got neither"),
+    "list": ({"opacities": [1.0] * 5}, "opacities must be a tensor"),
+    "dtype": ({"opacities": torch.ones(5, dtype=torch.float16)}, "opacities must be torch.float.* like vertices"),
+    "device": ({"opacities": torch.ones(5, device="meta")}, "opacities must be"),
+    "kernel": ({"kernel": "gaussian"}, "kernel must be one of 'single_sided'"),
+    "distance": ({"distance": "euclid"}, "distance must be one of 'barycentric', 'sdf'"),
+    "depth": ({"depth": "expected"}, "depth must be one of None, 'plane', 'centroid'"),
+    "width": ({"width": 0}, "width must be a positive integer, got 0"),
+    "height": ({"height": 7.0}, "height must be a positive integer, got 7.0"),
+    "near plane": ({"near_plane": 0.0}, "near_plane must be positive"),
+    "cutoffs": ({"cutoffs": Cutoffs(alpha_min=0.5, alpha_max=0.4)}, "cutoffs must satisfy"),
+    "engine": ({"engine": "metal"}, "engine must be one of reference, cpu, cuda or None, got 'metal'"),
+    "sigma range": ({"sigma": torch.zeros(5)}, "sigma must be positive, got 0.0"),
+    "skew": ({"Ks": torch.ones(2, 3, 3)}, "Ks must have the form"),
+    "NaN vertices": ({"vertices": torch.full((5, 3, 3), torch.nan)}, "vertices must be finite, got 45 NaN"),
+    "infinite colors": ({"colors": torch.full((5, 3), torch.inf)}, "colors must be finite"),
+    "NaN cameras": ({"viewmats": torch.full((2, 4, 4), torch.nan)}, "viewmats must be finite"),
+    "NaN backgrounds": ({"backgrounds": torch.full((2, 3), torch.nan)}, "backgrounds must be finite"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_ARGUMENTS)
+def test_bad_arguments_are_refused_by_name(engine, case, scene):
+    bad, message = BAD_ARGUMENTS[case]
+    converted = {
+        name: value.to(dtype_of(engine)) if isinstance(value, torch.Tensor) and value.dtype == torch.float32 else value
+        for name, value in bad.items()
+    }
+    with pytest.raises(ValueError, match=message):
+        rasterize(**{**prepare(scene, engine), "engine": engine, **converted})
+
+
+@pytest.mark.parametrize(
+    ("faces", "message"),
+    [
+        (torch.full((5, 3), 15), "faces must be indices from 0 to 14, got indices from 15 to 15"),
+        (torch.full((5, 3), -1), "faces must be indices from 0 to 14, got indices from -1 to -1"),
+        (torch.zeros(5, 3), "faces must be int32 or int64, got torch.float32"),
+    ],
+)
+def test_bad_faces_are_refused_even_without_validation(engine, faces, message, scene):
+    """An index out of range would crash a native engine."""
+    prepared = prepare(scene, engine)
+    prepared["vertices"] = prepared["vertices"].reshape(15, 3)
+    with pytest.raises(ValueError, match=message):
+        rasterize(**prepared, faces=faces, engine=engine, validate=False)
+
+
+def test_engines_refuse_what_they_cannot_compute(scene):
+    with pytest.raises(ValueError, match=r"engine cpu computes in float32, got torch\.float64"):
+        rasterize(**prepare(scene, "reference"), engine="cpu")
+    with pytest.raises(ValueError, match=r"float32 or float64, got torch\.float16"):
+        rasterize(**prepare(scene, "reference", torch.float16))

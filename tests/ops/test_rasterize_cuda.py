@@ -1,0 +1,220 @@
+"""The GPU rasterizer agrees with the float64 reference, run by the shim and, where there is one, on a GPU."""
+
+import pytest
+import test_rasterize_fuzz as fuzz
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from test_rasterize_engines import compare
+
+from etsplat import rasterize
+from etsplat.cuda.launch import use_backend
+from etsplat.ops import _raster_capacity
+from helpers.scenes import EVERYTHING, IMAGES, NO_CUTOFFS, colored, gradients, mesh, prepare, soup
+from helpers.simt.build import Simt
+
+FEW = settings(max_examples=25, deadline=None, derandomize=True)
+
+
+@pytest.mark.parametrize("cameras", [1, 3])
+def test_colors_alone(cuda_engine, kernel, distance, cameras, rng):
+    """What training asks for, in one view and in several at once."""
+    compare(soup(rng, 80, views=cameras), cuda_engine, rng, images=("color",), kernel=kernel, distance=distance)
+
+
+def test_every_image(cuda_engine, kernel, distance, rng):
+    compare(mesh(rng), cuda_engine, rng, kernel=kernel, distance=distance, **EVERYTHING)
+
+
+@pytest.mark.sanitize
+def test_every_image_of_a_soup(cuda_engine, rng):
+    compare(soup(rng, 60, width=37, height=21), cuda_engine, rng, **EVERYTHING)
+
+
+def test_centroid_depth(cuda_engine, rng):
+    compare(soup(rng, 80), cuda_engine, rng, **{**EVERYTHING, "depth": "centroid"})
+
+
+@pytest.mark.parametrize("image", ["alpha", "median_depth", "distortion"])
+def test_images_that_no_cotangent_reaches(cuda_engine, image, rng):
+    compare(soup(rng, 80), cuda_engine, rng, images=(image,), **EVERYTHING)
+
+
+@pytest.mark.parametrize("channels", [1, 20])
+def test_channels(cuda_engine, channels, rng):
+    """More than 16 take two passes."""
+    compare(soup(rng, 60, channels=channels), cuda_engine, rng, images=("color", "alpha"))
+
+
+def test_parts_of_many_channels_leave_out_the_same_triangles(cuda_engine, rng):
+    """A triangle with one channel that is not finite is in none of the passes."""
+    scene = soup(rng, 30, channels=20)
+    scene["colors"][7, 18] = torch.inf
+    out = gradients(scene, cuda_engine, {"color": torch.ones(2, 40, 48, 20)}, validate=False)[0]
+    without = {**scene, **{name: scene[name].clone() for name in ("colors", "opacities")}}
+    without["colors"][7], without["opacities"][7] = 0.0, 0.0
+    expected = gradients(without, cuda_engine, {"color": torch.ones(2, 40, 48, 20)})[0]
+    assert torch.equal(out.color, expected.color)
+
+
+@pytest.mark.parametrize("layout", ["per_view", "per_corner", "per_vertex"])
+def test_color_layouts(cuda_engine, layout, rng):
+    compare(colored(layout, rng), cuda_engine, rng, **EVERYTHING)
+
+
+def test_frozen_incentre(cuda_engine, kernel, rng):
+    compare(soup(rng, 80), cuda_engine, rng, kernel=kernel, distance="sdf", freeze_incentre=True, images=("color",))
+
+
+@pytest.mark.parametrize("sigma", [0.02, 2.5])
+def test_softness_from_sharp_to_flat(cuda_engine, kernel, sigma, rng):
+    scene = {**soup(rng, 80), "sigma": torch.tensor(sigma)}
+    compare(scene, cuda_engine, rng, kernel=kernel, images=("color",), looseness=max(1.0, 0.3 / sigma))
+
+
+@pytest.mark.sanitize
+def test_triangles_over_many_tiles(cuda_engine, distance, rng):
+    """Boxes of more than 4x4 tiles, more slots than a thread adds up alone, sizes that no tile divides."""
+    scene = soup(rng, 25, width=150, height=133, size=6.0, views=1)
+    compare(scene, cuda_engine, rng, images=("color",), distance=distance)
+
+
+def test_triangles_smaller_than_a_pixel(cuda_engine, rng):
+    compare(soup(rng, 60, size=0.01), cuda_engine, rng, images=("color",), looseness=10.0)
+
+
+@pytest.mark.sanitize
+def test_many_batches_and_early_termination(cuda_engine, kernel, rng):
+    """Hundreds of triangles in each of four tiles; opaque ones, whose pixels and tiles stop."""
+    scene = soup(rng, 700, width=24, height=20, size=2.0, views=1)
+    compare(scene, cuda_engine, rng, images=("color",), kernel=kernel)
+    scene["opacities"] = torch.ones(700)
+    compare(scene, cuda_engine, rng, images=("color",), kernel=kernel)
+
+
+def test_without_cutoffs(cuda_engine, rng):
+    compare(soup(rng, 40), cuda_engine, rng, images=("color",), cutoffs=NO_CUTOFFS)
+
+
+def test_no_triangles(cuda_engine):
+    scene = soup(torch.Generator().manual_seed(0), 0)
+    out, grads = gradients(scene, cuda_engine, {"color": torch.ones(2, 40, 48, 3)}, **EVERYTHING)
+    expected = scene["backgrounds"][:, None, None].expand(2, 40, 48, 3)
+    assert torch.equal(out.color.cpu(), expected)
+    assert all(not gradient.isnan().any() for gradient in grads.values())
+
+
+@pytest.mark.sanitize
+def test_more_pairs_than_room(cuda_engine, rng, monkeypatch):
+    """The render is repeated with more room, and is the one that had enough from the start."""
+    scene, cotangents = soup(rng, 80), {"color": torch.randn(2, 40, 48, 3, generator=rng)}
+    expected, expected_grads = gradients(scene, cuda_engine, cotangents)
+    monkeypatch.setattr(_raster_capacity, "_seen", {})
+    monkeypatch.setattr(_raster_capacity, "_FIRST_ROOM", 20)
+    monkeypatch.setattr(_raster_capacity, "_FIRST_PER_TRIANGLE", 0)
+    out, grads = gradients(scene, cuda_engine, cotangents)
+    assert torch.equal(out.color, expected.color)
+    assert all(torch.equal(grads[name], expected_grads[name]) for name in grads)
+    assert int(_raster_capacity.overflow_flag(out.color.device)) == 0
+
+
+def test_a_repair_does_not_take_earlier_captures_for_smaller_scenes(cuda_device, monkeypatch):
+    """A graph that was captured before triangles multiplied does not multiply the room once more."""
+    for name in ("_seen", "_captured"):
+        monkeypatch.setattr(_raster_capacity, name, {})
+    shape = (1, 64, 64)
+    _raster_capacity.note_capture(cuda_device, shape, 100)
+    _raster_capacity.record_need(cuda_device, shape, 10_000, 50_000)
+    _raster_capacity.overflow_flag(cuda_device).fill_(80_000)
+    assert _raster_capacity.repair_overflow(cuda_device)
+    assert _raster_capacity.capacity_for(cuda_device, shape, 10_000) == 100_000
+
+
+def test_overflow_inside_a_graph_is_found_afterwards(simt, rng, monkeypatch):
+    """Nothing is read while a graph is captured: the device remembers, and the repair makes room."""
+    scene, cotangents = soup(rng, 80), {"color": torch.randn(2, 40, 48, 3, generator=rng)}
+    expected, _ = gradients(scene, "cuda", cotangents)
+    for name, value in (("_seen", {}), ("_FIRST_ROOM", 20), ("_FIRST_PER_TRIANGLE", 0), ("_captured", {})):
+        monkeypatch.setattr(_raster_capacity, name, value)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Simt, "capturing", True)
+        gradients(scene, "cuda", cotangents)
+    device = torch.device("cpu")
+    assert int(_raster_capacity.overflow_flag(device)) > 20
+    assert _raster_capacity.repair_overflow(device)
+    out, _ = gradients(scene, "cuda", cotangents)
+    assert not _raster_capacity.repair_overflow(device)
+    assert torch.equal(out.color, expected.color)
+
+
+def test_bits_do_not_depend_on_the_order_of_threads(rng):
+    """Whichever fiber starts, images, statistics and gradients are the same bits."""
+    scene = mesh(rng)
+    cotangents = {
+        name: torch.randn(2, 40, 48, 3 if name in ("color", "normal") else 1, generator=rng) for name in IMAGES
+    }
+    results = []
+    for seed in (0, 3, 8):
+        with use_backend(Simt(seed)):
+            results.append(gradients(scene, "cuda", cotangents, **EVERYTHING))
+    first, first_grads = results[0]
+    for out, grads in results[1:]:
+        assert all(torch.equal(getattr(out, name), getattr(first, name)) for name in IMAGES)
+        assert torch.equal(out.statistics.max_weight, first.statistics.max_weight)
+        assert all(torch.equal(grads[name], first_grads[name]) for name in grads)
+
+
+@pytest.mark.cuda
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
+def test_a_captured_step_is_the_eager_one(rng):
+    """Forward and backward as a graph, replayed on changed vertices, give the bits of single calls."""
+    scene = prepare(soup(rng, 200), "cuda", requires_grad=True)
+    cotangent = torch.randn(2, 40, 48, 3, generator=rng).cuda()
+    leaves = [scene[name] for name in ("vertices", "colors", "opacities", "sigma")]
+
+    def step():
+        out = rasterize(**scene, engine="cuda")
+        return [out.color, *torch.autograd.grad(out.color, leaves, cotangent)]
+
+    side = torch.cuda.Stream()
+    side.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(side):
+        for _ in range(3):
+            step()
+    torch.cuda.current_stream().wait_stream(side)
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        captured = step()
+    with torch.no_grad():
+        leaves[0] += 0.05
+    graph.replay()
+    assert not _raster_capacity.repair_overflow(leaves[0].device)
+    assert all(torch.equal(a, b) for a, b in zip(captured, step(), strict=True))
+
+
+NOTHING = {"depth": None, "normals": False, "median_depth": False, "distortion": False}
+ALL = {"depth": "plane", "normals": True, "median_depth": True, "distortion": True}
+OPTIONS = st.fixed_dictionaries(
+    {
+        "images": st.sampled_from([NOTHING, ALL]),
+        "distance": st.sampled_from(["barycentric", "sdf"]),
+        "cutoffs": fuzz.cutoffs,
+        "freeze_incentre": st.booleans(),
+    }
+).map(lambda options: {**options.pop("images"), **options, "kernel": "elastic"})
+
+
+@pytest.mark.sanitize
+@FEW
+@given(vertices=fuzz.triangles, opacity=fuzz.opacities, sigma=fuzz.sigmas, color=fuzz.colors, options=OPTIONS)
+def test_any_triangles(vertices, opacity, sigma, color, options):
+    """Nothing that is not finite gets through."""
+    with use_backend(Simt()):
+        fuzz.test_any_triangles.hypothesis.inner_test("cuda", vertices, opacity, sigma, color, options)
+
+
+@FEW
+@given(viewmat=st.lists(fuzz.coordinates, min_size=12, max_size=12), options=OPTIONS)
+def test_any_camera(viewmat, options):
+    with use_backend(Simt()):
+        fuzz.test_any_camera.hypothesis.inner_test("cuda", viewmat, 12.0, 6.0, options)

@@ -1,0 +1,66 @@
+"""The paper's explanatory figures: they are drawn, and what they show is what the kernels are."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from etsplat.bench.dead_zone import pull, remaining_distance
+from etsplat.bench.drawings import FIGURES, draw_edges
+from etsplat.bench.teaser import draw_teaser
+from etsplat.cli.figures import Figures
+from etsplat.core.errors import InputError
+from etsplat.tasks.reconstruct import reconstruct
+from etsplat.tasks.reconstruct_config import PRESETS
+from etsplat.tasks.train import train
+from etsplat.tasks.train_config import train_settings
+from helpers.captures import write_colmap
+
+
+@pytest.mark.parametrize("name", [name for name in FIGURES if name != "dead-zone"])
+def test_figures_are_written(name: str, tmp_path: Path) -> None:
+    """Each of the quick ones ends up in a file of the kind that its name asks for, whatever its capitals."""
+    path = tmp_path / f"{name}.{'SVG' if name == 'kernels' else 'svg'}"
+    assert Figures(name=name, out=path).run([]) == 0  # pyright: ignore[reportArgumentType]
+    assert path.read_text().startswith("<?xml")
+
+
+def test_the_seam_of_single_sided_triangles_goes_down_to_nothing() -> None:
+    """At every sigma, however narrow: the profile has a value on the seam itself. Elastic triangles close it."""
+    axes = draw_edges().axes
+    single_sided, elastic = ([np.asarray(line.get_ydata()) for line in axes[row].get_lines()] for row in (3, 11))
+    assert [profile[len(profile) // 2] for profile in single_sided] == [0, 0, 0]
+    assert elastic[2][len(elastic[2]) // 2] > 0.99
+
+
+def test_every_kernel_pulls_an_overlapping_triangle_back() -> None:
+    """Displaced by one inradius, each soft kernel pulls towards the target, and Adam brings the triangle home."""
+    for kernel in ("single_sided", "bilateral", "elastic"):
+        assert pull(kernel, 1.0, 0.3) > 0
+    assert remaining_distance("elastic", 1.0, 0.3) < 0.5
+
+
+def test_wrong_requests_are_input_errors(tmp_path: Path) -> None:
+    """An unknown kind of file, and a teaser without runs."""
+    with pytest.raises(InputError, match="unknown kind of picture"):
+        Figures(name="kernels", out=tmp_path / "kernels.bmp").run([])
+    with pytest.raises(InputError, match="--runs"):
+        Figures(name="teaser", out=tmp_path / "teaser.png").run([])
+
+
+def test_the_teaser_shows_a_mesh_and_a_soup(tmp_path: Path) -> None:
+    """A row each, of five pictures that are not blank."""
+    quick = {"checkpoint_every": 0, "evaluate_every": 0}
+    mesh = replace(PRESETS["tiny"], resolution=32, iterations=3, chamfer_samples=1000, **quick)
+    reconstruct("demo:owl", tmp_path / "mesh", mesh)
+    write_colmap(tmp_path / "scene", [(48, 36)] * 9)
+    soup = replace(train_settings("tiny"), iterations=3, start_opacity=0.8, **quick)
+    train(tmp_path / "scene", tmp_path / "soup", soup)
+    figure = draw_teaser([tmp_path / "mesh", tmp_path / "soup"])
+    pictures = [axis.images[0].get_array() for axis in figure.axes]
+    assert len(pictures) == 10
+    assert all(float(picture.std()) > 0.02 for picture in pictures)
+    assert [axis.get_title() for axis in figure.axes[5:7]] == ["start", "opaque triangles"]
+    with pytest.raises(InputError, match="not a finished run"):
+        draw_teaser([tmp_path / "scene"])

@@ -1,0 +1,171 @@
+"""Whole steps of shape reconstruction on the GPU engine, by the shim and, where there is one, on a GPU."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from etsplat.cuda.graph import Repeated
+from etsplat.data.demo_object import demo_object
+from etsplat.data.photograph import photograph
+from etsplat.data.views import PosedViews
+from etsplat.optim.loop import Progress
+from etsplat.tasks.mesh_fitting import MeshFitting
+from etsplat.tasks.reconstruct import reconstruct
+from etsplat.tasks.reconstruct_config import PRESETS, ReconstructConfig
+from etsplat.tasks.sources import make_start
+from helpers.simt.build import Simt
+from helpers.simt.calls import Calls
+from helpers.simt.room import room_for_16_pairs, second_step_overflows
+
+CPU = torch.device("cpu")
+# 320 faces, subdivided after iterations 2 and 5.
+CONFIG = replace(
+    PRESETS["tiny"],
+    resolution=32,
+    iterations=6,
+    max_faces=500,
+    subdivide_from=0.3,
+    subdivide_until=0.8,
+    subdivide_steps=2,
+    gamma_hold=2,
+    log_every=4,
+    evaluate_every=0,
+    checkpoint_every=4,
+    chamfer_samples=500,
+)
+
+
+@pytest.fixture(scope="module")
+def views() -> PosedViews:
+    return photograph(demo_object(), 32, 32, elevations=(-35.0, 35.0), azimuths=3, supersampling=2)
+
+
+def fitting(
+    views: PosedViews, engine: str, config: ReconstructConfig = CONFIG, device: torch.device = CPU
+) -> MeshFitting:
+    views, config = views.to(device), replace(config, engine=engine)
+    return MeshFitting(make_start(None, views, config), views, config, lambda _: {})
+
+
+def run(problem: MeshFitting, last: int) -> list[float]:
+    """The losses of all steps up to iteration `last`, with refinements in between."""
+    losses: list[float] = []
+    while len(losses) < last:
+        losses += problem.advance(len(losses) + 1, last)
+        problem.refine(len(losses))
+    return losses
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"method": "elastic"},
+        {"method": "single-sided", "colors": "vertex"},
+        {"method": "raster-face", "start_sigma": 0.5},
+        {"coarse_levels": 1, "coarse_until": 0.6, "views_per_step": 2, "sigma_final": 0.2, "untangle_steps": 2},
+        {"vertex_update": "large-steps"},
+    ],
+    ids=lambda settings: next(iter(settings.values())),
+)
+def test_steps_are_those_of_the_cpu_engine(
+    cuda_device: torch.device, views: PosedViews, settings: dict[str, Any]
+) -> None:
+    """Six steps and two subdivisions: the same faces, losses and parameters to rounding; Adam divides small gradients
+    by small ones, so one parameter in a hundred may differ by more."""
+    config = replace(CONFIG, **settings)
+    on_device, on_cpu = fitting(views, "cuda", config, cuda_device), fitting(views, "cpu", config)
+    assert run(on_device, 6) == pytest.approx(run(on_cpu, 6), rel=1e-5)
+    assert on_device.count == on_cpu.count > 320
+    expected = on_cpu.mesh.parameters()
+    for name, parameter in on_device.mesh.parameters().items():
+        difference = (parameter.cpu() - expected[name]).detach().abs()
+        assert float((difference > 1e-5).float().mean()) < 0.01, name
+
+
+def test_steps_queued_together_are_the_steps_one_by_one(cuda_device: torch.device, views: PosedViews) -> None:
+    """The same bits, however many steps are queued before the host looks, and though room runs out on the way."""
+    config = replace(CONFIG, subdivide_steps=0)
+    together, one_by_one = (fitting(views, "cuda", config, cuda_device) for _ in range(2))
+    losses = together.advance(1, 1)
+    with room_for_16_pairs() as repairs:
+        losses += together.advance(2, 5)
+    assert any(repairs)
+    assert losses == [one_by_one.advance(i, i)[0] for i in range(1, 6)]
+    for name, parameter in together.mesh.parameters().items():
+        assert torch.equal(parameter, one_by_one.mesh.parameters()[name])
+
+
+def test_replayed_steps_are_those_that_are_called(cuda_device: torch.device, views: PosedViews, monkeypatch) -> None:
+    """The same bits with graphs and without: all that changes from step to step is in device memory."""
+    config = replace(CONFIG, iterations=9, subdivide_steps=0, sigma_final=0.2, views_per_step=2)
+    replayed, called = (fitting(views, "cuda", config, cuda_device) for _ in range(2))
+    losses = run(replayed, 9)
+    monkeypatch.setattr(Repeated, "__call__", lambda self: self._body())
+    assert run(called, 9) == losses
+    for name, parameter in replayed.mesh.parameters().items():
+        assert torch.equal(parameter, called.mesh.parameters()[name])
+
+
+@pytest.mark.parametrize(("method", "reads", "kernels"), [("elastic", 1, 17), ("raster-vertex", 0, 17)])
+def test_a_queued_step_reads_nothing_back(simt: Simt, views: PosedViews, method: str, reads: int, kernels: int) -> None:
+    """Nothing in a step waits for the device, but for the rasterizer's look at its room outside of captured graphs; and
+    few small kernels of torch are left."""
+    problem = fitting(views, "cuda", replace(CONFIG, method=method))
+    problem.advance(1, 1)  # fills caches
+    assert problem._queue is not None
+    problem._queue._position.zero_()
+    with Calls() as calls:
+        problem._queue._step(None)
+    assert calls.waiting() == reads
+    assert calls.kernels() <= kernels
+
+
+def test_a_step_whose_buffers_overflow_is_made_again(simt: Simt, views: PosedViews) -> None:
+    """While the flag is set nothing changes; after the repair the queue goes on where it stopped."""
+    problem, undisturbed = fitting(views, "cuda"), fitting(views, "cuda")
+    assert problem._queue is not None
+    with second_step_overflows(problem._queue, problem.mesh.vertices.device) as steps:
+        assert run(problem, 2) == run(undisturbed, 2)
+    assert len(steps) == 3
+    for name, parameter in problem.mesh.parameters().items():
+        assert torch.equal(parameter, undisturbed.mesh.parameters()[name])
+
+
+def test_a_loss_that_is_not_finite_stops_the_queue(cuda_device: torch.device, views: PosedViews) -> None:
+    """The losses end with it, and no step was made from there on."""
+    problem = fitting(views, "cuda", device=cuda_device)
+    with torch.no_grad():
+        problem.mesh.vertices[0] = math.nan
+    before = problem.mesh.colors.detach().clone()
+    losses = problem.advance(1, 2)
+    assert len(losses) == 1
+    assert math.isnan(losses[0])
+    assert torch.equal(problem.mesh.colors, before)
+
+
+def test_a_resumed_run_ends_with_the_same_bits(cuda_device: torch.device, views: PosedViews) -> None:
+    """State saved after iteration 4 and loaded into a new problem leads to the same parameters."""
+    whole = fitting(views, "cuda", device=cuda_device)
+    losses = run(whole, 4)
+    state = {name: tensor.cpu().clone() for name, tensor in whole.state(Progress(4)).items()}
+    resumed = fitting(views, "cuda", device=cuda_device)
+    resumed.load_state(state, 4)
+    for problem in (whole, resumed):
+        for first, last in ((5, 5), (6, 6)):
+            losses += problem.advance(first, last)
+            problem.refine(last)
+    assert losses[4:6] == losses[6:8]
+    for name, parameter in whole.mesh.parameters().items():
+        assert torch.equal(parameter, resumed.mesh.parameters()[name])
+
+
+def test_a_whole_run_leaves_its_directory(cuda_device: torch.device, tmp_path: Path) -> None:
+    """From photographs to metrics.json, with the engine's name in it."""
+    result = reconstruct(demo_object(), tmp_path, replace(CONFIG, engine="cuda", iterations=2, resolution=16))
+    assert result.metrics["engine"] == "cuda"
+    assert result.metrics["iterations"] == 2
+    assert (tmp_path / "mesh.ply").exists()

@@ -1,0 +1,217 @@
+"""Steps of a triangle soup on the GPU engine, by the shim and, where there is one, on a GPU."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from etsplat.cuda.graph import Repeated
+from etsplat.data.capture_images import StoredImages
+from etsplat.data.captures import Capture
+from etsplat.data.demo_scene import demo_scene
+from etsplat.model.soup_init import StartPoints, start_soup
+from etsplat.optim.loop import Progress
+from etsplat.tasks.soup_fitting import SoupFitting
+from etsplat.tasks.train import train
+from etsplat.tasks.train_config import TrainConfig, train_settings
+from helpers.simt.build import Simt
+from helpers.simt.calls import Calls
+from helpers.simt.room import room_for_16_pairs, second_step_overflows
+
+# Densified after iteration 3; the degree rises after iteration 4.
+CONFIG = replace(
+    train_settings("tiny"),
+    iterations=6,
+    lr_vertices_length=None,  # so that the steps of a few iterations are no larger than those of many
+    densify_every=15_000,
+    densify_from=0,
+    sh_every=20_000,
+)
+CPU = torch.device("cpu")
+
+
+@pytest.fixture(scope="module")
+def capture() -> Capture:
+    """Photos of two sizes, some of them with an alpha channel, and a mask for one in three."""
+    scene = demo_scene(40, 32)
+    pixels = [image[:24] if index % 2 else image for index, image in enumerate(scene.images)]
+    for index in range(0, len(pixels), 4):
+        alpha = torch.full((*pixels[index].shape[:2], 1), 255, dtype=torch.uint8)
+        pixels[index] = torch.cat([pixels[index], alpha], dim=-1)
+    return replace(scene, images=MaskedImages(pixels))
+
+
+class MaskedImages(StoredImages):
+    """The left half of every third image counts."""
+
+    def mask(self, index: int) -> torch.Tensor | None:  # type: ignore[override]
+        mask = torch.zeros(self[index].shape[:2], dtype=torch.uint8)
+        mask[:, :20] = 255
+        return mask if index % 3 == 0 else None
+
+
+def fitting(capture: Capture, engine: str, device: torch.device = CPU, config: TrainConfig = CONFIG) -> SoupFitting:
+    generator = torch.Generator().manual_seed(3)
+    assert capture.points is not None
+    chosen = capture.points[::150]
+    soup = start_soup(
+        StartPoints(chosen, torch.full_like(chosen, 0.5)), generator, scale=2.0, opacity=0.4, sigma=1.0, sh_degree=1
+    )
+    return SoupFitting(soup.to(device), capture, replace(config, engine=engine), generator, lambda *_: {})
+
+
+def run(problem: SoupFitting, last: int, together: int = 6) -> list[float]:
+    """The losses of all steps up to iteration `last`, with densification in between."""
+    losses: list[float] = []
+    while len(losses) < last:
+        losses += problem.advance(len(losses) + 1, min(last, len(losses) + together))
+        problem.refine(len(losses))
+    return losses
+
+
+def same_bits(first: SoupFitting, second: SoupFitting) -> None:
+    state, expected = first.state(Progress(0)), second.state(Progress(0))
+    assert all(torch.equal(tensor, expected[name]) for name, tensor in state.items())
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {},
+        {"finish": "opaque", "cull_small": True},
+        {"lambda_normal": 0.05, "lambda_distortion": 0.1, "lambda_size": 1e-6, "regularize_from": 10_000},
+        {"method": "single-sided", "background": "random"},
+    ],
+    ids=["plain", "finish", "paper", "single-sided"],
+)
+def test_steps_are_those_of_the_cpu_engine(cuda_device: torch.device, capture: Capture, settings: Any) -> None:
+    """Three steps: the same losses, and statistics and parameters to rounding but for a few triangles, where Adam
+    divided small gradients by small ones; then a densification and three more."""
+    config = replace(CONFIG, **settings)
+    on_device, on_cpu = fitting(capture, "cuda", cuda_device, config), fitting(capture, "cpu", CPU, config)
+    before = on_cpu.count
+    losses, expected = ([loss for i in (1, 2, 3) for loss in p.advance(i, i)] for p in (on_device, on_cpu))
+    assert losses == pytest.approx(expected, rel=1e-5)
+    for name, tensor in on_cpu.statistics.tensors().items():
+        difference = (on_device.statistics.tensors()[name].cpu() - tensor).abs()
+        assert float((difference > 1e-4 + 1e-3 * tensor.abs()).float().mean()) < 0.05, name
+    for name, parameter in on_cpu.soup.parameters().items():
+        difference = (on_device.soup.parameters()[name].cpu() - parameter).detach().abs()
+        assert float((difference > 1e-4).float().mean()) < 0.01, name
+    assert on_device.refine(3) == on_cpu.refine(3) > 0
+    losses, expected = ([loss for i in (4, 5, 6) for loss in p.advance(i, i)] for p in (on_device, on_cpu))
+    assert losses == pytest.approx(expected, rel=1e-3)
+    assert on_device.count == on_cpu.count > before
+
+
+def test_steps_queued_together_are_the_steps_one_by_one(cuda_device: torch.device) -> None:
+    """The same bits, however many steps are queued before the host looks, and though room runs out on the way."""
+    capture, config = demo_scene(40, 32), replace(CONFIG, densify_from=25_000)
+    together, one_by_one = (fitting(capture, "cuda", cuda_device, config) for _ in range(2))
+    losses = together.advance(1, 1)
+    with room_for_16_pairs() as repairs:
+        while len(losses) < 6:
+            losses += together.advance(len(losses) + 1, 6)
+    assert any(repairs)
+    assert losses == run(one_by_one, 6, together=1)
+    same_bits(together, one_by_one)
+
+
+def test_replayed_steps_are_those_that_are_called(cuda_device: torch.device, monkeypatch) -> None:
+    """The same bits with graphs and without: all that changes from step to step is in device memory."""
+    capture, changing = demo_scene(40, 32), {"finish": "opaque", "background": "random"}
+    config = replace(CONFIG, iterations=9, densify_every=30_000, lambda_normal=0.1, regularize_from=0, **changing)
+    replayed = fitting(capture, "cuda", cuda_device, config)
+    losses = run(replayed, 9, together=9)
+    monkeypatch.setattr(Repeated, "__call__", lambda self: self._body())
+    called = fitting(capture, "cuda", cuda_device, config)
+    assert run(called, 9, together=9) == losses
+    same_bits(replayed, called)
+
+
+def test_streamed_photos_give_the_same_bits(cuda_device: torch.device, capture: Capture) -> None:
+    """Where photos do not fit, each is uploaded before its step."""
+    images = MaskedImages(list(capture.images))
+    images.streamed = True
+    streamed, kept = (fitting(replace(capture, images=i), "cuda", cuda_device) for i in (images, capture.images))
+    assert run(streamed, 6) == run(kept, 6)
+    same_bits(streamed, kept)
+
+
+PAPER = {"cull_small": True, "lambda_normal": 0.1, "lambda_distortion": 0.1, "lambda_size": 1e-6, "regularize_from": 0}
+
+
+@pytest.mark.parametrize(("settings", "own", "kernels"), [({}, 25, 17), (PAPER, 37, 34)], ids=["quick", "paper"])
+def test_a_queued_step_reads_nothing_back(simt: Simt, settings: Any, own: int, kernels: int) -> None:
+    """Nothing in a step waits for the device, but for the rasterizer's look at its room outside of captured graphs; and
+    few small kernels of torch are left."""
+    problem = fitting(demo_scene(40, 32), "cuda", config=replace(CONFIG, **settings))
+    problem.advance(1, 1)  # fills caches
+    assert problem._queue is not None
+    kind = next(iter(problem._queue._repeated))
+    problem._queue._position.zero_()
+    simt.launches.clear()
+    with Calls() as calls:
+        problem._queue._step(kind)
+    assert calls.waiting() == 1
+    assert len(simt.launches) == own
+    assert calls.kernels() <= kernels
+
+
+def test_a_step_whose_buffers_overflow_is_made_again(simt: Simt, capture: Capture) -> None:
+    """While the flag is set nothing changes; after the repair the queue goes on where it stopped."""
+    problem, undisturbed = fitting(capture, "cuda"), fitting(capture, "cuda")
+    assert problem._queue is not None
+    with second_step_overflows(problem._queue, CPU) as steps:
+        assert run(problem, 3) == run(undisturbed, 3)
+    assert len(steps) == 5  # the second and what was queued behind it, twice
+    same_bits(problem, undisturbed)
+
+
+def test_a_loss_that_is_not_finite_stops_the_queue(cuda_device: torch.device, capture: Capture) -> None:
+    """The losses end with it, and nothing has changed from there on, statistics included."""
+    problem = fitting(capture, "cuda", cuda_device)
+    with torch.no_grad():
+        problem.soup.opacity_logits[0] = math.nan
+    before = problem.soup.sh_rest.detach().clone()
+    losses = problem.advance(1, 3)
+    assert len(losses) == 1
+    assert math.isnan(losses[0])
+    assert torch.equal(problem.soup.sh_rest, before)
+    assert int(problem.statistics.trial.max()) == 0
+
+
+def test_a_resumed_run_ends_with_the_same_bits(cuda_device: torch.device, capture: Capture) -> None:
+    """State saved after iteration 4 and loaded into a new problem leads to the same soup and statistics."""
+    whole = fitting(capture, "cuda", cuda_device)
+    run(whole, 4)
+    state = {name: tensor.cpu().clone() for name, tensor in whole.state(Progress(4)).items()}
+    resumed = fitting(capture, "cuda", cuda_device)
+    resumed.load_state(state, 4)
+    losses = []
+    for problem in (whole, resumed):
+        for first, last in ((5, 5), (6, 6)):
+            losses += problem.advance(first, last)
+    assert losses[:2] == losses[2:]
+    same_bits(whole, resumed)
+
+
+def test_a_whole_run_leaves_its_directory(cuda_device: torch.device, tmp_path: Path) -> None:
+    """From photos to a soup in a file, with the engine's name beside it."""
+    capture = demo_scene(40, 32)
+    assert capture.exact_points is not None
+    assert capture.point_colors is not None
+    few = replace(
+        capture,
+        exact_points=capture.exact_points[::400],
+        point_colors=capture.point_colors[::400],
+        test=capture.test[:1],
+    )
+    result = train(few, tmp_path / "run", replace(CONFIG, engine="cuda", iterations=2, sky_dome=False))
+    assert result.metrics["engine"] == "cuda"
+    assert result.metrics["psnr"] > 5
+    assert result.soup.vertices.device.type == "cpu"
+    assert (tmp_path / "run" / "soup.safetensors").exists()

@@ -1,0 +1,173 @@
+"""Settings of shape reconstruction that the paper does not have: each does what it says, and resumes to the bit."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from etsplat.core.errors import InputError
+from etsplat.data.photograph import photograph
+from etsplat.geometry.icosphere import icosphere
+from etsplat.geometry.intersections import count_self_intersections
+from etsplat.geometry.topology import MeshTopology
+from etsplat.geometry.untangle import untangle
+from etsplat.io.mesh_files import MeshFile
+from etsplat.io.run_directory import RunDirectory
+from etsplat.ops.adam import Adam
+from etsplat.optim.loop import StepEvent
+from etsplat.optim.schedules import coarse_level, evenly, regularization_weight
+from etsplat.optim.vertex_updates import laplacian_solver, uniform_step
+from etsplat.tasks.reconstruct import reconstruct
+from etsplat.tasks.reconstruct_config import PRESETS
+from helpers.meshes import bumpy_sphere
+
+SHORT = replace(PRESETS["tiny"], iterations=40, checkpoint_every=10, subdivide_steps=3, chamfer_samples=2000)
+
+
+def test_untangling_leaves_no_intersection_and_the_rest_in_place() -> None:
+    """A sphere with a vertex pushed through its far side: only vertices near it move, and nothing intersects after."""
+    vertices, faces = icosphere(3)
+    vertices = vertices.clone()
+    vertices[5] *= -1.2
+    assert count_self_intersections(vertices, faces) > 0
+    untangled, left = untangle(vertices, MeshTopology.from_faces(faces, len(vertices)))
+    assert left == count_self_intersections(untangled, faces) == 0
+    moved = (untangled != vertices).any(dim=1)
+    assert bool(moved[5])
+    assert int(moved.sum()) < len(vertices) / 2
+    clean, _ = untangle(untangled, MeshTopology.from_faces(faces, len(vertices)))
+    assert torch.equal(clean, untangled)
+
+
+def test_untangling_moves_no_farther_than_it_must(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Vertices that smoothing moved go most of the way back, and nothing intersects for that."""
+    vertices, faces = icosphere(3)
+    vertices = vertices.clone()
+    vertices[5] *= -1.2
+    topology = MeshTopology.from_faces(faces, len(vertices))
+    untangled, _ = untangle(vertices, topology)
+    monkeypatch.setattr("etsplat.geometry.untangle._RETURNS", 0)
+    smoothed, _ = untangle(vertices, topology)
+    moved = [float((result - vertices).norm(dim=1).sum()) for result in (untangled, smoothed)]
+    assert moved[0] < 0.3 * moved[1]
+    assert count_self_intersections(untangled, faces) == 0
+
+
+def test_folds_out_of_reach_stay() -> None:
+    """A cap pushed through the far side stays where it is, as a whole, while a stray vertex elsewhere is put right."""
+    vertices, faces = icosphere(4)
+    vertices = vertices.clone()
+    topology = MeshTopology.from_faces(faces, len(vertices))
+    cap, stray = vertices[:, 2] > 0.8, int(vertices[:, 0].argmax())
+    vertices[cap, 2] -= 2.0
+    of_cap = count_self_intersections(vertices, faces)
+    vertices[stray] += torch.tensor([-0.02, 0.2, 0.0])
+    assert count_self_intersections(vertices, faces) > of_cap > 0
+    untangled, left = untangle(vertices, topology, reach=0.5)
+    assert left == count_self_intersections(untangled, faces) == of_cap
+    assert torch.equal(untangled[cap], vertices[cap])
+    assert not torch.equal(untangled[stray], vertices[stray])
+
+
+def test_small_faces_do_not_count_as_far() -> None:
+    """A tangled patch, its edges a tenth of the others', is put right though vertices move by more than such edges."""
+    vertices, faces = icosphere(4)
+    vertices = vertices.clone()
+    topology = MeshTopology.from_faces(faces, len(vertices))
+    center = vertices[vertices[:, 2].argmax()].clone()
+    patch = (vertices - center).norm(dim=1) < 0.2
+    vertices[patch] = center + 0.1 * (vertices[patch] - center)
+    vertices[patch] += 0.01 * torch.randn(int(patch.sum()), 3, generator=torch.Generator().manual_seed(0))
+    assert count_self_intersections(vertices, faces) > 0
+    untangled, left = untangle(vertices, topology, reach=0.155)
+    assert left == count_self_intersections(untangled, faces) == 0
+
+
+def test_the_solver_inverts_the_laplacian() -> None:
+    """(I + w L) applied by hand to the solution gives back the right-hand side; constants stay as they are."""
+    vertices, faces = bumpy_sphere(2, seed=1)
+    topology = MeshTopology.from_faces(faces, len(vertices))
+    solution = laplacian_solver(topology, 7.0)(vertices)
+    laplacian = torch.zeros_like(solution)
+    for first, second in topology.edges.tolist():
+        laplacian[first] += solution[first] - solution[second]
+        laplacian[second] += solution[second] - solution[first]
+    torch.testing.assert_close(solution + 7.0 * laplacian, vertices, rtol=1e-4, atol=1e-5)
+    ones = torch.ones(len(vertices), 3)
+    torch.testing.assert_close(laplacian_solver(topology, 7.0)(ones), ones)
+
+
+def test_a_uniform_step_keeps_the_proportions_of_the_gradient() -> None:
+    """After the first step vertices moved along the gradient, the largest component by the rate; others as ever."""
+    vertices, other = torch.zeros(4, 3, requires_grad=True), torch.zeros(2, requires_grad=True)
+    adam = Adam({"vertices": vertices, "other": other}, {"vertices": 0.1, "other": 0.5})
+    gradient = torch.tensor([[1.0, -2.0, 0.0]] * 4) * torch.tensor([[1.0], [0.5], [0.25], [0.0]])
+    vertices.grad, other.grad = gradient.clone(), torch.tensor([3.0, -1e-3])
+    uniform_step(adam, "vertices", 0.1, None)
+    torch.testing.assert_close(vertices.detach(), -0.05 * gradient)
+    torch.testing.assert_close(other.detach(), torch.tensor([-0.5, 0.5]))
+
+
+def test_schedules_past_the_paper() -> None:
+    """Levels fall one by one to 0 at the given time; the cosine ends where told; untanglings end with the run."""
+    levels = [coarse_level(iteration, 100, 2, 0.5) for iteration in range(1, 101)]
+    assert levels == [2] * 25 + [1] * 25 + [0] * 50
+    assert coarse_level(1, 100, 0, 0.5) == 0
+    assert coarse_level(1, 100, 3, 0.0) == 0
+    assert regularization_weight(100, 100, 10, final=0.25) == pytest.approx(0.25)
+    assert regularization_weight(55, 100, 10, final=0.2) == pytest.approx(0.6)
+    assert evenly(100, 4, 0.6) == [70, 80, 90, 100]
+    assert evenly(100, 0, 0.6) == []
+
+
+def test_halved_views_are_means_and_see_the_same() -> None:
+    """Each pixel is the mean of four, and a point projects to half its coordinates."""
+    vertices, faces = icosphere(2)
+    views = photograph(MeshFile(vertices, faces), 32, 32, supersampling=1)
+    half = views.halved()
+    assert half.images.shape == (40, 16, 16, 4)
+    torch.testing.assert_close(half.images[3, 5, 7], views.images[3, 10:12, 14:16].mean(dim=(0, 1)))
+    torch.testing.assert_close(half.cameras.Ks[:, :2], views.cameras.Ks[:, :2] / 2)
+    assert torch.equal(half.cameras.viewmats, views.cameras.viewmats)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"coarse_levels": 1, "views_per_step": 2, "untangle_steps": 3, "gamma_final": 0.1},
+        {"vertex_update": "large-steps", "lr_vertices": 1e-2, "sigma_final": 0.05},
+        {"vertex_update": "uniform", "colors": "vertex"},
+    ],
+)
+def test_settings_run_and_resume_to_the_same_bits(tmp_path: Path, settings: dict[str, object]) -> None:
+    """A run that died at iteration 27 ends with the history of one that did not."""
+    vertices, faces = icosphere(3)
+    pebble = MeshFile(vertices * torch.tensor([1.0, 0.6, 0.8]), faces)
+    config = replace(SHORT, **settings)
+    reconstruct(pebble, tmp_path / "whole", config)
+
+    def die(event: object) -> None:
+        if isinstance(event, StepEvent) and event.iteration >= 27:
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        reconstruct(pebble, tmp_path / "killed", config, callbacks=[die])
+    reconstruct(pebble, tmp_path / "killed", config, resume=True)
+    histories = [RunDirectory(tmp_path / name).read_history() for name in ("whole", "killed")]
+    for lines in histories:
+        for line in lines:
+            del line["seconds"]
+    assert histories[0] == histories[1]
+    if "sigma_final" in settings:
+        assert histories[0][-1]["sigma"] == pytest.approx(0.05)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("views_per_step", 0), ("coarse_levels", -1), ("gamma_final", 1.5), ("vertex_update", "newton")],
+)
+def test_settings_out_of_range_are_named(field: str, value: object) -> None:
+    """Each is an InputError that names the setting."""
+    with pytest.raises(InputError, match=field):
+        replace(PRESETS["paper"], **{field: value})

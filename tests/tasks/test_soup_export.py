@@ -1,0 +1,247 @@
+import json
+import math
+import struct
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from etsplat import intrinsics, look_at
+from etsplat.cli.parse import parse
+from etsplat.core.cameras import Cameras
+from etsplat.core.errors import InputError
+from etsplat.io.ply_tables import encode_ply, read_ply_tables
+from etsplat.io.srgb import srgb_from_linear
+from etsplat.model.soup_files import SoupFile, save_soup
+from etsplat.model.soup_import import open_soup
+from etsplat.model.soup_rendering import SoupAppearance, render_soup, render_soup_opaque
+from etsplat.model.triangle_soup import TriangleSoup
+from etsplat.tasks.export_config import ExportConfig
+from etsplat.tasks.export_soup import bake_colors, export_soup
+from etsplat.tasks.soup_run import SoupRun, rotation_to_y_up, world_up
+
+CAMERA = Cameras(
+    look_at(torch.tensor([[0.5, 0.8, 4.0]]), torch.zeros(3), torch.tensor([0.0, 1.0, 0.0])),
+    intrinsics(45, 64, 48)[None],
+    64,
+    48,
+)
+
+
+@pytest.fixture
+def soup(rng):
+    """Triangles of many opacities, softnesses and colours that depend on the direction."""
+    count = 60
+    made = TriangleSoup.from_triangles(
+        torch.randn(count, 1, 3, generator=rng) * 0.7 + torch.randn(count, 3, 3, generator=rng) * 0.3,
+        torch.rand(count, 3, generator=rng),
+        opacity=0.5,
+        sigma=0.5,
+        sh_degree=2,
+    )
+    return TriangleSoup(
+        made.vertices.detach(),
+        torch.randn(count, generator=rng) * 2,
+        torch.randn(count, generator=rng) * 0.3 - 1,
+        made.sh_dc.detach(),
+        torch.randn(count, 8, 3, generator=rng) * 0.1,
+    )
+
+
+def run_of(soup, **appearance):
+    return SoupRun(path=None, file=SoupFile(soup, SoupAppearance(**appearance)), capture=None)  # pyright: ignore
+
+
+def flat(soup):
+    """The soup with colours that are the same from every side, as a file without harmonics holds them."""
+    return TriangleSoup(
+        soup.vertices, soup.opacity_logits, soup.sigma_raw, soup.sh_dc, soup.sh_rest[:, :0].contiguous()
+    )
+
+
+def difference(a, b):
+    return float((a - b).abs().max())
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".obj", ".off", ".glb"])
+@pytest.mark.parametrize("weld", [False, True])
+def test_a_mesh_viewer_shows_what_the_opaque_render_shows(tmp_path, soup, suffix, weld):
+    """Every format returns the opaque triangles in their colours, so that a z-buffer draws the same picture."""
+    path = tmp_path / f"soup{suffix}"
+    export_soup(run_of(soup), path, ExportConfig(colors="constant", weld=weld, up="keep"))
+    returned = open_soup(path).soup
+    expected = render_soup_opaque(flat(soup), CAMERA, SoupAppearance())
+    # trimesh, which reads GLB, keeps its linear light in 8 bits.
+    tolerance = 6 / 255 if suffix == ".glb" else 1.5 / 255
+    assert difference(render_soup_opaque(returned, CAMERA, SoupAppearance()), expected) < tolerance
+    assert float(expected.mean()) > 0.05
+
+
+@pytest.mark.parametrize("kernel", ["elastic", "bilateral"])
+def test_ply_with_harmonics_returns_the_same_soft_picture(tmp_path, soup, kernel):
+    path = tmp_path / "soup.ply"
+    export_soup(run_of(soup, kernel=kernel), path, ExportConfig(colors="keep", min_opacity=0.0, up="keep"))
+    returned = open_soup(path)
+    assert returned.appearance == SoupAppearance(kernel=kernel)
+    expected = render_soup(soup, CAMERA, SoupAppearance(kernel=kernel)).color
+    assert difference(render_soup(returned.soup, CAMERA, returned.appearance).color, expected) < 1e-4
+    assert np.asarray(trimesh.load_mesh(path, process=False).vertices).shape == (180, 3)
+
+
+def test_opacity_floor_and_softness_ceiling_are_in_the_exported_numbers(tmp_path, soup):
+    limits = {"opacity_floor": 0.6, "sigma_ceiling": 0.3}
+    export_soup(run_of(soup, **limits), tmp_path / "soup.ply", ExportConfig(colors="keep", up="keep"))
+    returned = open_soup(tmp_path / "soup.ply").soup
+    assert len(returned) == len(soup)
+    assert float(returned.opacities.min()) >= 0.6
+    assert float(returned.sigma.max()) <= 0.3001
+
+
+def test_glb_is_linear_and_blends_on_request_ply_has_colours_at_vertices_and_faces(tmp_path, soup):
+    export_soup(run_of(soup), tmp_path / "soup.glb", ExportConfig(colors="constant", alpha=True, min_opacity=0.0))
+    mesh = next(iter(trimesh.load_scene(tmp_path / "soup.glb", process=False).geometry.values()))
+    alpha = np.asarray(mesh.visual.vertex_attributes["color"])[::3, 3]
+    np.testing.assert_allclose(alpha, soup.opacities.numpy(), atol=1e-2 if alpha.max() <= 1 else 300)
+    export_soup(run_of(soup), tmp_path / "soup.ply", ExportConfig(colors="constant", min_opacity=0.0))
+    tables = read_ply_tables(tmp_path / "soup.ply", ("vertex", "face"))
+    for channel, name in enumerate(("red", "green", "blue")):
+        assert np.array_equal(tables["vertex"][name][::3], tables["face"][name])
+        np.testing.assert_allclose(tables["face"][name] / 255, soup.display_colors()[:, channel], atol=0.51 / 255)
+    assert float(srgb_from_linear(np.array([0.5]))[0]) > 0.7  # what the GLB test of meshes relies on
+
+
+def test_with_alpha_only_faint_faces_of_a_glb_blend(tmp_path, soup):
+    """What blends hides nothing in a viewer, so faces that are all but opaque must not."""
+    soup.opacity_logits[:] = torch.where(torch.arange(60) < 20, 9.0, 1.0)
+    export_soup(run_of(soup), tmp_path / "soup.glb", ExportConfig(colors="constant", alpha=True, min_opacity=0.0))
+    length = struct.unpack("<I", (tmp_path / "soup.glb").read_bytes()[12:16])[0]
+    document = json.loads((tmp_path / "soup.glb").read_bytes()[20 : 20 + length])
+    modes = {}
+    for part in document["meshes"][0]["primitives"]:
+        count = document["accessors"][part["indices"]]["count"]
+        modes[document["materials"][part["material"]]["alphaMode"]] = count
+    assert modes == {"OPAQUE": 3 * 20, "BLEND": 3 * 40}
+    assert all(material["doubleSided"] for material in document["materials"])
+    assert len(open_soup(tmp_path / "soup.glb").soup) == 60
+
+
+def test_baked_colours_are_what_the_cameras_see(soup):
+    """One camera: its own colours, wherever it sees a triangle."""
+    baked = bake_colors(soup, SoupAppearance(), [CAMERA])
+    seen = render_soup(soup, CAMERA, SoupAppearance(), statistics=True)
+    shown = seen.statistics.max_weight[0] > 0
+    direct = soup.display_colors(soup.vertices.mean(dim=1) - CAMERA.centers[0])
+    torch.testing.assert_close(baked[shown], direct[shown], atol=1e-5, rtol=0)
+    assert torch.equal(baked[~shown], soup.display_colors()[~shown])
+
+
+def test_up_is_the_cameras_mean_up_and_becomes_y():
+    directions = torch.nn.functional.normalize(torch.randn(5, 3, dtype=torch.float64), dim=1)
+    eyes = torch.tensor([[3.0, 0, 0], [0, 0, 3.0], [-3.0, 0, 0], [0, 0, -3.0]], dtype=torch.float64)
+    viewmats = look_at(eyes, torch.zeros(3), torch.tensor([0.0, -1.0, 0.0]))
+    up = world_up(viewmats)
+    torch.testing.assert_close(up, torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64))
+    for direction in [up, *directions]:
+        turned = rotation_to_y_up(direction) @ direction
+        torch.testing.assert_close(turned, torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64))
+    assert world_up(torch.cat([viewmats, look_at(eyes, torch.zeros(3), torch.tensor([0.0, 1.0, 0.0]))])) is None
+
+
+def test_triangle_splatting_states_come_in_safely(tmp_path, soup):
+    state = {
+        "triangles_points": torch.nn.Parameter(soup.vertices),
+        "sigma": soup.sigma_raw[:, None],
+        "opacity": soup.opacity_logits[:, None],
+        "features_dc": soup.sh_dc,
+        "features_rest": soup.sh_rest,
+        "active_sh_degree": 2,
+    }
+    torch.save(state, tmp_path / "point_cloud_state_dict.pt")
+    file = open_soup(tmp_path / "point_cloud_state_dict.pt")
+    assert file.appearance == SoupAppearance("single_sided", "sdf", sh_degree=2, cull_small=True, near_plane=0.2)
+    for name, tensor in file.soup.parameters().items():
+        assert torch.equal(tensor, getattr(soup, name))
+    torch.save({"triangles_points": soup.vertices}, tmp_path / "half.pt")
+    with pytest.raises(InputError, match="lacks"):
+        open_soup(tmp_path / "half.pt")
+    torch.save(soup, tmp_path / "code.pt")
+    with pytest.raises(InputError, match="cannot be read as a state dict") as raised:
+        open_soup(tmp_path / "code.pt")
+    assert "weights_only" not in str(raised.value)  # torch's advice is to run the code in the file
+    (tmp_path / "letter.pt").write_text("hi\n")  # which torch's unpickler answers with a KeyError
+    with pytest.raises(InputError, match="cannot be read as a state dict"):
+        open_soup(tmp_path / "letter.pt")
+
+
+def test_a_kind_of_file_without_opacities_is_refused_with_alpha(tmp_path, soup):
+    with pytest.raises(InputError, match=r"soup\.obj: files of this kind hold no opacities"):
+        export_soup(run_of(soup), tmp_path / "soup.obj", ExportConfig(alpha=True))
+
+
+def test_the_kind_of_file_follows_from_its_name(tmp_path, soup, capsys):
+    save_soup(tmp_path / "soup.safetensors", SoupFile(soup))
+    for arguments in (["--out", "a.ply", "--min-opacity", "0"], ["--format", "off", "--min-opacity", "0"]):
+        named = [str(tmp_path / word) if word == "a.ply" else word for word in arguments]
+        assert parse(["export", str(tmp_path / "soup.safetensors"), *named]).run([]) == 0
+    assert "left out" not in capsys.readouterr().out
+    assert {"a.ply", "soup.off"} <= {path.name for path in tmp_path.iterdir()}
+    with pytest.raises(InputError, match=r"does not end in \.glb; rename"):
+        parse(["export", str(tmp_path / "soup.safetensors"), "--format", "glb", "--out", "b.ply"]).run([])
+    with pytest.raises(InputError, match=r"does not end in \.ply or"):
+        parse(["export", str(tmp_path / "soup.safetensors"), "--out", "b.xyz"]).run([])
+
+
+@pytest.mark.parametrize(("floor", "advised"), [("0", False), ("0.97", True)])
+def test_an_export_that_leaves_out_most_says_what_to_do(tmp_path, soup, capsys, floor, advised):
+    save_soup(tmp_path / "soup.safetensors", SoupFile(soup))
+    assert parse(["export", str(tmp_path / "soup.safetensors"), "--min-opacity", floor]).run([]) == 0
+    assert ("train with --finish opaque" in capsys.readouterr().out) is advised
+
+
+@pytest.mark.parametrize("kind", ["PLY", "OBJ", "OFF", "GLB", "SafeTensors"])
+def test_the_kind_of_file_does_not_depend_on_capitals(tmp_path, soup, kind):
+    """A.GLB is written like a.glb, by name and by --format, and read back."""
+    save_soup(tmp_path / "from.SAFETENSORS", SoupFile(flat(soup)))
+    for name, more in (("A", []), ("B", ["--format", kind.lower()])):
+        out = tmp_path / f"{name}.{kind}"
+        command = ["export", str(tmp_path / "from.SAFETENSORS"), "--out", str(out), "--min-opacity", "0", *more]
+        assert parse(command).run([]) == 0
+        assert torch.equal(open_soup(out).soup.vertices, soup.vertices)
+
+
+def test_what_a_kind_of_file_cannot_hold_does_not_depend_on_capitals(tmp_path, soup):
+    with pytest.raises(InputError, match=r"soup\.OBJ: files of this kind hold no opacities"):
+        export_soup(run_of(soup), tmp_path / "soup.OBJ", ExportConfig(alpha=True))
+    export_soup(run_of(soup), tmp_path / "soup.PLY", ExportConfig(colors="keep", up="keep", min_opacity=0))
+    assert open_soup(tmp_path / "soup.PLY").soup.sh_degree == 2
+
+
+def test_a_gaussian_scene_comes_in_at_its_places_with_its_size_and_colours(tmp_path):
+    """A round Gaussian seen from the front blurs to the same width: the second moment of alpha agrees within 15 %."""
+    names = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", *(f"f_rest_{k}" for k in range(9)), "opacity"]
+    names += ["scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+    table = np.zeros(1, [(name, "f4") for name in names])
+    table["f_dc_0"], table["f_rest_4"], table["opacity"] = 1.0, 0.25, 4.0
+    table["scale_0"], table["scale_1"], table["scale_2"] = math.log(0.2), math.log(0.2), -9.0
+    table["rot_0"] = 1.0
+    (tmp_path / "gaussians.ply").write_bytes(encode_ply({"vertex": table}))
+    soup = open_soup(tmp_path / "gaussians.ply").soup
+    assert (len(soup), soup.sh_degree) == (1, 1)
+    assert soup.sh_rest[0].tolist() == [[0, 0, 0], [0, 0.25, 0], [0, 0, 0]]
+    torch.testing.assert_close(soup.vertices.mean(dim=1), torch.zeros(1, 3), atol=1e-6, rtol=0)
+    camera = Cameras(look_at(torch.tensor([[0.0, 0, 4]]), torch.zeros(3), torch.tensor([0.0, 1, 0])), CAMERA.Ks, 64, 48)
+    alpha = render_soup(soup, camera, SoupAppearance()).alpha[0, ..., 0] / float(soup.opacities)
+    x = (torch.arange(64) + 0.5 - 32) * 4 / float(camera.Ks[0, 0, 0])
+    spread = float((alpha.sum(dim=0) * x * x).sum() / alpha.sum()) ** 0.5
+    assert spread == pytest.approx(0.2, rel=0.15)
+
+
+def test_contradictions_and_empty_results_are_input_errors(tmp_path, soup):
+    with pytest.raises(InputError, match="--colors keep"):
+        export_soup(run_of(soup), tmp_path / "soup.obj", ExportConfig(colors="keep", up="keep"))
+    with pytest.raises(InputError, match="lower --min-opacity"):
+        export_soup(run_of(soup), tmp_path / "soup.obj", ExportConfig(min_opacity=1.0))
+    (tmp_path / "broken.ply").write_bytes(b"ply\nformat ascii 1.0\nelement vertex 3\n")
+    with pytest.raises(InputError, match="PLY header"):
+        open_soup(tmp_path / "broken.ply")

@@ -1,0 +1,100 @@
+"""What comes after training finds the run's soup and the very photos that it was trained on."""
+
+import shutil
+from dataclasses import replace
+
+import pytest
+import torch
+
+from etsplat.cli.parse import parse
+from etsplat.core.errors import InputError
+from etsplat.data.captures import load_capture
+from etsplat.io.run_directory import RunDirectory
+from etsplat.model.soup_files import load_soup
+from etsplat.optim.loop import CheckpointEvent
+from etsplat.tasks.evaluate_soup import evaluate_run
+from etsplat.tasks.soup_run import open_run
+from etsplat.tasks.train import train
+from etsplat.tasks.train_config import train_settings
+from helpers.captures import write_colmap, write_photo
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A short run on half-size copies of photos; with the iterations of the soups seen at its checkpoints."""
+    folder = tmp_path_factory.mktemp("trained")
+    write_colmap(folder / "scene", [(64, 48)] * 9)
+    for index in range(9):
+        write_photo(folder / "scene" / "images_2" / f"{index:04d}.jpg", 32, 24, seed=index)
+    config = replace(train_settings("tiny"), iterations=20, checkpoint_every=10, evaluate_every=0, log_every=10)
+    seen = []
+
+    def look(event):
+        if isinstance(event, CheckpointEvent):
+            seen.append(load_soup(folder / "run" / "soup.safetensors").notes["iteration"])
+
+    result = train(folder / "scene", folder / "run", config, images="images_2", callbacks=[look])
+    return folder, result, seen
+
+
+def test_a_run_opens_with_its_soup_and_its_photos(trained):
+    folder, result, _ = trained
+    run = open_run(folder / "run")
+    assert torch.equal(run.file.soup.vertices, result.soup.vertices)
+    assert run.capture.images.sizes == [(32, 24)] * 9
+    found = evaluate_run(run)
+    assert found["psnr"] == pytest.approx(result.metrics["psnr"], abs=1e-3)
+    assert found["ssim_opaque"] == pytest.approx(result.metrics["ssim_opaque"], abs=1e-3)
+
+
+def test_every_checkpoint_comes_with_a_soup_to_look_at(trained):
+    assert trained[2][:1] == ["10"]
+
+
+def test_a_scene_that_moved_is_named_with_an_option(trained, tmp_path):
+    folder, _, _ = trained
+    shutil.copytree(folder / "scene", tmp_path / "moved")
+    shutil.copytree(folder / "run", tmp_path / "run")
+    config = tmp_path / "run" / "config.json"
+    config.write_text(config.read_text().replace(str(folder / "scene"), str(folder / "gone")))
+    with pytest.raises(InputError, match=r"has gone; name where it is now with --scene"):
+        open_run(tmp_path / "run")
+    assert len(open_run(tmp_path / "run", tmp_path / "moved").capture) == 9
+    with pytest.raises(InputError, match=r"scene .*/mover: no such folder; did you mean .*/moved\?"):
+        open_run(tmp_path / "run", tmp_path / "mover")
+
+
+def test_a_run_is_no_scene(trained):
+    with pytest.raises(InputError, match=r"run: neither .* choose the scene's folder that this run was made from"):
+        load_capture(trained[0] / "run")
+
+
+def test_a_reconstruction_is_told_where_its_mesh_is(tmp_path):
+    RunDirectory.create(tmp_path / "mesh", {"task": "reconstruct", "config": {}})
+    with pytest.raises(InputError, match=r"mesh\.glb opens in any mesh viewer.*name a run of `etsplat train`"):
+        open_run(tmp_path / "mesh")
+
+
+@pytest.mark.parametrize("command", ["view", "eval", "render", "export"])
+def test_a_mistyped_folder_is_answered_at_once_with_what_was_meant(tmp_path, command):
+    meant = tmp_path / "runs" / "kitchen"
+    meant.mkdir(parents=True)
+    for given in (tmp_path / "runs" / "kichen", tmp_path / "rums" / "kitchen"):
+        with pytest.raises(InputError) as raised:
+            parse([command, str(given)]).run([])
+        assert str(raised.value).startswith(f"{given}: no such file or folder; did you mean {meant}?")
+
+
+def test_a_path_like_no_other_is_to_be_checked(tmp_path):
+    for path in (tmp_path / "run", tmp_path / "no" / "where"):
+        with pytest.raises(InputError, match=f"{path}: no such file or folder; check the path"):
+            open_run(path)
+
+
+def test_folders_without_a_soup_are_input_errors(tmp_path, trained):
+    with pytest.raises(InputError, match="is not a run of etsplat"):
+        open_run(tmp_path)
+    shutil.copytree(trained[0] / "run", tmp_path / "run")
+    (tmp_path / "run" / "soup.safetensors").unlink()
+    with pytest.raises(InputError, match="got to a checkpoint"):
+        open_run(tmp_path / "run")
