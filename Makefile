@@ -40,7 +40,8 @@ $(TOOLS): constraints.txt
 
 # No build isolation: the build folder then survives, and a changed C++ file is rebuilt in seconds.
 $(INSTALLED): $(TOOLS) pyproject.toml $(NATIVE)
-	$(PIP) -c constraints.txt --no-build-isolation -e '.[dev]'
+	$(PIP) 'pip>=25.1'  # which knows --group
+	$(PIP) -c constraints.txt --no-build-isolation -e . --group dev
 	@touch $@
 
 setup: $(INSTALLED)
@@ -104,4 +105,4 @@ check-wheel: wheel
 
 clean:
 	rm -rf $(VENV) build dist .pytest_cache .ruff_cache .hypothesis
-	find src tests benchmarks examples -name __pycache__ -type d -prune -exec rm -rf {} +
+	find src tests benchmarks studies examples -name __pycache__ -type d -prune -exec rm -rf {} +

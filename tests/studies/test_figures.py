@@ -6,16 +6,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from etsplat.bench.dead_zone import pull, remaining_distance
-from etsplat.bench.drawings import FIGURES, draw_edges
-from etsplat.bench.teaser import draw_teaser
-from etsplat.cli.figures import Figures
 from etsplat.core.errors import InputError
 from etsplat.tasks.reconstruct import reconstruct
 from etsplat.tasks.reconstruct_config import PRESETS
 from etsplat.tasks.train import train
 from etsplat.tasks.train_config import train_settings
 from helpers.captures import write_colmap
+from studies.drawings.dead_zone import pull, remaining_distance
+from studies.drawings.kernels import FIGURES, draw_edges
+from studies.drawings.teaser import draw_teaser
+from studies.figures import Figures
 
 
 @pytest.mark.parametrize("name", [name for name in FIGURES if name != "dead-zone"])

@@ -10,27 +10,29 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from benchmarks import gsplat_on_cpu
-from etsplat.bench import nvs, train_peer
-from etsplat.bench.gaussians import NAMES, load_gaussians, start_gaussians
-from etsplat.bench.nvs import evaluate_cells, make_nvs_cells, read_scene_argument
-from etsplat.bench.nvs_figures import draw_nvs
-from etsplat.bench.nvs_tables import nvs_tables
-from etsplat.bench.peers import load_gsplat, peer_config
 from etsplat.core.errors import InputError
 from etsplat.io.run_directory import RunDirectory
 from etsplat.model.soup_init import StartPoints
 from etsplat.model.triangle_soup import SH_CONSTANT
 from helpers import fake_gsplat
 from helpers.captures import write_colmap
+from studies import gsplat_on_cpu
+from studies.peers import training
+from studies.peers.gaussians import NAMES, load_gaussians, start_gaussians
+from studies.peers.settings import load_gsplat, peer_config
+from studies.peers.training import train_peer
+from studies.scenes import cells as scene_cells
+from studies.scenes.cells import evaluate_cells, make_nvs_cells, read_scene_argument
+from studies.scenes.pictures import draw_nvs
+from studies.scenes.tables import nvs_tables
 
 
 def put_in_place(module, monkeypatch):
     def load():
         return module, torch.device("cpu")
 
-    monkeypatch.setattr(train_peer, "load_gsplat", load)
-    monkeypatch.setattr(nvs, "load_gsplat", load)
+    monkeypatch.setattr(training, "load_gsplat", load)
+    monkeypatch.setattr(scene_cells, "load_gsplat", load)
 
 
 @pytest.fixture
@@ -43,7 +45,7 @@ def gsplat(monkeypatch):
 @pytest.fixture
 def real_gsplat(monkeypatch):
     """gsplat itself, but for its two functions that draw: arguments must fit theirs, the stand-in draws."""
-    gsplat = pytest.importorskip("gsplat", reason="gsplat is not installed (extra peers)")
+    gsplat = pytest.importorskip("gsplat", reason="gsplat is not installed (group studies)")
 
     def drawing(name):
         signature = inspect.signature(getattr(gsplat, name))
@@ -90,7 +92,7 @@ def test_a_peer_is_trained_measured_and_tabulated_as_our_methods_are(tmp_path, g
     write_colmap(tmp_path / "toy", [(48, 36)] * 9)
     (cell,) = cells_of(tmp_path, [method])
     assert (cell.variant, cell.config.iterations, cell.config.width) == (method, 30, 24)
-    train_peer.train_peer(cell.mesh, cell.folder, cell.config)
+    train_peer(cell.mesh, cell.folder, cell.config)
     again = cells_of(tmp_path, [method])[0]
     assert again.state == "done"
     strategy = fake_gsplat.DefaultStrategy.made[-1]
@@ -99,7 +101,7 @@ def test_a_peer_is_trained_measured_and_tabulated_as_our_methods_are(tmp_path, g
     assert strategy.steps == list(range(30))
     history = RunDirectory(cell.folder).read_history()
     assert (history[-1]["iteration"], history[-1]["triangles"]) == (30, 40)
-    gaussians = load_gaussians(cell.folder / train_peer.FILE, torch.device("cpu"))
+    gaussians = load_gaussians(cell.folder / training.FILE, torch.device("cpu"))
     assert gaussians["shN"].shape == (40, 15, 3)
     assert [len(gaussians[name]) for name in NAMES] == [40] * 6
     (row,) = evaluate_cells([again], None, lambda done, total: None)
@@ -113,7 +115,7 @@ def test_a_peer_is_trained_measured_and_tabulated_as_our_methods_are(tmp_path, g
 
 def test_training_a_peer_brings_the_loss_down(tmp_path, gsplat):
     write_colmap(tmp_path / "toy", [(24, 18)] * 9, points=60)
-    train_peer.train_peer(
+    train_peer(
         tmp_path / "toy", tmp_path / "run", peer_config("3dgs", iterations=100, schedule_length=100, lr_sh_dc=0.05)
     )
     losses = [line["loss"] for line in RunDirectory(tmp_path / "run").read_history()]
@@ -125,28 +127,28 @@ def test_a_peer_that_was_interrupted_goes_on_from_its_checkpoint(tmp_path, gspla
     """Gaussians, moments, statistics of the strategy and order of views come to what they are without interruption: the
     random numbers that gsplat draws before the checkpoint are those of the seed."""
     write_colmap(tmp_path / "toy", [(24, 18)] * 5)
-    monkeypatch.setattr(train_peer, "CHECKPOINT_EVERY", 10)
+    monkeypatch.setattr(training, "CHECKPOINT_EVERY", 10)
     config = peer_config(method, iterations=30, schedule_length=30, densify_from=5)
-    train_peer.train_peer(tmp_path / "toy", tmp_path / "whole", config)
+    train_peer(tmp_path / "toy", tmp_path / "whole", config)
     whole = fake_gsplat.DefaultStrategy.made[-1]
     torch.rand(1)  # what else the process draws makes no difference
-    step = train_peer._Fitting._step
+    step = training._Fitting._step
 
     def interrupted(self, iteration):
         if iteration == 26:
             raise KeyboardInterrupt
         return step(self, iteration)
 
-    monkeypatch.setattr(train_peer._Fitting, "_step", interrupted)
+    monkeypatch.setattr(training._Fitting, "_step", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        train_peer.train_peer(tmp_path / "toy", tmp_path / "parts", config)
-    monkeypatch.setattr(train_peer._Fitting, "_step", step)
-    train_peer.train_peer(tmp_path / "toy", tmp_path / "parts", config, resume=True)
+        train_peer(tmp_path / "toy", tmp_path / "parts", config)
+    monkeypatch.setattr(training._Fitting, "_step", step)
+    train_peer(tmp_path / "toy", tmp_path / "parts", config, resume=True)
     rest = fake_gsplat.DefaultStrategy.made[-1]
     assert rest.steps == list(range(20, 30))
     assert torch.equal(rest.pulls, whole.pulls)
-    expected = load_gaussians(tmp_path / "whole" / train_peer.FILE, torch.device("cpu"))
-    gaussians = load_gaussians(tmp_path / "parts" / train_peer.FILE, torch.device("cpu"))
+    expected = load_gaussians(tmp_path / "whole" / training.FILE, torch.device("cpu"))
+    gaussians = load_gaussians(tmp_path / "parts" / training.FILE, torch.device("cpu"))
     assert all(torch.equal(gaussians[name], expected[name]) for name in NAMES)
     losses = [[line["loss"] for line in RunDirectory(tmp_path / name).read_history()] for name in ("whole", "parts")]
     assert losses[0] == losses[1]
@@ -163,7 +165,7 @@ def test_2dgs_fits_normals_except_on_objects(tmp_path, gsplat, monkeypatch, kind
     scene = read_scene_argument(f"{tmp_path / 'toy'}:{kind}")
     setting = "iterations=30,width=24"
     (cell,) = make_nvs_cells([scene], ["2dgs"], tmp_path / "out", preset="tiny", culling=(False,), setting=setting)
-    train_peer.train_peer(cell.mesh, cell.folder, cell.config)
+    train_peer(cell.mesh, cell.folder, cell.config)
     assert seen == modes
 
 
@@ -180,9 +182,9 @@ def test_opacities_are_reset_which_gsplat_1_5_3_does_not_do(tmp_path, gsplat, mo
     )
     schedule = {"iterations": 50, "schedule_length": 50, "reset_every": 10, "densify_until": 40}
     config = peer_config(method, **schedule, start_opacity=0.6, lr_opacities=0.0)
-    train_peer.train_peer(tmp_path / "toy", tmp_path / "run", config)
+    train_peer(tmp_path / "toy", tmp_path / "run", config)
     assert resets == [10, 20, 30]
-    gaussians = load_gaussians(tmp_path / "run" / train_peer.FILE, torch.device("cpu"))
+    gaussians = load_gaussians(tmp_path / "run" / training.FILE, torch.device("cpu"))
     assert gaussians["opacities"].sigmoid().tolist() == pytest.approx([opacity] * len(gaussians["means"]), rel=1e-4)
 
 
@@ -203,10 +205,10 @@ def test_a_2d_gaussian_starts_without_thickness():
 def test_gsplats_own_strategy_densifies_prunes_and_resets_our_gaussians(tmp_path, real_gsplat, monkeypatch, method):
     """All calls fit its signatures; a run that is interrupted between two densifications goes on with it."""
     write_colmap(tmp_path / "toy", [(24, 18)] * 5)
-    monkeypatch.setattr(train_peer, "CHECKPOINT_EVERY", 10)
+    monkeypatch.setattr(training, "CHECKPOINT_EVERY", 10)
     schedule = {"densify_from": 5, "densify_until": 40, "densify_every": 8, "reset_every": 25}
     config = peer_config(method, iterations=60, schedule_length=60, normals_from=30, **schedule)
-    step = train_peer._Fitting._step
+    step = training._Fitting._step
     counts, opaque = {}, {}
 
     def watched(self, iteration, last=60):
@@ -217,11 +219,11 @@ def test_gsplats_own_strategy_densifies_prunes_and_resets_our_gaussians(tmp_path
         opaque[iteration - 1] = float(self.gaussians["opacities"].detach().sigmoid().max())
         return loss
 
-    monkeypatch.setattr(train_peer._Fitting, "_step", lambda self, iteration: watched(self, iteration, last=37))
+    monkeypatch.setattr(training._Fitting, "_step", lambda self, iteration: watched(self, iteration, last=37))
     with pytest.raises(KeyboardInterrupt):
-        train_peer.train_peer(tmp_path / "toy", tmp_path / "run", config)
-    monkeypatch.setattr(train_peer._Fitting, "_step", watched)
-    metrics = train_peer.train_peer(tmp_path / "toy", tmp_path / "run", config, resume=True)
+        train_peer(tmp_path / "toy", tmp_path / "run", config)
+    monkeypatch.setattr(training._Fitting, "_step", watched)
+    metrics = train_peer(tmp_path / "toy", tmp_path / "run", config, resume=True)
     assert counts[7] == counts[0] < counts[8]  # refined at 8, 16, 24, 32
     assert counts[32] != counts[31]
     assert counts[39] == counts[59] == metrics["triangles"]
@@ -234,8 +236,8 @@ def test_gsplats_own_strategy_densifies_prunes_and_resets_our_gaussians(tmp_path
 
 @pytest.mark.parametrize("method", ["3dgs", "2dgs"])
 def test_gsplat_on_the_cpu_draws_one_gaussian_after_the_other(monkeypatch, method):
-    """benchmarks/gsplat_on_cpu.py against a loop over Gaussians; of a disk, by where each pixel's ray meets it."""
-    gsplat = pytest.importorskip("gsplat", reason="gsplat is not installed (extra peers)")
+    """studies/gsplat_on_cpu.py against a loop over Gaussians; of a disk, by where each pixel's ray meets it."""
+    gsplat = pytest.importorskip("gsplat", reason="gsplat is not installed (group studies)")
     if gsplat.__version__ != gsplat_on_cpu.VERSION:
         pytest.skip(f"needs gsplat {gsplat_on_cpu.VERSION}")
     for module, name, value in gsplat_on_cpu.replacements():
@@ -281,7 +283,7 @@ def test_peers_stand_once_beside_our_methods_with_and_without_culling(tmp_path, 
 def test_without_gsplat_or_a_gpu_the_grid_says_so_before_anything_runs(tmp_path, monkeypatch):
     write_colmap(tmp_path / "toy", [(24, 18)] * 3)
     monkeypatch.setitem(sys.modules, "gsplat", None)
-    with pytest.raises(InputError, match=r"pip install 'etsplat\[peers\]'"):
+    with pytest.raises(InputError, match="pip install --group studies"):
         cells_of(tmp_path, ["elastic", "3dgs"])
     monkeypatch.setitem(sys.modules, "gsplat", fake_gsplat)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)

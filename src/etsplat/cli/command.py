@@ -1,5 +1,6 @@
 """What every command of the command line is: a dataclass whose fields are its options, with a method that runs it."""
 
+import inspect
 import shlex
 import sys
 from abc import ABC, abstractmethod
@@ -59,6 +60,15 @@ def option_value(arguments: Sequence[str], option: str) -> str | None:
         elif argument.startswith(f"{option}="):
             value = argument.removeprefix(f"{option}=")
     return value
+
+
+def help_of(command: type[Command]) -> str:
+    """What a command's own help says of it: its docstring and its examples."""
+    text = inspect.cleandoc(command.__doc__ or "")
+    if not command.EXAMPLES:
+        return text
+    examples = inspect.cleandoc(command.EXAMPLES).splitlines()
+    return f"{text}\n\nExamples:\n" + "\n".join(f"    {line}" for line in examples)
 
 
 def resume_line(arguments: Sequence[str]) -> str:

@@ -99,7 +99,7 @@ class Download(Command):
     EXAMPLES: ClassVar[str] = """
     etsplat data download tandt-db --out data
     etsplat data download famous --out data
-    etsplat bench nvs --scenes data/tandt/truck data/tandt/train --out runs/nvs
+    etsplat train data/tandt/truck --out runs/truck
     """
 
     name: tyro.conf.Positional[Literal["mipnerf360", "mipnerf360-extra", "tandt-db", "famous"]]

@@ -3,27 +3,32 @@
 import os
 import signal
 import sys
+from collections.abc import Callable, Sequence
 from importlib.metadata import version
 from types import FrameType
 from typing import NoReturn
 
-from etsplat.cli.command import FAILED, INTERRUPTED, WRONG_INPUT, fail
+from etsplat.cli.command import FAILED, INTERRUPTED, WRONG_INPUT, Command, fail
 from etsplat.cli.parse import parse
 from etsplat.core.errors import InputError
 
 
 def main() -> NoReturn:
-    """Entry point of the `etsplat` command.
+    """Entry point of the `etsplat` command; it ends as `run_command` does."""
+    if sys.argv[1:] == ["--version"]:
+        print(f"etsplat {version('etsplat')}")
+        sys.exit(0)
+    run_command(parse, sys.argv[1:])
 
-    The process ends with 0; 1 if a run failed; 2 if the input or the options cannot be used; 130 after Ctrl-C.
+
+def run_command(parse: Callable[[Sequence[str]], Command], arguments: Sequence[str]) -> NoReturn:
+    """Runs the command that `parse` makes of the arguments, and ends the process.
+
+    With 0; 1 if a run failed; 2 if the input or the options cannot be used; 130 after Ctrl-C.
     SIGTERM, which asks a process to end, is taken for Ctrl-C, so that a run saves a checkpoint then too.
     """
-    arguments = sys.argv[1:]
     before = signal.signal(signal.SIGTERM, _interrupt)
     try:
-        if arguments == ["--version"]:
-            print(f"etsplat {version('etsplat')}")
-            sys.exit(0)
         sys.exit(parse(arguments).run(arguments))
     except BrokenPipeError:  # `etsplat --help | head`: nobody reads on
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -7,14 +7,11 @@ from typing import Annotated, Any, Union
 
 import tyro
 
-from etsplat.cli.bench import Distance, Famous, Regularizers, Settings
-from etsplat.cli.bench_nvs import Nvs
-from etsplat.cli.command import Command
+from etsplat.cli.command import Command, help_of
 from etsplat.cli.data import Download, Sfm, Undistort
 from etsplat.cli.doctor import Doctor
 from etsplat.cli.evaluate import Evaluate
 from etsplat.cli.export import Export
-from etsplat.cli.figures import Figures
 from etsplat.cli.reconstruct import Demo, Reconstruct
 from etsplat.cli.render import Render
 from etsplat.cli.train import DemoScene, Train
@@ -46,11 +43,6 @@ COMMANDS: dict[str, type[Command] | Group] = {
     "view": View,
     "render": Render,
     "export": Export,
-    "bench": Group(
-        "The paper's studies as grids of runs, with tables and figures.",
-        {"famous": Famous, "nvs": Nvs, "regularizers": Regularizers, "distance": Distance, "settings": Settings},
-    ),
-    "figures": Figures,
     "doctor": Doctor,
 }
 
@@ -95,8 +87,6 @@ def _member(name: str, entry: type[Command] | Group, arguments: Sequence[str], a
         members = _union(entry.commands, arguments, depth + 1)
         group = make_dataclass(name, [("command", members)], frozen=True)
         return Annotated[group, tyro.conf.OmitArgPrefixes, tyro.conf.subcommand(name, description=entry.help)]
-    description = inspect.cleandoc(entry.__doc__ or "")
-    if asked and entry.EXAMPLES:  # the list of all commands has no room for them
-        examples = inspect.cleandoc(entry.EXAMPLES).splitlines()
-        description += "\n\nExamples:\n" + "\n".join(f"    {line}" for line in examples)
+    # The list of all commands has no room for examples.
+    description = help_of(entry) if asked else inspect.cleandoc(entry.__doc__ or "")
     return Annotated[entry, tyro.conf.subcommand(name, default=entry.defaults(arguments), description=description)]

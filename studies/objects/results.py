@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from etsplat.bench.grid import Cell
-from etsplat.bench.paper import paper_chamfer
+from studies.grid.cells import Cell
+from studies.objects.paper import paper_chamfer
 
 METRICS = (
     "chamfer",

@@ -11,12 +11,12 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
-from etsplat.bench.peers import PeerConfig
 from etsplat.core.cameras import Cameras
 from etsplat.core.errors import InputError
 from etsplat.io.tensors import save_tensors
 from etsplat.model.soup_init import StartPoints, spacing
 from etsplat.model.triangle_soup import SH_CONSTANT
+from studies.peers.settings import PeerConfig
 
 NAMES = ("means", "scales", "quats", "opacities", "sh0", "shN")
 """As gsplat's strategies want them: log scales, (w, x, y, z), opacities before their sigmoid, harmonics."""

@@ -8,20 +8,23 @@ from typing import Any
 
 import pytest
 
-from etsplat.bench.grid import Cell, make_cells, run_grid
-from etsplat.bench.nvs import METRICS as NVS_METRICS
-from etsplat.bench.nvs import evaluate_cells, make_nvs_cells, read_scene_argument
-from etsplat.bench.nvs_tables import write_nvs_tables
-from etsplat.bench.results import METRICS, rows_of
-from etsplat.bench.tables import write_tables
-from etsplat.bench.variants import find_meshes
-from etsplat.cli.bench import Distance, Famous, Regularizers, Settings
 from etsplat.ops.engines import num_threads, set_num_threads
 from etsplat.tasks.evaluate_soup import evaluate_run
 from etsplat.tasks.reconstruct import reconstruct
 from etsplat.tasks.reconstruct_config import PRESETS
 from etsplat.tasks.soup_run import open_run
 from etsplat.tasks.train import train
+from studies.distance import Distance
+from studies.famous import Famous
+from studies.grid.cells import Cell, make_cells, run_grid
+from studies.grid.variants import find_meshes
+from studies.objects.results import METRICS, rows_of
+from studies.objects.tables import write_tables
+from studies.regularizers import Regularizers
+from studies.scenes.cells import METRICS as NVS_METRICS
+from studies.scenes.cells import evaluate_cells, make_nvs_cells, read_scene_argument
+from studies.scenes.tables import write_nvs_tables
+from studies.settings import Settings
 
 OBJECT = "goathead"
 SMALL = replace(PRESETS["tiny"], iterations=150, evaluate_every=50, chamfer_samples=5000)
@@ -67,7 +70,7 @@ def cells(shared_data: Path, one_thread: None, tmp_path_factory: pytest.TempPath
 @pytest.mark.parametrize("table", TABLES)
 def test_a_cell_holds_what_its_run_comes_to(table: str, cells: dict[str, list[Cell]], tmp_path: Path) -> None:
     """CSV and JSON have the metrics of `reconstruct` with the cell's settings, in this process, bit for bit."""
-    write_tables(rows_of(cells[table]), TABLES[table][1], tmp_path, f"etsplat bench {table}")
+    write_tables(rows_of(cells[table]), TABLES[table][1], tmp_path, f"python -m studies.{table}")
     in_json = json.loads((tmp_path / "results.json").read_text())["rows"][0]
     in_csv = next(csv.DictReader((tmp_path / "results.csv").open()))
     cell = cells[table][0]
@@ -96,7 +99,7 @@ def test_a_cell_of_nvs_holds_what_its_run_comes_to(shared_data: Path, one_thread
         setting="iterations=20,max_triangles=3000",
     )
     run_grid(cells, 1, lambda: None)
-    write_nvs_tables(evaluate_cells(cells, None, lambda done, total: None), tmp_path, "etsplat bench nvs")
+    write_nvs_tables(evaluate_cells(cells, None, lambda done, total: None), tmp_path, "python -m studies.nvs")
     in_json = json.loads((tmp_path / "nvs.json").read_text())["rows"][0]
     in_csv = next(csv.DictReader((tmp_path / "nvs.csv").open()))
     result = train(scene, tmp_path / "alone", cells[0].config)  # pyright: ignore[reportArgumentType]

@@ -1,6 +1,5 @@
-"""`etsplat bench nvs`: the paper's tables and figures of novel-view synthesis."""
+"""`python -m studies.nvs`: the paper's tables and figures of novel-view synthesis."""
 
-import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,25 +7,26 @@ from typing import Any, ClassVar, Literal
 
 import tyro
 
-from etsplat.bench.peers import Peer
-from etsplat.cli.command import FAILED, INTERRUPTED, Command, fail
+from etsplat.cli.command import INTERRUPTED, fail
 from etsplat.tasks.train_config import Method, TrainPreset
+from studies.peers.settings import Peer
+from studies.study import Study
 
 
 @dataclass(frozen=True, kw_only=True)
-class Nvs(Command):
+class Nvs(Study):
     """The paper's tables nvs, per-scene, filter and efficiency, and its figures nvs and trisoup.
 
     Scenes of the paper get Triangle Splatting's settings for them with `--preset paper`.
     """
 
     EXAMPLES: ClassVar[str] = """
-    etsplat bench nvs --scenes scenes/kitchen:indoor scenes/fountain scenes/lego:object,background=white --out runs/nvs
-    etsplat bench nvs --scenes scenes/fox:indoor --out runs/filter --methods elastic --culling both
-    etsplat bench nvs --scenes scenes/fox:indoor --out runs/small --set iterations=1000,width=300,max_triangles=20000
-    etsplat bench nvs --scenes demo:scene --settings "" prune_views=2 start_limit=none --out runs/ablation
-    etsplat bench nvs --scenes data/tandt/truck data/tandt/train --out runs/tandt --preset paper --culling on
-    etsplat bench nvs --scenes scenes/kitchen --out runs/peers --methods elastic 3dgs 2dgs
+    python -m studies.nvs --scenes scenes/kitchen:indoor scenes/lego:object,background=white --out runs/nvs
+    python -m studies.nvs --scenes scenes/fox:indoor --out runs/filter --methods elastic --culling both
+    python -m studies.nvs --scenes scenes/fox:indoor --out runs/small --set iterations=1000,width=300
+    python -m studies.nvs --scenes demo:scene --settings "" prune_views=2 start_limit=none --out runs/ablation
+    python -m studies.nvs --scenes data/tandt/truck data/tandt/train --out runs/tandt --preset paper --culling on
+    python -m studies.nvs --scenes scenes/kitchen --out runs/peers --methods elastic 3dgs 2dgs
     """
 
     scenes: tuple[str, ...]
@@ -35,7 +35,7 @@ class Nvs(Command):
     out: Path
     """Folder for the runs, tables and figures; a grid that was interrupted goes on where it was."""
     methods: tuple[Method | Peer, ...] = ("elastic", "bilateral", "single-sided")
-    """Which kernels; 3dgs and 2dgs are Gaussian peers, which need gsplat (pip install 'etsplat[peers]') and a GPU."""
+    """Which kernels; 3dgs and 2dgs are Gaussian peers, which need gsplat (pip install --group studies) and a GPU."""
     culling: Literal["off", "on", "both"] = "off"
     """Leave out triangles with an inradius below a pixel: the paper's rows were measured with it on."""
     settings: tuple[str, ...] = ("",)
@@ -60,11 +60,11 @@ class Nvs(Command):
         """Runs what is not finished yet, measures it, then writes tables and figures."""
         from rich.console import Console
 
-        from etsplat.bench.grid import count_jobs, run_grid
-        from etsplat.bench.live import PSNR, LiveTable
-        from etsplat.bench.nvs import evaluate_cells, make_nvs_cells, read_scene_argument
         from etsplat.cli.phases import PhaseBar
         from etsplat.ops.engines import num_threads
+        from studies.grid.cells import count_jobs, run_grid
+        from studies.grid.live import PSNR, LiveTable, conclude
+        from studies.scenes.cells import evaluate_cells, make_nvs_cells, read_scene_argument
 
         jobs = min(count_jobs(self.jobs), num_threads())
         cells = make_nvs_cells(
@@ -87,18 +87,19 @@ class Nvs(Command):
             fail("interrupted; give the same command to go on", INTERRUPTED)
         if rows:
             self._report(cells, rows, arguments)
-        failed = [cell for cell in cells if cell.state == "failed"]
-        for cell in failed:
-            print(f"{cell.object}, {cell.variant}: failed: {cell.error}")
-        return FAILED if failed else 0
+        return conclude(cells)
 
     def _report(self, cells: list, rows: list[dict[str, Any]], arguments: Sequence[str]) -> None:
-        from etsplat.bench.nvs_figures import draw_nvs
-        from etsplat.bench.nvs_tables import write_nvs_tables
+        from studies.scenes.pictures import draw_nvs
+        from studies.scenes.tables import write_nvs_tables
 
-        write_nvs_tables(rows, self.out, shlex.join(["etsplat", *arguments]))
+        write_nvs_tables(rows, self.out, self.command_line(arguments))
         variants = list(dict.fromkeys(row["variant"] for row in rows))
         draw_nvs(cells, variants, self.out / "nvs.png")
         draw_nvs(cells, variants, self.out / "trisoup.png", kind="opaque")
         print((self.out / "nvs.md").read_text(encoding="utf-8"))
         print(f"{self.out}: nvs.md, .csv, .json, .tex, nvs.png, trisoup.png; each run under runs/")
+
+
+if __name__ == "__main__":
+    Nvs.main()

@@ -1,4 +1,4 @@
-"""`etsplat figures NAME`: the paper's explanatory figures, computed."""
+"""`python -m studies.figures NAME`: the paper's explanatory figures, computed."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,14 +7,14 @@ from typing import ClassVar, Literal
 
 import tyro
 
-from etsplat.cli.command import Command
 from etsplat.core.errors import InputError
+from studies.study import Study
 
 Name = Literal["kernels", "edges", "soft-triangle", "axes", "dead-zone", "teaser"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Figures(Command):
+class Figures(Study):
     """Draw a figure of the paper from the code itself.
 
     kernels: G(x) and its slope for several sigma. edges: the seam between two faces. soft-triangle: one triangle and
@@ -23,9 +23,9 @@ class Figures(Command):
     """
 
     EXAMPLES: ClassVar[str] = """
-    etsplat figures kernels
-    etsplat figures dead-zone --out dead_zone.pdf
-    etsplat figures teaser --runs runs/bunny runs/kitchen
+    python -m studies.figures kernels
+    python -m studies.figures dead-zone --out dead_zone.pdf
+    python -m studies.figures teaser --runs runs/bunny runs/kitchen
     """
 
     name: tyro.conf.Positional[Name]
@@ -42,10 +42,10 @@ class Figures(Command):
 
     def run(self, arguments: Sequence[str]) -> int:
         """Draws it."""
-        from etsplat.bench.drawings import FIGURES
-        from etsplat.bench.teaser import draw_teaser
         from etsplat.io.atomic import atomic_write
         from etsplat.io.paths import kind_of
+        from studies.drawings.kernels import FIGURES
+        from studies.drawings.teaser import draw_teaser
 
         path = self.out or Path(f"{self.name}.png")
         if kind_of(path) not in (".png", ".pdf", ".svg"):
@@ -57,3 +57,7 @@ class Figures(Command):
             figure.savefig(temporary, dpi=150, format=kind_of(path)[1:])
         print(path)
         return 0
+
+
+if __name__ == "__main__":
+    Figures.main()

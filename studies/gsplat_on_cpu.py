@@ -1,6 +1,6 @@
-r"""`etsplat bench nvs` with the peers 3dgs and 2dgs where there is no GPU: small pictures, a second or so a step.
+r"""`python -m studies.nvs` with the peers 3dgs and 2dgs where there is no GPU: small pictures, a second or so a step.
 
-    python -m benchmarks.gsplat_on_cpu --methods elastic 3dgs 2dgs --set width=80,iterations=1000 \
+    python -m studies.gsplat_on_cpu --methods elastic 3dgs 2dgs --set width=80,iterations=1000 \
         --scenes ../shared/data/scenes/fox:indoor --out runs/peers
 
 What runs is gsplat 1.5.3 itself, its densification included, but for what it compiles for a GPU: projection and
@@ -9,7 +9,6 @@ gsplat's thresholds).
 """
 
 import importlib
-import sys
 from collections.abc import Iterator
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -17,7 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from etsplat.bench import peers
+from studies.peers import settings
 
 VERSION = "1.5.3"
 """Of gsplat; what is replaced is not part of its interface."""
@@ -262,10 +261,9 @@ def _gsplat_on_cpu() -> tuple[Any, torch.device]:
 if __name__ in ("__main__", "__mp_main__"):  # the processes of a grid import this too
     for _module, _name, _value in replacements():
         setattr(_module, _name, _value)
-    peers.load_gsplat = _gsplat_on_cpu
+    settings.load_gsplat = _gsplat_on_cpu
 
 if __name__ == "__main__":
-    from etsplat.cli import main
+    from studies.nvs import Nvs
 
-    sys.argv[1:1] = ["bench", "nvs"]
-    main()
+    Nvs.main()

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from etsplat.bench.nvs import CULLED
-from etsplat.bench.paper_nvs import NVS, PER_SCENE, SCENES
-from etsplat.bench.writing import bold, csv_text, latex_tabular, origin_of, versions_of, write_text
+from studies.grid.writing import bold, csv_text, latex_tabular, origin_of, versions_of, write_text
+from studies.scenes.cells import CULLED
+from studies.scenes.paper import NVS, PER_SCENE, SCENES
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,9 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from etsplat.bench.dead_zone import draw_dead_zone
 from etsplat.core.kernels import KERNELS
 from etsplat.ops.rasterize import rasterize
+from studies.drawings.dead_zone import draw_dead_zone
 
 SIGMAS = (0.05, 0.25, 0.5, 1.0, 2.0)
 TITLES = {"single_sided": "single-sided (TS)", "bilateral": "bilateral (2DTS)", "elastic": "elastic"}

@@ -9,7 +9,8 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from etsplat.bench.grid import Cell
+from etsplat.cli.command import FAILED
+from studies.grid.cells import Cell
 
 
 @dataclass(frozen=True)
@@ -75,6 +76,14 @@ class LiveTable:
                 row.append(Text(" ").join(_short(cell, self._headline) for cell in cells))
             table.add_row(name, *row)
         return table
+
+
+def conclude(cells: Sequence[Cell]) -> int:
+    """Names the runs that failed; returns the exit status."""
+    failed = [cell for cell in cells if cell.state == "failed"]
+    for cell in failed:
+        print(f"{cell.object}, {cell.variant}: failed: {cell.error}")
+    return FAILED if failed else 0
 
 
 def _result(cell: Cell, headline: Headline) -> str:

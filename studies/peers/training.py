@@ -11,8 +11,6 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from etsplat.bench.gaussians import NAMES, Splatting, load_gaussians, save_gaussians, splat, start_gaussians
-from etsplat.bench.peers import PeerConfig, load_gsplat
 from etsplat.core.cameras import Cameras
 from etsplat.data.capture_views import CaptureViews
 from etsplat.data.captures import Capture, load_capture
@@ -36,6 +34,8 @@ from etsplat.tasks.running import (
     versions,
 )
 from etsplat.tasks.soup_scoring import SoupScorer
+from studies.peers.gaussians import NAMES, Splatting, load_gaussians, save_gaussians, splat, start_gaussians
+from studies.peers.settings import PeerConfig, load_gsplat
 
 FILE = "gaussians.safetensors"
 LOG_EVERY = 50

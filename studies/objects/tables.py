@@ -6,9 +6,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from etsplat.bench.paper import paper_chamfer
-from etsplat.bench.results import Summary, chamfer_of, summarize
-from etsplat.bench.writing import bold, csv_text, latex_tabular, origin_of, versions_of, write_text
+from studies.grid.writing import bold, csv_text, latex_tabular, origin_of, versions_of, write_text
+from studies.objects.paper import paper_chamfer
+from studies.objects.results import Summary, chamfer_of, summarize
 
 
 @dataclass(frozen=True)

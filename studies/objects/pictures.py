@@ -11,13 +11,13 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from etsplat.bench.grid import Cell
 from etsplat.data.photograph import orbit_cameras, shade_faces
 from etsplat.geometry.measures import bounding_ball
 from etsplat.io.atomic import atomic_write
 from etsplat.io.mesh_files import load_mesh
 from etsplat.io.run_directory import RunDirectory
 from etsplat.ops.rasterize_hard import render_opaque
+from studies.grid.cells import Cell
 
 TILE = 360
 OBJECTS = 6

@@ -16,8 +16,6 @@ from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any
 
-from etsplat.bench.peers import PeerConfig
-from etsplat.bench.variants import Variant
 from etsplat.core.errors import InputError
 from etsplat.core.processes import when_parent_ends
 from etsplat.io.atomic import write_error
@@ -25,6 +23,8 @@ from etsplat.io.run_directory import RunDirectory, is_run
 from etsplat.ops.engines import num_threads
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.train_config import TrainConfig
+from studies.grid.variants import Variant
+from studies.peers.settings import PeerConfig
 
 _POLL_SECONDS = 0.5
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -195,10 +195,10 @@ def _work(mesh: Path, folder: Path, config: AnyConfig, images: str | None, threa
 
 
 def _run(mesh: Path, folder: Path, config: AnyConfig, images: str | None, threads: int) -> None:
-    from etsplat.bench.train_peer import train_peer
     from etsplat.ops.engines import set_num_threads
     from etsplat.tasks.reconstruct import reconstruct
     from etsplat.tasks.train import train
+    from studies.peers.training import train_peer
 
     set_num_threads(threads)
     if isinstance(config, PeerConfig):

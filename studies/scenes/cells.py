@@ -6,14 +6,14 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-from etsplat.bench.grid import AnyConfig, Cell, is_finished
-from etsplat.bench.paper_nvs import SCENES
-from etsplat.bench.peers import PEERS, Peer, PeerConfig, load_gsplat, peer_config
-from etsplat.bench.variants import changes_of
 from etsplat.core.errors import InputError
 from etsplat.io.run_directory import RunDirectory
 from etsplat.tasks.train import DEMO
 from etsplat.tasks.train_config import SCENE_TYPE_NAMES, TrainConfig, train_settings
+from studies.grid.cells import AnyConfig, Cell, is_finished
+from studies.grid.variants import changes_of
+from studies.peers.settings import PEERS, Peer, PeerConfig, load_gsplat, peer_config
+from studies.scenes.paper import SCENES
 
 CULLED = "culling"
 """What is added to the name of a method whose small triangles are culled."""
@@ -139,9 +139,9 @@ def evaluate_cells(
 
     Speed is measured here, with nothing else running, and not while the grid runs.
     """
-    from etsplat.bench.train_peer import evaluate_peer
     from etsplat.tasks.evaluate_soup import evaluate_run
     from etsplat.tasks.soup_run import open_run
+    from studies.peers.training import evaluate_peer
 
     done, rows = [cell for cell in cells if cell.state == "done"], []
     for index, cell in enumerate(done):

@@ -5,14 +5,14 @@ import json
 import pytest
 from PIL import Image
 
-from etsplat.bench.grid import run_grid
-from etsplat.bench.nvs import Scene, evaluate_cells, make_nvs_cells, read_scene_argument
-from etsplat.bench.nvs_figures import draw_nvs
-from etsplat.bench.nvs_tables import nvs_tables, write_nvs_tables
-from etsplat.bench.paper_nvs import NVS, PER_SCENE, SCENES
 from etsplat.core.errors import InputError
 from etsplat.tasks.train_config import TrainConfig
 from helpers.captures import write_colmap
+from studies.grid.cells import run_grid
+from studies.scenes.cells import Scene, evaluate_cells, make_nvs_cells, read_scene_argument
+from studies.scenes.paper import NVS, PER_SCENE, SCENES
+from studies.scenes.pictures import draw_nvs
+from studies.scenes.tables import nvs_tables, write_nvs_tables
 
 
 def row(scene, variant, psnr, **numbers):
@@ -38,7 +38,7 @@ def test_a_grid_runs_is_measured_and_goes_on_where_it_was(tmp_path):
     assert [row["variant"] for row in rows] == ["elastic", "elastic culling"]
     for measured, cell in zip(rows, cells, strict=True):
         assert measured["psnr"] == pytest.approx(cell.metrics()["psnr"], abs=1e-3)
-    write_nvs_tables(rows, tmp_path / "out", "etsplat bench nvs")
+    write_nvs_tables(rows, tmp_path / "out", "python -m studies.nvs")
     assert json.loads((tmp_path / "out" / "nvs.json").read_text())["rows"] == rows
     assert "**filter.**" in (tmp_path / "out" / "nvs.md").read_text()
     draw_nvs(cells, ["elastic", "elastic culling"], tmp_path / "nvs.png")

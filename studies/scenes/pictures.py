@@ -5,8 +5,8 @@ from pathlib import Path
 
 from PIL import Image, ImageDraw, ImageFont
 
-from etsplat.bench.grid import Cell
 from etsplat.io.atomic import atomic_write
+from studies.grid.cells import Cell
 
 TILE = 400
 GAP = 4

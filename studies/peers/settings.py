@@ -1,4 +1,4 @@
-"""Settings of the Gaussian peers that `etsplat bench nvs` runs beside our methods. Imports no torch."""
+"""Settings of the Gaussian peers that `python -m studies.nvs` runs beside our methods. Imports no torch."""
 
 import importlib
 from dataclasses import dataclass
@@ -105,7 +105,7 @@ def load_gsplat() -> "tuple[Any, torch.device]":
     try:
         gsplat = importlib.import_module("gsplat")
     except ImportError as error:
-        raise InputError("methods 3dgs and 2dgs need gsplat: pip install 'etsplat[peers]'") from error
+        raise InputError("methods 3dgs and 2dgs need gsplat: pip install --group studies") from error
     import torch
 
     if not torch.cuda.is_available():

@@ -8,7 +8,6 @@ import torch
 from matplotlib.figure import Figure
 from PIL import Image
 
-from etsplat.bench.figures import draw_shape
 from etsplat.core.errors import InputError
 from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.measures import bounding_ball
@@ -20,6 +19,7 @@ from etsplat.tasks.render_soup import draw
 from etsplat.tasks.soup_run import open_run
 from etsplat.tasks.train import start_fitting
 from etsplat.tasks.train_config import TrainConfig
+from studies.objects.pictures import draw_shape
 
 _COLUMNS = {
     "reconstruct": ("start", "shape", "normals", "splatted", "truth"),

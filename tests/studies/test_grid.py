@@ -15,12 +15,15 @@ from pathlib import Path
 
 import pytest
 
-from etsplat.bench import paper
-from etsplat.bench.figures import draw_qualitative, plot_convergence
-from etsplat.bench.grid import Cell, count_jobs, make_cells, run_grid
-from etsplat.bench.results import rows_of, summarize
-from etsplat.bench.tables import write_tables
-from etsplat.bench.variants import (
+from etsplat.core.errors import InputError
+from etsplat.geometry.icosphere import icosphere
+from etsplat.io.mesh_files import save_mesh
+from etsplat.io.run_directory import RunDirectory
+from etsplat.ops.engines import num_threads
+from etsplat.tasks.reconstruct_config import METHODS, PRESETS
+from studies.famous import Famous
+from studies.grid.cells import Cell, count_jobs, make_cells, run_grid
+from studies.grid.variants import (
     Variant,
     distance_variants,
     find_meshes,
@@ -28,14 +31,14 @@ from etsplat.bench.variants import (
     regularizer_variants,
     setting_variants,
 )
-from etsplat.cli.parse import parse
-from etsplat.core.errors import InputError
-from etsplat.geometry.icosphere import icosphere
-from etsplat.io.mesh_files import save_mesh
-from etsplat.io.run_directory import RunDirectory
-from etsplat.ops.engines import num_threads
-from etsplat.tasks.reconstruct_config import METHODS, PRESETS
+from studies.nvs import Nvs
+from studies.objects import paper
+from studies.objects.pictures import draw_qualitative, plot_convergence
+from studies.objects.results import rows_of, summarize
+from studies.objects.tables import write_tables
+from studies.study import Study
 
+REPOSITORY = Path(__file__).resolve().parents[2]
 SHORT = replace(PRESETS["tiny"], iterations=30, evaluate_every=10, chamfer_samples=2000)
 VARIANTS = [Variant("elastic", {}), Variant("raster-face", {"method": "raster-face"})]
 
@@ -76,8 +79,8 @@ import signal
 from dataclasses import replace
 from pathlib import Path
 
-from etsplat.bench.grid import make_cells, run_grid
-from etsplat.bench.variants import Variant
+from studies.grid.cells import make_cells, run_grid
+from studies.grid.variants import Variant
 from etsplat.tasks.reconstruct_config import PRESETS
 
 if __name__ == "__main__":
@@ -89,12 +92,24 @@ if __name__ == "__main__":
 """A program that runs a grid, of one cell, in the folder where it is started, and prints its worker's process."""
 
 
+def start_grid(folder: Path, *, start_new_session: bool = False) -> subprocess.Popen[str]:
+    """The program, started in a folder."""
+    (folder / "grid.py").write_text(GRID)
+    return subprocess.Popen(
+        [sys.executable, "grid.py"],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": str(REPOSITORY)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=start_new_session,
+    )
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
 def test_runs_are_interrupted_when_the_grid_is(number: signal.Signals, tmp_path: Path) -> None:
     """Also when it is killed: the worker saves a checkpoint and ends, and says nothing."""
-    (tmp_path / "grid.py").write_text(GRID)
-    program = [sys.executable, "grid.py"]
-    process = subprocess.Popen(program, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    process = start_grid(tmp_path)
     assert process.stdout is not None
     worker = int(process.stdout.readline())
     folder = tmp_path / "runs" / "ball" / "long"
@@ -111,11 +126,7 @@ def test_runs_are_interrupted_when_the_grid_is(number: signal.Signals, tmp_path:
 
 def test_an_interrupt_while_processes_start_is_quiet(tmp_path: Path) -> None:
     """Ctrl-C in a terminal reaches a worker too, which takes seconds to start; it ends without a word."""
-    (tmp_path / "grid.py").write_text(GRID)
-    pipe = subprocess.PIPE
-    process = subprocess.Popen(
-        [sys.executable, "grid.py"], cwd=tmp_path, stdout=pipe, stderr=pipe, text=True, start_new_session=True
-    )
+    process = start_grid(tmp_path, start_new_session=True)
     assert process.stdout is not None
     process.stdout.readline()
     time.sleep(0.1)  # until Python is awake in the worker
@@ -162,11 +173,11 @@ def test_a_grid_of_nothing_is_refused() -> None:
         run_grid([], 1, lambda: None)
 
 
-@pytest.mark.parametrize("grid", [["famous", "--meshes", "none"], ["nvs", "--scenes", "none"]])
-def test_a_negative_number_of_jobs_is_named(grid: list[str], tmp_path: Path) -> None:
+@pytest.mark.parametrize(("study", "source"), [(Famous, "--meshes"), (Nvs, "--scenes")])
+def test_a_negative_number_of_jobs_is_named(study: type[Study], source: str, tmp_path: Path) -> None:
     """Before anything is read. 0 asks for one on each core."""
     with pytest.raises(InputError, match="jobs: is -2; it must be at least 1, or 0 for one on each core"):
-        parse(["bench", *grid, "--out", str(tmp_path), "--jobs", "-2"]).run([])
+        study.parse([source, "none", "--out", str(tmp_path), "--jobs", "-2"]).run([])
     assert count_jobs(0) == num_threads()
     assert count_jobs(3) == 3
 
@@ -194,9 +205,9 @@ def test_tables_hold_the_runs(grid: tuple[Path, list[Cell]], tmp_path: Path) -> 
     """Every file is written; JSON has the runs' own metrics, the command and the commit; failed runs are left out."""
     rows = rows_of(grid[1])
     assert [row["object"] for row in rows] == ["ball", "ball"]
-    write_tables(rows, ["elastic", "raster-face"], tmp_path, "etsplat bench ...")
+    write_tables(rows, ["elastic", "raster-face"], tmp_path, "python -m studies.famous ...")
     document = json.loads((tmp_path / "results.json").read_text())
-    assert document["command"] == "etsplat bench ..."
+    assert document["command"] == "python -m studies.famous ..."
     assert document["rows"][0]["chamfer"] == grid[1][0].metrics()["chamfer"]
     assert len((tmp_path / "results.csv").read_text().splitlines()) == 3
     assert "| ball | " in (tmp_path / "results.md").read_text()

@@ -1,1 +1,0 @@
-"""The paper's studies as grids of runs, with tables and figures at the end."""

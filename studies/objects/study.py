@@ -1,0 +1,76 @@
+"""What the studies of shape reconstruction have in common: a grid of runs of `etsplat reconstruct`."""
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from etsplat.cli.command import INTERRUPTED, fail
+from etsplat.tasks.reconstruct_config import PRESETS, Preset, ReconstructConfig
+from studies.grid.variants import Variant, find_meshes, setting_variants
+from studies.study import Study
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObjectStudy(Study):
+    """Base of the studies of objects: meshes by variants by seeds."""
+
+    meshes: Path
+    """Folder of mesh files, such as the paper's (`etsplat data download famous`)."""
+    out: Path
+    """Folder for the runs, tables and figures; a grid that was interrupted goes on where it was."""
+    objects: tuple[str, ...] = ()
+    """Names of the meshes, without suffix; all in the folder if none is named."""
+    preset: Preset = "study"
+    """Settings of all runs; what is compared is changed on top of it."""
+    set: str = ""
+    """More changes for all runs, such as resolution=256,iterations=1500."""
+    seeds: tuple[int, ...] = (0,)
+    """Each run is repeated with each of them."""
+    jobs: Annotated[int, tyro.conf.arg(help_behavior_hint="(default: one for each core)")] = 0
+    """Runs beside each other; 0 for one on each core. They share the cores evenly."""
+
+    @classmethod
+    def defaults(cls, arguments: Sequence[str]) -> "ObjectStudy":
+        """Nothing depends on the arguments."""
+        return cls(meshes=tyro.MISSING, out=tyro.MISSING)
+
+    @abstractmethod
+    def variants(self, base: ReconstructConfig) -> list[Variant]:
+        """What is compared."""
+
+    def run(self, arguments: Sequence[str]) -> int:
+        """Runs what is not finished yet, then writes tables and figures."""
+        from rich.console import Console
+
+        from studies.grid.cells import count_jobs, make_cells, run_grid
+        from studies.grid.live import LiveTable, conclude
+
+        jobs = count_jobs(self.jobs)
+        base = setting_variants(PRESETS[self.preset], [self.set])[0].config(PRESETS[self.preset], 0)
+        variants = self.variants(base)
+        cells = make_cells(find_meshes(self.meshes, self.objects), variants, base, self.seeds, self.out)
+        try:
+            with LiveTable(Console(), cells) as table:
+                run_grid(cells, jobs, table.update)
+        except KeyboardInterrupt:
+            fail("interrupted; give the same command to go on", INTERRUPTED)
+        self._report(cells, [variant.name for variant in variants], arguments)
+        return conclude(cells)
+
+    def _report(self, cells: list, variants: list[str], arguments: Sequence[str]) -> None:
+        from studies.objects.pictures import draw_qualitative, plot_convergence
+        from studies.objects.results import rows_of
+        from studies.objects.tables import write_tables
+
+        rows = rows_of(cells)
+        if not rows:
+            return
+        write_tables(rows, variants, self.out, self.command_line(arguments))
+        plot_convergence(cells, variants, self.out / "convergence.png")
+        draw_qualitative(cells, variants, self.out / "qualitative.png")
+        print((self.out / "results.md").read_text(encoding="utf-8"))
+        print(f"{self.out}: results.md, .csv, .json, .tex, convergence.png, qualitative.png; each run under runs/")

@@ -1,0 +1,1 @@
+"""Gaussian splatting with gsplat, beside our methods."""

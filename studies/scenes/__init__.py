@@ -1,0 +1,1 @@
+"""Novel-view synthesis: the paper's numbers, tables and pictures of a grid of scenes."""
