@@ -34,7 +34,7 @@ void bind_rasterize(nb::module_& m) {
     nb::class_<RasterGradients>(m, "RasterGradients")
         .def(nb::init<>()) FIELD(grad_color) FIELD(grad_alpha) FIELD(grad_distortion) FIELD(corner_offsets)
         FIELD(corner_indices) FIELD(vertices) FIELD(flat_colors) FIELD(corner_colors) FIELD(opacities) FIELD(sigmas)
-        FIELD(background) FIELD(viewmat);
+        FIELD(background) FIELD(viewmat) FIELD(K);
 #undef FIELD
     nb::class_<RasterState>(m, "RasterState")
         .def_prop_ro("bytes", &RasterState::bytes)

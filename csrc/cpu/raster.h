@@ -48,7 +48,7 @@ struct RasterGradients {
     uintptr_t grad_color = 0, grad_alpha = 0, grad_distortion = 0;
     uintptr_t corner_offsets = 0, corner_indices = 0;  // of each vertex, with faces: where it is used, as 3 face + corner
     uintptr_t vertices = 0, flat_colors = 0, corner_colors = 0, opacities = 0, sigmas = 0, background = 0;
-    uintptr_t viewmat = 0;  // 16 floats
+    uintptr_t viewmat = 0, K = 0;  // 16 and 9 floats
 };
 
 struct RasterState {

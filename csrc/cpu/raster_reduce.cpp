@@ -39,7 +39,7 @@ void reduce_gradients(RasterState& state, const RasterGradients& gradients) {
     const bool gather = call.faces && gradients.vertices;
     if (gather) state.corner_gradients.resize(9 * call.num_triangles);
     TrianglePass& pass = state.triangles;
-    pass.want_camera = gradients.viewmat != 0;
+    pass.want_camera = gradients.viewmat || gradients.K;
     pass.grad_corners = gather ? state.corner_gradients.data() : nullptr;
     pass.grad_vertices = gather ? nullptr : reinterpret_cast<float*>(gradients.vertices);
     pass.grad_flat = reinterpret_cast<float*>(gradients.flat_colors);
@@ -59,11 +59,14 @@ void reduce_gradients(RasterState& state, const RasterGradients& gradients) {
     ChunkSums total{};
     for (const ChunkSums& chunk : chunks) {
         total.sigma += chunk.sigma;
-        for (int k = 0; k < 12; ++k) total.viewmat[k] += chunk.viewmat[k];
+        for (int k = 0; k < kCameraGradients; ++k) total.camera[k] += chunk.camera[k];
     }
     if (call.shared_sigma && gradients.sigmas) *reinterpret_cast<float*>(gradients.sigmas) += static_cast<float>(total.sigma);
-    if (gradients.viewmat)
-        for (int k = 0; k < 12; ++k) reinterpret_cast<float*>(gradients.viewmat)[k] += static_cast<float>(total.viewmat[k]);
+    const auto add_camera = [&](uintptr_t out, int place, int number) {
+        if (out) reinterpret_cast<float*>(out)[place] += static_cast<float>(total.camera[number]);
+    };
+    for (int k = 0; k < 12; ++k) add_camera(gradients.viewmat, k, k);
+    for (int k = 0; k < 4; ++k) add_camera(gradients.K, kIntrinsicsPlace[k], 12 + k);
 }
 
 }  // namespace etsplat

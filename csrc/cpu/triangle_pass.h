@@ -30,7 +30,7 @@ struct ChunkTotals {
 // Sums over all triangles of one chunk.
 struct ChunkSums {
     double sigma;
-    double viewmat[12];
+    double camera[kCameraGradients];
 };
 
 struct TrianglePass {

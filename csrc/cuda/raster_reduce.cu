@@ -46,28 +46,25 @@ __device__ __forceinline__ void sum_slots(const RasterPass& pass, int m, bool in
     }
 }
 
-// Adds a triangle's geometry gradient in one view to grad_world (9), and its part of the camera's to camera (12).
+// Adds a triangle's geometry gradient in one view to grad_world (9), and its part of the camera's (kCameraGradients).
 __device__ __forceinline__ void add_geometry(const RasterPass& pass, int triangle, int view_index,
                                              const float (&sums)[kStride], float* grad_world, float* camera_part) {
     const PinholeCamera camera = load_camera(pass, view_index);
     const Distance distance = static_cast<Distance>(pass.distance);
-    float world[9], view[9], grad_view[9];
+    float world[9], view[9], grad_view[9], gx[3], gy[3];
     Triangle2D<float> t;
     load_corners(pass, triangle, world);
     project_triangle(camera, pass.near_plane, distance, world, view, t);
     const SlotLayout layout = kLayout;
-    view_gradient(camera, distance, pass.freeze_incentre != 0, layout, sums, view, t, grad_view);
+    view_gradient(camera, distance, pass.freeze_incentre != 0, layout, sums, view, t, grad_view, gx, gy);
     for (int k = 0; k < 3; ++k) {
         float grad[3];
         to_world_gradient(camera, grad_view + 3 * k, grad);
         for (int c = 0; c < 3; ++c) grad_world[3 * k + c] += grad[c];
     }
-    for (int row = 0; row < 3; ++row)
-        for (int k = 0; k < 3; ++k) {
-            for (int column = 0; column < 3; ++column)
-                camera_part[4 * row + column] += grad_view[3 * k + row] * world[3 * k + column];
-            camera_part[4 * row + 3] += grad_view[3 * k + row];
-        }
+    camera_gradient(world, view, grad_view, gx, gy, [&](int number, const float* a, const float* b) {
+        for (int k = 0; k < 3; ++k) camera_part[number] += a[k] * b[k];
+    });
 }
 
 }  // namespace etsplat
@@ -83,7 +80,7 @@ extern "C" __global__ void __launch_bounds__(128) raster_reduce(const __grid_con
     float corner[CORNER > 0 ? 3 * CORNER : 1] = {};
     for (int view = 0; view < pass.views; ++view) {
         const long long m = static_cast<long long>(view) * pass.triangles + triangle;
-        float sums[kStride], camera_part[12] = {};
+        float sums[kStride], camera_part[kCameraGradients] = {};
         sum_slots(pass, static_cast<int>(inside ? m : 0), inside, sums);
         const bool drawn = inside && span_count(pass.spans[2 * m + 1]) > 0;
         // elsewhere not even the projection may be finite
@@ -99,9 +96,10 @@ extern "C" __global__ void __launch_bounds__(128) raster_reduce(const __grid_con
             for (int c = 0; c < 3 * CORNER; ++c)
                 pass.grad_corner_colors[(pass.corner_per_view ? m : triangle) * 3 * CORNER + c] = corner[c];
         if (pass.camera_sums)
-            for (int j = 0; j < 12; ++j) {
+            for (int j = 0; j < kCameraGradients; ++j) {
                 const double sum = block_sum<kReduceBlock>(camera_part[j], part);
-                if (threadIdx.x == 0) pass.camera_sums[(static_cast<long long>(view) * gridDim.x + blockIdx.x) * 12 + j] = sum;
+                const long long block = static_cast<long long>(view) * gridDim.x + blockIdx.x;
+                if (threadIdx.x == 0) pass.camera_sums[block * kCameraGradients + j] = sum;
             }
     }
     if (pass.sigma_sums) {

@@ -85,12 +85,13 @@ ETSPLAT_FN T distortion_slope(float near, float far, T m, T w, T total_weight, T
     return T(2.0f * dm) * w * (m * total_weight - total_first);
 }
 
-// Camera-space gradient (3, 3) of the vertices of a triangle from its sums over pixels, sums[j] at SlotLayout's place j.
+// Gradients by the vertices of a triangle from its sums over pixels, sums[j] at SlotLayout's place j: in camera space (3, 3),
+// and gx, gy (3 each) by their projections, which are part of it.
 template <class T, class Sums>
 ETSPLAT_FN void view_gradient(const PinholeCamera& camera, Distance distance, bool freeze_incentre,
                               const SlotLayout& layout, const Sums& sums, const T* view, const Triangle2D<T>& t,
-                              T* grad_view) {
-    T gx[3], gy[3], s[3], rx[3], ry[3], log_weight[3];
+                              T* grad_view, T* gx, T* gy) {
+    T s[3], rx[3], ry[3], log_weight[3];
     for (int k = 0; k < 3; ++k) {
         gx[k] = gy[k] = log_weight[k] = T(0.0f);
         s[k] = sums[SlotLayout::kMoment + k];

@@ -223,6 +223,34 @@ ETSPLAT_FN void project_backward(const PinholeCamera& camera, const T* view, T x
     grad_view[2] = grad_view[2] - (grad_x * (x - T(camera.cx)) + grad_y * (y - T(camera.cy))) * inverse_z;
 }
 
+// Numbers of a camera's gradient: 12 by the rows [rotation | translation], then by fx, cx, fy, cy.
+constexpr int kCameraGradients = 16;
+constexpr int kIntrinsicsPlace[4] = {0, 2, 4, 5};  // of the last four in a row-major (3, 3)
+
+// A triangle's part of it: add(j, a, b) adds a[0] b[0] + a[1] b[1] + a[2] b[2] to number j.
+// world, view: its vertices (3, 3) there, grad_view by the latter; gx, gy by its projected vertices (3).
+template <class T, class Add>
+ETSPLAT_FN void camera_gradient(const T* world, const T* view, const T* grad_view, const T* gx, const T* gy, const Add& add) {
+    const T one[3] = {T(1.0f), T(1.0f), T(1.0f)};
+    for (int row = 0; row < 3; ++row) {
+        const T grad[3] = {grad_view[row], grad_view[3 + row], grad_view[6 + row]};
+        for (int column = 0; column < 3; ++column) {
+            const T position[3] = {world[column], world[3 + column], world[6 + column]};
+            add(4 * row + column, grad, position);
+        }
+        add(4 * row + 3, grad, one);
+    }
+    T x[3], y[3];  // on the plane z = 1
+    for (int k = 0; k < 3; ++k) {
+        x[k] = view[3 * k] / view[3 * k + 2];
+        y[k] = view[3 * k + 1] / view[3 * k + 2];
+    }
+    add(12, gx, x);
+    add(13, gx, one);
+    add(14, gy, y);
+    add(15, gy, one);
+}
+
 template <class T>
 ETSPLAT_FN void to_world_gradient(const PinholeCamera& camera, const T* grad_view, T* grad_world) {
     const float* r = camera.rotation;

@@ -18,7 +18,7 @@ EVERYTHING: dict[str, Any] = {
     "distortion": True,
     "statistics": True,
 }
-DIFFERENTIABLE = ("vertices", "colors", "corner_colors", "opacities", "sigma", "viewmats", "backgrounds")
+DIFFERENTIABLE = ("vertices", "colors", "corner_colors", "opacities", "sigma", "viewmats", "Ks", "backgrounds")
 
 Scene = dict[str, Any]
 

@@ -54,7 +54,7 @@ struct Scene {
 
 struct Result {
     std::vector<float> color, alpha, distortion, median, weights;
-    std::vector<float> vertices, flat, corner, opacities, sigmas, background, viewmat;
+    std::vector<float> vertices, flat, corner, opacities, sigmas, background, viewmat, K;
 };
 
 uintptr_t address(std::vector<float>& v) { return reinterpret_cast<uintptr_t>(v.data()); }
@@ -66,7 +66,7 @@ Result render(Scene& scene, int kernel, int distance, const Pass& pass) {
     make(r.color, channels * pixels), make(r.alpha, pixels), make(r.distortion, pixels), make(r.weights, kTriangles);
     make(r.vertices, 9 * kTriangles), make(r.flat, pass.flat * kTriangles);
     make(r.corner, 3 * pass.corner * kTriangles);
-    make(r.opacities, kTriangles), make(r.sigmas, kTriangles), make(r.background, channels), make(r.viewmat, 16);
+    make(r.opacities, kTriangles), make(r.sigmas, kTriangles), make(r.background, channels), make(r.viewmat, 16), make(r.K, 9);
     std::vector<float> totals(static_cast<size_t>(2 * pixels)), sizes(kTriangles), inradii(kTriangles);
     std::vector<int32_t> median(static_cast<size_t>(pixels));
     std::vector<uint8_t> visible(kTriangles);
@@ -114,6 +114,7 @@ Result render(Scene& scene, int kernel, int distance, const Pass& pass) {
     gradients.sigmas = address(r.sigmas);
     gradients.background = address(r.background);
     gradients.viewmat = address(r.viewmat);
+    gradients.K = address(r.K);
     const auto state = raster_forward(call);
     raster_backward(*state, gradients);
     for (const int32_t triangle : median) r.median.push_back(static_cast<float>(triangle));
@@ -169,6 +170,7 @@ int main() {
                     COMPARE(sigmas, 1e-4f);
                     COMPARE(background, 1e-4f);
                     COMPARE(viewmat, 1e-3f);
+                    COMPARE(K, 1e-3f);
 #undef COMPARE
                 }
         std::printf("%s: %d images and gradients compared with plain\n", path.c_str(), comparisons);

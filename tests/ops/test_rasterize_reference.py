@@ -30,12 +30,14 @@ def small_scene(rng: torch.Generator, colors: str) -> dict:
 
 @pytest.mark.parametrize("colors", ["per_triangle", "per_view", "per_corner", "per_vertex"])
 def test_gradients_are_derivatives(kernel, distance, colors, rng):
-    """gradcheck of every image, cut-offs off, to vertices, colours, opacities, sigma, backgrounds and viewmats."""
+    """gradcheck of every image, cut-offs off, to vertices, colours, opacities, sigma, backgrounds, viewmats and Ks."""
     scene = prepare(small_scene(rng, colors), "reference", requires_grad=True)
     names = [name for name in DIFFERENTIABLE if name in scene]
+    Ks, free = scene["Ks"].detach().clone(), torch.tensor([[1.0, 0.0, 1.0], [0.0, 1.0, 1.0], [0.0, 0.0, 0.0]])
 
     def images(*tensors: Tensor) -> tuple[Tensor, ...]:
         arguments = {"colors": None, **scene, **dict(zip(names, tensors, strict=True))}
+        arguments["Ks"] = Ks + free * (arguments["Ks"] - Ks)  # other entries are no parameters of a camera
         out = rasterize(**arguments, kernel=kernel, distance=distance, cutoffs=NO_CUTOFFS, **EVERYTHING)
         # The quotient of two tiny sums far from all triangles is too badly conditioned for finite differences.
         assert out.depth is not None

@@ -45,15 +45,13 @@ ETSPLAT_FN double lane_total(Vec v) {
     return total;
 }
 
-ETSPLAT_FN void add_camera_gradient(const Vec* world, const Vec* grad_view, ChunkSums& chunk) {
-    for (int row = 0; row < 3; ++row) {
-        for (int column = 0; column < 3; ++column) {
-            Vec sum = grad_view[row] * world[column];
-            for (int k = 1; k < 3; ++k) sum = vfma(grad_view[3 * k + row], world[3 * k + column], sum);
-            chunk.viewmat[4 * row + column] += lane_total(sum);
-        }
-        chunk.viewmat[4 * row + 3] += lane_total(grad_view[row] + grad_view[3 + row] + grad_view[6 + row]);
-    }
+// Lanes outside of `drawn` may not even be finite; their gradients by view and screen are 0 already.
+ETSPLAT_FN void add_camera_gradient(VecMask drawn, const Vec* world, Vec* view, const Vec* grad_view, const Vec* gx,
+                                    const Vec* gy, ChunkSums& chunk) {
+    for (int k = 0; k < 9; ++k) view[k] = vselect(drawn, view[k], Vec(1.0f));
+    camera_gradient(world, view, grad_view, gx, gy, [&](int number, const Vec* a, const Vec* b) {
+        chunk.camera[number] += lane_total(vfma(a[2], b[2], vfma(a[1], b[1], a[0] * b[0])));
+    });
 }
 
 ETSPLAT_FN void write_vertex_gradients(const TrianglePass& triangles, const LaneRange& range, const Vec world[9]) {
@@ -72,16 +70,21 @@ ETSPLAT_FN void write_vertex_gradients(const TrianglePass& triangles, const Lane
 
 ETSPLAT_FN void geometry_gradients(const RasterPass& pass, const TrianglePass& triangles, const LaneRange& range,
                                    const LaneSums& sums, VecMask any, ChunkSums& chunk) {
-    Vec corners[9], view[9], grad_view[9], grad_world[9];
+    Vec corners[9], view[9], grad_view[9], gx[3], gy[3], grad_world[9];
     Triangle2D<Vec> t;
     load_corners(triangles, range, corners);
     project_triangle(triangles.camera, triangles.near_plane, triangles.distance, corners, view, t);
-    view_gradient(triangles.camera, triangles.distance, triangles.freeze_incentre, pass.slot_layout, sums, view, t, grad_view);
+    view_gradient(triangles.camera, triangles.distance, triangles.freeze_incentre, pass.slot_layout, sums, view, t, grad_view,
+                  gx, gy);
     for (int k = 0; k < 9; ++k) {
         grad_view[k] = keep(any, grad_view[k]);  // other lanes may not even be finite
         corners[k] = keep(any, corners[k]);
     }
-    if (triangles.want_camera) add_camera_gradient(corners, grad_view, chunk);
+    for (int k = 0; k < 3; ++k) {
+        gx[k] = keep(any, gx[k]);
+        gy[k] = keep(any, gy[k]);
+    }
+    if (triangles.want_camera) add_camera_gradient(any, corners, view, grad_view, gx, gy, chunk);
     if (!triangles.grad_corners && !triangles.grad_vertices) return;
     for (int k = 0; k < 3; ++k) to_world_gradient(triangles.camera, grad_view + 3 * k, grad_world + 3 * k);
     write_vertex_gradients(triangles, range, grad_world);

@@ -29,7 +29,7 @@ class CpuRender:
         grad_color, grad_alpha, grad_distortion = cotangents
         if grad_color is None:
             grad_color = zeros_image(*self.color_shape)
-        grads = PerInput(*map(_zeros, inputs, needed._replace(Ks=None)))  # Ks are not differentiated
+        grads = PerInput(*map(_zeros, inputs, needed))
         for b, state in enumerate(self.states):
             call = _native.RasterGradients()
             call.grad_color = _address(grad_color, b)
@@ -43,6 +43,7 @@ class CpuRender:
             call.opacities = _address(grads.opacities)
             call.sigmas = _address(grads.sigma)
             call.viewmat = _address(grads.viewmats, b)
+            call.K = _address(grads.Ks, b)
             call.background = _address(grads.backgrounds, b)
             _native.raster_backward(state, call)
         return grads

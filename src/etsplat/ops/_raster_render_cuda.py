@@ -216,8 +216,9 @@ class _Gradients:
         self.sigmas = empty(count, device=device) if needed.sigma and own else None
         sums = torch.float64
         self.sigma_sums = torch.empty(reduce_grid, dtype=sums, device=device) if needed.sigma and not own else None
-        camera_shape = (views, reduce_grid, 12)
-        self.camera_sums = torch.empty(camera_shape, dtype=sums, device=device) if needed.viewmats else None
+        self.needed, cameras = needed, needed.viewmats or needed.Ks
+        camera_shape = (views, reduce_grid, 16)
+        self.camera_sums = torch.empty(camera_shape, dtype=sums, device=device) if cameras else None
         self.background = None
         if needed.backgrounds and backgrounds is not None:
             self.background = torch.empty(views, render.tile_count // views, backgrounds.shape[1], device=device)
@@ -240,12 +241,19 @@ class _Gradients:
             launch(Program("raster_reduce.cu", defines), "raster_gather", blocks(count, 256), 256, arguments)
         if self.sigma_sums is not None:
             sigma = self.sigma_sums.sum().float()
-        viewmats = None
-        if self.camera_sums is not None:
-            rows = self.camera_sums.sum(1).float().view(-1, 3, 4)
-            viewmats = torch.nn.functional.pad(rows, (0, 0, 0, 1))
+        viewmats, Ks = self._cameras()
         background = None if self.background is None else self.background.sum(1)
-        return PerInput(vertices, self.flat, self.corner, self.opacities, sigma, viewmats, None, background)
+        return PerInput(vertices, self.flat, self.corner, self.opacities, sigma, viewmats, Ks, background)
+
+    def _cameras(self) -> tuple[Tensor | None, Tensor | None]:
+        """By viewmats and Ks, from sums by [rotation | translation], fx, cx, fy, cy (``camera_gradient``)."""
+        if self.camera_sums is None:
+            return None, None
+        rows, fx, cx, fy, cy = self.camera_sums.sum(1).float().split((12, 1, 1, 1, 1), dim=1)
+        viewmats = torch.nn.functional.pad(rows.view(-1, 3, 4), (0, 0, 0, 1))
+        zero = torch.zeros_like(fx)
+        Ks = torch.cat([fx, zero, cx, zero, fy, cy, zero, zero, zero], dim=1).view(-1, 3, 3)
+        return viewmats if self.needed.viewmats else None, Ks if self.needed.Ks else None
 
 
 def _stride(flat: int, corner: int, distortion: int) -> int:

@@ -153,7 +153,9 @@ def _plane_depth(triangle: Tensor, corners: Tensor, viewmats: Tensor, Ks: Tensor
     for viewmat, K, chosen in zip(viewmats, Ks, triangle, strict=True):
         there = chosen > 0
         picked = corners[(chosen.long() - 1).clamp_min(0)] @ viewmat[:3, :3].T + viewmat[:3, 3]
-        screen, z = to_screen(torch.where(there[..., None, None], picked, stand_in), identity, K)
+        drawn = there[..., None, None]
+        screen, z = to_screen(torch.where(drawn, picked, stand_in), identity, K)
+        screen = torch.where(drawn, screen, stand_in[:, :2])  # K may make it degenerate, and would get NaN
         depth = (perspective_weights(barycentrics(pixels, screen), z) * z).sum(dim=-1)
         images.append(torch.where(there, depth, 0.0))
     return torch.stack(images)[..., None]

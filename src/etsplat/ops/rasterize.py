@@ -56,8 +56,8 @@ def rasterize(
     A pixel at normalised distance x from a triangle (0 at its centre, 1 on its edge) sees it with alpha = min(0.99,
     o G(x)). Triangles are composited front to back in the order of the view-space z of their centroid, ties by index:
     C = sum_i w_i c_i + T background with w_i = alpha_i prod_{j<i} (1 - alpha_j). docs/conventions.md has axes, culls
-    and cut-offs; docs/method.md has the formulas. Gradients reach vertices, colours, opacities, sigma, backgrounds and
-    viewmats. All floating-point tensors share one dtype and device.
+    and cut-offs; docs/method.md has the formulas. Gradients reach vertices, colours, opacities, sigma, backgrounds,
+    viewmats, and of Ks the focal lengths and principal point. All floating-point tensors share one dtype and device.
 
     Args:
         vertices: (V, 3) with ``faces``, or (N, 3, 3) corners of separate triangles; world space.
