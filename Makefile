@@ -16,7 +16,7 @@ SANITIZED := build/sanitize/.stamp
 # Folders are listed too: their time changes when a file is added or removed.
 NATIVE := CMakeLists.txt $(shell find csrc)
 
-.PHONY: help setup demo test lint format bench sanitize check-neon wheel check-wheel clean
+.PHONY: help setup demo test lint format bench equal-bits sanitize check-neon wheel check-wheel clean
 
 help:
 	@echo "make setup        create .venv and build the package into it"
@@ -24,6 +24,7 @@ help:
 	@echo "make test         run the tests"
 	@echo "make lint         ruff, pyright, import-linter"
 	@echo "make bench        measure the CPU engine"
+	@echo "make equal-bits BASE=COMMIT  small runs end with the same bits as at that commit; CASES='scene-*' for some"
 	@echo "make sanitize     run the tests of the C++ under ASan and UBSan (GCC, Linux)"
 	@echo "make check-neon   run the rasterizer's NEON path under QEMU (AArch64 cross compiler)"
 	@echo "make check-wheel  build the wheel, install it into an empty environment, run a tiny demo"
@@ -65,6 +66,12 @@ format: setup
 bench: setup
 	$(PY) -m benchmarks.rasterizer
 	$(PY) -m benchmarks.ops
+
+# BASE is built once, under build/equal_bits, and its results are kept; FRESH=1 makes them anew.
+CASES ?= *
+equal-bits: setup
+	@test -n "$(BASE)" || { echo "Which commit to compare with? make equal-bits BASE=main" >&2; exit 1; }
+	$(PY) -m tests.equal_bits --base "$(BASE)" --cases "$(CASES)" $(if $(FRESH),--fresh)
 
 # A second build, beside the first, with assertions and line numbers. `python -S` leaves out the editable install, so that
 # `etsplat` is the sanitized one. libstdc++ is preloaded too: ASan looks for the exception functions when it starts.
