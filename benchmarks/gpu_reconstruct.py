@@ -33,7 +33,7 @@ def step_milliseconds(
         subdivide_steps=1,
     )
     views = photograph(demo_object(), resolution, resolution, supersampling=1, device=device)
-    fitting = MeshFitting(make_start(None, views, config), views, config, lambda _: {})
+    fitting = MeshFitting(make_start(None, views, config, device), views, config, lambda _: {})
     _advance(fitting, 0, config.iterations - steps)
     begin = time.perf_counter()
     _advance(fitting, config.iterations - steps, config.iterations)

@@ -15,8 +15,9 @@ from typing import Any
 import torch
 
 from benchmarks.machine import description
-from etsplat.data.captures import Capture, load_capture
+from etsplat.data.dataset import Dataset
 from etsplat.data.demo_scene import demo_scene
+from etsplat.data.load import load_dataset
 from etsplat.ops.engines import num_threads, one_torch_thread, set_num_threads
 from etsplat.ops.photometric import photometric_loss
 from etsplat.ops.rasterize import rasterize
@@ -29,7 +30,7 @@ WARM_UP = 60
 """Steps before anything is timed: the soup is then no longer the start."""
 
 
-def grown(capture: Capture, config: TrainConfig) -> SoupFitting:
+def grown(capture: Dataset, config: TrainConfig) -> SoupFitting:
     """A soup of `config.max_triangles` triangles that has taken some steps at its full degree."""
     fitting = start_fitting(capture, config, lambda *_: {})
     iteration = 0
@@ -51,7 +52,7 @@ def median_ms(action: Callable[[], object], repeats: int) -> float:
     return 1000 * statistics.median(times)
 
 
-def measure(fitting: SoupFitting, capture: Capture, config: TrainConfig, repeats: int) -> dict[str, float]:
+def measure(fitting: SoupFitting, capture: Dataset, config: TrainConfig, repeats: int) -> dict[str, float]:
     """Means over all training views of step and rasterizer, which can then be subtracted; of the parts, on one view."""
     first = config.iterations - 3 * len(capture.train)
     start = time.perf_counter()
@@ -70,7 +71,7 @@ def measure(fitting: SoupFitting, capture: Capture, config: TrainConfig, repeats
     }
 
 
-def rasterizing(fitting: SoupFitting, capture: Capture, config: TrainConfig, view: int) -> Callable[[], object]:
+def rasterizing(fitting: SoupFitting, capture: Dataset, config: TrainConfig, view: int) -> Callable[[], object]:
     camera, soup = capture.cameras[view], fitting.soup
     with torch.no_grad():
         colors = soup_colors(soup.vertices, soup.sh_dc, soup.sh_rest, camera.centers, soup.sh_degree)
@@ -98,7 +99,7 @@ def rasterizing(fitting: SoupFitting, capture: Capture, config: TrainConfig, vie
     return run
 
 
-def coloring(fitting: SoupFitting, capture: Capture, view: int) -> Callable[[], object]:
+def coloring(fitting: SoupFitting, capture: Dataset, view: int) -> Callable[[], object]:
     soup, centers = fitting.soup, capture.cameras[view].centers
     cotangent = torch.rand(1, len(soup), 3)
 
@@ -110,7 +111,7 @@ def coloring(fitting: SoupFitting, capture: Capture, view: int) -> Callable[[], 
     return run
 
 
-def comparing(capture: Capture, view: int) -> Callable[[], object]:
+def comparing(capture: Dataset, view: int) -> Callable[[], object]:
     target = capture.images[view][None]
     color = torch.rand((*target.shape[:3], 3)).requires_grad_()
 
@@ -134,7 +135,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="write the result here as well")
     options = parser.parse_args()
     set_num_threads(options.threads)
-    loaded = load_capture(options.scene, width=options.width) if options.scene else demo_scene(options.width)
+    loaded = load_dataset(options.scene, width=options.width) if options.scene else demo_scene(options.width)
     config = replace(
         train_settings(options.preset, options.scene_type),
         method=options.method,

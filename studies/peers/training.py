@@ -12,8 +12,9 @@ import torch
 from torch import Tensor, nn
 
 from etsplat.core.cameras import Cameras
-from etsplat.data.capture_views import CaptureViews
-from etsplat.data.captures import Capture, load_capture
+from etsplat.data.dataset import Dataset
+from etsplat.data.load import load_dataset
+from etsplat.data.loader import View, ViewLoader
 from etsplat.io.images import save_image
 from etsplat.io.run_directory import RunDirectory
 from etsplat.metrics.image import psnr, ssim
@@ -59,7 +60,7 @@ def train_peer(
         DivergedError: the loss is not finite.
     """
     gsplat, device = load_gsplat()
-    own = load_capture(source, images=images, width=config.width)
+    own = load_dataset(source, images=images, width=config.width)
     capture = own.normalized()
     iterations = limited_iterations(config.iterations, config.max_epochs, len(own.train))
     paths = {"source": path_of(source), "images": images}
@@ -93,7 +94,7 @@ def evaluate_peer(folder: Path, config: PeerConfig, lpips_weights: Path | None) 
     """The numbers of `tasks.evaluate_soup.evaluate_run` for a finished run of `train_peer`; no opaque ones."""
     gsplat, device = load_gsplat()
     paths = RunDirectory(folder).read_config()["paths"]
-    capture = load_capture(paths["source"], images=paths["images"], width=config.width, preload=False).normalized()
+    capture = load_dataset(paths["source"], images=paths["images"], width=config.width, preload=False).normalized()
     gaussians = load_gaussians(folder / FILE, device)
     drawing = PeerDrawing(gsplat, gaussians, capture, config, device)
     lpips, reason = load_lpips(lpips_weights, device)
@@ -111,7 +112,7 @@ class PeerDrawing:
     """Pictures of finished Gaussians, and how they compare with the photos of the test views."""
 
     def __init__(
-        self, gsplat: Any, gaussians: nn.ParameterDict, capture: Capture, config: PeerConfig, device: torch.device
+        self, gsplat: Any, gaussians: nn.ParameterDict, capture: Dataset, config: PeerConfig, device: torch.device
     ) -> None:
         self._gsplat, self._gaussians, self._capture, self._config = gsplat, gaussians, capture, config
         self._background = _background(config, device)
@@ -145,7 +146,7 @@ class PeerDrawing:
 class _Fitting:
     """Parameters, their optimizers and gsplat's strategy: what `tasks.running.fit` drives."""
 
-    def __init__(self, gsplat: Any, capture: Capture, config: PeerConfig, device: torch.device) -> None:
+    def __init__(self, gsplat: Any, capture: Dataset, config: PeerConfig, device: torch.device) -> None:
         self._gsplat, self._config, self._device = gsplat, config, device
         generator = torch.Generator().manual_seed(config.seed)
         positions, colors = capture.points, capture.point_colors
@@ -175,7 +176,7 @@ class _Fitting:
         )
         self._strategy.check_sanity(self.gaussians, self._optimizers)
         self._state = self._strategy.initialize_state(scene_scale=1.0)  # the frame is normalized
-        self._views = CaptureViews(capture, device)
+        self._views = ViewLoader(capture, device)
         self._sampler = ViewSampler(capture.train, generator)
         self._background = _background(config, device)
 
@@ -235,7 +236,7 @@ class _Fitting:
 
     def _step(self, iteration: int) -> Tensor:
         """One view: draws, learns, densifies; returns the loss before it, on the device."""
-        config, view = self._config, self._sampler.next_view()
+        config, view = self._config, self._views.view(self._sampler.next_view())
         decay = exponential_decay(iteration, config.iterations, config.lr_means_final)
         self._optimizers["means"].param_groups[0]["lr"] = config.lr_means * decay
         regularized = (
@@ -244,7 +245,7 @@ class _Fitting:
         splatting = splat(
             self._gsplat,
             self.gaussians,
-            self._views.cameras[view],
+            view.camera,
             config,
             self._background,
             sh_degree=min(config.sh_degree, (iteration - 1) // config.at(config.sh_every)),
@@ -264,13 +265,12 @@ class _Fitting:
             self._gsplat.strategy.ops.reset_opa(*arguments[:3], 2 * config.prune_opacity)
         return loss.detach()
 
-    def _loss(self, splatting: Splatting, view: int) -> Tensor:
-        mask = self._views.mask(view)
+    def _loss(self, splatting: Splatting, view: View) -> Tensor:
         loss = photometric_loss(
             splatting.color,
-            self._views.photo(view)[None],
+            view.photo,
             self._config.lambda_dssim,
-            None if mask is None else mask[None].float() / 255,
+            None if view.mask is None else view.mask.float() / 255,
             backgrounds=self._background,
         )
         if splatting.normals is None:

@@ -16,7 +16,7 @@ import torch
 from PIL import Image
 
 from etsplat.core.errors import InputError
-from etsplat.data.captures import load_capture
+from etsplat.data.load import load_dataset
 from etsplat.data.structure_from_motion import find_cameras
 from etsplat.data.undistortion import undistort_scene, working_folder
 from etsplat.io import datasets
@@ -95,7 +95,7 @@ def test_real_photos_become_a_scene_that_loads(tmp_path, shared_data):
         progress=lambda phase, done, total: phases.append(phase),
     )
     assert (len(found.placed), found.unplaced) == (5, [])
-    capture = load_capture(found.scene)
+    capture = load_dataset(found.scene)
     assert len(capture) == 5
     assert len(capture.points) == found.points > 100
     assert list(dict.fromkeys(phases)) == [
@@ -111,9 +111,9 @@ def test_a_distorted_scene_is_refused_with_the_remedy_and_undistorted_once(tmp_p
     pytest.importorskip("pycolmap")
     write_colmap(tmp_path / "scene", [(64, 48)] * 3, model=model, extra=extra)
     with pytest.raises(InputError, match=rf"{model}.*etsplat data undistort"):
-        load_capture(tmp_path / "scene")
+        load_dataset(tmp_path / "scene")
     undistort_scene(tmp_path / "scene", tmp_path / "new")
-    capture = load_capture(tmp_path / "new")
+    capture = load_dataset(tmp_path / "new")
     assert (len(capture), len(capture.points)) == (3, 20)
     assert all(abs(width / height - 64 / 48) < 0.2 for width, height in capture.images.sizes)
     (tmp_path / "scene" / "images" / "0001.jpg").unlink()
@@ -148,7 +148,7 @@ def test_distortion_of_transforms_json_is_removed_once(tmp_path, model):
         tmp_path / "scene", 3, width=160, height=120, fl_y=150, cx=83, cy=58, camera_model=model, **LENSES[model]
     )
     with pytest.raises(InputError, match="etsplat data undistort"):
-        load_capture(tmp_path / "scene")
+        load_dataset(tmp_path / "scene")
     ray = (0.3, -0.2)
     u, v = distorted(*ray, model, **LENSES[model])
     rows, columns = np.mgrid[:120, :160] + 0.5
@@ -159,7 +159,7 @@ def test_distortion_of_transforms_json_is_removed_once(tmp_path, model):
         (tmp_path / "scene" / "masks").mkdir(exist_ok=True)
         Image.fromarray(dot).save(tmp_path / "scene" / "masks" / f"{index:04d}.png")
     assert undistort_scene(tmp_path / "scene", tmp_path / "new") == ["0000.png", "0001.png", "0002.png"]
-    capture = load_capture(tmp_path / "new")
+    capture = load_dataset(tmp_path / "new")
     expected = (capture.Ks[1] @ torch.tensor([*ray, 1.0], dtype=torch.float64))[:2]
     for picture in (capture.images[1][..., 0], capture.images.mask(1)):
         weight = picture.double()

@@ -4,12 +4,12 @@ import torch
 from etsplat.cli.parse import parse
 from etsplat.cli.reconstruct import Demo
 from etsplat.cli.train import DemoScene, Train
-from etsplat.data.captures import Capture
+from etsplat.data.dataset import Dataset
 from etsplat.data.demo_scene import demo_scene
 
 
 @pytest.fixture(scope="module")
-def capture() -> Capture:
+def capture() -> Dataset:
     return demo_scene(120, 90)
 
 

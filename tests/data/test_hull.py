@@ -3,14 +3,14 @@ from dataclasses import replace
 import pytest
 import torch
 
-from etsplat.core.cameras import Cameras, intrinsics, look_at
+from etsplat.core.cameras import intrinsics, look_at
 from etsplat.core.errors import InputError
+from etsplat.data.dataset import Dataset
 from etsplat.data.demo_object import demo_object
-from etsplat.data.frames import posed_views
 from etsplat.data.hull import axes_meeting_point, bounding_sphere
+from etsplat.data.load import load_dataset
 from etsplat.data.photograph import photograph
-from etsplat.data.transforms import read_transforms
-from etsplat.data.views import Normalization, PosedViews
+from etsplat.data.pictures import StoredPictures
 from etsplat.geometry.icosphere import icosphere
 from etsplat.io.mesh_files import MeshFile
 from etsplat.ops.rasterize_hard import render_opaque
@@ -28,8 +28,7 @@ def pictures(mesh, eyes, target, width=64, height=48, fov=50.0):
         mesh.vertices, viewmats, Ks, width, height, faces=mesh.faces, face_colors=torch.ones(len(mesh.faces), 3)
     )
     names = [f"v{k}" for k in range(len(eyes))]
-    cameras = Cameras(viewmats, Ks, width, height)
-    return PosedViews(cameras, images, names, list(range(len(eyes))), [], Normalization.identity())
+    return Dataset(viewmats.double(), Ks.double(), StoredPictures(images), names, list(range(len(eyes))), [])
 
 
 def test_axes_that_meet_give_their_point():
@@ -63,23 +62,23 @@ def test_the_sphere_follows_units_and_place():
 
 def test_the_sphere_of_the_shared_lego_covers_every_silhouette(shared_data):
     """A mask pixel is explained by the sphere only if its viewing ray passes through it: true of all of them."""
-    views = posed_views(read_transforms(shared_data / "scenes" / "lego_blender"), width=100)
+    views = load_dataset(shared_data / "scenes" / "lego_blender", masks_as="alpha", width=100)
     center, radius = bounding_sphere(views)
     assert 1.1 < radius < 1.6  # the model's farthest corner is about 1.4 from the origin
     for index in range(0, len(views), 5):
-        row, column = (views.images[index, ..., 3] > 0.5).nonzero().T
+        row, column = (views.images[index][..., 3] > 0.5).nonzero().T
         pixel = torch.stack([column + 0.5, row + 0.5, torch.ones(len(row))], dim=1)
-        viewmat = views.cameras.viewmats[index]
-        ray = torch.nn.functional.normalize(pixel @ torch.linalg.inv(views.cameras.Ks[index]).T, dim=1)
+        viewmat = views.viewmats[index].float()
+        ray = torch.nn.functional.normalize(pixel @ torch.linalg.inv(views.Ks[index].float()).T, dim=1)
         middle = viewmat[:3, :3] @ center + viewmat[:3, 3]
         assert float(torch.linalg.cross(ray, middle.expand_as(ray)).norm(dim=1).max()) <= radius
 
 
 def test_views_without_masks_or_with_an_empty_or_full_mask_are_refused(owl_views):
     def with_alpha(index, value):
-        images = owl_views.images.clone()
+        images = torch.stack(list(owl_views.images))
         images[index, ..., 3] = value
-        return replace(owl_views, images=images)
+        return replace(owl_views, images=StoredPictures(images))
 
     with pytest.raises(InputError, match="neither transparency nor masks"):
         bounding_sphere(with_alpha(slice(None), 1.0))
@@ -93,24 +92,24 @@ def test_cameras_that_cannot_work_are_refused(owl_views):
     mesh = MeshFile(*icosphere(2))
     eyes = 4 * icosphere(0)[0]
     inside = pictures(mesh, torch.cat([eyes, torch.tensor([[0.0, 0, 0.2]])]), torch.zeros(3))
-    inside.images[-1, :10] = 0  # a hole in the wall, or the mask would cover the whole image
+    inside.images[-1][:10] = 0  # a hole in the wall, or the mask would cover the whole image
     with pytest.raises(InputError, match="view v12: its camera is inside the object"):
         bounding_sphere(inside)
-    away = replace(inside, images=inside.images[:2], names=["a", "b"], train=[0, 1], cameras=inside.cameras[:2])
-    flipped = away.cameras.viewmats.clone()
-    flipped[1, :3] = torch.diag(torch.tensor([-1.0, 1, -1])) @ flipped[1, :3]
+    photos = StoredPictures(list(inside.images)[:2])
+    away = Dataset(inside.viewmats[:2], inside.Ks[:2], photos, ["a", "b"], [0, 1], [])
+    flipped = away.viewmats.clone()
+    flipped[1, :3] = torch.diag(torch.tensor([-1.0, 1, -1], dtype=torch.float64)) @ flipped[1, :3]
     with pytest.raises(InputError, match="looks away"):
-        bounding_sphere(replace(away, cameras=replace(away.cameras, viewmats=flipped)))
-    parallel = away.cameras.viewmats[:1].repeat(2, 1, 1)
+        bounding_sphere(replace(away, viewmats=flipped))
+    parallel = away.viewmats[:1].repeat(2, 1, 1)
     parallel[1, 0, 3] += 1
     with pytest.raises(InputError, match="parallel"):
-        bounding_sphere(replace(away, cameras=replace(away.cameras, viewmats=parallel)))
+        bounding_sphere(replace(away, viewmats=parallel))
 
 
 def test_masks_that_contradict_the_poses_are_refused(owl_views):
     """Masks mirrored in half of the views, far off the axis, leave no common point."""
-    images = torch.zeros_like(owl_views.images)
-    for index in range(len(owl_views)):
-        images[index, :6, :6] = 1
+    images = torch.zeros(len(owl_views), 128, 128, 4)
+    images[:, :6, :6] = 1
     with pytest.raises(InputError, match="no point in common"):
-        bounding_sphere(replace(owl_views, images=images))
+        bounding_sphere(replace(owl_views, images=StoredPictures(images)))

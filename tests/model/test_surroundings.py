@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from etsplat.data.captures import Capture
+from etsplat.data.dataset import Dataset
 from etsplat.data.demo_scene import demo_scene
 from etsplat.model.soup_rendering import SoupAppearance, render_soup
 from etsplat.model.surroundings import Surroundings
@@ -13,16 +13,16 @@ from etsplat.model.triangle_soup import TriangleSoup
 
 
 @pytest.fixture(scope="module")
-def capture() -> Capture:
+def capture() -> Dataset:
     return demo_scene(32, 24).normalized()
 
 
 @pytest.fixture(scope="module")
-def sphere(capture: Capture) -> TriangleSoup:
+def sphere(capture: Dataset) -> TriangleSoup:
     return Surroundings.of(capture).soup(capture, 1)
 
 
-def test_it_surrounds_cameras_and_nearly_all_points(capture: Capture, sphere: TriangleSoup) -> None:
+def test_it_surrounds_cameras_and_nearly_all_points(capture: Dataset, sphere: TriangleSoup) -> None:
     """A point that structure from motion put far away does not move it."""
     assert capture.exact_points is not None
     middle = capture.centers[capture.train].mean(dim=0).float()
@@ -37,7 +37,7 @@ def test_it_surrounds_cameras_and_nearly_all_points(capture: Capture, sphere: Tr
     assert not bool(again.outermost(0.8 * sphere.vertices.detach()).any())
 
 
-def test_every_view_is_covered(capture: Capture, sphere: TriangleSoup) -> None:
+def test_every_view_is_covered(capture: Dataset, sphere: TriangleSoup) -> None:
     """There is no gap, and about a third of the background shines through at the start."""
     for camera in capture.cameras[:3]:
         alpha = render_soup(sphere, camera, SoupAppearance(near_plane=0.05)).alpha.detach()
@@ -45,7 +45,7 @@ def test_every_view_is_covered(capture: Capture, sphere: TriangleSoup) -> None:
         assert float(alpha.min()) > 0.4
 
 
-def test_colours_are_those_of_the_photos_there_and_next_to_it(capture: Capture) -> None:
+def test_colours_are_those_of_the_photos_there_and_next_to_it(capture: Dataset) -> None:
     """Red photos make a red sphere, also where none shows it."""
 
     class Red:

@@ -9,9 +9,9 @@ import pytest
 import torch
 
 from etsplat.cuda.graph import Repeated
+from etsplat.data.dataset import Dataset
 from etsplat.data.demo_object import demo_object
 from etsplat.data.photograph import photograph
-from etsplat.data.views import PosedViews
 from etsplat.optim.loop import Progress
 from etsplat.tasks.mesh_fitting import MeshFitting
 from etsplat.tasks.reconstruct import reconstruct
@@ -40,15 +40,13 @@ CONFIG = replace(
 
 
 @pytest.fixture(scope="module")
-def views() -> PosedViews:
+def views() -> Dataset:
     return photograph(demo_object(), 32, 32, elevations=(-35.0, 35.0), azimuths=3, supersampling=2)
 
 
-def fitting(
-    views: PosedViews, engine: str, config: ReconstructConfig = CONFIG, device: torch.device = CPU
-) -> MeshFitting:
-    views, config = views.to(device), replace(config, engine=engine)
-    return MeshFitting(make_start(None, views, config), views, config, lambda _: {})
+def fitting(views: Dataset, engine: str, config: ReconstructConfig = CONFIG, device: torch.device = CPU) -> MeshFitting:
+    config = replace(config, engine=engine)
+    return MeshFitting(make_start(None, views, config, device), views, config, lambda _: {})
 
 
 def run(problem: MeshFitting, last: int) -> list[float]:
@@ -71,9 +69,7 @@ def run(problem: MeshFitting, last: int) -> list[float]:
     ],
     ids=lambda settings: next(iter(settings.values())),
 )
-def test_steps_are_those_of_the_cpu_engine(
-    cuda_device: torch.device, views: PosedViews, settings: dict[str, Any]
-) -> None:
+def test_steps_are_those_of_the_cpu_engine(cuda_device: torch.device, views: Dataset, settings: dict[str, Any]) -> None:
     """Six steps and two subdivisions: the same faces, losses and parameters to rounding; Adam divides small gradients
     by small ones, so one parameter in a hundred may differ by more."""
     config = replace(CONFIG, **settings)
@@ -86,7 +82,7 @@ def test_steps_are_those_of_the_cpu_engine(
         assert float((difference > 1e-5).float().mean()) < 0.01, name
 
 
-def test_steps_queued_together_are_the_steps_one_by_one(cuda_device: torch.device, views: PosedViews) -> None:
+def test_steps_queued_together_are_the_steps_one_by_one(cuda_device: torch.device, views: Dataset) -> None:
     """The same bits, however many steps are queued before the host looks, and though room runs out on the way."""
     config = replace(CONFIG, subdivide_steps=0)
     together, one_by_one = (fitting(views, "cuda", config, cuda_device) for _ in range(2))
@@ -99,7 +95,7 @@ def test_steps_queued_together_are_the_steps_one_by_one(cuda_device: torch.devic
         assert torch.equal(parameter, one_by_one.mesh.parameters()[name])
 
 
-def test_replayed_steps_are_those_that_are_called(cuda_device: torch.device, views: PosedViews, monkeypatch) -> None:
+def test_replayed_steps_are_those_that_are_called(cuda_device: torch.device, views: Dataset, monkeypatch) -> None:
     """The same bits with graphs and without: all that changes from step to step is in device memory."""
     config = replace(CONFIG, iterations=9, subdivide_steps=0, sigma_final=0.2, views_per_step=2)
     replayed, called = (fitting(views, "cuda", config, cuda_device) for _ in range(2))
@@ -111,7 +107,7 @@ def test_replayed_steps_are_those_that_are_called(cuda_device: torch.device, vie
 
 
 @pytest.mark.parametrize(("method", "reads", "kernels"), [("elastic", 1, 17), ("raster-vertex", 0, 17)])
-def test_a_queued_step_reads_nothing_back(simt: Simt, views: PosedViews, method: str, reads: int, kernels: int) -> None:
+def test_a_queued_step_reads_nothing_back(simt: Simt, views: Dataset, method: str, reads: int, kernels: int) -> None:
     """Nothing in a step waits for the device, but for the rasterizer's look at its room outside of captured graphs; and
     few small kernels of torch are left."""
     problem = fitting(views, "cuda", replace(CONFIG, method=method))
@@ -124,7 +120,7 @@ def test_a_queued_step_reads_nothing_back(simt: Simt, views: PosedViews, method:
     assert calls.kernels() <= kernels
 
 
-def test_a_step_whose_buffers_overflow_is_made_again(simt: Simt, views: PosedViews) -> None:
+def test_a_step_whose_buffers_overflow_is_made_again(simt: Simt, views: Dataset) -> None:
     """While the flag is set nothing changes; after the repair the queue goes on where it stopped."""
     problem, undisturbed = fitting(views, "cuda"), fitting(views, "cuda")
     assert problem._queue is not None
@@ -135,7 +131,7 @@ def test_a_step_whose_buffers_overflow_is_made_again(simt: Simt, views: PosedVie
         assert torch.equal(parameter, undisturbed.mesh.parameters()[name])
 
 
-def test_a_loss_that_is_not_finite_stops_the_queue(cuda_device: torch.device, views: PosedViews) -> None:
+def test_a_loss_that_is_not_finite_stops_the_queue(cuda_device: torch.device, views: Dataset) -> None:
     """The losses end with it, and no step was made from there on."""
     problem = fitting(views, "cuda", device=cuda_device)
     with torch.no_grad():
@@ -147,7 +143,7 @@ def test_a_loss_that_is_not_finite_stops_the_queue(cuda_device: torch.device, vi
     assert torch.equal(problem.mesh.colors, before)
 
 
-def test_a_resumed_run_ends_with_the_same_bits(cuda_device: torch.device, views: PosedViews) -> None:
+def test_a_resumed_run_ends_with_the_same_bits(cuda_device: torch.device, views: Dataset) -> None:
     """State saved after iteration 4 and loaded into a new problem leads to the same parameters."""
     whole = fitting(views, "cuda", device=cuda_device)
     losses = run(whole, 4)

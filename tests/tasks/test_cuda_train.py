@@ -1,6 +1,7 @@
 """Steps of a triangle soup on the GPU engine, by the shim and, where there is one, on a GPU."""
 
 import math
+from copy import copy
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -9,9 +10,9 @@ import pytest
 import torch
 
 from etsplat.cuda.graph import Repeated
-from etsplat.data.capture_images import StoredImages
-from etsplat.data.captures import Capture
+from etsplat.data.dataset import Dataset
 from etsplat.data.demo_scene import demo_scene
+from etsplat.data.pictures import StoredPictures
 from etsplat.model.soup_init import StartPoints, start_soup
 from etsplat.optim.loop import Progress
 from etsplat.tasks.soup_fitting import SoupFitting
@@ -34,26 +35,25 @@ CPU = torch.device("cpu")
 
 
 @pytest.fixture(scope="module")
-def capture() -> Capture:
+def capture() -> Dataset:
     """Photos of two sizes, some of them with an alpha channel, and a mask for one in three."""
     scene = demo_scene(40, 32)
     pixels = [image[:24] if index % 2 else image for index, image in enumerate(scene.images)]
     for index in range(0, len(pixels), 4):
         alpha = torch.full((*pixels[index].shape[:2], 1), 255, dtype=torch.uint8)
         pixels[index] = torch.cat([pixels[index], alpha], dim=-1)
-    return replace(scene, images=MaskedImages(pixels))
+    masks = [left_half(image) if index % 3 == 0 else None for index, image in enumerate(pixels)]
+    return replace(scene, images=StoredPictures(pixels, masks))
 
 
-class MaskedImages(StoredImages):
-    """The left half of every third image counts."""
-
-    def mask(self, index: int) -> torch.Tensor | None:  # type: ignore[override]
-        mask = torch.zeros(self[index].shape[:2], dtype=torch.uint8)
-        mask[:, :20] = 255
-        return mask if index % 3 == 0 else None
+def left_half(image: torch.Tensor) -> torch.Tensor:
+    """Which counts."""
+    mask = torch.zeros(image.shape[:2], dtype=torch.uint8)
+    mask[:, :20] = 255
+    return mask
 
 
-def fitting(capture: Capture, engine: str, device: torch.device = CPU, config: TrainConfig = CONFIG) -> SoupFitting:
+def fitting(capture: Dataset, engine: str, device: torch.device = CPU, config: TrainConfig = CONFIG) -> SoupFitting:
     generator = torch.Generator().manual_seed(3)
     assert capture.points is not None
     chosen = capture.points[::150]
@@ -87,7 +87,7 @@ def same_bits(first: SoupFitting, second: SoupFitting) -> None:
     ],
     ids=["plain", "finish", "paper", "single-sided"],
 )
-def test_steps_are_those_of_the_cpu_engine(cuda_device: torch.device, capture: Capture, settings: Any) -> None:
+def test_steps_are_those_of_the_cpu_engine(cuda_device: torch.device, capture: Dataset, settings: Any) -> None:
     """Three steps: the same losses, and statistics and parameters to rounding but for a few triangles, where Adam
     divided small gradients by small ones; then a densification and three more."""
     config = replace(CONFIG, **settings)
@@ -132,10 +132,10 @@ def test_replayed_steps_are_those_that_are_called(cuda_device: torch.device, mon
     same_bits(replayed, called)
 
 
-def test_streamed_photos_give_the_same_bits(cuda_device: torch.device, capture: Capture) -> None:
+def test_streamed_photos_give_the_same_bits(cuda_device: torch.device, capture: Dataset) -> None:
     """Where photos do not fit, each is uploaded before its step."""
-    images = MaskedImages(list(capture.images))
-    images.streamed = True
+    images = copy(capture.images)
+    images.streamed = True  # type: ignore[misc]
     streamed, kept = (fitting(replace(capture, images=i), "cuda", cuda_device) for i in (images, capture.images))
     assert run(streamed, 6) == run(kept, 6)
     same_bits(streamed, kept)
@@ -161,7 +161,7 @@ def test_a_queued_step_reads_nothing_back(simt: Simt, settings: Any, own: int, k
     assert calls.kernels() <= kernels
 
 
-def test_a_step_whose_buffers_overflow_is_made_again(simt: Simt, capture: Capture) -> None:
+def test_a_step_whose_buffers_overflow_is_made_again(simt: Simt, capture: Dataset) -> None:
     """While the flag is set nothing changes; after the repair the queue goes on where it stopped."""
     problem, undisturbed = fitting(capture, "cuda"), fitting(capture, "cuda")
     assert problem._queue is not None
@@ -171,7 +171,7 @@ def test_a_step_whose_buffers_overflow_is_made_again(simt: Simt, capture: Captur
     same_bits(problem, undisturbed)
 
 
-def test_a_loss_that_is_not_finite_stops_the_queue(cuda_device: torch.device, capture: Capture) -> None:
+def test_a_loss_that_is_not_finite_stops_the_queue(cuda_device: torch.device, capture: Dataset) -> None:
     """The losses end with it, and nothing has changed from there on, statistics included."""
     problem = fitting(capture, "cuda", cuda_device)
     with torch.no_grad():
@@ -184,7 +184,7 @@ def test_a_loss_that_is_not_finite_stops_the_queue(cuda_device: torch.device, ca
     assert int(problem.statistics.trial.max()) == 0
 
 
-def test_a_resumed_run_ends_with_the_same_bits(cuda_device: torch.device, capture: Capture) -> None:
+def test_a_resumed_run_ends_with_the_same_bits(cuda_device: torch.device, capture: Dataset) -> None:
     """State saved after iteration 4 and loaded into a new problem leads to the same soup and statistics."""
     whole = fitting(capture, "cuda", cuda_device)
     run(whole, 4)

@@ -4,7 +4,7 @@ import torch
 from PIL import Image
 
 from etsplat.core.errors import InputError
-from etsplat.data.captures import load_capture
+from etsplat.data.load import load_dataset
 from etsplat.io.images import save_image
 from etsplat.metrics.image import psnr, ssim
 from etsplat.model.soup_files import SoupFile
@@ -28,7 +28,7 @@ def soup(rng):
 
 def test_numbers_are_the_metrics_of_each_view_and_their_mean(tmp_path, soup):
     write_colmap(tmp_path / "scene", [(33, 24)] * 9)
-    run = SoupRun(tmp_path, SoupFile(soup), load_capture(tmp_path / "scene"))
+    run = SoupRun(tmp_path, SoupFile(soup), load_dataset(tmp_path / "scene"))
     found = evaluate_run(run, pictures=tmp_path / "pictures")
     assert [row["name"] for row in found["views"]] == ["0000", "0008"]
     for row, view in zip(found["views"], (0, 8), strict=True):
@@ -53,14 +53,14 @@ def test_masked_pixels_do_not_count(tmp_path, soup):
     for index in range(2):
         write_photo(tmp_path / "scene" / "masks" / f"{index:04d}.png", 33, 24)
         save_image(tmp_path / "scene" / "masks" / f"{index:04d}.png", torch.zeros(24, 33, 1))
-    found = evaluate_run(SoupRun(tmp_path, SoupFile(soup), load_capture(tmp_path / "scene")))
+    found = evaluate_run(SoupRun(tmp_path, SoupFile(soup), load_dataset(tmp_path / "scene")))
     assert found["psnr"] == float("inf")
     assert found["ssim"] == pytest.approx(1.0)
 
 
 def test_without_test_views_there_is_nothing_to_measure(tmp_path, soup):
     write_colmap(tmp_path / "scene", [(33, 24)] * 2)
-    capture = load_capture(tmp_path / "scene")
+    capture = load_dataset(tmp_path / "scene")
     capture.test.clear()
     with pytest.raises(InputError, match="no test views"):
         evaluate_run(SoupRun(tmp_path, SoupFile(soup), capture))

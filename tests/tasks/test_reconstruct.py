@@ -246,7 +246,7 @@ def test_a_given_mesh_is_the_start(pebble: MeshFile, tmp_path: Path) -> None:
 
 
 def test_views_can_be_handed_over(pebble: MeshFile, tmp_path: Path) -> None:
-    """PosedViews of an object without a true mesh: image metrics are there, those against the mesh are null."""
+    """A data set of an object without a true mesh: image metrics are there, those against the mesh are null."""
     metrics = reconstruct(photograph(pebble, 48, 48, supersampling=1), tmp_path, SHORT).metrics
     assert metrics["psnr"] > 5
     assert metrics["chamfer"] is None

@@ -6,7 +6,7 @@ import torch
 
 from etsplat.core.errors import InputError
 from etsplat.data.camera_paths import PATHS, camera_centers, focus_point
-from etsplat.data.captures import load_capture
+from etsplat.data.load import load_dataset
 from etsplat.io import videos
 from etsplat.io.images import load_image
 from etsplat.io.videos import open_video
@@ -31,7 +31,7 @@ def run(tmp_path, rng):
         sigma=0.3,
         sh_degree=1,
     )
-    return SoupRun(tmp_path, SoupFile(soup, background=(0.0, 0.0, 1.0)), load_capture(tmp_path / "scene"))
+    return SoupRun(tmp_path, SoupFile(soup, background=(0.0, 0.0, 1.0)), load_dataset(tmp_path / "scene"))
 
 
 @pytest.mark.parametrize("name", ["orbit.mp4", "there.txt"])

@@ -8,7 +8,7 @@ import torch
 
 from etsplat.cli.parse import parse
 from etsplat.core.errors import InputError
-from etsplat.data.captures import load_capture
+from etsplat.data.load import load_dataset
 from etsplat.io.run_directory import RunDirectory
 from etsplat.model.soup_files import load_soup
 from etsplat.optim.loop import CheckpointEvent
@@ -66,7 +66,7 @@ def test_a_scene_that_moved_is_named_with_an_option(trained, tmp_path):
 
 def test_a_run_is_no_scene(trained):
     with pytest.raises(InputError, match=r"run: neither .* choose the scene's folder that this run was made from"):
-        load_capture(trained[0] / "run")
+        load_dataset(trained[0] / "run")
 
 
 def test_a_reconstruction_is_told_where_its_mesh_is(tmp_path):

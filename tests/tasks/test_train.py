@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from etsplat.core.errors import InputError
-from etsplat.data.captures import Capture
+from etsplat.data.dataset import Dataset
 from etsplat.data.demo_scene import demo_scene
 from etsplat.io.run_directory import RunDirectory
 from etsplat.model.soup_files import load_soup
@@ -27,7 +27,7 @@ SHORT = replace(TINY, iterations=40, checkpoint_every=10, max_triangles=600, den
 
 
 @pytest.fixture(scope="module")
-def capture() -> Capture:
+def capture() -> Dataset:
     scene = demo_scene(64, 48)
     keep = torch.arange(0, 4000, 10)
     assert scene.exact_points is not None
@@ -36,7 +36,7 @@ def capture() -> Capture:
 
 
 @pytest.fixture(scope="module")
-def run(capture: Capture, tmp_path_factory: pytest.TempPathFactory) -> tuple[TrainResult, list[object]]:
+def run(capture: Dataset, tmp_path_factory: pytest.TempPathFactory) -> tuple[TrainResult, list[object]]:
     events: list[object] = []
     return train(capture, tmp_path_factory.mktemp("soup") / "run", TINY, callbacks=[events.append]), events
 
@@ -88,7 +88,7 @@ def test_triangles_multiply_up_to_the_cap(run: tuple[TrainResult, list[object]])
 
 
 @pytest.mark.parametrize("killed_at", [10, 30])
-def test_a_killed_run_ends_with_the_same_bits(capture: Capture, tmp_path: Path, killed_at: int) -> None:
+def test_a_killed_run_ends_with_the_same_bits(capture: Dataset, tmp_path: Path, killed_at: int) -> None:
     """Resumed before and after densifications, soup, metrics and history are those of a run that was never killed."""
     whole = train(capture, tmp_path / "whole", SHORT)
     with pytest.raises(RuntimeError, match="killed"):
@@ -103,7 +103,7 @@ def test_a_killed_run_ends_with_the_same_bits(capture: Capture, tmp_path: Path, 
 
 @pytest.mark.parametrize("method", ["single-sided", "bilateral"])
 @pytest.mark.parametrize("scene_type", ["indoor", "object"])
-def test_other_kernels_and_scenes_fit_too(capture: Capture, tmp_path: Path, method: str, scene_type: str) -> None:
+def test_other_kernels_and_scenes_fit_too(capture: Dataset, tmp_path: Path, method: str, scene_type: str) -> None:
     """All five losses of the paper's settings go down with every kernel, with small triangles left out."""
     paper = train_settings("paper", scene_type)
     config = replace(
@@ -124,7 +124,7 @@ def test_other_kernels_and_scenes_fit_too(capture: Capture, tmp_path: Path, meth
     assert losses[-1] < losses[0]
 
 
-def test_the_opaque_finish_leaves_nothing_soft(capture: Capture, tmp_path: Path) -> None:
+def test_the_opaque_finish_leaves_nothing_soft(capture: Dataset, tmp_path: Path) -> None:
     """At the end opacities are near 1 and sigma near 0, in the file too, and opaque drawing loses little."""
     result = train(capture, tmp_path / "run", replace(TINY, finish="opaque"))
     assert float(result.soup.opacities.min()) > 0.99
@@ -133,7 +133,7 @@ def test_the_opaque_finish_leaves_nothing_soft(capture: Capture, tmp_path: Path)
 
 
 def test_nan_names_iteration_parameter_and_checkpoint(
-    capture: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    capture: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A parameter that is not finite stops the run with one line that says all three."""
     honest = SoupFitting.advance
@@ -153,7 +153,7 @@ def test_nan_names_iteration_parameter_and_checkpoint(
     assert "step_000020" in message
 
 
-def test_a_capture_without_points_starts_at_random(capture: Capture, tmp_path: Path) -> None:
+def test_a_capture_without_points_starts_at_random(capture: Dataset, tmp_path: Path) -> None:
     """Random triangles where the cameras look, and a note about it."""
     bare = replace(capture, exact_points=None, point_colors=None)
     notes: list[object] = []
@@ -163,7 +163,7 @@ def test_a_capture_without_points_starts_at_random(capture: Capture, tmp_path: P
 
 
 def test_too_many_triangles_for_the_memory_are_refused(
-    capture: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    capture: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Memory is predicted before anything is written, and the message says what would fit."""
     monkeypatch.setattr(train_module, "available_memory", lambda: 1 << 30)
@@ -174,7 +174,7 @@ def test_too_many_triangles_for_the_memory_are_refused(
     assert not (tmp_path / "run").exists()
 
 
-def test_absolute_units_far_off_are_pointed_out(capture: Capture, tmp_path: Path) -> None:
+def test_absolute_units_far_off_are_pointed_out(capture: Dataset, tmp_path: Path) -> None:
     """Without normalization a scene a thousand times larger gets a note; with it, the same result as the small one."""
     assert capture.exact_points is not None
     viewmats = capture.viewmats.clone()
@@ -190,7 +190,7 @@ def test_absolute_units_far_off_are_pointed_out(capture: Capture, tmp_path: Path
     assert float(extent) == pytest.approx(1000, rel=0.02)
 
 
-def test_a_run_that_fails_for_its_scale_says_how_to_scale_it(capture: Capture, tmp_path: Path) -> None:
+def test_a_run_that_fails_for_its_scale_says_how_to_scale_it(capture: Dataset, tmp_path: Path) -> None:
     """A thousand times smaller, everything is nearer than the near plane: no triangle lives, and --normalize helps."""
     assert capture.exact_points is not None
     viewmats = capture.viewmats.clone()
@@ -257,7 +257,7 @@ def test_an_opaque_finish_replaces_what_it_hides() -> None:
 
 
 @pytest.mark.parametrize("replace_dead", [True, False])
-def test_growth_is_of_all_triangles_or_of_those_that_live(capture: Capture, replace_dead: bool) -> None:
+def test_growth_is_of_all_triangles_or_of_those_that_live(capture: Dataset, replace_dead: bool) -> None:
     """Otherwise a soup of which most triangles die in each edit would be made anew each time."""
     fitting = start_fitting(capture, replace(TINY, max_triangles=10_000, replace_dead=replace_dead), lambda *_: {})
     for iteration in range(1, len(capture.train)):  # no trial is over: nothing dies but what is made faint here
@@ -270,7 +270,7 @@ def test_growth_is_of_all_triangles_or_of_those_that_live(capture: Capture, repl
     assert most - 3 < fitting.count <= most  # a split that the budget does not allow is not made
 
 
-def test_few_photos_end_a_run_earlier(capture: Capture, tmp_path: Path) -> None:
+def test_few_photos_end_a_run_earlier(capture: Dataset, tmp_path: Path) -> None:
     """With `max_epochs` a run has so many iterations for each training photo, says so, and resumes with that length."""
     config = replace(SHORT, max_epochs=1)
     steps, events = len(capture.train), list[object]()

@@ -8,7 +8,7 @@ import torch
 
 from etsplat.cli.parse import parse
 from etsplat.core.errors import InputError
-from etsplat.data.captures import load_capture
+from etsplat.data.load import load_dataset
 from etsplat.io.run_directory import RunDirectory
 from etsplat.model.soup_files import SoupFile, save_soup
 from etsplat.model.triangle_soup import TriangleSoup
@@ -36,7 +36,7 @@ def make_soup(count, seed=0):
 def run(tmp_path):
     write_colmap(tmp_path / "scene", [(32, 24)] * 4)
     return SoupRun(
-        tmp_path / "soup.safetensors", SoupFile(make_soup(40)), load_capture(tmp_path / "scene", preload=False)
+        tmp_path / "soup.safetensors", SoupFile(make_soup(40)), load_dataset(tmp_path / "scene", preload=False)
     )
 
 

@@ -44,9 +44,17 @@ class Cameras:
 
     @property
     def centers(self) -> Float[Tensor, "B 3"]:
-        """Camera positions in world space, -R^T t."""
-        rotation, translation = self.viewmats[:, :3, :3], self.viewmats[:, :3, 3]
-        return -torch.einsum("bji,bj->bi", rotation, translation)
+        """Camera positions in world space."""
+        return camera_centers(self.viewmats)
+
+    @staticmethod
+    def stacked(cameras: Sequence["Cameras"]) -> "Cameras":
+        """Cameras of one size as a batch. Raises ValueError where sizes differ."""
+        sizes = {(camera.width, camera.height) for camera in cameras}
+        if len(sizes) != 1:
+            raise ValueError(f"cameras: expected images of one size, got {sorted(sizes)}")
+        viewmats, Ks = ([getattr(camera, name) for camera in cameras] for name in ("viewmats", "Ks"))
+        return Cameras(torch.cat(viewmats), torch.cat(Ks), *sizes.pop())
 
     def scaled(self, factor: float) -> "Cameras":
         """The same cameras with images ``factor`` times as large, rounded to whole pixels (at least one)."""
@@ -62,6 +70,11 @@ class Cameras:
             self.width,
             self.height,
         )
+
+
+def camera_centers(viewmats: Float[Tensor, "B 4 4"]) -> Float[Tensor, "B 3"]:
+    """Positions of cameras in world space, -R^T t."""
+    return -torch.einsum("bji,bj->bi", viewmats[:, :3, :3], viewmats[:, :3, 3])
 
 
 def look_at(

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from etsplat.core.cameras import look_at
+from etsplat.core.cameras import camera_centers, look_at
 
 Viewmats = Float[Tensor, "B 4 4"]
 
@@ -18,7 +18,7 @@ def focus_point(viewmats: Viewmats) -> Float[Tensor, "3"]:
     With axes d_i through c_i it solves sum_i (I - d_i d_i^T) (p - c_i) = 0. Axes that are all but parallel have no such
     point: it then lies ahead of the mean camera, at the distance of the cameras' spread.
     """
-    centers, forward = camera_centers(viewmats), viewmats[:, 2, :3].double()
+    centers, forward = camera_centers(viewmats.double()), viewmats[:, 2, :3].double()
     projections = torch.eye(3, dtype=torch.float64) - forward[:, :, None] * forward[:, None, :]
     total = projections.sum(dim=0)
     if float(torch.linalg.eigvalsh(total)[0]) < 1e-3 * len(viewmats):
@@ -27,16 +27,10 @@ def focus_point(viewmats: Viewmats) -> Float[Tensor, "3"]:
     return torch.linalg.solve(total, (projections @ centers[:, :, None]).sum(dim=0)[:, 0])
 
 
-def camera_centers(viewmats: Viewmats) -> Float[Tensor, "B 3"]:
-    """(B, 3) float64 positions."""
-    matrices = viewmats.double()
-    return -torch.einsum("bji,bj->bi", matrices[:, :3, :3], matrices[:, :3, 3])
-
-
 def orbit(viewmats: Viewmats, up: Float[Tensor, "3"], frames: int) -> Viewmats:
     """A circle around the focus at the cameras' median distance and mean height, looking at the focus."""
     focus, basis = focus_point(viewmats), _horizontal_basis(up)
-    offsets = camera_centers(viewmats) - focus
+    offsets = camera_centers(viewmats.double()) - focus
     flat = offsets @ basis.T
     height = (offsets @ up.double()).mean()
     radius = torch.maximum(flat.norm(dim=1).median(), 0.05 * height.abs())  # not straight above the focus
@@ -45,7 +39,7 @@ def orbit(viewmats: Viewmats, up: Float[Tensor, "3"], frames: int) -> Viewmats:
 
 def ellipse(viewmats: Viewmats, up: Float[Tensor, "3"], frames: int) -> Viewmats:
     """An ellipse through the outer cameras, along the main axes of where they stand, rising and sinking with them."""
-    focus, centers, basis = focus_point(viewmats), camera_centers(viewmats), _horizontal_basis(up)
+    focus, centers, basis = focus_point(viewmats), camera_centers(viewmats.double()), _horizontal_basis(up)
     middle = centers.mean(dim=0)
     flat = (centers - middle) @ basis.T
     basis = torch.linalg.eigh(flat.T @ flat).eigenvectors.T @ basis
@@ -60,7 +54,7 @@ def spiral(viewmats: Viewmats, up: Float[Tensor, "3"], frames: int) -> Viewmats:
 
     `up` is not used: it is the middle camera's own.
     """
-    focus, centers = focus_point(viewmats), camera_centers(viewmats)
+    focus, centers = focus_point(viewmats), camera_centers(viewmats.double())
     offsets = centers - centers.mean(dim=0)
     middle = int(offsets.norm(dim=1).argmin())
     own = viewmats[middle, :3, :3].double()  # rows: right, down, forward
@@ -76,7 +70,7 @@ def interpolated(viewmats: Viewmats, up: Float[Tensor, "3"], frames: int) -> Vie
 
     `up` is not used: orientations are the cameras' own.
     """
-    centers, rotations = camera_centers(viewmats), viewmats[:, :3, :3].double()
+    centers, rotations = camera_centers(viewmats.double()), viewmats[:, :3, :3].double()
     count = len(viewmats)
     if count == 1:
         return viewmats.double().expand(frames, 4, 4)

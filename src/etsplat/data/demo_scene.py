@@ -11,9 +11,8 @@ import numpy as np
 import torch
 
 from etsplat.core.cameras import Cameras, intrinsics, look_at, sphere_grid
-from etsplat.data.capture_images import StoredImages
-from etsplat.data.captures import Capture
-from etsplat.data.views import Normalization, every_eighth
+from etsplat.data.dataset import Dataset, every_eighth
+from etsplat.data.pictures import StoredPictures
 from etsplat.geometry.icosphere import icosphere
 from etsplat.ops.engines import one_torch_thread
 from etsplat.ops.rasterize_hard import render_opaque
@@ -30,7 +29,7 @@ Part = tuple[np.ndarray, np.ndarray]
 
 def demo_scene(
     width: int = WIDTH, height: int = HEIGHT, *, progress: Callable[[int, int], None] | None = None
-) -> Capture:
+) -> Dataset:
     """Photographs of the scene with their cameras and points: 42 views in two rings, every eighth of them for testing.
 
     Deterministic.
@@ -55,18 +54,17 @@ def demo_scene(
             if progress is not None:
                 progress(index + 1, len(viewmats))
     names = [f"view_{index:02d}" for index in range(len(viewmats))]
-    train, test = every_eighth(names)
+    train, test = every_eighth(len(names))
     chosen = torch.randperm(len(vertices), generator=torch.Generator().manual_seed(0))[:POINTS]
-    return Capture(
+    return Dataset(
         viewmats=viewmats.double(),
         Ks=K.double().expand(len(viewmats), 3, 3),
-        images=StoredImages(photos),
+        images=StoredPictures(photos),
         names=names,
         train=train,
         test=test,
         exact_points=vertices[chosen].mean(dim=1).double(),
         point_colors=base[chosen].clamp(0, 1),
-        normalization=Normalization(torch.zeros(3, dtype=torch.float64), 1.0),
     )
 
 

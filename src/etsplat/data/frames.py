@@ -1,31 +1,50 @@
-"""What all capture formats share: frames (file, pose, intrinsics, mask) with split and points; views made of them."""
+"""What all layouts of scene folders share: frames (file, pose, intrinsics, mask), and the data set made of them."""
 
+import hashlib
 import os
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from typing import Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from etsplat.core.cameras import Cameras
 from etsplat.core.errors import InputError
-from etsplat.data.views import Normalization, PosedViews
-from etsplat.io.images import IMAGE_SUFFIXES, image_size, load_image, load_mask, premultiply, resize_image
-from etsplat.io.paths import path_remedy
+from etsplat.data.dataset import Dataset, every_eighth
+from etsplat.data.pictures import LazyPictures, Picture
+from etsplat.io.images import (
+    IMAGE_SUFFIXES,
+    image_size,
+    load_image,
+    load_mask,
+    load_mask_pixels,
+    load_pixels,
+    premultiply,
+    resize_image,
+)
+from etsplat.io.paths import kind_of, path_remedy
+
+MAX_WIDTH = 1600
+"""Wider images are shrunk to this width unless another is asked for, as 3DGS does."""
+
+_SAMPLE = 4096
+"""So many bytes of each file's beginning, middle and end, with its length, tell it from others."""
+
+MasksAs = Literal["ignore", "alpha"]
 
 
 @dataclass(frozen=True)
 class Frame:
-    """One posed image of a capture.
+    """One posed image of a scene.
 
     Attributes:
-        name: path of the image as the capture names it, with forward slashes.
+        name: path of the image as the scene names it, with forward slashes.
         image: the file.
-        mask: its mask (white inside the object), or None.
+        mask: its mask (white inside the object, or where pixels count), or None.
         viewmat: (4, 4) float64, world to camera, OpenCV axes.
         K: (3, 3) float64, pixels of an image of `size`.
         size: (width, height) that K refers to; the file may be a smaller or larger copy.
@@ -40,79 +59,78 @@ class Frame:
 
 
 @dataclass(frozen=True)
-class FrameSet:
-    """What a reader finds in a capture; no image has been decoded yet.
+class Wanted:
+    """What is wanted of a scene; as `etsplat.data.load.load_dataset` takes it."""
 
-    Attributes:
-        source: the capture's folder, for error messages.
-        frames: at least one; their names are unique.
-        train: indices of the frames to optimise on, ascending.
-        test: indices of the frames held out, ascending.
-        points: (P, 3) float64, P > 0, in the units of the poses; or None.
-        point_colors: (P, 3) float32 in [0, 1] as displayed; or None without points.
-    """
-
-    source: Path
-    frames: list[Frame]
-    train: list[int]
-    test: list[int]
-    points: Float[Tensor, "P 3"] | None = None
-    point_colors: Float[Tensor, "P 3"] | None = None
-
-    def __post_init__(self) -> None:
-        name, count = Counter(frame.name for frame in self.frames).most_common(1)[0]
-        if count > 1:
-            raise InputError(f"scene {self.source}: {count} frames have the image {name}; keep one of them")
-        missing = [frame for frame in self.frames if not frame.image.is_file()]
-        if missing:
-            raise InputError(
-                f"scene {self.source}: {len(missing)} of {len(self.frames)} images are missing"
-                f" (first: {missing[0].image}); copy them there or remove their poses"
-            )
-
-    @property
-    def view_names(self) -> list[str]:
-        """Names fit for files: folders joined by underscores, endings dropped unless that made two alike."""
-        full = [frame.name.removeprefix("./").replace("/", "_") for frame in self.frames]
-        short = [PurePosixPath(name).stem for name in full]
-        return short if len(set(short)) == len(short) else full
+    masks_as: MasksAs = "ignore"
+    images: str | None = None
+    width: int | None = None
+    masks: Path | None = None
+    memory: int | None = None
 
 
-def posed_views(frame_set: FrameSet, *, width: int | None = None) -> PosedViews:
-    """Decode the images of all frames, in parallel, and set up their cameras in the capture's own units.
+def posed(
+    scene: Path,
+    frames: Sequence[Frame],
+    wanted: Wanted,
+    *,
+    split: tuple[list[int], list[int]] | None = None,
+    points: tuple[Float[Tensor, "P 3"], Float[Tensor, "P 3"]] | None = None,
+) -> Dataset:
+    """The data set of a scene's frames in its own units; no image has been decoded yet.
 
     Args:
-        frame_set: at least two frames.
-        width: shrink the images to this many pixels across (never enlarges).
+        scene: its folder, for error messages.
+        frames: of one scene.
+        wanted: width and kind of the images.
+        split: (train, test) indices; None for every 8th frame as test, `frames` being sorted by name.
+        points: (P, 3) float64 in the units of the poses, and (P, 3) float32 colours in [0, 1] as displayed.
 
     Raises:
-        InputError: fewer than two frames, damaged images, images of different sizes, or of another shape than the
-            intrinsics say; masks of another size than their images.
+        InputError: fewer than two frames, frames with one name, missing images, images of another shape than their
+            camera.
     """
-    source, frames = frame_set.source, frame_set.frames
-    check_count(source, frames)
-    if width is not None and width < 1:
-        raise ValueError(f"width: expected at least 1, got {width}")
-    size = _common_size(source, frames)
-    target = size if width is None or width >= size[0] else (width, max(1, round(size[1] * width / size[0])))
-    images = torch.empty(len(frames), target[1], target[0], 4)
-
-    def decode(index: int) -> None:
-        image = _masked_image(frames[index])
-        images[index] = image if target == size else resize_image(image, *target)
-
-    with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
-        list(pool.map(decode, range(len(frames))))  # list() re-raises the first error
-    Ks = torch.stack([scaled_intrinsics(source, frame, size, target) for frame in frames])
+    check_frames(scene, frames)
+    if len(frames) < 2:  # one to learn from, one to test
+        raise InputError(f"scene {scene}: has {len(frames)} posed images; at least 2 are needed, better 20")
+    Ks, sizes = [], []
+    for frame in frames:
+        size = image_size(frame.image)
+        across = min(size[0], wanted.width or MAX_WIDTH)
+        sizes.append((across, max(1, round(size[1] * across / size[0]))))
+        Ks.append(scaled_intrinsics(scene, frame, size, sizes[-1]))
+    decode = _DECODERS[wanted.masks_as]
+    files = [file for frame in frames for file in (frame.image, frame.mask) if file is not None]
+    pictures = LazyPictures(
+        lambda view: decode(frames[view], sizes[view]),
+        sizes,
+        [_size_in_bytes(frame, size, wanted.masks_as) for frame, size in zip(frames, sizes, strict=True)],
+        lambda: _fingerprint(files),
+        wanted.memory,
+    )
+    train, test = split or every_eighth(len(frames))
     viewmats = torch.stack([frame.viewmat for frame in frames])
-    cameras = Cameras(viewmats.float(), Ks.float(), *target)
-    return PosedViews(cameras, images, frame_set.view_names, frame_set.train, frame_set.test, Normalization.identity())
+    return Dataset(viewmats, torch.stack(Ks), pictures, _view_names(frames), train, test, *(points or (None, None)))
 
 
-def check_count(source: Path, frames: Sequence[Frame]) -> None:
-    """Raises InputError for fewer than two frames: one to learn from, one to test."""
-    if len(frames) < 2:
-        raise InputError(f"scene {source}: has {len(frames)} posed images; at least 2 are needed, better 20")
+def check_frames(scene: Path, frames: Sequence[Frame]) -> None:
+    """Raises InputError where two have one name, or images are missing."""
+    name, count = Counter(frame.name for frame in frames).most_common(1)[0]
+    if count > 1:
+        raise InputError(f"scene {scene}: {count} frames have the image {name}; keep one of them")
+    missing = [frame for frame in frames if not frame.image.is_file()]
+    if missing:
+        raise InputError(
+            f"scene {scene}: {len(missing)} of {len(frames)} images are missing"
+            f" (first: {missing[0].image}); copy them there or remove their poses"
+        )
+
+
+def _view_names(frames: Sequence[Frame]) -> list[str]:
+    """Names fit for files: folders joined by underscores, endings dropped unless that made two alike."""
+    full = [frame.name.removeprefix("./").replace("/", "_") for frame in frames]
+    short = [PurePosixPath(name).stem for name in full]
+    return short if len(set(short)) == len(short) else full
 
 
 def find_image(folder: Path, name: str) -> Path:
@@ -143,33 +161,8 @@ def _with_any_ending(path: Path) -> Path | None:
     return next((candidate for candidate in candidates if candidate.is_file()), None)
 
 
-def _common_size(source: Path, frames: Sequence[Frame]) -> tuple[int, int]:
-    first = image_size(frames[0].image)
-    for frame in frames:
-        size = image_size(frame.image)
-        if size != first:
-            raise InputError(
-                f"scene {source}: images of different sizes ({frames[0].name} is {first[0]}x{first[1]}, {frame.name} is"
-                f" {size[0]}x{size[1]}); resize them to one size"
-            )
-    return first
-
-
-def _masked_image(frame: Frame) -> Float[Tensor, "H W 4"]:
-    image = premultiply(load_image(frame.image))
-    if frame.mask is None:
-        return image
-    mask = load_mask(frame.mask)
-    if mask.shape != image.shape[:2]:
-        raise InputError(
-            f"mask {frame.mask}: is {mask.shape[1]}x{mask.shape[0]}, its image is {image.shape[1]}x{image.shape[0]};"
-            " resize the mask"
-        )
-    return image * mask[..., None]
-
-
 def scaled_intrinsics(
-    source: Path, frame: Frame, size: tuple[int, int], target: tuple[int, int]
+    scene: Path, frame: Frame, size: tuple[int, int], target: tuple[int, int]
 ) -> Float[Tensor, "3 3"]:
     """K for images of `target` pixels, when the file has `size` and K refers to `frame.size`; float64.
 
@@ -179,8 +172,63 @@ def scaled_intrinsics(
     scale = size[0] / frame.size[0]
     if abs(frame.size[1] * scale - size[1]) > 2:  # downscaled copies are rounded to whole pixels
         raise InputError(
-            f"scene {source}: {frame.name} is {size[0]}x{size[1]}, but its camera is for"
+            f"scene {scene}: {frame.name} is {size[0]}x{size[1]}, but its camera is for"
             f" {frame.size[0]}x{frame.size[1]}; use the images that the poses were made from"
         )
     ratio = torch.tensor([target[0] / frame.size[0], target[1] / frame.size[1], 1.0], dtype=torch.float64)
     return frame.K * ratio[:, None]
+
+
+def _size_in_bytes(frame: Frame, size: tuple[int, int], masks_as: MasksAs) -> int:
+    """An upper bound: PNG files may turn out to have no transparency."""
+    channels = (4 if kind_of(frame.image) == ".png" else 3) + (frame.mask is not None)
+    return size[0] * size[1] * (16 if masks_as == "alpha" else channels)
+
+
+def _bytes_and_mask(frame: Frame, size: tuple[int, int]) -> Picture:
+    pixels = load_pixels(frame.image, *size)
+    return Picture(pixels, None if frame.mask is None else load_mask_pixels(frame.mask, *size))
+
+
+def _masked_rgba(frame: Frame, size: tuple[int, int]) -> Picture:
+    """Shrunk in float, after the mask: a silhouette keeps its place to a part of a pixel."""
+    image = premultiply(load_image(frame.image))
+    if frame.mask is not None:
+        mask = load_mask(frame.mask)
+        if mask.shape != image.shape[:2]:
+            raise InputError(
+                f"mask {frame.mask}: is {mask.shape[1]}x{mask.shape[0]}, its image is"
+                f" {image.shape[1]}x{image.shape[0]}; resize the mask"
+            )
+        image = image * mask[..., None]
+    return Picture(image if size == (image.shape[1], image.shape[0]) else resize_image(image, *size))
+
+
+_DECODERS: dict[MasksAs, Callable[[Frame, tuple[int, int]], Picture]] = {
+    "ignore": _bytes_and_mask,
+    "alpha": _masked_rgba,
+}
+
+
+def _fingerprint(files: Sequence[Path]) -> bytes:
+    """What the files hold, not when they were written: the same for a copy. Decodes nothing."""
+    digest = hashlib.sha256()
+    with ThreadPoolExecutor() as pool:
+        for sample in pool.map(_sample, files):
+            digest.update(sample)
+    return digest.digest()
+
+
+def _sample(path: Path) -> bytes:
+    """A hash of a file's length and of three parts of it."""
+    digest = hashlib.sha256()
+    try:
+        with open(path, "rb") as file:
+            size = file.seek(0, os.SEEK_END)
+            digest.update(size.to_bytes(8, "little"))
+            for start in (0, size // 2, max(0, size - _SAMPLE)):
+                file.seek(start)
+                digest.update(file.read(_SAMPLE))
+    except OSError as error:
+        raise InputError(f"image {path}: cannot be read ({error.strerror}); copy it there again") from error
+    return digest.digest()

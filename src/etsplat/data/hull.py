@@ -12,8 +12,10 @@ from jaxtyping import Float
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
+from etsplat.core.cameras import camera_centers
 from etsplat.core.errors import InputError
-from etsplat.data.views import PosedViews
+from etsplat.data.dataset import Dataset
+from etsplat.data.pictures import Pixels, as_float
 
 _CELLS = 48
 """Grid cells per side, at each of the levels."""
@@ -25,7 +27,7 @@ _MASK_WIDTH = 200
 """Silhouettes are shrunk to about this many pixels across (a pixel counts as inside if any part of it was)."""
 
 
-def bounding_sphere(views: PosedViews) -> tuple[Float[Tensor, "3"], float]:
+def bounding_sphere(dataset: Dataset) -> tuple[Float[Tensor, "3"], float]:
     """A sphere that encloses the object: centred where the optical axes meet best, out to the visual hull.
 
     The hull is carved from a grid between the cameras with the masks of the training views. A view whose silhouette
@@ -34,7 +36,7 @@ def bounding_sphere(views: PosedViews) -> tuple[Float[Tensor, "3"], float]:
     half of the views.
 
     Args:
-        views: with masks (alpha), in any frame.
+        dataset: photos with alpha, in any frame.
 
     Returns:
         center (3,) and radius, in the frame of the cameras.
@@ -43,26 +45,28 @@ def bounding_sphere(views: PosedViews) -> tuple[Float[Tensor, "3"], float]:
         InputError: no masks; a view that sees nothing of the object or nothing else; axes that do not meet in front
             of the cameras; silhouettes that have no common point; a camera inside the hull.
     """
-    cameras = views.cameras[views.train]
-    names = [views.names[index] for index in views.train]
-    step = max(1, cameras.width // _MASK_WIDTH)
-    inside = _silhouettes(views, names, step)
-    viewmats, center = cameras.viewmats.double().numpy(), axes_meeting_point(cameras.viewmats)
+    names = [dataset.names[index] for index in dataset.train]
+    steps = np.array([max(1, dataset.images.sizes[index][0] // _MASK_WIDTH) for index in dataset.train])
+    inside = _silhouettes(dataset, names, steps)
+    rounded = dataset.viewmats[dataset.train].float()  # as the cameras have them
+    viewmats, center = rounded.double().numpy(), axes_meeting_point(rounded)
     meeting = center.numpy()
     depth = viewmats[:, 2, :3] @ meeting + viewmats[:, 2, 3]
     if (depth <= 0).any():
         raise InputError(
             f"view {names[depth.argmin()]}: looks away from where the others look; an object needs views around it"
         )
-    outside = np.stack([np.asarray(distance_transform_edt(~mask)) for mask in inside])
-    carver = _Carver(viewmats, cameras.Ks.double().numpy() / np.array([[step], [step], [1]]), outside)
-    eyes = cameras.centers.double().numpy()
+    outside = [np.asarray(distance_transform_edt(~mask)) for mask in inside]
+    Ks = dataset.Ks[dataset.train].float().double().numpy()
+    Ks[:, :2] /= steps[:, None, None]
+    carver = _Carver(viewmats, Ks, outside)
+    eyes = camera_centers(rounded).double().numpy()
     kept, cell = _carve(carver, meeting, np.linalg.norm(eyes - meeting, axis=1).max())
     within = carver.keeps(eyes, 0.0)
     if within.any():
         raise InputError(f"view {names[within.argmax()]}: its camera is inside the object; remove that view")
     radius = float(np.linalg.norm(kept - meeting, axis=1).max()) + cell * 3**0.5 / 2
-    return center.to(cameras.viewmats.dtype), radius
+    return center.float(), radius
 
 
 def _carve(carver: "_Carver", center: np.ndarray, reach: float) -> tuple[np.ndarray, float]:
@@ -101,9 +105,9 @@ def axes_meeting_point(viewmats: Float[Tensor, "B 4 4"]) -> Float[Tensor, "3"]:
     return torch.linalg.solve(system, (projectors @ centers[..., None]).sum(dim=0)[:, 0])
 
 
-def _silhouettes(views: PosedViews, names: list[str], step: int) -> np.ndarray:
-    """(B, h, w) masks of the training views, `step` times smaller; a pixel is inside if any of its `step`^2 was."""
-    masks = [views.images[index, ..., 3].numpy() >= 0.5 for index in views.train]
+def _silhouettes(dataset: Dataset, names: list[str], steps: np.ndarray) -> list[np.ndarray]:
+    """Masks of the training views, each so many times smaller; a pixel is inside if any of those in it was."""
+    masks = [_alpha(dataset.images[index]) for index in dataset.train]
     empty = [name for name, mask in zip(names, masks, strict=True) if not mask.any()]
     if empty:
         raise InputError(f"view {empty[0]}: its mask is empty, it sees nothing of the object; remove the view")
@@ -118,9 +122,17 @@ def _silhouettes(views: PosedViews, names: list[str], step: int) -> np.ndarray:
             f"view {full[0]}: its mask covers the whole image; the mask is missing, or the camera is inside or too near"
             " the object: add the mask or remove the view"
         )
-    height, width = masks[0].shape
-    rows, columns = np.arange(0, height, step), np.arange(0, width, step)
-    return np.stack([np.logical_or.reduceat(np.logical_or.reduceat(m, rows), columns, axis=1) for m in masks])
+    return [_any_of(mask, step) for mask, step in zip(masks, steps, strict=True)]
+
+
+def _alpha(image: Pixels) -> np.ndarray:
+    """(H, W) whether a pixel is inside: everywhere without an alpha channel."""
+    return as_float(image[..., 3]).numpy() >= 0.5 if image.shape[-1] == 4 else np.ones(image.shape[:2], dtype=bool)
+
+
+def _any_of(mask: np.ndarray, step: int) -> np.ndarray:
+    rows, columns = (np.arange(0, size, step) for size in mask.shape)
+    return np.logical_or.reduceat(np.logical_or.reduceat(mask, rows), columns, axis=1)
 
 
 @dataclass
@@ -130,24 +142,23 @@ class _Carver:
     Attributes:
         viewmats: (B, 4, 4) float64.
         Ks: (B, 3, 3) float64, for the shrunk silhouettes.
-        outside: (B, h, w) distance of each pixel to the silhouette, in pixels, 0 inside.
+        outside: B times (h, w), distance of each pixel to the silhouette, in pixels, 0 inside.
     """
 
     viewmats: np.ndarray
     Ks: np.ndarray
-    outside: np.ndarray
+    outside: list[np.ndarray]
 
     def keeps(self, points: np.ndarray, cell: float) -> np.ndarray:
         """(N,) whether the cube of side `cell` about each point may reach into the silhouettes of all that judge it."""
         alive = np.arange(len(points))
         judged = np.zeros(len(points), dtype=np.int32)
-        height, width = self.outside.shape[1:]
         for viewmat, K, outside in zip(self.viewmats, self.Ks, self.outside, strict=True):
             camera = points[alive] @ viewmat[:3, :3].T + viewmat[:3, 3]
             z = camera[:, 2]
             front = z > 0
             pixel = (camera[:, :2] / np.where(front, z, 1)[:, None]) * K.diagonal()[:2] + K[:2, 2]
-            framed = front & ((pixel >= 0) & (pixel < (width, height))).all(axis=1)
+            framed = front & ((pixel >= 0) & (pixel < outside.shape[::-1])).all(axis=1)
             column, row = pixel[framed].astype(np.int64).T
             # Half the cube's diagonal on the screen, and half a pixel's.
             reach = K[0, 0] * 0.87 * cell / z[framed] + 0.71

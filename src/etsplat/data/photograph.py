@@ -15,7 +15,8 @@ from torch import Tensor
 
 from etsplat.core.cameras import Cameras, intrinsics, look_at, sphere_grid
 from etsplat.core.errors import InputError
-from etsplat.data.views import Normalization, PosedViews
+from etsplat.data.dataset import Dataset, Normalization
+from etsplat.data.pictures import StoredPictures
 from etsplat.geometry.measures import bounding_ball
 from etsplat.io.mesh_files import MeshFile
 from etsplat.ops.rasterize_hard import render_opaque
@@ -58,7 +59,7 @@ def photograph(
     supersampling: int = 4,
     progress: Callable[[int, int], None] | None = None,
     device: torch.device | str = "cpu",
-) -> PosedViews:
+) -> Dataset:
     """Normalise a mesh and take its pictures. View index is `azimuths` * elevation + azimuth.
 
     Args:
@@ -69,10 +70,10 @@ def photograph(
         azimuths: number of directions around +y, evenly spaced.
         supersampling: samples per pixel side.
         progress: called after each picture with (pictures taken, pictures in all).
-        device: where the pictures are taken, and stay.
+        device: where the pictures are taken, before they come to the CPU.
 
     Returns:
-        Views in the unit frame; those with index % 5 == 2 are test views.
+        Views in the unit frame with float32 pictures; those with index % 5 == 2 are test views.
 
     Raises:
         ValueError: `width` below `height`, or elevations that look along the vertical.
@@ -83,27 +84,37 @@ def photograph(
     if not all(-90 < elevation < 90 for elevation in elevations):
         raise ValueError(f"elevations: expected degrees strictly between -90 and 90, got {list(elevations)}")
     unit, normalization = normalize_mesh(mesh)
-    cameras = orbit_cameras(width, height, elevations=elevations, azimuths=azimuths).to(device)
+    cameras = orbit_cameras(width, height, elevations=elevations, azimuths=azimuths)
     vertices, faces = unit.vertices.to(device), unit.faces.to(device)
     colors = shade_faces(unit.vertices, unit.faces).to(device)
-    images = torch.empty(len(cameras), height, width, 4, device=device)
+    images = []
     for view in range(len(cameras)):
-        images[view] = render_opaque(
+        camera = cameras[view].to(device)
+        image = render_opaque(
             vertices,
-            cameras.viewmats[view : view + 1],
-            cameras.Ks[view : view + 1],
+            camera.viewmats,
+            camera.Ks,
             width,
             height,
             faces=faces,
             face_colors=colors,
             supersampling=supersampling,
         )[0]
+        images.append(image.cpu())
         if progress is not None:
             progress(view + 1, len(cameras))
     names = [f"{view:03d}" for view in range(len(cameras))]
     test = [view for view in range(len(cameras)) if view % 5 == 2]
     train = [view for view in range(len(cameras)) if view % 5 != 2]
-    return PosedViews(cameras, images, names, train, test, normalization)
+    return Dataset(
+        cameras.viewmats.double(),
+        cameras.Ks.double(),
+        StoredPictures(images),
+        names,
+        train,
+        test,
+        normalization=normalization,
+    )
 
 
 def orbit_cameras(width: int, height: int, *, elevations: Sequence[float] = ELEVATIONS, azimuths: int = 8) -> Cameras:

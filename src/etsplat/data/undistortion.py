@@ -9,13 +9,11 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePosixPath
 from typing import IO, Any
 
-import torch
-
 from etsplat.core.errors import InputError
-from etsplat.data.colmap import find_model
 from etsplat.data.colmap_process import import_pycolmap, run_apart, undistort_images
+from etsplat.data.formats.colmap import find_model
+from etsplat.data.formats.transforms import DistortedFrames, read_distorted_transforms
 from etsplat.data.frames import find_mask, scaled_intrinsics
-from etsplat.data.transforms import DistortedFrames, read_distorted_transforms
 from etsplat.io.atomic import write_error
 from etsplat.io.images import image_size, load_pixels
 from etsplat.io.paths import kind_of, path_remedy
@@ -191,18 +189,17 @@ def _read_model(pycolmap: Any, scene: Path, folder: Path) -> tuple[Any, Path, di
 def _make_model(pycolmap: Any, frames: DistortedFrames) -> Any:
     """A model of frames with their lenses, at the size of their files, and of their points."""
     model = pycolmap.Reconstruction()
-    for index, (name, frame, lens) in enumerate(zip(frames.names, frames.set.frames, frames.lenses, strict=True), 1):
+    for index, (name, frame, lens) in enumerate(zip(frames.names, frames.frames, frames.lenses, strict=True), 1):
         size = image_size(frame.image)
-        K = scaled_intrinsics(frames.set.source, frame, size, size)
+        K = scaled_intrinsics(frames.scene, frame, size, size)
         params = [float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]), *lens.coefficients]
         camera = pycolmap.Camera(model=lens.model, width=size[0], height=size[1], params=params, camera_id=index)
         model.add_camera_with_trivial_rig(camera)
         image = pycolmap.Image(name=name, camera_id=index, image_id=index)
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(frame.viewmat[:3].numpy()))
-    if frames.set.points is not None:
-        colors = frames.set.point_colors
-        bytes_ = (torch.full_like(frames.set.points, 0.5) if colors is None else colors).mul(255).round().byte()
-        for point, color in zip(frames.set.points.numpy(), bytes_.numpy(), strict=True):
+    if frames.points is not None:
+        points, colors = frames.points
+        for point, color in zip(points.numpy(), colors.mul(255).round().byte().numpy(), strict=True):
             model.add_point3D(point, pycolmap.Track(), color)
     return model
 

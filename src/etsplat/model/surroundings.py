@@ -1,4 +1,4 @@
-"""What lies behind everything in a capture: a closed sphere of triangles, coloured by the photos.
+"""What lies behind everything in a scene: a closed sphere of triangles, coloured by the photos.
 
 Photos of few views leave gaps between what they show. Without anything behind them a gap is a hole, and the background
 of a photo is learned by triangles in the air before its camera, where no other view expects them.
@@ -11,7 +11,8 @@ from jaxtyping import Bool, Float
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from etsplat.data.captures import Capture
+from etsplat.data.dataset import Dataset
+from etsplat.data.pictures import as_float
 from etsplat.geometry.icosphere import icosphere
 from etsplat.model.triangle_soup import TriangleSoup
 
@@ -32,7 +33,7 @@ _BLENDED = 8
 
 @dataclass(frozen=True)
 class Surroundings:
-    """The sphere around the cameras and nearly all points of a capture.
+    """The sphere around the cameras and nearly all points of a scene.
 
     Attributes:
         middle: (3,) mean of the training cameras.
@@ -43,30 +44,30 @@ class Surroundings:
     radius: float
 
     @classmethod
-    def of(cls, capture: Capture) -> "Surroundings":
+    def of(cls, dataset: Dataset) -> "Surroundings":
         """Where it is. Single points far from the others do not move it."""
-        centers = capture.centers[capture.train].float()
+        centers = dataset.centers[dataset.train].float()
         middle = centers.mean(dim=0)
-        everything = centers if capture.points is None else torch.cat([centers, capture.points])
+        everything = centers if dataset.points is None else torch.cat([centers, dataset.points])
         return cls(middle, REACH * float((everything - middle).norm(dim=1).quantile(_NEARLY_ALL)))
 
     def to(self, device: torch.device) -> "Surroundings":
         """The same on a device."""
         return replace(self, middle=self.middle.to(device))
 
-    def soup(self, capture: Capture, sh_degree: int) -> TriangleSoup:
+    def soup(self, dataset: Dataset, sh_degree: int) -> TriangleSoup:
         """Its triangles at the start.
 
         A triangle has the mean colour of the photos at its centroid. One that no photo shows gets the colours of those
         nearest to it that one shows.
 
         Args:
-            capture: its training views are looked at.
+            dataset: its training views are looked at.
             sh_degree: of the colours.
         """
         directions, faces = icosphere(LEVEL)
         corners = self.middle + self.radius * directions[faces]
-        colors, seen = _photographed(capture, corners.mean(dim=1))
+        colors, seen = _photographed(dataset, corners.mean(dim=1))
         if bool(seen.any()) and not bool(seen.all()):
             colors[~seen] = _blended(directions[faces].mean(dim=1), colors, seen)
         return TriangleSoup.from_triangles(corners, colors, opacity=OPACITY, sigma=SIGMA, sh_degree=sh_degree)
@@ -87,16 +88,16 @@ def _blended(
     return (weight[..., None] * colors[seen][nearest]).sum(dim=1) / weight.sum(dim=1, keepdim=True)
 
 
-def _photographed(capture: Capture, positions: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, "N 3"], Bool[Tensor, " N"]]:
+def _photographed(dataset: Dataset, positions: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, "N 3"], Bool[Tensor, " N"]]:
     """Mean colour of the training photos at each position, grey where none shows it; and whether one does."""
     total, count = torch.zeros_like(positions), torch.zeros(len(positions), 1)
-    for view in capture.train:
-        camera, photo = capture.cameras[view], capture.images[view]
+    for view in dataset.train:
+        camera, photo = dataset.cameras[view], dataset.images[view]
         at = positions @ camera.viewmats[0, :3, :3].T + camera.viewmats[0, :3, 3]
         pixel = (at / at[:, 2:].clamp_min(1e-6)) @ camera.Ks[0].T
         inside = (at[:, 2] > 0) & (pixel[:, :2] >= 0).all(dim=1)
         inside &= (pixel[:, 0] < camera.width) & (pixel[:, 1] < camera.height)
         x, y = pixel[inside, :2].long().unbind(dim=1)
-        total[inside] += photo[y, x, :3].float() / 255
+        total[inside] += as_float(photo[y, x, :3])
         count[inside] += 1
     return torch.where(count > 0, total / count.clamp_min(1), 0.5), count[:, 0] > 0

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Hashable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import takewhile
 
 import torch
@@ -11,7 +11,8 @@ from torch import Tensor
 
 from etsplat.core.cameras import Cameras
 from etsplat.core.validation import first_not_finite
-from etsplat.data.views import PosedViews
+from etsplat.data.dataset import Dataset
+from etsplat.data.pictures import as_float
 from etsplat.geometry.measures import face_areas
 from etsplat.geometry.subdivision import longest_edge_plan
 from etsplat.geometry.topology import MeshTopology
@@ -31,6 +32,17 @@ from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.running import progress_tensor, read_progress
 
 
+@dataclass(frozen=True)
+class _Level:
+    cameras: Cameras
+    images: Float[Tensor, "B H W 4"]
+
+    @classmethod
+    def of(cls, views: Dataset, device: torch.device) -> "_Level":
+        cameras = Cameras.stacked(views.cameras).to(device)
+        return cls(cameras, torch.stack([as_float(image) for image in views.images]).to(device))
+
+
 class MeshFitting:
     """One run's state, and what changes it: steps and subdivisions. Implements `optim.loop.Problem`.
 
@@ -42,7 +54,7 @@ class MeshFitting:
     def __init__(
         self,
         mesh: TriangleMesh,
-        views: PosedViews,
+        views: Dataset,
         config: ReconstructConfig,
         evaluate: Callable[[TriangleMesh], dict[str, float]],
     ) -> None:
@@ -80,9 +92,10 @@ class MeshFitting:
             max_faces=config.max_faces,
         )
         self._untanglings = set(evenly(config.iterations, config.untangle_steps, config.subdivide_until))
-        self._levels = [views]  # halved 0, 1, ... times
+        levels = [views]  # halved 0, 1, ... times
         for _ in range(config.coarse_levels):
-            self._levels.append(self._levels[-1].halved())
+            levels.append(levels[-1].halved())
+        self._levels = [_Level.of(level, mesh.vertices.device) for level in levels]
         self._solve: Solve | None = None
         parameters = mesh.parameters()
         self.adam = Adam(parameters, {name: self._rates[name] for name in parameters}, engine=config.engine)

@@ -63,7 +63,7 @@ def reconstruct(
 
     Args:
         source: a mesh file or `MeshFile`, which is photographed from 40 sides; "demo:owl", an object built in code; a
-            folder with posed images and masks, or `PosedViews` with the object in the unit sphere (`renormalized` and
+            folder with posed images and masks, or a `Dataset` with the object in the unit sphere (`renormalized` and
             `bounding_sphere` bring it there).
         out: the run directory; made if it does not exist. README.txt in it explains what is there.
         config: settings; None for preset "best". See `PRESETS`.
@@ -95,8 +95,8 @@ def reconstruct(
     subject = make_subject(loaded, config, lambda done, total: announce(PrepareEvent(done, total)), device)
     if config.backend == "nvdiffrast":
         load_nvdiffrast()  # now rather than at the first step
-    scorer = Scorer(subject, config)
-    fitting = MeshFitting(make_start(start, subject.views, config), subject.views, config, scorer.cheap)
+    scorer = Scorer(subject, config, device)
+    fitting = MeshFitting(make_start(start, subject.views, config, device), subject.views, config, scorer.cheap)
     run = place.open(record)
     on_cpu = resolve_engine(config.engine, fitting.mesh.vertices) == "cpu"
     with one_torch_thread() if on_cpu else nullcontext():

@@ -14,7 +14,7 @@ from torch import Tensor
 from etsplat.core.cameras import Cameras
 from etsplat.core.errors import InputError
 from etsplat.data.camera_paths import PATHS
-from etsplat.data.captures import Capture
+from etsplat.data.dataset import Dataset
 from etsplat.io.atomic import atomic_write, write_error
 from etsplat.io.images import save_image
 from etsplat.io.paths import kind_of
@@ -81,7 +81,7 @@ def render_run(
     return written
 
 
-def views_of(capture: Capture, config: RenderConfig) -> tuple[list[str], list[Cameras]]:
+def views_of(capture: Dataset, config: RenderConfig) -> tuple[list[str], list[Cameras]]:
     """Names and single cameras of what is to be drawn.
 
     Raises:

@@ -8,6 +8,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from etsplat.data.loader import ViewLoader
+from etsplat.data.pictures import as_float
 from etsplat.geometry.intersections import count_degenerate_faces, count_self_intersections
 from etsplat.io.images import save_image
 from etsplat.metrics.geometry import chamfer, geometry_metrics, sample_pair
@@ -24,13 +26,13 @@ class Scorer:
     Images are compared over black, in float, renders clamped to [0, 1].
     """
 
-    def __init__(self, subject: Subject, config: ReconstructConfig) -> None:
+    def __init__(self, subject: Subject, config: ReconstructConfig, device: torch.device | None = None) -> None:
         """Loads what measuring needs.
 
         Raises:
             InputError: `config.lpips_weights` is given and cannot be used.
         """
-        self._views = subject.views
+        self._views, self._loader = subject.views, ViewLoader(subject.views, device or torch.device("cpu"))
         self._has_masks = subject.views.has_masks
         self._truth = subject.truth
         self._config = config
@@ -39,8 +41,8 @@ class Scorer:
         self._lpips = Lpips.from_weights(*weights.paths) if weights.paths else None
         self._lpips_reason = weights.reason
         if self._lpips is not None:
-            self._lpips.to(subject.views.images.device)
-        if min(self._views.cameras.width, self._views.cameras.height) < 16:
+            self._lpips.to(device or torch.device("cpu"))
+        if min(min(size) for size in self._views.images.sizes) < 16:
             self._lpips, self._lpips_reason = None, "the images are smaller than 16 pixels"
 
     def cheap(self, mesh: TriangleMesh) -> dict[str, float]:
@@ -91,7 +93,7 @@ class Scorer:
             scores["psnr_mesh"].append(psnr(opaque, photo))
             scores["ssim"].append(ssim(splatted, photo))
             if self._has_masks:
-                scores["silhouette_iou"].append(silhouette_iou(covered[..., 3], self._views.images[view, ..., 3]))
+                scores["silhouette_iou"].append(silhouette_iou(covered[..., 3], self._pixels(view)[..., 3]))
             if self._lpips is not None:
                 scores["lpips"].append(float(self._lpips(splatted, photo)))
             for kind, image in (("truth", photo), ("render", splatted), ("mesh", opaque)):
@@ -100,17 +102,19 @@ class Scorer:
         return {**means, "lpips_reason": self._lpips_reason if self._views.test else "no test views"}
 
     def _photo(self, view: int) -> Float[Tensor, "H W 3"]:
-        return self._views.images[view, ..., :3]
+        return self._pixels(view)[..., :3]
+
+    def _pixels(self, view: int) -> Float[Tensor, "H W 4"]:
+        return as_float(self._loader.view(view).photo[0])
 
     @torch.no_grad()
     def _splatted(self, mesh: TriangleMesh, view: int) -> Float[Tensor, "H W 3"]:
-        return render_mesh(mesh, self._views.cameras[view], self._config.appearance)[0].clamp(0.0, 1.0)
+        return render_mesh(mesh, self._loader.view(view).camera, self._config.appearance)[0].clamp(0.0, 1.0)
 
     def _opaque(self, mesh: TriangleMesh, view: int) -> Float[Tensor, "H W 4"]:
         config = self._config
-        image = render_exported(
-            mesh, self._views.cameras[view], supersampling=config.supersampling, engine=config.engine
-        )
+        camera = self._loader.view(view).camera
+        image = render_exported(mesh, camera, supersampling=config.supersampling, engine=config.engine)
         return image[0]
 
 

@@ -5,15 +5,13 @@ from dataclasses import replace
 from itertools import takewhile
 
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from torch import Tensor
 
-from etsplat.core.cameras import Cameras
 from etsplat.core.rasterization import TriangleStatistics
 from etsplat.core.validation import first_not_finite
-from etsplat.data.capture_views import CaptureViews
-from etsplat.data.captures import Capture
-from etsplat.data.device_views import DeviceViews
+from etsplat.data.dataset import Dataset
+from etsplat.data.loader import View, ViewLoader
 from etsplat.model.soup_rendering import SoupAppearance, render_soup
 from etsplat.model.surroundings import Surroundings
 from etsplat.model.triangle_soup import TriangleSoup
@@ -47,7 +45,7 @@ class SoupFitting:
     def __init__(
         self,
         soup: TriangleSoup,
-        capture: Capture,
+        capture: Dataset,
         config: TrainConfig,
         generator: torch.Generator,
         evaluate: Evaluate,
@@ -78,12 +76,10 @@ class SoupFitting:
         self._queue: StepQueue | None = None
         self._phase: tuple[SoupAppearance, SoupWeights] | None = None
         self._drawn: TriangleStatistics | None = None  # by the step that is being captured
+        self._views = ViewLoader(capture, self._device)
         if resolve_engine(config.engine, soup.vertices) == "cuda":
-            self._device_views = DeviceViews(capture, self._device)
             columns = 8 + len(self.adam.parameters) + 1
             self._queue = StepQueue(self._queued_gradients, self._commit, columns, self._device)
-        else:
-            self._views = CaptureViews(capture, self._device)
 
     @property
     def count(self) -> int:
@@ -114,7 +110,7 @@ class SoupFitting:
         if phase != self._phase:
             self._phase = phase
             self._queue.restart()
-        most = READ_AHEAD if self._device_views.streamed else MAX_STEPS
+        most = READ_AHEAD if self._views.streamed else MAX_STEPS
         steps = range(first, min(last, first + most - 1, self._schedule.next_edit(first)) + 1)
         unchanged = takewhile(lambda i: self._schedule.phase(i) == phase, steps)
         losses = self._queue.run([self._queued_step(i) for i in unchanged])
@@ -126,15 +122,8 @@ class SoupFitting:
         view = self._sampler.next_view()
         self._views.expect([view, *self._sampler.upcoming(READ_AHEAD)])
         appearance, weights = self._schedule.appearance(iteration), self._schedule.weights(iteration)
-        mask = self._views.mask(view)
-        loss, drawn = self._gradients(
-            self._views.cameras[view],
-            self._views.photo(view)[None],
-            None if mask is None else mask[None],
-            self._background().to(self._device),
-            appearance,
-            weights,
-        )
+        background = self._background().to(self._device)
+        loss, drawn = self._gradients(self._views.view(view), background, appearance, weights)
         self.adam.learning_rates = self._schedule.rates(iteration)
         self.adam.step()
         self.statistics.update(drawn, len(self._capture.train), epoch_starts=self._sampler.epoch_starts)
@@ -143,8 +132,8 @@ class SoupFitting:
     def _queued_step(self, iteration: int) -> QueuedStep:
         """A row: camera and place, background, opacity floor, sigma ceiling, whether an epoch starts, Adam's rates."""
         view = self._sampler.next_view()
-        self._device_views.expect([view, *self._sampler.upcoming(READ_AHEAD)])
-        kind, place = self._device_views.find(view)
+        self._views.expect([view, *self._sampler.upcoming(READ_AHEAD)])
+        kind, place = self._views.kind_and_place(view)
         appearance = self._schedule.appearance(iteration)
         limits = appearance.opacity_floor, appearance.sigma_ceiling
         self.adam.learning_rates = self._schedule.rates(iteration)
@@ -152,12 +141,12 @@ class SoupFitting:
         rates = self.adam.rates(list(self.adam.parameters))
         scheduled = *limits, float(self._sampler.epoch_starts), *rates
         row = [*place, *self._background()[0].tolist(), *scheduled]
-        return QueuedStep(row, kind, self._device_views.upload(view))
+        return QueuedStep(row, kind, self._views.upload(view))
 
     def _queued_gradients(self, row: Tensor, kind: Hashable) -> Tensor:
         assert self._phase is not None
-        view = self._device_views.look_up(kind, row[:2])
-        loss, self._drawn = self._gradients(*view, row[2:5][None], *self._phase, limits=row[5:7])
+        view = self._views.look_up(kind, row[:2])
+        loss, self._drawn = self._gradients(view, row[2:5][None], *self._phase, limits=row[5:7])
         return loss
 
     def _commit(self, row: Tensor, halted: Tensor) -> None:
@@ -168,9 +157,7 @@ class SoupFitting:
 
     def _gradients(
         self,
-        camera: Cameras,
-        photo: UInt8[Tensor, "1 H W C"],
-        mask: UInt8[Tensor, "1 H W"] | None,
+        view: View,
         background: Float[Tensor, "1 3"],
         appearance: SoupAppearance,
         weights: SoupWeights,
@@ -180,7 +167,7 @@ class SoupFitting:
         soup, engine = self.soup, self._config.engine
         rendering = render_soup(
             soup,
-            camera,
+            view.camera,
             appearance,
             limits=limits,
             backgrounds=background,
@@ -191,12 +178,12 @@ class SoupFitting:
             statistics=True,
             engine=engine,
         )
-        counts = None if mask is None else mask.float() / 255
+        counts = None if view.mask is None else view.mask.float() / 255
         opacities = soup.opacities
         if self._surroundings is not None:  # where no view looks, nothing would hold against the pull to transparency
             opacities = torch.where(self._surroundings.outermost(soup.vertices), 0.0, opacities)
         loss = soup_objective(
-            rendering, photo, counts, background, soup.vertices, opacities, camera, weights, engine=engine
+            rendering, view.photo, counts, background, soup.vertices, opacities, view.camera, weights, engine=engine
         )
         self.adam.zero_grad()
         loss.backward()

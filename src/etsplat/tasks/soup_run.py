@@ -9,7 +9,8 @@ from torch import Tensor
 
 from etsplat.core.cameras import Cameras
 from etsplat.core.errors import InputError
-from etsplat.data.captures import Capture, load_capture
+from etsplat.data.dataset import Dataset
+from etsplat.data.load import load_dataset
 from etsplat.io.paths import path_remedy
 from etsplat.io.run_directory import RunDirectory, is_run
 from etsplat.model.soup_files import SoupFile, load_soup
@@ -30,7 +31,7 @@ class SoupRun:
 
     path: Path
     file: SoupFile
-    capture: Capture | None
+    capture: Dataset | None
 
     @property
     def device(self) -> torch.device:
@@ -42,7 +43,7 @@ class SoupRun:
         """Where results go unless told otherwise: the run directory, or the folder of the file."""
         return self.path if self.path.is_dir() else self.path.parent
 
-    def needed_capture(self) -> Capture:
+    def needed_capture(self) -> Dataset:
         """The capture.
 
         Raises:
@@ -70,7 +71,7 @@ def open_run(path: Path | str, scene: Path | str | None = None, device: str | No
         raise InputError(f"{path}: no such file or folder; {path_remedy(path)}")
     if path.is_dir():
         return _open_directory(path, scene, place)
-    return SoupRun(path, open_soup(path).to(place), None if scene is None else load_capture(scene, preload=False))
+    return SoupRun(path, open_soup(path).to(place), None if scene is None else load_dataset(scene, preload=False))
 
 
 def check_trains(run: Path) -> None:
@@ -96,7 +97,7 @@ def world_up(viewmats: Float[Tensor, "B 4 4"]) -> Float[Tensor, "3"] | None:
     return up / length if length > 0.3 else None
 
 
-def training_cameras(capture: Capture) -> list[Cameras]:
+def training_cameras(capture: Dataset) -> list[Cameras]:
     """The single cameras of the training views."""
     cameras = capture.cameras
     return [cameras[index] for index in capture.train]
@@ -121,7 +122,7 @@ def _open_directory(path: Path, scene: Path | str | None, device: torch.device) 
         return SoupRun(path, file, demo_capture(config["config"]["width"]))
     if scene is None and not Path(source).is_dir():
         raise InputError(f"{path}: its scene {source} has gone; name where it is now with --scene")
-    capture = load_capture(
+    capture = load_dataset(
         source,
         images=paths.get("images"),
         width=config["config"]["width"],

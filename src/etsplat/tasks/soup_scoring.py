@@ -7,8 +7,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from etsplat.data.capture_views import CaptureViews
-from etsplat.data.captures import Capture
+from etsplat.data.dataset import Dataset
+from etsplat.data.loader import ViewLoader
+from etsplat.data.pictures import as_float
 from etsplat.io.images import over_background, save_image
 from etsplat.metrics.image import psnr, ssim
 from etsplat.model.soup_rendering import SoupAppearance, render_soup, render_soup_opaque
@@ -26,13 +27,13 @@ class SoupScorer:
 
     def __init__(
         self,
-        capture: Capture,
+        capture: Dataset,
         background: Float[Tensor, "3"],
         engine: str | None,
         device: torch.device = torch.device("cpu"),  # noqa: B008 (immutable)
     ) -> None:
         self._capture = capture
-        self._views = CaptureViews(capture, device)
+        self._views = ViewLoader(capture, device)
         self._background = background.to(device)
         self._engine = engine
 
@@ -77,19 +78,19 @@ class SoupScorer:
 
     def photo(self, view: int) -> Float[Tensor, "H W 3"]:
         """The photograph of a view, over the background."""
-        photo = self._views.photo(view).float() / 255
+        photo = as_float(self._views.view(view).photo[0])
         return photo if photo.shape[-1] == 3 else over_background(photo, self._background)
 
     def masked(self, picture: Tensor, photo: Tensor, view: int) -> Float[Tensor, "H W 3"]:
         """The picture, with the photograph's pixels where the view's mask excludes them."""
-        mask = self._views.mask(view)
-        return picture if mask is None else photo + mask[..., None].float() / 255 * (picture - photo)
+        mask = self._views.view(view).mask
+        return picture if mask is None else photo + mask[0, ..., None].float() / 255 * (picture - photo)
 
     @torch.no_grad()
     def splatted(self, soup: TriangleSoup, appearance: SoupAppearance, view: int) -> Float[Tensor, "H W 3"]:
         """A view of the soup, clamped to [0, 1]."""
         rendering = render_soup(
-            soup, self._views.cameras[view], appearance, backgrounds=self._background[None], engine=self._engine
+            soup, self._views.view(view).camera, appearance, backgrounds=self._background[None], engine=self._engine
         )
         return rendering.color[0].clamp(0.0, 1.0)
 
@@ -97,7 +98,7 @@ class SoupScorer:
         """The same as a mesh viewer would draw it."""
         picture = render_soup_opaque(
             soup,
-            self._views.cameras[view],
+            self._views.view(view).camera,
             appearance,
             background=self._background,
             supersampling=SUPERSAMPLING,

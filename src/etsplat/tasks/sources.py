@@ -9,17 +9,18 @@ import torch
 from torch import Tensor
 
 from etsplat.core.errors import InputError
+from etsplat.data.dataset import Dataset
 from etsplat.data.demo_object import demo_object
-from etsplat.data.load import load_views
+from etsplat.data.hull import bounding_sphere
+from etsplat.data.load import load_dataset
 from etsplat.data.photograph import normalize_mesh, photograph
-from etsplat.data.views import PosedViews
 from etsplat.geometry.icosphere import icosphere
 from etsplat.io.mesh_files import MeshFile, load_mesh, weld_vertices
 from etsplat.io.paths import path_remedy
 from etsplat.model.triangle_mesh import TriangleMesh
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 
-Source = str | Path | MeshFile | PosedViews
+Source = str | Path | MeshFile | Dataset
 
 DEMO = "demo:owl"
 """Names the object that is built in code."""
@@ -34,11 +35,11 @@ class Subject:
         truth: the mesh that was photographed, in that frame, or None if there is none.
     """
 
-    views: PosedViews
+    views: Dataset
     truth: MeshFile | None
 
 
-def load_source(source: Source, config: ReconstructConfig, masks: str | Path | None = None) -> MeshFile | PosedViews:
+def load_source(source: Source, config: ReconstructConfig, masks: str | Path | None = None) -> MeshFile | Dataset:
     """Reads a mesh file or a scene folder, or makes the demo's object; objects are passed through.
 
     Args:
@@ -50,22 +51,23 @@ def load_source(source: Source, config: ReconstructConfig, masks: str | Path | N
         InputError: there is nothing at the path, or what is there cannot be used; masks for something else than a
             scene folder.
     """
-    if masks is not None and (isinstance(source, MeshFile | PosedViews) or not Path(source).is_dir()):
+    if masks is not None and (isinstance(source, MeshFile | Dataset) or not Path(source).is_dir()):
         raise InputError(f"masks {masks}: belong to a folder with posed images; leave them out for a mesh")
-    if isinstance(source, MeshFile | PosedViews):
+    if isinstance(source, MeshFile | Dataset):
         return source
     if str(source) == DEMO:
         return demo_object()
     path = Path(source)
     if path.is_dir():
-        return load_views(path, width=config.resolution, masks=masks)
+        scene = load_dataset(path, masks_as="alpha", width=config.resolution, masks=masks)
+        return scene.renormalized(*bounding_sphere(scene))
     if path.is_file():
         return load_mesh(path)
     raise InputError(f"{path}: no such file or folder; {path_remedy(path)}")
 
 
 def make_subject(
-    source: MeshFile | PosedViews,
+    source: MeshFile | Dataset,
     config: ReconstructConfig,
     progress: Callable[[int, int], None],
     device: torch.device,
@@ -76,7 +78,7 @@ def make_subject(
         source: from `load_source`.
         config: resolution and supersampling.
         progress: called with (views done, views in all) while photographing.
-        device: where the views are to be.
+        device: where a mesh is photographed.
 
     Raises:
         InputError: the mesh has no extent, or there are no views to train on.
@@ -87,7 +89,7 @@ def make_subject(
         return Subject(views, normalize_mesh(source)[0])
     if not source.train:
         raise InputError("views: none to train on; name some in `train`")
-    return Subject(source.to(device), None)
+    return Subject(source, None)
 
 
 def load_start(start: str | Path | MeshFile | None) -> MeshFile | None:
@@ -97,18 +99,17 @@ def load_start(start: str | Path | MeshFile | None) -> MeshFile | None:
     return weld_vertices(start if isinstance(start, MeshFile) else load_mesh(start))
 
 
-def make_start(start: MeshFile | None, views: PosedViews, config: ReconstructConfig) -> TriangleMesh:
+def make_start(
+    start: MeshFile | None, views: Dataset, config: ReconstructConfig, device: torch.device | None = None
+) -> TriangleMesh:
     """The mesh that a run starts from, in the unit frame: an icosphere around the object, or the given mesh.
 
     Args:
         start: from `load_start`, in the input's units; its colours are used if it has the kind that is optimised.
         views: of the unit frame.
         config: level, radius, colour, opacity and softness.
-
-    Returns:
-        The mesh, on the device of the views.
+        device: of the mesh; None for the CPU.
     """
-    device = views.images.device
     if start is None:
         vertices, faces = icosphere(config.start_level)
         vertices = vertices * config.start_radius
@@ -118,8 +119,8 @@ def make_start(start: MeshFile | None, views: PosedViews, config: ReconstructCon
         given = start.vertex_colors if config.vertex_colored else start.face_colors
         colors = config.start_color if given is None else given
     return TriangleMesh.from_mesh(
-        vertices.to(device),
-        faces.to(device),
+        vertices.to(device or "cpu"),
+        faces.to(device or "cpu"),
         colors=colors,
         opacity=config.start_opacity if config.splats else None,
         sigma=config.start_sigma if config.splats else None,
@@ -127,17 +128,14 @@ def make_start(start: MeshFile | None, views: PosedViews, config: ReconstructCon
     )
 
 
-def fingerprint(source: MeshFile | PosedViews | None) -> str | None:
+def fingerprint(source: MeshFile | Dataset | None) -> str | None:
     """A short hash of everything in a source that a run depends on."""
     if source is None:
         return None
-    if isinstance(source, MeshFile):
-        tensors = [source.vertices, source.faces, source.face_colors, source.vertex_colors]
-    else:
-        split = torch.tensor([*source.train, -1, *source.test])
-        tensors = [source.cameras.viewmats, source.cameras.Ks, split, *source.images]
+    if isinstance(source, Dataset):
+        return source.fingerprint()
     digest = hashlib.sha256()
-    for tensor in tensors:
+    for tensor in (source.vertices, source.faces, source.face_colors, source.vertex_colors):
         if tensor is not None:
             digest.update(str(tuple(tensor.shape)).encode())
             digest.update(tensor.contiguous().cpu().numpy().data)

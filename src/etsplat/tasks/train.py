@@ -11,9 +11,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from etsplat.core.errors import InputError
-from etsplat.data.captures import Capture, load_capture
+from etsplat.data.dataset import Dataset
 from etsplat.data.demo_scene import HEIGHT, WIDTH, demo_scene
-from etsplat.data.device_views import stay_on
+from etsplat.data.load import load_dataset
+from etsplat.data.loader import stay_on
 from etsplat.io.memory import available_memory
 from etsplat.io.run_directory import RunDirectory
 from etsplat.model.soup_files import SoupFile, save_soup
@@ -70,7 +71,7 @@ class TrainResult:
 
 
 def train(
-    source: str | Path | Capture,
+    source: str | Path | Dataset,
     out: str | Path,
     config: TrainConfig | None = None,
     *,
@@ -86,7 +87,7 @@ def train(
     any number of times. Ctrl-C leaves a checkpoint of the last whole iteration.
 
     Args:
-        source: a folder with posed photos (COLMAP, nerfstudio, Blender), a `Capture` in its own units, or "demo:scene".
+        source: a folder with posed photos (COLMAP, nerfstudio, Blender), a `Dataset` in its own units, or "demo:scene".
         out: the run directory; made if it does not exist. README.txt in it explains what is there.
         config: settings; None for `train_settings("quick")`.
         images: folder in the scene to take the photos from, such as "images_4".
@@ -132,7 +133,7 @@ def train(
 
 
 def start_fitting(
-    capture: Capture, config: TrainConfig, evaluate: Evaluate, device: torch.device | None = None
+    capture: Dataset, config: TrainConfig, evaluate: Evaluate, device: torch.device | None = None
 ) -> SoupFitting:
     """The start of a run: triangles at the capture's points, or at random ones.
 
@@ -161,13 +162,13 @@ def start_fitting(
     return SoupFitting(soup, capture, config, generator, evaluate, squared=squared)
 
 
-def demo_capture(width: int | None, progress: Callable[[int, int], None] | None = None) -> Capture:
+def demo_capture(width: int | None, progress: Callable[[int, int], None] | None = None) -> Dataset:
     """The scene that is built in code, in photos no wider than a setting asks for; None for their usual width."""
     width = min(WIDTH, width or WIDTH)
     return demo_scene(width, max(1, round(HEIGHT * width / WIDTH)), progress=progress)
 
 
-def predicted_bytes(capture: Capture, config: TrainConfig, device: torch.device | None = None) -> int:
+def predicted_bytes(capture: Dataset, config: TrainConfig, device: torch.device | None = None) -> int:
     """Memory of a device, None for the CPU, that a run may come to need, beyond the program itself."""
     pixels = max(width * height for width, height in capture.images.sizes)
     triangles = max(config.max_triangles, _start_count(capture, config))
@@ -177,20 +178,20 @@ def predicted_bytes(capture: Capture, config: TrainConfig, device: torch.device 
 
 
 def _load(
-    source: str | Path | Capture,
+    source: str | Path | Dataset,
     config: TrainConfig,
     images: str | None,
     masks: str | Path | None,
     progress: Callable[[int, int], None],
-) -> Capture:
-    if isinstance(source, Capture):
+) -> Dataset:
+    if isinstance(source, Dataset):
         return source
     if str(source) == DEMO:
         return demo_capture(config.width, progress)
-    return load_capture(source, images=images, width=config.width, masks=masks, progress=progress)
+    return load_dataset(source, images=images, width=config.width, masks=masks, progress=progress)
 
 
-def _check(capture: Capture, config: TrainConfig, iterations: int, device: torch.device) -> list[str]:
+def _check(capture: Dataset, config: TrainConfig, iterations: int, device: torch.device) -> list[str]:
     """Refuses what cannot work; returns what the owner of a run of so many iterations should know."""
     if not capture.train:
         raise InputError("capture: has no view to train on; name some in its split")
@@ -218,7 +219,7 @@ def _check(capture: Capture, config: TrainConfig, iterations: int, device: torch
     return notes
 
 
-def _doubtful_scale(capture: Capture, config: TrainConfig) -> str | None:
+def _doubtful_scale(capture: Dataset, config: TrainConfig) -> str | None:
     """What to do about a scene whose size the absolute settings were not made for, if it is one."""
     low, high = USUAL_EXTENT
     if config.normalize or low <= capture.extent <= high:
@@ -233,12 +234,12 @@ def _amount(count: int) -> str:
     return f"{count / 2**30:.1f} GiB" if count >= 2**30 else f"{count >> 20} MiB"
 
 
-def _start_count(capture: Capture, config: TrainConfig) -> int:
+def _start_count(capture: Dataset, config: TrainConfig) -> int:
     points = config.start_points if capture.exact_points is None else len(capture.exact_points)
     return points + (SPHERE_TRIANGLES if config.closed else 0)
 
 
-def _start_points(capture: Capture, config: TrainConfig, generator: torch.Generator) -> StartPoints:
+def _start_points(capture: Dataset, config: TrainConfig, generator: torch.Generator) -> StartPoints:
     """The capture's points, or random ones in a cube that holds what the cameras look at."""
     positions, colors = capture.points, capture.point_colors
     if positions is None:
@@ -264,7 +265,7 @@ def _finish(
     progress: Progress,
     run: RunDirectory,
     scorer: SoupScorer,
-    capture: Capture,
+    capture: Dataset,
     config: TrainConfig,
 ) -> TrainResult:
     """Writes the soup in the input's units, draws the test views, measures everything."""
@@ -288,7 +289,7 @@ def _finish(
     return TrainResult(run.path, file.soup, run.read_metrics())
 
 
-def _soup_file(fitting: SoupFitting, iteration: int, capture: Capture, config: TrainConfig) -> SoupFile:
+def _soup_file(fitting: SoupFitting, iteration: int, capture: Dataset, config: TrainConfig) -> SoupFile:
     """The soup as it is now, in the input's units."""
     soup, appearance = fitting.finished()
     soup, own, grey = soup.to(torch.device("cpu")), capture.normalization, float(_background(config)[0])

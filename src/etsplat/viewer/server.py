@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from etsplat.core.cameras import Cameras, intrinsics
 from etsplat.core.errors import InputError
 from etsplat.data.camera_paths import focus_point
-from etsplat.data.captures import Capture
+from etsplat.data.dataset import Dataset
 from etsplat.model.soup_files import SoupFile
 from etsplat.tasks.soup_run import SoupRun, world_up
 from etsplat.viewer.follow import Followed
@@ -212,7 +212,7 @@ def _describe(file: SoupFile) -> str:
     return f"{len(file.soup):,} triangles" + (f" after {int(iteration):,} iterations" if iteration else "")
 
 
-def _add_frusta(server: Any, capture: Capture) -> list[Any]:
+def _add_frusta(server: Any, capture: Dataset) -> list[Any]:
     """A pyramid for every training camera, hidden; a click on one goes there."""
     rotations = capture.viewmats[:, :3, :3].mT
     frusta = []
@@ -237,11 +237,11 @@ def _add_frusta(server: Any, capture: Capture) -> list[Any]:
     return frusta
 
 
-def _stand_at_first_camera(client: Any, capture: Capture) -> None:
+def _stand_at_first_camera(client: Any, capture: Dataset) -> None:
     _stand_at(client, capture, capture.train[0])
 
 
-def _stand_at(client: Any, capture: Capture, index: int) -> None:
+def _stand_at(client: Any, capture: Dataset, index: int) -> None:
     position = capture.centers[index]
     forward = capture.viewmats[index, 2, :3]
     # The point to turn about: on the line of sight, beside what all cameras look at.

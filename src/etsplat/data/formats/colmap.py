@@ -1,4 +1,4 @@
-"""Captures in COLMAP's layout: `images/` and `sparse/0/{cameras,images,points3D}.{bin,txt}`, undistorted.
+"""Scenes in COLMAP's layout: `images/` and `sparse/0/{cameras,images,points3D}.{bin,txt}`, undistorted.
 
 COLMAP's poses are world-to-camera with OpenCV axes, its pixel centres at +0.5: our conventions, nothing to convert.
 """
@@ -12,33 +12,39 @@ from torch import Tensor
 
 from etsplat.core.errors import InputError
 from etsplat.data.colmap_model import PARAMETERS, ColmapCamera, ColmapImage, read_cameras, read_images, read_points
-from etsplat.data.frames import Frame, FrameSet, find_image, find_mask
-from etsplat.data.views import every_eighth
+from etsplat.data.dataset import Dataset
+from etsplat.data.frames import Frame, Wanted, find_image, find_mask, posed
+
+MARK = "sparse/"
+RANK = 2
 
 
-def read_colmap(folder: Path | str, masks: Path | str | None = None, *, images: str | None = None) -> FrameSet:
+def recognises(folder: Path) -> bool:
+    """Whether there is a model."""
+    return (folder / "sparse").is_dir()
+
+
+def read(folder: Path, wanted: Wanted) -> Dataset:
     """Read an undistorted COLMAP scene; every 8th image by name is test.
 
     Args:
-        folder: holds `images/` and `sparse/0/` (or `sparse/`), binary or text; binary is preferred.
-        masks: folder with a mask for every image (white counts). By default `masks/` of the scene if it is there;
-            images with an alpha channel need none.
-        images: the folder with the images, in the scene; by default `images`. `images_4` and the like may hold smaller
-            copies, also with other endings.
+        folder: holds `images/` and `sparse/0/` (or `sparse/`), binary or text; binary is preferred. Its `masks/`, if it
+            is there, has a mask for every image; images with an alpha channel need none.
+        wanted: other images and masks. `images_4` and the like may hold smaller copies, also with other endings.
 
     Returns:
-        Frames in COLMAP's own units, with the model's points.
+        Views in COLMAP's own units, with the model's points.
 
     Raises:
-        InputError: files are missing, cut short or malformed; camera models with distortion; a mask is missing.
+        InputError: files are missing, cut short or malformed; camera models with distortion; a mask is missing; as
+            `posed`.
     """
-    folder = Path(folder)
     model = find_model(folder)
     if model is None:
         raise InputError(
             f"scene {folder}: no sparse/0/cameras.bin or .txt; run COLMAP's mapper or choose another folder"
         )
-    mask_folder = Path(masks) if masks is not None else folder / "masks"
+    masks = wanted.masks or (folder / "masks" if (folder / "masks").is_dir() else None)
     cameras = read_cameras(model)
     registered = sorted(read_images(model), key=lambda image: image.name)
     if not registered:
@@ -49,16 +55,14 @@ def read_colmap(folder: Path | str, masks: Path | str | None = None, *, images: 
             raise InputError(f"scene {model}: {image.name} uses camera {image.camera}, which is missing; export again")
         camera = cameras[image.camera]
         K = _intrinsics(model, image.name, camera)
-        mask = find_mask(mask_folder, image.name) if masks is not None or mask_folder.is_dir() else None
-        file = find_image(folder / (images or "images"), image.name)
+        mask = None if masks is None else find_mask(masks, image.name)
+        file = find_image(folder / (wanted.images or "images"), image.name)
         frames.append(Frame(image.name, file, mask, _viewmat(image), K, (camera.width, camera.height)))
-    train, test = every_eighth([frame.name for frame in frames])
-    points = read_points(model)
-    if points is None or not len(points[0]):
-        return FrameSet(folder, frames, train, test)
-    return FrameSet(
-        folder, frames, train, test, torch.from_numpy(points[0]), torch.from_numpy(points[1].astype(np.float32) / 255)
-    )
+    found = read_points(model)
+    if found is None or not len(found[0]):
+        return posed(folder, frames, wanted)
+    points, colors = torch.from_numpy(found[0]), torch.from_numpy(found[1].astype(np.float32) / 255)
+    return posed(folder, frames, wanted, points=(points, colors))
 
 
 def find_model(folder: Path) -> Path | None:

@@ -1,4 +1,4 @@
-"""Captures described by `transforms*.json`: the Blender (NeRF-synthetic) and nerfstudio layouts.
+"""Scenes described by `transforms*.json`: the Blender (NeRF-synthetic) and nerfstudio layouts.
 
 Both give camera-to-world matrices with OpenGL axes (x right, y up, the camera looks along -z); flipping y and z and
 inverting gives our world-to-camera matrices with OpenCV axes.
@@ -15,10 +15,16 @@ from jaxtyping import Float
 from torch import Tensor
 
 from etsplat.core.errors import InputError
-from etsplat.data.frames import Frame, FrameSet, find_image, find_mask
-from etsplat.data.views import every_eighth
+from etsplat.data.dataset import Dataset
+from etsplat.data.frames import Frame, Wanted, check_frames, find_image, find_mask, posed
 from etsplat.io.images import image_size
 from etsplat.io.point_clouds import load_points
+
+MARK = "transforms.json"
+RANK = 1
+
+Points = tuple[Float[Tensor, "P 3"], Float[Tensor, "P 3"]]
+"""float64 positions, float32 colours."""
 
 _DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 _PERSPECTIVE, _FISHEYE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE"), ("OPENCV_FISHEYE", "FISHEYE")
@@ -38,55 +44,58 @@ class DistortedFrames:
     """Frames of `transforms.json` before their distortion is removed.
 
     Attributes:
-        set: frames, and the points.
+        scene: where they are described.
+        frames: with their poses.
+        points: of the scene, or None.
         lenses: of each frame.
         folder: of all images.
         names: of each frame's image in it.
         masks: the masks by these names; empty without.
     """
 
-    set: FrameSet
+    scene: Path
+    frames: list[Frame]
+    points: Points | None
     lenses: list[Lens]
     folder: Path
     names: list[str]
     masks: dict[str, Path]
 
 
-def read_transforms(folder: Path | str, masks: Path | str | None = None, *, images: str | None = None) -> FrameSet:
+def recognises(folder: Path) -> bool:
+    """Whether one of the files is there."""
+    return any((folder / name).is_file() for name in ("transforms.json", "transforms_train.json"))
+
+
+def read(folder: Path, wanted: Wanted) -> Dataset:
     """Read a scene folder with `transforms.json`, or with `transforms_train.json` and `transforms_test.json`.
 
-    Images may be RGBA; otherwise a frame's `mask_path`, or a folder `masks/` with a file for every image, separates
-    the object. With one `transforms.json` its `train_filenames` and `test_filenames` make the split; without them,
-    every 8th image by name is test. `transforms_val.json` is not used. `ply_file_path` names the points.
+    Images may be RGBA; otherwise a frame's `mask_path`, or a folder `masks/` with a file for every image, has masks.
+    With one `transforms.json` its `train_filenames` and `test_filenames` make the split; without them, every 8th image
+    by name is test. `transforms_val.json` is not used. `ply_file_path` names the points.
 
     Args:
         folder: the scene.
-        masks: folder with a mask for every image, in place of what the files name.
-        images: a folder in the scene that replaces the first folder of each image's path (`images_4`).
+        wanted: other masks; other images, in a folder that replaces the first of each image's path (`images_4`).
 
     Returns:
-        Frames in the capture's own units.
+        Views in the scene's own units.
 
     Raises:
-        InputError: a file is missing, damaged or of another layout; cameras with lens distortion.
+        InputError: a file is missing, damaged or of another layout; cameras with lens distortion; as `posed`.
     """
-    folder = Path(folder)
-    where = _Folders(images, Path(masks) if masks is not None else None)
-    if (folder / "transforms.json").is_file():
-        return _read_single(folder, where)
-    train_file, test_file = folder / "transforms_train.json", folder / "transforms_test.json"
-    if not train_file.is_file():
-        raise InputError(
-            f"scene {folder}: neither transforms.json nor transforms_train.json; choose the scene's folder"
-        )
-    frames = _frames(train_file, where)
-    train_count = len(frames)
-    if test_file.is_file():
-        frames += _frames(test_file, where)
-        train, test = list(range(train_count)), list(range(train_count, len(frames)))
-    else:
-        train, test = every_eighth([frame.name for frame in frames])
-    return FrameSet(folder, frames, train, test, *_points(train_file))
+    path = folder / "transforms.json"
+    if path.is_file():
+        frames = sorted(_frames(path, wanted), key=lambda frame: frame.name)
+        return posed(folder, frames, wanted, split=_named_split(path, frames), points=_points(path))
+    path, test_file = folder / "transforms_train.json", folder / "transforms_test.json"
+    frames = _frames(path, wanted)
+    if not test_file.is_file():
+        return posed(folder, frames, wanted, points=_points(path))
+    count = len(frames)
+    frames += _frames(test_file, wanted)
+    split = list(range(count)), list(range(count, len(frames)))
+    return posed(folder, frames, wanted, split=split, points=_points(path))
 
 
 def read_distorted_transforms(folder: Path) -> DistortedFrames:
@@ -96,11 +105,12 @@ def read_distorted_transforms(folder: Path) -> DistortedFrames:
         InputError: as `read_transforms`; a lens that COLMAP does not know.
     """
     path = folder / "transforms.json"
-    document, where = _read(path), _Folders(None, None, distorted=True)
-    frames = sorted(_frames(path, where), key=lambda frame: frame.name)
+    document = _read(path)
+    frames = sorted(_frames(path, Wanted(), distorted=True), key=lambda frame: frame.name)
     entries = {_plain(entry["file_path"]): {**document, **entry} for entry in document["frames"]}
     lenses = [_lens(path, frame.name, entries[frame.name]) for frame in frames]
-    found = FrameSet(folder, frames, list(range(len(frames))), [], *_points(path))
+    check_frames(folder, frames)
+    points = _points(path)
     outside = [frame for frame in frames if not frame.image.is_relative_to(folder)]
     if outside:
         raise InputError(f"scene {path}: {outside[0].name} lies outside of the scene's folder; copy the images into it")
@@ -110,43 +120,31 @@ def read_distorted_transforms(folder: Path) -> DistortedFrames:
     images = folder / first if together else folder
     names = [frame.image.relative_to(images).as_posix() for frame in frames]
     masks = {name: frame.mask for name, frame in zip(names, frames, strict=True) if frame.mask is not None}
-    return DistortedFrames(found, lenses, images, names, masks)
+    return DistortedFrames(folder, frames, points, lenses, images, names, masks)
 
 
-def _read_single(folder: Path, where: "_Folders") -> FrameSet:
-    path = folder / "transforms.json"
-    frames = sorted(_frames(path, where), key=lambda frame: frame.name)
+def _named_split(path: Path, frames: list[Frame]) -> tuple[list[int], list[int]] | None:
+    """As the file says; None where it does not."""
     document = _read(path)
     if "train_filenames" not in document or "test_filenames" not in document:
-        train, test = every_eighth([frame.name for frame in frames])
-        return FrameSet(folder, frames, train, test, *_points(path))
+        return None
     train_names, test_names = _name_set(path, document, "train_filenames"), _name_set(path, document, "test_filenames")
     train = [index for index, frame in enumerate(frames) if frame.name in train_names]
     test = [index for index, frame in enumerate(frames) if frame.name in test_names - train_names]
     if not train:
         raise InputError(f"scene {path}: train_filenames names none of the frames; correct or remove it")
-    return FrameSet(folder, frames, train, test, *_points(path))
+    return train, test
 
 
-@dataclass(frozen=True)
-class _Folders:
-    """What the caller wants instead of the folders that the file names."""
-
-    images: str | None
-    masks: Path | None
-    distorted: bool = False
-    """Whether lens distortion is accepted."""
-
-
-def _points(path: Path) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "P 3"]] | tuple[None, None]:
+def _points(path: Path) -> Points | None:
     """The points of `ply_file_path`, in the frame of the poses."""
     name = _read(path).get("ply_file_path")
     if name is None:
-        return None, None
+        return None
     if not isinstance(name, str):
         raise InputError(f"scene {path}: ply_file_path = {name!r} is not a file name; correct or remove it")
     points, colors = load_points(path.parent / _plain(name))
-    return (points, colors) if len(points) else (None, None)
+    return (points, colors) if len(points) else None
 
 
 def _name_set(path: Path, document: dict[str, Any], key: str) -> set[str]:
@@ -161,26 +159,26 @@ def _plain(name: str) -> str:
     return name.replace("\\", "/").removeprefix("./")
 
 
-def _frames(path: Path, where: _Folders) -> list[Frame]:
+def _frames(path: Path, wanted: Wanted, *, distorted: bool = False) -> list[Frame]:
     document = _read(path)
     entries = document.get("frames")
     if not isinstance(entries, list) or not entries:
         raise InputError(f"scene {path}: no list `frames`; is it a NeRF capture? Export the poses again")
-    return [_frame(path, document, entry, where) for entry in entries]
+    return [_frame(path, document, entry, wanted, distorted) for entry in entries]
 
 
-def _frame(path: Path, document: dict[str, Any], entry: dict[str, Any], where: _Folders) -> Frame:
+def _frame(path: Path, document: dict[str, Any], entry: dict[str, Any], wanted: Wanted, distorted: bool) -> Frame:
     if not isinstance(entry, dict) or not isinstance(entry.get("file_path"), str):
         raise InputError(f"scene {path}: a frame without `file_path`; export the poses again")
     name = _plain(entry["file_path"])
-    image = find_image(path.parent, name if where.images is None else _moved(name, where.images))
+    image = find_image(path.parent, name if wanted.images is None else _moved(name, wanted.images))
     settings = {**document, **entry}
-    if not where.distorted:
+    if not distorted:
         _refuse_distortion(path, name, settings)
     size = _size(path, name, settings, image)
     mask = None
-    if where.masks is not None:
-        mask = find_mask(where.masks, image.name)
+    if wanted.masks is not None:
+        mask = find_mask(wanted.masks, image.name)
     elif isinstance(entry.get("mask_path"), str):
         mask = path.parent / _plain(entry["mask_path"])
     elif (path.parent / "masks").is_dir():

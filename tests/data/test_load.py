@@ -7,7 +7,7 @@ import torch
 from PIL import Image
 
 from etsplat.core.errors import InputError
-from etsplat.data.captures import load_capture
+from etsplat.data.load import load_dataset
 from helpers.captures import circle_poses, write_colmap, write_photo, write_transforms
 
 SIZES = [(40, 30), (30, 40), (20, 20)] * 3
@@ -22,7 +22,7 @@ def project(capture, points, view):
 
 def test_every_view_keeps_its_own_size_camera_and_8_bit_pixels(tmp_path):
     write_colmap(tmp_path, SIZES)
-    capture = load_capture(tmp_path)
+    capture = load_dataset(tmp_path)
     assert [(camera.width, camera.height) for camera in capture.cameras] == SIZES
     for index, (image, (width, height)) in enumerate(zip(capture.images, SIZES, strict=True)):
         stored = np.array(Image.open(tmp_path / "images" / f"{index:04d}.jpg"))
@@ -35,22 +35,22 @@ def test_every_view_keeps_its_own_size_camera_and_8_bit_pixels(tmp_path):
 
 def test_images_wider_than_1600_shrink_to_it_and_width_shrinks_further(tmp_path):
     write_colmap(tmp_path, [(1640, 820), (1600, 800)])
-    capture = load_capture(tmp_path)
+    capture = load_dataset(tmp_path)
     assert capture.images.sizes == [(1600, 800), (1600, 800)]
     torch.testing.assert_close(capture.Ks[0, 0, 0], torch.tensor(1600.0, dtype=torch.float64))
-    assert load_capture(tmp_path, width=100).images.sizes == [(100, 50)] * 2
-    assert load_capture(tmp_path, width=5000).images.sizes == [(1640, 820), (1600, 800)]
+    assert load_dataset(tmp_path, width=100).images.sizes == [(100, 50)] * 2
+    assert load_dataset(tmp_path, width=5000).images.sizes == [(1640, 820), (1600, 800)]
 
 
 def test_a_folder_of_smaller_copies_with_other_endings_is_used_on_request(tmp_path):
     write_colmap(tmp_path, [(40, 30)] * 3)
     for index in range(3):
         write_photo(tmp_path / "images_2" / f"{index:04d}.PNG", 20, 15, seed=index)
-    capture = load_capture(tmp_path, images="images_2")
+    capture = load_dataset(tmp_path, images="images_2")
     assert capture.images.sizes == [(20, 15)] * 3
     torch.testing.assert_close(capture.Ks[0, 0, 0], torch.tensor(20.0, dtype=torch.float64))
     with pytest.raises(InputError, match="no folder images_8"):
-        load_capture(tmp_path, images="images_8")
+        load_dataset(tmp_path, images="images_8")
 
 
 @pytest.mark.parametrize(("scale", "center"), [(1000.0, 0.0), (0.001, 0.0), (1.0, 5e6)])
@@ -58,7 +58,7 @@ def test_normalized_has_extent_1_whatever_the_units_and_sees_the_same_pixels(tmp
     """Also for a scene with coordinates as maps have them, which float32 could not hold to a pixel."""
     poses = circle_poses(9, center=(center, 0.0, -center), radius=3 * scale)
     write_colmap(tmp_path, [(40, 30)] * 9, poses=poses, points=0)
-    capture = load_capture(tmp_path)
+    capture = load_dataset(tmp_path)
     unit = capture.normalized()
     assert unit.extent == pytest.approx(1.0, rel=1e-6)
     assert float(unit.centers[unit.train].mean(dim=0).abs().max()) < 1e-6
@@ -72,15 +72,15 @@ def test_normalized_has_extent_1_whatever_the_units_and_sees_the_same_pixels(tmp
 def test_cameras_at_one_place_leave_the_units_alone(tmp_path):
     pose = circle_poses(1)[0]
     write_colmap(tmp_path, [(16, 12)] * 3, poses=[pose] * 3)
-    capture = load_capture(tmp_path)
+    capture = load_dataset(tmp_path)
     assert capture.extent == 1.0
     assert capture.normalized().normalization.radius == 1.0
 
 
 def test_a_set_larger_than_memory_is_streamed_with_the_same_pixels(tmp_path):
     write_colmap(tmp_path, [(40, 30)] * 9)
-    whole = load_capture(tmp_path)
-    streamed = load_capture(tmp_path, memory=3 * 40 * 30 * 2)
+    whole = load_dataset(tmp_path)
+    streamed = load_dataset(tmp_path, memory=3 * 40 * 30 * 2)
     assert (whole.images.streamed, streamed.images.streamed) == (False, True)
     streamed.images.expect([5, 6])
     for index in (5, 6, 0, 8, 5, 1):
@@ -90,7 +90,7 @@ def test_a_set_larger_than_memory_is_streamed_with_the_same_pixels(tmp_path):
 
 def test_1300_views_load(tmp_path):
     write_transforms(tmp_path, 1300, width=8, height=6)
-    capture = load_capture(tmp_path)
+    capture = load_dataset(tmp_path)
     assert (len(capture), len(capture.test), capture.images.sizes[7]) == (1300, 163, (8, 6))
 
 
@@ -100,11 +100,11 @@ def test_the_fingerprint_follows_the_content_of_every_photo_and_mask(tmp_path):
     for index in range(4):
         write_photo(tmp_path / "a" / "masks" / f"{index:04d}.png", 40, 30)
     shutil.copytree(tmp_path / "a", tmp_path / "b", copy_function=shutil.copy)
-    first = load_capture(tmp_path / "a", preload=False).fingerprint()
-    assert load_capture(tmp_path / "b", memory=1).fingerprint() == first
+    first = load_dataset(tmp_path / "a", preload=False).fingerprint()
+    assert load_dataset(tmp_path / "b", memory=1).fingerprint() == first
     for file in ("images/0003.jpg", "masks/0002.png"):
         write_photo(tmp_path / "b" / file, 40, 30, seed=99)
-        changed = load_capture(tmp_path / "b").fingerprint()
+        changed = load_dataset(tmp_path / "b").fingerprint()
         assert changed != first
         first = changed
 
@@ -114,13 +114,13 @@ def test_masks_are_found_whatever_the_capitals_of_their_ending(tmp_path):
     write_transforms(tmp_path, 3)
     for name in ("0000.PNG", "0001.JPG", "0002.png.PNG"):
         write_photo(tmp_path / "masks" / name, 16, 12)
-    masks = load_capture(tmp_path).images
+    masks = load_dataset(tmp_path).images
     assert all(masks.mask(index) is not None for index in range(3))
 
 
 def test_transparent_images_are_premultiplied_and_masks_come_apart(tmp_path):
     write_transforms(tmp_path / "rgba", 3, channels=4)
-    capture = load_capture(tmp_path / "rgba")
+    capture = load_dataset(tmp_path / "rgba")
     image = capture.images[1]
     assert image.shape == (12, 16, 4)
     assert bool((image[..., :3] <= image[..., 3:]).all())
@@ -129,7 +129,7 @@ def test_transparent_images_are_premultiplied_and_masks_come_apart(tmp_path):
     write_transforms(tmp_path / "masked", 3)
     for index in range(3):
         write_photo(tmp_path / "masked" / "masks" / f"{index:04d}.png", 16, 12)
-    masked = load_capture(tmp_path / "masked", width=8)
+    masked = load_dataset(tmp_path / "masked", width=8)
     assert masked.images[1].shape == (6, 8, 3)
     assert masked.images.mask(1).shape == (6, 8)
 
@@ -139,7 +139,7 @@ def test_points_of_ply_file_path_are_read(tmp_path):
     header = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\n"
     header += "property uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n"
     (tmp_path / "points.ply").write_text(header + "1 2 3 255 0 51\n4 5 6 0 0 0\n")
-    capture = load_capture(tmp_path)
+    capture = load_dataset(tmp_path)
     assert capture.points.tolist() == [[1, 2, 3], [4, 5, 6]]
     torch.testing.assert_close(capture.point_colors[0], torch.tensor([1.0, 0.0, 0.2]))
 
@@ -149,11 +149,11 @@ def test_extra_photos_and_unused_cameras_are_ignored_and_points_may_be_missing(t
     write_photo(tmp_path / "images" / "unregistered.jpg", 50, 50)
     cameras = tmp_path / "sparse" / "0" / "cameras.txt"
     cameras.write_text(cameras.read_text() + "77 PINHOLE 9 9 5 5 4 4\n")
-    capture = load_capture(tmp_path)
+    capture = load_dataset(tmp_path)
     assert len(capture) == 4
     assert capture.points is None
     (tmp_path / "sparse" / "0" / "points3D.txt").write_text("# nothing\n")
-    assert load_capture(tmp_path).points is None
+    assert load_dataset(tmp_path).points is None
 
 
 def _truncate(folder):
@@ -180,31 +180,31 @@ def test_damaged_captures_are_one_line_input_errors(tmp_path, damage, message, m
     write_colmap(tmp_path, [(16, 12)] * 4)
     damage(tmp_path)
     with pytest.raises(InputError, match=message) as raised:
-        load_capture(tmp_path, memory=memory)
+        load_dataset(tmp_path, memory=memory)
     assert "\n" not in str(raised.value)
 
 
 def test_one_image_and_repeated_images_are_input_errors(tmp_path):
     write_colmap(tmp_path / "one", [(16, 12)])
     with pytest.raises(InputError, match="at least 2"):
-        load_capture(tmp_path / "one")
+        load_dataset(tmp_path / "one")
     write_transforms(tmp_path / "twice", 3)
     path = tmp_path / "twice" / "transforms.json"
     document = json.loads(path.read_text())
     document["frames"][2] = document["frames"][1]
     path.write_text(json.dumps(document))
     with pytest.raises(InputError, match=r"2 frames have the image images/0001\.png"):
-        load_capture(tmp_path / "twice")
+        load_dataset(tmp_path / "twice")
 
 
 def test_a_folder_of_photos_is_told_how_to_find_its_cameras(tmp_path):
     write_photo(tmp_path / "a.jpg", 16, 12)
     with pytest.raises(InputError, match="etsplat data sfm"):
-        load_capture(tmp_path)
+        load_dataset(tmp_path)
 
 
 @pytest.mark.parametrize("scene", ["kitchen25", "lego_blender"])
 def test_the_shared_captures_load(shared_data, scene):
-    capture = load_capture(shared_data / "scenes" / scene, width=80)
+    capture = load_dataset(shared_data / "scenes" / scene, width=80)
     assert all(width == 80 for width, _ in capture.images.sizes)
     assert (capture.points is None) == (scene == "lego_blender")

@@ -4,12 +4,10 @@ import pytest
 import torch
 
 from etsplat.core.errors import InputError
-from etsplat.data.colmap import read_colmap
 from etsplat.data.demo_object import demo_object
-from etsplat.data.frames import posed_views
-from etsplat.data.load import load_views
+from etsplat.data.hull import bounding_sphere
+from etsplat.data.load import load_dataset
 from etsplat.data.photograph import photograph
-from etsplat.data.transforms import read_transforms
 from etsplat.io.images import save_image
 from helpers.captures import quaternion
 
@@ -17,11 +15,12 @@ NAMES = [f"photo {k:02d}.png" for k in range(10)]
 
 
 def load_colmap(folder, masks=None, width=None):
-    return posed_views(read_colmap(folder, masks), width=width)
+    return load_dataset(folder, masks_as="alpha", masks=masks, width=width)
 
 
-def load_transforms(folder, width=None):
-    return posed_views(read_transforms(folder), width=width)
+def stack(views):
+    """(B, H, W, 4) of all photos."""
+    return torch.stack(list(views.images))
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +33,7 @@ def write_scene(folder, views, binary, model=("PINHOLE", 1)):
     sparse = folder / "sparse" / "0"
     sparse.mkdir(parents=True)
     (folder / "images").mkdir()
-    K, W, H = 2 * views.cameras.Ks[0], 2 * views.cameras.width, 2 * views.cameras.height
+    K, (W, H) = 2 * views.Ks[0], [2 * side for side in views.images.sizes[0]]
     params = [float(v) for v in (K[0, 0], K[1, 1], K[0, 2], K[1, 2])]
     if model[0] == "SIMPLE_PINHOLE":
         params = params[1:]
@@ -45,8 +44,8 @@ def write_scene(folder, views, binary, model=("PINHOLE", 1)):
     camera_bytes += struct.pack(f"<iiQQ{len(params)}d", 3, model[1], W, H, *params)
     camera_text += f"3 {model[0]} {W} {H} {' '.join(repr(p) for p in params)}\n"
     for index in reversed(range(len(views))):  # files need not be in the order of names
-        viewmat, name = views.cameras.viewmats[index], NAMES[index]
-        save_image(folder / "images" / name, views.images[index, ..., :3])
+        viewmat, name = views.viewmats[index], NAMES[index]
+        save_image(folder / "images" / name, views.images[index][..., :3])
         pose = [*quaternion(viewmat[:3, :3]), *viewmat[:3, 3].tolist()]
         points = [(1.0, 2.0, -1), (3.0, 4.5, 7)] if index % 2 else []
         image_bytes += struct.pack("<I7dI", index, *pose, 3) + name.encode() + b"\0" + struct.pack("<Q", len(points))
@@ -73,9 +72,9 @@ def write_masks(folder, views):
 def test_cameras_images_names_and_split_return(tmp_path, truth, binary, model):
     write_scene(tmp_path, truth, binary, model)
     views = load_colmap(tmp_path)
-    torch.testing.assert_close(views.cameras.viewmats, truth.cameras.viewmats, atol=1e-5, rtol=0)
-    torch.testing.assert_close(views.cameras.Ks, truth.cameras.Ks)
-    torch.testing.assert_close(views.images[..., :3], truth.images[..., :3], atol=1 / 255, rtol=0)
+    torch.testing.assert_close(views.viewmats, truth.viewmats, atol=1e-5, rtol=0)
+    torch.testing.assert_close(views.Ks, truth.Ks)
+    torch.testing.assert_close(stack(views)[..., :3], stack(truth)[..., :3], atol=1 / 255, rtol=0)
     assert views.test == [0, 8]
     assert views.names == [name.removesuffix(".png") for name in NAMES]
     assert not views.has_masks
@@ -85,17 +84,18 @@ def test_masks_are_found_beside_the_images_or_where_told(tmp_path, truth):
     write_scene(tmp_path / "scene", truth, True)
     write_masks(tmp_path / "elsewhere", truth)
     told = load_colmap(tmp_path / "scene", tmp_path / "elsewhere")
-    torch.testing.assert_close(told.images[..., 3], truth.images[..., 3], atol=1 / 255, rtol=0)
+    torch.testing.assert_close(stack(told)[..., 3], stack(truth)[..., 3], atol=1 / 255, rtol=0)
     (tmp_path / "elsewhere").rename(tmp_path / "scene" / "masks")
-    assert torch.equal(load_colmap(tmp_path / "scene").images, told.images)
-    vertices = load_views(tmp_path / "scene").normalization.apply(truth.normalization.apply(demo_object().vertices))
+    assert torch.equal(stack(load_colmap(tmp_path / "scene")), stack(told))
+    unit = told.renormalized(*bounding_sphere(told))
+    vertices = unit.normalization.apply(truth.normalization.apply(demo_object().vertices))
     assert float(vertices.norm(dim=1).max()) <= 1
 
 
-def test_load_views_without_masks_says_what_to_add(tmp_path, truth):
+def test_an_object_without_masks_says_what_to_add(tmp_path, truth):
     write_scene(tmp_path, truth, True)
     with pytest.raises(InputError, match="add a folder masks/"):
-        load_views(tmp_path)
+        bounding_sphere(load_colmap(tmp_path))
 
 
 @pytest.mark.parametrize("binary", [True, False], ids=["bin", "txt"])
@@ -133,8 +133,10 @@ def test_malformed_text_lines_are_quoted(tmp_path, truth, name, old, new):
 
 
 def test_missing_parts_are_input_errors(tmp_path, truth):
+    (tmp_path / "sparse").mkdir()
     with pytest.raises(InputError, match=r"no sparse/0/cameras\.bin"):
         load_colmap(tmp_path)
+    (tmp_path / "sparse").rmdir()
     write_scene(tmp_path, truth, True)
     with pytest.raises(InputError, match=r"masks .*: no such folder"):
         load_colmap(tmp_path, tmp_path / "absent")
@@ -150,15 +152,15 @@ def test_missing_parts_are_input_errors(tmp_path, truth):
 def test_the_shared_captures_load(shared_data, scene, count):
     views = load_colmap(shared_data / "scenes" / scene, width=64)
     assert len(views) == count
-    assert views.cameras.width == 64
-    rotation = views.cameras.viewmats[:, :3, :3]
-    torch.testing.assert_close(rotation @ rotation.mT, torch.eye(3).expand(count, 3, 3), atol=1e-5, rtol=0)
+    assert {width for width, _ in views.images.sizes} == {64}
+    rotation = views.viewmats[:, :3, :3]
+    torch.testing.assert_close(rotation @ rotation.mT, torch.eye(3).double().expand(count, 3, 3), atol=1e-5, rtol=0)
 
 
 def test_the_shared_lego_has_the_same_cameras_in_both_layouts(shared_data):
     """The COLMAP copy was made from the Blender scene; poses agree view by view."""
     colmap = load_colmap(shared_data / "scenes" / "lego", width=16)
-    blender = load_transforms(shared_data / "scenes" / "lego_blender", width=16)
+    blender = load_dataset(shared_data / "scenes" / "lego_blender", width=16)
     index = blender.names.index("train_r_7")
     other = colmap.names.index("train_007")
-    torch.testing.assert_close(colmap.cameras.viewmats[other], blender.cameras.viewmats[index], atol=1e-4, rtol=0)
+    torch.testing.assert_close(colmap.viewmats[other], blender.viewmats[index], atol=1e-4, rtol=0)

@@ -1,0 +1,166 @@
+"""Posed photos, of an object or of a scene: what every loader returns and every run starts from."""
+
+import hashlib
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from etsplat.core.cameras import Cameras, camera_centers
+from etsplat.data.pictures import Pictures, as_float, halved
+
+SPREAD_FACTOR = 1.1
+"""Extent = this times the largest distance of a training camera from their mean, as 3DGS has it."""
+
+
+@dataclass(frozen=True)
+class Normalization:
+    """The similarity between the input's own units and another frame: x_frame = (x - center) / radius.
+
+    Attributes:
+        center: (3,) in input units.
+        radius: > 0, in input units.
+    """
+
+    center: Float[Tensor, "3"] = field(default_factory=lambda: torch.zeros(3, dtype=torch.float64))
+    radius: float = 1.0
+
+    def apply(self, points: Float[Tensor, "*N 3"]) -> Float[Tensor, "*N 3"]:
+        """Input units to the frame."""
+        return (points - self.center.to(points)) / self.radius
+
+    def invert(self, points: Float[Tensor, "*N 3"]) -> Float[Tensor, "*N 3"]:
+        """The frame to input units."""
+        return points * self.radius + self.center.to(points)
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """Posed photos, each with a camera of its own size.
+
+    Poses and points are kept in double precision, so that a scene far from its origin can be moved there without loss;
+    `cameras` and `points` give them in the engines' float32.
+
+    Attributes:
+        viewmats: (B, 4, 4) float64, world to camera, OpenCV axes.
+        Ks: (B, 3, 3) float64, in pixels of the photos as loaded.
+        images: B photos; `images.sizes` are their (width, height). Where alpha is below 1 a background shows; pixels
+            that a mask excludes are ignored.
+        names: B names, unique, fit for files.
+        train: indices of the views to optimise on, ascending.
+        test: indices of the views held out, ascending. Disjoint from `train`.
+        exact_points: (P, 3) float64, P > 0, or None.
+        point_colors: (P, 3) float32 in [0, 1] as displayed, or None without points.
+        normalization: from the input's own units to the present frame.
+
+    Raises:
+        ValueError: fields that contradict each other.
+    """
+
+    viewmats: Float[Tensor, "B 4 4"]
+    Ks: Float[Tensor, "B 3 3"]
+    images: Pictures
+    names: list[str]
+    train: list[int]
+    test: list[int]
+    exact_points: Float[Tensor, "P 3"] | None = None
+    point_colors: Float[Tensor, "P 3"] | None = None
+    normalization: Normalization = field(default_factory=Normalization)
+
+    def __post_init__(self) -> None:
+        B = len(self.viewmats)
+        for name, count in (("Ks", len(self.Ks)), ("images", len(self.images.sizes)), ("names", len(self.names))):
+            if count != B:
+                raise ValueError(f"{name}: expected {B}, one per viewmat, got {count}")
+        if sorted([*self.train, *self.test]) != sorted(set(self.train) | set(self.test)):
+            raise ValueError("train, test: expected disjoint indices without repetition")
+        if not all(0 <= index < B for index in [*self.train, *self.test]):
+            raise ValueError(f"train, test: expected indices in [0, {B})")
+
+    def __len__(self) -> int:
+        return len(self.viewmats)
+
+    @cached_property
+    def cameras(self) -> list[Cameras]:
+        """B single cameras in float32."""
+        return [
+            Cameras(self.viewmats[index : index + 1].float(), self.Ks[index : index + 1].float(), *size)
+            for index, size in enumerate(self.images.sizes)
+        ]
+
+    @property
+    def points(self) -> Float[Tensor, "P 3"] | None:
+        """(P, 3) float32 points of structure from motion in the present frame, or None."""
+        return None if self.exact_points is None else self.exact_points.float()
+
+    @property
+    def centers(self) -> Float[Tensor, "B 3"]:
+        """(B, 3) float64 camera positions."""
+        return camera_centers(self.viewmats)
+
+    @property
+    def extent(self) -> float:
+        """1.1 times the largest distance of a training camera from the mean of them; 1 if all are at one place."""
+        return self._center_and_extent()[1]
+
+    @property
+    def has_masks(self) -> bool:
+        """Whether any pixel is not fully opaque, that is, whether an object is separated from its background."""
+        return any(bool((as_float(image[..., 3:]) < 1).any()) for image in self.images)
+
+    def fingerprint(self) -> str:
+        """A short hash of all that a run depends on: cameras, split, points, names, and the photos and masks."""
+        digest = hashlib.sha256()
+        split = torch.tensor([*self.train, -1, *self.test])
+        for tensor in (self.viewmats, self.Ks, split, self.exact_points, self.point_colors):
+            if tensor is not None:
+                digest.update(str(tuple(tensor.shape)).encode())
+                digest.update(tensor.contiguous().numpy().tobytes())
+        digest.update(repr((self.names, self.images.sizes)).encode())
+        digest.update(self.images.fingerprint())
+        return digest.hexdigest()[:16]
+
+    def halved(self) -> "Dataset":
+        """The same views at half the size, each pixel the mean of those it replaces (odd sizes are rounded down)."""
+        images = halved(self.images)
+        ratios = [
+            (width / before[0], height / before[1], 1.0)
+            for (width, height), before in zip(images.sizes, self.images.sizes, strict=True)
+        ]
+        Ks = self.Ks.float() * torch.tensor(ratios)[..., None]
+        return replace(self, Ks=Ks.double(), images=images)
+
+    def normalized(self) -> "Dataset":
+        """The same views where the training cameras are centred at the origin and the extent is 1.
+
+        `normalization.invert` of the result leads back to the input's own units.
+        """
+        return self.renormalized(*self._center_and_extent())
+
+    def renormalized(self, center: Float[Tensor, "3"], radius: float) -> "Dataset":
+        """The same views in the frame where the sphere (center, radius) of the present frame is the unit sphere.
+
+        A point maps to x' = (x - center) / radius, so a camera [R | t] becomes [R | (t + R center) / radius]; images
+        and intrinsics do not change. Computed in the precision of `center`.
+        """
+        viewmats = self.viewmats.clone()
+        rotations, translations = viewmats[:, :3, :3].to(center), viewmats[:, :3, 3].to(center)
+        viewmats[:, :3, 3] = ((translations + rotations @ center) / radius).double()
+        points = None if self.exact_points is None else (self.exact_points - center) / radius
+        before = self.normalization
+        total = Normalization(before.invert(center), before.radius * radius)
+        return replace(self, viewmats=viewmats, exact_points=points, normalization=total)
+
+    def _center_and_extent(self) -> tuple[Float[Tensor, "3"], float]:
+        centers = self.centers[self.train or list(range(len(self)))]
+        center = centers.mean(dim=0)
+        spread = float((centers - center).norm(dim=1).max())
+        resolvable = 1e-9 * float(center.abs().max())
+        return center, SPREAD_FACTOR * spread if spread > resolvable else 1.0
+
+
+def every_eighth(count: int) -> tuple[list[int], list[int]]:
+    """(train, test) indices of so many views, sorted by name: every 8th, starting with the first, is test."""
+    return [index for index in range(count) if index % 8], list(range(0, count, 8))

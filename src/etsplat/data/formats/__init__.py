@@ -1,0 +1,1 @@
+"""Layouts of folders with posed photos, a module each; `etsplat.data.load.Format` says what it holds."""

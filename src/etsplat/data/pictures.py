@@ -1,0 +1,234 @@
+"""The photos of a data set: made in parallel when they are needed, and kept in memory as far as they fit there."""
+
+import hashlib
+import math
+import os
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, as_completed
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from etsplat.io.memory import available_memory
+
+Pixels = UInt8[Tensor, "H W C"] | Float[Tensor, "H W 4"]
+"""Bytes of 3 channels, or of 4 premultiplied; or premultiplied RGBA in [0, 1]."""
+
+
+def as_float(pixels: Pixels) -> Float[Tensor, "H W C"]:
+    """Pixels in [0, 1]."""
+    return pixels.float() / 255 if pixels.dtype == torch.uint8 else pixels
+
+
+class Pictures(Protocol):
+    """Photos by view."""
+
+    @property
+    def sizes(self) -> Sequence[tuple[int, int]]:
+        """(width, height) of each."""
+        ...
+
+    @property
+    def total_bytes(self) -> int:
+        """What all of them take in memory."""
+        ...
+
+    @property
+    def streamed(self) -> bool:
+        """Whether they do not fit into memory, so that each is made anew when it is needed."""
+        ...
+
+    def __getitem__(self, index: int) -> Pixels:
+        """Raises IndexError where there is no such view, InputError where its file is damaged or has gone."""
+        ...
+
+    def __iter__(self) -> Iterator[Pixels]:
+        """Of all views in order."""
+        ...
+
+    def mask(self, index: int) -> UInt8[Tensor, "H W"] | None:
+        """255 where pixels of the view count and 0 where they are to be ignored; None if all count."""
+        ...
+
+    def fingerprint(self) -> bytes:
+        """A hash of what they show; the same for a copy."""
+        ...
+
+    def expect(self, indices: Sequence[int]) -> None:
+        """Start to make those that are needed soon, as many as fit."""
+        ...
+
+
+@dataclass(frozen=True)
+class Picture:
+    """One photo.
+
+    Attributes:
+        pixels: as of `Pictures`.
+        mask: (H, W), 255 where pixels count and 0 where they are to be ignored; None if all count.
+    """
+
+    pixels: Pixels
+    mask: UInt8[Tensor, "H W"] | None = None
+
+
+class StoredPictures:
+    """Photos that are in memory already."""
+
+    streamed = False
+
+    def __init__(self, pixels: Sequence[Pixels], masks: Sequence[UInt8[Tensor, "H W"] | None] | None = None) -> None:
+        self._pixels = list(pixels)
+        self._masks = [None] * len(self._pixels) if masks is None else list(masks)
+        self.sizes = [(image.shape[1], image.shape[0]) for image in self._pixels]
+        kept = [*self._pixels, *(mask for mask in self._masks if mask is not None)]
+        self.total_bytes = sum(image.numel() * image.element_size() for image in kept)
+
+    def __getitem__(self, index: int) -> Pixels:
+        """As they were handed in."""
+        return self._pixels[index]
+
+    def __iter__(self) -> Iterator[Pixels]:
+        return iter(self._pixels)
+
+    def mask(self, index: int) -> UInt8[Tensor, "H W"] | None:
+        """As handed in; None if all pixels count."""
+        return self._masks[index]
+
+    def fingerprint(self) -> bytes:
+        """Of all pixels and masks."""
+        digest = hashlib.sha256()
+        for image in [*self._pixels, *self._masks]:
+            digest.update(b"none" if image is None else image.contiguous().cpu().numpy().data)
+        return digest.digest()
+
+    def expect(self, indices: Sequence[int]) -> None:
+        """Nothing to prepare."""
+
+
+class LazyPictures:
+    """Photos that are made when they are first asked for. Safe to use from several threads.
+
+    Within `limit` bytes everything stays. Beyond it the photos used last are kept, and `expect` makes those that are
+    needed next while the caller works.
+    """
+
+    def __init__(
+        self,
+        make: Callable[[int], Picture],
+        sizes: Sequence[tuple[int, int]],
+        sizes_in_bytes: Sequence[int],
+        fingerprint: Callable[[], bytes],
+        limit: int | None = None,
+    ) -> None:
+        """Makes nothing yet.
+
+        Args:
+            make: the photo of a view; called from other threads.
+            sizes: (width, height) of each.
+            sizes_in_bytes: upper bounds.
+            fingerprint: of all of them, without making any.
+            limit: bytes that may be kept; None for half of the memory that is free.
+        """
+        self.sizes = list(sizes)
+        self.fingerprint = fingerprint
+        self._make = make
+        self._limit = available_memory() // 2 if limit is None else limit
+        self._bytes = list(sizes_in_bytes)
+        self.total_bytes = sum(self._bytes)
+        self._kept: OrderedDict[int, Future[Picture]] = OrderedDict()
+        self._lock = threading.Lock()
+        self._pool = ThreadPoolExecutor(max_workers=min(os.cpu_count() or 1, 8), thread_name_prefix="images")
+
+    @property
+    def streamed(self) -> bool:
+        """Whether the set is larger than the limit."""
+        return self.total_bytes > self._limit
+
+    def __getitem__(self, index: int) -> Pixels:
+        """Raises IndexError where there is no such view, and what making it raises."""
+        return self._picture(index).pixels
+
+    def __iter__(self) -> Iterator[Pixels]:
+        return (self[index] for index in range(len(self.sizes)))
+
+    def mask(self, index: int) -> UInt8[Tensor, "H W"] | None:
+        """(H, W), 255 where pixels of the view count and 0 where they are to be ignored; None if all count."""
+        return self._picture(index).mask
+
+    def expect(self, indices: Sequence[int]) -> None:
+        """Start to make those that are needed soon, as many as fit."""
+        space = self._limit
+        for index in indices:
+            space -= self._bytes[index]
+            if space < 0:
+                break
+            self._future(index)
+
+    def preload(self, progress: Callable[[int, int], None] | None = None) -> None:
+        """Make everything once, so that damaged files are found now, and keep it, if it fits.
+
+        Args:
+            progress: called with (photos made, photos in all).
+
+        Raises:
+            InputError: a file is damaged.
+        """
+        views = range(len(self.sizes))
+        futures = [self._pool.submit(self._check, view) if self.streamed else self._future(view) for view in views]
+        try:
+            for done, future in enumerate(as_completed(futures), 1):
+                future.result()
+                if progress is not None:
+                    progress(done, len(futures))
+        finally:
+            for future in futures:
+                future.cancel()
+
+    def _check(self, index: int) -> None:
+        self._make(index)  # and forgets it
+
+    def _picture(self, index: int) -> Picture:
+        if not 0 <= index < len(self.sizes):
+            raise IndexError(f"view {index}: expected one in [0, {len(self.sizes)})")
+        try:
+            return self._future(index).result()
+        except BaseException:
+            with self._lock:
+                self._kept.pop(index, None)
+            raise
+
+    def _future(self, index: int) -> Future[Picture]:
+        with self._lock:
+            if index not in self._kept:
+                self._kept[index] = self._pool.submit(self._make, index)
+            self._kept.move_to_end(index)
+            used = sum(self._bytes[kept] for kept in self._kept) if self.streamed else 0
+            while used > self._limit and len(self._kept) > 1:
+                used -= self._bytes[next(iter(self._kept))]
+                self._kept.popitem(last=False)
+            return self._kept[index]
+
+
+def halved(pictures: Pictures) -> LazyPictures:
+    """Photos and masks at half the size, each pixel the mean of those it replaces; odd sizes are rounded down."""
+    sizes = [(max(1, width // 2), max(1, height // 2)) for width, height in pictures.sizes]
+
+    def make(index: int) -> Picture:
+        mask, (width, height) = pictures.mask(index), sizes[index]
+        small = None if mask is None else _area_mean(mask[..., None], width, height)[..., 0]
+        return Picture(_area_mean(pictures[index], width, height), small)
+
+    per_pixel = math.ceil(pictures.total_bytes / sum(width * height for width, height in pictures.sizes))
+    return LazyPictures(make, sizes, [per_pixel * width * height for width, height in sizes], pictures.fingerprint)
+
+
+def _area_mean(image: Pixels, width: int, height: int) -> Pixels:
+    planes = image.movedim(-1, 0)[None]
+    mean = torch.nn.functional.interpolate(planes.float(), (height, width), mode="area")[0].movedim(0, -1)
+    return ((mean + 0.5).to(torch.uint8) if image.dtype == torch.uint8 else mean).contiguous()
