@@ -7,6 +7,7 @@ import torch
 from PIL import Image
 
 from etsplat.core.errors import InputError
+from etsplat.data import formats
 from etsplat.data.load import load_dataset
 from helpers.captures import circle_poses, write_colmap, write_photo, write_transforms
 
@@ -208,3 +209,60 @@ def test_the_shared_captures_load(shared_data, scene):
     capture = load_dataset(shared_data / "scenes" / scene, width=80)
     assert all(width == 80 for width, _ in capture.images.sizes)
     assert (capture.points is None) == (scene == "lego_blender")
+
+
+def test_a_layout_of_ones_own_is_one_module(tmp_path, monkeypatch):
+    """It is found by being there, comes in its rank, and is named where no layout fits."""
+    (tmp_path / "code").mkdir()
+    (tmp_path / "code" / "poses_txt.py").write_text(
+        """
+import torch
+from etsplat.data.frames import Frame, posed
+
+MARK, RANK = "poses.txt", 0
+
+
+def recognises(folder):
+    return (folder / "poses.txt").is_file()
+
+
+def read(folder, wanted):
+    frames = []
+    for line in (folder / "poses.txt").read_text().splitlines():
+        name, focal, z = line.split()
+        viewmat = torch.eye(4, dtype=torch.float64)
+        viewmat[2, 3] = float(z)
+        K = torch.tensor([[float(focal), 0, 8], [0, float(focal), 6], [0, 0, 1]], dtype=torch.float64)
+        frames.append(Frame(name, folder / name, None, viewmat, K, (16, 12)))
+    return posed(folder, frames, wanted)
+"""
+    )
+    monkeypatch.setattr(formats, "__path__", [*formats.__path__, str(tmp_path / "code")])
+    write_transforms(tmp_path / "scene", 3)
+    (tmp_path / "scene" / "poses.txt").write_text("images/0001.png 20 3\nimages/0002.png 30 4\n")
+    dataset = load_dataset(tmp_path / "scene", width=8)
+    assert (dataset.names, dataset.train, dataset.test) == (["images_0001", "images_0002"], [1], [0])
+    assert dataset.Ks[1, 0].tolist() == [15, 0, 4]
+    assert dataset.images.sizes == [(8, 6)] * 2
+    with pytest.raises(InputError, match=r"neither poses\.txt nor transforms\.json nor sparse/ in it"):
+        load_dataset(tmp_path / "code")
+
+
+def test_masks_count_as_transparency_or_say_what_to_ignore(tmp_path):
+    """The same folder as an object and as a scene; photos of an object may have different sizes, too."""
+    write_colmap(tmp_path, SIZES)
+    for index, (width, height) in enumerate(SIZES):
+        write_photo(tmp_path / "masks" / f"{index:04d}.png", width, height, seed=100 + index)
+    scene = load_dataset(tmp_path)
+    whole = load_dataset(tmp_path, masks_as="alpha", memory=40 * 30 * 16 * 2)
+    assert whole.images.streamed
+    assert (scene.has_masks, whole.has_masks) == (False, True)
+    assert torch.equal(scene.Ks, whole.Ks)
+    for index, (width, height) in enumerate(SIZES):
+        photo, mask = scene.images[index].float() / 255, scene.images.mask(index).float() / 255
+        assert (scene.images[index].dtype, whole.images[index].dtype) == (torch.uint8, torch.float32)
+        assert whole.images[index].shape == (height, width, 4)
+        assert whole.images.mask(index) is None
+        torch.testing.assert_close(whole.images[index][..., 3], mask, atol=1 / 255, rtol=0)
+        torch.testing.assert_close(whole.images[index][..., :3], photo * mask[..., None], atol=1 / 255, rtol=0)
+    assert whole.fingerprint() == load_dataset(tmp_path, masks_as="alpha").fingerprint()

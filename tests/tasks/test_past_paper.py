@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from etsplat.core.errors import InputError
-from etsplat.data.photograph import photograph
 from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.intersections import count_self_intersections
 from etsplat.geometry.topology import MeshTopology
@@ -119,17 +118,6 @@ def test_schedules_past_the_paper() -> None:
     assert regularization_weight(55, 100, 10, final=0.2) == pytest.approx(0.6)
     assert evenly(100, 4, 0.6) == [70, 80, 90, 100]
     assert evenly(100, 0, 0.6) == []
-
-
-def test_halved_views_are_means_and_see_the_same() -> None:
-    """Each pixel is the mean of four, and a point projects to half its coordinates."""
-    vertices, faces = icosphere(2)
-    views = photograph(MeshFile(vertices, faces), 32, 32, supersampling=1)
-    half = views.halved()
-    assert half.images.shape == (40, 16, 16, 4)
-    torch.testing.assert_close(half.images[3][5, 7], views.images[3][10:12, 14:16].mean(dim=(0, 1)))
-    torch.testing.assert_close(half.Ks[:, :2], views.Ks[:, :2] / 2)
-    assert torch.equal(half.viewmats, views.viewmats)
 
 
 @pytest.mark.parametrize(

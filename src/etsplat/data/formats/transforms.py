@@ -70,9 +70,9 @@ def recognises(folder: Path) -> bool:
 def read(folder: Path, wanted: Wanted) -> Dataset:
     """Read a scene folder with `transforms.json`, or with `transforms_train.json` and `transforms_test.json`.
 
-    Images may be RGBA; otherwise a frame's `mask_path`, or a folder `masks/` with a file for every image, has masks.
-    With one `transforms.json` its `train_filenames` and `test_filenames` make the split; without them, every 8th image
-    by name is test. `transforms_val.json` is not used. `ply_file_path` names the points.
+    Masks come from each frame's `mask_path`, or from a folder `masks/` with a file for every image; RGBA images need
+    none. With one `transforms.json` its `train_filenames` and `test_filenames` make the split; without them, every 8th
+    image by name is test. `transforms_val.json` is not used. `ply_file_path` names the points.
 
     Args:
         folder: the scene.
@@ -102,7 +102,7 @@ def read_distorted_transforms(folder: Path) -> DistortedFrames:
     """What `transforms.json` says of images with lens distortion (k1 to k4, p1, p2, OPENCV_FISHEYE).
 
     Raises:
-        InputError: as `read_transforms`; a lens that COLMAP does not know.
+        InputError: as `read`; a lens that COLMAP does not know.
     """
     path = folder / "transforms.json"
     document = _read(path)
