@@ -157,8 +157,7 @@ private:
 };
 
 // Cotangents of the shaded pixels, and what the silhouettes' ends get from the weights.
-void blend_backward(const AntialiasState& state, const AntialiasGradients& out) {
-    const AntialiasInput& in = state.input;
+void blend_backward(const AntialiasState& state, const AntialiasInput& in, const AntialiasGradients& out) {
     const int32_t channels = in.colors.channels;
     const int64_t size = static_cast<int64_t>(in.camera.width) * in.camera.height * channels;
     parallel_for(size, 1 << 16, [&](int64_t begin, int64_t end) {
@@ -194,7 +193,6 @@ void blend_backward(const AntialiasState& state, const AntialiasGradients& out) 
 
 std::shared_ptr<AntialiasState> antialias_forward(const AntialiasInput& input, float* shaded, float* color) {
     auto state = std::make_shared<AntialiasState>();
-    state->input = input;
     shade(input, shaded);
     state->blends = find_blends(input);
     const int32_t channels = input.colors.channels;
@@ -207,9 +205,9 @@ std::shared_ptr<AntialiasState> antialias_forward(const AntialiasInput& input, f
     return state;
 }
 
-void antialias_backward(const AntialiasState& state, const AntialiasGradients& gradients) {
-    blend_backward(state, gradients);
-    const ShadeBackward shading(state.input, gradients);
+void antialias_backward(const AntialiasState& state, const AntialiasInput& input, const AntialiasGradients& gradients) {
+    blend_backward(state, input, gradients);
+    const ShadeBackward shading(input, gradients);
     std::vector<BandSums> bands(kBands);
     parallel_for(kBands, 1, [&](int64_t begin, int64_t end) {
         for (int64_t band = begin; band < end; ++band) shading.gather(static_cast<int>(band), bands[band]);

@@ -35,7 +35,6 @@ struct Blend {
 std::vector<Blend> find_blends(const AntialiasInput& input);
 
 struct AntialiasState {
-    AntialiasInput input;
     std::vector<Blend> blends;
 };
 
@@ -65,6 +64,7 @@ inline PinholeCamera pinhole(const HardCamera& camera) {
 // Fills `shaded` (before antialiasing) and `color` (after).
 std::shared_ptr<AntialiasState> antialias_forward(const AntialiasInput& input, float* shaded, float* color);
 
-void antialias_backward(const AntialiasState& state, const AntialiasGradients& gradients);
+// `input` is that of the forward pass, wherever it lies now.
+void antialias_backward(const AntialiasState& state, const AntialiasInput& input, const AntialiasGradients& gradients);
 
 }  // namespace etsplat

@@ -56,7 +56,7 @@ void bind_rasterize(nb::module_& m) {
     m.def("count_tiles", &count_tiles, nb::arg("state"), NoGil());
     m.def("time_kernel", &time_kernel, nb::arg("kernel"), nb::arg("sigma"), NoGil());
     m.def("raster_forward", &raster_forward, nb::arg("call"), NoGil());
-    m.def("raster_backward", &raster_backward, nb::arg("state"), nb::arg("gradients"), NoGil());
+    m.def("raster_backward", &raster_backward, nb::arg("state"), nb::arg("call"), nb::arg("gradients"), NoGil());
 }
 
 }  // namespace etsplat

@@ -58,14 +58,6 @@ void fill_pass(RasterState& state) {
     pass.transmittance_min = call.transmittance_min;
     pass.distortion_near = call.distortion_near;
     pass.distortion_far = call.distortion_far;
-    pass.flat_colors = reinterpret_cast<const float*>(call.flat_colors);
-    pass.corner_colors = reinterpret_cast<const float*>(call.corner_colors);
-    pass.background = reinterpret_cast<const float*>(call.background);
-    pass.color = reinterpret_cast<float*>(call.color);
-    pass.alpha = reinterpret_cast<float*>(call.alpha);
-    pass.distortion = reinterpret_cast<float*>(call.distortion);
-    pass.distortion_totals = reinterpret_cast<float*>(call.distortion_totals);
-    pass.median_triangle = reinterpret_cast<int32_t*>(call.median_triangle);
     pass.slot_layout.flat_channels = call.flat_channels;
     pass.slot_layout.corner_channels = call.corner_channels;
     pass.slot_layout.attributes = pass.attributes;
@@ -84,13 +76,6 @@ void fill_triangles(RasterState& state) {
     pass.near_plane = call.near_plane;
     pass.support_alpha = call.alpha_min;
     pass.x_max = call.x_max;
-    pass.vertices = reinterpret_cast<const float*>(call.vertices);
-    pass.faces = reinterpret_cast<const int32_t*>(call.faces);
-    pass.opacities = reinterpret_cast<const float*>(call.opacities);
-    pass.sigmas = reinterpret_cast<const float*>(call.sigmas);
-    pass.screen_size = reinterpret_cast<float*>(call.screen_size);
-    pass.inradius = reinterpret_cast<float*>(call.inradius);
-    pass.visible = reinterpret_cast<bool*>(call.visible);
     state.records.resize(pass.count);
     state.attributes.resize(
         state.pass.attributes || state.pass.distortion_depth != DistortionDepth::kNone ? pass.count : 0);
@@ -101,6 +86,27 @@ void fill_triangles(RasterState& state) {
     pass.keys = state.keys.data();
     pass.spans = state.spans.data();
     state.triangles = pass;
+}
+
+// Where the arrays of `call` lie: the backward pass may be handed them elsewhere than the forward pass found them.
+void bind_arrays(RasterState& state, const RasterCall& call) {
+    RasterPass& pass = state.pass;
+    pass.flat_colors = reinterpret_cast<const float*>(call.flat_colors);
+    pass.corner_colors = reinterpret_cast<const float*>(call.corner_colors);
+    pass.background = reinterpret_cast<const float*>(call.background);
+    pass.color = reinterpret_cast<float*>(call.color);
+    pass.alpha = reinterpret_cast<float*>(call.alpha);
+    pass.distortion = reinterpret_cast<float*>(call.distortion);
+    pass.distortion_totals = reinterpret_cast<float*>(call.distortion_totals);
+    pass.median_triangle = reinterpret_cast<int32_t*>(call.median_triangle);
+    TrianglePass& triangles = state.triangles;
+    triangles.vertices = reinterpret_cast<const float*>(call.vertices);
+    triangles.faces = reinterpret_cast<const int32_t*>(call.faces);
+    triangles.opacities = reinterpret_cast<const float*>(call.opacities);
+    triangles.sigmas = reinterpret_cast<const float*>(call.sigmas);
+    triangles.screen_size = reinterpret_cast<float*>(call.screen_size);
+    triangles.inradius = reinterpret_cast<float*>(call.inradius);
+    triangles.visible = reinterpret_cast<bool*>(call.visible);
 }
 
 void project_triangles(RasterState& state, const TriangleKernels& kernels) {
@@ -151,6 +157,7 @@ std::shared_ptr<RasterState> raster_forward(const RasterCall& call) {
     state->call = call;
     fill_pass(*state);
     fill_triangles(*state);
+    bind_arrays(*state, call);
     RasterPass& pass = state->pass;
     const TriangleKernels& kernels = active_triangle_kernels();
     project_triangles(*state, kernels);
@@ -179,10 +186,11 @@ std::shared_ptr<RasterState> raster_forward(const RasterCall& call) {
     return state;
 }
 
-void raster_backward(RasterState& state, const RasterGradients& gradients) {
+void raster_backward(RasterState& state, const RasterCall& call, const RasterGradients& gradients) {
     StageClock clock(state.stages);
     RasterPass& pass = state.pass;
     if (!state.call.keep_for_backward) throw std::logic_error("rasterize: this render was made without keep_for_backward");
+    bind_arrays(state, call);
     pass.grad_color = reinterpret_cast<const float*>(gradients.grad_color);
     pass.grad_alpha = reinterpret_cast<const float*>(gradients.grad_alpha);
     pass.grad_distortion = reinterpret_cast<const float*>(gradients.grad_distortion);

@@ -20,7 +20,8 @@
 
 namespace etsplat {
 
-// Everything a call needs, by address; the Python side owns the memory. 0 where an optional tensor is absent.
+// Everything a call needs, by address; the Python side owns the memory, and keeps it for as long as the call runs, no
+// longer. 0 where an optional tensor is absent.
 struct RasterCall {
     uintptr_t vertices = 0;  // (N, 3, 3), or (V, 3) with faces
     uintptr_t faces = 0;     // (N, 3) int32
@@ -78,6 +79,7 @@ void bin_triangles(RasterState& state, const TriangleKernels& kernels);
 void reduce_gradients(RasterState& state, const RasterGradients& gradients);
 
 std::shared_ptr<RasterState> raster_forward(const RasterCall& call);
-void raster_backward(RasterState& state, const RasterGradients& gradients);
+// `call` is that of the forward pass, with the addresses of now.
+void raster_backward(RasterState& state, const RasterCall& call, const RasterGradients& gradients);
 
 }  // namespace etsplat

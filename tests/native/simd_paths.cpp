@@ -116,7 +116,7 @@ Result render(Scene& scene, int kernel, int distance, const Pass& pass) {
     gradients.viewmat = address(r.viewmat);
     gradients.K = address(r.K);
     const auto state = raster_forward(call);
-    raster_backward(*state, gradients);
+    raster_backward(*state, call, gradients);
     for (const int32_t triangle : median) r.median.push_back(static_cast<float>(triangle));
     return r;
 }

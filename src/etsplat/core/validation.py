@@ -1,5 +1,6 @@
 """Checks of tensor arguments; every failure is a ValueError that names the argument, what it got and what it wants."""
 
+import math
 from collections.abc import Mapping, Sequence
 
 import torch
@@ -20,12 +21,13 @@ def check_shape(name: str, tensor: Tensor, *shapes: Shape, sizes: dict[str, int]
         sizes: Letters with known sizes, shared by the checks of several arguments; letters first met here are added.
 
     Raises:
-        ValueError: It is no tensor, or no shape matches.
+        ValueError: It is no tensor, has no memory of its own, or no shape matches.
     """
     sizes = {} if sizes is None else sizes
     wanted = " or ".join("(" + ", ".join(map(str, shape)) + ("," if len(shape) == 1 else "") + ")" for shape in shapes)
     if not isinstance(tensor, Tensor):
         raise ValueError(f"{name} must be a tensor of shape {wanted}, got {type(tensor).__name__}")
+    _check_memory(name, tensor)
     for shape in shapes:
         if len(shape) != tensor.ndim:
             continue
@@ -39,6 +41,32 @@ def check_shape(name: str, tensor: Tensor, *shapes: Shape, sizes: dict[str, int]
     letters = {s for shape in shapes for s in shape if isinstance(s, str) and s in sizes}
     known = ", ".join(f"{letter}={sizes[letter]}" for letter in sorted(letters))
     raise ValueError(f"{name} must have shape {wanted}{' with ' + known if known else ''}, got {tuple(tensor.shape)}")
+
+
+def dense(tensor: Tensor, name: str = "gradient") -> Tensor:
+    """The tensor as native code reads it: detached, contiguous, its values in memory as they are.
+
+    Views such as ``torch.view_as_real(z.conj())[..., 1]`` carry a sign that memory does not show.
+
+    Raises:
+        ValueError: It has no memory; the message says ``name``.
+    """
+    _check_memory(name, tensor)
+    return tensor.detach().resolve_conj().resolve_neg().contiguous()
+
+
+def _check_memory(name: str, tensor: Tensor) -> None:
+    """Raise ValueError unless every element has its place in memory."""
+    if tensor.layout != torch.strided:
+        raise ValueError(f"{name} must be a dense tensor, got layout {tensor.layout}")
+    if tensor._is_zerotensor():
+        raise ValueError(f"{name} must have memory of its own, got a ZeroTensor: pass {name}.clone()")
+    if tensor.numel() == 0:
+        return
+    last = tensor.storage_offset() + sum((n - 1) * step for n, step in zip(tensor.shape, tensor.stride(), strict=True))
+    needed, held = (last + 1) * tensor.element_size(), tensor.untyped_storage().nbytes()
+    if held < needed:
+        raise ValueError(f"{name} must have memory of its own: it needs {needed} bytes, and its storage holds {held}")
 
 
 def check_like(name: str, tensor: Tensor, other_name: str, other: Tensor) -> None:
@@ -69,21 +97,25 @@ def check_indices(name: str, indices: Tensor, count: int) -> None:
         raise ValueError(f"{name} must be indices from 0 to {count - 1}, got indices from {low} to {high}")
 
 
-def check_finite(name: str, tensor: Tensor) -> None:
-    """Raise ValueError if ``tensor`` holds NaN or infinity; the message says how many."""
-    if bad := _count_not_finite(tensor):
+def check_finite(name: str, tensor: Tensor, largest: float = math.inf) -> None:
+    """Raise ValueError if ``tensor`` holds NaN, infinity or magnitudes above ``largest``; the message says how many."""
+    if not (unusable := _count_unusable(tensor, largest)):
+        return
+    if bad := _count_unusable(tensor, math.inf):
         raise ValueError(f"{name} must be finite, got {bad} NaN or infinite values")
+    raise ValueError(f"{name} must be from {-largest:g} to {largest:g}, got {unusable} values beyond")
 
 
 def first_not_finite(tensors: Mapping[str, Tensor]) -> str | None:
     """The name of the first tensor that holds NaN or infinity, or None."""
-    return next((name for name, tensor in tensors.items() if _count_not_finite(tensor)), None)
+    return next((name for name, tensor in tensors.items() if _count_unusable(tensor, math.inf)), None)
 
 
-def _count_not_finite(tensor: Tensor) -> int:
+def _count_unusable(tensor: Tensor, largest: float) -> int:
+    """How many values are NaN, infinite, or larger in magnitude."""
     if _is_plain(tensor) and tensor.dtype == torch.float32:
-        return _native.scan_floats(tensor.data_ptr(), tensor.numel()).nonfinite
-    return int((~torch.isfinite(tensor)).sum())
+        return _native.scan_floats(tensor.data_ptr(), tensor.numel(), largest).unusable
+    return int((~(tensor.isfinite() & (tensor.abs() <= largest))).sum())
 
 
 def check_positive(name: str, tensor: Tensor) -> None:
@@ -91,7 +123,7 @@ def check_positive(name: str, tensor: Tensor) -> None:
     if tensor.numel() == 0:
         return
     if _is_plain(tensor) and tensor.dtype == torch.float32:
-        lowest = _native.scan_floats(tensor.data_ptr(), tensor.numel()).minimum
+        lowest = _native.scan_floats(tensor.data_ptr(), tensor.numel(), math.inf).minimum
     else:
         lowest = float(tensor.detach().min())
     if not lowest > 0:
@@ -100,7 +132,7 @@ def check_positive(name: str, tensor: Tensor) -> None:
 
 def _is_plain(tensor: Tensor) -> bool:
     """Whether native code can read it where it lies."""
-    return tensor.device.type == "cpu" and tensor.is_contiguous()
+    return tensor.device.type == "cpu" and tensor.is_contiguous() and not tensor.is_neg()
 
 
 def check_intrinsics(name: str, Ks: Tensor) -> None:

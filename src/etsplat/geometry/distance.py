@@ -5,7 +5,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from etsplat import _native
-from etsplat.core.validation import check_shape
+from etsplat.core.validation import check_shape, dense
 from etsplat.geometry.measures import native_mesh
 
 
@@ -32,7 +32,7 @@ def closest_points(
     check_shape("points", points, ("N", 3))
     if not bool(points.isfinite().all()):
         raise ValueError("points must be finite, got NaN or infinity")
-    points = points.detach().cpu().double().contiguous()
+    points = dense(points.cpu().double(), "points")
     vertices, faces = native_mesh(vertices, faces)
     if len(faces) == 0:
         raise ValueError("faces must not be empty")

@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from etsplat.core.validation import check_indices, check_shape
+from etsplat.core.validation import check_indices, check_shape, dense
 
 
 def face_areas(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> Float[Tensor, " F"]:
@@ -41,4 +41,4 @@ def native_mesh(
     check_indices("faces", faces, len(vertices))
     if not bool(vertices.isfinite().all()):
         raise ValueError("vertices must be finite, got NaN or infinity")
-    return vertices.detach().cpu().double().contiguous(), faces.cpu().to(torch.int64).contiguous()
+    return dense(vertices.cpu().double(), "vertices"), dense(faces.cpu().to(torch.int64), "faces")

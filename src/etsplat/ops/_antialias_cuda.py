@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from etsplat.core.validation import dense
 from etsplat.cuda.launch import blocks, launch
 from etsplat.cuda.program import Program
 from etsplat.cuda.structs import struct_class
@@ -35,16 +36,17 @@ class AntialiasCuda(torch.autograd.Function):
         seen: "HardRasterization",
     ) -> Tensor:
         """See ``rasterize_antialiased``; ``view`` has viewmats, Ks, near_plane, width, height."""
-        vertices, colors, backgrounds = vertices.contiguous(), colors.contiguous(), backgrounds.contiguous()
+        vertices, colors, backgrounds = dense(vertices), dense(colors), dense(backgrounds)
         B, V, F = len(view[0]), len(vertices), len(connectivity.faces)
-        ctx.alive = (connectivity, view, seen, per_face)
+        ctx.per_face, ctx.connectivity, ctx.sizes = per_face, connectivity, view[2:]
         points = torch.empty((B, V, _POINT), dtype=torch.int64, device=vertices.device)
         silhouettes = torch.empty((B, F), dtype=torch.uint8, device=vertices.device)
         shaded = vertices.new_empty((B, view[4], view[3], colors.shape[1]))
         image = torch.empty_like(shaded)
-        tensors = vertices, colors, backgrounds, points, silhouettes, shaded
+        found = seen.triangle, seen.barycentrics, seen.depth
+        tensors = vertices, colors, backgrounds, *view[:2], *found, points, silhouettes, shaded
         for b in range(B):
-            scene = _scene(tensors, ctx.alive, b)
+            scene = _scene(tensors, ctx, b)
             _run("antialias_points", V, (scene.view, points[b]))
             _run("antialias_silhouettes", F, (scene.view, points[b], silhouettes[b]))
             _run("antialias_shade", view[3] * view[4], (scene.view, shaded[b]))
@@ -56,8 +58,8 @@ class AntialiasCuda(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, grad_image: Tensor) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Gradients are the same bits in every run."""
-        tensors = ctx.saved_tensors
-        shaded, grad_image = tensors[5], grad_image.contiguous()
+        tensors = tuple(map(dense, ctx.saved_tensors))
+        shaded, grad_image = tensors[-1], dense(grad_image)
         grad_shaded = torch.empty_like(shaded[0])
         grads = [
             torch.zeros_like(tensor) if needed else None
@@ -68,7 +70,7 @@ class AntialiasCuda(torch.autograd.Function):
             sums = [None if g is None else torch.zeros(g.shape, dtype=torch.int64, device=g.device) for g in parts]
             largest = torch.zeros(3, dtype=torch.int32, device=shaded.device)
             addresses = (None if tensor is None else tensor.data_ptr() for tensor in (*sums, largest))
-            scene, pixels = _scene(tensors, ctx.alive, b), shaded[b].shape[0] * shaded[b].shape[1]
+            scene, pixels = _scene(tensors, ctx, b), shaded[b].shape[0] * shaded[b].shape[1]
             _run("antialias_unblend", pixels, (scene, grad_image[b], grad_shaded))
             arguments = (scene, shaded[b], grad_image[b], grad_shaded, _struct("Targets")(*addresses))
             _run("antialias_measure", pixels, arguments)
@@ -88,12 +90,12 @@ def _run(name: str, count: int, arguments: tuple[Any, ...]) -> None:
     launch(_PROGRAM, name, blocks(count, _THREADS), _THREADS, arguments)
 
 
-def _scene(tensors: tuple[Tensor, ...], alive: tuple[Any, ...], b: int) -> Any:
-    """View b, as the kernels read it."""
-    vertices, colors, backgrounds, points, silhouettes, shaded = tensors
-    connectivity, (viewmats, Ks, near_plane, width, height), seen, per_face = alive
-    floats = (vertices, viewmats[b], Ks[b], seen.barycentrics[b], seen.depth[b], colors, backgrounds[b])
-    integers = (connectivity.faces, connectivity.pair_offsets, connectivity.paired_faces, seen.triangle[b])
+def _scene(tensors: tuple[Tensor, ...], ctx: Any, b: int) -> Any:
+    """View b, as the kernels read it, where its arrays lie now."""
+    vertices, colors, backgrounds, viewmats, Ks, triangle, barycentrics, depth, points, silhouettes, shaded = tensors
+    connectivity, (near_plane, width, height) = ctx.connectivity, ctx.sizes
+    floats = (vertices, viewmats[b], Ks[b], barycentrics[b], depth[b], colors, backgrounds[b])
+    integers = (connectivity.faces, connectivity.pair_offsets, connectivity.paired_faces, triangle[b])
     view = _struct("AntialiasView")(
         *(tensor.data_ptr() for tensor in (*floats, *integers)),
         len(vertices),
@@ -101,7 +103,7 @@ def _scene(tensors: tuple[Tensor, ...], alive: tuple[Any, ...], b: int) -> Any:
         width,
         height,
         shaded.shape[-1],
-        per_face,
+        ctx.per_face,
         near_plane,
     )
     return _struct("Scene")(view, points[b].data_ptr(), silhouettes[b].data_ptr())

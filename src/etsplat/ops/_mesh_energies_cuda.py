@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from etsplat.core.validation import dense
 from etsplat.cuda.launch import blocks, launch
 from etsplat.cuda.program import Program
 from etsplat.cuda.structs import struct_class
@@ -27,7 +28,7 @@ class MeshEnergiesCuda(torch.autograd.Function):
         ctx: Any, vertices: Tensor, connectivity: "MeshConnectivity", edge_power: int
     ) -> tuple[Tensor, Tensor, Tensor]:
         """See ``mesh_energies``."""
-        vertices, c = vertices.contiguous(), connectivity
+        vertices, c = dense(vertices, "vertices"), connectivity
         V, F = len(vertices), len(c.faces)
         addresses = (vertices.data_ptr(), *(getattr(c, name).data_ptr() for name in _ARRAYS))
         mesh = struct_class("math/mesh_energies.h", "MeshArrays")(*addresses, V, len(c.edges), len(c.face_pairs), F)
@@ -49,9 +50,9 @@ class MeshEnergiesCuda(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, edge: Tensor, normal: Tensor, laplacian: Tensor) -> tuple[Tensor, None, None]:  # pyright: ignore[reportIncompatibleMethodOverride]
         """The weights stay in device memory."""
-        (gradients,) = ctx.saved_tensors
+        gradients = dense(ctx.saved_tensors[0])
         combined = torch.empty_like(gradients[0])
         size = combined.numel()
-        arguments = (gradients, edge, normal, laplacian, ctypes.c_int64(size), combined)
+        arguments = (gradients, dense(edge), dense(normal), dense(laplacian), ctypes.c_int64(size), combined)
         launch(_PROGRAM, "mesh_combine", blocks(size, _THREADS), _THREADS, arguments)
         return combined, None, None

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from etsplat.core.validation import dense
 from etsplat.cuda.launch import blocks, launch
 from etsplat.cuda.program import Program
 from etsplat.cuda.structs import struct_class
@@ -21,7 +22,7 @@ class NormalConsistencyCuda(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *given: Tensor) -> Tensor:
         """See ``normal_consistency``."""
-        inputs = [tensor.contiguous() for tensor in given]
+        inputs = [dense(tensor) for tensor in given]
         problem, grid = _problem(inputs)
         sums = inputs[0].new_empty(grid[0] * grid[1], dtype=torch.float64)
         loss = inputs[0].new_empty(())
@@ -34,10 +35,10 @@ class NormalConsistencyCuda(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, grad_loss: Tensor) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
         """``grad_loss`` stays in device memory."""
-        inputs = ctx.saved_tensors
+        inputs = [dense(tensor) for tensor in ctx.saved_tensors]
         problem, grid = _problem(inputs)
         grads = torch.empty_like(inputs[0]), torch.empty_like(inputs[1])
-        launch(_PROGRAM, "normal_backward", grid, _THREADS, (problem, grad_loss, *grads))
+        launch(_PROGRAM, "normal_backward", grid, _THREADS, (problem, dense(grad_loss), *grads))
         return *grads, None, None, None
 
 

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from etsplat.core.validation import dense
 from etsplat.cuda.launch import blocks, launch
 from etsplat.cuda.program import Program
 from etsplat.cuda.structs import struct_class
@@ -30,7 +31,7 @@ class PhotometricLossCuda(torch.autograd.Function):
         squared: bool,
     ) -> Tensor:
         """See ``photometric_loss``."""
-        images = [None if image is None else image.contiguous() for image in (color, target, backgrounds, mask)]
+        images = [None if image is None else dense(image) for image in (color, target, backgrounds, mask)]
         B, H, W = color.shape[:3]
         maps = color.new_empty((B, 3, 3, H, W)) if ctx.needs_input_grad[0] and dssim_weight > 0 else None
         grid = _grid(color)
@@ -47,9 +48,10 @@ class PhotometricLossCuda(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, grad_loss: Tensor) -> tuple[Tensor, None, None, None, None, None]:  # pyright: ignore[reportIncompatibleMethodOverride]
         """``grad_loss`` stays in device memory."""
-        *images, maps = ctx.saved_tensors
-        gradient = torch.empty_like(images[0])
-        arguments = (_problem(images, *ctx.settings), maps, grad_loss, gradient)
+        *images, maps = (None if saved is None else dense(saved) for saved in ctx.saved_tensors)
+        color: Any = images[0]
+        gradient = torch.empty_like(color)
+        arguments = (_problem(images, *ctx.settings), maps, dense(grad_loss), gradient)
         launch(_PROGRAM, "photometric_backward", _grid(gradient), _THREADS, arguments)
         return gradient, None, None, None, None, None
 

@@ -1,12 +1,15 @@
 """What the native rasterizers share below autograd: their inputs, outputs, and what a render is made of."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
+from etsplat import _native
 from etsplat.core.rasterization import RasterizeSettings, TriangleStatistics
+from etsplat.core.validation import dense
 from etsplat.ops.pool import empty_image
 
 
@@ -50,31 +53,26 @@ class PerInput(NamedTuple):
 
 
 class Geometry:
-    """Triangles with the index arrays that native code wants: int32 faces, and the corners at each vertex.
-
-    The places 3 face + corner of vertex v are ``corner_indices[corner_offsets[v]:corner_offsets[v + 1]]``.
-    """
+    """Triangles, and a copy of their ``faces`` as int32, which nobody else can change before the backward pass."""
 
     def __init__(self, vertices: Tensor, faces: Tensor | None) -> None:
         self.vertex_count = vertices.shape[0]
         self.count = vertices.shape[0] if faces is None else faces.shape[0]
-        self.faces, self.corner_offsets, self.corner_indices = _face_arrays(faces, vertices.shape[0])
+        self.faces = None if faces is None else dense(faces, "faces").to(torch.int32, copy=True)
 
-
-def _face_arrays(faces: Tensor | None, vertices: int) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
-    """Kept on the tensor."""
-    if faces is None:
-        return None, None, None
-    key = (faces._version, vertices)
-    cached = getattr(faces, "_etsplat_face_arrays", None)
-    if cached is None or cached[0] != key:
-        faces32 = faces.to(torch.int32).contiguous()
-        ordered, indices = torch.sort(faces32.reshape(-1), stable=True)
-        ends = torch.arange(vertices + 1, dtype=torch.int32, device=faces.device)
-        offsets = torch.searchsorted(ordered, ends, out_int32=True)
-        cached = (key, faces32, offsets, indices.to(torch.int32))
-        setattr(faces, "_etsplat_face_arrays", cached)  # noqa: B010
-    return cached[1], cached[2], cached[3]
+    @cached_property
+    def corners(self) -> tuple[Tensor, Tensor]:
+        """With faces, where each vertex is used: offsets (V + 1,) and places 3 face + corner, ascending for each."""
+        assert self.faces is not None
+        flat, device = self.faces.view(-1), self.faces.device
+        if device.type == "cpu":
+            offsets, places = flat.new_empty(self.vertex_count + 1), torch.empty_like(flat)
+            outputs = offsets.data_ptr(), places.data_ptr()
+            _native.group_indices(flat.data_ptr(), len(flat), self.vertex_count, *outputs)
+            return offsets, places
+        ordered, places = torch.sort(flat, stable=True)
+        ends = torch.arange(self.vertex_count + 1, dtype=torch.int32, device=device)
+        return torch.searchsorted(ordered, ends, out_int32=True), places.to(torch.int32)
 
 
 @dataclass
@@ -88,16 +86,27 @@ class Plan:
     statistics: TriangleStatistics | None = None
 
 
+class Images(NamedTuple):
+    """What the backward pass reads of the outputs."""
+
+    color: Tensor
+    alpha: Tensor
+    distortion: Tensor  # empty unless asked for
+    distortion_totals: Tensor | None
+
+
 class Outputs:
     """Uninitialised output images of a batch; native code writes every element."""
 
     def __init__(self, plan: Plan, inputs: Inputs) -> None:
         settings, device = plan.settings, inputs.vertices.device
         image = (plan.views, settings.height, settings.width)
-        self.color = _empty(device, *image, sum(inputs.channels))
-        self.alpha = _empty(device, *image, 1)
-        self.distortion = _empty(device, *image, 1) if settings.distortion else _empty(device, 0)
-        self.distortion_totals = _empty(device, *image, 2) if settings.distortion else None
+        self.images = Images(
+            color=_empty(device, *image, sum(inputs.channels)),
+            alpha=_empty(device, *image, 1),
+            distortion=_empty(device, *image, 1) if settings.distortion else _empty(device, 0),
+            distortion_totals=_empty(device, *image, 2) if settings.distortion else None,
+        )
         median_shape = image if settings.median_depth else (0,)
         self.median_triangle = torch.empty(median_shape, dtype=torch.int32, device=device)
         self.statistics = None
@@ -110,7 +119,8 @@ class Outputs:
 class Render(Protocol):
     """An engine's forward pass over a batch, and what its backward pass needs of it.
 
-    The object may hold addresses of the inputs and outputs; the autograd function keeps the tensors.
+    It relies on no address of the inputs and outputs: autograd may hand ``backward`` copies that lie elsewhere, and
+    free what ``__init__`` has seen (checkpointing, hooks on saved tensors).
     """
 
     most_channels: int | None  # of one pass; more are rendered in several
@@ -119,14 +129,14 @@ class Render(Protocol):
         """Renders, and with ``keep`` keeps what ``backward`` needs. All tensors are contiguous."""
 
     def backward(
-        self, inputs: Inputs, cotangents: tuple[Tensor | None, Tensor | None, Tensor | None], needed: PerInput
+        self,
+        inputs: Inputs,
+        images: Images,
+        cotangents: tuple[Tensor | None, Tensor | None, Tensor | None],
+        needed: PerInput,
     ) -> PerInput:
         """Gradients, None where not ``needed``, from those of colour, alpha and distortion."""
         ...
-
-
-def contiguous(tensor: Tensor | None) -> Tensor | None:
-    return None if tensor is None else tensor.detach().contiguous()
 
 
 def channel_count(tensor: Tensor | None) -> int:

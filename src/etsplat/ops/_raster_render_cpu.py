@@ -7,7 +7,7 @@ from torch import Tensor
 from etsplat import _native
 from etsplat.core.kernels import DISTANCES, KERNELS
 from etsplat.core.rasterization import DISTORTION_FAR, DISTORTION_NEAR
-from etsplat.ops._raster_plan import Inputs, Outputs, PerInput, Plan
+from etsplat.ops._raster_plan import Images, Inputs, Outputs, PerInput, Plan
 from etsplat.ops.pool import zeros_image
 
 
@@ -17,26 +17,39 @@ class CpuRender:
     most_channels: int | None = None
 
     def __init__(self, plan: Plan, inputs: Inputs, outputs: Outputs, keep: bool) -> None:
-        self.geometry = plan.geometry
-        self.color_shape = outputs.color.shape
-        self.totals = outputs.distortion_totals  # the states refer to it by address
-        self.states = [_native.raster_forward(_call(b, inputs, outputs, plan, keep)) for b in range(plan.views)]
+        self.plan = plan
+        self.states = []
+        for b in range(plan.views):
+            call = _call(b, inputs, outputs.images, plan)
+            call.keep_for_backward = keep
+            if plan.settings.median_depth:
+                call.median_triangle = _address(outputs.median_triangle, b)
+            if outputs.statistics is not None:
+                call.max_weight = _address(outputs.statistics.max_weight, b)
+                call.screen_size = _address(outputs.statistics.screen_size, b)
+                call.inradius = _address(outputs.statistics.inradius, b)
+                call.visible = _address(outputs.statistics.visible, b)
+            self.states.append(_native.raster_forward(call))
 
     def backward(
-        self, inputs: Inputs, cotangents: tuple[Tensor | None, Tensor | None, Tensor | None], needed: PerInput
+        self,
+        inputs: Inputs,
+        images: Images,
+        cotangents: tuple[Tensor | None, Tensor | None, Tensor | None],
+        needed: PerInput,
     ) -> PerInput:
         """See ``Render``."""
         grad_color, grad_alpha, grad_distortion = cotangents
         if grad_color is None:
-            grad_color = zeros_image(*self.color_shape)
+            grad_color = zeros_image(*images.color.shape)
         grads = PerInput(*map(_zeros, inputs, needed))
         for b, state in enumerate(self.states):
             call = _native.RasterGradients()
             call.grad_color = _address(grad_color, b)
             call.grad_alpha = _address(grad_alpha, b)
             call.grad_distortion = _address(grad_distortion, b)
-            call.corner_offsets = _address(self.geometry.corner_offsets)
-            call.corner_indices = _address(self.geometry.corner_indices)
+            if needed.vertices and self.plan.geometry.faces is not None:
+                call.corner_offsets, call.corner_indices = map(_address, self.plan.geometry.corners)
             call.vertices = _address(grads.vertices)
             call.flat_colors = _address(grads.flat, b if inputs.flat_per_view else None)
             call.corner_colors = _address(grads.corner, b if inputs.corner_per_view else None)
@@ -45,11 +58,11 @@ class CpuRender:
             call.viewmat = _address(grads.viewmats, b)
             call.K = _address(grads.Ks, b)
             call.background = _address(grads.backgrounds, b)
-            _native.raster_backward(state, call)
+            _native.raster_backward(state, _call(b, inputs, images, self.plan), call)
         return grads
 
 
-def _call(b: int, inputs: Inputs, outputs: Outputs, plan: Plan, keep: bool) -> Any:
+def _call(b: int, inputs: Inputs, images: Images, plan: Plan) -> Any:
     settings, geometry = plan.settings, plan.geometry
     call = _native.RasterCall()
     call.vertices = _address(inputs.vertices)
@@ -75,19 +88,11 @@ def _call(b: int, inputs: Inputs, outputs: Outputs, plan: Plan, keep: bool) -> A
     call.distortion_near = DISTORTION_NEAR
     call.distortion_far = DISTORTION_FAR
     call.centroid_depth = settings.depth == "centroid"
-    call.keep_for_backward = keep
-    call.color = _address(outputs.color, b)
-    call.alpha = _address(outputs.alpha, b)
+    call.color = _address(images.color, b)
+    call.alpha = _address(images.alpha, b)
     if settings.distortion:
-        call.distortion = _address(outputs.distortion, b)
-        call.distortion_totals = _address(outputs.distortion_totals, b)
-    if settings.median_depth:
-        call.median_triangle = _address(outputs.median_triangle, b)
-    if outputs.statistics is not None:
-        call.max_weight = _address(outputs.statistics.max_weight, b)
-        call.screen_size = _address(outputs.statistics.screen_size, b)
-        call.inradius = _address(outputs.statistics.inradius, b)
-        call.visible = _address(outputs.statistics.visible, b)
+        call.distortion = _address(images.distortion, b)
+        call.distortion_totals = _address(images.distortion_totals, b)
     return call
 
 

@@ -19,7 +19,7 @@ from etsplat.cuda.program import Program
 from etsplat.cuda.sort import RadixSort
 from etsplat.cuda.structs import struct_class
 from etsplat.ops._raster_capacity import capacity_for, note_capture, overflow_flag, record_need
-from etsplat.ops._raster_plan import Inputs, Outputs, PerInput, Plan
+from etsplat.ops._raster_plan import Images, Inputs, Outputs, PerInput, Plan
 
 TILE = 16
 _TINY = 1.17549435e-38
@@ -44,8 +44,8 @@ class CudaRender:
         # 0 none, 1 with the plane's depth, 2 with the centroid's
         self.distortion = 0 if not settings.distortion else 2 if settings.depth == "centroid" else 1
         self.arguments = struct_class("cuda/raster_pass.h", "RasterPass")()
-        self.totals = outputs.distortion_totals
         self._fill_inputs(inputs)
+        self._fill_images(outputs.images)
         self._fill_outputs(outputs)
         self._render()
 
@@ -131,10 +131,16 @@ class CudaRender:
         return state, temporary
 
     def backward(
-        self, inputs: Inputs, cotangents: tuple[Tensor | None, Tensor | None, Tensor | None], needed: PerInput
+        self,
+        inputs: Inputs,
+        images: Images,
+        cotangents: tuple[Tensor | None, Tensor | None, Tensor | None],
+        needed: PerInput,
     ) -> PerInput:
         """See ``Render``."""
         a = self.arguments
+        self._fill_inputs(inputs)
+        self._fill_images(images)
         grad_color, grad_alpha, grad_distortion = cotangents
         distortion = self.distortion if grad_distortion is not None else 0
         defines = self._defines(distortion, median=False, weights=False)
@@ -187,11 +193,14 @@ class CudaRender:
         a.alpha_min, a.alpha_max = max(alpha_min, _TINY), min(alpha_max, 1.0 - 1e-6)
         a.distortion_near, a.distortion_far = DISTORTION_NEAR, DISTORTION_FAR
 
+    def _fill_images(self, images: Images) -> None:
+        a = self.arguments
+        a.color, a.alpha = images.color.data_ptr(), images.alpha.data_ptr()
+        if self.plan.settings.distortion:
+            a.distortion, a.distortion_totals = images.distortion.data_ptr(), _pointer(images.distortion_totals)
+
     def _fill_outputs(self, outputs: Outputs) -> None:
         a, settings = self.arguments, self.plan.settings
-        a.color, a.alpha = outputs.color.data_ptr(), outputs.alpha.data_ptr()
-        if settings.distortion:
-            a.distortion, a.distortion_totals = outputs.distortion.data_ptr(), _pointer(outputs.distortion_totals)
         if settings.median_depth:
             a.median_triangle = outputs.median_triangle.data_ptr()
         if outputs.statistics is not None:
@@ -237,7 +246,7 @@ class _Gradients:
         if vertices is not None and geometry.faces is not None:
             count = geometry.vertex_count
             vertices = torch.empty(count, 3, device=vertices.device)
-            arguments = [self.corners, geometry.corner_offsets, geometry.corner_indices, count, vertices]
+            arguments = [self.corners, *geometry.corners, count, vertices]
             launch(Program("raster_reduce.cu", defines), "raster_gather", blocks(count, 256), 256, arguments)
         if self.sigma_sums is not None:
             sigma = self.sigma_sums.sum().float()

@@ -12,6 +12,7 @@ from torch.autograd.function import once_differentiable
 
 from etsplat import _native
 from etsplat.core.rasterization import Rasterization, RasterizeSettings
+from etsplat.core.validation import dense
 from etsplat.ops._raster_plan import Geometry
 from etsplat.ops._rasterize_reference import barycentrics, perspective_weights, to_screen
 from etsplat.ops.pick_values import pick_values
@@ -104,11 +105,10 @@ class _PerCorner(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad_corners: Tensor) -> tuple[Tensor, None]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        sums = empty_image(*ctx.shape)
+        grad_corners, sums = dense(grad_corners), empty_image(*ctx.shape)
         _native.sum_groups(
-            grad_corners.contiguous().data_ptr(),
-            ctx.geometry.corner_offsets.data_ptr(),
-            ctx.geometry.corner_indices.data_ptr(),
+            grad_corners.data_ptr(),
+            *(array.data_ptr() for array in ctx.geometry.corners),
             *ctx.shape,
             sums.data_ptr(),
         )

@@ -8,8 +8,9 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from etsplat.core.rasterization import Rasterization, RasterizeSettings
+from etsplat.core.validation import dense
 from etsplat.cuda.launch import on_device_of
-from etsplat.ops._raster_plan import Geometry, Inputs, Outputs, PerInput, Plan, Render, channel_count, contiguous
+from etsplat.ops._raster_plan import Geometry, Images, Inputs, Outputs, PerInput, Plan, Render, channel_count
 from etsplat.ops._raster_render_cpu import CpuRender
 from etsplat.ops._raster_render_cuda import CudaRender
 from etsplat.ops._rasterize_channels import Channels, corners_of, median_depth
@@ -90,24 +91,29 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, plan: Plan, *tensors: Tensor | None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        inputs = Inputs(*map(contiguous, tensors))  # type: ignore[arg-type]
+        inputs = Inputs(*map(_dense, tensors, Inputs._fields))  # type: ignore[arg-type]
         outputs = Outputs(plan, inputs)
         with on_device_of(inputs.vertices):
             ctx.render = plan.render(plan, inputs, outputs, keep=any(ctx.needs_input_grad))
         plan.statistics = outputs.statistics
-        # The images, too, since a render may hold their addresses.
-        ctx.save_for_backward(*inputs, outputs.color, outputs.alpha, outputs.distortion)
+        images = outputs.images
+        ctx.save_for_backward(*inputs, *images)
         ctx.mark_non_differentiable(outputs.median_triangle)
         ctx.set_materialize_grads(False)
-        return outputs.color, outputs.alpha, outputs.distortion, outputs.median_triangle
+        return images.color, images.alpha, images.distortion, outputs.median_triangle
 
     @staticmethod
     @once_differentiable
     def backward(  # pyright: ignore[reportIncompatibleMethodOverride] -- once_differentiable hides the name
         ctx: Any, *cotangents: Tensor | None
     ) -> tuple[Tensor | None, ...]:
-        inputs = Inputs(*ctx.saved_tensors[: len(Inputs._fields)])
-        color, alpha, distortion, _ = map(contiguous, cotangents)
+        saved = list(map(_dense, ctx.saved_tensors))
+        inputs, images = Inputs(*saved[: len(Inputs._fields)]), Images(*saved[len(Inputs._fields) :])  # type: ignore[arg-type]
+        color, alpha, distortion, _ = map(_dense, cotangents)
         with on_device_of(inputs.vertices):
-            grads = ctx.render.backward(inputs, (color, alpha, distortion), PerInput(*ctx.needs_input_grad[1:]))
+            grads = ctx.render.backward(inputs, images, (color, alpha, distortion), PerInput(*ctx.needs_input_grad[1:]))
         return (None, *grads)
+
+
+def _dense(tensor: Tensor | None, name: str = "gradient") -> Tensor | None:
+    return None if tensor is None else dense(tensor, name)

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from etsplat.core.validation import dense
 from etsplat.cuda.launch import blocks, launch
 from etsplat.cuda.program import Program
 
@@ -20,7 +21,7 @@ class SphericalHarmonicsCuda(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, coefficients: Tensor, directions: Tensor, degree: int) -> Tensor:
         """See ``spherical_harmonics``."""
-        inputs = coefficients.contiguous(), directions.contiguous()
+        inputs = dense(coefficients), dense(directions)
         colors = directions.new_empty((*directions.shape[:-1], coefficients.shape[2]))
         _run("sh_forward", len(coefficients), (*inputs, *_sizes(*inputs, degree), colors))
         ctx.save_for_backward(*inputs, colors)
@@ -31,10 +32,10 @@ class SphericalHarmonicsCuda(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, grad_colors: Tensor) -> tuple[Tensor, Tensor, None]:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Through the clamp, the polynomials and the normalisation."""
-        coefficients, directions, colors = ctx.saved_tensors
+        coefficients, directions, colors = map(dense, ctx.saved_tensors)
         grads = torch.empty_like(coefficients), torch.empty_like(directions)
         sizes = _sizes(coefficients, directions, ctx.degree)
-        arguments = (coefficients, directions, *sizes, colors, grad_colors.contiguous(), *grads)
+        arguments = (coefficients, directions, *sizes, colors, dense(grad_colors), *grads)
         _run("sh_backward", len(coefficients), arguments)
         return *grads, None
 
@@ -45,7 +46,7 @@ class SoupColorsCuda(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, vertices: Tensor, dc: Tensor, rest: Tensor, centers: Tensor, degree: int) -> Tensor:
         """See ``soup_colors``; at most 15 bases in ``rest``."""
-        inputs = [tensor.contiguous() for tensor in (vertices, dc, rest, centers)]
+        inputs = [dense(tensor) for tensor in (vertices, dc, rest, centers)]
         colors = vertices.new_empty((len(centers), len(vertices), 3))
         _run("soup_forward", len(vertices), (*inputs, *_soup_sizes(inputs, degree), colors))
         ctx.save_for_backward(*inputs, colors)
@@ -56,11 +57,11 @@ class SoupColorsCuda(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, grad_colors: Tensor) -> tuple[Tensor, Tensor, Tensor, None, None]:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Zero for triangles that no view sees."""
-        *inputs, colors = ctx.saved_tensors
+        *inputs, colors = map(dense, ctx.saved_tensors)
         vertices, _, rest, centers = inputs
         grads = [torch.empty_like(tensor) for tensor in inputs[:3]]
         sizes = _soup_sizes(inputs, ctx.degree)
-        arguments = (vertices, rest, centers, *sizes, colors, grad_colors.contiguous(), *grads)
+        arguments = (vertices, rest, centers, *sizes, colors, dense(grad_colors), *grads)
         _run("soup_backward", len(vertices), arguments)
         return grads[0], grads[1], grads[2], None, None
 

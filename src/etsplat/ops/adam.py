@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from etsplat import _native
-from etsplat.core.validation import check_like, check_shape
+from etsplat.core.validation import check_like, check_shape, dense
 from etsplat.cuda.transfer import upload
 from etsplat.ops._adam_cuda import adam_step_cuda
 from etsplat.ops.engines import resolve_engine
@@ -111,8 +111,8 @@ class Adam:
             check_like(moment_name, moment, "parameter", parameter)
         check_like("parameter", parameter, f"parameters[{name}]", self.parameters[name])
         self.parameters[name] = parameter
-        self.first_moments[name] = first.contiguous()
-        self.second_moments[name] = second.contiguous()
+        self.first_moments[name] = dense(first, "first")
+        self.second_moments[name] = dense(second, "second")
 
     def state_dict(self) -> dict[str, Any]:
         """Everything but the parameters themselves; tensors are shared, not copied."""
@@ -185,14 +185,17 @@ class Adam:
         for name in names:
             parameter = self.parameters[name]
             assert parameter.grad is not None
-            value, gradient = parameter.contiguous(), parameter.grad.contiguous()
-            groups.append((value, gradient, self.first_moments[name], self.second_moments[name]))
+            first, second = self.first_moments[name], self.second_moments[name]
+            if not parameter.shape == parameter.grad.shape == first.shape == second.shape:
+                was, got = tuple(first.shape), tuple(parameter.shape)
+                raise ValueError(f"parameter {name}, its gradient and moments must have one shape, {was}, got {got}")
+            groups.append((dense(parameter, name), dense(parameter.grad, f"gradient of {name}"), first, second))
         return groups
 
     def _store(self, names: list[str], updated: Sequence[Tensor]) -> None:
         for name, value in zip(names, updated, strict=True):
             parameter = self.parameters[name]
-            if value is parameter:
+            if value.data_ptr() == parameter.data_ptr():
                 torch.autograd.graph.increment_version(parameter)  # so that a stale graph fails loudly in backward
             else:
                 parameter.copy_(value)

@@ -21,7 +21,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from etsplat import _native
-from etsplat.core.validation import check_device, check_intrinsics, check_like, check_shape
+from etsplat.core.validation import check_device, check_intrinsics, check_like, check_shape, dense
 from etsplat.ops._antialias_cuda import AntialiasCuda
 from etsplat.ops._antialias_reference import antialias_reference
 from etsplat.ops.engines import resolve_engine
@@ -77,7 +77,7 @@ def rasterize_antialiased(
     chosen = resolve_engine(engine, vertices)
     if chosen != "reference":
         native = AntialiasCuda if chosen == "cuda" else _Antialias
-        view = (viewmats.detach().contiguous(), Ks.detach().contiguous(), near_plane, width, height)
+        view = (dense(viewmats, "viewmats"), dense(Ks, "Ks"), near_plane, width, height)
         image: Any = native.apply(vertices, colors, backgrounds, per_face, connectivity, view, seen)
         return image
     images = [
@@ -140,54 +140,33 @@ class _Antialias(torch.autograd.Function):
         view: tuple[Tensor, Tensor, float, int, int],
         seen: HardRasterization,
     ) -> Tensor:
-        vertices, colors, backgrounds = vertices.contiguous(), colors.contiguous(), backgrounds.contiguous()
-        viewmats, Ks, near_plane, width, height = view
-        channels = colors.shape[1]
-        shaded = empty_image(len(viewmats), height, width, channels)
-        image = empty_image(len(viewmats), height, width, channels)
+        inputs = dense(vertices), dense(colors), dense(backgrounds), *view[:2]
+        shape = len(view[0]), view[4], view[3], colors.shape[1]
+        shaded, image = empty_image(*shape), empty_image(*shape)
+        ctx.per_face, ctx.connectivity, ctx.sizes = per_face, connectivity, view[2:]
+        found = seen.triangle, seen.barycentrics, seen.depth
         ctx.states = [
-            _native.antialias_forward(
-                vertices.data_ptr(),
-                connectivity.faces.data_ptr(),
-                len(vertices),
-                len(connectivity.faces),
-                viewmats[b].data_ptr(),
-                Ks[b].data_ptr(),
-                near_plane,
-                width,
-                height,
-                connectivity.pair_offsets.data_ptr(),
-                connectivity.paired_faces.data_ptr(),
-                seen.triangle[b].data_ptr(),
-                seen.barycentrics[b].data_ptr(),
-                seen.depth[b].data_ptr(),
-                colors.data_ptr() if per_face else 0,
-                0 if per_face else colors.data_ptr(),
-                channels,
-                backgrounds[b].data_ptr(),
-                shaded[b].data_ptr(),
-                image[b].data_ptr(),
-            )
-            for b in range(len(viewmats))
+            _native.antialias_forward(_input(b, inputs, found, ctx), shaded[b].data_ptr(), image[b].data_ptr())
+            for b in range(len(image))
         ]
-        # The states refer to these by address.
-        ctx.save_for_backward(vertices, colors, backgrounds, viewmats, Ks, shaded)
-        ctx.alive = (connectivity, seen)
+        ctx.save_for_backward(*inputs, *found, shaded)
         return image
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, grad_image: Tensor) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        vertices, colors, backgrounds, _, _, shaded = ctx.saved_tensors
-        grad_image = grad_image.contiguous()
+        *saved, shaded = map(dense, ctx.saved_tensors)
+        inputs, found = tuple(saved[:5]), tuple(saved[5:])
+        grad_image = dense(grad_image)
         grads = [
             zeros_image(*tensor.shape) if needed else None
-            for tensor, needed in zip((vertices, colors, backgrounds), ctx.needs_input_grad, strict=False)
+            for tensor, needed in zip(inputs[:3], ctx.needs_input_grad, strict=False)
         ]
         scratch = empty_image(*shaded.shape[1:])
         for b, state in enumerate(ctx.states):
             _native.antialias_backward(
                 state,
+                _input(b, inputs, found, ctx),
                 grad_image[b].data_ptr(),
                 shaded[b].data_ptr(),
                 scratch.data_ptr(),
@@ -195,3 +174,27 @@ class _Antialias(torch.autograd.Function):
                 0 if grads[2] is None else grads[2][b].data_ptr(),
             )
         return (*grads, None, None, None, None)
+
+
+def _input(b: int, inputs: tuple[Tensor, ...], found: tuple[Tensor, ...], ctx: Any) -> Any:
+    """View b, where its arrays lie now."""
+    vertices, colors, backgrounds, viewmats, Ks = inputs
+    connectivity, (near_plane, width, height) = ctx.connectivity, ctx.sizes
+    return _native.AntialiasInput(
+        vertices.data_ptr(),
+        connectivity.faces.data_ptr(),
+        len(vertices),
+        len(connectivity.faces),
+        viewmats[b].data_ptr(),
+        Ks[b].data_ptr(),
+        near_plane,
+        width,
+        height,
+        connectivity.pair_offsets.data_ptr(),
+        connectivity.paired_faces.data_ptr(),
+        *(tensor[b].data_ptr() for tensor in found),
+        colors.data_ptr() if ctx.per_face else 0,
+        0 if ctx.per_face else colors.data_ptr(),
+        colors.shape[1],
+        backgrounds[b].data_ptr(),
+    )

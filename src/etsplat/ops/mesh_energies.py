@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from etsplat import _native
-from etsplat.core.validation import check_indices, check_shape
+from etsplat.core.validation import check_indices, check_shape, dense
 from etsplat.ops._mesh_energies_cuda import MeshEnergiesCuda
 from etsplat.ops.engines import resolve_engine
 
@@ -105,7 +105,7 @@ class MeshConnectivity:
         paired_faces = face_pairs.flip(1).reshape(-1)[ends]
         arrays = (edges, face_pairs, faces, neighbor_offsets, neighbor_indices)
         derived = (corner_offsets, corners, pair_offsets, paired_faces)
-        return cls(*(array.to(torch.int32).contiguous() for array in (*arrays, *derived)))
+        return cls(*(dense(array).to(torch.int32, copy=True) for array in (*arrays, *derived)))
 
     @property
     def num_vertices(self) -> int:
@@ -155,7 +155,7 @@ class _MeshEnergies(torch.autograd.Function):
     def forward(
         ctx: Any, vertices: Tensor, connectivity: MeshConnectivity, edge_power: int
     ) -> tuple[Tensor, Tensor, Tensor]:
-        vertices = vertices.contiguous()
+        vertices = dense(vertices, "vertices")
         gradients = vertices.new_empty((3, *vertices.shape))
         c = connectivity
         adjacency = (c.faces, c.neighbor_offsets, c.neighbor_indices, c.corner_offsets, c.corners, c.pair_offsets)
@@ -175,7 +175,7 @@ class _MeshEnergies(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, edge: Tensor, normal: Tensor, laplacian: Tensor) -> tuple[Tensor, None, None]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        (gradients,) = ctx.saved_tensors
+        gradients = dense(ctx.saved_tensors[0])
         combined = torch.empty_like(gradients[0])
         weights = [float(edge), float(normal), float(laplacian)]
         _native.combine_mesh_gradients(gradients.data_ptr(), weights, combined.numel(), combined.data_ptr())

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from etsplat import _native
-from etsplat.core.validation import check_like, check_shape
+from etsplat.core.validation import check_like, check_shape, dense
 from etsplat.ops._normal_consistency_cuda import NormalConsistencyCuda
 from etsplat.ops.engines import resolve_engine
 from etsplat.ops.pool import empty_image
@@ -92,7 +92,7 @@ class _NormalConsistency(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, *given: Tensor) -> Tensor:
-        inputs = [tensor.contiguous() for tensor in given]
+        inputs = [dense(tensor) for tensor in given]
         normals, depth = inputs[:2]
         height, width = normals.shape[1:3]
         derivatives = [empty_image(*tensor.shape) for tensor in (normals, depth) if any(ctx.needs_input_grad)]

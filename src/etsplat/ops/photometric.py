@@ -15,7 +15,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from etsplat import _native
-from etsplat.core.validation import check_choice, check_device, check_like, check_shape
+from etsplat.core.validation import check_choice, check_device, check_like, check_shape, dense
 from etsplat.ops._photometric_cuda import PhotometricLossCuda
 from etsplat.ops.engines import resolve_engine
 from etsplat.ops.pool import empty_image
@@ -110,10 +110,10 @@ class _PhotometricLoss(torch.autograd.Function):
     def forward(
         ctx: Any, color: Tensor, target: Tensor, mask: Tensor | None, backgrounds: Tensor | None, settings: _Settings
     ) -> Tensor:
-        dense = [None if tensor is None else tensor.contiguous() for tensor in (color, target, backgrounds, mask)]
+        images = [None if tensor is None else dense(tensor) for tensor in (color, target, backgrounds, mask)]
         gradient = empty_image(*color.shape) if ctx.needs_input_grad[0] else None
         loss = _native.photometric(
-            *(0 if tensor is None else tensor.data_ptr() for tensor in (*dense, gradient)),
+            *(0 if tensor is None else tensor.data_ptr() for tensor in (*images, gradient)),
             *color.shape[:3],
             target.shape[-1],
             target.dtype == torch.uint8,
@@ -122,7 +122,7 @@ class _PhotometricLoss(torch.autograd.Function):
         )
         if gradient is not None:
             ctx.save_for_backward(gradient)
-        return color.new_tensor(loss)
+        return torch.tensor(loss)
 
     @staticmethod
     @torch.autograd.function.once_differentiable

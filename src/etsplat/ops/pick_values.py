@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from etsplat.core.validation import check_device, check_shape
+from etsplat.core.validation import check_device, check_shape, dense
 from etsplat.cuda.launch import blocks, launch
 from etsplat.cuda.program import Program
 from etsplat.ops.engines import resolve_engine
@@ -50,7 +50,7 @@ def pick_values(
 class _OnDevice(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, values: Tensor, chosen: Tensor) -> Tensor:
-        values, chosen = values.contiguous(), chosen.contiguous()
+        values, chosen = dense(values, "values"), dense(chosen, "chosen")
         image = values.new_empty(chosen.shape)
         grid, sizes = _problem(values, chosen)
         launch(_PROGRAM, "pick_forward", grid, _THREADS, (values, chosen, *sizes, image))
@@ -60,8 +60,8 @@ class _OnDevice(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad_image: Tensor) -> tuple[Tensor, None]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        values, chosen = ctx.saved_tensors
-        given, grid, sizes = grad_image.contiguous(), *_problem(values, chosen)
+        values, chosen = map(dense, ctx.saved_tensors)
+        given, grid, sizes = dense(grad_image), *_problem(values, chosen)
         words = torch.zeros(values.numel() + 1, dtype=torch.int64, device=values.device)
         largest, sums = words[:1], words[1:]
         launch(_PROGRAM, "pick_largest", grid, _THREADS, (given, chosen, *sizes, largest))

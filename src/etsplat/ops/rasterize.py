@@ -1,5 +1,6 @@
 """Differentiable triangle splatting (paper, section "Triangle Splatting"): the public call and its checks."""
 
+import math
 from functools import partial
 from typing import Literal
 
@@ -23,6 +24,9 @@ from etsplat.core.validation import (
 from etsplat.ops._rasterize_native import rasterize_native
 from etsplat.ops._rasterize_reference import rasterize_reference
 from etsplat.ops.engines import resolve_engine
+
+_COLORS = ("colors", "corner_colors", "backgrounds")
+_LARGEST_COLOR = 1e30  # beyond, the gradients of the triangles around overflow
 
 
 def rasterize(
@@ -83,8 +87,9 @@ def rasterize(
         near_plane: Triangles with a vertex at z <= near_plane are invisible; > 0.
         freeze_incentre: With distance "sdf", hold the inradius constant in the backward pass, as Triangle Splatting.
         cutoffs: Where compositing stops caring.
-        validate: Raise on non-finite input, sigma <= 0 and malformed Ks; None means on the CPU. Without it a triangle
-            with such data, or on a GPU with a wrong index in ``faces``, is invisible and gets zero gradient.
+        validate: Raise on non-finite input, sigma <= 0, malformed Ks, and colours beyond 1e30, whose products in the
+            gradients overflow; None means on the CPU. Without it a triangle with data that is not finite, or on a GPU
+            with a wrong index in ``faces``, is invisible and gets zero gradient.
         engine: "reference", "cpu", "cuda", or None: cpu or cuda for float32, by the tensors' device, and reference for
             float64.
 
@@ -182,6 +187,6 @@ def _check_tensors(given: dict[str, Tensor], faces: Tensor | None, look: bool) -
 
 def _check_values(given: dict[str, Tensor]) -> None:
     for name, tensor in given.items():
-        check_finite(name, tensor)
+        check_finite(name, tensor, _LARGEST_COLOR if name in _COLORS else math.inf)
     check_positive("sigma", given["sigma"])
     check_intrinsics("Ks", given["Ks"])

@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from etsplat import _native
-from etsplat.core.validation import check_device, check_indices, check_intrinsics, check_like, check_shape
+from etsplat.core.validation import check_device, check_indices, check_intrinsics, check_like, check_shape, dense
 from etsplat.ops._rasterize_hard_cuda import rasterize_hard_cuda, render_opaque_cuda
 from etsplat.ops._rasterize_hard_reference import View, rasterize_hard_reference, render_opaque_reference
 from etsplat.ops.engines import resolve_engine
@@ -131,14 +131,14 @@ def _check_mesh(vertices: Tensor, faces: Tensor | None) -> tuple[Tensor, Tensor]
     """Contiguous (V, 3) points and (F, 3) int32 faces."""
     if faces is None:
         check_shape("vertices", vertices, ("N", 3, 3))
-        points = vertices.detach().reshape(-1, 3).contiguous()
+        points = dense(vertices, "vertices").view(-1, 3)
         return points, torch.arange(len(points), dtype=torch.int32, device=points.device).view(-1, 3)
     check_shape("vertices", vertices, ("V", 3))
     check_shape("faces", faces, ("F", 3))
     if faces.device.type == "cpu":  # reading them would wait for a GPU, which leaves out what is out of range
         check_indices("faces", faces, len(vertices))
     check_device("faces", faces, "vertices", vertices)
-    return vertices.detach().contiguous(), faces.to(torch.int32).contiguous()
+    return dense(vertices, "vertices"), dense(faces, "faces").to(torch.int32)
 
 
 def _check_views(
@@ -154,7 +154,7 @@ def _check_views(
         raise ValueError(f"width and height must be at least 1, got {width} x {height}")
     if not 0.0 < near_plane < float("inf"):
         raise ValueError(f"near_plane must be positive and finite, got {near_plane}")
-    return viewmats.detach().contiguous(), Ks.detach().contiguous()
+    return dense(viewmats, "viewmats"), dense(Ks, "Ks")
 
 
 def _check_colors(
@@ -163,11 +163,11 @@ def _check_colors(
     if face_colors is not None and vertex_colors is None:
         check_shape("face_colors", face_colors, (len(triangles), "C"))
         check_like("face_colors", face_colors, "vertices", vertices)
-        return face_colors.detach().contiguous()
+        return dense(face_colors, "face_colors")
     if vertex_colors is not None and face_colors is None:
         check_shape("vertex_colors", vertex_colors, (len(points), "C"))
         check_like("vertex_colors", vertex_colors, "vertices", vertices)
-        return vertex_colors.detach().contiguous()
+        return dense(vertex_colors, "vertex_colors")
     raise ValueError("exactly one of face_colors and vertex_colors must be given")
 
 

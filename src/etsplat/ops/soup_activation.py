@@ -16,7 +16,7 @@ from torch.autograd.function import once_differentiable
 
 from etsplat import _native
 from etsplat.core.cameras import Cameras
-from etsplat.core.validation import check_like, check_shape
+from etsplat.core.validation import check_like, check_shape, dense
 from etsplat.cuda.launch import blocks, launch
 from etsplat.cuda.program import Program
 from etsplat.cuda.transfer import upload
@@ -76,7 +76,7 @@ def soup_activation(
         return opacities, (SOUP_SIGMA_FLOOR + torch.exp(sigma_raw)).clamp_max(ceiling)
     if chosen == "cuda" and not isinstance(limits, Tensor):
         limits = upload(limits, vertices.device)
-    view = (None, None) if camera is None else (camera.viewmats.contiguous(), camera.Ks.contiguous())
+    view = (None, None) if camera is None else (dense(camera.viewmats, "viewmats"), dense(camera.Ks, "Ks"))
     native = _OnDevice if chosen == "cuda" else _OnCpu
     drawn: Any = native.apply(vertices.detach(), opacity_logits, sigma_raw, *view, (smallest, largest), limits)
     return drawn
@@ -105,7 +105,7 @@ class _OnCpu(torch.autograd.Function):
         sizes: tuple[float, float],
         limits: tuple[float, float],
     ) -> tuple[Tensor, Tensor]:
-        inputs = vertices.contiguous(), logits.contiguous(), raw.contiguous()
+        inputs = dense(vertices), dense(logits), dense(raw)
         opacities, sigma = empty_image(len(logits)), empty_image(len(logits))
         view = (0 if tensor is None else tensor.data_ptr() for tensor in (viewmat, K))
         addresses = *(tensor.data_ptr() for tensor in inputs), *view
@@ -118,11 +118,11 @@ class _OnCpu(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *cotangents: Tensor | None) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        saved = [tensor.data_ptr() for tensor in ctx.saved_tensors]
-        given = [None if tensor is None else tensor.contiguous() for tensor in cotangents]
-        grads = empty_image(*ctx.saved_tensors[0].shape), empty_image(*ctx.saved_tensors[0].shape)
+        saved = [dense(tensor) for tensor in ctx.saved_tensors]
+        given = [None if tensor is None else dense(tensor) for tensor in cotangents]
+        grads = empty_image(len(saved[0])), empty_image(len(saved[0]))
         addresses = (0 if tensor is None else tensor.data_ptr() for tensor in (*given, *grads))
-        _native.soup_activate_backward(len(grads[0]), *saved, *ctx.limits, *addresses)
+        _native.soup_activate_backward(len(grads[0]), *(tensor.data_ptr() for tensor in saved), *ctx.limits, *addresses)
         return None, *grads, None, None, None, None
 
 
@@ -138,7 +138,7 @@ class _OnDevice(torch.autograd.Function):
         sizes: tuple[float, float],
         limits: Tensor,
     ) -> tuple[Tensor, Tensor]:
-        inputs = vertices.contiguous(), logits.contiguous(), raw.contiguous()
+        inputs = dense(vertices), dense(logits), dense(raw)
         opacities, sigma = torch.empty_like(inputs[1]), torch.empty_like(inputs[2])
         _launch("soup_activate", len(logits), *inputs, viewmat, K, *sizes, limits, opacities, sigma)
         ctx.save_for_backward(*inputs[1:], opacities, limits)
@@ -148,10 +148,10 @@ class _OnDevice(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *cotangents: Tensor | None) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        logits = ctx.saved_tensors[0]
-        grads = torch.empty_like(logits), torch.empty_like(logits)
-        given = (None if tensor is None else tensor.contiguous() for tensor in cotangents)
-        _launch("soup_activate_backward", len(logits), *ctx.saved_tensors, *given, *grads)
+        saved = [dense(tensor) for tensor in ctx.saved_tensors]
+        grads = torch.empty_like(saved[0]), torch.empty_like(saved[0])
+        given = (None if tensor is None else dense(tensor) for tensor in cotangents)
+        _launch("soup_activate_backward", len(grads[0]), *saved, *given, *grads)
         return None, *grads, None, None, None, None
 
 

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from etsplat import _native
-from etsplat.core.validation import check_like, check_shape
+from etsplat.core.validation import check_like, check_shape, dense
 from etsplat.ops._spherical_harmonics_cuda import SoupColorsCuda
 from etsplat.ops.engines import resolve_engine
 from etsplat.ops.pool import empty_image
@@ -64,7 +64,7 @@ def soup_colors(
 class _SoupColors(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, vertices: Tensor, dc: Tensor, rest: Tensor, centers: Tensor, degree: int) -> Tensor:
-        inputs = [tensor.detach().contiguous() for tensor in (vertices, dc, rest, centers)]
+        inputs = [dense(tensor) for tensor in (vertices, dc, rest, centers)]
         colors = empty_image(len(centers), len(vertices), 3)
         _native.soup_colors(*_problem(inputs, degree), colors.data_ptr())
         ctx.save_for_backward(*inputs, colors)
@@ -74,8 +74,8 @@ class _SoupColors(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, grad_colors: Tensor) -> tuple[Tensor, Tensor, Tensor, None, None]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        *inputs, colors = ctx.saved_tensors
-        grad_colors = grad_colors.contiguous()
+        *inputs, colors = map(dense, ctx.saved_tensors)
+        grad_colors = dense(grad_colors)
         grads = [empty_image(*tensor.shape) for tensor in inputs[:3]]
         _native.soup_colors_backward(
             *_problem(inputs, ctx.degree),

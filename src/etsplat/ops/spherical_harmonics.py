@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from etsplat import _native
-from etsplat.core.validation import check_like, check_shape
+from etsplat.core.validation import check_like, check_shape, dense
 from etsplat.ops._spherical_harmonics_cuda import SphericalHarmonicsCuda
 from etsplat.ops.engines import resolve_engine
 
@@ -65,7 +65,7 @@ def spherical_harmonics(
 class _SphericalHarmonics(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, coefficients: Tensor, directions: Tensor, degree: int) -> Tensor:
-        coefficients, directions = coefficients.contiguous(), directions.contiguous()
+        coefficients, directions = dense(coefficients, "coefficients"), dense(directions, "directions")
         colors = directions.new_empty((*directions.shape[:-1], coefficients.shape[2]))
         _native.spherical_harmonics(*_problem(coefficients, directions, degree), colors.data_ptr())
         ctx.save_for_backward(coefficients, directions, colors)
@@ -75,8 +75,8 @@ class _SphericalHarmonics(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, grad_colors: Tensor) -> tuple[Tensor, Tensor, None]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        coefficients, directions, colors = ctx.saved_tensors
-        grad_colors = grad_colors.contiguous()
+        coefficients, directions, colors = map(dense, ctx.saved_tensors)
+        grad_colors = dense(grad_colors)
         grad_coefficients, grad_directions = torch.empty_like(coefficients), torch.empty_like(directions)
         _native.spherical_harmonics_backward(
             *_problem(coefficients, directions, ctx.degree),

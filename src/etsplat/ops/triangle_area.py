@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from etsplat import _native
-from etsplat.core.validation import check_shape
+from etsplat.core.validation import check_shape, dense
 from etsplat.cuda.launch import blocks, launch
 from etsplat.cuda.program import Program
 from etsplat.ops.engines import resolve_engine
@@ -48,7 +48,7 @@ class _MeanArea(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, vertices: Tensor) -> Tensor:
-        vertices = vertices.contiguous()
+        vertices = dense(vertices, "vertices")
         gradient = empty_image(*vertices.shape)
         mean = _native.mean_area(vertices.data_ptr(), len(vertices), gradient.data_ptr())
         ctx.save_for_backward(gradient)
@@ -64,7 +64,7 @@ class _MeanArea(torch.autograd.Function):
 class _MeanAreaOnDevice(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, vertices: Tensor) -> Tensor:
-        vertices = vertices.contiguous()
+        vertices = dense(vertices, "vertices")
         grid = blocks(len(vertices), _THREADS)
         sums, mean = vertices.new_empty(grid, dtype=torch.float64), vertices.new_empty(())
         launch(_PROGRAM, "area_sums", grid, _THREADS, (vertices, len(vertices), sums))
@@ -76,8 +76,8 @@ class _MeanAreaOnDevice(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, grad_area: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
         """``grad_area`` stays in device memory."""
-        (vertices,) = ctx.saved_tensors
+        vertices = dense(ctx.saved_tensors[0])
         gradient = torch.empty_like(vertices)
-        arguments = (vertices, len(vertices), grad_area, gradient)
+        arguments = (vertices, len(vertices), dense(grad_area), gradient)
         launch(_PROGRAM, "area_backward", blocks(len(vertices), _THREADS), _THREADS, arguments)
         return gradient

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from etsplat import _native
-from etsplat.core.validation import check_like, check_shape
+from etsplat.core.validation import check_like, check_shape, dense
 from etsplat.cuda.launch import blocks, launch
 from etsplat.cuda.program import Program
 from etsplat.cuda.structs import struct_class
@@ -82,7 +82,7 @@ def _facing_normals(corners: Float[Tensor, "N 3 3"], viewmats: Float[Tensor, "B 
 class _TriangleChannels(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, corners: Tensor, viewmats: Tensor, depth: bool, normals: bool, on_device: bool) -> Tensor:
-        inputs = corners.contiguous(), viewmats.contiguous()
+        inputs = dense(corners, "corners"), dense(viewmats, "viewmats")
         ctx.save_for_backward(*inputs)
         ctx.settings = depth, normals, on_device
         shape = len(viewmats), len(corners), depth + 3 * normals
@@ -93,10 +93,10 @@ class _TriangleChannels(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad_channels: Tensor) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        corners, viewmats = ctx.saved_tensors
+        corners, viewmats = map(dense, ctx.saved_tensors)
         depth, normals, on_device = ctx.settings
         grad_corners = torch.empty_like(corners) if on_device else empty_image(*corners.shape)
-        _run("gradient", (depth, normals, on_device), (corners, viewmats), (grad_channels.contiguous(), grad_corners))
+        _run("gradient", (depth, normals, on_device), (corners, viewmats), (dense(grad_channels), grad_corners))
         grad_viewmats = None
         if ctx.needs_input_grad[1] and depth:
             finite = corners.isfinite().all(dim=2).all(dim=1)[:, None, None]

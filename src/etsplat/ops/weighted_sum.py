@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from etsplat.core.validation import check_like, check_shape
+from etsplat.core.validation import check_like, check_shape, dense
 from etsplat.cuda.launch import launch
 from etsplat.cuda.program import Program
 from etsplat.ops.engines import resolve_engine
@@ -79,20 +79,23 @@ class _WeightedSum(torch.autograd.Function):
     def forward(
         ctx: Any, settings: tuple[list[float], list[int]], scale: Tensor | None, first: Tensor, *values: Tensor
     ) -> Tensor:
+        scale, values = None if scale is None else dense(scale), tuple(map(dense, values))
         ctx.save_for_backward(*([] if scale is None else [scale]), *values)
         ctx.settings, ctx.scaled = settings, scale is not None
         total = first.new_empty(())
-        launch(_PROGRAM, "weighted_sum", 1, 1, (first, _table(settings, values), scale, total))
+        launch(_PROGRAM, "weighted_sum", 1, 1, (dense(first), _table(settings, values), scale, total))
         return total
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad_sum: Tensor) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
         """``grad_sum`` stays in device memory."""
-        values = ctx.saved_tensors[1:] if ctx.scaled else ctx.saved_tensors
-        scale = ctx.saved_tensors[0] if ctx.scaled else None
+        saved = [dense(tensor) for tensor in ctx.saved_tensors]
+        values, scale = (saved[1:], saved[0]) if ctx.scaled else (saved, None)
         gradients = grad_sum.new_empty(1 + len(values))
-        launch(_PROGRAM, "weighted_sum_backward", 1, 1, (_table(ctx.settings, values), scale, grad_sum, gradients))
+        launch(
+            _PROGRAM, "weighted_sum_backward", 1, 1, (_table(ctx.settings, values), scale, dense(grad_sum), gradients)
+        )
         return None, None, *gradients.unbind()
 
 

@@ -1,0 +1,432 @@
+"""Operations read their arguments where these are at that moment, and the values that they stand for.
+
+Between forward and backward autograd may hand over other memory with the same values and free the first: checkpointing
+and hooks on saved tensors do.
+"""
+
+import math
+from collections.abc import Callable
+from functools import partial
+
+import pytest
+import torch
+from torch import Tensor
+from torch.utils.checkpoint import checkpoint
+
+from etsplat import intrinsics, look_at, rasterize, rasterize_antialiased, rasterize_hard
+from etsplat.core.cameras import Cameras
+from etsplat.geometry.icosphere import icosphere
+from etsplat.geometry.topology import MeshTopology
+from etsplat.ops.adam import Adam
+from etsplat.ops.mesh_energies import mesh_energies
+from etsplat.ops.normal_consistency import normal_consistency
+from etsplat.ops.photometric import photometric_loss
+from etsplat.ops.pick_values import pick_values
+from etsplat.ops.pool import empty_image
+from etsplat.ops.rasterize_hard import render_opaque
+from etsplat.ops.soup_activation import soup_activation
+from etsplat.ops.soup_colors import soup_colors
+from etsplat.ops.spherical_harmonics import spherical_harmonics
+from etsplat.ops.triangle_area import mean_area
+from etsplat.ops.triangle_channels import triangle_channels
+from etsplat.ops.weighted_sum import Term, weighted_sum
+from helpers.scenes import EVERYTHING, mesh, soup
+
+Operation = Callable[..., list[Tensor]]
+Case = tuple[dict[str, Tensor], Operation]  # what gradients reach, and outputs from it
+
+
+def _splat(scene: dict, engine: str, names: tuple[str, ...], **options) -> Case:
+    rest = {"colors": None, **{k: v for k, v in scene.items() if k not in names}}
+
+    def run(**leaves: Tensor) -> list[Tensor]:
+        result = rasterize(**{**rest, **leaves}, **options, engine=engine)
+        images = result.color, result.alpha, result.depth, result.median_depth, result.normal, result.distortion
+        return [image for image in images if image is not None]
+
+    return {name: scene[name] for name in names}, run
+
+
+def _rasterize(rng: torch.Generator, engine: str, **options) -> Case:
+    names = ("vertices", "colors", "opacities", "sigma", "viewmats", "Ks", "backgrounds")
+    return _splat(soup(rng, 40, **options), engine, names)
+
+
+def _rasterize_everything(rng: torch.Generator, engine: str) -> Case:
+    scene = mesh(rng)
+    scene["corner_colors"] = torch.rand(len(scene["vertices"]), 3, generator=rng)
+    del scene["colors"]
+    names = ("vertices", "corner_colors", "opacities", "sigma", "viewmats", "Ks", "backgrounds")
+    return _splat(scene, engine, names, **EVERYTHING)
+
+
+def _antialiased(rng: torch.Generator, engine: str, kind: str) -> Case:
+    scene = mesh(rng)
+    faces, points = scene["faces"], scene["vertices"]
+    connectivity = MeshTopology.from_faces(faces, len(points)).connectivity
+    colors = torch.rand(len(faces) if kind == "face_colors" else len(points), 3, generator=rng)
+
+    def run(vertices: Tensor, colors: Tensor, backgrounds: Tensor) -> list[Tensor]:
+        view = scene["viewmats"] * 1.0, scene["Ks"] * 1.0, scene["width"], scene["height"]
+        options = {kind: colors, "backgrounds": backgrounds, "engine": engine}
+        return [rasterize_antialiased(vertices, connectivity, *view, **options)]
+
+    return {"vertices": points, "colors": colors, "backgrounds": scene["backgrounds"]}, run
+
+
+def _soup_activation(rng: torch.Generator, engine: str) -> Case:
+    logits, raw = torch.randn(2, 30, generator=rng)
+    corners = torch.randn(30, 3, 3, generator=rng)
+
+    def run(logits: Tensor, raw: Tensor) -> list[Tensor]:
+        camera = Cameras(torch.eye(4)[None], intrinsics(50, 32, 32)[None], 32, 32)
+        return [*soup_activation(corners, logits, raw, (0.1, 1.0), camera, engine=engine)]
+
+    return {"logits": logits, "raw": raw}, run
+
+
+def _soup_colors(rng: torch.Generator, engine: str) -> Case:
+    leaves = {
+        "vertices": torch.randn(30, 3, 3, generator=rng),
+        "sh_dc": torch.randn(30, 1, 3, generator=rng),
+        "sh_rest": torch.randn(30, 8, 3, generator=rng),
+    }
+    centers = torch.randn(2, 3, generator=rng)
+
+    def run(**leaves: Tensor) -> list[Tensor]:
+        return [soup_colors(**leaves, centers=centers, degree=2, engine=engine)]
+
+    return leaves, run
+
+
+def _harmonics(rng: torch.Generator, engine: str) -> Case:
+    leaves = {"coefficients": torch.randn(30, 9, 3, generator=rng), "directions": torch.randn(30, 3, generator=rng)}
+    return leaves, lambda **leaves: [spherical_harmonics(**leaves, degree=2, engine=engine)]
+
+
+def _mean_area(rng: torch.Generator, engine: str) -> Case:
+    return {"vertices": torch.randn(30, 3, 3, generator=rng)}, lambda vertices: [mean_area(vertices, engine=engine)]
+
+
+def _photometric(rng: torch.Generator, engine: str) -> Case:
+    color, target = torch.rand(2, 2, 20, 24, 3, generator=rng)
+    return {"color": color}, lambda color: [photometric_loss(color, target, dssim_weight=0.2, engine=engine)]
+
+
+def _normal_consistency(rng: torch.Generator, engine: str) -> Case:
+    normals = torch.nn.functional.normalize(torch.randn(2, 20, 24, 3, generator=rng), dim=-1)
+    depth, alpha = 2 + torch.rand(2, 2, 20, 24, 1, generator=rng)
+    views = torch.eye(4).expand(2, 4, 4), intrinsics(50, 24, 20).expand(2, 3, 3)
+
+    def run(normals: Tensor, depth: Tensor) -> list[Tensor]:
+        return [normal_consistency(normals, depth, alpha, *views, engine=engine)]
+
+    return {"normals": normals, "depth": depth}, run
+
+
+def _mesh_energies(rng: torch.Generator, engine: str) -> Case:
+    vertices, faces = icosphere(1)
+    connectivity = MeshTopology.from_faces(faces, len(vertices)).connectivity
+    points = vertices.float() + 0.1 * torch.randn(vertices.shape, generator=rng)
+    return {"vertices": points}, lambda vertices: [*mesh_energies(vertices, connectivity, engine=engine)]
+
+
+def _channels(rng: torch.Generator, engine: str) -> Case:
+    scene = soup(rng, 30)
+
+    def run(corners: Tensor, viewmats: Tensor) -> list[Tensor]:
+        return [triangle_channels(corners, viewmats, depth=True, normals=True, engine=engine)]
+
+    return {"corners": scene["vertices"], "viewmats": scene["viewmats"]}, run
+
+
+def _pick_values(rng: torch.Generator, engine: str) -> Case:
+    chosen = torch.randint(0, 31, (2, 20, 24), generator=rng, dtype=torch.int32)
+    values = torch.rand(2, 30, generator=rng)
+    return {"values": values}, lambda values: [pick_values(values, chosen * 1, engine=engine)]
+
+
+def _weighted_sum(rng: torch.Generator, engine: str) -> Case:
+    first, second = torch.rand(2, generator=rng)
+    terms = {"first": first, "second": second}
+    return terms, lambda first, second: [weighted_sum(first, [Term(0.5, second, -2)], engine=engine)]
+
+
+CASES: dict[str, Callable[[torch.Generator, str], Case]] = {
+    "rasterize": _rasterize,
+    "rasterize_many_channels": partial(_rasterize, channels=20),
+    "rasterize_everything": _rasterize_everything,
+    "antialiased_faces": partial(_antialiased, kind="face_colors"),
+    "antialiased_vertices": partial(_antialiased, kind="vertex_colors"),
+    "soup_activation": _soup_activation,
+    "soup_colors": _soup_colors,
+    "spherical_harmonics": _harmonics,
+    "mean_area": _mean_area,
+    "photometric_loss": _photometric,
+    "normal_consistency": _normal_consistency,
+    "mesh_energies": _mesh_energies,
+    "triangle_channels": _channels,
+    "pick_values": _pick_values,
+    "weighted_sum": _weighted_sum,
+}
+
+
+@pytest.fixture(params=["cpu", "cuda"])
+def native(request: pytest.FixtureRequest) -> str:
+    """Native engines; kernels of "cuda" run on CPU tensors, whose memory the tests can spoil."""
+    if request.param == "cuda":
+        request.getfixturevalue("simt")
+    return request.param
+
+
+def _loss(outputs: list[Tensor]) -> Tensor:
+    return torch.stack([(output * output).sum() for output in outputs]).sum()
+
+
+def _gradients(case: Case, loss: Callable[..., Tensor], runs: int = 1) -> dict[str, Tensor]:
+    leaves = {name: value.detach().clone().requires_grad_() for name, value in case[0].items()}
+    total = loss(leaves)
+    for _ in range(runs):
+        total.backward(retain_graph=runs > 1)
+    return {name: leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
+
+
+def _plainly(run: Operation, leaves: dict[str, Tensor]) -> Tensor:
+    # What the operation gets is freed as soon as autograd does not need it.
+    return _loss(run(**{name: leaf * 1.0 for name, leaf in leaves.items()}))
+
+
+def _same(found: dict[str, Tensor], expected: dict[str, Tensor], tolerance: float = 0.0) -> None:
+    assert found.keys() == expected.keys()
+    for name, gradient in expected.items():
+        assert gradient.abs().sum() > 0, name
+        limit = tolerance * float(gradient.abs().max())
+        torch.testing.assert_close(found[name], gradient, rtol=0, atol=limit, msg=name)
+
+
+def _spoil_free_memory() -> list[Tensor]:
+    """Fills what has been freed, in torch's allocator and in the pool, with NaN."""
+    sizes = [*range(4, 400, 4), *(3 * 40 * 48 * k for k in range(1, 24))]
+    blocks = [torch.full((size,), math.nan) for size in sizes for _ in range(4)]
+    return blocks + [empty_image(1 << 17).fill_(math.nan) for _ in range(4)]
+
+
+def _cloned_and_freed(saved: Tensor) -> Tensor:
+    """Packs a copy that lies elsewhere; unpacking it copies again, and the copy that was unpacked is spoilt later."""
+    return saved.detach().clone()
+
+
+@pytest.mark.sanitize
+@pytest.mark.parametrize("name", CASES)
+class TestSavedTensors:
+    def test_checkpoint_gives_the_same_gradients(self, name, native, rng):
+        case = CASES[name](rng, native)
+        expected = _gradients(case, partial(_plainly, case[1]))
+
+        def loss(leaves: dict[str, Tensor]) -> Tensor:
+            value = checkpoint(partial(_plainly, case[1]), leaves, use_reentrant=False)
+            spoilt = _spoil_free_memory()
+            assert len(spoilt) > 0
+            return value
+
+        _same(_gradients(case, loss), expected)
+
+    def test_hooks_that_move_what_is_saved_give_the_same_gradients(self, name, native, rng):
+        case = CASES[name](rng, native)
+        expected = _gradients(case, partial(_plainly, case[1]))
+        unpacked = []
+
+        def unpack(packed: Tensor) -> Tensor:
+            # Other strides, too, where there is more than one dimension.
+            unpacked.append(
+                packed.transpose(0, -1).contiguous().transpose(0, -1) if packed.ndim > 1 else packed.clone()
+            )
+            return unpacked[-1]
+
+        def loss(leaves: dict[str, Tensor]) -> Tensor:
+            with torch.autograd.graph.saved_tensors_hooks(_cloned_and_freed, unpack):
+                value = _plainly(case[1], leaves)
+            spoilt = _spoil_free_memory()
+            assert len(spoilt) > 0
+            return value
+
+        _same(_gradients(case, loss), expected, tolerance=1e-5)  # torch itself adds in another order for other strides
+        assert unpacked
+
+    def test_unpacked_tensors_may_be_freed_when_backward_has_dropped_them(self, name, native, rng):
+        case = CASES[name](rng, native)
+        expected = _gradients(case, partial(_plainly, case[1]))
+
+        def unpack(packed: Tensor) -> Tensor:
+            _spoil_free_memory()  # what an earlier unpacking has left
+            return packed.clone()
+
+        def loss(leaves: dict[str, Tensor]) -> Tensor:
+            with torch.autograd.graph.saved_tensors_hooks(_cloned_and_freed, unpack):
+                return _plainly(case[1], leaves)
+
+        _same(_gradients(case, loss), expected)
+
+    def test_a_second_backward_adds_the_same_again(self, name, native, rng):
+        case = CASES[name](rng, native)
+        expected = _gradients(case, partial(_plainly, case[1]))
+        twice = _gradients(case, partial(_plainly, case[1]), runs=2)
+        _same(twice, {name: 2 * gradient for name, gradient in expected.items()})
+
+
+@pytest.mark.sanitize
+@pytest.mark.parametrize("name", CASES)
+class TestOddTensors:
+    def test_a_sign_that_is_not_in_memory_counts(self, name, native, rng):
+        leaves, run = CASES[name](rng, native)
+        expected = run(**leaves)
+        for key, value in leaves.items():
+            odd = torch._neg_view(-value)
+            assert odd.is_neg()
+            for found, wanted in zip(run(**{**leaves, key: odd}), expected, strict=True):
+                torch.testing.assert_close(found, wanted, rtol=0, atol=0, msg=key)
+
+    def test_a_gradient_with_such_a_sign_counts(self, name, native, rng):
+        leaves, run = CASES[name](rng, native)
+        grown = {key: value.clone().requires_grad_() for key, value in leaves.items()}
+        outputs = [output for output in run(**grown) if output.requires_grad]
+        cotangents = [torch.rand(output.shape, generator=rng) for output in outputs]
+        odd = [torch._neg_view(-cotangent) for cotangent in cotangents]
+        found, expected = (
+            torch.autograd.grad(outputs, list(grown.values()), chosen, retain_graph=True, allow_unused=True)
+            for chosen in (odd, cotangents)
+        )
+        for one, other in zip(found, expected, strict=True):
+            torch.testing.assert_close(one, other, rtol=0, atol=0)
+
+    def test_tensors_without_memory_are_refused_by_name(self, name, native, rng):
+        leaves, run = CASES[name](rng, native)
+        for key, value in leaves.items():
+            freed = value.clone()
+            freed.untyped_storage().resize_(0)
+            for odd in (freed, torch._efficientzerotensor(value.shape), value.reshape(1, -1).to_sparse()):
+                with pytest.raises(ValueError, match=r"must (have memory of its own|be a dense tensor|have shape)"):
+                    run(**{**leaves, key: odd})
+
+
+FACES = torch.arange(300).view(100, 3)
+
+
+def _draw(faces: Tensor, engine: str, **options) -> Tensor:
+    generator = torch.Generator().manual_seed(3)
+    vertices = torch.randn(300, 3, generator=generator) * 0.5
+    colors, opacities = torch.rand(100, 3, generator=generator), torch.ones(100)
+    view = look_at(torch.tensor([[0.0, 0.0, 4.0]]), torch.zeros(3), torch.tensor([0.0, 1.0, 0.0]))
+    size = (intrinsics(50, 40, 30)[None], 40, 30)
+    n = len(faces)
+    return rasterize(
+        vertices, colors[:n], opacities[:n], 0.1, view, *size, faces=faces, engine=engine, **options
+    ).color  # fmt: skip
+
+
+@pytest.mark.sanitize
+class TestFaces:
+    @pytest.mark.parametrize("dtype", [torch.int32, torch.int64])
+    def test_faces_changed_through_numpy_are_drawn(self, native, dtype):
+        faces = FACES.to(dtype)
+        before = _draw(faces, native)
+        faces.numpy()[:] = faces.roll(1).flip(0).numpy()
+        after = _draw(faces, native)
+        assert torch.equal(after, _draw(faces.clone(), native))
+        assert not torch.equal(after, before)
+
+    @pytest.mark.parametrize("dtype", [torch.int32, torch.int64])
+    def test_other_faces_in_the_same_tensor_are_drawn(self, native, dtype):
+        faces = torch.nn.Parameter(FACES[:10].to(dtype), requires_grad=False)
+        _draw(faces, native)
+        faces.data = FACES.to(dtype)
+        assert torch.equal(_draw(faces, native), _draw(FACES, native))
+
+    def test_faces_changed_between_forward_and_backward_do_not_matter(self, native, rng):
+        scene = mesh(rng)
+        scene["faces"] = scene["faces"].to(torch.int32)
+        arguments = {key: value for key, value in scene.items() if key != "vertices"}
+
+        def gradient(spoil: bool) -> Tensor:
+            faces, vertices = arguments["faces"].clone(), scene["vertices"].clone().requires_grad_()
+            color = rasterize(vertices, **{**arguments, "faces": faces}, engine=native).color
+            if spoil:
+                faces.data.fill_(2**31 - 1)
+            color.square().sum().backward()
+            assert vertices.grad is not None
+            return vertices.grad
+
+        assert torch.equal(gradient(True), gradient(False))
+
+    def test_wrong_faces_put_there_after_a_call_are_refused(self):
+        faces = FACES.to(torch.int32)
+        _draw(faces, "cpu")
+        faces.numpy()[0, 0] = 10**8
+        with pytest.raises(ValueError, match="faces must be indices from 0 to 299"):
+            _draw(faces, "cpu")
+
+    def test_faces_made_in_inference_mode_are_drawn(self, native):
+        expected = _draw(FACES, native)
+        with torch.inference_mode():
+            assert torch.equal(_draw(FACES.clone(), native), expected)
+
+
+@pytest.mark.sanitize
+class TestOddArguments:
+    def test_opaque_pictures_count_signs_and_refuse_freed_memory(self, engine, rng):
+        scene = mesh(rng)
+        dtype = torch.float64 if engine == "reference" else torch.float32
+        points, *view = (scene[key].to(dtype) for key in ("vertices", "viewmats", "Ks"))
+        options = {"faces": scene["faces"], "engine": engine}
+        size = scene["width"], scene["height"]
+        for draw in (
+            lambda *given: rasterize_hard(*given, *size, **options).depth,
+            lambda *given: render_opaque(*given, *size, face_colors=scene["colors"].to(dtype), **options),
+        ):
+            expected = draw(points, *view)
+            assert torch.equal(draw(torch._neg_view(-points), *view), expected)
+            freed = points.clone()
+            freed.untyped_storage().resize_(0)
+            with pytest.raises(ValueError, match="vertices must have memory of its own"):
+                draw(freed, *view)
+
+    def test_faces_without_memory_are_refused(self):
+        faces = FACES.clone()
+        faces.untyped_storage().resize_(8)
+        with pytest.raises(ValueError, match="faces must have memory of its own: it needs 2400 bytes"):
+            _draw(faces, "cpu")
+
+    def test_adam_counts_signs_and_refuses_a_parameter_of_another_shape(self):
+        found = []
+        for odd in (False, True):
+            value, gradient = torch.rand(5), torch.linspace(-1, 1, 5)
+            value = value.zero_().requires_grad_()
+            value.grad = torch._neg_view(-gradient) if odd else gradient
+            optimizer = Adam({"value": value}, {"value": 0.1})
+            optimizer.step()
+            found.append(value.detach())
+        assert torch.equal(*found)
+        value.data, value.grad = torch.zeros(7), None
+        value.grad = torch.zeros(7)
+        with pytest.raises(ValueError, match="parameter value, its gradient and moments must have one shape"):
+            optimizer.step()
+
+    @pytest.mark.parametrize("name", ["colors", "backgrounds"])
+    def test_colours_whose_gradients_would_overflow_are_refused(self, engine, name, rng):
+        scene = soup(rng, 20)
+        if engine == "reference":
+            scene = {key: value.double() if isinstance(value, Tensor) else value for key, value in scene.items()}
+        scene[name][0, 0] = 1e38
+        with pytest.raises(ValueError, match=rf"{name} must be from -1e\+30 to 1e\+30, got 1 values beyond"):
+            rasterize(**scene, engine=engine)
+
+    @pytest.mark.parametrize("name", ["colors", "backgrounds"])
+    def test_the_largest_colours_leave_gradients_finite(self, name, rng):
+        scene = soup(rng, 200)
+        scene[name][0, 0] = 1e30
+        leaves = {key: scene[key].requires_grad_() for key in ("vertices", "colors", "opacities", "sigma")}
+        result = rasterize(**scene, engine="cpu")
+        (result.color.sum() + result.alpha.sum()).backward()
+        for key, leaf in leaves.items():
+            assert leaf.grad is not None, key
+            assert leaf.grad.isfinite().all(), key
