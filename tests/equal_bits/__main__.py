@@ -60,7 +60,7 @@ def open_session(base: str, *, fresh: bool) -> Session:
     with locked(FOLDER):
         write_inputs(inputs)
     drafts = Path(tempfile.mkdtemp(prefix="here-", dir=FOLDER))
-    return Session(tree, this_tree(), inputs, of_base / "runs", drafts, instruction_set, about, fresh)
+    return Session(tree, this_tree(drafts / "site"), inputs, of_base / "runs", drafts, instruction_set, about, fresh)
 
 
 def report(outcomes: list[Outcome], base: str, seconds: float) -> None:

@@ -35,6 +35,8 @@ _SHRUNK = (
 )
 _SCENE = f"--preset tiny --width 48 --iterations 120 --max-triangles 6000 {_EVERY}"
 _SMALL = f"--width 48 --iterations 120 --max-triangles 6000 {_EVERY}"
+# Plain PyTorch is slow.
+_FEW = "--engine reference --iterations 15 --log-every 5 --evaluate-every 5 --checkpoint-every 5"
 
 CASES = (
     Case("owl-elastic", "demo", _OWL),
@@ -48,7 +50,7 @@ CASES = (
     Case("owl-batch", "demo", f"{_OWL} --views-per-step 3 --seed 7"),
     Case("owl-sdf", "demo", f"{_OWL} --distance sdf --sigma-final 0.1"),
     Case("owl-weights", "demo", f"{_OWL} --lambda-normal 0.05 --lambda-edge 0.5 --lambda-laplacian 1 --lambda-sigma 0"),
-    Case("owl-reference", "demo", f"{_OWL} --resolution 16 --max-faces 400 --iterations 45 --engine reference"),
+    Case("owl-reference", "demo", f"{_OWL} --resolution 16 --max-faces 400 {_FEW}"),
     Case("owl-best", "demo", f"--preset best {_SHRUNK}", "interrupt"),
     Case("owl-paper", "demo", f"--preset paper {_SHRUNK}"),
     Case("owl-study", "demo", f"--preset study {_SHRUNK} --edge-power 2"),
@@ -65,9 +67,7 @@ CASES = (
     Case("scene-no-sky", "demo scene", f"{_SCENE} --no-sky-dome --background white --sample-by sharpness"),
     Case("scene-random", "demo scene", f"{_SCENE} --background random --no-replace-dead --sample-by opacity"),
     Case("scene-demo", "demo scene", f"--preset demo {_SMALL}"),
-    Case(
-        "scene-reference", "demo scene", f"{_SCENE} --width 12 --iterations 45 --max-triangles 4500 --engine reference"
-    ),
+    Case("soup-reference", "train pointless", f"{_SCENE} --width 16 --start-points 200 --max-triangles 300 {_FEW}"),
     Case("scene-paper", "demo scene", f"--preset paper {_SMALL}", "interrupt"),
     Case("scene-paper-indoor", "demo scene", f"--preset paper --scene-type indoor {_SMALL}"),
     Case("scene-paper-object", "demo scene", f"--preset paper --scene-type object {_SMALL} --regularize-from 5000"),

@@ -1,4 +1,4 @@
-"""The two trees: this one as it is installed, and BASE in a git work tree with a native build of its own."""
+"""The two trees: a copy of this one, and BASE in a git work tree with a native build of its own."""
 
 import fcntl
 import hashlib
@@ -41,10 +41,10 @@ class Tree:
         package: folder of the package that runs.
     """
 
-    def __init__(self, package: Path, interpreter: list[str], path: str = "") -> None:
-        """Starts nothing yet; `interpreter` is how Python is started for it, with PYTHONPATH `path`."""
+    def __init__(self, package: Path, path: str) -> None:
+        """Starts nothing yet; `path` is PYTHONPATH. `python -S` leaves out the editable install of this tree."""
         self.package = package
-        self._command = [*interpreter, str(RUNNER), str(package)]
+        self._command = [sys.executable, "-S", str(RUNNER), str(package)]
         self._environment = {**os.environ, **PINNED, "PYTHONPATH": path}
         self._idle: queue.SimpleQueue[subprocess.Popen[str]] = queue.SimpleQueue()
 
@@ -67,22 +67,24 @@ class Tree:
         return int(answer)
 
 
-def this_tree() -> Tree:
-    """The tree that this file is in, installed in the interpreter that runs it."""
-    return Tree(ROOT / "src" / "etsplat", [sys.executable])
+def this_tree(folder: Path) -> Tree:
+    """The tree that this file is in, with the native build that is installed; copied, so that it may be worked on."""
+    from etsplat import _native
+
+    shutil.copytree(ROOT / "src" / "etsplat", folder / "etsplat")
+    shutil.copy(_native.__file__, folder / "etsplat")
+    return _tree(folder)
 
 
 def base_tree(commit: str, folder: Path) -> Tree:
     """The tree of a commit; checked out and built in `folder` at the first call.
 
-    Its package alone is installed there, the interpreter's other packages are used. `python -S` leaves out the editable
-    install of this tree.
+    Its package alone is installed there; the interpreter's other packages are used.
     """
     with locked(folder):
         if not (folder / "site").is_dir():
             _build(commit, folder)
-    path = os.pathsep.join([str(folder / "site"), *_sites()])
-    return Tree(folder / "site" / "etsplat", [sys.executable, "-S"], path)
+    return _tree(folder / "site")
 
 
 def resolve_commit(name: str) -> str:
@@ -135,6 +137,10 @@ def _build(commit: str, folder: Path) -> None:
         check=True,
     )
     draft.rename(folder / "site")
+
+
+def _tree(site: Path) -> Tree:
+    return Tree(site / "etsplat", os.pathsep.join([str(site), *_sites()]))
 
 
 def _sites() -> list[str]:
