@@ -1,8 +1,8 @@
-"""Tables of a result file of benchmarks.rasterizer, on the screen or in a document.
+"""Tables of a result file of benchmarks.rasterizer on the screen, or the first of them in a document.
 
 python -m benchmarks.tables benchmarks/results/FILE.json --into docs/performance.md
 
-replaces what stands between the lines `<!-- results -->` and `<!-- end of results -->`.
+puts the times between the lines `<!-- results -->` and `<!-- end of results -->`.
 """
 
 import argparse
@@ -153,12 +153,13 @@ def all_tables(results: dict[str, Any]) -> list[Table]:
 
 
 def markdown(results: dict[str, Any], source: str) -> str:
+    """The times, and where they come from."""
     m = results["machine"]
     head = (
         f"`{results['command']}`, {m['date'][:10]}, commit {m['commit']}, {m['cpu']}, {m['cores']} cores, "
         f"load {m['load_average']} before, {results['load_average_after']} after, torch {m['torch']}; `{source}`.\n"
     )
-    return "\n".join([head, *(table.markdown() for table in all_tables(results))])
+    return f"{head}\n{times(results['results']).markdown()}"
 
 
 def main() -> None:

@@ -62,6 +62,20 @@ def test_nothing_local_is_committed() -> None:
     assert [name for name in found if name != "tests/test_packaging.py"] == []
 
 
+@pytest.mark.parametrize(
+    "page", sorted(REPOSITORY.glob("*.md")) + sorted(REPOSITORY.glob("[drs]*/*.md")), ids=lambda page: page.name
+)
+def test_links_lead_somewhere(page: Path) -> None:
+    """Every link of a page to another file of the repository, and to a heading of it, is right."""
+    for target in re.findall(r"\]\((?!https?://)([^)\s]+)\)", page.read_text(encoding="utf-8")):
+        name, _, heading = target.partition("#")
+        linked = page.parent / name if name else page
+        assert linked.exists(), target
+        if heading:
+            headings = re.findall(r"^#+ (.+)$", linked.read_text(encoding="utf-8"), re.MULTILINE)
+            assert heading in [re.sub(r"[^\w\- ]", "", text).lower().replace(" ", "-") for text in headings], target
+
+
 @pytest.mark.sanitize
 @pytest.mark.parametrize("threads", [1, 2, 5])
 def test_thread_count_can_be_set(threads: int) -> None:

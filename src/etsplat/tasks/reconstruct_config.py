@@ -184,7 +184,7 @@ def _check_range(config: ReconstructConfig, name: str, low: float, high: float =
 
 
 _PAPER = ReconstructConfig()
-# What measurements support beyond the paper (docs/ablations.md): closer to the truth, and no face cuts through another.
+# What measurements support beyond the paper (research/ablations.md): closer to the truth, no face cuts through another.
 _BEST: dict[str, Any] = {"coarse_levels": 2, "coarse_until": 0.1, "gamma_final": 0.03, "untangle_steps": 6}
 # The paper's method at about a fifth of its budget.
 _SHORT = replace(

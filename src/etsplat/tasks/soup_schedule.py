@@ -17,7 +17,7 @@ HIDDEN = 0.005
 """The opaque finish, as fractions of a run: opacities are squeezed above a floor that soon has its final height, so
 that most of the run is spent on an opaque soup, while its edges still give wide gradients. Then sigma is cut at a
 ceiling that falls. What is hidden meanwhile is removed (its blend weight stays below the last number), and others
-multiply in its place. The thresholds of soft soups take too much away (docs/ablations.md)."""
+multiply in its place. The thresholds of soft soups take too much away (research/ablations.md)."""
 
 
 @dataclass(frozen=True)
