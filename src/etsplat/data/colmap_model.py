@@ -1,13 +1,16 @@
 """The files of a COLMAP sparse model: cameras, registered images and points, binary or text."""
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
 from etsplat.core.errors import InputError
+
+Row = TypeVar("Row")
 
 _MODELS = (
     *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV"),
@@ -45,18 +48,13 @@ def read_cameras(model: Path) -> dict[int, ColmapCamera]:
     """
     if (model / "cameras.bin").is_file():
         return dict(_cameras_from_binary(_Reader(model / "cameras.bin")))
-    cameras = {}
-    path = model / "cameras.txt"
-    for line in _text_lines(path):
-        words = line.split()
-        try:
-            if len(words) < 5:
-                raise ValueError("too few numbers")
-            params = tuple(float(word) for word in words[4:])
-            cameras[int(words[0])] = ColmapCamera(words[1], int(words[2]), int(words[3]), params)
-        except ValueError as error:
-            raise InputError(f"scene {path}: malformed line `{line[:60]}` ({error}); export it again") from error
-    return cameras
+
+    def camera(line: str) -> tuple[int, ColmapCamera]:
+        words = _words(line, 5)
+        params = tuple(float(word) for word in words[4:])
+        return int(words[0]), ColmapCamera(words[1], int(words[2]), int(words[3]), params)
+
+    return dict(_parsed(model / "cameras.txt", camera))
 
 
 def read_images(model: Path) -> list[ColmapImage]:
@@ -67,19 +65,14 @@ def read_images(model: Path) -> list[ColmapImage]:
     """
     if (model / "images.bin").is_file():
         return list(_images_from_binary(_Reader(model / "images.bin")))
-    images = []
-    path = model / "images.txt"
+
+    def image(line: str) -> ColmapImage:
+        words = _words(line, 10, splits=9)  # names may have spaces
+        w, x, y, z, tx, ty, tz = (float(word) for word in words[1:8])
+        return ColmapImage(words[9], int(words[8]), (w, x, y, z), (tx, ty, tz))
+
     # Every second line lists the image's key points, and may be empty.
-    for line in _text_lines(path, keep_empty=True)[::2]:
-        words = line.split(maxsplit=9)
-        try:
-            if len(words) < 10:
-                raise ValueError("too few numbers")
-            w, x, y, z, tx, ty, tz = (float(word) for word in words[1:8])
-            images.append(ColmapImage(words[9], int(words[8]), (w, x, y, z), (tx, ty, tz)))
-        except ValueError as error:
-            raise InputError(f"scene {path}: malformed line `{line[:60]}` ({error}); export it again") from error
-    return images
+    return _parsed(model / "images.txt", image, every=2)
 
 
 def read_points(model: Path) -> tuple[np.ndarray, np.ndarray] | None:
@@ -97,15 +90,9 @@ def read_points(model: Path) -> tuple[np.ndarray, np.ndarray] | None:
             reader.skip(8 * row[8])
             rows.append(row[1:7])
     elif (model / "points3D.txt").is_file():
-        path = model / "points3D.txt"
-        try:
-            rows = [tuple(float(word) for word in line.split()[1:7]) for line in _text_lines(path)]
-        except ValueError as error:
-            raise InputError(f"scene {path}: malformed line ({error}); export it again") from error
+        rows = _parsed(model / "points3D.txt", lambda line: tuple(float(word) for word in _words(line, 7)[1:7]))
     else:
         return None
-    if any(len(row) != 6 for row in rows):
-        raise InputError(f"scene {model / 'points3D.txt'}: a line with too few numbers; export it again")
     table = np.array(rows, dtype=np.float64).reshape(-1, 6)
     table = table[np.isfinite(table).all(axis=1)]
     return table[:, :3], table[:, 3:].clip(0, 255).astype(np.uint8)
@@ -118,25 +105,18 @@ class _Reader:
         self.path, self._data, self._at = path, path.read_bytes(), 0
 
     def numbers(self, layout: str) -> tuple:
-        size = struct.calcsize("<" + layout)
-        if self._at + size > len(self._data):
-            raise InputError(f"scene {self.path}: the file is cut short; export the model again")
-        values = struct.unpack_from("<" + layout, self._data, self._at)
-        self._at += size
-        return values
+        return struct.unpack("<" + layout, self.skip(struct.calcsize("<" + layout)))
 
     def text(self) -> str:
         end = self._data.find(b"\0", self._at)
-        if end < 0:
-            raise InputError(f"scene {self.path}: the file is cut short; export the model again")
-        text = self._data[self._at : end].decode("utf-8", errors="replace")
-        self._at = end + 1
-        return text
+        return self.skip(1 + (end if end >= 0 else len(self._data)) - self._at)[:-1].decode("utf-8", errors="replace")
 
-    def skip(self, size: int) -> None:
-        if self._at + size > len(self._data):
-            raise InputError(f"scene {self.path}: the file is cut short; export the model again")
+    def skip(self, size: int) -> bytes:
+        """What is skipped."""
         self._at += size
+        if self._at > len(self._data):
+            raise InputError(f"scene {self.path}: the file is cut short; export the model again")
+        return self._data[self._at - size : self._at]
 
 
 def _cameras_from_binary(reader: _Reader) -> Iterator[tuple[int, ColmapCamera]]:
@@ -156,8 +136,22 @@ def _images_from_binary(reader: _Reader) -> Iterator[ColmapImage]:
         yield ColmapImage(name, camera, (w, x, y, z), (tx, ty, tz))
 
 
-def _text_lines(path: Path, keep_empty: bool = False) -> list[str]:
+def _parsed(path: Path, parse: Callable[[str], Row], every: int = 1) -> list[Row]:
+    """What every so manieth line of a text file says; empty ones count if not all are wanted."""
     if not path.is_file():
         raise InputError(f"scene {path}: no such file; export the model again")
     lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
-    return [line for line in lines if not line.startswith("#") and (keep_empty or line.strip())]
+    rows = []
+    for line in [line for line in lines if not line.startswith("#") and (every > 1 or line.strip())][::every]:
+        try:
+            rows.append(parse(line))
+        except ValueError as error:
+            raise InputError(f"scene {path}: malformed line `{line[:60]}` ({error}); export it again") from error
+    return rows
+
+
+def _words(line: str, least: int, splits: int = -1) -> list[str]:
+    words = line.split(maxsplit=splits)
+    if len(words) < least:
+        raise ValueError("too few numbers")
+    return words
