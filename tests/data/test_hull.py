@@ -60,6 +60,20 @@ def test_the_sphere_follows_units_and_place():
     assert 350 <= radius < 400
 
 
+def test_photos_of_different_sizes_and_of_bytes_give_the_same_sphere(owl_views):
+    """Every second photo is half as large; then all are bytes."""
+    center, radius = bounding_sphere(owl_views)
+    half = owl_views.halved()
+    chosen = [(half if index % 2 else owl_views) for index in range(len(owl_views))]
+    Ks = torch.stack([dataset.Ks[index] for index, dataset in enumerate(chosen)])
+    photos = [dataset.images[index] for index, dataset in enumerate(chosen)]
+    mixed = replace(owl_views, Ks=Ks, images=StoredPictures(photos))
+    for dataset in (mixed, replace(mixed, images=StoredPictures([(255 * photo).byte() for photo in photos]))):
+        there, reach = bounding_sphere(dataset)
+        torch.testing.assert_close(there, center, atol=1e-6, rtol=0)
+        assert reach == pytest.approx(radius, rel=0.02)
+
+
 def test_the_sphere_of_the_shared_lego_covers_every_silhouette(shared_data):
     """A mask pixel is explained by the sphere only if its viewing ray passes through it: true of all of them."""
     views = load_dataset(shared_data / "scenes" / "lego_blender", masks_as="alpha", width=100)
