@@ -7,7 +7,10 @@ from etsplat.core.errors import InputError as InputError
 from etsplat.core.rasterization import Cutoffs as Cutoffs
 from etsplat.core.rasterization import Rasterization as Rasterization
 from etsplat.core.rasterization import TriangleStatistics as TriangleStatistics
+from etsplat.data.dataset import Dataset as Dataset
 from etsplat.data.demo_object import demo_object as demo_object
+from etsplat.data.hull import bounding_sphere as bounding_sphere
+from etsplat.data.load import load_dataset as load_dataset
 from etsplat.io.mesh_files import MeshFile as MeshFile
 from etsplat.io.mesh_files import load_mesh as load_mesh
 from etsplat.io.mesh_files import save_mesh as save_mesh

@@ -1,1 +1,1 @@
-"""Posed photos and the points seen in them: loaders, captures, pictures of a mesh, what is built in code."""
+"""Posed photos and the points seen in them: data sets, where they come from, and what is built in code."""
