@@ -22,6 +22,7 @@ from etsplat.data.dataset import Dataset
 from etsplat.model.soup_files import SoupFile
 from etsplat.tasks.soup_run import SoupRun, world_up
 from etsplat.viewer.follow import Followed
+from etsplat.viewer.guard import Guard
 from etsplat.viewer.pace import Pace
 from etsplat.viewer.pictures import MODES, picture
 
@@ -51,13 +52,14 @@ class Viewer:
         Raises:
             InputError: viser is missing, or the address cannot be used.
         """
-        viser = _import_viser()
+        server_class = _server_class()
         self._run, self._width = run, width
         self._file: SoupFile = run.file
         self._clients: dict[int, _Client] = {}
         self._closed = threading.Event()
         _check_address(host, port)
-        self.server = viser.ViserServer(host=host, port=port, verbose=False)
+        with Guard(host).installed():
+            self.server = server_class(host=host, port=port, verbose=False)
         self._build_page()
         self.server.on_client_connect(self._connected)
         self.server.on_client_disconnect(lambda client: self._disconnected(client.client_id))
@@ -88,6 +90,7 @@ class Viewer:
 
     def _build_page(self) -> None:
         gui = self.server.gui
+        gui.configure_theme(show_share_button=False)
         self._mode = gui.add_dropdown("Mode", MODES, initial_value="soft")
         self._show_cameras = gui.add_checkbox("Training cameras", False, disabled=self._run.capture is None)
         self._status = gui.add_markdown(_describe(self._file))
@@ -270,9 +273,16 @@ def _quaternion(rotation: torch.Tensor) -> np.ndarray:
     return np.array([w, x, y, z])
 
 
-def _import_viser() -> Any:
+def _server_class() -> Any:
     try:
         import viser
     except ImportError as error:
         raise InputError("the viewer needs viser: pip install 'etsplat[viewer]'") from error
-    return viser
+
+    class Private(viser.ViserServer):
+        """Any page may ask viser for a tunnel through which everybody can look; this one makes none."""
+
+        def request_share_url(self, verbose: bool = True) -> None:
+            """Does nothing."""
+
+    return Private
