@@ -26,7 +26,7 @@ from etsplat.io.images import (
     premultiply,
     resize_image,
 )
-from etsplat.io.paths import kind_of, path_remedy
+from etsplat.io.paths import kind_of, path_remedy, path_within
 
 MAX_WIDTH = 1600
 """Wider images are shrunk to this width unless another is asked for, as 3DGS does."""
@@ -133,21 +133,25 @@ def _view_names(frames: Sequence[Frame]) -> list[str]:
     return short if len(set(short)) == len(short) else full
 
 
-def find_image(folder: Path, name: str) -> Path:
-    """The file of image `name` in a folder, or one that differs in its ending; as named if there is none."""
-    path = folder / name
+def find_image(folder: Path, name: str, source: Path) -> Path:
+    """The file of image `name` in a folder, or one that differs in its ending; as named if there is none.
+
+    Raises:
+        InputError: the name, which the file `source` gives, leads out of the folder.
+    """
+    path = path_within(folder, name, source)
     return _with_any_ending(path) or path
 
 
-def find_mask(folder: Path, name: str) -> Path:
+def find_mask(folder: Path, name: str, source: Path) -> Path:
     """The mask of image `name` in a folder: NAME itself, with another ending, or with .png added as COLMAP has it.
 
     Raises:
-        InputError: there is none, or no folder.
+        InputError: there is none, or no folder; or the name, which the file `source` gives, leads out of it.
     """
     if not folder.is_dir():
         raise InputError(f"masks {folder}: no such folder; {path_remedy(folder)}")
-    path = folder / name
+    path = path_within(folder, name, source)
     found = _with_any_ending(path)
     if found is None:
         raise InputError(f"masks {folder}: no mask for image {name}; add {path.with_suffix('.png').name}")

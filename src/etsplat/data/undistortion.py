@@ -16,7 +16,7 @@ from etsplat.data.formats.transforms import DistortedFrames, read_distorted_tran
 from etsplat.data.frames import find_mask, scaled_intrinsics
 from etsplat.io.atomic import write_error
 from etsplat.io.images import image_size, load_pixels
-from etsplat.io.paths import kind_of, path_remedy
+from etsplat.io.paths import kind_of, path_remedy, path_within
 
 LEAST_SIZE = 16
 """Pixels of the longer side of an image."""
@@ -179,10 +179,10 @@ def _read_model(pycolmap: Any, scene: Path, folder: Path) -> tuple[Any, Path, di
     except (ValueError, RuntimeError, OSError, LookupError) as error:  # what its C++ throws
         raise InputError(f"scene {folder}: cannot be read as a model ({str(error).splitlines()[0]})") from error
     names = sorted(image.name for image in model.images.values() if image.has_pose)
-    missing = [name for name in names if not (scene / "images" / name).is_file()]
+    missing = [name for name in names if not path_within(scene / "images", name, folder).is_file()]
     if missing:
         raise InputError(f"scene {scene}: {len(missing)} images are missing (first: {missing[0]}); copy them there")
-    masks = {name: find_mask(scene / "masks", name) for name in names} if (scene / "masks").is_dir() else {}
+    masks = {name: find_mask(scene / "masks", name, folder) for name in names} if (scene / "masks").is_dir() else {}
     return model, scene / "images", masks
 
 

@@ -2,12 +2,33 @@
 
 import difflib
 import os
-from pathlib import Path
+from pathlib import Path, PurePosixPath, PureWindowsPath
+
+from etsplat.core.errors import InputError
 
 
 def kind_of(path: Path | str) -> str:
     """The suffix of a file's name, which says what kind of file it is, in lower case: cameras write .JPG."""
     return Path(path).suffix.lower()
+
+
+def path_within(folder: Path, name: str, source: Path | str) -> Path:
+    """Where the file lies that another file names: `folder` / `name`, never outside of the folder.
+
+    Args:
+        folder: what the name is relative to.
+        name: with forward slashes or backslashes.
+        source: the file that has the name, for the message.
+
+    Raises:
+        InputError: the name is empty, absolute, of a drive, or leads out of the folder.
+    """
+    parts = PurePosixPath(name.replace("\\", "/")).parts
+    if not parts or "\0" in name:
+        raise InputError(f"{source}: {name!r} is no file name; correct it there")
+    if parts[0].startswith("/") or ".." in parts or PureWindowsPath(name).drive:
+        raise InputError(f"{source}: {name!r} leads out of {folder}; copy the file there and name it in that folder")
+    return folder / name
 
 
 def path_remedy(path: Path | str) -> str:

@@ -55,8 +55,8 @@ def read(folder: Path, wanted: Wanted) -> Dataset:
             raise InputError(f"scene {model}: {image.name} uses camera {image.camera}, which is missing; export again")
         camera = cameras[image.camera]
         K = _intrinsics(model, image.name, camera)
-        mask = None if masks is None else find_mask(masks, image.name)
-        file = find_image(folder / (wanted.images or "images"), image.name)
+        mask = None if masks is None else find_mask(masks, image.name, model)
+        file = find_image(folder / (wanted.images or "images"), image.name, model)
         frames.append(Frame(image.name, file, mask, _viewmat(image), K, (camera.width, camera.height)))
     found = read_points(model)
     if found is None or not len(found[0]):

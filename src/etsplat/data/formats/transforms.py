@@ -18,6 +18,7 @@ from etsplat.core.errors import InputError
 from etsplat.data.dataset import Dataset
 from etsplat.data.frames import Frame, Wanted, check_frames, find_image, find_mask, posed
 from etsplat.io.images import image_size
+from etsplat.io.paths import path_within
 from etsplat.io.point_clouds import load_points
 
 MARK = "transforms.json"
@@ -143,7 +144,7 @@ def _points(path: Path) -> Points | None:
         return None
     if not isinstance(name, str):
         raise InputError(f"scene {path}: ply_file_path = {name!r} is not a file name; correct or remove it")
-    points, colors = load_points(path.parent / _plain(name))
+    points, colors = load_points(path_within(path.parent, _plain(name), path))
     return (points, colors) if len(points) else None
 
 
@@ -171,18 +172,21 @@ def _frame(path: Path, document: dict[str, Any], entry: dict[str, Any], wanted: 
     if not isinstance(entry, dict) or not isinstance(entry.get("file_path"), str):
         raise InputError(f"scene {path}: a frame without `file_path`; export the poses again")
     name = _plain(entry["file_path"])
-    image = find_image(path.parent, name if wanted.images is None else _moved(name, wanted.images))
+    if wanted.images is None:
+        image = find_image(path.parent, name, path)
+    else:  # it replaces the first folder
+        image = find_image(path.parent / wanted.images, name.split("/", 1)[-1], path)
     settings = {**document, **entry}
     if not distorted:
         _refuse_distortion(path, name, settings)
     size = _size(path, name, settings, image)
     mask = None
     if wanted.masks is not None:
-        mask = find_mask(wanted.masks, image.name)
+        mask = find_mask(wanted.masks, image.name, path)
     elif isinstance(entry.get("mask_path"), str):
-        mask = path.parent / _plain(entry["mask_path"])
+        mask = path_within(path.parent, _plain(entry["mask_path"]), path)
     elif (path.parent / "masks").is_dir():
-        mask = find_mask(path.parent / "masks", image.name)
+        mask = find_mask(path.parent / "masks", image.name, path)
     return Frame(name, image, mask, _viewmat(path, name, entry), _intrinsics(path, name, settings, size), size)
 
 
@@ -196,11 +200,6 @@ def _read(path: Path) -> dict[str, Any]:
     if not isinstance(document, dict):
         raise InputError(f"scene {path}: expected a JSON object with a list `frames`; export the poses again")
     return document
-
-
-def _moved(name: str, images: str) -> str:
-    """`name` with its first folder replaced."""
-    return f"{images}/{name.split('/', 1)[-1]}"
 
 
 def _refuse_distortion(path: Path, name: str, settings: dict[str, Any]) -> None:
