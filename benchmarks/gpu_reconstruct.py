@@ -1,7 +1,6 @@
 """Time of a whole step of shape reconstruction on a GPU, from the choice of a view to Adam's update."""
 
 import time
-from dataclasses import replace
 from typing import Any
 
 import torch
@@ -9,7 +8,7 @@ import torch
 from etsplat.data.demo_object import demo_object
 from etsplat.data.photograph import photograph
 from etsplat.tasks.mesh_fitting import MeshFitting
-from etsplat.tasks.reconstruct_config import PRESETS
+from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.sources import make_start
 
 
@@ -21,16 +20,17 @@ def step_milliseconds(
     Wall time: steps are queued in the hundreds, and each batch ends with the one wait for the device.
     """
     warm_up = 10
-    config = replace(
-        PRESETS["paper"],
-        engine="cuda",
-        resolution=resolution,
-        start_level=start_level,
-        max_faces=faces,
-        iterations=2 * steps + warm_up,
-        subdivide_from=warm_up / (2 * steps + warm_up),
-        subdivide_until=warm_up / (2 * steps + warm_up),
-        subdivide_steps=1,
+    config = ReconstructConfig.paper().changed(
+        {
+            "engine": "cuda",
+            "resolution": resolution,
+            "start.level": start_level,
+            "max_faces": faces,
+            "iterations": 2 * steps + warm_up,
+            "refinement.first": warm_up / (2 * steps + warm_up),
+            "refinement.last": warm_up / (2 * steps + warm_up),
+            "refinement.subdivisions": 1,
+        }
     )
     views = photograph(demo_object(), resolution, resolution, supersampling=1, device=device)
     fitting = MeshFitting(make_start(None, views, config, device), views, config, lambda _: {})

@@ -1,7 +1,6 @@
 """Time of a whole step of novel-view synthesis on a GPU, from the choice of a view to statistics, and its kernels."""
 
 import time
-from dataclasses import replace
 from typing import Any
 
 import torch
@@ -10,7 +9,7 @@ from benchmarks.gpu_timing import kernel_times
 from etsplat.data.demo_scene import demo_scene
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.tasks.soup_fitting import SoupFitting
-from etsplat.tasks.train_config import train_settings
+from etsplat.tasks.train_config import TrainConfig
 
 SIZE = (1237, 822)
 TRIANGLES = 4_000_000
@@ -43,14 +42,11 @@ def step_milliseconds(
     vertices = middles + EXTENT * torch.randn((triangles, 3, 3), generator=generator)
     colors = torch.rand((triangles, 3), generator=generator)
     soup = TriangleSoup.from_triangles(vertices, colors, opacity=0.3, sigma=0.5, sh_degree=3).to(device)
-    config = replace(
-        train_settings(preset, "indoor"),
-        engine="cuda",
-        iterations=30_000,
-        sh_every=1,
-        regularize_from=0,
-        densify_every=15_000,
+    config = TrainConfig.of(preset, "indoor").changed(
+        {"engine": "cuda", "iterations": 30_000, "schedule.sh_every": 1, "densification.every": 15_000}
     )
+    if config.loss.lambda_distortion > 0:
+        config = config.changed({"loss.regularize_from": 0})
     fitting = SoupFitting(soup, capture, config, generator, lambda *_: {})
     done = _advance(fitting, 10, 10 + steps)
     begin = time.perf_counter()

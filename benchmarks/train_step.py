@@ -8,7 +8,6 @@ import json
 import statistics
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +23,7 @@ from etsplat.ops.rasterize import rasterize
 from etsplat.ops.soup_colors import soup_colors
 from etsplat.tasks.soup_fitting import SoupFitting
 from etsplat.tasks.train import start_fitting
-from etsplat.tasks.train_config import TrainConfig, train_settings
+from etsplat.tasks.train_config import TrainConfig
 
 WARM_UP = 60
 """Steps before anything is timed: the soup is then no longer the start."""
@@ -90,7 +89,7 @@ def rasterizing(fitting: SoupFitting, capture: Dataset, config: TrainConfig, vie
             kernel=config.kernel,
             distance=config.distance,
             backgrounds=torch.zeros(1, 3),
-            near_plane=config.near_plane,
+            near_plane=config.drawing.near_plane,
             statistics=True,
             validate=False,
         )
@@ -136,15 +135,16 @@ def main() -> None:
     options = parser.parse_args()
     set_num_threads(options.threads)
     loaded = load_dataset(options.scene, width=options.width) if options.scene else demo_scene(options.width)
-    config = replace(
-        train_settings(options.preset, options.scene_type),
-        method=options.method,
-        max_triangles=options.triangles,
-        iterations=100_000,
-        schedule_length=30_000,
-        sh_every=1,
-        regularize_from=0,
+    config = TrainConfig.of(options.preset, options.scene_type).changed(
+        {
+            "method": options.method,
+            "max_triangles": options.triangles,
+            "iterations": 100_000,
+            "schedule.sh_every": 1,
+        }
     )
+    if config.loss.lambda_depth_normal > 0:
+        config = config.changed({"loss.regularize_from": 0})
     capture = loaded.normalized() if config.normalize else loaded
     with one_torch_thread():
         fitting = grown(capture, config)

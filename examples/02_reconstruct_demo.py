@@ -13,7 +13,7 @@ from etsplat.optim.loop import RefineEvent, StepEvent
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--out", default="runs/example")
-    parser.add_argument("--preset", choices=list(etsplat.PRESETS), default="demo")
+    parser.add_argument("--preset", default="demo")
     options = parser.parse_args()
 
     def tell(event: object) -> None:
@@ -25,7 +25,7 @@ def main() -> None:
     result = etsplat.reconstruct(
         etsplat.demo_object(),  # or a path: a mesh file, or a folder with posed images
         options.out,
-        replace(etsplat.PRESETS[options.preset], seed=1),
+        replace(etsplat.ReconstructConfig.of(options.preset), seed=1),
         callbacks=[tell],
         overwrite=True,
     )

@@ -8,7 +8,8 @@ from typing import Any, ClassVar, Literal
 import tyro
 
 from etsplat.cli.command import INTERRUPTED, fail
-from etsplat.tasks.train_config import Method, TrainPreset
+from etsplat.tasks.settings import SoftMethod
+from etsplat.tasks.train_config import Preset
 from studies.peers.settings import Peer
 from studies.study import Study
 
@@ -24,7 +25,7 @@ class Nvs(Study):
     python -m studies.nvs --scenes scenes/kitchen:indoor scenes/lego:object,background=white --out runs/nvs
     python -m studies.nvs --scenes scenes/fox:indoor --out runs/filter --methods elastic --culling both
     python -m studies.nvs --scenes scenes/fox:indoor --out runs/small --set iterations=1000,width=300
-    python -m studies.nvs --scenes demo:scene --settings "" prune_views=2 start_limit=none --out runs/ablation
+    python -m studies.nvs --scenes demo:scene --settings "" pruning.views=2 start.limit=none --out runs/ablation
     python -m studies.nvs --scenes data/tandt/truck data/tandt/train --out runs/tandt --preset paper --culling on
     python -m studies.nvs --scenes scenes/kitchen --out runs/peers --methods elastic 3dgs 2dgs
     """
@@ -34,15 +35,15 @@ class Nvs(Study):
     Their kind (outdoor if not given) and changes come after a colon: FOLDER:indoor, FOLDER:object,background=white."""
     out: Path
     """Folder for the runs, tables and figures; a grid that was interrupted goes on where it was."""
-    methods: tuple[Method | Peer, ...] = ("elastic", "bilateral", "single-sided")
+    methods: tuple[SoftMethod | Peer, ...] = ("elastic", "bilateral", "single-sided")
     """Which kernels; 3dgs and 2dgs are Gaussian peers, which need gsplat (pip install --group studies) and a GPU."""
     culling: Literal["off", "on", "both"] = "off"
     """Leave out triangles with an inradius below a pixel: the paper's rows were measured with it on."""
     settings: tuple[str, ...] = ("",)
-    """What is compared beside methods: lists of changes such as prune_views=2,start_limit=none; "" is the preset."""
+    """What is compared beside methods: lists of changes such as pruning.views=2,start.limit=none; "" is the preset."""
     seeds: tuple[int, ...] = (0,)
     """Each run is repeated with each of them; tables have the means."""
-    preset: TrainPreset = "quick"
+    preset: Preset = "quick"
     """Settings of all runs."""
     set: str = ""
     """More changes for all runs, such as iterations=1500,width=400."""

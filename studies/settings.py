@@ -16,12 +16,12 @@ class Settings(ObjectStudy):
     """Any settings against each other: for ablations, and to look for better ones."""
 
     EXAMPLES: ClassVar[str] = """
-    python -m studies.settings --meshes data/famous --out runs/rates --settings "" lr_vertices=5e-3 lr_vertices=2e-2
-    python -m studies.settings --meshes data/famous --out runs/colors --preset quick --settings "" colors=vertex
+    python -m studies.settings --meshes data/famous --out runs/rates --settings "" optimizer.lr_vertices=5e-3
+    python -m studies.settings --meshes data/famous --out runs/colors --preset quick --settings "" drawing.colors=vertex
     """
 
     settings: tuple[str, ...]
-    """Each a list of changes such as lr_vertices=5e-3,edge_power=2; "" is the preset itself."""
+    """Each a list of changes such as iterations=900,optimizer.lr_vertices=5e-3; "" is the preset itself."""
 
     @classmethod
     def defaults(cls, arguments: Sequence[str]) -> "Settings":

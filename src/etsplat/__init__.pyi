@@ -24,11 +24,9 @@ from etsplat.ops.rasterize_hard import render_opaque as render_opaque
 from etsplat.report.html import write_report as write_report
 from etsplat.tasks.reconstruct import ReconstructResult as ReconstructResult
 from etsplat.tasks.reconstruct import reconstruct as reconstruct
-from etsplat.tasks.reconstruct_config import PRESETS as PRESETS
 from etsplat.tasks.reconstruct_config import ReconstructConfig as ReconstructConfig
 from etsplat.tasks.train import TrainResult as TrainResult
 from etsplat.tasks.train import train as train
 from etsplat.tasks.train_config import TrainConfig as TrainConfig
-from etsplat.tasks.train_config import train_settings as train_settings
 
 __version__: str

@@ -14,6 +14,7 @@ from etsplat.geometry.measures import bounding_ball
 from etsplat.io.mesh_files import load_mesh
 from etsplat.io.run_directory import RunDirectory, is_run
 from etsplat.model.soup_rendering import render_soup
+from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.render_config import RenderConfig
 from etsplat.tasks.render_soup import draw
 from etsplat.tasks.soup_run import open_run
@@ -56,10 +57,10 @@ def _shape_row(run: RunDirectory) -> list[Any]:
     mesh = load_mesh(run.mesh_path(".ply"))
     center, radius = bounding_ball(mesh.vertices)
     unit = ((mesh.vertices.double() - center) / radius).float()
-    config = run.read_config()["config"]
-    start, start_faces = icosphere(config["start_level"])
+    begin = ReconstructConfig.from_file(run.config_path).start
+    start, start_faces = icosphere(begin.level)
     shapes = [
-        draw_shape(start * min(config["start_radius"], 1.0), start_faces),
+        draw_shape(start * min(begin.radius, 1.0), start_faces),
         draw_shape(unit, mesh.faces),
         draw_shape(unit, mesh.faces, normals=True),
     ]
@@ -71,7 +72,7 @@ def _shape_row(run: RunDirectory) -> list[Any]:
 def _soup_row(run: RunDirectory) -> list[Any]:
     """As the middle test view sees it."""
     opened = open_run(run.path, device="cpu")
-    capture, config = opened.needed_capture(), TrainConfig(**run.read_config()["config"])
+    capture, config = opened.needed_capture(), TrainConfig.from_file(run.config_path)
     if not capture.test:
         raise InputError(f"{run.path}: its capture has no test view to show; name another run")
     number = len(capture.test) // 2

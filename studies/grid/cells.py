@@ -5,7 +5,6 @@ goes on from its last checkpoint. As many processes run as there are cores, each
 thread wastes nothing on waiting for others, so the grid as a whole is fastest that way, though no single run is.
 """
 
-import json
 import multiprocessing
 import os
 import signal
@@ -222,5 +221,4 @@ def is_finished(cell: Cell) -> bool:
     run = RunDirectory(cell.folder)
     if not is_run(cell.folder) or not run.metrics_path.exists():
         return False
-    settings = {name: str(value) if isinstance(value, Path) else value for name, value in vars(cell.config).items()}
-    return run.read_config()["config"] == json.loads(json.dumps(settings))
+    return run.read_config()["config"] == cell.config.to_dict()

@@ -1,15 +1,13 @@
 """What a grid compares: named changes of a preset's settings."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from types import NoneType
-from typing import Any, Literal, get_args, get_origin, get_type_hints
+from typing import Any
 
 from etsplat.core.errors import InputError
 from etsplat.io.paths import kind_of
 from etsplat.tasks.reconstruct_config import METHODS, ReconstructConfig
-from etsplat.tasks.train_config import TrainConfig
 
 LAMBDA_SIGMAS = (1e-3, 1e-4)
 """The two softness weights of the paper's tables."""
@@ -24,7 +22,7 @@ class Variant:
 
     Attributes:
         name: unique within a grid; also the name of a folder.
-        changes: settings that differ from the preset's.
+        changes: settings that differ from the preset's, by their dotted names.
     """
 
     name: str
@@ -32,7 +30,7 @@ class Variant:
 
     def config(self, base: ReconstructConfig, seed: int) -> ReconstructConfig:
         """The settings of a run."""
-        return replace(base, seed=seed, **self.changes)
+        return base.changed({**self.changes, "seed": seed})
 
 
 def method_variants(methods: Sequence[str], lambda_sigmas: Sequence[float]) -> list[Variant]:
@@ -48,61 +46,38 @@ def method_variants(methods: Sequence[str], lambda_sigmas: Sequence[float]) -> l
         if method.startswith("raster"):
             variants.append(Variant(method, {"method": method}))
             continue
-        variants += [Variant(f"{method} {w:g}", {"method": method, "lambda_sigma": w}) for w in lambda_sigmas]
+        variants += [
+            Variant(f"{method} {w:g}", {"method": method, "regularization.lambda_sigma": w}) for w in lambda_sigmas
+        ]
     return variants
 
 
 def regularizer_variants(base: ReconstructConfig) -> list[Variant]:
     """The paper's table reg_ablation: one weight at a time at 0.1, 1 and 10 times its value."""
     variants = [Variant("1x", {})]
-    for name in ("lambda_edge", "lambda_normal", "lambda_laplacian"):
+    for name in ("lambda_edge", "lambda_smooth_normal", "lambda_laplacian"):
         for factor in (0.1, 10.0):
-            variants.append(Variant(f"{factor:g}x {name}", {name: factor * getattr(base, name)}))
+            value = factor * getattr(base.regularization, name)
+            variants.append(Variant(f"{factor:g}x {name}", {f"regularization.{name}": value}))
     return variants
 
 
 def distance_variants(methods: Sequence[str]) -> list[Variant]:
     """Barycentric against signed distance, for each kernel."""
     return [
-        Variant(f"{method} {distance}", {"method": method, "distance": distance})
+        Variant(f"{method} {distance}", {"method": method, "drawing.distance": distance})
         for method in methods
         for distance in ("barycentric", "sdf")
     ]
 
 
 def setting_variants(base: ReconstructConfig, settings: Sequence[str]) -> list[Variant]:
-    """Free ones: each setting is a list of changes such as "lr_vertices=5e-3,colors=vertex"; "" is the preset itself.
+    """Free ones: lists of changes such as "optimizer.lr_vertices=5e-3,drawing.colors=vertex"; "" is the preset itself.
 
     Raises:
         InputError: not a setting, or not a value of its type.
     """
-    return [Variant(setting or "preset", changes_of(base, setting)) for setting in settings]
-
-
-def changes_of(base: ReconstructConfig | TrainConfig, setting: str) -> dict[str, Any]:
-    """What a list such as "iterations=1000,start_limit=none" changes; a value has the type of the one that it replaces.
-
-    Raises:
-        InputError: as `setting_variants`.
-    """
-    changes: dict[str, Any] = {}
-    hints = get_type_hints(type(base))
-    for item in filter(None, setting.split(",")):
-        name, _, text = item.partition("=")
-        if not hasattr(base, name) or not text:
-            raise InputError(f"{item}: is not a setting and its value; write NAME=VALUE,NAME=VALUE")
-        types = get_args(hints[name]) if NoneType in get_args(hints[name]) else (hints[name],)
-        kind = str if get_origin(types[0]) is Literal else types[0]
-        try:
-            if text.lower() == "none" and NoneType in types:
-                changes[name] = None
-            elif kind is bool:
-                changes[name] = {"true": True, "false": False}[text.lower()]
-            else:
-                changes[name] = int(float(text)) if kind is int else kind(text)
-        except (ValueError, KeyError, TypeError) as error:
-            raise InputError(f"{item}: {text} is no value for {name}, which is now {getattr(base, name)}") from error
-    return changes
+    return [Variant(text or "preset", base.read_changes(text)) for text in settings]
 
 
 def find_meshes(folder: Path, objects: Sequence[str]) -> dict[str, Path]:

@@ -9,8 +9,8 @@ from typing import Annotated
 import tyro
 
 from etsplat.cli.command import INTERRUPTED, fail
-from etsplat.tasks.reconstruct_config import PRESETS, Preset, ReconstructConfig
-from studies.grid.variants import Variant, find_meshes, setting_variants
+from etsplat.tasks.reconstruct_config import Preset, ReconstructConfig
+from studies.grid.variants import Variant, find_meshes
 from studies.study import Study
 
 
@@ -50,7 +50,8 @@ class ObjectStudy(Study):
         from studies.grid.live import LiveTable, conclude
 
         jobs = count_jobs(self.jobs)
-        base = setting_variants(PRESETS[self.preset], [self.set])[0].config(PRESETS[self.preset], 0)
+        preset = ReconstructConfig.of(self.preset)
+        base = preset.changed(preset.read_changes(self.set))
         variants = self.variants(base)
         cells = make_cells(find_meshes(self.meshes, self.objects), variants, base, self.seeds, self.out)
         try:

@@ -2,9 +2,10 @@
 
 import importlib
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args
 
 from etsplat.core.errors import InputError
+from etsplat.tasks.settings import Settings
 
 if TYPE_CHECKING:
     import torch
@@ -14,7 +15,7 @@ PEERS: tuple[Peer, ...] = get_args(Peer)
 
 
 @dataclass(frozen=True)
-class PeerConfig:
+class PeerConfig(Settings):
     """3D Gaussian splatting (Kerbl et al. 2023) or 2D Gaussian splatting (Huang et al. 2024), in gsplat.
 
     Learning rates, losses and densification are those of their papers, lengths relative to the scene's extent. What
@@ -22,6 +23,8 @@ class PeerConfig:
     Gaussians that have no time to settle are split again and again. Made by `peer_config`, which knows what differs
     between the two: the values here are those of 3dgs.
     """
+
+    TASK: ClassVar[str] = "peer"
 
     method: Peer
     """Which."""

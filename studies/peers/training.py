@@ -64,7 +64,7 @@ def train_peer(
     capture = own.normalized()
     iterations = limited_iterations(config.iterations, config.max_epochs, len(own.train))
     paths = {"source": path_of(source), "images": images}
-    record = make_record("peer", config, iterations, {"fingerprint": own.fingerprint()}, paths)
+    record = make_record(config, iterations, {"fingerprint": own.fingerprint()}, paths)
     config = replace(config, iterations=iterations)
     place = Place(out, resume, overwrite=not resume)
     fitting = _Fitting(gsplat, capture, config, device)

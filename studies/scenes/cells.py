@@ -9,9 +9,8 @@ from typing import Any
 from etsplat.core.errors import InputError
 from etsplat.io.run_directory import RunDirectory
 from etsplat.tasks.train import DEMO
-from etsplat.tasks.train_config import SCENE_TYPE_NAMES, TrainConfig, train_settings
+from etsplat.tasks.train_config import SCENE_TYPES, TrainConfig
 from studies.grid.cells import AnyConfig, Cell, is_finished
-from studies.grid.variants import changes_of
 from studies.peers.settings import PEERS, Peer, PeerConfig, load_gsplat, peer_config
 from studies.scenes.paper import SCENES
 
@@ -59,14 +58,14 @@ def read_scene_argument(text: str) -> Scene:
     """
     folder, colon, rest = text.rpartition(":")
     scene_type, _, setting = rest.partition(",")
-    if colon and scene_type in SCENE_TYPE_NAMES:
+    if colon and scene_type in SCENE_TYPES:
         scene = Scene(Path(folder), scene_type, setting)
     else:
         scene = Scene(Path(text), None, "")
     if not scene.folder.is_dir() and scene.folder != Path(DEMO):
         raise InputError(
             f"scene {scene.folder}: no such folder; fetch it with `etsplat data download`, or check the path; its kind "
-            f"comes after a colon: one of {', '.join(SCENE_TYPE_NAMES)}"
+            f"comes after a colon: one of {', '.join(SCENE_TYPES)}"
         )
     return scene
 
@@ -113,10 +112,10 @@ def make_nvs_cells(
     cells = []
     for scene, name in zip(scenes, names, strict=True):
         base, images = _settings(scene, preset)
-        base = replace(base, **{**changes_of(base, setting), **changes_of(base, scene.setting)})
+        base = base.changed({**base.read_changes(setting), **base.read_changes(scene.setting)})
         variants: dict[str, AnyConfig] = {
-            " ".join(filter(None, (text, method, CULLED if culled else ""))): replace(
-                base, method=method, **{"cull_small": culled, **changes_of(base, text)}
+            " ".join(filter(None, (text, method, CULLED if culled else ""))): base.changed(
+                {"method": method, "drawing.cull_small": culled, **base.read_changes(text)}
             )
             for text in settings
             for culled in culling
@@ -173,8 +172,8 @@ def evaluate_cells(
 def _settings(scene: Scene, preset: str) -> tuple[TrainConfig, str | None]:
     known = SCENES.get(scene.name) if preset == "paper" else None
     if known is None or scene.scene_type is not None:
-        return train_settings(preset, scene.scene_type or "outdoor"), None
-    config = replace(train_settings(preset, known.scene_type), max_triangles=known.max_triangles)
+        return TrainConfig.of(preset, scene.scene_type or "outdoor"), None
+    config = replace(TrainConfig.of(preset, known.scene_type), max_triangles=known.max_triangles)
     return config, known.images if (scene.folder / known.images).is_dir() else None
 
 
@@ -184,8 +183,8 @@ def _peer(peer: Peer, base: TrainConfig) -> PeerConfig:
     return peer_config(
         peer,
         iterations=base.iterations,
-        max_epochs=base.max_epochs,
-        schedule_length=base.schedule_length,
+        max_epochs=base.schedule.max_epochs,
+        schedule_length=base.schedule.length,
         width=base.width,
         background="white" if base.background == "white" else "black",
         seed=base.seed,

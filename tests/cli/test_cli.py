@@ -18,12 +18,12 @@ from etsplat.cli.command import Command, resume_line
 from etsplat.cli.doctor import Doctor
 from etsplat.cli.main import main
 from etsplat.cli.parse import COMMANDS, Group, parse
-from etsplat.cli.reconstruct import Demo, Reconstruct
+from etsplat.cli.reconstruct import DemoObject, Reconstruct
 from etsplat.cli.train import Train
 from etsplat.core.errors import InputError
 from etsplat.geometry.icosphere import icosphere
 from etsplat.io.mesh_files import save_mesh
-from etsplat.tasks.reconstruct_config import PRESETS, ReconstructConfig
+from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.train_config import TrainConfig
 
 PROGRAM = [sys.executable, "-c", "from etsplat.cli import main; main()"]
@@ -98,9 +98,9 @@ def _commands(entries: Mapping[str, type[Command] | Group]) -> Iterator[type[Com
 
 def test_help_of_a_command_teaches(etsplat: Run) -> None:
     """Each setting is an option with its help and the preset's default, and there are examples."""
-    result = etsplat("reconstruct", "--help", "--preset", "paper")
+    result = etsplat("reconstruct", "--help-all", "--preset", "paper")
     assert result.returncode == 0
-    for word in ("--lambda-sigma", "--max-faces", "30000)", "--resume", "Examples:"):
+    for word in ("--regularization.lambda-sigma", "--max-faces", "30000)", "--resume", "Examples:"):
         assert word in result.stdout
 
 
@@ -166,13 +166,13 @@ def test_preset_sets_the_defaults_and_options_change_them() -> None:
     command = parse(["reconstruct", "a.ply", "--out", "b", "--preset=paper", "--iterations", "7", "--engine", "cpu"])
     assert isinstance(command, Reconstruct)
     assert (command.settings.iterations, command.settings.engine) == (7, "cpu")
-    assert command.settings.resolution == PRESETS["paper"].resolution
+    assert command.settings.resolution == ReconstructConfig.paper().resolution
     demo = parse(["demo"])
-    assert isinstance(demo, Demo)
-    assert demo.settings == PRESETS["demo"]
+    assert isinstance(demo, DemoObject)
+    assert demo.settings == ReconstructConfig.demo()
     best = parse(["reconstruct", "a.ply", "--out", "b"])
     assert isinstance(best, Reconstruct)
-    assert best.settings == PRESETS["best"]
+    assert best.settings == ReconstructConfig.best()
 
 
 @pytest.mark.parametrize(
@@ -288,7 +288,7 @@ def test_interrupted_run_says_how_to_resume_and_resumes(
     """Ctrl-C ends with status 130 and the command that continues; that command finishes the run. So does SIGTERM."""
     run = tmp_path / "run"
     options = ["reconstruct", str(sphere), "--out", str(run), "--preset", "tiny", "--iterations", "1500"]
-    options += ["--max-faces", "400", "--checkpoint-every", "0"]
+    options += ["--max-faces", "400", "--output.checkpoint-every", "0"]
     process = subprocess.Popen([*PROGRAM, *options], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
     history = run / "history.jsonl"
     deadline = time.monotonic() + 60

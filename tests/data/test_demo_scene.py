@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from etsplat.cli.parse import parse
-from etsplat.cli.reconstruct import Demo
+from etsplat.cli.reconstruct import DemoObject
 from etsplat.cli.train import DemoScene, Train
 from etsplat.data.dataset import Dataset
 from etsplat.data.demo_scene import demo_scene
@@ -46,10 +46,12 @@ def test_the_scene_is_deterministic(capture):
 
 def test_demo_with_and_without_scene_are_two_commands():
     """Each has its own options; presets and kinds of scenes set the defaults of the others."""
-    assert isinstance(parse(["demo"]), Demo)
+    assert isinstance(parse(["demo"]), DemoObject)
     scene = parse(["demo", "scene", "--method", "bilateral"])
     assert isinstance(scene, DemoScene)
     assert scene.settings.method == "bilateral"
-    train = parse(["train", "photos", "--out", "run", "--preset", "paper", "--scene-type=indoor", "--lr-sigma", "0.1"])
+    words = ["train", "photos", "--out", "run", "--preset", "paper", "--scene-type=indoor"]
+    train = parse([*words, "--optimizer.lr-sigma", "0.1"])
     assert isinstance(train, Train)
-    assert (train.settings.lambda_dssim, train.settings.lr_sigma, train.settings.iterations) == (0.4, 0.1, 30_000)
+    settings = train.settings
+    assert (settings.loss.lambda_dssim, settings.optimizer.lr_sigma, settings.iterations) == (0.4, 0.1, 30_000)

@@ -32,8 +32,8 @@ from etsplat.report.curves import (
 )
 from etsplat.report.data import read_run
 from etsplat.report.plots import ShortNumbers
-from etsplat.tasks.reconstruct_config import PRESETS
-from etsplat.tasks.train_config import train_settings
+from etsplat.tasks.reconstruct_config import ReconstructConfig
+from etsplat.tasks.train_config import TrainConfig
 
 METRICS = {
     "chamfer": 6.4e-5,
@@ -62,7 +62,7 @@ METRICS = {
 
 CONFIG = {
     "task": "reconstruct",
-    "config": vars(replace(PRESETS["quick"], iterations=3000, method="bilateral")),
+    "config": replace(ReconstructConfig.quick(), iterations=3000, method="bilateral").to_dict(),
     "source": {"fingerprint": "0123456789abcdef", "init_mesh": None},
     "paths": {"source": "meshes/bunny <&> co.ply", "init_mesh": None},
     "versions": {"etsplat": version("etsplat"), "torch": "2.13.0"},
@@ -265,7 +265,7 @@ def write_soup_run(folder: Path) -> Path:
     """A finished run of `etsplat train`, with grey pictures."""
     config = {
         "task": "train",
-        "config": vars(replace(train_settings("quick", "indoor"), iterations=500)),
+        "config": replace(TrainConfig.quick("indoor"), iterations=500).to_dict(),
         "source": {"fingerprint": "0123456789abcdef"},
         "paths": {"source": "scenes/my kitchen", "images": "images_2", "masks": None},
         "versions": {"etsplat": version("etsplat"), "torch": "2.13.0"},

@@ -1,6 +1,5 @@
 """The paper's explanatory figures: they are drawn, and what they show is what the kernels are."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,9 +7,9 @@ import pytest
 
 from etsplat.core.errors import InputError
 from etsplat.tasks.reconstruct import reconstruct
-from etsplat.tasks.reconstruct_config import PRESETS
+from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.train import train
-from etsplat.tasks.train_config import train_settings
+from etsplat.tasks.train_config import TrainConfig
 from helpers.captures import write_colmap
 from studies.drawings.dead_zone import pull, remaining_distance
 from studies.drawings.kernels import FIGURES, draw_edges
@@ -51,11 +50,13 @@ def test_wrong_requests_are_input_errors(tmp_path: Path) -> None:
 
 def test_the_teaser_shows_a_mesh_and_a_soup(tmp_path: Path) -> None:
     """A row each, of five pictures that are not blank."""
-    quick = {"checkpoint_every": 0, "evaluate_every": 0}
-    mesh = replace(PRESETS["tiny"], resolution=32, iterations=3, chamfer_samples=1000, **quick)
+    quick = {"output.checkpoint_every": 0, "output.evaluate_every": 0}
+    mesh = ReconstructConfig.tiny().changed(
+        {"resolution": 32, "iterations": 3, "output.chamfer_samples": 1000, **quick}
+    )
     reconstruct("demo:owl", tmp_path / "mesh", mesh)
     write_colmap(tmp_path / "scene", [(48, 36)] * 9)
-    soup = replace(train_settings("tiny"), iterations=3, start_opacity=0.8, **quick)
+    soup = TrainConfig.tiny().changed({"iterations": 3, "start.opacity": 0.8, **quick})
     train(tmp_path / "scene", tmp_path / "soup", soup)
     figure = draw_teaser([tmp_path / "mesh", tmp_path / "soup"])
     pictures = [axis.images[0].get_array() for axis in figure.axes]

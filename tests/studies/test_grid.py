@@ -10,7 +10,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -20,7 +19,7 @@ from etsplat.geometry.icosphere import icosphere
 from etsplat.io.mesh_files import save_mesh
 from etsplat.io.run_directory import RunDirectory
 from etsplat.ops.engines import num_threads
-from etsplat.tasks.reconstruct_config import METHODS, PRESETS
+from etsplat.tasks.reconstruct_config import METHODS, ReconstructConfig
 from studies.famous import Famous
 from studies.grid.cells import Cell, count_jobs, make_cells, run_grid
 from studies.grid.variants import (
@@ -39,7 +38,9 @@ from studies.objects.tables import write_tables
 from studies.study import Study
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-SHORT = replace(PRESETS["tiny"], iterations=30, evaluate_every=10, chamfer_samples=2000)
+SHORT = ReconstructConfig.tiny().changed(
+    {"iterations": 30, "output.evaluate_every": 10, "output.chamfer_samples": 2000}
+)
 VARIANTS = [Variant("elastic", {}), Variant("raster-face", {"method": "raster-face"})]
 
 
@@ -81,11 +82,11 @@ from pathlib import Path
 
 from studies.grid.cells import make_cells, run_grid
 from studies.grid.variants import Variant
-from etsplat.tasks.reconstruct_config import PRESETS
+from etsplat.tasks.reconstruct_config import ReconstructConfig
 
 if __name__ == "__main__":
     signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored where the tests run in a shell's background
-    config = replace(PRESETS["tiny"], iterations=1_000_000, checkpoint_every=0)
+    config = ReconstructConfig.tiny().changed({"iterations": 1_000_000, "output.checkpoint_every": 0})
     cells = make_cells({"ball": Path("demo:owl")}, [Variant("long", {})], config, [0], Path())
     run_grid(cells, 1, lambda: print(cells[0]._process.pid, flush=True))
 """
@@ -140,7 +141,7 @@ def test_a_run_whose_folder_is_removed_fails_in_one_line(
     sphere: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """Its worker has nowhere to write what went wrong, and says it on standard error."""
-    config = replace(SHORT, checkpoint_every=1, iterations=1_000_000)
+    config = SHORT.changed({"output.checkpoint_every": 1, "iterations": 1_000_000})
     cells = make_cells({"ball": sphere}, VARIANTS[:1], config, [0], tmp_path / "out")
 
     def remove() -> None:
@@ -197,7 +198,7 @@ def test_finished_runs_are_not_repeated(grid: tuple[Path, list[Cell]]) -> None:
     folder, _ = grid
     meshes = find_meshes(folder, ["ball"])
     assert [cell.state for cell in make_cells(meshes, VARIANTS, SHORT, [0], folder / "out")] == ["done", "done"]
-    other = make_cells(meshes, VARIANTS, replace(SHORT, lr_colors=0.5), [0], folder / "out")
+    other = make_cells(meshes, VARIANTS, SHORT.changed({"optimizer.lr_colors": 0.5}), [0], folder / "out")
     assert [cell.state for cell in other] == ["waiting", "waiting"]
 
 
@@ -255,23 +256,29 @@ def test_the_variants_are_the_papers_rows() -> None:
     """Six methods at two weights make the eight columns of famous_cd; regularizers change one weight at a time."""
     names = [variant.name for variant in method_variants(METHODS, (1e-3, 1e-4))]
     assert set(names) == set(paper.COLUMNS)
-    base = PRESETS["study"]
-    weights = ("lambda_edge", "lambda_normal", "lambda_laplacian")
+    base = ReconstructConfig.study()
+    weights = ("lambda_edge", "lambda_smooth_normal", "lambda_laplacian")
     for variant in regularizer_variants(base):
         config = variant.config(base, seed=3)
-        assert sum(getattr(config, name) != getattr(base, name) for name in weights) == (variant.name != "1x")
+        ours, before = config.regularization, base.regularization
+        assert sum(getattr(ours, name) != getattr(before, name) for name in weights) == (variant.name != "1x")
         assert config.seed == 3
-    assert {variant.config(base, 0).distance for variant in distance_variants(["elastic"])} == {"barycentric", "sdf"}
-    changed = setting_variants(base, ["", "lr_vertices=5e-3,max_faces=2e4,colors=vertex"])[1].config(base, 0)
-    assert (changed.lr_vertices, changed.max_faces, changed.colors) == (5e-3, 20_000, "vertex")
+    assert {variant.config(base, 0).drawing.distance for variant in distance_variants(["elastic"])} == {
+        "barycentric",
+        "sdf",
+    }
+    changed = setting_variants(base, ["", "optimizer.lr_vertices=5e-3,max_faces=2e4,drawing.colors=vertex"])[1].config(
+        base, 0
+    )
+    assert (changed.optimizer.lr_vertices, changed.max_faces, changed.drawing.colors) == (5e-3, 20_000, "vertex")
 
 
 def test_wrong_requests_are_input_errors(tmp_path: Path) -> None:
     """Unknown methods, settings, values, meshes and folders are named."""
-    base = PRESETS["study"]
-    for setting, message in (("colour=red", "colour=red"), ("lr_vertices=fast", "fast"), ("seed", "NAME=VALUE")):
+    base = ReconstructConfig.study()
+    for setting, message in (("hue=red", "hue"), ("optimizer.lr_vertices=fast", "fast"), ("seed", "NAME=VALUE")):
         with pytest.raises(InputError, match=message):
-            setting_variants(base, [setting])
+            setting_variants(base, [setting])[0].config(base, 0)
     with pytest.raises(InputError, match="gaussian"):
         method_variants(["gaussian"], [1e-3])
     with pytest.raises(InputError, match="data download famous"):

@@ -21,7 +21,7 @@ def row(scene, variant, psnr, **numbers):
 
 
 def cells_of(folder, **options):
-    settings = {"preset": "tiny", "culling": (False, True), "setting": "iterations=6,max_epochs=2"}
+    settings = {"preset": "tiny", "culling": (False, True), "setting": "iterations=6,schedule.max_epochs=2"}
     scene = read_scene_argument(f"{folder / 'toy'}:indoor,background=white")
     return make_nvs_cells([scene], ["elastic"], folder / "out", **{**settings, **options})
 
@@ -49,7 +49,7 @@ def test_a_grid_runs_is_measured_and_goes_on_where_it_was(tmp_path):
 
 
 def test_settings_and_seeds_multiply_the_runs_of_our_methods(tmp_path):
-    scene = read_scene_argument("demo:scene:indoor,start_limit=0.3")
+    scene = read_scene_argument("demo:scene:indoor,start.limit=0.3")
     cells = make_nvs_cells(
         [scene],
         ["elastic"],
@@ -57,20 +57,25 @@ def test_settings_and_seeds_multiply_the_runs_of_our_methods(tmp_path):
         preset="quick",
         culling=(False,),
         setting="width=40",
-        settings=("", "start_limit=none,cull_small=true"),
+        settings=("", "start.limit=none,drawing.cull_small=true"),
         seeds=(0, 1),
     )
-    names = ["elastic", "start_limit=none,cull_small=true elastic"]
+    names = ["elastic", "start.limit=none,drawing.cull_small=true elastic"]
     assert [(cell.object, cell.variant, cell.config.seed) for cell in cells] == [
         ("demo", variant, seed) for seed in (0, 1) for variant in names
     ]
     assert len({cell.folder for cell in cells}) == 4
-    limits = [cell.config.start_limit for cell in cells if isinstance(cell.config, TrainConfig)]
+    limits = [cell.config.start.limit for cell in cells if isinstance(cell.config, TrainConfig)]
     assert limits == [0.3, None, 0.3, None]
-    assert [getattr(cell.config, "cull_small", None) for cell in cells] == [False, True, False, True]
-    with pytest.raises(InputError, match=r"settings: 'sh_degree=1' is named twice"):
+    assert [cell.config.drawing.cull_small for cell in cells if isinstance(cell.config, TrainConfig)] == [
+        False,
+        True,
+        False,
+        True,
+    ]
+    with pytest.raises(InputError, match=r"settings: 'seed=1' is named twice"):
         make_nvs_cells(
-            [scene], ["elastic"], tmp_path, preset="quick", culling=(False,), setting="", settings=["sh_degree=1"] * 2
+            [scene], ["elastic"], tmp_path, preset="quick", culling=(False,), setting="", settings=["seed=1"] * 2
         )
 
 
@@ -145,7 +150,7 @@ def test_the_papers_scenes_get_their_settings_with_preset_paper(tmp_path):
     cell = make_nvs_cells([garden], ["single-sided"], tmp_path / "out", preset="paper", culling=(True,), setting="")[0]
     assert isinstance(cell.config, TrainConfig)
     assert (cell.config.max_triangles, cell.config.scene_type, cell.images) == (5_200_000, "outdoor", "images_4")
-    assert cell.config.cull_small
+    assert cell.config.drawing.cull_small
     assert {scene.dataset for scene in SCENES.values()} == {"Mip-NeRF 360", "Tanks and Temples", "Deep Blending"}
 
 

@@ -2,7 +2,6 @@
 
 import csv
 import json
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,7 @@ import pytest
 from etsplat.ops.engines import num_threads, set_num_threads
 from etsplat.tasks.evaluate_soup import evaluate_run
 from etsplat.tasks.reconstruct import reconstruct
-from etsplat.tasks.reconstruct_config import PRESETS
+from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.soup_run import open_run
 from etsplat.tasks.train import train
 from studies.distance import Distance
@@ -27,7 +26,9 @@ from studies.scenes.tables import write_nvs_tables
 from studies.settings import Settings
 
 OBJECT = "goathead"
-SMALL = replace(PRESETS["tiny"], iterations=150, evaluate_every=50, chamfer_samples=5000)
+SMALL = ReconstructConfig.tiny().changed(
+    {"iterations": 150, "output.evaluate_every": 50, "output.chamfer_samples": 5000}
+)
 SECONDS = {"seconds", "fps", "ms_per_million"}
 """What no two runs have in common."""
 
@@ -39,7 +40,7 @@ TABLES = {
     ),
     "regularizers": (Regularizers(**NOWHERE), ["0.1x lambda_edge"]),
     "distance": (Distance(**NOWHERE), ["elastic sdf"]),
-    "settings": (Settings(**NOWHERE, settings=("", "colors=vertex")), ["colors=vertex"]),
+    "settings": (Settings(**NOWHERE, settings=("", "drawing.colors=vertex")), ["drawing.colors=vertex"]),
 }
 """A command, and which of its variants are run."""
 

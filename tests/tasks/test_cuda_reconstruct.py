@@ -15,7 +15,7 @@ from etsplat.data.photograph import photograph
 from etsplat.optim.loop import Progress
 from etsplat.tasks.mesh_fitting import MeshFitting
 from etsplat.tasks.reconstruct import reconstruct
-from etsplat.tasks.reconstruct_config import PRESETS, ReconstructConfig
+from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.sources import make_start
 from helpers.simt.build import Simt
 from helpers.simt.calls import Calls
@@ -23,20 +23,22 @@ from helpers.simt.room import room_for_16_pairs, second_step_overflows
 
 CPU = torch.device("cpu")
 # 320 faces, subdivided after iterations 2 and 5.
-CONFIG = replace(
-    PRESETS["tiny"],
-    resolution=32,
-    iterations=6,
-    max_faces=500,
-    subdivide_from=0.3,
-    subdivide_until=0.8,
-    subdivide_steps=2,
-    gamma_hold=2,
-    log_every=4,
-    evaluate_every=0,
-    checkpoint_every=4,
-    chamfer_samples=500,
+CONFIG = ReconstructConfig.tiny().changed(
+    {
+        "resolution": 32,
+        "iterations": 6,
+        "max_faces": 500,
+        "refinement.first": 0.3,
+        "refinement.last": 0.8,
+        "refinement.subdivisions": 2,
+        "regularization.hold": 2,
+        "output.log_every": 4,
+        "output.evaluate_every": 0,
+        "output.checkpoint_every": 4,
+        "output.chamfer_samples": 500,
+    }
 )
+UNREFINED = {"refinement.first": 0.1, "refinement.subdivisions": 0}
 
 
 @pytest.fixture(scope="module")
@@ -62,17 +64,23 @@ def run(problem: MeshFitting, last: int) -> list[float]:
     "settings",
     [
         {"method": "elastic"},
-        {"method": "single-sided", "colors": "vertex"},
-        {"method": "raster-face", "start_sigma": 0.5},
-        {"coarse_levels": 1, "coarse_until": 0.6, "views_per_step": 2, "sigma_final": 0.2, "untangle_steps": 2},
-        {"vertex_update": "large-steps"},
+        {"method": "single-sided", "drawing.colors": "vertex"},
+        {"method": "raster-face"},
+        {
+            "pictures.coarse_levels": 1,
+            "pictures.coarse_until": 0.6,
+            "batch": 2,
+            "optimizer.sigma_final": 0.2,
+            "refinement.untanglings": 2,
+        },
+        {"optimizer.vertex_update": "large-steps"},
     ],
     ids=lambda settings: next(iter(settings.values())),
 )
 def test_steps_are_those_of_the_cpu_engine(cuda_device: torch.device, views: Dataset, settings: dict[str, Any]) -> None:
     """Six steps and two subdivisions: the same faces, losses and parameters to rounding; Adam divides small gradients
     by small ones, so one parameter in a hundred may differ by more."""
-    config = replace(CONFIG, **settings)
+    config = CONFIG.changed(settings)
     on_device, on_cpu = fitting(views, "cuda", config, cuda_device), fitting(views, "cpu", config)
     assert run(on_device, 6) == pytest.approx(run(on_cpu, 6), rel=1e-5)
     assert on_device.count == on_cpu.count > 320
@@ -84,7 +92,7 @@ def test_steps_are_those_of_the_cpu_engine(cuda_device: torch.device, views: Dat
 
 def test_steps_queued_together_are_the_steps_one_by_one(cuda_device: torch.device, views: Dataset) -> None:
     """The same bits, however many steps are queued before the host looks, and though room runs out on the way."""
-    config = replace(CONFIG, subdivide_steps=0)
+    config = CONFIG.changed(UNREFINED)
     together, one_by_one = (fitting(views, "cuda", config, cuda_device) for _ in range(2))
     losses = together.advance(1, 1)
     with room_for_16_pairs() as repairs:
@@ -97,7 +105,7 @@ def test_steps_queued_together_are_the_steps_one_by_one(cuda_device: torch.devic
 
 def test_replayed_steps_are_those_that_are_called(cuda_device: torch.device, views: Dataset, monkeypatch) -> None:
     """The same bits with graphs and without: all that changes from step to step is in device memory."""
-    config = replace(CONFIG, iterations=9, subdivide_steps=0, sigma_final=0.2, views_per_step=2)
+    config = CONFIG.changed({**UNREFINED, "iterations": 9, "optimizer.sigma_final": 0.2, "batch": 2})
     replayed, called = (fitting(views, "cuda", config, cuda_device) for _ in range(2))
     losses = run(replayed, 9)
     monkeypatch.setattr(Repeated, "__call__", lambda self: self._body())

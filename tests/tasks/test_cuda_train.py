@@ -17,19 +17,20 @@ from etsplat.model.soup_init import StartPoints, start_soup
 from etsplat.optim.loop import Progress
 from etsplat.tasks.soup_fitting import SoupFitting
 from etsplat.tasks.train import train
-from etsplat.tasks.train_config import TrainConfig, train_settings
+from etsplat.tasks.train_config import TrainConfig
 from helpers.simt.build import Simt
 from helpers.simt.calls import Calls
 from helpers.simt.room import room_for_16_pairs, second_step_overflows
 
 # Densified after iteration 3; the degree rises after iteration 4.
-CONFIG = replace(
-    train_settings("tiny"),
-    iterations=6,
-    lr_vertices_length=None,  # so that the steps of a few iterations are no larger than those of many
-    densify_every=15_000,
-    densify_from=0,
-    sh_every=20_000,
+CONFIG = TrainConfig.tiny().changed(
+    {
+        "iterations": 6,
+        "optimizer.lr_vertices_length": None,  # so that the steps of a few iterations are no larger than those of many
+        "densification.every": 15_000,
+        "densification.begin": 0,
+        "schedule.sh_every": 20_000,
+    }
 )
 CPU = torch.device("cpu")
 
@@ -81,8 +82,13 @@ def same_bits(first: SoupFitting, second: SoupFitting) -> None:
     "settings",
     [
         {},
-        {"finish": "opaque", "cull_small": True},
-        {"lambda_normal": 0.05, "lambda_distortion": 0.1, "lambda_size": 1e-6, "regularize_from": 10_000},
+        {"finish": "opaque", "drawing.cull_small": True},
+        {
+            "loss.lambda_depth_normal": 0.05,
+            "loss.lambda_distortion": 0.1,
+            "loss.lambda_size": 1e-6,
+            "loss.regularize_from": 10_000,
+        },
         {"method": "single-sided", "background": "random"},
     ],
     ids=["plain", "finish", "paper", "single-sided"],
@@ -90,7 +96,7 @@ def same_bits(first: SoupFitting, second: SoupFitting) -> None:
 def test_steps_are_those_of_the_cpu_engine(cuda_device: torch.device, capture: Dataset, settings: Any) -> None:
     """Three steps: the same losses, and statistics and parameters to rounding but for a few triangles, where Adam
     divided small gradients by small ones; then a densification and three more."""
-    config = replace(CONFIG, **settings)
+    config = CONFIG.changed(settings)
     on_device, on_cpu = fitting(capture, "cuda", cuda_device, config), fitting(capture, "cpu", CPU, config)
     before = on_cpu.count
     losses, expected = ([loss for i in (1, 2, 3) for loss in p.advance(i, i)] for p in (on_device, on_cpu))
@@ -109,7 +115,7 @@ def test_steps_are_those_of_the_cpu_engine(cuda_device: torch.device, capture: D
 
 def test_steps_queued_together_are_the_steps_one_by_one(cuda_device: torch.device) -> None:
     """The same bits, however many steps are queued before the host looks, and though room runs out on the way."""
-    capture, config = demo_scene(40, 32), replace(CONFIG, densify_from=25_000)
+    capture, config = demo_scene(40, 32), CONFIG.changed({"densification.begin": 25_000})
     together, one_by_one = (fitting(capture, "cuda", cuda_device, config) for _ in range(2))
     losses = together.advance(1, 1)
     with room_for_16_pairs() as repairs:
@@ -123,7 +129,15 @@ def test_steps_queued_together_are_the_steps_one_by_one(cuda_device: torch.devic
 def test_replayed_steps_are_those_that_are_called(cuda_device: torch.device, monkeypatch) -> None:
     """The same bits with graphs and without: all that changes from step to step is in device memory."""
     capture, changing = demo_scene(40, 32), {"finish": "opaque", "background": "random"}
-    config = replace(CONFIG, iterations=9, densify_every=30_000, lambda_normal=0.1, regularize_from=0, **changing)
+    config = CONFIG.changed(
+        {
+            "iterations": 9,
+            "densification.every": 30_000,
+            "loss.lambda_depth_normal": 0.1,
+            "loss.regularize_from": 0,
+            **changing,
+        }
+    )
     replayed = fitting(capture, "cuda", cuda_device, config)
     losses = run(replayed, 9, together=9)
     monkeypatch.setattr(Repeated, "__call__", lambda self: self._body())
@@ -141,14 +155,20 @@ def test_streamed_photos_give_the_same_bits(cuda_device: torch.device, capture: 
     same_bits(streamed, kept)
 
 
-PAPER = {"cull_small": True, "lambda_normal": 0.1, "lambda_distortion": 0.1, "lambda_size": 1e-6, "regularize_from": 0}
+PAPER = {
+    "drawing.cull_small": True,
+    "loss.lambda_depth_normal": 0.1,
+    "loss.lambda_distortion": 0.1,
+    "loss.lambda_size": 1e-6,
+    "loss.regularize_from": 0,
+}
 
 
 @pytest.mark.parametrize(("settings", "own", "kernels"), [({}, 25, 17), (PAPER, 37, 34)], ids=["quick", "paper"])
 def test_a_queued_step_reads_nothing_back(simt: Simt, settings: Any, own: int, kernels: int) -> None:
     """Nothing in a step waits for the device, but for the rasterizer's look at its room outside of captured graphs; and
     few small kernels of torch are left."""
-    problem = fitting(demo_scene(40, 32), "cuda", config=replace(CONFIG, **settings))
+    problem = fitting(demo_scene(40, 32), "cuda", config=CONFIG.changed(settings))
     problem.advance(1, 1)  # fills caches
     assert problem._queue is not None
     kind = next(iter(problem._queue._repeated))
@@ -210,7 +230,7 @@ def test_a_whole_run_leaves_its_directory(cuda_device: torch.device, tmp_path: P
         point_colors=capture.point_colors[::400],
         test=capture.test[:1],
     )
-    result = train(few, tmp_path / "run", replace(CONFIG, engine="cuda", iterations=2, sky_dome=False))
+    result = train(few, tmp_path / "run", replace(CONFIG, engine="cuda", iterations=2, sky="none"))
     assert result.metrics["engine"] == "cuda"
     assert result.metrics["psnr"] > 5
     assert result.soup.vertices.device.type == "cpu"

@@ -1,7 +1,6 @@
 """What comes after training finds the run's soup and the very photos that it was trained on."""
 
 import shutil
-from dataclasses import replace
 
 import pytest
 import torch
@@ -15,7 +14,7 @@ from etsplat.optim.loop import CheckpointEvent
 from etsplat.tasks.evaluate_soup import evaluate_run
 from etsplat.tasks.soup_run import open_run
 from etsplat.tasks.train import train
-from etsplat.tasks.train_config import train_settings
+from etsplat.tasks.train_config import TrainConfig
 from helpers.captures import write_colmap, write_photo
 
 
@@ -26,7 +25,9 @@ def trained(tmp_path_factory):
     write_colmap(folder / "scene", [(64, 48)] * 9)
     for index in range(9):
         write_photo(folder / "scene" / "images_2" / f"{index:04d}.jpg", 32, 24, seed=index)
-    config = replace(train_settings("tiny"), iterations=20, checkpoint_every=10, evaluate_every=0, log_every=10)
+    config = TrainConfig.tiny().changed(
+        {"iterations": 20, "output.checkpoint_every": 10, "output.evaluate_every": 0, "output.log_every": 10}
+    )
     seen = []
 
     def look(event):

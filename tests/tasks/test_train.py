@@ -1,6 +1,5 @@
 """A small soup from photos: it fits, it resumes to the bit, and it says what is wrong."""
 
-import json
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
@@ -20,10 +19,20 @@ from etsplat.tasks.running import NoteEvent
 from etsplat.tasks.soup_fitting import SoupFitting
 from etsplat.tasks.soup_schedule import SoupSchedule
 from etsplat.tasks.train import TrainResult, predicted_bytes, start_fitting, train
-from etsplat.tasks.train_config import PRESET_NAMES, TrainConfig, train_settings
+from etsplat.tasks.train_config import TrainConfig
 
-TINY = replace(train_settings("tiny"), iterations=120, log_every=10, checkpoint_every=30, evaluate_every=60)
-SHORT = replace(TINY, iterations=40, checkpoint_every=10, max_triangles=600, densify_every=3000, sh_every=3000)
+TINY = TrainConfig.tiny().changed(
+    {"iterations": 120, "output.log_every": 10, "output.checkpoint_every": 30, "output.evaluate_every": 60}
+)
+SHORT = TINY.changed(
+    {
+        "iterations": 40,
+        "output.checkpoint_every": 10,
+        "max_triangles": 600,
+        "densification.every": 3000,
+        "schedule.sh_every": 3000,
+    }
+)
 
 
 @pytest.fixture(scope="module")
@@ -105,18 +114,19 @@ def test_a_killed_run_ends_with_the_same_bits(capture: Dataset, tmp_path: Path, 
 @pytest.mark.parametrize("scene_type", ["indoor", "object"])
 def test_other_kernels_and_scenes_fit_too(capture: Dataset, tmp_path: Path, method: str, scene_type: str) -> None:
     """All five losses of the paper's settings go down with every kernel, with small triangles left out."""
-    paper = train_settings("paper", scene_type)
-    config = replace(
-        SHORT,
-        method=method,
-        scene_type=scene_type,
-        cull_small=True,
-        normalize=False,
-        regularize_from=10,
-        lambda_normal=paper.lambda_normal,
-        lambda_distortion=paper.lambda_distortion,
-        lambda_size=paper.lambda_size,
-        background="random",
+    paper = TrainConfig.of("paper", scene_type).loss
+    config = SHORT.changed(
+        {
+            "method": method,
+            "scene_type": scene_type,
+            "drawing.cull_small": True,
+            "normalize": False,
+            "loss.regularize_from": 10,
+            "loss.lambda_depth_normal": paper.lambda_depth_normal,
+            "loss.lambda_distortion": paper.lambda_distortion,
+            "loss.lambda_size": paper.lambda_size,
+            "background": "random",
+        }
     )
     events: list[object] = []
     train(capture, tmp_path / "run", config, callbacks=[events.append])
@@ -157,7 +167,7 @@ def test_a_capture_without_points_starts_at_random(capture: Dataset, tmp_path: P
     """Random triangles where the cameras look, and a note about it."""
     bare = replace(capture, exact_points=None, point_colors=None)
     notes: list[object] = []
-    result = train(bare, tmp_path / "run", replace(SHORT, start_points=300), callbacks=[notes.append])
+    result = train(bare, tmp_path / "run", SHORT.changed({"start.points": 300}), callbacks=[notes.append])
     assert result.metrics["triangles"] > 100
     assert any("no points" in getattr(note, "text", "") for note in notes)
 
@@ -200,39 +210,21 @@ def test_a_run_that_fails_for_its_scale_says_how_to_scale_it(capture: Dataset, t
         train(small, tmp_path / "run", replace(SHORT, normalize=False))
 
 
-def test_presets_are_consistent() -> None:
-    """Every preset exists for every kind of scene; paper has the original's numbers; wrong names are refused."""
-    for preset in PRESET_NAMES:
-        assert train_settings(preset, "indoor").preset == preset
-    paper = train_settings("paper")
-    assert paper == TrainConfig()
-    assert (paper.lr_vertices, paper.lambda_dssim, paper.densify_until) == (0.0018, 0.2, 25_000)
-    indoor = train_settings("paper", "indoor")
-    assert (indoor.lr_vertices, indoor.lambda_dssim, indoor.lambda_distortion) == (0.0015, 0.4, 1.0)
-    assert not train_settings("paper", "object").sky_dome
-    assert (train_settings("paper", "object").lr_vertices, paper.lambda_opacity) == (0.0018, 0.0055)
-    for preset in ("quick", "demo", "tiny"):
-        assert train_settings(preset, "object").lr_vertices < train_settings(preset, "indoor").lr_vertices / 3
-    with pytest.raises(InputError, match="scene_type"):
-        train_settings("paper", "underwater")
-    with pytest.raises(InputError, match="growth"):
-        TrainConfig(growth=0.5)
-    assert json.dumps(vars(paper))
-
-
 def test_shorter_runs_move_vertices_faster() -> None:
     """By the root of how much shorter they are; the original's rate does not know the length of a run."""
-    quick, paper = train_settings("quick"), train_settings("paper")
+    quick, paper = TrainConfig.quick(), TrainConfig.paper()
     for iterations, factor in ((6000, 1.0), (1500, 2.0)):
         first = SoupSchedule(replace(quick, iterations=iterations), squared=False).rates(1)
-        assert first["vertices"] == pytest.approx(factor * quick.lr_vertices)
-    assert SoupSchedule(replace(paper, iterations=300), squared=False).rates(1)["vertices"] == paper.lr_vertices
+        assert first["vertices"] == pytest.approx(factor * quick.optimizer.lr_vertices)
+    assert (
+        SoupSchedule(replace(paper, iterations=300), squared=False).rates(1)["vertices"] == paper.optimizer.lr_vertices
+    )
 
 
 def test_rates_settle_towards_the_end() -> None:
     """With `lr_settle` colours, opacities and softness come to rest like the vertices; the original's never do."""
-    paper = replace(train_settings("paper"), iterations=300)
-    quick = replace(paper, lr_settle=20_000)
+    paper = replace(TrainConfig.paper(), iterations=300)
+    quick = paper.changed({"optimizer.lr_settle": 20_000})
     for config, ratio, last in ((paper, 1.0, 1.0), (quick, 0.1**0.5, 0.1)):
         schedule = SoupSchedule(config, squared=False)
         first = schedule.rates(1)
@@ -240,26 +232,28 @@ def test_rates_settle_towards_the_end() -> None:
             assert schedule.rates(200)[name] == first[name]
             assert schedule.rates(250)[name] == pytest.approx(ratio * first[name])
             assert schedule.rates(300)[name] == pytest.approx(last * first[name])
-        assert schedule.rates(300)["vertices"] == pytest.approx(paper.lr_vertices_final * first["vertices"])
+        assert schedule.rates(300)["vertices"] == pytest.approx(paper.optimizer.lr_vertices_final * first["vertices"])
 
 
 def test_an_opaque_finish_removes_only_what_is_hidden() -> None:
     """The threshold of soft soups would take away too much of it; a lower one stays as it is."""
     for finish, asked, least in (("none", 0.022, 0.022), ("opaque", 0.022, 0.005), ("opaque", 0.001, 0.001)):
-        config = replace(TrainConfig(), finish=finish, prune_importance=asked)
+        config = TrainConfig().changed({"finish": finish, "pruning.importance": asked})
         assert SoupSchedule(config, squared=False).least_importance == least
 
 
 def test_an_opaque_finish_replaces_what_it_hides() -> None:
-    for finish, asked, replaces in (("none", False, False), ("none", True, True), ("opaque", False, True)):
-        config = replace(TrainConfig(), finish=finish, replace_dead=asked)
+    for finish, asked, replaces in (("none", False, False), ("none", True, True), ("opaque", True, True)):
+        config = TrainConfig().changed({"finish": finish, "densification.replace_dead": asked})
         assert SoupSchedule(config, squared=False).replaces_dead is replaces
 
 
 @pytest.mark.parametrize("replace_dead", [True, False])
 def test_growth_is_of_all_triangles_or_of_those_that_live(capture: Dataset, replace_dead: bool) -> None:
     """Otherwise a soup of which most triangles die in each edit would be made anew each time."""
-    fitting = start_fitting(capture, replace(TINY, max_triangles=10_000, replace_dead=replace_dead), lambda *_: {})
+    fitting = start_fitting(
+        capture, TINY.changed({"max_triangles": 10_000, "densification.replace_dead": replace_dead}), lambda *_: {}
+    )
     for iteration in range(1, len(capture.train)):  # no trial is over: nothing dies but what is made faint here
         fitting.advance(iteration, iteration)
     count, dead = fitting.count, fitting.count // 10
@@ -272,7 +266,7 @@ def test_growth_is_of_all_triangles_or_of_those_that_live(capture: Dataset, repl
 
 def test_few_photos_end_a_run_earlier(capture: Dataset, tmp_path: Path) -> None:
     """With `max_epochs` a run has so many iterations for each training photo, says so, and resumes with that length."""
-    config = replace(SHORT, max_epochs=1)
+    config = SHORT.changed({"schedule.max_epochs": 1})
     steps, events = len(capture.train), list[object]()
     result = train(capture, tmp_path / "run", config, callbacks=[events.append])
     assert result.metrics["iterations"] == steps < config.iterations
@@ -284,7 +278,7 @@ def test_few_photos_end_a_run_earlier(capture: Dataset, tmp_path: Path) -> None:
 
 def test_the_schedule_scales_with_the_length_of_the_run() -> None:
     """At 30,000 iterations it is the original's; at a tenth, everything comes ten times earlier."""
-    assert TrainConfig().at(25_000) == 25_000
-    assert replace(TrainConfig(), iterations=3000).at(25_000) == 2500
-    assert replace(TrainConfig(), iterations=30).at(100) == 1
-    assert TrainConfig().at(0) == 0
+    assert TrainConfig.paper().at(25_000) == 25_000
+    assert replace(TrainConfig.paper(), iterations=3000).at(25_000) == 2500
+    assert replace(TrainConfig.paper(), iterations=30).at(100) == 1
+    assert TrainConfig.paper().at(0) == 0

@@ -6,9 +6,11 @@ import sys
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar, NoReturn, TypeVar
+from typing import ClassVar, NoReturn
 
 import tyro
+
+from etsplat.tasks.settings import AnySettings
 
 FAILED, WRONG_INPUT, INTERRUPTED = 1, 2, 130
 
@@ -43,12 +45,23 @@ class Command(ABC):
         """
 
 
-Settings = TypeVar("Settings")
+def settings_before_options(kind: type[AnySettings], arguments: Sequence[str], **named: str) -> AnySettings:
+    """The settings that options change: those of ``--config FILE``, or of the preset that the arguments name.
 
+    Args:
+        kind: of config.
+        arguments: the command line.
+        named: what a preset is named by, with the values where the arguments have none: ``preset="best"``.
 
-def preset_of(arguments: Sequence[str], presets: dict[str, Settings], default: str) -> Settings:
-    """The settings of the preset that the arguments name: the defaults of all other options depend on it."""
-    return presets.get(option_value(arguments, "--preset") or default, presets[default])  # tyro refuses other names
+    Raises:
+        InputError: the file cannot be used, there is no such preset, or both name one.
+    """
+    given = {}
+    for name in named:
+        if (value := option_value(arguments, f"--{name.replace('_', '-')}")) is not None:
+            given[name] = value
+    path = option_value(arguments, "--config")
+    return kind.based_on(named | given) if path is None else kind.from_file(path, named, given)
 
 
 def option_value(arguments: Sequence[str], option: str) -> str | None:

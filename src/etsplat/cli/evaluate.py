@@ -3,11 +3,12 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import tyro
 
 from etsplat.cli.command import Command
+from etsplat.tasks.settings import Device
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -41,7 +42,7 @@ class Evaluate(Command):
     """Folder for evaluation.json and pictures side by side; by default the run's, whose report is written anew."""
     scene: Path | None = None
     """The capture's folder, if it has moved or a file is given."""
-    device: Literal["cpu", "cuda"] | None = None
+    device: Device | None = None
     """Where it is drawn: cpu, cuda (an NVIDIA GPU), or None for cuda where there is one."""
     lpips_weights: Path | None = None
     """File with LPIPS's weights, or `download`; by default torch's cache is looked into."""

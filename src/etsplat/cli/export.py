@@ -9,6 +9,7 @@ import tyro
 
 from etsplat.cli.command import Command
 from etsplat.tasks.export_config import ExportConfig
+from etsplat.tasks.settings import Device
 
 Settings = Annotated[ExportConfig, tyro.conf.arg(name=""), tyro.conf.OmitArgPrefixes]
 
@@ -36,7 +37,7 @@ class Export(Command):
     """The file to write; by default soup.FORMAT in the run's folder."""
     scene: Path | None = None
     """The capture's folder, if it has moved or a file is given: for colours as the cameras saw them, and for up."""
-    device: Literal["cpu", "cuda"] | None = None
+    device: Device | None = None
     """Where it is drawn: cpu, cuda (an NVIDIA GPU), or None for cuda where there is one."""
     settings: Settings = field(default_factory=ExportConfig)
 

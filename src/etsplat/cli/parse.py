@@ -2,8 +2,8 @@
 
 import inspect
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, make_dataclass
-from typing import Annotated, Any, Union
+from dataclasses import dataclass, fields, is_dataclass, make_dataclass
+from typing import Annotated, Any, Union, get_type_hints
 
 import tyro
 
@@ -12,10 +12,12 @@ from etsplat.cli.data import Download, Sfm, Undistort
 from etsplat.cli.doctor import Doctor
 from etsplat.cli.evaluate import Evaluate
 from etsplat.cli.export import Export
-from etsplat.cli.reconstruct import Demo, Reconstruct
+from etsplat.cli.reconstruct import DemoObject, Reconstruct
 from etsplat.cli.render import Render
 from etsplat.cli.train import DemoScene, Train
 from etsplat.cli.view import View
+from etsplat.core.errors import InputError
+from etsplat.tasks.settings import Rare, Settings, did_you_mean, docs_of
 
 
 @dataclass(frozen=True)
@@ -32,7 +34,10 @@ class Group:
 
 
 COMMANDS: dict[str, type[Command] | Group] = {
-    "demo": Demo,
+    "demo": Group(
+        "See it work on what is built in code; `etsplat demo` alone is `etsplat demo object`.",
+        {"object": DemoObject, "scene": DemoScene},
+    ),
     "reconstruct": Reconstruct,
     "train": Train,
     "data": Group(
@@ -49,11 +54,11 @@ COMMANDS: dict[str, type[Command] | Group] = {
 # tyro joins the lines of a paragraph, except indented ones.
 _ETSPLAT = """Differentiable triangle splatting: posed images in, triangles out.
 
-    etsplat demo                                      see it work
+    etsplat demo object                               see it work
     etsplat demo scene                                the same on a scene, as a triangle soup
     etsplat reconstruct bunny.obj --out runs/bunny    reconstruct a mesh from pictures of it
     etsplat train my_scene/ --out runs/scene          fit a triangle soup to photos
-    etsplat train --help                              every option
+    etsplat train --help                              what can be set; --help-all for the rest
 """
 
 
@@ -61,32 +66,69 @@ def parse(arguments: Sequence[str]) -> Command:
     """The command that the arguments ask for. `--help` and wrong options end the process, as tyro does.
 
     Raises:
-        InputError: a setting is out of its range.
+        InputError: there is no such command, or a setting is out of its range.
     """
-    # `demo` with and without "scene" are two commands with options of their own.
-    demo = {"demo": DemoScene} if list(arguments[:2]) == ["demo", "scene"] else {}
-    commands: Any = _union({**COMMANDS, **demo}, arguments, 0)
+    words = list(arguments) or ["--help"]
+    if words[0] == "demo" and (len(words) == 1 or (words[1].startswith("-") and words[1] not in ("-h", "--help"))):
+        words.insert(1, "object")
+    _check_command(words)
     parsed = tyro.cli(
-        commands,
+        _union(COMMANDS, words, 0),
         prog="etsplat",
         description=_ETSPLAT,
-        args=list(arguments) or ["--help"],
+        args=["--help" if word == "--help-all" else word for word in words],
         config=(tyro.conf.OmitSubcommandPrefixes,),
+        registry=_registry(brief=("--help" in words or "-h" in words) and "--help-all" not in words),
     )
     return parsed if isinstance(parsed, Command) else parsed.command
 
 
-def _union(commands: Mapping[str, type[Command] | Group], arguments: Sequence[str], depth: int) -> Any:
-    """A type that tyro reads as one of the commands."""
-    asked = arguments[depth] if depth < len(arguments) else ""
-    return Union[tuple(_member(name, entry, arguments, name == asked, depth) for name, entry in commands.items())]  # noqa: UP007
+def _check_command(words: Sequence[str]) -> None:
+    """Refuses words that name no command, before tyro takes them for options."""
+    known: Mapping[str, type[Command] | Group] = COMMANDS
+    for depth, word in enumerate(words):
+        if word.startswith("-") or not known:
+            return
+        if word not in known:
+            program, hint = " ".join(["etsplat", *words[:depth]]), did_you_mean(word, known)
+            raise InputError(f"{word}: is no command{f'{hint} ' if hint else '; '}`{program} --help` lists them")
+        entry = known[word]
+        known = entry.commands if isinstance(entry, Group) else {}
 
 
-def _member(name: str, entry: type[Command] | Group, arguments: Sequence[str], asked: bool, depth: int) -> Any:
+def _union(commands: Mapping[str, type[Command] | Group], words: Sequence[str], depth: int) -> Any:
+    """A type that tyro reads as one of the commands. Those that are not asked for have a name and a line of help."""
+    asked = words[depth] if depth < len(words) else ""
+    return Union[tuple(_member(name, entry, words, name == asked, depth) for name, entry in commands.items())]  # noqa: UP007
+
+
+def _member(name: str, entry: type[Command] | Group, words: Sequence[str], asked: bool, depth: int) -> Any:
+    description = entry.help if isinstance(entry, Group) else inspect.cleandoc(entry.__doc__ or "")
+    if not asked:
+        return Annotated[make_dataclass(name, []), tyro.conf.subcommand(name, description=description)]
     if isinstance(entry, Group):
-        members = _union(entry.commands, arguments, depth + 1)
-        group = make_dataclass(name, [("command", members)], frozen=True)
-        return Annotated[group, tyro.conf.OmitArgPrefixes, tyro.conf.subcommand(name, description=entry.help)]
-    # The list of all commands has no room for examples.
-    description = help_of(entry) if asked else inspect.cleandoc(entry.__doc__ or "")
-    return Annotated[entry, tyro.conf.subcommand(name, default=entry.defaults(arguments), description=description)]
+        commands = Annotated[_union(entry.commands, words, depth + 1), tyro.conf.arg(name="")]
+        group = make_dataclass(name, [("command", commands)], frozen=True)
+        return Annotated[group, tyro.conf.subcommand(name, description=description)]
+    return Annotated[entry, tyro.conf.subcommand(name, default=entry.defaults(words), description=help_of(entry))]
+
+
+def _registry(*, brief: bool) -> tyro.constructors.ConstructorRegistry:
+    """How tyro is to read commands and configs: in brief, without groups and what is `Rare`."""
+    registry = tyro.constructors.ConstructorRegistry()
+
+    @registry.struct_rule
+    def rule(info: tyro.constructors.StructTypeInfo) -> tyro.constructors.StructConstructorSpec | None:
+        if not (isinstance(info.type, type) and issubclass(info.type, Command | Settings)):
+            return None
+        hints, docs = get_type_hints(info.type, include_extras=True), docs_of(info.type)
+        specs = []
+        for field in fields(info.type):
+            hint, value = hints[field.name], getattr(info.default, field.name)
+            group = is_dataclass(value) and not isinstance(value, Settings)
+            hidden = brief and (group or Rare in getattr(hint, "__metadata__", ()))
+            kind: Any = Annotated[hint, tyro.conf.Suppress] if hidden else hint
+            specs.append(tyro.constructors.StructFieldSpec(field.name, kind, value, docs.get(field.name)))
+        return tyro.constructors.StructConstructorSpec(info.type, tuple(specs))
+
+    return registry

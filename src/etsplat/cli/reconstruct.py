@@ -1,4 +1,4 @@
-"""`etsplat reconstruct` and `etsplat demo`: shape reconstruction with a progress bar and a report."""
+"""`etsplat reconstruct` and `etsplat demo object`: shape reconstruction with a progress bar and a report."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,46 +7,46 @@ from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import tyro
 
-from etsplat.cli.command import Command, Flag, preset_of
-from etsplat.cli.running import run_task
-from etsplat.tasks.reconstruct_config import PRESETS, ReconstructConfig
+from etsplat.cli.command import settings_before_options
+from etsplat.cli.running import RunCommand
+from etsplat.tasks.reconstruct_config import ReconstructConfig
+from etsplat.tasks.settings import Rare
 
 if TYPE_CHECKING:
     from etsplat.cli.progress import RunProgress
 
-Settings = Annotated[ReconstructConfig, tyro.conf.arg(name=""), tyro.conf.OmitArgPrefixes]
+Settings = Annotated[ReconstructConfig, tyro.conf.arg(name="")]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Demo(Command):
+class DemoObject(RunCommand):
     """Reconstruct an object that is built in code: nothing to download, nothing to choose."""
 
     EXAMPLES: ClassVar[str] = """
-    etsplat demo
-    etsplat demo --out owl --method bilateral
-    etsplat demo --preset tiny --overwrite
+    etsplat demo object
+    etsplat demo object --out owl --method bilateral
+    etsplat demo object --preset tiny --overwrite
     """
+    PREPARING: ClassVar[str] = "Taking pictures"
 
-    settings: Settings
     out: Path = Path("runs/demo")
     """Folder for the results."""
-    overwrite: Flag = False
-    """Replace an earlier run in the folder."""
-    resume: Flag = False
-    """Continue an interrupted run in the folder."""
+    settings: Settings
 
     @classmethod
-    def defaults(cls, arguments: Sequence[str]) -> "Demo":
+    def defaults(cls, arguments: Sequence[str]) -> "DemoObject":
         """The preset's settings."""
-        return cls(settings=preset_of(arguments, PRESETS, "demo"))
+        return cls(settings=settings_before_options(ReconstructConfig, arguments, preset="demo"))
 
-    def run(self, arguments: Sequence[str]) -> int:
+    def task(self, progress: "RunProgress") -> None:
         """Reconstructs the built-in object."""
-        return _run("demo:owl", None, None, self, arguments)
+        from etsplat.tasks.reconstruct import reconstruct
+
+        reconstruct("demo:owl", self.out, self.settings, callbacks=[progress], **self.place)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Reconstruct(Command):
+class Reconstruct(RunCommand):
     """Deform a sphere into the object that pictures show."""
 
     EXAMPLES: ClassVar[str] = """
@@ -54,52 +54,37 @@ class Reconstruct(Command):
     etsplat reconstruct bunny.obj --out runs/bunny
     etsplat reconstruct bunny.obj --out runs/bunny --resume
     etsplat reconstruct bunny.obj --out runs/paper --preset paper --method bilateral
+    etsplat reconstruct boot.obj --out runs/boot --config runs/bunny/config.json
     etsplat reconstruct my_scene/ --out runs/scene --iterations 4000
     """
+    PREPARING: ClassVar[str] = "Taking pictures"
 
     source: tyro.conf.Positional[Path]
     """A mesh file, which is photographed from 40 sides; or a folder with posed images (transforms.json or COLMAP)."""
     out: Path
     """Folder for the results: mesh.ply, mesh.obj, mesh.glb, metrics.json, report.html and more."""
     settings: Settings
-    init_mesh: Path | None = None
+    init_mesh: Annotated[Path | None, Rare] = None
     """Start from this mesh instead of a sphere; in the units of the source."""
-    masks: Path | None = None
+    masks: Annotated[Path | None, Rare] = None
     """Folder with a mask (white inside the object) for every image; else masks/ of the source, or transparency."""
-    overwrite: Flag = False
-    """Replace an earlier run in the folder."""
-    resume: Flag = False
-    """Continue an interrupted run in the folder; give the same options as then."""
 
     @classmethod
     def defaults(cls, arguments: Sequence[str]) -> "Reconstruct":
         """The preset's settings."""
-        return cls(source=tyro.MISSING, out=tyro.MISSING, settings=preset_of(arguments, PRESETS, "best"))
+        settings = settings_before_options(ReconstructConfig, arguments, preset="best")
+        return cls(source=tyro.MISSING, out=tyro.MISSING, settings=settings)
 
-    def run(self, arguments: Sequence[str]) -> int:
+    def task(self, progress: "RunProgress") -> None:
         """Reconstructs what the source shows."""
-        return _run(self.source, self.init_mesh, self.masks, self, arguments)
+        from etsplat.tasks.reconstruct import reconstruct
 
-
-def _run(
-    source: Path | str,
-    init_mesh: Path | None,
-    masks: Path | None,
-    command: Demo | Reconstruct,
-    arguments: Sequence[str],
-) -> int:
-    from etsplat.tasks.reconstruct import reconstruct
-
-    def task(progress: "RunProgress") -> None:
         reconstruct(
-            source,
-            command.out,
-            command.settings,
-            init_mesh=init_mesh,
-            masks=masks,
+            self.source,
+            self.out,
+            self.settings,
+            init_mesh=self.init_mesh,
+            masks=self.masks,
             callbacks=[progress],
-            resume=command.resume,
-            overwrite=command.overwrite,
+            **self.place,
         )
-
-    return run_task(task, command.out, arguments, debug=command.debug, preparing="Taking pictures")

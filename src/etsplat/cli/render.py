@@ -3,12 +3,13 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar
 
 import tyro
 
 from etsplat.cli.command import Command
 from etsplat.tasks.render_config import RenderConfig
+from etsplat.tasks.settings import Device
 
 Settings = Annotated[RenderConfig, tyro.conf.arg(name=""), tyro.conf.OmitArgPrefixes]
 
@@ -30,7 +31,7 @@ class Render(Command):
     """Folder for the pictures; by default renders/ in the run's folder."""
     scene: Path | None = None
     """The capture's folder, if it has moved or a file is given."""
-    device: Literal["cpu", "cuda"] | None = None
+    device: Device | None = None
     """Where it is drawn: cpu, cuda (an NVIDIA GPU), or None for cuda where there is one."""
     settings: Settings = field(default_factory=RenderConfig)
 

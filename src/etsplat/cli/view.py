@@ -4,12 +4,13 @@ import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar
 
 import tyro
 
 from etsplat.cli.command import Command, Flag
 from etsplat.core.errors import InputError
+from etsplat.tasks.settings import Device
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,7 +33,7 @@ class View(Command):
     """Wait for the run to begin, if its folder is not there yet."""
     scene: Path | None = None
     """The capture's folder, if it has moved or a file is given: for its cameras."""
-    device: Literal["cpu", "cuda"] | None = None
+    device: Device | None = None
     """Where it is drawn: cpu, cuda (an NVIDIA GPU), or None for cuda where there is one."""
     host: str = "localhost"
     """Address to listen on; 0.0.0.0 lets other machines look too."""

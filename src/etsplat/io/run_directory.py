@@ -336,4 +336,11 @@ def _differences(stored: Any, given: Any) -> list[str]:
     if not isinstance(stored, dict) or not isinstance(given, dict):
         return [] if stored == given else [f"{stored} (not {given})"]
     keys = [*stored, *(key for key in given if key not in stored)]
-    return [f"{key}={stored.get(key)} (not {given.get(key)})" for key in keys if stored.get(key) != given.get(key)]
+    found = []
+    for key in keys:
+        before, now = stored.get(key), given.get(key)
+        if isinstance(before, dict) and isinstance(now, dict):
+            found += [f"{key}.{difference}" for difference in _differences(before, now)]
+        elif before != now:
+            found.append(f"{key}={before} (not {now})")
+    return found

@@ -59,13 +59,16 @@ def load_nvdiffrast() -> Any:
         InputError: it, or a CUDA device, is missing.
     """
     if not torch.cuda.is_available():
-        raise InputError("backend nvdiffrast: needs a CUDA device; leave out --backend to use etsplat's own rasterizer")
+        raise InputError(
+            "drawing.backend nvdiffrast: needs a CUDA device; "
+            "leave out --drawing.backend to use etsplat's own rasterizer"
+        )
     try:
         return importlib.import_module("nvdiffrast.torch")
     except ImportError as error:
         raise InputError(
             "backend nvdiffrast: is not installed; see github.com/NVlabs/nvdiffrast (its licence is non-commercial), "
-            "or leave out --backend to use etsplat's own rasterizer"
+            "or leave out --drawing.backend to use etsplat's own rasterizer"
         ) from error
 
 

@@ -1,21 +1,21 @@
 """Settings of the export of soups. Imports no torch: the command line reads them for its help."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
-from etsplat.core.errors import InputError
+from etsplat.tasks.settings import Range, Settings
 
 Bake = Literal["mean", "constant", "keep"]
 
 
 @dataclass(frozen=True)
-class ExportConfig:
+class ExportConfig(Settings):
     """How a soup leaves for other programs."""
 
     colors: Bake = "mean"
     """One colour per triangle: mean of what the training views see; constant part of its harmonics; or keep the
     harmonics beside the latter (PLY only), so that the file comes back with the same colours from every side."""
-    min_opacity: float | None = None
+    min_opacity: Annotated[float | None, Range(0, 1)] = None
     """Leave out triangles less opaque than this; by default 0.5, as `etsplat render --opaque` does."""
     alpha: bool = False
     """Write opacities as alpha too (PLY, OFF, GLB). Most viewers sort transparent triangles badly."""
@@ -23,7 +23,3 @@ class ExportConfig:
     """Let triangles share vertices where positions and colours are equal."""
     up: Literal["y", "keep"] = "y"
     """Turn the scene so that the training cameras' mean up direction is +y, or keep the capture's axes."""
-
-    def __post_init__(self) -> None:
-        if self.min_opacity is not None and not 0 <= self.min_opacity <= 1:
-            raise InputError(f"min_opacity: is {self.min_opacity}; it must be between 0 and 1")

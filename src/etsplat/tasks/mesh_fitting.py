@@ -71,38 +71,40 @@ class MeshFitting:
         self._evaluate = evaluate
         self._sampler = ViewSampler(views.train, torch.Generator().manual_seed(config.seed))
         self._rates = {
-            "vertices": config.lr_vertices,
-            "colors": config.lr_colors,
-            "opacity_logits": config.lr_opacities,
-            "log_sigma": config.lr_sigma if config.sigma_final == 0 else 0.0,
+            "vertices": config.optimizer.lr_vertices,
+            "colors": config.optimizer.lr_colors,
+            "opacity_logits": config.optimizer.lr_opacities,
+            "log_sigma": config.optimizer.lr_sigma if config.optimizer.sigma_final == 0 else 0.0,
         }
         self._weights = MeshWeights(
-            edge=config.lambda_edge,
-            normal=config.lambda_normal,
-            laplacian=config.lambda_laplacian,
-            softness=config.lambda_sigma,
-            edge_power=config.edge_power,
+            edge=config.regularization.lambda_edge,
+            normal=config.regularization.lambda_smooth_normal,
+            laplacian=config.regularization.lambda_laplacian,
+            softness=config.regularization.lambda_sigma,
+            edge_power=config.regularization.edge_power,
         )
         self._budgets = face_budgets(
             config.iterations,
-            steps=config.subdivide_steps,
-            first=config.subdivide_from,
-            last=config.subdivide_until,
+            steps=config.refinement.subdivisions,
+            first=config.refinement.first,
+            last=config.refinement.last,
             start_faces=len(mesh.faces),
             max_faces=config.max_faces,
         )
-        self._untanglings = set(evenly(config.iterations, config.untangle_steps, config.subdivide_until))
+        self._untanglings = set(evenly(config.iterations, config.refinement.untanglings, config.refinement.last))
         levels = [views]  # halved 0, 1, ... times
-        for _ in range(config.coarse_levels):
+        for _ in range(config.pictures.coarse_levels):
             levels.append(levels[-1].halved())
         self._levels = [_Level.of(level, mesh.vertices.device) for level in levels]
         self._solve: Solve | None = None
         parameters = mesh.parameters()
         self.adam = Adam(parameters, {name: self._rates[name] for name in parameters}, engine=config.engine)
         self._queue, self._queued_level = None, self._level(1)
-        queueable = config.vertex_update == "adam" and config.backend == "etsplat"  # others need the host in a step
+        queueable = (
+            config.optimizer.vertex_update == "adam" and config.drawing.backend == "etsplat"
+        )  # others need the host in a step
         if queueable and resolve_engine(config.engine, mesh.vertices) == "cuda":
-            width = 4 * config.views_per_step + 2 + len(parameters) + 1
+            width = 4 * config.batch + 2 + len(parameters) + 1
             self._queue = StepQueue(self._queued_gradients, self._commit, width, mesh.vertices.device)
 
     @property
@@ -149,7 +151,7 @@ class MeshFitting:
         self.adam.step_on_device(row[-len(self.adam.parameters) - 1 :], halted)
 
     def _queued_gradients(self, row: Tensor, kind: Hashable) -> Tensor:
-        views, count = self._levels[self._queued_level], self._config.views_per_step
+        views, count = self._levels[self._queued_level], self._config.batch
         chosen, backgrounds = row[:count].long(), row[count : 4 * count].reshape(count, 3)
         viewmats, Ks = (tensor.index_select(0, chosen) for tensor in (views.cameras.viewmats, views.cameras.Ks))
         cameras = replace(views.cameras, viewmats=viewmats, Ks=Ks)
@@ -167,43 +169,47 @@ class MeshFitting:
 
     def _draw(self) -> tuple[list[int], Float[Tensor, "B 3"]]:
         """Views and backgrounds of the next step."""
-        chosen = [self._sampler.next_view() for _ in range(self._config.views_per_step)]
+        chosen = [self._sampler.next_view() for _ in range(self._config.batch)]
         return chosen, torch.cat([self._sampler.background() for _ in chosen])
 
     def _level(self, iteration: int) -> int:
         config = self._config
-        return coarse_level(iteration, config.iterations, config.coarse_levels, config.coarse_until)
+        return coarse_level(iteration, config.iterations, config.pictures.coarse_levels, config.pictures.coarse_until)
 
     def _gamma(self, iteration: int) -> float:
         config = self._config
-        return regularization_weight(iteration, config.iterations, config.gamma_hold, config.gamma_final)
+        return regularization_weight(
+            iteration, config.iterations, config.regularization.hold, config.regularization.final
+        )
 
     def _log_sigma(self, iteration: int) -> float:
         """Of the schedule; 0 where there is none."""
         config = self._config
-        if config.sigma_final == 0:
+        if config.optimizer.sigma_final == 0:
             return 0.0
-        fall = exponential_decay(iteration, config.iterations, config.sigma_final / config.start_sigma)
-        return math.log(config.start_sigma * fall)
+        fall = exponential_decay(iteration, config.iterations, config.optimizer.sigma_final / config.start.sigma)
+        return math.log(config.start.sigma * fall)
 
     @torch.no_grad()
     def _set_sigma(self, log_sigma: float | Tensor) -> None:
-        if self._config.sigma_final > 0 and self.mesh.log_sigma is not None:
+        if self._config.optimizer.sigma_final > 0 and self.mesh.log_sigma is not None:
             self.mesh.log_sigma.fill_(log_sigma)
 
     def _vertex_rate(self, iteration: int) -> float:
         config = self._config
-        return self._rates["vertices"] * exponential_decay(iteration, config.iterations, config.lr_vertices_final)
+        return self._rates["vertices"] * exponential_decay(
+            iteration, config.iterations, config.optimizer.lr_vertices_final
+        )
 
     def _update(self, iteration: int) -> None:
         config = self._config
         rate = self._vertex_rate(iteration)
-        if config.vertex_update == "adam":
+        if config.optimizer.vertex_update == "adam":
             self.adam.learning_rates["vertices"] = rate
             self.adam.step()
             return
-        if config.vertex_update == "large-steps" and self._solve is None:
-            self._solve = laplacian_solver(self.mesh.topology, config.large_steps_weight)
+        if config.optimizer.vertex_update == "large-steps" and self._solve is None:
+            self._solve = laplacian_solver(self.mesh.topology, config.optimizer.large_steps_weight)
         uniform_step(self.adam, "vertices", rate, self._solve)
 
     def refine(self, iteration: int) -> int:

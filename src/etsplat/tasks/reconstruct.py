@@ -14,7 +14,7 @@ from etsplat.ops.antialias_nvdiffrast import load_nvdiffrast
 from etsplat.ops.engines import one_torch_thread, resolve_device, resolve_engine
 from etsplat.optim.loop import Progress
 from etsplat.tasks.mesh_fitting import MeshFitting
-from etsplat.tasks.reconstruct_config import PRESETS, ReconstructConfig
+from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.running import (
     Callback,
     NoteEvent,
@@ -23,6 +23,7 @@ from etsplat.tasks.running import (
     announcer,
     common_metrics,
     fit,
+    loop_settings,
     make_record,
     path_of,
 )
@@ -66,7 +67,7 @@ def reconstruct(
             folder with posed images and masks, or a `Dataset` with the object in the unit sphere (`renormalized` and
             `bounding_sphere` bring it there).
         out: the run directory; made if it does not exist. README.txt in it explains what is there.
-        config: settings; None for preset "best". See `PRESETS`.
+        config: settings; None for preset "best". See `ReconstructConfig`.
         init_mesh: a mesh to start from instead of the sphere, in the units of the source.
         masks: folder with a mask (white inside the object) for every image of a scene folder, instead of its own masks/
             or the images' transparency.
@@ -79,28 +80,28 @@ def reconstruct(
         InputError: something handed in cannot be used; earlier results in `out` are as they were.
         DivergedError: the optimization went to NaN or infinity.
     """
-    config = config or PRESETS["best"]
+    config = config or ReconstructConfig()
     device = resolve_device(config.device, config.engine)
     place, announce = Place(Path(out), resume, overwrite), announcer(callbacks)
     place.check()
     loaded, start = load_source(source, config, masks), load_start(init_mesh)
     hashes = {"fingerprint": fingerprint(loaded), "init_mesh": fingerprint(start)}
     paths = {"source": path_of(source), "init_mesh": path_of(init_mesh)}
-    record = make_record("reconstruct", config, config.iterations, hashes, paths)
+    record = make_record(config, config.iterations, hashes, paths)
     if resume:
         place.open(record)  # refuses another run before pictures are taken
     for name, mesh in (("source", loaded), ("init_mesh", start)):
         for note in mesh.notes if isinstance(mesh, MeshFile) else ():
             announce(NoteEvent(f"{name}: {note}"))
     subject = make_subject(loaded, config, lambda done, total: announce(PrepareEvent(done, total)), device)
-    if config.backend == "nvdiffrast":
+    if config.drawing.backend == "nvdiffrast":
         load_nvdiffrast()  # now rather than at the first step
     scorer = Scorer(subject, config, device)
     fitting = MeshFitting(make_start(start, subject.views, config, device), subject.views, config, scorer.cheap)
     run = place.open(record)
     on_cpu = resolve_engine(config.engine, fitting.mesh.vertices) == "cpu"
     with one_torch_thread() if on_cpu else nullcontext():
-        progress = fit(fitting, run, config, record, announce)
+        progress = fit(fitting, run, loop_settings(config), record, announce)
     return _finish(fitting, progress, run, scorer, subject.views.normalization.invert, config)
 
 

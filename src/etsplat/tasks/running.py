@@ -18,6 +18,7 @@ from etsplat.ops.engines import num_threads, resolve_engine
 from etsplat.optim.checkpoints import load_latest_checkpoint, save_checkpoint
 from etsplat.optim.loop import Event, LoopSettings, Problem, Progress, StepEvent, optimize
 from etsplat.tasks.reconstruct_config import ReconstructConfig
+from etsplat.tasks.settings import Settings
 from etsplat.tasks.train_config import TrainConfig
 
 
@@ -111,7 +112,7 @@ def announcer(callbacks: Sequence[Callback]) -> Callback:
 def fit(
     problem: Resumable,
     run: RunDirectory,
-    config: ReconstructConfig | TrainConfig | LoopSettings,
+    settings: LoopSettings,
     record: dict[str, Any],
     announce: Callback,
 ) -> Progress:
@@ -120,7 +121,7 @@ def fit(
     Args:
         problem: changed in place.
         run: gets checkpoints and history.jsonl.
-        config: says when things happen.
+        settings: when things happen.
         record: from `make_record`.
         announce: called with every event.
 
@@ -128,7 +129,6 @@ def fit(
         DivergedError: a loss or parameter is not finite.
         InputError: the checkpoint is damaged or of another run; the disk is full.
     """
-    settings = LoopSettings(config.iterations, config.log_every, config.evaluate_every, config.checkpoint_every)
     run_hash = hash_record(record)
     progress = Progress()
     checkpoint = load_latest_checkpoint(run.checkpoints, run_hash)
@@ -147,22 +147,26 @@ def fit(
     return progress
 
 
+def loop_settings(config: ReconstructConfig | TrainConfig) -> LoopSettings:
+    """When things happen, for `fit`."""
+    output = config.output
+    return LoopSettings(config.iterations, output.log_every, output.evaluate_every, output.checkpoint_every)
+
+
 def make_record(
-    task: str, config: object, iterations: int, hashes: dict[str, str | None], paths: dict[str, str | None]
+    config: Settings, iterations: int, hashes: dict[str, str | None], paths: dict[str, str | None]
 ) -> dict[str, Any]:
     """What config.json holds. Inputs are identified by their hashes; paths are for the reader.
 
     Args:
-        task: name of the kind of run.
         config: settings, as they were asked for.
         iterations: of this run, which may be fewer.
         hashes: of the input, by kind.
         paths: where it was read from, by kind.
     """
-    settings = {name: str(value) if isinstance(value, Path) else value for name, value in vars(config).items()}
     return {
-        "task": task,
-        "config": settings,
+        "task": config.TASK,
+        "config": config.to_dict(),
         "iterations": iterations,
         "source": hashes,
         "paths": paths,

@@ -30,14 +30,14 @@ class Scorer:
         """Loads what measuring needs.
 
         Raises:
-            InputError: `config.lpips_weights` is given and cannot be used.
+            InputError: `config.output.lpips_weights` is given and cannot be used.
         """
         self._views, self._loader = subject.views, ViewLoader(subject.views, device or torch.device("cpu"))
         self._has_masks = subject.views.has_masks
         self._truth = subject.truth
         self._config = config
         # Now rather than after the run, so that a file that cannot be used is found before hours are spent.
-        weights = find_lpips_weights(config.lpips_weights)
+        weights = find_lpips_weights(config.output.lpips_weights)
         self._lpips = Lpips.from_weights(*weights.paths) if weights.paths else None
         self._lpips_reason = weights.reason
         if self._lpips is not None:
@@ -51,7 +51,7 @@ class Scorer:
         if self._views.test:
             scores["psnr"] = _mean([psnr(self._splatted(mesh, view), self._photo(view)) for view in self._views.test])
         if self._truth is not None:
-            truth, samples = self._truth, self._config.chamfer_samples
+            truth, samples = self._truth, self._config.output.chamfer_samples
             pair = sample_pair(mesh.vertices, mesh.faces, truth.vertices, truth.faces, samples)
             scores["chamfer"] = chamfer(*pair, queries=samples // 10)
         return scores
@@ -76,7 +76,7 @@ class Scorer:
     def _geometry(self, mesh: TriangleMesh) -> dict[str, Any]:
         vertices, faces, truth = mesh.vertices.detach().cpu(), mesh.faces.cpu(), self._truth
         if truth is not None:
-            samples = self._config.chamfer_samples
+            samples = self._config.output.chamfer_samples
             return asdict(geometry_metrics(vertices, faces, truth.vertices, truth.faces, samples=samples))
         return {
             **dict.fromkeys(("chamfer", "chamfer_floor", "chamfer_exact", "f_score")),
@@ -114,7 +114,7 @@ class Scorer:
     def _opaque(self, mesh: TriangleMesh, view: int) -> Float[Tensor, "H W 4"]:
         config = self._config
         camera = self._loader.view(view).camera
-        image = render_exported(mesh, camera, supersampling=config.supersampling, engine=config.engine)
+        image = render_exported(mesh, camera, supersampling=config.pictures.supersampling, engine=config.engine)
         return image[0]
 
 

@@ -71,7 +71,7 @@ class SoupFitting:
         self._evaluate = evaluate
         self._sampler = ViewSampler(capture.train, generator)
         self._iteration = 0
-        self._surroundings = Surroundings.of(capture).to(self._device) if config.closed else None
+        self._surroundings = Surroundings.of(capture).to(self._device) if config.sky == "sphere" else None
         self.adam = Adam(soup.parameters(), self._schedule.rates(1), engine=config.engine)
         self._queue: StepQueue | None = None
         self._phase: tuple[SoupAppearance, SoupWeights] | None = None
@@ -193,10 +193,10 @@ class SoupFitting:
     def refine(self, iteration: int) -> int:
         """Densifies or prunes if it is time to; returns by how many triangles the soup grew."""
         config, before = self._config, self.count
-        every = config.at(config.densify_every)
-        if iteration % every or iteration <= config.at(config.densify_from) or iteration == config.iterations:
+        every = config.at(config.densification.every)
+        if iteration % every or iteration <= config.at(config.densification.begin) or iteration == config.iterations:
             return 0
-        if iteration < config.at(config.densify_until):
+        if iteration < config.at(config.densification.end):
             self.densify(iteration)
         else:
             self.prune(iteration)
@@ -266,13 +266,13 @@ class SoupFitting:
 
     def _dead(self, iteration: int) -> Tensor:
         config = self._config
-        first = iteration <= config.at(config.densify_from) + config.at(config.densify_every)
-        densifying = iteration < config.at(config.densify_until)
-        limit = config.prune_screen_size if densifying and not first else None
+        first = iteration <= config.at(config.densification.begin) + config.at(config.densification.every)
+        densifying = iteration < config.at(config.densification.end)
+        limit = config.pruning.screen_size if densifying and not first else None
         rules = PruneRules(
-            opacity=config.prune_opacity,
+            opacity=config.pruning.opacity,
             importance=self._schedule.least_importance,
-            views=0 if first else min(config.prune_views, len(self._capture.train)),
+            views=0 if first else min(config.pruning.views, len(self._capture.train)),
             screen_size=float("inf") if limit is None else limit,
         )
         with torch.no_grad():
@@ -283,14 +283,14 @@ class SoupFitting:
             dead &= ~(self._surroundings.outermost(self.soup.vertices) & (self.statistics.screen_size == 0))
         if bool(dead.all()):
             raise DivergedError(
-                f"no triangle is left at iteration {iteration}; lower lambda_opacity or prune_importance"
+                f"no triangle is left at iteration {iteration}; lower loss.lambda_opacity or pruning.importance"
             )
         return dead
 
     def _densification(self, iteration: int, dead: Tensor) -> RowPlan:
         config, soup = self._config, self.soup
-        even = iteration // config.at(config.densify_every) % 2 == 0
-        by = {"opacity": True, "sharpness": False, "alternate": even}[config.sample_by]
+        even = iteration // config.at(config.densification.every) % 2 == 0
+        by = {"opacity": True, "sharpness": False, "alternate": even}[config.densification.sample_by]
         count = self.count if self._schedule.replaces_dead else self.count - int(dead.sum())
         return densify_plan(
             soup.vertices.detach(),
@@ -298,10 +298,10 @@ class SoupFitting:
             soup.sigma.detach(),
             self.statistics.screen_size,
             dead,
-            target=grown_count(count, config.growth, config.max_triangles),
+            target=grown_count(count, config.densification.growth, config.max_triangles),
             by="opacity" if by else "sharpness",
-            split_size=config.split_size,
-            noise=config.clone_noise,
+            split_size=config.densification.split_size,
+            noise=config.densification.clone_noise,
             generator=self._sampler.generator,
         )
 

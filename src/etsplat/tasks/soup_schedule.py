@@ -49,47 +49,49 @@ class SoupSchedule:
     def weights(self, iteration: int) -> SoupWeights:
         """Of the losses."""
         config = self.config
-        regular = iteration > config.at(config.regularize_from)
+        regular = iteration > config.at(config.loss.regularize_from)
         return SoupWeights(
-            dssim=config.lambda_dssim,
-            opacity=0.0 if config.finish == "opaque" else config.lambda_opacity,
-            size=config.lambda_size if iteration < config.at(config.densify_until) else 0.0,
-            normal=config.lambda_normal if regular else 0.0,
-            distortion=config.lambda_distortion if regular else 0.0,
+            dssim=config.loss.lambda_dssim,
+            opacity=0.0 if config.finish == "opaque" else config.loss.lambda_opacity,
+            size=config.loss.lambda_size if iteration < config.at(config.densification.end) else 0.0,
+            normal=config.loss.lambda_depth_normal if regular else 0.0,
+            distortion=config.loss.lambda_distortion if regular else 0.0,
             pixel="l2" if self.squared else "l1",
         )
 
     def rates(self, iteration: int) -> dict[str, float]:
         """Adam's learning rates, by parameter."""
         config = self.config
-        vertices = config.lr_vertices * exponential_decay(iteration, config.iterations, config.lr_vertices_final)
-        if config.lr_vertices_length is not None:
-            vertices *= math.sqrt(config.lr_vertices_length / config.iterations)
+        vertices = config.optimizer.lr_vertices * exponential_decay(
+            iteration, config.iterations, config.optimizer.lr_vertices_final
+        )
+        if config.optimizer.lr_vertices_length is not None:
+            vertices *= math.sqrt(config.optimizer.lr_vertices_length / config.iterations)
         others = 1.0
-        if config.lr_settle is not None:
-            others = SETTLED ** ramp(iteration, config.at(config.lr_settle), config.iterations)
+        if config.optimizer.lr_settle is not None:
+            others = SETTLED ** ramp(iteration, config.at(config.optimizer.lr_settle), config.iterations)
         return {
             "vertices": vertices,
-            "opacity_logits": config.lr_opacities * others,
-            "sigma_raw": config.lr_sigma * others,
-            "sh_dc": config.lr_sh_dc * others,
-            "sh_rest": config.lr_sh_rest * others,
+            "opacity_logits": config.optimizer.lr_opacities * others,
+            "sigma_raw": config.optimizer.lr_sigma * others,
+            "sh_dc": config.optimizer.lr_sh_dc * others,
+            "sh_rest": config.optimizer.lr_sh_rest * others,
         }
 
     @property
     def least_importance(self) -> float:
         """Triangles whose blend weight stays below this are removed."""
-        least = self.config.prune_importance
+        least = self.config.pruning.importance
         return least if self.config.finish == "none" else min(least, HIDDEN)
 
     @property
     def replaces_dead(self) -> bool:
         """Whether triangles that die count in the number that densification multiplies."""
-        return self.config.replace_dead or self.config.finish == "opaque"
+        return self.config.densification.replace_dead or self.config.finish == "opaque"
 
     def next_edit(self, iteration: int) -> int:
         """The first iteration, from this one on, after which triangles may come or go."""
-        every = self.config.at(self.config.densify_every)
+        every = self.config.at(self.config.densification.every)
         return -(-iteration // every) * every
 
     def _plain(self, iteration: int) -> SoupAppearance:
@@ -97,9 +99,9 @@ class SoupSchedule:
         return SoupAppearance(
             kernel=config.kernel,
             distance=config.distance,
-            sh_degree=min(config.sh_degree, iteration // config.at(config.sh_every)),
-            cull_small=config.cull_small,
-            cull_large=float("inf") if config.cull_large is None else config.cull_large,
-            freeze_incentre=config.freeze_incentre and config.distance == "sdf",
-            near_plane=config.near_plane,
+            sh_degree=min(config.drawing.sh_degree, iteration // config.at(config.schedule.sh_every)),
+            cull_small=config.drawing.cull_small,
+            cull_large=float("inf") if config.drawing.cull_large is None else config.drawing.cull_large,
+            freeze_incentre=config.drawing.freeze_inradius and config.distance == "sdf",
+            near_plane=config.drawing.near_plane,
         )

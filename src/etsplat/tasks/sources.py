@@ -84,7 +84,7 @@ def make_subject(
         InputError: the mesh has no extent, or there are no views to train on.
     """
     if isinstance(source, MeshFile):
-        side, samples = config.resolution, config.supersampling
+        side, samples = config.resolution, config.pictures.supersampling
         views = photograph(source, side, side, supersampling=samples, progress=progress, device=device)
         return Subject(views, normalize_mesh(source)[0])
     if not source.train:
@@ -111,19 +111,19 @@ def make_start(
         device: of the mesh; None for the CPU.
     """
     if start is None:
-        vertices, faces = icosphere(config.start_level)
-        vertices = vertices * config.start_radius
-        colors: Tensor | float = config.start_color
+        vertices, faces = icosphere(config.start.level)
+        vertices = vertices * config.start.radius
+        colors: Tensor | float = config.start.color
     else:
         vertices, faces = views.normalization.apply(start.vertices), start.faces
         given = start.vertex_colors if config.vertex_colored else start.face_colors
-        colors = config.start_color if given is None else given
+        colors = config.start.color if given is None else given
     return TriangleMesh.from_mesh(
         vertices.to(device or "cpu"),
         faces.to(device or "cpu"),
         colors=colors,
-        opacity=config.start_opacity if config.splats else None,
-        sigma=config.start_sigma if config.splats else None,
+        opacity=config.start.opacity if config.soft else None,
+        sigma=config.start.sigma if config.soft else None,
         vertex_colored=config.vertex_colored,
     )
 

@@ -32,12 +32,13 @@ from etsplat.tasks.running import (
     announcer,
     common_metrics,
     fit,
+    loop_settings,
     make_record,
     path_of,
 )
 from etsplat.tasks.soup_fitting import Evaluate, SoupFitting
 from etsplat.tasks.soup_scoring import SoupScorer
-from etsplat.tasks.train_config import TrainConfig, train_settings
+from etsplat.tasks.train_config import TrainConfig
 
 DEMO = "demo:scene"
 """Names the scene that is built in code."""
@@ -89,7 +90,7 @@ def train(
     Args:
         source: a folder with posed photos (COLMAP, nerfstudio, Blender), a `Dataset` in its own units, or "demo:scene".
         out: the run directory; made if it does not exist. README.txt in it explains what is there.
-        config: settings; None for `train_settings("quick")`.
+        config: settings; None for preset "quick", outdoor. See `TrainConfig`.
         images: folder in the scene to take the photos from, such as "images_4".
         masks: folder with a mask for every photo, white where pixels count.
         callbacks: each is called with every event, in the thread of the caller.
@@ -100,17 +101,17 @@ def train(
         InputError: something handed in cannot be used; earlier results in `out` are as they were.
         DivergedError: the optimization went to NaN or infinity.
     """
-    config = config or train_settings("quick")
+    config = config or TrainConfig()
     device = resolve_device(config.device, config.engine)
     place, announce = Place(Path(out), resume, overwrite), announcer(callbacks)
     place.check()
     own = _load(source, config, images, masks, lambda done, total: announce(PrepareEvent(done, total)))
     capture = own.normalized() if config.normalize else own
-    iterations = limited_iterations(config.iterations, config.max_epochs, len(own.train))
+    iterations = limited_iterations(config.iterations, config.schedule.max_epochs, len(own.train))
     for note in _check(own, config, iterations, device):
         announce(NoteEvent(note))
     paths = {"source": path_of(source), "images": images, "masks": path_of(masks)}
-    record = make_record("train", config, iterations, {"fingerprint": own.fingerprint()}, paths)
+    record = make_record(config, iterations, {"fingerprint": own.fingerprint()}, paths)
     config = replace(config, iterations=iterations)
     scorer = SoupScorer(capture, _background(config), config.engine, device)
     fitting = start_fitting(capture, config, scorer.cheap, device)
@@ -124,7 +125,7 @@ def train(
     native = resolve_engine(config.engine, fitting.soup.vertices) == "cpu"
     with one_torch_thread() if native else nullcontext():
         try:
-            progress = fit(fitting, run, config, record, keep)
+            progress = fit(fitting, run, loop_settings(config), record, keep)
         except DivergedError as error:
             if doubt := _doubtful_scale(own, config):
                 raise DivergedError(f"{error}. But first: {doubt}") from error
@@ -148,15 +149,15 @@ def start_fitting(
     soup = start_soup(
         points,
         generator,
-        scale=config.start_scale,
-        opacity=config.start_opacity,
-        sigma=config.start_sigma,
-        sh_degree=config.sh_degree,
+        scale=config.start.scale,
+        opacity=config.start.opacity,
+        sigma=config.start.sigma,
+        sh_degree=config.drawing.sh_degree,
         centers=capture.centers[capture.train],
-        limit=config.start_limit,
+        limit=config.start.limit,
     )
-    if config.closed:
-        soup = soup.joined(Surroundings.of(capture).soup(capture, config.sh_degree))
+    if config.sky == "sphere":
+        soup = soup.joined(Surroundings.of(capture).soup(capture, config.drawing.sh_degree))
     soup = soup.to(device or torch.device("cpu"))
     squared = config.scene_type == "outdoor" and not config.normalize and _span(points) > LARGE_SPAN
     return SoupFitting(soup, capture, config, generator, evaluate, squared=squared)
@@ -207,13 +208,12 @@ def _check(capture: Dataset, config: TrainConfig, iterations: int, device: torch
         f"{len(capture.train)} photos to train on, {len(capture.test)} to test; at most {_amount(needed)} of memory"
     ]
     if iterations < config.iterations:
-        notes.append(
-            f"few photos: {iterations:,} iterations, not {config.iterations:,} (max_epochs {config.max_epochs})"
-        )
+        limit = f"schedule.max_epochs {config.schedule.max_epochs}"
+        notes.append(f"few photos: {iterations:,} iterations, not {config.iterations:,} ({limit})")
     if capture.images.streamed:
         notes.append("the photos do not fit into memory: they are decoded anew whenever they are needed")
     if capture.exact_points is None:
-        notes.append(f"no points in the capture: starting from {config.start_points:,} random ones")
+        notes.append(f"no points in the capture: starting from {config.start.points:,} random ones")
     if doubt := _doubtful_scale(capture, config):
         notes.append(doubt)
     return notes
@@ -235,19 +235,19 @@ def _amount(count: int) -> str:
 
 
 def _start_count(capture: Dataset, config: TrainConfig) -> int:
-    points = config.start_points if capture.exact_points is None else len(capture.exact_points)
-    return points + (SPHERE_TRIANGLES if config.closed else 0)
+    points = config.start.points if capture.exact_points is None else len(capture.exact_points)
+    return points + (SPHERE_TRIANGLES if config.sky == "sphere" else 0)
 
 
 def _start_points(capture: Dataset, config: TrainConfig, generator: torch.Generator) -> StartPoints:
     """The capture's points, or random ones in a cube that holds what the cameras look at."""
     positions, colors = capture.points, capture.point_colors
     if positions is None:
-        points = random_points(config.start_points, capture.viewmats[capture.train], generator)
+        points = random_points(config.start.points, capture.viewmats[capture.train], generator)
     else:
         grey = torch.full_like(positions, 0.5)
         points = StartPoints(positions, grey if colors is None else colors)
-    return points.with_sky() if config.sky_dome and not config.closed else points
+    return points.with_sky() if config.sky == "dome" else points
 
 
 def _background(config: TrainConfig) -> Float[Tensor, "3"]:

@@ -1,0 +1,321 @@
+"""What the settings of all tasks have in common: limits declared at the fields, one check, changes by name, files.
+
+A config is a frozen dataclass over `Settings`. A field of it is a setting, with a docstring that becomes its help, or a
+group of them, a frozen dataclass. A setting's name is dotted: "optimizer.lr_vertices". Imports no torch, since the
+command line reads configs for its help.
+"""
+
+import difflib
+import inspect
+import json
+import math
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, fields, is_dataclass, replace
+from functools import cache
+from pathlib import Path
+from types import NoneType
+from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_args, get_origin, get_type_hints
+
+from etsplat.core.errors import InputError
+from etsplat.io.run_directory import FORMAT
+
+Device = Literal["cpu", "cuda"]
+Engine = Literal["cpu", "cuda", "reference"]
+
+SoftMethod = Literal["elastic", "bilateral", "single-sided"]
+"""The kernels of soft triangles, as both tasks name them."""
+
+AnySettings = TypeVar("AnySettings", bound="Settings")
+
+_KINDS = {bool: "true or false", int: "a whole number", float: "a number", str: "a word", Path: "a path"}
+
+
+@dataclass(frozen=True)
+class Range:
+    """At a field: the least and the largest value that it may have, as in ``Annotated[float, Range(0, 1)]``."""
+
+    low: float
+    high: float = math.inf
+
+    @property
+    def text(self) -> str:
+        """As it follows "it must be"."""
+        if self.high < math.inf:
+            return f"between {self.low:g} and {self.high:g}"
+        return f"at least {self.low:g}" if self.low > -math.inf else "finite"
+
+
+@dataclass(frozen=True)
+class Only:
+    """At a field: the condition under which it has an effect; where it has none, it may not be changed.
+
+    Attributes:
+        text: the condition in words, as they follow "only".
+        holds: for a whole config.
+    """
+
+    text: str
+    holds: Callable[[Any], bool]
+
+
+class Rare:
+    """At a field: ``--help`` leaves it out, and ``--help-all`` has it, as the settings in groups."""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What a field declares.
+
+    Attributes:
+        kind: bool, int, float, str or Path.
+        optional: whether it may be None.
+        choices: all values; empty where any of its kind and range will do.
+        range: of numbers.
+        only: when it has an effect.
+        default: of its class.
+    """
+
+    kind: type
+    optional: bool
+    choices: tuple[Any, ...]
+    range: Range | None
+    only: Only | None
+    default: Any
+
+    def problem(self, value: Any) -> str | None:
+        """What is wrong with a value, or None."""
+        if value is None and self.optional:
+            return None
+        if self.choices:
+            choices = (None, *self.choices) if self.optional else self.choices
+            return None if value in self.choices else f"choose one of {', '.join(map(str, choices))}"
+        kinds = (int, float) if self.kind is float else self.kind
+        if not isinstance(value, kinds) or isinstance(value, bool) != (self.kind is bool):
+            return f"it must be {_KINDS[self.kind]}"
+        if isinstance(value, int | float):
+            limits = self.range or Range(-math.inf)
+            if not (limits.low <= value <= limits.high and math.isfinite(value)):
+                return f"it must be {limits.text}"
+        return None
+
+    def read(self, text: str) -> Any:
+        """The value that a text stands for; the text itself if it stands for none, of which `problem` complains."""
+        if self.optional and text.lower() == "none":
+            return None
+        if self.kind is bool:
+            return {"true": True, "false": False}.get(text.lower(), text)
+        try:
+            number = float(text) if self.kind is int else None
+            return self.kind(text) if number is None or not number.is_integer() else int(number)
+        except ValueError:
+            return text
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Base of the configs: frozen dataclasses of settings and groups.
+
+    Raises InputError where a setting is out of its range, is none of its choices, or would have no effect.
+    """
+
+    TASK: ClassVar[str] = ""
+    """What a run with these settings is called in its config.json."""
+
+    def __post_init__(self) -> None:
+        implied = self.implied()
+        for name, setting in settings_of(type(self)).items():
+            value = get(self, name)
+            if problem := setting.problem(value):
+                shown = repr(value) if isinstance(value, str) or setting.choices else value
+                raise InputError(f"{name}: is {shown}; {problem}")
+            untouched = value in (setting.default, implied.get(name, setting.default))
+            if setting.only and not untouched and not setting.only.holds(self):
+                raise InputError(f"{name}: has an effect only {setting.only.text}; leave it out, or change that")
+        if problem := self.contradiction():
+            raise InputError(problem)
+
+    def implied(self) -> Mapping[str, Any]:
+        """The settings, by name, that differ from the class's defaults because of the preset."""
+        return {}
+
+    def contradiction(self) -> str | None:
+        """What is wrong with settings that are right one by one."""
+        return None
+
+    @classmethod
+    def based_on(cls: type[AnySettings], settings: Mapping[str, Any]) -> AnySettings:
+        """The config that some settings are changes of: of the preset that they name, or the default one."""
+        return cls()
+
+    def changed(self: AnySettings, changes: Mapping[str, Any]) -> AnySettings:
+        """The config with some settings changed.
+
+        Args:
+            changes: by dotted name, or with a mapping for a group: ``{"optimizer": {"lr_vertices": 5e-3}}``.
+
+        Raises:
+            InputError: there is no such setting, or its value cannot be used.
+        """
+        known, flat = settings_of(type(self)), flatten(changes)
+        for name in flat:
+            if any(other.startswith(f"{name}.") for other in known):
+                raise InputError(f"{name}: is a group of settings; name one of them, with its value")
+            if name not in known:
+                raise InputError(f"{name}: is no setting{did_you_mean(name, known)}")
+        return _replaced(self, {name: _typed(known[name], value) for name, value in flat.items()}, "")
+
+    @classmethod
+    def read_changes(cls, text: str) -> dict[str, Any]:
+        """Changes, for `changed`, from a text such as "iterations=1000,start.limit=none".
+
+        Raises:
+            InputError: that is not how changes are written.
+        """
+        known, changes = settings_of(cls), {}
+        for item in filter(None, text.split(",")):
+            name, equals, value = item.partition("=")
+            if not equals:
+                raise InputError(f"{item}: is not a setting and its value; write NAME=VALUE,NAME=VALUE")
+            changes[name] = known[name].read(value) if name in known else value
+        return changes
+
+    def to_dict(self) -> dict[str, Any]:
+        """All settings as JSON has them, with a dictionary for each group."""
+        return _as_dict(self)
+
+    @classmethod
+    def from_file(
+        cls: type[AnySettings], path: str | Path, named: Mapping[str, str] = {}, given: Mapping[str, str] = {}
+    ) -> AnySettings:
+        """The settings of a run, from its config.json; or those of a JSON file with some of them.
+
+        Such a file has the form of "config" in config.json. Settings that it lacks are those of the preset that it
+        names, or of the default one.
+
+        Args:
+            path: of the file.
+            named: the preset, where neither the file nor `given` name one.
+            given: the preset that somebody asks for beside the file, which therefore must not name one.
+
+        Raises:
+            InputError: it cannot be read, is of another kind of run, or has settings that there are not.
+        """
+        found = _read(path, cls.TASK)
+        for name in given:
+            if name in found:
+                raise InputError(f"{name}: {path} is of {name} {found[name]} already; leave one of them out")
+        try:
+            return cls.based_on({**named, **given, **found}).changed(found)
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from error
+
+
+def _read(path: str | Path, task: str) -> dict[str, Any]:
+    """What a file that `Settings.from_file` takes says, unchecked."""
+    try:
+        found = json.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); name a run's config.json") from error
+    except ValueError as error:
+        raise InputError(f"{path}: is not JSON ({error}); name a run's config.json") from error
+    if not isinstance(found, dict):
+        raise InputError(f"{path}: holds no settings; name a run's config.json")
+    if found.get("format") != FORMAT:
+        return found
+    if found["task"] != task:
+        raise InputError(f"{path}: has the settings of `etsplat {found['task']}`; name a run of `etsplat {task}`")
+    return found["config"]
+
+
+@cache
+def settings_of(kind: type) -> dict[str, Setting]:
+    """All settings of a config class or group by their dotted names, in the order of the fields."""
+    found: dict[str, Setting] = {}
+    hints = get_type_hints(kind, include_extras=True)
+    for field in fields(kind):
+        hint = hints[field.name]
+        if is_dataclass(hint):
+            found |= {f"{field.name}.{name}": setting for name, setting in settings_of(hint).items()}
+        else:
+            found[field.name] = _setting(hint, field.default)
+    return found
+
+
+def docs_of(kind: type) -> dict[str, str]:
+    """The docstrings of a class's fields, those that it inherits too."""
+    import docstring_parser
+
+    docs: dict[str, str] = {}
+    for base in reversed(kind.__mro__[:-1]):
+        found = docstring_parser.parse_from_object(base).params
+        docs |= {entry.arg_name: inspect.cleandoc(entry.description or "") for entry in found}
+    return docs
+
+
+def get(config: object, name: str) -> Any:
+    """The value of a setting, by its dotted name."""
+    for part in name.split("."):
+        config = getattr(config, part)
+    return config
+
+
+def flatten(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Nested settings by their dotted names."""
+    flat: dict[str, Any] = {}
+    for name, value in settings.items():
+        if isinstance(value, Mapping):
+            flat |= {f"{name}.{inner}": entry for inner, entry in flatten(value).items()}
+        else:
+            flat[name] = value
+    return flat
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """For the end of an error: the name that was probably meant, if one is close, whichever group it is in."""
+    names = list(known)
+    last = {name.rpartition(".")[2]: name for name in reversed(names)}
+    close = difflib.get_close_matches(word, names, 1) or [
+        last[found] for found in difflib.get_close_matches(word.rpartition(".")[2], last, 1)
+    ]
+    return f"; did you mean {close[0]}?" if close else ""
+
+
+def _setting(hint: Any, default: Any) -> Setting:
+    extras: tuple[Any, ...] = ()
+    if get_origin(hint) is Annotated:
+        hint, *rest = get_args(hint)
+        extras = tuple(rest)
+    parts = get_args(hint)
+    optional = NoneType in parts
+    if optional:
+        (hint,) = (part for part in parts if part is not NoneType)
+    choices = get_args(hint) if get_origin(hint) is Literal else ()
+    limits = next((extra for extra in extras if isinstance(extra, Range)), None)
+    only = next((extra for extra in extras if isinstance(extra, Only)), None)
+    return Setting(type(choices[0]) if choices else hint, optional, choices, limits, only, default)
+
+
+def _typed(setting: Setting, value: Any) -> Any:
+    """A value of JSON, which has no paths and may have floats without a point, as its setting has it."""
+    if setting.kind is float and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    return Path(value) if setting.kind is Path and isinstance(value, str) else value
+
+
+def _replaced(group: Any, changes: Mapping[str, Any], prefix: str) -> Any:
+    own = {}
+    for field in fields(group):
+        name, value = prefix + field.name, getattr(group, field.name)
+        if is_dataclass(value) and any(change.startswith(f"{name}.") for change in changes):
+            own[field.name] = _replaced(value, changes, f"{name}.")
+        elif name in changes:
+            own[field.name] = changes[name]
+    return replace(group, **own)
+
+
+def _as_dict(group: Any) -> dict[str, Any]:
+    values = {field.name: getattr(group, field.name) for field in fields(group)}
+    return {
+        name: _as_dict(value) if is_dataclass(value) else str(value) if isinstance(value, Path) else value
+        for name, value in values.items()
+    }

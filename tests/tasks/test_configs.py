@@ -1,0 +1,220 @@
+"""The settings of all tasks: what their declarations promise, the presets, files."""
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, get_args
+
+import pytest
+
+from etsplat.core.errors import InputError
+from etsplat.io.run_directory import FORMAT
+from etsplat.tasks.export_config import ExportConfig
+from etsplat.tasks.reconstruct_config import Preset as ReconstructPreset
+from etsplat.tasks.reconstruct_config import ReconstructConfig
+from etsplat.tasks.render_config import RenderConfig
+from etsplat.tasks.settings import Setting, Settings, docs_of, flatten, get, settings_of
+from etsplat.tasks.train_config import SCENE_TYPES, TrainConfig
+from etsplat.tasks.train_config import Preset as TrainPreset
+from helpers import presets_before as before
+
+CONFIGS: tuple[type[Settings], ...] = (ReconstructConfig, TrainConfig, RenderConfig, ExportConfig)
+SETTINGS = [(kind, name, setting) for kind in CONFIGS for name, setting in settings_of(kind).items()]
+NAMES = [f"{kind.__name__}.{name}" for kind, name, _ in SETTINGS]
+PRESETS = [
+    *(ReconstructConfig.of(preset) for preset in get_args(ReconstructPreset)),
+    *(TrainConfig.of(preset, scene) for preset in get_args(TrainPreset) for scene in SCENE_TYPES),
+]
+RECONSTRUCT, TRAIN = ReconstructConfig(), TrainConfig()
+
+
+@pytest.mark.parametrize(("kind", "name", "setting"), SETTINGS, ids=NAMES)
+def test_every_setting_has_help_and_limits(kind: type[Settings], name: str, setting: Setting) -> None:
+    """A docstring, whether it is in a group or not; a number has a range, a word its choices."""
+    group, _, last = name.rpartition(".")
+    owner = type(get(kind(), group)) if group else kind
+    assert docs_of(owner)[last]
+    assert setting.kind not in (int, float) or setting.choices or setting.range
+    assert setting.kind is not str or setting.choices
+
+
+@pytest.mark.parametrize(("kind", "name", "setting"), SETTINGS, ids=NAMES)
+def test_values_are_taken_within_the_limits_and_refused_beyond(
+    kind: type[Settings], name: str, setting: Setting
+) -> None:
+    """At the bounds and one step outside, of another type, NaN and infinity; the error begins with the dotted name."""
+    for value in inside(setting):
+        assert setting.problem(value) is None, value
+    for value in outside(setting):
+        with pytest.raises(InputError) as error:
+            kind().changed({name: value})
+        assert str(error.value).startswith(f"{name}: is ")
+        assert "\n" not in str(error.value)
+
+
+def inside(setting: Setting) -> list[Any]:
+    values: list[Any] = [*setting.choices, setting.default]
+    if setting.range:
+        values += [bound for bound in (setting.range.low, setting.range.high) if math.isfinite(bound)]
+    return [int(value) if setting.kind is int and value is not None else value for value in values]
+
+
+def outside(setting: Setting) -> list[Any]:
+    values: list[Any] = [object()]
+    if not setting.optional:
+        values.append(None)
+    if setting.choices:
+        return [*values, "nonsense"]
+    if setting.kind in (int, float):
+        values += ["many", True, math.nan, math.inf, -math.inf]
+    if setting.kind in (int, bool):
+        values.append(0.5)
+    if setting.range:
+        low, high, step = setting.range.low, setting.range.high, 1 if setting.kind is int else 1e-9
+        values += [int(low) - 1 if setting.kind is int else low - step]
+        values += [high + step] if math.isfinite(high) else []
+    return values
+
+
+@pytest.mark.parametrize("preset", before.RECONSTRUCT_CHANGES)
+def test_presets_of_reconstruct_are_what_they_were(preset: str) -> None:
+    """Every setting of then has a name now, and nothing else has come but the preset's own name."""
+    config = flatten(ReconstructConfig.of(preset).to_dict())
+    expected = {**before.RECONSTRUCT_PAPER, **before.RECONSTRUCT_CHANGES[preset]}
+    assert config == {"preset": preset, **{before.RECONSTRUCT_NAMES[name]: expected[name] for name in expected}}
+
+
+@pytest.mark.parametrize(("preset", "scene"), before.TRAIN_CHANGES)
+def test_presets_of_train_are_what_they_were(preset: str, scene: str) -> None:
+    """The same for every kind of scene."""
+    config = flatten(TrainConfig.of(preset, scene).to_dict())
+    base = before.TRAIN_PAPER if preset == "paper" else before.TRAIN_QUICK
+    expected = {**base, **before.TRAIN_CHANGES[preset, scene]}
+    named = {before.TRAIN_NAMES[name]: expected[name] for name in expected}
+    assert config == {"preset": preset, "scene_type": scene, **named}
+
+
+def test_defaults_are_those_of_the_command_line() -> None:
+    """Preset best, and quick for outdoor scenes; each constructor is its preset."""
+    assert ReconstructConfig.best() == RECONSTRUCT
+    assert TrainConfig.quick() == TRAIN
+    for preset in get_args(ReconstructPreset):
+        assert getattr(ReconstructConfig, preset)() == ReconstructConfig.of(preset)
+    for preset in get_args(TrainPreset):
+        assert getattr(TrainConfig, preset)(scene="indoor") == TrainConfig.of(preset, "indoor")
+
+
+@pytest.mark.parametrize("config", PRESETS, ids=lambda config: f"{config.TASK} {config.preset}")
+def test_settings_come_back_from_a_file(config: Settings, tmp_path: Path) -> None:
+    """The same config, whether the file is a run's config.json or holds the settings alone; hashes do not change."""
+    record = {"format": FORMAT, "task": config.TASK, "config": config.to_dict()}
+    for name, content in (("config.json", record), ("settings.json", config.to_dict())):
+        (tmp_path / name).write_text(json.dumps(content))
+        again = type(config).from_file(tmp_path / name)
+        assert again == config
+        assert json.dumps(again.to_dict()) == json.dumps(config.to_dict())
+
+
+def test_a_part_of_the_settings_is_enough(tmp_path: Path) -> None:
+    """The rest is that of the preset that the file names, else of the default; dotted names and groups both work."""
+    path = tmp_path / "mine.json"
+    path.write_text('{"preset": "paper", "scene_type": "indoor", "optimizer.lr_sigma": 1, "loss": {"lambda_size": 0}}')
+    changes = {"optimizer.lr_sigma": 1.0, "loss.lambda_size": 0.0}
+    assert TrainConfig.from_file(path) == TrainConfig.paper("indoor").changed(changes)
+    path.write_text('{"output": {"lpips_weights": "weights.pth"}}')
+    weights = {"output.lpips_weights": Path("weights.pth")}
+    assert ReconstructConfig.from_file(path) == RECONSTRUCT.changed(weights)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ('{"optimizer": {"lr_vertice": 1}}', r"optimizer\.lr_vertice: is no setting; did you mean optimizer\.lr_vert"),
+        ('{"lr_colors": 1}', r"lr_colors: is no setting; did you mean optimizer\.lr_colors\?"),
+        ('{"banana": 1}', r"banana: is no setting$"),
+        ('{"optimizer": 1}', r"optimizer: is a group of settings"),
+        ('{"iterations": "many"}', r"iterations: is 'many'; it must be a whole number"),
+        ('{"optimizer": {"lr_vertices": -1}}', r"optimizer\.lr_vertices: is -1\.0; it must be at least 0"),
+        ('{"start": {"opacity": 2}}', r"start\.opacity: is 2\.0; it must be between 0\.01 and 0\.999"),
+        ('{"regularization": {"edge_power": 3}}', r"edge_power: is 3; choose one of 1, 2"),
+        ('{"preset": "huge"}', r"preset: is 'huge'; choose one of best, paper"),
+        ('{"refinement": {"first": 0.7}}', r"refinement\.first: is after refinement\.last; make it smaller"),
+        ('{"iterations": ', r"is not JSON"),
+        ("[1, 2]", r"holds no settings"),
+        (json.dumps({"format": FORMAT, "task": "train", "config": {}}), r"has the settings of `etsplat train`"),
+    ],
+)
+def test_files_that_cannot_be_used_are_named_with_what_is_wrong(tmp_path: Path, content: str, message: str) -> None:
+    """One line: the file, the setting, and what was probably meant."""
+    path = tmp_path / "mine.json"
+    path.write_text(content)
+    with pytest.raises(InputError, match=message) as error:
+        ReconstructConfig.from_file(path)
+    assert str(error.value).startswith(str(path))
+    assert "\n" not in str(error.value)
+
+
+def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"none\.json: cannot be read"):
+        TrainConfig.from_file(tmp_path / "none.json")
+
+
+@pytest.mark.parametrize(
+    ("config", "changes", "allowed"),
+    [
+        (RECONSTRUCT, {"method": "raster-face", "start.sigma": 0.3}, {"method": "elastic"}),
+        (RECONSTRUCT, {"method": "raster-vertex", "drawing.colors": "vertex"}, {"method": "bilateral"}),
+        (RECONSTRUCT, {"method": "raster-face", "drawing.distance": "sdf"}, {"method": "elastic"}),
+        (RECONSTRUCT, {"drawing.backend": "nvdiffrast"}, {"method": "raster-face"}),
+        (RECONSTRUCT, {"optimizer.large_steps_weight": 3.0}, {"optimizer.vertex_update": "large-steps"}),
+        (
+            RECONSTRUCT,
+            {"optimizer.sigma_final": 0.1, "optimizer.lr_sigma": 0.1},
+            {"optimizer.sigma_final": 0.0},
+        ),
+        (
+            RECONSTRUCT,
+            {"pictures.coarse_levels": 0, "pictures.coarse_until": 0.2},
+            {"pictures.coarse_levels": 1},
+        ),
+        (TRAIN, {"drawing.freeze_inradius": False}, {"method": "single-sided"}),
+        (TRAIN, {"loss.regularize_from": 100}, {"loss.lambda_distortion": 1.0}),
+        (TRAIN, {"finish": "opaque", "loss.lambda_opacity": 0.1}, {"finish": "none"}),
+        (TRAIN, {"finish": "opaque", "densification.replace_dead": False}, {"finish": "none"}),
+        (TRAIN, {"drawing.sh_degree": 0, "schedule.sh_every": 10}, {"drawing.sh_degree": 1}),
+        (RenderConfig(), {"frames": 7}, {"path": "orbit"}),
+        (RenderConfig(), {"fps": 7}, {"format": "mp4"}),
+    ],
+    ids=lambda value: next(iter(value)) if isinstance(value, dict) else type(value).__name__,
+)
+def test_what_would_have_no_effect_is_refused(
+    config: Settings, changes: dict[str, Any], allowed: dict[str, Any]
+) -> None:
+    """With the name of the setting and what it needs; where it has that, it is taken."""
+    with pytest.raises(InputError, match="|".join(name.replace(".", r"\.") for name in changes)):
+        config.changed(changes)
+    config.changed({**changes, **allowed})
+
+
+def test_a_method_without_softness_takes_the_soft_settings_of_its_preset() -> None:
+    """What a preset says of softness is nobody's wish, so every method goes with every preset."""
+    for preset in get_args(ReconstructPreset):
+        assert replace(ReconstructConfig.of(preset), method="raster-face").start == ReconstructConfig.of(preset).start
+    for preset in get_args(TrainPreset):
+        for scene in SCENE_TYPES:
+            assert replace(TrainConfig.of(preset, scene), finish="opaque").finish == "opaque"
+
+
+def test_changes_are_written_as_a_list() -> None:
+    """Numbers, none, true and false have the type of their setting."""
+    text = "iterations=2e3,start.limit=none,drawing.cull_small=True,optimizer.lr_sigma=1"
+    assert TRAIN.read_changes(text) == {
+        "iterations": 2000,
+        "start.limit": None,
+        "drawing.cull_small": True,
+        "optimizer.lr_sigma": 1.0,
+    }
+    for wrong, message in (("iterations=2.5", "whole number"), ("normalize=maybe", "true or false"), ("seed", "NAME=")):
+        with pytest.raises(InputError, match=message):
+            TRAIN.changed(TRAIN.read_changes(wrong))
