@@ -2,7 +2,8 @@
 
 import json
 import struct
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,61 +18,80 @@ OPAQUE_ALPHA = 0.99
 """Faces of GLB files with this alpha or more do not blend."""
 
 
-def write_ply(
-    path: Path,
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    vertex_colors: Colors,
-    face_colors: Colors,
-    numbers: Mapping[str, np.ndarray] | None = None,
-    comment: str | None = None,
-) -> None:
-    """Binary PLY; colours (V, 3|4) and (F, 3|4) have 8 bits. `numbers` are further values per face, by name."""
-    vertex = np.empty(len(vertices), [("x", "f4"), ("y", "f4"), ("z", "f4"), *_color_fields(vertex_colors)])
-    for axis, values in zip("xyz", vertices.T, strict=True):
+@dataclass(frozen=True)
+class Surface:
+    """What is written; each format takes what it knows.
+
+    Attributes:
+        vertices: (V, 3) float32.
+        faces: (F, 3).
+        vertex_colors: (V, 3|4) display values in [0, 1], or None.
+        face_colors: the same for faces.
+        name: what importers call the object.
+        numbers: further values per face, by name.
+        comment: a line of text.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    vertex_colors: Colors
+    face_colors: Colors
+    name: str
+    numbers: Mapping[str, np.ndarray]
+    comment: str | None = None
+
+
+def write_ply(path: Path, surface: Surface) -> None:
+    """Binary PLY with all there is; colours have 8 bits."""
+    s = surface
+    vertex = np.empty(len(s.vertices), [("x", "f4"), ("y", "f4"), ("z", "f4"), *_color_fields(s.vertex_colors)])
+    for axis, values in zip("xyz", s.vertices.T, strict=True):
         vertex[axis] = values
-    extra = [(name, "f4") for name in numbers or {}]
-    face = np.empty(len(faces), [(CORNERS, "i4", (3,)), *_color_fields(face_colors), *extra])
-    face[CORNERS] = faces
-    for name, values in (numbers or {}).items():
+    extra = [(name, "f4") for name in s.numbers]
+    face = np.empty(len(s.faces), [(CORNERS, "i4", (3,)), *_color_fields(s.face_colors), *extra])
+    face[CORNERS] = s.faces
+    for name, values in s.numbers.items():
         face[name] = values
-    for table, colors in ((vertex, vertex_colors), (face, face_colors)):
+    for table, colors in ((vertex, s.vertex_colors), (face, s.face_colors)):
         for (name, _), values in zip(_color_fields(colors), () if colors is None else colors.T, strict=True):
             table[name] = np.floor(values * 255 + 0.5)
-    path.write_bytes(encode_ply({"vertex": vertex, "face": face}, comment))
+    path.write_bytes(encode_ply({"vertex": vertex, "face": face}, s.comment))
 
 
 def _color_fields(colors: Colors) -> list[tuple[str, str]]:
     return [] if colors is None else [(name, "u1") for name in ("red", "green", "blue", "alpha")[: colors.shape[1]]]
 
 
-def write_obj(path: Path, vertices: np.ndarray, faces: np.ndarray, colors: Colors) -> None:
-    """Wavefront OBJ; colours (V, 3) follow the coordinates, the extension that MeshLab and Blender read."""
-    rows = vertices if colors is None else np.hstack([vertices, colors.astype(np.float32)])
+def write_obj(path: Path, surface: Surface) -> None:
+    """Wavefront OBJ; colours of vertices follow the coordinates, the extension that MeshLab and Blender read."""
+    rows, colors = surface.vertices, surface.vertex_colors
+    if colors is not None:
+        rows = np.hstack([rows, colors[:, :3].astype(np.float32)])
     line = "v " + " ".join(["%.9g"] * 3 + ["%.6g"] * (rows.shape[1] - 3))
     with open(path, "w", encoding="ascii", newline="\n") as file:
         np.savetxt(file, rows, fmt=line)
-        np.savetxt(file, faces + 1, fmt="f %d %d %d")
+        np.savetxt(file, surface.faces + 1, fmt="f %d %d %d")
 
 
-def write_off(path: Path, vertices: np.ndarray, faces: np.ndarray, colors: Colors) -> None:
-    """OFF; `colors` (F, 3) or (F, 4) per face follow the corners as whole numbers from 0 to 255."""
-    rows = np.hstack([np.full((len(faces), 1), 3), faces])
-    if colors is not None:
-        rows = np.hstack([rows, np.floor(colors * 255 + 0.5).astype(np.int64)])
+def write_off(path: Path, surface: Surface) -> None:
+    """OFF; colours of faces follow the corners as whole numbers from 0 to 255."""
+    rows = np.hstack([np.full((len(surface.faces), 1), 3), surface.faces])
+    if surface.face_colors is not None:
+        rows = np.hstack([rows, np.floor(surface.face_colors * 255 + 0.5).astype(np.int64)])
     with open(path, "w", encoding="ascii", newline="\n") as file:
-        file.write(f"OFF\n{len(vertices)} {len(faces)} 0\n")
-        np.savetxt(file, vertices, fmt="%.9g")
+        file.write(f"OFF\n{len(surface.vertices)} {len(rows)} 0\n")
+        np.savetxt(file, surface.vertices, fmt="%.9g")
         np.savetxt(file, rows, fmt="%d")
 
 
-def write_glb(path: Path, vertices: np.ndarray, faces: np.ndarray, colors: Colors, name: str) -> None:
+def write_glb(path: Path, surface: Surface) -> None:
     """Binary glTF 2.0. Colours of vertices, display values, become linear COLOR_0 under an unlit material.
 
     With (V, 4) the last channel is alpha. Faces with all corners above `OPAQUE_ALPHA` are a primitive of their own and
     stay opaque: viewers sort what blends by mesh at best, and do not let it hide anything. COLOR_0 has an alpha in any
-    case, as programs that read with Assimp take one that is missing for 0. `name` is what importers call the object.
+    case, as programs that read with Assimp take one that is missing for 0.
     """
+    vertices, faces, colors = surface.vertices, surface.faces, surface.vertex_colors
     parts = [(faces, "OPAQUE")]
     if colors is not None and colors.shape[1] == 4:
         solid = (colors[:, 3] >= OPAQUE_ALPHA)[faces].all(axis=1)
@@ -98,8 +118,8 @@ def write_glb(path: Path, vertices: np.ndarray, faces: np.ndarray, colors: Color
         "asset": {"version": "2.0", "generator": "etsplat"},
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "name": name}],
-        "meshes": [{"primitives": primitives, "name": name}],
+        "nodes": [{"mesh": 0, "name": surface.name}],
+        "meshes": [{"primitives": primitives, "name": surface.name}],
         "materials": [_gltf_material(mode, unlit=colors is not None) for _, mode in parts],
         "buffers": [{"byteLength": offset}],
         "bufferViews": views,
@@ -125,3 +145,15 @@ def _gltf_material(mode: str, *, unlit: bool) -> dict[str, Any]:
         "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0},
     }
     return {**material, "extensions": {"KHR_materials_unlit": {}}} if unlit else material
+
+
+WRITERS: dict[str, Callable[[Path, Surface], None]] = {
+    ".ply": write_ply,
+    ".obj": write_obj,
+    ".off": write_off,
+    ".glb": write_glb,
+}
+"""By suffix, lower case."""
+
+COLORED_BY_FACE = (".off",)
+"""Formats that know colours of faces alone."""

@@ -10,11 +10,11 @@ from torch import Tensor
 
 from etsplat.core.errors import InputError
 from etsplat.io._mesh_readers import READERS, RawMesh
-from etsplat.io._mesh_writers import write_glb, write_obj, write_ply
+from etsplat.io._mesh_writers import COLORED_BY_FACE, WRITERS, Surface
 from etsplat.io.atomic import atomic_write
 from etsplat.io.paths import kind_of, path_remedy
 
-MESH_SUFFIXES = (".ply", ".obj", ".glb")
+MESH_SUFFIXES = tuple(suffix for suffix in WRITERS if suffix not in COLORED_BY_FACE)
 """Kinds of files that `save_mesh` writes."""
 
 
@@ -110,12 +110,7 @@ def save_mesh(
         per_vertex = np.repeat(per_face, 3, axis=0) if split else _vertex_means(v, f, per_face)
     v = v.astype(np.float32)
     with atomic_write(path) as temporary:
-        if suffix == ".ply":
-            write_ply(temporary, v, f, per_vertex, per_face)
-        elif suffix == ".obj":
-            write_obj(temporary, v, f, per_vertex)
-        else:
-            write_glb(temporary, v, f, per_vertex, path.stem)
+        WRITERS[suffix](temporary, Surface(v, f, per_vertex, per_face, path.stem, {}))
 
 
 def weld_vertices(mesh: MeshFile) -> MeshFile:

@@ -7,11 +7,9 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
-from etsplat.io._mesh_writers import write_glb, write_obj, write_off, write_ply
+from etsplat.io._mesh_writers import COLORED_BY_FACE, WRITERS, Surface
 from etsplat.io.atomic import atomic_write
 from etsplat.io.paths import kind_of
-
-TRIANGLE_SUFFIXES = (".ply", ".obj", ".off", ".glb")
 
 
 def save_triangles(
@@ -43,27 +41,17 @@ def save_triangles(
     """
     path = Path(path)
     suffix = kind_of(path)
-    if suffix not in TRIANGLE_SUFFIXES:
-        raise ValueError(f"path: expected one of the suffixes {', '.join(TRIANGLE_SUFFIXES)}, got {path.name}")
+    if suffix not in WRITERS:
+        raise ValueError(f"path: expected one of the suffixes {', '.join(WRITERS)}, got {path.name}")
     if vertices.shape[1:] != (3, 3) or colors.shape not in ((len(vertices), 3), (len(vertices), 4)):
         raise ValueError(f"vertices, colors: expected (N, 3, 3), (N, 3|4); got {vertices.shape}, {colors.shape}")
     corners = vertices.detach().cpu().numpy().astype(np.float32).reshape(-1, 3)
     face_colors = colors.detach().cpu().double().clamp(0, 1).numpy()
-    if suffix == ".off":
-        points, faces, _ = _indexed(corners, None, weld)
-        with atomic_write(path) as temporary:
-            write_off(temporary, points, faces, face_colors)
-        return
-    points, faces, point_colors = _indexed(corners, np.repeat(face_colors, 3, axis=0), weld)
-    assert point_colors is not None
+    corner_colors = None if suffix in COLORED_BY_FACE else np.repeat(face_colors, 3, axis=0)
+    points, faces, point_colors = _indexed(corners, corner_colors, weld)
+    extra = {name: value.detach().cpu().numpy() for name, value in (numbers or {}).items()}
     with atomic_write(path) as temporary:
-        if suffix == ".ply":
-            extra = {name: value.detach().cpu().numpy() for name, value in (numbers or {}).items()}
-            write_ply(temporary, points, faces, point_colors, face_colors, extra, comment)
-        elif suffix == ".obj":
-            write_obj(temporary, points, faces, point_colors[:, :3])
-        else:
-            write_glb(temporary, points, faces, point_colors, path.stem)
+        WRITERS[suffix](temporary, Surface(points, faces, point_colors, face_colors, path.stem, extra, comment))
 
 
 def _indexed(
