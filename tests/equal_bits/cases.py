@@ -37,6 +37,8 @@ _SCENE = f"--preset tiny --width 48 --iterations 120 --max-triangles 6000 {_EVER
 _SMALL = f"--width 48 --iterations 120 --max-triangles 6000 {_EVERY}"
 # Plain PyTorch is slow.
 _FEW = "--engine reference --iterations 15 --log-every 5 --evaluate-every 5 --checkpoint-every 5"
+# So short a run would lose all triangles where there are few photos.
+_KEPT = "--prune-importance 0.002 --lambda-opacity 0.0005"
 
 CASES = (
     Case("owl-elastic", "demo", _OWL),
@@ -72,11 +74,11 @@ CASES = (
     Case("scene-paper-indoor", "demo scene", f"--preset paper --scene-type indoor {_SMALL}"),
     Case("scene-paper-object", "demo scene", f"--preset paper --scene-type object {_SMALL} --regularize-from 5000"),
     Case("scene-paper-sided", "demo scene", f"--preset paper --method single-sided {_SMALL} --lambda-distortion 0.1"),
-    Case("soup-quick", "train rgba", f"--preset quick --scene-type object {_SMALL} --background random"),
+    Case("soup-quick", "train rgba", f"--preset quick --scene-type object {_SMALL} {_KEPT} --background random"),
     Case("soup-indoor", "train rgba", f"--preset quick --scene-type indoor {_SMALL}"),
-    Case("soup-masks", "train masked", f"{_SCENE} --max-epochs 6", "interrupt"),
+    Case("soup-masks", "train masked", f"{_SCENE} {_KEPT} --max-epochs 6", "interrupt"),
     Case("soup-other-masks", "train rgba", f"{_SCENE} --masks masked/masks --sky-closed"),
-    Case("soup-pointless", "train pointless", f"{_SCENE} --start-points 800", "interrupt"),
+    Case("soup-pointless", "train pointless", f"{_SCENE} {_KEPT} --start-points 800", "interrupt"),
 )
 
 CONTROLS = ("owl-elastic", "scene-elastic")

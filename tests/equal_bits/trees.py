@@ -1,6 +1,5 @@
 """The two trees: a copy of this one, and BASE in a git work tree with a native build of its own."""
 
-import fcntl
 import hashlib
 import json
 import os
@@ -115,6 +114,8 @@ def digest(value: object) -> str:
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
     """One process at a time."""
+    import fcntl  # not everywhere, and the tests of the comparison do without
+
     folder.mkdir(parents=True, exist_ok=True)
     with open(folder / "lock", "w") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
