@@ -11,6 +11,8 @@ from etsplat import intrinsics, look_at
 from etsplat.cli.parse import parse
 from etsplat.core.cameras import Cameras
 from etsplat.core.errors import InputError
+from etsplat.io import writers
+from etsplat.io.mesh_files import save_mesh
 from etsplat.io.ply_tables import encode_ply, read_ply_tables
 from etsplat.io.srgb import srgb_from_linear
 from etsplat.model.soup_files import SoupFile, save_soup
@@ -188,7 +190,7 @@ def test_the_kind_of_file_follows_from_its_name(tmp_path, soup, capsys):
     assert {"a.ply", "soup.off"} <= {path.name for path in tmp_path.iterdir()}
     with pytest.raises(InputError, match=r"does not end in \.glb; rename"):
         parse(["export", str(tmp_path / "soup.safetensors"), "--format", "glb", "--out", "b.ply"]).run([])
-    with pytest.raises(InputError, match=r"does not end in \.ply or"):
+    with pytest.raises(InputError, match=r"does not end in \.glb or \.obj or \.off or \.ply or \.safetensors; rename"):
         parse(["export", str(tmp_path / "soup.safetensors"), "--out", "b.xyz"]).run([])
 
 
@@ -208,6 +210,34 @@ def test_the_kind_of_file_does_not_depend_on_capitals(tmp_path, soup, kind):
         command = ["export", str(tmp_path / "from.SAFETENSORS"), "--out", str(out), "--min-opacity", "0", *more]
         assert parse(command).run([]) == 0
         assert torch.equal(open_soup(out).soup.vertices, soup.vertices)
+
+
+def test_a_kind_of_file_of_ones_own_is_one_module(tmp_path, soup, monkeypatch):
+    """It is found by being there, told of what it has room for alone, and offered on the command line with its line."""
+    (tmp_path / "code").mkdir()
+    (tmp_path / "code" / "tri.py").write_text(
+        '''"""For a test."""
+
+HOLDS = frozenset({"face_colors"})
+
+
+def write(path, surface):
+    """A line for each triangle."""
+    assert surface.vertex_colors is None
+    rows = [*surface.vertices[surface.faces].reshape(-1, 9)], surface.face_colors
+    path.write_text("".join(f"{list(map(float, corners))} {list(color)}\\n" for corners, color in zip(*rows)))
+'''
+    )
+    monkeypatch.setattr(writers, "__path__", [*writers.__path__, str(tmp_path / "code")])
+    export_soup(run_of(soup), tmp_path / "soup.tri", ExportConfig(colors="constant", min_opacity=0.0))
+    lines = (tmp_path / "soup.tri").read_text().splitlines()
+    assert len(lines) == len(soup)
+    assert lines[7].startswith(str(soup.vertices[7].flatten().tolist()))
+    assert writers.purposes()["tri"] == "For a test."
+    with pytest.raises(InputError, match=r"soup\.tri: files of this kind hold no opacities"):
+        export_soup(run_of(soup), tmp_path / "soup.tri", ExportConfig(alpha=True))
+    with pytest.raises(ValueError, match=r"expected one of the suffixes \.glb, \.obj, \.ply, got mesh\.tri"):
+        save_mesh(tmp_path / "mesh.tri", torch.eye(3), torch.tensor([[0, 1, 2]]))
 
 
 def test_what_a_kind_of_file_cannot_hold_does_not_depend_on_capitals(tmp_path, soup):

@@ -3,13 +3,23 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import tyro
 
 from etsplat.cli.command import Command
+from etsplat.io.writers import purposes
 from etsplat.tasks.export_config import ExportConfig
 from etsplat.tasks.settings import Device
+
+PURPOSES = {**purposes(), "safetensors": "For etsplat."}
+if TYPE_CHECKING:
+    Kind = str
+else:
+    Kind = Literal[tuple(PURPOSES)]
+_FORMAT = "\n".join(
+    ["Kind of file; by default what --out ends in, or glb.", *(f"{kind}: {use}" for kind, use in PURPOSES.items())]
+)
 
 Settings = Annotated[ExportConfig, tyro.conf.arg(name=""), tyro.conf.OmitArgPrefixes]
 
@@ -27,12 +37,7 @@ class Export(Command):
 
     run_dir: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(name="dir")]
     """A run of `etsplat train`; or a file: .safetensors, .pt of Triangle Splatting, Gaussian .ply, or a mesh."""
-    format: Literal["ply", "obj", "off", "glb", "safetensors"] | None = None
-    """Kind of file; by default what --out ends in, or glb.
-    glb: for Blender, game engines and the web;
-    Unity needs the package com.unity.cloud.gltfast for it;
-    ply: for MeshLab and Open3D (glb is too dark there);
-    obj and off: for others; safetensors: for etsplat."""
+    format: Annotated[Kind | None, tyro.conf.arg(help=_FORMAT)] = None
     out: Path | None = None
     """The file to write; by default soup.FORMAT in the run's folder."""
     scene: Path | None = None
@@ -55,7 +60,7 @@ class Export(Command):
 
         opened = open_run(self.run_dir, self.scene, self.device)
         out = self.out or opened.folder / f"soup.{self.format or 'glb'}"
-        kinds = [self.format] if self.format else ["ply", "obj", "off", "glb", "safetensors"]
+        kinds = [self.format] if self.format else list(PURPOSES)
         if kind_of(out).removeprefix(".") not in kinds:
             raise InputError(f"--out {out}: does not end in .{' or .'.join(kinds)}; rename it or change --format")
         read = self.run_dir / "soup.safetensors" if self.run_dir.is_dir() else self.run_dir

@@ -1,4 +1,4 @@
-"""Triangle meshes on disk: PLY, OBJ, GLB, STL and OFF in; PLY, OBJ and GLB with colours out."""
+"""Triangle meshes on disk: PLY, OBJ, GLB, STL and OFF in; every kind of file with colours at vertices out."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,12 +10,9 @@ from torch import Tensor
 
 from etsplat.core.errors import InputError
 from etsplat.io._mesh_readers import READERS, RawMesh
-from etsplat.io._mesh_writers import COLORED_BY_FACE, WRITERS, Surface
-from etsplat.io.atomic import atomic_write
 from etsplat.io.paths import kind_of, path_remedy
-
-MESH_SUFFIXES = tuple(suffix for suffix in WRITERS if suffix not in COLORED_BY_FACE)
-"""Kinds of files that `save_mesh` writes."""
+from etsplat.io.surface import Surface
+from etsplat.io.surface_files import save_surface, writer_of
 
 
 @dataclass(frozen=True)
@@ -96,9 +93,7 @@ def save_mesh(
         InputError: the file cannot be written.
     """
     path = Path(path)
-    suffix = kind_of(path)
-    if suffix not in MESH_SUFFIXES:
-        raise ValueError(f"path: expected one of the suffixes {', '.join(MESH_SUFFIXES)}, got {path.name}")
+    writer_of(path, holding="vertex_colors")
     _check_arguments(vertices, faces, face_colors, vertex_colors)
     v = vertices.detach().to("cpu", torch.float64).numpy()
     f = faces.detach().to("cpu", torch.int64).numpy()
@@ -108,9 +103,7 @@ def save_mesh(
         v, f = v[f].reshape(-1, 3), np.arange(f.size).reshape(-1, 3)
     if per_face is not None:
         per_vertex = np.repeat(per_face, 3, axis=0) if split else _vertex_means(v, f, per_face)
-    v = v.astype(np.float32)
-    with atomic_write(path) as temporary:
-        WRITERS[suffix](temporary, Surface(v, f, per_vertex, per_face, path.stem, {}))
+    save_surface(path, Surface(v.astype(np.float32), f, per_vertex, per_face, name=path.stem))
 
 
 def weld_vertices(mesh: MeshFile) -> MeshFile:

@@ -7,9 +7,8 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
-from etsplat.io._mesh_writers import COLORED_BY_FACE, WRITERS, Surface
-from etsplat.io.atomic import atomic_write
-from etsplat.io.paths import kind_of
+from etsplat.io.surface import Surface
+from etsplat.io.surface_files import save_surface, writer_of
 
 
 def save_triangles(
@@ -28,30 +27,28 @@ def save_triangles(
     is unlit. Colours have 8 bits in PLY and OFF.
 
     Args:
-        path: ends in .ply, .obj, .off or .glb.
+        path: ends in what a module of `etsplat.io.writers` writes: .ply, .obj, .off or .glb.
         vertices: (N, 3, 3) finite positions.
-        colors: (N, 3), or (N, 4) with alpha, which OBJ leaves out; in [0, 1] (others are clamped).
-        weld: triangles share vertices at equal positions, where their colours are equal too (OFF: all of them).
-        numbers: further values per face, by name; only PLY holds them.
-        comment: a line of text; only PLY holds it.
+        colors: (N, 3), or (N, 4) with alpha, which files without room for it leave out; in [0, 1] (others are clamped).
+        weld: triangles share vertices at equal positions, where their colours are equal too
+            (in files without colours at vertices: all of them).
+        numbers: further values per face, by name; only PLY has room for them.
+        comment: a line of text; only PLY has room for it.
 
     Raises:
         ValueError: another suffix or wrong shapes.
         InputError: the file cannot be written.
     """
     path = Path(path)
-    suffix = kind_of(path)
-    if suffix not in WRITERS:
-        raise ValueError(f"path: expected one of the suffixes {', '.join(WRITERS)}, got {path.name}")
+    holds = writer_of(path).HOLDS
     if vertices.shape[1:] != (3, 3) or colors.shape not in ((len(vertices), 3), (len(vertices), 4)):
         raise ValueError(f"vertices, colors: expected (N, 3, 3), (N, 3|4); got {vertices.shape}, {colors.shape}")
     corners = vertices.detach().cpu().numpy().astype(np.float32).reshape(-1, 3)
     face_colors = colors.detach().cpu().double().clamp(0, 1).numpy()
-    corner_colors = None if suffix in COLORED_BY_FACE else np.repeat(face_colors, 3, axis=0)
+    corner_colors = np.repeat(face_colors, 3, axis=0) if "vertex_colors" in holds else None
     points, faces, point_colors = _indexed(corners, corner_colors, weld)
     extra = {name: value.detach().cpu().numpy() for name, value in (numbers or {}).items()}
-    with atomic_write(path) as temporary:
-        WRITERS[suffix](temporary, Surface(points, faces, point_colors, face_colors, path.stem, extra, comment))
+    save_surface(path, Surface(points, faces, point_colors, face_colors, extra, comment, path.stem))
 
 
 def _indexed(

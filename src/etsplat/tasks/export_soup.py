@@ -10,6 +10,7 @@ from torch import Tensor
 from etsplat.core.cameras import Cameras
 from etsplat.core.errors import InputError
 from etsplat.io.paths import kind_of
+from etsplat.io.surface_files import suffixes, writer_of
 from etsplat.io.triangle_files import save_triangles
 from etsplat.model.soup_files import save_soup
 from etsplat.model.soup_rendering import OPAQUE_FROM, SoupAppearance, render_soup
@@ -32,19 +33,20 @@ class Export:
 
 
 def export_soup(run: SoupRun, path: Path | str, config: ExportConfig) -> Export:
-    """Write a soup to `path`, whose suffix chooses the format: .ply, .obj, .off, .glb, .safetensors.
+    """Write a soup to `path`, whose suffix chooses the format: .safetensors, or one of `etsplat.io.writers`.
 
     Raises:
         InputError: settings that contradict each other; nothing is left; the file cannot be written.
     """
     path = Path(path)
-    kind = kind_of(path)
-    if kind == ".safetensors":
+    if kind_of(path) == ".safetensors":
         save_soup(path, run.file)
         return Export(path, len(run.file.soup), 0)
-    if config.colors == "keep" and (kind != ".ply" or config.up == "y"):
-        raise InputError("colours that depend on the direction (--colors keep) need --format ply and --up keep")
-    if config.alpha and kind == ".obj":
+    holds = writer_of(path).HOLDS
+    if config.colors == "keep" and ("numbers" not in holds or config.up == "y"):
+        kinds = " or ".join(suffix[1:] for suffix in suffixes("numbers"))
+        raise InputError(f"colours that depend on the direction (--colors keep) need --format {kinds} and --up keep")
+    if config.alpha and "alpha" not in holds:
         raise InputError(f"{path}: files of this kind hold no opacities; leave out --alpha, or choose another --format")
     soup, appearance = run.file.soup, run.file.appearance
     opacities = appearance.opacities(soup).detach()

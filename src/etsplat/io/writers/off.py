@@ -1,0 +1,20 @@
+"""For programs that read neither of the others; colours at faces."""
+
+from pathlib import Path
+
+import numpy as np
+
+from etsplat.io.surface import Content, Surface
+
+HOLDS: frozenset[Content] = frozenset({"face_colors", "alpha"})
+
+
+def write(path: Path, surface: Surface) -> None:
+    """OFF; colours follow the corners of each face as whole numbers from 0 to 255."""
+    rows = np.hstack([np.full((len(surface.faces), 1), 3), surface.faces])
+    if surface.face_colors is not None:
+        rows = np.hstack([rows, np.floor(surface.face_colors * 255 + 0.5).astype(np.int64)])
+    with open(path, "w", encoding="ascii", newline="\n") as file:
+        file.write(f"OFF\n{len(surface.vertices)} {len(surface.faces)} 0\n")
+        np.savetxt(file, surface.vertices, fmt="%.9g")
+        np.savetxt(file, rows, fmt="%d")
