@@ -76,7 +76,9 @@ CASES = (
     Case("scene-paper-sided", "demo scene", f"--preset paper --method single-sided {_SMALL} --lambda-distortion 0.1"),
     Case("soup-quick", "train rgba", f"--preset quick --scene-type object {_SMALL} {_KEPT} --background random"),
     Case("soup-indoor", "train rgba", f"--preset quick --scene-type indoor {_SMALL}"),
-    Case("soup-masks", "train masked", f"{_SCENE} {_KEPT} --max-epochs 6", "interrupt"),
+    Case(
+        "soup-masks", "train masked", f"{_SCENE} --prune-importance 0 --prune-opacity 0.001 --max-epochs 9", "interrupt"
+    ),
     Case("soup-other-masks", "train rgba", f"{_SCENE} --masks masked/masks --sky-closed"),
     Case("soup-pointless", "train pointless", f"{_SCENE} {_KEPT} --start-points 800", "interrupt"),
 )
