@@ -32,6 +32,14 @@ def test_layers_hold() -> None:
     assert result.returncode == 0, result.stdout
 
 
+def test_tests_mirror_the_sources() -> None:
+    """Each folder of tests is named as a layer, but for what tests share and what is beside the package."""
+    tests = {path.name for path in (REPOSITORY / "tests").iterdir() if path.is_dir() and any(path.glob("**/*.py"))}
+    layers = {path.parent.name for path in (REPOSITORY / "src" / "etsplat").glob("*/__init__.py")}
+    assert tests - layers == {"equal_bits", "helpers", "studies"}
+    assert layers - tests == set()
+
+
 def test_report_assets_are_installed() -> None:
     """The report's page, style and scripts come with the package, and so does the typing marker."""
     for name in ("page.html", "page.css", "page.js", "viewer.js"):
