@@ -2,12 +2,13 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import ClassVar, cast
 
@@ -23,7 +24,11 @@ from etsplat.cli.train import Train
 from etsplat.core.errors import InputError
 from etsplat.geometry.icosphere import icosphere
 from etsplat.io.mesh_files import save_mesh
+from etsplat.io.run_directory import FORMAT
+from etsplat.tasks.export_config import ExportConfig
 from etsplat.tasks.reconstruct_config import ReconstructConfig
+from etsplat.tasks.render_config import RenderConfig
+from etsplat.tasks.settings import settings_of
 from etsplat.tasks.train_config import TrainConfig
 
 PROGRAM = [sys.executable, "-c", "from etsplat.cli import main; main()"]
@@ -80,9 +85,78 @@ def test_help_lists_the_commands(etsplat: Run, arguments: list[str]) -> None:
         assert word in result.stdout
 
 
+@pytest.mark.parametrize("command", ["reconstruct", "train"])
+def test_help_is_short_and_help_all_has_the_rest_under_headings(etsplat: Run, command: str) -> None:
+    """About a dozen options at first; then every setting, each group with its own help."""
+    brief, whole = (etsplat(command, option).stdout for option in ("--help", "--help-all"))
+    config = ReconstructConfig if command == "reconstruct" else TrainConfig
+    assert 10 <= len(options_in(brief)) <= 16
+    options = {"--" + name.replace("_", "-") for name in settings_of(config)}
+    assert options <= set(options_in(whole))
+    assert "--help-all" in brief
+    assert "optimizer options" in whole
+    assert "optimizer options" not in brief
+    assert "How vertices, colours, opacities and softness move." in whole
+
+
+def options_in(text: str) -> list[str]:
+    """The options that a help lists, once each."""
+    return re.findall(r"^│ (?:-h, )?(--[a-z.-]+)", text, re.MULTILINE)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("reconstrct", "reconstrct: is no command; did you mean reconstruct? `etsplat --help` lists them"),
+        ("demo scne", "scne: is no command; did you mean scene? `etsplat demo --help` lists them"),
+        ("data xyz --out a", "xyz: is no command; `etsplat data --help` lists them"),
+    ],
+)
+def test_commands_that_were_probably_meant_are_named(etsplat: Run, words: str, message: str) -> None:
+    result = etsplat(*words.split())
+    assert_one_line_error(result, message)
+
+
+def test_options_that_were_probably_meant_are_named(etsplat: Run) -> None:
+    """Of the command that is asked for, whichever group they are in."""
+    result = etsplat("train", "scene", "--out", "run", "--lr-vertices", "1")
+    assert result.returncode == 2
+    assert "--optimizer.lr-vertices FLOAT" in result.stderr
+    assert "reconstruct" not in result.stderr
+
+
+def test_demo_alone_is_demo_object() -> None:
+    """Options may follow in both cases."""
+    for words in (["demo"], ["demo", "object"]):
+        command = parse([*words, "--start.level", "3"])
+        assert isinstance(command, DemoObject)
+        assert command.settings == ReconstructConfig.demo().changed({"start.level": 3})
+
+
+def test_settings_of_a_run_are_taken_over_and_options_change_them(tmp_path: Path) -> None:
+    """--config takes config.json of a run, or some settings; what is given as an option goes over it."""
+    config = TrainConfig.paper("indoor").changed({"iterations": 77, "start.scale": 3.0})
+    record = {"format": FORMAT, "task": "train", "config": config.to_dict()}
+    (tmp_path / "config.json").write_text(json.dumps(record))
+    (tmp_path / "mine.json").write_text('{"start": {"scale": 3}}')
+    words = ["train", "scene", "--out", "run", "--config"]
+    again = parse([*words, str(tmp_path / "config.json"), "--start.scale", "4"])
+    assert isinstance(again, Train)
+    assert again.settings == config.changed({"start.scale": 4.0})
+    part = parse([*words, str(tmp_path / "mine.json"), "--preset", "paper"])
+    assert isinstance(part, Train)
+    assert part.settings == TrainConfig.paper().changed({"start.scale": 3.0})
+    with pytest.raises(InputError, match=r"preset: .*config\.json is of preset paper already; leave one of them out"):
+        parse([*words, str(tmp_path / "config.json"), "--preset", "quick"])
+    with pytest.raises(InputError, match=r"has the settings of `etsplat train`; name a run of `etsplat reconstruct`"):
+        parse(["reconstruct", "a.ply", "--out", "run", "--config", str(tmp_path / "config.json")])
+
+
 def test_lines_of_help_end_where_clauses_do() -> None:
     """Help keeps the line breaks of docstrings, so that one within a clause would be seen."""
-    for settings in (*_commands(COMMANDS), ReconstructConfig, TrainConfig):
+    configs = (ReconstructConfig, TrainConfig, RenderConfig, ExportConfig)
+    groups = [field.default for config in configs for field in fields(config) if is_dataclass(field.default)]
+    for settings in (*_commands(COMMANDS), *configs, *map(type, groups)):
         for option in docstring_parser.parse_from_object(settings).params:
             for line in (option.description or "").splitlines()[:-1]:
                 assert line.endswith((".", ":", ";")), f"{settings.__name__}.{option.arg_name}: {line}"

@@ -13,8 +13,10 @@ class ExportConfig(Settings):
     """How a soup leaves for other programs."""
 
     colors: Bake = "mean"
-    """One colour per triangle: mean of what the training views see; constant part of its harmonics; or keep the
-    harmonics beside the latter (PLY only), so that the file comes back with the same colours from every side."""
+    """What becomes of colours that depend on the direction.
+    mean: one per triangle, of what the training views see;
+    constant: one per triangle, the constant part of its harmonics;
+    keep: that, and the harmonics beside it (PLY only): the file comes back with the same colours from every side."""
     min_opacity: Annotated[float | None, Range(0, 1)] = None
     """Leave out triangles less opaque than this; by default 0.5, as `etsplat render --opaque` does."""
     alpha: bool = False

@@ -13,8 +13,10 @@ class RenderConfig(Settings):
     """What is drawn of a soup, from where, and into which files."""
 
     path: ViewPath = "test"
-    """The test or training views; or a path: around what the cameras look at (orbit, ellipse), in front of it
-    (spiral), or from one training camera to the next (interpolated)."""
+    """The test or training views; or a path:
+    orbit, ellipse: around what the cameras look at;
+    spiral: in front of it;
+    interpolated: from one training camera to the next."""
     frames: Annotated[int, Range(1), Only("along a path", lambda config: config.path not in _VIEWS)] = 120
     """Of a path."""
     fps: Annotated[int, Range(1, 240), Only("in an MP4", lambda config: config.video)] = 30
