@@ -40,16 +40,16 @@ class GpuScene:
     def render(self) -> Rasterization:
         """A training step's rendering."""
         height, width = self.cotangent.shape[1:3]
-        engine = "cuda"
-        if self.sh is None:
-            colors = self.colors
-        else:
-            centers = -torch.einsum("bji,bj->bi", self.viewmats[:, :3, :3], self.viewmats[:, :3, 3])
-            colors = soup_colors(self.vertices, *self.sh, centers, 3, engine=engine)
-        return etsplat.rasterize(
-            self.vertices, colors, self.opacities, self.sigma, self.viewmats, self.Ks, width, height, faces=self.faces,
-            corner_colors=self.corner_colors, validate=False, engine=engine,
-        )  # fmt: skip
+        with etsplat.engine("cuda"):
+            if self.sh is None:
+                colors = self.colors
+            else:
+                centers = -torch.einsum("bji,bj->bi", self.viewmats[:, :3, :3], self.viewmats[:, :3, 3])
+                colors = soup_colors(self.vertices, *self.sh, centers, 3)
+            return etsplat.rasterize(
+                self.vertices, colors, self.opacities, self.sigma, self.viewmats, self.Ks, width, height,
+                faces=self.faces, corner_colors=self.corner_colors, validate=False,
+            )  # fmt: skip
 
 
 def load(name: str, device: str) -> GpuScene:

@@ -12,9 +12,9 @@ import torch
 
 from benchmarks.gpu_floors import Work
 from benchmarks.gpu_scenes import GpuScene
-from etsplat.cuda.launch import use_backend
-from etsplat.ops._raster_capacity import repair_overflow
-from etsplat.ops._raster_render_cuda import TILE, CudaRender
+from etsplat.engines.cuda.capacity import repair_overflow
+from etsplat.engines.cuda.launch import use_backend
+from etsplat.engines.cuda.rasterize import TILE, CudaRender
 
 WARM_UP = 5
 

@@ -14,10 +14,11 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
+import etsplat
 from etsplat.core.cameras import Cameras, intrinsics, look_at
+from etsplat.engines.threads import num_threads, one_torch_thread, set_num_threads
 from etsplat.geometry.topology import MeshTopology
 from etsplat.ops.adam import Adam
-from etsplat.ops.engines import num_threads, one_torch_thread, set_num_threads
 from etsplat.ops.mesh_energies import mesh_energies
 from etsplat.ops.normal_consistency import normal_consistency
 from etsplat.ops.photometric import photometric_loss
@@ -105,27 +106,32 @@ def soup_losses(size: int, vertices: torch.Tensor, faces: torch.Tensor) -> list[
     normals, depth = torch.rand(1, size, size, 3).requires_grad_(), (2 + torch.rand(1, size, size, 1)).requires_grad_()
     alpha, logits = torch.rand(1, size, size, 1), torch.randn(len(faces)).requires_grad_()
 
-    def agreement(engine: str) -> None:
+    def agreement() -> None:
         normals.grad = depth.grad = None
         with one_torch_thread():
-            normal_consistency(normals, depth, alpha, camera.viewmats, camera.Ks, engine=engine).backward()
+            normal_consistency(normals, depth, alpha, camera.viewmats, camera.Ks).backward()
 
-    def channels(engine: str) -> None:
+    def channels() -> None:
         corners.grad = None
         with one_torch_thread():
-            triangle_channels(corners, viewmats, depth=True, normals=True, engine=engine).sum().backward()
+            triangle_channels(corners, viewmats, depth=True, normals=True).sum().backward()
 
-    def activation(engine: str) -> None:
+    def activation() -> None:
         logits.grad = None
         with one_torch_thread():
-            opacities, _ = soup_activation(corners, logits, logits.detach(), (0.0, math.inf), camera, engine=engine)
+            opacities, _ = soup_activation(corners, logits, logits.detach(), (0.0, math.inf), camera)
             opacities.sum().backward()
 
     pixels, triangles = f"{size} x {size}", f"{len(faces):,} triangles"
     named = [("normal_consistency", pixels, agreement), ("triangle_channels", triangles, channels)]
     named.append(("soup_activation", triangles, activation))
+
+    def on(engine: str, run: Callable[[], None]) -> None:
+        with etsplat.engine(engine):
+            run()
+
     engines = {"cpu": ", with gradient", "reference": ", in PyTorch"}
-    return [(name + tail, at, partial(run, engine)) for name, at, run in named for engine, tail in engines.items()]
+    return [(name + tail, at, partial(on, engine, run)) for name, at, run in named for engine, tail in engines.items()]
 
 
 def milliseconds(operation: Callable[[], object], repeats: int) -> list[float]:

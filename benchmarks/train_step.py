@@ -17,7 +17,7 @@ from benchmarks.machine import description
 from etsplat.data.dataset import Dataset
 from etsplat.data.demo_scene import demo_scene
 from etsplat.data.load import load_dataset
-from etsplat.ops.engines import num_threads, one_torch_thread, set_num_threads
+from etsplat.engines.threads import num_threads, one_torch_thread, set_num_threads
 from etsplat.ops.photometric import photometric_loss
 from etsplat.ops.rasterize import rasterize
 from etsplat.ops.soup_colors import soup_colors

@@ -62,7 +62,7 @@ class Nvs(Study):
         from rich.console import Console
 
         from etsplat.cli.phases import PhaseBar
-        from etsplat.ops.engines import num_threads
+        from etsplat.engines.threads import num_threads
         from studies.grid.cells import count_jobs, run_grid
         from studies.grid.live import PSNR, LiveTable, conclude
         from studies.scenes.cells import evaluate_cells, make_nvs_cells, read_scene_argument

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from etsplat.core.kernels import DISTANCES, KERNELS
-from etsplat.cuda.launch import device_type, use_backend
+from etsplat.engines.cuda.launch import device_type, use_backend
 from helpers.simt.build import Simt
 
 # Tests run side by side, on small tensors: torch's own threads would only wait for each other.

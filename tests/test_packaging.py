@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from etsplat import _native
-from etsplat.cuda.program import source_root
+from etsplat.engines.cuda.program import source_root
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 

@@ -11,12 +11,14 @@ from etsplat.data.dataset import Dataset as Dataset
 from etsplat.data.demo_object import demo_object as demo_object
 from etsplat.data.hull import bounding_sphere as bounding_sphere
 from etsplat.data.load import load_dataset as load_dataset
+from etsplat.engines.choice import engine as engine
+from etsplat.engines.choice import register_engine as register_engine
+from etsplat.engines.threads import num_threads as num_threads
+from etsplat.engines.threads import set_num_threads as set_num_threads
 from etsplat.io.mesh_files import MeshFile as MeshFile
 from etsplat.io.mesh_files import load_mesh as load_mesh
 from etsplat.io.mesh_files import save_mesh as save_mesh
 from etsplat.ops.antialias import rasterize_antialiased as rasterize_antialiased
-from etsplat.ops.engines import num_threads as num_threads
-from etsplat.ops.engines import set_num_threads as set_num_threads
 from etsplat.ops.rasterize import rasterize as rasterize
 from etsplat.ops.rasterize_hard import HardRasterization as HardRasterization
 from etsplat.ops.rasterize_hard import rasterize_hard as rasterize_hard

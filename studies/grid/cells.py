@@ -17,9 +17,9 @@ from typing import Any
 
 from etsplat.core.errors import InputError
 from etsplat.core.processes import when_parent_ends
+from etsplat.engines.threads import num_threads
 from etsplat.io.atomic import write_error
 from etsplat.io.run_directory import RunDirectory, is_run
-from etsplat.ops.engines import num_threads
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.train_config import TrainConfig
 from studies.grid.variants import Variant
@@ -194,7 +194,7 @@ def _work(mesh: Path, folder: Path, config: AnyConfig, images: str | None, threa
 
 
 def _run(mesh: Path, folder: Path, config: AnyConfig, images: str | None, threads: int) -> None:
-    from etsplat.ops.engines import set_num_threads
+    from etsplat.engines.threads import set_num_threads
     from etsplat.tasks.reconstruct import reconstruct
     from etsplat.tasks.train import train
     from studies.peers.training import train_peer

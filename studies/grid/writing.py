@@ -10,8 +10,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from etsplat.engines.threads import num_threads
 from etsplat.io.atomic import atomic_write
-from etsplat.ops.engines import num_threads
 
 
 def origin_of(command: str) -> dict[str, str]:

@@ -116,7 +116,7 @@ class PeerDrawing:
     ) -> None:
         self._gsplat, self._gaussians, self._capture, self._config = gsplat, gaussians, capture, config
         self._background = _background(config, device)
-        self._scorer = SoupScorer(capture, self._background[0], None, device)
+        self._scorer = SoupScorer(capture, self._background[0], device)
         self._device = device
 
     @torch.no_grad()

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from etsplat.core.validation import check_finite, check_indices, check_positive, first_not_finite
-from etsplat.ops.pool import zeros_image
+from etsplat.engines.native.pool import zeros_image
 
 LARGE = 100_000  # several ranges of the native scans
 

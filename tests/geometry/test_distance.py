@@ -4,10 +4,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from etsplat.engines.threads import num_threads, set_num_threads
 from etsplat.geometry.distance import closest_points
 from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.sampling import sample_surface
-from etsplat.ops.engines import num_threads, set_num_threads
 from helpers.meshes import TETRAHEDRON, bumpy_sphere, read_obj
 
 

@@ -6,10 +6,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from etsplat.engines.threads import set_num_threads
 from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.intersections import count_degenerate_faces, count_self_intersections, intersecting_faces
 from etsplat.geometry.measures import bounding_ball
-from etsplat.ops.engines import set_num_threads
 from helpers.meshes import FAMOUS, TETRAHEDRON, bumpy_sphere, read_obj
 
 # The oracle: the definition in rational arithmetic, by clipping instead of by orientation signs.

@@ -5,9 +5,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from etsplat import Cutoffs, Rasterization, intrinsics, look_at, rasterize
-from etsplat.cuda.launch import device_type
+import etsplat
+from etsplat import Cutoffs, Rasterization, intrinsics, look_at
 from etsplat.geometry.icosphere import icosphere
+from helpers.engines import device_of, dtype_of
 
 NO_CUTOFFS = Cutoffs(alpha_min=0.0, alpha_max=1.0, x_max=float("inf"), transmittance_min=0.0)
 IMAGES = ("color", "alpha", "depth", "median_depth", "normal", "distortion")
@@ -102,14 +103,6 @@ def stacked(*scenes: Scene) -> Scene:
     return {**scenes[0], **joined}
 
 
-def dtype_of(engine: str) -> torch.dtype:
-    return torch.float64 if engine == "reference" else torch.float32
-
-
-def device_of(engine: str) -> str:
-    return device_type() if engine == "cuda" else "cpu"
-
-
 def accuracy(engine: str) -> float:
     """Relative error that a well-conditioned image may have."""
     return 1e-11 if engine == "reference" else 2e-5
@@ -129,7 +122,8 @@ def prepare(scene: Scene, engine: str, dtype: torch.dtype | None = None, require
 
 def render(scene: Scene, engine: str, **options: Any) -> Rasterization:
     arguments = {"colors": None, **prepare(scene, engine), **options}
-    return rasterize(**arguments, engine=engine)
+    with etsplat.engine(engine):
+        return etsplat.rasterize(**arguments)
 
 
 def gradients(
@@ -137,7 +131,8 @@ def gradients(
 ) -> tuple[Rasterization, dict[str, Tensor]]:
     """Run forward and backward; ``cotangents`` are dL/d(image) by the image's name."""
     prepared = prepare(scene, engine, dtype, requires_grad=True)
-    out = rasterize(**{"colors": None, **prepared, **options}, engine=engine)
+    with etsplat.engine(engine):
+        out = etsplat.rasterize(**{"colors": None, **prepared, **options})
     loss = sum(
         (getattr(out, name) * cotangent.to(prepared["vertices"])).sum() for name, cotangent in cotangents.items()
     )

@@ -1,8 +1,9 @@
 import pytest
 import torch
 
+from etsplat.engines.threads import num_threads, set_num_threads
 from etsplat.ops.adam import Adam
-from etsplat.ops.engines import num_threads, set_num_threads
+from helpers.engines import on
 
 SHAPES = {"vertices": (1001, 3), "colors": (20011, 3), "sigma": (), "empty": (0, 3)}
 RATES = {"vertices": 1e-3, "colors": 5e-2, "sigma": 2e-2, "empty": 1.0}
@@ -32,13 +33,13 @@ def test_equals_torch_adam_within_rounding(engine, rng, dtype):
         pytest.skip("the native engine computes in float32")
     ours = parameters(rng, dtype)
     theirs = copies(ours)
-    adam = Adam(ours, RATES, engine=engine)
+    adam = Adam(ours, RATES)
     expected = torch.optim.Adam([{"params": [theirs[n]], "lr": RATES[n], "name": n} for n in theirs], eps=1e-15)
     for step in range(12):
         set_gradients(rng, ours, theirs)
         if step == 6:
             adam.learning_rates["colors"] = expected.param_groups[1]["lr"] = 1e-2
-        adam.step()
+        on(engine, adam.step)
         expected.step()
     assert adam.step_count == 12
     tolerance = {"rtol": 2e-5, "atol": 2e-6} if dtype == torch.float32 else {"rtol": 1e-12, "atol": 1e-12}
@@ -51,7 +52,7 @@ def test_first_step_moves_by_the_learning_rate(engine):
     """After one step every element with a gradient has moved by lr against its sign, whatever its size."""
     parameter = torch.zeros(5, requires_grad=True)
     parameter.grad = torch.tensor([1e-6, -3.0, 0.0, 1e4, -1e-3])
-    Adam({"p": parameter}, {"p": 0.25}, engine=engine).step()
+    on(engine, Adam({"p": parameter}, {"p": 0.25}).step)
     torch.testing.assert_close(parameter.detach(), torch.tensor([-0.25, 0.25, 0.0, -0.25, 0.25]))
 
 

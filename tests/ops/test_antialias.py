@@ -7,13 +7,14 @@ import torch
 from torch import Tensor
 
 from etsplat.core.cameras import intrinsics, look_at
+from etsplat.engines.threads import num_threads, set_num_threads
 from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.topology import MeshTopology
 from etsplat.ops.antialias import rasterize_antialiased
 from etsplat.ops.antialias_nvdiffrast import rasterize_nvdiffrast
-from etsplat.ops.engines import num_threads, set_num_threads
 from etsplat.ops.mesh_energies import MeshConnectivity
 from etsplat.ops.rasterize_hard import render_opaque
+from helpers.engines import on
 from helpers.meshes import TETRAHEDRON, bumpy_sphere
 from helpers.tolerances import assert_close_to_scale
 
@@ -112,9 +113,9 @@ def test_a_half_plane_covers_its_pixels_exactly(engine):
     for edge, expected in ((8.3, 0.3), (8.7, 0.7)):
         corners = torch.tensor([[-90.0, -90.0, 1.0], [edge, -90.0, 1.0], [edge, 99.0, 1.0], [-90.0, 99.0, 1.0]])
         connectivity = connect(torch.tensor([[0, 1, 2], [0, 2, 3]]), corners)
-        image = rasterize_antialiased(
-            corners, connectivity, *FLAT, 16, 4, vertex_colors=torch.ones(4, 1), engine=engine
-        )[0, :, :, 0]
+        image = on(engine, rasterize_antialiased, corners, connectivity, *FLAT, 16, 4, vertex_colors=torch.ones(4, 1))[
+            0, :, :, 0
+        ]
         torch.testing.assert_close(image[:, :8], torch.ones(4, 8))
         torch.testing.assert_close(image[:, 8], torch.full((4,), expected))
         torch.testing.assert_close(image[:, 9:], torch.zeros(4, 7))
@@ -126,7 +127,7 @@ def test_the_image_is_close_to_a_supersampled_one(engine):
     viewmats, Ks = views(64, 64)
     ones = torch.ones(len(faces), 1)
     scene = (0.6 * vertices, viewmats, Ks, 64, 64)
-    image = rasterize_antialiased(scene[0], connect(faces, vertices), *scene[1:], face_colors=ones, engine=engine)
+    image = on(engine, rasterize_antialiased, scene[0], connect(faces, vertices), *scene[1:], face_colors=ones)
     exact, plain = (
         render_opaque(*scene, faces=faces, face_colors=ones, supersampling=samples)[..., 1:] for samples in (8, 1)
     )
@@ -144,9 +145,7 @@ def test_edges_within_a_welded_surface_get_no_gradient(engine):
 
     def pulled(points: Tensor, triangles: Tensor) -> Tensor:
         leaf = points.clone().requires_grad_(True)
-        image = rasterize_antialiased(
-            leaf, connect(triangles, points), *FLAT, 24, 24, face_colors=colors, engine=engine
-        )
+        image = on(engine, rasterize_antialiased, leaf, connect(triangles, points), *FLAT, 24, 24, face_colors=colors)
         (image * torch.linspace(0, 1, 24)[:, None]).sum().backward()
         assert leaf.grad is not None
         return leaf.grad.abs().sum(dim=1)
@@ -185,14 +184,15 @@ def test_unusable_vertices_harm_nothing(engine):
     for index, value in enumerate((math.nan, math.inf, 1e30)):
         vertices[index, index] = value
     leaf = vertices.requires_grad_(True)
-    image = rasterize_antialiased(
+    image = on(
+        engine,
+        rasterize_antialiased,
         leaf,
         connect(faces, vertices),
         *views(20, 20),
         20,
         20,
         face_colors=torch.ones(len(faces), 3),
-        engine=engine,
     )
     assert bool(image.isfinite().all())
     image.square().sum().backward()

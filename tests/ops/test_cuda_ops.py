@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+import etsplat
 from etsplat.core.cameras import intrinsics, look_at
 from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.topology import MeshTopology
@@ -15,6 +16,7 @@ from etsplat.ops.soup_colors import soup_colors
 from etsplat.ops.spherical_harmonics import spherical_harmonics
 from etsplat.ops.triangle_area import mean_area
 from etsplat.ops.weighted_sum import Term, weighted_sum
+from helpers.engines import on
 from helpers.simt.build import Simt
 
 pytestmark = pytest.mark.sanitize
@@ -40,7 +42,7 @@ def test_mesh_energies_are_those_of_the_cpu_engine(cuda_device, rng, power):
     for engine, device in (("cuda", cuda_device), ("cpu", CPU)):
         connectivity = MeshTopology.from_faces(faces[5:].to(device), len(vertices)).connectivity
         leaf = vertices.to(device, copy=True).requires_grad_()
-        energies = mesh_energies(leaf, connectivity, edge_power=power, engine=engine)
+        energies = on(engine, mesh_energies, leaf, connectivity, edge_power=power)
         (1.5 * energies.edge + 0.25 * energies.normal + 0.5 * energies.laplacian).backward()
         results.append((torch.stack(energies).detach().cpu(), leaf.grad))
     torch.testing.assert_close(results[0][0], results[1][0], rtol=1e-6, atol=0)
@@ -55,7 +57,7 @@ def test_l1_is_that_of_the_cpu_engine(cuda_device, rng):
     results = []
     for engine, device in (("cuda", cuda_device), ("cpu", CPU)):
         leaf = color.to(device, copy=True).requires_grad_()
-        loss = photometric_loss(leaf, target.to(device), 0.0, backgrounds=backgrounds.to(device), engine=engine)
+        loss = on(engine, photometric_loss, leaf, target.to(device), 0.0, backgrounds=backgrounds.to(device))
         (4 * loss).backward()
         results.append((loss.detach().cpu(), leaf.grad.cpu()))
     torch.testing.assert_close(results[0][0], results[1][0], rtol=1e-6, atol=0)
@@ -69,7 +71,7 @@ def test_mean_area_is_that_of_the_cpu_engine(cuda_device, rng):
     results = []
     for engine, device in (("cuda", cuda_device), ("cpu", CPU)):
         leaf = vertices.to(device, copy=True).requires_grad_()
-        area = mean_area(leaf, engine=engine)
+        area = on(engine, mean_area, leaf)
         (2.5 * area).backward()
         results.append((area.detach().cpu(), leaf.grad.cpu()))
     torch.testing.assert_close(results[0], results[1], rtol=1e-6, atol=1e-9)
@@ -84,7 +86,7 @@ def test_weighted_sum_is_that_of_pytorch(cuda_device, scale):
         powers = (1, -1, -2)
         terms = [Term(0.5 + power, leaf, power) for leaf, power in zip(leaves[1:], powers, strict=True)]
         factor = torch.tensor(0.3, device=device) if scale == "tensor" else scale
-        total = weighted_sum(leaves[0], terms, factor, engine=engine)
+        total = on(engine, weighted_sum, leaves[0], terms, factor)
         (3 * total).backward()
         results.append(torch.stack([total.detach(), *(leaf.grad for leaf in leaves)]).cpu())
     torch.testing.assert_close(results[0], results[1], rtol=1e-6, atol=0)
@@ -108,9 +110,10 @@ def test_photometric_loss_is_that_of_the_cpu_engine(cuda_device, rng, channels, 
     results = []
     for engine, device in (("cuda", cuda_device), ("cpu", CPU)):
         leaf = color.to(device, copy=True).requires_grad_()
-        options = {"backgrounds": None if backgrounds is None else backgrounds.to(device), "engine": engine}
-        on = None if mask is None else mask.to(device)
-        loss = photometric_loss(leaf, target.to(device), weight, on, pixel=pixel, **options)
+        options = {"backgrounds": None if backgrounds is None else backgrounds.to(device)}
+        counts = None if mask is None else mask.to(device)
+        with etsplat.engine(engine):
+            loss = photometric_loss(leaf, target.to(device), weight, counts, pixel=pixel, **options)
         (0.5 * loss).backward()
         results.append((loss.detach().cpu(), leaf.grad.cpu()))
     torch.testing.assert_close(results[0][0], results[1][0], rtol=1e-6, atol=0)
@@ -126,12 +129,12 @@ def test_adam_takes_the_steps_of_the_cpu_engine(cuda_device, rng):
     ends = []
     for engine, device in (("cuda", cuda_device), ("cpu", CPU)):
         parameters = {name: p.to(device, copy=True).requires_grad_() for name, p in start.items()}
-        adam = Adam(parameters, {name: 0.01 * (i + 1) for i, name in enumerate(start)}, engine=engine)
+        adam = Adam(parameters, {name: 0.01 * (i + 1) for i, name in enumerate(start)})
         for step in gradients:
             for name, p in parameters.items():
                 p.grad = step[name].to(device)
             adam.learning_rates["p0"] *= 0.5
-            adam.step()
+            on(engine, adam.step)
         ends.append([*parameters.values(), *adam.first_moments.values(), *adam.second_moments.values()])
     for actual, expected in zip(*ends, strict=True):
         same_bits(actual.detach(), expected.detach())
@@ -140,14 +143,15 @@ def test_adam_takes_the_steps_of_the_cpu_engine(cuda_device, rng):
 def test_a_halted_adam_changes_nothing(cuda_device):
     """With the flag set, parameters and moments stay; without, they move."""
     parameter = torch.ones(10, requires_grad=True, device=cuda_device)
-    adam = Adam({"p": parameter}, {"p": 0.1}, engine="cuda")
+    adam = Adam({"p": parameter}, {"p": 0.1})
     parameter.grad = torch.ones_like(parameter)
     rates = torch.tensor([0.1, 1.0], device=cuda_device)
     halted = torch.ones((), dtype=torch.int32, device=cuda_device)
-    adam.step_on_device(rates, halted)
-    assert bool((parameter == 1).all())
-    assert not adam.second_moments["p"].any()
-    adam.step_on_device(rates, halted.zero_())
+    with etsplat.engine("cuda"):
+        adam.step_on_device(rates, halted)
+        assert bool((parameter == 1).all())
+        assert not adam.second_moments["p"].any()
+        adam.step_on_device(rates, halted.zero_())
     assert bool((parameter < 1).all())
 
 
@@ -161,7 +165,7 @@ def test_spherical_harmonics_are_those_of_the_cpu_engine(cuda_device, rng, degre
     results = []
     for engine, device in (("cuda", cuda_device), ("cpu", CPU)):
         leaves = [tensor.to(device, copy=True).requires_grad_() for tensor in (coefficients, directions)]
-        colors = spherical_harmonics(*leaves, degree, engine=engine)
+        colors = on(engine, spherical_harmonics, *leaves, degree)
         results.append(on_cpu(colors.detach(), *torch.autograd.grad(colors, leaves, cotangent.to(device))))
     for actual, expected in zip(*results, strict=True):
         torch.testing.assert_close(actual, expected, rtol=1e-5, atol=1e-6)
@@ -177,7 +181,7 @@ def test_soup_colors_are_those_of_the_cpu_engine(cuda_device, rng, degree):
     results = []
     for engine, device in (("cuda", cuda_device), ("cpu", CPU)):
         leaves = [tensor.to(device, copy=True).requires_grad_() for tensor in inputs]
-        colors = soup_colors(*leaves, centers.to(device), degree, engine=engine)
+        colors = on(engine, soup_colors, *leaves, centers.to(device), degree)
         results.append(on_cpu(colors.detach(), *torch.autograd.grad(colors, leaves, cotangent.to(device))))
     for actual, expected in zip(*results, strict=True):
         torch.testing.assert_close(actual, expected, rtol=1e-5, atol=1e-6)
@@ -203,10 +207,10 @@ def hard_scene(rng: torch.Generator) -> dict[str, torch.Tensor]:
 def test_hard_rasterization_is_that_of_the_cpu_engine(cuda_device, rng, monkeypatch):
     """Triangles, barycentrics and depths are the same bits, whatever the height of a strip."""
     scene = hard_scene(rng)
-    expected = rasterize_hard(width=45, height=37, engine="cpu", **scene)
+    expected = on("cpu", rasterize_hard, width=45, height=37, **scene)
     for samples in (1 << 21, 45 * 10):
-        monkeypatch.setattr("etsplat.ops._rasterize_hard_cuda._STRIP_SAMPLES", samples)
-        actual = rasterize_hard(width=45, height=37, engine="cuda", **moved(scene, cuda_device))
+        monkeypatch.setattr("etsplat.engines.cuda.rasterize_opaque._STRIP_SAMPLES", samples)
+        actual = on("cuda", rasterize_hard, width=45, height=37, **moved(scene, cuda_device))
         for name, image in vars(expected).items():
             same_bits(getattr(actual, name), image)
     assert int(expected.triangle.max()) >= 320  # some of the soup is in front
@@ -215,13 +219,13 @@ def test_hard_rasterization_is_that_of_the_cpu_engine(cuda_device, rng, monkeypa
 @pytest.mark.parametrize(("colors", "channels", "cull"), [("face_colors", 3, False), ("vertex_colors", 5, True)])
 def test_opaque_pictures_are_those_of_the_cpu_engine(cuda_device, rng, monkeypatch, colors, channels, cull):
     """Nine samples a pixel, drawn in several strips, both ways to colour: the same bits."""
-    monkeypatch.setattr("etsplat.ops._rasterize_hard_cuda._STRIP_SAMPLES", 135 * 40)
+    monkeypatch.setattr("etsplat.engines.cuda.rasterize_opaque._STRIP_SAMPLES", 135 * 40)
     scene = hard_scene(rng)
     count = len(scene["faces"] if colors == "face_colors" else scene["vertices"])
     scene[colors] = torch.rand((count, channels), generator=rng)
     options = {"width": 45, "height": 37, "supersampling": 3, "cull_backfaces": cull}
-    actual = render_opaque(engine="cuda", **options, **moved(scene, cuda_device))
-    same_bits(actual, render_opaque(engine="cpu", **options, **scene))
+    actual = on("cuda", render_opaque, **options, **moved(scene, cuda_device))
+    same_bits(actual, on("cpu", render_opaque, **options, **scene))
 
 
 def antialiased(kind: str, rng: torch.Generator, engine: str, device: torch.device) -> tuple[torch.Tensor, ...]:
@@ -233,8 +237,8 @@ def antialiased(kind: str, rng: torch.Generator, engine: str, device: torch.devi
     colors = torch.rand((len(faces) if kind == "face_colors" else len(vertices), 3), generator=rng)
     backgrounds, cotangent = torch.rand((2, 3), generator=rng), torch.randn((2, 37, 45, 3), generator=rng)
     leaves = [tensor.to(device, copy=True).requires_grad_() for tensor in (vertices, colors, backgrounds)]
-    shown = {kind: leaves[1], "backgrounds": leaves[2], "engine": engine}
-    image = rasterize_antialiased(leaves[0], connectivity, scene["viewmats"], scene["Ks"], 45, 37, **shown)
+    shown = {kind: leaves[1], "backgrounds": leaves[2]}
+    image = on(engine, rasterize_antialiased, leaves[0], connectivity, scene["viewmats"], scene["Ks"], 45, 37, **shown)
     return on_cpu(image.detach(), *torch.autograd.grad(image, leaves, cotangent.to(device)))
 
 

@@ -15,6 +15,7 @@ from torch.utils.checkpoint import checkpoint
 
 from etsplat import intrinsics, look_at, rasterize, rasterize_antialiased, rasterize_hard
 from etsplat.core.cameras import Cameras
+from etsplat.engines.native.pool import empty_image
 from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.topology import MeshTopology
 from etsplat.ops.adam import Adam
@@ -22,7 +23,6 @@ from etsplat.ops.mesh_energies import mesh_energies
 from etsplat.ops.normal_consistency import normal_consistency
 from etsplat.ops.photometric import photometric_loss
 from etsplat.ops.pick_values import pick_values
-from etsplat.ops.pool import empty_image
 from etsplat.ops.rasterize_hard import render_opaque
 from etsplat.ops.soup_activation import soup_activation
 from etsplat.ops.soup_colors import soup_colors
@@ -30,6 +30,7 @@ from etsplat.ops.spherical_harmonics import spherical_harmonics
 from etsplat.ops.triangle_area import mean_area
 from etsplat.ops.triangle_channels import triangle_channels
 from etsplat.ops.weighted_sum import Term, weighted_sum
+from helpers.engines import on
 from helpers.scenes import EVERYTHING, mesh, soup
 
 Operation = Callable[..., list[Tensor]]
@@ -40,7 +41,7 @@ def _splat(scene: dict, engine: str, names: tuple[str, ...], **options) -> Case:
     rest = {"colors": None, **{k: v for k, v in scene.items() if k not in names}}
 
     def run(**leaves: Tensor) -> list[Tensor]:
-        result = rasterize(**{**rest, **leaves}, **options, engine=engine)
+        result = on(engine, rasterize, **{**rest, **leaves}, **options)
         images = result.color, result.alpha, result.depth, result.median_depth, result.normal, result.distortion
         return [image for image in images if image is not None]
 
@@ -68,8 +69,8 @@ def _antialiased(rng: torch.Generator, engine: str, kind: str) -> Case:
 
     def run(vertices: Tensor, colors: Tensor, backgrounds: Tensor) -> list[Tensor]:
         view = scene["viewmats"] * 1.0, scene["Ks"] * 1.0, scene["width"], scene["height"]
-        options = {kind: colors, "backgrounds": backgrounds, "engine": engine}
-        return [rasterize_antialiased(vertices, connectivity, *view, **options)]
+        options = {kind: colors, "backgrounds": backgrounds}
+        return [on(engine, rasterize_antialiased, vertices, connectivity, *view, **options)]
 
     return {"vertices": points, "colors": colors, "backgrounds": scene["backgrounds"]}, run
 
@@ -80,7 +81,7 @@ def _soup_activation(rng: torch.Generator, engine: str) -> Case:
 
     def run(logits: Tensor, raw: Tensor) -> list[Tensor]:
         camera = Cameras(torch.eye(4)[None], intrinsics(50, 32, 32)[None], 32, 32)
-        return [*soup_activation(corners, logits, raw, (0.1, 1.0), camera, engine=engine)]
+        return [*on(engine, soup_activation, corners, logits, raw, (0.1, 1.0), camera)]
 
     return {"logits": logits, "raw": raw}, run
 
@@ -94,23 +95,23 @@ def _soup_colors(rng: torch.Generator, engine: str) -> Case:
     centers = torch.randn(2, 3, generator=rng)
 
     def run(**leaves: Tensor) -> list[Tensor]:
-        return [soup_colors(**leaves, centers=centers, degree=2, engine=engine)]
+        return [on(engine, soup_colors, **leaves, centers=centers, degree=2)]
 
     return leaves, run
 
 
 def _harmonics(rng: torch.Generator, engine: str) -> Case:
     leaves = {"coefficients": torch.randn(30, 9, 3, generator=rng), "directions": torch.randn(30, 3, generator=rng)}
-    return leaves, lambda **leaves: [spherical_harmonics(**leaves, degree=2, engine=engine)]
+    return leaves, lambda **leaves: [on(engine, spherical_harmonics, **leaves, degree=2)]
 
 
 def _mean_area(rng: torch.Generator, engine: str) -> Case:
-    return {"vertices": torch.randn(30, 3, 3, generator=rng)}, lambda vertices: [mean_area(vertices, engine=engine)]
+    return {"vertices": torch.randn(30, 3, 3, generator=rng)}, lambda vertices: [on(engine, mean_area, vertices)]
 
 
 def _photometric(rng: torch.Generator, engine: str) -> Case:
     color, target = torch.rand(2, 2, 20, 24, 3, generator=rng)
-    return {"color": color}, lambda color: [photometric_loss(color, target, dssim_weight=0.2, engine=engine)]
+    return {"color": color}, lambda color: [on(engine, photometric_loss, color, target, dssim_weight=0.2)]
 
 
 def _normal_consistency(rng: torch.Generator, engine: str) -> Case:
@@ -119,7 +120,7 @@ def _normal_consistency(rng: torch.Generator, engine: str) -> Case:
     views = torch.eye(4).expand(2, 4, 4), intrinsics(50, 24, 20).expand(2, 3, 3)
 
     def run(normals: Tensor, depth: Tensor) -> list[Tensor]:
-        return [normal_consistency(normals, depth, alpha, *views, engine=engine)]
+        return [on(engine, normal_consistency, normals, depth, alpha, *views)]
 
     return {"normals": normals, "depth": depth}, run
 
@@ -128,14 +129,14 @@ def _mesh_energies(rng: torch.Generator, engine: str) -> Case:
     vertices, faces = icosphere(1)
     connectivity = MeshTopology.from_faces(faces, len(vertices)).connectivity
     points = vertices.float() + 0.1 * torch.randn(vertices.shape, generator=rng)
-    return {"vertices": points}, lambda vertices: [*mesh_energies(vertices, connectivity, engine=engine)]
+    return {"vertices": points}, lambda vertices: [*on(engine, mesh_energies, vertices, connectivity)]
 
 
 def _channels(rng: torch.Generator, engine: str) -> Case:
     scene = soup(rng, 30)
 
     def run(corners: Tensor, viewmats: Tensor) -> list[Tensor]:
-        return [triangle_channels(corners, viewmats, depth=True, normals=True, engine=engine)]
+        return [on(engine, triangle_channels, corners, viewmats, depth=True, normals=True)]
 
     return {"corners": scene["vertices"], "viewmats": scene["viewmats"]}, run
 
@@ -143,13 +144,13 @@ def _channels(rng: torch.Generator, engine: str) -> Case:
 def _pick_values(rng: torch.Generator, engine: str) -> Case:
     chosen = torch.randint(0, 31, (2, 20, 24), generator=rng, dtype=torch.int32)
     values = torch.rand(2, 30, generator=rng)
-    return {"values": values}, lambda values: [pick_values(values, chosen * 1, engine=engine)]
+    return {"values": values}, lambda values: [on(engine, pick_values, values, chosen * 1)]
 
 
 def _weighted_sum(rng: torch.Generator, engine: str) -> Case:
     first, second = torch.rand(2, generator=rng)
     terms = {"first": first, "second": second}
-    return terms, lambda first, second: [weighted_sum(first, [Term(0.5, second, -2)], engine=engine)]
+    return terms, lambda first, second: [on(engine, weighted_sum, first, [Term(0.5, second, -2)])]
 
 
 CASES: dict[str, Callable[[torch.Generator, str], Case]] = {
@@ -319,9 +320,8 @@ def _draw(faces: Tensor, engine: str, **options) -> Tensor:
     view = look_at(torch.tensor([[0.0, 0.0, 4.0]]), torch.zeros(3), torch.tensor([0.0, 1.0, 0.0]))
     size = (intrinsics(50, 40, 30)[None], 40, 30)
     n = len(faces)
-    return rasterize(
-        vertices, colors[:n], opacities[:n], 0.1, view, *size, faces=faces, engine=engine, **options
-    ).color  # fmt: skip
+    arguments = vertices, colors[:n], opacities[:n], 0.1, view, *size
+    return on(engine, rasterize, *arguments, faces=faces, **options).color
 
 
 @pytest.mark.sanitize
@@ -349,7 +349,7 @@ class TestFaces:
 
         def gradient(spoil: bool) -> Tensor:
             faces, vertices = arguments["faces"].clone(), scene["vertices"].clone().requires_grad_()
-            color = rasterize(vertices, **{**arguments, "faces": faces}, engine=native).color
+            color = on(native, rasterize, vertices, **{**arguments, "faces": faces}).color
             if spoil:
                 faces.data.fill_(2**31 - 1)
             color.square().sum().backward()
@@ -377,11 +377,11 @@ class TestOddArguments:
         scene = mesh(rng)
         dtype = torch.float64 if engine == "reference" else torch.float32
         points, *view = (scene[key].to(dtype) for key in ("vertices", "viewmats", "Ks"))
-        options = {"faces": scene["faces"], "engine": engine}
+        options = {"faces": scene["faces"]}
         size = scene["width"], scene["height"]
         for draw in (
-            lambda *given: rasterize_hard(*given, *size, **options).depth,
-            lambda *given: render_opaque(*given, *size, face_colors=scene["colors"].to(dtype), **options),
+            lambda *given: on(engine, rasterize_hard, *given, *size, **options).depth,
+            lambda *given: on(engine, render_opaque, *given, *size, face_colors=scene["colors"].to(dtype), **options),
         ):
             expected = draw(points, *view)
             assert torch.equal(draw(torch._neg_view(-points), *view), expected)
@@ -418,14 +418,14 @@ class TestOddArguments:
             scene = {key: value.double() if isinstance(value, Tensor) else value for key, value in scene.items()}
         scene[name][0, 0] = 1e38
         with pytest.raises(ValueError, match=rf"{name} must be from -1e\+30 to 1e\+30, got 1 values beyond"):
-            rasterize(**scene, engine=engine)
+            on(engine, rasterize, **scene)
 
     @pytest.mark.parametrize("name", ["colors", "backgrounds"])
     def test_the_largest_colours_leave_gradients_finite(self, name, rng):
         scene = soup(rng, 200)
         scene[name][0, 0] = 1e30
         leaves = {key: scene[key].requires_grad_() for key in ("vertices", "colors", "opacities", "sigma")}
-        result = rasterize(**scene, engine="cpu")
+        result = on("cpu", rasterize, **scene)
         (result.color.sum() + result.alpha.sum()).backward()
         for key, leaf in leaves.items():
             assert leaf.grad is not None, key

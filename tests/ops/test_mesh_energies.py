@@ -3,10 +3,11 @@ import math
 import pytest
 import torch
 
+from etsplat.engines.threads import num_threads, set_num_threads
 from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.topology import MeshTopology
-from etsplat.ops.engines import num_threads, set_num_threads
 from etsplat.ops.mesh_energies import MeshConnectivity, mesh_energies
+from helpers.engines import on
 
 
 def bumpy_sphere(rng: torch.Generator, level: int, noise: float) -> tuple[torch.Tensor, MeshConnectivity]:
@@ -21,7 +22,7 @@ def mesh(faces: list[list[int]], num_vertices: int) -> MeshConnectivity:
 
 def values_and_gradients(vertices, connectivity, power, engine=None):
     leaf = vertices.clone().requires_grad_()
-    energies = mesh_energies(leaf, connectivity, edge_power=power, engine=engine)
+    energies = on(engine, mesh_energies, leaf, connectivity, edge_power=power)
     gradients = [torch.autograd.grad(energy, leaf, retain_graph=True)[0] for energy in energies]
     return torch.stack(energies).detach(), torch.stack(gradients)
 
@@ -54,11 +55,11 @@ def test_icosphere_has_the_known_energies(engine):
     """Level 4: mean edge 0.0755, mean squared edge 0.00572, L_n 0.00098, L_lap 0.0040."""
     vertices, faces = icosphere(4)
     connectivity = MeshTopology.from_faces(faces, len(vertices)).connectivity
-    energies = mesh_energies(vertices, connectivity, engine=engine)
+    energies = on(engine, mesh_energies, vertices, connectivity)
     assert float(energies.edge) == pytest.approx(0.0755, abs=5e-5)
     assert float(energies.normal) == pytest.approx(0.00098, abs=5e-6)
     assert float(energies.laplacian) == pytest.approx(0.0040, abs=5e-5)
-    squared = mesh_energies(vertices, connectivity, edge_power=2, engine=engine)
+    squared = on(engine, mesh_energies, vertices, connectivity, edge_power=2)
     assert float(squared.edge) == pytest.approx(0.00572, abs=5e-6)
 
 
@@ -76,7 +77,7 @@ def test_radial_derivatives_of_a_sphere(engine):
 def test_closed_forms_of_a_folded_square(engine):
     """Two triangles that meet at a right angle: known edges, 1 - cos 90 degrees, known Laplacian."""
     vertices = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
-    energies = mesh_energies(vertices, mesh([[0, 1, 2], [1, 0, 3]], 4), engine=engine)
+    energies = on(engine, mesh_energies, vertices, mesh([[0, 1, 2], [1, 0, 3]], 4))
     assert float(energies.edge) == pytest.approx((3 + 2 * math.sqrt(2)) / 5, rel=1e-6)
     assert float(energies.normal) == pytest.approx(1.0, rel=1e-6)
     ends = torch.tensor([[1 / 3, 1 / 3, 1 / 3], [1.0, -1 / 3, -1 / 3], [-0.5, 1.0, 0.0], [-0.5, 0.0, 1.0]])
@@ -139,7 +140,7 @@ def test_an_edge_with_three_faces_counts_every_pair(engine):
     angles = torch.arange(3) * (2 * math.pi / 3)
     wings = torch.stack([angles.cos(), angles.sin(), torch.full((3,), 0.5)], dim=1)
     vertices = torch.cat([torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), wings])
-    energies = mesh_energies(vertices, mesh([[0, 1, 2], [0, 1, 3], [0, 1, 4]], 5), engine=engine)
+    energies = on(engine, mesh_energies, vertices, mesh([[0, 1, 2], [0, 1, 3], [0, 1, 4]], 5))
     assert float(energies.normal) == pytest.approx(1.5, rel=1e-6)
 
 

@@ -5,8 +5,10 @@ import torch
 
 from etsplat import _native
 from etsplat.core.cameras import Cameras, intrinsics, look_at
-from etsplat.ops.engines import num_threads, set_num_threads
-from etsplat.ops.normal_consistency import depth_normals, normal_consistency
+from etsplat.engines.reference.normal_consistency import depth_normals
+from etsplat.engines.threads import num_threads, set_num_threads
+from etsplat.ops.normal_consistency import normal_consistency
+from helpers.engines import on
 
 SIZE = 40
 
@@ -56,7 +58,7 @@ def test_passes_gradcheck(rng):
 def gradients(given: tuple[torch.Tensor, ...], camera: Cameras, engine: str) -> list[torch.Tensor]:
     normals, depth, alpha = given
     leaves = [tensor.clone().requires_grad_() for tensor in (normals, depth)]
-    loss = normal_consistency(*leaves, alpha, camera.viewmats, camera.Ks, engine=engine)
+    loss = on(engine, normal_consistency, *leaves, alpha, camera.viewmats, camera.Ks)
     (3 * loss).backward()
     return [loss.detach(), *(leaf.grad for leaf in leaves if leaf.grad is not None)]
 

@@ -2,9 +2,10 @@ import pytest
 import torch
 
 from etsplat import _native
+from etsplat.engines.threads import num_threads, set_num_threads
 from etsplat.metrics.image import ssim
-from etsplat.ops.engines import num_threads, set_num_threads
 from etsplat.ops.photometric import photometric_loss
+from helpers.engines import on
 
 
 def pair(rng: torch.Generator, views: int, height: int, width: int, channels: int = 3):
@@ -16,9 +17,9 @@ def pair(rng: torch.Generator, views: int, height: int, width: int, channels: in
     return color, (255 * target).round().to(torch.uint8)
 
 
-def value_and_gradient(color, target, weight, mask=None, **options):
+def value_and_gradient(color, target, weight, mask=None, engine=None, **options):
     leaf = color.clone().requires_grad_()
-    loss = photometric_loss(leaf, target, weight, mask, **options)
+    loss = on(engine, photometric_loss, leaf, target, weight, mask, **options)
     loss.backward()
     return loss.detach(), leaf.grad
 
@@ -60,7 +61,7 @@ def test_black_image_over_a_transparent_target_gives_the_mean_background(engine)
     """Where the target is empty the pixel term is the background's brightness."""
     backgrounds = torch.tensor([[0.2, 0.4, 0.9]])
     empty = torch.zeros(1, 8, 8, 3), torch.zeros(1, 8, 8, 4)
-    assert float(photometric_loss(*empty, 0.0, backgrounds=backgrounds, engine=engine)) == pytest.approx(0.5, rel=1e-6)
+    assert float(on(engine, photometric_loss, *empty, 0.0, backgrounds=backgrounds)) == pytest.approx(0.5, rel=1e-6)
 
 
 def test_equal_images_have_zero_loss_and_gradient(engine, rng):
@@ -76,14 +77,14 @@ def test_equal_images_have_zero_loss_and_gradient(engine, rng):
 def test_structural_part_is_the_metric(engine, rng):
     """At weight 1 the loss is 1 - SSIM as the zero-padded metric measures it."""
     color, target = pair(rng, 1, 40, 30)
-    loss = photometric_loss(color, target, 1.0, engine=engine)
+    loss = on(engine, photometric_loss, color, target, 1.0)
     assert float(loss) == pytest.approx(1 - ssim(color[0], target[0] / 255), abs=1e-5)
 
 
 def test_bytes_and_floats_give_the_same_loss(engine, rng):
     """A target in bytes is its value over 255."""
     color, target = pair(rng, 1, 20, 30)
-    losses = [photometric_loss(color, t, 0.2, engine=engine) for t in (target, target / 255)]
+    losses = [on(engine, photometric_loss, color, t, 0.2) for t in (target, target / 255)]
     assert float(losses[0]) == pytest.approx(float(losses[1]), rel=1e-6)
 
 

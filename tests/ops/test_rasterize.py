@@ -3,9 +3,11 @@
 import pytest
 import torch
 
+import etsplat
 from etsplat import Cutoffs, rasterize
-from etsplat.ops.engines import resolve_engine
-from helpers.scenes import EVERYTHING, IMAGES, accuracy, dtype_of, mesh, prepare, render, soup
+from etsplat.engines.choice import engine_for
+from helpers.engines import dtype_of, on
+from helpers.scenes import EVERYTHING, IMAGES, accuracy, mesh, prepare, render, soup
 
 
 @pytest.fixture
@@ -79,12 +81,12 @@ def test_non_contiguous_tensors_are_understood(engine, scene):
     for name in ("vertices", "colors", "viewmats", "Ks", "backgrounds"):
         prepared[name] = prepared[name].transpose(-1, -2).contiguous().transpose(-1, -2)
     prepared["opacities"] = torch.stack([prepared["opacities"]] * 2, dim=1)[:, 0]
-    assert torch.equal(rasterize(**prepared, engine=engine).color, expected)
+    assert torch.equal(on(engine, rasterize, **prepared).color, expected)
 
 
 def test_default_engine_follows_dtype():
-    assert resolve_engine(None, torch.zeros(1)) == "cpu"
-    assert resolve_engine(None, torch.zeros(1, dtype=torch.float64)) == "reference"
+    assert engine_for(torch.zeros(1)).name == "cpu"
+    assert engine_for(torch.zeros(1, dtype=torch.float64)).name == "reference"
 
 
 BAD_ARGUMENTS = {
@@ -111,7 +113,6 @@ BAD_ARGUMENTS = {
     "height": ({"height": 7.0}, "height must be a positive integer, got 7.0"),
     "near plane": ({"near_plane": 0.0}, "near_plane must be positive"),
     "cutoffs": ({"cutoffs": Cutoffs(alpha_min=0.5, alpha_max=0.4)}, "cutoffs must satisfy"),
-    "engine": ({"engine": "metal"}, "engine must be one of reference, cpu, cuda or None, got 'metal'"),
     "sigma range": ({"sigma": torch.zeros(5)}, "sigma must be positive, got 0.0"),
     "skew": ({"Ks": torch.ones(2, 3, 3)}, "Ks must have the form"),
     "NaN vertices": ({"vertices": torch.full((5, 3, 3), torch.nan)}, "vertices must be finite, got 45 NaN"),
@@ -128,8 +129,8 @@ def test_bad_arguments_are_refused_by_name(engine, case, scene):
         name: value.to(dtype_of(engine)) if isinstance(value, torch.Tensor) and value.dtype == torch.float32 else value
         for name, value in bad.items()
     }
-    with pytest.raises(ValueError, match=message):
-        rasterize(**{**prepare(scene, engine), "engine": engine, **converted})
+    with etsplat.engine(engine), pytest.raises(ValueError, match=message):
+        rasterize(**{**prepare(scene, engine), **converted})
 
 
 @pytest.mark.parametrize(
@@ -145,11 +146,11 @@ def test_bad_faces_are_refused_even_without_validation(engine, faces, message, s
     prepared = prepare(scene, engine)
     prepared["vertices"] = prepared["vertices"].reshape(15, 3)
     with pytest.raises(ValueError, match=message):
-        rasterize(**prepared, faces=faces, engine=engine, validate=False)
+        on(engine, rasterize, **prepared, faces=faces, validate=False)
 
 
 def test_engines_refuse_what_they_cannot_compute(scene):
     with pytest.raises(ValueError, match=r"engine cpu computes in float32, got torch\.float64"):
-        rasterize(**prepare(scene, "reference"), engine="cpu")
+        on("cpu", rasterize, **prepare(scene, "reference"))
     with pytest.raises(ValueError, match=r"float32 or float64, got torch\.float16"):
         rasterize(**prepare(scene, "reference", torch.float16))

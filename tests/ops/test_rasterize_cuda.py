@@ -8,8 +8,9 @@ from hypothesis import strategies as st
 from test_rasterize_engines import compare
 
 from etsplat import rasterize
-from etsplat.cuda.launch import use_backend
-from etsplat.ops import _raster_capacity
+from etsplat.engines.cuda import capacity
+from etsplat.engines.cuda.launch import use_backend
+from helpers.engines import on
 from helpers.scenes import EVERYTHING, IMAGES, NO_CUTOFFS, colored, gradients, mesh, prepare, soup
 from helpers.simt.build import Simt
 
@@ -109,25 +110,25 @@ def test_more_pairs_than_room(cuda_engine, rng, monkeypatch):
     """The render is repeated with more room, and is the one that had enough from the start."""
     scene, cotangents = soup(rng, 80), {"color": torch.randn(2, 40, 48, 3, generator=rng)}
     expected, expected_grads = gradients(scene, cuda_engine, cotangents)
-    monkeypatch.setattr(_raster_capacity, "_seen", {})
-    monkeypatch.setattr(_raster_capacity, "_FIRST_ROOM", 20)
-    monkeypatch.setattr(_raster_capacity, "_FIRST_PER_TRIANGLE", 0)
+    monkeypatch.setattr(capacity, "_seen", {})
+    monkeypatch.setattr(capacity, "_FIRST_ROOM", 20)
+    monkeypatch.setattr(capacity, "_FIRST_PER_TRIANGLE", 0)
     out, grads = gradients(scene, cuda_engine, cotangents)
     assert torch.equal(out.color, expected.color)
     assert all(torch.equal(grads[name], expected_grads[name]) for name in grads)
-    assert int(_raster_capacity.overflow_flag(out.color.device)) == 0
+    assert int(capacity.overflow_flag(out.color.device)) == 0
 
 
 def test_a_repair_does_not_take_earlier_captures_for_smaller_scenes(cuda_device, monkeypatch):
     """A graph that was captured before triangles multiplied does not multiply the room once more."""
     for name in ("_seen", "_captured"):
-        monkeypatch.setattr(_raster_capacity, name, {})
+        monkeypatch.setattr(capacity, name, {})
     shape = (1, 64, 64)
-    _raster_capacity.note_capture(cuda_device, shape, 100)
-    _raster_capacity.record_need(cuda_device, shape, 10_000, 50_000)
-    _raster_capacity.overflow_flag(cuda_device).fill_(80_000)
-    assert _raster_capacity.repair_overflow(cuda_device)
-    assert _raster_capacity.capacity_for(cuda_device, shape, 10_000) == 100_000
+    capacity.note_capture(cuda_device, shape, 100)
+    capacity.record_need(cuda_device, shape, 10_000, 50_000)
+    capacity.overflow_flag(cuda_device).fill_(80_000)
+    assert capacity.repair_overflow(cuda_device)
+    assert capacity.capacity_for(cuda_device, shape, 10_000) == 100_000
 
 
 def test_overflow_inside_a_graph_is_found_afterwards(simt, rng, monkeypatch):
@@ -135,15 +136,15 @@ def test_overflow_inside_a_graph_is_found_afterwards(simt, rng, monkeypatch):
     scene, cotangents = soup(rng, 80), {"color": torch.randn(2, 40, 48, 3, generator=rng)}
     expected, _ = gradients(scene, "cuda", cotangents)
     for name, value in (("_seen", {}), ("_FIRST_ROOM", 20), ("_FIRST_PER_TRIANGLE", 0), ("_captured", {})):
-        monkeypatch.setattr(_raster_capacity, name, value)
+        monkeypatch.setattr(capacity, name, value)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Simt, "capturing", True)
         gradients(scene, "cuda", cotangents)
     device = torch.device("cpu")
-    assert int(_raster_capacity.overflow_flag(device)) > 20
-    assert _raster_capacity.repair_overflow(device)
+    assert int(capacity.overflow_flag(device)) > 20
+    assert capacity.repair_overflow(device)
     out, _ = gradients(scene, "cuda", cotangents)
-    assert not _raster_capacity.repair_overflow(device)
+    assert not capacity.repair_overflow(device)
     assert torch.equal(out.color, expected.color)
 
 
@@ -173,7 +174,7 @@ def test_a_captured_step_is_the_eager_one(rng):
     leaves = [scene[name] for name in ("vertices", "colors", "opacities", "sigma")]
 
     def step():
-        out = rasterize(**scene, engine="cuda")
+        out = on("cuda", rasterize, **scene)
         return [out.color, *torch.autograd.grad(out.color, leaves, cotangent)]
 
     side = torch.cuda.Stream()
@@ -188,7 +189,7 @@ def test_a_captured_step_is_the_eager_one(rng):
     with torch.no_grad():
         leaves[0] += 0.05
     graph.replay()
-    assert not _raster_capacity.repair_overflow(leaves[0].device)
+    assert not capacity.repair_overflow(leaves[0].device)
     assert all(torch.equal(a, b) for a, b in zip(captured, step(), strict=True))
 
 

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from etsplat import Cutoffs, rasterize
 from etsplat.core.kernels import DISTANCES, KERNELS
-from helpers.scenes import EVERYTHING, IMAGES, NO_CUTOFFS, dtype_of, facing, gradients
+from helpers.engines import dtype_of, on
+from helpers.scenes import EVERYTHING, IMAGES, NO_CUTOFFS, facing, gradients
 
 SIZE = 12
 FUZZ = settings(max_examples=60, deadline=None, derandomize=True)
@@ -136,6 +137,6 @@ def test_any_faces(engine, faces):
         )
         if bad:
             with pytest.raises(ValueError, match="faces must be indices from 0 to 3"):
-                rasterize(*arguments, faces=tensor, engine=engine, validate=False)
+                on(engine, rasterize, *arguments, faces=tensor, validate=False)
         else:
-            assert rasterize(*arguments, faces=tensor, engine=engine).color.isfinite().all()
+            assert on(engine, rasterize, *arguments, faces=tensor).color.isfinite().all()

@@ -4,9 +4,10 @@ import pytest
 import torch
 
 from etsplat.core.cameras import intrinsics, look_at
+from etsplat.engines.threads import num_threads, set_num_threads
 from etsplat.geometry.icosphere import icosphere
-from etsplat.ops.engines import num_threads, set_num_threads
 from etsplat.ops.rasterize_hard import rasterize_hard, render_opaque
+from helpers.engines import on
 
 IDENTITY = torch.eye(4)[None]
 
@@ -71,8 +72,16 @@ def test_shared_edges_have_neither_crack_nor_overlap(engine, rng):
     faces = torch.cat([torch.stack([a, a + 1, a + n + 2], 1), torch.stack([a, a + n + 2, a + n + 1], 1)])
     seen = torch.zeros((size + 2, size + 2), dtype=torch.int32)
     for face in faces:
-        picture = rasterize_hard(
-            vertices, IDENTITY, flat_camera(), size + 2, size + 2, faces=face[None], near_plane=0.1, engine=engine
+        picture = on(
+            engine,
+            rasterize_hard,
+            vertices,
+            IDENTITY,
+            flat_camera(),
+            size + 2,
+            size + 2,
+            faces=face[None],
+            near_plane=0.1,
         )
         seen += picture.triangle[0] == 0
     wanted = torch.zeros_like(seen)
@@ -84,10 +93,10 @@ def test_nearest_wins_and_ties_go_to_the_smaller_index(engine):
     """Of coincident triangles the first is drawn; a nearer one hides both."""
     triangle = torch.tensor([[1.3, 1.1, 1.0], [30.2, 2.7, 1.0], [9.1, 28.4, 1.0]]) * torch.tensor([[1.0], [2.0], [3.0]])
     coincident = triangle.expand(2, 3, 3)
-    seen = rasterize_hard(coincident, IDENTITY, flat_camera(), 32, 32, engine=engine).triangle
+    seen = on(engine, rasterize_hard, coincident, IDENTITY, flat_camera(), 32, 32).triangle
     assert set(seen.unique().tolist()) == {-1, 0}
     nearer = torch.cat([coincident, 0.5 * triangle[None]])
-    seen = rasterize_hard(nearer, IDENTITY, flat_camera(), 32, 32, engine=engine).triangle
+    seen = on(engine, rasterize_hard, nearer, IDENTITY, flat_camera(), 32, 32).triangle
     assert set(seen.unique().tolist()) == {-1, 2}
 
 
@@ -103,7 +112,7 @@ def test_intersecting_triangles_are_split_at_their_line(engine):
     """Two planes that cross at x = 16 hide one another on either side of it."""
     left = torch.tensor([[-90.0, -90.0, 1.0], [122.0, -90.0, 1.0], [16.0, 200.0, 1.0]])
     slope = 1 / (1 + (left[:, :1] - 16) / 500)
-    seen = rasterize_hard(torch.stack([left, left * slope]), IDENTITY, flat_camera(), 32, 32, engine=engine).triangle[0]
+    seen = on(engine, rasterize_hard, torch.stack([left, left * slope]), IDENTITY, flat_camera(), 32, 32).triangle[0]
     assert bool((seen[:, :16] == 0).all())
     assert bool((seen[:, 16:] == 1).all())
 
@@ -112,7 +121,7 @@ def test_barycentrics_reproduce_the_surface_point(engine):
     """Weights times the vertices give the point on the pixel's ray at the depth that was returned."""
     vertices, faces = icosphere(2)
     viewmats, Ks = sphere_views(40, 40)
-    seen = rasterize_hard(vertices, viewmats, Ks, 40, 40, faces=faces, engine=engine)
+    seen = on(engine, rasterize_hard, vertices, viewmats, Ks, 40, 40, faces=faces)
     for view in range(2):
         i, j = (seen.triangle[view] >= 0).nonzero(as_tuple=True)
         corners = vertices[faces[seen.triangle[view, i, j].long()]]
@@ -139,9 +148,9 @@ def test_supersampling_is_the_mean_of_a_larger_image(engine):
     vertices, faces = icosphere(1)
     viewmats, Ks = sphere_views(33, 29)
     ones = torch.ones(len(faces), 1)
-    image = render_opaque(vertices, viewmats, Ks, 33, 29, faces=faces, face_colors=ones, engine=engine)
+    image = on(engine, render_opaque, vertices, viewmats, Ks, 33, 29, faces=faces, face_colors=ones)
     large = Ks * torch.tensor([4.0, 4.0, 1.0])[:, None]
-    mask = (rasterize_hard(vertices, viewmats, large, 132, 116, faces=faces, engine=engine).triangle >= 0).float()
+    mask = (on(engine, rasterize_hard, vertices, viewmats, large, 132, 116, faces=faces).triangle >= 0).float()
     assert torch.equal(image[..., 1], mask.view(2, 29, 4, 33, 4).mean(dim=(2, 4)))
 
 
@@ -151,7 +160,7 @@ def test_culling_draws_front_faces_only(engine):
     viewmats, Ks = sphere_views(32, 32)
     colors = vertices[faces].mean(1)
     plain, culled, turned = (
-        render_opaque(vertices, viewmats, Ks, 32, 32, faces=f, face_colors=colors, cull_backfaces=c, engine=engine)
+        on(engine, render_opaque, vertices, viewmats, Ks, 32, 32, faces=f, face_colors=colors, cull_backfaces=c)
         for f, c in [(faces, False), (faces, True), (faces.flip(1), True)]
     )
     torch.testing.assert_close(plain, culled)
@@ -181,7 +190,7 @@ def test_same_bits_for_any_number_of_threads(rng):
 def test_unusable_triangles_are_dropped_and_harm_nothing(engine):
     """NaN, Inf, behind the camera, without area or huge: none crashes, none changes what a good triangle shows."""
     good = torch.tensor([[2.0, 2.0, 1.0], [28.0, 3.0, 1.0], [10.0, 30.0, 1.0]])
-    alone = rasterize_hard(good[None], IDENTITY, flat_camera(), 32, 32, engine=engine)
+    alone = on(engine, rasterize_hard, good[None], IDENTITY, flat_camera(), 32, 32)
     bad = []
     for value in (math.nan, math.inf, -math.inf):
         for corner in range(3):
@@ -193,7 +202,7 @@ def test_unusable_triangles_are_dropped_and_harm_nothing(engine):
     point, line = good[:1].expand(3, 3), torch.stack([good[0], good[1], good[:2].mean(0)])
     tiny, far = good * 1e-40, torch.full((3, 3), 3e38)
     triangles = torch.stack([*bad, behind, point, line, tiny, far, good])
-    seen = rasterize_hard(triangles, IDENTITY, flat_camera(), 32, 32, engine=engine)
+    seen = on(engine, rasterize_hard, triangles, IDENTITY, flat_camera(), 32, 32)
     assert torch.equal(seen.triangle >= 0, alone.triangle >= 0)
     assert torch.equal(seen.depth, alone.depth)
 
@@ -203,7 +212,7 @@ def test_huge_triangles_fill_the_image(engine):
     """Coordinates far beyond the image are exact enough to cover it completely, with the right depth."""
     for reach in (1e3, 1e7, 1e20):
         corners = torch.tensor([[-reach, -reach, 1.0], [reach, -reach, 1.0], [0.0, reach, 1.0]])[None]
-        seen = rasterize_hard(corners, IDENTITY, flat_camera(), 70, 3, engine=engine)
+        seen = on(engine, rasterize_hard, corners, IDENTITY, flat_camera(), 70, 3)
         assert bool((seen.triangle == 0).all())
         torch.testing.assert_close(seen.depth, torch.ones(1, 3, 70))
 
@@ -211,20 +220,20 @@ def test_huge_triangles_fill_the_image(engine):
 def test_near_plane_drops_a_crossing_triangle_whole(engine):
     """One vertex at the near plane is enough."""
     corners = torch.tensor([[2.0, 2.0, 1.0], [28.0, 3.0, 1.0], [1.0, 3.0, 0.1]])[None]
-    shown = rasterize_hard(corners, IDENTITY, flat_camera(), 32, 32, near_plane=0.05, engine=engine)
-    dropped = rasterize_hard(corners, IDENTITY, flat_camera(), 32, 32, near_plane=0.11, engine=engine)
+    shown = on(engine, rasterize_hard, corners, IDENTITY, flat_camera(), 32, 32, near_plane=0.05)
+    dropped = on(engine, rasterize_hard, corners, IDENTITY, flat_camera(), 32, 32, near_plane=0.11)
     assert bool((shown.triangle == 0).any())
     assert bool((dropped.triangle == -1).all())
 
 
 def test_empty_mesh_gives_an_empty_image(engine):
     """No triangles, or no views, are no error."""
-    image = render_opaque(
-        torch.zeros(0, 3, 3), IDENTITY, flat_camera(), 5, 4, face_colors=torch.zeros(0, 3), engine=engine
+    image = on(
+        engine, render_opaque, torch.zeros(0, 3, 3), IDENTITY, flat_camera(), 5, 4, face_colors=torch.zeros(0, 3)
     )
     assert image.shape == (1, 4, 5, 4)
     assert float(image.abs().sum()) == 0
-    assert rasterize_hard(torch.zeros(1, 3, 3), IDENTITY[:0], flat_camera()[:0], 5, 4, engine=engine).depth.shape == (
+    assert on(engine, rasterize_hard, torch.zeros(1, 3, 3), IDENTITY[:0], flat_camera()[:0], 5, 4).depth.shape == (
         (0, 4, 5)
     )
 
@@ -256,7 +265,6 @@ def test_non_contiguous_input_is_read_correctly(rng):
         ({"face_colors": torch.zeros(2, 3)}, "face_colors"),
         ({"vertex_colors": torch.zeros(3, 3)}, "exactly one"),
         ({"supersampling": 0}, "supersampling"),
-        ({"engine": "gpu"}, "engine"),
     ],
 )
 def test_wrong_arguments_are_named(change, message):

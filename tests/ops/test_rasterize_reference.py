@@ -9,6 +9,7 @@ from torch import Tensor
 
 from etsplat import Cutoffs, intrinsics, look_at, rasterize
 from helpers.brute_force import brute_force
+from helpers.engines import on
 from helpers.scenes import DIFFERENTIABLE, EVERYTHING, IMAGES, NO_CUTOFFS, facing, prepare, render, soup
 
 TRIANGLE = [(3.0, 2.5), (13.0, 4.0), (6.5, 14.0)]
@@ -184,5 +185,5 @@ def test_intrinsics_and_look_at_agree_with_the_rasterizer():
     """A small triangle at the target of the camera is drawn in the middle of the image."""
     viewmats = look_at(torch.tensor([[1.0, 2.0, 3.0]]), torch.zeros(3), torch.tensor([0.0, 1.0, 0.0]))
     K, vertices = intrinsics(40, 21, 21)[None], 0.05 * torch.eye(3)[None]
-    out = rasterize(vertices, torch.ones(1, 1), torch.ones(1), 0.3, viewmats, K, 21, 21, engine="reference")
+    out = on("reference", rasterize, vertices, torch.ones(1, 1), torch.ones(1), 0.3, viewmats, K, 21, 21)
     assert divmod(int(out.alpha.argmax()), 21) == (10, 10)

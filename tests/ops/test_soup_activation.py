@@ -3,10 +3,12 @@
 import pytest
 import torch
 
+import etsplat
 from etsplat.core.cameras import Cameras, intrinsics, look_at
 from etsplat.core.rasterization import TriangleStatistics
 from etsplat.ops.soup_activation import soup_activation
 from etsplat.optim.densification import SoupStatistics
+from helpers.engines import on
 
 pytestmark = pytest.mark.sanitize
 
@@ -38,7 +40,7 @@ def test_native_engines_agree_with_the_float64_reference(rng, cuda_device, limit
         given = torch.tensor(limits, device=device) if engine == "cuda" else limits
         seen = camera().to(torch.device(device), dtype=dtype) if culling else None
         sizes = {"smallest": 1.0, "largest": 20.0}
-        drawn = torch.stack(soup_activation(vertices.to(device, dtype), *leaves, given, seen, **sizes, engine=engine))
+        drawn = torch.stack(on(engine, soup_activation, vertices.to(device, dtype), *leaves, given, seen, **sizes))
         (drawn * cotangents.to(device, dtype)).sum().backward()
         results.append([tensor.detach().cpu().double() for tensor in (drawn, *(leaf.grad for leaf in leaves))])
     exact, on_cpu, on_device = results
@@ -56,8 +58,16 @@ def test_triangles_are_left_out_by_their_size():
     vertices = legs[:, None, None] * corners + torch.tensor([0.0, 0, 3])
     pixels = float(camera().Ks[0, 0, 0]) / 3 * legs
     for engine in ("cpu", "reference"):
-        drawn, _ = soup_activation(
-            vertices, torch.zeros(4), torch.zeros(4), (0.0, 1.0), front, smallest=1.0, largest=20.0, engine=engine
+        drawn, _ = on(
+            engine,
+            soup_activation,
+            vertices,
+            torch.zeros(4),
+            torch.zeros(4),
+            (0.0, 1.0),
+            front,
+            smallest=1.0,
+            largest=20.0,
         )
         assert (drawn > 0).tolist() == ((0.2929 * pixels > 1) & (0.7454 * pixels < 20)).tolist()
     assert (drawn > 0).tolist() == [False, True, True, False]
@@ -85,8 +95,10 @@ def test_statistics_on_a_device_are_those_of_pytorch(rng, cuda_device):
         moved = TriangleStatistics(*(tensor.to(cuda_device) for tensor in vars(view).values()))
         flag = torch.tensor([float(starts)], device=cuda_device)
         expected.update(view, 3, epoch_starts=starts)
-        on_device.update_on_device(moved, 3, flag, going)
-        on_device.update_on_device(TriangleStatistics(*(t + 5 for t in vars(moved).values())), 3, flag, halted)
+        more = TriangleStatistics(*(t + 5 for t in vars(moved).values()))
+        with etsplat.engine("cuda"):
+            on_device.update_on_device(moved, 3, flag, going)
+            on_device.update_on_device(more, 3, flag, halted)
         if step == 4:
             born = torch.arange(N) % 5 == 0
             for statistics in (expected, on_device):

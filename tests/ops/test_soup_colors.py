@@ -3,6 +3,7 @@ import torch
 
 from etsplat.ops.soup_colors import soup_colors
 from etsplat.ops.spherical_harmonics import spherical_harmonics
+from helpers.engines import on
 
 
 def problem(rng: torch.Generator, triangles: int, views: int, bases: int = 15):
@@ -14,7 +15,7 @@ def problem(rng: torch.Generator, triangles: int, views: int, bases: int = 15):
 
 def gradients(inputs, degree, cotangent, engine):
     leaves = [tensor.clone().requires_grad_() for tensor in inputs[:3]]
-    colors = soup_colors(*leaves, inputs[3], degree, engine=engine)
+    colors = on(engine, soup_colors, *leaves, inputs[3], degree)
     colors.backward(cotangent)
     return colors.detach(), [torch.zeros_like(leaf) if leaf.grad is None else leaf.grad for leaf in leaves]
 
@@ -39,7 +40,7 @@ def test_direction_is_from_the_camera_to_the_centroid(engine, rng):
     """The colours are the spherical harmonics of that direction."""
     vertices, dc, rest, centers = problem(rng, 20, 1)
     expected = spherical_harmonics(torch.cat([dc, rest], dim=1), vertices.mean(dim=1) - centers, 3)
-    torch.testing.assert_close(soup_colors(vertices, dc, rest, centers, 3, engine=engine)[0], expected)
+    torch.testing.assert_close(on(engine, soup_colors, vertices, dc, rest, centers, 3)[0], expected)
 
 
 def test_camera_at_the_centroid_sees_the_constant_band(engine, rng):

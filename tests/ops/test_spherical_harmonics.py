@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from etsplat.ops.engines import num_threads, set_num_threads
+from etsplat.engines.threads import num_threads, set_num_threads
 from etsplat.ops.spherical_harmonics import spherical_harmonics
+from helpers.engines import on
 
 DEGREES = [0, 1, 2, 3]
 
@@ -18,7 +19,7 @@ def problem(rng: torch.Generator, degree: int, points: int = 37, channels: int =
 
 def gradients(coefficients, directions, degree, cotangent, engine=None):
     leaves = coefficients.clone().requires_grad_(), directions.clone().requires_grad_()
-    colors = spherical_harmonics(*leaves, degree, engine=engine)
+    colors = on(engine, spherical_harmonics, *leaves, degree)
     return colors.detach(), *torch.autograd.grad((colors * cotangent).sum(), leaves, materialize_grads=True)
 
 
@@ -26,7 +27,7 @@ def basis_values(directions: torch.Tensor, degree: int, engine: str) -> torch.Te
     """Y_k at N directions (N, K): coefficients that pick one basis per channel, before the shift by 1/2."""
     bases = (degree + 1) ** 2
     picks = 0.1 * torch.eye(bases).expand(len(directions), bases, bases)
-    return (spherical_harmonics(picks, directions, degree, engine=engine) - 0.5) / 0.1
+    return (on(engine, spherical_harmonics, picks, directions, degree) - 0.5) / 0.1
 
 
 @pytest.mark.sanitize
@@ -92,7 +93,7 @@ def test_directions_need_not_be_normalised(engine, rng):
     coefficients, directions = problem(rng, 3)
     cotangent = torch.randn((37, 3), generator=rng)
     colors, _, grad = gradients(coefficients, directions, 3, cotangent, engine)
-    scaled = spherical_harmonics(coefficients, 7 * directions, 3, engine=engine)
+    scaled = on(engine, spherical_harmonics, coefficients, 7 * directions, 3)
     torch.testing.assert_close(colors, scaled, rtol=1e-5, atol=1e-5)
     assert float((grad * directions).sum(dim=1).abs().max()) < 1e-4
 

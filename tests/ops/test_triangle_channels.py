@@ -6,9 +6,10 @@ import pytest
 import torch
 
 from etsplat.core.cameras import look_at
-from etsplat.ops.engines import num_threads, set_num_threads
+from etsplat.engines.threads import num_threads, set_num_threads
 from etsplat.ops.pick_values import pick_values
 from etsplat.ops.triangle_channels import triangle_channels
+from helpers.engines import on
 
 pytestmark = pytest.mark.sanitize
 
@@ -19,7 +20,7 @@ def viewmats() -> torch.Tensor:
 
 def gradients(corners: torch.Tensor, views: torch.Tensor, cotangent: torch.Tensor, engine: str, **wanted: bool):
     leaves = corners.clone().requires_grad_(), views.clone().requires_grad_()
-    channels = triangle_channels(*leaves, **wanted, engine=engine)
+    channels = on(engine, triangle_channels, *leaves, **wanted)
     (channels * cotangent.to(channels)).sum().backward()
     return [channels.detach(), *(torch.zeros_like(leaf) if leaf.grad is None else leaf.grad for leaf in leaves)]
 
@@ -83,7 +84,7 @@ def test_picked_values_and_their_gradients(rng, cuda_device):
     for engine, device in (("reference", "cpu"), ("cpu", "cpu"), ("cuda", cuda_device)):
         dtype = torch.float64 if engine == "reference" else torch.float32
         leaf = values.to(device, dtype, copy=True).requires_grad_()
-        image = pick_values(leaf, chosen.to(device), engine=engine)
+        image = on(engine, pick_values, leaf, chosen.to(device))
         (image * cotangent.to(image)).sum().backward()
         results.append([tensor.detach().cpu().double() for tensor in (image, leaf.grad) if tensor is not None])
     assert float(results[0][0][chosen == 0].abs().max()) == 0

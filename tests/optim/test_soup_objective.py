@@ -2,11 +2,12 @@ import pytest
 import torch
 
 from etsplat.core.cameras import Cameras, intrinsics, look_at
+from etsplat.engines.threads import num_threads, set_num_threads
 from etsplat.model.soup_rendering import SoupAppearance, render_soup
 from etsplat.model.triangle_soup import TriangleSoup
-from etsplat.ops.engines import num_threads, set_num_threads
 from etsplat.ops.triangle_area import mean_area
 from etsplat.optim.soup_objective import SoupWeights, soup_objective
+from helpers.engines import on
 
 SIZE = 40
 
@@ -57,7 +58,9 @@ def test_mean_area_has_the_same_bits_for_any_number_of_threads(rng):
 def test_every_term_adds_with_its_weight(rng, engine):
     """The objective is the weighted sum of the terms, each of which can be had alone."""
     start, camera = soup(rng), view()
-    rendering = render_soup(
+    rendering = on(
+        engine,
+        render_soup,
         start,
         camera,
         SoupAppearance(),
@@ -65,7 +68,6 @@ def test_every_term_adds_with_its_weight(rng, engine):
         median_depth=True,
         normals=True,
         distortion=True,
-        engine=engine,
     )
     target = (255 * torch.rand((1, SIZE, SIZE, 3), generator=rng)).to(torch.uint8)
 
@@ -73,7 +75,7 @@ def test_every_term_adds_with_its_weight(rng, engine):
         full = SoupWeights(**{"dssim": 0.2, "opacity": 0.0, "size": 0.0, "normal": 0.0, "distortion": 0.0, **weights})
         background = torch.zeros(1, 3)
         arguments = (rendering, target, None, background, start.vertices, start.opacities, camera, full)
-        return float(soup_objective(*arguments, engine=engine).detach())
+        return float(on(engine, soup_objective, *arguments).detach())
 
     weights = {"opacity": 0.3, "size": 0.02, "normal": 0.5, "distortion": 2.0}
     plain = objective()

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from etsplat.core.errors import InputError
-from etsplat.cuda.compile import cache_folder
+from etsplat.engines.cuda.compile import cache_folder
 from etsplat.io import datasets
 from etsplat.metrics import image
 

@@ -15,10 +15,10 @@ from pathlib import Path
 import pytest
 
 from etsplat.core.errors import InputError
+from etsplat.engines.threads import num_threads
 from etsplat.geometry.icosphere import icosphere
 from etsplat.io.mesh_files import save_mesh
 from etsplat.io.run_directory import RunDirectory
-from etsplat.ops.engines import num_threads
 from etsplat.tasks.reconstruct_config import METHODS, ReconstructConfig
 from studies.famous import Famous
 from studies.grid.cells import Cell, count_jobs, make_cells, run_grid

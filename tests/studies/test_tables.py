@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from etsplat.ops.engines import num_threads, set_num_threads
+from etsplat.engines.threads import num_threads, set_num_threads
 from etsplat.tasks.evaluate_soup import evaluate_run
 from etsplat.tasks.reconstruct import reconstruct
 from etsplat.tasks.reconstruct_config import ReconstructConfig

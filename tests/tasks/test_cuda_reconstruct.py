@@ -8,15 +8,17 @@ from typing import Any
 import pytest
 import torch
 
-from etsplat.cuda.graph import Repeated
+import etsplat
 from etsplat.data.dataset import Dataset
 from etsplat.data.demo_object import demo_object
 from etsplat.data.photograph import photograph
+from etsplat.engines.cuda.graph import Repeated
 from etsplat.optim.loop import Progress
 from etsplat.tasks.mesh_fitting import MeshFitting
 from etsplat.tasks.reconstruct import reconstruct
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.sources import make_start
+from helpers.engines import keeping
 from helpers.simt.build import Simt
 from helpers.simt.calls import Calls
 from helpers.simt.room import room_for_16_pairs, second_step_overflows
@@ -47,8 +49,8 @@ def views() -> Dataset:
 
 
 def fitting(views: Dataset, engine: str, config: ReconstructConfig = CONFIG, device: torch.device = CPU) -> MeshFitting:
-    config = replace(config, engine=engine)
-    return MeshFitting(make_start(None, views, config, device), views, config, lambda _: {})
+    with etsplat.engine(engine):
+        return keeping(engine, MeshFitting(make_start(None, views, config, device), views, config, lambda _: {}))
 
 
 def run(problem: MeshFitting, last: int) -> list[float]:
@@ -122,7 +124,7 @@ def test_a_queued_step_reads_nothing_back(simt: Simt, views: Dataset, method: st
     problem.advance(1, 1)  # fills caches
     assert problem._queue is not None
     problem._queue._position.zero_()
-    with Calls() as calls:
+    with Calls() as calls, etsplat.engine("cuda"):
         problem._queue._step(None)
     assert calls.waiting() == reads
     assert calls.kernels() <= kernels

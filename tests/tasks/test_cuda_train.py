@@ -9,15 +9,17 @@ from typing import Any
 import pytest
 import torch
 
-from etsplat.cuda.graph import Repeated
+import etsplat
 from etsplat.data.dataset import Dataset
 from etsplat.data.demo_scene import demo_scene
 from etsplat.data.pictures import StoredPictures
+from etsplat.engines.cuda.graph import Repeated
 from etsplat.model.soup_init import StartPoints, start_soup
 from etsplat.optim.loop import Progress
 from etsplat.tasks.soup_fitting import SoupFitting
 from etsplat.tasks.train import train
 from etsplat.tasks.train_config import TrainConfig
+from helpers.engines import keeping
 from helpers.simt.build import Simt
 from helpers.simt.calls import Calls
 from helpers.simt.room import room_for_16_pairs, second_step_overflows
@@ -61,7 +63,8 @@ def fitting(capture: Dataset, engine: str, device: torch.device = CPU, config: T
     soup = start_soup(
         StartPoints(chosen, torch.full_like(chosen, 0.5)), generator, scale=2.0, opacity=0.4, sigma=1.0, sh_degree=1
     )
-    return SoupFitting(soup.to(device), capture, replace(config, engine=engine), generator, lambda *_: {})
+    with etsplat.engine(engine):
+        return keeping(engine, SoupFitting(soup.to(device), capture, config, generator, lambda *_: {}))
 
 
 def run(problem: SoupFitting, last: int, together: int = 6) -> list[float]:
@@ -174,7 +177,7 @@ def test_a_queued_step_reads_nothing_back(simt: Simt, settings: Any, own: int, k
     kind = next(iter(problem._queue._repeated))
     problem._queue._position.zero_()
     simt.launches.clear()
-    with Calls() as calls:
+    with Calls() as calls, etsplat.engine("cuda"):
         problem._queue._step(kind)
     assert calls.waiting() == 1
     assert len(simt.launches) == own

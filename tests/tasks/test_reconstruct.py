@@ -13,11 +13,11 @@ from PIL import Image
 from etsplat.core.errors import InputError
 from etsplat.data.demo_object import demo_object
 from etsplat.data.photograph import photograph
+from etsplat.engines.threads import num_threads, set_num_threads
 from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.topology import MeshTopology
 from etsplat.io.mesh_files import MeshFile, load_mesh
 from etsplat.io.run_directory import RunDirectory
-from etsplat.ops.engines import num_threads, set_num_threads
 from etsplat.optim.loop import CheckpointEvent, DivergedError, DoneEvent, Event, RefineEvent, StepEvent
 from etsplat.tasks.mesh_fitting import MeshFitting
 from etsplat.tasks.reconstruct import ReconstructResult, reconstruct

@@ -12,10 +12,11 @@ from rich.text import Text
 from etsplat import _native
 from etsplat.core.cameras import intrinsics
 from etsplat.core.errors import EngineUnavailableError
-from etsplat.cuda.compile import cache_folder
-from etsplat.cuda.device import Device
+from etsplat.engines.choice import engine
+from etsplat.engines.cuda.compile import cache_folder
+from etsplat.engines.cuda.device import Device
+from etsplat.engines.threads import num_threads
 from etsplat.metrics.image import find_lpips_weights
-from etsplat.ops.engines import num_threads
 from etsplat.ops.rasterize import rasterize
 
 TOLERANCE = 1e-4
@@ -48,20 +49,20 @@ def examine(console: Console) -> bool:
 def engine_difference() -> float:
     """Largest difference between the two engines' pictures of one soft triangle."""
     vertices = torch.tensor([[[-0.8, -0.6, 2.0], [0.9, -0.4, 2.5], [0.1, 0.8, 3.0]]])
-    pictures = [
-        rasterize(
-            vertices,
-            torch.tensor([[0.9, 0.5, 0.2]]),
-            torch.tensor([0.8]),
-            torch.tensor(0.5),
-            torch.eye(4)[None],
-            intrinsics(60.0, 32, 32)[None],
-            32,
-            32,
-            engine=engine,
-        ).color
-        for engine in ("cpu", "reference")
-    ]
+    pictures = []
+    for name in ("cpu", "reference"):
+        with engine(name):
+            drawn = rasterize(
+                vertices,
+                torch.tensor([[0.9, 0.5, 0.2]]),
+                torch.tensor([0.8]),
+                torch.tensor(0.5),
+                torch.eye(4)[None],
+                intrinsics(60.0, 32, 32)[None],
+                32,
+                32,
+            )
+        pictures.append(drawn.color)
     return float((pictures[0] - pictures[1]).abs().max())
 
 

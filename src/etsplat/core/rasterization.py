@@ -3,12 +3,15 @@
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 # Depths that the distortion maps to [0, 1]; those of 2DGS and Triangle Splatting.
 DISTORTION_NEAR = 0.2
 DISTORTION_FAR = 100.0
+
+SOUP_SIGMA_FLOOR = 0.01
+"""No triangle of a soup gets sharper than this."""
 
 
 class Cutoffs(NamedTuple):
@@ -50,6 +53,16 @@ class RasterizeSettings:
     cutoffs: Cutoffs = DEFAULT_CUTOFFS
 
 
+class OpaqueView(NamedTuple):
+    """One camera with its image, for the z-buffer; contiguous, without gradients."""
+
+    viewmat: Float[Tensor, "4 4"]
+    K: Float[Tensor, "3 3"]
+    width: int
+    height: int
+    near_plane: float
+
+
 @dataclass
 class TriangleStatistics:
     """Per view and triangle, without gradients; all 0 where ``visible`` is False.
@@ -88,3 +101,18 @@ class Rasterization:
     normal: Float[Tensor, "B H W 3"] | None = None
     distortion: Float[Tensor, "B H W 1"] | None = None
     statistics: TriangleStatistics | None = None
+
+
+@dataclass(frozen=True)
+class HardRasterization:
+    """What each pixel's centre sees.
+
+    Attributes:
+        triangle: Index of the nearest triangle, -1 where there is none.
+        barycentrics: Perspective-correct weights of its vertices, summing to 1; 0 where there is none.
+        depth: View-space z of the surface point; 0 where there is none.
+    """
+
+    triangle: Int[Tensor, "B H W"]
+    barycentrics: Float[Tensor, "B H W 3"]
+    depth: Float[Tensor, "B H W"]

@@ -13,8 +13,8 @@ import torch
 from etsplat.core.cameras import Cameras, intrinsics, look_at, sphere_grid
 from etsplat.data.dataset import Dataset, every_eighth
 from etsplat.data.pictures import StoredPictures
+from etsplat.engines.threads import one_torch_thread
 from etsplat.geometry.icosphere import icosphere
-from etsplat.ops.engines import one_torch_thread
 from etsplat.ops.rasterize_hard import render_opaque
 
 WIDTH, HEIGHT = 400, 300

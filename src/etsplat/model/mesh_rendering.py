@@ -21,13 +21,11 @@ class MeshAppearance:
         kernel: "elastic", "bilateral", "single_sided", or None for opaque triangles with antialiased silhouettes.
         distance: "barycentric" or "sdf".
         backend: whose antialiased rasterizer draws opaque triangles.
-        engine: "reference", "cpu" or None for the one that suits the tensors.
     """
 
     kernel: str | None = "elastic"
     distance: str = "barycentric"
     backend: Literal["etsplat", "nvdiffrast"] = "etsplat"
-    engine: str | None = None
 
 
 def render_mesh(
@@ -59,7 +57,6 @@ def render_mesh(
             *view,
             **mesh.named(mesh.colors),
             backgrounds=backgrounds,
-            engine=appearance.engine,
         )
     return rasterize(
         mesh.vertices,
@@ -73,13 +70,10 @@ def render_mesh(
         distance=appearance.distance,
         backgrounds=backgrounds,
         validate=False,  # the loop checks the loss at every step, and the parameters before each checkpoint
-        engine=appearance.engine,
     ).color
 
 
-def render_exported(
-    mesh: TriangleMesh, cameras: Cameras, *, supersampling: int, engine: str | None = None
-) -> Float[Tensor, "B H W 4"]:
+def render_exported(mesh: TriangleMesh, cameras: Cameras, *, supersampling: int) -> Float[Tensor, "B H W 4"]:
     """What a mesh viewer shows: opaque triangles in display colours, premultiplied RGBA."""
     return render_opaque(
         mesh.vertices.detach(),
@@ -90,5 +84,4 @@ def render_exported(
         faces=mesh.faces,
         **mesh.named(mesh.display_colors),
         supersampling=supersampling,
-        engine=engine,
     )

@@ -10,13 +10,13 @@ from torch import Tensor
 
 from etsplat.core.errors import InputError
 from etsplat.core.kernels import DISTANCES, KERNELS
+from etsplat.core.rasterization import SOUP_SIGMA_FLOOR
 from etsplat.io.mesh_files import load_mesh
 from etsplat.io.paths import kind_of
 from etsplat.io.ply_tables import CORNERS, read_ply_header, read_ply_tables
 from etsplat.model.soup_files import SoupFile, check_finite_soup, load_soup
 from etsplat.model.soup_rendering import SoupAppearance
 from etsplat.model.triangle_soup import TriangleSoup
-from etsplat.ops.soup_activation import SOUP_SIGMA_FLOOR
 
 GAUSSIAN_SIGMA = 1.0
 """With it the elastic kernel is exp(-x^2): the profile of a Gaussian."""

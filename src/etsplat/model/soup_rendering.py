@@ -76,7 +76,6 @@ def render_soup(
     normals: bool = False,
     distortion: bool = False,
     statistics: bool = False,
-    engine: str | None = None,
 ) -> Rasterization:
     """Splat a soup into the images of B cameras; differentiable with respect to its parameters.
 
@@ -84,17 +83,16 @@ def render_soup(
         soup: N triangles.
         cameras: B cameras of one image size.
         appearance: kernel and switches.
-        limits: (2,) in place of the appearance's opacity floor and sigma ceiling, in device memory of engine "cuda".
+        limits: (2,) in place of the appearance's opacity floor and sigma ceiling, in device memory.
         backgrounds: (B, 3); None is black.
         depth: as in `rasterize`, and so are the other images.
         median_depth: also return the median depth.
         normals: also return normals.
         distortion: also return the distortion.
         statistics: also return per-triangle statistics.
-        engine: "reference", "cpu" or None (by dtype and device).
     """
     degree = appearance.degree(soup)
-    colors = soup_colors(soup.vertices, soup.sh_dc, soup.sh_rest, cameras.centers, degree, engine=engine)
+    colors = soup_colors(soup.vertices, soup.sh_dc, soup.sh_rest, cameras.centers, degree)
     opacities, sigma = soup_activation(
         soup.vertices,
         soup.opacity_logits,
@@ -103,7 +101,6 @@ def render_soup(
         cameras if appearance.cull_small or appearance.cull_large < float("inf") else None,
         smallest=SMALLEST_INRADIUS if appearance.cull_small else 0.0,
         largest=appearance.cull_large * max(cameras.width, cameras.height),
-        engine=engine,
     )
     return rasterize(
         soup.vertices,
@@ -125,7 +122,6 @@ def render_soup(
         near_plane=appearance.near_plane,
         freeze_incentre=appearance.freeze_incentre,
         validate=False,
-        engine=engine,
     )
 
 
@@ -137,7 +133,6 @@ def render_soup_opaque(
     *,
     background: Float[Tensor, "3"] | None = None,
     supersampling: int = 4,
-    engine: str | None = None,
 ) -> Float[Tensor, "B H W 3"]:
     """Draw a soup as a mesh viewer would: sharp opaque triangles with a z-buffer, colours as each camera sees them.
 
@@ -147,7 +142,6 @@ def render_soup_opaque(
         appearance: of the opacities and colours.
         background: (3,); None is black.
         supersampling: samples along each axis of a pixel.
-        engine: "reference", "cpu" or None (by dtype and device).
     """
     degree = appearance.degree(soup)
     kept = appearance.opacities(soup) >= OPAQUE_FROM
@@ -161,10 +155,9 @@ def render_soup_opaque(
             camera.Ks,
             camera.width,
             camera.height,
-            face_colors=soup_colors(vertices, dc, rest, camera.centers, degree, engine=engine)[0],
+            face_colors=soup_colors(vertices, dc, rest, camera.centers, degree)[0],
             supersampling=supersampling,
             near_plane=appearance.near_plane,
-            engine=engine,
         )
         behind = 0.0 if background is None else (1 - rgba[..., 3:]) * background
         images.append(rgba[..., :3] + behind)

@@ -6,8 +6,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from etsplat.ops.soup_activation import SOUP_SIGMA_FLOOR
-from etsplat.ops.spherical_harmonics import MAX_DEGREE, spherical_harmonics
+from etsplat.core.harmonics import MAX_DEGREE
+from etsplat.core.rasterization import SOUP_SIGMA_FLOOR
+from etsplat.ops.spherical_harmonics import spherical_harmonics
 
 SH_CONSTANT = 0.28209479177387814
 """The constant basis function Y_0: a colour c is the coefficient (c - 1/2) / Y_0."""

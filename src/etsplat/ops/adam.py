@@ -10,11 +10,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from etsplat import _native
 from etsplat.core.validation import check_like, check_shape, dense
-from etsplat.cuda.transfer import upload
-from etsplat.ops._adam_cuda import adam_step_cuda
-from etsplat.ops.engines import resolve_engine
+from etsplat.engines.choice import engine_for, queued_steps
+from etsplat.engines.engine import AdamGroup, Engine, step_rates
 
 
 class Adam:
@@ -41,7 +39,6 @@ class Adam:
         *,
         betas: tuple[float, float] = (0.9, 0.999),
         eps: float = 1e-15,
-        engine: str | None = None,
     ) -> None:
         """Start with zero moments.
 
@@ -50,7 +47,6 @@ class Adam:
             learning_rates: One for each name, at least 0.
             betas: Both in [0, 1).
             eps: At least 0.
-            engine: "cpu", "cuda", "reference" or None (by dtype and device, for each parameter).
 
         Raises:
             ValueError: Names that do not match, or a number out of its range.
@@ -68,7 +64,6 @@ class Adam:
         self.step_count = 0
         self.first_moments = {name: _zeros(parameter) for name, parameter in self.parameters.items()}
         self.second_moments = {name: _zeros(parameter) for name, parameter in self.parameters.items()}
-        self._engines = {name: resolve_engine(engine, parameter) for name, parameter in self.parameters.items()}
 
     @torch.no_grad()
     def step(self) -> None:
@@ -81,17 +76,17 @@ class Adam:
             if parameter.grad is None:
                 raise ValueError(f"parameter {name} has no gradient: call backward() before step()")
         self.step_count += 1
-        if names := self._of_engine("cpu"):
-            self._step_cpu(names)
-        if names := self._of_engine("cuda"):
-            self._step_cuda(names, upload(self.rates(names), self.parameters[names[0]].device), None)
-        for name in self._of_engine("reference"):
-            self._step_reference(name)
+        together: dict[Engine, list[str]] = {}
+        for name, parameter in self.parameters.items():
+            together.setdefault(engine_for(parameter), []).append(name)
+        for engine, names in together.items():
+            groups, rates = self._groups(names), [self.learning_rates[name] for name in names]
+            engine.adam_step(groups, rates, self.betas, self.eps, self.step_count)
+            self._store(names, groups)
 
     def rates(self, names: Sequence[str]) -> list[float]:
         """What step t = `step_count` needs: lr / (1 - b1^t) of each named parameter, then sqrt(1 - b2^t)."""
-        first, second = (1 - beta**self.step_count for beta in self.betas)
-        return [*(self.learning_rates[name] / first for name in names), second**0.5]
+        return step_rates([self.learning_rates[name] for name in names], self.betas, self.step_count)
 
     def zero_grad(self) -> None:
         """Drop all gradients."""
@@ -146,40 +141,19 @@ class Adam:
         self.second_moments = {name: _dense_copy(state["second_moments"][name]) for name in self.parameters}
 
     @torch.no_grad()
-    def step_on_device(self, rates: Tensor, halted: Tensor | None) -> None:
-        """A step of engine "cuda" that a CUDA graph can capture and repeat; it leaves `step_count` to the caller.
+    def step_on_device(self, rates: Tensor, halted: Tensor) -> None:
+        """A step as part of a queued one; it leaves `step_count` to the caller.
 
         Args:
             rates: (P + 1,) float32 in device memory, of `rates`.
-            halted: () int32 in device memory: nothing is updated where it is not 0. None never halts.
+            halted: () int32 in device memory: nothing is updated where it is not 0.
         """
-        self._step_cuda(list(self.parameters), rates, halted)
+        names = list(self.parameters)
+        groups = self._groups(names)
+        queued_steps(groups[0][0]).adam_step(groups, rates, self.betas, self.eps, halted)
+        self._store(names, groups)
 
-    def _of_engine(self, engine: str) -> list[str]:
-        return [name for name, chosen in self._engines.items() if chosen == engine]
-
-    def _step_cpu(self, names: list[str]) -> None:
-        groups = self._dense(names)
-        values, gradients, firsts, seconds = zip(*groups, strict=True)
-        _native.adam_step(
-            [tensor.data_ptr() for tensor in values],
-            [tensor.data_ptr() for tensor in gradients],
-            [tensor.data_ptr() for tensor in firsts],
-            [tensor.data_ptr() for tensor in seconds],
-            [tensor.numel() for tensor in values],
-            [self.learning_rates[name] for name in names],
-            *self.betas,
-            self.eps,
-            self.step_count,
-        )
-        self._store(names, values)
-
-    def _step_cuda(self, names: list[str], rates: Tensor, halted: Tensor | None) -> None:
-        groups = self._dense(names)
-        adam_step_cuda(groups, rates, self.betas, self.eps, halted)
-        self._store(names, [group[0] for group in groups])
-
-    def _dense(self, names: list[str]) -> list[tuple[Tensor, Tensor, Tensor, Tensor]]:
+    def _groups(self, names: Sequence[str]) -> list[AdamGroup]:
         """Value, gradient and moments of each parameter, contiguous."""
         groups = []
         for name in names:
@@ -192,23 +166,13 @@ class Adam:
             groups.append((dense(parameter, name), dense(parameter.grad, f"gradient of {name}"), first, second))
         return groups
 
-    def _store(self, names: list[str], updated: Sequence[Tensor]) -> None:
-        for name, value in zip(names, updated, strict=True):
+    def _store(self, names: Sequence[str], groups: Sequence[AdamGroup]) -> None:
+        for name, (value, *_) in zip(names, groups, strict=True):
             parameter = self.parameters[name]
             if value.data_ptr() == parameter.data_ptr():
                 torch.autograd.graph.increment_version(parameter)  # so that a stale graph fails loudly in backward
             else:
                 parameter.copy_(value)
-
-    def _step_reference(self, name: str) -> None:
-        parameter, first, second = self.parameters[name], self.first_moments[name], self.second_moments[name]
-        gradient = parameter.grad
-        assert gradient is not None
-        beta1, beta2 = self.betas
-        first += (1 - beta1) * (gradient - first)
-        second.mul_(beta2).add_((1 - beta2) * gradient * gradient)
-        root = second.sqrt() / (1 - beta2**self.step_count) ** 0.5
-        parameter -= self.learning_rates[name] / (1 - beta1**self.step_count) * (first / (root + self.eps))
 
 
 def _zeros(parameter: Tensor) -> Tensor:

@@ -1,7 +1,6 @@
 """Differentiable triangle splatting (paper, section "Triangle Splatting"): the public call and its checks."""
 
 import math
-from functools import partial
 from typing import Literal
 
 import torch
@@ -21,9 +20,7 @@ from etsplat.core.validation import (
     check_positive,
     check_shape,
 )
-from etsplat.ops._rasterize_native import rasterize_native
-from etsplat.ops._rasterize_reference import rasterize_reference
-from etsplat.ops.engines import resolve_engine
+from etsplat.engines.choice import engine_for
 
 _COLORS = ("colors", "corner_colors", "backgrounds")
 _LARGEST_COLOR = 1e30  # beyond, the gradients of the triangles around overflow
@@ -53,7 +50,6 @@ def rasterize(
     freeze_incentre: bool = False,
     cutoffs: Cutoffs = DEFAULT_CUTOFFS,
     validate: bool | None = None,
-    engine: str | None = None,
 ) -> Rasterization:
     """Splat N soft triangles into B images.
 
@@ -90,8 +86,6 @@ def rasterize(
         validate: Raise on non-finite input, sigma <= 0, malformed Ks, and colours beyond 1e30, whose products in the
             gradients overflow; None means on the CPU. Without it a triangle with data that is not finite, or on a GPU
             with a wrong index in ``faces``, is invisible and gets zero gradient.
-        engine: "reference", "cpu", "cuda", or None: cpu or cuda for float32, by the tensors' device, and reference for
-            float64.
 
     Returns:
         Images, channels last, in the dtype of ``vertices``; see ``Rasterization``.
@@ -99,7 +93,6 @@ def rasterize(
     Raises:
         ValueError: An argument has the wrong shape, dtype, device or range; the message names it.
     """
-    chosen = resolve_engine(engine, vertices)
     if not isinstance(sigma, Tensor):
         sigma = torch.full((), float(sigma), dtype=vertices.dtype, device=vertices.device)
     settings = RasterizeSettings(
@@ -129,12 +122,13 @@ def rasterize(
     }
     given = {name: tensor for name, tensor in floats.items() if tensor is not None}
     # Looking at values on a GPU would mean to wait for it.
-    look = validate or (validate is None and vertices.device.type == "cpu")
+    look = validate or (validate is None and vertices.is_cpu)
     _check_tensors(given, faces, look)
     if look:
         _check_values(given)
-    run = rasterize_reference if chosen == "reference" else partial(rasterize_native, chosen)
-    return run(vertices, faces, colors, corner_colors, opacities, sigma, viewmats, Ks, backgrounds, settings)
+    return engine_for(vertices).rasterize(
+        vertices, faces, colors, corner_colors, opacities, sigma, viewmats, Ks, backgrounds, settings
+    )
 
 
 def _check_settings(settings: RasterizeSettings) -> None:
@@ -181,7 +175,7 @@ def _check_tensors(given: dict[str, Tensor], faces: Tensor | None, look: bool) -
         raise ValueError("colors must have at least one channel, got 0")
     if faces is not None:
         check_device("faces", faces, "vertices", given["vertices"])
-        if look or faces.device.type == "cpu":
+        if look or faces.is_cpu:
             check_indices("faces", faces, sizes["V"])
 
 

@@ -8,24 +8,13 @@ A triangle is on trial for as many views as there are, from the first view of an
 
 from collections.abc import Sequence
 
-import torch
 from torch import Tensor
 
 from etsplat.core.rasterization import TriangleStatistics
-from etsplat.cuda.launch import blocks, launch
-from etsplat.cuda.program import Program
-
-_PROGRAM = Program("soup_statistics.cu", contract=False)
-_THREADS = 256
-_VISIBLE_INRADIUS = 1.0
+from etsplat.engines.choice import engine_for, queued_steps
 
 
-def update_statistics(
-    records: Sequence[Tensor],
-    view: TriangleStatistics,
-    views: int,
-    epoch_starts: bool,
-) -> None:
+def update_statistics(records: Sequence[Tensor], view: TriangleStatistics, views: int, epoch_starts: bool) -> None:
     """Take a view into the records of N triangles, in place.
 
     Args:
@@ -34,21 +23,13 @@ def update_statistics(
         views: length of an epoch.
         epoch_starts: whether the view is the first of an epoch.
     """
-    importance, screen_size, seen, trial = records
-    seen_now = view.max_weight[0], view.screen_size[0], view.inradius[0]
-    torch.maximum(importance, seen_now[0], out=importance)
-    torch.maximum(screen_size, seen_now[1], out=screen_size)
-    running = trial < views
-    if not epoch_starts:
-        running &= trial > 0
-    seen += running & (seen_now[2] > _VISIBLE_INRADIUS)
-    trial += running
+    engine_for(records[0]).update_statistics(records, view, views, epoch_starts)
 
 
-def update_statistics_on_device(
+def update_statistics_queued(
     records: Sequence[Tensor], view: TriangleStatistics, views: int, epoch_starts: Tensor, halted: Tensor
 ) -> None:
-    """As ``update_statistics``, by engine "cuda", so that a CUDA graph can capture and repeat it.
+    """As ``update_statistics``, as part of a queued step.
 
     Args:
         records: as there, float32 and int32.
@@ -57,7 +38,4 @@ def update_statistics_on_device(
         epoch_starts: (1,) float32 in device memory, 0 or 1.
         halted: () int32 in device memory; nothing is updated where it is not 0.
     """
-    count = len(records[0])
-    seen_now = view.max_weight[0], view.screen_size[0], view.inradius[0]
-    arguments = (count, *seen_now, *records, views, epoch_starts, halted)
-    launch(_PROGRAM, "soup_statistics", blocks(count, _THREADS), _THREADS, arguments)
+    queued_steps(records[0]).update_statistics(records, view, views, epoch_starts, halted)

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from etsplat.core.rasterization import TriangleStatistics
-from etsplat.ops.soup_statistics import update_statistics, update_statistics_on_device
+from etsplat.ops.soup_statistics import update_statistics, update_statistics_queued
 from etsplat.optim.edit import RowPlan
 
 SPLIT_PARTS = 4
@@ -54,7 +54,7 @@ class SoupStatistics:
         update_statistics(list(self.tensors().values()), view, views, epoch_starts)
 
     def update_on_device(self, view: TriangleStatistics, views: int, epoch_starts: Tensor, halted: Tensor) -> None:
-        """As `update`, on engine "cuda", which can be captured in a CUDA graph.
+        """As `update`, as part of a queued step.
 
         Args:
             view: as there.
@@ -62,7 +62,7 @@ class SoupStatistics:
             epoch_starts: (1,) float32 in device memory, 0 or 1.
             halted: () int32 in device memory: nothing is updated where it is not 0.
         """
-        update_statistics_on_device(list(self.tensors().values()), view, views, epoch_starts, halted)
+        update_statistics_queued(list(self.tensors().values()), view, views, epoch_starts, halted)
 
     def judged(self, views: int) -> Bool[Tensor, " N"]:
         """Whose trial is over."""

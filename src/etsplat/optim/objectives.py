@@ -37,8 +37,6 @@ def mesh_objective(
     mesh: TriangleMesh,
     weights: MeshWeights,
     gamma: float | Float[Tensor, ""],
-    *,
-    engine: str | None = None,
 ) -> Float[Tensor, ""]:
     """The paper's training objective of shape reconstruction (section 3.3, L_mesh).
 
@@ -52,15 +50,14 @@ def mesh_objective(
         mesh: whose geometry and softness are regularized.
         weights: lambda_e, lambda_n, lambda_lap, lambda_sigma and the exponent of L_e.
         gamma: global weight of the regularizers; at the number 0 they are not computed.
-        engine: "reference", "cpu", "cuda" or None for the one that suits the tensors.
 
     Returns:
         Scalar, differentiable with respect to `color` and the mesh's parameters.
     """
-    photometric = photometric_loss(color, target, 0.0, backgrounds=backgrounds, engine=engine)
+    photometric = photometric_loss(color, target, 0.0, backgrounds=backgrounds)
     if not isinstance(gamma, Tensor) and gamma == 0.0:
         return photometric
-    energies = mesh_energies(mesh.vertices, mesh.topology.connectivity, edge_power=weights.edge_power, engine=engine)
+    energies = mesh_energies(mesh.vertices, mesh.topology.connectivity, edge_power=weights.edge_power)
     terms = [
         Term(weights.edge, energies.edge),
         Term(weights.normal, energies.normal),
@@ -68,4 +65,4 @@ def mesh_objective(
     ]
     if mesh.log_sigma is not None:
         terms.append(Term(weights.softness, mesh.sigma, -2))
-    return weighted_sum(photometric, terms, gamma, engine=engine)
+    return weighted_sum(photometric, terms, gamma)

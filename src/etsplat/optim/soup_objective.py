@@ -44,8 +44,6 @@ def soup_objective(
     opacities: Float[Tensor, " N"],
     camera: Cameras,
     weights: SoupWeights,
-    *,
-    engine: str | None = None,
 ) -> Float[Tensor, ""]:
     """The training objective of novel-view synthesis (paper section 3.4, L_nvs).
 
@@ -61,19 +59,18 @@ def soup_objective(
         opacities: (N,) of the soup.
         camera: of the view.
         weights: of the terms.
-        engine: "reference", "cpu" or None for the one that suits the tensors.
 
     Returns:
         Scalar, differentiable with respect to the rendering, the vertices and the opacities.
     """
     photometric = photometric_loss(
-        rendering.color, target, weights.dssim, mask, backgrounds=background, pixel=weights.pixel, engine=engine
+        rendering.color, target, weights.dssim, mask, backgrounds=background, pixel=weights.pixel
     )
     terms = []
     if weights.opacity > 0:
         terms.append(Term(weights.opacity, opacities.mean()))
     if weights.size > 0:
-        terms.append(Term(weights.size, mean_area(vertices, engine=engine), -1))
+        terms.append(Term(weights.size, mean_area(vertices), -1))
     if weights.normal > 0:
         assert rendering.normal is not None
         assert rendering.median_depth is not None
@@ -83,10 +80,9 @@ def soup_objective(
             rendering.alpha.detach(),
             camera.viewmats,
             camera.Ks,
-            engine=engine,
         )
         terms.append(Term(weights.normal, disagreement))
     if weights.distortion > 0:
         assert rendering.distortion is not None
         terms.append(Term(weights.distortion, rendering.distortion.mean()))
-    return weighted_sum(photometric, terms, engine=engine)
+    return weighted_sum(photometric, terms)

@@ -6,12 +6,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from etsplat.cuda.graph import Repeated
-from etsplat.cuda.launch import backend, launch
-from etsplat.cuda.program import Program
-from etsplat.ops._raster_capacity import overflow_flag, repair_overflow
+from etsplat.engines.choice import queued_steps
 
-_PROGRAM = Program("step.cu", contract=False)
 MAX_STEPS = 256
 """Steps that can be queued at a time."""
 
@@ -67,13 +63,14 @@ class StepQueue:
         self._position = torch.zeros(1, dtype=torch.int64, device=device)
         self._losses = torch.zeros(MAX_STEPS, device=device)
         self._halted = torch.zeros((), dtype=torch.int32, device=device)
-        self._repeated: dict[Hashable, Repeated] = {}
+        self._engine = queued_steps(self._rows)
+        self._repeated: dict[Hashable, Callable[[], None]] = {}
         self.restart()
 
     def restart(self) -> None:
         """To be called when a tensor that the steps use was replaced: captures anew."""
         self._repeated.clear()
-        self._pool = backend().memory_pool()  # torch takes no new graphs into a pool that has lost all of its own
+        self._pool = self._engine.memory_pool()  # torch takes no new graphs into a pool that has lost all of its own
 
     def run(self, steps: Sequence[QueuedStep]) -> list[float]:
         """Makes at most MAX_STEPS steps.
@@ -92,19 +89,18 @@ class StepQueue:
                 step.prepare()
                 self._graph(step.kind)()
             done = int(self._position)  # waits for the device
-            if done == len(steps) or not repair_overflow(self._rows.device):
+            if done == len(steps) or not self._engine.repair(self._rows.device):
                 break
             self.restart()
         return self._losses[: min(done + 1, len(steps))].tolist()
 
-    def _graph(self, kind: Hashable) -> Repeated:
+    def _graph(self, kind: Hashable) -> Callable[[], None]:
         if kind not in self._repeated:
-            self._repeated[kind] = Repeated(lambda: self._step(kind), self._pool)
+            self._repeated[kind] = self._engine.repeated(lambda: self._step(kind), self._pool)
         return self._repeated[kind]
 
     def _step(self, kind: Hashable) -> None:
         row = self._rows.index_select(0, self._position)[0]
         loss = self._gradients(row, kind)
-        overflow = overflow_flag(self._rows.device)
-        launch(_PROGRAM, "step_verdict", 1, 1, (loss, overflow, self._position, self._losses, self._halted))
+        self._engine.verdict(loss, self._position, self._losses, self._halted)
         self._commit(row, self._halted)

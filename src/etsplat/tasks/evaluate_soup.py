@@ -12,11 +12,12 @@ from torch import Tensor
 
 from etsplat.core.cameras import Cameras
 from etsplat.core.errors import InputError
+from etsplat.engines.choice import engine_for
+from etsplat.engines.threads import num_threads
 from etsplat.io.atomic import write_error
 from etsplat.io.images import save_image, to_8_bit
 from etsplat.metrics.image import Lpips, find_lpips_weights, psnr, ssim
 from etsplat.model.soup_rendering import render_soup
-from etsplat.ops.engines import num_threads, resolve_engine
 from etsplat.tasks.running import device_name
 from etsplat.tasks.soup_run import SoupRun
 from etsplat.tasks.soup_scoring import SoupScorer
@@ -63,7 +64,7 @@ def evaluate_run(
     place, soup, appearance = run.device, run.file.soup, run.file.appearance
     lpips, reason = load_lpips(lpips_weights, place)
     background = torch.tensor(run.file.background)
-    scorer = SoupScorer(capture, background, None, place)
+    scorer = SoupScorer(capture, background, place)
     rows: list[dict[str, Any]] = []
     for index, view in enumerate(capture.test):
         photo = scorer.photo(view)
@@ -81,7 +82,7 @@ def evaluate_run(
         render_soup(soup, camera, appearance, backgrounds=background[None].to(place))
 
     cameras = [capture.cameras[view] for view in capture.test]
-    speed = {**drawing_speed(draw, cameras, place, len(soup)), "engine": resolve_engine(None, soup.vertices)}
+    speed = {**drawing_speed(draw, cameras, place, len(soup)), "engine": engine_for(soup.vertices).name}
     return {**mean_scores(rows), "lpips_reason": reason, **speed, "triangles": len(soup), "views": rows}
 
 

@@ -71,9 +71,7 @@ def export_soup(run: SoupRun, path: Path | str, config: ExportConfig) -> Export:
 
 
 @torch.no_grad()
-def bake_colors(
-    soup: TriangleSoup, appearance: SoupAppearance, cameras: list[Cameras], *, engine: str | None = None
-) -> Float[Tensor, "N 3"]:
+def bake_colors(soup: TriangleSoup, appearance: SoupAppearance, cameras: list[Cameras]) -> Float[Tensor, "N 3"]:
     """One colour for every triangle: the mean of what the cameras see, weighted by how much each sees of it.
 
     The weight is the largest blend weight of any pixel. A triangle that nobody sees has the part of its colour that is
@@ -84,9 +82,9 @@ def bake_colors(
     degree = appearance.degree(soup)
     for camera in cameras:
         small = camera.scaled(min(1.0, BAKING_WIDTH / camera.width)).to(device)
-        seen = render_soup(soup, small, appearance, statistics=True, engine=engine).statistics
+        seen = render_soup(soup, small, appearance, statistics=True).statistics
         assert seen is not None
-        colors = soup_colors(soup.vertices, soup.sh_dc, soup.sh_rest, small.centers, degree, engine=engine)[0]
+        colors = soup_colors(soup.vertices, soup.sh_dc, soup.sh_rest, small.centers, degree)[0]
         total += seen.max_weight[0, :, None] * colors.clamp(0, 1)
         weight += seen.max_weight[0, :, None]
     return torch.where(weight > 0, total / weight.clamp_min(1e-12), soup.display_colors())

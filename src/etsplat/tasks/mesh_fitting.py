@@ -13,6 +13,7 @@ from etsplat.core.cameras import Cameras
 from etsplat.core.validation import first_not_finite
 from etsplat.data.dataset import Dataset
 from etsplat.data.pictures import as_float
+from etsplat.engines.choice import engine_for
 from etsplat.geometry.measures import face_areas
 from etsplat.geometry.subdivision import longest_edge_plan
 from etsplat.geometry.topology import MeshTopology
@@ -20,7 +21,6 @@ from etsplat.geometry.untangle import untangle
 from etsplat.model.mesh_rendering import render_mesh
 from etsplat.model.triangle_mesh import TriangleMesh
 from etsplat.ops.adam import Adam
-from etsplat.ops.engines import resolve_engine
 from etsplat.optim.edit import apply_subdivision
 from etsplat.optim.loop import Progress
 from etsplat.optim.objectives import MeshWeights, mesh_objective
@@ -98,12 +98,12 @@ class MeshFitting:
         self._levels = [_Level.of(level, mesh.vertices.device) for level in levels]
         self._solve: Solve | None = None
         parameters = mesh.parameters()
-        self.adam = Adam(parameters, {name: self._rates[name] for name in parameters}, engine=config.engine)
+        self.adam = Adam(parameters, {name: self._rates[name] for name in parameters})
         self._queue, self._queued_level = None, self._level(1)
         queueable = (
             config.optimizer.vertex_update == "adam" and config.drawing.backend == "etsplat"
         )  # others need the host in a step
-        if queueable and resolve_engine(config.engine, mesh.vertices) == "cuda":
+        if queueable and engine_for(mesh.vertices).queues_steps:
             width = 4 * config.batch + 2 + len(parameters) + 1
             self._queue = StepQueue(self._queued_gradients, self._commit, width, mesh.vertices.device)
 
@@ -162,7 +162,7 @@ class MeshFitting:
         """Those of the objective, whose value is returned."""
         config, mesh = self._config, self.mesh
         color = render_mesh(mesh, cameras, config.appearance, backgrounds=backgrounds)
-        loss = mesh_objective(color, target, backgrounds, mesh, self._weights, gamma, engine=config.engine)
+        loss = mesh_objective(color, target, backgrounds, mesh, self._weights, gamma)
         self.adam.zero_grad()
         loss.backward()
         return loss.detach()

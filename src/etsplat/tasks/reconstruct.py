@@ -1,17 +1,16 @@
 """Shape reconstruction (paper section 3.3): posed images of an object in, a run directory with its mesh out."""
 
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from etsplat.engines.choice import engine, engine_for, resolve_device
 from etsplat.io.mesh_files import MeshFile, save_mesh
 from etsplat.io.run_directory import RunDirectory
 from etsplat.ops.antialias_nvdiffrast import load_nvdiffrast
-from etsplat.ops.engines import one_torch_thread, resolve_device, resolve_engine
 from etsplat.optim.loop import Progress
 from etsplat.tasks.mesh_fitting import MeshFitting
 from etsplat.tasks.reconstruct_config import ReconstructConfig
@@ -96,13 +95,13 @@ def reconstruct(
     subject = make_subject(loaded, config, lambda done, total: announce(PrepareEvent(done, total)), device)
     if config.drawing.backend == "nvdiffrast":
         load_nvdiffrast()  # now rather than at the first step
-    scorer = Scorer(subject, config, device)
-    fitting = MeshFitting(make_start(start, subject.views, config, device), subject.views, config, scorer.cheap)
-    run = place.open(record)
-    on_cpu = resolve_engine(config.engine, fitting.mesh.vertices) == "cpu"
-    with one_torch_thread() if on_cpu else nullcontext():
-        progress = fit(fitting, run, loop_settings(config), record, announce)
-    return _finish(fitting, progress, run, scorer, subject.views.normalization.invert, config)
+    with engine(config.engine):
+        scorer = Scorer(subject, config, device)
+        fitting = MeshFitting(make_start(start, subject.views, config, device), subject.views, config, scorer.cheap)
+        run = place.open(record)
+        with engine_for(fitting.mesh.vertices).looping():
+            progress = fit(fitting, run, loop_settings(config), record, announce)
+        return _finish(fitting, progress, run, scorer, subject.views.normalization.invert, config)
 
 
 def _finish(

@@ -239,7 +239,7 @@ class ReconstructConfig(Settings):
         from etsplat.model.mesh_rendering import MeshAppearance  # imports torch
 
         kernel = self.method.replace("-", "_") if self.soft else None
-        return MeshAppearance(kernel, self.drawing.distance, self.drawing.backend, self.engine)
+        return MeshAppearance(kernel, self.drawing.distance, self.drawing.backend)
 
     @classmethod
     def based_on(cls, settings: Mapping[str, Any]) -> "ReconstructConfig":

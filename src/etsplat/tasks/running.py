@@ -13,8 +13,9 @@ import torch
 from torch import Tensor
 
 from etsplat.core.errors import InputError
+from etsplat.engines.choice import engine_for
+from etsplat.engines.threads import num_threads
 from etsplat.io.run_directory import RunDirectory, is_run
-from etsplat.ops.engines import num_threads, resolve_engine
 from etsplat.optim.checkpoints import load_latest_checkpoint, save_checkpoint
 from etsplat.optim.loop import Event, LoopSettings, Problem, Progress, StepEvent, optimize
 from etsplat.tasks.reconstruct_config import ReconstructConfig
@@ -199,7 +200,7 @@ def common_metrics(progress: Progress, config: ReconstructConfig | TrainConfig, 
         "iterations": progress.iteration,
         "seconds": progress.seconds,
         "seconds_per_iteration": progress.seconds / progress.iteration,
-        "engine": resolve_engine(config.engine, result),
+        "engine": engine_for(result).name,
         "device": device_name(result.device),
         "threads": num_threads(),
         "method": config.method,

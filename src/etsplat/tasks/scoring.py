@@ -114,7 +114,7 @@ class Scorer:
     def _opaque(self, mesh: TriangleMesh, view: int) -> Float[Tensor, "H W 4"]:
         config = self._config
         camera = self._loader.view(view).camera
-        image = render_exported(mesh, camera, supersampling=config.pictures.supersampling, engine=config.engine)
+        image = render_exported(mesh, camera, supersampling=config.pictures.supersampling)
         return image[0]
 
 

@@ -12,11 +12,11 @@ from etsplat.core.rasterization import TriangleStatistics
 from etsplat.core.validation import first_not_finite
 from etsplat.data.dataset import Dataset
 from etsplat.data.loader import View, ViewLoader
+from etsplat.engines.choice import engine_for
 from etsplat.model.soup_rendering import SoupAppearance, render_soup
 from etsplat.model.surroundings import Surroundings
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.ops.adam import Adam
-from etsplat.ops.engines import resolve_engine
 from etsplat.optim.densification import PruneRules, SoupStatistics, dead_triangles, densify_plan, grown_count
 from etsplat.optim.edit import RowPlan, apply_rows
 from etsplat.optim.loop import DivergedError, Progress
@@ -72,12 +72,12 @@ class SoupFitting:
         self._sampler = ViewSampler(capture.train, generator)
         self._iteration = 0
         self._surroundings = Surroundings.of(capture).to(self._device) if config.sky == "sphere" else None
-        self.adam = Adam(soup.parameters(), self._schedule.rates(1), engine=config.engine)
+        self.adam = Adam(soup.parameters(), self._schedule.rates(1))
         self._queue: StepQueue | None = None
         self._phase: tuple[SoupAppearance, SoupWeights] | None = None
         self._drawn: TriangleStatistics | None = None  # by the step that is being captured
         self._views = ViewLoader(capture, self._device)
-        if resolve_engine(config.engine, soup.vertices) == "cuda":
+        if engine_for(soup.vertices).queues_steps:
             columns = 8 + len(self.adam.parameters) + 1
             self._queue = StepQueue(self._queued_gradients, self._commit, columns, self._device)
 
@@ -164,7 +164,7 @@ class SoupFitting:
         limits: Float[Tensor, "2"] | None = None,
     ) -> tuple[Tensor, TriangleStatistics]:
         """Those of the objective, whose value is returned with what was seen of each triangle."""
-        soup, engine = self.soup, self._config.engine
+        soup = self.soup
         rendering = render_soup(
             soup,
             view.camera,
@@ -176,15 +176,12 @@ class SoupFitting:
             normals=weights.normal > 0,
             distortion=weights.distortion > 0,
             statistics=True,
-            engine=engine,
         )
         counts = None if view.mask is None else view.mask.float() / 255
         opacities = soup.opacities
         if self._surroundings is not None:  # where no view looks, nothing would hold against the pull to transparency
             opacities = torch.where(self._surroundings.outermost(soup.vertices), 0.0, opacities)
-        loss = soup_objective(
-            rendering, view.photo, counts, background, soup.vertices, opacities, view.camera, weights, engine=engine
-        )
+        loss = soup_objective(rendering, view.photo, counts, background, soup.vertices, opacities, view.camera, weights)
         self.adam.zero_grad()
         loss.backward()
         assert rendering.statistics is not None

@@ -11,11 +11,11 @@ from etsplat.core.cameras import Cameras
 from etsplat.core.errors import InputError
 from etsplat.data.dataset import Dataset
 from etsplat.data.load import load_dataset
+from etsplat.engines.choice import resolve_device
 from etsplat.io.paths import path_remedy
 from etsplat.io.run_directory import RunDirectory, is_run
 from etsplat.model.soup_files import SoupFile, load_soup
 from etsplat.model.soup_import import open_soup
-from etsplat.ops.engines import resolve_device
 from etsplat.tasks.train import DEMO, demo_capture
 
 

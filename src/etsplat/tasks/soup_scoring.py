@@ -29,13 +29,11 @@ class SoupScorer:
         self,
         capture: Dataset,
         background: Float[Tensor, "3"],
-        engine: str | None,
         device: torch.device = torch.device("cpu"),  # noqa: B008 (immutable)
     ) -> None:
         self._capture = capture
         self._views = ViewLoader(capture, device)
         self._background = background.to(device)
-        self._engine = engine
 
     def cheap(self, soup: TriangleSoup, appearance: SoupAppearance) -> dict[str, float]:
         """For the history: "psnr" if there are test views."""
@@ -89,9 +87,7 @@ class SoupScorer:
     @torch.no_grad()
     def splatted(self, soup: TriangleSoup, appearance: SoupAppearance, view: int) -> Float[Tensor, "H W 3"]:
         """A view of the soup, clamped to [0, 1]."""
-        rendering = render_soup(
-            soup, self._views.view(view).camera, appearance, backgrounds=self._background[None], engine=self._engine
-        )
+        rendering = render_soup(soup, self._views.view(view).camera, appearance, backgrounds=self._background[None])
         return rendering.color[0].clamp(0.0, 1.0)
 
     def opaque(self, soup: TriangleSoup, appearance: SoupAppearance, view: int) -> Float[Tensor, "H W 3"]:
@@ -102,7 +98,6 @@ class SoupScorer:
             appearance,
             background=self._background,
             supersampling=SUPERSAMPLING,
-            engine=self._engine,
         )
         return picture[0].clamp(0.0, 1.0)
 

@@ -1,7 +1,6 @@
 """Novel-view synthesis (paper section 3.4): photos in, a run directory with a triangle soup out."""
 
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,13 +14,13 @@ from etsplat.data.dataset import Dataset
 from etsplat.data.demo_scene import HEIGHT, WIDTH, demo_scene
 from etsplat.data.load import load_dataset
 from etsplat.data.loader import stay_on
+from etsplat.engines.choice import engine, engine_for, resolve_device
 from etsplat.io.memory import available_memory
 from etsplat.io.run_directory import RunDirectory
 from etsplat.model.soup_files import SoupFile, save_soup
 from etsplat.model.soup_init import StartPoints, random_points, start_soup
 from etsplat.model.surroundings import SPHERE_TRIANGLES, Surroundings
 from etsplat.model.triangle_soup import TriangleSoup
-from etsplat.ops.engines import one_torch_thread, resolve_device, resolve_engine
 from etsplat.optim.loop import CheckpointEvent, DivergedError, Progress
 from etsplat.optim.schedules import limited_iterations
 from etsplat.tasks.running import (
@@ -113,24 +112,24 @@ def train(
     paths = {"source": path_of(source), "images": images, "masks": path_of(masks)}
     record = make_record(config, iterations, {"fingerprint": own.fingerprint()}, paths)
     config = replace(config, iterations=iterations)
-    scorer = SoupScorer(capture, _background(config), config.engine, device)
-    fitting = start_fitting(capture, config, scorer.cheap, device)
-    run = place.open(record)
+    scorer = SoupScorer(capture, _background(config), device)
+    with engine(config.engine):
+        fitting = start_fitting(capture, config, scorer.cheap, device)
+        run = place.open(record)
 
-    def keep(event: Any) -> None:
-        if isinstance(event, CheckpointEvent):  # so that `etsplat view` can follow
-            save_soup(run.soup_path, _soup_file(fitting, event.iteration, capture, config))
-        announce(event)
+        def keep(event: Any) -> None:
+            if isinstance(event, CheckpointEvent):  # so that `etsplat view` can follow
+                save_soup(run.soup_path, _soup_file(fitting, event.iteration, capture, config))
+            announce(event)
 
-    native = resolve_engine(config.engine, fitting.soup.vertices) == "cpu"
-    with one_torch_thread() if native else nullcontext():
-        try:
-            progress = fit(fitting, run, loop_settings(config), record, keep)
-        except DivergedError as error:
-            if doubt := _doubtful_scale(own, config):
-                raise DivergedError(f"{error}. But first: {doubt}") from error
-            raise
-        return _finish(fitting, progress, run, scorer, capture, config)
+        with engine_for(fitting.soup.vertices).looping():
+            try:
+                progress = fit(fitting, run, loop_settings(config), record, keep)
+            except DivergedError as error:
+                if doubt := _doubtful_scale(own, config):
+                    raise DivergedError(f"{error}. But first: {doubt}") from error
+                raise
+            return _finish(fitting, progress, run, scorer, capture, config)
 
 
 def start_fitting(

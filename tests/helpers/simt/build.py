@@ -12,8 +12,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from etsplat.cuda.launch import pointers_to
-from etsplat.cuda.program import Program
+from etsplat.engines.cuda.launch import pointers_to
+from etsplat.engines.cuda.program import Program
 from helpers.simt.calls import Recording
 
 HERE = Path(__file__).resolve().parent
@@ -26,7 +26,7 @@ SANITIZE = ["-fsanitize=address,undefined", "-fno-sanitize-recover=undefined", "
 
 
 class Simt:
-    """The backend (``etsplat.cuda.launch.Backend``) that runs kernels in this process, on CPU tensors."""
+    """The backend (``etsplat.engines.cuda.launch.Backend``) that runs kernels in this process, on CPU tensors."""
 
     device_type = "cpu"
 

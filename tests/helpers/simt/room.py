@@ -6,8 +6,9 @@ from contextlib import contextmanager
 import pytest
 import torch
 
-from etsplat.ops import _raster_capacity
-from etsplat.ops._raster_capacity import repair_overflow
+from etsplat.engines.cuda import capacity
+from etsplat.engines.cuda import queue as cuda_queue
+from etsplat.engines.cuda.capacity import repair_overflow
 from etsplat.optim import step_queue
 
 
@@ -21,17 +22,17 @@ def room_for_16_pairs() -> Iterator[list[bool]]:
         return repairs[-1]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(step_queue, "repair_overflow", repair)
-        patch.setattr(_raster_capacity, "_seen", {})
-        patch.setattr(_raster_capacity, "_FIRST_ROOM", 16)
-        patch.setattr(_raster_capacity, "_FIRST_PER_TRIANGLE", 0)
+        patch.setattr(cuda_queue, "repair_overflow", repair)
+        patch.setattr(capacity, "_seen", {})
+        patch.setattr(capacity, "_FIRST_ROOM", 16)
+        patch.setattr(capacity, "_FIRST_PER_TRIANGLE", 0)
         yield repairs
 
 
 @contextmanager
 def second_step_overflows(queue: step_queue.StepQueue, device: torch.device) -> Iterator[list[Hashable]]:
     """The queue's second step finds too little room; yields the kind of every step made, repeated ones included."""
-    flag, gradients = _raster_capacity.overflow_flag(device), queue._gradients
+    flag, gradients = capacity.overflow_flag(device), queue._gradients
     kinds: list[Hashable] = []
 
     def overflowing(row: torch.Tensor, kind: Hashable) -> torch.Tensor:

@@ -1,0 +1,132 @@
+"""Programs to CUBIN by NVRTC, which needs neither a GPU nor a driver, and a cache of the results on disk."""
+
+import hashlib
+import importlib
+import os
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+from etsplat.core.errors import EngineUnavailableError
+from etsplat.engines.cuda.program import Program
+
+INSTALL = "pip install 'etsplat[cuda]'"
+OPTIONS = ("--std=c++17",)
+_DIGEST_SIZE = 32
+
+
+def compile_program(program: Program, architecture: str) -> bytes:
+    """CUBIN of ``program`` for an architecture such as "sm_90", from the cache if it is there.
+
+    Raises:
+        EngineUnavailableError: NVRTC is not installed.
+        RuntimeError: The source does not compile; the message is the compiler's.
+    """
+    nvrtc = import_nvrtc()
+    path = cache_folder() / f"{_key(program, architecture, nvrtc_version(nvrtc))}.cubin"
+    cubin = _load(path)
+    if cubin is None:
+        start = time.perf_counter()
+        cubin = compile_without_cache(program, architecture)
+        print(f"compiled {program} for {architecture} in {time.perf_counter() - start:.1f} s", file=sys.stderr)
+        _store(path, cubin)
+    return cubin
+
+
+def compile_without_cache(program: Program, architecture: str) -> bytes:
+    """As ``compile_program``, without looking at the cache or writing to it."""
+    nvrtc = import_nvrtc()
+    handle = _checked(nvrtc, nvrtc.nvrtcCreateProgram(program.source.encode(), program.file.encode(), 0, [], []))
+    try:
+        options = [option.encode() for option in _options(program, architecture)]
+        (status,) = nvrtc.nvrtcCompileProgram(handle, len(options), options)
+        if status != nvrtc.nvrtcResult.NVRTC_SUCCESS:
+            log = b" " * _checked(nvrtc, nvrtc.nvrtcGetProgramLogSize(handle))
+            nvrtc.nvrtcGetProgramLog(handle, log)
+            raise RuntimeError(
+                f"{program} for {architecture}: {status.name}\n{log.decode(errors='replace').rstrip(chr(0))}"
+            )
+        cubin = b" " * _checked(nvrtc, nvrtc.nvrtcGetCUBINSize(handle))
+        _checked(nvrtc, nvrtc.nvrtcGetCUBIN(handle, cubin))
+        return cubin
+    finally:
+        nvrtc.nvrtcDestroyProgram(handle)
+
+
+def import_nvrtc() -> Any:
+    """The module ``cuda.bindings.nvrtc`` with its library found.
+
+    Raises:
+        EngineUnavailableError: The package or the library is missing.
+    """
+    try:
+        nvrtc = importlib.import_module("cuda.bindings.nvrtc")
+        nvrtc.nvrtcVersion()
+    except Exception as error:  # what is raised for a missing library differs between versions
+        raise EngineUnavailableError(
+            f"the GPU engine compiles its kernels with NVRTC, which is missing ({type(error).__name__}): {INSTALL}"
+        ) from error
+    return nvrtc
+
+
+def nvrtc_version(nvrtc: Any) -> tuple[int, int]:
+    """(major, minor) of the NVRTC library."""
+    _, major, minor = nvrtc.nvrtcVersion()
+    return major, minor
+
+
+def cache_folder() -> Path:
+    """Where compiled kernels are kept: ETSPLAT_CACHE_DIR, or the user's cache folder."""
+    chosen = os.environ.get("ETSPLAT_CACHE_DIR")
+    if chosen:
+        return Path(chosen)
+    if os.name == "nt":
+        base = Path(os.environ.get("LOCALAPPDATA", Path.home() / "AppData" / "Local"))
+    else:
+        base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return base / "etsplat" / "kernels"
+
+
+def _options(program: Program, architecture: str) -> tuple[str, ...]:
+    # Where contraction is on, what forward and backward must compute alike is written with vfma (csrc/math/portable.h).
+    contraction = "true" if program.contract else "false"
+    return (*OPTIONS, f"--fmad={contraction}", f"--gpu-architecture={architecture}")
+
+
+def _key(program: Program, architecture: str, version: tuple[int, int]) -> str:
+    parts = (program.source, *_options(program, architecture), str(version))
+    return hashlib.sha256("\0".join(parts).encode()).hexdigest()
+
+
+def _load(path: Path) -> bytes | None:
+    """The content of a cache file, or None if it is not there or not what was stored."""
+    try:
+        content = path.read_bytes()
+    except OSError:
+        return None
+    digest, cubin = content[:_DIGEST_SIZE], content[_DIGEST_SIZE:]
+    return cubin if hashlib.sha256(cubin).digest() == digest else None
+
+
+def _store(path: Path, cubin: bytes) -> None:
+    """Write beside and rename: processes that compile the same thing at once replace each other's equal files."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".part", delete=False) as part:
+            part.write(hashlib.sha256(cubin).digest() + cubin)
+        try:
+            os.replace(part.name, path)
+        except OSError:
+            os.unlink(part.name)
+            raise
+    except OSError as error:
+        print(f"compiled kernels cannot be kept in {path.parent} ({error}): set ETSPLAT_CACHE_DIR", file=sys.stderr)
+
+
+def _checked(nvrtc: Any, result: tuple[Any, ...]) -> Any:
+    status, *values = result
+    if status != nvrtc.nvrtcResult.NVRTC_SUCCESS:
+        raise RuntimeError(f"NVRTC: {status.name}")
+    return values[0] if values else None

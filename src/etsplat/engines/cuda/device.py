@@ -1,0 +1,138 @@
+"""The backend that runs kernels on NVIDIA GPUs, by the driver's own interface (cuda-bindings)."""
+
+import ctypes
+import importlib
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+
+from etsplat.core.errors import EngineUnavailableError
+from etsplat.engines.cuda.compile import INSTALL, compile_program, import_nvrtc, nvrtc_version
+from etsplat.engines.cuda.launch import pointers_to
+from etsplat.engines.cuda.program import Program
+
+OLDEST_TORCH = (2, 11)
+
+
+class Device:
+    """Launches on torch's current stream of its current device; compiles and loads at first use, per device."""
+
+    device_type = "cuda"
+
+    def __init__(self) -> None:
+        check_torch()
+        self._driver = _import_driver()
+        check_driver(self._driver)
+        self._architectures: dict[int, str] = {}
+        self._contexts: dict[int, Any] = {}
+        self._modules: dict[tuple[int, Program], Any] = {}
+        self._functions: dict[tuple[int, Program, str], Any] = {}
+
+    def launch(
+        self,
+        program: Program,
+        name: str,
+        grid: tuple[int, int, int],
+        block: tuple[int, int, int],
+        values: Sequence[Any],
+    ) -> None:
+        """See ``etsplat.engines.cuda.launch.Backend``."""
+        device = torch.cuda.current_device()
+        function = self._functions.get((device, program, name))
+        if function is None:
+            function = self._function(device, program, name)
+        stream = torch.cuda.current_stream(device).cuda_stream
+        driver, pointers = self._driver, pointers_to(values)
+        arguments = (function, *grid, *block, 0, stream, ctypes.addressof(pointers), 0)
+        (status,) = driver.cuLaunchKernel(*arguments)
+        if status == driver.CUresult.CUDA_ERROR_INVALID_CONTEXT:
+            self._enter_context(device)
+            (status,) = driver.cuLaunchKernel(*arguments)
+        if status != driver.CUresult.CUDA_SUCCESS:
+            raise RuntimeError(f"launch of {name} ({program}): {status.name}")
+
+    def capture(self, body: Callable[[], None], pool: Any) -> Callable[[], None]:
+        """See ``etsplat.engines.cuda.launch.Backend``: a CUDA graph."""
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph, pool=pool):
+            body()
+        graph.replay()
+        return graph.replay
+
+    def memory_pool(self) -> Any:
+        """See ``etsplat.engines.cuda.launch.Backend``."""
+        return torch.cuda.graph_pool_handle()
+
+    @property
+    def capturing(self) -> bool:
+        """See ``etsplat.engines.cuda.launch.Backend``: also of graphs that others capture."""
+        return torch.cuda.is_current_stream_capturing()
+
+    def _enter_context(self, device: int) -> None:
+        """Make torch's context current in this thread: in those of autograd it may not be so yet."""
+        if device not in self._contexts:
+            self._contexts[device] = self._checked(self._driver.cuDevicePrimaryCtxRetain(device), "context")
+        (status,) = self._driver.cuCtxSetCurrent(self._contexts[device])
+        if status != self._driver.CUresult.CUDA_SUCCESS:
+            raise RuntimeError(f"context of device {device}: {status.name}")
+
+    def _function(self, device: int, program: Program, name: str) -> Any:
+        self._enter_context(device)
+        module = self._modules.get((device, program))
+        if module is None:
+            if device not in self._architectures:
+                major, minor = torch.cuda.get_device_capability(device)
+                self._architectures[device] = f"sm_{major}{minor}"
+            cubin = compile_program(program, self._architectures[device])
+            module = self._checked(self._driver.cuModuleLoadData(cubin), program)
+            self._modules[device, program] = module
+        function = self._checked(self._driver.cuModuleGetFunction(module, name.encode()), program)
+        self._functions[device, program, name] = function
+        return function
+
+    def _checked(self, result: tuple[Any, ...], what: Program | str) -> Any:
+        status, value = result
+        if status != self._driver.CUresult.CUDA_SUCCESS:
+            raise RuntimeError(f"{what}: {status.name}")
+        return value
+
+
+def check_torch() -> None:
+    """Raise ``EngineUnavailableError`` unless this torch can use a GPU."""
+    version = torch.__version__
+    if tuple(int(part) for part in version.split("+")[0].split(".")[:2]) < OLDEST_TORCH:
+        raise EngineUnavailableError(
+            f"the GPU engine needs torch {'.'.join(map(str, OLDEST_TORCH))} or newer, found {version}: upgrade torch, "
+            "or compute on the CPU"
+        )
+    if torch.version.cuda is None:
+        raise EngineUnavailableError(
+            f"torch {version} is built without CUDA: install a CUDA build of torch (https://pytorch.org), "
+            "or compute on the CPU"
+        )
+    if not torch.cuda.is_available():
+        raise EngineUnavailableError(
+            f"torch {version} finds no usable GPU: check that nvidia-smi works and that its driver supports CUDA "
+            f"{torch.version.cuda}, or compute on the CPU"
+        )
+
+
+def _import_driver() -> Any:
+    try:
+        return importlib.import_module("cuda.bindings.driver")
+    except ImportError as error:
+        raise EngineUnavailableError(f"the GPU engine needs cuda-bindings, which is missing: {INSTALL}") from error
+
+
+def check_driver(driver: Any) -> None:
+    """Raise ``EngineUnavailableError`` if the driver cannot run what NVRTC compiles."""
+    status, number = driver.cuDriverGetVersion()
+    if status != driver.CUresult.CUDA_SUCCESS:
+        raise EngineUnavailableError(f"the NVIDIA driver does not answer ({status.name}): reinstall it")
+    major, minor = nvrtc_version(import_nvrtc())
+    if number // 1000 < major:
+        raise EngineUnavailableError(
+            f"the NVIDIA driver supports CUDA {number // 1000}.{number % 1000 // 10} and the kernels are compiled by "
+            f"NVRTC {major}.{minor}: update the driver, or install torch and NVRTC for the older CUDA"
+        )

@@ -1,0 +1,29 @@
+"""What engines of native code have in common."""
+
+import torch
+from torch import Tensor
+
+from etsplat.engines.engine import Engine
+
+
+class NativeEngine(Engine):
+    """Computes in float32 on one type of device.
+
+    Attributes:
+        place: its device in words.
+    """
+
+    place: str
+
+    def tensors_on(self) -> str:
+        """Type of the device of its tensors."""
+        raise NotImplementedError
+
+    def check(self, tensor: Tensor) -> None:
+        """Float32 on its own device."""
+        if tensor.device.type != self.tensors_on():
+            raise ValueError(f"engine {self.name} needs tensors on {self.place}, got {tensor.device}")
+        if tensor.dtype != torch.float32:
+            raise ValueError(
+                f"engine {self.name} computes in float32, got {tensor.dtype}: use .float() or engine reference"
+            )

@@ -1,0 +1,34 @@
+"""Tensors from recycled memory."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from etsplat import _native
+
+_SMALLEST = 1 << 16  # floats; below, the allocator of the C library recycles by itself
+
+
+def empty_image(*shape: int) -> Tensor:
+    """An uninitialised float32 CPU tensor, contiguous.
+
+    Memory new to the process costs a page fault every 4 KiB at its first write, for an image of a million pixels as
+    much as rendering it. Blocks return to the pool (csrc/cpu/pool.h) when their last tensor is freed.
+    """
+    count = math.prod(shape)
+    if count < _SMALLEST:
+        return torch.empty(shape)
+    return torch.from_numpy(_native.pooled_floats(count)).view(shape)
+
+
+def empty(like: Tensor, *shape: int) -> Tensor:
+    """An uninitialised float32 tensor beside ``like``; on devices torch recycles memory by itself."""
+    return empty_image(*shape) if like.is_cpu else torch.empty(shape, device=like.device)
+
+
+def zeros_image(*shape: int) -> Tensor:
+    """Like ``empty_image``, zeroed by the engine's threads."""
+    zeros = empty_image(*shape)
+    _native.zero_floats(zeros.data_ptr(), zeros.numel())
+    return zeros

@@ -1,0 +1,112 @@
+"""The native engines' side of ``rasterize``: one autograd function around an engine's ``Render``."""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from etsplat.core.rasterization import Rasterization, RasterizeSettings
+from etsplat.core.validation import dense
+from etsplat.engines.native.channels import Channels, corners_of, median_depth
+from etsplat.engines.native.plan import Geometry, Images, Inputs, NativeCalls, Outputs, PerInput, Plan, channel_count
+
+
+def rasterize_native(
+    calls: NativeCalls,
+    vertices: Tensor,
+    faces: Tensor | None,
+    colors: Tensor | None,
+    corner_colors: Tensor | None,
+    opacities: Tensor,
+    sigma: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    backgrounds: Tensor | None,
+    settings: RasterizeSettings,
+) -> Rasterization:
+    """Render with an engine of native code; see `Engine.rasterize`."""
+    geometry = Geometry(vertices, faces)
+    channels = Channels(colors, corner_colors, faces, geometry, calls)
+    if settings.depth != "none" or settings.normals:
+        channels.add_geometry(corners_of(vertices, faces), viewmats, settings, calls)
+    backgrounds = channels.pad_backgrounds(backgrounds)
+    render = calls.render
+
+    def run(part: _Part, part_settings: RasterizeSettings) -> tuple[tuple[Tensor, ...], Plan]:
+        plan = Plan(render, part_settings, geometry, viewmats.shape[0])
+        inputs = Inputs(vertices, part.flat, part.corner, opacities, sigma, viewmats, Ks, part.backgrounds)
+        return _Rasterize.apply(plan, *inputs), plan
+
+    first, *rest = _parts(channels.flat, channels.corner, backgrounds, render.most_channels)
+    (color, alpha, distortion, median_triangle), plan = run(first, settings)
+    if rest:
+        plain = replace(settings, statistics=False, distortion=False, median_depth=False)
+        color = torch.cat([color, *(run(part, plain)[0][0] for part in rest)], dim=-1)
+    result = Rasterization(color=color, alpha=alpha, statistics=plan.statistics)
+    if settings.distortion:
+        result.distortion = distortion
+    if settings.median_depth:
+        corners = corners_of(vertices, faces)
+        result.median_depth = median_depth(median_triangle, channels, corners, viewmats, Ks, calls)
+    channels.split(result)
+    return result
+
+
+@dataclass
+class _Part:
+    """Channels of one pass."""
+
+    flat: Tensor | None
+    corner: Tensor | None
+    backgrounds: Tensor | None
+
+
+def _parts(flat: Tensor | None, corner: Tensor | None, backgrounds: Tensor | None, most: int | None) -> list[_Part]:
+    """All channels, or, where they are more than ``most``, parts that lie next to each other in the image."""
+    if most is None or channel_count(flat) + channel_count(corner) <= most:
+        return [_Part(flat, corner, backgrounds)]
+    # A triangle with any channel that is not finite is to be left out of every part.
+    finite = torch.ones((), dtype=torch.bool, device=(flat if flat is not None else corner).device)  # type: ignore[union-attr]
+    for channels, dims in ((flat, -1), (corner, (-2, -1))):
+        finite = finite if channels is None else finite & channels.isfinite().all(dim=dims)
+    parts, at = [], 0
+    for channels, mask in ((flat, finite[..., None]), (corner, finite[..., None, None])):
+        for begin in range(0, channel_count(channels), most):
+            chosen = torch.where(mask, channels[..., begin : begin + most], torch.nan)  # type: ignore[index]
+            behind = None if backgrounds is None else backgrounds[:, at : at + chosen.shape[-1]]
+            parts.append(_Part(chosen, None, behind) if channels is flat else _Part(None, chosen, behind))
+            at += chosen.shape[-1]
+    return parts
+
+
+class _Rasterize(torch.autograd.Function):
+    """(colour of all channels, alpha, distortion, median triangle); the latter two are empty unless asked for."""
+
+    @staticmethod
+    def forward(ctx: Any, plan: Plan, *tensors: Tensor | None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        inputs = Inputs(*map(_dense, tensors, Inputs._fields))  # type: ignore[arg-type]
+        outputs = Outputs(plan, inputs)
+        ctx.render = plan.render(plan, inputs, outputs, keep=any(ctx.needs_input_grad))
+        plan.statistics = outputs.statistics
+        images = outputs.images
+        ctx.save_for_backward(*inputs, *images)
+        ctx.mark_non_differentiable(outputs.median_triangle)
+        ctx.set_materialize_grads(False)
+        return images.color, images.alpha, images.distortion, outputs.median_triangle
+
+    @staticmethod
+    @once_differentiable
+    def backward(  # pyright: ignore[reportIncompatibleMethodOverride] -- once_differentiable hides the name
+        ctx: Any, *cotangents: Tensor | None
+    ) -> tuple[Tensor | None, ...]:
+        saved = list(map(_dense, ctx.saved_tensors))
+        inputs, images = Inputs(*saved[: len(Inputs._fields)]), Images(*saved[len(Inputs._fields) :])  # type: ignore[arg-type]
+        color, alpha, distortion, _ = map(_dense, cotangents)
+        grads = ctx.render.backward(inputs, images, (color, alpha, distortion), PerInput(*ctx.needs_input_grad[1:]))
+        return (None, *grads)
+
+
+def _dense(tensor: Tensor | None, name: str = "gradient") -> Tensor | None:
+    return None if tensor is None else dense(tensor, name)

@@ -1,0 +1,1 @@
+"""Plain PyTorch that reads like the paper: the oracle of the others."""

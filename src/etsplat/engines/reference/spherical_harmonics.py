@@ -1,0 +1,48 @@
+"""View-dependent colours in plain PyTorch."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+_MIN_LENGTH = 1e-12
+
+
+def spherical_harmonics(coefficients: Tensor, directions: Tensor, degree: int) -> Tensor:
+    """See `Engine.spherical_harmonics`."""
+    basis = _basis(directions, degree)
+    return torch.relu(0.5 + torch.einsum("...nk,nkc->...nc", basis, coefficients[:, : basis.shape[-1]]))
+
+
+def soup_colors(vertices: Tensor, sh_dc: Tensor, sh_rest: Tensor, centers: Tensor, degree: int) -> Tensor:
+    """See `Engine.soup_colors`."""
+    directions = vertices.mean(dim=1) - centers[:, None].detach()
+    return spherical_harmonics(torch.cat([sh_dc, sh_rest], dim=1), directions, degree)
+
+
+def _basis(directions: Tensor, degree: int) -> Float[Tensor, "*batch K"]:
+    """Y_k at the normalised directions, (..., (degree + 1)^2); the constant alone where there is no direction."""
+    square = directions.square().sum(dim=-1, keepdim=True)
+    usable = square > _MIN_LENGTH**2
+    x, y, z = torch.where(usable, directions / torch.where(usable, square, 1).sqrt(), 0).unbind(dim=-1)
+    xx, yy, zz = x * x, y * y, z * z
+    bands = [
+        [torch.full_like(x, 0.28209479177387814)],
+        [-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x],
+        [
+            1.0925484305920792 * x * y,
+            -1.0925484305920792 * y * z,
+            0.31539156525252005 * (2 * zz - xx - yy),
+            -1.0925484305920792 * x * z,
+            0.5462742152960396 * (xx - yy),
+        ],
+        [
+            -0.5900435899266435 * y * (3 * xx - yy),
+            2.890611442640554 * x * y * z,
+            -0.4570457994644658 * y * (4 * zz - xx - yy),
+            0.3731763325901154 * z * (2 * zz - 3 * xx - 3 * yy),
+            -0.4570457994644658 * x * (4 * zz - xx - yy),
+            1.445305721320277 * z * (xx - yy),
+            -0.5900435899266435 * x * (xx - 3 * yy),
+        ],
+    ]
+    return torch.stack([value for band in bands[: degree + 1] for value in band], dim=-1)

@@ -1,0 +1,138 @@
+"""Every kernel compiles for the supported architectures, without a GPU; the cache of compiled kernels is safe."""
+
+from multiprocessing import get_context
+
+import pytest
+
+from etsplat.core.errors import EngineUnavailableError
+from etsplat.engines.cuda import device
+from etsplat.engines.cuda.compile import cache_folder, compile_program, compile_without_cache
+from etsplat.engines.cuda.program import Program, source_root
+
+OLDEST, NEWEST = "sm_75", "sm_120"
+BETWEEN = ("sm_80", "sm_86", "sm_89", "sm_90", "sm_100")
+
+
+def tile_loops(kernel: str, *values: int) -> tuple[tuple[str, int | str], ...]:
+    names = ("FLAT", "CORNER", "DISTORTION", "MEDIAN", "WEIGHTS")
+    return (("KERNEL", kernel), *zip(names, values, strict=True))
+
+
+PROGRAMS = [
+    Program("raster_project.cu"),
+    Program("radix_sort.cu"),
+    Program("raster_forward.cu", tile_loops("Elastic", 3, 0, 0, 0, 0)),
+    Program("raster_backward.cu", tile_loops("Elastic", 3, 0, 0, 0, 0)),
+    Program("raster_reduce.cu", tile_loops("Elastic", 3, 0, 0, 0, 0)[1:]),
+    Program("fill.cu"),
+    *(Program(file, contract=False) for file in ("adam.cu", "antialias.cu", "mesh_energies.cu", "photometric.cu")),
+    *(Program(file, contract=False) for file in ("rasterize_hard.cu", "soup_statistics.cu", "step.cu")),
+    *(Program(file, contract=False) for file in ("normal_consistency.cu", "pick_values.cu", "triangle_channels.cu")),
+    *(Program(file, contract=False) for file in ("triangle_area.cu", "weighted_sum.cu")),
+    *(Program(file) for file in ("soup_activation.cu", "spherical_harmonics.cu")),
+]
+# Other definitions of what is compiled above.
+VARIANTS = [
+    Program("raster_forward.cu", tile_loops("SingleSided", 6, 1, 1, 1, 1)),
+    Program("raster_backward.cu", tile_loops("Bilateral", 16, 0, 2, 0, 0)),
+    Program("raster_backward.cu", tile_loops("Hard", 0, 16, 1, 0, 0)),
+    Program("raster_reduce.cu", tile_loops("Elastic", 6, 1, 1, 0, 0)[1:]),
+]
+ELF = b"\x7fELF"
+
+
+@pytest.mark.parametrize("architecture", [OLDEST, NEWEST])
+@pytest.mark.parametrize("program", [*PROGRAMS, *VARIANTS], ids=str)
+def test_compiles(program, architecture):
+    assert compile_without_cache(program, architecture).startswith(ELF)
+
+
+@pytest.mark.parametrize("architecture", BETWEEN)
+def test_compiles_for_architectures_between(architecture):
+    """One program stands for all: no source asks for the architecture."""
+    assert compile_without_cache(PROGRAMS[3], architecture).startswith(ELF)
+
+
+def test_no_source_asks_for_the_architecture():
+    """If one did, every architecture would have to be compiled for."""
+    assert not [path for path in source_root().rglob("*.*") if "__CUDA_ARCH__" in path.read_text(encoding="utf-8")]
+
+
+def test_every_file_is_checked():
+    """A new .cu file belongs into the list above."""
+    assert {program.file for program in PROGRAMS} == {path.name for path in (source_root() / "cuda").glob("*.cu")}
+
+
+def test_errors_name_file_and_line():
+    broken = Program("fill.cu", (("count", "missing +"),))
+    with pytest.raises(RuntimeError, match=r"cuda/fill\.cu\(4\): error"):
+        compile_without_cache(broken, "sm_90")
+
+
+def test_cache_keeps_and_recognises(tmp_path, monkeypatch, capfd):
+    """Compiled once per source and architecture; a damaged file is compiled anew; a folder that cannot be written to
+    costs the cache only."""
+    monkeypatch.setenv("ETSPLAT_CACHE_DIR", str(tmp_path / "kernels"))
+    first = compile_program(Program("fill.cu"), "sm_90")
+    assert compile_program(Program("fill.cu"), "sm_90") == first
+    assert capfd.readouterr().err.count("compiled fill.cu for sm_90") == 1
+    compile_program(Program("fill.cu"), "sm_80")
+    compile_program(Program("fill.cu", (("UNUSED", 1),)), "sm_90")
+    files = list(cache_folder().iterdir())
+    assert len(files) == 3
+    for file in files:
+        file.write_bytes(file.read_bytes()[:-1])
+    assert compile_program(Program("fill.cu"), "sm_90") == first
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("ETSPLAT_CACHE_DIR", str(tmp_path / "file"))
+    assert compile_program(Program("fill.cu"), "sm_90") == first
+    assert "set ETSPLAT_CACHE_DIR" in capfd.readouterr().err
+
+
+def _compile_into(folder):
+    import os
+
+    os.environ["ETSPLAT_CACHE_DIR"] = folder
+    return compile_program(Program("fill.cu"), "sm_90")
+
+
+def test_processes_share_the_cache(tmp_path):
+    """Several at once get the same kernels, and leave one file and no parts."""
+    with get_context("fork").Pool(3) as pool:
+        results = pool.map(_compile_into, [str(tmp_path)] * 6)
+    assert len(set(results)) == 1
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+class TestErrors:
+    """Each missing piece has its line."""
+
+    def test_torch_without_cuda(self, monkeypatch):
+        monkeypatch.setattr(device.torch, "__version__", "2.13.0+cpu")
+        monkeypatch.setattr(device.torch.version, "cuda", None)
+        with pytest.raises(EngineUnavailableError, match="built without CUDA"):
+            device.check_torch()
+
+    def test_old_torch(self, monkeypatch):
+        monkeypatch.setattr(device.torch, "__version__", "2.9.1+cu128")
+        with pytest.raises(EngineUnavailableError, match=r"needs torch 2\.11 or newer, found 2\.9\.1\+cu128"):
+            device.check_torch()
+
+    def test_no_gpu(self, monkeypatch):
+        monkeypatch.setattr(device.torch, "__version__", "2.11.0+cu130")
+        monkeypatch.setattr(device.torch.version, "cuda", "13.0")
+        monkeypatch.setattr(device.torch.cuda, "is_available", lambda: False)
+        with pytest.raises(EngineUnavailableError, match="finds no usable GPU"):
+            device.check_torch()
+
+    def test_old_driver(self):
+        class Driver:
+            class CUresult:
+                CUDA_SUCCESS = 0
+
+            @staticmethod
+            def cuDriverGetVersion():  # noqa: N802
+                return 0, 12040
+
+        with pytest.raises(EngineUnavailableError, match=r"supports CUDA 12\.4 .* NVRTC 13"):
+            device.check_driver(Driver)

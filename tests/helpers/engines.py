@@ -1,0 +1,54 @@
+"""Calls on an engine, whose device the test need not know."""
+
+from collections.abc import Callable
+from dataclasses import fields, is_dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+import etsplat
+from etsplat.engines.cuda.launch import device_type
+
+
+def on(engine: str | None, function: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
+    """Calls the function on an engine: tensors go to its device, results come back, gradients with them."""
+    there = device_of(engine)
+    with etsplat.engine(engine):
+        result = function(*_moved(arguments, there), **_moved(named, there))
+    return _moved(result, "cpu")
+
+
+def device_of(engine: str | None) -> str:
+    return device_type() if engine == "cuda" else "cpu"
+
+
+def dtype_of(engine: str) -> torch.dtype:
+    return torch.float64 if engine == "reference" else torch.float32
+
+
+def _moved(value: Any, device: str) -> Any:
+    """The tensors in it on the device: also those in tuples, lists, dictionaries and dataclasses."""
+    if isinstance(value, Tensor):
+        return value.to(device)
+    if isinstance(value, dict):
+        return {name: _moved(item, device) for name, item in value.items()}
+    if isinstance(value, tuple) and hasattr(value, "_fields"):
+        return type(value)(*(_moved(item, device) for item in value))
+    if isinstance(value, list | tuple):
+        return type(value)(_moved(item, device) for item in value)
+    if is_dataclass(value) and not isinstance(value, type):
+        return type(value)(**{field.name: _moved(getattr(value, field.name), device) for field in fields(value)})
+    return value
+
+
+def keeping(engine: str, problem: Any) -> Any:
+    """The problem with its steps always on this engine, whoever calls for them."""
+    advance = problem.advance
+
+    def advance_there(first: int, last: int) -> list[float]:
+        with etsplat.engine(engine):
+            return advance(first, last)
+
+    problem.advance = advance_there
+    return problem
