@@ -12,7 +12,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from etsplat.engines.cuda.launch import pointers_to
+from etsplat.engines.cuda.device import pointers_to
 from etsplat.engines.cuda.program import Program
 from helpers.simt.calls import Recording
 

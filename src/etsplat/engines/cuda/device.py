@@ -9,7 +9,6 @@ import torch
 
 from etsplat.core.errors import EngineUnavailableError
 from etsplat.engines.cuda.compile import INSTALL, compile_program, import_nvrtc, nvrtc_version
-from etsplat.engines.cuda.launch import pointers_to
 from etsplat.engines.cuda.program import Program
 
 OLDEST_TORCH = (2, 11)
@@ -96,6 +95,11 @@ class Device:
         if status != self._driver.CUresult.CUDA_SUCCESS:
             raise RuntimeError(f"{what}: {status.name}")
         return value
+
+
+def pointers_to(values: Sequence[Any]) -> Any:
+    """What drivers want of arguments: a ctypes array of pointers to them."""
+    return (ctypes.c_void_p * len(values))(*(ctypes.addressof(value) for value in values))
 
 
 def check_torch() -> None:

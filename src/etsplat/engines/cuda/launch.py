@@ -18,6 +18,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
+from etsplat.engines.cuda.device import Device
 from etsplat.engines.cuda.program import Program
 
 Dim = int | tuple[int, ...]
@@ -68,8 +69,6 @@ def backend() -> Backend:
     """
     global _backend
     if _backend is None:
-        from etsplat.engines.cuda.device import Device
-
         _backend = Device()
     return _backend
 
@@ -113,11 +112,6 @@ def on_device_of(tensor: Tensor | None) -> AbstractContextManager[Any]:
     if tensor is None or not tensor.is_cuda or tensor.device.index == torch.cuda.current_device():
         return _NOWHERE_ELSE
     return torch.cuda.device(tensor.device)
-
-
-def pointers_to(values: Sequence[Any]) -> Any:
-    """What drivers want of arguments: a ctypes array of pointers to them."""
-    return (ctypes.c_void_p * len(values))(*(ctypes.addressof(value) for value in values))
 
 
 def blocks(count: int, size: int) -> int:
