@@ -5,6 +5,7 @@ from etsplat.core.cameras import look_at as look_at
 from etsplat.core.cameras import sphere_grid as sphere_grid
 from etsplat.core.errors import InputError as InputError
 from etsplat.core.rasterization import Cutoffs as Cutoffs
+from etsplat.core.rasterization import HardRasterization as HardRasterization
 from etsplat.core.rasterization import Rasterization as Rasterization
 from etsplat.core.rasterization import TriangleStatistics as TriangleStatistics
 from etsplat.data.dataset import Dataset as Dataset
@@ -20,7 +21,6 @@ from etsplat.io.mesh_files import load_mesh as load_mesh
 from etsplat.io.mesh_files import save_mesh as save_mesh
 from etsplat.ops.antialias import rasterize_antialiased as rasterize_antialiased
 from etsplat.ops.rasterize import rasterize as rasterize
-from etsplat.ops.rasterize_hard import HardRasterization as HardRasterization
 from etsplat.ops.rasterize_hard import rasterize_hard as rasterize_hard
 from etsplat.ops.rasterize_hard import render_opaque as render_opaque
 from etsplat.report.html import write_report as write_report
