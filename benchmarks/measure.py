@@ -3,6 +3,7 @@
 import statistics
 import time
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ import torch
 from benchmarks.machine import cores
 from benchmarks.memory import memory
 from benchmarks.prototype import Prototype
-from benchmarks.scenes import VERTEX_COLORS, Scene, load
+from benchmarks.scenes import REGISTERED, VERTEX_COLORS, Scene, load
 from etsplat import _native
 from etsplat.core.kernels import KERNELS
 
@@ -83,9 +84,9 @@ def check_same_picture(scene: Scene, prototype: Prototype) -> float:
 
 def yardstick(scene: Scene, threads: int, instruction_set: str, prototype: Prototype) -> tuple[str, Any] | None:
     """What a scene is compared with, and a call that gives the milliseconds of one turn of it."""
-    if scene.name.endswith(VERTEX_COLORS):
-        constant = load(scene.name.removesuffix(VERTEX_COLORS))
-        return "constant colours", lambda: one_turn(constant).total
+    for ending, plain in ((VERTEX_COLORS, "constant colours"), (REGISTERED, "the built-in kernel")):
+        if scene.name.endswith(ending):
+            return plain, partial(turn_milliseconds, load(scene.name.removesuffix(ending)))
     if prototype.program is not None and scene.name.startswith("sphere") and instruction_set == "avx512":
         return "prototype", lambda: prototype.milliseconds(int(scene.name[6:]), threads)
     return None
@@ -97,6 +98,11 @@ def one_turn(scene: Scene) -> Timings:
     for warm in range(SAMPLES + 1):
         repetition(scene, turn if warm else Timings())
     return turn
+
+
+def turn_milliseconds(scene: Scene) -> list[float]:
+    """Of each repetition of one turn."""
+    return one_turn(scene).total
 
 
 def measure(
@@ -155,7 +161,7 @@ def summary(values: list[float]) -> dict[str, float]:
 
 def derive(entry: dict[str, Any], timings: Timings, counts: dict[str, int], workers: int) -> None:
     """What follows from times and counts. The scene is one of the elastic kernel."""
-    kernel = _native.time_kernel(list(KERNELS).index("elastic"), 0.5)
+    kernel = _native.time_kernel(KERNELS["elastic"].native_id, 0.5)
     stage = {name: entry["stages"][name]["median"] for name in STAGES}
     native = [sum(values) for values in zip(*timings.stages.values(), strict=True)]
     entry["counts"] = counts

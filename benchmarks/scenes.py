@@ -8,12 +8,14 @@ import torch
 from torch import Tensor
 
 import etsplat
+from etsplat.core.kernels import KERNELS
 from etsplat.core.rasterization import Rasterization
 from etsplat.geometry.icosphere import icosphere
 
 SIZE = 1024
 VERTEX_COLORS = "-vertex"  # at the end of a name: colours at the vertices instead of constant ones
-NAMES = ("sphere4", "sphere5", "sphere6", "sphere7", "soup100000", "sphere6-vertex")
+REGISTERED = "-registered"  # ... the elastic kernel registered from Python, that is, read from a table
+NAMES = ("sphere4", "sphere5", "sphere6", "sphere7", "soup100000", "sphere6-vertex", "sphere6-registered")
 
 
 @dataclass
@@ -30,6 +32,7 @@ class Scene:
     viewmats: Tensor
     Ks: Tensor
     cotangent: Tensor
+    kernel: str
 
     @property
     def leaves(self) -> tuple[Tensor, ...]:
@@ -51,18 +54,24 @@ class Scene:
             SIZE,
             faces=self.faces,
             corner_colors=self.corner_colors,
+            kernel=self.kernel,
         )
 
 
 def load(name: str) -> Scene:
-    """Scene "sphere<level>" or "soup<number of triangles>", "-vertex" after it or not."""
-    match = re.fullmatch(rf"(sphere|soup)(\d+)({VERTEX_COLORS})?", name)
+    """Scene "sphere<level>" or "soup<number of triangles>", "-vertex" or "-registered" after it or not."""
+    match = re.fullmatch(rf"(sphere|soup)(\d+)({VERTEX_COLORS}|{REGISTERED})?", name)
     if match is None:
-        raise SystemExit(f"no scene {name}: choose sphere<level> or soup<triangles>, {VERTEX_COLORS} after it or not")
+        endings = f"{VERTEX_COLORS} or {REGISTERED}"
+        raise SystemExit(f"no scene {name}: choose sphere<level> or soup<triangles>, {endings} after it or not")
     builder = displaced_sphere if match[1] == "sphere" else random_soup
     vertices, faces, colors, opacities, sigma = builder(int(match[2]))
     corner_colors = None
-    if match[3]:
+    kernel = "elastic"
+    if match[3] == REGISTERED:
+        kernel = "registered"
+        etsplat.register_kernel(kernel, KERNELS["elastic"].value)
+    if match[3] == VERTEX_COLORS:
         colors, corner_colors = None, 0.5 + 0.5 * vertices
     generator = torch.Generator().manual_seed(1)
     cotangent = torch.rand(1, SIZE, SIZE, 3, generator=generator) - 0.5
@@ -70,7 +79,7 @@ def load(name: str) -> Scene:
     viewmats[0, 2, 3] = 3.0
     focal = 1.3 * SIZE
     Ks = torch.tensor([[[focal, 0.0, SIZE / 2], [0.0, focal, SIZE / 2], [0.0, 0.0, 1.0]]])
-    scene = Scene(name, vertices, faces, colors, corner_colors, opacities, sigma, viewmats, Ks, cotangent)
+    scene = Scene(name, vertices, faces, colors, corner_colors, opacities, sigma, viewmats, Ks, cotangent, kernel)
     for leaf in scene.leaves:
         leaf.requires_grad_()
     return scene

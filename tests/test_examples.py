@@ -11,6 +11,7 @@ EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
 SMALLEST = {
     "01_fit_one_triangle.py": ["--steps", "6", "--out", "triangle.png"],
     "02_reconstruct_demo.py": ["--preset", "tiny", "--out", "run"],
+    "03_own_kernel.py": ["--preset", "tiny", "--out", "plateau"],
 }
 
 

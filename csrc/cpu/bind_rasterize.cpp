@@ -25,7 +25,7 @@ void bind_rasterize(nb::module_& m) {
         .def(nb::init<>()) FIELD(vertices) FIELD(faces) FIELD(num_triangles) FIELD(num_vertices) FIELD(flat_colors)
         FIELD(corner_colors) FIELD(flat_channels) FIELD(corner_channels) FIELD(opacities) FIELD(sigmas)
         FIELD(shared_sigma) FIELD(viewmat) FIELD(K) FIELD(background) FIELD(width) FIELD(height) FIELD(kernel)
-        FIELD(distance) FIELD(freeze_incentre) FIELD(near_plane) FIELD(alpha_min) FIELD(alpha_max) FIELD(x_max)
+        FIELD(kernel_table) FIELD(distance) FIELD(freeze_incentre) FIELD(near_plane) FIELD(alpha_min) FIELD(alpha_max) FIELD(x_max)
         FIELD(transmittance_min) FIELD(distortion_near) FIELD(distortion_far) FIELD(centroid_depth)
         FIELD(keep_for_backward) FIELD(color) FIELD(alpha) FIELD(distortion) FIELD(distortion_totals)
         FIELD(median_triangle) FIELD(max_weight) FIELD(screen_size) FIELD(inradius) FIELD(visible);
@@ -54,7 +54,8 @@ void bind_rasterize(nb::module_& m) {
         .def_ro("value", &KernelNanoseconds::value)
         .def_ro("gradient", &KernelNanoseconds::gradient);
     m.def("count_tiles", &count_tiles, nb::arg("state"), NoGil());
-    m.def("time_kernel", &time_kernel, nb::arg("kernel"), nb::arg("sigma"), NoGil());
+    m.def("time_kernel", &time_kernel, nb::arg("kernel"), nb::arg("sigma"), nb::arg("kernel_table") = 0, NoGil());
+    m.def("kernel_names", &kernel_names);
     m.def("raster_forward", &raster_forward, nb::arg("call"), NoGil());
     m.def("raster_backward", &raster_backward, nb::arg("state"), nb::arg("call"), nb::arg("gradients"), NoGil());
 }

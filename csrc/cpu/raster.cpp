@@ -91,6 +91,7 @@ void fill_triangles(RasterState& state) {
 // Where the arrays of `call` lie: the backward pass may be handed them elsewhere than the forward pass found them.
 void bind_arrays(RasterState& state, const RasterCall& call) {
     RasterPass& pass = state.pass;
+    pass.kernel_table = reinterpret_cast<const float*>(call.kernel_table);
     pass.flat_colors = reinterpret_cast<const float*>(call.flat_colors);
     pass.corner_colors = reinterpret_cast<const float*>(call.corner_colors);
     pass.background = reinterpret_cast<const float*>(call.background);

@@ -32,6 +32,7 @@ struct RasterCall {
     bool shared_sigma = false;
     uintptr_t viewmat = 0, K = 0;   // 16 and 9 floats, row-major
     uintptr_t background = 0;       // (channels)
+    uintptr_t kernel_table = 0;     // of kernel "Tabulated"
     int width = 0, height = 0, kernel = 0, distance = 0;
     bool freeze_incentre = false;
     float near_plane = 0.01f, alpha_min = 0, alpha_max = 1, x_max = 2, transmittance_min = 0;

@@ -1,7 +1,6 @@
 #include "raster_diagnostics.h"
 
 #include <algorithm>
-#include <array>
 #include <chrono>
 #include <stdexcept>
 
@@ -20,19 +19,29 @@ TileCounts count_tiles(const RasterState& state) {
     return counts;
 }
 
-KernelNanoseconds time_kernel(int kernel, float sigma) {
-    if (kernel < 0 || kernel >= 4) throw std::invalid_argument("time_kernel: no such kernel");
+std::vector<std::string> kernel_names() {
+#define ETSPLAT_NAME(K) #K,
+    return {ETSPLAT_KERNELS(ETSPLAT_NAME)};
+#undef ETSPLAT_NAME
+}
+
+KernelNanoseconds time_kernel(int kernel, float sigma, uintptr_t kernel_table) {
+    if (kernel < 0 || kernel >= kKernels) throw std::invalid_argument("time_kernel: no such kernel");
+    const float* table = reinterpret_cast<const float*>(kernel_table);
     constexpr int kCount = 1024, kLoops = 100, kRuns = 50;
     alignas(64) float x[kCount], out[kCount];
     for (int i = 0; i < kCount; ++i) x[i] = 2.0f * (static_cast<float>(i) + 0.5f) / kCount;
-#define ETSPLAT_COEFFICIENTS(K) K::coefficients(sigma),
-    const KernelCoefficients coefficients = std::array{ETSPLAT_KERNELS(ETSPLAT_COEFFICIENTS)}[static_cast<size_t>(kernel)];
-#undef ETSPLAT_COEFFICIENTS
+    KernelCoefficients<float> coefficients{};
+    int index = 0;
+#define ETSPLAT_CASE(K) \
+    if (kernel == index++) coefficients = kernel_with<K>(table).coefficients(sigma);
+    ETSPLAT_KERNELS(ETSPLAT_CASE)
+#undef ETSPLAT_CASE
     const auto best = [&](EvaluationLoop loop) {
         double seconds = 1e30;
         for (int run = 0; run < kRuns; ++run) {
             const auto start = std::chrono::steady_clock::now();
-            for (int i = 0; i < kLoops; ++i) loop(x, kCount, coefficients.exponent, coefficients.scale, out);
+            for (int i = 0; i < kLoops; ++i) loop(table, x, kCount, coefficients.exponent, coefficients.scale, out);
             const std::chrono::duration<double> elapsed = std::chrono::steady_clock::now() - start;
             seconds = std::min(seconds, elapsed.count());
         }

@@ -2,6 +2,7 @@
 #pragma once
 
 #include <string>
+#include <vector>
 
 #include "raster.h"
 
@@ -11,12 +12,15 @@ namespace etsplat {
 // still be in memory.
 TileCounts count_tiles(const RasterState& state);
 
+// The structs of math/kernels.h, in the order in which calls number them.
+std::vector<std::string> kernel_names();
+
 struct KernelNanoseconds {
     double value, gradient;
 };
 
 // Nanoseconds that a tight loop over an array in the first-level cache needs for 16 values of a kernel, and for 16 values
-// with both derivatives, on one thread and the active instruction set; the best of many runs.
-KernelNanoseconds time_kernel(int kernel, float sigma);
+// with both derivatives, on one thread and the active instruction set; the best of many runs. kernel_table: as in RasterCall.
+KernelNanoseconds time_kernel(int kernel, float sigma, uintptr_t kernel_table);
 
 }  // namespace etsplat

@@ -6,6 +6,7 @@
 
 #include <cstdint>
 
+#include "math/kernels.h"
 #include "math/raster_records.h"
 #include "math/tiles.h"
 
@@ -26,6 +27,7 @@ struct TileEntry {
 struct RasterPass {
     int width = 0, height = 0, tiles_x = 0, tiles_y = 0;
     int kernel = 0;
+    const float* kernel_table = nullptr;  // of a kernel from Python (math/kernel_table.h)
     int flat_channels = 0, corner_channels = 0;
     bool attributes = false;  // anything interpolated: corner colours, or distortion with per-pixel depth
     DistortionDepth distortion_depth = DistortionDepth::kNone;
@@ -78,14 +80,14 @@ struct TileCounts {
     int64_t drawn = 0;             // pixels in which a triangle is drawn
 };
 using TileCounter = void (*)(const RasterPass& pass, int tile, float* scratch, TileCounts& counts);
-using EvaluationLoop = void (*)(const float* x, int count, float exponent, float scale, float* out);
+using EvaluationLoop = void (*)(const float* table, const float* x, int count, float exponent, float scale, float* out);
 
 struct RasterKernels {
-    TileFunction forward[4][kShapes];  // [kernel][shape]
-    TileFunction backward[4][kShapes];
+    TileFunction forward[kKernels][kShapes];  // [kernel][shape]
+    TileFunction backward[kKernels][kShapes];
     // diagnostics [kernel]
-    TileCounter count[4];
-    EvaluationLoop value_loop[4], gradient_loop[4];
+    TileCounter count[kKernels];
+    EvaluationLoop value_loop[kKernels], gradient_loop[kKernels];
 };
 
 }  // namespace etsplat

@@ -69,7 +69,7 @@ struct TriangleKernels {
     using Project = ChunkTotals (*)(const RasterPass&, const TrianglePass&, int64_t begin, int64_t end);
     using Number = void (*)(const RasterPass&, const TrianglePass&, int64_t begin, int64_t end, int32_t slot, int32_t rank);
     using Reduce = ChunkSums (*)(const RasterPass&, const TrianglePass&, int64_t begin, int64_t end, float* scratch);
-    Project project[4];  // [kernel]
+    Project project[kKernels];  // [kernel]
     Number number;
     Reduce reduce;
 

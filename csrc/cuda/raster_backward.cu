@@ -99,8 +99,8 @@ __device__ __forceinline__ void differentiate(const RasterPass& pass, const Stag
                                               float first_inverse_z, BackwardPixel& p, float (&sums)[kStride]) {
     const Forms f(s, pixel);
     if (!(p.alive && f.x <= s.extent)) return;
-    const KernelValue<float> kernel = KERNEL::gradient(f.x, s.exponent, s.scale);
-    const float raw_alpha = s.opacity * kernel.value, alpha = vmin(raw_alpha, pass.alpha_max);
+    const KernelValue<float> gain = kernel_with<KERNEL>(pass.kernel_table).gradient(f.x, s.exponent, s.scale);
+    const float raw_alpha = s.opacity * gain.value, alpha = vmin(raw_alpha, pass.alpha_max);
     if (!(alpha >= pass.alpha_min)) return;
     const float rest = vfma(-alpha, p.transmittance, p.transmittance);
     if (rest < pass.transmittance_min) {
@@ -122,9 +122,9 @@ __device__ __forceinline__ void differentiate(const RasterPass& pass, const Stag
     const float grad_alpha = p.transmittance * cotangent - p.remaining / (1.0f - alpha);
     p.transmittance = rest;
     if (!(raw_alpha < pass.alpha_max)) return;
-    const float grad_kernel = grad_alpha * s.opacity, grad_x = grad_kernel * kernel.dx;
-    sums[SlotLayout::kOpacity] = grad_alpha * kernel.value;
-    sums[SlotLayout::kSigma] = grad_kernel * kernel.dsigma;
+    const float grad_kernel = grad_alpha * s.opacity, grad_x = grad_kernel * gain.dx;
+    sums[SlotLayout::kOpacity] = grad_alpha * gain.value;
+    sums[SlotLayout::kSigma] = grad_kernel * gain.dsigma;
     const int largest = f.form[0] >= f.x ? 0 : f.form[1] >= f.x ? 1 : 2;
     for (int k = 0; k < 3; ++k) add_moments(f, k, k == largest ? grad_x : 0.0f, sums);
 }

@@ -46,7 +46,8 @@ __device__ __forceinline__ bool draw(const RasterPass& pass, const Staged& s, co
     w = 0.0f;
     const Forms f(s, pixel);
     if (!(p.alive && f.x <= s.extent)) return false;
-    const float alpha = vmin(s.opacity * KERNEL::value(f.x, s.exponent, s.scale), pass.alpha_max);
+    const KERNEL kernel = kernel_with<KERNEL>(pass.kernel_table);
+    const float alpha = vmin(s.opacity * kernel.value(f.x, s.exponent, s.scale), pass.alpha_max);
     if (!(alpha >= pass.alpha_min)) return false;
     const float rest = vfma(-alpha, p.transmittance, p.transmittance);
     if (rest < pass.transmittance_min) {

@@ -13,7 +13,7 @@
 namespace etsplat {
 
 struct RasterPass {
-    const float *vertices, *flat_colors, *corner_colors, *opacities, *sigmas, *viewmats, *Ks, *backgrounds;
+    const float *vertices, *flat_colors, *corner_colors, *opacities, *sigmas, *viewmats, *Ks, *backgrounds, *kernel_table;
     const int* faces;
     int triangles, vertex_count, views, width, height, tiles_x, tiles_y, kernel, distance, freeze_incentre;
     int shared_sigma, flat_per_view, corner_per_view, flat_channels, corner_channels, capacity;

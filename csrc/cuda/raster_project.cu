@@ -24,8 +24,9 @@ __device__ __forceinline__ void kernel_of(const RasterPass& pass, float opacity,
     int index = 0;
 #define ETSPLAT_CASE(Kernel)                                                                     \
     if (pass.kernel == index++) {                                                                \
-        extent = visible_extent<Kernel>(opacity, sigma, pass.support_alpha, pass.x_max);         \
-        coefficients = Kernel::coefficients(vmax(sigma, kMinSigma));                             \
+        const Kernel kernel = kernel_with<Kernel>(pass.kernel_table);                            \
+        extent = visible_extent(kernel, opacity, sigma, pass.support_alpha, pass.x_max);         \
+        coefficients = kernel.coefficients(vmax(sigma, kMinSigma));                              \
     }
     ETSPLAT_KERNELS(ETSPLAT_CASE)
 #undef ETSPLAT_CASE

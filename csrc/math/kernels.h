@@ -1,15 +1,18 @@
 // The kernels G(x) of the paper (section 3.2) with their derivatives and visible supports.
 //
-// x is the normalised distance: 0 at the triangle's centre, 1 on its edge. A kernel is a struct of static functions;
-// ETSPLAT_KERNELS lists them once, in the order of etsplat.core.kernels.KERNELS. What depends on sigma alone is computed
-// once per triangle (KernelCoefficients), so that a pixel costs two exp2 and one log2 at most.
+// x is the normalised distance: 0 at the triangle's centre, 1 on its edge. A kernel is a struct of functions, static ones
+// where there is no table; ETSPLAT_KERNELS lists them once. What depends on sigma alone is computed once per triangle
+// (KernelCoefficients), so that a pixel costs two exp2 and one log2 at most.
 #pragma once
 
 #include "portable.h"
 
 namespace etsplat {
 
-#define ETSPLAT_KERNELS(X) X(SingleSided) X(Bilateral) X(Elastic) X(Hard)
+#define ETSPLAT_KERNELS(X) X(SingleSided) X(Bilateral) X(Elastic) X(Hard) X(Tabulated)
+#define ETSPLAT_COUNT_ONE(K) +1
+constexpr int kKernels = ETSPLAT_KERNELS(ETSPLAT_COUNT_ONE);
+#undef ETSPLAT_COUNT_ONE
 
 template <class T>
 struct KernelCoefficients {
@@ -159,16 +162,31 @@ struct Hard {
     }
 };
 
+}  // namespace etsplat
+
+#include "kernel_table.h"
+
+namespace etsplat {
+
+// A kernel that reads `table`, or one that needs none.
+template <class Kernel>
+ETSPLAT_FN Kernel kernel_with(const float* table) {
+    if constexpr (__is_empty(Kernel))
+        return Kernel{};
+    else
+        return Kernel{table};
+}
+
 constexpr float kSupportMargin = 1.0f + 1e-4f;  // the alpha test decides; the extent only bounds the work
 constexpr float kLargestExtent = 1e6f;
 
 // Largest visible x of a triangle, or a negative number if nothing is visible. alpha_min = 0: there is no such test.
 template <class Kernel, class T>
-ETSPLAT_FN T visible_extent(T opacity, T sigma, float alpha_min, float x_max) {
+ETSPLAT_FN T visible_extent(const Kernel& kernel, T opacity, T sigma, float alpha_min, float x_max) {
     T extent(vmin(x_max, kLargestExtent));
     if (alpha_min > 0.0f) {
         const T ratio = opacity / T(alpha_min);
-        const T support = Kernel::support(vmin(vmax(ratio, T(1.0f + 1e-6f)), T(1e30f)), vmax(sigma, T(kMinSigma)));
+        const T support = kernel.support(vmin(vmax(ratio, T(1.0f + 1e-6f)), T(1e30f)), vmax(sigma, T(kMinSigma)));
         extent = vmin(extent, support * T(kSupportMargin) + T(1e-5f));
         extent = vselect(ratio >= T(1.0f), extent, T(-1.0f));
     } else if (Kernel::kEndsAtOne) {

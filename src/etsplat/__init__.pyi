@@ -8,6 +8,7 @@ from etsplat.core.rasterization import Cutoffs as Cutoffs
 from etsplat.core.rasterization import HardRasterization as HardRasterization
 from etsplat.core.rasterization import Rasterization as Rasterization
 from etsplat.core.rasterization import TriangleStatistics as TriangleStatistics
+from etsplat.core.registered_kernels import register_kernel as register_kernel
 from etsplat.data.dataset import Dataset as Dataset
 from etsplat.data.demo_object import demo_object as demo_object
 from etsplat.data.hull import bounding_sphere as bounding_sphere

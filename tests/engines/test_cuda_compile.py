@@ -37,6 +37,8 @@ VARIANTS = [
     Program("raster_backward.cu", tile_loops("Bilateral", 16, 0, 2, 0, 0)),
     Program("raster_backward.cu", tile_loops("Hard", 0, 16, 1, 0, 0)),
     Program("raster_reduce.cu", tile_loops("Elastic", 6, 1, 1, 0, 0)[1:]),
+    Program("raster_forward.cu", tile_loops("Tabulated", 3, 0, 0, 0, 0)),
+    Program("raster_backward.cu", tile_loops("Tabulated", 3, 0, 0, 0, 0)),
 ]
 ELF = b"\x7fELF"
 

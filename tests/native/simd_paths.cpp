@@ -9,6 +9,7 @@
 
 #include "cpu/instruction_set.h"
 #include "cpu/raster.h"
+#include "math/kernels.h"
 
 using namespace etsplat;
 
@@ -25,7 +26,45 @@ struct Pass {
 };
 constexpr Pass kPasses[] = {{"flat", 3, 0, false}, {"corner", 0, 3, false}, {"general", 3, 2, true}};
 
+// G = exp(-x / sigma) as a table (math/kernel_table.h), for the kernel "Tabulated".
+std::vector<float> exponential_table() {
+    constexpr int kRows = 9, kCells = 4, kOctaves[3] = {3, 6, 3};
+    constexpr float kLow = 0.1f, kHigh = 2.0f, kPivot[3] = {0, 1, 1}, kWidth[3] = {0.5f, -0.5f, 1.0f};
+    TableHeader header{std::log2(kLow), (kRows - 1) / std::log2(kHigh / kLow), kRows, 0, 0, {}};
+    std::vector<float> zones[3], knots;  // x of the knots, from the pivot on
+    float start = 0;
+    for (int z = 0; z < 3; ++z) {
+        const float first = std::ldexp(0.75f, -kOctaves[z]), scale = (0.75f - first) / kWidth[z];
+        const auto add = [&](float u) { zones[z].push_back(kPivot[z] + (u - first) / scale); };
+        for (int octave = -kOctaves[z]; octave < 0; ++octave)
+            for (int cell = 0; cell < kCells; ++cell) add(std::ldexp(0.75f * (1 + static_cast<float>(cell) / kCells), octave));
+        add(0.75f);
+        const float cells = static_cast<float>(kOctaves[z] * kCells);
+        header.zones[z] = {kPivot[z], scale, first, start + cells, kCells, 0.75f / kCells};
+        start += cells + 1;
+    }
+    knots.assign(zones[0].begin(), zones[0].end() - 1);
+    knots.insert(knots.end(), zones[1].rbegin(), zones[1].rend());
+    knots.insert(knots.end(), zones[2].begin(), zones[2].end());
+    header.knots = static_cast<float>(knots.size());
+    header.row_size = 2 * start;
+    std::vector<float> table(reinterpret_cast<float*>(&header), reinterpret_cast<float*>(&header) + kTableHeader);
+    table.insert(table.end(), knots.begin(), knots.end());
+    const auto sigma = [&](int row) { return kLow * std::pow(kHigh / kLow, static_cast<float>(row) / (kRows - 1)); };
+    for (int row = 1; row < kRows; ++row)
+        for (const float x : knots) table.push_back(std::exp(-x / sigma(row)));
+    for (int row = 0; row < kRows; ++row)
+        for (int z = 0; z < 3; ++z)
+            for (const float x : zones[z]) {
+                const float value = std::exp(-x / sigma(row));
+                table.push_back(value);
+                table.push_back(-value / sigma(row) / header.zones[z].scale);
+            }
+    return table;
+}
+
 struct Scene {
+    std::vector<float> table = exponential_table();
     std::vector<float> vertices, flat, corner, opacities, sigmas, background{0.1f, 0.4f, 0.7f, 0.2f, 0.9f};
     std::vector<float> viewmat{1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 4, 0, 0, 0, 1};
     std::vector<float> K{60, 0, 37.3f, 0, 55, 25.2f, 0, 0, 1};
@@ -87,6 +126,7 @@ Result render(Scene& scene, int kernel, int distance, const Pass& pass) {
     call.width = kWidth;
     call.height = kHeight;
     call.kernel = kernel;
+    call.kernel_table = address(scene.table);
     call.distance = distance;
     call.alpha_min = 1.0f / 255.0f;
     call.alpha_max = 0.99f;
@@ -147,7 +187,7 @@ int main() {
     int failures = 0;
     for (const std::string& path : available_instruction_sets()) {
         int comparisons = 0;
-        for (int kernel = 0; kernel < 4; ++kernel)
+        for (int kernel = 0; kernel < kKernels; ++kernel)
             for (int distance = 0; distance < 2; ++distance)
                 for (const Pass& pass : kPasses) {
                     set_instruction_set("plain");

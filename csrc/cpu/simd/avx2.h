@@ -52,6 +52,22 @@ ETSPLAT_FN Register r_scale(Register a, Register n) {
         _mm256_add_epi32(_mm256_castps_si256(a), _mm256_slli_epi32(_mm256_cvtps_epi32(n), 23)));
 }
 
+// out[k] lane i = table[index of lane i + k]
+ETSPLAT_FN void r_lookup4(const float* table, Register index, Register out[4]) {
+    alignas(32) int at[8];
+    _mm256_store_si256(reinterpret_cast<__m256i*>(at), _mm256_cvttps_epi32(index));
+    Register quads[4];  // quads[j]: of lanes j and 4 + j
+    for (int j = 0; j < 4; ++j)
+        quads[j] = _mm256_insertf128_ps(_mm256_castps128_ps256(_mm_loadu_ps(table + at[j])), _mm_loadu_ps(table + at[4 + j]), 1);
+    for (int half = 0; half < 2; ++half) {
+        const Register a = half ? _mm256_unpackhi_ps(quads[0], quads[1]) : _mm256_unpacklo_ps(quads[0], quads[1]);
+        const Register b = half ? _mm256_unpackhi_ps(quads[2], quads[3]) : _mm256_unpacklo_ps(quads[2], quads[3]);
+        const __m256d low = _mm256_castps_pd(a), high = _mm256_castps_pd(b);
+        out[2 * half] = _mm256_castpd_ps(_mm256_unpacklo_pd(low, high));
+        out[2 * half + 1] = _mm256_castpd_ps(_mm256_unpackhi_pd(low, high));
+    }
+}
+
 // Sums of the lanes of eight vectors, in order.
 ETSPLAT_FN Register r_column_sums(const Register v[8]) {
     // quads hold, in each half, partial sums of four vectors

@@ -43,14 +43,16 @@ void count_tile(const RasterPass& pass, int index, float* scratch, TileCounts& c
 
 // Tight loops over an array: the least that an evaluation of the kernel costs.
 template <class Kernel>
-void value_loop(const float* x, int count, float exponent, float scale, float* out) {
+void value_loop(const float* table, const float* x, int count, float exponent, float scale, float* out) {
+    const Kernel kernel = kernel_with<Kernel>(table);
     for (int i = 0; i < count; i += kLanes)
-        Kernel::value(Vec::load(x + i), Vec(exponent), Vec(scale)).store(out + i);
+        kernel.value(Vec::load(x + i), Vec(exponent), Vec(scale)).store(out + i);
 }
 template <class Kernel>
-void gradient_loop(const float* x, int count, float exponent, float scale, float* out) {
+void gradient_loop(const float* table, const float* x, int count, float exponent, float scale, float* out) {
+    const Kernel kernel = kernel_with<Kernel>(table);
     for (int i = 0; i < count; i += kLanes) {
-        const KernelValue<Vec> g = Kernel::gradient(Vec::load(x + i), Vec(exponent), Vec(scale));
+        const KernelValue<Vec> g = kernel.gradient(Vec::load(x + i), Vec(exponent), Vec(scale));
         (g.value + g.dx + g.dsigma).store(out + i);
     }
 }

@@ -51,6 +51,19 @@ ETSPLAT_FN Register r_scale(Register a, Register n) {
     return vreinterpretq_f32_s32(vaddq_s32(vreinterpretq_s32_f32(a), vshlq_n_s32(vcvtnq_s32_f32(n), 23)));
 }
 
+// out[k] lane i = table[index of lane i + k]
+ETSPLAT_FN void r_lookup4(const float* table, Register index, Register out[4]) {
+    int32_t at[4];
+    vst1q_s32(at, vcvtq_s32_f32(index));
+    const float32x4x2_t even = vzipq_f32(vld1q_f32(table + at[0]), vld1q_f32(table + at[2]));
+    const float32x4x2_t odd = vzipq_f32(vld1q_f32(table + at[1]), vld1q_f32(table + at[3]));
+    for (int half = 0; half < 2; ++half) {
+        const float32x4x2_t columns = vzipq_f32(even.val[half], odd.val[half]);
+        out[2 * half] = columns.val[0];
+        out[2 * half + 1] = columns.val[1];
+    }
+}
+
 // Sums of the lanes of four vectors, in order.
 ETSPLAT_FN Register r_column_sums(const Register v[4]) {
     return vpaddq_f32(vpaddq_f32(v[0], v[1]), vpaddq_f32(v[2], v[3]));

@@ -117,10 +117,35 @@ ETSPLAT_FN Vec vsqrt(Vec a) {
 }
 ETSPLAT_FN Vec vabs(Vec a) { return vmax(a, Vec(0.0f) - a); }
 
+ETSPLAT_FN bool vany(VecMask mask) { return mask.bits() != 0; }
+// x = mantissa 2^exponent with mantissa in [3/4, 3/2), for positive normal numbers
+ETSPLAT_FN void vsplit(Vec x, Vec& mantissa, Vec& exponent) {
+    for (int i = 0; i < kRegisters; ++i) r_split(x.r[i], mantissa.r[i], exponent.r[i]);
+}
+// a 2^n for whole numbers n
+ETSPLAT_FN Vec vscale(Vec a, Vec n) {
+    for (int i = 0; i < kRegisters; ++i) a.r[i] = r_scale(a.r[i], n.r[i]);
+    return a;
+}
+// A float of a table at each lane's index, a whole number; four in a row.
+ETSPLAT_FN Vec vlookup(const float* table, Vec index) {
+    float lanes[kLanes];
+    index.store(lanes);
+    for (int i = 0; i < kLanes; ++i) lanes[i] = table[static_cast<int>(lanes[i])];
+    return Vec::load(lanes);
+}
+ETSPLAT_FN void vlookup4(const float* table, Vec index, Vec* out) {
+    for (int i = 0; i < kRegisters; ++i) {
+        Register columns[4];
+        r_lookup4(table, index.r[i], columns);
+        for (int k = 0; k < 4; ++k) out[k].r[i] = columns[k];
+    }
+}
+
 // log2 of a positive normal number: minimax polynomial of log2(1 + t) / t on [-1/4, 1/2], relative error 1.8e-7.
 ETSPLAT_FN Vec vlog2(Vec x) {
     Vec mantissa, exponent;
-    for (int i = 0; i < kRegisters; ++i) r_split(x.r[i], mantissa.r[i], exponent.r[i]);
+    vsplit(x, mantissa, exponent);
     const Vec t = mantissa - Vec(1.0f);
     Vec p = Vec(-0.0958695665f);
     p = vfma(p, t, Vec(0.203868653f));
@@ -145,8 +170,7 @@ ETSPLAT_FN Vec vexp2(Vec x) {
     p = vfma(p, f, Vec(0.240221197f));
     p = vfma(p, f, Vec(0.693146967f));
     p = vfma(p, f, Vec(1.00000007f));
-    for (int i = 0; i < kRegisters; ++i) p.r[i] = r_scale(p.r[i], n.r[i]);
-    return p;
+    return vscale(p, n);
 }
 
 ETSPLAT_FN float lane_sum(Vec a) {

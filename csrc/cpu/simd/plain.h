@@ -48,6 +48,11 @@ ETSPLAT_FN Register r_scale(Register a, Register n) {
     return std::bit_cast<float>(std::bit_cast<int32_t>(a) + (static_cast<int32_t>(n) << 23));
 }
 
+// out[k] = table[index + k]
+ETSPLAT_FN void r_lookup4(const float* table, Register index, Register out[4]) {
+    for (int k = 0; k < 4; ++k) out[k] = table[static_cast<int>(index) + k];
+}
+
 ETSPLAT_FN Register r_column_sums(const Register* v) { return *v; }
 
 }  // namespace etsplat::plain

@@ -45,7 +45,8 @@ struct Projected {
         visible = (opacity > Vec(0.0f)) & (opacity <= largest) & (sigma > Vec(0.0f)) & (sigma <= largest);
         opacity = vselect(visible, opacity, Vec(1.0f));  // no NaN may enter the kernels' integer arithmetic
         sigma = vselect(visible, sigma, Vec(1.0f));
-        extent = visible_extent<Kernel>(opacity, sigma, triangles.support_alpha, triangles.x_max);
+        const Kernel kernel = kernel_with<Kernel>(pass.kernel_table);
+        extent = visible_extent(kernel, opacity, sigma, triangles.support_alpha, triangles.x_max);
         Vec world[9];
         load_corners(triangles, range, world);
         visible = visible & (extent > Vec(0.0f)) &
@@ -73,10 +74,11 @@ ETSPLAT_FN void store_rows(const Vec columns[16], int size, const LaneRange& ran
 }
 
 template <class Kernel>
-ETSPLAT_FN void write_records(const TrianglePass& triangles, const LaneRange& range, const Projected& p) {
+ETSPLAT_FN void write_records(const RasterPass& pass, const TrianglePass& triangles, const LaneRange& range, const Projected& p) {
     static_assert(sizeof(TriangleRecord) == 64 && sizeof(AttributeRecord) == 32);
     const DistanceForms<Vec>& f = p.forms;
-    const KernelCoefficients<Vec> c = Kernel::coefficients(vmax(p.sigma, Vec(kMinSigma)));
+    const Kernel kernel = kernel_with<Kernel>(pass.kernel_table);
+    const KernelCoefficients<Vec> c = kernel.coefficients(vmax(p.sigma, Vec(kMinSigma)));
     const Vec record[16] = {f.qx,     f.qy,      f.gx[0],    f.gx[1], f.gx[2],    f.gy[0],     f.gy[1],   f.gy[2],
                             p.extent, p.opacity, c.exponent, c.scale, p.box.left, p.box.right, p.box.top, p.box.bottom};
     store_rows(record, 16, range, triangles.records + range.first);
@@ -171,7 +173,7 @@ ChunkTotals project_chunk(const RasterPass& pass, const TrianglePass& triangles,
         const LaneRange range(i, end);
         Projected p;
         p.project<Kernel>(pass, triangles, range);
-        write_records<Kernel>(triangles, range, p);
+        write_records<Kernel>(pass, triangles, range, p);
         write_spans(pass, triangles, range, p, totals);
         write_keys(triangles, range, p);
         depths.include(p);

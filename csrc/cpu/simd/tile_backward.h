@@ -237,6 +237,7 @@ ETSPLAT_FN void differentiate(const RasterPass& pass, BackwardTile& tile, const 
 
     const int flat = flat_channels<kShape>(pass);
     const float* color = pass.flat_colors + int64_t{entry.triangle} * flat;
+    const Kernel kernel = kernel_with<Kernel>(pass.kernel_table);
     const Vec exponent(record.exponent), scale(record.scale), opacity(record.opacity), extent(record.extent);
     const Vec alpha_min(pass.alpha_min), alpha_max(pass.alpha_max), transmittance_min(pass.transmittance_min);
     SlotSums<kShape> sums(pass, tile.sums);
@@ -246,8 +247,8 @@ ETSPLAT_FN void differentiate(const RasterPass& pass, BackwardTile& tile, const 
         const int block = lowest_bit(blocks);
         const Vec form[3] = {forms.value(0, block), forms.value(1, block), forms.value(2, block)};
         const Vec x = vmax(form[0], vmax(form[1], form[2]));
-        const KernelValue<Vec> kernel = Kernel::gradient(x, exponent, scale);
-        const Vec raw_alpha = opacity * kernel.value;
+        const KernelValue<Vec> gain = kernel.gradient(x, exponent, scale);
+        const Vec raw_alpha = opacity * gain.value;
         const Vec alpha = vmin(raw_alpha, alpha_max);
         const Vec transmittance = Vec::load(tile.transmittance[block]);
         const unsigned alive = tile.alive[block];
@@ -277,10 +278,10 @@ ETSPLAT_FN void differentiate(const RasterPass& pass, BackwardTile& tile, const 
         Vec grad_alpha = transmittance * cotangent - remaining * vreciprocal(Vec(1.0f) - alpha);
         grad_alpha = keep(drawn & (raw_alpha < alpha_max), grad_alpha);
 
-        sums.v[SlotLayout::kOpacity] = vfma(grad_alpha, kernel.value, sums.v[SlotLayout::kOpacity]);
+        sums.v[SlotLayout::kOpacity] = vfma(grad_alpha, gain.value, sums.v[SlotLayout::kOpacity]);
         const Vec grad_kernel = grad_alpha * opacity;
-        sums.v[SlotLayout::kSigma] = vfma(grad_kernel, kernel.dsigma, sums.v[SlotLayout::kSigma]);
-        const Vec grad_x = grad_kernel * kernel.dx;
+        sums.v[SlotLayout::kSigma] = vfma(grad_kernel, gain.dsigma, sums.v[SlotLayout::kSigma]);
+        const Vec grad_x = grad_kernel * gain.dx;
 
         const Vec dx = forms.dx(block), dy = forms.dy(block);
         const VecMask first = form[0] >= x, second = and_not(form[1] >= x, first);

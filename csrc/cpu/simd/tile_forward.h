@@ -128,8 +128,9 @@ ETSPLAT_FN void draw(const RasterPass& pass, ForwardTile& tile, Batch& batch, in
 
     const Vec form[3] = {forms.value(0, block), forms.value(1, block), forms.value(2, block)};
     const Vec x = vmax(form[0], vmax(form[1], form[2]));
-    const Vec kernel = Kernel::value(x, Vec(record.exponent), Vec(record.scale));
-    const Vec alpha = vmin(Vec(record.opacity) * kernel, Vec(pass.alpha_max));
+    const Kernel kernel = kernel_with<Kernel>(pass.kernel_table);
+    const Vec gain = kernel.value(x, Vec(record.exponent), Vec(record.scale));
+    const Vec alpha = vmin(Vec(record.opacity) * gain, Vec(pass.alpha_max));
     const Vec transmittance = Vec::load(tile.transmittance[block]);
     const unsigned alive = tile.alive[block];
     const VecMask mask = (x <= Vec(record.extent)) & (alpha >= Vec(pass.alpha_min)) & VecMask::from_bits(alive);

@@ -1,7 +1,7 @@
 """The registry of splatting kernels G(x): closed forms, derivatives, extents (paper, section "Kernel Function").
 
-Every formula here is the one that ``csrc/math/kernels.h`` evaluates; a native kernel's id is its position in
-``KERNELS``. A kernel that exists only here runs on the reference engine.
+Every formula here is the one that ``csrc/math/kernels.h`` evaluates. A kernel that was registered from Python
+(``core/registered_kernels.py``) has a table beside it, which native engines read.
 
 Three floors keep values and derivatives finite, alike in every engine:
 
@@ -20,6 +20,9 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+
+from etsplat import _native
+from etsplat.core.kernel_table import KernelTable
 
 X_FLOOR = 1e-6
 SIGMA_FLOOR = 1e-6
@@ -44,6 +47,7 @@ class Kernel:
         log_support: ``(log_ratio, sigma) -> X``, the largest x with ``ln G(x) >= -log_ratio``, for ``log_ratio >= 0``.
         area: ``sigma -> integral of G over the plane / area of the triangle``. The level sets of x are scaled copies of
             the triangle, so this is the integral of ``2 x G(x)``.
+        table: What native engines draw it from; None where they have its formula.
     """
 
     name: str
@@ -52,6 +56,17 @@ class Kernel:
     dvalue_dsigma: _Function
     log_support: _Function
     area: Callable[[Tensor], Tensor]
+    table: KernelTable | None = None
+
+    @property
+    def native_name(self) -> str:
+        """The struct in ``csrc/math`` that evaluates it."""
+        return "Tabulated" if self.table is not None else "".join(map(str.capitalize, self.name.split("_")))
+
+    @property
+    def native_id(self) -> int:
+        """Its position in ``ETSPLAT_KERNELS``."""
+        return _native.kernel_names().index(self.native_name)
 
     def support(self, opacity: Tensor, sigma: Tensor, alpha_min: float = 1 / 255) -> Tensor:
         """Largest x at which ``opacity * G(x) >= alpha_min``, before the cut at ``Cutoffs.x_max``.

@@ -71,7 +71,7 @@ def rasterize(
         height: Image height in pixels.
         faces: (N, 3) int32 or int64 indices into ``vertices``.
         corner_colors: (N, 3, C), or (V, C) with ``faces``: colours interpolated over the triangle, perspective-correct.
-        kernel: "elastic", "bilateral", "single_sided" or "hard".
+        kernel: "elastic", "bilateral", "single_sided", "hard", or a name given to ``register_kernel``.
         distance: "barycentric" (about the mean of the projected vertices) or "sdf" (about the incentre).
         backgrounds: (B, C); None is black.
         depth: z of a pixel on the triangle's "plane", or of the triangle's "centroid"; None for no depth image. Median
@@ -145,6 +145,12 @@ def _check_settings(settings: RasterizeSettings) -> None:
         raise ValueError(
             "cutoffs must satisfy 0 <= alpha_min < alpha_max <= 1, x_max > 0 and 0 <= transmittance_min < 1, "
             f"got {settings.cutoffs}"
+        )
+    table = KERNELS[settings.kernel].table
+    if table is not None and x_max > table.x_max:
+        raise ValueError(
+            f"cutoffs.x_max must be at most {table.x_max} with kernel {settings.kernel!r}, as it was registered, "
+            f"got {x_max}"
         )
 
 

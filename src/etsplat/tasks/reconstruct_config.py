@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, get_args
 
 from etsplat.core.errors import InputError
-from etsplat.tasks.settings import Device, Engine, Only, Range, Rare, Settings, SoftMethod
+from etsplat.tasks.settings import Device, Engine, Only, OrRegistered, Range, Rare, Settings, SoftMethod
 
 if TYPE_CHECKING:
     from etsplat.model.mesh_rendering import MeshAppearance
@@ -156,8 +156,9 @@ class ReconstructConfig(Settings):
     paper: the paper's method at its budget;
     study: the paper's method in two minutes, for comparisons;
     demo, tiny: for `etsplat demo object` and for tests."""
-    method: Method = "elastic"
-    """Kernel of soft triangles: elastic (the paper's), bilateral (2DTS) or single-sided (Triangle Splatting).
+    method: Annotated[Method, OrRegistered] = "elastic"
+    """Kernel of soft triangles: elastic (the paper's), bilateral (2DTS), single-sided (Triangle Splatting) or a name
+    given to `register_kernel`.
     Opaque triangles with antialiased silhouettes: raster-face or raster-vertex (a colour per face or per vertex)."""
     iterations: Annotated[int, Range(1)] = 30_000
     """Optimization steps."""
@@ -226,7 +227,7 @@ class ReconstructConfig(Settings):
     @property
     def soft(self) -> bool:
         """Whether triangles are soft."""
-        return not self.method.startswith("raster")
+        return not self.method.startswith("raster-")
 
     @property
     def vertex_colored(self) -> bool:

@@ -9,6 +9,7 @@ import difflib
 import inspect
 import json
 import math
+import sys
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import cache
@@ -58,6 +59,10 @@ class Only:
     holds: Callable[[Any], bool]
 
 
+class OrRegistered:
+    """At a field that names a kernel: it may also be one that was registered from Python."""
+
+
 class Rare:
     """At a field: ``--help`` leaves it out, and ``--help-all`` has it, as the settings in groups."""
 
@@ -70,6 +75,7 @@ class Setting:
         kind: bool, int, float, str or Path.
         optional: whether it may be None.
         choices: all values; empty where any of its kind and range will do.
+        open: whether names of registered kernels are choices, too.
         range: of numbers.
         only: when it has an effect.
         default: of its class.
@@ -78,6 +84,7 @@ class Setting:
     kind: type
     optional: bool
     choices: tuple[Any, ...]
+    open: bool
     range: Range | None
     only: Only | None
     default: Any
@@ -87,8 +94,9 @@ class Setting:
         if value is None and self.optional:
             return None
         if self.choices:
-            choices = (None, *self.choices) if self.optional else self.choices
-            return None if value in self.choices else f"choose one of {', '.join(map(str, choices))}"
+            known = self.choices + registered_kernels() if self.open else self.choices
+            choices = (None, *known) if self.optional else known
+            return None if value in known else f"choose one of {', '.join(map(str, choices))}"
         kinds = (int, float) if self.kind is float else self.kind
         if not isinstance(value, kinds) or isinstance(value, bool) != (self.kind is bool):
             return f"it must be {_KINDS[self.kind]}"
@@ -292,7 +300,14 @@ def _setting(hint: Any, default: Any) -> Setting:
     choices = get_args(hint) if get_origin(hint) is Literal else ()
     limits = next((extra for extra in extras if isinstance(extra, Range)), None)
     only = next((extra for extra in extras if isinstance(extra, Only)), None)
-    return Setting(type(choices[0]) if choices else hint, optional, choices, limits, only, default)
+    kind = type(choices[0]) if choices else hint
+    return Setting(kind, optional, choices, OrRegistered in extras, limits, only, default)
+
+
+def registered_kernels() -> tuple[str, ...]:
+    """Names given to `register_kernel`; none where nobody has imported what registers them."""
+    kernels = sys.modules.get("etsplat.core.kernels")
+    return tuple(name for name, kernel in kernels.KERNELS.items() if kernel.table is not None) if kernels else ()
 
 
 def _typed(setting: Setting, value: Any) -> Any:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Literal, get_args
 
 from etsplat.core.errors import InputError
-from etsplat.tasks.settings import Device, Engine, Only, Range, Rare, Settings, SoftMethod
+from etsplat.tasks.settings import Device, Engine, Only, OrRegistered, Range, Rare, Settings, SoftMethod
 
 Preset = Literal["paper", "quick", "demo", "tiny"]
 SceneType = Literal["outdoor", "indoor", "object"]
@@ -174,8 +174,9 @@ class TrainConfig(Settings):
     demo, tiny: for `etsplat demo scene` and for tests."""
     scene_type: SceneType = "outdoor"
     """What is photographed, for learning rates and losses: outdoor, indoor, or an object."""
-    method: SoftMethod = "elastic"
-    """Kernel of the triangles: elastic (the paper's), bilateral (2DTS) or single-sided (Triangle Splatting)."""
+    method: Annotated[SoftMethod, OrRegistered] = "elastic"
+    """Kernel of the triangles: elastic (the paper's), bilateral (2DTS), single-sided (Triangle Splatting) or a name
+    given to `register_kernel`."""
     iterations: Annotated[int, Range(1)] = 6000
     """Optimization steps; each sees one view."""
     width: Annotated[int | None, Range(1)] = 800

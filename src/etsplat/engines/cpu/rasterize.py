@@ -112,7 +112,10 @@ def _call(b: int, inputs: Inputs, images: Images, plan: Plan) -> Any:
     call.background = _address(inputs.backgrounds, b)
     call.width = settings.width
     call.height = settings.height
-    call.kernel = list(KERNELS).index(settings.kernel)
+    kernel = KERNELS[settings.kernel]
+    call.kernel = kernel.native_id
+    if kernel.table is not None:
+        call.kernel_table = _address(kernel.table.native(inputs.vertices.device))
     call.distance = DISTANCES.index(settings.distance)
     call.freeze_incentre = settings.freeze_incentre
     call.near_plane = settings.near_plane

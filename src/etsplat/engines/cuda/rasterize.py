@@ -168,9 +168,8 @@ class CudaRender:
 
     def _defines(self, distortion: int, median: bool, weights: bool) -> tuple[tuple[str, int | str], ...]:
         """Definitions that specialise the tile loops."""
-        kernel = "".join(word.capitalize() for word in self.plan.settings.kernel.split("_"))
         return (
-            ("KERNEL", kernel),
+            ("KERNEL", KERNELS[self.plan.settings.kernel].native_name),
             ("FLAT", self.flat),
             ("CORNER", self.corner),
             ("DISTORTION", distortion),
@@ -187,7 +186,10 @@ class CudaRender:
         a.triangles, a.vertex_count, a.views = plan.geometry.count, plan.geometry.vertex_count, plan.views
         a.width, a.height = settings.width, settings.height
         a.tiles_x, a.tiles_y = self.tiles
-        a.kernel, a.distance = list(KERNELS).index(settings.kernel), DISTANCES.index(settings.distance)
+        kernel = KERNELS[settings.kernel]
+        self.table = None if kernel.table is None else kernel.table.native(self.device)  # kept: `a` has its address
+        a.kernel, a.kernel_table = kernel.native_id, _pointer(self.table)
+        a.distance = DISTANCES.index(settings.distance)
         a.freeze_incentre = settings.freeze_incentre
         a.shared_sigma = inputs.sigma.dim() == 0
         a.flat_per_view = inputs.flat_per_view
