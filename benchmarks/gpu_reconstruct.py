@@ -7,7 +7,9 @@ import torch
 
 from etsplat.data.demo_object import demo_object
 from etsplat.data.photograph import photograph
-from etsplat.tasks.mesh_fitting import MeshFitting
+from etsplat.engines.choice import engine
+from etsplat.optim.trainer import Trainer
+from etsplat.tasks.reconstruct import make_trainer
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.sources import make_start
 
@@ -22,7 +24,6 @@ def step_milliseconds(
     warm_up = 10
     config = ReconstructConfig.paper().changed(
         {
-            "engine": "cuda",
             "resolution": resolution,
             "start.level": start_level,
             "max_faces": faces,
@@ -33,14 +34,15 @@ def step_milliseconds(
         }
     )
     views = photograph(demo_object(), resolution, resolution, supersampling=1, device=device)
-    fitting = MeshFitting(make_start(None, views, config, device), views, config, lambda _: {})
-    _advance(fitting, 0, config.iterations - steps)
-    begin = time.perf_counter()
-    _advance(fitting, config.iterations - steps, config.iterations)
-    return {"faces": fitting.count, "milliseconds": 1e3 * (time.perf_counter() - begin) / steps}
+    with engine("cuda"):
+        trainer = make_trainer(make_start(None, views, config, device), views, config)
+        _advance(trainer, 0, config.iterations - steps)
+        begin = time.perf_counter()
+        _advance(trainer, config.iterations - steps, config.iterations)
+    return {"faces": trainer.count, "milliseconds": 1e3 * (time.perf_counter() - begin) / steps}
 
 
-def _advance(fitting: MeshFitting, done: int, last: int) -> None:
+def _advance(trainer: Trainer[Any], done: int, last: int) -> None:
     while done < last:
-        done += len(fitting.advance(done + 1, last))
-        fitting.refine(done)
+        done += len(trainer.advance(done + 1, last))
+        trainer.refine(done)

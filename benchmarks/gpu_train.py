@@ -7,8 +7,10 @@ import torch
 
 from benchmarks.gpu_timing import kernel_times
 from etsplat.data.demo_scene import demo_scene
+from etsplat.engines.choice import engine
 from etsplat.model.triangle_soup import TriangleSoup
-from etsplat.tasks.soup_fitting import SoupFitting
+from etsplat.optim.trainer import Trainer
+from etsplat.tasks.train import make_trainer
 from etsplat.tasks.train_config import TrainConfig
 
 SIZE = (1237, 822)
@@ -43,22 +45,23 @@ def step_milliseconds(
     colors = torch.rand((triangles, 3), generator=generator)
     soup = TriangleSoup.from_triangles(vertices, colors, opacity=0.3, sigma=0.5, sh_degree=3).to(device)
     config = TrainConfig.of(preset, "indoor").changed(
-        {"engine": "cuda", "iterations": 30_000, "schedule.sh_every": 1, "densification.every": 15_000}
+        {"iterations": 30_000, "schedule.sh_every": 1, "densification.every": 15_000}
     )
     if config.loss.lambda_distortion > 0:
         config = config.changed({"loss.regularize_from": 0})
-    fitting = SoupFitting(soup, capture, config, generator, lambda *_: {})
-    done = _advance(fitting, 10, 10 + steps)
-    begin = time.perf_counter()
-    done = _advance(fitting, done, done + steps)
-    milliseconds = 1e3 * (time.perf_counter() - begin) / steps
-    kernels = {}
-    if device.type == "cuda":
-        kernels = kernel_times(lambda: fitting.advance(done + 1, done + 1), 8)
+    with engine("cuda"):
+        trainer = make_trainer(soup, capture, config, generator=generator)
+        done = _advance(trainer, 10, 10 + steps)
+        begin = time.perf_counter()
+        done = _advance(trainer, done, done + steps)
+        milliseconds = 1e3 * (time.perf_counter() - begin) / steps
+        kernels = {}
+        if device.type == "cuda":
+            kernels = kernel_times(lambda: trainer.advance(done + 1, done + 1), 8)
     return {"triangles": triangles, "size": size, "milliseconds": milliseconds, "kernels": kernels}
 
 
-def _advance(fitting: SoupFitting, done: int, last: int) -> int:
+def _advance(trainer: Trainer[TriangleSoup], done: int, last: int) -> int:
     while done < last:
-        done += len(fitting.advance(done + 1, last))
+        done += len(trainer.advance(done + 1, last))
     return done

@@ -18,27 +18,31 @@ from etsplat.data.dataset import Dataset
 from etsplat.data.demo_scene import demo_scene
 from etsplat.data.load import load_dataset
 from etsplat.engines.threads import num_threads, one_torch_thread, set_num_threads
+from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.ops.photometric import photometric_loss
 from etsplat.ops.rasterize import rasterize
 from etsplat.ops.soup_colors import soup_colors
-from etsplat.tasks.soup_fitting import SoupFitting
-from etsplat.tasks.train import start_fitting
+from etsplat.optim.strategies import DensifyAndPrune
+from etsplat.optim.trainer import Trainer
+from etsplat.tasks.train import start_trainer
 from etsplat.tasks.train_config import TrainConfig
 
 WARM_UP = 60
 """Steps before anything is timed: the soup is then no longer the start."""
 
 
-def grown(capture: Dataset, config: TrainConfig) -> SoupFitting:
+def grown(capture: Dataset, config: TrainConfig) -> Trainer[TriangleSoup]:
     """A soup of `config.max_triangles` triangles that has taken some steps at its full degree."""
-    fitting = start_fitting(capture, config, lambda *_: {})
+    trainer = start_trainer(capture, config)
+    strategy = trainer.strategy
+    assert isinstance(strategy, DensifyAndPrune)
     iteration = 0
-    while fitting.count < config.max_triangles or iteration < WARM_UP:
+    while trainer.count < config.max_triangles or iteration < WARM_UP:
         iteration += 1
-        fitting.advance(iteration, iteration)
+        trainer.advance(iteration, iteration)
         if iteration % 5 == 0:
-            fitting.densify(iteration)
-    return fitting
+            strategy.densify(iteration)
+    return trainer
 
 
 def median_ms(action: Callable[[], object], repeats: int) -> float:
@@ -51,27 +55,29 @@ def median_ms(action: Callable[[], object], repeats: int) -> float:
     return 1000 * statistics.median(times)
 
 
-def measure(fitting: SoupFitting, capture: Dataset, config: TrainConfig, repeats: int) -> dict[str, float]:
+def measure(trainer: Trainer[TriangleSoup], capture: Dataset, config: TrainConfig, repeats: int) -> dict[str, float]:
     """Means over all training views of step and rasterizer, which can then be subtracted; of the parts, on one view."""
     first = config.iterations - 3 * len(capture.train)
     start = time.perf_counter()
     for iteration in range(first, first + 2 * len(capture.train)):
-        fitting.advance(iteration, iteration)
+        trainer.advance(iteration, iteration)
     step = 1000 * (time.perf_counter() - start) / (2 * len(capture.train))
-    rasterizer = statistics.mean(median_ms(rasterizing(fitting, capture, config, view), 3) for view in capture.train)
+    rasterizer = statistics.mean(median_ms(rasterizing(trainer, capture, config, view), 3) for view in capture.train)
     view = capture.train[0]
     return {
         "step": step,
         "rasterizer": rasterizer,
         "outside": step - rasterizer,
-        "colours": median_ms(coloring(fitting, capture, view), repeats),
+        "colours": median_ms(coloring(trainer, capture, view), repeats),
         "photometric loss": median_ms(comparing(capture, view), repeats),
-        "Adam": median_ms(fitting.adam.step, repeats),
+        "Adam": median_ms(trainer.adam.step, repeats),
     }
 
 
-def rasterizing(fitting: SoupFitting, capture: Dataset, config: TrainConfig, view: int) -> Callable[[], object]:
-    camera, soup = capture.cameras[view], fitting.soup
+def rasterizing(
+    trainer: Trainer[TriangleSoup], capture: Dataset, config: TrainConfig, view: int
+) -> Callable[[], object]:
+    camera, soup = capture.cameras[view], trainer.model
     with torch.no_grad():
         colors = soup_colors(soup.vertices, soup.sh_dc, soup.sh_rest, camera.centers, soup.sh_degree)
     leaves = [t.detach().clone().requires_grad_() for t in (soup.vertices, colors, soup.opacities, soup.sigma)]
@@ -98,8 +104,8 @@ def rasterizing(fitting: SoupFitting, capture: Dataset, config: TrainConfig, vie
     return run
 
 
-def coloring(fitting: SoupFitting, capture: Dataset, view: int) -> Callable[[], object]:
-    soup, centers = fitting.soup, capture.cameras[view].centers
+def coloring(trainer: Trainer[TriangleSoup], capture: Dataset, view: int) -> Callable[[], object]:
+    soup, centers = trainer.model, capture.cameras[view].centers
     cotangent = torch.rand(1, len(soup), 3)
 
     def run() -> None:
@@ -147,14 +153,14 @@ def main() -> None:
         config = config.changed({"loss.regularize_from": 0})
     capture = loaded.normalized() if config.normalize else loaded
     with one_torch_thread():
-        fitting = grown(capture, config)
-        times = measure(fitting, capture, config, options.repeats)
+        trainer = grown(capture, config)
+        times = measure(trainer, capture, config, options.repeats)
     size = capture.images.sizes[0]
-    print(f"{fitting.count:,} triangles, {size[0]}x{size[1]}, {options.method}, {num_threads()} threads")
+    print(f"{trainer.count:,} triangles, {size[0]}x{size[1]}, {options.method}, {num_threads()} threads")
     for name, value in times.items():
         print(f"  {name:18} {value:7.1f} ms")
     if options.json:
-        result: dict[str, Any] = {"triangles": fitting.count, "size": size, "threads": num_threads(), **times}
+        result: dict[str, Any] = {"triangles": trainer.count, "size": size, "threads": num_threads(), **times}
         options.json.write_text(json.dumps({**description(), **result}, indent=2) + "\n", encoding="utf-8")
 
 

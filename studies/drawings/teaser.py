@@ -13,12 +13,11 @@ from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.measures import bounding_ball
 from etsplat.io.mesh_files import load_mesh
 from etsplat.io.run_directory import RunDirectory, is_run
-from etsplat.model.soup_rendering import render_soup
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.render_config import RenderConfig
 from etsplat.tasks.render_soup import draw
 from etsplat.tasks.soup_run import open_run
-from etsplat.tasks.train import start_fitting
+from etsplat.tasks.train import start_trainer
 from etsplat.tasks.train_config import TrainConfig
 from studies.objects.pictures import draw_shape
 
@@ -78,9 +77,8 @@ def _soup_row(run: RunDirectory) -> list[Any]:
     number = len(capture.test) // 2
     view = capture.test[number]
     frame = capture.normalized() if config.normalize else capture
-    fitting = start_fitting(frame, config, lambda soup, appearance: {})
-    start = render_soup(fitting.soup, frame.cameras[view], fitting.appearance).color[0].clamp(0, 1)
-    normals = draw(opened.file, capture.cameras[view], RenderConfig(normals=True))["normal"].clamp(0, 1)
+    start = start_trainer(frame, config).model.render(frame.cameras[view]).color[0].clamp(0, 1)
+    normals = draw(opened.soup, capture.cameras[view], RenderConfig(normals=True))["normal"].clamp(0, 1)
     opaque, *others = _test_view(run, number, "opaque", "render", "truth")
     return [start.numpy(), opaque, normals.numpy(), *others]
 

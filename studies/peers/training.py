@@ -20,21 +20,20 @@ from etsplat.io.run_directory import RunDirectory
 from etsplat.metrics.image import psnr, ssim
 from etsplat.model.soup_init import StartPoints, random_points
 from etsplat.ops.photometric import photometric_loss
+from etsplat.optim.drive import drive
 from etsplat.optim.loop import LoopSettings, Progress
 from etsplat.optim.schedules import exponential_decay, limited_iterations
 from etsplat.optim.view_sampler import ViewSampler
-from etsplat.tasks.evaluate_soup import drawing_speed, image_scores, load_lpips, mean_scores
+from etsplat.tasks.evaluate_soup import drawing_speed, image_scores, mean_scores
 from etsplat.tasks.running import (
     Place,
     device_name,
-    fit,
+    hash_record,
     make_record,
     path_of,
-    progress_tensor,
-    read_progress,
     versions,
 )
-from etsplat.tasks.soup_scoring import SoupScorer
+from etsplat.tasks.scoring import Scorer, load_lpips
 from studies.peers.gaussians import NAMES, Splatting, load_gaussians, save_gaussians, splat, start_gaussians
 from studies.peers.settings import PeerConfig, load_gsplat
 
@@ -72,7 +71,7 @@ def train_peer(
     settings = LoopSettings(config.iterations, LOG_EVERY, evaluate_every=0, checkpoint_every=CHECKPOINT_EVERY)
     with torch.random.fork_rng([device] if device.type == "cuda" else []):
         torch.manual_seed(config.seed)  # gsplat splits at random
-        progress = fit(fitting, run, settings, record, lambda event: None)
+        drive(fitting, progress := Progress(), settings, (), run, hash_record(record))
     save_gaussians(run.path / FILE, fitting.gaussians)
     drawing = PeerDrawing(gsplat, fitting.gaussians, capture, config, device)
     run.write_metrics(
@@ -103,7 +102,7 @@ def evaluate_peer(folder: Path, config: PeerConfig, lpips_weights: Path | None) 
         picture, photo = drawing.pair(view)
         rows.append({"name": capture.names[view], **image_scores(picture, photo, lpips)})
     cameras = [capture.cameras[view] for view in capture.test]
-    speed = drawing_speed(drawing.picture, cameras, device, len(gaussians["means"]))
+    speed = drawing_speed(drawing.render, cameras, device, len(gaussians["means"]))
     opaque = {"psnr_opaque": None, "ssim_opaque": None}
     return {**mean_scores(rows), **opaque, "lpips_reason": reason, **speed, "engine": "gsplat", "views": rows}
 
@@ -116,20 +115,20 @@ class PeerDrawing:
     ) -> None:
         self._gsplat, self._gaussians, self._capture, self._config = gsplat, gaussians, capture, config
         self._background = _background(config, device)
-        self._scorer = SoupScorer(capture, self._background[0], device)
+        self._scorer = Scorer(capture, device, background=self._background[0].tolist())
         self._device = device
 
     @torch.no_grad()
-    def picture(self, camera: Cameras) -> Tensor:
-        """(H, W, 3) in [0, 1]."""
-        splatting = splat(self._gsplat, self._gaussians, camera, self._config, self._background)
-        return splatting.color[0].clamp(0, 1)
+    def render(self, cameras: Cameras, *, backgrounds: Tensor | None = None) -> Splatting:
+        """As a model of ours draws itself."""
+        behind = self._background if backgrounds is None else backgrounds
+        return splat(self._gsplat, self._gaussians, cameras, self._config, behind)
 
     def pair(self, view: int) -> tuple[Tensor, Tensor]:
         """Picture and photo (H, W, 3); pixels that a mask excludes agree."""
-        photo = self._scorer.photo(view)
-        picture = self.picture(self._capture.cameras[view].to(self._device))
-        return self._scorer.masked(picture, photo, view), photo
+        model: Any = self
+        seen = self._scorer.see(model, view)
+        return seen.counting(seen.splatted), seen.photo
 
     def draw_test_views(self, folder: Path) -> dict[str, Any]:
         """NNN_render.png and NNN_truth.png of every test view; mean PSNR and SSIM, None without test views."""
@@ -144,7 +143,7 @@ class PeerDrawing:
 
 
 class _Fitting:
-    """Parameters, their optimizers and gsplat's strategy: what `tasks.running.fit` drives."""
+    """Parameters, their optimizers and gsplat's strategy: what `optim.drive` drives."""
 
     def __init__(self, gsplat: Any, capture: Dataset, config: PeerConfig, device: torch.device) -> None:
         self._gsplat, self._config, self._device = gsplat, config, device
@@ -205,7 +204,7 @@ class _Fitting:
         """The name of a parameter that holds NaN or infinity."""
         return next((name for name in NAMES if not bool(self.gaussians[name].isfinite().all())), None)
 
-    def state(self, progress: Progress) -> dict[str, Tensor]:
+    def state(self) -> dict[str, Tensor]:
         """Everything but the random numbers of gsplat."""
         state = {f"sampler.{name}": tensor for name, tensor in self._sampler.state().items()}
         for name in NAMES:
@@ -213,11 +212,10 @@ class _Fitting:
             moments = self._optimizers[name].state[parameter]
             state |= {f"adam.{name}.{kind}": tensor for kind, tensor in moments.items()}
         strategy = {name: value for name, value in self._state.items() if isinstance(value, Tensor)}
-        state |= {f"strategy.{name}": value for name, value in strategy.items()}
-        return {**state, "progress": progress_tensor(progress)}
+        return state | {f"strategy.{name}": value for name, value in strategy.items()}
 
-    def load_state(self, state: dict[str, Tensor], iteration: int) -> Progress:
-        """Continues where `state` was taken; returns where that was."""
+    def load_state(self, state: dict[str, Tensor], iteration: int) -> None:
+        """Continues where `state` was taken."""
         self._sampler.load_state({name: state[f"sampler.{name}"] for name in self._sampler.state()})
         for name, optimizer in self._optimizers.items():
             parameter = nn.Parameter(state[f"gaussians.{name}"].to(self._device))
@@ -228,7 +226,6 @@ class _Fitting:
             if "step" in moments:
                 moments["step"] = moments["step"].cpu()  # where torch's Adam counts
         self._state.update(self._under("strategy.", state))
-        return read_progress(state["progress"], iteration)
 
     def _under(self, prefix: str, state: dict[str, Tensor]) -> dict[str, Tensor]:
         found = {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}

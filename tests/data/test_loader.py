@@ -57,3 +57,22 @@ def test_a_view_is_the_same_by_index_and_by_place(dataset, streamed):
             assert (seen.mask is None) == (mask is None)
             assert mask is None or torch.equal(seen.mask[0], mask)
     assert len(kinds) > 5
+
+
+def test_streamed_views_of_one_step_lie_side_by_side(dataset):
+    """Two photos of the same kind, both uploaded before either is looked at."""
+    pictures = LazyPictures(
+        lambda index: Picture(dataset.images[index], dataset.images.mask(index)),
+        dataset.images.sizes,
+        [20 * 16 * 4] * len(dataset),
+        dataset.images.fingerprint,
+        limit=5000,
+    )
+    loader = ViewLoader(replace(dataset, images=pictures), CPU, batch=2)
+    kinds = {index: loader.kind_and_place(index)[0] for index in dataset.train}
+    pair = next([a, b] for a in dataset.train for b in dataset.train if a < b and kinds[a] == kinds[b])
+    places = [loader.kind_and_place(index, number)[1] for number, index in enumerate(pair)]
+    for upload in [loader.upload(index, number) for number, index in enumerate(pair)]:
+        upload()
+    for index, place in zip(pair, places, strict=True):
+        assert torch.equal(loader.look_up(kinds[index], torch.tensor(place)).photo[0], dataset.images[index])

@@ -123,9 +123,15 @@ class Names:
         return name
 
 
-TENSORS = Names({})
+TENSORS = Names({r"(mesh|soup)\.(.*)": r"model.\2", r"statistics\.(.*)": r"strategy.\1"})
 """Of checkpoints and of soup.safetensors."""
-METRICS = Names({}, ignored=frozenset({"seconds", "seconds_per_iteration", "versions"}))
+_GEOMETRY = ("chamfer", "chamfer_floor", "chamfer_exact", "f_score")
+METRICS = Names(
+    {},
+    # Meshes and soups are measured by one scorer.
+    added=frozenset({"ssim_mesh", "test_views", "lpips", "lpips_reason", "silhouette_iou", *_GEOMETRY}),
+    ignored=frozenset({"seconds", "seconds_per_iteration", "versions"}),
+)
 """Of metrics.json."""
 HISTORY = Names({}, ignored=frozenset({"seconds"}))
 """Of the lines of history.jsonl."""
@@ -135,7 +141,9 @@ FILES = Names({})
 CLOCKS = {"progress": 0}
 """Tensors with an element that is a time: its index. By the names of either tree."""
 
-CHANGED: dict[str, str] = {}
+CHANGED: dict[str, str] = {
+    "owl-batch": "each view of a step is differentiated by itself; their gradients are added in the order of the views",
+}
 """Cases whose bits change on purpose, and why. They must differ: a line that is not true any more is an error."""
 
 

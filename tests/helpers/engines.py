@@ -40,15 +40,3 @@ def _moved(value: Any, device: str) -> Any:
     if is_dataclass(value) and not isinstance(value, type):
         return type(value)(**{field.name: _moved(getattr(value, field.name), device) for field in fields(value)})
     return value
-
-
-def keeping(engine: str, problem: Any) -> Any:
-    """The problem with its steps always on this engine, whoever calls for them."""
-    advance = problem.advance
-
-    def advance_there(first: int, last: int) -> list[float]:
-        with etsplat.engine(engine):
-            return advance(first, last)
-
-    problem.advance = advance_there
-    return problem

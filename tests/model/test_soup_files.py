@@ -1,9 +1,10 @@
+from dataclasses import replace
+
 import pytest
 import torch
 
 from etsplat.core.errors import InputError
-from etsplat.model.soup_files import SoupFile, load_soup, save_soup
-from etsplat.model.soup_rendering import SoupAppearance
+from etsplat.model.soup_appearance import SoupAppearance
 from etsplat.model.triangle_soup import TriangleSoup
 
 
@@ -18,38 +19,38 @@ def soup(rng):
 
 
 def test_a_soup_returns_bit_for_bit_with_how_it_is_drawn(tmp_path, soup):
-    appearance = SoupAppearance(kernel="bilateral", cull_small=True, near_plane=0.3, sigma_ceiling=0.5)
-    saved = SoupFile(soup, appearance, (1.0, 0.5, 0.0), {"iteration": "30000"})
-    save_soup(tmp_path / "soup.safetensors", saved)
-    loaded = load_soup(tmp_path / "soup.safetensors")
-    for name, tensor in loaded.soup.parameters().items():
+    appearance = SoupAppearance("bilateral", cull_small=True, near_plane=0.3, background=(1, 0.5, 0), sigma_ceiling=0.5)
+    saved = replace(soup, appearance=appearance, notes={"iteration": "30000"})
+    saved.save(tmp_path / "soup.safetensors")
+    loaded = TriangleSoup.load(tmp_path / "soup.safetensors")
+    for name, tensor in loaded.parameters().items():
         assert torch.equal(tensor, getattr(soup, name).detach())
         assert not tensor.requires_grad
-    assert (loaded.appearance, loaded.background, loaded.notes) == (appearance, saved.background, saved.notes)
+    assert (loaded.appearance, loaded.notes) == (appearance, saved.notes)
 
 
 def test_an_unlimited_softness_returns_as_unlimited(tmp_path, soup):
-    save_soup(tmp_path / "soup.safetensors", SoupFile(soup))
-    assert load_soup(tmp_path / "soup.safetensors").appearance == SoupAppearance()
+    soup.save(tmp_path / "soup.safetensors")
+    assert TriangleSoup.load(tmp_path / "soup.safetensors").appearance == SoupAppearance()
 
 
 @pytest.mark.parametrize("part", [0.0, 0.02, 0.5, 0.99])
 def test_files_cut_anywhere_are_one_line_input_errors(tmp_path, soup, part):
     path = tmp_path / "soup.safetensors"
-    save_soup(path, SoupFile(soup))
+    soup.save(path)
     path.write_bytes(path.read_bytes()[: int(path.stat().st_size * part)])
     with pytest.raises(InputError, match=r"soup\.safetensors: cannot be read") as raised:
-        load_soup(path)
+        TriangleSoup.load(path)
     assert "\n" not in str(raised.value)
 
 
 def test_missing_files_and_nan_are_input_errors(tmp_path, soup):
     with pytest.raises(InputError, match="no such file"):
-        load_soup(tmp_path / "absent.safetensors")
+        TriangleSoup.load(tmp_path / "absent.safetensors")
     with torch.no_grad():
         soup.sigma_raw[3] = torch.nan
-    save_soup(tmp_path / "soup.safetensors", SoupFile(soup))
+    soup.save(tmp_path / "soup.safetensors")
     with pytest.raises(InputError, match="sigma_raw holds NaN"):
-        load_soup(tmp_path / "soup.safetensors")
+        TriangleSoup.load(tmp_path / "soup.safetensors")
     with pytest.raises(ValueError, match="suffix"):
-        save_soup(tmp_path / "soup.bin", SoupFile(soup))
+        soup.save(tmp_path / "soup.bin")

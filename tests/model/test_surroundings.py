@@ -7,7 +7,7 @@ import torch
 
 from etsplat.data.dataset import Dataset
 from etsplat.data.demo_scene import demo_scene
-from etsplat.model.soup_rendering import SoupAppearance, render_soup
+from etsplat.model.soup_appearance import SoupAppearance
 from etsplat.model.surroundings import Surroundings
 from etsplat.model.triangle_soup import TriangleSoup
 
@@ -40,7 +40,7 @@ def test_it_surrounds_cameras_and_nearly_all_points(capture: Dataset, sphere: Tr
 def test_every_view_is_covered(capture: Dataset, sphere: TriangleSoup) -> None:
     """There is no gap, and about a third of the background shines through at the start."""
     for camera in capture.cameras[:3]:
-        alpha = render_soup(sphere, camera, SoupAppearance(near_plane=0.05)).alpha.detach()
+        alpha = replace(sphere, appearance=SoupAppearance(near_plane=0.05)).render(camera).alpha.detach()
         assert float(alpha.mean()) > 0.6
         assert float(alpha.min()) > 0.4
 

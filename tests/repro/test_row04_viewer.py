@@ -8,10 +8,10 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from etsplat.model.soup_files import SoupFile, save_soup
 
 from etsplat.core.errors import InputError
 from etsplat.io.run_directory import RunDirectory
-from etsplat.model.soup_files import SoupFile, save_soup
 from etsplat.tasks.soup_run import SoupRun
 from etsplat.viewer import server
 from etsplat.viewer.follow import Followed

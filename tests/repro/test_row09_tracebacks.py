@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from etsplat.model.soup_files import SoupFile, save_soup
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
@@ -16,7 +17,6 @@ from etsplat.core.errors import InputError
 from etsplat.data.load import load_dataset
 from etsplat.io.images import load_image
 from etsplat.io.mesh_files import load_mesh
-from etsplat.model.soup_files import SoupFile, save_soup
 from etsplat.model.soup_import import open_soup
 from etsplat.model.triangle_soup import TriangleSoup
 from helpers.captures import write_colmap, write_transforms

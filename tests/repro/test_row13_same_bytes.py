@@ -1,8 +1,8 @@
 """The same soup is the same file."""
 
 import pytest
-
 from etsplat.model.soup_files import SoupFile, save_soup
+
 from viewer.test_viewer import make_soup
 
 

@@ -92,7 +92,7 @@ def test_presets_of_train_are_what_they_were(preset: str, scene: str) -> None:
     base = before.TRAIN_PAPER if preset == "paper" else before.TRAIN_QUICK
     expected = {**base, **before.TRAIN_CHANGES[preset, scene]}
     named = {before.TRAIN_NAMES[name]: expected[name] for name in expected}
-    assert config == {"preset": preset, "scene_type": scene, **named}
+    assert config == {"preset": preset, "scene_type": scene, "batch": 1, **named}
 
 
 def test_defaults_are_those_of_the_command_line() -> None:

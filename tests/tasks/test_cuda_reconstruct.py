@@ -8,20 +8,17 @@ from typing import Any
 import pytest
 import torch
 
-import etsplat
 from etsplat.data.dataset import Dataset
 from etsplat.data.demo_object import demo_object
 from etsplat.data.photograph import photograph
 from etsplat.engines.cuda.graph import Repeated
-from etsplat.optim.loop import Progress
-from etsplat.tasks.mesh_fitting import MeshFitting
-from etsplat.tasks.reconstruct import reconstruct
+from etsplat.tasks.reconstruct import make_trainer, reconstruct
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.sources import make_start
-from helpers.engines import keeping
 from helpers.simt.build import Simt
 from helpers.simt.calls import Calls
 from helpers.simt.room import room_for_16_pairs, second_step_overflows
+from helpers.trainers import OnEngine, same_bits
 
 CPU = torch.device("cpu")
 # 320 faces, subdivided after iterations 2 and 5.
@@ -48,18 +45,8 @@ def views() -> Dataset:
     return photograph(demo_object(), 32, 32, elevations=(-35.0, 35.0), azimuths=3, supersampling=2)
 
 
-def fitting(views: Dataset, engine: str, config: ReconstructConfig = CONFIG, device: torch.device = CPU) -> MeshFitting:
-    with etsplat.engine(engine):
-        return keeping(engine, MeshFitting(make_start(None, views, config, device), views, config, lambda _: {}))
-
-
-def run(problem: MeshFitting, last: int) -> list[float]:
-    """The losses of all steps up to iteration `last`, with refinements in between."""
-    losses: list[float] = []
-    while len(losses) < last:
-        losses += problem.advance(len(losses) + 1, last)
-        problem.refine(len(losses))
-    return losses
+def fitting(views: Dataset, engine: str, config: ReconstructConfig = CONFIG, device: torch.device = CPU) -> OnEngine:
+    return OnEngine(engine, lambda: make_trainer(make_start(None, views, config, device), views, config))
 
 
 @pytest.mark.parametrize(
@@ -84,10 +71,10 @@ def test_steps_are_those_of_the_cpu_engine(cuda_device: torch.device, views: Dat
     by small ones, so one parameter in a hundred may differ by more."""
     config = CONFIG.changed(settings)
     on_device, on_cpu = fitting(views, "cuda", config, cuda_device), fitting(views, "cpu", config)
-    assert run(on_device, 6) == pytest.approx(run(on_cpu, 6), rel=1e-5)
-    assert on_device.count == on_cpu.count > 320
-    expected = on_cpu.mesh.parameters()
-    for name, parameter in on_device.mesh.parameters().items():
+    assert on_device.run(6) == pytest.approx(on_cpu.run(6), rel=1e-5)
+    assert on_device.model.count == on_cpu.model.count > 320
+    expected = on_cpu.model.parameters()
+    for name, parameter in on_device.model.parameters().items():
         difference = (parameter.cpu() - expected[name]).detach().abs()
         assert float((difference > 1e-5).float().mean()) < 0.01, name
 
@@ -101,19 +88,17 @@ def test_steps_queued_together_are_the_steps_one_by_one(cuda_device: torch.devic
         losses += together.advance(2, 5)
     assert any(repairs)
     assert losses == [one_by_one.advance(i, i)[0] for i in range(1, 6)]
-    for name, parameter in together.mesh.parameters().items():
-        assert torch.equal(parameter, one_by_one.mesh.parameters()[name])
+    same_bits(together, one_by_one)
 
 
 def test_replayed_steps_are_those_that_are_called(cuda_device: torch.device, views: Dataset, monkeypatch) -> None:
     """The same bits with graphs and without: all that changes from step to step is in device memory."""
     config = CONFIG.changed({**UNREFINED, "iterations": 9, "optimizer.sigma_final": 0.2, "batch": 2})
     replayed, called = (fitting(views, "cuda", config, cuda_device) for _ in range(2))
-    losses = run(replayed, 9)
+    losses = replayed.run(9)
     monkeypatch.setattr(Repeated, "__call__", lambda self: self._body())
-    assert run(called, 9) == losses
-    for name, parameter in replayed.mesh.parameters().items():
-        assert torch.equal(parameter, called.mesh.parameters()[name])
+    assert called.run(9) == losses
+    same_bits(replayed, called)
 
 
 @pytest.mark.parametrize(("method", "reads", "kernels"), [("elastic", 1, 18), ("raster-vertex", 0, 17)])
@@ -122,10 +107,10 @@ def test_a_queued_step_reads_nothing_back(simt: Simt, views: Dataset, method: st
     few small kernels of torch are left."""
     problem = fitting(views, "cuda", replace(CONFIG, method=method))
     problem.advance(1, 1)  # fills caches
-    assert problem._queue is not None
-    problem._queue._position.zero_()
-    with Calls() as calls, etsplat.engine("cuda"):
-        problem._queue._step(None)
+    kind = next(iter(problem.queue._repeated))
+    problem.queue._position.zero_()
+    with Calls() as calls:
+        problem.step_again(kind)
     assert calls.waiting() == reads
     assert calls.kernels() <= kernels
 
@@ -133,40 +118,36 @@ def test_a_queued_step_reads_nothing_back(simt: Simt, views: Dataset, method: st
 def test_a_step_whose_buffers_overflow_is_made_again(simt: Simt, views: Dataset) -> None:
     """While the flag is set nothing changes; after the repair the queue goes on where it stopped."""
     problem, undisturbed = fitting(views, "cuda"), fitting(views, "cuda")
-    assert problem._queue is not None
-    with second_step_overflows(problem._queue, problem.mesh.vertices.device) as steps:
-        assert run(problem, 2) == run(undisturbed, 2)
+    with second_step_overflows(problem.queue, CPU) as steps:
+        assert problem.run(2) == undisturbed.run(2)
     assert len(steps) == 3
-    for name, parameter in problem.mesh.parameters().items():
-        assert torch.equal(parameter, undisturbed.mesh.parameters()[name])
+    same_bits(problem, undisturbed)
 
 
 def test_a_loss_that_is_not_finite_stops_the_queue(cuda_device: torch.device, views: Dataset) -> None:
     """The losses end with it, and no step was made from there on."""
     problem = fitting(views, "cuda", device=cuda_device)
     with torch.no_grad():
-        problem.mesh.vertices[0] = math.nan
-    before = problem.mesh.colors.detach().clone()
+        problem.model.vertices[0] = math.nan
+    before = problem.model.colors.detach().clone()
     losses = problem.advance(1, 2)
     assert len(losses) == 1
     assert math.isnan(losses[0])
-    assert torch.equal(problem.mesh.colors, before)
+    assert torch.equal(problem.model.colors, before)
 
 
 def test_a_resumed_run_ends_with_the_same_bits(cuda_device: torch.device, views: Dataset) -> None:
     """State saved after iteration 4 and loaded into a new problem leads to the same parameters."""
     whole = fitting(views, "cuda", device=cuda_device)
-    losses = run(whole, 4)
-    state = {name: tensor.cpu().clone() for name, tensor in whole.state(Progress(4)).items()}
+    losses = whole.run(4)
     resumed = fitting(views, "cuda", device=cuda_device)
-    resumed.load_state(state, 4)
+    resumed.trainer.load_state(whole.state(), 4)
     for problem in (whole, resumed):
         for first, last in ((5, 5), (6, 6)):
             losses += problem.advance(first, last)
             problem.refine(last)
     assert losses[4:6] == losses[6:8]
-    for name, parameter in whole.mesh.parameters().items():
-        assert torch.equal(parameter, resumed.mesh.parameters()[name])
+    same_bits(whole, resumed)
 
 
 def test_a_whole_run_leaves_its_directory(cuda_device: torch.device, tmp_path: Path) -> None:

@@ -9,20 +9,17 @@ from typing import Any
 import pytest
 import torch
 
-import etsplat
 from etsplat.data.dataset import Dataset
 from etsplat.data.demo_scene import demo_scene
 from etsplat.data.pictures import StoredPictures
 from etsplat.engines.cuda.graph import Repeated
 from etsplat.model.soup_init import StartPoints, start_soup
-from etsplat.optim.loop import Progress
-from etsplat.tasks.soup_fitting import SoupFitting
-from etsplat.tasks.train import train
+from etsplat.tasks.train import make_trainer, train
 from etsplat.tasks.train_config import TrainConfig
-from helpers.engines import keeping
 from helpers.simt.build import Simt
 from helpers.simt.calls import Calls
 from helpers.simt.room import room_for_16_pairs, second_step_overflows
+from helpers.trainers import OnEngine, same_bits
 
 # Densified after iteration 3; the degree rises after iteration 4.
 CONFIG = TrainConfig.tiny().changed(
@@ -56,29 +53,14 @@ def left_half(image: torch.Tensor) -> torch.Tensor:
     return mask
 
 
-def fitting(capture: Dataset, engine: str, device: torch.device = CPU, config: TrainConfig = CONFIG) -> SoupFitting:
-    generator = torch.Generator().manual_seed(3)
+def fitting(capture: Dataset, engine: str, device: torch.device = CPU, config: TrainConfig = CONFIG) -> OnEngine:
     assert capture.points is not None
     chosen = capture.points[::150]
+    generator = torch.Generator().manual_seed(3)
     soup = start_soup(
         StartPoints(chosen, torch.full_like(chosen, 0.5)), generator, scale=2.0, opacity=0.4, sigma=1.0, sh_degree=1
     )
-    with etsplat.engine(engine):
-        return keeping(engine, SoupFitting(soup.to(device), capture, config, generator, lambda *_: {}))
-
-
-def run(problem: SoupFitting, last: int, together: int = 6) -> list[float]:
-    """The losses of all steps up to iteration `last`, with densification in between."""
-    losses: list[float] = []
-    while len(losses) < last:
-        losses += problem.advance(len(losses) + 1, min(last, len(losses) + together))
-        problem.refine(len(losses))
-    return losses
-
-
-def same_bits(first: SoupFitting, second: SoupFitting) -> None:
-    state, expected = first.state(Progress(0)), second.state(Progress(0))
-    assert all(torch.equal(tensor, expected[name]) for name, tensor in state.items())
+    return OnEngine(engine, lambda: make_trainer(soup.to(device), capture, config, generator=generator))
 
 
 @pytest.mark.parametrize(
@@ -93,27 +75,28 @@ def same_bits(first: SoupFitting, second: SoupFitting) -> None:
             "loss.regularize_from": 10_000,
         },
         {"method": "single-sided", "background": "random"},
+        {"batch": 2},
     ],
-    ids=["plain", "finish", "paper", "single-sided"],
+    ids=["plain", "finish", "paper", "single-sided", "batch"],
 )
 def test_steps_are_those_of_the_cpu_engine(cuda_device: torch.device, capture: Dataset, settings: Any) -> None:
     """Three steps: the same losses, and statistics and parameters to rounding but for a few triangles, where Adam
     divided small gradients by small ones; then a densification and three more."""
     config = CONFIG.changed(settings)
     on_device, on_cpu = fitting(capture, "cuda", cuda_device, config), fitting(capture, "cpu", CPU, config)
-    before = on_cpu.count
+    before = on_cpu.model.count
     losses, expected = ([loss for i in (1, 2, 3) for loss in p.advance(i, i)] for p in (on_device, on_cpu))
     assert losses == pytest.approx(expected, rel=1e-5)
-    for name, tensor in on_cpu.statistics.tensors().items():
-        difference = (on_device.statistics.tensors()[name].cpu() - tensor).abs()
+    for name, tensor in on_cpu.trainer.strategy.statistics.tensors().items():
+        difference = (on_device.trainer.strategy.statistics.tensors()[name].cpu() - tensor).abs()
         assert float((difference > 1e-4 + 1e-3 * tensor.abs()).float().mean()) < 0.05, name
-    for name, parameter in on_cpu.soup.parameters().items():
-        difference = (on_device.soup.parameters()[name].cpu() - parameter).detach().abs()
+    for name, parameter in on_cpu.model.parameters().items():
+        difference = (on_device.model.parameters()[name].cpu() - parameter).detach().abs()
         assert float((difference > 1e-4).float().mean()) < 0.01, name
     assert on_device.refine(3) == on_cpu.refine(3) > 0
     losses, expected = ([loss for i in (4, 5, 6) for loss in p.advance(i, i)] for p in (on_device, on_cpu))
     assert losses == pytest.approx(expected, rel=1e-3)
-    assert on_device.count == on_cpu.count > before
+    assert on_device.model.count == on_cpu.model.count > before
 
 
 def test_steps_queued_together_are_the_steps_one_by_one(cuda_device: torch.device) -> None:
@@ -125,7 +108,7 @@ def test_steps_queued_together_are_the_steps_one_by_one(cuda_device: torch.devic
         while len(losses) < 6:
             losses += together.advance(len(losses) + 1, 6)
     assert any(repairs)
-    assert losses == run(one_by_one, 6, together=1)
+    assert losses == one_by_one.run(6, together=1)
     same_bits(together, one_by_one)
 
 
@@ -142,19 +125,23 @@ def test_replayed_steps_are_those_that_are_called(cuda_device: torch.device, mon
         }
     )
     replayed = fitting(capture, "cuda", cuda_device, config)
-    losses = run(replayed, 9, together=9)
+    losses = replayed.run(9)
     monkeypatch.setattr(Repeated, "__call__", lambda self: self._body())
     called = fitting(capture, "cuda", cuda_device, config)
-    assert run(called, 9, together=9) == losses
+    assert called.run(9) == losses
     same_bits(replayed, called)
 
 
-def test_streamed_photos_give_the_same_bits(cuda_device: torch.device, capture: Dataset) -> None:
-    """Where photos do not fit, each is uploaded before its step."""
+@pytest.mark.parametrize("batch", [1, 2])
+def test_streamed_photos_give_the_same_bits(cuda_device: torch.device, capture: Dataset, batch: int) -> None:
+    """Where photos do not fit, those of a step are uploaded before it."""
     images = copy(capture.images)
     images.streamed = True  # type: ignore[misc]
-    streamed, kept = (fitting(replace(capture, images=i), "cuda", cuda_device) for i in (images, capture.images))
-    assert run(streamed, 6) == run(kept, 6)
+    streamed, kept = (
+        fitting(replace(capture, images=i), "cuda", cuda_device, replace(CONFIG, batch=batch))
+        for i in (images, capture.images)
+    )
+    assert streamed.run(6) == kept.run(6)
     same_bits(streamed, kept)
 
 
@@ -173,12 +160,11 @@ def test_a_queued_step_reads_nothing_back(simt: Simt, settings: Any, own: int, k
     few small kernels of torch are left."""
     problem = fitting(demo_scene(40, 32), "cuda", config=CONFIG.changed(settings))
     problem.advance(1, 1)  # fills caches
-    assert problem._queue is not None
-    kind = next(iter(problem._queue._repeated))
-    problem._queue._position.zero_()
+    kind = next(iter(problem.queue._repeated))
+    problem.queue._position.zero_()
     simt.launches.clear()
-    with Calls() as calls, etsplat.engine("cuda"):
-        problem._queue._step(kind)
+    with Calls() as calls:
+        problem.step_again(kind)
     assert calls.waiting() == 1
     assert len(simt.launches) == own
     assert calls.kernels() <= kernels
@@ -187,9 +173,8 @@ def test_a_queued_step_reads_nothing_back(simt: Simt, settings: Any, own: int, k
 def test_a_step_whose_buffers_overflow_is_made_again(simt: Simt, capture: Dataset) -> None:
     """While the flag is set nothing changes; after the repair the queue goes on where it stopped."""
     problem, undisturbed = fitting(capture, "cuda"), fitting(capture, "cuda")
-    assert problem._queue is not None
-    with second_step_overflows(problem._queue, CPU) as steps:
-        assert run(problem, 3) == run(undisturbed, 3)
+    with second_step_overflows(problem.queue, CPU) as steps:
+        assert problem.run(3) == undisturbed.run(3)
     assert len(steps) == 5  # the second and what was queued behind it, twice
     same_bits(problem, undisturbed)
 
@@ -198,22 +183,21 @@ def test_a_loss_that_is_not_finite_stops_the_queue(cuda_device: torch.device, ca
     """The losses end with it, and nothing has changed from there on, statistics included."""
     problem = fitting(capture, "cuda", cuda_device)
     with torch.no_grad():
-        problem.soup.opacity_logits[0] = math.nan
-    before = problem.soup.sh_rest.detach().clone()
+        problem.model.opacity_logits[0] = math.nan
+    before = problem.model.sh_rest.detach().clone()
     losses = problem.advance(1, 3)
     assert len(losses) == 1
     assert math.isnan(losses[0])
-    assert torch.equal(problem.soup.sh_rest, before)
-    assert int(problem.statistics.trial.max()) == 0
+    assert torch.equal(problem.model.sh_rest, before)
+    assert int(problem.trainer.strategy.statistics.trial.max()) == 0
 
 
 def test_a_resumed_run_ends_with_the_same_bits(cuda_device: torch.device, capture: Dataset) -> None:
     """State saved after iteration 4 and loaded into a new problem leads to the same soup and statistics."""
     whole = fitting(capture, "cuda", cuda_device)
-    run(whole, 4)
-    state = {name: tensor.cpu().clone() for name, tensor in whole.state(Progress(4)).items()}
+    whole.run(4)
     resumed = fitting(capture, "cuda", cuda_device)
-    resumed.load_state(state, 4)
+    resumed.trainer.load_state(whole.state(), 4)
     losses = []
     for problem in (whole, resumed):
         for first, last in ((5, 5), (6, 6)):

@@ -7,8 +7,6 @@ from etsplat.core.errors import InputError
 from etsplat.data.load import load_dataset
 from etsplat.io.images import save_image
 from etsplat.metrics.image import psnr, ssim
-from etsplat.model.soup_files import SoupFile
-from etsplat.model.soup_rendering import render_soup, render_soup_opaque
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.tasks.evaluate_soup import evaluate_run
 from etsplat.tasks.soup_run import SoupRun
@@ -28,13 +26,13 @@ def soup(rng):
 
 def test_numbers_are_the_metrics_of_each_view_and_their_mean(tmp_path, soup):
     write_colmap(tmp_path / "scene", [(33, 24)] * 9)
-    run = SoupRun(tmp_path, SoupFile(soup), load_dataset(tmp_path / "scene"))
+    run = SoupRun(tmp_path, soup, load_dataset(tmp_path / "scene"))
     found = evaluate_run(run, pictures=tmp_path / "pictures")
     assert [row["name"] for row in found["views"]] == ["0000", "0008"]
     for row, view in zip(found["views"], (0, 8), strict=True):
         photo = run.capture.images[view].float() / 255
-        image = render_soup(soup, run.capture.cameras[view], run.file.appearance).color[0].detach().clamp(0, 1)
-        opaque = render_soup_opaque(soup, run.capture.cameras[view], run.file.appearance)[0]
+        image = soup.render(run.capture.cameras[view]).color[0].detach().clamp(0, 1)
+        opaque = soup.render_opaque(run.capture.cameras[view])[0, ..., :3]
         assert row["psnr"] == pytest.approx(psnr(image, photo))
         assert row["psnr_8bit"] == pytest.approx(psnr(image, photo), abs=0.02)
         assert row["ssim"] == pytest.approx(ssim(image, photo))
@@ -53,7 +51,7 @@ def test_masked_pixels_do_not_count(tmp_path, soup):
     for index in range(2):
         write_photo(tmp_path / "scene" / "masks" / f"{index:04d}.png", 33, 24)
         save_image(tmp_path / "scene" / "masks" / f"{index:04d}.png", torch.zeros(24, 33, 1))
-    found = evaluate_run(SoupRun(tmp_path, SoupFile(soup), load_dataset(tmp_path / "scene")))
+    found = evaluate_run(SoupRun(tmp_path, soup, load_dataset(tmp_path / "scene")))
     assert found["psnr"] == float("inf")
     assert found["ssim"] == pytest.approx(1.0)
 
@@ -63,4 +61,4 @@ def test_without_test_views_there_is_nothing_to_measure(tmp_path, soup):
     capture = load_dataset(tmp_path / "scene")
     capture.test.clear()
     with pytest.raises(InputError, match="no test views"):
-        evaluate_run(SoupRun(tmp_path, SoupFile(soup), capture))
+        evaluate_run(SoupRun(tmp_path, soup, capture))

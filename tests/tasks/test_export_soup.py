@@ -1,6 +1,7 @@
 import json
 import math
 import struct
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,9 +16,8 @@ from etsplat.io import writers
 from etsplat.io.mesh_files import save_mesh
 from etsplat.io.ply_tables import encode_ply, read_ply_tables
 from etsplat.io.srgb import srgb_from_linear
-from etsplat.model.soup_files import SoupFile, save_soup
+from etsplat.model.soup_appearance import SoupAppearance
 from etsplat.model.soup_import import open_soup
-from etsplat.model.soup_rendering import SoupAppearance, render_soup, render_soup_opaque
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.tasks.export_config import ExportConfig
 from etsplat.tasks.export_soup import bake_colors, export_soup
@@ -52,7 +52,8 @@ def soup(rng):
 
 
 def run_of(soup, **appearance):
-    return SoupRun(path=None, file=SoupFile(soup, SoupAppearance(**appearance)), capture=None)  # pyright: ignore
+    drawn = replace(soup, appearance=SoupAppearance(**appearance))
+    return SoupRun(path=None, soup=drawn, capture=None)  # pyright: ignore
 
 
 def flat(soup):
@@ -72,11 +73,11 @@ def test_a_mesh_viewer_shows_what_the_opaque_render_shows(tmp_path, soup, suffix
     """Every format returns the opaque triangles in their colours, so that a z-buffer draws the same picture."""
     path = tmp_path / f"soup{suffix}"
     export_soup(run_of(soup), path, ExportConfig(colors="constant", weld=weld, up="keep"))
-    returned = open_soup(path).soup
-    expected = render_soup_opaque(flat(soup), CAMERA, SoupAppearance())
+    returned = open_soup(path)
+    expected = flat(soup).render_opaque(CAMERA)
     # trimesh, which reads GLB, keeps its linear light in 8 bits.
     tolerance = 6 / 255 if suffix == ".glb" else 1.5 / 255
-    assert difference(render_soup_opaque(returned, CAMERA, SoupAppearance()), expected) < tolerance
+    assert difference(returned.render_opaque(CAMERA), expected) < tolerance
     assert float(expected.mean()) > 0.05
 
 
@@ -86,15 +87,15 @@ def test_ply_with_harmonics_returns_the_same_soft_picture(tmp_path, soup, kernel
     export_soup(run_of(soup, kernel=kernel), path, ExportConfig(colors="keep", min_opacity=0.0, up="keep"))
     returned = open_soup(path)
     assert returned.appearance == SoupAppearance(kernel=kernel)
-    expected = render_soup(soup, CAMERA, SoupAppearance(kernel=kernel)).color
-    assert difference(render_soup(returned.soup, CAMERA, returned.appearance).color, expected) < 1e-4
+    expected = replace(soup, appearance=SoupAppearance(kernel=kernel)).render(CAMERA).color
+    assert difference(returned.render(CAMERA).color, expected) < 1e-4
     assert np.asarray(trimesh.load_mesh(path, process=False).vertices).shape == (180, 3)
 
 
 def test_opacity_floor_and_softness_ceiling_are_in_the_exported_numbers(tmp_path, soup):
     limits = {"opacity_floor": 0.6, "sigma_ceiling": 0.3}
     export_soup(run_of(soup, **limits), tmp_path / "soup.ply", ExportConfig(colors="keep", up="keep"))
-    returned = open_soup(tmp_path / "soup.ply").soup
+    returned = open_soup(tmp_path / "soup.ply")
     assert len(returned) == len(soup)
     assert float(returned.opacities.min()) >= 0.6
     assert float(returned.sigma.max()) <= 0.3001
@@ -125,13 +126,13 @@ def test_with_alpha_only_faint_faces_of_a_glb_blend(tmp_path, soup):
         modes[document["materials"][part["material"]]["alphaMode"]] = count
     assert modes == {"OPAQUE": 3 * 20, "BLEND": 3 * 40}
     assert all(material["doubleSided"] for material in document["materials"])
-    assert len(open_soup(tmp_path / "soup.glb").soup) == 60
+    assert len(open_soup(tmp_path / "soup.glb")) == 60
 
 
 def test_baked_colours_are_what_the_cameras_see(soup):
     """One camera: its own colours, wherever it sees a triangle."""
-    baked = bake_colors(soup, SoupAppearance(), [CAMERA])
-    seen = render_soup(soup, CAMERA, SoupAppearance(), statistics=True)
+    baked = bake_colors(soup, [CAMERA])
+    seen = soup.render(CAMERA, outputs=("statistics",))
     shown = seen.statistics.max_weight[0] > 0
     direct = soup.display_colors(soup.vertices.mean(dim=1) - CAMERA.centers[0])
     torch.testing.assert_close(baked[shown], direct[shown], atol=1e-5, rtol=0)
@@ -162,7 +163,7 @@ def test_triangle_splatting_states_come_in_safely(tmp_path, soup):
     torch.save(state, tmp_path / "point_cloud_state_dict.pt")
     file = open_soup(tmp_path / "point_cloud_state_dict.pt")
     assert file.appearance == SoupAppearance("single_sided", "sdf", sh_degree=2, cull_small=True, near_plane=0.2)
-    for name, tensor in file.soup.parameters().items():
+    for name, tensor in file.parameters().items():
         assert torch.equal(tensor, getattr(soup, name))
     torch.save({"triangles_points": soup.vertices}, tmp_path / "half.pt")
     with pytest.raises(InputError, match="lacks"):
@@ -182,7 +183,7 @@ def test_a_kind_of_file_without_opacities_is_refused_with_alpha(tmp_path, soup):
 
 
 def test_the_kind_of_file_follows_from_its_name(tmp_path, soup, capsys):
-    save_soup(tmp_path / "soup.safetensors", SoupFile(soup))
+    soup.save(tmp_path / "soup.safetensors")
     for arguments in (["--out", "a.ply", "--min-opacity", "0"], ["--format", "off", "--min-opacity", "0"]):
         named = [str(tmp_path / word) if word == "a.ply" else word for word in arguments]
         assert parse(["export", str(tmp_path / "soup.safetensors"), *named]).run([]) == 0
@@ -196,7 +197,7 @@ def test_the_kind_of_file_follows_from_its_name(tmp_path, soup, capsys):
 
 @pytest.mark.parametrize(("floor", "advised"), [("0", False), ("0.97", True)])
 def test_an_export_that_leaves_out_most_says_what_to_do(tmp_path, soup, capsys, floor, advised):
-    save_soup(tmp_path / "soup.safetensors", SoupFile(soup))
+    soup.save(tmp_path / "soup.safetensors")
     assert parse(["export", str(tmp_path / "soup.safetensors"), "--min-opacity", floor]).run([]) == 0
     assert ("train with --finish opaque" in capsys.readouterr().out) is advised
 
@@ -204,12 +205,12 @@ def test_an_export_that_leaves_out_most_says_what_to_do(tmp_path, soup, capsys, 
 @pytest.mark.parametrize("kind", ["PLY", "OBJ", "OFF", "GLB", "SafeTensors"])
 def test_the_kind_of_file_does_not_depend_on_capitals(tmp_path, soup, kind):
     """A.GLB is written like a.glb, by name and by --format, and read back."""
-    save_soup(tmp_path / "from.SAFETENSORS", SoupFile(flat(soup)))
+    flat(soup).save(tmp_path / "from.SAFETENSORS")
     for name, more in (("A", []), ("B", ["--format", kind.lower()])):
         out = tmp_path / f"{name}.{kind}"
         command = ["export", str(tmp_path / "from.SAFETENSORS"), "--out", str(out), "--min-opacity", "0", *more]
         assert parse(command).run([]) == 0
-        assert torch.equal(open_soup(out).soup.vertices, soup.vertices)
+        assert torch.equal(open_soup(out).vertices, soup.vertices)
 
 
 def test_a_kind_of_file_of_ones_own_is_one_module(tmp_path, soup, monkeypatch):
@@ -244,7 +245,7 @@ def test_what_a_kind_of_file_cannot_hold_does_not_depend_on_capitals(tmp_path, s
     with pytest.raises(InputError, match=r"soup\.OBJ: files of this kind hold no opacities"):
         export_soup(run_of(soup), tmp_path / "soup.OBJ", ExportConfig(alpha=True))
     export_soup(run_of(soup), tmp_path / "soup.PLY", ExportConfig(colors="keep", up="keep", min_opacity=0))
-    assert open_soup(tmp_path / "soup.PLY").soup.sh_degree == 2
+    assert open_soup(tmp_path / "soup.PLY").sh_degree == 2
 
 
 def test_a_gaussian_scene_comes_in_at_its_places_with_its_size_and_colours(tmp_path):
@@ -256,12 +257,12 @@ def test_a_gaussian_scene_comes_in_at_its_places_with_its_size_and_colours(tmp_p
     table["scale_0"], table["scale_1"], table["scale_2"] = math.log(0.2), math.log(0.2), -9.0
     table["rot_0"] = 1.0
     (tmp_path / "gaussians.ply").write_bytes(encode_ply({"vertex": table}))
-    soup = open_soup(tmp_path / "gaussians.ply").soup
+    soup = open_soup(tmp_path / "gaussians.ply")
     assert (len(soup), soup.sh_degree) == (1, 1)
     assert soup.sh_rest[0].tolist() == [[0, 0, 0], [0, 0.25, 0], [0, 0, 0]]
     torch.testing.assert_close(soup.vertices.mean(dim=1), torch.zeros(1, 3), atol=1e-6, rtol=0)
     camera = Cameras(look_at(torch.tensor([[0.0, 0, 4]]), torch.zeros(3), torch.tensor([0.0, 1, 0])), CAMERA.Ks, 64, 48)
-    alpha = render_soup(soup, camera, SoupAppearance()).alpha[0, ..., 0] / float(soup.opacities)
+    alpha = soup.render(camera).alpha[0, ..., 0] / float(soup.opacities)
     x = (torch.arange(64) + 0.5 - 32) * 4 / float(camera.Ks[0, 0, 0])
     spread = float((alpha.sum(dim=0) * x * x).sum() / alpha.sum()) ** 0.5
     assert spread == pytest.approx(0.2, rel=0.15)

@@ -5,6 +5,7 @@ import signal
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -19,7 +20,7 @@ from etsplat.geometry.topology import MeshTopology
 from etsplat.io.mesh_files import MeshFile, load_mesh
 from etsplat.io.run_directory import RunDirectory
 from etsplat.optim.loop import CheckpointEvent, DivergedError, DoneEvent, Event, RefineEvent, StepEvent
-from etsplat.tasks.mesh_fitting import MeshFitting
+from etsplat.optim.trainer import Trainer
 from etsplat.tasks.reconstruct import ReconstructResult, reconstruct
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.running import PrepareEvent
@@ -349,16 +350,16 @@ def test_a_run_that_diverges_names_the_iteration_and_the_checkpoint(
     pebble: MeshFile, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A vertex that becomes NaN after iteration 13 is found at the next log, and no checkpoint holds it."""
-    advance = MeshFitting.advance
+    advance = Trainer.advance
 
-    def poisoned(self: MeshFitting, iteration: int, last: int) -> list[float]:
+    def poisoned(self: Trainer[Any], iteration: int, last: int) -> list[float]:
         losses = advance(self, iteration, last)
         if iteration == 13:
             with torch.no_grad():
-                self.mesh.colors[0] = float("nan")
+                self.model.colors[0] = float("nan")
         return losses
 
-    monkeypatch.setattr(MeshFitting, "advance", poisoned)
+    monkeypatch.setattr(Trainer, "advance", poisoned)
     with pytest.raises(DivergedError, match=r"iteration 1[45].*step_000010") as error:
         reconstruct(pebble, tmp_path, SHORT)
     assert "\n" not in str(error.value)

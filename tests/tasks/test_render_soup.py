@@ -1,4 +1,5 @@
 import subprocess
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,10 +9,9 @@ from etsplat.core.errors import InputError
 from etsplat.data.camera_paths import PATHS, camera_centers, focus_point
 from etsplat.data.load import load_dataset
 from etsplat.io import videos
-from etsplat.io.images import load_image
+from etsplat.io.images import load_image, over_background
 from etsplat.io.videos import open_video
-from etsplat.model.soup_files import SoupFile
-from etsplat.model.soup_rendering import render_soup_opaque
+from etsplat.model.soup_appearance import SoupAppearance
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.tasks.render_config import RenderConfig
 from etsplat.tasks.render_soup import color_depth, render_run
@@ -31,7 +31,9 @@ def run(tmp_path, rng):
         sigma=0.3,
         sh_degree=1,
     )
-    return SoupRun(tmp_path, SoupFile(soup, background=(0.0, 0.0, 1.0)), load_dataset(tmp_path / "scene"))
+    return SoupRun(
+        tmp_path, replace(soup, appearance=SoupAppearance(background=(0.0, 0.0, 1.0))), load_dataset(tmp_path / "scene")
+    )
 
 
 @pytest.mark.parametrize("name", ["orbit.mp4", "there.txt"])
@@ -88,7 +90,7 @@ def test_test_views_come_as_png_with_depth_and_normals(run, tmp_path):
 def test_opaque_pictures_are_those_of_a_mesh_viewer(run, tmp_path):
     render_run(run, tmp_path / "out", RenderConfig(opaque=True))
     camera = run.capture.cameras[0]
-    expected = render_soup_opaque(run.file.soup, camera, run.file.appearance, background=torch.tensor([0.0, 0, 1]))[0]
+    expected = over_background(run.soup.render_opaque(camera)[0], torch.tensor([0.0, 0, 1]))
     torch.testing.assert_close(load_image(tmp_path / "out" / "0000_color.png"), expected, atol=0.51 / 255, rtol=0)
 
 
@@ -119,7 +121,7 @@ def test_without_the_extra_frames_are_offered_and_nothing_is_left(run, tmp_path,
 
 def test_a_file_without_its_scene_says_what_to_name(run, tmp_path):
     with pytest.raises(InputError, match="--scene"):
-        render_run(SoupRun(tmp_path / "soup.ply", run.file, None), tmp_path / "out", RenderConfig())
+        render_run(SoupRun(tmp_path / "soup.ply", run.soup, None), tmp_path / "out", RenderConfig())
 
 
 def test_a_disk_that_fills_while_a_video_is_written_is_one_line_and_leaves_nothing(tmp_path, monkeypatch):

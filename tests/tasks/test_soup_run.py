@@ -9,7 +9,7 @@ from etsplat.cli.parse import parse
 from etsplat.core.errors import InputError
 from etsplat.data.load import load_dataset
 from etsplat.io.run_directory import RunDirectory
-from etsplat.model.soup_files import load_soup
+from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.optim.loop import CheckpointEvent
 from etsplat.tasks.evaluate_soup import evaluate_run
 from etsplat.tasks.soup_run import open_run
@@ -32,7 +32,7 @@ def trained(tmp_path_factory):
 
     def look(event):
         if isinstance(event, CheckpointEvent):
-            seen.append(load_soup(folder / "run" / "soup.safetensors").notes["iteration"])
+            seen.append(TriangleSoup.load(folder / "run" / "soup.safetensors").notes["iteration"])
 
     result = train(folder / "scene", folder / "run", config, images="images_2", callbacks=[look])
     return folder, result, seen
@@ -41,7 +41,7 @@ def trained(tmp_path_factory):
 def test_a_run_opens_with_its_soup_and_its_photos(trained):
     folder, result, _ = trained
     run = open_run(folder / "run")
-    assert torch.equal(run.file.soup.vertices, result.soup.vertices)
+    assert torch.equal(run.soup.vertices, result.soup.vertices)
     assert run.capture.images.sizes == [(32, 24)] * 9
     found = evaluate_run(run)
     assert found["psnr"] == pytest.approx(result.metrics["psnr"], abs=1e-3)

@@ -12,13 +12,15 @@ from etsplat.core.errors import InputError
 from etsplat.data.dataset import Dataset
 from etsplat.data.demo_scene import demo_scene
 from etsplat.io.run_directory import RunDirectory
-from etsplat.model.soup_files import load_soup
+from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.optim.loop import CheckpointEvent, DivergedError, RefineEvent, StepEvent
-from etsplat.tasks import train as train_module
+from etsplat.optim.schedules import at
+from etsplat.optim.strategies import DensifyAndPrune
+from etsplat.optim.trainer import Trainer
+from etsplat.tasks import train_checks
 from etsplat.tasks.running import NoteEvent
-from etsplat.tasks.soup_fitting import SoupFitting
-from etsplat.tasks.soup_schedule import SoupSchedule
-from etsplat.tasks.train import TrainResult, predicted_bytes, start_fitting, train
+from etsplat.tasks.train import TrainResult, start_trainer, train
+from etsplat.tasks.train_checks import predicted_bytes
 from etsplat.tasks.train_config import TrainConfig
 
 TINY = TrainConfig.tiny().changed(
@@ -72,8 +74,8 @@ def test_a_run_directory_holds_everything(run: tuple[TrainResult, list[object]])
     """The soup in the scene's units, metrics with the opaque PSNR, quantiles over time, and pictures."""
     result = run[0]
     directory = RunDirectory(result.path)
-    saved = load_soup(directory.soup_path)
-    assert torch.equal(saved.soup.vertices, result.soup.vertices)
+    saved = TriangleSoup.load(directory.soup_path)
+    assert torch.equal(saved.vertices, result.soup.vertices)
     assert saved.appearance.kernel == "elastic"
     assert float(result.soup.vertices.detach().median(dim=0).values.abs().max()) < 5
     assert {"psnr", "ssim", "psnr_opaque", "triangles", "seconds", "test_views"} <= result.metrics.keys()
@@ -146,15 +148,15 @@ def test_nan_names_iteration_parameter_and_checkpoint(
     capture: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A parameter that is not finite stops the run with one line that says all three."""
-    honest = SoupFitting.advance
+    honest = Trainer.advance
 
-    def poisoned(self: SoupFitting, iteration: int, last: int) -> list[float]:
+    def poisoned(self: Trainer[TriangleSoup], iteration: int, last: int) -> list[float]:
         losses = honest(self, iteration, last)
         if iteration == 25:
-            self.soup.sigma_raw.data[7] = float("nan")
+            self.model.sigma_raw.data[7] = float("nan")
         return losses
 
-    monkeypatch.setattr(SoupFitting, "advance", poisoned)
+    monkeypatch.setattr(Trainer, "advance", poisoned)
     with pytest.raises(DivergedError) as error:
         train(capture, tmp_path / "run", SHORT)
     message = str(error.value)
@@ -176,7 +178,7 @@ def test_too_many_triangles_for_the_memory_are_refused(
     capture: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Memory is predicted before anything is written, and the message says what would fit."""
-    monkeypatch.setattr(train_module, "available_memory", lambda: 1 << 30)
+    monkeypatch.setattr(train_checks, "available_memory", lambda: 1 << 30)
     config = replace(SHORT, max_triangles=10_000_000)
     assert predicted_bytes(capture, config) > 10 << 30
     with pytest.raises(InputError, match=r"max_triangles.*set it to"):
@@ -210,58 +212,49 @@ def test_a_run_that_fails_for_its_scale_says_how_to_scale_it(capture: Dataset, t
         train(small, tmp_path / "run", replace(SHORT, normalize=False))
 
 
-def test_shorter_runs_move_vertices_faster() -> None:
+def rates_of(config: TrainConfig, capture: Dataset, iteration: int) -> dict[str, float]:
+    rates = start_trainer(capture, config)._schedule.rates
+    return {name: at(rate, iteration) for name, rate in rates.items()}
+
+
+def test_shorter_runs_move_vertices_faster(capture: Dataset) -> None:
     """By the root of how much shorter they are; the original's rate does not know the length of a run."""
     quick, paper = TrainConfig.quick(), TrainConfig.paper()
     for iterations, factor in ((6000, 1.0), (1500, 2.0)):
-        first = SoupSchedule(replace(quick, iterations=iterations), squared=False).rates(1)
+        first = rates_of(replace(quick, iterations=iterations), capture, 1)
         assert first["vertices"] == pytest.approx(factor * quick.optimizer.lr_vertices)
-    assert (
-        SoupSchedule(replace(paper, iterations=300), squared=False).rates(1)["vertices"] == paper.optimizer.lr_vertices
-    )
+    assert rates_of(replace(paper, iterations=300), capture, 1)["vertices"] == paper.optimizer.lr_vertices
 
 
-def test_rates_settle_towards_the_end() -> None:
+def test_rates_settle_towards_the_end(capture: Dataset) -> None:
     """With `lr_settle` colours, opacities and softness come to rest like the vertices; the original's never do."""
     paper = replace(TrainConfig.paper(), iterations=300)
     quick = paper.changed({"optimizer.lr_settle": 20_000})
     for config, ratio, last in ((paper, 1.0, 1.0), (quick, 0.1**0.5, 0.1)):
-        schedule = SoupSchedule(config, squared=False)
-        first = schedule.rates(1)
+        first, middle, late, end = (rates_of(config, capture, iteration) for iteration in (1, 200, 250, 300))
         for name in ("opacity_logits", "sigma_raw", "sh_dc", "sh_rest"):
-            assert schedule.rates(200)[name] == first[name]
-            assert schedule.rates(250)[name] == pytest.approx(ratio * first[name])
-            assert schedule.rates(300)[name] == pytest.approx(last * first[name])
-        assert schedule.rates(300)["vertices"] == pytest.approx(paper.optimizer.lr_vertices_final * first["vertices"])
+            assert middle[name] == first[name]
+            assert late[name] == pytest.approx(ratio * first[name])
+            assert end[name] == pytest.approx(last * first[name])
+        assert end["vertices"] == pytest.approx(paper.optimizer.lr_vertices_final * first["vertices"])
 
 
-def test_an_opaque_finish_removes_only_what_is_hidden() -> None:
+def strategy_of(capture: Dataset, **settings: object) -> DensifyAndPrune:
+    named = {name.replace("__", "."): value for name, value in settings.items()}
+    strategy = start_trainer(capture, TINY.changed(named)).strategy
+    assert isinstance(strategy, DensifyAndPrune)
+    return strategy
+
+
+def test_an_opaque_finish_removes_only_what_is_hidden(capture: Dataset) -> None:
     """The threshold of soft soups would take away too much of it; a lower one stays as it is."""
     for finish, asked, least in (("none", 0.022, 0.022), ("opaque", 0.022, 0.005), ("opaque", 0.001, 0.001)):
-        config = TrainConfig().changed({"finish": finish, "pruning.importance": asked})
-        assert SoupSchedule(config, squared=False).least_importance == least
+        assert strategy_of(capture, finish=finish, pruning__importance=asked).prune.importance == least
 
 
-def test_an_opaque_finish_replaces_what_it_hides() -> None:
+def test_an_opaque_finish_replaces_what_it_hides(capture: Dataset) -> None:
     for finish, asked, replaces in (("none", False, False), ("none", True, True), ("opaque", True, True)):
-        config = TrainConfig().changed({"finish": finish, "densification.replace_dead": asked})
-        assert SoupSchedule(config, squared=False).replaces_dead is replaces
-
-
-@pytest.mark.parametrize("replace_dead", [True, False])
-def test_growth_is_of_all_triangles_or_of_those_that_live(capture: Dataset, replace_dead: bool) -> None:
-    """Otherwise a soup of which most triangles die in each edit would be made anew each time."""
-    fitting = start_fitting(
-        capture, TINY.changed({"max_triangles": 10_000, "densification.replace_dead": replace_dead}), lambda *_: {}
-    )
-    for iteration in range(1, len(capture.train)):  # no trial is over: nothing dies but what is made faint here
-        fitting.advance(iteration, iteration)
-    count, dead = fitting.count, fitting.count // 10
-    with torch.no_grad():
-        fitting.soup.opacity_logits[:dead] = -20
-    fitting.densify(len(capture.train))
-    most = int(1.3 * (count if replace_dead else count - dead))
-    assert most - 3 < fitting.count <= most  # a split that the budget does not allow is not made
+        assert strategy_of(capture, finish=finish, densification__replace_dead=asked).replace_dead is replaces
 
 
 def test_few_photos_end_a_run_earlier(capture: Dataset, tmp_path: Path) -> None:

@@ -5,8 +5,8 @@ import socket
 import threading
 
 import pytest
-
 from etsplat.model.soup_files import SoupFile
+
 from etsplat.tasks.soup_run import SoupRun
 from etsplat.viewer.guard import Guard
 from etsplat.viewer.server import Viewer

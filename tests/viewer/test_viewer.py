@@ -10,7 +10,6 @@ from etsplat.cli.parse import parse
 from etsplat.core.errors import InputError
 from etsplat.data.load import load_dataset
 from etsplat.io.run_directory import RunDirectory
-from etsplat.model.soup_files import SoupFile, save_soup
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.tasks.soup_run import SoupRun
 from etsplat.viewer import follow, server
@@ -35,9 +34,7 @@ def make_soup(count, seed=0):
 @pytest.fixture
 def run(tmp_path):
     write_colmap(tmp_path / "scene", [(32, 24)] * 4)
-    return SoupRun(
-        tmp_path / "soup.safetensors", SoupFile(make_soup(40)), load_dataset(tmp_path / "scene", preload=False)
-    )
+    return SoupRun(tmp_path / "soup.safetensors", make_soup(40), load_dataset(tmp_path / "scene", preload=False))
 
 
 def browser_camera(capture, index):
@@ -60,7 +57,7 @@ def test_a_browsers_camera_is_the_captures_camera(run):
 
 @pytest.mark.parametrize("mode", MODES)
 def test_every_mode_shows_something_else(run, mode):
-    shown = {name: picture(run.file, run.capture.cameras[1], name) for name in MODES}
+    shown = {name: picture(run.soup, run.capture.cameras[1], name) for name in MODES}
     assert shown[mode].dtype == torch.uint8
     assert shown[mode].shape == (24, 32, 3)
     assert float(shown[mode].float().mean()) > 5
@@ -85,11 +82,11 @@ def test_a_run_is_followed_through_its_files(tmp_path):
     followed = Followed(folder.path, torch.device("cpu"))
     assert followed.poll() is None
     assert followed.status() == ""
-    save_soup(folder.soup_path, SoupFile(make_soup(3)))
-    assert len(followed.poll().soup) == 3
+    make_soup(3).save(folder.soup_path)
+    assert len(followed.poll()) == 3
     assert followed.poll() is None
-    save_soup(folder.soup_path, SoupFile(make_soup(5)))
-    assert len(followed.poll().soup) == 5
+    make_soup(5).save(folder.soup_path)
+    assert len(followed.poll()) == 5
     folder.append_history({"iteration": 50, "seconds": 1.0, "loss": 0.1, "psnr": 21.5})
     assert followed.status() == "running: iteration 50 of 100, 21.50 dB on test views"
     folder.soup_path.unlink()
@@ -106,7 +103,7 @@ def test_a_run_that_is_about_to_begin_is_waited_for(tmp_path, monkeypatch):
         if len(steps) == 2:
             RunDirectory.create(path, {"task": "train", "iterations": 100, "config": {}})
         if len(steps) == 4:
-            save_soup(path / "soup.safetensors", SoupFile(make_soup(3)))
+            make_soup(3).save(path / "soup.safetensors")
 
     monkeypatch.setattr(follow.time, "sleep", happen)
     wait_for_soup(path, told.append)
@@ -114,7 +111,7 @@ def test_a_run_that_is_about_to_begin_is_waited_for(tmp_path, monkeypatch):
     waited = [text.split("waiting for ")[1] for text in told]
     assert waited == ["`etsplat train` to begin there", "the first checkpoint"]
     old = RunDirectory.create(tmp_path / "old", {"task": "train", "config": {}})
-    save_soup(old.soup_path, SoupFile(make_soup(3)))
+    make_soup(3).save(old.soup_path)
     with pytest.raises(InputError, match=r"old/config\.json: an earlier version .* lacks `iterations`; remove the"):
         wait_for_soup(old.path, told.append)
     (tmp_path / "letters").mkdir()
@@ -180,7 +177,7 @@ def test_a_browser_that_is_closed_while_its_picture_is_drawn_gets_none(run, monk
     scene = SimpleNamespace(set_background_image=lambda *arguments, **options: sent.append(arguments))
     before = set(threading.enumerate())
     client = server._Client(
-        SimpleNamespace(file=run.file, mode="soft"), SimpleNamespace(camera=camera, scene=scene), 64
+        SimpleNamespace(soup=run.soup, mode="soft"), SimpleNamespace(camera=camera, scene=scene), 64
     )
     (worker,) = set(threading.enumerate()) - before
     assert drawing.wait(10)

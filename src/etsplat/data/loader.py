@@ -43,7 +43,7 @@ class PhotoKind:
 
 @dataclass
 class _Stack:
-    """Photos of one kind; where they are streamed there is room for one."""
+    """Photos of one kind; where they are streamed there is room for those of one step."""
 
     pixels: Tensor
     masks: UInt8[Tensor, "P H W"] | None
@@ -54,20 +54,21 @@ class ViewLoader:
 
     For the latter (optim/step_queue.py) a view has a kind, which decides what is launched, and a place, which the
     launches read: its camera, and where its photo is among those of its kind. Where all photos fit they stay on the
-    device. Where they do not, each kind has a single place, and a photo is uploaded there before its step.
+    device. Where they do not, each kind has a place for each view of a step, and photos are uploaded there before it.
 
     Attributes:
         streamed: whether photos do not stay on the device, or not in memory.
     """
 
-    def __init__(self, dataset: Dataset, device: torch.device) -> None:
+    def __init__(self, dataset: Dataset, device: torch.device, batch: int = 1) -> None:
         """Uploads the cameras.
 
         Args:
             dataset: whose views these are; only those in `dataset.train` can be queued.
             device: where views are wanted.
+            batch: views of a queued step.
         """
-        self._images, self._train, self._device = dataset.images, dataset.train, device
+        self._images, self._train, self._device, self._batch = dataset.images, dataset.train, device, batch
         self._cameras = [camera.to(device) for camera in dataset.cameras]
         self._viewmats = torch.cat([camera.viewmats for camera in self._cameras])
         self._Ks = torch.cat([camera.Ks for camera in self._cameras])
@@ -95,8 +96,12 @@ class ViewLoader:
             self._kept[index] = view
         return view
 
-    def kind_and_place(self, index: int) -> tuple[Hashable, tuple[float, float]]:
+    def kind_and_place(self, index: int, number: int = 0) -> tuple[Hashable, tuple[float, float]]:
         """Of a view that is to be queued. The first call uploads all photos of the training views if they can stay.
+
+        Args:
+            index: of the view.
+            number: which view of its step it is.
 
         Raises:
             InputError: a photo is damaged or has gone.
@@ -105,21 +110,26 @@ class ViewLoader:
             self._keep_all()
         if index not in self._kinds:
             self._kinds[index] = self._kind(index)
-        return self._kinds[index], (float(index), float(self._places.get(index, 0)))
+        return self._kinds[index], (float(index), float(self._places.get(index, number)))
 
-    def upload(self, index: int) -> Callable[[], None]:
-        """What has to be done before the view's step, whenever that is made: queues the upload, or nothing."""
+    def upload(self, index: int, number: int = 0) -> Callable[[], None]:
+        """What has to be done before the view's step, whenever that is made: queues the upload, or nothing.
+
+        Args:
+            index: of the view.
+            number: which view of its step it is.
+        """
         if not self.streamed:
             return lambda: None
         kind = self._kinds[index]
         if kind not in self._stacks:
-            self._stacks[kind] = self._room(kind, 1)
+            self._stacks[kind] = self._room(kind, self._batch)
         stack, pixels, mask = self._stacks[kind], self._images[index], self._images.mask(index)
 
         def run() -> None:
-            _copy(pixels, stack.pixels[0])
+            _copy(pixels, stack.pixels[number])
             if stack.masks is not None and mask is not None:
-                _copy(mask, stack.masks[0])
+                _copy(mask, stack.masks[number])
 
         return run
 
@@ -132,8 +142,11 @@ class ViewLoader:
         """
         assert isinstance(kind, PhotoKind)
         stack = self._stacks[kind]
-        # Behind a step that does not count, all others read its row, whatever their kind: their place is anywhere.
-        view, at = place[:1].long(), place[1:2].long().clamp_max(len(stack.pixels) - 1)
+        # Behind a step that does not count, all others read its row, whatever their kind: among several kinds, of which
+        # one may have fewer photos than another, their place is anywhere.
+        view, at = place.long().split(1)
+        if len(self._stacks) > 1:
+            at = at.clamp_max(len(stack.pixels) - 1)
         camera = Cameras(self._viewmats.index_select(0, view), self._Ks.index_select(0, view), kind.width, kind.height)
         mask = None if stack.masks is None else stack.masks.index_select(0, at)
         return View(camera, stack.pixels.index_select(0, at), mask)

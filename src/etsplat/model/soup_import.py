@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +15,7 @@ from etsplat.core.rasterization import SOUP_SIGMA_FLOOR
 from etsplat.io.mesh_files import load_mesh
 from etsplat.io.paths import kind_of
 from etsplat.io.ply_tables import CORNERS, read_ply_header, read_ply_tables
-from etsplat.model.soup_files import SoupFile, check_finite_soup, load_soup
-from etsplat.model.soup_rendering import SoupAppearance
+from etsplat.model.soup_appearance import SoupAppearance
 from etsplat.model.triangle_soup import TriangleSoup
 
 GAUSSIAN_SIGMA = 1.0
@@ -30,7 +30,7 @@ MESH_OPACITY, MESH_SIGMA = 0.999, 0.02
 _TS_KEYS = ("triangles_points", "sigma", "opacity", "features_dc", "features_rest")
 
 
-def open_soup(path: Path | str) -> SoupFile:
+def open_soup(path: Path | str) -> TriangleSoup:
     """Read triangles from any file that holds some.
 
     Args:
@@ -43,19 +43,19 @@ def open_soup(path: Path | str) -> SoupFile:
     path = Path(path)
     if not path.is_file():
         raise InputError(f"soup {path}: no such file; check the path")
-    readers: dict[str, Callable[[Path], SoupFile]] = {
-        ".safetensors": load_soup,
+    readers: dict[str, Callable[[Path], TriangleSoup]] = {
+        ".safetensors": TriangleSoup.load,
         ".pt": _read_triangle_splatting,
         ".ply": _read_ply,
     }
-    file = readers.get(kind_of(path), _read_mesh)(path)
-    if not len(file.soup):
+    soup = readers.get(kind_of(path), _read_mesh)(path)
+    if not len(soup):
         raise InputError(f"soup {path}: holds no triangle; take another file")
-    check_finite_soup(path, file.soup)
-    return file
+    soup.check_finite(path)
+    return soup
 
 
-def _read_triangle_splatting(path: Path) -> SoupFile:
+def _read_triangle_splatting(path: Path) -> TriangleSoup:
     """The state dict that Triangle Splatting saves; its numbers mean the same as ours. No code in it is run."""
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
@@ -79,10 +79,10 @@ def _read_triangle_splatting(path: Path) -> SoupFile:
     degree = int(state.get("active_sh_degree", soup.sh_degree))
     # near_plane: Triangle Splatting drops triangles whose centroid is nearer than 0.2, we those with such a corner.
     appearance = SoupAppearance("single_sided", "sdf", sh_degree=degree, cull_small=True, near_plane=0.2)
-    return SoupFile(soup, appearance, notes={"source": path.name})
+    return replace(soup, appearance=appearance, notes={"source": path.name})
 
 
-def _read_ply(path: Path) -> SoupFile:
+def _read_ply(path: Path) -> TriangleSoup:
     header = read_ply_header(path)
     properties = header.properties
     if {"scale_0", "rot_0", "opacity", "f_dc_0"} <= set(properties.get("vertex", [])):
@@ -92,7 +92,7 @@ def _read_ply(path: Path) -> SoupFile:
     return _read_mesh(path)
 
 
-def _read_exported(path: Path, comments: list[str]) -> SoupFile:
+def _read_exported(path: Path, comments: list[str]) -> TriangleSoup:
     tables = read_ply_tables(path, ("vertex", "face"))
     vertex, face = tables["vertex"], tables["face"]
     points = np.stack([vertex[axis] for axis in "xyz"], axis=1).astype(np.float32)
@@ -120,10 +120,10 @@ def _read_exported(path: Path, comments: list[str]) -> SoupFile:
     words = next((comment.split() for comment in comments if comment.startswith("etsplat ")), [])
     known = len(words) == 3 and words[1] in KERNELS and words[2] in DISTANCES
     appearance = SoupAppearance(words[1], words[2]) if known else SoupAppearance()
-    return SoupFile(soup, appearance, notes={"source": path.name})
+    return replace(soup, appearance=appearance, notes={"source": path.name})
 
 
-def _read_gaussians(path: Path) -> SoupFile:
+def _read_gaussians(path: Path) -> TriangleSoup:
     """A triangle for each Gaussian, across its two larger axes; its third axis, the thinnest, is lost."""
     table = read_ply_tables(path)["vertex"]
 
@@ -145,10 +145,10 @@ def _read_gaussians(path: Path) -> SoupFile:
     circle = torch.stack([angles.cos(), angles.sin()], dim=1)
     vertices = centers[:, None] + torch.einsum("kc,nac->nka", circle, axes)
     raw = torch.full((len(table),), math.log(GAUSSIAN_SIGMA - SOUP_SIGMA_FLOOR))
-    return SoupFile(TriangleSoup(vertices.float(), logits, raw, dc, rest), notes={"source": path.name})
+    return TriangleSoup(vertices.float(), logits, raw, dc, rest, notes={"source": path.name})
 
 
-def _read_mesh(path: Path) -> SoupFile:
+def _read_mesh(path: Path) -> TriangleSoup:
     mesh = load_mesh(path)
     if mesh.face_colors is not None:
         colors = mesh.face_colors
@@ -159,8 +159,7 @@ def _read_mesh(path: Path) -> SoupFile:
     soup = TriangleSoup.from_triangles(
         mesh.vertices[mesh.faces], colors, opacity=MESH_OPACITY, sigma=MESH_SIGMA, sh_degree=0
     )
-    detached = TriangleSoup(**{name: tensor.detach() for name, tensor in soup.parameters().items()})
-    return SoupFile(detached, notes={"source": path.name})
+    return replace(soup, **soup.state(), notes={"source": path.name})
 
 
 def _harmonics(table: np.ndarray) -> tuple[Tensor, Tensor]:

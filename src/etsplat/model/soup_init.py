@@ -33,6 +33,11 @@ class StartPoints:
     def __len__(self) -> int:
         return len(self.positions)
 
+    @property
+    def span(self) -> float:
+        """Longest side of the box around them; 0 of none."""
+        return float((self.positions.amax(dim=0) - self.positions.amin(dim=0)).max()) if len(self) else 0.0
+
     def with_sky(self) -> "StartPoints":
         """The same after 5 % more on a white sphere about the origin that reaches the farthest coordinate."""
         count = int(SKY_FRACTION * len(self))

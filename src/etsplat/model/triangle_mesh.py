@@ -1,13 +1,52 @@
 """The learnable mesh of shape reconstruction."""
 
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, ClassVar, Literal
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from etsplat.core.cameras import Cameras
+from etsplat.core.rasterization import Rasterization
+from etsplat.data.dataset import Normalization
 from etsplat.geometry.topology import MeshTopology
+from etsplat.io.mesh_files import MeshFile, load_mesh, save_mesh, weld_vertices
+from etsplat.model.model import Depth
+from etsplat.ops.antialias import rasterize_antialiased
+from etsplat.ops.rasterize import rasterize
+from etsplat.ops.rasterize_hard import render_opaque
+
+
+@dataclass(frozen=True)
+class MeshAppearance:
+    """How the numbers of a mesh become pictures.
+
+    Attributes:
+        kernel: "elastic", "bilateral", "single_sided", or None for opaque triangles with antialiased silhouettes.
+        distance: "barycentric" or "sdf".
+        backend: whose antialiased rasterizer draws opaque triangles.
+    """
+
+    kernel: str | None = "elastic"
+    distance: str = "barycentric"
+    backend: Literal["etsplat", "nvdiffrast"] = "etsplat"
+
+    @property
+    def numbers(self) -> tuple[float, ...]:
+        """Nothing changes from step to step."""
+        return ()
+
+    @property
+    def structure(self) -> "MeshAppearance":
+        """All of it."""
+        return self
+
+    def on_device(self, numbers: Float[Tensor, "0"]) -> "MeshAppearance":
+        """The same."""
+        return self
 
 
 @dataclass
@@ -24,7 +63,16 @@ class TriangleMesh:
         log_sigma: () learnable; None for a mesh of opaque triangles.
         topology: connectivity of the faces.
         vertex_colored: whether colours belong to vertices, and are interpolated over the faces.
+        appearance: how it is drawn.
     """
+
+    RATES: ClassVar[Mapping[str, float]] = {
+        "vertices": 2e-3,
+        "colors": 1e-2,
+        "opacity_logits": 1e-3,
+        "log_sigma": 1e-4,
+    }
+    OPAQUE: ClassVar[str] = "mesh"
 
     vertices: Float[Tensor, "V 3"]
     colors: Float[Tensor, "F 3"] | Float[Tensor, "V 3"]
@@ -32,6 +80,7 @@ class TriangleMesh:
     log_sigma: Float[Tensor, ""] | None
     topology: MeshTopology
     vertex_colored: bool = False
+    appearance: MeshAppearance = field(default_factory=MeshAppearance)
 
     @classmethod
     def from_mesh(
@@ -43,6 +92,7 @@ class TriangleMesh:
         opacity: float | None,
         sigma: float | None,
         vertex_colored: bool = False,
+        appearance: MeshAppearance | None = None,
     ) -> "TriangleMesh":
         """A mesh to start from.
 
@@ -53,6 +103,7 @@ class TriangleMesh:
             opacity: of every face, in (0, 1); None, as is `sigma`, for opaque triangles.
             sigma: softness, > 0.
             vertex_colored: whether colours belong to vertices.
+            appearance: how it is drawn; None for the elastic kernel, or as opaque triangles where it is not soft.
         """
         vertices = vertices.detach().clone()
         count = len(vertices) if vertex_colored else len(faces)
@@ -66,10 +117,140 @@ class TriangleMesh:
             log_sigma=torch.tensor(sigma, dtype=torch.float64).log().to(vertices) if soft else None,
             topology=MeshTopology.from_faces(faces, len(vertices)),
             vertex_colored=vertex_colored,
+            appearance=appearance or MeshAppearance("elastic" if soft else None),
         )
         for parameter in mesh.parameters().values():
             parameter.requires_grad_(True)
         return mesh
+
+    @classmethod
+    def load(cls, path: Path | str, *, opacity: float | None = 0.98, sigma: float | None = 0.25) -> "TriangleMesh":
+        """A mesh to start from, from a file of any kind that `etsplat.load_mesh` reads, with the colours it has.
+
+        Args:
+            path: vertices at equal positions are merged, so that neighbouring faces move together.
+            opacity: of every face; None, as is `sigma`, for opaque triangles.
+            sigma: softness.
+
+        Raises:
+            InputError: the file is missing, damaged or of another kind.
+        """
+        mesh = weld_vertices(load_mesh(path))
+        by_vertex = mesh.face_colors is None and mesh.vertex_colors is not None
+        given = mesh.vertex_colors if by_vertex else mesh.face_colors
+        colors = 0.5 if given is None else given
+        return cls.from_mesh(
+            mesh.vertices, mesh.faces, colors=colors, opacity=opacity, sigma=sigma, vertex_colored=by_vertex
+        )
+
+    def to_file(self, frame: Normalization | None = None) -> MeshFile:
+        """Its surface with display colours, on the CPU; in the input's units where `frame` leads back to these."""
+        vertices, faces = self.surface()
+        vertices = vertices if frame is None else frame.invert(vertices)
+        return MeshFile(vertices, faces, **self.named(self.display_colors.cpu()))
+
+    def save(self, path: Path | str, frame: Normalization | None = None) -> None:
+        """Write what a mesh viewer shows, atomically: .ply, .obj or .glb. Opacities and softness are not in it."""
+        file = self.to_file(frame)
+        save_mesh(path, file.vertices, file.faces, face_colors=file.face_colors, vertex_colors=file.vertex_colors)
+
+    def to(self, device: torch.device) -> "TriangleMesh":
+        """The same mesh on another device, its parameters leaf tensors as they are here."""
+        moved = {name: p.detach().to(device).requires_grad_(p.requires_grad) for name, p in self.parameters().items()}
+        return replace(self, **moved, topology=self.topology.to(device))
+
+    def render(
+        self,
+        cameras: Cameras,
+        *,
+        backgrounds: Float[Tensor, "B 3"] | None = None,
+        outputs: tuple[str, ...] = ("color",),
+        depth_of: Depth = "plane",
+    ) -> Rasterization:
+        """A differentiable picture for each camera.
+
+        Args:
+            cameras: B cameras.
+            backgrounds: (B, 3); None is black.
+            outputs: as in `etsplat.rasterize`; of opaque triangles there is colour alone.
+            depth_of: as there.
+
+        Returns:
+            Images that are not clamped: blended silhouettes can leave [0, 1] by a little.
+        """
+        view, look = (cameras.viewmats, cameras.Ks, cameras.width, cameras.height), self.appearance
+        if look.kernel is None:
+            if set(outputs) - {"color", "alpha"}:
+                raise ValueError(f"outputs of opaque triangles must be colour alone, got {outputs}")
+            draw = rasterize_antialiased
+            if look.backend == "nvdiffrast":
+                from etsplat.ops.antialias_nvdiffrast import rasterize_nvdiffrast as draw
+            image = draw(
+                self.vertices, self.topology.connectivity, *view, **self.named(self.colors), backgrounds=backgrounds
+            )
+            return Rasterization(image, image[..., :1])
+        return rasterize(
+            self.vertices,
+            None if self.vertex_colored else self.colors,
+            self.opacities,
+            self.sigma,
+            *view,
+            faces=self.faces,
+            corner_colors=self.colors if self.vertex_colored else None,
+            kernel=look.kernel,
+            distance=look.distance,
+            backgrounds=backgrounds,
+            depth=depth_of if {"depth", "median_depth", "distortion"} & set(outputs) else None,
+            median_depth="median_depth" in outputs,
+            normals="normal" in outputs,
+            distortion="distortion" in outputs,
+            statistics="statistics" in outputs,
+            validate=False,  # the loop checks the loss at every step, and the parameters before each checkpoint
+        )
+
+    @torch.no_grad()
+    def render_opaque(self, cameras: Cameras, *, supersampling: int = 4) -> Float[Tensor, "B H W 4"]:
+        """What a mesh viewer shows: opaque triangles in display colours, premultiplied RGBA."""
+        return render_opaque(
+            self.vertices.detach(),
+            cameras.viewmats,
+            cameras.Ks,
+            cameras.width,
+            cameras.height,
+            faces=self.faces,
+            **self.named(self.display_colors),
+            supersampling=supersampling,
+        )
+
+    def surface(self) -> tuple[Float[Tensor, "V 3"], Int[Tensor, "F 3"]]:
+        """Vertices and faces, detached, on the CPU."""
+        return self.vertices.detach().cpu(), self.faces.cpu()
+
+    @property
+    def count(self) -> int:
+        """Number of faces."""
+        return len(self.faces)
+
+    @property
+    def needs_host(self) -> bool:
+        """Whether nvdiffrast draws it."""
+        return self.appearance.kernel is None and self.appearance.backend == "nvdiffrast"
+
+    def describe(self) -> dict[str, float]:
+        """For the log: number of faces and softness (0 for opaque triangles)."""
+        return {"faces": self.count, "sigma": float(self.sigma.detach())}
+
+    def state(self) -> dict[str, Tensor]:
+        """Parameters and faces, detached, by name."""
+        return {**{name: parameter.detach() for name, parameter in self.parameters().items()}, "faces": self.faces}
+
+    def load_state(self, state: Mapping[str, Tensor]) -> None:
+        """Takes these tensors in the place of its own, onto its device; those not named stay."""
+        for name in self.parameters().keys() & state.keys():
+            old = getattr(self, name)
+            setattr(self, name, state[name].to(old.device).requires_grad_(old.requires_grad))
+        if "faces" in state:
+            self.topology = MeshTopology.from_faces(state["faces"].to(self.vertices.device), len(self.vertices))
 
     def parameters(self) -> dict[str, Tensor]:
         """The learnable tensors by name."""

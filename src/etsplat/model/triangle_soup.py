@@ -1,14 +1,30 @@
 """The learnable triangle soup of novel-view synthesis."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import ClassVar
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
+from safetensors import SafetensorError
 from torch import Tensor
 
+from etsplat.core.cameras import Cameras
+from etsplat.core.errors import InputError
 from etsplat.core.harmonics import MAX_DEGREE
-from etsplat.core.rasterization import SOUP_SIGMA_FLOOR
+from etsplat.core.rasterization import SOUP_SIGMA_FLOOR, Rasterization
+from etsplat.io.paths import kind_of
+from etsplat.io.tensors import read_tensors, save_tensors
+from etsplat.model.model import Depth
+from etsplat.model.soup_appearance import OPAQUE_FROM, SMALLEST_INRADIUS, SoupAppearance
+from etsplat.ops.rasterize import rasterize
+from etsplat.ops.rasterize_hard import render_opaque
+from etsplat.ops.soup_activation import soup_activation
+from etsplat.ops.soup_colors import soup_colors
 from etsplat.ops.spherical_harmonics import spherical_harmonics
+
+FORMAT = "etsplat soup 1"
 
 SH_CONSTANT = 0.28209479177387814
 """The constant basis function Y_0: a colour c is the coefficient (c - 1/2) / Y_0."""
@@ -28,13 +44,26 @@ class TriangleSoup:
         sigma_raw: (N,) learnable; sigma = 0.01 + exp(sigma_raw).
         sh_dc: (N, 1, 3) coefficients of the constant band, learnable.
         sh_rest: (N, K - 1, 3) those of the other bands, learnable.
+        appearance: how it is drawn; its near plane is in the same units as the corners.
+        notes: whatever else its maker wrote down, as text (iteration, source).
     """
+
+    RATES: ClassVar[Mapping[str, float]] = {
+        "vertices": 1.5e-3,
+        "opacity_logits": 0.05,
+        "sigma_raw": 0.005,
+        "sh_dc": 0.01,
+        "sh_rest": 0.0005,
+    }
+    OPAQUE: ClassVar[str] = "opaque"
 
     vertices: Float[Tensor, "N 3 3"]
     opacity_logits: Float[Tensor, " N"]
     sigma_raw: Float[Tensor, " N"]
     sh_dc: Float[Tensor, "N 1 3"]
     sh_rest: Float[Tensor, "N R 3"]
+    appearance: SoupAppearance = field(default_factory=SoupAppearance)
+    notes: Mapping[str, str] = field(default_factory=dict)
 
     PARAMETERS = ("vertices", "opacity_logits", "sigma_raw", "sh_dc", "sh_rest")
 
@@ -85,6 +114,48 @@ class TriangleSoup:
             parameter.requires_grad_(True)
         return soup
 
+    @classmethod
+    def load(cls, path: Path | str) -> "TriangleSoup":
+        """Read a soup that `save` wrote. Its parameters do not require gradients.
+
+        Raises:
+            InputError: the file is missing, cut short, of another kind, or holds numbers that are not finite.
+        """
+        path = Path(path)
+        if not path.is_file():
+            raise InputError(f"soup {path}: no such file; check the path")
+        try:
+            tensors, metadata = read_tensors(path)
+            if metadata.get("format") != FORMAT:
+                raise ValueError("not a soup of this version of etsplat")
+            notes = {key.removeprefix("note."): value for key, value in metadata.items() if key.startswith("note.")}
+            parameters = {name: tensors[name].float() for name in cls.PARAMETERS}
+            soup = cls(**parameters, appearance=SoupAppearance.from_json(metadata["appearance"]), notes=notes)
+        except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
+            detail = (str(error) or type(error).__name__).splitlines()[0]
+            raise InputError(f"soup {path}: cannot be read ({detail}); was it written by `etsplat train`?") from error
+        soup.check_finite(path)
+        return soup
+
+    def save(self, path: Path | str) -> None:
+        """Write parameters, appearance and notes, atomically.
+
+        Raises:
+            ValueError: `path` does not end in .safetensors.
+            InputError: the file cannot be written.
+        """
+        path = Path(path)
+        if kind_of(path) != ".safetensors":
+            raise ValueError(f"path: expected the suffix .safetensors, got {path.name}")
+        notes = {f"note.{key}": value for key, value in self.notes.items()}
+        save_tensors(path, self.state(), {**notes, "format": FORMAT, "appearance": self.appearance.to_json()})
+
+    def check_finite(self, path: Path) -> None:
+        """Raises InputError, naming the file, for NaN or infinity among the parameters."""
+        for name, tensor in self.parameters().items():
+            if not bool(torch.isfinite(tensor).all()):
+                raise InputError(f"soup {path}: {name} holds NaN or infinity; take another file")
+
     def __len__(self) -> int:
         return len(self.vertices)
 
@@ -92,16 +163,160 @@ class TriangleSoup:
     def joined(self, other: "TriangleSoup") -> "TriangleSoup":
         """The triangles of both, in new learnable tensors."""
         mine, theirs = self.parameters(), other.parameters()
-        return TriangleSoup(**{n: torch.cat([mine[n], theirs[n]]).requires_grad_(True) for n in self.PARAMETERS})
+        return replace(self, **{n: torch.cat([mine[n], theirs[n]]).requires_grad_(True) for n in self.PARAMETERS})
 
     def to(self, device: torch.device) -> "TriangleSoup":
         """The same soup on another device, its parameters leaf tensors as they are here."""
         moved = {name: p.detach().to(device).requires_grad_(p.requires_grad) for name, p in self.parameters().items()}
-        return TriangleSoup(**moved)
+        return replace(self, **moved)
 
     def parameters(self) -> dict[str, Tensor]:
         """The learnable tensors by name."""
         return {name: getattr(self, name) for name in self.PARAMETERS}
+
+    @property
+    def count(self) -> int:
+        """Number of triangles."""
+        return len(self)
+
+    @property
+    def needs_host(self) -> bool:
+        """Drawing never waits for it."""
+        return False
+
+    def describe(self) -> dict[str, float]:
+        """For the log: number of triangles, and deciles of softness and opacity as they are drawn."""
+        state: dict[str, float] = {"triangles": self.count}
+        for name, tensor in (("sigma", self.drawn_sigma), ("opacity", self.drawn_opacities)):
+            ordered = tensor.detach().sort().values
+            for suffix, fraction in (("_10", 0.1), ("", 0.5), ("_90", 0.9)):
+                state[name + suffix] = float(ordered[int(fraction * (len(ordered) - 1))])
+        return state
+
+    def state(self) -> dict[str, Tensor]:
+        """The parameters, detached, by name."""
+        return {name: parameter.detach() for name, parameter in self.parameters().items()}
+
+    def load_state(self, state: Mapping[str, Tensor]) -> None:
+        """Takes these tensors in the place of its own, onto its device; those not named stay."""
+        for name, tensor in state.items():
+            old = getattr(self, name)
+            setattr(self, name, tensor.to(old.device).requires_grad_(old.requires_grad))
+
+    def render(
+        self,
+        cameras: Cameras,
+        *,
+        backgrounds: Float[Tensor, "B 3"] | None = None,
+        outputs: tuple[str, ...] = ("color",),
+        depth_of: Depth = "plane",
+    ) -> Rasterization:
+        """Splat the triangles into the images of B cameras; differentiable with respect to the parameters.
+
+        Args:
+            cameras: B cameras; one where the appearance leaves out triangles by their size on the image.
+            backgrounds: (B, 3); None is black.
+            outputs: as in `etsplat.rasterize`.
+            depth_of: as there.
+        """
+        look = self.appearance
+        colors = soup_colors(self.vertices, self.sh_dc, self.sh_rest, cameras.centers, self.drawn_degree)
+        opacities, sigma = soup_activation(
+            self.vertices,
+            self.opacity_logits,
+            self.sigma_raw,
+            look.numbers if look.limits is None else look.limits,
+            cameras if look.cull_small or look.cull_large < float("inf") else None,
+            smallest=SMALLEST_INRADIUS if look.cull_small else 0.0,
+            largest=look.cull_large * max(cameras.width, cameras.height),
+        )
+        return rasterize(
+            self.vertices,
+            colors,
+            opacities,
+            sigma,
+            cameras.viewmats,
+            cameras.Ks,
+            cameras.width,
+            cameras.height,
+            kernel=look.kernel,
+            distance=look.distance,
+            backgrounds=backgrounds,
+            depth=depth_of if {"depth", "median_depth", "distortion"} & set(outputs) else None,
+            median_depth="median_depth" in outputs,
+            normals="normal" in outputs,
+            distortion="distortion" in outputs,
+            statistics="statistics" in outputs,
+            near_plane=look.near_plane,
+            freeze_incentre=look.freeze_incentre,
+            validate=False,
+        )
+
+    @torch.no_grad()
+    def render_opaque(self, cameras: Cameras, *, supersampling: int = 4) -> Float[Tensor, "B H W 4"]:
+        """What a mesh viewer shows: sharp opaque triangles with a z-buffer, colours as each camera sees them.
+
+        Args:
+            cameras: B cameras.
+            supersampling: samples along each axis of a pixel.
+
+        Returns:
+            (B, H, W, 4) premultiplied RGBA. Triangles with an opacity below one half are left out.
+        """
+        kept = self.seen_opaque
+        vertices, dc, rest = (tensor.detach()[kept] for tensor in (self.vertices, self.sh_dc, self.sh_rest))
+        images = [
+            render_opaque(
+                vertices,
+                camera.viewmats,
+                camera.Ks,
+                camera.width,
+                camera.height,
+                face_colors=soup_colors(vertices, dc, rest, camera.centers, self.drawn_degree)[0],
+                supersampling=supersampling,
+                near_plane=self.appearance.near_plane,
+            )
+            for camera in (cameras[index] for index in range(len(cameras)))
+        ]
+        return torch.cat(images)
+
+    def surface(self) -> tuple[Float[Tensor, "V 3"], Int[Tensor, "F 3"]]:
+        """Corners and faces of the triangles that are drawn opaque, detached, on the CPU."""
+        vertices = self.vertices.detach()[self.seen_opaque].cpu().reshape(-1, 3)
+        return vertices, torch.arange(len(vertices)).reshape(-1, 3)
+
+    def finished(self) -> "TriangleSoup":
+        """The same with all that its appearance squeezes written into its parameters, detached."""
+        look, parameters = self.appearance, self.state()
+        if look.opacity_floor > 0:
+            parameters["opacity_logits"] = torch.logit(self.drawn_opacities.detach().double()).float()
+        if look.sigma_ceiling < float("inf"):
+            highest = torch.tensor(look.sigma_ceiling - SOUP_SIGMA_FLOOR).log()
+            parameters["sigma_raw"] = parameters["sigma_raw"].clamp_max(float(highest))
+        return replace(self, **parameters, appearance=look.structure)
+
+    @property
+    def drawn_opacities(self) -> Float[Tensor, " N"]:
+        """(N,) as they are drawn, above the appearance's floor: floor + (1 - floor) o."""
+        floor = self.appearance.opacity_floor
+        return self.opacities if floor == 0.0 else floor + (1.0 - floor) * self.opacities
+
+    @property
+    def drawn_sigma(self) -> Float[Tensor, " N"]:
+        """(N,) as it is drawn, below the appearance's ceiling."""
+        ceiling = self.appearance.sigma_ceiling
+        return self.sigma if ceiling == float("inf") else self.sigma.clamp_max(ceiling)
+
+    @property
+    def drawn_degree(self) -> int:
+        """Of the bands of the colours that are drawn."""
+        asked = self.appearance.sh_degree
+        return self.sh_degree if asked is None else min(asked, self.sh_degree)
+
+    @property
+    def seen_opaque(self) -> Bool[Tensor, " N"]:
+        """(N,) which triangles are drawn where the soup is drawn opaque: those half opaque or more."""
+        return self.drawn_opacities.detach() >= OPAQUE_FROM
 
     @property
     def opacities(self) -> Float[Tensor, " N"]:

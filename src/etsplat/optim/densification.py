@@ -7,7 +7,8 @@ once there are more views than iterations between two edits.) Up to half as many
 same.
 """
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
@@ -89,10 +90,14 @@ class PruneRules:
         screen_size: it grows larger than this on some view's screen, in pixels.
     """
 
-    opacity: float
-    importance: float
-    views: int
-    screen_size: float
+    opacity: float = 0.014
+    importance: float = 0.022
+    views: int = 0
+    screen_size: float = math.inf
+
+    def limited(self, *, views: int, by_size: bool) -> "PruneRules":
+        """The same where there are so many views at most, and triangles may grow larger unless `by_size`."""
+        return replace(self, views=min(self.views, views), screen_size=self.screen_size if by_size else math.inf)
 
 
 def dead_triangles(

@@ -158,7 +158,11 @@ class LoopSettings:
 
 
 def optimize(
-    problem: Problem, settings: LoopSettings, progress: Progress, save: Callable[[Progress], Path], folder: Path
+    problem: Problem,
+    settings: LoopSettings,
+    progress: Progress,
+    save: Callable[[Progress], Path] | None,
+    folder: Path | None,
 ) -> Iterator[Event]:
     """Runs `problem` from `progress` to the last iteration.
 
@@ -169,8 +173,8 @@ def optimize(
         problem: what to optimise; changed in place.
         settings: when things happen.
         progress: where the run stands; changed in place.
-        save: writes a checkpoint and returns its path.
-        folder: of the checkpoints, named in the error of a diverged run.
+        save: writes a checkpoint and returns its path; None where nothing is kept.
+        folder: of the checkpoints, named in the error of a diverged run; None where there is none.
 
     Yields:
         Events in the order of `Event`; of one iteration, those that apply.
@@ -186,7 +190,7 @@ def optimize(
             last = iteration == settings.iterations
             evaluating = last or _due(iteration, settings.evaluate_every)
             stopping = interrupted()
-            saving = last or stopping or _due(iteration, settings.checkpoint_every)
+            saving = save is not None and (last or stopping or _due(iteration, settings.checkpoint_every))
             logging = evaluating or _due(iteration, settings.log_every)
             if (logging or saving) and (name := problem.first_not_finite()):
                 raise DivergedError(f"{name} is not finite at iteration {iteration}; {_what_is_left(folder)}")
@@ -194,7 +198,7 @@ def optimize(
                 yield _step_event(problem, settings, progress, problem.evaluate() if evaluating else {})
             if added:
                 yield RefineEvent(iteration, problem.count, added)
-            if saving:
+            if save is not None and saving:
                 yield CheckpointEvent(iteration, save(progress))
             if stopping:
                 raise KeyboardInterrupt
@@ -203,7 +207,7 @@ def optimize(
     yield DoneEvent(progress.iteration, progress.seconds)
 
 
-def _advance(problem: Problem, progress: Progress, stop: int, folder: Path) -> int:
+def _advance(problem: Problem, progress: Progress, stop: int, folder: Path | None) -> int:
     start = time.perf_counter()
     for loss in problem.advance(progress.iteration + 1, stop):
         progress.iteration += 1
@@ -239,8 +243,8 @@ def _due(iteration: int, every: int) -> bool:
     return every > 0 and iteration % every == 0
 
 
-def _what_is_left(folder: Path) -> str:
-    saved = list_checkpoints(folder)
+def _what_is_left(folder: Path | None) -> str:
+    saved = [] if folder is None else list_checkpoints(folder)
     if not saved:
         return "no checkpoint was written yet; lower the learning rates and start again"
     return f"the last good checkpoint is {saved[-1]}; lower the learning rates and start again in another folder"

@@ -1,6 +1,38 @@
 """How weights and learning rates change over a run. Iterations are counted from 1 to `iterations`."""
 
 import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+Scheduled = float | Callable[[int], float]
+"""A number, or a function of the iteration."""
+
+
+def at(value: Scheduled, iteration: int) -> float:
+    """What something scheduled is at an iteration."""
+    return value(iteration) if callable(value) else value
+
+
+def _full(iteration: int) -> int:
+    return 0
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """What changes over a run and is not learned.
+
+    Attributes:
+        rates: Adam's learning rates, by parameter.
+        values: parameters of one number that are set instead of learned, by name.
+        appearance: how the model is drawn, by iteration (0 is the start); None for what the model says.
+        halvings: how often the photos are halved, by iteration.
+    """
+
+    rates: Mapping[str, Scheduled]
+    values: Mapping[str, Scheduled] = field(default_factory=dict)
+    appearance: Callable[[int], Any] | None = None
+    halvings: Callable[[int], int] = _full
 
 
 def regularization_weight(iteration: int, iterations: int, hold: int, final: float = 0.0) -> float:
@@ -21,15 +53,16 @@ def regularization_weight(iteration: int, iterations: int, hold: int, final: flo
     return final + (1.0 - final) * cosine
 
 
-def limited_iterations(iterations: int, max_epochs: int | None, views: int) -> int:
-    """The length of a run that sees no view more often than `max_epochs` times, one in each iteration.
+def limited_iterations(iterations: int, max_epochs: int | None, views: int, batch: int = 1) -> int:
+    """The length of a run that sees no view more often than `max_epochs` times.
 
     Args:
         iterations: at most so many.
         max_epochs: None for no limit.
         views: number of training views, >= 1.
+        batch: how many of them an iteration sees.
     """
-    return iterations if max_epochs is None else min(iterations, max_epochs * views)
+    return iterations if max_epochs is None else min(iterations, max(1, max_epochs * views // batch))
 
 
 def exponential_decay(iteration: int, iterations: int, ratio: float) -> float:

@@ -16,6 +16,7 @@ from scipy.sparse.linalg import splu
 from torch import Tensor
 
 from etsplat.geometry.topology import MeshTopology
+from etsplat.model.triangle_mesh import TriangleMesh
 from etsplat.ops.adam import Adam
 
 Solve = Callable[[Float[Tensor, "V 3"]], Float[Tensor, "V 3"]]
@@ -35,6 +36,22 @@ def laplacian_solver(topology: MeshTopology, weight: float) -> Solve:
         return torch.from_numpy(factors.solve(x.detach().cpu().double().numpy())).to(x)
 
     return solve
+
+
+class UniformSteps:
+    """Steps of a mesh's vertices with one scale for all of them; of other parameters Adam's own."""
+
+    def __init__(self, smoothing: float | None = None) -> None:
+        """Takes the weight of the Laplacian beside the identity, or None for no smoothing."""
+        self._smoothing = smoothing
+        self._solve: Solve | None = None
+        self._topology: MeshTopology | None = None
+
+    def __call__(self, adam: Adam, mesh: TriangleMesh) -> None:
+        """One step, by the gradients and learning rates that `adam` has."""
+        if self._smoothing is not None and mesh.topology is not self._topology:
+            self._topology, self._solve = mesh.topology, laplacian_solver(mesh.topology, self._smoothing)
+        uniform_step(adam, "vertices", adam.learning_rates["vertices"], self._solve)
 
 
 @torch.no_grad()

@@ -16,17 +16,13 @@ from etsplat.engines.choice import engine_for
 from etsplat.engines.threads import num_threads
 from etsplat.io.atomic import write_error
 from etsplat.io.images import save_image, to_8_bit
-from etsplat.metrics.image import Lpips, find_lpips_weights, psnr, ssim
-from etsplat.model.soup_rendering import render_soup
+from etsplat.metrics.image import Lpips, psnr, ssim
 from etsplat.tasks.running import device_name
+from etsplat.tasks.scoring import SMALLEST, Scorer, load_lpips
 from etsplat.tasks.soup_run import SoupRun
-from etsplat.tasks.soup_scoring import SoupScorer
 
 REPEATS = 3
 """Every view is timed so often, after one picture that is not counted; the best time counts."""
-
-_SMALLEST = 16
-"""Pixels a side below which LPIPS is not defined."""
 
 
 def evaluate_run(
@@ -61,15 +57,14 @@ def evaluate_run(
             pictures.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise write_error(pictures, error) from error
-    place, soup, appearance = run.device, run.file.soup, run.file.appearance
+    place, soup = run.device, run.soup
     lpips, reason = load_lpips(lpips_weights, place)
-    background = torch.tensor(run.file.background)
-    scorer = SoupScorer(capture, background, place)
+    background = soup.appearance.background
+    scorer = Scorer(capture, place, background=background)
     rows: list[dict[str, Any]] = []
     for index, view in enumerate(capture.test):
-        photo = scorer.photo(view)
-        soft = scorer.masked(scorer.splatted(soup, appearance, view), photo, view)
-        opaque = scorer.masked(scorer.opaque(soup, appearance, view), photo, view)
+        seen = scorer.see(soup, view)
+        photo, soft, opaque = seen.photo, seen.counting(seen.splatted), seen.counting(seen.opaque)
         name = capture.names[view]
         rows.append({"name": name, **image_scores(soft, photo, lpips), **image_scores(opaque, photo, lpips, "_opaque")})
         if pictures is not None:
@@ -79,21 +74,11 @@ def evaluate_run(
             progress(index + 1, len(capture.test))
 
     def draw(camera: Cameras) -> None:
-        render_soup(soup, camera, appearance, backgrounds=background[None].to(place))
+        soup.render(camera, backgrounds=torch.tensor([background], device=place))
 
     cameras = [capture.cameras[view] for view in capture.test]
     speed = {**drawing_speed(draw, cameras, place, len(soup)), "engine": engine_for(soup.vertices).name}
     return {**mean_scores(rows), "lpips_reason": reason, **speed, "triangles": len(soup), "views": rows}
-
-
-def load_lpips(weights: Path | str | None, device: torch.device) -> tuple[Lpips | None, str | None]:
-    """The metric, or why it cannot be measured; `weights` as `etsplat.metrics.image.find_lpips_weights` takes it."""
-    found = find_lpips_weights(weights)
-    if not found.paths:
-        return None, found.reason
-    lpips = Lpips.from_weights(*found.paths)
-    lpips.to(device)
-    return lpips, found.reason
 
 
 def image_scores(
@@ -101,7 +86,7 @@ def image_scores(
 ) -> dict[str, float | None]:
     """Every image metric of one view by name, with a suffix; None where it is not defined or not at hand."""
     smallest = min(image.shape[:2])
-    measured = lpips if smallest >= _SMALLEST else None
+    measured = lpips if smallest >= SMALLEST else None
     scores: dict[str, float | None] = {
         "psnr": psnr(image, photo),
         "psnr_8bit": psnr(to_8_bit(image).float() / 255, to_8_bit(photo).float() / 255),

@@ -12,8 +12,7 @@ from etsplat.core.errors import InputError
 from etsplat.io.paths import kind_of
 from etsplat.io.surface_files import suffixes, writer_of
 from etsplat.io.triangle_files import save_triangles
-from etsplat.model.soup_files import save_soup
-from etsplat.model.soup_rendering import OPAQUE_FROM, SoupAppearance, render_soup
+from etsplat.model.soup_appearance import OPAQUE_FROM
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.ops.soup_colors import soup_colors
 from etsplat.tasks.export_config import Bake, ExportConfig
@@ -40,16 +39,16 @@ def export_soup(run: SoupRun, path: Path | str, config: ExportConfig) -> Export:
     """
     path = Path(path)
     if kind_of(path) == ".safetensors":
-        save_soup(path, run.file)
-        return Export(path, len(run.file.soup), 0)
+        run.soup.save(path)
+        return Export(path, run.soup.count, 0)
     holds = writer_of(path).HOLDS
     if config.colors == "keep" and ("numbers" not in holds or config.up == "y"):
         kinds = " or ".join(suffix[1:] for suffix in suffixes("numbers"))
         raise InputError(f"colours that depend on the direction (--colors keep) need --format {kinds} and --up keep")
     if config.alpha and "alpha" not in holds:
         raise InputError(f"{path}: files of this kind hold no opacities; leave out --alpha, or choose another --format")
-    soup, appearance = run.file.soup, run.file.appearance
-    opacities = appearance.opacities(soup).detach()
+    soup = run.soup
+    opacities = soup.drawn_opacities.detach()
     kept = opacities >= (OPAQUE_FROM if config.min_opacity is None else config.min_opacity)
     if not bool(kept.any()):
         raise InputError(
@@ -62,16 +61,16 @@ def export_soup(run: SoupRun, path: Path | str, config: ExportConfig) -> Export:
         vertices = (vertices.double() @ rotation.T).float()
     if config.alpha:
         colors = torch.cat([colors, opacities[kept, None]], dim=1)
-    numbers = {"opacity": opacities[kept], "sigma": appearance.sigma(soup).detach()[kept]}
+    numbers = {"opacity": opacities[kept], "sigma": soup.drawn_sigma.detach()[kept]}
     if config.colors == "keep":
         numbers |= _coefficients(soup, kept)
-    comment = f"etsplat {appearance.kernel} {appearance.distance}"
+    comment = f"etsplat {soup.appearance.kernel} {soup.appearance.distance}"
     save_triangles(path, vertices, colors, weld=config.weld, numbers=numbers, comment=comment)
     return Export(path, len(vertices), int((~kept).sum()))
 
 
 @torch.no_grad()
-def bake_colors(soup: TriangleSoup, appearance: SoupAppearance, cameras: list[Cameras]) -> Float[Tensor, "N 3"]:
+def bake_colors(soup: TriangleSoup, cameras: list[Cameras]) -> Float[Tensor, "N 3"]:
     """One colour for every triangle: the mean of what the cameras see, weighted by how much each sees of it.
 
     The weight is the largest blend weight of any pixel. A triangle that nobody sees has the part of its colour that is
@@ -79,12 +78,11 @@ def bake_colors(soup: TriangleSoup, appearance: SoupAppearance, cameras: list[Ca
     """
     device = soup.vertices.device
     total, weight = torch.zeros(len(soup), 3, device=device), torch.zeros(len(soup), 1, device=device)
-    degree = appearance.degree(soup)
     for camera in cameras:
         small = camera.scaled(min(1.0, BAKING_WIDTH / camera.width)).to(device)
-        seen = render_soup(soup, small, appearance, statistics=True).statistics
+        seen = soup.render(small, outputs=("statistics",)).statistics
         assert seen is not None
-        colors = soup_colors(soup.vertices, soup.sh_dc, soup.sh_rest, small.centers, degree)[0]
+        colors = soup_colors(soup.vertices, soup.sh_dc, soup.sh_rest, small.centers, soup.drawn_degree)[0]
         total += seen.max_weight[0, :, None] * colors.clamp(0, 1)
         weight += seen.max_weight[0, :, None]
     return torch.where(weight > 0, total / weight.clamp_min(1e-12), soup.display_colors())
@@ -92,8 +90,8 @@ def bake_colors(soup: TriangleSoup, appearance: SoupAppearance, cameras: list[Ca
 
 def _baked(run: SoupRun, bake: Bake) -> Float[Tensor, "N 3"]:
     if bake == "mean" and run.capture is not None:
-        return bake_colors(run.file.soup, run.file.appearance, training_cameras(run.capture))
-    return run.file.soup.display_colors()
+        return bake_colors(run.soup, training_cameras(run.capture))
+    return run.soup.display_colors()
 
 
 def _rotation(run: SoupRun, config: ExportConfig) -> Float[Tensor, "3 3"] | None:

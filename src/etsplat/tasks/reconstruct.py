@@ -1,18 +1,30 @@
 """Shape reconstruction (paper section 3.3): posed images of an object in, a run directory with its mesh out."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-import torch
-
-from etsplat.engines.choice import engine, engine_for, resolve_device
-from etsplat.io.mesh_files import MeshFile, save_mesh
-from etsplat.io.run_directory import RunDirectory
+from etsplat.data.dataset import Dataset
+from etsplat.engines.choice import engine, resolve_device
+from etsplat.io.mesh_files import MeshFile
+from etsplat.model.triangle_mesh import TriangleMesh
 from etsplat.ops.antialias_nvdiffrast import load_nvdiffrast
-from etsplat.optim.loop import Progress
-from etsplat.tasks.mesh_fitting import MeshFitting
+from etsplat.optim.objective import Objective
+from etsplat.optim.schedules import (
+    Schedule,
+    coarse_level,
+    evenly,
+    exponential_decay,
+    face_budgets,
+    regularization_weight,
+)
+from etsplat.optim.strategies import SubdivideAndUntangle
+from etsplat.optim.terms.photometric import Photometric
+from etsplat.optim.trainer import Trainer
+from etsplat.optim.vertex_updates import UniformSteps
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.running import (
     Callback,
@@ -22,11 +34,11 @@ from etsplat.tasks.running import (
     announcer,
     common_metrics,
     fit,
-    loop_settings,
     make_record,
     path_of,
+    terms_of,
 )
-from etsplat.tasks.scoring import Scorer
+from etsplat.tasks.scoring import Scorer, load_lpips
 from etsplat.tasks.sources import Source, fingerprint, load_source, load_start, make_start, make_subject
 
 
@@ -96,27 +108,89 @@ def reconstruct(
     if config.drawing.backend == "nvdiffrast":
         load_nvdiffrast()  # now rather than at the first step
     with engine(config.engine):
-        scorer = Scorer(subject, config, device)
-        fitting = MeshFitting(make_start(start, subject.views, config, device), subject.views, config, scorer.cheap)
+        scorer = Scorer(
+            subject.views,
+            device,
+            truth=subject.truth,
+            samples=config.output.chamfer_samples,
+            supersampling=config.pictures.supersampling,
+            lpips=load_lpips(config.output.lpips_weights, device),
+        )
+        trainer = make_trainer(make_start(start, subject.views, config, device), subject.views, config, scorer.cheap)
         run = place.open(record)
-        with engine_for(fitting.mesh.vertices).looping():
-            progress = fit(fitting, run, loop_settings(config), record, announce)
-        return _finish(fitting, progress, run, scorer, subject.views.normalization.invert, config)
-
-
-def _finish(
-    fitting: MeshFitting,
-    progress: Progress,
-    run: RunDirectory,
-    scorer: Scorer,
-    to_input_units: Callable[[torch.Tensor], torch.Tensor],
-    config: ReconstructConfig,
-) -> ReconstructResult:
-    """Exports the mesh, draws the test views, measures everything."""
-    mesh = fitting.mesh
-    colors = mesh.named(mesh.display_colors.cpu())
-    result = MeshFile(to_input_units(mesh.vertices.detach().cpu()), mesh.faces.cpu(), **colors)
-    for suffix in (".ply", ".obj", ".glb"):
-        save_mesh(run.mesh_path(suffix), result.vertices, result.faces, **colors)
-    run.write_metrics({**scorer.full(mesh, run.test), **common_metrics(progress, config, mesh.vertices)})
+        progress = fit(trainer, config, run, record, callbacks)
+        mesh = trainer.model
+        result = mesh.to_file(subject.views.normalization)
+        for suffix in (".ply", ".obj", ".glb"):
+            mesh.save(run.mesh_path(suffix), subject.views.normalization)
+        sizes = {"faces": len(mesh.faces), "vertices": len(mesh.vertices)}
+        metrics = {**scorer.full(mesh, run.test), **sizes, **common_metrics(progress, config, mesh.vertices)}
+    run.write_metrics(metrics)
     return ReconstructResult(run.path, result, run.read_metrics())
+
+
+def make_trainer(
+    mesh: TriangleMesh,
+    views: Dataset,
+    config: ReconstructConfig,
+    evaluate: Callable[[TriangleMesh], dict[str, float]] | None = None,
+) -> Trainer[TriangleMesh]:
+    """The paper's way from a start to the object that views show: L_mesh, Adam, subdivision.
+
+    Args:
+        mesh: the start; changed in place.
+        views: what it is fitted to.
+        config: settings.
+        evaluate: cheap metrics of a mesh.
+    """
+    length, regularization, refinement = config.iterations, config.regularization, config.refinement
+    terms = terms_of(
+        regularization,
+        leaving=() if config.soft else ("sigma",),
+        arguments={"edge": {"power": regularization.edge_power}},
+    )
+    gamma = partial(regularization_weight, iterations=length, hold=regularization.hold, final=regularization.final)
+    budgets = face_budgets(
+        length,
+        steps=refinement.subdivisions,
+        first=refinement.first,
+        last=refinement.last,
+        start_faces=mesh.count,
+        max_faces=config.max_faces,
+    )
+    untanglings = evenly(length, refinement.untanglings, refinement.last)
+    smoothing = config.optimizer.large_steps_weight if config.optimizer.vertex_update == "large-steps" else None
+    return Trainer(
+        mesh,
+        views,
+        Objective(Photometric(), terms, scale=gamma),
+        SubdivideAndUntangle(budgets, untanglings),
+        schedule=_schedule(config),
+        batch=config.batch,
+        update=None if config.optimizer.vertex_update == "adam" else UniformSteps(smoothing),
+        evaluate=evaluate,
+        seed=config.seed,
+    )
+
+
+def _schedule(config: ReconstructConfig) -> Schedule:
+    length, rates, pictures = config.iterations, config.optimizer, config.pictures
+    annealed = config.soft and rates.sigma_final > 0
+
+    def vertices(iteration: int) -> float:
+        return rates.lr_vertices * exponential_decay(iteration, length, rates.lr_vertices_final)
+
+    def log_sigma(iteration: int) -> float:
+        fall = exponential_decay(iteration, length, rates.sigma_final / config.start.sigma)
+        return math.log(config.start.sigma * fall)
+
+    return Schedule(
+        rates={
+            "vertices": vertices,
+            "colors": rates.lr_colors,
+            "opacity_logits": rates.lr_opacities,
+            "log_sigma": 0.0 if annealed else rates.lr_sigma,
+        },
+        values={"log_sigma": log_sigma} if annealed else {},
+        halvings=partial(coarse_level, iterations=length, levels=pictures.coarse_levels, until=pictures.coarse_until),
+    )

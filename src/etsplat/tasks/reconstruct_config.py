@@ -3,13 +3,10 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, get_args
+from typing import Annotated, Any, ClassVar, Literal, get_args
 
 from etsplat.core.errors import InputError
 from etsplat.tasks.settings import Device, Engine, Only, OrRegistered, Range, Rare, Settings, SoftMethod
-
-if TYPE_CHECKING:
-    from etsplat.model.mesh_rendering import MeshAppearance
 
 Method = Literal[SoftMethod, "raster-face", "raster-vertex"]
 METHODS: tuple[Method, ...] = get_args(Method)
@@ -233,14 +230,6 @@ class ReconstructConfig(Settings):
     def vertex_colored(self) -> bool:
         """Whether colours belong to vertices."""
         return self.drawing.colors == "vertex" if self.soft else self.method == "raster-vertex"
-
-    @property
-    def appearance(self) -> "MeshAppearance":
-        """How the mesh is drawn."""
-        from etsplat.model.mesh_rendering import MeshAppearance  # imports torch
-
-        kernel = self.method.replace("-", "_") if self.soft else None
-        return MeshAppearance(kernel, self.drawing.distance, self.drawing.backend)
 
     @classmethod
     def based_on(cls, settings: Mapping[str, Any]) -> "ReconstructConfig":

@@ -16,11 +16,10 @@ from etsplat.core.errors import InputError
 from etsplat.data.camera_paths import PATHS
 from etsplat.data.dataset import Dataset
 from etsplat.io.atomic import atomic_write, write_error
-from etsplat.io.images import save_image
+from etsplat.io.images import over_background, save_image
 from etsplat.io.paths import kind_of
 from etsplat.io.videos import VideoSink, open_video
-from etsplat.model.soup_files import SoupFile
-from etsplat.model.soup_rendering import render_soup, render_soup_opaque
+from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.tasks.render_config import RenderConfig
 from etsplat.tasks.soup_run import SoupRun, world_up
 
@@ -57,11 +56,11 @@ def render_run(
     except OSError as error:
         raise write_error(out, error) from error
     written: list[Path] = []
-    span = _path_span(run.file, cameras) if config.video and config.depth else None
+    span = _path_span(run.soup, cameras) if config.video and config.depth else None
     with ExitStack() as stack:
         sinks: dict[str, VideoSink] = {}
         for index, (name, camera) in enumerate(zip(names, cameras, strict=True)):
-            pictures = draw(run.file, camera, config)
+            pictures = draw(run.soup, camera, config)
             if "depth" in pictures:
                 depth = pictures["depth"]
                 if not config.video:
@@ -103,28 +102,20 @@ def views_of(capture: Dataset, config: RenderConfig) -> tuple[list[str], list[Ca
 
 
 @torch.no_grad()
-def draw(file: SoupFile, camera: Cameras, config: RenderConfig) -> dict[str, Float[Tensor, "H W *C"]]:
+def draw(soup: TriangleSoup, camera: Cameras, config: RenderConfig) -> dict[str, Float[Tensor, "H W *C"]]:
     """The images of one camera by kind: color (H, W, 3); depth (H, W), 0 where nothing is; normal (H, W, 3).
 
     Drawn on the soup's device, returned on the CPU.
     """
-    soup, appearance = file.soup, file.appearance
     device = soup.vertices.device
-    background, camera = torch.tensor(file.background, device=device), camera.to(device)
+    background, camera = torch.tensor(soup.appearance.background, device=device), camera.to(device)
     pictures: dict[str, Tensor] = {}
     if config.opaque:
-        color = render_soup_opaque(soup, camera, appearance, background=background)[0]
-        pictures["color"] = color.clamp(0, 1)
+        pictures["color"] = over_background(soup.render_opaque(camera)[0], background).clamp(0, 1)
     if config.opaque and not (config.depth or config.normals):
         return {"color": pictures["color"].cpu()}
-    rendering = render_soup(
-        soup,
-        camera,
-        appearance,
-        backgrounds=background[None],
-        depth="plane" if config.depth else None,
-        normals=config.normals,
-    )
+    outputs = ("color", *(["depth"] if config.depth else []), *(["normal"] if config.normals else []))
+    rendering = soup.render(camera, backgrounds=background[None], outputs=outputs)
     pictures.setdefault("color", rendering.color[0].clamp(0, 1))
     if rendering.depth is not None:
         pictures["depth"] = rendering.depth[0, ..., 0]
@@ -153,10 +144,10 @@ def color_depth(depth: Float[Tensor, "H W"], span: tuple[float, float]) -> Float
     return torch.where(depth[..., None] > 0, colors, 0.0)
 
 
-def _path_span(file: SoupFile, cameras: list[Cameras]) -> tuple[float, float]:
+def _path_span(soup: TriangleSoup, cameras: list[Cameras]) -> tuple[float, float]:
     """One span for all frames of a video, from some of them drawn small: colours do not flicker."""
     probes = [cameras[index].scaled(_PROBE_WIDTH / cameras[index].width) for index in range(0, len(cameras), 8)]
-    depths = [draw(file, probe, RenderConfig(depth=True))["depth"] for probe in probes]
+    depths = [draw(soup, probe, RenderConfig(depth=True))["depth"] for probe in probes]
     return depth_span(torch.cat(depths))
 
 

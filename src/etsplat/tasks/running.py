@@ -1,13 +1,13 @@
-"""What every task's run has in common: its record, its events, and the loop from the last checkpoint to the end."""
+"""What every task's run has in common: its place, its record and its events."""
 
 import hashlib
 import json
 import platform
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -16,8 +16,11 @@ from etsplat.core.errors import InputError
 from etsplat.engines.choice import engine_for
 from etsplat.engines.threads import num_threads
 from etsplat.io.run_directory import RunDirectory, is_run
-from etsplat.optim.checkpoints import load_latest_checkpoint, save_checkpoint
-from etsplat.optim.loop import Event, LoopSettings, Problem, Progress, StepEvent, optimize
+from etsplat.optim.loop import Event, Progress
+from etsplat.optim.objective import Term
+from etsplat.optim.schedules import Scheduled
+from etsplat.optim.terms import named_terms
+from etsplat.optim.trainer import Trainer
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.settings import Settings
 from etsplat.tasks.train_config import TrainConfig
@@ -48,18 +51,6 @@ class NoteEvent:
 
 
 Callback = Callable[[Event | PrepareEvent | NoteEvent], None]
-
-
-class Resumable(Problem, Protocol):
-    """A problem whose state can be written down and continued from."""
-
-    def state(self, progress: Progress) -> dict[str, Tensor]:
-        """Everything that the rest of the run depends on, by name, for a checkpoint."""
-        ...
-
-    def load_state(self, state: dict[str, Tensor], iteration: int) -> Progress:
-        """Continues where `state` was taken; returns where that was."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -111,47 +102,47 @@ def announcer(callbacks: Sequence[Callback]) -> Callback:
 
 
 def fit(
-    problem: Resumable,
+    trainer: Trainer[Any],
+    config: ReconstructConfig | TrainConfig,
     run: RunDirectory,
-    settings: LoopSettings,
     record: dict[str, Any],
-    announce: Callback,
+    callbacks: Sequence[Callback],
 ) -> Progress:
-    """Runs the loop from the last checkpoint, or from the start, to the end, and keeps the history.
+    """Runs a trainer from the last checkpoint to the end, as settings and record say; see `Trainer.fit`."""
+    output = config.output
+    return trainer.fit(
+        config.iterations,
+        callbacks=callbacks,
+        log_every=output.log_every,
+        evaluate_every=output.evaluate_every,
+        checkpoint_every=output.checkpoint_every,
+        run=run,
+        run_hash=hash_record(record),
+    )
+
+
+def terms_of(
+    group: object,
+    *,
+    leaving: Collection[str] = (),
+    scheduled: Mapping[str, Callable[[float], Scheduled]] | None = None,
+    arguments: Mapping[str, Mapping[str, Any]] | None = None,
+) -> list[Term]:
+    """The terms whose weights `lambda_NAME` are settings, in the order of these.
 
     Args:
-        problem: changed in place.
-        run: gets checkpoints and history.jsonl.
-        settings: when things happen.
-        record: from `make_record`.
-        announce: called with every event.
-
-    Raises:
-        DivergedError: a loss or parameter is not finite.
-        InputError: the checkpoint is damaged or of another run; the disk is full.
+        group: the settings.
+        leaving: names of weights of something else, or of terms that do not apply.
+        scheduled: by name of a term, what becomes of its weight over the run, where it does not stay.
+        arguments: by name, what else it is made with.
     """
-    run_hash = hash_record(record)
-    progress = Progress()
-    checkpoint = load_latest_checkpoint(run.checkpoints, run_hash)
-    if checkpoint is not None:
-        progress = problem.load_state(checkpoint.tensors, checkpoint.iteration)
-    run.truncate_history(progress.iteration)
-
-    def save(at: Progress) -> Path:
-        return save_checkpoint(run.checkpoints, at.iteration, problem.state(at), run_hash)
-
-    for event in optimize(problem, settings, progress, save, run.checkpoints):
-        if isinstance(event, StepEvent):
-            place = {"iteration": event.iteration, "seconds": round(event.seconds, 3), "loss": event.loss}
-            run.append_history({**place, **event.state, **event.metrics})
-        announce(event)
-    return progress
-
-
-def loop_settings(config: ReconstructConfig | TrainConfig) -> LoopSettings:
-    """When things happen, for `fit`."""
-    output = config.output
-    return LoopSettings(config.iterations, output.log_every, output.evaluate_every, output.checkpoint_every)
+    known, scheduled, arguments = named_terms(), scheduled or {}, arguments or {}
+    weights = {key.removeprefix("lambda_"): value for key, value in vars(group).items() if key.startswith("lambda_")}
+    return [
+        known[name](scheduled[name](weight) if name in scheduled else weight, **arguments.get(name, {}))
+        for name, weight in weights.items()
+        if name not in leaving
+    ]
 
 
 def make_record(
@@ -218,14 +209,3 @@ def device_name(device: torch.device) -> str:
 def versions() -> dict[str, str]:
     """Of what computes."""
     return {"etsplat": version("etsplat"), "torch": torch.__version__, "python": platform.python_version()}
-
-
-def progress_tensor(progress: Progress) -> Tensor:
-    """For a checkpoint: everything of `progress` but the iteration."""
-    return torch.tensor([progress.seconds, progress.loss_sum, progress.loss_count], dtype=torch.float64)
-
-
-def read_progress(tensor: Tensor, iteration: int) -> Progress:
-    """The inverse of `progress_tensor`."""
-    seconds, loss_sum, loss_count = tensor.tolist()
-    return Progress(iteration, seconds, loss_sum, int(loss_count))

@@ -1,6 +1,8 @@
-"""How good a reconstruction is: on the test views and against the true mesh."""
+"""How good a model is: on the test views, splatted and as a mesh viewer draws it, and against the true mesh."""
 
+from collections.abc import Sequence
 from dataclasses import asdict
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -8,115 +10,175 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from etsplat.data.loader import ViewLoader
+from etsplat.data.dataset import Dataset
+from etsplat.data.loader import View, ViewLoader
 from etsplat.data.pictures import as_float
 from etsplat.geometry.intersections import count_degenerate_faces, count_self_intersections
-from etsplat.io.images import save_image
-from etsplat.metrics.geometry import chamfer, geometry_metrics, sample_pair
+from etsplat.io.images import over_background, save_image
+from etsplat.io.mesh_files import MeshFile
+from etsplat.metrics.geometry import SAMPLES, chamfer, geometry_metrics, sample_pair
 from etsplat.metrics.image import Lpips, find_lpips_weights, psnr, silhouette_iou, ssim
-from etsplat.model.mesh_rendering import render_exported, render_mesh
+from etsplat.model.model import Model
 from etsplat.model.triangle_mesh import TriangleMesh
-from etsplat.tasks.reconstruct_config import ReconstructConfig
-from etsplat.tasks.sources import Subject
+
+SMALLEST = 16
+"""Pixels a side below which LPIPS is not defined."""
+
+FoundLpips = tuple[Lpips | None, str | None]
+"""The metric, or why it is not measured."""
+
+
+class Seen:
+    """One view of a model beside its photograph; colours over the background, in [0, 1]. Drawn when it is asked for.
+
+    Attributes:
+        photo: (H, W, 3) the photograph.
+        alpha: (H, W) of the photograph; None where it has none.
+    """
+
+    def __init__(self, model: Model, view: View, background: Float[Tensor, "3"], supersampling: int) -> None:
+        self._model, self._view, self._background, self._supersampling = model, view, background, supersampling
+        photo = as_float(view.photo[0])
+        self.alpha = photo[..., 3] if photo.shape[-1] == 4 else None
+        self.photo: Float[Tensor, "H W 3"] = photo if self.alpha is None else over_background(photo, background)
+
+    @cached_property
+    @torch.no_grad()
+    def splatted(self) -> Float[Tensor, "H W 3"]:
+        """(H, W, 3) the model as it is trained."""
+        return self._model.render(self._view.camera, backgrounds=self._background[None]).color[0].clamp(0.0, 1.0)
+
+    @cached_property
+    def covered(self) -> Float[Tensor, "H W 4"]:
+        """(H, W, 4) as a mesh viewer draws it, premultiplied."""
+        return self._model.render_opaque(self._view.camera, supersampling=self._supersampling)[0]
+
+    @property
+    def opaque(self) -> Float[Tensor, "H W 3"]:
+        """(H, W, 3) the same over the background."""
+        return over_background(self.covered, self._background).clamp(0.0, 1.0)
+
+    def counting(self, picture: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:
+        """A picture with the photograph's pixels where the view's mask leaves them out."""
+        mask = self._view.mask
+        return picture if mask is None else self.photo + as_float(mask[0])[..., None] * (picture - self.photo)
 
 
 class Scorer:
-    """Measures meshes of one subject. Measuring changes nothing and draws no random number of the run.
+    """Measures models on one data set. Measuring changes nothing and draws no random number of a run.
 
-    Images are compared over black, in float, renders clamped to [0, 1].
+    Images are compared over the background, in float, renders clamped to [0, 1]; pixels that a mask excludes count as
+    right.
     """
 
-    def __init__(self, subject: Subject, config: ReconstructConfig, device: torch.device | None = None) -> None:
-        """Loads what measuring needs.
+    def __init__(
+        self,
+        dataset: Dataset,
+        device: torch.device,
+        *,
+        background: Sequence[float] = (0.0, 0.0, 0.0),
+        truth: MeshFile | None = None,
+        samples: int = SAMPLES,
+        supersampling: int = 4,
+        lpips: FoundLpips = (None, None),
+    ) -> None:
+        """Takes what measuring needs.
 
-        Raises:
-            InputError: `config.output.lpips_weights` is given and cannot be used.
+        Args:
+            dataset: its test views are measured.
+            device: of the models.
+            background: behind pictures and photos.
+            truth: the true mesh, in the frame of the data set, or None if there is none.
+            samples: points on each surface for the Chamfer distance.
+            supersampling: samples along each axis of a pixel of opaque pictures.
+            lpips: from `load_lpips`; not measured by default.
         """
-        self._views, self._loader = subject.views, ViewLoader(subject.views, device or torch.device("cpu"))
-        self._has_masks = subject.views.has_masks
-        self._truth = subject.truth
-        self._config = config
-        # Now rather than after the run, so that a file that cannot be used is found before hours are spent.
-        weights = find_lpips_weights(config.output.lpips_weights)
-        self._lpips = Lpips.from_weights(*weights.paths) if weights.paths else None
-        self._lpips_reason = weights.reason
-        if self._lpips is not None:
-            self._lpips.to(device or torch.device("cpu"))
-        if min(min(size) for size in self._views.images.sizes) < 16:
-            self._lpips, self._lpips_reason = None, "the images are smaller than 16 pixels"
+        self._dataset, self._views = dataset, ViewLoader(dataset, device)
+        self._background = torch.tensor(background, device=device)
+        self._truth, self._samples, self._supersampling = truth, samples, supersampling
+        sides = [min(camera.width, camera.height) for camera in (dataset.cameras[index] for index in dataset.test)]
+        too_small = min(sides, default=SMALLEST) < SMALLEST
+        self._lpips, self.lpips_reason = (None, "the images are smaller than 16 pixels") if too_small else lpips
 
-    def cheap(self, mesh: TriangleMesh) -> dict[str, float]:
+    def cheap(self, model: Model) -> dict[str, float]:
         """For the history: "psnr" if there are test views, "chamfer" (an estimate) if there is a true mesh."""
         scores: dict[str, float] = {}
-        if self._views.test:
-            scores["psnr"] = _mean([psnr(self._splatted(mesh, view), self._photo(view)) for view in self._views.test])
+        if self._dataset.test:
+            seen = [self.see(model, index) for index in self._dataset.test]
+            scores["psnr"] = sum(psnr(view.counting(view.splatted), view.photo) for view in seen) / len(seen)
         if self._truth is not None:
-            truth, samples = self._truth, self._config.output.chamfer_samples
-            pair = sample_pair(mesh.vertices, mesh.faces, truth.vertices, truth.faces, samples)
-            scores["chamfer"] = chamfer(*pair, queries=samples // 10)
+            pair = sample_pair(*model.surface(), self._truth.vertices, self._truth.faces, self._samples)
+            scores["chamfer"] = chamfer(*pair, queries=self._samples // 10)
         return scores
 
-    def full(self, mesh: TriangleMesh, folder: Path) -> dict[str, Any]:
+    def full(self, model: Model, folder: Path) -> dict[str, Any]:
         """For metrics.json; draws the test views into `folder` on the way.
 
         Args:
-            mesh: what to measure.
-            folder: gets NNN_render.png, NNN_truth.png and NNN_mesh.png for every test view.
+            model: what to measure.
+            folder: gets NNN_render.png, NNN_truth.png and NNN_<model.OPAQUE>.png for every test view.
 
         Returns:
-            Every key that there is; null where there are no test views or no true mesh.
+            Means over the test views, and what was found of each, null where there are none; geometry, null where there
+            is no true mesh.
         """
-        return {
-            **self._geometry(mesh),
-            **self._images(mesh, folder),
-            "faces": len(mesh.faces),
-            "vertices": len(mesh.vertices),
-        }
-
-    def _geometry(self, mesh: TriangleMesh) -> dict[str, Any]:
-        vertices, faces, truth = mesh.vertices.detach().cpu(), mesh.faces.cpu(), self._truth
-        if truth is not None:
-            samples = self._config.output.chamfer_samples
-            return asdict(geometry_metrics(vertices, faces, truth.vertices, truth.faces, samples=samples))
-        return {
-            **dict.fromkeys(("chamfer", "chamfer_floor", "chamfer_exact", "f_score")),
-            "degenerate_faces": count_degenerate_faces(vertices, faces),
-            "self_intersections": count_self_intersections(vertices, faces),
-        }
-
-    def _images(self, mesh: TriangleMesh, folder: Path) -> dict[str, Any]:
-        scores: dict[str, list[float]] = {"psnr": [], "psnr_mesh": [], "ssim": [], "lpips": [], "silhouette_iou": []}
-        for number, view in enumerate(self._views.test):
-            photo, splatted, covered = self._photo(view), self._splatted(mesh, view), self._opaque(mesh, view)
-            opaque = covered[..., :3]
-            scores["psnr"].append(psnr(splatted, photo))
-            scores["psnr_mesh"].append(psnr(opaque, photo))
-            scores["ssim"].append(ssim(splatted, photo))
-            if self._has_masks:
-                scores["silhouette_iou"].append(silhouette_iou(covered[..., 3], self._pixels(view)[..., 3]))
-            if self._lpips is not None:
-                scores["lpips"].append(float(self._lpips(splatted, photo)))
-            for kind, image in (("truth", photo), ("render", splatted), ("mesh", opaque)):
+        rows: list[dict[str, Any]] = []
+        for number, index in enumerate(self._dataset.test):
+            seen = self.see(model, index)
+            rows.append({"name": self._dataset.names[index], **self._scores(seen, model.OPAQUE)})
+            for kind, image in (("truth", seen.photo), ("render", seen.splatted), (model.OPAQUE, seen.opaque)):
                 save_image(folder / f"{number:03d}_{kind}.png", image)
-        means = {name: _mean(values) if values else None for name, values in scores.items()}
-        return {**means, "lpips_reason": self._lpips_reason if self._views.test else "no test views"}
+        names = ("psnr", "ssim", f"psnr_{model.OPAQUE}", f"ssim_{model.OPAQUE}", "lpips", "silhouette_iou")
+        means = {name: _mean([row[name] for row in rows]) for name in names}
+        reason = self.lpips_reason if rows else "no test views"
+        return {**self._geometry(model), **means, "lpips_reason": reason, "test_views": rows}
 
-    def _photo(self, view: int) -> Float[Tensor, "H W 3"]:
-        return self._pixels(view)[..., :3]
+    def see(self, model: Model, index: int) -> Seen:
+        """A view of the data set, by its index, beside the model's."""
+        return Seen(model, self._views.view(index), self._background, self._supersampling)
 
-    def _pixels(self, view: int) -> Float[Tensor, "H W 4"]:
-        return as_float(self._loader.view(view).photo[0])
+    def _scores(self, seen: Seen, opaque: str) -> dict[str, float | None]:
+        pictures = {"": seen.counting(seen.splatted), f"_{opaque}": seen.counting(seen.opaque)}
+        scores: dict[str, float | None] = {}
+        for suffix, picture in pictures.items():
+            scores |= {f"psnr{suffix}": psnr(picture, seen.photo), f"ssim{suffix}": ssim(picture, seen.photo)}
+        scores["lpips"] = None if self._lpips is None else float(self._lpips(pictures[""], seen.photo))
+        scores["silhouette_iou"] = None
+        if seen.alpha is not None and self._has_outlines:
+            scores["silhouette_iou"] = silhouette_iou(seen.covered[..., 3], seen.alpha)
+        return scores
 
-    @torch.no_grad()
-    def _splatted(self, mesh: TriangleMesh, view: int) -> Float[Tensor, "H W 3"]:
-        return render_mesh(mesh, self._loader.view(view).camera, self._config.appearance)[0].clamp(0.0, 1.0)
+    @cached_property
+    def _has_outlines(self) -> bool:
+        return self._dataset.has_masks
 
-    def _opaque(self, mesh: TriangleMesh, view: int) -> Float[Tensor, "H W 4"]:
-        config = self._config
-        camera = self._loader.view(view).camera
-        image = render_exported(mesh, camera, supersampling=config.pictures.supersampling)
-        return image[0]
+    def _geometry(self, model: Model) -> dict[str, Any]:
+        vertices, faces = model.surface()
+        if self._truth is not None:
+            truth = self._truth.vertices, self._truth.faces
+            return asdict(geometry_metrics(vertices, faces, *truth, samples=self._samples))
+        found: dict[str, Any] = dict.fromkeys(("chamfer", "chamfer_floor", "chamfer_exact", "f_score"))
+        if isinstance(model, TriangleMesh):
+            found["degenerate_faces"] = count_degenerate_faces(vertices, faces)
+            found["self_intersections"] = count_self_intersections(vertices, faces)
+        return found
 
 
-def _mean(values: list[float]) -> float:
-    return sum(values) / len(values)
+def load_lpips(weights: Path | str | None, device: torch.device) -> FoundLpips:
+    """The metric, or why it cannot be measured; `weights` as `etsplat.metrics.image.find_lpips_weights` takes it.
+
+    Raises:
+        InputError: `weights` are given and cannot be used.
+    """
+    found = find_lpips_weights(weights)
+    if not found.paths:
+        return None, found.reason
+    lpips = Lpips.from_weights(*found.paths)
+    lpips.to(device)
+    return lpips, found.reason
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    """Of what was measured in all views."""
+    present = [value for value in values if value is not None]
+    return sum(present) / len(present) if present and len(present) == len(values) else None

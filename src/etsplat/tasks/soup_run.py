@@ -14,8 +14,8 @@ from etsplat.data.load import load_dataset
 from etsplat.engines.choice import resolve_device
 from etsplat.io.paths import path_remedy
 from etsplat.io.run_directory import RunDirectory, is_run
-from etsplat.model.soup_files import SoupFile, load_soup
 from etsplat.model.soup_import import open_soup
+from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.tasks.train import DEMO, demo_capture
 
 
@@ -25,18 +25,18 @@ class SoupRun:
 
     Attributes:
         path: what was opened: a run directory or a file.
-        file: the soup and how it is drawn.
+        soup: the triangles.
         capture: cameras and photos; images are decoded when they are asked for. None for a file without its scene.
     """
 
     path: Path
-    file: SoupFile
+    soup: TriangleSoup
     capture: Dataset | None
 
     @property
     def device(self) -> torch.device:
         """Where the soup is, and pictures of it are drawn."""
-        return self.file.soup.vertices.device
+        return self.soup.vertices.device
 
     @property
     def folder(self) -> Path:
@@ -112,14 +112,14 @@ def _open_directory(path: Path, scene: Path | str | None, device: torch.device) 
         raise InputError(
             f"{path}: has no {run.soup_path.name} (yet); name a run of `etsplat train` that got to a checkpoint"
         )
-    file = load_soup(run.soup_path).to(device)
+    soup = TriangleSoup.load(run.soup_path).to(device)
     config = run.read_config()
     paths = config["paths"]
     source = scene or paths["source"]
     if source is None:
-        return SoupRun(path, file, None)
+        return SoupRun(path, soup, None)
     if str(source) == DEMO:
-        return SoupRun(path, file, demo_capture(config["config"]["width"]))
+        return SoupRun(path, soup, demo_capture(config["config"]["width"]))
     if scene is None and not Path(source).is_dir():
         raise InputError(f"{path}: its scene {source} has gone; name where it is now with --scene")
     capture = load_dataset(
@@ -129,7 +129,7 @@ def _open_directory(path: Path, scene: Path | str | None, device: torch.device) 
         masks=paths.get("masks"),
         preload=False,
     )
-    return SoupRun(path, file, capture)
+    return SoupRun(path, soup, capture)
 
 
 def rotation_to_y_up(up: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:

@@ -17,7 +17,7 @@ from etsplat.data.photograph import normalize_mesh, photograph
 from etsplat.geometry.icosphere import icosphere
 from etsplat.io.mesh_files import MeshFile, load_mesh, weld_vertices
 from etsplat.io.paths import path_remedy
-from etsplat.model.triangle_mesh import TriangleMesh
+from etsplat.model.triangle_mesh import MeshAppearance, TriangleMesh
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 
 Source = str | Path | MeshFile | Dataset
@@ -118,6 +118,7 @@ def make_start(
         vertices, faces = views.normalization.apply(start.vertices), start.faces
         given = start.vertex_colors if config.vertex_colored else start.face_colors
         colors = config.start.color if given is None else given
+    kernel = config.method.replace("-", "_") if config.soft else None
     return TriangleMesh.from_mesh(
         vertices.to(device or "cpu"),
         faces.to(device or "cpu"),
@@ -125,6 +126,7 @@ def make_start(
         opacity=config.start.opacity if config.soft else None,
         sigma=config.start.sigma if config.soft else None,
         vertex_colored=config.vertex_colored,
+        appearance=MeshAppearance(kernel, config.drawing.distance, config.drawing.backend),
     )
 
 

@@ -1,28 +1,31 @@
 """Novel-view synthesis (paper section 3.4): photos in, a run directory with a triangle soup out."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
-from etsplat.core.errors import InputError
 from etsplat.data.dataset import Dataset
 from etsplat.data.demo_scene import HEIGHT, WIDTH, demo_scene
 from etsplat.data.load import load_dataset
-from etsplat.data.loader import stay_on
 from etsplat.engines.choice import engine, engine_for, resolve_device
-from etsplat.io.memory import available_memory
 from etsplat.io.run_directory import RunDirectory
-from etsplat.model.soup_files import SoupFile, save_soup
+from etsplat.model.soup_appearance import SoupAppearance
 from etsplat.model.soup_init import StartPoints, random_points, start_soup
-from etsplat.model.surroundings import SPHERE_TRIANGLES, Surroundings
+from etsplat.model.surroundings import Surroundings
 from etsplat.model.triangle_soup import TriangleSoup
+from etsplat.optim.densification import PruneRules
 from etsplat.optim.loop import CheckpointEvent, DivergedError, Progress
-from etsplat.optim.schedules import limited_iterations
+from etsplat.optim.objective import Objective
+from etsplat.optim.schedules import Schedule, Scheduled, exponential_decay, limited_iterations, ramp
+from etsplat.optim.strategies import DensifyAndPrune
+from etsplat.optim.terms.photometric import Photometric
+from etsplat.optim.terms.soup import Spared
+from etsplat.optim.trainer import Trainer
 from etsplat.tasks.running import (
     Callback,
     NoteEvent,
@@ -31,28 +34,30 @@ from etsplat.tasks.running import (
     announcer,
     common_metrics,
     fit,
-    loop_settings,
     make_record,
     path_of,
+    terms_of,
 )
-from etsplat.tasks.soup_fitting import Evaluate, SoupFitting
-from etsplat.tasks.soup_scoring import SoupScorer
+from etsplat.tasks.scoring import Scorer
+from etsplat.tasks.train_checks import check_train, doubtful_scale
 from etsplat.tasks.train_config import TrainConfig
 
 DEMO = "demo:scene"
 """Names the scene that is built in code."""
 
-BYTES_PER_TRIANGLE = 1500
-"""Parameters, gradients, moments, statistics, what the rasterizer keeps, and the copies while triangles multiply."""
-
-BYTES_PER_PIXEL = 400
-"""Of the step's images and the rasterizer's lists."""
-
 LARGE_SPAN = 300.0
 """Above this many units across, Triangle Splatting compares outdoor scenes by squares."""
 
-USUAL_EXTENT = (0.5, 50.0)
-"""Extents of the scenes that the paper's absolute settings were made for, generously."""
+SETTLED = 0.1
+"""What is left, at the end of a run, of the learning rates that settle (`lr_settle`)."""
+
+FINAL_FLOOR, OPAQUE_AT = 0.995, 0.2
+FIRST_CEILING, FINAL_CEILING, SHARP_FROM, SHARP_AT = 1.0, 0.05, 0.3, 0.95
+HIDDEN = 0.005
+"""The opaque finish, as fractions of a run: opacities are squeezed above a floor that soon has its final height, so
+that most of the run is spent on an opaque soup, while its edges still give wide gradients. Then sigma is cut at a
+ceiling that falls. What is hidden meanwhile is removed (its blend weight stays below the last number), and others
+multiply in its place. The thresholds of soft soups take too much away (research/ablations.md)."""
 
 
 @dataclass(frozen=True)
@@ -106,39 +111,42 @@ def train(
     place.check()
     own = _load(source, config, images, masks, lambda done, total: announce(PrepareEvent(done, total)))
     capture = own.normalized() if config.normalize else own
-    iterations = limited_iterations(config.iterations, config.schedule.max_epochs, len(own.train))
-    for note in _check(own, config, iterations, device):
+    iterations = limited_iterations(config.iterations, config.schedule.max_epochs, len(own.train), config.batch)
+    for note in check_train(own, config, iterations, device):
         announce(NoteEvent(note))
     paths = {"source": path_of(source), "images": images, "masks": path_of(masks)}
     record = make_record(config, iterations, {"fingerprint": own.fingerprint()}, paths)
     config = replace(config, iterations=iterations)
-    scorer = SoupScorer(capture, _background(config), device)
     with engine(config.engine):
-        fitting = start_fitting(capture, config, scorer.cheap, device)
+        scorer = Scorer(capture, device, background=_background(config))
+        trainer = start_trainer(capture, config, scorer.cheap, device)
         run = place.open(record)
 
         def keep(event: Any) -> None:
             if isinstance(event, CheckpointEvent):  # so that `etsplat view` can follow
-                save_soup(run.soup_path, _soup_file(fitting, event.iteration, capture, config))
+                _in_own_units(trainer, event.iteration, capture, config).save(run.soup_path)
             announce(event)
 
-        with engine_for(fitting.soup.vertices).looping():
+        with engine_for(trainer.model.vertices).looping():
             try:
-                progress = fit(fitting, run, loop_settings(config), record, keep)
+                progress = fit(trainer, config, run, record, [keep])
             except DivergedError as error:
-                if doubt := _doubtful_scale(own, config):
+                if doubt := doubtful_scale(own, config):
                     raise DivergedError(f"{error}. But first: {doubt}") from error
                 raise
-            return _finish(fitting, progress, run, scorer, capture, config)
+            return _finish(trainer, progress, run, scorer, capture, config)
 
 
-def start_fitting(
-    capture: Dataset, config: TrainConfig, evaluate: Evaluate, device: torch.device | None = None
-) -> SoupFitting:
+def start_trainer(
+    capture: Dataset,
+    config: TrainConfig,
+    evaluate: Callable[[TriangleSoup], dict[str, float]] | None = None,
+    device: torch.device | None = None,
+) -> Trainer[TriangleSoup]:
     """The start of a run: triangles at the capture's points, or at random ones.
 
     Args:
-        capture: in the frame that is trained in.
+        capture: photos in the frame that is trained in.
         config: settings.
         evaluate: cheap metrics of a soup.
         device: where the soup lives; None for the CPU.
@@ -157,24 +165,134 @@ def start_fitting(
     )
     if config.sky == "sphere":
         soup = soup.joined(Surroundings.of(capture).soup(capture, config.drawing.sh_degree))
+    squared = config.scene_type == "outdoor" and not config.normalize and points.span > LARGE_SPAN
     soup = soup.to(device or torch.device("cpu"))
-    squared = config.scene_type == "outdoor" and not config.normalize and _span(points) > LARGE_SPAN
-    return SoupFitting(soup, capture, config, generator, evaluate, squared=squared)
+    return make_trainer(soup, capture, config, evaluate, generator, squared=squared)
+
+
+def make_trainer(
+    soup: TriangleSoup,
+    capture: Dataset,
+    config: TrainConfig,
+    evaluate: Callable[[TriangleSoup], dict[str, float]] | None = None,
+    generator: torch.Generator | None = None,
+    *,
+    squared: bool = False,
+) -> Trainer[TriangleSoup]:
+    """The paper's way from a start to the scene that photos show: L_nvs, Adam, densification and pruning.
+
+    Args:
+        soup: the start; changed in place.
+        capture: what it is fitted to.
+        config: settings.
+        evaluate: cheap metrics of a soup.
+        generator: of every random choice; None for a new one with the seed of `config`.
+        squared: photos are compared by squares.
+    """
+    closed = Surroundings.of(capture).to(soup.vertices.device) if config.sky == "sphere" else None
+    spared = None if closed is None else closed.outermost
+    return Trainer(
+        soup,
+        capture,
+        _objective(config, spared, squared=squared),
+        _strategy(config, spared),
+        schedule=_schedule(config),
+        batch=config.batch,
+        background=None if config.background == "random" else _background(config),
+        evaluate=evaluate,
+        seed=generator or config.seed,
+    )
+
+
+def _objective(config: TrainConfig, spared: Spared | None, *, squared: bool) -> Objective:
+    """L_nvs. Where no view looks, nothing would hold what is spared against the pull to transparency."""
+
+    def late(weight: float) -> Scheduled:
+        return lambda iteration: weight if iteration > config.at(config.loss.regularize_from) else 0.0
+
+    def early(weight: float) -> Scheduled:
+        return lambda iteration: weight if iteration < config.at(config.densification.end) else 0.0
+
+    terms = terms_of(
+        config.loss,
+        leaving=("dssim", "opacity") if config.finish == "opaque" else ("dssim",),
+        scheduled={"size": early, "depth_normal": late, "distortion": late},
+        arguments={"opacity": {"spared": spared}},
+    )
+    photometric = Photometric(config.loss.lambda_dssim, "l2" if squared else "l1")
+    return Objective(photometric, terms, depth_of="centroid")
+
+
+def _strategy(config: TrainConfig, spared: Spared | None) -> DensifyAndPrune:
+    opaque, multiplying, dying = config.finish == "opaque", config.densification, config.pruning
+    return DensifyAndPrune(
+        after=config.at(multiplying.begin),
+        until=config.at(multiplying.end),
+        every=config.at(multiplying.every),
+        last=config.iterations,
+        max_triangles=config.max_triangles,
+        growth=multiplying.growth,
+        replace_dead=multiplying.replace_dead or opaque,
+        sample_by=multiplying.sample_by,
+        split_size=multiplying.split_size,
+        clone_noise=multiplying.clone_noise,
+        prune=PruneRules(
+            opacity=dying.opacity,
+            importance=min(dying.importance, HIDDEN) if opaque else dying.importance,
+            views=dying.views,
+            screen_size=math.inf if dying.screen_size is None else dying.screen_size,
+        ),
+        spared=spared,
+    )
+
+
+def _schedule(config: TrainConfig) -> Schedule:
+    length, given = config.iterations, config.optimizer
+    faster = 1.0 if given.lr_vertices_length is None else math.sqrt(given.lr_vertices_length / length)
+
+    def vertices(iteration: int) -> float:
+        return given.lr_vertices * exponential_decay(iteration, length, given.lr_vertices_final) * faster
+
+    def settling(rate: float) -> Scheduled:
+        if given.lr_settle is None:
+            return rate
+        first = config.at(given.lr_settle)
+        return lambda iteration: rate * SETTLED ** ramp(iteration, first, length)
+
+    rates: dict[str, Scheduled] = {
+        "vertices": vertices,
+        "opacity_logits": settling(given.lr_opacities),
+        "sigma_raw": settling(given.lr_sigma),
+        "sh_dc": settling(given.lr_sh_dc),
+        "sh_rest": settling(given.lr_sh_rest),
+    }
+    return Schedule(rates, appearance=partial(_appearance, config))
+
+
+def _appearance(config: TrainConfig, iteration: int) -> SoupAppearance:
+    """How the soup is drawn at an iteration: bands of the colours come one by one; the opaque finish."""
+    plain = SoupAppearance(
+        kernel=config.kernel,
+        distance=config.distance,
+        sh_degree=min(config.drawing.sh_degree, iteration // config.at(config.schedule.sh_every)),
+        cull_small=config.drawing.cull_small,
+        cull_large=math.inf if config.drawing.cull_large is None else config.drawing.cull_large,
+        freeze_incentre=config.drawing.freeze_inradius and config.distance == "sdf",
+        near_plane=config.drawing.near_plane,
+        background=_background(config),
+    )
+    if config.finish == "none":
+        return plain
+    opaque = ramp(iteration, 0, round(OPAQUE_AT * config.iterations))
+    sharp = ramp(iteration, round(SHARP_FROM * config.iterations), round(SHARP_AT * config.iterations))
+    ceiling = FIRST_CEILING * (FINAL_CEILING / FIRST_CEILING) ** sharp
+    return replace(plain, opacity_floor=FINAL_FLOOR * opaque, sigma_ceiling=ceiling)
 
 
 def demo_capture(width: int | None, progress: Callable[[int, int], None] | None = None) -> Dataset:
     """The scene that is built in code, in photos no wider than a setting asks for; None for their usual width."""
     width = min(WIDTH, width or WIDTH)
     return demo_scene(width, max(1, round(HEIGHT * width / WIDTH)), progress=progress)
-
-
-def predicted_bytes(capture: Dataset, config: TrainConfig, device: torch.device | None = None) -> int:
-    """Memory of a device, None for the CPU, that a run may come to need, beyond the program itself."""
-    pixels = max(width * height for width, height in capture.images.sizes)
-    triangles = max(config.max_triangles, _start_count(capture, config))
-    kept = not capture.images.streamed and (device is None or stay_on(device, capture.images.total_bytes))
-    pictures = capture.images.total_bytes if kept else 0
-    return triangles * BYTES_PER_TRIANGLE + pixels * BYTES_PER_PIXEL + pictures
 
 
 def _load(
@@ -191,53 +309,6 @@ def _load(
     return load_dataset(source, images=images, width=config.width, masks=masks, progress=progress)
 
 
-def _check(capture: Dataset, config: TrainConfig, iterations: int, device: torch.device) -> list[str]:
-    """Refuses what cannot work; returns what the owner of a run of so many iterations should know."""
-    if not capture.train:
-        raise InputError("capture: has no view to train on; name some in its split")
-    needed = predicted_bytes(capture, config, device)
-    free = torch.cuda.mem_get_info(device)[0] if device.type == "cuda" else available_memory()
-    if needed > free:
-        fitting = max(1000, int(config.max_triangles - (needed - free) / BYTES_PER_TRIANGLE))
-        raise InputError(
-            f"max_triangles: {config.max_triangles:,} triangles may need {needed / 2**30:.1f} GiB and "
-            f"{free / 2**30:.1f} GiB are free; set it to {fitting} or less"
-        )
-    notes = [
-        f"{len(capture.train)} photos to train on, {len(capture.test)} to test; at most {_amount(needed)} of memory"
-    ]
-    if iterations < config.iterations:
-        limit = f"schedule.max_epochs {config.schedule.max_epochs}"
-        notes.append(f"few photos: {iterations:,} iterations, not {config.iterations:,} ({limit})")
-    if capture.images.streamed:
-        notes.append("the photos do not fit into memory: they are decoded anew whenever they are needed")
-    if capture.exact_points is None:
-        notes.append(f"no points in the capture: starting from {config.start.points:,} random ones")
-    if doubt := _doubtful_scale(capture, config):
-        notes.append(doubt)
-    return notes
-
-
-def _doubtful_scale(capture: Dataset, config: TrainConfig) -> str | None:
-    """What to do about a scene whose size the absolute settings were not made for, if it is one."""
-    low, high = USUAL_EXTENT
-    if config.normalize or low <= capture.extent <= high:
-        return None
-    return (
-        f"the cameras are spread over {capture.extent:.4g} units, and the settings are made for {low:g} to {high:g}: "
-        "start again with --normalize, which scales the scene"
-    )
-
-
-def _amount(count: int) -> str:
-    return f"{count / 2**30:.1f} GiB" if count >= 2**30 else f"{count >> 20} MiB"
-
-
-def _start_count(capture: Dataset, config: TrainConfig) -> int:
-    points = config.start.points if capture.exact_points is None else len(capture.exact_points)
-    return points + (SPHERE_TRIANGLES if config.sky == "sphere" else 0)
-
-
 def _start_points(capture: Dataset, config: TrainConfig, generator: torch.Generator) -> StartPoints:
     """The capture's points, or random ones in a cube that holds what the cameras look at."""
     positions, colors = capture.points, capture.point_colors
@@ -249,34 +320,29 @@ def _start_points(capture: Dataset, config: TrainConfig, generator: torch.Genera
     return points.with_sky() if config.sky == "dome" else points
 
 
-def _background(config: TrainConfig) -> Float[Tensor, "3"]:
+def _background(config: TrainConfig) -> tuple[float, float, float]:
     """Behind the pictures that are measured."""
-    return torch.full((3,), 1.0 if config.background == "white" else 0.0)
-
-
-def _span(points: StartPoints) -> float:
-    """Longest side of the box around the points."""
-    return float((points.positions.amax(dim=0) - points.positions.amin(dim=0)).max()) if len(points) else 0.0
+    grey = 1.0 if config.background == "white" else 0.0
+    return grey, grey, grey
 
 
 def _finish(
-    fitting: SoupFitting,
+    trainer: Trainer[TriangleSoup],
     progress: Progress,
     run: RunDirectory,
-    scorer: SoupScorer,
+    scorer: Scorer,
     capture: Dataset,
     config: TrainConfig,
 ) -> TrainResult:
     """Writes the soup in the input's units, draws the test views, measures everything."""
-    soup, appearance = fitting.finished()
-    scores = scorer.full(soup, appearance, run.test)
-    file = _soup_file(fitting, progress.iteration, capture, config)
-    save_soup(run.soup_path, file)
+    soup = trainer.model.finished()
+    scores = scorer.full(soup, run.test)
+    result = _in_own_units(trainer, progress.iteration, capture, config)
+    result.save(run.soup_path)
     metrics = {
         **scores,
         "psnr_opaque_loss": None if scores["psnr"] is None else scores["psnr"] - scores["psnr_opaque"],
-        "triangles": len(soup),
-        **fitting.describe(),
+        **trainer.describe(),
         "width": capture.images.sizes[0][0],
         "height": capture.images.sizes[0][1],
         "train_views": len(capture.train),
@@ -285,16 +351,17 @@ def _finish(
         **common_metrics(progress, config, soup.vertices),
     }
     run.write_metrics(metrics)
-    return TrainResult(run.path, file.soup, run.read_metrics())
+    return TrainResult(run.path, result, run.read_metrics())
 
 
-def _soup_file(fitting: SoupFitting, iteration: int, capture: Dataset, config: TrainConfig) -> SoupFile:
-    """The soup as it is now, in the input's units."""
-    soup, appearance = fitting.finished()
-    soup, own, grey = soup.to(torch.device("cpu")), capture.normalization, float(_background(config)[0])
-    return SoupFile(
-        replace(soup, vertices=own.invert(soup.vertices.double()).float()),
-        replace(appearance, near_plane=appearance.near_plane * own.radius),
-        (grey, grey, grey),
-        {"iteration": str(iteration), "method": config.method, "preset": config.preset},
+def _in_own_units(
+    trainer: Trainer[TriangleSoup], iteration: int, capture: Dataset, config: TrainConfig
+) -> TriangleSoup:
+    """The soup as it is now, on the CPU."""
+    soup, own = trainer.model.finished().to(torch.device("cpu")), capture.normalization
+    return replace(
+        soup,
+        vertices=own.invert(soup.vertices.double()).float(),
+        appearance=replace(soup.appearance, near_plane=soup.appearance.near_plane * own.radius),
+        notes={"iteration": str(iteration), "method": config.method, "preset": config.preset},
     )

@@ -178,7 +178,7 @@ class TrainConfig(Settings):
     """Kernel of the triangles: elastic (the paper's), bilateral (2DTS), single-sided (Triangle Splatting) or a name
     given to `register_kernel`."""
     iterations: Annotated[int, Range(1)] = 6000
-    """Optimization steps; each sees one view."""
+    """Optimization steps."""
     width: Annotated[int | None, Range(1)] = 800
     """Wider images are scaled down to this width; None shrinks those wider than 1600 pixels to 1600."""
     max_triangles: Annotated[int, Range(1)] = 100_000
@@ -192,6 +192,8 @@ class TrainConfig(Settings):
     or a closed sphere in the colours of the photos, which stays where no photo shows it."""
     finish: Literal["none", "opaque"] = "none"
     """opaque: triangles are made opaque, then sharp, for engines without transparency."""
+    batch: Annotated[int, Range(1), Rare] = 1
+    """Views that each step sees; the paper's method sees one."""
     seed: Annotated[int, Range(0), Rare] = 0
     """Of every random choice: start, order of views, backgrounds, densification."""
     device: Device | None = None

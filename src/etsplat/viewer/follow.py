@@ -8,7 +8,7 @@ import torch
 
 from etsplat.core.errors import InputError
 from etsplat.io.run_directory import RunDirectory, is_run
-from etsplat.model.soup_files import SoupFile, load_soup
+from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.tasks.soup_run import check_trains
 
 WAITING_SECONDS = 1.0
@@ -48,17 +48,17 @@ class Followed:
         self._run, self._device = RunDirectory(folder), device
         self._seen = self._stamp()
 
-    def poll(self) -> SoupFile | None:
+    def poll(self) -> TriangleSoup | None:
         """The new soup if there is one since the last call."""
         stamp = self._stamp()
         if stamp == self._seen:
             return None
         try:
-            file = load_soup(self._run.soup_path).to(self._device)
+            soup = TriangleSoup.load(self._run.soup_path).to(self._device)
         except InputError:  # the file went away in between: a run was started anew
             return None
         self._seen = stamp
-        return file
+        return soup
 
     def status(self) -> str:
         """How the run stands, in a line; empty before its first line of history."""

@@ -9,8 +9,7 @@ from torch import Tensor
 
 from etsplat.core.cameras import Cameras
 from etsplat.io.images import to_8_bit
-from etsplat.model.soup_files import SoupFile
-from etsplat.model.soup_rendering import OPAQUE_FROM
+from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.ops.rasterize_hard import rasterize_hard
 from etsplat.ops.soup_colors import soup_colors
 from etsplat.tasks.render_config import RenderConfig
@@ -24,27 +23,26 @@ _LINE = 0.25
 
 
 @torch.no_grad()
-def picture(file: SoupFile, camera: Cameras, mode: Mode) -> UInt8[Tensor, "H W 3"]:
+def picture(soup: TriangleSoup, camera: Cameras, mode: Mode) -> UInt8[Tensor, "H W 3"]:
     """One camera's picture, 8 bits.
 
     Modes: soft is the splatted soup; opaque its triangles above half opacity, sharp, as a mesh viewer draws them; depth
     in false colours, near is red; normals as (n + 1) / 2; wireframe the nearest triangles with their borders.
     """
     if mode == "wireframe":
-        return to_8_bit(_wireframe(file, camera).cpu())
+        return to_8_bit(_wireframe(soup, camera).cpu())
     config = RenderConfig(opaque=mode == "opaque", depth=mode == "depth", normals=mode == "normal")
-    pictures = draw(file, camera, config)
+    pictures = draw(soup, camera, config)
     if mode == "depth":
         return to_8_bit(color_depth(pictures["depth"], depth_span(pictures["depth"])))
     return to_8_bit(pictures["normal" if mode == "normal" else "color"])
 
 
-def _wireframe(file: SoupFile, camera: Cameras) -> Float[Tensor, "H W 3"]:
+def _wireframe(soup: TriangleSoup, camera: Cameras) -> Float[Tensor, "H W 3"]:
     """Flat triangles, dark where the triangle of the pixel to the right or below is another one."""
-    soup, appearance = file.soup, file.appearance
-    kept = appearance.opacities(soup) >= OPAQUE_FROM
+    appearance, kept = soup.appearance, soup.seen_opaque
     camera = camera.to(soup.vertices.device)
-    image = torch.tensor(file.background).to(soup.vertices).expand(camera.height, camera.width, 3)
+    image = torch.tensor(appearance.background).to(soup.vertices).expand(camera.height, camera.width, 3)
     if not bool(kept.any()):
         return image
     chosen = replace(soup, **{name: tensor[kept] for name, tensor in soup.parameters().items()})
@@ -55,8 +53,8 @@ def _wireframe(file: SoupFile, camera: Cameras) -> Float[Tensor, "H W 3"]:
         .triangle[0]
         .long()
     )
-    degree = appearance.degree(soup)
-    colors = soup_colors(chosen.vertices, chosen.sh_dc, chosen.sh_rest, camera.centers, degree)[0].clamp(0, 1)
+    view = chosen.vertices, chosen.sh_dc, chosen.sh_rest, camera.centers
+    colors = soup_colors(*view, soup.drawn_degree)[0].clamp(0, 1)
     flat = torch.where(hit[..., None] >= 0, colors[hit.clamp_min(0)], image)
     border = torch.zeros_like(hit, dtype=torch.bool)
     border[:, :-1] |= hit[:, 1:] != hit[:, :-1]

@@ -19,7 +19,7 @@ from etsplat.core.cameras import Cameras, intrinsics
 from etsplat.core.errors import InputError
 from etsplat.data.camera_paths import focus_point
 from etsplat.data.dataset import Dataset
-from etsplat.model.soup_files import SoupFile
+from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.tasks.soup_run import SoupRun, world_up
 from etsplat.viewer.follow import Followed
 from etsplat.viewer.guard import Guard
@@ -54,7 +54,7 @@ class Viewer:
         """
         server_class = _server_class()
         self._run, self._width = run, width
-        self._file: SoupFile = run.file
+        self._soup = run.soup
         self._clients: dict[int, _Client] = {}
         self._closed = threading.Event()
         _check_address(host, port)
@@ -72,9 +72,9 @@ class Viewer:
         return self.server.get_port()
 
     @property
-    def file(self) -> SoupFile:
+    def soup(self) -> TriangleSoup:
         """What is shown now."""
-        return self._file
+        return self._soup
 
     @property
     def mode(self) -> Any:
@@ -93,7 +93,7 @@ class Viewer:
         gui.configure_theme(show_share_button=False)
         self._mode = gui.add_dropdown("Mode", MODES, initial_value="soft")
         self._show_cameras = gui.add_checkbox("Training cameras", False, disabled=self._run.capture is None)
-        self._status = gui.add_markdown(_describe(self._file))
+        self._status = gui.add_markdown(_describe(self._soup))
         self._mode.on_update(lambda _: self._refresh())
         frusta: list[Any] = []
         if self._run.capture is not None:
@@ -112,7 +112,7 @@ class Viewer:
         if self._run.capture is not None:
             _stand_at_first_camera(client, self._run.capture)
         else:
-            _stand_before(client, self._file)
+            _stand_before(client, self._soup)
         self._clients[client.client_id] = _Client(self, client, self._width)
 
     def _disconnected(self, identity: int) -> None:
@@ -126,11 +126,11 @@ class Viewer:
 
     def _follow(self, followed: Followed) -> None:
         while not self._closed.wait(POLL_SECONDS):
-            file = followed.poll()
-            if file is not None:
-                self._file = file
+            soup = followed.poll()
+            if soup is not None:
+                self._soup = soup
                 self._refresh()
-            self._status.content = "\n\n".join(text for text in (_describe(self._file), followed.status()) if text)
+            self._status.content = "\n\n".join(text for text in (_describe(self._soup), followed.status()) if text)
 
 
 class _Client:
@@ -169,7 +169,7 @@ class _Client:
 
     def _draw(self, width: int, quality: int = 70) -> None:
         camera = camera_of(self._client.camera, width)
-        pixels = picture(self._viewer.file, camera, self._viewer.mode)
+        pixels = picture(self._viewer.soup, camera, self._viewer.mode)
         if self._closed:  # while it was drawn: viser would warn that nobody gets the picture
             return
         self._client.scene.set_background_image(pixels.numpy(), format="jpeg", jpeg_quality=quality)
@@ -210,9 +210,9 @@ def _check_address(host: str, port: int) -> None:
             ) from error
 
 
-def _describe(file: SoupFile) -> str:
-    iteration = file.notes.get("iteration")
-    return f"{len(file.soup):,} triangles" + (f" after {int(iteration):,} iterations" if iteration else "")
+def _describe(soup: TriangleSoup) -> str:
+    iteration = soup.notes.get("iteration")
+    return f"{len(soup):,} triangles" + (f" after {int(iteration):,} iterations" if iteration else "")
 
 
 def _add_frusta(server: Any, capture: Dataset) -> list[Any]:
@@ -257,9 +257,9 @@ def _stand_at(client: Any, capture: Dataset, index: int) -> None:
         client.camera.fov = 2 * float(torch.atan(capture.images.sizes[index][1] / (2 * capture.Ks[index, 1, 1])))
 
 
-def _stand_before(client: Any, file: SoupFile) -> None:
+def _stand_before(client: Any, soup: TriangleSoup) -> None:
     """Without cameras: far enough away to see nine tenths of the triangles."""
-    centers = file.soup.vertices.detach().mean(dim=1).cpu()
+    centers = soup.vertices.detach().mean(dim=1).cpu()
     middle = centers.median(dim=0).values
     distance = 2.5 * float(torch.quantile((centers - middle).norm(dim=1)[:1_000_000], 0.9))
     with client.atomic():

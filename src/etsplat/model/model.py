@@ -1,0 +1,103 @@
+"""What can be fitted to photos: the trainer, the objectives and the scorer know a model by this alone."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, ClassVar, Literal, Protocol, TypeVar
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from etsplat.core.cameras import Cameras
+from etsplat.core.rasterization import Rasterization
+
+Depth = Literal["plane", "centroid"]
+
+
+class Appearance(Protocol):
+    """How the numbers of a model become pictures: a frozen dataclass."""
+
+    @property
+    def numbers(self) -> tuple[float, ...]:
+        """Those of its values that may change at every step."""
+        ...
+
+    @property
+    def structure(self: "A") -> "A":
+        """All else: what changes the kernels that are launched, and so seldom. Comparable."""
+        ...
+
+    def on_device(self: "A", numbers: Float[Tensor, " K"]) -> "A":
+        """The same with its `numbers` read from device memory, for steps that the host does not look at."""
+        ...
+
+
+A = TypeVar("A", bound=Appearance)
+M = TypeVar("M", bound="Model")
+
+
+class Model(Protocol):
+    """Learnable triangles.
+
+    Attributes:
+        appearance: how they are drawn, in training and ever after.
+        RATES: Adam's learning rate of each parameter where nobody says otherwise, for a model of about unit size.
+        OPAQUE: what its picture is called where a mesh viewer draws it.
+    """
+
+    appearance: Any
+    RATES: ClassVar[Mapping[str, float]]
+    OPAQUE: ClassVar[str]
+
+    @property
+    def count(self) -> int:
+        """Number of triangles."""
+        ...
+
+    @property
+    def needs_host(self) -> bool:
+        """Whether drawing waits for the host, so that steps cannot be queued on a device."""
+        ...
+
+    def parameters(self) -> dict[str, Tensor]:
+        """The learnable tensors by name."""
+        ...
+
+    def render(
+        self,
+        cameras: Cameras,
+        *,
+        backgrounds: Float[Tensor, "B 3"] | None = None,
+        outputs: tuple[str, ...] = ("color",),
+        depth_of: Depth = "plane",
+    ) -> Rasterization:
+        """Pictures of B cameras, differentiable; `outputs` and `depth_of` as in `etsplat.rasterize`."""
+        ...
+
+    def render_opaque(self, cameras: Cameras, *, supersampling: int = 4) -> Float[Tensor, "B H W 4"]:
+        """What a mesh viewer shows: opaque triangles with a z-buffer, premultiplied RGBA, detached."""
+        ...
+
+    def surface(self) -> tuple[Float[Tensor, "V 3"], Int[Tensor, "F 3"]]:
+        """Vertices and faces of what a mesh viewer shows, detached, on the CPU."""
+        ...
+
+    def describe(self) -> dict[str, float]:
+        """A few numbers for the log, by name. Changes nothing."""
+        ...
+
+    def state(self) -> dict[str, Tensor]:
+        """Every tensor that the model consists of, detached, by name, for a checkpoint."""
+        ...
+
+    def load_state(self, state: Mapping[str, Tensor]) -> None:
+        """Takes these tensors in the place of its own, onto its device; those not named stay."""
+        ...
+
+    def to(self: M, device: torch.device) -> M:
+        """The same on another device, in leaf tensors of its own."""
+        ...
+
+    def save(self, path: Path | str) -> None:
+        """Writes a file, atomically; the suffix is its kind."""
+        ...

@@ -1,0 +1,74 @@
+"""How a triangle soup is drawn, in training and afterwards."""
+
+import json
+from dataclasses import dataclass, field, fields, replace
+
+from jaxtyping import Float
+from torch import Tensor
+
+SMALLEST_INRADIUS = 1.0
+"""Triangle Splatting draws no triangle whose inscribed circle on the image is smaller, in pixels."""
+
+OPAQUE_FROM = 0.5
+"""Where a soup is drawn opaque, fainter triangles are left out."""
+
+
+@dataclass(frozen=True)
+class SoupAppearance:
+    """How the numbers of a soup become pictures.
+
+    Attributes:
+        kernel: "elastic", "bilateral" or "single_sided".
+        distance: "barycentric" or "sdf".
+        sh_degree: highest band of the colours that is used; None for all that the soup has.
+        cull_small: leave out triangles with an inradius below one pixel, as Triangle Splatting does.
+        cull_large: leave out triangles with a vertex farther from their middle than this times the image's longer side.
+            Beside the camera triangles are stretched without bound, and would cover images that they are not in.
+        freeze_incentre: with distance "sdf", hold the inradius constant in the backward pass, as Triangle Splatting.
+        near_plane: triangles with a vertex at this depth or nearer are invisible.
+        background: display colour behind them where nobody names another.
+        opacity_floor: opacities are squeezed into [floor, 1].
+        sigma_ceiling: softness is cut here.
+        limits: (2,) floor and ceiling in device memory, in the place of the two above, within a queued step.
+    """
+
+    kernel: str = "elastic"
+    distance: str = "barycentric"
+    sh_degree: int | None = None
+    cull_small: bool = False
+    cull_large: float = float("inf")
+    freeze_incentre: bool = False
+    near_plane: float = 0.01
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    opacity_floor: float = 0.0
+    sigma_ceiling: float = float("inf")
+    limits: Float[Tensor, "2"] | None = field(default=None, compare=False, repr=False)
+
+    @property
+    def numbers(self) -> tuple[float, float]:
+        """Opacity floor and sigma ceiling, which may change at every step."""
+        return self.opacity_floor, self.sigma_ceiling
+
+    def to_json(self) -> str:
+        """For files; `limits` are not in it, nor is what is infinite, as JSON has no such numbers."""
+        values = {entry.name: getattr(self, entry.name) for entry in fields(self) if entry.name != "limits"}
+        return json.dumps({name: value for name, value in values.items() if value != float("inf")})
+
+    @staticmethod
+    def from_json(text: str) -> "SoupAppearance":
+        """Of `to_json`; names that this version does not know are left out."""
+        known = {entry.name for entry in fields(SoupAppearance)}
+        values = {name: value for name, value in json.loads(text).items() if name in known}
+        if "background" in values:
+            red, green, blue = (float(channel) for channel in values["background"])
+            values["background"] = (red, green, blue)
+        return SoupAppearance(**values)
+
+    @property
+    def structure(self) -> "SoupAppearance":
+        """The same without floor and ceiling."""
+        return replace(self, opacity_floor=0.0, sigma_ceiling=float("inf"), limits=None)
+
+    def on_device(self, numbers: Float[Tensor, "2"]) -> "SoupAppearance":
+        """The same with floor and ceiling read from device memory."""
+        return replace(self, limits=numbers)

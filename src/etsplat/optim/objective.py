@@ -1,0 +1,137 @@
+"""What is minimised: how far pictures are from photos, and a sum of weighted terms.
+
+    L = photometric + scale * sum_k weight_k value_k ^ power_k
+
+A step sees one view or more. Each view is drawn, compared and differentiated by itself; what looks at pictures counts
+with the mean over the views, what looks at parameters alone counts once.
+"""
+
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, Literal
+
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from etsplat.core.cameras import Cameras
+from etsplat.core.rasterization import Rasterization
+from etsplat.model.model import Depth
+from etsplat.ops.weighted_sum import Term as Summand
+from etsplat.ops.weighted_sum import weighted_sum
+from etsplat.optim.schedules import Scheduled, at
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """One view of a step: what terms look at.
+
+    Attributes:
+        model: as it is now.
+        camera: of the view.
+        photo: (1, H, W, 3 or 4), bytes or floats in [0, 1]; four channels are premultiplied.
+        mask: (1, H, W) bytes, 255 where pixels count, or None.
+        background: (1, 3) behind the picture, and to be put behind the photo.
+        rendering: the picture, with the outputs that the terms ask for.
+        shared: what one term has computed of this view for others, by its name.
+    """
+
+    model: Any
+    camera: Cameras
+    photo: UInt8[Tensor, "1 H W C"] | Float[Tensor, "1 H W C"]
+    mask: UInt8[Tensor, "1 H W"] | None
+    background: Float[Tensor, "1 3"]
+    rendering: Rasterization
+    shared: dict[Hashable, Any] = field(default_factory=dict)
+
+
+class Term:
+    """One summand: weight * value ^ power. A term of one's own overrides `__call__`, or is made by `Custom`.
+
+    Attributes:
+        name: what settings call it: `lambda_NAME` is its weight. None for a term without a setting.
+        weight: a number, or a function of the iteration; at 0 the term is not computed. On a device a new weight
+            captures the steps anew, so what changes at every step belongs into the objective's `scale`.
+        outputs: what it needs of `etsplat.rasterize`; nothing for a term that depends on the parameters alone.
+        power: of the value.
+    """
+
+    name: ClassVar[str | None] = None
+    outputs: tuple[str, ...] = ()
+    power: Literal[1, -1, -2] = 1
+
+    def __init__(self, weight: Scheduled = 1.0) -> None:
+        self.weight = weight
+
+    def __call__(self, drawing: Drawing) -> Float[Tensor, ""]:
+        """The value, differentiable."""
+        raise NotImplementedError
+
+
+class Custom(Term):
+    """A term of one's own from a function of the drawing."""
+
+    def __init__(
+        self, value: Callable[[Drawing], Float[Tensor, ""]], weight: Scheduled = 1.0, *, outputs: tuple[str, ...] = ()
+    ) -> None:
+        super().__init__(weight)
+        self._value, self.outputs = value, outputs
+
+    def __call__(self, drawing: Drawing) -> Float[Tensor, ""]:
+        """Of the function."""
+        return self._value(drawing)
+
+
+class Objective:
+    """A photometric term and others.
+
+    Attributes:
+        photometric: compares pictures with photos; its weight is 1.
+        terms: the others, added in their order.
+        scale: of all others together: a number, or a function of the iteration.
+        depth_of: where depths of the outputs are measured: on a triangle's "plane" or at its "centroid".
+    """
+
+    def __init__(
+        self, photometric: Term, terms: Sequence[Term] = (), *, scale: Scheduled = 1.0, depth_of: Depth = "plane"
+    ) -> None:
+        self.photometric, self.terms, self.scale = photometric, tuple(terms), scale
+        self.depth_of: Depth = depth_of
+
+    def weights(self, iteration: int) -> tuple[float, ...]:
+        """Of the terms."""
+        return tuple(at(term.weight, iteration) for term in self.terms)
+
+    def outputs(self, weights: Sequence[float]) -> tuple[str, ...]:
+        """What pictures must hold for the terms that count."""
+        counting = [self.photometric, *(term for term, weight in zip(self.terms, weights, strict=True) if weight)]
+        return tuple(dict.fromkeys(name for term in counting for name in term.outputs))
+
+    def __call__(
+        self,
+        drawing: Drawing,
+        weights: Sequence[float],
+        scale: float | Float[Tensor, ""],
+        *,
+        views: int = 1,
+        whole: bool = True,
+    ) -> Float[Tensor, ""]:
+        """The part of a step's objective that belongs to one of its views.
+
+        Args:
+            drawing: the view.
+            weights: of the terms, as of `weights`.
+            scale: of them all; at the number 0 they are not computed.
+            views: how many the step has.
+            whole: whether terms that depend on the parameters alone belong to this view.
+        """
+        first = self.photometric(drawing)
+        if views > 1:
+            first = first / views
+        if not isinstance(scale, Tensor) and scale == 0.0:
+            return first
+        summands = [
+            Summand(weight / views if term.outputs else weight, term(drawing), term.power)
+            for term, weight in zip(self.terms, weights, strict=True)
+            if weight and (whole or term.outputs)
+        ]
+        return weighted_sum(first, summands, scale)

@@ -1,0 +1,219 @@
+"""When triangles are added and removed, and which: strategies. They edit through `optim/edit.py` alone."""
+
+import math
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from etsplat.core.rasterization import Rasterization
+from etsplat.geometry.measures import face_areas
+from etsplat.geometry.subdivision import longest_edge_plan
+from etsplat.geometry.untangle import untangle
+from etsplat.model.triangle_mesh import TriangleMesh
+from etsplat.model.triangle_soup import TriangleSoup
+from etsplat.ops.adam import Adam
+from etsplat.optim.densification import PruneRules, SoupStatistics, dead_triangles, densify_plan, grown_count
+from etsplat.optim.edit import RowPlan, apply_rows, apply_subdivision
+from etsplat.optim.loop import DivergedError
+from etsplat.optim.terms.soup import Spared
+
+NEVER = 1 << 62
+
+
+class Strategy:
+    """What a run does to the number of its triangles; this one does nothing. One of your own overrides what it needs.
+
+    Attributes:
+        outputs: what it looks at of each picture of a step, as of `etsplat.rasterize`.
+        model: what is edited, from `start` on.
+        adam: its optimizer.
+        views: number of training views.
+        generator: of every random choice.
+    """
+
+    outputs: tuple[str, ...] = ()
+    model: Any
+    adam: Adam
+    views: int
+    generator: torch.Generator
+
+    def start(self, model: Any, adam: Adam, views: int, generator: torch.Generator) -> None:
+        """Called once, before the first step."""
+        self.model, self.adam, self.views, self.generator = model, adam, views, generator
+
+    def next_edit(self, iteration: int) -> int:
+        """The first iteration, from this one on, after whose step `edit` may have something to do."""
+        return NEVER
+
+    def edit(self, iteration: int) -> bool:
+        """Edits the model if it is time to. Returns whether tensors were replaced."""
+        return False
+
+    def observe(self, seen: Rasterization, *, epoch_starts: bool) -> None:
+        """Takes in a view of a step; `epoch_starts` if it is the first after all views had their turn."""
+
+    def observe_on_device(self, seen: Rasterization, epoch_starts: Tensor, halted: Tensor) -> None:
+        """As `observe`, without the host: `epoch_starts` (1,) is 0 or 1, nothing changes where () `halted` is not 0."""
+
+    def state(self) -> dict[str, Tensor]:
+        """Everything that later edits depend on, by name, for a checkpoint."""
+        return {}
+
+    def load_state(self, state: Mapping[str, Tensor]) -> None:
+        """Continues where `state` was taken."""
+
+
+class Fixed(Strategy):
+    """The triangles of the start are those of the end."""
+
+
+class SubdivideAndUntangle(Strategy):
+    """Divides a mesh's largest faces at given times (paper, appendix Adaptive Refinement), and smooths folds away."""
+
+    def __init__(self, budgets: Mapping[int, int], untangle_after: Collection[int] = ()) -> None:
+        """Takes the times.
+
+        Args:
+            budgets: by iteration, how many faces there may be after it (`optim.schedules.face_budgets`).
+            untangle_after: iterations after which faces that cut through others are smoothed away.
+        """
+        self._budgets, self._untangle_after = dict(budgets), set(untangle_after)
+
+    def next_edit(self, iteration: int) -> int:
+        """The next of the given times."""
+        return min((i for i in (*self._budgets, *self._untangle_after) if i >= iteration), default=NEVER)
+
+    def edit(self, iteration: int) -> bool:
+        """Untangles, then divides."""
+        mesh: TriangleMesh = self.model
+        topology = mesh.topology.to(torch.device("cpu"))
+        if iteration in self._untangle_after:
+            # What smoothing takes away later steps bring back, but nothing does after the last.
+            reach = 0.5 if iteration == max(self._untangle_after) else math.inf
+            with torch.no_grad():
+                mesh.vertices.copy_(untangle(mesh.vertices.cpu(), topology, reach=reach)[0])
+        if iteration not in self._budgets:
+            return False
+        vertices = mesh.vertices.detach().cpu()
+        plan = longest_edge_plan(vertices, topology, face_areas(vertices, topology.faces), self._budgets[iteration])
+        carried = apply_subdivision(plan, self.adam, per_vertex=mesh.vertex_parameters, per_face=mesh.face_parameters)
+        mesh.load_state({**carried, "faces": plan.faces})
+        return True
+
+
+@dataclass
+class DensifyAndPrune(Strategy):
+    """Triangles of a soup multiply and die by Triangle Splatting's rules (`optim/densification.py`).
+
+    Attributes:
+        after: no edit up to this iteration.
+        until: from this iteration on triangles only die.
+        every: iterations between edits.
+        last: no edit from this iteration on, the last of the run.
+        max_triangles: no more than these.
+        growth: each edit multiplies their number by this, at most.
+        replace_dead: triangles that die count in the number that is multiplied, so that all of them are replaced.
+        sample_by: what makes a parent likely: its opacity, 1/sigma, or the one and the other in turn.
+        split_size: parents larger on screen than this, in pixels, are split into four; others are cloned.
+        clone_noise: how far a clone is shifted, as a multiple of the triangle's extent.
+        prune: when a triangle dies.
+        spared: of which triangles, by their corners, those that no view has seen stay.
+    """
+
+    after: int = 100
+    until: int = NEVER
+    every: int = 100
+    last: int = NEVER
+    max_triangles: int = 100_000
+    growth: float = 1.3
+    replace_dead: bool = True
+    sample_by: Literal["alternate", "opacity", "sharpness"] = "alternate"
+    split_size: float = 24.0
+    clone_noise: float = 1.5
+    prune: PruneRules = field(default_factory=PruneRules)
+    spared: Spared | None = None
+
+    outputs = ("statistics",)
+
+    def start(self, model: TriangleSoup, adam: Adam, views: int, generator: torch.Generator) -> None:
+        """Nobody has seen any triangle yet."""
+        super().start(model, adam, views, generator)
+        self.statistics = SoupStatistics.zeros(model.count, model.vertices.device)
+
+    def next_edit(self, iteration: int) -> int:
+        """The next multiple of `every`."""
+        return -(-iteration // self.every) * self.every
+
+    def edit(self, iteration: int) -> bool:
+        """Lets triangles multiply and die, or only die."""
+        if iteration % self.every or iteration <= self.after or iteration >= self.last:
+            return False
+        if iteration < self.until:
+            self.densify(iteration)
+        else:
+            self._apply(RowPlan.keeping(~self._dead(iteration)))
+        return True
+
+    def densify(self, iteration: int) -> None:
+        """Removes dead triangles and lets others multiply, whatever the time."""
+        self._apply(self._densification(iteration, self._dead(iteration)))
+
+    def observe(self, seen: Rasterization, *, epoch_starts: bool) -> None:
+        """Takes in the statistics of a view."""
+        assert seen.statistics is not None
+        self.statistics.update(seen.statistics, self.views, epoch_starts=epoch_starts)
+
+    def observe_on_device(self, seen: Rasterization, epoch_starts: Tensor, halted: Tensor) -> None:
+        """Takes in the statistics of a view."""
+        assert seen.statistics is not None
+        self.statistics.update_on_device(seen.statistics, self.views, epoch_starts, halted)
+
+    def state(self) -> dict[str, Tensor]:
+        """The statistics."""
+        return self.statistics.tensors()
+
+    def load_state(self, state: Mapping[str, Tensor]) -> None:
+        """Takes the statistics."""
+        device = self.model.vertices.device
+        self.statistics = SoupStatistics(**{name: tensor.to(device) for name, tensor in state.items()})
+
+    def _dead(self, iteration: int) -> Tensor:
+        first = iteration <= self.after + self.every
+        rules = self.prune.limited(views=0 if first else self.views, by_size=iteration < self.until and not first)
+        with torch.no_grad():
+            dead = dead_triangles(self.model.drawn_opacities, self.statistics, rules, self.views)
+        if self.spared is not None:
+            dead &= ~(self.spared(self.model.vertices) & (self.statistics.screen_size == 0))
+        if bool(dead.all()):
+            raise DivergedError(
+                f"no triangle is left at iteration {iteration}; lower lambda_opacity or prune_importance"
+            )
+        return dead
+
+    def _densification(self, iteration: int, dead: Tensor) -> RowPlan:
+        soup = self.model
+        by = self.sample_by
+        if by == "alternate":
+            by = "opacity" if iteration // self.every % 2 == 0 else "sharpness"
+        count = soup.count if self.replace_dead else soup.count - int(dead.sum())
+        return densify_plan(
+            soup.vertices.detach(),
+            soup.opacity_logits.detach(),
+            soup.sigma.detach(),
+            self.statistics.screen_size,
+            dead,
+            target=grown_count(count, self.growth, self.max_triangles),
+            by=by,
+            split_size=self.split_size,
+            noise=self.clone_noise,
+            generator=self.generator,
+        )
+
+    def _apply(self, plan: RowPlan) -> None:
+        parameters, statistics = apply_rows(plan, self.adam, self.statistics.tensors())
+        self.model.load_state(parameters)
+        self.statistics = SoupStatistics(**statistics)
+        self.statistics.restart(self.statistics.judged(self.views))

@@ -1,0 +1,71 @@
+"""Terms that keep a mesh well shaped (paper section 3.3, L_mesh; formulas in ops/mesh_energies.py)."""
+
+from jaxtyping import Float
+from torch import Tensor
+
+from etsplat.model.triangle_mesh import TriangleMesh
+from etsplat.ops.mesh_energies import MeshEnergies, mesh_energies
+from etsplat.optim.objective import Drawing, Term
+from etsplat.optim.schedules import Scheduled
+
+
+def _mesh(drawing: Drawing, term: Term) -> TriangleMesh:
+    if not isinstance(drawing.model, TriangleMesh):
+        raise ValueError(f"{type(term).__name__} needs a TriangleMesh, got a {type(drawing.model).__name__}")
+    return drawing.model
+
+
+def _energies(drawing: Drawing, term: Term, edge_power: int | None = None) -> MeshEnergies:
+    """All three at once, as one call computes them; any exponent serves those that have none."""
+    energies = drawing.shared.setdefault("mesh_energies", {})
+    chosen = edge_power or next(iter(energies), 1)
+    if chosen not in energies:
+        mesh = _mesh(drawing, term)
+        energies[chosen] = mesh_energies(mesh.vertices, mesh.topology.connectivity, edge_power=chosen)
+    return energies[chosen]
+
+
+class EdgeLength(Term):
+    """L_e: the mean length of the edges, or the mean of its square."""
+
+    name = "edge"
+
+    def __init__(self, weight: Scheduled = 1.0, power: int = 1) -> None:
+        """Takes lambda_e and the exponent, 1 as the paper prints it or 2."""
+        super().__init__(weight)
+        self._edge_power = power
+
+    def __call__(self, drawing: Drawing) -> Float[Tensor, ""]:
+        """Of the mesh."""
+        return _energies(drawing, self, self._edge_power).edge
+
+
+class SmoothNormals(Term):
+    """L_n: the mean of 1 - cos of the angle between neighbouring faces."""
+
+    name = "smooth_normal"
+
+    def __call__(self, drawing: Drawing) -> Float[Tensor, ""]:
+        """Of the mesh."""
+        return _energies(drawing, self).normal
+
+
+class Laplacian(Term):
+    """L_lap: the mean distance of vertices from the mean of their neighbours."""
+
+    name = "laplacian"
+
+    def __call__(self, drawing: Drawing) -> Float[Tensor, ""]:
+        """Of the mesh."""
+        return _energies(drawing, self).laplacian
+
+
+class Softness(Term):
+    """sigma^-2, for the one softness of a mesh."""
+
+    name = "sigma"
+    power = -2
+
+    def __call__(self, drawing: Drawing) -> Float[Tensor, ""]:
+        """Sigma."""
+        return _mesh(drawing, self).sigma

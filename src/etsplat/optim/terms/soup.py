@@ -1,0 +1,71 @@
+"""Terms that keep a soup in order (paper section 3.4, L_nvs)."""
+
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from etsplat.ops.normal_consistency import normal_consistency
+from etsplat.ops.triangle_area import mean_area
+from etsplat.optim.objective import Drawing, Term
+from etsplat.optim.schedules import Scheduled
+
+Spared = Callable[[Float[Tensor, "N 3 3"]], Bool[Tensor, " N"]]
+
+
+class Opacity(Term):
+    """The mean opacity."""
+
+    name = "opacity"
+
+    def __init__(self, weight: Scheduled = 1.0, spared: Spared | None = None) -> None:
+        """Takes its weight, and which triangles count as transparent, by their corners; None for none."""
+        super().__init__(weight)
+        self._spared = spared
+
+    def __call__(self, drawing: Drawing) -> Float[Tensor, ""]:
+        """Of the soup."""
+        opacities = drawing.model.opacities
+        if self._spared is not None:
+            opacities = torch.where(self._spared(drawing.model.vertices), 0.0, opacities)
+        return opacities.mean()
+
+
+class Size(Term):
+    """The reciprocal of the mean area."""
+
+    name = "size"
+    power = -1
+
+    def __call__(self, drawing: Drawing) -> Float[Tensor, ""]:
+        """Mean area."""
+        return mean_area(drawing.model.vertices)
+
+
+class DepthNormals(Term):
+    """How far normals are from those of the depth image, where something is opaque (ops/normal_consistency.py)."""
+
+    name = "depth_normal"
+    outputs = ("normal", "median_depth")
+
+    def __call__(self, drawing: Drawing) -> Float[Tensor, ""]:
+        """Of one view."""
+        rendering, camera = drawing.rendering, drawing.camera
+        assert rendering.normal is not None
+        assert rendering.median_depth is not None
+        return normal_consistency(
+            rendering.normal, rendering.median_depth, rendering.alpha.detach(), camera.viewmats, camera.Ks
+        )
+
+
+class Distortion(Term):
+    """The mean spread of triangles along a line of sight."""
+
+    name = "distortion"
+    outputs = ("distortion",)
+
+    def __call__(self, drawing: Drawing) -> Float[Tensor, ""]:
+        """Of one view."""
+        assert drawing.rendering.distortion is not None
+        return drawing.rendering.distortion.mean()

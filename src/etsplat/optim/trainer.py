@@ -1,0 +1,344 @@
+"""Fits a model to photos: one trainer for every model, objective, strategy and data set."""
+
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass
+from itertools import takewhile
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from etsplat.core.rasterization import Rasterization
+from etsplat.core.validation import first_not_finite
+from etsplat.data.loader import ViewLoader
+from etsplat.engines.choice import engine_for
+from etsplat.io.run_directory import RunDirectory
+from etsplat.model.model import Model
+from etsplat.ops.adam import Adam
+from etsplat.optim.drive import Callback, drive
+from etsplat.optim.loop import LoopSettings, Progress
+from etsplat.optim.objective import Drawing, Objective
+from etsplat.optim.row import RowLayout
+from etsplat.optim.schedules import Schedule, at
+from etsplat.optim.step_queue import MAX_STEPS, QueuedStep, StepQueue
+from etsplat.optim.strategies import Fixed, Strategy
+from etsplat.optim.view_sampler import ViewSampler
+
+READ_AHEAD = 8
+"""Views whose photos are decoded ahead of their turn, where they do not fit into memory."""
+
+
+@dataclass(frozen=True)
+class _Chosen:
+    """A view of a step to come: its index, what is behind it, whether it is the first of an epoch."""
+
+    view: int
+    background: Float[Tensor, "1 3"]
+    epoch_starts: bool
+
+
+M = TypeVar("M", bound=Model)
+
+
+class Trainer(Generic[M]):
+    """One run's state, and what changes it: steps and edits. Implements `optim.drive.Resumable`.
+
+    A step draws some views, adds up the gradients of each in their order, and updates. On engine "cuda" what changes
+    from step to step is a row of numbers, and many steps are queued together.
+
+    Attributes:
+        model: as it is now; changed in place.
+        adam: its optimizer.
+        strategy: what adds and removes triangles.
+        progress: where the run stands.
+    """
+
+    def __init__(
+        self,
+        model: M,
+        dataset: Any,
+        objective: Objective,
+        strategy: Strategy | None = None,
+        *,
+        schedule: Schedule | None = None,
+        batch: int = 1,
+        background: Sequence[float] | None = None,
+        update: Callable[[Adam, Any], None] | None = None,
+        evaluate: Callable[[Any], dict[str, float]] | None = None,
+        seed: int | torch.Generator = 0,
+    ) -> None:
+        """Starts a run.
+
+        Args:
+            model: the start, on the device where the run is to be.
+            dataset: photos and cameras; the views in `dataset.train` are fitted to.
+            objective: what is minimised.
+            strategy: what adds and removes triangles; None for `Fixed`.
+            schedule: learning rates, and what else changes over the run; None for the model's own rates throughout.
+            batch: views that each step sees.
+            background: colour behind the pictures; None for another random one behind each.
+            update: takes the step from the gradients, in the place of `Adam.step`.
+            evaluate: cheap metrics of the model.
+            seed: of the order of views and every other random choice; or a generator to go on with.
+        """
+        self.model, self.strategy, self.progress = model, strategy or Fixed(), Progress()
+        self._objective, self._dataset, self._batch = objective, dataset, batch
+        self._schedule = schedule or Schedule(model.RATES)
+        self._appearance = self._schedule.appearance or _constant(model.appearance)
+        self._background = None if background is None else torch.tensor(background)[None]
+        self._update, self._evaluate = update, evaluate
+        generator = seed if isinstance(seed, torch.Generator) else torch.Generator().manual_seed(seed)
+        self._sampler = ViewSampler(dataset.train, generator)
+        parameters = model.parameters()
+        self._device = next(iter(parameters.values())).device
+        self.adam = Adam(parameters, self._rates(1))
+        self.strategy.start(model, self.adam, len(dataset.train), generator)
+        self._halvings = -1
+        self._arrive(0)
+        self._queue: StepQueue | None = None
+        self._phase: tuple[Any, ...] = ()
+        self._seen: list[Rasterization] = []  # by the step that is being captured
+        queues = engine_for(next(iter(parameters.values()))).queues_steps
+        if queues and update is None and not model.needs_host:
+            self._row = RowLayout(
+                places=2 * batch,
+                backgrounds=3 * batch,
+                epochs=batch,
+                scale=1,
+                appearance=len(model.appearance.numbers),
+                values=len(self._schedule.values),
+                rates=len(parameters) + 1,
+            )
+            self._queue = StepQueue(self._queued_gradients, self._commit, self._row.width, self._device)
+
+    def fit(
+        self,
+        iterations: int,
+        *,
+        callbacks: Sequence[Callback] = (),
+        log_every: int = 50,
+        evaluate_every: int = 0,
+        checkpoint_every: int = 0,
+        run: RunDirectory | Path | str | None = None,
+        run_hash: str = "",
+    ) -> Progress:
+        """Makes all steps up to an iteration that have not been made, and the edits between them.
+
+        Ctrl-C finishes the iteration at hand first, and saves a checkpoint if there is a run directory.
+
+        Args:
+            iterations: length of the run, counted from its start.
+            callbacks: each is called with every event (`optim/loop.py`), in the thread of the caller.
+            log_every: iterations between StepEvents.
+            evaluate_every: iterations between evaluations; 0 for one at the end only.
+            checkpoint_every: iterations between checkpoints; 0 for one at the end only.
+            run: gets checkpoints and history.jsonl, and is gone on with if it has a checkpoint; None writes nothing.
+            run_hash: identifies all that the result depends on; a checkpoint of another run is refused.
+
+        Returns:
+            Where the run stands.
+
+        Raises:
+            DivergedError: a loss or parameter is not finite.
+            InputError: a checkpoint is damaged or of another run; the disk is full.
+        """
+        settings = LoopSettings(iterations, log_every, evaluate_every, checkpoint_every)
+        directory = RunDirectory(Path(run)) if isinstance(run, Path | str) else run
+        with engine_for(next(iter(self.model.parameters().values()))).looping():
+            drive(self, self.progress, settings, callbacks, directory, run_hash)
+        return self.progress
+
+    @property
+    def count(self) -> int:
+        """Number of triangles."""
+        return self.model.count
+
+    def describe(self) -> dict[str, float]:
+        """What the model says of itself."""
+        return self.model.describe()
+
+    def advance(self, first: int, last: int) -> list[float]:
+        """Steps; on a device many together. Returns the losses before them."""
+        if self._queue is None:
+            return [self._step(first)]
+        phase = self._phase_at(first)
+        if phase != self._phase:
+            self._phase = phase
+            self._arrive(first)
+            self._queue.restart()
+        most = max(1, READ_AHEAD // self._batch) if self._loader.streamed else MAX_STEPS
+        steps = range(first, min(last, first + most - 1, self.strategy.next_edit(first)) + 1)
+        unchanged = takewhile(lambda i: self._phase_at(i) == phase, steps)
+        losses = self._queue.run([self._queued_step(i) for i in unchanged])
+        self._arrive(first + len(losses) - 1)
+        return losses
+
+    def refine(self, iteration: int) -> int:
+        """Edits if it is time to; returns by how many triangles the model grew."""
+        before = self.count
+        if self.strategy.edit(iteration):
+            self.edited()
+        return self.count - before
+
+    def edited(self) -> None:
+        """To be called when tensors of the model were replaced."""
+        if self._queue is not None:
+            self._queue.restart()
+
+    def evaluate(self) -> dict[str, float]:
+        """Cheap metrics of the present state."""
+        return self._evaluate(self.model) if self._evaluate else {}
+
+    def first_not_finite(self) -> str | None:
+        """The name of a parameter that holds NaN or infinity, or None."""
+        return first_not_finite(self.model.parameters())
+
+    def state(self) -> dict[str, Tensor]:
+        """Everything that the rest of the run depends on, by name, for a checkpoint."""
+        parts = {
+            "model": self.model.state(),
+            "adam.first": self.adam.first_moments,
+            "adam.second": self.adam.second_moments,
+            "strategy": self.strategy.state(),
+            "sampler": self._sampler.state(),
+        }
+        state = {f"{part}.{name}": tensor for part, tensors in parts.items() for name, tensor in tensors.items()}
+        return {**state, "adam.step_count": torch.tensor(self.adam.step_count)}
+
+    def load_state(self, state: dict[str, Tensor], iteration: int) -> None:
+        """Continues where `state` was taken."""
+        self.model.load_state(_part(state, "model"))
+        first, second = _part(state, "adam.first"), _part(state, "adam.second")
+        for name, parameter in self.model.parameters().items():
+            self.adam.replace(name, parameter, first[name].to(self._device), second[name].to(self._device))
+        self.adam.step_count = int(state["adam.step_count"])
+        self.strategy.load_state(_part(state, "strategy"))
+        self._sampler.load_state(_part(state, "sampler"))
+        self._arrive(iteration)
+        self.edited()
+
+    def _step(self, iteration: int) -> float:
+        self._arrive(iteration)
+        chosen = self._choose()
+        views = ((self._loader.view(c.view), c.background.to(self._device)) for c in chosen)
+        weights, scale = self._objective.weights(iteration), at(self._objective.scale, iteration)
+        loss, seen = self._gradients(views, weights, scale)
+        self.adam.learning_rates = self._rates(iteration)
+        if self._update is None:
+            self.adam.step()
+        else:
+            self._update(self.adam, self.model)
+        for each, rendering in zip(chosen, seen, strict=True):
+            self.strategy.observe(rendering, epoch_starts=each.epoch_starts)
+        return float(loss)
+
+    def _queued_step(self, iteration: int) -> QueuedStep:
+        chosen = self._choose()
+        found = [self._loader.kind_and_place(each.view, number) for number, each in enumerate(chosen)]
+        uploads = [self._loader.upload(each.view, number) for number, each in enumerate(chosen)]
+        self.adam.learning_rates = self._rates(iteration)
+        self.adam.step_count += 1
+        row = self._row.pack(
+            places=[number for _, place in found for number in place],
+            backgrounds=torch.cat([c.background for c in chosen]).flatten().tolist(),
+            epochs=[c.epoch_starts for c in chosen],
+            scale=[at(self._objective.scale, iteration)],
+            appearance=self._appearance(iteration).numbers,
+            values=list(self._values(iteration).values()),
+            rates=self.adam.rates(list(self.adam.parameters)),
+        )
+
+        def prepare() -> None:
+            for upload in uploads:
+                upload()
+
+        return QueuedStep(row, tuple(kind for kind, _ in found), prepare)
+
+    def _queued_gradients(self, row: Tensor, kinds: Hashable) -> Tensor:
+        assert isinstance(kinds, tuple)
+        fields = self._row.unpack(row)
+        _, structure, weights = self._phase
+        self.model.appearance = structure.on_device(fields["appearance"])
+        self._set(dict(zip(self._schedule.values, fields["values"].unbind(), strict=True)))
+        places, backgrounds = fields["places"].split(2), fields["backgrounds"].split(3)
+        views = (
+            (self._loader.look_up(kind, place), background[None])
+            for kind, place, background in zip(kinds, places, backgrounds, strict=True)
+        )
+        loss, self._seen = self._gradients(views, weights, fields["scale"][0])
+        return loss
+
+    def _commit(self, row: Tensor, halted: Tensor) -> None:
+        fields = self._row.unpack(row)
+        self.adam.step_on_device(fields["rates"], halted)
+        for rendering, epoch_starts in zip(self._seen, fields["epochs"].split(1), strict=True):
+            self.strategy.observe_on_device(rendering, epoch_starts, halted)
+        self._seen = []
+
+    def _gradients(
+        self, views: Any, weights: Sequence[float], scale: float | Tensor
+    ) -> tuple[Tensor, list[Rasterization]]:
+        """Those of the objective, one view after the other; its value, and what was seen."""
+        outputs = (*self._objective.outputs(weights), *self.strategy.outputs)
+        losses, seen = [], []
+        for number, (view, background) in enumerate(views, start=1):
+            rendering = self.model.render(
+                view.camera, backgrounds=background, outputs=outputs, depth_of=self._objective.depth_of
+            )
+            drawing = Drawing(self.model, view.camera, view.photo, view.mask, background, rendering)
+            whole = number == self._batch
+            loss = self._objective(drawing, weights, scale, views=self._batch, whole=whole)
+            if not losses:
+                self.adam.zero_grad()
+            loss.backward()
+            losses.append(loss.detach())
+            seen.append(rendering)
+        return sum(losses[1:], start=losses[0]), seen
+
+    def _choose(self) -> list[_Chosen]:
+        """Views and backgrounds of the next step; photos that come after them are decoded ahead."""
+        views, firsts = [], []
+        for _ in range(self._batch):
+            views.append(self._sampler.next_view())
+            firsts.append(self._sampler.epoch_starts)
+        self._loader.expect([*views, *self._sampler.upcoming(READ_AHEAD)])
+        backgrounds = [self._sampler.background() if self._background is None else self._background for _ in views]
+        return [_Chosen(*each) for each in zip(views, backgrounds, firsts, strict=True)]
+
+    def _phase_at(self, iteration: int) -> tuple[Any, ...]:
+        """What changes seldom: how often photos are halved, how the model is drawn, the weights of the objective."""
+        look = self._appearance(iteration).structure
+        return self._schedule.halvings(iteration), look, self._objective.weights(iteration)
+
+    def _arrive(self, iteration: int) -> None:
+        """Lets all that is scheduled be as it is at an iteration."""
+        self.model.appearance = self._appearance(iteration)
+        if iteration:
+            self._set(self._values(iteration))
+        halvings = self._schedule.halvings(max(1, iteration))
+        if halvings != self._halvings:
+            dataset = self._dataset
+            for _ in range(halvings):
+                dataset = dataset.halved()
+            self._halvings, self._loader = halvings, ViewLoader(dataset, self._device, self._batch)
+
+    def _rates(self, iteration: int) -> dict[str, float]:
+        return {name: at(self._schedule.rates[name], iteration) for name in self.model.parameters()}
+
+    def _values(self, iteration: int) -> dict[str, float]:
+        return {name: at(value, iteration) for name, value in self._schedule.values.items()}
+
+    @torch.no_grad()
+    def _set(self, values: dict[str, float] | dict[str, Tensor]) -> None:
+        for name, value in values.items():
+            self.model.parameters()[name].fill_(value)
+
+
+def _constant(appearance: Any) -> Callable[[int], Any]:
+    return lambda _: appearance
+
+
+def _part(state: dict[str, Tensor], name: str) -> dict[str, Tensor]:
+    return {key.removeprefix(f"{name}."): tensor for key, tensor in state.items() if key.startswith(f"{name}.")}

@@ -1,0 +1,135 @@
+"""When strategies edit, and what they refuse."""
+
+from typing import Any
+
+import pytest
+import torch
+
+from etsplat.geometry.icosphere import icosphere
+from etsplat.geometry.intersections import count_self_intersections
+from etsplat.model.triangle_mesh import TriangleMesh
+from etsplat.model.triangle_soup import TriangleSoup
+from etsplat.ops.adam import Adam
+from etsplat.optim.densification import PruneRules
+from etsplat.optim.loop import DivergedError
+from etsplat.optim.strategies import NEVER, DensifyAndPrune, Fixed, Strategy, SubdivideAndUntangle
+
+
+def started(strategy: Strategy, model: Any, views: int = 2) -> Adam:
+    adam = Adam(model.parameters(), dict.fromkeys(model.parameters(), 0.1))
+    strategy.start(model, adam, views, torch.Generator().manual_seed(0))
+    return adam
+
+
+def a_mesh() -> TriangleMesh:
+    vertices, faces = icosphere(2)
+    return TriangleMesh.from_mesh(vertices, faces, colors=0.5, opacity=0.9, sigma=0.5)
+
+
+def a_soup(rng: torch.Generator, count: int = 40) -> TriangleSoup:
+    return TriangleSoup.from_triangles(
+        torch.randn((count, 3, 3), generator=rng),
+        torch.rand((count, 3), generator=rng),
+        opacity=0.5,
+        sigma=0.5,
+        sh_degree=0,
+    )
+
+
+def seen_by_all(strategy: DensifyAndPrune) -> None:
+    """As after an epoch in which every triangle was large and important."""
+    for tensor in strategy.statistics.tensors().values():
+        tensor.fill_(5)
+
+
+def test_a_fixed_model_is_never_edited() -> None:
+    strategy = Fixed()
+    started(strategy, a_mesh())
+    assert strategy.next_edit(1) == NEVER
+    assert not strategy.edit(1)
+
+
+def test_a_mesh_is_subdivided_at_its_times_and_only_then() -> None:
+    """The model, its topology and the optimizer's state have the new faces; in between nothing changes."""
+    strategy, mesh = SubdivideAndUntangle({3: 400, 7: 450}, [5]), a_mesh()
+    adam = started(strategy, mesh)
+    assert [strategy.next_edit(i) for i in (1, 3, 4, 6, 8)] == [3, 3, 5, 7, NEVER]
+    assert not strategy.edit(2)
+    assert mesh.count == 320
+    assert strategy.edit(3)
+    assert 320 < mesh.count <= 400
+    assert len(mesh.colors) == len(adam.first_moments["colors"]) == mesh.count == len(mesh.topology.faces)
+    assert all(adam.parameters[name] is parameter for name, parameter in mesh.parameters().items())
+
+
+def test_folds_are_smoothed_away_in_place() -> None:
+    """A vertex pushed through the far side comes back, and no tensor is replaced."""
+    strategy, mesh = SubdivideAndUntangle({}, [4, 9]), a_mesh()
+    started(strategy, mesh)
+    before = mesh.vertices
+    with torch.no_grad():
+        mesh.vertices[5] *= -1.2
+    assert not strategy.edit(4)
+    assert mesh.vertices is before
+    assert count_self_intersections(mesh.vertices.detach(), mesh.faces) == 0
+
+
+def test_a_soup_is_edited_between_its_first_and_its_last_time(rng: torch.Generator) -> None:
+    """At multiples of `every`, after `after`, before `last`; from `until` on triangles only die."""
+    strategy, soup = DensifyAndPrune(after=10, until=20, every=5, last=30, max_triangles=1000), a_soup(rng)
+    started(strategy, soup)
+    grown = {}
+    for iteration in range(1, 35):
+        seen_by_all(strategy)
+        before = soup.count
+        if strategy.edit(iteration):
+            grown[iteration] = soup.count - before
+    assert list(grown) == [15, 20, 25]
+    assert grown[15] > 0 == grown[20] == grown[25]
+    assert [strategy.next_edit(i) for i in (1, 5, 6)] == [5, 5, 10]
+
+
+def test_faint_triangles_die_and_others_take_their_place(rng: torch.Generator) -> None:
+    """With `replace_dead` the number grows by the factor all the same; without it less."""
+    counts = {}
+    for replaces in (True, False):
+        strategy, soup = DensifyAndPrune(replace_dead=replaces, max_triangles=1000, split_size=1e9), a_soup(rng, 100)
+        adam = started(strategy, soup)
+        seen_by_all(strategy)
+        with torch.no_grad():
+            soup.opacity_logits[:20] = -20
+        strategy.densify(100)
+        counts[replaces] = soup.count
+        assert float(soup.opacities.detach().min()) > 0.014
+        assert all(adam.parameters[name] is parameter for name, parameter in soup.parameters().items())
+    assert counts == {True: 130, False: 104}
+
+
+def test_what_is_spared_stays_where_nobody_looks(rng: torch.Generator) -> None:
+    """Unseen and faint, it lives; seen, it dies like any other."""
+    spared = torch.zeros(40, dtype=torch.bool)
+    spared[:10] = True
+    strategy, soup = DensifyAndPrune(until=0, after=0, every=1, spared=lambda _: spared), a_soup(rng)
+    started(strategy, soup)
+    with torch.no_grad():
+        soup.opacity_logits[:20] = -20
+    strategy.statistics.screen_size[5:10] = 3.0
+    strategy.edit(3)
+    assert soup.count == 25
+
+
+def test_a_soup_that_dies_out_is_an_error(rng: torch.Generator) -> None:
+    """In words that name the iteration and what to change."""
+    strategy, soup = DensifyAndPrune(prune=PruneRules(opacity=0.9)), a_soup(rng)
+    started(strategy, soup)
+    with pytest.raises(DivergedError, match=r"no triangle is left at iteration 7; lower lambda_opacity"):
+        strategy.densify(7)
+
+
+def test_statistics_survive_a_checkpoint(rng: torch.Generator) -> None:
+    first, second = DensifyAndPrune(), DensifyAndPrune()
+    started(first, a_soup(rng))
+    started(second, a_soup(rng))
+    seen_by_all(first)
+    second.load_state(first.state())
+    assert all(torch.equal(tensor, first.state()[name]) for name, tensor in second.state().items())

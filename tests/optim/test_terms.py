@@ -1,0 +1,232 @@
+"""Terms of objectives: the paper's L_mesh and L_nvs, one by one and together."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+import etsplat
+from etsplat.core.cameras import Cameras, intrinsics, look_at
+from etsplat.core.rasterization import Rasterization
+from etsplat.engines.threads import num_threads, set_num_threads
+from etsplat.model.triangle_mesh import TriangleMesh
+from etsplat.model.triangle_soup import TriangleSoup
+from etsplat.ops.triangle_area import mean_area
+from etsplat.optim.objective import Custom, Drawing, Objective, Term
+from etsplat.optim.terms.mesh import EdgeLength, Laplacian, SmoothNormals, Softness
+from etsplat.optim.terms.photometric import Photometric
+from etsplat.optim.terms.soup import DepthNormals, Distortion, Opacity, Size
+
+# Two faces that share the edge (0, 2) of a folded unit square.
+VERTICES = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.5], [1.0, 1.0, 0.0], [0.0, 1.0, 0.25]]
+FACES = [[0, 1, 2], [0, 2, 3]]
+CAMERA = Cameras(torch.eye(4)[None], torch.eye(3)[None], 7, 5)
+
+
+def a_mesh(sigma: float = 0.5) -> TriangleMesh:
+    vertices = torch.tensor(VERTICES, dtype=torch.float64)
+    return TriangleMesh.from_mesh(vertices, torch.tensor(FACES), colors=0.3, opacity=0.9, sigma=sigma)
+
+
+def a_drawing(rng: torch.Generator, mesh: TriangleMesh | None = None) -> Drawing:
+    color = torch.rand(1, 5, 7, 3, generator=rng, dtype=torch.float64)
+    straight = torch.rand(1, 5, 7, 4, generator=rng, dtype=torch.float64)
+    photo = torch.cat([straight[..., :3] * straight[..., 3:], straight[..., 3:]], dim=-1)
+    background = torch.rand(1, 3, generator=rng, dtype=torch.float64)
+    return Drawing(mesh or a_mesh(), CAMERA, photo, None, background, Rasterization(color, color[..., :1]))
+
+
+def value(drawing: Drawing, terms: list[Term], scale: float = 1.0) -> float:
+    objective = Objective(Photometric(), terms, scale=scale)
+    return float(objective(drawing, objective.weights(1), scale).detach())
+
+
+def distance(i: int, j: int) -> float:
+    return math.dist(VERTICES[i], VERTICES[j])
+
+
+def to_mean(i: int, neighbors: list[int]) -> float:
+    return math.dist(VERTICES[i], [sum(VERTICES[j][k] for j in neighbors) / len(neighbors) for k in range(3)])
+
+
+def unit_normal(face: list[int]) -> list[float]:
+    a, b, c = (VERTICES[i] for i in face)
+    u, v = [b[k] - a[k] for k in range(3)], [c[k] - a[k] for k in range(3)]
+    n = [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]]
+    return [x / math.hypot(*n) for x in n]
+
+
+EDGES = [(0, 1), (1, 2), (0, 2), (2, 3), (0, 3)]
+EXPECTED = {
+    "edge": sum(distance(i, j) for i, j in EDGES) / 5,
+    "edge squared": sum(distance(i, j) ** 2 for i, j in EDGES) / 5,
+    "normal": 1 - sum(a * b for a, b in zip(unit_normal(FACES[0]), unit_normal(FACES[1]), strict=True)),
+    "laplacian": (to_mean(0, [1, 2, 3]) + to_mean(1, [0, 2]) + to_mean(2, [0, 1, 3]) + to_mean(3, [0, 2])) / 4,
+    "softness": 1 / 0.5**2,
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "term"),
+    [
+        ("edge", EdgeLength()),
+        ("edge squared", EdgeLength(power=2)),
+        ("normal", SmoothNormals()),
+        ("laplacian", Laplacian()),
+        ("softness", Softness()),
+    ],
+)
+def test_each_term_is_the_papers_formula(rng: torch.Generator, name: str, term: Term) -> None:
+    """With one weight at 1 and scale 0.7, the objective exceeds the photometric loss by 0.7 of that term."""
+    drawing = a_drawing(rng)
+    assert value(drawing, [term], 0.7) - value(drawing, []) == pytest.approx(0.7 * EXPECTED[name], rel=1e-12)
+
+
+def test_the_photometric_term_compares_over_the_same_background(rng: torch.Generator) -> None:
+    """L_c is the mean of |color - (rgb + (1 - a) background)| with the background of the view."""
+    drawing = a_drawing(rng)
+    composited = drawing.photo[..., :3] + (1 - drawing.photo[..., 3:]) * drawing.background[:, None, None]
+    difference = float((drawing.rendering.color - composited).abs().mean())
+    assert value(drawing, [EdgeLength(1.5)], 0.0) == pytest.approx(difference, rel=1e-12)
+
+
+@pytest.mark.parametrize("first", ["edge", "normal"])
+def test_the_papers_weights_add_up(rng: torch.Generator, first: str) -> None:
+    """With lambda 1.5, 0.01, 0.5 and 1e-4 the objective is L_c + gamma times the weighted sum, in whatever order."""
+    weights = {"edge squared": 1.5, "normal": 0.01, "laplacian": 0.5, "softness": 1e-4}
+    terms = [EdgeLength(1.5, power=2), SmoothNormals(0.01), Laplacian(0.5), Softness(1e-4)]
+    drawing = a_drawing(rng)
+    expected = value(drawing, []) + 0.25 * sum(weight * EXPECTED[name] for name, weight in weights.items())
+    chosen = terms if first == "edge" else terms[::-1]
+    assert value(drawing, chosen, 0.25) == pytest.approx(expected, rel=1e-12)
+
+
+def test_softness_pushes_sigma_up(rng: torch.Generator) -> None:
+    """The gradient of sigma^-2 with respect to log sigma is -2 sigma^-2: descent makes a small sigma larger."""
+    drawing = a_drawing(rng, a_mesh(sigma=0.1))
+    objective = Objective(Photometric(), [Softness(1e-3)])
+    objective(drawing, objective.weights(1), 1.0).backward()
+    assert float(drawing.model.log_sigma.grad) == pytest.approx(-2 * 1e-3 / 0.1**2, rel=1e-12)
+
+
+def test_terms_of_a_mesh_refuse_a_soup(rng: torch.Generator) -> None:
+    """In words, rather than by an attribute that is missing."""
+    _, drawing = a_soups_drawing(rng, ("color",))
+    with pytest.raises(ValueError, match="EdgeLength needs a TriangleMesh, got a TriangleSoup"):
+        EdgeLength()(drawing)
+
+
+def test_a_weight_follows_the_iteration_and_at_zero_nothing_is_computed(rng: torch.Generator) -> None:
+    """A term that would fail is not asked before its time, nor are its outputs of the renderer."""
+
+    def fails(drawing: Drawing) -> Tensor:
+        raise RuntimeError
+
+    late = Custom(fails, lambda iteration: float(iteration > 5), outputs=("depth",))
+    objective, drawing = Objective(Photometric(), [late]), a_drawing(rng)
+    assert objective.weights(5) == (0.0,)
+    assert objective.outputs(objective.weights(5)) == ("color",)
+    objective(drawing, objective.weights(5), 1.0)
+    assert objective.outputs(objective.weights(6)) == ("color", "depth")
+    with pytest.raises(RuntimeError):
+        objective(drawing, objective.weights(6), 1.0)
+
+
+def test_of_several_views_each_counts_its_share_and_parameters_once(rng: torch.Generator) -> None:
+    """Mean over views of what looks at pictures, plus what looks at parameters alone, with the last view."""
+    mesh = a_mesh()
+    drawings = [a_drawing(rng, mesh) for _ in range(3)]
+    bright = Custom(lambda drawing: drawing.rendering.color.mean(), 0.5, outputs=("color",))
+    objective = Objective(Photometric(), [EdgeLength(1.5), bright])
+    weights = objective.weights(1)
+    parts = [objective(d, weights, 0.3, views=3, whole=number == 2) for number, d in enumerate(drawings)]
+    seen = [value(d, [bright], 0.3) for d in drawings]
+    assert float(sum(parts).detach()) == pytest.approx(sum(seen) / 3 + 0.3 * 1.5 * EXPECTED["edge"], rel=1e-12)
+
+
+def test_parameters_start_where_they_are_told_to() -> None:
+    """Opacity, sigma and colour come back from their parametrisation; the display colours are clamped."""
+    mesh = a_mesh(sigma=0.25)
+    assert mesh.opacities.tolist() == pytest.approx([0.9, 0.9])
+    assert float(mesh.sigma.detach()) == pytest.approx(0.25)
+    with torch.no_grad():
+        mesh.colors[0] = torch.tensor([-0.5, 0.5, 1.5])
+    assert mesh.display_colors[0].tolist() == [0.0, 0.5, 1.0]
+
+
+SIZE = 40
+
+
+def a_soups_drawing(rng: torch.Generator, outputs: tuple[str, ...]) -> tuple[Cameras, Drawing]:
+    soup = TriangleSoup.from_triangles(
+        0.8 * torch.randn((30, 3, 3), generator=rng),
+        torch.rand((30, 3), generator=rng),
+        opacity=0.6,
+        sigma=0.5,
+        sh_degree=0,
+    )
+    viewmats = look_at(torch.tensor([[0.6, 0.4, 3.0]]), torch.zeros(3), torch.tensor([0.0, 1, 0]))
+    camera = Cameras(viewmats, intrinsics(45, SIZE, SIZE)[None], SIZE, SIZE)
+    photo = (255 * torch.rand((1, SIZE, SIZE, 3), generator=rng)).to(torch.uint8)
+    rendering = soup.render(camera, outputs=outputs, depth_of="centroid")
+    return camera, Drawing(soup, camera, photo, None, torch.zeros(1, 3), rendering)
+
+
+@pytest.mark.sanitize
+def test_mean_area_agrees_with_the_float64_reference(rng):
+    """Value and gradient; a triangle without area has none."""
+    vertices = torch.randn((5000, 3, 3), generator=rng)
+    vertices[7] = vertices[7, :1]
+    results = []
+    for tensor in (vertices, vertices[torch.arange(5000) != 7].double()):
+        leaf = tensor.clone().requires_grad_()
+        (2.0 * mean_area(leaf)).backward()
+        results.append((mean_area(tensor), leaf.grad))
+    assert float(results[0][0]) == pytest.approx(float(results[1][0]) * 4999 / 5000, rel=1e-6)
+    assert float(results[0][1][7].abs().max()) == 0
+    kept = results[0][1][torch.arange(5000) != 7]
+    torch.testing.assert_close(kept.double(), results[1][1] * 4999 / 5000, rtol=1e-4, atol=1e-9)
+
+
+@pytest.mark.sanitize
+def test_mean_area_has_the_same_bits_for_any_number_of_threads(rng):
+    """Ranges are added in a fixed order."""
+    vertices, before = torch.randn((9000, 3, 3), generator=rng), num_threads()
+    areas = []
+    for count in (1, 3):
+        set_num_threads(count)
+        areas.append(mean_area(vertices))
+    set_num_threads(before)
+    assert torch.equal(areas[0], areas[1])
+
+
+def test_every_term_of_a_soup_adds_with_its_weight(rng: torch.Generator, engine: str) -> None:
+    """The objective is the weighted sum of the terms, each of which can be had alone."""
+    kinds: dict[str, tuple[type[Term], float]] = {
+        "opacity": (Opacity, 0.3),
+        "size": (Size, 0.02),
+        "normal": (DepthNormals, 0.5),
+        "distortion": (Distortion, 2.0),
+    }
+    with etsplat.engine(engine):
+        _, drawing = a_soups_drawing(rng, ("color", "normal", "median_depth", "distortion"))
+
+        def objective(*terms: Term) -> float:
+            whole = Objective(Photometric(0.2), terms)
+            return float(whole(drawing, whole.weights(1), 1.0).detach())
+
+        plain = objective()
+        terms = {name: objective(kind(weight)) - plain for name, (kind, weight) in kinds.items()}
+        assert all(term > 0 for term in terms.values())
+        together = objective(*(kind(weight) for kind, weight in kinds.values()))
+    assert together == pytest.approx(plain + sum(terms.values()), rel=1e-5)
+    assert terms["opacity"] == pytest.approx(0.3 * 0.6, rel=1e-4)
+    assert terms["size"] == pytest.approx(0.02 / float(mean_area(drawing.model.vertices).detach()), rel=1e-4)
+
+
+def test_spared_triangles_count_as_transparent(rng: torch.Generator) -> None:
+    """The mean is still over all of them."""
+    _, drawing = a_soups_drawing(rng, ("color",))
+    spared = torch.arange(30) < 10
+    assert float(Opacity(spared=lambda _: spared)(drawing).detach()) == pytest.approx(0.4, rel=1e-5)

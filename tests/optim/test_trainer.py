@@ -1,0 +1,229 @@
+"""One trainer for every model, data set, objective and strategy: any combination fits, and resumes to the bit."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from etsplat.core.errors import InputError
+from etsplat.data.dataset import Dataset
+from etsplat.data.demo_object import demo_object
+from etsplat.data.demo_scene import demo_scene
+from etsplat.data.photograph import photograph
+from etsplat.geometry.icosphere import icosphere
+from etsplat.io.run_directory import RunDirectory
+from etsplat.model.soup_init import StartPoints, start_soup
+from etsplat.model.triangle_mesh import TriangleMesh
+from etsplat.model.triangle_soup import TriangleSoup
+from etsplat.optim.loop import DoneEvent, RefineEvent, StepEvent
+from etsplat.optim.objective import Custom, Drawing, Objective, Term
+from etsplat.optim.schedules import Schedule, face_budgets
+from etsplat.optim.strategies import DensifyAndPrune, Fixed, Strategy, SubdivideAndUntangle
+from etsplat.optim.terms.mesh import EdgeLength, Laplacian, SmoothNormals, Softness
+from etsplat.optim.terms.photometric import Photometric
+from etsplat.optim.terms.soup import DepthNormals, Opacity
+from etsplat.optim.trainer import Trainer
+
+
+@pytest.fixture(scope="module")
+def object_views() -> Dataset:
+    return photograph(demo_object(), 24, 24, elevations=(-35.0, 35.0), azimuths=5, supersampling=1)
+
+
+@pytest.fixture(scope="module")
+def scene() -> Dataset:
+    scene = demo_scene(32, 24)
+    assert scene.exact_points is not None
+    assert scene.point_colors is not None
+    return replace(scene, exact_points=scene.exact_points[::20], point_colors=scene.point_colors[::20]).normalized()
+
+
+def a_mesh(radius: float = 1.05) -> TriangleMesh:
+    vertices, faces = icosphere(2)
+    return TriangleMesh.from_mesh(radius * vertices, faces, colors=0.5, opacity=0.9, sigma=0.5)
+
+
+def a_soup(dataset: Dataset | None = None) -> TriangleSoup:
+    rng = torch.Generator().manual_seed(1)
+    positions = dataset.points if dataset is not None and dataset.points is not None else None
+    if positions is None:
+        positions = torch.nn.functional.normalize(torch.randn((300, 3), generator=rng), dim=1)
+    points = StartPoints(positions, torch.full_like(positions, 0.5))
+    return start_soup(points, rng, scale=2.0, opacity=0.4, sigma=0.8, sh_degree=1)
+
+
+def mesh_objective() -> Objective:
+    return Objective(Photometric(), [EdgeLength(0.5), SmoothNormals(0.01), Laplacian(0.2), Softness(1e-4)], scale=0.5)
+
+
+def soup_objective() -> Objective:
+    return Objective(Photometric(0.2), [Opacity(0.005), DepthNormals(1e-3)], depth_of="centroid")
+
+
+def losses_of(trainer: Trainer[Any], iterations: int, **options: Any) -> list[float]:
+    """Of every iteration."""
+    events: list[object] = []
+    trainer.fit(iterations, callbacks=[events.append], log_every=1, **options)
+    return [event.loss for event in events if isinstance(event, StepEvent)]
+
+
+def combination(model: str, data: Dataset, **options: Any) -> Trainer[Any]:
+    if model == "mesh":
+        budgets = face_budgets(60, steps=2, first=0.3, last=0.6, start_faces=320, max_faces=500)
+        strategy: Strategy = SubdivideAndUntangle(budgets)
+        rates = Schedule({"vertices": 1e-2, "colors": 2e-2, "opacity_logits": 1e-2, "log_sigma": 1e-2})
+        return Trainer(a_mesh(), data, mesh_objective(), strategy, schedule=rates, **options)
+    strategy = DensifyAndPrune(after=10, every=15, max_triangles=600)
+    return Trainer(a_soup(data), data, soup_objective(), strategy, **options)
+
+
+@pytest.mark.parametrize("batch", [1, 2])
+@pytest.mark.parametrize("data", ["object", "scene"])
+@pytest.mark.parametrize("model", ["mesh", "soup"])
+def test_any_model_fits_any_data(
+    object_views: Dataset, scene: Dataset, tmp_path: Path, model: str, data: str, batch: int
+) -> None:
+    """The loss falls, triangles come, and a run that was killed ends with the same bits."""
+    dataset = object_views if data == "object" else scene
+    trainer = combination(model, dataset, batch=batch)
+    before = trainer.count
+    losses = losses_of(trainer, 60)
+    assert sum(losses[-5:]) < 0.95 * sum(losses[:5])
+    assert trainer.count > before
+
+    run = RunDirectory.create(tmp_path / "run", {"task": "train"})
+    killed = combination(model, dataset, batch=batch)
+
+    def kill(event: object) -> None:
+        if isinstance(event, StepEvent) and event.iteration == 33:
+            raise RuntimeError("killed")
+
+    with pytest.raises(RuntimeError, match="killed"):
+        killed.fit(60, callbacks=[kill], log_every=1, checkpoint_every=25, run=run)
+    resumed = combination(model, dataset, batch=batch)
+    assert losses_of(resumed, 60, run=run) == losses[25:]
+    state, expected = resumed.state(), trainer.state()
+    assert [name for name in expected if not torch.equal(state[name], expected[name])] == []
+    assert [line["loss"] for line in run.read_history()] == losses
+
+
+def test_a_fit_can_be_gone_on_with(object_views: Dataset) -> None:
+    """Twenty iterations and then up to forty are the same as forty, without any run directory."""
+    whole, parts = (combination("mesh", object_views) for _ in range(2))
+    assert losses_of(whole, 40) == losses_of(parts, 20) + losses_of(parts, 40)
+
+
+def test_a_checkpoint_of_another_run_is_refused(object_views: Dataset, tmp_path: Path) -> None:
+    """By the hash that the owner of the run gives."""
+    run = RunDirectory.create(tmp_path / "run", {"task": "reconstruct"})
+    combination("mesh", object_views).fit(2, run=run, run_hash="one")
+    with pytest.raises(InputError, match="with other settings"):
+        combination("mesh", object_views).fit(3, run=run, run_hash="two")
+
+
+def test_a_step_of_two_views_is_the_mean_of_their_gradients(object_views: Dataset) -> None:
+    """Of what looks at pictures; what looks at parameters alone counts once. The views come in the sampler's order."""
+    pair = combination("mesh", object_views, batch=2, background=(0.2, 0.4, 0.6))
+    pair.strategy = Fixed()
+    mesh, chosen = a_mesh(), []
+    honest = pair._choose
+    pair._choose = lambda: chosen.extend(found := honest()) or found  # type: ignore[method-assign]
+    pair.advance(1, 1)
+    background = torch.tensor([[0.2, 0.4, 0.6]])
+    objective, total = mesh_objective(), 0.0
+    for each in chosen:
+        view = pair._loader.view(each.view)
+        rendering = mesh.render(view.camera, backgrounds=background)
+        drawing = Drawing(mesh, view.camera, view.photo, view.mask, background, rendering)
+        total = total + objective(drawing, objective.weights(1), 0.5) / 2
+    assert isinstance(total, Tensor)
+    total.backward()
+    for name, parameter in mesh.parameters().items():
+        # The first of Adam's moments after one step is a tenth of the gradient.
+        torch.testing.assert_close(10 * pair.adam.first_moments[name], parameter.grad, rtol=1e-4, atol=1e-7)
+
+
+class Drop(Strategy):
+    """A strategy of one's own: lets the last triangles go at iteration 5, and counts what it saw."""
+
+    outputs = ("statistics",)
+
+    def start(self, model: Any, adam: Any, views: int, generator: torch.Generator) -> None:
+        super().start(model, adam, views, generator)
+        self.seen = 0
+
+    def observe(self, seen: Any, *, epoch_starts: bool) -> None:
+        assert seen.statistics is not None
+        self.seen += 1
+
+    def edit(self, iteration: int) -> bool:
+        from etsplat.optim.edit import RowPlan, apply_rows
+
+        if iteration != 5:
+            return False
+        kept = torch.arange(self.model.count) < self.model.count - 10
+        self.model.load_state(apply_rows(RowPlan.keeping(kept), self.adam, {})[0])
+        return True
+
+
+def test_ones_own_term_strategy_and_callback(object_views: Dataset) -> None:
+    """A term as a function or a class, a strategy that edits, callbacks that see it: no other file knows of them."""
+
+    class Bright(Term):
+        outputs = ("color",)
+
+        def __call__(self, drawing: Drawing) -> Tensor:
+            return drawing.rendering.color.mean()
+
+    depths = Custom(lambda drawing: drawing.rendering.depth.mean(), 0.01, outputs=("depth",))
+    strategy, events = Drop(), list[object]()
+    trainer = Trainer(a_soup(), object_views, Objective(Photometric(), [Bright(2.0), depths]), strategy)
+    trainer.fit(8, callbacks=[events.append], log_every=4)
+    assert [type(event) for event in events] == [StepEvent, RefineEvent, StepEvent, DoneEvent]
+    assert next(event for event in events if isinstance(event, RefineEvent)).added == -10
+    assert (trainer.count, strategy.seen) == (290, 8)
+    dark = Trainer(a_soup(), object_views, Objective(Photometric(), []))
+    dark.fit(8)
+    assert float(trainer.model.sh_dc.detach().mean()) < float(dark.model.sh_dc.detach().mean())
+
+
+def test_a_schedule_sets_values_and_appearance(object_views: Dataset) -> None:
+    """A parameter that is set is what the schedule says after each step; the appearance changes with the iteration."""
+    mesh = a_mesh()
+    rates = dict(TriangleMesh.RATES, log_sigma=0.0)
+    Trainer(mesh, object_views, mesh_objective(), schedule=Schedule(rates, {"log_sigma": lambda i: -float(i)})).fit(3)
+    assert mesh.log_sigma is not None
+    assert float(mesh.log_sigma.detach()) == -3.0
+    soup = a_soup()
+
+    def look(iteration: int) -> Any:
+        return replace(soup.appearance, opacity_floor=0.1 * iteration)
+
+    Trainer(soup, object_views, soup_objective(), schedule=Schedule(TriangleSoup.RATES, appearance=look)).fit(4)
+    assert soup.appearance.opacity_floor == 0.4
+    assert float(soup.drawn_opacities.detach().min()) > 0.4
+
+
+def test_photos_are_halved_when_the_schedule_says(object_views: Dataset) -> None:
+    """Pictures of the first two steps have half the size."""
+    widths: list[int] = []
+
+    def look(drawing: Drawing) -> Tensor:
+        widths.append(drawing.rendering.color.shape[2])
+        return drawing.rendering.color.sum() * 0
+
+    schedule = Schedule(TriangleMesh.RATES, halvings=lambda iteration: int(iteration <= 2))
+    Trainer(
+        a_mesh(), object_views, Objective(Photometric(), [Custom(look, outputs=("color",))]), schedule=schedule
+    ).fit(4)
+    assert widths == [12, 12, 24, 24]
+
+
+def test_every_random_choice_follows_from_the_seed(object_views: Dataset) -> None:
+    """The same seed gives the same losses, another one does not."""
+    make: Callable[[int], list[float]] = lambda seed: losses_of(combination("mesh", object_views, seed=seed), 3)  # noqa: E731
+    assert make(0) == make(0) != make(1)
