@@ -8,7 +8,6 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from etsplat.model.soup_files import SoupFile, save_soup
 
 from etsplat.core.errors import InputError
 from etsplat.io.run_directory import RunDirectory
@@ -32,7 +31,7 @@ def test_after_an_odd_camera_a_good_one_is_drawn(bad, monkeypatch):
     camera = browser(**bad)
     camera.on_update = lambda call: None
     scene = SimpleNamespace(set_background_image=lambda *_, **__: drawn.set())
-    viewer = SimpleNamespace(file=SoupFile(make_soup(4)), mode="soft")
+    viewer = SimpleNamespace(soup=make_soup(4), mode="soft")
     before = set(threading.enumerate())
     client = server._Client(viewer, SimpleNamespace(camera=camera, scene=scene), 32)
     (worker,) = set(threading.enumerate()) - before
@@ -55,7 +54,7 @@ def test_a_tall_browser_gets_a_small_picture():
 def test_a_browser_that_has_gone_before_it_was_welcomed_leaves_no_thread(tmp_path):
     """viser calls what is registered for connecting in a pool, and often after what is for disconnecting."""
     pytest.importorskip("viser")
-    viewer = Viewer(SoupRun(tmp_path / "soup.safetensors", SoupFile(make_soup(4)), None), "localhost", 0, 32)
+    viewer = Viewer(SoupRun(tmp_path / "soup.safetensors", make_soup(4), None), "localhost", 0, 32)
     try:
         gone = SimpleNamespace(client_id=7, atomic=threading.Lock, camera=browser(), scene=None)
         gone.camera.on_update = lambda call: None
@@ -90,7 +89,7 @@ def test_the_interpreter_ends_while_a_thread_draws():
 @pytest.mark.xfail(strict=True, raises=InputError, reason="row 4: the page stops following if a file is missing once")
 def test_a_run_that_is_started_anew_is_followed_on(tmp_path):
     run = RunDirectory.create(tmp_path / "run", {"task": "train", "iterations": 100, "config": {}})
-    save_soup(run.soup_path, SoupFile(make_soup(3)))
+    make_soup(3).save(run.soup_path)
     run.append_history({"iteration": 50, "seconds": 1.0, "loss": 0.1})
     followed = Followed(run.path, torch.device("cpu"))
     assert followed.status()

@@ -5,7 +5,6 @@ import socket
 import threading
 
 import pytest
-from etsplat.model.soup_files import SoupFile
 
 from etsplat.tasks.soup_run import SoupRun
 from etsplat.viewer.guard import Guard
@@ -18,7 +17,7 @@ PROTOCOL = f"viser-v{viser.__version__}"
 
 @pytest.fixture
 def viewer(tmp_path):
-    shown = Viewer(SoupRun(tmp_path / "soup.safetensors", SoupFile(make_soup(4)), None), "localhost", 0, 64)
+    shown = Viewer(SoupRun(tmp_path / "soup.safetensors", make_soup(4), None), "localhost", 0, 64)
     yield shown
     shown.close()
 
