@@ -20,7 +20,7 @@ from etsplat.cli.doctor import Doctor
 from etsplat.cli.main import main
 from etsplat.cli.parse import COMMANDS, Group, parse
 from etsplat.cli.reconstruct import DemoObject, Reconstruct
-from etsplat.cli.train import Train
+from etsplat.cli.train import DemoScene, Train
 from etsplat.core.errors import InputError
 from etsplat.geometry.icosphere import icosphere
 from etsplat.io.mesh_files import save_mesh
@@ -123,6 +123,13 @@ def test_options_that_were_probably_meant_are_named(etsplat: Run) -> None:
     assert result.returncode == 2
     assert "--optimizer.lr-vertices FLOAT" in result.stderr
     assert "reconstruct" not in result.stderr
+
+
+@pytest.mark.parametrize("words", [["--method", "single_sided"], ["--method=single_sided"], ["--method=single-sided"]])
+def test_methods_may_be_written_as_kernels(words: list[str]) -> None:
+    command = parse(["demo", "scene", *words])
+    assert isinstance(command, DemoScene)
+    assert command.settings.method == "single-sided"
 
 
 def test_demo_alone_is_demo_object() -> None:

@@ -14,6 +14,8 @@ import pytest
 import torch
 from PIL import Image
 
+from etsplat.cli.parse import parse
+from etsplat.cli.train import Train
 from etsplat.core.errors import InputError
 from etsplat.geometry.icosphere import icosphere
 from etsplat.io.mesh_files import save_mesh
@@ -251,6 +253,25 @@ def test_command_repeats_the_run() -> None:
     older = reproduce_command(CONFIG | {"versions": {"etsplat": "0.0.1"}}, here)
     assert older is not None
     assert "--max-faces" in older
+
+
+def test_the_command_is_read_back_as_the_same_settings() -> None:
+    """Whatever was changed: numbers, switches, words, none, at the top and in groups."""
+    changes = {"normalize": False, "width": None, "drawing.cull_small": True, "optimizer.lr_sigma": 1e-7, "sky": "dome"}
+    settings = TrainConfig.demo("indoor").changed({**changes, "densification.replace_dead": False})
+    paths = {"source": "scenes/a b", "images": None, "masks": None}
+    record = {
+        "task": "train",
+        "config": settings.to_dict(),
+        "paths": paths,
+        "versions": {"etsplat": version("etsplat")},
+    }
+    for made_with in (version("etsplat"), "0.0.1"):
+        command = reproduce_command(record, made_with)
+        assert command is not None
+        parsed = parse(shlex.split(command.replace("\\\n", ""))[1:])
+        assert isinstance(parsed, Train)
+        assert parsed.settings == settings
 
 
 def test_no_command_for_objects_from_python() -> None:

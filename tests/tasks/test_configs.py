@@ -206,6 +206,14 @@ def test_a_method_without_softness_takes_the_soft_settings_of_its_preset() -> No
             assert replace(TrainConfig.of(preset, scene), finish="opaque").finish == "opaque"
 
 
+def test_methods_may_be_written_as_kernels() -> None:
+    """single_sided is single-sided."""
+    assert replace(TRAIN, method="single_sided") == replace(TRAIN, method="single-sided")
+    assert RECONSTRUCT.changed({"method": "raster_face"}).method == "raster-face"
+    with pytest.raises(InputError, match="method: is 'double-sided'; choose one of elastic, bilateral, single-sided"):
+        replace(TRAIN, method="double-sided")
+
+
 def test_changes_are_written_as_a_list() -> None:
     """Numbers, none, true and false have the type of their setting."""
     text = "iterations=2e3,start.limit=none,drawing.cull_small=True,optimizer.lr_sigma=1"

@@ -1,6 +1,7 @@
 """The list of commands, and which of them a command line asks for. Imports no torch, so that help is fast."""
 
 import inspect
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, make_dataclass
 from typing import Annotated, Any, Union, get_type_hints
@@ -68,7 +69,7 @@ def parse(arguments: Sequence[str]) -> Command:
     Raises:
         InputError: there is no such command, or a setting is out of its range.
     """
-    words = list(arguments) or ["--help"]
+    words = [re.sub(r"^(--method=)?single_sided$", r"\1single-sided", word) for word in arguments] or ["--help"]
     if words[0] == "demo" and (len(words) == 1 or (words[1].startswith("-") and words[1] not in ("-h", "--help"))):
         words.insert(1, "object")
     _check_command(words)

@@ -133,6 +133,9 @@ class Settings:
         implied = self.implied()
         for name, setting in settings_of(type(self)).items():
             value = get(self, name)
+            if isinstance(value, str) and value not in setting.choices and "." not in name:
+                value = value.replace("_", "-")  # single_sided, as the rasterizer has it
+                object.__setattr__(self, name, value)
             if problem := setting.problem(value):
                 shown = repr(value) if isinstance(value, str) or setting.choices else value
                 raise InputError(f"{name}: is {shown}; {problem}")
