@@ -4,7 +4,7 @@ import inspect
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, make_dataclass
-from typing import Annotated, Any, Union, get_type_hints
+from typing import Annotated, Any, Literal, Union, get_type_hints
 
 import tyro
 
@@ -18,7 +18,7 @@ from etsplat.cli.render import Render
 from etsplat.cli.train import DemoScene, Train
 from etsplat.cli.view import View
 from etsplat.core.errors import InputError
-from etsplat.tasks.settings import Rare, Settings, did_you_mean, docs_of
+from etsplat.tasks.settings import OneOf, Rare, Setting, Settings, did_you_mean, docs_of, settings_of
 
 
 @dataclass(frozen=True)
@@ -114,6 +114,12 @@ def _member(name: str, entry: type[Command] | Group, words: Sequence[str], asked
     return Annotated[entry, tyro.conf.subcommand(name, default=entry.defaults(words), description=help_of(entry))]
 
 
+def _offered(setting: Setting) -> Any:
+    """A type that tyro reads as one of the words that there are by now."""
+    words: Any = Literal[setting.choices]  # pyright: ignore[reportInvalidTypeForm]
+    return words | None if setting.optional else words
+
+
 def _registry(*, brief: bool) -> tyro.constructors.ConstructorRegistry:
     """How tyro is to read commands and configs: in brief, without groups and what is `Rare`."""
     registry = tyro.constructors.ConstructorRegistry()
@@ -127,8 +133,10 @@ def _registry(*, brief: bool) -> tyro.constructors.ConstructorRegistry:
         for field in fields(info.type):
             hint, value = hints[field.name], getattr(info.default, field.name)
             group = is_dataclass(value) and not isinstance(value, Settings)
-            hidden = brief and (group or Rare in getattr(hint, "__metadata__", ()))
-            kind: Any = Annotated[hint, tyro.conf.Suppress] if hidden else hint
+            extras = getattr(hint, "__metadata__", ())
+            hidden = brief and (group or Rare in extras)
+            kind: Any = _offered(settings_of(info.type)[field.name]) if OneOf in map(type, extras) else hint
+            kind = Annotated[kind, tyro.conf.Suppress] if hidden else kind
             specs.append(tyro.constructors.StructFieldSpec(field.name, kind, value, docs.get(field.name)))
         return tyro.constructors.StructConstructorSpec(info.type, tuple(specs))
 

@@ -6,13 +6,19 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, get_args
 
 from etsplat.core.errors import InputError
-from etsplat.tasks.settings import Device, Engine, Only, OrRegistered, Range, Rare, Settings, SoftMethod
+from etsplat.tasks.settings import Device, OneOf, Only, Range, Rare, Settings, SoftMethod, engine_names, kernel_methods
 
-Method = Literal[SoftMethod, "raster-face", "raster-vertex"]
+RasterMethod = Literal["raster-face", "raster-vertex"]
+Method = Literal[SoftMethod, RasterMethod]
 METHODS: tuple[Method, ...] = get_args(Method)
 Preset = Literal["best", "paper", "study", "quick", "demo", "tiny"]
 
 _SOFT = Only("with soft triangles (elastic, bilateral, single-sided)", lambda config: config.soft)
+_COARSE = Only("with coarse levels", lambda config: config.pictures.coarse_levels > 0)
+_LARGE = Only("with vertex_update large-steps", lambda config: config.optimizer.vertex_update == "large-steps")
+_LEARNED = Only("where softness is learned", lambda config: config.soft and not config.optimizer.sigma_final)
+_EDGES = Only("with lambda_edge", lambda config: config.regularization.lambda_edge > 0)
+_SUBDIVIDED = Only("with subdivisions", lambda config: config.refinement.subdivisions > 0)
 
 
 @dataclass(frozen=True)
@@ -23,9 +29,7 @@ class Pictures:
     """Pictures of a mesh average this many samples squared per pixel."""
     coarse_levels: Annotated[int, Range(0)] = 2
     """How many times the pictures are halved at first; the resolution doubles in equal steps."""
-    coarse_until: Annotated[float, Range(0, 1), Only("with coarse levels", lambda c: c.pictures.coarse_levels > 0)] = (
-        0.1
-    )
+    coarse_until: Annotated[float, Range(0, 1), _COARSE] = 0.1
     """When full resolution begins, as a fraction of the iterations."""
 
 
@@ -63,9 +67,7 @@ class Optimizer:
 
     vertex_update: Literal["adam", "uniform", "large-steps"] = "adam"
     """Adam's; Adam's with one scale for all vertices; or that, smoothed by the mesh's Laplacian."""
-    large_steps_weight: Annotated[
-        float, Range(0), Only("with vertex_update large-steps", lambda c: c.optimizer.vertex_update == "large-steps")
-    ] = 10.0
+    large_steps_weight: Annotated[float, Range(0), _LARGE] = 10.0
     """How far large-steps smooths: the weight of the Laplacian beside the identity."""
     lr_vertices: Annotated[float, Range(0)] = 2e-3
     """Adam learning rate of positions, in units of the object's radius."""
@@ -75,13 +77,7 @@ class Optimizer:
     """Adam learning rate of colours."""
     lr_opacities: Annotated[float, Range(0), _SOFT] = 1e-3
     """Adam learning rate of opacities, before their sigmoid."""
-    lr_sigma: Annotated[
-        float,
-        Range(0),
-        Only(
-            "where sigma is learned (soft triangles, sigma_final 0)", lambda c: c.soft and not c.optimizer.sigma_final
-        ),
-    ] = 1e-4
+    lr_sigma: Annotated[float, Range(0), _LEARNED] = 1e-4
     """Adam learning rate of the logarithm of sigma."""
     sigma_final: Annotated[float, Range(0), _SOFT] = 0.0
     """Softness at the end: sigma then falls exponentially from start.sigma and is not learned; 0 to learn it."""
@@ -93,7 +89,7 @@ class Regularization:
 
     lambda_edge: Annotated[float, Range(0)] = 1.5
     """Weight of the mean edge length."""
-    edge_power: Annotated[Literal[1, 2], Only("with lambda_edge", lambda c: c.regularization.lambda_edge > 0)] = 1
+    edge_power: Annotated[Literal[1, 2], _EDGES] = 1
     """1: mean edge length, as the paper prints it; 2: mean squared length."""
     lambda_smooth_normal: Annotated[float, Range(0)] = 0.01
     """Weight of the angle between neighbouring faces."""
@@ -111,7 +107,7 @@ class Regularization:
 class Refinement:
     """When faces are subdivided, and those that cut through each other untangled."""
 
-    first: Annotated[float, Range(0, 1), Only("with subdivisions", lambda c: c.refinement.subdivisions > 0)] = 0.1
+    first: Annotated[float, Range(0, 1), _SUBDIVIDED] = 0.1
     """First subdivision, as a fraction of the iterations."""
     last: Annotated[float, Range(0, 1)] = 0.6
     """Last subdivision, as a fraction of the iterations."""
@@ -153,7 +149,7 @@ class ReconstructConfig(Settings):
     paper: the paper's method at its budget;
     study: the paper's method in two minutes, for comparisons;
     demo, tiny: for `etsplat demo object` and for tests."""
-    method: Annotated[Method, OrRegistered] = "elastic"
+    method: Annotated[str, OneOf(lambda: (*kernel_methods(), *get_args(RasterMethod)))] = "elastic"
     """Kernel of soft triangles: elastic (the paper's), bilateral (2DTS), single-sided (Triangle Splatting) or a name
     given to `register_kernel`.
     Opaque triangles with antialiased silhouettes: raster-face or raster-vertex (a colour per face or per vertex)."""
@@ -169,7 +165,7 @@ class ReconstructConfig(Settings):
     """Of the order of views and the backgrounds. (Metrics always sample with the same seed.)"""
     device: Device | None = None
     """Where it runs: cpu, cuda (an NVIDIA GPU), or None for cuda where there is one."""
-    engine: Annotated[Engine | None, Rare] = None
+    engine: Annotated[str | None, OneOf(engine_names), Rare] = None
     """What computes: cpu, cuda, reference (plain PyTorch, slow), or None for the fastest on the device."""
 
     pictures: Pictures = Pictures()

@@ -21,7 +21,6 @@ from etsplat.core.errors import InputError
 from etsplat.io.run_directory import FORMAT
 
 Device = Literal["cpu", "cuda"]
-Engine = Literal["cpu", "cuda", "reference"]
 
 SoftMethod = Literal["elastic", "bilateral", "single-sided"]
 """The kernels of soft triangles, as both tasks name them."""
@@ -47,6 +46,13 @@ class Range:
 
 
 @dataclass(frozen=True)
+class OneOf:
+    """At a field of words, where more may be registered in the course of a program: which there are by now."""
+
+    names: Callable[[], tuple[str, ...]]
+
+
+@dataclass(frozen=True)
 class Only:
     """At a field: the condition under which it has an effect; where it has none, it may not be changed.
 
@@ -57,10 +63,6 @@ class Only:
 
     text: str
     holds: Callable[[Any], bool]
-
-
-class OrRegistered:
-    """At a field that names a kernel: it may also be one that was registered from Python."""
 
 
 class Rare:
@@ -74,8 +76,7 @@ class Setting:
     Attributes:
         kind: bool, int, float, str or Path.
         optional: whether it may be None.
-        choices: all values; empty where any of its kind and range will do.
-        open: whether names of registered kernels are choices, too.
+        names: gives all values; none where any of its kind and range will do.
         range: of numbers.
         only: when it has an effect.
         default: of its class.
@@ -83,20 +84,25 @@ class Setting:
 
     kind: type
     optional: bool
-    choices: tuple[Any, ...]
-    open: bool
+    names: Callable[[], tuple[Any, ...]]
     range: Range | None
     only: Only | None
     default: Any
+
+    @property
+    def choices(self) -> tuple[Any, ...]:
+        """The values that there are by now."""
+        return self.names()
 
     def problem(self, value: Any) -> str | None:
         """What is wrong with a value, or None."""
         if value is None and self.optional:
             return None
-        if self.choices:
-            known = self.choices + registered_kernels() if self.open else self.choices
-            choices = (None, *known) if self.optional else known
-            return None if value in known else f"choose one of {', '.join(map(str, choices))}"
+        if choices := self.choices:
+            if value in choices:
+                return None
+            choices = (None, *choices) if self.optional else choices
+            return f"choose one of {', '.join(map(str, choices))}"
         kinds = (int, float) if self.kind is float else self.kind
         if not isinstance(value, kinds) or isinstance(value, bool) != (self.kind is bool):
             return f"it must be {_KINDS[self.kind]}"
@@ -252,6 +258,19 @@ def settings_of(kind: type) -> dict[str, Setting]:
     return found
 
 
+def kernel_methods() -> tuple[str, ...]:
+    """The methods of soft triangles, with the names given to `register_kernel`: none where nobody has imported it."""
+    kernels = sys.modules.get("etsplat.core.kernels")
+    own = (name for name, kernel in kernels.KERNELS.items() if kernel.table is not None) if kernels else ()
+    return (*get_args(SoftMethod), *own)
+
+
+def engine_names() -> tuple[str, ...]:
+    """The engines that there are; before anything of torch is imported, those that come with the package."""
+    choice = sys.modules.get("etsplat.engines.choice")
+    return ("reference", "cpu", "cuda") if choice is None else choice.engine_names()
+
+
 def docs_of(kind: type) -> dict[str, str]:
     """The docstrings of a class's fields, those that it inherits too."""
     import docstring_parser
@@ -301,16 +320,10 @@ def _setting(hint: Any, default: Any) -> Setting:
     if optional:
         (hint,) = (part for part in parts if part is not NoneType)
     choices = get_args(hint) if get_origin(hint) is Literal else ()
+    named = next((extra.names for extra in extras if isinstance(extra, OneOf)), lambda: choices)
     limits = next((extra for extra in extras if isinstance(extra, Range)), None)
     only = next((extra for extra in extras if isinstance(extra, Only)), None)
-    kind = type(choices[0]) if choices else hint
-    return Setting(kind, optional, choices, OrRegistered in extras, limits, only, default)
-
-
-def registered_kernels() -> tuple[str, ...]:
-    """Names given to `register_kernel`; none where nobody has imported what registers them."""
-    kernels = sys.modules.get("etsplat.core.kernels")
-    return tuple(name for name, kernel in kernels.KERNELS.items() if kernel.table is not None) if kernels else ()
+    return Setting(type(choices[0]) if choices else hint, optional, named, limits, only, default)
 
 
 def _typed(setting: Setting, value: Any) -> Any:

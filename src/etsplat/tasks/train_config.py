@@ -5,13 +5,19 @@ from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Literal, get_args
 
 from etsplat.core.errors import InputError
-from etsplat.tasks.settings import Device, Engine, Only, OrRegistered, Range, Rare, Settings, SoftMethod
+from etsplat.tasks.settings import Device, OneOf, Only, Range, Rare, Settings, engine_names, kernel_methods
 
 Preset = Literal["paper", "quick", "demo", "tiny"]
 SceneType = Literal["outdoor", "indoor", "object"]
 SCENE_TYPES: tuple[SceneType, ...] = get_args(SceneType)
 
 _TRANSPARENT = Only("with finish none", lambda config: config.finish == "none")
+_SINGLE_SIDED = Only("with method single-sided", lambda config: config.method == "single-sided")
+_HARMONICS = Only("with view-dependent colours", lambda config: config.drawing.sh_degree > 0)
+_REGULAR = Only(
+    "with lambda_depth_normal or lambda_distortion",
+    lambda config: config.loss.lambda_depth_normal > 0 or config.loss.lambda_distortion > 0,
+)
 
 
 @dataclass(frozen=True)
@@ -26,7 +32,7 @@ class Drawing:
     """Leave out triangles that reach farther than this from their middle, in units of the photo's longer side."""
     sh_degree: Annotated[int, Range(0, 3)] = 3
     """Degree of the view-dependent colours."""
-    freeze_inradius: Annotated[bool, Only("with method single-sided", lambda c: c.method == "single-sided")] = True
+    freeze_inradius: Annotated[bool, _SINGLE_SIDED] = True
     """With single-sided, hold the inradius constant in the backward pass, as Triangle Splatting does."""
 
 
@@ -54,7 +60,7 @@ class Schedule:
     """What the iterations of this and the next groups refer to, but for those of `output`."""
     max_epochs: Annotated[int | None, Range(1)] = 100
     """A run ends earlier where it would see a photo more often than this; few photos are soon learnt by heart."""
-    sh_every: Annotated[int, Range(1), Only("with view-dependent colours", lambda c: c.drawing.sh_degree > 0)] = 1000
+    sh_every: Annotated[int, Range(1), _HARMONICS] = 1000
     """Iterations between steps of the colours' degree, from 0."""
 
 
@@ -71,9 +77,7 @@ class Optimizer:
     """Ratio of that rate's last value to its first; it falls exponentially."""
     lr_sh_dc: Annotated[float, Range(0)] = 0.01
     """Adam learning rate of the constant band of the colours."""
-    lr_sh_rest: Annotated[float, Range(0), Only("with view-dependent colours", lambda c: c.drawing.sh_degree > 0)] = (
-        0.0005
-    )
+    lr_sh_rest: Annotated[float, Range(0), _HARMONICS] = 0.0005
     """Adam learning rate of the other bands."""
     lr_opacities: Annotated[float, Range(0)] = 0.05
     """Adam learning rate of opacities, before their sigmoid."""
@@ -98,14 +102,7 @@ class Loss:
     """Weight of the angle between the normals of triangles and those of the depth image."""
     lambda_distortion: Annotated[float, Range(0)] = 0.0
     """Weight of the spread of triangles along a line of sight."""
-    regularize_from: Annotated[
-        int,
-        Range(0),
-        Only(
-            "with lambda_depth_normal or lambda_distortion",
-            lambda c: c.loss.lambda_depth_normal > 0 or c.loss.lambda_distortion > 0,
-        ),
-    ] = 5000
+    regularize_from: Annotated[int, Range(0), _REGULAR] = 5000
     """After this iteration the last two weights apply."""
 
 
@@ -174,7 +171,7 @@ class TrainConfig(Settings):
     demo, tiny: for `etsplat demo scene` and for tests."""
     scene_type: SceneType = "outdoor"
     """What is photographed, for learning rates and losses: outdoor, indoor, or an object."""
-    method: Annotated[SoftMethod, OrRegistered] = "elastic"
+    method: Annotated[str, OneOf(kernel_methods)] = "elastic"
     """Kernel of the triangles: elastic (the paper's), bilateral (2DTS), single-sided (Triangle Splatting) or a name
     given to `register_kernel`."""
     iterations: Annotated[int, Range(1)] = 6000
@@ -198,7 +195,7 @@ class TrainConfig(Settings):
     """Of every random choice: start, order of views, backgrounds, densification."""
     device: Device | None = None
     """Where it runs: cpu, cuda (an NVIDIA GPU), or None for cuda where there is one."""
-    engine: Annotated[Engine | None, Rare] = None
+    engine: Annotated[str | None, OneOf(engine_names), Rare] = None
     """What computes: cpu, cuda, reference (plain PyTorch, slow), or None for the fastest on the device."""
 
     drawing: Drawing = Drawing()
