@@ -258,11 +258,15 @@ def settings_of(kind: type) -> dict[str, Setting]:
     return found
 
 
-def kernel_methods() -> tuple[str, ...]:
-    """The methods of soft triangles, with the names given to `register_kernel`: none where nobody has imported it."""
+def registered_kernels() -> tuple[str, ...]:
+    """Names given to `register_kernel`; none where nobody has imported what registers them."""
     kernels = sys.modules.get("etsplat.core.kernels")
-    own = (name for name, kernel in kernels.KERNELS.items() if kernel.table is not None) if kernels else ()
-    return (*get_args(SoftMethod), *own)
+    return tuple(name for name, kernel in kernels.KERNELS.items() if kernel.table is not None) if kernels else ()
+
+
+def kernel_methods() -> tuple[str, ...]:
+    """The methods of soft triangles."""
+    return (*get_args(SoftMethod), *registered_kernels())
 
 
 def engine_names() -> tuple[str, ...]:
