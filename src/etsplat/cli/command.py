@@ -6,10 +6,12 @@ import sys
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import ClassVar, NoReturn
 
 import tyro
 
+from etsplat.io.run_directory import KERNEL_FILE
 from etsplat.tasks.settings import AnySettings
 
 FAILED, WRONG_INPUT, INTERRUPTED = 1, 2, 130
@@ -56,12 +58,26 @@ def settings_before_options(kind: type[AnySettings], arguments: Sequence[str], *
     Raises:
         InputError: the file cannot be used, there is no such preset, or both name one.
     """
+    _know_kernels(arguments)
     given = {}
     for name in named:
         if (value := option_value(arguments, f"--{name.replace('_', '-')}")) is not None:
             given[name] = value
     path = option_value(arguments, "--config")
     return kind.based_on(named | given) if path is None else kind.from_file(path, named, given)
+
+
+def _know_kernels(arguments: Sequence[str]) -> None:
+    """Registers what settings may name: kernels of ``--kernel-file``, which runs, and of a run that goes on."""
+    if (file := option_value(arguments, "--kernel-file")) is not None:
+        from etsplat.cli.kernel_file import run_kernel_file
+
+        run_kernel_file(Path(file))
+    out = option_value(arguments, "--out")
+    if "--resume" in arguments and out is not None and (Path(out) / KERNEL_FILE).is_file():
+        from etsplat.io.kernel_files import adopt_kernel_of
+
+        adopt_kernel_of(Path(out))
 
 
 def option_value(arguments: Sequence[str], option: str) -> str | None:

@@ -35,6 +35,8 @@ class RunCommand(Command):
     """Folder for the results."""
     config: Path | None = None
     """Settings to begin with: config.json of a run, or a JSON file with some of them. Options go over it."""
+    kernel_file: Annotated[Path | None, Rare] = None
+    """A Python file that registers the kernel named by --method (etsplat.register_kernel). It is run."""
     overwrite: Flag = False
     """Replace an earlier run in the folder."""
     resume: Flag = False

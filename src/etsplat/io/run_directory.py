@@ -20,6 +20,9 @@ from etsplat.io.atomic import atomic_write, write_error
 
 FORMAT = "etsplat run 1"
 
+KERNEL_FILE = "kernel.safetensors"
+"""The table of the run's kernel; there where that is none of the built-in ones."""
+
 _README = """\
 This folder is a run of etsplat ({task}).
 
@@ -64,6 +67,7 @@ _FILES = (
     "mesh.obj",
     "mesh.glb",
     "soup.safetensors",
+    KERNEL_FILE,
     "gaussians.safetensors",
     "metrics.json",
     "evaluation.json",

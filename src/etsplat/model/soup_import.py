@@ -118,7 +118,11 @@ def _read_exported(path: Path, comments: list[str]) -> TriangleSoup:
         rest,
     )
     words = next((comment.split() for comment in comments if comment.startswith("etsplat ")), [])
-    known = len(words) == 3 and words[1] in KERNELS and words[2] in DISTANCES
+    known = len(words) == 3 and words[2] in DISTANCES
+    if known and words[1] not in KERNELS:
+        raise InputError(
+            f"soup {path}: is drawn with kernel {words[1]!r}, which is not registered; take soup.safetensors"
+        )
     appearance = SoupAppearance(words[1], words[2]) if known else SoupAppearance()
     return replace(soup, appearance=appearance, notes={"source": path.name})
 

@@ -14,6 +14,7 @@ from etsplat.core.cameras import Cameras
 from etsplat.core.errors import InputError
 from etsplat.core.harmonics import MAX_DEGREE
 from etsplat.core.rasterization import SOUP_SIGMA_FLOOR, Rasterization
+from etsplat.io.kernel_files import adopt_kernel, kernel_tensors
 from etsplat.io.paths import kind_of
 from etsplat.io.tensors import read_tensors, save_tensors
 from etsplat.model.model import Depth
@@ -116,7 +117,7 @@ class TriangleSoup:
 
     @classmethod
     def load(cls, path: Path | str) -> "TriangleSoup":
-        """Read a soup that `save` wrote. Its parameters do not require gradients.
+        """Read a soup that `save` wrote. Its parameters do not require gradients. A kernel from Python is registered.
 
         Raises:
             InputError: the file is missing, cut short, of another kind, or holds numbers that are not finite.
@@ -134,11 +135,12 @@ class TriangleSoup:
         except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
             detail = (str(error) or type(error).__name__).splitlines()[0]
             raise InputError(f"soup {path}: cannot be read ({detail}); was it written by `etsplat train`?") from error
+        adopt_kernel(path, soup.appearance.kernel, tensors)
         soup.check_finite(path)
         return soup
 
     def save(self, path: Path | str) -> None:
-        """Write parameters, appearance and notes, atomically.
+        """Write parameters, appearance and notes, and the table of a kernel from Python, atomically.
 
         Raises:
             ValueError: `path` does not end in .safetensors.
@@ -148,7 +150,8 @@ class TriangleSoup:
         if kind_of(path) != ".safetensors":
             raise ValueError(f"path: expected the suffix .safetensors, got {path.name}")
         notes = {f"note.{key}": value for key, value in self.notes.items()}
-        save_tensors(path, self.state(), {**notes, "format": FORMAT, "appearance": self.appearance.to_json()})
+        tensors = {**self.state(), **kernel_tensors(self.appearance.kernel)}
+        save_tensors(path, tensors, {**notes, "format": FORMAT, "appearance": self.appearance.to_json()})
 
     def check_finite(self, path: Path) -> None:
         """Raises InputError, naming the file, for NaN or infinity among the parameters."""

@@ -14,6 +14,7 @@ from etsplat.core.rasterization import Rasterization
 from etsplat.core.validation import first_not_finite
 from etsplat.data.loader import ViewLoader
 from etsplat.engines.choice import engine_for
+from etsplat.io.kernel_files import adopt_kernel, kernel_tensors
 from etsplat.io.run_directory import RunDirectory
 from etsplat.model.model import Model
 from etsplat.ops.adam import Adam
@@ -205,10 +206,11 @@ class Trainer(Generic[M]):
             "sampler": self._sampler.state(),
         }
         state = {f"{part}.{name}": tensor for part, tensors in parts.items() for name, tensor in tensors.items()}
-        return {**state, "adam.step_count": torch.tensor(self.adam.step_count)}
+        return {**state, **kernel_tensors(self._kernel), "adam.step_count": torch.tensor(self.adam.step_count)}
 
     def load_state(self, state: dict[str, Tensor], iteration: int) -> None:
         """Continues where `state` was taken."""
+        adopt_kernel(Path("checkpoint"), self._kernel, state)  # refuses one of another kernel of this name
         self.model.load_state(_part(state, "model"))
         first, second = _part(state, "adam.first"), _part(state, "adam.second")
         for name, parameter in self.model.parameters().items():
@@ -218,6 +220,11 @@ class Trainer(Generic[M]):
         self._sampler.load_state(_part(state, "sampler"))
         self._arrive(iteration)
         self.edited()
+
+    @property
+    def _kernel(self) -> str | None:
+        """What the model is drawn with; None for models that are drawn otherwise."""
+        return getattr(self.model.appearance, "kernel", None)
 
     def _step(self, iteration: int) -> float:
         self._arrive(iteration)

@@ -15,6 +15,7 @@ from torch import Tensor
 from etsplat.core.errors import InputError
 from etsplat.engines.choice import engine_for
 from etsplat.engines.threads import num_threads
+from etsplat.io.kernel_files import kernel_digest, write_kernel
 from etsplat.io.run_directory import RunDirectory, is_run
 from etsplat.optim.loop import Event, Progress
 from etsplat.optim.objective import Term
@@ -88,7 +89,9 @@ class Place:
         """
         if self.resume:
             return RunDirectory.resume(self.path, record)
-        return RunDirectory.create(self.path, record, overwrite=self.overwrite)
+        run = RunDirectory.create(self.path, record, overwrite=self.overwrite)
+        write_kernel(run.path, record["config"].get("method"))
+        return run
 
 
 def announcer(callbacks: Sequence[Callback]) -> Callback:
@@ -153,14 +156,15 @@ def make_record(
     Args:
         config: settings, as they were asked for.
         iterations: of this run, which may be fewer.
-        hashes: of the input, by kind.
+        hashes: of the input, by kind. That of a kernel from Python joins them.
         paths: where it was read from, by kind.
     """
+    settings = config.to_dict()
     return {
         "task": config.TASK,
-        "config": config.to_dict(),
+        "config": settings,
         "iterations": iterations,
-        "source": hashes,
+        "source": {**hashes, **kernel_digest(settings.get("method"))},
         "paths": paths,
         "versions": versions(),
     }

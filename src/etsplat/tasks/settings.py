@@ -18,7 +18,7 @@ from types import NoneType
 from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 from etsplat.core.errors import InputError
-from etsplat.io.run_directory import FORMAT
+from etsplat.io.run_directory import FORMAT, KERNEL_FILE
 
 Device = Literal["cpu", "cuda"]
 
@@ -217,6 +217,10 @@ class Settings:
         Raises:
             InputError: it cannot be read, is of another kind of run, or has settings that there are not.
         """
+        if (Path(path).parent / KERNEL_FILE).is_file():
+            from etsplat.io.kernel_files import adopt_kernel_of  # imports torch
+
+            adopt_kernel_of(Path(path).parent)
         found = _read(path, cls.TASK)
         for name in given:
             if name in found:
