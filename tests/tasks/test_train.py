@@ -253,8 +253,11 @@ def test_an_opaque_finish_removes_only_what_is_hidden(capture: Dataset) -> None:
 
 
 def test_an_opaque_finish_replaces_what_it_hides(capture: Dataset) -> None:
-    for finish, asked, replaces in (("none", False, False), ("none", True, True), ("opaque", True, True)):
-        assert strategy_of(capture, finish=finish, densification__replace_dead=asked).replace_dead is replaces
+    for replaces in (False, True):
+        assert strategy_of(capture, densification__replace_dead=replaces).replace_dead is replaces
+    assert strategy_of(capture, finish="opaque").replace_dead
+    with pytest.raises(InputError, match=r"densification\.replace_dead: has an effect only with finish none"):
+        strategy_of(capture, finish="opaque", densification__replace_dead=False)
 
 
 def test_few_photos_end_a_run_earlier(capture: Dataset, tmp_path: Path) -> None:

@@ -232,7 +232,7 @@ def _strategy(config: TrainConfig, spared: Spared | None) -> DensifyAndPrune:
         last=config.iterations,
         max_triangles=config.max_triangles,
         growth=multiplying.growth,
-        replace_dead=multiplying.replace_dead or opaque,
+        replace_dead=multiplying.replace_dead,
         sample_by=multiplying.sample_by,
         split_size=multiplying.split_size,
         clone_noise=multiplying.clone_noise,

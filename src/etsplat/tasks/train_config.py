@@ -119,8 +119,7 @@ class Densification:
     growth: Annotated[float, Range(1)] = 1.3
     """Each multiplies the number of triangles by this, at most."""
     replace_dead: Annotated[bool, _TRANSPARENT] = True
-    """Triangles that die count in the number that is multiplied, so that all of them are replaced.
-    With an opaque finish they do in any case."""
+    """Triangles that die count in the number that is multiplied, so that all of them are replaced."""
     sample_by: Literal["alternate", "opacity", "sharpness"] = "alternate"
     """What makes a parent likely: its opacity, 1/sigma, or the one and the other in turn."""
     split_size: Annotated[float, Range(0)] = 24.0
