@@ -1,6 +1,5 @@
 from dataclasses import replace
 
-import pytest
 import torch
 
 from etsplat.core.cameras import Cameras, intrinsics, look_at
@@ -34,8 +33,10 @@ def test_small_triangles_are_left_out_only_on_request():
     culled.color.sum().backward()
     assert float(soup.vertices.grad[1].abs().max()) == 0
     assert float(soup.vertices.grad[0].abs().max()) > 0
-    with pytest.raises(ValueError, match="camera must be one"):
-        culling.render(camera(2))
+    pair = culling.render(camera(2), backgrounds=torch.rand(2, 3), outputs=("normal", "statistics"))
+    assert pair.color.shape == (2, 48, 48, 3)
+    assert pair.statistics.visible.tolist() == [[True, False]] * 2
+    torch.testing.assert_close(pair.normal[:1], culling.render(camera(), outputs=("normal",)).normal)
 
 
 def test_sharp_full_triangles_look_alike_soft_and_opaque():

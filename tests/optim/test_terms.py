@@ -14,9 +14,12 @@ from etsplat.model.triangle_mesh import TriangleMesh
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.ops.triangle_area import mean_area
 from etsplat.optim.objective import Custom, Drawing, Objective, Term
+from etsplat.optim.terms import named_terms
 from etsplat.optim.terms.mesh import EdgeLength, Laplacian, SmoothNormals, Softness
 from etsplat.optim.terms.photometric import Photometric
 from etsplat.optim.terms.soup import DepthNormals, Distortion, Opacity, Size
+from etsplat.tasks.reconstruct_config import ReconstructConfig
+from etsplat.tasks.train_config import TrainConfig
 
 # Two faces that share the edge (0, 2) of a folded unit square.
 VERTICES = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.5], [1.0, 1.0, 0.0], [0.0, 1.0, 0.25]]
@@ -230,3 +233,10 @@ def test_spared_triangles_count_as_transparent(rng: torch.Generator) -> None:
     _, drawing = a_soups_drawing(rng, ("color",))
     spared = torch.arange(30) < 10
     assert float(Opacity(spared=lambda _: spared)(drawing).detach()) == pytest.approx(0.4, rel=1e-5)
+
+
+def test_every_weight_among_the_settings_is_that_of_a_term() -> None:
+    """And every term with a name has a setting."""
+    groups = (ReconstructConfig().regularization, TrainConfig().loss)
+    weights = {name for group in groups for name in vars(group) if name.startswith("lambda_")}
+    assert weights - {"lambda_dssim"} == {f"lambda_{name}" for name in named_terms()}

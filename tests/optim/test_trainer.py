@@ -117,12 +117,15 @@ def test_a_fit_can_be_gone_on_with(object_views: Dataset) -> None:
     assert losses_of(whole, 40) == losses_of(parts, 20) + losses_of(parts, 40)
 
 
-def test_a_checkpoint_of_another_run_is_refused(object_views: Dataset, tmp_path: Path) -> None:
-    """By the hash that the owner of the run gives."""
-    run = RunDirectory.create(tmp_path / "run", {"task": "reconstruct"})
-    combination("mesh", object_views).fit(2, run=run, run_hash="one")
-    with pytest.raises(InputError, match="with other settings"):
-        combination("mesh", object_views).fit(3, run=run, run_hash="two")
+def test_a_folder_becomes_a_run_to_go_on_with(object_views: Dataset, tmp_path: Path) -> None:
+    """Nothing but its name is needed; another seed, or other parts, are another run, and refused."""
+    whole = losses_of(combination("mesh", object_views), 20)
+    combination("mesh", object_views).fit(10, run=tmp_path / "run", log_every=1)
+    assert losses_of(combination("mesh", object_views), 20, run=tmp_path / "run") == whole[10:]
+    assert "Trainer.fit" in (tmp_path / "run" / "README.txt").read_text()
+    for other in (combination("mesh", object_views, seed=1), combination("soup", object_views)):
+        with pytest.raises(InputError, match="with other settings"):
+            other.fit(30, run=tmp_path / "run")
 
 
 def test_a_step_of_two_views_is_the_mean_of_their_gradients(object_views: Dataset) -> None:

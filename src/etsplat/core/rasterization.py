@@ -1,8 +1,10 @@
 """What goes into and comes out of the rasterizer, shared by its engines."""
 
-from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Any, Literal, NamedTuple
 
+import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
@@ -116,3 +118,17 @@ class HardRasterization:
     triangle: Int[Tensor, "B H W"]
     barycentrics: Float[Tensor, "B H W 3"]
     depth: Float[Tensor, "B H W"]
+
+
+def joined(renderings: Sequence[Rasterization]) -> Rasterization:
+    """Renderings of single views, one or more, as one of them all."""
+
+    def join(parts: Sequence[Any]) -> Any:
+        if isinstance(parts[0], Tensor):
+            return torch.cat(list(parts))
+        if parts[0] is None:
+            return None
+        names = [entry.name for entry in fields(parts[0])]
+        return type(parts[0])(**{name: join([getattr(part, name) for part in parts]) for name in names})
+
+    return join(renderings)

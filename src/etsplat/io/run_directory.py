@@ -42,6 +42,8 @@ mesh.glb        the result, for viewers
 mesh.obj, .ply  the same; colours of faces are exact in mesh.ply, and means at the vertices in all three""",
     "train": """\
 soup.safetensors  the result: triangles with opacity, softness and view-dependent colour; etsplat export converts it""",
+    "fit": """\
+                (whoever called Trainer.fit saves the model)""",
 }
 
 _TEST = {
@@ -49,6 +51,8 @@ _TEST = {
 test/           held-out views: NNN_render.png (splatted), NNN_truth.png, NNN_mesh.png (the mesh drawn opaque)""",
     "train": """\
 test/           held-out views: NNN_render.png (splatted), NNN_truth.png, NNN_opaque.png (drawn opaque)""",
+    "fit": """\
+test/           held-out views, where somebody scored them""",
 }
 
 _PEER_README = """\
@@ -163,7 +167,8 @@ class RunDirectory:
 
         Args:
             path: as in `check_free`.
-            config: what config.json holds, JSON-serialisable, with the key "task": "reconstruct", "train" or "peer".
+            config: what config.json holds, JSON-serialisable, with the key "task": "reconstruct", "train",
+                "fit" or "peer".
             overwrite: whether an earlier run may be replaced. Only files that a run writes are removed.
 
         Raises:

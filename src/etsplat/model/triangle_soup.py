@@ -13,7 +13,7 @@ from torch import Tensor
 from etsplat.core.cameras import Cameras
 from etsplat.core.errors import InputError
 from etsplat.core.harmonics import MAX_DEGREE
-from etsplat.core.rasterization import SOUP_SIGMA_FLOOR, Rasterization
+from etsplat.core.rasterization import SOUP_SIGMA_FLOOR, Rasterization, joined
 from etsplat.io.kernel_files import adopt_kernel, kernel_tensors
 from etsplat.io.paths import kind_of
 from etsplat.io.tensors import read_tensors, save_tensors
@@ -217,19 +217,24 @@ class TriangleSoup:
         """Splat the triangles into the images of B cameras; differentiable with respect to the parameters.
 
         Args:
-            cameras: B cameras; one where the appearance leaves out triangles by their size on the image.
+            cameras: B cameras.
             backgrounds: (B, 3); None is black.
             outputs: as in `etsplat.rasterize`.
             depth_of: as there.
         """
         look = self.appearance
+        culls = look.cull_small or look.cull_large < float("inf")
+        if culls and len(cameras) > 1:  # which triangles are left out differs from view to view
+            behind = [None] * len(cameras) if backgrounds is None else backgrounds.split(1)
+            views = [(cameras[index], behind[index]) for index in range(len(cameras))]
+            return joined([self.render(v, backgrounds=b, outputs=outputs, depth_of=depth_of) for v, b in views])
         colors = soup_colors(self.vertices, self.sh_dc, self.sh_rest, cameras.centers, self.drawn_degree)
         opacities, sigma = soup_activation(
             self.vertices,
             self.opacity_logits,
             self.sigma_raw,
             look.numbers if look.limits is None else look.limits,
-            cameras if look.cull_small or look.cull_large < float("inf") else None,
+            cameras if culls else None,
             smallest=SMALLEST_INRADIUS if look.cull_small else 0.0,
             largest=look.cull_large * max(cameras.width, cameras.height),
         )

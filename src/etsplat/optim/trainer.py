@@ -1,6 +1,8 @@
 """Fits a model to photos: one trainer for every model, objective, strategy and data set."""
 
-from collections.abc import Callable, Hashable, Sequence
+import hashlib
+import json
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import takewhile
 from pathlib import Path
@@ -12,10 +14,11 @@ from torch import Tensor
 
 from etsplat.core.rasterization import Rasterization
 from etsplat.core.validation import first_not_finite
-from etsplat.data.loader import ViewLoader
+from etsplat.data.dataset import Dataset
+from etsplat.data.loader import View, ViewLoader
 from etsplat.engines.choice import engine_for
 from etsplat.io.kernel_files import adopt_kernel, kernel_tensors
-from etsplat.io.run_directory import RunDirectory
+from etsplat.io.run_directory import RunDirectory, is_run
 from etsplat.model.model import Model
 from etsplat.ops.adam import Adam
 from etsplat.optim.drive import Callback, drive
@@ -59,7 +62,7 @@ class Trainer(Generic[M]):
     def __init__(
         self,
         model: M,
-        dataset: Any,
+        dataset: Dataset,
         objective: Objective,
         strategy: Strategy | None = None,
         *,
@@ -92,6 +95,7 @@ class Trainer(Generic[M]):
         self._update, self._evaluate = update, evaluate
         generator = seed if isinstance(seed, torch.Generator) else torch.Generator().manual_seed(seed)
         self._sampler = ViewSampler(dataset.train, generator)
+        self._began = generator.get_state()
         parameters = model.parameters()
         self._device = next(iter(parameters.values())).device
         self.adam = Adam(parameters, self._rates(1))
@@ -123,7 +127,7 @@ class Trainer(Generic[M]):
         evaluate_every: int = 0,
         checkpoint_every: int = 0,
         run: RunDirectory | Path | str | None = None,
-        run_hash: str = "",
+        run_hash: str | None = None,
     ) -> Progress:
         """Makes all steps up to an iteration that have not been made, and the edits between them.
 
@@ -135,8 +139,10 @@ class Trainer(Generic[M]):
             log_every: iterations between StepEvents.
             evaluate_every: iterations between evaluations; 0 for one at the end only.
             checkpoint_every: iterations between checkpoints; 0 for one at the end only.
-            run: gets checkpoints and history.jsonl, and is gone on with if it has a checkpoint; None writes nothing.
-            run_hash: identifies all that the result depends on; a checkpoint of another run is refused.
+            run: gets checkpoints and history.jsonl, and is gone on with if it has a checkpoint; made if it is missing.
+                None writes nothing.
+            run_hash: identifies all that the result depends on; a checkpoint of another run is refused. None for one of
+                the photos, the seed and the kinds of the parts.
 
         Returns:
             Where the run stands.
@@ -146,9 +152,13 @@ class Trainer(Generic[M]):
             InputError: a checkpoint is damaged or of another run; the disk is full.
         """
         settings = LoopSettings(iterations, log_every, evaluate_every, checkpoint_every)
-        directory = RunDirectory(Path(run)) if isinstance(run, Path | str) else run
+        if isinstance(run, Path | str):
+            record = {"task": "fit", "iterations": iterations}
+            run = RunDirectory(Path(run)) if is_run(run) else RunDirectory.create(run, record)
+        if run is not None and run_hash is None:
+            run_hash = self._hash()
         with engine_for(next(iter(self.model.parameters().values()))).looping():
-            drive(self, self.progress, settings, callbacks, directory, run_hash)
+            drive(self, self.progress, settings, callbacks, run, run_hash or "")
         return self.progress
 
     @property
@@ -285,7 +295,7 @@ class Trainer(Generic[M]):
         self._seen = []
 
     def _gradients(
-        self, views: Any, weights: Sequence[float], scale: float | Tensor
+        self, views: Iterable[tuple[View, Tensor]], weights: Sequence[float], scale: float | Tensor
     ) -> tuple[Tensor, list[Rasterization]]:
         """Those of the objective, one view after the other; its value, and what was seen."""
         outputs = (*self._objective.outputs(weights), *self.strategy.outputs)
@@ -330,6 +340,11 @@ class Trainer(Generic[M]):
             for _ in range(halvings):
                 dataset = dataset.halved()
             self._halvings, self._loader = halvings, ViewLoader(dataset, self._device, self._batch)
+
+    def _hash(self) -> str:
+        kinds = [type(part).__name__ for part in (self.model, self.strategy, *self._objective.terms)]
+        about = [self._dataset.fingerprint(), self._batch, kinds, self._objective.weights(1), self._began.tolist()]
+        return hashlib.sha256(json.dumps(about).encode()).hexdigest()
 
     def _rates(self, iteration: int) -> dict[str, float]:
         return {name: at(self._schedule.rates[name], iteration) for name in self.model.parameters()}
