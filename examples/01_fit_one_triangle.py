@@ -11,7 +11,6 @@ import argparse
 import torch
 
 import etsplat
-from etsplat.io.images import save_image
 
 SIZE = 96
 
@@ -61,7 +60,7 @@ def main() -> None:
 
     if options.out:
         result = render(corners, color, opacity, log_sigma.exp()).detach()
-        save_image(options.out, torch.cat([start, result, target], dim=1))
+        etsplat.save_image(options.out, torch.cat([start, result, target], dim=1))
         print(f"start, result and target: {options.out}")
 
 

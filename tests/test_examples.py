@@ -1,29 +1,96 @@
-"""The examples run as they are, at their smallest."""
+"""The examples run as they are, at their smallest, and so does the code of the documents; from public names alone."""
 
+import ast
+import os
+import re
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+from PIL import Image
 
-EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
+import etsplat
 
-SMALLEST = {
-    "01_fit_one_triangle.py": ["--steps", "6", "--out", "triangle.png"],
-    "02_reconstruct_demo.py": ["--preset", "tiny", "--out", "run"],
-    "03_own_kernel.py": ["--preset", "tiny", "--out", "plateau"],
+ROOT = Path(__file__).resolve().parent.parent
+EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
+PACKAGES = {"etsplat", "torch", "numpy", "matplotlib"}
+ONE_SCREEN = 78
+"""Lines."""
+
+SMALLEST: dict[str, tuple[list[str], str]] = {
+    "01_fit_one_triangle.py": (["--steps", "6", "--out", "triangle.png"], "triangle.png"),
+    "03_own_kernel.py": (["--preset", "tiny"], "runs/plateau/kernel.png"),
+    "04_own_loss.py": (["--iterations", "4"], "symmetry.png"),
+    "05_own_strategy.py": (["--iterations", "8"], "strategy.png"),
+    "06_scene_and_path.py": (["--iterations", "6", "--width", "32"], "runs/scene/path.png"),
+    "07_camera_refinement.py": (["--steps", "2"], "cameras.png"),
+    "08_object_soup.py": (["--iterations", "6"], "soup.png"),
 }
+"""By example: what makes it small, and the picture that it then writes."""
+
+
+def run(program: list[str], folder: Path) -> str:
+    environment = {**os.environ, "MPLBACKEND": "Agg"}
+    command = [sys.executable, *program]
+    result = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False, env=environment)
+    assert result.returncode == 0, result.stderr
+    return result.stdout
+
+
+def code_of(document: str, containing: str) -> str:
+    blocks = re.findall(r"^```python\n(.*?)^```$", (ROOT / document).read_text(encoding="utf-8"), re.S | re.M)
+    (found,) = (block for block in blocks if containing in block)
+    return found
+
+
+def assert_shows_something(picture: Path) -> None:
+    with Image.open(picture) as image:
+        assert np.asarray(image.convert("RGB")).std() > 5
 
 
 def test_every_example_is_listed() -> None:
     """A new example is run too."""
-    assert sorted(path.name for path in EXAMPLES.glob("*.py")) == sorted(SMALLEST)
+    assert [path.name for path in EXAMPLES] == sorted(SMALLEST)
 
 
-@pytest.mark.parametrize("name", SMALLEST)
-def test_example_runs(name: str, tmp_path: Path) -> None:
-    """The example ends well and writes what it was asked to."""
-    command = [sys.executable, str(EXAMPLES / name), *SMALLEST[name]]
-    result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert result.returncode == 0, result.stderr
-    assert (tmp_path / SMALLEST[name][-1]).exists()
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+def test_an_example_uses_public_names_alone(path: Path) -> None:
+    """Nothing but the standard library, torch, numpy, matplotlib, and what `import etsplat` lists; on one screen."""
+    source = path.read_text(encoding="utf-8")
+    assert len(source.splitlines()) <= ONE_SCREEN
+    for node in ast.walk(ast.parse(source)):
+        modules = [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+        modules += [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+        for module in modules:
+            assert module.split(".")[0] in PACKAGES | sys.stdlib_module_names
+            assert module == "etsplat" or not module.startswith("etsplat")
+        assert not (isinstance(node, ast.ImportFrom) and node.module == "etsplat")
+        if isinstance(node, ast.Attribute):
+            owner = node.value.id if isinstance(node.value, ast.Name) else ""
+            assert owner != "etsplat" or node.attr in etsplat.__all__
+            assert owner == "self" or not node.attr.startswith("_") or node.attr.endswith("__")
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+def test_an_example_runs(path: Path, tmp_path: Path) -> None:
+    """It ends well, says something, and its picture shows something."""
+    options, picture = SMALLEST[path.name]
+    assert run([str(path), *options], tmp_path)
+    assert_shows_something(tmp_path / picture)
+
+
+def test_the_loop_of_the_documents_runs(tmp_path: Path) -> None:
+    """docs/library.md: twenty lines that end with a mesh and a picture that is more than the start's."""
+    code = code_of("docs/library.md", "photometric_loss")
+    assert float(run(["-c", code], tmp_path)) > 15  # dB
+    assert_shows_something(tmp_path / "view.png")
+    assert len(etsplat.load_mesh(tmp_path / "owl.glb").faces) == 1280
+
+
+def test_the_trainer_of_the_documents_runs(tmp_path: Path) -> None:
+    """docs/library.md: the same in fewer lines, with a term and a strategy."""
+    printed = run(["-c", code_of("docs/library.md", "Trainer")], tmp_path)
+    assert "iterations in" in printed
+    assert etsplat.TriangleMesh.load(tmp_path / "owl.glb").count > 1280

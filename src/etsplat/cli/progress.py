@@ -1,5 +1,6 @@
 """Shows how a run goes: a live bar on a terminal, now and then a line elsewhere."""
 
+from dataclasses import replace
 from types import TracebackType
 
 from rich.console import Console
@@ -19,7 +20,7 @@ class RunProgress:
         self._console = console
         self._preparing = preparing
         self._bar = PhaseBar(console)
-        self._psnr = ""
+        self._metrics: dict[str, float] = {}
         self._lines = 0
 
     def __enter__(self) -> "RunProgress":
@@ -48,11 +49,9 @@ class RunProgress:
         self._bar.show(phase, 0, 0)
 
     def _step(self, event: StepEvent) -> None:
-        if "psnr" in event.metrics:
-            self._psnr = f" · {event.metrics['psnr']:.2f} dB"
-        counts = "".join(f" · {event.state[name]:,} {name}" for name in ("faces", "triangles") if name in event.state)
-        state = f"loss {event.loss:.4f}{self._psnr}{counts} · σ {event.state['sigma']:.3f}"
-        self._bar.show("Optimizing", event.iteration, event.iterations, state)
+        self._metrics |= event.metrics
+        event = replace(event, metrics=self._metrics)  # the last that were measured
+        self._bar.show("Optimizing", event.iteration, event.iterations, event.summary)
         if not self._console.is_terminal and event.iteration * LINES >= self._lines * event.iterations:
             self._lines = event.iteration * LINES // event.iterations + 1
-            print(f"  {event.iteration}/{event.iterations} · {event.seconds:.0f} s · {state}", flush=True)
+            print(f"  {event}", flush=True)

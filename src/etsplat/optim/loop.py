@@ -42,6 +42,18 @@ class StepEvent:
     state: dict[str, float]
     metrics: dict[str, float]
 
+    @property
+    def summary(self) -> str:
+        """Loss, PSNR if it was measured, number of triangles and softness."""
+        parts = [f"loss {self.loss:.4f}"]
+        parts += [f"{self.metrics['psnr']:.2f} dB"] if "psnr" in self.metrics else []
+        parts += [f"{self.state[name]:,} {name}" for name in ("faces", "triangles") if name in self.state]
+        parts += [f"σ {self.state['sigma']:.3f}"] if "sigma" in self.state else []
+        return " · ".join(parts)
+
+    def __str__(self) -> str:
+        return f"{self.iteration}/{self.iterations} · {self.seconds:.0f} s · {self.summary}"
+
 
 @dataclass(frozen=True)
 class RefineEvent:
@@ -57,6 +69,9 @@ class RefineEvent:
     count: int
     added: int
 
+    def __str__(self) -> str:
+        return f"{self.iteration}: {self.count:,} triangles ({self.added:+,})"
+
 
 @dataclass(frozen=True)
 class CheckpointEvent:
@@ -70,6 +85,9 @@ class CheckpointEvent:
     iteration: int
     path: Path
 
+    def __str__(self) -> str:
+        return f"{self.iteration}: {self.path}"
+
 
 @dataclass(frozen=True)
 class DoneEvent:
@@ -82,6 +100,9 @@ class DoneEvent:
 
     iteration: int
     seconds: float
+
+    def __str__(self) -> str:
+        return f"{self.iteration} iterations in {self.seconds:.1f} s"
 
 
 Event = StepEvent | RefineEvent | CheckpointEvent | DoneEvent

@@ -6,17 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from etsplat.core.errors import InputError
+from etsplat.io.overview import TestView, find_test_views
 from etsplat.io.run_directory import RunDirectory, is_run
-
-
-@dataclass(frozen=True)
-class TestView:
-    """The pictures of one test view: paths of PNG files; `opaque` is the result as a mesh viewer draws it."""
-
-    name: str
-    truth: Path
-    render: Path
-    opaque: Path
 
 
 @dataclass(frozen=True)
@@ -69,15 +60,9 @@ def read_run(run_dir: Path | str) -> Run:
         config=config,
         metrics={**directory.read_metrics(), **directory.read_evaluation()},
         history=directory.read_history(),
-        views=_find_views(directory.test, "opaque" if mesh is None else "mesh"),
+        views=find_test_views(directory.test, "opaque" if mesh is None else "mesh"),
         mesh=mesh,
     )
-
-
-def _find_views(folder: Path, kind: str) -> list[TestView]:
-    names = sorted(path.name.removesuffix("_render.png") for path in folder.glob("*_render.png"))
-    views = [TestView(name, *(folder / f"{name}_{k}.png" for k in ("truth", "render", kind))) for name in names]
-    return [view for view in views if view.truth.is_file() and view.opaque.is_file()]
 
 
 def _is_finite(value: object) -> bool:

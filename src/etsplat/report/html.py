@@ -16,12 +16,13 @@ from PIL import Image
 
 from etsplat.io.atomic import atomic_write
 from etsplat.io.mesh_files import load_mesh
+from etsplat.io.overview import TestView, draw_overview, spread
 from etsplat.report.cards import cards_of
 from etsplat.report.command import reproduce_command
 from etsplat.report.curves import curves_of, draw_svg, short_number
-from etsplat.report.data import Run, TestView, read_run
+from etsplat.report.data import Run, read_run
 from etsplat.report.metrics import Metric
-from etsplat.report.plots import draw_overview, plot_convergence, spread
+from etsplat.report.plots import plot_convergence
 
 MAX_VIEWS = 12
 MAX_PICTURE = 800
@@ -42,7 +43,9 @@ def write_report(run_dir: Path | str) -> Path:
     """
     run = read_run(run_dir)
     plot_convergence(run, run.folder / "convergence.png")
-    draw_overview(run, run.folder / "overview.png")
+    if run.views:
+        with atomic_write(run.folder / "overview.png") as temporary:
+            draw_overview(run.views, "opaque" if run.mesh is None else "mesh").save(temporary)
     path = run.folder / "report.html"
     with atomic_write(path) as temporary:
         temporary.write_text(render_page(run), encoding="utf-8")

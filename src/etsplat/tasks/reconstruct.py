@@ -25,6 +25,7 @@ from etsplat.optim.strategies import SubdivideAndUntangle
 from etsplat.optim.terms.photometric import Photometric
 from etsplat.optim.trainer import Trainer
 from etsplat.optim.vertex_updates import UniformSteps
+from etsplat.tasks.notebook import notebook_callbacks, result_html
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.running import (
     Callback,
@@ -56,6 +57,9 @@ class ReconstructResult:
     mesh: MeshFile
     metrics: dict[str, Any]
 
+    def _repr_html_(self) -> str:
+        return result_html(self.path, self.metrics, TriangleMesh.OPAQUE)
+
 
 def reconstruct(
     source: Source,
@@ -82,7 +86,7 @@ def reconstruct(
         init_mesh: a mesh to start from instead of the sphere, in the units of the source.
         masks: folder with a mask (white inside the object) for every image of a scene folder, instead of its own masks/
             or the images' transparency.
-        callbacks: each is called with every event, in the thread of the caller.
+        callbacks: each is called with every event, in the thread of the caller. With none a notebook shows a line.
         resume: continue the run in `out`, which must have been started with the same source and settings; from the
             beginning if it has no checkpoint yet.
         overwrite: replace a run in `out`. Nothing but files of a run is ever removed.
@@ -93,6 +97,7 @@ def reconstruct(
     """
     config = config or ReconstructConfig()
     device = resolve_device(config.device, config.engine)
+    callbacks = callbacks or notebook_callbacks()
     place, announce = Place(Path(out), resume, overwrite), announcer(callbacks)
     place.check()
     loaded, start = load_source(source, config, masks), load_start(init_mesh)

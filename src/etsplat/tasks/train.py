@@ -26,6 +26,7 @@ from etsplat.optim.strategies import DensifyAndPrune
 from etsplat.optim.terms.photometric import Photometric
 from etsplat.optim.terms.soup import Spared
 from etsplat.optim.trainer import Trainer
+from etsplat.tasks.notebook import notebook_callbacks, result_html
 from etsplat.tasks.running import (
     Callback,
     NoteEvent,
@@ -74,6 +75,9 @@ class TrainResult:
     soup: TriangleSoup
     metrics: dict[str, Any]
 
+    def _repr_html_(self) -> str:
+        return result_html(self.path, self.metrics, TriangleSoup.OPAQUE)
+
 
 def train(
     source: str | Path | Dataset,
@@ -97,7 +101,7 @@ def train(
         config: settings; None for preset "quick", outdoor. See `TrainConfig`.
         images: folder in the scene to take the photos from, such as "images_4".
         masks: folder with a mask for every photo, white where pixels count.
-        callbacks: each is called with every event, in the thread of the caller.
+        callbacks: each is called with every event, in the thread of the caller. With none a notebook shows a line.
         resume: continue the run in `out`, which must have been started with the same source and settings.
         overwrite: replace a run in `out`. Nothing but files of a run is ever removed.
 
@@ -107,6 +111,7 @@ def train(
     """
     config = config or TrainConfig()
     device = resolve_device(config.device, config.engine)
+    callbacks = callbacks or notebook_callbacks()
     place, announce = Place(Path(out), resume, overwrite), announcer(callbacks)
     place.check()
     own = _load(source, config, images, masks, lambda done, total: announce(PrepareEvent(done, total)))
