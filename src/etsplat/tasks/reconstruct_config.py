@@ -150,8 +150,8 @@ class ReconstructConfig(Settings):
     study: the paper's method in two minutes, for comparisons;
     demo, tiny: for `etsplat demo object` and for tests."""
     method: Annotated[str, OneOf(lambda: (*kernel_methods(), *get_args(RasterMethod)))] = "elastic"
-    """Kernel of soft triangles: elastic (the paper's), bilateral (2DTS), single-sided (Triangle Splatting) or a name
-    given to `register_kernel`.
+    """Kernel of soft triangles: elastic (the paper's), bilateral (2DTS) or single-sided (Triangle Splatting);
+    or the name of one of your own, with --kernel-file.
     Opaque triangles with antialiased silhouettes: raster-face or raster-vertex (a colour per face or per vertex)."""
     iterations: Annotated[int, Range(1)] = 30_000
     """Optimization steps."""

@@ -171,8 +171,8 @@ class TrainConfig(Settings):
     scene_type: SceneType = "outdoor"
     """What is photographed, for learning rates and losses: outdoor, indoor, or an object."""
     method: Annotated[str, OneOf(kernel_methods)] = "elastic"
-    """Kernel of the triangles: elastic (the paper's), bilateral (2DTS), single-sided (Triangle Splatting) or a name
-    given to `register_kernel`."""
+    """Kernel of the triangles: elastic (the paper's), bilateral (2DTS) or single-sided (Triangle Splatting);
+    or the name of one of your own, with --kernel-file."""
     iterations: Annotated[int, Range(1)] = 6000
     """Optimization steps."""
     width: Annotated[int | None, Range(1)] = 800
