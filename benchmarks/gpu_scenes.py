@@ -23,7 +23,7 @@ class GpuScene:
     vertices: Tensor
     faces: Tensor | None
     colors: Tensor | None
-    corner_colors: Tensor | None
+    vertex_colors: Tensor | None
     sh: tuple[Tensor, Tensor] | None
     opacities: Tensor
     sigma: Tensor
@@ -34,7 +34,7 @@ class GpuScene:
     @property
     def leaves(self) -> list[Tensor]:
         """What gradients are asked for."""
-        colors = [t for t in (self.colors, self.corner_colors, *(self.sh or ())) if t is not None]
+        colors = [t for t in (self.colors, self.vertex_colors, *(self.sh or ())) if t is not None]
         return [self.vertices, *colors, self.opacities, self.sigma]
 
     def render(self) -> Rasterization:
@@ -47,9 +47,18 @@ class GpuScene:
                 centers = -torch.einsum("bji,bj->bi", self.viewmats[:, :3, :3], self.viewmats[:, :3, 3])
                 colors = soup_colors(self.vertices, *self.sh, centers, 3)
             return etsplat.rasterize(
-                self.vertices, colors, self.opacities, self.sigma, self.viewmats, self.Ks, width, height,
-                faces=self.faces, corner_colors=self.corner_colors, validate=False,
-            )  # fmt: skip
+                self.vertices,
+                opacities=self.opacities,
+                sigma=self.sigma,
+                face_colors=colors,
+                vertex_colors=self.vertex_colors,
+                viewmats=self.viewmats,
+                Ks=self.Ks,
+                width=width,
+                height=height,
+                faces=self.faces,
+                validate=False,
+            )
 
 
 def load(name: str, device: str) -> GpuScene:
@@ -66,7 +75,7 @@ def load(name: str, device: str) -> GpuScene:
         leaf(scene.vertices),
         None if scene.faces is None else scene.faces.to(device),
         None if scene.colors is None else leaf(scene.colors),
-        None if scene.corner_colors is None else leaf(scene.corner_colors),
+        None if scene.vertex_colors is None else leaf(scene.vertex_colors),
         None,
         leaf(scene.opacities),
         leaf(scene.sigma),

@@ -22,7 +22,7 @@ from etsplat.ops.adam import Adam
 from etsplat.ops.mesh_energies import mesh_energies
 from etsplat.ops.normal_consistency import normal_consistency
 from etsplat.ops.photometric import photometric_loss
-from etsplat.ops.rasterize_hard import rasterize_hard, render_opaque
+from etsplat.ops.rasterize_opaque import rasterize_opaque, render_opaque
 from etsplat.ops.soup_activation import soup_activation
 from etsplat.ops.spherical_harmonics import spherical_harmonics
 from etsplat.ops.triangle_channels import triangle_channels
@@ -45,16 +45,16 @@ def torus(rings: int, sides: int) -> tuple[torch.Tensor, torch.Tensor]:
 
 def rendering(size: int, vertices: torch.Tensor, faces: torch.Tensor) -> list[Operation]:
     viewmats = look_at(torch.tensor([[0.3, 0.4, 3.2]]), torch.zeros(3), torch.tensor([0.0, 1.0, 0.0])).float()
-    view = viewmats, intrinsics(40.0, size, size).float()[None], size, size
+    shown = {"cameras": Cameras(viewmats, intrinsics(40.0, size, size).float()[None], size, size), "faces": faces}
     colors, vertex_colors = torch.rand(len(faces), 3), torch.rand(len(vertices), 3)
     shape = f"{size} x {size}, {len(faces):,} faces"
     return [
-        ("rasterize_hard", shape, lambda: rasterize_hard(vertices, *view, faces=faces)),
-        ("render_opaque 4 x 4", shape, lambda: render_opaque(vertices, *view, faces=faces, face_colors=colors)),
+        ("rasterize_opaque", shape, lambda: rasterize_opaque(vertices, **shown)),
+        ("render_opaque 4 x 4", shape, lambda: render_opaque(vertices, **shown, face_colors=colors)),
         (
             "render_opaque 4 x 4, vertex colours",
             shape,
-            lambda: render_opaque(vertices, *view, faces=faces, vertex_colors=vertex_colors),
+            lambda: render_opaque(vertices, **shown, vertex_colors=vertex_colors),
         ),
     ]
 

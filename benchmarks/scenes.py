@@ -26,7 +26,7 @@ class Scene:
     vertices: Tensor
     faces: Tensor | None
     colors: Tensor | None
-    corner_colors: Tensor | None
+    vertex_colors: Tensor | None
     opacities: Tensor
     sigma: Tensor
     viewmats: Tensor
@@ -37,7 +37,7 @@ class Scene:
     @property
     def leaves(self) -> tuple[Tensor, ...]:
         """What gradients are asked for."""
-        colors = self.corner_colors if self.colors is None else self.colors
+        colors = self.vertex_colors if self.colors is None else self.colors
         assert colors is not None
         return self.vertices, colors, self.opacities, self.sigma
 
@@ -45,15 +45,15 @@ class Scene:
         """One call of the public API."""
         return etsplat.rasterize(
             self.vertices,
-            self.colors,
-            self.opacities,
-            self.sigma,
-            self.viewmats,
-            self.Ks,
-            SIZE,
-            SIZE,
+            opacities=self.opacities,
+            sigma=self.sigma,
+            face_colors=self.colors,
+            vertex_colors=self.vertex_colors,
+            viewmats=self.viewmats,
+            Ks=self.Ks,
+            width=SIZE,
+            height=SIZE,
             faces=self.faces,
-            corner_colors=self.corner_colors,
             kernel=self.kernel,
         )
 
@@ -66,20 +66,20 @@ def load(name: str) -> Scene:
         raise SystemExit(f"no scene {name}: choose sphere<level> or soup<triangles>, {endings} after it or not")
     builder = displaced_sphere if match[1] == "sphere" else random_soup
     vertices, faces, colors, opacities, sigma = builder(int(match[2]))
-    corner_colors = None
+    vertex_colors = None
     kernel = "elastic"
     if match[3] == REGISTERED:
         kernel = "registered"
         etsplat.register_kernel(kernel, KERNELS["elastic"].value)
     if match[3] == VERTEX_COLORS:
-        colors, corner_colors = None, 0.5 + 0.5 * vertices
+        colors, vertex_colors = None, 0.5 + 0.5 * vertices
     generator = torch.Generator().manual_seed(1)
     cotangent = torch.rand(1, SIZE, SIZE, 3, generator=generator) - 0.5
     viewmats = torch.eye(4)[None].clone()
     viewmats[0, 2, 3] = 3.0
     focal = 1.3 * SIZE
     Ks = torch.tensor([[[focal, 0.0, SIZE / 2], [0.0, focal, SIZE / 2], [0.0, 0.0, 1.0]]])
-    scene = Scene(name, vertices, faces, colors, corner_colors, opacities, sigma, viewmats, Ks, cotangent, kernel)
+    scene = Scene(name, vertices, faces, colors, vertex_colors, opacities, sigma, viewmats, Ks, cotangent, kernel)
     for leaf in scene.leaves:
         leaf.requires_grad_()
     return scene

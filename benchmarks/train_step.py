@@ -81,22 +81,23 @@ def rasterizing(
     with torch.no_grad():
         colors = soup_colors(soup.vertices, soup.sh_dc, soup.sh_rest, camera.centers, soup.sh_degree)
     leaves = [t.detach().clone().requires_grad_() for t in (soup.vertices, colors, soup.opacities, soup.sigma)]
+    vertices, face_colors, opacities, sigma = leaves
     cotangent = torch.rand(1, camera.height, camera.width, 3)
 
     def run() -> None:
         for leaf in leaves:
             leaf.grad = None
         out = rasterize(
-            *leaves,
-            camera.viewmats,
-            camera.Ks,
-            camera.width,
-            camera.height,
+            vertices,
+            opacities=opacities,
+            sigma=sigma,
+            face_colors=face_colors,
+            cameras=camera,
             kernel=config.kernel,
             distance=config.distance,
             backgrounds=torch.zeros(1, 3),
             near_plane=config.drawing.near_plane,
-            statistics=True,
+            outputs=("statistics",),
             validate=False,
         )
         out.color.backward(cotangent)

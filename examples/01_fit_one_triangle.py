@@ -19,9 +19,9 @@ def render(corners: torch.Tensor, color: torch.Tensor, opacity: torch.Tensor, si
     """One picture (SIZE, SIZE, 3) of one triangle, seen from the origin along +z."""
     return etsplat.rasterize(
         corners[None],  # a soup of one triangle: (1, 3, 3)
-        color[None],
-        opacity[None],
-        sigma,
+        opacities=opacity[None],
+        sigma=sigma,
+        face_colors=color[None],
         viewmats=torch.eye(4)[None],
         Ks=etsplat.intrinsics(50.0, SIZE, SIZE)[None],
         width=SIZE,

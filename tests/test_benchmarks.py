@@ -12,6 +12,7 @@ import torch
 from benchmarks import gpu, gpu_floors, gpu_reconstruct, gpu_scenes, gpu_timing, gpu_train, rasterizer, scenes, tables
 from benchmarks.measure import native_state
 from etsplat import _native, rasterize
+from etsplat.core.cameras import Cameras
 from helpers.scenes import mesh
 
 
@@ -28,7 +29,13 @@ def test_useful_pairs_are_the_pixels_in_which_triangles_are_drawn(rng):
     for copies in (1, 2):
         vertices = triangle.repeat(copies, 1, 1).requires_grad_()
         out = rasterize(
-            vertices, torch.ones(copies, 3), torch.full((copies,), 0.5), torch.tensor(0.5), *camera, width=83, height=61
+            vertices,
+            face_colors=torch.ones(copies, 3),
+            opacities=torch.full((copies,), 0.5),
+            sigma=torch.tensor(0.5),
+            cameras=Cameras(*camera),
+            width=83,
+            height=61,
         )
         counts = _native.count_tiles(native_state(out))
         assert counts.backward_vectors <= counts.forward_vectors

@@ -5,7 +5,6 @@ from etsplat.core.cameras import look_at as look_at
 from etsplat.core.cameras import sphere_grid as sphere_grid
 from etsplat.core.errors import InputError as InputError
 from etsplat.core.rasterization import Cutoffs as Cutoffs
-from etsplat.core.rasterization import HardRasterization as HardRasterization
 from etsplat.core.rasterization import Rasterization as Rasterization
 from etsplat.core.rasterization import TriangleStatistics as TriangleStatistics
 from etsplat.core.registered_kernels import register_kernel as register_kernel
@@ -55,8 +54,8 @@ from etsplat.ops.mesh_energies import mesh_energies as mesh_energies
 from etsplat.ops.normal_consistency import normal_consistency as normal_consistency
 from etsplat.ops.photometric import photometric_loss as photometric_loss
 from etsplat.ops.rasterize import rasterize as rasterize
-from etsplat.ops.rasterize_hard import rasterize_hard as rasterize_hard
-from etsplat.ops.rasterize_hard import render_opaque as render_opaque
+from etsplat.ops.rasterize_opaque import rasterize_opaque as rasterize_opaque
+from etsplat.ops.rasterize_opaque import render_opaque as render_opaque
 from etsplat.ops.spherical_harmonics import spherical_harmonics as spherical_harmonics
 from etsplat.optim.densification import PruneRules as PruneRules
 from etsplat.optim.edit import RowPlan as RowPlan

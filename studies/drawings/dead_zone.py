@@ -9,7 +9,7 @@ from torch import Tensor
 
 from etsplat.ops.adam import Adam
 from etsplat.ops.rasterize import rasterize
-from etsplat.ops.rasterize_hard import render_opaque
+from etsplat.ops.rasterize_opaque import render_opaque
 
 KERNEL_COLORS = {"single_sided": "#b5542d", "bilateral": "#6c7a2c", "elastic": "#2060a8"}
 
@@ -95,7 +95,7 @@ def draw_dead_zone() -> Figure:
 
 def _loss(vertices: Tensor, kernel: str, sigma: float, distance: str) -> Float[Tensor, ""]:
     """L1 between the triangle and the target's picture, white over black."""
-    picture = render_opaque(target_triangle(), **camera(), face_colors=torch.ones(1, 1), supersampling=8)[..., :1]
-    ones = torch.ones(1, 1)
-    color = rasterize(vertices, ones, 0.99 * ones[0], sigma, **camera(), kernel=kernel, distance=distance).color
+    picture = render_opaque(target_triangle(), **camera(), face_colors=torch.ones(1, 1), supersampling=8).color
+    one = {"opacities": torch.tensor([0.99]), "sigma": sigma, "face_colors": torch.ones(1, 1)}
+    color = rasterize(vertices, **one, **camera(), kernel=kernel, distance=distance).color
     return (color - picture).abs().mean()

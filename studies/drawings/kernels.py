@@ -12,6 +12,7 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from etsplat.core.cameras import Cameras
 from etsplat.core.kernels import KERNELS
 from etsplat.ops.rasterize import rasterize
 from studies.drawings.dead_zone import draw_dead_zone
@@ -147,9 +148,9 @@ def _splat(
     scale = width // 2
     K = torch.tensor([[[scale, 0, width / 2], [0, scale, height / 2], [0, 0, 1]]])
     ones = torch.ones(len(flat))
-    return rasterize(flat, ones[:, None], ones, sigma, torch.eye(4)[None], K, width, height, kernel=kernel).color[
-        0, ..., 0
-    ]
+    cameras = Cameras(torch.eye(4)[None], K, width, height)
+    drawn = rasterize(flat, opacities=ones, sigma=sigma, face_colors=ones[:, None], cameras=cameras, kernel=kernel)
+    return drawn.color[0, ..., 0]
 
 
 def _profile(triangles: Float[Tensor, "N 3 2"], kernel: str, sigma: float) -> Float[Tensor, " W"]:

@@ -16,7 +16,7 @@ from etsplat.geometry.measures import bounding_ball
 from etsplat.io.atomic import atomic_write
 from etsplat.io.mesh_files import load_mesh
 from etsplat.io.run_directory import RunDirectory
-from etsplat.ops.rasterize_hard import render_opaque
+from etsplat.ops.rasterize_opaque import render_opaque
 from studies.grid.cells import Cell
 
 TILE = 360
@@ -128,7 +128,5 @@ def draw_shape(vertices: Tensor, faces: Tensor, *, normals: bool = False) -> Flo
         colors = 0.5 + 0.5 * in_view * torch.tensor([1.0, -1.0, -1.0])
     else:
         colors = shade_faces(vertices, faces)
-    image = render_opaque(
-        vertices, camera.viewmats, camera.Ks, TILE, TILE, faces=faces, face_colors=colors, supersampling=3
-    )[0]
-    return (image[..., :3] + 1 - image[..., 3:]).clamp(0, 1)
+    drawn = render_opaque(vertices, face_colors=colors, cameras=camera, faces=faces, supersampling=3)
+    return (drawn.color[0] + 1 - drawn.alpha[0]).clamp(0, 1)

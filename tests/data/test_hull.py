@@ -3,7 +3,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from etsplat.core.cameras import intrinsics, look_at
+from etsplat.core.cameras import Cameras, intrinsics, look_at
 from etsplat.core.errors import InputError
 from etsplat.data.dataset import Dataset
 from etsplat.data.demo_object import demo_object
@@ -13,7 +13,7 @@ from etsplat.data.photograph import photograph
 from etsplat.data.pictures import StoredPictures
 from etsplat.geometry.icosphere import icosphere
 from etsplat.io.mesh_files import MeshFile
-from etsplat.ops.rasterize_hard import render_opaque
+from etsplat.ops.rasterize_opaque import render_opaque
 
 
 @pytest.fixture(scope="module")
@@ -25,8 +25,11 @@ def pictures(mesh, eyes, target, width=64, height=48, fov=50.0):
     viewmats = look_at(eyes, target, torch.tensor([0.0, 1.0, 0.05]))
     Ks = intrinsics(fov, width, height).repeat(len(eyes), 1, 1)
     images = render_opaque(
-        mesh.vertices, viewmats, Ks, width, height, faces=mesh.faces, face_colors=torch.ones(len(mesh.faces), 3)
-    )
+        mesh.vertices,
+        cameras=Cameras(viewmats, Ks, width, height),
+        faces=mesh.faces,
+        face_colors=torch.ones(len(mesh.faces), 3),
+    ).rgba
     names = [f"v{k}" for k in range(len(eyes))]
     return Dataset(viewmats.double(), Ks.double(), StoredPictures(images), names, list(range(len(eyes))), [])
 

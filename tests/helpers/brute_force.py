@@ -15,7 +15,7 @@ def brute_force(scene: dict[str, Any], kernel: str, distance: str, depth: str, c
     in_view = world @ viewmat[:3, :3].T + viewmat[:3, 3]
     order = sorted(range(len(world)), key=lambda i: (in_view[i, :, 2].mean(), i))
     height, width = scene["height"], scene["width"]
-    channels = scene["colors"].shape[1]
+    channels = scene["face_colors"].shape[1]
     images = {
         "color": np.zeros((height, width, channels)),
         "alpha": np.zeros((height, width, 1)),
@@ -61,7 +61,7 @@ def _composite(layers, order, world, camera, scene) -> dict[str, Any]:
     normal = np.zeros(3)
     previous = 1.0
     for i, weight, z, after in layers:
-        color = color + weight * scene["colors"][i].double().numpy()
+        color = color + weight * scene["face_colors"][i].double().numpy()
         depth += weight * z
         n = np.cross(world[i, 1] - world[i, 0], world[i, 2] - world[i, 0])
         n /= np.linalg.norm(n)

@@ -7,19 +7,24 @@ from torch import Tensor
 
 import etsplat
 from etsplat import Cutoffs, Rasterization, intrinsics, look_at
+from etsplat.core.rasterization import OUTPUTS
 from etsplat.geometry.icosphere import icosphere
 from helpers.engines import device_of, dtype_of
 
 NO_CUTOFFS = Cutoffs(alpha_min=0.0, alpha_max=1.0, x_max=float("inf"), transmittance_min=0.0)
 IMAGES = ("color", "alpha", "depth", "median_depth", "normal", "distortion")
-EVERYTHING: dict[str, Any] = {
-    "depth": "plane",
-    "median_depth": True,
-    "normals": True,
-    "distortion": True,
-    "statistics": True,
-}
-DIFFERENTIABLE = ("vertices", "colors", "corner_colors", "opacities", "sigma", "viewmats", "Ks", "backgrounds")
+EVERYTHING: dict[str, Any] = {"outputs": OUTPUTS}
+DIFFERENTIABLE = (
+    "vertices",
+    "face_colors",
+    "vertex_colors",
+    "corner_colors",
+    "opacities",
+    "sigma",
+    "viewmats",
+    "Ks",
+    "backgrounds",
+)
 
 Scene = dict[str, Any]
 
@@ -47,7 +52,7 @@ def soup(rng: torch.Generator, count: int, width: int = 48, height: int = 40, **
     corners = torch.stack([angles.cos(), angles.sin()], dim=-1) @ frames
     return {
         "vertices": centres + size * torch.rand(count, 1, 1, generator=rng) * corners,
-        "colors": torch.rand(count, channels, generator=rng),
+        "face_colors": torch.rand(count, channels, generator=rng),
         "opacities": 0.2 + 0.75 * torch.rand(count, generator=rng),
         "sigma": 0.15 + torch.rand(count, generator=rng),
         "backgrounds": torch.rand(views, channels, generator=rng),
@@ -62,7 +67,7 @@ def mesh(rng: torch.Generator, level: int = 2, width: int = 48, height: int = 40
     return {
         "vertices": vertices,
         "faces": faces,
-        "colors": torch.rand(len(faces), 3, generator=rng),
+        "face_colors": torch.rand(len(faces), 3, generator=rng),
         "opacities": 0.5 + 0.5 * torch.rand(len(faces), generator=rng),
         "sigma": torch.tensor(0.4),
         "backgrounds": torch.rand(2, 3, generator=rng),
@@ -74,10 +79,11 @@ def colored(layout: str, rng: torch.Generator) -> Scene:
     """A scene with colours "per_view", or interpolated ones "per_corner" or, of a mesh, "per_vertex"."""
     scene = mesh(rng) if layout == "per_vertex" else soup(rng, 80)
     if layout == "per_view":
-        return {**scene, "colors": torch.rand(2, 80, 3, generator=rng)}
-    del scene["colors"]
-    shape = (len(scene["vertices"]), 3) if layout == "per_vertex" else (80, 3, 3)
-    return {**scene, "corner_colors": torch.rand(shape, generator=rng)}
+        return {**scene, "face_colors": torch.rand(2, 80, 3, generator=rng)}
+    del scene["face_colors"]
+    if layout == "per_vertex":
+        return {**scene, "vertex_colors": torch.rand(len(scene["vertices"]), 3, generator=rng)}
+    return {**scene, "corner_colors": torch.rand(80, 3, 3, generator=rng)}
 
 
 def facing(corners: list[tuple[float, float]], z: float = 2.0, size: int = 16, opacity: float = 0.9) -> Scene:
@@ -87,7 +93,7 @@ def facing(corners: list[tuple[float, float]], z: float = 2.0, size: int = 16, o
     points = torch.cat([(pixels - middle) * z / focal, torch.full((3, 1), z)], dim=1)
     return {
         "vertices": points[None],
-        "colors": torch.tensor([[0.25, 0.5, 1.0]]),
+        "face_colors": torch.tensor([[0.25, 0.5, 1.0]]),
         "opacities": torch.tensor([opacity]),
         "sigma": torch.tensor(0.7),
         "viewmats": torch.eye(4)[None],
@@ -99,7 +105,7 @@ def facing(corners: list[tuple[float, float]], z: float = 2.0, size: int = 16, o
 
 def stacked(*scenes: Scene) -> Scene:
     """The triangles of several ``facing`` scenes, in this order."""
-    joined = {name: torch.cat([scene[name] for scene in scenes]) for name in ("vertices", "colors", "opacities")}
+    joined = {name: torch.cat([scene[name] for scene in scenes]) for name in ("vertices", "face_colors", "opacities")}
     return {**scenes[0], **joined}
 
 
@@ -121,7 +127,7 @@ def prepare(scene: Scene, engine: str, dtype: torch.dtype | None = None, require
 
 
 def render(scene: Scene, engine: str, **options: Any) -> Rasterization:
-    arguments = {"colors": None, **prepare(scene, engine), **options}
+    arguments = {**prepare(scene, engine), **options}
     with etsplat.engine(engine):
         return etsplat.rasterize(**arguments)
 
@@ -132,7 +138,7 @@ def gradients(
     """Run forward and backward; ``cotangents`` are dL/d(image) by the image's name."""
     prepared = prepare(scene, engine, dtype, requires_grad=True)
     with etsplat.engine(engine):
-        out = etsplat.rasterize(**{"colors": None, **prepared, **options})
+        out = etsplat.rasterize(**{**prepared, **options})
     loss = sum(
         (getattr(out, name) * cotangent.to(prepared["vertices"])).sum() for name, cotangent in cotangents.items()
     )

@@ -6,14 +6,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from etsplat.core.cameras import intrinsics, look_at
+from etsplat.core.cameras import Cameras, intrinsics, look_at
 from etsplat.engines.threads import num_threads, set_num_threads
 from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.topology import MeshTopology
 from etsplat.ops.antialias import rasterize_antialiased
 from etsplat.ops.antialias_nvdiffrast import rasterize_nvdiffrast
 from etsplat.ops.mesh_energies import MeshConnectivity
-from etsplat.ops.rasterize_hard import render_opaque
+from etsplat.ops.rasterize_opaque import render_opaque
 from helpers.engines import on
 from helpers.meshes import TETRAHEDRON, bumpy_sphere
 from helpers.tolerances import assert_close_to_scale
@@ -57,8 +57,12 @@ def test_native_agrees_with_the_reference(kind, rng):
         leaves = [t.detach().to(dtype).requires_grad_(True) for t in (vertices, colors, backgrounds)]
         cameras = [t.to(dtype) for t in views(45, 31)]
         image = rasterize_antialiased(
-            leaves[0], connectivity, *cameras, 45, 31, backgrounds=leaves[2], **{kind: leaves[1]}
-        )
+            leaves[0],
+            connectivity=connectivity,
+            cameras=Cameras(*cameras, 45, 31),
+            backgrounds=leaves[2],
+            **{kind: leaves[1]},
+        ).color
         (image * cotangent.to(dtype)).sum().backward()
         results.append([image.detach(), *(leaf.grad for leaf in leaves)])
     for name, native, exact in zip(("image", "vertices", "colors", "backgrounds"), *results, strict=True):
@@ -75,7 +79,12 @@ def test_gradients_are_those_of_finite_differences(kind, rng):
     cotangent = torch.randn(1, 20, 24, 3, generator=rng, dtype=torch.float64)
 
     def loss(points: Tensor) -> Tensor:
-        return (rasterize_antialiased(points, connectivity, viewmats, Ks, 24, 20, **{kind: colors}) * cotangent).sum()
+        return (
+            rasterize_antialiased(
+                points, connectivity=connectivity, cameras=Cameras(viewmats, Ks, 24, 20), **{kind: colors}
+            ).color
+            * cotangent
+        ).sum()
 
     leaf = vertices.clone().requires_grad_(True)
     loss(leaf).backward()
@@ -99,8 +108,12 @@ def test_reference_passes_gradcheck(kind, rng):
 
     def image(points: Tensor, colors: Tensor, background: Tensor) -> Tensor:
         return rasterize_antialiased(
-            points, connectivity, viewmats, Ks, 10, 8, backgrounds=background, **{kind: colors}
-        )
+            points,
+            connectivity=connectivity,
+            cameras=Cameras(viewmats, Ks, 10, 8),
+            backgrounds=background,
+            **{kind: colors},
+        ).color
 
     leaves = [vertices, colors_of(kind, vertices, faces, rng), torch.rand(1, 3, generator=rng)]
     assert torch.autograd.gradcheck(
@@ -113,9 +126,14 @@ def test_a_half_plane_covers_its_pixels_exactly(engine):
     for edge, expected in ((8.3, 0.3), (8.7, 0.7)):
         corners = torch.tensor([[-90.0, -90.0, 1.0], [edge, -90.0, 1.0], [edge, 99.0, 1.0], [-90.0, 99.0, 1.0]])
         connectivity = connect(torch.tensor([[0, 1, 2], [0, 2, 3]]), corners)
-        image = on(engine, rasterize_antialiased, corners, connectivity, *FLAT, 16, 4, vertex_colors=torch.ones(4, 1))[
-            0, :, :, 0
-        ]
+        image = on(
+            engine,
+            rasterize_antialiased,
+            corners,
+            connectivity=connectivity,
+            cameras=Cameras(*FLAT, 16, 4),
+            vertex_colors=torch.ones(4, 1),
+        ).color[0, :, :, 0]
         torch.testing.assert_close(image[:, :8], torch.ones(4, 8))
         torch.testing.assert_close(image[:, 8], torch.full((4,), expected))
         torch.testing.assert_close(image[:, 9:], torch.zeros(4, 7))
@@ -127,9 +145,17 @@ def test_the_image_is_close_to_a_supersampled_one(engine):
     viewmats, Ks = views(64, 64)
     ones = torch.ones(len(faces), 1)
     scene = (0.6 * vertices, viewmats, Ks, 64, 64)
-    image = on(engine, rasterize_antialiased, scene[0], connect(faces, vertices), *scene[1:], face_colors=ones)
+    image = on(
+        engine,
+        rasterize_antialiased,
+        scene[0],
+        connectivity=connect(faces, vertices),
+        cameras=Cameras(*scene[1:]),
+        face_colors=ones,
+    ).color
     exact, plain = (
-        render_opaque(*scene, faces=faces, face_colors=ones, supersampling=samples)[..., 1:] for samples in (8, 1)
+        render_opaque(scene[0], cameras=Cameras(*scene[1:]), faces=faces, face_colors=ones, supersampling=samples).alpha
+        for samples in (8, 1)
     )
     assert float((image - exact).abs().mean()) < 0.25 * float((plain - exact).abs().mean())
 
@@ -145,7 +171,14 @@ def test_edges_within_a_welded_surface_get_no_gradient(engine):
 
     def pulled(points: Tensor, triangles: Tensor) -> Tensor:
         leaf = points.clone().requires_grad_(True)
-        image = on(engine, rasterize_antialiased, leaf, connect(triangles, points), *FLAT, 24, 24, face_colors=colors)
+        image = on(
+            engine,
+            rasterize_antialiased,
+            leaf,
+            connectivity=connect(triangles, points),
+            cameras=Cameras(*FLAT, 24, 24),
+            face_colors=colors,
+        ).color
         (image * torch.linspace(0, 1, 24)[:, None]).sum().backward()
         assert leaf.grad is not None
         return leaf.grad.abs().sum(dim=1)
@@ -168,7 +201,9 @@ def test_same_bits_for_any_number_of_threads(rng):
         set_num_threads(count)
         leaf = vertices.clone().requires_grad_(True)
         colors = torch.linspace(0, 1, 3 * len(vertices)).view(-1, 3).requires_grad_(True)
-        image = rasterize_antialiased(leaf, connectivity, *views(130, 150), 130, 150, vertex_colors=colors)
+        image = rasterize_antialiased(
+            leaf, connectivity=connectivity, cameras=Cameras(*views(130, 150), 130, 150), vertex_colors=colors
+        ).color
         (image * cotangent).sum().backward()
         results.append((image.detach(), leaf.grad, colors.grad))
     set_num_threads(before)
@@ -188,12 +223,10 @@ def test_unusable_vertices_harm_nothing(engine):
         engine,
         rasterize_antialiased,
         leaf,
-        connect(faces, vertices),
-        *views(20, 20),
-        20,
-        20,
+        connectivity=connect(faces, vertices),
+        cameras=Cameras(*views(20, 20), 20, 20),
         face_colors=torch.ones(len(faces), 3),
-    )
+    ).color
     assert bool(image.isfinite().all())
     image.square().sum().backward()
     assert leaf.grad is not None

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from etsplat import intrinsics, look_at, rasterize, rasterize_antialiased, rasterize_hard
+from etsplat import intrinsics, look_at, rasterize, rasterize_antialiased, rasterize_opaque
 from etsplat.core.cameras import Cameras
 from etsplat.engines.native.pool import empty_image
 from etsplat.geometry.icosphere import icosphere
@@ -23,7 +23,7 @@ from etsplat.ops.mesh_energies import mesh_energies
 from etsplat.ops.normal_consistency import normal_consistency
 from etsplat.ops.photometric import photometric_loss
 from etsplat.ops.pick_values import pick_values
-from etsplat.ops.rasterize_hard import render_opaque
+from etsplat.ops.rasterize_opaque import render_opaque
 from etsplat.ops.soup_activation import soup_activation
 from etsplat.ops.soup_colors import soup_colors
 from etsplat.ops.spherical_harmonics import spherical_harmonics
@@ -38,7 +38,7 @@ Case = tuple[dict[str, Tensor], Operation]  # what gradients reach, and outputs 
 
 
 def _splat(scene: dict, engine: str, names: tuple[str, ...], **options) -> Case:
-    rest = {"colors": None, **{k: v for k, v in scene.items() if k not in names}}
+    rest = {k: v for k, v in scene.items() if k not in names}
 
     def run(**leaves: Tensor) -> list[Tensor]:
         result = on(engine, rasterize, **{**rest, **leaves}, **options)
@@ -49,15 +49,15 @@ def _splat(scene: dict, engine: str, names: tuple[str, ...], **options) -> Case:
 
 
 def _rasterize(rng: torch.Generator, engine: str, **options) -> Case:
-    names = ("vertices", "colors", "opacities", "sigma", "viewmats", "Ks", "backgrounds")
+    names = ("vertices", "face_colors", "opacities", "sigma", "viewmats", "Ks", "backgrounds")
     return _splat(soup(rng, 40, **options), engine, names)
 
 
 def _rasterize_everything(rng: torch.Generator, engine: str) -> Case:
     scene = mesh(rng)
-    scene["corner_colors"] = torch.rand(len(scene["vertices"]), 3, generator=rng)
-    del scene["colors"]
-    names = ("vertices", "corner_colors", "opacities", "sigma", "viewmats", "Ks", "backgrounds")
+    scene["vertex_colors"] = torch.rand(len(scene["vertices"]), 3, generator=rng)
+    del scene["face_colors"]
+    names = ("vertices", "vertex_colors", "opacities", "sigma", "viewmats", "Ks", "backgrounds")
     return _splat(scene, engine, names, **EVERYTHING)
 
 
@@ -70,7 +70,11 @@ def _antialiased(rng: torch.Generator, engine: str, kind: str) -> Case:
     def run(vertices: Tensor, colors: Tensor, backgrounds: Tensor) -> list[Tensor]:
         view = scene["viewmats"] * 1.0, scene["Ks"] * 1.0, scene["width"], scene["height"]
         options = {kind: colors, "backgrounds": backgrounds}
-        return [on(engine, rasterize_antialiased, vertices, connectivity, *view, **options)]
+        return [
+            on(
+                engine, rasterize_antialiased, vertices, connectivity=connectivity, cameras=Cameras(*view), **options
+            ).color
+        ]
 
     return {"vertices": points, "colors": colors, "backgrounds": scene["backgrounds"]}, run
 
@@ -378,10 +382,12 @@ class TestOddArguments:
         dtype = torch.float64 if engine == "reference" else torch.float32
         points, *view = (scene[key].to(dtype) for key in ("vertices", "viewmats", "Ks"))
         options = {"faces": scene["faces"]}
-        size = scene["width"], scene["height"]
+        size, colors = (scene["width"], scene["height"]), scene["face_colors"].to(dtype)
         for draw in (
-            lambda *given: on(engine, rasterize_hard, *given, *size, **options).depth,
-            lambda *given: on(engine, render_opaque, *given, *size, face_colors=scene["colors"].to(dtype), **options),
+            lambda points, *view: on(engine, rasterize_opaque, points, cameras=Cameras(*view, *size), **options).depth,
+            lambda points, *view: (
+                on(engine, render_opaque, points, cameras=Cameras(*view, *size), face_colors=colors, **options).rgba
+            ),
         ):
             expected = draw(points, *view)
             assert torch.equal(draw(torch._neg_view(-points), *view), expected)
@@ -411,7 +417,7 @@ class TestOddArguments:
         with pytest.raises(ValueError, match="parameter value, its gradient and moments must have one shape"):
             optimizer.step()
 
-    @pytest.mark.parametrize("name", ["colors", "backgrounds"])
+    @pytest.mark.parametrize("name", ["face_colors", "backgrounds"])
     def test_colours_whose_gradients_would_overflow_are_refused(self, engine, name, rng):
         scene = soup(rng, 20)
         if engine == "reference":
@@ -420,11 +426,11 @@ class TestOddArguments:
         with pytest.raises(ValueError, match=rf"{name} must be from -1e\+30 to 1e\+30, got 1 values beyond"):
             on(engine, rasterize, **scene)
 
-    @pytest.mark.parametrize("name", ["colors", "backgrounds"])
+    @pytest.mark.parametrize("name", ["face_colors", "backgrounds"])
     def test_the_largest_colours_leave_gradients_finite(self, name, rng):
         scene = soup(rng, 200)
         scene[name][0, 0] = 1e30
-        leaves = {key: scene[key].requires_grad_() for key in ("vertices", "colors", "opacities", "sigma")}
+        leaves = {key: scene[key].requires_grad_() for key in ("vertices", "face_colors", "opacities", "sigma")}
         result = on("cpu", rasterize, **scene)
         (result.color.sum() + result.alpha.sum()).backward()
         for key, leaf in leaves.items():

@@ -1,10 +1,12 @@
 """The public call: what comes out, and one clear error for every bad argument."""
 
+import numpy as np
 import pytest
 import torch
 
 import etsplat
 from etsplat import Cutoffs, rasterize
+from etsplat.core.cameras import Cameras
 from etsplat.engines.choice import engine_for
 from helpers.engines import dtype_of, on
 from helpers.scenes import EVERYTHING, IMAGES, accuracy, mesh, prepare, render, soup
@@ -36,7 +38,7 @@ def test_any_number_of_channels(engine, channels, rng):
     """Each channel is what it would be alone."""
     scene = soup(rng, 20, channels=channels)
     out = render(scene, engine)
-    last = {**scene, "colors": scene["colors"][:, -1:], "backgrounds": scene["backgrounds"][:, -1:]}
+    last = {**scene, "face_colors": scene["face_colors"][:, -1:], "backgrounds": scene["backgrounds"][:, -1:]}
     assert out.color.shape[-1] == channels
     torch.testing.assert_close(out.color[..., -1:], render(last, engine).color, rtol=0, atol=accuracy(engine))
 
@@ -52,7 +54,11 @@ def test_faces_and_soup_of_the_same_triangles_give_the_same_images(engine, rng):
 
 def test_colors_per_view_and_one_sigma_for_all_are_the_same_as_spelled_out(engine, scene):
     shared = {**scene, "sigma": torch.tensor(0.5)}
-    spelled = {**scene, "sigma": torch.full((5,), 0.5), "colors": scene["colors"].expand(2, 5, 3).contiguous()}
+    spelled = {
+        **scene,
+        "sigma": torch.full((5,), 0.5),
+        "face_colors": scene["face_colors"].expand(2, 5, 3).contiguous(),
+    }
     expected = render(shared, engine).color
     assert torch.equal(render(spelled, engine).color, expected)
     assert torch.equal(render({**scene, "sigma": 0.5}, engine).color, expected)
@@ -68,7 +74,7 @@ def test_views_of_a_batch_do_not_see_each_other(engine, scene):
 
 
 def test_no_triangles_show_the_background(engine, scene):
-    empty = {name: scene[name][:0] for name in ("vertices", "colors", "opacities", "sigma")}
+    empty = {name: scene[name][:0] for name in ("vertices", "face_colors", "opacities", "sigma")}
     out = render({**scene, **empty}, engine, **EVERYTHING)
     assert torch.equal(out.color, scene["backgrounds"].to(out.color.dtype)[:, None, None].expand_as(out.color))
     assert all((getattr(out, name) == 0).all() for name in IMAGES[1:])
@@ -78,7 +84,7 @@ def test_no_triangles_show_the_background(engine, scene):
 def test_non_contiguous_tensors_are_understood(engine, scene):
     expected = render(scene, engine).color
     prepared = prepare(scene, engine)
-    for name in ("vertices", "colors", "viewmats", "Ks", "backgrounds"):
+    for name in ("vertices", "face_colors", "viewmats", "Ks", "backgrounds"):
         prepared[name] = prepared[name].transpose(-1, -2).contiguous().transpose(-1, -2)
     prepared["opacities"] = torch.stack([prepared["opacities"]] * 2, dim=1)[:, 0]
     assert torch.equal(on(engine, rasterize, **prepared).color, expected)
@@ -89,26 +95,36 @@ def test_default_engine_follows_dtype():
     assert engine_for(torch.zeros(1, dtype=torch.float64)).name == "reference"
 
 
+ONE_CAMERA = Cameras(torch.eye(4)[None], torch.eye(3)[None], 4, 4)
 BAD_ARGUMENTS = {
     "vertices without faces": ({"vertices": torch.zeros(5, 3)}, r"vertices must have shape \(N, 3, 3\), got \(5, 3\)"),
     "vertices with faces": ({"faces": torch.zeros(5, 3, dtype=torch.int64)}, r"vertices must have shape \(V, 3\)"),
-    "number of colors": ({"colors": torch.zeros(4, 3)}, r"colors must have shape .* with B=2, N=5, got \(4, 3\)"),
-    "views of colors": ({"colors": torch.zeros(3, 5, 3)}, "colors must have shape"),
-    "no channels": ({"colors": torch.zeros(5, 0), "backgrounds": None}, "colors must have at least one channel"),
+    "number of colors": ({"face_colors": torch.zeros(4, 3)}, r"colors must have shape .* with B=2, N=5, got \(4, 3\)"),
+    "views of colors": ({"face_colors": torch.zeros(3, 5, 3)}, "colors must have shape"),
+    "no channels": ({"face_colors": torch.zeros(5, 0), "backgrounds": None}, "colors must have at least one channel"),
     "opacities": ({"opacities": torch.zeros(5, 1)}, r"opacities must have shape \(N,\)"),
     "sigma": ({"sigma": torch.ones(4)}, r"sigma must have shape \(\) or \(N,\)"),
     "viewmats": ({"viewmats": torch.eye(4)}, "viewmats must have shape"),
     "no cameras": ({"viewmats": torch.zeros(0, 4, 4), "Ks": torch.zeros(0, 3, 3), "backgrounds": None}, "viewmats"),
     "Ks": ({"Ks": torch.eye(3)[None]}, r"Ks must have shape \(B, 3, 3\) with B=2"),
     "backgrounds": ({"backgrounds": torch.zeros(3)}, r"backgrounds must have shape \(B, C\)"),
-    "both colors": ({"corner_colors": torch.zeros(5, 3, 3)}, "exactly one of colors and corner_colors .* got both"),
-    "no colors": ({"colors": None}, "exactly one of colors and corner_colors .* got neither"),
-    "list": ({"opacities": [1.0] * 5}, "opacities must be a tensor"),
+    "both colors": ({"corner_colors": torch.zeros(5, 3, 3)}, "exactly one of .* got face_colors and corner_colors"),
+    "no colors": (
+        {"face_colors": None},
+        "exactly one of face_colors, vertex_colors, corner_colors must be given, got none",
+    ),
+    "list": ({"opacities": [1.0] * 5}, r"opacities must be a tensor .* got list: pass torch.tensor\(opacities\)"),
     "dtype": ({"opacities": torch.ones(5, dtype=torch.float16)}, "opacities must be torch.float.* like vertices"),
     "device": ({"opacities": torch.ones(5, device="meta")}, "opacities must be"),
     "kernel": ({"kernel": "gaussian"}, "kernel must be one of 'single_sided'"),
     "distance": ({"distance": "euclid"}, "distance must be one of 'barycentric', 'sdf'"),
-    "depth": ({"depth": "expected"}, "depth must be one of None, 'plane', 'centroid'"),
+    "depth_of": ({"depth_of": "surface"}, "depth_of must be one of 'plane', 'centroid', got 'surface'"),
+    "outputs": ({"outputs": ("color", "depths")}, "outputs must be one of 'color', 'alpha', 'depth', .* got 'depths'"),
+    "vertex colors": ({"face_colors": None, "vertex_colors": torch.ones(15, 3)}, "vertex_colors need faces"),
+    "numpy": ({"vertices": np.zeros((5, 3, 3))}, r"vertices must be .* got ndarray: pass torch.from_numpy\(vertices\)"),
+    "sigma list": ({"sigma": [0.5] * 5}, r"sigma must be .* got list: pass torch.tensor\(sigma\)"),
+    "two kinds of cameras": ({"cameras": ONE_CAMERA}, "either cameras, or all of viewmats, Ks, width and height"),
+    "cameras missing": ({"viewmats": None}, "either cameras, or all of viewmats, Ks, width and height must be given"),
     "width": ({"width": 0}, "width must be a positive integer, got 0"),
     "height": ({"height": 7.0}, "height must be a positive integer, got 7.0"),
     "near plane": ({"near_plane": 0.0}, "near_plane must be positive"),
@@ -116,7 +132,7 @@ BAD_ARGUMENTS = {
     "sigma range": ({"sigma": torch.zeros(5)}, "sigma must be positive, got 0.0"),
     "skew": ({"Ks": torch.ones(2, 3, 3)}, "Ks must have the form"),
     "NaN vertices": ({"vertices": torch.full((5, 3, 3), torch.nan)}, "vertices must be finite, got 45 NaN"),
-    "infinite colors": ({"colors": torch.full((5, 3), torch.inf)}, "colors must be finite"),
+    "infinite colors": ({"face_colors": torch.full((5, 3), torch.inf)}, "colors must be finite"),
     "NaN cameras": ({"viewmats": torch.full((2, 4, 4), torch.nan)}, "viewmats must be finite"),
     "NaN backgrounds": ({"backgrounds": torch.full((2, 3), torch.nan)}, "backgrounds must be finite"),
 }
@@ -154,3 +170,15 @@ def test_engines_refuse_what_they_cannot_compute(scene):
         on("cpu", rasterize, **prepare(scene, "reference"))
     with pytest.raises(ValueError, match=r"float32 or float64, got torch\.float16"):
         rasterize(**prepare(scene, "reference", torch.float16))
+
+
+def test_cameras_in_one_or_one_by_one_are_the_same(engine, scene):
+    """So are the two spellings of a kernel."""
+    views = {name: scene[name] for name in ("viewmats", "Ks", "width", "height")}
+    rest = {name: value for name, value in scene.items() if name not in views}
+    dtype = dtype_of(engine)
+    cameras = Cameras(scene["viewmats"].to(dtype), scene["Ks"].to(dtype), scene["width"], scene["height"])
+    expected = render(scene, engine, kernel="single_sided").color
+    assert torch.equal(
+        on(engine, rasterize, **prepare(rest, engine), cameras=cameras, kernel="single-sided").color, expected.cpu()
+    )

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from test_rasterize_engines import compare
 
 from etsplat import rasterize
+from etsplat.core.rasterization import OUTPUTS
 from etsplat.engines.cuda import capacity
 from etsplat.engines.cuda.launch import use_backend
 from helpers.engines import on
@@ -33,7 +34,7 @@ def test_every_image_of_a_soup(cuda_engine, rng):
 
 
 def test_centroid_depth(cuda_engine, rng):
-    compare(soup(rng, 80), cuda_engine, rng, **{**EVERYTHING, "depth": "centroid"})
+    compare(soup(rng, 80), cuda_engine, rng, **EVERYTHING, depth_of="centroid")
 
 
 @pytest.mark.parametrize("image", ["alpha", "median_depth", "distortion"])
@@ -50,10 +51,10 @@ def test_channels(cuda_engine, channels, rng):
 def test_parts_of_many_channels_leave_out_the_same_triangles(cuda_engine, rng):
     """A triangle with one channel that is not finite is in none of the passes."""
     scene = soup(rng, 30, channels=20)
-    scene["colors"][7, 18] = torch.inf
+    scene["face_colors"][7, 18] = torch.inf
     out = gradients(scene, cuda_engine, {"color": torch.ones(2, 40, 48, 20)}, validate=False)[0]
-    without = {**scene, **{name: scene[name].clone() for name in ("colors", "opacities")}}
-    without["colors"][7], without["opacities"][7] = 0.0, 0.0
+    without = {**scene, **{name: scene[name].clone() for name in ("face_colors", "opacities")}}
+    without["face_colors"][7], without["opacities"][7] = 0.0, 0.0
     expected = gradients(without, cuda_engine, {"color": torch.ones(2, 40, 48, 20)})[0]
     assert torch.equal(out.color, expected.color)
 
@@ -63,8 +64,8 @@ def test_color_layouts(cuda_engine, layout, rng):
     compare(colored(layout, rng), cuda_engine, rng, **EVERYTHING)
 
 
-def test_frozen_incentre(cuda_engine, kernel, rng):
-    compare(soup(rng, 80), cuda_engine, rng, kernel=kernel, distance="sdf", freeze_incentre=True, images=("color",))
+def test_frozen_inradius(cuda_engine, kernel, rng):
+    compare(soup(rng, 80), cuda_engine, rng, kernel=kernel, distance="sdf", freeze_inradius=True, images=("color",))
 
 
 @pytest.mark.parametrize("sigma", [0.02, 2.5])
@@ -171,7 +172,7 @@ def test_a_captured_step_is_the_eager_one(rng):
     """Forward and backward as a graph, replayed on changed vertices, give the bits of single calls."""
     scene = prepare(soup(rng, 200), "cuda", requires_grad=True)
     cotangent = torch.randn(2, 40, 48, 3, generator=rng).cuda()
-    leaves = [scene[name] for name in ("vertices", "colors", "opacities", "sigma")]
+    leaves = [scene[name] for name in ("vertices", "face_colors", "opacities", "sigma")]
 
     def step():
         out = on("cuda", rasterize, **scene)
@@ -193,16 +194,14 @@ def test_a_captured_step_is_the_eager_one(rng):
     assert all(torch.equal(a, b) for a, b in zip(captured, step(), strict=True))
 
 
-NOTHING = {"depth": None, "normals": False, "median_depth": False, "distortion": False}
-ALL = {"depth": "plane", "normals": True, "median_depth": True, "distortion": True}
 OPTIONS = st.fixed_dictionaries(
     {
-        "images": st.sampled_from([NOTHING, ALL]),
+        "outputs": st.sampled_from([("color",), OUTPUTS]),
         "distance": st.sampled_from(["barycentric", "sdf"]),
         "cutoffs": fuzz.cutoffs,
-        "freeze_incentre": st.booleans(),
+        "freeze_inradius": st.booleans(),
     }
-).map(lambda options: {**options.pop("images"), **options, "kernel": "elastic"})
+).map(lambda options: {**options, "kernel": "elastic"})
 
 
 @pytest.mark.sanitize

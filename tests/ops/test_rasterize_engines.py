@@ -7,7 +7,9 @@ import pytest
 import torch
 
 from etsplat import _native, num_threads, rasterize, set_num_threads
+from etsplat.core.cameras import Cameras
 from etsplat.geometry.icosphere import icosphere
+from etsplat.ops.rasterize import COLORS
 from helpers.scenes import EVERYTHING, IMAGES, colored, gradients, mesh, soup
 from helpers.tolerances import assert_close_to_scale
 
@@ -36,7 +38,7 @@ def compare(scene, engine, rng, images=IMAGES, looseness=1.0, **options):
         # Below 1 its slope at the edge is unbounded, and rounding decides the gradient of a pixel there.
         scene = {**scene, "sigma": scene["sigma"] + 1.0}
     shape = (len(scene["viewmats"]), scene["height"], scene["width"])
-    colors = scene.get("colors", scene.get("corner_colors"))
+    colors = next(scene[name] for name in COLORS if name in scene)
     widths = {"color": colors.shape[-1], "normal": 3}
     cotangents = {name: torch.randn(*shape, widths.get(name, 1), generator=rng) for name in images}
     dtype = torch.float32
@@ -48,7 +50,7 @@ def compare(scene, engine, rng, images=IMAGES, looseness=1.0, **options):
         assert_close_to_scale(
             grads[name], expected, **gradient_tolerance(name, expected, looseness), name=f"gradient of {name}"
         )
-    if options.get("statistics"):
+    if "statistics" in options.get("outputs", ()):
         assert (out.statistics.visible.cpu() != oracle.statistics.visible).sum() <= 1
         for name in ("max_weight", "screen_size", "inradius"):
             actual, expected = getattr(out.statistics, name), getattr(oracle.statistics, name)
@@ -71,8 +73,8 @@ def test_colors_alone(kernel, distance, rng):
 def with_interpolated_colors(scene, rng):
     """Colours at the vertices, or at the corners of separate triangles, instead of constant ones."""
     shape = (*scene["vertices"].shape[:-1], 3)
-    return {name: value for name, value in scene.items() if name != "colors"} | {
-        "corner_colors": torch.rand(shape, generator=rng)
+    return {name: value for name, value in scene.items() if name != "face_colors"} | {
+        ("vertex_colors" if "faces" in scene else "corner_colors"): torch.rand(shape, generator=rng)
     }
 
 
@@ -80,7 +82,7 @@ def with_interpolated_colors(scene, rng):
 def test_interpolated_colors_alone(kernel, distance, layout, rng):
     """The same with interpolated colours, which have a path of their own."""
     scene = with_interpolated_colors(mesh(rng) if layout == "per_vertex" else soup(rng, 150), rng)
-    compare(scene, "cpu", rng, images=("color",), kernel=kernel, distance=distance, statistics=True)
+    compare(scene, "cpu", rng, images=("color",), kernel=kernel, distance=distance, outputs=("statistics",))
 
 
 @pytest.mark.parametrize("case", ["frozen incentre", "tiny", "huge", "saturated"])
@@ -89,14 +91,14 @@ def test_interpolated_colors_at_the_extremes(kernel, case, rng):
     scene = with_interpolated_colors(soup(rng, 80, size={"tiny": 0.01, "huge": 3.0}.get(case, 1.5)), rng)
     if case == "saturated":
         scene["opacities"] = torch.ones(80)
-    options = {"distance": "sdf", "freeze_incentre": True} if case == "frozen incentre" else {}
+    options = {"distance": "sdf", "freeze_inradius": True} if case == "frozen incentre" else {}
     compare(scene, "cpu", rng, IMAGES[:1], 10.0 if case == "tiny" else 1.0, kernel=kernel, **options)
 
 
 @pytest.mark.parametrize("image", IMAGES)
 def test_each_image_alone(image, rng):
     """Also when an image is asked for that no cotangent reaches."""
-    options = {**EVERYTHING, "depth": "centroid"} if image != "color" else EVERYTHING
+    options = {**EVERYTHING, "depth_of": "centroid"} if image != "color" else EVERYTHING
     compare(soup(rng, 80), "cpu", rng, images=(image,), **options)
 
 
@@ -112,11 +114,11 @@ def test_color_layouts(layout, rng):
 
 @pytest.mark.parametrize("depth", ["plane", "centroid"])
 def test_depth_modes(depth, distance, rng):
-    compare(soup(rng, 80), "cpu", rng, distance=distance, **{**EVERYTHING, "depth": depth})
+    compare(soup(rng, 80), "cpu", rng, distance=distance, **EVERYTHING, depth_of=depth)
 
 
-def test_frozen_incentre(kernel, rng):
-    compare(soup(rng, 80), "cpu", rng, kernel=kernel, distance="sdf", freeze_incentre=True, images=("color",))
+def test_frozen_inradius(kernel, rng):
+    compare(soup(rng, 80), "cpu", rng, kernel=kernel, distance="sdf", freeze_inradius=True, images=("color",))
 
 
 @pytest.mark.parametrize("sigma", [0.02, 0.1, 2.5])
@@ -152,7 +154,7 @@ def test_shifting_the_principal_point_shifts_the_image(engine, kernel, distance,
     before, before_grads = gradients(scene, engine, {"color": cotangent}, **options)
     after, after_grads = gradients(moved, engine, {"color": cotangent.roll((11, 5), dims=(1, 2))}, **options)
     assert_close_to_scale(after.color[:, 11:, 5:], before.color[:, :-11, :-5], **IMAGE_TOLERANCE)
-    for name in ("vertices", "colors", "opacities", "sigma"):
+    for name in ("vertices", "face_colors", "opacities", "sigma"):
         assert_close_to_scale(
             after_grads[name], before_grads[name], **gradient_tolerance(name, before_grads[name]), name=name
         )
@@ -190,7 +192,14 @@ def test_chunks_of_triangles_do_not_depend_on_the_number_of_threads():
             leaves = [vertices, torch.rand(len(faces), 3, generator=torch.Generator().manual_seed(0)), viewmat[None]]
             leaves = [leaf.clone().requires_grad_() for leaf in leaves]
             opacities, sigma = torch.full((len(faces),), 0.7), torch.tensor(0.5, requires_grad=True)
-            out = rasterize(leaves[0], leaves[1], opacities, sigma, leaves[2], K[None], 130, 120, faces=faces)
+            out = rasterize(
+                leaves[0],
+                face_colors=leaves[1],
+                opacities=opacities,
+                sigma=sigma,
+                cameras=Cameras(leaves[2], K[None], 130, 120),
+                faces=faces,
+            )
             grads = torch.autograd.grad(out.color.square().sum(), [*leaves, sigma])
             results.append([out.color.detach(), *grads])
     finally:

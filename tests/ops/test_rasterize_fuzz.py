@@ -8,7 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from etsplat import Cutoffs, rasterize
+from etsplat.core.cameras import Cameras
 from etsplat.core.kernels import DISTANCES, KERNELS
+from etsplat.core.rasterization import OUTPUTS
 from helpers.engines import dtype_of, on
 from helpers.scenes import EVERYTHING, IMAGES, NO_CUTOFFS, facing, gradients
 
@@ -28,11 +30,9 @@ OPTIONS = st.fixed_dictionaries(
         "kernel": st.sampled_from(list(KERNELS)),
         "distance": st.sampled_from(DISTANCES),
         "cutoffs": cutoffs,
-        "depth": st.sampled_from([None, "plane", "centroid"]),
-        "normals": st.booleans(),
-        "median_depth": st.booleans(),
-        "distortion": st.booleans(),
-        "freeze_incentre": st.booleans(),
+        "depth_of": st.sampled_from(["plane", "centroid"]),
+        "outputs": st.sets(st.sampled_from(OUTPUTS[2:6])),
+        "freeze_inradius": st.booleans(),
     }
 )
 GOOD = facing([(1.0, 2.0), (11.0, 3.0), (5.0, 10.0)], size=SIZE)
@@ -46,17 +46,24 @@ def with_good(vertices, opacity, sigma, color):
     scene["vertices"] = torch.cat([fuzzed, GOOD["vertices"]])
     scene["opacities"] = torch.full((count,), 0.9)
     scene["sigma"] = torch.full((count,), 0.7)
-    scene["colors"] = torch.full((count, 3), 0.5)
-    for name, value in (("opacities", opacity), ("sigma", sigma), ("colors", color)):
+    scene["face_colors"] = torch.full((count, 3), 0.5)
+    for name, value in (("opacities", opacity), ("sigma", sigma), ("face_colors", color)):
         scene[name][:-1] = value
     scene["backgrounds"] = torch.ones(1, 3)
     return scene
 
 
+def with_statistics(options):
+    return {**options, "outputs": {*options["outputs"], "statistics"}}
+
+
 def cotangents_for(options):
     wanted = {"color": 3, "alpha": 1, "depth": 1, "median_depth": 1, "normal": 3, "distortion": 1}
-    switches = {"color": True, "alpha": True, "normal": options["normals"], **options}
-    return {name: torch.ones(1, SIZE, SIZE, width) for name, width in wanted.items() if switches[name]}
+    return {
+        name: torch.ones(1, SIZE, SIZE, width)
+        for name, width in wanted.items()
+        if name in {"color", "alpha", *options["outputs"]}
+    }
 
 
 @pytest.mark.sanitize
@@ -67,7 +74,14 @@ def test_any_triangles(engine, vertices, opacity, sigma, color, options):
     scene = with_good(vertices, opacity, sigma, color)
     cotangents = cotangents_for(options)
     for dtype in {torch.float32, dtype_of(engine)}:
-        out, grads = gradients(scene, engine, cotangents, dtype, validate=False, statistics=True, **options)
+        out, grads = gradients(
+            scene,
+            engine,
+            cotangents,
+            dtype,
+            validate=False,
+            **{**options, "outputs": {*options["outputs"], "statistics"}},
+        )
         for name in cotangents:
             assert getattr(out, name).isfinite().all(), name
         for name, gradient in grads.items():
@@ -78,7 +92,7 @@ def test_any_triangles(engine, vertices, opacity, sigma, color, options):
         assert all(value.isfinite().all() for value in vars(statistics).values())
         invisible = ~statistics.visible[0]
         assert (statistics.max_weight[0, invisible] == 0).all()
-        for name in ("vertices", "opacities", "colors"):
+        for name in ("vertices", "opacities", "face_colors"):
             assert (grads[name][invisible] == 0).all(), name
 
 
@@ -108,7 +122,7 @@ def test_any_camera(engine, viewmat, focal, middle, options):
 def test_any_size(engine, count, width, height, channels):
     """Images of any size, with any number of triangles and channels."""
     scene = {**GOOD, "width": width, "height": height, "vertices": GOOD["vertices"].expand(count, 3, 3)}
-    scene |= {"colors": torch.rand(count, channels), "opacities": torch.rand(count), "sigma": torch.tensor(0.5)}
+    scene |= {"face_colors": torch.rand(count, channels), "opacities": torch.rand(count), "sigma": torch.tensor(0.5)}
     cotangents = {"color": torch.ones(1, height, width, channels)}
     out, grads = gradients(scene, engine, cotangents, **EVERYTHING)
     assert out.color.shape == (1, height, width, channels)
@@ -124,19 +138,16 @@ def test_any_faces(engine, faces):
     indices = torch.tensor(faces[: len(faces) // 3 * 3]).reshape(-1, 3)
     for tensor in (indices, indices % 4):
         bad = bool(((tensor < 0) | (tensor >= 4)).any())
-        dtype = torch.float32 if engine == "cpu" else torch.float64
-        arguments = (
-            torch.tensor([[0, 0, 2], [1, 0, 2], [0, 1, 2], [1, 1, 3]], dtype=dtype),
-            torch.ones(len(tensor), 1, dtype=dtype),
-            torch.ones(len(tensor), dtype=dtype),
-            0.5,
-            torch.eye(4, dtype=dtype)[None],
-            GOOD["Ks"].to(dtype),
-            SIZE,
-            SIZE,
-        )
+        dtype = dtype_of(engine)
+        arguments = {
+            "vertices": torch.tensor([[0, 0, 2], [1, 0, 2], [0, 1, 2], [1, 1, 3]], dtype=dtype),
+            "face_colors": torch.ones(len(tensor), 1, dtype=dtype),
+            "opacities": torch.ones(len(tensor), dtype=dtype),
+            "sigma": 0.5,
+            "cameras": Cameras(torch.eye(4, dtype=dtype)[None], GOOD["Ks"].to(dtype), SIZE, SIZE),
+        }
         if bad:
             with pytest.raises(ValueError, match="faces must be indices from 0 to 3"):
-                on(engine, rasterize, *arguments, faces=tensor, validate=False)
+                on(engine, rasterize, **arguments, faces=tensor, validate=False)
         else:
-            assert on(engine, rasterize, *arguments, faces=tensor).color.isfinite().all()
+            assert on(engine, rasterize, **arguments, faces=tensor).color.isfinite().all()

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from etsplat import Cutoffs, intrinsics, look_at, rasterize
+from etsplat.core.cameras import Cameras
 from helpers.brute_force import brute_force
 from helpers.engines import on
 from helpers.scenes import DIFFERENTIABLE, EVERYTHING, IMAGES, NO_CUTOFFS, facing, prepare, render, soup
@@ -18,14 +19,15 @@ TRIANGLE = [(3.0, 2.5), (13.0, 4.0), (6.5, 14.0)]
 def small_scene(rng: torch.Generator, colors: str) -> dict:
     scene = soup(rng, 4, width=6, height=5, channels=2, size=0.7)
     if colors == "per_view":
-        scene["colors"] = torch.rand(2, 4, 2, generator=rng)
+        scene["face_colors"] = torch.rand(2, 4, 2, generator=rng)
     elif colors != "per_triangle":
-        del scene["colors"]
+        del scene["face_colors"]
         scene["corner_colors"] = torch.rand(4, 3, 2, generator=rng)
     if colors == "per_vertex":
         scene["faces"] = torch.tensor([[0, 1, 2], [2, 1, 3], [3, 4, 5], [5, 0, 4]])
         scene["vertices"] = torch.randn(6, 3, generator=rng)
-        scene["corner_colors"] = torch.rand(6, 2, generator=rng)
+        del scene["corner_colors"]
+        scene["vertex_colors"] = torch.rand(6, 2, generator=rng)
     return scene
 
 
@@ -37,7 +39,7 @@ def test_gradients_are_derivatives(kernel, distance, colors, rng):
     Ks, free = scene["Ks"].detach().clone(), torch.tensor([[1.0, 0.0, 1.0], [0.0, 1.0, 1.0], [0.0, 0.0, 0.0]])
 
     def images(*tensors: Tensor) -> tuple[Tensor, ...]:
-        arguments = {"colors": None, **scene, **dict(zip(names, tensors, strict=True))}
+        arguments = {**scene, **dict(zip(names, tensors, strict=True))}
         arguments["Ks"] = Ks + free * (arguments["Ks"] - Ks)  # other entries are no parameters of a camera
         out = rasterize(**arguments, kernel=kernel, distance=distance, cutoffs=NO_CUTOFFS, **EVERYTHING)
         # The quotient of two tiny sums far from all triangles is too badly conditioned for finite differences.
@@ -54,7 +56,9 @@ def test_gradient_of_the_expected_depth(distance, rng):
 
     def depth(vertices: Tensor, opacities: Tensor) -> Tensor:
         arguments = {**scene, "vertices": vertices, "opacities": opacities, "sigma": scene["sigma"] + 1}
-        out = rasterize(**arguments, distance=distance, cutoffs=NO_CUTOFFS, depth="centroid").depth
+        out = rasterize(
+            **arguments, distance=distance, cutoffs=NO_CUTOFFS, outputs=("depth",), depth_of="centroid"
+        ).depth
         assert out is not None
         return out
 
@@ -67,9 +71,7 @@ def test_every_image_equals_a_brute_force_loop(kernel, distance, depth, cutoffs,
     """Compositing, depths, normals and the pairwise double sum of the distortion, one pixel at a time."""
     scene = soup(rng, 6, width=7, height=6, size=0.6, views=1)
     expected = brute_force(scene, kernel, distance, depth, cutoffs)
-    out = render(
-        scene, "reference", kernel=kernel, distance=distance, cutoffs=cutoffs, **{**EVERYTHING, "depth": depth}
-    )
+    out = render(scene, "reference", kernel=kernel, distance=distance, cutoffs=cutoffs, **EVERYTHING, depth_of=depth)
     for name in IMAGES:
         np.testing.assert_allclose(getattr(out, name)[0].numpy(), expected[name], atol=1e-10, rtol=1e-9, err_msg=name)
 
@@ -133,7 +135,7 @@ def test_gradient_of_x_follows_the_barycentric_identity():
 def test_freezing_the_incentre_drops_only_its_share_of_the_gradient():
     """The frozen gradient is the finite difference with the inradius held, and the image does not change."""
     scene = prepare(facing(TRIANGLE), "reference", requires_grad=True)
-    frozen = rasterize(**scene, distance="sdf", freeze_incentre=True, cutoffs=NO_CUTOFFS)
+    frozen = rasterize(**scene, distance="sdf", freeze_inradius=True, cutoffs=NO_CUTOFFS)
     free = render(facing(TRIANGLE), "reference", distance="sdf", cutoffs=NO_CUTOFFS)
     torch.testing.assert_close(frozen.alpha, free.alpha, rtol=0, atol=0)
     frozen.alpha[0, 5, 6, 0].backward()
@@ -185,5 +187,13 @@ def test_intrinsics_and_look_at_agree_with_the_rasterizer():
     """A small triangle at the target of the camera is drawn in the middle of the image."""
     viewmats = look_at(torch.tensor([[1.0, 2.0, 3.0]]), torch.zeros(3), torch.tensor([0.0, 1.0, 0.0]))
     K, vertices = intrinsics(40, 21, 21)[None], 0.05 * torch.eye(3)[None]
-    out = on("reference", rasterize, vertices, torch.ones(1, 1), torch.ones(1), 0.3, viewmats, K, 21, 21)
+    out = on(
+        "reference",
+        rasterize,
+        vertices,
+        face_colors=torch.ones(1, 1),
+        opacities=torch.ones(1),
+        sigma=0.3,
+        cameras=Cameras(viewmats, K, 21, 21),
+    )
     assert divmod(int(out.alpha.argmax()), 21) == (10, 10)

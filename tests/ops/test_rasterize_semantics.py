@@ -23,7 +23,7 @@ TRIANGLE = [(3.0, 2.5), (13.0, 4.0), (6.5, 14.0)]
 
 
 def colored(scene, color):
-    return {**scene, "colors": torch.tensor([color])}
+    return {**scene, "face_colors": torch.tensor([color])}
 
 
 def test_nearer_triangle_covers_the_farther_whatever_the_order(engine):
@@ -62,12 +62,12 @@ def test_pixel_dies_at_the_layer_it_cannot_afford(engine):
     layers = [facing(COVER, z=2.0 + k, opacity=1.0) for k in range(2)]
     third, faint = facing(COVER, z=4.0, opacity=0.9), facing(COVER, z=5.0, opacity=0.005)
     scene = stacked(*layers, third, faint)
-    out = render(scene, engine, kernel="hard", statistics=True)
+    out = render(scene, engine, kernel="hard", outputs=("statistics",))
     assert float(out.alpha[0, 8, 8, 0]) == pytest.approx(1 - 1e-4, abs=2e-7)
     assert out.statistics.max_weight[0, 2:].tolist() == [0.0, 0.0]
     assert out.statistics.visible.all()
     # The faint layer alone would have been affordable.
-    affordable = render(stacked(*layers, faint), engine, kernel="hard", statistics=True)
+    affordable = render(stacked(*layers, faint), engine, kernel="hard", outputs=("statistics",))
     assert float(affordable.statistics.max_weight[0, 2]) > 0
 
 
@@ -102,7 +102,7 @@ def test_triangle_with_a_vertex_at_or_before_the_near_plane_is_dropped_whole(eng
     assert render(scene, engine, near_plane=2.0).alpha.max() == 0
     behind = {**scene, "vertices": scene["vertices"].clone()}
     behind["vertices"][0, 0, 2] = -1.0
-    out, grads = gradients(behind, engine, {"color": torch.ones(1, 16, 16, 3)}, statistics=True)
+    out, grads = gradients(behind, engine, {"color": torch.ones(1, 16, 16, 3)}, outputs=("statistics",))
     assert not out.statistics.visible.any()
     assert all((value == 0).all() for value in grads.values())
 
@@ -116,7 +116,7 @@ INVISIBLE = {
     "too faint": {"opacities": torch.tensor([0.0039])},
     "NaN vertex": {"vertices": facing(TRIANGLE)["vertices"] * torch.tensor([[[1.0], [torch.nan], [1.0]]])},
     "infinite vertex": {"vertices": facing(TRIANGLE)["vertices"] * torch.tensor([[[1.0], [torch.inf], [1.0]]])},
-    "NaN color": {"colors": torch.tensor([[0.1, torch.nan, 0.2]])},
+    "NaN color": {"face_colors": torch.tensor([[0.1, torch.nan, 0.2]])},
     "NaN opacity": {"opacities": torch.tensor([torch.nan])},
     "infinite opacity": {"opacities": torch.tensor([torch.inf])},
     "NaN sigma": {"sigma": torch.tensor([torch.nan])},
@@ -140,7 +140,7 @@ def test_invisible_triangle_changes_nothing_and_gets_zero_gradient(engine, case,
     for values in (out.statistics.max_weight, out.statistics.screen_size, out.statistics.inradius):
         assert values[0, 0] > 0
         assert values[0, 1] == 0
-    for name in ("vertices", "colors", "opacities", "sigma"):
+    for name in ("vertices", "face_colors", "opacities", "sigma"):
         assert (grads[name][1] == 0).all()
         assert torch.equal(grads[name][:1], alone_grads[name])
     assert torch.equal(grads["viewmats"], alone_grads["viewmats"])
@@ -161,14 +161,14 @@ def test_camera_of_nan_shows_the_background_and_spoils_no_other(engine, rng):
 def test_both_windings_are_drawn_alike(engine, distance):
     scene = facing(TRIANGLE)
     flipped = {**scene, "vertices": scene["vertices"].flip(1)}
-    expected = render(scene, engine, distance=distance, normals=True)
-    out = render(flipped, engine, distance=distance, normals=True)
+    expected = render(scene, engine, distance=distance, outputs=("normal",))
+    out = render(flipped, engine, distance=distance, outputs=("normal",))
     torch.testing.assert_close(out.alpha, expected.alpha, rtol=0, atol=accuracy(engine))
     torch.testing.assert_close(out.normal, expected.normal, rtol=0, atol=accuracy(engine))
 
 
 def test_normal_faces_the_camera_and_is_weighted_by_alpha(engine):
-    out = render(facing(COVER, opacity=0.5), engine, kernel="hard", normals=True)
+    out = render(facing(COVER, opacity=0.5), engine, kernel="hard", outputs=("normal",))
     assert out.normal[0, 8, 8].tolist() == pytest.approx([0.0, 0.0, -0.5], abs=1e-6)
 
 
@@ -176,7 +176,7 @@ def test_normal_faces_the_camera_and_is_weighted_by_alpha(engine):
 def test_depths_of_two_layers(engine, mode):
     """Expected depth is the weighted mean; the median is where T falls below one half."""
     scene = stacked(facing(COVER, z=2.0, opacity=0.4), facing(COVER, z=3.0, opacity=0.5))
-    out = render(scene, engine, kernel="hard", depth=mode, median_depth=True)
+    out = render(scene, engine, kernel="hard", outputs=("depth", "median_depth"), depth_of=mode)
     expected = (0.4 * 2 + 0.6 * 0.5 * 3) / 0.7
     assert float(out.depth[0, 8, 8, 0]) == pytest.approx(expected, abs=1e-5)
     assert float(out.median_depth[0, 8, 8, 0]) == pytest.approx(3.0, abs=1e-5)
@@ -184,7 +184,7 @@ def test_depths_of_two_layers(engine, mode):
 
 def test_depths_are_zero_where_there_is_nothing_to_measure(engine):
     """Expected depth in empty pixels, median depth where T stays above one half."""
-    out = render(facing(TRIANGLE, opacity=0.4), engine, kernel="hard", depth="plane", median_depth=True)
+    out = render(facing(TRIANGLE, opacity=0.4), engine, kernel="hard", outputs=("depth", "median_depth"))
     empty = out.alpha == 0
     assert empty.any()
     assert (out.depth[empty] == 0).all()
@@ -205,7 +205,7 @@ def slanted():
 
 def test_plane_depth_is_perspective_correct(engine):
     scene, _, expected = slanted()
-    out = render(scene, engine, kernel="hard", depth="plane")
+    out = render(scene, engine, kernel="hard", outputs=("depth",))
     inside = out.alpha[0, ..., 0] > 0
     assert inside.sum() > 50
     torch.testing.assert_close(out.depth[0, ..., 0][inside].double(), expected[inside], rtol=1e-5, atol=0)
@@ -213,7 +213,7 @@ def test_plane_depth_is_perspective_correct(engine):
 
 def test_centroid_depth_is_constant(engine):
     scene, _, _ = slanted()
-    out = render(scene, engine, kernel="hard", depth="centroid")
+    out = render(scene, engine, kernel="hard", outputs=("depth",), depth_of="centroid")
     centroid = float(scene["vertices"][0, :, 2].mean())
     values = out.depth[out.alpha > 0]
     torch.testing.assert_close(values, torch.full_like(values, centroid), rtol=1e-5, atol=0)
@@ -222,7 +222,7 @@ def test_centroid_depth_is_constant(engine):
 def test_corner_colors_interpolate_perspective_correctly(engine):
     """World x and y given as corner colours come out as x and y of the point on the plane."""
     scene, ray, depth = slanted()
-    del scene["colors"]
+    del scene["face_colors"]
     scene["corner_colors"] = scene["vertices"][..., :2].clone()
     out = render(scene, engine, kernel="hard")
     inside = out.alpha[0, ..., 0] > 0
@@ -234,7 +234,7 @@ def test_corner_colors_interpolate_perspective_correctly(engine):
 def test_corner_colors_do_not_extrapolate(engine, rng):
     """Outside of the triangle a colour is a blend of its corners."""
     scene = facing([(6.0, 6.0), (10.0, 6.0), (8.0, 10.0)])
-    del scene["colors"]
+    del scene["face_colors"]
     scene["corner_colors"] = torch.rand(1, 3, 2, generator=rng)
     out = render({**scene, "sigma": torch.tensor(1.0)}, engine)
     color = (out.color / out.alpha)[0][out.alpha[0, ..., 0] > 0]
@@ -244,17 +244,17 @@ def test_corner_colors_do_not_extrapolate(engine, rng):
 
 def test_equal_corner_colors_are_a_triangle_color(engine, rng):
     scene = soup(rng, 15)
-    corners = {**scene, "corner_colors": scene["colors"][:, None].expand(15, 3, 3).contiguous()}
-    del corners["colors"]
+    corners = {**scene, "corner_colors": scene["face_colors"][:, None].expand(15, 3, 3).contiguous()}
+    del corners["face_colors"]
     expected = render(scene, engine).color
     torch.testing.assert_close(render(corners, engine).color, expected, rtol=0, atol=accuracy(engine))
 
 
 def test_vertex_colors_are_corner_colors_of_the_faces(engine, rng):
     scene = mesh(rng)
-    del scene["colors"]
+    del scene["face_colors"]
     shared = torch.rand(len(scene["vertices"]), 3, generator=rng)
-    by_vertex = render({**scene, "corner_colors": shared}, engine).color
+    by_vertex = render({**scene, "vertex_colors": shared}, engine).color
     by_corner = render({**scene, "corner_colors": shared[scene["faces"]]}, engine).color
     assert torch.equal(by_vertex, by_corner)
 
@@ -262,7 +262,7 @@ def test_vertex_colors_are_corner_colors_of_the_faces(engine, rng):
 def test_distortion_of_two_layers(engine):
     """w_1 w_2 (m_1 - m_2)^2 with m = 100 / 99.8 (1 - 0.2 / z)."""
     scene = stacked(facing(COVER, z=0.5, opacity=0.4), facing(COVER, z=3.0, opacity=0.5))
-    out = render(scene, engine, kernel="hard", distortion=True)
+    out = render(scene, engine, kernel="hard", outputs=("distortion",))
     difference = 100 / 99.8 * (0.2 / 0.5 - 0.2 / 3.0)
     assert float(out.distortion[0, 8, 8, 0]) == pytest.approx(0.4 * 0.3 * difference**2, rel=1e-4)
 
@@ -270,7 +270,7 @@ def test_distortion_of_two_layers(engine):
 def test_statistics_of_one_triangle(engine):
     """Greatest weight, distance from the mean to the farthest vertex, inradius, in pixels."""
     corners = [(2.0, 2.0), (14.0, 2.0), (2.0, 7.0)]  # sides 5, 12, 13: inradius 2
-    out = render(facing(corners, opacity=0.9), engine, kernel="hard", statistics=True)
+    out = render(facing(corners, opacity=0.9), engine, kernel="hard", outputs=("statistics",))
     assert float(out.statistics.max_weight) == pytest.approx(0.9, abs=1e-6)
     assert float(out.statistics.screen_size) == pytest.approx(math.hypot(8.0, 5 / 3), rel=1e-5)
     assert float(out.statistics.inradius) == pytest.approx(2.0, rel=1e-5)
@@ -281,7 +281,7 @@ def test_box_of_the_visible_support_decides_visibility(engine):
 
     def visible(left: float) -> bool:
         scene = facing([(left, 6.0), (left + 3.0, 6.0), (left, 9.0)], opacity=0.9)
-        return bool(render({**scene, "sigma": torch.tensor(1.4)}, engine, statistics=True).statistics.visible)
+        return bool(render({**scene, "sigma": torch.tensor(1.4)}, engine, outputs=("statistics",)).statistics.visible)
 
     # {x <= 2} reaches from the mean at left + 1 to left - 1.
     assert visible(16.9)

@@ -8,10 +8,11 @@ import torch
 
 from etsplat import intrinsics
 from etsplat.cli.parse import parse
+from etsplat.core.cameras import Cameras
 from etsplat.core.errors import InputError
 from etsplat.data.load import load_dataset
 from etsplat.io.mesh_files import load_mesh
-from etsplat.ops.rasterize_hard import render_opaque
+from etsplat.ops.rasterize_opaque import render_opaque
 from helpers.captures import write_colmap, write_photo, write_transforms
 from repro.limits import room_for
 from repro.tables import NOTHING, Leak, cases
@@ -93,4 +94,6 @@ def test_files(act, tmp_path):
 def test_a_picture_of_too_many_samples_is_refused_by_name():
     view = torch.eye(4)[None], intrinsics(50, 64, 1)[None]
     with pytest.raises(ValueError, match="width"), room_for(4096):
-        render_opaque(torch.rand(2, 3, 3), *view, 2**27 + 1, 1, face_colors=torch.rand(2, 1), supersampling=16)
+        render_opaque(
+            torch.rand(2, 3, 3), cameras=Cameras(*view, 2**27 + 1, 1), face_colors=torch.rand(2, 1), supersampling=16
+        )

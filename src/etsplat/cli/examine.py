@@ -10,7 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from etsplat import _native
-from etsplat.core.cameras import intrinsics
+from etsplat.core.cameras import Cameras, intrinsics
 from etsplat.core.errors import EngineUnavailableError
 from etsplat.engines.choice import engine
 from etsplat.engines.cuda.compile import cache_folder
@@ -54,13 +54,10 @@ def engine_difference() -> float:
         with engine(name):
             drawn = rasterize(
                 vertices,
-                torch.tensor([[0.9, 0.5, 0.2]]),
-                torch.tensor([0.8]),
-                torch.tensor(0.5),
-                torch.eye(4)[None],
-                intrinsics(60.0, 32, 32)[None],
-                32,
-                32,
+                opacities=torch.tensor([0.8]),
+                sigma=0.5,
+                face_colors=torch.tensor([[0.9, 0.5, 0.2]]),
+                cameras=Cameras(torch.eye(4)[None], intrinsics(60.0, 32, 32)[None], 32, 32),
             )
         pictures.append(drawn.color)
     return float((pictures[0] - pictures[1]).abs().max())

@@ -77,6 +77,29 @@ def camera_centers(viewmats: Float[Tensor, "B 4 4"]) -> Float[Tensor, "B 3"]:
     return -torch.einsum("bji,bj->bi", viewmats[:, :3, :3], viewmats[:, :3, 3])
 
 
+def view_arguments(
+    cameras: Cameras | None,
+    viewmats: Float[Tensor, "B 4 4"] | None,
+    Ks: Float[Tensor, "B 3 3"] | None,
+    width: int | None,
+    height: int | None,
+) -> tuple[Float[Tensor, "B 4 4"], Float[Tensor, "B 3 3"], int, int]:
+    """What a drawing function was given to look from: ``cameras``, or the four others.
+
+    Raises:
+        ValueError: Both, neither or only some of the four are given.
+    """
+    if cameras is None:
+        if viewmats is None or Ks is None or width is None or height is None:
+            raise ValueError("either cameras, or all of viewmats, Ks, width and height must be given")
+        return viewmats, Ks, width, height
+    if not isinstance(cameras, Cameras):
+        raise ValueError(f"cameras must be Cameras, got {type(cameras).__name__}: pass them as cameras=")
+    if any(given is not None for given in (viewmats, Ks, width, height)):
+        raise ValueError("either cameras, or all of viewmats, Ks, width and height must be given, not some of both")
+    return cameras.viewmats, cameras.Ks, cameras.width, cameras.height
+
+
 def look_at(
     eye: Float[Tensor, "*batch 3"], target: Float[Tensor, "*#batch 3"], up: Float[Tensor, "*#batch 3"]
 ) -> Float[Tensor, "*batch 4 4"]:

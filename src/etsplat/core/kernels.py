@@ -32,6 +32,12 @@ _LOG_POWER_CAP = 40.0
 
 DISTANCES = ("barycentric", "sdf")
 
+
+def kernel_name(name: str) -> str:
+    """As kernels are called within: "single-sided" is "single_sided"."""
+    return name.replace("-", "_") if isinstance(name, str) else name
+
+
 _Function = Callable[[Tensor, Tensor], Tensor]
 
 

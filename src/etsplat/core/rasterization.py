@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -37,6 +37,12 @@ class Cutoffs(NamedTuple):
 DEFAULT_CUTOFFS = Cutoffs()
 
 
+OUTPUTS = ("color", "alpha", "depth", "median_depth", "normal", "distortion", "statistics")
+"""What ``etsplat.rasterize`` can return, the first two always."""
+
+DEPTHS = ("plane", "centroid")
+
+
 @dataclass(frozen=True)
 class RasterizeSettings:
     """The arguments of ``etsplat.rasterize`` that are not tensors; see there."""
@@ -45,14 +51,35 @@ class RasterizeSettings:
     height: int
     kernel: str
     distance: str
-    near_plane: float = 0.01
-    freeze_incentre: bool = False
-    depth: Literal["none", "plane", "centroid"] = "none"
-    median_depth: bool = False
-    normals: bool = False
-    distortion: bool = False
-    statistics: bool = False
-    cutoffs: Cutoffs = DEFAULT_CUTOFFS
+    outputs: frozenset[str]
+    depth_of: str
+    near_plane: float
+    freeze_inradius: bool
+    cutoffs: Cutoffs
+
+    def wants(self, *names: str) -> bool:
+        """Whether one of these outputs is asked for."""
+        return not self.outputs.isdisjoint(names)
+
+
+class RasterizeTensors(NamedTuple):
+    """The arguments of ``etsplat.rasterize`` that are tensors; see there. Exactly one kind of colours is given."""
+
+    vertices: Tensor
+    opacities: Tensor
+    sigma: Tensor
+    viewmats: Tensor
+    Ks: Tensor
+    faces: Tensor | None
+    face_colors: Tensor | None
+    vertex_colors: Tensor | None
+    corner_colors: Tensor | None
+    backgrounds: Tensor | None
+
+    @property
+    def corners(self) -> Float[Tensor, "N 3 3"]:
+        """Positions of the corners, differentiable."""
+        return self.vertices if self.faces is None else self.vertices[self.faces.long()]
 
 
 class OpaqueView(NamedTuple):
@@ -84,16 +111,21 @@ class TriangleStatistics:
 
 @dataclass
 class Rasterization:
-    """Images of ``etsplat.rasterize``; what was not asked for is None.
+    """Images of the rasterizers; what was not asked for, or what a rasterizer does not have, is None.
+
+    Soft triangles have what ``outputs`` of ``etsplat.rasterize`` names. Opaque ones show the nearest triangle at each
+    pixel's centre: they have triangle, barycentrics and depth, of ``render_opaque`` colour and coverage alone.
 
     Attributes:
-        color: Sum of w c, plus T times the background.
-        alpha: 1 - T, the opacity of the pixel.
-        depth: Sum of w z / max(alpha, 1e-8); 0 where the pixel is empty.
+        color: Sum of w c, plus T times the background; C is 0 where no colours were given.
+        alpha: 1 - T, the opacity of the pixel; of opaque triangles 1 or 0, of ``render_opaque`` the share of samples.
+        depth: Sum of w z / max(alpha, 1e-8), view-space z; 0 where the pixel is empty.
         median_depth: z of the triangle at which T falls from above 0.5 to 0.5 or less; 0 where that never happens.
         normal: Sum of w n, unit normals in world space that face the camera; not renormalised.
         distortion: Sum over pairs of w_i w_j (m_i - m_j)^2 with m the depth mapped to [0, 1] between 0.2 and 100.
         statistics: Per-triangle statistics.
+        triangle: int32 index of the nearest triangle, -1 where there is none.
+        barycentrics: Perspective-correct weights of its vertices, summing to 1; 0 where there is none.
     """
 
     color: Float[Tensor, "B H W C"]
@@ -103,21 +135,13 @@ class Rasterization:
     normal: Float[Tensor, "B H W 3"] | None = None
     distortion: Float[Tensor, "B H W 1"] | None = None
     statistics: TriangleStatistics | None = None
+    triangle: Int[Tensor, "B H W"] | None = None
+    barycentrics: Float[Tensor, "B H W 3"] | None = None
 
-
-@dataclass(frozen=True)
-class HardRasterization:
-    """What each pixel's centre sees.
-
-    Attributes:
-        triangle: Index of the nearest triangle, -1 where there is none.
-        barycentrics: Perspective-correct weights of its vertices, summing to 1; 0 where there is none.
-        depth: View-space z of the surface point; 0 where there is none.
-    """
-
-    triangle: Int[Tensor, "B H W"]
-    barycentrics: Float[Tensor, "B H W 3"]
-    depth: Float[Tensor, "B H W"]
+    @property
+    def rgba(self) -> Float[Tensor, "B H W C+1"]:
+        """Colour, then alpha, as one tensor."""
+        return torch.cat([self.color, self.alpha], dim=-1)
 
 
 def joined(renderings: Sequence[Rasterization]) -> Rasterization:

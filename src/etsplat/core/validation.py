@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -26,7 +27,9 @@ def check_shape(name: str, tensor: Tensor, *shapes: Shape, sizes: dict[str, int]
     sizes = {} if sizes is None else sizes
     wanted = " or ".join("(" + ", ".join(map(str, shape)) + ("," if len(shape) == 1 else "") + ")" for shape in shapes)
     if not isinstance(tensor, Tensor):
-        raise ValueError(f"{name} must be a tensor of shape {wanted}, got {type(tensor).__name__}")
+        raise ValueError(
+            f"{name} must be a tensor of shape {wanted}, got {type(tensor).__name__}{_remedy(name, tensor)}"
+        )
     _check_memory(name, tensor)
     for shape in shapes:
         if len(shape) != tensor.ndim:
@@ -67,6 +70,13 @@ def _check_memory(name: str, tensor: Tensor) -> None:
     needed, held = (last + 1) * tensor.element_size(), tensor.untyped_storage().nbytes()
     if held < needed:
         raise ValueError(f"{name} must have memory of its own: it needs {needed} bytes, and its storage holds {held}")
+
+
+def _remedy(name: str, value: object) -> str:
+    """How to make a tensor of it, for the end of a message."""
+    if isinstance(value, np.ndarray):
+        return f": pass torch.from_numpy({name})"
+    return f": pass torch.tensor({name})" if isinstance(value, list | tuple | float | int | np.generic) else ""
 
 
 def check_like(name: str, tensor: Tensor, other_name: str, other: Tensor) -> None:

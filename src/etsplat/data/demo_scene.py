@@ -15,7 +15,7 @@ from etsplat.data.dataset import Dataset, every_eighth
 from etsplat.data.pictures import StoredPictures
 from etsplat.engines.threads import one_torch_thread
 from etsplat.geometry.icosphere import icosphere
-from etsplat.ops.rasterize_hard import render_opaque
+from etsplat.ops.rasterize_opaque import render_opaque
 
 WIDTH, HEIGHT = 400, 300
 POINTS = 4000
@@ -77,16 +77,8 @@ def _photo(vertices: torch.Tensor, base: torch.Tensor, camera: Cameras) -> torch
     shiny = (base[:, 2:] > 1).float()
     glint = (normals * half).sum(dim=1, keepdim=True).clamp_min(0) ** 40
     colors = base.clamp(0, 1) + 0.7 * shiny * glint
-    picture = render_opaque(
-        vertices,
-        camera.viewmats,
-        camera.Ks,
-        camera.width,
-        camera.height,
-        face_colors=colors.clamp(0, 1),
-        supersampling=_SUPERSAMPLING,
-    )
-    return (255 * picture[0, ..., :3] + 0.5).to(torch.uint8)
+    picture = render_opaque(vertices, face_colors=colors.clamp(0, 1), cameras=camera, supersampling=_SUPERSAMPLING)
+    return (255 * picture.color[0] + 0.5).to(torch.uint8)
 
 
 def _parts() -> list[Part]:

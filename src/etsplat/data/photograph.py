@@ -19,7 +19,7 @@ from etsplat.data.dataset import Dataset, Normalization
 from etsplat.data.pictures import StoredPictures
 from etsplat.geometry.measures import bounding_ball
 from etsplat.io.mesh_files import MeshFile
-from etsplat.ops.rasterize_hard import render_opaque
+from etsplat.ops.rasterize_opaque import render_opaque
 
 ELEVATIONS = (-70.0, -35.0, 0.0, 35.0, 70.0)
 """Degrees above the horizon."""
@@ -91,15 +91,8 @@ def photograph(
     for view in range(len(cameras)):
         camera = cameras[view].to(device)
         image = render_opaque(
-            vertices,
-            camera.viewmats,
-            camera.Ks,
-            width,
-            height,
-            faces=faces,
-            face_colors=colors,
-            supersampling=supersampling,
-        )[0]
+            vertices, face_colors=colors, cameras=camera, faces=faces, supersampling=supersampling
+        ).rgba[0]
         images.append(image.cpu())
         if progress is not None:
             progress(view + 1, len(cameras))

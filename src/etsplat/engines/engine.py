@@ -14,7 +14,13 @@ from torch import Tensor
 
 from etsplat.core.cameras import Cameras
 from etsplat.core.connectivity import MeshConnectivity
-from etsplat.core.rasterization import OpaqueView, Rasterization, RasterizeSettings, TriangleStatistics
+from etsplat.core.rasterization import (
+    OpaqueView,
+    Rasterization,
+    RasterizeSettings,
+    RasterizeTensors,
+    TriangleStatistics,
+)
 
 AdamGroup = tuple[Tensor, Tensor, Tensor, Tensor]
 """A parameter, its gradient and both moments, contiguous."""
@@ -63,18 +69,7 @@ class Engine(Protocol):
     # Pictures
 
     @staticmethod
-    def rasterize(
-        vertices: Tensor,
-        faces: Tensor | None,
-        colors: Tensor | None,
-        corner_colors: Tensor | None,
-        opacities: Tensor,
-        sigma: Tensor,
-        viewmats: Tensor,
-        Ks: Tensor,
-        backgrounds: Tensor | None,
-        settings: RasterizeSettings,
-    ) -> Rasterization:
+    def rasterize(tensors: RasterizeTensors, settings: RasterizeSettings) -> Rasterization:
         """See `etsplat.rasterize`."""
         ...
 

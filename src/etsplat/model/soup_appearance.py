@@ -24,7 +24,7 @@ class SoupAppearance:
         cull_small: leave out triangles with an inradius below one pixel, as Triangle Splatting does.
         cull_large: leave out triangles with a vertex farther from their middle than this times the image's longer side.
             Beside the camera triangles are stretched without bound, and would cover images that they are not in.
-        freeze_incentre: with distance "sdf", hold the inradius constant in the backward pass, as Triangle Splatting.
+        freeze_inradius: with distance "sdf", hold the inradius constant in the backward pass, as Triangle Splatting.
         near_plane: triangles with a vertex at this depth or nearer are invisible.
         background: display colour behind them where nobody names another.
         opacity_floor: opacities are squeezed into [floor, 1].
@@ -37,7 +37,7 @@ class SoupAppearance:
     sh_degree: int | None = None
     cull_small: bool = False
     cull_large: float = float("inf")
-    freeze_incentre: bool = False
+    freeze_inradius: bool = False
     near_plane: float = 0.01
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     opacity_floor: float = 0.0

@@ -17,7 +17,7 @@ from etsplat.io.mesh_files import MeshFile, load_mesh, save_mesh, weld_vertices
 from etsplat.model.model import Depth
 from etsplat.ops.antialias import rasterize_antialiased
 from etsplat.ops.rasterize import rasterize
-from etsplat.ops.rasterize_hard import render_opaque
+from etsplat.ops.rasterize_opaque import render_opaque
 
 
 @dataclass(frozen=True)
@@ -178,33 +178,32 @@ class TriangleMesh:
         Returns:
             Images that are not clamped: blended silhouettes can leave [0, 1] by a little.
         """
-        view, look = (cameras.viewmats, cameras.Ks, cameras.width, cameras.height), self.appearance
+        look = self.appearance
         if look.kernel is None:
             if set(outputs) - {"color", "alpha"}:
                 raise ValueError(f"outputs of opaque triangles must be colour alone, got {outputs}")
             draw = rasterize_antialiased
             if look.backend == "nvdiffrast":
                 from etsplat.ops.antialias_nvdiffrast import rasterize_nvdiffrast as draw
-            image = draw(
-                self.vertices, self.topology.connectivity, *view, **self.named(self.colors), backgrounds=backgrounds
+            return draw(
+                self.vertices,
+                connectivity=self.topology.connectivity,
+                **self.named(self.colors),
+                cameras=cameras,
+                backgrounds=backgrounds,
             )
-            return Rasterization(image, image[..., :1])
         return rasterize(
             self.vertices,
-            None if self.vertex_colored else self.colors,
-            self.opacities,
-            self.sigma,
-            *view,
+            opacities=self.opacities,
+            sigma=self.sigma,
+            **self.named(self.colors),
+            cameras=cameras,
             faces=self.faces,
-            corner_colors=self.colors if self.vertex_colored else None,
             kernel=look.kernel,
             distance=look.distance,
             backgrounds=backgrounds,
-            depth=depth_of if {"depth", "median_depth", "distortion"} & set(outputs) else None,
-            median_depth="median_depth" in outputs,
-            normals="normal" in outputs,
-            distortion="distortion" in outputs,
-            statistics="statistics" in outputs,
+            outputs=outputs,
+            depth_of=depth_of,
             validate=False,  # the loop checks the loss at every step, and the parameters before each checkpoint
         )
 
@@ -213,14 +212,11 @@ class TriangleMesh:
         """What a mesh viewer shows: opaque triangles in display colours, premultiplied RGBA."""
         return render_opaque(
             self.vertices.detach(),
-            cameras.viewmats,
-            cameras.Ks,
-            cameras.width,
-            cameras.height,
-            faces=self.faces,
             **self.named(self.display_colors),
+            cameras=cameras,
+            faces=self.faces,
             supersampling=supersampling,
-        )
+        ).rgba
 
     def surface(self) -> tuple[Float[Tensor, "V 3"], Int[Tensor, "F 3"]]:
         """Vertices and faces, detached, on the CPU."""

@@ -20,7 +20,7 @@ from etsplat.io.tensors import read_tensors, save_tensors
 from etsplat.model.model import Depth
 from etsplat.model.soup_appearance import OPAQUE_FROM, SMALLEST_INRADIUS, SoupAppearance
 from etsplat.ops.rasterize import rasterize
-from etsplat.ops.rasterize_hard import render_opaque
+from etsplat.ops.rasterize_opaque import render_opaque
 from etsplat.ops.soup_activation import soup_activation
 from etsplat.ops.soup_colors import soup_colors
 from etsplat.ops.spherical_harmonics import spherical_harmonics
@@ -240,23 +240,17 @@ class TriangleSoup:
         )
         return rasterize(
             self.vertices,
-            colors,
-            opacities,
-            sigma,
-            cameras.viewmats,
-            cameras.Ks,
-            cameras.width,
-            cameras.height,
+            opacities=opacities,
+            sigma=sigma,
+            face_colors=colors,
+            cameras=cameras,
             kernel=look.kernel,
             distance=look.distance,
             backgrounds=backgrounds,
-            depth=depth_of if {"depth", "median_depth", "distortion"} & set(outputs) else None,
-            median_depth="median_depth" in outputs,
-            normals="normal" in outputs,
-            distortion="distortion" in outputs,
-            statistics="statistics" in outputs,
+            outputs=outputs,
+            depth_of=depth_of,
             near_plane=look.near_plane,
-            freeze_incentre=look.freeze_incentre,
+            freeze_inradius=look.freeze_inradius,
             validate=False,
         )
 
@@ -276,14 +270,11 @@ class TriangleSoup:
         images = [
             render_opaque(
                 vertices,
-                camera.viewmats,
-                camera.Ks,
-                camera.width,
-                camera.height,
+                cameras=camera,
                 face_colors=soup_colors(vertices, dc, rest, camera.centers, self.drawn_degree)[0],
                 supersampling=supersampling,
                 near_plane=self.appearance.near_plane,
-            )
+            ).rgba
             for camera in (cameras[index] for index in range(len(cameras)))
         ]
         return torch.cat(images)

@@ -17,81 +17,71 @@ within the surface give none, so the mesh must be welded. A triangle too small t
 from jaxtyping import Float
 from torch import Tensor
 
+from etsplat.core.cameras import Cameras, view_arguments
 from etsplat.core.connectivity import MeshConnectivity
-from etsplat.core.validation import check_device, check_intrinsics, check_like, check_shape
+from etsplat.core.rasterization import Rasterization
+from etsplat.core.validation import check_device, check_like, check_shape
 from etsplat.engines.choice import engine_for
-from etsplat.ops.rasterize_hard import rasterize_hard
+from etsplat.ops.rasterize import one_kind_of_colors
+from etsplat.ops.rasterize_opaque import rasterize_opaque
 
 
 def rasterize_antialiased(
     vertices: Float[Tensor, "V 3"],
-    connectivity: MeshConnectivity,
-    viewmats: Float[Tensor, "B 4 4"],
-    Ks: Float[Tensor, "B 3 3"],
-    width: int,
-    height: int,
     *,
+    connectivity: MeshConnectivity,
     face_colors: Float[Tensor, "F C"] | None = None,
     vertex_colors: Float[Tensor, "V C"] | None = None,
+    viewmats: Float[Tensor, "B 4 4"] | None = None,
+    Ks: Float[Tensor, "B 3 3"] | None = None,
+    width: int | None = None,
+    height: int | None = None,
+    cameras: Cameras | None = None,
     backgrounds: Float[Tensor, "B C"] | None = None,
     near_plane: float = 0.01,
-) -> Float[Tensor, "B H W C"]:
+) -> Rasterization:
     """Picture of an opaque mesh, differentiable by vertices, colours and backgrounds.
 
     Args:
         vertices: (V, 3) of a welded mesh, world space.
         connectivity: its faces and which of them share edges; ``MeshTopology.connectivity``.
+        face_colors: (F, C), one colour per face. Exactly one of the two colours is given.
+        vertex_colors: (V, C), interpolated perspective-correctly.
         viewmats: (B, 4, 4) world to camera, OpenCV axes.
         Ks: (B, 3, 3) intrinsics [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels.
         width: Image width in pixels.
         height: Image height in pixels.
-        face_colors: (F, C), one colour per face. Exactly one of the two colours is given.
-        vertex_colors: (V, C), interpolated perspective-correctly.
+        cameras: All of the four above in one.
         backgrounds: (B, C); None is black.
         near_plane: Triangles with a vertex at this depth or nearer are dropped; > 0.
 
     Returns:
-        (B, H, W, C). The native engines' images and gradients are the same bits in every run.
+        The picture as colour (B, H, W, C), and what ``rasterize_opaque`` gives, without gradients. The native engines'
+        images and gradients are the same bits in every run.
 
     Raises:
         ValueError: Wrong shape, dtype or device; the message names the argument.
     """
-    colors = _check(vertices, connectivity, viewmats, Ks, face_colors, vertex_colors)
+    viewmats, Ks, width, height = view_arguments(cameras, viewmats, Ks, width, height)
+    check_shape("vertices", vertices, (connectivity.num_vertices, 3))
+    check_device("connectivity", connectivity.faces, "vertices", vertices)
+    if (face_colors is None) == (vertex_colors is None):
+        raise ValueError("exactly one of face_colors and vertex_colors must be given")
+    name, colors = one_kind_of_colors(face_colors, vertex_colors, None, connectivity.faces)
+    check_shape(name, colors, (len(vertices) if face_colors is None else len(connectivity.faces), "C"))
+    check_like(name, colors, "vertices", vertices)
+    seen = rasterize_opaque(
+        vertices, viewmats=viewmats, Ks=Ks, width=width, height=height, faces=connectivity.faces, near_plane=near_plane
+    )
     if backgrounds is None:
         backgrounds = vertices.new_zeros(len(viewmats), colors.shape[1])
     check_shape("backgrounds", backgrounds, (len(viewmats), colors.shape[1]))
     check_like("backgrounds", backgrounds, "vertices", vertices)
-    seen = rasterize_hard(vertices, viewmats, Ks, width, height, faces=connectivity.faces, near_plane=near_plane)
-    found = seen.triangle, seen.barycentrics, seen.depth
-    per_face = face_colors is not None
-    return engine_for(vertices).antialias(
-        vertices, colors, backgrounds, viewmats, Ks, *found, near_plane, per_face, connectivity
+    assert seen.triangle is not None
+    assert seen.barycentrics is not None
+    assert seen.depth is not None
+    found = seen.triangle, seen.barycentrics, seen.depth[..., 0]
+    seen.color = engine_for(vertices).antialias(
+        vertices, colors, backgrounds, viewmats, Ks, *found, near_plane, face_colors is not None, connectivity
     )
-
-
-def _check(
-    vertices: Tensor,
-    connectivity: MeshConnectivity,
-    viewmats: Tensor,
-    Ks: Tensor,
-    face_colors: Tensor | None,
-    vertex_colors: Tensor | None,
-) -> Tensor:
-    """Checks what ``rasterize_hard`` does not; returns the colours."""
-    check_shape("vertices", vertices, (connectivity.num_vertices, 3))
-    check_device("connectivity", connectivity.faces, "vertices", vertices)
-    check_shape("viewmats", viewmats, ("B", 4, 4))
-    check_shape("Ks", Ks, (len(viewmats), 3, 3))
-    if Ks.is_cpu:  # reading them would wait for a GPU
-        check_intrinsics("Ks", Ks)
-    if (face_colors is None) == (vertex_colors is None):
-        raise ValueError("exactly one of face_colors and vertex_colors must be given")
-    for name, colors, count in (
-        ("face_colors", face_colors, len(connectivity.faces)),
-        ("vertex_colors", vertex_colors, len(vertices)),
-    ):
-        if colors is not None:
-            check_shape(name, colors, (count, "C"))
-            check_like(name, colors, "vertices", vertices)
-            return colors
-    raise AssertionError
+    return seen

@@ -11,34 +11,33 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from etsplat.core.cameras import Cameras
+from etsplat.core.connectivity import MeshConnectivity
 from etsplat.core.errors import InputError
-from etsplat.ops.mesh_energies import MeshConnectivity
+from etsplat.core.rasterization import Rasterization
 
 _FAR = 1000.0
 
 
 def rasterize_nvdiffrast(
     vertices: Float[Tensor, "V 3"],
-    connectivity: MeshConnectivity,
-    viewmats: Float[Tensor, "B 4 4"],
-    Ks: Float[Tensor, "B 3 3"],
-    width: int,
-    height: int,
     *,
+    connectivity: MeshConnectivity,
+    cameras: Cameras,
     face_colors: Float[Tensor, "F C"] | None = None,
     vertex_colors: Float[Tensor, "V C"] | None = None,
     backgrounds: Float[Tensor, "B C"] | None = None,
     near_plane: float = 0.01,
-    engine: str | None = None,
-) -> Float[Tensor, "B H W C"]:
-    """As ``etsplat.ops.antialias.rasterize_antialiased``, computed on the GPU; the result is on ``vertices``' device.
+) -> Rasterization:
+    """As ``etsplat.rasterize_antialiased``, computed on the GPU; colour and alpha are on ``vertices``' device.
 
     Raises:
         InputError: nvdiffrast or a CUDA device is missing.
     """
     library = load_nvdiffrast()
     home, device = vertices.device, torch.device("cuda")
-    clip = _clip_positions(vertices, viewmats, Ks, width, height, near_plane).to(device)
+    height, width = cameras.height, cameras.width
+    clip = _clip_positions(vertices, cameras.viewmats, cameras.Ks, width, height, near_plane).to(device)
     faces = connectivity.faces.to(device)
     seen, _ = library.rasterize(_context(), clip, faces, (height, width), grad_db=False)
     if vertex_colors is not None:
@@ -49,7 +48,7 @@ def rasterize_nvdiffrast(
     empty = seen[..., 3:] == 0
     behind = colors.new_zeros(()) if backgrounds is None else backgrounds.to(device)[:, None, None, :]
     image = library.antialias(torch.where(empty, behind, colors).contiguous(), seen, clip, faces)
-    return image.to(home)
+    return Rasterization(image.to(home), (~empty).to(home, vertices.dtype))
 
 
 def load_nvdiffrast() -> Any:

@@ -1,14 +1,25 @@
 """Differentiable triangle splatting (paper, section "Triangle Splatting"): the public call and its checks."""
 
 import math
+from collections.abc import Sequence
 from typing import Literal
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from etsplat.core.kernels import DISTANCES, KERNELS
-from etsplat.core.rasterization import DEFAULT_CUTOFFS, Cutoffs, Rasterization, RasterizeSettings
+from etsplat.core.cameras import Cameras, view_arguments
+from etsplat.core.kernels import DISTANCES, KERNELS, kernel_name
+from etsplat.core.rasterization import (
+    DEFAULT_CUTOFFS,
+    DEPTHS,
+    OUTPUTS,
+    Cutoffs,
+    Rasterization,
+    RasterizeSettings,
+    RasterizeTensors,
+)
 from etsplat.core.validation import (
     Shape,
     check_choice,
@@ -22,32 +33,31 @@ from etsplat.core.validation import (
 )
 from etsplat.engines.choice import engine_for
 
-_COLORS = ("colors", "corner_colors", "backgrounds")
+COLORS = ("face_colors", "vertex_colors", "corner_colors")
 _LARGEST_COLOR = 1e30  # beyond, the gradients of the triangles around overflow
 
 
 def rasterize(
     vertices: Float[Tensor, "V 3"] | Float[Tensor, "N 3 3"],
-    colors: Float[Tensor, "N C"] | Float[Tensor, "B N C"] | None,
+    *,
     opacities: Float[Tensor, " N"],
     sigma: Float[Tensor, ""] | Float[Tensor, " N"] | float,
-    viewmats: Float[Tensor, "B 4 4"],
-    Ks: Float[Tensor, "B 3 3"],
-    width: int,
-    height: int,
-    *,
+    face_colors: Float[Tensor, "N C"] | Float[Tensor, "B N C"] | None = None,
+    vertex_colors: Float[Tensor, "V C"] | None = None,
+    corner_colors: Float[Tensor, "N 3 C"] | None = None,
+    viewmats: Float[Tensor, "B 4 4"] | None = None,
+    Ks: Float[Tensor, "B 3 3"] | None = None,
+    width: int | None = None,
+    height: int | None = None,
+    cameras: Cameras | None = None,
     faces: Int[Tensor, "N 3"] | None = None,
-    corner_colors: Float[Tensor, "N 3 C"] | Float[Tensor, "V C"] | None = None,
+    backgrounds: Float[Tensor, "B C"] | None = None,
     kernel: str = "elastic",
     distance: str = "barycentric",
-    backgrounds: Float[Tensor, "B C"] | None = None,
-    depth: Literal["plane", "centroid"] | None = None,
-    median_depth: bool = False,
-    normals: bool = False,
-    distortion: bool = False,
-    statistics: bool = False,
+    outputs: Sequence[str] = ("color",),
+    depth_of: Literal["plane", "centroid"] = "plane",
     near_plane: float = 0.01,
-    freeze_incentre: bool = False,
+    freeze_inradius: bool = False,
     cutoffs: Cutoffs = DEFAULT_CUTOFFS,
     validate: bool | None = None,
 ) -> Rasterization:
@@ -57,31 +67,30 @@ def rasterize(
     o G(x)). Triangles are composited front to back in the order of the view-space z of their centroid, ties by index:
     C = sum_i w_i c_i + T background with w_i = alpha_i prod_{j<i} (1 - alpha_j). docs/conventions.md has axes, culls
     and cut-offs; docs/method.md has the formulas. Gradients reach vertices, colours, opacities, sigma, backgrounds,
-    viewmats, and of Ks the focal lengths and principal point. All floating-point tensors share one dtype and device.
+    viewmats and Ks. All floating-point tensors share one dtype and device.
 
     Args:
         vertices: (V, 3) with ``faces``, or (N, 3, 3) corners of separate triangles; world space.
-        colors: (N, C) or, per view, (B, N, C): one colour per triangle, any number C >= 1 of channels. None if
-            ``corner_colors`` is given.
         opacities: (N,) in [0, 1].
         sigma: Softness > 0, small is sharp: () or (N,).
+        face_colors: (N, C) or, per view, (B, N, C): one colour per triangle, any number C >= 1 of channels. Exactly one
+            of the three colours is given.
+        vertex_colors: (V, C), with ``faces``: interpolated over the triangles, perspective-correct.
+        corner_colors: (N, 3, C): the same with a colour of its own for each corner.
         viewmats: (B, 4, 4) world to camera, OpenCV axes (x right, y down, z forward).
         Ks: (B, 3, 3) intrinsics [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels, pixel centres at half-integers.
         width: Image width in pixels.
         height: Image height in pixels.
+        cameras: All of the four above in one.
         faces: (N, 3) int32 or int64 indices into ``vertices``.
-        corner_colors: (N, 3, C), or (V, C) with ``faces``: colours interpolated over the triangle, perspective-correct.
+        backgrounds: (B, C); None is black.
         kernel: "elastic", "bilateral", "single_sided", "hard", or a name given to ``register_kernel``.
         distance: "barycentric" (about the mean of the projected vertices) or "sdf" (about the incentre).
-        backgrounds: (B, C); None is black.
-        depth: z of a pixel on the triangle's "plane", or of the triangle's "centroid"; None for no depth image. Median
-            depth and distortion use the same z, on the plane if None.
-        median_depth: Also return the median depth.
-        normals: Also return normals.
-        distortion: Also return the distortion.
-        statistics: Also return per-triangle statistics.
+        outputs: What is wanted besides colour and alpha, which are always there: "depth", "median_depth", "normal",
+            "distortion", "statistics".
+        depth_of: z of a pixel, of all three kinds of depth: on the triangle's "plane", or of its "centroid".
         near_plane: Triangles with a vertex at z <= near_plane are invisible; > 0.
-        freeze_incentre: With distance "sdf", hold the inradius constant in the backward pass, as Triangle Splatting.
+        freeze_inradius: With distance "sdf", hold the inradius constant in the backward pass, as Triangle Splatting.
         cutoffs: Where compositing stops caring.
         validate: Raise on non-finite input, sigma <= 0, malformed Ks, and colours beyond 1e30, whose products in the
             gradients overflow; None means on the CPU. Without it a triangle with data that is not finite, or on a GPU
@@ -93,42 +102,59 @@ def rasterize(
     Raises:
         ValueError: An argument has the wrong shape, dtype, device or range; the message names it.
     """
-    if not isinstance(sigma, Tensor):
-        sigma = torch.full((), float(sigma), dtype=vertices.dtype, device=vertices.device)
+    viewmats, Ks, width, height = view_arguments(cameras, viewmats, Ks, width, height)
     settings = RasterizeSettings(
         width=width,
         height=height,
-        kernel=kernel,
+        kernel=kernel_name(kernel),
         distance=distance,
+        outputs=frozenset([outputs] if isinstance(outputs, str) else outputs),
+        depth_of=depth_of,
         near_plane=near_plane,
-        freeze_incentre=freeze_incentre,
-        depth=depth or "none",
-        median_depth=median_depth,
-        normals=normals,
-        distortion=distortion,
-        statistics=statistics,
+        freeze_inradius=freeze_inradius,
         cutoffs=cutoffs,
     )
     _check_settings(settings)
-    floats = {
-        "vertices": vertices,
-        "colors": colors,
-        "corner_colors": corner_colors,
-        "opacities": opacities,
-        "sigma": sigma,
-        "viewmats": viewmats,
-        "Ks": Ks,
-        "backgrounds": backgrounds,
-    }
-    given = {name: tensor for name, tensor in floats.items() if tensor is not None}
+    check_shape("vertices", vertices, ("N", 3, 3) if faces is None else ("V", 3))
+    if not isinstance(sigma, Tensor) and isinstance(sigma, float | int | np.number):
+        sigma = torch.full((), float(sigma), dtype=vertices.dtype, device=vertices.device)
+    tensors = RasterizeTensors(
+        vertices=vertices,
+        opacities=opacities,
+        sigma=sigma,
+        viewmats=viewmats,
+        Ks=Ks,
+        faces=faces,
+        face_colors=face_colors,
+        vertex_colors=vertex_colors,
+        corner_colors=corner_colors,
+        backgrounds=backgrounds,
+    )
     # Looking at values on a GPU would mean to wait for it.
     look = validate or (validate is None and vertices.is_cpu)
+    given = {name: tensor for name, tensor in tensors._asdict().items() if tensor is not None and name != "faces"}
     _check_tensors(given, faces, look)
     if look:
         _check_values(given)
-    return engine_for(vertices).rasterize(
-        vertices, faces, colors, corner_colors, opacities, sigma, viewmats, Ks, backgrounds, settings
-    )
+    return engine_for(vertices).rasterize(tensors, settings)
+
+
+def one_kind_of_colors(
+    face_colors: Tensor | None, vertex_colors: Tensor | None, corner_colors: Tensor | None, faces: Tensor | None
+) -> tuple[str, Tensor]:
+    """The colours that are given, with their name.
+
+    Raises:
+        ValueError: Not exactly one kind is given, or those of vertices without faces.
+    """
+    kinds = zip(COLORS, (face_colors, vertex_colors, corner_colors), strict=True)
+    given = [(name, colors) for name, colors in kinds if colors is not None]
+    if len(given) != 1:
+        names = " and ".join(name for name, _ in given) or "none"
+        raise ValueError(f"exactly one of {', '.join(COLORS)} must be given, got {names}")
+    if vertex_colors is not None and faces is None:
+        raise ValueError("vertex_colors need faces; separate triangles have corner_colors (N, 3, C)")
+    return given[0]
 
 
 def _check_settings(settings: RasterizeSettings) -> None:
@@ -137,7 +163,9 @@ def _check_settings(settings: RasterizeSettings) -> None:
             raise ValueError(f"{name} must be a positive integer, got {size!r}")
     check_choice("kernel", settings.kernel, list(KERNELS))
     check_choice("distance", settings.distance, DISTANCES)
-    check_choice("depth", None if settings.depth == "none" else settings.depth, (None, "plane", "centroid"))
+    check_choice("depth_of", settings.depth_of, DEPTHS)
+    for name in sorted(settings.outputs, key=str):
+        check_choice("outputs", name, OUTPUTS)
     if not 0.0 < settings.near_plane < float("inf"):
         raise ValueError(f"near_plane must be positive and finite, got {settings.near_plane}")
     alpha_min, alpha_max, x_max, transmittance_min = settings.cutoffs
@@ -155,9 +183,8 @@ def _check_settings(settings: RasterizeSettings) -> None:
 
 
 def _check_tensors(given: dict[str, Tensor], faces: Tensor | None, look: bool) -> None:
-    if ("colors" in given) == ("corner_colors" in given):
-        got = "both" if "colors" in given else "neither"
-        raise ValueError(f"exactly one of colors and corner_colors must be given, got {got}")
+    face_colors, vertex_colors, corner_colors = map(given.get, COLORS)
+    colors, _ = one_kind_of_colors(face_colors, vertex_colors, corner_colors, faces)
     sizes: dict[str, int] = {}
     if faces is not None:
         check_shape("faces", faces, ("N", 3), sizes=sizes)
@@ -167,8 +194,9 @@ def _check_tensors(given: dict[str, Tensor], faces: Tensor | None, look: bool) -
         "sigma": [(), ("N",)],
         "viewmats": [("B", 4, 4)],
         "Ks": [("B", 3, 3)],
-        "colors": [("N", "C"), ("B", "N", "C")],
-        "corner_colors": [("N", 3, "C")] if faces is None else [("V", "C"), ("N", 3, "C")],
+        "face_colors": [("N", "C"), ("B", "N", "C")],
+        "vertex_colors": [("V", "C")],
+        "corner_colors": [("N", 3, "C")],
         "backgrounds": [("B", "C")],
     }
     for name, alternatives in shapes.items():
@@ -178,7 +206,7 @@ def _check_tensors(given: dict[str, Tensor], faces: Tensor | None, look: bool) -
     if sizes["B"] < 1:
         raise ValueError("viewmats must hold at least one camera, got 0")
     if sizes["C"] < 1:
-        raise ValueError("colors must have at least one channel, got 0")
+        raise ValueError(f"{colors} must have at least one channel, got 0")
     if faces is not None:
         check_device("faces", faces, "vertices", given["vertices"])
         if look or faces.is_cpu:
@@ -187,6 +215,6 @@ def _check_tensors(given: dict[str, Tensor], faces: Tensor | None, look: bool) -
 
 def _check_values(given: dict[str, Tensor]) -> None:
     for name, tensor in given.items():
-        check_finite(name, tensor, _LARGEST_COLOR if name in _COLORS else math.inf)
+        check_finite(name, tensor, _LARGEST_COLOR if name in (*COLORS, "backgrounds") else math.inf)
     check_positive("sigma", given["sigma"])
     check_intrinsics("Ks", given["Ks"])

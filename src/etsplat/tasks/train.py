@@ -282,7 +282,7 @@ def _appearance(config: TrainConfig, iteration: int) -> SoupAppearance:
         sh_degree=min(config.drawing.sh_degree, iteration // config.at(config.schedule.sh_every)),
         cull_small=config.drawing.cull_small,
         cull_large=math.inf if config.drawing.cull_large is None else config.drawing.cull_large,
-        freeze_incentre=config.drawing.freeze_inradius and config.distance == "sdf",
+        freeze_inradius=config.drawing.freeze_inradius and config.distance == "sdf",
         near_plane=config.drawing.near_plane,
         background=_background(config),
     )

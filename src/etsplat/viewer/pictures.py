@@ -10,7 +10,7 @@ from torch import Tensor
 from etsplat.core.cameras import Cameras
 from etsplat.io.images import to_8_bit
 from etsplat.model.triangle_soup import TriangleSoup
-from etsplat.ops.rasterize_hard import rasterize_hard
+from etsplat.ops.rasterize_opaque import rasterize_opaque
 from etsplat.ops.soup_colors import soup_colors
 from etsplat.tasks.render_config import RenderConfig
 from etsplat.tasks.render_soup import color_depth, depth_span, draw
@@ -46,13 +46,9 @@ def _wireframe(soup: TriangleSoup, camera: Cameras) -> Float[Tensor, "H W 3"]:
     if not bool(kept.any()):
         return image
     chosen = replace(soup, **{name: tensor[kept] for name, tensor in soup.parameters().items()})
-    hit = (
-        rasterize_hard(
-            chosen.vertices, camera.viewmats, camera.Ks, camera.width, camera.height, near_plane=appearance.near_plane
-        )
-        .triangle[0]
-        .long()
-    )
+    triangle = rasterize_opaque(chosen.vertices, cameras=camera, near_plane=appearance.near_plane).triangle
+    assert triangle is not None
+    hit = triangle[0].long()
     view = chosen.vertices, chosen.sh_dc, chosen.sh_rest, camera.centers
     colors = soup_colors(*view, soup.drawn_degree)[0].clamp(0, 1)
     flat = torch.where(hit[..., None] >= 0, colors[hit.clamp_min(0)], image)

@@ -25,7 +25,7 @@ class CpuRender:
         for b in range(plan.views):
             call = _call(b, inputs, outputs.images, plan)
             call.keep_for_backward = keep
-            if plan.settings.median_depth:
+            if plan.settings.wants("median_depth"):
                 call.median_triangle = _address(outputs.median_triangle, b)
             if outputs.statistics is not None:
                 call.max_weight = _address(outputs.statistics.max_weight, b)
@@ -117,15 +117,15 @@ def _call(b: int, inputs: Inputs, images: Images, plan: Plan) -> Any:
     if kernel.table is not None:
         call.kernel_table = _address(kernel.table.native(inputs.vertices.device))
     call.distance = DISTANCES.index(settings.distance)
-    call.freeze_incentre = settings.freeze_incentre
+    call.freeze_incentre = settings.freeze_inradius
     call.near_plane = settings.near_plane
     call.alpha_min, call.alpha_max, call.x_max, call.transmittance_min = settings.cutoffs
     call.distortion_near = DISTORTION_NEAR
     call.distortion_far = DISTORTION_FAR
-    call.centroid_depth = settings.depth == "centroid"
+    call.centroid_depth = settings.depth_of == "centroid"
     call.color = _address(images.color, b)
     call.alpha = _address(images.alpha, b)
-    if settings.distortion:
+    if settings.wants("distortion"):
         call.distortion = _address(images.distortion, b)
         call.distortion_totals = _address(images.distortion_totals, b)
     return call

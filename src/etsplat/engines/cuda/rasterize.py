@@ -42,7 +42,7 @@ class CudaRender:
         self.tile_count = plan.views * self.tiles[0] * self.tiles[1]
         self.projected = plan.views * plan.geometry.count
         # 0 none, 1 with the plane's depth, 2 with the centroid's
-        self.distortion = 0 if not settings.distortion else 2 if settings.depth == "centroid" else 1
+        self.distortion = 0 if not settings.wants("distortion") else 2 if settings.depth_of == "centroid" else 1
         self.arguments = struct_class("cuda/raster_pass.h", "RasterPass")()
         self._fill_inputs(inputs)
         self._fill_images(outputs.images)
@@ -108,7 +108,7 @@ class CudaRender:
         a.sorted_tiles, a.sorted_slots = self.by_tile.run(keys, slots, ctypes.c_void_p(a.slots), self.tile_zeros)
         launch(_PROJECT, "raster_ranges", blocks(capacity, 256), 256, [a])
         settings = self.plan.settings
-        defines = self._defines(self.distortion, settings.median_depth, settings.statistics)
+        defines = self._defines(self.distortion, settings.wants("median_depth"), settings.wants("statistics"))
         launch(Program("raster_forward.cu", defines), "raster_forward", self.tile_count, 256, [a])
         del self.temporary, self.tile_zeros
 
@@ -190,7 +190,7 @@ class CudaRender:
         self.table = None if kernel.table is None else kernel.table.native(self.device)  # kept: `a` has its address
         a.kernel, a.kernel_table = kernel.native_id, _pointer(self.table)
         a.distance = DISTANCES.index(settings.distance)
-        a.freeze_incentre = settings.freeze_incentre
+        a.freeze_incentre = settings.freeze_inradius
         a.shared_sigma = inputs.sigma.dim() == 0
         a.flat_per_view = inputs.flat_per_view
         a.corner_per_view = inputs.corner_per_view
@@ -205,12 +205,12 @@ class CudaRender:
     def _fill_images(self, images: Images) -> None:
         a = self.arguments
         a.color, a.alpha = images.color.data_ptr(), images.alpha.data_ptr()
-        if self.plan.settings.distortion:
+        if self.plan.settings.wants("distortion"):
             a.distortion, a.distortion_totals = images.distortion.data_ptr(), _pointer(images.distortion_totals)
 
     def _fill_outputs(self, outputs: Outputs) -> None:
         a, settings = self.arguments, self.plan.settings
-        if settings.median_depth:
+        if settings.wants("median_depth"):
             a.median_triangle = outputs.median_triangle.data_ptr()
         if outputs.statistics is not None:
             statistics = outputs.statistics

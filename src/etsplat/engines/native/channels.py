@@ -7,7 +7,7 @@ it. Depth and normals are channels as well, so their gradients need no code of t
 import torch
 from torch import Tensor
 
-from etsplat.core.rasterization import Rasterization, RasterizeSettings
+from etsplat.core.rasterization import Rasterization, RasterizeSettings, RasterizeTensors
 from etsplat.engines.native.plan import Geometry, NativeCalls
 from etsplat.engines.native.triangle_channels import triangle_channels
 from etsplat.engines.reference.rasterize import barycentrics, perspective_weights, to_screen
@@ -16,21 +16,12 @@ from etsplat.engines.reference.rasterize import barycentrics, perspective_weight
 class Channels:
     """Flat (N, F) or (B, N, F) and corner (N, 3, K) or (B, N, 3, K) channels; in each, colours come first."""
 
-    def __init__(
-        self,
-        colors: Tensor | None,
-        corner_colors: Tensor | None,
-        faces: Tensor | None,
-        geometry: Geometry,
-        calls: NativeCalls,
-    ) -> None:
-        if corner_colors is not None and corner_colors.dim() == 2:
-            assert faces is not None
-            corner_colors = calls.per_corner(corner_colors, faces, geometry)
-        self.flat = colors
-        self.corner = corner_colors
-        self.flat_is_color = colors is not None
-        self.colors = colors.shape[-1] if colors is not None else corner_colors.shape[-1]  # type: ignore[union-attr]
+    def __init__(self, tensors: RasterizeTensors, geometry: Geometry, calls: NativeCalls) -> None:
+        self.flat, self.corner = tensors.face_colors, tensors.corner_colors
+        if tensors.vertex_colors is not None and tensors.faces is not None:
+            self.corner = calls.per_corner(tensors.vertex_colors, tensors.faces, geometry)
+        self.flat_is_color = self.flat is not None
+        self.colors = self.count
         self.centroid_depth: Tensor | None = None  # (B, N)
         self.flat_names: list[str] = []
         self.corner_names: list[str] = []
@@ -45,16 +36,22 @@ class Channels:
         """Flat channels come first in an image, so a normal or a depth may precede interpolated colours."""
         return 0 if self.flat_is_color or self.flat is None else self.flat.shape[-1]
 
-    def add_geometry(self, corners: Tensor, viewmats: Tensor, settings: RasterizeSettings, calls: NativeCalls) -> None:
-        """Append what the settings ask for of depth and normals, differentiable by ``corners`` and ``viewmats``."""
-        batch, centroid = viewmats.shape[0], settings.depth == "centroid"
-        if centroid or settings.normals:
-            geometry = triangle_channels(calls.triangle_channels, corners, viewmats, centroid, settings.normals)
-            self.flat_names += ["depth"] * centroid + ["normal"] * settings.normals
+    def add_geometry(self, tensors: RasterizeTensors, settings: RasterizeSettings, calls: NativeCalls) -> None:
+        """Append what the settings ask for of depth and normals, differentiable by vertices and viewmats."""
+        depth, normals = settings.wants("depth"), settings.wants("normal")
+        centroid = settings.depth_of == "centroid" and settings.wants("depth", "median_depth")
+        if not (depth or normals or centroid):
+            return
+        corners, viewmats = tensors.corners, tensors.viewmats
+        batch = len(viewmats)
+        if centroid or normals:
+            geometry = triangle_channels(calls.triangle_channels, corners, viewmats, centroid, normals)
             self.centroid_depth = geometry[..., 0] if centroid else None
+            shown = geometry[..., 1:] if centroid and not depth else geometry
+            self.flat_names += ["depth"] * (centroid and depth) + ["normal"] * normals
             own = [] if self.flat is None else [self.flat if self.flat.dim() == 3 else self.flat.expand(batch, -1, -1)]
-            self.flat = torch.cat([*own, geometry], dim=-1)
-        if settings.depth == "plane":
+            self.flat = torch.cat([*own, shown], dim=-1) if self.flat_names else self.flat
+        if depth and not centroid:
             corners = finite(corners)
             # A camera that is not finite sees nothing, and must not spoil the gradients of the others.
             viewmats = torch.where(viewmats.isfinite().all(dim=2).all(dim=1)[:, None, None], viewmats, 0.0)
@@ -85,28 +82,21 @@ class Channels:
             result.depth = parts["depth"] / result.alpha.clamp_min(1e-8)
 
 
-def corners_of(vertices: Tensor, faces: Tensor | None) -> Tensor:
-    """Corner positions (N, 3, 3), differentiable."""
-    return vertices if faces is None else vertices[faces.long()]
-
-
 def finite(corners: Tensor) -> Tensor:
     """With 0 for triangles that are not finite, which are never drawn."""
     return torch.where(corners.isfinite().all(dim=2).all(dim=1)[:, None, None], corners, 0.0)
 
 
-def median_depth(
-    triangle: Tensor, channels: Channels, corners: Tensor, viewmats: Tensor, Ks: Tensor, calls: NativeCalls
-) -> Tensor:
+def median_depth(triangle: Tensor, channels: Channels, tensors: RasterizeTensors, calls: NativeCalls) -> Tensor:
     """Depth (B, H, W, 1) at each pixel of the triangle whose index + 1 is given, 0 where that is 0; differentiable.
 
     The depth of the centroid where ``channels`` have it, else that of the triangle's plane at the pixel.
     """
-    if len(corners) == 0:
-        return torch.zeros((*triangle.shape, 1), device=corners.device)
+    if len(tensors.opacities) == 0:
+        return torch.zeros((*triangle.shape, 1), device=triangle.device)
     if channels.centroid_depth is not None:
         return calls.pick_values(channels.centroid_depth, triangle)[..., None]
-    return _plane_depth(triangle, finite(corners), viewmats, Ks)
+    return _plane_depth(triangle, finite(tensors.corners), tensors.viewmats, tensors.Ks)
 
 
 def _plane_depth(triangle: Tensor, corners: Tensor, viewmats: Tensor, Ks: Tensor) -> Tensor:

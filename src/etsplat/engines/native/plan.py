@@ -108,13 +108,13 @@ class Outputs:
         self.images = Images(
             color=empty(near, *image, sum(inputs.channels)),
             alpha=empty(near, *image, 1),
-            distortion=empty(near, *image, 1) if settings.distortion else empty(near, 0),
-            distortion_totals=empty(near, *image, 2) if settings.distortion else None,
+            distortion=empty(near, *image, 1) if settings.wants("distortion") else empty(near, 0),
+            distortion_totals=empty(near, *image, 2) if settings.wants("distortion") else None,
         )
-        median_shape = image if settings.median_depth else (0,)
+        median_shape = image if settings.wants("median_depth") else (0,)
         self.median_triangle = torch.empty(median_shape, dtype=torch.int32, device=near.device)
         self.statistics = None
-        if settings.statistics:
+        if settings.wants("statistics"):
             values = torch.empty(3, plan.views, plan.geometry.count, device=near.device)
             visible = torch.empty(values.shape[1:], dtype=torch.bool, device=near.device)
             self.statistics = TriangleStatistics(values[0], values[1], values[2], visible)

@@ -7,49 +7,36 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from etsplat.core.rasterization import Rasterization, RasterizeSettings
+from etsplat.core.rasterization import Rasterization, RasterizeSettings, RasterizeTensors
 from etsplat.core.validation import dense
-from etsplat.engines.native.channels import Channels, corners_of, median_depth
+from etsplat.engines.native.channels import Channels, median_depth
 from etsplat.engines.native.plan import Geometry, Images, Inputs, NativeCalls, Outputs, PerInput, Plan, channel_count
 
 
-def rasterize_native(
-    calls: NativeCalls,
-    vertices: Tensor,
-    faces: Tensor | None,
-    colors: Tensor | None,
-    corner_colors: Tensor | None,
-    opacities: Tensor,
-    sigma: Tensor,
-    viewmats: Tensor,
-    Ks: Tensor,
-    backgrounds: Tensor | None,
-    settings: RasterizeSettings,
-) -> Rasterization:
+def rasterize_native(calls: NativeCalls, tensors: RasterizeTensors, settings: RasterizeSettings) -> Rasterization:
     """Render with an engine of native code; see `Engine.rasterize`."""
-    geometry = Geometry(vertices, faces)
-    channels = Channels(colors, corner_colors, faces, geometry, calls)
-    if settings.depth != "none" or settings.normals:
-        channels.add_geometry(corners_of(vertices, faces), viewmats, settings, calls)
-    backgrounds = channels.pad_backgrounds(backgrounds)
+    geometry = Geometry(tensors.vertices, tensors.faces)
+    channels = Channels(tensors, geometry, calls)
+    channels.add_geometry(tensors, settings, calls)
+    backgrounds = channels.pad_backgrounds(tensors.backgrounds)
     render = calls.render
 
     def run(part: _Part, part_settings: RasterizeSettings) -> tuple[tuple[Tensor, ...], Plan]:
-        plan = Plan(render, part_settings, geometry, viewmats.shape[0])
-        inputs = Inputs(vertices, part.flat, part.corner, opacities, sigma, viewmats, Ks, part.backgrounds)
+        t, plan = tensors, Plan(render, part_settings, geometry, len(tensors.viewmats))
+        views = t.viewmats, t.Ks, part.backgrounds
+        inputs = Inputs(t.vertices, part.flat, part.corner, t.opacities, t.sigma, *views)
         return _Rasterize.apply(plan, *inputs), plan
 
     first, *rest = _parts(channels.flat, channels.corner, backgrounds, render.most_channels)
     (color, alpha, distortion, median_triangle), plan = run(first, settings)
     if rest:
-        plain = replace(settings, statistics=False, distortion=False, median_depth=False)
+        plain = replace(settings, outputs=settings.outputs - {"statistics", "distortion", "median_depth"})
         color = torch.cat([color, *(run(part, plain)[0][0] for part in rest)], dim=-1)
     result = Rasterization(color=color, alpha=alpha, statistics=plan.statistics)
-    if settings.distortion:
+    if settings.wants("distortion"):
         result.distortion = distortion
-    if settings.median_depth:
-        corners = corners_of(vertices, faces)
-        result.median_depth = median_depth(median_triangle, channels, corners, viewmats, Ks, calls)
+    if settings.wants("median_depth"):
+        result.median_depth = median_depth(median_triangle, channels, tensors, calls)
     channels.split(result)
     return result
 

@@ -17,8 +17,10 @@ from etsplat.core.kernels import KERNELS, Kernel
 from etsplat.core.rasterization import (
     DISTORTION_FAR,
     DISTORTION_NEAR,
+    OUTPUTS,
     Rasterization,
     RasterizeSettings,
+    RasterizeTensors,
     TriangleStatistics,
 )
 
@@ -28,36 +30,25 @@ _FARTHEST_PIXEL = 1e15
 _LARGEST = 1e30  # of depths, and of squared lengths in pixels
 
 
-def rasterize(
-    vertices: Tensor,
-    faces: Tensor | None,
-    colors: Tensor | None,
-    corner_colors: Tensor | None,
-    opacities: Tensor,
-    sigma: Tensor,
-    viewmats: Tensor,
-    Ks: Tensor,
-    backgrounds: Tensor | None,
-    settings: RasterizeSettings,
-) -> Rasterization:
+def rasterize(tensors: RasterizeTensors, settings: RasterizeSettings) -> Rasterization:
     """See `Engine.rasterize`."""
-    triangles = vertices if faces is None else vertices[faces.long()]
-    if corner_colors is not None and corner_colors.ndim == 2:
-        assert faces is not None
-        corner_colors = corner_colors[faces.long()]
-    sigma = sigma.expand(opacities.shape)
+    triangles, colors = tensors.corners, tensors.face_colors
+    if tensors.vertex_colors is not None and tensors.faces is not None:
+        colors = tensors.vertex_colors[tensors.faces.long()]
+    elif tensors.corner_colors is not None:
+        colors = tensors.corner_colors
+    assert colors is not None
+    opacities, viewmats, Ks = tensors.opacities, tensors.viewmats, tensors.Ks
+    per_view = tensors.face_colors is not None and colors.ndim == 3
+    sigma = tensors.sigma.expand(opacities.shape)
     images, statistics = [], []
     for view in range(viewmats.shape[0]):
-        if corner_colors is not None:
-            view_colors = corner_colors
-        else:
-            assert colors is not None
-            view_colors = colors[view] if colors.ndim == 3 else colors
+        view_colors = colors[view] if per_view else colors
         projected = _project(triangles, view_colors, opacities, sigma, viewmats[view], Ks[view], settings)
         channels, max_weight = _render(projected, settings)
         images.append(channels)
         statistics.append(_statistics(projected, max_weight, len(opacities)))
-    return _assemble(torch.stack(images), statistics, backgrounds, settings)
+    return _assemble(torch.stack(images), statistics, tensors.backgrounds, settings)
 
 
 @dataclass
@@ -250,18 +241,18 @@ def _composite(
     else:
         channels = [(weight[..., None] * z_weights).flatten(start_dim=1) @ colors.flatten(end_dim=1)]
     channels.append(transmittance[:, -1:])
-    if settings.depth == "centroid":
+    if settings.depth_of == "centroid":
         z = triangles.depth[near].expand_as(weight)
     else:
         z = (z_weights * triangles.corner_depths[near]).sum(dim=-1)
-    if settings.depth != "none":
+    if settings.wants("depth"):
         channels.append((weight * z).sum(dim=1, keepdim=True))
-    if settings.median_depth:
+    if settings.wants("median_depth"):
         crossing = (before > 0.5) & (after <= 0.5)
         channels.append(torch.where(crossing, z, 0.0).sum(dim=1, keepdim=True))
-    if settings.normals:
+    if settings.wants("normal"):
         channels.append(weight @ triangles.normal[near])
-    if settings.distortion:
+    if settings.wants("distortion"):
         channels.append(_distortion(weight, z))
     return torch.cat(channels, dim=1), weight.detach().amax(dim=0)
 
@@ -287,7 +278,7 @@ def _distance(barycentric: Tensor, corners: Tensor, settings: RasterizeSettings)
     doubled_area = _doubled_area(corners).abs()
     lengths = _edge_lengths(corners)
     inradius = doubled_area / lengths.sum(dim=-1)
-    if settings.freeze_incentre:
+    if settings.freeze_inradius:
         inradius = inradius.detach()
     signed_distance = -barycentric * (doubled_area[:, None] / lengths)
     return 1.0 + _first_max(signed_distance) / inradius
@@ -349,7 +340,8 @@ def _assemble(
     channels: Tensor, statistics: list[TriangleStatistics], backgrounds: Tensor | None, settings: RasterizeSettings
 ) -> Rasterization:
     """Split the channels (B, H, W, K) into images."""
-    extra = [settings.depth != "none", settings.median_depth, 3 * settings.normals, settings.distortion]
+    depths, median, normals, distorted = (settings.wants(name) for name in OUTPUTS[2:6])
+    extra = [depths, median, 3 * normals, distorted]
     colors = channels.shape[-1] - 1 - sum(extra)
     color, transmittance, depth, median_depth, normal, distortion = channels.split([colors, 1, *extra], dim=-1)
     if backgrounds is not None:
@@ -358,13 +350,13 @@ def _assemble(
     return Rasterization(
         color=color,
         alpha=alpha,
-        depth=depth / alpha.clamp(min=1e-8) if settings.depth != "none" else None,
-        median_depth=median_depth if settings.median_depth else None,
-        normal=normal if settings.normals else None,
-        distortion=distortion if settings.distortion else None,
+        depth=depth / alpha.clamp(min=1e-8) if depths else None,
+        median_depth=median_depth if median else None,
+        normal=normal if normals else None,
+        distortion=distortion if distorted else None,
         statistics=TriangleStatistics(
             *(torch.stack([getattr(s, name) for s in statistics]) for name in TriangleStatistics.__dataclass_fields__)
         )
-        if settings.statistics
+        if settings.wants("statistics")
         else None,
     )

@@ -10,24 +10,27 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from etsplat.core.rasterization import HardRasterization, OpaqueView
+from etsplat.core.cameras import Cameras, view_arguments
+from etsplat.core.rasterization import OpaqueView, Rasterization
 from etsplat.core.validation import check_device, check_indices, check_intrinsics, check_like, check_shape, dense
 from etsplat.engines.choice import engine_for
+from etsplat.ops.rasterize import one_kind_of_colors
 
 MAX_SUPERSAMPLING = 16
 
 
 @torch.no_grad()
-def rasterize_hard(
+def rasterize_opaque(
     vertices: Float[Tensor, "V 3"] | Float[Tensor, "N 3 3"],
-    viewmats: Float[Tensor, "B 4 4"],
-    Ks: Float[Tensor, "B 3 3"],
-    width: int,
-    height: int,
     *,
+    viewmats: Float[Tensor, "B 4 4"] | None = None,
+    Ks: Float[Tensor, "B 3 3"] | None = None,
+    width: int | None = None,
+    height: int | None = None,
+    cameras: Cameras | None = None,
     faces: Int[Tensor, "F 3"] | None = None,
     near_plane: float = 0.01,
-) -> HardRasterization:
+) -> Rasterization:
     """The nearest triangle at every pixel centre.
 
     Args:
@@ -36,74 +39,94 @@ def rasterize_hard(
         Ks: (B, 3, 3) intrinsics [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels.
         width: Image width in pixels.
         height: Image height in pixels.
+        cameras: All of the four above in one.
         faces: (F, 3) vertex indices, int32 or int64.
         near_plane: Triangles with a vertex at this depth or nearer are dropped; > 0.
+
+    Returns:
+        Triangle, barycentrics and depth; alpha is 1 where there is a triangle, and colour has no channels.
 
     Raises:
         ValueError: Wrong shape, dtype, device or index; the message names the argument.
     """
     points, triangles = _check_mesh(vertices, faces)
-    viewmats, Ks = _check_views(vertices, viewmats, Ks, width, height, near_plane)
-    views = len(viewmats)
-    triangle = torch.empty((views, height, width), dtype=torch.int32, device=vertices.device)
-    barycentrics = vertices.new_empty((views, height, width, 3))
-    depth = vertices.new_empty((views, height, width))
+    views = _check_views(vertices, *view_arguments(cameras, viewmats, Ks, width, height), near_plane)
+    B, H, W = len(views), views.height, views.width
+    triangle = torch.empty((B, H, W), dtype=torch.int32, device=vertices.device)
+    barycentrics, depth = vertices.new_empty((B, H, W, 3)), vertices.new_empty((B, H, W, 1))
     engine = engine_for(vertices)
-    for b in range(views):
-        view = OpaqueView(viewmats[b], Ks[b], width, height, near_plane)
-        engine.rasterize_opaque(points, triangles, view, triangle[b], barycentrics[b], depth[b])
-    return HardRasterization(triangle, barycentrics, depth)
+    for b in range(B):
+        view = OpaqueView(views.viewmats[b], views.Ks[b], W, H, near_plane)
+        engine.rasterize_opaque(points, triangles, view, triangle[b], barycentrics[b], depth[b, ..., 0])
+    return Rasterization(
+        color=vertices.new_empty((B, H, W, 0)),
+        alpha=(triangle >= 0).to(vertices.dtype)[..., None],
+        depth=depth,
+        triangle=triangle,
+        barycentrics=barycentrics,
+    )
 
 
 @torch.no_grad()
 def render_opaque(
     vertices: Float[Tensor, "V 3"] | Float[Tensor, "N 3 3"],
-    viewmats: Float[Tensor, "B 4 4"],
-    Ks: Float[Tensor, "B 3 3"],
-    width: int,
-    height: int,
     *,
-    faces: Int[Tensor, "F 3"] | None = None,
     face_colors: Float[Tensor, "F C"] | None = None,
     vertex_colors: Float[Tensor, "V C"] | None = None,
+    corner_colors: Float[Tensor, "F 3 C"] | None = None,
+    viewmats: Float[Tensor, "B 4 4"] | None = None,
+    Ks: Float[Tensor, "B 3 3"] | None = None,
+    width: int | None = None,
+    height: int | None = None,
+    cameras: Cameras | None = None,
+    faces: Int[Tensor, "F 3"] | None = None,
     supersampling: int = 4,
     near_plane: float = 0.01,
     cull_backfaces: bool = False,
-) -> Float[Tensor, "B H W C1"]:
+) -> Rasterization:
     """Antialiased picture of opaque triangles: the mean over a regular grid of samples in every pixel.
 
     Args:
         vertices: (V, 3) with ``faces``, or (N, 3, 3) without.
+        face_colors: (F, C), one colour per triangle. Exactly one of the three colours is given.
+        vertex_colors: (V, C), with ``faces``: interpolated perspective-correctly.
+        corner_colors: (F, 3, C): the same with a colour of its own for each corner.
         viewmats: (B, 4, 4) world to camera, OpenCV axes.
         Ks: (B, 3, 3) intrinsics [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels.
         width: Image width in pixels.
         height: Image height in pixels.
+        cameras: All of the four above in one.
         faces: (F, 3) vertex indices, int32 or int64.
-        face_colors: (F, C), one colour per triangle. Exactly one of the two colours is given.
-        vertex_colors: (V, C), or (3 N, C) without faces, interpolated perspective-correctly.
         supersampling: Samples along each axis of a pixel, 1 to 16.
         near_plane: Triangles with a vertex at this depth or nearer are dropped; > 0.
         cull_backfaces: Drop triangles whose vertices run clockwise as seen from the camera.
 
     Returns:
-        (B, H, W, C + 1): colour premultiplied by the coverage, then the coverage in [0, 1].
+        Colour (B, H, W, C), premultiplied by the coverage, and the coverage in [0, 1] as alpha.
 
     Raises:
         ValueError: Wrong shape, dtype, device or index; the message names the argument.
     """
     points, triangles = _check_mesh(vertices, faces)
-    viewmats, Ks = _check_views(vertices, viewmats, Ks, width, height, near_plane)
-    colors = _check_colors(vertices, points, triangles, face_colors, vertex_colors)
+    views = _check_views(vertices, *view_arguments(cameras, viewmats, Ks, width, height), near_plane)
+    count, per_face = len(triangles), face_colors is not None
+    name, colors = one_kind_of_colors(face_colors, vertex_colors, corner_colors, faces)
+    check_shape(
+        name, colors, {"face_colors": (count, "C"), "vertex_colors": (len(points), "C")}.get(name, (count, 3, "C"))
+    )
+    check_like(name, colors, "vertices", vertices)
+    colors = dense(colors, name)
+    if colors.ndim == 3:  # every corner a vertex of its own
+        points, colors = points[triangles.long()].view(-1, 3), colors.view(3 * count, -1)
+        triangles = _separate(points)
     if not 1 <= supersampling <= MAX_SUPERSAMPLING:
         raise ValueError(f"supersampling must be from 1 to {MAX_SUPERSAMPLING}, got {supersampling}")
-    image = vertices.new_empty((len(viewmats), height, width, colors.shape[1] + 1))
+    image = vertices.new_empty((len(views), views.height, views.width, colors.shape[1] + 1))
     engine = engine_for(vertices)
-    for b in range(len(viewmats)):
-        view = OpaqueView(viewmats[b], Ks[b], width, height, near_plane)
-        engine.render_opaque(
-            points, triangles, view, colors, face_colors is not None, supersampling, cull_backfaces, image[b]
-        )
-    return image
+    for b in range(len(views)):
+        view = OpaqueView(views.viewmats[b], views.Ks[b], views.width, views.height, near_plane)
+        engine.render_opaque(points, triangles, view, colors, per_face, supersampling, cull_backfaces, image[b])
+    return Rasterization(color=image[..., :-1], alpha=image[..., -1:])
 
 
 def _check_mesh(vertices: Tensor, faces: Tensor | None) -> tuple[Tensor, Tensor]:
@@ -111,7 +134,7 @@ def _check_mesh(vertices: Tensor, faces: Tensor | None) -> tuple[Tensor, Tensor]
     if faces is None:
         check_shape("vertices", vertices, ("N", 3, 3))
         points = dense(vertices, "vertices").view(-1, 3)
-        return points, torch.arange(len(points), dtype=torch.int32, device=points.device).view(-1, 3)
+        return points, _separate(points)
     check_shape("vertices", vertices, ("V", 3))
     check_shape("faces", faces, ("F", 3))
     if faces.is_cpu:  # reading them would wait for a GPU, which leaves out what is out of range
@@ -120,9 +143,12 @@ def _check_mesh(vertices: Tensor, faces: Tensor | None) -> tuple[Tensor, Tensor]
     return dense(vertices, "vertices"), dense(faces, "faces").to(torch.int32)
 
 
-def _check_views(
-    vertices: Tensor, viewmats: Tensor, Ks: Tensor, width: int, height: int, near_plane: float
-) -> tuple[Tensor, Tensor]:
+def _separate(points: Tensor) -> Tensor:
+    """Faces of triangles that share no vertex."""
+    return torch.arange(len(points), dtype=torch.int32, device=points.device).view(-1, 3)
+
+
+def _check_views(vertices: Tensor, viewmats: Tensor, Ks: Tensor, width: int, height: int, near_plane: float) -> Cameras:
     check_shape("viewmats", viewmats, ("B", 4, 4))
     check_shape("Ks", Ks, (len(viewmats), 3, 3))
     check_like("viewmats", viewmats, "vertices", vertices)
@@ -133,18 +159,4 @@ def _check_views(
         raise ValueError(f"width and height must be at least 1, got {width} x {height}")
     if not 0.0 < near_plane < float("inf"):
         raise ValueError(f"near_plane must be positive and finite, got {near_plane}")
-    return dense(viewmats, "viewmats"), dense(Ks, "Ks")
-
-
-def _check_colors(
-    vertices: Tensor, points: Tensor, triangles: Tensor, face_colors: Tensor | None, vertex_colors: Tensor | None
-) -> Tensor:
-    if face_colors is not None and vertex_colors is None:
-        check_shape("face_colors", face_colors, (len(triangles), "C"))
-        check_like("face_colors", face_colors, "vertices", vertices)
-        return dense(face_colors, "face_colors")
-    if vertex_colors is not None and face_colors is None:
-        check_shape("vertex_colors", vertex_colors, (len(points), "C"))
-        check_like("vertex_colors", vertex_colors, "vertices", vertices)
-        return dense(vertex_colors, "vertex_colors")
-    raise ValueError("exactly one of face_colors and vertex_colors must be given")
+    return Cameras(dense(viewmats, "viewmats"), dense(Ks, "Ks"), width, height)
