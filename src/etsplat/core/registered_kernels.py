@@ -11,7 +11,7 @@ from etsplat.core.kernel_table import KNOTS, LEFT, ROWS, KernelTable, knots, lim
 from etsplat.core.kernels import KERNELS, RIM_FLOOR, SIGMA_FLOOR, X_FLOOR, Kernel
 
 LARGEST_ERROR = 5e-3
-"""Of a table, in units of G; half of what separates two levels of an 8-bit image at most, as alpha is at most o G."""
+"""Of a table, in units of G: about one level of an 8-bit image."""
 _BESIDE = 1e-9  # from x = 1, where the slopes of a kink are taken
 _STEPS = (2.0**-25, 2.0**-50)  # from x = 1, where a step is as high at both
 
