@@ -75,8 +75,8 @@ def test_folds_are_smoothed_away_in_place() -> None:
 
 
 def test_a_soup_is_edited_between_its_first_and_its_last_time(rng: torch.Generator) -> None:
-    """At multiples of `every`, after `after`, before `last`; from `until` on triangles only die."""
-    strategy, soup = DensifyAndPrune(after=10, until=20, every=5, last=30, max_triangles=1000), a_soup(rng)
+    """At multiples of `every`, after `begin`, before `last`; from `end` on triangles only die."""
+    strategy, soup = DensifyAndPrune(begin=10, end=20, every=5, last=30, max_triangles=1000), a_soup(rng)
     started(strategy, soup)
     grown = {}
     for iteration in range(1, 35):
@@ -109,7 +109,7 @@ def test_what_is_spared_stays_where_nobody_looks(rng: torch.Generator) -> None:
     """Unseen and faint, it lives; seen, it dies like any other."""
     spared = torch.zeros(40, dtype=torch.bool)
     spared[:10] = True
-    strategy, soup = DensifyAndPrune(until=0, after=0, every=1, spared=lambda _: spared), a_soup(rng)
+    strategy, soup = DensifyAndPrune(end=0, begin=0, every=1, spared=lambda _: spared), a_soup(rng)
     started(strategy, soup)
     with torch.no_grad():
         soup.opacity_logits[:20] = -20

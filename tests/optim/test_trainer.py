@@ -77,7 +77,7 @@ def combination(model: str, data: Dataset, **options: Any) -> Trainer[Any]:
         strategy: Strategy = SubdivideAndUntangle(budgets)
         rates = Schedule({"vertices": 1e-2, "colors": 2e-2, "opacity_logits": 1e-2, "log_sigma": 1e-2})
         return Trainer(a_mesh(), data, mesh_objective(), strategy, schedule=rates, **options)
-    strategy = DensifyAndPrune(after=10, every=15, max_triangles=600)
+    strategy = DensifyAndPrune(begin=10, every=15, max_triangles=600)
     return Trainer(a_soup(data), data, soup_objective(), strategy, **options)
 
 

@@ -12,27 +12,35 @@ from etsplat.core.cameras import Cameras
 from etsplat.core.rasterization import Rasterization
 
 Depth = Literal["plane", "centroid"]
+A = TypeVar("A", bound="Appearance")
 
 
-class Appearance(Protocol):
-    """How the numbers of a model become pictures: a frozen dataclass."""
+class Appearance:
+    """How the numbers of a model become pictures: a frozen dataclass over this class, which has nothing that changes.
+
+    Those of its values that may change at every step are its `numbers`.
+    """
 
     @property
     def numbers(self) -> tuple[float, ...]:
-        """Those of its values that may change at every step."""
-        ...
+        """Those values."""
+        return ()
 
     @property
-    def structure(self: "A") -> "A":
-        """All else: what changes the kernels that are launched, and so seldom. Comparable."""
-        ...
+    def needs_host(self) -> bool:
+        """Whether drawing waits for the host, so that steps cannot be queued on a device."""
+        return False
 
-    def on_device(self: "A", numbers: Float[Tensor, " K"]) -> "A":
+    @property
+    def structure(self: A) -> A:
+        """All but the numbers: what changes the kernels that are launched, and so seldom. Comparable."""
+        return self
+
+    def on_device(self: A, numbers: Float[Tensor, " K"]) -> A:
         """The same with its `numbers` read from device memory, for steps that the host does not look at."""
-        ...
+        return self
 
 
-A = TypeVar("A", bound=Appearance)
 M = TypeVar("M", bound="Model")
 
 
@@ -52,11 +60,6 @@ class Model(Protocol):
     @property
     def count(self) -> int:
         """Number of triangles."""
-        ...
-
-    @property
-    def needs_host(self) -> bool:
-        """Whether drawing waits for the host, so that steps cannot be queued on a device."""
         ...
 
     def parameters(self) -> dict[str, Tensor]:

@@ -6,6 +6,8 @@ from dataclasses import dataclass, field, fields, replace
 from jaxtyping import Float
 from torch import Tensor
 
+from etsplat.model.model import Appearance
+
 SMALLEST_INRADIUS = 1.0
 """Triangle Splatting draws no triangle whose inscribed circle on the image is smaller, in pixels."""
 
@@ -14,7 +16,7 @@ OPAQUE_FROM = 0.5
 
 
 @dataclass(frozen=True)
-class SoupAppearance:
+class SoupAppearance(Appearance):
     """How the numbers of a soup become pictures.
 
     Attributes:

@@ -14,14 +14,14 @@ from etsplat.core.rasterization import Rasterization
 from etsplat.data.dataset import Normalization
 from etsplat.geometry.topology import MeshTopology
 from etsplat.io.mesh_files import MeshFile, load_mesh, save_mesh, weld_vertices
-from etsplat.model.model import Depth
+from etsplat.model.model import Appearance, Depth
 from etsplat.ops.antialias import rasterize_antialiased
 from etsplat.ops.rasterize import rasterize
 from etsplat.ops.rasterize_opaque import render_opaque
 
 
 @dataclass(frozen=True)
-class MeshAppearance:
+class MeshAppearance(Appearance):
     """How the numbers of a mesh become pictures.
 
     Attributes:
@@ -35,18 +35,9 @@ class MeshAppearance:
     backend: Literal["etsplat", "nvdiffrast"] = "etsplat"
 
     @property
-    def numbers(self) -> tuple[float, ...]:
-        """Nothing changes from step to step."""
-        return ()
-
-    @property
-    def structure(self) -> "MeshAppearance":
-        """All of it."""
-        return self
-
-    def on_device(self, numbers: Float[Tensor, "0"]) -> "MeshAppearance":
-        """The same."""
-        return self
+    def needs_host(self) -> bool:
+        """Whether nvdiffrast draws it."""
+        return self.kernel is None and self.backend == "nvdiffrast"
 
 
 @dataclass
@@ -226,11 +217,6 @@ class TriangleMesh:
     def count(self) -> int:
         """Number of faces."""
         return len(self.faces)
-
-    @property
-    def needs_host(self) -> bool:
-        """Whether nvdiffrast draws it."""
-        return self.appearance.kernel is None and self.appearance.backend == "nvdiffrast"
 
     def describe(self) -> dict[str, float]:
         """For the log: number of faces and softness (0 for opaque triangles)."""

@@ -182,11 +182,6 @@ class TriangleSoup:
         """Number of triangles."""
         return len(self)
 
-    @property
-    def needs_host(self) -> bool:
-        """Drawing never waits for it."""
-        return False
-
     def describe(self) -> dict[str, float]:
         """For the log: number of triangles, and deciles of softness and opacity as they are drawn."""
         state: dict[str, float] = {"triangles": self.count}

@@ -109,8 +109,8 @@ class DensifyAndPrune(Strategy):
     """Triangles of a soup multiply and die by Triangle Splatting's rules (`optim/densification.py`).
 
     Attributes:
-        after: no edit up to this iteration.
-        until: from this iteration on triangles only die.
+        begin: no edit up to this iteration.
+        end: from this iteration on triangles only die.
         every: iterations between edits.
         last: no edit from this iteration on, the last of the run.
         max_triangles: no more than these.
@@ -123,8 +123,8 @@ class DensifyAndPrune(Strategy):
         spared: of which triangles, by their corners, those that no view has seen stay.
     """
 
-    after: int = 100
-    until: int = NEVER
+    begin: int = 100
+    end: int = NEVER
     every: int = 100
     last: int = NEVER
     max_triangles: int = 100_000
@@ -149,9 +149,9 @@ class DensifyAndPrune(Strategy):
 
     def edit(self, iteration: int) -> bool:
         """Lets triangles multiply and die, or only die."""
-        if iteration % self.every or iteration <= self.after or iteration >= self.last:
+        if iteration % self.every or iteration <= self.begin or iteration >= self.last:
             return False
-        if iteration < self.until:
+        if iteration < self.end:
             self.densify(iteration)
         else:
             self._apply(RowPlan.keeping(~self._dead(iteration)))
@@ -181,8 +181,8 @@ class DensifyAndPrune(Strategy):
         self.statistics = SoupStatistics(**{name: tensor.to(device) for name, tensor in state.items()})
 
     def _dead(self, iteration: int) -> Tensor:
-        first = iteration <= self.after + self.every
-        rules = self.prune.limited(views=0 if first else self.views, by_size=iteration < self.until and not first)
+        first = iteration <= self.begin + self.every
+        rules = self.prune.limited(views=0 if first else self.views, by_size=iteration < self.end and not first)
         with torch.no_grad():
             dead = dead_triangles(self.model.drawn_opacities, self.statistics, rules, self.views)
         if self.spared is not None:

@@ -106,7 +106,7 @@ class Trainer(Generic[M]):
         self._phase: tuple[Any, ...] = ()
         self._seen: list[Rasterization] = []  # by the step that is being captured
         queues = engine_for(next(iter(parameters.values()))).queues_steps
-        if queues and update is None and not model.needs_host:
+        if queues and update is None and not model.appearance.needs_host:
             self._row = RowLayout(
                 places=2 * batch,
                 backgrounds=3 * batch,

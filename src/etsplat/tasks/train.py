@@ -229,24 +229,15 @@ def _objective(config: TrainConfig, spared: Spared | None, *, squared: bool) -> 
 
 
 def _strategy(config: TrainConfig, spared: Spared | None) -> DensifyAndPrune:
-    opaque, multiplying, dying = config.finish == "opaque", config.densification, config.pruning
+    times = {name: config.at(getattr(config.densification, name)) for name in ("begin", "end", "every")}
+    rules = {**vars(config.pruning), "screen_size": config.pruning.screen_size or math.inf}
+    if config.finish == "opaque":
+        rules["importance"] = min(config.pruning.importance, HIDDEN)
     return DensifyAndPrune(
-        after=config.at(multiplying.begin),
-        until=config.at(multiplying.end),
-        every=config.at(multiplying.every),
+        **{**vars(config.densification), **times},
         last=config.iterations,
         max_triangles=config.max_triangles,
-        growth=multiplying.growth,
-        replace_dead=multiplying.replace_dead,
-        sample_by=multiplying.sample_by,
-        split_size=multiplying.split_size,
-        clone_noise=multiplying.clone_noise,
-        prune=PruneRules(
-            opacity=dying.opacity,
-            importance=min(dying.importance, HIDDEN) if opaque else dying.importance,
-            views=dying.views,
-            screen_size=math.inf if dying.screen_size is None else dying.screen_size,
-        ),
+        prune=PruneRules(**rules),
         spared=spared,
     )
 
