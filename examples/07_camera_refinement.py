@@ -1,7 +1,7 @@
 """Find out where photos were taken from: gradients reach poses and intrinsics.
 
-The cameras start turned, shifted and with a wrong focal length. The picture shows, for three of them, the photo and how
-far the model is from it at the start and at the end.
+The cameras start turned, shifted and with a wrong focal length. The picture shows, for each of them, the photo and
+how far the model is from it at the start and at the end.
 
     python examples/07_camera_refinement.py --out cameras.png
 """
@@ -13,20 +13,16 @@ import torch
 import etsplat
 
 SIZE = 128
-# Infinitesimal shifts along x, y, z and turns about them, as 4x4 matrices.
-MOTIONS = torch.zeros(6, 4, 4)
-for axis in range(3):
-    MOTIONS[axis, axis, 3] = 1.0
-    MOTIONS[3 + axis, (axis + 2) % 3, (axis + 1) % 3] = 1.0
-    MOTIONS[3 + axis, (axis + 1) % 3, (axis + 2) % 3] = -1.0
 
 
 def moved(cameras: etsplat.Cameras, motions: torch.Tensor, zoom: torch.Tensor) -> etsplat.Cameras:
-    """Cameras after a rigid motion (B, 6) each, and with another focal length; differentiable by both."""
-    viewmats = torch.linalg.matrix_exp(torch.einsum("bk,kij->bij", motions, MOTIONS)) @ cameras.viewmats
-    scale = torch.stack([zoom.exp(), zoom.exp(), torch.ones(())])[:, None]
-    centre = cameras.Ks * torch.tensor([[0.0, 0.0, 1.0]])
-    return etsplat.Cameras(viewmats, (cameras.Ks - centre) * scale + centre, cameras.width, cameras.height)
+    """Cameras shifted and turned by (B, 6), and with another focal length; differentiable by both."""
+    motion = torch.zeros(len(motions), 4, 4)
+    motion[:, :3, 3] = motions[:, :3]
+    motion[:, :3, :3] = torch.linalg.cross(torch.eye(3)[None], motions[:, None, 3:])  # about the three axes
+    viewmats = torch.linalg.matrix_exp(motion) @ cameras.viewmats
+    columns = torch.cat([zoom.exp().expand(2), torch.ones(1)])
+    return etsplat.Cameras(viewmats, cameras.Ks * columns, cameras.width, cameras.height)
 
 
 def projected(cameras: etsplat.Cameras, points: torch.Tensor) -> torch.Tensor:
@@ -55,21 +51,19 @@ def main() -> None:
     start = moved(truth, 0.04 * noise, torch.tensor(0.05))
     motions, zoom = torch.zeros(len(truth), 6, requires_grad=True), torch.zeros((), requires_grad=True)
     optimizer = torch.optim.Adam([motions, zoom], lr=2e-3)
-    on_photos = projected(truth, owl.vertices)
     for step in range(options.steps + 1):
         cameras = moved(start, motions, zoom)
         loss = (model.render(cameras).color - photos).abs().mean()
         if step % max(1, options.steps // 6) == 0:
-            error = (projected(cameras, owl.vertices) - on_photos).norm(dim=-1).mean()
+            error = (projected(cameras, owl.vertices) - projected(truth, owl.vertices)).norm(dim=-1).mean()
             focal = cameras.Ks[0, 0, 0] / truth.Ks[0, 0, 0] - 1
             print(f"step {step:4d}   loss {loss:.4f}   off by {error:.2f} pixels, the focal length by {focal:+.1%}")
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
 
-    with torch.no_grad():
-        before, after = ((model.render(c).color - photos).abs() for c in (start, moved(start, motions, zoom)))
-    rows = [torch.cat([photos[view], before[view], after[view]], dim=1) for view in range(3)]
+    before, after = ((model.render(c).color.detach() - photos).abs() for c in (start, moved(start, motions, zoom)))
+    rows = [torch.cat([*kind], dim=1) for kind in (photos, before, after)]
     etsplat.save_image(options.out, torch.cat(rows))
 
 
