@@ -16,7 +16,7 @@ from equal_bits.names import Names, translated
 from equal_bits.session import flip_bit
 from etsplat.cli.parse import parse
 
-TENSORS = {"soup.vertices": np.linspace(-1, 1, 27, dtype=np.float32).reshape(3, 3, 3), "progress": np.array([1.5, 3.0])}
+TENSORS = {"vertices": np.linspace(-1, 1, 27, dtype=np.float32).reshape(3, 3, 3), "progress": np.array([1.5, 3.0])}
 METRICS = {"psnr": 20.25, "seconds": 1.0, "test_views": [{"name": "a", "psnr": 1 / 3}], "lpips": None}
 
 
@@ -47,17 +47,17 @@ def test_runs_that_differ_in_their_clocks_alone_are_equal(runs):
 
 @pytest.mark.parametrize("file", ["soup.safetensors", "checkpoints/step_000010.safetensors"])
 def test_one_flipped_bit_of_a_tensor_is_found_and_named(runs, file):
-    flip_bit(runs[1] / file, "soup.vertices")
+    flip_bit(runs[1] / file, "vertices")
     (text,) = differing(runs)["parameters"]
-    assert "soup.vertices: 1 of 27 differ" in text
+    assert "vertices: 1 of 27 differ" in text
     assert "first [0, 1, 0]" in text
 
 
 def test_flip_bit_changes_the_last_bit_of_one_number(tmp_path):
     save_file(TENSORS, tmp_path / "a.safetensors")
-    flip_bit(tmp_path / "a.safetensors", "soup.vertices")
-    changed = load_file(tmp_path / "a.safetensors")["soup.vertices"].view(np.uint32)
-    difference = (changed ^ TENSORS["soup.vertices"].view(np.uint32)).reshape(-1)
+    flip_bit(tmp_path / "a.safetensors", "vertices")
+    changed = load_file(tmp_path / "a.safetensors")["vertices"].view(np.uint32)
+    difference = (changed ^ TENSORS["vertices"].view(np.uint32)).reshape(-1)
     assert sorted(difference.tolist()) == [0] * 26 + [1]
 
 

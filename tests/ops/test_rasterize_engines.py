@@ -28,7 +28,7 @@ def gradient_tolerance(name, expected, looseness=1.0):
     if name == "sigma" and expected.ndim == 0:
         chosen = SHARED_SIGMA_TOLERANCE
     else:
-        chosen = GEOMETRY_TOLERANCE if name in ("vertices", "viewmats") else GRADIENT_TOLERANCE
+        chosen = GEOMETRY_TOLERANCE if name in ("vertices", "viewmats", "Ks") else GRADIENT_TOLERANCE
     return {key: value if key == "outliers" else looseness * value for key, value in chosen.items()}
 
 
