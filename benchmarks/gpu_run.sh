@@ -51,7 +51,7 @@ sanitize() {
     fi
     for tool in memcheck racecheck; do
         step "$tool" 540 compute-sanitizer --tool "$tool" --error-exitcode 1 "${pytest_cuda[@]}" \
-            -m "cuda and sanitize" tests/ops/test_rasterize_cuda.py tests/engines/test_cuda_sort.py tests/ops/test_cuda_ops.py \
+            -m "cuda and sanitize" tests/engines tests/ops/test_rasterize_engines.py tests/ops/test_cuda_ops.py \
             tests/ops/test_soup_activation.py tests/ops/test_triangle_channels.py tests/ops/test_normal_consistency.py
     done
 }

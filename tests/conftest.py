@@ -1,7 +1,8 @@
 """Fixtures shared by all tests."""
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -14,8 +15,8 @@ from helpers.simt.build import Simt
 # Tests run side by side, on small tensors: torch's own threads would only wait for each other.
 torch.set_num_threads(1)
 
-# Of the engine-parameterised tests. What engine "cuda" computes is compared with these in its own (test_cuda_*.py).
-ENGINES = ("reference", "cpu")
+# Of the engine-parameterised tests.
+ENGINES = ("reference", "cpu", "cuda")
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 
@@ -36,7 +37,26 @@ def pytest_configure(config: pytest.Config) -> None:
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     if "engine" in metafunc.fixturenames:
         only = metafunc.config.getoption("--engine")
-        metafunc.parametrize("engine", [only] if only else ENGINES)
+        metafunc.parametrize("engine", [only] if only else ENGINES, indirect=True)
+
+
+@pytest.fixture
+def engine_of() -> Iterator[Callable[[str], str]]:
+    """Makes the engine of a name usable in a test and returns the name: "cuda" by the shim where there is no GPU."""
+    with ExitStack() as stack:
+
+        def prepared(name: str) -> str:
+            if name == "cuda" and not torch.cuda.is_available():
+                stack.enter_context(use_backend(Simt()))
+            return name
+
+        yield prepared
+
+
+@pytest.fixture
+def engine(request: pytest.FixtureRequest, engine_of: Callable[[str], str]) -> str:
+    """The name of an engine."""
+    return engine_of(request.param)
 
 
 @pytest.fixture(params=list(KERNELS))

@@ -78,12 +78,13 @@ def test_mean_area_is_that_of_the_cpu_engine(cuda_device, rng):
 
 
 @pytest.mark.parametrize("scale", [0.3, "tensor"])
-def test_weighted_sum_is_that_of_pytorch(cuda_device, scale):
-    """Value and gradients of all powers, with a scale as a number and in device memory."""
+@pytest.mark.parametrize("rounds", [1, 5])
+def test_weighted_sum_is_that_of_pytorch(cuda_device, scale, rounds):
+    """Value and gradients of all powers, with a scale as a number and in device memory; more than a launch takes."""
     results = []
+    values, powers = (2.0, *(0.7, 1.4, 0.2) * rounds), (1, -1, -2) * rounds
     for engine, device in (("cuda", cuda_device), ("cpu", CPU)):
-        leaves = [torch.tensor(value, device=device, requires_grad=True) for value in (2.0, 0.7, 1.4, 0.2)]
-        powers = (1, -1, -2)
+        leaves = [torch.tensor(value, device=device, requires_grad=True) for value in values]
         terms = [Term(0.5 + power, leaf, power) for leaf, power in zip(leaves[1:], powers, strict=True)]
         factor = torch.tensor(0.3, device=device) if scale == "tensor" else scale
         total = on(engine, weighted_sum, leaves[0], terms, factor)

@@ -9,52 +9,15 @@ import torch
 from etsplat import _native, num_threads, rasterize, set_num_threads
 from etsplat.core.cameras import Cameras
 from etsplat.geometry.icosphere import icosphere
-from etsplat.ops.rasterize import COLORS
+from helpers.agreement import IMAGE_TOLERANCE, compare, gradient_tolerance
 from helpers.scenes import EVERYTHING, IMAGES, colored, gradients, mesh, soup
 from helpers.tolerances import assert_close_to_scale
 
-# Rounding, and pixels that float32 decides differently at alpha = 1/255, at x = 2 or between almost equal depths.
-IMAGE_TOLERANCE = {"tolerance": 2e-5, "outliers": 2e-3, "outlier_tolerance": 2e-2}
-GRADIENT_TOLERANCE = {"tolerance": 2e-4, "outliers": 5e-3, "outlier_tolerance": 1e-3}
-# The gradient of x grows as the triangle gets thinner, and with it the scale and the rounding.
-GEOMETRY_TOLERANCE = {"tolerance": 5e-4, "outliers": 5e-3, "outlier_tolerance": 5e-3}
 
-
-# One sigma for all: a sum over all triangles of terms of both signs.
-SHARED_SIGMA_TOLERANCE = {"tolerance": 5e-3}
-
-
-def gradient_tolerance(name, expected, looseness=1.0):
-    if name == "sigma" and expected.ndim == 0:
-        chosen = SHARED_SIGMA_TOLERANCE
-    else:
-        chosen = GEOMETRY_TOLERANCE if name in ("vertices", "viewmats", "Ks") else GRADIENT_TOLERANCE
-    return {key: value if key == "outliers" else looseness * value for key, value in chosen.items()}
-
-
-def compare(scene, engine, rng, images=IMAGES, looseness=1.0, **options):
-    """Same images, statistics and gradients under random cotangents as the oracle has."""
-    if options.get("kernel") == "single_sided":
-        # Below 1 its slope at the edge is unbounded, and rounding decides the gradient of a pixel there.
-        scene = {**scene, "sigma": scene["sigma"] + 1.0}
-    shape = (len(scene["viewmats"]), scene["height"], scene["width"])
-    colors = next(scene[name] for name in COLORS if name in scene)
-    widths = {"color": colors.shape[-1], "normal": 3}
-    cotangents = {name: torch.randn(*shape, widths.get(name, 1), generator=rng) for name in images}
-    dtype = torch.float32
-    out, grads = gradients(scene, engine, cotangents, dtype, **options)
-    oracle, oracle_grads = gradients(scene, "reference", cotangents, torch.float64, **options)
-    for name in images:
-        assert_close_to_scale(getattr(out, name), getattr(oracle, name), **IMAGE_TOLERANCE, name=name)
-    for name, expected in oracle_grads.items():
-        assert_close_to_scale(
-            grads[name], expected, **gradient_tolerance(name, expected, looseness), name=f"gradient of {name}"
-        )
-    if "statistics" in options.get("outputs", ()):
-        assert (out.statistics.visible.cpu() != oracle.statistics.visible).sum() <= 1
-        for name in ("max_weight", "screen_size", "inradius"):
-            actual, expected = getattr(out.statistics, name), getattr(oracle.statistics, name)
-            assert_close_to_scale(actual, expected, 1e-4, outliers=0.01, outlier_tolerance=0.1, name=name)
+@pytest.fixture(params=["cpu", "cuda"])
+def native(request, engine_of) -> str:
+    """The engines of native code."""
+    return engine_of(request.param)
 
 
 def test_soup(engine, kernel, distance, rng):
@@ -65,9 +28,9 @@ def test_mesh(engine, kernel, distance, rng):
     compare(mesh(rng), engine, rng, kernel=kernel, distance=distance, **EVERYTHING)
 
 
-def test_colors_alone(kernel, distance, rng):
+def test_colors_alone(native, kernel, distance, rng):
     """The path that shape reconstruction takes: no image but the colour."""
-    compare(mesh(rng), "cpu", rng, images=("color",), kernel=kernel, distance=distance)
+    compare(mesh(rng), native, rng, images=("color",), kernel=kernel, distance=distance)
 
 
 def with_interpolated_colors(scene, rng):
@@ -79,68 +42,68 @@ def with_interpolated_colors(scene, rng):
 
 
 @pytest.mark.parametrize("layout", ["per_corner", "per_vertex"])
-def test_interpolated_colors_alone(kernel, distance, layout, rng):
+def test_interpolated_colors_alone(native, kernel, distance, layout, rng):
     """The same with interpolated colours, which have a path of their own."""
     scene = with_interpolated_colors(mesh(rng) if layout == "per_vertex" else soup(rng, 150), rng)
-    compare(scene, "cpu", rng, images=("color",), kernel=kernel, distance=distance, outputs=("statistics",))
+    compare(scene, native, rng, images=("color",), kernel=kernel, distance=distance, outputs=("statistics",))
 
 
 @pytest.mark.parametrize("case", ["frozen incentre", "tiny", "huge", "saturated"])
-def test_interpolated_colors_at_the_extremes(kernel, case, rng):
+def test_interpolated_colors_at_the_extremes(native, kernel, case, rng):
     """Triangles of a tenth of a pixel, some larger than the image, pixels that stop; the incentre held."""
     scene = with_interpolated_colors(soup(rng, 80, size={"tiny": 0.01, "huge": 3.0}.get(case, 1.5)), rng)
     if case == "saturated":
         scene["opacities"] = torch.ones(80)
     options = {"distance": "sdf", "freeze_inradius": True} if case == "frozen incentre" else {}
-    compare(scene, "cpu", rng, IMAGES[:1], 10.0 if case == "tiny" else 1.0, kernel=kernel, **options)
+    compare(scene, native, rng, IMAGES[:1], 10.0 if case == "tiny" else 1.0, kernel=kernel, **options)
 
 
 @pytest.mark.parametrize("image", IMAGES)
-def test_each_image_alone(image, rng):
+def test_each_image_alone(native, image, rng):
     """Also when an image is asked for that no cotangent reaches."""
     options = {**EVERYTHING, "depth_of": "centroid"} if image != "color" else EVERYTHING
-    compare(soup(rng, 80), "cpu", rng, images=(image,), **options)
+    compare(soup(rng, 80), native, rng, images=(image,), **options)
 
 
 @pytest.mark.parametrize("channels", [1, 4, 5, 9])
-def test_channels(channels, rng):
-    compare(soup(rng, 60, channels=channels), "cpu", rng, images=("color", "alpha"))
+def test_channels(native, channels, rng):
+    compare(soup(rng, 60, channels=channels), native, rng, images=("color", "alpha"))
 
 
 @pytest.mark.parametrize("layout", ["per_view", "per_corner", "per_vertex"])
-def test_color_layouts(layout, rng):
-    compare(colored(layout, rng), "cpu", rng, **EVERYTHING)
+def test_color_layouts(native, layout, rng):
+    compare(colored(layout, rng), native, rng, **EVERYTHING)
 
 
 @pytest.mark.parametrize("depth", ["plane", "centroid"])
-def test_depth_modes(depth, distance, rng):
-    compare(soup(rng, 80), "cpu", rng, distance=distance, **EVERYTHING, depth_of=depth)
+def test_depth_modes(native, depth, distance, rng):
+    compare(soup(rng, 80), native, rng, distance=distance, **EVERYTHING, depth_of=depth)
 
 
-def test_frozen_inradius(kernel, rng):
-    compare(soup(rng, 80), "cpu", rng, kernel=kernel, distance="sdf", freeze_inradius=True, images=("color",))
+def test_frozen_inradius(native, kernel, rng):
+    compare(soup(rng, 80), native, rng, kernel=kernel, distance="sdf", freeze_inradius=True, images=("color",))
 
 
 @pytest.mark.parametrize("sigma", [0.02, 0.1, 2.5])
-def test_softness_from_sharp_to_flat(kernel, sigma, rng):
+def test_softness_from_sharp_to_flat(native, kernel, sigma, rng):
     scene = {**soup(rng, 80), "sigma": torch.tensor(sigma)}
     # Sharp, x is raised to the power of 100 with its rounding.
-    compare(scene, "cpu", rng, kernel=kernel, images=("color", "alpha"), looseness=max(1.0, 0.3 / sigma))
+    compare(scene, native, rng, kernel=kernel, images=("color", "alpha"), looseness=max(1.0, 0.3 / sigma))
 
 
 @pytest.mark.parametrize("size", [0.01, 3.0])
-def test_triangles_smaller_than_a_pixel_and_larger_than_the_image(kernel, distance, size, rng):
+def test_triangles_smaller_than_a_pixel_and_larger_than_the_image(native, kernel, distance, size, rng):
     # The corners of a triangle of a tenth of a pixel are known to 1e-5 of its size.
     looseness = 10.0 if size < 0.1 else 1.0
     options = {"kernel": kernel, "distance": distance, "images": ("color", "alpha"), "looseness": looseness}
-    compare(soup(rng, 60, size=size), "cpu", rng, **options)
+    compare(soup(rng, 60, size=size), native, rng, **options)
 
 
-def test_opaque_stack_saturates(kernel, rng):
+def test_opaque_stack_saturates(native, kernel, rng):
     """Pixels that stop: clamped layers of opacity 1."""
     scene = soup(rng, 120, size=1.5)
     scene["opacities"] = torch.ones(120)
-    compare(scene, "cpu", rng, kernel=kernel, **EVERYTHING)
+    compare(scene, native, rng, kernel=kernel, **EVERYTHING)
 
 
 def test_shifting_the_principal_point_shifts_the_image(engine, kernel, distance, rng):

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from etsplat import Cutoffs, rasterize
@@ -15,7 +15,9 @@ from helpers.engines import dtype_of, on
 from helpers.scenes import EVERYTHING, IMAGES, NO_CUTOFFS, facing, gradients
 
 SIZE = 12
-FUZZ = settings(max_examples=60, deadline=None, derandomize=True)
+FUZZ = settings(
+    max_examples=60, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 
 SPECIAL = [0.0, -0.0, 1e-45, -1e-40, 1e-20, 1e-7, 0.01, 1.0, -1.0, 2.0, 1e4, -1e9, 1e15, 1e20, 3e38, -3e38]
 BROKEN = [math.nan, math.inf, -math.inf]
@@ -132,7 +134,7 @@ def test_any_size(engine, count, width, height, channels):
 
 @pytest.mark.sanitize
 @given(faces=st.lists(st.integers(-(2**31), 2**31 - 1), min_size=3, max_size=12))
-@settings(max_examples=40, deadline=None, derandomize=True)
+@settings(max_examples=40, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_any_faces(engine, faces):
     """Indices out of range are refused; repeated ones make a triangle without area, which is invisible."""
     indices = torch.tensor(faces[: len(faces) // 3 * 3]).reshape(-1, 3)

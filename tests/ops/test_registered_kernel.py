@@ -4,13 +4,13 @@ from typing import Any
 
 import pytest
 import torch
-from test_rasterize_engines import compare
 
 import etsplat
 from etsplat import _native
 from etsplat.core.kernel_table import KNOTS, KernelTable
 from etsplat.core.kernels import KERNELS
 from etsplat.core.registered_kernels import adopt_table
+from helpers.agreement import compare
 from helpers.scenes import EVERYTHING, IMAGES, gradients, mesh, render, soup
 from helpers.tolerances import assert_close_to_scale
 

@@ -10,8 +10,6 @@ from torch import Tensor
 from etsplat.core.validation import check_like, check_shape
 from etsplat.engines.choice import engine_for
 
-_MAX_TERMS = 6
-
 
 @dataclass(frozen=True)
 class Term:
@@ -31,18 +29,16 @@ def weighted_sum(
 
     Args:
         first: Scalar.
-        terms: At most 6.
+        terms: Any number of them.
         scale: Of the terms; a number, or a scalar tensor, which receives no gradient.
 
     Raises:
-        ValueError: Wrong shape, dtype or device, or too many terms.
+        ValueError: Wrong shape, dtype or device.
     """
     check_shape("first", first, ())
     for term in terms:
         check_shape("value", term.value, ())
         check_like("value", term.value, "first", first)
-    if len(terms) > _MAX_TERMS:
-        raise ValueError(f"terms must be at most {_MAX_TERMS}, got {len(terms)}")
     if not terms:
         return first
     values, weights, powers = zip(*((term.value, term.weight, term.power) for term in terms), strict=True)

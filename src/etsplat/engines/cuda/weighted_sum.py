@@ -13,7 +13,7 @@ from etsplat.engines.cuda.launch import launch
 from etsplat.engines.cuda.program import Program
 
 _PROGRAM = Program("weighted_sum.cu", contract=False)
-_MAX_TERMS = 6
+_TERMS = 6  # of one launch: WeightedTerms of csrc/cuda/weighted_sum.cu
 
 
 def weighted_sum(
@@ -25,16 +25,19 @@ def weighted_sum(
 ) -> Tensor:
     """See `Engine.weighted_sum`."""
     factor, on_host = (scale, 1.0) if isinstance(scale, Tensor) else (None, scale)
-    settings = [on_host * weight for weight in weights], list(powers)
-    total: Any = _WeightedSum.apply(settings, factor, first, *values)
+    total: Any = first
+    for begin in range(0, len(values), _TERMS):
+        end = begin + _TERMS
+        settings = [on_host * weight for weight in weights[begin:end]], list(powers[begin:end])
+        total = _WeightedSum.apply(settings, factor, total, *values[begin:end])
     return total
 
 
 class _WeightedTerms(ctypes.Structure):
     _fields_ = (
-        ("values", ctypes.c_void_p * _MAX_TERMS),
-        ("weights", ctypes.c_float * _MAX_TERMS),
-        ("powers", ctypes.c_int * _MAX_TERMS),
+        ("values", ctypes.c_void_p * _TERMS),
+        ("weights", ctypes.c_float * _TERMS),
+        ("powers", ctypes.c_int * _TERMS),
         ("count", ctypes.c_int),
     )
 

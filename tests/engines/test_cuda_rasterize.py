@@ -1,51 +1,15 @@
-"""The GPU rasterizer agrees with the float64 reference, run by the shim and, where there is one, on a GPU."""
+"""What is special to the GPU rasterizer, run by the shim and, where there is one, on a GPU."""
 
 import pytest
-import test_rasterize_fuzz as fuzz
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from test_rasterize_engines import compare
 
 from etsplat import rasterize
-from etsplat.core.rasterization import OUTPUTS
 from etsplat.engines.cuda import capacity
 from etsplat.engines.cuda.launch import use_backend
+from helpers.agreement import compare
 from helpers.engines import on
-from helpers.scenes import EVERYTHING, IMAGES, NO_CUTOFFS, colored, gradients, mesh, prepare, soup
+from helpers.scenes import EVERYTHING, IMAGES, gradients, mesh, prepare, soup
 from helpers.simt.build import Simt
-
-FEW = settings(max_examples=25, deadline=None, derandomize=True)
-
-
-@pytest.mark.parametrize("cameras", [1, 3])
-def test_colors_alone(cuda_engine, kernel, distance, cameras, rng):
-    """What training asks for, in one view and in several at once."""
-    compare(soup(rng, 80, views=cameras), cuda_engine, rng, images=("color",), kernel=kernel, distance=distance)
-
-
-def test_every_image(cuda_engine, kernel, distance, rng):
-    compare(mesh(rng), cuda_engine, rng, kernel=kernel, distance=distance, **EVERYTHING)
-
-
-@pytest.mark.sanitize
-def test_every_image_of_a_soup(cuda_engine, rng):
-    compare(soup(rng, 60, width=37, height=21), cuda_engine, rng, **EVERYTHING)
-
-
-def test_centroid_depth(cuda_engine, rng):
-    compare(soup(rng, 80), cuda_engine, rng, **EVERYTHING, depth_of="centroid")
-
-
-@pytest.mark.parametrize("image", ["alpha", "median_depth", "distortion"])
-def test_images_that_no_cotangent_reaches(cuda_engine, image, rng):
-    compare(soup(rng, 80), cuda_engine, rng, images=(image,), **EVERYTHING)
-
-
-@pytest.mark.parametrize("channels", [1, 20])
-def test_channels(cuda_engine, channels, rng):
-    """More than 16 take two passes."""
-    compare(soup(rng, 60, channels=channels), cuda_engine, rng, images=("color", "alpha"))
 
 
 def test_parts_of_many_channels_leave_out_the_same_triangles(cuda_engine, rng):
@@ -59,30 +23,11 @@ def test_parts_of_many_channels_leave_out_the_same_triangles(cuda_engine, rng):
     assert torch.equal(out.color, expected.color)
 
 
-@pytest.mark.parametrize("layout", ["per_view", "per_corner", "per_vertex"])
-def test_color_layouts(cuda_engine, layout, rng):
-    compare(colored(layout, rng), cuda_engine, rng, **EVERYTHING)
-
-
-def test_frozen_inradius(cuda_engine, kernel, rng):
-    compare(soup(rng, 80), cuda_engine, rng, kernel=kernel, distance="sdf", freeze_inradius=True, images=("color",))
-
-
-@pytest.mark.parametrize("sigma", [0.02, 2.5])
-def test_softness_from_sharp_to_flat(cuda_engine, kernel, sigma, rng):
-    scene = {**soup(rng, 80), "sigma": torch.tensor(sigma)}
-    compare(scene, cuda_engine, rng, kernel=kernel, images=("color",), looseness=max(1.0, 0.3 / sigma))
-
-
 @pytest.mark.sanitize
 def test_triangles_over_many_tiles(cuda_engine, distance, rng):
     """Boxes of more than 4x4 tiles, more slots than a thread adds up alone, sizes that no tile divides."""
     scene = soup(rng, 25, width=150, height=133, size=6.0, views=1)
     compare(scene, cuda_engine, rng, images=("color",), distance=distance)
-
-
-def test_triangles_smaller_than_a_pixel(cuda_engine, rng):
-    compare(soup(rng, 60, size=0.01), cuda_engine, rng, images=("color",), looseness=10.0)
 
 
 @pytest.mark.sanitize
@@ -92,18 +37,6 @@ def test_many_batches_and_early_termination(cuda_engine, kernel, rng):
     compare(scene, cuda_engine, rng, images=("color",), kernel=kernel)
     scene["opacities"] = torch.ones(700)
     compare(scene, cuda_engine, rng, images=("color",), kernel=kernel)
-
-
-def test_without_cutoffs(cuda_engine, rng):
-    compare(soup(rng, 40), cuda_engine, rng, images=("color",), cutoffs=NO_CUTOFFS)
-
-
-def test_no_triangles(cuda_engine):
-    scene = soup(torch.Generator().manual_seed(0), 0)
-    out, grads = gradients(scene, cuda_engine, {"color": torch.ones(2, 40, 48, 3)}, **EVERYTHING)
-    expected = scene["backgrounds"][:, None, None].expand(2, 40, 48, 3)
-    assert torch.equal(out.color.cpu(), expected)
-    assert all(not gradient.isnan().any() for gradient in grads.values())
 
 
 @pytest.mark.sanitize
@@ -192,29 +125,3 @@ def test_a_captured_step_is_the_eager_one(rng):
     graph.replay()
     assert not capacity.repair_overflow(leaves[0].device)
     assert all(torch.equal(a, b) for a, b in zip(captured, step(), strict=True))
-
-
-OPTIONS = st.fixed_dictionaries(
-    {
-        "outputs": st.sampled_from([("color",), OUTPUTS]),
-        "distance": st.sampled_from(["barycentric", "sdf"]),
-        "cutoffs": fuzz.cutoffs,
-        "freeze_inradius": st.booleans(),
-    }
-).map(lambda options: {**options, "kernel": "elastic"})
-
-
-@pytest.mark.sanitize
-@FEW
-@given(vertices=fuzz.triangles, opacity=fuzz.opacities, sigma=fuzz.sigmas, color=fuzz.colors, options=OPTIONS)
-def test_any_triangles(vertices, opacity, sigma, color, options):
-    """Nothing that is not finite gets through."""
-    with use_backend(Simt()):
-        fuzz.test_any_triangles.hypothesis.inner_test("cuda", vertices, opacity, sigma, color, options)
-
-
-@FEW
-@given(viewmat=st.lists(fuzz.coordinates, min_size=12, max_size=12), options=OPTIONS)
-def test_any_camera(viewmat, options):
-    with use_backend(Simt()):
-        fuzz.test_any_camera.hypothesis.inner_test("cuda", viewmat, 12.0, 6.0, options)
