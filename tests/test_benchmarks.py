@@ -33,9 +33,7 @@ def test_useful_pairs_are_the_pixels_in_which_triangles_are_drawn(rng):
             face_colors=torch.ones(copies, 3),
             opacities=torch.full((copies,), 0.5),
             sigma=torch.tensor(0.5),
-            cameras=Cameras(*camera),
-            width=83,
-            height=61,
+            cameras=Cameras(*camera, 83, 61),
         )
         counts = _native.count_tiles(native_state(out))
         assert counts.backward_vectors <= counts.forward_vectors
@@ -47,7 +45,7 @@ def test_useful_pairs_are_the_pixels_in_which_triangles_are_drawn(rng):
 
 
 @pytest.mark.sanitize
-@pytest.mark.parametrize("options", [{}, {"distortion": True, "median_depth": True, "depth": "plane"}])
+@pytest.mark.parametrize("options", [{}, {"outputs": ("depth", "median_depth", "distortion")}])
 def test_counting_changes_nothing(options, rng):
     out = render({**mesh(rng), **options})
     before = out.alpha.clone()

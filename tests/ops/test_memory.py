@@ -324,8 +324,8 @@ def _draw(faces: Tensor, engine: str, **options) -> Tensor:
     view = look_at(torch.tensor([[0.0, 0.0, 4.0]]), torch.zeros(3), torch.tensor([0.0, 1.0, 0.0]))
     size = (intrinsics(50, 40, 30)[None], 40, 30)
     n = len(faces)
-    arguments = vertices, colors[:n], opacities[:n], 0.1, view, *size
-    return on(engine, rasterize, *arguments, faces=faces, **options).color
+    colored = {"face_colors": colors[:n], "opacities": opacities[:n], "sigma": 0.1}
+    return on(engine, rasterize, vertices, **colored, cameras=Cameras(view, *size), faces=faces, **options).color
 
 
 @pytest.mark.sanitize
