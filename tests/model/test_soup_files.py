@@ -1,7 +1,10 @@
+import json
 from dataclasses import replace
 
 import pytest
 import torch
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
 
 from etsplat.core.errors import InputError
 from etsplat.model.soup_appearance import SoupAppearance
@@ -54,3 +57,15 @@ def test_missing_files_and_nan_are_input_errors(tmp_path, soup):
         TriangleSoup.load(tmp_path / "soup.safetensors")
     with pytest.raises(ValueError, match="suffix"):
         soup.save(tmp_path / "soup.bin")
+
+
+@pytest.mark.parametrize("kernel", ["nope", 5])
+def test_a_kernel_that_is_not_known_is_an_input_error(tmp_path, soup, kernel):
+    path = tmp_path / "soup.safetensors"
+    soup.save(path)
+    with safe_open(path, "pt") as opened:
+        metadata = dict(opened.metadata())
+    metadata["appearance"] = json.dumps({**json.loads(metadata["appearance"]), "kernel": kernel})
+    save_file(load_file(path), path, metadata=metadata)
+    with pytest.raises(InputError, match=r"soup\.safetensors.*kernel"):
+        TriangleSoup.load(path)

@@ -68,12 +68,13 @@ def test_a_browser_that_has_gone_before_it_was_welcomed_leaves_no_thread(tmp_pat
 
 EXITING = """
 import threading, time, torch
-from etsplat import intrinsics, look_at, rasterize
+from etsplat import Cameras, intrinsics, look_at, rasterize
 corners = torch.rand(3000, 3, 3)
 view = look_at(torch.tensor([[0.0, 0.5, 3.0]]), torch.zeros(3), torch.tensor([0.0, 1.0, 0.0]))
+cameras = Cameras(view, intrinsics(50, 160, 120)[None], 160, 120)
 def draw():
     while True:
-        rasterize(corners, torch.rand(3000, 3), torch.rand(3000), 0.3, view, intrinsics(50, 160, 120)[None], 160, 120)
+        rasterize(corners, face_colors=torch.rand(3000, 3), opacities=torch.rand(3000), sigma=0.3, cameras=cameras)
 for _ in range(2):
     threading.Thread(target=draw, daemon=True).start()
 time.sleep(0.3)

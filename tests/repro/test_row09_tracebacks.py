@@ -240,8 +240,6 @@ def appearing(**entries: object) -> Callable[[dict, dict], object]:
     "a soup with a wrong appearance or background is taken, or its traceback shown",
     [
         ("appearance-list", safetensors(lambda metadata, _: metadata.update(appearance="[1, 2]")), AttributeError),
-        ("kernel", safetensors(appearing(kernel="nope")), NOTHING),
-        ("kernel-number", safetensors(appearing(kernel=5)), NOTHING),
         ("near-plane", safetensors(appearing(near_plane=-1)), NOTHING),
         ("near-plane-word", safetensors(appearing(near_plane="x")), NOTHING),
         ("background", safetensors(appearing(background=[math.nan, 0, 0])), NOTHING),
