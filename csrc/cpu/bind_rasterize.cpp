@@ -25,7 +25,7 @@ void bind_rasterize(nb::module_& m) {
         .def(nb::init<>()) FIELD(vertices) FIELD(faces) FIELD(num_triangles) FIELD(num_vertices) FIELD(flat_colors)
         FIELD(corner_colors) FIELD(flat_channels) FIELD(corner_channels) FIELD(opacities) FIELD(sigmas)
         FIELD(shared_sigma) FIELD(viewmat) FIELD(K) FIELD(background) FIELD(width) FIELD(height) FIELD(kernel)
-        FIELD(kernel_table) FIELD(distance) FIELD(freeze_incentre) FIELD(near_plane) FIELD(alpha_min) FIELD(alpha_max) FIELD(x_max)
+        FIELD(kernel_table) FIELD(distance) FIELD(freeze_inradius) FIELD(near_plane) FIELD(alpha_min) FIELD(alpha_max) FIELD(x_max)
         FIELD(transmittance_min) FIELD(distortion_near) FIELD(distortion_far) FIELD(centroid_depth)
         FIELD(keep_for_backward) FIELD(color) FIELD(alpha) FIELD(distortion) FIELD(distortion_totals)
         FIELD(median_triangle) FIELD(max_weight) FIELD(screen_size) FIELD(inradius) FIELD(visible);

@@ -71,7 +71,7 @@ void fill_triangles(RasterState& state) {
     pass.count = call.num_triangles;
     pass.camera = camera_of(call);
     pass.distance = static_cast<Distance>(call.distance);
-    pass.freeze_incentre = call.freeze_incentre;
+    pass.freeze_inradius = call.freeze_inradius;
     pass.shared_sigma = call.shared_sigma;
     pass.near_plane = call.near_plane;
     pass.support_alpha = call.alpha_min;

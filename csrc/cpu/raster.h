@@ -34,7 +34,7 @@ struct RasterCall {
     uintptr_t background = 0;       // (channels)
     uintptr_t kernel_table = 0;     // of kernel "Tabulated"
     int width = 0, height = 0, kernel = 0, distance = 0;
-    bool freeze_incentre = false;
+    bool freeze_inradius = false;
     float near_plane = 0.01f, alpha_min = 0, alpha_max = 1, x_max = 2, transmittance_min = 0;
     float distortion_near = 0.2f, distortion_far = 100.0f;
     bool centroid_depth = false;  // depth of the distortion: the centroid's, not the pixel's

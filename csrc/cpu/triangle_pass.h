@@ -37,7 +37,7 @@ struct TrianglePass {
     int64_t count = 0;
     PinholeCamera camera;
     Distance distance = Distance::kBarycentric;
-    bool freeze_incentre = false, shared_sigma = false;
+    bool freeze_inradius = false, shared_sigma = false;
     float near_plane = 0, support_alpha = 0, x_max = 0;  // support_alpha: alpha_min, or 0 where it is off
     const float* vertices = nullptr;  // (count, 3, 3), or (V, 3) with faces
     const int32_t* faces = nullptr;   // (count, 3) or null

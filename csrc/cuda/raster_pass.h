@@ -15,7 +15,7 @@ namespace etsplat {
 struct RasterPass {
     const float *vertices, *flat_colors, *corner_colors, *opacities, *sigmas, *viewmats, *Ks, *backgrounds, *kernel_table;
     const int* faces;
-    int triangles, vertex_count, views, width, height, tiles_x, tiles_y, kernel, distance, freeze_incentre;
+    int triangles, vertex_count, views, width, height, tiles_x, tiles_y, kernel, distance, freeze_inradius;
     int shared_sigma, flat_per_view, corner_per_view, flat_channels, corner_channels, capacity;
     float near_plane, support_alpha, alpha_min, alpha_max, x_max, transmittance_min, distortion_near, distortion_far;
 

@@ -56,7 +56,7 @@ __device__ __forceinline__ void add_geometry(const RasterPass& pass, int triangl
     load_corners(pass, triangle, world);
     project_triangle(camera, pass.near_plane, distance, world, view, t);
     const SlotLayout layout = kLayout;
-    view_gradient(camera, distance, pass.freeze_incentre != 0, layout, sums, view, t, grad_view, gx, gy);
+    view_gradient(camera, distance, pass.freeze_inradius != 0, layout, sums, view, t, grad_view, gx, gy);
     for (int k = 0; k < 3; ++k) {
         float grad[3];
         to_world_gradient(camera, grad_view + 3 * k, grad);

@@ -88,7 +88,7 @@ ETSPLAT_FN T distortion_slope(float near, float far, T m, T w, T total_weight, T
 // Gradients by the vertices of a triangle from its sums over pixels, sums[j] at SlotLayout's place j: in camera space (3, 3),
 // and gx, gy (3 each) by their projections, which are part of it.
 template <class T, class Sums>
-ETSPLAT_FN void view_gradient(const PinholeCamera& camera, Distance distance, bool freeze_incentre,
+ETSPLAT_FN void view_gradient(const PinholeCamera& camera, Distance distance, bool freeze_inradius,
                               const SlotLayout& layout, const Sums& sums, const T* view, const Triangle2D<T>& t,
                               T* grad_view, T* gx, T* gy) {
     T s[3], rx[3], ry[3], log_weight[3];
@@ -108,7 +108,7 @@ ETSPLAT_FN void view_gradient(const PinholeCamera& camera, Distance distance, bo
         for (int k = 0; k < 3; ++k) log_weight[k] = log_weight[k] + sums[layout.plane() + k];
     if (layout.depth == DistortionDepth::kCentroid)
         for (int k = 0; k < 3; ++k) grad_view[3 * k + 2] = grad_view[3 * k + 2] + sums[layout.centroid()] / T(3.0f);
-    distance_backward(t, distance, freeze_incentre, s, rx, ry, log_weight, gx, gy);
+    distance_backward(t, distance, freeze_inradius, s, rx, ry, log_weight, gx, gy);
     for (int k = 0; k < 3; ++k)
         project_backward(camera, view + 3 * k, t.x[k], t.y[k], gx[k], gy[k], grad_view + 3 * k);
 }

@@ -177,9 +177,9 @@ ETSPLAT_FN void barycentric_backward(const Triangle2D<T>& t, const T* a_at_origi
 }
 
 // Gradient by the projected vertices, from the moments about q of the gradients by the forms f_k = g_k . (p - q), and those
-// by log w_k on its own. freeze_incentre treats the inradius as a constant, as Triangle Splatting does.
+// by log w_k on its own. freeze_inradius treats the inradius as a constant, as Triangle Splatting does.
 template <class T>
-ETSPLAT_FN void distance_backward(const Triangle2D<T>& t, Distance distance, bool freeze_incentre, const T* s,
+ETSPLAT_FN void distance_backward(const Triangle2D<T>& t, Distance distance, bool freeze_inradius, const T* s,
                                   const T* rx, const T* ry, const T* log_weight, T* grad_x, T* grad_y) {
     T a_at_q[3], cs[3], cx[3], cy[3];
     for (int k = 0; k < 3; ++k) {
@@ -200,14 +200,14 @@ ETSPLAT_FN void distance_backward(const Triangle2D<T>& t, Distance distance, boo
     for (int k = 0; k < 3; ++k) {
         const int i = (k + 1) % 3, j = (k + 2) % 3;
         T grad_side = T(0.0f) - grad_weight[k] * t.weight[k] / t.side[k];
-        if (!freeze_incentre) grad_side = grad_side + shared;  // w_k = perimeter / l_k
+        if (!freeze_inradius) grad_side = grad_side + shared;  // w_k = perimeter / l_k
         const T scale = grad_side / t.side[k];
         const T ux = (t.x[i] - t.x[j]) * scale, uy = (t.y[i] - t.y[j]) * scale;
         grad_x[i] = grad_x[i] + ux;
         grad_y[i] = grad_y[i] + uy;
         grad_x[j] = grad_x[j] - ux;
         grad_y[j] = grad_y[j] - uy;
-        if (freeze_incentre) {  // w_k = |2A| / (l_k r) with r constant, and d|2A| / d v_k = |2A| grad a_k
+        if (freeze_inradius) {  // w_k = |2A| / (l_k r) with r constant, and d|2A| / d v_k = |2A| grad a_k
             grad_x[k] = grad_x[k] + shared * perimeter * t.ax[k];
             grad_y[k] = grad_y[k] + shared * perimeter * t.ay[k];
         }

@@ -74,7 +74,7 @@ ETSPLAT_FN void geometry_gradients(const RasterPass& pass, const TrianglePass& t
     Triangle2D<Vec> t;
     load_corners(triangles, range, corners);
     project_triangle(triangles.camera, triangles.near_plane, triangles.distance, corners, view, t);
-    view_gradient(triangles.camera, triangles.distance, triangles.freeze_incentre, pass.slot_layout, sums, view, t, grad_view,
+    view_gradient(triangles.camera, triangles.distance, triangles.freeze_inradius, pass.slot_layout, sums, view, t, grad_view,
                   gx, gy);
     for (int k = 0; k < 9; ++k) {
         grad_view[k] = keep(any, grad_view[k]);  // other lanes may not even be finite

@@ -117,7 +117,7 @@ def _call(b: int, inputs: Inputs, images: Images, plan: Plan) -> Any:
     if kernel.table is not None:
         call.kernel_table = _address(kernel.table.native(inputs.vertices.device))
     call.distance = DISTANCES.index(settings.distance)
-    call.freeze_incentre = settings.freeze_inradius
+    call.freeze_inradius = settings.freeze_inradius
     call.near_plane = settings.near_plane
     call.alpha_min, call.alpha_max, call.x_max, call.transmittance_min = settings.cutoffs
     call.distortion_near = DISTORTION_NEAR

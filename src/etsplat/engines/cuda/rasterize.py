@@ -190,7 +190,7 @@ class CudaRender:
         self.table = None if kernel.table is None else kernel.table.native(self.device)  # kept: `a` has its address
         a.kernel, a.kernel_table = kernel.native_id, _pointer(self.table)
         a.distance = DISTANCES.index(settings.distance)
-        a.freeze_incentre = settings.freeze_inradius
+        a.freeze_inradius = settings.freeze_inradius
         a.shared_sigma = inputs.sigma.dim() == 0
         a.flat_per_view = inputs.flat_per_view
         a.corner_per_view = inputs.corner_per_view
