@@ -1,7 +1,6 @@
 """`python -m studies.distance`: barycentric distance against signed distance."""
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 from etsplat.tasks.reconstruct_config import METHODS, Method, ReconstructConfig
 from studies.grid.variants import Variant, distance_variants
@@ -12,10 +11,10 @@ SOFT: tuple[Method, ...] = tuple(method for method in METHODS if not method.star
 
 @dataclass(frozen=True, kw_only=True)
 class Distance(ObjectStudy):
-    """Barycentric distance against signed distance, for each kernel: the paper says the choice does not matter."""
+    """Barycentric distance against signed distance, for each kernel: the paper says the choice does not matter.
 
-    EXAMPLES: ClassVar[str] = """
-    python -m studies.distance --meshes data/famous --out runs/distance --objects bunny_hr boot
+    Examples:
+        python -m studies.distance --meshes data/famous --out runs/distance --objects bunny_hr boot
     """
 
     methods: tuple[Method, ...] = SOFT

@@ -1,7 +1,6 @@
 """`python -m studies.famous`: the paper's tables famous and famous_cd."""
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 from etsplat.tasks.reconstruct_config import METHODS, Method, ReconstructConfig
 from studies.grid.variants import LAMBDA_SIGMAS, Variant, method_variants
@@ -10,12 +9,12 @@ from studies.objects.study import ObjectStudy
 
 @dataclass(frozen=True, kw_only=True)
 class Famous(ObjectStudy):
-    """The paper's tables famous and famous_cd: every method on every mesh, with the paper's numbers beside ours."""
+    """The paper's tables famous and famous_cd: every method on every mesh, with the paper's numbers beside ours.
 
-    EXAMPLES: ClassVar[str] = """
-    python -m studies.famous --meshes data/famous --out runs/famous
-    python -m studies.famous --meshes data/famous --out runs/famous --methods elastic bilateral --preset paper
-    python -m studies.famous --meshes data/famous --out runs/seeds --objects bunny_hr --seeds 0 1 2
+    Examples:
+        python -m studies.famous --meshes data/famous --out runs/famous
+        python -m studies.famous --meshes data/famous --out runs/famous --methods elastic bilateral --preset paper
+        python -m studies.famous --meshes data/famous --out runs/seeds --objects bunny_hr --seeds 0 1 2
     """
 
     methods: tuple[Method, ...] = METHODS

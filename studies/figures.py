@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Literal
 
 import tyro
 
@@ -20,12 +20,11 @@ class Figures(Study):
     kernels: G(x) and its slope for several sigma. edges: the seam between two faces. soft-triangle: one triangle and
     the level sets of x. axes: the table of kernel properties. dead-zone: from how far each kernel pulls a triangle
     back. teaser: from the sphere to a reconstruction, and from points to a scene, of finished runs.
-    """
 
-    EXAMPLES: ClassVar[str] = """
-    python -m studies.figures kernels
-    python -m studies.figures dead-zone --out dead_zone.pdf
-    python -m studies.figures teaser --runs runs/bunny runs/kitchen
+    Examples:
+        python -m studies.figures kernels
+        python -m studies.figures dead-zone --out dead_zone.pdf
+        python -m studies.figures teaser --runs runs/bunny runs/kitchen
     """
 
     name: tyro.conf.Positional[Name]
@@ -34,11 +33,6 @@ class Figures(Study):
     """File to write, .png, .pdf or .svg; NAME.png if not given."""
     runs: tuple[Path, ...] = ()
     """Finished runs of `etsplat reconstruct` and `train` that the teaser shows."""
-
-    @classmethod
-    def defaults(cls, arguments: Sequence[str]) -> "Figures":
-        """Nothing depends on the arguments."""
-        return cls(name=tyro.MISSING)
 
     def run(self, arguments: Sequence[str]) -> int:
         """Draws it."""

@@ -3,9 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Literal
-
-import tyro
+from typing import Any, Literal
 
 from etsplat.cli.command import INTERRUPTED, fail
 from etsplat.tasks.settings import SoftMethod
@@ -19,15 +17,14 @@ class Nvs(Study):
     """The paper's tables nvs, per-scene, filter and efficiency, and its figures nvs and trisoup.
 
     Scenes of the paper get Triangle Splatting's settings for them with `--preset paper`.
-    """
 
-    EXAMPLES: ClassVar[str] = """
-    python -m studies.nvs --scenes scenes/kitchen:indoor scenes/lego:object,background=white --out runs/nvs
-    python -m studies.nvs --scenes scenes/fox:indoor --out runs/filter --methods elastic --culling both
-    python -m studies.nvs --scenes scenes/fox:indoor --out runs/small --set iterations=1000,width=300
-    python -m studies.nvs --scenes demo:scene --settings "" pruning.views=2 start.limit=none --out runs/ablation
-    python -m studies.nvs --scenes data/tandt/truck data/tandt/train --out runs/tandt --preset paper --culling on
-    python -m studies.nvs --scenes scenes/kitchen --out runs/peers --methods elastic 3dgs 2dgs
+    Examples:
+        python -m studies.nvs --scenes scenes/kitchen:indoor scenes/lego:object,background=white --out runs/nvs
+        python -m studies.nvs --scenes scenes/fox:indoor --out runs/filter --methods elastic --culling both
+        python -m studies.nvs --scenes scenes/fox:indoor --out runs/small --set iterations=1000,width=300
+        python -m studies.nvs --scenes demo:scene --settings "" pruning.views=2 start.limit=none --out runs/ablation
+        python -m studies.nvs --scenes data/tandt/truck data/tandt/train --out runs/tandt --preset paper --culling on
+        python -m studies.nvs --scenes scenes/kitchen --out runs/peers --methods elastic 3dgs 2dgs
     """
 
     scenes: tuple[str, ...]
@@ -52,16 +49,11 @@ class Nvs(Study):
     lpips_weights: Path | None = None
     """File with LPIPS's weights, or `download`."""
 
-    @classmethod
-    def defaults(cls, arguments: Sequence[str]) -> "Nvs":
-        """Nothing depends on the arguments."""
-        return cls(scenes=tyro.MISSING, out=tyro.MISSING)
-
     def run(self, arguments: Sequence[str]) -> int:
         """Runs what is not finished yet, measures it, then writes tables and figures."""
         from rich.console import Console
 
-        from etsplat.cli.phases import PhaseBar
+        from etsplat.cli.progress import PhaseBar
         from etsplat.engines.threads import num_threads
         from studies.grid.cells import count_jobs, run_grid
         from studies.grid.live import PSNR, LiveTable, conclude

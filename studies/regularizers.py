@@ -1,7 +1,6 @@
 """`python -m studies.regularizers`: the paper's table reg_ablation."""
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 from studies.grid.variants import SUBSET, Variant, regularizer_variants
@@ -10,10 +9,10 @@ from studies.objects.study import ObjectStudy
 
 @dataclass(frozen=True, kw_only=True)
 class Regularizers(ObjectStudy):
-    """The paper's table reg_ablation: one weight of the mesh energies at a time at 0.1, 1 and 10 times its value."""
+    """The paper's table reg_ablation: one weight of the mesh energies at a time at 0.1, 1 and 10 times its value.
 
-    EXAMPLES: ClassVar[str] = """
-    python -m studies.regularizers --meshes data/famous --out runs/regularizers
+    Examples:
+        python -m studies.regularizers --meshes data/famous --out runs/regularizers
     """
 
     objects: tuple[str, ...] = SUBSET

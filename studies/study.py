@@ -1,5 +1,6 @@
 """What every study is: a command of its own, `python -m studies.NAME`."""
 
+import inspect
 import shlex
 import sys
 from collections.abc import Sequence
@@ -8,7 +9,7 @@ from typing import NoReturn
 
 import tyro
 
-from etsplat.cli.command import Command, help_of
+from etsplat.cli.command import Command
 from etsplat.cli.main import run_command
 
 
@@ -25,7 +26,13 @@ class Study(Command):
     def parse(cls, arguments: Sequence[str]) -> Command:
         """The study with these options. `--help` and wrong options end the process, as tyro does."""
         default = cls.defaults(arguments)
-        return tyro.cli(cls, prog=cls.program(), description=help_of(cls), args=list(arguments), default=default)
+        return tyro.cli(
+            cls,
+            prog=cls.program(),
+            description=inspect.cleandoc(cls.__doc__ or ""),
+            args=list(arguments),
+            default=default,
+        )
 
     @classmethod
     def main(cls) -> NoReturn:

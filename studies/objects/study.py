@@ -33,11 +33,6 @@ class ObjectStudy(Study):
     jobs: Annotated[int, tyro.conf.arg(help_behavior_hint="(default: one for each core)")] = 0
     """Runs beside each other; 0 for one on each core. They share the cores evenly."""
 
-    @classmethod
-    def defaults(cls, arguments: Sequence[str]) -> "ObjectStudy":
-        """Nothing depends on the arguments."""
-        return cls(meshes=tyro.MISSING, out=tyro.MISSING)
-
     @abstractmethod
     def variants(self, base: ReconstructConfig) -> list[Variant]:
         """What is compared."""

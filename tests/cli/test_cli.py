@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
-from typing import ClassVar, cast
+from typing import cast
 
 import docstring_parser
 import pytest
@@ -19,8 +19,7 @@ from etsplat.cli.command import Command, resume_line
 from etsplat.cli.doctor import Doctor
 from etsplat.cli.main import main
 from etsplat.cli.parse import COMMANDS, Group, parse
-from etsplat.cli.reconstruct import DemoObject, Reconstruct
-from etsplat.cli.train import DemoScene, Train
+from etsplat.cli.runs import DemoObject, DemoScene, Reconstruct, Train
 from etsplat.core.errors import InputError
 from etsplat.geometry.icosphere import icosphere
 from etsplat.io.mesh_files import save_mesh
@@ -394,15 +393,14 @@ def test_resume_line_keeps_the_options() -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class _Paint(Command):
-    """Paint."""
+    """Paint.
 
-    EXAMPLES: ClassVar[str] = "etsplat studio paint --color red"
+    Examples:
+        etsplat studio paint --color red
+    """
+
     color: str = "blue"
     """Of the paint."""
-
-    @classmethod
-    def defaults(cls, arguments: Sequence[str]) -> "_Paint":
-        return cls()
 
     def run(self, arguments: Sequence[str]) -> int:
         return 0

@@ -2,8 +2,7 @@ import pytest
 import torch
 
 from etsplat.cli.parse import parse
-from etsplat.cli.reconstruct import DemoObject
-from etsplat.cli.train import DemoScene, Train
+from etsplat.cli.runs import DemoObject, DemoScene, Train
 from etsplat.data.dataset import Dataset
 from etsplat.data.demo_scene import demo_scene
 

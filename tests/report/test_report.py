@@ -15,7 +15,7 @@ import torch
 from PIL import Image
 
 from etsplat.cli.parse import parse
-from etsplat.cli.train import Train
+from etsplat.cli.runs import Train
 from etsplat.core.errors import InputError
 from etsplat.geometry.icosphere import icosphere
 from etsplat.io.mesh_files import save_mesh

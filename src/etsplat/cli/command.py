@@ -1,18 +1,21 @@
 """What every command of the command line is: a dataclass whose fields are its options, with a method that runs it."""
 
-import inspect
+import runpy
 import shlex
 import sys
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
-from typing import ClassVar, NoReturn
+from typing import Any, NoReturn, TypeVar, get_args
 
 import tyro
 
+from etsplat.core.errors import InputError
 from etsplat.io.run_directory import KERNEL_FILE
-from etsplat.tasks.settings import AnySettings
+from etsplat.tasks.settings import AnySettings, SoftMethod, kernel_methods
+
+AnyCommand = TypeVar("AnyCommand", bound="Command")
 
 FAILED, WRONG_INPUT, INTERRUPTED = 1, 2, 130
 
@@ -24,19 +27,24 @@ Flag = tyro.conf.FlagCreatePairsOff[bool]
 class Command(ABC):
     """Base of the commands. The docstring of a subclass is its help, those of its fields are theirs.
 
-    A module that defines commands imports no torch at its top, so that `--help` is fast.
+    The list of commands shows it up to its examples. A module that defines commands imports no torch at its top, so
+    that `--help` is fast.
     """
-
-    EXAMPLES: ClassVar[str] = ""
-    """Command lines, one each line, for the command's own help."""
 
     debug: Flag = False
     """Show the traceback of an error."""
 
     @classmethod
-    @abstractmethod
-    def defaults(cls, arguments: Sequence[str]) -> "Command":
-        """The command before its options are applied; where a preset is an option, `arguments` name it."""
+    def defaults(cls: type[AnyCommand], arguments: Sequence[str], **known: Any) -> AnyCommand:
+        """The command before its options are applied.
+
+        Args:
+            arguments: the command line; where a preset is an option, it is named there.
+            known: what the arguments decide, by name. What else has no default must be given as an option.
+        """
+        required = [entry.name for entry in fields(cls) if entry.default is entry.default_factory is MISSING]
+        options: dict[str, Any] = {**dict.fromkeys(required, tyro.MISSING), **known}
+        return cls(**options)
 
     @abstractmethod
     def run(self, arguments: Sequence[str]) -> int:
@@ -70,14 +78,28 @@ def settings_before_options(kind: type[AnySettings], arguments: Sequence[str], *
 def _know_kernels(arguments: Sequence[str]) -> None:
     """Registers what settings may name: kernels of ``--kernel-file``, which runs, and of a run that goes on."""
     if (file := option_value(arguments, "--kernel-file")) is not None:
-        from etsplat.cli.kernel_file import run_kernel_file
-
         run_kernel_file(Path(file))
     out = option_value(arguments, "--out")
     if "--resume" in arguments and out is not None and (Path(out) / KERNEL_FILE).is_file():
         from etsplat.io.kernel_files import adopt_kernel_of
 
         adopt_kernel_of(Path(out))
+
+
+def run_kernel_file(path: Path) -> None:
+    """Runs a Python file that registers kernels: the only file that the command line runs, and only where it is named.
+
+    Raises:
+        InputError: there is no such file, it fails, or it registers nothing.
+    """
+    if not path.is_file():
+        raise InputError(f"--kernel-file {path}: no such file; check the path")
+    try:
+        runpy.run_path(str(path))
+    except Exception as error:
+        raise InputError(f"--kernel-file {path}: failed ({type(error).__name__}: {error})") from error
+    if kernel_methods() == get_args(SoftMethod):
+        raise InputError(f"--kernel-file {path}: registers no kernel; call etsplat.register_kernel(name, value) in it")
 
 
 def option_value(arguments: Sequence[str], option: str) -> str | None:
@@ -89,15 +111,6 @@ def option_value(arguments: Sequence[str], option: str) -> str | None:
         elif argument.startswith(f"{option}="):
             value = argument.removeprefix(f"{option}=")
     return value
-
-
-def help_of(command: type[Command]) -> str:
-    """What a command's own help says of it: its docstring and its examples."""
-    text = inspect.cleandoc(command.__doc__ or "")
-    if not command.EXAMPLES:
-        return text
-    examples = inspect.cleandoc(command.EXAMPLES).splitlines()
-    return f"{text}\n\nExamples:\n" + "\n".join(f"    {line}" for line in examples)
 
 
 def resume_line(arguments: Sequence[str]) -> str:

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Literal
 
 import tyro
 
@@ -15,11 +15,10 @@ class Sfm(Command):
     """Find the cameras of photos (structure from motion, on the CPU), so that they can be trained on.
 
     Needs pycolmap: pip install 'etsplat[sfm]'.
-    """
 
-    EXAMPLES: ClassVar[str] = """
-    etsplat data sfm photos/ --out my_scene
-    etsplat data sfm video_frames/ --out my_scene --matching sequential
+    Examples:
+        etsplat data sfm photos/ --out my_scene
+        etsplat data sfm video_frames/ --out my_scene --matching sequential
     """
 
     photos: tyro.conf.Positional[Path]
@@ -31,16 +30,11 @@ class Sfm(Command):
     max_size: int = 1600
     """Longer sides are shrunk to this many pixels."""
 
-    @classmethod
-    def defaults(cls, arguments: Sequence[str]) -> "Sfm":
-        """Nothing depends on the arguments."""
-        return cls(photos=tyro.MISSING, out=tyro.MISSING)
-
     def run(self, arguments: Sequence[str]) -> int:
         """Writes the scene and says which photos have no place in it."""
         from rich.console import Console
 
-        from etsplat.cli.phases import PhaseBar
+        from etsplat.cli.progress import PhaseBar
         from etsplat.data.structure_from_motion import find_cameras
 
         console = Console()
@@ -63,11 +57,10 @@ class Undistort(Command):
     """Write a scene anew without lens distortion, in COLMAP's layout: what every other command wants.
 
     Needs pycolmap: pip install 'etsplat[sfm]'.
-    """
 
-    EXAMPLES: ClassVar[str] = """
-    etsplat data undistort distorted_scene/ --out my_scene
-    etsplat data undistort nerfstudio_capture/ --out my_scene --max-size 1000
+    Examples:
+        etsplat data undistort distorted_scene/ --out my_scene
+        etsplat data undistort nerfstudio_capture/ --out my_scene --max-size 1000
     """
 
     source: tyro.conf.Positional[Path]
@@ -77,11 +70,6 @@ class Undistort(Command):
     """Folder for the new scene."""
     max_size: int = 1600
     """Longer sides are shrunk to this many pixels."""
-
-    @classmethod
-    def defaults(cls, arguments: Sequence[str]) -> "Undistort":
-        """Nothing depends on the arguments."""
-        return cls(source=tyro.MISSING, out=tyro.MISSING)
 
     def run(self, arguments: Sequence[str]) -> int:
         """Writes the scene."""
@@ -94,12 +82,12 @@ class Undistort(Command):
 
 @dataclass(frozen=True, kw_only=True)
 class Download(Command):
-    """Fetch the captures and meshes of the paper's tables: Mip-NeRF 360, Tanks and Temples, Deep Blending, FAMOUS."""
+    """Fetch the captures and meshes of the paper's tables: Mip-NeRF 360, Tanks and Temples, Deep Blending, FAMOUS.
 
-    EXAMPLES: ClassVar[str] = """
-    etsplat data download tandt-db --out data
-    etsplat data download famous --out data
-    etsplat train data/tandt/truck --out runs/truck
+    Examples:
+        etsplat data download tandt-db --out data
+        etsplat data download famous --out data
+        etsplat train data/tandt/truck --out runs/truck
     """
 
     name: tyro.conf.Positional[Literal["mipnerf360", "mipnerf360-extra", "tandt-db", "famous"]]
@@ -108,16 +96,11 @@ class Download(Command):
     out: Path = Path("data")
     """Folder for the scenes."""
 
-    @classmethod
-    def defaults(cls, arguments: Sequence[str]) -> "Download":
-        """Nothing depends on the arguments."""
-        return cls(name=tyro.MISSING)
-
     def run(self, arguments: Sequence[str]) -> int:
         """Fetches and unpacks."""
         from rich.console import Console
 
-        from etsplat.cli.phases import PhaseBar
+        from etsplat.cli.progress import PhaseBar
         from etsplat.io.datasets import download_dataset
 
         with PhaseBar(Console()) as bar:

@@ -10,11 +10,6 @@ from etsplat.cli.command import FAILED, Command
 class Doctor(Command):
     """Say what this installation can do: engine, instruction set, threads, versions, and what is missing for what."""
 
-    @classmethod
-    def defaults(cls, arguments: Sequence[str]) -> "Doctor":
-        """Nothing depends on the arguments."""
-        return cls()
-
     def run(self, arguments: Sequence[str]) -> int:
         """Prints the state of the installation; fails if what must work does not."""
         from rich.console import Console

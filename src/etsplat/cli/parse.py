@@ -8,15 +8,11 @@ from typing import Annotated, Any, Literal, Union, get_type_hints
 
 import tyro
 
-from etsplat.cli.command import Command, help_of
+from etsplat.cli.command import Command
 from etsplat.cli.data import Download, Sfm, Undistort
 from etsplat.cli.doctor import Doctor
-from etsplat.cli.evaluate import Evaluate
-from etsplat.cli.export import Export
-from etsplat.cli.reconstruct import DemoObject, Reconstruct
-from etsplat.cli.render import Render
-from etsplat.cli.train import DemoScene, Train
-from etsplat.cli.view import View
+from etsplat.cli.runs import DemoObject, DemoScene, Reconstruct, Train
+from etsplat.cli.soups import Evaluate, Export, Render, View
 from etsplat.core.errors import InputError
 from etsplat.tasks.settings import OneOf, Rare, Setting, Settings, did_you_mean, docs_of, settings_of
 
@@ -106,12 +102,13 @@ def _union(commands: Mapping[str, type[Command] | Group], words: Sequence[str], 
 def _member(name: str, entry: type[Command] | Group, words: Sequence[str], asked: bool, depth: int) -> Any:
     description = entry.help if isinstance(entry, Group) else inspect.cleandoc(entry.__doc__ or "")
     if not asked:
+        description = description.partition("\n\nExamples:")[0]
         return Annotated[make_dataclass(name, []), tyro.conf.subcommand(name, description=description)]
     if isinstance(entry, Group):
         commands = Annotated[_union(entry.commands, words, depth + 1), tyro.conf.arg(name="")]
         group = make_dataclass(name, [("command", commands)], frozen=True)
         return Annotated[group, tyro.conf.subcommand(name, description=description)]
-    return Annotated[entry, tyro.conf.subcommand(name, default=entry.defaults(words), description=help_of(entry))]
+    return Annotated[entry, tyro.conf.subcommand(name, default=entry.defaults(words), description=description)]
 
 
 def _offered(setting: Setting) -> Any:

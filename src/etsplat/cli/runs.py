@@ -1,0 +1,194 @@
+"""The commands that make a run: `etsplat reconstruct`, `etsplat train` and both `etsplat demo`."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+
+import tyro
+
+from etsplat.cli.command import FAILED, INTERRUPTED, Command, Flag, fail, resume_line, settings_before_options
+from etsplat.tasks.reconstruct_config import ReconstructConfig
+from etsplat.tasks.settings import Rare, Settings
+from etsplat.tasks.train_config import TrainConfig
+
+if TYPE_CHECKING:
+    from etsplat.tasks.running import Callback
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunCommand(Command):
+    """Base of the commands that make a run: options, progress, report, summary, and how a run ends early."""
+
+    CONFIG: ClassVar[type[Settings]]
+    """Of `settings`. The function of `etsplat` that makes the run is called as its task."""
+    PRESET: ClassVar[dict[str, str]]
+    """What the settings start from, where nobody says otherwise."""
+    SOURCE: ClassVar[str | None] = None
+    """What is shown; None where `source` is an option."""
+    INPUT: ClassVar[tuple[str, ...]] = ()
+    """Options that the function takes too."""
+    PREPARING: ClassVar[str] = "Taking pictures"
+    """What happens before the first step."""
+
+    help_all: Flag = False
+    """Show every option, and every setting under its heading."""
+    debug: Annotated[Flag, Rare] = False
+    """Show the traceback of an error."""
+    out: Path
+    """Folder for the results."""
+    config: Path | None = None
+    """Settings to begin with: config.json of a run, or a JSON file with some of them. Options go over it."""
+    kernel_file: Annotated[Path | None, Rare] = None
+    """A Python file that registers the kernel named by --method (etsplat.register_kernel). It is run."""
+    overwrite: Flag = False
+    """Replace an earlier run in the folder."""
+    resume: Flag = False
+    """Continue an interrupted run in the folder; give the same options as then."""
+    settings: Settings
+
+    @classmethod
+    def defaults(cls, arguments: Sequence[str], **known: Any) -> Any:
+        """With the preset's settings."""
+        settings = settings_before_options(cls.CONFIG, arguments, **cls.PRESET)
+        return super().defaults(arguments, settings=settings, **known)
+
+    def callbacks(self) -> "list[Callback]":
+        """What is told of the run beside the progress bar."""
+        return []
+
+    def run(self, arguments: Sequence[str]) -> int:
+        """Does the run with a progress bar, writes its report and prints what came out."""
+        from rich.console import Console
+
+        import etsplat
+        from etsplat.cli.progress import RunProgress, print_summary
+        from etsplat.io.run_directory import is_run
+
+        console, options = Console(), vars(self)
+        try:
+            with RunProgress(console, preparing=self.PREPARING) as progress:
+                progress.show("Reading the input")
+                getattr(etsplat, self.CONFIG.TASK)(
+                    options.get("source", self.SOURCE),
+                    self.out,
+                    self.settings,
+                    **{name: options[name] for name in self.INPUT},
+                    callbacks=[progress, *self.callbacks()],
+                    resume=self.resume,
+                    overwrite=self.overwrite,
+                )
+                progress.show("Writing the report")
+                etsplat.write_report(self.out)
+        except KeyboardInterrupt:
+            if not is_run(self.out):
+                raise
+            fail(f"interrupted; continue with: {resume_line(arguments)}", INTERRUPTED)
+        except etsplat.DivergedError as error:
+            if self.debug:
+                raise
+            fail(str(error), FAILED)
+        print_summary(console, self.out)
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class DemoObject(RunCommand):
+    """Reconstruct an object that is built in code: nothing to download, nothing to choose.
+
+    Examples:
+        etsplat demo object
+        etsplat demo object --out owl --method bilateral
+        etsplat demo object --preset tiny --overwrite
+    """
+
+    CONFIG = ReconstructConfig
+    PRESET: ClassVar[dict[str, str]] = {"preset": "demo"}
+    SOURCE = "demo:owl"
+
+    out: Path = Path("runs/demo")
+    """Folder for the results."""
+    settings: Annotated[ReconstructConfig, tyro.conf.arg(name="")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reconstruct(RunCommand):
+    """Deform a sphere into the object that pictures show.
+
+    Examples:
+        etsplat reconstruct bunny.obj --out runs/bunny --preset quick
+        etsplat reconstruct bunny.obj --out runs/bunny
+        etsplat reconstruct bunny.obj --out runs/bunny --resume
+        etsplat reconstruct bunny.obj --out runs/paper --preset paper --method bilateral
+        etsplat reconstruct boot.obj --out runs/boot --config runs/bunny/config.json
+        etsplat reconstruct my_scene/ --out runs/scene --iterations 4000
+    """
+
+    CONFIG = ReconstructConfig
+    PRESET: ClassVar[dict[str, str]] = {"preset": "best"}
+    INPUT = ("init_mesh", "masks")
+
+    source: tyro.conf.Positional[Path]
+    """A mesh file, which is photographed from 40 sides; or a folder with posed images (transforms.json or COLMAP)."""
+    out: Path
+    """Folder for the results: mesh.ply, mesh.obj, mesh.glb, metrics.json, report.html and more."""
+    settings: Annotated[ReconstructConfig, tyro.conf.arg(name="")]
+    init_mesh: Annotated[Path | None, Rare] = None
+    """Start from this mesh instead of a sphere; in the units of the source."""
+    masks: Annotated[Path | None, Rare] = None
+    """Folder with a mask (white inside the object) for every image; else masks/ of the source, or transparency."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Train(RunCommand):
+    """Fit a triangle soup to the photos of a scene.
+
+    Examples:
+        etsplat train my_scene/ --out runs/scene
+        etsplat train my_scene/ --out runs/scene --scene-type indoor --width 1000 --iterations 8000
+        etsplat train my_scene/ --out runs/scene --preset paper --images images_4
+        etsplat train my_scene/ --out runs/again --config runs/scene/config.json --finish opaque
+    """
+
+    CONFIG = TrainConfig
+    PRESET: ClassVar[dict[str, str]] = {"preset": "quick", "scene_type": "outdoor"}
+    INPUT = ("images", "masks")
+    PREPARING = "Reading the photos"
+
+    source: tyro.conf.Positional[Path]
+    """A folder with posed photos: COLMAP, nerfstudio or Blender. For photos alone: `etsplat data sfm`."""
+    out: Path
+    """Folder for the results: soup.safetensors, metrics.json, report.html and more."""
+    settings: Annotated[TrainConfig, tyro.conf.arg(name="")]
+    images: Annotated[str | None, Rare] = None
+    """Folder in the scene to take the photos from, such as images_4."""
+    masks: Annotated[Path | None, Rare] = None
+    """Folder with a mask for every photo, white where pixels count."""
+    tensorboard: Annotated[Flag, Rare] = False
+    """Write curves for tensorboard into the folder as well."""
+
+    def callbacks(self) -> "list[Callback]":
+        """Tensorboard's, if it is asked for."""
+        if not self.tensorboard:
+            return []
+        from etsplat.cli.tensorboard import TensorboardWriter
+
+        return [TensorboardWriter(self.out)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class DemoScene(RunCommand):
+    """Fit a triangle soup to pictures of a small scene that is built in code: no photos needed.
+
+    Examples:
+        etsplat demo scene
+        etsplat demo scene --out scene --method single-sided
+    """
+
+    CONFIG = TrainConfig
+    PRESET: ClassVar[dict[str, str]] = {"preset": "demo", "scene_type": "outdoor"}
+    SOURCE = "demo:scene"
+
+    out: Path = Path("runs/demo_scene")
+    """Folder for the results."""
+    settings: Annotated[TrainConfig, tyro.conf.arg(name="")]

@@ -1,0 +1,248 @@
+"""The commands that take a trained soup: `etsplat eval`, `etsplat render`, `etsplat export` and `etsplat view`."""
+
+import contextlib
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
+
+import tyro
+
+from etsplat.cli.command import Command, Flag
+from etsplat.core.errors import InputError
+from etsplat.io.writers import purposes
+from etsplat.tasks.export_config import ExportConfig
+from etsplat.tasks.render_config import RenderConfig
+from etsplat.tasks.settings import Device
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+AnySettings = TypeVar("AnySettings")
+Unnamed = Annotated[AnySettings, tyro.conf.arg(name=""), tyro.conf.OmitArgPrefixes]
+
+_COLUMNS = {
+    "psnr": ("PSNR", ".2f"),
+    "ssim": ("SSIM", ".4f"),
+    "ssim_interior": ("SSIM interior", ".4f"),
+    "lpips_3dgs": ("LPIPS as 3DGS", ".4f"),
+    "lpips": ("LPIPS", ".4f"),
+    "psnr_opaque": ("PSNR opaque", ".2f"),
+}
+
+PURPOSES = {**purposes(), "safetensors": "For etsplat."}
+if TYPE_CHECKING:
+    Kind = str
+else:
+    Kind = Literal[tuple(PURPOSES)]
+_FORMAT = "\n".join(
+    ["Kind of file; by default what --out ends in, or glb.", *(f"{kind}: {use}" for kind, use in PURPOSES.items())]
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evaluate(Command):
+    """Measure a trained soup on the views that training never saw, and how fast it is drawn.
+
+    PSNR; SSIM zero-padded as 3DGS has it, and in the interior; LPIPS in both conventions where its weights are.
+
+    Examples:
+        etsplat eval runs/kitchen
+        etsplat eval runs/kitchen --lpips-weights download
+        etsplat eval soup.ply --scene scenes/kitchen --out evaluation
+    """
+
+    run_dir: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(name="dir")]
+    """A run of `etsplat train`; or a file with a soup, with --scene."""
+    out: Path | None = None
+    """Folder for evaluation.json and pictures side by side; by default the run's, whose report is written anew."""
+    scene: Path | None = None
+    """The capture's folder, if it has moved or a file is given."""
+    device: Device | None = None
+    """Where it is drawn: cpu, cuda (an NVIDIA GPU), or None for cuda where there is one."""
+    lpips_weights: Path | None = None
+    """File with LPIPS's weights, or `download`; by default torch's cache is looked into."""
+
+    def run(self, arguments: Sequence[str]) -> int:
+        """Measures, writes evaluation.json, pictures and report, prints a table."""
+        from rich.console import Console
+
+        from etsplat.cli.progress import PhaseBar
+        from etsplat.io.run_directory import RunDirectory, is_run
+        from etsplat.report import write_report
+        from etsplat.tasks.evaluate_soup import evaluate_run
+        from etsplat.tasks.soup_run import open_run
+
+        opened = open_run(self.run_dir, self.scene, self.device)
+        folder = RunDirectory(self.out or opened.folder)
+        console = Console()
+        with PhaseBar(console) as bar:
+            found = evaluate_run(
+                opened,
+                lpips_weights=self.lpips_weights,
+                pictures=folder.path / "evaluation",
+                progress=lambda done, total: bar.show("Measuring", done, total),
+            )
+        folder.write_evaluation(found)
+        _print(console, found)
+        print(f"{folder.evaluation_path}; pictures in {folder.path / 'evaluation'}")
+        if is_run(folder.path) and folder.metrics_path.is_file():
+            print(write_report(folder.path))
+        return 0
+
+
+def _print(console: "Console", found: dict[str, Any]) -> None:
+    from rich.table import Table
+
+    table = Table("view", box=None)
+    shown = {key: column for key, column in _COLUMNS.items() if found[key] is not None}
+    for title, _ in shown.values():
+        table.add_column(title, justify="right")
+    for row in [*found["views"], {**found, "name": "mean"}]:
+        table.add_row(row["name"], *(f"{row[key]:{form}}" for key, (_, form) in shown.items()))
+    console.print(table)
+    if found["lpips"] is None and found["lpips_reason"]:
+        console.print(f"LPIPS: {found['lpips_reason']}", soft_wrap=True)
+    threads = "1 thread" if found["threads"] == 1 else f"{found['threads']} threads"
+    console.print(
+        f"{found['fps']:.1f} frames/s at {found['width']}x{found['height']}, {found['ms_per_million']:.0f} ms per "
+        f"million triangles ({found['triangles']:,} triangles, engine {found['engine']}, {threads})"
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Render(Command):
+    """Draw a trained soup: its test views, or a path through the scene as a video.
+
+    Examples:
+        etsplat render runs/kitchen
+        etsplat render runs/kitchen --path orbit --frames 240
+        etsplat render runs/kitchen --path ellipse --opaque --depth --normals
+        etsplat render soup.ply --scene scenes/kitchen --path interpolated --format frames
+    """
+
+    run_dir: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(name="dir")]
+    """A run of `etsplat train`; or a file with a soup, with --scene."""
+    out: Path | None = None
+    """Folder for the pictures; by default renders/ in the run's folder."""
+    scene: Path | None = None
+    """The capture's folder, if it has moved or a file is given."""
+    device: Device | None = None
+    """Where it is drawn: cpu, cuda (an NVIDIA GPU), or None for cuda where there is one."""
+    settings: Unnamed[RenderConfig] = field(default_factory=RenderConfig)
+
+    def run(self, arguments: Sequence[str]) -> int:
+        """Draws, and says where the pictures are."""
+        from rich.console import Console
+
+        from etsplat.cli.progress import PhaseBar
+        from etsplat.tasks.render_soup import render_run
+        from etsplat.tasks.soup_run import open_run
+
+        opened = open_run(self.run_dir, self.scene, self.device)
+        out = self.out or opened.folder / "renders"
+        with PhaseBar(Console()) as bar:
+            files = render_run(
+                opened, out, self.settings, progress=lambda done, total: bar.show("Drawing", done, total)
+            )
+        print(f"{len(files)} files in {out}" if len(files) != 1 else files[0])
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Export(Command):
+    """Write a trained soup for Blender, game engines or the web; or turn another program's file into a soup.
+
+    Examples:
+        etsplat export runs/kitchen
+        etsplat export runs/kitchen --out kitchen.ply
+        etsplat export runs/kitchen --format ply --colors keep --min-opacity 0 --up keep
+        etsplat export point_cloud_state_dict.pt --format safetensors
+    """
+
+    run_dir: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(name="dir")]
+    """A run of `etsplat train`; or a file: .safetensors, .pt of Triangle Splatting, Gaussian .ply, or a mesh."""
+    format: Annotated[Kind | None, tyro.conf.arg(help=_FORMAT)] = None
+    out: Path | None = None
+    """The file to write; by default soup.FORMAT in the run's folder."""
+    scene: Path | None = None
+    """The capture's folder, if it has moved or a file is given: for colours as the cameras saw them, and for up."""
+    device: Device | None = None
+    """Where it is drawn: cpu, cuda (an NVIDIA GPU), or None for cuda where there is one."""
+    settings: Unnamed[ExportConfig] = field(default_factory=ExportConfig)
+
+    def run(self, arguments: Sequence[str]) -> int:
+        """Writes the file and says what is in it."""
+        from etsplat.io.paths import kind_of
+        from etsplat.tasks.export_soup import export_soup
+        from etsplat.tasks.soup_run import open_run
+
+        opened = open_run(self.run_dir, self.scene, self.device)
+        out = self.out or opened.folder / f"soup.{self.format or 'glb'}"
+        kinds = [self.format] if self.format else list(PURPOSES)
+        if kind_of(out).removeprefix(".") not in kinds:
+            raise InputError(f"--out {out}: does not end in .{' or .'.join(kinds)}; rename it or change --format")
+        read = self.run_dir / "soup.safetensors" if self.run_dir.is_dir() else self.run_dir
+        if out.resolve() == read.resolve():
+            raise InputError(f"--out {out}: is what is read; choose another file")
+        written = export_soup(opened, out, self.settings)
+        left_out = f", {written.dropped:,} fainter ones left out" if written.dropped else ""
+        print(f"{written.path}: {written.triangles:,} triangles{left_out}")
+        if written.dropped > written.triangles:
+            print("Most of it is too faint to be drawn opaque; train with --finish opaque, or lower --min-opacity.")
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class View(Command):
+    """Look around in a trained soup with a web browser; follows a run that is still going on.
+
+    Needs viser: pip install 'etsplat[viewer]'.
+
+    Examples:
+        etsplat view runs/kitchen
+        etsplat view runs/kitchen --port 9000 --width 1600
+        etsplat view runs/garden --wait
+        etsplat view point_cloud_state_dict.pt --scene scenes/kitchen
+    """
+
+    run_dir: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(name="dir")]
+    """A run of `etsplat train`, finished or in progress; an empty folder in which one is to begin; or a file."""
+    wait: Flag = False
+    """Wait for the run to begin, if its folder is not there yet."""
+    scene: Path | None = None
+    """The capture's folder, if it has moved or a file is given: for its cameras."""
+    device: Device | None = None
+    """Where it is drawn: cpu, cuda (an NVIDIA GPU), or None for cuda where there is one."""
+    host: str = "localhost"
+    """Address to listen on; 0.0.0.0 lets other machines look too."""
+    port: int = 8080
+    """Port to listen on; the next free one if it is in use."""
+    width: int = 960
+    """Width of the picture when the camera stands still."""
+
+    def run(self, arguments: Sequence[str]) -> int:
+        """Serves until Ctrl-C."""
+        for name, value, low, high in (("width", self.width, 16, 8192), ("port", self.port, 0, 65535)):
+            if not low <= value <= high:
+                raise InputError(f"{name}: is {value}; it must be between {low} and {high}")
+        from etsplat.io.paths import path_remedy
+        from etsplat.tasks.soup_run import open_run
+        from etsplat.viewer.follow import wait_for_soup
+        from etsplat.viewer.server import serve
+
+        if not self.run_dir.exists() and not self.wait:
+            remedy = f"{path_remedy(self.run_dir)} (or --wait for a run to begin there)"
+            raise InputError(f"{self.run_dir}: no such file or folder; {remedy}")
+        with contextlib.suppress(KeyboardInterrupt):
+            if not self.run_dir.is_file():
+                wait_for_soup(self.run_dir, lambda text: print(f"{text} (Ctrl-C ends it)", flush=True))
+            opened = open_run(self.run_dir, self.scene, self.device)
+            serve(
+                opened,
+                self.host,
+                self.port,
+                self.width,
+                lambda port: print(f"http://{self.host}:{port}  (Ctrl-C ends it)", flush=True),
+            )
+        return 0
