@@ -13,167 +13,14 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from etsplat import intrinsics, look_at, rasterize, rasterize_antialiased, rasterize_opaque
+from etsplat import intrinsics, look_at, rasterize, rasterize_opaque
 from etsplat.core.cameras import Cameras
 from etsplat.engines.native.pool import empty_image
-from etsplat.geometry.icosphere import icosphere
-from etsplat.geometry.topology import MeshTopology
 from etsplat.ops.adam import Adam
-from etsplat.ops.mesh_energies import mesh_energies
-from etsplat.ops.normal_consistency import normal_consistency
-from etsplat.ops.photometric import photometric_loss
-from etsplat.ops.pick_values import pick_values
 from etsplat.ops.rasterize_opaque import render_opaque
-from etsplat.ops.soup_activation import soup_activation
-from etsplat.ops.soup_colors import soup_colors
-from etsplat.ops.spherical_harmonics import spherical_harmonics
-from etsplat.ops.triangle_area import mean_area
-from etsplat.ops.triangle_channels import triangle_channels
-from etsplat.ops.weighted_sum import Term, weighted_sum
 from helpers.engines import on
-from helpers.scenes import EVERYTHING, mesh, soup
-
-Operation = Callable[..., list[Tensor]]
-Case = tuple[dict[str, Tensor], Operation]  # what gradients reach, and outputs from it
-
-
-def _splat(scene: dict, engine: str, names: tuple[str, ...], **options) -> Case:
-    rest = {k: v for k, v in scene.items() if k not in names}
-
-    def run(**leaves: Tensor) -> list[Tensor]:
-        result = on(engine, rasterize, **{**rest, **leaves}, **options)
-        images = result.color, result.alpha, result.depth, result.median_depth, result.normal, result.distortion
-        return [image for image in images if image is not None]
-
-    return {name: scene[name] for name in names}, run
-
-
-def _rasterize(rng: torch.Generator, engine: str, **options) -> Case:
-    names = ("vertices", "face_colors", "opacities", "sigma", "viewmats", "Ks", "backgrounds")
-    return _splat(soup(rng, 40, **options), engine, names)
-
-
-def _rasterize_everything(rng: torch.Generator, engine: str) -> Case:
-    scene = mesh(rng)
-    scene["vertex_colors"] = torch.rand(len(scene["vertices"]), 3, generator=rng)
-    del scene["face_colors"]
-    names = ("vertices", "vertex_colors", "opacities", "sigma", "viewmats", "Ks", "backgrounds")
-    return _splat(scene, engine, names, **EVERYTHING)
-
-
-def _antialiased(rng: torch.Generator, engine: str, kind: str) -> Case:
-    scene = mesh(rng)
-    faces, points = scene["faces"], scene["vertices"]
-    connectivity = MeshTopology.from_faces(faces, len(points)).connectivity
-    colors = torch.rand(len(faces) if kind == "face_colors" else len(points), 3, generator=rng)
-
-    def run(vertices: Tensor, colors: Tensor, backgrounds: Tensor) -> list[Tensor]:
-        view = scene["viewmats"] * 1.0, scene["Ks"] * 1.0, scene["width"], scene["height"]
-        options = {kind: colors, "backgrounds": backgrounds}
-        return [
-            on(
-                engine, rasterize_antialiased, vertices, connectivity=connectivity, cameras=Cameras(*view), **options
-            ).color
-        ]
-
-    return {"vertices": points, "colors": colors, "backgrounds": scene["backgrounds"]}, run
-
-
-def _soup_activation(rng: torch.Generator, engine: str) -> Case:
-    logits, raw = torch.randn(2, 30, generator=rng)
-    corners = torch.randn(30, 3, 3, generator=rng)
-
-    def run(logits: Tensor, raw: Tensor) -> list[Tensor]:
-        camera = Cameras(torch.eye(4)[None], intrinsics(50, 32, 32)[None], 32, 32)
-        return [*on(engine, soup_activation, corners, logits, raw, (0.1, 1.0), camera)]
-
-    return {"logits": logits, "raw": raw}, run
-
-
-def _soup_colors(rng: torch.Generator, engine: str) -> Case:
-    leaves = {
-        "vertices": torch.randn(30, 3, 3, generator=rng),
-        "sh_dc": torch.randn(30, 1, 3, generator=rng),
-        "sh_rest": torch.randn(30, 8, 3, generator=rng),
-    }
-    centers = torch.randn(2, 3, generator=rng)
-
-    def run(**leaves: Tensor) -> list[Tensor]:
-        return [on(engine, soup_colors, **leaves, centers=centers, degree=2)]
-
-    return leaves, run
-
-
-def _harmonics(rng: torch.Generator, engine: str) -> Case:
-    leaves = {"coefficients": torch.randn(30, 9, 3, generator=rng), "directions": torch.randn(30, 3, generator=rng)}
-    return leaves, lambda **leaves: [on(engine, spherical_harmonics, **leaves, degree=2)]
-
-
-def _mean_area(rng: torch.Generator, engine: str) -> Case:
-    return {"vertices": torch.randn(30, 3, 3, generator=rng)}, lambda vertices: [on(engine, mean_area, vertices)]
-
-
-def _photometric(rng: torch.Generator, engine: str) -> Case:
-    color, target = torch.rand(2, 2, 20, 24, 3, generator=rng)
-    return {"color": color}, lambda color: [on(engine, photometric_loss, color, target, dssim_weight=0.2)]
-
-
-def _normal_consistency(rng: torch.Generator, engine: str) -> Case:
-    normals = torch.nn.functional.normalize(torch.randn(2, 20, 24, 3, generator=rng), dim=-1)
-    depth, alpha = 2 + torch.rand(2, 2, 20, 24, 1, generator=rng)
-    views = torch.eye(4).expand(2, 4, 4), intrinsics(50, 24, 20).expand(2, 3, 3)
-
-    def run(normals: Tensor, depth: Tensor) -> list[Tensor]:
-        return [on(engine, normal_consistency, normals, depth, alpha, *views)]
-
-    return {"normals": normals, "depth": depth}, run
-
-
-def _mesh_energies(rng: torch.Generator, engine: str) -> Case:
-    vertices, faces = icosphere(1)
-    connectivity = MeshTopology.from_faces(faces, len(vertices)).connectivity
-    points = vertices.float() + 0.1 * torch.randn(vertices.shape, generator=rng)
-    return {"vertices": points}, lambda vertices: [*on(engine, mesh_energies, vertices, connectivity)]
-
-
-def _channels(rng: torch.Generator, engine: str) -> Case:
-    scene = soup(rng, 30)
-
-    def run(corners: Tensor, viewmats: Tensor) -> list[Tensor]:
-        return [on(engine, triangle_channels, corners, viewmats, depth=True, normals=True)]
-
-    return {"corners": scene["vertices"], "viewmats": scene["viewmats"]}, run
-
-
-def _pick_values(rng: torch.Generator, engine: str) -> Case:
-    chosen = torch.randint(0, 31, (2, 20, 24), generator=rng, dtype=torch.int32)
-    values = torch.rand(2, 30, generator=rng)
-    return {"values": values}, lambda values: [on(engine, pick_values, values, chosen * 1)]
-
-
-def _weighted_sum(rng: torch.Generator, engine: str) -> Case:
-    first, second = torch.rand(2, generator=rng)
-    terms = {"first": first, "second": second}
-    return terms, lambda first, second: [on(engine, weighted_sum, first, [Term(0.5, second, -2)])]
-
-
-CASES: dict[str, Callable[[torch.Generator, str], Case]] = {
-    "rasterize": _rasterize,
-    "rasterize_many_channels": partial(_rasterize, channels=20),
-    "rasterize_everything": _rasterize_everything,
-    "antialiased_faces": partial(_antialiased, kind="face_colors"),
-    "antialiased_vertices": partial(_antialiased, kind="vertex_colors"),
-    "soup_activation": _soup_activation,
-    "soup_colors": _soup_colors,
-    "spherical_harmonics": _harmonics,
-    "mean_area": _mean_area,
-    "photometric_loss": _photometric,
-    "normal_consistency": _normal_consistency,
-    "mesh_energies": _mesh_energies,
-    "triangle_channels": _channels,
-    "pick_values": _pick_values,
-    "weighted_sum": _weighted_sum,
-}
+from helpers.operations import CASES, Case, Run, loss
+from helpers.scenes import mesh, soup
 
 
 @pytest.fixture(params=["cpu", "cuda"])
@@ -184,10 +31,6 @@ def native(request: pytest.FixtureRequest) -> str:
     return request.param
 
 
-def _loss(outputs: list[Tensor]) -> Tensor:
-    return torch.stack([(output * output).sum() for output in outputs]).sum()
-
-
 def _gradients(case: Case, loss: Callable[..., Tensor], runs: int = 1) -> dict[str, Tensor]:
     leaves = {name: value.detach().clone().requires_grad_() for name, value in case[0].items()}
     total = loss(leaves)
@@ -196,9 +39,9 @@ def _gradients(case: Case, loss: Callable[..., Tensor], runs: int = 1) -> dict[s
     return {name: leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
 
 
-def _plainly(run: Operation, leaves: dict[str, Tensor]) -> Tensor:
+def _plainly(run: Run, leaves: dict[str, Tensor]) -> Tensor:
     # What the operation gets is freed as soon as autograd does not need it.
-    return _loss(run(**{name: leaf * 1.0 for name, leaf in leaves.items()}))
+    return loss(run(**{name: leaf * 1.0 for name, leaf in leaves.items()}))
 
 
 def _same(found: dict[str, Tensor], expected: dict[str, Tensor], tolerance: float = 0.0) -> None:
@@ -224,12 +67,16 @@ def _cloned_and_freed(saved: Tensor) -> Tensor:
 @pytest.mark.sanitize
 @pytest.mark.parametrize("name", CASES)
 class TestSavedTensors:
-    def test_checkpoint_gives_the_same_gradients(self, name, native, rng):
+    @pytest.mark.parametrize("reentrant", [True, False])
+    def test_checkpoint_gives_the_same_gradients(self, name, reentrant, native, rng):
         case = CASES[name](rng, native)
         expected = _gradients(case, partial(_plainly, case[1]))
 
         def loss(leaves: dict[str, Tensor]) -> Tensor:
-            value = checkpoint(partial(_plainly, case[1]), leaves, use_reentrant=False)
+            def run(*values: Tensor) -> Tensor:
+                return _plainly(case[1], dict(zip(leaves, values, strict=True)))
+
+            value = checkpoint(run, *leaves.values(), use_reentrant=reentrant)
             spoilt = _spoil_free_memory()
             assert len(spoilt) > 0
             return value

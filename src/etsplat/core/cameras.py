@@ -8,6 +8,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from etsplat.core.precision import as_given
+
 
 @dataclass(frozen=True)
 class Cameras:
@@ -72,6 +74,7 @@ class Cameras:
         )
 
 
+@as_given
 def camera_centers(viewmats: Float[Tensor, "B 4 4"]) -> Float[Tensor, "B 3"]:
     """Positions of cameras in world space, -R^T t."""
     return -torch.einsum("bji,bj->bi", viewmats[:, :3, :3], viewmats[:, :3, 3])
@@ -100,6 +103,7 @@ def view_arguments(
     return cameras.viewmats, cameras.Ks, cameras.width, cameras.height
 
 
+@as_given
 def look_at(
     eye: Float[Tensor, "*batch 3"], target: Float[Tensor, "*#batch 3"], up: Float[Tensor, "*#batch 3"]
 ) -> Float[Tensor, "*batch 4 4"]:

@@ -22,7 +22,8 @@ def check_shape(name: str, tensor: Tensor, *shapes: Shape, sizes: dict[str, int]
         sizes: Letters with known sizes, shared by the checks of several arguments; letters first met here are added.
 
     Raises:
-        ValueError: It is no tensor, has no memory of its own, or no shape matches.
+        ValueError: It is no tensor, has no memory of its own or is within a transform of torch.func, or no shape
+            matches.
     """
     sizes = {} if sizes is None else sizes
     wanted = " or ".join("(" + ", ".join(map(str, shape)) + ("," if len(shape) == 1 else "") + ")" for shape in shapes)
@@ -52,7 +53,7 @@ def dense(tensor: Tensor, name: str = "gradient") -> Tensor:
     Views such as ``torch.view_as_real(z.conj())[..., 1]`` carry a sign that memory does not show.
 
     Raises:
-        ValueError: It has no memory; the message says ``name``.
+        ValueError: It has no memory, or is within a transform of torch.func; the message says ``name``.
     """
     _check_memory(name, tensor)
     return tensor.detach().resolve_conj().resolve_neg().contiguous()
@@ -60,6 +61,11 @@ def dense(tensor: Tensor, name: str = "gradient") -> Tensor:
 
 def _check_memory(name: str, tensor: Tensor) -> None:
     """Raise ValueError unless every element has its place in memory."""
+    if torch._C._functorch.is_functorch_wrapped_tensor(tensor):  # pyright: ignore[reportAttributeAccessIssue]
+        raise ValueError(
+            f"{name} must be a plain tensor, got one within a transform of torch.func, which native code cannot see "
+            "through: take torch.autograd.grad for gradients, and several cameras in one call in the place of vmap"
+        )
     if tensor.layout != torch.strided:
         raise ValueError(f"{name} must be a dense tensor, got layout {tensor.layout}")
     if tensor._is_zerotensor():

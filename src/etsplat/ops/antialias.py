@@ -19,6 +19,7 @@ from torch import Tensor
 
 from etsplat.core.cameras import Cameras, view_arguments
 from etsplat.core.connectivity import MeshConnectivity
+from etsplat.core.precision import as_given
 from etsplat.core.rasterization import Rasterization
 from etsplat.core.validation import check_device, check_like, check_shape
 from etsplat.engines.choice import engine_for
@@ -26,6 +27,7 @@ from etsplat.ops.rasterize import one_kind_of_colors
 from etsplat.ops.rasterize_opaque import rasterize_opaque
 
 
+@as_given
 def rasterize_antialiased(
     vertices: Float[Tensor, "V 3"],
     *,

@@ -9,10 +9,12 @@ world, differentiated centrally. On the border of one pixel, and where the point
 from jaxtyping import Float
 from torch import Tensor
 
+from etsplat.core.precision import as_given
 from etsplat.core.validation import check_like, check_shape
 from etsplat.engines.choice import engine_for
 
 
+@as_given
 def normal_consistency(
     normals: Float[Tensor, "B H W 3"],
     depth: Float[Tensor, "B H W 1"],

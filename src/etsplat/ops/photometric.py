@@ -13,10 +13,12 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from etsplat.core.precision import as_given
 from etsplat.core.validation import check_choice, check_device, check_like, check_shape
 from etsplat.engines.choice import engine_for
 
 
+@as_given
 def photometric_loss(
     color: Float[Tensor, "B H W 3"],
     target: Float[Tensor, "B H W C"] | UInt8[Tensor, "B H W C"],

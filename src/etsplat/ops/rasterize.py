@@ -11,6 +11,7 @@ from torch import Tensor
 
 from etsplat.core.cameras import Cameras, view_arguments
 from etsplat.core.kernels import DISTANCES, KERNELS, kernel_name
+from etsplat.core.precision import as_given
 from etsplat.core.rasterization import (
     DEFAULT_CUTOFFS,
     DEPTHS,
@@ -37,6 +38,7 @@ COLORS = ("face_colors", "vertex_colors", "corner_colors")
 _LARGEST_COLOR = 1e30  # beyond, the gradients of the triangles around overflow
 
 
+@as_given
 def rasterize(
     vertices: Float[Tensor, "V 3"] | Float[Tensor, "N 3 3"],
     *,

@@ -4,10 +4,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from etsplat.core.harmonics import MAX_DEGREE
+from etsplat.core.precision import as_given
 from etsplat.core.validation import check_like, check_shape
 from etsplat.engines.choice import engine_for
 
 
+@as_given
 def soup_colors(
     vertices: Float[Tensor, "N 3 3"],
     sh_dc: Float[Tensor, "N 1 3"],

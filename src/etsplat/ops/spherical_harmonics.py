@@ -9,10 +9,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from etsplat.core.harmonics import MAX_DEGREE
+from etsplat.core.precision import as_given
 from etsplat.core.validation import check_like, check_shape
 from etsplat.engines.choice import engine_for
 
 
+@as_given
 def spherical_harmonics(
     coefficients: Float[Tensor, "N K C"],
     directions: Float[Tensor, "N 3"] | Float[Tensor, "B N 3"],

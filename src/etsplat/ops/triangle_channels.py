@@ -6,10 +6,12 @@ z = (R (v0 + v1 + v2) / 3 + t)_z      n = +- normalize((v1 - v0) x (v2 - v0)),  
 from jaxtyping import Float
 from torch import Tensor
 
+from etsplat.core.precision import as_given
 from etsplat.core.validation import check_like, check_shape
 from etsplat.engines.choice import engine_for
 
 
+@as_given
 def triangle_channels(
     corners: Float[Tensor, "N 3 3"],
     viewmats: Float[Tensor, "B 4 4"],

@@ -1,0 +1,150 @@
+"""What torch can do with a differentiable function holds for every operation, or is refused in plain words.
+
+Checkpoints and hooks on saved tensors, of both kinds, are in test_memory.py, over the same table.
+"""
+
+import importlib
+import inspect
+import pkgutil
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+import etsplat
+from etsplat import ops
+from helpers.operations import CASES, COMPOSED, SMOOTH, loss
+
+WITHOUT_GRADIENTS = {
+    "rasterize_opaque": "z-buffer: runs without gradients",
+    "render_opaque": "z-buffer: runs without gradients",
+    "update_statistics": "in place, of detached statistics",
+    "update_statistics_queued": "in place, of detached statistics",
+    "one_kind_of_colors": "a check",
+    "load_nvdiffrast": "imports a module",
+    "rasterize_nvdiffrast": "nvdiffrast's own; needs a GPU and that program",
+    "ellipse": "camera paths: float64 on the host",
+    "interpolated": "camera paths: float64 on the host",
+    "orbit": "camera paths: float64 on the host",
+    "spiral": "camera paths: float64 on the host",
+    "start_soup": "makes parameters from points",
+    "geometry_metrics": "returns Python numbers",
+    "psnr": "returns a Python number",
+    "silhouette_iou": "returns a Python number",
+    "ssim": "returns a Python number",
+    "longest_edge_plan": "returns a plan of indices",
+    "save_image": "writes a file",
+    "save_mesh": "writes a file",
+}
+"""Public functions of tensors that are not in the table, and why."""
+
+
+def _of_tensors(function: Any) -> bool:
+    """Whether it takes floating-point tensors."""
+    if not inspect.isfunction(function):
+        return False
+    return any("Float[" in str(p.annotation) for p in inspect.signature(function).parameters.values())
+
+
+def test_every_public_operation_is_in_the_table_or_says_why_not() -> None:
+    """Those of `etsplat` that take tensors, and all of `etsplat.ops`."""
+    public = {name for name in etsplat.__all__ if _of_tensors(getattr(etsplat, name))}
+    for module in pkgutil.iter_modules(ops.__path__, "etsplat.ops."):
+        members = vars(importlib.import_module(module.name)).items()
+        public |= {
+            name
+            for name, value in members
+            if inspect.isfunction(value) and value.__module__ == module.name and not name.startswith("_")
+        }
+    tabled = {name.split("/")[0] for name in CASES | COMPOSED if "." not in name}
+    assert public - tabled == set(WITHOUT_GRADIENTS)
+
+
+FACTORIES = CASES | COMPOSED
+EVERY_OPERATION = pytest.mark.parametrize("name", FACTORIES)
+
+
+def _grown(name: str, engine: str, rng: torch.Generator) -> tuple[list[Tensor], Callable[..., list[Tensor]]]:
+    """Leaves that want gradients, and the outputs as a function of them."""
+    leaves, run = FACTORIES[name](rng, engine)
+
+    def outputs(*values: Tensor) -> list[Tensor]:
+        return run(**dict(zip(leaves, values, strict=True)))
+
+    return [leaf.clone().requires_grad_() for leaf in leaves.values()], outputs
+
+
+def _gradients(values: list[Tensor], outputs: Callable[..., list[Tensor]]) -> list[Tensor]:
+    return list(torch.autograd.grad(loss(outputs(*values)), values))
+
+
+def _assert_same(found: list[Tensor], expected: list[Tensor]) -> None:
+    assert len(found) == len(expected) > 0
+    for one, other in zip(found, expected, strict=True):
+        assert one.dtype == other.dtype
+        assert torch.equal(one, other)
+
+
+@pytest.mark.parametrize("name", SMOOTH)
+def test_gradients_are_derivatives(name, rng):
+    """gradcheck of the reference engine, in float64."""
+    leaves, run = SMOOTH[name](rng, "reference")
+    assert torch.autograd.gradcheck(
+        lambda *values: tuple(run(**dict(zip(leaves, values, strict=True)))),
+        [leaf.requires_grad_() for leaf in leaves.values()],
+        fast_mode=True,
+    )
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_compiled_by_torch_it_is_the_same(name, rng):
+    """torch.compile(fullgraph=False): the same bits, with their gradients; what it cannot trace breaks its graph."""
+    values, outputs = _grown(name, "cpu", rng)
+    torch._dynamo.reset()
+    compiled = torch.compile(outputs, backend="eager", fullgraph=False)
+    _assert_same(_gradients(values, compiled), _gradients(values, outputs))
+
+
+@EVERY_OPERATION
+def test_autocast_changes_nothing(name, engine, rng, monkeypatch):
+    """Operations compute in the precision of their arguments, also where autocast is on."""
+    monkeypatch.setattr("helpers.operations.dtype_of", lambda engine: torch.float32)  # float64 it leaves alone
+    values, outputs = _grown(name, engine, rng)
+    expected = outputs(*values)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        _assert_same(outputs(*values), expected)
+
+
+@EVERY_OPERATION
+def test_inference_mode_changes_nothing(name, engine, rng):
+    values, outputs = _grown(name, engine, rng)
+    expected = outputs(*values)
+    with torch.inference_mode():
+        found = outputs(*(value.detach().clone() for value in values))
+    assert all(output.is_inference() for output in found)
+    _assert_same(found, expected)
+
+
+@EVERY_OPERATION
+@pytest.mark.parametrize("transform", ["grad", "vmap", "jvp"])
+def test_transforms_of_torch_func_are_refused(name, transform, engine, rng):
+    """Native code reads memory, which tensors within a transform do not show."""
+    if name == "look_at":
+        pytest.skip("made of torch alone, which can do this")
+    values, outputs = _grown(name, engine, rng)
+    values = [value.detach() for value in values]
+
+    def total(*values: Tensor) -> Tensor:
+        return loss(outputs(*values))
+
+    def call() -> Any:
+        if transform == "jvp":
+            return torch.func.jvp(total, tuple(values), tuple(map(torch.ones_like, values)))
+        if transform == "vmap":
+            return torch.func.vmap(total)(*(value[None] for value in values))
+        return torch.func.grad(total)(*values)
+
+    with pytest.raises(ValueError, match=r"must be a plain tensor, got one within a transform of torch\.func"):
+        call()
