@@ -1,13 +1,18 @@
+import io
+import struct
+import zlib
+
 import numpy as np
 import pytest
 import torch
-from PIL import Image
+from PIL import EpsImagePlugin, Image
 
 from etsplat.core.errors import InputError
 from etsplat.io.images import (
     image_size,
     load_image,
     load_mask,
+    load_pixels,
     over_background,
     premultiply,
     resize_image,
@@ -77,6 +82,44 @@ def test_missing_empty_and_foreign_files_are_input_errors(tmp_path, content, mes
         path.write_bytes(content)
     with pytest.raises(InputError, match=message):
         load_image(path)
+
+
+@pytest.mark.parametrize("kind", ["TIFF", "GIF", "BMP", "TGA", "JPEG2000", "PPM", "ICO", "PCX", "SGI"])
+def test_no_other_kind_of_image_is_read_whatever_its_name(tmp_path, kind):
+    buffer = io.BytesIO()
+    try:
+        Image.fromarray(np.full((24, 32, 3), 90, np.uint8)).save(buffer, kind)
+    except OSError as error:
+        pytest.skip(f"Pillow was built without it: {error}")
+    (tmp_path / "0001.jpg").write_bytes(buffer.getvalue())
+    for read in (load_image, load_mask, image_size, lambda path: load_pixels(path, 32, 24)):
+        with pytest.raises(InputError, match=r"0001\.jpg: not an image that can be read"):
+            read(tmp_path / "0001.jpg")
+
+
+def test_postscript_starts_no_program(tmp_path, monkeypatch):
+    started = []
+    monkeypatch.setattr(EpsImagePlugin, "Ghostscript", lambda *arguments, **_: started.append(arguments))
+    (tmp_path / "0001.jpg").write_bytes(
+        b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 32 24\n%%EndComments\nshowpage\n%%EOF\n"
+    )
+    with pytest.raises(InputError, match="not an image"):
+        load_image(tmp_path / "0001.jpg")
+    assert started == []
+
+
+@pytest.mark.parametrize(("width", "height"), [(40_000, 40_000), (13_000, 13_000), (2**31 - 1, 1)])
+def test_an_image_of_too_many_pixels_is_refused_before_it_is_decoded(tmp_path, width, height):
+    """Its file is small: 1.6e9 pixels of one bit unpack to 6 GB of floats."""
+
+    def chunk(kind, content):
+        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+
+    head = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 1, 0, 0, 0, 0))
+    rows = chunk(b"IDAT", zlib.compress(bytes(1 << 20)))
+    (tmp_path / "a.png").write_bytes(b"\x89PNG\r\n\x1a\n" + head + rows + chunk(b"IEND", b""))
+    with pytest.raises(InputError, match=r"a\.png: .*pixels"):
+        load_image(tmp_path / "a.png")
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])

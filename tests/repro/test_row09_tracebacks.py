@@ -38,9 +38,9 @@ def mesh(suffix: str, text: str) -> Callable[[Path], object]:
     9,
     "a mesh file's traceback",
     [
-        ("obj-index", mesh(".obj", TRIANGLE + "f 99999999999999999999 2 3\n"), OverflowError),
-        ("obj-index-negative", mesh(".obj", TRIANGLE + "f -99999999999999999999 2 3\n"), OverflowError),
-        ("off-color-word", mesh(".off", "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2 red green blue\n"), ValueError),
+        ("obj-index", mesh(".obj", TRIANGLE + "f 99999999999999999999 2 3\n"), None),
+        ("obj-index-negative", mesh(".obj", TRIANGLE + "f -99999999999999999999 2 3\n"), None),
+        ("off-color-word", mesh(".off", "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2 red green blue\n"), None),
     ],
 )
 def test_meshes(act, tmp_path):
@@ -142,7 +142,7 @@ def more(count: int) -> list[str]:
     9,
     "a traceback of a PLY file",
     [
-        ("property-twice", gaussians([*GAUSSIAN, "x"]), ValueError),
+        ("property-twice", gaussians([*GAUSSIAN, "x"]), None),
         ("1-f_rest", gaussians(more(1)), RuntimeError),
         ("4-f_rest", gaussians(more(4)), RuntimeError),
         ("48-f_rest", gaussians(more(48)), ValueError),
@@ -171,7 +171,7 @@ def points(fields: str) -> Callable[[Path], object]:
     9,
     "a traceback of the points' PLY file",
     [
-        ("property-twice", points("x y z x red green blue"), ValueError),
+        ("property-twice", points("x y z x red green blue"), None),
     ],
 )
 def test_point_files(act, tmp_path):
@@ -281,21 +281,21 @@ def test_triangle_splatting_files(act, tmp_path):
         act(tmp_path)
 
 
-FOUND: list[tuple[str, Leak]] = [
+FOUND: list[tuple[str, Leak | None]] = [
     ("colmap_txt_OSError_frames.py_143_sparse_0_images.txt", OSError),
-    ("eply_ValueError_ply_tables.py_71", ValueError),
+    ("eply_ValueError_ply_tables.py_71", None),
     ("eply_ValueError_soup_import.py_108", ValueError),
     ("eply_ValueError_soup_import.py_168", ValueError),
     ("eply_ValueError_soup_import.py_98", ValueError),
-    ("gply_ValueError_ply_tables.py_71", ValueError),
-    ("image_NotImplementedError_images.py_167", NotImplementedError),
-    ("image_RuntimeError_images.py_167", RuntimeError),
-    ("image_RuntimeError_images.py_182", RuntimeError),
-    ("image_ValueError_images.py_167", ValueError),
+    ("gply_ValueError_ply_tables.py_71", None),
+    ("image_NotImplementedError_images.py_167", None),
+    ("image_RuntimeError_images.py_167", None),
+    ("image_RuntimeError_images.py_182", None),
+    ("image_ValueError_images.py_167", None),
     ("json_OverflowError_transforms.py_263_transforms.json", OverflowError),
     ("json_OverflowError_transforms.py_280_transforms.json", OverflowError),
-    ("mesh_OverflowError__mesh_readers.py_57.obj", OverflowError),
-    ("points_ValueError_ply_tables.py_71_points.ply", ValueError),
+    ("mesh_OverflowError__mesh_readers.py_57.obj", None),
+    ("points_ValueError_ply_tables.py_71_points.ply", None),
 ]
 
 

@@ -81,8 +81,8 @@ def unknown_color_off(folder: Path) -> object:
         ("pose", huge_pose, NOTHING),
         ("focal-length", huge_focal_length, NOTHING),
         ("1x1-photo", tiny_photo, NOTHING),
-        ("obj-color", unknown_color, NOTHING),
-        ("off-color", unknown_color_off, NOTHING),
+        ("obj-color", unknown_color, None),
+        ("off-color", unknown_color_off, None),
     ],
 )
 def test_files(act, tmp_path):

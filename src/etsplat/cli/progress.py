@@ -10,6 +10,7 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TaskID, TextColumn
 from rich.table import Table
 from rich.text import Text
 
+from etsplat.io.images import open_image
 from etsplat.optim.loop import DoneEvent, Event, StepEvent
 from etsplat.tasks.running import NoteEvent, PrepareEvent
 
@@ -108,7 +109,7 @@ def print_summary(console: Console, run_dir: Path) -> None:
 
     run = read_run(run_dir)
     if console.is_terminal and console.color_system == "truecolor" and (run_dir / "overview.png").is_file():
-        with Image.open(run_dir / "overview.png") as image:
+        with open_image(run_dir / "overview.png") as image:
             console.print(half_blocks(image, min(PICTURE_COLUMNS, console.width)))
     metrics = Table(box=None, show_header=False, pad_edge=False)
     for metric in cards_of(run):

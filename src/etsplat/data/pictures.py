@@ -8,7 +8,6 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
-from typing import Protocol
 
 import torch
 from jaxtyping import Float, UInt8
@@ -25,51 +24,12 @@ def as_float(pixels: Pixels) -> Float[Tensor, "H W C"]:
     return pixels.float() / 255 if pixels.dtype == torch.uint8 else pixels
 
 
-class Pictures(Protocol):
-    """Photos by view."""
-
-    @property
-    def sizes(self) -> Sequence[tuple[int, int]]:
-        """(width, height) of each."""
-        ...
-
-    @property
-    def total_bytes(self) -> int:
-        """What all of them take in memory."""
-        ...
-
-    @property
-    def streamed(self) -> bool:
-        """Whether they do not fit into memory, so that each is made anew when it is needed."""
-        ...
-
-    def __getitem__(self, index: int) -> Pixels:
-        """Raises IndexError where there is no such view, InputError where its file is damaged or has gone."""
-        ...
-
-    def __iter__(self) -> Iterator[Pixels]:
-        """Of all views in order."""
-        ...
-
-    def mask(self, index: int) -> UInt8[Tensor, "H W"] | None:
-        """255 where pixels of the view count and 0 where they are to be ignored; None if all count."""
-        ...
-
-    def fingerprint(self) -> bytes:
-        """A hash of what they show; the same for a copy."""
-        ...
-
-    def expect(self, indices: Sequence[int]) -> None:
-        """Start to make those that are needed soon, as many as fit."""
-        ...
-
-
 @dataclass(frozen=True)
 class Picture:
     """One photo.
 
     Attributes:
-        pixels: as of `Pictures`.
+        pixels: bytes of 3 channels, or of 4 premultiplied; or premultiplied RGBA in [0, 1].
         mask: (H, W), 255 where pixels count and 0 where they are to be ignored; None if all count.
     """
 
@@ -77,41 +37,65 @@ class Picture:
     mask: UInt8[Tensor, "H W"] | None = None
 
 
-class StoredPictures:
-    """Photos that are in memory already."""
+class Pictures:
+    """Photos by view.
 
-    streamed = False
+    Attributes:
+        sizes: (width, height) of each.
+        total_bytes: what all of them take in memory.
+        streamed: whether they do not fit into memory, so that each is made anew when it is needed.
+    """
 
-    def __init__(self, pixels: Sequence[Pixels], masks: Sequence[UInt8[Tensor, "H W"] | None] | None = None) -> None:
-        self._pixels = list(pixels)
-        self._masks = [None] * len(self._pixels) if masks is None else list(masks)
-        self.sizes = [(image.shape[1], image.shape[0]) for image in self._pixels]
-        kept = [*self._pixels, *(mask for mask in self._masks if mask is not None)]
-        self.total_bytes = sum(image.numel() * image.element_size() for image in kept)
+    sizes: list[tuple[int, int]]
+    total_bytes: int
+    streamed: bool = False
+
+    def picture(self, index: int) -> Picture:
+        """Raises IndexError where there is no such view, InputError where its file is damaged or has gone."""
+        raise NotImplementedError
+
+    def fingerprint(self) -> bytes:
+        """A hash of what they show; the same for a copy."""
+        raise NotImplementedError
+
+    def expect(self, indices: Sequence[int]) -> None:
+        """Start to make those that are needed soon, as many as fit."""
 
     def __getitem__(self, index: int) -> Pixels:
-        """As they were handed in."""
-        return self._pixels[index]
+        """Raises what `picture` raises."""
+        return self.picture(index).pixels
 
     def __iter__(self) -> Iterator[Pixels]:
-        return iter(self._pixels)
+        return (self[index] for index in range(len(self.sizes)))
 
     def mask(self, index: int) -> UInt8[Tensor, "H W"] | None:
-        """As handed in; None if all pixels count."""
-        return self._masks[index]
+        """(H, W), 255 where pixels of the view count and 0 where they are to be ignored; None if all count."""
+        return self.picture(index).mask
+
+
+class StoredPictures(Pictures):
+    """Photos that are in memory already."""
+
+    def __init__(self, pixels: Sequence[Pixels], masks: Sequence[UInt8[Tensor, "H W"] | None] | None = None) -> None:
+        masks = [None] * len(pixels) if masks is None else masks
+        self._pictures = [Picture(image, mask) for image, mask in zip(pixels, masks, strict=True)]
+        self._tensors = [*pixels, *masks]
+        self.sizes = [(image.shape[1], image.shape[0]) for image in pixels]
+        self.total_bytes = sum(image.numel() * image.element_size() for image in self._tensors if image is not None)
+
+    def picture(self, index: int) -> Picture:
+        """As handed in."""
+        return self._pictures[index]
 
     def fingerprint(self) -> bytes:
         """Of all pixels and masks."""
         digest = hashlib.sha256()
-        for image in [*self._pixels, *self._masks]:
+        for image in self._tensors:
             digest.update(b"none" if image is None else image.contiguous().cpu().numpy().data)
         return digest.digest()
 
-    def expect(self, indices: Sequence[int]) -> None:
-        """Nothing to prepare."""
 
-
-class LazyPictures:
+class LazyPictures(Pictures):
     """Photos that are made when they are first asked for. Safe to use from several threads.
 
     Within `limit` bytes everything stays. Beyond it the photos used last are kept, and `expect` makes those that are
@@ -135,31 +119,28 @@ class LazyPictures:
             fingerprint: of all of them, without making any.
             limit: bytes that may be kept; None for half of the memory that is free.
         """
-        self.sizes = list(sizes)
-        self.fingerprint = fingerprint
-        self._make = make
+        self.sizes, self.total_bytes = list(sizes), sum(sizes_in_bytes)
+        self._make, self._bytes, self._fingerprint = make, list(sizes_in_bytes), fingerprint
         self._limit = available_memory() // 2 if limit is None else limit
-        self._bytes = list(sizes_in_bytes)
-        self.total_bytes = sum(self._bytes)
+        self.streamed = self.total_bytes > self._limit
         self._kept: OrderedDict[int, Future[Picture]] = OrderedDict()
         self._lock = threading.Lock()
         self._pool = ThreadPoolExecutor(max_workers=min(os.cpu_count() or 1, 8), thread_name_prefix="images")
 
-    @property
-    def streamed(self) -> bool:
-        """Whether the set is larger than the limit."""
-        return self.total_bytes > self._limit
-
-    def __getitem__(self, index: int) -> Pixels:
+    def picture(self, index: int) -> Picture:
         """Raises IndexError where there is no such view, and what making it raises."""
-        return self._picture(index).pixels
+        if not 0 <= index < len(self.sizes):
+            raise IndexError(f"view {index}: expected one in [0, {len(self.sizes)})")
+        try:
+            return self._future(index).result()
+        except BaseException:
+            with self._lock:
+                self._kept.pop(index, None)
+            raise
 
-    def __iter__(self) -> Iterator[Pixels]:
-        return (self[index] for index in range(len(self.sizes)))
-
-    def mask(self, index: int) -> UInt8[Tensor, "H W"] | None:
-        """(H, W), 255 where pixels of the view count and 0 where they are to be ignored; None if all count."""
-        return self._picture(index).mask
+    def fingerprint(self) -> bytes:
+        """Made by what it was constructed with."""
+        return self._fingerprint()
 
     def expect(self, indices: Sequence[int]) -> None:
         """Start to make those that are needed soon, as many as fit."""
@@ -192,16 +173,6 @@ class LazyPictures:
 
     def _check(self, index: int) -> None:
         self._make(index)  # and forgets it
-
-    def _picture(self, index: int) -> Picture:
-        if not 0 <= index < len(self.sizes):
-            raise IndexError(f"view {index}: expected one in [0, {len(self.sizes)})")
-        try:
-            return self._future(index).result()
-        except BaseException:
-            with self._lock:
-                self._kept.pop(index, None)
-            raise
 
     def _future(self, index: int) -> Future[Picture]:
         with self._lock:

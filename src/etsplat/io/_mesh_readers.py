@@ -1,4 +1,4 @@
-"""Mesh readers by suffix. OBJ has its own (it keeps the file's connectivity); the others go through trimesh.
+"""Mesh readers by suffix. OBJ and OFF have their own, which keep the file's connectivity; the others use trimesh.
 
 trimesh is imported where it is used: it takes half a second, which runs without such files need not wait for.
 """
@@ -15,6 +15,8 @@ from etsplat.io.srgb import srgb_from_linear
 
 if TYPE_CHECKING:
     import trimesh
+
+Corners = tuple[int, int, int]
 
 
 @dataclass
@@ -35,53 +37,85 @@ class RawMesh:
 def read_obj(path: Path) -> RawMesh:
     """Positions (with the colours that may follow them) and faces of a Wavefront OBJ; everything else is ignored."""
     rows: list[list[float]] = []
-    faces: list[tuple[int, int, int]] = []
+    faces: list[Corners] = []
     file_faces = 0
     with open(path, encoding="utf-8", errors="replace") as file:
         for number, line in enumerate(file, 1):
             words = line.split()
             try:
                 if words[:1] == ["v"]:
-                    rows.append(_obj_vertex(words))
+                    if len(words) not in (4, 5, 7, 8):  # x y z [w] [r g b] (with alpha in some exporters)
+                        raise ValueError(f"a vertex with {len(words) - 1} numbers")
+                    values = [float(word) for word in words[1:]]
+                    rows.append(values[:6] if len(values) >= 6 else values[:3])
                 elif words[:1] == ["f"]:
-                    corners = _obj_corners(words, len(rows))
+                    corners = [int(word.split("/", 1)[0]) for word in words[1:]]
+                    if 0 in corners:
+                        raise ValueError("vertex number 0; they count from 1")
+                    faces += _fan([corner - 1 if corner > 0 else len(rows) + corner for corner in corners])
                     file_faces += 1
-                    faces += [(corners[0], corners[k], corners[k + 1]) for k in range(1, len(corners) - 1)]
             except ValueError as error:
                 raise InputError(
                     f"mesh {path}: line {number} is not valid OBJ ({error}); is the file cut short? Export it again"
                 ) from error
     table = np.array([row[:3] for row in rows], dtype=np.float64).reshape(-1, 3)
     colored = len(rows) > 0 and all(len(row) == 6 for row in rows)
-    colors = np.clip(np.array([row[3:] for row in rows], dtype=np.float64), 0, 1) if colored else None
+    colors = np.array([row[3:] for row in rows], dtype=np.float64) if colored else None
     return RawMesh(table, np.array(faces, dtype=np.int64).reshape(-1, 3), vertex_colors=colors, file_faces=file_faces)
 
 
-def _obj_vertex(words: list[str]) -> list[float]:
-    if len(words) not in (4, 5, 7, 8):  # x y z [w] [r g b] (with alpha in some exporters)
-        raise ValueError(f"a vertex with {len(words) - 1} numbers")
-    values = [float(word) for word in words[1:]]
-    return values[:6] if len(values) >= 6 else values[:3]
+def _fan(corners: list[int]) -> list[Corners]:
+    """The triangles that a polygon is cut into."""
+    if len(corners) < 3:
+        raise ValueError(f"a face with {len(corners)} corners")
+    if max(corners) > np.iinfo(np.int64).max or min(corners) < np.iinfo(np.int64).min:
+        raise ValueError(f"a face of vertex {max(corners, key=abs)}")
+    return [(corners[0], corners[k], corners[k + 1]) for k in range(1, len(corners) - 1)]
 
 
-def _obj_corners(words: list[str], vertex_count: int) -> list[int]:
-    if len(words) < 4:
-        raise ValueError(f"a face with {len(words) - 1} corners")
-    corners = [int(word.split("/", 1)[0]) for word in words[1:]]
-    if 0 in corners:
-        raise ValueError("vertex number 0; they count from 1")
-    return [corner - 1 if corner > 0 else vertex_count + corner for corner in corners]
+def read_off(path: Path) -> RawMesh:
+    """OFF. Colours behind the corners of every face are whole numbers up to 255 or fractions; vertices lose theirs."""
+    with open(path, encoding="utf-8", errors="replace") as file:
+        rows = [words for line in file if (words := line.split("#")[0].split())]
+    faces: list[Corners] = []
+    tails: list[list[str]] = []
+    try:
+        if rows[0].pop(0) not in ("OFF", "COFF"):
+            raise ValueError("its first word is not OFF")
+        vertex_count, face_count = (int(word) for word in (rows.pop(0) or rows.pop(0))[:2])
+        if min(vertex_count, face_count) < 0 or len(rows) < vertex_count + face_count:
+            raise ValueError(f"{len(rows)} lines for {vertex_count} vertices and {face_count} faces")
+        vertices = np.array([[float(word) for word in row[:3]] for row in rows[:vertex_count]], dtype=np.float64)
+        vertices = vertices.reshape(vertex_count, 3)
+        for row in rows[vertex_count : vertex_count + face_count]:
+            behind = 1 + int(row[0])
+            cut = _fan([int(word) for word in row[1:behind]])
+            if len(row) < behind:
+                raise ValueError(f"a face of {row[0]} corners with {len(row) - 1}")
+            faces += cut
+            tails += [row[behind : behind + 3]] * len(cut)
+        colors = None
+        if all(len(tail) == 3 for tail in tails):
+            whole = all(word.isdigit() for tail in tails for word in tail)
+            colors = np.array([[float(word) for word in tail] for tail in tails]) / (255 if whole else 1)
+    except (ValueError, IndexError) as error:
+        raise _unreadable(path, error) from error
+    table = np.array(faces, dtype=np.int64).reshape(-1, 3)
+    return RawMesh(vertices, table, face_colors=colors, file_faces=face_count)
 
 
 def read_ply(path: Path) -> RawMesh:
     """PLY, ASCII or binary, through trimesh; a file with fewer faces than its header announces is an error."""
-    return _with_announced_faces(path, _read_with_trimesh(path), _announced_ply_faces(path))
-
-
-def read_off(path: Path) -> RawMesh:
-    """OFF through trimesh; a file with fewer faces than its header announces is an error."""
-    mesh = _with_announced_faces(path, _read_with_trimesh(path), _announced_off_faces(path))
-    mesh.face_colors = _off_face_colors(path, len(mesh.faces))  # trimesh leaves them out
+    mesh = _read_with_trimesh(path)
+    with open(path, "rb") as file:
+        header = [line.split() for line in file.read(1 << 16).split(b"end_header")[0].splitlines()]
+    announced = next((int(words[2]) for words in header if words[:2] == [b"element", b"face"]), 0)
+    if len(mesh.faces) < announced:
+        raise InputError(
+            f"mesh {path}: {len(mesh.faces)} faces where its header announces {announced};"
+            " the file is cut short or has faces with fewer than three corners: export it again"
+        )
+    mesh.file_faces = announced
     return mesh
 
 
@@ -93,6 +127,14 @@ def read_gltf(path: Path) -> RawMesh:
     return mesh
 
 
+def _unreadable(path: Path, error: Exception) -> InputError:
+    detail = (str(error) or type(error).__name__).splitlines()[0]
+    if isinstance(error, ImportError):  # trimesh wanted a module that guesses encodings
+        detail = "neither its binary form nor text"
+    kind = path.suffix[1:].upper()
+    return InputError(f"mesh {path}: cannot be read as {kind} ({detail}); is the file cut short? Export it again")
+
+
 def _read_with_trimesh(path: Path) -> RawMesh:
     """All meshes of the file in one, vertices and faces as stored."""
     import trimesh
@@ -102,14 +144,21 @@ def _read_with_trimesh(path: Path) -> RawMesh:
         scene = trimesh.load_scene(str(path), process=False, skip_materials=True)
         parts = [_placed(scene, node) for node in scene.graph.nodes_geometry]
     except Exception as error:
-        detail = (str(error) or type(error).__name__).splitlines()[0]
-        if isinstance(error, ImportError):  # it wanted a module that guesses encodings
-            detail = "neither its binary form nor text"
-        kind = path.suffix[1:].upper()
-        raise InputError(
-            f"mesh {path}: cannot be read as {kind} ({detail}); is the file cut short? Export it again"
-        ) from error
-    return _concatenated(parts)
+        raise _unreadable(path, error) from error
+    if not parts:
+        return RawMesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
+    offsets = np.cumsum([0] + [len(part.vertices) for part in parts])
+    return RawMesh(
+        np.concatenate([part.vertices for part in parts]),
+        np.concatenate([part.faces + offset for part, offset in zip(parts, offsets, strict=False)]),
+        _joined([part.face_colors for part in parts]),
+        _joined([part.vertex_colors for part in parts]),
+    )
+
+
+def _joined(colors: list[np.ndarray | None]) -> np.ndarray | None:
+    present = [array for array in colors if array is not None]
+    return np.concatenate(present) if len(present) == len(colors) else None
 
 
 def _placed(scene: "trimesh.Scene", node: str) -> RawMesh:
@@ -121,17 +170,12 @@ def _placed(scene: "trimesh.Scene", node: str) -> RawMesh:
     vertices = trimesh.transform_points(geometry.vertices, transform)
     if not isinstance(geometry, trimesh.Trimesh):
         return RawMesh(vertices, np.zeros((0, 3), dtype=np.int64))
-    visual = geometry.visual
-    if not isinstance(visual, ColorVisuals):  # a texture
-        return RawMesh(vertices, np.asarray(geometry.faces))
-    face_colors = np.asarray(visual.face_colors)[:, :3] / 255 if visual.kind == "face" else _ply_face_colors(geometry)
-    per_vertex = visual.kind == "vertex" and face_colors is None
-    return RawMesh(
-        vertices,
-        np.asarray(geometry.faces),
-        face_colors=face_colors,
-        vertex_colors=np.asarray(visual.vertex_colors)[:, :3] / 255 if per_vertex else None,
-    )
+    mesh, visual = RawMesh(vertices, np.asarray(geometry.faces)), geometry.visual
+    if isinstance(visual, ColorVisuals):  # and no texture
+        mesh.face_colors = visual.face_colors[:, :3] / 255 if visual.kind == "face" else _ply_face_colors(geometry)
+        if visual.kind == "vertex" and mesh.face_colors is None:
+            mesh.vertex_colors = visual.vertex_colors[:, :3] / 255
+    return mesh
 
 
 def _ply_face_colors(mesh: "trimesh.Trimesh") -> np.ndarray | None:
@@ -143,61 +187,6 @@ def _ply_face_colors(mesh: "trimesh.Trimesh") -> np.ndarray | None:
     if len(channels) < 3 or len(channels[0]) != len(mesh.faces):
         return None
     return to_rgba(np.column_stack(channels))[:, :3] / 255
-
-
-def _concatenated(parts: list[RawMesh]) -> RawMesh:
-    def joined(arrays: list[np.ndarray | None]) -> np.ndarray | None:
-        present = [array for array in arrays if array is not None]
-        return np.concatenate(present) if present and len(present) == len(arrays) else None
-
-    if not parts:
-        return RawMesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
-    offsets = np.cumsum([0] + [len(part.vertices) for part in parts])
-    return RawMesh(
-        np.concatenate([part.vertices for part in parts]),
-        np.concatenate([part.faces + offset for part, offset in zip(parts, offsets, strict=False)]),
-        joined([part.face_colors for part in parts]),
-        joined([part.vertex_colors for part in parts]),
-    )
-
-
-def _with_announced_faces(path: Path, mesh: RawMesh, announced: int) -> RawMesh:
-    if len(mesh.faces) < announced:
-        raise InputError(
-            f"mesh {path}: {len(mesh.faces)} faces where its header announces {announced};"
-            " the file is cut short or has faces with fewer than three corners: export it again"
-        )
-    mesh.file_faces = announced
-    return mesh
-
-
-def _announced_ply_faces(path: Path) -> int:
-    with open(path, "rb") as file:
-        for line in file:
-            words = line.split()
-            if words[:2] == [b"element", b"face"]:
-                return int(words[2])
-            if words[:1] == [b"end_header"]:
-                break
-    return 0
-
-
-def _announced_off_faces(path: Path) -> int:
-    with open(path, encoding="utf-8", errors="replace") as file:
-        words = [word for line in file for word in line.split("#")[0].split()][:4]
-    return int(words[2])
-
-
-def _off_face_colors(path: Path, count: int) -> np.ndarray | None:
-    """Colours behind the corners of every face, as whole numbers up to 255 or fractions; None if a face has none."""
-    with open(path, encoding="utf-8", errors="replace") as file:
-        lines = [words for line in file if (words := line.split("#")[0].split())]
-    rows = lines[-count:]
-    if not rows or any(row[0] != "3" or len(row) < 7 for row in rows):
-        return None
-    colors = np.array([[float(word) for word in row[4:7]] for row in rows])
-    whole = all(word.isdigit() for row in rows for word in row[4:7])
-    return np.clip(colors / 255 if whole else colors, 0, 1)
 
 
 READERS: dict[str, Callable[[Path], RawMesh]] = {

@@ -16,6 +16,36 @@ from etsplat.io.paths import kind_of
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 """File name endings, lower case, that are tried when a scene names an image without one."""
 
+MAX_PIXELS = 160_000_000
+"""Larger images are refused before they are decoded: a file of a few kilobytes may unpack to gigabytes."""
+
+_FORMATS = ("PNG", "JPEG")
+
+
+def open_image(path: Path | str) -> Image.Image:
+    """An image that is not decoded yet, of the formats that are read here and within MAX_PIXELS.
+
+    Raises:
+        InputError: the file is missing, empty, too large, or not such an image.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"image {path}: no such file; check the path")
+    if path.stat().st_size == 0:
+        raise InputError(f"image {path}: the file is empty; copy it again")
+    try:
+        image = Image.open(path, formats=_FORMATS)  # without them Pillow tries all it knows, and starts programs
+    except UnidentifiedImageError as error:
+        raise InputError(f"image {path}: not an image that can be read; convert it to PNG or JPEG") from error
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        raise InputError(f"image {path}: cannot be opened ({error}); convert it to PNG or JPEG") from error
+    if image.width * image.height > MAX_PIXELS:
+        image.close()
+        raise InputError(
+            f"image {path}: is {image.width}x{image.height}, more than {MAX_PIXELS // 10**6} million pixels; shrink it"
+        )
+    return image
+
 
 def load_image(path: Path | str) -> Float[Tensor, "H W C"]:
     """Read an image as stored: straight (not premultiplied) colours, EXIF orientation not applied.
@@ -23,19 +53,18 @@ def load_image(path: Path | str) -> Float[Tensor, "H W C"]:
     Orientation is left alone because poses refer to the pixels as stored.
 
     Args:
-        path: a file that Pillow reads. Grey becomes RGB; palettes and CMYK become RGB or RGBA.
+        path: a PNG or JPEG file. Grey becomes RGB; palettes and CMYK become RGB or RGBA.
 
     Returns:
         float32 in [0, 1], 4 channels when the file has transparency, else 3.
 
     Raises:
-        InputError: the file is missing, empty, cut short, or not an image.
+        InputError: the file is missing, empty, cut short, too large, or not an image.
     """
-    with _open_image(path) as image:
-        # 16-bit grey has no direct conversion to RGB in Pillow (it would clip instead of scale).
-        if image.mode.startswith("I") or image.mode == "F":
-            return _scaled_grey(path, image)[..., None].repeat(1, 1, 3)
-        return _to_float(np.asarray(_converted(path, image, _color_mode(image))))
+    decoded = _decoded(path)
+    if isinstance(decoded, Tensor):
+        return decoded[..., None].repeat(1, 1, 3)
+    return torch.from_numpy(np.array(decoded)).to(torch.float32) / 255
 
 
 def load_pixels(path: Path | str, width: int, height: int) -> UInt8[Tensor, "H W C"]:
@@ -46,12 +75,9 @@ def load_pixels(path: Path | str, width: int, height: int) -> UInt8[Tensor, "H W
     Raises:
         InputError: as `load_image`.
     """
-    with _open_image(path) as image:
-        if image.mode.startswith("I") or image.mode == "F":
-            pixels = (_scaled_grey(path, image) * 255 + 0.5).to(torch.uint8).numpy()
-            loaded = Image.fromarray(pixels).convert("RGB")
-        else:
-            loaded = _converted(path, image, _color_mode(image))
+    loaded = _decoded(path)
+    if isinstance(loaded, Tensor):
+        loaded = Image.fromarray(to_8_bit(loaded).numpy()).convert("RGB")
     if loaded.mode == "RGBA":
         opaque = np.asarray(loaded)[..., 3].min() == 255
         loaded = loaded.convert("RGB" if opaque else "RGBa")
@@ -81,9 +107,6 @@ def load_mask_pixels(path: Path | str, width: int, height: int) -> UInt8[Tensor,
 def load_mask(path: Path | str) -> Float[Tensor, "H W"]:
     """Read a mask, 1 inside the object: the alpha channel where it varies, else the grey level.
 
-    Args:
-        path: a file that Pillow reads.
-
     Returns:
         float32 in [0, 1].
 
@@ -98,7 +121,7 @@ def load_mask(path: Path | str) -> Float[Tensor, "H W"]:
 
 def image_size(path: Path | str) -> tuple[int, int]:
     """(width, height) of an image file, from its header alone. Raises InputError as `load_image`."""
-    with _open_image(path) as image:
+    with open_image(path) as image:
         return image.size
 
 
@@ -157,39 +180,16 @@ def resize_image(image: Float[Tensor, "H W C"], width: int, height: int) -> Floa
     return resized[0].movedim(0, -1).clamp(0, 1).contiguous()
 
 
-def _open_image(path: Path | str) -> Image.Image:
-    path = Path(path)
-    if not path.is_file():
-        raise InputError(f"image {path}: no such file; check the path")
-    if path.stat().st_size == 0:
-        raise InputError(f"image {path}: the file is empty; copy it again")
-    try:
-        return Image.open(path)
-    except UnidentifiedImageError as error:
-        raise InputError(f"image {path}: not an image that can be read; convert it to PNG or JPEG") from error
-    except (OSError, Image.DecompressionBombError) as error:
-        raise InputError(f"image {path}: cannot be opened ({error}); convert it to PNG or JPEG") from error
-
-
-def _color_mode(image: Image.Image) -> str:
-    transparent = image.mode in ("RGBA", "LA", "PA", "La", "RGBa") or "transparency" in image.info
-    return "RGBA" if transparent else "RGB"
-
-
-def _converted(path: Path | str, image: Image.Image, mode: str) -> Image.Image:
-    """The decoded image in another mode."""
-    try:
-        return image.convert(mode)
-    except (OSError, ValueError, SyntaxError) as error:  # Pillow reports a damaged PNG chunk as a SyntaxError
-        detail = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputError(f"image {path}: damaged or cut short ({detail}); copy it again") from error
-
-
-def _scaled_grey(path: Path | str, image: Image.Image) -> Float[Tensor, "H W"]:
-    scale = 1.0 if image.mode == "F" else 65535.0
-    values = torch.from_numpy(np.asarray(_converted(path, image, image.mode)).astype(np.float32)) / scale
-    return values.clamp(0, 1)
-
-
-def _to_float(pixels: np.ndarray) -> Float[Tensor, "H W C"]:
-    return torch.from_numpy(pixels.copy()).to(torch.float32) / 255
+def _decoded(path: Path | str) -> Image.Image | Float[Tensor, "H W"]:
+    """8-bit RGB, or RGBA with transparency; or levels of 16-bit grey, which Pillow would clip instead of scale."""
+    with open_image(path) as image:
+        deep = image.mode.startswith("I")
+        transparent = image.mode in ("RGBA", "LA", "PA", "La", "RGBa") or "transparency" in image.info
+        try:
+            decoded = image.convert(image.mode if deep else "RGBA" if transparent else "RGB")
+        except Exception as error:  # Pillow's decoders signal damage with whatever their parsing runs into
+            detail = str(error).splitlines()[0] if str(error) else type(error).__name__
+            raise InputError(f"image {path}: damaged or cut short ({detail}); copy it again") from error
+    if not deep:
+        return decoded
+    return torch.from_numpy(np.asarray(decoded).astype(np.float32) / 65535.0).clamp(0, 1)

@@ -1,5 +1,6 @@
-"""Triangle meshes on disk: PLY, OBJ, GLB, STL and OFF in; every kind of file with colours at vertices out."""
+"""Triangle meshes on disk: PLY, OBJ, GLB, STL and OFF in; whatever `etsplat.io.writers` writes out."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -11,8 +12,7 @@ from torch import Tensor
 from etsplat.core.errors import InputError
 from etsplat.io._mesh_readers import READERS, RawMesh
 from etsplat.io.paths import kind_of, path_remedy
-from etsplat.io.surface import Surface
-from etsplat.io.surface_files import save_surface, writer_of
+from etsplat.io.writers import Surface, save_surface, writer_of
 
 
 @dataclass(frozen=True)
@@ -95,9 +95,9 @@ def save_mesh(
     path = Path(path)
     writer_of(path, holding="vertex_colors")
     _check_arguments(vertices, faces, face_colors, vertex_colors)
-    v = vertices.detach().to("cpu", torch.float64).numpy()
-    f = faces.detach().to("cpu", torch.int64).numpy()
-    per_face, per_vertex = _display_values(face_colors), _display_values(vertex_colors)
+    v, f = vertices.detach().to("cpu", torch.float64).numpy(), faces.detach().to("cpu", torch.int64).numpy()
+    per_face = None if face_colors is None else _display_values(face_colors)
+    per_vertex = None if vertex_colors is None else _display_values(vertex_colors)
     if split:
         per_vertex = None if per_vertex is None else per_vertex[f].reshape(-1, 3)
         v, f = v[f].reshape(-1, 3), np.arange(f.size).reshape(-1, 3)
@@ -106,25 +106,73 @@ def save_mesh(
     save_surface(path, Surface(v.astype(np.float32), f, per_vertex, per_face, name=path.stem))
 
 
+def save_triangles(
+    path: Path | str,
+    vertices: Float[Tensor, "N 3 3"],
+    colors: Float[Tensor, "N C"],
+    *,
+    weld: bool = False,
+    numbers: Mapping[str, Float[Tensor, " N"]] | None = None,
+    comment: str | None = None,
+) -> None:
+    """Write separate triangles, each in exactly its colour, as Blender, MeshLab, three.js and Unity read them. Atomic.
+
+    OBJ and GLB know only colours of vertices, and Blender reads no others from PLY: PLY has them twice, at its vertices
+    and at its faces. Colours are display values (sRGB); glTF wants linear light, so GLB is converted, and its material
+    is unlit. Colours have 8 bits in PLY and OFF.
+
+    Args:
+        path: ends in what a module of `etsplat.io.writers` writes: .ply, .obj, .off or .glb.
+        vertices: (N, 3, 3) finite positions.
+        colors: (N, 3), or (N, 4) with alpha, which files without room for it leave out; in [0, 1] (others are clamped).
+        weld: triangles share vertices at equal positions, where their colours are equal too
+            (in files without colours at vertices: all of them).
+        numbers: further values per face, by name; only PLY has room for them.
+        comment: a line of text; only PLY has room for it.
+
+    Raises:
+        ValueError: another suffix or wrong shapes.
+        InputError: the file cannot be written.
+    """
+    path = Path(path)
+    holds = writer_of(path).HOLDS
+    if vertices.shape[1:] != (3, 3) or colors.shape not in ((len(vertices), 3), (len(vertices), 4)):
+        raise ValueError(f"vertices, colors: expected (N, 3, 3), (N, 3|4); got {vertices.shape}, {colors.shape}")
+    points = vertices.detach().cpu().numpy().astype(np.float32).reshape(-1, 3)
+    face_colors, faces = _display_values(colors), np.arange(len(points)).reshape(-1, 3)
+    point_colors = np.repeat(face_colors, 3, axis=0) if "vertex_colors" in holds else None
+    if weld:
+        keys = points if point_colors is None else np.hstack([points, point_colors.astype(np.float32)])
+        kept, index = _first_of_equal(keys)
+        points, faces = points[kept], index.reshape(-1, 3)
+        point_colors = None if point_colors is None else point_colors[kept]
+    extra = {name: value.detach().cpu().numpy() for name, value in (numbers or {}).items()}
+    save_surface(path, Surface(points, faces, point_colors, face_colors, extra, comment, path.stem))
+
+
 def weld_vertices(mesh: MeshFile) -> MeshFile:
     """Merge vertices at exactly equal positions (as STL and texture seams leave them); the first one's colour stays.
 
     Faces that collapse by this are dropped, with a note.
     """
-    unique, first, inverse = np.unique(mesh.vertices.numpy(), axis=0, return_index=True, return_inverse=True)
-    order = np.argsort(first)  # keep the file's order
-    rank = np.empty(len(unique), dtype=np.int64)
-    rank[order] = np.arange(len(unique))
-    keep = torch.from_numpy(first[order])
+    kept, index = _first_of_equal(mesh.vertices.numpy())
     welded = replace(
         mesh,
-        vertices=mesh.vertices[keep],
-        faces=torch.from_numpy(rank[inverse.reshape(-1)])[mesh.faces],
-        vertex_colors=None if mesh.vertex_colors is None else mesh.vertex_colors[keep],
+        vertices=mesh.vertices[kept],
+        faces=torch.from_numpy(index)[mesh.faces],
+        vertex_colors=None if mesh.vertex_colors is None else mesh.vertex_colors[kept],
     )
-    f = welded.faces
-    whole = (f[:, 0] != f[:, 1]) & (f[:, 1] != f[:, 2]) & (f[:, 2] != f[:, 0])
-    return _drop_faces(welded, ~whole, "that collapsed when vertices were merged")
+    collapsed = (welded.faces == welded.faces.roll(-1, dims=1)).any(dim=1)
+    return _drop_faces(welded, collapsed, "that collapsed when vertices were merged")
+
+
+def _first_of_equal(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Which rows are the first of those equal to them, in the file's order; and each row's number among these."""
+    _, first, inverse = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    rank = np.empty(len(order), dtype=np.int64)
+    rank[order] = np.arange(len(order))
+    return first[order], rank[inverse.reshape(-1)]
 
 
 def _check(path: Path, raw: RawMesh) -> None:
@@ -135,12 +183,14 @@ def _check(path: Path, raw: RawMesh) -> None:
         raise InputError(
             f"mesh {path}: {len(raw.vertices)} points but no faces; mesh the point cloud first (e.g. in MeshLab)"
         )
-    with np.errstate(over="ignore"):
-        bad = np.flatnonzero(~np.isfinite(raw.vertices.astype(np.float32)).all(axis=1))
-    if len(bad):
-        raise InputError(
-            f"mesh {path}: {len(bad)} of {len(raw.vertices)} vertices are not finite (first: {bad[0]}); repair the mesh"
-        )
+    named = (("vertices", raw.vertices), ("face colours", raw.face_colors), ("vertex colours", raw.vertex_colors))
+    for name, values in ((name, values) for name, values in named if values is not None):
+        with np.errstate(over="ignore"):
+            bad = np.flatnonzero(~np.isfinite(values.astype(np.float32)).all(axis=1))
+        if len(bad):
+            raise InputError(
+                f"mesh {path}: {len(bad)} of {len(values)} {name} are not finite (first: {bad[0]}); repair the mesh"
+            )
     outside = (raw.faces < 0) | (raw.faces >= len(raw.vertices))
     if outside.any():
         face, corner = np.argwhere(outside)[0]
@@ -154,7 +204,7 @@ def _clean(path: Path, raw: RawMesh) -> MeshFile:
     """Float32 and int64 tensors; faces without area, repeated faces and loose vertices dropped."""
 
     def colors(values: np.ndarray | None) -> Tensor | None:
-        return None if values is None else torch.from_numpy(np.ascontiguousarray(values[:, :3], dtype=np.float32))
+        return None if values is None else torch.from_numpy(values.clip(0, 1).astype(np.float32))
 
     mesh = MeshFile(
         torch.from_numpy(np.ascontiguousarray(raw.vertices, dtype=np.float32)),
@@ -189,42 +239,37 @@ def _drop_faces(mesh: MeshFile, drop: Tensor, which: str) -> MeshFile:
 
 
 def _drop_loose_vertices(mesh: MeshFile) -> MeshFile:
-    used = torch.zeros(len(mesh.vertices), dtype=torch.bool)
-    used[mesh.faces.reshape(-1)] = True
-    if bool(used.all()):
+    used, faces = mesh.faces.unique(return_inverse=True)
+    loose = len(mesh.vertices) - len(used)
+    if loose == 0:
         return mesh
-    index = used.cumsum(0) - 1
     return replace(
         mesh,
         vertices=mesh.vertices[used],
-        faces=index[mesh.faces],
+        faces=faces,
         vertex_colors=None if mesh.vertex_colors is None else mesh.vertex_colors[used],
-        notes=(*mesh.notes, f"{int((~used).sum())} vertices without a face were dropped"),
+        notes=(*mesh.notes, f"{loose} vertices without a face were dropped"),
     )
 
 
-def _display_values(colors: Tensor | None) -> np.ndarray | None:
-    return None if colors is None else colors.detach().to("cpu", torch.float64).clamp(0, 1).numpy()
+def _display_values(colors: Tensor) -> np.ndarray:
+    return colors.detach().to("cpu", torch.float64).clamp(0, 1).numpy()
 
 
 def _check_arguments(vertices: Tensor, faces: Tensor, face_colors: Tensor | None, vertex_colors: Tensor | None) -> None:
-    if vertices.ndim != 2 or vertices.shape[1] != 3:
-        raise ValueError(f"vertices: expected shape (V, 3), got {tuple(vertices.shape)}")
-    if faces.ndim != 2 or faces.shape[1] != 3 or len(faces) == 0:
-        raise ValueError(f"faces: expected shape (F, 3) with F > 0, got {tuple(faces.shape)}")
-    if int(faces.min()) < 0 or int(faces.max()) >= len(vertices):
-        raise ValueError(f"faces: expected indices in [0, {len(vertices)})")
     if face_colors is not None and vertex_colors is not None:
         raise ValueError("face_colors, vertex_colors: expected one of them at most, got both")
-    for name, colors, count in (
-        ("face_colors", face_colors, len(faces)),
-        ("vertex_colors", vertex_colors, len(vertices)),
-    ):
-        if colors is not None and tuple(colors.shape) != (count, 3):
-            raise ValueError(f"{name}: expected shape {(count, 3)}, got {tuple(colors.shape)}")
-    for name, values in (("vertices", vertices), ("face_colors", face_colors), ("vertex_colors", vertex_colors)):
-        if values is not None and not bool(torch.isfinite(values).all()):
+    tables = {"vertices": (vertices, vertices), "faces": (faces, faces)}
+    tables |= {} if face_colors is None else {"face_colors": (face_colors, faces)}
+    tables |= {} if vertex_colors is None else {"vertex_colors": (vertex_colors, vertices)}
+    for name, (values, rows) in tables.items():
+        wanted = (*rows.shape[:1], 3)
+        if tuple(values.shape) != wanted:
+            raise ValueError(f"{name}: expected shape {wanted}, got {tuple(values.shape)}")
+        if not bool(torch.isfinite(values).all()):
             raise ValueError(f"{name}: expected finite values, got NaN or Inf")
+    if len(faces) == 0 or int(faces.min()) < 0 or int(faces.max()) >= len(vertices):
+        raise ValueError(f"faces: expected indices in [0, {len(vertices)}), and at least one face")
 
 
 def _vertex_means(v: np.ndarray, f: np.ndarray, face_colors: np.ndarray) -> np.ndarray:

@@ -6,6 +6,8 @@ from pathlib import Path
 
 from PIL import Image, ImageDraw, ImageFont
 
+from etsplat.io.images import open_image
+
 OVERVIEW_VIEWS = 4
 TILE = 360
 CAPTION = 34
@@ -62,7 +64,7 @@ def spread(views: Sequence[TestView], count: int) -> list[TestView]:
 
 
 def _tile(path: Path) -> Image.Image:
-    with Image.open(path) as image:
+    with open_image(path) as image:
         image = image.convert("RGB")
     scale = TILE / max(image.size)
     size = (max(1, round(image.width * scale)), max(1, round(image.height * scale)))

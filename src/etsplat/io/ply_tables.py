@@ -1,11 +1,15 @@
 """PLY files as tables: points, Gaussian scenes, and triangles with numbers of their own."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
+from jaxtyping import Float
+from numpy.typing import DTypeLike
+from torch import Tensor
 
 from etsplat.core.errors import InputError
 
@@ -23,18 +27,72 @@ _ALIASES = {"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32":
 _ALIASES |= {"float32": "f4", "float64": "f8", **_TYPES}
 _NAMES = {np.dtype(kind): name for name, kind in _TYPES.items()}
 _FORMATS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
+_LONGEST_HEADER = 1 << 16
 
 CORNERS = "vertex_indices"
 """The list property of a face: the only kind of list that is read, with three entries each."""
 
+GREY = 0.5
+"""The colour of points without one."""
+
 
 @dataclass(frozen=True)
-class _Element:
-    """A table of the file: its name, the number of its rows, and (name, type, is a list of three) of its columns."""
+class PlyHeader:
+    """What the header of a file says.
 
-    name: str
-    count: int
-    columns: list[tuple[str, str, bool]]
+    Attributes:
+        tables: of each element, in their order, the number of rows, and a field for every property; the number of
+            corners of a face is in the field `#vertex_indices`.
+        comments: lines of text.
+        text: whether the tables are text, not binary.
+        size: in bytes.
+    """
+
+    tables: dict[str, tuple[int, np.dtype]]
+    comments: list[str]
+    text: bool
+    size: int
+
+    def properties(self, element: str) -> set[str]:
+        """The names of an element's properties; none if there is no such element."""
+        return set(self.tables[element][1].names or ()) if element in self.tables else set()
+
+
+def read_ply_header(path: Path | str) -> PlyHeader:
+    """Read the header alone.
+
+    Raises:
+        InputError: the file is missing or not PLY, names a property twice, or has lists other than triangles.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"PLY file {path}: no such file; check the path")
+    with open(path, "rb") as file:
+        head, mark, rest = file.read(_LONGEST_HEADER).partition(b"end_header")
+    if not head.startswith(b"ply") or not mark:
+        raise InputError(f"PLY file {path}: has no PLY header; export it again")
+    order, comments = "", []
+    counts: dict[str, int] = {}
+    fields: list[list[tuple]] = []
+    for line in head.decode("ascii", errors="replace").splitlines():
+        words = line.split()
+        if words[:1] == ["format"] and len(words) > 1:
+            order = _FORMATS.get(words[1], "")
+        elif words[:1] == ["comment"]:
+            comments.append(line.removeprefix("comment ").strip())
+        elif words[:1] == ["element"] and len(words) == 3 and re.fullmatch(r"\d{1,15}", words[2]):
+            counts[words[1]] = int(words[2])
+            fields.append([])
+        elif words[:1] == ["property"] and fields and order:
+            fields[-1] += _fields(path, order, line)
+    if not order or not counts or len(counts) < len(fields) or not all(fields):
+        raise InputError(f"PLY file {path}: the header names no format, or no element or property; export it again")
+    try:
+        tables = {name: (counts[name], np.dtype(kinds)) for name, kinds in zip(counts, fields, strict=True)}
+    except ValueError as error:  # a name that comes twice
+        raise InputError(f"PLY file {path}: cannot be read ({error}); export it again") from error
+    line_end = len(rest.partition(b"\n")[0]) + 1
+    return PlyHeader(tables, comments, order == "=", len(head) + len(mark) + line_end)
 
 
 def read_ply_tables(path: Path | str, elements: tuple[str, ...] = ("vertex",)) -> dict[str, np.ndarray]:
@@ -49,66 +107,60 @@ def read_ply_tables(path: Path | str, elements: tuple[str, ...] = ("vertex",)) -
         the field `vertex_indices` of shape (3,).
 
     Raises:
-        InputError: the file is missing, cut short, not PLY, lacks an element, or has lists other than triangles.
+        InputError: as `read_ply_header`; the file is cut short or lacks an element.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise InputError(f"PLY file {path}: no such file; check the path")
-    data = path.read_bytes()
-    end = data.find(b"end_header")
-    if not data.startswith(b"ply") or end < 0:
-        raise InputError(f"PLY file {path}: has no PLY header; export it again")
-    start = data.find(b"\n", end) + 1
-    order, found = _header(path, data[:end].decode("ascii", errors="replace"))
-    missing = [name for name in elements if name not in [element.name for element in found]]
+    path, header = Path(path), read_ply_header(path)
+    data, start = path.read_bytes(), header.size
+    missing = [name for name in elements if name not in header.tables]
     if missing:
         raise InputError(f"PLY file {path}: has no element {missing[0]}; export it again")
-    lines = data[start:].decode("ascii", errors="replace").splitlines() if order == "=" else []
+    lines = data[start:].decode("ascii", errors="replace").splitlines() if header.text else []
     tables: dict[str, np.ndarray] = {}
-    for element in found:
+    for element, (count, dtype) in header.tables.items():
         if all(name in tables for name in elements):
             break
-        dtype = np.dtype(_fields(element, order))
-        if order == "=":
-            table, lines = _ascii_table(path, element, dtype, lines[: element.count]), lines[element.count :]
+        if header.text:
+            tables[element], lines = _text_table(path, element, dtype, lines[:count], count), lines[count:]
+        elif len(data) - start < count * dtype.itemsize:
+            raise InputError(f"PLY file {path}: is cut short; export it again")
         else:
-            if len(data) - start < element.count * dtype.itemsize:
-                raise InputError(f"PLY file {path}: is cut short; export it again")
-            table = np.frombuffer(data, dtype, element.count, start)
-            start += element.count * dtype.itemsize
-        for name in dtype.names or ():
-            if name.startswith("#") and not bool((table[name] == 3).all()):
-                raise InputError(f"PLY file {path}: has faces with other than three corners; triangulate it")
-        tables[element.name] = table
+            tables[element] = np.frombuffer(data, dtype, count, start)
+            start += count * dtype.itemsize
+        if any(name.startswith("#") and (tables[element][name] != 3).any() for name in dtype.names or ()):
+            raise InputError(f"PLY file {path}: has faces with other than three corners; triangulate it")
     return {name: tables[name] for name in elements}
 
 
-@dataclass(frozen=True)
-class PlyHeader:
-    """What the header of a file says: names of the properties of every element, and the lines of comment."""
-
-    properties: dict[str, list[str]]
-    comments: list[str]
-
-
-def read_ply_header(path: Path | str) -> PlyHeader:
-    """Read the header alone.
+def columns(path: Path | str, table: np.ndarray, names: Iterable[str], dtype: DTypeLike) -> np.ndarray:
+    """Properties of a table side by side, (rows, names); those that no number of the type can hold become infinite.
 
     Raises:
-        InputError: the file is missing or not PLY.
+        InputError: the table lacks one.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise InputError(f"PLY file {path}: no such file; check the path")
-    with open(path, "rb") as file:
-        head = file.read(1 << 16)
-    end = head.find(b"end_header")
-    if not head.startswith(b"ply") or end < 0:
-        raise InputError(f"PLY file {path}: has no PLY header; export it again")
-    text = head[:end].decode("ascii", errors="replace")
-    elements = _header(path, text)[1]
-    comments = [line.removeprefix("comment ").strip() for line in text.splitlines() if line.startswith("comment ")]
-    return PlyHeader({element.name: [name for name, _, _ in element.columns] for element in elements}, comments)
+    missing = [name for name in names if name not in (table.dtype.names or ())]
+    if missing:
+        raise InputError(f"PLY file {path}: lacks the property {missing[0]}; export it again")
+    with np.errstate(over="ignore"):
+        return np.stack([table[name].astype(dtype) for name in names], axis=1)
+
+
+def load_points(path: Path | str) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "P 3"]]:
+    """Positions (float64) and colours (float32 in [0, 1]) of a PLY point cloud; grey where the file has no colours.
+
+    Points that are not finite are left out.
+
+    Raises:
+        InputError: as `read_ply_tables`, or there are no coordinates.
+    """
+    table = read_ply_tables(path)["vertex"]
+    points = columns(path, table, "xyz", np.float64)
+    colors = np.full(points.shape, GREY, dtype=np.float32)
+    if {"red", "green", "blue"} <= set(table.dtype.names or ()):
+        colors = columns(path, table, ("red", "green", "blue"), np.float32)
+        if table.dtype["red"].kind == "u":
+            colors /= np.iinfo(table.dtype["red"]).max
+    finite = np.isfinite(points).all(axis=1) & np.isfinite(colors).all(axis=1)
+    return torch.from_numpy(points[finite]), torch.from_numpy(colors[finite].clip(0, 1))
 
 
 def encode_ply(tables: Mapping[str, np.ndarray], comment: str | None = None) -> bytes:
@@ -120,12 +172,10 @@ def encode_ply(tables: Mapping[str, np.ndarray], comment: str | None = None) -> 
         fields: list[tuple] = []
         for name in table.dtype.names or ():
             kind = table.dtype[name]
-            if kind.shape == (3,):
-                header.append(f"property list uchar {_NAMES[kind.base]} {name}")
-                fields += [(f"#{name}", "u1"), (name, kind.base.newbyteorder("<"), (3,))]
-            else:
-                header.append(f"property {_NAMES[kind]} {name}")
-                fields.append((name, kind.newbyteorder("<")))
+            corners = kind.shape == (3,)
+            header.append(f"property {'list uchar ' if corners else ''}{_NAMES[kind.base]} {name}")
+            fields += [(f"#{name}", "u1")] if corners else []
+            fields.append((name, kind.base.newbyteorder("<"), kind.shape))
         packed = np.empty(len(table), fields)
         for name in packed.dtype.names or ():
             packed[name] = 3 if name.startswith("#") else table[name]
@@ -133,47 +183,30 @@ def encode_ply(tables: Mapping[str, np.ndarray], comment: str | None = None) -> 
     return "\n".join([*header, "end_header", ""]).encode() + b"".join(body)
 
 
-def _header(path: Path, text: str) -> tuple[str, list[_Element]]:
-    order, elements = "", []
-    for line in text.splitlines():
-        words = line.split()
-        if words[:1] == ["format"] and len(words) > 1:
-            order = _FORMATS.get(words[1], "")
-        elif words[:1] == ["element"] and len(words) == 3 and words[2].isdigit():
-            elements.append(_Element(words[1], int(words[2]), []))
-        elif words[:1] == ["property"] and elements:
-            elements[-1].columns.append(_column(path, line, words))
-    if not order or not elements:
-        raise InputError(f"PLY file {path}: the header names no format or no element; export it again")
-    return order, elements
-
-
-def _column(path: Path, line: str, words: list[str]) -> tuple[str, str, bool]:
+def _fields(path: Path, order: str, line: str) -> list[tuple]:
+    """Of a property, as numpy has them: one, or two of a list of corners."""
+    words = line.split()
     if len(words) == 3 and words[1] in _ALIASES:
-        return words[2], _ALIASES[words[1]], False
+        return [(words[2], order + _ALIASES[words[1]])]
     corners = len(words) == 5 and words[1] == "list" and re.fullmatch(r"vertex_ind(ex|ices)", words[4])
     if corners and words[2] in ("uchar", "uint8") and words[3] in _ALIASES:
-        return CORNERS, _ALIASES[words[3]], True
+        return [(f"#{CORNERS}", "u1"), (CORNERS, order + _ALIASES[words[3]], (3,))]
     raise InputError(f"PLY file {path}: cannot read `{line.strip()[:50]}`; export it again")
 
 
-def _fields(element: _Element, order: str) -> list[tuple]:
-    fields: list[tuple] = []
-    for name, kind, corners in element.columns:
-        fields += [(f"#{name}", "u1"), (name, order + kind, (3,))] if corners else [(name, order + kind)]
-    return fields
-
-
-def _ascii_table(path: Path, element: _Element, dtype: np.dtype, lines: list[str]) -> np.ndarray:
+def _text_table(path: Path, element: str, dtype: np.dtype, lines: list[str], count: int) -> np.ndarray:
     widths = [dtype[name].shape[0] if dtype[name].shape else 1 for name in dtype.names or ()]
     try:
         values = np.array([[float(word) for word in line.split()] for line in lines], dtype=np.float64)
-        if values.shape != (element.count, sum(widths)):
+        if values.shape != (count, sum(widths)) and count:
             raise ValueError("rows are missing or of different lengths")
+        blocks = np.split(values.reshape(count, sum(widths)), np.cumsum(widths)[:-1], axis=1)
+        table = np.empty(count, dtype)
+        for name, block in zip(dtype.names or (), blocks, strict=True):
+            kind = dtype[name].base
+            if kind.kind in "iu" and not ((block >= np.iinfo(kind).min) & (block <= np.iinfo(kind).max)).all():
+                raise ValueError(f"{name} is beyond its type")
+            table[name] = block.reshape(table[name].shape)
     except ValueError as error:
-        raise InputError(f"PLY file {path}: {element.name} cannot be read ({error}); export it again") from error
-    table, column = np.empty(element.count, dtype), 0
-    for name, width in zip(dtype.names or (), widths, strict=True):
-        table[name] = values[:, column] if width == 1 else values[:, column : column + width]
-        column += width
+        raise InputError(f"PLY file {path}: {element} cannot be read ({error}); export it again") from error
     return table

@@ -84,10 +84,9 @@ def _read_triangle_splatting(path: Path) -> TriangleSoup:
 
 def _read_ply(path: Path) -> TriangleSoup:
     header = read_ply_header(path)
-    properties = header.properties
-    if {"scale_0", "rot_0", "opacity", "f_dc_0"} <= set(properties.get("vertex", [])):
+    if {"scale_0", "rot_0", "opacity", "f_dc_0"} <= header.properties("vertex"):
         return _read_gaussians(path)
-    if {CORNERS, "opacity", "sigma"} <= set(properties.get("face", [])):
+    if {CORNERS, "opacity", "sigma"} <= header.properties("face"):
         return _read_exported(path, header.comments)
     return _read_mesh(path)
 

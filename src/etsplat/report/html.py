@@ -15,6 +15,7 @@ import torch
 from PIL import Image
 
 from etsplat.io.atomic import atomic_write
+from etsplat.io.images import open_image
 from etsplat.io.mesh_files import load_mesh
 from etsplat.io.overview import TestView, draw_overview, spread
 from etsplat.report.cards import cards_of
@@ -166,7 +167,7 @@ def _comparison(view: TestView, kind: str) -> str:
 
 
 def _picture(path: Path) -> str:
-    with Image.open(path) as image:
+    with open_image(path) as image:
         image = image.convert("RGB")
     image.thumbnail((MAX_PICTURE, MAX_PICTURE), Image.Resampling.LANCZOS)
     buffer = io.BytesIO()

@@ -9,9 +9,9 @@ from torch import Tensor
 
 from etsplat.core.cameras import Cameras
 from etsplat.core.errors import InputError
+from etsplat.io.mesh_files import save_triangles
 from etsplat.io.paths import kind_of
-from etsplat.io.surface_files import suffixes, writer_of
-from etsplat.io.triangle_files import save_triangles
+from etsplat.io.writers import suffixes, writer_of
 from etsplat.model.soup_appearance import OPAQUE_FROM
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.ops.soup_colors import soup_colors

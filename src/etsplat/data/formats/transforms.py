@@ -19,7 +19,7 @@ from etsplat.data.dataset import Dataset
 from etsplat.data.frames import Frame, Wanted, check_frames, find_image, find_mask, posed
 from etsplat.io.images import image_size
 from etsplat.io.paths import path_within
-from etsplat.io.point_clouds import load_points
+from etsplat.io.ply_tables import load_points
 
 MARK = "transforms.json"
 RANK = 1

@@ -1,13 +1,95 @@
-"""Kinds of mesh files for other programs, a module each: `ply.py` writes .ply. It is found by being here.
+"""Surfaces as files for other programs: a module for each kind, `ply.py` writes .ply. It is found by being here.
 
-`etsplat.io.surface_files.Writer` says what a module holds. Its first line says what its files are for: the command
-line's help shows it.
+`Writer` says what a module holds. Its first line says what its files are for: the command line's help shows it.
 """
 
+import importlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING, Literal, Protocol, TypeAlias, cast
+
+from etsplat.io.atomic import atomic_write
+from etsplat.io.paths import kind_of
+
+if TYPE_CHECKING:  # help, which lists the kinds, must not wait for it
+    import numpy as np
+
+Colors: TypeAlias = "np.ndarray | None"
+Content = Literal["vertex_colors", "face_colors", "alpha", "numbers"]
+"""What a kind of file may have room for, beside vertices and faces."""
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Triangles, and what may be known of them. Colours are display values (sRGB) in [0, 1], with alpha where C is 4.
+
+    Attributes:
+        vertices: (V, 3) float32.
+        faces: (F, 3) indices into `vertices`.
+        vertex_colors: (V, C), or None.
+        face_colors: (F, C), or None.
+        numbers: further values (F,) of each face, by name.
+        comment: a line of text.
+        name: what programs call the object.
+    """
+
+    vertices: "np.ndarray"
+    faces: "np.ndarray"
+    vertex_colors: Colors = None
+    face_colors: Colors = None
+    numbers: "Mapping[str, np.ndarray]" = field(default_factory=dict)
+    comment: str | None = None
+    name: str = ""
+
+
+class Writer(Protocol):
+    """A module of this folder: one kind of file, after which it is named.
+
+    Attributes:
+        HOLDS: what such files have room for; `write` leaves out the rest.
+    """
+
+    HOLDS: frozenset[Content]
+
+    def write(self, path: Path, surface: Surface) -> None:
+        """Write the file."""
+        ...
 
 
 def purposes() -> dict[str, str]:
-    """What each kind of file is for, by its name, without importing the modules: help must not wait for numpy."""
+    """What each kind of file is for, by its name, without importing the modules."""
     modules = sorted(module for folder in __path__ for module in Path(folder).glob("[!_]*.py"))
     return {module.stem: module.read_text(encoding="utf-8").splitlines()[0].strip('"') for module in modules}
+
+
+def suffixes(holding: Content | None = None) -> list[str]:
+    """Endings of the files that can be written; of those that have room for something."""
+    return [f".{kind}" for kind in purposes() if holding is None or holding in _writer(kind).HOLDS]
+
+
+def writer_of(path: Path, holding: Content | None = None) -> Writer:
+    """What writes the kind of file that a path ends in.
+
+    Raises:
+        ValueError: none does, or such files have no room for what they must hold.
+    """
+    if kind_of(path) not in suffixes(holding):
+        raise ValueError(f"path: expected one of the suffixes {', '.join(suffixes(holding))}, got {path.name}")
+    return _writer(kind_of(path)[1:])
+
+
+def save_surface(path: Path, surface: Surface) -> None:
+    """Write the kind of file that the path ends in. Atomic.
+
+    Raises:
+        ValueError: nothing writes that kind.
+        InputError: the file cannot be written.
+    """
+    writer = writer_of(path)
+    with atomic_write(path) as temporary:
+        writer.write(temporary, surface)
+
+
+def _writer(kind: str) -> Writer:
+    return cast(Writer, importlib.import_module(f"{__name__}.{kind}"))

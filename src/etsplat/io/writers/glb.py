@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from etsplat.io.srgb import linear_from_srgb
-from etsplat.io.surface import Content, Surface
+from etsplat.io.writers import Content, Surface
 
 HOLDS: frozenset[Content] = frozenset({"vertex_colors", "alpha"})
 

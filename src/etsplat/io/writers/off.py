@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from etsplat.io.surface import Content, Surface
+from etsplat.io.writers import Content, Surface
 
 HOLDS: frozenset[Content] = frozenset({"face_colors", "alpha"})
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from etsplat.io.ply_tables import CORNERS, encode_ply
-from etsplat.io.surface import Colors, Content, Surface
+from etsplat.io.writers import Colors, Content, Surface
 
 HOLDS: frozenset[Content] = frozenset({"vertex_colors", "face_colors", "alpha", "numbers"})
 
