@@ -50,15 +50,15 @@ bool has_avx512() {
     }
 
 const std::vector<Path>& paths() {
-    static const std::vector<Path> all = [] {
-        std::vector<Path> found;
+    static const std::vector<Path>& all = *[] {  // never destroyed: threads may still draw while the process ends
+        auto* found = new std::vector<Path>;
 #if defined(ETSPLAT_X86)
-        if (has_avx512()) found.push_back(ETSPLAT_PATH(avx512));
-        if (has_avx2()) found.push_back(ETSPLAT_PATH(avx2));
+        if (has_avx512()) found->push_back(ETSPLAT_PATH(avx512));
+        if (has_avx2()) found->push_back(ETSPLAT_PATH(avx2));
 #elif defined(ETSPLAT_ARM64)
-        found.push_back(ETSPLAT_PATH(neon));
+        found->push_back(ETSPLAT_PATH(neon));
 #endif
-        found.push_back(ETSPLAT_PATH(plain));
+        found->push_back(ETSPLAT_PATH(plain));
         return found;
     }();
     return all;

@@ -1,5 +1,12 @@
+#include <cstdlib>
+#include <exception>
+
 #include "bindings.h"
 #include "parallel.h"
+
+#if !defined(_WIN32)
+#include <unistd.h>
+#endif
 
 namespace etsplat {
 void bind_adam(nb::module_& m);
@@ -16,12 +23,32 @@ void bind_soup_colors(nb::module_& m);
 void bind_spherical_harmonics(nb::module_& m);
 void bind_triangle_area(nb::module_& m);
 void bind_triangle_channels(nb::module_& m);
+
+namespace {
+
+#if !defined(_WIN32)
+std::terminate_handler other_handler = nullptr;
+
+// Before Python 3.14 a thread that wants the GIL back while the interpreter ends is ended by pthread_exit, which unwinds
+// its stack through destructors (of ours, of torch's) that may not throw: the process aborts. Such a thread waits here for
+// the end of the process instead, as threads do from 3.14 on.
+[[noreturn]] void outlast_the_interpreter() {
+    while (!std::current_exception() && !Py_IsInitialized()) pause();
+    if (other_handler) other_handler();
+    std::abort();
+}
+#endif
+
+}  // namespace
 }  // namespace etsplat
 
 NB_MODULE(_native, m) {
     using namespace etsplat;
     m.doc() = "CPU engine of etsplat.";
     nb::set_leak_warnings(false);  // tensors alive at interpreter exit keep their render states, which is no leak
+#if !defined(_WIN32)
+    other_handler = std::set_terminate(outlast_the_interpreter);
+#endif
     m.def("num_threads", &num_threads);
     m.def("set_num_threads", &set_num_threads);
     m.def("parallel_seconds", &parallel_seconds);

@@ -7,17 +7,17 @@
 #include <cstdlib>
 #include <exception>
 #include <mutex>
+#include <new>
 #include <thread>
 #include <vector>
+
+#include "forking.h"
 
 #if defined(__linux__)
 #include <sched.h>
 #endif
 #if defined(__x86_64__) || defined(_M_X64)
 #include <immintrin.h>
-#endif
-#if !defined(_WIN32)
-#include <unistd.h>
 #endif
 
 namespace etsplat {
@@ -140,46 +140,39 @@ private:
     bool stop_ = false;
 };
 
-std::mutex pool_mutex;  // one parallel region at a time; other callers wait
-Pool* pool = nullptr;
-long pool_process = 0;
-int wanted_threads = 0;
+struct Shared {
+    std::mutex mutex;  // one parallel region at a time; other callers wait
+    Pool* pool = nullptr;
+};
+
+// Never destroyed: threads may still draw while the process ends. After fork() the workers do not exist in the child, and
+// the thread that held the mutex may not either: the child starts with neither, and the old pool leaks there.
+Shared& shared = *new Shared;
+const AfterFork renewed([] { new (&shared) Shared; });
+
+std::atomic<int> wanted_threads{0};
 std::atomic<int64_t> parallel_nanoseconds{0};
 
-long process_id() {
-#if defined(_WIN32)
-    return 0;
-#else
-    return static_cast<long>(getpid());
-#endif
-}
-
 Pool& current_pool() {
-    // After fork() the workers do not exist in the child: leak the old pool and make a new one.
     const int workers = num_threads() - 1;
-    if (pool && pool_process != process_id()) pool = nullptr;
-    if (pool && pool->workers() != workers) {
-        delete pool;
-        pool = nullptr;
+    if (shared.pool && shared.pool->workers() != workers) {
+        delete shared.pool;
+        shared.pool = nullptr;
     }
-    if (!pool) {
-        pool = new Pool(workers);
-        pool_process = process_id();
-    }
-    return *pool;
+    if (!shared.pool) shared.pool = new Pool(workers);
+    return *shared.pool;
 }
 
 }  // namespace
 
 int num_threads() {
-    static const int by_default = default_threads();
-    return wanted_threads > 0 ? wanted_threads : by_default;
+    static std::atomic<int> by_default{0};  // no lock, which a child of fork() could find taken
+    if (const int wanted = wanted_threads.load(); wanted > 0) return wanted;
+    if (by_default == 0) by_default = default_threads();
+    return by_default;
 }
 
-void set_num_threads(int n) {
-    std::lock_guard lock(pool_mutex);
-    wanted_threads = n;
-}
+void set_num_threads(int n) { wanted_threads = n; }
 
 void parallel_for(int64_t n, int64_t grain, const RangeBody& body) {
     if (n <= 0) return;
@@ -194,7 +187,7 @@ void parallel_for(int64_t n, int64_t grain, const RangeBody& body) {
     job.n = n;
     job.grain = grain;
     {
-        std::lock_guard lock(pool_mutex);
+        std::lock_guard lock(shared.mutex);
         if (n <= grain || num_threads() == 1) {
             job.run();
         } else {

@@ -6,14 +6,18 @@
 #include <new>
 #include <unordered_map>
 
+#include "forking.h"
+
 namespace etsplat {
 namespace {
 
 constexpr std::size_t kAlignment = 64;
 constexpr std::size_t kMostIdleBytes = std::size_t{256} << 20;
 
+std::mutex mutex;
+const LockedWhileForking<mutex> whole_in_children;
+
 struct Pool {
-    std::mutex mutex;
     std::multimap<std::size_t, float*> idle;  // by size in floats
     std::unordered_map<float*, std::size_t> size;
     std::size_t idle_bytes = 0;
@@ -28,7 +32,7 @@ Pool& pool() {
 
 float* pool_acquire(std::size_t count) {
     Pool& p = pool();
-    std::lock_guard lock(p.mutex);
+    std::lock_guard lock(mutex);
     const auto found = p.idle.find(count);
     if (found != p.idle.end()) {
         float* block = found->second;
@@ -43,7 +47,7 @@ float* pool_acquire(std::size_t count) {
 
 void pool_release(float* block) noexcept {
     Pool& p = pool();
-    std::lock_guard lock(p.mutex);
+    std::lock_guard lock(mutex);
     const std::size_t count = p.size.at(block);
     p.idle.emplace(count, block);
     p.idle_bytes += count * sizeof(float);
@@ -58,7 +62,7 @@ void pool_release(float* block) noexcept {
 
 std::size_t pool_idle_bytes() {
     Pool& p = pool();
-    std::lock_guard lock(p.mutex);
+    std::lock_guard lock(mutex);
     return p.idle_bytes;
 }
 

@@ -6,6 +6,7 @@
 #include <stdexcept>
 #include <vector>
 
+#include "forking.h"
 #include "instruction_set.h"
 
 namespace etsplat {
@@ -13,7 +14,8 @@ namespace {
 
 // States are recycled: their buffers are warm, and a step of training makes no large allocation.
 std::mutex free_mutex;
-std::vector<std::unique_ptr<RasterState>> free_states;
+const LockedWhileForking<free_mutex> whole_in_children;
+auto& free_states = *new std::vector<std::unique_ptr<RasterState>>;  // threads may still draw while the process ends
 constexpr size_t kMostFreeStates = 2;
 
 std::shared_ptr<RasterState> acquire_state() {
