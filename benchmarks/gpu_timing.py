@@ -12,9 +12,10 @@ import torch
 
 from benchmarks.gpu_floors import Work
 from benchmarks.gpu_scenes import GpuScene
+from etsplat import _native
 from etsplat.engines.cuda.capacity import repair_overflow
 from etsplat.engines.cuda.launch import use_backend
-from etsplat.engines.cuda.rasterize import TILE, CudaRender
+from etsplat.engines.cuda.rasterize import CudaRender
 
 WARM_UP = 5
 
@@ -107,7 +108,7 @@ def count(scene: GpuScene) -> Work:
         hit_slots=int((hits != 0).sum()),
         hit_pairs=int(bits),
         pixels=batch * height * width,
-        tiles=batch * -(-height // TILE) * -(-width // TILE),
+        tiles=batch * -(-height // _native.TILE) * -(-width // _native.TILE),
         channels=channels,
     )
 

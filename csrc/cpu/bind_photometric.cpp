@@ -34,29 +34,29 @@ PhotometricSums photometric(const PhotometricPass& pass, int64_t views) {
 }  // namespace
 
 void bind_photometric(nb::module_& m) {
-    // color (B, H, W, 3) float32; target (B, H, W, channels) bytes or float32; backgrounds (B, 3), mask (B, H, W) and
-    // gradient (B, H, W, 3), each float32 or 0. The loss.
-    m.def(
-        "photometric",
-        [](Address color, Address target, Address backgrounds, Address mask, Address gradient, int64_t views,
-           int64_t height, int64_t width, int channels, bool bytes, bool squared, double dssim_weight) {
-            const double count = 3.0 * static_cast<double>(views * height * width);
-            const PhotometricPass pass{pointer<const float>(color),
-                                       pointer<const void>(target),
-                                       pointer<const float>(backgrounds),
-                                       pointer<const float>(mask),
-                                       pointer<float>(gradient),
-                                       height,
-                                       width,
-                                       channels,
-                                       bytes,
+    // color and gradient (B, H, W, 3), target (B, H, W, channels), backgrounds (B, 3), mask (B, H, W). The loss.
+    def_function(
+        m, "photometric",
+        [](Array<const float, 4> color, EitherArray<const uint8_t, const float, 4> target,
+           OptionalArray<const float, 2> backgrounds, OptionalArray<const float, 3> mask,
+           OptionalArray<float, 4> gradient, bool squared, double dssim_weight) {
+            const double count = static_cast<double>(color.count());
+            const PhotometricPass pass{color.data(),
+                                       target.data(),
+                                       data_or_null(backgrounds),
+                                       data_or_null(mask),
+                                       data_or_null(gradient),
+                                       color.size(1),
+                                       color.size(2),
+                                       static_cast<int>(target.size(3)),
+                                       target.is<const uint8_t>(),
                                        squared,
                                        static_cast<float>((1.0 - dssim_weight) / count),
                                        static_cast<float>(dssim_weight / count)};
-            const PhotometricSums sums = photometric(pass, views);
+            const PhotometricSums sums = photometric(pass, color.size(0));
             return (1.0 - dssim_weight) * sums.pixel / count + dssim_weight * (1.0 - sums.ssim / count);
         },
-        NoGil());
+        "color", "target", "backgrounds", "mask", "gradient", "squared", "dssim_weight");
 }
 
 }  // namespace etsplat

@@ -12,6 +12,7 @@ namespace etsplat {
 void bind_adam(nb::module_& m);
 void bind_antialias(nb::module_& m);
 void bind_array_scans(nb::module_& m);
+void bind_constants(nb::module_& m);
 void bind_geometry(nb::module_& m);
 void bind_mesh_energies(nb::module_& m);
 void bind_normals(nb::module_& m);
@@ -49,6 +50,7 @@ NB_MODULE(_native, m) {
 #if !defined(_WIN32)
     other_handler = std::set_terminate(outlast_the_interpreter);
 #endif
+    load_torch();
     m.def("num_threads", &num_threads);
     m.def("set_num_threads", &set_num_threads);
     m.def("parallel_seconds", &parallel_seconds);
@@ -56,6 +58,7 @@ NB_MODULE(_native, m) {
     bind_adam(m);
     bind_antialias(m);
     bind_array_scans(m);
+    bind_constants(m);
     bind_geometry(m);
     bind_mesh_energies(m);
     bind_normals(m);

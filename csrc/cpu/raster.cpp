@@ -53,17 +53,14 @@ void fill_pass(RasterState& state) {
     pass.want_median = call.median_triangle != 0;
     if (pass.want_distortion)
         pass.distortion_depth = call.centroid_depth ? DistortionDepth::kCentroid : DistortionDepth::kPlane;
-    pass.attributes = call.corner_channels > 0 || pass.distortion_depth == DistortionDepth::kPlane;
     // With the cut-offs off, too: where alpha is 0 x^(2/sigma) may have overflowed, and the backward divides by 1 - alpha.
     pass.alpha_min = vmax(call.alpha_min, std::numeric_limits<float>::min());
     pass.alpha_max = vmin(call.alpha_max, 1.0f - 1e-6f);
     pass.transmittance_min = call.transmittance_min;
     pass.distortion_near = call.distortion_near;
     pass.distortion_far = call.distortion_far;
-    pass.slot_layout.flat_channels = call.flat_channels;
-    pass.slot_layout.corner_channels = call.corner_channels;
-    pass.slot_layout.attributes = pass.attributes;
-    pass.slot_layout.depth = pass.distortion_depth;
+    pass.slot_layout = {call.flat_channels, call.corner_channels, pass.distortion_depth};
+    pass.attributes = pass.slot_layout.attributes();
     state.pass = pass;
 }
 

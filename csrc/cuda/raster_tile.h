@@ -13,9 +13,10 @@ namespace etsplat {
 constexpr int kTileThreads = kTile * kTile;
 constexpr int kWarps = kTileThreads / kWarp;
 constexpr int kSubWidth = 8, kSubHeight = 4;
-constexpr bool kAttributes = CORNER > 0 || DISTORTION == 1;
 constexpr int kChannels = FLAT + CORNER;
-constexpr SlotLayout kLayout{FLAT, CORNER, kAttributes, static_cast<DistortionDepth>(DISTORTION)};
+static_assert(kChannels <= kMostGpuChannels);
+constexpr SlotLayout kLayout{FLAT, CORNER, static_cast<DistortionDepth>(DISTORTION)};
+constexpr bool kAttributes = kLayout.attributes();
 constexpr int kStride = kLayout.stride();
 
 // Room for attributes only where they are needed.

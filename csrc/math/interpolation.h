@@ -99,7 +99,7 @@ ETSPLAT_FN void view_gradient(const PinholeCamera& camera, Distance distance, bo
         ry[k] = sums[SlotLayout::kMomentY + k];
     }
     for (int k = 0; k < 9; ++k) grad_view[k] = T(0.0f);
-    if (layout.attributes)
+    if (layout.attributes())
         for (int k = 0; k < 3; ++k) {
             log_weight[k] = sums[layout.product() + k];
             grad_view[3 * k + 2] = log_weight[k] / view[3 * k + 2];

@@ -23,6 +23,8 @@ struct alignas(32) AttributeRecord {
     float padding;
 };
 
+constexpr int kMostGpuChannels = 16;  // of a pass on a GPU, whose tile loops keep them in registers
+
 enum class DistortionDepth : int { kNone, kPlane, kCentroid };
 
 // Where a slot keeps its sums over pixels. With df_k = dL/df_k of a pixel at p: moment[k] = sum df_k,
@@ -30,14 +32,15 @@ enum class DistortionDepth : int { kNone, kPlane, kCentroid };
 struct SlotLayout {
     static constexpr int kMoment = 0, kMomentX = 3, kMomentY = 6, kOpacity = 9, kSigma = 10, kFlat = 11;
     int flat_channels = 0, corner_channels = 0;
-    bool attributes = false;
     DistortionDepth depth = DistortionDepth::kNone;
 
+    // Whether anything is interpolated: corner colours, or the distortion's depth of each pixel.
+    ETSPLAT_CONSTEXPR_FN bool attributes() const { return corner_channels > 0 || depth == DistortionDepth::kPlane; }
     // dL/d log(w_k z_k), then the corner colours, corner-major
     ETSPLAT_CONSTEXPR_FN int product() const { return kFlat + flat_channels; }
     ETSPLAT_CONSTEXPR_FN int corner() const { return product() + 3; }
     // kPlane: dL/d log w_k; kCentroid: dL/dz of the centroid
-    ETSPLAT_CONSTEXPR_FN int plane() const { return attributes ? corner() + 3 * corner_channels : product(); }
+    ETSPLAT_CONSTEXPR_FN int plane() const { return attributes() ? corner() + 3 * corner_channels : product(); }
     ETSPLAT_CONSTEXPR_FN int centroid() const { return plane(); }
     ETSPLAT_CONSTEXPR_FN int size() const {
         return plane() + (depth == DistortionDepth::kPlane ? 3 : depth == DistortionDepth::kCentroid ? 1 : 0);

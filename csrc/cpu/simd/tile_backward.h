@@ -111,8 +111,8 @@ ETSPLAT_FN void background_gradient(const RasterPass& pass, const BackwardTile& 
 
 template <Shape kShape>
 ETSPLAT_FN SlotLayout layout_of(const RasterPass& pass) {
-    if constexpr (kShape == Shape::kFlat) return {kFastChannels, 0, false, DistortionDepth::kNone};
-    if constexpr (kShape == Shape::kCorner) return {0, kFastChannels, true, DistortionDepth::kNone};
+    if constexpr (kShape == Shape::kFlat) return {kFastChannels, 0, DistortionDepth::kNone};
+    if constexpr (kShape == Shape::kCorner) return {0, kFastChannels, DistortionDepth::kNone};
     return pass.slot_layout;
 }
 

@@ -37,15 +37,15 @@ class _PhotometricLoss(torch.autograd.Function):
         dssim_weight: float,
         squared: bool,
     ) -> Tensor:
-        images = [None if tensor is None else dense(tensor) for tensor in (color, target, backgrounds, mask)]
         gradient = empty_image(*color.shape) if ctx.needs_input_grad[0] else None
         loss = _native.photometric(
-            *(0 if tensor is None else tensor.data_ptr() for tensor in (*images, gradient)),
-            *color.shape[:3],
-            target.shape[-1],
-            target.dtype == torch.uint8,
-            squared,
-            dssim_weight,
+            color=dense(color),
+            target=dense(target),
+            backgrounds=None if backgrounds is None else dense(backgrounds),
+            mask=None if mask is None else dense(mask),
+            gradient=gradient,
+            squared=squared,
+            dssim_weight=dssim_weight,
         )
         if gradient is not None:
             ctx.save_for_backward(gradient)

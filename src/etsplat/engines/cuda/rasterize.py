@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from etsplat import _native
 from etsplat.core.kernels import DISTANCES, KERNELS
 from etsplat.core.rasterization import DISTORTION_FAR, DISTORTION_NEAR
 from etsplat.engines.cuda.capacity import capacity_for, note_capture, overflow_flag, record_need
@@ -21,15 +22,15 @@ from etsplat.engines.cuda.sort import RadixSort
 from etsplat.engines.cuda.structs import struct_class
 from etsplat.engines.native.plan import Geometry, Images, Inputs, Outputs, PerInput, Plan
 
-TILE = 16
 _TINY = 1.17549435e-38
 _PROJECT = Program("raster_project.cu")
+_Depth = _native.DistortionDepth
 
 
 class CudaRender:
     """One forward pass of all views together, and what its backward pass needs of it."""
 
-    most_channels: int | None = 16
+    most_channels: int | None = _native.MOST_GPU_CHANNELS
 
     def __init__(self, plan: Plan, inputs: Inputs, outputs: Outputs, keep: bool) -> None:
         settings = plan.settings
@@ -38,11 +39,12 @@ class CudaRender:
         self.device = inputs.vertices.device
         self.flat, self.corner = inputs.channels
         self.shape = (plan.views, settings.width, settings.height)
-        self.tiles = blocks(settings.width, TILE), blocks(settings.height, TILE)
+        self.tiles = blocks(settings.width, _native.TILE), blocks(settings.height, _native.TILE)
         self.tile_count = plan.views * self.tiles[0] * self.tiles[1]
         self.projected = plan.views * plan.geometry.count
-        # 0 none, 1 with the plane's depth, 2 with the centroid's
-        self.distortion = 0 if not settings.wants("distortion") else 2 if settings.depth_of == "centroid" else 1
+        self.distortion = _Depth.NONE
+        if settings.wants("distortion"):
+            self.distortion = _Depth.CENTROID if settings.depth_of == "centroid" else _Depth.PLANE
         self.arguments = struct_class("cuda/raster_pass.h", "RasterPass")()
         self._fill_inputs(inputs)
         self._fill_images(outputs.images)
@@ -115,8 +117,8 @@ class CudaRender:
     def _allocate(self, capacity: int) -> tuple[Arena, Arena]:
         """What the backward pass reads, and what only the forward pass needs."""
         m, state, temporary = self.projected, Arena(), Arena()
-        state.add("records", 16 * m)
-        state.add("attributes", 8 * m if self._attributes else 0)
+        state.add("records", _native.TRIANGLE_RECORD * m)
+        state.add("attributes", _native.ATTRIBUTE_RECORD * m if self._attributes else 0)
         state.add("spans", 2 * m)
         state.add("slot_begin", m)
         state.add("slot_triangle", capacity)
@@ -149,9 +151,9 @@ class CudaRender:
     ) -> PerInput:
         a = self.arguments
         grad_color, grad_alpha, grad_distortion = cotangents
-        distortion = self.distortion if grad_distortion is not None else 0
+        distortion = self.distortion if grad_distortion is not None else _Depth.NONE
         defines = self._defines(distortion, median=False, weights=False)
-        stride = _stride(self.flat, self.corner, distortion)
+        stride = _native.slot_stride(flat_channels=self.flat, corner_channels=self.corner, distortion=distortion)
         reduce_grid = blocks(self.plan.geometry.count, 128)
         grads = _Gradients(self, inputs, needed, reduce_grid)
         sums = torch.empty(a.capacity * stride, device=self.device)
@@ -164,15 +166,17 @@ class CudaRender:
 
     @property
     def _attributes(self) -> bool:
-        return self.corner > 0 or self.distortion > 0
+        return self.corner > 0 or self.distortion != _Depth.NONE
 
-    def _defines(self, distortion: int, median: bool, weights: bool) -> tuple[tuple[str, int | str], ...]:
+    def _defines(
+        self, distortion: _native.DistortionDepth, median: bool, weights: bool
+    ) -> tuple[tuple[str, int | str], ...]:
         """Definitions that specialise the tile loops."""
         return (
             ("KERNEL", KERNELS[self.plan.settings.kernel].native_name),
             ("FLAT", self.flat),
             ("CORNER", self.corner),
-            ("DISTORTION", distortion),
+            ("DISTORTION", int(distortion)),
             ("MEDIAN", int(median)),
             ("WEIGHTS", int(weights)),
         )
@@ -240,7 +244,7 @@ class _Gradients:
         sums = torch.float64
         self.sigma_sums = torch.empty(reduce_grid, dtype=sums, device=device) if needed.sigma and not own else None
         self.needed, cameras = needed, needed.viewmats or needed.Ks
-        camera_shape = (views, reduce_grid, 16)
+        camera_shape = (views, reduce_grid, _native.CAMERA_GRADIENTS)
         self.camera_sums = torch.empty(camera_shape, dtype=sums, device=device) if cameras else None
         self.background = None
         if needed.backgrounds and backgrounds is not None:
@@ -277,12 +281,6 @@ class _Gradients:
         zero = torch.zeros_like(fx)
         Ks = torch.cat([fx, zero, cx, zero, fy, cy, zero, zero, zero], dim=1).view(-1, 3, 3)
         return viewmats if self.needed.viewmats else None, Ks if self.needed.Ks else None
-
-
-def _stride(flat: int, corner: int, distortion: int) -> int:
-    """Floats of a slot: ``SlotLayout`` of csrc/math/raster_records.h."""
-    size = 11 + flat + (3 + 3 * corner if corner > 0 or distortion == 1 else 0) + (0, 3, 1)[distortion]
-    return blocks(size, 16) * 16
 
 
 def _pointer(tensor: Tensor | None) -> int:
