@@ -23,7 +23,9 @@ def test_a_name_that_leads_out_is_refused_on_every_system(name):
     assert str(caught.value) == told
 
 
-@pytest.mark.parametrize("name", ["", ".", "./", "a\0.jpg"])
+@pytest.mark.parametrize(
+    "name", ["", ".", "./", "a\0.jpg", "a" * 300 + ".jpg", "x/" + "é" * 130, "a/" * 2000, "\ud800.jpg"]
+)
 def test_what_is_no_file_name_is_refused(name):
     with pytest.raises(InputError, match=r"cameras\.bin: .* is no file name"):
         path_within(Path("photos"), name, "cameras.bin")

@@ -83,17 +83,17 @@ def angle(value: object) -> Callable[[dict], object]:
     9,
     "a traceback of transforms.json",
     [
-        ("deep", transforms(b"[" * 100_000), RecursionError),
-        ("400-digits", transforms(entry("k1", 10**400)), OverflowError),
-        ("400-digits-focal", transforms(entry("fl_x", 10**400)), OverflowError),
+        ("deep", transforms(b"[" * 100_000), None),
+        ("400-digits", transforms(entry("k1", 10**400)), None),
+        ("400-digits-focal", transforms(entry("fl_x", 10**400)), None),
         (
             "400-digits-pose",
             transforms(pose([[10**400] * 4] * 4)),
-            OverflowError,
+            None,
         ),
-        ("nan-width", transforms(entry("w", float("nan"))), ValueError),
-        ("infinite-height", transforms(entry("h", float("inf"))), OverflowError),
-        ("angle-0", transforms(angle(0)), ZeroDivisionError),
+        ("nan-width", transforms(entry("w", float("nan"))), None),
+        ("infinite-height", transforms(entry("h", float("inf"))), None),
+        ("angle-0", transforms(angle(0)), None),
     ],
 )
 def test_transforms(act, tmp_path):
@@ -113,7 +113,7 @@ def colmap_points(text: str) -> Callable[[Path], object]:
     return act
 
 
-@cases(9, "points of 1e308 are infinite", [("huge", colmap_points("1 1e308 1e308 1e308 0 0 0\n"), AssertionError)])
+@cases(9, "points of 1e308 are infinite", [("huge", colmap_points("1 1e308 1e308 1e308 0 0 0\n"), None)])
 def test_colmap(act, tmp_path):
     with pytest.raises(InputError):
         act(tmp_path)
@@ -282,7 +282,7 @@ def test_triangle_splatting_files(act, tmp_path):
 
 
 FOUND: list[tuple[str, Leak | None]] = [
-    ("colmap_txt_OSError_frames.py_143_sparse_0_images.txt", OSError),
+    ("colmap_txt_OSError_frames.py_143_sparse_0_images.txt", None),
     ("eply_ValueError_ply_tables.py_71", None),
     ("eply_ValueError_soup_import.py_108", ValueError),
     ("eply_ValueError_soup_import.py_168", ValueError),
@@ -292,8 +292,8 @@ FOUND: list[tuple[str, Leak | None]] = [
     ("image_RuntimeError_images.py_167", None),
     ("image_RuntimeError_images.py_182", None),
     ("image_ValueError_images.py_167", None),
-    ("json_OverflowError_transforms.py_263_transforms.json", OverflowError),
-    ("json_OverflowError_transforms.py_280_transforms.json", OverflowError),
+    ("json_OverflowError_transforms.py_263_transforms.json", None),
+    ("json_OverflowError_transforms.py_280_transforms.json", None),
     ("mesh_OverflowError__mesh_readers.py_57.obj", None),
     ("points_ValueError_ply_tables.py_71_points.ply", None),
 ]

@@ -78,9 +78,9 @@ def unknown_color_off(folder: Path) -> object:
     11,
     "numbers that cannot be meant are taken",
     [
-        ("pose", huge_pose, NOTHING),
-        ("focal-length", huge_focal_length, NOTHING),
-        ("1x1-photo", tiny_photo, NOTHING),
+        ("pose", huge_pose, None),
+        ("focal-length", huge_focal_length, None),
+        ("1x1-photo", tiny_photo, None),
         ("obj-color", unknown_color, None),
         ("off-color", unknown_color_off, None),
     ],

@@ -34,7 +34,28 @@ MAX_WIDTH = 1600
 _SAMPLE = 4096
 """So many bytes of each file's beginning, middle and end, with its length, tell it from others."""
 
+LARGEST = 1e18
+"""Of all numbers of poses and cameras: float32 holds their squares."""
+
 MasksAs = Literal["ignore", "alpha"]
+
+Points = tuple[Float[Tensor, "P 3"], Float[Tensor, "P 3"]]
+"""Float64 positions in the units of the poses, and float32 colours in [0, 1] as displayed."""
+
+
+@dataclass(frozen=True)
+class Lens:
+    """Distortion as COLMAP has it.
+
+    Attributes:
+        model: its name.
+        coefficients: the model's parameters after the focal lengths and the principal point.
+        told: what it is in words, for error messages.
+    """
+
+    model: str
+    coefficients: tuple[float, ...]
+    told: str
 
 
 @dataclass(frozen=True)
@@ -48,6 +69,7 @@ class Frame:
         viewmat: (4, 4) float64, world to camera, OpenCV axes.
         K: (3, 3) float64, pixels of an image of `size`.
         size: (width, height) that K refers to; the file may be a smaller or larger copy.
+        lens: its distortion, which has to be removed before a data set is made of it; None without.
     """
 
     name: str
@@ -56,6 +78,7 @@ class Frame:
     viewmat: Float[Tensor, "4 4"]
     K: Float[Tensor, "3 3"]
     size: tuple[int, int]
+    lens: Lens | None = None
 
 
 @dataclass(frozen=True)
@@ -68,6 +91,20 @@ class Wanted:
     masks: Path | None = None
     memory: int | None = None
 
+    def mask_of(self, scene: Path, name: str, source: Path) -> Path | None:
+        """The mask of image `name`, which the file `source` names: in `masks`, or in the scene's own, if it has any.
+
+        Raises:
+            InputError: the folder lacks it; or as `path_within`.
+        """
+        folder = self.masks or scene / "masks"
+        return find_mask(folder, name, source) if self.masks or folder.is_dir() else None
+
+
+def pinhole(fx: float, fy: float, cx: float, cy: float) -> Float[Tensor, "3 3"]:
+    """K of these, float64."""
+    return torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
+
 
 def posed(
     scene: Path,
@@ -75,7 +112,7 @@ def posed(
     wanted: Wanted,
     *,
     split: tuple[list[int], list[int]] | None = None,
-    points: tuple[Float[Tensor, "P 3"], Float[Tensor, "P 3"]] | None = None,
+    points: Points | None = None,
 ) -> Dataset:
     """The data set of a scene's frames in its own units; no image has been decoded yet.
 
@@ -84,13 +121,21 @@ def posed(
         frames: of one scene.
         wanted: width and kind of the images.
         split: (train, test) indices; None for every 8th frame as test, `frames` being sorted by name.
-        points: (P, 3) float64 in the units of the poses, and (P, 3) float32 colours in [0, 1] as displayed.
+        points: of the scene, P > 0.
 
     Raises:
         InputError: fewer than two frames, frames with one name, missing images, images of another shape than their
-            camera.
+            camera, lens distortion, numbers beyond `LARGEST`.
     """
     check_frames(scene, frames)
+    for frame in frames:
+        if frame.lens is not None:
+            raise InputError(
+                f"scene {scene}: {frame.name} has {frame.lens.told}; run `etsplat data undistort SCENE --out NEW`"
+                " or `colmap image_undistorter`, and use the new folder"
+            )
+    if points is not None and not bool((points[0].abs() <= LARGEST).all()):
+        raise InputError(f"scene {scene}: has points farther away than {LARGEST:g}; remove them")
     if len(frames) < 2:  # one to learn from, one to test
         raise InputError(f"scene {scene}: has {len(frames)} posed images; at least 2 are needed, better 20")
     Ks, sizes = [], []
@@ -114,7 +159,7 @@ def posed(
 
 
 def check_frames(scene: Path, frames: Sequence[Frame]) -> None:
-    """Raises InputError where two have one name, or images are missing."""
+    """Raises InputError where two have one name, images are missing, or numbers cannot be meant."""
     name, count = Counter(frame.name for frame in frames).most_common(1)[0]
     if count > 1:
         raise InputError(f"scene {scene}: {count} frames have the image {name}; keep one of them")
@@ -124,6 +169,17 @@ def check_frames(scene: Path, frames: Sequence[Frame]) -> None:
             f"scene {scene}: {len(missing)} of {len(frames)} images are missing"
             f" (first: {missing[0].image}); copy them there or remove their poses"
         )
+    for frame in frames:
+        if not float(frame.K.diagonal()[:2].min()) >= 1 / LARGEST:
+            raise InputError(
+                f"scene {scene}: {frame.name} has a focal length that is not positive; export the poses again"
+            )
+        if not float(torch.cat([frame.K, frame.viewmat[:3, :3], frame.viewmat[:3, 3:].T]).abs().max()) <= LARGEST:
+            raise InputError(
+                f"scene {scene}: {frame.name} has a pose or camera with numbers beyond {LARGEST:g}; export them again"
+            )
+        if not all(1 <= side < 2**31 for side in frame.size):
+            raise InputError(f"scene {scene}: the camera of {frame.name} has no size; export the poses again")
 
 
 def _view_names(frames: Sequence[Frame]) -> list[str]:
@@ -174,7 +230,7 @@ def scaled_intrinsics(
         InputError: the file has another shape than K's image.
     """
     scale = size[0] / frame.size[0]
-    if abs(frame.size[1] * scale - size[1]) > 2:  # downscaled copies are rounded to whole pixels
+    if abs(frame.size[1] * scale - size[1]) > min(2, 0.1 * size[1]):  # smaller copies are rounded to whole pixels
         raise InputError(
             f"scene {scene}: {frame.name} is {size[0]}x{size[1]}, but its camera is for"
             f" {frame.size[0]}x{frame.size[1]}; use the images that the poses were made from"

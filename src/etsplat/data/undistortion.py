@@ -12,8 +12,8 @@ from typing import IO, Any
 from etsplat.core.errors import InputError
 from etsplat.data.colmap_process import import_pycolmap, run_apart, undistort_images
 from etsplat.data.formats.colmap import find_model
-from etsplat.data.formats.transforms import DistortedFrames, read_distorted_transforms
-from etsplat.data.frames import find_mask, scaled_intrinsics
+from etsplat.data.formats.transforms import read_frames
+from etsplat.data.frames import Frame, Points, Wanted, scaled_intrinsics
 from etsplat.io.atomic import write_error
 from etsplat.io.images import image_size, load_pixels
 from etsplat.io.paths import kind_of, path_remedy, path_within
@@ -55,12 +55,13 @@ def undistort_scene(scene: Path | str, out: Path | str, *, max_size: int = 1600)
         raise InputError(f"scene {scene}: neither sparse/0/cameras.bin or .txt nor transforms.json; choose a scene")
     check_output(out, max_size)
     if colmap is not None:
-        model, photos, masks = _read_model(pycolmap, scene, colmap)
+        photos = scene / "images"
+        model, masks = _read_model(pycolmap, scene, colmap)
     else:
-        frames = read_distorted_transforms(scene)
-        photos = frames.folder
-        model, masks = _make_model(pycolmap, frames), frames.masks
-    names = sorted(image.name for image in model.images.values() if image.has_pose)
+        frames, points = read_frames(scene)
+        photos = _common_folder(scene, frames)
+        model, masks = _make_model(pycolmap, scene, photos, frames, points)
+    names = _placed(model)
     for photo in (photos / name for name in names):
         if kind_of(photo) == ".png" and load_pixels(photo, *image_size(photo)).shape[2] == 4:
             raise InputError(f"image {photo}: has transparency, which would be lost; put it into {scene}/masks")
@@ -172,51 +173,65 @@ def _failure(out: Path, error: Exception) -> InputError:
     )
 
 
-def _read_model(pycolmap: Any, scene: Path, folder: Path) -> tuple[Any, Path, dict[str, Path]]:
-    """A COLMAP scene's model, folder of images, and masks by the names of the images."""
+def _placed(model: Any) -> list[str]:
+    return sorted(image.name for image in model.images.values() if image.has_pose)
+
+
+def _read_model(pycolmap: Any, scene: Path, folder: Path) -> tuple[Any, dict[str, Path]]:
+    """A COLMAP scene's model, and masks by the names of the images."""
     try:
         model = pycolmap.Reconstruction(folder)
     except (ValueError, RuntimeError, OSError, LookupError) as error:  # what its C++ throws
         raise InputError(f"scene {folder}: cannot be read as a model ({str(error).splitlines()[0]})") from error
-    names = sorted(image.name for image in model.images.values() if image.has_pose)
+    names = _placed(model)
     missing = [name for name in names if not path_within(scene / "images", name, folder).is_file()]
     if missing:
         raise InputError(f"scene {scene}: {len(missing)} images are missing (first: {missing[0]}); copy them there")
-    masks = {name: find_mask(scene / "masks", name, folder) for name in names} if (scene / "masks").is_dir() else {}
-    return model, scene / "images", masks
+    return model, {name: mask for name in names if (mask := Wanted().mask_of(scene, name, folder)) is not None}
 
 
-def _make_model(pycolmap: Any, frames: DistortedFrames) -> Any:
-    """A model of frames with their lenses, at the size of their files, and of their points."""
-    model = pycolmap.Reconstruction()
-    for index, (name, frame, lens) in enumerate(zip(frames.names, frames.frames, frames.lenses, strict=True), 1):
-        size = image_size(frame.image)
-        K = scaled_intrinsics(frames.scene, frame, size, size)
-        params = [float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]), *lens.coefficients]
-        camera = pycolmap.Camera(model=lens.model, width=size[0], height=size[1], params=params, camera_id=index)
+def _common_folder(scene: Path, frames: list[Frame]) -> Path:
+    """The folder in the scene where all images lie, or the scene."""
+    outside = [frame.name for frame in frames if not frame.image.is_relative_to(scene)]
+    if outside:
+        raise InputError(f"scene {scene}: {outside[0]} lies outside of it; copy the images into it")
+    folders = {frame.image.relative_to(scene).parts[:-1][:1] for frame in frames}
+    return scene.joinpath(*folders.pop()) if len(folders) == 1 else scene
+
+
+def _make_model(
+    pycolmap: Any, scene: Path, photos: Path, frames: list[Frame], points: Points | None
+) -> tuple[Any, dict[str, Path]]:
+    """A model of frames with their lenses, at the size of their files, and of points; and masks by image."""
+    model, masks = pycolmap.Reconstruction(), {}
+    for index, frame in enumerate(frames, 1):
+        name, size = frame.image.relative_to(photos).as_posix(), image_size(frame.image)
+        K = scaled_intrinsics(scene, frame, size, size)
+        lens, coefficients = ("PINHOLE", ()) if frame.lens is None else (frame.lens.model, frame.lens.coefficients)
+        params = [float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]), *coefficients]
+        camera = pycolmap.Camera(model=lens, width=size[0], height=size[1], params=params, camera_id=index)
         model.add_camera_with_trivial_rig(camera)
         image = pycolmap.Image(name=name, camera_id=index, image_id=index)
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(frame.viewmat[:3].numpy()))
-    if frames.points is not None:
-        points, colors = frames.points
-        for point, color in zip(points.numpy(), colors.mul(255).round().byte().numpy(), strict=True):
+        if frame.mask is not None:
+            masks[name] = frame.mask
+    if points is not None:
+        for point, color in zip(points[0].numpy(), points[1].mul(255).round().byte().numpy(), strict=True):
             model.add_point3D(point, pycolmap.Track(), color)
-    return model
+    return model, masks
 
 
 def _undistort_masks(model: Any, masks: dict[str, Path], work: Path, max_size: int) -> None:
     """Masks go the way of the images, under their names, into WORK/scene/masks."""
     (work / "images").mkdir()
     (work / "scene").rename(work / "whole")
-    named: dict[str, str] = {}
     for image in model.images.values():
         mask = masks[image.name]
-        named[image.name] = str(PurePosixPath(image.name).with_suffix(mask.suffix))
-        copy = work / "images" / named[image.name]
+        image.name = str(PurePosixPath(image.name).with_suffix(mask.suffix))
+        copy = work / "images" / image.name
         copy.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(mask, copy)
-        image.name = named[image.name]
-    undistort_model(model, work / "images", sorted(named.values()), work, max_size)
+    undistort_model(model, work / "images", sorted(image.name for image in model.images.values()), work, max_size)
     (work / "scene" / "images").rename(work / "whole" / "masks")
     shutil.rmtree(work / "scene")
     (work / "whole").rename(work / "scene")

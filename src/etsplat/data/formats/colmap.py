@@ -11,9 +11,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from etsplat.core.errors import InputError
-from etsplat.data.colmap_model import PARAMETERS, ColmapCamera, ColmapImage, read_cameras, read_images, read_points
+from etsplat.data.colmap_model import PARAMETERS, ColmapImage, read_cameras, read_images, read_points
 from etsplat.data.dataset import Dataset
-from etsplat.data.frames import Frame, Wanted, find_image, find_mask, posed
+from etsplat.data.frames import Frame, Lens, Wanted, find_image, pinhole, posed
 
 MARK = "sparse/"
 RANK = 2
@@ -36,28 +36,38 @@ def read(folder: Path, wanted: Wanted) -> Dataset:
         Views in COLMAP's own units, with the model's points.
 
     Raises:
-        InputError: files are missing, cut short or malformed; camera models with distortion; a mask is missing; as
-            `posed`.
+        InputError: files are missing, cut short or malformed; a mask is missing; as `posed`.
     """
     model = find_model(folder)
     if model is None:
         raise InputError(
             f"scene {folder}: no sparse/0/cameras.bin or .txt; run COLMAP's mapper or choose another folder"
         )
-    masks = wanted.masks or (folder / "masks" if (folder / "masks").is_dir() else None)
     cameras = read_cameras(model)
     registered = sorted(read_images(model), key=lambda image: image.name)
     if not registered:
         raise InputError(f"scene {folder}: the sparse model has no registered image; run COLMAP's mapper again")
     frames = []
     for image in registered:
-        if image.camera not in cameras:
+        camera = cameras.get(image.camera)
+        if camera is None:
             raise InputError(f"scene {model}: {image.name} uses camera {image.camera}, which is missing; export again")
-        camera = cameras[image.camera]
-        K = _intrinsics(model, image.name, camera)
-        mask = None if masks is None else find_mask(masks, image.name, model)
-        file = find_image(folder / (wanted.images or "images"), image.name, model)
-        frames.append(Frame(image.name, file, mask, _viewmat(image), K, (camera.width, camera.height)))
+        if len(camera.params) != PARAMETERS.get(camera.model):
+            raise InputError(f"scene {model}: the camera of {image.name} is malformed; export the model again")
+        one_focal_length = "SIMPLE" in camera.model or "RADIAL" in camera.model
+        fx, fy, cx, cy, *distortion = (camera.params[0], *camera.params) if one_focal_length else camera.params
+        lens = Lens(camera.model, tuple(distortion), f"a {camera.model} camera with lens distortion")
+        frames.append(
+            Frame(
+                image.name,
+                find_image(folder / (wanted.images or "images"), image.name, model),
+                wanted.mask_of(folder, image.name, model),
+                _viewmat(image),
+                pinhole(fx, fy, cx, cy),
+                (camera.width, camera.height),
+                lens if distortion else None,
+            )
+        )
     found = read_points(model)
     if found is None or not len(found[0]):
         return posed(folder, frames, wanted)
@@ -67,31 +77,15 @@ def read(folder: Path, wanted: Wanted) -> Dataset:
 
 def find_model(folder: Path) -> Path | None:
     """The sparse model of a scene folder: `sparse/0` or `sparse`, or None."""
-    return next((path for path in (folder / "sparse" / "0", folder / "sparse") if _has_model(path)), None)
-
-
-def _has_model(path: Path) -> bool:
-    return any((path / f"cameras.{suffix}").is_file() for suffix in ("bin", "txt"))
-
-
-def _intrinsics(model: Path, name: str, camera: ColmapCamera) -> Float[Tensor, "3 3"]:
-    if camera.model not in ("PINHOLE", "SIMPLE_PINHOLE"):
-        raise InputError(
-            f"scene {model}: {name} has a {camera.model} camera with lens distortion;"
-            " run `etsplat data undistort SCENE --out NEW` or `colmap image_undistorter`, and use the new folder"
-        )
-    if len(camera.params) != PARAMETERS[camera.model] or camera.width < 1 or camera.height < 1:
-        raise InputError(f"scene {model}: the camera of {name} is malformed; export the model again")
-    fx, fy, cx, cy = camera.params if camera.model == "PINHOLE" else (camera.params[0], *camera.params)
-    if not np.isfinite(camera.params).all() or min(fx, fy) <= 0:
-        raise InputError(f"scene {model}: the camera of {name} has no positive focal length; export the model again")
-    return torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
+    folders = [folder / "sparse" / "0", folder / "sparse"]
+    return next((path for path in folders if any((path / f"cameras.{s}").is_file() for s in ("bin", "txt"))), None)
 
 
 def _viewmat(image: ColmapImage) -> Float[Tensor, "4 4"]:
     q = np.array(image.quaternion)
-    norm = np.linalg.norm(q)
-    if not np.isfinite([*q, *image.translation]).all() or norm < 1e-9:
+    with np.errstate(over="ignore"):
+        norm = float(np.linalg.norm(q))
+    if not np.isfinite([norm, *image.translation]).all() or norm < 1e-9:
         raise InputError(f"scene: the pose of {image.name} is not finite; run COLMAP's mapper again")
     w, x, y, z = q / norm
     viewmat = torch.eye(4, dtype=torch.float64)
