@@ -15,7 +15,7 @@ from etsplat.io.mesh_files import load_mesh
 from etsplat.ops.rasterize_opaque import render_opaque
 from helpers.captures import write_colmap, write_photo, write_transforms
 from repro.limits import room_for
-from repro.tables import NOTHING, Leak, cases
+from repro.tables import Leak, cases
 
 
 def option(name: str, value: str):
