@@ -64,6 +64,8 @@ from etsplat.optim.edit import apply_subdivision as apply_subdivision
 from etsplat.optim.loop import CheckpointEvent as CheckpointEvent
 from etsplat.optim.loop import DivergedError as DivergedError
 from etsplat.optim.loop import DoneEvent as DoneEvent
+from etsplat.optim.loop import NoteEvent as NoteEvent
+from etsplat.optim.loop import PrepareEvent as PrepareEvent
 from etsplat.optim.loop import RefineEvent as RefineEvent
 from etsplat.optim.loop import StepEvent as StepEvent
 from etsplat.optim.objective import Custom as Custom
@@ -93,8 +95,6 @@ from etsplat.report.html import write_report as write_report
 from etsplat.tasks.reconstruct import ReconstructResult as ReconstructResult
 from etsplat.tasks.reconstruct import reconstruct as reconstruct
 from etsplat.tasks.reconstruct_config import ReconstructConfig as ReconstructConfig
-from etsplat.tasks.running import NoteEvent as NoteEvent
-from etsplat.tasks.running import PrepareEvent as PrepareEvent
 from etsplat.tasks.scoring import Scorer as Scorer
 from etsplat.tasks.train import TrainResult as TrainResult
 from etsplat.tasks.train import train as train

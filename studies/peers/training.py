@@ -20,11 +20,10 @@ from etsplat.io.run_directory import RunDirectory
 from etsplat.metrics.image import psnr, ssim
 from etsplat.model.soup_init import StartPoints, random_points
 from etsplat.ops.photometric import photometric_loss
-from etsplat.optim.drive import drive
-from etsplat.optim.loop import LoopSettings, Progress
+from etsplat.optim.loop import LoopSettings, Progress, drive
 from etsplat.optim.schedules import exponential_decay, limited_iterations
 from etsplat.optim.view_sampler import ViewSampler
-from etsplat.tasks.evaluate_soup import drawing_speed, image_scores, mean_scores
+from etsplat.tasks.evaluate_soup import drawing_speed, mean_scores
 from etsplat.tasks.running import (
     Place,
     device_name,
@@ -33,7 +32,7 @@ from etsplat.tasks.running import (
     path_of,
     versions,
 )
-from etsplat.tasks.scoring import Scorer, load_lpips
+from etsplat.tasks.scoring import Scorer, image_scores, load_lpips
 from studies.peers.gaussians import NAMES, Splatting, load_gaussians, save_gaussians, splat, start_gaussians
 from studies.peers.settings import PeerConfig, load_gsplat
 
@@ -143,7 +142,7 @@ class PeerDrawing:
 
 
 class _Fitting:
-    """Parameters, their optimizers and gsplat's strategy: what `optim.drive` drives."""
+    """Parameters, their optimizers and gsplat's strategy: what `optim.loop` drives."""
 
     def __init__(self, gsplat: Any, capture: Dataset, config: PeerConfig, device: torch.device) -> None:
         self._gsplat, self._config, self._device = gsplat, config, device

@@ -8,7 +8,7 @@ from typing import Any
 
 from etsplat.core.errors import InputError
 from etsplat.io.run_directory import RunDirectory
-from etsplat.tasks.train import DEMO
+from etsplat.tasks.sources import DEMO_SCENE
 from etsplat.tasks.train_config import SCENE_TYPES, TrainConfig
 from studies.grid.cells import AnyConfig, Cell, is_finished
 from studies.peers.settings import PEERS, Peer, PeerConfig, load_gsplat, peer_config
@@ -47,7 +47,7 @@ class Scene:
     @property
     def name(self) -> str:
         """Of its rows and folders."""
-        return "demo" if self.folder == Path(DEMO) else self.folder.resolve().name
+        return "demo" if self.folder == Path(DEMO_SCENE) else self.folder.resolve().name
 
 
 def read_scene_argument(text: str) -> Scene:
@@ -62,7 +62,7 @@ def read_scene_argument(text: str) -> Scene:
         scene = Scene(Path(folder), scene_type, setting)
     else:
         scene = Scene(Path(text), None, "")
-    if not scene.folder.is_dir() and scene.folder != Path(DEMO):
+    if not scene.folder.is_dir() and scene.folder != Path(DEMO_SCENE):
         raise InputError(
             f"scene {scene.folder}: no such folder; fetch it with `etsplat data download`, or check the path; its kind "
             f"comes after a colon: one of {', '.join(SCENE_TYPES)}"

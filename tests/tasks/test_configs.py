@@ -2,6 +2,9 @@
 
 import json
 import math
+import pickle
+from collections.abc import Callable
+from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
@@ -103,6 +106,26 @@ def test_defaults_are_those_of_the_command_line() -> None:
         assert getattr(ReconstructConfig, preset)() == ReconstructConfig.of(preset)
     for preset in get_args(TrainPreset):
         assert getattr(TrainConfig, preset)(scene="indoor") == TrainConfig.of(preset, "indoor")
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: ReconstructConfig(preset="quick"), r"preset: 'quick' .* begin with ReconstructConfig\.quick\(\)$"),
+        (lambda: ReconstructConfig(preset="demo", iterations=7), r"begin with ReconstructConfig\.demo\(\)$"),
+        (lambda: RECONSTRUCT.changed({"preset": "tiny"}), r"begin with ReconstructConfig\.tiny\(\)$"),
+        (lambda: TrainConfig(scene_type="indoor"), r"scene_type: .* begin with TrainConfig\.quick\('indoor'\)$"),
+        (lambda: TrainConfig.paper("object").changed({"scene_type": "indoor"}), r"TrainConfig\.paper\('indoor'\)$"),
+        (lambda: TrainConfig(preset="huge"), r"preset: is 'huge'; choose one of paper, quick"),  # pyright: ignore
+    ],
+)
+def test_a_preset_is_no_mere_label(make: Callable[[], Settings], message: str) -> None:
+    """Naming one beside the settings of another is refused, with what to begin with; its own name does no harm."""
+    with pytest.raises(InputError, match=message):
+        make()
+    assert ReconstructConfig(preset="best", iterations=7) == RECONSTRUCT.changed({"iterations": 7, "preset": "best"})
+    assert replace(TrainConfig.tiny("indoor"), seed=1) == TrainConfig.tiny("indoor").changed({"seed": 1})
+    assert pickle.loads(pickle.dumps(TrainConfig.paper())) == TrainConfig.paper() == deepcopy(TrainConfig.paper())
 
 
 @pytest.mark.parametrize("config", PRESETS, ids=lambda config: f"{config.TASK} {config.preset}")

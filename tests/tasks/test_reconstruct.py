@@ -19,11 +19,10 @@ from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.topology import MeshTopology
 from etsplat.io.mesh_files import MeshFile, load_mesh
 from etsplat.io.run_directory import RunDirectory
-from etsplat.optim.loop import CheckpointEvent, DivergedError, DoneEvent, Event, RefineEvent, StepEvent
+from etsplat.optim.loop import CheckpointEvent, DivergedError, DoneEvent, Event, PrepareEvent, RefineEvent, StepEvent
 from etsplat.optim.trainer import Trainer
 from etsplat.tasks.reconstruct import ReconstructResult, reconstruct
 from etsplat.tasks.reconstruct_config import ReconstructConfig
-from etsplat.tasks.running import PrepareEvent
 
 TINY = ReconstructConfig.tiny()
 # Shorter still, with subdivisions at iterations 4, 14, 24, 34 and checkpoints at 10, 20, ...
@@ -43,10 +42,10 @@ class KilledError(Exception):
     """Stands for a kill: the run gets no chance to save anything."""
 
 
-def kill_at(iteration: int) -> Callable[[Event | PrepareEvent], None]:
+def kill_at(iteration: int) -> Callable[[Event], None]:
     """A callback that dies at the first event of an iteration or later."""
 
-    def callback(event: Event | PrepareEvent) -> None:
+    def callback(event: Event) -> None:
         if not isinstance(event, PrepareEvent) and event.iteration >= iteration:
             raise KilledError
 
@@ -68,9 +67,9 @@ def whole_run(pebble: MeshFile, tmp_path_factory: pytest.TempPathFactory) -> Rec
 
 
 @pytest.fixture(scope="module")
-def owl(tmp_path_factory: pytest.TempPathFactory) -> tuple[ReconstructResult, list[Event | PrepareEvent]]:
+def owl(tmp_path_factory: pytest.TempPathFactory) -> tuple[ReconstructResult, list[Event]]:
     """The demo's object with preset tiny, and the events."""
-    events: list[Event | PrepareEvent] = []
+    events: list[Event] = []
     return reconstruct(demo_object(), tmp_path_factory.mktemp("owl"), TINY, callbacks=[events.append]), events
 
 
@@ -84,7 +83,7 @@ def untimed(run: Path) -> dict[str, object]:
     return {"metrics": metrics, "history": history, "meshes": meshes, "pictures": pictures}
 
 
-def test_a_small_shape_is_reconstructed(owl: tuple[ReconstructResult, list[Event | PrepareEvent]]) -> None:
+def test_a_small_shape_is_reconstructed(owl: tuple[ReconstructResult, list[Event]]) -> None:
     """From a sphere with a Chamfer distance of about 0.4, the owl at 64 x 64 gets below 0.01, and looks like it."""
     metrics = owl[0].metrics
     assert metrics["chamfer"] < 0.01
@@ -95,7 +94,7 @@ def test_a_small_shape_is_reconstructed(owl: tuple[ReconstructResult, list[Event
     assert metrics["degenerate_faces"] == 0
 
 
-def test_the_result_is_a_closed_oriented_mesh(owl: tuple[ReconstructResult, list[Event | PrepareEvent]]) -> None:
+def test_the_result_is_a_closed_oriented_mesh(owl: tuple[ReconstructResult, list[Event]]) -> None:
     """Subdivision kept the sphere's topology: closed, manifold, oriented, Euler characteristic 2."""
     mesh = owl[0].mesh
     topology = MeshTopology.from_faces(mesh.faces, len(mesh.vertices))
@@ -105,7 +104,7 @@ def test_the_result_is_a_closed_oriented_mesh(owl: tuple[ReconstructResult, list
     assert topology.euler_characteristic() == 2
 
 
-def test_a_run_directory_holds_everything(owl: tuple[ReconstructResult, list[Event | PrepareEvent]]) -> None:
+def test_a_run_directory_holds_everything(owl: tuple[ReconstructResult, list[Event]]) -> None:
     """Meshes, metrics with every key, history, pictures of all 8 test views, two checkpoints, config, README."""
     run = RunDirectory(owl[0].path)
     keys = """chamfer chamfer_floor chamfer_exact f_score psnr psnr_mesh ssim lpips faces vertices degenerate_faces
@@ -127,7 +126,7 @@ def test_a_run_directory_holds_everything(owl: tuple[ReconstructResult, list[Eve
     assert run.mesh_path(".glb").exists()
 
 
-def test_history_has_a_line_for_every_log_step(owl: tuple[ReconstructResult, list[Event | PrepareEvent]]) -> None:
+def test_history_has_a_line_for_every_log_step(owl: tuple[ReconstructResult, list[Event]]) -> None:
     """Every 20 iterations, with PSNR and Chamfer distance every 100; the last ones are those of metrics.json,
     Chamfer up to its estimation."""
     history = RunDirectory(owl[0].path).read_history()
@@ -138,7 +137,7 @@ def test_history_has_a_line_for_every_log_step(owl: tuple[ReconstructResult, lis
     assert history[-1]["psnr"] == pytest.approx(owl[0].metrics["psnr"])
 
 
-def test_callbacks_see_all_events_in_order(owl: tuple[ReconstructResult, list[Event | PrepareEvent]]) -> None:
+def test_callbacks_see_all_events_in_order(owl: tuple[ReconstructResult, list[Event]]) -> None:
     """40 views are photographed first; iterations never go back; refinements grow the mesh; done is last."""
     events = owl[1]
     prepared = [event for event in events if isinstance(event, PrepareEvent)]
@@ -179,14 +178,14 @@ def test_ctrl_c_leaves_a_checkpoint_to_resume_from(
 ) -> None:
     """Interrupted at iteration 15, the run keeps a checkpoint of 16 and ends with the whole run's bits."""
 
-    def press(event: Event | PrepareEvent) -> None:
+    def press(event: Event) -> None:
         if isinstance(event, StepEvent) and event.iteration == 15:
             signal.raise_signal(signal.SIGINT)
 
     with pytest.raises(KeyboardInterrupt):
         reconstruct(pebble, tmp_path, SHORT, callbacks=[press])
     assert (tmp_path / "checkpoints" / "step_000016.safetensors").exists()
-    events: list[Event | PrepareEvent] = []
+    events: list[Event] = []
     reconstruct(pebble, tmp_path, SHORT, callbacks=[events.append], resume=True)
     assert min(event.iteration for event in events if not isinstance(event, PrepareEvent)) > 16
     assert untimed(tmp_path) == untimed(whole_run.path)

@@ -13,12 +13,11 @@ from etsplat.data.dataset import Dataset
 from etsplat.data.demo_scene import demo_scene
 from etsplat.io.run_directory import RunDirectory
 from etsplat.model.triangle_soup import TriangleSoup
-from etsplat.optim.loop import CheckpointEvent, DivergedError, RefineEvent, StepEvent
+from etsplat.optim.loop import CheckpointEvent, DivergedError, NoteEvent, RefineEvent, StepEvent
 from etsplat.optim.schedules import at
 from etsplat.optim.strategies import DensifyAndPrune
 from etsplat.optim.trainer import Trainer
 from etsplat.tasks import train_checks
-from etsplat.tasks.running import NoteEvent
 from etsplat.tasks.train import TrainResult, start_trainer, train
 from etsplat.tasks.train_checks import predicted_bytes
 from etsplat.tasks.train_config import TrainConfig

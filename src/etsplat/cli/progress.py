@@ -11,8 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from etsplat.io.images import open_image
-from etsplat.optim.loop import DoneEvent, Event, StepEvent
-from etsplat.tasks.running import NoteEvent, PrepareEvent
+from etsplat.optim.loop import DoneEvent, Event, NoteEvent, PrepareEvent, StepEvent
 
 LINES = 10
 """Without a terminal, so many lines tell of the optimization."""
@@ -82,7 +81,7 @@ class RunProgress(PhaseBar):
         self._metrics: dict[str, float] = {}
         self._lines = 0
 
-    def __call__(self, event: Event | PrepareEvent | NoteEvent) -> None:
+    def __call__(self, event: Event) -> None:
         """Take in an event of the run."""
         if isinstance(event, PrepareEvent):
             self.show(self._preparing, event.done, event.total)

@@ -13,7 +13,7 @@ from etsplat.tasks.settings import Rare, Settings
 from etsplat.tasks.train_config import TrainConfig
 
 if TYPE_CHECKING:
-    from etsplat.tasks.running import Callback
+    from etsplat.optim.loop import Callback
 
 
 @dataclass(frozen=True, kw_only=True)

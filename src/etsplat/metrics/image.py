@@ -18,7 +18,7 @@ from etsplat.core.errors import InputError
 from etsplat.io.paths import kind_of
 
 _C1, _C2 = 0.01**2, 0.03**2
-_WINDOW, _SIGMA = 11, 1.5
+WINDOW, _SIGMA = 11, 1.5
 
 _VGG16 = (64, 64, "pool", 128, 128, "pool", 256, 256, 256, "pool", 512, 512, 512, "pool", 512, 512, 512)
 _TAPS = (3, 8, 15, 22, 29)
@@ -66,10 +66,10 @@ def ssim(image: Float[Tensor, "H W C"], truth: Float[Tensor, "H W C"], *, interi
         ValueError: shapes differ or are not (H, W, C); with `interior`, an image smaller than the window.
     """
     _check_pair(image, truth)
-    if interior and min(image.shape[:2]) < _WINDOW:
-        raise ValueError(f"image: expected at least {_WINDOW} pixels a side for the interior SSIM, got {image.shape}")
+    if interior and min(image.shape[:2]) < WINDOW:
+        raise ValueError(f"image: expected at least {WINDOW} pixels a side for the interior SSIM, got {image.shape}")
     x, y = image.double().movedim(-1, 0), truth.double().movedim(-1, 0)
-    moments = _blur(torch.stack([x, y, x * x, y * y, x * y]), 0 if interior else _WINDOW // 2)
+    moments = _blur(torch.stack([x, y, x * x, y * y, x * y]), 0 if interior else WINDOW // 2)
     mean_x, mean_y, square_x, square_y, product = moments
     variance_x, variance_y = square_x - mean_x**2, square_y - mean_y**2
     covariance = product - mean_x * mean_y
@@ -221,7 +221,7 @@ def _check_pair(image: Tensor, truth: Tensor) -> None:
 
 def _blur(planes: Float[Tensor, "M C H W"], padding: int) -> Float[Tensor, "M C H2 W2"]:
     """Separable Gaussian window; beyond the border there are zeros."""
-    offsets = torch.arange(_WINDOW, dtype=planes.dtype, device=planes.device) - _WINDOW // 2
+    offsets = torch.arange(WINDOW, dtype=planes.dtype, device=planes.device) - WINDOW // 2
     window = torch.exp(-(offsets**2) / (2 * _SIGMA**2))
     window = window / window.sum()
     flat = planes.reshape(-1, 1, *planes.shape[-2:])

@@ -1,6 +1,7 @@
 """What can be fitted to photos: the trainer, the objectives and the scorer know a model by this alone."""
 
 from collections.abc import Mapping
+from copy import copy
 from pathlib import Path
 from typing import Any, ClassVar, Literal, Protocol, TypeVar
 
@@ -45,7 +46,7 @@ M = TypeVar("M", bound="Model")
 
 
 class Model(Protocol):
-    """Learnable triangles.
+    """Learnable triangles. One of your own is a class over this one, with its parameters as attributes.
 
     Attributes:
         appearance: how they are drawn, in training and ever after.
@@ -63,8 +64,15 @@ class Model(Protocol):
         ...
 
     def parameters(self) -> dict[str, Tensor]:
-        """The learnable tensors by name."""
-        ...
+        """The learnable tensors by name, in the order of `RATES`; those that are None are not."""
+        found = {name: getattr(self, name) for name in self.RATES}
+        return {name: parameter for name, parameter in found.items() if parameter is not None}
+
+    def learnable(self: M) -> M:
+        """This one, with parameters that require gradients."""
+        for parameter in self.parameters().values():
+            parameter.requires_grad_(True)
+        return self
 
     def render(
         self,
@@ -91,15 +99,20 @@ class Model(Protocol):
 
     def state(self) -> dict[str, Tensor]:
         """Every tensor that the model consists of, detached, by name, for a checkpoint."""
-        ...
+        return {name: parameter.detach() for name, parameter in self.parameters().items()}
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
         """Takes these tensors in the place of its own, onto its device; those not named stay."""
-        ...
+        for name, old in self.parameters().items():
+            if name in state:
+                setattr(self, name, state[name].to(old.device).requires_grad_(old.requires_grad))
 
     def to(self: M, device: torch.device) -> M:
         """The same on another device, in leaf tensors of its own."""
-        ...
+        moved = copy(self)
+        for name, parameter in self.parameters().items():
+            setattr(moved, name, parameter.detach().to(device).requires_grad_(parameter.requires_grad))
+        return moved
 
     def save(self, path: Path | str) -> None:
         """Writes a file, atomically; the suffix is its kind."""

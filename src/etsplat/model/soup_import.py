@@ -1,7 +1,6 @@
 """Soups from files of other programs: Triangle Splatting's state, Gaussian scenes, meshes; and our own exports."""
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +15,7 @@ from etsplat.io.mesh_files import load_mesh
 from etsplat.io.paths import kind_of
 from etsplat.io.ply_tables import CORNERS, read_ply_header, read_ply_tables
 from etsplat.model.soup_appearance import SoupAppearance
-from etsplat.model.triangle_soup import TriangleSoup
+from etsplat.model.triangle_soup import SH_CONSTANT, TriangleSoup
 
 GAUSSIAN_SIGMA = 1.0
 """With it the elastic kernel is exp(-x^2): the profile of a Gaussian."""
@@ -27,7 +26,7 @@ GAUSSIAN_INRADIUS = math.sqrt(2 * math.pi / (3 * math.sqrt(3)))
 MESH_OPACITY, MESH_SIGMA = 0.999, 0.02
 """A mesh becomes a soup that is drawn all but opaque and sharp."""
 
-_TS_KEYS = ("triangles_points", "sigma", "opacity", "features_dc", "features_rest")
+_TS_KEYS = ("triangles_points", "opacity", "sigma", "features_dc", "features_rest")
 
 
 def open_soup(path: Path | str) -> TriangleSoup:
@@ -43,12 +42,11 @@ def open_soup(path: Path | str) -> TriangleSoup:
     path = Path(path)
     if not path.is_file():
         raise InputError(f"soup {path}: no such file; check the path")
-    readers: dict[str, Callable[[Path], TriangleSoup]] = {
-        ".safetensors": TriangleSoup.load,
-        ".pt": _read_triangle_splatting,
-        ".ply": _read_ply,
-    }
-    soup = readers.get(kind_of(path), _read_mesh)(path)
+    if kind_of(path) == ".safetensors":
+        soup = TriangleSoup.load(path)
+    else:
+        soup = {".pt": _read_triangle_splatting, ".ply": _read_ply}.get(kind_of(path), _read_mesh)(path)
+        soup = replace(soup, **soup.state(), notes={"source": path.name})
     if not len(soup):
         raise InputError(f"soup {path}: holds no triangle; take another file")
     soup.check_finite(path)
@@ -64,22 +62,16 @@ def _read_triangle_splatting(path: Path) -> TriangleSoup:
         raise InputError(f"soup {path}: cannot be read as a state dict of tensors alone; save it again") from error
     if not isinstance(state, dict) or not all(isinstance(state.get(key), Tensor) for key in _TS_KEYS):
         raise InputError(f"soup {path}: lacks keys of Triangle Splatting's point_cloud_state_dict.pt")
-    points, sigma, opacity, dc, rest = (state[key].detach().float() for key in _TS_KEYS)
-    count = len(points)
+    count, parts = len(state[_TS_KEYS[0]]), (state[key].detach().float() for key in _TS_KEYS)
+    shapes = ((count, 3, 3), (count,), (count,), (count, 1, 3), (count, -1, 3))
     try:
-        soup = TriangleSoup(
-            points.reshape(count, 3, 3),
-            opacity.reshape(count),
-            sigma.reshape(count),
-            dc.reshape(count, 1, 3),
-            rest.reshape(count, -1, 3),
-        )
+        soup = TriangleSoup(*(part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)))
     except (RuntimeError, ValueError) as error:
         raise InputError(f"soup {path}: its tensors do not fit together ({error}); save it again") from error
     degree = int(state.get("active_sh_degree", soup.sh_degree))
     # near_plane: Triangle Splatting drops triangles whose centroid is nearer than 0.2, we those with such a corner.
     appearance = SoupAppearance("single_sided", "sdf", sh_degree=degree, cull_small=True, near_plane=0.2)
-    return replace(soup, appearance=appearance, notes={"source": path.name})
+    return replace(soup, appearance=appearance)
 
 
 def _read_ply(path: Path) -> TriangleSoup:
@@ -94,25 +86,20 @@ def _read_ply(path: Path) -> TriangleSoup:
 def _read_exported(path: Path, comments: list[str]) -> TriangleSoup:
     tables = read_ply_tables(path, ("vertex", "face"))
     vertex, face = tables["vertex"], tables["face"]
-    points = np.stack([vertex[axis] for axis in "xyz"], axis=1).astype(np.float32)
+    points = _columns(vertex, *"xyz").float()
     corners = face[CORNERS].astype(np.int64)
     if corners.size and not 0 <= corners.min() <= corners.max() < len(points):
         raise InputError(f"soup {path}: has corners that name no vertex; export it again")
-    names = face.dtype.names or ()
-    opacity = torch.from_numpy(face["opacity"].astype(np.float32))
-    sigma = torch.from_numpy(face["sigma"].astype(np.float32))
-    if "f_dc_0" in names:
+    opacity, sigma = _columns(face, "opacity", "sigma").float().double().unbind(dim=1)
+    if "f_dc_0" in (face.dtype.names or ()):
         dc, rest = _harmonics(face)
     else:
-        rgb = np.stack([face[name] for name in ("red", "green", "blue")], axis=1).astype(np.float32) / 255
-        start = TriangleSoup.from_triangles(
-            torch.zeros(len(face), 3, 3), torch.from_numpy(rgb), opacity=0.5, sigma=0.5, sh_degree=0
-        )
-        dc, rest = start.sh_dc.detach(), start.sh_rest.detach()
+        colors = _columns(face, "red", "green", "blue").float() / 255
+        dc, rest = ((colors - 0.5) / SH_CONSTANT)[:, None], torch.zeros(len(face), 0, 3)
     soup = TriangleSoup(
-        torch.from_numpy(points[corners]),
-        torch.logit(opacity.double().clamp(1e-6, 1 - 1e-7)).float(),
-        (sigma.double() - SOUP_SIGMA_FLOOR).clamp_min(1e-6).log().float(),
+        points[torch.from_numpy(corners)],
+        torch.logit(opacity.clamp(1e-6, 1 - 1e-7)).float(),
+        (sigma - SOUP_SIGMA_FLOOR).clamp_min(1e-6).log().float(),
         dc,
         rest,
     )
@@ -122,22 +109,17 @@ def _read_exported(path: Path, comments: list[str]) -> TriangleSoup:
         raise InputError(
             f"soup {path}: is drawn with kernel {words[1]!r}, which is not registered; take soup.safetensors"
         )
-    appearance = SoupAppearance(words[1], words[2]) if known else SoupAppearance()
-    return replace(soup, appearance=appearance, notes={"source": path.name})
+    return replace(soup, appearance=SoupAppearance(words[1], words[2])) if known else soup
 
 
 def _read_gaussians(path: Path) -> TriangleSoup:
     """A triangle for each Gaussian, across its two larger axes; its third axis, the thinnest, is lost."""
     table = read_ply_tables(path)["vertex"]
-
-    def columns(*names: str) -> Tensor:
-        return torch.from_numpy(np.stack([table[name].astype(np.float64) for name in names], axis=1))
-
     try:
-        centers = columns("x", "y", "z")
-        scales = columns("scale_0", "scale_1", "scale_2").exp()
-        rotations = _rotations(columns("rot_0", "rot_1", "rot_2", "rot_3"))
-        logits = columns("opacity")[:, 0].float()
+        centers = _columns(table, *"xyz")
+        scales = _columns(table, "scale_0", "scale_1", "scale_2").exp()
+        rotations = _rotations(_columns(table, "rot_0", "rot_1", "rot_2", "rot_3"))
+        logits = _columns(table, "opacity")[:, 0].float()
         dc, rest = _harmonics(table)
     except (KeyError, ValueError) as error:
         raise InputError(f"soup {path}: lacks a property of a Gaussian scene ({error}); export it again") from error
@@ -148,7 +130,7 @@ def _read_gaussians(path: Path) -> TriangleSoup:
     circle = torch.stack([angles.cos(), angles.sin()], dim=1)
     vertices = centers[:, None] + torch.einsum("kc,nac->nka", circle, axes)
     raw = torch.full((len(table),), math.log(GAUSSIAN_SIGMA - SOUP_SIGMA_FLOOR))
-    return TriangleSoup(vertices.float(), logits, raw, dc, rest, notes={"source": path.name})
+    return TriangleSoup(vertices.float(), logits, raw, dc, rest)
 
 
 def _read_mesh(path: Path) -> TriangleSoup:
@@ -159,21 +141,23 @@ def _read_mesh(path: Path) -> TriangleSoup:
         colors = mesh.vertex_colors[mesh.faces].mean(dim=1)
     else:
         colors = torch.full((len(mesh.faces), 3), 0.8)
-    soup = TriangleSoup.from_triangles(
-        mesh.vertices[mesh.faces], colors, opacity=MESH_OPACITY, sigma=MESH_SIGMA, sh_degree=0
-    )
-    return replace(soup, **soup.state(), notes={"source": path.name})
+    corners = mesh.vertices[mesh.faces]
+    return TriangleSoup.from_triangles(corners, colors, opacity=MESH_OPACITY, sigma=MESH_SIGMA, sh_degree=0)
+
+
+def _columns(table: np.ndarray, *names: str) -> Tensor:
+    """(N, K) float64."""
+    return torch.from_numpy(np.stack([table[name].astype(np.float64) for name in names], axis=1))
 
 
 def _harmonics(table: np.ndarray) -> tuple[Tensor, Tensor]:
     """Coefficients (N, 1, 3), (N, R, 3) from f_dc_* and f_rest_*; these hold all of red, then green, then blue."""
-    dc = np.stack([table[f"f_dc_{channel}"] for channel in range(3)], axis=1).astype(np.float32)
+    dc = _columns(table, *(f"f_dc_{channel}" for channel in range(3))).float()[:, None]
     count = sum(name.startswith("f_rest_") for name in table.dtype.names or ())
-    rest = np.zeros((len(table), 0), dtype=np.float32)
-    if count:
-        rest = np.stack([table[f"f_rest_{index}"] for index in range(count)], axis=1).astype(np.float32)
-    channels_first = torch.from_numpy(rest).reshape(len(table), 3, count // 3)
-    return torch.from_numpy(dc)[:, None], channels_first.transpose(1, 2).contiguous()
+    if not count:
+        return dc, dc.new_zeros((len(table), 0, 3))
+    rest = _columns(table, *(f"f_rest_{index}" for index in range(count))).float()
+    return dc, rest.reshape(len(table), 3, count // 3).transpose(1, 2).contiguous()
 
 
 def _rotations(quaternions: Tensor) -> Tensor:

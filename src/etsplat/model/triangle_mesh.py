@@ -14,7 +14,7 @@ from etsplat.core.rasterization import Rasterization
 from etsplat.data.dataset import Normalization
 from etsplat.geometry.topology import MeshTopology
 from etsplat.io.mesh_files import MeshFile, load_mesh, save_mesh, weld_vertices
-from etsplat.model.model import Appearance, Depth
+from etsplat.model.model import Appearance, Depth, Model
 from etsplat.ops.antialias import rasterize_antialiased
 from etsplat.ops.rasterize import rasterize
 from etsplat.ops.rasterize_opaque import render_opaque
@@ -41,7 +41,7 @@ class MeshAppearance(Appearance):
 
 
 @dataclass
-class TriangleMesh:
+class TriangleMesh(Model):
     """A triangle mesh with a colour per face or per vertex; where it is soft, an opacity per face and one softness.
 
     Colours are optimised as they are (not squashed) and clamped to [0, 1] where they leave as a mesh; opacities pass
@@ -101,7 +101,7 @@ class TriangleMesh:
         start = colors if isinstance(colors, Tensor) else torch.full((count, 3), colors)
         soft = opacity is not None and sigma is not None
         logit = torch.logit(torch.tensor(opacity, dtype=torch.float64)).to(vertices) if soft else None
-        mesh = cls(
+        return cls(
             vertices=vertices,
             colors=start.detach().clone().to(vertices),
             opacity_logits=None if logit is None else logit.repeat(len(faces)),
@@ -109,10 +109,7 @@ class TriangleMesh:
             topology=MeshTopology.from_faces(faces, len(vertices)),
             vertex_colored=vertex_colored,
             appearance=appearance or MeshAppearance("elastic" if soft else None),
-        )
-        for parameter in mesh.parameters().values():
-            parameter.requires_grad_(True)
-        return mesh
+        ).learnable()
 
     @classmethod
     def load(cls, path: Path | str, *, opacity: float | None = 0.98, sigma: float | None = 0.25) -> "TriangleMesh":
@@ -147,8 +144,7 @@ class TriangleMesh:
 
     def to(self, device: torch.device) -> "TriangleMesh":
         """The same mesh on another device, its parameters leaf tensors as they are here."""
-        moved = {name: p.detach().to(device).requires_grad_(p.requires_grad) for name, p in self.parameters().items()}
-        return replace(self, **moved, topology=self.topology.to(device))
+        return replace(super().to(device), topology=self.topology.to(device))
 
     def render(
         self,
@@ -224,25 +220,13 @@ class TriangleMesh:
 
     def state(self) -> dict[str, Tensor]:
         """Parameters and faces, detached, by name."""
-        return {**{name: parameter.detach() for name, parameter in self.parameters().items()}, "faces": self.faces}
+        return {**super().state(), "faces": self.faces}
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
         """Takes these tensors in the place of its own, onto its device; those not named stay."""
-        for name in self.parameters().keys() & state.keys():
-            old = getattr(self, name)
-            setattr(self, name, state[name].to(old.device).requires_grad_(old.requires_grad))
+        super().load_state(state)
         if "faces" in state:
             self.topology = MeshTopology.from_faces(state["faces"].to(self.vertices.device), len(self.vertices))
-
-    def parameters(self) -> dict[str, Tensor]:
-        """The learnable tensors by name."""
-        parameters = {
-            "vertices": self.vertices,
-            "colors": self.colors,
-            "opacity_logits": self.opacity_logits,
-            "log_sigma": self.log_sigma,
-        }
-        return {name: parameter for name, parameter in parameters.items() if parameter is not None}
 
     @property
     def vertex_parameters(self) -> tuple[str, ...]:

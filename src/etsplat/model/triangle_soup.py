@@ -17,7 +17,7 @@ from etsplat.core.rasterization import SOUP_SIGMA_FLOOR, Rasterization, joined
 from etsplat.io.kernel_files import adopt_kernel, kernel_tensors
 from etsplat.io.paths import kind_of
 from etsplat.io.tensors import read_tensors, save_tensors
-from etsplat.model.model import Depth
+from etsplat.model.model import Depth, Model
 from etsplat.model.soup_appearance import OPAQUE_FROM, SMALLEST_INRADIUS, SoupAppearance
 from etsplat.ops.rasterize import rasterize
 from etsplat.ops.rasterize_opaque import render_opaque
@@ -32,7 +32,7 @@ SH_CONSTANT = 0.28209479177387814
 
 
 @dataclass
-class TriangleSoup:
+class TriangleSoup(Model):
     """N separate triangles, each with its own opacity, softness and view-dependent colour.
 
     Opacities pass through a sigmoid and sigma through 0.01 + exp, so that every real parameter is a valid one. Colours
@@ -65,8 +65,6 @@ class TriangleSoup:
     sh_rest: Float[Tensor, "N R 3"]
     appearance: SoupAppearance = field(default_factory=SoupAppearance)
     notes: Mapping[str, str] = field(default_factory=dict)
-
-    PARAMETERS = ("vertices", "opacity_logits", "sigma_raw", "sh_dc", "sh_rest")
 
     def __post_init__(self) -> None:
         N = len(self.vertices)
@@ -104,16 +102,13 @@ class TriangleSoup:
         N = len(vertices)
         logit = torch.logit(torch.tensor(opacity, dtype=torch.float64)).to(vertices)
         raw = torch.tensor(sigma - SOUP_SIGMA_FLOOR, dtype=torch.float64).log().to(vertices)
-        soup = cls(
+        return cls(
             vertices=vertices.detach().clone(),
             opacity_logits=logit.repeat(N),
             sigma_raw=raw.repeat(N),
             sh_dc=((colors.detach().to(vertices) - 0.5) / SH_CONSTANT)[:, None, :].clone(),
             sh_rest=vertices.new_zeros((N, (sh_degree + 1) ** 2 - 1, 3)),
-        )
-        for parameter in soup.parameters().values():
-            parameter.requires_grad_(True)
-        return soup
+        ).learnable()
 
     @classmethod
     def load(cls, path: Path | str) -> "TriangleSoup":
@@ -130,7 +125,7 @@ class TriangleSoup:
             if metadata.get("format") != FORMAT:
                 raise ValueError("not a soup of this version of etsplat")
             notes = {key.removeprefix("note."): value for key, value in metadata.items() if key.startswith("note.")}
-            parameters = {name: tensors[name].float() for name in cls.PARAMETERS}
+            parameters = {name: tensors[name].float() for name in cls.RATES}
             soup = cls(**parameters, appearance=SoupAppearance.from_json(metadata["appearance"]), notes=notes)
         except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
             detail = (str(error) or type(error).__name__).splitlines()[0]
@@ -165,17 +160,9 @@ class TriangleSoup:
     @torch.no_grad()
     def joined(self, other: "TriangleSoup") -> "TriangleSoup":
         """The triangles of both, in new learnable tensors."""
-        mine, theirs = self.parameters(), other.parameters()
-        return replace(self, **{n: torch.cat([mine[n], theirs[n]]).requires_grad_(True) for n in self.PARAMETERS})
-
-    def to(self, device: torch.device) -> "TriangleSoup":
-        """The same soup on another device, its parameters leaf tensors as they are here."""
-        moved = {name: p.detach().to(device).requires_grad_(p.requires_grad) for name, p in self.parameters().items()}
-        return replace(self, **moved)
-
-    def parameters(self) -> dict[str, Tensor]:
-        """The learnable tensors by name."""
-        return {name: getattr(self, name) for name in self.PARAMETERS}
+        theirs = other.parameters()
+        both = {name: torch.cat([mine, theirs[name]]) for name, mine in self.parameters().items()}
+        return replace(self, **both).learnable()
 
     @property
     def count(self) -> int:
@@ -190,16 +177,6 @@ class TriangleSoup:
             for suffix, fraction in (("_10", 0.1), ("", 0.5), ("_90", 0.9)):
                 state[name + suffix] = float(ordered[int(fraction * (len(ordered) - 1))])
         return state
-
-    def state(self) -> dict[str, Tensor]:
-        """The parameters, detached, by name."""
-        return {name: parameter.detach() for name, parameter in self.parameters().items()}
-
-    def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """Takes these tensors in the place of its own, onto its device; those not named stay."""
-        for name, tensor in state.items():
-            old = getattr(self, name)
-            setattr(self, name, tensor.to(old.device).requires_grad_(old.requires_grad))
 
     def render(
         self,

@@ -1,5 +1,7 @@
 """The optimization loop: it drives a problem and yields events; it knows nothing about triangles.
 
+`optimize` is the loop, `drive` that from the last checkpoint on, with a run's history.
+
 Everything that happens at an iteration (step, refinement) is done before its events are yielded, so a consumer always
 sees, and a checkpoint always holds, the state between two iterations.
 """
@@ -8,17 +10,45 @@ import math
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-from etsplat.optim.checkpoints import list_checkpoints
+import torch
+from torch import Tensor
+
+from etsplat.io.run_directory import RunDirectory
+from etsplat.optim.checkpoints import list_checkpoints, load_latest_checkpoint, save_checkpoint
 
 
 class DivergedError(RuntimeError):
     """The loss or a parameter became NaN or infinite. The message is one line that says when and what is left."""
+
+
+@dataclass(frozen=True)
+class PrepareEvent:
+    """While the input is made ready (pictures are taken of a mesh, photos are decoded), before the first step.
+
+    Attributes:
+        done: views done.
+        total: views in all.
+    """
+
+    done: int
+    total: int
+
+
+@dataclass(frozen=True)
+class NoteEvent:
+    """Something that the owner of the run should know, such as a repair made while reading the input.
+
+    Attributes:
+        text: a sentence.
+    """
+
+    text: str
 
 
 @dataclass(frozen=True)
@@ -105,7 +135,10 @@ class DoneEvent:
         return f"{self.iteration} iterations in {self.seconds:.1f} s"
 
 
-Event = StepEvent | RefineEvent | CheckpointEvent | DoneEvent
+Event = PrepareEvent | NoteEvent | StepEvent | RefineEvent | CheckpointEvent | DoneEvent
+"""The first two are told by tasks, before the loop begins."""
+
+Callback = Callable[[Event], None]
 
 
 class Problem(Protocol):
@@ -143,6 +176,14 @@ class Problem(Protocol):
         """The name of a parameter that holds NaN or infinity, or None."""
         ...
 
+    def state(self) -> dict[str, Tensor]:
+        """Everything that the rest of the run depends on, by name, for a checkpoint."""
+        ...
+
+    def load_state(self, state: dict[str, Tensor], iteration: int) -> None:
+        """Continues where `state` was taken."""
+        ...
+
 
 @dataclass
 class Progress:
@@ -176,6 +217,50 @@ class LoopSettings:
     log_every: int
     evaluate_every: int
     checkpoint_every: int
+
+
+def drive(
+    problem: Problem,
+    progress: Progress,
+    settings: LoopSettings,
+    callbacks: Sequence[Callback],
+    run: RunDirectory | None,
+    run_hash: str,
+) -> None:
+    """Runs the loop to the last iteration.
+
+    Args:
+        problem: changed in place.
+        progress: where it stands; changed in place. A checkpoint in `run` takes its place.
+        settings: when things happen.
+        callbacks: each is called with every event.
+        run: gets checkpoints and history.jsonl; None writes nothing.
+        run_hash: identifies all that the result depends on.
+
+    Raises:
+        DivergedError: a loss or parameter is not finite.
+        InputError: the checkpoint is damaged or of another run; the disk is full.
+    """
+    if run is not None:
+        checkpoint = load_latest_checkpoint(run.checkpoints, run_hash)
+        if checkpoint is not None:
+            problem.load_state(checkpoint.tensors, checkpoint.iteration)
+            progress.iteration = checkpoint.iteration
+            progress.seconds, progress.loss_sum, loss_count = checkpoint.tensors["progress"].tolist()
+            progress.loss_count = int(loss_count)
+        run.truncate_history(progress.iteration)
+
+    def save(at: Progress) -> Path:
+        assert run is not None
+        place = torch.tensor([at.seconds, at.loss_sum, at.loss_count], dtype=torch.float64)
+        return save_checkpoint(run.checkpoints, at.iteration, {**problem.state(), "progress": place}, run_hash)
+
+    for event in optimize(problem, settings, progress, save if run else None, run.checkpoints if run else None):
+        if isinstance(event, StepEvent) and run is not None:
+            place = {"iteration": event.iteration, "seconds": round(event.seconds, 3), "loss": event.loss}
+            run.append_history({**place, **event.state, **event.metrics})
+        for callback in callbacks:
+            callback(event)
 
 
 def optimize(

@@ -21,8 +21,7 @@ from etsplat.io.kernel_files import adopt_kernel, kernel_tensors
 from etsplat.io.run_directory import RunDirectory, is_run
 from etsplat.model.model import Model
 from etsplat.ops.adam import Adam
-from etsplat.optim.drive import Callback, drive
-from etsplat.optim.loop import LoopSettings, Progress
+from etsplat.optim.loop import Callback, LoopSettings, Progress, drive
 from etsplat.optim.objective import Drawing, Objective
 from etsplat.optim.row import RowLayout
 from etsplat.optim.schedules import Schedule, at
@@ -47,7 +46,7 @@ M = TypeVar("M", bound=Model)
 
 
 class Trainer(Generic[M]):
-    """One run's state, and what changes it: steps and edits. Implements `optim.drive.Resumable`.
+    """One run's state, and what changes it: steps and edits. Implements `optim.loop.Problem`.
 
     A step draws some views, adds up the gradients of each in their order, and updates. On engine "cuda" what changes
     from step to step is a row of numbers, and many steps are queued together.

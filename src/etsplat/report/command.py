@@ -4,8 +4,10 @@ import shlex
 from typing import Any
 
 from etsplat.tasks.reconstruct_config import ReconstructConfig
-from etsplat.tasks.settings import flatten
+from etsplat.tasks.settings import Settings, flatten
 from etsplat.tasks.train_config import TrainConfig
+
+CONFIGS: dict[str, type[Settings]] = {kind.TASK: kind for kind in (ReconstructConfig, TrainConfig)}
 
 
 def reproduce_command(config: dict[str, Any], version: str) -> str | None:
@@ -15,17 +17,18 @@ def reproduce_command(config: dict[str, Any], version: str) -> str | None:
         config: the run's config.json.
         version: of this etsplat. Settings that the preset implies are left out if the run was made with the same.
     """
-    settings, same = config["config"], config["versions"]["etsplat"] == version
-    if config["paths"]["source"] is None:
+    settings, paths, same = config["config"], config["paths"], config["versions"]["etsplat"] == version
+    if paths["source"] is None or (paths.get("init_mesh", "") is None and config["source"]["init_mesh"]):
         return None
-    if config["task"] == "train":
-        words, implied = _train_words(config["paths"], settings)
-    else:
-        if config["source"]["init_mesh"] and config["paths"]["init_mesh"] is None:
-            return None
-        words, implied = _reconstruct_words(config["paths"], settings)
+    kind = CONFIGS[config["task"]]
+    implied = flatten(kind.based_on(settings).to_dict())
+    words = [f"etsplat {config['task']} {shlex.quote(paths['source'])} --out DIR"]
+    if paths["source"] == "demo:scene":
+        words = ["etsplat demo scene --out DIR"]
+    words += [_option(name, paths[name]) for name in ("init_mesh", "images", "masks") if paths.get(name)]
+    words += [_option(name, settings[name]) for name in kind.LABELS]
     for name, value in flatten(settings).items():
-        if name not in ("preset", "scene_type") and (not same or name not in implied or implied[name] != value):
+        if name not in kind.LABELS and (not same or name not in implied or implied[name] != value):
             words.append(_option(name, value))
     return " \\\n    ".join(words)
 
@@ -36,23 +39,3 @@ def _option(name: str, value: object) -> str:
     if isinstance(value, bool):
         return f"--{group}{dot}{'' if value else 'no-'}{last}"
     return f"--{group}{dot}{last} {shlex.quote(str(value))}"
-
-
-def _reconstruct_words(paths: dict[str, Any], settings: dict[str, Any]) -> tuple[list[str], dict[str, Any]]:
-    """How the command begins, and the settings that its preset implies."""
-    words = [f"etsplat reconstruct {shlex.quote(paths['source'])} --out DIR"]
-    if paths["init_mesh"]:
-        words.append(f"--init-mesh {shlex.quote(paths['init_mesh'])}")
-    words.append(f"--preset {settings['preset']}")
-    return words, flatten(ReconstructConfig.of(settings["preset"]).to_dict())
-
-
-def _train_words(paths: dict[str, Any], settings: dict[str, Any]) -> tuple[list[str], dict[str, Any]]:
-    """The same for a soup."""
-    source = paths["source"]
-    words = [f"etsplat train {shlex.quote(source)} --out DIR"]
-    if source == "demo:scene":
-        words = ["etsplat demo scene --out DIR"]
-    words += [f"--{name} {shlex.quote(paths[name])}" for name in ("images", "masks") if paths.get(name)]
-    words += [f"--preset {settings['preset']}", f"--scene-type {settings['scene_type']}"]
-    return words, flatten(TrainConfig.of(settings["preset"], settings["scene_type"]).to_dict())

@@ -18,11 +18,10 @@ from etsplat.io.atomic import atomic_write
 from etsplat.io.images import open_image
 from etsplat.io.mesh_files import load_mesh
 from etsplat.io.overview import TestView, draw_overview, spread
-from etsplat.report.cards import cards_of
+from etsplat.report.cards import Metric, cards_of
 from etsplat.report.command import reproduce_command
 from etsplat.report.curves import curves_of, draw_svg, short_number
 from etsplat.report.data import Run, read_run
-from etsplat.report.metrics import Metric
 from etsplat.report.plots import plot_convergence
 
 MAX_VIEWS = 12

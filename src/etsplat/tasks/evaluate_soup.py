@@ -7,18 +7,15 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from etsplat.core.cameras import Cameras
 from etsplat.core.errors import InputError
 from etsplat.engines.choice import engine_for
 from etsplat.engines.threads import num_threads
 from etsplat.io.atomic import write_error
-from etsplat.io.images import save_image, to_8_bit
-from etsplat.metrics.image import Lpips, psnr, ssim
+from etsplat.io.images import save_image
 from etsplat.tasks.running import device_name
-from etsplat.tasks.scoring import SMALLEST, Scorer, load_lpips
+from etsplat.tasks.scoring import Scorer, image_scores, load_lpips
 from etsplat.tasks.soup_run import SoupRun
 
 REPEATS = 3
@@ -65,8 +62,8 @@ def evaluate_run(
     for index, view in enumerate(capture.test):
         seen = scorer.see(soup, view)
         photo, soft, opaque = seen.photo, seen.counting(seen.splatted), seen.counting(seen.opaque)
-        name = capture.names[view]
-        rows.append({"name": name, **image_scores(soft, photo, lpips), **image_scores(opaque, photo, lpips, "_opaque")})
+        name, scores = capture.names[view], image_scores(soft, photo, lpips)
+        rows.append({"name": name, **scores, **image_scores(opaque, photo, lpips, suffix="_opaque")})
         if pictures is not None:
             error = (4 * (soft - photo).abs()).clamp(0, 1)
             save_image(pictures / f"{name}.png", torch.cat([photo, soft, opaque, error], dim=1))
@@ -81,26 +78,10 @@ def evaluate_run(
     return {**mean_scores(rows), "lpips_reason": reason, **speed, "triangles": len(soup), "views": rows}
 
 
-def image_scores(
-    image: Float[Tensor, "H W 3"], photo: Float[Tensor, "H W 3"], lpips: Lpips | None, suffix: str = ""
-) -> dict[str, float | None]:
-    """Every image metric of one view by name, with a suffix; None where it is not defined or not at hand."""
-    smallest = min(image.shape[:2])
-    measured = lpips if smallest >= SMALLEST else None
-    scores: dict[str, float | None] = {
-        "psnr": psnr(image, photo),
-        "psnr_8bit": psnr(to_8_bit(image).float() / 255, to_8_bit(photo).float() / 255),
-        "ssim": ssim(image, photo),
-        "ssim_interior": ssim(image, photo, interior=True) if smallest >= 11 else None,
-        "lpips": None if measured is None else float(measured(image, photo)),
-        "lpips_3dgs": None if measured is None else float(measured(image, photo, rescale=False)),
-    }
-    return {f"{name}{suffix}": value for name, value in scores.items()}
-
-
 def mean_scores(rows: Sequence[dict[str, Any]]) -> dict[str, float | None]:
     """Means over views, of what was measured in all of them."""
-    return {name: _mean([row[name] for row in rows]) for name in rows[0] if name != "name"}
+    columns = {name: [row[name] for row in rows] for name in rows[0] if name != "name"}
+    return {name: None if None in values else statistics.fmean(values) for name, values in columns.items()}
 
 
 @torch.no_grad()
@@ -129,8 +110,3 @@ def drawing_speed(
         "device": device_name(device),
         "threads": num_threads(),
     }
-
-
-def _mean(values: list[float | None]) -> float | None:
-    present = [value for value in values if value is not None]
-    return statistics.fmean(present) if len(present) == len(values) else None

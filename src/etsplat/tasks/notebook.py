@@ -11,8 +11,7 @@ from typing import Any
 
 from etsplat.io.overview import draw_overview, find_test_views
 from etsplat.io.run_directory import RunDirectory
-from etsplat.optim.loop import DoneEvent, Event, StepEvent
-from etsplat.tasks.running import Callback, NoteEvent, PrepareEvent
+from etsplat.optim.loop import Callback, DoneEvent, Event, NoteEvent, PrepareEvent, StepEvent
 
 _SHOWN = (
     ("psnr", "PSNR", "{:.2f} dB"),
@@ -31,7 +30,7 @@ class NotebookProgress:
         self._display = importlib.import_module("IPython.display").display
         self._line: Any = None
 
-    def __call__(self, event: Event | PrepareEvent | NoteEvent) -> None:
+    def __call__(self, event: Event) -> None:
         """Takes in an event of the run."""
         if isinstance(event, NoteEvent):
             print(event.text)

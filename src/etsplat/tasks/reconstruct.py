@@ -5,13 +5,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from etsplat.data.dataset import Dataset
-from etsplat.engines.choice import engine, resolve_device
+from etsplat.engines.choice import engine
 from etsplat.io.mesh_files import MeshFile
 from etsplat.model.triangle_mesh import TriangleMesh
 from etsplat.ops.antialias_nvdiffrast import load_nvdiffrast
+from etsplat.optim.loop import Callback, NoteEvent
 from etsplat.optim.objective import Objective
 from etsplat.optim.schedules import (
     Schedule,
@@ -25,26 +25,14 @@ from etsplat.optim.strategies import SubdivideAndUntangle
 from etsplat.optim.terms.photometric import Photometric
 from etsplat.optim.trainer import Trainer
 from etsplat.optim.vertex_updates import UniformSteps
-from etsplat.tasks.notebook import notebook_callbacks, result_html
 from etsplat.tasks.reconstruct_config import ReconstructConfig
-from etsplat.tasks.running import (
-    Callback,
-    NoteEvent,
-    Place,
-    PrepareEvent,
-    announcer,
-    common_metrics,
-    fit,
-    make_record,
-    path_of,
-    terms_of,
-)
+from etsplat.tasks.running import Job, Result, path_of, terms_of
 from etsplat.tasks.scoring import Scorer, load_lpips
 from etsplat.tasks.sources import Source, fingerprint, load_source, load_start, make_start, make_subject
 
 
 @dataclass(frozen=True)
-class ReconstructResult:
+class ReconstructResult(Result):
     """What a run gives back; all of it is in the run directory too.
 
     Attributes:
@@ -53,12 +41,9 @@ class ReconstructResult:
         metrics: as in metrics.json.
     """
 
-    path: Path
-    mesh: MeshFile
-    metrics: dict[str, Any]
+    OPAQUE = TriangleMesh.OPAQUE
 
-    def _repr_html_(self) -> str:
-        return result_html(self.path, self.metrics, TriangleMesh.OPAQUE)
+    mesh: MeshFile
 
 
 def reconstruct(
@@ -96,42 +81,32 @@ def reconstruct(
         DivergedError: the optimization went to NaN or infinity.
     """
     config = config or ReconstructConfig()
-    device = resolve_device(config.device, config.engine)
-    callbacks = callbacks or notebook_callbacks()
-    place, announce = Place(Path(out), resume, overwrite), announcer(callbacks)
-    place.check()
+    job = Job(config, out, callbacks, resume=resume, overwrite=overwrite)
     loaded, start = load_source(source, config, masks), load_start(init_mesh)
     hashes = {"fingerprint": fingerprint(loaded), "init_mesh": fingerprint(start)}
-    paths = {"source": path_of(source), "init_mesh": path_of(init_mesh)}
-    record = make_record(config, config.iterations, hashes, paths)
-    if resume:
-        place.open(record)  # refuses another run before pictures are taken
+    job.identify(hashes, {"source": path_of(source), "init_mesh": path_of(init_mesh)})
     for name, mesh in (("source", loaded), ("init_mesh", start)):
         for note in mesh.notes if isinstance(mesh, MeshFile) else ():
-            announce(NoteEvent(f"{name}: {note}"))
-    subject = make_subject(loaded, config, lambda done, total: announce(PrepareEvent(done, total)), device)
+            job.announce(NoteEvent(f"{name}: {note}"))
+    views, truth = make_subject(loaded, config, job.prepared, job.device)
     if config.drawing.backend == "nvdiffrast":
         load_nvdiffrast()  # now rather than at the first step
     with engine(config.engine):
         scorer = Scorer(
-            subject.views,
-            device,
-            truth=subject.truth,
+            views,
+            job.device,
+            truth=truth,
             samples=config.output.chamfer_samples,
             supersampling=config.pictures.supersampling,
-            lpips=load_lpips(config.output.lpips_weights, device),
+            lpips=load_lpips(config.output.lpips_weights, job.device),
         )
-        trainer = make_trainer(make_start(start, subject.views, config, device), subject.views, config, scorer.cheap)
-        run = place.open(record)
-        progress = fit(trainer, config, run, record, callbacks)
-        mesh = trainer.model
-        result = mesh.to_file(subject.views.normalization)
+        trainer = make_trainer(make_start(start, views, config, job.device), views, config, scorer.cheap)
+        progress, mesh, frame = job.fit(trainer), trainer.model, views.normalization
         for suffix in (".ply", ".obj", ".glb"):
-            mesh.save(run.mesh_path(suffix), subject.views.normalization)
+            mesh.save(job.run.mesh_path(suffix), frame)
         sizes = {"faces": len(mesh.faces), "vertices": len(mesh.vertices)}
-        metrics = {**scorer.full(mesh, run.test), **sizes, **common_metrics(progress, config, mesh.vertices)}
-    run.write_metrics(metrics)
-    return ReconstructResult(run.path, result, run.read_metrics())
+        metrics = job.finish(progress, {**scorer.full(mesh, job.run.test), **sizes}, mesh.vertices)
+    return ReconstructResult(job.run.path, metrics, mesh.to_file(frame))
 
 
 def make_trainer(

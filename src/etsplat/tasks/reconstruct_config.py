@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, get_args
 
-from etsplat.core.errors import InputError
 from etsplat.tasks.settings import Device, OneOf, Only, Range, Rare, Settings, SoftMethod, engine_names, kernel_methods
 
 RasterMethod = Literal["raster-face", "raster-vertex"]
@@ -133,7 +132,7 @@ class Output:
     """Weights file for LPIPS; "download" fetches it; None uses the one in torch's cache or goes without."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ReconstructConfig(Settings):
     """Settings of `etsplat.reconstruct`; the defaults are preset "best".
 
@@ -141,6 +140,7 @@ class ReconstructConfig(Settings):
     """
 
     TASK: ClassVar[str] = "reconstruct"
+    LABELS: ClassVar[tuple[str, ...]] = ("preset",)
 
     preset: Preset = "best"
     """Where the other settings start from; in Python, begin with `ReconstructConfig.quick()` and the like.
@@ -175,17 +175,6 @@ class ReconstructConfig(Settings):
     regularization: Regularization = Regularization()
     refinement: Refinement = Refinement()
     output: Output = Output()
-
-    @classmethod
-    def of(cls, preset: str) -> "ReconstructConfig":
-        """The settings of a preset.
-
-        Raises:
-            InputError: there is none of that name.
-        """
-        if preset not in _PRESETS:
-            raise InputError(f"preset: is {preset!r}; choose one of {', '.join(_PRESETS)}")
-        return cls().changed({**_PRESETS[preset], "preset": preset})
 
     @classmethod
     def best(cls) -> "ReconstructConfig":
@@ -228,13 +217,9 @@ class ReconstructConfig(Settings):
         return self.drawing.colors == "vertex" if self.soft else self.method == "raster-vertex"
 
     @classmethod
-    def based_on(cls, settings: Mapping[str, Any]) -> "ReconstructConfig":
-        """The preset that some settings are changes of."""
-        return cls.of(settings.get("preset", "best"))
-
-    def implied(self) -> Mapping[str, Any]:
+    def implied_by(cls, *labels: str) -> Mapping[str, Any]:
         """What the preset sets."""
-        return _PRESETS.get(self.preset, {})
+        return _PRESETS.get(labels[0], {})
 
     def contradiction(self) -> str | None:
         """What is wrong with settings that are right one by one."""

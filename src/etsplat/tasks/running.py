@@ -7,51 +7,25 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
 from etsplat.core.errors import InputError
-from etsplat.engines.choice import engine_for
+from etsplat.engines.choice import engine_for, resolve_device
 from etsplat.engines.threads import num_threads
 from etsplat.io.kernel_files import kernel_digest, write_kernel
 from etsplat.io.run_directory import RunDirectory, is_run
-from etsplat.optim.loop import Event, Progress
+from etsplat.optim.loop import Callback, Event, PrepareEvent, Progress
 from etsplat.optim.objective import Term
 from etsplat.optim.schedules import Scheduled
 from etsplat.optim.terms import named_terms
 from etsplat.optim.trainer import Trainer
+from etsplat.tasks.notebook import notebook_callbacks, result_html
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.settings import Settings
 from etsplat.tasks.train_config import TrainConfig
-
-
-@dataclass(frozen=True)
-class PrepareEvent:
-    """While the input is made ready (pictures are taken of a mesh, photos are decoded), before the first step.
-
-    Attributes:
-        done: views done.
-        total: views in all.
-    """
-
-    done: int
-    total: int
-
-
-@dataclass(frozen=True)
-class NoteEvent:
-    """Something that the owner of the run should know, such as a repair made while reading the input.
-
-    Attributes:
-        text: a sentence.
-    """
-
-    text: str
-
-
-Callback = Callable[[Event | PrepareEvent | NoteEvent], None]
 
 
 @dataclass(frozen=True)
@@ -94,34 +68,110 @@ class Place:
         return run
 
 
-def announcer(callbacks: Sequence[Callback]) -> Callback:
-    """Calls each with every event."""
+@dataclass(frozen=True)
+class Result:
+    """What a run gives back; all of it is in the run directory too.
 
-    def announce(event: Event | PrepareEvent | NoteEvent) -> None:
-        for callback in callbacks:
+    Attributes:
+        path: the run directory.
+        metrics: as in metrics.json.
+        OPAQUE: what pictures of opaque triangles are called, as of the model.
+    """
+
+    OPAQUE: ClassVar[str]
+
+    path: Path
+    metrics: dict[str, Any]
+
+    def _repr_html_(self) -> str:
+        return result_html(self.path, self.metrics, self.OPAQUE)
+
+
+class Job:
+    """A run of a task, from its settings to its metrics: what all tasks do around their trainers.
+
+    Attributes:
+        config: settings.
+        device: where it runs.
+        run: the run directory, from `fit` on.
+    """
+
+    run: RunDirectory
+
+    def __init__(
+        self,
+        config: ReconstructConfig | TrainConfig,
+        out: str | Path,
+        callbacks: Sequence[Callback],
+        *,
+        resume: bool,
+        overwrite: bool,
+    ) -> None:
+        """Raises InputError where there is no run to continue, or no place for a new one."""
+        self.config, self.device = config, resolve_device(config.device, config.engine)
+        self._callbacks = callbacks or notebook_callbacks()
+        self._place = Place(Path(out), resume, overwrite)
+        self._place.check()
+
+    def announce(self, event: Event) -> None:
+        """Tells all callbacks."""
+        for callback in self._callbacks:
             callback(event)
 
-    return announce
+    def prepared(self, done: int, total: int) -> None:
+        """Tells that so many views are ready."""
+        self.announce(PrepareEvent(done, total))
 
+    def identify(
+        self, hashes: dict[str, str | None], paths: dict[str, str | None], iterations: int | None = None
+    ) -> None:
+        """Takes what the run is of, as `make_record` does. A run that goes on must be of the same.
 
-def fit(
-    trainer: Trainer[Any],
-    config: ReconstructConfig | TrainConfig,
-    run: RunDirectory,
-    record: dict[str, Any],
-    callbacks: Sequence[Callback],
-) -> Progress:
-    """Runs a trainer from the last checkpoint to the end, as settings and record say; see `Trainer.fit`."""
-    output = config.output
-    return trainer.fit(
-        config.iterations,
-        callbacks=callbacks,
-        log_every=output.log_every,
-        evaluate_every=output.evaluate_every,
-        checkpoint_every=output.checkpoint_every,
-        run=run,
-        run_hash=hash_record(record),
-    )
+        Raises:
+            InputError: the run in the folder was started with other settings or input.
+        """
+        self._record = make_record(self.config, iterations or self.config.iterations, hashes, paths)
+        if self._place.resume:
+            self._place.open(self._record)
+
+    def fit(self, trainer: Trainer[Any], watch: Callback | None = None) -> Progress:
+        """Runs a trainer from the last checkpoint to the end; see `Trainer.fit`. `watch` is told before the others."""
+        output, self.run = self.config.output, self._place.open(self._record)
+        return trainer.fit(
+            self.config.iterations,
+            callbacks=[self.announce] if watch is None else [watch, self.announce],
+            log_every=output.log_every,
+            evaluate_every=output.evaluate_every,
+            checkpoint_every=output.checkpoint_every,
+            run=self.run,
+            run_hash=hash_record(self._record),
+        )
+
+    def finish(self, progress: Progress, found: Mapping[str, Any], result: Tensor) -> dict[str, Any]:
+        """Writes metrics.json: what was found, how long it took, on what, and how it was made.
+
+        Args:
+            progress: at the end.
+            found: metrics.
+            result: a tensor of the result, for its device and precision.
+        """
+        config = self.config
+        self.run.write_metrics(
+            {
+                **found,
+                "iterations": progress.iteration,
+                "seconds": progress.seconds,
+                "seconds_per_iteration": progress.seconds / progress.iteration,
+                "engine": engine_for(result).name,
+                "device": device_name(result.device),
+                "threads": num_threads(),
+                "method": config.method,
+                "preset": config.preset,
+                "seed": config.seed,
+                "versions": versions(),
+            }
+        )
+        return self.run.read_metrics()
 
 
 def terms_of(
@@ -181,28 +231,6 @@ def path_of(source: object) -> str | None:
     if not isinstance(source, str | Path):
         return None
     return str(Path(source).resolve()) if Path(source).exists() else str(source)  # the latter: "demo:scene"
-
-
-def common_metrics(progress: Progress, config: ReconstructConfig | TrainConfig, result: Tensor) -> dict[str, Any]:
-    """What metrics.json says of every run: how long it took, on what, and how it was made.
-
-    Args:
-        progress: at the end.
-        config: settings.
-        result: a tensor of the result, for its device and precision.
-    """
-    return {
-        "iterations": progress.iteration,
-        "seconds": progress.seconds,
-        "seconds_per_iteration": progress.seconds / progress.iteration,
-        "engine": engine_for(result).name,
-        "device": device_name(result.device),
-        "threads": num_threads(),
-        "method": config.method,
-        "preset": config.preset,
-        "seed": config.seed,
-        "versions": versions(),
-    }
 
 
 def device_name(device: torch.device) -> str:

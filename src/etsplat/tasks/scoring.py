@@ -1,6 +1,6 @@
 """How good a model is: on the test views, splatted and as a mesh viewer draws it, and against the true mesh."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from functools import cached_property
 from pathlib import Path
@@ -14,15 +14,19 @@ from etsplat.data.dataset import Dataset
 from etsplat.data.loader import View, ViewLoader
 from etsplat.data.pictures import as_float
 from etsplat.geometry.intersections import count_degenerate_faces, count_self_intersections
-from etsplat.io.images import over_background, save_image
+from etsplat.io.images import over_background, save_image, to_8_bit
 from etsplat.io.mesh_files import MeshFile
 from etsplat.metrics.geometry import SAMPLES, chamfer, geometry_metrics, sample_pair
-from etsplat.metrics.image import Lpips, find_lpips_weights, psnr, silhouette_iou, ssim
+from etsplat.metrics.image import WINDOW, Lpips, find_lpips_weights, psnr, silhouette_iou, ssim
 from etsplat.model.model import Model
 from etsplat.model.triangle_mesh import TriangleMesh
 
 SMALLEST = 16
 """Pixels a side below which LPIPS is not defined."""
+
+METRICS = ("psnr", "psnr_8bit", "ssim", "ssim_interior", "lpips", "lpips_3dgs")
+"""Of a view: psnr_8bit is that of images rounded to 8 bits, as published numbers are; ssim is zero-padded; lpips has
+inputs in [-1, 1], lpips_3dgs in [0, 1]."""
 
 FoundLpips = tuple[Lpips | None, str | None]
 """The metric, or why it is not measured."""
@@ -138,15 +142,14 @@ class Scorer:
         return Seen(model, self._views.view(index), self._background, self._supersampling)
 
     def _scores(self, seen: Seen, opaque: str) -> dict[str, float | None]:
-        pictures = {"": seen.counting(seen.splatted), f"_{opaque}": seen.counting(seen.opaque)}
-        scores: dict[str, float | None] = {}
-        for suffix, picture in pictures.items():
-            scores |= {f"psnr{suffix}": psnr(picture, seen.photo), f"ssim{suffix}": ssim(picture, seen.photo)}
-        scores["lpips"] = None if self._lpips is None else float(self._lpips(pictures[""], seen.photo))
-        scores["silhouette_iou"] = None
-        if seen.alpha is not None and self._has_outlines:
-            scores["silhouette_iou"] = silhouette_iou(seen.covered[..., 3], seen.alpha)
-        return scores
+        splatted, drawn = seen.counting(seen.splatted), seen.counting(seen.opaque)
+        outline = None if seen.alpha is None or not self._has_outlines else seen.alpha
+        return {
+            **image_scores(splatted, seen.photo, names=("psnr", "ssim")),
+            **image_scores(drawn, seen.photo, names=("psnr", "ssim"), suffix=f"_{opaque}"),
+            **image_scores(splatted, seen.photo, self._lpips, ("lpips",)),
+            "silhouette_iou": None if outline is None else silhouette_iou(seen.covered[..., 3], outline),
+        }
 
     @cached_property
     def _has_outlines(self) -> bool:
@@ -162,6 +165,37 @@ class Scorer:
             found["degenerate_faces"] = count_degenerate_faces(vertices, faces)
             found["self_intersections"] = count_self_intersections(vertices, faces)
         return found
+
+
+def image_scores(
+    image: Float[Tensor, "H W 3"],
+    photo: Float[Tensor, "H W 3"],
+    lpips: Lpips | None = None,
+    names: Sequence[str] = METRICS,
+    *,
+    suffix: str = "",
+) -> dict[str, float | None]:
+    """Metrics of one view by name, with a suffix; None where one is not defined or not at hand.
+
+    Args:
+        image: (H, W, 3) in [0, 1].
+        photo: (H, W, 3) in [0, 1].
+        lpips: the metric, if there is one.
+        names: which of `METRICS`.
+        suffix: of the names in the result.
+    """
+    smallest = min(image.shape[:2])
+    measures: dict[str, Callable[[], float]] = {
+        "psnr": lambda: psnr(image, photo),
+        "psnr_8bit": lambda: psnr(to_8_bit(image).float() / 255, to_8_bit(photo).float() / 255),
+        "ssim": lambda: ssim(image, photo),
+    }
+    if smallest >= WINDOW:
+        measures["ssim_interior"] = lambda: ssim(image, photo, interior=True)
+    if lpips is not None and smallest >= SMALLEST:
+        measures["lpips"] = lambda: float(lpips(image, photo))
+        measures["lpips_3dgs"] = lambda: float(lpips(image, photo, rescale=False))
+    return {f"{name}{suffix}": measures[name]() if name in measures else None for name in names}
 
 
 def load_lpips(weights: Path | str | None, device: torch.device) -> FoundLpips:

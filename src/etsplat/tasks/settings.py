@@ -134,9 +134,17 @@ class Settings:
 
     TASK: ClassVar[str] = ""
     """What a run with these settings is called in its config.json."""
+    LABELS: ClassVar[tuple[str, ...]] = ()
+    """Settings that others start from: the preset first. They are named before the others are set, or not at all."""
+
+    def __new__(cls: type[AnySettings], **given: Any) -> AnySettings:
+        """Refuses a label without the settings that it stands for."""
+        if len(given) < len(fields(cls)):
+            cls._check_labels(given, cls)
+        return object.__new__(cls)
 
     def __post_init__(self) -> None:
-        implied = self.implied()
+        implied = self.implied_by(*(getattr(self, name) for name in self.LABELS))
         for name, setting in settings_of(type(self)).items():
             value = get(self, name)
             if isinstance(value, str) and value not in setting.choices and "." not in name:
@@ -151,8 +159,20 @@ class Settings:
         if problem := self.contradiction():
             raise InputError(problem)
 
-    def implied(self) -> Mapping[str, Any]:
-        """The settings, by name, that differ from the class's defaults because of the preset."""
+    @classmethod
+    def of(cls: type[AnySettings], *labels: str) -> AnySettings:
+        """The settings of a preset, and of the other labels of the class.
+
+        Raises:
+            InputError: there is none of that name.
+        """
+        labels += tuple(getattr(cls, name) for name in cls.LABELS[len(labels) :])
+        named = dict(zip(cls.LABELS, labels, strict=True))
+        return _replaced(cls(), {**cls.implied_by(*labels), **named}, "")
+
+    @classmethod
+    def implied_by(cls, *labels: str) -> Mapping[str, Any]:
+        """The settings, by name, that differ from the class's defaults because of its labels; none for unknown ones."""
         return {}
 
     def contradiction(self) -> str | None:
@@ -162,7 +182,7 @@ class Settings:
     @classmethod
     def based_on(cls: type[AnySettings], settings: Mapping[str, Any]) -> AnySettings:
         """The config that some settings are changes of: of the preset that they name, or the default one."""
-        return cls()
+        return cls.of(*(settings.get(name, getattr(cls, name)) for name in cls.LABELS))
 
     def changed(self: AnySettings, changes: Mapping[str, Any]) -> AnySettings:
         """The config with some settings changed.
@@ -179,6 +199,7 @@ class Settings:
                 raise InputError(f"{name}: is a group of settings; name one of them, with its value")
             if name not in known:
                 raise InputError(f"{name}: is no setting{did_you_mean(name, known)}")
+        self._check_labels(flat, self)
         return _replaced(self, {name: _typed(known[name], value) for name, value in flat.items()}, "")
 
     @classmethod
@@ -195,6 +216,16 @@ class Settings:
                 raise InputError(f"{item}: is not a setting and its value; write NAME=VALUE,NAME=VALUE")
             changes[name] = known[name].read(value) if name in known else value
         return changes
+
+    @classmethod
+    def _check_labels(cls, given: Mapping[str, Any], present: object) -> None:
+        """Refuses other labels than those present: one by itself would stand beside what others stand for."""
+        for name in cls.LABELS:
+            value = given.get(name, getattr(present, name))
+            if value != getattr(present, name) and value in settings_of(cls)[name].choices:
+                preset, *others = (given.get(label, getattr(present, label)) for label in cls.LABELS)
+                start = f"{cls.__name__}.{preset}({', '.join(map(repr, others))})"
+                raise InputError(f"{name}: {value!r} stands for other settings too; begin with {start}")
 
     def to_dict(self) -> dict[str, Any]:
         """All settings as JSON has them, with a dictionary for each group."""

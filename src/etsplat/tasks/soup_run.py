@@ -16,7 +16,7 @@ from etsplat.io.paths import path_remedy
 from etsplat.io.run_directory import RunDirectory, is_run
 from etsplat.model.soup_import import open_soup
 from etsplat.model.triangle_soup import TriangleSoup
-from etsplat.tasks.train import DEMO, demo_capture
+from etsplat.tasks.sources import DEMO_SCENE, load_scene
 
 
 @dataclass(frozen=True)
@@ -118,18 +118,10 @@ def _open_directory(path: Path, scene: Path | str | None, device: torch.device) 
     source = scene or paths["source"]
     if source is None:
         return SoupRun(path, soup, None)
-    if str(source) == DEMO:
-        return SoupRun(path, soup, demo_capture(config["config"]["width"]))
-    if scene is None and not Path(source).is_dir():
+    if scene is None and source != DEMO_SCENE and not Path(source).is_dir():
         raise InputError(f"{path}: its scene {source} has gone; name where it is now with --scene")
-    capture = load_dataset(
-        source,
-        images=paths.get("images"),
-        width=config["config"]["width"],
-        masks=paths.get("masks"),
-        preload=False,
-    )
-    return SoupRun(path, soup, capture)
+    width = config["config"]["width"]
+    return SoupRun(path, soup, load_scene(source, width, paths.get("images"), paths.get("masks"), preload=False))
 
 
 def rotation_to_y_up(up: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:

@@ -2,7 +2,6 @@
 
 import hashlib
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -11,6 +10,7 @@ from torch import Tensor
 from etsplat.core.errors import InputError
 from etsplat.data.dataset import Dataset
 from etsplat.data.demo_object import demo_object
+from etsplat.data.demo_scene import HEIGHT, WIDTH, demo_scene
 from etsplat.data.hull import bounding_sphere
 from etsplat.data.load import load_dataset
 from etsplat.data.photograph import normalize_mesh, photograph
@@ -22,21 +22,8 @@ from etsplat.tasks.reconstruct_config import ReconstructConfig
 
 Source = str | Path | MeshFile | Dataset
 
-DEMO = "demo:owl"
-"""Names the object that is built in code."""
-
-
-@dataclass(frozen=True)
-class Subject:
-    """A source made ready: the object fills the unit sphere around the origin.
-
-    Attributes:
-        views: images and cameras in that frame; `views.normalization` leads back to the input's units.
-        truth: the mesh that was photographed, in that frame, or None if there is none.
-    """
-
-    views: Dataset
-    truth: MeshFile | None
+DEMO_OBJECT, DEMO_SCENE = "demo:owl", "demo:scene"
+"""Name what is built in code."""
 
 
 def load_source(source: Source, config: ReconstructConfig, masks: str | Path | None = None) -> MeshFile | Dataset:
@@ -55,7 +42,7 @@ def load_source(source: Source, config: ReconstructConfig, masks: str | Path | N
         raise InputError(f"masks {masks}: belong to a folder with posed images; leave them out for a mesh")
     if isinstance(source, MeshFile | Dataset):
         return source
-    if str(source) == DEMO:
+    if str(source) == DEMO_OBJECT:
         return demo_object()
     path = Path(source)
     if path.is_dir():
@@ -66,12 +53,39 @@ def load_source(source: Source, config: ReconstructConfig, masks: str | Path | N
     raise InputError(f"{path}: no such file or folder; {path_remedy(path)}")
 
 
+def load_scene(
+    source: str | Path | Dataset,
+    width: int | None,
+    images: str | None = None,
+    masks: str | Path | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    *,
+    preload: bool = True,
+) -> Dataset:
+    """Reads a scene's folder as `load_dataset` does, or makes the demo's scene in photos no wider than its own.
+
+    Args:
+        source: what to read; a data set is passed through.
+        width: wider photos are scaled down to this; None for the usual limit.
+        images: folder in the scene to take the photos from.
+        masks: folder with a mask for every photo.
+        progress: called with (views done, views in all).
+        preload: decode all photos now.
+    """
+    if isinstance(source, Dataset):
+        return source
+    if str(source) == DEMO_SCENE:
+        width = min(WIDTH, width or WIDTH)
+        return demo_scene(width, max(1, round(HEIGHT * width / WIDTH)), progress=progress)
+    return load_dataset(source, images=images, width=width, masks=masks, progress=progress, preload=preload)
+
+
 def make_subject(
     source: MeshFile | Dataset,
     config: ReconstructConfig,
     progress: Callable[[int, int], None],
     device: torch.device,
-) -> Subject:
+) -> tuple[Dataset, MeshFile | None]:
     """Photographs a mesh; views are ready as they are (loaders put the object into the unit sphere).
 
     Args:
@@ -80,16 +94,20 @@ def make_subject(
         progress: called with (views done, views in all) while photographing.
         device: where a mesh is photographed.
 
+    Returns:
+        Images and cameras in the frame where the object fills the unit sphere around the origin (`normalization` leads
+        back to the input's units); and the mesh that was photographed, in that frame, or None if there is none.
+
     Raises:
         InputError: the mesh has no extent, or there are no views to train on.
     """
     if isinstance(source, MeshFile):
         side, samples = config.resolution, config.pictures.supersampling
         views = photograph(source, side, side, supersampling=samples, progress=progress, device=device)
-        return Subject(views, normalize_mesh(source)[0])
+        return views, normalize_mesh(source)[0]
     if not source.train:
         raise InputError("views: none to train on; name some in `train`")
-    return Subject(source, None)
+    return source, None
 
 
 def load_start(start: str | Path | MeshFile | None) -> MeshFile | None:

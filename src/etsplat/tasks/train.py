@@ -5,46 +5,28 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import torch
 
 from etsplat.data.dataset import Dataset
-from etsplat.data.demo_scene import HEIGHT, WIDTH, demo_scene
-from etsplat.data.load import load_dataset
-from etsplat.engines.choice import engine, engine_for, resolve_device
-from etsplat.io.run_directory import RunDirectory
+from etsplat.engines.choice import engine, engine_for
 from etsplat.model.soup_appearance import SoupAppearance
 from etsplat.model.soup_init import StartPoints, random_points, start_soup
 from etsplat.model.surroundings import Surroundings
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.optim.densification import PruneRules
-from etsplat.optim.loop import CheckpointEvent, DivergedError, Progress
+from etsplat.optim.loop import Callback, CheckpointEvent, DivergedError, Event, NoteEvent
 from etsplat.optim.objective import Objective
 from etsplat.optim.schedules import Schedule, Scheduled, exponential_decay, limited_iterations, ramp
 from etsplat.optim.strategies import DensifyAndPrune
 from etsplat.optim.terms.photometric import Photometric
 from etsplat.optim.terms.soup import Spared
 from etsplat.optim.trainer import Trainer
-from etsplat.tasks.notebook import notebook_callbacks, result_html
-from etsplat.tasks.running import (
-    Callback,
-    NoteEvent,
-    Place,
-    PrepareEvent,
-    announcer,
-    common_metrics,
-    fit,
-    make_record,
-    path_of,
-    terms_of,
-)
+from etsplat.tasks.running import Job, Result, path_of, terms_of
 from etsplat.tasks.scoring import Scorer
+from etsplat.tasks.sources import load_scene
 from etsplat.tasks.train_checks import check_train, doubtful_scale
 from etsplat.tasks.train_config import TrainConfig
-
-DEMO = "demo:scene"
-"""Names the scene that is built in code."""
 
 LARGE_SPAN = 300.0
 """Above this many units across, Triangle Splatting compares outdoor scenes by squares."""
@@ -62,7 +44,7 @@ multiply in its place. The thresholds of soft soups take too much away (research
 
 
 @dataclass(frozen=True)
-class TrainResult:
+class TrainResult(Result):
     """What a run gives back; all of it is in the run directory too.
 
     Attributes:
@@ -71,12 +53,9 @@ class TrainResult:
         metrics: as in metrics.json.
     """
 
-    path: Path
-    soup: TriangleSoup
-    metrics: dict[str, Any]
+    OPAQUE = TriangleSoup.OPAQUE
 
-    def _repr_html_(self) -> str:
-        return result_html(self.path, self.metrics, TriangleSoup.OPAQUE)
+    soup: TriangleSoup
 
 
 def train(
@@ -110,36 +89,45 @@ def train(
         DivergedError: the optimization went to NaN or infinity.
     """
     config = config or TrainConfig()
-    device = resolve_device(config.device, config.engine)
-    callbacks = callbacks or notebook_callbacks()
-    place, announce = Place(Path(out), resume, overwrite), announcer(callbacks)
-    place.check()
-    own = _load(source, config, images, masks, lambda done, total: announce(PrepareEvent(done, total)))
+    job = Job(config, out, callbacks, resume=resume, overwrite=overwrite)
+    own = load_scene(source, config.width, images, masks, job.prepared)
     capture = own.normalized() if config.normalize else own
     iterations = limited_iterations(config.iterations, config.schedule.max_epochs, len(own.train), config.batch)
-    for note in check_train(own, config, iterations, device):
-        announce(NoteEvent(note))
+    for note in check_train(own, config, iterations, job.device):
+        job.announce(NoteEvent(note))
     paths = {"source": path_of(source), "images": images, "masks": path_of(masks)}
-    record = make_record(config, iterations, {"fingerprint": own.fingerprint()}, paths)
-    config = replace(config, iterations=iterations)
+    job.identify({"fingerprint": own.fingerprint()}, paths, iterations)
+    job.config = config = replace(config, iterations=iterations)
     with engine(config.engine):
-        scorer = Scorer(capture, device, background=_background(config))
-        trainer = start_trainer(capture, config, scorer.cheap, device)
-        run = place.open(record)
+        scorer = Scorer(capture, job.device, background=_background(config))
+        trainer = start_trainer(capture, config, scorer.cheap, job.device)
 
-        def keep(event: Any) -> None:
+        def keep(event: Event) -> None:
             if isinstance(event, CheckpointEvent):  # so that `etsplat view` can follow
-                _in_own_units(trainer, event.iteration, capture, config).save(run.soup_path)
-            announce(event)
+                _in_own_units(trainer.model, event.iteration, capture, config).save(job.run.soup_path)
 
         with engine_for(trainer.model.vertices).looping():
             try:
-                progress = fit(trainer, config, run, record, [keep])
+                progress = job.fit(trainer, keep)
             except DivergedError as error:
                 if doubt := doubtful_scale(own, config):
                     raise DivergedError(f"{error}. But first: {doubt}") from error
                 raise
-            return _finish(trainer, progress, run, scorer, capture, config)
+            soup = trainer.model.finished()
+            scores = scorer.full(soup, job.run.test)
+            result = _in_own_units(soup, progress.iteration, capture, config)
+            result.save(job.run.soup_path)
+            found = {
+                **scores,
+                "psnr_opaque_loss": None if scores["psnr"] is None else scores["psnr"] - scores["psnr_opaque"],
+                **trainer.describe(),
+                "width": capture.images.sizes[0][0],
+                "height": capture.images.sizes[0][1],
+                "train_views": len(capture.train),
+                "scene_type": config.scene_type,
+                "finish": config.finish,
+            }
+            return TrainResult(job.run.path, job.finish(progress, found, soup.vertices), result)
 
 
 def start_trainer(
@@ -285,26 +273,6 @@ def _appearance(config: TrainConfig, iteration: int) -> SoupAppearance:
     return replace(plain, opacity_floor=FINAL_FLOOR * opaque, sigma_ceiling=ceiling)
 
 
-def demo_capture(width: int | None, progress: Callable[[int, int], None] | None = None) -> Dataset:
-    """The scene that is built in code, in photos no wider than a setting asks for; None for their usual width."""
-    width = min(WIDTH, width or WIDTH)
-    return demo_scene(width, max(1, round(HEIGHT * width / WIDTH)), progress=progress)
-
-
-def _load(
-    source: str | Path | Dataset,
-    config: TrainConfig,
-    images: str | None,
-    masks: str | Path | None,
-    progress: Callable[[int, int], None],
-) -> Dataset:
-    if isinstance(source, Dataset):
-        return source
-    if str(source) == DEMO:
-        return demo_capture(config.width, progress)
-    return load_dataset(source, images=images, width=config.width, masks=masks, progress=progress)
-
-
 def _start_points(capture: Dataset, config: TrainConfig, generator: torch.Generator) -> StartPoints:
     """The capture's points, or random ones in a cube that holds what the cameras look at."""
     positions, colors = capture.points, capture.point_colors
@@ -322,39 +290,9 @@ def _background(config: TrainConfig) -> tuple[float, float, float]:
     return grey, grey, grey
 
 
-def _finish(
-    trainer: Trainer[TriangleSoup],
-    progress: Progress,
-    run: RunDirectory,
-    scorer: Scorer,
-    capture: Dataset,
-    config: TrainConfig,
-) -> TrainResult:
-    """Writes the soup in the input's units, draws the test views, measures everything."""
-    soup = trainer.model.finished()
-    scores = scorer.full(soup, run.test)
-    result = _in_own_units(trainer, progress.iteration, capture, config)
-    result.save(run.soup_path)
-    metrics = {
-        **scores,
-        "psnr_opaque_loss": None if scores["psnr"] is None else scores["psnr"] - scores["psnr_opaque"],
-        **trainer.describe(),
-        "width": capture.images.sizes[0][0],
-        "height": capture.images.sizes[0][1],
-        "train_views": len(capture.train),
-        "scene_type": config.scene_type,
-        "finish": config.finish,
-        **common_metrics(progress, config, soup.vertices),
-    }
-    run.write_metrics(metrics)
-    return TrainResult(run.path, result, run.read_metrics())
-
-
-def _in_own_units(
-    trainer: Trainer[TriangleSoup], iteration: int, capture: Dataset, config: TrainConfig
-) -> TriangleSoup:
+def _in_own_units(soup: TriangleSoup, iteration: int, capture: Dataset, config: TrainConfig) -> TriangleSoup:
     """The soup as it is now, on the CPU."""
-    soup, own = trainer.model.finished().to(torch.device("cpu")), capture.normalization
+    soup, own = soup.finished().to(torch.device("cpu")), capture.normalization
     return replace(
         soup,
         vertices=own.invert(soup.vertices.double()).float(),

@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Literal, get_args
 
-from etsplat.core.errors import InputError
 from etsplat.tasks.settings import Device, OneOf, Only, Range, Rare, Settings, engine_names, kernel_methods
 
 Preset = Literal["paper", "quick", "demo", "tiny"]
@@ -154,7 +153,7 @@ class Output:
     """Iterations between checkpoints; 0 for one at the end only."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class TrainConfig(Settings):
     """Settings of `etsplat.train`; the defaults are preset "quick" for outdoor scenes.
 
@@ -162,6 +161,7 @@ class TrainConfig(Settings):
     """
 
     TASK: ClassVar[str] = "train"
+    LABELS: ClassVar[tuple[str, ...]] = ("preset", "scene_type")
 
     preset: Preset = "quick"
     """Where the other settings start from; in Python, begin with `TrainConfig.quick()` and the like.
@@ -207,18 +207,6 @@ class TrainConfig(Settings):
     output: Output = Output()
 
     @classmethod
-    def of(cls, preset: str, scene: str = "outdoor") -> "TrainConfig":
-        """The settings of a preset for a kind of scene: outdoor, indoor or object.
-
-        Raises:
-            InputError: there is none of that name.
-        """
-        for option, name, known in (("preset", preset, _PRESETS), ("scene_type", scene, SCENE_TYPES)):
-            if name not in known:
-                raise InputError(f"{option}: is {name!r}; choose one of {', '.join(known)}")
-        return cls().changed({**_implied(preset, scene), "preset": preset, "scene_type": scene})
-
-    @classmethod
     def quick(cls, scene: SceneType = "outdoor") -> "TrainConfig":
         """Minutes on four cores, the scene scaled to unit size."""
         return cls.of("quick", scene)
@@ -253,13 +241,11 @@ class TrainConfig(Settings):
         return max(1, round(step * self.iterations / self.schedule.length)) if step > 0 else 0
 
     @classmethod
-    def based_on(cls, settings: Mapping[str, Any]) -> "TrainConfig":
-        """The preset, for the kind of scene, that some settings are changes of."""
-        return cls.of(settings.get("preset", "quick"), settings.get("scene_type", "outdoor"))
-
-    def implied(self) -> Mapping[str, Any]:
+    def implied_by(cls, *labels: str) -> Mapping[str, Any]:
         """What the preset and the kind of scene set."""
-        return _implied(self.preset, self.scene_type)
+        preset, scene = labels
+        own = _PAPER_SCENES if preset == "paper" else _QUICK_SCENES
+        return {**_PRESETS.get(preset, {}), **_SCENES.get(scene, {}), **own.get(scene, {})}
 
     def contradiction(self) -> str | None:
         """What is wrong with settings that are right one by one."""
@@ -337,8 +323,3 @@ _PAPER_SCENES: dict[str, dict[str, Any]] = {
 
 _QUICK_SCENES: dict[str, dict[str, Any]] = {"object": {"optimizer.lr_vertices": 0.0004}}
 """An object is small in the frame that its cameras span: at the rate of rooms its triangles come to rest late."""
-
-
-def _implied(preset: str, scene: str) -> dict[str, Any]:
-    own = _PAPER_SCENES if preset == "paper" else _QUICK_SCENES
-    return {**_PRESETS.get(preset, {}), **_SCENES.get(scene, {}), **own.get(scene, {})}
