@@ -94,7 +94,7 @@ def count(scene: GpuScene) -> Work:
     """The work of one step."""
     out = scene.render()
     out.color.backward(scene.cotangent)
-    render: CudaRender = out.color.grad_fn.render  # type: ignore[union-attr]
+    render: CudaRender = out.color.grad_fn.constants[0]  # type: ignore[union-attr]
     slots = int(render.zeros[2 + 2 * -(-len(scene.opacities) // 1024)].item())
     hits = render.state.bytes("hits", slots)
     bits = sum(((hits >> bit) & 1).sum(dtype=torch.int64) for bit in range(8))

@@ -57,7 +57,7 @@ def repetition(scene: Scene, timings: Timings) -> None:
 
 def native_state(out: Any) -> Any:
     """The native state of a render whose only image is the colour: what its autograd node keeps."""
-    return out.color.grad_fn.render.states[0]
+    return out.color.grad_fn.constants[0].states[0]
 
 
 def count(scene: Scene) -> dict[str, int]:

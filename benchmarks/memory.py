@@ -32,7 +32,7 @@ def _measure(name: str, threads: int, instruction_set: str, answer: "SimpleQueue
     scene = scenes.load(name)
     before = _reset_peak()
     out = scene.render()
-    state = out.color.grad_fn.render.states[0]  # pyright: ignore[reportOptionalMemberAccess]
+    state = out.color.grad_fn.constants[0].states[0]  # pyright: ignore[reportOptionalMemberAccess]
     out.color.backward(scene.cotangent)
     grown = None if before is None else (_kibibytes("VmHWM") - before) / 1024
     outputs = [out.color, out.alpha, *(leaf.grad for leaf in scene.leaves)]

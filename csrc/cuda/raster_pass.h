@@ -1,5 +1,6 @@
-// What the rasterizer's kernels read and write. The host fills it from the declarations below (etsplat/cuda/structs.py), so
+// What the rasterizer's kernels read and write. The host fills it from the declarations below (engines/cuda/structs.py), so
 // each member is a pointer, int or float, on one line with others of its type. Null where an optional tensor is absent.
+// The first ones are the inputs in the order in which the host has them (engines/native/plan.py).
 //
 // Views are rendered together. "Projected triangle" m = view * triangles + triangle; "tile" counts through all views.
 #pragma once

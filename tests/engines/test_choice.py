@@ -6,18 +6,19 @@ import pytest
 import torch
 
 import etsplat
+from etsplat import _native
 from etsplat.core.errors import EngineUnavailableError, InputError
 from etsplat.engines import choice
 from etsplat.engines.choice import engine_for, queued_steps, resolve_device
-from etsplat.engines.cpu import triangle_area as cpu_triangle_area
 from etsplat.engines.cpu.engine import CpuEngine
 from etsplat.engines.cuda import device as cuda_device_module
 from etsplat.engines.cuda.engine import CudaEngine
 from etsplat.engines.engine import Engine
-from etsplat.engines.reference.engine import ReferenceEngine
+from etsplat.engines.native.engine import NativeEngine
 from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.topology import MeshTopology
 from etsplat.ops.mesh_energies import mesh_energies
+from etsplat.ops.spherical_harmonics import spherical_harmonics
 from etsplat.ops.triangle_area import mean_area
 from helpers.simt.build import Simt
 
@@ -77,7 +78,7 @@ def test_other_threads_keep_their_own_choice():
     assert chosen == {"main": "cpu", "other": "reference"}
 
 
-class Toy(ReferenceEngine):
+class Toy(Engine):
     """Computes like the reference and counts the pictures and losses."""
 
     name = "toy"
@@ -137,24 +138,26 @@ def test_backward_keeps_the_engine_of_forward(toy: Toy, elsewhere: bool):
 
 def test_native_backward_keeps_its_engine(monkeypatch: pytest.MonkeyPatch):
     """The native gradient belongs to what was computed natively, whatever is chosen afterwards."""
-    vertices, called = torch.rand(5, 3, 3).requires_grad_(), []
-    backward = cpu_triangle_area._MeanArea.backward
-    monkeypatch.setattr(
-        cpu_triangle_area._MeanArea, "backward", staticmethod(lambda *given: called.append(1) or backward(*given))
-    )
-    area = mean_area(vertices)
+    coefficients, directions, called = torch.rand(5, 4, 3).requires_grad_(), torch.rand(5, 3), []
+    backward = _native.spherical_harmonics_backward
+
+    def noted(*given, **named):
+        called.append(1)
+        return backward(*given, **named)
+
+    monkeypatch.setattr(_native, "spherical_harmonics_backward", noted)
+    colors = spherical_harmonics(coefficients, directions, 1)
     with etsplat.engine("reference"):
-        area.backward()
+        colors.sum().backward()
     assert called == [1]
 
 
 def test_every_engine_has_every_operation():
     """Engine "cuda" inherits nothing from the reference; engine "cpu" only what is a few operations of torch."""
     operations = {name for name, value in vars(Engine).items() if isinstance(value, staticmethod)}
-    assert operations <= set(vars(ReferenceEngine))
-    shared = {"rasterize", "triangle_channels"}
-    assert operations - shared <= {name for cls in CudaEngine.__mro__[:2] for name in vars(cls)}
-    assert operations - set(vars(CpuEngine)) == {"pick_values", "update_statistics", "weighted_sum"}
+    own = {cls: set(vars(cls)) | set(vars(NativeEngine)) for cls in (CpuEngine, CudaEngine)}
+    assert operations <= own[CudaEngine]
+    assert operations - own[CpuEngine] == {"pick_values", "update_statistics", "weighted_sum"}
 
 
 def test_engine_cuda_wants_float32_on_a_gpu(simt: Simt):

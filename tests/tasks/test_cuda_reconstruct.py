@@ -11,7 +11,7 @@ import torch
 from etsplat.data.dataset import Dataset
 from etsplat.data.demo_object import demo_object
 from etsplat.data.photograph import photograph
-from etsplat.engines.cuda.graph import Repeated
+from etsplat.engines.cuda.steps import Repeated
 from etsplat.tasks.reconstruct import make_trainer, reconstruct
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.sources import make_start

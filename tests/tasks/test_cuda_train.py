@@ -12,7 +12,7 @@ import torch
 from etsplat.data.dataset import Dataset
 from etsplat.data.demo_scene import demo_scene
 from etsplat.data.pictures import StoredPictures
-from etsplat.engines.cuda.graph import Repeated
+from etsplat.engines.cuda.steps import Repeated
 from etsplat.model.soup_init import StartPoints, start_soup
 from etsplat.tasks.train import make_trainer, train
 from etsplat.tasks.train_config import TrainConfig

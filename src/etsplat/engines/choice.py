@@ -12,9 +12,8 @@ from etsplat.core.errors import EngineUnavailableError, InputError
 from etsplat.engines.cpu.engine import CpuEngine
 from etsplat.engines.cuda.engine import CudaEngine
 from etsplat.engines.engine import Engine, QueuedSteps
-from etsplat.engines.reference.engine import ReferenceEngine
 
-_REFERENCE = ReferenceEngine()
+_REFERENCE = Engine()
 _engines: dict[str, Engine] = {}
 _chosen: ContextVar[Engine | None] = ContextVar("etsplat.engine", default=None)
 

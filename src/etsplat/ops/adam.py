@@ -12,7 +12,8 @@ from torch import Tensor
 
 from etsplat.core.validation import check_like, check_shape, dense
 from etsplat.engines.choice import engine_for, queued_steps
-from etsplat.engines.engine import AdamGroup, Engine, step_rates
+from etsplat.engines.engine import Engine
+from etsplat.engines.reference.adam import AdamGroup, step_rates
 
 
 class Adam:

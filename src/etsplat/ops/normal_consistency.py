@@ -49,4 +49,4 @@ def normal_consistency(
         check_like(name, tensor, "normals", normals)
     if normals.numel() == 0:
         raise ValueError(f"normals must hold at least one pixel, got shape {tuple(normals.shape)}")
-    return engine_for(normals).normal_consistency(normals, depth, alpha, viewmats, Ks)
+    return engine_for(normals).normal_consistency(normals, depth, *(t.detach() for t in (alpha, viewmats, Ks)))

@@ -51,4 +51,6 @@ def soup_activation(
         check_like(name, tensor, "vertices", vertices)
     if camera is not None and len(camera) != 1:
         raise ValueError(f"camera must be one where triangles are left out, got {len(camera)}")
-    return engine_for(vertices).soup_activation(vertices, opacity_logits, sigma_raw, limits, camera, smallest, largest)
+    return engine_for(vertices).soup_activation(
+        vertices.detach(), opacity_logits, sigma_raw, limits, camera, smallest, largest
+    )

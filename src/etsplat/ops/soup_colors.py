@@ -3,7 +3,7 @@
 from jaxtyping import Float
 from torch import Tensor
 
-from etsplat.core.harmonics import MAX_DEGREE
+from etsplat.core.harmonics import MAX_DEGREE, MAX_REST
 from etsplat.core.precision import as_given
 from etsplat.core.validation import check_like, check_shape
 from etsplat.engines.choice import engine_for
@@ -43,4 +43,4 @@ def soup_colors(
         check_like(name, tensor, "vertices", vertices)
     if sh_rest.shape[1] < (degree + 1) ** 2 - 1:
         raise ValueError(f"sh_rest must have {(degree + 1) ** 2 - 1} bases for degree {degree}, got {sh_rest.shape[1]}")
-    return engine_for(vertices).soup_colors(vertices, sh_dc, sh_rest, centers, degree)
+    return engine_for(vertices).soup_colors(vertices, sh_dc, sh_rest[:, :MAX_REST], centers.detach(), degree)

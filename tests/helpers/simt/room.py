@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from etsplat.engines.cuda import capacity
-from etsplat.engines.cuda import queue as cuda_queue
+from etsplat.engines.cuda import steps as cuda_steps
 from etsplat.engines.cuda.capacity import repair_overflow
 from etsplat.optim import step_queue
 
@@ -22,7 +22,7 @@ def room_for_16_pairs() -> Iterator[list[bool]]:
         return repairs[-1]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(cuda_queue, "repair_overflow", repair)
+        patch.setattr(cuda_steps, "repair_overflow", repair)
         patch.setattr(capacity, "_seen", {})
         patch.setattr(capacity, "_FIRST_ROOM", 16)
         patch.setattr(capacity, "_FIRST_PER_TRIANGLE", 0)

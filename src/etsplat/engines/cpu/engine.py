@@ -1,35 +1,30 @@
 """The engine "cpu": csrc/cpu, float32."""
 
 from contextlib import AbstractContextManager
-from functools import partial
 
 from etsplat.engines.cpu.adam import adam_step
-from etsplat.engines.cpu.antialias import Antialias
+from etsplat.engines.cpu.antialias import antialias
 from etsplat.engines.cpu.mesh_energies import mesh_energies
 from etsplat.engines.cpu.normal_consistency import normal_consistency
 from etsplat.engines.cpu.photometric import photometric_loss
-from etsplat.engines.cpu.rasterize import CpuRender, per_corner
+from etsplat.engines.cpu.rasterize import CpuRender
 from etsplat.engines.cpu.rasterize_opaque import rasterize_opaque, render_opaque
 from etsplat.engines.cpu.soup_activation import soup_activation
 from etsplat.engines.cpu.spherical_harmonics import soup_colors, spherical_harmonics
 from etsplat.engines.cpu.triangle_area import mean_area
 from etsplat.engines.cpu.triangle_channels import run as run_triangle_channels
 from etsplat.engines.native.engine import NativeEngine
-from etsplat.engines.native.plan import NativeCalls
-from etsplat.engines.native.rasterize import rasterize_native
 from etsplat.engines.native.triangle_channels import triangle_channels
-from etsplat.engines.reference.engine import ReferenceEngine
 from etsplat.engines.threads import one_torch_thread
 
-_CALLS = NativeCalls(CpuRender, run_triangle_channels, ReferenceEngine.pick_values, per_corner)
 
-
-class CpuEngine(NativeEngine, ReferenceEngine):
+class CpuEngine(NativeEngine):
     """Inherits from the reference what is no more than a few operations of torch."""
 
     name = "cpu"
     device = "cpu"
     place = "the CPU"
+    render = CpuRender
 
     def tensors_on(self) -> str:
         """The CPU."""
@@ -40,15 +35,14 @@ class CpuEngine(NativeEngine, ReferenceEngine):
         return one_torch_thread()
 
     adam_step = staticmethod(adam_step)
-    antialias = staticmethod(Antialias.apply)
+    antialias = staticmethod(antialias)
     mean_area = staticmethod(mean_area)
     mesh_energies = staticmethod(mesh_energies)
     normal_consistency = staticmethod(normal_consistency)
     photometric_loss = staticmethod(photometric_loss)
-    rasterize = staticmethod(partial(rasterize_native, _CALLS))
     rasterize_opaque = staticmethod(rasterize_opaque)
     render_opaque = staticmethod(render_opaque)
     soup_activation = staticmethod(soup_activation)
     soup_colors = staticmethod(soup_colors)
     spherical_harmonics = staticmethod(spherical_harmonics)
-    triangle_channels = staticmethod(partial(triangle_channels, run_triangle_channels))
+    triangle_channels = staticmethod(triangle_channels(run_triangle_channels))

@@ -2,22 +2,39 @@
 
 from typing import Any
 
-import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from etsplat import _native
 from etsplat.core.kernels import DISTANCES, KERNELS
 from etsplat.core.rasterization import DISTORTION_FAR, DISTORTION_NEAR
-from etsplat.core.validation import dense
+from etsplat.engines.native.operation import differentiable
 from etsplat.engines.native.plan import Geometry, Images, Inputs, Outputs, PerInput, Plan
 from etsplat.engines.native.pool import empty_image, zeros_image
+
+
+def _gather(_keep: bool, values: Tensor, _faces: Tensor, geometry: Geometry) -> tuple[Tensor, Any]:
+    """(V, C) -> (N, 3, C). Autograd's own backward of the indexing takes longer than rasterizing."""
+    assert geometry.faces is not None
+    # values[faces] takes five times as long
+    return values.index_select(0, geometry.faces.view(-1)).view(-1, 3, values.shape[1]), (geometry, values.shape)
+
+
+def _scatter(kept: Any, _needed: Any, grad_corners: Tensor) -> tuple[Tensor]:
+    geometry, shape = kept
+    sums = empty_image(*shape)
+    arrays = (grad_corners, *geometry.corners)
+    _native.sum_groups(*(array.data_ptr() for array in arrays), *shape, sums.data_ptr())
+    return (sums,)
+
+
+_per_corner = differentiable(_gather, _scatter)
 
 
 class CpuRender:
     """One forward pass: a native state for each view."""
 
     most_channels: int | None = None
+    per_corner = staticmethod(_per_corner)
 
     def __init__(self, plan: Plan, inputs: Inputs, outputs: Outputs, keep: bool) -> None:
         self.plan = plan
@@ -63,35 +80,6 @@ class CpuRender:
             call.background = _address(grads.backgrounds, b)
             _native.raster_backward(state, _call(b, inputs, images, self.plan), call)
         return grads
-
-
-def per_corner(values: Tensor, _faces: Tensor, geometry: Geometry) -> Tensor:
-    """See `NativeCalls.per_corner`."""
-    corners: Any = _PerCorner.apply(values, geometry)
-    return corners
-
-
-class _PerCorner(torch.autograd.Function):
-    """(V, C) -> (N, 3, C). Autograd's own backward of the indexing takes longer than rasterizing."""
-
-    @staticmethod
-    def forward(ctx: Any, values: Tensor, geometry: Geometry) -> Tensor:
-        ctx.geometry, ctx.shape = geometry, values.shape
-        assert geometry.faces is not None
-        # values[faces] takes five times as long
-        return values.index_select(0, geometry.faces.view(-1)).view(-1, 3, values.shape[1])
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad_corners: Tensor) -> tuple[Tensor, None]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        grad_corners, sums = dense(grad_corners), empty_image(*ctx.shape)
-        _native.sum_groups(
-            grad_corners.data_ptr(),
-            *(array.data_ptr() for array in ctx.geometry.corners),
-            *ctx.shape,
-            sums.data_ptr(),
-        )
-        return sums, None
 
 
 def _call(b: int, inputs: Inputs, images: Images, plan: Plan) -> Any:

@@ -2,34 +2,23 @@
 
 from typing import Any
 
-import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from etsplat import _native
-from etsplat.core.validation import dense
+from etsplat.engines.native.operation import differentiable
 from etsplat.engines.native.pool import empty_image
 
 
-def mean_area(vertices: Tensor) -> Tensor:
-    """See `Engine.mean_area`."""
-    area: Any = _MeanArea.apply(vertices)
-    return area
-
-
-class _MeanArea(torch.autograd.Function):
+def _forward(_keep: bool, vertices: Tensor) -> tuple[Tensor, Any]:
     """One pass computes the value and the gradient, which waits for backward."""
+    gradient = empty_image(*vertices.shape)
+    mean = _native.mean_area(vertices.data_ptr(), len(vertices), gradient.data_ptr())
+    return vertices.new_tensor(mean), [gradient]
 
-    @staticmethod
-    def forward(ctx: Any, vertices: Tensor) -> Tensor:
-        vertices = dense(vertices, "vertices")
-        gradient = empty_image(*vertices.shape)
-        mean = _native.mean_area(vertices.data_ptr(), len(vertices), gradient.data_ptr())
-        ctx.save_for_backward(gradient)
-        return vertices.new_tensor(mean)
 
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad_area: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
-        (gradient,) = ctx.saved_tensors
-        return gradient * grad_area
+def _backward(kept: Any, _needed: Any, grad_area: Tensor) -> tuple[Tensor]:
+    (gradient,) = kept
+    return (gradient * grad_area,)
+
+
+mean_area = differentiable(_forward, _backward)

@@ -44,7 +44,7 @@ class Backend(Protocol):
     def capture(self, body: Callable[[], None], pool: Any) -> Callable[[], None]:
         """Do what ``body`` queues, once, and return what does it again without calling it.
 
-        ``pool`` is from ``memory_pool``; see ``etsplat.engines.cuda.graph.Repeated``.
+        ``pool`` is from ``memory_pool``; see ``etsplat.engines.cuda.steps.Repeated``.
         """
         ...
 
@@ -107,6 +107,11 @@ def launch(program: Program, name: str, grid: Dim, block: Dim, args: Sequence[An
         backend().launch(program, name, grid, block, values)
 
 
+def launch_each(program: Program, name: str, count: int, args: Sequence[Any], threads: int = 256) -> None:
+    """Start a kernel for ``count`` items, one a thread, ``threads`` in a block."""
+    launch(program, name, blocks(count, threads), threads, args)
+
+
 def on_device_of(tensor: Tensor | None) -> AbstractContextManager[Any]:
     """Within the block, launches go to the tensor's device; ``launch`` does so by itself for those that it is given."""
     if tensor is None or not tensor.is_cuda or tensor.device.index == torch.cuda.current_device():
@@ -117,6 +122,11 @@ def on_device_of(tensor: Tensor | None) -> AbstractContextManager[Any]:
 def blocks(count: int, size: int) -> int:
     """Number of blocks of ``size`` that hold ``count`` items."""
     return -(-count // size)
+
+
+def upload(values: Sequence[float], device: torch.device) -> Tensor:
+    """(N,) float32 on ``device``. The copy is queued like a kernel; torch keeps the pinned memory until it is done."""
+    return torch.tensor(values, dtype=torch.float32, pin_memory=device.type == "cuda").to(device, non_blocking=True)
 
 
 def _three(dim: Dim) -> tuple[int, int, int]:

@@ -9,29 +9,25 @@ _ALIGNMENT = 256
 
 
 class Arena:
-    """Uninitialised arrays in one tensor: ask for all of them, then ``allocate``.
+    """Uninitialised arrays in one tensor, by name.
 
     The tensor comes from torch's allocator, which recycles it in the order of the stream and keeps it apart within a
     captured graph.
     """
 
-    def __init__(self) -> None:
-        self._offsets: dict[str, int] = {}
-        self._size = 0
-        self._memory = torch.empty(0)
-
-    def add(self, name: str, count: int, size: int = 4) -> None:
-        """Ask for ``count`` items of ``size`` bytes."""
-        self._offsets[name] = self._size
-        self._size += -(-count * size // _ALIGNMENT) * _ALIGNMENT
-
-    def allocate(self, device: torch.device) -> None:
-        """Make room for everything asked for."""
-        self._memory = torch.empty(self._size, dtype=torch.uint8, device=device)
+    def __init__(self, device: torch.device, **sizes: int) -> None:
+        """Makes room for arrays of these numbers of bytes."""
+        self._offsets, end = {}, 0
+        for name, size in sizes.items():
+            self._offsets[name] = end
+            end += -(-size // _ALIGNMENT) * _ALIGNMENT
+        self._memory = torch.empty(end, dtype=torch.uint8, device=device)
+        base = self._memory.data_ptr()
+        self.addresses = {name: base + self._offsets[name] if size else None for name, size in sizes.items()}
 
     def __getitem__(self, name: str) -> ctypes.c_void_p:
         """Address of an array, as an argument of kernels."""
-        return ctypes.c_void_p(self._memory.data_ptr() + self._offsets[name])
+        return ctypes.c_void_p(self.addresses[name])
 
     def bytes(self, name: str, count: int) -> Tensor:
         """The first ``count`` bytes of an array."""

@@ -6,7 +6,6 @@ results are the same bits every time.
 """
 
 import ctypes
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -15,7 +14,7 @@ from etsplat import _native
 from etsplat.core.kernels import DISTANCES, KERNELS
 from etsplat.core.rasterization import DISTORTION_FAR, DISTORTION_NEAR
 from etsplat.engines.cuda.capacity import capacity_for, note_capture, overflow_flag, record_need
-from etsplat.engines.cuda.launch import backend, blocks, launch, on_device_of
+from etsplat.engines.cuda.launch import backend, blocks, launch, launch_each, on_device_of
 from etsplat.engines.cuda.memory import Arena, PendingNumber
 from etsplat.engines.cuda.program import Program
 from etsplat.engines.cuda.sort import RadixSort
@@ -32,6 +31,11 @@ class CudaRender:
 
     most_channels: int | None = _native.MOST_GPU_CHANNELS
 
+    @staticmethod
+    def per_corner(values: Tensor, faces: Tensor, geometry: Geometry) -> Tensor:
+        """See ``Render``."""
+        return values[faces.long()]
+
     def __init__(self, plan: Plan, inputs: Inputs, outputs: Outputs, keep: bool) -> None:
         settings = plan.settings
         self.plan = plan
@@ -46,9 +50,10 @@ class CudaRender:
         if settings.wants("distortion"):
             self.distortion = _Depth.CENTROID if settings.depth_of == "centroid" else _Depth.PLANE
         self.arguments = struct_class("cuda/raster_pass.h", "RasterPass")()
-        self._fill_inputs(inputs)
-        self._fill_images(outputs.images)
-        self._fill_outputs(outputs)
+        self._fill(inputs, outputs.images)
+        self.arguments.median_triangle = outputs.median_triangle
+        if outputs.statistics is not None:
+            self.arguments.set(**vars(outputs.statistics))
         with on_device_of(inputs.vertices):
             self._render()
 
@@ -83,20 +88,28 @@ class CudaRender:
         sizes = [2, 2 * emit_grid, 2, 2 * tiles, by_depth.zeros, self.by_tile.zeros]
         self.zeros = torch.zeros(sum(sizes), dtype=torch.int32, device=self.device)
         wanted, scan_state, counters, ranges, depth_zeros, self.tile_zeros = self.zeros.split(sizes)
-        self.state, self.temporary = self._allocate(capacity)
-        state, temporary = self.state, self.temporary
-        a.capacity = capacity
-        a.records, a.spans, a.slot_begin = state["records"], state["spans"], state["slot_begin"]
-        a.attributes = state["attributes"] if self._attributes else 0
-        a.slot_triangle, a.hits = state["slot_triangle"], state["hits"] if self.keep else 0
-        a.tile_done, a.tile_ranges = state["tile_done"], ranges.data_ptr()
-        a.depth_keys, a.slot_tile = temporary["depth_keys"], temporary["tile_keys"]
-        a.wanted, a.slots, a.scan_ticket = wanted.data_ptr(), counters.data_ptr(), counters[1:].data_ptr()
-        a.scan_state, a.overflow = scan_state.data_ptr(), _pointer(overflow)
-        launch(_PROJECT, "raster_project", blocks(m, 128), 128, [a])
+        attributes = self.corner > 0 or self.distortion != _Depth.NONE
+        # What the backward pass reads, and what only the forward pass needs.
+        self.state = Arena(
+            self.device,
+            records=4 * _native.TRIANGLE_RECORD * m,
+            attributes=4 * _native.ATTRIBUTE_RECORD * m if attributes else 0,
+            spans=8 * m,
+            slot_begin=4 * m,
+            slot_triangle=4 * capacity,
+            sorted_slots=4 * capacity,
+            hits=capacity if self.keep else 0,
+            tile_done=4 * tiles,
+        )
+        per_triangle = dict.fromkeys(("depth_keys", "depth_keys_2", "order", "order_2"), 4 * m)
+        per_pair = dict.fromkeys(("slot_tile", "slot_tile_2", "sorted_slots_2"), 4 * capacity)
+        self.temporary = temporary = Arena(self.device, **per_triangle, **per_pair)
+        a.set(capacity=capacity, wanted=wanted, overflow=overflow, scan_state=scan_state, tile_ranges=ranges)
+        a.set(slots=counters, scan_ticket=counters[1:], **self.state.addresses)
+        a.depth_keys, a.slot_tile = temporary["depth_keys"], temporary["slot_tile"]
+        launch_each(_PROJECT, "raster_project", m, [a], 128)
         keys = (temporary["depth_keys"], temporary["depth_keys_2"])
-        _, order = by_depth.run(keys, (temporary["order"], temporary["order_2"]), m, depth_zeros)
-        a.order = order
+        _, a.order = by_depth.run(keys, (temporary["order"], temporary["order_2"]), m, depth_zeros)
         launch(_PROJECT, "raster_emit", emit_grid, 256, [a])
         return wanted.view(torch.int64)
 
@@ -106,32 +119,13 @@ class CudaRender:
         slots = (self.state["sorted_slots"], temporary["sorted_slots_2"])
         if self.by_tile.passes % 2 == 1:  # the result ends up in what is kept
             slots = (slots[1], slots[0])
-        keys = (temporary["tile_keys"], temporary["tile_keys_2"])
+        keys = (temporary["slot_tile"], temporary["slot_tile_2"])
         a.sorted_tiles, a.sorted_slots = self.by_tile.run(keys, slots, ctypes.c_void_p(a.slots), self.tile_zeros)
-        launch(_PROJECT, "raster_ranges", blocks(capacity, 256), 256, [a])
+        launch_each(_PROJECT, "raster_ranges", capacity, [a])
         settings = self.plan.settings
         defines = self._defines(self.distortion, settings.wants("median_depth"), settings.wants("statistics"))
         launch(Program("raster_forward.cu", defines), "raster_forward", self.tile_count, 256, [a])
         del self.temporary, self.tile_zeros
-
-    def _allocate(self, capacity: int) -> tuple[Arena, Arena]:
-        """What the backward pass reads, and what only the forward pass needs."""
-        m, state, temporary = self.projected, Arena(), Arena()
-        state.add("records", _native.TRIANGLE_RECORD * m)
-        state.add("attributes", _native.ATTRIBUTE_RECORD * m if self._attributes else 0)
-        state.add("spans", 2 * m)
-        state.add("slot_begin", m)
-        state.add("slot_triangle", capacity)
-        state.add("sorted_slots", capacity)
-        state.add("hits", capacity if self.keep else 0, size=1)
-        state.add("tile_done", self.tile_count)
-        for name in ("depth_keys", "depth_keys_2", "order", "order_2"):
-            temporary.add(name, m)
-        for name in ("tile_keys", "tile_keys_2", "sorted_slots_2"):
-            temporary.add(name, capacity)
-        state.allocate(self.device)
-        temporary.allocate(self.device)
-        return state, temporary
 
     def backward(
         self,
@@ -142,31 +136,47 @@ class CudaRender:
     ) -> PerInput:
         """See ``Render``."""
         with on_device_of(inputs.vertices):
-            self._fill_inputs(inputs)
-            self._fill_images(images)
+            self._fill(inputs, images)
             return self._gradients(inputs, cotangents, needed)
 
     def _gradients(
         self, inputs: Inputs, cotangents: tuple[Tensor | None, Tensor | None, Tensor | None], needed: PerInput
     ) -> PerInput:
-        a = self.arguments
+        """Written by the kernels; of a shared sigma, cameras and backgrounds they leave sums to add up."""
+        a, geometry, views = self.arguments, self.plan.geometry, self.plan.views
         grad_color, grad_alpha, grad_distortion = cotangents
         distortion = self.distortion if grad_distortion is not None else _Depth.NONE
         defines = self._defines(distortion, median=False, weights=False)
-        stride = _native.slot_stride(flat_channels=self.flat, corner_channels=self.corner, distortion=distortion)
-        reduce_grid = blocks(self.plan.geometry.count, 128)
-        grads = _Gradients(self, inputs, needed, reduce_grid)
-        sums = torch.empty(a.capacity * stride, device=self.device)
-        a.grad_color, a.grad_alpha = _pointer(grad_color), _pointer(grad_alpha)
-        a.grad_distortion, a.slot_sums = _pointer(grad_distortion), sums.data_ptr()
-        grads.fill(a)
-        launch(Program("raster_backward.cu", defines), "raster_backward", self.tile_count, 256, [a])
-        launch(Program("raster_reduce.cu", defines[1:]), "raster_reduce", reduce_grid, 128, [a])
-        return grads.finish(defines[1:])
+        grid = blocks(geometry.count, 128)
 
-    @property
-    def _attributes(self) -> bool:
-        return self.corner > 0 or self.distortion != _Depth.NONE
+        def room(wanted: bool, *shape: int, dtype: torch.dtype = torch.float32) -> Tensor | None:
+            return torch.empty(shape, dtype=dtype, device=self.device) if wanted else None
+
+        wanted = (t if want else None for t, want in zip(inputs, needed, strict=True))
+        grads = PerInput(*(None if t is None else torch.empty_like(t) for t in wanted))
+        gathered, shared_sigma = needed.vertices and geometry.faces is not None, inputs.sigma.dim() == 0
+        corners = room(True, geometry.count, 3, 3) if gathered else grads.vertices
+        sigma_sums = room(needed.sigma and shared_sigma, grid, dtype=torch.float64)
+        camera_sums = room(needed.viewmats or needed.Ks, views, grid, _native.CAMERA_GRADIENTS, dtype=torch.float64)
+        background = room(needed.backgrounds, views, self.tile_count // views, self.flat + self.corner)
+        stride = _native.slot_stride(flat_channels=self.flat, corner_channels=self.corner, distortion=distortion)
+        sums = room(True, a.capacity * stride)
+        a.set(grad_color=grad_color, grad_alpha=grad_alpha, grad_distortion=grad_distortion, slot_sums=sums)
+        a.set(grad_corners=corners, grad_flat=grads.flat, grad_corner_colors=grads.corner)
+        a.set(grad_opacities=grads.opacities, grad_sigmas=None if shared_sigma else grads.sigma)
+        a.set(sigma_sums=sigma_sums, camera_sums=camera_sums, tile_background=background)
+        reduction = Program("raster_reduce.cu", defines[1:])
+        launch(Program("raster_backward.cu", defines), "raster_backward", self.tile_count, 256, [a])
+        launch(reduction, "raster_reduce", grid, 128, [a])
+        if gathered:
+            count = geometry.vertex_count
+            launch_each(reduction, "raster_gather", count, [corners, *geometry.corners, count, grads.vertices])
+        if sigma_sums is not None:
+            grads = grads._replace(sigma=sigma_sums.sum().float())
+        if camera_sums is not None:
+            viewmats, Ks = _camera_gradients(camera_sums)
+            grads = grads._replace(viewmats=viewmats if needed.viewmats else None, Ks=Ks if needed.Ks else None)
+        return grads if background is None else grads._replace(backgrounds=background.sum(1))
 
     def _defines(
         self, distortion: _native.DistortionDepth, median: bool, weights: bool
@@ -181,23 +191,18 @@ class CudaRender:
             ("WEIGHTS", int(weights)),
         )
 
-    def _fill_inputs(self, inputs: Inputs) -> None:
-        a, plan, settings = self.arguments, self.plan, self.plan.settings
-        a.vertices, a.faces = _pointer(inputs.vertices), _pointer(plan.geometry.faces)
-        a.flat_colors, a.corner_colors = _pointer(inputs.flat), _pointer(inputs.corner)
-        a.opacities, a.sigmas = _pointer(inputs.opacities), _pointer(inputs.sigma)
-        a.viewmats, a.Ks, a.backgrounds = map(_pointer, (inputs.viewmats, inputs.Ks, inputs.backgrounds))
-        a.triangles, a.vertex_count, a.views = plan.geometry.count, plan.geometry.vertex_count, plan.views
-        a.width, a.height = settings.width, settings.height
+    def _fill(self, inputs: Inputs, images: Images) -> None:
+        a, geometry, settings = self.arguments, self.plan.geometry, self.plan.settings
+        a.set(*inputs, faces=geometry.faces, **images._asdict())
+        a.triangles, a.vertex_count = geometry.count, geometry.vertex_count
+        a.views, a.width, a.height = self.shape
         a.tiles_x, a.tiles_y = self.tiles
         kernel = KERNELS[settings.kernel]
         self.table = None if kernel.table is None else kernel.table.native(self.device)  # kept: `a` has its address
-        a.kernel, a.kernel_table = kernel.native_id, _pointer(self.table)
-        a.distance = DISTANCES.index(settings.distance)
-        a.freeze_inradius = settings.freeze_inradius
+        a.kernel, a.kernel_table = kernel.native_id, self.table
+        a.distance, a.freeze_inradius = DISTANCES.index(settings.distance), settings.freeze_inradius
         a.shared_sigma = inputs.sigma.dim() == 0
-        a.flat_per_view = inputs.flat_per_view
-        a.corner_per_view = inputs.corner_per_view
+        a.flat_per_view, a.corner_per_view = inputs.flat_per_view, inputs.corner_per_view
         a.flat_channels, a.corner_channels = self.flat, self.corner
         alpha_min, alpha_max, x_max, a.transmittance_min = settings.cutoffs
         # With the cut-offs off, too: where alpha is 0 x^(2/sigma) may have overflowed, and the backward divides by
@@ -206,82 +211,10 @@ class CudaRender:
         a.alpha_min, a.alpha_max = max(alpha_min, _TINY), min(alpha_max, 1.0 - 1e-6)
         a.distortion_near, a.distortion_far = DISTORTION_NEAR, DISTORTION_FAR
 
-    def _fill_images(self, images: Images) -> None:
-        a = self.arguments
-        a.color, a.alpha = images.color.data_ptr(), images.alpha.data_ptr()
-        if self.plan.settings.wants("distortion"):
-            a.distortion, a.distortion_totals = images.distortion.data_ptr(), _pointer(images.distortion_totals)
 
-    def _fill_outputs(self, outputs: Outputs) -> None:
-        a, settings = self.arguments, self.plan.settings
-        if settings.wants("median_depth"):
-            a.median_triangle = outputs.median_triangle.data_ptr()
-        if outputs.statistics is not None:
-            statistics = outputs.statistics
-            a.max_weight, a.screen_size = statistics.max_weight.data_ptr(), statistics.screen_size.data_ptr()
-            a.inradius, a.visible = statistics.inradius.data_ptr(), statistics.visible.data_ptr()
-
-
-def per_corner(values: Tensor, faces: Tensor, _geometry: Geometry) -> Tensor:
-    """See `NativeCalls.per_corner`."""
-    return values[faces.long()]
-
-
-class _Gradients:
-    """Gradients of the inputs, as the kernels write them, and what is left to add up in torch."""
-
-    def __init__(self, render: CudaRender, inputs: Inputs, needed: PerInput, reduce_grid: int) -> None:
-        self.geometry = render.plan.geometry
-        device, views, count = render.device, render.plan.views, self.geometry.count
-        flat, corner, sigma, backgrounds = inputs.flat, inputs.corner, inputs.sigma, inputs.backgrounds
-        empty = torch.empty if count > 0 else torch.zeros
-        self.corners = empty(count, 3, 3, device=device) if needed.vertices else None
-        self.flat = empty(flat.shape, device=device) if needed.flat and flat is not None else None
-        self.corner = empty(corner.shape, device=device) if needed.corner and corner is not None else None
-        self.opacities = empty(count, device=device) if needed.opacities else None
-        own = sigma.dim() == 1
-        self.sigmas = empty(count, device=device) if needed.sigma and own else None
-        sums = torch.float64
-        self.sigma_sums = torch.empty(reduce_grid, dtype=sums, device=device) if needed.sigma and not own else None
-        self.needed, cameras = needed, needed.viewmats or needed.Ks
-        camera_shape = (views, reduce_grid, _native.CAMERA_GRADIENTS)
-        self.camera_sums = torch.empty(camera_shape, dtype=sums, device=device) if cameras else None
-        self.background = None
-        if needed.backgrounds and backgrounds is not None:
-            self.background = torch.empty(views, render.tile_count // views, backgrounds.shape[1], device=device)
-
-    def fill(self, a: Any) -> None:
-        """Hand the addresses to the kernels."""
-        a.grad_corners, a.grad_flat, a.grad_corner_colors = map(_pointer, (self.corners, self.flat, self.corner))
-        a.grad_opacities, a.grad_sigmas = _pointer(self.opacities), _pointer(self.sigmas)
-        a.sigma_sums, a.camera_sums = _pointer(self.sigma_sums), _pointer(self.camera_sums)
-        a.tile_background = _pointer(self.background)
-
-    def finish(self, defines: tuple[tuple[str, int | str], ...]) -> PerInput:
-        """What is left to add up."""
-        vertices, sigma = self.corners, self.sigmas
-        geometry = self.geometry
-        if vertices is not None and geometry.faces is not None:
-            count = geometry.vertex_count
-            vertices = torch.empty(count, 3, device=vertices.device)
-            arguments = [self.corners, *geometry.corners, count, vertices]
-            launch(Program("raster_reduce.cu", defines), "raster_gather", blocks(count, 256), 256, arguments)
-        if self.sigma_sums is not None:
-            sigma = self.sigma_sums.sum().float()
-        viewmats, Ks = self._cameras()
-        background = None if self.background is None else self.background.sum(1)
-        return PerInput(vertices, self.flat, self.corner, self.opacities, sigma, viewmats, Ks, background)
-
-    def _cameras(self) -> tuple[Tensor | None, Tensor | None]:
-        """By viewmats and Ks, from sums by [rotation | translation], fx, cx, fy, cy (``camera_gradient``)."""
-        if self.camera_sums is None:
-            return None, None
-        rows, fx, cx, fy, cy = self.camera_sums.sum(1).float().split((12, 1, 1, 1, 1), dim=1)
-        viewmats = torch.nn.functional.pad(rows.view(-1, 3, 4), (0, 0, 0, 1))
-        zero = torch.zeros_like(fx)
-        Ks = torch.cat([fx, zero, cx, zero, fy, cy, zero, zero, zero], dim=1).view(-1, 3, 3)
-        return viewmats if self.needed.viewmats else None, Ks if self.needed.Ks else None
-
-
-def _pointer(tensor: Tensor | None) -> int:
-    return 0 if tensor is None else tensor.data_ptr()
+def _camera_gradients(sums: Tensor) -> tuple[Tensor, Tensor]:
+    """By viewmats and Ks, from sums by [rotation | translation], fx, cx, fy, cy (``camera_gradient``)."""
+    rows, fx, cx, fy, cy = sums.sum(1).float().split((12, 1, 1, 1, 1), dim=1)
+    viewmats = torch.nn.functional.pad(rows.view(-1, 3, 4), (0, 0, 0, 1))
+    zero = torch.zeros_like(fx)
+    return viewmats, torch.cat([fx, zero, cx, zero, fy, cy, zero, zero, zero], dim=1).view(-1, 3, 3)

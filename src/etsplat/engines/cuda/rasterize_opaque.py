@@ -46,9 +46,9 @@ def render_opaque(
 
 
 def _problem(points: Tensor, triangles: Tensor, view: OpaqueView, samples: int, cull_backfaces: bool) -> Any:
-    addresses = (tensor.data_ptr() for tensor in (points, triangles, view.viewmat, view.K))
+    tensors = points, triangles, view.viewmat, view.K
     sizes = len(points), len(triangles), view.width * samples, view.height * samples, samples
-    return struct_class("cuda/rasterize_hard.cu", "HardView")(*addresses, *sizes, view.near_plane, cull_backfaces)
+    return struct_class("cuda/rasterize_hard.cu", "HardView")(*tensors, *sizes, view.near_plane, cull_backfaces)
 
 
 def _drawn_strips(problem: Any, points: Tensor) -> Iterator[tuple[int, int, Tensor]]:

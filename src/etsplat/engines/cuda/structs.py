@@ -5,6 +5,8 @@ import re
 from functools import cache
 from typing import Any
 
+from torch import Tensor
+
 from etsplat.engines.cuda.program import source_root
 
 _TYPES = {
@@ -13,15 +15,37 @@ _TYPES = {
     "unsigned": ctypes.c_uint32,
     "long long": ctypes.c_int64,
 }
-_MEMBERS = re.compile(r"^(?:const )?(.+?) ?(\*? ?\w+(?:, \*?\w+)*);$")  # a type, and names with their stars
+_MEMBERS = re.compile(r"^(?:const )?(.+?) ?(\*? ?\w+(?:, \*?\w+)*)(?:\[(\w+)\])?;$")  # type, names with stars, count
+
+
+class Struct(ctypes.Structure):
+    """Pointers, 0 at first like everything else, are set to contiguous tensors, which the struct does not keep."""
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Also of the arguments of the constructor, and of all elements of a list for an array."""
+        super().__setattr__(name, tuple(map(_address, value)) if isinstance(value, list) else _address(value))
+
+    def set(self, *first: Any, **others: Any) -> None:
+        """The first members in their order, and others by name."""
+        for member, value in zip(self._fields_, first, strict=False):
+            setattr(self, member[0], value)
+        for name, value in others.items():
+            setattr(self, name, value)
+
+
+def _address(value: Any) -> Any:
+    if not isinstance(value, Tensor):
+        return value
+    assert value.is_contiguous(), "kernels get contiguous tensors only"
+    return value.data_ptr()
 
 
 @cache
-def struct_class(file: str, name: str) -> Any:
+def struct_class(file: str, name: str) -> type[Struct]:
     """A ctypes.Structure with the members of ``struct name`` in csrc/``file``.
 
-    The struct holds pointers, numbers and other structs of the file, one type a line. Pointers are addresses here, 0
-    at first like everything else.
+    The struct holds pointers, numbers and other structs of the file, one type a line, or an array a line whose length
+    is a constant of the file.
     """
     text = (source_root() / file).read_text(encoding="utf-8")
     body = text.split(f"struct {name} {{\n", 1)[1].split("\n};", 1)[0]
@@ -37,5 +61,9 @@ def struct_class(file: str, name: str) -> Any:
                 kind = ctypes.c_void_p
             else:
                 kind = _TYPES[match[1]] if match[1] in _TYPES else struct_class(file, match[1])
+            if match[3]:
+                length = re.search(rf"constexpr int {match[3]} = (\d+);", text)
+                assert length, f"{file}: not understood: {line}"
+                kind = kind * int(length[1])
             fields.append((member.strip(" *"), kind))
-    return type(name, (ctypes.Structure,), {"_fields_": fields})
+    return type(name, (Struct,), {"_fields_": fields})

@@ -8,18 +8,18 @@ import torch
 from torch import Tensor
 
 from etsplat.core.rasterization import Rasterization, RasterizeSettings, RasterizeTensors
-from etsplat.engines.native.plan import Geometry, NativeCalls
-from etsplat.engines.native.triangle_channels import triangle_channels
+from etsplat.engines.engine import Engine
+from etsplat.engines.native.plan import Geometry, Render
 from etsplat.engines.reference.rasterize import barycentrics, perspective_weights, to_screen
 
 
 class Channels:
     """Flat (N, F) or (B, N, F) and corner (N, 3, K) or (B, N, 3, K) channels; in each, colours come first."""
 
-    def __init__(self, tensors: RasterizeTensors, geometry: Geometry, calls: NativeCalls) -> None:
+    def __init__(self, tensors: RasterizeTensors, geometry: Geometry, render: type[Render]) -> None:
         self.flat, self.corner = tensors.face_colors, tensors.corner_colors
         if tensors.vertex_colors is not None and tensors.faces is not None:
-            self.corner = calls.per_corner(tensors.vertex_colors, tensors.faces, geometry)
+            self.corner = render.per_corner(tensors.vertex_colors, tensors.faces, geometry)
         self.flat_is_color = self.flat is not None
         self.colors = self.count
         self.centroid_depth: Tensor | None = None  # (B, N)
@@ -36,7 +36,7 @@ class Channels:
         """Flat channels come first in an image, so a normal or a depth may precede interpolated colours."""
         return 0 if self.flat_is_color or self.flat is None else self.flat.shape[-1]
 
-    def add_geometry(self, tensors: RasterizeTensors, settings: RasterizeSettings, calls: NativeCalls) -> None:
+    def add_geometry(self, tensors: RasterizeTensors, settings: RasterizeSettings, engine: Engine) -> None:
         """Append what the settings ask for of depth and normals, differentiable by vertices and viewmats."""
         depth, normals = settings.wants("depth"), settings.wants("normal")
         centroid = settings.depth_of == "centroid" and settings.wants("depth", "median_depth")
@@ -45,7 +45,7 @@ class Channels:
         corners, viewmats = tensors.corners, tensors.viewmats
         batch = len(viewmats)
         if centroid or normals:
-            geometry = triangle_channels(calls.triangle_channels, corners, viewmats, centroid, normals)
+            geometry = engine.triangle_channels(corners, viewmats, centroid, normals)
             self.centroid_depth = geometry[..., 0] if centroid else None
             shown = geometry[..., 1:] if centroid and not depth else geometry
             self.flat_names += ["depth"] * (centroid and depth) + ["normal"] * normals
@@ -87,7 +87,7 @@ def finite(corners: Tensor) -> Tensor:
     return torch.where(corners.isfinite().all(dim=2).all(dim=1)[:, None, None], corners, 0.0)
 
 
-def median_depth(triangle: Tensor, channels: Channels, tensors: RasterizeTensors, calls: NativeCalls) -> Tensor:
+def median_depth(triangle: Tensor, channels: Channels, tensors: RasterizeTensors, engine: Engine) -> Tensor:
     """Depth (B, H, W, 1) at each pixel of the triangle whose index + 1 is given, 0 where that is 0; differentiable.
 
     The depth of the centroid where ``channels`` have it, else that of the triangle's plane at the pixel.
@@ -95,7 +95,7 @@ def median_depth(triangle: Tensor, channels: Channels, tensors: RasterizeTensors
     if len(tensors.opacities) == 0:
         return torch.zeros((*triangle.shape, 1), device=triangle.device)
     if channels.centroid_depth is not None:
-        return calls.pick_values(channels.centroid_depth, triangle)[..., None]
+        return engine.pick_values(channels.centroid_depth, triangle)[..., None]
     return _plane_depth(triangle, finite(tensors.corners), tensors.viewmats, tensors.Ks)
 
 

@@ -3,7 +3,10 @@
 import torch
 from torch import Tensor
 
+from etsplat.core.rasterization import Rasterization, RasterizeSettings, RasterizeTensors
 from etsplat.engines.engine import Engine
+from etsplat.engines.native.plan import Render
+from etsplat.engines.native.rasterize import rasterize_native
 
 
 class NativeEngine(Engine):
@@ -11,9 +14,11 @@ class NativeEngine(Engine):
 
     Attributes:
         place: its device in words.
+        render: forward and backward pass of its rasterizer.
     """
 
     place: str
+    render: type[Render]
 
     def tensors_on(self) -> str:
         """Type of the device of its tensors."""
@@ -27,3 +32,7 @@ class NativeEngine(Engine):
             raise ValueError(
                 f"engine {self.name} computes in float32, got {tensor.dtype}: use .float() or engine reference"
             )
+
+    def rasterize(self, tensors: RasterizeTensors, settings: RasterizeSettings) -> Rasterization:
+        """See `etsplat.rasterize`."""
+        return rasterize_native(self, self.render, tensors, settings)

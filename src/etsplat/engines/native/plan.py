@@ -1,6 +1,5 @@
 """What the native rasterizers share below autograd: their inputs, outputs, and what a render is made of."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple, Protocol
@@ -12,7 +11,6 @@ from etsplat import _native
 from etsplat.core.rasterization import RasterizeSettings, TriangleStatistics
 from etsplat.core.validation import dense
 from etsplat.engines.native.pool import empty
-from etsplat.engines.native.triangle_channels import Run
 
 
 class Inputs(NamedTuple):
@@ -132,6 +130,11 @@ class Render(Protocol):
     def __init__(self, plan: Plan, inputs: Inputs, outputs: Outputs, keep: bool) -> None:
         """Renders, and with ``keep`` keeps what ``backward`` needs. All tensors are contiguous."""
 
+    @staticmethod
+    def per_corner(values: Tensor, faces: Tensor, geometry: Geometry) -> Tensor:
+        """Values (V, C) of vertices at the corners (N, 3, C) of faces, differentiable."""
+        ...
+
     def backward(
         self,
         inputs: Inputs,
@@ -141,23 +144,6 @@ class Render(Protocol):
     ) -> PerInput:
         """Gradients, None where not ``needed``, from those of colour, alpha and distortion."""
         ...
-
-
-@dataclass(frozen=True)
-class NativeCalls:
-    """What an engine of native code brings to the rasterizer.
-
-    Attributes:
-        render: its forward and backward pass.
-        triangle_channels: the two calls of `triangle_channels`; see `native/triangle_channels.py`.
-        pick_values: see `Engine.pick_values`.
-        per_corner: values (V, C) of vertices at the corners (N, 3, C) of faces, differentiable.
-    """
-
-    render: type[Render]
-    triangle_channels: Run
-    pick_values: Callable[[Tensor, Tensor], Tensor]
-    per_corner: Callable[[Tensor, Tensor, Geometry], Tensor]
 
 
 def channel_count(tensor: Tensor | None) -> int:

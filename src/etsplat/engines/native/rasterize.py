@@ -5,27 +5,28 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from etsplat.core.rasterization import Rasterization, RasterizeSettings, RasterizeTensors
-from etsplat.core.validation import dense
+from etsplat.engines.engine import Engine
 from etsplat.engines.native.channels import Channels, median_depth
-from etsplat.engines.native.plan import Geometry, Images, Inputs, NativeCalls, Outputs, PerInput, Plan, channel_count
+from etsplat.engines.native.operation import differentiable
+from etsplat.engines.native.plan import Geometry, Images, Inputs, Outputs, PerInput, Plan, Render, channel_count
 
 
-def rasterize_native(calls: NativeCalls, tensors: RasterizeTensors, settings: RasterizeSettings) -> Rasterization:
+def rasterize_native(
+    engine: Engine, render: type[Render], tensors: RasterizeTensors, settings: RasterizeSettings
+) -> Rasterization:
     """Render with an engine of native code; see `Engine.rasterize`."""
     geometry = Geometry(tensors.vertices, tensors.faces)
-    channels = Channels(tensors, geometry, calls)
-    channels.add_geometry(tensors, settings, calls)
+    channels = Channels(tensors, geometry, render)
+    channels.add_geometry(tensors, settings, engine)
     backgrounds = channels.pad_backgrounds(tensors.backgrounds)
-    render = calls.render
 
     def run(part: _Part, part_settings: RasterizeSettings) -> tuple[tuple[Tensor, ...], Plan]:
         t, plan = tensors, Plan(render, part_settings, geometry, len(tensors.viewmats))
         views = t.viewmats, t.Ks, part.backgrounds
         inputs = Inputs(t.vertices, part.flat, part.corner, t.opacities, t.sigma, *views)
-        return _Rasterize.apply(plan, *inputs), plan
+        return _rasterize(plan, *inputs), plan
 
     first, *rest = _parts(channels.flat, channels.corner, backgrounds, render.most_channels)
     (color, alpha, distortion, median_triangle), plan = run(first, settings)
@@ -36,7 +37,7 @@ def rasterize_native(calls: NativeCalls, tensors: RasterizeTensors, settings: Ra
     if settings.wants("distortion"):
         result.distortion = distortion
     if settings.wants("median_depth"):
-        result.median_depth = median_depth(median_triangle, channels, tensors, calls)
+        result.median_depth = median_depth(median_triangle, channels, tensors, engine)
     channels.split(result)
     return result
 
@@ -68,32 +69,21 @@ def _parts(flat: Tensor | None, corner: Tensor | None, backgrounds: Tensor | Non
     return parts
 
 
-class _Rasterize(torch.autograd.Function):
+def _forward(keep: bool, plan: Plan, *given: Tensor) -> tuple[tuple[Tensor, ...], Any]:
     """(colour of all channels, alpha, distortion, median triangle); the latter two are empty unless asked for."""
-
-    @staticmethod
-    def forward(ctx: Any, plan: Plan, *tensors: Tensor | None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        inputs = Inputs(*map(_dense, tensors, Inputs._fields))  # type: ignore[arg-type]
-        outputs = Outputs(plan, inputs)
-        ctx.render = plan.render(plan, inputs, outputs, keep=any(ctx.needs_input_grad))
-        plan.statistics = outputs.statistics
-        images = outputs.images
-        ctx.save_for_backward(*inputs, *images)
-        ctx.mark_non_differentiable(outputs.median_triangle)
-        ctx.set_materialize_grads(False)
-        return images.color, images.alpha, images.distortion, outputs.median_triangle
-
-    @staticmethod
-    @once_differentiable
-    def backward(  # pyright: ignore[reportIncompatibleMethodOverride] -- once_differentiable hides the name
-        ctx: Any, *cotangents: Tensor | None
-    ) -> tuple[Tensor | None, ...]:
-        saved = list(map(_dense, ctx.saved_tensors))
-        inputs, images = Inputs(*saved[: len(Inputs._fields)]), Images(*saved[len(Inputs._fields) :])  # type: ignore[arg-type]
-        color, alpha, distortion, _ = map(_dense, cotangents)
-        grads = ctx.render.backward(inputs, images, (color, alpha, distortion), PerInput(*ctx.needs_input_grad[1:]))
-        return (None, *grads)
+    inputs = Inputs(*given)
+    outputs = Outputs(plan, inputs)
+    render = plan.render(plan, inputs, outputs, keep)
+    plan.statistics, images = outputs.statistics, outputs.images
+    shown = images.color, images.alpha, images.distortion, outputs.median_triangle
+    return shown, (render, *inputs, *images)
 
 
-def _dense(tensor: Tensor | None, name: str = "gradient") -> Tensor | None:
-    return None if tensor is None else dense(tensor, name)
+def _backward(kept: Any, needed: Any, *cotangents: Tensor | None) -> tuple[Tensor | None, ...]:
+    render, *saved = kept
+    count = len(Inputs._fields)
+    inputs, images = Inputs(*saved[:count]), Images(*saved[count:])
+    return None, *render.backward(inputs, images, cotangents[:3], PerInput(*needed[1:]))
+
+
+_rasterize = differentiable(_forward, _backward)

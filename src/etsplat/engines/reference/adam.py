@@ -2,7 +2,16 @@
 
 from collections.abc import Sequence
 
-from etsplat.engines.engine import AdamGroup
+from torch import Tensor
+
+AdamGroup = tuple[Tensor, Tensor, Tensor, Tensor]
+"""A parameter, its gradient and both moments, contiguous."""
+
+
+def step_rates(learning_rates: Sequence[float], betas: tuple[float, float], step_count: int) -> list[float]:
+    """The step size of each parameter, lr / (1 - beta1^t), then sqrt(1 - beta2^t)."""
+    first, second = (1 - beta**step_count for beta in betas)
+    return [*(rate / first for rate in learning_rates), second**0.5]
 
 
 def adam_step(
@@ -12,7 +21,7 @@ def adam_step(
     eps: float,
     step_count: int,
 ) -> None:
-    """See `Engine.adam_step`."""
+    """Update the parameters and their moments in place; see `etsplat.ops.adam`."""
     beta1, beta2 = betas
     for (parameter, gradient, first, second), learning_rate in zip(groups, learning_rates, strict=True):
         first += (1 - beta1) * (gradient - first)

@@ -21,7 +21,7 @@ def antialias(
     per_face: bool,
     connectivity: MeshConnectivity,
 ) -> Tensor:
-    """See `Engine.antialias`."""
+    """Shade and blend what `rasterize_opaque` has seen: (B, H, W, C)."""
     images = [
         _antialiased(
             vertices,

@@ -10,7 +10,7 @@ _MIN_SHAPE = 1e-6
 
 
 def mesh_energies(vertices: Tensor, connectivity: MeshConnectivity, edge_power: int) -> tuple[Tensor, Tensor, Tensor]:
-    """See `Engine.mesh_energies`."""
+    """L_e, L_n and L_lap of `etsplat.ops.mesh_energies`."""
     tail, head = vertices[connectivity.edges.long()].unbind(dim=1)
     edge = _length(head - tail) if edge_power == 1 else (head - tail).square().sum(dim=1)
 

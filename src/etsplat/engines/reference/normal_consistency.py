@@ -6,9 +6,9 @@ from torch import Tensor
 
 
 def normal_consistency(normals: Tensor, depth: Tensor, alpha: Tensor, viewmats: Tensor, Ks: Tensor) -> Tensor:
-    """See `Engine.normal_consistency`."""
+    """See `etsplat.ops.normal_consistency`."""
     facing = depth_normals(depth, viewmats, Ks)
-    return (1 - (normals * facing * alpha.detach()).sum(dim=-1)).mean()
+    return (1 - (normals * facing * alpha).sum(dim=-1)).mean()
 
 
 def depth_normals(

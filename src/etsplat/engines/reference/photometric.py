@@ -16,7 +16,7 @@ def photometric_loss(
     dssim_weight: float,
     squared: bool,
 ) -> Tensor:
-    """See `Engine.photometric_loss`."""
+    """See `etsplat.ops.photometric`."""
     y = target.to(color.dtype) / 255 if target.dtype == torch.uint8 else target
     if y.shape[-1] == 4:
         behind = 0 if backgrounds is None else (1 - y[..., 3:]) * backgrounds[:, None, None, :]

@@ -31,7 +31,7 @@ _LARGEST = 1e30  # of depths, and of squared lengths in pixels
 
 
 def rasterize(tensors: RasterizeTensors, settings: RasterizeSettings) -> Rasterization:
-    """See `Engine.rasterize`."""
+    """See `etsplat.rasterize`."""
     triangles, colors = tensors.corners, tensors.face_colors
     if tensors.vertex_colors is not None and tensors.faces is not None:
         colors = tensors.vertex_colors[tensors.faces.long()]

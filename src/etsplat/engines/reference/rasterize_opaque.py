@@ -18,7 +18,7 @@ def rasterize_opaque(
     barycentrics: Float[Tensor, "H W 3"],
     depth: Float[Tensor, "H W"],
 ) -> None:
-    """See `Engine.rasterize_opaque`."""
+    """Fill the three images of one view: contiguous points and int32 triangles."""
     corners, inverse_depths, drawn = _project(points, triangles, view)
     owner, inverse_depth = _z_buffer(corners, inverse_depths, drawn, view.width, view.height)
     triangle.copy_(owner)
@@ -36,7 +36,7 @@ def render_opaque(
     cull_backfaces: bool,
     image: Float[Tensor, "H W C1"],
 ) -> None:
-    """See `Engine.render_opaque`; strip by strip."""
+    """Fill the image of one view, strip by strip; colours are contiguous."""
     corners, inverse_depths, drawn = _project(points, triangles, view)
     if cull_backfaces:
         drawn &= _doubled_area(corners) < 0  # y points down: counter-clockwise is negative

@@ -17,11 +17,11 @@ def soup_activation(
     smallest: float,
     largest: float,
 ) -> tuple[Tensor, Tensor]:
-    """See `Engine.soup_activation`."""
+    """See `etsplat.ops.soup_activation`."""
     floor, ceiling = limits
     opacities = floor + (1.0 - floor) * torch.sigmoid(opacity_logits)
     if camera is not None:
-        opacities = torch.where(_left_out(vertices.detach(), camera, smallest, largest), 0.0, opacities)
+        opacities = torch.where(_left_out(vertices, camera, smallest, largest), 0.0, opacities)
     return opacities, (SOUP_SIGMA_FLOOR + torch.exp(sigma_raw)).clamp_max(ceiling)
 
 

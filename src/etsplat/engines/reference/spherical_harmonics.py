@@ -8,14 +8,14 @@ _MIN_LENGTH = 1e-12
 
 
 def spherical_harmonics(coefficients: Tensor, directions: Tensor, degree: int) -> Tensor:
-    """See `Engine.spherical_harmonics`."""
+    """See `etsplat.ops.spherical_harmonics`."""
     basis = _basis(directions, degree)
     return torch.relu(0.5 + torch.einsum("...nk,nkc->...nc", basis, coefficients[:, : basis.shape[-1]]))
 
 
 def soup_colors(vertices: Tensor, sh_dc: Tensor, sh_rest: Tensor, centers: Tensor, degree: int) -> Tensor:
-    """See `Engine.soup_colors`."""
-    directions = vertices.mean(dim=1) - centers[:, None].detach()
+    """See `etsplat.ops.soup_colors`."""
+    directions = vertices.mean(dim=1) - centers[:, None]
     return spherical_harmonics(torch.cat([sh_dc, sh_rest], dim=1), directions, degree)
 
 

@@ -8,7 +8,7 @@ from etsplat.engines.reference.rasterize import unit_normals
 
 
 def triangle_channels(corners: Tensor, viewmats: Tensor, depth: bool, normals: bool) -> Tensor:
-    """See `Engine.triangle_channels`."""
+    """See `etsplat.ops.triangle_channels`."""
     finite = corners.isfinite().all(dim=2).all(dim=1)
     corners = torch.where(finite[:, None, None], corners, 0.0)
     viewmats = torch.where(viewmats.isfinite().all(dim=2).all(dim=1)[:, None, None], viewmats, 0.0)

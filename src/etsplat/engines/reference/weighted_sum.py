@@ -12,7 +12,7 @@ def weighted_sum(
     powers: Sequence[int],
     scale: float | Tensor,
 ) -> Tensor:
-    """See `Engine.weighted_sum`."""
+    """See `etsplat.ops.weighted_sum`; at least one value."""
     powered = (value if power == 1 else value.pow(power) for value, power in zip(values, powers, strict=True))
     total, *others = (weight * value for weight, value in zip(weights, powered, strict=True))
     for other in others:

@@ -1,0 +1,51 @@
+"""The GPU engine's side of depths and normals as channels: csrc/cuda/triangle_channels.cu and pick_values.cu."""
+
+import ctypes
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from etsplat.engines.cuda.launch import blocks, launch, launch_each
+from etsplat.engines.cuda.program import Program
+from etsplat.engines.cuda.structs import struct_class
+from etsplat.engines.native.operation import differentiable
+
+_CHANNELS = Program("triangle_channels.cu", contract=False)
+_PICK = Program("pick_values.cu", contract=False)
+_CHANNELS_THREADS = 128
+_PICK_THREADS = 256
+
+
+def run_triangle_channels(name: str, problem: tuple[Any, ...], images: tuple[Tensor, ...]) -> None:
+    """See `etsplat.engines.native.triangle_channels.Run`."""
+    struct = struct_class("cuda/triangle_channels.cu", "ChannelsOf")(*problem)
+    launch_each(_CHANNELS, f"triangle_channels_{name}", struct.triangles, (struct, *images), _CHANNELS_THREADS)
+
+
+def _pick(_keep: bool, values: Tensor, chosen: Tensor) -> tuple[Tensor, Any]:
+    image = values.new_empty(chosen.shape)
+    grid, sizes = _views(values, chosen)
+    launch(_PICK, "pick_forward", grid, _PICK_THREADS, (values, chosen, *sizes, image))
+    return image, (values, chosen)
+
+
+def _pick_backward(kept: Any, _needed: Any, grad_image: Tensor) -> tuple[Tensor]:
+    values, chosen = kept
+    grid, sizes = _views(values, chosen)
+    words = torch.zeros(values.numel() + 1, dtype=torch.int64, device=values.device)
+    largest, sums = words[:1], words[1:]
+    launch(_PICK, "pick_largest", grid, _PICK_THREADS, (grad_image, chosen, *sizes, largest))
+    launch(_PICK, "pick_add", grid, _PICK_THREADS, (grad_image, chosen, *sizes, largest, sums))
+    grad_values, count = torch.empty_like(values), values.numel()
+    launch_each(_PICK, "pick_finish", count, (sums, largest, ctypes.c_int64(count), grad_values), _PICK_THREADS)
+    return (grad_values,)
+
+
+def _views(values: Tensor, chosen: Tensor) -> tuple[tuple[int, int], tuple[ctypes.c_int64, ctypes.c_int64]]:
+    """Blocks of a view and views; pixels and triangles of a view."""
+    pixels = chosen.shape[1] * chosen.shape[2]
+    return (blocks(pixels, _PICK_THREADS), len(values)), (ctypes.c_int64(pixels), ctypes.c_int64(values.shape[1]))
+
+
+pick_values = differentiable(_pick, _pick_backward)

@@ -1,0 +1,116 @@
+"""Steps of a fit on a GPU, queued as CUDA graphs: csrc/cuda/adam.cu, soup_statistics.cu and step.cu."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from etsplat.core.rasterization import TriangleStatistics
+from etsplat.engines.cuda.capacity import overflow_flag, repair_overflow
+from etsplat.engines.cuda.launch import backend, blocks, launch, launch_each, upload
+from etsplat.engines.cuda.program import Program
+from etsplat.engines.cuda.structs import struct_class
+from etsplat.engines.reference.adam import AdamGroup, step_rates
+
+_ADAM = Program("adam.cu", contract=False)
+_STATISTICS = Program("soup_statistics.cu", contract=False)
+_STEP = Program("step.cu", contract=False)
+_ADAM_THREADS, _ADAM_ELEMENTS = 256, 1024
+
+
+def adam_step(
+    groups: Sequence[AdamGroup],
+    learning_rates: Sequence[float],
+    betas: tuple[float, float],
+    eps: float,
+    step_count: int,
+) -> None:
+    """See `Engine.adam_step`."""
+    rates = upload(step_rates(learning_rates, betas, step_count), groups[0][0].device)
+    CudaQueuedSteps.adam_step(groups, rates, betas, eps, None)
+
+
+def update_statistics(records: Sequence[Tensor], view: TriangleStatistics, views: int, epoch_starts: bool) -> None:
+    """See `Engine.update_statistics`."""
+    device = records[0].device
+    going_on = torch.zeros((), dtype=torch.int32, device=device)
+    CudaQueuedSteps.update_statistics(records, view, views, upload([epoch_starts], device), going_on)
+
+
+class Repeated:
+    """Calls a function the first time, captures it the second time, and replays the graph from then on.
+
+    The function must do the same on every call and read what changes from device memory; what it allocates stays
+    allocated for the graph. The first call compiles kernels and fills caches, which a capture must not.
+    """
+
+    def __init__(self, body: Callable[[], None], pool: Any) -> None:
+        """Captures nothing yet.
+
+        Args:
+            body: the function.
+            pool: from the backend's `memory_pool`. Graphs of one pool work in the same memory: they are replayed on one
+                stream, and none reads what another has left there.
+        """
+        self._body = body
+        self._pool = pool
+        self._called = False
+        self._replay: Callable[[], None] | None = None
+
+    def __call__(self) -> None:
+        """Queue the launches; nothing waits for them."""
+        if self._replay is not None:
+            self._replay()
+        elif self._called:
+            self._replay = backend().capture(self._body, self._pool)
+        else:
+            self._body()
+            self._called = True
+
+
+class CudaQueuedSteps:
+    """What a captured step needs besides the operations; see `QueuedSteps`."""
+
+    repeated = Repeated
+
+    def memory_pool(self) -> Any:
+        """See `QueuedSteps.memory_pool`."""
+        return backend().memory_pool()
+
+    def verdict(self, loss: Tensor, position: Tensor, losses: Tensor, halted: Tensor) -> None:
+        """See `QueuedSteps.verdict`; a step counts if its buffers were large enough and its loss is finite."""
+        launch(_STEP, "step_verdict", 1, 1, (loss, overflow_flag(loss.device), position, losses, halted))
+
+    def repair(self, device: torch.device) -> bool:
+        """See `QueuedSteps.repair`."""
+        return repair_overflow(device)
+
+    @staticmethod
+    def adam_step(
+        groups: Sequence[AdamGroup],
+        rates: Tensor,
+        betas: tuple[float, float],
+        eps: float,
+        halted: Tensor | None,
+    ) -> None:
+        """See `QueuedSteps.adam_step`; None never halts."""
+        first_beta, second_beta = betas
+        constants = 1 - first_beta, second_beta, 1 - second_beta, eps
+        table_class = struct_class("cuda/adam.cu", "AdamParameters")
+        most = len(table_class().sizes)
+        for first in range(0, len(groups), most):
+            chosen = groups[first : first + most]
+            sizes = [group[0].numel() for group in chosen]
+            table = table_class(*map(list, zip(*chosen, strict=True)), sizes)
+            grid = sum(blocks(size, _ADAM_ELEMENTS) for size in sizes)
+            arguments = (table, len(chosen), rates[first:], rates[len(groups) :], *constants, halted)
+            launch(_ADAM, "adam_step", grid, _ADAM_THREADS, arguments)
+
+    @staticmethod
+    def update_statistics(
+        records: Sequence[Tensor], view: TriangleStatistics, views: int, epoch_starts: Tensor, halted: Tensor
+    ) -> None:
+        """See `QueuedSteps.update_statistics`."""
+        count, seen_now = len(records[0]), (view.max_weight[0], view.screen_size[0], view.inradius[0])
+        launch_each(_STATISTICS, "soup_statistics", count, (count, *seen_now, *records, views, epoch_starts, halted))

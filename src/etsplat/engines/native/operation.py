@@ -1,0 +1,49 @@
+"""What operations of native code have in common: one autograd function around the two functions of an engine."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from etsplat.core.validation import dense
+
+
+def differentiable(forward: Callable[..., Any], backward: Callable[..., Any]) -> Callable[..., Any]:
+    """A method of engines from native code in both directions, which gets dense tensors, detached from autograd.
+
+    Args:
+        forward: (keep, *arguments) -> (result, kept): a tensor or a tuple of them, and a tuple of whatever ``backward``
+            needs, nothing if ``keep`` is False. It must not rely on addresses: autograd may hand over copies.
+        backward: (kept, needed, *cotangents) -> gradients of the first arguments, the others have none. ``needed`` says
+            of each argument whether its gradient is. A result of several that nothing was made of has cotangent None.
+    """
+    return partial(_Native.apply, forward, backward)
+
+
+class _Native(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, forward: Callable[..., Any], backward: Callable[..., Any], *arguments: Any) -> Any:
+        given = (dense(argument) if isinstance(argument, Tensor) else argument for argument in arguments)
+        result, kept = forward(any(ctx.needs_input_grad), *given)
+        ctx.save_for_backward(*(item if isinstance(item, Tensor) else None for item in kept))
+        ctx.constants = [None if isinstance(item, Tensor) else item for item in kept]
+        ctx.gradients = backward
+        ctx.set_materialize_grads(isinstance(result, Tensor))
+        return result
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *cotangents: Tensor | None) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        saved = zip(ctx.saved_tensors, ctx.constants, strict=True)
+        kept = [constant if tensor is None else _dense(tensor) for tensor, constant in saved]
+        needed = ctx.needs_input_grad[2:]
+        gradients = ctx.gradients(kept, needed, *(None if given is None else dense(given) for given in cotangents))
+        return None, None, *gradients, *(None,) * (len(needed) - len(gradients))
+
+
+def _dense(tensor: Tensor) -> Tensor:
+    """Itself if it is: autograd copies the gradients that it is given where it must not add to them."""
+    return tensor if tensor.is_contiguous() and not tensor.is_neg() else dense(tensor)
