@@ -12,19 +12,28 @@ from etsplat.core.cameras import camera_centers, look_at
 Viewmats = Float[Tensor, "B 4 4"]
 
 
-def focus_point(viewmats: Viewmats) -> Float[Tensor, "3"]:
-    """The point nearest to all optical axes, in least squares; float64.
+def axes_meeting_point(viewmats: Viewmats, least: float = 1e-4) -> Float[Tensor, "3"] | None:
+    """The point with the least sum of squared distances to the cameras' optical axes, float64.
 
-    With axes d_i through c_i it solves sum_i (I - d_i d_i^T) (p - c_i) = 0. Axes that are all but parallel have no such
-    point: it then lies ahead of the mean camera, at the distance of the cameras' spread.
+    For an axis through c along the unit vector d the distance is |(I - d d^T)(x - c)|, so x solves
+    sum(I - d d^T) x = sum(I - d d^T) c. None if axes are parallel: an eigenvalue of the mean matrix is below `least`.
     """
     centers, forward = camera_centers(viewmats.double()), viewmats[:, 2, :3].double()
     projections = torch.eye(3, dtype=torch.float64) - forward[:, :, None] * forward[:, None, :]
     total = projections.sum(dim=0)
-    if float(torch.linalg.eigvalsh(total)[0]) < 1e-3 * len(viewmats):
-        spread = (centers - centers.mean(dim=0)).norm(dim=1).max()
-        return centers.mean(dim=0) + forward.mean(dim=0) * spread.clamp_min(1e-6)
+    if float(torch.linalg.eigvalsh(total)[0]) < least * len(viewmats):
+        return None
     return torch.linalg.solve(total, (projections @ centers[:, :, None]).sum(dim=0)[:, 0])
+
+
+def focus_point(viewmats: Viewmats) -> Float[Tensor, "3"]:
+    """Where the optical axes meet best, float64; if nowhere, ahead of the mean camera by the spread of the cameras."""
+    met = axes_meeting_point(viewmats, least=1e-3)
+    if met is not None:
+        return met
+    centers = camera_centers(viewmats.double())
+    spread = (centers - centers.mean(dim=0)).norm(dim=1).max()
+    return centers.mean(dim=0) + viewmats[:, 2, :3].double().mean(dim=0) * spread.clamp_min(1e-6)
 
 
 def orbit(viewmats: Viewmats, up: Float[Tensor, "3"], frames: int) -> Viewmats:
