@@ -1,7 +1,7 @@
 """The files of a COLMAP sparse model: cameras, registered images and points, binary or text."""
 
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -44,17 +44,22 @@ def read_cameras(model: Path) -> dict[int, ColmapCamera]:
     """All cameras of a sparse model by their id, from `cameras.bin` or else `cameras.txt`.
 
     Raises:
-        InputError: the file is cut short or malformed.
+        InputError: the file is missing, cut short or malformed.
     """
-    if (model / "cameras.bin").is_file():
-        return dict(_cameras_from_binary(_Reader(model / "cameras.bin")))
 
-    def camera(line: str) -> tuple[int, ColmapCamera]:
+    def binary(reader: _Reader) -> tuple[int, ColmapCamera]:
+        identity, kind, width, height = reader.numbers("iiQQ")
+        if not 0 <= kind < len(_MODELS):
+            raise InputError(f"scene {reader.path}: unknown camera model {kind}; run `colmap image_undistorter` first")
+        name = _MODELS[kind]
+        return identity, ColmapCamera(name, width, height, reader.numbers(f"{PARAMETERS[name]}d"))
+
+    def text(line: str) -> tuple[int, ColmapCamera]:
         words = _words(line, 5)
         params = tuple(float(word) for word in words[4:])
         return int(words[0]), ColmapCamera(words[1], int(words[2]), int(words[3]), params)
 
-    return dict(_parsed(model / "cameras.txt", camera))
+    return dict(_rows(model / "cameras", binary, text))
 
 
 def read_images(model: Path) -> list[ColmapImage]:
@@ -63,16 +68,20 @@ def read_images(model: Path) -> list[ColmapImage]:
     Raises:
         InputError: the file is missing, cut short or malformed.
     """
-    if (model / "images.bin").is_file():
-        return list(_images_from_binary(_Reader(model / "images.bin")))
 
-    def image(line: str) -> ColmapImage:
+    def binary(reader: _Reader) -> ColmapImage:
+        _, w, x, y, z, tx, ty, tz, camera = reader.numbers("I7dI")
+        name = reader.text()
+        reader.skip(24 * reader.numbers("Q")[0])
+        return ColmapImage(name, camera, (w, x, y, z), (tx, ty, tz))
+
+    def text(line: str) -> ColmapImage:
         words = _words(line, 10, splits=9)  # names may have spaces
         w, x, y, z, tx, ty, tz = (float(word) for word in words[1:8])
         return ColmapImage(words[9], int(words[8]), (w, x, y, z), (tx, ty, tz))
 
-    # Every second line lists the image's key points, and may be empty.
-    return _parsed(model / "images.txt", image, every=2)
+    # Every second line of text lists the image's key points, and may be empty.
+    return _rows(model / "images", binary, text, every=2)
 
 
 def read_points(model: Path) -> tuple[np.ndarray, np.ndarray] | None:
@@ -81,18 +90,15 @@ def read_points(model: Path) -> tuple[np.ndarray, np.ndarray] | None:
     Raises:
         InputError: the file is cut short or malformed.
     """
-    if (model / "points3D.bin").is_file():
-        reader = _Reader(model / "points3D.bin")
-        count = reader.numbers("Q")[0]
-        rows = []
-        for _ in range(count):
-            row = reader.numbers("Q3d3BdQ")
-            reader.skip(8 * row[8])
-            rows.append(row[1:7])
-    elif (model / "points3D.txt").is_file():
-        rows = _parsed(model / "points3D.txt", lambda line: tuple(float(word) for word in _words(line, 7)[1:7]))
-    else:
+
+    def binary(reader: _Reader) -> tuple[float, ...]:
+        row = reader.numbers("Q3d3BdQ")
+        reader.skip(8 * row[8])
+        return row[1:7]
+
+    if not any((model / f"points3D.{suffix}").is_file() for suffix in ("bin", "txt")):
         return None
+    rows = _rows(model / "points3D", binary, lambda line: tuple(float(word) for word in _words(line, 7)[1:7]))
     table = np.array(rows, dtype=np.float64).reshape(-1, 6)
     table = table[np.isfinite(table).all(axis=1)]
     return table[:, :3], table[:, 3:].clip(0, 255).astype(np.uint8)
@@ -119,32 +125,19 @@ class _Reader:
         return self._data[self._at - size : self._at]
 
 
-def _cameras_from_binary(reader: _Reader) -> Iterator[tuple[int, ColmapCamera]]:
-    for _ in range(reader.numbers("Q")[0]):
-        identity, model, width, height = reader.numbers("iiQQ")
-        if not 0 <= model < len(_MODELS):
-            raise InputError(f"scene {reader.path}: unknown camera model {model}; run `colmap image_undistorter` first")
-        name = _MODELS[model]
-        yield identity, ColmapCamera(name, width, height, reader.numbers(f"{PARAMETERS[name]}d"))
-
-
-def _images_from_binary(reader: _Reader) -> Iterator[ColmapImage]:
-    for _ in range(reader.numbers("Q")[0]):
-        _, w, x, y, z, tx, ty, tz, camera = reader.numbers("I7dI")
-        name = reader.text()
-        reader.skip(24 * reader.numbers("Q")[0])
-        yield ColmapImage(name, camera, (w, x, y, z), (tx, ty, tz))
-
-
-def _parsed(path: Path, parse: Callable[[str], Row], every: int = 1) -> list[Row]:
-    """What every so manieth line of a text file says; empty ones count if not all are wanted."""
+def _rows(path: Path, binary: Callable[[_Reader], Row], text: Callable[[str], Row], every: int = 1) -> list[Row]:
+    """All records of `path`.bin, or else what every so manieth line of `path`.txt says, empty ones included."""
+    if path.with_suffix(".bin").is_file():
+        reader = _Reader(path.with_suffix(".bin"))
+        return [binary(reader) for _ in range(reader.numbers("Q")[0])]
+    path = path.with_suffix(".txt")
     if not path.is_file():
         raise InputError(f"scene {path}: no such file; export the model again")
     lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
     rows = []
     for line in [line for line in lines if not line.startswith("#") and (every > 1 or line.strip())][::every]:
         try:
-            rows.append(parse(line))
+            rows.append(text(line))
         except ValueError as error:
             raise InputError(f"scene {path}: malformed line `{line[:60]}` ({error}); export it again") from error
     return rows

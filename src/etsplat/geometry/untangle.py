@@ -103,11 +103,8 @@ def _too_far(
         unit.scatter_reduce_(0, end, lengths, "amax")
     distance = (vertices - original).norm(dim=1)
     moved, lost = distance > 0, distance > reach * unit
-    together = moved[first] & moved[second]
     while True:
-        grown = lost.clone()
-        grown[second[together & lost[first]]] = True
-        grown[first[together & lost[second]]] = True
+        grown = _grown(lost, topology) & moved
         if torch.equal(grown, lost):
             return lost
         lost = grown
