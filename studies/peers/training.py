@@ -66,25 +66,25 @@ def train_peer(
     config = replace(config, iterations=iterations)
     place = Place(out, resume, overwrite=not resume)
     fitting = _Fitting(gsplat, capture, config, device)
-    run = place.open(record)
-    settings = LoopSettings(config.iterations, LOG_EVERY, evaluate_every=0, checkpoint_every=CHECKPOINT_EVERY)
-    with torch.random.fork_rng([device] if device.type == "cuda" else []):
-        torch.manual_seed(config.seed)  # gsplat splits at random
-        drive(fitting, progress := Progress(), settings, (), run, hash_record(record))
-    save_gaussians(run.path / FILE, fitting.gaussians)
-    drawing = PeerDrawing(gsplat, fitting.gaussians, capture, config, device)
-    run.write_metrics(
-        {
-            **drawing.draw_test_views(run.test),
-            "triangles": fitting.count,
-            "iterations": config.iterations,
-            "seconds": progress.seconds,
-            "device": device_name(device),
-            "method": config.method,
-            "seed": config.seed,
-            "versions": {**versions(), "gsplat": gsplat.__version__},
-        }
-    )
+    with place.open(record, print) as run:
+        settings = LoopSettings(config.iterations, LOG_EVERY, evaluate_every=0, checkpoint_every=CHECKPOINT_EVERY)
+        with torch.random.fork_rng([device] if device.type == "cuda" else []):
+            torch.manual_seed(config.seed)  # gsplat splits at random
+            drive(fitting, progress := Progress(), settings, (), run, hash_record(record))
+        save_gaussians(run.path / FILE, fitting.gaussians)
+        drawing = PeerDrawing(gsplat, fitting.gaussians, capture, config, device)
+        run.write_metrics(
+            {
+                **drawing.draw_test_views(run.test),
+                "triangles": fitting.count,
+                "iterations": config.iterations,
+                "seconds": progress.seconds,
+                "device": device_name(device),
+                "method": config.method,
+                "seed": config.seed,
+                "versions": {**versions(), "gsplat": gsplat.__version__},
+            }
+        )
     return run.read_metrics()
 
 

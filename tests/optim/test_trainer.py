@@ -15,6 +15,7 @@ from etsplat.data.demo_object import demo_object
 from etsplat.data.demo_scene import demo_scene
 from etsplat.data.photograph import photograph
 from etsplat.geometry.icosphere import icosphere
+from etsplat.io.locks import writing_run
 from etsplat.io.run_directory import RunDirectory
 from etsplat.model.soup_init import StartPoints, start_soup
 from etsplat.model.triangle_mesh import TriangleMesh
@@ -126,6 +127,8 @@ def test_a_folder_becomes_a_run_to_go_on_with(object_views: Dataset, tmp_path: P
     for other in (combination("mesh", object_views, seed=1), combination("soup", object_views)):
         with pytest.raises(InputError, match="with other settings"):
             other.fit(30, run=tmp_path / "run")
+    with writing_run(tmp_path / "run", pytest.fail), pytest.raises(InputError, match="is writing this run"):
+        combination("mesh", object_views).fit(30, run=tmp_path / "run")
 
 
 def test_a_step_of_two_views_is_the_mean_of_their_gradients(object_views: Dataset) -> None:

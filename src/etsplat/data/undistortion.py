@@ -7,7 +7,7 @@ import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePosixPath
-from typing import IO, Any
+from typing import Any
 
 from etsplat.core.errors import InputError
 from etsplat.data.colmap_process import import_pycolmap, run_apart, undistort_images
@@ -16,6 +16,7 @@ from etsplat.data.formats.transforms import read_frames
 from etsplat.data.frames import Frame, Points, Wanted, scaled_intrinsics
 from etsplat.io.atomic import write_error
 from etsplat.io.images import image_size, load_pixels
+from etsplat.io.locks import lock_file
 from etsplat.io.paths import kind_of, path_remedy, path_within
 
 LEAST_SIZE = 16
@@ -134,7 +135,7 @@ def working_folder(out: Path) -> Iterator[Path]:
             open(Path(folder) / f"{_MARK}.new", "wb") as mark,
         ):
             with contextlib.suppress(OSError):  # where there are no locks nobody finds the mark, nor removes this
-                _lock(mark)
+                lock_file(mark)
                 os.rename(mark.name, Path(folder) / _MARK)  # locked from the moment that it has its name
             try:
                 yield Path(folder)
@@ -150,17 +151,8 @@ def _remove_abandoned(out: Path) -> None:
     """Removes working folders for `out` whose processes have ended."""
     for mark in out.parent.glob(f".{glob.escape(out.name)}-*/{_MARK}"):
         with contextlib.suppress(OSError), open(mark, "rb") as file:  # locked, by a living process; or just removed
-            _lock(file)
+            lock_file(file)
             shutil.rmtree(mark.parent)
-
-
-def _lock(file: IO[bytes]) -> None:
-    """Until the file is closed; OSError where another process has locked it, or the system has no such locks."""
-    try:
-        import fcntl
-    except ImportError as error:
-        raise OSError("no file locks on this system") from error
-    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
 def _failure(out: Path, error: Exception) -> InputError:

@@ -1,7 +1,8 @@
 """The folder that holds a run: what may become one, and how its files are written.
 
 A folder is a run's if it holds a config.json that says so. Files are written whole or not at all, except history.jsonl,
-which grows by a line at a time; a line that a kill cut short is ignored and, on resume, removed.
+which grows by a line at a time; a line that a kill cut short is ignored and, on resume, removed. Who writes holds the
+folder's lock (`io/locks.py`); readers need none.
 """
 
 import contextlib
@@ -17,6 +18,7 @@ from typing import Any
 
 from etsplat.core.errors import InputError
 from etsplat.io.atomic import atomic_write, write_error
+from etsplat.io.locks import RUN_LOCK
 
 FORMAT = "etsplat run 1"
 
@@ -151,7 +153,7 @@ class RunDirectory:
         path = Path(path)
         if path.exists() and not path.is_dir():
             raise InputError(f"{path}: is a file; choose a folder for the results")
-        if path.is_dir() and any(path.iterdir()):
+        if path.is_dir() and not is_empty(path):
             if not is_run(path):
                 raise InputError(f"{path}: is not empty and not a run of etsplat; choose another or a new folder")
             if not overwrite:
@@ -284,6 +286,11 @@ class RunDirectory:
         for name in _FOLDERS:
             if (self.path / name).is_dir():
                 shutil.rmtree(self.path / name)
+
+
+def is_empty(folder: Path) -> bool:
+    """Whether a folder holds nothing but what a run leaves that was killed before it began."""
+    return all(path.name == RUN_LOCK for path in folder.iterdir())
 
 
 def is_run(path: Path | str) -> bool:

@@ -1,5 +1,6 @@
 """Named tensors on disk, as safetensors files."""
 
+import json
 import os
 import re
 from collections.abc import Mapping
@@ -13,7 +14,7 @@ from etsplat.io.atomic import atomic_write
 
 
 def save_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: dict[str, str] | None = None) -> None:
-    """Write tensors of any device under their names. Atomic.
+    """Write tensors of any device under their names. Atomic. Equal tensors and metadata are equal bytes.
 
     Args:
         path: ends in .safetensors.
@@ -34,6 +35,7 @@ def save_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: dict[str, 
             if number is None:
                 raise OSError(str(error).splitlines()[0]) from error
             raise OSError(int(number[1]), os.strerror(int(number[1]))) from error
+        _sort_metadata(temporary)
         temporary.chmod(mode)  # safetensors makes files that only their owner may read
 
 
@@ -45,3 +47,17 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     """
     with safe_open(path, framework="pt") as file:
         return {name: file.get_tensor(name) for name in file.keys()}, file.metadata() or {}  # noqa: SIM118 (no mapping)
+
+
+def _sort_metadata(path: Path) -> None:
+    """By name, in place: safetensors writes it in another order in every call."""
+    with open(path, "rb+") as file:
+        size = int.from_bytes(file.read(8), "little")
+        header = json.loads(file.read(size))
+        if "__metadata__" in header:
+            header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
+        text = json.dumps(header, ensure_ascii=False, separators=(",", ":")).encode().ljust(size)
+        if len(text) != size:  # the offsets of the tensors count from its end
+            raise ValueError(f"{path}: safetensors writes its header in another way than JSON of {size} bytes")
+        file.seek(8)
+        file.write(text)

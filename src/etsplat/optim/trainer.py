@@ -1,7 +1,9 @@
 """Fits a model to photos: one trainer for every model, objective, strategy and data set."""
 
+import contextlib
 import hashlib
 import json
+import warnings
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import takewhile
@@ -18,6 +20,7 @@ from etsplat.data.dataset import Dataset
 from etsplat.data.loader import View, ViewLoader
 from etsplat.engines.choice import engine_for
 from etsplat.io.kernel_files import adopt_kernel, kernel_tensors
+from etsplat.io.locks import writing_run
 from etsplat.io.run_directory import RunDirectory, is_run
 from etsplat.model.model import Model
 from etsplat.ops.adam import Adam
@@ -148,15 +151,17 @@ class Trainer(Generic[M]):
 
         Raises:
             DivergedError: a loss or parameter is not finite.
-            InputError: a checkpoint is damaged or of another run; the disk is full.
+            InputError: a checkpoint is damaged or of another run; somebody else writes the run; the disk is full.
         """
         settings = LoopSettings(iterations, log_every, evaluate_every, checkpoint_every)
-        if isinstance(run, Path | str):
-            record = {"task": "fit", "iterations": iterations}
-            run = RunDirectory(Path(run)) if is_run(run) else RunDirectory.create(run, record)
         if run is not None and run_hash is None:
             run_hash = self._hash()
-        with engine_for(next(iter(self.model.parameters().values()))).looping():
+        with contextlib.ExitStack() as stack:
+            stack.enter_context(engine_for(next(iter(self.model.parameters().values()))).looping())
+            if isinstance(run, Path | str):
+                stack.enter_context(writing_run(Path(run), warnings.warn))
+                record = {"task": "fit", "iterations": iterations}
+                run = RunDirectory(Path(run)) if is_run(run) else RunDirectory.create(run, record)
             drive(self, self.progress, settings, callbacks, run, run_hash or "")
         return self.progress
 

@@ -101,11 +101,12 @@ def reconstruct(
             lpips=load_lpips(config.output.lpips_weights, job.device),
         )
         trainer = make_trainer(make_start(start, views, config, job.device), views, config, scorer.cheap)
-        progress, mesh, frame = job.fit(trainer), trainer.model, views.normalization
-        for suffix in (".ply", ".obj", ".glb"):
-            mesh.save(job.run.mesh_path(suffix), frame)
-        sizes = {"faces": len(mesh.faces), "vertices": len(mesh.vertices)}
-        metrics = job.finish(progress, {**scorer.full(mesh, job.run.test), **sizes}, mesh.vertices)
+        with job.writing():
+            progress, mesh, frame = job.fit(trainer), trainer.model, views.normalization
+            for suffix in (".ply", ".obj", ".glb"):
+                mesh.save(job.run.mesh_path(suffix), frame)
+            sizes = {"faces": len(mesh.faces), "vertices": len(mesh.vertices)}
+            metrics = job.finish(progress, {**scorer.full(mesh, job.run.test), **sizes}, mesh.vertices)
     return ReconstructResult(job.run.path, metrics, mesh.to_file(frame))
 
 

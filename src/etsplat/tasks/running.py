@@ -1,9 +1,10 @@
 """What every task's run has in common: its place, its record and its events."""
 
+import contextlib
 import hashlib
 import json
 import platform
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -16,8 +17,9 @@ from etsplat.core.errors import InputError
 from etsplat.engines.choice import engine_for, resolve_device
 from etsplat.engines.threads import num_threads
 from etsplat.io.kernel_files import kernel_digest, write_kernel
+from etsplat.io.locks import check_nobody_writes, writing_run
 from etsplat.io.run_directory import RunDirectory, is_run
-from etsplat.optim.loop import Callback, Event, PrepareEvent, Progress
+from etsplat.optim.loop import Callback, Event, NoteEvent, PrepareEvent, Progress
 from etsplat.optim.objective import Term
 from etsplat.optim.schedules import Scheduled
 from etsplat.optim.terms import named_terms
@@ -46,7 +48,8 @@ class Place:
         """Cheap, so that it comes before the input is prepared.
 
         Raises:
-            InputError: there is no run to continue, or no place for a new one; or both are asked for.
+            InputError: there is no run to continue, or no place for a new one; both are asked for; or somebody writes
+                the run that is there.
         """
         if self.resume and self.overwrite:
             raise InputError("--resume and --overwrite: contradict each other; give one of them")
@@ -54,18 +57,27 @@ class Place:
             RunDirectory.check_free(self.path, overwrite=self.overwrite)
         elif not is_run(self.path):
             raise InputError(f"{self.path}: holds no run to resume; start it without --resume")
+        check_nobody_writes(self.path)
 
-    def open(self, record: dict[str, Any]) -> RunDirectory:
-        """The directory, made or with the run that goes on; ``record`` as of `make_record`.
+    @contextlib.contextmanager
+    def open(self, record: dict[str, Any], tell: Callable[[str], None]) -> Iterator[RunDirectory]:
+        """The directory, made or with the run that goes on, which nobody else writes within the block.
+
+        Args:
+            record: as of `make_record`.
+            tell: called with a sentence where nothing keeps others away.
 
         Raises:
             InputError: as `check`; or the run in it was started with other settings or input.
         """
-        if self.resume:
-            return RunDirectory.resume(self.path, record)
-        run = RunDirectory.create(self.path, record, overwrite=self.overwrite)
-        write_kernel(run.path, record["config"].get("method"))
-        return run
+        self.check()
+        with writing_run(self.path, tell):
+            if self.resume:
+                yield RunDirectory.resume(self.path, record)
+                return
+            run = RunDirectory.create(self.path, record, overwrite=self.overwrite)
+            write_kernel(run.path, record["config"].get("method"))
+            yield run
 
 
 @dataclass(frozen=True)
@@ -93,7 +105,7 @@ class Job:
     Attributes:
         config: settings.
         device: where it runs.
-        run: the run directory, from `fit` on.
+        run: the run directory, within `writing`.
     """
 
     run: RunDirectory
@@ -132,11 +144,21 @@ class Job:
         """
         self._record = make_record(self.config, iterations or self.config.iterations, hashes, paths)
         if self._place.resume:
-            self._place.open(self._record)
+            RunDirectory.resume(self._place.path, self._record)
+
+    @contextlib.contextmanager
+    def writing(self) -> Iterator[None]:
+        """Within the block there is `run`, and nobody else writes it.
+
+        Raises:
+            InputError: somebody does; or as `Place.open`.
+        """
+        with self._place.open(self._record, lambda text: self.announce(NoteEvent(text))) as self.run:
+            yield
 
     def fit(self, trainer: Trainer[Any], watch: Callback | None = None) -> Progress:
         """Runs a trainer from the last checkpoint to the end; see `Trainer.fit`. `watch` is told before the others."""
-        output, self.run = self.config.output, self._place.open(self._record)
+        output = self.config.output
         return trainer.fit(
             self.config.iterations,
             callbacks=[self.announce] if watch is None else [watch, self.announce],

@@ -106,7 +106,7 @@ def train(
             if isinstance(event, CheckpointEvent):  # so that `etsplat view` can follow
                 _in_own_units(trainer.model, event.iteration, capture, config).save(job.run.soup_path)
 
-        with engine_for(trainer.model.vertices).looping():
+        with job.writing(), engine_for(trainer.model.vertices).looping():
             try:
                 progress = job.fit(trainer, keep)
             except DivergedError as error:

@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 
 from etsplat.core.errors import InputError
-from etsplat.io.run_directory import RunDirectory, is_run
+from etsplat.io.run_directory import RunDirectory, is_empty, is_run
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.tasks.soup_run import check_trains
 
@@ -24,7 +24,7 @@ def wait_for_soup(folder: Path, announce: Callable[[str], None]) -> None:
     Raises:
         InputError: the folder holds something else, or a run of an earlier version, or goes away.
     """
-    if folder.is_dir() and any(folder.iterdir()) and not is_run(folder):
+    if folder.is_dir() and not is_empty(folder) and not is_run(folder):
         raise InputError(f"{folder}: is not a run of etsplat; name a folder given to --out, or a soup's file")
     told, seen = "", False
     while not RunDirectory(folder).soup_path.is_file():
