@@ -266,11 +266,12 @@ class RunDirectory:
 
     def read_history(self) -> list[dict[str, Any]]:
         """The lines of history.jsonl; empty if there is none yet. A last line that a kill cut short is left out."""
-        if not self.history_path.exists():
-            return []
-        lines = self.history_path.read_text(encoding="utf-8").split("\n")[:-1]  # what follows the last \n is cut short
         try:
-            return [json.loads(line) for line in lines]
+            text = self.history_path.read_text(encoding="utf-8")
+        except FileNotFoundError:
+            return []
+        try:
+            return [json.loads(line) for line in text.split("\n")[:-1]]  # what follows the last \n is cut short
         except json.JSONDecodeError as error:
             raise InputError(f"{self.history_path}: is damaged ({error}); delete the file") from error
 

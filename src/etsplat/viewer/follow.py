@@ -61,12 +61,14 @@ class Followed:
         return soup
 
     def status(self) -> str:
-        """How the run stands, in a line; empty before its first line of history."""
-        history = self._run.read_history()
+        """How the run stands, in a line; empty before its first line of history, and where a file is missing."""
+        try:
+            history, iterations = self._run.read_history(), self._run.read_iterations()
+        except InputError:  # between two runs, of which one replaces the other
+            return ""
         if not history:
             return ""
         last = history[-1]
-        iterations = self._run.read_iterations()
         known = [line["psnr"] for line in history if line.get("psnr") is not None]
         quality = f", {known[-1]:.2f} dB on test views" if known else ""
         state = "done" if self._run.metrics_path.is_file() else "running"

@@ -5,9 +5,11 @@ width that `Pace` allows, and one of full width as soon as it stands still.
 """
 
 import errno
+import math
 import socket
 import threading
 import time
+import traceback
 from collections.abc import Callable
 from typing import Any
 
@@ -32,7 +34,13 @@ MOVING_SECONDS = 0.08
 STILL_AFTER = 0.2
 """Seconds without motion after which the picture is sharpened."""
 
+TALLEST, MOST_PIXELS = 4, 1 << 26
+"""Of a picture: its height in widths, and how large it is at most. Those for narrower windows are less wide."""
+
 POLL_SECONDS = 2.0
+CLOSING_SECONDS = 5.0
+"""For which pictures that are being drawn are waited for at the end."""
+
 FRUSTUM = 0.04
 """Size of the pictured cameras, relative to the scene's extent."""
 
@@ -84,9 +92,12 @@ class Viewer:
     def close(self) -> None:
         """Ends the server and its threads."""
         self._closed.set()
-        for client in list(self._clients.values()):
+        clients = list(self._clients.values())
+        for client in clients:
             client.close()
         self.server.stop()
+        for client in clients:
+            client.worker.join(CLOSING_SECONDS)
 
     def _build_page(self) -> None:
         gui = self.server.gui
@@ -114,6 +125,9 @@ class Viewer:
         else:
             _stand_before(client, self._soup)
         self._clients[client.client_id] = _Client(self, client, self._width)
+        # viser calls this in a thread, maybe after the browser has gone and `_disconnected` was called.
+        if self._closed.is_set() or client.client_id not in self.server.get_clients():
+            self._disconnected(client.client_id)
 
     def _disconnected(self, identity: int) -> None:
         gone = self._clients.pop(identity, None)
@@ -140,9 +154,10 @@ class _Client:
         self._viewer, self._client = viewer, client
         self._pace = Pace(width, MOVING_SECONDS)
         self._changed = threading.Event()
-        self._closed = False
+        self._closed = self._failing = False
         client.camera.on_update(lambda _: self.redraw())
-        threading.Thread(target=self._work, daemon=True).start()
+        self.worker = threading.Thread(target=self._work, daemon=True)
+        self.worker.start()
         self.redraw()
 
     def redraw(self) -> None:
@@ -169,22 +184,47 @@ class _Client:
 
     def _draw(self, width: int, quality: int = 70) -> None:
         camera = camera_of(self._client.camera, width)
-        pixels = picture(self._viewer.soup, camera, self._viewer.mode)
+        if camera is None:
+            return
+        try:
+            pixels = picture(self._viewer.soup, camera, self._viewer.mode)
+        except Exception:  # whatever it was, such as no memory for this soup: the next picture may come out
+            if not self._failing:
+                traceback.print_exc()
+            self._failing = True
+            return
+        self._failing = False
         if self._closed:  # while it was drawn: viser would warn that nobody gets the picture
             return
         self._client.scene.set_background_image(pixels.numpy(), format="jpeg", jpeg_quality=quality)
 
 
-def camera_of(camera: Any, width: int) -> Cameras:
-    """The single camera of a browser: `wxyz` and `position` camera to world, `fov` vertical in radians, `aspect`."""
-    height = max(1, round(width / camera.aspect))
-    w, x, y, z = camera.wxyz
+def camera_of(camera: Any, width: int) -> Cameras | None:
+    """The single camera of a browser, which may say anything; None if nothing can be drawn with it.
+
+    Args:
+        camera: `wxyz` and `position` camera to world, `fov` vertical in radians, `aspect`.
+        width: of the picture, at most.
+    """
+    try:
+        told = [float(number) for number in (*camera.wxyz, *camera.position, camera.fov, camera.aspect)]
+        w, x, y, z, *position, fov, aspect = told
+    except (TypeError, ValueError, ArithmeticError):  # viser divides by the height of the window
+        return None
+    turned = 0 < math.hypot(w, x, y, z) < math.inf
+    if len(position) != 3 or not (turned and 0 < fov < math.pi and 1e-9 < aspect < 1e9):
+        return None
+    most = min(TALLEST * width**2, MOST_PIXELS)
+    width = max(1, round(min(width, math.sqrt(most * aspect))))
+    height = min(max(1, round(width / aspect)), most // width)
     rotation = torch.from_numpy(Rotation.from_quat([x, y, z, w]).as_matrix())
     viewmat = torch.eye(4, dtype=torch.float64)
     viewmat[:3, :3] = rotation.T
-    viewmat[:3, 3] = -rotation.T @ torch.as_tensor(np.asarray(camera.position), dtype=torch.float64)
-    K = intrinsics(float(np.degrees(camera.fov)), width, height)
-    return Cameras(viewmat[None].float(), K[None], width, height)
+    viewmat[:3, 3] = -rotation.T @ torch.tensor(position, dtype=torch.float64)
+    viewmat, K = viewmat.float(), intrinsics(float(np.degrees(fov)), width, height)
+    if not (viewmat.isfinite().all() and K.isfinite().all()):
+        return None
+    return Cameras(viewmat[None], K[None], width, height)
 
 
 def serve(run: SoupRun, host: str, port: int, width: int, announce: Callable[[int], None]) -> None:
