@@ -1,10 +1,15 @@
 """Every kernel compiles for the supported architectures, without a GPU; the cache of compiled kernels is safe."""
 
+import hashlib
+import os
+import stat
 from multiprocessing import get_context
+from types import SimpleNamespace
 
 import pytest
 
-from etsplat.core.errors import EngineUnavailableError
+from etsplat.core.errors import EngineUnavailableError, InputError
+from etsplat.engines.cuda import compile as compile_module
 from etsplat.engines.cuda import device
 from etsplat.engines.cuda.compile import cache_folder, compile_program, compile_without_cache
 from etsplat.engines.cuda.program import Program, source_root
@@ -91,9 +96,33 @@ def test_cache_keeps_and_recognises(tmp_path, monkeypatch, capfd):
     assert "set ETSPLAT_CACHE_DIR" in capfd.readouterr().err
 
 
-def _compile_into(folder):
-    import os
+def test_kernels_that_others_may_have_written_are_not_run(tmp_path, monkeypatch, capfd):
+    """A folder that others can write to is refused; so is one of somebody else. Of a folder that is one's own, a file
+    that others can write to is compiled anew."""
+    folder = tmp_path / "kernels"
+    monkeypatch.setenv("ETSPLAT_CACHE_DIR", str(folder))
+    before = os.umask(0o002)
+    try:
+        first = compile_program(Program("fill.cu"), "sm_90")
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+    (file,) = folder.iterdir()
+    planted = b"planted"
+    file.write_bytes(hashlib.sha256(planted).digest() + planted)
+    assert compile_program(Program("fill.cu"), "sm_90") == planted  # what the next lines keep out
+    file.chmod(0o666)
+    assert compile_program(Program("fill.cu"), "sm_90") == first
+    for mode in (0o777, 0o770):
+        folder.chmod(mode)
+        with pytest.raises(InputError, match="others can write to this folder"):
+            compile_program(Program("fill.cu"), "sm_90")
+    mine = os.geteuid()
+    owned = [compile_module._is_trusted(SimpleNamespace(st_uid=uid, st_mode=0o40755)) for uid in (mine, 0, mine + 1)]
+    assert owned == [True, True, False]
 
+
+def _compile_into(folder):
     os.environ["ETSPLAT_CACHE_DIR"] = folder
     return compile_program(Program("fill.cu"), "sm_90")
 

@@ -1,3 +1,4 @@
+import hashlib
 import math
 import pickle
 
@@ -177,16 +178,28 @@ def test_weights_are_looked_for_in_torchs_cache_and_absence_is_a_reason(tmp_path
         find_lpips_weights(tmp_path / "absent.pth")
 
 
-def test_download_fetches_into_the_cache_and_failure_is_an_input_error(tmp_path, monkeypatch):
-    """Served from local files; a source that is not there fails as a missing network does."""
-    (tmp_path / "a.pth").write_bytes(b"trunk")
+def test_download_fetches_into_the_cache_what_is_meant_and_nothing_else(tmp_path, monkeypatch):
+    """Served from local files; a source that is not there fails as a missing network does. Another file than the one
+    that is meant is refused, and one that is in the cache replaced."""
+
+    def source(name, meant):
+        return (tmp_path / name).as_uri(), hashlib.sha256(meant).hexdigest()
+
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path / "cache"))
-    monkeypatch.setattr(image_metrics, "_SOURCES", ((tmp_path / "a.pth").as_uri(), (tmp_path / "b.pth").as_uri()))
+    monkeypatch.setattr(image_metrics, "_WEIGHTS", {"1.pth": source("a", b"trunk"), "2.pth": source("b", b"linear")})
+    (tmp_path / "a").write_bytes(b"trunk")
     with pytest.raises(InputError, match="cannot be downloaded"):
         find_lpips_weights("download")
-    (tmp_path / "b.pth").write_bytes(b"linear")
+    (tmp_path / "b").write_bytes(b"junk")
+    with pytest.raises(InputError, match="is another file now"):
+        find_lpips_weights("download")
+    assert [path.name for path in (tmp_path / "cache" / "checkpoints").iterdir()] == ["1.pth"]
+    (tmp_path / "b").write_bytes(b"linear")
+    (tmp_path / "cache" / "checkpoints" / "2.pth").write_bytes(b"junk of an earlier version")
     found = find_lpips_weights("download")
     assert [path.read_bytes() for path in found.paths] == [b"trunk", b"linear"]
+    (tmp_path / "b").unlink()
+    assert find_lpips_weights("download") == found  # without a network
 
 
 def test_lpips_refuses_images_too_small_for_its_five_stages(weights):

@@ -1,10 +1,8 @@
 """Scenes without lens distortion out of scenes with it, once and for all, with pycolmap (an extra)."""
 
 import contextlib
-import glob
 import os
 import shutil
-import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -16,16 +14,13 @@ from etsplat.data.formats.transforms import read_frames
 from etsplat.data.frames import Frame, Points, Wanted, scaled_intrinsics
 from etsplat.io.atomic import write_error
 from etsplat.io.images import image_size, load_pixels
-from etsplat.io.locks import lock_file
+from etsplat.io.locks import scratch_folder
 from etsplat.io.paths import kind_of, path_remedy, path_within
 
 LEAST_SIZE = 16
 """Pixels of the longer side of an image."""
 
 _LITTLE_SPACE = 64 << 20
-
-_MARK = "etsplat-working"
-"""File of a working folder that its process keeps locked."""
 
 _GROWTH, _SPARE_BYTES = 4, 1 << 20
 """COLMAP writes JPEG with few losses: files grow. Beside them lies the model."""
@@ -124,35 +119,17 @@ def check_space(out: Path, images: Sequence[Path], more: int = 0) -> None:
 
 @contextlib.contextmanager
 def working_folder(out: Path) -> Iterator[Path]:
-    """A folder beside `out` that is gone afterwards. What COLMAP and the system say of a full disk is an InputError.
-
-    A process that is killed leaves its own behind. The next one for the same `out` removes it.
-    """
+    """`scratch_folder` beside `out`. What COLMAP and the system say of a full disk is an InputError."""
     try:
-        _remove_abandoned(out)
-        with (
-            tempfile.TemporaryDirectory(prefix=f".{out.name}-", dir=out.parent) as folder,
-            open(Path(folder) / f"{_MARK}.new", "wb") as mark,
-        ):
-            with contextlib.suppress(OSError):  # where there are no locks nobody finds the mark, nor removes this
-                lock_file(mark)
-                os.rename(mark.name, Path(folder) / _MARK)  # locked from the moment that it has its name
+        with scratch_folder(out) as folder:
             try:
-                yield Path(folder)
+                yield folder
             except InputError:
                 raise
             except (RuntimeError, ValueError) as error:  # what pycolmap's C++ throws
                 raise _failure(out, error) from error
     except OSError as error:
         raise write_error(out, error) from error
-
-
-def _remove_abandoned(out: Path) -> None:
-    """Removes working folders for `out` whose processes have ended."""
-    for mark in out.parent.glob(f".{glob.escape(out.name)}-*/{_MARK}"):
-        with contextlib.suppress(OSError), open(mark, "rb") as file:  # locked, by a living process; or just removed
-            lock_file(file)
-            shutil.rmtree(mark.parent)
 
 
 def _failure(out: Path, error: Exception) -> InputError:

@@ -1,5 +1,6 @@
 """The captures and meshes of the paper's tables, fetched from where their authors keep them."""
 
+import os
 import shutil
 import urllib.error
 import urllib.request
@@ -10,8 +11,12 @@ from pathlib import Path
 
 from etsplat.core.errors import InputError
 from etsplat.io.atomic import write_error
+from etsplat.io.locks import scratch_folder
+from etsplat.io.paths import path_within
 
 _CHUNK = 1 << 20
+_TOO_LARGE = 2
+"""Times its size at which an archive is another one."""
 
 
 @dataclass(frozen=True)
@@ -83,6 +88,9 @@ def download_dataset(
 ) -> list[Path]:
     """Fetch and unpack a data set, unless its scenes are there already.
 
+    None of the archives has a published hash. What comes must have about the known size, and the known scenes; nothing
+    of another archive stays.
+
     Args:
         name: a key of DATASETS.
         folder: gets the scenes.
@@ -92,18 +100,25 @@ def download_dataset(
         The folders of the scenes, or the mesh files.
 
     Raises:
-        InputError: there is no network or no such file any more; the disk is full; the archive is damaged.
+        InputError: there is no network or no such file any more; the disk is full; the archive is damaged or another.
     """
     dataset, folder = DATASETS[name], Path(folder)
     scenes = [folder / scene for scene in dataset.scenes]
-    if all(scene.is_file() or (scene / "sparse").is_dir() for scene in scenes):
+    if all(map(_is_scene, scenes)):
         return scenes
-    archive = folder / f".{name}.zip"
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        _fetch(dataset.url, archive, progress)
-        with zipfile.ZipFile(archive) as file:
-            file.extractall(folder)
+        with scratch_folder(folder / name) as scratch:
+            archive, unpacked = scratch / "archive.zip", scratch / "unpacked"
+            _fetch(name, dataset, archive, progress)
+            with zipfile.ZipFile(archive) as file:
+                for member in file.namelist():
+                    path_within(unpacked, member, dataset.url)
+                file.extractall(unpacked)
+            missing = [scene for scene in dataset.scenes if not _is_scene(unpacked / scene)]
+            if missing:
+                raise InputError(f"data set {name}: {dataset.url} is another archive now, without {missing[0]}")
+            _move(unpacked, folder)
     except (urllib.error.URLError, TimeoutError, ConnectionError) as error:
         reason = getattr(error, "reason", error)
         raise InputError(
@@ -114,18 +129,34 @@ def download_dataset(
         raise InputError(f"data set {name}: {dataset.url} is damaged or not a zip file; try again") from error
     except OSError as error:
         raise write_error(folder, error) from error
-    finally:
-        archive.unlink(missing_ok=True)
     return scenes
 
 
-def _fetch(url: str, path: Path, progress: Callable[[int, int], None] | None) -> None:
-    with urllib.request.urlopen(url, timeout=30) as response, open(path, "wb") as file:
+def _is_scene(path: Path) -> bool:
+    return path.is_file() or (path / "sparse").is_dir()
+
+
+def _fetch(name: str, dataset: Dataset, path: Path, progress: Callable[[int, int], None] | None) -> None:
+    most = int(_TOO_LARGE * dataset.gigabytes * 1e9)
+    with urllib.request.urlopen(dataset.url, timeout=30) as response, open(path, "wb") as file:
         total, done = int(response.headers.get("Content-Length") or 0), 0
         if total and shutil.disk_usage(path.parent).free < 2 * total:
             raise OSError(f"{2 * total >> 30} GB are needed for the archive and what is in it")
         while chunk := response.read(_CHUNK):
             file.write(chunk)
             done += len(chunk)
+            if done > most:
+                raise InputError(
+                    f"data set {name}: {dataset.url} is larger than the {dataset.gigabytes:g} GB that it should have"
+                )
             if progress is not None:
                 progress(done, total)
+
+
+def _move(source: Path, target: Path) -> None:
+    """Into folders that exist file by file, else whole. By name, so that a scene has its sparse/ last."""
+    if not (source.is_dir() and target.is_dir()):
+        os.replace(source, target)
+        return
+    for child in sorted(source.iterdir()):
+        _move(child, target / child.name)

@@ -1,8 +1,14 @@
-"""Locks on files. They end with the process that holds them, however it ends; its children do not hold them."""
+"""Locks on files, and what they keep: the folder of a run, and scratch folders.
+
+They end with the process that holds them, however it ends; its children do not hold them.
+"""
 
 import contextlib
+import glob
 import os
+import shutil
 import socket
+import tempfile
 import weakref
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -13,6 +19,9 @@ from etsplat.io.atomic import write_error
 
 RUN_LOCK = ".lock"
 """In the folder of a run while somebody writes it; says who. A killed process leaves the file, not the lock."""
+
+_MARK = "etsplat-working"
+"""File of a scratch folder that its process keeps locked."""
 
 _held: "weakref.WeakSet[IO[bytes]]" = weakref.WeakSet()
 
@@ -72,6 +81,34 @@ def check_nobody_writes(folder: Path) -> None:
         raise _refusal(folder) from error
     except OSError:  # nobody has begun to, or no locks
         pass
+
+
+@contextlib.contextmanager
+def scratch_folder(beside: Path) -> Iterator[Path]:
+    """A folder of a random name beside a path that will exist, for this user alone, and gone afterwards.
+
+    A process that is killed leaves its own behind. The next one for the same path removes it.
+
+    Raises:
+        OSError: it cannot be made.
+    """
+    _remove_abandoned(beside)
+    with (
+        tempfile.TemporaryDirectory(prefix=f".{beside.name}-", dir=beside.parent) as folder,
+        open(Path(folder) / f"{_MARK}.new", "wb") as mark,
+    ):
+        with contextlib.suppress(OSError):  # where there are no locks nobody finds the mark, nor removes this
+            lock_file(mark)
+            os.rename(mark.name, Path(folder) / _MARK)  # locked from the moment that it has its name
+        yield Path(folder)
+
+
+def _remove_abandoned(beside: Path) -> None:
+    """Removes scratch folders whose processes have ended."""
+    for mark in beside.parent.glob(f".{glob.escape(beside.name)}-*/{_MARK}"):
+        with contextlib.suppress(OSError), open(mark, "rb") as file:  # locked, by a living process; or just removed
+            lock_file(file)
+            shutil.rmtree(mark.parent)
 
 
 def _open_locked(path: Path) -> IO[bytes] | None:

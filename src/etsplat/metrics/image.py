@@ -4,6 +4,7 @@ All take float images (H, W, 3) with values in [0, 1] and no transparency; ours 
 Numbers of different papers are comparable only in the same convention, so every function says which it is.
 """
 
+import hashlib
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -24,11 +25,17 @@ _VGG16 = (64, 64, "pool", 128, 128, "pool", 256, 256, 256, "pool", 512, 512, 512
 _TAPS = (3, 8, 15, 22, 29)
 """Layers of torchvision's vgg16.features whose output LPIPS compares: relu1_2, 2_2, 3_3, 4_3, 5_3."""
 
-_CACHED = ("vgg16-397923af.pth", "vgg.pth")
-_SOURCES = (
-    "https://download.pytorch.org/models/vgg16-397923af.pth",
-    "https://raw.githubusercontent.com/richzhang/PerceptualSimilarity/master/lpips/weights/v0.1/vgg.pth",
-)
+_WEIGHTS = {
+    "vgg16-397923af.pth": (
+        "https://download.pytorch.org/models/vgg16-397923af.pth",
+        "397923af8e79cdbb6a7127f12361acd7a2f83e06b05044ddf496e83de57a5bf0",
+    ),
+    "vgg.pth": (
+        "https://raw.githubusercontent.com/richzhang/PerceptualSimilarity/master/lpips/weights/v0.1/vgg.pth",
+        "a78928a0af1e5f0fcb1f3b9e8f8c3a2a5a3de244d830ad5c1feddc79b8432868",
+    ),
+}
+"""Where the weights of LPIPS come from, by the names that torch's cache has for them; SHA-256 of each."""
 
 
 def psnr(image: Float[Tensor, "H W C"], truth: Float[Tensor, "H W C"]) -> float:
@@ -189,23 +196,23 @@ def find_lpips_weights(option: Path | str | None = None) -> LpipsWeights:
 
     Args:
         option: a file; the word "download", which fetches the two usual files (torchvision's VGG16, 528 MB, and LPIPS's
-            linear weights) into torch's cache unless they are there; or None, which uses them if they are there and
-            never touches the network.
+            linear weights) into torch's cache unless they are there to the bit; or None, which uses them if they are
+            there and never touches the network.
 
     Raises:
-        InputError: the file does not exist, or the download failed.
+        InputError: the file does not exist; or the download failed, or gave another file, of which nothing stays.
     """
     folder = Path(torch.hub.get_dir()) / "checkpoints"
-    cached = tuple(folder / name for name in _CACHED)
+    cached = tuple(folder / name for name in _WEIGHTS)
     if option is None:
         absent = [path.name for path in cached if not path.is_file()]
         if not absent:
             return LpipsWeights(cached, None)
         return LpipsWeights((), f"no weights ({' and '.join(absent)} not in {folder}); give --lpips-weights")
     if str(option) == "download":
-        for path, url in zip(cached, _SOURCES, strict=True):
-            if not path.is_file():
-                _download(url, path)
+        for path, (url, sha256) in zip(cached, _WEIGHTS.values(), strict=True):
+            if not path.is_file() or _sha256(path) != sha256:
+                _download(url, path, sha256)
         return LpipsWeights(cached, None)
     if not Path(option).is_file():
         raise InputError(f"LPIPS weights {option}: no such file; check the path, or say `download`")
@@ -245,9 +252,20 @@ def _read_weights(path: Path) -> Mapping[str, Tensor]:
     return entries
 
 
-def _download(url: str, path: Path) -> None:
+def _sha256(path: Path) -> str:
+    with open(path, "rb") as file:
+        digest = hashlib.sha256()
+        while chunk := file.read(1 << 20):
+            digest.update(chunk)
+        return digest.hexdigest()
+
+
+def _download(url: str, path: Path, sha256: str) -> None:
+    """Beside its place and then there, if it has the hash."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        torch.hub.download_url_to_file(url, str(path), progress=False)
+        torch.hub.download_url_to_file(url, str(path), hash_prefix=sha256, progress=False)
     except OSError as error:  # a refused connection, no route, a full disk
         raise InputError(f"LPIPS weights: {url} cannot be downloaded ({error}); give a file instead") from error
+    except RuntimeError as error:
+        raise InputError(f"LPIPS weights: {url} is another file now (its SHA-256 differs); give a file") from error

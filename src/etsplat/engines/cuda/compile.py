@@ -3,13 +3,14 @@
 import hashlib
 import importlib
 import os
+import stat
 import sys
 import tempfile
 import time
 from pathlib import Path
 from typing import Any
 
-from etsplat.core.errors import EngineUnavailableError
+from etsplat.core.errors import EngineUnavailableError, InputError
 from etsplat.engines.cuda.program import Program
 
 INSTALL = "pip install 'etsplat[cuda]'"
@@ -22,6 +23,7 @@ def compile_program(program: Program, architecture: str) -> bytes:
 
     Raises:
         EngineUnavailableError: NVRTC is not installed.
+        InputError: Others can write to the folder of the cache.
         RuntimeError: The source does not compile; the message is the compiler's.
     """
     nvrtc = import_nvrtc()
@@ -78,7 +80,25 @@ def nvrtc_version(nvrtc: Any) -> tuple[int, int]:
 
 
 def cache_folder() -> Path:
-    """Where compiled kernels are kept: ETSPLAT_CACHE_DIR, or the user's cache folder."""
+    """Where compiled kernels are kept: ETSPLAT_CACHE_DIR, or the user's cache folder. It need not exist.
+
+    Raises:
+        InputError: others can write to it, or it is another user's: what lies there would be run.
+    """
+    folder = _chosen_folder()
+    try:
+        trusted = _is_trusted(folder.stat())
+    except OSError:
+        return folder
+    if not trusted:
+        raise InputError(
+            f"{folder}: others can write to this folder, or it is another user's, and compiled kernels from there would"
+            f" be run; remove it, or set ETSPLAT_CACHE_DIR to a folder that is yours alone"
+        )
+    return folder
+
+
+def _chosen_folder() -> Path:
     chosen = os.environ.get("ETSPLAT_CACHE_DIR")
     if chosen:
         return Path(chosen)
@@ -87,6 +107,13 @@ def cache_folder() -> Path:
     else:
         base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     return base / "etsplat" / "kernels"
+
+
+def _is_trusted(found: os.stat_result) -> bool:
+    """Whether nobody but this user and the superuser could have written a file, or a folder's files."""
+    if os.name == "nt":  # where a profile's folders are its user's
+        return True
+    return found.st_uid in (os.geteuid(), 0) and not found.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
 
 
 def _options(program: Program, architecture: str) -> tuple[str, ...]:
@@ -101,9 +128,12 @@ def _key(program: Program, architecture: str, version: tuple[int, int]) -> str:
 
 
 def _load(path: Path) -> bytes | None:
-    """The content of a cache file, or None if it is not there or not what was stored."""
+    """The content of a cache file, or None if it is not there, not what was stored, or maybe somebody else's."""
     try:
-        content = path.read_bytes()
+        with open(path, "rb") as file:
+            if not _is_trusted(os.fstat(file.fileno())):
+                return None
+            content = file.read()
     except OSError:
         return None
     digest, cubin = content[:_DIGEST_SIZE], content[_DIGEST_SIZE:]
@@ -113,7 +143,8 @@ def _load(path: Path) -> bytes | None:
 def _store(path: Path, cubin: bytes) -> None:
     """Write beside and rename: processes that compile the same thing at once replace each other's equal files."""
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        path.parent.parent.mkdir(parents=True, exist_ok=True)
+        path.parent.mkdir(mode=0o700, exist_ok=True)
         with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".part", delete=False) as part:
             part.write(hashlib.sha256(cubin).digest() + cubin)
         try:
