@@ -36,7 +36,7 @@ def draw_kernels() -> Figure:
             sigma = torch.tensor(value, dtype=torch.float64)
             color = _shade(index)
             axes[0, column].plot(x, kernel.value(x, sigma), color=color, label=f"σ = {value:g}")
-            axes[1, column].plot(x, kernel.dvalue_dx(x, sigma), color=color)
+            axes[1, column].plot(x, kernel.gradient(x, sigma)[0], color=color)
             boundary = float(kernel.value(torch.ones((), dtype=torch.float64), sigma))
             axes[0, column].plot(1, boundary, "o", color=color, markersize=4)
         axes[0, column].set_title(title)
@@ -122,7 +122,7 @@ def _axes_row(name: str) -> list[str]:
     one = torch.ones((), dtype=torch.float64)
     low, high = float(kernel.value(one, soft)), float(kernel.value(one, sharp))
     reaches = float(kernel.value(outside, soft)) > 0
-    gradient = float(kernel.dvalue_dx(outside, soft)) != 0
+    gradient = float(kernel.gradient(outside, soft)[0]) != 0
     seam = 1 - (1 - high) ** 2
     return [
         TITLES[name],

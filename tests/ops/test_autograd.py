@@ -21,7 +21,6 @@ WITHOUT_GRADIENTS = {
     "rasterize_opaque": "z-buffer: runs without gradients",
     "render_opaque": "z-buffer: runs without gradients",
     "update_statistics": "in place, of detached statistics",
-    "update_statistics_queued": "in place, of detached statistics",
     "one_kind_of_colors": "a check",
     "load_nvdiffrast": "imports a module",
     "rasterize_nvdiffrast": "nvdiffrast's own; needs a GPU and that program",

@@ -12,9 +12,7 @@ from etsplat.ops.antialias import rasterize_antialiased
 from etsplat.ops.mesh_energies import mesh_energies
 from etsplat.ops.photometric import photometric_loss
 from etsplat.ops.rasterize_opaque import rasterize_opaque, render_opaque
-from etsplat.ops.soup_colors import soup_colors
 from etsplat.ops.spherical_harmonics import spherical_harmonics
-from etsplat.ops.triangle_area import mean_area
 from etsplat.ops.weighted_sum import Term, weighted_sum
 from helpers.engines import on
 from helpers.simt.build import Simt
@@ -64,19 +62,6 @@ def test_l1_is_that_of_the_cpu_engine(cuda_device, rng):
     same_bits(results[0][1], results[1][1])
 
 
-def test_mean_area_is_that_of_the_cpu_engine(cuda_device, rng):
-    """Over several blocks of triangles, one without area; values to rounding."""
-    vertices = torch.randn((700, 3, 3), generator=rng)
-    vertices[7] = vertices[7, :1]
-    results = []
-    for engine, device in (("cuda", cuda_device), ("cpu", CPU)):
-        leaf = vertices.to(device, copy=True).requires_grad_()
-        area = on(engine, mean_area, leaf)
-        (2.5 * area).backward()
-        results.append((area.detach().cpu(), leaf.grad.cpu()))
-    torch.testing.assert_close(results[0], results[1], rtol=1e-6, atol=1e-9)
-
-
 @pytest.mark.parametrize("scale", [0.3, "tensor"])
 @pytest.mark.parametrize("rounds", [1, 5])
 def test_weighted_sum_is_that_of_pytorch(cuda_device, scale, rounds):
@@ -91,34 +76,6 @@ def test_weighted_sum_is_that_of_pytorch(cuda_device, scale, rounds):
         (3 * total).backward()
         results.append(torch.stack([total.detach(), *(leaf.grad for leaf in leaves)]).cpu())
     torch.testing.assert_close(results[0], results[1], rtol=1e-6, atol=0)
-
-
-@pytest.mark.parametrize(
-    ("channels", "as_bytes", "masked", "pixel", "weight"),
-    [
-        (3, True, False, "l1", 0.2),
-        (4, False, True, "l1", 0.3),
-        (4, True, True, "l2", 1.0),
-        (3, False, False, "l2", 0.0),
-    ],
-)
-def test_photometric_loss_is_that_of_the_cpu_engine(cuda_device, rng, channels, as_bytes, masked, pixel, weight):
-    """Bytes and floats, with and without alpha and mask, absolute and squared, over tiles cut by the border."""
-    color, target = torch.rand((2, 21, 35, 3), generator=rng), torch.rand((2, 21, 35, channels), generator=rng)
-    target = (255 * target).to(torch.uint8) if as_bytes else target
-    mask = torch.rand((2, 21, 35), generator=rng) if masked else None
-    backgrounds = torch.rand((2, 3), generator=rng) if channels == 4 else None
-    results = []
-    for engine, device in (("cuda", cuda_device), ("cpu", CPU)):
-        leaf = color.to(device, copy=True).requires_grad_()
-        options = {"backgrounds": None if backgrounds is None else backgrounds.to(device)}
-        counts = None if mask is None else mask.to(device)
-        with etsplat.engine(engine):
-            loss = photometric_loss(leaf, target.to(device), weight, counts, pixel=pixel, **options)
-        (0.5 * loss).backward()
-        results.append((loss.detach().cpu(), leaf.grad.cpu()))
-    torch.testing.assert_close(results[0][0], results[1][0], rtol=1e-6, atol=0)
-    torch.testing.assert_close(results[0][1], results[1][1], rtol=1e-5, atol=1e-9)
 
 
 def test_adam_takes_the_steps_of_the_cpu_engine(cuda_device, rng):
@@ -167,22 +124,6 @@ def test_spherical_harmonics_are_those_of_the_cpu_engine(cuda_device, rng, degre
     for engine, device in (("cuda", cuda_device), ("cpu", CPU)):
         leaves = [tensor.to(device, copy=True).requires_grad_() for tensor in (coefficients, directions)]
         colors = on(engine, spherical_harmonics, *leaves, degree)
-        results.append(on_cpu(colors.detach(), *torch.autograd.grad(colors, leaves, cotangent.to(device))))
-    for actual, expected in zip(*results, strict=True):
-        torch.testing.assert_close(actual, expected, rtol=1e-5, atol=1e-6)
-
-
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_soup_colors_are_those_of_the_cpu_engine(cuda_device, rng, degree):
-    """Colours and gradients, with a whole block of triangles that no view sees, and more bases than any degree has."""
-    shapes = (150, 3, 3), (150, 1, 3), (150, 17, 3)
-    inputs = [torch.randn(shape, generator=rng) for shape in shapes]
-    centers, cotangent = torch.randn((2, 3), generator=rng), torch.randn((2, 150, 3), generator=rng)
-    cotangent[:, :64] = 0
-    results = []
-    for engine, device in (("cuda", cuda_device), ("cpu", CPU)):
-        leaves = [tensor.to(device, copy=True).requires_grad_() for tensor in inputs]
-        colors = on(engine, soup_colors, *leaves, centers.to(device), degree)
         results.append(on_cpu(colors.detach(), *torch.autograd.grad(colors, leaves, cotangent.to(device))))
     for actual, expected in zip(*results, strict=True):
         torch.testing.assert_close(actual, expected, rtol=1e-5, atol=1e-6)

@@ -28,13 +28,13 @@ def value_and_gradient(color, target, weight, mask=None, engine=None, **options)
 @pytest.mark.parametrize("shape", [(1, 1, 1), (2, 33, 47), (1, 7, 130), (1, 70, 9)])
 @pytest.mark.parametrize("pixel", ["l1", "l2"])
 @pytest.mark.parametrize("channels", [3, 4])
-def test_native_agrees_with_float64_reference(rng, shape, pixel, channels):
+def test_every_engine_agrees_with_the_float64_reference(engine, rng, shape, pixel, channels):
     """Value and gradient agree at sizes below the window and across bands, with and without alpha and mask."""
     color, target = pair(rng, *shape, channels)
     backgrounds = torch.rand((shape[0], 3), generator=rng)
     mask = torch.rand(shape, generator=rng)
     for weight, given in ((0.2, None), (0.4, mask), (0.0, None), (0.0, mask), (1.0, None)):
-        loss, gradient = value_and_gradient(color, target, weight, given, backgrounds=backgrounds, pixel=pixel)
+        loss, gradient = value_and_gradient(color, target, weight, given, engine, backgrounds=backgrounds, pixel=pixel)
         exact, exact_gradient = value_and_gradient(
             color.double(),
             target,

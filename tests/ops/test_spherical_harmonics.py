@@ -33,11 +33,11 @@ def basis_values(directions: torch.Tensor, degree: int, engine: str) -> torch.Te
 @pytest.mark.sanitize
 @pytest.mark.parametrize("degree", DEGREES)
 @pytest.mark.parametrize("views", [None, 1, 3])
-def test_native_agrees_with_float64_reference(rng, degree, views):
+def test_every_engine_agrees_with_the_float64_reference(engine, rng, degree, views):
     """Colours and both gradients agree, for one and for several views, with clamped colours among them."""
     coefficients, directions = problem(rng, degree, views=views)
     cotangent = torch.randn((*directions.shape[:-1], 3), generator=rng)
-    ours = gradients(coefficients, directions, degree, cotangent)
+    ours = gradients(coefficients, directions, degree, cotangent, engine)
     exact = gradients(coefficients.double(), directions.double(), degree, cotangent.double())
     assert bool((ours[0] == 0).any())
     for a, b in zip(ours, exact, strict=True):

@@ -20,6 +20,7 @@ from etsplat.optim.terms.photometric import Photometric
 from etsplat.optim.terms.soup import DepthNormals, Distortion, Opacity, Size
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.train_config import TrainConfig
+from helpers.engines import on
 
 # Two faces that share the edge (0, 2) of a folded unit square.
 VERTICES = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.5], [1.0, 1.0, 0.0], [0.0, 1.0, 0.25]]
@@ -177,15 +178,16 @@ def a_soups_drawing(rng: torch.Generator, outputs: tuple[str, ...]) -> tuple[Cam
 
 
 @pytest.mark.sanitize
-def test_mean_area_agrees_with_the_float64_reference(rng):
+def test_mean_area_agrees_with_the_float64_reference(engine, rng):
     """Value and gradient; a triangle without area has none."""
     vertices = torch.randn((5000, 3, 3), generator=rng)
     vertices[7] = vertices[7, :1]
     results = []
-    for tensor in (vertices, vertices[torch.arange(5000) != 7].double()):
+    for name, tensor in ((engine, vertices), (None, vertices[torch.arange(5000) != 7].double())):
         leaf = tensor.clone().requires_grad_()
-        (2.0 * mean_area(leaf)).backward()
-        results.append((mean_area(tensor), leaf.grad))
+        area = on(name, mean_area, leaf)
+        (2.0 * area).backward()
+        results.append((area.detach(), leaf.grad))
     assert float(results[0][0]) == pytest.approx(float(results[1][0]) * 4999 / 5000, rel=1e-6)
     assert float(results[0][1][7].abs().max()) == 0
     kept = results[0][1][torch.arange(5000) != 7]

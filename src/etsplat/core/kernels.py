@@ -48,8 +48,7 @@ class Kernel:
     Attributes:
         name: Key in ``KERNELS``.
         value: ``(x, sigma) -> G``, in [0, 1].
-        dvalue_dx: ``(x, sigma) -> dG/dx``.
-        dvalue_dsigma: ``(x, sigma) -> dG/dsigma``.
+        gradient: ``(x, sigma) -> (dG/dx, dG/dsigma)``.
         log_support: ``(log_ratio, sigma) -> X``, the largest x with ``ln G(x) >= -log_ratio``, for ``log_ratio >= 0``.
         area: ``sigma -> integral of G over the plane / area of the triangle``. The level sets of x are scaled copies of
             the triangle, so this is the integral of ``2 x G(x)``.
@@ -58,8 +57,7 @@ class Kernel:
 
     name: str
     value: _Function
-    dvalue_dx: _Function
-    dvalue_dsigma: _Function
+    gradient: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
     log_support: _Function
     area: Callable[[Tensor], Tensor]
     table: KernelTable | None = None
@@ -101,14 +99,10 @@ def _elastic(x: Tensor, sigma: Tensor) -> Tensor:
     return torch.exp(-sigma * power)
 
 
-def _elastic_dx(x: Tensor, sigma: Tensor) -> Tensor:
-    power, _, sigma = _power(x, sigma)
-    return -2.0 * power / x.clamp(min=X_FLOOR) * torch.exp(-sigma * power)
-
-
-def _elastic_dsigma(x: Tensor, sigma: Tensor) -> Tensor:
+def _elastic_gradient(x: Tensor, sigma: Tensor) -> tuple[Tensor, Tensor]:
     power, log_power, sigma = _power(x, sigma)
-    return power * (log_power - 1.0) * torch.exp(-sigma * power)
+    value = torch.exp(-sigma * power)
+    return -2.0 * power / x.clamp(min=X_FLOOR) * value, power * (log_power - 1.0) * value
 
 
 def _elastic_support(log_ratio: Tensor, sigma: Tensor) -> Tensor:
@@ -127,14 +121,10 @@ def _bilateral(x: Tensor, sigma: Tensor) -> Tensor:
     return torch.exp(-0.5 * power)
 
 
-def _bilateral_dx(x: Tensor, sigma: Tensor) -> Tensor:
-    power, _, sigma = _power(x, sigma)
-    return -power / (sigma * x.clamp(min=X_FLOOR)) * torch.exp(-0.5 * power)
-
-
-def _bilateral_dsigma(x: Tensor, sigma: Tensor) -> Tensor:
+def _bilateral_gradient(x: Tensor, sigma: Tensor) -> tuple[Tensor, Tensor]:
     power, log_power, sigma = _power(x, sigma)
-    return 0.5 * power * (log_power / sigma) * torch.exp(-0.5 * power)
+    value = torch.exp(-0.5 * power)
+    return -power / (sigma * x.clamp(min=X_FLOOR)) * value, 0.5 * power * (log_power / sigma) * value
 
 
 def _bilateral_support(log_ratio: Tensor, sigma: Tensor) -> Tensor:
@@ -154,14 +144,9 @@ def _single_sided(x: Tensor, sigma: Tensor) -> Tensor:
     return inside ** sigma.clamp(min=SIGMA_FLOOR)
 
 
-def _single_sided_dx(x: Tensor, sigma: Tensor) -> Tensor:
-    rim, sigma = (1.0 - x.clamp(min=X_FLOOR)).clamp(min=RIM_FLOOR), sigma.clamp(min=SIGMA_FLOOR)
-    return torch.where(x < 1.0, -sigma * rim ** (sigma - 1.0), 0.0)
-
-
-def _single_sided_dsigma(x: Tensor, sigma: Tensor) -> Tensor:
-    rim = (1.0 - x.clamp(min=X_FLOOR)).clamp(min=RIM_FLOOR)
-    return _single_sided(x, sigma) * rim.log()
+def _single_sided_gradient(x: Tensor, sigma: Tensor) -> tuple[Tensor, Tensor]:
+    rim, floored = (1.0 - x.clamp(min=X_FLOOR)).clamp(min=RIM_FLOOR), sigma.clamp(min=SIGMA_FLOOR)
+    return torch.where(x < 1.0, -floored * rim ** (floored - 1.0), 0.0), _single_sided(x, sigma) * rim.log()
 
 
 def _single_sided_support(log_ratio: Tensor, sigma: Tensor) -> Tensor:
@@ -180,9 +165,9 @@ def _hard(x: Tensor, sigma: Tensor) -> Tensor:
     return (x <= 1.0).to(x.dtype)
 
 
-def _hard_derivative(x: Tensor, sigma: Tensor) -> Tensor:
+def _hard_gradient(x: Tensor, sigma: Tensor) -> tuple[Tensor, Tensor]:
     x, _ = torch.broadcast_tensors(x, sigma)
-    return torch.zeros_like(x)
+    return torch.zeros_like(x), torch.zeros_like(x)
 
 
 def _hard_support(log_ratio: Tensor, sigma: Tensor) -> Tensor:
@@ -193,16 +178,9 @@ def _hard_support(log_ratio: Tensor, sigma: Tensor) -> Tensor:
 KERNELS: dict[str, Kernel] = {
     kernel.name: kernel
     for kernel in (
-        Kernel(
-            "single_sided",
-            _single_sided,
-            _single_sided_dx,
-            _single_sided_dsigma,
-            _single_sided_support,
-            _single_sided_area,
-        ),
-        Kernel("bilateral", _bilateral, _bilateral_dx, _bilateral_dsigma, _bilateral_support, _bilateral_area),
-        Kernel("elastic", _elastic, _elastic_dx, _elastic_dsigma, _elastic_support, _elastic_area),
-        Kernel("hard", _hard, _hard_derivative, _hard_derivative, _hard_support, torch.ones_like),
+        Kernel("single_sided", _single_sided, _single_sided_gradient, _single_sided_support, _single_sided_area),
+        Kernel("bilateral", _bilateral, _bilateral_gradient, _bilateral_support, _bilateral_area),
+        Kernel("elastic", _elastic, _elastic_gradient, _elastic_support, _elastic_area),
+        Kernel("hard", _hard, _hard_gradient, _hard_support, torch.ones_like),
     )
 }

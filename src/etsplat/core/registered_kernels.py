@@ -69,7 +69,7 @@ def register_kernel(
     function = _Function(name, value)
     table = _tabulate(function, (float(low), float(high)), float(x_max))
     error = _measure(function, table)
-    kernel = Kernel(name, function.value, function.dx, function.dsigma, _support(table), function.area(x_max), table)
+    kernel = Kernel(name, function.value, function.gradient, _support(table), _area(function.value, x_max), table)
     _check_free(name, table)
     KERNELS[name] = kernel
     return error
@@ -88,16 +88,14 @@ def adopt_table(name: str, table: KernelTable) -> None:
     if name in KERNELS:
         return
 
-    def at(x: Tensor, sigma: Tensor) -> Tensor:
+    def value(x: Tensor, sigma: Tensor) -> Tensor:
         return table.evaluate(x.clamp(min=X_FLOOR), sigma).value.to(x.dtype)
 
-    def dx(x: Tensor, sigma: Tensor) -> Tensor:
-        return table.evaluate(_off_the_rim(x), sigma).dx.to(x.dtype)
+    def gradient(x: Tensor, sigma: Tensor) -> tuple[Tensor, Tensor]:
+        point = table.evaluate(_off_the_rim(x), sigma)
+        return point.dx.to(x.dtype), point.dsigma.to(x.dtype)
 
-    def dsigma(x: Tensor, sigma: Tensor) -> Tensor:
-        return table.evaluate(_off_the_rim(x), sigma).dsigma.to(x.dtype)
-
-    KERNELS[name] = Kernel(name, at, dx, dsigma, _support(table), _area(at, table.x_max), table)
+    KERNELS[name] = Kernel(name, value, gradient, _support(table), _area(value, table.x_max), table)
 
 
 def _check_free(name: str, table: KernelTable) -> None:
@@ -116,11 +114,9 @@ class _Function:
     def value(self, x: Tensor, sigma: Tensor) -> Tensor:
         return self._call(x.clamp(min=X_FLOOR), sigma).to(x.dtype)
 
-    def dx(self, x: Tensor, sigma: Tensor) -> Tensor:
-        return self._derivatives(_off_the_rim(x), sigma)[0].to(x.dtype)
-
-    def dsigma(self, x: Tensor, sigma: Tensor) -> Tensor:
-        return self._derivatives(_off_the_rim(x), sigma)[1].to(x.dtype)
+    def gradient(self, x: Tensor, sigma: Tensor) -> tuple[Tensor, Tensor]:
+        dx, dsigma = self._derivatives(_off_the_rim(x), sigma)
+        return dx.to(x.dtype), dsigma.to(x.dtype)
 
     def slopes(self, x: Tensor, sigma: Tensor) -> Tensor:
         """dG/dx where a table wants it: beside x = 1, not as far as the floor."""
@@ -135,9 +131,6 @@ class _Function:
             result.isfinite() & (result >= 0.0) & (result <= 1.0), result, "value", "must be in [0, 1]", x, sigma
         )
         return result
-
-    def area(self, x_max: float) -> Callable[[Tensor], Tensor]:
-        return _area(self.value, x_max)
 
     def _call(self, x: Tensor, sigma: Tensor) -> Tensor:
         x, sigma = torch.broadcast_tensors(x.double(), sigma.double().clamp(min=SIGMA_FLOOR))

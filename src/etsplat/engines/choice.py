@@ -11,7 +11,8 @@ from torch import Tensor
 from etsplat.core.errors import EngineUnavailableError, InputError
 from etsplat.engines.cpu.engine import CpuEngine
 from etsplat.engines.cuda.engine import CudaEngine
-from etsplat.engines.engine import Engine, QueuedSteps
+from etsplat.engines.cuda.steps import CudaQueuedSteps
+from etsplat.engines.engine import Engine
 
 _REFERENCE = Engine()
 _engines: dict[str, Engine] = {}
@@ -74,7 +75,7 @@ def engine_for(tensor: Tensor) -> Engine:
     return next(own, _REFERENCE)
 
 
-def queued_steps(tensor: Tensor) -> QueuedSteps:
+def queued_steps(tensor: Tensor) -> CudaQueuedSteps:
     """How steps are queued on the engine for `tensor`.
 
     Raises:

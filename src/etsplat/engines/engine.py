@@ -1,14 +1,12 @@
 """What an engine is: one method for each operation of `etsplat.ops`, which has checked the arguments."""
 
-from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from etsplat.core.rasterization import TriangleStatistics
-from etsplat.engines.reference.adam import AdamGroup, adam_step
+from etsplat.engines.reference.adam import adam_step
 from etsplat.engines.reference.antialias import antialias
 from etsplat.engines.reference.mesh_energies import mesh_energies
 from etsplat.engines.reference.normal_consistency import normal_consistency
@@ -24,47 +22,6 @@ from etsplat.engines.reference.triangle_channels import triangle_channels
 from etsplat.engines.reference.weighted_sum import weighted_sum
 
 
-class QueuedSteps(Protocol):
-    """Steps that a device repeats by itself; what changes from one to the next is read from its memory.
-
-    `halted` is () int32 in device memory: where it is not 0, nothing is updated.
-    """
-
-    def memory_pool(self) -> Any:
-        """Memory that steps of several kinds can share."""
-        ...
-
-    def repeated(self, body: Callable[[], None], pool: Any) -> Callable[[], None]:
-        """What queues the work of `body` each time it is called, by and by without calling `body`."""
-        ...
-
-    def verdict(self, loss: Tensor, position: Tensor, losses: Tensor, halted: Tensor) -> None:
-        """Queue: keep the loss at `position`, move on if the step counts, and halt otherwise."""
-        ...
-
-    def repair(self, device: torch.device) -> bool:
-        """Whether a step found too little room, which the next ones will have. Waits for the device."""
-        ...
-
-    @staticmethod
-    def adam_step(
-        groups: Sequence[AdamGroup],
-        rates: Tensor,
-        betas: tuple[float, float],
-        eps: float,
-        halted: Tensor,
-    ) -> None:
-        """As `Engine.adam_step`, with `Adam.rates` (P + 1,) float32 in device memory."""
-        ...
-
-    @staticmethod
-    def update_statistics(
-        records: Sequence[Tensor], view: TriangleStatistics, views: int, epoch_starts: Tensor, halted: Tensor
-    ) -> None:
-        """As `Engine.update_statistics`, with `epoch_starts` (1,) float32 in device memory, 0 or 1."""
-        ...
-
-
 class Engine:
     """The engine "reference": plain PyTorch, on any device, in any precision; gradients by autograd.
 
@@ -75,12 +32,12 @@ class Engine:
     Attributes:
         name: by which it is chosen: `with etsplat.engine(name)`.
         device: type of the devices on which it is chosen by itself, for float32; None if it never is.
-        queued: how steps are queued on it, None where each step returns to the host.
+        queued: how steps are queued on it, as `engines/cuda/steps.py` does; None where each step returns to the host.
     """
 
     name: str = "reference"
     device: str | None = None
-    queued: QueuedSteps | None = None
+    queued: Any = None
 
     @property
     def queues_steps(self) -> bool:

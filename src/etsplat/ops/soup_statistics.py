@@ -14,28 +14,23 @@ from etsplat.core.rasterization import TriangleStatistics
 from etsplat.engines.choice import engine_for, queued_steps
 
 
-def update_statistics(records: Sequence[Tensor], view: TriangleStatistics, views: int, epoch_starts: bool) -> None:
+def update_statistics(
+    records: Sequence[Tensor],
+    view: TriangleStatistics,
+    views: int,
+    epoch_starts: bool | Tensor,
+    halted: Tensor | None = None,
+) -> None:
     """Take a view into the records of N triangles, in place.
 
     Args:
         records: (N,) importance and screen size, floating point; views seen and views of the trial, int32.
         view: its statistics, (1, N).
         views: length of an epoch.
-        epoch_starts: whether the view is the first of an epoch.
+        epoch_starts: whether the view is the first of an epoch; in a queued step (1,) float32 in device memory, 0 or 1.
+        halted: of a queued step, () int32 in device memory; nothing is updated where it is not 0.
     """
-    engine_for(records[0]).update_statistics(records, view, views, epoch_starts)
-
-
-def update_statistics_queued(
-    records: Sequence[Tensor], view: TriangleStatistics, views: int, epoch_starts: Tensor, halted: Tensor
-) -> None:
-    """As ``update_statistics``, as part of a queued step.
-
-    Args:
-        records: as there, float32 and int32.
-        view: as there.
-        views: as there.
-        epoch_starts: (1,) float32 in device memory, 0 or 1.
-        halted: () int32 in device memory; nothing is updated where it is not 0.
-    """
-    queued_steps(records[0]).update_statistics(records, view, views, epoch_starts, halted)
+    if halted is None:
+        engine_for(records[0]).update_statistics(records, view, views, epoch_starts)
+    else:
+        queued_steps(records[0]).update_statistics(records, view, views, epoch_starts, halted)

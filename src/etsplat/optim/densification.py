@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from etsplat.core.rasterization import TriangleStatistics
-from etsplat.ops.soup_statistics import update_statistics, update_statistics_queued
+from etsplat.ops.soup_statistics import update_statistics
 from etsplat.optim.edit import RowPlan
 
 SPLIT_PARTS = 4
@@ -63,7 +63,7 @@ class SoupStatistics:
             epoch_starts: (1,) float32 in device memory, 0 or 1.
             halted: () int32 in device memory: nothing is updated where it is not 0.
         """
-        update_statistics_queued(list(self.tensors().values()), view, views, epoch_starts, halted)
+        update_statistics(list(self.tensors().values()), view, views, epoch_starts, halted)
 
     def judged(self, views: int) -> Bool[Tensor, " N"]:
         """Whose trial is over."""

@@ -26,7 +26,7 @@ SANITIZE = ["-fsanitize=address,undefined", "-fno-sanitize-recover=undefined", "
 
 
 class Simt:
-    """The backend (``etsplat.engines.cuda.launch.Backend``) that runs kernels in this process, on CPU tensors."""
+    """In the place of ``etsplat.engines.cuda.device.Device``: runs kernels in this process, on CPU tensors."""
 
     device_type = "cpu"
 

@@ -36,7 +36,7 @@ class Device:
         block: tuple[int, int, int],
         values: Sequence[Any],
     ) -> None:
-        """See ``etsplat.engines.cuda.launch.Backend``."""
+        """Run kernel ``name``; ``values`` are its arguments as ctypes values, which may change afterwards."""
         device = torch.cuda.current_device()
         function = self._functions.get((device, program, name))
         if function is None:
@@ -52,7 +52,10 @@ class Device:
             raise RuntimeError(f"launch of {name} ({program}): {status.name}")
 
     def capture(self, body: Callable[[], None], pool: Any) -> Callable[[], None]:
-        """See ``etsplat.engines.cuda.launch.Backend``: a CUDA graph."""
+        """Do what ``body`` queues, once, and return what does it again without calling it: a CUDA graph.
+
+        ``pool`` is from ``memory_pool``; see ``etsplat.engines.cuda.steps.Repeated``.
+        """
         graph = torch.cuda.CUDAGraph()
         with torch.cuda.graph(graph, pool=pool):
             body()
@@ -60,12 +63,12 @@ class Device:
         return graph.replay
 
     def memory_pool(self) -> Any:
-        """See ``etsplat.engines.cuda.launch.Backend``."""
+        """Memory that captures can share."""
         return torch.cuda.graph_pool_handle()
 
     @property
     def capturing(self) -> bool:
-        """See ``etsplat.engines.cuda.launch.Backend``: also of graphs that others capture."""
+        """Whether a capture is under way, also by others: nothing can be read back then."""
         return torch.cuda.is_current_stream_capturing()
 
     def _enter_context(self, device: int) -> None:

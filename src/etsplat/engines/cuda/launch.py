@@ -7,13 +7,13 @@ Arguments are converted by their Python type, so that the call reads like the ke
     float    float                                 ctypes   as it is (c_int64, Structure for a struct by value)
 
 On a device the kernel goes to torch's current stream of the current device; nothing waits for it. Tests put another
-``Backend`` in place (tests/simt), which runs the same sources on CPU tensors.
+backend in its place (tests/helpers/simt), which runs the same sources on CPU tensors.
 """
 
 import ctypes
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -25,43 +25,10 @@ Dim = int | tuple[int, ...]
 _NOWHERE_ELSE = nullcontext()
 
 
-class Backend(Protocol):
-    """What runs kernels, on tensors of one type of device."""
-
-    device_type: str
-
-    def launch(
-        self,
-        program: Program,
-        name: str,
-        grid: tuple[int, int, int],
-        block: tuple[int, int, int],
-        values: Sequence[Any],
-    ) -> None:
-        """Run kernel ``name``; ``values`` are its arguments as ctypes values, which may change afterwards."""
-        ...
-
-    def capture(self, body: Callable[[], None], pool: Any) -> Callable[[], None]:
-        """Do what ``body`` queues, once, and return what does it again without calling it.
-
-        ``pool`` is from ``memory_pool``; see ``etsplat.engines.cuda.steps.Repeated``.
-        """
-        ...
-
-    def memory_pool(self) -> Any:
-        """Memory that captures can share."""
-        ...
-
-    @property
-    def capturing(self) -> bool:
-        """Whether a capture is under way: nothing can be read back then."""
-        ...
+_backend: Device | None = None
 
 
-_backend: Backend | None = None
-
-
-def backend() -> Backend:
+def backend() -> Device:
     """What runs kernels now.
 
     Raises:
@@ -74,8 +41,8 @@ def backend() -> Backend:
 
 
 @contextmanager
-def use_backend(other: Backend) -> Iterator[None]:
-    """Within the block kernels run on ``other``."""
+def use_backend(other: Any) -> Iterator[None]:
+    """Within the block kernels run on ``other``, which has what `Device` has."""
     global _backend
     before, _backend = _backend, other
     try:

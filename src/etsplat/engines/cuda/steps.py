@@ -31,11 +31,19 @@ def adam_step(
     CudaQueuedSteps.adam_step(groups, rates, betas, eps, None)
 
 
-def update_statistics(records: Sequence[Tensor], view: TriangleStatistics, views: int, epoch_starts: bool) -> None:
-    """See `Engine.update_statistics`."""
-    device = records[0].device
-    going_on = torch.zeros((), dtype=torch.int32, device=device)
-    CudaQueuedSteps.update_statistics(records, view, views, upload([epoch_starts], device), going_on)
+def update_statistics(
+    records: Sequence[Tensor],
+    view: TriangleStatistics,
+    views: int,
+    epoch_starts: bool | Tensor,
+    halted: Tensor | None = None,
+) -> None:
+    """See `etsplat.ops.soup_statistics`."""
+    count, device = len(records[0]), records[0].device
+    seen_now = view.max_weight[0], view.screen_size[0], view.inradius[0]
+    starts = epoch_starts if isinstance(epoch_starts, Tensor) else upload([epoch_starts], device)
+    going_on = torch.zeros((), dtype=torch.int32, device=device) if halted is None else halted
+    launch_each(_STATISTICS, "soup_statistics", count, (count, *seen_now, *records, views, starts, going_on))
 
 
 class Repeated:
@@ -70,20 +78,28 @@ class Repeated:
 
 
 class CudaQueuedSteps:
-    """What a captured step needs besides the operations; see `QueuedSteps`."""
+    """Steps that the device repeats by itself; what changes from one to the next is read from its memory.
 
+    `halted` is () int32 in device memory: where it is not 0, nothing is updated.
+    """
+
+    update_statistics = staticmethod(update_statistics)
     repeated = Repeated
+    """What queues the work of a function each time it is called, by and by without calling the function."""
 
     def memory_pool(self) -> Any:
-        """See `QueuedSteps.memory_pool`."""
+        """Memory that steps of several kinds can share."""
         return backend().memory_pool()
 
     def verdict(self, loss: Tensor, position: Tensor, losses: Tensor, halted: Tensor) -> None:
-        """See `QueuedSteps.verdict`; a step counts if its buffers were large enough and its loss is finite."""
+        """Queue: keep the loss at `position`, move on if the step counts, and halt otherwise.
+
+        A step counts if its buffers were large enough and its loss is finite.
+        """
         launch(_STEP, "step_verdict", 1, 1, (loss, overflow_flag(loss.device), position, losses, halted))
 
     def repair(self, device: torch.device) -> bool:
-        """See `QueuedSteps.repair`."""
+        """Whether a step found too little room, which the next ones will have. Waits for the device."""
         return repair_overflow(device)
 
     @staticmethod
@@ -94,7 +110,7 @@ class CudaQueuedSteps:
         eps: float,
         halted: Tensor | None,
     ) -> None:
-        """See `QueuedSteps.adam_step`; None never halts."""
+        """As `Engine.adam_step`, with `Adam.rates` (P + 1,) float32 in device memory; None never halts."""
         first_beta, second_beta = betas
         constants = 1 - first_beta, second_beta, 1 - second_beta, eps
         table_class = struct_class("cuda/adam.cu", "AdamParameters")
@@ -106,11 +122,3 @@ class CudaQueuedSteps:
             grid = sum(blocks(size, _ADAM_ELEMENTS) for size in sizes)
             arguments = (table, len(chosen), rates[first:], rates[len(groups) :], *constants, halted)
             launch(_ADAM, "adam_step", grid, _ADAM_THREADS, arguments)
-
-    @staticmethod
-    def update_statistics(
-        records: Sequence[Tensor], view: TriangleStatistics, views: int, epoch_starts: Tensor, halted: Tensor
-    ) -> None:
-        """See `QueuedSteps.update_statistics`."""
-        count, seen_now = len(records[0]), (view.max_weight[0], view.screen_size[0], view.inradius[0])
-        launch_each(_STATISTICS, "soup_statistics", count, (count, *seen_now, *records, views, epoch_starts, halted))

@@ -1,11 +1,11 @@
 """Antialiased z-buffer rasterization in plain PyTorch: all pixels, and all pairs of pixels, at once."""
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from etsplat.core.connectivity import MeshConnectivity
-from etsplat.engines.reference.rasterize import to_screen
+from etsplat.engines.reference.rasterize import cross, to_screen
 
 
 def antialias(
@@ -22,70 +22,27 @@ def antialias(
     connectivity: MeshConnectivity,
 ) -> Tensor:
     """Shade and blend what `rasterize_opaque` has seen: (B, H, W, C)."""
-    images = [
-        _antialiased(
-            vertices,
-            connectivity,
-            viewmats[b].detach(),
-            Ks[b].detach(),
-            near_plane,
-            colors,
-            per_face,
-            backgrounds[b],
-            triangle[b],
-            depth[b],
-        )
-        for b in range(len(viewmats))
-    ]
+    faces, images = connectivity.faces.long(), []
+    for b, (viewmat, K) in enumerate(zip(viewmats.detach(), Ks.detach(), strict=True)):
+        screen, z = to_screen(vertices, viewmat, K)
+        drawn = ((z > near_plane) & screen.isfinite().all(dim=1)).detach()
+        row, column = (triangle[b] >= 0).nonzero(as_tuple=True)
+        owner = triangle[b, row, column].long()
+        if per_face:
+            values = colors[owner]
+        else:
+            corners = vertices[faces[owner]] @ viewmat[:3, :3].T + viewmat[:3, 3]
+            pixels = torch.stack([column + 0.5, row + 0.5, torch.ones_like(row)], dim=1).to(vertices.dtype)
+            rays = torch.linalg.solve(K, pixels.T).T
+            # The point b_0 v_0 + b_1 v_1 + b_2 v_2 lies on the ray.
+            beta = torch.linalg.solve(corners.mT, rays[..., None])[..., 0]
+            values = ((beta / beta.sum(dim=1, keepdim=True))[..., None] * colors[faces[owner]]).sum(dim=1)
+        image = shaded = backgrounds[b].expand(*triangle[b].shape, -1).index_put((row, column), values)
+        silhouette = _silhouettes(connectivity, screen.detach(), drawn)
+        for axis in range(2):
+            image = image + _blends(shaded, screen, silhouette, faces, triangle[b], depth[b], axis)
+        images.append(image)
     return torch.stack(images) if images else vertices.new_zeros(*triangle.shape, colors.shape[1])
-
-
-def _antialiased(
-    vertices: Float[Tensor, "V 3"],
-    connectivity: MeshConnectivity,
-    viewmat: Float[Tensor, "4 4"],
-    K: Float[Tensor, "3 3"],
-    near_plane: float,
-    colors: Float[Tensor, "F C"] | Float[Tensor, "V C"],
-    per_face: bool,
-    background: Float[Tensor, " C"],
-    triangle: Int[Tensor, "H W"],
-    depth: Float[Tensor, "H W"],
-) -> Float[Tensor, "H W C"]:
-    screen, z = to_screen(vertices, viewmat, K)
-    drawn = ((z > near_plane) & screen.isfinite().all(dim=1)).detach()
-    shaded = _shaded(vertices, connectivity.faces.long(), viewmat, K, colors, per_face, background, triangle)
-    silhouette = _silhouettes(connectivity, screen.detach(), drawn)
-    image = shaded
-    for axis in range(2):
-        image = image + _blends(shaded, screen, silhouette, connectivity.faces.long(), triangle, depth, axis)
-    return image
-
-
-def _shaded(
-    vertices: Tensor,
-    faces: Tensor,
-    viewmat: Tensor,
-    K: Tensor,
-    colors: Tensor,
-    per_face: bool,
-    background: Tensor,
-    triangle: Tensor,
-) -> Float[Tensor, "H W C"]:
-    """Colours of the nearest triangles, without antialiasing."""
-    covered = triangle >= 0
-    row, column = covered.nonzero(as_tuple=True)
-    owner = triangle[row, column].long()
-    if per_face:
-        values = colors[owner]
-    else:
-        corners = vertices[faces[owner]] @ viewmat[:3, :3].T + viewmat[:3, 3]
-        pixels = torch.stack([column + 0.5, row + 0.5, torch.ones_like(row)], dim=1).to(vertices.dtype)
-        rays = torch.linalg.solve(K, pixels.T).T
-        # The point b_0 v_0 + b_1 v_1 + b_2 v_2 lies on the ray.
-        beta = torch.linalg.solve(corners.mT, rays[..., None])[..., 0]
-        values = ((beta / beta.sum(dim=1, keepdim=True))[..., None] * colors[faces[owner]]).sum(dim=1)
-    return background.expand(*triangle.shape, -1).index_put((row, column), values)
 
 
 def _silhouettes(connectivity: MeshConnectivity, screen: Tensor, drawn: Tensor) -> Bool[Tensor, "F 3"]:
@@ -100,13 +57,11 @@ def _silhouettes(connectivity: MeshConnectivity, screen: Tensor, drawn: Tensor) 
             for j in range(3):
                 p, q, opposite = (faces[other, (j + i) % 3] for i in range(3))
                 shared = ((p == a) & (q == b)) | ((p == b) & (q == a))
-                across = _side(screen[a], screen[b], screen[c]) * _side(screen[a], screen[b], screen[opposite]) < 0
+                edge = screen[b] - screen[a]
+                own_side, other_side = (cross(edge, screen[corner] - screen[a]) for corner in (c, opposite))
+                across = own_side * other_side < 0
                 silhouette[own[shared & usable & across], k] = False
     return silhouette
-
-
-def _side(a: Tensor, b: Tensor, p: Tensor) -> Tensor:
-    return (b[:, 0] - a[:, 0]) * (p[:, 1] - a[:, 1]) - (p[:, 0] - a[:, 0]) * (b[:, 1] - a[:, 1])
 
 
 def _blends(

@@ -22,6 +22,7 @@ from etsplat.core.rasterization import (
     RasterizeSettings,
     RasterizeTensors,
     TriangleStatistics,
+    joined,
 )
 
 _BLOCK = 32  # pixels along a side of a block
@@ -41,14 +42,17 @@ def rasterize(tensors: RasterizeTensors, settings: RasterizeSettings) -> Rasteri
     opacities, viewmats, Ks = tensors.opacities, tensors.viewmats, tensors.Ks
     per_view = tensors.face_colors is not None and colors.ndim == 3
     sigma = tensors.sigma.expand(opacities.shape)
-    images, statistics = [], []
+    views = []
     for view in range(viewmats.shape[0]):
         view_colors = colors[view] if per_view else colors
         projected = _project(triangles, view_colors, opacities, sigma, viewmats[view], Ks[view], settings)
         channels, max_weight = _render(projected, settings)
-        images.append(channels)
-        statistics.append(_statistics(projected, max_weight, len(opacities)))
-    return _assemble(torch.stack(images), statistics, tensors.backgrounds, settings)
+        background = None if tensors.backgrounds is None else tensors.backgrounds[view, None, None, None]
+        result = _assemble(channels[None], background, settings)
+        if settings.wants("statistics"):
+            result.statistics = _statistics(projected, max_weight, len(opacities))
+        views.append(result)
+    return joined(views)
 
 
 @dataclass
@@ -141,15 +145,16 @@ def _shape(corners: Tensor, distance: str) -> tuple[Tensor, Tensor, Tensor]:
     mean = corners.mean(dim=-2)
     incentre = (lengths[..., None] * corners).sum(dim=-2) / perimeter[:, None]
     screen_size = (corners - mean[:, None]).norm(dim=-1).amax(dim=-1)
-    return (mean if distance == "barycentric" else incentre), _doubled_area(corners).abs() / perimeter, screen_size
+    return (mean if distance == "barycentric" else incentre), doubled_area(corners).abs() / perimeter, screen_size
 
 
-def _doubled_area(corners: Tensor) -> Tensor:
+def doubled_area(corners: Tensor) -> Tensor:
     """Twice the signed area (..., ) of 2-D triangles (..., 3, 2)."""
-    return _cross(corners[..., 1, :] - corners[..., 0, :], corners[..., 2, :] - corners[..., 0, :])
+    return cross(corners[..., 1, :] - corners[..., 0, :], corners[..., 2, :] - corners[..., 0, :])
 
 
-def _cross(a: Tensor, b: Tensor) -> Tensor:
+def cross(a: Tensor, b: Tensor) -> Tensor:
+    """Of 2-D vectors (..., 2)."""
     return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
 
@@ -161,9 +166,9 @@ def _edge_lengths(corners: Tensor) -> Tensor:
 def _has_area(corners: Tensor) -> Tensor:
     """Whether the projected triangle is wide enough to have a well-defined x, and small enough for float32 sums."""
     longest = (corners - corners.roll(1, dims=-2)).square().sum(dim=-1).amax(dim=-1)
-    doubled_area = _doubled_area(corners).abs()
+    doubled = doubled_area(corners).abs()
     in_range = (corners.abs() < _FARTHEST_PIXEL).all(dim=-1).all(dim=-1) & (longest < _LARGEST)
-    return (doubled_area > (1e-6 * longest).clamp(min=1e-12)) & in_range
+    return (doubled > (1e-6 * longest).clamp(min=1e-12)) & in_range
 
 
 def unit_normals(triangles: Tensor) -> Tensor:
@@ -262,9 +267,13 @@ def barycentrics(pixels: Tensor, corners: Tensor) -> Tensor:
 
     Signed areas opposite to each corner over the triangle's.
     """
+    return edge_functions(pixels, corners) / doubled_area(corners)[..., None]
+
+
+def edge_functions(pixels: Tensor, corners: Tensor) -> Tensor:
+    """Twice the signed areas (..., 3) that points (..., 2) span with the edges opposite to each corner (..., 3, 2)."""
     to_corners = corners - pixels[..., None, :]
-    doubled = _cross(to_corners.roll(-1, dims=-2), to_corners.roll(-2, dims=-2))
-    return doubled / _doubled_area(corners)[..., None]
+    return cross(to_corners.roll(-1, dims=-2), to_corners.roll(-2, dims=-2))
 
 
 def _distance(barycentric: Tensor, corners: Tensor, settings: RasterizeSettings) -> Tensor:
@@ -275,12 +284,12 @@ def _distance(barycentric: Tensor, corners: Tensor, settings: RasterizeSettings)
     """
     if settings.distance == "barycentric":
         return 1.0 + _first_max(-3.0 * barycentric)
-    doubled_area = _doubled_area(corners).abs()
+    doubled = doubled_area(corners).abs()
     lengths = _edge_lengths(corners)
-    inradius = doubled_area / lengths.sum(dim=-1)
+    inradius = doubled / lengths.sum(dim=-1)
     if settings.freeze_inradius:
         inradius = inradius.detach()
-    signed_distance = -barycentric * (doubled_area[:, None] / lengths)
+    signed_distance = -barycentric * (doubled[:, None] / lengths)
     return 1.0 + _first_max(signed_distance) / inradius
 
 
@@ -302,7 +311,8 @@ class _KernelValue(torch.autograd.Function):
     def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor, Tensor, None]:
         (grad,) = grad_outputs
         x, sigma = ctx.saved_tensors
-        return grad * ctx.kernel.dvalue_dx(x, sigma), grad * ctx.kernel.dvalue_dsigma(x, sigma), None
+        dx, dsigma = ctx.kernel.gradient(x, sigma)
+        return grad * dx, grad * dsigma, None
 
 
 def _transmittance(alpha: Tensor) -> Tensor:
@@ -326,7 +336,7 @@ def _distortion(weight: Tensor, z: Tensor) -> Tensor:
 
 def _statistics(projected: _Projected, max_weight: Tensor, count: int) -> TriangleStatistics:
     def scatter(values: Tensor) -> Tensor:
-        return values.new_zeros(count).index_copy(0, projected.index, values)
+        return values.new_zeros(1, count).index_copy(1, projected.index, values[None])
 
     return TriangleStatistics(
         max_weight=scatter(max_weight),
@@ -336,16 +346,14 @@ def _statistics(projected: _Projected, max_weight: Tensor, count: int) -> Triang
     )
 
 
-def _assemble(
-    channels: Tensor, statistics: list[TriangleStatistics], backgrounds: Tensor | None, settings: RasterizeSettings
-) -> Rasterization:
-    """Split the channels (B, H, W, K) into images."""
+def _assemble(channels: Tensor, background: Tensor | None, settings: RasterizeSettings) -> Rasterization:
+    """Split the channels (1, H, W, K) of a view into images."""
     depths, median, normals, distorted = (settings.wants(name) for name in OUTPUTS[2:6])
     extra = [depths, median, 3 * normals, distorted]
     colors = channels.shape[-1] - 1 - sum(extra)
     color, transmittance, depth, median_depth, normal, distortion = channels.split([colors, 1, *extra], dim=-1)
-    if backgrounds is not None:
-        color = color + transmittance * backgrounds[:, None, None]
+    if background is not None:
+        color = color + transmittance * background
     alpha = 1.0 - transmittance
     return Rasterization(
         color=color,
@@ -354,9 +362,4 @@ def _assemble(
         median_depth=median_depth if median else None,
         normal=normal if normals else None,
         distortion=distortion if distorted else None,
-        statistics=TriangleStatistics(
-            *(torch.stack([getattr(s, name) for s in statistics]) for name in TriangleStatistics.__dataclass_fields__)
-        )
-        if settings.wants("statistics")
-        else None,
     )

@@ -5,6 +5,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from etsplat.core.rasterization import OpaqueView
+from etsplat.engines.reference.rasterize import doubled_area, edge_functions
 
 # Samples held at a time.
 _STRIP_SAMPLES = 4_000_000
@@ -39,20 +40,21 @@ def render_opaque(
     """Fill the image of one view, strip by strip; colours are contiguous."""
     corners, inverse_depths, drawn = _project(points, triangles, view)
     if cull_backfaces:
-        drawn &= _doubled_area(corners) < 0  # y points down: counter-clockwise is negative
+        drawn &= doubled_area(corners) < 0  # y points down: counter-clockwise is negative
     rows = max(1, _STRIP_SAMPLES // (view.width * supersampling**2))
     for top in range(0, view.height, rows):
         bottom = min(top + rows, view.height)
         samples = supersampling * (corners - corners.new_tensor([0, top]))
         owner, _ = _z_buffer(samples, inverse_depths, drawn, supersampling * view.width, supersampling * (bottom - top))
         covered = owner >= 0
-        layers = corners.new_zeros((*owner.shape, colors.shape[1] + 1))
+        chosen = owner[covered].long()
         if per_face:
-            layers[covered] = _with_one(colors[owner[covered].long()].double())
+            shown = colors[chosen].double()
         else:
             weights = _barycentrics(samples, inverse_depths, owner)[covered]
-            chosen = colors[triangles[owner[covered].long()].long()]
-            layers[covered] = _with_one((weights[..., None] * chosen).sum(dim=-2))
+            shown = (weights[..., None] * colors[triangles[chosen].long()]).sum(dim=-2)
+        layers = corners.new_zeros((*owner.shape, colors.shape[1] + 1))
+        layers[covered] = torch.nn.functional.pad(shown, (0, 1), value=1.0)  # the coverage
         grid = layers.view(bottom - top, supersampling, view.width, supersampling, -1)
         image[top:bottom] = grid.mean(dim=(1, 3))
 
@@ -67,21 +69,8 @@ def _project(points: Tensor, triangles: Tensor, view: OpaqueView) -> tuple[Tenso
     usable = (z > view.near_plane) & screen.isfinite().all(dim=1) & z.isfinite()
     chosen = triangles.long()
     corners = screen[chosen]
-    area = _doubled_area(corners)
+    area = doubled_area(corners)
     return corners, inverse_depth[chosen], usable[chosen].all(dim=1) & (area != 0) & area.isfinite()
-
-
-def _doubled_area(corners: Tensor) -> Tensor:
-    """Signed, (F,)."""
-    a, b, c = corners.unbind(-2)
-    return (b[..., 0] - a[..., 0]) * (c[..., 1] - a[..., 1]) - (c[..., 0] - a[..., 0]) * (b[..., 1] - a[..., 1])
-
-
-def _edge_functions(corners: Tensor, x: Tensor, y: Tensor) -> Tensor:
-    """Twice the signed areas opposite the three corners (..., 3, 2), at (x, y): (..., 3); a_k up to normalisation."""
-    p, q = corners.roll(-1, dims=-2), corners.roll(-2, dims=-2)
-    x, y = x[..., None], y[..., None]
-    return (p[..., 0] - x) * (q[..., 1] - y) - (q[..., 0] - x) * (p[..., 1] - y)
 
 
 def _z_buffer(corners: Tensor, inverse_depths: Tensor, drawn: Tensor, width: int, height: int) -> tuple[Tensor, Tensor]:
@@ -95,15 +84,16 @@ def _z_buffer(corners: Tensor, inverse_depths: Tensor, drawn: Tensor, width: int
     for f in drawn.nonzero()[:, 0].tolist():
         (x0, y0), (x1, y1) = low[f].int().tolist(), high[f].int().tolist()
         x = torch.arange(x0, x1, dtype=corners.dtype, device=corners.device) + 0.5
-        y = torch.arange(y0, y1, dtype=corners.dtype, device=corners.device)[:, None] + 0.5
+        y = torch.arange(y0, y1, dtype=corners.dtype, device=corners.device) + 0.5
+        pixels = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
         triangle, depths = corners[f], inverse_depths[f]
-        if _doubled_area(triangle) < 0:
+        if doubled_area(triangle) < 0:
             triangle, depths = triangle.flip(0), depths.flip(0)
-        areas = _edge_functions(triangle, *torch.broadcast_tensors(x, y))
+        areas = edge_functions(pixels, triangle)
         edge = triangle.roll(-2, 0) - triangle.roll(-1, 0)
         top_left = (edge[:, 1] < 0) | ((edge[:, 1] == 0) & (edge[:, 0] > 0))
         inside = ((areas > 0) | ((areas == 0) & top_left)).all(dim=-1)
-        inverse_depth = (areas * depths).sum(dim=-1) / _doubled_area(triangle)
+        inverse_depth = (areas * depths).sum(dim=-1) / doubled_area(triangle)
         box = (slice(y0, y1), slice(x0, x1))
         nearer = inside & (inverse_depth > nearest[box])  # strictly: the smaller index wins a tie
         nearest[box] = torch.where(nearer, inverse_depth, nearest[box])
@@ -117,12 +107,7 @@ def _barycentrics(corners: Tensor, inverse_depths: Tensor, owner: Tensor) -> Ten
     result = corners.new_zeros((height, width, 3))
     y, x = (owner >= 0).nonzero(as_tuple=True)
     chosen = owner[y, x].long()
-    areas = _edge_functions(corners[chosen], x.to(corners.dtype) + 0.5, y.to(corners.dtype) + 0.5)
-    weights = (areas * _doubled_area(corners[chosen]).sign()[:, None]).clamp(min=0) * inverse_depths[chosen]
+    areas = edge_functions(torch.stack([x, y], dim=-1).to(corners.dtype) + 0.5, corners[chosen])
+    weights = (areas * doubled_area(corners[chosen]).sign()[:, None]).clamp(min=0) * inverse_depths[chosen]
     result[y, x] = weights / weights.sum(dim=-1, keepdim=True)
     return result
-
-
-def _with_one(color: Tensor) -> Tensor:
-    """Append the coverage of a covered sample."""
-    return torch.cat([color, torch.ones_like(color[:, :1])], dim=1)

@@ -10,7 +10,9 @@ from etsplat.core.rasterization import TriangleStatistics
 _VISIBLE_INRADIUS = 1.0
 
 
-def update_statistics(records: Sequence[Tensor], view: TriangleStatistics, views: int, epoch_starts: bool) -> None:
+def update_statistics(
+    records: Sequence[Tensor], view: TriangleStatistics, views: int, epoch_starts: bool | Tensor
+) -> None:
     """Update the records in place; see `etsplat.ops.soup_statistics`."""
     importance, screen_size, seen, trial = records
     seen_now = view.max_weight[0], view.screen_size[0], view.inradius[0]
