@@ -3,20 +3,31 @@
 trimesh is imported where it is used: it takes half a second, which runs without such files need not wait for.
 """
 
+import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
+from urllib.parse import unquote
 
 import numpy as np
 
 from etsplat.core.errors import InputError
+from etsplat.io.paths import kind_of, path_within
 from etsplat.io.srgb import srgb_from_linear
 
 if TYPE_CHECKING:
     import trimesh
 
 Corners = tuple[int, int, int]
+
+_MOST_VERTICES = 1 << 26
+"""Of all copies of meshes that the nodes of a glTF scene place."""
+
+_COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
+_COMPONENT_BYTES = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}
+_SHARING = 4
+"""glTF accessors may share bytes; together they have no more than this many times those that there are."""
 
 
 @dataclass
@@ -141,8 +152,13 @@ def _read_with_trimesh(path: Path) -> RawMesh:
 
     # trimesh's readers signal damage with whatever their parsing runs into, missing optional modules included.
     try:
+        if kind_of(path) in (".glb", ".gltf"):
+            _check_gltf(path)
         scene = trimesh.load_scene(str(path), process=False, skip_materials=True)
-        parts = [_placed(scene, node) for node in scene.graph.nodes_geometry]
+        nodes = scene.graph.nodes_geometry
+        if sum(len(scene.geometry[scene.graph[node][1]].vertices) for node in nodes) > _MOST_VERTICES:
+            raise ValueError(f"its {len(nodes)} nodes have more than {_MOST_VERTICES} vertices")
+        parts = [_placed(scene, node) for node in nodes]
     except Exception as error:
         raise _unreadable(path, error) from error
     if not parts:
@@ -154,6 +170,24 @@ def _read_with_trimesh(path: Path) -> RawMesh:
         _joined([part.face_colors for part in parts]),
         _joined([part.vertex_colors for part in parts]),
     )
+
+
+def _check_gltf(path: Path) -> None:
+    """Raises what damage leads to, and ValueError where arrays are larger than the files, or a file lies elsewhere."""
+    data = path.read_bytes()
+    binary = data.startswith(b"glTF")
+    document = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")] if binary else data)
+    room = len(data)
+    for uri in [buffer["uri"] for buffer in document.get("buffers", []) if "uri" in buffer]:
+        if not uri.startswith("data:"):
+            room += path_within(path.parent, unquote(uri), path).stat().st_size
+    claimed = 0
+    for accessor in document.get("accessors", []):
+        if accessor["count"] < 0:
+            raise ValueError(f"an array of {accessor['count']} elements")
+        claimed += accessor["count"] * _COMPONENTS[accessor["type"]] * _COMPONENT_BYTES[accessor["componentType"]]
+    if claimed > _SHARING * room:
+        raise ValueError(f"arrays of {claimed} bytes in {room}")
 
 
 def _joined(colors: list[np.ndarray | None]) -> np.ndarray | None:
