@@ -268,6 +268,42 @@ def test_setting_out_of_range(etsplat: Run) -> None:
     assert_one_line_error(etsplat("demo", "--iterations", "0"), "iterations", "at least 1")
 
 
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("resolution", "60000"),
+        ("pictures.supersampling", "100000"),
+        ("pictures.coarse_levels", "1000"),
+        ("start.level", "1000"),
+        ("start.radius", "1e308"),
+        ("optimizer.lr_vertices", "1e308"),
+        ("iterations", "1" + "0" * 400),
+        ("batch", "1000000"),
+        ("seed", "9" * 23),
+    ],
+)
+def test_numbers_that_cannot_be_meant_are_refused_by_name(etsplat: Run, name: str, value: str) -> None:
+    """Before memory or time is spent on them."""
+    option = f"--{name.replace('_', '-')}"
+    assert_one_line_error(etsplat("demo", option, value), name, "it must be")
+
+
+def test_memory_that_torch_does_not_get_is_no_traceback(etsplat: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its allocator raises a RuntimeError; others stay what they are."""
+
+    def fail(command: Command, arguments: Sequence[str]) -> int:
+        raise RuntimeError(message)
+
+    monkeypatch.setattr(Doctor, "run", fail)
+    message = "[enforce fail at alloc_cpu.cpp:119] err == 0. DefaultCPUAllocator: can't allocate memory"
+    result = etsplat("doctor")
+    assert result.returncode == 1
+    assert "not enough memory" in result.stderr
+    message = "something else"
+    with pytest.raises(RuntimeError, match="something else"):
+        parse(["doctor"]).run(["doctor"])
+
+
 def test_missing_mesh(etsplat: Run, tmp_path: Path) -> None:
     """A missing input is named, nothing is written."""
     result = etsplat("reconstruct", "no.ply", "--out", "run", cwd=tmp_path)

@@ -162,6 +162,31 @@ def _truncate(folder):
     path.write_bytes(path.read_bytes()[:200])
 
 
+def _shrink(folder):
+    """Whose ratio of sides says nothing."""
+    write_photo(folder / "images" / "0002.jpg", 1, 1)
+
+
+def _points(number):
+    return lambda folder: (folder / "sparse" / "0" / "points3D.txt").write_text(f"1 0 0 {number} 0 0 0\n")
+
+
+def _pose(number):
+    """The first image's, with another number for each of its 7."""
+    row = f"1 {' '.join([number] * 7)} 1 0000.jpg"
+    return lambda folder: (folder / "sparse" / "0" / "images.txt").write_text(f"{row}\n\n")
+
+
+def _name(name):
+    return lambda folder: (folder / "sparse" / "0" / "images.txt").write_text(f"1 1 0 0 0 0 0 0 1 {name}\n\n")
+
+
+def _camera(line):
+    return lambda folder: (folder / "sparse" / "0" / "cameras.txt").write_text(
+        "".join(f"{index} {line}\n" for index in range(9))
+    )
+
+
 def _resize(folder):
     write_photo(folder / "images" / "0002.jpg", 16, 16)
 
@@ -172,6 +197,20 @@ def _resize(folder):
     [
         (_truncate, r"0002\.jpg"),
         (_resize, "0002.jpg is 16x16, but its camera is for 16x12"),
+        (_shrink, "0002.jpg is 1x1, but its camera is for 16x12"),
+        (_points("1e308"), "has points farther away than"),
+        (_pose("1e308"), "not finite"),
+        (_pose("nan"), "not finite"),
+        (_pose("1e30"), "0000.jpg has a pose or camera with numbers beyond"),
+        (_name("x" * 300), "is no file name"),
+        (_name("x/.."), "leads out"),
+        (_camera("PINHOLE 16 12 1e308 1e308 8 6"), "numbers beyond"),
+        (_camera("PINHOLE 16 12 nan 10 8 6"), "not positive"),
+        (_camera("PINHOLE 16 12 10 10 8 inf"), "numbers beyond"),
+        (_camera(f"PINHOLE {10**400} 12 10 10 8 6"), "has no size"),
+        (_camera("PINHOLE 16 0 10 10 8 6"), "has no size"),
+        (_camera("NONE 16 12 10 10 8 6"), "malformed"),
+        (_camera("PINHOLE 16 12 10 10 8"), "malformed"),
         (lambda folder: (folder / "images" / "0001.jpg").unlink(), "1 of 4 images are missing"),
         (lambda folder: (folder / "sparse" / "0" / "points3D.txt").write_text("1 2 x"), "malformed line"),
         (lambda folder: (folder / "sparse" / "0" / "images.txt").write_text(""), "no registered image"),

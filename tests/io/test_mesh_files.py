@@ -1,5 +1,7 @@
 import json
 import struct
+import tracemalloc
+from contextlib import suppress
 
 import numpy as np
 import pytest
@@ -8,6 +10,7 @@ import trimesh
 
 from etsplat.core.errors import InputError
 from etsplat.geometry.icosphere import icosphere
+from etsplat.io import _mesh_readers
 from etsplat.io.mesh_files import load_mesh, save_mesh, weld_vertices
 from etsplat.io.srgb import linear_from_srgb, srgb_from_linear
 
@@ -15,6 +18,9 @@ PLY_HEADER = (
     "ply\nformat ascii 1.0\nelement vertex {}\nproperty float x\nproperty float y\nproperty float z\n"
     "element face {}\nproperty list uchar int vertex_indices\nend_header\n"
 )
+
+TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
+OFF = "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n"
 
 
 @pytest.fixture
@@ -189,6 +195,19 @@ def test_faces_without_area_repeated_faces_and_loose_vertices_are_dropped_with_n
         ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\nf 1 2", "line 5"),
         ("a.obj", "v 0 0 0\nv 1 0", "line 2"),
         ("a.obj", "v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "zero area"),
+        ("a.obj", TRIANGLE + "f 99999999999999999999 2 3\n", "line 4 .*vertex 99999999999999999998"),
+        ("a.obj", TRIANGLE + "f -99999999999999999999 2 3\n", "line 4"),
+        ("a.obj", TRIANGLE + "f " + "9" * 5000 + " 2 3\n", "line 4"),
+        ("a.obj", "v 0 0 0 nan nan nan\nv 1 0 0 1 1 1\nv 0 1 0 0 0 0\nf 1 2 3\n", "1 of 3 vertex colours are not"),
+        ("a.obj", "v 0 0 0 1e400 0 0\nv 1 0 0 1 1 1\nv 0 1 0 0 0 0\nf 1 2 3\n", "1 of 3 vertex colours are not"),
+        ("a.off", OFF + "3 0 1 2 red green blue\n", "cannot be read as OFF"),
+        ("a.off", OFF + "3 0 1 2 nan inf 1e999\n", "1 of 1 face colours are not finite"),
+        ("a.off", OFF + "3 0 1\n", "a face of 3 corners with 2"),
+        ("a.off", OFF + "2 0 1\n", "a face with 2 corners"),
+        ("a.off", OFF + "3 0 1 99999999999999999999\n", "cannot be read as OFF"),
+        ("a.off", "OFF\n-3 -1 0\n0 0 0\n", "cannot be read as OFF"),
+        ("a.off", f"OFF\n{2**62} {2**62} 0\n0 0 0\n", "cannot be read as OFF"),
+        ("a.off", "no mesh\n", "its first word is not OFF"),
         ("a.ply", "ply\nformat ascii 1.0\nelement ver", "cannot be read as PLY"),
         ("a.glb", "no glb at all, just some text", "cannot be read as GLB"),
         ("a.off", "OFF\n3 1 0\n0 0 0\n1 0", "cannot be read as OFF"),
@@ -213,6 +232,103 @@ def test_a_file_cut_anywhere_is_an_input_error(tmp_path, ball, name, part):
     with pytest.raises(InputError) as raised:
         load_mesh(tmp_path / name)
     assert "\n" not in str(raised.value)
+
+
+def test_off_has_colours_of_faces_and_counts_behind_its_first_word(tmp_path):
+    """Of a quadrilateral both triangles have its colour; whole numbers go up to 255, fractions to 1."""
+    points = "0 0 0 # the first\n1 0 0\n1 1 0\n0 1 0\n0 0 1\n"
+    (tmp_path / "a.off").write_text(f"OFF 5 2 0\n{points}4 0 1 2 3 255 0 51\n3 0 1 4 0 0 0 128\n")
+    mesh = load_mesh(tmp_path / "a.off")
+    assert mesh.faces.tolist() == [[0, 1, 2], [0, 2, 3], [0, 1, 4]]
+    torch.testing.assert_close(mesh.face_colors, torch.tensor([[1, 0, 0.2], [1, 0, 0.2], [0, 0, 0]]))
+    assert mesh.notes == ("2 polygons were cut into 3 triangles",)
+    (tmp_path / "a.off").write_text(f"OFF\n5 2 0\n{points}4 0 1 2 3 1 0 0.2\n3 0 1 4 0 0 7\n")
+    torch.testing.assert_close(
+        load_mesh(tmp_path / "a.off").face_colors, torch.tensor([[1, 0, 0.2], [1, 0, 0.2], [0, 0, 1]])
+    )
+    (tmp_path / "a.off").write_text(f"OFF\n5 2 0\n{points}4 0 1 2 3 1 0 0\n3 0 1 4\n")
+    assert load_mesh(tmp_path / "a.off").face_colors is None
+
+
+def glb(count, **accessor):
+    """Triangles whose accessor has no buffer view, which means zeros: a file of a few hundred bytes."""
+    accessor = {"componentType": 5126, "count": count, "type": "VEC3", "min": [0] * 3, "max": [0] * 3, **accessor}
+    document = {
+        "asset": {"version": "2.0"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}],
+        "accessors": [accessor],
+        "bufferViews": [{"buffer": 0, "byteLength": 4}],
+        "buffers": [{"byteLength": 4}],
+    }
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s4x", 4, b"BIN\0")
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+
+def ply(vertices, faces):
+    header = PLY_HEADER.format(vertices, faces).replace("ascii", "binary_little_endian").encode()
+    return header + np.eye(3, dtype="<f4").tobytes() + b"\3" + np.array([0, 1, 2], "<i4").tobytes()
+
+
+def stl(faces):
+    return bytes(80) + struct.pack("<I", faces) + np.zeros(12, "<f4").tobytes() + b"\0\0"
+
+
+@pytest.mark.parametrize(
+    ("suffix", "small", "large"),
+    [
+        (".glb", glb(3), glb(3 * 10**8)),
+        (".glb", glb(3), glb(3 * 10**5)),
+        (".glb", glb(3), glb(10**4, bufferView=0)),
+        (".glb", glb(3), glb(-(10**9))),
+        (".ply", ply(3, 1), ply(2**31 - 1, 1)),
+        (".ply", ply(3, 1), ply(3, 2**40)),
+        (".stl", stl(1), stl(2**32 - 1)),
+    ],
+)
+def test_counts_fit_the_file_before_anything_is_allocated(tmp_path, suffix, small, large):
+    """A GLB of 1,220 bytes took 8 GB."""
+    (tmp_path / f"small{suffix}").write_bytes(small)
+    (tmp_path / f"large{suffix}").write_bytes(large)
+    with suppress(InputError):  # imports what reading needs
+        load_mesh(tmp_path / f"small{suffix}")
+    tracemalloc.start()
+    try:
+        with pytest.raises(InputError, match="large"):
+            load_mesh(tmp_path / f"large{suffix}")
+        assert tracemalloc.get_traced_memory()[1] < 1 << 20
+    finally:
+        tracemalloc.stop()
+
+
+def test_a_scene_of_many_copies_is_refused_before_they_are_made(tmp_path, ball, monkeypatch):
+    save_mesh(tmp_path / "a.glb", *ball[:2])
+    assert len(load_mesh(tmp_path / "a.glb").vertices) == len(ball[0])
+    monkeypatch.setattr(_mesh_readers, "_MOST_VERTICES", len(ball[0]) - 1)
+    with pytest.raises(InputError, match="1 nodes have more than"):
+        load_mesh(tmp_path / "a.glb")
+
+
+@pytest.mark.parametrize("uri", ["../secret.bin", "/etc/passwd", "x/../../secret.bin", "absent.bin"])
+def test_gltf_reads_no_file_outside_of_its_folder(tmp_path, ball, uri):
+    trimesh.Trimesh(ball[0].numpy(), ball[1].numpy(), process=False).export(tmp_path / "a.glb")
+    data = (tmp_path / "a.glb").read_bytes()
+    size = struct.unpack("<I", data[12:16])[0]
+    document = glb_json(tmp_path / "a.glb")
+    (tmp_path / "in").mkdir()
+    (tmp_path / "in" / "b.bin").write_bytes(data[28 + size :])
+    (tmp_path / "secret.bin").write_bytes(data[28 + size :])
+    for name in ("b.bin", uri):
+        document["buffers"][0]["uri"] = name
+        (tmp_path / "in" / "a.gltf").write_text(json.dumps(document))
+        if name != uri:
+            assert len(load_mesh(tmp_path / "in" / "a.gltf").vertices) == len(ball[0])
+    with pytest.raises(InputError, match=r"a\.gltf"):
+        load_mesh(tmp_path / "in" / "a.gltf")
 
 
 def test_a_folder_is_an_input_error(tmp_path):

@@ -30,6 +30,22 @@ def soup(rng: torch.Generator, count: int, spread: float = 40.0) -> torch.Tensor
     return corners
 
 
+@pytest.mark.parametrize("size", [(2**27 + 1, 1), (1, 2**27 + 1)])
+def test_a_picture_of_more_samples_than_can_be_numbered_is_refused(size):
+    """Times the samples its width does not fit into 32 bits: it came out as zeros."""
+    width, height = size
+    with pytest.raises(ValueError, match="width and height must be from 1 to 1048576"):
+        render_opaque(
+            torch.rand(2, 3, 3),
+            viewmats=IDENTITY,
+            Ks=flat_camera(),
+            width=width,
+            height=height,
+            face_colors=torch.rand(2, 1),
+            supersampling=16,
+        )
+
+
 @pytest.mark.sanitize
 def test_native_agrees_with_float64_reference(rng):
     """On an odd-sized image of a soup both engines see the same triangles, depths and barycentrics."""

@@ -76,7 +76,7 @@ def outside(setting: Setting) -> list[Any]:
     if setting.range:
         low, high, step = setting.range.low, setting.range.high, 1 if setting.kind is int else 1e-9
         values += [int(low) - 1 if setting.kind is int else low - step]
-        values += [high + step] if math.isfinite(high) else []
+        values += [high + step] if math.isfinite(high) else [10**10, 10**400] if setting.kind is int else [1e31]
     return values
 
 

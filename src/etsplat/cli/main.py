@@ -1,6 +1,7 @@
 """Runs the command that was asked for and turns errors into one line."""
 
 import os
+import re
 import signal
 import sys
 from collections.abc import Callable, Sequence
@@ -35,8 +36,9 @@ def run_command(parse: Callable[[Sequence[str]], Command], arguments: Sequence[s
         sys.exit(FAILED)
     except KeyboardInterrupt:
         fail("interrupted", INTERRUPTED)
-    except MemoryError:
-        if "--debug" in arguments:
+    except (MemoryError, RuntimeError) as error:
+        full = isinstance(error, MemoryError) or re.search(r"can't allocate memory|out of memory", str(error))
+        if "--debug" in arguments or not full:
             raise
         fail("there is not enough memory for this; ask for smaller or fewer pictures or triangles", FAILED)
     except (InputError, OSError) as error:

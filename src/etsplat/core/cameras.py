@@ -10,6 +10,9 @@ from torch import Tensor
 
 from etsplat.core.precision import as_given
 
+MAX_SIDE = 1 << 20
+"""Pixels of an image's width or height: with 16 samples in each, float32 can still tell one from the next."""
+
 
 @dataclass(frozen=True)
 class Cameras:
@@ -33,8 +36,8 @@ class Cameras:
             raise ValueError(f"viewmats must have shape (B, 4, 4), got {tuple(self.viewmats.shape)}")
         if self.Ks.shape != (batch, 3, 3):
             raise ValueError(f"Ks must have shape ({batch}, 3, 3), one per viewmat, got {tuple(self.Ks.shape)}")
-        if self.width < 1 or self.height < 1:
-            raise ValueError(f"width and height must be at least 1, got {self.width} x {self.height}")
+        if not (1 <= self.width <= MAX_SIDE and 1 <= self.height <= MAX_SIDE):
+            raise ValueError(f"width and height must be from 1 to {MAX_SIDE}, got {self.width} x {self.height}")
 
     def __len__(self) -> int:
         return self.viewmats.shape[0]

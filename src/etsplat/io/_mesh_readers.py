@@ -8,7 +8,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
-from urllib.parse import unquote
 
 import numpy as np
 
@@ -100,9 +99,9 @@ def read_off(path: Path) -> RawMesh:
         vertices = vertices.reshape(vertex_count, 3)
         for row in rows[vertex_count : vertex_count + face_count]:
             behind = 1 + int(row[0])
-            cut = _fan([int(word) for word in row[1:behind]])
             if len(row) < behind:
                 raise ValueError(f"a face of {row[0]} corners with {len(row) - 1}")
+            cut = _fan([int(word) for word in row[1:behind]])
             faces += cut
             tails += [row[behind : behind + 3]] * len(cut)
         colors = None
@@ -180,7 +179,7 @@ def _check_gltf(path: Path) -> None:
     room = len(data)
     for uri in [buffer["uri"] for buffer in document.get("buffers", []) if "uri" in buffer]:
         if not uri.startswith("data:"):
-            room += path_within(path.parent, unquote(uri), path).stat().st_size
+            room += path_within(path.parent, uri, path).stat().st_size
     claimed = 0
     for accessor in document.get("accessors", []):
         if accessor["count"] < 0:

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from etsplat.core.cameras import Cameras, view_arguments
+from etsplat.core.cameras import MAX_SIDE, Cameras, view_arguments
 from etsplat.core.kernels import DISTANCES, KERNELS, kernel_name
 from etsplat.core.precision import as_given
 from etsplat.core.rasterization import (
@@ -163,6 +163,8 @@ def _check_settings(settings: RasterizeSettings) -> None:
     for name, size in (("width", settings.width), ("height", settings.height)):
         if not isinstance(size, int) or size < 1:
             raise ValueError(f"{name} must be a positive integer, got {size!r}")
+        if size > MAX_SIDE:
+            raise ValueError(f"{name} must be at most {MAX_SIDE}, got {size}")
     check_choice("kernel", settings.kernel, list(KERNELS))
     check_choice("distance", settings.distance, DISTANCES)
     check_choice("depth_of", settings.depth_of, DEPTHS)

@@ -155,8 +155,6 @@ def _check_views(vertices: Tensor, viewmats: Tensor, Ks: Tensor, width: int, hei
     check_like("Ks", Ks, "vertices", vertices)
     if Ks.is_cpu:  # reading them would wait for a GPU
         check_intrinsics("Ks", Ks)
-    if width < 1 or height < 1:
-        raise ValueError(f"width and height must be at least 1, got {width} x {height}")
     if not 0.0 < near_plane < float("inf"):
         raise ValueError(f"near_plane must be positive and finite, got {near_plane}")
     return Cameras(dense(viewmats, "viewmats"), dense(Ks, "Ks"), width, height)

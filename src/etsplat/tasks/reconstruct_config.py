@@ -24,9 +24,9 @@ _SUBDIVIDED = Only("with subdivisions", lambda config: config.refinement.subdivi
 class Pictures:
     """The pictures that the mesh is fitted to."""
 
-    supersampling: Annotated[int, Range(1)] = 4
+    supersampling: Annotated[int, Range(1, 16)] = 4
     """Pictures of a mesh average this many samples squared per pixel."""
-    coarse_levels: Annotated[int, Range(0)] = 2
+    coarse_levels: Annotated[int, Range(0, 12)] = 2
     """How many times the pictures are halved at first; the resolution doubles in equal steps."""
     coarse_until: Annotated[float, Range(0, 1), _COARSE] = 0.1
     """When full resolution begins, as a fraction of the iterations."""
@@ -48,9 +48,9 @@ class Drawing:
 class Start:
     """What the optimization starts from, unless that is a mesh of one's own."""
 
-    level: Annotated[int, Range(0)] = 4
+    level: Annotated[int, Range(0, 9)] = 4
     """The start is a sphere of 20 * 4^level faces."""
-    radius: Annotated[float, Range(1e-6)] = 1.05
+    radius: Annotated[float, Range(1e-6, 1e6)] = 1.05
     """Radius of that sphere, as a multiple of the radius of a sphere around the object."""
     color: Annotated[float, Range(0, 1)] = 0.5
     """Grey of all faces at the start."""
@@ -126,7 +126,7 @@ class Output:
     """Iterations between evaluations for history.jsonl; 0 for one at the end only."""
     checkpoint_every: Annotated[int, Range(0)] = 1000
     """Iterations between checkpoints; 0 for one at the end only."""
-    chamfer_samples: Annotated[int, Range(1)] = 100_000
+    chamfer_samples: Annotated[int, Range(1, 10**8)] = 100_000
     """Points per surface for the Chamfer distance."""
     lpips_weights: Path | None = None
     """Weights file for LPIPS; "download" fetches it; None uses the one in torch's cache or goes without."""
@@ -155,13 +155,13 @@ class ReconstructConfig(Settings):
     Opaque triangles with antialiased silhouettes: raster-face or raster-vertex (a colour per face or per vertex)."""
     iterations: Annotated[int, Range(1)] = 30_000
     """Optimization steps."""
-    resolution: Annotated[int, Range(1)] = 1024
+    resolution: Annotated[int, Range(1, 8192)] = 1024
     """Side of the pictures taken of a mesh, in pixels; wider images of a scene are scaled down to this width."""
     max_faces: Annotated[int, Range(1)] = 100_000
     """Subdivision stops here."""
-    batch: Annotated[int, Range(1), Rare] = 1
+    batch: Annotated[int, Range(1, 1024), Rare] = 1
     """Views that each step sees; the paper's method sees one."""
-    seed: Annotated[int, Range(0), Rare] = 0
+    seed: Annotated[int, Range(0, 2**63 - 1), Rare] = 0
     """Of the order of views and the backgrounds. (Metrics always sample with the same seed.)"""
     device: Device | None = None
     """Where it runs: cpu, cuda (an NVIDIA GPU), or None for cuda where there is one."""

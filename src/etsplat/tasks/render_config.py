@@ -17,7 +17,7 @@ class RenderConfig(Settings):
     orbit, ellipse: around what the cameras look at;
     spiral: in front of it;
     interpolated: from one training camera to the next."""
-    frames: Annotated[int, Range(1), Only("along a path", lambda config: config.path not in _VIEWS)] = 120
+    frames: Annotated[int, Range(1, 10**6), Only("along a path", lambda config: config.path not in _VIEWS)] = 120
     """Of a path."""
     fps: Annotated[int, Range(1, 240), Only("in an MP4", lambda config: config.video)] = 30
     """Frames per second of an MP4."""

@@ -30,6 +30,10 @@ AnySettings = TypeVar("AnySettings", bound="Settings")
 _KINDS = {bool: "true or false", int: "a whole number", float: "a number", str: "a word", Path: "a path"}
 
 
+_LARGEST = {int: 1e9, float: 1e30}
+"""Of numbers that are not bounded otherwise: nobody counts further, and float32 holds what is computed from it."""
+
+
 @dataclass(frozen=True)
 class Range:
     """At a field: the least and the largest value that it may have, as in ``Annotated[float, Range(0, 1)]``."""
@@ -106,10 +110,12 @@ class Setting:
         kinds = (int, float) if self.kind is float else self.kind
         if not isinstance(value, kinds) or isinstance(value, bool) != (self.kind is bool):
             return f"it must be {_KINDS[self.kind]}"
-        if isinstance(value, int | float):
+        if self.kind in _LARGEST and isinstance(value, int | float):
             limits = self.range or Range(-math.inf)
-            if not (limits.low <= value <= limits.high and math.isfinite(value)):
+            if not limits.low <= value <= limits.high:
                 return f"it must be {limits.text}"
+            if limits.high == math.inf and not abs(value) <= _LARGEST[self.kind]:
+                return f"it must be at most {_LARGEST[self.kind]:g}"
         return None
 
     def read(self, text: str) -> Any:

@@ -23,7 +23,7 @@ _REGULAR = Only(
 class Drawing:
     """How triangles become a picture."""
 
-    near_plane: Annotated[float, Range(1e-6)] = 0.25
+    near_plane: Annotated[float, Range(1e-6, 1e6)] = 0.25
     """Triangles with a vertex nearer than this to a camera are invisible to it."""
     cull_small: bool = False
     """Leave out triangles with an inradius below one pixel, as Triangle Splatting does."""
@@ -39,7 +39,7 @@ class Drawing:
 class Start:
     """The triangles that the optimization starts from: one at each point of the capture."""
 
-    points: Annotated[int, Range(1)] = 100_000
+    points: Annotated[int, Range(1, 10**8)] = 100_000
     """So many random triangles to start from where the capture has no points."""
     scale: Annotated[float, Range(1e-6)] = 2.23
     """Size of a triangle at the start, relative to the distance to its neighbours."""
@@ -175,9 +175,9 @@ class TrainConfig(Settings):
     or the name of one of your own, with --kernel-file."""
     iterations: Annotated[int, Range(1)] = 6000
     """Optimization steps."""
-    width: Annotated[int | None, Range(1)] = 800
+    width: Annotated[int | None, Range(1, 16384)] = 800
     """Wider images are scaled down to this width; None shrinks those wider than 1600 pixels to 1600."""
-    max_triangles: Annotated[int, Range(1)] = 100_000
+    max_triangles: Annotated[int, Range(1, 10**8)] = 100_000
     """Densification stops here."""
     normalize: Annotated[bool, Rare] = True
     """Train in the frame where the cameras are centred and the scene has extent 1. Results are in the scene's units."""
@@ -188,9 +188,9 @@ class TrainConfig(Settings):
     or a closed sphere in the colours of the photos, which stays where no photo shows it."""
     finish: Literal["none", "opaque"] = "none"
     """opaque: triangles are made opaque, then sharp, for engines without transparency."""
-    batch: Annotated[int, Range(1), Rare] = 1
+    batch: Annotated[int, Range(1, 1024), Rare] = 1
     """Views that each step sees; the paper's method sees one."""
-    seed: Annotated[int, Range(0), Rare] = 0
+    seed: Annotated[int, Range(0, 2**63 - 1), Rare] = 0
     """Of every random choice: start, order of views, backgrounds, densification."""
     device: Device | None = None
     """Where it runs: cpu, cuda (an NVIDIA GPU), or None for cuda where there is one."""

@@ -136,6 +136,24 @@ def test_the_bounding_sphere_brings_the_object_into_the_unit_sphere(scene, truth
         (lambda d: d.update(fl_x=-3), "not positive"),
         (lambda d: d.update(fl_x="wide"), "not a number"),
         (lambda d: d.update(w=80, h=40), "its camera is for 80x40"),
+        (lambda d: d.update(w=float("nan"), h=40), "has the size nanx40"),
+        (lambda d: d.update(w=40, h=float("inf")), "has the size 40xinf"),
+        (lambda d: d.update(w=10**400, h=40), "w = 1000.*not a number"),
+        (lambda d: d.update(k1=10**400), "k1 = 1000.*not a number"),
+        (lambda d: d.update(fl_x=10**400), "fl_x = 1000.*not a number"),
+        (lambda d: d.update(fl_x=1e308), "numbers beyond"),
+        (lambda d: d.update(fl_x=1e-308), "not positive"),
+        (lambda d: d.update(cx=-1e308), "numbers beyond"),
+        (lambda d: d.update(camera_angle_x=0), "camera_angle_x = 0, not an angle"),
+        (lambda d: d.update(camera_angle_x=float("nan")), "camera_angle_x = nan"),
+        (lambda d: d.update(camera_angle_x=10**400), "camera_angle_x = 1000"),
+        (lambda d: d["frames"][2].update(transform_matrix=[[10**400] * 4] * 4), "no 4x4 transform_matrix"),
+        (lambda d: d["frames"][2]["transform_matrix"][0].__setitem__(3, 1e308), "002 has .* numbers beyond"),
+        (lambda d: d["frames"][2].update(file_path="/"), "'/' leads out"),
+        (lambda d: d["frames"][2].update(file_path="a" * 300), "is no file name"),
+        (lambda d: d["frames"][2].update(mask_path="a" * 300), "is no file name"),
+        (lambda d: d.update(ply_file_path="./"), "is no file name"),
+        (lambda d: d.update(ply_file_path=[7]), "is not a file name"),
         (lambda d: d.update(train_filenames=["x"], test_filenames=["y"]), "names none of the frames"),
     ],
 )
@@ -153,6 +171,10 @@ def test_broken_files_are_input_errors(scene, truth):
     (scene / "transforms.json").write_text('{"frames": [')
     with pytest.raises(InputError, match="not valid JSON"):
         load_transforms(scene)
+    for deep in ("[" * 100_000, '{"frames":' * 100_000, "9" * 5000):
+        (scene / "transforms.json").write_text(deep)
+        with pytest.raises(InputError, match="not valid JSON"):
+            load_transforms(scene)
     (scene / "transforms.json").write_text("[]")
     with pytest.raises(InputError, match="JSON object"):
         load_transforms(scene)
