@@ -127,7 +127,7 @@ BAD_ARGUMENTS = {
     "cameras missing": ({"viewmats": None}, "either cameras, or all of viewmats, Ks, width and height must be given"),
     "width": ({"width": 0}, "width must be a positive integer, got 0"),
     "height": ({"height": 7.0}, "height must be a positive integer, got 7.0"),
-    "too wide": ({"width": 2**31}, "width must be at most 1048576, got 2147483648"),
+    "too wide": ({"width": 2**31}, "width must be at most 67108864, got 2147483648"),
     "near plane": ({"near_plane": 0.0}, "near_plane must be positive"),
     "cutoffs": ({"cutoffs": Cutoffs(alpha_min=0.5, alpha_max=0.4)}, "cutoffs must satisfy"),
     "sigma range": ({"sigma": torch.zeros(5)}, "sigma must be positive, got 0.0"),

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from etsplat.core.precision import as_given
 
-MAX_SIDE = 1 << 20
-"""Pixels of an image's width or height: with 16 samples in each, float32 can still tell one from the next."""
+MAX_SIDE = 1 << 26
+"""Pixels of the width or height of an image: with 16 samples in each they can still be numbered in 32 bits."""
 
 
 @dataclass(frozen=True)
