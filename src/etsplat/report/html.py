@@ -8,7 +8,6 @@ from importlib.metadata import version
 from importlib.resources import files
 from pathlib import Path
 from string import Template
-from typing import Any
 
 import numpy as np
 import torch
@@ -23,6 +22,7 @@ from etsplat.report.command import reproduce_command
 from etsplat.report.curves import curves_of, draw_svg, short_number
 from etsplat.report.data import Run, read_run
 from etsplat.report.plots import plot_convergence
+from etsplat.tasks.settings import flatten
 
 MAX_VIEWS = 12
 MAX_PICTURE = 800
@@ -54,7 +54,8 @@ def write_report(run_dir: Path | str) -> Path:
 
 def render_page(run: Run) -> str:
     """The page as text."""
-    return Template(_asset("page.html")).substitute(
+    return _filled(
+        "page.html",
         version=version("etsplat"),
         title=escape(_title(run)),
         subtitle=escape(_subtitle(run)),
@@ -72,6 +73,11 @@ def render_page(run: Run) -> str:
 
 def _asset(name: str) -> str:
     return (files("etsplat.report") / "assets" / name).read_text(encoding="utf-8")
+
+
+def _filled(asset: str, **values: str) -> str:
+    """An asset with these values in it."""
+    return Template(_asset(asset)).substitute(values)
 
 
 def _title(run: Run) -> str:
@@ -116,21 +122,7 @@ def _mesh_section(path: Path) -> str:
         "faces": _base64(mesh.faces.numpy().astype("<u4").tobytes()),
         "colors": _base64(np.rint(colors.numpy() * 255).astype("u1").tobytes()),
     }
-    return f"""<section>
-<h2>The mesh</h2>
-<p class="note">Drag to turn, wheel to zoom, shift-drag to move, double-click to start over; arrow keys work too.
-Colours are the reconstructed ones, with the photographs' light in them. In the shape view, orange is the inside of a
-face.</p>
-<div class="bar">
-<div class="group" id="mesh-surface"><button type="button" value="colors" aria-pressed="true">Colours</button><button
-type="button" value="shape" aria-pressed="false">Shape</button></div>
-<button type="button" id="mesh-wireframe" aria-pressed="false">Wireframe</button>
-</div>
-<div class="card stage">
-<canvas id="mesh" tabindex="0" aria-label="The reconstructed mesh, to turn around"></canvas>
-</div>
-<script type="application/json" id="mesh-data">{json.dumps(data)}</script>
-</section>"""
+    return _filled("mesh.html", data=json.dumps(data))
 
 
 def _views_section(run: Run) -> str:
@@ -139,30 +131,13 @@ def _views_section(run: Run) -> str:
         return ""
     opaque, label = ("opaque", "Opaque triangles") if run.mesh is None else ("mesh", "Exported mesh")
     shown = "" if len(views) == len(run.views) else f" {len(views)} of {len(run.views)} are shown."
-    return f"""<section>
-<h2>Test views</h2>
-<p class="note">Pictures that training never saw, beside the render. Drag the edge across a picture.{shown} The
-originals are in <code>test/</code>.</p>
-<div class="bar">
-<div class="group" id="compare-mode"><button type="button" value="slide" aria-pressed="true">Slide</button><button
-type="button" value="side" aria-pressed="false">Side by side</button><button type="button" value="difference"
-aria-pressed="false">Difference × 4</button></div>
-<div class="group" id="compare-with"><button type="button" value="render" aria-pressed="true">Splatted
-render</button><button type="button" value="{opaque}" aria-pressed="false">{label}</button></div>
-</div>
-<div id="views" data-mode="slide" data-shown="render">{"".join(_comparison(view, opaque) for view in views)}</div>
-</section>"""
+    figures = "".join(_comparison(view, opaque) for view in views)
+    return _filled("views.html", shown=shown, opaque=opaque, label=label, views=figures)
 
 
 def _comparison(view: TestView, kind: str) -> str:
-    name = escape(view.name)
-    truth, render, opaque = (_picture(path) for path in (view.truth, view.render, view.opaque))
-    return f"""<figure class="card"><div class="compare">
-<img src="{truth}" alt="View {name}: photograph">
-<img class="shown" src="{render}" data-render="{render}" data-{kind}="{opaque}" alt="View {name}: render">
-<input type="range" min="0" max="100" value="50" aria-label="Where the photograph ends and the render begins">
-<span class="edge"></span><span class="tag truth">photograph</span><span class="tag other"></span>
-</div><figcaption>View {name}</figcaption></figure>"""
+    pictures = {"truth": _picture(view.truth), "render": _picture(view.render), "opaque": _picture(view.opaque)}
+    return _filled("view.html", name=escape(view.name), kind=kind, **pictures)
 
 
 def _picture(path: Path) -> str:
@@ -180,14 +155,7 @@ def _curves_section(run: Run) -> str:
         f'<span class="last">{short_number(curve.mean[-1])}</span></h3>{draw_svg(curve)}</div>'
         for curve in curves_of(run)
     )
-    if not charts:
-        return ""
-    return f"""<section>
-<h2>Convergence</h2>
-<p class="note">Over iterations. Where many steps share a point of a curve, the line is their mean and the band their
-range; for softness and opacity of a soup, the median and 10 to 90 % of the triangles.</p>
-<div class="curves">{charts}</div>
-</section>"""
+    return _filled("curves.html", charts=charts) if charts else ""
 
 
 def _reproduce_section(run: Run) -> str:
@@ -196,24 +164,15 @@ def _reproduce_section(run: Run) -> str:
         f"<pre>{escape(command)}</pre>" if command else "<p>This run was started from Python, with a mesh or views.</p>"
     )
     versions = ", ".join(f"{name} {number}" for name, number in run.metrics["versions"].items())
-    return f"""<section>
-<h2>Run it again</h2>
-{shown}
-<p class="note">Made with {escape(versions)}, engine {escape(str(run.metrics["engine"]))}. The same settings on the same
-machine, torch and number of threads give the same bits.</p>
-</section>"""
+    engine = escape(str(run.metrics["engine"]))
+    return _filled("reproduce.html", shown=shown, versions=escape(versions), engine=engine)
 
 
 def _config_section(run: Run) -> str:
-    rows = "".join(f"<tr><td>{escape(name)}</td><td>{escape(value)}</td></tr>" for name, value in _flatten(run.config))
+    said = {name: v if isinstance(v, str) else json.dumps(v) for name, v in flatten(run.config).items()}
+    rows = "".join(f"<tr><td>{escape(name)}</td><td>{escape(value)}</td></tr>" for name, value in said.items())
     summary = "<summary>Every setting of this run</summary>"
     return f'<section><details class="card">{summary}<table>{rows}</table></details></section>'
-
-
-def _flatten(value: Any, prefix: str = "") -> list[tuple[str, str]]:
-    if isinstance(value, dict):
-        return [row for key, item in value.items() for row in _flatten(item, f"{prefix}.{key}" if prefix else str(key))]
-    return [(prefix, value if isinstance(value, str) else json.dumps(value))]
 
 
 def _base64(content: bytes) -> str:
