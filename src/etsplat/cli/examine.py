@@ -26,20 +26,39 @@ def examine(console: Console) -> bool:
     """Print the state of the installation; whether everything that must work does."""
     difference = engine_difference()
     sound = difference <= TOLERANCE
-    table = Table(box=None, show_header=False, pad_edge=False)
-    for name, value in _versions():
-        table.add_row(name, Text(value))
-    table.add_section()
-    table.add_row("engine", "cpu (native)")
-    table.add_row(
-        "instruction set", f"{_native.instruction_set()} of {', '.join(_native.available_instruction_sets())}"
-    )
-    table.add_row("threads", Text(_threads()))
     verdict = f"agrees with the reference to {difference:.0e}" if sound else f"WRONG: differs by {difference:.0e}"
-    table.add_row("self-check", Text(verdict, style="" if sound else "bold red"))
-    table.add_section()
-    for name, value in _optional():
-        table.add_row(name, Text(value))
+    variable = os.environ.get("ETSPLAT_NUM_THREADS")
+    origin = f"ETSPLAT_NUM_THREADS={variable}" if variable else "all usable cores; set ETSPLAT_NUM_THREADS to change"
+    weights = find_lpips_weights(None)
+    found = ", ".join(map(str, weights.paths)) or f"missing, so lpips in metrics.json is null: {weights.reason}"
+    sections = (
+        {
+            "etsplat": version("etsplat"),
+            "python": f"{platform.python_version()} on {platform.system()} {platform.machine()}",
+            "torch": str(torch.__version__),
+            "numpy": version("numpy"),
+        },
+        {
+            "engine": "cpu (native)",
+            "instruction set": f"{_native.instruction_set()} of {', '.join(_native.available_instruction_sets())}",
+            "threads": f"{num_threads()} ({origin})",
+            "self-check": Text(verdict, style="" if sound else "bold red"),
+        },
+        {
+            "LPIPS weights": found,
+            "compiler": "not needed: the native engine is compiled already",
+            "GPU (CUDA)": _gpu(),
+            "etsplat data sfm": _extra("sfm", "pycolmap"),
+            "etsplat view": _extra("viewer", "viser"),
+            "videos": _extra("video", "imageio-ffmpeg"),
+            "--tensorboard": _extra("tensorboard", "tensorboard"),
+        },
+    )
+    table = Table(box=None, show_header=False, pad_edge=False)
+    for section in sections:
+        table.add_section()
+        for name, value in section.items():
+            table.add_row(name, Text(value) if isinstance(value, str) else value)
     console.print(table)
     if not sound:
         console.print("The native engine computes wrong pictures here: reinstall etsplat, or use --engine reference.")
@@ -63,21 +82,6 @@ def engine_difference() -> float:
     return float((pictures[0] - pictures[1]).abs().max())
 
 
-def _versions() -> list[tuple[str, str]]:
-    return [
-        ("etsplat", version("etsplat")),
-        ("python", f"{platform.python_version()} on {platform.system()} {platform.machine()}"),
-        ("torch", str(torch.__version__)),
-        ("numpy", version("numpy")),
-    ]
-
-
-def _threads() -> str:
-    variable = os.environ.get("ETSPLAT_NUM_THREADS")
-    origin = f"ETSPLAT_NUM_THREADS={variable}" if variable else "all usable cores; set ETSPLAT_NUM_THREADS to change"
-    return f"{num_threads()} ({origin})"
-
-
 def _gpu() -> str:
     try:
         Device()
@@ -91,17 +95,3 @@ def _extra(name: str, package: str) -> str:
         return f"{package} {version(package)}"
     except PackageNotFoundError:
         return f"missing: pip install 'etsplat[{name}]'"
-
-
-def _optional() -> list[tuple[str, str]]:
-    weights = find_lpips_weights(None)
-    found = ", ".join(map(str, weights.paths)) or f"missing, so lpips in metrics.json is null: {weights.reason}"
-    return [
-        ("LPIPS weights", found),
-        ("compiler", "not needed: the native engine is compiled already"),
-        ("GPU (CUDA)", _gpu()),
-        ("etsplat data sfm", _extra("sfm", "pycolmap")),
-        ("etsplat view", _extra("viewer", "viser")),
-        ("videos", _extra("video", "imageio-ffmpeg")),
-        ("--tensorboard", _extra("tensorboard", "tensorboard")),
-    ]

@@ -14,10 +14,6 @@ def at(value: Scheduled, iteration: int) -> float:
     return value(iteration) if callable(value) else value
 
 
-def _full(iteration: int) -> int:
-    return 0
-
-
 @dataclass(frozen=True)
 class Schedule:
     """What changes over a run and is not learned.
@@ -32,7 +28,7 @@ class Schedule:
     rates: Mapping[str, Scheduled]
     values: Mapping[str, Scheduled] = field(default_factory=dict)
     appearance: Callable[[int], Any] | None = None
-    halvings: Callable[[int], int] = _full
+    halvings: Callable[[int], int] = lambda _: 0
 
 
 def regularization_weight(iteration: int, iterations: int, hold: int, final: float = 0.0) -> float:

@@ -26,9 +26,8 @@ from etsplat.model.model import Model
 from etsplat.ops.adam import Adam
 from etsplat.optim.loop import Callback, LoopSettings, Progress, drive
 from etsplat.optim.objective import Drawing, Objective
-from etsplat.optim.row import RowLayout
 from etsplat.optim.schedules import Schedule, at
-from etsplat.optim.step_queue import MAX_STEPS, QueuedStep, StepQueue
+from etsplat.optim.step_queue import MAX_STEPS, QueuedStep, RowLayout, StepQueue
 from etsplat.optim.strategies import Fixed, Strategy
 from etsplat.optim.view_sampler import ViewSampler
 
@@ -91,8 +90,8 @@ class Trainer(Generic[M]):
         """
         self.model, self.strategy, self.progress = model, strategy or Fixed(), Progress()
         self._objective, self._dataset, self._batch = objective, dataset, batch
-        self._schedule = schedule or Schedule(model.RATES)
-        self._appearance = self._schedule.appearance or _constant(model.appearance)
+        self._schedule, appearance = schedule or Schedule(model.RATES), model.appearance
+        self._appearance = self._schedule.appearance or (lambda _: appearance)
         self._background = None if background is None else torch.tensor(background)[None]
         self._update, self._evaluate = update, evaluate
         generator = seed if isinstance(seed, torch.Generator) else torch.Generator().manual_seed(seed)
@@ -360,10 +359,6 @@ class Trainer(Generic[M]):
     def _set(self, values: dict[str, float] | dict[str, Tensor]) -> None:
         for name, value in values.items():
             self.model.parameters()[name].fill_(value)
-
-
-def _constant(appearance: Any) -> Callable[[int], Any]:
-    return lambda _: appearance
 
 
 def _part(state: dict[str, Tensor], name: str) -> dict[str, Tensor]:

@@ -15,7 +15,7 @@ from etsplat.io.writers import suffixes, writer_of
 from etsplat.model.soup_appearance import OPAQUE_FROM
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.ops.soup_colors import soup_colors
-from etsplat.tasks.export_config import Bake, ExportConfig
+from etsplat.tasks.export_config import ExportConfig
 from etsplat.tasks.soup_run import SoupRun, rotation_to_y_up, training_cameras, world_up
 
 BAKING_WIDTH = 400
@@ -54,11 +54,14 @@ def export_soup(run: SoupRun, path: Path | str, config: ExportConfig) -> Export:
         raise InputError(
             f"{run.path}: no triangle is opaque enough; lower --min-opacity, or train with --finish opaque"
         )
-    colors = _baked(run, config.colors)[kept]
+    if config.colors == "mean" and run.capture is not None:
+        colors = bake_colors(soup, training_cameras(run.capture))[kept]
+    else:
+        colors = soup.display_colors()[kept]
     vertices = soup.vertices.detach()[kept].cpu()
-    rotation = _rotation(run, config)
-    if rotation is not None:
-        vertices = (vertices.double() @ rotation.T).float()
+    up = None if run.capture is None or config.colors == "keep" else world_up(run.capture.viewmats)
+    if config.up == "y" and up is not None:
+        vertices = (vertices.double() @ rotation_to_y_up(up).T).float()
     if config.alpha:
         colors = torch.cat([colors, opacities[kept, None]], dim=1)
     numbers = {"opacity": opacities[kept], "sigma": soup.drawn_sigma.detach()[kept]}
@@ -86,19 +89,6 @@ def bake_colors(soup: TriangleSoup, cameras: list[Cameras]) -> Float[Tensor, "N 
         total += seen.max_weight[0, :, None] * colors.clamp(0, 1)
         weight += seen.max_weight[0, :, None]
     return torch.where(weight > 0, total / weight.clamp_min(1e-12), soup.display_colors())
-
-
-def _baked(run: SoupRun, bake: Bake) -> Float[Tensor, "N 3"]:
-    if bake == "mean" and run.capture is not None:
-        return bake_colors(run.soup, training_cameras(run.capture))
-    return run.soup.display_colors()
-
-
-def _rotation(run: SoupRun, config: ExportConfig) -> Float[Tensor, "3 3"] | None:
-    if config.up == "keep" or config.colors == "keep" or run.capture is None:
-        return None
-    up = world_up(run.capture.viewmats)
-    return None if up is None else rotation_to_y_up(up)
 
 
 def _coefficients(soup: TriangleSoup, kept: Tensor) -> dict[str, Tensor]:

@@ -11,7 +11,7 @@ import json
 import math
 import sys
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import asdict, dataclass, fields, is_dataclass, replace
 from functools import cache
 from pathlib import Path
 from types import NoneType
@@ -235,7 +235,7 @@ class Settings:
 
     def to_dict(self) -> dict[str, Any]:
         """All settings as JSON has them, with a dictionary for each group."""
-        return _as_dict(self)
+        return asdict(self, dict_factory=lambda items: {k: str(v) if isinstance(v, Path) else v for k, v in items})
 
     @classmethod
     def from_file(
@@ -387,11 +387,3 @@ def _replaced(group: Any, changes: Mapping[str, Any], prefix: str) -> Any:
         elif name in changes:
             own[field.name] = changes[name]
     return replace(group, **own)
-
-
-def _as_dict(group: Any) -> dict[str, Any]:
-    values = {field.name: getattr(group, field.name) for field in fields(group)}
-    return {
-        name: _as_dict(value) if is_dataclass(value) else str(value) if isinstance(value, Path) else value
-        for name, value in values.items()
-    }

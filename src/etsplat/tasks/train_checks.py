@@ -60,7 +60,8 @@ def doubtful_scale(capture: Dataset, config: TrainConfig) -> str | None:
 def predicted_bytes(capture: Dataset, config: TrainConfig, device: torch.device | None = None) -> int:
     """Memory of a device, None for the CPU, that a run may come to need, beyond the program itself."""
     pixels = max(width * height for width, height in capture.images.sizes)
-    triangles = max(config.max_triangles, _start_count(capture, config))
+    points = config.start.points if capture.exact_points is None else len(capture.exact_points)
+    triangles = max(config.max_triangles, points + (SPHERE_TRIANGLES if config.sky == "sphere" else 0))
     kept = not capture.images.streamed and (device is None or stay_on(device, capture.images.total_bytes))
     pictures = capture.images.total_bytes if kept else 0
     return triangles * BYTES_PER_TRIANGLE + pixels * BYTES_PER_PIXEL + pictures
@@ -68,8 +69,3 @@ def predicted_bytes(capture: Dataset, config: TrainConfig, device: torch.device 
 
 def _amount(count: int) -> str:
     return f"{count / 2**30:.1f} GiB" if count >= 2**30 else f"{count >> 20} MiB"
-
-
-def _start_count(capture: Dataset, config: TrainConfig) -> int:
-    points = config.start.points if capture.exact_points is None else len(capture.exact_points)
-    return points + (SPHERE_TRIANGLES if config.sky == "sphere" else 0)

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from etsplat.optim.row import RowLayout
+from etsplat.optim.step_queue import RowLayout
 
 
 def test_groups_come_out_by_name_as_views() -> None:
