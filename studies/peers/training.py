@@ -23,7 +23,6 @@ from etsplat.ops.photometric import photometric_loss
 from etsplat.optim.loop import LoopSettings, Progress, drive
 from etsplat.optim.schedules import exponential_decay, limited_iterations
 from etsplat.optim.view_sampler import ViewSampler
-from etsplat.tasks.evaluate_soup import drawing_speed, mean_scores
 from etsplat.tasks.running import (
     Place,
     device_name,
@@ -32,7 +31,7 @@ from etsplat.tasks.running import (
     path_of,
     versions,
 )
-from etsplat.tasks.scoring import Scorer, image_scores, load_lpips
+from etsplat.tasks.scoring import Scorer, drawing_speed, image_scores, load_lpips, mean_scores
 from studies.peers.gaussians import NAMES, Splatting, load_gaussians, save_gaussians, splat, start_gaussians
 from studies.peers.settings import PeerConfig, load_gsplat
 
@@ -89,7 +88,7 @@ def train_peer(
 
 
 def evaluate_peer(folder: Path, config: PeerConfig, lpips_weights: Path | None) -> dict[str, Any]:
-    """The numbers of `tasks.evaluate_soup.evaluate_run` for a finished run of `train_peer`; no opaque ones."""
+    """The numbers of `tasks.scoring.evaluate_run` for a finished run of `train_peer`; no opaque ones."""
     gsplat, device = load_gsplat()
     paths = RunDirectory(folder).read_config()["paths"]
     capture = load_dataset(paths["source"], images=paths["images"], width=config.width, preload=False).normalized()

@@ -25,6 +25,7 @@ from etsplat.report.command import reproduce_command
 from etsplat.report.curves import (
     MAX_POINTS,
     Curve,
+    ShortNumbers,
     curves_of,
     draw_svg,
     linear_ticks,
@@ -33,7 +34,6 @@ from etsplat.report.curves import (
     tick_labels,
 )
 from etsplat.report.data import read_run
-from etsplat.report.plots import ShortNumbers
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.train_config import TrainConfig
 

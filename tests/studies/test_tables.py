@@ -8,10 +8,10 @@ from typing import Any
 import pytest
 
 from etsplat.engines.threads import num_threads, set_num_threads
-from etsplat.tasks.evaluate_soup import evaluate_run
 from etsplat.tasks.reconstruct import reconstruct
 from etsplat.tasks.reconstruct_config import ReconstructConfig
-from etsplat.tasks.soup_run import open_run
+from etsplat.tasks.scoring import evaluate_run
+from etsplat.tasks.sources import open_run
 from etsplat.tasks.train import train
 from studies.distance import Distance
 from studies.famous import Famous

@@ -21,7 +21,7 @@ from etsplat.model.soup_import import open_soup
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.tasks.export_config import ExportConfig
 from etsplat.tasks.export_soup import bake_colors, export_soup
-from etsplat.tasks.soup_run import SoupRun, rotation_to_y_up, world_up
+from etsplat.tasks.sources import SoupRun, rotation_to_y_up, world_up
 
 CAMERA = Cameras(
     look_at(torch.tensor([[0.5, 0.8, 4.0]]), torch.zeros(3), torch.tensor([0.0, 1.0, 0.0])),

@@ -15,7 +15,7 @@ from etsplat.model.soup_appearance import SoupAppearance
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.tasks.render_config import RenderConfig
 from etsplat.tasks.render_soup import color_depth, render_run
-from etsplat.tasks.soup_run import SoupRun
+from etsplat.tasks.sources import SoupRun
 from helpers.captures import circle_poses, write_colmap
 
 UP = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)

@@ -6,7 +6,7 @@ import threading
 
 import pytest
 
-from etsplat.tasks.soup_run import SoupRun
+from etsplat.tasks.sources import SoupRun
 from etsplat.viewer.guard import Guard
 from etsplat.viewer.server import Viewer
 from viewer.test_viewer import make_soup

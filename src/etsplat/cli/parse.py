@@ -27,7 +27,7 @@ class Group:
     """
 
     help: str
-    commands: dict[str, type[Command]]
+    commands: "Mapping[str, type[Command] | Group]"
 
 
 COMMANDS: dict[str, type[Command] | Group] = {
@@ -68,47 +68,35 @@ def parse(arguments: Sequence[str]) -> Command:
     words = [re.sub(r"^(--method=)?single_sided$", r"\1single-sided", word) for word in arguments] or ["--help"]
     if words[0] == "demo" and (len(words) == 1 or (words[1].startswith("-") and words[1] not in ("-h", "--help"))):
         words.insert(1, "object")
-    _check_command(words)
-    parsed = tyro.cli(
-        _union(COMMANDS, words, 0),
-        prog="etsplat",
-        description=_ETSPLAT,
+    registry = _registry(brief=("--help" in words or "-h" in words) and "--help-all" not in words)
+    entry: type[Command] | Group = Group(_ETSPLAT, COMMANDS)
+    program = ["etsplat"]
+    while isinstance(entry, Group) and words and not words[0].startswith("-"):
+        word = words.pop(0)
+        if word not in entry.commands:
+            hint = did_you_mean(word, entry.commands)
+            raise InputError(
+                f"{word}: is no command{f'{hint} ' if hint else '; '}`{' '.join(program)} --help` lists them"
+            )
+        program.append(word)
+        entry = entry.commands[word]
+    listing = isinstance(entry, Group)
+    asked: Any = Union[tuple(_named(*item) for item in entry.commands.items())] if listing else entry  # noqa: UP007
+    return tyro.cli(
+        asked,
+        prog=" ".join(program),
+        description=entry.help if listing else inspect.cleandoc(entry.__doc__ or ""),
         args=["--help" if word == "--help-all" else word for word in words],
-        config=(tyro.conf.OmitSubcommandPrefixes,),
-        registry=_registry(brief=("--help" in words or "-h" in words) and "--help-all" not in words),
+        default=tyro.MISSING if listing else entry.defaults(words),
+        registry=registry,
     )
-    return parsed if isinstance(parsed, Command) else parsed.command
 
 
-def _check_command(words: Sequence[str]) -> None:
-    """Refuses words that name no command, before tyro takes them for options."""
-    known: Mapping[str, type[Command] | Group] = COMMANDS
-    for depth, word in enumerate(words):
-        if word.startswith("-") or not known:
-            return
-        if word not in known:
-            program, hint = " ".join(["etsplat", *words[:depth]]), did_you_mean(word, known)
-            raise InputError(f"{word}: is no command{f'{hint} ' if hint else '; '}`{program} --help` lists them")
-        entry = known[word]
-        known = entry.commands if isinstance(entry, Group) else {}
-
-
-def _union(commands: Mapping[str, type[Command] | Group], words: Sequence[str], depth: int) -> Any:
-    """A type that tyro reads as one of the commands. Those that are not asked for have a name and a line of help."""
-    asked = words[depth] if depth < len(words) else ""
-    return Union[tuple(_member(name, entry, words, name == asked, depth) for name, entry in commands.items())]  # noqa: UP007
-
-
-def _member(name: str, entry: type[Command] | Group, words: Sequence[str], asked: bool, depth: int) -> Any:
-    description = entry.help if isinstance(entry, Group) else inspect.cleandoc(entry.__doc__ or "")
-    if not asked:
-        description = description.partition("\n\nExamples:")[0]
-        return Annotated[make_dataclass(name, []), tyro.conf.subcommand(name, description=description)]
-    if isinstance(entry, Group):
-        commands = Annotated[_union(entry.commands, words, depth + 1), tyro.conf.arg(name="")]
-        group = make_dataclass(name, [("command", commands)], frozen=True)
-        return Annotated[group, tyro.conf.subcommand(name, description=description)]
-    return Annotated[entry, tyro.conf.subcommand(name, default=entry.defaults(words), description=description)]
+def _named(name: str, entry: type[Command] | Group) -> Any:
+    """A command with a line of help; nobody asks for its options here."""
+    text = entry.help if isinstance(entry, Group) else inspect.cleandoc(entry.__doc__ or "")
+    text = text.partition("\n\nExamples:")[0]
+    return Annotated[make_dataclass(name, []), tyro.conf.subcommand(name, description=text)]
 
 
 def _offered(setting: Setting) -> Any:

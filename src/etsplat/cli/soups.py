@@ -70,8 +70,8 @@ class Evaluate(Command):
         from etsplat.cli.progress import PhaseBar
         from etsplat.io.run_directory import RunDirectory, is_run
         from etsplat.report import write_report
-        from etsplat.tasks.evaluate_soup import evaluate_run
-        from etsplat.tasks.soup_run import open_run
+        from etsplat.tasks.scoring import evaluate_run
+        from etsplat.tasks.sources import open_run
 
         opened = open_run(self.run_dir, self.scene, self.device)
         folder = RunDirectory(self.out or opened.folder)
@@ -137,7 +137,7 @@ class Render(Command):
 
         from etsplat.cli.progress import PhaseBar
         from etsplat.tasks.render_soup import render_run
-        from etsplat.tasks.soup_run import open_run
+        from etsplat.tasks.sources import open_run
 
         opened = open_run(self.run_dir, self.scene, self.device)
         out = self.out or opened.folder / "renders"
@@ -175,7 +175,7 @@ class Export(Command):
         """Writes the file and says what is in it."""
         from etsplat.io.paths import kind_of
         from etsplat.tasks.export_soup import export_soup
-        from etsplat.tasks.soup_run import open_run
+        from etsplat.tasks.sources import open_run
 
         opened = open_run(self.run_dir, self.scene, self.device)
         out = self.out or opened.folder / f"soup.{self.format or 'glb'}"
@@ -227,7 +227,7 @@ class View(Command):
             if not low <= value <= high:
                 raise InputError(f"{name}: is {value}; it must be between {low} and {high}")
         from etsplat.io.paths import path_remedy
-        from etsplat.tasks.soup_run import open_run
+        from etsplat.tasks.sources import open_run
         from etsplat.viewer.follow import wait_for_soup
         from etsplat.viewer.server import serve
 

@@ -137,14 +137,11 @@ def _mesh_meaning(metrics: dict[str, Any]) -> str:
 
 def time_card(metrics: dict[str, Any]) -> Metric:
     """How long the optimization took."""
-    return Metric("Time", *_duration(metrics["seconds"]), _time_meaning(metrics))
-
-
-def _time_meaning(metrics: dict[str, Any]) -> str:
-    return (
+    meaning = (
         f"{metrics['iterations']:,} iterations at {1000 * metrics['seconds_per_iteration']:.1f} ms on the engine "
         f"{metrics['engine']}; photographs and metrics not counted in the milliseconds."
     )
+    return Metric("Time", *_duration(metrics["seconds"]), meaning)
 
 
 def _duration(seconds: float) -> tuple[str, str]:

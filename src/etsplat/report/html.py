@@ -19,14 +19,16 @@ from etsplat.io.mesh_files import load_mesh
 from etsplat.io.overview import TestView, draw_overview, spread
 from etsplat.report.cards import Metric, cards_of
 from etsplat.report.command import reproduce_command
-from etsplat.report.curves import curves_of, draw_svg, short_number
+from etsplat.report.curves import curves_of, draw_svg, plot_convergence, short_number
 from etsplat.report.data import Run, read_run
-from etsplat.report.plots import plot_convergence
 from etsplat.tasks.settings import flatten
 
 MAX_VIEWS = 12
 MAX_PICTURE = 800
 """Test pictures are embedded with at most this many pixels on the longer side."""
+
+
+FROM_PYTHON = "This run was started from Python, with a mesh or views."
 
 
 def write_report(run_dir: Path | str) -> Path:
@@ -54,6 +56,9 @@ def write_report(run_dir: Path | str) -> Path:
 
 def render_page(run: Run) -> str:
     """The page as text."""
+    command = reproduce_command(run.config, version("etsplat"))
+    versions = ", ".join(f"{name} {number}" for name, number in run.metrics["versions"].items())
+    said = {name: v if isinstance(v, str) else json.dumps(v) for name, v in flatten(run.config).items()}
     return _filled(
         "page.html",
         version=version("etsplat"),
@@ -62,12 +67,14 @@ def render_page(run: Run) -> str:
         style=_asset("page.css"),
         viewer_script=_asset("viewer.js"),
         page_script=_asset("page.js"),
-        metrics=_metrics_section(cards_of(run)),
+        metrics="".join(_card(card) for card in cards_of(run)),
         mesh="" if run.mesh is None else _mesh_section(run.mesh),
         views=_views_section(run),
         curves=_curves_section(run),
-        reproduce=_reproduce_section(run),
-        config=_config_section(run),
+        command=f"<pre>{escape(command)}</pre>" if command else f"<p>{FROM_PYTHON}</p>",
+        versions=escape(versions),
+        engine=escape(str(run.metrics["engine"])),
+        config="".join(f"<tr><td>{escape(name)}</td><td>{escape(value)}</td></tr>" for name, value in said.items()),
     )
 
 
@@ -98,10 +105,6 @@ def _subtitle(run: Run) -> str:
         f"{m['method']} kernel, preset {m['preset']}, {m['iterations']:,} iterations, {m['faces']:,} faces, "
         f"seed {m['seed']}."
     )
-
-
-def _metrics_section(cards: list[Metric]) -> str:
-    return f'<section class="metrics" aria-label="Metrics">{"".join(_card(card) for card in cards)}</section>'
 
 
 def _card(metric: Metric) -> str:
@@ -156,23 +159,6 @@ def _curves_section(run: Run) -> str:
         for curve in curves_of(run)
     )
     return _filled("curves.html", charts=charts) if charts else ""
-
-
-def _reproduce_section(run: Run) -> str:
-    command = reproduce_command(run.config, version("etsplat"))
-    shown = (
-        f"<pre>{escape(command)}</pre>" if command else "<p>This run was started from Python, with a mesh or views.</p>"
-    )
-    versions = ", ".join(f"{name} {number}" for name, number in run.metrics["versions"].items())
-    engine = escape(str(run.metrics["engine"]))
-    return _filled("reproduce.html", shown=shown, versions=escape(versions), engine=engine)
-
-
-def _config_section(run: Run) -> str:
-    said = {name: v if isinstance(v, str) else json.dumps(v) for name, v in flatten(run.config).items()}
-    rows = "".join(f"<tr><td>{escape(name)}</td><td>{escape(value)}</td></tr>" for name, value in said.items())
-    summary = "<summary>Every setting of this run</summary>"
-    return f'<section><details class="card">{summary}<table>{rows}</table></details></section>'
 
 
 def _base64(content: bytes) -> str:

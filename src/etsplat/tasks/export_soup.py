@@ -16,7 +16,7 @@ from etsplat.model.soup_appearance import OPAQUE_FROM
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.ops.soup_colors import soup_colors
 from etsplat.tasks.export_config import ExportConfig
-from etsplat.tasks.soup_run import SoupRun, rotation_to_y_up, training_cameras, world_up
+from etsplat.tasks.sources import SoupRun, rotation_to_y_up, training_cameras, world_up
 
 BAKING_WIDTH = 400
 """Training views are drawn this wide to find how much each shows of a triangle."""

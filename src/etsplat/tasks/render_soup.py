@@ -21,7 +21,7 @@ from etsplat.io.paths import kind_of
 from etsplat.io.videos import VideoSink, open_video
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.tasks.render_config import RenderConfig
-from etsplat.tasks.soup_run import SoupRun, world_up
+from etsplat.tasks.sources import SoupRun, world_up
 
 _NEAREST = 0.02
 """Quantile of depths that is shown as nearest, and as farthest from the other end."""

@@ -143,7 +143,7 @@ class Settings:
     LABELS: ClassVar[tuple[str, ...]] = ()
     """Settings that others start from: the preset first. They are named before the others are set, or not at all."""
 
-    def __new__(cls: type[AnySettings], **given: Any) -> AnySettings:
+    def __new__(cls: type[AnySettings], *_: Any, **given: Any) -> AnySettings:
         """Refuses a label without the settings that it stands for."""
         if len(given) < len(fields(cls)):
             cls._check_labels(given, cls)

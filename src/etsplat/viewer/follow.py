@@ -9,7 +9,7 @@ import torch
 from etsplat.core.errors import InputError
 from etsplat.io.run_directory import RunDirectory, is_empty, is_run
 from etsplat.model.triangle_soup import TriangleSoup
-from etsplat.tasks.soup_run import check_trains
+from etsplat.tasks.sources import check_trains
 
 WAITING_SECONDS = 1.0
 

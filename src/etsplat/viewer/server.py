@@ -22,7 +22,7 @@ from etsplat.core.errors import InputError
 from etsplat.data.camera_paths import focus_point
 from etsplat.data.dataset import Dataset
 from etsplat.model.triangle_soup import TriangleSoup
-from etsplat.tasks.soup_run import SoupRun, world_up
+from etsplat.tasks.sources import SoupRun, world_up
 from etsplat.viewer.follow import Followed
 from etsplat.viewer.guard import Guard
 from etsplat.viewer.pace import Pace

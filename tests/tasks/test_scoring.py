@@ -8,8 +8,8 @@ from etsplat.data.load import load_dataset
 from etsplat.io.images import save_image
 from etsplat.metrics.image import psnr, ssim
 from etsplat.model.triangle_soup import TriangleSoup
-from etsplat.tasks.evaluate_soup import evaluate_run
-from etsplat.tasks.soup_run import SoupRun
+from etsplat.tasks.scoring import evaluate_run
+from etsplat.tasks.sources import SoupRun
 from helpers.captures import write_colmap, write_photo
 
 

@@ -11,8 +11,8 @@ from etsplat.data.load import load_dataset
 from etsplat.io.run_directory import RunDirectory
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.optim.loop import CheckpointEvent
-from etsplat.tasks.evaluate_soup import evaluate_run
-from etsplat.tasks.soup_run import open_run
+from etsplat.tasks.scoring import evaluate_run
+from etsplat.tasks.sources import open_run
 from etsplat.tasks.train import train
 from etsplat.tasks.train_config import TrainConfig
 from helpers.captures import write_colmap, write_photo
