@@ -16,7 +16,7 @@ from etsplat.optim.loop import CheckpointEvent
 from etsplat.report import write_report
 from etsplat.tasks.reconstruct import reconstruct
 from etsplat.tasks.reconstruct_config import ReconstructConfig
-from etsplat.tasks.soup_run import open_run
+from etsplat.tasks.sources import open_run
 from etsplat.tasks.train import train
 from etsplat.tasks.train_config import TrainConfig
 
