@@ -16,13 +16,14 @@ SANITIZED := build/sanitize/.stamp
 # Folders are listed too: their time changes when a file is added or removed.
 NATIVE := CMakeLists.txt $(shell find csrc)
 
-.PHONY: help setup demo test lint format bench equal-bits sanitize check-neon wheel check-wheel clean
+.PHONY: help setup demo test lint format stubs bench equal-bits sanitize check-neon wheel check-wheel clean
 
 help:
 	@echo "make setup        create .venv and build the package into it"
 	@echo "make demo         reconstruct a built-in object into runs/demo"
 	@echo "make test         run the tests"
 	@echo "make lint         ruff, pyright, import-linter"
+	@echo "make stubs        describe the native calls to Python (src/etsplat/_native.pyi)"
 	@echo "make bench        measure the CPU engine"
 	@echo "make equal-bits BASE=COMMIT  small runs end with the same bits as at that commit; CASES='scene-*' for some"
 	@echo "make sanitize     run the tests of the C++ under ASan and UBSan (GCC, Linux)"
@@ -62,6 +63,9 @@ lint: setup
 format: setup
 	$(VENV)/bin/ruff check --fix .
 	$(VENV)/bin/ruff format .
+
+stubs: setup
+	$(PY) -m tests.helpers.stubs src/etsplat/_native.pyi
 
 bench: setup
 	$(PY) -m benchmarks.rasterizer

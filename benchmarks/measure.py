@@ -63,7 +63,7 @@ def native_state(out: Any) -> Any:
 def count(scene: Scene) -> dict[str, int]:
     """Work of one render."""
     state = native_state(scene.render())
-    counts = _native.count_tiles(state)
+    counts = _native.count_tiles(state=state)
     return {
         "pairs": state.num_pairs,
         "pairs_seen": counts.pairs,
@@ -161,7 +161,7 @@ def summary(values: list[float]) -> dict[str, float]:
 
 def derive(entry: dict[str, Any], timings: Timings, counts: dict[str, int], workers: int) -> None:
     """What follows from times and counts. The scene is one of the elastic kernel."""
-    kernel = _native.time_kernel(KERNELS["elastic"].native_id, 0.5)
+    kernel = _native.time_kernel(kernel=KERNELS["elastic"].native_id, sigma=0.5)
     stage = {name: entry["stages"][name]["median"] for name in STAGES}
     native = [sum(values) for values in zip(*timings.stages.values(), strict=True)]
     entry["counts"] = counts

@@ -35,7 +35,7 @@ def test_useful_pairs_are_the_pixels_in_which_triangles_are_drawn(rng):
             sigma=torch.tensor(0.5),
             cameras=Cameras(*camera, 83, 61),
         )
-        counts = _native.count_tiles(native_state(out))
+        counts = _native.count_tiles(state=native_state(out))
         assert counts.backward_vectors <= counts.forward_vectors
         assert counts.drawn <= 16 * counts.backward_vectors
         assert counts.pairs == native_state(out).num_pairs
@@ -50,7 +50,7 @@ def test_counting_changes_nothing(options, rng):
     out = render({**mesh(rng), **options})
     before = out.alpha.clone()
     state = out.alpha.grad_fn.constants[0].states[0]
-    counts = [_native.count_tiles(state) for _ in range(2)]
+    counts = [_native.count_tiles(state=state) for _ in range(2)]
     assert counts[0].drawn == counts[1].drawn > 0
     assert torch.equal(out.alpha, before)
 
@@ -67,7 +67,7 @@ def test_a_tight_loop_takes_time_and_derivatives_more(instruction_set):
     before = _native.instruction_set()
     try:
         _native.set_instruction_set(instruction_set)
-        times = _native.time_kernel(2, 0.5)
+        times = _native.time_kernel(kernel=2, sigma=0.5)
     finally:
         _native.set_instruction_set(before)
     assert 0.1 < times.value < 1e4

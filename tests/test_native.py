@@ -1,12 +1,16 @@
 """What native calls take, and how they are described."""
 
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 
 from etsplat import _native
+from helpers.stubs import native_stub
 
-pytestmark = pytest.mark.sanitize
+STUB = Path(__file__).resolve().parent.parent / "src" / "etsplat" / "_native.pyi"
 
 
 def photometric(**changed: object) -> float:
@@ -15,6 +19,7 @@ def photometric(**changed: object) -> float:
     return _native.photometric(**{**arguments, **options, **changed})
 
 
+@pytest.mark.sanitize
 @pytest.mark.parametrize("dtype", [torch.float32, torch.uint8])
 def test_a_call_reads_dtype_and_sizes_from_the_tensors(dtype):
     target = torch.zeros(2, 5, 7, 3, dtype=dtype)
@@ -23,6 +28,7 @@ def test_a_call_reads_dtype_and_sizes_from_the_tensors(dtype):
     assert photometric(color=torch.zeros(2, 5, 7, 3), target=target) == pytest.approx(1 / (35 * unit**2))
 
 
+@pytest.mark.sanitize
 @pytest.mark.parametrize(
     ("wrong", "got"),
     [
@@ -44,16 +50,54 @@ def test_what_native_code_cannot_read_is_refused_by_the_name_of_its_argument(wro
             photometric(**{name: wrong})
 
 
+@pytest.mark.sanitize
 def test_either_of_two_dtypes_is_named():
     with pytest.raises(TypeError, match=r"^target must be a contiguous uint8 or float32 tensor .*, got torch.int64"):
         photometric(target=torch.zeros(1, 4, 4, 3, dtype=torch.int64))
 
 
+@pytest.mark.sanitize
 def test_calls_take_their_arguments_by_name_only():
     with pytest.raises(TypeError, match="incompatible function arguments"):
         _native.slot_stride(3, 0, _native.DistortionDepth.NONE)
 
 
+@pytest.mark.sanitize
 def test_none_is_refused_where_a_tensor_is_needed():
     with pytest.raises(TypeError, match="color: NoneType"):
         photometric(color=None)
+
+
+def test_the_description_for_type_checkers_is_that_of_the_module():
+    """`make stubs` writes it."""
+    assert STUB.read_text(encoding="utf-8") == native_stub()
+
+
+@pytest.mark.sanitize
+def test_lists_of_tensors_are_read_one_by_one():
+    """Each element has its own sizes, and is named where it does not fit."""
+    parameters = [torch.ones(3), torch.ones(2, 5), torch.ones(())]
+    zeros = [[torch.zeros_like(parameter) for parameter in parameters] for _ in range(2)]
+    gradients = [torch.ones_like(parameter) for parameter in parameters]
+    rest = {"learning_rates": [0.5] * 3, "beta1": 0.9, "beta2": 0.99, "eps": 0.0, "step": 1}
+    state = {"firsts": zeros[0], "seconds": zeros[1]}
+    _native.adam_step(parameters=parameters, gradients=gradients, **state, **rest)
+    for parameter in parameters:
+        torch.testing.assert_close(parameter, torch.full_like(parameter, 0.5))
+    with pytest.raises(TypeError, match=r"^gradients must be a contiguous float32 tensor .*, got torch.float64"):
+        _native.adam_step(parameters=parameters, gradients=[g.double() for g in gradients], **state, **rest)
+
+
+@pytest.mark.sanitize
+def test_a_group_of_arguments_keeps_its_tensors():
+    """They are read when the call is made, which may be after the last name for them is gone."""
+    color = torch.zeros(1, 16, 16, 3)
+    held = sys.getrefcount(color)
+    gradients = _native.RasterGradients(
+        grad_color=color,
+        **dict.fromkeys(("grad_alpha", "grad_distortion", "corner_offsets", "corner_indices", "vertices")),
+        **dict.fromkeys(("flat_colors", "corner_colors", "opacities", "sigmas", "viewmats", "Ks", "backgrounds")),
+    )
+    assert sys.getrefcount(color) == held + 1
+    del gradients
+    assert sys.getrefcount(color) == held

@@ -25,17 +25,6 @@ std::string written(const nb::object& object) {
     return nb::cast<std::string>(nb::steal<nb::str>(PyObject_Str(object.ptr())));
 }
 
-// The number of axes, or -1.
-int read_sizes(PyObject* shape, int64_t* sizes) {
-    const Py_ssize_t rank = PyTuple_Size(shape);
-    if (rank < 0 || rank > kMostAxes) return -1;
-    for (Py_ssize_t axis = 0; axis < rank; ++axis) {
-        sizes[axis] = PyLong_AsLongLong(PyTuple_GetItem(shape, axis));
-        if (sizes[axis] < 0) return -1;
-    }
-    return static_cast<int>(rank);
-}
-
 }  // namespace
 
 void load_torch() {
@@ -48,20 +37,27 @@ void load_torch() {
 }
 
 void ArrayBase::read(PyObject* tensor) noexcept {
+    *this = ArrayBase();  // casters of lists read one tensor after the other
     tensor_ = tensor;
     const nb::object dtype = attribute(tensor, torch.dtype);
     for (int i = 0; i < kDtypes; ++i) {
         if (dtype.ptr() == torch.dtypes[i]) dtype_ = i;
     }
-    if (dtype_ < 0 || attribute(tensor, torch.is_cpu).ptr() != Py_True ||
-        call_method(tensor, torch.is_contiguous).ptr() != Py_True) {
-        dtype_ = -1;
-    } else {
-        rank_ = read_sizes(attribute(tensor, torch.shape).ptr(), sizes_);
-        const nb::object address = call_method(tensor, torch.data_ptr);
-        data_ = address.is_valid() ? PyLong_AsVoidPtr(address.ptr()) : nullptr;
-        if (rank_ < 0 || !address.is_valid()) dtype_ = -1;
+    const bool dense = dtype_ >= 0 && attribute(tensor, torch.is_cpu).ptr() == Py_True &&
+                       call_method(tensor, torch.is_contiguous).ptr() == Py_True;
+    const nb::object shape = dense ? attribute(tensor, torch.shape) : nb::object();
+    const nb::object address = shape.is_valid() ? call_method(tensor, torch.data_ptr) : nb::object();
+    if (address.is_valid()) {
+        rank_ = static_cast<int>(PyTuple_Size(shape.ptr()));
+        for (int axis = 0; axis < rank_; ++axis) {
+            const int64_t size = PyLong_AsLongLong(PyTuple_GetItem(shape.ptr(), axis));
+            if (axis < kMostAxes) sizes_[axis] = size;
+            if (axis > 0) row_count_ *= size;
+            count_ *= size;
+        }
+        data_ = PyLong_AsVoidPtr(address.ptr());
     }
+    if (!address.is_valid() || PyErr_Occurred()) dtype_ = -1;
     PyErr_Clear();
 }
 

@@ -39,17 +39,14 @@ void load_torch();
 class ArrayBase {
 public:
     int rank() const { return rank_; }
-    // Counted from the last one if `axis` is negative.
+    // Of one of the first kMostAxes axes; counted from the last one if `axis` is negative.
     int64_t size(int axis) const { return sizes_[axis < 0 ? axis + rank_ : axis]; }
-    // Of values from axis `first` on.
-    int64_t count(int first = 0) const {
-        int64_t product = 1;
-        for (int axis = first; axis < rank_; ++axis) product *= sizes_[axis];
-        return product;
-    }
+    // Of all values, and of those of a row of the first axis.
+    int64_t count() const { return count_; }
+    int64_t row_count() const { return row_count_; }
+    PyObject* tensor() const { return tensor_; }
 
 protected:
-    // Takes what lies contiguous on the CPU, whatever its dtype; `fits` tells whether it does.
     void read(PyObject* tensor) noexcept;
     // Raises TypeError: `name` must be what `wanted` says.
     [[noreturn]] void refuse(const char* name, std::initializer_list<Dtype> wanted, int rank) const;
@@ -57,6 +54,7 @@ protected:
     PyObject* tensor_ = nullptr;
     void* data_ = nullptr;
     int64_t sizes_[kMostAxes] = {};
+    int64_t count_ = 1, row_count_ = 1;
     int rank_ = 0;
     int dtype_ = -1;  // a Dtype; -1: this is no tensor that native code can read
 };
@@ -66,7 +64,7 @@ class Array : public ArrayBase {
 public:
     T* data() const { return static_cast<T*>(data_); }
     // Row `index` of the first axis.
-    T* row(int64_t index) const { return data() + index * count(1); }
+    T* row(int64_t index) const { return data() + index * row_count_; }
 
     void read(PyObject* tensor) noexcept { ArrayBase::read(tensor); }
     void check(const char* name) const {

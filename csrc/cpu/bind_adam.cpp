@@ -53,29 +53,29 @@ void adam_step(const std::vector<AdamGroup>& groups) {
 }  // namespace
 
 void bind_adam(nb::module_& m) {
-    // Addresses of float32 arrays, one entry per parameter; `step` counts from 1.
-    m.def(
-        "adam_step",
-        [](const std::vector<Address>& parameters, const std::vector<Address>& gradients,
-           const std::vector<Address>& firsts, const std::vector<Address>& seconds, const std::vector<int64_t>& sizes,
+    // One tensor of each kind and one rate per parameter; `step` counts from 1.
+    def_function(
+        m, "adam_step",
+        [](const std::vector<Array<float>>& parameters, const std::vector<Array<const float>>& gradients,
+           const std::vector<Array<float>>& firsts, const std::vector<Array<float>>& seconds,
            const std::vector<double>& learning_rates, double beta1, double beta2, double eps, int64_t step) {
             const double first_correction = 1.0 - std::pow(beta1, static_cast<double>(step));
             const double second_correction = std::sqrt(1.0 - std::pow(beta2, static_cast<double>(step)));
             std::vector<AdamGroup> groups;
-            for (size_t i = 0; i < sizes.size(); ++i) {
+            for (size_t i = 0; i < parameters.size(); ++i) {
                 AdamCoefficients<float> k;
                 k.first_weight = static_cast<float>(1.0 - beta1);
                 k.second_decay = static_cast<float>(beta2);
                 k.second_weight = static_cast<float>(1.0 - beta2);
-                k.step_size = static_cast<float>(learning_rates[i] / first_correction);
+                k.step_size = static_cast<float>(learning_rates.at(i) / first_correction);
                 k.second_correction = static_cast<float>(second_correction);
                 k.eps = static_cast<float>(eps);
-                groups.push_back({pointer<float>(parameters[i]), pointer<const float>(gradients[i]),
-                                  pointer<float>(firsts[i]), pointer<float>(seconds[i]), sizes[i], k});
+                groups.push_back({parameters[i].data(), gradients.at(i).data(), firsts.at(i).data(),
+                                  seconds.at(i).data(), parameters[i].count(), k});
             }
             adam_step(groups);
         },
-        NoGil());
+        "parameters", "gradients", "firsts", "seconds", "learning_rates", "beta1", "beta2", "eps", "step");
 }
 
 }  // namespace etsplat

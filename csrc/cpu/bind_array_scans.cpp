@@ -6,39 +6,35 @@ namespace etsplat {
 void bind_array_scans(nb::module_& m) {
     nb::class_<FloatScan>(m, "FloatScan").def_ro("unusable", &FloatScan::unusable).def_ro("minimum", &FloatScan::minimum);
     nb::class_<IndexRange>(m, "IndexRange").def_ro("low", &IndexRange::low).def_ro("high", &IndexRange::high);
-    // Addresses of contiguous arrays of `count` float32, int32 or int64; indices must not be empty.
-    m.def(
-        "scan_floats",
-        [](Address values, int64_t count, float largest) {
-            return scan_floats(pointer<const float>(values), count, largest);
+    def_function(
+        m, "scan_floats",
+        [](Array<const float> values, float largest) { return scan_floats(values.data(), values.count(), largest); },
+        "values", "largest");
+    // Of at least one index.
+    def_function(
+        m, "index_range",
+        [](EitherArray<const int32_t, const int64_t> values) {
+            return values.is<const int64_t>() ? index_range(values.data<const int64_t>(), values.count())
+                                              : index_range(values.data<const int32_t>(), values.count());
         },
-        NoGil());
-    m.def(
-        "index_range",
-        [](Address values, int64_t count, bool wide) {
-            return wide ? index_range(pointer<const int64_t>(values), count)
-                        : index_range(pointer<const int32_t>(values), count);
+        "values");
+    // values (N,) from 0 to groups - 1, offsets (groups + 1,), members (N,).
+    def_function(
+        m, "group_indices",
+        [](Array<const int32_t, 1> values, Array<int32_t, 1> offsets, Array<int32_t, 1> members) {
+            group_indices(values.data(), values.count(), offsets.count() - 1, offsets.data(), members.data());
         },
-        NoGil());
-    // values (count,) int32 from 0 to groups - 1, offsets (groups + 1,), members (count,).
-    m.def(
-        "group_indices",
-        [](Address values, int64_t count, int64_t groups, Address offsets, Address members) {
-            group_indices(pointer<const int32_t>(values), count, groups, pointer<int32_t>(offsets),
-                          pointer<int32_t>(members));
-        },
-        NoGil());
-    // values (N, C), offsets (groups + 1,), members into the rows of `values`: sums (groups, C), each in the order of its
+        "values", "offsets", "members");
+    // values (..., C), offsets (groups + 1,), members into the rows of `values`: sums (groups, C), each in the order of its
     // members.
-    m.def(
-        "sum_groups",
-        [](Address values, Address offsets, Address members, int64_t groups, int64_t channels, Address sums) {
-            sum_groups(pointer<const float>(values), pointer<const int32_t>(offsets), pointer<const int32_t>(members),
-                       groups, channels, pointer<float>(sums));
+    def_function(
+        m, "sum_groups",
+        [](Array<const float> values, Array<const int32_t, 1> offsets, Array<const int32_t, 1> members,
+           Array<float, 2> sums) {
+            sum_groups(values.data(), offsets.data(), members.data(), sums.size(0), sums.size(1), sums.data());
         },
-        NoGil());
-    m.def(
-        "zero_floats", [](Address values, int64_t count) { zero_floats(pointer<float>(values), count); }, NoGil());
+        "values", "offsets", "members", "sums");
+    def_function(m, "zero_floats", [](Array<float> values) { zero_floats(values.data(), values.count()); }, "values");
 }
 
 }  // namespace etsplat

@@ -104,38 +104,40 @@ void combine(const float* gradients, const std::vector<float>& weights, int64_t 
 }  // namespace
 
 void bind_mesh_energies(nb::module_& m) {
-    // Addresses: vertices (V, 3) float32; the int32 arrays of etsplat.ops.mesh_energies.MeshConnectivity; gradients
-    // (3, V, 3) float32: of the edge, normal and Laplacian energy. Returns the three values.
-    m.def(
-        "mesh_energies",
-        [](Address vertices, Address faces, Address neighbor_offsets, Address neighbors, Address corner_offsets,
-           Address corners, Address pair_offsets, Address paired_faces, int64_t num_vertices, int64_t num_edges,
-           int64_t num_pairs, int64_t num_faces, int edge_power, Address gradients) {
-            const MeshArrays mesh{pointer<const Vector>(vertices),
-                                  pointer<const int32_t>(faces),
-                                  pointer<const int32_t>(neighbor_offsets),
-                                  pointer<const int32_t>(neighbors),
-                                  pointer<const int32_t>(corner_offsets),
-                                  pointer<const int32_t>(corners),
-                                  pointer<const int32_t>(pair_offsets),
-                                  pointer<const int32_t>(paired_faces),
-                                  num_vertices,
-                                  num_edges,
-                                  num_pairs,
-                                  num_faces};
-            Vector* out = pointer<Vector>(gradients);
+    // vertices (V, 3); the arrays of etsplat.core.connectivity.MeshConnectivity; gradients (3, V, 3): of the edge, normal
+    // and Laplacian energy. Returns the three values.
+    def_function(
+        m, "mesh_energies",
+        [](Array<const float, 2> vertices, Array<const int32_t, 2> faces, Array<const int32_t, 1> neighbor_offsets,
+           Array<const int32_t, 1> neighbor_indices, Array<const int32_t, 1> corner_offsets,
+           Array<const int32_t, 1> corners, Array<const int32_t, 1> pair_offsets, Array<const int32_t, 1> paired_faces,
+           int edge_power, Array<float, 3> gradients) {
+            const MeshArrays mesh{reinterpret_cast<const Vector*>(vertices.data()),
+                                  faces.data(),
+                                  neighbor_offsets.data(),
+                                  neighbor_indices.data(),
+                                  corner_offsets.data(),
+                                  corners.data(),
+                                  pair_offsets.data(),
+                                  paired_faces.data(),
+                                  neighbor_offsets.count() - 1,
+                                  neighbor_indices.count() / 2,
+                                  paired_faces.count() / 2,
+                                  faces.size(0)};
+            const auto by = [&](int64_t energy) { return reinterpret_cast<Vector*>(gradients.row(energy)); };
             std::vector<double> values(3);
-            mesh_energies(mesh, edge_power, {out, out + num_vertices, out + 2 * num_vertices}, values.data());
+            mesh_energies(mesh, edge_power, {by(0), by(1), by(2)}, values.data());
             return values;
         },
-        NoGil());
-    // combined (size,) = weights . gradients (3, size), all float32.
-    m.def(
-        "combine_mesh_gradients",
-        [](Address gradients, const std::vector<float>& weights, int64_t size, Address combined) {
-            combine(pointer<const float>(gradients), weights, size, pointer<float>(combined));
+        "vertices", "faces", "neighbor_offsets", "neighbor_indices", "corner_offsets", "corners", "pair_offsets",
+        "paired_faces", "edge_power", "gradients");
+    // combined (V, 3) = weights . gradients (3, V, 3).
+    def_function(
+        m, "combine_mesh_gradients",
+        [](Array<const float, 3> gradients, const std::vector<float>& weights, Array<float, 2> combined) {
+            combine(gradients.data(), weights, combined.count(), combined.data());
         },
-        NoGil());
+        "gradients", "weights", "combined");
 }
 
 }  // namespace etsplat

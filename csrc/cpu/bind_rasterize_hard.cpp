@@ -4,30 +4,34 @@
 namespace etsplat {
 
 void bind_rasterize_hard(nb::module_& m) {
-    // Addresses: vertices (V, 3) float32; faces (F, 3) int32; viewmat (4, 4), K (3, 3) float32 of one view;
-    // triangle (H, W) int32; barycentrics (H, W, 3), depth (H, W) float32.
-    m.def(
-        "rasterize_hard",
-        [](Address vertices, Address faces, int64_t num_vertices, int64_t num_faces, Address viewmat, Address K,
-           float near_plane, int32_t width, int32_t height, Address triangle, Address barycentrics, Address depth) {
-            const HardMesh mesh{pointer<const float>(vertices), pointer<const int32_t>(faces), num_vertices, num_faces};
-            const HardCamera camera{pointer<const float>(viewmat), pointer<const float>(K), near_plane, width, height};
-            rasterize_hard(mesh, camera, pointer<int32_t>(triangle), pointer<float>(barycentrics),
-                           pointer<float>(depth));
+    // Of one view: vertices (V, 3), faces (F, 3), viewmat (4, 4), K (3, 3); triangle (H, W), barycentrics (H, W, 3), depth
+    // (H, W).
+    def_function(
+        m, "rasterize_opaque",
+        [](Array<const float, 2> vertices, Array<const int32_t, 2> faces, Array<const float, 2> viewmat,
+           Array<const float, 2> K, float near_plane, Array<int32_t, 2> triangle, Array<float, 3> barycentrics,
+           Array<float, 2> depth) {
+            const HardMesh mesh{vertices.data(), faces.data(), vertices.size(0), faces.size(0)};
+            const HardCamera camera{viewmat.data(), K.data(), near_plane, static_cast<int32_t>(triangle.size(1)),
+                                    static_cast<int32_t>(triangle.size(0))};
+            rasterize_hard(mesh, camera, triangle.data(), barycentrics.data(), depth.data());
         },
-        NoGil());
-    // As above; face_colors (F, C) or 0, then vertex_colors (V, C); image (H, W, C + 1) float32.
-    m.def(
-        "render_opaque",
-        [](Address vertices, Address faces, int64_t num_vertices, int64_t num_faces, Address viewmat, Address K,
-           float near_plane, int32_t width, int32_t height, Address face_colors, Address vertex_colors,
-           int32_t channels, int32_t supersampling, bool cull_backfaces, Address image) {
-            const HardMesh mesh{pointer<const float>(vertices), pointer<const int32_t>(faces), num_vertices, num_faces};
-            const HardCamera camera{pointer<const float>(viewmat), pointer<const float>(K), near_plane, width, height};
-            const HardColors colors{pointer<const float>(face_colors), pointer<const float>(vertex_colors), channels};
-            render_opaque(mesh, camera, colors, supersampling, cull_backfaces, pointer<float>(image));
+        "vertices", "faces", "viewmat", "K", "near_plane", "triangle", "barycentrics", "depth");
+    // As above; colors (F, C) or (V, C), image (H, W, C + 1).
+    def_function(
+        m, "render_opaque",
+        [](Array<const float, 2> vertices, Array<const int32_t, 2> faces, Array<const float, 2> viewmat,
+           Array<const float, 2> K, float near_plane, Array<const float, 2> colors, bool per_face,
+           int32_t supersampling, bool cull_backfaces, Array<float, 3> image) {
+            const HardMesh mesh{vertices.data(), faces.data(), vertices.size(0), faces.size(0)};
+            const HardCamera camera{viewmat.data(), K.data(), near_plane, static_cast<int32_t>(image.size(1)),
+                                    static_cast<int32_t>(image.size(0))};
+            const HardColors shown{per_face ? colors.data() : nullptr, per_face ? nullptr : colors.data(),
+                                   static_cast<int32_t>(colors.size(1))};
+            render_opaque(mesh, camera, shown, supersampling, cull_backfaces, image.data());
         },
-        NoGil());
+        "vertices", "faces", "viewmat", "K", "near_plane", "colors", "per_face", "supersampling", "cull_backfaces",
+        "image");
 }
 
 }  // namespace etsplat

@@ -18,40 +18,42 @@ void for_each_triangle(int64_t triangles, const Body& body) {
 }  // namespace
 
 void bind_soup_activation(nb::module_& m) {
-    // vertices (N, 3, 3), logits, raw, opacities, sigma (N) float32; viewmat (4, 4) and K (3, 3) of the camera for which
-    // triangles smaller or larger than this get opacity 0, or 0.
-    m.def(
-        "soup_activate",
-        [](int64_t triangles, Address vertices, Address logits, Address raw, Address viewmat, Address K,
-           float smallest, float largest, float opacity_floor, float sigma_ceiling, Address opacities, Address sigma) {
+    // vertices (N, 3, 3); logits, raw, opacities and sigma (N,); viewmats (1, 4, 4) and Ks (1, 3, 3) of the camera for which
+    // triangles smaller or larger than this get opacity 0, or neither.
+    def_function(
+        m, "soup_activate",
+        [](Array<const float, 3> vertices, Array<const float, 1> logits, Array<const float, 1> raw,
+           OptionalArray<const float, 3> viewmats, OptionalArray<const float, 3> Ks, float smallest, float largest,
+           float opacity_floor, float sigma_ceiling, Array<float, 1> opacities, Array<float, 1> sigma) {
             PinholeCamera camera{};
-            if (viewmat) camera = pinhole_camera(pointer<const float>(viewmat), pointer<const float>(K));
-            for_each_triangle(triangles, [&](int64_t n) {
-                const Activated drawn = activate(pointer<const float>(logits)[n], pointer<const float>(raw)[n],
-                                                 {opacity_floor, sigma_ceiling});
-                const bool left_out = viewmat && is_left_out(camera, pointer<const float>(vertices) + 9 * n, {smallest, largest});
-                pointer<float>(opacities)[n] = left_out ? 0.0f : drawn.opacity;
-                pointer<float>(sigma)[n] = drawn.sigma;
+            if (viewmats) camera = pinhole_camera(viewmats->data(), Ks.value().data());
+            for_each_triangle(logits.count(), [&](int64_t n) {
+                const Activated drawn = activate(logits.data()[n], raw.data()[n], {opacity_floor, sigma_ceiling});
+                const bool left_out = viewmats && is_left_out(camera, vertices.row(n), {smallest, largest});
+                opacities.data()[n] = left_out ? 0.0f : drawn.opacity;
+                sigma.data()[n] = drawn.sigma;
             });
         },
-        NoGil());
-    // An opacity of 0 belongs to a triangle that was left out. Gradients of the outputs may be 0.
-    m.def(
-        "soup_activate_backward",
-        [](int64_t triangles, Address logits, Address raw, Address opacities, float opacity_floor, float sigma_ceiling,
-           Address grad_opacities, Address grad_sigma, Address grad_logits, Address grad_raw) {
-            for_each_triangle(triangles, [&](int64_t n) {
-                const bool drawn = pointer<const float>(opacities)[n] > 0.0f;
-                const Activated grad{grad_opacities && drawn ? pointer<const float>(grad_opacities)[n] : 0.0f,
-                                     grad_sigma ? pointer<const float>(grad_sigma)[n] : 0.0f};
+        "vertices", "logits", "raw", "viewmats", "Ks", "smallest", "largest", "opacity_floor", "sigma_ceiling",
+        "opacities", "sigma");
+    // All (N,). An opacity of 0 belongs to a triangle that was left out.
+    def_function(
+        m, "soup_activate_backward",
+        [](Array<const float, 1> logits, Array<const float, 1> raw, Array<const float, 1> opacities,
+           float opacity_floor, float sigma_ceiling, OptionalArray<const float, 1> grad_opacities,
+           OptionalArray<const float, 1> grad_sigma, Array<float, 1> grad_logits, Array<float, 1> grad_raw) {
+            for_each_triangle(logits.count(), [&](int64_t n) {
+                const bool drawn = opacities.data()[n] > 0.0f;
+                const Activated grad{grad_opacities && drawn ? grad_opacities->data()[n] : 0.0f,
+                                     grad_sigma ? grad_sigma->data()[n] : 0.0f};
                 const Activated result =
-                    activate_backward(pointer<const float>(logits)[n], pointer<const float>(raw)[n],
-                                      {opacity_floor, sigma_ceiling}, grad);
-                pointer<float>(grad_logits)[n] = result.opacity;
-                pointer<float>(grad_raw)[n] = result.sigma;
+                    activate_backward(logits.data()[n], raw.data()[n], {opacity_floor, sigma_ceiling}, grad);
+                grad_logits.data()[n] = result.opacity;
+                grad_raw.data()[n] = result.sigma;
             });
         },
-        NoGil());
+        "logits", "raw", "opacities", "opacity_floor", "sigma_ceiling", "grad_opacities", "grad_sigma", "grad_logits",
+        "grad_raw");
 }
 
 }  // namespace etsplat

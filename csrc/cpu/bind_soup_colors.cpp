@@ -61,29 +61,38 @@ void backward(const SoupColors& p, const float* colors, const float* grad_colors
     });
 }
 
+SoupColors problem(const Array<const float, 3>& corners, const Array<const float, 3>& dc,
+                   const Array<const float, 3>& rest, const Array<const float, 2>& centers, int degree) {
+    return {reinterpret_cast<const Vector*>(corners.data()),
+            dc.data(),
+            rest.data(),
+            reinterpret_cast<const Vector*>(centers.data()),
+            corners.size(0),
+            centers.size(0),
+            rest.size(1),
+            degree};
+}
+
 }  // namespace
 
 void bind_soup_colors(nb::module_& m) {
-    // corners (N, 3, 3), dc (N, 1, 3), rest (N, bases, 3), centers (views, 3), colors (views, N, 3), all float32.
-    m.def(
-        "soup_colors",
-        [](Address corners, Address dc, Address rest, Address centers, int64_t triangles, int64_t views, int64_t bases,
-           int degree, Address colors) {
-            forward({pointer<const Vector>(corners), pointer<const float>(dc), pointer<const float>(rest),
-                     pointer<const Vector>(centers), triangles, views, bases, degree},
-                    pointer<float>(colors));
+    // corners (N, 3, 3), dc (N, 1, 3), rest (N, bases, 3), centers (views, 3), colors (views, N, 3).
+    def_function(
+        m, "soup_colors",
+        [](Array<const float, 3> corners, Array<const float, 3> dc, Array<const float, 3> rest,
+           Array<const float, 2> centers, int degree, Array<float, 3> colors) {
+            forward(problem(corners, dc, rest, centers, degree), colors.data());
         },
-        NoGil());
-    m.def(
-        "soup_colors_backward",
-        [](Address corners, Address dc, Address rest, Address centers, int64_t triangles, int64_t views, int64_t bases,
-           int degree, Address colors, Address grad_colors, Address grad_corners, Address grad_dc, Address grad_rest) {
-            backward({pointer<const Vector>(corners), pointer<const float>(dc), pointer<const float>(rest),
-                      pointer<const Vector>(centers), triangles, views, bases, degree},
-                     pointer<const float>(colors), pointer<const float>(grad_colors), pointer<Vector>(grad_corners),
-                     pointer<float>(grad_dc), pointer<float>(grad_rest));
+        "corners", "dc", "rest", "centers", "degree", "colors");
+    def_function(
+        m, "soup_colors_backward",
+        [](Array<const float, 3> corners, Array<const float, 3> dc, Array<const float, 3> rest,
+           Array<const float, 2> centers, int degree, Array<const float, 3> colors, Array<const float, 3> grad_colors,
+           Array<float, 3> grad_corners, Array<float, 3> grad_dc, Array<float, 3> grad_rest) {
+            backward(problem(corners, dc, rest, centers, degree), colors.data(), grad_colors.data(),
+                     reinterpret_cast<Vector*>(grad_corners.data()), grad_dc.data(), grad_rest.data());
         },
-        NoGil());
+        "corners", "dc", "rest", "centers", "degree", "colors", "grad_colors", "grad_corners", "grad_dc", "grad_rest");
 }
 
 }  // namespace etsplat

@@ -79,31 +79,36 @@ void backward(const ShProblem& p, const float* colors, const float* grad_colors,
     });
 }
 
+ShProblem problem(const Array<const float, 3>& coefficients, const Array<const float>& directions, int degree) {
+    return {coefficients.data(),
+            reinterpret_cast<const Vector*>(directions.data()),
+            coefficients.size(0),
+            directions.rank() == 3 ? directions.size(0) : 1,
+            coefficients.size(1),
+            coefficients.size(2),
+            degree};
+}
+
 }  // namespace
 
 void bind_spherical_harmonics(nb::module_& m) {
-    // coefficients (N, bases, channels), directions (views, N, 3), colors (views, N, channels), all float32.
-    m.def(
-        "spherical_harmonics",
-        [](Address coefficients, Address directions, int64_t points, int64_t views, int64_t bases, int64_t channels,
-           int degree, Address colors) {
-            const auto run = channels == 3 ? forward<3> : forward<0>;
-            run({pointer<const float>(coefficients), pointer<const Vector>(directions), points, views, bases, channels,
-                 degree},
-                pointer<float>(colors));
+    // coefficients (N, bases, channels); directions (views, N, 3) and colors (views, N, channels), or without views.
+    def_function(
+        m, "spherical_harmonics",
+        [](Array<const float, 3> coefficients, Array<const float> directions, int degree, Array<float> colors) {
+            const auto run = coefficients.size(2) == 3 ? forward<3> : forward<0>;
+            run(problem(coefficients, directions, degree), colors.data());
         },
-        NoGil());
-    m.def(
-        "spherical_harmonics_backward",
-        [](Address coefficients, Address directions, int64_t points, int64_t views, int64_t bases, int64_t channels,
-           int degree, Address colors, Address grad_colors, Address grad_coefficients, Address grad_directions) {
-            const auto run = channels == 3 ? backward<3> : backward<0>;
-            run({pointer<const float>(coefficients), pointer<const Vector>(directions), points, views, bases, channels,
-                 degree},
-                pointer<const float>(colors), pointer<const float>(grad_colors), pointer<float>(grad_coefficients),
-                pointer<Vector>(grad_directions));
+        "coefficients", "directions", "degree", "colors");
+    def_function(
+        m, "spherical_harmonics_backward",
+        [](Array<const float, 3> coefficients, Array<const float> directions, int degree, Array<const float> colors,
+           Array<const float> grad_colors, Array<float, 3> grad_coefficients, Array<float> grad_directions) {
+            const auto run = coefficients.size(2) == 3 ? backward<3> : backward<0>;
+            run(problem(coefficients, directions, degree), colors.data(), grad_colors.data(), grad_coefficients.data(),
+                reinterpret_cast<Vector*>(grad_directions.data()));
         },
-        NoGil());
+        "coefficients", "directions", "degree", "colors", "grad_colors", "grad_coefficients", "grad_directions");
 }
 
 }  // namespace etsplat

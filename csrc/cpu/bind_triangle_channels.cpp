@@ -15,42 +15,44 @@ constexpr int64_t kTriangles = 1024;  // that a thread takes at a time
 }  // namespace
 
 void bind_triangle_channels(nb::module_& m) {
-    // corners (N, 3, 3), viewmats (B, 4, 4), channels (B, N, D), D = depth + 3 normals; all float32.
-    m.def(
-        "triangle_channels",
-        [](Address corners, Address viewmats, int64_t triangles, int64_t views, bool depth, bool normals,
-           Address channels) {
-            const int64_t count = (depth ? 1 : 0) + (normals ? 3 : 0);
-            for (int64_t b = 0; b < views; ++b) {
-                const DepthAxis camera = depth_axis(pointer<const float>(viewmats) + 16 * b);
+    // corners (N, 3, 3), viewmats (B, 4, 4), channels (B, N, D), D = depth + 3 normals.
+    def_function(
+        m, "triangle_channels",
+        [](Array<const float, 3> corners, Array<const float, 3> viewmats, bool depth, bool normals,
+           Array<float, 3> channels) {
+            const int64_t triangles = corners.size(0);
+            const Vector* corner = reinterpret_cast<const Vector*>(corners.data());
+            for (int64_t b = 0; b < viewmats.size(0); ++b) {
+                const DepthAxis camera = depth_axis(viewmats.row(b));
                 parallel_for(triangles, kTriangles, [&](int64_t begin, int64_t end) {
                     for (int64_t n = begin; n < end; ++n) {
-                        triangle_channels(camera, pointer<const Vector>(corners) + 3 * n, depth, normals,
-                                          pointer<float>(channels) + (b * triangles + n) * count);
+                        triangle_channels(camera, corner + 3 * n, depth, normals,
+                                          channels.data() + (b * triangles + n) * channels.size(2));
                     }
                 });
             }
         },
-        NoGil());
-    m.def(
-        "triangle_channels_backward",
-        [](Address corners, Address viewmats, int64_t triangles, int64_t views, bool depth, bool normals,
-           Address grad_channels, Address grad_corners) {
-            const int64_t count = (depth ? 1 : 0) + (normals ? 3 : 0);
+        "corners", "viewmats", "depth", "normals", "channels");
+    def_function(
+        m, "triangle_channels_backward",
+        [](Array<const float, 3> corners, Array<const float, 3> viewmats, bool depth, bool normals,
+           Array<const float, 3> grad_channels, Array<float, 3> grad_corners) {
+            const int64_t triangles = corners.size(0);
+            const Vector* corner = reinterpret_cast<const Vector*>(corners.data());
             parallel_for(triangles, kTriangles, [&](int64_t begin, int64_t end) {
-                Vector* grad = pointer<Vector>(grad_corners);
+                Vector* grad = reinterpret_cast<Vector*>(grad_corners.data());
                 std::fill(grad + 3 * begin, grad + 3 * end, Vector{});
-                for (int64_t b = 0; b < views; ++b) {
-                    const DepthAxis camera = depth_axis(pointer<const float>(viewmats) + 16 * b);
+                for (int64_t b = 0; b < viewmats.size(0); ++b) {
+                    const DepthAxis camera = depth_axis(viewmats.row(b));
                     for (int64_t n = begin; n < end; ++n) {
                         triangle_channels_backward(
-                            camera, pointer<const Vector>(corners) + 3 * n, depth, normals,
-                            pointer<const float>(grad_channels) + (b * triangles + n) * count, grad + 3 * n);
+                            camera, corner + 3 * n, depth, normals,
+                            grad_channels.data() + (b * triangles + n) * grad_channels.size(2), grad + 3 * n);
                     }
                 }
             });
         },
-        NoGil());
+        "corners", "viewmats", "depth", "normals", "grad_channels", "grad_corners");
 }
 
 }  // namespace etsplat

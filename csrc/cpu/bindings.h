@@ -9,27 +9,26 @@
 
 #include <cstdint>
 #include <optional>
+#include <type_traits>
+#include <utility>
+#include <vector>
 
 #include "array.h"
 
 namespace etsplat {
 
 namespace nb = nanobind;
-using Address = std::uintptr_t;
-
-template <class T>
-T* pointer(Address address) {
-    return reinterpret_cast<T*>(address);
-}
-
-using NoGil = nb::call_guard<nb::gil_scoped_release>;
-
 template <class T, int Rank = kAnyRank>
 using OptionalArray = std::optional<Array<T, Rank>>;
 
 template <class T, int Rank>
 T* data_or_null(const OptionalArray<T, Rank>& array) {
     return array ? array->data() : nullptr;
+}
+
+template <class T, int Rank>
+T* row_or_null(const OptionalArray<T, Rank>& array, int64_t index) {
+    return array ? array->row(index) : nullptr;
 }
 
 namespace bindings_detail {
@@ -57,12 +56,41 @@ auto guarded(const Function& function, Return (Function::*)(Arguments...) const,
     };
 }
 
+template <class T>
+void keep(std::vector<nb::object>& kept, const T& value) {
+    if constexpr (std::is_base_of_v<ArrayBase, T>) kept.push_back(nb::borrow(value.tensor()));
+}
+template <class T>
+void keep(std::vector<nb::object>& kept, const std::optional<T>& value) {
+    if (value) keep(kept, *value);
+}
+
 }  // namespace bindings_detail
 
 // Exposes `function`, a lambda, whose arguments are given by name. It runs without the GIL.
 template <class Function, class... Names>
 void def_function(nb::module_& m, const char* name, const Function& function, const Names&... names) {
     m.def(name, bindings_detail::guarded(function, &Function::operator(), names...), nb::kw_only(), nb::arg(names)...);
+}
+
+// Arguments of a call under a name of their own. It keeps the tensors alive.
+struct ArgumentGroup {
+    std::vector<nb::object> kept;
+};
+
+// Exposes a group, whose members are given by name when one is made.
+template <class Group, class... Members>
+void def_group(nb::module_& m, const char* name, std::pair<const char*, Members Group::*>... members) {
+    nb::class_<Group>(m, name).def(
+        "__init__",
+        [members...](Group* self, Members... values) {
+            (bindings_detail::check_argument(members.first, values), ...);
+            Group group{};
+            ((group.*members.second = values), ...);
+            (bindings_detail::keep(group.kept, values), ...);
+            new (self) Group(std::move(group));
+        },
+        nb::kw_only(), nb::arg(members.first)...);
 }
 
 }  // namespace etsplat

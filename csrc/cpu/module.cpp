@@ -45,14 +45,14 @@ std::terminate_handler other_handler = nullptr;
 
 NB_MODULE(_native, m) {
     using namespace etsplat;
-    m.doc() = "CPU engine of etsplat.";
+    m.doc() = "Native code of etsplat. This file is made by `make stubs`.";
     nb::set_leak_warnings(false);  // tensors alive at interpreter exit keep their render states, which is no leak
 #if !defined(_WIN32)
     other_handler = std::set_terminate(outlast_the_interpreter);
 #endif
     load_torch();
     m.def("num_threads", &num_threads);
-    m.def("set_num_threads", &set_num_threads);
+    m.def("set_num_threads", &set_num_threads, nb::arg("count"));
     m.def("parallel_seconds", &parallel_seconds);
     m.def("reset_parallel_seconds", &reset_parallel_seconds);
     bind_adam(m);

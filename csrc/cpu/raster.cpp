@@ -36,7 +36,7 @@ std::shared_ptr<RasterState> acquire_state() {
 }
 
 PinholeCamera camera_of(const RasterCall& call) {
-    return pinhole_camera(reinterpret_cast<const float*>(call.viewmat), reinterpret_cast<const float*>(call.K));
+    return pinhole_camera(call.viewmat, call.K);
 }
 
 void fill_pass(RasterState& state) {
@@ -49,8 +49,8 @@ void fill_pass(RasterState& state) {
     pass.kernel = call.kernel;
     pass.flat_channels = call.flat_channels;
     pass.corner_channels = call.corner_channels;
-    pass.want_distortion = call.distortion != 0;
-    pass.want_median = call.median_triangle != 0;
+    pass.want_distortion = call.distortion != nullptr;
+    pass.want_median = call.median_triangle != nullptr;
     if (pass.want_distortion)
         pass.distortion_depth = call.centroid_depth ? DistortionDepth::kCentroid : DistortionDepth::kPlane;
     // With the cut-offs off, too: where alpha is 0 x^(2/sigma) may have overflowed, and the backward divides by 1 - alpha.
@@ -90,23 +90,23 @@ void fill_triangles(RasterState& state) {
 // Where the arrays of `call` lie: the backward pass may be handed them elsewhere than the forward pass found them.
 void bind_arrays(RasterState& state, const RasterCall& call) {
     RasterPass& pass = state.pass;
-    pass.kernel_table = reinterpret_cast<const float*>(call.kernel_table);
-    pass.flat_colors = reinterpret_cast<const float*>(call.flat_colors);
-    pass.corner_colors = reinterpret_cast<const float*>(call.corner_colors);
-    pass.background = reinterpret_cast<const float*>(call.background);
-    pass.color = reinterpret_cast<float*>(call.color);
-    pass.alpha = reinterpret_cast<float*>(call.alpha);
-    pass.distortion = reinterpret_cast<float*>(call.distortion);
-    pass.distortion_totals = reinterpret_cast<float*>(call.distortion_totals);
-    pass.median_triangle = reinterpret_cast<int32_t*>(call.median_triangle);
+    pass.kernel_table = call.kernel_table;
+    pass.flat_colors = call.flat_colors;
+    pass.corner_colors = call.corner_colors;
+    pass.background = call.background;
+    pass.color = call.color;
+    pass.alpha = call.alpha;
+    pass.distortion = call.distortion;
+    pass.distortion_totals = call.distortion_totals;
+    pass.median_triangle = call.median_triangle;
     TrianglePass& triangles = state.triangles;
-    triangles.vertices = reinterpret_cast<const float*>(call.vertices);
-    triangles.faces = reinterpret_cast<const int32_t*>(call.faces);
-    triangles.opacities = reinterpret_cast<const float*>(call.opacities);
-    triangles.sigmas = reinterpret_cast<const float*>(call.sigmas);
-    triangles.screen_size = reinterpret_cast<float*>(call.screen_size);
-    triangles.inradius = reinterpret_cast<float*>(call.inradius);
-    triangles.visible = reinterpret_cast<bool*>(call.visible);
+    triangles.vertices = call.vertices;
+    triangles.faces = call.faces;
+    triangles.opacities = call.opacities;
+    triangles.sigmas = call.sigmas;
+    triangles.screen_size = call.screen_size;
+    triangles.inradius = call.inradius;
+    triangles.visible = call.visible;
 }
 
 void project_triangles(RasterState& state, const TriangleKernels& kernels) {
@@ -131,7 +131,7 @@ void run_tiles(RasterState& state, const TileFunction function) {
 }
 
 void reduce_weights(RasterState& state) {
-    auto* out = reinterpret_cast<float*>(state.call.max_weight);
+    auto* out = state.call.max_weight;
     parallel_for(state.call.num_triangles, 4096, [&](int64_t begin, int64_t end) {
         for (int64_t i = begin; i < end; ++i) {
             float largest = 0.0f;
@@ -191,9 +191,9 @@ void raster_backward(RasterState& state, const RasterCall& call, const RasterGra
     RasterPass& pass = state.pass;
     if (!state.call.keep_for_backward) throw std::logic_error("rasterize: this render was made without keep_for_backward");
     bind_arrays(state, call);
-    pass.grad_color = reinterpret_cast<const float*>(gradients.grad_color);
-    pass.grad_alpha = reinterpret_cast<const float*>(gradients.grad_alpha);
-    pass.grad_distortion = reinterpret_cast<const float*>(gradients.grad_distortion);
+    pass.grad_color = gradients.grad_color;
+    pass.grad_alpha = gradients.grad_alpha;
+    pass.grad_distortion = gradients.grad_distortion;
     state.slots.resize(state.num_slots * pass.slot_layout.stride());
     state.touched.resize(state.num_slots);
     state.touched.fill_zero();

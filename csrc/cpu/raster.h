@@ -20,19 +20,19 @@
 
 namespace etsplat {
 
-// Everything a call needs, by address; the Python side owns the memory, and keeps it for as long as the call runs, no
-// longer. 0 where an optional tensor is absent.
+// Everything a call needs; the Python side owns the memory, and keeps it for as long as the call runs, no longer. Null
+// where an optional tensor is absent.
 struct RasterCall {
-    uintptr_t vertices = 0;  // (N, 3, 3), or (V, 3) with faces
-    uintptr_t faces = 0;     // (N, 3) int32
+    const float* vertices = nullptr;  // (N, 3, 3), or (V, 3) with faces
+    const int32_t* faces = nullptr;   // (N, 3)
     int64_t num_triangles = 0, num_vertices = 0;
-    uintptr_t flat_colors = 0, corner_colors = 0;  // (N, flat_channels), (N, 3, corner_channels)
+    const float *flat_colors = nullptr, *corner_colors = nullptr;  // (N, flat_channels), (N, 3, corner_channels)
     int flat_channels = 0, corner_channels = 0;
-    uintptr_t opacities = 0, sigmas = 0;  // (N), (N) or one
+    const float *opacities = nullptr, *sigmas = nullptr;  // (N), (N) or one
     bool shared_sigma = false;
-    uintptr_t viewmat = 0, K = 0;   // 16 and 9 floats, row-major
-    uintptr_t background = 0;       // (channels)
-    uintptr_t kernel_table = 0;     // of kernel "Tabulated"
+    const float *viewmat = nullptr, *K = nullptr;  // 16 and 9 floats, row-major
+    const float* background = nullptr;             // (channels)
+    const float* kernel_table = nullptr;           // of kernel "Tabulated"
     int width = 0, height = 0, kernel = 0, distance = 0;
     bool freeze_inradius = false;
     float near_plane = 0.01f, alpha_min = 0, alpha_max = 1, x_max = 2, transmittance_min = 0;
@@ -40,17 +40,20 @@ struct RasterCall {
     bool centroid_depth = false;  // depth of the distortion: the centroid's, not the pixel's
     bool keep_for_backward = false;
 
-    uintptr_t color = 0, alpha = 0;
-    uintptr_t distortion = 0, distortion_totals = 0, median_triangle = 0;
-    uintptr_t max_weight = 0, screen_size = 0, inradius = 0, visible = 0;  // (N) float, float, float, bool
+    float *color = nullptr, *alpha = nullptr, *distortion = nullptr, *distortion_totals = nullptr;
+    int32_t* median_triangle = nullptr;
+    float *max_weight = nullptr, *screen_size = nullptr, *inradius = nullptr;  // (N)
+    bool* visible = nullptr;                                                   // (N)
 };
 
 // Gradients in and out; outputs are added to.
 struct RasterGradients {
-    uintptr_t grad_color = 0, grad_alpha = 0, grad_distortion = 0;
-    uintptr_t corner_offsets = 0, corner_indices = 0;  // of each vertex, with faces: where it is used, as 3 face + corner
-    uintptr_t vertices = 0, flat_colors = 0, corner_colors = 0, opacities = 0, sigmas = 0, background = 0;
-    uintptr_t viewmat = 0, K = 0;  // 16 and 9 floats
+    const float *grad_color = nullptr, *grad_alpha = nullptr, *grad_distortion = nullptr;
+    // Of each vertex, with faces: where it is used, as 3 face + corner.
+    const int32_t *corner_offsets = nullptr, *corner_indices = nullptr;
+    float *vertices = nullptr, *flat_colors = nullptr, *corner_colors = nullptr, *opacities = nullptr;
+    float *sigmas = nullptr, *background = nullptr;
+    float *viewmat = nullptr, *K = nullptr;  // 16 and 9 floats
 };
 
 struct RasterState {
@@ -80,7 +83,7 @@ void bin_triangles(RasterState& state, const TriangleKernels& kernels);
 void reduce_gradients(RasterState& state, const RasterGradients& gradients);
 
 std::shared_ptr<RasterState> raster_forward(const RasterCall& call);
-// `call` is that of the forward pass, with the addresses of now.
+// `call` is that of the forward pass, with where its arrays lie now.
 void raster_backward(RasterState& state, const RasterCall& call, const RasterGradients& gradients);
 
 }  // namespace etsplat

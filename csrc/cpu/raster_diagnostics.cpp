@@ -25,9 +25,9 @@ std::vector<std::string> kernel_names() {
 #undef ETSPLAT_NAME
 }
 
-KernelNanoseconds time_kernel(int kernel, float sigma, uintptr_t kernel_table) {
-    if (kernel < 0 || kernel >= kKernels) throw std::invalid_argument("time_kernel: no such kernel");
-    const float* table = reinterpret_cast<const float*>(kernel_table);
+KernelNanoseconds time_kernel(int kernel, float sigma) {
+    if (kernel < 0 || kernel >= kKernels - 1) throw std::invalid_argument("time_kernel: no such kernel");
+    constexpr const float* table = nullptr;
     constexpr int kCount = 1024, kLoops = 100, kRuns = 50;
     alignas(64) float x[kCount], out[kCount];
     for (int i = 0; i < kCount; ++i) x[i] = 2.0f * (static_cast<float>(i) + 0.5f) / kCount;

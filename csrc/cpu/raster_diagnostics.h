@@ -20,7 +20,7 @@ struct KernelNanoseconds {
 };
 
 // Nanoseconds that a tight loop over an array in the first-level cache needs for 16 values of a kernel, and for 16 values
-// with both derivatives, on one thread and the active instruction set; the best of many runs. kernel_table: as in RasterCall.
-KernelNanoseconds time_kernel(int kernel, float sigma, uintptr_t kernel_table);
+// with both derivatives, on one thread and the active instruction set; the best of many runs. Not of the last kernel, which wants a table.
+KernelNanoseconds time_kernel(int kernel, float sigma);
 
 }  // namespace etsplat

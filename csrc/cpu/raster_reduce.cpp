@@ -10,9 +10,9 @@ namespace etsplat {
 namespace {
 
 void gather_vertices(const RasterState& state, const RasterGradients& gradients) {
-    const auto* offsets = reinterpret_cast<const int32_t*>(gradients.corner_offsets);
-    const auto* corners = reinterpret_cast<const int32_t*>(gradients.corner_indices);
-    auto* out = reinterpret_cast<float*>(gradients.vertices);
+    const auto* offsets = gradients.corner_offsets;
+    const auto* corners = gradients.corner_indices;
+    auto* out = gradients.vertices;
     parallel_for(state.call.num_vertices, 4096, [&](int64_t begin, int64_t end) {
         for (int64_t v = begin; v < end; ++v) {
             float sum[3] = {};
@@ -41,11 +41,11 @@ void reduce_gradients(RasterState& state, const RasterGradients& gradients) {
     TrianglePass& pass = state.triangles;
     pass.want_camera = gradients.viewmat || gradients.K;
     pass.grad_corners = gather ? state.corner_gradients.data() : nullptr;
-    pass.grad_vertices = gather ? nullptr : reinterpret_cast<float*>(gradients.vertices);
-    pass.grad_flat = reinterpret_cast<float*>(gradients.flat_colors);
-    pass.grad_corner_colors = reinterpret_cast<float*>(gradients.corner_colors);
-    pass.grad_opacities = reinterpret_cast<float*>(gradients.opacities);
-    pass.grad_sigmas = call.shared_sigma ? nullptr : reinterpret_cast<float*>(gradients.sigmas);
+    pass.grad_vertices = gather ? nullptr : gradients.vertices;
+    pass.grad_flat = gradients.flat_colors;
+    pass.grad_corner_colors = gradients.corner_colors;
+    pass.grad_opacities = gradients.opacities;
+    pass.grad_sigmas = call.shared_sigma ? nullptr : gradients.sigmas;
 
     const TriangleKernels::Reduce reduce = active_triangle_kernels().reduce;
     std::vector<ChunkSums> chunks(static_cast<size_t>((pass.count + kTriangleChunk - 1) / kTriangleChunk));
@@ -55,15 +55,15 @@ void reduce_gradients(RasterState& state, const RasterGradients& gradients) {
         chunks[static_cast<size_t>(begin / kTriangleChunk)] = reduce(state.pass, pass, begin, end, scratch.data());
     });
     if (gather) gather_vertices(state, gradients);
-    if (gradients.background) add_background(state, reinterpret_cast<float*>(gradients.background));
+    if (gradients.background) add_background(state, gradients.background);
     ChunkSums total{};
     for (const ChunkSums& chunk : chunks) {
         total.sigma += chunk.sigma;
         for (int k = 0; k < kCameraGradients; ++k) total.camera[k] += chunk.camera[k];
     }
-    if (call.shared_sigma && gradients.sigmas) *reinterpret_cast<float*>(gradients.sigmas) += static_cast<float>(total.sigma);
-    const auto add_camera = [&](uintptr_t out, int place, int number) {
-        if (out) reinterpret_cast<float*>(out)[place] += static_cast<float>(total.camera[number]);
+    if (call.shared_sigma && gradients.sigmas) *gradients.sigmas += static_cast<float>(total.sigma);
+    const auto add_camera = [&](float* out, int place, int number) {
+        if (out) out[place] += static_cast<float>(total.camera[number]);
     };
     for (int k = 0; k < 12; ++k) add_camera(gradients.viewmat, k, k);
     for (int k = 0; k < 4; ++k) add_camera(gradients.K, kIntrinsicsPlace[k], 12 + k);

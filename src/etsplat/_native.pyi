@@ -1,3 +1,344 @@
-from typing import Any
+"""Native code of etsplat. This file is made by `make stubs`."""
 
-def __getattr__(name: str) -> Any: ...
+import enum
+from collections.abc import Sequence
+
+import numpy
+import numpy.typing
+import torch
+
+def num_threads() -> int: ...
+def set_num_threads(count: int) -> None: ...
+def parallel_seconds() -> float: ...
+def reset_parallel_seconds() -> None: ...
+def adam_step(
+    *,
+    parameters: Sequence[torch.Tensor],
+    gradients: Sequence[torch.Tensor],
+    firsts: Sequence[torch.Tensor],
+    seconds: Sequence[torch.Tensor],
+    learning_rates: Sequence[float],
+    beta1: float,
+    beta2: float,
+    eps: float,
+    step: int,
+) -> None: ...
+
+class AntialiasState:
+    pass
+
+class AntialiasViews:
+    def __init__(
+        self,
+        *,
+        vertices: torch.Tensor,
+        faces: torch.Tensor,
+        viewmats: torch.Tensor,
+        Ks: torch.Tensor,
+        near_plane: float,
+        pair_offsets: torch.Tensor,
+        paired_faces: torch.Tensor,
+        triangle: torch.Tensor,
+        barycentrics: torch.Tensor,
+        depth: torch.Tensor,
+        colors: torch.Tensor,
+        per_face: bool,
+        backgrounds: torch.Tensor,
+    ) -> None: ...
+
+def antialias_forward(*, views: AntialiasViews, shaded: torch.Tensor, color: torch.Tensor) -> list[AntialiasState]: ...
+def antialias_backward(
+    *,
+    states: Sequence[AntialiasState],
+    views: AntialiasViews,
+    grad_color: torch.Tensor,
+    shaded: torch.Tensor,
+    scratch: torch.Tensor,
+    grad_vertices: torch.Tensor | None,
+    grad_colors: torch.Tensor | None,
+    grad_backgrounds: torch.Tensor | None,
+) -> None: ...
+
+class FloatScan:
+    @property
+    def unusable(self) -> int: ...
+    @property
+    def minimum(self) -> float: ...
+
+class IndexRange:
+    @property
+    def low(self) -> int: ...
+    @property
+    def high(self) -> int: ...
+
+def scan_floats(*, values: torch.Tensor, largest: float) -> FloatScan: ...
+def index_range(*, values: torch.Tensor) -> IndexRange: ...
+def group_indices(*, values: torch.Tensor, offsets: torch.Tensor, members: torch.Tensor) -> None: ...
+def sum_groups(*, values: torch.Tensor, offsets: torch.Tensor, members: torch.Tensor, sums: torch.Tensor) -> None: ...
+def zero_floats(*, values: torch.Tensor) -> None: ...
+
+TILE: int = 16
+
+TRIANGLE_RECORD: int = 16
+
+ATTRIBUTE_RECORD: int = 8
+
+CAMERA_GRADIENTS: int = 16
+
+MOST_GPU_CHANNELS: int = 16
+
+MAX_SH_DEGREE: int = 3
+
+class DistortionDepth(enum.IntEnum):
+    NONE = 0
+
+    PLANE = 1
+
+    CENTROID = 2
+
+def slot_stride(*, flat_channels: int, corner_channels: int, distortion: DistortionDepth) -> int: ...
+def select_edge_splits(
+    *,
+    order: torch.Tensor,
+    longest_edge: torch.Tensor,
+    edge_face_offsets: torch.Tensor,
+    edge_faces: torch.Tensor,
+    split_edge: torch.Tensor,
+    max_new_faces: int,
+) -> None: ...
+def closest_faces(
+    *,
+    points: torch.Tensor,
+    vertices: torch.Tensor,
+    faces: torch.Tensor,
+    squared_distances: torch.Tensor,
+    closest: torch.Tensor,
+) -> None: ...
+def mark_intersecting_faces(*, vertices: torch.Tensor, faces: torch.Tensor, intersecting: torch.Tensor) -> None: ...
+def mesh_energies(
+    *,
+    vertices: torch.Tensor,
+    faces: torch.Tensor,
+    neighbor_offsets: torch.Tensor,
+    neighbor_indices: torch.Tensor,
+    corner_offsets: torch.Tensor,
+    corners: torch.Tensor,
+    pair_offsets: torch.Tensor,
+    paired_faces: torch.Tensor,
+    edge_power: int,
+    gradients: torch.Tensor,
+) -> list[float]: ...
+def combine_mesh_gradients(*, gradients: torch.Tensor, weights: Sequence[float], combined: torch.Tensor) -> None: ...
+def normal_agreement(
+    *,
+    normals: torch.Tensor,
+    depth: torch.Tensor,
+    alpha: torch.Tensor,
+    viewmats: torch.Tensor,
+    Ks: torch.Tensor,
+    by_normals: torch.Tensor | None,
+    by_depth: torch.Tensor | None,
+) -> float: ...
+def photometric(
+    *,
+    color: torch.Tensor,
+    target: torch.Tensor,
+    backgrounds: torch.Tensor | None,
+    mask: torch.Tensor | None,
+    gradient: torch.Tensor | None,
+    squared: bool,
+    dssim_weight: float,
+) -> float: ...
+def pooled_floats(count: int) -> numpy.typing.NDArray[numpy.float32]: ...
+
+class RasterState:
+    @property
+    def bytes(self) -> int: ...
+    @property
+    def num_pairs(self) -> int: ...
+    @property
+    def stage_seconds(self) -> dict[str, tuple[float, float]]: ...
+
+class RasterBatch:
+    def __init__(
+        self,
+        *,
+        vertices: torch.Tensor,
+        faces: torch.Tensor | None,
+        flat_colors: torch.Tensor | None,
+        corner_colors: torch.Tensor | None,
+        opacities: torch.Tensor,
+        sigmas: torch.Tensor,
+        viewmats: torch.Tensor,
+        Ks: torch.Tensor,
+        backgrounds: torch.Tensor | None,
+        kernel_table: torch.Tensor | None,
+        kernel: int,
+        distance: int,
+        freeze_inradius: bool,
+        near_plane: float,
+        alpha_min: float,
+        alpha_max: float,
+        x_max: float,
+        transmittance_min: float,
+        distortion_near: float,
+        distortion_far: float,
+        centroid_depth: bool,
+        color: torch.Tensor,
+        alpha: torch.Tensor,
+        distortion: torch.Tensor | None,
+        distortion_totals: torch.Tensor | None,
+    ) -> None: ...
+
+class RasterGradients:
+    def __init__(
+        self,
+        *,
+        grad_color: torch.Tensor,
+        grad_alpha: torch.Tensor | None,
+        grad_distortion: torch.Tensor | None,
+        corner_offsets: torch.Tensor | None,
+        corner_indices: torch.Tensor | None,
+        vertices: torch.Tensor | None,
+        flat_colors: torch.Tensor | None,
+        corner_colors: torch.Tensor | None,
+        opacities: torch.Tensor | None,
+        sigmas: torch.Tensor | None,
+        viewmats: torch.Tensor | None,
+        Ks: torch.Tensor | None,
+        backgrounds: torch.Tensor | None,
+    ) -> None: ...
+
+def raster_forward(
+    *,
+    batch: RasterBatch,
+    keep_for_backward: bool,
+    median_triangle: torch.Tensor | None,
+    max_weight: torch.Tensor | None,
+    screen_size: torch.Tensor | None,
+    inradius: torch.Tensor | None,
+    visible: torch.Tensor | None,
+) -> list[RasterState]: ...
+def raster_backward(*, states: Sequence[RasterState], batch: RasterBatch, gradients: RasterGradients) -> None: ...
+def available_instruction_sets() -> list[str]: ...
+def instruction_set() -> str: ...
+def set_instruction_set(name: str) -> None: ...
+def kernel_names() -> list[str]: ...
+def pool_idle_bytes() -> int: ...
+
+class TileCounts:
+    @property
+    def pairs(self) -> int: ...
+    @property
+    def forward_vectors(self) -> int: ...
+    @property
+    def backward_vectors(self) -> int: ...
+    @property
+    def drawn(self) -> int: ...
+
+class KernelNanoseconds:
+    @property
+    def value(self) -> float: ...
+    @property
+    def gradient(self) -> float: ...
+
+def count_tiles(*, state: RasterState) -> TileCounts: ...
+def time_kernel(*, kernel: int, sigma: float) -> KernelNanoseconds: ...
+def rasterize_opaque(
+    *,
+    vertices: torch.Tensor,
+    faces: torch.Tensor,
+    viewmat: torch.Tensor,
+    K: torch.Tensor,
+    near_plane: float,
+    triangle: torch.Tensor,
+    barycentrics: torch.Tensor,
+    depth: torch.Tensor,
+) -> None: ...
+def render_opaque(
+    *,
+    vertices: torch.Tensor,
+    faces: torch.Tensor,
+    viewmat: torch.Tensor,
+    K: torch.Tensor,
+    near_plane: float,
+    colors: torch.Tensor,
+    per_face: bool,
+    supersampling: int,
+    cull_backfaces: bool,
+    image: torch.Tensor,
+) -> None: ...
+def soup_activate(
+    *,
+    vertices: torch.Tensor,
+    logits: torch.Tensor,
+    raw: torch.Tensor,
+    viewmats: torch.Tensor | None,
+    Ks: torch.Tensor | None,
+    smallest: float,
+    largest: float,
+    opacity_floor: float,
+    sigma_ceiling: float,
+    opacities: torch.Tensor,
+    sigma: torch.Tensor,
+) -> None: ...
+def soup_activate_backward(
+    *,
+    logits: torch.Tensor,
+    raw: torch.Tensor,
+    opacities: torch.Tensor,
+    opacity_floor: float,
+    sigma_ceiling: float,
+    grad_opacities: torch.Tensor | None,
+    grad_sigma: torch.Tensor | None,
+    grad_logits: torch.Tensor,
+    grad_raw: torch.Tensor,
+) -> None: ...
+def soup_colors(
+    *,
+    corners: torch.Tensor,
+    dc: torch.Tensor,
+    rest: torch.Tensor,
+    centers: torch.Tensor,
+    degree: int,
+    colors: torch.Tensor,
+) -> None: ...
+def soup_colors_backward(
+    *,
+    corners: torch.Tensor,
+    dc: torch.Tensor,
+    rest: torch.Tensor,
+    centers: torch.Tensor,
+    degree: int,
+    colors: torch.Tensor,
+    grad_colors: torch.Tensor,
+    grad_corners: torch.Tensor,
+    grad_dc: torch.Tensor,
+    grad_rest: torch.Tensor,
+) -> None: ...
+def spherical_harmonics(
+    *, coefficients: torch.Tensor, directions: torch.Tensor, degree: int, colors: torch.Tensor
+) -> None: ...
+def spherical_harmonics_backward(
+    *,
+    coefficients: torch.Tensor,
+    directions: torch.Tensor,
+    degree: int,
+    colors: torch.Tensor,
+    grad_colors: torch.Tensor,
+    grad_coefficients: torch.Tensor,
+    grad_directions: torch.Tensor,
+) -> None: ...
+def mean_area(*, vertices: torch.Tensor, gradient: torch.Tensor) -> float: ...
+def triangle_channels(
+    *, corners: torch.Tensor, viewmats: torch.Tensor, depth: bool, normals: bool, channels: torch.Tensor
+) -> None: ...
+def triangle_channels_backward(
+    *,
+    corners: torch.Tensor,
+    viewmats: torch.Tensor,
+    depth: bool,
+    normals: bool,
+    grad_channels: torch.Tensor,
+    grad_corners: torch.Tensor,
+) -> None: ...

@@ -96,8 +96,6 @@ struct Result {
     std::vector<float> vertices, flat, corner, opacities, sigmas, background, viewmat, K;
 };
 
-uintptr_t address(std::vector<float>& v) { return reinterpret_cast<uintptr_t>(v.data()); }
-
 Result render(Scene& scene, int kernel, int distance, const Pass& pass) {
     const int channels = pass.flat + pass.corner, pixels = kWidth * kHeight;
     Result r;
@@ -111,50 +109,50 @@ Result render(Scene& scene, int kernel, int distance, const Pass& pass) {
     std::vector<uint8_t> visible(kTriangles);
 
     RasterCall call;
-    call.vertices = address(scene.vertices);
+    call.vertices = scene.vertices.data();
     call.num_triangles = kTriangles;
     call.num_vertices = 3 * kTriangles;
-    call.flat_colors = address(scene.flat);
+    call.flat_colors = scene.flat.data();
     call.flat_channels = pass.flat;
-    call.corner_colors = address(scene.corner);
+    call.corner_colors = scene.corner.data();
     call.corner_channels = pass.corner;
-    call.opacities = address(scene.opacities);
-    call.sigmas = address(scene.sigmas);
-    call.viewmat = address(scene.viewmat);
-    call.K = address(scene.K);
-    call.background = address(scene.background);
+    call.opacities = scene.opacities.data();
+    call.sigmas = scene.sigmas.data();
+    call.viewmat = scene.viewmat.data();
+    call.K = scene.K.data();
+    call.background = scene.background.data();
     call.width = kWidth;
     call.height = kHeight;
     call.kernel = kernel;
-    call.kernel_table = address(scene.table);
+    call.kernel_table = scene.table.data();
     call.distance = distance;
     call.alpha_min = 1.0f / 255.0f;
     call.alpha_max = 0.99f;
     call.transmittance_min = 0.99e-4f;
     call.keep_for_backward = true;
-    call.color = address(r.color);
-    call.alpha = address(r.alpha);
+    call.color = r.color.data();
+    call.alpha = r.alpha.data();
     RasterGradients gradients;
     if (pass.everything) {
-        call.distortion = address(r.distortion);
-        call.distortion_totals = address(totals);
-        call.median_triangle = reinterpret_cast<uintptr_t>(median.data());
-        call.max_weight = address(r.weights);
-        call.screen_size = address(sizes);
-        call.inradius = address(inradii);
-        call.visible = reinterpret_cast<uintptr_t>(visible.data());
-        gradients.grad_distortion = address(scene.grad_distortion);
+        call.distortion = r.distortion.data();
+        call.distortion_totals = totals.data();
+        call.median_triangle = median.data();
+        call.max_weight = r.weights.data();
+        call.screen_size = sizes.data();
+        call.inradius = inradii.data();
+        call.visible = reinterpret_cast<bool*>(visible.data());
+        gradients.grad_distortion = scene.grad_distortion.data();
     }
-    gradients.grad_color = address(scene.grad_color);
-    gradients.grad_alpha = address(scene.grad_alpha);
-    gradients.vertices = address(r.vertices);
-    gradients.flat_colors = address(r.flat);
-    gradients.corner_colors = address(r.corner);
-    gradients.opacities = address(r.opacities);
-    gradients.sigmas = address(r.sigmas);
-    gradients.background = address(r.background);
-    gradients.viewmat = address(r.viewmat);
-    gradients.K = address(r.K);
+    gradients.grad_color = scene.grad_color.data();
+    gradients.grad_alpha = scene.grad_alpha.data();
+    gradients.vertices = r.vertices.data();
+    gradients.flat_colors = r.flat.data();
+    gradients.corner_colors = r.corner.data();
+    gradients.opacities = r.opacities.data();
+    gradients.sigmas = r.sigmas.data();
+    gradients.background = r.background.data();
+    gradients.viewmat = r.viewmat.data();
+    gradients.K = r.K.data();
     const auto state = raster_forward(call);
     raster_backward(*state, call, gradients);
     for (const int32_t triangle : median) r.median.push_back(static_cast<float>(triangle));

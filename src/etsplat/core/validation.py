@@ -105,7 +105,7 @@ def check_indices(name: str, indices: Tensor, count: int) -> None:
     if indices.numel() == 0:
         return
     if _is_plain(indices):
-        found = _native.index_range(indices.data_ptr(), indices.numel(), indices.dtype == torch.int64)
+        found = _native.index_range(values=indices)
         low, high = found.low, found.high
     else:
         low, high = (int(value) for value in torch.aminmax(indices))
@@ -130,7 +130,7 @@ def first_not_finite(tensors: Mapping[str, Tensor]) -> str | None:
 def _count_unusable(tensor: Tensor, largest: float) -> int:
     """How many values are NaN, infinite, or larger in magnitude."""
     if _is_plain(tensor) and tensor.dtype == torch.float32:
-        return _native.scan_floats(tensor.data_ptr(), tensor.numel(), largest).unusable
+        return _native.scan_floats(values=tensor, largest=largest).unusable
     return int((~(tensor.isfinite() & (tensor.abs() <= largest))).sum())
 
 
@@ -139,7 +139,7 @@ def check_positive(name: str, tensor: Tensor) -> None:
     if tensor.numel() == 0:
         return
     if _is_plain(tensor) and tensor.dtype == torch.float32:
-        lowest = _native.scan_floats(tensor.data_ptr(), tensor.numel(), math.inf).minimum
+        lowest = _native.scan_floats(values=tensor, largest=math.inf).minimum
     else:
         lowest = float(tensor.detach().min())
     if not lowest > 0:

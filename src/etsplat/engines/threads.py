@@ -23,7 +23,7 @@ def set_num_threads(count: int) -> None:
     """
     if count < 0:
         raise ValueError(f"count must be 0 (all cores) or positive, got {count}")
-    _native.set_num_threads(count)
+    _native.set_num_threads(count=count)
 
 
 @contextmanager

@@ -38,13 +38,5 @@ def closest_points(
         raise ValueError("faces must not be empty")
     squared = torch.empty(len(points), dtype=torch.float64)
     nearest = torch.empty(len(points), dtype=torch.int64)
-    _native.closest_faces(
-        points.data_ptr(),
-        len(points),
-        vertices.data_ptr(),
-        faces.data_ptr(),
-        len(faces),
-        squared.data_ptr(),
-        nearest.data_ptr(),
-    )
+    _native.closest_faces(points=points, vertices=vertices, faces=faces, squared_distances=squared, closest=nearest)
     return squared, nearest

@@ -27,7 +27,7 @@ def intersecting_faces(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]
     vertices, faces = native_mesh(vertices, faces)
     marks = torch.zeros(len(faces), dtype=torch.bool)
     if len(faces):
-        _native.mark_intersecting_faces(vertices.data_ptr(), faces.data_ptr(), len(faces), marks.data_ptr())
+        _native.mark_intersecting_faces(vertices=vertices, faces=faces, intersecting=marks)
     return marks
 
 

@@ -77,13 +77,12 @@ def longest_edge_plan(
     longest = _longest_edges(vertices.detach().cpu().double(), topology)
     split_edge = torch.full((topology.num_faces,), -1, dtype=torch.int64)
     _native.select_edge_splits(
-        order.data_ptr(),
-        longest.data_ptr(),
-        topology.edge_face_offsets.data_ptr(),
-        topology.edge_faces.data_ptr(),
-        split_edge.data_ptr(),
-        topology.num_faces,
-        budget_faces - topology.num_faces,
+        order=order,
+        longest_edge=longest,
+        edge_face_offsets=topology.edge_face_offsets,
+        edge_faces=topology.edge_faces,
+        split_edge=split_edge,
+        max_new_faces=budget_faces - topology.num_faces,
     )
     return _plan(topology, split_edge)
 

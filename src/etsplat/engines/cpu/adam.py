@@ -14,6 +14,15 @@ def adam_step(
     step_count: int,
 ) -> None:
     """See `Engine.adam_step`."""
-    addresses = ([tensor.data_ptr() for tensor in tensors] for tensors in zip(*groups, strict=True))
-    sizes = [group[0].numel() for group in groups]
-    _native.adam_step(*addresses, sizes, list(learning_rates), *betas, eps, step_count)
+    parameters, gradients, firsts, seconds = zip(*groups, strict=True)
+    _native.adam_step(
+        parameters=parameters,
+        gradients=gradients,
+        firsts=firsts,
+        seconds=seconds,
+        learning_rates=learning_rates,
+        beta1=betas[0],
+        beta2=betas[1],
+        eps=eps,
+        step=step_count,
+    )

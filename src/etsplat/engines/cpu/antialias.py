@@ -12,13 +12,9 @@ from etsplat.engines.native.pool import empty_image, zeros_image
 
 def _forward(_keep: bool, *given: Any) -> tuple[Tensor, Any]:
     """Shading and blending of what the z-buffer has found."""
-    colors, triangle = given[1], given[5]
-    shape = *triangle.shape, colors.shape[1]
+    shape = *given[5].shape, given[1].shape[1]  # triangle, colours
     shaded, image = empty_image(*shape), empty_image(*shape)
-    states = [
-        _native.antialias_forward(_input(b, *given), shaded[b].data_ptr(), image[b].data_ptr())
-        for b in range(len(image))
-    ]
+    states = _native.antialias_forward(views=_views(*given), shaded=shaded, color=image)
     return image, (*given, shaded, states)
 
 
@@ -26,22 +22,20 @@ def _backward(kept: Any, needed: Any, grad_image: Tensor) -> list[Tensor | None]
     """By vertices, colours and backgrounds."""
     *given, shaded, states = kept
     grads = [zeros_image(*tensor.shape) if wanted else None for tensor, wanted in zip(given[:3], needed, strict=False)]
-    scratch = empty_image(*shaded.shape[1:])
-    for b, state in enumerate(states):
-        _native.antialias_backward(
-            state,
-            _input(b, *given),
-            grad_image[b].data_ptr(),
-            shaded[b].data_ptr(),
-            scratch.data_ptr(),
-            *(0 if grad is None else grad.data_ptr() for grad in grads[:2]),
-            0 if grads[2] is None else grads[2][b].data_ptr(),
-        )
+    _native.antialias_backward(
+        states=states,
+        views=_views(*given),
+        grad_color=grad_image,
+        shaded=shaded,
+        scratch=empty_image(*shaded.shape[1:]),
+        grad_vertices=grads[0],
+        grad_colors=grads[1],
+        grad_backgrounds=grads[2],
+    )
     return grads
 
 
-def _input(
-    b: int,
+def _views(
     vertices: Tensor,
     colors: Tensor,
     backgrounds: Tensor,
@@ -53,26 +47,22 @@ def _input(
     near_plane: float,
     per_face: bool,
     connectivity: MeshConnectivity,
-) -> Any:
-    """View b, where its arrays lie now."""
-    height, width = triangle.shape[1:]
-    return _native.AntialiasInput(
-        vertices.data_ptr(),
-        connectivity.faces.data_ptr(),
-        len(vertices),
-        len(connectivity.faces),
-        viewmats[b].data_ptr(),
-        Ks[b].data_ptr(),
-        near_plane,
-        width,
-        height,
-        connectivity.pair_offsets.data_ptr(),
-        connectivity.paired_faces.data_ptr(),
-        *(tensor[b].data_ptr() for tensor in (triangle, barycentrics, depth)),
-        colors.data_ptr() if per_face else 0,
-        0 if per_face else colors.data_ptr(),
-        colors.shape[1],
-        backgrounds[b].data_ptr(),
+) -> _native.AntialiasViews:
+    """With the arrays where they lie now."""
+    return _native.AntialiasViews(
+        vertices=vertices,
+        faces=connectivity.faces,
+        viewmats=viewmats,
+        Ks=Ks,
+        near_plane=near_plane,
+        pair_offsets=connectivity.pair_offsets,
+        paired_faces=connectivity.paired_faces,
+        triangle=triangle,
+        barycentrics=barycentrics,
+        depth=depth,
+        colors=colors,
+        per_face=per_face,
+        backgrounds=backgrounds,
     )
 
 

@@ -2,6 +2,7 @@
 
 from contextlib import AbstractContextManager
 
+from etsplat import _native
 from etsplat.engines.cpu.adam import adam_step
 from etsplat.engines.cpu.antialias import antialias
 from etsplat.engines.cpu.mesh_energies import mesh_energies
@@ -12,7 +13,6 @@ from etsplat.engines.cpu.rasterize_opaque import rasterize_opaque, render_opaque
 from etsplat.engines.cpu.soup_activation import soup_activation
 from etsplat.engines.cpu.spherical_harmonics import soup_colors, spherical_harmonics
 from etsplat.engines.cpu.triangle_area import mean_area
-from etsplat.engines.cpu.triangle_channels import run as run_triangle_channels
 from etsplat.engines.native.engine import NativeEngine
 from etsplat.engines.native.triangle_channels import triangle_channels
 from etsplat.engines.threads import one_torch_thread
@@ -45,4 +45,4 @@ class CpuEngine(NativeEngine):
     soup_activation = staticmethod(soup_activation)
     soup_colors = staticmethod(soup_colors)
     spherical_harmonics = staticmethod(spherical_harmonics)
-    triangle_channels = staticmethod(triangle_channels(run_triangle_channels))
+    triangle_channels = staticmethod(triangle_channels(_native.triangle_channels, _native.triangle_channels_backward))

@@ -15,17 +15,17 @@ def _forward(
 ) -> tuple[tuple[Tensor, ...], Any]:
     """One native call computes the values and the three gradients, which backward combines."""
     gradients = vertices.new_empty((3, *vertices.shape))
-    c = connectivity
-    adjacency = (c.faces, c.neighbor_offsets, c.neighbor_indices, c.corner_offsets, c.corners, c.pair_offsets)
     energies = _native.mesh_energies(
-        vertices.data_ptr(),
-        *(array.data_ptr() for array in (*adjacency, c.paired_faces)),
-        c.num_vertices,
-        len(c.edges),
-        len(c.face_pairs),
-        len(c.faces),
-        edge_power,
-        gradients.data_ptr(),
+        vertices=vertices,
+        faces=connectivity.faces,
+        neighbor_offsets=connectivity.neighbor_offsets,
+        neighbor_indices=connectivity.neighbor_indices,
+        corner_offsets=connectivity.corner_offsets,
+        corners=connectivity.corners,
+        pair_offsets=connectivity.pair_offsets,
+        paired_faces=connectivity.paired_faces,
+        edge_power=edge_power,
+        gradients=gradients,
     )
     return tuple(map(vertices.new_tensor, energies)), [gradients]
 
@@ -34,7 +34,7 @@ def _backward(kept: Any, _needed: Any, *cotangents: Tensor | None) -> tuple[Tens
     (gradients,) = kept
     combined = torch.empty_like(gradients[0])
     weights = [0.0 if cotangent is None else float(cotangent) for cotangent in cotangents]
-    _native.combine_mesh_gradients(gradients.data_ptr(), weights, combined.numel(), combined.data_ptr())
+    _native.combine_mesh_gradients(gradients=gradients, weights=weights, combined=combined)
     return (combined,)
 
 

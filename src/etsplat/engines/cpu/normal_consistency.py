@@ -1,4 +1,4 @@
-"""The CPU engine's side of `normal_consistency`: csrc/cpu/bind_normals.cpp, one view after the other."""
+"""The CPU engine's side of `normal_consistency`: csrc/cpu/bind_normals.cpp."""
 
 from typing import Any
 
@@ -10,17 +10,15 @@ from etsplat.engines.native.operation import differentiable
 from etsplat.engines.native.pool import empty_image
 
 
-def _forward(keep: bool, *inputs: Tensor) -> tuple[Tensor, Any]:
+def _forward(
+    keep: bool, normals: Tensor, depth: Tensor, alpha: Tensor, viewmats: Tensor, Ks: Tensor
+) -> tuple[Tensor, Any]:
     """One pass computes the value and the derivatives, which wait for backward."""
-    normals, depth = inputs[:2]
-    height, width = normals.shape[1:3]
-    derivatives = [empty_image(*tensor.shape) for tensor in (normals, depth) if keep]
-    total = 0.0
-    for b in range(len(normals)):
-        views = (tensor[b].data_ptr() for tensor in inputs)
-        outputs = [tensor[b].data_ptr() for tensor in derivatives] or [0, 0]
-        total += _native.normal_agreement(*views, height, width, *outputs)
-    return normals.new_tensor(1.0 - total / depth.numel()), derivatives
+    by_normals, by_depth = (empty_image(*tensor.shape) if keep else None for tensor in (normals, depth))
+    total = _native.normal_agreement(
+        normals=normals, depth=depth, alpha=alpha, viewmats=viewmats, Ks=Ks, by_normals=by_normals, by_depth=by_depth
+    )
+    return normals.new_tensor(1.0 - total / depth.numel()), (by_normals, by_depth)
 
 
 def _backward(derivatives: Any, _needed: Any, grad_loss: Tensor) -> list[Tensor]:

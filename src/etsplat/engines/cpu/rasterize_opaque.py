@@ -10,8 +10,15 @@ def rasterize_opaque(
     points: Tensor, triangles: Tensor, view: OpaqueView, triangle: Tensor, barycentrics: Tensor, depth: Tensor
 ) -> None:
     """See `Engine.rasterize_opaque`."""
-    _native.rasterize_hard(
-        *_addresses(points, triangles, view), triangle.data_ptr(), barycentrics.data_ptr(), depth.data_ptr()
+    _native.rasterize_opaque(
+        vertices=points,
+        faces=triangles,
+        viewmat=view.viewmat,
+        K=view.K,
+        near_plane=view.near_plane,
+        triangle=triangle,
+        barycentrics=barycentrics,
+        depth=depth,
     )
 
 
@@ -27,25 +34,14 @@ def render_opaque(
 ) -> None:
     """See `Engine.render_opaque`."""
     _native.render_opaque(
-        *_addresses(points, triangles, view),
-        colors.data_ptr() if per_face else 0,
-        0 if per_face else colors.data_ptr(),
-        colors.shape[1],
-        supersampling,
-        cull_backfaces,
-        image.data_ptr(),
-    )
-
-
-def _addresses(points: Tensor, triangles: Tensor, view: OpaqueView) -> tuple[int | float, ...]:
-    return (
-        points.data_ptr(),
-        triangles.data_ptr(),
-        len(points),
-        len(triangles),
-        view.viewmat.data_ptr(),
-        view.K.data_ptr(),
-        view.near_plane,
-        view.width,
-        view.height,
+        vertices=points,
+        faces=triangles,
+        viewmat=view.viewmat,
+        K=view.K,
+        near_plane=view.near_plane,
+        colors=colors,
+        per_face=per_face,
+        supersampling=supersampling,
+        cull_backfaces=cull_backfaces,
+        image=image,
     )

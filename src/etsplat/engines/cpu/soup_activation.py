@@ -16,25 +16,45 @@ def _forward(
     vertices: Tensor,
     logits: Tensor,
     raw: Tensor,
-    limits: tuple[float, float] | Tensor,
+    limits: tuple[float, float],
     camera: Cameras | None,
     smallest: float,
     largest: float,
 ) -> tuple[tuple[Tensor, Tensor], Any]:
-    view = () if camera is None else (dense(camera.viewmats, "viewmats"), dense(camera.Ks, "Ks"))
-    addresses = [tensor.data_ptr() for tensor in (vertices, logits, raw, *view)] + [0] * (2 - len(view))
     opacities, sigma = empty_image(len(logits)), empty_image(len(logits))
-    outputs = opacities.data_ptr(), sigma.data_ptr()
-    _native.soup_activate(len(logits), *addresses, smallest, largest, *limits, *outputs)
+    _native.soup_activate(
+        vertices=vertices,
+        logits=logits,
+        raw=raw,
+        viewmats=None if camera is None else dense(camera.viewmats, "viewmats"),
+        Ks=None if camera is None else dense(camera.Ks, "Ks"),
+        smallest=smallest,
+        largest=largest,
+        opacity_floor=limits[0],
+        sigma_ceiling=limits[1],
+        opacities=opacities,
+        sigma=sigma,
+    )
     return (opacities, sigma), (logits, raw, opacities, limits)
 
 
-def _backward(kept: Any, _needed: Any, *cotangents: Tensor | None) -> tuple[None, Tensor, Tensor]:
-    *saved, limits = kept
-    grads = empty_image(len(saved[0])), empty_image(len(saved[0]))
-    addresses = (0 if tensor is None else tensor.data_ptr() for tensor in (*cotangents, *grads))
-    _native.soup_activate_backward(len(grads[0]), *(tensor.data_ptr() for tensor in saved), *limits, *addresses)
-    return None, *grads
+def _backward(
+    kept: Any, _needed: Any, grad_opacities: Tensor | None, grad_sigma: Tensor | None
+) -> tuple[None, Tensor, Tensor]:
+    logits, raw, opacities, limits = kept
+    grad_logits, grad_raw = empty_image(len(logits)), empty_image(len(raw))
+    _native.soup_activate_backward(
+        logits=logits,
+        raw=raw,
+        opacities=opacities,
+        opacity_floor=limits[0],
+        sigma_ceiling=limits[1],
+        grad_opacities=grad_opacities,
+        grad_sigma=grad_sigma,
+        grad_logits=grad_logits,
+        grad_raw=grad_raw,
+    )
+    return None, grad_logits, grad_raw
 
 
 soup_activation = differentiable(_forward, _backward)

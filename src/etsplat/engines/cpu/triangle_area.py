@@ -12,7 +12,7 @@ from etsplat.engines.native.pool import empty_image
 def _forward(_keep: bool, vertices: Tensor) -> tuple[Tensor, Any]:
     """One pass computes the value and the gradient, which waits for backward."""
     gradient = empty_image(*vertices.shape)
-    mean = _native.mean_area(vertices.data_ptr(), len(vertices), gradient.data_ptr())
+    mean = _native.mean_area(vertices=vertices, gradient=gradient)
     return vertices.new_tensor(mean), [gradient]
 
 

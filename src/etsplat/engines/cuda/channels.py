@@ -17,10 +17,27 @@ _CHANNELS_THREADS = 128
 _PICK_THREADS = 256
 
 
-def run_triangle_channels(name: str, problem: tuple[Any, ...], images: tuple[Tensor, ...]) -> None:
-    """See `etsplat.engines.native.triangle_channels.Run`."""
-    struct = struct_class("cuda/triangle_channels.cu", "ChannelsOf")(*problem)
-    launch_each(_CHANNELS, f"triangle_channels_{name}", struct.triangles, (struct, *images), _CHANNELS_THREADS)
+def channels_forward(corners: Tensor, viewmats: Tensor, depth: bool, normals: bool, channels: Tensor) -> None:
+    """See `etsplat.engines.native.triangle_channels.triangle_channels`."""
+    _run("triangle_channels_forward", _channels_of(corners, viewmats, depth, normals), channels)
+
+
+def channels_backward(
+    corners: Tensor, viewmats: Tensor, depth: bool, normals: bool, grad_channels: Tensor, grad_corners: Tensor
+) -> None:
+    """See `etsplat.engines.native.triangle_channels.triangle_channels`."""
+    _run("triangle_channels_gradient", _channels_of(corners, viewmats, depth, normals), grad_channels, grad_corners)
+
+
+def _run(kernel: str, struct: Any, *images: Tensor) -> None:
+    launch_each(_CHANNELS, kernel, struct.triangles, (struct, *images), _CHANNELS_THREADS)
+
+
+def _channels_of(corners: Tensor, viewmats: Tensor, depth: bool, normals: bool) -> Any:
+    addresses = corners.data_ptr(), viewmats.data_ptr()
+    return struct_class("cuda/triangle_channels.cu", "ChannelsOf")(
+        *addresses, len(corners), len(viewmats), depth, normals
+    )
 
 
 def _pick(_keep: bool, values: Tensor, chosen: Tensor) -> tuple[Tensor, Any]:

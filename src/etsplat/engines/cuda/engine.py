@@ -3,7 +3,7 @@
 import torch
 
 from etsplat.engines.cuda.antialias import antialias
-from etsplat.engines.cuda.channels import pick_values, run_triangle_channels
+from etsplat.engines.cuda.channels import channels_backward, channels_forward, pick_values
 from etsplat.engines.cuda.launch import backend, device_type
 from etsplat.engines.cuda.losses import mean_area, mesh_energies, normal_consistency, photometric_loss, weighted_sum
 from etsplat.engines.cuda.rasterize import CudaRender
@@ -44,6 +44,6 @@ class CudaEngine(NativeEngine):
     soup_activation = staticmethod(soup_activation)
     soup_colors = staticmethod(soup_colors)
     spherical_harmonics = staticmethod(spherical_harmonics)
-    triangle_channels = staticmethod(triangle_channels(run_triangle_channels))
+    triangle_channels = staticmethod(triangle_channels(channels_forward, channels_backward))
     update_statistics = staticmethod(update_statistics)
     weighted_sum = staticmethod(weighted_sum)

@@ -69,8 +69,7 @@ class Geometry:
         flat, device = self.faces.view(-1), self.faces.device
         if flat.is_cpu:
             offsets, places = flat.new_empty(self.vertex_count + 1), torch.empty_like(flat)
-            outputs = offsets.data_ptr(), places.data_ptr()
-            _native.group_indices(flat.data_ptr(), len(flat), self.vertex_count, *outputs)
+            _native.group_indices(values=flat, offsets=offsets, members=places)
             return offsets, places
         ordered, places = torch.sort(flat, stable=True)
         ends = torch.arange(self.vertex_count + 1, dtype=torch.int32, device=device)

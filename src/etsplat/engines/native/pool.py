@@ -19,7 +19,7 @@ def empty_image(*shape: int) -> Tensor:
     count = math.prod(shape)
     if count < _SMALLEST:
         return torch.empty(shape)
-    return torch.from_numpy(_native.pooled_floats(count)).view(shape)
+    return torch.from_numpy(_native.pooled_floats(count=count)).view(shape)
 
 
 def empty(like: Tensor, *shape: int) -> Tensor:
@@ -30,5 +30,5 @@ def empty(like: Tensor, *shape: int) -> Tensor:
 def zeros_image(*shape: int) -> Tensor:
     """Like ``empty_image``, zeroed by the engine's threads."""
     zeros = empty_image(*shape)
-    _native.zero_floats(zeros.data_ptr(), zeros.numel())
+    _native.zero_floats(values=zeros)
     return zeros
