@@ -6,20 +6,20 @@
 #include <vector>
 
 #include "math/triangle.h"
-#include "rasterize_hard.h"
+#include "rasterize_opaque.h"
 
 namespace etsplat {
 
 // One view. Images are (height, width, ...).
 struct AntialiasInput {
-    HardMesh mesh;
-    HardCamera camera;
+    OpaqueMesh mesh;
+    OpaqueCamera camera;
     const int32_t* pair_offsets;  // (num_faces + 1): where the partners of each face start in `paired_faces`
     const int32_t* paired_faces;  // faces that share an edge
-    const int32_t* triangle;      // what `rasterize_hard` found
+    const int32_t* triangle;      // what `rasterize_opaque` found
     const float* barycentrics;
     const float* depth;
-    HardColors colors;
+    OpaqueColors colors;
     const float* background;  // (channels)
 };
 
@@ -47,7 +47,7 @@ struct AntialiasGradients {
     float* background;   // (channels), added to; or null
 };
 
-inline PinholeCamera pinhole(const HardCamera& camera) {
+inline PinholeCamera pinhole(const OpaqueCamera& camera) {
     PinholeCamera p;
     for (int r = 0; r < 3; ++r) {
         for (int c = 0; c < 3; ++c) p.rotation[3 * r + c] = camera.viewmat[4 * r + c];

@@ -18,7 +18,7 @@ void bind_mesh_energies(nb::module_& m);
 void bind_normals(nb::module_& m);
 void bind_photometric(nb::module_& m);
 void bind_rasterize(nb::module_& m);
-void bind_rasterize_hard(nb::module_& m);
+void bind_rasterize_opaque(nb::module_& m);
 void bind_soup_activation(nb::module_& m);
 void bind_soup_colors(nb::module_& m);
 void bind_spherical_harmonics(nb::module_& m);
@@ -64,7 +64,7 @@ NB_MODULE(_native, m) {
     bind_normals(m);
     bind_photometric(m);
     bind_rasterize(m);
-    bind_rasterize_hard(m);
+    bind_rasterize_opaque(m);
     bind_soup_activation(m);
     bind_soup_colors(m);
     bind_spherical_harmonics(m);

@@ -133,7 +133,7 @@ def moved(scene: dict[str, torch.Tensor], device: torch.device) -> dict[str, tor
     return {name: tensor.to(device) for name, tensor in scene.items()}
 
 
-def hard_scene(rng: torch.Generator) -> dict[str, torch.Tensor]:
+def opaque_scene(rng: torch.Generator) -> dict[str, torch.Tensor]:
     """Two views of a sphere of small triangles within a soup of large ones, some of them behind the camera."""
     vertices, faces = icosphere(2)
     soup = 2 * torch.randn((40, 3), generator=rng)
@@ -146,9 +146,9 @@ def hard_scene(rng: torch.Generator) -> dict[str, torch.Tensor]:
     }
 
 
-def test_hard_rasterization_is_that_of_the_cpu_engine(cuda_device, rng, monkeypatch):
+def test_opaque_rasterization_is_that_of_the_cpu_engine(cuda_device, rng, monkeypatch):
     """Triangles, barycentrics and depths are the same bits, whatever the height of a strip."""
-    scene = hard_scene(rng)
+    scene = opaque_scene(rng)
     expected = on("cpu", rasterize_opaque, width=45, height=37, **scene)
     for samples in (1 << 21, 45 * 10):
         monkeypatch.setattr("etsplat.engines.cuda.rasterize_opaque._STRIP_SAMPLES", samples)
@@ -162,7 +162,7 @@ def test_hard_rasterization_is_that_of_the_cpu_engine(cuda_device, rng, monkeypa
 def test_opaque_pictures_are_those_of_the_cpu_engine(cuda_device, rng, monkeypatch, colors, channels, cull):
     """Nine samples a pixel, drawn in several strips, both ways to colour: the same bits."""
     monkeypatch.setattr("etsplat.engines.cuda.rasterize_opaque._STRIP_SAMPLES", 135 * 40)
-    scene = hard_scene(rng)
+    scene = opaque_scene(rng)
     count = len(scene["faces"] if colors == "face_colors" else scene["vertices"])
     scene[colors] = torch.rand((count, channels), generator=rng)
     options = {"width": 45, "height": 37, "supersampling": 3, "cull_backfaces": cull}
@@ -175,7 +175,7 @@ def antialiased(kind: str, rng: torch.Generator, engine: str, device: torch.devi
     vertices, faces = icosphere(2)
     vertices = vertices * (1 + 0.35 * torch.sin(5 * vertices[:, :1]) * torch.cos(4 * vertices[:, 1:2]))
     connectivity = MeshTopology.from_faces(faces.to(device), len(vertices)).connectivity
-    scene = moved(hard_scene(rng), device)
+    scene = moved(opaque_scene(rng), device)
     colors = torch.rand((len(faces) if kind == "face_colors" else len(vertices), 3), generator=rng)
     backgrounds, cotangent = torch.rand((2, 3), generator=rng), torch.randn((2, 37, 45, 3), generator=rng)
     leaves = [tensor.to(device, copy=True).requires_grad_() for tensor in (vertices, colors, backgrounds)]

@@ -1,4 +1,4 @@
-"""The CPU engine's side of `rasterize_opaque` and `render_opaque`: csrc/cpu/bind_rasterize_hard.cpp."""
+"""The CPU engine's side of `rasterize_opaque` and `render_opaque`: csrc/cpu/bind_rasterize_opaque.cpp."""
 
 from torch import Tensor
 

@@ -10,13 +10,13 @@
 
 namespace etsplat {
 
-struct HardVertex {
+struct OpaqueVertex {
     double x, y, inverse_depth;  // in samples; inverse_depth is NaN where the vertex cannot be drawn
 };
 
 ETSPLAT_FN bool is_finite(double a) { return a - a == 0.0; }
 
-ETSPLAT_FN HardVertex project_hard(const float* viewmat, const float* K, float near_plane, int samples,
+ETSPLAT_FN OpaqueVertex project_opaque(const float* viewmat, const float* K, float near_plane, int samples,
                                    const float* point) {
     double c[3];
     for (int r = 0; r < 3; ++r) {
@@ -24,7 +24,7 @@ ETSPLAT_FN HardVertex project_hard(const float* viewmat, const float* K, float n
         c[r] = static_cast<double>(m[0]) * point[0] + static_cast<double>(m[1]) * point[1] +
                static_cast<double>(m[2]) * point[2] + m[3];
     }
-    HardVertex v;
+    OpaqueVertex v;
     v.inverse_depth = 1.0 / c[2];
     v.x = samples * (K[0] * c[0] * v.inverse_depth + K[2]);
     v.y = samples * (K[4] * c[1] * v.inverse_depth + K[5]);
@@ -43,7 +43,7 @@ ETSPLAT_FN int first_sample(double coordinate, int size) {
     return truncated + (at > truncated ? 1 : 0);
 }
 
-struct HardEdge {
+struct OpaqueEdge {
     double x, y, slope, x_low, x_high;
 
     // Column of the first sample on the right side of the edge, clamped to [0, width].
@@ -55,13 +55,13 @@ struct HardEdge {
     }
 };
 
-ETSPLAT_FN HardEdge hard_edge(const HardVertex& upper, const HardVertex& lower) {
+ETSPLAT_FN OpaqueEdge opaque_edge(const OpaqueVertex& upper, const OpaqueVertex& lower) {
     const double low = lower.x < upper.x ? lower.x : upper.x, high = upper.x < lower.x ? lower.x : upper.x;
     return {upper.x, upper.y, (lower.x - upper.x) / (lower.y - upper.y), low, high};
 }
 
-struct HardTriangle {
-    HardEdge whole, upper, lower;  // from the top vertex to the bottom one, top to middle, middle to bottom
+struct OpaqueTriangle {
+    OpaqueEdge whole, upper, lower;  // from the top vertex to the bottom one, top to middle, middle to bottom
     double inverse_depth, inverse_depth_dx, inverse_depth_dy;  // plane, at the top vertex
     float inverse_depth_min, inverse_depth_max;
     int x_begin, x_end, y_begin, y_end;  // samples; empty where the triangle draws nothing
@@ -92,16 +92,16 @@ struct HardTriangle {
 };
 
 // Empty if it cannot be drawn: a vertex behind the near plane or not finite, no area, facing away.
-ETSPLAT_FN HardTriangle set_up_hard(const HardVertex* in, int width, int height, bool cull_backfaces) {
-    HardTriangle t;
+ETSPLAT_FN OpaqueTriangle set_up_opaque(const OpaqueVertex* in, int width, int height, bool cull_backfaces) {
+    OpaqueTriangle t;
     t.x_begin = t.x_end = t.y_begin = t.y_end = 0;
-    HardVertex v[3] = {in[0], in[1], in[2]};
+    OpaqueVertex v[3] = {in[0], in[1], in[2]};
     const double facing = (v[1].x - v[0].x) * (v[2].y - v[0].y) - (v[2].x - v[0].x) * (v[1].y - v[0].y);
     if (cull_backfaces && !(facing < 0.0)) return t;  // y points down: counter-clockwise is negative
     for (int i = 0; i < 3; ++i) {                     // by y, then x: pairs 01, 12, 01
-        HardVertex &a = v[i % 2], &b = v[i % 2 + 1];
+        OpaqueVertex &a = v[i % 2], &b = v[i % 2 + 1];
         if (b.y < a.y || (b.y == a.y && b.x < a.x)) {
-            const HardVertex swapped = a;
+            const OpaqueVertex swapped = a;
             a = b;
             b = swapped;
         }
@@ -122,9 +122,9 @@ ETSPLAT_FN HardTriangle set_up_hard(const HardVertex* in, int width, int height,
     }
     t.inverse_depth_min = static_cast<float>(low);
     t.inverse_depth_max = static_cast<float>(high);
-    t.whole = hard_edge(v[0], v[2]);
-    t.upper = hard_edge(v[0], v[1]);
-    t.lower = hard_edge(v[1], v[2]);
+    t.whole = opaque_edge(v[0], v[2]);
+    t.upper = opaque_edge(v[0], v[1]);
+    t.lower = opaque_edge(v[1], v[2]);
     t.y_begin = first_sample(v[0].y, height);
     t.y_end = first_sample(v[2].y, height);
     t.x_begin = first_sample(v[1].x < t.whole.x_low ? v[1].x : t.whole.x_low, width);
@@ -134,8 +134,8 @@ ETSPLAT_FN HardTriangle set_up_hard(const HardVertex* in, int width, int height,
 
 // Perspective-correct barycentrics b_k = (a_k / z_k) / sum_j (a_j / z_j), a clamped at 0, of the sample at column x and
 // row y.
-ETSPLAT_FN void hard_barycentrics(const HardVertex* vertices, int x, int y, float* out) {
-    HardVertex v[3];
+ETSPLAT_FN void opaque_barycentrics(const OpaqueVertex* vertices, int x, int y, float* out) {
+    OpaqueVertex v[3];
     for (int k = 0; k < 3; ++k) {
         v[k] = vertices[k];
         v[k].x -= x + 0.5;
@@ -143,7 +143,7 @@ ETSPLAT_FN void hard_barycentrics(const HardVertex* vertices, int x, int y, floa
     }
     double weight[3];
     for (int k = 0; k < 3; ++k) {
-        const HardVertex &p = v[(k + 1) % 3], &q = v[(k + 2) % 3];
+        const OpaqueVertex &p = v[(k + 1) % 3], &q = v[(k + 2) % 3];
         weight[k] = p.x * q.y - q.x * p.y;
     }
     const double sign = weight[0] + weight[1] + weight[2] < 0.0 ? -1.0 : 1.0;

@@ -3,13 +3,13 @@
 // so that each tile sees them in ascending index; (3) tiles run in parallel, each with its own z-buffer (32 KiB, in the
 // L1 cache), and are resolved to final pixels at once: no buffer of the supersampled size exists. Strips of tile rows
 // bound the memory of (2). Nothing depends on which thread runs what.
-#include "rasterize_hard.h"
+#include "rasterize_opaque.h"
 
 #include <algorithm>
 #include <utility>
 #include <vector>
 
-#include "math/hard_triangle.h"
+#include "math/opaque_triangle.h"
 #include "parallel.h"
 
 namespace etsplat {
@@ -19,13 +19,13 @@ constexpr int kTileSamples = 64;
 constexpr int64_t kStripEntries = 8'000'000;  // (tile, triangle) pairs in memory at a time
 
 struct Screen {
-    std::vector<HardVertex> vertices;
-    std::vector<HardTriangle> triangles;
+    std::vector<OpaqueVertex> vertices;
+    std::vector<OpaqueTriangle> triangles;
     int32_t width, height;  // in samples
     int32_t tile, tiles_x, tiles_y;
 };
 
-Screen set_up_screen(const HardMesh& mesh, const HardCamera& camera, int32_t samples, bool cull_backfaces) {
+Screen set_up_screen(const OpaqueMesh& mesh, const OpaqueCamera& camera, int32_t samples, bool cull_backfaces) {
     Screen screen;
     screen.width = camera.width * samples;
     screen.height = camera.height * samples;
@@ -36,15 +36,15 @@ Screen set_up_screen(const HardMesh& mesh, const HardCamera& camera, int32_t sam
     parallel_for(mesh.num_vertices, 4096, [&](int64_t begin, int64_t end) {
         for (int64_t v = begin; v < end; ++v) {
             screen.vertices[v] =
-                project_hard(camera.viewmat, camera.K, camera.near_plane, samples, mesh.vertices + 3 * v);
+                project_opaque(camera.viewmat, camera.K, camera.near_plane, samples, mesh.vertices + 3 * v);
         }
     });
     screen.triangles.resize(mesh.num_faces);
     parallel_for(mesh.num_faces, 2048, [&](int64_t begin, int64_t end) {
         for (int64_t f = begin; f < end; ++f) {
             const int32_t* k = mesh.faces + 3 * f;
-            const HardVertex v[3] = {screen.vertices[k[0]], screen.vertices[k[1]], screen.vertices[k[2]]};
-            screen.triangles[f] = set_up_hard(v, screen.width, screen.height, cull_backfaces);
+            const OpaqueVertex v[3] = {screen.vertices[k[0]], screen.vertices[k[1]], screen.vertices[k[2]]};
+            screen.triangles[f] = set_up_opaque(v, screen.width, screen.height, cull_backfaces);
         }
     });
     return screen;
@@ -53,7 +53,7 @@ Screen set_up_screen(const HardMesh& mesh, const HardCamera& camera, int32_t sam
 // Ends of strips of tile rows that hold at most kStripEntries pairs each, or are one row high.
 std::vector<int32_t> strip_ends(const Screen& screen) {
     std::vector<int64_t> change(screen.tiles_y + 1, 0);
-    for (const HardTriangle& t : screen.triangles) {
+    for (const OpaqueTriangle& t : screen.triangles) {
         if (!t.draws()) continue;
         const int64_t columns = (t.x_end - 1) / screen.tile - t.x_begin / screen.tile + 1;
         change[t.y_begin / screen.tile] += columns;
@@ -86,7 +86,7 @@ Bins bin_strip(const Screen& screen, int32_t row_begin, int32_t row_end) {
 
     const auto for_each_pair = [&](int64_t c, auto&& visit) {
         for (int64_t f = c * chunk; f < std::min(n, (c + 1) * chunk); ++f) {
-            const HardTriangle& t = screen.triangles[f];
+            const OpaqueTriangle& t = screen.triangles[f];
             if (!t.draws()) continue;
             const int32_t y0 = std::max(t.y_begin / screen.tile, row_begin);
             const int32_t y1 = std::min((t.y_end - 1) / screen.tile + 1, row_end);
@@ -136,7 +136,7 @@ struct TileBuffer {
 
 // Triangles come in ascending index: a strict comparison lets the smaller index win a tie.
 void draw(const Screen& screen, int32_t index, TileBuffer& tile) {
-    const HardTriangle t = screen.triangles[index];  // a copy, which no store can alias
+    const OpaqueTriangle t = screen.triangles[index];  // a copy, which no store can alias
     const auto slope = static_cast<float>(t.inverse_depth_dx);
     const int32_t y_end = std::min(t.y_end, tile.y1);
     for (int32_t y = std::max(t.y_begin, tile.y0); y < y_end; ++y) {
@@ -180,16 +180,16 @@ void for_each_tile(const Screen& screen, const Resolve& resolve) {
     }
 }
 
-void barycentrics_at(const HardMesh& mesh, const Screen& screen, int32_t face, int32_t x, int32_t y, float out[3]) {
+void barycentrics_at(const OpaqueMesh& mesh, const Screen& screen, int32_t face, int32_t x, int32_t y, float out[3]) {
     const int32_t* k = mesh.faces + 3 * static_cast<int64_t>(face);
-    const HardVertex v[3] = {screen.vertices[k[0]], screen.vertices[k[1]], screen.vertices[k[2]]};
-    hard_barycentrics(v, x, y, out);
+    const OpaqueVertex v[3] = {screen.vertices[k[0]], screen.vertices[k[1]], screen.vertices[k[2]]};
+    opaque_barycentrics(v, x, y, out);
 }
 
 // Adds a sample's colour to `sum` (channels).
 struct Shader {
-    const HardMesh& mesh;
-    const HardColors& colors;
+    const OpaqueMesh& mesh;
+    const OpaqueColors& colors;
     const Screen& screen;
 
     void add(int32_t face, int32_t x, int32_t y, float* sum) const {
@@ -212,8 +212,8 @@ struct Shader {
 
 }  // namespace
 
-void rasterize_hard(const HardMesh& mesh, const HardCamera& camera, int32_t* triangle, float* barycentrics,
-                    float* depth) {
+void rasterize_opaque(const OpaqueMesh& mesh, const OpaqueCamera& camera, int32_t* triangle, float* barycentrics,
+                      float* depth) {
     const Screen screen = set_up_screen(mesh, camera, 1, false);
     for_each_tile(screen, [&](const TileBuffer& tile) {
         for (int32_t y = tile.y0; y < tile.y1; ++y) {
@@ -232,8 +232,8 @@ void rasterize_hard(const HardMesh& mesh, const HardCamera& camera, int32_t* tri
     });
 }
 
-void render_opaque(const HardMesh& mesh, const HardCamera& camera, const HardColors& colors, int32_t supersampling,
-                   bool cull_backfaces, float* image) {
+void render_opaque(const OpaqueMesh& mesh, const OpaqueCamera& camera, const OpaqueColors& colors,
+                   int32_t supersampling, bool cull_backfaces, float* image) {
     const Screen screen = set_up_screen(mesh, camera, supersampling, cull_backfaces);
     const Shader shader{mesh, colors, screen};
     const int32_t channels = colors.channels, s = supersampling;

@@ -5,32 +5,32 @@
 
 namespace etsplat {
 
-struct HardMesh {
+struct OpaqueMesh {
     const float* vertices;  // (num_vertices, 3)
     const int32_t* faces;   // (num_faces, 3)
     int64_t num_vertices;
     int64_t num_faces;
 };
 
-struct HardCamera {
+struct OpaqueCamera {
     const float* viewmat;  // (4, 4) world to camera
     const float* K;        // (3, 3) in pixels
     float near_plane;
     int32_t width, height;
 };
 
-struct HardColors {
+struct OpaqueColors {
     const float* faces;     // (num_faces, channels), or null
     const float* vertices;  // (num_vertices, channels), used if `faces` is null
     int32_t channels;
 };
 
 // The nearest triangle of every pixel centre (-1: none), its perspective-correct barycentrics and its depth.
-void rasterize_hard(const HardMesh& mesh, const HardCamera& camera, int32_t* triangle, float* barycentrics,
-                    float* depth);
+void rasterize_opaque(const OpaqueMesh& mesh, const OpaqueCamera& camera, int32_t* triangle, float* barycentrics,
+                      float* depth);
 
 // Mean over supersampling^2 samples a pixel: premultiplied colour and coverage, (height, width, channels + 1).
-void render_opaque(const HardMesh& mesh, const HardCamera& camera, const HardColors& colors, int32_t supersampling,
-                   bool cull_backfaces, float* image);
+void render_opaque(const OpaqueMesh& mesh, const OpaqueCamera& camera, const OpaqueColors& colors,
+                   int32_t supersampling, bool cull_backfaces, float* image);
 
 }  // namespace etsplat

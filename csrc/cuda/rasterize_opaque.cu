@@ -1,13 +1,13 @@
 // Z-buffer rasterization of one view, strip by strip of its rows of samples, so that the z-buffer (8 bytes a sample) stays
-// in the L2 cache and the memory bounded. hard_rows finds each triangle's rows once. For every strip, hard_draw sets up
-// the triangles that meet it, one to a lane, in double as the CPU engine does (csrc/math/hard_triangle.h); a lane draws a
+// in the L2 cache and the memory bounded. opaque_rows finds each triangle's rows once. For every strip, opaque_draw sets up
+// the triangles that meet it, one to a lane, in double as the CPU engine does (csrc/math/opaque_triangle.h); a lane draws a
 // small one by itself, the whole warp a large one. The z-buffer holds, in one number, the inverse depth and the
 // complement of the index: its maximum is the nearest triangle, of equals the first, in whatever order they come. A
 // resolve kernel turns the samples into pixels and leaves zeros for the next strip.
 //
 // Bound by atomics in L2 for large triangles, by the set-up in double for small ones.
 #include "cuda/common.h"
-#include "math/hard_triangle.h"
+#include "math/opaque_triangle.h"
 
 using namespace etsplat;
 
@@ -17,7 +17,7 @@ constexpr int kChannels = 4;  // that a pixel sums at a time
 
 using Sample = unsigned long long;  // 0: empty
 
-struct HardView {
+struct OpaqueView {
     const float* points;    // (V, 3)
     const int* faces;       // (F, 3)
     const float* viewmat;   // (4, 4)
@@ -30,38 +30,38 @@ struct HardView {
 };
 
 // False for a face with an index out of range, which is not drawn.
-__device__ bool load_corners(const HardView& view, long long face, HardVertex* corners) {
+__device__ bool load_corners(const OpaqueView& view, long long face, OpaqueVertex* corners) {
     const int* k = view.faces + 3 * face;
     for (int i = 0; i < 3; ++i) {
         if (k[i] < 0 || k[i] >= view.num_points) return false;
-        corners[i] = project_hard(view.viewmat, view.K, view.near_plane, view.samples,
+        corners[i] = project_opaque(view.viewmat, view.K, view.near_plane, view.samples,
                                   view.points + 3 * static_cast<long long>(k[i]));
     }
     return true;
 }
 
-__device__ HardTriangle load_triangle(const HardView& view, long long face) {
-    HardVertex corners[3];
-    HardTriangle t;
+__device__ OpaqueTriangle load_triangle(const OpaqueView& view, long long face) {
+    OpaqueVertex corners[3];
+    OpaqueTriangle t;
     t.x_begin = t.x_end = t.y_begin = t.y_end = 0;
-    if (load_corners(view, face, corners)) t = set_up_hard(corners, view.width, view.height, view.cull_backfaces != 0);
+    if (load_corners(view, face, corners)) t = set_up_opaque(corners, view.width, view.height, view.cull_backfaces != 0);
     return t;
 }
 
 __device__ int face_of(Sample sample) { return static_cast<int>(~static_cast<unsigned>(sample)); }
 
 // rows (F, 2): first row of samples and the one after the last; equal where the triangle draws nothing.
-extern "C" __global__ void hard_rows(HardView view, int* rows) {
+extern "C" __global__ void opaque_rows(OpaqueView view, int* rows) {
     const long long f = static_cast<long long>(blockIdx.x) * kThreads + threadIdx.x;
     if (f >= view.num_faces) return;
-    const HardTriangle t = load_triangle(view, f);
+    const OpaqueTriangle t = load_triangle(view, f);
     rows[2 * f] = t.draws() ? t.y_begin : 0;
     rows[2 * f + 1] = t.draws() ? t.y_end : 0;
 }
 
 // Rows [begin, end) of a triangle, every `stride`-th column from `offset` on, into a buffer that starts at row `top`.
-__device__ void draw(const HardTriangle& t, long long face, int begin, int end, int offset, int stride, int width, int top,
-                     Sample* buffer) {
+__device__ void draw(const OpaqueTriangle& t, long long face, int begin, int end, int offset, int stride, int width,
+                     int top, Sample* buffer) {
     const float slope = static_cast<float>(t.inverse_depth_dx);
     const unsigned complement = ~static_cast<unsigned>(face);
     for (int y = begin; y < end; ++y) {
@@ -78,11 +78,11 @@ __device__ void draw(const HardTriangle& t, long long face, int begin, int end, 
     }
 }
 
-extern "C" __global__ void hard_draw(HardView view, const int* rows, int top, int bottom, Sample* buffer) {
-    __shared__ HardTriangle shared[kThreads / kWarp];
+extern "C" __global__ void opaque_draw(OpaqueView view, const int* rows, int top, int bottom, Sample* buffer) {
+    __shared__ OpaqueTriangle shared[kThreads / kWarp];
     const int lane = lane_index();
     const long long first = static_cast<long long>(blockIdx.x) * kThreads + threadIdx.x - lane, f = first + lane;
-    HardTriangle t;
+    OpaqueTriangle t;
     int begin = 0, end = 0;
     if (f < view.num_faces) {
         begin = rows[2 * f] < top ? top : rows[2 * f];
@@ -92,7 +92,7 @@ extern "C" __global__ void hard_draw(HardView view, const int* rows, int top, in
     const bool small = begin < end && (end - begin) * static_cast<long long>(t.x_end - t.x_begin) <= kSmall;
     if (small) draw(t, f, begin, end, 0, 1, view.width, top, buffer);
     unsigned large = __ballot_sync(kAllLanes, begin < end && !small);
-    HardTriangle* common = shared + warp_index();
+    OpaqueTriangle* common = shared + warp_index();
     for (; large; large &= large - 1) {
         const int leader = __ffs(static_cast<int>(large)) - 1;
         if (lane == leader) *common = t;
@@ -104,7 +104,7 @@ extern "C" __global__ void hard_draw(HardView view, const int* rows, int top, in
 }
 
 // One sample a pixel: index of the triangle, barycentrics, depth of the rows [top, bottom) of an image.
-extern "C" __global__ void hard_resolve(HardView view, int top, int bottom, Sample* buffer, int* triangle,
+extern "C" __global__ void opaque_resolve(OpaqueView view, int top, int bottom, Sample* buffer, int* triangle,
                                         float* barycentrics, float* depth) {
     const long long i = static_cast<long long>(blockIdx.x) * kThreads + threadIdx.x;
     if (i >= static_cast<long long>(bottom - top) * view.width) return;
@@ -115,14 +115,14 @@ extern "C" __global__ void hard_resolve(HardView view, int top, int bottom, Samp
     triangle[pixel] = sample ? face_of(sample) : -1;
     depth[pixel] = b[0] = b[1] = b[2] = 0.0f;
     if (!sample) return;
-    HardVertex corners[3];
+    OpaqueVertex corners[3];
     load_corners(view, face_of(sample), corners);
-    hard_barycentrics(corners, static_cast<int>(i % view.width), top + static_cast<int>(i / view.width), b);
+    opaque_barycentrics(corners, static_cast<int>(i % view.width), top + static_cast<int>(i / view.width), b);
     depth[pixel] = 1.0f / __uint_as_float(static_cast<unsigned>(sample >> 32));
 }
 
 // colors: (F, C) if per_face, else (V, C). image (H, W, C + 1): the mean of premultiplied colour and of coverage.
-extern "C" __global__ void hard_shade(HardView view, int top, int bottom, Sample* buffer, const float* colors,
+extern "C" __global__ void opaque_shade(OpaqueView view, int top, int bottom, Sample* buffer, const float* colors,
                                       int per_face, int channels, float* image) {
     const int s = view.samples, width = view.width / s;
     const long long i = static_cast<long long>(blockIdx.x) * kThreads + threadIdx.x;
@@ -146,10 +146,10 @@ extern "C" __global__ void hard_shade(HardView view, int top, int bottom, Sample
                 for (int c = 0; c < kChannels; ++c) sums[c] += c < count ? of_face[c] : 0.0f;
                 continue;
             }
-            HardVertex corners[3];
+            OpaqueVertex corners[3];
             float b[3];
             load_corners(view, face, corners);
-            hard_barycentrics(corners, x, top + y, b);
+            opaque_barycentrics(corners, x, top + y, b);
             const int* v = view.faces + 3 * face;
             const float* at[3];
             for (int j = 0; j < 3; ++j) at[j] = colors + static_cast<long long>(v[j]) * channels + first;

@@ -1,9 +1,9 @@
 #include "bindings.h"
-#include "rasterize_hard.h"
+#include "rasterize_opaque.h"
 
 namespace etsplat {
 
-void bind_rasterize_hard(nb::module_& m) {
+void bind_rasterize_opaque(nb::module_& m) {
     // Of one view: vertices (V, 3), faces (F, 3), viewmat (4, 4), K (3, 3); triangle (H, W), barycentrics (H, W, 3), depth
     // (H, W).
     def_function(
@@ -11,10 +11,10 @@ void bind_rasterize_hard(nb::module_& m) {
         [](Array<const float, 2> vertices, Array<const int32_t, 2> faces, Array<const float, 2> viewmat,
            Array<const float, 2> K, float near_plane, Array<int32_t, 2> triangle, Array<float, 3> barycentrics,
            Array<float, 2> depth) {
-            const HardMesh mesh{vertices.data(), faces.data(), vertices.size(0), faces.size(0)};
-            const HardCamera camera{viewmat.data(), K.data(), near_plane, static_cast<int32_t>(triangle.size(1)),
+            const OpaqueMesh mesh{vertices.data(), faces.data(), vertices.size(0), faces.size(0)};
+            const OpaqueCamera camera{viewmat.data(), K.data(), near_plane, static_cast<int32_t>(triangle.size(1)),
                                     static_cast<int32_t>(triangle.size(0))};
-            rasterize_hard(mesh, camera, triangle.data(), barycentrics.data(), depth.data());
+            rasterize_opaque(mesh, camera, triangle.data(), barycentrics.data(), depth.data());
         },
         "vertices", "faces", "viewmat", "K", "near_plane", "triangle", "barycentrics", "depth");
     // As above; colors (F, C) or (V, C), image (H, W, C + 1).
@@ -23,10 +23,10 @@ void bind_rasterize_hard(nb::module_& m) {
         [](Array<const float, 2> vertices, Array<const int32_t, 2> faces, Array<const float, 2> viewmat,
            Array<const float, 2> K, float near_plane, Array<const float, 2> colors, bool per_face,
            int32_t supersampling, bool cull_backfaces, Array<float, 3> image) {
-            const HardMesh mesh{vertices.data(), faces.data(), vertices.size(0), faces.size(0)};
-            const HardCamera camera{viewmat.data(), K.data(), near_plane, static_cast<int32_t>(image.size(1)),
+            const OpaqueMesh mesh{vertices.data(), faces.data(), vertices.size(0), faces.size(0)};
+            const OpaqueCamera camera{viewmat.data(), K.data(), near_plane, static_cast<int32_t>(image.size(1)),
                                     static_cast<int32_t>(image.size(0))};
-            const HardColors shown{per_face ? colors.data() : nullptr, per_face ? nullptr : colors.data(),
+            const OpaqueColors shown{per_face ? colors.data() : nullptr, per_face ? nullptr : colors.data(),
                                    static_cast<int32_t>(colors.size(1))};
             render_opaque(mesh, camera, shown, supersampling, cull_backfaces, image.data());
         },
