@@ -114,8 +114,8 @@ def test_defaults_are_those_of_the_command_line() -> None:
         (lambda: ReconstructConfig(preset="quick"), r"preset: 'quick' .* begin with ReconstructConfig\.quick\(\)$"),
         (lambda: ReconstructConfig(preset="demo", iterations=7), r"begin with ReconstructConfig\.demo\(\)$"),
         (lambda: RECONSTRUCT.changed({"preset": "tiny"}), r"begin with ReconstructConfig\.tiny\(\)$"),
-        (lambda: TrainConfig(scene_type="indoor"), r"scene_type: .* begin with TrainConfig\.quick\('indoor'\)$"),
-        (lambda: TrainConfig.paper("object").changed({"scene_type": "indoor"}), r"TrainConfig\.paper\('indoor'\)$"),
+        (lambda: TrainConfig(preset="tiny", scene_type="indoor"), r"begin with TrainConfig\.tiny\('indoor'\)$"),
+        (lambda: TrainConfig.paper("object").changed({"preset": "demo"}), r"TrainConfig\.demo\('object'\)$"),
         (lambda: TrainConfig(preset="huge"), r"preset: is 'huge'; choose one of paper, quick"),  # pyright: ignore
     ],
 )

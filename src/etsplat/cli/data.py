@@ -32,13 +32,10 @@ class Sfm(Command):
 
     def run(self, arguments: Sequence[str]) -> int:
         """Writes the scene and says which photos have no place in it."""
-        from rich.console import Console
-
         from etsplat.cli.progress import PhaseBar
         from etsplat.data.structure_from_motion import find_cameras
 
-        console = Console()
-        with PhaseBar(console) as bar:
+        with PhaseBar() as bar:
             found = find_cameras(
                 self.photos, self.out, matching=self.matching, max_size=self.max_size, progress=bar.show
             )
@@ -98,12 +95,10 @@ class Download(Command):
 
     def run(self, arguments: Sequence[str]) -> int:
         """Fetches and unpacks."""
-        from rich.console import Console
-
         from etsplat.cli.progress import PhaseBar
         from etsplat.io.datasets import download_dataset
 
-        with PhaseBar(Console()) as bar:
+        with PhaseBar() as bar:
             scenes = download_dataset(
                 self.name, self.out, progress=lambda done, total: bar.show("Fetching MB", done >> 20, total >> 20)
             )

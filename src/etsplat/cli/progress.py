@@ -32,8 +32,8 @@ B = TypeVar("B", bound="PhaseBar")
 class PhaseBar:
     """A context in which `show` may be called, from any thread."""
 
-    def __init__(self, console: Console) -> None:
-        self._console = console
+    def __init__(self, console: Console | None = None) -> None:
+        self._console = console = console or Console()
         self._progress = Progress(
             SpinnerColumn(),
             TextColumn("{task.description}"),

@@ -133,15 +133,13 @@ class Render(Command):
 
     def run(self, arguments: Sequence[str]) -> int:
         """Draws, and says where the pictures are."""
-        from rich.console import Console
-
         from etsplat.cli.progress import PhaseBar
         from etsplat.tasks.render_soup import render_run
         from etsplat.tasks.sources import open_run
 
         opened = open_run(self.run_dir, self.scene, self.device)
         out = self.out or opened.folder / "renders"
-        with PhaseBar(Console()) as bar:
+        with PhaseBar() as bar:
             files = render_run(
                 opened, out, self.settings, progress=lambda done, total: bar.show("Drawing", done, total)
             )

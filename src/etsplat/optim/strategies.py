@@ -159,7 +159,23 @@ class DensifyAndPrune(Strategy):
 
     def densify(self, iteration: int) -> None:
         """Removes dead triangles and lets others multiply, whatever the time."""
-        self._apply(self._densification(iteration, self._dead(iteration)))
+        soup, dead, by = self.model, self._dead(iteration), self.sample_by
+        if by == "alternate":
+            by = "opacity" if iteration // self.every % 2 == 0 else "sharpness"
+        count = soup.count if self.replace_dead else soup.count - int(dead.sum())
+        plan = densify_plan(
+            soup.vertices.detach(),
+            soup.opacity_logits.detach(),
+            soup.sigma.detach(),
+            self.statistics.screen_size,
+            dead,
+            target=grown_count(count, self.growth, self.max_triangles),
+            by=by,
+            split_size=self.split_size,
+            noise=self.clone_noise,
+            generator=self.generator,
+        )
+        self._apply(plan)
 
     def observe(self, seen: Rasterization, *, epoch_starts: bool) -> None:
         """Takes in the statistics of a view."""
@@ -192,25 +208,6 @@ class DensifyAndPrune(Strategy):
                 f"no triangle is left at iteration {iteration}; lower lambda_opacity or prune_importance"
             )
         return dead
-
-    def _densification(self, iteration: int, dead: Tensor) -> RowPlan:
-        soup = self.model
-        by = self.sample_by
-        if by == "alternate":
-            by = "opacity" if iteration // self.every % 2 == 0 else "sharpness"
-        count = soup.count if self.replace_dead else soup.count - int(dead.sum())
-        return densify_plan(
-            soup.vertices.detach(),
-            soup.opacity_logits.detach(),
-            soup.sigma.detach(),
-            self.statistics.screen_size,
-            dead,
-            target=grown_count(count, self.growth, self.max_triangles),
-            by=by,
-            split_size=self.split_size,
-            noise=self.clone_noise,
-            generator=self.generator,
-        )
 
     def _apply(self, plan: RowPlan) -> None:
         parameters, statistics = apply_rows(plan, self.adam, self.statistics.tensors())

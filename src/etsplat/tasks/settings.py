@@ -141,12 +141,12 @@ class Settings:
     TASK: ClassVar[str] = ""
     """What a run with these settings is called in its config.json."""
     LABELS: ClassVar[tuple[str, ...]] = ()
-    """Settings that others start from: the preset first. They are named before the others are set, or not at all."""
+    """Settings that others start from. The first is the preset: it is named before others are set, or not at all."""
 
     def __new__(cls: type[AnySettings], *_: Any, **given: Any) -> AnySettings:
-        """Refuses a label without the settings that it stands for."""
+        """Refuses a preset's name without the settings that it stands for."""
         if len(given) < len(fields(cls)):
-            cls._check_labels(given, cls)
+            cls._check_preset(given, cls)
         return object.__new__(cls)
 
     def __post_init__(self) -> None:
@@ -205,7 +205,7 @@ class Settings:
                 raise InputError(f"{name}: is a group of settings; name one of them, with its value")
             if name not in known:
                 raise InputError(f"{name}: is no setting{did_you_mean(name, known)}")
-        self._check_labels(flat, self)
+        self._check_preset(flat, self)
         return _replaced(self, {name: _typed(known[name], value) for name, value in flat.items()}, "")
 
     @classmethod
@@ -224,14 +224,14 @@ class Settings:
         return changes
 
     @classmethod
-    def _check_labels(cls, given: Mapping[str, Any], present: object) -> None:
-        """Refuses other labels than those present: one by itself would stand beside what others stand for."""
-        for name in cls.LABELS:
-            value = given.get(name, getattr(present, name))
-            if value != getattr(present, name) and value in settings_of(cls)[name].choices:
-                preset, *others = (given.get(label, getattr(present, label)) for label in cls.LABELS)
+    def _check_preset(cls, given: Mapping[str, Any], present: object) -> None:
+        """Refuses another preset than that present: its name would stand beside the other's settings."""
+        for name in cls.LABELS[:1]:
+            preset = given.get(name, getattr(present, name))
+            if preset != getattr(present, name) and preset in settings_of(cls)[name].choices:
+                others = (given.get(label, getattr(present, label)) for label in cls.LABELS[1:])
                 start = f"{cls.__name__}.{preset}({', '.join(map(repr, others))})"
-                raise InputError(f"{name}: {value!r} stands for other settings too; begin with {start}")
+                raise InputError(f"{name}: {preset!r} stands for other settings too; begin with {start}")
 
     def to_dict(self) -> dict[str, Any]:
         """All settings as JSON has them, with a dictionary for each group."""
@@ -299,15 +299,11 @@ def settings_of(kind: type) -> dict[str, Setting]:
     return found
 
 
-def registered_kernels() -> tuple[str, ...]:
-    """Names given to `register_kernel`; none where nobody has imported what registers them."""
-    kernels = sys.modules.get("etsplat.core.kernels")
-    return tuple(name for name, kernel in kernels.KERNELS.items() if kernel.table is not None) if kernels else ()
-
-
 def kernel_methods() -> tuple[str, ...]:
-    """The methods of soft triangles."""
-    return (*get_args(SoftMethod), *registered_kernels())
+    """The methods of soft triangles: ours, and what was given to `register_kernel`, if anybody has imported that."""
+    kernels = sys.modules.get("etsplat.core.kernels")
+    registered = [name for name, kernel in kernels.KERNELS.items() if kernel.table is not None] if kernels else []
+    return (*get_args(SoftMethod), *registered)
 
 
 def engine_names() -> tuple[str, ...]:
