@@ -5,7 +5,7 @@ import torch
 
 from etsplat import _native
 from etsplat.core.cameras import Cameras, intrinsics, look_at
-from etsplat.engines.reference.normal_consistency import depth_normals
+from etsplat.engines.reference.losses import depth_normals
 from etsplat.engines.threads import num_threads, set_num_threads
 from etsplat.ops.normal_consistency import normal_consistency
 from helpers.engines import on

@@ -6,20 +6,19 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from etsplat.engines.reference.adam import adam_step
 from etsplat.engines.reference.antialias import antialias
-from etsplat.engines.reference.mesh_energies import mesh_energies
-from etsplat.engines.reference.normal_consistency import normal_consistency
-from etsplat.engines.reference.photometric import photometric_loss
-from etsplat.engines.reference.pick_values import pick_values
+from etsplat.engines.reference.channels import pick_values, triangle_channels
+from etsplat.engines.reference.losses import (
+    mean_area,
+    mesh_energies,
+    normal_consistency,
+    photometric_loss,
+    weighted_sum,
+)
 from etsplat.engines.reference.rasterize import rasterize
 from etsplat.engines.reference.rasterize_opaque import rasterize_opaque, render_opaque
-from etsplat.engines.reference.soup_activation import soup_activation
-from etsplat.engines.reference.soup_statistics import update_statistics
-from etsplat.engines.reference.spherical_harmonics import soup_colors, spherical_harmonics
-from etsplat.engines.reference.triangle_area import mean_area
-from etsplat.engines.reference.triangle_channels import triangle_channels
-from etsplat.engines.reference.weighted_sum import weighted_sum
+from etsplat.engines.reference.soup import soup_activation, soup_colors, spherical_harmonics
+from etsplat.engines.reference.steps import adam_step, update_statistics
 
 
 class Engine:

@@ -13,7 +13,7 @@ from torch import Tensor
 from etsplat.core.validation import check_like, check_shape, dense
 from etsplat.engines.choice import engine_for, queued_steps
 from etsplat.engines.engine import Engine
-from etsplat.engines.reference.adam import AdamGroup, step_rates
+from etsplat.engines.reference.steps import AdamGroup, step_rates
 
 
 class Adam:
@@ -73,13 +73,12 @@ class Adam:
         Raises:
             ValueError: A parameter without gradient; nothing is updated then.
         """
+        together: dict[Engine, list[str]] = {}
         for name, parameter in self.parameters.items():
             if parameter.grad is None:
                 raise ValueError(f"parameter {name} has no gradient: call backward() before step()")
-        self.step_count += 1
-        together: dict[Engine, list[str]] = {}
-        for name, parameter in self.parameters.items():
             together.setdefault(engine_for(parameter), []).append(name)
+        self.step_count += 1
         for engine, names in together.items():
             groups, rates = self._groups(names), [self.learning_rates[name] for name in names]
             engine.adam_step(groups, rates, self.betas, self.eps, self.step_count)

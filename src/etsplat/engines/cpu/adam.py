@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from etsplat import _native
-from etsplat.engines.reference.adam import AdamGroup
+from etsplat.engines.reference.steps import AdamGroup
 
 
 def adam_step(

@@ -6,7 +6,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from etsplat.core.connectivity import MeshConnectivity
 from etsplat.engines.cuda.launch import launch_each
 from etsplat.engines.cuda.program import Program
 from etsplat.engines.cuda.structs import Struct, struct_class
@@ -58,23 +57,10 @@ def _backward(kept: Any, needed: Any, grad_image: Tensor) -> list[Tensor | None]
     return grads
 
 
-def _scene(
-    b: int,
-    points: Tensor,
-    silhouettes: Tensor,
-    vertices: Tensor,
-    colors: Tensor,
-    backgrounds: Tensor,
-    viewmats: Tensor,
-    Ks: Tensor,
-    triangle: Tensor,
-    barycentrics: Tensor,
-    depth: Tensor,
-    near_plane: float,
-    per_face: bool,
-    connectivity: MeshConnectivity,
-) -> Struct:
+def _scene(b: int, points: Tensor, silhouettes: Tensor, *given: Any) -> Struct:
     """View b, as the kernels read it, where its arrays lie now."""
+    vertices, colors, backgrounds, viewmats, Ks, triangle, barycentrics, depth, *settings = given
+    near_plane, per_face, connectivity = settings
     faces, (height, width) = connectivity.faces, triangle.shape[1:]
     floats = (vertices, viewmats[b], Ks[b], barycentrics[b], depth[b], colors, backgrounds[b])
     integers = (faces, connectivity.pair_offsets, connectivity.paired_faces, triangle[b])

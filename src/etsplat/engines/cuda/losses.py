@@ -25,24 +25,16 @@ _THREADS = 256
 _TILE = 16  # _TILE^2 threads
 
 
-def _photometric(
-    keep: bool,
-    color: Tensor,
-    target: Tensor,
-    mask: Tensor | None,
-    backgrounds: Tensor | None,
-    dssim_weight: float,
-    squared: bool,
-) -> tuple[Tensor, Any]:
+def _photometric(keep: bool, color: Tensor, *compared: Any) -> tuple[Tensor, Any]:
     """Keeps the derivatives of SSIM by its moments, which backward blurs once more; both read the images."""
+    problem, grid = _compared(color, *compared)
     B, H, W = color.shape[:3]
-    maps = color.new_empty((B, 3, 3, H, W)) if keep and dssim_weight > 0 else None
-    problem, grid = _compared(color, target, mask, backgrounds, dssim_weight, squared)
+    maps = color.new_empty((B, 3, 3, H, W)) if keep and problem.dssim_weight > 0 else None
     sums = color.new_empty((grid[0] * grid[1] * grid[2], 2), dtype=torch.float64)
     loss = color.new_empty(())
     launch(_PHOTOMETRIC, "photometric_sums", grid, _TILE * _TILE, (problem, maps, sums))
     launch(_PHOTOMETRIC, "photometric_loss", 1, _TILE * _TILE, (problem, sums, ctypes.c_int64(len(sums)), loss))
-    return loss, (maps, color, target, mask, backgrounds, dssim_weight, squared)
+    return loss, (maps, color, *compared)
 
 
 def _photometric_backward(kept: Any, _needed: Any, grad_loss: Tensor) -> tuple[Tensor]:

@@ -11,7 +11,7 @@ from etsplat.engines.cuda.capacity import overflow_flag, repair_overflow
 from etsplat.engines.cuda.launch import backend, blocks, launch, launch_each, upload
 from etsplat.engines.cuda.program import Program
 from etsplat.engines.cuda.structs import struct_class
-from etsplat.engines.reference.adam import AdamGroup, step_rates
+from etsplat.engines.reference.steps import AdamGroup, step_rates
 
 _ADAM = Program("adam.cu", contract=False)
 _STATISTICS = Program("soup_statistics.cu", contract=False)

@@ -13,17 +13,25 @@ from etsplat.core.validation import dense
 from etsplat.engines.native.pool import empty
 
 
-class Inputs(NamedTuple):
-    """The tensors of a render; shapes as in ``etsplat.rasterize``."""
+class PerInput(NamedTuple):
+    """Something for each tensor of a render: the tensor itself, its gradient, or whether that is needed."""
 
-    vertices: Tensor
-    flat: Tensor | None  # (N, F) or (B, N, F)
-    corner: Tensor | None  # (N, 3, K) or (B, N, 3, K)
-    opacities: Tensor
-    sigma: Tensor
-    viewmats: Tensor
-    Ks: Tensor
-    backgrounds: Tensor | None  # (B, F + K)
+    vertices: Any
+    flat: Any
+    corner: Any
+    opacities: Any
+    sigma: Any
+    viewmats: Any
+    Ks: Any
+    backgrounds: Any
+
+
+class Inputs(PerInput):
+    """The tensors of a render; shapes as in ``etsplat.rasterize``.
+
+    Flat channels are (N, F) or (B, N, F), corner channels (N, 3, K) or (B, N, 3, K), and backgrounds (B, F + K); each
+    may be None.
+    """
 
     @property
     def channels(self) -> tuple[int, int]:
@@ -39,19 +47,6 @@ class Inputs(NamedTuple):
     def corner_per_view(self) -> bool:
         """Whether each view has corner channels of its own."""
         return self.corner is not None and self.corner.dim() == 4
-
-
-class PerInput(NamedTuple):
-    """Something for each of the inputs: its gradient, or whether that is needed."""
-
-    vertices: Any
-    flat: Any
-    corner: Any
-    opacities: Any
-    sigma: Any
-    viewmats: Any
-    Ks: Any
-    backgrounds: Any
 
 
 class Geometry:

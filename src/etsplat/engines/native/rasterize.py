@@ -1,6 +1,6 @@
 """The native engines' side of ``rasterize``: one autograd function around an engine's ``Render``."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -22,17 +22,15 @@ def rasterize_native(
     channels.add_geometry(tensors, settings, engine)
     backgrounds = channels.pad_backgrounds(tensors.backgrounds)
 
-    def run(part: _Part, part_settings: RasterizeSettings) -> tuple[tuple[Tensor, ...], Plan]:
-        t, plan = tensors, Plan(render, part_settings, geometry, len(tensors.viewmats))
-        views = t.viewmats, t.Ks, part.backgrounds
-        inputs = Inputs(t.vertices, part.flat, part.corner, t.opacities, t.sigma, *views)
-        return _rasterize(plan, *inputs), plan
-
-    first, *rest = _parts(channels.flat, channels.corner, backgrounds, render.most_channels)
-    (color, alpha, distortion, median_triangle), plan = run(first, settings)
+    shared = (tensors.opacities, tensors.sigma, tensors.viewmats, tensors.Ks)
+    inputs = Inputs(tensors.vertices, channels.flat, channels.corner, *shared, backgrounds)
+    first, *rest = _parts(inputs, render.most_channels)
+    plan = Plan(render, settings, geometry, len(tensors.viewmats))
+    color, alpha, distortion, median_triangle = _rasterize(plan, *first)
     if rest:
         plain = replace(settings, outputs=settings.outputs - {"statistics", "distortion", "median_depth"})
-        color = torch.cat([color, *(run(part, plain)[0][0] for part in rest)], dim=-1)
+        others = replace(plan, settings=plain)
+        color = torch.cat([color, *(_rasterize(others, *part)[0] for part in rest)], dim=-1)
     result = Rasterization(color=color, alpha=alpha, statistics=plan.statistics)
     if settings.wants("distortion"):
         result.distortion = distortion
@@ -42,29 +40,22 @@ def rasterize_native(
     return result
 
 
-@dataclass
-class _Part:
-    """Channels of one pass."""
-
-    flat: Tensor | None
-    corner: Tensor | None
-    backgrounds: Tensor | None
-
-
-def _parts(flat: Tensor | None, corner: Tensor | None, backgrounds: Tensor | None, most: int | None) -> list[_Part]:
+def _parts(inputs: Inputs, most: int | None) -> list[Inputs]:
     """All channels, or, where they are more than ``most``, parts that lie next to each other in the image."""
-    if most is None or channel_count(flat) + channel_count(corner) <= most:
-        return [_Part(flat, corner, backgrounds)]
+    flat, corner, backgrounds = inputs.flat, inputs.corner, inputs.backgrounds
+    if most is None or sum(inputs.channels) <= most:
+        return [inputs]
     # A triangle with any channel that is not finite is to be left out of every part.
-    finite = torch.ones((), dtype=torch.bool, device=(flat if flat is not None else corner).device)  # type: ignore[union-attr]
+    finite = torch.ones((), dtype=torch.bool, device=inputs.vertices.device)
     for channels, dims in ((flat, -1), (corner, (-2, -1))):
         finite = finite if channels is None else finite & channels.isfinite().all(dim=dims)
     parts, at = [], 0
     for channels, mask in ((flat, finite[..., None]), (corner, finite[..., None, None])):
         for begin in range(0, channel_count(channels), most):
-            chosen = torch.where(mask, channels[..., begin : begin + most], torch.nan)  # type: ignore[index]
+            chosen = torch.where(mask, channels[..., begin : begin + most], torch.nan)
             behind = None if backgrounds is None else backgrounds[:, at : at + chosen.shape[-1]]
-            parts.append(_Part(chosen, None, behind) if channels is flat else _Part(None, chosen, behind))
+            kinds = (chosen, None) if channels is flat else (None, chosen)
+            parts.append(inputs._replace(flat=kinds[0], corner=kinds[1], backgrounds=behind))
             at += chosen.shape[-1]
     return parts
 

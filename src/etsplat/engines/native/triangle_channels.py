@@ -9,7 +9,7 @@ from torch import Tensor
 
 from etsplat.engines.native.operation import differentiable
 from etsplat.engines.native.pool import empty
-from etsplat.engines.reference.triangle_channels import homogeneous_centroids
+from etsplat.engines.reference.channels import homogeneous_centroids
 
 Call = Callable[..., None]
 

@@ -1,4 +1,4 @@
-"""Depths of centroids and normals of triangles, in plain PyTorch."""
+"""Depths and normals of triangles as channels, and their values at pixels, in plain PyTorch."""
 
 import torch
 from jaxtyping import Float
@@ -32,3 +32,9 @@ def _facing_normals(corners: Float[Tensor, "N 3 3"], viewmats: Float[Tensor, "B 
     towards = corners.mean(1)[None] - centers[:, None]
     away = (towards * normal).sum(-1, keepdim=True) > 0
     return torch.where(away, -normal[None], normal[None])
+
+
+def pick_values(values: Tensor, chosen: Tensor) -> Tensor:
+    """See `etsplat.ops.pick_values`."""
+    behind = torch.cat([values.new_zeros(len(values), 1), values], dim=1)
+    return behind.gather(1, chosen.long().flatten(start_dim=1)).view(chosen.shape)

@@ -1,8 +1,13 @@
-"""Adam in plain PyTorch."""
+"""What a step of a fit updates in place, in plain PyTorch."""
 
 from collections.abc import Sequence
 
+import torch
 from torch import Tensor
+
+from etsplat.core.rasterization import TriangleStatistics
+
+_VISIBLE_INRADIUS = 1.0
 
 AdamGroup = tuple[Tensor, Tensor, Tensor, Tensor]
 """A parameter, its gradient and both moments, contiguous."""
@@ -28,3 +33,18 @@ def adam_step(
         second.mul_(beta2).add_((1 - beta2) * gradient * gradient)
         root = second.sqrt() / (1 - beta2**step_count) ** 0.5
         parameter -= learning_rate / (1 - beta1**step_count) * (first / (root + eps))
+
+
+def update_statistics(
+    records: Sequence[Tensor], view: TriangleStatistics, views: int, epoch_starts: bool | Tensor
+) -> None:
+    """Update the records in place; see `etsplat.ops.soup_statistics`."""
+    importance, screen_size, seen, trial = records
+    seen_now = view.max_weight[0], view.screen_size[0], view.inradius[0]
+    torch.maximum(importance, seen_now[0], out=importance)
+    torch.maximum(screen_size, seen_now[1], out=screen_size)
+    running = trial < views
+    if not epoch_starts:
+        running &= trial > 0
+    seen += running & (seen_now[2] > _VISIBLE_INRADIUS)
+    trial += running
