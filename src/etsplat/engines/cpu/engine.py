@@ -5,14 +5,10 @@ from contextlib import AbstractContextManager
 from etsplat import _native
 from etsplat.engines.cpu.adam import adam_step
 from etsplat.engines.cpu.antialias import antialias
-from etsplat.engines.cpu.mesh_energies import mesh_energies
-from etsplat.engines.cpu.normal_consistency import normal_consistency
-from etsplat.engines.cpu.photometric import photometric_loss
+from etsplat.engines.cpu.losses import mean_area, mesh_energies, normal_consistency, photometric_loss
 from etsplat.engines.cpu.rasterize import CpuRender
 from etsplat.engines.cpu.rasterize_opaque import rasterize_opaque, render_opaque
-from etsplat.engines.cpu.soup_activation import soup_activation
-from etsplat.engines.cpu.spherical_harmonics import soup_colors, spherical_harmonics
-from etsplat.engines.cpu.triangle_area import mean_area
+from etsplat.engines.cpu.soup import soup_activation, soup_colors, spherical_harmonics
 from etsplat.engines.native.engine import NativeEngine
 from etsplat.engines.native.triangle_channels import triangle_channels
 from etsplat.engines.threads import one_torch_thread
