@@ -11,7 +11,7 @@
 
 using namespace etsplat;
 
-constexpr int kThreads = 256;
+constexpr int kThreads = kBlock;
 
 struct AntialiasView {
     const float *vertices, *viewmat, *K, *barycentrics, *depth, *colors, *background;

@@ -10,6 +10,7 @@
 namespace etsplat {
 
 constexpr int kWarp = 32;
+constexpr int kBlock = 256;  // threads of a block, where nothing else is said
 constexpr unsigned kAllLanes = 0xffffffffu;
 
 __device__ __forceinline__ int lane_index() { return static_cast<int>(threadIdx.x % kWarp); }

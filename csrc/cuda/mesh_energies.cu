@@ -11,7 +11,7 @@ using namespace etsplat;
 
 using Vector = Vector3<float>;
 
-constexpr int kThreads = 256;
+constexpr int kThreads = kBlock;
 
 __device__ long long block_count(long long elements) { return (elements + kThreads - 1) / kThreads; }
 

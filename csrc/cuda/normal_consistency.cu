@@ -6,7 +6,7 @@
 
 using namespace etsplat;
 
-constexpr int kThreads = 256;
+constexpr int kThreads = kBlock;
 
 struct DepthNormals {
     const float *normals, *depth, *alpha, *viewmats, *Ks;  // (B, H, W, 3), (B, H, W), (B, H, W), (B, 4, 4), (B, 3, 3)

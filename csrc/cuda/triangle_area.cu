@@ -4,7 +4,7 @@
 
 using namespace etsplat;
 
-constexpr int kThreads = 256;
+constexpr int kThreads = kBlock;
 
 __device__ float area_of(const float* vertices, int n, float scale, Vector3<float>* gradient) {
     const float* from = vertices + 9ll * n;

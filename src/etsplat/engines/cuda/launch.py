@@ -20,8 +20,11 @@ from torch import Tensor
 
 from etsplat.engines.cuda.device import Device
 from etsplat.engines.cuda.program import Program
+from etsplat.engines.cuda.structs import constant
 
 Dim = int | tuple[int, ...]
+BLOCK = constant("cuda/common.h", "kBlock")
+"""Threads of a block, where nothing else is said."""
 _NOWHERE_ELSE = nullcontext()
 
 
@@ -74,7 +77,7 @@ def launch(program: Program, name: str, grid: Dim, block: Dim, args: Sequence[An
         backend().launch(program, name, grid, block, values)
 
 
-def launch_each(program: Program, name: str, count: int, args: Sequence[Any], threads: int = 256) -> None:
+def launch_each(program: Program, name: str, count: int, args: Sequence[Any], threads: int = BLOCK) -> None:
     """Start a kernel for ``count`` items, one a thread, ``threads`` in a block."""
     launch(program, name, blocks(count, threads), threads, args)
 

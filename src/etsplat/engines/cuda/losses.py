@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from etsplat.core.connectivity import MeshConnectivity
-from etsplat.engines.cuda.launch import blocks, launch, launch_each
+from etsplat.engines.cuda.launch import BLOCK, blocks, launch, launch_each
 from etsplat.engines.cuda.program import Program
-from etsplat.engines.cuda.structs import Struct, struct_class
+from etsplat.engines.cuda.structs import Struct, constant, struct_class
 from etsplat.engines.native.operation import differentiable
 
 _PHOTOMETRIC = Program("photometric.cu", contract=False)
@@ -21,8 +21,7 @@ _ENERGIES = Program("mesh_energies.cu", contract=False)
 _NORMALS = Program("normal_consistency.cu", contract=False)
 _AREA = Program("triangle_area.cu", contract=False)
 _SUM = Program("weighted_sum.cu", contract=False)
-_THREADS = 256
-_TILE = 16  # _TILE^2 threads
+_TILE = constant("cuda/photometric.cu", "kTile")  # _TILE^2 threads
 
 
 def _photometric(keep: bool, color: Tensor, *compared: Any) -> tuple[Tensor, Any]:
@@ -72,17 +71,17 @@ def _mesh_energies(
     corners, pairs = (c.corner_offsets, c.corners), (c.pair_offsets, c.paired_faces)
     arrays = (vertices, c.faces, c.neighbor_offsets, c.neighbor_indices, *corners, *pairs)
     mesh = struct_class("math/mesh_energies.h", "MeshArrays")(*arrays, V, len(c.edges), len(c.face_pairs), F)
-    vertex_blocks, face_blocks = blocks(V, _THREADS), blocks(F, _THREADS)
+    vertex_blocks, face_blocks = blocks(V, BLOCK), blocks(F, BLOCK)
     vertex_sums = vertices.new_empty((vertex_blocks, 2), dtype=torch.float64)
     face_sums = vertices.new_empty(face_blocks, dtype=torch.float64)
     normals, spread = vertices.new_empty((F, 4)), vertices.new_empty((V, 3))
     corner_gradients, gradients = vertices.new_empty((3 * F, 3)), vertices.new_empty((3, V, 3))
     energies = vertices.new_empty(()), vertices.new_empty(()), vertices.new_empty(())
     arguments = (mesh, edge_power, normals, spread, gradients, vertex_sums)
-    launch(_ENERGIES, "mesh_elements", face_blocks + vertex_blocks, _THREADS, arguments)
-    launch(_ENERGIES, "mesh_pairs", face_blocks, _THREADS, (mesh, normals, corner_gradients, face_sums))
+    launch(_ENERGIES, "mesh_elements", face_blocks + vertex_blocks, BLOCK, arguments)
+    launch(_ENERGIES, "mesh_pairs", face_blocks, BLOCK, (mesh, normals, corner_gradients, face_sums))
     arguments = (mesh, spread, corner_gradients, gradients, vertex_sums, face_sums, *energies)
-    launch(_ENERGIES, "mesh_gather", vertex_blocks + 1, _THREADS, arguments)
+    launch(_ENERGIES, "mesh_gather", vertex_blocks + 1, BLOCK, arguments)
     return energies, [gradients]
 
 
@@ -103,15 +102,15 @@ def _normal_consistency(_keep: bool, *inputs: Tensor) -> tuple[Tensor, Any]:
     problem, grid = _depth_normals(inputs)
     sums = inputs[0].new_empty(grid[0] * grid[1], dtype=torch.float64)
     loss = inputs[0].new_empty(())
-    launch(_NORMALS, "normal_sums", grid, _THREADS, (problem, sums))
-    launch(_NORMALS, "normal_mean", 1, _THREADS, (problem, sums, ctypes.c_int64(len(sums)), loss))
+    launch(_NORMALS, "normal_sums", grid, BLOCK, (problem, sums))
+    launch(_NORMALS, "normal_mean", 1, BLOCK, (problem, sums, ctypes.c_int64(len(sums)), loss))
     return loss, inputs
 
 
 def _normal_consistency_backward(inputs: Any, _needed: Any, grad_loss: Tensor) -> tuple[Tensor, Tensor]:
     problem, grid = _depth_normals(inputs)
     grads = torch.empty_like(inputs[0]), torch.empty_like(inputs[1])
-    launch(_NORMALS, "normal_backward", grid, _THREADS, (problem, grad_loss, *grads))
+    launch(_NORMALS, "normal_backward", grid, BLOCK, (problem, grad_loss, *grads))
     return grads
 
 
@@ -119,17 +118,17 @@ def _depth_normals(inputs: Sequence[Tensor]) -> tuple[Struct, tuple[int, int]]:
     """The kernels' struct and their grid: blocks of a view, views."""
     views, height, width = inputs[0].shape[:3]
     struct = struct_class("cuda/normal_consistency.cu", "DepthNormals")(*inputs, views, height, width)
-    return struct, (blocks(height * width, _THREADS), views)
+    return struct, (blocks(height * width, BLOCK), views)
 
 
 normal_consistency = differentiable(_normal_consistency, _normal_consistency_backward)
 
 
 def _mean_area(_keep: bool, vertices: Tensor) -> tuple[Tensor, Any]:
-    grid = blocks(len(vertices), _THREADS)
+    grid = blocks(len(vertices), BLOCK)
     sums, mean = vertices.new_empty(grid, dtype=torch.float64), vertices.new_empty(())
-    launch(_AREA, "area_sums", grid, _THREADS, (vertices, len(vertices), sums))
-    launch(_AREA, "area_mean", 1, _THREADS, (sums, ctypes.c_int64(grid), len(vertices), mean))
+    launch(_AREA, "area_sums", grid, BLOCK, (vertices, len(vertices), sums))
+    launch(_AREA, "area_mean", 1, BLOCK, (sums, ctypes.c_int64(grid), len(vertices), mean))
     return mean, [vertices]
 
 

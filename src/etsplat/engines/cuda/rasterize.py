@@ -18,9 +18,13 @@ from etsplat.engines.cuda.launch import backend, blocks, launch, launch_each, on
 from etsplat.engines.cuda.memory import Arena, PendingNumber
 from etsplat.engines.cuda.program import Program
 from etsplat.engines.cuda.sort import RadixSort
-from etsplat.engines.cuda.structs import struct_class
+from etsplat.engines.cuda.structs import constant, struct_class
 from etsplat.engines.native.plan import Geometry, Images, Inputs, Outputs, PerInput, Plan
 
+_TILE_THREADS = _native.TILE**2
+_PROJECT_BLOCK = constant("cuda/raster_project.cu", "kProjectBlock")
+_EMIT_BLOCK, _EMIT_ITEMS = (constant("cuda/raster_project.cu", name) for name in ("kEmitBlock", "kEmitItems"))
+_REDUCE_BLOCK = constant("cuda/raster_reduce.cu", "kReduceBlock")
 _TINY = 1.17549435e-38
 _PROJECT = Program("raster_project.cu")
 _Depth = _native.DistortionDepth
@@ -83,7 +87,7 @@ class CudaRender:
         a, m, tiles = self.arguments, self.projected, self.tile_count
         by_depth = RadixSort(max(m, 1), 31)
         self.by_tile = RadixSort(capacity, max(tiles - 1, 1).bit_length())
-        emit_grid = blocks(m, 1024)
+        emit_grid = blocks(m, _EMIT_BLOCK * _EMIT_ITEMS)
         # What has to be zero at first, in one piece; the 64-bit words first.
         sizes = [2, 2 * emit_grid, 2, 2 * tiles, by_depth.zeros, self.by_tile.zeros]
         self.zeros = torch.zeros(sum(sizes), dtype=torch.int32, device=self.device)
@@ -107,10 +111,10 @@ class CudaRender:
         a.set(capacity=capacity, wanted=wanted, overflow=overflow, scan_state=scan_state, tile_ranges=ranges)
         a.set(slots=counters, scan_ticket=counters[1:], **self.state.addresses)
         a.depth_keys, a.slot_tile = temporary["depth_keys"], temporary["slot_tile"]
-        launch_each(_PROJECT, "raster_project", m, [a], 128)
+        launch_each(_PROJECT, "raster_project", m, [a], _PROJECT_BLOCK)
         keys = (temporary["depth_keys"], temporary["depth_keys_2"])
         _, a.order = by_depth.run(keys, (temporary["order"], temporary["order_2"]), m, depth_zeros)
-        launch(_PROJECT, "raster_emit", emit_grid, 256, [a])
+        launch(_PROJECT, "raster_emit", emit_grid, _EMIT_BLOCK, [a])
         return wanted.view(torch.int64)
 
     def _composite(self, capacity: int) -> None:
@@ -124,7 +128,7 @@ class CudaRender:
         launch_each(_PROJECT, "raster_ranges", capacity, [a])
         settings = self.plan.settings
         defines = self._defines(self.distortion, settings.wants("median_depth"), settings.wants("statistics"))
-        launch(Program("raster_forward.cu", defines), "raster_forward", self.tile_count, 256, [a])
+        launch(Program("raster_forward.cu", defines), "raster_forward", self.tile_count, _TILE_THREADS, [a])
         del self.temporary, self.tile_zeros
 
     def backward(
@@ -147,7 +151,7 @@ class CudaRender:
         grad_color, grad_alpha, grad_distortion = cotangents
         distortion = self.distortion if grad_distortion is not None else _Depth.NONE
         defines = self._defines(distortion, median=False, weights=False)
-        grid = blocks(geometry.count, 128)
+        grid = blocks(geometry.count, _REDUCE_BLOCK)
 
         def room(wanted: bool, *shape: int, dtype: torch.dtype = torch.float32) -> Tensor | None:
             return torch.empty(shape, dtype=dtype, device=self.device) if wanted else None
@@ -166,8 +170,8 @@ class CudaRender:
         a.set(grad_opacities=grads.opacities, grad_sigmas=None if shared_sigma else grads.sigma)
         a.set(sigma_sums=sigma_sums, camera_sums=camera_sums, tile_background=background)
         reduction = Program("raster_reduce.cu", defines[1:])
-        launch(Program("raster_backward.cu", defines), "raster_backward", self.tile_count, 256, [a])
-        launch(reduction, "raster_reduce", grid, 128, [a])
+        launch(Program("raster_backward.cu", defines), "raster_backward", self.tile_count, _TILE_THREADS, [a])
+        launch(reduction, "raster_reduce", grid, _REDUCE_BLOCK, [a])
         if gathered:
             count = geometry.vertex_count
             launch_each(reduction, "raster_gather", count, [corners, *geometry.corners, count, grads.vertices])

@@ -9,10 +9,10 @@ from torch import Tensor
 from etsplat.core.rasterization import OpaqueView
 from etsplat.engines.cuda.launch import blocks, launch
 from etsplat.engines.cuda.program import Program
-from etsplat.engines.cuda.structs import struct_class
+from etsplat.engines.cuda.structs import constant, struct_class
 
 _PROGRAM = Program("rasterize_opaque.cu", contract=False)
-_THREADS = 128
+_THREADS = constant("cuda/rasterize_opaque.cu", "kThreads")
 # Samples of a strip: 16 MiB of z-buffer, which the L2 cache of most devices holds.
 _STRIP_SAMPLES = 1 << 21
 

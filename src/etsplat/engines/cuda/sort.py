@@ -8,11 +8,10 @@ from torch import Tensor
 
 from etsplat.engines.cuda.launch import blocks, launch
 from etsplat.engines.cuda.program import Program
+from etsplat.engines.cuda.structs import constant
 
 _PROGRAM = Program("radix_sort.cu")
-_DIGITS = 256
-_BLOCK = 256
-_TILE = 2048  # pairs of a block
+_DIGITS, _BLOCK, _TILE = (constant("cuda/radix_sort.cu", name) for name in ("kDigits", "kSortBlock", "kSortTile"))
 _HISTOGRAM_GRID = 528  # blocks at most: four for each multiprocessor of the largest GPUs
 
 

@@ -10,11 +10,12 @@ from etsplat.core.cameras import Cameras
 from etsplat.core.validation import dense
 from etsplat.engines.cuda.launch import launch_each, upload
 from etsplat.engines.cuda.program import Program
+from etsplat.engines.cuda.structs import constant
 from etsplat.engines.native.operation import differentiable
 
 _ACTIVATION = Program("soup_activation.cu")
 _HARMONICS = Program("spherical_harmonics.cu")
-_HARMONICS_THREADS = 64
+_HARMONICS_THREADS = constant("cuda/spherical_harmonics.cu", "kThreads")
 
 
 def _activation(

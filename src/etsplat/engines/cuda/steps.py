@@ -10,13 +10,13 @@ from etsplat.core.rasterization import TriangleStatistics
 from etsplat.engines.cuda.capacity import overflow_flag, repair_overflow
 from etsplat.engines.cuda.launch import backend, blocks, launch, launch_each, upload
 from etsplat.engines.cuda.program import Program
-from etsplat.engines.cuda.structs import struct_class
+from etsplat.engines.cuda.structs import constant, struct_class
 from etsplat.engines.reference.steps import AdamGroup, step_rates
 
 _ADAM = Program("adam.cu", contract=False)
 _STATISTICS = Program("soup_statistics.cu", contract=False)
 _STEP = Program("step.cu", contract=False)
-_ADAM_THREADS, _ADAM_ELEMENTS = 256, 1024
+_ADAM_THREADS, _ADAM_ELEMENTS = (constant("cuda/adam.cu", name) for name in ("kThreads", "kElements"))
 
 
 def adam_step(

@@ -1,6 +1,7 @@
-"""Structs that kernels take by value, from their C++ declaration: one place says what they hold."""
+"""Structs that kernels take by value, and constants, from their C++ declaration: one place says what they are."""
 
 import ctypes
+import math
 import re
 from functools import cache
 from typing import Any
@@ -62,8 +63,15 @@ def struct_class(file: str, name: str) -> type[Struct]:
             else:
                 kind = _TYPES[match[1]] if match[1] in _TYPES else struct_class(file, match[1])
             if match[3]:
-                length = re.search(rf"constexpr int {match[3]} = (\d+);", text)
-                assert length, f"{file}: not understood: {line}"
-                kind = kind * int(length[1])
+                kind = kind * constant(file, match[3])
             fields.append((member.strip(" *"), kind))
     return type(name, (Struct,), {"_fields_": fields})
+
+
+@cache
+def constant(file: str, name: str) -> int:
+    """The value of ``constexpr int name`` in csrc/``file``: a product of numbers and such constants of the file."""
+    text = (source_root() / file).read_text(encoding="utf-8")
+    value = re.search(rf"^constexpr int {name} = (\w+(?: \* \w+)*);", text, re.MULTILINE)
+    assert value, f"{file}: no constant {name}"
+    return math.prod(int(word) if word.isdigit() else constant(file, word) for word in value[1].split(" * "))
