@@ -1,4 +1,5 @@
 import json
+import re
 import shutil
 
 import numpy as np
@@ -143,6 +144,23 @@ def test_points_of_ply_file_path_are_read(tmp_path):
     capture = load_dataset(tmp_path)
     assert capture.points.tolist() == [[1, 2, 3], [4, 5, 6]]
     torch.testing.assert_close(capture.point_colors[0], torch.tensor([1.0, 0.0, 0.2]))
+
+
+@pytest.mark.parametrize(
+    ("properties", "message"),
+    [
+        ("float x float y float z float x", "'x' occurs more than once"),
+        ("float x float y", "lacks the property z"),
+        ("float x float y float z list uchar int odd", "cannot read `property list"),
+    ],
+)
+def test_points_without_places_are_refused_by_the_name_of_their_file(tmp_path, properties, message):
+    write_transforms(tmp_path, 3, ply_file_path="points.ply")
+    lines = "".join(f"property {line}\n" for line in re.findall(r"(?:list \w+ )?\w+ \w+", properties))
+    head = f"ply\nformat binary_little_endian 1.0\nelement vertex 2\n{lines}end_header\n"
+    (tmp_path / "points.ply").write_bytes(head.encode() + bytes(200))
+    with pytest.raises(InputError, match=rf"points\.ply: {message}|points\.ply: .*{message}"):
+        load_dataset(tmp_path)
 
 
 def test_extra_photos_and_unused_cameras_are_ignored_and_points_may_be_missing(tmp_path):

@@ -132,6 +132,29 @@ def test_a_file_cut_short_is_an_input_error(tmp_path, suffix):
         load_image(path)
 
 
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+def test_whatever_is_in_a_damaged_file_it_is_an_image_or_an_input_error(tmp_path, picture, suffix):
+    """Bytes changed, taken out and repeated, mostly near the beginning."""
+    path, rng = tmp_path / f"a{suffix}", np.random.default_rng(0)
+    save_image(path, picture[..., :3])
+    whole, read, messages = path.read_bytes(), 0, []
+    for _ in range(400):
+        data, at = bytearray(whole), int(rng.integers(min(len(whole), rng.choice([60, 10**9]))))
+        length = int(rng.choice([1, 2, 4, 16]))
+        data[at : at + length] = rng.choice([rng.bytes(length), b"", whole[at : at + 2 * length], b"\xff" * length])
+        path.write_bytes(data)
+        try:
+            for load in (load_image, load_mask, lambda path: load_pixels(path, 3, 4).float() / 255):
+                values = load(path)
+                assert 0 <= float(values.min()) <= float(values.max()) <= 1
+            read += 1
+        except InputError as error:
+            messages.append(str(error))
+    assert read > 20
+    assert messages
+    assert not any("\n" in message for message in messages)
+
+
 def test_premultiplied_over_background_equals_the_straight_blend(picture):
     background = torch.tensor([0.2, 0.5, 0.9])
     expected = picture[..., :3] * picture[..., 3:] + background * (1 - picture[..., 3:])

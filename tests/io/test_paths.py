@@ -24,7 +24,7 @@ def test_a_name_that_leads_out_is_refused_on_every_system(name):
 
 
 @pytest.mark.parametrize(
-    "name", ["", ".", "./", "a\0.jpg", "a" * 300 + ".jpg", "x/" + "é" * 130, "a/" * 2000, "\ud800.jpg"]
+    "name", ["", ".", "./", "a\0.jpg", "a\nb.jpg", "a" * 300 + ".jpg", "x/" + "é" * 130, "a/" * 2000, "\ud800.jpg"]
 )
 def test_what_is_no_file_name_is_refused(name):
     with pytest.raises(InputError, match=r"cameras\.bin: .* is no file name"):

@@ -28,7 +28,7 @@ def path_within(folder: Path, name: str, source: Path | str) -> Path:
         longest = max(len(part.encode()) for part in parts)
     except ValueError:  # no part, or characters that are none
         longest = 0
-    if not 0 < longest < 256 or len(name) > 2048 or "\0" in name:
+    if not 0 < longest < 256 or len(name) > 2048 or any(character < " " for character in name):
         raise InputError(f"{source}: {name[:80]!r} is no file name; correct it there")
     if parts[0].startswith("/") or ".." in parts or PureWindowsPath(name).drive:
         raise InputError(f"{source}: {name!r} leads out of {folder}; copy the file there and name it in that folder")

@@ -1,14 +1,13 @@
 """PLY files as tables: points, Gaussian scenes, and triangles with numbers of their own."""
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
 from jaxtyping import Float
-from numpy.typing import DTypeLike
 from torch import Tensor
 
 from etsplat.core.errors import InputError
@@ -131,8 +130,8 @@ def read_ply_tables(path: Path | str, elements: tuple[str, ...] = ("vertex",)) -
     return {name: tables[name] for name in elements}
 
 
-def columns(path: Path | str, table: np.ndarray, names: Iterable[str], dtype: DTypeLike) -> np.ndarray:
-    """Properties of a table side by side, (rows, names); those that no number of the type can hold become infinite.
+def columns(path: Path | str, table: np.ndarray, *names: str) -> Float[Tensor, "N K"]:
+    """Properties of a file's table side by side, in float64.
 
     Raises:
         InputError: the table lacks one.
@@ -140,8 +139,7 @@ def columns(path: Path | str, table: np.ndarray, names: Iterable[str], dtype: DT
     missing = [name for name in names if name not in (table.dtype.names or ())]
     if missing:
         raise InputError(f"PLY file {path}: lacks the property {missing[0]}; export it again")
-    with np.errstate(over="ignore"):
-        return np.stack([table[name].astype(dtype) for name in names], axis=1)
+    return torch.from_numpy(np.stack([table[name].astype(np.float64) for name in names], axis=1))
 
 
 def load_points(path: Path | str) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "P 3"]]:
@@ -153,14 +151,14 @@ def load_points(path: Path | str) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "
         InputError: as `read_ply_tables`, or there are no coordinates.
     """
     table = read_ply_tables(path)["vertex"]
-    points = columns(path, table, "xyz", np.float64)
-    colors = np.full(points.shape, GREY, dtype=np.float32)
+    points = columns(path, table, *"xyz")
+    colors = torch.full(points.shape, GREY)
     if {"red", "green", "blue"} <= set(table.dtype.names or ()):
-        colors = columns(path, table, ("red", "green", "blue"), np.float32)
+        colors = columns(path, table, "red", "green", "blue").float()
         if table.dtype["red"].kind == "u":
             colors /= np.iinfo(table.dtype["red"]).max
-    finite = np.isfinite(points).all(axis=1) & np.isfinite(colors).all(axis=1)
-    return torch.from_numpy(points[finite]), torch.from_numpy(colors[finite].clip(0, 1))
+    finite = points.isfinite().all(dim=1) & colors.isfinite().all(dim=1)
+    return points[finite], colors[finite].clamp(0, 1)
 
 
 def encode_ply(tables: Mapping[str, np.ndarray], comment: str | None = None) -> bytes:

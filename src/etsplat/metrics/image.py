@@ -17,6 +17,7 @@ from torch import Tensor, nn
 
 from etsplat.core.errors import InputError
 from etsplat.io.paths import kind_of
+from etsplat.io.tensors import read_state_dict
 
 _C1, _C2 = 0.01**2, 0.03**2
 WINDOW, _SIGMA = 11, 1.5
@@ -243,7 +244,7 @@ def _read_weights(path: Path) -> Mapping[str, Tensor]:
     try:
         if kind_of(path) == ".safetensors":
             return load_file(path)
-        entries = torch.load(path, map_location="cpu", weights_only=True)
+        entries = read_state_dict(path)
     except Exception as error:  # torch's unpickler raises anything, depending on the bytes
         detail = (str(error) or type(error).__name__).splitlines()[0]
         raise InputError(f"LPIPS weights {path}: not a readable weights file ({detail}); download it again") from error

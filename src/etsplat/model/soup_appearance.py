@@ -1,11 +1,15 @@
 """How a triangle soup is drawn, in training and afterwards."""
 
 import json
+from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
+from typing import Any
 
 from jaxtyping import Float
 from torch import Tensor
 
+from etsplat.core.harmonics import MAX_DEGREE
+from etsplat.core.kernels import DISTANCES
 from etsplat.model.model import Appearance
 
 SMALLEST_INRADIUS = 1.0
@@ -58,12 +62,23 @@ class SoupAppearance(Appearance):
 
     @staticmethod
     def from_json(text: str) -> "SoupAppearance":
-        """Of `to_json`; names that this version does not know are left out."""
-        known = {entry.name for entry in fields(SoupAppearance)}
-        values = {name: value for name, value in json.loads(text).items() if name in known}
+        """Of `to_json`; names that this version does not know are left out.
+
+        Raises:
+            ValueError: it is not JSON, or a value is none that can be drawn with.
+        """
+        try:
+            document = json.loads(text)
+        except RecursionError as error:
+            raise ValueError("appearance is nested too deep") from error
+        if not isinstance(document, dict):
+            raise ValueError("appearance is not a JSON object")
+        values = {name: value for name, value in document.items() if name in _SOUND}
+        for name, value in values.items():
+            if not _SOUND[name](value):
+                raise ValueError(f"appearance has {name} = {value!r:.40}")
         if "background" in values:
-            red, green, blue = (float(channel) for channel in values["background"])
-            values["background"] = (red, green, blue)
+            values["background"] = tuple(map(float, values["background"]))
         return SoupAppearance(**values)
 
     @property
@@ -74,3 +89,31 @@ class SoupAppearance(Appearance):
     def on_device(self, numbers: Float[Tensor, "2"]) -> "SoupAppearance":
         """The same with floor and ceiling read from device memory."""
         return replace(self, limits=numbers)
+
+
+def _number(low: float, high: float) -> Callable[[Any], bool]:
+    return lambda value: isinstance(value, int | float) and not isinstance(value, bool) and low <= value <= high
+
+
+def _flag(value: Any) -> bool:
+    return isinstance(value, bool)
+
+
+def _color(value: Any) -> bool:
+    return isinstance(value, list) and len(value) == 3 and all(map(_number(-_LARGEST, _LARGEST), value))
+
+
+_LARGEST = 1e30
+_SOUND: dict[str, Callable[[Any], bool]] = {
+    "kernel": lambda value: isinstance(value, str),
+    "distance": lambda value: value in DISTANCES,
+    "sh_degree": lambda value: value is None or (isinstance(value, int) and 0 <= value <= MAX_DEGREE),
+    "cull_small": _flag,
+    "cull_large": _number(1e-30, _LARGEST),
+    "freeze_inradius": _flag,
+    "near_plane": _number(1e-30, _LARGEST),
+    "background": _color,
+    "opacity_floor": _number(0, 1),
+    "sigma_ceiling": _number(1e-30, _LARGEST),
+}
+"""Which values of a file can be drawn with."""

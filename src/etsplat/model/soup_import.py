@@ -9,11 +9,13 @@ import torch
 from torch import Tensor
 
 from etsplat.core.errors import InputError
+from etsplat.core.harmonics import MAX_DEGREE
 from etsplat.core.kernels import DISTANCES, KERNELS
 from etsplat.core.rasterization import SOUP_SIGMA_FLOOR
 from etsplat.io.mesh_files import load_mesh
 from etsplat.io.paths import kind_of
-from etsplat.io.ply_tables import CORNERS, read_ply_header, read_ply_tables
+from etsplat.io.ply_tables import CORNERS, columns, read_ply_header, read_ply_tables
+from etsplat.io.tensors import read_state_dict
 from etsplat.model.soup_appearance import SoupAppearance
 from etsplat.model.triangle_soup import SH_CONSTANT, TriangleSoup
 
@@ -56,19 +58,21 @@ def open_soup(path: Path | str) -> TriangleSoup:
 def _read_triangle_splatting(path: Path) -> TriangleSoup:
     """The state dict that Triangle Splatting saves; its numbers mean the same as ours. No code in it is run."""
     try:
-        state = torch.load(path, map_location="cpu", weights_only=True)
+        state = read_state_dict(path)
     except Exception as error:  # torch's unpickler raises anything, depending on the bytes
         # Its own words would have the reader run whatever code is in the file.
         raise InputError(f"soup {path}: cannot be read as a state dict of tensors alone; save it again") from error
     if not isinstance(state, dict) or not all(isinstance(state.get(key), Tensor) for key in _TS_KEYS):
         raise InputError(f"soup {path}: lacks keys of Triangle Splatting's point_cloud_state_dict.pt")
-    count, parts = len(state[_TS_KEYS[0]]), (state[key].detach().float() for key in _TS_KEYS)
-    shapes = ((count, 3, 3), (count,), (count,), (count, 1, 3), (count, -1, 3))
     try:
+        count, parts = len(state[_TS_KEYS[0]]), (state[key].detach().float() for key in _TS_KEYS)
+        shapes = ((count, 3, 3), (count,), (count,), (count, 1, 3), (count, -1, 3))
         soup = TriangleSoup(*(part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)))
-    except (RuntimeError, ValueError) as error:
+    except (RuntimeError, TypeError, ValueError) as error:
         raise InputError(f"soup {path}: its tensors do not fit together ({error}); save it again") from error
-    degree = int(state.get("active_sh_degree", soup.sh_degree))
+    degree = state.get("active_sh_degree", soup.sh_degree)
+    if not isinstance(degree, int) or not 0 <= degree <= MAX_DEGREE:
+        raise InputError(f"soup {path}: active_sh_degree is not from 0 to {MAX_DEGREE}; save it again")
     # near_plane: Triangle Splatting drops triangles whose centroid is nearer than 0.2, we those with such a corner.
     appearance = SoupAppearance("single_sided", "sdf", sh_degree=degree, cull_small=True, near_plane=0.2)
     return replace(soup, appearance=appearance)
@@ -86,15 +90,15 @@ def _read_ply(path: Path) -> TriangleSoup:
 def _read_exported(path: Path, comments: list[str]) -> TriangleSoup:
     tables = read_ply_tables(path, ("vertex", "face"))
     vertex, face = tables["vertex"], tables["face"]
-    points = _columns(vertex, *"xyz").float()
+    points = columns(path, vertex, *"xyz").float()
     corners = face[CORNERS].astype(np.int64)
     if corners.size and not 0 <= corners.min() <= corners.max() < len(points):
         raise InputError(f"soup {path}: has corners that name no vertex; export it again")
-    opacity, sigma = _columns(face, "opacity", "sigma").float().double().unbind(dim=1)
+    opacity, sigma = columns(path, face, "opacity", "sigma").float().double().unbind(dim=1)
     if "f_dc_0" in (face.dtype.names or ()):
-        dc, rest = _harmonics(face)
+        dc, rest = _harmonics(path, face)
     else:
-        colors = _columns(face, "red", "green", "blue").float() / 255
+        colors = columns(path, face, "red", "green", "blue").float() / 255
         dc, rest = ((colors - 0.5) / SH_CONSTANT)[:, None], torch.zeros(len(face), 0, 3)
     soup = TriangleSoup(
         points[torch.from_numpy(corners)],
@@ -115,14 +119,11 @@ def _read_exported(path: Path, comments: list[str]) -> TriangleSoup:
 def _read_gaussians(path: Path) -> TriangleSoup:
     """A triangle for each Gaussian, across its two larger axes; its third axis, the thinnest, is lost."""
     table = read_ply_tables(path)["vertex"]
-    try:
-        centers = _columns(table, *"xyz")
-        scales = _columns(table, "scale_0", "scale_1", "scale_2").exp()
-        rotations = _rotations(_columns(table, "rot_0", "rot_1", "rot_2", "rot_3"))
-        logits = _columns(table, "opacity")[:, 0].float()
-        dc, rest = _harmonics(table)
-    except (KeyError, ValueError) as error:
-        raise InputError(f"soup {path}: lacks a property of a Gaussian scene ({error}); export it again") from error
+    centers = columns(path, table, *"xyz")
+    scales = columns(path, table, "scale_0", "scale_1", "scale_2").exp()
+    rotations = _rotations(columns(path, table, "rot_0", "rot_1", "rot_2", "rot_3"))
+    logits = columns(path, table, "opacity")[:, 0].float()
+    dc, rest = _harmonics(path, table)
     order = scales.argsort(dim=1, descending=True)[:, :2]
     radii = 2 * GAUSSIAN_INRADIUS * scales.gather(1, order)  # to the corners: twice the inradius
     axes = rotations.gather(2, order[:, None].expand(-1, 3, -1)) * radii[:, None]
@@ -145,18 +146,15 @@ def _read_mesh(path: Path) -> TriangleSoup:
     return TriangleSoup.from_triangles(corners, colors, opacity=MESH_OPACITY, sigma=MESH_SIGMA, sh_degree=0)
 
 
-def _columns(table: np.ndarray, *names: str) -> Tensor:
-    """(N, K) float64."""
-    return torch.from_numpy(np.stack([table[name].astype(np.float64) for name in names], axis=1))
-
-
-def _harmonics(table: np.ndarray) -> tuple[Tensor, Tensor]:
+def _harmonics(path: Path, table: np.ndarray) -> tuple[Tensor, Tensor]:
     """Coefficients (N, 1, 3), (N, R, 3) from f_dc_* and f_rest_*; these hold all of red, then green, then blue."""
-    dc = _columns(table, *(f"f_dc_{channel}" for channel in range(3))).float()[:, None]
+    dc = columns(path, table, *(f"f_dc_{channel}" for channel in range(3))).float()[:, None]
     count = sum(name.startswith("f_rest_") for name in table.dtype.names or ())
+    if count not in [3 * ((degree + 1) ** 2 - 1) for degree in range(MAX_DEGREE + 1)]:
+        raise InputError(f"soup {path}: has {count} properties f_rest_*, as no harmonics have; export it again")
     if not count:
         return dc, dc.new_zeros((len(table), 0, 3))
-    rest = _columns(table, *(f"f_rest_{index}" for index in range(count))).float()
+    rest = columns(path, table, *(f"f_rest_{index}" for index in range(count))).float()
     return dc, rest.reshape(len(table), 3, count // 3).transpose(1, 2).contiguous()
 
 
