@@ -42,7 +42,7 @@ def _cases(folder: Path) -> dict[str, Case]:
     eye, target, up = torch.randn(3, 5, 3, generator=rng)
     depth, alpha = 1 + torch.rand(2, 2, 20, 24, 1, generator=rng)
 
-    def saved_mesh(**given: Tensor) -> bytes:
+    def saved_mesh(**given: Any) -> bytes:
         save_mesh(folder / "mesh.ply", **given)
         return (folder / "mesh.ply").read_bytes()
 
