@@ -33,6 +33,24 @@ def test_a_new_folder_is_made_with_its_parents_and_explains_itself(tmp_path: Pat
         assert name in readme
 
 
+@pytest.mark.parametrize("text", ["{", "[1]", "[" * 100_000, "9" * 5000])
+def test_files_of_a_run_that_are_damaged_are_named(tmp_path: Path, text: str) -> None:
+    """Also those that are nested deeper than Python can follow."""
+    run = RunDirectory.create(tmp_path / "run", CONFIG)
+    run.write_metrics({})
+    for path, read in ((run.metrics_path, run.read_metrics), (run.config_path, run.read_config)):
+        path.write_text(text)
+        with pytest.raises(InputError) as error:
+            read()
+        assert_one_line(error, str(path), "JSON")
+    assert not is_run(run.path)
+    if text != "[1]":  # which is a line
+        run.history_path.write_text(text + "\n")
+        with pytest.raises(InputError) as error:
+            run.read_history()
+        assert_one_line(error, str(run.history_path), "damaged")
+
+
 def test_an_empty_folder_is_used(tmp_path: Path) -> None:
     """An existing empty folder becomes the run's."""
     assert RunDirectory.create(tmp_path, CONFIG).config_path.exists()

@@ -18,6 +18,7 @@ from typing import Any
 
 from etsplat.core.errors import InputError
 from etsplat.io.atomic import atomic_write, write_error
+from etsplat.io.json_text import parse_json
 from etsplat.io.locks import RUN_LOCK
 
 FORMAT = "etsplat run 1"
@@ -271,8 +272,8 @@ class RunDirectory:
         except FileNotFoundError:
             return []
         try:
-            return [json.loads(line) for line in text.split("\n")[:-1]]  # what follows the last \n is cut short
-        except json.JSONDecodeError as error:
+            return [parse_json(line) for line in text.split("\n")[:-1]]  # what follows the last \n is cut short
+        except ValueError as error:
             raise InputError(f"{self.history_path}: is damaged ({error}); delete the file") from error
 
     def truncate_history(self, iteration: int) -> None:
@@ -297,7 +298,7 @@ def is_empty(folder: Path) -> bool:
 def is_run(path: Path | str) -> bool:
     """Whether a folder holds a run of etsplat, finished or not."""
     try:
-        return json.loads((Path(path) / "config.json").read_text(encoding="utf-8")).get("format") == FORMAT
+        return parse_json((Path(path) / "config.json").read_text(encoding="utf-8")).get("format") == FORMAT
     except (OSError, ValueError, AttributeError):
         return False
 
@@ -333,11 +334,14 @@ def _write_json(path: Path, value: Mapping[str, Any]) -> None:
 
 def _read_json(path: Path) -> dict[str, Any]:
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        found = parse_json(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); is the run done?") from error
     except ValueError as error:
         raise InputError(f"{path}: is not JSON ({error}); delete it and run again") from error
+    if not isinstance(found, dict):
+        raise InputError(f"{path}: holds no JSON object; delete it and run again")
+    return found
 
 
 def _null_if_not_finite(value: Any) -> Any:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from etsplat.core.harmonics import MAX_DEGREE
 from etsplat.core.kernels import DISTANCES
+from etsplat.io.json_text import parse_json
 from etsplat.model.model import Appearance
 
 SMALLEST_INRADIUS = 1.0
@@ -67,10 +68,7 @@ class SoupAppearance(Appearance):
         Raises:
             ValueError: it is not JSON, or a value is none that can be drawn with.
         """
-        try:
-            document = json.loads(text)
-        except RecursionError as error:
-            raise ValueError("appearance is nested too deep") from error
+        document = parse_json(text)
         if not isinstance(document, dict):
             raise ValueError("appearance is not a JSON object")
         values = {name: value for name, value in document.items() if name in _SOUND}

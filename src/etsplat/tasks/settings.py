@@ -7,7 +7,6 @@ command line reads configs for its help.
 
 import difflib
 import inspect
-import json
 import math
 import sys
 from collections.abc import Callable, Iterable, Mapping
@@ -18,6 +17,7 @@ from types import NoneType
 from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 from etsplat.core.errors import InputError
+from etsplat.io.json_text import parse_json
 from etsplat.io.run_directory import FORMAT, KERNEL_FILE
 
 Device = Literal["cpu", "cuda"]
@@ -271,7 +271,7 @@ class Settings:
 def _read(path: str | Path, task: str) -> dict[str, Any]:
     """What a file that `Settings.from_file` takes says, unchecked."""
     try:
-        found = json.loads(Path(path).read_text(encoding="utf-8"))
+        found = parse_json(Path(path).read_text(encoding="utf-8"))
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); name a run's config.json") from error
     except ValueError as error:

@@ -4,7 +4,6 @@ Both give camera-to-world matrices with OpenGL axes (x right, y up, the camera l
 inverting gives our world-to-camera matrices with OpenCV axes.
 """
 
-import json
 import math
 from contextlib import suppress
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ from etsplat.core.errors import InputError
 from etsplat.data.dataset import Dataset
 from etsplat.data.frames import Frame, Lens, Points, Wanted, check_frames, find_image, pinhole, posed
 from etsplat.io.images import image_size
+from etsplat.io.json_text import parse_json
 from etsplat.io.paths import path_within
 from etsplat.io.ply_tables import load_points
 
@@ -107,8 +107,8 @@ def read_frames(folder: Path) -> tuple[list[Frame], Points | None]:
 
 def _read(path: Path) -> dict[str, Any]:
     try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError, OSError) as error:
+        document = parse_json(path.read_text(encoding="utf-8"))
+    except (ValueError, OSError) as error:
         detail = str(error).splitlines()[0]
         raise InputError(f"scene {path}: not valid JSON ({detail}); export the poses again") from error
     if not isinstance(document, dict):
