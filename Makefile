@@ -16,7 +16,8 @@ SANITIZED := build/sanitize/.stamp
 # Folders are listed too: their time changes when a file is added or removed.
 NATIVE := CMakeLists.txt $(shell find csrc)
 
-.PHONY: help setup demo test lint format stubs bench equal-bits sanitize check-neon wheel check-wheel clean
+.PHONY: help setup demo test lint format stubs bench equal-bits fuzz fuzz-short sanitize races soak lock audit \
+	check-neon wheel check-wheel clean
 
 help:
 	@echo "make setup        create .venv and build the package into it"
@@ -26,7 +27,11 @@ help:
 	@echo "make stubs        describe the native calls to Python (src/etsplat/_native.pyi)"
 	@echo "make bench        measure the CPU engine"
 	@echo "make equal-bits BASE=COMMIT  small runs end with the same bits as at that commit; CASES='scene-*' for some"
-	@echo "make sanitize     run the tests of the C++ under ASan and UBSan (GCC, Linux)"
+	@echo "make sanitize     run the tests of the C++ under ASan, LSan and UBSan (GCC, Linux)"
+	@echo "make fuzz         a million changed files and 100,000 odd calls; FUZZ='--targets mesh*' for some; fuzz-short for a minute"
+	@echo "make races        threads and forks under ThreadSanitizer (GCC, Linux); RACES=300 for so many seconds"
+	@echo "make soak         kill runs, fill their disk, move their clock; SOAK=100 for so many of each (Linux)"
+	@echo "make lock         requirements.lock: the newest versions that fit, with hashes; make audit: known holes in them"
 	@echo "make check-neon   run the rasterizer's NEON path under QEMU (AArch64 cross compiler)"
 	@echo "make check-wheel  build the wheel, install it into an empty environment, run a tiny demo"
 	@echo "make clean        remove .venv, build, dist and caches"
@@ -91,6 +96,18 @@ sanitize: $(SANITIZED)
 	LD_PRELOAD="$$($(CXX) -print-file-name=libasan.so) $$($(CXX) -print-file-name=libstdc++.so)" \
 	ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1 \
 	PYTHONPATH="$(CURDIR)/build/sanitize/site:$(SITE)" $(PY) -S -m pytest -p no:cacheprovider -m sanitize $(PYTEST_ARGS)
+
+# Odd input: a seed makes the same inputs everywhere. What fails is kept under build/fuzz.
+FUZZ ?=
+fuzz: setup
+	PYTHONPATH=tests $(PY) -m tests.fuzz $(FUZZ)
+
+fuzz-short: setup
+	PYTHONPATH=tests $(PY) -m tests.fuzz --seconds 60 $(FUZZ)
+
+RACES ?= 60
+races:
+	tests/native/run.sh races $(RACES)
 
 # The NEON path under an emulator, where there is no ARM machine (Debian: g++-aarch64-linux-gnu qemu-user).
 check-neon:

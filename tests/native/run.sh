@@ -1,19 +1,33 @@
 #!/usr/bin/env bash
-# Builds simd_paths.cpp with the rasterizer's sources and runs it: without arguments for this processor, with "neon" for
-# AArch64 by a cross compiler, under QEMU (Debian: g++-aarch64-linux-gnu qemu-user).
+# Builds a program with the rasterizer's sources and runs it.
+#
+#   run.sh                  simd_paths.cpp for this processor
+#   run.sh neon             the same for AArch64 by a cross compiler, under QEMU (Debian: g++-aarch64-linux-gnu qemu-user)
+#   run.sh races [SECONDS]  races.cpp under ThreadSanitizer; a planted race must be found first
 set -euo pipefail
 cd "$(dirname "$0")/../.."
 
 target=${1:-native}
+program=simd_paths
 flags=(-std=c++20 -O2 -ffp-contract=off -fno-math-errno -fno-trapping-math -Icsrc)
 runner=()
 machine=$(uname -m)
-if [ "$target" = neon ]; then
-    CXX=${CROSS_CXX:-aarch64-linux-gnu-g++}
-    machine=aarch64
-    flags+=(-static)
-    [ "$(uname -m)" = aarch64 ] || runner=("${QEMU:-qemu-aarch64}")
-fi
+case $target in
+    neon)
+        CXX=${CROSS_CXX:-aarch64-linux-gnu-g++}
+        machine=aarch64
+        flags+=(-static)
+        [ "$(uname -m)" = aarch64 ] || runner=("${QEMU:-qemu-aarch64}")
+        ;;
+    races)
+        program=races
+        machine=plain # one instruction set will do: threads share nothing within a tile
+        flags+=(-O0 -g -fsanitize=thread) # optimised, the tile loops compile for minutes
+        # Children of a process with threads start threads of their own. Address layouts of newer kernels: see setarch.
+        export TSAN_OPTIONS="die_after_fork=0 halt_on_error=1 ${TSAN_OPTIONS:-}"
+        runner=(setarch --addr-no-randomize)
+        ;;
+esac
 CXX=${CXX:-c++}
 build=build/native-$target
 mkdir -p "$build"
@@ -25,11 +39,12 @@ case $machine in
     *) define=-DETSPLAT_PLAIN=1 paths=("plain:") ;;
 esac
 
-objects=()
+objects=() compilers=()
 compile() { # object, source, flags...
     local object=$build/$1 source=$2
     shift 2
-    "$CXX" "${flags[@]}" "$define" "$@" -c "$source" -o "$object"
+    "$CXX" "${flags[@]}" "$define" "$@" -c "$source" -o "$object" &
+    compilers+=($!)
     objects+=("$object")
 }
 for path in "${paths[@]}"; do
@@ -39,8 +54,14 @@ for path in "${paths[@]}"; do
         compile "$(basename "$source" .cpp)_$name.o" "$source" "-DETSPLAT_SIMD=$name" ${path#*:}
     done
 done
-for source in csrc/cpu/raster.cpp csrc/cpu/raster_*.cpp csrc/cpu/{parallel,instruction_set}.cpp tests/native/simd_paths.cpp; do
+for source in csrc/cpu/raster.cpp csrc/cpu/raster_*.cpp csrc/cpu/{parallel,pool,instruction_set}.cpp "tests/native/$program.cpp"; do
     compile "$(basename "$source" .cpp).o" "$source"
 done
-"$CXX" "${flags[@]}" "${objects[@]}" -o "$build/simd_paths" -lpthread
-"${runner[@]}" "$build/simd_paths"
+for compiler in "${compilers[@]}"; do wait "$compiler"; done
+"$CXX" "${flags[@]}" "${objects[@]}" -o "$build/$program" -lpthread
+if [ "$target" = races ]; then
+    status=0
+    "${runner[@]}" "$build/$program" 60 planted 2>"$build/planted.log" || status=$?
+    [ $status = 66 ] || { echo "the planted race was not found, but status $status" >&2; exit 1; }
+fi
+"${runner[@]}" "$build/$program" "${@:2}"
