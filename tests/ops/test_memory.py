@@ -273,6 +273,22 @@ class TestOddArguments:
         with pytest.raises(ValueError, match=rf"{name} must be from -1e\+30 to 1e\+30, got 1 values beyond"):
             on(engine, rasterize, **scene)
 
+    @pytest.mark.parametrize("kind", ["face_colors", "vertex_colors"])
+    def test_so_are_those_of_antialiased_pictures(self, engine, kind, rng):
+        """Up to the bound the gradients are finite."""
+        leaves, run = CASES[f"rasterize_antialiased/{kind}"](rng, engine)
+        for name in (kind, "backgrounds"):
+            for value in (1e30, 1e38, -math.inf, math.nan):
+                grown = {key: leaf.clone() for key, leaf in leaves.items()}
+                grown[name][0, 0] = value
+                grown = {key: leaf.requires_grad_() for key, leaf in grown.items()}
+                if value != 1e30:
+                    with pytest.raises(ValueError, match=rf"{name} must be (finite|from -1e\+30)"):
+                        run(**grown)
+                    continue
+                run(**grown)[0].sum().backward()
+                assert all(leaf.grad is not None and leaf.grad.isfinite().all() for leaf in grown.values())
+
     @pytest.mark.parametrize("name", ["face_colors", "backgrounds"])
     def test_the_largest_colours_leave_gradients_finite(self, name, rng):
         scene = soup(rng, 200)

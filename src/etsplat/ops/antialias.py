@@ -21,9 +21,9 @@ from etsplat.core.cameras import Cameras, view_arguments
 from etsplat.core.connectivity import MeshConnectivity
 from etsplat.core.precision import as_given
 from etsplat.core.rasterization import Rasterization
-from etsplat.core.validation import check_device, check_like, check_shape
+from etsplat.core.validation import check_device, check_finite, check_like, check_shape
 from etsplat.engines.choice import engine_for
-from etsplat.ops.rasterize import one_kind_of_colors
+from etsplat.ops.rasterize import LARGEST_COLOR, one_kind_of_colors
 from etsplat.ops.rasterize_opaque import rasterize_opaque
 
 
@@ -41,6 +41,7 @@ def rasterize_antialiased(
     cameras: Cameras | None = None,
     backgrounds: Float[Tensor, "B C"] | None = None,
     near_plane: float = 0.01,
+    validate: bool | None = None,
 ) -> Rasterization:
     """Picture of an opaque mesh, differentiable by vertices, colours and backgrounds.
 
@@ -56,13 +57,15 @@ def rasterize_antialiased(
         cameras: All of the four above in one.
         backgrounds: (B, C); None is black.
         near_plane: Triangles with a vertex at this depth or nearer are dropped; > 0.
+        validate: Raise on colours and backgrounds that are not finite, or beyond 1e30, whose products in the gradients
+            overflow; None means on the CPU.
 
     Returns:
         The picture as colour (B, H, W, C), and what ``rasterize_opaque`` gives, without gradients. The native engines'
         images and gradients are the same bits in every run.
 
     Raises:
-        ValueError: Wrong shape, dtype or device; the message names the argument.
+        ValueError: Wrong shape, dtype, device or values; the message names the argument.
     """
     viewmats, Ks, width, height = view_arguments(cameras, viewmats, Ks, width, height)
     check_shape("vertices", vertices, (connectivity.num_vertices, 3))
@@ -72,13 +75,16 @@ def rasterize_antialiased(
     name, colors = one_kind_of_colors(face_colors, vertex_colors, None, connectivity.faces)
     check_shape(name, colors, (len(vertices) if face_colors is None else len(connectivity.faces), "C"))
     check_like(name, colors, "vertices", vertices)
-    seen = rasterize_opaque(
-        vertices, viewmats=viewmats, Ks=Ks, width=width, height=height, faces=connectivity.faces, near_plane=near_plane
-    )
     if backgrounds is None:
         backgrounds = vertices.new_zeros(len(viewmats), colors.shape[1])
     check_shape("backgrounds", backgrounds, (len(viewmats), colors.shape[1]))
     check_like("backgrounds", backgrounds, "vertices", vertices)
+    if validate or (validate is None and vertices.is_cpu):
+        check_finite(name, colors, LARGEST_COLOR)
+        check_finite("backgrounds", backgrounds, LARGEST_COLOR)
+    seen = rasterize_opaque(
+        vertices, viewmats=viewmats, Ks=Ks, width=width, height=height, faces=connectivity.faces, near_plane=near_plane
+    )
     assert seen.triangle is not None
     assert seen.barycentrics is not None
     assert seen.depth is not None

@@ -35,7 +35,7 @@ from etsplat.core.validation import (
 from etsplat.engines.choice import engine_for
 
 COLORS = ("face_colors", "vertex_colors", "corner_colors")
-_LARGEST_COLOR = 1e30  # beyond, the gradients of the triangles around overflow
+LARGEST_COLOR = 1e30  # beyond, the gradients of the triangles around overflow
 
 
 @as_given
@@ -219,6 +219,6 @@ def _check_tensors(given: dict[str, Tensor], faces: Tensor | None, look: bool) -
 
 def _check_values(given: dict[str, Tensor]) -> None:
     for name, tensor in given.items():
-        check_finite(name, tensor, _LARGEST_COLOR if name in (*COLORS, "backgrounds") else math.inf)
+        check_finite(name, tensor, LARGEST_COLOR if name in (*COLORS, "backgrounds") else math.inf)
     check_positive("sigma", given["sigma"])
     check_intrinsics("Ks", given["Ks"])
