@@ -18,7 +18,7 @@ __device__ __forceinline__ void record_largest(float magnitude, unsigned* larges
     if (lane_index() == 0 && bits > *largest) atomicMax(largest, bits);
 }
 
-// 2^38 over the power of two above the largest value; up to 2^24 such values fit into a sum.
+// 2^38 over the power of two above the largest value; fewer than 2^25 such values fit into a sum (engines/cuda/capacity.py checks it).
 __device__ __forceinline__ double fixed_scale(unsigned largest) {
     return ldexp(1.0, 38 - (static_cast<int>(largest >> 23 & 255u) - 126));
 }

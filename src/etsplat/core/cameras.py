@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from etsplat.core.precision import as_given
+from etsplat.core.validation import check_memory
 
 MAX_SIDE = 1 << 26
 """Pixels of the width or height of an image: with 16 samples in each they can still be numbered in 32 bits."""
@@ -31,6 +32,8 @@ class Cameras:
     height: int
 
     def __post_init__(self) -> None:
+        check_memory("viewmats", self.viewmats)
+        check_memory("Ks", self.Ks)
         batch = self.viewmats.shape[0] if self.viewmats.ndim == 3 else -1
         if self.viewmats.shape != (batch, 4, 4):
             raise ValueError(f"viewmats must have shape (B, 4, 4), got {tuple(self.viewmats.shape)}")
@@ -123,6 +126,9 @@ def look_at(
     Raises:
         ValueError: ``eye`` coincides with ``target``, or ``up`` is parallel to the line of sight.
     """
+    for name, given in (("eye", eye), ("target", target), ("up", up)):
+        if name == "eye" or isinstance(given, Tensor):  # others may be tuples
+            check_memory(name, given)
     forward = torch.as_tensor(target, dtype=eye.dtype, device=eye.device) - eye
     distance = forward.norm(dim=-1, keepdim=True)
     if not bool((distance > 0).all()):

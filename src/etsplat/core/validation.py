@@ -31,7 +31,7 @@ def check_shape(name: str, tensor: Tensor, *shapes: Shape, sizes: dict[str, int]
         raise ValueError(
             f"{name} must be a tensor of shape {wanted}, got {type(tensor).__name__}{_remedy(name, tensor)}"
         )
-    _check_memory(name, tensor)
+    _check_native(name, tensor)
     for shape in shapes:
         if len(shape) != tensor.ndim:
             continue
@@ -55,19 +55,26 @@ def dense(tensor: Tensor, name: str = "gradient") -> Tensor:
     Raises:
         ValueError: It has no memory, or is within a transform of torch.func; the message says ``name``.
     """
-    _check_memory(name, tensor)
+    _check_native(name, tensor)
     return tensor.detach().resolve_conj().resolve_neg().contiguous()
 
 
-def _check_memory(name: str, tensor: Tensor) -> None:
-    """Raise ValueError unless every element has its place in memory."""
-    if torch._C._functorch.is_functorch_wrapped_tensor(tensor):  # pyright: ignore[reportAttributeAccessIssue]
-        raise ValueError(
-            f"{name} must be a plain tensor, got one within a transform of torch.func, which native code cannot see "
-            "through: take torch.autograd.grad for gradients, and several cameras in one call in the place of vmap"
-        )
-    if tensor.layout != torch.strided:
-        raise ValueError(f"{name} must be a dense tensor, got layout {tensor.layout}")
+def check_memory(name: str, tensor: Tensor) -> None:
+    """Raise ValueError unless it is a tensor of numbers each of which has its place in memory.
+
+    Functions that are made of torch's own ask for it too: on a freed storage those end the process.
+    """
+    if not isinstance(tensor, Tensor):
+        raise ValueError(f"{name} must be a tensor, got {type(tensor).__name__}{_remedy(name, tensor)}")
+    if tensor.layout != torch.strided or tensor.is_nested:
+        kind = "a nested one" if tensor.is_nested else f"layout {tensor.layout}"
+        raise ValueError(f"{name} must be a dense tensor, got {kind}")
+    if tensor.is_quantized or tensor.is_complex():
+        raise ValueError(f"{name} must be a tensor of plain numbers, got {tensor.dtype}")
+    if _is_transformed(tensor):  # torch sees through
+        return
+    if tensor.is_meta:
+        raise ValueError(f"{name} must be in memory, got a tensor on {tensor.device}")
     if tensor._is_zerotensor():
         raise ValueError(f"{name} must have memory of its own, got a ZeroTensor: pass {name}.clone()")
     if tensor.numel() == 0:
@@ -76,6 +83,20 @@ def _check_memory(name: str, tensor: Tensor) -> None:
     needed, held = (last + 1) * tensor.element_size(), tensor.untyped_storage().nbytes()
     if held < needed:
         raise ValueError(f"{name} must have memory of its own: it needs {needed} bytes, and its storage holds {held}")
+
+
+def _check_native(name: str, tensor: Tensor) -> None:
+    """`check_memory`, and ValueError within a transform of torch.func."""
+    if isinstance(tensor, Tensor) and _is_transformed(tensor):
+        raise ValueError(
+            f"{name} must be a plain tensor, got one within a transform of torch.func, which native code cannot see "
+            "through: take torch.autograd.grad for gradients, and several cameras in one call in the place of vmap"
+        )
+    check_memory(name, tensor)
+
+
+def _is_transformed(tensor: Tensor) -> bool:
+    return torch._C._functorch.is_functorch_wrapped_tensor(tensor)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def _remedy(name: str, value: object) -> str:

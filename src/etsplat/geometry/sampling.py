@@ -7,6 +7,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from etsplat.core.validation import dense
+
 
 def sample_surface(
     vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], count: int, seed: int | Sequence[int]
@@ -28,7 +30,8 @@ def sample_surface(
     Raises:
         ValueError: there is no area to draw from, or a vertex is not finite.
     """
-    corners = vertices.detach().cpu().double().numpy()[faces.cpu().numpy()]
+    points, triangles = (dense(given, name).cpu() for name, given in (("vertices", vertices), ("faces", faces)))
+    corners = points.double().numpy()[triangles.numpy()]
     if len(corners) == 0 or not np.isfinite(corners).all():
         raise ValueError("vertices and faces must be a finite surface, got no faces, NaN or infinity")
     origin, side1, side2 = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]

@@ -10,6 +10,7 @@ from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
 from etsplat.core.errors import InputError
+from etsplat.core.validation import check_memory
 from etsplat.io.atomic import atomic_write
 from etsplat.io.paths import kind_of
 
@@ -140,6 +141,7 @@ def save_image(path: Path | str, image: Float[Tensor, "H W C"]) -> None:
     channels = (1, 3) if kind_of(path) in (".jpg", ".jpeg") else (1, 3, 4)
     if kind_of(path) not in IMAGE_SUFFIXES:
         raise ValueError(f"path: expected one of the suffixes {', '.join(IMAGE_SUFFIXES)}, got {path.name}")
+    check_memory("image", image)
     if image.ndim != 3 or image.shape[-1] not in channels:
         raise ValueError(f"image: expected shape (H, W, C) with C in {channels}, got {tuple(image.shape)}")
     pixels = Image.fromarray(to_8_bit(image).cpu().numpy().squeeze(axis=-1 if image.shape[-1] == 1 else ()))

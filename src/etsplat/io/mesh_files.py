@@ -10,6 +10,7 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from etsplat.core.errors import InputError
+from etsplat.core.validation import check_memory, dense
 from etsplat.io._mesh_readers import READERS, RawMesh
 from etsplat.io.paths import kind_of, path_remedy
 from etsplat.io.writers import Surface, save_surface, writer_of
@@ -95,7 +96,7 @@ def save_mesh(
     path = Path(path)
     writer_of(path, holding="vertex_colors")
     _check_arguments(vertices, faces, face_colors, vertex_colors)
-    v, f = vertices.detach().to("cpu", torch.float64).numpy(), faces.detach().to("cpu", torch.int64).numpy()
+    v, f = dense(vertices).to("cpu", torch.float64).numpy(), dense(faces).to("cpu", torch.int64).numpy()
     per_face = None if face_colors is None else _display_values(face_colors)
     per_vertex = None if vertex_colors is None else _display_values(vertex_colors)
     if split:
@@ -262,6 +263,8 @@ def _check_arguments(vertices: Tensor, faces: Tensor, face_colors: Tensor | None
     tables = {"vertices": (vertices, vertices), "faces": (faces, faces)}
     tables |= {} if face_colors is None else {"face_colors": (face_colors, faces)}
     tables |= {} if vertex_colors is None else {"vertex_colors": (vertex_colors, vertices)}
+    for name, (values, _) in tables.items():
+        check_memory(name, values)
     for name, (values, rows) in tables.items():
         wanted = (*rows.shape[:1], 3)
         if tuple(values.shape) != wanted:

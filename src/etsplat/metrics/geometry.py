@@ -13,6 +13,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 from torch import Tensor
 
+from etsplat.core.validation import check_shape, dense
 from etsplat.geometry.distance import closest_points
 from etsplat.geometry.intersections import count_degenerate_faces, count_self_intersections
 from etsplat.geometry.measures import bounding_ball, face_areas
@@ -71,11 +72,14 @@ def sample_pair(
     Raises:
         ValueError: a mesh has no area or is not finite.
     """
+    meshes = {"vertices": vertices, "faces": faces, "true_vertices": true_vertices, "true_faces": true_faces}
+    for name, given in meshes.items():
+        check_shape(name, given, ("N", 3))
     center, radius = bounding_ball(true_vertices)
     surfaces = []
     for side, (points, triangles) in enumerate([(vertices, faces), (true_vertices, true_faces)]):
         normalized = (points.detach().cpu().double() - center.cpu()) / radius
-        triangles = triangles.cpu()
+        triangles = dense(triangles).cpu()
         surfaces.append(Surface(normalized, triangles, sample_surface(normalized, triangles, samples, (seed, side))[0]))
     return surfaces[0], surfaces[1]
 

@@ -16,6 +16,7 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from etsplat.core.errors import InputError
+from etsplat.core.validation import check_memory
 from etsplat.io.paths import kind_of
 from etsplat.io.tensors import read_state_dict
 
@@ -54,6 +55,8 @@ def psnr(image: Float[Tensor, "H W C"], truth: Float[Tensor, "H W C"]) -> float:
 
 def silhouette_iou(coverage: Float[Tensor, "H W"], truth: Float[Tensor, "H W"]) -> float:
     """Intersection over union of two silhouettes: pixels that are covered by at least half. 1 where both are empty."""
+    check_memory("coverage", coverage)
+    check_memory("truth", truth)
     ours, theirs = coverage >= 0.5, truth >= 0.5
     union = int((ours | theirs).sum())
     return int((ours & theirs).sum()) / union if union else 1.0
@@ -221,6 +224,8 @@ def find_lpips_weights(option: Path | str | None = None) -> LpipsWeights:
 
 
 def _check_pair(image: Tensor, truth: Tensor) -> None:
+    check_memory("image", image)
+    check_memory("truth", truth)
     if image.ndim != 3:
         raise ValueError(f"image: expected shape (H, W, C), got {tuple(image.shape)}")
     if image.shape != truth.shape:

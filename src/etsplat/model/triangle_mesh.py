@@ -11,6 +11,7 @@ from torch import Tensor
 
 from etsplat.core.cameras import Cameras
 from etsplat.core.rasterization import Rasterization
+from etsplat.core.validation import check_memory, check_shape
 from etsplat.data.dataset import Normalization
 from etsplat.geometry.topology import MeshTopology
 from etsplat.io.mesh_files import MeshFile, load_mesh, save_mesh, weld_vertices
@@ -96,6 +97,10 @@ class TriangleMesh(Model):
             vertex_colored: whether colours belong to vertices.
             appearance: how it is drawn; None for the elastic kernel, or as opaque triangles where it is not soft.
         """
+        check_shape("vertices", vertices, ("V", 3))
+        check_shape("faces", faces, ("F", 3))
+        if isinstance(colors, Tensor):
+            check_memory("colors", colors)
         vertices = vertices.detach().clone()
         count = len(vertices) if vertex_colored else len(faces)
         start = colors if isinstance(colors, Tensor) else torch.full((count, 3), colors)

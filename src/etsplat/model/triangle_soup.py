@@ -14,6 +14,7 @@ from etsplat.core.cameras import Cameras
 from etsplat.core.errors import InputError
 from etsplat.core.harmonics import MAX_DEGREE
 from etsplat.core.rasterization import SOUP_SIGMA_FLOOR, Rasterization, joined
+from etsplat.core.validation import check_shape
 from etsplat.io.kernel_files import adopt_kernel, kernel_tensors
 from etsplat.io.paths import kind_of
 from etsplat.io.tensors import read_tensors, save_tensors
@@ -99,7 +100,8 @@ class TriangleSoup(Model):
             sigma: softness of every triangle, above 0.01.
             sh_degree: of the colours, 0 to 3.
         """
-        N = len(vertices)
+        check_shape("vertices", vertices, ("N", 3, 3))
+        check_shape("colors", colors, (N := len(vertices), 3))
         logit = torch.logit(torch.tensor(opacity, dtype=torch.float64)).to(vertices)
         raw = torch.tensor(sigma - SOUP_SIGMA_FLOOR, dtype=torch.float64).log().to(vertices)
         return cls(

@@ -37,8 +37,8 @@ def normal_consistency(
     Raises:
         ValueError: Wrong shape, dtype or device; an empty image.
     """
-    image = tuple(normals.shape[:3])
     check_shape("normals", normals, ("B", "H", "W", 3))
+    image = tuple(normals.shape[:3])
     for name, tensor, shape in (
         ("depth", depth, (*image, 1)),
         ("alpha", alpha, (*image, 1)),

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from etsplat.core.harmonics import MAX_DEGREE
 from etsplat.core.precision import as_given
-from etsplat.core.validation import check_like, check_shape
+from etsplat.core.validation import check_like, check_memory, check_shape
 from etsplat.engines.choice import engine_for
 
 
@@ -42,6 +42,7 @@ def spherical_harmonics(
             f"coefficients must have at least {(degree + 1) ** 2} bases for degree {degree}, "
             f"got shape {tuple(coefficients.shape)}"
         )
+    check_memory("directions", directions)
     batch = ("B",) if directions.ndim == 3 else ()
     check_shape("directions", directions, (*batch, len(coefficients), 3))
     check_like("directions", directions, "coefficients", coefficients)

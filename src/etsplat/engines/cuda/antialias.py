@@ -6,6 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from etsplat.engines.cuda.capacity import check_summed
 from etsplat.engines.cuda.launch import launch_each
 from etsplat.engines.cuda.program import Program
 from etsplat.engines.cuda.structs import Struct, struct_class
@@ -16,7 +17,11 @@ _FILE = "cuda/antialias.cu"
 _POINT = 3  # 64-bit words
 
 
-def _forward(_keep: bool, *given: Any) -> tuple[Tensor, Any]:
+_PER_PIXEL = 3
+"""Values that a pixel adds to a vertex at most: of its colour's place, and of two silhouettes."""
+
+
+def _forward(keep: bool, *given: Any) -> tuple[Tensor, Any]:
     """Shading and blending of what the z-buffer has found."""
     vertices, colors, _, viewmats, _, triangle, *_, connectivity = given
     B, V, F = len(viewmats), len(vertices), len(connectivity.faces)
@@ -24,6 +29,8 @@ def _forward(_keep: bool, *given: Any) -> tuple[Tensor, Any]:
     silhouettes = torch.empty((B, F), dtype=torch.uint8, device=vertices.device)
     shaded = vertices.new_empty((*triangle.shape, colors.shape[1]))
     pixels = shaded.shape[1] * shaded.shape[2]
+    if keep:
+        check_summed("rasterize_antialiased", pixels, _PER_PIXEL)
     image = torch.empty_like(shaded)
     for b in range(B):
         scene = _scene(b, points, silhouettes, *given)

@@ -23,6 +23,7 @@ _FIRST_PER_TRIANGLE = 4
 _FIRST_ROOM = 1 << 16
 _SLACK = 1.25
 _MOST = (1 << 30) - 1
+_MOST_SUMMED = (1 << 25) - 1
 
 _seen: dict[tuple[torch.device, Shape], tuple[int, int]] = {}  # -> (triangles, pairs they needed at most)
 _overflow: dict[torch.device, Tensor] = {}
@@ -35,6 +36,36 @@ def capacity_for(device: torch.device, shape: Shape, triangles: int) -> int:
     scale = max(1.0, triangles / max(seen_triangles, 1))
     guess = _FIRST_ROOM + _FIRST_PER_TRIANGLE * triangles * shape[0] if pairs == 0 else int(_SLACK * pairs * scale)
     return min(guess, _MOST)
+
+
+def check_numbers(views: int, triangles: int, tiles: int) -> None:
+    """Raise ValueError if the rasterizer cannot number what it draws.
+
+    Args:
+        views: Drawn together.
+        triangles: In each view.
+        tiles: In each view.
+    """
+    for what, each in (("triangles", triangles), ("tiles of pixels", tiles)):
+        if views * each > _MOST:
+            raise ValueError(
+                f"rasterize: {views} views of {each} {what} are more than {_MOST}: render fewer views at a time"
+            )
+
+
+def check_summed(operation: str, pixels: int, values: int) -> None:
+    """Raise ValueError if a sum of fixed-point numbers (csrc/cuda/fixed_sums.h) may overflow.
+
+    Args:
+        operation: For the message.
+        pixels: In a view.
+        values: That a pixel adds to one sum at most.
+    """
+    if pixels * values > _MOST_SUMMED:
+        raise ValueError(
+            f"{operation}: a view has {pixels} pixels, gradients are added up over {_MOST_SUMMED // values} at most:"
+            " draw it in parts, or without gradients"
+        )
 
 
 def record_need(device: torch.device, shape: Shape, triangles: int, pairs: int) -> None:

@@ -6,6 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from etsplat.engines.cuda.capacity import check_summed
 from etsplat.engines.cuda.launch import blocks, launch, launch_each
 from etsplat.engines.cuda.program import Program
 from etsplat.engines.cuda.structs import struct_class
@@ -40,7 +41,9 @@ def _channels_of(corners: Tensor, viewmats: Tensor, depth: bool, normals: bool) 
     )
 
 
-def _pick(_keep: bool, values: Tensor, chosen: Tensor) -> tuple[Tensor, Any]:
+def _pick(keep: bool, values: Tensor, chosen: Tensor) -> tuple[Tensor, Any]:
+    if keep:
+        check_summed("pick_values", chosen[:1].numel(), 1)
     image = values.new_empty(chosen.shape)
     grid, sizes = _views(values, chosen)
     launch(_PICK, "pick_forward", grid, _PICK_THREADS, (values, chosen, *sizes, image))

@@ -13,7 +13,7 @@ from torch import Tensor
 from etsplat import _native
 from etsplat.core.kernels import DISTANCES, KERNELS
 from etsplat.core.rasterization import DISTORTION_FAR, DISTORTION_NEAR
-from etsplat.engines.cuda.capacity import capacity_for, note_capture, overflow_flag, record_need
+from etsplat.engines.cuda.capacity import capacity_for, check_numbers, note_capture, overflow_flag, record_need
 from etsplat.engines.cuda.launch import backend, blocks, launch, launch_each, on_device_of
 from etsplat.engines.cuda.memory import Arena, PendingNumber
 from etsplat.engines.cuda.program import Program
@@ -48,6 +48,7 @@ class CudaRender:
         self.flat, self.corner = inputs.channels
         self.shape = (plan.views, settings.width, settings.height)
         self.tiles = blocks(settings.width, _native.TILE), blocks(settings.height, _native.TILE)
+        check_numbers(plan.views, plan.geometry.count, self.tiles[0] * self.tiles[1])
         self.tile_count = plan.views * self.tiles[0] * self.tiles[1]
         self.projected = plan.views * plan.geometry.count
         self.distortion = _Depth.NONE
