@@ -71,6 +71,7 @@ def this_tree(folder: Path) -> Tree:
     from etsplat import _native
 
     shutil.copytree(ROOT / "src" / "etsplat", folder / "etsplat")
+    shutil.copytree(ROOT / "csrc", folder / "etsplat" / "csrc")  # where a wheel has it
     shutil.copy(_native.__file__, folder / "etsplat")
     return _tree(folder)
 
