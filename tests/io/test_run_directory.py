@@ -149,5 +149,11 @@ def test_history_survives_a_kill_in_the_middle_of_a_line(tmp_path: Path) -> None
 def test_metrics_are_valid_json_whatever_they_are(tmp_path: Path) -> None:
     """An infinite PSNR becomes null, which JSON has; infinity it has not."""
     run = RunDirectory.create(tmp_path, CONFIG)
-    run.write_metrics({"psnr": float("inf"), "chamfer": 1e-3})
-    assert run.read_metrics() == {"psnr": None, "chamfer": 1e-3}
+    views = [{"psnr": float("inf"), "ssim": 1.0}]
+    run.write_metrics({"psnr": float("inf"), "chamfer": 1e-3, "views": views, "range": (0.0, float("nan"))})
+    assert run.read_metrics() == {
+        "psnr": None,
+        "chamfer": 1e-3,
+        "views": [{"psnr": None, "ssim": 1.0}],
+        "range": [0.0, None],
+    }

@@ -74,6 +74,18 @@ def test_folds_are_smoothed_away_in_place() -> None:
     assert count_self_intersections(mesh.vertices.detach(), mesh.faces) == 0
 
 
+@pytest.mark.parametrize("number", [float("nan"), float("inf"), 1e30])
+def test_a_mesh_that_went_to_infinity_is_neither_untangled_nor_divided(number: float) -> None:
+    """Nor is the last number one whose square float32 holds."""
+    strategy, mesh = SubdivideAndUntangle({8: 400}, [4]), a_mesh()
+    started(strategy, mesh)
+    with torch.no_grad():
+        mesh.vertices[5] = number
+    for iteration in (4, 8):
+        with pytest.raises(DivergedError, match=f"not finite at iteration {iteration}"):
+            strategy.edit(iteration)
+
+
 def test_a_soup_is_edited_between_its_first_and_its_last_time(rng: torch.Generator) -> None:
     """At multiples of `every`, after `begin`, before `last`; from `end` on triangles only die."""
     strategy, soup = DensifyAndPrune(begin=10, end=20, every=5, last=30, max_triangles=1000), a_soup(rng)

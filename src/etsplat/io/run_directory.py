@@ -250,7 +250,7 @@ class RunDirectory:
 
     def write_metrics(self, metrics: Mapping[str, Any]) -> None:
         """Writes metrics.json, whole or not at all. NaN and infinity, which JSON has not, become null."""
-        _write_json(self.metrics_path, {key: _null_if_not_finite(value) for key, value in metrics.items()})
+        _write_json(self.metrics_path, _null_if_not_finite(metrics))
 
     def read_evaluation(self) -> dict[str, Any]:
         """What evaluation.json holds; empty if nobody evaluated the run after it was done."""
@@ -258,7 +258,7 @@ class RunDirectory:
 
     def write_evaluation(self, evaluation: Mapping[str, Any]) -> None:
         """Writes evaluation.json as `write_metrics` does."""
-        _write_json(self.evaluation_path, {key: _null_if_not_finite(value) for key, value in evaluation.items()})
+        _write_json(self.evaluation_path, _null_if_not_finite(evaluation))
 
     def append_history(self, line: Mapping[str, Any]) -> None:
         """Appends one line to history.jsonl."""
@@ -345,6 +345,10 @@ def _read_json(path: Path) -> dict[str, Any]:
 
 
 def _null_if_not_finite(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _null_if_not_finite(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_null_if_not_finite(entry) for entry in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 

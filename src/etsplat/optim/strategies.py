@@ -87,9 +87,11 @@ class SubdivideAndUntangle(Strategy):
         return min((i for i in (*self._budgets, *self._untangle_after) if i >= iteration), default=NEVER)
 
     def edit(self, iteration: int) -> bool:
-        """Untangles, then divides."""
+        """Untangles, then divides. Raises DivergedError where faces have no finite area."""
         mesh: TriangleMesh = self.model
         topology = mesh.topology.to(torch.device("cpu"))
+        if not bool(face_areas(mesh.vertices.detach().cpu(), topology.faces).isfinite().all()):
+            raise DivergedError(f"the areas of faces are not finite at iteration {iteration}; lower the learning rates")
         if iteration in self._untangle_after:
             # What smoothing takes away later steps bring back, but nothing does after the last.
             reach = 0.5 if iteration == max(self._untangle_after) else math.inf

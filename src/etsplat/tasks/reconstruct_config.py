@@ -110,9 +110,9 @@ class Refinement:
     """First subdivision, as a fraction of the iterations."""
     last: Annotated[float, Range(0, 1)] = 0.6
     """Last subdivision, as a fraction of the iterations."""
-    subdivisions: Annotated[int, Range(0)] = 30
+    subdivisions: Annotated[int, Range(0, 10_000)] = 30
     """Number of subdivisions between these two; each adds the same fraction of faces, up to `max_faces`."""
-    untanglings: Annotated[int, Range(0)] = 6
+    untanglings: Annotated[int, Range(0, 10_000)] = 6
     """How often faces that cut through others are smoothed away, from the last subdivision to the last step."""
 
 
@@ -126,7 +126,7 @@ class Output:
     """Iterations between evaluations for history.jsonl; 0 for one at the end only."""
     checkpoint_every: Annotated[int, Range(0)] = 1000
     """Iterations between checkpoints; 0 for one at the end only."""
-    chamfer_samples: Annotated[int, Range(1, 10**8)] = 100_000
+    chamfer_samples: Annotated[int, Range(1, 10**7)] = 100_000
     """Points per surface for the Chamfer distance."""
     lpips_weights: Path | None = None
     """Weights file for LPIPS; "download" fetches it; None uses the one in torch's cache or goes without."""
