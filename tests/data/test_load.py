@@ -1,6 +1,7 @@
 import json
 import re
 import shutil
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -144,6 +145,21 @@ def test_points_of_ply_file_path_are_read(tmp_path):
     capture = load_dataset(tmp_path)
     assert capture.points.tolist() == [[1, 2, 3], [4, 5, 6]]
     torch.testing.assert_close(capture.point_colors[0], torch.tensor([1.0, 0.0, 0.2]))
+
+
+@pytest.mark.parametrize("kind", ["ascii", "binary_little_endian", "binary_big_endian"])
+@pytest.mark.parametrize("count", [1000, 2**40, 10**15 - 1])
+def test_points_beyond_their_file_take_no_memory(tmp_path, kind, count):
+    write_transforms(tmp_path, 3, ply_file_path="points.ply")
+    head = f"ply\nformat {kind} 1.0\nelement vertex {count}\n" + "".join(f"property float {axis}\n" for axis in "xyz")
+    (tmp_path / "points.ply").write_bytes(f"{head}end_header\n".encode() + b"0 0 0\n" * 20)
+    tracemalloc.start()
+    try:
+        with pytest.raises(InputError, match=r"points\.ply: (is cut short|vertex cannot be read)"):
+            load_dataset(tmp_path)
+        assert tracemalloc.get_traced_memory()[1] < 1 << 20
+    finally:
+        tracemalloc.stop()
 
 
 @pytest.mark.parametrize(

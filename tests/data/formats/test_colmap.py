@@ -1,4 +1,5 @@
 import struct
+import tracemalloc
 
 import pytest
 import torch
@@ -113,6 +114,32 @@ def test_binary_files_cut_anywhere_are_input_errors(tmp_path, truth, name, part)
     path.write_bytes(path.read_bytes()[: int(path.stat().st_size * part)])
     with pytest.raises(InputError, match=rf"{name}.*cut short"):
         load_colmap(tmp_path)
+
+
+@pytest.mark.parametrize("count", [10**6, 2**40, 2**64 - 1])
+@pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
+def test_counts_beyond_the_file_take_no_memory(tmp_path, truth, name, count):
+    """Of records, and of the key points of an image and the track of a point."""
+    write_scene(tmp_path, truth, True)
+    sparse = tmp_path / "sparse" / "0"
+    track = struct.pack("<QQ3d3Bd", 2, 1, 0, 0, 0, 9, 9, 9, 0) + struct.pack("<Q", count) + bytes(8)
+    (sparse / "points3D.bin").write_bytes(track)
+    data = (sparse / name).read_bytes()
+    if name == "images.bin":
+        (sparse / "points3D.bin").unlink()
+        name_end = data.index(b"\0", 8 + struct.calcsize("<I7dI")) + 1
+        files = [struct.pack("<Q", count) + data[8:], data[:name_end] + struct.pack("<Q", count) + data[name_end + 8 :]]
+    else:
+        files = [struct.pack("<Q", count) + data[8:]] + [data] * (name == "points3D.bin")
+    for content in files:
+        (sparse / name).write_bytes(content)
+        tracemalloc.start()
+        try:
+            with pytest.raises(InputError, match=rf"{name}.*cut short"):
+                load_colmap(tmp_path)
+            assert tracemalloc.get_traced_memory()[1] < 1 << 20
+        finally:
+            tracemalloc.stop()
 
 
 @pytest.mark.parametrize(
