@@ -209,6 +209,7 @@ def test_faces_without_area_repeated_faces_and_loose_vertices_are_dropped_with_n
         ("a.off", f"OFF\n{2**62} {2**62} 0\n0 0 0\n", "cannot be read as OFF"),
         ("a.off", "no mesh\n", "its first word is not OFF"),
         ("a.ply", "ply\nformat ascii 1.0\nelement ver", "cannot be read as PLY"),
+        ("a.ply", PLY_HEADER.format(3, "\u0661") + "0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n", "cannot be read as PLY"),
         ("a.glb", "no glb at all, just some text", "cannot be read as GLB"),
         ("a.off", "OFF\n3 1 0\n0 0 0\n1 0", "cannot be read as OFF"),
     ],
@@ -285,6 +286,12 @@ def stl(faces):
         (".glb", glb(3), glb(3 * 10**5)),
         (".glb", glb(3), glb(10**4, bufferView=0)),
         (".glb", glb(3), glb(-(10**9))),
+        (".glb", glb(3), glb(3)[:12] + struct.pack("<I", 2**32 - 1) + glb(3)[16:]),
+        (
+            ".glb",
+            glb(3),
+            glb(3)[:8] + struct.pack("<I", 2**32 - 1) + glb(3)[12:-8] + struct.pack("<I4s4x", 2**32 - 1, b"BIN\0"),
+        ),
         (".ply", ply(3, 1), ply(2**31 - 1, 1)),
         (".ply", ply(3, 1), ply(3, 2**40)),
         (".stl", stl(1), stl(2**32 - 1)),
@@ -303,6 +310,16 @@ def test_counts_fit_the_file_before_anything_is_allocated(tmp_path, suffix, smal
         assert tracemalloc.get_traced_memory()[1] < 1 << 20
     finally:
         tracemalloc.stop()
+
+
+def test_a_glb_with_vertices_of_four_numbers_is_an_input_error(tmp_path, ball):
+    save_mesh(tmp_path / "a.glb", *ball)
+    data = (tmp_path / "a.glb").read_bytes()
+    swapped = data.replace(b'"POSITION":0,"COLOR_0":1', b'"POSITION":1,"COLOR_0":1')
+    assert swapped != data
+    (tmp_path / "a.glb").write_bytes(swapped)
+    with pytest.raises(InputError, match="vertices of 4 numbers, not 3"):
+        load_mesh(tmp_path / "a.glb")
 
 
 def test_a_scene_of_many_copies_is_refused_before_they_are_made(tmp_path, ball, monkeypatch):

@@ -119,7 +119,10 @@ def read_ply(path: Path) -> RawMesh:
     mesh = _read_with_trimesh(path)
     with open(path, "rb") as file:
         header = [line.split() for line in file.read(1 << 16).split(b"end_header")[0].splitlines()]
-    announced = next((int(words[2]) for words in header if words[:2] == [b"element", b"face"]), 0)
+    try:
+        announced = next((int(words[2]) for words in header if words[:2] == [b"element", b"face"]), 0)
+    except (ValueError, IndexError) as error:  # of lines that trimesh takes no notice of
+        raise _unreadable(path, error) from error
     if len(mesh.faces) < announced:
         raise InputError(
             f"mesh {path}: {len(mesh.faces)} faces where its header announces {announced};"
@@ -173,10 +176,15 @@ def _read_with_trimesh(path: Path) -> RawMesh:
 
 def _check_gltf(path: Path) -> None:
     """Raises what damage leads to, and ValueError where arrays are larger than the files, or a file lies elsewhere."""
-    data = path.read_bytes()
-    binary = data.startswith(b"glTF")
-    document = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")] if binary else data)
-    room = len(data)
+    text = data = path.read_bytes()
+    room, at = len(data), 12
+    if data.startswith(b"glTF"):
+        text = data[20 : 20 + int.from_bytes(data[12:16], "little")]
+        while at < min(room, int.from_bytes(data[8:12], "little")):
+            at += 8 + int.from_bytes(data[at : at + 4], "little")
+        if at > room + 8:  # of what follows the last chunk only a part may be there
+            raise ValueError(f"chunks of {at} bytes in {room}")
+    document = json.loads(text)
     for uri in [buffer["uri"] for buffer in document.get("buffers", []) if "uri" in buffer]:
         if not uri.startswith("data:"):
             room += path_within(path.parent, uri, path).stat().st_size

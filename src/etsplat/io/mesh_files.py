@@ -184,6 +184,8 @@ def _check(path: Path, raw: RawMesh) -> None:
         raise InputError(
             f"mesh {path}: {len(raw.vertices)} points but no faces; mesh the point cloud first (e.g. in MeshLab)"
         )
+    if raw.vertices.shape[1:] != (3,):
+        raise InputError(f"mesh {path}: vertices of {raw.vertices.shape[1]} numbers, not 3; export it again")
     named = (("vertices", raw.vertices), ("face colours", raw.face_colors), ("vertex colours", raw.vertex_colors))
     for name, values in ((name, values) for name, values in named if values is not None):
         with np.errstate(over="ignore"):
