@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from etsplat.core.errors import InputError
+from etsplat.io import run_directory
 from etsplat.io.run_directory import RunDirectory, is_run
 
 CONFIG = {"task": "reconstruct", "config": {"seed": 0, "method": "elastic"}, "source": {"fingerprint": "abc"}}
@@ -31,6 +32,29 @@ def test_a_new_folder_is_made_with_its_parents_and_explains_itself(tmp_path: Pat
     readme = (run.path / "README.txt").read_text()
     for name in ("report.html", "mesh.ply", "metrics.json", "history.jsonl", "checkpoints", "--resume"):
         assert name in readme
+
+
+@pytest.mark.parametrize("full", ["config.json", "README.txt"])
+def test_a_disk_that_is_full_from_the_start_leaves_a_folder_to_go_on_with(
+    tmp_path: Path, full: str, monkeypatch
+) -> None:
+    """Whatever had room: nothing of a run, which starts anew there, or a run that is resumed and explains itself."""
+    write = run_directory.atomic_write
+
+    def atomic_write(path: Path):
+        if path.name == full:
+            raise InputError("full")
+        return write(path)
+
+    monkeypatch.setattr(run_directory, "atomic_write", atomic_write)
+    with pytest.raises(InputError, match="full"):
+        RunDirectory.create(tmp_path / "run", CONFIG)
+    monkeypatch.undo()
+    again = RunDirectory.resume if is_run(tmp_path / "run") else RunDirectory.create
+    run = again(tmp_path / "run", CONFIG)
+    fresh = RunDirectory.create(tmp_path / "fresh", CONFIG)
+    assert contents(run.path) == contents(fresh.path)
+    assert run.checkpoints.is_dir()
 
 
 @pytest.mark.parametrize("text", ["{", "[1]", "[" * 100_000, "9" * 5000])

@@ -182,12 +182,9 @@ class RunDirectory:
         with _explained(run.path):
             run.path.mkdir(parents=True, exist_ok=True)
             run._remove_results()
-            run.checkpoints.mkdir()
-            run.test.mkdir()
+        # First, so that a folder in which no more than this had room says whose it is, and can be resumed.
         _write_json(run.config_path, {"format": FORMAT, **config})
-        task = config["task"]
-        text = _PEER_README if task == "peer" else _README.format(task=task, results=_RESULTS[task], test=_TEST[task])
-        _write_text(run.path / "README.txt", text)
+        run._furnish(config["task"])
         return run
 
     @classmethod
@@ -213,9 +210,7 @@ class RunDirectory:
                     f"{path}: was started with {'; '.join(differences)}; resume with the same, or choose another folder"
                 )
         _check_writable(path)
-        with _explained(path):
-            run.checkpoints.mkdir(exist_ok=True)
-            run.test.mkdir(exist_ok=True)
+        run._furnish(stored["task"])
         return run
 
     def read_config(self) -> dict[str, Any]:
@@ -280,6 +275,18 @@ class RunDirectory:
         """Keeps only the lines up to an iteration: what came after the checkpoint will be done again."""
         kept = [line for line in self.read_history() if line["iteration"] <= iteration]
         _write_text(self.history_path, "".join(json.dumps(line) + "\n" for line in kept))
+
+    def _furnish(self, task: str) -> None:
+        """What a run's folder has from the start beside its config.json, where it is not there yet."""
+        with _explained(self.path):
+            self.checkpoints.mkdir(exist_ok=True)
+            self.test.mkdir(exist_ok=True)
+        readme = self.path / "README.txt"
+        if not readme.is_file():
+            peer = task == "peer"
+            _write_text(
+                readme, _PEER_README if peer else _README.format(task=task, results=_RESULTS[task], test=_TEST[task])
+            )
 
     def _remove_results(self) -> None:
         # config.json goes last: until then the folder still says whose it is.
