@@ -14,6 +14,11 @@ def at(value: Scheduled, iteration: int) -> float:
     return value(iteration) if callable(value) else value
 
 
+def _never(_iteration: int) -> int:
+    """A name, so that schedules can be pickled."""
+    return 0
+
+
 @dataclass(frozen=True)
 class Schedule:
     """What changes over a run and is not learned.
@@ -28,7 +33,7 @@ class Schedule:
     rates: Mapping[str, Scheduled]
     values: Mapping[str, Scheduled] = field(default_factory=dict)
     appearance: Callable[[int], Any] | None = None
-    halvings: Callable[[int], int] = lambda _: 0
+    halvings: Callable[[int], int] = _never
 
 
 def regularization_weight(iteration: int, iterations: int, hold: int, final: float = 0.0) -> float:
