@@ -26,15 +26,9 @@ ENOUGH = 200
 
 _PLAIN = "made of torch alone, which answers odd tensors in its own words"
 KNOWN: dict[str, str] = {
-    "picture": "row 6: a small file that claims many pixels takes 275 MiB",
-    "mask": "row 6: as pictures",
-    "photos of a scene": "row 6: as pictures",
-    "report": "row 6: as pictures",
-    "soup .safetensors": "row 9: an unknown distance",
-    "soup .ply, exported": "row 9: properties that are missing",
-    "checkpoint": "row 9: metadata that is missing or no number",
-    "run": "row 9: history that is not UTF-8; settings that are missing in config.json",
-    "--config": "row 9: a config.json without a task",
+    "report": "row 9: settings, metrics and history that lack names",
+    "run": "row 9: settings that are missing in config.json",
+    "--config": "row 9: a preset that is a list",
     "rasterize": "width beyond int32; opacities that are None",
     "rasterize_antialiased": "width beyond int32",
     "rasterize_opaque": "width beyond int32",

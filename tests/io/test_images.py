@@ -108,7 +108,7 @@ def test_postscript_starts_no_program(tmp_path, monkeypatch):
     assert started == []
 
 
-@pytest.mark.parametrize(("width", "height"), [(40_000, 40_000), (13_000, 13_000), (2**31 - 1, 1)])
+@pytest.mark.parametrize(("width", "height"), [(40_000, 40_000), (13_000, 13_000), (9000, 9000), (2**31 - 1, 1)])
 def test_an_image_of_too_many_pixels_is_refused_before_it_is_decoded(tmp_path, width, height):
     """Its file is small: 1.6e9 pixels of one bit unpack to 6 GB of floats."""
 
@@ -118,7 +118,7 @@ def test_an_image_of_too_many_pixels_is_refused_before_it_is_decoded(tmp_path, w
     head = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 1, 0, 0, 0, 0))
     rows = chunk(b"IDAT", zlib.compress(bytes(1 << 20)))
     (tmp_path / "a.png").write_bytes(b"\x89PNG\r\n\x1a\n" + head + rows + chunk(b"IEND", b""))
-    with pytest.raises(InputError, match=r"a\.png: .*pixels"):
+    with pytest.raises(InputError, match=r"a\.png: .*(pixels|too small for)"):
         load_image(tmp_path / "a.png")
 
 

@@ -69,7 +69,7 @@ def test_files_of_a_run_that_are_damaged_are_named(tmp_path: Path, text: str) ->
         assert_one_line(error, str(path), "JSON")
     assert not is_run(run.path)
     if text != "[1]":  # which is a line
-        run.history_path.write_text(text + "\n")
+        run.history_path.write_bytes(text.encode() + b"\xff\n")
         with pytest.raises(InputError) as error:
             run.read_history()
         assert_one_line(error, str(run.history_path), "damaged")

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from etsplat.core.errors import InputError
+from etsplat.io.tensors import read_tensors, save_tensors
 from etsplat.optim.checkpoints import list_checkpoints, load_latest_checkpoint, save_checkpoint
 
 
@@ -62,6 +63,19 @@ def test_a_checkpoint_cut_short_says_what_to_do(tmp_path: Path, rng: torch.Gener
     assert "\n" not in message
     assert "step_000020" in message
     assert "delete it to resume from step_000010" in message
+
+
+@pytest.mark.parametrize("told", [{}, {"iteration": "pe"}, {"iteration": "-1"}, {"iteration": "9" * 5000}])
+def test_a_checkpoint_that_does_not_say_of_which_iteration_it_is_is_refused(
+    tmp_path: Path, rng: torch.Generator, told: dict[str, str]
+) -> None:
+    """By name, with what to do."""
+    path = save_checkpoint(tmp_path, 20, some_tensors(rng), "run")
+    tensors, metadata = read_tensors(path)
+    del metadata["iteration"]
+    save_tensors(path, tensors, metadata | told)
+    with pytest.raises(InputError, match="does not say which iteration it is of; delete it"):
+        load_latest_checkpoint(tmp_path, "run")
 
 
 def test_a_checkpoint_of_another_run_is_refused(tmp_path: Path, rng: torch.Generator) -> None:

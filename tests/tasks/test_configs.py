@@ -170,6 +170,9 @@ def test_a_part_of_the_settings_is_enough(tmp_path: Path) -> None:
         ('{"optimizer": {"lr_vertices": 1e308}}', r"lr_vertices: is 1e\+308; it must be at most 1e\+30"),
         ('{"optimizer": {"lr_vertices": NaN}}', r"lr_vertices: is nan; it must be at least 0"),
         ("[1, 2]", r"holds no settings"),
+        (json.dumps({"format": FORMAT}), r"has the settings of `etsplat None`"),
+        (json.dumps({"format": FORMAT, "task": "reconstruct"}), r"holds no settings"),
+        ('{"optimizer": {"lr_vertices": ' + "9" * 400 + "}}", r"lr_vertices: is 9+; it must be at most 1e\+30"),
         (json.dumps({"format": FORMAT, "task": "train", "config": {}}), r"has the settings of `etsplat train`"),
     ],
 )

@@ -22,6 +22,9 @@ MAX_PIXELS = 160_000_000
 
 _FORMATS = ("PNG", "JPEG")
 
+_DENSEST = 520
+"""Pixels of 16 bits in a byte of PNG, of which deflate makes at most 1032; JPEG needs a bit for 64 pixels at least."""
+
 
 def open_image(path: Path | str) -> Image.Image:
     """An image that is not decoded yet, of the formats that are read here and within MAX_PIXELS.
@@ -44,6 +47,12 @@ def open_image(path: Path | str) -> Image.Image:
         image.close()
         raise InputError(
             f"image {path}: is {image.width}x{image.height}, more than {MAX_PIXELS // 10**6} million pixels; shrink it"
+        )
+    denser = 16 if image.format == "PNG" and image.mode in ("1", "L", "P") else 1  # with one bit for a pixel
+    if image.width * image.height > _DENSEST * denser * path.stat().st_size:
+        image.close()
+        raise InputError(
+            f"image {path}: damaged or cut short (too small for {image.width}x{image.height}); copy it again"
         )
     return image
 

@@ -264,10 +264,9 @@ class RunDirectory:
         """The lines of history.jsonl; empty if there is none yet. A last line that a kill cut short is left out."""
         try:
             text = self.history_path.read_text(encoding="utf-8")
+            return [parse_json(line) for line in text.split("\n")[:-1]]  # what follows the last \n is cut short
         except FileNotFoundError:
             return []
-        try:
-            return [parse_json(line) for line in text.split("\n")[:-1]]  # what follows the last \n is cut short
         except ValueError as error:
             raise InputError(f"{self.history_path}: is damaged ({error}); delete the file") from error
 

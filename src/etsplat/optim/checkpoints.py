@@ -1,5 +1,6 @@
 """Checkpoints: one safetensors file each, written whole or not at all, bound to the run that wrote it."""
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -81,7 +82,10 @@ def load_latest_checkpoint(folder: Path, run_hash: str) -> Checkpoint | None:
         raise InputError(
             f"{path}: belongs to a run with other settings or input; resume with the same, or choose another folder"
         )
-    return Checkpoint(path, int(metadata["iteration"]), tensors)
+    iteration = metadata.get("iteration", "")
+    if not re.fullmatch(r"[0-9]{1,18}", iteration):
+        raise InputError(f"{path}: does not say which iteration it is of; {remedy}")
+    return Checkpoint(path, int(iteration), tensors)
 
 
 def _first_line(error: Exception) -> str:

@@ -10,6 +10,7 @@ import inspect
 import math
 import sys
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass, fields, is_dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -280,8 +281,10 @@ def _read(path: str | Path, task: str) -> dict[str, Any]:
         raise InputError(f"{path}: holds no settings; name a run's config.json")
     if found.get("format") != FORMAT:
         return found
-    if found["task"] != task:
-        raise InputError(f"{path}: has the settings of `etsplat {found['task']}`; name a run of `etsplat {task}`")
+    if found.get("task") != task:
+        raise InputError(f"{path}: has the settings of `etsplat {found.get('task')}`; name a run of `etsplat {task}`")
+    if not isinstance(found.get("config"), dict):
+        raise InputError(f"{path}: holds no settings; name a run's config.json")
     return found["config"]
 
 
@@ -370,7 +373,8 @@ def _setting(hint: Any, default: Any) -> Setting:
 def _typed(setting: Setting, value: Any) -> Any:
     """A value of JSON, which has no paths and may have floats without a point, as its setting has it."""
     if setting.kind is float and isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
+        with suppress(OverflowError):  # and then its check complains of the integer
+            return float(value)
     return Path(value) if setting.kind is Path and isinstance(value, str) else value
 
 
