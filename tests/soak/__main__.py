@@ -85,8 +85,8 @@ def killed(task: Task, out: Path, rng: random.Random) -> str | None:
         else:
             break
     ended = task.finish(out)
-    # A run that had ended before its signal is not resumed.
-    return None if ended.status == 0 or (out / "metrics.json").exists() else f"did not go on: {ended.said[-300:]}"
+    # A run that had ended before its signal need not be resumed.
+    return None if ended.status == 0 or (out / "report.html").exists() else f"did not go on: {ended.said[-300:]}"
 
 
 def full_disk(task: Task, out: Path, rng: random.Random) -> str | None:
@@ -109,7 +109,7 @@ def moved_clock(task: Task, out: Path, rng: random.Random) -> str | None:
     except subprocess.TimeoutExpired:
         process.kill()
         process.communicate()
-    if (out / "metrics.json").exists():
+    if (out / "report.html").exists():
         return None
     ended = task.finish(out, clock=rng.randint(1, 1 << 30))
     return None if ended.status == 0 else f"did not go on: {ended.said[-300:]}"
