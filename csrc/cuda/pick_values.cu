@@ -9,7 +9,7 @@ __device__ long long picked(const int* chosen, long long pixels, long long trian
     pixel = static_cast<long long>(blockIdx.x) * blockDim.x + threadIdx.x;
     if (pixel >= pixels) return -1;
     pixel += blockIdx.y * pixels;
-    return chosen[pixel] > 0 ? blockIdx.y * triangles + chosen[pixel] - 1 : -1;
+    return chosen[pixel] > 0 && chosen[pixel] <= triangles ? blockIdx.y * triangles + chosen[pixel] - 1 : -1;
 }
 
 extern "C" __global__ void pick_forward(const float* values, const int* chosen, long long pixels, long long triangles,

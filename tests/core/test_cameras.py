@@ -100,3 +100,32 @@ def test_bad_cameras_are_refused_by_name():
         look_at(ORIGIN, ORIGIN, UP)
     with pytest.raises(ValueError, match="fov_y_degrees"):
         intrinsics(180, 4, 4)
+
+
+@pytest.mark.parametrize("factor", [0, -1, math.nan, math.inf, -math.inf])
+def test_cameras_are_scaled_by_positive_finite_factors_alone(factor):
+    cameras = Cameras(torch.eye(4)[None], intrinsics(50, 9, 8)[None], 9, 8)
+    with pytest.raises(ValueError, match="factor must be positive and finite"):
+        cameras.scaled(factor)
+
+
+def test_cameras_of_integers_are_refused():
+    with pytest.raises(ValueError, match=r"viewmats must be of floating-point numbers, got torch\.int64"):
+        Cameras(torch.eye(4)[None].long(), intrinsics(50, 9, 8)[None], 9, 8)
+
+
+@pytest.mark.parametrize(
+    ("odd", "text"),
+    [
+        ({"eye": torch.ones(5, 1)}, r"eye must have shape \(\.\.\., 3\)"),
+        ({"eye": torch.ones(5, 3, dtype=torch.int64)}, "eye must be of floating-point numbers"),
+        ({"target": torch.zeros(4, 3)}, r"target must have shape \(3,\) or that of eye, \(5, 3\), got \(4, 3\)"),
+        ({"target": torch.zeros(2, 5, 3)}, "target must have shape"),
+        ({"up": torch.ones(1)}, "up must have shape"),
+        ({"up": None}, "up must be a tensor or three numbers, got None"),
+        ({"up": "y"}, "up must be a tensor or three numbers, got 'y'"),
+    ],
+)
+def test_what_cannot_be_looked_at_is_refused_by_name(odd, text):
+    with pytest.raises(ValueError, match=text):
+        look_at(**{"eye": torch.rand(5, 3) + 1, "target": torch.zeros(3), "up": (0, 1, 0), **odd})

@@ -4,6 +4,7 @@
 """
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +13,12 @@ import torch
 from torch import Tensor
 
 from etsplat import (
+    Adam,
     Cameras,
+    RowPlan,
     TriangleMesh,
     TriangleSoup,
+    apply_rows,
     geometry_metrics,
     icosphere,
     intrinsics,
@@ -27,6 +31,7 @@ from etsplat import (
     spherical_harmonics,
     ssim,
 )
+from etsplat.data.camera_paths import PATHS
 from etsplat.geometry.distance import closest_points
 from etsplat.geometry.sampling import sample_surface
 
@@ -50,9 +55,17 @@ def _cases(folder: Path) -> dict[str, Case]:
         save_image(folder / "image.png", image)
         return (folder / "image.png").read_bytes()
 
+    def kept_rows(count: Tensor) -> Tensor:
+        return apply_rows(RowPlan.keeping(torch.arange(5) % 2 == 0), Adam({}, {}), {"count": count})[1]["count"]
+
     return {
         "Cameras": (lambda **given: Cameras(**given, width=24, height=20).centers, views),
         "look_at": (look_at, {"eye": eye, "target": target, "up": up}),
+        **{
+            name: (partial(path, frames=3), {"viewmats": look_at(eye, torch.zeros(3), up), "up": up[0]})
+            for name, path in PATHS.items()
+        },
+        "apply_rows": (kept_rows, {"count": eye[:, 0]}),
         "psnr": (psnr, pair),
         "ssim": (ssim, pair),
         "silhouette_iou": (silhouette_iou, {"coverage": pair["image"][..., 0], "truth": pair["truth"][..., 0]}),

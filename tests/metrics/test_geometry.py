@@ -89,3 +89,24 @@ def test_inflated_bunny_has_the_published_values(shared_data):
         assert 1e3 * chamfer(surface, truth) == pytest.approx(expected, rel=0.01)
         assert chamfer_exact(*exact_squared_distances(surface, truth)) == pytest.approx(2 * d * d, rel=0.02, abs=1e-20)
     assert 1e3 * chamfer_floor(truth) == pytest.approx(0.0337, abs=5e-5)
+
+
+@pytest.mark.parametrize(
+    ("odd", "text"),
+    [
+        ({"samples": 0}, "samples must be an integer from 1 to 100000000, got 0"),
+        ({"samples": 2**40}, "samples must be an integer from 1"),
+        ({"samples": 0.5}, "samples must be an integer from 1"),
+        ({"seed": -1}, "seed must be an integer of at least 0, got -1"),
+        ({"seed": None}, "seed must be an integer"),
+        ({"faces": torch.tensor([[0, 1, 12]])}, "faces must be indices from 0 to 11"),
+        ({"true_faces": torch.tensor([[0, 1, -1]])}, "true_faces must be indices from 0 to 11"),
+        ({"faces": torch.tensor([[0.0, 1.0, 2.0]])}, "faces must be int32 or int64"),
+        ({"true_vertices": torch.zeros(0, 3)}, "true_vertices must have at least one row"),
+    ],
+)
+def test_arguments_out_of_range_are_refused_by_name(odd, text):
+    points, faces = icosphere(0)
+    both = {"vertices": points, "faces": faces, "true_vertices": points, "true_faces": faces, "samples": 20}
+    with pytest.raises(ValueError, match=text):
+        geometry_metrics(**{**both, **odd})

@@ -205,3 +205,8 @@ def test_download_fetches_into_the_cache_what_is_meant_and_nothing_else(tmp_path
 def test_lpips_refuses_images_too_small_for_its_five_stages(weights):
     with pytest.raises(ValueError, match="at least 16 pixels"):
         Lpips()(torch.zeros(8, 30, 3), torch.zeros(8, 30, 3))
+
+
+def test_silhouettes_of_other_shapes_are_refused():
+    with pytest.raises(ValueError, match=r"truth must have the coverage's shape \(5, 6\), got \(5, 1\)"):
+        silhouette_iou(torch.rand(5, 6), torch.rand(5, 1))

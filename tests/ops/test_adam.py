@@ -151,3 +151,24 @@ def test_missing_gradients_and_wrong_names_are_errors(rng):
     assert all(parameter.grad is None for parameter in ours.values())
     with pytest.raises(ValueError, match="first_moments"):
         adam.load_state_dict({**adam.state_dict(), "first_moments": {}})
+
+
+def test_parameters_without_a_place_for_each_element_are_refused_before_anything_changes():
+    expanded = torch.rand(1).expand(7)
+    for odd, text in (
+        (expanded, "a place for each element"),
+        ((), "a tensor"),
+        (torch.rand(7).to("meta"), "in memory"),
+    ):
+        with pytest.raises(ValueError, match=rf"parameters\[value\] must (be|have) {text}"):
+            Adam({"value": odd}, {"value": 0.1})
+    first, second = torch.ones(7), torch.ones(7)
+    first.grad, second.grad = torch.ones(7), torch.ones(7)
+    adam = Adam({"first": first, "second": second}, {"first": 0.1, "second": 0.1})
+    second.data = expanded
+    with pytest.raises(ValueError, match=r"parameters\[second\] must have a place for each element"):
+        adam.step()
+    assert adam.step_count == 0
+    assert torch.equal(first, torch.ones(7))
+    with pytest.raises(ValueError, match="parameter must have a place for each element"):
+        adam.replace("first", expanded, first, first)

@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from etsplat import intrinsics, look_at, rasterize, rasterize_opaque
-from etsplat.core.cameras import Cameras
+from etsplat import MeshTopology, intrinsics, look_at, rasterize, rasterize_antialiased, rasterize_opaque
+from etsplat.core.cameras import MAX_SIDE, Cameras
 from etsplat.engines.native.pool import empty_image
 from etsplat.ops.adam import Adam
 from etsplat.ops.rasterize_opaque import render_opaque
@@ -263,6 +263,36 @@ class TestOddArguments:
         value.grad = torch.zeros(7)
         with pytest.raises(ValueError, match="parameter value, its gradient and moments must have one shape"):
             optimizer.step()
+
+    @pytest.mark.parametrize("name", ["opacities", "sigma"])
+    def test_what_is_no_option_cannot_be_none(self, name, rng):
+        with pytest.raises(ValueError, match=f"{name} must be a tensor of shape .*, got NoneType"):
+            rasterize(**{**soup(rng, 20), name: None})
+
+    def test_flags_that_are_no_bool_are_refused(self, rng):
+        scene = mesh(rng)
+        with pytest.raises(ValueError, match="freeze_inradius must be True or False, got 2"):
+            rasterize(**scene, freeze_inradius=2)
+        shown = {key: scene[key] for key in ("vertices", "faces", "viewmats", "Ks", "width", "height", "face_colors")}
+        with pytest.raises(ValueError, match="cull_backfaces must be True or False, got None"):
+            render_opaque(**shown, cull_backfaces=None)
+
+    @pytest.mark.parametrize("size", [MAX_SIDE + 1, 2**31, 2**40])
+    @pytest.mark.parametrize("name", ["width", "height"])
+    def test_sizes_beyond_what_can_be_numbered_are_refused(self, name, size, rng):
+        scene = {**mesh(rng), name: size}
+        opaque = {key: scene[key] for key in ("vertices", "faces", "viewmats", "Ks", "width", "height")}
+        topology = MeshTopology.from_faces(scene["faces"], len(scene["vertices"]))
+        antialiased = {key: value for key, value in opaque.items() if key != "faces"}
+        colors = {"face_colors": torch.rand(len(scene["faces"]), 3)}
+        for draw in (
+            partial(rasterize, **scene),
+            partial(rasterize_opaque, **opaque),
+            partial(render_opaque, **opaque, **colors),
+            partial(rasterize_antialiased, **antialiased, **colors, connectivity=topology.connectivity),
+        ):
+            with pytest.raises(ValueError, match=rf"{name}.* must be .* {MAX_SIDE}, got"):
+                draw()
 
     @pytest.mark.parametrize("name", ["face_colors", "backgrounds"])
     def test_colours_whose_gradients_would_overflow_are_refused(self, engine, name, rng):

@@ -5,7 +5,9 @@ import math
 import pytest
 import torch
 
+import etsplat
 from etsplat.core.cameras import look_at
+from etsplat.engines.choice import engine_for
 from etsplat.engines.threads import num_threads, set_num_threads
 from etsplat.ops.pick_values import pick_values
 from etsplat.ops.triangle_channels import triangle_channels
@@ -102,3 +104,35 @@ def test_bits_do_not_depend_on_threads(rng):
         results.append(gradients(corners, viewmats(), cotangent, "cpu", depth=True, normals=True))
     set_num_threads(before)
     assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
+
+
+@pytest.mark.parametrize("odd", [-1, 1, 2**40, None, "yes"])
+@pytest.mark.parametrize("name", ["depth", "normals"])
+def test_flags_that_are_no_bool_are_refused_by_name(name, odd):
+    with pytest.raises(ValueError, match=f"{name} must be True or False, got"):
+        triangle_channels(torch.rand(5, 3, 3), viewmats(), **{"depth": True, "normals": True, name: odd})
+
+
+@pytest.mark.parametrize("odd", [-1, 10, 2**31 - 1])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_numbers_of_triangles_out_of_range_are_refused(odd, dtype):
+    """In every engine on the CPU."""
+    chosen = torch.zeros(2, 5, 4, dtype=torch.int32)
+    chosen[1, 2, 3] = odd
+    with pytest.raises(ValueError, match="chosen must be indices from 0 to 9, got indices from"):
+        pick_values(torch.rand(2, 9, dtype=dtype), chosen)
+
+
+def test_kernels_show_nothing_where_the_number_is_out_of_range(cuda_device):
+    """There it is not asked for before: 0, and no gradient."""
+    values = torch.rand(2, 9, device=cuda_device).requires_grad_()
+    chosen = torch.tensor([[[-5, 0, 9]], [[1, 10, 2**31 - 1]]], dtype=torch.int32, device=cuda_device)
+    with etsplat.engine("cuda"):
+        image = engine_for(values).pick_values(values, chosen)
+    image.sum().backward()
+    expected, gradient = torch.zeros(2, 1, 3), torch.zeros(2, 9)
+    expected[0, 0, 2], expected[1, 0, 0] = values[0, 8].item(), values[1, 0].item()
+    gradient[0, 8] = gradient[1, 0] = 1
+    assert torch.equal(image.detach().cpu(), expected)
+    assert values.grad is not None
+    assert torch.equal(values.grad.cpu(), gradient)

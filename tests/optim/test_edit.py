@@ -6,7 +6,7 @@ from etsplat.geometry.measures import face_areas
 from etsplat.geometry.subdivision import longest_edge_plan
 from etsplat.geometry.topology import MeshTopology
 from etsplat.ops.adam import Adam
-from etsplat.optim.edit import apply_subdivision
+from etsplat.optim.edit import RowPlan, apply_rows, apply_subdivision
 
 RATES = {"vertices": 1e-2, "colors": 1e-1, "opacities": 1e-1, "sigma": 1e-3}
 
@@ -136,3 +136,42 @@ def test_bad_names_and_shapes_change_nothing(problem, per_face, statistics, mess
     with pytest.raises(ValueError, match=message):
         subdivide(plan, adam, statistics, per_face)
     assert all(adam.parameters[name] is tensor for name, tensor in before.items())
+
+
+def freed(tensor: torch.Tensor) -> torch.Tensor:
+    """Without its memory, which to read ends the process."""
+    tensor.untyped_storage().resize_(0)
+    return tensor
+
+
+@pytest.mark.parametrize(
+    ("kept", "text"),
+    [
+        (None, "kept must be a tensor"),
+        (freed(torch.ones(4) > 0), "kept must have memory of its own"),
+        (torch.ones(4), "kept must be of bools"),
+        (torch.ones(4, 1) > 0, "kept must have shape"),
+    ],
+)
+def test_rows_to_keep_that_are_no_flags_are_refused(kept, text):
+    with pytest.raises(ValueError, match=text):
+        RowPlan.keeping(kept)
+
+
+@pytest.mark.parametrize(
+    ("odd", "text"),
+    [
+        ({"source": torch.tensor([0, 4])}, "source must be indices from 0 to 3, got indices from 0 to 4"),
+        ({"source": torch.tensor([0.0, 1.0])}, "source must be int32 or int64"),
+        ({"fresh": torch.tensor([0, 1])}, "fresh must be of bools"),
+        ({"fresh": torch.ones(3) > 0}, r"fresh must have shape \(2,\)"),
+        ({"values": {"p": freed(torch.ones(1, 3))}}, "values of p must have memory of its own"),
+    ],
+)
+def test_plans_that_cannot_be_are_refused_before_anything_changes(odd, text):
+    plan = {"num_rows": 4, "source": torch.tensor([0, 1]), "fresh": torch.tensor([False, True])}
+    value = torch.ones(4, 3)
+    adam = Adam({"p": value}, {"p": 0.1})
+    with pytest.raises(ValueError, match=text):
+        apply_rows(RowPlan(**{**plan, **odd}), adam, {})
+    assert adam.parameters["p"] is value

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from etsplat.core.precision import as_given
-from etsplat.core.validation import check_memory
+from etsplat.core.validation import check_floating, check_memory
 
 MAX_SIDE = 1 << 26
 """Pixels of the width or height of an image: with 16 samples in each they can still be numbered in 32 bits."""
@@ -32,8 +32,9 @@ class Cameras:
     height: int
 
     def __post_init__(self) -> None:
-        check_memory("viewmats", self.viewmats)
-        check_memory("Ks", self.Ks)
+        for name, tensor in (("viewmats", self.viewmats), ("Ks", self.Ks)):
+            check_memory(name, tensor)
+            check_floating(name, tensor)
         batch = self.viewmats.shape[0] if self.viewmats.ndim == 3 else -1
         if self.viewmats.shape != (batch, 4, 4):
             raise ValueError(f"viewmats must have shape (B, 4, 4), got {tuple(self.viewmats.shape)}")
@@ -65,9 +66,16 @@ class Cameras:
         return Cameras(torch.cat(viewmats), torch.cat(Ks), *sizes.pop())
 
     def scaled(self, factor: float) -> "Cameras":
-        """The same cameras with images ``factor`` times as large, rounded to whole pixels (at least one)."""
+        """The same cameras with images ``factor`` times as large, rounded to whole pixels (at least one).
+
+        Raises:
+            ValueError: ``factor`` is not positive and finite, or the images become too large.
+        """
+        if not 0.0 < factor < math.inf:
+            raise ValueError(f"factor must be positive and finite, got {factor}")
         width, height = max(1, round(self.width * factor)), max(1, round(self.height * factor))
-        ratio = self.Ks.new_tensor([width / self.width, height / self.height, 1.0])
+        ratios = [width / self.width, height / self.height, 1.0]
+        ratio = torch.tensor(ratios, dtype=self.Ks.dtype, device=self.Ks.device)
         return Cameras(self.viewmats, self.Ks * ratio[:, None], width, height)
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> "Cameras":
@@ -124,17 +132,19 @@ def look_at(
         (..., 4, 4) with OpenCV axes.
 
     Raises:
-        ValueError: ``eye`` coincides with ``target``, or ``up`` is parallel to the line of sight.
+        ValueError: A wrong shape or dtype; ``eye`` coincides with ``target``, or ``up`` is parallel to the line of
+            sight.
     """
-    for name, given in (("eye", eye), ("target", target), ("up", up)):
-        if name == "eye" or isinstance(given, Tensor):  # others may be tuples
-            check_memory(name, given)
-    forward = torch.as_tensor(target, dtype=eye.dtype, device=eye.device) - eye
+    check_memory("eye", eye)
+    check_floating("eye", eye)
+    if eye.shape[-1:] != (3,):
+        raise ValueError(f"eye must have shape (..., 3), got {tuple(eye.shape)}")
+    forward = _like_eye("target", target, eye) - eye
     distance = forward.norm(dim=-1, keepdim=True)
     if not bool((distance > 0).all()):
         raise ValueError("eye must differ from target")
     forward = forward / distance
-    up = torch.as_tensor(up, dtype=eye.dtype, device=eye.device).expand_as(forward)
+    up = _like_eye("up", up, eye).expand_as(forward)
     right = torch.linalg.cross(forward, up / up.norm(dim=-1, keepdim=True))
     length = right.norm(dim=-1, keepdim=True)
     if not bool((length > 1e-6).all()):
@@ -147,6 +157,22 @@ def look_at(
     viewmats[..., :3, 3] = -(rotation @ eye[..., None])[..., 0]
     viewmats[..., 3, 3] = 1.0
     return viewmats
+
+
+def _like_eye(name: str, given: Tensor | Sequence[float], eye: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*#batch 3"]:
+    """A tensor, or a tuple of numbers, in the precision and on the device of ``eye``."""
+    if isinstance(given, Tensor):
+        check_memory(name, given)
+    try:
+        points = torch.as_tensor(given, dtype=eye.dtype, device=eye.device)
+    except (TypeError, ValueError, RuntimeError) as error:  # torch's own, depending on what it is
+        raise ValueError(f"{name} must be a tensor or three numbers, got {given!r}") from error
+    fits = points.ndim <= eye.ndim and all(
+        n in (1, m) for n, m in zip(points.shape[::-1], eye.shape[::-1], strict=False)
+    )
+    if points.shape[-1:] != (3,) or not fits:
+        raise ValueError(f"{name} must have shape (3,) or that of eye, {tuple(eye.shape)}, got {tuple(points.shape)}")
+    return points
 
 
 def intrinsics(

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from numbers import Integral
 
 import numpy as np
 import torch
@@ -176,6 +177,33 @@ def check_intrinsics(name: str, Ks: Tensor) -> None:
     """Raise ValueError unless every matrix of ``Ks`` (B, 3, 3) is a pinhole camera without skew."""
     if any((k[0][1], k[1][0], *k[2]) != (0, 0, 0, 0, 1) for k in Ks.tolist()):
         raise ValueError(f"{name} must have the form [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]; skew is not supported")
+
+
+def check_flags(**values: object) -> None:
+    """Raise ValueError unless every value, named by its argument, is True or False."""
+    for name, value in values.items():
+        if not isinstance(value, bool):
+            raise ValueError(f"{name} must be True or False, got {value!r}")
+
+
+def check_count(name: str, value: object, *, least: int = 1, most: float = math.inf) -> None:
+    """Raise ValueError unless ``value`` is an integer, and no bool, from ``least`` to ``most``."""
+    if isinstance(value, bool) or not isinstance(value, Integral) or not least <= int(value) <= most:
+        bounds = f"of at least {least}" if most == math.inf else f"from {least} to {most}"
+        raise ValueError(f"{name} must be an integer {bounds}, got {value!r}")
+
+
+def check_floating(name: str, tensor: Tensor) -> None:
+    """Raise ValueError unless ``tensor``, which is one, is of floating-point numbers."""
+    if not tensor.is_floating_point():
+        raise ValueError(f"{name} must be of floating-point numbers, got {tensor.dtype}")
+
+
+def check_written(name: str, tensor: Tensor) -> None:
+    """`check_memory`, and ValueError where several elements share one place, of which only one could be kept."""
+    check_memory(name, tensor)
+    if any(size > 1 and step == 0 for size, step in zip(tensor.shape, tensor.stride(), strict=True)):
+        raise ValueError(f"{name} must have a place for each element, got an expanded tensor: pass {name}.clone()")
 
 
 def check_choice(name: str, value: object, choices: Sequence[object]) -> None:

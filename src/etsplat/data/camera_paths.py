@@ -8,8 +8,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from etsplat.core.cameras import camera_centers, look_at
+from etsplat.core.validation import check_count, check_finite, check_floating, check_shape
 
 Viewmats = Float[Tensor, "B 4 4"]
+
+MAX_FRAMES = 1_000_000
+"""Of a path, which is made as a whole."""
 
 
 def axes_meeting_point(viewmats: Viewmats, least: float = 1e-4) -> Float[Tensor, "3"] | None:
@@ -38,6 +42,7 @@ def focus_point(viewmats: Viewmats) -> Float[Tensor, "3"]:
 
 def orbit(viewmats: Viewmats, up: Float[Tensor, "3"], frames: int) -> Viewmats:
     """A circle around the focus at the cameras' median distance and mean height, looking at the focus."""
+    _check(viewmats, up, frames)
     focus, basis = focus_point(viewmats), _horizontal_basis(up)
     offsets = camera_centers(viewmats.double()) - focus
     flat = offsets @ basis.T
@@ -48,6 +53,7 @@ def orbit(viewmats: Viewmats, up: Float[Tensor, "3"], frames: int) -> Viewmats:
 
 def ellipse(viewmats: Viewmats, up: Float[Tensor, "3"], frames: int) -> Viewmats:
     """An ellipse through the outer cameras, along the main axes of where they stand, rising and sinking with them."""
+    _check(viewmats, up, frames)
     focus, centers, basis = focus_point(viewmats), camera_centers(viewmats.double()), _horizontal_basis(up)
     middle = centers.mean(dim=0)
     flat = (centers - middle) @ basis.T
@@ -63,6 +69,7 @@ def spiral(viewmats: Viewmats, up: Float[Tensor, "3"], frames: int) -> Viewmats:
 
     `up` is not used: it is the middle camera's own.
     """
+    _check(viewmats, up, frames)
     focus, centers = focus_point(viewmats), camera_centers(viewmats.double())
     offsets = centers - centers.mean(dim=0)
     middle = int(offsets.norm(dim=1).argmin())
@@ -79,6 +86,7 @@ def interpolated(viewmats: Viewmats, up: Float[Tensor, "3"], frames: int) -> Vie
 
     `up` is not used: orientations are the cameras' own.
     """
+    _check(viewmats, up, frames)
     centers, rotations = camera_centers(viewmats.double()), viewmats[:, :3, :3].double()
     count = len(viewmats)
     if count == 1:
@@ -104,7 +112,23 @@ PATHS: dict[str, Callable[[Viewmats, Float[Tensor, "3"], int], Viewmats]] = {
     "spiral": spiral,
     "interpolated": interpolated,
 }
-"""By name: (viewmats of the cameras, where up is, number of frames) to float64 viewmats of the path."""
+"""By name: (viewmats of the cameras, where up is, number of frames) to float64 viewmats of the path.
+
+They raise ValueError where an argument has a wrong shape, dtype, device or range; the message names it.
+"""
+
+
+def _check(viewmats: Tensor, up: Tensor, frames: int) -> None:
+    check_shape("viewmats", viewmats, ("B", 4, 4))
+    check_shape("up", up, (3,))
+    for name, tensor in (("viewmats", viewmats), ("up", up)):
+        check_floating(name, tensor)
+        if not tensor.is_cpu:
+            raise ValueError(f"{name} must be on the CPU, got {tensor.device}")
+        check_finite(name, tensor)
+    if len(viewmats) == 0:
+        raise ValueError("viewmats must hold at least one camera, got 0")
+    check_count("frames", frames, most=MAX_FRAMES)
 
 
 def _around(

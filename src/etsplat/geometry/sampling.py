@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from etsplat.core.validation import dense
+from etsplat.core.validation import check_indices, dense
 
 
 def sample_surface(
@@ -28,9 +28,10 @@ def sample_surface(
         Points (N, 3) float64 and the face of each (N,) int64, in random order.
 
     Raises:
-        ValueError: there is no area to draw from, or a vertex is not finite.
+        ValueError: there is no area to draw from, a vertex is not finite, or an index is out of range.
     """
     points, triangles = (dense(given, name).cpu() for name, given in (("vertices", vertices), ("faces", faces)))
+    check_indices("faces", triangles, len(points))
     corners = points.double().numpy()[triangles.numpy()]
     if len(corners) == 0 or not np.isfinite(corners).all():
         raise ValueError("vertices and faces must be a finite surface, got no faces, NaN or infinity")

@@ -16,7 +16,7 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from etsplat.core.errors import InputError
-from etsplat.core.validation import check_memory
+from etsplat.core.validation import check_device, check_memory
 from etsplat.io.paths import kind_of
 from etsplat.io.tensors import read_state_dict
 
@@ -54,9 +54,16 @@ def psnr(image: Float[Tensor, "H W C"], truth: Float[Tensor, "H W C"]) -> float:
 
 
 def silhouette_iou(coverage: Float[Tensor, "H W"], truth: Float[Tensor, "H W"]) -> float:
-    """Intersection over union of two silhouettes: pixels that are covered by at least half. 1 where both are empty."""
+    """Intersection over union of two silhouettes: pixels that are covered by at least half. 1 where both are empty.
+
+    Raises:
+        ValueError: shapes or devices differ.
+    """
     check_memory("coverage", coverage)
     check_memory("truth", truth)
+    check_device("truth", truth, "coverage", coverage)
+    if truth.shape != coverage.shape:
+        raise ValueError(f"truth must have the coverage's shape {tuple(coverage.shape)}, got {tuple(truth.shape)}")
     ours, theirs = coverage >= 0.5, truth >= 0.5
     union = int((ours | theirs).sum())
     return int((ours & theirs).sum()) / union if union else 1.0
@@ -226,6 +233,7 @@ def find_lpips_weights(option: Path | str | None = None) -> LpipsWeights:
 def _check_pair(image: Tensor, truth: Tensor) -> None:
     check_memory("image", image)
     check_memory("truth", truth)
+    check_device("truth", truth, "image", image)
     if image.ndim != 3:
         raise ValueError(f"image: expected shape (H, W, C), got {tuple(image.shape)}")
     if image.shape != truth.shape:

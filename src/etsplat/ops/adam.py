@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from etsplat.core.validation import check_like, check_shape, dense
+from etsplat.core.validation import check_like, check_shape, check_written, dense
 from etsplat.engines.choice import engine_for, queued_steps
 from etsplat.engines.engine import Engine
 from etsplat.engines.reference.steps import AdamGroup, step_rates
@@ -50,7 +50,8 @@ class Adam:
             eps: At least 0.
 
         Raises:
-            ValueError: Names that do not match, or a number out of its range.
+            ValueError: Names that do not match, a number out of its range, or a parameter that is no tensor with
+                a place in memory for each element.
         """
         if set(parameters) != set(learning_rates):
             raise ValueError(f"learning_rates must name {sorted(parameters)}, got {sorted(learning_rates)}")
@@ -58,6 +59,8 @@ class Adam:
             raise ValueError(f"betas must be in [0, 1), got {betas}")
         if eps < 0:
             raise ValueError(f"eps must be at least 0, got {eps}")
+        for name, parameter in parameters.items():
+            check_written(f"parameters[{name}]", parameter)
         self.parameters = dict(parameters)
         self.learning_rates = dict(learning_rates)
         self.betas = betas
@@ -71,10 +74,11 @@ class Adam:
         """Update every parameter from its gradient.
 
         Raises:
-            ValueError: A parameter without gradient; nothing is updated then.
+            ValueError: A parameter without gradient or without a place for each element; nothing is updated then.
         """
         together: dict[Engine, list[str]] = {}
         for name, parameter in self.parameters.items():
+            check_written(f"parameters[{name}]", parameter)  # `data` may have been set since
             if parameter.grad is None:
                 raise ValueError(f"parameter {name} has no gradient: call backward() before step()")
             together.setdefault(engine_for(parameter), []).append(name)
@@ -97,10 +101,11 @@ class Adam:
         """Put another tensor, with its moments, in the place of a parameter (structural edits only).
 
         Raises:
-            ValueError: An unknown name, or moments that do not fit the parameter.
+            ValueError: An unknown name, a parameter that cannot be written, or moments that do not fit it.
         """
         if name not in self.parameters:
             raise ValueError(f"name must be one of {sorted(self.parameters)}, got {name!r}")
+        check_written("parameter", parameter)
         for moment_name, moment in (("first", first), ("second", second)):
             check_shape(moment_name, moment, tuple(parameter.shape))
             check_like(moment_name, moment, "parameter", parameter)

@@ -26,6 +26,7 @@ from etsplat.core.validation import (
     check_choice,
     check_device,
     check_finite,
+    check_flags,
     check_indices,
     check_intrinsics,
     check_like,
@@ -35,6 +36,7 @@ from etsplat.core.validation import (
 from etsplat.engines.choice import engine_for
 
 COLORS = ("face_colors", "vertex_colors", "corner_colors")
+OPTIONAL = (*COLORS, "backgrounds")
 LARGEST_COLOR = 1e30  # beyond, the gradients of the triangles around overflow
 
 
@@ -134,7 +136,9 @@ def rasterize(
     )
     # Looking at values on a GPU would mean to wait for it.
     look = validate or (validate is None and vertices.is_cpu)
-    given = {name: tensor for name, tensor in tensors._asdict().items() if tensor is not None and name != "faces"}
+    named = tensors._asdict()
+    left_out = {"faces", *(name for name in OPTIONAL if named[name] is None)}
+    given = {name: tensor for name, tensor in named.items() if name not in left_out}
     _check_tensors(given, faces, look)
     if look:
         _check_values(given)
@@ -165,6 +169,7 @@ def _check_settings(settings: RasterizeSettings) -> None:
             raise ValueError(f"{name} must be a positive integer, got {size!r}")
         if size > MAX_SIDE:
             raise ValueError(f"{name} must be at most {MAX_SIDE}, got {size}")
+    check_flags(freeze_inradius=settings.freeze_inradius)
     check_choice("kernel", settings.kernel, list(KERNELS))
     check_choice("distance", settings.distance, DISTANCES)
     check_choice("depth_of", settings.depth_of, DEPTHS)

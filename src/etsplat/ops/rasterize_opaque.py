@@ -12,7 +12,15 @@ from torch import Tensor
 
 from etsplat.core.cameras import Cameras, view_arguments
 from etsplat.core.rasterization import OpaqueView, Rasterization
-from etsplat.core.validation import check_device, check_indices, check_intrinsics, check_like, check_shape, dense
+from etsplat.core.validation import (
+    check_device,
+    check_flags,
+    check_indices,
+    check_intrinsics,
+    check_like,
+    check_shape,
+    dense,
+)
 from etsplat.engines.choice import engine_for
 from etsplat.ops.rasterize import one_kind_of_colors
 
@@ -119,6 +127,7 @@ def render_opaque(
     if colors.ndim == 3:  # every corner a vertex of its own
         points, colors = points[triangles.long()].view(-1, 3), colors.view(3 * count, -1)
         triangles = _separate(points)
+    check_flags(cull_backfaces=cull_backfaces)
     if not 1 <= supersampling <= MAX_SUPERSAMPLING:
         raise ValueError(f"supersampling must be from 1 to {MAX_SUPERSAMPLING}, got {supersampling}")
     image = vertices.new_empty((len(views), views.height, views.width, colors.shape[1] + 1))

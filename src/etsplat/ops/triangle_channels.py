@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from etsplat.core.precision import as_given
-from etsplat.core.validation import check_like, check_shape
+from etsplat.core.validation import check_flags, check_like, check_shape
 from etsplat.engines.choice import engine_for
 
 
@@ -31,11 +31,12 @@ def triangle_channels(
         (B, N, D), D from 1 to 4. Gradients reach corners, and through the depth viewmats.
 
     Raises:
-        ValueError: Wrong shape, dtype or device, or nothing is wanted.
+        ValueError: Wrong shape, dtype or device, or nothing is wanted; the message names the argument.
     """
     check_shape("corners", corners, ("N", 3, 3))
     check_shape("viewmats", viewmats, ("B", 4, 4))
     check_like("viewmats", viewmats, "corners", corners)
+    check_flags(depth=depth, normals=normals)
     if not (depth or normals):
         raise ValueError("depth and normals must not both be False")
     return engine_for(corners).triangle_channels(corners, viewmats, depth, normals)

@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
+from etsplat.core.validation import check_indices, check_memory, check_shape
 from etsplat.geometry.subdivision import SubdivisionPlan
 from etsplat.ops.adam import Adam
 
@@ -52,6 +53,7 @@ def apply_subdivision(
         tensor = adam.parameters.get(name, statistics.get(name))
         if tensor is None:
             raise ValueError(f"per_vertex and per_face must name parameters or statistics, got {name!r}")
+        check_memory(name, tensor)
         if tensor.ndim == 0 or len(tensor) != count:
             raise ValueError(f"{name} must have {count} rows as the plan, got shape {tuple(tensor.shape)}")
     if missing := set(statistics) - set(carry):
@@ -78,7 +80,12 @@ class RowPlan:
 
     @staticmethod
     def keeping(kept: Bool[Tensor, " N"]) -> "RowPlan":
-        """The plan that removes all other rows."""
+        """The plan that removes all other rows.
+
+        Raises:
+            ValueError: another shape or dtype.
+        """
+        _check_flags_of_rows("kept", kept, "N")
         source = kept.nonzero()[:, 0]
         return RowPlan(len(kept), source, torch.zeros(len(source), dtype=torch.bool, device=kept.device))
 
@@ -100,13 +107,18 @@ def apply_rows(
         ValueError: a tensor does not have the plan's number of rows, or values do not fit. Nothing has been changed
             then.
     """
+    check_shape("source", plan.source, ("M",))
+    check_indices("source", plan.source, plan.num_rows)
+    _check_flags_of_rows("fresh", plan.fresh, len(plan.source))
     for name, tensor in [*adam.parameters.items(), *statistics.items()]:
+        check_memory(name, tensor)
         if tensor.ndim == 0 or len(tensor) != plan.num_rows:
             raise ValueError(f"{name} must have {plan.num_rows} rows as the plan, got shape {tuple(tensor.shape)}")
     count = int(plan.fresh.sum())
     for name, values in plan.values.items():
         if name not in adam.parameters:
             raise ValueError(f"values must name parameters, got {name!r}")
+        check_memory(f"values of {name}", values)
         expected = (count, *adam.parameters[name].shape[1:])
         if tuple(values.shape) != expected:
             raise ValueError(f"values of {name} must have shape {expected}, got {tuple(values.shape)}")
@@ -127,6 +139,12 @@ def apply_rows(
 
     parameters = {name: _carry(name, set_values(name), start_at_zero, adam, {}) for name in list(adam.parameters)}
     return parameters, {name: start_at_zero(tensor) for name, tensor in statistics.items()}
+
+
+def _check_flags_of_rows(name: str, flags: Tensor, rows: str | int) -> None:
+    check_shape(name, flags, (rows,))
+    if flags.dtype != torch.bool:
+        raise ValueError(f"{name} must be of bools, got {flags.dtype}")
 
 
 @torch.no_grad()
