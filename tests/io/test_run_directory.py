@@ -68,11 +68,57 @@ def test_files_of_a_run_that_are_damaged_are_named(tmp_path: Path, text: str) ->
             read()
         assert_one_line(error, str(path), "JSON")
     assert not is_run(run.path)
-    if text != "[1]":  # which is a line
-        run.history_path.write_bytes(text.encode() + b"\xff\n")
+    run.history_path.write_bytes(text.encode() + b"\xff\n")
+    with pytest.raises(InputError) as error:
+        run.read_history()
+    assert_one_line(error, str(run.history_path), "damaged")
+
+
+@pytest.mark.parametrize(
+    ("entry", "value", "words"),
+    [
+        ("task", ["train"], ("`task` is", "must be a text")),
+        ("task", None, ("`task` is null",)),
+        ("iterations", 1.5, ("`iterations` is 1.5", "a whole number")),
+        ("iterations", True, ("`iterations` is true",)),
+        ("iterations", 10**400, ("`iterations` is 1000",)),
+        ("config", [], ("`config` is []", "an object")),
+        ("paths", "scene", ("`paths` is", "an object")),
+        ("paths", {"source": 5}, ("`paths.source` is 5", "a text or null")),
+        ("paths", {"masks": {}}, ("`paths.masks`",)),
+        ("paths", {}, ("lacks `paths.source`",)),
+    ],
+)
+def test_a_config_with_values_of_other_types_is_named(
+    tmp_path: Path, entry: str, value: object, words: tuple[str, ...]
+) -> None:
+    """Whoever reads it may rely on what it asked for."""
+    record = {**CONFIG, "iterations": 10, "paths": {"source": None}}
+    run = RunDirectory.create(tmp_path / "run", record)
+    assert run.read_config("paths.source") == {"format": run_directory.FORMAT, **record}
+    run.config_path.write_text(json.dumps({"format": run_directory.FORMAT, **record, entry: value}))
+    with pytest.raises(InputError) as error:
+        run.read_config("paths.source")
+    assert_one_line(error, str(run.config_path), "run again", *words)
+
+
+@pytest.mark.parametrize(
+    ("lines", "problem"),
+    [
+        ("[1]\n", "line 1: holds no JSON object"),
+        ('{"iteration": 1}\n{"loss": 1}\n', "line 2: lacks `iteration`"),
+        ('{"iteration": "1"}\n', 'line 1: `iteration` is "1", but must be a whole number'),
+        ('{"iteration": 2}\n{"iteration": 2}\n', "line 2: its iteration is not after"),
+    ],
+)
+def test_a_history_without_increasing_iterations_is_damaged(tmp_path: Path, lines: str, problem: str) -> None:
+    run = RunDirectory.create(tmp_path / "run", CONFIG)
+    run.history_path.write_text(lines)
+    for read in (run.read_history, lambda: run.truncate_history(1)):
         with pytest.raises(InputError) as error:
-            run.read_history()
-        assert_one_line(error, str(run.history_path), "damaged")
+            read()
+        assert_one_line(error, str(run.history_path), problem, "delete the file")
+    assert run.history_path.read_text() == lines
 
 
 def test_an_empty_folder_is_used(tmp_path: Path) -> None:

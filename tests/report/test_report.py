@@ -19,7 +19,7 @@ from etsplat.cli.runs import Train
 from etsplat.core.errors import InputError
 from etsplat.geometry.icosphere import icosphere
 from etsplat.io.mesh_files import save_mesh
-from etsplat.io.run_directory import RunDirectory
+from etsplat.io.run_directory import FORMAT, RunDirectory
 from etsplat.report import write_report
 from etsplat.report.command import reproduce_command
 from etsplat.report.curves import (
@@ -186,6 +186,76 @@ def test_unfinished_or_foreign_folder_is_an_input_error(tmp_path: Path, run_dir:
     (run_dir / "metrics.json").unlink()
     with pytest.raises(InputError, match="has not finished; continue it with --resume"):
         write_report(run_dir)
+
+
+@pytest.mark.parametrize(
+    ("file", "entry", "value"),
+    [
+        ("config.json", "task", "fit"),
+        ("config.json", "task", {}),
+        ("config.json", "config", 5),
+        ("config.json", "config", {}),
+        ("config.json", "config", {"preset": ["quick"]}),
+        ("config.json", "config", {"preset": "splendid"}),
+        ("config.json", "paths", {"source": 1}),
+        ("config.json", "paths", {}),
+        ("config.json", "source", None),
+        ("config.json", "versions", {"etsplat": 1}),
+        ("metrics.json", "versions", ["0.1.0"]),
+        ("metrics.json", "faces", None),
+        ("metrics.json", "faces", "5120"),
+        ("metrics.json", "psnr", "high"),
+        ("metrics.json", "psnr", [1.0]),
+        ("metrics.json", "chamfer_floor", {}),
+        ("metrics.json", "seconds", math.nan),
+        ("metrics.json", "seconds", 10**400),
+        ("metrics.json", "lpips_reason", 3),
+        ("evaluation.json", "engine", None),
+        ("evaluation.json", "threads", "4"),
+        ("history.jsonl", "iteration", None),
+    ],
+)
+def test_a_damaged_run_is_named(tmp_path: Path, file: str, entry: str, value: object) -> None:
+    """In one line with the file, or the folder of another kind of run, and what to do; no page is written."""
+    run_dir = write_run(tmp_path / "run", views=0, steps=2)
+    said = {"config.json": {"format": FORMAT, **CONFIG}, "metrics.json": METRICS}.get(file, {})
+    (run_dir / file).write_text(json.dumps({**said, entry: value}) + "\n")
+    with pytest.raises(InputError) as error:
+        write_report(run_dir)
+    assert str(error.value).startswith(str(run_dir if value == "fit" else run_dir / file))
+    assert "; " in str(error.value)
+    assert "\n" not in str(error.value)
+    assert not (run_dir / "report.html").exists()
+
+
+@pytest.mark.parametrize("needed", ["faces", "iterations", "seconds", "engine", "seed", "versions"])
+def test_metrics_without_what_every_run_has_are_refused(tmp_path: Path, needed: str) -> None:
+    run_dir = write_run(tmp_path / "run", views=0, steps=2)
+    (run_dir / "metrics.json").write_text(json.dumps({key: METRICS[key] for key in METRICS if key != needed}))
+    with pytest.raises(InputError, match=f"metrics.json: lacks `{needed}`; delete it and run again"):
+        write_report(run_dir)
+
+
+def test_odd_values_in_the_history_are_left_out_of_the_curves(tmp_path: Path) -> None:
+    """Only numbers are points; where a band or a floor goes below zero, no logarithm is taken of it."""
+    folder = write_soup_run(tmp_path / "run")
+    run = RunDirectory(folder)
+    odd = ["1", True, None, [1], math.nan, math.inf, 10**400, 1e300]
+    for place, value in enumerate(odd):
+        run.append_history({"iteration": 1000 + place, "loss": value})
+    run.append_history({"iteration": 2000, "loss": 1e-320, "sigma": 0.1, "sigma_10": 0.1, "sigma_90": -1})
+    write_report(folder)
+    curves = {curve.quantity.key: curve for curve in curves_of(read_run(folder))}
+    assert len(curves["loss"].x) == 30
+    assert not curves["sigma"].logarithmic
+
+
+def test_a_path_that_is_no_text_has_a_page(tmp_path: Path) -> None:
+    """As of a file system whose names are bytes."""
+    run_dir = write_run(tmp_path / "run", views=0, steps=2)
+    record = {"format": FORMAT, **CONFIG, "paths": {"source": "b\udcffnny.ply", "init_mesh": None}}
+    (run_dir / "config.json").write_text(json.dumps(record))
+    assert "b?nny.ply" in write_report(run_dir).read_text(encoding="utf-8")
 
 
 def test_long_history_is_thinned(tmp_path: Path) -> None:

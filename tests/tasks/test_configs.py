@@ -162,6 +162,10 @@ def test_a_part_of_the_settings_is_enough(tmp_path: Path) -> None:
         ('{"start": {"opacity": 2}}', r"start\.opacity: is 2\.0; it must be between 0\.01 and 0\.999"),
         ('{"regularization": {"edge_power": 3}}', r"edge_power: is 3; choose one of 1, 2"),
         ('{"preset": "huge"}', r"preset: is 'huge'; choose one of best, paper"),
+        ('{"preset": ["quick"]}', r"preset: is \['quick'\]; choose one of best, paper"),
+        ('{"preset": {}, "iterations": 3}', r"preset: is \{\}; choose one of"),
+        ('{"method": ["elastic"]}', r"method: is \['elastic'\]; choose one of"),
+        ('{"seed": [1]}', r"seed: is \[1\]; it must be a whole number"),
         ('{"refinement": {"first": 0.7}}', r"refinement\.first: is after refinement\.last; make it smaller"),
         ('{"iterations": ', r"is not JSON"),
         ("[" * 100_000, r"is not JSON \(nested too deep\)"),
@@ -184,6 +188,14 @@ def test_files_that_cannot_be_used_are_named_with_what_is_wrong(tmp_path: Path, 
         ReconstructConfig.from_file(path)
     assert str(error.value).startswith(str(path))
     assert "\n" not in str(error.value)
+
+
+def test_labels_that_no_table_can_be_asked_for_are_refused() -> None:
+    """From Python as from a file."""
+    for wrong in ({"preset": []}, {"scene_type": ["indoor"]}):
+        for make in (TRAIN.changed, TrainConfig.based_on, lambda changes: replace(TRAIN, **changes)):
+            with pytest.raises(InputError, match=f"{next(iter(wrong))}: is \\["):
+                make(wrong)
 
 
 def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """What comes after training finds the run's soup and the very photos that it was trained on."""
 
+import json
 import shutil
 
 import pytest
@@ -63,6 +64,31 @@ def test_a_scene_that_moved_is_named_with_an_option(trained, tmp_path):
     assert len(open_run(tmp_path / "run", tmp_path / "moved").capture) == 9
     with pytest.raises(InputError, match=r"scene .*/mover: no such folder; did you mean .*/moved\?"):
         open_run(tmp_path / "run", tmp_path / "mover")
+
+
+@pytest.mark.parametrize(
+    ("group", "name", "value", "message"),
+    [
+        ("config", "width", "800", "width: is '800'; it must be a whole number"),
+        ("config", "width", -5, "width: is -5; it must be between 1 and 16384"),
+        ("paths", "source", 5, "`paths.source` is 5, but must be a text or null"),
+        ("paths", "images", ["images_2"], "`paths.images` is"),
+        ("paths", "source", ..., "lacks `paths.source`"),
+        ("config", "width", ..., "lacks `config.width`"),
+    ],
+)
+def test_a_run_whose_config_is_damaged_is_named(tmp_path, trained, group, name, value, message):
+    shutil.copytree(trained[0] / "run", tmp_path / "run")
+    config = tmp_path / "run" / "config.json"
+    record = json.loads(config.read_text())
+    record[group][name] = value
+    if value is ...:
+        del record[group][name]
+    config.write_text(json.dumps(record))
+    with pytest.raises(InputError) as error:
+        open_run(tmp_path / "run", trained[0] / "scene")
+    assert str(error.value).startswith(f"{config}: ")
+    assert message in str(error.value)
 
 
 def test_a_run_is_no_scene(trained):

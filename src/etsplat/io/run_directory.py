@@ -18,7 +18,7 @@ from typing import Any
 
 from etsplat.core.errors import InputError
 from etsplat.io.atomic import atomic_write, write_error
-from etsplat.io.json_text import parse_json
+from etsplat.io.json_text import as_json, check_entries, entries_problem, json_differences, parse_json
 from etsplat.io.locks import RUN_LOCK
 
 FORMAT = "etsplat run 1"
@@ -86,6 +86,21 @@ _FILES = (
     "config.json",
 )
 _FOLDERS = ("test", "checkpoints", "tensorboard")
+
+_CONFIG_KINDS: dict[str, Any] = {
+    "task": str,
+    "config": dict,
+    "iterations": int,
+    "source": dict,
+    "paths": dict,
+    "paths.source": str | None,
+    "paths.init_mesh": str | None,
+    "paths.images": str | None,
+    "paths.masks": str | None,
+    "versions": dict,
+    "versions.etsplat": str,
+}
+"""What config.json holds. Only the task is in every one: `Trainer.fit` records what its caller says."""
 
 
 @dataclass(frozen=True)
@@ -204,7 +219,7 @@ class RunDirectory:
         run = cls(path)
         stored = run.read_config()
         for section in ("task", "config", "source"):
-            differences = _differences(stored.get(section), _as_json(config.get(section)))
+            differences = json_differences(stored.get(section), as_json(config.get(section)))
             if differences:
                 raise InputError(
                     f"{path}: was started with {'; '.join(differences)}; resume with the same, or choose another folder"
@@ -213,13 +228,24 @@ class RunDirectory:
         run._furnish(stored["task"])
         return run
 
-    def read_config(self) -> dict[str, Any]:
+    def read_config(self, *needed: str) -> dict[str, Any]:
         """What config.json holds.
 
+        Args:
+            needed: dotted names of entries that it must have, beside "task". Whatever is there has the right type.
+
         Raises:
-            InputError: it is missing or not JSON.
+            InputError: it is missing, not JSON, or has not what it must.
         """
-        return _read_json(self.config_path)
+        found = _read_json(self.config_path)
+        check_entries(self.config_path, found, _CONFIG_KINDS)
+        for name in ("task", *needed):
+            if entries_problem(found, {name: object}, [name]):
+                raise InputError(
+                    f"{self.config_path}: an earlier version of etsplat wrote it, it lacks `{name}`; "
+                    "remove the folder and run again"
+                )
+        return found
 
     def read_iterations(self) -> int:
         """How many iterations the run will have had when it is done.
@@ -227,13 +253,7 @@ class RunDirectory:
         Raises:
             InputError: config.json is missing, or does not say, as those of the first days did not.
         """
-        config = self.read_config()
-        if "iterations" not in config:
-            raise InputError(
-                f"{self.config_path}: an earlier version of etsplat wrote it, it lacks `iterations`; "
-                "remove the folder and run again"
-            )
-        return config["iterations"]
+        return self.read_config("iterations")["iterations"]
 
     def read_metrics(self) -> dict[str, Any]:
         """What metrics.json holds.
@@ -261,14 +281,29 @@ class RunDirectory:
             file.write(json.dumps(line) + "\n")
 
     def read_history(self) -> list[dict[str, Any]]:
-        """The lines of history.jsonl; empty if there is none yet. A last line that a kill cut short is left out."""
+        """The lines of history.jsonl; empty if there is none yet. A last line that a kill cut short is left out.
+
+        Each has its "iteration", which increases from line to line; what else it says may be anything.
+
+        Raises:
+            InputError: the file is damaged.
+        """
         try:
             text = self.history_path.read_text(encoding="utf-8")
-            return [parse_json(line) for line in text.split("\n")[:-1]]  # what follows the last \n is cut short
+            lines = [parse_json(line) for line in text.split("\n")[:-1]]  # what follows the last \n is cut short
         except FileNotFoundError:
             return []
         except ValueError as error:
             raise InputError(f"{self.history_path}: is damaged ({error}); delete the file") from error
+        before = -1
+        for number, line in enumerate(lines, 1):
+            problem = entries_problem(line, {"iteration": int}, ["iteration"])
+            if not problem and line["iteration"] <= before:
+                problem = "its iteration is not after that of the line before"
+            if problem:
+                raise InputError(f"{self.history_path}: is damaged (line {number}: {problem}); delete the file")
+            before = line["iteration"]
+        return lines
 
     def truncate_history(self, iteration: int) -> None:
         """Keeps only the lines up to an iteration: what came after the checkpoint will be done again."""
@@ -356,22 +391,3 @@ def _null_if_not_finite(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_null_if_not_finite(entry) for entry in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def _as_json(value: object) -> Any:
-    return json.loads(json.dumps(value))
-
-
-def _differences(stored: Any, given: Any) -> list[str]:
-    """What differs, as "key=stored (not given)"."""
-    if not isinstance(stored, dict) or not isinstance(given, dict):
-        return [] if stored == given else [f"{stored} (not {given})"]
-    keys = [*stored, *(key for key in given if key not in stored)]
-    found = []
-    for key in keys:
-        before, now = stored.get(key), given.get(key)
-        if isinstance(before, dict) and isinstance(now, dict):
-            found += [f"{key}.{difference}" for difference in _differences(before, now)]
-        elif before != now:
-            found.append(f"{key}={before} (not {now})")
-    return found

@@ -18,7 +18,7 @@ def reproduce_command(config: dict[str, Any], version: str) -> str | None:
         version: of this etsplat. Settings that the preset implies are left out if the run was made with the same.
     """
     settings, paths, same = config["config"], config["paths"], config["versions"]["etsplat"] == version
-    if paths["source"] is None or (paths.get("init_mesh", "") is None and config["source"]["init_mesh"]):
+    if paths["source"] is None or (paths.get("init_mesh", "") is None and config["source"].get("init_mesh")):
         return None
     kind = CONFIGS[config["task"]]
     implied = flatten(kind.based_on(settings).to_dict())

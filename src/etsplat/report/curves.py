@@ -1,6 +1,7 @@
 """Convergence curves: which quantities are shown and how, thinned for display; drawn as inline SVG, and as one PNG."""
 
 import math
+import sys
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
@@ -58,7 +59,7 @@ class Curve:
     @property
     def logarithmic(self) -> bool:
         """A logarithmic axis where asked for and possible."""
-        return self.quantity.logarithmic and min(self.low) > 0
+        return self.quantity.logarithmic and min(*self.low, *self.mean, *self.high) > 0
 
 
 def curves_of(run: Run) -> list[Curve]:
@@ -73,7 +74,9 @@ def curves_of(run: Run) -> list[Curve]:
                 (_, lower), (_, upper) = (run.series(key) for key in quantity.band)
                 if len(lower) == len(upper) == len(y):
                     low, high = _thin(lower, lower)[2], _thin(upper, upper)[3]
-            curves.append(Curve(quantity, x, mean, low, high, floor=quantity.scale * floor if floor else None))
+            curves.append(
+                Curve(quantity, x, mean, low, high, floor=quantity.scale * floor if floor and floor > 0 else None)
+            )
     return curves
 
 
@@ -117,7 +120,7 @@ def draw_svg(curve: Curve) -> str:
 def linear_ticks(low: float, high: float, count: int = 5) -> list[float]:
     """Round values, about `count`, that cover [low, high]."""
     span = (high - low) or abs(high) or 1.0
-    raw = span / max(count - 1, 1)
+    raw = max(span / max(count - 1, 1), sys.float_info.min)
     unit = 10.0 ** math.floor(math.log10(raw))
     step = next(factor * unit for factor in (1, 2, 2.5, 5, 10) if factor * unit >= raw * (1 - 1e-9))
     first, last = math.floor(low / step + 1e-9), math.ceil(high / step - 1e-9)

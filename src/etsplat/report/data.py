@@ -1,13 +1,42 @@
 """What a run directory says, read once for all pages and pictures of the report."""
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from etsplat.core.errors import InputError
+from etsplat.io.json_text import check_entries, is_number
 from etsplat.io.overview import TestView, find_test_views
 from etsplat.io.run_directory import RunDirectory, is_run
+from etsplat.report.command import CONFIGS
+from etsplat.tasks.sources import read_record
+
+_NEEDED: dict[str, Any] = {
+    "iterations": int,
+    "seconds": float,
+    "seconds_per_iteration": float,
+    "engine": str,
+    "method": str,
+    "preset": str,
+    "seed": int,
+    "versions": dict,
+}
+_COUNTS = {"reconstruct": "faces", "train": "triangles"}
+"""What the result has so many of, by task."""
+
+_MEASURED = (
+    *("psnr", "ssim", "lpips", "lpips_3dgs", "psnr_mesh", "psnr_opaque", "silhouette_iou"),
+    *("chamfer", "chamfer_floor", "chamfer_exact", "f_score", "fps", "ms_per_million"),
+    *("sigma", "sigma_10", "sigma_90", "opacity", "opacity_10", "opacity_90"),
+)
+"""Numbers that may be missing, or null, where they were not measured."""
+
+_OPTIONAL: dict[str, Any] = {
+    **dict.fromkeys(_MEASURED, float | None),
+    **dict.fromkeys(("vertices", "degenerate_faces", "self_intersections"), int | None),
+    "lpips_reason": str | None,
+    "threads": int,
+}
 
 
 @dataclass(frozen=True)
@@ -36,8 +65,8 @@ class Run:
         return self.config["task"]
 
     def series(self, key: str) -> tuple[list[float], list[float]]:
-        """Iterations and values of the history records that have a finite `key`."""
-        points = [(row["iteration"], row[key]) for row in self.history if _is_finite(row.get(key))]
+        """Iterations and values of the history records whose `key` is a number."""
+        points = [(float(row["iteration"]), float(row[key])) for row in self.history if is_number(row.get(key))]
         return [x for x, _ in points], [y for _, y in points]
 
 
@@ -51,19 +80,23 @@ def read_run(run_dir: Path | str) -> Run:
     directory = RunDirectory(folder)
     if not is_run(folder):
         raise InputError(f"{folder}: is not a run of etsplat; name a folder that was given to --out")
-    config = directory.read_config()
-    mesh = directory.mesh_path(".ply") if config["task"] == "reconstruct" else None
+    task = directory.read_config()["task"]
+    if task not in _COUNTS:
+        raise InputError(f"{folder}: is a run without a report; name one of `etsplat reconstruct` or `etsplat train`")
+    mesh = directory.mesh_path(".ply") if task == "reconstruct" else None
     if not directory.metrics_path.is_file() or not (mesh or directory.soup_path).is_file():
         raise InputError(f"{folder}: this run has not finished; continue it with --resume")
+    kind = CONFIGS[task]
+    config = read_record(directory, kind, kind.LABELS, "source", "paths.source", "versions.etsplat")
+    metrics, evaluation = directory.read_metrics(), directory.read_evaluation()
+    needed = {**_NEEDED, _COUNTS[task]: int}
+    check_entries(directory.metrics_path, metrics, {**needed, **_OPTIONAL}, needed)
+    check_entries(directory.evaluation_path, evaluation, {**needed, **_OPTIONAL})
     return Run(
         folder=folder,
         config=config,
-        metrics={**directory.read_metrics(), **directory.read_evaluation()},
+        metrics={**metrics, **evaluation},
         history=directory.read_history(),
         views=find_test_views(directory.test, "opaque" if mesh is None else "mesh"),
         mesh=mesh,
     )
-
-
-def _is_finite(value: object) -> bool:
-    return isinstance(value, int | float) and math.isfinite(value)

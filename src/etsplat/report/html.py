@@ -50,7 +50,8 @@ def write_report(run_dir: Path | str) -> Path:
             draw_overview(run.views, "opaque" if run.mesh is None else "mesh").save(temporary)
     path = run.folder / "report.html"
     with atomic_write(path) as temporary:
-        temporary.write_text(render_page(run), encoding="utf-8")
+        # A path on Linux may have bytes that are no text.
+        temporary.write_text(render_page(run), encoding="utf-8", errors="replace")
     return path
 
 

@@ -119,6 +119,12 @@ class Setting:
                 return f"it must be at most {_LARGEST[self.kind]:g}"
         return None
 
+    def check(self, name: str, value: Any) -> None:
+        """Raises InputError where there is a problem with a value."""
+        if problem := self.problem(value):
+            shown = repr(value) if isinstance(value, str) or self.choices else value
+            raise InputError(f"{name}: is {shown}; {problem}")
+
     def read(self, text: str) -> Any:
         """The value that a text stands for; the text itself if it stands for none, of which `problem` complains."""
         if self.optional and text.lower() == "none":
@@ -151,15 +157,16 @@ class Settings:
         return object.__new__(cls)
 
     def __post_init__(self) -> None:
-        implied = self.implied_by(*(getattr(self, name) for name in self.LABELS))
-        for name, setting in settings_of(type(self)).items():
+        known = settings_of(type(self))
+        for name, setting in known.items():
             value = get(self, name)
             if isinstance(value, str) and value not in setting.choices and "." not in name:
                 value = value.replace("_", "-")  # single_sided, as the rasterizer has it
                 object.__setattr__(self, name, value)
-            if problem := setting.problem(value):
-                shown = repr(value) if isinstance(value, str) or setting.choices else value
-                raise InputError(f"{name}: is {shown}; {problem}")
+            setting.check(name, value)
+        implied = self.implied_by(*(getattr(self, name) for name in self.LABELS))
+        for name, setting in known.items():
+            value = get(self, name)
             untouched = value in (setting.default, implied.get(name, setting.default))
             if setting.only and not untouched and not setting.only.holds(self):
                 raise InputError(f"{name}: has an effect only {setting.only.text}; leave it out, or change that")
@@ -175,6 +182,8 @@ class Settings:
         """
         labels += tuple(getattr(cls, name) for name in cls.LABELS[len(labels) :])
         named = dict(zip(cls.LABELS, labels, strict=True))
+        for name, label in named.items():
+            settings_of(cls)[name].check(name, label)
         return _replaced(cls(), {**cls.implied_by(*labels), **named}, "")
 
     @classmethod

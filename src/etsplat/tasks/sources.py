@@ -4,9 +4,10 @@ A `SoupRun` is what every command that comes after training starts from.
 """
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -29,6 +30,8 @@ from etsplat.model.soup_import import open_soup
 from etsplat.model.triangle_mesh import MeshAppearance, TriangleMesh
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.tasks.reconstruct_config import ReconstructConfig
+from etsplat.tasks.settings import Settings, settings_of
+from etsplat.tasks.train_config import TrainConfig
 
 Source = str | Path | MeshFile | Dataset
 
@@ -243,6 +246,28 @@ def check_trains(run: Path) -> None:
         raise InputError(f"{run}: is no run of `etsplat train`; name another")
 
 
+def read_record(run: RunDirectory, kind: type[Settings], names: Iterable[str], *needed: str) -> dict[str, Any]:
+    """A run's config.json, from which only some settings are used: so it may be of a version that had other ones.
+
+    Args:
+        run: of `kind`.
+        kind: declares the settings.
+        names: of the settings that are used; they must be there, with values that they may have.
+        needed: what else config.json must have, as of `RunDirectory.read_config`.
+
+    Raises:
+        InputError: it has not.
+    """
+    names = tuple(names)
+    record = run.read_config(*needed, "config", *(f"config.{name}" for name in names))
+    try:
+        for name in names:
+            settings_of(kind)[name].check(name, record["config"][name])
+    except InputError as error:
+        raise InputError(f"{run.config_path}: {error}") from error
+    return record
+
+
 def world_up(viewmats: Float[Tensor, "B 4 4"]) -> Float[Tensor, "3"] | None:
     """Where up is in the world: the mean of the cameras' own up directions; None if they contradict each other."""
     up = -viewmats[:, 1, :3].double().mean(dim=0)
@@ -266,14 +291,13 @@ def _open_directory(path: Path, scene: Path | str | None, device: torch.device) 
             f"{path}: has no {run.soup_path.name} (yet); name a run of `etsplat train` that got to a checkpoint"
         )
     soup = TriangleSoup.load(run.soup_path).to(device)
-    config = run.read_config()
-    paths = config["paths"]
+    config = read_record(run, TrainConfig, ["width"], "paths.source")
+    paths, width = config["paths"], config["config"]["width"]
     source = scene or paths["source"]
     if source is None:
         return SoupRun(path, soup, None)
     if scene is None and source != DEMO_SCENE and not Path(source).is_dir():
         raise InputError(f"{path}: its scene {source} has gone; name where it is now with --scene")
-    width = config["config"]["width"]
     return SoupRun(path, soup, load_scene(source, width, paths.get("images"), paths.get("masks"), preload=False))
 
 

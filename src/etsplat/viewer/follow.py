@@ -7,6 +7,7 @@ from pathlib import Path
 import torch
 
 from etsplat.core.errors import InputError
+from etsplat.io.json_text import is_number
 from etsplat.io.run_directory import RunDirectory, is_empty, is_run
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.tasks.sources import check_trains
@@ -69,7 +70,7 @@ class Followed:
         if not history:
             return ""
         last = history[-1]
-        known = [line["psnr"] for line in history if line.get("psnr") is not None]
+        known = [line["psnr"] for line in history if is_number(line.get("psnr"))]
         quality = f", {known[-1]:.2f} dB on test views" if known else ""
         state = "done" if self._run.metrics_path.is_file() else "running"
         return f"{state}: iteration {last['iteration']:,} of {iterations:,}{quality}"
