@@ -9,17 +9,29 @@ from typing import Any
 
 import pytest
 import torch
+import trimesh
 from PIL import Image
 
 from etsplat.core.errors import InputError
 from etsplat.data.demo_object import demo_object
 from etsplat.data.photograph import photograph
+from etsplat.data.pictures import StoredPictures
 from etsplat.engines.threads import num_threads, set_num_threads
 from etsplat.geometry.icosphere import icosphere
+from etsplat.geometry.parts import genera
 from etsplat.geometry.topology import MeshTopology
 from etsplat.io.mesh_files import MeshFile, load_mesh
 from etsplat.io.run_directory import RunDirectory
-from etsplat.optim.loop import CheckpointEvent, DivergedError, DoneEvent, Event, PrepareEvent, RefineEvent, StepEvent
+from etsplat.optim.loop import (
+    CheckpointEvent,
+    DivergedError,
+    DoneEvent,
+    Event,
+    NoteEvent,
+    PrepareEvent,
+    RefineEvent,
+    StepEvent,
+)
 from etsplat.optim.trainer import Trainer
 from etsplat.tasks.reconstruct import ReconstructResult, reconstruct
 from etsplat.tasks.reconstruct_config import ReconstructConfig
@@ -46,7 +58,7 @@ def kill_at(iteration: int) -> Callable[[Event], None]:
     """A callback that dies at the first event of an iteration or later."""
 
     def callback(event: Event) -> None:
-        if not isinstance(event, PrepareEvent) and event.iteration >= iteration:
+        if not isinstance(event, PrepareEvent | NoteEvent) and event.iteration >= iteration:
             raise KilledError
 
     return callback
@@ -372,3 +384,27 @@ def test_config_json_says_how_to_make_it_again(whole_run: ReconstructResult) -> 
     assert ReconstructConfig.from_file(path) == SHORT
     assert len(config["source"]["fingerprint"]) == 16
     assert set(config["versions"]) == {"etsplat", "torch", "python"}
+
+
+def test_a_start_from_the_hull_keeps_the_hole_and_ends_the_same_when_resumed(tmp_path: Path) -> None:
+    """A torus: the sphere would span its hole; the hull has it, so the result is closed and of genus 1."""
+    ring = trimesh.creation.torus(1.0, 0.4, major_sections=32, minor_sections=16)
+    source = MeshFile(torch.from_numpy(ring.vertices.copy()).float(), torch.from_numpy(ring.faces.copy()).long())
+    config = SHORT.changed({"start.shape": "hull"})
+    events: list[Event] = []
+    whole = reconstruct(source, tmp_path / "whole", config, callbacks=[events.append])
+    assert genera(whole.mesh.faces, len(whole.mesh.vertices)) == [1]
+    assert any(isinstance(event, NoteEvent) and "holes in each part: [1]" in event.text for event in events)
+    with pytest.raises(KilledError):
+        reconstruct(source, tmp_path / "killed", config, callbacks=[kill_at(config.iterations // 2)])
+    reconstruct(source, tmp_path / "killed", config, resume=True)
+    assert untimed(tmp_path / "killed") == untimed(tmp_path / "whole")
+
+
+def test_a_hull_needs_masks(pebble: MeshFile, tmp_path: Path) -> None:
+    """Pictures without transparency are no silhouettes."""
+    views = photograph(pebble, 48, 48, supersampling=1)
+    opaque = [image[..., :3] for image in views.images]
+    config = SHORT.changed({"start.shape": "hull"})
+    with pytest.raises(InputError, match="needs masks"):
+        reconstruct(replace(views, images=StoredPictures(opaque)), tmp_path, config)

@@ -23,7 +23,12 @@ _RING = {
 
 
 def dual_contour(
-    sdf: SignedDistance, lower: tuple[float, float, float], cell: float, cells: tuple[int, int, int]
+    sdf: SignedDistance,
+    lower: tuple[float, float, float],
+    cell: float,
+    cells: tuple[int, int, int],
+    *,
+    bisections: int = 30,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Mesh the zero level of `sdf` inside a box of cubic cells. The surface must stay off the box's outermost cells.
 
@@ -35,6 +40,7 @@ def dual_contour(
         lower: the box's lowest corner.
         cell: side of a cell.
         cells: number of cells along x, y, z.
+        bisections: the surface is found to this power of 2 of a cell; 30 are far below float32 resolution.
 
     Returns:
         vertices (V, 3) float64 and faces (F, 3) int64.
@@ -62,7 +68,7 @@ def dual_contour(
         ring = 4 * np.ravel_multi_index(tuple(np.moveaxis(around, -1, 0)), cells) + sheet[code, edge]
         # From inside to outside along the axis the outward side is the axis's positive end.
         quads.append(np.where(inward[:, None], ring[:, ::-1], ring))
-        crossing = _crossings(sdf, origin + cell * start, axis, cell)
+        crossing = _crossings(sdf, origin + cell * start, axis, cell, bisections)
         points.append(crossing)
         normals.append(_gradient(sdf, crossing, 1e-4 * cell))
     used, quad = np.unique(np.concatenate(quads), return_inverse=True)
@@ -127,12 +133,12 @@ def _crossed_edges(inside: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarra
     return start, ~inside[tuple(start.T)]
 
 
-def _crossings(sdf: SignedDistance, start: np.ndarray, axis: int, cell: float) -> np.ndarray:
-    """Where the surface crosses each edge, by 30 bisections (far below float32 resolution)."""
+def _crossings(sdf: SignedDistance, start: np.ndarray, axis: int, cell: float, bisections: int) -> np.ndarray:
+    """Where the surface crosses each edge, by bisection."""
     low, high = np.zeros(len(start)), np.full(len(start), cell)
     point = start.copy()
     start_inside = sdf(start) < 0
-    for _ in range(30):
+    for _ in range(bisections):
         middle = (low + high) / 2
         point[:, axis] = start[:, axis] + middle
         same = (sdf(point) < 0) == start_inside

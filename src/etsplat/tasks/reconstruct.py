@@ -2,12 +2,13 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
 from etsplat.data.dataset import Dataset
 from etsplat.engines.choice import engine
+from etsplat.geometry.parts import genera
 from etsplat.io.mesh_files import MeshFile
 from etsplat.model.triangle_mesh import TriangleMesh
 from etsplat.ops.antialias_nvdiffrast import load_nvdiffrast
@@ -100,7 +101,12 @@ def reconstruct(
             supersampling=config.pictures.supersampling,
             lpips=load_lpips(config.output.lpips_weights, job.device),
         )
-        trainer = make_trainer(make_start(start, views, config, job.device), views, config, scorer.cheap)
+        mesh = make_start(start, views, config, job.device)
+        if start is None and config.start.shape == "hull":
+            holes = genera(mesh.faces.cpu(), len(mesh.vertices))
+            job.announce(NoteEvent(f"start: the visual hull, {mesh.count:,} faces; holes in each part: {holes}"))
+            config = nearby(config)
+        trainer = make_trainer(mesh, views, config, scorer.cheap)
         with job.writing():
             progress, mesh, frame = job.fit(trainer), trainer.model, views.normalization
             for suffix in (".ply", ".obj", ".glb"):
@@ -108,6 +114,16 @@ def reconstruct(
             sizes = {"faces": len(mesh.faces), "vertices": len(mesh.vertices)}
             metrics = job.finish(progress, {**scorer.full(mesh, job.run.test), **sizes}, mesh.vertices)
     return ReconstructResult(job.run.path, metrics, mesh.to_file(frame))
+
+
+def nearby(config: ReconstructConfig) -> ReconstructConfig:
+    """The settings for a start that is near the surface."""
+    near, rates, weights = config.start.near, config.optimizer, config.regularization
+    return replace(
+        config,
+        optimizer=replace(rates, lr_vertices=near * rates.lr_vertices),
+        regularization=replace(weights, lambda_edge=near * weights.lambda_edge),
+    )
 
 
 def make_trainer(

@@ -14,6 +14,8 @@ Preset = Literal["best", "paper", "study", "quick", "demo", "tiny"]
 
 _SOFT = Only("with soft triangles (elastic, bilateral, single-sided)", lambda config: config.soft)
 _COARSE = Only("with coarse levels", lambda config: config.pictures.coarse_levels > 0)
+_HULL = Only("with start.shape hull", lambda config: config.start.shape == "hull")
+_SPHERE = Only("with start.shape sphere", lambda config: config.start.shape == "sphere")
 _LARGE = Only("with vertex_update large-steps", lambda config: config.optimizer.vertex_update == "large-steps")
 _LEARNED = Only("where softness is learned", lambda config: config.soft and not config.optimizer.sigma_final)
 _EDGES = Only("with lambda_edge", lambda config: config.regularization.lambda_edge > 0)
@@ -48,10 +50,16 @@ class Drawing:
 class Start:
     """What the optimization starts from, unless that is a mesh of one's own."""
 
-    level: Annotated[int, Range(0, 9)] = 4
-    """The start is a sphere of 20 * 4^level faces."""
+    shape: Literal["sphere", "hull"] = "sphere"
+    """A sphere around the object; or the visual hull of its masks, which has the holes and parts that they show."""
+    level: Annotated[int, Range(0, 9), _SPHERE] = 4
+    """The sphere has 20 * 4^level faces."""
     radius: Annotated[float, Range(1e-6, 1e6)] = 1.05
-    """Radius of that sphere, as a multiple of the radius of a sphere around the object."""
+    """Radius of the sphere, in which the hull lies too, as a multiple of the radius of a sphere around the object."""
+    hull_faces: Annotated[float, Range(0.01, 1), _HULL] = 0.5
+    """Faces of the hull, as a fraction of `max_faces`."""
+    near: Annotated[float, Range(1e-6, 1), _HULL] = 0.1
+    """A hull is near the surface already: the rate of vertices and the weight of edges are multiplied by this."""
     color: Annotated[float, Range(0, 1)] = 0.5
     """Grey of all faces at the start."""
     opacity: Annotated[float, Range(0.01, 0.999), _SOFT] = 0.98

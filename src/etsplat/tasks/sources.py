@@ -21,8 +21,11 @@ from etsplat.data.demo_scene import HEIGHT, WIDTH, demo_scene
 from etsplat.data.hull import bounding_sphere
 from etsplat.data.load import load_dataset
 from etsplat.data.photograph import normalize_mesh, photograph
+from etsplat.data.visual_hull import visual_hull
 from etsplat.engines.choice import resolve_device
 from etsplat.geometry.icosphere import icosphere
+from etsplat.geometry.topology import MeshTopology
+from etsplat.geometry.untangle import untangle
 from etsplat.io.mesh_files import MeshFile, load_mesh, weld_vertices
 from etsplat.io.paths import path_remedy
 from etsplat.io.run_directory import RunDirectory, is_run
@@ -133,18 +136,23 @@ def load_start(start: str | Path | MeshFile | None) -> MeshFile | None:
 def make_start(
     start: MeshFile | None, views: Dataset, config: ReconstructConfig, device: torch.device | None = None
 ) -> TriangleMesh:
-    """The mesh that a run starts from, in the unit frame: an icosphere around the object, or the given mesh.
+    """The mesh that a run starts from, in the unit frame: an icosphere around the object, its hull, or the given mesh.
 
     Args:
         start: from `load_start`, in the input's units; its colours are used if it has the kind that is optimised.
         views: of the unit frame.
-        config: level, radius, colour, opacity and softness.
+        config: shape, colour, opacity and softness.
         device: of the mesh; None for the CPU.
+
+    Raises:
+        InputError: the hull is asked for, and the views have no masks, or masks that exclude everything.
     """
-    if start is None:
+    colors: Tensor | float = config.start.color
+    if start is None and config.start.shape == "hull":
+        vertices, faces = _hull(views, config)
+    elif start is None:
         vertices, faces = icosphere(config.start.level)
         vertices = vertices * config.start.radius
-        colors: Tensor | float = config.start.color
     else:
         vertices, faces = views.normalization.apply(start.vertices), start.faces
         given = start.vertex_colors if config.vertex_colored else start.face_colors
@@ -159,6 +167,18 @@ def make_start(
         vertex_colored=config.vertex_colored,
         appearance=MeshAppearance(kernel, config.drawing.distance, config.drawing.backend),
     )
+
+
+def _hull(views: Dataset, config: ReconstructConfig) -> tuple[Tensor, Tensor]:
+    if not views.has_masks:
+        raise InputError("start.shape: hull needs masks or transparent pictures; give masks, or start from a sphere")
+    vertices, faces = visual_hull(views, round(config.start.hull_faces * config.max_faces), radius=config.start.radius)
+    if len(faces) == 0:
+        raise InputError(
+            "start.shape: the masks have no point in common, so there is no hull; check that masks are white inside the"
+            " object and that poses and images belong together"
+        )
+    return untangle(vertices, MeshTopology.from_faces(faces, len(vertices)))[0], faces
 
 
 def fingerprint(source: MeshFile | Dataset | None) -> str | None:

@@ -1,0 +1,127 @@
+"""The visual hull as a mesh: the largest shape that all silhouettes allow (Laurentini 1994).
+
+It has the holes and the parts that the silhouettes show, so a run that starts from it need not tear a sphere; hollows
+that no silhouette shows are closed in it.
+"""
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int64
+from scipy.ndimage import distance_transform_edt
+from torch import Tensor
+
+from etsplat.data.dataset import Dataset
+from etsplat.data.meshing import dual_contour
+from etsplat.data.pictures import as_float
+from etsplat.geometry.parts import face_parts
+
+_FIRST_CELLS, _MOST_CELLS = 48, 160
+"""Grid cells per side of the box, at first and at most."""
+
+_TRIES = 3
+"""Grids that are tried, to come near the number of faces that is wanted."""
+
+_NEAR = 0.15
+"""How near, as a fraction of it."""
+
+_SPECK = 0.02
+"""Parts with fewer faces than this fraction of the largest are dropped: dents of rough masks leave them."""
+
+_CHUNK = 1 << 17
+"""Points that are looked up together."""
+
+_MARGIN = 2
+"""Free cells around the hull; dual contouring wants one."""
+
+_BISECTIONS = 8
+"""The surface is found to this power of 2 of a cell."""
+
+
+def visual_hull(
+    dataset: Dataset, faces: int, *, radius: float = 1.0
+) -> tuple[Float[Tensor, "V 3"], Int64[Tensor, "F 3"]]:
+    """The hull of the training views' silhouettes (alpha 0.5) within a ball around the origin, as a closed mesh.
+
+    A view whose silhouette keeps off the image border excludes what its image does not show; where the border cuts the
+    silhouette, nothing is known beyond. A point of the hull is judged by at least half of the views.
+
+    Args:
+        dataset: photos with alpha around an object at the origin, as `bounding_sphere` and `renormalized` place it.
+        faces: about how many are wanted.
+        radius: of the ball.
+
+    Returns:
+        vertices (V, 3) float32 and faces (F, 3) int64, counter-clockwise seen from outside; (0, 3) both if the
+        silhouettes have no point in common.
+    """
+    views = [_View(dataset, index) for index in dataset.train]
+
+    def outside(points: np.ndarray) -> np.ndarray:
+        """Negative inside."""
+        chunks = torch.from_numpy(points).float().split(_CHUNK)
+        distance = torch.cat([_outside(views, chunk) for chunk in chunks]).double().numpy()
+        return np.maximum(distance, np.linalg.norm(points, axis=1) - radius)
+
+    cells = _FIRST_CELLS
+    vertices, triangles = np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)
+    for _ in range(_TRIES):
+        cell = 2 * radius / (cells - 2 * _MARGIN)
+        corner = -0.5 * cell * cells
+        lower, counts = (corner, corner, corner), (cells, cells, cells)
+        vertices, triangles = dual_contour(outside, lower, cell, counts, bisections=_BISECTIONS)
+        if len(triangles) == 0 or abs(len(triangles) - faces) <= _NEAR * faces:
+            break
+        wanted = round(cells * (faces / len(triangles)) ** 0.5)
+        if cells == (cells := min(max(wanted, _FIRST_CELLS // 2), _MOST_CELLS)):
+            break
+    return _without_specks(torch.from_numpy(vertices).float(), torch.from_numpy(triangles))
+
+
+class _View:
+    """A silhouette and its camera."""
+
+    def __init__(self, dataset: Dataset, index: int) -> None:
+        photo = dataset.images[index]
+        alpha = as_float(photo[..., 3]).numpy() if photo.shape[-1] == 4 else np.ones(photo.shape[:2], np.float32)
+        inside = alpha >= 0.5
+        # From pixel centres to the border between pixels, which partly covered pixels place within themselves.
+        within, beyond = (np.asarray(distance_transform_edt(mask)) for mask in (inside, ~inside))
+        distance = within - beyond
+        distance = np.where((alpha > 0) & (alpha < 1), alpha - 0.5, distance - np.copysign(0.5, distance))
+        self.distance = torch.from_numpy(distance).float()[None, None]
+        self.whole = not (inside[0].any() or inside[-1].any() or inside[:, 0].any() or inside[:, -1].any())
+        self.viewmat, self.K = dataset.viewmats[index].float(), dataset.Ks[index].float()
+
+    def inside(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """(N,) how deep points are within the silhouette, in units of the scene, and (N,) whether it judges them."""
+        camera = points @ self.viewmat[:3, :3].T + self.viewmat[:3, 3]
+        z = camera[:, 2]
+        front = z > 0
+        height, width = self.distance.shape[2:]
+        pixel = camera @ self.K.T / torch.where(front, z, 1.0)[:, None]
+        place = 2 * pixel[:, :2] / torch.tensor([width, height]) - 1
+        found = torch.nn.functional.grid_sample(
+            self.distance, place[None, None], padding_mode="border", align_corners=False
+        )
+        judged = front & (self.whole | (place.abs() < 1).all(dim=1))
+        return found[0, 0, 0] * z / self.K[0, 0], judged
+
+
+def _outside(views: list[_View], points: Tensor) -> Tensor:
+    """(N,) how far points are outside the hull, in units of the scene; negative inside."""
+    depth, judges = torch.full((len(points),), torch.inf), torch.zeros(len(points))
+    for view in views:
+        found, judged = view.inside(points)
+        depth = torch.where(judged, torch.minimum(depth, found), depth)
+        judges += judged
+    return torch.where(2 * judges >= len(views), -depth, 1.0)
+
+
+def _without_specks(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
+    """Only the large parts, and the vertices that these use."""
+    if len(faces) == 0:
+        return vertices[:0], faces
+    part = face_parts(faces, len(vertices))
+    sizes = part.bincount()
+    used, renumbered = faces[sizes[part] >= _SPECK * sizes[0]].unique(return_inverse=True)
+    return vertices[used], renumbered
