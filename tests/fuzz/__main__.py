@@ -24,9 +24,6 @@ FOUND = Path("build/fuzz")
 ENOUGH = 200
 """So many inputs say what share is accepted."""
 
-KNOWN: dict[str, str] = {}
-"""Targets with defects that are being mended, and which: they are told, and do not fail the session."""
-
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The exit status."""
@@ -65,9 +62,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             console.print(f"{target.name}: only {tally.share_accepted():.1%} of its inputs were accepted")
             failed = True
     console.print(_table(tallies))
-    for name in sorted({tally.name for tally in tallies if tally.failures} & set(KNOWN)):
-        console.print(f"{name}: known, {KNOWN[name]}")
-    return int(failed or any(tally.failures for tally in tallies if tally.name not in KNOWN))
+    return int(failed or any(tally.failures for tally in tallies))
 
 
 def _table(tallies: Sequence[Tally]) -> Table:
