@@ -1,5 +1,7 @@
+import contextlib
 import io
 import struct
+import tracemalloc
 import zlib
 
 import numpy as np
@@ -168,3 +170,17 @@ def test_shrinking_keeps_constants_and_the_mean():
     assert small.shape == (16, 12, 4)
     torch.testing.assert_close(small.mean(), image.mean(), atol=5e-3, rtol=0)
     torch.testing.assert_close(resize_image(torch.full((9, 9, 3), 0.3), 4, 5), torch.full((5, 4, 3), 0.3))
+
+
+def test_the_length_that_a_part_of_a_png_claims_is_not_allocated(tmp_path):
+    """Pillow reads what follows the pixels in one piece, here of 4 GB in a file of a hundred bytes."""
+    whole = io.BytesIO()
+    Image.new("L", (16, 12)).save(whole, "PNG")
+    path = tmp_path / "a.png"
+    path.write_bytes(whole.getvalue().split(b"\0\0\0\0IEND")[0] + b"\xff\xff\xff\xf0IDATx")
+    tracemalloc.start()
+    with contextlib.suppress(InputError):
+        load_image(path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 100e6

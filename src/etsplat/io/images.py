@@ -26,6 +26,21 @@ _DENSEST = 520
 """Pixels of 16 bits in a byte of PNG, of which deflate makes at most 1032; JPEG needs a bit for 64 pixels at least."""
 
 
+class _Bounded(io.BufferedReader):
+    """A file that reads no more than it holds: the length that a part of a PNG claims is allocated before it is read."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(io.FileIO(path))
+        self._size = path.stat().st_size
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """As of any file."""
+        return super().read(size if size is None else min(size, self._size))
+
+    def __del__(self) -> None:
+        self.close()  # Pillow leaves a file open that it did not open
+
+
 def open_image(path: Path | str) -> Image.Image:
     """An image that is not decoded yet, of the formats that are read here and within MAX_PIXELS.
 
@@ -38,7 +53,8 @@ def open_image(path: Path | str) -> Image.Image:
     if path.stat().st_size == 0:
         raise InputError(f"image {path}: the file is empty; copy it again")
     try:
-        image = Image.open(path, formats=_FORMATS)  # without them Pillow tries all it knows, and starts programs
+        # Without formats Pillow tries all it knows, and starts programs.
+        image = Image.open(_Bounded(path), formats=_FORMATS)
     except UnidentifiedImageError as error:
         raise InputError(f"image {path}: not an image that can be read; convert it to PNG or JPEG") from error
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
