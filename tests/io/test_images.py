@@ -173,11 +173,13 @@ def test_shrinking_keeps_constants_and_the_mean():
 
 
 def test_the_length_that_a_part_of_a_png_claims_is_not_allocated(tmp_path):
-    """Pillow reads what follows the pixels in one piece, here of 4 GB in a file of a hundred bytes."""
+    """Pillow reads what its decoder leaves of the pixels in one piece, here of 4 GB in a file of a hundred bytes."""
     whole = io.BytesIO()
     Image.new("L", (16, 12)).save(whole, "PNG")
+    data = bytearray(whole.getvalue())
+    data[data.index(b"IDAT") - 4] = 0xFF
     path = tmp_path / "a.png"
-    path.write_bytes(whole.getvalue().split(b"\0\0\0\0IEND")[0] + b"\xff\xff\xff\xf0IDATx")
+    path.write_bytes(data)
     tracemalloc.start()
     with contextlib.suppress(InputError):
         load_image(path)

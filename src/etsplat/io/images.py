@@ -27,7 +27,7 @@ _DENSEST = 520
 
 
 class _Bounded(io.BufferedReader):
-    """A file that reads no more than it holds: the length that a part of a PNG claims is allocated before it is read."""
+    """A file that reads no more than it holds: what a part of a PNG claims to hold is allocated before it is read."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(io.FileIO(path))
