@@ -20,11 +20,10 @@ import os, sys, time
 from pathlib import Path
 from etsplat.io.locks import writing_run
 with writing_run(Path(sys.argv[1]), print):
-    if os.fork() == 0:  # a child that outlives its parent holds nothing
-        time.sleep(60)
-        os._exit(0)
-    print("holds", flush=True)
+    if os.fork() == 0:  # a child that outlives its parent holds nothing, from when it runs at all
+        print("holds", flush=True)
     time.sleep(60)
+    os._exit(0)
 """
 
 
