@@ -5,7 +5,7 @@ object.
 """
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
@@ -13,7 +13,7 @@ from etsplat.core.cameras import camera_centers
 from etsplat.core.errors import InputError
 from etsplat.data.camera_paths import axes_meeting_point
 from etsplat.data.dataset import Dataset
-from etsplat.data.pictures import as_float
+from etsplat.data.pictures import Pixels, as_float
 
 _CELLS = 48
 """Grid cells per side, at each of the levels."""
@@ -90,13 +90,19 @@ def _carve(views: list[_View], center: np.ndarray, reach: float) -> tuple[np.nda
     return kept, cell
 
 
+def silhouette(photo: Pixels) -> Bool[np.ndarray, "H W"]:
+    """Where a photo shows the object: alpha from 0.5 on; everywhere without alpha."""
+    return as_float(photo[..., 3]).numpy() >= 0.5 if photo.shape[-1] == 4 else np.ones(photo.shape[:2], dtype=bool)
+
+
+def touches_border(mask: Bool[np.ndarray, "H W"]) -> bool:
+    """Whether a silhouette goes on, as far as one knows, beyond its picture."""
+    return any(edge.any() for edge in (mask[0], mask[-1], mask[:, 0], mask[:, -1]))
+
+
 def _silhouettes(dataset: Dataset, names: list[str], steps: np.ndarray) -> list[np.ndarray]:
     """Masks of the training views, each so many times smaller; a pixel is inside if any of those in it was."""
-    photos = (dataset.images[index] for index in dataset.train)
-    masks = [
-        as_float(photo[..., 3]).numpy() >= 0.5 if photo.shape[-1] == 4 else np.ones(photo.shape[:2], dtype=bool)
-        for photo in photos
-    ]
+    masks = [silhouette(dataset.images[index]) for index in dataset.train]
     empty = [name for name, mask in zip(names, masks, strict=True) if not mask.any()]
     if empty:
         raise InputError(f"view {empty[0]}: its mask is empty, it sees nothing of the object; remove the view")
@@ -135,7 +141,7 @@ def _keeps(views: list[_View], points: np.ndarray, cell: float) -> np.ndarray:
         column, row = pixel[framed].astype(np.int64).T
         # Half the cube's diagonal on the screen, and half a pixel's.
         reach = K[0, 0] * 0.87 * cell / z[framed] + 0.71
-        whole = min(edge.min() for edge in (outside[0], outside[-1], outside[:, 0], outside[:, -1])) > 0
+        whole = not touches_border(outside == 0)
         keep = np.full(len(alive), not whole)
         keep[framed] = outside[row, column] <= reach
         judged[alive] += framed | whole

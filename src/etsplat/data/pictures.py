@@ -4,6 +4,7 @@ import hashlib
 import math
 import os
 import threading
+from abc import ABC, abstractmethod
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
@@ -37,7 +38,7 @@ class Picture:
     mask: UInt8[Tensor, "H W"] | None = None
 
 
-class Pictures:
+class Pictures(ABC):
     """Photos by view.
 
     Attributes:
@@ -50,15 +51,15 @@ class Pictures:
     total_bytes: int
     streamed: bool = False
 
+    @abstractmethod
     def picture(self, index: int) -> Picture:
         """Raises IndexError where there is no such view, InputError where its file is damaged or has gone."""
-        raise NotImplementedError
 
+    @abstractmethod
     def fingerprint(self) -> bytes:
         """A hash of what they show; the same for a copy."""
-        raise NotImplementedError
 
-    def expect(self, indices: Sequence[int]) -> None:
+    def expect(self, indices: Sequence[int]) -> None:  # noqa: B027 -- a wish, which a subclass may leave
         """Start to make those that are needed soon, as many as fit."""
 
     def __getitem__(self, index: int) -> Pixels:

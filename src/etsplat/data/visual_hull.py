@@ -11,6 +11,7 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from etsplat.data.dataset import Dataset
+from etsplat.data.hull import silhouette, touches_border
 from etsplat.data.meshing import dual_contour
 from etsplat.data.pictures import as_float
 from etsplat.geometry.parts import face_parts
@@ -82,14 +83,16 @@ class _View:
 
     def __init__(self, dataset: Dataset, index: int) -> None:
         photo = dataset.images[index]
-        alpha = as_float(photo[..., 3]).numpy() if photo.shape[-1] == 4 else np.ones(photo.shape[:2], np.float32)
-        inside = alpha >= 0.5
+        inside = silhouette(photo)
         # From pixel centres to the border between pixels, which partly covered pixels place within themselves.
         within, beyond = (np.asarray(distance_transform_edt(mask)) for mask in (inside, ~inside))
         distance = within - beyond
-        distance = np.where((alpha > 0) & (alpha < 1), alpha - 0.5, distance - np.copysign(0.5, distance))
+        distance -= np.copysign(0.5, distance)
+        if photo.shape[-1] == 4:
+            alpha = as_float(photo[..., 3]).numpy()
+            distance = np.where((alpha > 0) & (alpha < 1), alpha - 0.5, distance)
         self.distance = torch.from_numpy(distance).float()[None, None]
-        self.whole = not (inside[0].any() or inside[-1].any() or inside[:, 0].any() or inside[:, -1].any())
+        self.whole = not touches_border(inside)
         self.viewmat, self.K = dataset.viewmats[index].float(), dataset.Ks[index].float()
 
     def inside(self, points: Tensor) -> tuple[Tensor, Tensor]:

@@ -6,6 +6,7 @@ A step sees one view or more. Each view is drawn, compared and differentiated by
 with the mean over the views, what looks at parameters alone counts once.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal
@@ -44,7 +45,7 @@ class Drawing:
     shared: dict[Hashable, Any] = field(default_factory=dict)
 
 
-class Term:
+class Term(ABC):
     """One summand: weight * value ^ power. A term of one's own overrides `__call__`, or is made by `Custom`.
 
     Attributes:
@@ -62,9 +63,9 @@ class Term:
     def __init__(self, weight: Scheduled = 1.0) -> None:
         self.weight = weight
 
+    @abstractmethod
     def __call__(self, drawing: Drawing) -> Float[Tensor, ""]:
         """The value, differentiable."""
-        raise NotImplementedError
 
 
 class Custom(Term):

@@ -1,5 +1,7 @@
 """What engines of native code have in common."""
 
+from abc import ABC, abstractmethod
+
 import torch
 from torch import Tensor
 
@@ -9,7 +11,7 @@ from etsplat.engines.native.plan import Render
 from etsplat.engines.native.rasterize import rasterize_native
 
 
-class NativeEngine(Engine):
+class NativeEngine(Engine, ABC):
     """Computes in float32 on one type of device.
 
     Attributes:
@@ -20,9 +22,9 @@ class NativeEngine(Engine):
     place: str
     render: type[Render]
 
+    @abstractmethod
     def tensors_on(self) -> str:
         """Type of the device of its tensors."""
-        raise NotImplementedError
 
     def check(self, tensor: Tensor) -> None:
         """Float32 on its own device."""
