@@ -83,6 +83,7 @@ VALUES: dict[str, Callable[[], Any]] = {
     "Rasterization": _rasterization,
     "ReconstructConfig": lambda: etsplat.ReconstructConfig.demo(),
     "ReconstructResult": lambda: etsplat.ReconstructResult(Path("x"), MESH, {"psnr": 30.0}),
+    "UndoEvent": lambda: etsplat.UndoEvent(10, 110, 0.1, 0.2),
     "RefineEvent": lambda: etsplat.RefineEvent(1, 2, 3),
     "RowPlan": lambda: etsplat.RowPlan.keeping(torch.tensor([True, False, True])),
     "Schedule": lambda: etsplat.Schedule({"vertices": 0.1}),

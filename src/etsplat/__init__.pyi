@@ -68,6 +68,7 @@ from etsplat.optim.loop import NoteEvent as NoteEvent
 from etsplat.optim.loop import PrepareEvent as PrepareEvent
 from etsplat.optim.loop import RefineEvent as RefineEvent
 from etsplat.optim.loop import StepEvent as StepEvent
+from etsplat.optim.loop import UndoEvent as UndoEvent
 from etsplat.optim.objective import Custom as Custom
 from etsplat.optim.objective import Drawing as Drawing
 from etsplat.optim.objective import Objective as Objective

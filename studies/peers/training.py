@@ -20,7 +20,8 @@ from etsplat.io.run_directory import RunDirectory
 from etsplat.metrics.image import psnr, ssim
 from etsplat.model.soup_init import StartPoints, random_points
 from etsplat.ops.photometric import photometric_loss
-from etsplat.optim.loop import LoopSettings, Progress, drive
+from etsplat.optim.drive import drive
+from etsplat.optim.loop import LoopSettings, Progress, UndoEvent
 from etsplat.optim.schedules import exponential_decay, limited_iterations
 from etsplat.optim.view_sampler import ViewSampler
 from etsplat.tasks.running import (
@@ -193,6 +194,10 @@ class _Fitting:
     def refine(self, iteration: int) -> int:
         """Nothing: gsplat densifies within the steps."""
         return 0
+
+    def review(self, progress: Progress) -> UndoEvent | None:
+        """Nothing is ever undone."""
+        return None
 
     def evaluate(self) -> dict[str, float]:
         """Nothing before the end."""

@@ -17,6 +17,7 @@ from etsplat.optim.loop import (
     Progress,
     RefineEvent,
     StepEvent,
+    UndoEvent,
     optimize,
 )
 
@@ -45,6 +46,9 @@ class Counting:
         added = 10 if iteration == 3 else 0
         self.count += added
         return added
+
+    def review(self, progress: Progress) -> UndoEvent | None:
+        return None
 
     def evaluate(self) -> dict[str, float]:
         return {"psnr": 30.0}

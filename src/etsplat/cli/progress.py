@@ -11,7 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from etsplat.io.images import open_image
-from etsplat.optim.loop import DoneEvent, Event, NoteEvent, PrepareEvent, StepEvent
+from etsplat.optim.loop import DoneEvent, Event, NoteEvent, PrepareEvent, StepEvent, UndoEvent
 
 LINES = 10
 """Without a terminal, so many lines tell of the optimization."""
@@ -85,8 +85,8 @@ class RunProgress(PhaseBar):
         """Take in an event of the run."""
         if isinstance(event, PrepareEvent):
             self.show(self._preparing, event.done, event.total)
-        elif isinstance(event, NoteEvent):
-            self._console.print(f"  {event.text}", highlight=False, markup=False, soft_wrap=True)
+        elif isinstance(event, NoteEvent | UndoEvent):
+            self._console.print(f"  {event}", highlight=False, markup=False, soft_wrap=True)
         elif isinstance(event, StepEvent):
             self._step(event)
         elif isinstance(event, DoneEvent):

@@ -1,6 +1,7 @@
 """Posed photos, of an object or of a scene: what every loader returns and every run starts from."""
 
 import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -159,6 +160,11 @@ class Dataset:
         spread = float((centers - center).norm(dim=1).max())
         resolvable = 1e-9 * float(center.abs().max())
         return center, SPREAD_FACTOR * spread if spread > resolvable else 1.0
+
+
+def middles_of(views: Sequence[int], count: int) -> list[int]:
+    """So many of the views, evenly spread: the middles of `count` equal parts."""
+    return [views[(2 * part + 1) * len(views) // (2 * count)] for part in range(count)]
 
 
 def every_eighth(count: int) -> tuple[list[int], list[int]]:

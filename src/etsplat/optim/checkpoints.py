@@ -36,7 +36,9 @@ def checkpoint_path(folder: Path, iteration: int) -> Path:
 
 
 def save_checkpoint(folder: Path, iteration: int, tensors: Mapping[str, Tensor], run_hash: str) -> Path:
-    """Writes a checkpoint atomically, then deletes all but the last two of the folder.
+    """Writes a checkpoint atomically, then deletes all but it and the one before.
+
+    Those of later iterations, which a run has that went back, go too.
 
     Args:
         folder: must exist.
@@ -50,7 +52,9 @@ def save_checkpoint(folder: Path, iteration: int, tensors: Mapping[str, Tensor],
     path = checkpoint_path(folder, iteration)
     metadata = {"format": FORMAT, "iteration": str(iteration), "run_hash": run_hash}
     save_tensors(path, tensors, metadata)
-    for old in list_checkpoints(folder)[:-KEEP]:
+    paths = list_checkpoints(folder)
+    newest = paths.index(path) + 1
+    for old in [*paths[: max(0, newest - KEEP)], *paths[newest:]]:
         old.unlink(missing_ok=True)
     return path
 

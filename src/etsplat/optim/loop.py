@@ -1,6 +1,6 @@
 """The optimization loop: it drives a problem and yields events; it knows nothing about triangles.
 
-`optimize` is the loop, `drive` that from the last checkpoint on, with a run's history.
+`optimize` is the loop; `optim/drive.py` has that from the last checkpoint on, with a run's history.
 
 Everything that happens at an iteration (step, refinement) is done before its events are yielded, so a consumer always
 sees, and a checkpoint always holds, the state between two iterations.
@@ -10,17 +10,15 @@ import math
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-import torch
 from torch import Tensor
 
-from etsplat.io.run_directory import RunDirectory
-from etsplat.optim.checkpoints import list_checkpoints, load_latest_checkpoint, save_checkpoint
+from etsplat.optim.checkpoints import list_checkpoints
 
 
 class DivergedError(RuntimeError):
@@ -49,6 +47,9 @@ class NoteEvent:
     """
 
     text: str
+
+    def __str__(self) -> str:
+        return self.text
 
 
 @dataclass(frozen=True)
@@ -104,6 +105,32 @@ class RefineEvent:
 
 
 @dataclass(frozen=True)
+class UndoEvent:
+    """An edit was undone: photos were explained worse some steps later. The run is back where it was before the edit.
+
+    What came after that iteration does not count any more, and comes again without the edit.
+
+    Attributes:
+        iteration: after whose step the edit had been made; so many are done now.
+        judged: how many were done.
+        loss_before: photometric loss of the training views before the edit.
+        loss_after: the same when it was judged.
+    """
+
+    iteration: int
+    judged: int
+    loss_before: float
+    loss_after: float
+
+    def __str__(self) -> str:
+        rise = 100 * (self.loss_after / self.loss_before - 1) if self.loss_before else math.inf
+        return (
+            f"iteration {self.iteration:,}: the edit of the triangles is left out: {self.judged - self.iteration} "
+            f"steps after it the loss of the training photos was {rise:.1f} % higher than before"
+        )
+
+
+@dataclass(frozen=True)
 class CheckpointEvent:
     """A checkpoint was written.
 
@@ -135,7 +162,7 @@ class DoneEvent:
         return f"{self.iteration} iterations in {self.seconds:.1f} s"
 
 
-Event = PrepareEvent | NoteEvent | StepEvent | RefineEvent | CheckpointEvent | DoneEvent
+Event = PrepareEvent | NoteEvent | StepEvent | RefineEvent | UndoEvent | CheckpointEvent | DoneEvent
 """The first two are told by tasks, before the loop begins."""
 
 Callback = Callable[[Event], None]
@@ -157,7 +184,7 @@ class Problem(Protocol):
         """Makes the optimizer steps of iteration `first` and of as many as it likes up to `last`.
 
         Nothing else is asked before, so steps on a device can follow each other without the host. It must not pass an
-        iteration at which `refine` has something to do.
+        iteration at which `refine` or `review` has something to do.
 
         Returns:
             The loss before each step made; one that is not finite ends them.
@@ -166,6 +193,10 @@ class Problem(Protocol):
 
     def refine(self, iteration: int) -> int:
         """Adds or removes primitives if this iteration is one for that; returns how many were added."""
+        ...
+
+    def review(self, progress: "Progress") -> UndoEvent | None:
+        """Judges an earlier edit if it is time to. If it is undone, everything, `progress` too, is as it was before."""
         ...
 
     def evaluate(self) -> dict[str, float]:
@@ -219,50 +250,6 @@ class LoopSettings:
     checkpoint_every: int
 
 
-def drive(
-    problem: Problem,
-    progress: Progress,
-    settings: LoopSettings,
-    callbacks: Sequence[Callback],
-    run: RunDirectory | None,
-    run_hash: str,
-) -> None:
-    """Runs the loop to the last iteration.
-
-    Args:
-        problem: changed in place.
-        progress: where it stands; changed in place. A checkpoint in `run` takes its place.
-        settings: when things happen.
-        callbacks: each is called with every event.
-        run: gets checkpoints and history.jsonl; None writes nothing.
-        run_hash: identifies all that the result depends on.
-
-    Raises:
-        DivergedError: a loss or parameter is not finite.
-        InputError: the checkpoint is damaged or of another run; the disk is full.
-    """
-    if run is not None:
-        checkpoint = load_latest_checkpoint(run.checkpoints, run_hash)
-        if checkpoint is not None:
-            problem.load_state(checkpoint.tensors, checkpoint.iteration)
-            progress.iteration = checkpoint.iteration
-            progress.seconds, progress.loss_sum, loss_count = checkpoint.tensors["progress"].tolist()
-            progress.loss_count = int(loss_count)
-        run.truncate_history(progress.iteration)
-
-    def save(at: Progress) -> Path:
-        assert run is not None
-        place = torch.tensor([at.seconds, at.loss_sum, at.loss_count], dtype=torch.float64)
-        return save_checkpoint(run.checkpoints, at.iteration, {**problem.state(), "progress": place}, run_hash)
-
-    for event in optimize(problem, settings, progress, save if run else None, run.checkpoints if run else None):
-        if isinstance(event, StepEvent) and run is not None:
-            place = {"iteration": event.iteration, "seconds": round(event.seconds, 3), "loss": event.loss}
-            run.append_history({**place, **event.state, **event.metrics})
-        for callback in callbacks:
-            callback(event)
-
-
 def optimize(
     problem: Problem,
     settings: LoopSettings,
@@ -291,15 +278,19 @@ def optimize(
     """
     with _deferred_interrupt() as interrupted:
         while progress.iteration < settings.iterations:
-            added = _advance(problem, progress, _next_stop(settings, progress.iteration), folder)
+            added, undone = _advance(problem, progress, _next_stop(settings, progress.iteration), folder)
             iteration = progress.iteration
             last = iteration == settings.iterations
             evaluating = last or _due(iteration, settings.evaluate_every)
             stopping = interrupted()
-            saving = save is not None and (last or stopping or _due(iteration, settings.checkpoint_every))
+            saving = save is not None and (
+                last or stopping or undone is not None or _due(iteration, settings.checkpoint_every)
+            )
             logging = evaluating or _due(iteration, settings.log_every)
             if (logging or saving) and (name := problem.first_not_finite()):
                 raise DivergedError(f"{name} is not finite at iteration {iteration}; {_what_is_left(folder)}")
+            if undone is not None:
+                yield undone
             if logging:
                 yield _step_event(problem, settings, progress, problem.evaluate() if evaluating else {})
             if added:
@@ -313,7 +304,8 @@ def optimize(
     yield DoneEvent(progress.iteration, progress.seconds)
 
 
-def _advance(problem: Problem, progress: Progress, stop: int, folder: Path | None) -> int:
+def _advance(problem: Problem, progress: Progress, stop: int, folder: Path | None) -> tuple[int, UndoEvent | None]:
+    """Steps and edits; returns how many triangles were added, and what was undone."""
     start = time.perf_counter()
     for loss in problem.advance(progress.iteration + 1, stop):
         progress.iteration += 1
@@ -321,9 +313,12 @@ def _advance(problem: Problem, progress: Progress, stop: int, folder: Path | Non
             raise DivergedError(f"the loss is {loss} at iteration {progress.iteration}; {_what_is_left(folder)}")
         progress.loss_sum += loss
         progress.loss_count += 1
-    added = problem.refine(progress.iteration)
+    added, undone = 0, problem.review(progress)
+    if undone is None:
+        added = problem.refine(progress.iteration)
+        undone = problem.review(progress)  # of an edit that no step follows
     progress.seconds += time.perf_counter() - start
-    return added
+    return (0 if undone else added), undone
 
 
 def _next_stop(settings: LoopSettings, iteration: int) -> int:

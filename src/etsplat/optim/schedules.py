@@ -5,6 +5,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+NEVER = 1 << 62
+"""An iteration that no run gets to."""
+
 Scheduled = float | Callable[[int], float]
 """A number, or a function of the iteration."""
 

@@ -18,9 +18,8 @@ from etsplat.ops.adam import Adam
 from etsplat.optim.densification import PruneRules, SoupStatistics, dead_triangles, densify_plan, grown_count
 from etsplat.optim.edit import RowPlan, apply_rows, apply_subdivision
 from etsplat.optim.loop import DivergedError
+from etsplat.optim.schedules import NEVER
 from etsplat.optim.terms.soup import Spared
-
-NEVER = 1 << 62
 
 
 class Strategy:

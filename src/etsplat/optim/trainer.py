@@ -16,7 +16,7 @@ from torch import Tensor
 
 from etsplat.core.rasterization import Rasterization
 from etsplat.core.validation import first_not_finite
-from etsplat.data.dataset import Dataset
+from etsplat.data.dataset import Dataset, middles_of
 from etsplat.data.loader import View, ViewLoader
 from etsplat.engines.choice import engine_for
 from etsplat.io.kernel_files import adopt_kernel, kernel_tensors
@@ -24,15 +24,21 @@ from etsplat.io.locks import writing_run
 from etsplat.io.run_directory import RunDirectory, is_run
 from etsplat.model.model import Model
 from etsplat.ops.adam import Adam
-from etsplat.optim.loop import Callback, LoopSettings, Progress, drive
+from etsplat.optim.drive import drive
+from etsplat.optim.gauge import Gauge
+from etsplat.optim.guard import Guard
+from etsplat.optim.loop import Callback, LoopSettings, Progress, UndoEvent
 from etsplat.optim.objective import Drawing, Objective
-from etsplat.optim.schedules import Schedule, at
+from etsplat.optim.schedules import NEVER, Schedule, at
 from etsplat.optim.step_queue import MAX_STEPS, QueuedStep, RowLayout, StepQueue
 from etsplat.optim.strategies import Fixed, Strategy
 from etsplat.optim.view_sampler import ViewSampler
 
 READ_AHEAD = 8
 """Views whose photos are decoded ahead of their turn, where they do not fit into memory."""
+
+GUARD_SIDE, GUARD_VIEWS = 128, 32
+"""Edits are judged by pictures with at most so many pixels on a side, of at most so many training views."""
 
 
 @dataclass(frozen=True)
@@ -58,6 +64,7 @@ class Trainer(Generic[M]):
         adam: its optimizer.
         strategy: what adds and removes triangles.
         progress: where the run stands.
+        guard: what undoes edits; None lets all of them stay.
     """
 
     def __init__(
@@ -72,6 +79,7 @@ class Trainer(Generic[M]):
         background: Sequence[float] | None = None,
         update: Callable[[Adam, Any], None] | None = None,
         evaluate: Callable[[Any], dict[str, float]] | None = None,
+        guard: Guard | None = None,
         seed: int | torch.Generator = 0,
     ) -> None:
         """Starts a run.
@@ -86,6 +94,7 @@ class Trainer(Generic[M]):
             background: colour behind the pictures; None for another random one behind each.
             update: takes the step from the gradients, in the place of `Adam.step`.
             evaluate: cheap metrics of the model.
+            guard: undoes edits of the strategy after which the training photos are explained worse.
             seed: of the order of views and every other random choice; or a generator to go on with.
         """
         self.model, self.strategy, self.progress = model, strategy or Fixed(), Progress()
@@ -99,6 +108,9 @@ class Trainer(Generic[M]):
         self._began = generator.get_state()
         parameters = model.parameters()
         self._device = next(iter(parameters.values())).device
+        self.guard = guard
+        judges = middles_of(dataset.train, min(len(dataset.train), GUARD_VIEWS))
+        self._judging = Gauge(dataset, judges, GUARD_SIDE, self._device, self._background)
         self.adam = Adam(parameters, self._rates(1))
         self.strategy.start(model, self.adam, len(dataset.train), generator)
         self._halvings = -1
@@ -183,7 +195,8 @@ class Trainer(Generic[M]):
             self._arrive(first)
             self._queue.restart()
         most = max(1, READ_AHEAD // self._batch) if self._loader.streamed else MAX_STEPS
-        steps = range(first, min(last, first + most - 1, self.strategy.next_edit(first)) + 1)
+        judged = NEVER if self.guard is None else self.guard.due
+        steps = range(first, min(last, first + most - 1, self.strategy.next_edit(first), judged) + 1)
         unchanged = takewhile(lambda i: self._phase_at(i) == phase, steps)
         losses = self._queue.run([self._queued_step(i) for i in unchanged])
         self._arrive(first + len(losses) - 1)
@@ -192,9 +205,29 @@ class Trainer(Generic[M]):
     def refine(self, iteration: int) -> int:
         """Edits if it is time to; returns by how many triangles the model grew."""
         before = self.count
+        if self.guard is not None and self.strategy.next_edit(iteration) == iteration:
+            if iteration in self.guard.left_out:
+                return 0
+            loss, following = self._judging.loss(self.model, self._objective), self.strategy.next_edit(iteration + 1)
+            self.guard.hold(self.progress, following, loss, self._state())
         if self.strategy.edit(iteration):
             self.edited()
+        elif self.guard is not None:
+            self.guard.release_if_same(self._state())
         return self.count - before
+
+    def review(self, progress: Progress) -> UndoEvent | None:
+        """Judges the last edit if it is time to; if it is undone, everything is as it was before."""
+        if self.guard is None or progress.iteration < self.guard.due:
+            return None
+        loss = self._judging.loss(self.model, self._objective)
+        held = self.guard.judge(loss)
+        if held is None:
+            return None
+        undone = UndoEvent(held.iteration, progress.iteration, held.loss, loss)
+        self._load(held.state, held.iteration)
+        progress.iteration, (progress.loss_sum, progress.loss_count) = held.iteration, held.losses
+        return undone
 
     def edited(self) -> None:
         """To be called when tensors of the model were replaced."""
@@ -211,6 +244,11 @@ class Trainer(Generic[M]):
 
     def state(self) -> dict[str, Tensor]:
         """Everything that the rest of the run depends on, by name, for a checkpoint."""
+        judgements = {} if self.guard is None else self.guard.state()
+        return {**self._state(), **{f"guard.{name}": tensor for name, tensor in judgements.items()}}
+
+    def _state(self) -> dict[str, Tensor]:
+        """All but the guard's."""
         parts = {
             "model": self.model.state(),
             "adam.first": self.adam.first_moments,
@@ -223,6 +261,11 @@ class Trainer(Generic[M]):
 
     def load_state(self, state: dict[str, Tensor], iteration: int) -> None:
         """Continues where `state` was taken."""
+        self._load(state, iteration)
+        if self.guard is not None:
+            self.guard.load_state(_part(state, "guard"))
+
+    def _load(self, state: dict[str, Tensor], iteration: int) -> None:
         adopt_kernel(Path("checkpoint"), self._kernel, state)  # refuses one of another kernel of this name
         self.model.load_state(_part(state, "model"))
         first, second = _part(state, "adam.first"), _part(state, "adam.second")

@@ -132,7 +132,8 @@ def _mesh_meaning(metrics: dict[str, Any]) -> str:
 
     vertices = f"{metrics['vertices']:,} vertices; " if metrics.get("vertices") else ""
     degenerate = count("degenerate_faces", "faces without area")
-    return f"{vertices}{degenerate}, {count('self_intersections', 'self-intersecting faces')}."
+    undone = f" Left out, since they spoilt it: {metrics['edits_undone']} edits." if metrics.get("edits_undone") else ""
+    return f"{vertices}{degenerate}, {count('self_intersections', 'self-intersecting faces')}.{undone}"
 
 
 def time_card(metrics: dict[str, Any]) -> Metric:

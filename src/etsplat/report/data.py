@@ -33,7 +33,7 @@ _MEASURED = (
 
 _OPTIONAL: dict[str, Any] = {
     **dict.fromkeys(_MEASURED, float | None),
-    **dict.fromkeys(("vertices", "degenerate_faces", "self_intersections"), int | None),
+    **dict.fromkeys(("vertices", "degenerate_faces", "self_intersections", "edits_undone"), int | None),
     "lpips_reason": str | None,
     "threads": int,
 }

@@ -11,7 +11,7 @@ from typing import Any
 
 from etsplat.io.overview import draw_overview, find_test_views
 from etsplat.io.run_directory import RunDirectory
-from etsplat.optim.loop import Callback, DoneEvent, Event, NoteEvent, PrepareEvent, StepEvent
+from etsplat.optim.loop import Callback, DoneEvent, Event, NoteEvent, PrepareEvent, StepEvent, UndoEvent
 
 _SHOWN = (
     ("psnr", "PSNR", "{:.2f} dB"),
@@ -32,8 +32,8 @@ class NotebookProgress:
 
     def __call__(self, event: Event) -> None:
         """Takes in an event of the run."""
-        if isinstance(event, NoteEvent):
-            print(event.text)
+        if isinstance(event, NoteEvent | UndoEvent):
+            print(event)
         elif isinstance(event, PrepareEvent):
             self._show(f"preparing the pictures: {event.done}/{event.total}")
         elif isinstance(event, StepEvent | DoneEvent):

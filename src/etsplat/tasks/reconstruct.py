@@ -12,6 +12,7 @@ from etsplat.geometry.parts import genera
 from etsplat.io.mesh_files import MeshFile
 from etsplat.model.triangle_mesh import TriangleMesh
 from etsplat.ops.antialias_nvdiffrast import load_nvdiffrast
+from etsplat.optim.guard import Guard
 from etsplat.optim.loop import Callback, NoteEvent
 from etsplat.optim.objective import Objective
 from etsplat.optim.schedules import (
@@ -112,6 +113,7 @@ def reconstruct(
             for suffix in (".ply", ".obj", ".glb"):
                 mesh.save(job.run.mesh_path(suffix), frame)
             sizes = {"faces": len(mesh.faces), "vertices": len(mesh.vertices)}
+            sizes["edits_undone"] = len(trainer.guard.left_out) if trainer.guard else 0
             metrics = job.finish(progress, {**scorer.full(mesh, job.run.test), **sizes}, mesh.vertices)
     return ReconstructResult(job.run.path, metrics, mesh.to_file(frame))
 
@@ -166,6 +168,7 @@ def make_trainer(
         batch=config.batch,
         update=None if config.optimizer.vertex_update == "adam" else UniformSteps(smoothing),
         evaluate=evaluate,
+        guard=Guard(tolerance=refinement.guard, until=length) if refinement.guard else None,
         seed=config.seed,
     )
 

@@ -1,0 +1,77 @@
+"""The loop from the last checkpoint on, with checkpoints and the history of a run."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from etsplat.io.run_directory import RunDirectory
+from etsplat.optim.checkpoints import load_latest_checkpoint, save_checkpoint
+from etsplat.optim.loop import Callback, Event, LoopSettings, Problem, Progress, StepEvent, UndoEvent, optimize
+
+
+def drive(
+    problem: Problem,
+    progress: Progress,
+    settings: LoopSettings,
+    callbacks: Sequence[Callback],
+    run: RunDirectory | None,
+    run_hash: str,
+) -> None:
+    """Runs the loop to the last iteration.
+
+    Args:
+        problem: changed in place.
+        progress: where it stands; changed in place. A checkpoint in `run` takes its place.
+        settings: when things happen.
+        callbacks: each is called with every event.
+        run: gets checkpoints and history.jsonl; None writes nothing.
+        run_hash: identifies all that the result depends on.
+
+    Raises:
+        DivergedError: a loss or parameter is not finite.
+        InputError: the checkpoint is damaged or of another run; the disk is full.
+    """
+    if run is not None:
+        checkpoint = load_latest_checkpoint(run.checkpoints, run_hash)
+        if checkpoint is not None:
+            problem.load_state(checkpoint.tensors, checkpoint.iteration)
+            progress.iteration = checkpoint.iteration
+            progress.seconds, progress.loss_sum, loss_count = checkpoint.tensors["progress"].tolist()
+            progress.loss_count = int(loss_count)
+        run.truncate_history(progress.iteration)
+
+    def save(at: Progress) -> Path:
+        assert run is not None
+        place = torch.tensor([at.seconds, at.loss_sum, at.loss_count], dtype=torch.float64)
+        return save_checkpoint(run.checkpoints, at.iteration, {**problem.state(), "progress": place}, run_hash)
+
+    told = callbacks if run is None else [History(run), *callbacks]
+    for event in optimize(problem, settings, progress, save if run else None, run.checkpoints if run else None):
+        for callback in told:
+            callback(event)
+
+
+class History:
+    """Writes a line for each StepEvent and each UndoEvent; what is said of one iteration is one line."""
+
+    def __init__(self, run: RunDirectory) -> None:
+        """Takes whose history it is."""
+        self._run = run
+        self._undone: dict[str, Any] = {}
+
+    def __call__(self, event: Event) -> None:
+        """Takes in an event."""
+        if isinstance(event, StepEvent):
+            line = {"iteration": event.iteration, "seconds": round(event.seconds, 3), "loss": event.loss}
+            line |= {**event.state, **event.metrics}
+            if event.iteration == self._undone.get("iteration"):
+                self._run.truncate_history(event.iteration - 1)
+                line |= self._undone
+            self._run.append_history(line)
+        elif isinstance(event, UndoEvent):
+            self._run.truncate_history(event.iteration - 1)
+            losses = {"loss_before": event.loss_before, "loss_after": event.loss_after}
+            self._undone = {"iteration": event.iteration, "undone": {"judged": event.judged, **losses}}
+            self._run.append_history(self._undone)
