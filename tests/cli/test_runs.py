@@ -117,6 +117,7 @@ def test_demo_end_to_end_then_refuses_then_overwrites(etsplat: Run, tmp_path: Pa
     assert result.returncode == 0, result.stderr
     for word in ("Optimizing", "PSNR", "Chamfer", "report.html", "overview.png", "mesh.glb"):
         assert word in result.stdout
+    assert result.stdout.splitlines()[-1].startswith("The result is poor: silhouette IoU 0.")
     names = {path.name for path in (tmp_path / "run").iterdir()}
     assert names >= {"mesh.ply", "mesh.obj", "mesh.glb", "metrics.json", "config.json", "history.jsonl"}
     assert names >= {"report.html", "overview.png", "convergence.png", "test", "checkpoints", "README.txt"}

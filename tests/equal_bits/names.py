@@ -128,8 +128,10 @@ TENSORS = Names({r"(mesh|soup)\.(.*)": r"model.\2", r"statistics\.(.*)": r"strat
 _GEOMETRY = ("chamfer", "chamfer_floor", "chamfer_exact", "f_score")
 METRICS = Names(
     {},
-    # Meshes and soups are measured by one scorer; edits that spoil are undone.
-    added=frozenset({"edits_undone", "ssim_mesh", "test_views", "lpips", "lpips_reason", "silhouette_iou", *_GEOMETRY}),
+    # Meshes and soups are measured by one scorer; edits that spoil are undone; results of meshes are judged.
+    added=frozenset(
+        {"edits_undone", "ssim_mesh", "test_views", "lpips", "lpips_reason", "silhouette_iou", "judgement", *_GEOMETRY}
+    ),
     ignored=frozenset({"seconds", "seconds_per_iteration", "versions"}),
 )
 """Of metrics.json."""

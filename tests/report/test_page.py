@@ -62,10 +62,18 @@ def test_page_says_what_the_run_says(run_dir: Path) -> None:
         "98.7",
         "3 self-intersecting faces",
         "Not measured: no weights: give --lpips-weights",
+        '<p class="verdict poor">The result is poor: the result has 1 part and 0 holes, the input mesh &lt;1&gt; part',
     ):
         assert text in page
     assert "bunny &lt;&amp;&gt; co" in page
     assert "bunny <&> co" not in page
+
+
+def test_a_run_that_nobody_judged_has_a_page(tmp_path: Path) -> None:
+    """As those of earlier versions."""
+    run = RunDirectory(write_run(tmp_path))
+    run.write_metrics({key: value for key, value in METRICS.items() if key != "judgement"})
+    assert 'class="verdict' not in write_report(tmp_path).read_text(encoding="utf-8")
 
 
 def test_pictures_are_written(run_dir: Path) -> None:

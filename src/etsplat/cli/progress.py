@@ -119,6 +119,8 @@ def print_summary(console: Console, run_dir: Path) -> None:
     for name, meaning in _FILES:
         if (run_dir / name).is_file():
             console.print(Text(f"{run_dir / name}").append(f"  {meaning}", style="dim"), soft_wrap=True)
+    if run.verdict is not None:
+        console.print(Text(f"The result is {run.verdict}."), soft_wrap=True)
 
 
 def half_blocks(image: Image.Image, columns: int) -> Text:

@@ -275,6 +275,11 @@ class RunDirectory:
         """Writes evaluation.json as `write_metrics` does."""
         _write_json(self.evaluation_path, _null_if_not_finite(evaluation))
 
+    def conclude(self, verdict: str) -> None:
+        """Puts what became of the run into README.txt, in the place of what that said of it before."""
+        task = self.read_config()["task"]
+        _write_text(self.path / "README.txt", f"{_readme(task)}\nThe result is {verdict}.\n")
+
     def append_history(self, line: Mapping[str, Any]) -> None:
         """Appends one line to history.jsonl."""
         with _explained(self.history_path), open(self.history_path, "a", encoding="utf-8") as file:
@@ -317,10 +322,7 @@ class RunDirectory:
             self.test.mkdir(exist_ok=True)
         readme = self.path / "README.txt"
         if not readme.is_file():
-            peer = task == "peer"
-            _write_text(
-                readme, _PEER_README if peer else _README.format(task=task, results=_RESULTS[task], test=_TEST[task])
-            )
+            _write_text(readme, _readme(task))
 
     def _remove_results(self) -> None:
         # config.json goes last: until then the folder still says whose it is.
@@ -329,6 +331,10 @@ class RunDirectory:
         for name in _FOLDERS:
             if (self.path / name).is_dir():
                 shutil.rmtree(self.path / name)
+
+
+def _readme(task: str) -> str:
+    return _PEER_README if task == "peer" else _README.format(task=task, results=_RESULTS[task], test=_TEST[task])
 
 
 def is_empty(folder: Path) -> bool:

@@ -35,6 +35,8 @@ _OPTIONAL: dict[str, Any] = {
     **dict.fromkeys(_MEASURED, float | None),
     **dict.fromkeys(("vertices", "degenerate_faces", "self_intersections", "edits_undone"), int | None),
     "lpips_reason": str | None,
+    "judgement": dict,
+    "judgement.verdict": str,
     "threads": int,
 }
 
@@ -63,6 +65,11 @@ class Run:
     def task(self) -> str:
         """What was run: "reconstruct" or "train"."""
         return self.config["task"]
+
+    @property
+    def verdict(self) -> str | None:
+        """Whether the result is good, and if not why; None for a soup, and for a mesh that nobody judged."""
+        return self.metrics.get("judgement", {}).get("verdict")
 
     def series(self, key: str) -> tuple[list[float], list[float]]:
         """Iterations and values of the history records whose `key` is a number."""

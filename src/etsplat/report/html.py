@@ -65,6 +65,7 @@ def render_page(run: Run) -> str:
         version=version("etsplat"),
         title=escape(_title(run)),
         subtitle=escape(_subtitle(run)),
+        verdict="" if run.verdict is None else _verdict(run.verdict),
         style=_asset("page.css"),
         viewer_script=_asset("viewer.js"),
         page_script=_asset("page.js"),
@@ -91,6 +92,11 @@ def _filled(asset: str, **values: str) -> str:
 def _title(run: Run) -> str:
     path = run.config["paths"]["source"]
     return "Given from Python" if path is None else Path(path.removeprefix("demo:")).stem
+
+
+def _verdict(verdict: str) -> str:
+    kind = "poor" if verdict.startswith("poor") else "good"
+    return f'<p class="verdict {kind}">The result is {escape(verdict)}.</p>'
 
 
 def _subtitle(run: Run) -> str:

@@ -63,7 +63,9 @@ def result_html(path: Path, metrics: Mapping[str, Any], opaque: str) -> str:
         opaque: what the pictures of opaque triangles are called (`Model.OPAQUE`).
     """
     found = [f"{title} {form.format(metrics[key])}" for key, title, form in _SHOWN if metrics.get(key) is not None]
-    caption = f"<p>{escape(' · '.join(found))}<br><code>{escape(str(path))}</code></p>"
+    said = f"The result is {metrics['judgement']['verdict']}." if "judgement" in metrics else ""
+    lines = [escape(line) for line in (" · ".join(found), said) if line]
+    caption = f"<p>{'<br>'.join(lines)}<br><code>{escape(str(path))}</code></p>"
     views = find_test_views(RunDirectory(path).test, opaque)
     if not views:
         return caption

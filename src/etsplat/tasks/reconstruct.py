@@ -1,14 +1,15 @@
 """Shape reconstruction (paper section 3.3): posed images of an object in, a run directory with its mesh out."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from etsplat.data.dataset import Dataset
 from etsplat.engines.choice import engine
-from etsplat.geometry.parts import genera
+from etsplat.geometry.parts import Shape, genera, shape_of
 from etsplat.io.mesh_files import MeshFile
 from etsplat.model.triangle_mesh import TriangleMesh
 from etsplat.ops.antialias_nvdiffrast import load_nvdiffrast
@@ -27,6 +28,16 @@ from etsplat.optim.strategies import SubdivideAndUntangle
 from etsplat.optim.terms.photometric import Photometric
 from etsplat.optim.trainer import Trainer
 from etsplat.optim.vertex_updates import UniformSteps
+from etsplat.tasks.judgement import (
+    TRAINING_VIEWS,
+    Judgement,
+    Start,
+    expect_hull,
+    expect_mesh,
+    expect_photos,
+    judge,
+    spread,
+)
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.running import Job, Result, path_of, terms_of
 from etsplat.tasks.scoring import Scorer, load_lpips
@@ -46,6 +57,11 @@ class ReconstructResult(Result):
     OPAQUE = TriangleMesh.OPAQUE
 
     mesh: MeshFile
+
+    @property
+    def verdict(self) -> str:
+        """A sentence that begins with "good" or "poor"; of a poor result it says what is wrong and what to try."""
+        return self.metrics["judgement"]["verdict"]
 
 
 def reconstruct(
@@ -103,7 +119,9 @@ def reconstruct(
             lpips=load_lpips(config.output.lpips_weights, job.device),
         )
         mesh = make_start(start, views, config, job.device)
-        if start is None and config.start.shape == "hull":
+        begun: Start = "mesh" if start is not None else config.start.shape
+        judging = partial(_judge, scorer, views, truth, config, begun, shape_of(*mesh.surface()))
+        if begun == "hull":
             holes = genera(mesh.faces.cpu(), len(mesh.vertices))
             job.announce(NoteEvent(f"start: the visual hull, {mesh.count:,} faces; holes in each part: {holes}"))
             config = nearby(config)
@@ -114,8 +132,41 @@ def reconstruct(
                 mesh.save(job.run.mesh_path(suffix), frame)
             sizes = {"faces": len(mesh.faces), "vertices": len(mesh.vertices)}
             sizes["edits_undone"] = len(trainer.guard.left_out) if trainer.guard else 0
-            metrics = job.finish(progress, {**scorer.full(mesh, job.run.test), **sizes}, mesh.vertices)
+            found = {**scorer.full(mesh, job.run.test), **sizes}
+            judgement = judging(mesh, found)
+            metrics = job.finish(progress, {**found, "judgement": judgement.to_dict()}, mesh.vertices)
+            job.run.conclude(judgement.verdict)
     return ReconstructResult(job.run.path, metrics, mesh.to_file(frame))
+
+
+def _judge(
+    scorer: Scorer,
+    views: Dataset,
+    truth: MeshFile | None,
+    config: ReconstructConfig,
+    begun: Start,
+    start: Shape,
+    mesh: TriangleMesh,
+    scores: Mapping[str, Any],
+) -> Judgement:
+    """A run ends with the parts and holes of its start, so those of a hull are what its silhouettes show."""
+    found = shape_of(*mesh.surface())
+    if truth is not None:
+        expected = expect_mesh(truth, views, found, config.start.radius)
+    elif begun == "hull":
+        expected = expect_hull(start)
+    else:
+        expected = expect_photos(views, found, config.start.radius)
+    return judge(
+        "test" if views.test else "training",
+        scores if views.test else scorer.opaque(mesh, spread(views.train, TRAINING_VIEWS)),
+        100 * scores["self_intersections"] / mesh.count,
+        found,
+        expected,
+        begun=begun,
+        preset=config.preset,
+        untangled=config.refinement.untanglings > 0,
+    )
 
 
 def nearby(config: ReconstructConfig) -> ReconstructConfig:

@@ -152,19 +152,34 @@ class Scorer:
         reason = self.lpips_reason if rows else "no test views"
         return {**self._geometry(model), **means, "lpips_reason": reason, "test_views": rows}
 
+    def opaque(self, model: Model, views: Sequence[int]) -> dict[str, float | None]:
+        """Means over some views, by index, of how a mesh viewer draws a model: "psnr_mesh" and "silhouette_iou".
+
+        None where there are no views, or no masks.
+        """
+        rows = []
+        for seen in (self.see(model, index) for index in views):
+            rows.append((psnr(seen.counting(seen.opaque), seen.photo), self._outline_iou(seen)))
+        psnrs, ious = zip(*rows, strict=True) if rows else ((), ())
+        return {"psnr_mesh": _mean(psnrs), "silhouette_iou": _mean(ious)}
+
     def see(self, model: Model, index: int) -> Seen:
         """A view of the data set, by its index, beside the model's."""
         return Seen(model, self._views.view(index), self._background, self._supersampling)
 
     def _scores(self, seen: Seen, opaque: str) -> dict[str, float | None]:
         splatted, drawn = seen.counting(seen.splatted), seen.counting(seen.opaque)
-        outline = None if seen.alpha is None or not self._has_outlines else seen.alpha
         return {
             **image_scores(splatted, seen.photo, names=("psnr", "ssim")),
             **image_scores(drawn, seen.photo, names=("psnr", "ssim"), suffix=f"_{opaque}"),
             **image_scores(splatted, seen.photo, self._lpips, ("lpips",)),
-            "silhouette_iou": None if outline is None else silhouette_iou(seen.covered[..., 3], outline),
+            "silhouette_iou": self._outline_iou(seen),
         }
+
+    def _outline_iou(self, seen: Seen) -> float | None:
+        if seen.alpha is None or not self._has_outlines:
+            return None
+        return silhouette_iou(seen.covered[..., 3], seen.alpha)
 
     @cached_property
     def _has_outlines(self) -> bool:

@@ -1,0 +1,194 @@
+"""Whether a reconstruction is good: its outline, its faces, its parts and holes; and what to try where it is not.
+
+The limits are what good and bad runs were found to have; research/results.md has the numbers.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Literal
+
+from etsplat.data.dataset import Dataset
+from etsplat.data.visual_hull import visual_hull
+from etsplat.geometry.intersections import intersecting_faces
+from etsplat.geometry.parts import Shape, shape_of
+from etsplat.io.mesh_files import MeshFile, weld_vertices
+
+Views = Literal["test", "training"]
+Start = Literal["sphere", "hull", "mesh"]
+
+GOOD_IOU = 0.97
+"""Silhouette IoU that good results have at least."""
+
+GOOD_INTERSECTING = 1.0
+"""Percentage of faces that cut through others, which good results have at most."""
+
+TRAINING_VIEWS = 16
+"""So many training views, evenly spaced, are looked at where there are no test views."""
+
+_HULL_FACES = 12_500
+"""Of the hull whose holes are counted: enough for spokes and crossbars that are 3 % of the object."""
+
+_HULL_VIEWS = (16, 64)
+"""The hull is carved from so many views: from more only where the few say that something is wrong."""
+
+
+@dataclass(frozen=True)
+class Expected:
+    """What a result should look like.
+
+    Attributes:
+        shape: parts and holes, or why they are unclear, in a sentence.
+        of: what has them: "input mesh" or "visual hull"; None where they are unclear.
+        shown: whether silhouettes show them; a tunnel that nobody can look through is in none.
+    """
+
+    shape: Shape
+    of: str | None
+    shown: bool = True
+
+    @classmethod
+    def unclear(cls, reason: str) -> "Expected":
+        """Nothing is known, because `reason`."""
+        return cls(Shape(None, None, reason), None)
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """What metrics.json has under "judgement".
+
+    Attributes:
+        views: which photos were looked at: "test", or "training" where there are no test views.
+        silhouette_iou: mean over them; None without masks.
+        psnr_mesh: of the opaque mesh, mean over them, in dB.
+        intersecting_percent: faces of the result that cut through others.
+        parts: of the result; None, as `holes`, where it is no closed manifold.
+        holes: of the result.
+        expected_parts: what it should have; None, as `expected_holes`, where that is not known.
+        expected_holes: what it should have.
+        expected_of: "input mesh" or "visual hull"; None where neither tells.
+        verdict: a sentence that begins with "good" or "poor"; of a poor result it says what is wrong and what to try.
+    """
+
+    views: Views
+    silhouette_iou: float | None
+    psnr_mesh: float | None
+    intersecting_percent: float
+    parts: int | None
+    holes: int | None
+    expected_parts: int | None
+    expected_holes: int | None
+    expected_of: str | None
+    verdict: str
+
+    def to_dict(self) -> dict[str, Any]:
+        """As in metrics.json."""
+        return asdict(self)
+
+
+def expect_mesh(truth: MeshFile, photos: Dataset, found: Shape, radius: float) -> Expected:
+    """What a result for an input mesh should look like. Where `found` is something else, its `photos` are asked too."""
+    welded = weld_vertices(truth)
+    shape = shape_of(welded.vertices, welded.faces)
+    if shape.unclear:
+        return Expected.unclear(f"the input mesh {shape.unclear}")
+    if shape.parts != 1 and bool(intersecting_faces(welded.vertices, welded.faces).any()):
+        return Expected.unclear("the input mesh has parts that cut through each other")
+    shown = shape == found or expect_photos(photos, found, radius).shape != found
+    return Expected(shape, "input mesh", shown)
+
+
+def expect_photos(photos: Dataset, found: Shape, radius: float) -> Expected:
+    """What the silhouettes say of a result with the shape `found`; `radius` as `visual_hull` takes it."""
+    if not photos.has_masks:
+        return Expected.unclear("the photos have no masks")
+    shape = found
+    for count in _HULL_VIEWS:
+        vertices, faces = visual_hull(replace(photos, train=spread(photos.train, count)), _HULL_FACES, radius=radius)
+        if len(faces) == 0:
+            return Expected.unclear("the silhouettes have no point in common")
+        shape = shape_of(vertices, faces)
+        if shape == found or count >= len(photos.train):
+            break
+    return expect_hull(shape)
+
+
+def expect_hull(shape: Shape) -> Expected:
+    """What a result should look like whose visual hull has this shape."""
+    return Expected.unclear(f"the visual hull {shape.unclear}") if shape.unclear else Expected(shape, "visual hull")
+
+
+def spread(items: Sequence[int], count: int) -> list[int]:
+    """At most so many of the items, evenly spaced."""
+    kept = min(count, len(items))
+    return [items[number * len(items) // kept] for number in range(kept)]
+
+
+def judge(
+    views: Views,
+    scores: Mapping[str, float | None],
+    intersecting_percent: float,
+    found: Shape,
+    expected: Expected,
+    *,
+    begun: Start,
+    preset: str,
+    untangled: bool,
+) -> Judgement:
+    """Judges a result.
+
+    Args:
+        views: what the scores are means over.
+        scores: "silhouette_iou" and "psnr_mesh".
+        intersecting_percent: faces that cut through others.
+        found: what the result looks like.
+        expected: what it should look like.
+        begun: what the run started from; with the rest it decides what to try next.
+        preset: of the run.
+        untangled: whether faces that cut through others were smoothed away.
+    """
+    iou, poor = scores["silhouette_iou"], []
+    hull = "--start.shape hull" if begun == "sphere" else None
+    longer = None if preset == "best" else "--preset best"
+    if expected.shown and _differ(found, expected.shape):
+        remedy = hull or "--init-mesh with a mesh that has them"
+        poor.append(f"the result has {_counted(found)}, the {expected.of} {_counted(expected.shape)}: try {remedy}")
+    if iou is not None and iou < GOOD_IOU:
+        remedies = " or ".join(filter(None, (hull, longer))) or "--init-mesh, and check masks and poses"
+        poor.append(f"silhouette IoU {iou:.3f} where good results have {GOOD_IOU:.2f} on {views} views: try {remedies}")
+    if intersecting_percent > GOOD_INTERSECTING:
+        remedy = (hull or longer or "--init-mesh") if untangled else "--refinement.untanglings 6"
+        poor.append(f"{intersecting_percent:.1f} % of its faces cut through others: try {remedy}")
+    return Judgement(
+        views=views,
+        silhouette_iou=iou,
+        psnr_mesh=scores["psnr_mesh"],
+        intersecting_percent=intersecting_percent,
+        parts=found.parts,
+        holes=found.holes,
+        expected_parts=expected.shape.parts,
+        expected_holes=expected.shape.holes,
+        expected_of=expected.of,
+        verdict=f"poor: {'; '.join(poor)}" if poor else _praise(views, scores, intersecting_percent, found, expected),
+    )
+
+
+def _differ(found: Shape, expected: Shape) -> bool:
+    clear = not (found.unclear or expected.unclear)
+    return clear and (found.parts, found.holes) != (expected.parts, expected.holes)
+
+
+def _praise(
+    views: Views, scores: Mapping[str, float | None], intersecting_percent: float, found: Shape, expected: Expected
+) -> str:
+    seen = (("silhouette IoU {:.3f}", scores["silhouette_iou"]), ("PSNR of the mesh {:.2f} dB", scores["psnr_mesh"]))
+    said = [form.format(value) for form, value in seen if value is not None]
+    said.append(f"{intersecting_percent:.1f} % of the faces cut through others")
+    if found.unclear or expected.shape.unclear:
+        reason = f"the result {found.unclear}" if found.unclear else expected.shape.unclear
+        return f"good on {views} views: {', '.join(said)}; parts and holes were not compared: {reason}"
+    same = f"as the {expected.of}" if expected.shown else f"as silhouettes of the {expected.of} show it"
+    return f"good on {views} views: {', '.join(said)}; {_counted(found)}, {same}"
+
+
+def _counted(shape: Shape) -> str:
+    return f"{shape.parts} part{'s' * (shape.parts != 1)} and {shape.holes} hole{'s' * (shape.holes != 1)}"

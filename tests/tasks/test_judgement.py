@@ -1,0 +1,147 @@
+"""Whether a result is called good or poor, and what is said of a poor one."""
+
+import re
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+import trimesh
+
+from etsplat import reconstruct
+from etsplat.data.photograph import photograph
+from etsplat.geometry.icosphere import icosphere
+from etsplat.geometry.parts import Shape
+from etsplat.io.mesh_files import MeshFile
+from etsplat.tasks.judgement import Expected, Judgement, expect_mesh, expect_photos, judge, spread
+from etsplat.tasks.reconstruct_config import ReconstructConfig
+
+BALL, RING = Shape(1, 0), Shape(1, 1)
+GOOD = {"silhouette_iou": 0.99, "psnr_mesh": 31.0}
+
+
+def ring() -> MeshFile:
+    mesh = trimesh.creation.torus(1.0, 0.3, major_sections=32, minor_sections=16)
+    return MeshFile(torch.from_numpy(mesh.vertices.copy()).float(), torch.from_numpy(mesh.faces.copy()).long())
+
+
+def ball(size: float = 1.0, x: float = 0.0) -> MeshFile:
+    vertices, faces = icosphere(2)
+    return MeshFile(size * vertices + torch.tensor([x, 0.0, 0.0]), faces)
+
+
+def joined(*meshes: MeshFile) -> MeshFile:
+    offsets = torch.tensor([0, *(len(mesh.vertices) for mesh in meshes)]).cumsum(0)
+    faces = [mesh.faces + offset for mesh, offset in zip(meshes, offsets, strict=False)]
+    return MeshFile(torch.cat([mesh.vertices for mesh in meshes]), torch.cat(faces))
+
+
+def judged(
+    found: Shape = BALL,
+    expected: Shape = BALL,
+    scores: Mapping[str, float | None] = GOOD,
+    intersecting: float = 0.0,
+    *,
+    preset: str = "quick",
+    untangled: bool = True,
+    shown: bool = True,
+) -> Judgement:
+    wanted = Expected(expected, None if expected.unclear else "input mesh", shown)
+    return judge("test", scores, intersecting, found, wanted, begun="sphere", preset=preset, untangled=untangled)
+
+
+def test_of_a_good_result_nothing_is_said_but_its_numbers():
+    verdict = judged().verdict
+    assert verdict.startswith("good on test views: silhouette IoU 0.990, PSNR of the mesh 31.00 dB, 0.0 % of the faces")
+    assert verdict.endswith("1 part and 0 holes, as the input mesh")
+    assert "try" not in verdict
+
+
+def test_photos_without_masks_have_no_outline_to_judge():
+    assert judged(scores={"silhouette_iou": None, "psnr_mesh": 20.0}).verdict.startswith("good on test views: PSNR of")
+
+
+def test_other_parts_and_holes_are_said_with_what_to_try():
+    found = judged(expected=Shape(2, 4))
+    assert found.verdict == (
+        "poor: the result has 1 part and 0 holes, the input mesh 2 parts and 4 holes: try --start.shape hull"
+    )
+    assert (found.parts, found.holes, found.expected_parts, found.expected_holes) == (1, 0, 2, 4)
+
+
+def test_holes_that_no_silhouette_shows_are_not_held_against_a_result():
+    found = judged(expected=Shape(1, 12), shown=False)
+    assert found.verdict.endswith("1 part and 0 holes, as silhouettes of the input mesh show it")
+    assert found.expected_holes == 12
+
+
+@pytest.mark.parametrize(
+    ("preset", "remedy"), [("quick", "--start.shape hull or --preset best"), ("best", "--start.shape hull")]
+)
+def test_a_poor_outline_is_said(preset, remedy):
+    verdict = judged(scores={**GOOD, "silhouette_iou": 0.92}, preset=preset).verdict
+    assert verdict == f"poor: silhouette IoU 0.920 where good results have 0.97 on test views: try {remedy}"
+
+
+def test_faces_that_cut_through_others_are_said():
+    assert judged(intersecting=3.14).verdict == "poor: 3.1 % of its faces cut through others: try --start.shape hull"
+    assert judged(intersecting=3.14, untangled=False).verdict.endswith("try --refinement.untanglings 6")
+    assert judged(intersecting=0.9).verdict.startswith("good")
+
+
+def test_an_open_input_is_said_and_not_compared():
+    found = judged(expected=Shape(None, None, "the input mesh is not closed"))
+    assert found.verdict.endswith("parts and holes were not compared: the input mesh is not closed")
+    assert (found.expected_of, found.expected_parts) == (None, None)
+
+
+def test_an_input_mesh_is_welded_and_counted():
+    """A ring whose faces share no vertex; and a ball inside of another, which nobody sees."""
+    torus = ring()
+    apart = MeshFile(torus.vertices[torus.faces].reshape(-1, 3), torch.arange(3 * len(torus.faces)).reshape(-1, 3))
+    photos = photograph(torus, 32, 32, supersampling=1)
+    assert expect_mesh(apart, photos, RING, 1.05) == Expected(RING, "input mesh")
+    assert expect_mesh(joined(ball(), ball(0.5)), photos, BALL, 1.05) == Expected(BALL, "input mesh")
+    assert expect_mesh(joined(ball(), ball(x=3)), photos, Shape(2, 0), 1.05).shape == Shape(2, 0)
+
+
+def test_inputs_whose_parts_are_unclear_say_why():
+    photos = photograph(ball(), 16, 16, supersampling=1)
+    opened = ball()
+    opened = replace(opened, faces=opened.faces[1:])
+    assert expect_mesh(opened, photos, BALL, 1.05).shape.unclear == "the input mesh is not closed"
+    crossing = expect_mesh(joined(ball(), ball(x=1)), photos, BALL, 1.05)
+    assert crossing.shape.unclear == "the input mesh has parts that cut through each other"
+
+
+def test_silhouettes_tell_whether_a_ring_is_a_ring():
+    """What the result is does not decide what they show; and a hole of the mesh that they do show counts."""
+    photos = photograph(ring(), 96, 96, supersampling=1)
+    assert expect_photos(photos, RING, 1.05) == Expected(RING, "visual hull")
+    assert expect_photos(photos, BALL, 1.05) == Expected(RING, "visual hull")
+    assert expect_mesh(ring(), photos, BALL, 1.05).shown
+    assert not expect_mesh(ring(), photograph(ball(), 48, 48, supersampling=1), BALL, 1.05).shown
+
+
+def test_views_are_spread_evenly():
+    assert spread(range(10), 5) == [0, 2, 4, 6, 8]
+    assert spread([3, 5], 16) == [3, 5]
+
+
+def test_a_run_from_photos_alone_ends_with_a_verdict_everywhere(tmp_path: Path):
+    """A ring from a sphere, without test views: poor, by the training views; in metrics, README.txt and result."""
+    photos = photograph(ring(), 48, 48, supersampling=1)
+    photos = replace(photos, train=sorted([*photos.train, *photos.test]), test=[])
+    config = ReconstructConfig.tiny().changed({"iterations": 5})
+    result = reconstruct(photos, tmp_path / "run", config)
+    found = result.metrics["judgement"]
+    assert result.metrics["silhouette_iou"] is None
+    assert (found["views"], found["expected_of"]) == ("training", "visual hull")
+    assert 0 < found["silhouette_iou"] < 0.97
+    assert (found["parts"], found["holes"], found["expected_holes"]) == (1, 0, 1)
+    assert result.verdict.startswith("poor: the result has 1 part and 0 holes, the visual hull 1 part and 1 hole: try")
+    readme = (tmp_path / "run" / "README.txt").read_text()
+    assert readme.endswith(f"\nThe result is {result.verdict}.\n")
+    assert len(re.findall("The result is", readme)) == 1
+    assert "The result is poor" in result._repr_html_()
