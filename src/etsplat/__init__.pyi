@@ -61,6 +61,7 @@ from etsplat.optim.densification import PruneRules as PruneRules
 from etsplat.optim.edit import RowPlan as RowPlan
 from etsplat.optim.edit import apply_rows as apply_rows
 from etsplat.optim.edit import apply_subdivision as apply_subdivision
+from etsplat.optim.guard import Guard as Guard
 from etsplat.optim.loop import CheckpointEvent as CheckpointEvent
 from etsplat.optim.loop import DivergedError as DivergedError
 from etsplat.optim.loop import DoneEvent as DoneEvent
@@ -92,6 +93,7 @@ from etsplat.optim.terms.soup import Opacity as Opacity
 from etsplat.optim.terms.soup import Size as Size
 from etsplat.optim.trainer import Trainer as Trainer
 from etsplat.optim.vertex_updates import UniformSteps as UniformSteps
+from etsplat.optim.watch import Outcome as Outcome
 from etsplat.report.html import write_report as write_report
 from etsplat.tasks.reconstruct import ReconstructResult as ReconstructResult
 from etsplat.tasks.reconstruct import reconstruct as reconstruct

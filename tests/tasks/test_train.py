@@ -262,7 +262,7 @@ def test_an_opaque_finish_replaces_what_it_hides(capture: Dataset) -> None:
 def test_few_photos_end_a_run_earlier(capture: Dataset, tmp_path: Path) -> None:
     """With `max_epochs` a run has so many iterations for each training photo, says so, and resumes with that length."""
     config = SHORT.changed({"schedule.max_epochs": 1})
-    steps, events = len(capture.train), list[object]()
+    steps, events = len(capture.watching().train), list[object]()
     result = train(capture, tmp_path / "run", config, callbacks=[events.append])
     assert result.metrics["iterations"] == steps < config.iterations
     record = RunDirectory(result.path).read_config()

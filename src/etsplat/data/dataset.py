@@ -10,7 +10,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from etsplat.core.cameras import Cameras, camera_centers
+from etsplat.core.errors import InputError
 from etsplat.data.pictures import Pictures, as_float, halved
+
+WATCHED_ONE_IN, WATCHED_FROM = 16, 24
+"""One in so many training photos is kept aside to watch runs by, where there are at least so many."""
 
 SPREAD_FACTOR = 1.1
 """Extent = this times the largest distance of a training camera from their mean, as 3DGS has it."""
@@ -52,6 +56,7 @@ class Dataset:
         names: B names, unique, fit for files.
         train: indices of the views to optimise on, ascending.
         test: indices of the views held out, ascending. Disjoint from `train`.
+        watched: indices of the views kept from training to watch runs by, ascending. Disjoint from both.
         exact_points: (P, 3) float64, P > 0, or None.
         point_colors: (P, 3) float32 in [0, 1] as displayed, or None without points.
         normalization: from the input's own units to the present frame.
@@ -69,16 +74,18 @@ class Dataset:
     exact_points: Float[Tensor, "P 3"] | None = None
     point_colors: Float[Tensor, "P 3"] | None = None
     normalization: Normalization = field(default_factory=Normalization)
+    watched: list[int] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         B = len(self.viewmats)
         for name, count in (("Ks", len(self.Ks)), ("images", len(self.images.sizes)), ("names", len(self.names))):
             if count != B:
                 raise ValueError(f"{name}: expected {B}, one per viewmat, got {count}")
-        if sorted([*self.train, *self.test]) != sorted(set(self.train) | set(self.test)):
-            raise ValueError("train, test: expected disjoint indices without repetition")
-        if not all(0 <= index < B for index in [*self.train, *self.test]):
-            raise ValueError(f"train, test: expected indices in [0, {B})")
+        split = [*self.train, *self.test, *self.watched]
+        if len(split) != len(set(split)):
+            raise ValueError("train, test, watched: expected disjoint indices without repetition")
+        if not all(0 <= index < B for index in split):
+            raise ValueError(f"train, test, watched: expected indices in [0, {B})")
 
     def __len__(self) -> int:
         return len(self.viewmats)
@@ -114,7 +121,7 @@ class Dataset:
     def fingerprint(self) -> str:
         """A short hash of all that a run depends on: cameras, split, points, names, and the photos and masks."""
         digest = hashlib.sha256()
-        split = torch.tensor([*self.train, -1, *self.test])
+        split = torch.tensor([*self.train, -1, *self.test, *([-1, *self.watched] if self.watched else [])])
         for tensor in (self.viewmats, self.Ks, split, self.exact_points, self.point_colors):
             if tensor is not None:
                 digest.update(str(tuple(tensor.shape)).encode())
@@ -122,6 +129,28 @@ class Dataset:
         digest.update(repr((self.names, self.images.sizes)).encode())
         digest.update(self.images.fingerprint())
         return digest.hexdigest()[:16]
+
+    def watching(self, one_in: int | None = None) -> "Dataset":
+        """The same with some of the training views kept from training, evenly spread, to watch runs by.
+
+        Args:
+            one_in: keeps one in so many; 0 keeps none; None keeps one in 16 where there are 24 or more. A data set that
+                has watched views already stays as it is.
+
+        Raises:
+            InputError: that would be none, or all.
+        """
+        count = len(self.train)
+        if self.watched or one_in == 0 or (one_in is None and count < WATCHED_FROM):
+            return self
+        kept = count // (one_in or WATCHED_ONE_IN)
+        if not 0 < kept < count:
+            raise InputError(
+                f"watch: one in {one_in} of {count} training photos would be {'all' if kept else 'none'}; choose a "
+                f"number from 2 to {count}, or 0"
+            )
+        watched = middles_of(self.train, kept)
+        return replace(self, train=[index for index in self.train if index not in watched], watched=watched)
 
     def halved(self) -> "Dataset":
         """The same views at half the size, each pixel the mean of those it replaces (odd sizes are rounded down)."""

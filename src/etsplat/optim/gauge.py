@@ -1,6 +1,7 @@
 """What a model is measured on in the course of a run: some views at a small size, kept."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property
 
 import torch
@@ -9,10 +10,24 @@ from torch import Tensor
 from etsplat.data.dataset import Dataset
 from etsplat.data.loader import View, ViewLoader
 from etsplat.model.model import Model
+from etsplat.ops.photometric import photometric_loss
 from etsplat.optim.objective import Drawing, Objective
 
 _CORNERS = [[float(corner >> bit & 1) for bit in range(3)] for corner in range(8)]
 """Backgrounds in turn where a run has random ones, so that a picture cannot hide before all of them."""
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Means over some views.
+
+    Attributes:
+        loss: the photometric term.
+        psnr: in dB; pixels that a mask leaves out count as right.
+    """
+
+    loss: float
+    psnr: float
 
 
 class Gauge:
@@ -20,6 +35,9 @@ class Gauge:
 
     Photos are halved until none has a longer side than asked for, whatever size a run trains on at the time. They are
     made when they are first needed, and kept.
+
+    Attributes:
+        views: how many they are.
     """
 
     def __init__(
@@ -39,22 +57,26 @@ class Gauge:
             device: of the models.
             background: (1, 3) behind pictures and photos; None for the corners of the colour cube, in turn.
         """
+        self.views = len(views)
         self._dataset, self._indices, self._side, self._device = dataset, list(views), side, device
         colors = torch.tensor(_CORNERS) if background is None else background
         self._backgrounds = colors.to(device)
 
     @torch.no_grad()
-    def loss(self, model: Model, objective: Objective) -> float:
-        """The photometric term of an objective, mean over the views."""
-        values = [objective.photometric(drawing) for drawing in self._drawings(model, objective)]
-        return float(torch.stack(values).double().mean())
-
-    def _drawings(self, model: Model, objective: Objective) -> Iterator[Drawing]:
+    def measure(self, model: Model, objective: Objective) -> Measured:
+        """The photometric term of an objective, and the PSNR; means over the views."""
+        term, losses, errors = objective.photometric, [], []
         for number, view in enumerate(self._views):
             background = self._backgrounds[number % len(self._backgrounds)][None]
-            outputs, depth_of = objective.photometric.outputs, objective.depth_of
-            rendering = model.render(view.camera, backgrounds=background, outputs=outputs, depth_of=depth_of)
-            yield Drawing(model, view.camera, view.photo, view.mask, background, rendering)
+            rendering = model.render(
+                view.camera, backgrounds=background, outputs=("color", *term.outputs), depth_of=objective.depth_of
+            )
+            losses.append(term(Drawing(model, view.camera, view.photo, view.mask, background, rendering)))
+            mask = None if view.mask is None else view.mask.float() / 255
+            color = rendering.color.clamp(0.0, 1.0)
+            errors.append(photometric_loss(color, view.photo, 0.0, mask, backgrounds=background, pixel="l2"))
+        psnr = -10 * torch.stack(errors).double().log10()
+        return Measured(float(torch.stack(losses).double().mean()), float(psnr.mean()))
 
     @cached_property
     def _views(self) -> list[View]:

@@ -75,9 +75,10 @@ class StepEvent:
 
     @property
     def summary(self) -> str:
-        """Loss, PSNR if it was measured, number of triangles and softness."""
+        """Loss, PSNR of test and watched photos if it was measured, number of triangles and softness."""
         parts = [f"loss {self.loss:.4f}"]
         parts += [f"{self.metrics['psnr']:.2f} dB"] if "psnr" in self.metrics else []
+        parts += [f"watched {self.metrics['watched_psnr']:.2f} dB"] if "watched_psnr" in self.metrics else []
         parts += [f"{self.state[name]:,} {name}" for name in ("faces", "triangles") if name in self.state]
         parts += [f"σ {self.state['sigma']:.3f}"] if "sigma" in self.state else []
         return " · ".join(parts)

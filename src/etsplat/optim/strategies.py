@@ -51,6 +51,9 @@ class Strategy:
         """Edits the model if it is time to. Returns whether tensors were replaced."""
         return False
 
+    def finish(self, model: Any) -> None:
+        """Does to an earlier state of the model, which is to be the result, what `edit` does after the last step."""
+
     def observe(self, seen: Rasterization, *, epoch_starts: bool) -> None:
         """Takes in a view of a step; `epoch_starts` if it is the first after all views had their turn."""
 
@@ -93,9 +96,10 @@ class SubdivideAndUntangle(Strategy):
             raise DivergedError(f"the areas of faces are not finite at iteration {iteration}; lower the learning rates")
         if iteration in self._untangle_after:
             # What smoothing takes away later steps bring back, but nothing does after the last.
-            reach = 0.5 if iteration == max(self._untangle_after) else math.inf
-            with torch.no_grad():
-                mesh.vertices.copy_(untangle(mesh.vertices.cpu(), topology, reach=reach)[0])
+            if iteration == max(self._untangle_after):
+                self.finish(mesh)
+            else:
+                _untangle(mesh, math.inf)
         if iteration not in self._budgets:
             return False
         vertices = mesh.vertices.detach().cpu()
@@ -103,6 +107,17 @@ class SubdivideAndUntangle(Strategy):
         carried = apply_subdivision(plan, self.adam, per_vertex=mesh.vertex_parameters, per_face=mesh.face_parameters)
         mesh.load_state({**carried, "faces": plan.faces})
         return True
+
+    def finish(self, model: TriangleMesh) -> None:
+        """Untangles it, where folds need not move far, if any untangling was asked for."""
+        if self._untangle_after:
+            _untangle(model, 0.5)
+
+
+@torch.no_grad()
+def _untangle(mesh: TriangleMesh, reach: float) -> None:
+    topology = mesh.topology.to(torch.device("cpu"))
+    mesh.vertices.copy_(untangle(mesh.vertices.cpu(), topology, reach=reach)[0])
 
 
 @dataclass

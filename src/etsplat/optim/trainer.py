@@ -33,12 +33,16 @@ from etsplat.optim.schedules import NEVER, Schedule, at
 from etsplat.optim.step_queue import MAX_STEPS, QueuedStep, RowLayout, StepQueue
 from etsplat.optim.strategies import Fixed, Strategy
 from etsplat.optim.view_sampler import ViewSampler
+from etsplat.optim.watch import Outcome, Watch
 
 READ_AHEAD = 8
 """Views whose photos are decoded ahead of their turn, where they do not fit into memory."""
 
 GUARD_SIDE, GUARD_VIEWS = 128, 32
 """Edits are judged by pictures with at most so many pixels on a side, of at most so many training views."""
+
+WATCH_SIDE = 512
+"""The photos that are kept aside are measured with at most so many pixels on a side."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +90,8 @@ class Trainer(Generic[M]):
 
         Args:
             model: the start, on the device where the run is to be.
-            dataset: photos and cameras; the views in `dataset.train` are fitted to.
+            dataset: photos and cameras; the views in `dataset.train` are fitted to, those in `dataset.watched` are
+                measured at every evaluation, and choose the state that `outcome` gives.
             objective: what is minimised.
             strategy: what adds and removes triangles; None for `Fixed`.
             schedule: learning rates, and what else changes over the run; None for the model's own rates throughout.
@@ -111,6 +116,10 @@ class Trainer(Generic[M]):
         self.guard = guard
         judges = middles_of(dataset.train, min(len(dataset.train), GUARD_VIEWS))
         self._judging = Gauge(dataset, judges, GUARD_SIDE, self._device, self._background)
+        self._watch: Watch | None = None
+        if dataset.watched:
+            kept = Gauge(dataset, dataset.watched, WATCH_SIDE, self._device, self._background)
+            self._watch = Watch(kept, objective, self._look)
         self.adam = Adam(parameters, self._rates(1))
         self.strategy.start(model, self.adam, len(dataset.train), generator)
         self._halvings = -1
@@ -208,7 +217,10 @@ class Trainer(Generic[M]):
         if self.guard is not None and self.strategy.next_edit(iteration) == iteration:
             if iteration in self.guard.left_out:
                 return 0
-            loss, following = self._judging.loss(self.model, self._objective), self.strategy.next_edit(iteration + 1)
+            loss, following = (
+                self._judging.measure(self.model, self._objective).loss,
+                self.strategy.next_edit(iteration + 1),
+            )
             self.guard.hold(self.progress, following, loss, self._state())
         if self.strategy.edit(iteration):
             self.edited()
@@ -220,7 +232,7 @@ class Trainer(Generic[M]):
         """Judges the last edit if it is time to; if it is undone, everything is as it was before."""
         if self.guard is None or progress.iteration < self.guard.due:
             return None
-        loss = self._judging.loss(self.model, self._objective)
+        loss = self._loss()
         held = self.guard.judge(loss)
         if held is None:
             return None
@@ -235,8 +247,24 @@ class Trainer(Generic[M]):
             self._queue.restart()
 
     def evaluate(self) -> dict[str, float]:
-        """Cheap metrics of the present state."""
-        return self._evaluate(self.model) if self._evaluate else {}
+        """Cheap metrics of the present state, which is kept if the watched photos speak for it."""
+        metrics = self._evaluate(self.model) if self._evaluate else {}
+        return metrics | (self._watch.observe(self.model, self.progress.iteration) if self._watch else {})
+
+    def outcome(self) -> Outcome[M]:
+        """What the run gives: the last state, or an earlier one where the watched photos speak for it (optim/watch.py).
+
+        Changes nothing, so that the run can be gone on with.
+        """
+        last = self.progress.iteration
+        if self._watch is None:
+            return Outcome(self.model, last)
+
+        def finish(model: M) -> None:
+            if self.guard is None or last not in self.guard.left_out:
+                self.strategy.finish(model)
+
+        return self._watch.outcome(self.model, last, finish)
 
     def first_not_finite(self) -> str | None:
         """The name of a parameter that holds NaN or infinity, or None."""
@@ -255,6 +283,7 @@ class Trainer(Generic[M]):
             "adam.second": self.adam.second_moments,
             "strategy": self.strategy.state(),
             "sampler": self._sampler.state(),
+            "watch": self._watch.state() if self._watch else {},
         }
         state = {f"{part}.{name}": tensor for part, tensors in parts.items() for name, tensor in tensors.items()}
         return {**state, **kernel_tensors(self._kernel), "adam.step_count": torch.tensor(self.adam.step_count)}
@@ -274,6 +303,8 @@ class Trainer(Generic[M]):
         self.adam.step_count = int(state["adam.step_count"])
         self.strategy.load_state(_part(state, "strategy"))
         self._sampler.load_state(_part(state, "sampler"))
+        if self._watch is not None:
+            self._watch.load_state(_part(state, "watch"))
         self._arrive(iteration)
         self.edited()
 
@@ -281,6 +312,10 @@ class Trainer(Generic[M]):
     def _kernel(self) -> str | None:
         """What the model is drawn with; None for models that are drawn otherwise."""
         return getattr(self.model.appearance, "kernel", None)
+
+    def _loss(self) -> float:
+        """By which edits are judged."""
+        return self._judging.measure(self.model, self._objective).loss
 
     def _step(self, iteration: int) -> float:
         self._arrive(iteration)
@@ -374,6 +409,11 @@ class Trainer(Generic[M]):
         """What changes seldom: how often photos are halved, how the model is drawn, the weights of the objective."""
         look = self._appearance(iteration).structure
         return self._schedule.halvings(iteration), look, self._objective.weights(iteration)
+
+    def _look(self, iteration: int) -> tuple[Any, ...]:
+        """How the model is drawn after an iteration, and which photos it is fitted to."""
+        values = self._values(iteration) if iteration else {}
+        return self._appearance(iteration), self._schedule.halvings(max(1, iteration)), values
 
     def _arrive(self, iteration: int) -> None:
         """Lets all that is scheduled be as it is at an iteration."""

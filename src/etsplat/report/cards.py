@@ -62,7 +62,9 @@ _PER_MILLION = "The same time, divided by the millions of triangles in the soup.
 
 def cards_of(run: Run) -> list[Metric]:
     """The cards of a run, most telling first."""
-    return describe_mesh(run.metrics) if run.task == "reconstruct" else describe_soup(run.metrics)
+    cards = describe_mesh(run.metrics) if run.task == "reconstruct" else describe_soup(run.metrics)
+    watched = [_watched_card(run.metrics)] if run.metrics.get("watched_psnr") is not None else []
+    return [cards[0], *watched, *cards[1:]]
 
 
 def describe_mesh(metrics: dict[str, Any]) -> list[Metric]:
@@ -96,6 +98,20 @@ def describe_soup(metrics: dict[str, Any]) -> list[Metric]:
         number_card(metrics, "ms_per_million", "Time per million triangles", "ms", fixed(1), _PER_MILLION, ask),
         time_card(metrics),
     ]
+
+
+def _watched_card(metrics: dict[str, Any]) -> Metric:
+    last, now = metrics.get("watched_psnr_last"), metrics["watched_psnr"]
+    meaning = (
+        f"{metrics.get('watched_views') or 'Some'} of the training photos were kept from training to watch the run by, "
+        "and choose the state that is the result; drawn at 512 pixels at most."
+    )
+    if last is not None and last != now:
+        meaning += (
+            f" The run got worse towards its end, where they have {last:.2f} dB: the result is of iteration "
+            f"{metrics.get('result_iteration') or 0:,}."
+        )
+    return number_card(metrics, "watched_psnr", "PSNR of watched photos", "dB", fixed(2), meaning, "")
 
 
 def _triangles_meaning(metrics: dict[str, Any]) -> str:

@@ -37,6 +37,7 @@ class Quantity:
 QUANTITIES = (
     Quantity("loss", "Training loss", True),
     Quantity("psnr", "PSNR of test views, dB", False),
+    Quantity("watched_psnr", "PSNR of watched photos, dB", False),
     Quantity("chamfer", "Chamfer distance × 10⁻³", True, floor_key="chamfer_floor", scale=1000.0),
     Quantity("sigma", "Softness σ", True, band=("sigma_10", "sigma_90")),
     Quantity("opacity", "Opacity", False, band=("opacity_10", "opacity_90")),

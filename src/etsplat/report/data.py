@@ -27,13 +27,20 @@ _COUNTS = {"reconstruct": "faces", "train": "triangles"}
 _MEASURED = (
     *("psnr", "ssim", "lpips", "lpips_3dgs", "psnr_mesh", "psnr_opaque", "silhouette_iou"),
     *("chamfer", "chamfer_floor", "chamfer_exact", "f_score", "fps", "ms_per_million"),
+    *("watched_psnr", "watched_psnr_last"),
     *("sigma", "sigma_10", "sigma_90", "opacity", "opacity_10", "opacity_90"),
 )
 """Numbers that may be missing, or null, where they were not measured."""
 
+_COUNTED = (
+    *("vertices", "degenerate_faces", "self_intersections", "edits_undone"),
+    *("watched_views", "result_iteration"),
+)
+"""Whole numbers of that kind."""
+
 _OPTIONAL: dict[str, Any] = {
     **dict.fromkeys(_MEASURED, float | None),
-    **dict.fromkeys(("vertices", "degenerate_faces", "self_intersections", "edits_undone"), int | None),
+    **dict.fromkeys(_COUNTED, int | None),
     "lpips_reason": str | None,
     "judgement": dict,
     "judgement.verdict": str,

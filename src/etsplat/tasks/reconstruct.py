@@ -107,6 +107,8 @@ def reconstruct(
         for note in mesh.notes if isinstance(mesh, MeshFile) else ():
             job.announce(NoteEvent(f"{name}: {note}"))
     views, truth = make_subject(loaded, config, job.prepared, job.device)
+    if truth is None or config.watch is not None:  # of a mesh there is the mesh itself to compare with
+        views = views.watching(config.watch)
     if config.drawing.backend == "nvdiffrast":
         load_nvdiffrast()  # now rather than at the first step
     with engine(config.engine):
@@ -127,14 +129,15 @@ def reconstruct(
             config = nearby(config)
         trainer = make_trainer(mesh, views, config, scorer.cheap)
         with job.writing():
-            progress, mesh, frame = job.fit(trainer), trainer.model, views.normalization
+            outcome, frame = job.fit(trainer), views.normalization
+            mesh = outcome.model
             for suffix in (".ply", ".obj", ".glb"):
                 mesh.save(job.run.mesh_path(suffix), frame)
             sizes = {"faces": len(mesh.faces), "vertices": len(mesh.vertices)}
             sizes["edits_undone"] = len(trainer.guard.left_out) if trainer.guard else 0
-            found = {**scorer.full(mesh, job.run.test), **sizes}
+            found = {**scorer.full(mesh, job.run.test), **sizes, **outcome.metrics}
             judgement = judging(mesh, found)
-            metrics = job.finish(progress, {**found, "judgement": judgement.to_dict()}, mesh.vertices)
+            metrics = job.finish(trainer.progress, {**found, "judgement": judgement.to_dict()}, mesh.vertices)
             job.run.conclude(judgement.verdict)
     return ReconstructResult(job.run.path, metrics, mesh.to_file(frame))
 

@@ -170,6 +170,10 @@ class ReconstructConfig(Settings):
     """Side of the pictures taken of a mesh, in pixels; wider images of a scene are scaled down to this width."""
     max_faces: Annotated[int, Range(1)] = 100_000
     """Subdivision stops here."""
+    watch: Annotated[int | None, Range(0)] = None
+    """One in so many training photos is kept from training, to watch the run by; 0 keeps none. None keeps one in 16
+    where there are at least 24, and none of those that are taken of a mesh. Where a run gets worse by them towards its
+    end, its best state is the result."""
     batch: Annotated[int, Range(1, 1024), Rare] = 1
     """Views that each step sees; the paper's method sees one."""
     seed: Annotated[int, Range(0, 2**63 - 1), Rare] = 0
@@ -236,6 +240,8 @@ class ReconstructConfig(Settings):
         """What is wrong with settings that are right one by one."""
         if self.drawing.backend == "nvdiffrast" and self.soft:
             return "drawing.backend: nvdiffrast draws opaque triangles; choose --method raster-face or raster-vertex"
+        if self.watch == 1:
+            return "watch: 1 would keep all photos from training; choose 0 or at least 2"
         if self.refinement.first > self.refinement.last:
             return "refinement.first: is after refinement.last; make it smaller"
         return None
@@ -245,6 +251,7 @@ class ReconstructConfig(Settings):
 # (research/ablations.md), and a guard of its edits. With them the result is closer to the truth, and no face cuts
 # through another.
 _PAPER: dict[str, Any] = {
+    "watch": 0,
     "pictures.coarse_levels": 0,
     "pictures.coarse_until": 0.5,
     "regularization.final": 0.0,

@@ -23,7 +23,8 @@ from etsplat.optim.loop import Callback, Event, NoteEvent, PrepareEvent, Progres
 from etsplat.optim.objective import Term
 from etsplat.optim.schedules import Scheduled
 from etsplat.optim.terms import named_terms
-from etsplat.optim.trainer import Trainer
+from etsplat.optim.trainer import M, Trainer
+from etsplat.optim.watch import Outcome
 from etsplat.tasks.notebook import notebook_callbacks, result_html
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.settings import Settings
@@ -156,18 +157,22 @@ class Job:
         with self._place.open(self._record, lambda text: self.announce(NoteEvent(text))) as self.run:
             yield
 
-    def fit(self, trainer: Trainer[Any], watch: Callback | None = None) -> Progress:
-        """Runs a trainer from the last checkpoint to the end; see `Trainer.fit`. `watch` is told before the others."""
+    def fit(self, trainer: Trainer[M], first: Callback | None = None) -> Outcome[M]:
+        """Runs a trainer from the last checkpoint to the end; see `Trainer.fit`. `first` is told before the others."""
         output = self.config.output
-        return trainer.fit(
+        trainer.fit(
             self.config.iterations,
-            callbacks=[self.announce] if watch is None else [watch, self.announce],
+            callbacks=[self.announce] if first is None else [first, self.announce],
             log_every=output.log_every,
             evaluate_every=output.evaluate_every,
             checkpoint_every=output.checkpoint_every,
             run=self.run,
             run_hash=hash_record(self._record),
         )
+        outcome = trainer.outcome()
+        if outcome.note is not None:
+            self.announce(NoteEvent(outcome.note))
+        return outcome
 
     def finish(self, progress: Progress, found: Mapping[str, Any], result: Tensor) -> dict[str, Any]:
         """Writes metrics.json: what was found, how long it took, on what, and how it was made.

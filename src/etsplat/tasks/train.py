@@ -90,7 +90,7 @@ def train(
     """
     config = config or TrainConfig()
     job = Job(config, out, callbacks, resume=resume, overwrite=overwrite)
-    own = load_scene(source, config.width, images, masks, job.prepared)
+    own = load_scene(source, config.width, images, masks, job.prepared).watching(config.watch)
     capture = own.normalized() if config.normalize else own
     iterations = limited_iterations(config.iterations, config.schedule.max_epochs, len(own.train), config.batch)
     for note in check_train(own, config, iterations, job.device):
@@ -108,26 +108,27 @@ def train(
 
         with job.writing(), engine_for(trainer.model.vertices).looping():
             try:
-                progress = job.fit(trainer, keep)
+                outcome = job.fit(trainer, keep)
             except DivergedError as error:
                 if doubt := doubtful_scale(own, config):
                     raise DivergedError(f"{error}. But first: {doubt}") from error
                 raise
-            soup = trainer.model.finished()
+            soup = outcome.model.finished()
             scores = scorer.full(soup, job.run.test)
-            result = _in_own_units(soup, progress.iteration, capture, config)
+            result = _in_own_units(soup, outcome.iteration, capture, config)
             result.save(job.run.soup_path)
             found = {
                 **scores,
                 "psnr_opaque_loss": None if scores["psnr"] is None else scores["psnr"] - scores["psnr_opaque"],
-                **trainer.describe(),
+                **outcome.model.describe(),
+                **outcome.metrics,
                 "width": capture.images.sizes[0][0],
                 "height": capture.images.sizes[0][1],
                 "train_views": len(capture.train),
                 "scene_type": config.scene_type,
                 "finish": config.finish,
             }
-            return TrainResult(job.run.path, job.finish(progress, found, soup.vertices), result)
+            return TrainResult(job.run.path, job.finish(trainer.progress, found, soup.vertices), result)
 
 
 def start_trainer(

@@ -31,9 +31,9 @@ def check_train(capture: Dataset, config: TrainConfig, iterations: int, device: 
             f"max_triangles: {config.max_triangles:,} triangles may need {needed / 2**30:.1f} GiB and "
             f"{free / 2**30:.1f} GiB are free; set it to {fitting} or less"
         )
-    notes = [
-        f"{len(capture.train)} photos to train on, {len(capture.test)} to test; at most {_amount(needed)} of memory"
-    ]
+    aside = f", {len(capture.watched)} to watch the run" if capture.watched else ""
+    views = f"{len(capture.train)} photos to train on{aside}, {len(capture.test)} to test"
+    notes = [f"{views}; at most {_amount(needed)} of memory"]
     if iterations < config.iterations:
         limit = f"schedule.max_epochs {config.schedule.max_epochs}"
         notes.append(f"few photos: {iterations:,} iterations, not {config.iterations:,} ({limit})")

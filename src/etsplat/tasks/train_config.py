@@ -188,6 +188,9 @@ class TrainConfig(Settings):
     or a closed sphere in the colours of the photos, which stays where no photo shows it."""
     finish: Literal["none", "opaque"] = "none"
     """opaque: triangles are made opaque, then sharp, for engines without transparency."""
+    watch: Annotated[int | None, Range(0)] = None
+    """One in so many training photos is kept from training, to watch the run by; 0 keeps none. None keeps one in 16
+    where there are at least 24. Where a run gets worse by them towards its end, its best state is the result."""
     batch: Annotated[int, Range(1, 1024), Rare] = 1
     """Views that each step sees; the paper's method sees one."""
     seed: Annotated[int, Range(0, 2**63 - 1), Rare] = 0
@@ -249,12 +252,15 @@ class TrainConfig(Settings):
 
     def contradiction(self) -> str | None:
         """What is wrong with settings that are right one by one."""
+        if self.watch == 1:
+            return "watch: 1 would keep all photos from training; choose 0 or at least 2"
         if self.densification.begin > self.densification.end:
             return "densification.begin: is after densification.end; make it smaller"
         return None
 
 
 _PAPER: dict[str, Any] = {
+    "watch": 0,
     "iterations": 30_000,
     "width": None,
     "max_triangles": 4_000_000,
