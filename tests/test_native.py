@@ -95,7 +95,7 @@ def test_a_group_of_arguments_keeps_its_tensors():
     held = sys.getrefcount(color)
     gradients = _native.RasterGradients(
         grad_color=color,
-        **dict.fromkeys(("grad_alpha", "grad_distortion", "corner_offsets", "corner_indices", "vertices")),
+        **dict.fromkeys(("grad_alpha", "grad_distortion", "vertices")),
         **dict.fromkeys(("flat_colors", "corner_colors", "opacities", "sigmas", "viewmats", "Ks", "backgrounds")),
     )
     assert sys.getrefcount(color) == held + 1

@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <bit>
 #include <limits>
+#include <type_traits>
 #include <vector>
 
 #include "parallel.h"
@@ -26,6 +27,30 @@ std::vector<Part> chunkwise(int64_t count, F&& scan) {
 
 // Bits of a float to an integer of the same order, and back.
 int32_t in_order(int32_t bits) { return bits ^ ((bits >> 31) & kMagnitude); }
+
+// Adds row i of `values` to row indices[i] of `sums` where that is from `low` to `high` - 1. Channels: 0 if not known here.
+template <int Channels>
+void sum_range(const float* values, const int32_t* indices, int64_t count, int64_t low, int64_t high, int64_t channels,
+               float* sums) {
+    if constexpr (Channels > 0) channels = Channels;
+    constexpr int64_t kBlock = 1024;
+    int32_t own[kBlock];  // places in the block
+    const auto lowest = static_cast<uint32_t>(low), size = static_cast<uint32_t>(high - low);
+    for (int64_t begin = 0; begin < count; begin += kBlock) {
+        const int32_t* index = indices + begin;
+        const auto places = static_cast<int32_t>(std::min(kBlock, count - begin));
+        int found = 0;
+        for (int32_t i = 0; i < places; ++i) {
+            own[found] = i;
+            found += static_cast<uint32_t>(index[i]) - lowest < size ? 1 : 0;
+        }
+        for (int k = 0; k < found; ++k) {
+            const float* row = values + (begin + own[k]) * channels;
+            float* sum = sums + index[own[k]] * channels;
+            for (int64_t c = 0; c < channels; ++c) sum[c] += row[c];
+        }
+    }
+}
 
 }  // namespace
 
@@ -52,47 +77,43 @@ FloatScan scan_floats(const float* values, int64_t count, float largest) {
 }
 
 template <class T>
-IndexRange index_range(const T* values, int64_t count) {
-    const auto parts = chunkwise<IndexRange>(count, [values](int64_t begin, int64_t end) {
-        T low = values[begin], high = values[begin];
-        for (int64_t i = begin; i < end; ++i) {
-            low = std::min(low, values[i]);
-            high = std::max(high, values[i]);
-        }
-        return IndexRange{low, high};
+bool indices_below(const T* values, int64_t count, int64_t bound) {
+    using Bits = std::make_unsigned_t<T>;
+    const auto last = static_cast<Bits>(std::min<int64_t>(bound - 1, std::numeric_limits<T>::max()));
+    const auto parts = chunkwise<Bits>(count, [values, last](int64_t begin, int64_t end) {
+        Bits wrong = 0;  // the sign bit: of a negative index, or of what one lacks that is too large
+        for (int64_t i = begin; i < end; ++i) wrong |= static_cast<Bits>(values[i]) | (last - static_cast<Bits>(values[i]));
+        return wrong;
     });
-    IndexRange total = parts.front();
-    for (const IndexRange& part : parts) total = {std::min(total.low, part.low), std::max(total.high, part.high)};
-    return total;
+    return std::ranges::all_of(parts, [](Bits wrong) { return static_cast<T>(wrong) >= 0; });
 }
-template IndexRange index_range(const int32_t*, int64_t);
-template IndexRange index_range(const int64_t*, int64_t);
+template bool indices_below(const int32_t*, int64_t, int64_t);
+template bool indices_below(const int64_t*, int64_t, int64_t);
 
-// A counting sort on one thread: 0.3 ms for the corners of 82,000 faces.
-void group_indices(const int32_t* values, int64_t count, int64_t groups, int32_t* offsets, int32_t* members) {
-    std::fill(offsets, offsets + groups + 1, 0);
-    for (int64_t i = 0; i < count; ++i) ++offsets[values[i]];
-    int32_t end = 0;
-    for (int64_t g = 0; g <= groups; ++g) offsets[g] = end += offsets[g];
-    // From the last to the first, so that each offset ends up where its group begins.
-    for (int64_t i = count - 1; i >= 0; --i) members[--offsets[values[i]]] = static_cast<int32_t>(i);
+template <class T>
+void copy_indices(const T* values, int64_t count, int32_t* copies) {
+    parallel_for(count, kChunk, [=](int64_t begin, int64_t end) {
+        for (int64_t i = begin; i < end; ++i) copies[i] = static_cast<int32_t>(values[i]);
+    });
 }
+template void copy_indices(const int32_t*, int64_t, int32_t*);
+template void copy_indices(const int64_t*, int64_t, int32_t*);
 
 void zero_floats(float* values, int64_t count) {
     parallel_for(count, kChunk, [values](int64_t begin, int64_t end) { std::fill(values + begin, values + end, 0.0f); });
 }
 
-void sum_groups(const float* values, const int32_t* offsets, const int32_t* members, int64_t groups, int64_t channels,
-                float* sums) {
-    parallel_for(groups, 4096, [&](int64_t begin, int64_t end) {
-        for (int64_t g = begin; g < end; ++g) {
-            float* sum = sums + g * channels;
-            for (int64_t c = 0; c < channels; ++c) sum[c] = 0.0f;
-            for (int32_t i = offsets[g]; i < offsets[g + 1]; ++i) {
-                const float* row = values + members[i] * channels;
-                for (int64_t c = 0; c < channels; ++c) sum[c] += row[c];
-            }
-        }
+// Each range of rows belongs to one thread, which looks through all indices for those of its own. For the corners of 82,000
+// faces that takes 0.5 ms on one thread, where grouping them by row and gathering takes 1.1.
+void sum_by_index(const float* values, const int32_t* indices, int64_t count, int64_t rows, int64_t channels, float* sums) {
+    constexpr int64_t kFewest = 1 << 13;  // indices for each range
+    const int64_t ranges = std::clamp<int64_t>(count / kFewest, 1, num_threads());
+    const int64_t size = (rows + ranges - 1) / ranges;
+    parallel_for(ranges, 1, [&](int64_t first, int64_t last) {
+        const int64_t low = std::min(rows, first * size), high = std::min(rows, last * size);
+        std::fill(sums + low * channels, sums + high * channels, 0.0f);
+        if (channels == 3) return sum_range<3>(values, indices, count, low, high, channels, sums);
+        sum_range<0>(values, indices, count, low, high, channels, sums);
     });
 }
 

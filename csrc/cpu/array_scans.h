@@ -12,20 +12,16 @@ struct FloatScan {
 };
 FloatScan scan_floats(const float* values, int64_t count, float largest);
 
-struct IndexRange {
-    int64_t low, high;
-};
 template <class T>
-IndexRange index_range(const T* values, int64_t count);  // count > 0; T is int32_t or int64_t
+bool indices_below(const T* values, int64_t count, int64_t bound);  // all from 0 to bound - 1; T is int32_t or int64_t
 
-// Where each of `groups` values occurs: value g at members[offsets[g]] ..., ascending; offsets (groups + 1). Values must be
-// from 0 to groups - 1.
-void group_indices(const int32_t* values, int64_t count, int64_t groups, int32_t* offsets, int32_t* members);
+template <class T>
+void copy_indices(const T* values, int64_t count, int32_t* copies);  // that fit
 
 void zero_floats(float* values, int64_t count);
 
-// sums (groups, channels): row g is the sum of the rows `members[offsets[g]] ...` of values, in that order.
-void sum_groups(const float* values, const int32_t* offsets, const int32_t* members, int64_t groups, int64_t channels,
-                float* sums);
+// sums (rows, channels): row g is the sum of those rows i of values (count, channels) whose indices[i] is g, from the first
+// to the last. Indices are from 0 to rows - 1.
+void sum_by_index(const float* values, const int32_t* indices, int64_t count, int64_t rows, int64_t channels, float* sums);
 
 }  // namespace etsplat

@@ -79,7 +79,6 @@ struct RasterBatch : ArgumentGroup {
 struct RasterBatchGradients : ArgumentGroup {
     Array<const float, 4> grad_color;
     OptionalArray<const float, 4> grad_alpha, grad_distortion;
-    OptionalArray<const int32_t, 1> corner_offsets, corner_indices;  // with faces
     OptionalArray<float> vertices, flat_colors, corner_colors, opacities, sigmas;
     OptionalArray<float, 3> viewmats, Ks;
     OptionalArray<float, 2> backgrounds;
@@ -89,8 +88,6 @@ struct RasterBatchGradients : ArgumentGroup {
         call.grad_color = grad_color.row(b);
         call.grad_alpha = row_or_null(grad_alpha, b);
         call.grad_distortion = row_or_null(grad_distortion, b);
-        call.corner_offsets = data_or_null(corner_offsets);
-        call.corner_indices = data_or_null(corner_indices);
         call.vertices = data_or_null(vertices);
         call.flat_colors = RasterBatch::own_or_shared(flat_colors, 3, b);
         call.corner_colors = RasterBatch::own_or_shared(corner_colors, 4, b);
@@ -152,7 +149,7 @@ void bind_rasterize(nb::module_& m) {
 #undef MEMBER
 #define MEMBER(name) std::pair(#name, &RasterBatchGradients::name)
     def_group(m, "RasterGradients", MEMBER(grad_color), MEMBER(grad_alpha), MEMBER(grad_distortion),
-              MEMBER(corner_offsets), MEMBER(corner_indices), MEMBER(vertices), MEMBER(flat_colors),
+              MEMBER(vertices), MEMBER(flat_colors),
               MEMBER(corner_colors), MEMBER(opacities), MEMBER(sigmas), MEMBER(viewmats), MEMBER(Ks),
               MEMBER(backgrounds));
 #undef MEMBER

@@ -148,7 +148,7 @@ int64_t RasterState::bytes() const {
     return records.bytes() + attributes.bytes() + keys.bytes() + keys_swap.bytes() + order.bytes() + order_swap.bytes() +
            spans.bytes() + slot_begin.bytes() + slot_tile.bytes() + histogram.bytes() + tile_begin.bytes() +
            entries.bytes() + hits.bytes() + slot_weight.bytes() + slots.bytes() + corner_gradients.bytes() +
-           tile_background.bytes() + touched.bytes();
+           vertex_gradients.bytes() + tile_background.bytes() + touched.bytes();
 }
 
 std::shared_ptr<RasterState> raster_forward(const RasterCall& call) {

@@ -49,8 +49,6 @@ struct RasterCall {
 // Gradients in and out; outputs are added to.
 struct RasterGradients {
     const float *grad_color = nullptr, *grad_alpha = nullptr, *grad_distortion = nullptr;
-    // Of each vertex, with faces: where it is used, as 3 face + corner.
-    const int32_t *corner_offsets = nullptr, *corner_indices = nullptr;
     float *vertices = nullptr, *flat_colors = nullptr, *corner_colors = nullptr, *opacities = nullptr;
     float *sigmas = nullptr, *background = nullptr;
     float *viewmat = nullptr, *K = nullptr;  // 16 and 9 floats
@@ -71,7 +69,7 @@ struct RasterState {
     Buffer<int32_t> histogram, tile_begin, tile_done;
     Buffer<TileEntry> entries;
     Buffer<uint16_t> hits;
-    Buffer<float> slot_weight, slots, corner_gradients, tile_background;
+    Buffer<float> slot_weight, slots, corner_gradients, vertex_gradients, tile_background;
     Buffer<uint8_t> touched;
     int64_t num_slots = 0;
     StageSeconds stages[kStages];

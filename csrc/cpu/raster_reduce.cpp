@@ -3,23 +3,21 @@
 // added to the outputs.
 #include <vector>
 
+#include "array_scans.h"
 #include "instruction_set.h"
 #include "raster.h"
 
 namespace etsplat {
 namespace {
 
-void gather_vertices(const RasterState& state, const RasterGradients& gradients) {
-    const auto* offsets = gradients.corner_offsets;
-    const auto* corners = gradients.corner_indices;
-    auto* out = gradients.vertices;
-    parallel_for(state.call.num_vertices, 4096, [&](int64_t begin, int64_t end) {
-        for (int64_t v = begin; v < end; ++v) {
-            float sum[3] = {};
-            for (int32_t c = offsets[v]; c < offsets[v + 1]; ++c)
-                for (int k = 0; k < 3; ++k) sum[k] += state.corner_gradients[int64_t{3} * corners[c] + k];
-            for (int k = 0; k < 3; ++k) out[3 * v + k] += sum[k];
-        }
+void gather_vertices(RasterState& state, float* out) {
+    const int64_t count = 3 * state.call.num_vertices;
+    state.vertex_gradients.resize(count);
+    float* sums = state.vertex_gradients.data();
+    sum_by_index(state.corner_gradients.data(), state.triangles.faces, 3 * state.call.num_triangles, state.call.num_vertices,
+                 3, sums);
+    parallel_for(count, 1 << 14, [=](int64_t begin, int64_t end) {
+        for (int64_t i = begin; i < end; ++i) out[i] += sums[i];
     });
 }
 
@@ -54,7 +52,7 @@ void reduce_gradients(RasterState& state, const RasterGradients& gradients) {
         scratch.resize(TriangleKernels::reduce_scratch_size(state.pass.slot_layout));
         chunks[static_cast<size_t>(begin / kTriangleChunk)] = reduce(state.pass, pass, begin, end, scratch.data());
     });
-    if (gather) gather_vertices(state, gradients);
+    if (gather) gather_vertices(state, gradients.vertices);
     if (gradients.background) add_background(state, gradients.background);
     ChunkSums total{};
     for (const ChunkSums& chunk : chunks) {

@@ -40,7 +40,7 @@ def test_the_smallest_value_decides_whether_all_are_positive(place):
 
 
 @pytest.mark.sanitize
-@pytest.mark.parametrize(("place", "index"), [(0, -1), (40_000, 7), (LARGE - 1, -5)])
+@pytest.mark.parametrize(("place", "index"), [(0, -1), (40_000, 7), (LARGE - 1, -5), (5, -(2**31)), (9, 2**31 - 1)])
 def test_indices_out_of_range_are_found(place, index):
     indices = torch.arange(LARGE, dtype=torch.int32) % 7
     for tensor in layouts(indices):
@@ -50,6 +50,18 @@ def test_indices_out_of_range_are_found(place, index):
     for tensor in layouts(indices):
         with pytest.raises(ValueError, match=message):
             check_indices("faces", tensor, 7)
+
+
+@pytest.mark.sanitize
+@pytest.mark.parametrize("index", [2**32, 2**63 - 1, -(2**63)])
+def test_indices_are_not_cut_to_32_bits_before_they_are_looked_at(index):
+    with pytest.raises(ValueError, match=f"got indices from {min(index, 3)} to {max(index, 3)}"):
+        check_indices("faces", torch.tensor([3, index]), 2**31)
+
+
+def test_no_index_is_right_where_there_is_nothing():
+    with pytest.raises(ValueError, match="got indices from 0 to 0"):
+        check_indices("faces", torch.zeros(2, dtype=torch.int32), 0)
 
 
 def test_empty_tensors_pass():

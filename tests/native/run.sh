@@ -54,7 +54,7 @@ for path in "${paths[@]}"; do
         compile "$(basename "$source" .cpp)_$name.o" "$source" "-DETSPLAT_SIMD=$name" ${path#*:}
     done
 done
-for source in csrc/cpu/raster.cpp csrc/cpu/raster_*.cpp csrc/cpu/{parallel,pool,instruction_set}.cpp "tests/native/$program.cpp"; do
+for source in csrc/cpu/raster.cpp csrc/cpu/raster_*.cpp csrc/cpu/{array_scans,parallel,pool,instruction_set}.cpp "tests/native/$program.cpp"; do
     compile "$(basename "$source" .cpp).o" "$source"
 done
 for compiler in "${compilers[@]}"; do wait "$compiler"; done

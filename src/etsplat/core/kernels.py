@@ -17,6 +17,7 @@ The floors are passed straight through: the derivative at a floored argument is 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -67,7 +68,7 @@ class Kernel:
         """The struct in ``csrc/math`` that evaluates it."""
         return "Tabulated" if self.table is not None else "".join(map(str.capitalize, self.name.split("_")))
 
-    @property
+    @cached_property
     def native_id(self) -> int:
         """Its position in ``ETSPLAT_KERNELS``."""
         return _native.kernel_names().index(self.native_name)

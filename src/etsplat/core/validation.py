@@ -27,11 +27,9 @@ def check_shape(name: str, tensor: Tensor, *shapes: Shape, sizes: dict[str, int]
             matches.
     """
     sizes = {} if sizes is None else sizes
-    wanted = " or ".join("(" + ", ".join(map(str, shape)) + ("," if len(shape) == 1 else "") + ")" for shape in shapes)
     if not isinstance(tensor, Tensor):
-        raise ValueError(
-            f"{name} must be a tensor of shape {wanted}, got {type(tensor).__name__}{_remedy(name, tensor)}"
-        )
+        got = f"{type(tensor).__name__}{_remedy(name, tensor)}"
+        raise ValueError(f"{name} must be a tensor of shape {_written(shapes)}, got {got}")
     _check_native(name, tensor)
     for shape in shapes:
         if len(shape) != tensor.ndim:
@@ -45,7 +43,13 @@ def check_shape(name: str, tensor: Tensor, *shapes: Shape, sizes: dict[str, int]
             return
     letters = {s for shape in shapes for s in shape if isinstance(s, str) and s in sizes}
     known = ", ".join(f"{letter}={sizes[letter]}" for letter in sorted(letters))
-    raise ValueError(f"{name} must have shape {wanted}{' with ' + known if known else ''}, got {tuple(tensor.shape)}")
+    wanted = _written(shapes) + (" with " + known if known else "")
+    raise ValueError(f"{name} must have shape {wanted}, got {tuple(tensor.shape)}")
+
+
+def _written(shapes: Sequence[Shape]) -> str:
+    """As Python writes them."""
+    return " or ".join("(" + ", ".join(map(str, shape)) + ("," if len(shape) == 1 else "") + ")" for shape in shapes)
 
 
 def dense(tensor: Tensor, name: str = "gradient") -> Tensor:
@@ -124,13 +128,9 @@ def check_indices(name: str, indices: Tensor, count: int) -> None:
     """Raise ValueError unless ``indices`` are int32 or int64, from 0 to ``count`` - 1."""
     if indices.dtype not in (torch.int32, torch.int64):
         raise ValueError(f"{name} must be int32 or int64, got {indices.dtype}")
-    if indices.numel() == 0:
+    if indices.numel() == 0 or (_is_plain(indices) and _native.indices_below(values=indices, bound=count)):
         return
-    if _is_plain(indices):
-        found = _native.index_range(values=indices)
-        low, high = found.low, found.high
-    else:
-        low, high = (int(value) for value in torch.aminmax(indices))
+    low, high = (int(value) for value in torch.aminmax(indices))
     if low < 0 or high >= count:
         raise ValueError(f"{name} must be indices from 0 to {count - 1}, got indices from {low} to {high}")
 

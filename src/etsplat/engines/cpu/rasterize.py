@@ -22,8 +22,7 @@ def _gather(_keep: bool, values: Tensor, _faces: Tensor, geometry: Geometry) -> 
 def _scatter(kept: Any, _needed: Any, grad_corners: Tensor) -> tuple[Tensor]:
     geometry, shape = kept
     sums = empty_image(*shape)
-    offsets, places = geometry.corners
-    _native.sum_groups(values=grad_corners, offsets=offsets, members=places, sums=sums)
+    _native.sum_by_index(values=grad_corners, indices=geometry.faces, sums=sums)
     return (sums,)
 
 
@@ -61,14 +60,10 @@ class CpuRender:
         if grad_color is None:
             grad_color = zeros_image(*images.color.shape)
         grads = PerInput(*map(_zeros, inputs, needed))
-        faces = self.plan.geometry.faces
-        offsets, corners = self.plan.geometry.corners if needed.vertices and faces is not None else (None, None)
         gradients = _native.RasterGradients(
             grad_color=grad_color,
             grad_alpha=grad_alpha,
             grad_distortion=grad_distortion,
-            corner_offsets=offsets,
-            corner_indices=corners,
             vertices=grads.vertices,
             flat_colors=grads.flat,
             corner_colors=grads.corner,

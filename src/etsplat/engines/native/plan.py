@@ -7,10 +7,9 @@ from typing import Any, NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from etsplat import _native
 from etsplat.core.rasterization import RasterizeSettings, TriangleStatistics
 from etsplat.core.validation import dense
-from etsplat.engines.native.pool import empty
+from etsplat.engines.native.pool import copied_indices, empty
 
 
 class PerInput(NamedTuple):
@@ -55,19 +54,14 @@ class Geometry:
     def __init__(self, vertices: Tensor, faces: Tensor | None) -> None:
         self.vertex_count = vertices.shape[0]
         self.count = vertices.shape[0] if faces is None else faces.shape[0]
-        self.faces = None if faces is None else dense(faces, "faces").to(torch.int32, copy=True)
+        self.faces = None if faces is None else copied_indices(dense(faces, "faces"))
 
     @cached_property
     def corners(self) -> tuple[Tensor, Tensor]:
         """With faces, where each vertex is used: offsets (V + 1,) and places 3 face + corner, ascending for each."""
         assert self.faces is not None
-        flat, device = self.faces.view(-1), self.faces.device
-        if flat.is_cpu:
-            offsets, places = flat.new_empty(self.vertex_count + 1), torch.empty_like(flat)
-            _native.group_indices(values=flat, offsets=offsets, members=places)
-            return offsets, places
-        ordered, places = torch.sort(flat, stable=True)
-        ends = torch.arange(self.vertex_count + 1, dtype=torch.int32, device=device)
+        ordered, places = torch.sort(self.faces.view(-1), stable=True)
+        ends = torch.arange(self.vertex_count + 1, dtype=torch.int32, device=self.faces.device)
         return torch.searchsorted(ordered, ends, out_int32=True), places.to(torch.int32)
 
 

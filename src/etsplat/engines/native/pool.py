@@ -32,3 +32,12 @@ def zeros_image(*shape: int) -> Tensor:
     zeros = empty_image(*shape)
     _native.zero_floats(values=zeros)
     return zeros
+
+
+def copied_indices(indices: Tensor) -> Tensor:
+    """A contiguous int32 copy of a dense int32 or int64 tensor, whose values fit."""
+    if not indices.is_cpu:
+        return indices.to(torch.int32, copy=True)
+    copies = empty_image(*indices.shape).view(torch.int32)
+    _native.copy_indices(values=indices, copies=copies)
+    return copies
