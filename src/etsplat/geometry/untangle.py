@@ -1,4 +1,4 @@
-"""Undoing self-intersections by smoothing where they are."""
+"""Undoing self-intersections: sheets that cross are pushed apart, and what that leaves is smoothed or stays."""
 
 import math
 
@@ -7,7 +7,15 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from etsplat.geometry.intersections import intersecting_faces
+from etsplat.geometry.separation import separated
 from etsplat.geometry.topology import MeshTopology
+
+_PUSHES = 32
+"""Rounds of pushing apart."""
+
+_SETTLE = 6
+"""After so many of them what still intersects moves half as far as a sweep of smoothing: pushes that contradict each
+other end."""
 
 _SWEEPS = 2
 """Smoothing sweeps between two looks for intersections: more move vertices farther than needed, fewer look longer."""
@@ -33,11 +41,14 @@ def untangle(
 ) -> tuple[Float[Tensor, "V 3"], int]:
     """Moves the vertices of faces that cut through others until none does, as little as possible.
 
-    1. In rounds, the corners of intersecting faces, with a ring of neighbours for every eighth round already done, so
-       that what resists is smoothed more widely, move to the mean of their neighbours in damped sweeps.
-    2. What smoothing moved goes back towards its old place, as far as that makes no face intersect anew: folds end
-       where they touch instead of flat.
-    3. Where a vertex still ends too far away, all that moved together with it returns to its old place, intersections
+    1. In rounds, sheets that cross are pushed apart (`separation.separated`): most cross by a small part of an edge, so
+       that nobody sees it. Every few rounds the corners of what still intersects are smoothed a little.
+    2. What that leaves is smoothed in rounds: the corners of intersecting faces, with a ring of neighbours for every
+       eighth round already done, so that what resists is smoothed more widely, move to the mean of their neighbours in
+       damped sweeps.
+    3. What moved goes back towards its old place, as far as that makes no face intersect anew: folds end where they
+       touch instead of flat.
+    4. Where a vertex still ends too far away, all that moved together with it returns to its old place, intersections
        included: folds so large hold up the shape, as where a sphere stands for an object with holes.
 
     All other vertices stay where they are. Boundary vertices may shrink inwards. Computed on the CPU.
@@ -45,7 +56,7 @@ def untangle(
     Args:
         vertices: (V, 3) finite.
         topology: of the mesh.
-        rounds: most looks for intersections in step 1.
+        rounds: most looks for intersections in step 2.
         reach: how far a vertex may go, in lengths of its longest edge, or of two mean edges of the mesh if that is
             more: where it is folded its own are short.
 
@@ -55,6 +66,14 @@ def untangle(
     original, faces = vertices.detach().cpu(), topology.faces.cpu()
     moved = original.clone()
     marked = intersecting_faces(moved, faces)
+    topology = topology.to(torch.device("cpu"))
+    for done in range(1, _PUSHES + 1):
+        if not bool(marked.any()):
+            break
+        moved = separated(moved.double(), topology, marked).to(original)
+        if done % _SETTLE == 0:
+            _smooth(moved, topology, _region(marked, topology, rings=0), sweeps=1, step=0.5 * _STEP)
+        marked = intersecting_faces(moved, faces)
     for done in range(rounds):
         if not bool(marked.any()):
             break
@@ -128,14 +147,16 @@ def _grown(region: Bool[Tensor, " V"], topology: MeshTopology) -> Bool[Tensor, "
     return grown
 
 
-def _smooth(vertices: Tensor, topology: MeshTopology, region: Bool[Tensor, " V"]) -> None:
+def _smooth(
+    vertices: Tensor, topology: MeshTopology, region: Bool[Tensor, " V"], sweeps: int = _SWEEPS, step: float = _STEP
+) -> None:
     """Damped sweeps over the vertices of a region, in place."""
     counts = topology.neighbor_offsets.cpu().diff()
     owner = torch.repeat_interleave(torch.arange(topology.num_vertices), counts)
     inside = region[owner]
     owner, neighbors = owner[inside], topology.neighbor_indices.cpu()[inside]
     moved = region & (counts > 0)
-    for _ in range(_SWEEPS):
+    for _ in range(sweeps):
         sums = torch.zeros_like(vertices).index_add_(0, owner, vertices[neighbors])
         means = sums[moved] / counts[moved, None]
-        vertices[moved] += _STEP * (means - vertices[moved])
+        vertices[moved] += step * (means - vertices[moved])

@@ -1,6 +1,5 @@
 """When triangles are added and removed, and which: strategies. They edit through `optim/edit.py` alone."""
 
-import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -20,6 +19,9 @@ from etsplat.optim.edit import RowPlan, apply_rows, apply_subdivision
 from etsplat.optim.loop import DivergedError
 from etsplat.optim.schedules import NEVER
 from etsplat.optim.terms.soup import Spared
+
+_REACH = 0.5
+"""Folds in which a vertex would have to move farther stay (`geometry.untangle`): they hold up the shape."""
 
 
 class Strategy:
@@ -73,14 +75,14 @@ class Fixed(Strategy):
 
 
 class SubdivideAndUntangle(Strategy):
-    """Divides a mesh's largest faces at given times (paper, appendix Adaptive Refinement), and smooths folds away."""
+    """Divides a mesh's largest faces at given times (paper, appendix Adaptive Refinement), and undoes folds."""
 
     def __init__(self, budgets: Mapping[int, int], untangle_after: Collection[int] = ()) -> None:
         """Takes the times.
 
         Args:
             budgets: by iteration, how many faces there may be after it (`optim.schedules.face_budgets`).
-            untangle_after: iterations after which faces that cut through others are smoothed away.
+            untangle_after: iterations after which faces that cut through others are put right.
         """
         self._budgets, self._untangle_after = dict(budgets), set(untangle_after)
 
@@ -95,11 +97,7 @@ class SubdivideAndUntangle(Strategy):
         if not bool(face_areas(mesh.vertices.detach().cpu(), topology.faces).isfinite().all()):
             raise DivergedError(f"the areas of faces are not finite at iteration {iteration}; lower the learning rates")
         if iteration in self._untangle_after:
-            # What smoothing takes away later steps bring back, but nothing does after the last.
-            if iteration == max(self._untangle_after):
-                self.finish(mesh)
-            else:
-                _untangle(mesh, math.inf)
+            self.finish(mesh)
         if iteration not in self._budgets:
             return False
         vertices = mesh.vertices.detach().cpu()
@@ -111,13 +109,9 @@ class SubdivideAndUntangle(Strategy):
     def finish(self, model: TriangleMesh) -> None:
         """Untangles it, where folds need not move far, if any untangling was asked for."""
         if self._untangle_after:
-            _untangle(model, 0.5)
-
-
-@torch.no_grad()
-def _untangle(mesh: TriangleMesh, reach: float) -> None:
-    topology = mesh.topology.to(torch.device("cpu"))
-    mesh.vertices.copy_(untangle(mesh.vertices.cpu(), topology, reach=reach)[0])
+            topology = model.topology.to(torch.device("cpu"))
+            with torch.no_grad():
+                model.vertices.copy_(untangle(model.vertices.cpu(), topology, reach=_REACH)[0])
 
 
 @dataclass

@@ -121,7 +121,7 @@ class Refinement:
     subdivisions: Annotated[int, Range(0, 10_000)] = 30
     """Number of subdivisions between these two; each adds the same fraction of faces, up to `max_faces`."""
     untanglings: Annotated[int, Range(0, 10_000)] = 6
-    """How often faces that cut through others are smoothed away, from the last subdivision to the last step."""
+    """How often faces that cut through others are pushed apart, from the last subdivision to the last step."""
     guard: Annotated[float, Range(0)] = 0.02
     """A subdivision or untangling is undone where 100 steps after it the loss of the training photos, at a small size,
     is higher than before by more than this part; 0 lets all of them stay."""

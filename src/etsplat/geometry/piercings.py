@@ -1,0 +1,138 @@
+"""Where edges of a mesh pierce its faces, and on which side of a face an edge that pierces it ought to be."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from etsplat.geometry.topology import MeshTopology
+
+_TURN = torch.linalg.qr(torch.tensor([[0.83, -0.31, 0.47], [0.29, 0.91, -0.17], [-0.41, 0.23, 0.87]]).double()).Q
+"""Some rotation: rays are cast along its first axis, since meshes often have edges in planes of the coordinate axes."""
+
+
+@dataclass(frozen=True)
+class Piercings:
+    """P edges that pierce faces, each pair once, in ascending order.
+
+    Attributes:
+        edges: (P,) rows of the topology's edges.
+        faces: (P,) the face that each pierces.
+        weights: (P, 3) where it does, as weights of the face's corners; positive, with sum 1.
+    """
+
+    edges: Int[Tensor, " P"]
+    faces: Int[Tensor, " P"]
+    weights: Float[Tensor, "P 3"]
+
+
+def find_piercings(vertices: Float[Tensor, "V 3"], topology: MeshTopology, marked: Bool[Tensor, " F"]) -> Piercings:
+    """The edges of marked faces that pierce marked faces with which they share no corner.
+
+    Args:
+        vertices: (V, 3) float64 on the CPU.
+        topology: of the mesh, on the CPU.
+        marked: (F,) faces that intersect others, as of `intersecting_faces`.
+    """
+    first, second = _overlapping_boxes(vertices[topology.faces], marked.nonzero()[:, 0])
+    edges = torch.cat([topology.face_edges[first], topology.face_edges[second]]).reshape(-1)
+    faces = torch.cat([second, first]).repeat_interleave(3)
+    both = torch.unique(edges * topology.num_faces + faces)
+    edges, faces = both // max(topology.num_faces, 1), both % max(topology.num_faces, 1)
+    ends, corners = topology.edges[edges], topology.faces[faces]
+    apart = (ends[:, :, None] != corners[:, None, :]).all(dim=2).all(dim=1)
+    edges, faces = edges[apart], faces[apart]
+    (p, q), (a, b, c) = vertices[ends[apart]].unbind(1), vertices[corners[apart]].unbind(1)
+    weights = torch.stack([_volume(p, q, b, c), _volume(p, q, c, a), _volume(p, q, a, b)], dim=1)
+    through = (_volume(a, b, c, p) * _volume(a, b, c, q) < 0) & ((weights > 0).all(dim=1) | (weights < 0).all(dim=1))
+    weights = weights[through]
+    return Piercings(edges[through], faces[through], weights / weights.sum(dim=1, keepdim=True))
+
+
+def outer_windings(
+    vertices: Float[Tensor, "V 3"], topology: MeshTopology, normals: Float[Tensor, "F 3"], found: Piercings
+) -> Int[Tensor, " P"]:
+    """How often the mesh winds around what lies outside both sheets that cross, just beside each piercing.
+
+    Two oriented sheets that cross part space into four: outside of both, with winding number k, inside of one, with
+    k + 1, and inside of both, with k + 2. At k = 0 two parts of a solid overlap; at k = -1 one is thinner than nothing:
+    its front has gone behind its back. Found by counting faces along a ray, so that it depends on the whole surface
+    and not on how it looks from here. The edges must be of two faces; others count as if they went straight on.
+
+    Args:
+        vertices: (V, 3) float64 on the CPU.
+        topology: of the mesh, on the CPU.
+        normals: (F, 3) unit normals of its faces.
+        found: from `find_piercings`.
+    """
+    offsets = topology.edge_face_offsets
+    first = topology.edge_faces[offsets[found.edges]]
+    last = topology.edge_faces[offsets[found.edges + 1] - 1]
+    points = (vertices[topology.faces[found.faces]] * found.weights[:, :, None]).sum(dim=1) @ _TURN
+    beside = vertices[topology.faces[last]].mean(dim=1) - vertices[topology.edges[found.edges, 0]]
+    convex = (beside * normals[first]).sum(dim=1) < 0
+    inward = normals @ _TURN[:, 0] < 0
+    in_edge = torch.where(convex, inward[first] & inward[last], inward[first] | inward[last])
+    own = torch.stack([found.faces, first, last], dim=1)
+    return _crossings(points, (vertices @ _TURN)[topology.faces], own) - inward[found.faces].long() - in_edge.long()
+
+
+def _volume(a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> Float[Tensor, " P"]:
+    """Six times the signed volume of tetrahedra."""
+    return ((b - a) * torch.linalg.cross(c - a, d - a)).sum(dim=1)
+
+
+def _overlapping_boxes(
+    corners: Float[Tensor, "F 3 3"], chosen: Int[Tensor, " K"]
+) -> tuple[Int[Tensor, " N"], Int[Tensor, " N"]]:
+    """Pairs of the chosen faces whose boxes overlap, each once."""
+    low, high = corners[chosen].amin(dim=1), corners[chosen].amax(dim=1)
+    order = torch.sort(low[:, 0], stable=True).indices
+    chosen, low, high = chosen[order], low[order], high[order]
+    begin = torch.arange(1, len(chosen) + 1)
+    end = torch.searchsorted(low[:, 0].contiguous(), high[:, 0].contiguous(), right=True)
+    first, second = _ranges(begin, torch.maximum(begin, end))
+    overlap = ((low[first] <= high[second]) & (low[second] <= high[first])).all(dim=1)
+    return chosen[first[overlap]], chosen[second[overlap]]
+
+
+def _crossings(
+    points: Float[Tensor, "P 3"], corners: Float[Tensor, "F 3 3"], own: Int[Tensor, "P K"]
+) -> Int[Tensor, " P"]:
+    """How many faces a ray along +x leaves through less those it enters through, but for each point's own faces."""
+    low, high = corners.amin(dim=1), corners.amax(dim=1)
+    width = high[:, 1] - low[:, 1]
+    counts = torch.zeros(len(points), dtype=torch.int64)
+    octave = torch.log2(width.clamp(min=1e-30)).floor()
+    for size in torch.unique(octave[width > 0]):  # faces of like width together: a wide one would widen every search
+        some = ((octave == size) & (width > 0)).nonzero()[:, 0]
+        some = some[torch.sort(low[some, 1], stable=True).indices]
+        keys = low[some, 1].contiguous()
+        begin = torch.searchsorted(keys, points[:, 1] - width[some].max())
+        end = torch.searchsorted(keys, points[:, 1].contiguous(), right=True)
+        point, place = _ranges(begin, torch.maximum(begin, end))
+        face, at = some[place], points[point]
+        near = (high[face, 1:] >= at[:, 1:]).all(dim=1) & (low[face, 2] <= at[:, 2]) & (high[face, 0] >= at[:, 0])
+        near &= (own[point] != face[:, None]).all(dim=1)
+        point, face, at = point[near], face[near], at[near]
+        a, b, c = (corners[face] - at[:, None]).unbind(1)
+        weights = torch.stack([_span(b, c), _span(c, a), _span(a, b)], dim=1)
+        total = weights.sum(dim=1)
+        inside = (weights > 0).all(dim=1) | (weights < 0).all(dim=1)
+        ahead = (weights * torch.stack([a[:, 0], b[:, 0], c[:, 0]], dim=1)).sum(dim=1) * total > 0
+        hit = inside & ahead
+        counts.index_add_(0, point[hit], total[hit].sign().long())
+    return counts
+
+
+def _span(a: Tensor, b: Tensor) -> Float[Tensor, " N"]:
+    """Twice the signed area that a and b span, seen along x."""
+    return a[:, 1] * b[:, 2] - a[:, 2] * b[:, 1]
+
+
+def _ranges(begin: Int[Tensor, " N"], end: Int[Tensor, " N"]) -> tuple[Int[Tensor, " M"], Int[Tensor, " M"]]:
+    """All (i, j) with begin[i] <= j < end[i]."""
+    counts = end - begin
+    rows = torch.repeat_interleave(torch.arange(len(begin)), counts)
+    return rows, torch.arange(len(rows)) + torch.repeat_interleave(begin - counts.cumsum(0) + counts, counts)
