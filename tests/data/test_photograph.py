@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -8,6 +9,8 @@ from etsplat.data.demo_object import demo_object
 from etsplat.data.photograph import CAMERA_DISTANCE, normalize_mesh, orbit_cameras, photograph, shade_faces
 from etsplat.geometry.icosphere import icosphere
 from etsplat.io.mesh_files import MeshFile, load_mesh
+from etsplat.io.textures import Texture
+from etsplat.tasks.sources import fingerprint
 
 
 @pytest.fixture(scope="module")
@@ -102,3 +105,31 @@ def test_the_shared_koala_stands_upright_in_its_front_view(shared_data):
     views = photograph(load_mesh(shared_data / "famous" / "koala.obj"), 64, 64, elevations=(0.0,), azimuths=1)
     rows = views.images[0][..., 3].sum(dim=1)
     assert int(rows.argmax()) < 32
+
+
+def test_a_textured_mesh_is_photographed_in_the_colours_of_its_texture():
+    """A cube, each side a picture of four colours: seen from the front they are in their places, to the bit, unlit."""
+    corners = torch.tensor([[x, y, z] for x in (-1.0, 1) for y in (-1.0, 1) for z in (-1.0, 1)])
+    front = torch.tensor([[1, 5, 7], [1, 7, 3]])
+    others = torch.tensor([[0, 2, 6], [0, 6, 4], [0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1]])
+    faces = torch.cat([front, others, torch.tensor([[2, 3, 7], [2, 7, 6]])])
+    pixels = torch.tensor([[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [255, 255, 0]]], dtype=torch.uint8)
+    uvs = 0.5 + 0.5 * corners[faces][..., :2]
+    # Enlarged, so that between the borders of the four pixels nothing is mixed.
+    texture = Texture.of([pixels.repeat_interleave(64, 0).repeat_interleave(64, 1)], torch.zeros(12).long(), uvs)
+    seen = photograph(MeshFile(corners, faces, texture=texture), 64, 64).images[16]
+    for row, column, color in ((24, 24, (1, 0, 0)), (24, 40, (0, 1, 0)), (40, 24, (0, 0, 1)), (40, 40, (1, 1, 0))):
+        torch.testing.assert_close(seen[row, column], torch.tensor([*map(float, color), 1]), atol=1e-6, rtol=0)
+    white = photograph(MeshFile(corners, faces), 64, 64).images[16]
+    assert float((seen[..., 3] - white[..., 3]).abs().max()) <= 1 / 16
+    assert bool((seen[..., :3] <= seen[..., 3:] + 1e-6).all())
+
+
+def test_a_texture_belongs_to_the_fingerprint_of_a_source(sphere):
+    texture = Texture.of(
+        [torch.zeros(1, 1, 3, dtype=torch.uint8)],
+        torch.zeros(len(sphere.faces)).long(),
+        torch.zeros(len(sphere.faces), 3, 2),
+    )
+    black, white = (replace(sphere, texture=replace(texture, pixels=texture.pixels + shade)) for shade in (0, 255))
+    assert len({fingerprint(mesh) for mesh in (sphere, black, white)}) == 3

@@ -2,9 +2,11 @@
 
 The set-up (docs/conventions.md): the mesh is scaled to its bounding box's centre and a largest radius of 1; +y is up;
 five elevations from -70 to 70 degrees by eight azimuths, azimuth 0 on +z; a vertical field of view of 40 degrees; the
-silhouette of the unit sphere fills 90 % of the height; white albedo under two lights along +z and -z.
+silhouette of the unit sphere fills 90 % of the height; white albedo under two lights along +z and -z. A mesh with a
+texture is seen in the texture's own colours, without light.
 """
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -19,7 +21,8 @@ from etsplat.data.dataset import Dataset, Normalization
 from etsplat.data.pictures import StoredPictures
 from etsplat.geometry.measures import bounding_ball
 from etsplat.io.mesh_files import MeshFile
-from etsplat.ops.rasterize_opaque import render_opaque
+from etsplat.io.textures import Texture
+from etsplat.ops.rasterize_opaque import rasterize_opaque, render_opaque
 
 ELEVATIONS = (-70.0, -35.0, 0.0, 35.0, 70.0)
 """Degrees above the horizon."""
@@ -63,7 +66,7 @@ def photograph(
     """Normalise a mesh and take its pictures. View index is `azimuths` * elevation + azimuth.
 
     Args:
-        mesh: the object, in any units; its own colours are not used.
+        mesh: the object, in any units; its texture is used, colours of faces and vertices are not.
         width: image width in pixels, at least `height` (the sphere is fitted to the height).
         height: image height in pixels.
         elevations: degrees, strictly between -90 and 90.
@@ -86,13 +89,17 @@ def photograph(
     unit, normalization = normalize_mesh(mesh)
     cameras = orbit_cameras(width, height, elevations=elevations, azimuths=azimuths)
     vertices, faces = unit.vertices.to(device), unit.faces.to(device)
+    texture = None if unit.texture is None else unit.texture.to(device)
     colors = shade_faces(unit.vertices, unit.faces).to(device)
     images = []
     for view in range(len(cameras)):
         camera = cameras[view].to(device)
-        image = render_opaque(
-            vertices, face_colors=colors, cameras=camera, faces=faces, supersampling=supersampling
-        ).rgba[0]
+        if texture is None:
+            image = render_opaque(
+                vertices, face_colors=colors, cameras=camera, faces=faces, supersampling=supersampling
+            ).rgba[0]
+        else:
+            image = draw_textured(vertices, faces, texture, camera, supersampling)
         images.append(image.cpu())
         if progress is not None:
             progress(view + 1, len(cameras))
@@ -108,6 +115,38 @@ def photograph(
         test,
         normalization=normalization,
     )
+
+
+def draw_textured(
+    vertices: Float[Tensor, "V 3"],
+    faces: Int64[Tensor, "F 3"],
+    texture: Texture,
+    camera: Cameras,
+    supersampling: int,
+) -> Float[Tensor, "H W 4"]:
+    """One picture of a mesh in its texture's colours, premultiplied: the mean over a grid of samples in each pixel.
+
+    Args:
+        vertices: (V, 3).
+        faces: (F, 3).
+        texture: of these faces.
+        camera: one.
+        supersampling: samples along each axis of a pixel.
+    """
+    total = vertices.new_zeros((camera.height, camera.width, 4))
+    steps = [0.5 - (step + 0.5) / supersampling for step in range(supersampling)]
+    for down, across in itertools.product(steps, steps):
+        Ks = camera.Ks.clone()
+        Ks[:, 0, 2] += across
+        Ks[:, 1, 2] += down
+        seen = rasterize_opaque(vertices, cameras=replace(camera, Ks=Ks), faces=faces)
+        assert seen.triangle is not None
+        assert seen.barycentrics is not None
+        triangle, weights = seen.triangle[0], seen.barycentrics[0]
+        covered = (triangle.view(-1) >= 0).nonzero()[:, 0]
+        colors = texture.colors(triangle.view(-1)[covered].long(), weights.view(-1, 3)[covered])
+        total.view(-1, 4)[covered] += torch.cat([colors, torch.ones_like(colors[:, :1])], dim=1)
+    return total / supersampling**2
 
 
 def orbit_cameras(width: int, height: int, *, elevations: Sequence[float] = ELEVATIONS, azimuths: int = 8) -> Cameras:

@@ -3,17 +3,19 @@
 trimesh is imported where it is used: it takes half a second, which runs without such files need not wait for.
 """
 
-import json
+import io
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from etsplat.core.errors import InputError
+from etsplat.io._materials import GltfMaterials, join_gltf, obj_texture, split_gltf
 from etsplat.io.paths import kind_of, path_within
 from etsplat.io.srgb import srgb_from_linear
+from etsplat.io.textures import Texture
 
 if TYPE_CHECKING:
     import trimesh
@@ -42,11 +44,18 @@ class RawMesh:
     vertex_colors: np.ndarray | None = None
     file_faces: int | None = None
     """Faces in the file before polygons were cut into triangles, where the format tells."""
+    texture: Texture | None = None
+    notes: list[str] = field(default_factory=list)
+    """What of the file is left out."""
 
 
 def read_obj(path: Path) -> RawMesh:
-    """Positions (with the colours that may follow them) and faces of a Wavefront OBJ; everything else is ignored."""
+    """Positions (with the colours that may follow them), faces, and the texture of a Wavefront OBJ."""
     rows: list[list[float]] = []
+    uvs: list[list[float]] = []
+    face_uvs: list[Corners] = []
+    libraries: list[str] = []
+    materials, material, face_materials = {"": 0}, 0, []
     faces: list[Corners] = []
     file_faces = 0
     with open(path, encoding="utf-8", errors="replace") as file:
@@ -62,8 +71,20 @@ def read_obj(path: Path) -> RawMesh:
                     corners = [int(word.split("/", 1)[0]) for word in words[1:]]
                     if 0 in corners:
                         raise ValueError("vertex number 0; they count from 1")
-                    faces += _fan([corner - 1 if corner > 0 else len(rows) + corner for corner in corners])
+                    cut = _fan([corner - 1 if corner > 0 else len(rows) + corner for corner in corners])
+                    faces += cut
                     file_faces += 1
+                    if libraries:
+                        face_uvs += _fan([_uv_number(word, len(uvs)) for word in words[1:]])
+                        face_materials += [material] * len(cut)
+                elif words[:1] == ["vt"] and libraries:
+                    if len(words) < 2:
+                        raise ValueError("a texture coordinate without a number")
+                    uvs.append([float(word) for word in [*words[1:3], "0"][:2]])
+                elif words[:1] == ["usemtl"]:
+                    material = materials.setdefault(line.split(None, 1)[1].strip() if words[1:] else "", len(materials))
+                elif words[:1] == ["mtllib"] and words[1:]:
+                    libraries.append(line.split(None, 1)[1].strip())
             except ValueError as error:
                 raise InputError(
                     f"mesh {path}: line {number} is not valid OBJ ({error}); is the file cut short? Export it again"
@@ -71,7 +92,32 @@ def read_obj(path: Path) -> RawMesh:
     table = np.array([row[:3] for row in rows], dtype=np.float64).reshape(-1, 3)
     colored = len(rows) > 0 and all(len(row) == 6 for row in rows)
     colors = np.array([row[3:] for row in rows], dtype=np.float64) if colored else None
-    return RawMesh(table, np.array(faces, dtype=np.int64).reshape(-1, 3), vertex_colors=colors, file_faces=file_faces)
+    mesh = RawMesh(table, np.array(faces, dtype=np.int64).reshape(-1, 3), vertex_colors=colors, file_faces=file_faces)
+    if libraries and len(face_uvs) < len(faces):
+        mesh.notes.append("its materials are named behind its faces; they are left out")
+    elif len(face_uvs) > 0:
+        numbers = np.array(face_uvs)
+        if numbers.max() >= len(uvs):
+            raise InputError(
+                f"mesh {path}: a face uses texture coordinate {int(numbers.max()) + 1}, but there are {len(uvs)};"
+                " is the file cut short? Export it again"
+            )
+        table = np.array(uvs, dtype=np.float64).reshape(-1, 2)
+        if not (np.abs(table) < np.finfo(np.float32).max).all():
+            raise InputError(f"mesh {path}: texture coordinates that are not finite; export it again")
+        mesh.texture, mesh.notes = obj_texture(
+            path, libraries, list(materials), np.array(face_materials), table, numbers
+        )
+    return mesh
+
+
+def _uv_number(word: str, count: int) -> int:
+    """The texture coordinate of a corner, from 0; -1 if it has none."""
+    parts = word.split("/")
+    number = int(parts[1]) if len(parts) > 1 and parts[1] else 0
+    if number < -count:
+        raise ValueError(f"texture coordinate {number} of {count}")
+    return number - 1 if number >= 0 else count + number
 
 
 def _fan(corners: list[int]) -> list[Corners]:
@@ -134,7 +180,16 @@ def read_ply(path: Path) -> RawMesh:
 
 def read_gltf(path: Path) -> RawMesh:
     """GLB and glTF through trimesh: all meshes of the scene in its frame; linear COLOR_0 becomes display values."""
-    mesh = _read_with_trimesh(path)
+    try:
+        data = _check_gltf(path)
+        document, binary = split_gltf(data)
+        materials = GltfMaterials(path, document, binary)
+        if materials.wanted:
+            materials.mark()
+            data = join_gltf(data, document)
+    except Exception as error:
+        raise _unreadable(path, error) from error
+    mesh = _read_with_trimesh(path, (data, materials) if materials.wanted else None)
     if mesh.vertex_colors is not None:
         mesh.vertex_colors = srgb_from_linear(mesh.vertex_colors)
     return mesh
@@ -148,19 +203,26 @@ def _unreadable(path: Path, error: Exception) -> InputError:
     return InputError(f"mesh {path}: cannot be read as {kind} ({detail}); is the file cut short? Export it again")
 
 
-def _read_with_trimesh(path: Path) -> RawMesh:
-    """All meshes of the file in one, vertices and faces as stored."""
+def _read_with_trimesh(path: Path, textured: tuple[bytes, GltfMaterials] | None = None) -> RawMesh:
+    """All meshes of the file in one, vertices and faces as stored; of glTF with textures what is read, and these."""
     import trimesh
+    from trimesh.resolvers import FilePathResolver
 
     # trimesh's readers signal damage with whatever their parsing runs into, missing optional modules included.
     try:
-        if kind_of(path) in (".glb", ".gltf"):
-            _check_gltf(path)
-        scene = trimesh.load_scene(str(path), process=False, skip_materials=True)
+        file = str(path) if textured is None else io.BytesIO(textured[0])
+        scene = trimesh.load_scene(
+            file,
+            file_type=None if textured is None else kind_of(path)[1:],
+            resolver=None if textured is None else FilePathResolver(str(path)),
+            process=False,
+            skip_materials=True,
+        )
         nodes = scene.graph.nodes_geometry
         if sum(len(scene.geometry[scene.graph[node][1]].vertices) for node in nodes) > _MOST_VERTICES:
             raise ValueError(f"its {len(nodes)} nodes have more than {_MOST_VERTICES} vertices")
         parts = [_placed(scene, node) for node in nodes]
+        texture = None if textured is None else _gltf_texture(scene, parts, textured[1])
     except Exception as error:
         raise _unreadable(path, error) from error
     if not parts:
@@ -171,20 +233,34 @@ def _read_with_trimesh(path: Path) -> RawMesh:
         np.concatenate([part.faces + offset for part, offset in zip(parts, offsets, strict=False)]),
         _joined([part.face_colors for part in parts]),
         _joined([part.vertex_colors for part in parts]),
+        texture=texture,
+        notes=[] if textured is None else textured[1].pictures.notes,
     )
 
 
-def _check_gltf(path: Path) -> None:
-    """Raises what damage leads to, and ValueError where arrays are larger than the files, or a file lies elsewhere."""
-    text = data = path.read_bytes()
+def _gltf_texture(scene: "trimesh.Scene", parts: list[RawMesh], materials: GltfMaterials) -> Texture | None:
+    """Of the faces of all nodes."""
+    images, corners = [], []
+    for node, part in zip(scene.graph.nodes_geometry, parts, strict=True):
+        if len(part.faces):
+            number, uvs = materials.uvs(scene.geometry[scene.graph[node][1]].vertex_attributes)
+            if not np.isfinite(uvs.astype(np.float32)).all():
+                raise ValueError("texture coordinates that are not finite")
+            images.append(np.full(len(part.faces), number))
+            corners.append(uvs[part.faces])
+    return materials.pictures.texture(np.concatenate(images), np.concatenate(corners)) if images else None
+
+
+def _check_gltf(path: Path) -> bytes:
+    """The file. Raises what damage leads to, and ValueError where arrays are larger than the files."""
+    data = path.read_bytes()
     room, at = len(data), 12
     if data.startswith(b"glTF"):
-        text = data[20 : 20 + int.from_bytes(data[12:16], "little")]
         while at < min(room, int.from_bytes(data[8:12], "little")):
             at += 8 + int.from_bytes(data[at : at + 4], "little")
         if at > room + 8:  # of what follows the last chunk only a part may be there
             raise ValueError(f"chunks of {at} bytes in {room}")
-    document = json.loads(text)
+    document = split_gltf(data)[0]
     for uri in [buffer["uri"] for buffer in document.get("buffers", []) if "uri" in buffer]:
         if not uri.startswith("data:"):
             room += path_within(path.parent, uri, path).stat().st_size
@@ -195,6 +271,7 @@ def _check_gltf(path: Path) -> None:
         claimed += accessor["count"] * _COMPONENTS[accessor["type"]] * _COMPONENT_BYTES[accessor["componentType"]]
     if claimed > _SHARING * room:
         raise ValueError(f"arrays of {claimed} bytes in {room}")
+    return data
 
 
 def _joined(colors: list[np.ndarray | None]) -> np.ndarray | None:

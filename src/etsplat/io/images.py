@@ -41,8 +41,12 @@ class _Bounded(io.BufferedReader):
         self.close()  # Pillow leaves a file open that it did not open
 
 
-def open_image(path: Path | str) -> Image.Image:
+def open_image(path: Path | str, data: bytes | None = None) -> Image.Image:
     """An image that is not decoded yet, of the formats that are read here and within MAX_PIXELS.
+
+    Args:
+        path: of its file.
+        data: what there is of it, where it is only a part of that file.
 
     Raises:
         InputError: the file is missing, empty, too large, or not such an image.
@@ -50,11 +54,12 @@ def open_image(path: Path | str) -> Image.Image:
     path = Path(path)
     if not path.is_file():
         raise InputError(f"image {path}: no such file; check the path")
-    if path.stat().st_size == 0:
+    size = path.stat().st_size if data is None else len(data)
+    if size == 0:
         raise InputError(f"image {path}: the file is empty; copy it again")
     try:
         # Without formats Pillow tries all it knows, and starts programs.
-        image = Image.open(_Bounded(path), formats=_FORMATS)
+        image = Image.open(_Bounded(path) if data is None else io.BytesIO(data), formats=_FORMATS)
     except UnidentifiedImageError as error:
         raise InputError(f"image {path}: not an image that can be read; convert it to PNG or JPEG") from error
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
@@ -65,7 +70,7 @@ def open_image(path: Path | str) -> Image.Image:
             f"image {path}: is {image.width}x{image.height}, more than {MAX_PIXELS // 10**6} million pixels; shrink it"
         )
     denser = 16 if image.format == "PNG" and image.mode in ("1", "L", "P") else 1  # with one bit for a pixel
-    if image.width * image.height > _DENSEST * denser * path.stat().st_size:
+    if image.width * image.height > _DENSEST * denser * size:
         image.close()
         raise InputError(
             f"image {path}: damaged or cut short (too small for {image.width}x{image.height}); copy it again"
@@ -91,6 +96,23 @@ def load_image(path: Path | str) -> Float[Tensor, "H W C"]:
     if isinstance(decoded, Tensor):
         return decoded[..., None].repeat(1, 1, 3)
     return torch.from_numpy(np.array(decoded)).to(torch.float32) / 255
+
+
+def load_colors(path: Path | str, data: bytes | None = None) -> tuple[np.ndarray, bool]:
+    """The straight colours of an image, (H, W, 3) uint8, and whether some of it is transparent.
+
+    Args:
+        path: of its file.
+        data: the image, where it is only a part of that file.
+
+    Raises:
+        InputError: as `load_image`.
+    """
+    decoded = _decoded(path, data)
+    if isinstance(decoded, Tensor):
+        return to_8_bit(decoded)[..., None].repeat(1, 1, 3).numpy(), False
+    pixels = np.array(decoded)
+    return np.ascontiguousarray(pixels[..., :3]), bool((pixels[..., 3:] < 255).any())
 
 
 def load_pixels(path: Path | str, width: int, height: int) -> UInt8[Tensor, "H W C"]:
@@ -207,9 +229,9 @@ def resize_image(image: Float[Tensor, "H W C"], width: int, height: int) -> Floa
     return resized[0].movedim(0, -1).clamp(0, 1).contiguous()
 
 
-def _decoded(path: Path | str) -> Image.Image | Float[Tensor, "H W"]:
+def _decoded(path: Path | str, data: bytes | None = None) -> Image.Image | Float[Tensor, "H W"]:
     """8-bit RGB, or RGBA with transparency; or levels of 16-bit grey, which Pillow would clip instead of scale."""
-    with open_image(path) as image:
+    with open_image(path, data) as image:
         deep = image.mode.startswith("I")
         transparent = image.mode in ("RGBA", "LA", "PA", "La", "RGBa") or "transparency" in image.info
         try:

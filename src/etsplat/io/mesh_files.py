@@ -13,6 +13,7 @@ from etsplat.core.errors import InputError
 from etsplat.core.validation import check_memory, dense
 from etsplat.io._mesh_readers import READERS, RawMesh
 from etsplat.io.paths import kind_of, path_remedy
+from etsplat.io.textures import Texture
 from etsplat.io.writers import Surface, save_surface, writer_of
 
 
@@ -25,7 +26,9 @@ class MeshFile:
         faces: (F, 3) int64 indices into `vertices`.
         face_colors: (F, 3) float32 in [0, 1] as displayed (sRGB), or None.
         vertex_colors: (V, 3) float32 in [0, 1] as displayed (sRGB), or None.
-        notes: one sentence for each repair made while reading (polygons cut into triangles, faces dropped).
+        notes: one sentence for each repair made while reading (polygons cut into triangles, faces dropped), and for
+            what of its textures is left out.
+        texture: pictures over the faces (OBJ with MTL, glTF), or None. `save_mesh` does not write them.
     """
 
     vertices: Float[Tensor, "V 3"]
@@ -33,6 +36,7 @@ class MeshFile:
     face_colors: Float[Tensor, "F 3"] | None = None
     vertex_colors: Float[Tensor, "V 3"] | None = None
     notes: tuple[str, ...] = ()
+    texture: Texture | None = None
 
 
 def load_mesh(path: Path | str) -> MeshFile:
@@ -45,7 +49,8 @@ def load_mesh(path: Path | str) -> MeshFile:
         path: .ply, .obj, .glb, .gltf, .stl or .off.
 
     Returns:
-        The mesh, with whatever colours per face or vertex the file has (textures are ignored).
+        The mesh, with whatever colours per face or vertex the file has, and its texture. Pictures must be PNG or JPEG
+        in the folder of the file; those that cannot be used are left out, with a note.
 
     Raises:
         InputError: the file is missing, empty, cut short, of another kind, has no faces, non-finite vertices, or
@@ -214,9 +219,11 @@ def _clean(path: Path, raw: RawMesh) -> MeshFile:
         torch.from_numpy(np.ascontiguousarray(raw.faces, dtype=np.int64)),
         colors(raw.face_colors),
         colors(raw.vertex_colors),
+        notes=tuple(raw.notes),
+        texture=raw.texture,
     )
     if raw.file_faces is not None and len(raw.faces) > raw.file_faces:
-        mesh = replace(mesh, notes=(f"{raw.file_faces} polygons were cut into {len(raw.faces)} triangles",))
+        mesh = replace(mesh, notes=(*mesh.notes, f"{raw.file_faces} polygons were cut into {len(raw.faces)} triangles"))
     corners = mesh.vertices[mesh.faces].double()
     normals = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     mesh = _drop_faces(mesh, (normals == 0).all(dim=1), "of zero area")
@@ -237,6 +244,7 @@ def _drop_faces(mesh: MeshFile, drop: Tensor, which: str) -> MeshFile:
         mesh,
         faces=mesh.faces[~drop],
         face_colors=None if mesh.face_colors is None else mesh.face_colors[~drop],
+        texture=None if mesh.texture is None else mesh.texture.keep(~drop),
         notes=(*mesh.notes, f"{count} of {len(drop)} faces {which} were dropped"),
     )
 

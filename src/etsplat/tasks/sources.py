@@ -188,7 +188,8 @@ def fingerprint(source: MeshFile | Dataset | None) -> str | None:
     if isinstance(source, Dataset):
         return source.fingerprint()
     digest = hashlib.sha256()
-    for tensor in (source.vertices, source.faces, source.face_colors, source.vertex_colors):
+    textures = () if source.texture is None else vars(source.texture).values()
+    for tensor in (source.vertices, source.faces, source.face_colors, source.vertex_colors, *textures):
         if tensor is not None:
             digest.update(str(tuple(tensor.shape)).encode())
             digest.update(tensor.contiguous().cpu().numpy().data)

@@ -1,0 +1,67 @@
+"""Pictures that a mesh file lays over its faces, and the colours that they give to points of these."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float, Int64, UInt8
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Texture:
+    """Colours of a mesh that vary within its faces. A material without a picture has one of a single pixel.
+
+    Attributes:
+        pixels: (P, 3) of all pictures one after the other, display values (sRGB), row by row from the top.
+        sizes: (I, 2) height and width of each picture.
+        face_images: (F,) the picture of each face.
+        corner_uvs: (F, 3, 2) where the corners of each face are in it: (0, 0) is its lower left corner, (1, 1) the
+            upper right one; beyond these it repeats.
+    """
+
+    pixels: UInt8[Tensor, "P 3"]
+    sizes: Int64[Tensor, "I 2"]
+    face_images: Int64[Tensor, " F"]
+    corner_uvs: Float[Tensor, "F 3 2"]
+
+    @classmethod
+    def of(
+        cls,
+        images: Sequence[UInt8[Tensor, "H W 3"]],
+        face_images: Int64[Tensor, " F"],
+        corner_uvs: Float[Tensor, "F 3 2"],
+    ) -> "Texture":
+        """Of whole pictures, each (H, W, 3)."""
+        sizes = torch.tensor([image.shape[:2] for image in images])
+        return cls(torch.cat([image.reshape(-1, 3) for image in images]), sizes, face_images, corner_uvs)
+
+    def keep(self, faces: Tensor) -> "Texture":
+        """That of some of the faces, by index or mask."""
+        return replace(self, face_images=self.face_images[faces], corner_uvs=self.corner_uvs[faces])
+
+    def to(self, device: torch.device | str) -> "Texture":
+        """The same on a device."""
+        return Texture(**{name: tensor.to(device) for name, tensor in vars(self).items()})
+
+    def colors(self, faces: Int64[Tensor, " N"], weights: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+        """The colours of points of faces in [0, 1], bilinear between the pixels' centres.
+
+        Args:
+            faces: the face of each point.
+            weights: its barycentric coordinates.
+        """
+        uv = torch.einsum("nk,nkc->nc", weights, self.corner_uvs[faces])
+        uv = uv - uv.floor()
+        areas, image = self.sizes.prod(dim=1), self.face_images[faces]
+        first, (height, width) = (areas.cumsum(0) - areas)[image], self.sizes[image].unbind(1)
+        x, y = uv[:, 0] * width - 0.5, (1 - uv[:, 1]) * height - 0.5
+        left, top = x.floor(), y.floor()
+        columns = [(left.long() + step) % width for step in (0, 1)]
+        rows = []
+        for step in (0, 1):
+            row = first + (top.long() + step) % height * width
+            west, east = (self.pixels[row + column].float() for column in columns)
+            rows.append(torch.lerp(west, east, (x - left)[:, None]))
+        north, south = rows
+        return torch.lerp(north, south, (y - top)[:, None]) / 255
