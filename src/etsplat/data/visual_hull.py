@@ -4,6 +4,8 @@ It has the holes and the parts that the silhouettes show, so a run that starts f
 that no silhouette shows are closed in it.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 import torch
 from jaxtyping import Float, Int64
@@ -15,6 +17,9 @@ from etsplat.data.hull import silhouette, touches_border
 from etsplat.data.meshing import dual_contour
 from etsplat.data.pictures import as_float
 from etsplat.geometry.parts import face_parts
+
+Distance = Callable[[Float[Tensor, "N 3"]], Float[Tensor, " N"]]
+"""Of points from a surface, negative inside; it need not be exact."""
 
 _FIRST_CELLS, _MOST_CELLS = 48, 160
 """Grid cells per side of the box, at first and at most."""
@@ -55,13 +60,12 @@ def visual_hull(
         vertices (V, 3) float32 and faces (F, 3) int64, counter-clockwise seen from outside; (0, 3) both if the
         silhouettes have no point in common.
     """
-    views = [_View(dataset, index) for index in dataset.train]
+    outside = outside_hull(dataset)
 
-    def outside(points: np.ndarray) -> np.ndarray:
-        """Negative inside."""
+    def distance(points: np.ndarray) -> np.ndarray:
         chunks = torch.from_numpy(points).float().split(_CHUNK)
-        distance = torch.cat([_outside(views, chunk) for chunk in chunks]).double().numpy()
-        return np.maximum(distance, np.linalg.norm(points, axis=1) - radius)
+        found = torch.cat([outside(chunk) for chunk in chunks]).double().numpy()
+        return np.maximum(found, np.linalg.norm(points, axis=1) - radius)
 
     cells = _FIRST_CELLS
     vertices, triangles = np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)
@@ -69,13 +73,28 @@ def visual_hull(
         cell = 2 * radius / (cells - 2 * _MARGIN)
         corner = -0.5 * cell * cells
         lower, counts = (corner, corner, corner), (cells, cells, cells)
-        vertices, triangles = dual_contour(outside, lower, cell, counts, bisections=_BISECTIONS)
+        vertices, triangles = dual_contour(distance, lower, cell, counts, bisections=_BISECTIONS)
         if len(triangles) == 0 or abs(len(triangles) - faces) <= _NEAR * faces:
             break
         wanted = round(cells * (faces / len(triangles)) ** 0.5)
         if cells == (cells := min(max(wanted, _FIRST_CELLS // 2), _MOST_CELLS)):
             break
     return _without_specks(torch.from_numpy(vertices).float(), torch.from_numpy(triangles))
+
+
+def outside_hull(dataset: Dataset) -> Distance:
+    """How far points are outside the visual hull: a function of them, in units of the scene, negative inside."""
+    views = [_View(dataset, index) for index in dataset.train]
+
+    def outside(points: Tensor) -> Tensor:
+        depth, judges = torch.full((len(points),), torch.inf), torch.zeros(len(points))
+        for view in views:
+            found, judged = view.inside(points)
+            depth = torch.where(judged, torch.minimum(depth, found), depth)
+            judges += judged
+        return torch.where(2 * judges >= len(views), -depth, 1.0)
+
+    return outside
 
 
 class _View:
@@ -108,16 +127,6 @@ class _View:
         )
         judged = front & (self.whole | (place.abs() < 1).all(dim=1))
         return found[0, 0, 0] * z / self.K[0, 0], judged
-
-
-def _outside(views: list[_View], points: Tensor) -> Tensor:
-    """(N,) how far points are outside the hull, in units of the scene; negative inside."""
-    depth, judges = torch.full((len(points),), torch.inf), torch.zeros(len(points))
-    for view in views:
-        found, judged = view.inside(points)
-        depth = torch.where(judged, torch.minimum(depth, found), depth)
-        judges += judged
-    return torch.where(2 * judges >= len(views), -depth, 1.0)
 
 
 def _without_specks(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:

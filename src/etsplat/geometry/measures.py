@@ -13,6 +13,16 @@ def face_areas(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> Flo
     return 0.5 * torch.linalg.cross(b - a, c - a).norm(dim=1)
 
 
+def vertex_normals(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> Float[Tensor, "V 3"]:
+    """(V, 3) unit normals, the mean of the faces' weighted by area; 0 for a vertex without one."""
+    a, b, c = vertices[faces].unbind(1)
+    across = torch.linalg.cross(b - a, c - a)
+    total = torch.zeros_like(vertices)
+    for corner in faces.T:
+        total = total.index_add(0, corner, across)
+    return torch.nn.functional.normalize(total, dim=1)
+
+
 def enclosed_volume(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> float:
     """The volume inside a closed oriented mesh, positive if its normals point outwards: sum of a . (b x c) / 6."""
     corners = vertices[faces].double()

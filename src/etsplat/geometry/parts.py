@@ -3,14 +3,11 @@
 import math
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from jaxtyping import Float, Int64
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
-from etsplat.geometry.topology import MeshTopology
+from etsplat.geometry.topology import MeshTopology, connected
 
 _MOST_PARTS = 64
 """Of a surface whose parts are counted: more are grass or fur, which nobody counts."""
@@ -33,9 +30,8 @@ class Shape:
 
 def face_parts(faces: Int64[Tensor, "F 3"], num_vertices: int) -> Int64[Tensor, " F"]:
     """The part that each face belongs to, those with most faces first; faces with a common vertex are together."""
-    first, second = faces.numpy().ravel(), faces.roll(1, dims=1).numpy().ravel()
-    links = coo_matrix((np.ones(len(first), dtype=bool), (first, second)), (num_vertices, num_vertices))
-    label = torch.from_numpy(connected_components(links, directed=False)[1]).long()[faces[:, 0]]
+    links = torch.stack([faces, faces.roll(1, dims=1)], dim=-1).reshape(-1, 2)
+    label = connected(links, num_vertices)[1][faces[:, 0]]
     rank = torch.argsort(torch.argsort(label.bincount(), descending=True, stable=True))
     return rank[label]
 

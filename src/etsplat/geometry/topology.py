@@ -124,7 +124,7 @@ class MeshTopology:
 
     def components(self) -> Int[Tensor, " F"]:
         """The connected component of each face, 0, 1, ...; faces that share a vertex are connected."""
-        _, labels = _connected(self.edges, self.num_vertices)
+        _, labels = connected(self.edges, self.num_vertices)
         _, compact = torch.unique(labels[self.faces[:, 0].cpu()], return_inverse=True)
         return compact.to(self.faces.device)
 
@@ -146,7 +146,7 @@ class MeshTopology:
                     dim=1,
                 )
             )
-        return _connected(torch.cat(links), 3 * self.num_faces)[0]
+        return connected(torch.cat(links), 3 * self.num_faces)[0]
 
     def _shared_vertices(self) -> Int[Tensor, "P 2"]:
         counts = self.edge_face_counts
@@ -192,7 +192,7 @@ def _neighbors(edges: Int[Tensor, "E 2"], num_vertices: int) -> tuple[Int[Tensor
     return offsets, others[torch.sort(ends, stable=True).indices]
 
 
-def _connected(links: Int[Tensor, "L 2"], count: int) -> tuple[int, Int[Tensor, " N"]]:
+def connected(links: Int[Tensor, "L 2"], count: int) -> tuple[int, Int[Tensor, " N"]]:
     """Number of connected components of `count` nodes, and each node's component in order of first appearance."""
     rows, columns = links.cpu().numpy().T
     graph = coo_array((np.ones(len(rows), dtype=np.int8), (rows, columns)), shape=(count, count))

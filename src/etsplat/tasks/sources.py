@@ -18,6 +18,7 @@ from etsplat.core.errors import InputError
 from etsplat.data.dataset import Dataset
 from etsplat.data.demo_object import demo_object
 from etsplat.data.demo_scene import HEIGHT, WIDTH, demo_scene
+from etsplat.data.hollows import open_hollows
 from etsplat.data.hull import bounding_sphere
 from etsplat.data.load import load_dataset
 from etsplat.data.photograph import normalize_mesh, photograph
@@ -178,6 +179,7 @@ def _hull(views: Dataset, config: ReconstructConfig) -> tuple[Tensor, Tensor]:
             "start.shape: the masks have no point in common, so there is no hull; check that masks are white inside the"
             " object and that poses and images belong together"
         )
+    vertices, faces, _ = open_hollows(views, vertices, faces)
     return untangle(vertices, MeshTopology.from_faces(faces, len(vertices)))[0], faces
 
 

@@ -1,0 +1,135 @@
+"""A bowl with painted walls: its hull has a flat lid, which the photos contradict."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from etsplat.data.hollows import open_hollows
+from etsplat.data.photograph import orbit_cameras, photograph
+from etsplat.data.pictures import StoredPictures
+from etsplat.data.visual_hull import visual_hull
+from etsplat.geometry.distance import closest_points
+from etsplat.geometry.topology import MeshTopology
+from etsplat.io.mesh_files import MeshFile
+from etsplat.ops.rasterize_opaque import render_opaque
+
+
+def revolved(profile: list[tuple[float, float]], rounds: int = 96) -> tuple[torch.Tensor, torch.Tensor]:
+    """A closed mesh from a polyline of (radius, height), whose ends lie on the axis, about y."""
+    angles = 2 * math.pi * torch.arange(rounds) / rounds
+    rings = [torch.stack([r * angles.sin(), torch.full_like(angles, y), r * angles.cos()], 1) for r, y in profile[1:-1]]
+    vertices = torch.cat([torch.tensor([[0.0, profile[0][1], 0.0], [0.0, profile[-1][1], 0.0]]), *rings])
+    k = torch.arange(rounds)
+    following = (k + 1) % rounds
+    faces = [torch.stack([torch.zeros_like(k), 2 + following, 2 + k], 1)]
+    for ring in range(len(rings) - 1):
+        a, b = 2 + ring * rounds, 2 + (ring + 1) * rounds
+        faces.append(torch.stack([a + k, a + following, b + following], 1))
+        faces.append(torch.stack([a + k, b + following, b + k], 1))
+    last = 2 + (len(rings) - 1) * rounds
+    faces.append(torch.stack([torch.ones_like(k), last + k, last + following], 1))
+    return vertices, torch.cat(faces)
+
+
+def line(start: tuple[float, float], end: tuple[float, float], parts: int = 16) -> list[tuple[float, float]]:
+    return [tuple(a + (b - a) * i / parts for a, b in zip(start, end, strict=True)) for i in range(parts)]  # type: ignore[misc]
+
+
+def pictures_of(profile: list[tuple[float, float]], *, painted: bool):
+    """Vertices and faces in the frame of the views, and the views: of one colour, or with soft spots."""
+    vertices, faces = revolved(profile)
+    views = photograph(MeshFile(vertices, faces), 160, 160, supersampling=2)
+    unit = views.normalization.apply(vertices)
+    waves = 8 * torch.randn(3, 3, 4, generator=torch.Generator().manual_seed(1))
+    phases = torch.einsum("fk,kcw->fcw", unit[faces].mean(dim=1), waves) * float(painted)
+    images = render_opaque(
+        unit,
+        face_colors=0.5 + 0.4 * phases.sin().mean(dim=2),
+        cameras=orbit_cameras(160, 160),
+        faces=faces,
+        supersampling=2,
+    ).rgba
+    return unit, faces, replace(views, images=StoredPictures(list(images)))
+
+
+BOWL = [
+    (0.0, -0.5),
+    *line((0.04, -0.5), (0.7, -0.5)),
+    *line((0.7, -0.5), (0.7, 0.4)),
+    *line((0.7, 0.4), (0.58, 0.4), 3),
+    *line((0.58, 0.4), (0.58, -0.2)),
+    *line((0.58, -0.2), (0.04, -0.2)),
+    (0.0, -0.2),
+]
+CAN = [
+    (0.0, -0.5),
+    *line((0.04, -0.5), (0.7, -0.5)),
+    *line((0.7, -0.5), (0.7, 0.4)),
+    *line((0.7, 0.4), (0.04, 0.4)),
+    (0.0, 0.4),
+]
+
+
+@pytest.fixture(scope="module")
+def bowl():
+    """The bowl and its views, its hull, and that opened."""
+    vertices, faces, views = pictures_of(BOWL, painted=True)
+    hull = visual_hull(views, 1600)
+    return vertices, faces, views, hull, open_hollows(views, *hull)
+
+
+def inner(views, vertices):
+    """Vertices near the axis that look up, above the middle of the bottom's thickness."""
+    points = views.normalization.invert(vertices)
+    return (points[:, ::2].norm(dim=1) < 0.4) & (points[:, 1] > -0.4)
+
+
+def test_a_lid_goes_down_to_the_bottom(bowl):
+    truth, faces, views, (hull, _), (found, opened, moved) = bowl
+    lid = inner(views, hull)
+    assert lid.sum() > 30
+    assert views.normalization.invert(hull)[lid, 1].min() > 0.35  # it is closed before
+    assert moved > 0.9 * lid.sum()
+    topology = MeshTopology.from_faces(opened, len(found))
+    assert topology.is_closed()
+    assert topology.is_manifold()
+    assert topology.is_oriented()
+    depth = views.normalization.invert(found[: len(hull)])[lid, 1]
+    assert depth.median() == pytest.approx(-0.2, abs=0.03)
+    assert (depth + 0.2).abs().quantile(0.9) < 0.06
+    before, after = (closest_points(points, truth, faces)[0].square().mean() for points in (hull, found))
+    assert after < before / 10
+
+
+def test_the_side_which_is_no_lid_stays(bowl):
+    _, _, views, (hull, _), (found, _, _) = bowl
+    points = views.normalization.invert(hull)
+    side = (points[:, ::2].norm(dim=1) > 0.66) & (points[:, 1] > -0.4) & (points[:, 1] < 0.3)
+    assert side.sum() > 100
+    assert torch.equal(found[: len(hull)][side], hull[side])
+
+
+def test_a_shallow_lid_over_a_flat_end_is_taken_off():
+    """No camera looks along the ends of the can, so its hull is domed there, and nothing lies deeper."""
+    truth, faces, views = pictures_of(CAN, painted=True)
+    hull, triangles = visual_hull(views, 1600)
+    found, _, moved = open_hollows(views, hull, triangles)
+    assert moved > 100
+    before, after = (closest_points(points, truth, faces)[0] for points in (hull, found))
+    assert after.square().mean() < before.square().mean() / 4
+    assert after.max() <= before.max()
+
+
+def test_where_there_is_no_texture_nothing_moves():
+    _, _, views = pictures_of(BOWL, painted=False)
+    hull, triangles = visual_hull(views, 1600)
+    assert open_hollows(views, hull, triangles)[2] == 0
+
+
+def test_it_repeats_to_the_bit(bowl):
+    _, _, views, hull, first = bowl
+    second = open_hollows(views, *hull)
+    assert torch.equal(first[0], second[0])
+    assert torch.equal(first[1], second[1])
