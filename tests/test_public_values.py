@@ -64,6 +64,7 @@ VALUES: dict[str, Callable[[], Any]] = {
     "DivergedError": lambda: etsplat.DivergedError("the loss is NaN at iteration 3"),
     "DoneEvent": lambda: etsplat.DoneEvent(3, 0.5),
     "EdgeLength": lambda: etsplat.EdgeLength(0.5, power=2),
+    "Exposure": lambda: etsplat.Exposure(10),
     "Fixed": lambda: etsplat.Fixed(),
     "GeometryMetrics": lambda: etsplat.GeometryMetrics(0.1, 0.0, 0.1, 0.9, 1, 2),
     "Guard": lambda: etsplat.Guard(tolerance=0.1),

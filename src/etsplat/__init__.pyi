@@ -61,6 +61,7 @@ from etsplat.optim.densification import PruneRules as PruneRules
 from etsplat.optim.edit import RowPlan as RowPlan
 from etsplat.optim.edit import apply_rows as apply_rows
 from etsplat.optim.edit import apply_subdivision as apply_subdivision
+from etsplat.optim.exposure import Exposure as Exposure
 from etsplat.optim.guard import Guard as Guard
 from etsplat.optim.loop import CheckpointEvent as CheckpointEvent
 from etsplat.optim.loop import DivergedError as DivergedError

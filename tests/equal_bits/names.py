@@ -125,7 +125,10 @@ class Names:
         return name
 
 
-TENSORS = Names({r"(mesh|soup)\.(.*)": r"model.\2", r"statistics\.(.*)": r"strategy.\1"})
+TENSORS = Names(
+    {r"(mesh|soup)\.(.*)": r"model.\2", r"statistics\.(.*)": r"strategy.\1"},
+    added=frozenset({"exposure.explained"}),  # what is measured of the photos; where that is little, nothing else is
+)
 """Of checkpoints and of soup.safetensors."""
 _GEOMETRY = ("chamfer", "chamfer_floor", "chamfer_exact", "f_score")
 METRICS = Names(
@@ -133,7 +136,8 @@ METRICS = Names(
     # Meshes and soups are measured by one scorer; edits that spoil are undone; results of meshes are judged.
     added=frozenset(
         {"edits_undone", "ssim_mesh", "test_views", "lpips", "lpips_reason", "silhouette_iou", "judgement", *_GEOMETRY}
-    ),
+    )
+    | {"psnr_affine", "exposure_learned", "exposure_explained"},
     ignored=frozenset({"seconds", "seconds_per_iteration", "versions"}),
 )
 """Of metrics.json."""

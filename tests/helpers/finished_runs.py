@@ -96,6 +96,7 @@ def write_soup_run(folder: Path) -> Path:
             "psnr": 27.1,
             "ssim": 0.81,
             "psnr_opaque": 25.9,
+            "psnr_affine": 27.5,
             "triangles": 98765,
             "threads": 4,
             "method": "elastic",

@@ -10,7 +10,7 @@ from scipy.ndimage import correlate
 
 from etsplat.core.errors import InputError
 from etsplat.metrics import image as image_metrics
-from etsplat.metrics.image import Lpips, find_lpips_weights, psnr, silhouette_iou, ssim
+from etsplat.metrics.image import Lpips, colors_fitted, find_lpips_weights, psnr, silhouette_iou, ssim
 
 
 @pytest.fixture
@@ -31,6 +31,27 @@ def weights():
         random = torch.randn(value.shape, generator=generator)
         entries[key] = random.abs() if key.startswith("lin") else random * (2 / max(value[0].numel(), 1)) ** 0.5
     return entries
+
+
+def test_colors_are_fitted_where_an_affine_map_explains_them() -> None:
+    """The map is undone; what does not count or lies behind has no say, and the background stays."""
+    rng = torch.Generator().manual_seed(3)
+    image, matrix, shift = torch.rand((9, 8, 3), generator=rng), torch.eye(3) + 0.1, torch.tensor([0.02, 0.0, 0.05])
+    truth = 0.6 * image @ matrix.T + shift
+    torch.testing.assert_close(colors_fitted(image, truth), truth, atol=1e-5, rtol=0)
+    counts, wrong = torch.ones(9, 8), truth.clone()
+    counts[:4], wrong[:4] = 0, 1.0
+    torch.testing.assert_close(colors_fitted(image, wrong, counts=counts), truth, atol=1e-5, rtol=0)
+
+    coverage, behind = torch.rand((9, 8, 1), generator=rng), torch.tensor([0.9, 0.2, 0.4])
+    seen, photo = (coverage * picture + (1 - coverage) * behind for picture in (image, truth))
+    fitted = colors_fitted(seen, photo, coverage=coverage[..., 0], background=behind)
+    torch.testing.assert_close(fitted, photo, atol=1e-5, rtol=0)
+    black = torch.zeros(4, 4, 3)
+    assert torch.equal(colors_fitted(black, black), black)
+    assert psnr(colors_fitted(image, image.flip(0)), image.flip(0)) >= psnr(image, image.flip(0))
+    with pytest.raises(ValueError, match="shape"):
+        colors_fitted(image, truth[:4])
 
 
 def test_silhouette_iou_counts_pixels_covered_by_half() -> None:

@@ -185,5 +185,5 @@ def test_a_gauge_measures_at_its_own_size(views: Dataset) -> None:
     for side in (24, 20, 6):
         gauge = Gauge(views, views.train, side, torch.device("cpu"))
         sizes.append({view.photo.shape[1] for view in gauge._views})
-        assert 0 < gauge.measure(run.model, run._objective).loss < 1
+        assert 0 < gauge.measure(run.model, run._objective, run.exposure).loss < 1
     assert sizes == [{24}, {12}, {6}]

@@ -86,6 +86,7 @@ def test_presets_of_reconstruct_are_what_they_were(preset: str) -> None:
     config = flatten(ReconstructConfig.of(preset).to_dict())
     since = {"start.shape": "sphere", "start.hull_faces": 0.5, "start.near": 0.1}
     since["watch"] = 0 if preset in ("paper", "study", "tiny") else None
+    since["exposure"] = "off" if preset in ("paper", "study", "tiny") else "auto"
     since["refinement.guard"] = 0.0 if preset in ("paper", "study", "tiny") else 0.02
     expected = {**before.RECONSTRUCT_PAPER, **before.RECONSTRUCT_CHANGES[preset]}
     named = {before.RECONSTRUCT_NAMES[name]: expected[name] for name in expected}
@@ -99,7 +100,8 @@ def test_presets_of_train_are_what_they_were(preset: str, scene: str) -> None:
     base = before.TRAIN_PAPER if preset == "paper" else before.TRAIN_QUICK
     expected = {**base, **before.TRAIN_CHANGES[preset, scene]}
     named = {before.TRAIN_NAMES[name]: expected[name] for name in expected}
-    since = {"batch": 1, "watch": 0 if preset == "paper" else None}
+    off = preset == "paper"
+    since = {"batch": 1, "watch": 0 if off else None, "exposure": "off" if off else "auto"}
     assert config == {"preset": preset, "scene_type": scene, **since, **named}
 
 

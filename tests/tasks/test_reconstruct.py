@@ -273,6 +273,22 @@ def test_views_can_be_handed_over(pebble: MeshFile, tmp_path: Path) -> None:
     assert "chamfer" not in RunDirectory(tmp_path).read_history()[-1]
 
 
+def test_what_was_learned_of_each_photo_is_in_a_file_of_its_own(pebble: MeshFile, tmp_path: Path) -> None:
+    """A matrix for every training photo, neutral in the mean; not there when the run is replaced by one without."""
+    views, out = photograph(pebble, 32, 32, supersampling=1), tmp_path / "run"
+    result = reconstruct(views, out, SHORT.changed({"exposure": "on"}))
+    found = json.loads((out / "exposure.json").read_text())
+    assert list(found["matrices"]) == [views.names[index] for index in views.train]
+    mean = torch.tensor(list(found["matrices"].values())).mean(dim=0)
+    torch.testing.assert_close(mean, torch.eye(3), atol=0.02, rtol=0)
+    assert (result.metrics["exposure_learned"], result.metrics["exposure_explained"]) == (True, None)
+    assert result.metrics["psnr_affine"] >= result.metrics["psnr"]
+    assert "exposure.json" in (out / "README.txt").read_text()
+    metrics = reconstruct(views, out, SHORT, overwrite=True).metrics
+    assert not (out / "exposure.json").exists()
+    assert metrics["exposure_learned"] is False
+
+
 @pytest.mark.shared_data
 def test_a_scene_folder_is_reconstructed(shared_data: Path, tmp_path: Path) -> None:
     """NeRF-synthetic lego at 64 x 64: a closed mesh with about its outline, which draws like the splats."""

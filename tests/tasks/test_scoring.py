@@ -6,7 +6,7 @@ from PIL import Image
 from etsplat.core.errors import InputError
 from etsplat.data.load import load_dataset
 from etsplat.io.images import save_image
-from etsplat.metrics.image import psnr, ssim
+from etsplat.metrics.image import colors_fitted, psnr, ssim
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.tasks.scoring import evaluate_run
 from etsplat.tasks.sources import SoupRun
@@ -38,6 +38,8 @@ def test_numbers_are_the_metrics_of_each_view_and_their_mean(tmp_path, soup):
         assert row["ssim"] == pytest.approx(ssim(image, photo))
         assert row["ssim_interior"] == pytest.approx(ssim(image, photo, interior=True))
         assert row["psnr_opaque"] == pytest.approx(psnr(opaque, photo))
+        assert row["psnr_affine"] == pytest.approx(psnr(colors_fitted(image, photo), photo))
+        assert row["psnr_affine"] > row["psnr"]
     assert found["psnr"] == pytest.approx(np.mean([row["psnr"] for row in found["views"]]))
     assert found["fps"] == pytest.approx(1e3 / found["ms_per_frame"])
     assert found["ms_per_million"] == pytest.approx(found["ms_per_frame"] * 25_000)

@@ -28,6 +28,7 @@ _COLUMNS = {
     "lpips_3dgs": ("LPIPS as 3DGS", ".4f"),
     "lpips": ("LPIPS", ".4f"),
     "psnr_opaque": ("PSNR opaque", ".2f"),
+    "psnr_affine": ("PSNR, colours fitted", ".2f"),
 }
 
 PURPOSES = {**purposes(), "safetensors": "For etsplat."}
@@ -44,7 +45,8 @@ _FORMAT = "\n".join(
 class Evaluate(Command):
     """Measure a trained soup on the views that training never saw, and how fast it is drawn.
 
-    PSNR; SSIM zero-padded as 3DGS has it, and in the interior; LPIPS in both conventions where its weights are.
+    PSNR; SSIM zero-padded as 3DGS has it, and in the interior; LPIPS in both conventions where its weights are. Beside
+    them PSNR after a fit of the colours to each photo, which has seen what it is measured on.
 
     Examples:
         etsplat eval runs/kitchen

@@ -4,7 +4,7 @@ from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from etsplat.core.cameras import Cameras
@@ -23,11 +23,13 @@ class View:
         camera: one.
         photo: (1, H, W, C): bytes of 3 channels, or of 4 premultiplied; or float32 premultiplied RGBA.
         mask: (1, H, W), 255 where pixels count; None where all do.
+        index: (1,) int64, of the view in its data set.
     """
 
     camera: Cameras
     photo: Tensor
     mask: UInt8[Tensor, "1 H W"] | None
+    index: Int[Tensor, "1"]
 
 
 @dataclass(frozen=True)
@@ -72,6 +74,7 @@ class ViewLoader:
         self._cameras = [camera.to(device) for camera in dataset.cameras]
         self._viewmats = torch.cat([camera.viewmats for camera in self._cameras])
         self._Ks = torch.cat([camera.Ks for camera in self._cameras])
+        self._indices = torch.arange(len(dataset), device=device)
         self._kept: dict[int, View] = {}
         self._kinds: dict[int, PhotoKind] = {}
         self._places: dict[int, int] = {}
@@ -91,7 +94,8 @@ class ViewLoader:
         if index in self._kept:
             return self._kept[index]
         mask, photo = self._images.mask(index), self._images[index].to(self._device)[None]
-        view = View(self._cameras[index], photo, None if mask is None else mask.to(self._device)[None])
+        mask = None if mask is None else mask.to(self._device)[None]
+        view = View(self._cameras[index], photo, mask, self._indices[index : index + 1])
         if self._device.type == "cuda" and not self.streamed:
             self._kept[index] = view
         return view
@@ -149,7 +153,7 @@ class ViewLoader:
             at = at.clamp_max(len(stack.pixels) - 1)
         camera = Cameras(self._viewmats.index_select(0, view), self._Ks.index_select(0, view), kind.width, kind.height)
         mask = None if stack.masks is None else stack.masks.index_select(0, at)
-        return View(camera, stack.pixels.index_select(0, at), mask)
+        return View(camera, stack.pixels.index_select(0, at), mask, view)
 
     def _keep_all(self) -> None:
         counts: dict[PhotoKind, int] = {}

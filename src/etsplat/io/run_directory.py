@@ -35,6 +35,7 @@ metrics.json    how good it is; docs/conventions.md of etsplat says how each num
 {test}
 history.jsonl   one line per log step: iteration, seconds of optimisation, loss, state, and what was evaluated
 convergence.png how loss, quality and the number of triangles went; overview.png shows test views
+exposure.json   if it is there: the photos were exposed unlike each other; how each saw the colours of the result
 config.json     the settings that made it
 checkpoints/    where an interrupted run continues with --resume; safe to delete once the run is done
 """
@@ -78,6 +79,7 @@ _FILES = (
     "gaussians.safetensors",
     "metrics.json",
     "evaluation.json",
+    "exposure.json",
     "history.jsonl",
     "convergence.png",
     "overview.png",
@@ -279,6 +281,10 @@ class RunDirectory:
         """Puts what became of the run into README.txt, in the place of what that said of it before."""
         task = self.read_config()["task"]
         _write_text(self.path / "README.txt", f"{_readme(task)}\nThe result is {verdict}.\n")
+
+    def write_exposure(self, exposure: Mapping[str, Any]) -> None:
+        """Writes exposure.json: what was learned of each training photo's exposure."""
+        _write_json(self.path / "exposure.json", exposure)
 
     def append_history(self, line: Mapping[str, Any]) -> None:
         """Appends one line to history.jsonl."""

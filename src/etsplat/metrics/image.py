@@ -53,6 +53,44 @@ def psnr(image: Float[Tensor, "H W C"], truth: Float[Tensor, "H W C"]) -> float:
     return math.inf if error == 0 else -10 * math.log10(error)
 
 
+def colors_fitted(
+    image: Float[Tensor, "H W 3"],
+    truth: Float[Tensor, "H W 3"],
+    *,
+    counts: Float[Tensor, "H W"] | None = None,
+    coverage: Float[Tensor, "H W"] | None = None,
+    background: Float[Tensor, "3"] | None = None,
+) -> Float[Tensor, "H W 3"]:
+    """An image with its colours mapped to M c + t, with the M (3, 3) and t (3,) that bring it closest to another.
+
+    By least squares over all pixels, in float64; the result is in [0, 1]. For what a camera's exposure and white
+    balance hide: a score of the result has seen the truth, and is none of the image.
+
+    Args:
+        image: over the background.
+        truth: over the background.
+        counts: (H, W) weights of the pixels; None for 1.
+        coverage: (H, W) opacity of what is mapped: the background shows through and stays. None for all of the image.
+        background: (3,); None for black.
+
+    Raises:
+        ValueError: shapes differ or are not (H, W, 3).
+    """
+    _check_pair(image, truth)
+    x, y = image.double(), truth.double()
+    whole = torch.ones_like(x[..., :1])
+    weight = whole if counts is None else counts[..., None].to(x)
+    alpha = whole if coverage is None else coverage[..., None].to(x)
+    behind = torch.zeros_like(x) if background is None else (1 - alpha) * background.to(x)
+    basis = torch.cat([x - behind, alpha], dim=-1).flatten(0, 1)
+    weighted = (weight * basis.view(*x.shape[:2], 4)).flatten(0, 1)
+    squares, products = weighted.T @ basis, weighted.T @ (y - behind).flatten(0, 1)
+    if not bool(squares.isfinite().all()):
+        return image
+    mapped = (basis @ (torch.linalg.pinv(squares, hermitian=True) @ products)).view_as(x)
+    return (mapped + behind).clamp(0.0, 1.0).to(image)
+
+
 def silhouette_iou(coverage: Float[Tensor, "H W"], truth: Float[Tensor, "H W"]) -> float:
     """Intersection over union of two silhouettes: pixels that are covered by at least half. 1 where both are empty.
 

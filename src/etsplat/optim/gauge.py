@@ -11,6 +11,7 @@ from etsplat.data.dataset import Dataset
 from etsplat.data.loader import View, ViewLoader
 from etsplat.model.model import Model
 from etsplat.ops.photometric import photometric_loss
+from etsplat.optim.exposure import Exposure
 from etsplat.optim.objective import Drawing, Objective
 
 _CORNERS = [[float(corner >> bit & 1) for bit in range(3)] for corner in range(8)]
@@ -63,14 +64,22 @@ class Gauge:
         self._backgrounds = colors.to(device)
 
     @torch.no_grad()
-    def measure(self, model: Model, objective: Objective) -> Measured:
-        """The photometric term of an objective, and the PSNR; means over the views."""
+    def measure(self, model: Model, objective: Objective, exposure: Exposure | None = None) -> Measured:
+        """The photometric term of an objective, and the PSNR; means over the views.
+
+        Args:
+            model: as it is now.
+            objective: of the run.
+            exposure: of training photos, as which their pictures are exposed where it is learned; None for others.
+        """
         term, losses, errors = objective.photometric, [], []
         for number, view in enumerate(self._views):
             background = self._backgrounds[number % len(self._backgrounds)][None]
             rendering = model.render(
                 view.camera, backgrounds=background, outputs=("color", *term.outputs), depth_of=objective.depth_of
             )
+            if exposure is not None and exposure.learned:
+                rendering = exposure.applied(rendering, view, background)
             losses.append(term(Drawing(model, view.camera, view.photo, view.mask, background, rendering)))
             mask = None if view.mask is None else view.mask.float() / 255
             color = rendering.color.clamp(0.0, 1.0)

@@ -32,7 +32,7 @@ class Drawing:
         photo: (1, H, W, 3 or 4), bytes or floats in [0, 1]; four channels are premultiplied.
         mask: (1, H, W) bytes, 255 where pixels count, or None.
         background: (1, 3) behind the picture, and to be put behind the photo.
-        rendering: the picture, with the outputs that the terms ask for.
+        rendering: the picture, as the photo was exposed, with the outputs that the terms ask for.
         shared: what one term has computed of this view for others, by its name.
     """
 

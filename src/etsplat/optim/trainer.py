@@ -25,6 +25,7 @@ from etsplat.io.run_directory import RunDirectory, is_run
 from etsplat.model.model import Model
 from etsplat.ops.adam import Adam
 from etsplat.optim.drive import drive
+from etsplat.optim.exposure import Exposure
 from etsplat.optim.gauge import Gauge
 from etsplat.optim.guard import Guard
 from etsplat.optim.loop import Callback, LoopSettings, Progress, UndoEvent
@@ -67,6 +68,7 @@ class Trainer(Generic[M]):
         model: as it is now; changed in place.
         adam: its optimizer.
         strategy: what adds and removes triangles.
+        exposure: what is learned of each photo's exposure.
         progress: where the run stands.
         guard: what undoes edits; None lets all of them stay.
     """
@@ -81,6 +83,7 @@ class Trainer(Generic[M]):
         schedule: Schedule | None = None,
         batch: int = 1,
         background: Sequence[float] | None = None,
+        exposure: Exposure | None = None,
         update: Callable[[Adam, Any], None] | None = None,
         evaluate: Callable[[Any], dict[str, float]] | None = None,
         guard: Guard | None = None,
@@ -97,12 +100,14 @@ class Trainer(Generic[M]):
             schedule: learning rates, and what else changes over the run; None for the model's own rates throughout.
             batch: views that each step sees.
             background: colour behind the pictures; None for another random one behind each.
+            exposure: what is learned of each photo's exposure; None for photos that were all exposed alike.
             update: takes the step from the gradients, in the place of `Adam.step`.
             evaluate: cheap metrics of the model.
             guard: undoes edits of the strategy after which the training photos are explained worse.
             seed: of the order of views and every other random choice; or a generator to go on with.
         """
         self.model, self.strategy, self.progress = model, strategy or Fixed(), Progress()
+        self.exposure = exposure or Exposure(NEVER)
         self._objective, self._dataset, self._batch = objective, dataset, batch
         self._schedule, appearance = schedule or Schedule(model.RATES), model.appearance
         self._appearance = self._schedule.appearance or (lambda _: appearance)
@@ -122,6 +127,7 @@ class Trainer(Generic[M]):
             self._watch = Watch(kept, objective, self._look)
         self.adam = Adam(parameters, self._rates(1))
         self.strategy.start(model, self.adam, len(dataset.train), generator)
+        self.exposure.start(dataset.train, batch, next(iter(parameters.values())))
         self._halvings = -1
         self._arrive(0)
         self._queue: StepQueue | None = None
@@ -137,6 +143,7 @@ class Trainer(Generic[M]):
                 appearance=len(model.appearance.numbers),
                 values=len(self._schedule.values),
                 rates=len(parameters) + 1,
+                exposure=2,
             )
             self._queue = StepQueue(self._queued_gradients, self._commit, self._row.width, self._device)
 
@@ -205,7 +212,8 @@ class Trainer(Generic[M]):
             self._queue.restart()
         most = max(1, READ_AHEAD // self._batch) if self._loader.streamed else MAX_STEPS
         judged = NEVER if self.guard is None else self.guard.due
-        steps = range(first, min(last, first + most - 1, self.strategy.next_edit(first), judged) + 1)
+        stops = self.strategy.next_edit(first), judged, self.exposure.next_measurement(first)
+        steps = range(first, min(last, first + most - 1, *stops) + 1)
         unchanged = takewhile(lambda i: self._phase_at(i) == phase, steps)
         losses = self._queue.run([self._queued_step(i) for i in unchanged])
         self._arrive(first + len(losses) - 1)
@@ -213,14 +221,13 @@ class Trainer(Generic[M]):
 
     def refine(self, iteration: int) -> int:
         """Edits if it is time to; returns by how many triangles the model grew."""
+        if iteration == self.exposure.measured_at:
+            self._measure_exposure()
         before = self.count
         if self.guard is not None and self.strategy.next_edit(iteration) == iteration:
             if iteration in self.guard.left_out:
                 return 0
-            loss, following = (
-                self._judging.measure(self.model, self._objective).loss,
-                self.strategy.next_edit(iteration + 1),
-            )
+            loss, following = self._loss(), self.strategy.next_edit(iteration + 1)
             self.guard.hold(self.progress, following, loss, self._state())
         if self.strategy.edit(iteration):
             self.edited()
@@ -268,7 +275,7 @@ class Trainer(Generic[M]):
 
     def first_not_finite(self) -> str | None:
         """The name of a parameter that holds NaN or infinity, or None."""
-        return first_not_finite(self.model.parameters())
+        return first_not_finite({**self.model.parameters(), "exposure": self.exposure.values})
 
     def state(self) -> dict[str, Tensor]:
         """Everything that the rest of the run depends on, by name, for a checkpoint."""
@@ -284,6 +291,7 @@ class Trainer(Generic[M]):
             "strategy": self.strategy.state(),
             "sampler": self._sampler.state(),
             "watch": self._watch.state() if self._watch else {},
+            "exposure": self.exposure.state(),
         }
         state = {f"{part}.{name}": tensor for part, tensors in parts.items() for name, tensor in tensors.items()}
         return {**state, **kernel_tensors(self._kernel), "adam.step_count": torch.tensor(self.adam.step_count)}
@@ -305,6 +313,7 @@ class Trainer(Generic[M]):
         self._sampler.load_state(_part(state, "sampler"))
         if self._watch is not None:
             self._watch.load_state(_part(state, "watch"))
+        self.exposure.load_state(_part(state, "exposure"))
         self._arrive(iteration)
         self.edited()
 
@@ -315,7 +324,7 @@ class Trainer(Generic[M]):
 
     def _loss(self) -> float:
         """By which edits are judged."""
-        return self._judging.measure(self.model, self._objective).loss
+        return self._judging.measure(self.model, self._objective, self.exposure).loss
 
     def _step(self, iteration: int) -> float:
         self._arrive(iteration)
@@ -328,6 +337,8 @@ class Trainer(Generic[M]):
             self.adam.step()
         else:
             self._update(self.adam, self.model)
+        if self.exposure.learned:
+            self.exposure.step(iteration)
         for each, rendering in zip(chosen, seen, strict=True):
             self.strategy.observe(rendering, epoch_starts=each.epoch_starts)
         return float(loss)
@@ -346,6 +357,7 @@ class Trainer(Generic[M]):
             appearance=self._appearance(iteration).numbers,
             values=list(self._values(iteration).values()),
             rates=self.adam.rates(list(self.adam.parameters)),
+            exposure=self.exposure.queued_rates(iteration),
         )
 
         def prepare() -> None:
@@ -371,6 +383,8 @@ class Trainer(Generic[M]):
     def _commit(self, row: Tensor, halted: Tensor) -> None:
         fields = self._row.unpack(row)
         self.adam.step_on_device(fields["rates"], halted)
+        if self.exposure.learned:
+            self.exposure.step_on_device(fields["exposure"], halted)
         for rendering, epoch_starts in zip(self._seen, fields["epochs"].split(1), strict=True):
             self.strategy.observe_on_device(rendering, epoch_starts, halted)
         self._seen = []
@@ -380,20 +394,31 @@ class Trainer(Generic[M]):
     ) -> tuple[Tensor, list[Rasterization]]:
         """Those of the objective, one view after the other; its value, and what was seen."""
         outputs = (*self._objective.outputs(weights), *self.strategy.outputs)
-        losses, seen = [], []
+        losses, seen, exposure = [], [], self.exposure
         for number, (view, background) in enumerate(views, start=1):
             rendering = self.model.render(
                 view.camera, backgrounds=background, outputs=outputs, depth_of=self._objective.depth_of
             )
-            drawing = Drawing(self.model, view.camera, view.photo, view.mask, background, rendering)
+            shot = exposure.applied(rendering, view, background) if exposure.learned else rendering
+            drawing = Drawing(self.model, view.camera, view.photo, view.mask, background, shot)
             whole = number == self._batch
             loss = self._objective(drawing, weights, scale, views=self._batch, whole=whole)
+            if exposure.learned:
+                loss = loss + exposure.penalty(view) / self._batch
             if not losses:
                 self.adam.zero_grad()
+                exposure.adam.zero_grad()
             loss.backward()
             losses.append(loss.detach())
             seen.append(rendering)
         return sum(losses[1:], start=losses[0]), seen
+
+    def _measure_exposure(self) -> None:
+        behind = torch.zeros(1, 3) if self._background is None else self._background
+        views = (self._loader.view(index) for index in self._dataset.train)
+        self.exposure.measure(self.model, views, behind.to(self._device))
+        if self.exposure.learned:
+            self.edited()
 
     def _choose(self) -> list[_Chosen]:
         """Views and backgrounds of the next step; photos that come after them are decoded ahead."""

@@ -37,6 +37,10 @@ _IOU = (
     "Pixels of the test views that the mesh and the object both cover, over those that either covers (at least half of "
     "the pixel); mean over views. 100 % is the same outline."
 )
+_PSNR_AFFINE = (
+    "PSNR after the colours of each picture were fitted to those of its photograph: what it would be if the exposure "
+    "and white balance of test views were known. It has seen what it is measured on; PSNR is the score."
+)
 _SSIM = "Structural similarity on the test views: 11 × 11 Gaussian window, σ 1.5, zero padding. 1 is identical."
 _LPIPS = "Learned perceptual distance (VGG16) on the test views. Lower is better."
 
@@ -79,6 +83,7 @@ def describe_mesh(metrics: dict[str, Any]) -> list[Metric]:
         number_card(metrics, "silhouette_iou", "Silhouette IoU", "%", _percent, _IOU, "no masks, or no test views"),
         number_card(metrics, "ssim", "SSIM", "", fixed(4), _SSIM, "no test views"),
         number_card(metrics, "lpips", "LPIPS", "", fixed(4), _LPIPS, metrics.get("lpips_reason") or "no weights"),
+        number_card(metrics, "psnr_affine", "PSNR, colours fitted", "dB", fixed(2), _PSNR_AFFINE, "no test views"),
         Metric("Mesh", f"{metrics['faces']:,}", "faces", _mesh_meaning(metrics)),
         time_card(metrics),
     ]
@@ -93,6 +98,7 @@ def describe_soup(metrics: dict[str, Any]) -> list[Metric]:
         number_card(metrics, "ssim", "SSIM", "", fixed(4), _SOUP_SSIM, no_views),
         number_card(metrics, "lpips_3dgs", "LPIPS", "", fixed(4), _SOUP_LPIPS, metrics.get("lpips_reason") or ask),
         number_card(metrics, "psnr_opaque", "PSNR of opaque triangles", "dB", fixed(2), _OPAQUE, no_views),
+        number_card(metrics, "psnr_affine", "PSNR, colours fitted", "dB", fixed(2), _PSNR_AFFINE, no_views),
         Metric("Triangles", f"{metrics['triangles']:,}", "", _triangles_meaning(metrics)),
         number_card(metrics, "fps", "Speed", "frames/s", fixed(1), _speed(metrics), ask),
         number_card(metrics, "ms_per_million", "Time per million triangles", "ms", fixed(1), _PER_MILLION, ask),

@@ -25,7 +25,7 @@ _COUNTS = {"reconstruct": "faces", "train": "triangles"}
 """What the result has so many of, by task."""
 
 _MEASURED = (
-    *("psnr", "ssim", "lpips", "lpips_3dgs", "psnr_mesh", "psnr_opaque", "silhouette_iou"),
+    *("psnr", "psnr_affine", "ssim", "lpips", "lpips_3dgs", "psnr_mesh", "psnr_opaque", "silhouette_iou"),
     *("chamfer", "chamfer_floor", "chamfer_exact", "f_score", "fps", "ms_per_million"),
     *("watched_psnr", "watched_psnr_last"),
     *("sigma", "sigma_10", "sigma_90", "opacity", "opacity_10", "opacity_90"),

@@ -13,6 +13,7 @@ from etsplat.geometry.parts import Shape, genera, shape_of
 from etsplat.io.mesh_files import MeshFile
 from etsplat.model.triangle_mesh import TriangleMesh
 from etsplat.ops.antialias_nvdiffrast import load_nvdiffrast
+from etsplat.optim.exposure import Exposure
 from etsplat.optim.guard import Guard
 from etsplat.optim.loop import Callback, NoteEvent
 from etsplat.optim.objective import Objective
@@ -135,7 +136,8 @@ def reconstruct(
                 mesh.save(job.run.mesh_path(suffix), frame)
             sizes = {"faces": len(mesh.faces), "vertices": len(mesh.vertices)}
             sizes["edits_undone"] = len(trainer.guard.left_out) if trainer.guard else 0
-            found = {**scorer.full(mesh, job.run.test), **sizes, **outcome.metrics}
+            exposed = job.exposed(trainer.exposure, views.names)
+            found = {**scorer.full(mesh, job.run.test), **sizes, **outcome.metrics, **exposed}
             judgement = judging(mesh, found)
             metrics = job.finish(trainer.progress, {**found, "judgement": judgement.to_dict()}, mesh.vertices)
             job.run.conclude(judgement.verdict)
@@ -220,6 +222,7 @@ def make_trainer(
         SubdivideAndUntangle(budgets, untanglings),
         schedule=_schedule(config),
         batch=config.batch,
+        exposure=Exposure.of(config.exposure, length, len(views.train) / config.batch),
         update=None if config.optimizer.vertex_update == "adam" else UniformSteps(smoothing),
         evaluate=evaluate,
         guard=Guard(tolerance=refinement.guard, until=length) if refinement.guard else None,

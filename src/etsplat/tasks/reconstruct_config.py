@@ -174,6 +174,9 @@ class ReconstructConfig(Settings):
     """One in so many training photos is kept from training, to watch the run by; 0 keeps none. None keeps one in 16
     where there are at least 24, and none of those that are taken of a mesh. Where a run gets worse by them towards its
     end, its best state is the result."""
+    exposure: Literal["auto", "on", "off"] = "auto"
+    """Whether photos were exposed unlike each other, or with other white balances: then a gain and a colour matrix of
+    each are learned, which are not part of the result. auto: if an early measurement says that they were."""
     batch: Annotated[int, Range(1, 1024), Rare] = 1
     """Views that each step sees; the paper's method sees one."""
     seed: Annotated[int, Range(0, 2**63 - 1), Rare] = 0
@@ -252,6 +255,7 @@ class ReconstructConfig(Settings):
 # through another.
 _PAPER: dict[str, Any] = {
     "watch": 0,
+    "exposure": "off",
     "pictures.coarse_levels": 0,
     "pictures.coarse_until": 0.5,
     "regularization.final": 0.0,

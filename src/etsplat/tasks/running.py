@@ -19,6 +19,7 @@ from etsplat.engines.threads import num_threads
 from etsplat.io.kernel_files import kernel_digest, write_kernel
 from etsplat.io.locks import check_nobody_writes, writing_run
 from etsplat.io.run_directory import RunDirectory, is_run
+from etsplat.optim.exposure import Exposure
 from etsplat.optim.loop import Callback, Event, NoteEvent, PrepareEvent, Progress
 from etsplat.optim.objective import Term
 from etsplat.optim.schedules import Scheduled
@@ -29,6 +30,11 @@ from etsplat.tasks.notebook import notebook_callbacks, result_html
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.settings import Settings
 from etsplat.tasks.train_config import TrainConfig
+
+ABOUT_EXPOSURE = (
+    "colour in a training photo = matrix times colour of the result, both as displayed, red, green and blue in [0, 1]; "
+    "the mean photo is neutral"
+)
 
 
 @dataclass(frozen=True)
@@ -173,6 +179,23 @@ class Job:
         if outcome.note is not None:
             self.announce(NoteEvent(outcome.note))
         return outcome
+
+    def exposed(self, exposure: Exposure, names: Sequence[str]) -> dict[str, Any]:
+        """Writes exposure.json where exposures were learned, and says so.
+
+        Args:
+            exposure: of the trainer, at the end.
+            names: of the views.
+
+        Returns:
+            For metrics.json: whether they were, and what they explained of the error when that was measured.
+        """
+        if exposure.learned:
+            matrices = {names[view]: matrix.tolist() for view, matrix in exposure.matrices().items()}
+            self.run.write_exposure({"about": ABOUT_EXPOSURE, "matrices": matrices})
+            text = "the photos were exposed unlike each other; exposure.json has what was learned of each"
+            self.announce(NoteEvent(f"exposure: {text}"))
+        return {"exposure_learned": exposure.learned, "exposure_explained": exposure.explained}
 
     def finish(self, progress: Progress, found: Mapping[str, Any], result: Tensor) -> dict[str, Any]:
         """Writes metrics.json: what was found, how long it took, on what, and how it was made.

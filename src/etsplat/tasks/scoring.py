@@ -17,6 +17,7 @@ from torch import Tensor
 
 from etsplat.core.cameras import Cameras
 from etsplat.core.errors import InputError
+from etsplat.core.rasterization import Rasterization
 from etsplat.data.dataset import Dataset
 from etsplat.data.loader import View, ViewLoader
 from etsplat.data.pictures import as_float
@@ -27,7 +28,7 @@ from etsplat.io.atomic import write_error
 from etsplat.io.images import over_background, save_image, to_8_bit
 from etsplat.io.mesh_files import MeshFile
 from etsplat.metrics.geometry import SAMPLES, chamfer, geometry_metrics, sample_pair
-from etsplat.metrics.image import WINDOW, Lpips, find_lpips_weights, psnr, silhouette_iou, ssim
+from etsplat.metrics.image import WINDOW, Lpips, colors_fitted, find_lpips_weights, psnr, silhouette_iou, ssim
 from etsplat.model.model import Model
 from etsplat.model.triangle_mesh import TriangleMesh
 from etsplat.tasks.running import device_name
@@ -62,10 +63,22 @@ class Seen:
         self.photo: Float[Tensor, "H W 3"] = photo if self.alpha is None else over_background(photo, background)
 
     @cached_property
-    @torch.no_grad()
     def splatted(self) -> Float[Tensor, "H W 3"]:
         """(H, W, 3) the model as it is trained."""
-        return self._model.render(self._view.camera, backgrounds=self._background[None]).color[0].clamp(0.0, 1.0)
+        return self._rendered.color[0].clamp(0.0, 1.0)
+
+    @property
+    def fitted(self) -> Float[Tensor, "H W 3"]:
+        """(H, W, 3) the same with its colours mapped to those of the photograph, as another exposure would."""
+        mask, coverage = self._view.mask, None if self.alpha is None else self._rendered.alpha[0, ..., 0]
+        counts = None if mask is None else as_float(mask[0])
+        behind = self._background
+        return colors_fitted(self.splatted, self.photo, counts=counts, coverage=coverage, background=behind)
+
+    @cached_property
+    @torch.no_grad()
+    def _rendered(self) -> Rasterization:
+        return self._model.render(self._view.camera, backgrounds=self._background[None])
 
     @cached_property
     def covered(self) -> Float[Tensor, "H W 4"]:
@@ -147,7 +160,15 @@ class Scorer:
             rows.append({"name": self._dataset.names[index], **self._scores(seen, model.OPAQUE)})
             for kind, image in (("truth", seen.photo), ("render", seen.splatted), (model.OPAQUE, seen.opaque)):
                 save_image(folder / f"{number:03d}_{kind}.png", image)
-        names = ("psnr", "ssim", f"psnr_{model.OPAQUE}", f"ssim_{model.OPAQUE}", "lpips", "silhouette_iou")
+        names = (
+            "psnr",
+            "psnr_affine",
+            "ssim",
+            f"psnr_{model.OPAQUE}",
+            f"ssim_{model.OPAQUE}",
+            "lpips",
+            "silhouette_iou",
+        )
         means = {name: _mean([row[name] for row in rows]) for name in names}
         reason = self.lpips_reason if rows else "no test views"
         return {**self._geometry(model), **means, "lpips_reason": reason, "test_views": rows}
@@ -171,6 +192,7 @@ class Scorer:
         splatted, drawn = seen.counting(seen.splatted), seen.counting(seen.opaque)
         return {
             **image_scores(splatted, seen.photo, names=("psnr", "ssim")),
+            **fitted_score(seen),
             **image_scores(drawn, seen.photo, names=("psnr", "ssim"), suffix=f"_{opaque}"),
             **image_scores(splatted, seen.photo, self._lpips, ("lpips",)),
             "silhouette_iou": self._outline_iou(seen),
@@ -228,6 +250,11 @@ def image_scores(
     return {f"{name}{suffix}": measures[name]() if name in measures else None for name in names}
 
 
+def fitted_score(seen: Seen) -> dict[str, float | None]:
+    """What the PSNR of a view would be if its photograph's exposure and white balance were known, by its own name."""
+    return {"psnr_affine": psnr(seen.counting(seen.fitted), seen.photo)}
+
+
 def load_lpips(weights: Path | str | None, device: torch.device) -> FoundLpips:
     """The metric, or why it cannot be measured; `weights` as `etsplat.metrics.image.find_lpips_weights` takes it.
 
@@ -260,8 +287,9 @@ def evaluate_run(
     Returns:
         Means over the test views by name: psnr and psnr_8bit (of renders rounded to 8 bits, as published numbers are),
         ssim (zero-padded), ssim_interior, lpips (inputs scaled to [-1, 1]) and lpips_3dgs (not scaled), each also with
-        `_opaque` for the opaque triangles; `views`, the same for each; fps, ms_per_frame, ms_per_million and their
-        circumstances. null where something could not be measured, `lpips_reason` says why.
+        `_opaque` for the opaque triangles; psnr_affine, after a fit of the colours to each photograph; `views`, the
+        same for each; fps, ms_per_frame, ms_per_million and their circumstances. null where something could not be
+        measured, `lpips_reason` says why.
 
     Raises:
         InputError: no capture, no test views, weights that cannot be read, `pictures` cannot be written to.
@@ -283,7 +311,8 @@ def evaluate_run(
         seen = scorer.see(soup, view)
         photo, soft, opaque = seen.photo, seen.counting(seen.splatted), seen.counting(seen.opaque)
         name, scores = capture.names[view], image_scores(soft, photo, lpips)
-        rows.append({"name": name, **scores, **image_scores(opaque, photo, lpips, suffix="_opaque")})
+        scores |= fitted_score(seen) | image_scores(opaque, photo, lpips, suffix="_opaque")
+        rows.append({"name": name, **scores})
         if pictures is not None:
             error = (4 * (soft - photo).abs()).clamp(0, 1)
             save_image(pictures / f"{name}.png", torch.cat([photo, soft, opaque, error], dim=1))

@@ -15,6 +15,7 @@ from etsplat.model.soup_init import StartPoints, random_points, start_soup
 from etsplat.model.surroundings import Surroundings
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.optim.densification import PruneRules
+from etsplat.optim.exposure import Exposure
 from etsplat.optim.loop import Callback, CheckpointEvent, DivergedError, Event, NoteEvent
 from etsplat.optim.objective import Objective
 from etsplat.optim.schedules import Schedule, Scheduled, exponential_decay, limited_iterations, ramp
@@ -122,6 +123,7 @@ def train(
                 "psnr_opaque_loss": None if scores["psnr"] is None else scores["psnr"] - scores["psnr_opaque"],
                 **outcome.model.describe(),
                 **outcome.metrics,
+                **job.exposed(trainer.exposure, capture.names),
                 "width": capture.images.sizes[0][0],
                 "height": capture.images.sizes[0][1],
                 "train_views": len(capture.train),
@@ -193,6 +195,7 @@ def make_trainer(
         schedule=_schedule(config),
         batch=config.batch,
         background=None if config.background == "random" else _background(config),
+        exposure=Exposure.of(config.exposure, config.iterations, len(capture.train) / config.batch),
         evaluate=evaluate,
         seed=generator or config.seed,
     )
