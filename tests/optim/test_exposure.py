@@ -279,6 +279,8 @@ def test_photos_are_measured_when_each_was_seen(iterations: int, epoch: float, a
     assert Exposure.of("auto", iterations, epoch).next_measurement(at + 1) == NEVER
     assert not Exposure.of("off", iterations, epoch).learned
     assert Exposure.of("on", iterations, epoch).next_measurement(1) == at
+    assert Exposure.of("on", 40, 32).next_measurement(1) == 20, "in a run that is too short to tell"
+    assert Exposure.of("auto", 40, 32).next_measurement(1) > 40
 
 
 def test_a_step_that_does_not_count_changes_nothing(simt: object, scene: Dataset) -> None:

@@ -281,7 +281,8 @@ def test_what_was_learned_of_each_photo_is_in_a_file_of_its_own(pebble: MeshFile
     assert list(found["matrices"]) == [views.names[index] for index in views.train]
     mean = torch.tensor(list(found["matrices"].values())).mean(dim=0)
     torch.testing.assert_close(mean, torch.eye(3), atol=0.02, rtol=0)
-    assert (result.metrics["exposure_learned"], result.metrics["exposure_explained"]) == (True, None)
+    assert result.metrics["exposure_learned"] is True
+    assert -1 < result.metrics["exposure_explained"] < 1
     assert result.metrics["psnr_affine"] >= result.metrics["psnr"]
     assert "exposure.json" in (out / "README.txt").read_text()
     metrics = reconstruct(views, out, SHORT, overwrite=True).metrics

@@ -58,17 +58,17 @@ class Exposure:
 
     @staticmethod
     def of(choice: Literal["auto", "on", "off"], iterations: int, epoch: float) -> "Exposure":
-        """Learned if a measurement says so, in any case, or not at all.
+        """Learned if a measurement says so, in any case, or not at all. Runs too short for it are not measured.
 
         Args:
             choice: which of these.
             iterations: of the run.
             epoch: how many iterations show every photo once.
         """
-        measured = max(1, round(MEASURED_AT * iterations), round(EPOCHS * epoch))
+        early = max(1, round(MEASURED_AT * iterations), round(EPOCHS * epoch))
+        measured = {"auto": early, "on": min(early, max(1, iterations // 2)), "off": NEVER}
         needed = -math.inf if choice == "on" else NEEDED
-        rate = partial(_falling, iterations=iterations)
-        return Exposure(NEVER if choice == "off" else measured, needed=needed, rate=rate)
+        return Exposure(measured[choice], needed=needed, rate=partial(_falling, iterations=iterations))
 
     def __init__(
         self, measured_at: int, *, needed: float = NEEDED, rate: Scheduled = RATE, weight: float = WEIGHT
