@@ -42,7 +42,7 @@ from etsplat.tasks.judgement import (
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.running import Job, Result, path_of, terms_of
 from etsplat.tasks.scoring import Scorer, load_lpips
-from etsplat.tasks.sources import Source, fingerprint, load_source, load_start, make_start, make_subject
+from etsplat.tasks.sources import Source, fingerprint, load_source, load_start, make_start, make_subject, settle_start
 
 
 @dataclass(frozen=True)
@@ -121,8 +121,9 @@ def reconstruct(
             supersampling=config.pictures.supersampling,
             lpips=load_lpips(config.output.lpips_weights, job.device),
         )
+        config = settle_start(config, views, truth)
         mesh = make_start(start, views, config, job.device)
-        begun: Start = "mesh" if start is not None else config.start.shape
+        begun: Start = "mesh" if start is not None else "hull" if config.start.shape == "hull" else "sphere"
         judging = partial(_judge, scorer, views, truth, config, begun, shape_of(*mesh.surface()))
         if begun == "hull":
             holes = genera(mesh.faces.cpu(), len(mesh.vertices))

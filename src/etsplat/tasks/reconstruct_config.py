@@ -14,8 +14,8 @@ Preset = Literal["best", "paper", "study", "quick", "demo", "tiny"]
 
 _SOFT = Only("with soft triangles (elastic, bilateral, single-sided)", lambda config: config.soft)
 _COARSE = Only("with coarse levels", lambda config: config.pictures.coarse_levels > 0)
-_HULL = Only("with start.shape hull", lambda config: config.start.shape == "hull")
-_SPHERE = Only("with start.shape sphere", lambda config: config.start.shape == "sphere")
+_HULL = Only("with start.shape hull or auto", lambda config: config.start.shape != "sphere")
+_SPHERE = Only("with start.shape sphere or auto", lambda config: config.start.shape != "hull")
 _LARGE = Only("with vertex_update large-steps", lambda config: config.optimizer.vertex_update == "large-steps")
 _LEARNED = Only("where softness is learned", lambda config: config.soft and not config.optimizer.sigma_final)
 _EDGES = Only("with lambda_edge", lambda config: config.regularization.lambda_edge > 0)
@@ -50,8 +50,9 @@ class Drawing:
 class Start:
     """What the optimization starts from, unless that is a mesh of one's own."""
 
-    shape: Literal["sphere", "hull"] = "sphere"
-    """A sphere around the object; or the visual hull of its masks, which has the holes and parts that they show."""
+    shape: Literal["auto", "sphere", "hull"] = "auto"
+    """A sphere around the object; or the visual hull of its masks, which has the holes and parts that they show.
+    auto: the hull of photos that show the object as a whole, the sphere for photos that cut it off and for a mesh."""
     level: Annotated[int, Range(0, 9), _SPHERE] = 4
     """The sphere has 20 * 4^level faces."""
     radius: Annotated[float, Range(1e-6, 1e6)] = 1.05
@@ -251,11 +252,12 @@ class ReconstructConfig(Settings):
 
 
 # The paper does without what measurements support beyond it: coarse pictures at first, weights that stay, untangling
-# (research/ablations.md), and a guard of its edits. With them the result is closer to the truth, and no face cuts
-# through another.
+# (research/ablations.md), a guard of its edits and a start from the hull. With them the result is closer to the truth,
+# and no face cuts through another.
 _PAPER: dict[str, Any] = {
     "watch": 0,
     "exposure": "off",
+    "start.shape": "sphere",
     "pictures.coarse_levels": 0,
     "pictures.coarse_until": 0.5,
     "regularization.final": 0.0,

@@ -5,7 +5,7 @@ A `SoupRun` is what every command that comes after training starts from.
 
 import hashlib
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from etsplat.data.dataset import Dataset
 from etsplat.data.demo_object import demo_object
 from etsplat.data.demo_scene import HEIGHT, WIDTH, demo_scene
 from etsplat.data.hollows import open_hollows
-from etsplat.data.hull import bounding_sphere
+from etsplat.data.hull import bounding_sphere, silhouette, touches_border
 from etsplat.data.load import load_dataset
 from etsplat.data.photograph import normalize_mesh, photograph
 from etsplat.data.visual_hull import visual_hull
@@ -134,6 +134,21 @@ def load_start(start: str | Path | MeshFile | None) -> MeshFile | None:
     return weld_vertices(start if isinstance(start, MeshFile) else load_mesh(start))
 
 
+def settle_start(config: ReconstructConfig, views: Dataset, truth: MeshFile | None) -> ReconstructConfig:
+    """The settings with a start from the sphere or the hull in the place of "auto".
+
+    Args:
+        config: settings.
+        views: from `make_subject`.
+        truth: the mesh that they show, if they are pictures of one.
+    """
+    if config.start.shape != "auto":
+        return config
+    whole = [not touches_border(silhouette(views.images[index])) for index in views.train] if truth is None else []
+    hull = views.has_masks and 2 * sum(whole) > len(views.train)
+    return replace(config, start=replace(config.start, shape="hull" if hull else "sphere"))
+
+
 def make_start(
     start: MeshFile | None, views: Dataset, config: ReconstructConfig, device: torch.device | None = None
 ) -> TriangleMesh:
@@ -149,7 +164,7 @@ def make_start(
         InputError: the hull is asked for, and the views have no masks, or masks that exclude everything.
     """
     colors: Tensor | float = config.start.color
-    if start is None and config.start.shape == "hull":
+    if start is None and settle_start(config, views, None).start.shape == "hull":
         vertices, faces = _hull(views, config)
     elif start is None:
         vertices, faces = icosphere(config.start.level)
