@@ -101,10 +101,10 @@ def test_replayed_steps_are_those_that_are_called(cuda_device: torch.device, vie
     same_bits(replayed, called)
 
 
-@pytest.mark.parametrize(("method", "reads", "kernels"), [("elastic", 1, 18), ("raster-vertex", 0, 17)])
+@pytest.mark.parametrize(("method", "reads", "kernels"), [("elastic", 1, 21), ("raster-vertex", 0, 17)])
 def test_a_queued_step_reads_nothing_back(simt: Simt, views: Dataset, method: str, reads: int, kernels: int) -> None:
     """Nothing in a step waits for the device, but for the rasterizer's look at its room outside of captured graphs; and
-    few small kernels of torch are left."""
+    few small kernels of torch are left (four of them group corners by vertex)."""
     problem = fitting(views, "cuda", replace(CONFIG, method=method))
     problem.advance(1, 1)  # fills caches
     kind = next(iter(problem.queue._repeated))
