@@ -10,6 +10,10 @@ from etsplat.geometry.intersections import intersecting_faces
 from etsplat.geometry.separation import separated
 from etsplat.geometry.topology import MeshTopology
 
+_TANGLED = 0.2
+"""Fraction of faces that intersect, above which none is pushed: such a mesh is no solid whose sheets have sides, and
+its pairs of faces are too many to look at."""
+
 _PUSHES = 32
 """Rounds of pushing apart."""
 
@@ -68,7 +72,7 @@ def untangle(
     marked = intersecting_faces(moved, faces)
     topology = topology.to(torch.device("cpu"))
     for done in range(1, _PUSHES + 1):
-        if not bool(marked.any()):
+        if not 0 < float(marked.float().mean()) <= _TANGLED:
             break
         moved = separated(moved.double(), topology, marked).to(original)
         if done % _SETTLE == 0:
