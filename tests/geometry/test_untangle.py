@@ -1,4 +1,4 @@
-"""Untangling as a whole; how single piercings are undone is in test_separation.py, what a run sees of it in tests/optim."""
+"""Untangling as a whole; single piercings are in test_separation.py, what a run sees in tests/optim."""
 
 import pytest
 import torch
