@@ -124,8 +124,8 @@ class Refinement:
     untanglings: Annotated[int, Range(0, 10_000)] = 6
     """How often faces that cut through others are pushed apart, from the last subdivision to the last step."""
     guard: Annotated[float, Range(0)] = 0.02
-    """A subdivision or untangling is undone where 100 steps after it the loss of the training photos, at a small size,
-    is higher than before by more than this part; 0 lets all of them stay."""
+    """A subdivision or untangling is undone where 100 steps later training photos are explained worse;
+    that is where their loss, at a small size, is higher by more than this part; 0 lets all of them stay."""
 
 
 @dataclass(frozen=True)
@@ -172,12 +172,13 @@ class ReconstructConfig(Settings):
     max_faces: Annotated[int, Range(1)] = 100_000
     """Subdivision stops here."""
     watch: Annotated[int | None, Range(0)] = None
-    """One in so many training photos is kept from training, to watch the run by; 0 keeps none. None keeps one in 16
-    where there are at least 24, and none of those that are taken of a mesh. Where a run gets worse by them towards its
-    end, its best state is the result."""
+    """One in so many training photos is kept from training, to watch the run by; 0 keeps none.
+    None keeps one in 16 where there are at least 24, and none of those that are taken of a mesh.
+    Where a run gets worse by them towards its end, its best state is the result."""
     exposure: Literal["auto", "on", "off"] = "auto"
-    """Whether photos were exposed unlike each other, or with other white balances: then a gain and a colour matrix of
-    each are learned, which are not part of the result. auto: if an early measurement says that they were."""
+    """Whether photos were exposed unlike each other, or with other white balances:
+    then a gain and a colour matrix of each are learned, which are not part of the result.
+    auto: if an early measurement says that they were."""
     batch: Annotated[int, Range(1, 1024), Rare] = 1
     """Views that each step sees; the paper's method sees one."""
     seed: Annotated[int, Range(0, 2**63 - 1), Rare] = 0

@@ -189,11 +189,13 @@ class TrainConfig(Settings):
     finish: Literal["none", "opaque"] = "none"
     """opaque: triangles are made opaque, then sharp, for engines without transparency."""
     watch: Annotated[int | None, Range(0)] = None
-    """One in so many training photos is kept from training, to watch the run by; 0 keeps none. None keeps one in 16
-    where there are at least 24. Where a run gets worse by them towards its end, its best state is the result."""
+    """One in so many training photos is kept from training, to watch the run by; 0 keeps none.
+    None keeps one in 16 where there are at least 24.
+    Where a run gets worse by them towards its end, its best state is the result."""
     exposure: Literal["auto", "on", "off"] = "auto"
-    """Whether photos were exposed unlike each other, or with other white balances: then a gain and a colour matrix of
-    each are learned, which are not part of the result. auto: if an early measurement says that they were."""
+    """Whether photos were exposed unlike each other, or with other white balances:
+    then a gain and a colour matrix of each are learned, which are not part of the result.
+    auto: if an early measurement says that they were."""
     batch: Annotated[int, Range(1, 1024), Rare] = 1
     """Views that each step sees; the paper's method sees one."""
     seed: Annotated[int, Range(0, 2**63 - 1), Rare] = 0
