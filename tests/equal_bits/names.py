@@ -46,8 +46,8 @@ OPTIONS: dict[str, dict[str, str]] = {
         "--lpips-weights": "--output.lpips-weights",
     },
     "train": {
-        # No photo was kept from training to watch runs by.
-        **{f"--preset {preset}": f"--preset {preset} --watch 0" for preset in ("quick", "demo", "tiny")},
+        # No photo was kept from training to watch runs by, and exposures were not looked at.
+        **{f"--preset {preset}": f"--preset {preset} --watch 0 --exposure off" for preset in ("quick", "demo", "tiny")},
         "--near-plane": "--drawing.near-plane",
         "--cull-small": "--drawing.cull-small",
         "--no-cull-small": "--drawing.no-cull-small",
