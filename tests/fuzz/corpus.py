@@ -11,6 +11,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 import torch
+import trimesh
 from PIL import Image
 
 import etsplat
@@ -111,6 +112,37 @@ def gltfs() -> list[bytes]:
         document["buffers"] = [{"byteLength": len(buffer), "uri": uri}]
         found.append(json.dumps(document).encode())
     return found
+
+
+def textured_obj() -> Files:
+    """Two materials with a picture, one of them with options, and one with a colour."""
+    cube = "".join(f"v {x} {y} {z}\n" for x in (0, 1) for y in (0, 1) for z in (0, 1))
+    corners = "vt 0 0\nvt 1 0\nvt 1 1\nvt -0.5 2.5\n"
+    faces = "usemtl wood\nf 1/1 2/2 4/3 3/4\nusemtl stone\nf 5/1 6/2 8/3\nusemtl paint\nf -8 -7 -3\n"
+    materials = (
+        "newmtl wood\nKd 0.2 0.4 0.6\nmap_Kd wood.png\nmap_Bump wood.png\n"
+        "newmtl stone\nmap_Kd -s 2 2 1 -clamp on wood.png\nnewmtl paint\nKd 1 0.5 0\n"
+    )
+    return {
+        "input.obj": f"mtllib cube.mtl\n{cube}{corners}{faces}".encode(),
+        "cube.mtl": materials.encode(),
+        "wood.png": pictures()[0],
+    }
+
+
+def textured_gltfs() -> list[Files]:
+    """With its picture within, and with files beside it."""
+    vertices, faces = etsplat.icosphere(0)
+    uv = vertices.numpy()[:, :2] + 0.5
+    material = trimesh.visual.material.PBRMaterial(
+        baseColorTexture=Image.open(io.BytesIO(pictures()[0])), baseColorFactor=[255, 128, 64, 255]
+    )
+    mesh = trimesh.Trimesh(
+        vertices.numpy(), faces.numpy(), visual=trimesh.visual.TextureVisuals(uv, material=material), process=False
+    )
+    parts = trimesh.exchange.gltf.export_gltf(trimesh.Scene(mesh))
+    beside = {"input.gltf" if name.endswith(".gltf") else name: bytes(data) for name, data in parts.items()}
+    return [{"input.glb": trimesh.exchange.gltf.export_glb(trimesh.Scene(mesh))}, beside]
 
 
 def pictures() -> list[bytes]:

@@ -101,6 +101,12 @@ def _mesh(path: Path) -> None:
     assert 0 <= int(mesh.faces.min()) <= int(mesh.faces.max()) < len(mesh.vertices)
     for colors, count in ((mesh.vertex_colors, len(mesh.vertices)), (mesh.face_colors, len(mesh.faces))):
         assert colors is None or (colors.shape == (count, 3) and 0 <= colors.min() <= colors.max() <= 1)
+    if mesh.texture is not None:
+        every = torch.arange(len(mesh.faces))
+        for corner in torch.eye(3):
+            colors = mesh.texture.colors(every, corner.expand(len(every), 3))
+            assert colors.shape == (len(every), 3)
+            assert 0 <= colors.min() <= colors.max() <= 1
 
 
 CAMERA = etsplat.orbit_cameras(16, 12, azimuths=1)[0]
@@ -210,6 +216,8 @@ READERS = [
     Reader("mesh .stl", _single(".stl", corpus.stls), (".stl",), _file(_mesh)),
     Reader("mesh .glb", _single(".glb", lambda: corpus.meshes(".glb")), (".glb",), _file(_mesh)),
     Reader("mesh .gltf", _single(".gltf", corpus.gltfs), (".gltf",), _file(_mesh)),
+    Reader("textured .obj", _prefixed(corpus.textured_obj), (".obj", ".mtl", ".png"), _file(_mesh)),
+    Reader("textured .glb, .gltf", corpus.textured_gltfs, (".glb", ".gltf", ".bin", ".png"), _file(_mesh)),
     Reader("picture", _single(".png", corpus.pictures), (".png",), _file(_picture)),
     Reader("mask", _single(".png", corpus.masks), (".png",), _file(_mask)),
     Reader("points", _single(".ply", corpus.point_clouds), (".ply",), _file(_points)),
