@@ -11,7 +11,7 @@ from etsplat.engines.choice import engine
 from etsplat.optim.trainer import Trainer
 from etsplat.tasks.reconstruct import make_trainer
 from etsplat.tasks.reconstruct_config import ReconstructConfig
-from etsplat.tasks.sources import make_start
+from etsplat.tasks.starts import make_start
 
 
 def step_milliseconds(

@@ -25,8 +25,8 @@ class OnEngine:
     @property
     def queue(self) -> StepQueue:
         """Of a trainer on engine "cuda"."""
-        assert self.trainer._queue is not None
-        return self.trainer._queue
+        assert self.trainer._stepper.queue is not None
+        return self.trainer._stepper.queue
 
     def advance(self, first: int, last: int) -> list[float]:
         with etsplat.engine(self.engine):

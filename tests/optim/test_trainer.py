@@ -134,15 +134,16 @@ def test_a_folder_becomes_a_run_to_go_on_with(object_views: Dataset, tmp_path: P
 def test_a_step_of_two_views_is_the_mean_of_their_gradients(object_views: Dataset) -> None:
     """Of what looks at pictures; what looks at parameters alone counts once. The views come in the sampler's order."""
     pair = combination("mesh", object_views, batch=2, background=(0.2, 0.4, 0.6))
-    pair.strategy = Fixed()
+    steps = pair._stepper
+    steps._strategy = Fixed()
     mesh, chosen = a_mesh(), []
-    honest = pair._choose
-    pair._choose = lambda: chosen.extend(found := honest()) or found  # type: ignore[method-assign]
+    honest = steps._choose
+    steps._choose = lambda: chosen.extend(found := honest()) or found  # type: ignore[method-assign]
     pair.advance(1, 1)
     background = torch.tensor([[0.2, 0.4, 0.6]])
     objective, total = mesh_objective(), 0.0
     for each in chosen:
-        view = pair._loader.view(each.view)
+        view = steps._loader.view(each.view)
         rendering = mesh.render(view.camera, backgrounds=background)
         drawing = Drawing(mesh, view.camera, view.photo, view.mask, background, rendering)
         total = total + objective(drawing, objective.weights(1), 0.5) / 2

@@ -14,7 +14,7 @@ from etsplat.data.photograph import photograph
 from etsplat.engines.cuda.steps import Repeated
 from etsplat.tasks.reconstruct import make_trainer, reconstruct
 from etsplat.tasks.reconstruct_config import ReconstructConfig
-from etsplat.tasks.sources import make_start
+from etsplat.tasks.starts import make_start
 from helpers.simt.build import Simt
 from helpers.simt.calls import Calls
 from helpers.simt.room import room_for_16_pairs, second_step_overflows

@@ -2,23 +2,18 @@
 
 import json
 import signal
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-import trimesh
 from PIL import Image
 
 from etsplat.core.errors import InputError
 from etsplat.data.demo_object import demo_object
 from etsplat.data.photograph import photograph
-from etsplat.data.pictures import StoredPictures
 from etsplat.engines.threads import num_threads, set_num_threads
-from etsplat.geometry.icosphere import icosphere
-from etsplat.geometry.parts import genera
 from etsplat.geometry.topology import MeshTopology
 from etsplat.io.mesh_files import MeshFile, load_mesh
 from etsplat.io.run_directory import RunDirectory
@@ -27,7 +22,6 @@ from etsplat.optim.loop import (
     DivergedError,
     DoneEvent,
     Event,
-    NoteEvent,
     PrepareEvent,
     RefineEvent,
     StepEvent,
@@ -35,41 +29,12 @@ from etsplat.optim.loop import (
 from etsplat.optim.trainer import Trainer
 from etsplat.tasks.reconstruct import ReconstructResult, reconstruct
 from etsplat.tasks.reconstruct_config import ReconstructConfig
-
-TINY = ReconstructConfig.tiny()
-# Shorter still, with subdivisions at iterations 4, 14, 24, 34 and checkpoints at 10, 20, ...
-SHORT = TINY.changed(
-    {
-        "iterations": 40,
-        "refinement.first": 0.1,
-        "refinement.last": 0.85,
-        "refinement.subdivisions": 4,
-        "output.checkpoint_every": 10,
-        "output.log_every": 3,
-    }
-)
-
-
-class KilledError(Exception):
-    """Stands for a kill: the run gets no chance to save anything."""
-
-
-def kill_at(iteration: int) -> Callable[[Event], None]:
-    """A callback that dies at the first event of an iteration or later."""
-
-    def callback(event: Event) -> None:
-        if not isinstance(event, PrepareEvent | NoteEvent) and event.iteration >= iteration:
-            raise KilledError
-
-    return callback
+from helpers.reconstructions import SHORT, TINY, KilledError, kill_at, pebble_mesh, untimed
 
 
 @pytest.fixture(scope="module")
 def pebble() -> MeshFile:
-    """A smooth, lopsided closed shape, not centred, not of unit size."""
-    vertices, faces = icosphere(4)
-    vertices = vertices * torch.tensor([1.0, 0.6, 0.8]) * (1 + 0.1 * torch.sin(4 * vertices[:, :1]))
-    return MeshFile(7.0 * vertices + torch.tensor([3.0, -1.0, 2.0]), faces)
+    return pebble_mesh()
 
 
 @pytest.fixture(scope="module")
@@ -83,16 +48,6 @@ def owl(tmp_path_factory: pytest.TempPathFactory) -> tuple[ReconstructResult, li
     """The demo's object with preset tiny, and the events."""
     events: list[Event] = []
     return reconstruct(demo_object(), tmp_path_factory.mktemp("owl"), TINY, callbacks=[events.append]), events
-
-
-def untimed(run: Path) -> dict[str, object]:
-    """All that a run leaves, except for times and what an interruption may differ in."""
-    directory = RunDirectory(run)
-    metrics = {key: value for key, value in directory.read_metrics().items() if not key.startswith("seconds")}
-    history = [{k: v for k, v in line.items() if k != "seconds"} for line in directory.read_history()]
-    meshes = {suffix: directory.mesh_path(suffix).read_bytes() for suffix in (".ply", ".obj", ".glb")}
-    pictures = {path.name: path.read_bytes() for path in sorted(directory.test.iterdir())}
-    return {"metrics": metrics, "history": history, "meshes": meshes, "pictures": pictures}
 
 
 def test_a_small_shape_is_reconstructed(owl: tuple[ReconstructResult, list[Event]]) -> None:
@@ -254,16 +209,6 @@ def test_a_backend_that_is_missing_is_named(pebble: MeshFile, tmp_path: Path) ->
             reconstruct(pebble, tmp_path, SHORT.changed({"method": "raster-face", "drawing.backend": "nvdiffrast"}))
 
 
-def test_a_given_mesh_is_the_start(pebble: MeshFile, tmp_path: Path) -> None:
-    """Started from the solution, in its own units and unwelded, a short run without subdivision stays close to it."""
-    soup = MeshFile(pebble.vertices[pebble.faces].reshape(-1, 3), torch.arange(3 * len(pebble.faces)).reshape(-1, 3))
-    config = SHORT.changed({"optimizer.lr_vertices": 1e-4, "max_faces": 100})
-    result = reconstruct(pebble, tmp_path, config, init_mesh=soup)
-    assert result.metrics["faces"] == len(pebble.faces)
-    assert result.metrics["vertices"] == len(pebble.vertices)
-    assert result.metrics["chamfer_exact"] < 1e-4
-
-
 def test_views_can_be_handed_over(pebble: MeshFile, tmp_path: Path) -> None:
     """A data set of an object without a true mesh: image metrics are there, those against the mesh are null."""
     metrics = reconstruct(photograph(pebble, 48, 48, supersampling=1), tmp_path, SHORT).metrics
@@ -401,27 +346,3 @@ def test_config_json_says_how_to_make_it_again(whole_run: ReconstructResult) -> 
     assert ReconstructConfig.from_file(path) == SHORT
     assert len(config["source"]["fingerprint"]) == 16
     assert set(config["versions"]) == {"etsplat", "torch", "python"}
-
-
-def test_a_start_from_the_hull_keeps_the_hole_and_ends_the_same_when_resumed(tmp_path: Path) -> None:
-    """A torus: the sphere would span its hole; the hull has it, so the result is closed and of genus 1."""
-    ring = trimesh.creation.torus(1.0, 0.4, major_sections=32, minor_sections=16)
-    source = MeshFile(torch.from_numpy(ring.vertices.copy()).float(), torch.from_numpy(ring.faces.copy()).long())
-    config = SHORT.changed({"start.shape": "hull"})
-    events: list[Event] = []
-    whole = reconstruct(source, tmp_path / "whole", config, callbacks=[events.append])
-    assert genera(whole.mesh.faces, len(whole.mesh.vertices)) == [1]
-    assert any(isinstance(event, NoteEvent) and "holes in each part: [1]" in event.text for event in events)
-    with pytest.raises(KilledError):
-        reconstruct(source, tmp_path / "killed", config, callbacks=[kill_at(config.iterations // 2)])
-    reconstruct(source, tmp_path / "killed", config, resume=True)
-    assert untimed(tmp_path / "killed") == untimed(tmp_path / "whole")
-
-
-def test_a_hull_needs_masks(pebble: MeshFile, tmp_path: Path) -> None:
-    """Pictures without transparency are no silhouettes."""
-    views = photograph(pebble, 48, 48, supersampling=1)
-    opaque = [image[..., :3] for image in views.images]
-    config = SHORT.changed({"start.shape": "hull"})
-    with pytest.raises(InputError, match="needs masks"):
-        reconstruct(replace(views, images=StoredPictures(opaque)), tmp_path, config)

@@ -2,25 +2,18 @@
 
 import json
 import shutil
-from dataclasses import replace
 
 import pytest
 import torch
 
 from etsplat.cli.parse import parse
 from etsplat.core.errors import InputError
-from etsplat.data.dataset import Dataset
 from etsplat.data.load import load_dataset
-from etsplat.data.photograph import photograph
-from etsplat.data.pictures import StoredPictures
-from etsplat.geometry.icosphere import icosphere
-from etsplat.io.mesh_files import MeshFile
 from etsplat.io.run_directory import RunDirectory
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.optim.loop import CheckpointEvent
-from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.scoring import evaluate_run
-from etsplat.tasks.sources import open_run, settle_start
+from etsplat.tasks.sources import open_run
 from etsplat.tasks.train import train
 from etsplat.tasks.train_config import TrainConfig
 from helpers.captures import write_colmap, write_photo
@@ -132,24 +125,3 @@ def test_folders_without_a_soup_are_input_errors(tmp_path, trained):
     (tmp_path / "run" / "soup.safetensors").unlink()
     with pytest.raises(InputError, match="got to a checkpoint"):
         open_run(tmp_path / "run")
-
-
-def test_photos_start_from_the_hull_if_most_show_the_object_as_a_whole() -> None:
-    """Those of a mesh, without transparency, or cut off by their frames start from the sphere."""
-    ball = MeshFile(*icosphere(2))
-    views = photograph(ball, 48, 48, supersampling=1)
-    config = ReconstructConfig.quick()
-
-    def start(views: Dataset, truth: MeshFile | None = None) -> str:
-        return settle_start(config, views, truth).start.shape
-
-    assert start(views) == "hull"
-    assert start(views, ball) == "sphere"
-    images = list(views.images)
-    assert start(replace(views, images=StoredPictures([image[..., :3] for image in images]))) == "sphere"
-    cut = [
-        image.flip(0).roll(-20, dims=0) if index in views.train[::2] else image for index, image in enumerate(images)
-    ]
-    assert start(replace(views, images=StoredPictures(cut))) == "sphere"
-    asked = ReconstructConfig.quick().changed({"start.shape": "sphere"})
-    assert settle_start(asked, views, None) == asked

@@ -113,7 +113,7 @@ class DemoObject(RunCommand):
 
 @dataclass(frozen=True, kw_only=True)
 class Reconstruct(RunCommand):
-    """Deform a sphere into the object that pictures show.
+    """Deform a sphere, or the visual hull, into the object that pictures show.
 
     Examples:
         etsplat reconstruct bunny.obj --out runs/bunny --preset quick
@@ -134,7 +134,7 @@ class Reconstruct(RunCommand):
     """Folder for the results: mesh.ply, mesh.obj, mesh.glb, metrics.json, report.html and more."""
     settings: Annotated[ReconstructConfig, tyro.conf.arg(name="")]
     init_mesh: Annotated[Path | None, Rare] = None
-    """Start from this mesh instead of a sphere; in the units of the source."""
+    """Start from this mesh; in the units of the source."""
     masks: Annotated[Path | None, Rare] = None
     """Folder with a mask (white inside the object) for every image; else masks/ of the source, or transparency."""
 

@@ -20,55 +20,12 @@ from etsplat.core.errors import InputError
 from etsplat.io.atomic import atomic_write, write_error
 from etsplat.io.json_text import as_json, check_entries, entries_problem, json_differences, parse_json
 from etsplat.io.locks import RUN_LOCK
+from etsplat.io.run_readme import readme_of
 
 FORMAT = "etsplat run 1"
 
 KERNEL_FILE = "kernel.safetensors"
 """The table of the run's kernel; there where that is none of the built-in ones."""
-
-_README = """\
-This folder is a run of etsplat ({task}).
-
-report.html     the whole result on one page; opens in any browser, without a network
-{results}
-metrics.json    how good it is; docs/conventions.md of etsplat says how each number is measured
-{test}
-history.jsonl   one line per log step: iteration, seconds of optimisation, loss, state, and what was evaluated
-convergence.png how loss, quality and the number of triangles went; overview.png shows test views
-exposure.json   if it is there: the photos were exposed unlike each other; how each saw the colours of the result
-config.json     the settings that made it
-checkpoints/    where an interrupted run continues with --resume; safe to delete once the run is done
-"""
-
-_RESULTS = {
-    "reconstruct": """\
-mesh.glb        the result, for viewers
-mesh.obj, .ply  the same; colours of faces are exact in mesh.ply, and means at the vertices in all three""",
-    "train": """\
-soup.safetensors  the result: triangles with opacity, softness and view-dependent colour; etsplat export converts it""",
-    "fit": """\
-                (whoever called Trainer.fit saves the model)""",
-}
-
-_TEST = {
-    "reconstruct": """\
-test/           held-out views: NNN_render.png (splatted), NNN_truth.png, NNN_mesh.png (the mesh drawn opaque)""",
-    "train": """\
-test/           held-out views: NNN_render.png (splatted), NNN_truth.png, NNN_opaque.png (drawn opaque)""",
-    "fit": """\
-test/           held-out views, where somebody scored them""",
-}
-
-_PEER_README = """\
-This folder is a run of a peer of etsplat, in gsplat.
-
-gaussians.safetensors  the result: Gaussians as gsplat has them, where the cameras are centred and their extent is 1
-metrics.json    how good it is; evaluation.json has more, and the speed
-test/           held-out views: NNN_render.png, NNN_truth.png
-history.jsonl   one line per log step: iteration, seconds of optimisation, loss, number of Gaussians
-config.json     the settings that made it
-checkpoints/    where an interrupted run continues; safe to delete once the run is done
-"""
 
 _FILES = (
     "mesh.ply",
@@ -280,7 +237,7 @@ class RunDirectory:
     def conclude(self, verdict: str) -> None:
         """Puts what became of the run into README.txt, in the place of what that said of it before."""
         task = self.read_config()["task"]
-        _write_text(self.path / "README.txt", f"{_readme(task)}\nThe result is {verdict}.\n")
+        _write_text(self.path / "README.txt", f"{readme_of(task)}\nThe result is {verdict}.\n")
 
     def write_exposure(self, exposure: Mapping[str, Any]) -> None:
         """Writes exposure.json: what was learned of each training photo's exposure."""
@@ -328,7 +285,7 @@ class RunDirectory:
             self.test.mkdir(exist_ok=True)
         readme = self.path / "README.txt"
         if not readme.is_file():
-            _write_text(readme, _readme(task))
+            _write_text(readme, readme_of(task))
 
     def _remove_results(self) -> None:
         # config.json goes last: until then the folder still says whose it is.
@@ -337,10 +294,6 @@ class RunDirectory:
         for name in _FOLDERS:
             if (self.path / name).is_dir():
                 shutil.rmtree(self.path / name)
-
-
-def _readme(task: str) -> str:
-    return _PEER_README if task == "peer" else _README.format(task=task, results=_RESULTS[task], test=_TEST[task])
 
 
 def is_empty(folder: Path) -> bool:

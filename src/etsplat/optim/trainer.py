@@ -4,20 +4,15 @@ import contextlib
 import hashlib
 import json
 import warnings
-from collections.abc import Callable, Hashable, Iterable, Sequence
-from dataclasses import dataclass
-from itertools import takewhile
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
-from etsplat.core.rasterization import Rasterization
 from etsplat.core.validation import first_not_finite
 from etsplat.data.dataset import Dataset, middles_of
-from etsplat.data.loader import View, ViewLoader
 from etsplat.engines.choice import engine_for
 from etsplat.io.kernel_files import adopt_kernel, kernel_tensors
 from etsplat.io.locks import writing_run
@@ -29,15 +24,11 @@ from etsplat.optim.exposure import Exposure
 from etsplat.optim.gauge import Gauge
 from etsplat.optim.guard import Guard
 from etsplat.optim.loop import Callback, LoopSettings, Progress, UndoEvent
-from etsplat.optim.objective import Drawing, Objective
-from etsplat.optim.schedules import NEVER, Schedule, at
-from etsplat.optim.step_queue import MAX_STEPS, QueuedStep, RowLayout, StepQueue
+from etsplat.optim.objective import Objective
+from etsplat.optim.schedules import NEVER, Schedule
+from etsplat.optim.stepper import Stepper
 from etsplat.optim.strategies import Fixed, Strategy
-from etsplat.optim.view_sampler import ViewSampler
 from etsplat.optim.watch import Outcome, Watch
-
-READ_AHEAD = 8
-"""Views whose photos are decoded ahead of their turn, where they do not fit into memory."""
 
 GUARD_SIDE, GUARD_VIEWS = 128, 32
 """Edits are judged by pictures with at most so many pixels on a side, of at most so many training views."""
@@ -46,23 +37,11 @@ WATCH_SIDE = 512
 """The photos that are kept aside are measured with at most so many pixels on a side."""
 
 
-@dataclass(frozen=True)
-class _Chosen:
-    """A view of a step to come: its index, what is behind it, whether it is the first of an epoch."""
-
-    view: int
-    background: Float[Tensor, "1 3"]
-    epoch_starts: bool
-
-
 M = TypeVar("M", bound=Model)
 
 
 class Trainer(Generic[M]):
     """One run's state, and what changes it: steps and edits. Implements `optim.loop.Problem`.
-
-    A step draws some views, adds up the gradients of each in their order, and updates. On engine "cuda" what changes
-    from step to step is a row of numbers, and many steps are queued together.
 
     Attributes:
         model: as it is now; changed in place.
@@ -107,45 +86,34 @@ class Trainer(Generic[M]):
             seed: of the order of views and every other random choice; or a generator to go on with.
         """
         self.model, self.strategy, self.progress = model, strategy or Fixed(), Progress()
-        self.exposure = exposure or Exposure(NEVER)
-        self._objective, self._dataset, self._batch = objective, dataset, batch
-        self._schedule, appearance = schedule or Schedule(model.RATES), model.appearance
-        self._appearance = self._schedule.appearance or (lambda _: appearance)
-        self._background = None if background is None else torch.tensor(background)[None]
-        self._update, self._evaluate = update, evaluate
+        self.exposure, self.guard = exposure or Exposure(NEVER), guard
+        self._objective, self._dataset, self._batch, self._evaluate = objective, dataset, batch, evaluate
         generator = seed if isinstance(seed, torch.Generator) else torch.Generator().manual_seed(seed)
-        self._sampler = ViewSampler(dataset.train, generator)
         self._began = generator.get_state()
-        parameters = model.parameters()
-        self._device = next(iter(parameters.values())).device
-        self.guard = guard
+        behind = None if background is None else torch.tensor(background)[None]
+        self._stepper = Stepper(
+            model,
+            dataset,
+            objective,
+            self.strategy,
+            schedule or Schedule(model.RATES),
+            self.exposure,
+            batch=batch,
+            background=behind,
+            update=update,
+            generator=generator,
+        )
+        self.adam = self._stepper.adam
+        some = next(iter(model.parameters().values()))
+        self._device = some.device
         judges = middles_of(dataset.train, min(len(dataset.train), GUARD_VIEWS))
-        self._judging = Gauge(dataset, judges, GUARD_SIDE, self._device, self._background)
+        self._judging = Gauge(dataset, judges, GUARD_SIDE, self._device, behind)
         self._watch: Watch | None = None
         if dataset.watched:
-            kept = Gauge(dataset, dataset.watched, WATCH_SIDE, self._device, self._background)
-            self._watch = Watch(kept, objective, self._look)
-        self.adam = Adam(parameters, self._rates(1))
+            kept = Gauge(dataset, dataset.watched, WATCH_SIDE, self._device, behind)
+            self._watch = Watch(kept, objective, self._stepper.look)
         self.strategy.start(model, self.adam, len(dataset.train), generator)
-        self.exposure.start(dataset.train, batch, next(iter(parameters.values())))
-        self._halvings = -1
-        self._arrive(0)
-        self._queue: StepQueue | None = None
-        self._phase: tuple[Any, ...] = ()
-        self._seen: list[Rasterization] = []  # by the step that is being captured
-        queues = engine_for(next(iter(parameters.values()))).queues_steps
-        if queues and update is None and not model.appearance.needs_host:
-            self._row = RowLayout(
-                places=2 * batch,
-                backgrounds=3 * batch,
-                epochs=batch,
-                scale=1,
-                appearance=len(model.appearance.numbers),
-                values=len(self._schedule.values),
-                rates=len(parameters) + 1,
-                exposure=2,
-            )
-            self._queue = StepQueue(self._queued_gradients, self._commit, self._row.width, self._device)
+        self.exposure.start(dataset.train, batch, some)
 
     def fit(
         self,
@@ -203,26 +171,14 @@ class Trainer(Generic[M]):
 
     def advance(self, first: int, last: int) -> list[float]:
         """Steps; on a device many together. Returns the losses before them."""
-        if self._queue is None:
-            return [self._step(first)]
-        phase = self._phase_at(first)
-        if phase != self._phase:
-            self._phase = phase
-            self._arrive(first)
-            self._queue.restart()
-        most = max(1, READ_AHEAD // self._batch) if self._loader.streamed else MAX_STEPS
         judged = NEVER if self.guard is None else self.guard.due
         stops = self.strategy.next_edit(first), judged, self.exposure.next_measurement(first)
-        steps = range(first, min(last, first + most - 1, *stops) + 1)
-        unchanged = takewhile(lambda i: self._phase_at(i) == phase, steps)
-        losses = self._queue.run([self._queued_step(i) for i in unchanged])
-        self._arrive(first + len(losses) - 1)
-        return losses
+        return self._stepper.advance(first, last, stops)
 
     def refine(self, iteration: int) -> int:
         """Edits if it is time to; returns by how many triangles the model grew."""
         if iteration == self.exposure.measured_at:
-            self._measure_exposure()
+            self._stepper.measure_exposure()
         before = self.count
         if self.guard is not None and self.strategy.next_edit(iteration) == iteration:
             if iteration in self.guard.left_out:
@@ -250,8 +206,7 @@ class Trainer(Generic[M]):
 
     def edited(self) -> None:
         """To be called when tensors of the model were replaced."""
-        if self._queue is not None:
-            self._queue.restart()
+        self._stepper.restart()
 
     def evaluate(self) -> dict[str, float]:
         """Cheap metrics of the present state, which is kept if the watched photos speak for it."""
@@ -289,7 +244,7 @@ class Trainer(Generic[M]):
             "adam.first": self.adam.first_moments,
             "adam.second": self.adam.second_moments,
             "strategy": self.strategy.state(),
-            "sampler": self._sampler.state(),
+            "sampler": self._stepper.sampler.state(),
             "watch": self._watch.state() if self._watch else {},
             "exposure": self.exposure.state(),
         }
@@ -310,11 +265,11 @@ class Trainer(Generic[M]):
             self.adam.replace(name, parameter, first[name].to(self._device), second[name].to(self._device))
         self.adam.step_count = int(state["adam.step_count"])
         self.strategy.load_state(_part(state, "strategy"))
-        self._sampler.load_state(_part(state, "sampler"))
+        self._stepper.sampler.load_state(_part(state, "sampler"))
         if self._watch is not None:
             self._watch.load_state(_part(state, "watch"))
         self.exposure.load_state(_part(state, "exposure"))
-        self._arrive(iteration)
+        self._stepper.arrive(iteration)
         self.edited()
 
     @property
@@ -326,147 +281,10 @@ class Trainer(Generic[M]):
         """By which edits are judged."""
         return self._judging.measure(self.model, self._objective, self.exposure).loss
 
-    def _step(self, iteration: int) -> float:
-        self._arrive(iteration)
-        chosen = self._choose()
-        views = ((self._loader.view(c.view), c.background.to(self._device)) for c in chosen)
-        weights, scale = self._objective.weights(iteration), at(self._objective.scale, iteration)
-        loss, seen = self._gradients(views, weights, scale)
-        self.adam.learning_rates = self._rates(iteration)
-        if self._update is None:
-            self.adam.step()
-        else:
-            self._update(self.adam, self.model)
-        if self.exposure.learned:
-            self.exposure.step(iteration)
-        for each, rendering in zip(chosen, seen, strict=True):
-            self.strategy.observe(rendering, epoch_starts=each.epoch_starts)
-        return float(loss)
-
-    def _queued_step(self, iteration: int) -> QueuedStep:
-        chosen = self._choose()
-        found = [self._loader.kind_and_place(each.view, number) for number, each in enumerate(chosen)]
-        uploads = [self._loader.upload(each.view, number) for number, each in enumerate(chosen)]
-        self.adam.learning_rates = self._rates(iteration)
-        self.adam.step_count += 1
-        row = self._row.pack(
-            places=[number for _, place in found for number in place],
-            backgrounds=torch.cat([c.background for c in chosen]).flatten().tolist(),
-            epochs=[c.epoch_starts for c in chosen],
-            scale=[at(self._objective.scale, iteration)],
-            appearance=self._appearance(iteration).numbers,
-            values=list(self._values(iteration).values()),
-            rates=self.adam.rates(list(self.adam.parameters)),
-            exposure=self.exposure.queued_rates(iteration),
-        )
-
-        def prepare() -> None:
-            for upload in uploads:
-                upload()
-
-        return QueuedStep(row, tuple(kind for kind, _ in found), prepare)
-
-    def _queued_gradients(self, row: Tensor, kinds: Hashable) -> Tensor:
-        assert isinstance(kinds, tuple)
-        fields = self._row.unpack(row)
-        _, structure, weights = self._phase
-        self.model.appearance = structure.on_device(fields["appearance"])
-        self._set(dict(zip(self._schedule.values, fields["values"].unbind(), strict=True)))
-        places, backgrounds = fields["places"].split(2), fields["backgrounds"].split(3)
-        views = (
-            (self._loader.look_up(kind, place), background[None])
-            for kind, place, background in zip(kinds, places, backgrounds, strict=True)
-        )
-        loss, self._seen = self._gradients(views, weights, fields["scale"][0])
-        return loss
-
-    def _commit(self, row: Tensor, halted: Tensor) -> None:
-        fields = self._row.unpack(row)
-        self.adam.step_on_device(fields["rates"], halted)
-        if self.exposure.learned:
-            self.exposure.step_on_device(fields["exposure"], halted)
-        for rendering, epoch_starts in zip(self._seen, fields["epochs"].split(1), strict=True):
-            self.strategy.observe_on_device(rendering, epoch_starts, halted)
-        self._seen = []
-
-    def _gradients(
-        self, views: Iterable[tuple[View, Tensor]], weights: Sequence[float], scale: float | Tensor
-    ) -> tuple[Tensor, list[Rasterization]]:
-        """Those of the objective, one view after the other; its value, and what was seen."""
-        outputs = (*self._objective.outputs(weights), *self.strategy.outputs)
-        losses, seen, exposure = [], [], self.exposure
-        for number, (view, background) in enumerate(views, start=1):
-            rendering = self.model.render(
-                view.camera, backgrounds=background, outputs=outputs, depth_of=self._objective.depth_of
-            )
-            shot = exposure.applied(rendering, view, background) if exposure.learned else rendering
-            drawing = Drawing(self.model, view.camera, view.photo, view.mask, background, shot)
-            whole = number == self._batch
-            loss = self._objective(drawing, weights, scale, views=self._batch, whole=whole)
-            if exposure.learned:
-                loss = loss + exposure.penalty(view) / self._batch
-            if not losses:
-                self.adam.zero_grad()
-                exposure.adam.zero_grad()
-            loss.backward()
-            losses.append(loss.detach())
-            seen.append(rendering)
-        return sum(losses[1:], start=losses[0]), seen
-
-    def _measure_exposure(self) -> None:
-        behind = torch.zeros(1, 3) if self._background is None else self._background
-        views = (self._loader.view(index) for index in self._dataset.train)
-        self.exposure.measure(self.model, views, behind.to(self._device))
-        if self.exposure.learned:
-            self.edited()
-
-    def _choose(self) -> list[_Chosen]:
-        """Views and backgrounds of the next step; photos that come after them are decoded ahead."""
-        views, firsts = [], []
-        for _ in range(self._batch):
-            views.append(self._sampler.next_view())
-            firsts.append(self._sampler.epoch_starts)
-        self._loader.expect([*views, *self._sampler.upcoming(READ_AHEAD)])
-        backgrounds = [self._sampler.background() if self._background is None else self._background for _ in views]
-        return [_Chosen(*each) for each in zip(views, backgrounds, firsts, strict=True)]
-
-    def _phase_at(self, iteration: int) -> tuple[Any, ...]:
-        """What changes seldom: how often photos are halved, how the model is drawn, the weights of the objective."""
-        look = self._appearance(iteration).structure
-        return self._schedule.halvings(iteration), look, self._objective.weights(iteration)
-
-    def _look(self, iteration: int) -> tuple[Any, ...]:
-        """How the model is drawn after an iteration, and which photos it is fitted to."""
-        values = self._values(iteration) if iteration else {}
-        return self._appearance(iteration), self._schedule.halvings(max(1, iteration)), values
-
-    def _arrive(self, iteration: int) -> None:
-        """Lets all that is scheduled be as it is at an iteration."""
-        self.model.appearance = self._appearance(iteration)
-        if iteration:
-            self._set(self._values(iteration))
-        halvings = self._schedule.halvings(max(1, iteration))
-        if halvings != self._halvings:
-            dataset = self._dataset
-            for _ in range(halvings):
-                dataset = dataset.halved()
-            self._halvings, self._loader = halvings, ViewLoader(dataset, self._device, self._batch)
-
     def _hash(self) -> str:
         kinds = [type(part).__name__ for part in (self.model, self.strategy, *self._objective.terms)]
         about = [self._dataset.fingerprint(), self._batch, kinds, self._objective.weights(1), self._began.tolist()]
         return hashlib.sha256(json.dumps(about).encode()).hexdigest()
-
-    def _rates(self, iteration: int) -> dict[str, float]:
-        return {name: at(self._schedule.rates[name], iteration) for name in self.model.parameters()}
-
-    def _values(self, iteration: int) -> dict[str, float]:
-        return {name: at(value, iteration) for name, value in self._schedule.values.items()}
-
-    @torch.no_grad()
-    def _set(self, values: dict[str, float] | dict[str, Tensor]) -> None:
-        for name, value in values.items():
-            self.model.parameters()[name].fill_(value)
 
 
 def _part(state: dict[str, Tensor], name: str) -> dict[str, Tensor]:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -42,7 +42,8 @@ from etsplat.tasks.judgement import (
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.running import Job, Result, path_of, terms_of
 from etsplat.tasks.scoring import Scorer, load_lpips
-from etsplat.tasks.sources import Source, fingerprint, load_source, load_start, make_start, make_subject, settle_start
+from etsplat.tasks.sources import Source, fingerprint, load_source, make_subject
+from etsplat.tasks.starts import load_start, make_start, nearby, settle_start
 
 
 @dataclass(frozen=True)
@@ -76,7 +77,7 @@ def reconstruct(
     resume: bool = False,
     overwrite: bool = False,
 ) -> ReconstructResult:
-    """Deforms a sphere into the object that the source shows.
+    """Deforms a sphere, or the visual hull, into the object that the source shows.
 
     A run ends with the same bits on the same machine, torch and number of threads, also if it was killed and resumed
     any number of times. Ctrl-C leaves a checkpoint of the last whole iteration.
@@ -87,7 +88,7 @@ def reconstruct(
             `bounding_sphere` bring it there).
         out: the run directory; made if it does not exist. README.txt in it explains what is there.
         config: settings; None for preset "best". See `ReconstructConfig`.
-        init_mesh: a mesh to start from instead of the sphere, in the units of the source.
+        init_mesh: a mesh to start from, in the units of the source.
         masks: folder with a mask (white inside the object) for every image of a scene folder, instead of its own masks/
             or the images' transparency.
         callbacks: each is called with every event, in the thread of the caller. With none a notebook shows a line.
@@ -172,16 +173,6 @@ def _judge(
         begun=begun,
         preset=config.preset,
         untangled=config.refinement.untanglings > 0,
-    )
-
-
-def nearby(config: ReconstructConfig) -> ReconstructConfig:
-    """The settings for a start that is near the surface."""
-    near, rates, weights = config.start.near, config.optimizer, config.regularization
-    return replace(
-        config,
-        optimizer=replace(rates, lr_vertices=near * rates.lr_vertices),
-        regularization=replace(weights, lambda_edge=near * weights.lambda_edge),
     )
 
 

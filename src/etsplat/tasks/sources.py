@@ -5,7 +5,7 @@ A `SoupRun` is what every command that comes after training starts from.
 
 import hashlib
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,20 +18,14 @@ from etsplat.core.errors import InputError
 from etsplat.data.dataset import Dataset
 from etsplat.data.demo_object import demo_object
 from etsplat.data.demo_scene import HEIGHT, WIDTH, demo_scene
-from etsplat.data.hollows import open_hollows
-from etsplat.data.hull import bounding_sphere, silhouette, touches_border
+from etsplat.data.hull import bounding_sphere
 from etsplat.data.load import load_dataset
 from etsplat.data.photograph import normalize_mesh, photograph
-from etsplat.data.visual_hull import visual_hull
 from etsplat.engines.choice import resolve_device
-from etsplat.geometry.icosphere import icosphere
-from etsplat.geometry.topology import MeshTopology
-from etsplat.geometry.untangle import untangle
-from etsplat.io.mesh_files import MeshFile, load_mesh, weld_vertices
+from etsplat.io.mesh_files import MeshFile, load_mesh
 from etsplat.io.paths import path_remedy
 from etsplat.io.run_directory import RunDirectory, is_run
 from etsplat.model.soup_import import open_soup
-from etsplat.model.triangle_mesh import MeshAppearance, TriangleMesh
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.settings import Settings, settings_of
@@ -125,77 +119,6 @@ def make_subject(
     if not source.train:
         raise InputError("views: none to train on; name some in `train`")
     return source, None
-
-
-def load_start(start: str | Path | MeshFile | None) -> MeshFile | None:
-    """Reads the mesh to start from and merges vertices at equal positions, so that neighbours move together."""
-    if start is None:
-        return None
-    return weld_vertices(start if isinstance(start, MeshFile) else load_mesh(start))
-
-
-def settle_start(config: ReconstructConfig, views: Dataset, truth: MeshFile | None) -> ReconstructConfig:
-    """The settings with a start from the sphere or the hull in the place of "auto".
-
-    Args:
-        config: settings.
-        views: from `make_subject`.
-        truth: the mesh that they show, if they are pictures of one.
-    """
-    if config.start.shape != "auto":
-        return config
-    whole = [not touches_border(silhouette(views.images[index])) for index in views.train] if truth is None else []
-    hull = views.has_masks and 2 * sum(whole) > len(views.train)
-    return replace(config, start=replace(config.start, shape="hull" if hull else "sphere"))
-
-
-def make_start(
-    start: MeshFile | None, views: Dataset, config: ReconstructConfig, device: torch.device | None = None
-) -> TriangleMesh:
-    """The mesh that a run starts from, in the unit frame: an icosphere around the object, its hull, or the given mesh.
-
-    Args:
-        start: from `load_start`, in the input's units; its colours are used if it has the kind that is optimised.
-        views: of the unit frame.
-        config: shape, colour, opacity and softness.
-        device: of the mesh; None for the CPU.
-
-    Raises:
-        InputError: the hull is asked for, and the views have no masks, or masks that exclude everything.
-    """
-    colors: Tensor | float = config.start.color
-    if start is None and settle_start(config, views, None).start.shape == "hull":
-        vertices, faces = _hull(views, config)
-    elif start is None:
-        vertices, faces = icosphere(config.start.level)
-        vertices = vertices * config.start.radius
-    else:
-        vertices, faces = views.normalization.apply(start.vertices), start.faces
-        given = start.vertex_colors if config.vertex_colored else start.face_colors
-        colors = config.start.color if given is None else given
-    kernel = config.method.replace("-", "_") if config.soft else None
-    return TriangleMesh.from_mesh(
-        vertices.to(device or "cpu"),
-        faces.to(device or "cpu"),
-        colors=colors,
-        opacity=config.start.opacity if config.soft else None,
-        sigma=config.start.sigma if config.soft else None,
-        vertex_colored=config.vertex_colored,
-        appearance=MeshAppearance(kernel, config.drawing.distance, config.drawing.backend),
-    )
-
-
-def _hull(views: Dataset, config: ReconstructConfig) -> tuple[Tensor, Tensor]:
-    if not views.has_masks:
-        raise InputError("start.shape: hull needs masks or transparent pictures; give masks, or start from a sphere")
-    vertices, faces = visual_hull(views, round(config.start.hull_faces * config.max_faces), radius=config.start.radius)
-    if len(faces) == 0:
-        raise InputError(
-            "start.shape: the masks have no point in common, so there is no hull; check that masks are white inside the"
-            " object and that poses and images belong together"
-        )
-    vertices, faces, _ = open_hollows(views, vertices, faces)
-    return untangle(vertices, MeshTopology.from_faces(faces, len(vertices)))[0], faces
 
 
 def fingerprint(source: MeshFile | Dataset | None) -> str | None:

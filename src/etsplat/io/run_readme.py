@@ -1,0 +1,50 @@
+"""README.txt of run directories: what is in them."""
+
+_README = """\
+This folder is a run of etsplat ({task}).
+
+report.html     the whole result on one page; opens in any browser, without a network
+{results}
+metrics.json    how good it is; docs/conventions.md of etsplat says how each number is measured
+{test}
+history.jsonl   one line per log step: iteration, seconds of optimisation, loss, state, and what was evaluated
+convergence.png how loss, quality and the number of triangles went; overview.png shows test views
+exposure.json   if it is there: the photos were exposed unlike each other; how each saw the colours of the result
+config.json     the settings that made it
+checkpoints/    where an interrupted run continues with --resume; safe to delete once the run is done
+"""
+
+_RESULTS = {
+    "reconstruct": """\
+mesh.glb        the result, for viewers
+mesh.obj, .ply  the same; colours of faces are exact in mesh.ply, and means at the vertices in all three""",
+    "train": """\
+soup.safetensors  the result: triangles with opacity, softness and view-dependent colour; etsplat export converts it""",
+    "fit": """\
+                (whoever called Trainer.fit saves the model)""",
+}
+
+_TEST = {
+    "reconstruct": """\
+test/           held-out views: NNN_render.png (splatted), NNN_truth.png, NNN_mesh.png (the mesh drawn opaque)""",
+    "train": """\
+test/           held-out views: NNN_render.png (splatted), NNN_truth.png, NNN_opaque.png (drawn opaque)""",
+    "fit": """\
+test/           held-out views, where somebody scored them""",
+}
+
+_PEER_README = """\
+This folder is a run of a peer of etsplat, in gsplat.
+
+gaussians.safetensors  the result: Gaussians as gsplat has them, where the cameras are centred and their extent is 1
+metrics.json    how good it is; evaluation.json has more, and the speed
+test/           held-out views: NNN_render.png, NNN_truth.png
+history.jsonl   one line per log step: iteration, seconds of optimisation, loss, number of Gaussians
+config.json     the settings that made it
+checkpoints/    where an interrupted run continues; safe to delete once the run is done
+"""
+
+
+def readme_of(task: str) -> str:
+    """The text for a run of a task: "reconstruct", "train", "fit" or "peer"."""
+    return _PEER_README if task == "peer" else _README.format(task=task, results=_RESULTS[task], test=_TEST[task])

@@ -1,0 +1,262 @@
+"""How a model steps: draws some views, adds up their gradients and updates; on a device many steps together."""
+
+from collections.abc import Callable, Hashable, Iterable, Sequence
+from dataclasses import dataclass
+from itertools import takewhile
+from typing import Any, Generic, TypeVar
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from etsplat.core.rasterization import Rasterization
+from etsplat.data.dataset import Dataset
+from etsplat.data.loader import View, ViewLoader
+from etsplat.engines.choice import engine_for
+from etsplat.model.model import Model
+from etsplat.ops.adam import Adam
+from etsplat.optim.exposure import Exposure
+from etsplat.optim.objective import Drawing, Objective
+from etsplat.optim.schedules import Schedule, at
+from etsplat.optim.step_queue import MAX_STEPS, QueuedStep, RowLayout, StepQueue
+from etsplat.optim.strategies import Strategy
+from etsplat.optim.view_sampler import ViewSampler
+
+READ_AHEAD = 8
+"""Views whose photos are decoded ahead of their turn, where they do not fit into memory."""
+
+
+@dataclass(frozen=True)
+class _Chosen:
+    """A view of a step to come: its index, what is behind it, whether it is the first of an epoch."""
+
+    view: int
+    background: Float[Tensor, "1 3"]
+    epoch_starts: bool
+
+
+M = TypeVar("M", bound=Model)
+
+
+class Stepper(Generic[M]):
+    """Steps of a run, and all that is scheduled in it.
+
+    A step draws some views, adds up the gradients of each in their order, and updates. On engine "cuda" what changes
+    from step to step is a row of numbers, and many steps are queued together.
+
+    Attributes:
+        adam: the model's optimizer.
+        sampler: the order of the views, and all else that is random.
+        queue: of a model on an engine that queues steps; None elsewhere.
+    """
+
+    def __init__(
+        self,
+        model: M,
+        dataset: Dataset,
+        objective: Objective,
+        strategy: Strategy,
+        schedule: Schedule,
+        exposure: Exposure,
+        *,
+        batch: int,
+        background: Float[Tensor, "1 3"] | None,
+        update: Callable[[Adam, Any], None] | None,
+        generator: torch.Generator,
+    ) -> None:
+        """Arrives at the start of a run; arguments are those of `Trainer`."""
+        self._model, self._strategy, self._exposure = model, strategy, exposure
+        self._objective, self._dataset, self._batch = objective, dataset, batch
+        self._schedule, appearance = schedule, model.appearance
+        self._appearance = schedule.appearance or (lambda _: appearance)
+        self._background, self._update = background, update
+        self.sampler = ViewSampler(dataset.train, generator)
+        parameters = model.parameters()
+        self._device = next(iter(parameters.values())).device
+        self.adam = Adam(parameters, self._rates(1))
+        self._halvings = -1
+        self.arrive(0)
+        self.queue: StepQueue | None = None
+        self._phase: tuple[Any, ...] = ()
+        self._seen: list[Rasterization] = []  # by the step that is being captured
+        queues = engine_for(next(iter(parameters.values()))).queues_steps
+        if queues and update is None and not model.appearance.needs_host:
+            self._row = RowLayout(
+                places=2 * batch,
+                backgrounds=3 * batch,
+                epochs=batch,
+                scale=1,
+                appearance=len(model.appearance.numbers),
+                values=len(schedule.values),
+                rates=len(parameters) + 1,
+                exposure=2,
+            )
+            self.queue = StepQueue(self._queued_gradients, self._commit, self._row.width, self._device)
+
+    def advance(self, first: int, last: int, stops: Sequence[int]) -> list[float]:
+        """Makes the step `first`, and on a device as many behind it as go together.
+
+        Args:
+            first: iteration of the first step.
+            last: of the last one, at most.
+            stops: iterations behind which something else is due.
+
+        Returns:
+            The losses before the steps.
+        """
+        if self.queue is None:
+            return [self._step(first)]
+        phase = self._phase_at(first)
+        if phase != self._phase:
+            self._phase = phase
+            self.arrive(first)
+            self.queue.restart()
+        most = max(1, READ_AHEAD // self._batch) if self._loader.streamed else MAX_STEPS
+        steps = range(first, min(last, first + most - 1, *stops) + 1)
+        unchanged = takewhile(lambda i: self._phase_at(i) == phase, steps)
+        losses = self.queue.run([self._queued_step(i) for i in unchanged])
+        self.arrive(first + len(losses) - 1)
+        return losses
+
+    def restart(self) -> None:
+        """To be called when tensors of the model were replaced."""
+        if self.queue is not None:
+            self.queue.restart()
+
+    def arrive(self, iteration: int) -> None:
+        """Lets all that is scheduled be as it is at an iteration."""
+        self._model.appearance = self._appearance(iteration)
+        if iteration:
+            self._set(self._values(iteration))
+        halvings = self._schedule.halvings(max(1, iteration))
+        if halvings != self._halvings:
+            dataset = self._dataset
+            for _ in range(halvings):
+                dataset = dataset.halved()
+            self._halvings, self._loader = halvings, ViewLoader(dataset, self._device, self._batch)
+
+    def look(self, iteration: int) -> tuple[Any, ...]:
+        """How the model is drawn after an iteration, and which photos it is fitted to."""
+        values = self._values(iteration) if iteration else {}
+        return self._appearance(iteration), self._schedule.halvings(max(1, iteration)), values
+
+    def measure_exposure(self) -> None:
+        """Measures whether the photos that are fitted to were exposed unlike each other."""
+        behind = torch.zeros(1, 3) if self._background is None else self._background
+        views = (self._loader.view(index) for index in self._dataset.train)
+        self._exposure.measure(self._model, views, behind.to(self._device))
+        if self._exposure.learned:
+            self.restart()
+
+    def _step(self, iteration: int) -> float:
+        self.arrive(iteration)
+        chosen = self._choose()
+        views = ((self._loader.view(c.view), c.background.to(self._device)) for c in chosen)
+        weights, scale = self._objective.weights(iteration), at(self._objective.scale, iteration)
+        loss, seen = self._gradients(views, weights, scale)
+        self.adam.learning_rates = self._rates(iteration)
+        if self._update is None:
+            self.adam.step()
+        else:
+            self._update(self.adam, self._model)
+        if self._exposure.learned:
+            self._exposure.step(iteration)
+        for each, rendering in zip(chosen, seen, strict=True):
+            self._strategy.observe(rendering, epoch_starts=each.epoch_starts)
+        return float(loss)
+
+    def _queued_step(self, iteration: int) -> QueuedStep:
+        chosen = self._choose()
+        found = [self._loader.kind_and_place(each.view, number) for number, each in enumerate(chosen)]
+        uploads = [self._loader.upload(each.view, number) for number, each in enumerate(chosen)]
+        self.adam.learning_rates = self._rates(iteration)
+        self.adam.step_count += 1
+        row = self._row.pack(
+            places=[number for _, place in found for number in place],
+            backgrounds=torch.cat([c.background for c in chosen]).flatten().tolist(),
+            epochs=[c.epoch_starts for c in chosen],
+            scale=[at(self._objective.scale, iteration)],
+            appearance=self._appearance(iteration).numbers,
+            values=list(self._values(iteration).values()),
+            rates=self.adam.rates(list(self.adam.parameters)),
+            exposure=self._exposure.queued_rates(iteration),
+        )
+
+        def prepare() -> None:
+            for upload in uploads:
+                upload()
+
+        return QueuedStep(row, tuple(kind for kind, _ in found), prepare)
+
+    def _queued_gradients(self, row: Tensor, kinds: Hashable) -> Tensor:
+        assert isinstance(kinds, tuple)
+        fields = self._row.unpack(row)
+        _, structure, weights = self._phase
+        self._model.appearance = structure.on_device(fields["appearance"])
+        self._set(dict(zip(self._schedule.values, fields["values"].unbind(), strict=True)))
+        places, backgrounds = fields["places"].split(2), fields["backgrounds"].split(3)
+        views = (
+            (self._loader.look_up(kind, place), background[None])
+            for kind, place, background in zip(kinds, places, backgrounds, strict=True)
+        )
+        loss, self._seen = self._gradients(views, weights, fields["scale"][0])
+        return loss
+
+    def _commit(self, row: Tensor, halted: Tensor) -> None:
+        fields = self._row.unpack(row)
+        self.adam.step_on_device(fields["rates"], halted)
+        if self._exposure.learned:
+            self._exposure.step_on_device(fields["exposure"], halted)
+        for rendering, epoch_starts in zip(self._seen, fields["epochs"].split(1), strict=True):
+            self._strategy.observe_on_device(rendering, epoch_starts, halted)
+        self._seen = []
+
+    def _gradients(
+        self, views: Iterable[tuple[View, Tensor]], weights: Sequence[float], scale: float | Tensor
+    ) -> tuple[Tensor, list[Rasterization]]:
+        """Those of the objective, one view after the other; its value, and what was seen."""
+        outputs = (*self._objective.outputs(weights), *self._strategy.outputs)
+        losses, seen, exposure = [], [], self._exposure
+        for number, (view, background) in enumerate(views, start=1):
+            rendering = self._model.render(
+                view.camera, backgrounds=background, outputs=outputs, depth_of=self._objective.depth_of
+            )
+            shot = exposure.applied(rendering, view, background) if exposure.learned else rendering
+            drawing = Drawing(self._model, view.camera, view.photo, view.mask, background, shot)
+            whole = number == self._batch
+            loss = self._objective(drawing, weights, scale, views=self._batch, whole=whole)
+            if exposure.learned:
+                loss = loss + exposure.penalty(view) / self._batch
+            if not losses:
+                self.adam.zero_grad()
+                exposure.adam.zero_grad()
+            loss.backward()
+            losses.append(loss.detach())
+            seen.append(rendering)
+        return sum(losses[1:], start=losses[0]), seen
+
+    def _choose(self) -> list[_Chosen]:
+        """Views and backgrounds of the next step; photos that come after them are decoded ahead."""
+        views, firsts = [], []
+        for _ in range(self._batch):
+            views.append(self.sampler.next_view())
+            firsts.append(self.sampler.epoch_starts)
+        self._loader.expect([*views, *self.sampler.upcoming(READ_AHEAD)])
+        backgrounds = [self.sampler.background() if self._background is None else self._background for _ in views]
+        return [_Chosen(*each) for each in zip(views, backgrounds, firsts, strict=True)]
+
+    def _phase_at(self, iteration: int) -> tuple[Any, ...]:
+        """What changes seldom: how often photos are halved, how the model is drawn, the weights of the objective."""
+        look = self._appearance(iteration).structure
+        return self._schedule.halvings(iteration), look, self._objective.weights(iteration)
+
+    def _rates(self, iteration: int) -> dict[str, float]:
+        return {name: at(self._schedule.rates[name], iteration) for name in self._model.parameters()}
+
+    def _values(self, iteration: int) -> dict[str, float]:
+        return {name: at(value, iteration) for name, value in self._schedule.values.items()}
+
+    @torch.no_grad()
+    def _set(self, values: dict[str, float] | dict[str, Tensor]) -> None:
+        for name, value in values.items():
+            self._model.parameters()[name].fill_(value)
