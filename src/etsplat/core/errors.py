@@ -8,6 +8,11 @@ class InputError(ValueError):
     it without a traceback. Wrong shapes, dtypes and devices of tensors are plain ``ValueError``.
     """
 
+    def __init__(self, message: str) -> None:
+        """Escapes what is not printable: names in files may hold ends of lines and worse."""
+        shown = (c if c.isprintable() else c.encode("unicode_escape").decode() for c in message)
+        super().__init__("".join(shown))
+
 
 class EngineUnavailableError(InputError):
     """An engine was asked for that cannot run here; the line says what is missing and how to get it."""
