@@ -151,6 +151,18 @@ def test_a_damaged_run_is_named(tmp_path: Path, file: str, entry: str, value: ob
     assert not (run_dir / "report.html").exists()
 
 
+@pytest.mark.parametrize("cut", [41, 60, -20])
+def test_a_damaged_picture_of_a_view_is_named(tmp_path: Path, cut: int) -> None:
+    """Pillow reports a chunk of PNG that is none by a SyntaxError."""
+    run_dir = write_run(tmp_path / "run", views=2, steps=2)
+    picture = next((run_dir / "test").glob("*_render.png"))
+    data = bytearray(picture.read_bytes())
+    data[cut : cut + 12] = b"\xffU\x05 3\n\x00\x00\x00\x00\x01\x02"
+    picture.write_bytes(bytes(data))
+    with pytest.raises(InputError, match=f"^image {picture}: .*; copy it again"):
+        write_report(run_dir)
+
+
 @pytest.mark.parametrize("needed", ["faces", "iterations", "seconds", "engine", "seed", "versions"])
 def test_metrics_without_what_every_run_has_are_refused(tmp_path: Path, needed: str) -> None:
     run_dir = write_run(tmp_path / "run", views=0, steps=2)

@@ -78,6 +78,16 @@ def open_image(path: Path | str, data: bytes | None = None) -> Image.Image:
     return image
 
 
+def load_rgb(path: Path | str) -> Image.Image:
+    """An image as it is shown, decoded to 8-bit RGB; what is transparent keeps its colour.
+
+    Raises:
+        InputError: as in `open_image`, or it is damaged.
+    """
+    with open_image(path) as image:
+        return _converted(image, path, "RGB")
+
+
 def load_image(path: Path | str) -> Float[Tensor, "H W C"]:
     """Read an image as stored: straight (not premultiplied) colours, EXIF orientation not applied.
 
@@ -234,11 +244,15 @@ def _decoded(path: Path | str, data: bytes | None = None) -> Image.Image | Float
     with open_image(path, data) as image:
         deep = image.mode.startswith("I")
         transparent = image.mode in ("RGBA", "LA", "PA", "La", "RGBa") or "transparency" in image.info
-        try:
-            decoded = image.convert(image.mode if deep else "RGBA" if transparent else "RGB")
-        except Exception as error:  # Pillow's decoders signal damage with whatever their parsing runs into
-            detail = str(error).splitlines()[0] if str(error) else type(error).__name__
-            raise InputError(f"image {path}: damaged or cut short ({detail}); copy it again") from error
+        decoded = _converted(image, path, image.mode if deep else "RGBA" if transparent else "RGB")
     if not deep:
         return decoded
     return torch.from_numpy(np.asarray(decoded).astype(np.float32) / 65535.0).clamp(0, 1)
+
+
+def _converted(image: Image.Image, path: Path | str, mode: str) -> Image.Image:
+    try:
+        return image.convert(mode)
+    except Exception as error:  # Pillow's decoders signal damage with whatever their parsing runs into
+        detail = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InputError(f"image {path}: damaged or cut short ({detail}); copy it again") from error

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from PIL import Image, ImageDraw, ImageFont
 
-from etsplat.io.images import open_image
+from etsplat.io.images import load_rgb
 
 OVERVIEW_VIEWS = 4
 TILE = 360
@@ -64,8 +64,7 @@ def spread(views: Sequence[TestView], count: int) -> list[TestView]:
 
 
 def _tile(path: Path) -> Image.Image:
-    with open_image(path) as image:
-        image = image.convert("RGB")
+    image = load_rgb(path)
     scale = TILE / max(image.size)
     size = (max(1, round(image.width * scale)), max(1, round(image.height * scale)))
     return image.resize(size, Image.Resampling.LANCZOS if scale < 1 else Image.Resampling.NEAREST)

@@ -14,7 +14,7 @@ import torch
 from PIL import Image
 
 from etsplat.io.atomic import atomic_write
-from etsplat.io.images import open_image
+from etsplat.io.images import load_rgb
 from etsplat.io.mesh_files import load_mesh
 from etsplat.io.overview import TestView, draw_overview, spread
 from etsplat.report.cards import Metric, cards_of
@@ -151,8 +151,7 @@ def _comparison(view: TestView, kind: str) -> str:
 
 
 def _picture(path: Path) -> str:
-    with open_image(path) as image:
-        image = image.convert("RGB")
+    image = load_rgb(path)
     image.thumbnail((MAX_PICTURE, MAX_PICTURE), Image.Resampling.LANCZOS)
     buffer = io.BytesIO()
     image.save(buffer, "PNG", optimize=True)
