@@ -3,12 +3,13 @@
 from studies.distance import Distance
 from studies.famous import Famous
 from studies.figures import Figures
+from studies.gallery import Gallery
 from studies.nvs import Nvs
 from studies.regularizers import Regularizers
 from studies.settings import Settings
 from studies.study import Study
 
-STUDIES: tuple[type[Study], ...] = (Famous, Nvs, Regularizers, Distance, Settings, Figures)
+STUDIES: tuple[type[Study], ...] = (Famous, Nvs, Regularizers, Distance, Settings, Gallery, Figures)
 
 
 def main() -> None:

@@ -4,7 +4,7 @@ from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
@@ -13,17 +13,18 @@ from etsplat.tasks.reconstruct_config import Preset, ReconstructConfig
 from studies.grid.variants import Variant, find_meshes
 from studies.study import Study
 
+if TYPE_CHECKING:
+    from studies.grid.cells import Cell
+
 
 @dataclass(frozen=True, kw_only=True)
-class ObjectStudy(Study):
-    """Base of the studies of objects: meshes by variants by seeds."""
+class GridStudy(Study):
+    """Base of the studies that are a grid of reconstructions."""
 
-    meshes: Path
-    """Folder of mesh files, such as the paper's (`etsplat data download famous`)."""
     out: Path
     """Folder for the runs, tables and figures; a grid that was interrupted goes on where it was."""
     objects: tuple[str, ...] = ()
-    """Names of the meshes, without suffix; all in the folder if none is named."""
+    """Names of the objects, without suffix; all there are if none is named."""
     preset: Preset = "study"
     """Settings of all runs; what is compared is changed on top of it."""
     set: str = ""
@@ -33,31 +34,50 @@ class ObjectStudy(Study):
     jobs: Annotated[int, tyro.conf.arg(help_behavior_hint="(default: one for each core)")] = 0
     """Runs beside each other; 0 for one on each core. They share the cores evenly."""
 
+    def base(self) -> ReconstructConfig:
+        """The settings that all runs have in common."""
+        preset = ReconstructConfig.of(self.preset)
+        return preset.changed(preset.read_changes(self.set))
+
+    def run_cells(self, cells: list["Cell"], jobs: int) -> None:
+        """Runs what is not finished yet, so many beside each other; Ctrl-C ends the process, which can be repeated."""
+        from rich.console import Console
+
+        from studies.grid.cells import run_grid
+        from studies.grid.live import LiveTable
+
+        try:
+            with LiveTable(Console(), cells) as table:
+                run_grid(cells, jobs, table.update)
+        except KeyboardInterrupt:
+            fail("interrupted; give the same command to go on", INTERRUPTED)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObjectStudy(GridStudy):
+    """Base of the studies of objects: meshes by variants by seeds."""
+
+    meshes: Path
+    """Folder of mesh files, such as the paper's (`etsplat data download famous`)."""
+
     @abstractmethod
     def variants(self, base: ReconstructConfig) -> list[Variant]:
         """What is compared."""
 
     def run(self, arguments: Sequence[str]) -> int:
         """Runs what is not finished yet, then writes tables and figures."""
-        from rich.console import Console
-
-        from studies.grid.cells import count_jobs, make_cells, run_grid
-        from studies.grid.live import LiveTable, conclude
+        from studies.grid.cells import count_jobs, make_cells
+        from studies.grid.live import conclude
 
         jobs = count_jobs(self.jobs)
-        preset = ReconstructConfig.of(self.preset)
-        base = preset.changed(preset.read_changes(self.set))
+        base = self.base()
         variants = self.variants(base)
         cells = make_cells(find_meshes(self.meshes, self.objects), variants, base, self.seeds, self.out)
-        try:
-            with LiveTable(Console(), cells) as table:
-                run_grid(cells, jobs, table.update)
-        except KeyboardInterrupt:
-            fail("interrupted; give the same command to go on", INTERRUPTED)
+        self.run_cells(cells, jobs)
         self._report(cells, [variant.name for variant in variants], arguments)
         return conclude(cells)
 
-    def _report(self, cells: list, variants: list[str], arguments: Sequence[str]) -> None:
+    def _report(self, cells: list["Cell"], variants: list[str], arguments: Sequence[str]) -> None:
         from studies.objects.pictures import draw_qualitative, plot_convergence
         from studies.objects.results import rows_of
         from studies.objects.tables import write_tables

@@ -66,9 +66,9 @@ def render_page(run: Run) -> str:
         title=escape(_title(run)),
         subtitle=escape(_subtitle(run)),
         verdict="" if run.verdict is None else _verdict(run.verdict),
-        style=_asset("page.css"),
-        viewer_script=_asset("viewer.js"),
-        page_script=_asset("page.js"),
+        style=asset("page.css"),
+        viewer_script=asset("viewer.js"),
+        page_script=asset("page.js"),
         metrics="".join(_card(card) for card in cards_of(run)),
         mesh="" if run.mesh is None else _mesh_section(run.mesh),
         views=_views_section(run),
@@ -80,13 +80,14 @@ def render_page(run: Run) -> str:
     )
 
 
-def _asset(name: str) -> str:
+def asset(name: str) -> str:
+    """A file of the page's parts, such as page.css, as text."""
     return (files("etsplat.report") / "assets" / name).read_text(encoding="utf-8")
 
 
-def _filled(asset: str, **values: str) -> str:
-    """An asset with these values in it."""
-    return Template(_asset(asset)).substitute(values)
+def _filled(template: str, **values: str) -> str:
+    """A template of the assets with these values in it."""
+    return Template(asset(template)).substitute(values)
 
 
 def _title(run: Run) -> str:

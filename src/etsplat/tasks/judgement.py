@@ -87,14 +87,20 @@ class Judgement:
 
 def expect_mesh(truth: MeshFile, photos: Dataset, found: Shape, radius: float) -> Expected:
     """What a result for an input mesh should look like. Where `found` is something else, its `photos` are asked too."""
-    welded = weld_vertices(truth)
-    shape = shape_of(welded.vertices, welded.faces)
+    shape = true_shape(truth)
     if shape.unclear:
         return Expected.unclear(f"the input mesh {shape.unclear}")
-    if shape.parts != 1 and bool(intersecting_faces(welded.vertices, welded.faces).any()):
-        return Expected.unclear("the input mesh has parts that cut through each other")
     shown = shape == found or expect_photos(photos, found, radius).shape != found
     return Expected(shape, "input mesh", shown)
+
+
+def true_shape(truth: MeshFile) -> Shape:
+    """The parts and holes of a mesh that is the truth; unclear also where its parts cut through each other."""
+    welded = weld_vertices(truth)
+    shape = shape_of(welded.vertices, welded.faces)
+    if shape.parts not in (None, 1) and bool(intersecting_faces(welded.vertices, welded.faces).any()):
+        return Shape(None, None, "has parts that cut through each other")
+    return shape
 
 
 def expect_photos(photos: Dataset, found: Shape, radius: float) -> Expected:

@@ -109,8 +109,6 @@ def reconstruct(
         for note in mesh.notes if isinstance(mesh, MeshFile) else ():
             job.announce(NoteEvent(f"{name}: {note}"))
     views, truth = make_subject(loaded, config, job.prepared, job.device)
-    if truth is None or config.watch is not None:  # of a mesh there is the mesh itself to compare with
-        views = views.watching(config.watch)
     if config.drawing.backend == "nvdiffrast":
         load_nvdiffrast()  # now rather than at the first step
     with engine(config.engine):

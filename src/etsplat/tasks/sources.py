@@ -101,7 +101,7 @@ def make_subject(
 
     Args:
         source: from `load_source`.
-        config: resolution and supersampling.
+        config: resolution and supersampling; how many photos are kept from training to watch the run by.
         progress: called with (views done, views in all) while photographing.
         device: where a mesh is photographed.
 
@@ -115,10 +115,11 @@ def make_subject(
     if isinstance(source, MeshFile):
         side, samples = config.resolution, config.pictures.supersampling
         views = photograph(source, side, side, supersampling=samples, progress=progress, device=device)
-        return views, normalize_mesh(source)[0]
+        # There is the mesh itself to compare with, so photos are kept only where that is asked for.
+        return views if config.watch is None else views.watching(config.watch), normalize_mesh(source)[0]
     if not source.train:
         raise InputError("views: none to train on; name some in `train`")
-    return source, None
+    return source.watching(config.watch), None
 
 
 def fingerprint(source: MeshFile | Dataset | None) -> str | None:

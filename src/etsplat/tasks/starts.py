@@ -57,7 +57,8 @@ def make_start(
     """
     colors: Tensor | float = config.start.color
     if start is None and config.start.shape == "hull":
-        vertices, faces = _hull(views, config)
+        vertices, faces, _ = open_hollows(views, *plain_hull(views, config))
+        vertices = untangle(vertices, MeshTopology.from_faces(faces, len(vertices)))[0]
     elif start is None:
         vertices, faces = icosphere(config.start.level)
         vertices = vertices * config.start.radius
@@ -77,7 +78,16 @@ def make_start(
     )
 
 
-def _hull(views: Dataset, config: ReconstructConfig) -> tuple[Tensor, Tensor]:
+def plain_hull(views: Dataset, config: ReconstructConfig) -> tuple[Tensor, Tensor]:
+    """The visual hull that a run starts from, before its hollows are opened: (V, 3) and (F, 3), in the unit frame.
+
+    Args:
+        views: of the unit frame.
+        config: how many faces are wanted.
+
+    Raises:
+        InputError: the views have no masks, or masks that exclude everything.
+    """
     if not views.has_masks:
         raise InputError("start.shape: hull needs masks or transparent pictures; give masks, or start from a sphere")
     vertices, faces = visual_hull(views, round(config.start.hull_faces * config.max_faces), radius=config.start.radius)
@@ -86,8 +96,7 @@ def _hull(views: Dataset, config: ReconstructConfig) -> tuple[Tensor, Tensor]:
             "start.shape: the masks have no point in common, so there is no hull; check that masks are white inside the"
             " object and that poses and images belong together"
         )
-    vertices, faces, _ = open_hollows(views, vertices, faces)
-    return untangle(vertices, MeshTopology.from_faces(faces, len(vertices)))[0], faces
+    return vertices, faces
 
 
 def nearby(config: ReconstructConfig) -> ReconstructConfig:
