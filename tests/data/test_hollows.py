@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from etsplat.data.hollows import open_hollows
+from etsplat.data.hollows import _where_agreed, _without_unseen, open_hollows
 from etsplat.data.photograph import orbit_cameras, photograph
 from etsplat.data.pictures import StoredPictures
 from etsplat.data.visual_hull import visual_hull
@@ -124,12 +124,43 @@ def test_a_shallow_lid_over_a_flat_end_is_taken_off():
 
 def test_where_there_is_no_texture_nothing_moves():
     _, _, views = pictures_of(BOWL, painted=False)
-    hull, triangles = visual_hull(views, 1600)
+    hull, triangles = visual_hull(views, 400)
     assert open_hollows(views, hull, triangles)[2] == 0
 
 
 def test_it_repeats_to_the_bit(bowl):
-    _, _, views, hull, first = bowl
-    second = open_hollows(views, *hull)
+    views = bowl[2]
+    few = replace(views, train=views.train[::2])
+    hull = visual_hull(few, 400)
+    first, second = (open_hollows(few, *hull) for _ in range(2))
+    assert first[2] > 0
     assert torch.equal(first[0], second[0])
     assert torch.equal(first[1], second[1])
+
+
+def grid_links(side: int) -> torch.Tensor:
+    """Edges of a square of vertices."""
+    number = torch.arange(side * side).reshape(side, side)
+    pairs = [(number[:, 1:], number[:, :-1]), (number[1:], number[:-1])]
+    return torch.cat([torch.stack([a.flatten(), b.flatten()], dim=1) for a, b in pairs])
+
+
+def test_a_hollow_is_not_much_deeper_than_it_is_wide():
+    """Photos that agree far below a small lid show something else: its bottom would be out of sight."""
+    side, agreed = 6, torch.full((36, 40), 0.9)
+    for depth, opens in ((8, True), (11, True), (13, False), (39, False)):
+        found = _where_agreed(torch.full((36,), depth), agreed, grid_links(side), 1.0)
+        assert bool((found > 0).all()) is opens
+        assert bool((found > 0).any()) is opens
+
+
+def test_what_photos_would_not_see_goes_no_deeper_than_what_is_beside_it():
+    """A line of five vertices of a lid, the ends of which have a neighbour beside it."""
+    links = torch.tensor([[0, 1], [1, 2], [2, 3], [3, 4]])
+    way, neighbours = torch.tensor([0.2, 0.2, 0.9, 0.4, 0.4]), torch.full((5,), 2)
+    seen = torch.ones(3, 5, dtype=torch.bool)
+    assert torch.equal(_without_unseen(way, seen, neighbours, links), way)
+    seen[1:, 2] = False
+    expected = torch.tensor([0.2, 0.2, 0.3, 0.4, 0.4])
+    torch.testing.assert_close(_without_unseen(way, seen, neighbours, links), expected)
+    assert _without_unseen(way, torch.zeros_like(seen), neighbours, links).abs().max() == 0

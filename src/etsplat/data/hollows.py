@@ -57,6 +57,12 @@ _ROUNDS = 30
 _SMOOTH, _SMOOTH_LID = 3, 20
 """Rounds in which normals of the hull, and of lids by themselves, are averaged with their neighbours'."""
 
+_SLENDER = 2.0
+"""Hollows are at most so many times as deep as they are wide."""
+
+_SMOOTH_UNSEEN = 100
+"""Rounds in which what no two photos see comes between its neighbours."""
+
 _PASSES = 3
 """Looks at all lids: the second sees walls where the first tore."""
 
@@ -145,15 +151,22 @@ def _push(photos: list[_Photo], outside: Distance, vertices: Tensor, faces: Tens
     inward = -_averaged(raw[own], links, _SMOOTH_LID)
     depths = _STEP * pixel * torch.arange(int(_DEEPEST / (_STEP * pixel)) + 1)
     lids = [((hit >= 0) & (lid[faces].sum(dim=1) >= 2)[hit.clamp_min(0)]).float()[None, None] for _, hit in hits]
-    found = torch.stack(
-        [_agreement_behind(photos, lids, vertices[own] + depth * inward, -inward, pixel) for depth in depths], dim=1
-    )
-    cost = torch.where(found.isnan(), _UNKNOWN, 1 - found.clamp(0, 1))
-    depth = _depths(_within(outside, vertices[own], inward, depths, cost), links)
-    depth = _where_agreed(depth, found, links)
-    moved = vertices.clone()
-    moved[own] += depths[depth][:, None] * inward
-    return moved, int((depth > 0).sum())
+    free = _within(outside, vertices[own], inward, depths)
+    found = torch.full(free.shape, torch.nan)
+    for number, depth in enumerate(depths):
+        within = free[:, number]
+        points = vertices[own][within] + depth * inward[within]
+        found[within, number] = _agreement_behind(photos, lids, points, -inward[within], pixel)
+    cost = torch.where(found.isnan(), _UNKNOWN, 1 - found.clamp(0, 1)).masked_fill(~free, torch.inf)
+    depth = _depths(cost, links)
+    edge = float((vertices[edges[:, 0]] - vertices[edges[:, 1]]).norm(dim=1).mean())
+    depth = _where_agreed(depth, found, links, edge / float(depths[1]))
+    way, moved = depths[depth], vertices.clone()
+    moved[own] += way[:, None] * inward
+    seen = _seen(photos, [_first_hits(photo, moved, faces) for photo in photos], moved[own], pixel)
+    way = _without_unseen(way, seen, edges.flatten().bincount(minlength=len(vertices))[own], links)
+    moved[own] = vertices[own] + way[:, None] * inward
+    return moved, int((way > depths[1]).sum())
 
 
 def _divided(vertices: Tensor, faces: Tensor, longest: float, most: int) -> tuple[Tensor, Tensor]:
@@ -199,24 +212,34 @@ def _surface_agreement(
     photos: list[_Photo], hits: list[tuple[Tensor, Tensor]], points: Tensor, normals: Tensor, pixel: float
 ) -> Tensor:
     """(V,) how far photos agree at points of the surface that they see."""
-    seen, masks = [], []
+    masks = [(photo.pixels[:, 3:] >= 0.95).float() for photo in photos]
+    return _agreement(photos, masks, points, normals, _seen(photos, hits, points, pixel), pixel, fewest=3)
+
+
+def _seen(photos: list[_Photo], hits: list[tuple[Tensor, Tensor]], points: Tensor, pixel: float) -> Bool[Tensor, "B V"]:
+    """Which photos see which points of the surface."""
+    seen = []
     for photo, (depth, _) in zip(photos, hits, strict=True):
         place, z = photo.project(points)
         around = max_pool2d(depth[None, None], 3, stride=1, padding=1)
         seen.append(z <= photo.look_up(around, place[None], "nearest")[0, 0] + 1.5 * pixel)
-        masks.append((photo.pixels[:, 3:] >= 0.95).float())
-    return _agreement(photos, masks, points, normals, torch.stack(seen), pixel, fewest=3)
+    return torch.stack(seen)
 
 
 def _agreement_behind(
     photos: list[_Photo], lids: list[Tensor], points: Tensor, normals: Tensor, pixel: float
 ) -> Tensor:
     """(N,) how far photos agree at points that they see through lids, which are masks (1, 1, H, W)."""
-    seen = [
-        photo.look_up(lid, photo.project(points)[0][None], "nearest")[0, 0] > 0.5
-        for photo, lid in zip(photos, lids, strict=True)
-    ]
-    return _agreement(photos, lids, points, normals, torch.stack(seen), pixel, fewest=2)
+    seen = torch.stack(
+        [
+            photo.look_up(lid, photo.project(points)[0][None], "nearest")[0, 0] > 0.5
+            for photo, lid in zip(photos, lids, strict=True)
+        ]
+    )
+    enough = seen.sum(dim=0) >= 2
+    found = torch.full((len(points),), torch.nan)
+    found[enough] = _agreement(photos, lids, points[enough], normals[enough], seen[:, enough], pixel, fewest=2)
+    return found
 
 
 def _agreement(
@@ -264,12 +287,12 @@ def _patches(points: Tensor, normals: Tensor, pixel: float) -> Tensor:
     return points[:, None] + x.reshape(-1, 1) * u[:, None] + y.reshape(-1, 1) * v[:, None]
 
 
-def _within(outside: Distance, points: Tensor, inward: Tensor, depths: Tensor, cost: Tensor) -> Tensor:
-    """(N, D) the cost, infinite from where the way inwards comes within a step of the hull's other side."""
+def _within(outside: Distance, points: Tensor, inward: Tensor, depths: Tensor) -> Bool[Tensor, "N D"]:
+    """Which depths lie before the way inwards comes within a step of the hull's other side."""
     beyond = torch.stack([outside(points + depth * inward) > -depths[1] for depth in depths[2:]], dim=1)
     free = beyond.int().cumsum(dim=1) == 0
     # A lid itself, and the way to the first depth well inside of it, are always free.
-    return torch.cat([cost[:, :2], torch.where(free, cost[:, 2:], torch.inf)], dim=1)
+    return torch.cat([torch.ones(len(points), 2, dtype=torch.bool), free], dim=1)
 
 
 def _depths(cost: Float[Tensor, "N D"], edges: Int64[Tensor, "E 2"]) -> Int64[Tensor, " N"]:
@@ -293,8 +316,12 @@ def _depths(cost: Float[Tensor, "N D"], edges: Int64[Tensor, "E 2"]) -> Int64[Te
     return belief().argmin(dim=1)
 
 
-def _where_agreed(depth: Tensor, found: Tensor, edges: Tensor) -> Tensor:
-    """The depths, 0 for lids under which photos agree no more than on a lid, and for those that hardly move."""
+def _where_agreed(depth: Tensor, found: Tensor, edges: Tensor, edge: float) -> Tensor:
+    """The depths, 0 for lids under which photos agree no more than on a lid, and for those that hardly move.
+
+    Hollows much deeper than wide are no hollows: no two photos could see their bottom. The length of an edge, by which
+    widths are known, is given in depths.
+    """
     at = found.gather(1, depth[:, None])[:, 0]
     deep = depth > 1
     count, lid = connected(edges[deep[edges].all(dim=1)], len(depth))
@@ -302,8 +329,30 @@ def _where_agreed(depth: Tensor, found: Tensor, edges: Tensor) -> Tensor:
     known = ~at.isnan()
     asked = torch.zeros(count).index_add(0, lid, known.float())
     agreement = torch.zeros(count).index_add(0, lid, at.nan_to_num()) / asked.clamp_min(1)
+    deepest = torch.zeros(count).scatter_reduce(0, lid, depth.float(), "amax")
     opened = (size >= _FEWEST) & (2 * asked >= size) & (agreement >= _AGREED)
+    opened &= deepest <= _SLENDER * edge * size.sqrt()
     return torch.where(deep & opened[lid], depth, 0)
+
+
+def _without_unseen(way: Tensor, seen: Bool[Tensor, "B N"], neighbours: Tensor, edges: Tensor) -> Tensor:
+    """How far lids go in, and between those that photos see, where others would be out of sight.
+
+    Photos that agree where they cannot see the surface show something else.
+
+    Args:
+        way: (N,) of each vertex of the lids.
+        seen: by which photos, if it goes so far.
+        neighbours: (N,) how many each has, on its lid or beside.
+        edges: (E, 2) of the lids.
+    """
+    doubtful = (way > 0) & (seen.sum(dim=0) < 2)
+    source, target = torch.cat([edges, edges.flip(1)]).T
+    way = torch.where(doubtful, 0.0, way)
+    for _ in range(_SMOOTH_UNSEEN if bool(doubtful.any()) else 0):
+        mean = torch.zeros_like(way).index_add(0, target, way[source]) / neighbours
+        way = torch.where(doubtful, mean, way)
+    return way
 
 
 def _averaged(normals: Tensor, edges: Tensor, rounds: int) -> Tensor:
