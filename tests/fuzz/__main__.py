@@ -46,7 +46,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     targets = [target for target in everything if fnmatch(target.name, options.targets)]
     shutil.rmtree(FOUND, ignore_errors=True)
     tallies: list[Tally] = []
-    for target in targets:
+    for number, target in enumerate(targets, start=1):
+        if console.is_terminal or not options.seconds:  # an hour, in which one wants to know how far it is
+            console.print(f"{number} of {len(targets)}: {target.name}", style="dim")
         kin = [other for other in targets if isinstance(other, type(target))]
         if options.seconds:
             tally = run_target(target, options.seed, seconds=options.seconds / len(targets))
@@ -54,8 +56,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             total = options.inputs if target in READERS else options.calls
             tally = run_target(target, options.seed, inputs=-(-total // len(kin)))
         tallies.append(tally)
-        for number, (what, failure) in enumerate(tally.failures.items()):
-            place = FOUND / target.name.replace(" ", "_").replace("/", "_") / str(number)
+        for kind, (what, failure) in enumerate(tally.failures.items()):
+            place = FOUND / target.name.replace(" ", "_").replace("/", "_") / str(kind)
             keep(target, options.seed, failure, place)
             console.print(f"{target.name}: {what}, {failure.count} times, first input {failure.index}: {place}")
         if tally.inputs >= ENOUGH and tally.share_accepted() < target.least_accepted:

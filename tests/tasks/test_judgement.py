@@ -14,7 +14,7 @@ from etsplat.data.photograph import photograph
 from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.parts import Shape
 from etsplat.io.mesh_files import MeshFile
-from etsplat.tasks.judgement import Expected, Judgement, expect_mesh, expect_photos, judge, spread
+from etsplat.tasks.judgement import Expected, Judgement, Start, expect_mesh, expect_photos, judge, spread
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 
 BALL, RING = Shape(1, 0), Shape(1, 1)
@@ -43,12 +43,13 @@ def judged(
     scores: Mapping[str, float | None] = GOOD,
     intersecting: float = 0.0,
     *,
+    begun: Start = "sphere",
     preset: str = "quick",
     untangled: bool = True,
     shown: bool = True,
 ) -> Judgement:
     wanted = Expected(expected, None if expected.unclear else "input mesh", shown)
-    return judge("test", scores, intersecting, found, wanted, begun="sphere", preset=preset, untangled=untangled)
+    return judge("test", scores, intersecting, found, wanted, begun=begun, preset=preset, untangled=untangled)
 
 
 def test_of_a_good_result_nothing_is_said_but_its_numbers():
@@ -68,6 +69,14 @@ def test_other_parts_and_holes_are_said_with_what_to_try():
         "poor: the result has 1 part and 0 holes, the input mesh 2 parts and 4 holes: try --start.shape hull"
     )
     assert (found.parts, found.holes, found.expected_parts, found.expected_holes) == (1, 0, 2, 4)
+
+
+def test_a_hull_with_other_holes_has_other_remedies():
+    """A sphere can do something about holes that are too many, not about those that lack."""
+    mesh = "try --init-mesh with a mesh that has them"
+    assert judged(found=Shape(1, 2), expected=Shape(1, 8), begun="hull").verdict.endswith(mesh)
+    sphere = mesh.replace("try ", "try --start.shape sphere or ")
+    assert judged(found=Shape(1, 8), expected=Shape(1, 2), begun="hull").verdict.endswith(sphere)
 
 
 def test_holes_that_no_silhouette_shows_are_not_held_against_a_result():

@@ -156,7 +156,8 @@ def judge(
     hull = "--start.shape hull" if begun == "sphere" else None
     longer = None if preset == "best" else "--preset best"
     if expected.shown and _differ(found, expected.shape):
-        remedy = hull or "--init-mesh with a mesh that has them"
+        fewer = begun == "hull" and (found.holes or 0) > (expected.shape.holes or 0)
+        remedy = hull or f"{'--start.shape sphere or ' * fewer}--init-mesh with a mesh that has them"
         poor.append(f"the result has {_counted(found)}, the {expected.of} {_counted(expected.shape)}: try {remedy}")
     if iou is not None and iou < GOOD_IOU:
         remedies = " or ".join(filter(None, (hull, longer))) or "--init-mesh, and check masks and poses"

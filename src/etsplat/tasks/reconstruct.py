@@ -120,7 +120,7 @@ def reconstruct(
             supersampling=config.pictures.supersampling,
             lpips=load_lpips(config.output.lpips_weights, job.device),
         )
-        config = settle_start(config, views, truth)
+        config = settle_start(config, views)
         mesh = make_start(start, views, config, job.device)
         begun: Start = "mesh" if start is not None else "hull" if config.start.shape == "hull" else "sphere"
         judging = partial(_judge, scorer, views, truth, config, begun, shape_of(*mesh.surface()))

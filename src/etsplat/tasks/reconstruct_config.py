@@ -52,15 +52,17 @@ class Start:
 
     shape: Literal["auto", "sphere", "hull"] = "auto"
     """A sphere around the object; or the visual hull of its masks, which has the holes and parts that they show.
-    auto: the hull of photos that show the object as a whole, the sphere for photos that cut it off and for a mesh."""
+    auto: the hull where photos show the object as a whole, as those of a mesh do; the sphere where most cut it off."""
     level: Annotated[int, Range(0, 9), _SPHERE] = 4
     """The sphere has 20 * 4^level faces."""
     radius: Annotated[float, Range(1e-6, 1e6)] = 1.05
     """Radius of the sphere, in which the hull lies too, as a multiple of the radius of a sphere around the object."""
     hull_faces: Annotated[float, Range(0.01, 1), _HULL] = 0.5
     """Faces of the hull, as a fraction of `max_faces`."""
-    near: Annotated[float, Range(1e-6, 1), _HULL] = 0.1
-    """A hull is near the surface already: the rate of vertices and the weight of edges are multiplied by this."""
+    near: Annotated[float, Range(1e-6, 1), _HULL] = 0.3
+    """A hull is near the surface already: the rate of vertices is multiplied by this."""
+    near_edge: Annotated[float, Range(0, 1), _HULL] = 0.1
+    """And the weight of edges by this: they need not pull the surface inwards."""
     color: Annotated[float, Range(0, 1)] = 0.5
     """Grey of all faces at the start."""
     opacity: Annotated[float, Range(0.01, 0.999), _SOFT] = 0.98

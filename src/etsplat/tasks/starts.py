@@ -26,18 +26,17 @@ def load_start(start: str | Path | MeshFile | None) -> MeshFile | None:
     return weld_vertices(start if isinstance(start, MeshFile) else load_mesh(start))
 
 
-def settle_start(config: ReconstructConfig, views: Dataset, truth: MeshFile | None) -> ReconstructConfig:
+def settle_start(config: ReconstructConfig, views: Dataset) -> ReconstructConfig:
     """The settings with a start from the sphere or the hull in the place of "auto".
 
     Args:
         config: settings.
         views: from `make_subject`.
-        truth: the mesh that they show, if they are pictures of one.
     """
     if config.start.shape != "auto":
         return config
-    whole = [not touches_border(silhouette(views.images[index])) for index in views.train] if truth is None else []
-    hull = views.has_masks and 2 * sum(whole) > len(views.train)
+    whole = [not touches_border(silhouette(views.images[index])) for index in views.train] if views.has_masks else []
+    hull = 2 * sum(whole) > len(views.train)
     return replace(config, start=replace(config.start, shape="hull" if hull else "sphere"))
 
 
@@ -101,9 +100,9 @@ def plain_hull(views: Dataset, config: ReconstructConfig) -> tuple[Tensor, Tenso
 
 def nearby(config: ReconstructConfig) -> ReconstructConfig:
     """The settings for a start that is near the surface."""
-    near, rates, weights = config.start.near, config.optimizer, config.regularization
+    start, rates, weights = config.start, config.optimizer, config.regularization
     return replace(
         config,
-        optimizer=replace(rates, lr_vertices=near * rates.lr_vertices),
-        regularization=replace(weights, lambda_edge=near * weights.lambda_edge),
+        optimizer=replace(rates, lr_vertices=start.near * rates.lr_vertices),
+        regularization=replace(weights, lambda_edge=start.near_edge * weights.lambda_edge),
     )
