@@ -84,7 +84,7 @@ def outside(setting: Setting) -> list[Any]:
 def test_presets_of_reconstruct_are_what_they_were(preset: str) -> None:
     """Every setting of then has a name now; what has come since has no effect unless it is asked for or needed."""
     config = flatten(ReconstructConfig.of(preset).to_dict())
-    since = {"start.hull_faces": 0.5, "start.near": 0.3, "start.near_edge": 0.1}
+    since = {"start.hull_faces": 0.5, "start.near": 0.3, "start.near_edge": 0.02}
     since["start.shape"] = "sphere" if preset in ("paper", "study", "tiny") else "auto"
     since["watch"] = 0 if preset in ("paper", "study", "tiny") else None
     since["exposure"] = "off" if preset in ("paper", "study", "tiny") else "auto"

@@ -61,8 +61,8 @@ class Start:
     """Faces of the hull, as a fraction of `max_faces`."""
     near: Annotated[float, Range(1e-6, 1), _HULL] = 0.3
     """A hull is near the surface already: the rate of vertices is multiplied by this."""
-    near_edge: Annotated[float, Range(0, 1), _HULL] = 0.1
-    """And the weight of edges by this: they need not pull the surface inwards."""
+    near_edge: Annotated[float, Range(0, 1), _HULL] = 0.02
+    """And the weight of edges by this: pulled tight they fill hollows."""
     color: Annotated[float, Range(0, 1)] = 0.5
     """Grey of all faces at the start."""
     opacity: Annotated[float, Range(0.01, 0.999), _SOFT] = 0.98
