@@ -8,6 +8,8 @@ from dataclasses import dataclass
 
 OPTIONS: dict[str, dict[str, str]] = {
     "reconstruct": {
+        # Every run of a mesh started from the sphere.
+        **{f"--preset {preset}": f"--preset {preset} --start.shape sphere" for preset in ("best", "quick", "demo")},
         "--views-per-step": "--batch",
         "--supersampling": "--pictures.supersampling",
         "--coarse-levels": "--pictures.coarse-levels",

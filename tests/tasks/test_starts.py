@@ -1,5 +1,6 @@
 """What reconstructions start from: which shape is chosen, and that runs from each end as they should."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from etsplat.io.mesh_files import MeshFile
 from etsplat.optim.loop import Event, NoteEvent
 from etsplat.tasks.reconstruct import reconstruct
 from etsplat.tasks.reconstruct_config import ReconstructConfig
-from etsplat.tasks.starts import settle_start
+from etsplat.tasks.starts import start_shape
 from helpers.reconstructions import SHORT, KilledError, kill_at, pebble_mesh, untimed
 
 
@@ -33,7 +34,7 @@ def test_photos_start_from_the_hull_if_most_show_the_object_as_a_whole() -> None
     config = ReconstructConfig.quick()
 
     def start(views: Dataset) -> str:
-        return settle_start(config, views).start.shape
+        return start_shape(config, views)
 
     assert start(views) == "hull"
     images = list(views.images)
@@ -43,7 +44,16 @@ def test_photos_start_from_the_hull_if_most_show_the_object_as_a_whole() -> None
     ]
     assert start(replace(views, images=StoredPictures(cut))) == "sphere"
     asked = ReconstructConfig.quick().changed({"start.shape": "sphere"})
-    assert settle_start(asked, views) == asked
+    assert start_shape(asked, views) == "sphere"
+
+
+def test_settings_of_one_start_are_taken_where_it_is_chosen_as_the_run_begins(tmp_path: Path) -> None:
+    """With "auto" those of the sphere have an effect or not, as the photos are."""
+    views = photograph(MeshFile(*icosphere(2)), 48, 48, supersampling=1)
+    config = SHORT.changed({"iterations": 2, "start.shape": "auto", "start.level": 1, "start.near": 0.5})
+    reconstruct(views, tmp_path, config)
+    told = json.loads((tmp_path / "config.json").read_text())["config"]["start"]
+    assert (told["shape"], told["level"], told["near"]) == ("auto", 1, 0.5)
 
 
 def test_a_given_mesh_is_the_start(pebble: MeshFile, tmp_path: Path) -> None:

@@ -43,7 +43,7 @@ from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.running import Job, Result, path_of, terms_of
 from etsplat.tasks.scoring import Scorer, load_lpips
 from etsplat.tasks.sources import Source, fingerprint, load_source, make_subject
-from etsplat.tasks.starts import load_start, make_start, nearby, settle_start
+from etsplat.tasks.starts import load_start, make_start, nearby
 
 
 @dataclass(frozen=True)
@@ -120,9 +120,7 @@ def reconstruct(
             supersampling=config.pictures.supersampling,
             lpips=load_lpips(config.output.lpips_weights, job.device),
         )
-        config = settle_start(config, views)
-        mesh = make_start(start, views, config, job.device)
-        begun: Start = "mesh" if start is not None else "hull" if config.start.shape == "hull" else "sphere"
+        mesh, begun = make_start(start, views, config, job.device)
         judging = partial(_judge, scorer, views, truth, config, begun, shape_of(*mesh.surface()))
         if begun == "hull":
             holes = genera(mesh.faces.cpu(), len(mesh.vertices))

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -16,6 +17,7 @@ from etsplat.geometry.topology import MeshTopology
 from etsplat.geometry.untangle import untangle
 from etsplat.io.mesh_files import MeshFile, load_mesh, weld_vertices
 from etsplat.model.triangle_mesh import MeshAppearance, TriangleMesh
+from etsplat.tasks.judgement import Start
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 
 
@@ -26,36 +28,38 @@ def load_start(start: str | Path | MeshFile | None) -> MeshFile | None:
     return weld_vertices(start if isinstance(start, MeshFile) else load_mesh(start))
 
 
-def settle_start(config: ReconstructConfig, views: Dataset) -> ReconstructConfig:
-    """The settings with a start from the sphere or the hull in the place of "auto".
+def start_shape(config: ReconstructConfig, views: Dataset) -> Literal["sphere", "hull"]:
+    """What "auto" amounts to, or what is asked for.
 
     Args:
         config: settings.
         views: from `make_subject`.
     """
     if config.start.shape != "auto":
-        return config
+        return config.start.shape
     whole = [not touches_border(silhouette(views.images[index])) for index in views.train] if views.has_masks else []
-    hull = 2 * sum(whole) > len(views.train)
-    return replace(config, start=replace(config.start, shape="hull" if hull else "sphere"))
+    return "hull" if 2 * sum(whole) > len(views.train) else "sphere"
 
 
 def make_start(
     start: MeshFile | None, views: Dataset, config: ReconstructConfig, device: torch.device | None = None
-) -> TriangleMesh:
+) -> tuple[TriangleMesh, Start]:
     """The mesh that a run starts from, in the unit frame: an icosphere around the object, its hull, or the given mesh.
+
+    With it what it is.
 
     Args:
         start: from `load_start`, in the input's units; its colours are used if it has the kind that is optimised.
         views: of the unit frame.
-        config: shape as `settle_start` leaves it, colour, opacity and softness.
+        config: shape, colour, opacity and softness.
         device: of the mesh; None for the CPU.
 
     Raises:
         InputError: the hull is asked for, and the views have no masks, or masks that exclude everything.
     """
     colors: Tensor | float = config.start.color
-    if start is None and config.start.shape == "hull":
+    begun: Start = start_shape(config, views) if start is None else "mesh"
+    if begun == "hull":
         vertices, faces, _ = open_hollows(views, *plain_hull(views, config))
         vertices = untangle(vertices, MeshTopology.from_faces(faces, len(vertices)))[0]
     elif start is None:
@@ -66,7 +70,7 @@ def make_start(
         given = start.vertex_colors if config.vertex_colored else start.face_colors
         colors = config.start.color if given is None else given
     kernel = config.method.replace("-", "_") if config.soft else None
-    return TriangleMesh.from_mesh(
+    mesh = TriangleMesh.from_mesh(
         vertices.to(device or "cpu"),
         faces.to(device or "cpu"),
         colors=colors,
@@ -75,6 +79,7 @@ def make_start(
         vertex_colored=config.vertex_colored,
         appearance=MeshAppearance(kernel, config.drawing.distance, config.drawing.backend),
     )
+    return mesh, begun
 
 
 def plain_hull(views: Dataset, config: ReconstructConfig) -> tuple[Tensor, Tensor]:
