@@ -212,7 +212,7 @@ def test_a_run_that_fails_for_its_scale_says_how_to_scale_it(capture: Dataset, t
 
 
 def rates_of(config: TrainConfig, capture: Dataset, iteration: int) -> dict[str, float]:
-    rates = start_trainer(capture, config)._schedule.rates
+    rates = start_trainer(capture, config)._stepper._schedule.rates
     return {name: at(rate, iteration) for name, rate in rates.items()}
 
 
