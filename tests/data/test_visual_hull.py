@@ -4,6 +4,7 @@ import pytest
 import torch
 import trimesh
 
+from etsplat.data.demo_object import demo_object
 from etsplat.data.photograph import photograph
 from etsplat.data.pictures import StoredPictures
 from etsplat.data.visual_hull import visual_hull
@@ -63,3 +64,12 @@ def test_silhouettes_without_a_common_point_leave_nothing(ring_and_ball):
     vertices, triangles = visual_hull(replace(views, images=StoredPictures(images)), 4000)
     assert vertices.shape == (0, 3)
     assert triangles.shape == (0, 3)
+
+
+def test_a_hull_that_touches_itself_is_taken_apart():
+    """As wings and ears of the owl do where the grid is coarse: edges had four faces."""
+    found, triangles = visual_hull(photograph(demo_object(), 64, 64, supersampling=2), 4000)
+    topology = MeshTopology.from_faces(triangles, len(found))
+    assert topology.is_closed()
+    assert topology.is_manifold()
+    assert topology.is_oriented()

@@ -16,6 +16,7 @@ from etsplat.data.dataset import Dataset
 from etsplat.data.hull import silhouette, touches_border
 from etsplat.data.meshing import dual_contour
 from etsplat.data.pictures import as_float
+from etsplat.geometry.manifold import taken_apart
 from etsplat.geometry.parts import face_parts
 
 Distance = Callable[[Float[Tensor, "N 3"]], Float[Tensor, " N"]]
@@ -46,7 +47,7 @@ _BISECTIONS = 8
 def visual_hull(
     dataset: Dataset, faces: int, *, radius: float = 1.0
 ) -> tuple[Float[Tensor, "V 3"], Int64[Tensor, "F 3"]]:
-    """The hull of the training views' silhouettes (alpha 0.5) within a ball around the origin, as a closed mesh.
+    """The hull of the training views' silhouettes (alpha 0.5) within a ball around the origin, as a closed manifold.
 
     A view whose silhouette keeps off the image border excludes what its image does not show; where the border cuts the
     silhouette, nothing is known beyond. A point of the hull is judged by at least half of the views.
@@ -79,7 +80,7 @@ def visual_hull(
         wanted = round(cells * (faces / len(triangles)) ** 0.5)
         if cells == (cells := min(max(wanted, _FIRST_CELLS // 2), _MOST_CELLS)):
             break
-    return _without_specks(torch.from_numpy(vertices).float(), torch.from_numpy(triangles))
+    return _without_specks(*taken_apart(torch.from_numpy(vertices).float(), torch.from_numpy(triangles)))
 
 
 def outside_hull(dataset: Dataset) -> Distance:
