@@ -66,7 +66,7 @@ def hull_of(subject: Subject, config: ReconstructConfig, folder: Path) -> Hull:
 
 def _carve(subject: Subject, config: ReconstructConfig, path: Path) -> dict[str, Any]:
     device = resolve_device(config.device, config.engine)
-    views, truth = make_subject(load_source(subject.source, config), config, lambda done, total: None, device)
+    views, truth = make_subject(load_source(subject.source, config)[0], config, lambda done, total: None, device)
     # Meshes are photographed with +y up.
     up = world_up(views.viewmats) if truth is None else None
     found: dict[str, Any] = {"problem": None, "silhouette_iou": None, "up": None if up is None else up.tolist()}

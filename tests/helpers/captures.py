@@ -8,6 +8,8 @@ import torch
 from PIL import Image
 
 from etsplat import look_at
+from etsplat.data.photograph import FIELD_OF_VIEW
+from etsplat.io.images import save_image
 
 UP = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
 
@@ -76,3 +78,22 @@ def write_transforms(folder, count, *, width=16, height=12, channels=3, **settin
         frames.append({"file_path": f"images/{index:04d}.png", "transform_matrix": (pose.inverse() @ flip).tolist()})
     document = {"fl_x": width, "w": width, "h": height, "frames": frames, **settings}
     (folder / "transforms.json").write_text(json.dumps(document))
+
+
+def opengl_pose(viewmat):
+    """Camera to world with OpenGL's axes, as transforms.json has it."""
+    return (torch.linalg.inv(viewmat.double()) @ torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]).double())).tolist()
+
+
+def write_views(folder, views, indices, name, **settings):
+    """Writes the views with the given indices as RGBA PNG beside a JSON file `name`; returns the document."""
+    frames = []
+    for index in indices:
+        image = views.images[index].clone()
+        image[..., :3] /= image[..., 3:].clamp_min(1e-6)
+        (folder / "images").mkdir(parents=True, exist_ok=True)
+        save_image(folder / "images" / f"{index:03d}.png", image)
+        frames.append({"file_path": f"./images/{index:03d}", "transform_matrix": opengl_pose(views.viewmats[index])})
+    document = {"camera_angle_x": math.radians(FIELD_OF_VIEW), "frames": frames, **settings}
+    (folder / name).write_text(json.dumps(document))
+    return document

@@ -2,21 +2,26 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import pytest
 import torch
 
 from etsplat.cli.parse import parse
 from etsplat.core.errors import InputError
+from etsplat.data.demo_object import demo_object
 from etsplat.data.load import load_dataset
+from etsplat.data.photograph import photograph
+from etsplat.data.pictures import StoredPictures
 from etsplat.io.run_directory import RunDirectory
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.optim.loop import CheckpointEvent
+from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.scoring import evaluate_run
-from etsplat.tasks.sources import open_run
+from etsplat.tasks.sources import load_source, open_run
 from etsplat.tasks.train import train
 from etsplat.tasks.train_config import TrainConfig
-from helpers.captures import write_colmap, write_photo
+from helpers.captures import write_colmap, write_photo, write_views
 
 
 @pytest.fixture(scope="module")
@@ -125,3 +130,19 @@ def test_folders_without_a_soup_are_input_errors(tmp_path, trained):
     (tmp_path / "run" / "soup.safetensors").unlink()
     with pytest.raises(InputError, match="got to a checkpoint"):
         open_run(tmp_path / "run")
+
+
+def test_photos_whose_masks_contradict_the_others_are_left_out_and_named(tmp_path):
+    """Half of one mask is lost: the hull would lose that half of the object, and so would the sphere about it."""
+    views = photograph(demo_object(), 64, 64, supersampling=2)
+    images = [image.clone() for image in views.images]
+    images[views.train[4]][32:] = 0
+    spoilt = replace(views, images=StoredPictures(images))
+    write_views(tmp_path, spoilt, views.train, "transforms_train.json")
+    write_views(tmp_path, spoilt, views.test, "transforms_test.json")
+    scene, notes = load_source(tmp_path, ReconstructConfig.tiny())
+    names = [scene.names[index] for index in scene.train]
+    wrong = f"images_{views.train[4]:03d}"
+    assert wrong not in names
+    assert len(names) == len(views.train) - 1
+    assert notes == [f"left out, since its mask contradicts the others: {wrong}"]

@@ -5,7 +5,7 @@ object.
 """
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
@@ -13,7 +13,7 @@ from etsplat.core.cameras import camera_centers
 from etsplat.core.errors import InputError
 from etsplat.data.camera_paths import axes_meeting_point
 from etsplat.data.dataset import Dataset
-from etsplat.data.pictures import Pixels, as_float
+from etsplat.data.silhouettes import silhouette, touches_border
 
 _CELLS = 48
 """Grid cells per side, at each of the levels."""
@@ -88,16 +88,6 @@ def _carve(views: list[_View], center: np.ndarray, reach: float) -> tuple[np.nda
             )
         lower, upper = kept.min(axis=0) - cell / 2, kept.max(axis=0) + cell / 2
     return kept, cell
-
-
-def silhouette(photo: Pixels) -> Bool[np.ndarray, "H W"]:
-    """Where a photo shows the object: alpha from 0.5 on; everywhere without alpha."""
-    return as_float(photo[..., 3]).numpy() >= 0.5 if photo.shape[-1] == 4 else np.ones(photo.shape[:2], dtype=bool)
-
-
-def touches_border(mask: Bool[np.ndarray, "H W"]) -> bool:
-    """Whether a silhouette goes on, as far as one knows, beyond its picture."""
-    return any(edge.any() for edge in (mask[0], mask[-1], mask[:, 0], mask[:, -1]))
 
 
 def _silhouettes(dataset: Dataset, names: list[str], steps: np.ndarray) -> list[np.ndarray]:

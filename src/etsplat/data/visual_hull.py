@@ -9,13 +9,11 @@ from collections.abc import Callable
 import numpy as np
 import torch
 from jaxtyping import Float, Int64
-from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from etsplat.data.dataset import Dataset
-from etsplat.data.hull import silhouette, touches_border
 from etsplat.data.meshing import dual_contour
-from etsplat.data.pictures import as_float
+from etsplat.data.silhouettes import Evidence, Silhouette
 from etsplat.geometry.manifold import taken_apart
 from etsplat.geometry.parts import face_parts
 
@@ -84,50 +82,25 @@ def visual_hull(
 
 
 def outside_hull(dataset: Dataset) -> Distance:
-    """How far points are outside the visual hull: a function of them, in units of the scene, negative inside."""
-    views = [_View(dataset, index) for index in dataset.train]
+    """How far points are outside the visual hull: a function of them, in units of the scene, negative inside.
+
+    Where masks are rough and lose what others show, silhouettes are taken to be larger by so many pixels.
+
+    Args:
+        dataset: as in `visual_hull`.
+    """
+    views = [Silhouette(dataset, index) for index in dataset.train]
+    rough = Evidence.of(views, torch.zeros(3), 1.0).rough()
 
     def outside(points: Tensor) -> Tensor:
         depth, judges = torch.full((len(points),), torch.inf), torch.zeros(len(points))
         for view in views:
-            found, judged = view.inside(points)
-            depth = torch.where(judged, torch.minimum(depth, found), depth)
+            found, unit, judged = view.depth(points)
+            depth = torch.where(judged, torch.minimum(depth, (found + rough) * unit), depth)
             judges += judged
         return torch.where(2 * judges >= len(views), -depth, 1.0)
 
     return outside
-
-
-class _View:
-    """A silhouette and its camera."""
-
-    def __init__(self, dataset: Dataset, index: int) -> None:
-        photo = dataset.images[index]
-        inside = silhouette(photo)
-        # From pixel centres to the border between pixels, which partly covered pixels place within themselves.
-        within, beyond = (np.asarray(distance_transform_edt(mask)) for mask in (inside, ~inside))
-        distance = within - beyond
-        distance -= np.copysign(0.5, distance)
-        if photo.shape[-1] == 4:
-            alpha = as_float(photo[..., 3]).numpy()
-            distance = np.where((alpha > 0) & (alpha < 1), alpha - 0.5, distance)
-        self.distance = torch.from_numpy(distance).float()[None, None]
-        self.whole = not touches_border(inside)
-        self.viewmat, self.K = dataset.viewmats[index].float(), dataset.Ks[index].float()
-
-    def inside(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """(N,) how deep points are within the silhouette, in units of the scene, and (N,) whether it judges them."""
-        camera = points @ self.viewmat[:3, :3].T + self.viewmat[:3, 3]
-        z = camera[:, 2]
-        front = z > 0
-        height, width = self.distance.shape[2:]
-        pixel = camera @ self.K.T / torch.where(front, z, 1.0)[:, None]
-        place = 2 * pixel[:, :2] / torch.tensor([width, height]) - 1
-        found = torch.nn.functional.grid_sample(
-            self.distance, place[None, None], padding_mode="border", align_corners=False
-        )
-        judged = front & (self.whole | (place.abs() < 1).all(dim=1))
-        return found[0, 0, 0] * z / self.K[0, 0], judged
 
 
 def _without_specks(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:

@@ -102,11 +102,11 @@ def reconstruct(
     """
     config = config or ReconstructConfig()
     job = Job(config, out, callbacks, resume=resume, overwrite=overwrite)
-    loaded, start = load_source(source, config, masks), load_start(init_mesh)
+    (loaded, notes), start = load_source(source, config, masks), load_start(init_mesh)
     hashes = {"fingerprint": fingerprint(loaded), "init_mesh": fingerprint(start)}
     job.identify(hashes, {"source": path_of(source), "init_mesh": path_of(init_mesh)})
-    for name, mesh in (("source", loaded), ("init_mesh", start)):
-        for note in mesh.notes if isinstance(mesh, MeshFile) else ():
+    for name, found in (("source", notes), ("init_mesh", start.notes if start else [])):
+        for note in found:
             job.announce(NoteEvent(f"{name}: {note}"))
     views, truth = make_subject(loaded, config, job.prepared, job.device)
     if config.drawing.backend == "nvdiffrast":

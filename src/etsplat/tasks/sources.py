@@ -4,8 +4,8 @@ A `SoupRun` is what every command that comes after training starts from.
 """
 
 import hashlib
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from etsplat.data.demo_scene import HEIGHT, WIDTH, demo_scene
 from etsplat.data.hull import bounding_sphere
 from etsplat.data.load import load_dataset
 from etsplat.data.photograph import normalize_mesh, photograph
+from etsplat.data.silhouettes import contradicting
 from etsplat.engines.choice import resolve_device
 from etsplat.io.mesh_files import MeshFile, load_mesh
 from etsplat.io.paths import path_remedy
@@ -37,13 +38,20 @@ DEMO_OBJECT, DEMO_SCENE = "demo:owl", "demo:scene"
 """Name what is built in code."""
 
 
-def load_source(source: Source, config: ReconstructConfig, masks: str | Path | None = None) -> MeshFile | Dataset:
+def load_source(
+    source: Source, config: ReconstructConfig, masks: str | Path | None = None
+) -> tuple[MeshFile | Dataset, Sequence[str]]:
     """Reads a mesh file or a scene folder, or makes the demo's object; objects are passed through.
+
+    Of a folder, training views are left out whose masks contradict the others'.
 
     Args:
         source: what to read.
         config: the resolution of a scene's images.
         masks: folder with a mask for every image of a scene folder, instead of the scene's own.
+
+    Returns:
+        What is to be reconstructed, and notes about what of it is not used.
 
     Raises:
         InputError: there is nothing at the path, or what is there cannot be used; masks for something else than a
@@ -51,17 +59,32 @@ def load_source(source: Source, config: ReconstructConfig, masks: str | Path | N
     """
     if masks is not None and (isinstance(source, MeshFile | Dataset) or not Path(source).is_dir()):
         raise InputError(f"masks {masks}: belong to a folder with posed images; leave them out for a mesh")
-    if isinstance(source, MeshFile | Dataset):
-        return source
+    if isinstance(source, MeshFile):
+        return source, source.notes
+    if isinstance(source, Dataset):
+        return source, []
     if str(source) == DEMO_OBJECT:
-        return demo_object()
+        return demo_object(), []
     path = Path(source)
     if path.is_dir():
-        scene = load_dataset(path, masks_as="alpha", width=config.resolution, masks=masks)
-        return scene.renormalized(*bounding_sphere(scene))
+        scene, notes = _agreeing(load_dataset(path, masks_as="alpha", width=config.resolution, masks=masks))
+        return scene.renormalized(*bounding_sphere(scene)), notes
     if path.is_file():
-        return load_mesh(path)
+        mesh = load_mesh(path)
+        return mesh, mesh.notes
     raise InputError(f"{path}: no such file or folder; {path_remedy(path)}")
+
+
+def _agreeing(scene: Dataset) -> tuple[Dataset, list[str]]:
+    """Without training views whose masks contradict the others', and a note that names them."""
+    wrong = contradicting(scene)
+    if not wrong:
+        return scene, []
+    names = ", ".join(scene.names[index] for index in sorted(wrong))
+    note = (
+        f"left out, since {'its mask contradicts' if len(wrong) == 1 else 'their masks contradict'} the others: {names}"
+    )
+    return replace(scene, train=[index for index in scene.train if index not in wrong]), [note]
 
 
 def load_scene(

@@ -10,7 +10,7 @@ from torch import Tensor
 from etsplat.core.errors import InputError
 from etsplat.data.dataset import Dataset
 from etsplat.data.hollows import open_hollows
-from etsplat.data.hull import silhouette, touches_border
+from etsplat.data.silhouettes import silhouette, touches_border
 from etsplat.data.visual_hull import visual_hull
 from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.topology import MeshTopology

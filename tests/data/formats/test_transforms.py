@@ -10,8 +10,7 @@ from etsplat.data.hull import bounding_sphere
 from etsplat.data.load import load_dataset
 from etsplat.data.photograph import photograph
 from etsplat.io.images import save_image
-
-FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
+from helpers.captures import write_views
 
 
 def load_transforms(folder, width=None):
@@ -28,24 +27,6 @@ def truth():
     return photograph(demo_object(), 40, 40, elevations=(-30.0, 20.0), azimuths=5, supersampling=2)
 
 
-def opengl_pose(viewmat):
-    return (torch.linalg.inv(viewmat.double()) @ FLIP).tolist()
-
-
-def write_scene(folder, views, indices, name, straight=True, **settings):
-    """Writes the views with the given indices as RGBA PNG beside a JSON file `name`; returns the document."""
-    frames = []
-    for index in indices:
-        image = views.images[index].clone()
-        image[..., :3] /= image[..., 3:].clamp_min(1e-6)
-        (folder / "images").mkdir(exist_ok=True)
-        save_image(folder / "images" / f"{index:03d}.png", image)
-        frames.append({"file_path": f"./images/{index:03d}", "transform_matrix": opengl_pose(views.viewmats[index])})
-    document = {"camera_angle_x": math.radians(40), "frames": frames, **settings}
-    (folder / name).write_text(json.dumps(document))
-    return document
-
-
 def rewrite(folder, change):
     """Loads transforms.json, lets `change` edit it, writes it back."""
     document = json.loads((folder / "transforms.json").read_text())
@@ -55,13 +36,13 @@ def rewrite(folder, change):
 
 @pytest.fixture
 def scene(tmp_path, truth):
-    write_scene(tmp_path, truth, range(10), "transforms.json")
+    write_views(tmp_path, truth, range(10), "transforms.json")
     return tmp_path
 
 
 def test_blender_layout_returns_the_cameras_and_premultiplied_images(tmp_path, truth):
-    write_scene(tmp_path, truth, range(7), "transforms_train.json")
-    write_scene(tmp_path, truth, range(7, 10), "transforms_test.json")
+    write_views(tmp_path, truth, range(7), "transforms_train.json")
+    write_views(tmp_path, truth, range(7, 10), "transforms_test.json")
     views = load_transforms(tmp_path)
     torch.testing.assert_close(views.viewmats, truth.viewmats, atol=1e-5, rtol=0)
     torch.testing.assert_close(views.Ks, truth.Ks, atol=1e-3, rtol=0)

@@ -1,0 +1,215 @@
+"""Silhouettes with their cameras: how deep points are within them, and whether they contradict each other."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int64
+from scipy.ndimage import distance_transform_edt
+from torch import Tensor
+from torch.nn.functional import grid_sample
+
+from etsplat.core.cameras import camera_centers
+from etsplat.data.camera_paths import axes_meeting_point
+from etsplat.data.dataset import Dataset
+from etsplat.data.pictures import Pixels, as_float
+
+_RAYS, _LEAST_RAYS = 4096, 8
+"""Pixels that are asked for, in all views together, and of each at least."""
+
+_SAMPLES, _FINER = 96, (9, 9)
+"""Points along the line of sight of each, and then around the best of these."""
+
+_CHUNK = 1 << 10
+"""Lines of sight that are looked along together."""
+
+_FAR, _LEAST_FAR = 0.03, 3.0
+"""Pixels further outside than this fraction of a silhouette's size, and no less than so many, are a contradiction."""
+
+_FEWEST = 6
+"""With fewer views nobody can say which of them is wrong."""
+
+_EXCLUDES, _EXCEEDS = 0.01, 0.2
+"""A view is left out if it excludes so large a part of what the others show, or if they exclude so much of its own."""
+
+_ALONE = 4.0
+"""And if it does so many times as much as others do."""
+
+_KEPT = 0.75
+"""So many of the views are kept at least."""
+
+_ROUGH = 0.02
+"""The part of the object's pixels that masks may lose where they are rough."""
+
+_EXACT = 1.0
+"""Pixels, up to which masks are taken to be exact."""
+
+
+def silhouette(photo: Pixels) -> Bool[np.ndarray, "H W"]:
+    """Where a photo shows the object: alpha from 0.5 on; everywhere without alpha."""
+    return as_float(photo[..., 3]).numpy() >= 0.5 if photo.shape[-1] == 4 else np.ones(photo.shape[:2], dtype=bool)
+
+
+def touches_border(mask: Bool[np.ndarray, "H W"]) -> bool:
+    """Whether a silhouette goes on, as far as one knows, beyond its picture."""
+    return any(edge.any() for edge in (mask[0], mask[-1], mask[:, 0], mask[:, -1]))
+
+
+class Silhouette:
+    """Where a view shows the object, with its camera.
+
+    Attributes:
+        inside: (H, W) the mask.
+        whole: whether it shows all of the object, and so excludes what is outside of its picture.
+        distance: (1, 1, H, W) pixels to its outline, negative outside.
+    """
+
+    def __init__(self, dataset: Dataset, index: int) -> None:
+        photo = dataset.images[index]
+        self.inside = inside = silhouette(photo)
+        # From pixel centres to the border between pixels, which partly covered pixels place within themselves.
+        within, beyond = (np.asarray(distance_transform_edt(mask)) for mask in (inside, ~inside))
+        distance = within - beyond
+        distance -= np.copysign(0.5, distance)
+        if photo.shape[-1] == 4:
+            alpha = as_float(photo[..., 3]).numpy()
+            distance = np.where((alpha > 0) & (alpha < 1), alpha - 0.5, distance)
+        self.distance = torch.from_numpy(distance).float()[None, None]
+        self.whole = not touches_border(inside)
+        self.viewmat, self.K = dataset.viewmats[index].float(), dataset.Ks[index].float()
+
+    def depth(self, points: Float[Tensor, "N 3"]) -> tuple[Tensor, Tensor, Tensor]:
+        """How deep points are within it: (N,) in pixels, (N,) units of the scene for each, and (N,) if it judges."""
+        camera = points @ self.viewmat[:3, :3].T + self.viewmat[:3, 3]
+        z = camera[:, 2]
+        front = z > 0
+        height, width = self.distance.shape[2:]
+        pixel = camera @ self.K.T / torch.where(front, z, 1.0)[:, None]
+        place = 2 * pixel[:, :2] / torch.tensor([width, height]) - 1
+        found = grid_sample(self.distance, place[None, None], padding_mode="border", align_corners=False)
+        return found[0, 0, 0], z / self.K[0, 0], front & (self.whole | (place.abs() < 1).all(dim=1))
+
+    def rays(self, count: int) -> tuple[Float[Tensor, "3"], Float[Tensor, "R 3"]]:
+        """The camera's centre, and unit directions of so many pixels of the object, evenly spread over its rows."""
+        inside = np.flatnonzero(self.inside)
+        chosen = inside[np.linspace(0, len(inside) - 1, min(count, len(inside))).round().astype(np.int64)]
+        row, column = np.unravel_index(chosen, self.inside.shape)
+        pixel = torch.from_numpy(np.stack([column + 0.5, row + 0.5, np.ones(len(row))], axis=1)).float()
+        direction = torch.linalg.solve(self.K, pixel.T).T @ self.viewmat[:3, :3]
+        return camera_centers(self.viewmat[None])[0], torch.nn.functional.normalize(direction, dim=1)
+
+    @property
+    def far(self) -> float:
+        """Pixels, by which masks of it may be off without anyone being wrong."""
+        return max(_LEAST_FAR, _FAR * float(self.inside.sum()) ** 0.5)
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Pixels of the object, and what the views say of the point on each one's line of sight that most can agree on.
+
+    Attributes:
+        view: (R,) whose pixel it is.
+        depth: (R, N) how deep the point is within each silhouette, in pixels; infinite where one does not judge.
+        excluded: (R, N) where it is so far outside that either mask is wrong.
+    """
+
+    view: Int64[Tensor, " R"]
+    depth: Float[Tensor, "R N"]
+    excluded: Bool[Tensor, "R N"]
+
+    @staticmethod
+    def of(views: Sequence[Silhouette], center: Float[Tensor, "3"], radius: float) -> "Evidence":
+        """Looks along lines of sight through a ball."""
+        count = max(_LEAST_RAYS, _RAYS // len(views))
+        lines = [view.rays(count) for view in views]
+        starts = torch.cat([start.expand_as(along) for start, along in lines])
+        along = torch.cat([along for _, along in lines])
+        view = torch.arange(len(views)).repeat_interleave(torch.tensor([len(along) for _, along in lines]))
+        nearest = ((center - starts) * along).sum(dim=1)
+        aside = (starts + nearest[:, None] * along - center).norm(dim=1)
+        half = (radius**2 - aside**2).clamp_min((0.1 * radius) ** 2).sqrt()
+        chunks = zip(*(x.split(_CHUNK) for x in (starts, along, nearest, half)), strict=True)
+        depth = torch.cat([_best_along(views, *chunk) for chunk in chunks])
+        return Evidence(view, depth, depth < -torch.tensor([view.far for view in views]))
+
+    def rough(self) -> float:
+        """By how many pixels silhouettes must grow until they explain each other, contradictions left out.
+
+        0 where they are exact.
+        """
+        lost = (-self.depth.amin(dim=1)).clamp_min(0)[~self.excluded.any(dim=1)]
+        rough = float(lost.quantile(1 - _ROUGH)) if len(lost) else 0.0
+        return rough if rough > _EXACT else 0.0
+
+
+def _best_along(views: Sequence[Silhouette], starts: Tensor, along: Tensor, middle: Tensor, half: Tensor) -> Tensor:
+    """(R, N) depths of the point on each line that the fewest exclude, within `half` of its `middle`."""
+    every = torch.arange(len(starts))
+    best = torch.empty(len(starts), len(views))
+    for samples in (_SAMPLES, *_FINER):
+        offsets = torch.linspace(-1, 1, samples)
+        t = middle[:, None] + half[:, None] * offsets
+        points = (starts[:, None] + t[..., None] * along[:, None]).reshape(-1, 3)
+        depths = torch.empty(len(views), len(starts), samples)
+        cost = torch.zeros(len(starts), samples)
+        for depth, view in zip(depths, views, strict=True):
+            found, _, judged = view.depth(points)
+            depth.copy_(torch.where(judged, found, torch.inf).reshape(depth.shape))
+            # Beyond what is a contradiction it does not matter how far: views that are right outvote one that is not.
+            cost += (-depth).clamp(0, 2 * view.far) - 1e-3 * depth.clamp(0, 1)
+        choice = cost.argmin(dim=1)
+        best = depths[:, every, choice].T
+        middle, half = t[every, choice], half * 2 / (samples - 1)
+    return best
+
+
+def contradicting(dataset: Dataset) -> list[int]:
+    """Training views whose masks cannot be of the object that the others show, worst first.
+
+    Each pixel of the object has a point on its line of sight that is in all silhouettes, if masks and poses are right.
+    A view that by itself excludes much of what the others show is wrong, and so is one much of which the others
+    exclude. At most a quarter of the views are named, none where there are fewer than six.
+
+    Args:
+        dataset: photos with alpha around an object, in any frame.
+
+    Returns:
+        Their indices; none where a mask is empty, which `bounding_sphere` refuses.
+    """
+    left, wrong = list(dataset.train), []
+    center = axes_meeting_point(dataset.viewmats[left].float())
+    silhouettes = {index: Silhouette(dataset, index) for index in left} if len(left) >= _FEWEST else {}
+    if center is None or not all(view.inside.any() for view in silhouettes.values()):
+        return []
+    while len(left) >= max(_FEWEST, _KEPT * len(dataset.train) + 1):
+        views = [silhouettes[index] for index in left]
+        guilt = _guilt(views, Evidence.of(views, center.float(), _reach(views, center.float())))
+        if float(guilt.max()) < 1:
+            break
+        wrong.append(left.pop(int(guilt.argmax())))
+    return wrong
+
+
+def _guilt(views: Sequence[Silhouette], evidence: Evidence) -> Float[Tensor, " N"]:
+    """From 1 on a view is to be left out."""
+    N = len(views)
+    excluded = evidence.excluded
+    blame = excluded / excluded.sum(dim=1, keepdim=True).clamp_min(1)
+    excludes = blame.sum(dim=0) / len(blame)
+    lost = excluded.any(dim=1).float()
+    exceeds = torch.zeros(N).index_add(0, evidence.view, lost) / torch.bincount(evidence.view, minlength=N)
+    guilt = torch.stack([excludes / _EXCLUDES, exceeds / _EXCEEDS])
+    alone = torch.stack([x > _ALONE * x.median() for x in (excludes, exceeds)])
+    return torch.where(alone, guilt, 0.0).amax(dim=0)
+
+
+def _reach(views: Sequence[Silhouette], center: Tensor) -> float:
+    """Radius of a ball about the point that holds the object, by what most views show."""
+    radii = []
+    for view in views:
+        start, along = view.rays(64)
+        nearest = (along @ (center - start)).clamp_min(0)
+        radii.append((start + nearest[:, None] * along - center).norm(dim=1).max())
+    return 1.2 * float(torch.stack(radii).median())

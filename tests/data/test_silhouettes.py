@@ -1,0 +1,108 @@
+"""Masks of a ring and a ball beside it, some of them spoilt."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from scipy.ndimage import distance_transform_edt, gaussian_filter
+
+from etsplat.data.dataset import Dataset
+from etsplat.data.photograph import photograph
+from etsplat.data.pictures import StoredPictures
+from etsplat.data.silhouettes import Evidence, Silhouette, contradicting, silhouette
+from etsplat.data.visual_hull import visual_hull
+from etsplat.geometry.icosphere import icosphere
+from etsplat.geometry.parts import genera
+from etsplat.io.mesh_files import MeshFile
+
+Mask = np.ndarray
+
+
+@pytest.fixture(scope="module")
+def views() -> Dataset:
+    """In the unit ball around the origin."""
+    ring = trimesh.creation.torus(0.5, 0.05, major_sections=48, minor_sections=24)
+    v, f = icosphere(3)
+    w = torch.from_numpy(ring.vertices.copy()).float()
+    vertices = torch.cat([w, 0.15 * v + torch.tensor([0.0, 0.0, 0.6])])
+    faces = torch.cat([torch.from_numpy(ring.faces.copy()).long(), f + len(w)])
+    return photograph(MeshFile(vertices, faces), 160, 160, supersampling=2)
+
+
+def spoilt(views: Dataset, change: Callable[[Mask], Mask], which: list[int]) -> Dataset:
+    images = [image.clone() for image in views.images]
+    for index in which:
+        images[index][..., 3] = torch.from_numpy(change(silhouette(images[index]))).float()
+    return replace(views, images=StoredPictures(images))
+
+
+def without_lower_half(mask: Mask) -> Mask:
+    rows = np.flatnonzero(mask.any(axis=1))
+    return mask & (np.arange(len(mask)) < (rows[0] + rows[-1]) // 2)[:, None]
+
+
+def elsewhere(mask: Mask) -> Mask:
+    return np.roll(mask, 15, axis=1)
+
+
+def with_a_blob(mask: Mask) -> Mask:
+    blob = np.zeros_like(mask)
+    blob[10:60, 10:60] = True
+    return mask | blob
+
+
+def rough(mask: Mask) -> Mask:
+    """The outline wanders by two pixels or so, otherwise in every view."""
+    noise = gaussian_filter(np.random.default_rng(int(mask.sum())).standard_normal(mask.shape), 4)
+    distance = np.asarray(distance_transform_edt(mask)) - np.asarray(distance_transform_edt(~mask))
+    return distance + 1.5 * noise / noise.std() > 0
+
+
+def evidence(views: Dataset) -> Evidence:
+    return Evidence.of([Silhouette(views, index) for index in views.train], torch.zeros(3), 1.0)
+
+
+def test_masks_of_one_object_explain_each_other(views: Dataset) -> None:
+    found = evidence(views)
+    assert contradicting(views) == []
+    assert found.rough() == 0
+    assert not found.excluded.any()
+    assert float(found.depth.min()) > -1
+
+
+@pytest.mark.parametrize("change", [without_lower_half, elsewhere, with_a_blob])
+def test_a_mask_of_something_else_is_named(views: Dataset, change: Callable[[Mask], Mask]) -> None:
+    wrong = views.train[7]
+    assert contradicting(spoilt(views, change, [wrong])) == [wrong]
+
+
+def test_it_is_named_in_any_units_and_among_others(views: Dataset) -> None:
+    wrong = views.train[3::9]
+    far = spoilt(views, without_lower_half, wrong).renormalized(
+        torch.tensor([40.0, -7.0, 3.0], dtype=torch.float64), 0.01
+    )
+    assert sorted(contradicting(far)) == wrong
+
+
+def test_a_quarter_is_named_at_most(views: Dataset) -> None:
+    some = replace(views, train=views.train[:12])
+    assert len(contradicting(spoilt(some, elsewhere, some.train[::3]))) == 3
+
+
+def test_few_views_and_empty_masks_name_nobody(views: Dataset) -> None:
+    wrong = views.train[2]
+    few = replace(spoilt(views, without_lower_half, [wrong]), train=views.train[:5])
+    assert contradicting(few) == []
+    assert contradicting(spoilt(views, np.zeros_like, [wrong])) == []
+
+
+def test_rough_masks_keep_what_is_thin(views: Dataset) -> None:
+    """Each mask loses a bit of the ring, and they lose other bits: the hull keeps it, with its hole."""
+    every = spoilt(views, rough, views.train)
+    assert contradicting(every) == []
+    assert 1 < evidence(every).rough() < 6
+    vertices, faces = visual_hull(every, 6000)
+    assert genera(faces, len(vertices)) == [1, 0]
