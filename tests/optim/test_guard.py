@@ -46,13 +46,15 @@ class Spoil(SubdivideAndUntangle):
         return super().edit(iteration)
 
 
-def trainer(views: Dataset, *spoiled: int, guarded: bool = True, steps: int = 8, **options: Any) -> Trainer[Any]:
+def trainer(
+    views: Dataset, *spoiled: int, kind: type[Spoil] = Spoil, guarded: bool = True, steps: int = 8, **options: Any
+) -> Trainer[Any]:
     vertices, faces = icosphere(2)
     mesh = TriangleMesh.from_mesh(1.05 * vertices, faces, colors=0.5, opacity=0.9, sigma=0.5)
     objective = Objective(Photometric(), [EdgeLength(0.5), Laplacian(0.2)], scale=0.5)
     guard = Guard(steps=steps, until=LENGTH) if guarded else None
     schedule = Schedule({**mesh.RATES, "vertices": 1e-2})
-    return Trainer(mesh, views, objective, Spoil(*spoiled), schedule=schedule, guard=guard, **options)
+    return Trainer(mesh, views, objective, kind(*spoiled), schedule=schedule, guard=guard, **options)
 
 
 def final(run: Trainer[Any]) -> dict[str, torch.Tensor]:
@@ -92,17 +94,56 @@ def test_what_spoils_is_undone_as_if_it_had_never_been(views: Dataset, tmp_path:
     undone = [event for event in events if isinstance(event, UndoEvent)]
     assert [(event.iteration, event.judged) for event in undone] == [(20, min(20 + steps, 40)), (LENGTH, LENGTH)]
     assert all(event.loss_after > 1.02 * event.loss_before for event in undone)
-    assert "20: the edit of the triangles is left out" in str(undone[0])
+    assert "20: the edit of the triangles is undone" in str(undone[0])
     assert [event.iteration for event in events if isinstance(event, RefineEvent)] == [10, 40]
     assert_equal(plain, run)
     assert run.guard is not None
-    assert run.guard.left_out == [20, LENGTH]
+    assert run.guard.undone == [20, LENGTH]
     assert run.progress.iteration == LENGTH
     assert logged(tmp_path / "run") == logged(tmp_path / "plain")
     (first, last) = (line for line in RunDirectory(tmp_path / "run").read_history() if "undone" in line)
     assert (first["iteration"], last["iteration"]) == (20, LENGTH)
     assert first["undone"]["judged"] == undone[0].judged
     assert first["undone"]["loss_after"] == undone[0].loss_after
+
+
+class Milder(Spoil):
+    """Has a second way of making the edits that spoil: one that hardly moves the mesh."""
+
+    def attempts(self, iteration: int) -> int:
+        return 2
+
+    def edit(self, iteration: int) -> bool:
+        if iteration in self._spoiled and self.undone == 1:
+            with torch.no_grad():
+                self.model.vertices.mul_(1.0001)
+            return False
+        return super().edit(iteration)
+
+
+def test_what_spoils_is_tried_again_milder_and_resumes_there(views: Dataset, tmp_path: Path) -> None:
+    """The second attempt stays: as if the run had never had another; also if it is killed in that one's trial."""
+
+    class Mild(Milder):
+        undone = 1
+
+    whole, killed, resumed = (trainer(views, 20, kind=Milder) for _ in range(3))
+    mild = trainer(views, 20, kind=Mild, guarded=False)
+    whole.fit(LENGTH, log_every=5)
+    mild.fit(LENGTH, log_every=5)
+    assert whole.guard is not None
+    assert whole.guard.undone == [20]
+    assert_equal(mild, whole)
+
+    def kill(event: object) -> None:
+        if isinstance(event, CheckpointEvent) and event.iteration == 24 and killed.guard and killed.guard.undone:
+            raise RuntimeError("killed")
+
+    folder = RunDirectory.create(tmp_path / "run", {"task": "train"})
+    with pytest.raises(RuntimeError, match="killed"):
+        killed.fit(LENGTH, callbacks=[kill], log_every=5, checkpoint_every=3, run=folder)
+    resumed.fit(LENGTH, log_every=5, checkpoint_every=3, run=folder)
+    assert_equal(whole, resumed)
 
 
 def test_an_undone_edit_between_logs_has_a_line_of_its_own(views: Dataset, tmp_path: Path) -> None:
@@ -129,7 +170,7 @@ def test_a_run_killed_around_a_trial_ends_with_the_same_bits(views: Dataset, tmp
     resumed.fit(LENGTH, log_every=5, checkpoint_every=3, run=run)
     assert_equal(whole, resumed)
     assert resumed.guard is not None
-    assert resumed.guard.left_out == [20]
+    assert resumed.guard.undone == [20]
     assert [line["iteration"] for line in run.read_history() if "undone" in line] == [20]
 
 

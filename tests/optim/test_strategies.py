@@ -10,6 +10,7 @@ from etsplat.geometry.intersections import count_self_intersections
 from etsplat.model.triangle_mesh import TriangleMesh
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.ops.adam import Adam
+from etsplat.optim import strategies
 from etsplat.optim.densification import PruneRules
 from etsplat.optim.loop import DivergedError
 from etsplat.optim.strategies import NEVER, DensifyAndPrune, Fixed, Strategy, SubdivideAndUntangle
@@ -72,6 +73,24 @@ def test_folds_are_smoothed_away_in_place() -> None:
     assert not strategy.edit(4)
     assert mesh.vertices is before
     assert count_self_intersections(mesh.vertices.detach(), mesh.faces) == 0
+
+
+def test_a_long_reach_is_tried_before_a_short_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Once it was undone; a short one has no other, nor has a subdivision."""
+    seen = []
+
+    def look(vertices: torch.Tensor, topology: object, *, reach: float) -> tuple[torch.Tensor, int]:
+        seen.append(reach)
+        return vertices, 0
+
+    monkeypatch.setattr(strategies, "untangle", look)
+    for reach, attempts in ((2.0, 2), (0.5, 1), (0.1, 1)):
+        strategy = SubdivideAndUntangle({3: 400}, [4], reach=reach)
+        started(strategy, a_mesh())
+        assert (strategy.attempts(4), strategy.attempts(3)) == (attempts, 1)
+        for strategy.undone in range(attempts):
+            strategy.edit(4)
+    assert seen == [2.0, 0.5, 0.5, 0.1]
 
 
 @pytest.mark.parametrize("number", [float("nan"), float("inf"), 1e30])

@@ -170,7 +170,7 @@ def test_an_untangling_that_was_undone_is_not_made_on_the_best_state(watched: Da
     run = trainer(watched, worse_from=31)
     measured(run)
     run.guard = Guard()
-    run.guard.left_out = [LENGTH]
+    run.guard.undone = [LENGTH]
     run.strategy.finish = lambda model: pytest.fail("untangled")  # type: ignore[method-assign]
     assert run.outcome().iteration < LENGTH
 

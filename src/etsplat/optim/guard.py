@@ -2,7 +2,8 @@
 
 The photometric loss, mean over training views at a small fixed size, is measured before an edit, and again some
 steps after it. If it is higher than before by more than a tolerance, everything goes back to where it was before the
-edit, and the run goes on from there without it: with the bits of a run that never had it.
+edit, and the run goes on from there with a milder one, if the strategy has one, or without: with the bits of a run
+that never had it.
 """
 
 from collections.abc import Mapping
@@ -35,11 +36,11 @@ class Held:
 
 
 class Guard:
-    """Holds the state before an edit until that is judged, and knows which edits are left out.
+    """Holds the state before an edit until that is judged, and knows which edits were undone.
 
     Attributes:
         held: the edit on trial, if there is one.
-        left_out: iterations whose edits were undone, ascending.
+        undone: iterations whose edits were undone, ascending; each as often as that happened.
     """
 
     def __init__(self, *, tolerance: float = 0.02, steps: int = 100, until: int = NEVER) -> None:
@@ -52,7 +53,7 @@ class Guard:
         """
         self._tolerance, self._steps, self._until = tolerance, steps, until
         self.held: Held | None = None
-        self.left_out: list[int] = []
+        self.undone: list[int] = []
 
     @property
     def due(self) -> int:
@@ -83,12 +84,12 @@ class Guard:
         assert held is not None
         if loss <= (1 + self._tolerance) * held.loss:
             return None
-        self.left_out = sorted({*self.left_out, held.iteration})
+        self.undone = sorted([*self.undone, held.iteration])
         return held
 
     def state(self) -> dict[str, Tensor]:
         """Everything that later judgements depend on, by name, for a checkpoint; empty if nothing was ever undone."""
-        state = {"left_out": torch.tensor(self.left_out)} if self.left_out else {}
+        state = {"undone": torch.tensor(self.undone)} if self.undone else {}
         if self.held is not None:
             held = self.held
             state |= {f"held.{name}": tensor for name, tensor in held.state.items()}
@@ -98,9 +99,9 @@ class Guard:
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
         """Continues where `state` was taken."""
-        self.left_out, self.held = [], None
-        if "left_out" in state:
-            self.left_out = state["left_out"].tolist()
+        self.undone, self.held = [], None
+        if "undone" in state:
+            self.undone = state["undone"].tolist()
         if "trial" in state:
             iteration, due, loss, loss_sum, loss_count = state["trial"].tolist()
             held = {name.removeprefix("held."): tensor for name, tensor in state.items() if name.startswith("held.")}

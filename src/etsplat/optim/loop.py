@@ -126,7 +126,7 @@ class UndoEvent:
     def __str__(self) -> str:
         rise = 100 * (self.loss_after / self.loss_before - 1) if self.loss_before else math.inf
         return (
-            f"iteration {self.iteration:,}: the edit of the triangles is left out: {self.judged - self.iteration} "
+            f"iteration {self.iteration:,}: the edit of the triangles is undone: {self.judged - self.iteration} "
             f"steps after it the loss of the training photos was {rise:.1f} % higher than before"
         )
 

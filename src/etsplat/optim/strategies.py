@@ -20,8 +20,8 @@ from etsplat.optim.loop import DivergedError
 from etsplat.optim.schedules import NEVER
 from etsplat.optim.terms.soup import Spared
 
-_REACH = 0.5
-"""Folds in which a vertex would have to move farther stay (`geometry.untangle`): they hold up the shape."""
+_SHORT = 0.5
+"""Folds in which a vertex would have to move farther than this stay where a longer reach spoilt the pictures."""
 
 
 class Strategy:
@@ -33,9 +33,11 @@ class Strategy:
         adam: its optimizer.
         views: number of training views.
         generator: of every random choice.
+        undone: how many attempts at the edit that is to be made were undone, because the pictures got worse.
     """
 
     outputs: tuple[str, ...] = ()
+    undone: int = 0
     model: Any
     adam: Adam
     views: int
@@ -48,6 +50,10 @@ class Strategy:
     def next_edit(self, iteration: int) -> int:
         """The first iteration, from this one on, after whose step `edit` may have something to do."""
         return NEVER
+
+    def attempts(self, iteration: int) -> int:
+        """How many ways there are of making the edit of an iteration, the milder ones later."""
+        return 1
 
     def edit(self, iteration: int) -> bool:
         """Edits the model if it is time to. Returns whether tensors were replaced."""
@@ -77,18 +83,27 @@ class Fixed(Strategy):
 class SubdivideAndUntangle(Strategy):
     """Divides a mesh's largest faces at given times (paper, appendix Adaptive Refinement), and undoes folds."""
 
-    def __init__(self, budgets: Mapping[int, int], untangle_after: Collection[int] = ()) -> None:
+    def __init__(
+        self, budgets: Mapping[int, int], untangle_after: Collection[int] = (), *, reach: float = _SHORT
+    ) -> None:
         """Takes the times.
 
         Args:
             budgets: by iteration, how many faces there may be after it (`optim.schedules.face_budgets`).
             untangle_after: iterations after which faces that cut through others are put right.
+            reach: folds in which a vertex would have to move farther stay (`geometry.untangle`). If it is more than a
+                half, and that spoils the pictures, a half is tried.
         """
         self._budgets, self._untangle_after = dict(budgets), set(untangle_after)
+        self._reaches = (reach, _SHORT) if reach > _SHORT else (reach,)
 
     def next_edit(self, iteration: int) -> int:
         """The next of the given times."""
         return min((i for i in (*self._budgets, *self._untangle_after) if i >= iteration), default=NEVER)
+
+    def attempts(self, iteration: int) -> int:
+        """Untangling has one for each reach."""
+        return len(self._reaches) if iteration in self._untangle_after else 1
 
     def edit(self, iteration: int) -> bool:
         """Untangles, then divides. Raises DivergedError where faces have no finite area."""
@@ -109,9 +124,9 @@ class SubdivideAndUntangle(Strategy):
     def finish(self, model: TriangleMesh) -> None:
         """Untangles it, where folds need not move far, if any untangling was asked for."""
         if self._untangle_after:
-            topology = model.topology.to(torch.device("cpu"))
+            topology, reach = model.topology.to(torch.device("cpu")), self._reaches[self.undone]
             with torch.no_grad():
-                model.vertices.copy_(untangle(model.vertices.cpu(), topology, reach=_REACH)[0])
+                model.vertices.copy_(untangle(model.vertices.cpu(), topology, reach=reach)[0])
 
 
 @dataclass

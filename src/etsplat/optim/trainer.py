@@ -179,9 +179,13 @@ class Trainer(Generic[M]):
         """Edits if it is time to; returns by how many triangles the model grew."""
         if iteration == self.exposure.measured_at:
             self._stepper.measure_exposure()
+        return self._edit(iteration)
+
+    def _edit(self, iteration: int) -> int:
         before = self.count
         if self.guard is not None and self.strategy.next_edit(iteration) == iteration:
-            if iteration in self.guard.left_out:
+            self.strategy.undone = self.guard.undone.count(iteration)
+            if self.strategy.undone == self.strategy.attempts(iteration):
                 return 0
             loss, following = self._loss(), self.strategy.next_edit(iteration + 1)
             self.guard.hold(self.progress, following, loss, self._state())
@@ -192,7 +196,7 @@ class Trainer(Generic[M]):
         return self.count - before
 
     def review(self, progress: Progress) -> UndoEvent | None:
-        """Judges the last edit if it is time to; if it is undone, everything is as it was before."""
+        """Judges the last edit if it is time to; if it is undone, everything is as it was, and a milder one is made."""
         if self.guard is None or progress.iteration < self.guard.due:
             return None
         loss = self._loss()
@@ -202,7 +206,8 @@ class Trainer(Generic[M]):
         undone = UndoEvent(held.iteration, progress.iteration, held.loss, loss)
         self._load(held.state, held.iteration)
         progress.iteration, (progress.loss_sum, progress.loss_count) = held.iteration, held.losses
-        return undone
+        self._edit(held.iteration)
+        return self.review(progress) or undone
 
     def edited(self) -> None:
         """To be called when tensors of the model were replaced."""
@@ -223,7 +228,8 @@ class Trainer(Generic[M]):
             return Outcome(self.model, last)
 
         def finish(model: M) -> None:
-            if self.guard is None or last not in self.guard.left_out:
+            self.strategy.undone = 0 if self.guard is None else self.guard.undone.count(last)
+            if self.strategy.undone < self.strategy.attempts(last):
                 self.strategy.finish(model)
 
         return self._watch.outcome(self.model, last, finish)

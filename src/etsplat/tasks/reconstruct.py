@@ -133,7 +133,7 @@ def reconstruct(
             for suffix in (".ply", ".obj", ".glb"):
                 mesh.save(job.run.mesh_path(suffix), frame)
             sizes = {"faces": len(mesh.faces), "vertices": len(mesh.vertices)}
-            sizes["edits_undone"] = len(trainer.guard.left_out) if trainer.guard else 0
+            sizes["edits_undone"] = len(trainer.guard.undone) if trainer.guard else 0
             exposed = job.exposed(trainer.exposure, views.names)
             found = {**scorer.full(mesh, job.run.test), **sizes, **outcome.metrics, **exposed}
             judgement = judging(mesh, found)
@@ -207,7 +207,7 @@ def make_trainer(
         mesh,
         views,
         Objective(Photometric(), terms, scale=gamma),
-        SubdivideAndUntangle(budgets, untanglings),
+        SubdivideAndUntangle(budgets, untanglings, reach=refinement.reach),
         schedule=_schedule(config),
         batch=config.batch,
         exposure=Exposure.of(config.exposure, length, len(views.train) / config.batch),

@@ -19,6 +19,7 @@ _SPHERE = Only("with start.shape sphere or auto", lambda config: config.start.sh
 _LARGE = Only("with vertex_update large-steps", lambda config: config.optimizer.vertex_update == "large-steps")
 _LEARNED = Only("where softness is learned", lambda config: config.soft and not config.optimizer.sigma_final)
 _EDGES = Only("with lambda_edge", lambda config: config.regularization.lambda_edge > 0)
+_UNTANGLED = Only("with untanglings", lambda config: config.refinement.untanglings > 0)
 _SUBDIVIDED = Only("with subdivisions", lambda config: config.refinement.subdivisions > 0)
 
 
@@ -63,6 +64,8 @@ class Start:
     """A hull is near the surface already: the rate of vertices is multiplied by this."""
     near_edge: Annotated[float, Range(0, 1), _HULL] = 0.02
     """And the weight of edges by this: pulled tight they fill hollows."""
+    near_reach: Annotated[float, Range(0), _HULL] = 2.0
+    """And this is how far untangling reaches: folds do not hold up a shape that has the right holes."""
     color: Annotated[float, Range(0, 1)] = 0.5
     """Grey of all faces at the start."""
     opacity: Annotated[float, Range(0.01, 0.999), _SOFT] = 0.98
@@ -125,6 +128,9 @@ class Refinement:
     """Number of subdivisions between these two; each adds the same fraction of faces, up to `max_faces`."""
     untanglings: Annotated[int, Range(0, 10_000)] = 6
     """How often faces that cut through others are pushed apart, from the last subdivision to the last step."""
+    reach: Annotated[float, Range(0), _UNTANGLED] = 0.5
+    """Folds stay in which a vertex would have to move farther than so many lengths of its edges.
+    They may hold up the shape. If it is more than a half, and that spoils the photos, a half is tried (`guard`)."""
     guard: Annotated[float, Range(0)] = 0.02
     """A subdivision or untangling is undone where 100 steps later training photos are explained worse;
     that is where their loss, at a small size, is higher by more than this part; 0 lets all of them stay."""

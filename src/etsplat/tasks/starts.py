@@ -110,4 +110,5 @@ def nearby(config: ReconstructConfig) -> ReconstructConfig:
         config,
         optimizer=replace(rates, lr_vertices=start.near * rates.lr_vertices),
         regularization=replace(weights, lambda_edge=start.near_edge * weights.lambda_edge),
+        refinement=replace(config.refinement, reach=start.near_reach),
     )
