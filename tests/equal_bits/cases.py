@@ -74,7 +74,11 @@ CASES = (
     Case("scene-paper-indoor", "demo scene", f"--preset paper --scene-type indoor {_SMALL}"),
     Case("scene-paper-object", "demo scene", f"--preset paper --scene-type object {_SMALL} --regularize-from 5000"),
     Case("scene-paper-sided", "demo scene", f"--preset paper --method single-sided {_SMALL} --lambda-distortion 0.1"),
-    Case("soup-quick", "train rgba", f"--preset quick --scene-type object {_SMALL} {_KEPT} --background random"),
+    Case(
+        "soup-quick",
+        "train rgba",
+        f"--preset quick --scene-type object {_SMALL} {_KEPT} --background random --lr-vertices 0.0004",
+    ),
     Case("soup-indoor", "train rgba", f"--preset quick --scene-type indoor {_SMALL}"),
     Case(
         "soup-masks", "train masked", f"{_SCENE} --prune-importance 0 --prune-opacity 0.001 --max-epochs 9", "interrupt"

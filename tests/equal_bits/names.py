@@ -48,8 +48,13 @@ OPTIONS: dict[str, dict[str, str]] = {
         "--lpips-weights": "--output.lpips-weights",
     },
     "train": {
-        # No photo was kept from training to watch runs by, and exposures were not looked at.
-        **{f"--preset {preset}": f"--preset {preset} --watch 0 --exposure off" for preset in ("quick", "demo", "tiny")},
+        # No photo was kept from training to watch runs by, and exposures were not looked at; the rate of positions and
+        # the number of triangles did not depend on the photos.
+        **{
+            f"--preset {preset}": f"--preset {preset} --watch 0 --exposure off --pixels-per-triangle None"
+            " --optimizer.lr-vertices-unit frame --optimizer.lr-vertices 0.0015"
+            for preset in ("quick", "demo", "tiny")
+        },
         "--near-plane": "--drawing.near-plane",
         "--cull-small": "--drawing.cull-small",
         "--no-cull-small": "--drawing.no-cull-small",

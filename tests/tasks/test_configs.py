@@ -84,7 +84,8 @@ def outside(setting: Setting) -> list[Any]:
 def test_presets_of_reconstruct_are_what_they_were(preset: str) -> None:
     """Every setting of then has a name now; what has come since has no effect unless it is asked for or needed."""
     config = flatten(ReconstructConfig.of(preset).to_dict())
-    since = {"start.hull_faces": 0.5, "start.near": 0.3, "start.near_edge": 0.02}
+    since = {"start.hull_faces": 0.5, "start.near": 0.3, "start.near_edge": 0.02, "start.near_reach": 2.0}
+    since["refinement.reach"] = 0.5
     since["start.shape"] = "sphere" if preset in ("paper", "study", "tiny") else "auto"
     since["watch"] = 0 if preset in ("paper", "study", "tiny") else None
     since["exposure"] = "off" if preset in ("paper", "study", "tiny") else "auto"
@@ -103,7 +104,10 @@ def test_presets_of_train_are_what_they_were(preset: str, scene: str) -> None:
     named = {before.TRAIN_NAMES[name]: expected[name] for name in expected}
     off = preset == "paper"
     since = {"batch": 1, "watch": 0 if off else None, "exposure": "off" if off else "auto"}
-    assert config == {"preset": preset, "scene_type": scene, **since, **named}
+    since |= {"optimizer.lr_vertices_unit": "frame" if off else "view", "pixels_per_triangle": None if off else 50.0}
+    if not off:  # 0.0015, and 0.0004 of objects, in the unit of the frame
+        since["optimizer.lr_vertices"] = 0.0006
+    assert config == {"preset": preset, "scene_type": scene, **named, **since}
 
 
 def test_defaults_are_those_of_the_command_line() -> None:

@@ -11,6 +11,7 @@ import torch
 from etsplat.core.errors import InputError
 from etsplat.data.dataset import Dataset
 from etsplat.data.demo_scene import demo_scene
+from etsplat.data.shown_width import shown_width
 from etsplat.io.run_directory import RunDirectory
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.optim.loop import CheckpointEvent, DivergedError, NoteEvent, RefineEvent, StepEvent
@@ -19,7 +20,7 @@ from etsplat.optim.strategies import DensifyAndPrune
 from etsplat.optim.trainer import Trainer
 from etsplat.tasks import train_checks
 from etsplat.tasks.train import TrainResult, start_trainer, train
-from etsplat.tasks.train_checks import predicted_bytes
+from etsplat.tasks.train_checks import check_train, predicted_bytes, triangle_limit
 from etsplat.tasks.train_config import TrainConfig
 
 TINY = TrainConfig.tiny().changed(
@@ -178,7 +179,7 @@ def test_too_many_triangles_for_the_memory_are_refused(
 ) -> None:
     """Memory is predicted before anything is written, and the message says what would fit."""
     monkeypatch.setattr(train_checks, "available_memory", lambda: 1 << 30)
-    config = replace(SHORT, max_triangles=10_000_000)
+    config = replace(SHORT, max_triangles=10_000_000, pixels_per_triangle=None)
     assert predicted_bytes(capture, config) > 10 << 30
     with pytest.raises(InputError, match=r"max_triangles.*set it to"):
         train(capture, tmp_path / "run", config)
@@ -219,10 +220,35 @@ def rates_of(config: TrainConfig, capture: Dataset, iteration: int) -> dict[str,
 def test_shorter_runs_move_vertices_faster(capture: Dataset) -> None:
     """By the root of how much shorter they are; the original's rate does not know the length of a run."""
     quick, paper = TrainConfig.quick(), TrainConfig.paper()
+    points = capture.points
+    assert points is not None
+    shown = shown_width(capture, points)
+    assert shown is not None
     for iterations, factor in ((6000, 1.0), (1500, 2.0)):
         first = rates_of(replace(quick, iterations=iterations), capture, 1)
-        assert first["vertices"] == pytest.approx(factor * quick.optimizer.lr_vertices)
+        assert first["vertices"] == pytest.approx(factor * shown * quick.optimizer.lr_vertices)
     assert rates_of(replace(paper, iterations=300), capture, 1)["vertices"] == paper.optimizer.lr_vertices
+
+
+def test_vertices_are_as_fast_on_screen_whatever_the_extent_of_the_cameras(capture: Dataset) -> None:
+    """In a frame ten times as large, they move ten times as far."""
+    center = torch.zeros(3, dtype=torch.float64)
+    first, second = (
+        rates_of(TrainConfig.quick(), views, 1)["vertices"] for views in (capture, capture.renormalized(center, 0.1))
+    )
+    assert second == pytest.approx(10 * first)
+
+
+def test_few_pixels_carry_few_triangles(capture: Dataset) -> None:
+    """One for so many of the training photos' pixels, and a note says so; the test photos do not count."""
+    pixels = sum(capture.images.sizes[index][0] * capture.images.sizes[index][1] for index in capture.train)
+    config = TrainConfig.quick()
+    assert pixels / 50 < config.max_triangles
+    assert triangle_limit(capture, config) == int(pixels / 50)
+    notes = check_train(capture, config, config.iterations, torch.device("cpu"))
+    assert any(f"few pixels: at most {int(pixels / 50):,} triangles, not 100,000" in note for note in notes)
+    assert triangle_limit(capture, replace(config, pixels_per_triangle=None)) == 100_000
+    assert triangle_limit(capture, replace(config, max_triangles=5)) == 5
 
 
 def test_rates_settle_towards_the_end(capture: Dataset) -> None:

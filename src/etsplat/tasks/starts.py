@@ -105,10 +105,10 @@ def plain_hull(views: Dataset, config: ReconstructConfig) -> tuple[Tensor, Tenso
 
 def nearby(config: ReconstructConfig) -> ReconstructConfig:
     """The settings for a start that is near the surface."""
-    start, rates, weights = config.start, config.optimizer, config.regularization
+    start, rates, weights, edits = config.start, config.optimizer, config.regularization, config.refinement
     return replace(
         config,
         optimizer=replace(rates, lr_vertices=start.near * rates.lr_vertices),
         regularization=replace(weights, lambda_edge=start.near_edge * weights.lambda_edge),
-        refinement=replace(config.refinement, reach=start.near_reach),
+        refinement=replace(edits, reach=start.near_reach) if edits.untanglings else edits,
     )

@@ -9,6 +9,7 @@ from pathlib import Path
 import torch
 
 from etsplat.data.dataset import Dataset
+from etsplat.data.shown_width import shown_width
 from etsplat.engines.choice import engine, engine_for
 from etsplat.model.soup_appearance import SoupAppearance
 from etsplat.model.soup_init import StartPoints, random_points, start_soup
@@ -26,7 +27,7 @@ from etsplat.optim.trainer import Trainer
 from etsplat.tasks.running import Job, Result, path_of, terms_of
 from etsplat.tasks.scoring import Scorer
 from etsplat.tasks.sources import load_scene
-from etsplat.tasks.train_checks import check_train, doubtful_scale
+from etsplat.tasks.train_checks import check_train, doubtful_scale, triangle_limit
 from etsplat.tasks.train_config import TrainConfig
 
 LARGE_SPAN = 300.0
@@ -191,8 +192,8 @@ def make_trainer(
         soup,
         capture,
         _objective(config, spared, squared=squared),
-        _strategy(config, spared),
-        schedule=_schedule(config),
+        _strategy(config, triangle_limit(capture, config), spared),
+        schedule=_schedule(config, _vertex_unit(soup, capture, config)),
         batch=config.batch,
         background=None if config.background == "random" else _background(config),
         exposure=Exposure.of(config.exposure, config.iterations, len(capture.train) / config.batch),
@@ -220,7 +221,7 @@ def _objective(config: TrainConfig, spared: Spared | None, *, squared: bool) -> 
     return Objective(photometric, terms, depth_of="centroid")
 
 
-def _strategy(config: TrainConfig, spared: Spared | None) -> DensifyAndPrune:
+def _strategy(config: TrainConfig, most: int, spared: Spared | None) -> DensifyAndPrune:
     times = {name: config.at(getattr(config.densification, name)) for name in ("begin", "end", "every")}
     rules = {**vars(config.pruning), "screen_size": config.pruning.screen_size or math.inf}
     if config.finish == "opaque":
@@ -228,18 +229,26 @@ def _strategy(config: TrainConfig, spared: Spared | None) -> DensifyAndPrune:
     return DensifyAndPrune(
         **{**vars(config.densification), **times},
         last=config.iterations,
-        max_triangles=config.max_triangles,
+        max_triangles=most,
         prune=PruneRules(**rules),
         spared=spared,
     )
 
 
-def _schedule(config: TrainConfig) -> Schedule:
+def _vertex_unit(soup: TriangleSoup, capture: Dataset, config: TrainConfig) -> float:
+    """What the rate of positions is a fraction of, in units of the frame."""
+    if config.optimizer.lr_vertices_unit == "frame":
+        return 1.0
+    points = soup.vertices.detach().mean(dim=1).cpu() if capture.points is None else capture.points
+    return shown_width(capture, points) or 1.0
+
+
+def _schedule(config: TrainConfig, unit: float) -> Schedule:
     length, given = config.iterations, config.optimizer
     faster = 1.0 if given.lr_vertices_length is None else math.sqrt(given.lr_vertices_length / length)
 
     def vertices(iteration: int) -> float:
-        return given.lr_vertices * exponential_decay(iteration, length, given.lr_vertices_final) * faster
+        return unit * given.lr_vertices * exponential_decay(iteration, length, given.lr_vertices_final) * faster
 
     def settling(rate: float) -> Scheduled:
         if given.lr_settle is None:

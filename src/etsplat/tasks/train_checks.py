@@ -37,6 +37,9 @@ def check_train(capture: Dataset, config: TrainConfig, iterations: int, device: 
     if iterations < config.iterations:
         limit = f"schedule.max_epochs {config.schedule.max_epochs}"
         notes.append(f"few photos: {iterations:,} iterations, not {config.iterations:,} ({limit})")
+    if (limit := triangle_limit(capture, config)) < config.max_triangles:
+        setting = f"pixels_per_triangle {config.pixels_per_triangle:g}"
+        notes.append(f"few pixels: at most {limit:,} triangles, not {config.max_triangles:,} ({setting})")
     if capture.images.streamed:
         notes.append("the photos do not fit into memory: they are decoded anew whenever they are needed")
     if capture.exact_points is None:
@@ -44,6 +47,14 @@ def check_train(capture: Dataset, config: TrainConfig, iterations: int, device: 
     if doubt := doubtful_scale(capture, config):
         notes.append(doubt)
     return notes
+
+
+def triangle_limit(capture: Dataset, config: TrainConfig) -> int:
+    """How many triangles there may be: `max_triangles`, or fewer where the training photos have few pixels."""
+    if config.pixels_per_triangle is None:
+        return config.max_triangles
+    pixels = sum(width * height for width, height in (capture.images.sizes[index] for index in capture.train))
+    return min(config.max_triangles, max(1, int(pixels / config.pixels_per_triangle)))
 
 
 def doubtful_scale(capture: Dataset, config: TrainConfig) -> str | None:
@@ -61,7 +72,7 @@ def predicted_bytes(capture: Dataset, config: TrainConfig, device: torch.device 
     """Memory of a device, None for the CPU, that a run may come to need, beyond the program itself."""
     pixels = max(width * height for width, height in capture.images.sizes)
     points = config.start.points if capture.exact_points is None else len(capture.exact_points)
-    triangles = max(config.max_triangles, points + (SPHERE_TRIANGLES if config.sky == "sphere" else 0))
+    triangles = max(triangle_limit(capture, config), points + (SPHERE_TRIANGLES if config.sky == "sphere" else 0))
     kept = not capture.images.streamed and (device is None or stay_on(device, capture.images.total_bytes))
     pictures = capture.images.total_bytes if kept else 0
     return triangles * BYTES_PER_TRIANGLE + pixels * BYTES_PER_PIXEL + pictures

@@ -67,8 +67,12 @@ class Schedule:
 class Optimizer:
     """How vertices, colours, opacities and softness move."""
 
-    lr_vertices: Annotated[float, Range(0)] = 0.0015
-    """Adam learning rate of positions, in units of the frame."""
+    lr_vertices: Annotated[float, Range(0)] = 0.0006
+    """Adam learning rate of positions."""
+    lr_vertices_unit: Literal["view", "frame"] = "view"
+    """What that is a fraction of.
+    view: the longer side of what photos show at the capture's points, as fast on screen in every capture;
+    frame: the unit of the frame, the extent of the cameras, as also where no photo shows a point."""
     lr_vertices_length: Annotated[int | None, Range(1)] = 6000
     """Length of the runs that this rate is for: it grows with the root of how many times shorter another run is.
     None for the same rate whatever the length."""
@@ -178,7 +182,10 @@ class TrainConfig(Settings):
     width: Annotated[int | None, Range(1, 16384)] = 800
     """Wider images are scaled down to this width; None shrinks those wider than 1600 pixels to 1600."""
     max_triangles: Annotated[int, Range(1, 10**8)] = 100_000
-    """Densification stops here."""
+    """Densification stops here, or earlier where photos are few or small."""
+    pixels_per_triangle: Annotated[float | None, Range(0.01), Rare] = 50.0
+    """Densification stops where there is a triangle for so many pixels of the training photos.
+    More learn the photos by heart, and other views fall apart; None for `max_triangles` whatever the photos."""
     normalize: Annotated[bool, Rare] = True
     """Train in the frame where the cameras are centred and the scene has extent 1. Results are in the scene's units."""
     background: Annotated[Literal["black", "white", "random"], Rare] = "black"
@@ -252,7 +259,7 @@ class TrainConfig(Settings):
     def implied_by(cls, *labels: str) -> Mapping[str, Any]:
         """What the preset and the kind of scene set."""
         preset, scene = labels
-        own = _PAPER_SCENES if preset == "paper" else _QUICK_SCENES
+        own = _PAPER_SCENES if preset == "paper" else {}
         return {**_PRESETS.get(preset, {}), **_SCENES.get(scene, {}), **own.get(scene, {})}
 
     def contradiction(self) -> str | None:
@@ -277,6 +284,7 @@ _PAPER: dict[str, Any] = {
     "start.limit": None,
     "schedule.max_epochs": None,
     "optimizer.lr_vertices": 0.0018,
+    "optimizer.lr_vertices_unit": "frame",
     "optimizer.lr_vertices_length": None,
     "optimizer.lr_sh_dc": 0.0025,
     "optimizer.lr_sh_rest": 0.000125,
@@ -285,6 +293,7 @@ _PAPER: dict[str, Any] = {
     "optimizer.lr_settle": None,
     "loss.lambda_size": 1e-8,
     "loss.lambda_depth_normal": 1e-4,
+    "pixels_per_triangle": None,
     "pruning.views": 2,
     "output.evaluate_every": 1000,
     "output.checkpoint_every": 1000,
@@ -332,6 +341,3 @@ _PAPER_SCENES: dict[str, dict[str, Any]] = {
     },
 }
 """What else they set, which is for preset "paper" alone."""
-
-_QUICK_SCENES: dict[str, dict[str, Any]] = {"object": {"optimizer.lr_vertices": 0.0004}}
-"""An object is small in the frame that its cameras span: at the rate of rooms its triangles come to rest late."""
