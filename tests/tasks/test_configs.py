@@ -104,7 +104,7 @@ def test_presets_of_train_are_what_they_were(preset: str, scene: str) -> None:
     named = {before.TRAIN_NAMES[name]: expected[name] for name in expected}
     off = preset == "paper"
     since = {"batch": 1, "watch": 0 if off else None, "exposure": "off" if off else "auto"}
-    since |= {"optimizer.lr_vertices_unit": "frame" if off else "view", "pixels_per_triangle": None if off else 50.0}
+    since |= {"optimizer.lr_vertices_unit": "frame" if off else "view", "pixels_per_triangle": None if off else 75.0}
     if not off:  # 0.0015, and 0.0004 of objects, in the unit of the frame
         since["optimizer.lr_vertices"] = 0.0006
     assert config == {"preset": preset, "scene_type": scene, **named, **since}

@@ -183,7 +183,7 @@ class TrainConfig(Settings):
     """Wider images are scaled down to this width; None shrinks those wider than 1600 pixels to 1600."""
     max_triangles: Annotated[int, Range(1, 10**8)] = 100_000
     """Densification stops here, or earlier where photos are few or small."""
-    pixels_per_triangle: Annotated[float | None, Range(0.01), Rare] = 50.0
+    pixels_per_triangle: Annotated[float | None, Range(0.01), Rare] = 75.0
     """Densification stops where there is a triangle for so many pixels of the training photos.
     More learn the photos by heart, and other views fall apart; None for `max_triangles` whatever the photos."""
     normalize: Annotated[bool, Rare] = True
