@@ -126,6 +126,7 @@ soak: setup
 RACES ?= 60
 races:
 	tests/native/run.sh races $(RACES)
+	tests/native/run.sh forks $(RACES)
 
 # The NEON path under an emulator, where there is no ARM machine (Debian: g++-aarch64-linux-gnu qemu-user).
 check-neon:

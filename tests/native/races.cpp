@@ -1,13 +1,18 @@
-// The pool of threads, the pool of memory and the tile loops under ThreadSanitizer: tests/native/run.sh races [SECONDS].
+// The pool of threads, the pool of memory and the tile loops: tests/native/run.sh races [SECONDS], with ThreadSanitizer,
+// and tests/native/run.sh forks [SECONDS] without.
 //
 // Threads draw side by side, take and give back memory, and change how many threads there are; the process forks
 // meanwhile, and its children draw. Every picture and gradient has the bits of the first, which one thread drew alone.
 // A race ends the program with status 66, a child that hangs or fails with 1. A second argument plants a race.
+//
+// ThreadSanitizer's own allocator is locked in a child of fork() if another thread was in it (seen with GCC 12, in one or
+// two of a hundred children): there, one child in ten may hang. Without it none may.
 #include <sys/wait.h>
 #include <unistd.h>
 
 #include <atomic>
 #include <chrono>
+#include <csignal>
 #include <cstdio>
 #include <cstdlib>
 #include <cstring>
@@ -26,7 +31,12 @@ using namespace etsplat::scene;
 namespace {
 
 constexpr int kDrawing = 3;         // threads that draw
-constexpr unsigned kPatience = 60;  // seconds that a child may take
+constexpr unsigned kPatience = 30;  // seconds that a child may take
+#if defined(__SANITIZE_THREAD__)
+constexpr int kHangOneIn = 10;
+#else
+constexpr int kHangOneIn = 0;  // none
+#endif
 constexpr int kKernel = 2;          // any of them
 
 bool same(const std::vector<float>& a, const std::vector<float>& b) {
@@ -82,8 +92,10 @@ bool exceptions_come_out() {
     return false;
 }
 
+enum class Child { drew, hung, failed };
+
 // Whether a child of this process, as it is now, can do all of it.
-bool a_child_draws(const Expected& expected) {
+Child a_child_draws(const Expected& expected) {
     const pid_t child = fork();
     if (child == 0) {
         alarm(kPatience);
@@ -93,7 +105,8 @@ bool a_child_draws(const Expected& expected) {
     int status = 0;
     waitpid(child, &status, 0);
     if (WIFSIGNALED(status)) std::printf("a child got signal %d\n", WTERMSIG(status));
-    return WIFEXITED(status) && WEXITSTATUS(status) == 0;
+    if (WIFSIGNALED(status) && WTERMSIG(status) == SIGALRM) return Child::hung;
+    return WIFEXITED(status) && WEXITSTATUS(status) == 0 ? Child::drew : Child::failed;
 }
 
 }  // namespace
@@ -122,15 +135,17 @@ int main(int argc, char** argv) {
             std::this_thread::sleep_for(std::chrono::milliseconds(20));
         }
     });
-    int forked = 0;
-    while (std::chrono::steady_clock::now() < until && !wrong) {
+    int forked = 0, hung = 0;
+    while ((std::chrono::steady_clock::now() < until || forked == hung) && !wrong) {
         std::this_thread::sleep_for(std::chrono::milliseconds(10 * (forked % 4)));
-        if (!a_child_draws(expected)) wrong = true;
+        const Child child = a_child_draws(expected);
         ++forked;
+        if (child == Child::hung) ++hung;
+        if (child == Child::failed || hung * kHangOneIn > forked + kHangOneIn || (hung > 0 && kHangOneIn == 0)) wrong = true;
     }
     stop = true;
     for (std::thread& thread : threads) thread.join();
-    std::printf("%d times drawn, %d times another number of threads, %d children%s\n", drawn.load(), resized.load(), forked,
-                wrong ? ": WRONG" : "");
+    std::printf("%d times drawn, %d times another number of threads, %d children, %d of them hung%s\n", drawn.load(),
+                resized.load(), forked, hung, wrong ? ": WRONG" : "");
     return wrong || drawn == 0 || resized == 0 || forked == 0 ? 1 : 0;
 }

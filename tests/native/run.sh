@@ -4,6 +4,7 @@
 #   run.sh                  simd_paths.cpp for this processor
 #   run.sh neon             the same for AArch64 by a cross compiler, under QEMU (Debian: g++-aarch64-linux-gnu qemu-user)
 #   run.sh races [SECONDS]  races.cpp under ThreadSanitizer; a planted race must be found first
+#   run.sh forks [SECONDS]  races.cpp without, where no child may hang
 set -euo pipefail
 cd "$(dirname "$0")/../.."
 
@@ -18,6 +19,11 @@ case $target in
         machine=aarch64
         flags+=(-static)
         [ "$(uname -m)" = aarch64 ] || runner=("${QEMU:-qemu-aarch64}")
+        ;;
+    forks)
+        program=races
+        machine=plain
+        flags+=(-O0 -g)
         ;;
     races)
         program=races
