@@ -31,7 +31,7 @@ using namespace etsplat::scene;
 namespace {
 
 constexpr int kDrawing = 3;         // threads that draw
-constexpr unsigned kPatience = 30;  // seconds that a child may take
+constexpr unsigned kPatience = 60;  // seconds that a child may take
 #if defined(__SANITIZE_THREAD__)
 constexpr int kHangOneIn = 10;
 #else

@@ -1,5 +1,6 @@
 """Edits that spoil what training has reached are undone, to the bit, and the others stay."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from etsplat.optim.strategies import SubdivideAndUntangle
 from etsplat.optim.terms.mesh import EdgeLength, Laplacian
 from etsplat.optim.terms.photometric import Photometric
 from etsplat.optim.trainer import Trainer
+from helpers.reconstructions import KilledError
 
 LENGTH = 60
 
@@ -72,6 +74,26 @@ def logged(folder: Path) -> list[dict[str, Any]]:
     """The history without its clock and what was undone."""
     lines = RunDirectory(folder).read_history()
     return [{key: value for key, value in line.items() if key not in ("seconds", "undone")} for line in lines]
+
+
+def killed_and_resumed(
+    views: Dataset, run: RunDirectory, dies: Callable[[bool, int], bool], **options: Any
+) -> Trainer[Any]:
+    """A run that spoils the mesh at 20, killed at a checkpoint and gone on with.
+
+    `dies` is asked whether something was undone, and for the iteration.
+    """
+    killed, resumed = (trainer(views, 20, **options) for _ in range(2))
+
+    def kill(event: object) -> None:
+        assert killed.guard is not None
+        if isinstance(event, CheckpointEvent) and dies(bool(killed.guard.undone), event.iteration):
+            raise KilledError
+
+    with pytest.raises(KilledError):
+        killed.fit(LENGTH, callbacks=[kill], log_every=5, checkpoint_every=3, run=run)
+    resumed.fit(LENGTH, log_every=5, checkpoint_every=3, run=run)
+    return resumed
 
 
 def test_a_run_in_which_nothing_is_undone_keeps_its_bits(views: Dataset) -> None:
@@ -127,23 +149,17 @@ def test_what_spoils_is_tried_again_milder_and_resumes_there(views: Dataset, tmp
     class Mild(Milder):
         undone = 1
 
-    whole, killed, resumed = (trainer(views, 20, kind=Milder) for _ in range(3))
-    mild = trainer(views, 20, kind=Mild, guarded=False)
+    whole, mild = trainer(views, 20, kind=Milder), trainer(views, 20, kind=Mild, guarded=False)
     whole.fit(LENGTH, log_every=5)
     mild.fit(LENGTH, log_every=5)
     assert whole.guard is not None
     assert whole.guard.undone == [20]
     assert_equal(mild, whole)
 
-    def kill(event: object) -> None:
-        if isinstance(event, CheckpointEvent) and event.iteration == 24 and killed.guard and killed.guard.undone:
-            raise RuntimeError("killed")
-
-    folder = RunDirectory.create(tmp_path / "run", {"task": "train"})
-    with pytest.raises(RuntimeError, match="killed"):
-        killed.fit(LENGTH, callbacks=[kill], log_every=5, checkpoint_every=3, run=folder)
-    resumed.fit(LENGTH, log_every=5, checkpoint_every=3, run=folder)
-    assert_equal(whole, resumed)
+    run = RunDirectory.create(tmp_path / "run", {"task": "train"})
+    assert_equal(
+        whole, killed_and_resumed(views, run, lambda undone, iteration: undone and iteration == 24, kind=Milder)
+    )
 
 
 def test_an_undone_edit_between_logs_has_a_line_of_its_own(views: Dataset, tmp_path: Path) -> None:
@@ -157,17 +173,9 @@ def test_an_undone_edit_between_logs_has_a_line_of_its_own(views: Dataset, tmp_p
 @pytest.mark.parametrize("killed_at", [12, 21, 24, 27, 29, 42])
 def test_a_run_killed_around_a_trial_ends_with_the_same_bits(views: Dataset, tmp_path: Path, killed_at: int) -> None:
     """Killed at a checkpoint (every third iteration): before the trial, in it, after the way back."""
-    whole, killed, resumed = (trainer(views, 20) for _ in range(3))
+    whole, run = trainer(views, 20), RunDirectory.create(tmp_path / "run", {"task": "train"})
     whole.fit(LENGTH, log_every=5)
-
-    def kill(event: object) -> None:
-        if isinstance(event, CheckpointEvent) and event.iteration >= killed_at:
-            raise RuntimeError("killed")
-
-    run = RunDirectory.create(tmp_path / "run", {"task": "train"})
-    with pytest.raises(RuntimeError, match="killed"):
-        killed.fit(LENGTH, callbacks=[kill], log_every=5, checkpoint_every=3, run=run)
-    resumed.fit(LENGTH, log_every=5, checkpoint_every=3, run=run)
+    resumed = killed_and_resumed(views, run, lambda undone, iteration: iteration >= killed_at)
     assert_equal(whole, resumed)
     assert resumed.guard is not None
     assert resumed.guard.undone == [20]

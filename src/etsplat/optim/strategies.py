@@ -122,7 +122,7 @@ class SubdivideAndUntangle(Strategy):
         return True
 
     def finish(self, model: TriangleMesh) -> None:
-        """Untangles it, where folds need not move far, if any untangling was asked for."""
+        """Untangles it as far as the reach of this attempt goes, if any untangling was asked for."""
         if self._untangle_after:
             topology, reach = model.topology.to(torch.device("cpu")), self._reaches[self.undone]
             with torch.no_grad():

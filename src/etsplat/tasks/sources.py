@@ -81,9 +81,8 @@ def _agreeing(scene: Dataset) -> tuple[Dataset, list[str]]:
     if not wrong:
         return scene, []
     names = ", ".join(scene.names[index] for index in sorted(wrong))
-    note = (
-        f"left out, since {'its mask contradicts' if len(wrong) == 1 else 'their masks contradict'} the others: {names}"
-    )
+    contradict = "its mask contradicts" if len(wrong) == 1 else "their masks contradict"
+    note = f"left out, since {contradict} the others: {names}"
     return replace(scene, train=[index for index in scene.train if index not in wrong]), [note]
 
 
