@@ -1,26 +1,20 @@
-// Shading and silhouette antialiasing of a z-buffer image, with gradients.
+// Silhouette antialiasing of a shaded z-buffer image, with gradients.
 #pragma once
 
 #include <cstdint>
 #include <memory>
 #include <vector>
 
-#include "math/triangle.h"
-#include "rasterize_opaque.h"
+#include "shading.h"
 
 namespace etsplat {
 
 // One view. Images are (height, width, ...).
 struct AntialiasInput {
-    OpaqueMesh mesh;
-    OpaqueCamera camera;
+    ShadeInput shading;
     const int32_t* pair_offsets;  // (num_faces + 1): where the partners of each face start in `paired_faces`
     const int32_t* paired_faces;  // faces that share an edge
-    const int32_t* triangle;      // what `rasterize_opaque` found
-    const float* barycentrics;
     const float* depth;
-    OpaqueColors colors;
-    const float* background;  // (channels)
 };
 
 // A pixel gets weight * (colour of `from` - its own).
@@ -39,27 +33,11 @@ struct AntialiasState {
 };
 
 struct AntialiasGradients {
-    const float* color;  // (height, width, channels) cotangent of the image
+    const float* color;   // (height, width, channels) cotangent of the image
     const float* shaded;  // as the forward pass left it
-    float* grad_shaded;  // (height, width, channels) scratch
-    float* vertices;     // (num_vertices, 3), added to; or null
-    float* colors;       // as the colours, added to; or null
-    float* background;   // (channels), added to; or null
+    float* grad_shaded;   // (height, width, channels) scratch
+    ShadeGradients into;
 };
-
-inline PinholeCamera pinhole(const OpaqueCamera& camera) {
-    PinholeCamera p;
-    for (int r = 0; r < 3; ++r) {
-        for (int c = 0; c < 3; ++c) p.rotation[3 * r + c] = camera.viewmat[4 * r + c];
-        p.translation[r] = camera.viewmat[4 * r + 3];
-    }
-    p.fx = camera.K[0];
-    p.skew = camera.K[1];
-    p.cx = camera.K[2];
-    p.fy = camera.K[4];
-    p.cy = camera.K[5];
-    return p;
-}
 
 // Fills `shaded` (before antialiasing) and `color` (after).
 std::shared_ptr<AntialiasState> antialias_forward(const AntialiasInput& input, float* shaded, float* color);

@@ -16,7 +16,7 @@ struct Point {
     bool drawn;
 };
 
-std::vector<Point> project_vertices(const AntialiasInput& in) {
+std::vector<Point> project_vertices(const ShadeInput& in) {
     const PinholeCamera camera = pinhole(in.camera);
     std::vector<Point> points(in.mesh.num_vertices);
     parallel_for(in.mesh.num_vertices, 4096, [&](int64_t begin, int64_t end) {
@@ -36,13 +36,14 @@ std::vector<Point> project_vertices(const AntialiasInput& in) {
 
 // Bit k of a face: its edge from corner k to k + 1 is a silhouette, that is, no face across it lies on the other side.
 std::vector<uint8_t> find_silhouettes(const AntialiasInput& in, const std::vector<Point>& points) {
-    std::vector<uint8_t> bits(in.mesh.num_faces);
-    parallel_for(in.mesh.num_faces, 2048, [&](int64_t begin, int64_t end) {
+    const OpaqueMesh& mesh = in.shading.mesh;
+    std::vector<uint8_t> bits(mesh.num_faces);
+    parallel_for(mesh.num_faces, 2048, [&](int64_t begin, int64_t end) {
         for (int64_t f = begin; f < end; ++f) {
-            const int32_t* own = in.mesh.faces + 3 * f;
+            const int32_t* own = mesh.faces + 3 * f;
             int found = 7;
             for (int32_t i = in.pair_offsets[f]; i < in.pair_offsets[f + 1]; ++i) {
-                const int32_t* other = in.mesh.faces + 3 * static_cast<int64_t>(in.paired_faces[i]);
+                const int32_t* other = mesh.faces + 3 * static_cast<int64_t>(in.paired_faces[i]);
                 if (!points[other[0]].drawn || !points[other[1]].drawn || !points[other[2]].drawn) continue;
                 for (int k = 0; k < 3; ++k) {
                     const int32_t a = own[k], b = own[(k + 1) % 3];
@@ -65,14 +66,14 @@ std::vector<uint8_t> find_silhouettes(const AntialiasInput& in, const std::vecto
 class PairSearch {
 public:
     PairSearch(const AntialiasInput& in, const std::vector<Point>& points, const std::vector<uint8_t>& silhouettes)
-        : in_(in), points_(points), silhouettes_(silhouettes) {}
+        : in_(in.shading), depth_(in.depth), points_(points), silhouettes_(silhouettes) {}
 
     // The pair is the pixel (x, y) and its neighbour at the right (axis 0) or below (axis 1).
     void visit(int32_t x, int32_t y, int axis, std::vector<Blend>& blends) const {
         const int32_t first = y * in_.camera.width + x, second = axis == 0 ? first + 1 : first + in_.camera.width;
         const int32_t face[2] = {in_.triangle[first], in_.triangle[second]};
         if (face[0] == face[1]) return;
-        const bool forward = face[1] < 0 || (face[0] >= 0 && in_.depth[first] <= in_.depth[second]);
+        const bool forward = face[1] < 0 || (face[0] >= 0 && depth_[first] <= depth_[second]);
         const int32_t nearer = face[forward ? 0 : 1];
         const int silhouettes = silhouettes_[nearer];
         if (silhouettes == 0) return;
@@ -102,7 +103,8 @@ private:
         return true;
     }
 
-    const AntialiasInput& in_;
+    const ShadeInput& in_;
+    const float* depth_;
     const std::vector<Point>& points_;
     const std::vector<uint8_t>& silhouettes_;
 };
@@ -110,10 +112,10 @@ private:
 }  // namespace
 
 std::vector<Blend> find_blends(const AntialiasInput& in) {
-    const std::vector<Point> points = project_vertices(in);
+    const std::vector<Point> points = project_vertices(in.shading);
     const std::vector<uint8_t> silhouettes = find_silhouettes(in, points);
     const PairSearch search(in, points, silhouettes);
-    const int32_t width = in.camera.width, height = in.camera.height, bands = (height + kRows - 1) / kRows;
+    const int32_t width = in.shading.camera.width, height = in.shading.camera.height, bands = (height + kRows - 1) / kRows;
     std::vector<std::vector<Blend>> lists(bands);
     parallel_for(bands, 1, [&](int64_t begin, int64_t end) {
         for (int64_t band = begin; band < end; ++band) {

@@ -22,6 +22,7 @@ void bind_rasterize_opaque(nb::module_& m);
 void bind_soup_activation(nb::module_& m);
 void bind_soup_colors(nb::module_& m);
 void bind_spherical_harmonics(nb::module_& m);
+void bind_texture(nb::module_& m);
 void bind_triangle_area(nb::module_& m);
 void bind_triangle_channels(nb::module_& m);
 
@@ -68,6 +69,7 @@ NB_MODULE(_native, m) {
     bind_soup_activation(m);
     bind_soup_colors(m);
     bind_spherical_harmonics(m);
+    bind_texture(m);
     bind_triangle_area(m);
     bind_triangle_channels(m);
 }

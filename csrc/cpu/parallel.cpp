@@ -137,7 +137,7 @@ private:
     std::atomic<uint32_t> entered_{0};  // workers inside the job, and whether more may enter
     std::atomic<int> sleeping_{0};
     Job* job_ = nullptr;
-    bool stop_ = false;
+    std::atomic<bool> stop_{false};  // read by workers that wake late from a job, while the pool is being destroyed
 };
 
 struct Shared {

@@ -13,4 +13,11 @@ ETSPLAT_FN void prefetch(const void* p) {
 #endif
 }
 
+// All of a record's cache lines.
+template <class T>
+ETSPLAT_FN void prefetch_all(const T& record) {
+    const char* bytes = reinterpret_cast<const char*>(&record);
+    for (unsigned place = 0; place < sizeof(T); place += 64) prefetch(bytes + place);
+}
+
 }  // namespace etsplat

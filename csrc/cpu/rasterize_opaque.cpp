@@ -11,12 +11,14 @@
 
 #include "math/opaque_triangle.h"
 #include "parallel.h"
+#include "prefetch.h"
 
 namespace etsplat {
 namespace {
 
 constexpr int kTileSamples = 64;
 constexpr int64_t kStripEntries = 8'000'000;  // (tile, triangle) pairs in memory at a time
+constexpr int32_t kAhead = 8;  // triangles of a tile, and pixels of a row: what they read lies anywhere in memory
 
 struct Screen {
     std::vector<OpaqueVertex> vertices;
@@ -170,7 +172,9 @@ void for_each_tile(const Screen& screen, const Resolve& resolve) {
             for (int64_t tile = begin; tile < end; ++tile) {
                 buffer.reset(screen, static_cast<int32_t>(tile % screen.tiles_x),
                              row_begin + static_cast<int32_t>(tile / screen.tiles_x));
-                for (int64_t i = bins.begin[tile]; i < bins.begin[tile + 1]; ++i) {
+                const int64_t last = bins.begin[tile + 1];
+                for (int64_t i = bins.begin[tile]; i < last; ++i) {
+                    if (i + kAhead < last) prefetch_all(screen.triangles[bins.triangles[i + kAhead]]);
                     draw(screen, bins.triangles[i], buffer);
                 }
                 resolve(buffer);
@@ -184,6 +188,16 @@ void barycentrics_at(const OpaqueMesh& mesh, const Screen& screen, int32_t face,
     const int32_t* k = mesh.faces + 3 * static_cast<int64_t>(face);
     const OpaqueVertex v[3] = {screen.vertices[k[0]], screen.vertices[k[1]], screen.vertices[k[2]]};
     opaque_barycentrics(v, x, y, out);
+}
+
+// Asks for what `barycentrics_at` reads at pixels that follow `here` in a row: the corners of some, of later ones where
+// these are found.
+void look_ahead(const OpaqueMesh& mesh, const Screen& screen, const int32_t* here, int32_t following) {
+    const auto face = [&](int32_t pixels) { return following > pixels ? here[pixels] : -1; };
+    if (const int64_t later = face(2 * kAhead); later >= 0) prefetch(mesh.faces + 3 * later);
+    if (const int64_t next = face(kAhead); next >= 0) {
+        for (int k = 0; k < 3; ++k) prefetch(&screen.vertices[mesh.faces[3 * next + k]]);
+    }
 }
 
 // Adds a sample's colour to `sum` (channels).
@@ -220,6 +234,7 @@ void rasterize_opaque(const OpaqueMesh& mesh, const OpaqueCamera& camera, int32_
             for (int32_t x = tile.x0; x < tile.x1; ++x) {
                 const int64_t place = static_cast<int64_t>(y - tile.y0) * tile.stride + (x - tile.x0);
                 const int64_t pixel = static_cast<int64_t>(y) * screen.width + x;
+                look_ahead(mesh, screen, &tile.triangle[place], tile.x1 - x);
                 const int32_t face = tile.triangle[place];
                 float* b = barycentrics + 3 * pixel;
                 triangle[pixel] = face;

@@ -5,19 +5,15 @@
 // the same way; then cotangents go to colours and corners, many pixels to a place, as fixed-point sums (fixed_sums.h):
 // the same bits in every run. Each pair is evaluated by both its pixels, and few pairs have anything between them: some 50
 // bytes a pixel bound the forward; atomics in L2, 3 a pixel for colours, bound the backward.
-#include "cuda/fixed_sums.h"
-#include "math/antialias.h"
-#include "math/triangle.h"
+#include "cuda/shading.h"
+#include "math/texture.h"
 
 using namespace etsplat;
 
-constexpr int kThreads = kBlock;
-
 struct AntialiasView {
-    const float *vertices, *viewmat, *K, *barycentrics, *depth, *colors, *background;
-    const int *faces, *pair_offsets, *paired_faces, *triangle;
-    long long num_vertices, num_faces;
-    int width, height, channels, per_face;
+    ShadedView shaded;
+    const float* depth;
+    const int *pair_offsets, *paired_faces;
     float near_plane;
 };
 
@@ -26,21 +22,14 @@ struct ScreenPoint {
     int drawn;
 };
 
-__device__ PinholeCamera camera_of(const AntialiasView& view) {
-    return pinhole_camera(view.viewmat, view.K);
-}
-
-__device__ long long thread_index() { return static_cast<long long>(blockIdx.x) * kThreads + threadIdx.x; }
-__device__ long long pixel_count(const AntialiasView& view) { return static_cast<long long>(view.width) * view.height; }
-
 extern "C" __global__ void antialias_points(AntialiasView view, ScreenPoint* points) {
     const long long v = thread_index();
-    if (v >= view.num_vertices) return;
-    const float* p = view.vertices + 3 * v;
+    if (v >= view.shaded.num_vertices) return;
+    const float* p = view.shaded.vertices + 3 * v;
     const double world[3] = {p[0], p[1], p[2]};
     double seen[3];
     ScreenPoint q;
-    const PinholeCamera camera = camera_of(view);
+    const PinholeCamera camera = camera_of(view.shaded);
     to_camera(camera, world, seen);
     project(camera, seen, q.at[0], q.at[1]);
     q.drawn = seen[2] > static_cast<double>(view.near_plane) && q.at[0] - q.at[0] == 0.0 && q.at[1] - q.at[1] == 0.0;
@@ -50,11 +39,11 @@ extern "C" __global__ void antialias_points(AntialiasView view, ScreenPoint* poi
 // Bit k of a face: its edge from corner k to k + 1 is a silhouette, that is, no face across it lies on the other side.
 extern "C" __global__ void antialias_silhouettes(AntialiasView view, const ScreenPoint* points, unsigned char* bits) {
     const long long f = thread_index();
-    if (f >= view.num_faces) return;
-    const int* own = view.faces + 3 * f;
+    if (f >= view.shaded.num_faces) return;
+    const int* own = view.shaded.faces + 3 * f;
     int found = 7;
     for (int i = view.pair_offsets[f]; i < view.pair_offsets[f + 1]; ++i) {
-        const int* other = view.faces + 3 * static_cast<long long>(view.paired_faces[i]);
+        const int* other = view.shaded.faces + 3 * static_cast<long long>(view.paired_faces[i]);
         if (!points[other[0]].drawn || !points[other[1]].drawn || !points[other[2]].drawn) continue;
         for (int k = 0; k < 3; ++k) {
             const int a = own[k], b = own[(k + 1) % 3];
@@ -70,25 +59,43 @@ extern "C" __global__ void antialias_silhouettes(AntialiasView view, const Scree
     bits[f] = static_cast<unsigned char>(found);
 }
 
-extern "C" __global__ void antialias_shade(AntialiasView view, float* shaded) {
+extern "C" __global__ void shade_forward(ShadedView view, float* image) {
+    const long long p = thread_index();
+    if (p < pixel_count(view)) shade(view, p, image + p * view.channels);
+}
+
+// Colours of pixels get the cotangents of those that show a triangle.
+extern "C" __global__ void shade_pixels(ShadedView view, const float* grad_shaded, float* grad_colors) {
     const long long p = thread_index();
     if (p >= pixel_count(view)) return;
-    float* out = shaded + p * view.channels;
-    const long long face = view.triangle[p];
     for (int c = 0; c < view.channels; ++c) {
-        if (face < 0) {
-            out[c] = view.background[c];
-        } else if (view.per_face) {
-            out[c] = view.colors[face * view.channels + c];
-        } else {
-            const float* b = view.barycentrics + 3 * p;
-            float color[3];
-            for (int i = 0; i < 3; ++i) {
-                color[i] = view.colors[static_cast<long long>(view.faces[3 * face + i]) * view.channels + c];
-            }
-            out[c] = b[0] * color[0] + b[1] * color[1] + b[2] * color[2];
-        }
+        grad_colors[p * view.channels + c] = view.triangle[p] < 0 ? 0.0f : grad_shaded[p * view.channels + c];
     }
+}
+
+extern "C" __global__ void shade_measure(ShadedView view, const float* grad_shaded, Targets targets) {
+    const long long p = thread_index();
+    Collector<true> into(targets);
+    if (p < pixel_count(view)) collect_shaded(view, p, grad_shaded + p * view.channels, into);
+    for (int i = 0; i < 3; ++i) record_largest(into.magnitudes[i], targets.largest + i);
+}
+
+extern "C" __global__ void shade_scatter(ShadedView view, const float* grad_shaded, Targets targets) {
+    const long long p = thread_index();
+    Collector<false> into(targets);
+    if (p < pixel_count(view)) collect_shaded(view, p, grad_shaded + p * view.channels, into);
+}
+
+// The view's colours are texture coordinates of corners, in a texture of so many texels.
+extern "C" __global__ void texture_detail(ShadedView view, const float* depth, int width, int height, float* lod) {
+    const long long p = thread_index();
+    if (p >= pixel_count(view)) return;
+    const long long face = view.triangle[p];
+    lod[p] = 0.0f;
+    if (face < 0) return;
+    const PinholeCamera camera = camera_of(view);
+    lod[p] = level_of_detail(inverse_of(view, camera, p), ray_turn(camera), view.barycentrics + 3 * p,
+                             view.colors + 6 * face, depth[p], width, height);
 }
 
 struct Scene {
@@ -105,13 +112,14 @@ struct PairBlend {
 
 // The pair of the pixel (x, y) and its neighbour at the right (axis 0) or below (axis 1).
 __device__ bool find_pair(const Scene& scene, int x, int y, int axis, PairBlend& pair) {
-    const AntialiasView& view = scene.view;
+    const ShadedView& view = scene.view.shaded;
+    const float* depth = scene.view.depth;
     const bool exists = x >= 0 && y >= 0 && x + (axis == 0) < view.width && y + (axis == 1) < view.height;
     if (!exists) return false;
     const long long first = static_cast<long long>(y) * view.width + x, second = first + (axis == 0 ? 1 : view.width);
     const int face[2] = {view.triangle[first], view.triangle[second]};
     if (face[0] == face[1]) return false;
-    const bool forward = face[1] < 0 || (face[0] >= 0 && view.depth[first] <= view.depth[second]);
+    const bool forward = face[1] < 0 || (face[0] >= 0 && depth[first] <= depth[second]);
     const long long nearer = face[forward ? 0 : 1];
     const int silhouettes = scene.silhouettes[nearer];
     const double along = (axis == 0 ? x : y) + (forward ? 0.5 : 1.5), across = (axis == 0 ? y : x) + 0.5;
@@ -132,7 +140,7 @@ __device__ bool find_pair(const Scene& scene, int x, int y, int axis, PairBlend&
 // The pairs of pixel p, in the order of their first pixels: above, left, right, below.
 template <class Visit>
 __device__ void for_each_pair(const Scene& scene, long long p, const Visit& visit) {
-    const int x = static_cast<int>(p % scene.view.width), y = static_cast<int>(p / scene.view.width);
+    const int x = static_cast<int>(p % scene.view.shaded.width), y = static_cast<int>(p / scene.view.shaded.width);
 #pragma unroll 1
     for (int side = 0; side < 4; ++side) {
         PairBlend pair;
@@ -143,8 +151,8 @@ __device__ void for_each_pair(const Scene& scene, long long p, const Visit& visi
 
 extern "C" __global__ void antialias_blend(Scene scene, const float* shaded, float* image) {
     const long long p = thread_index();
-    if (p >= pixel_count(scene.view)) return;
-    const int channels = scene.view.channels;
+    if (p >= pixel_count(scene.view.shaded)) return;
+    const int channels = scene.view.shaded.channels;
     for (int c = 0; c < channels; ++c) image[p * channels + c] = shaded[p * channels + c];
     for_each_pair(scene, p, [&](const PairBlend& pair) {
         if (pair.to != p) return;
@@ -157,8 +165,8 @@ extern "C" __global__ void antialias_blend(Scene scene, const float* shaded, flo
 // Cotangent of the shaded image from that of the image.
 extern "C" __global__ void antialias_unblend(Scene scene, const float* grad_image, float* grad_shaded) {
     const long long p = thread_index();
-    if (p >= pixel_count(scene.view)) return;
-    const int channels = scene.view.channels;
+    if (p >= pixel_count(scene.view.shaded)) return;
+    const int channels = scene.view.shaded.channels;
     for (int c = 0; c < channels; ++c) grad_shaded[p * channels + c] = grad_image[p * channels + c];
     for_each_pair(scene, p, [&](const PairBlend& pair) {
         for (int c = 0; c < channels; ++c) {
@@ -168,54 +176,19 @@ extern "C" __global__ void antialias_unblend(Scene scene, const float* grad_imag
     });
 }
 
-// Where gradients go, null if nobody wants them; `largest` has a number for each of the three.
-struct Targets {
-    FixedSum *vertices, *colors, *background;
-    unsigned* largest;
-};
-
-// Adds (or, if Measure, looks at) what one pixel gives to the targets.
-template <bool Measure>
-struct Collector {
-    const Targets& targets;
-    float magnitudes[3] = {};
-    double scales[3] = {};
-
-    __device__ explicit Collector(const Targets& t) : targets(t) {
-        for (int i = 0; i < 3 && !Measure; ++i) scales[i] = fixed_scale(t.largest[i]);
-    }
-    __device__ void add(int target, FixedSum* sums, long long index, double value) {
-        if (Measure) {
-            const float magnitude = static_cast<float>(value < 0.0 ? -value : value);
-            if (!(magnitude <= magnitudes[target])) magnitudes[target] = magnitude;  // also a NaN
-        } else {
-            add_fixed(sums + index, value, scales[target]);
-        }
-    }
-    __device__ void vertex(long long v, const double* gradient) {
-        for (int i = 0; i < 3; ++i) add(0, targets.vertices, 3 * v + i, gradient[i]);
-    }
-    __device__ void color(long long index, double value) {
-        if (targets.colors) add(1, targets.colors, index, value);
-    }
-    __device__ void background(int channel, double value) {
-        if (targets.background) add(2, targets.background, channel, value);
-    }
-};
-
 // The weight of a pair's blend moves the ends of its silhouette.
 template <class Into>
 __device__ void collect_silhouette(const Scene& scene, const PairBlend& pair, const float* shaded,
                                    const float* grad_image, Into& into) {
-    const int channels = scene.view.channels;
+    const int channels = scene.view.shaded.channels;
     double by_weight = 0.0;
     for (int c = 0; c < channels; ++c) {
         const float step = shaded[pair.from * channels + c] - shaded[pair.to * channels + c];
         by_weight += static_cast<double>(grad_image[pair.to * channels + c]) * step;
     }
-    const PinholeCamera camera = camera_of(scene.view);
+    const PinholeCamera camera = camera_of(scene.view.shaded);
     for (int end = 0; end < 2; ++end) {
-        const float* p = scene.view.vertices + 3 * static_cast<long long>(pair.ends[end]);
+        const float* p = scene.view.shaded.vertices + 3 * static_cast<long long>(pair.ends[end]);
         const double world[3] = {p[0], p[1], p[2]};
         double seen[3], grad_seen[3] = {0.0, 0.0, 0.0}, grad_world[3], x, y;
         to_camera(camera, world, seen);
@@ -227,43 +200,10 @@ __device__ void collect_silhouette(const Scene& scene, const PairBlend& pair, co
     }
 }
 
-// An interpolated colour gives to the colours of three vertices, and to their positions.
-template <class Into>
-__device__ void collect_interpolated(const AntialiasView& view, long long p, const float* g, Into& into) {
-    const int* k = view.faces + 3 * static_cast<long long>(view.triangle[p]);
-    double b[3], cotangent[3] = {0.0, 0.0, 0.0};
-    for (int i = 0; i < 3; ++i) {
-        b[i] = view.barycentrics[3 * p + i];
-        const long long place = static_cast<long long>(k[i]) * view.channels;
-        for (int c = 0; c < view.channels; ++c) {
-            into.color(place + c, b[i] * g[c]);
-            cotangent[i] += static_cast<double>(g[c]) * view.colors[place + c];
-        }
-    }
-    if (!into.targets.vertices) return;
-    const PinholeCamera camera = camera_of(view);
-    Vector3<double> corner[3];
-    for (int i = 0; i < 3; ++i) {
-        double relative[3];  // to the camera's centre
-        for (int j = 0; j < 3; ++j) {
-            relative[j] = view.vertices[3 * static_cast<long long>(k[i]) + j];
-            for (int r = 0; r < 3; ++r) {
-                relative[j] += static_cast<double>(camera.rotation[3 * r + j]) * camera.translation[r];
-            }
-        }
-        corner[i] = {relative[0], relative[1], relative[2]};
-    }
-    const Vector3<double> u = interpolation_derivative(view_inverse(corner), b, cotangent);
-    for (int i = 0; i < 3; ++i) {
-        const double moved[3] = {-b[i] * u.x, -b[i] * u.y, -b[i] * u.z};
-        into.vertex(k[i], moved);
-    }
-}
-
 template <class Into>
 __device__ void collect(const Scene& scene, long long p, const float* shaded, const float* grad_image,
                         const float* grad_shaded, Into& into) {
-    const AntialiasView& view = scene.view;
+    const ShadedView& view = scene.view.shaded;
     if (into.targets.vertices) {  // the pairs that begin here
         const int x = static_cast<int>(p % view.width), y = static_cast<int>(p / view.width);
         PairBlend pair;
@@ -271,20 +211,14 @@ __device__ void collect(const Scene& scene, long long p, const float* shaded, co
             if (find_pair(scene, x, y, axis, pair)) collect_silhouette(scene, pair, shaded, grad_image, into);
         }
     }
-    const float* g = grad_shaded + p * view.channels;
-    const long long face = view.triangle[p];
-    if (face >= 0 && !view.per_face) return collect_interpolated(view, p, g, into);
-    for (int c = 0; c < view.channels; ++c) {
-        if (face < 0) into.background(c, g[c]);
-        else into.color(face * view.channels + c, g[c]);
-    }
+    collect_shaded(view, p, grad_shaded + p * view.channels, into);
 }
 
 extern "C" __global__ void antialias_measure(Scene scene, const float* shaded, const float* grad_image,
                                              const float* grad_shaded, Targets targets) {
     const long long p = thread_index();
     Collector<true> into(targets);
-    if (p < pixel_count(scene.view)) collect(scene, p, shaded, grad_image, grad_shaded, into);
+    if (p < pixel_count(scene.view.shaded)) collect(scene, p, shaded, grad_image, grad_shaded, into);
     for (int i = 0; i < 3; ++i) record_largest(into.magnitudes[i], targets.largest + i);
 }
 
@@ -292,7 +226,7 @@ extern "C" __global__ void antialias_scatter(Scene scene, const float* shaded, c
                                              const float* grad_shaded, Targets targets) {
     const long long p = thread_index();
     Collector<false> into(targets);
-    if (p < pixel_count(scene.view)) collect(scene, p, shaded, grad_image, grad_shaded, into);
+    if (p < pixel_count(scene.view.shaded)) collect(scene, p, shaded, grad_image, grad_shaded, into);
 }
 
 // Adds `count` sums to a gradient.

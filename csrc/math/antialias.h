@@ -9,6 +9,9 @@
 
 namespace etsplat {
 
+// What has a colour of its own. Between those of vertices or corners, pixels are interpolated.
+enum class ColorsOf : int { kFaces, kVertices, kCorners, kPixels };
+
 // Where the line from a to b meets the row (or column) at `across`. Coordinates along it, and across it.
 template <class T>
 struct Crossing {

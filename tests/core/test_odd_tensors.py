@@ -19,6 +19,7 @@ from etsplat import (
     TriangleMesh,
     TriangleSoup,
     apply_rows,
+    flip,
     geometry_metrics,
     icosphere,
     intrinsics,
@@ -68,6 +69,7 @@ def _cases(folder: Path) -> dict[str, Case]:
         "apply_rows": (kept_rows, {"count": eye[:, 0]}),
         "psnr": (psnr, pair),
         "ssim": (ssim, pair),
+        "flip": (flip, pair),
         "silhouette_iou": (silhouette_iou, {"coverage": pair["image"][..., 0], "truth": pair["truth"][..., 0]}),
         "TriangleSoup": (
             lambda **given: TriangleSoup.from_triangles(**given, opacity=0.8, sigma=0.5, sh_degree=1).sh_dc,

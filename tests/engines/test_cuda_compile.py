@@ -33,7 +33,7 @@ PROGRAMS = [
     *(Program(file, contract=False) for file in ("adam.cu", "antialias.cu", "mesh_energies.cu", "photometric.cu")),
     *(Program(file, contract=False) for file in ("rasterize_opaque.cu", "soup_statistics.cu", "step.cu")),
     *(Program(file, contract=False) for file in ("normal_consistency.cu", "pick_values.cu", "triangle_channels.cu")),
-    *(Program(file, contract=False) for file in ("triangle_area.cu", "weighted_sum.cu")),
+    *(Program(file, contract=False) for file in ("texture.cu", "triangle_area.cu", "weighted_sum.cu")),
     *(Program(file) for file in ("soup_activation.cu", "spherical_harmonics.cu")),
 ]
 # Other definitions of what is compiled above.

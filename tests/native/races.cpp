@@ -132,7 +132,7 @@ int main(int argc, char** argv) {
         for (int i = 0; !stop; ++i) {
             set_num_threads(1 + i % 4);
             ++resized;
-            std::this_thread::sleep_for(std::chrono::milliseconds(20));
+            std::this_thread::sleep_for(std::chrono::milliseconds(1));
         }
     });
     int forked = 0, hung = 0;

@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from etsplat.engines.reference.antialias import antialias
+from etsplat.engines.reference.antialias import antialias, interpolate, texture_detail
 from etsplat.engines.reference.channels import pick_values, triangle_channels
 from etsplat.engines.reference.losses import (
     mean_area,
@@ -19,6 +19,7 @@ from etsplat.engines.reference.rasterize import rasterize
 from etsplat.engines.reference.rasterize_opaque import rasterize_opaque, render_opaque
 from etsplat.engines.reference.soup import soup_activation, soup_colors, spherical_harmonics
 from etsplat.engines.reference.steps import adam_step, update_statistics
+from etsplat.engines.reference.texture import sample_texture
 
 
 class Engine:
@@ -60,6 +61,7 @@ class Engine:
 
     adam_step = staticmethod(adam_step)
     antialias = staticmethod(antialias)
+    interpolate = staticmethod(interpolate)
     mean_area = staticmethod(mean_area)
     mesh_energies = staticmethod(mesh_energies)
     normal_consistency = staticmethod(normal_consistency)
@@ -68,9 +70,11 @@ class Engine:
     rasterize = staticmethod(rasterize)
     rasterize_opaque = staticmethod(rasterize_opaque)
     render_opaque = staticmethod(render_opaque)
+    sample_texture = staticmethod(sample_texture)
     soup_activation = staticmethod(soup_activation)
     soup_colors = staticmethod(soup_colors)
     spherical_harmonics = staticmethod(spherical_harmonics)
+    texture_detail = staticmethod(texture_detail)
     triangle_channels = staticmethod(triangle_channels)
     update_statistics = staticmethod(update_statistics)
     weighted_sum = staticmethod(weighted_sum)

@@ -1,4 +1,4 @@
-"""The CPU engine's side of `rasterize_antialiased`: csrc/cpu/antialias.cpp, one view after the other."""
+"""The CPU engine's side of `rasterize_antialiased`: csrc/cpu/antialias.cpp and shading.cpp, view by view."""
 
 from typing import Any
 
@@ -6,15 +6,17 @@ from torch import Tensor
 
 from etsplat import _native
 from etsplat.core.connectivity import MeshConnectivity
+from etsplat.core.validation import dense
 from etsplat.engines.native.operation import differentiable
 from etsplat.engines.native.pool import empty_image, zeros_image
 
 
 def _forward(_keep: bool, *given: Any) -> tuple[Tensor, Any]:
     """Shading and blending of what the z-buffer has found."""
-    shape = *given[5].shape, given[1].shape[1]  # triangle, colours
+    shape = *given[5].shape, given[1].shape[-1]  # triangle, colours
     shaded, image = empty_image(*shape), empty_image(*shape)
-    states = _native.antialias_forward(views=_views(*given), shaded=shaded, color=image)
+    views, silhouettes = _problem(*given)
+    states = _native.antialias_forward(views=views, silhouettes=silhouettes, shaded=shaded, color=image)
     return image, (*given, shaded, states)
 
 
@@ -22,9 +24,11 @@ def _backward(kept: Any, needed: Any, grad_image: Tensor) -> list[Tensor | None]
     """By vertices, colours and backgrounds."""
     *given, shaded, states = kept
     grads = [zeros_image(*tensor.shape) if wanted else None for tensor, wanted in zip(given[:3], needed, strict=False)]
+    views, silhouettes = _problem(*given)
     _native.antialias_backward(
         states=states,
-        views=_views(*given),
+        views=views,
+        silhouettes=silhouettes,
         grad_color=grad_image,
         shaded=shaded,
         scratch=empty_image(*shaded.shape[1:]),
@@ -35,7 +39,7 @@ def _backward(kept: Any, needed: Any, grad_image: Tensor) -> list[Tensor | None]
     return grads
 
 
-def _views(
+def _problem(
     vertices: Tensor,
     colors: Tensor,
     backgrounds: Tensor,
@@ -45,25 +49,83 @@ def _views(
     barycentrics: Tensor,
     depth: Tensor,
     near_plane: float,
-    per_face: bool,
+    colors_of: str,
     connectivity: MeshConnectivity,
-) -> _native.AntialiasViews:
+) -> tuple[_native.ShadedViews, _native.Silhouettes]:
     """With the arrays where they lie now."""
-    return _native.AntialiasViews(
+    views = _native.ShadedViews(
         vertices=vertices,
         faces=connectivity.faces,
         viewmats=viewmats,
         Ks=Ks,
+        triangle=triangle,
+        barycentrics=barycentrics,
+        colors=colors,
+        colors_of=_native.ColorsOf[colors_of.upper()],
+        backgrounds=backgrounds,
+    )
+    return views, _native.Silhouettes(
         near_plane=near_plane,
         pair_offsets=connectivity.pair_offsets,
         paired_faces=connectivity.paired_faces,
-        triangle=triangle,
-        barycentrics=barycentrics,
         depth=depth,
-        colors=colors,
-        per_face=per_face,
-        backgrounds=backgrounds,
     )
 
 
+def _interpolate_forward(_keep: bool, *given: Tensor) -> tuple[Tensor, Any]:
+    """Values of corners at pixels."""
+    image = empty_image(*given[5].shape, given[1].shape[-1])  # triangle, values
+    _native.shade(views=_corners(*given), shaded=image)
+    return image, given
+
+
+def _interpolate_backward(kept: Any, needed: Any, grad_image: Tensor) -> list[Tensor | None]:
+    """By vertices and values."""
+    grads = [zeros_image(*tensor.shape) if wanted else None for tensor, wanted in zip(kept[:2], needed, strict=False)]
+    _native.shade_backward(views=_corners(*kept), grad_shaded=grad_image, grad_vertices=grads[0], grad_colors=grads[1])
+    return grads
+
+
+def _corners(
+    vertices: Tensor,
+    values: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    faces: Tensor,
+    triangle: Tensor,
+    barycentrics: Tensor,
+) -> _native.ShadedViews:
+    return _native.ShadedViews(
+        vertices=vertices,
+        faces=faces,
+        viewmats=viewmats,
+        Ks=Ks,
+        triangle=triangle,
+        barycentrics=barycentrics,
+        colors=values,
+        colors_of=_native.ColorsOf.CORNERS,
+        backgrounds=None,
+    )
+
+
+def texture_detail(
+    vertices: Tensor,
+    uvs: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    faces: Tensor,
+    triangle: Tensor,
+    barycentrics: Tensor,
+    depth: Tensor,
+    width: int,
+    height: int,
+) -> Tensor:
+    """See `Engine.texture_detail`."""
+    given = (dense(tensor) for tensor in (vertices, uvs, viewmats, Ks, faces, triangle, barycentrics))
+    lod = empty_image(*triangle.shape)
+    _native.texture_detail(views=_corners(*given), depth=dense(depth), width=width, height=height, lod=lod)
+    return lod
+
+
 antialias = differentiable(_forward, _backward)
+interpolate = differentiable(_interpolate_forward, _interpolate_backward)

@@ -1,4 +1,4 @@
-"""The GPU engine's side of ``rasterize_antialiased``: csrc/cuda/antialias.cu, one view after the other."""
+"""The GPU engine's side of ``rasterize_antialiased``: csrc/cuda/antialias.cu and shading.h, view by view."""
 
 import ctypes
 from typing import Any
@@ -6,6 +6,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from etsplat import _native
+from etsplat.core.validation import dense
 from etsplat.engines.cuda.capacity import check_summed
 from etsplat.engines.cuda.launch import launch_each
 from etsplat.engines.cuda.program import Program
@@ -13,12 +15,15 @@ from etsplat.engines.cuda.structs import Struct, struct_class
 from etsplat.engines.native.operation import differentiable
 
 _PROGRAM = Program("antialias.cu", contract=False)
-_FILE = "cuda/antialias.cu"
+_FILE, _SHADING = "cuda/antialias.cu", "cuda/shading.h"
 _POINT = 3  # 64-bit words
 
 
 _PER_PIXEL = 3
 """Values that a pixel adds to a vertex at most: of its colour's place, and of two silhouettes."""
+
+_COLORS_OF = -2
+"""Its place among the arguments of `antialias`."""
 
 
 def _forward(keep: bool, *given: Any) -> tuple[Tensor, Any]:
@@ -27,7 +32,7 @@ def _forward(keep: bool, *given: Any) -> tuple[Tensor, Any]:
     B, V, F = len(viewmats), len(vertices), len(connectivity.faces)
     points = torch.empty((B, V, _POINT), dtype=torch.int64, device=vertices.device)
     silhouettes = torch.empty((B, F), dtype=torch.uint8, device=vertices.device)
-    shaded = vertices.new_empty((*triangle.shape, colors.shape[1]))
+    shaded = vertices.new_empty((*triangle.shape, colors.shape[-1]))
     pixels = shaded.shape[1] * shaded.shape[2]
     if keep:
         check_summed("rasterize_antialiased", pixels, _PER_PIXEL)
@@ -36,7 +41,7 @@ def _forward(keep: bool, *given: Any) -> tuple[Tensor, Any]:
         scene = _scene(b, points, silhouettes, *given)
         launch_each(_PROGRAM, "antialias_points", V, (scene.view, points[b]))
         launch_each(_PROGRAM, "antialias_silhouettes", F, (scene.view, points[b], silhouettes[b]))
-        launch_each(_PROGRAM, "antialias_shade", pixels, (scene.view, shaded[b]))
+        launch_each(_PROGRAM, "shade_forward", pixels, (scene.view.shaded, shaded[b]))
         launch_each(_PROGRAM, "antialias_blend", pixels, (scene, shaded[b], image[b]))
     return image, (shaded, points, silhouettes, *given)
 
@@ -47,33 +52,102 @@ def _backward(kept: Any, needed: Any, grad_image: Tensor) -> list[Tensor | None]
     grad_shaded = torch.empty_like(shaded[0])
     inputs = zip(problem[2:5], needed, strict=False)
     grads = [torch.zeros_like(tensor) if wanted else None for tensor, wanted in inputs]
+    of_pixels = problem[_COLORS_OF] == "pixels"
     for b in range(len(shaded)):
-        parts = [grads[0], grads[1], None if grads[2] is None else grads[2][b]]
-        sums = [None if g is None else torch.zeros(g.shape, dtype=torch.int64, device=g.device) for g in parts]
-        largest = torch.zeros(3, dtype=torch.int32, device=shaded.device)
         scene, pixels = _scene(b, *problem), shaded[b].shape[0] * shaded[b].shape[1]
         launch_each(_PROGRAM, "antialias_unblend", pixels, (scene, grad_image[b], grad_shaded))
-        arguments = (scene, shaded[b], grad_image[b], grad_shaded, struct_class(_FILE, "Targets")(*sums, largest))
-        launch_each(_PROGRAM, "antialias_measure", pixels, arguments)
-        launch_each(_PROGRAM, "antialias_scatter", pixels, arguments)
-        for i, (total, gradient) in enumerate(zip(sums, parts, strict=True)):
-            if total is not None and gradient is not None:
-                count = gradient.numel()
-                arguments = (total, largest[i:], ctypes.c_int64(count), gradient)
-                launch_each(_PROGRAM, "antialias_finish", count, arguments)
+        parts = [grads[0], grads[1], None if grads[2] is None else grads[2][b]]
+        if of_pixels and grads[1] is not None:
+            launch_each(_PROGRAM, "shade_pixels", pixels, (scene.view.shaded, grad_shaded, grads[1][b]))
+            parts[1] = None
+        _add_sums("antialias", pixels, (scene, shaded[b], grad_image[b], grad_shaded), parts)
     return grads
+
+
+def _add_sums(kernels: str, pixels: int, arguments: tuple[Any, ...], parts: list[Tensor | None]) -> None:
+    """Adds what the pixels of a view give to gradients by vertices, colours and a background, but to those of None."""
+    sums = [None if g is None else torch.zeros(g.shape, dtype=torch.int64, device=g.device) for g in parts]
+    largest = torch.zeros(3, dtype=torch.int32, device=arguments[-1].device)
+    arguments = (*arguments, struct_class(_SHADING, "Targets")(*sums, largest))
+    launch_each(_PROGRAM, f"{kernels}_measure", pixels, arguments)
+    launch_each(_PROGRAM, f"{kernels}_scatter", pixels, arguments)
+    for i, (total, gradient) in enumerate(zip(sums, parts, strict=True)):
+        if total is not None and gradient is not None:
+            count = gradient.numel()
+            launch_each(_PROGRAM, "antialias_finish", count, (total, largest[i:], ctypes.c_int64(count), gradient))
 
 
 def _scene(b: int, points: Tensor, silhouettes: Tensor, *given: Any) -> Struct:
     """View b, as the kernels read it, where its arrays lie now."""
     vertices, colors, backgrounds, viewmats, Ks, triangle, barycentrics, depth, *settings = given
-    near_plane, per_face, connectivity = settings
-    faces, (height, width) = connectivity.faces, triangle.shape[1:]
-    floats = (vertices, viewmats[b], Ks[b], barycentrics[b], depth[b], colors, backgrounds[b])
-    integers = (faces, connectivity.pair_offsets, connectivity.paired_faces, triangle[b])
-    sizes = len(vertices), len(faces), width, height, colors.shape[1], per_face
-    view = struct_class(_FILE, "AntialiasView")(*floats, *integers, *sizes, near_plane)
+    near_plane, colors_of, connectivity = settings
+    mine = colors[b] if colors_of == "pixels" else colors
+    seen = viewmats, Ks, connectivity.faces, triangle, barycentrics
+    shaded = _shaded(b, vertices, mine, *seen, colors_of, backgrounds)
+    pairs = connectivity.pair_offsets, connectivity.paired_faces
+    view = struct_class(_FILE, "AntialiasView")(shaded, depth[b], *pairs, near_plane)
     return struct_class(_FILE, "Scene")(view, points[b], silhouettes[b])
 
 
+def _shaded(
+    b: int,
+    vertices: Tensor,
+    colors: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    faces: Tensor,
+    triangle: Tensor,
+    barycentrics: Tensor,
+    colors_of: str = "corners",
+    backgrounds: Tensor | None = None,
+) -> Struct:
+    """View b with what is shaded, where its arrays lie now."""
+    background = None if backgrounds is None else backgrounds[b]
+    arrays = vertices, viewmats[b], Ks[b], barycentrics[b], colors, background, faces, triangle[b]
+    kind, (height, width) = int(_native.ColorsOf[colors_of.upper()]), triangle.shape[1:]
+    sizes = len(vertices), len(faces), width, height, colors.shape[-1], kind
+    return struct_class(_SHADING, "ShadedView")(*arrays, *sizes)
+
+
+def _interpolate_forward(keep: bool, *given: Any) -> tuple[Tensor, Any]:
+    """Values of corners at pixels."""
+    image = given[0].new_empty((*given[5].shape, given[1].shape[-1]))  # triangle, values
+    pixels = image.shape[1] * image.shape[2]
+    if keep:
+        check_summed("rasterize_antialiased", pixels, _PER_PIXEL)
+    for b in range(len(image)):
+        launch_each(_PROGRAM, "shade_forward", pixels, (_shaded(b, *given), image[b]))
+    return image, given
+
+
+def _interpolate_backward(kept: Any, needed: Any, grad_image: Tensor) -> list[Tensor | None]:
+    """By vertices and values; the same bits in every run."""
+    grads = [torch.zeros_like(tensor) if wanted else None for tensor, wanted in zip(kept[:2], needed, strict=False)]
+    pixels = grad_image.shape[1] * grad_image.shape[2]
+    for b in range(len(grad_image)):
+        _add_sums("shade", pixels, (_shaded(b, *kept), grad_image[b]), [*grads, None])
+    return grads
+
+
+def texture_detail(
+    vertices: Tensor,
+    uvs: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    faces: Tensor,
+    triangle: Tensor,
+    barycentrics: Tensor,
+    depth: Tensor,
+    width: int,
+    height: int,
+) -> Tensor:
+    """See `Engine.texture_detail`."""
+    given: list[Any] = [dense(tensor) for tensor in (vertices, uvs, viewmats, Ks, faces, triangle, barycentrics)]
+    depth, lod = dense(depth), vertices.new_empty(triangle.shape)
+    for b in range(len(lod)):
+        launch_each(_PROGRAM, "texture_detail", lod[b].numel(), (_shaded(b, *given), depth[b], width, height, lod[b]))
+    return lod
+
+
 antialias = differentiable(_forward, _backward)
+interpolate = differentiable(_interpolate_forward, _interpolate_backward)

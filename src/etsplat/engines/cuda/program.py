@@ -42,6 +42,12 @@ def source_root() -> Path:
     return installed if installed.is_dir() else package.parent.parent / "csrc"
 
 
+def included(path: Path, name: str) -> Path:
+    """The file that ``path`` means by ``#include "name"``."""
+    beside = path.parent / name
+    return beside if beside.is_file() else source_root() / name
+
+
 @lru_cache(maxsize=64)
 def _flattened(file: str) -> str:
     lines: list[str] = []
@@ -59,8 +65,7 @@ def _append(path: Path, lines: list[str], seen: set[Path]) -> None:
     for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
         include = _INCLUDE.match(line)
         if include:
-            beside = path.parent / include[1]
-            _append(beside if beside.is_file() else source_root() / include[1], lines, seen)
+            _append(included(path, include[1]), lines, seen)
             lines.append(f'#line {number + 1} "{name}"')
         elif line != "#pragma once":
             lines.append(line)

@@ -4,11 +4,12 @@ import ctypes
 import math
 import re
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 from torch import Tensor
 
-from etsplat.engines.cuda.program import source_root
+from etsplat.engines.cuda.program import included, source_root
 
 _TYPES = {
     "float": ctypes.c_float,
@@ -43,13 +44,16 @@ def _address(value: Any) -> Any:
 
 @cache
 def struct_class(file: str, name: str) -> type[Struct]:
-    """A ctypes.Structure with the members of ``struct name`` in csrc/``file``.
+    """A ctypes.Structure with the members of ``struct name`` in csrc/``file``, or in what that includes.
 
-    The struct holds pointers, numbers and other structs of the file, one type a line, or an array a line whose length
-    is a constant of the file.
+    The struct holds pointers, numbers and other structs of these files, one type a line, or an array a line whose
+    length is a constant of the file.
     """
-    text = (source_root() / file).read_text(encoding="utf-8")
-    body = text.split(f"struct {name} {{\n", 1)[1].split("\n};", 1)[0]
+    declared = _declared(source_root() / file, name)
+    assert declared, f"{file}: no struct {name}"
+    if (where := declared.relative_to(source_root()).as_posix()) != file:
+        return struct_class(where, name)
+    body = declared.read_text(encoding="utf-8").split(f"struct {name} {{\n", 1)[1].split("\n};", 1)[0]
     fields: list[tuple[str, Any]] = []
     for line in body.splitlines():
         code = line.split("//")[0].strip()
@@ -66,6 +70,15 @@ def struct_class(file: str, name: str) -> type[Struct]:
                 kind = kind * constant(file, match[3])
             fields.append((member.strip(" *"), kind))
     return type(name, (Struct,), {"_fields_": fields})
+
+
+def _declared(path: Path, name: str) -> Path | None:
+    """The file that declares a struct: this one, or one that it includes."""
+    text = path.read_text(encoding="utf-8")
+    if f"struct {name} {{\n" in text:
+        return path
+    others = (included(path, other) for other in re.findall(r'^#include "(.+)"$', text, re.MULTILINE))
+    return next(filter(None, (_declared(other, name) for other in others)), None)
 
 
 @cache

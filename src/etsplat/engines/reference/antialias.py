@@ -18,31 +18,92 @@ def antialias(
     barycentrics: Tensor,
     depth: Tensor,
     near_plane: float,
-    per_face: bool,
+    colors_of: str,
     connectivity: MeshConnectivity,
 ) -> Tensor:
-    """Shade and blend what `rasterize_opaque` has seen: (B, H, W, C)."""
+    """Shade and blend what `rasterize_opaque` has seen: (B, H, W, C); colours of "faces", "vertices" or "pixels"."""
     faces, images = connectivity.faces.long(), []
     for b, (viewmat, K) in enumerate(zip(viewmats.detach(), Ks.detach(), strict=True)):
         screen, z = to_screen(vertices, viewmat, K)
         drawn = ((z > near_plane) & screen.isfinite().all(dim=1)).detach()
         row, column = (triangle[b] >= 0).nonzero(as_tuple=True)
         owner = triangle[b, row, column].long()
-        if per_face:
+        if colors_of == "faces":
             values = colors[owner]
+        elif colors_of == "pixels":
+            values = colors[b, row, column]
         else:
-            corners = vertices[faces[owner]] @ viewmat[:3, :3].T + viewmat[:3, 3]
-            pixels = torch.stack([column + 0.5, row + 0.5, torch.ones_like(row)], dim=1).to(vertices.dtype)
-            rays = torch.linalg.solve(K, pixels.T).T
-            # The point b_0 v_0 + b_1 v_1 + b_2 v_2 lies on the ray.
-            beta = torch.linalg.solve(corners.mT, rays[..., None])[..., 0]
-            values = ((beta / beta.sum(dim=1, keepdim=True))[..., None] * colors[faces[owner]]).sum(dim=1)
+            values = _interpolated(colors[faces[owner]], vertices[faces[owner]], viewmat, K, row, column)
         image = shaded = backgrounds[b].expand(*triangle[b].shape, -1).index_put((row, column), values)
         silhouette = _silhouettes(connectivity, screen.detach(), drawn)
         for axis in range(2):
             image = image + _blends(shaded, screen, silhouette, faces, triangle[b], depth[b], axis)
         images.append(image)
-    return torch.stack(images) if images else vertices.new_zeros(*triangle.shape, colors.shape[1])
+    return torch.stack(images) if images else vertices.new_zeros(*triangle.shape, colors.shape[-1])
+
+
+def interpolate(
+    vertices: Tensor,
+    values: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    faces: Tensor,
+    triangle: Tensor,
+    barycentrics: Tensor,
+) -> Tensor:
+    """Values of corners (F, 3, C) where `rasterize_opaque` has seen these: (B, H, W, C), 0 where there is nothing."""
+    image = vertices.new_zeros(*triangle.shape, values.shape[-1])
+    for b, (viewmat, K) in enumerate(zip(viewmats.detach(), Ks.detach(), strict=True)):
+        row, column = (triangle[b] >= 0).nonzero(as_tuple=True)
+        owner = triangle[b, row, column].long()
+        found = _interpolated(values[owner], vertices[faces[owner].long()], viewmat, K, row, column)
+        image = image.index_put((torch.full_like(row, b), row, column), found)
+    return image
+
+
+def texture_detail(
+    vertices: Tensor,
+    uvs: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    faces: Tensor,
+    triangle: Tensor,
+    barycentrics: Tensor,
+    depth: Tensor,
+    width: int,
+    height: int,
+) -> Float[Tensor, "B H W"]:
+    """The level of detail that each pixel asks of a texture of so many texels, without gradients; 0 where nothing is.
+
+    It is that at which a texel is as wide as the longer of the steps that texture coordinates make from a pixel to its
+    neighbours (Williams 1983), and at least 0.
+    """
+    lod = vertices.new_zeros(triangle.shape)
+    size = vertices.new_tensor([width, height])
+    for b, (viewmat, K) in enumerate(zip(viewmats.detach(), Ks.detach(), strict=True)):
+        row, column = (triangle[b] >= 0).nonzero(as_tuple=True)
+        owner = triangle[b, row, column].long()
+        corners = vertices.detach()[faces[owner].long()] @ viewmat[:3, :3].T + viewmat[:3, 3]
+        # b = beta / sum(beta) with V beta = r, and the ray r = K^-1 (x, y, 1): beta moves by V^-1 K^-1 per pixel.
+        turned = torch.linalg.solve(corners.mT, torch.linalg.inv(K)[:, :2].expand(len(owner), 3, 2))
+        sums = turned.sum(dim=1, keepdim=True) * barycentrics[b, row, column][..., None]
+        moved = depth[b, row, column][:, None, None] * (turned - sums)  # (pixels, 3, 2), by x and y
+        steps = torch.einsum("nka,nkc->nac", moved, uvs.detach()[owner]) * size
+        longest = steps.square().sum(dim=-1).amax(dim=-1)
+        lod[b, row, column] = 0.5 * longest.clamp(1.0, 1e30).log2()
+    return lod
+
+
+def _interpolated(
+    values: Tensor, corners: Tensor, viewmat: Tensor, K: Tensor, row: Tensor, column: Tensor
+) -> Float[Tensor, "N C"]:
+    """Values of corners (N, 3, C) where the rays of N pixels meet the triangles with these corners (N, 3, 3)."""
+    corners = corners @ viewmat[:3, :3].T + viewmat[:3, 3]
+    pixels = torch.stack([column + 0.5, row + 0.5, torch.ones_like(row)], dim=1).to(corners.dtype)
+    rays = torch.linalg.solve(K, pixels.T).T
+    # The point b_0 v_0 + b_1 v_1 + b_2 v_2 lies on the ray.
+    beta = torch.linalg.solve(corners.mT, rays[..., None])[..., 0]
+    return ((beta / beta.sum(dim=1, keepdim=True))[..., None] * values).sum(dim=1)
 
 
 def _silhouettes(connectivity: MeshConnectivity, screen: Tensor, drawn: Tensor) -> Bool[Tensor, "F 3"]:
