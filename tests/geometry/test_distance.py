@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from etsplat.engines.threads import num_threads, set_num_threads
-from etsplat.geometry.distance import closest_points
+from etsplat.geometry.distance import closest_places, closest_points
 from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.sampling import sample_surface
 from helpers.meshes import TETRAHEDRON, bumpy_sphere, read_obj
@@ -126,3 +126,23 @@ def test_bad_arguments_are_named():
             closest_points(*arguments)
     squared, nearest = closest_points(points[:0], vertices, faces)
     assert len(squared) == len(nearest) == 0
+
+
+def test_places_are_where_the_nearest_points_are(rng: torch.Generator) -> None:
+    """Inside of faces, on edges and at corners: weights sum to 1, and the distance is the exact one."""
+    vertices, faces = bumpy_sphere(3, 0)
+    points = torch.cat([1.5 * torch.randn(500, 3, generator=rng), vertices[:20], vertices[faces].mean(dim=1)[:20]])
+    face, weights = closest_places(points, vertices, faces)
+    squared, nearest = closest_points(points, vertices, faces)
+    assert torch.equal(face, nearest)
+    assert float(weights.min()) >= 0
+    assert torch.allclose(weights.sum(dim=1), torch.ones(len(points), dtype=torch.float64))
+    found = (weights[..., None] * vertices.double()[faces[face]]).sum(dim=1)
+    assert torch.allclose((found - points).square().sum(dim=1), squared, rtol=1e-9, atol=1e-12)
+    assert ((weights > 0).sum(dim=1).unique() == torch.tensor([1, 2, 3])).all()
+
+
+def test_places_on_triangles_without_area() -> None:
+    vertices = torch.tensor([[0.0, 0, 0], [1, 0, 0], [3, 0, 0]])
+    _, weights = closest_places(torch.tensor([[2.0, 1, 0], [-1, 0, 0]]), vertices, torch.tensor([[0, 1, 2]]))
+    assert torch.allclose(weights @ vertices.double(), torch.tensor([[2.0, 0, 0], [0, 0, 0]], dtype=torch.float64))

@@ -1,13 +1,16 @@
-"""Small captures written to disk: COLMAP's text layout and transforms.json, noise for photos, cameras on a circle."""
+"""Small captures, most of them on disk: COLMAP, transforms.json, noise for photos, cameras on a circle."""
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import torch
 from PIL import Image
 
 from etsplat import look_at
+from etsplat.data.dataset import Dataset
+from etsplat.data.demo_scene import demo_scene
 from etsplat.data.photograph import FIELD_OF_VIEW
 from etsplat.io.images import save_image
 
@@ -97,3 +100,12 @@ def write_views(folder, views, indices, name, **settings):
     document = {"camera_angle_x": math.radians(FIELD_OF_VIEW), "frames": frames, **settings}
     (folder / name).write_text(json.dumps(document))
     return document
+
+
+def small_demo_scene() -> Dataset:
+    """The demo's scene in pictures of 64 x 48, with 400 of its points: enough for short runs."""
+    scene = demo_scene(64, 48)
+    keep = torch.arange(0, 4000, 10)
+    assert scene.exact_points is not None
+    assert scene.point_colors is not None
+    return replace(scene, exact_points=scene.exact_points[keep], point_colors=scene.point_colors[keep])

@@ -18,6 +18,7 @@ from etsplat.ops.pick_values import pick_values
 from etsplat.ops.soup_activation import soup_activation
 from etsplat.ops.soup_colors import soup_colors
 from etsplat.ops.spherical_harmonics import spherical_harmonics
+from etsplat.ops.texture import sample_texture
 from etsplat.ops.triangle_area import mean_area
 from etsplat.ops.triangle_channels import triangle_channels
 from etsplat.ops.weighted_sum import Term, weighted_sum
@@ -91,11 +92,11 @@ def _rasterize_smoothly(rng: torch.Generator, engine: str) -> Case:
 def _antialiased(rng: torch.Generator, engine: str, kind: str) -> Case:
     scene = mesh(rng)
     faces, points = scene["faces"], scene["vertices"]
-    leaves = {
-        "vertices": points,
-        kind: torch.rand(len(faces) if kind == "face_colors" else len(points), 3, generator=rng),
-        "backgrounds": scene["backgrounds"],
-    }
+    shapes = {"face_colors": (len(faces), 3), "vertex_colors": (len(points), 3)}
+    shapes["texture"] = (15, 24, 3)  # of one level: which one is shown has no gradient
+    leaves = {"vertices": points, kind: torch.rand(shapes[kind], generator=rng), "backgrounds": scene["backgrounds"]}
+    if kind == "texture":
+        leaves["face_uvs"] = torch.rand(len(faces), 3, 2, generator=rng)
 
     def draw(**arguments: Any) -> Tensor:
         return rasterize_antialiased(**arguments).color
@@ -103,6 +104,11 @@ def _antialiased(rng: torch.Generator, engine: str, kind: str) -> Case:
     view = Cameras(scene["viewmats"], scene["Ks"], scene["width"], scene["height"])
     connectivity = MeshTopology.from_faces(faces, len(points)).connectivity
     return case(engine, leaves, draw, cameras=view, connectivity=connectivity)
+
+
+def _texture(rng: torch.Generator, engine: str) -> Case:
+    leaves = {"texture": torch.rand(8, 12, 3, generator=rng), "uv": 1.2 * torch.rand(20, 2, generator=rng) - 0.1}
+    return case(engine, leaves, sample_texture, lod=3 * torch.rand(20, generator=rng) - 0.5)
 
 
 def _soup_activation(rng: torch.Generator, engine: str) -> Case:
@@ -206,6 +212,8 @@ CASES: dict[str, Factory] = {
     "rasterize/everything": _rasterize_everything,
     "rasterize_antialiased/face_colors": partial(_antialiased, kind="face_colors"),
     "rasterize_antialiased/vertex_colors": partial(_antialiased, kind="vertex_colors"),
+    "rasterize_antialiased/texture": partial(_antialiased, kind="texture"),
+    "sample_texture": _texture,
     "soup_activation": _soup_activation,
     "soup_colors": _soup_colors,
     "spherical_harmonics": _harmonics,

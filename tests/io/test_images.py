@@ -19,7 +19,9 @@ from etsplat.io.images import (
     premultiply,
     resize_image,
     save_image,
+    size_for,
 )
+from helpers.photos import upright_picture, write_phone_photo
 
 
 @pytest.fixture
@@ -186,3 +188,19 @@ def test_the_length_that_a_part_of_a_png_claims_is_not_allocated(tmp_path):
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 100e6
+
+
+@pytest.mark.parametrize("orientation", [1, 3, 6, 8])
+def test_an_image_is_turned_where_only_then_it_has_the_shape_of_its_camera(tmp_path, orientation):
+    """Poses mean stored pixels where COLMAP found them, turned ones where others did; the camera's shape says which."""
+    upright = upright_picture()
+    write_phone_photo(tmp_path / "a.png", upright, orientation)
+    stored = np.asarray(Image.open(tmp_path / "a.png"))
+    expected = np.asarray(upright) if orientation in (6, 8) else stored
+    assert size_for(tmp_path / "a.png", (400, 240)) == (40, 24)
+    assert np.array_equal(load_pixels(tmp_path / "a.png", 40, 24).numpy(), expected)
+    turned = load_image(tmp_path / "a.png", (400, 240))
+    assert np.array_equal((turned * 255).round().byte().numpy(), expected)
+    as_stored = stored.shape[1::-1]
+    assert size_for(tmp_path / "a.png", as_stored) == as_stored
+    assert np.array_equal(load_pixels(tmp_path / "a.png", *as_stored).numpy(), stored)

@@ -11,7 +11,7 @@ import trimesh
 from etsplat.core.errors import InputError
 from etsplat.geometry.icosphere import icosphere
 from etsplat.io import _mesh_readers
-from etsplat.io.mesh_files import load_mesh, save_mesh, weld_vertices
+from etsplat.io.mesh_files import load_mesh, save_mesh, save_triangles, weld_vertices
 from etsplat.io.srgb import linear_from_srgb, srgb_from_linear
 
 PLY_HEADER = (
@@ -369,3 +369,36 @@ def test_save_mesh_names_the_wrong_argument(tmp_path, ball):
 def test_the_shared_meshes_load_without_repairs(shared_data):
     for path in sorted((shared_data / "famous").glob("*.obj"))[:3]:
         assert load_mesh(path).notes == ()
+
+
+def test_a_sky_needs_a_kind_of_file_with_room_for_two_objects(tmp_path):
+    """And is some of the triangles."""
+    vertices, colors = torch.rand(4, 3, 3), torch.rand(4, 3)
+    some = torch.tensor([True, False, True, False])
+    with pytest.raises(ValueError, match=r"expected one of the suffixes \.glb, \.obj, got a\.ply"):
+        save_triangles(tmp_path / "a.ply", vertices, colors, sky=some)
+    for wrong in (some | True, some & False):
+        with pytest.raises(ValueError, match="sky: expected some of 4 triangles, got"):
+            save_triangles(tmp_path / "a.glb", vertices, colors, sky=wrong)
+
+
+def test_a_sky_does_not_blend_where_the_scene_does(tmp_path):
+    """With alpha there are three materials: nothing is behind a sky."""
+    alpha = torch.tensor([[1.0], [0.5], [0.5], [1.0]])
+    colors, sky = torch.cat([torch.rand(4, 3), alpha], dim=1), torch.tensor([False, False, True, True])
+    save_triangles(tmp_path / "a.glb", torch.rand(4, 3, 3), colors, sky=sky)
+    document = glb_json(tmp_path / "a.glb")
+    found = [(m["name"], m["alphaMode"], m["doubleSided"]) for m in document["materials"]]
+    assert found == [("opaque", "OPAQUE", True), ("blend", "BLEND", True), ("sky", "OPAQUE", False)]
+    assert [len(mesh["primitives"]) for mesh in document["meshes"]] == [2, 1]
+    assert len(load_mesh(tmp_path / "a.glb").faces) == 4
+
+
+@pytest.mark.parametrize("kind", ["glb", "obj", "ply", "off"])
+def test_a_record_does_not_disturb_readers(tmp_path, kind):
+    """Names in it may be of any script; OFF has no room for it."""
+    vertices, colors = torch.rand(4, 3, 3), torch.rand(4, 3)
+    save_triangles(tmp_path / f"a.{kind}", vertices, colors, record={"made": {"by": "Zoë\n", "times": 3}})
+    assert torch.equal(load_mesh(tmp_path / f"a.{kind}").vertices, vertices.reshape(-1, 3))
+    assert (b'{"by": "Zo\\u00eb\\n"' in (tmp_path / f"a.{kind}").read_bytes()) is (kind in ("obj", "ply"))
+    assert len(trimesh.load_mesh(tmp_path / f"a.{kind}", process=False).faces) == 4

@@ -175,6 +175,8 @@ def read_ply(path: Path) -> RawMesh:
             " the file is cut short or has faces with fewer than three corners: export it again"
         )
     mesh.file_faces = announced
+    if any(words[:2] == [b"comment", b"TextureFile"] for words in header):
+        mesh.notes.append("its texture is left out: PLY is read without; save it as glb")
     return mesh
 
 

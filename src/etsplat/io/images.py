@@ -12,6 +12,7 @@ from torch import Tensor
 from etsplat.core.errors import InputError
 from etsplat.core.validation import check_memory
 from etsplat.io.atomic import atomic_write
+from etsplat.io.exif import on_its_side, turn_of
 from etsplat.io.paths import kind_of
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
@@ -20,7 +21,8 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 MAX_PIXELS = 160_000_000
 """Larger images are refused before they are decoded: a file of a few kilobytes may unpack to gigabytes."""
 
-_FORMATS = ("PNG", "JPEG")
+IMAGE_FORMATS = ("PNG", "JPEG")
+"""Pillow's names of them."""
 
 _DENSEST = 520
 """Pixels of 16 bits in a byte of PNG, of which deflate makes at most 1032; JPEG needs a bit for 64 pixels at least."""
@@ -41,12 +43,13 @@ class _Bounded(io.BufferedReader):
         self.close()  # Pillow leaves a file open that it did not open
 
 
-def open_image(path: Path | str, data: bytes | None = None) -> Image.Image:
+def open_image(path: Path | str, data: bytes | None = None, formats: tuple[str, ...] = IMAGE_FORMATS) -> Image.Image:
     """An image that is not decoded yet, of the formats that are read here and within MAX_PIXELS.
 
     Args:
         path: of its file.
         data: what there is of it, where it is only a part of that file.
+        formats: Pillow's names of those that it may have.
 
     Raises:
         InputError: the file is missing, empty, too large, or not such an image.
@@ -59,7 +62,7 @@ def open_image(path: Path | str, data: bytes | None = None) -> Image.Image:
         raise InputError(f"image {path}: the file is empty; copy it again")
     try:
         # Without formats Pillow tries all it knows, and starts programs.
-        image = Image.open(_Bounded(path) if data is None else io.BytesIO(data), formats=_FORMATS)
+        image = Image.open(_Bounded(path) if data is None else io.BytesIO(data), formats=formats)
     except UnidentifiedImageError as error:
         raise InputError(f"image {path}: not an image that can be read; convert it to PNG or JPEG") from error
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
@@ -70,12 +73,21 @@ def open_image(path: Path | str, data: bytes | None = None) -> Image.Image:
             f"image {path}: is {image.width}x{image.height}, more than {MAX_PIXELS // 10**6} million pixels; shrink it"
         )
     denser = 16 if image.format == "PNG" and image.mode in ("1", "L", "P") else 1  # with one bit for a pixel
-    if image.width * image.height > _DENSEST * denser * size:
+    if image.format in IMAGE_FORMATS and image.width * image.height > _DENSEST * denser * size:
         image.close()
         raise InputError(
             f"image {path}: damaged or cut short (too small for {image.width}x{image.height}); copy it again"
         )
     return image
+
+
+def decoded_as(image: Image.Image, path: Path | str, mode: str) -> Image.Image:
+    """Decodes an image from `open_image` into a mode of Pillow's. Raises InputError if it is damaged."""
+    try:
+        return image.convert(mode)
+    except Exception as error:  # Pillow's decoders signal damage with whatever their parsing runs into
+        detail = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InputError(f"image {path}: damaged or cut short ({detail}); copy it again") from error
 
 
 def load_rgb(path: Path | str) -> Image.Image:
@@ -85,16 +97,16 @@ def load_rgb(path: Path | str) -> Image.Image:
         InputError: as in `open_image`, or it is damaged.
     """
     with open_image(path) as image:
-        return _converted(image, path, "RGB")
+        return decoded_as(image, path, "RGB")
 
 
-def load_image(path: Path | str) -> Float[Tensor, "H W C"]:
-    """Read an image as stored: straight (not premultiplied) colours, EXIF orientation not applied.
-
-    Orientation is left alone because poses refer to the pixels as stored.
+def load_image(path: Path | str, shape: tuple[int, int] | None = None) -> Float[Tensor, "H W C"]:
+    """Read an image: straight (not premultiplied) colours.
 
     Args:
         path: a PNG or JPEG file. Grey becomes RGB; palettes and CMYK become RGB or RGBA.
+        shape: (width, height) of its camera, which says whether poses mean the pixels as stored or turned as the
+            image's EXIF says (see `size_for`); None for as stored.
 
     Returns:
         float32 in [0, 1], 4 channels when the file has transparency, else 3.
@@ -102,7 +114,7 @@ def load_image(path: Path | str) -> Float[Tensor, "H W C"]:
     Raises:
         InputError: the file is missing, empty, cut short, too large, or not an image.
     """
-    decoded = _decoded(path)
+    decoded = _decoded(path, shape=shape)
     if isinstance(decoded, Tensor):
         return decoded[..., None].repeat(1, 1, 3)
     return torch.from_numpy(np.array(decoded)).to(torch.float32) / 255
@@ -128,12 +140,12 @@ def load_colors(path: Path | str, data: bytes | None = None) -> tuple[np.ndarray
 def load_pixels(path: Path | str, width: int, height: int) -> UInt8[Tensor, "H W C"]:
     """Read an image as 8-bit pixels of the given size: RGB, or premultiplied RGBA where some pixel is transparent.
 
-    Sizes are changed with Pillow's bicubic filter, as 3DGS does.
+    Sizes are changed with Pillow's bicubic filter, as 3DGS does. Turned as in `size_for`.
 
     Raises:
         InputError: as `load_image`.
     """
-    loaded = _decoded(path)
+    loaded = _decoded(path, shape=(width, height))
     if isinstance(loaded, Tensor):
         loaded = Image.fromarray(to_8_bit(loaded).numpy()).convert("RGB")
     if loaded.mode == "RGBA":
@@ -183,6 +195,19 @@ def image_size(path: Path | str) -> tuple[int, int]:
         return image.size
 
 
+def size_for(path: Path | str, shape: tuple[int, int]) -> tuple[int, int]:
+    """(width, height) of an image file whose camera has the shape `shape`.
+
+    Poses mean the pixels as whoever found them read them: COLMAP as stored, others turned as EXIF says. Which of the
+    two is seen from the shape: an image that lies on its side is turned where its camera does not.
+
+    Raises:
+        InputError: as `load_image`.
+    """
+    with open_image(path) as image:
+        return (image.height, image.width) if _is_to_turn(image, shape) else image.size
+
+
 def save_image(path: Path | str, image: Float[Tensor, "H W C"]) -> None:
     """Write an image, rounded to 8 bits; the suffix of `path` chooses the format. Atomic.
 
@@ -208,6 +233,13 @@ def save_image(path: Path | str, image: Float[Tensor, "H W C"]) -> None:
     pixels.save(encoded, format=kind, quality=95, subsampling=0)  # PNG ignores the last two
     with atomic_write(path) as temporary:
         temporary.write_bytes(encoded.getvalue())
+
+
+def encode_png(pixels: np.ndarray) -> bytes:
+    """A PNG file of uint8, (H, W, 3), or (H, W) for grey."""
+    encoded = io.BytesIO()
+    Image.fromarray(pixels).save(encoded, format="PNG")
+    return encoded.getvalue()
 
 
 def to_8_bit(image: Float[Tensor, "..."]) -> UInt8[Tensor, "..."]:
@@ -239,20 +271,20 @@ def resize_image(image: Float[Tensor, "H W C"], width: int, height: int) -> Floa
     return resized[0].movedim(0, -1).clamp(0, 1).contiguous()
 
 
-def _decoded(path: Path | str, data: bytes | None = None) -> Image.Image | Float[Tensor, "H W"]:
+def _is_to_turn(image: Image.Image, shape: tuple[int, int]) -> bool:
+    return (image.width - image.height) * (shape[0] - shape[1]) < 0 and on_its_side(image)
+
+
+def _decoded(
+    path: Path | str, data: bytes | None = None, shape: tuple[int, int] | None = None
+) -> Image.Image | Float[Tensor, "H W"]:
     """8-bit RGB, or RGBA with transparency; or levels of 16-bit grey, which Pillow would clip instead of scale."""
     with open_image(path, data) as image:
+        turn = turn_of(image) if shape is not None and _is_to_turn(image, shape) else None
         deep = image.mode.startswith("I")
         transparent = image.mode in ("RGBA", "LA", "PA", "La", "RGBa") or "transparency" in image.info
-        decoded = _converted(image, path, image.mode if deep else "RGBA" if transparent else "RGB")
+        decoded = decoded_as(image, path, image.mode if deep else "RGBA" if transparent else "RGB")
+    decoded = decoded if turn is None else decoded.transpose(turn)
     if not deep:
         return decoded
     return torch.from_numpy(np.asarray(decoded).astype(np.float32) / 65535.0).clamp(0, 1)
-
-
-def _converted(image: Image.Image, path: Path | str, mode: str) -> Image.Image:
-    try:
-        return image.convert(mode)
-    except Exception as error:  # Pillow's decoders signal damage with whatever their parsing runs into
-        detail = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputError(f"image {path}: damaged or cut short ({detail}); copy it again") from error

@@ -83,6 +83,20 @@ def check_nobody_writes(folder: Path) -> None:
         pass
 
 
+def was_killed(folder: Path) -> bool:
+    """Whether who wrote the run in a folder ended without a word, as far as this machine knows; takes no lock."""
+    try:
+        _, number, _, host = (folder / RUN_LOCK).read_text(encoding="utf-8", errors="replace").split()
+        if host != socket.gethostname() or os.name == "nt":
+            return False
+        os.kill(int(number), 0)
+    except ProcessLookupError:
+        return True
+    except (OSError, ValueError, OverflowError):  # no lock, or that of another user's process
+        return False
+    return False
+
+
 @contextlib.contextmanager
 def scratch_folder(beside: Path) -> Iterator[Path]:
     """A folder of a random name beside a path that will exist, for this user alone, and gone afterwards.

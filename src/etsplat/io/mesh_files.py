@@ -3,18 +3,20 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from etsplat.core.errors import InputError
 from etsplat.core.validation import check_memory, dense
 from etsplat.io._mesh_readers import READERS, RawMesh
+from etsplat.io.georeference import Georeference
 from etsplat.io.paths import kind_of, path_remedy
-from etsplat.io.textures import Texture
-from etsplat.io.writers import Surface, save_surface, writer_of
+from etsplat.io.textures import NormalMap, Texture
+from etsplat.io.writers import Surface, SurfaceNormals, SurfaceTexture, save_surface, writer_of
 
 
 @dataclass(frozen=True)
@@ -28,7 +30,7 @@ class MeshFile:
         vertex_colors: (V, 3) float32 in [0, 1] as displayed (sRGB), or None.
         notes: one sentence for each repair made while reading (polygons cut into triangles, faces dropped), and for
             what of its textures is left out.
-        texture: pictures over the faces (OBJ with MTL, glTF), or None. `save_mesh` does not write them.
+        texture: pictures over the faces (OBJ with MTL, glTF), or None.
     """
 
     vertices: Float[Tensor, "V 3"]
@@ -77,9 +79,13 @@ def save_mesh(
     face_colors: Float[Tensor, "F 3"] | None = None,
     *,
     vertex_colors: Float[Tensor, "V 3"] | None = None,
+    texture: Texture | None = None,
+    normal_map: NormalMap | None = None,
+    mipmaps: bool = True,
     split: bool = False,
+    world: Georeference | None = None,
 ) -> None:
-    """Write a triangle mesh with colours per face or per vertex. Atomic.
+    """Write a triangle mesh with colours per face or per vertex, or a texture. Atomic.
 
     Of colours per face, each vertex gets the area-weighted mean of its faces'; with `split` no vertex is shared, and so
     its face's exact colour. OBJ and GLB know no others, and many programs read no others from PLY, which has both.
@@ -92,14 +98,21 @@ def save_mesh(
         faces: indices into `vertices`.
         face_colors: display values in [0, 1] (others are clamped); at most one of the two kinds of colours.
         vertex_colors: the same for vertices.
+        texture: one picture over all faces, in the place of colours; for GLB, and OBJ and PLY with a PNG beside them.
+        normal_map: how light falls on the faces under the texture, for GLB alone, whose material then is lit.
+        mipmaps: whether viewers of GLB may shrink the texture; not if its parts belong to faces apart.
         split: unshare all vertices.
+        world: its offset is added to all vertices in float64: PLY holds doubles then, OBJ and OFF the digits, GLB has
+            it as the translation of its nodes, which turn z to +y where that is up. Vertices are scaled already.
 
     Raises:
         ValueError: wrong shapes, indices out of range, or values that are not finite.
         InputError: the file cannot be written.
     """
     path = Path(path)
-    writer_of(path, holding="vertex_colors")
+    writer_of(path, holding="vertex_colors" if texture is None else "texture" if normal_map is None else "normals")
+    if texture is not None and (face_colors is not None or vertex_colors is not None):
+        raise ValueError("texture: expected no colours beside it")
     _check_arguments(vertices, faces, face_colors, vertex_colors)
     v, f = dense(vertices).to("cpu", torch.float64).numpy(), dense(faces).to("cpu", torch.int64).numpy()
     per_face = None if face_colors is None else _display_values(face_colors)
@@ -109,19 +122,40 @@ def save_mesh(
         v, f = v[f].reshape(-1, 3), np.arange(f.size).reshape(-1, 3)
     if per_face is not None:
         per_vertex = np.repeat(per_face, 3, axis=0) if split else _vertex_means(v, f, per_face)
-    save_surface(path, Surface(v.astype(np.float32), f, per_vertex, per_face, name=path.stem))
+    skin = None if texture is None else _surface_texture(texture, len(faces), mipmaps, normal_map)
+    far = _far(path, world)
+    save_surface(path, Surface(v.astype(np.float32), f, per_vertex, per_face, name=path.stem, texture=skin, **far))
+
+
+def _surface_texture(texture: Texture, faces: int, mipmaps: bool, normal_map: NormalMap | None) -> SurfaceTexture:
+    """As writers take it, whose coordinates count from the top.
+
+    Raises:
+        ValueError: it has several pictures, or is that of another number of faces.
+    """
+    picture = texture.picture()
+    if picture is None or len(texture.corner_uvs) != faces:
+        given = f"{len(texture.face_images.unique())} over {len(texture.corner_uvs)}"
+        raise ValueError(f"texture: expected one picture over {faces} faces, got {given}")
+    uvs = texture.corner_uvs.detach().cpu().numpy().astype(np.float64)
+    arrays = {} if normal_map is None else {name: value.cpu().numpy() for name, value in vars(normal_map).items()}
+    relief = SurfaceNormals(**arrays) if arrays else None
+    return SurfaceTexture(picture.cpu().numpy(), np.stack([uvs[..., 0], 1 - uvs[..., 1]], axis=-1), mipmaps, relief)
 
 
 def save_triangles(
     path: Path | str,
     vertices: Float[Tensor, "N 3 3"],
-    colors: Float[Tensor, "N C"],
+    colors: Float[Tensor, "N C"] | Float[Tensor, "N 3 C"],
     *,
     weld: bool = False,
     numbers: Mapping[str, Float[Tensor, " N"]] | None = None,
     comment: str | None = None,
+    record: Mapping[str, Any] | None = None,
+    sky: Bool[Tensor, " N"] | None = None,
+    world: Georeference | None = None,
 ) -> None:
-    """Write separate triangles, each in exactly its colour, as Blender, MeshLab, three.js and Unity read them. Atomic.
+    """Write separate triangles, each or each of its corners in exactly its colour, as other programs read them. Atomic.
 
     OBJ and GLB know only colours of vertices, and Blender reads no others from PLY: PLY has them twice, at its vertices
     and at its faces. Colours are display values (sRGB); glTF wants linear light, so GLB is converted, and its material
@@ -131,29 +165,58 @@ def save_triangles(
         path: ends in what a module of `etsplat.io.writers` writes: .ply, .obj, .off or .glb.
         vertices: (N, 3, 3) finite positions.
         colors: (N, 3), or (N, 4) with alpha, which files without room for it leave out; in [0, 1] (others are clamped).
+            (N, 3, 3) or (N, 3, 4) of each corner: faces then have their means.
         weld: triangles share vertices at equal positions, where their colours are equal too
             (in files without colours at vertices: all of them).
         numbers: further values per face, by name; only PLY has room for them.
         comment: a line of text; only PLY has room for it.
+        record: how the triangles were made, by name, as JSON has it; OFF has no room for it.
+        sky: which triangles are an object of their own, the sky, to be seen from the side from which their corners run
+            counterclockwise; neither all nor none. Only OBJ and GLB have room for more than one object.
+        world: as of `save_mesh`.
 
     Raises:
-        ValueError: another suffix or wrong shapes.
+        ValueError: another suffix or wrong shapes; a sky where there is no room for it.
         InputError: the file cannot be written.
     """
     path = Path(path)
-    holds = writer_of(path).HOLDS
-    if vertices.shape[1:] != (3, 3) or colors.shape not in ((len(vertices), 3), (len(vertices), 4)):
-        raise ValueError(f"vertices, colors: expected (N, 3, 3), (N, 3|4); got {vertices.shape}, {colors.shape}")
-    points = vertices.detach().cpu().numpy().astype(np.float32).reshape(-1, 3)
-    face_colors, faces = _display_values(colors), np.arange(len(points)).reshape(-1, 3)
-    point_colors = np.repeat(face_colors, 3, axis=0) if "vertex_colors" in holds else None
+    writer_of(path, holding=None if sky is None else "objects")
+    far = _far(path, world)
+    N = len(vertices)
+    if vertices.shape[1:] != (3, 3) or colors.shape not in ((N, 3), (N, 4), (N, 3, 3), (N, 3, 4)):
+        expected = "(N, 3, 3), (N, 3|4) or (N, 3, 3|4)"
+        raise ValueError(f"vertices, colors: expected {expected}; got {vertices.shape}, {colors.shape}")
+    if sky is not None and not 0 < int(sky.sum()) < len(vertices):
+        raise ValueError(f"sky: expected some of {len(vertices)} triangles, got {int(sky.sum())}")
+    points, tones = vertices.detach().cpu().numpy().astype(np.float32), _display_values(colors)
+    extra = {name: value.detach().cpu().numpy() for name, value in (numbers or {}).items()}
+    rows = np.ones(len(points), dtype=bool) if sky is None else ~sky.cpu().numpy()
+    scene = replace(_triangles(path, points[rows], tones[rows], weld=weld), **far)
+    apart = None if sky is None else replace(_triangles(path, points[~rows], tones[~rows], weld=weld), **far)
+    extra = {name: value[rows] for name, value in extra.items()}
+    save_surface(path, replace(scene, numbers=extra, comment=comment, name=path.stem, record=record or {}, sky=apart))
+
+
+def _far(path: Path, world: Georeference | None) -> dict[str, Any]:
+    """What a surface has to know of its place in the world."""
+    if world is None:
+        return {}
+    writer_of(path, holding="offset")
+    return {"offset": np.array(world.offset, dtype=np.float64), "z_up": world.up == "z"}
+
+
+def _triangles(path: Path, corners: np.ndarray, colors: np.ndarray, *, weld: bool) -> Surface:
+    """Separate triangles as a kind of file has room for them; colours of them, or of their corners."""
+    points, faces = corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3)
+    by_corner = colors if colors.ndim == 3 else np.repeat(colors[:, None], 3, axis=1)
+    face_colors = colors.mean(axis=1) if colors.ndim == 3 else colors
+    point_colors = by_corner.reshape(len(points), -1) if "vertex_colors" in writer_of(path).HOLDS else None
     if weld:
         keys = points if point_colors is None else np.hstack([points, point_colors.astype(np.float32)])
         kept, index = _first_of_equal(keys)
         points, faces = points[kept], index.reshape(-1, 3)
         point_colors = None if point_colors is None else point_colors[kept]
-    extra = {name: value.detach().cpu().numpy() for name, value in (numbers or {}).items()}
-    save_surface(path, Surface(points, faces, point_colors, face_colors, extra, comment, path.stem))
+    return Surface(points, faces, point_colors, face_colors)
 
 
 def weld_vertices(mesh: MeshFile) -> MeshFile:

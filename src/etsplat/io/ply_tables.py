@@ -1,7 +1,7 @@
 """PLY files as tables: points, Gaussian scenes, and triangles with numbers of their own."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -161,22 +161,21 @@ def load_points(path: Path | str) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "
     return points[finite], colors[finite].clamp(0, 1)
 
 
-def encode_ply(tables: Mapping[str, np.ndarray], comment: str | None = None) -> bytes:
-    """A binary PLY file with an element for each structured array; fields of shape (3,) become lists of corners."""
+def encode_ply(tables: Mapping[str, np.ndarray], comments: Sequence[str] = ()) -> bytes:
+    """A binary PLY file with an element for each structured array; fields of shape (K,) become lists, as of corners."""
     header, body = ["ply", "format binary_little_endian 1.0"], []
-    header += [f"comment {comment}"] if comment else []
+    header += [f"comment {comment}" for comment in comments]
     for element, table in tables.items():
         header.append(f"element {element} {len(table)}")
         fields: list[tuple] = []
         for name in table.dtype.names or ():
             kind = table.dtype[name]
-            corners = kind.shape == (3,)
-            header.append(f"property {'list uchar ' if corners else ''}{_NAMES[kind.base]} {name}")
-            fields += [(f"#{name}", "u1")] if corners else []
+            header.append(f"property {'list uchar ' if kind.shape else ''}{_NAMES[kind.base]} {name}")
+            fields += [(f"#{name}", "u1")] if kind.shape else []
             fields.append((name, kind.base.newbyteorder("<"), kind.shape))
         packed = np.empty(len(table), fields)
         for name in packed.dtype.names or ():
-            packed[name] = 3 if name.startswith("#") else table[name]
+            packed[name] = table.dtype[name[1:]].shape[0] if name.startswith("#") else table[name]
         body.append(packed.tobytes())
     return "\n".join([*header, "end_header", ""]).encode() + b"".join(body)
 

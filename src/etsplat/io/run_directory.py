@@ -18,6 +18,7 @@ from typing import Any
 
 from etsplat.core.errors import InputError
 from etsplat.io.atomic import atomic_write, write_error
+from etsplat.io.georeference import GEOREFERENCE_FILE
 from etsplat.io.json_text import as_json, check_entries, entries_problem, json_differences, parse_json
 from etsplat.io.locks import RUN_LOCK
 from etsplat.io.run_readme import readme_of
@@ -28,23 +29,21 @@ KERNEL_FILE = "kernel.safetensors"
 """The table of the run's kernel; there where that is none of the built-in ones."""
 
 _FILES = (
-    "mesh.ply",
-    "mesh.obj",
-    "mesh.glb",
-    "soup.safetensors",
+    *("mesh.ply", "mesh.obj", "mesh.glb", "textured.glb"),
+    *("soup.safetensors", "opaque.glb", "opaque.safetensors", "gaussians.safetensors"),
     KERNEL_FILE,
-    "gaussians.safetensors",
-    "metrics.json",
-    "evaluation.json",
-    "exposure.json",
+    *("metrics.json", "evaluation.json", "exposure.json"),
+    GEOREFERENCE_FILE,
     "history.jsonl",
     "convergence.png",
     "overview.png",
     "report.html",
     "README.txt",
+    "ended.txt",
     "config.json",
 )
-_FOLDERS = ("test", "checkpoints", "tensorboard")
+_STAGES = "stages"
+_FOLDERS = ("test", "checkpoints", "tensorboard", _STAGES)
 
 _CONFIG_KINDS: dict[str, Any] = {
     "task": str,
@@ -107,9 +106,30 @@ class RunDirectory:
         return self.path / f"mesh{suffix}"
 
     @property
+    def textured_path(self) -> Path:
+        """textured.glb: a light mesh under a texture."""
+        return self.path / "textured.glb"
+
+    @property
     def soup_path(self) -> Path:
         """soup.safetensors."""
         return self.path / "soup.safetensors"
+
+    @property
+    def opaque_path(self) -> Path:
+        """opaque.safetensors: the opaque mesh of a scene."""
+        return self.path / "opaque.safetensors"
+
+    def stage(self, name: str, iterations: int) -> "RunDirectory":
+        """The folder for checkpoints and history of something that is made beside what the run optimizes.
+
+        Raises:
+            InputError: it cannot be written to.
+        """
+        folder = self.path / _STAGES / name
+        if is_run(folder):
+            return RunDirectory(folder)
+        return RunDirectory.create(folder, {"task": "fit", "iterations": iterations})
 
     @staticmethod
     def check_free(path: Path | str, *, overwrite: bool = False) -> None:
@@ -234,6 +254,23 @@ class RunDirectory:
         """Writes evaluation.json as `write_metrics` does."""
         _write_json(self.evaluation_path, _null_if_not_finite(evaluation))
 
+    def write_end(self, text: str) -> None:
+        """Says in ended.txt how the run ended before it was done. Where nothing can be written it stays unsaid."""
+        with contextlib.suppress(InputError):
+            _write_text(self.path / "ended.txt", f"{text}\n")
+
+    def read_end(self) -> str:
+        """How the run ended before it was done; empty where it did not, or nobody could say."""
+        try:
+            return (self.path / "ended.txt").read_text(encoding="utf-8").strip()
+        except (OSError, ValueError):
+            return ""
+
+    def forget_end(self) -> None:
+        """The run goes on."""
+        with _explained(self.path):
+            (self.path / "ended.txt").unlink(missing_ok=True)
+
     def conclude(self, verdict: str) -> None:
         """Puts what became of the run into README.txt, in the place of what that said of it before."""
         task = self.read_config()["task"]
@@ -242,6 +279,10 @@ class RunDirectory:
     def write_exposure(self, exposure: Mapping[str, Any]) -> None:
         """Writes exposure.json: what was learned of each training photo's exposure."""
         _write_json(self.path / "exposure.json", exposure)
+
+    def read_exposure(self) -> dict[str, Any]:
+        """What exposure.json holds; empty if the run learned none."""
+        return _read_json(path) if (path := self.path / "exposure.json").is_file() else {}
 
     def append_history(self, line: Mapping[str, Any]) -> None:
         """Appends one line to history.jsonl."""

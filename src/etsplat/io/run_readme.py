@@ -10,16 +10,22 @@ metrics.json    how good it is; docs/conventions.md of etsplat says how each num
 history.jsonl   one line per log step: iteration, seconds of optimisation, loss, state, and what was evaluated
 convergence.png how loss, quality and the number of triangles went; overview.png shows test views
 exposure.json   if it is there: the photos were exposed unlike each other; how each saw the colours of the result
+georeference.json  if it is there: world coordinates = offset + scale * coordinates of the result, before it was turned
+ended.txt       if it is there: how the run ended before it was done
 config.json     the settings that made it
 checkpoints/    where an interrupted run continues with --resume; safe to delete once the run is done
+stages/         if it is there: the same of what was made beside it; as safe to delete
 """
 
 _RESULTS = {
     "reconstruct": """\
 mesh.glb        the result, for viewers
-mesh.obj, .ply  the same; colours of faces are exact in mesh.ply, and means at the vertices in all three""",
+mesh.obj, .ply  the same; colours of faces are exact in mesh.ply, and means at the vertices in all three
+textured.glb    if it is there: few faces under a texture, of --texture or of etsplat export --texture""",
     "train": """\
-soup.safetensors  the result: triangles with opacity, softness and view-dependent colour; etsplat export converts it""",
+soup.safetensors  the result: triangles with opacity, softness and view-dependent colour; etsplat export converts it
+opaque.glb      if it is there: the scene as opaque triangles, for every mesh viewer and game engine
+opaque.safetensors  the same in the units and axes of the capture""",
     "fit": """\
                 (whoever called Trainer.fit saves the model)""",
 }

@@ -40,6 +40,16 @@ class Texture:
         """That of some of the faces, by index or mask."""
         return replace(self, face_images=self.face_images[faces], corner_uvs=self.corner_uvs[faces])
 
+    def picture(self) -> UInt8[Tensor, "H W 3"] | None:
+        """The one that all faces are under; None where these are under several."""
+        used = self.face_images.unique()
+        if len(used) != 1:
+            return None
+        number = int(used)
+        height, width = self.sizes[number].tolist()
+        first = int(self.sizes[:number].prod(dim=1).sum())
+        return self.pixels[first : first + height * width].reshape(height, width, 3)
+
     def to(self, device: torch.device | str) -> "Texture":
         """The same on a device."""
         return Texture(**{name: tensor.to(device) for name, tensor in vars(self).items()})
@@ -65,3 +75,18 @@ class Texture:
             rows.append(torch.lerp(west, east, (x - left)[:, None]))
         north, south = rows
         return torch.lerp(north, south, (y - top)[:, None]) / 255
+
+
+@dataclass(frozen=True)
+class NormalMap:
+    """How light falls on the faces under a texture: what lies beside its picture in a file.
+
+    Attributes:
+        pixels: (H, W, 3) normals in tangent space, -1 to 1 as 0 to 255, row by row from the top, where the texture is.
+        normals: (F, 3, 3) unit normals of the corners.
+        tangents: (F, 3, 4) their tangents and signs, as of `etsplat.geometry.tangents`.
+    """
+
+    pixels: UInt8[Tensor, "H W 3"]
+    normals: Float[Tensor, "F 3 3"]
+    tangents: Float[Tensor, "F 3 4"]

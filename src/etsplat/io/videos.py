@@ -66,8 +66,12 @@ def open_video(path: Path | str, fps: int) -> Iterator[VideoSink]:
 
 
 def _error(complaints: str) -> OSError:
-    """What the encoder said, as the system's error if it is one."""
-    for number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-        if os.strerror(number) in complaints:
-            return OSError(number, os.strerror(number))
-    return OSError(complaints.strip().splitlines()[-1] if complaints.strip() else "the encoder failed")
+    """What the encoder said."""
+    said = complaints.strip().splitlines()
+    return told_error(complaints) or OSError(said[-1] if said else "the encoder failed")
+
+
+def told_error(complaints: str) -> OSError | None:
+    """The system's error that FFmpeg's complaints tell of, if it is that a disk is full or the like."""
+    numbers = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+    return next((OSError(n, os.strerror(n)) for n in numbers if os.strerror(n) in complaints), None)

@@ -7,7 +7,7 @@ import importlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, Protocol, TypeAlias, cast
+from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias, cast
 
 from etsplat.io.atomic import atomic_write
 from etsplat.io.paths import kind_of
@@ -16,8 +16,42 @@ if TYPE_CHECKING:  # help, which lists the kinds, must not wait for it
     import numpy as np
 
 Colors: TypeAlias = "np.ndarray | None"
-Content = Literal["vertex_colors", "face_colors", "alpha", "numbers"]
-"""What a kind of file may have room for, beside vertices and faces."""
+Content = Literal["vertex_colors", "face_colors", "texture", "alpha", "numbers", "objects", "z_up", "normals", "offset"]
+"""What a kind of file may have room for, beside vertices and faces: several objects; +z up, where no rule says +y;
+an offset in float64."""
+
+
+@dataclass(frozen=True)
+class SurfaceTexture:
+    """A picture over all triangles.
+
+    Attributes:
+        pixels: (H, W, 3) uint8, display values, row by row from the top.
+        corner_uvs: (F, 3, 2) where the corners of each face are in it: (0, 0) is its upper left corner, (1, 1) the
+            lower right one.
+        mipmaps: whether viewers may shrink it; not if parts that lie side by side belong to faces apart.
+        relief: how light falls on it, or None for colours that are shown as they are.
+    """
+
+    pixels: "np.ndarray"
+    corner_uvs: "np.ndarray"
+    mipmaps: bool = True
+    relief: "SurfaceNormals | None" = None
+
+
+@dataclass(frozen=True)
+class SurfaceNormals:
+    """Arrays as of `etsplat.io.textures.NormalMap`.
+
+    Attributes:
+        pixels: (H, W, 3) uint8, normals in tangent space.
+        normals: (F, 3, 3) of the corners.
+        tangents: (F, 3, 4) of the corners.
+    """
+
+    pixels: "np.ndarray"
+    normals: "np.ndarray"
+    tangents: "np.ndarray"
 
 
 @dataclass(frozen=True)
@@ -32,6 +66,13 @@ class Surface:
         numbers: further values (F,) of each face, by name.
         comment: a line of text.
         name: what programs call the object.
+        record: how it was made, by name, as JSON has it.
+        texture: in the place of colours, or None.
+        offset: (3,) float64, what has to be added to all vertices, whose float32 could not hold the sum; or None.
+            Kinds of files that hold "offset" do it.
+        z_up: whether z is known to be up, so that files that have +y up by their standard turn it.
+        sky: what lies behind the scene, as an object of its own whose triangles are to be seen from one side: that from
+            which their corners run counterclockwise.
     """
 
     vertices: "np.ndarray"
@@ -41,6 +82,21 @@ class Surface:
     numbers: "Mapping[str, np.ndarray]" = field(default_factory=dict)
     comment: str | None = None
     name: str = ""
+    record: "Mapping[str, Any]" = field(default_factory=dict)
+    texture: SurfaceTexture | None = None
+    offset: "np.ndarray | None" = None
+    z_up: bool = False
+    sky: "Surface | None" = None
+
+    @property
+    def places(self) -> "np.ndarray":
+        """(V, 3) vertices with the offset, float64; without one as they are."""
+        return self.vertices if self.offset is None else self.vertices.astype("f8") + self.offset
+
+    @property
+    def digits(self) -> str:
+        """How coordinates are printed so that they come back as they are."""
+        return "%.9g" if self.offset is None else "%.15g"
 
 
 class Writer(Protocol):

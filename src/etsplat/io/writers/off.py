@@ -6,7 +6,7 @@ import numpy as np
 
 from etsplat.io.writers import Content, Surface
 
-HOLDS: frozenset[Content] = frozenset({"face_colors", "alpha"})
+HOLDS: frozenset[Content] = frozenset({"face_colors", "alpha", "z_up", "offset"})
 
 
 def write(path: Path, surface: Surface) -> None:
@@ -16,5 +16,5 @@ def write(path: Path, surface: Surface) -> None:
         rows = np.hstack([rows, np.floor(surface.face_colors * 255 + 0.5).astype(np.int64)])
     with open(path, "w", encoding="ascii", newline="\n") as file:
         file.write(f"OFF\n{len(surface.vertices)} {len(surface.faces)} 0\n")
-        np.savetxt(file, surface.vertices, fmt="%.9g")
+        np.savetxt(file, surface.places, fmt=surface.digits)
         np.savetxt(file, rows, fmt="%d")

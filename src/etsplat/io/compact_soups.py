@@ -1,0 +1,285 @@
+"""Compact soups: quantised, the most important triangles first, so that any part of the file from its start draws.
+
+The format is described in docs/compact_format.md. Files end in .etz.
+"""
+
+import json
+import math
+import struct
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from etsplat.core.errors import InputError
+from etsplat.core.harmonics import MAX_DEGREE
+from etsplat.io.byte_planes import MOST_INFLATED, MOST_ROWS, Channel, pack_chunk, row_bytes, unpack_chunk
+from etsplat.io.json_text import entries_problem, is_number, parse_json
+
+MAGIC, VERSION = b"ETSZ", 1
+CHUNK = 4096
+"""Triangles of a chunk, as they are written here."""
+
+_HEAD = struct.Struct("<4sII")  # magic, version, bytes of the header
+_SIZES_PER_OCTAVE = 8
+_OFFSET_STEPS = 1023
+_CONSTANT_STEP = 1 / 128
+_BAND_STEP = 1 / 64
+_FINEST = (1 << 24) - 1  # of a centre's coordinate
+
+Places = dict[str, np.ndarray]
+
+
+@dataclass(frozen=True)
+class CompactSoup:
+    """N separate triangles, the most important first: soft ones with harmonics, or opaque ones with colours at corners.
+
+    Attributes:
+        vertices: (N, 3, 3) float32 corners.
+        opacities: (N,) in [0, 1]; None of opaque triangles, like the two after it.
+        sigma: (N,) softness, above 0.
+        harmonics: (N, K, 3) coefficients, K = (degree + 1)^2.
+        corner_colors: (N, 3, 3) in [0, 1]; None of soft triangles.
+        appearance: how they are drawn, as `SoupAppearance.to_json` says it.
+        notes: text by name.
+        left_out: how many triangles are missing at the end of a file that was cut short.
+    """
+
+    vertices: np.ndarray
+    opacities: np.ndarray | None = None
+    sigma: np.ndarray | None = None
+    harmonics: np.ndarray | None = None
+    corner_colors: np.ndarray | None = None
+    appearance: Mapping[str, Any] = field(default_factory=dict)
+    notes: Mapping[str, str] = field(default_factory=dict)
+    left_out: int = 0
+
+    def __len__(self) -> int:
+        return len(self.vertices)
+
+
+def encode_compact(soup: CompactSoup) -> bytes:
+    """The file's bytes. Numbers lose what nobody sees of them.
+
+    Args:
+        soup: with at least one triangle; all of its numbers are finite.
+    """
+    scales, table = _quantised(soup)
+    bases = 0 if soup.harmonics is None else soup.harmonics.shape[1]
+    channels = _channels(bases)
+    chunks = []
+    for start in range(0, len(soup), CHUNK):
+        rows = start + _along_a_curve(table["center"][start : start + CHUNK])
+        chunks.append((len(rows), pack_chunk(channels, {name: values[rows] for name, values in table.items()})))
+    header = {
+        "format": "etsplat compact soup",
+        "count": len(soup),
+        "bases": bases,
+        "chunks": [[count, len(data)] for count, data in chunks],
+        **scales,
+        "appearance": dict(soup.appearance),
+        "notes": dict(sorted(soup.notes.items())),  # safetensors gives them in any order
+    }
+    text = json.dumps(header, separators=(",", ":")).encode()
+    return b"".join([_HEAD.pack(MAGIC, VERSION, len(text)), text, *(data for _, data in chunks)])
+
+
+def read_compact(path: Path | str) -> CompactSoup:
+    """Read a compact soup, or those of its triangles that are whole in a file that was cut short.
+
+    Raises:
+        InputError: the file is missing, damaged, of another kind, or cut short before its first triangles.
+    """
+    path = Path(path)
+    try:
+        return decode_compact(path.read_bytes())
+    except (OSError, ValueError) as error:
+        detail = (str(error) or type(error).__name__).splitlines()[0]
+        raise InputError(f"soup {path}: cannot be read ({detail}); export it again with --format etz") from error
+
+
+def decode_compact(data: bytes) -> CompactSoup:
+    """What `encode_compact` was given, but for what the file's numbers lose.
+
+    Raises:
+        ValueError: these are no bytes of a compact soup, or of another version.
+    """
+    header, start = _header(data)
+    channels = _channels(header["bases"])
+    tables = []
+    for rows, size in header["chunks"]:
+        if start + size > len(data):
+            break
+        tables.append(unpack_chunk(channels, rows, data[start : start + size]))
+        start += size
+    if not tables:
+        raise ValueError("it is cut short before its first triangles")
+    table = {channel.name: np.concatenate([part[channel.name] for part in tables]) for channel in channels}
+    return _restored(header, table)
+
+
+def _channels(bases: int) -> list[Channel]:
+    """What each triangle has in the file; `bases` 0: colours at corners."""
+    place = [Channel("center", 3, 3, delta=True), Channel("size", 1, 1), Channel("offsets", 6, 2, signed=True)]
+    if not bases:
+        return [*place, Channel("colors", 9, 1)]
+    soft = [Channel("opacity", 1, 1), Channel("sigma", 1, 1), Channel("constant", 3, 2, signed=True)]
+    return [*place, *soft, Channel("rest", 3 * (bases - 1), 2, signed=True)]
+
+
+def _quantised(soup: CompactSoup) -> tuple[dict[str, Any], Places]:
+    """The header's scales, and whole numbers (N, width) of each channel."""
+    vertices = soup.vertices.astype(np.float64)
+    centers = vertices.mean(axis=1)
+    offsets = (vertices - centers[:, None])[:, :2].reshape(-1, 6)  # the third corner follows
+    reach = np.abs(offsets).max(axis=1)
+    least = max(float(reach.max()) * 2.0 ** (-255 / _SIZES_PER_OCTAVE), 1e-30)
+    size = np.ceil(_SIZES_PER_OCTAVE * np.log2(np.maximum(reach, least) / least)).clip(0, 255)
+    unit = least * 2.0 ** (size / _SIZES_PER_OCTAVE) / _OFFSET_STEPS
+    origin = centers.min(axis=0)
+    span = float((centers - origin).max())
+    # Small triangles are placed to a fraction of their size, as far as 24 bits go.
+    step = max(span / _FINEST, float(np.quantile(reach, 0.1)) / 128, 1e-30)
+    scales: dict[str, Any] = {
+        "center": {"origin": origin.tolist(), "step": step},
+        "size": {"least": least, "per_octave": _SIZES_PER_OCTAVE},
+        "offset": {"steps": _OFFSET_STEPS},
+    }
+    table = {
+        "center": np.rint((centers - origin) / step).clip(0, _FINEST),
+        "size": size[:, None],
+        "offsets": np.rint(offsets / unit[:, None]).clip(-_OFFSET_STEPS, _OFFSET_STEPS),
+    }
+    colors, more = _quantised_colors(soup)
+    return {**scales, **colors}, {name: values.astype(np.int64) for name, values in {**table, **more}.items()}
+
+
+def _quantised_colors(soup: CompactSoup) -> tuple[dict[str, Any], Places]:
+    if soup.corner_colors is not None:
+        return {}, {"colors": np.rint(soup.corner_colors.reshape(-1, 9) * 255).clip(0, 255)}
+    assert soup.opacities is not None
+    assert soup.sigma is not None
+    assert soup.harmonics is not None
+    logs = np.log(np.maximum(soup.sigma.astype(np.float64), 1e-30))
+    low, high = float(logs.min()), float(logs.max())
+    rest = soup.harmonics[:, 1:].reshape(len(soup), -1).astype(np.float64)
+    # Where coefficients are out of proportion the step grows: 16 bits hold them all.
+    largest = [float(np.abs(values).max(initial=0.0)) / 32767 for values in (soup.harmonics[:, :1], rest)]
+    constant, band = max(_CONSTANT_STEP, largest[0]), max(_BAND_STEP, largest[1])
+    sigma_step = max((high - low) / 255, 1e-9)
+    scales = {
+        "sigma": {"low": low, "step": sigma_step},
+        "constant": {"step": constant},
+        "rest": {"step": band},
+    }
+    return scales, {
+        "opacity": np.rint(soup.opacities[:, None] * 255.0).clip(0, 255),
+        "sigma": np.rint((logs[:, None] - low) / sigma_step).clip(0, 255),
+        "constant": np.rint(soup.harmonics[:, 0] / constant),
+        "rest": np.rint(rest / band),
+    }
+
+
+def _restored(header: Mapping[str, Any], table: Places) -> CompactSoup:
+    """Whole numbers to what they stand for."""
+    centers = np.array(header["center"]["origin"]) + header["center"]["step"] * table["center"]
+    size = header["size"]["least"] * 2.0 ** (table["size"] / header["size"]["per_octave"])
+    first = (size / header["offset"]["steps"] * table["offsets"]).reshape(-1, 2, 3)
+    offsets = np.concatenate([first, -first.sum(axis=1, keepdims=True)], axis=1)
+    place: dict[str, Any] = {
+        "vertices": (centers[:, None] + offsets).astype(np.float32),
+        "appearance": header["appearance"],
+        "notes": header["notes"],
+        "left_out": header["count"] - len(centers),
+    }
+    if not header["bases"]:
+        return CompactSoup(**place, corner_colors=(table["colors"].reshape(-1, 3, 3) / 255).astype(np.float32))
+    bands = [header["constant"]["step"] * table["constant"], header["rest"]["step"] * table["rest"]]
+    harmonics = np.concatenate(bands, axis=1).reshape(len(centers), header["bases"], 3)
+    sigma = np.exp(header["sigma"]["low"] + header["sigma"]["step"] * table["sigma"][:, 0])
+    return CompactSoup(
+        **place,
+        opacities=(table["opacity"][:, 0] / 255).astype(np.float32),
+        sigma=sigma.astype(np.float32),
+        harmonics=harmonics.astype(np.float32),
+    )
+
+
+def _header(data: bytes) -> tuple[dict[str, Any], int]:
+    """What the header says, and where the first chunk begins. Raises ValueError."""
+    if len(data) < _HEAD.size or data[:4] != MAGIC:
+        raise ValueError("it is no compact soup")
+    _, version, length = _HEAD.unpack_from(data)
+    if version != VERSION:
+        raise ValueError(f"it is of version {version}, and this etsplat reads version {VERSION}")
+    if _HEAD.size + length > len(data):
+        raise ValueError("it is cut short before its first triangles")
+    header = parse_json(data[_HEAD.size : _HEAD.size + length])
+    kinds = {"count": int, "bases": int, "center": dict, "center.step": float, "size": dict, "size.least": float}
+    kinds |= {"size.per_octave": float, "offset": dict, "offset.steps": float, "appearance": dict, "notes": dict}
+    if isinstance(header, dict) and header.get("bases"):
+        kinds |= {"sigma": dict, "sigma.low": float, "sigma.step": float}
+        kinds |= {"constant": dict, "constant.step": float, "rest": dict, "rest.step": float}
+    if problem := entries_problem(header, kinds, kinds):
+        raise ValueError(f"its header {problem}")
+    if header["bases"] not in [0, *((degree + 1) ** 2 for degree in range(MAX_DEGREE + 1))]:
+        raise ValueError(f"its header has {header['bases']} bases of colours")
+    origin = header["center"].get("origin")
+    if not (isinstance(origin, list) and len(origin) == 3 and all(map(is_number, origin))):
+        raise ValueError("its header has no origin")
+    _check_scales(header)
+    _check_chunks(header)
+    return header, _HEAD.size + length
+
+
+def _check_scales(header: Mapping[str, Any]) -> None:
+    """Raises ValueError for scales with which numbers would not be finite."""
+    positive = [header["size"]["least"], header["size"]["per_octave"], header["offset"]["steps"]]
+    if min(positive) <= 0 or 255 / header["size"]["per_octave"] + math.log2(header["size"]["least"]) > 120:
+        raise ValueError("its header has sizes that are none")
+    if header["bases"] and abs(header["sigma"]["low"]) + 255 * abs(header["sigma"]["step"]) > 80:
+        raise ValueError("its header has a softness that is none")
+    if not all(isinstance(text, str) for text in header["notes"].values()):
+        raise ValueError("its header has notes that are no text")
+
+
+def _check_chunks(header: Mapping[str, Any]) -> None:
+    """Raises ValueError where what chunks claim to hold is not what their bytes can."""
+    chunks = header.get("chunks")
+    if not isinstance(chunks, list) or not all(_is_pair(chunk) for chunk in chunks):
+        raise ValueError("its header has no chunks")
+    each = row_bytes(_channels(header["bases"]))
+    if any(not 0 < rows <= MOST_ROWS or rows * each > MOST_INFLATED * size for rows, size in chunks):
+        raise ValueError("its header has chunks that cannot hold their triangles")
+    if sum(rows for rows, _ in chunks) != header["count"]:
+        raise ValueError("its header has another number of triangles than its chunks")
+
+
+def _is_pair(chunk: object) -> bool:
+    return (
+        isinstance(chunk, list)
+        and len(chunk) == 2
+        and all(isinstance(number, int) and not isinstance(number, bool) and number > 0 for number in chunk)
+    )
+
+
+def _along_a_curve(centers: np.ndarray) -> np.ndarray:
+    """The order of (n, 3) whole numbers below 2^24 along Morton's curve, on which neighbours are near each other."""
+    code = np.zeros(len(centers), np.int64)
+    for axis, values in enumerate(centers.T):
+        spread = values.astype(np.int64) >> 3  # 21 bits of each axis are 63
+        for shift, mask in _SPREADING:
+            spread = (spread | (spread << shift)) & mask
+        code |= spread << axis
+    return np.argsort(code, kind="stable")
+
+
+_SPREADING: Sequence[tuple[int, int]] = (
+    (32, 0x1F00000000FFFF),
+    (16, 0x1F0000FF0000FF),
+    (8, 0x100F00F00F00F00F),
+    (4, 0x10C30C30C30C30C3),
+    (2, 0x1249249249249249),
+)

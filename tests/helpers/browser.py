@@ -1,0 +1,132 @@
+"""A browser without a window that opens pages of this package: Chromium, with WebGL in software."""
+
+import base64
+import io
+import json
+import os
+import shutil
+import subprocess
+import time
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+FLAGS = (
+    *("--headless=new", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
+    *("--no-first-run", "--disable-extensions", "--disable-background-networking", "--disable-dev-shm-usage"),
+    *("--hide-scrollbars", "--remote-debugging-port=0"),
+)
+PATIENCE = 120.0
+"""Seconds for any answer."""
+
+
+def find_browser() -> str | None:
+    """Where the browser is, if there is one."""
+    return next((path for name in NAMES if (path := shutil.which(name))), None)
+
+
+class Page:
+    """An open page, which is asked by the protocol of the browser's own tools."""
+
+    def __init__(self, connection: Any) -> None:
+        self._connection, self._count = connection, 0
+        self.errors: list[str] = []
+        for domain in ("Page", "Runtime", "Network"):
+            self.ask(f"{domain}.enable")
+
+    def ask(self, method: str, **parameters: Any) -> dict[str, Any]:
+        """The answer to a command. What the page reports meanwhile as an error is kept."""
+        self._count += 1
+        self._connection.send(json.dumps({"id": self._count, "method": method, "params": parameters}))
+        while True:
+            said = json.loads(self._connection.recv(timeout=PATIENCE))
+            if said.get("method") == "Runtime.exceptionThrown":
+                self.errors.append(json.dumps(said["params"]["exceptionDetails"])[:2000])
+            if said.get("method") == "Network.requestWillBeSent":
+                address = said["params"]["request"]["url"]
+                if not address.startswith(("file:", "data:", "blob:")):
+                    self.errors.append(f"asked for {address}")
+            if said.get("id") == self._count:
+                assert "error" not in said, said
+                return said["result"]
+
+    def open(self, path: Path, width: int = 1280, height: int = 720, *, phone: bool = False) -> None:
+        """Opens a file in a window of so many pixels."""
+        scale = 2 if phone else 1
+        self.ask(
+            "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=scale, mobile=phone
+        )
+        self.visit(path.resolve().as_uri())
+
+    def visit(self, address: str) -> None:
+        """Goes to an address, and waits until what is there has come."""
+        self.ask("Page.navigate", url=address)
+        end = time.monotonic() + PATIENCE
+        while self.value("document.readyState === 'complete' ? location.href : ''") != address:
+            assert time.monotonic() < end
+            time.sleep(0.05)
+
+    def value(self, code: str) -> Any:
+        """What an expression, or the promise that it is, comes to; waits until the page knows its names."""
+        end = time.monotonic() + PATIENCE
+        while True:
+            found = self.ask("Runtime.evaluate", expression=code, awaitPromise=True, returnByValue=True)
+            if "exceptionDetails" not in found:
+                return found["result"].get("value")
+            assert "ReferenceError" in json.dumps(found), found
+            assert time.monotonic() < end, found
+            time.sleep(0.1)
+
+    def picture(self, code: str) -> np.ndarray:
+        """(H, W, 3) in [0, 1] of a canvas, or of the promise of one."""
+        return self._decoded(self.value(f"(async () => (await ({code})).toDataURL('image/png'))()").split(",")[1])
+
+    def screenshot(self) -> np.ndarray:
+        """(H, W, 3) in [0, 1] of the window."""
+        return self._decoded(self.ask("Page.captureScreenshot", format="png")["data"])
+
+    def _decoded(self, text: str) -> np.ndarray:
+        return np.asarray(Image.open(io.BytesIO(base64.b64decode(text))).convert("RGB")) / 255
+
+
+@contextmanager
+def browser_page() -> Iterator[Page]:
+    """A page of a browser of its own.
+
+    Raises:
+        AssertionError: there is no browser.
+    """
+    from websockets.sync.client import connect
+
+    program = find_browser()
+    assert program is not None
+    with TemporaryDirectory(ignore_cleanup_errors=True) as profile:
+        root = ["--no-sandbox"] if hasattr(os, "geteuid") and os.geteuid() == 0 else []
+        command = [program, *FLAGS, *root, f"--user-data-dir={profile}", "about:blank"]
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        try:
+            port = _port(Path(profile) / "DevToolsActivePort", process)
+            with urllib.request.urlopen(f"http://127.0.0.1:{port}/json/list", timeout=PATIENCE) as answer:
+                pages = [page for page in json.load(answer) if page["type"] == "page"]
+            with connect(pages[0]["webSocketDebuggerUrl"], max_size=None, compression=None) as connection:
+                yield Page(connection)
+        finally:
+            process.terminate()
+            process.wait(PATIENCE)
+
+
+def _port(file: Path, process: "subprocess.Popen[bytes]") -> int:
+    end = time.monotonic() + PATIENCE
+    while time.monotonic() < end:
+        assert process.poll() is None, "the browser ended"
+        if file.is_file() and (lines := file.read_text().splitlines()):
+            return int(lines[0])
+        time.sleep(0.05)
+    raise AssertionError("the browser does not answer")

@@ -1,0 +1,131 @@
+"""What a binary glTF file must be, checked on its bytes: the rules of the specification that our files can break."""
+
+import io
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+_TYPES = {5121: "u1", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+_ATTRIBUTES = {"POSITION": "VEC3", "NORMAL": "VEC3", "TANGENT": "VEC4", "TEXCOORD_0": "VEC2", "COLOR_0": "VEC4"}
+_ARRAYS, _INDICES = 34962, 34963
+
+
+def read_glb(path: Path) -> tuple[dict[str, Any], bytes]:
+    """The document and the buffer of a file whose header and two chunks are as they must be."""
+    data = path.read_bytes()
+    magic, version, length = struct.unpack("<4sII", data[:12])
+    assert (magic, version, length) == (b"glTF", 2, len(data))
+    size, kind = struct.unpack("<I4s", data[12:20])
+    assert (kind, size % 4) == (b"JSON", 0)
+    text, rest = data[20 : 20 + size], data[20 + size :]
+    size, kind = struct.unpack("<I4s", rest[:8])
+    assert (kind, size % 4, size) == (b"BIN\0", 0, len(rest) - 8)
+    return json.loads(text.decode("utf-8"), parse_constant=_refuse), rest[8:]
+
+
+def array_of(document: dict[str, Any], buffer: bytes, number: int) -> np.ndarray:
+    """What an accessor holds, a row for each element."""
+    accessor = document["accessors"][number]
+    view = document["bufferViews"][accessor["bufferView"]]
+    kind, width = _TYPES[accessor["componentType"]], _WIDTHS[accessor["type"]]
+    start = view["byteOffset"] + accessor.get("byteOffset", 0)
+    found = np.frombuffer(buffer, kind, accessor["count"] * width, start)
+    assert start % found.itemsize == 0
+    assert accessor.get("byteOffset", 0) + found.nbytes <= view["byteLength"]
+    return found.reshape(accessor["count"], width)
+
+
+def check_glb(path: Path) -> dict[str, Any]:
+    """The document of a file in which everything fits together; AssertionError where something does not."""
+    document, buffer = read_glb(path)
+    assert document["asset"]["version"] == "2.0"
+    assert [entry["byteLength"] for entry in document["buffers"]] == [len(buffer)]
+    end = 0
+    for view in document["bufferViews"]:
+        assert view["byteOffset"] % 4 == 0
+        assert view["byteOffset"] >= end, "views overlap"
+        end = view["byteOffset"] + view["byteLength"]
+        assert 0 < view["byteLength"] <= len(buffer) - view["byteOffset"]
+    for mesh in document["meshes"]:
+        assert mesh["primitives"]
+        for primitive in mesh["primitives"]:
+            _check_primitive(document, buffer, primitive)
+    for image in document.get("images", []):
+        view = document["bufferViews"][image["bufferView"]]
+        assert "target" not in view
+        with Image.open(io.BytesIO(buffer[view["byteOffset"] : view["byteOffset"] + view["byteLength"]])) as picture:
+            assert f"image/{picture.format}".lower() == image["mimeType"]
+    _check_references(document)
+    return document
+
+
+def _check_primitive(document: dict[str, Any], buffer: bytes, primitive: dict[str, Any]) -> None:
+    arrays = {name: array_of(document, buffer, number) for name, number in primitive["attributes"].items()}
+    vertices = len(arrays["POSITION"])
+    for name, number in primitive["attributes"].items():
+        accessor = document["accessors"][number]
+        assert accessor["type"] == _ATTRIBUTES[name]
+        assert document["bufferViews"][accessor["bufferView"]]["target"] == _ARRAYS
+        assert len(arrays[name]) == vertices
+        assert np.isfinite(arrays[name]).all()
+    position = document["accessors"][primitive["attributes"]["POSITION"]]
+    assert position["min"] == arrays["POSITION"].min(axis=0).tolist()
+    assert position["max"] == arrays["POSITION"].max(axis=0).tolist()
+    for name in ("NORMAL", "TANGENT"):
+        if name in arrays:
+            assert np.allclose(np.linalg.norm(arrays[name][:, :3].astype(float), axis=1), 1, atol=5e-4)
+    if "TANGENT" in arrays:
+        assert np.isin(arrays["TANGENT"][:, 3], (-1, 1)).all()
+    if "COLOR_0" in arrays:
+        assert ((arrays["COLOR_0"] >= 0) & (arrays["COLOR_0"] <= 1)).all()
+    accessor = document["accessors"][primitive["indices"]]
+    assert document["bufferViews"][accessor["bufferView"]]["target"] == _INDICES
+    indices = array_of(document, buffer, primitive["indices"])
+    assert accessor["type"] == "SCALAR"
+    assert accessor["componentType"] != 5126
+    assert len(indices) % 3 == 0 < len(indices)
+    assert indices.max() < min(vertices, 2 ** (8 * indices.itemsize) - 1)
+
+
+def _check_references(document: dict[str, Any]) -> None:
+    """Everything that is named is there, and nothing is there that is not used."""
+    used: dict[str, set[int]] = {key: set() for key in ("accessors", "materials", "textures", "images", "samplers")}
+    for mesh in document["meshes"]:
+        for primitive in mesh["primitives"]:
+            used["accessors"] |= {primitive["indices"], *primitive["attributes"].values()}
+            used["materials"].add(primitive["material"])
+            textures = list(_textures(document["materials"][primitive["material"]]))
+            used["textures"] |= set(textures)
+            assert bool(textures) == ("TEXCOORD_0" in primitive["attributes"])
+    for texture in document.get("textures", []):
+        used["images"].add(texture["source"])
+        used["samplers"].add(texture["sampler"])
+    views = [entry["bufferView"] for key in ("accessors", "images") for entry in document.get(key, [])]
+    assert sorted(views) == list(range(len(document["bufferViews"])))
+    for key, numbers in used.items():
+        assert numbers == set(range(len(document.get(key, [])))), key
+        assert key not in document or document[key], f"{key} is empty"
+    nodes = range(len(document["nodes"]))
+    assert [scene["nodes"] for scene in document["scenes"]] == [list(nodes)]
+    assert {node["mesh"] for node in document["nodes"]} == set(range(len(document["meshes"])))
+    extensions = {name for material in document["materials"] for name in material.get("extensions", {})}
+    assert set(document.get("extensionsUsed", [])) == extensions
+    assert "extensionsUsed" not in document or document["extensionsUsed"]
+
+
+def _textures(entry: Any) -> Any:
+    """Numbers of all textures that a material names."""
+    for name, value in entry.items():
+        if name.endswith("Texture"):
+            yield value["index"]
+        elif isinstance(value, dict):
+            yield from _textures(value)
+
+
+def _refuse(name: str) -> None:
+    raise AssertionError(f"{name} is no JSON")

@@ -1,0 +1,53 @@
+"""What photos say of how they were taken, also where they say it badly."""
+
+import io
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from etsplat.io.exif import TakenWith, on_its_side, taken_with, turn_of, upright_exif
+from helpers.photos import STORED_AS, exif_bytes, upright_picture
+
+
+def with_exif(exif: bytes, kind: str = "JPEG") -> Image.Image:
+    memory = io.BytesIO()
+    upright_picture().save(memory, kind, exif=exif)
+    return Image.open(memory)
+
+
+@pytest.mark.parametrize("kind", ["JPEG", "PNG"])
+@pytest.mark.parametrize("orientation", STORED_AS)
+def test_a_stored_picture_is_turned_upright(orientation, kind):
+    """For each of the eight ways of storing one."""
+    turn, stored_as = turn_of(with_exif(exif_bytes(orientation), kind)), STORED_AS[orientation]
+    upright = upright_picture()
+    stored = upright if stored_as is None else upright.transpose(stored_as)
+    assert np.array_equal(np.asarray(stored if turn is None else stored.transpose(turn)), np.asarray(upright))
+    assert on_its_side(with_exif(exif_bytes(orientation), kind)) == (stored.size != upright.size)
+
+
+def test_the_camera_and_its_focal_length_are_read_and_kept_in_upright_copies():
+    exif = exif_bytes(6, "Phone 7", 4.25, 28)
+    expected = TakenWith("", "Phone 7", 4.25, 28.0)
+    assert taken_with(with_exif(exif)) == expected
+    copy = with_exif(upright_exif(with_exif(exif)))
+    assert taken_with(copy) == expected
+    assert turn_of(copy) is None
+    assert upright_exif(Image.open(io.BytesIO(with_exif(b"").fp.getvalue()))) == b""  # pyright: ignore
+
+
+@pytest.mark.filterwarnings("ignore")  # pytest does not know the filter of the module
+def test_tags_that_make_no_sense_count_as_not_there():
+    """Orientation 9, focal lengths of nothing, and EXIF cut short or full of noise, which leaves the picture usable."""
+    assert turn_of(with_exif(exif_bytes(9))) is None
+    assert taken_with(with_exif(exif_bytes(1, focal_mm=1e-9))).focal_mm == 0
+    whole, rng = exif_bytes(6, "Phone 7", 4.25, 28), np.random.default_rng(0)
+    for _ in range(300):
+        data = bytearray(whole[: int(rng.integers(7, len(whole) + 1))])
+        for at in rng.integers(6, len(data), 3):
+            data[at] = rng.integers(256)
+        image = with_exif(bytes(data))
+        assert turn_of(image) is None or turn_of(image) in STORED_AS.values()
+        assert 0 <= taken_with(image).focal_mm <= 10_000
+        upright_exif(image)
