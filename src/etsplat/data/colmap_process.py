@@ -8,17 +8,27 @@ import multiprocessing
 import os
 import signal
 import sqlite3
-import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 from etsplat.core.errors import InputError
 from etsplat.core.processes import when_parent_ends
 
 Progress = Callable[[str, int, int], None]
+"""Called with (phase, done, of how many)."""
+
+Report = Callable[..., None]
+"""The same within the process of its own; a fourth argument is what counts from then on, asked in the other process."""
+
+_POLL_SECONDS = 0.5
+
 Result = TypeVar("Result")
+
+Mapper = Literal["incremental", "global"]
+"""Cameras one after the other; or all at once (GLOMAP)."""
 
 NEIGHBOURS = 15
 """Photos on either side, in order of names, that one is compared with where not every pair is."""
@@ -46,7 +56,7 @@ def run_apart(function: Callable[..., Result], *arguments: Any, report: Progress
     Args:
         function: of a module; it, its arguments and its result can be pickled.
         arguments: all but the first.
-        report: called here with what it reports there.
+        report: called here with what it reports there, and with what is counted here meanwhile.
 
     Raises:
         RuntimeError: the process came to a sudden end.
@@ -57,15 +67,24 @@ def run_apart(function: Callable[..., Result], *arguments: Any, report: Progress
     process = context.Process(target=_serve, args=(sender, function, arguments), daemon=True)
     process.start()
     sender.close()  # so that the end of the other process ends the pipe
+    phase, total, count = "", 0, None
     try:
         while True:
+            if not receiver.poll(_POLL_SECONDS):
+                # What is counted may not be there yet, or be locked: then the next poll tells.
+                with contextlib.suppress(sqlite3.Error, OSError):
+                    if report is not None and count is not None:
+                        report(phase, min(count(), total), total)
+                continue
             kind, value = receiver.recv()
             if kind == "result":
                 return value
             if kind == "error":
                 raise value
+            phase, done, total, *counts = value
+            count = counts[0] if counts else None
             if report is not None:
-                report(*value)
+                report(phase, done, total)
     except EOFError as error:
         process.join()
         raise RuntimeError(f"a sudden end, exit status {process.exitcode}") from error
@@ -88,84 +107,161 @@ def _serve(sender: Connection, function: Callable[..., Any], arguments: tuple[An
     sender.send(answer)
 
 
-def place_photos(
-    report: Progress,
-    photos: Path,
-    names: list[str],
-    work: Path,
-    exhaustive: bool,
-    one_camera: bool,
-    max_size: int,
-    threads: int,
-) -> Path | None:
-    """Structure from motion. The folder of the largest model within `work`, if there is one."""
+@dataclass(frozen=True)
+class Rows:
+    """Counts the rows of a table of COLMAP's database.
+
+    Never in COLMAP's own process: another SQLite in it takes the locks for its own, cuts the file that both have in
+    memory, and the next access ends the process.
+    """
+
+    database: Path
+    table: str
+
+    def __call__(self) -> int:
+        """Raises sqlite3.Error where it cannot be read just now."""
+        connection = sqlite3.connect(f"{self.database.resolve().as_uri()}?mode=ro", uri=True, timeout=0.1)
+        try:
+            return connection.execute(f"SELECT count(*) FROM {self.table}").fetchone()[0]
+        finally:
+            connection.close()
+
+
+@dataclass(frozen=True)
+class Files:
+    """Counts the files in a folder and its subfolders."""
+
+    folder: Path
+
+    def __call__(self) -> int:
+        """Raises OSError where it cannot be read just now."""
+        return sum(path.is_file() for path in self.folder.rglob("*"))
+
+
+@dataclass(frozen=True)
+class Job:
+    """What structure from motion is to do.
+
+    Attributes:
+        photos: folder of the photos.
+        cameras: names of photos in it, those with one camera together.
+        work: folder for the database and the models.
+        exhaustive: whether every pair is compared; else those near in order of names.
+        mapper: cameras one after the other, or all at once.
+        max_size: features are looked for in pictures that are no longer than so many pixels.
+        threads: -1 for all cores.
+        masks: folder with a PNG file for each photo, black where no features are to be looked for; None for none.
+    """
+
+    photos: Path
+    cameras: list[list[str]]
+    work: Path
+    exhaustive: bool
+    mapper: Mapper
+    max_size: int
+    threads: int
+    masks: Path | None
+
+    @property
+    def names(self) -> list[str]:
+        """Of all photos, in order."""
+        return sorted(name for camera in self.cameras for name in camera)
+
+
+def place_photos(report: Report, job: Job) -> Path | None:
+    """Structure from motion. The folder of the largest model within `job.work`, if there is one."""
     pycolmap = import_pycolmap()
-    database = work / "database.db"
-    mode = pycolmap.CameraMode.SINGLE if one_camera else pycolmap.CameraMode.AUTO
-    options = pycolmap.FeatureExtractionOptions(max_image_size=max_size, num_threads=threads, use_gpu=False)
-    with _polled(database, "keypoints", "Finding features", len(names), report):
-        pycolmap.extract_features(
-            database, photos, names, camera_mode=mode, extraction_options=options, device=pycolmap.Device.cpu
-        )
+    database = job.work / "database.db"
+    _find_features(pycolmap, database, job, report)
+    _compare(pycolmap, database, job, report)
+    (job.work / "models").mkdir()
+    models = (_place_all if job.mapper == "global" else _place_one_by_one)(pycolmap, database, job, report)
+    largest = max(models, key=lambda index: models[index].num_reg_images(), default=None)
+    if largest is None:
+        return None
+    models[largest].write(_made(job.work / "largest"))
+    return job.work / "largest"
+
+
+def _find_features(pycolmap: Any, database: Path, job: Job, report: Report) -> None:
+    pycolmap.Database.open(database).close()  # which makes it
+    for names in job.cameras:
+        # The first photo's EXIF gives the focal length to start from.
+        pycolmap.import_images(database, job.photos, pycolmap.CameraMode.SINGLE, names)
+    report("Finding features", 0, len(job.names), Rows(database, "keypoints"))
+    pycolmap.extract_features(
+        database,
+        job.photos,
+        job.names,
+        reader_options=pycolmap.ImageReaderOptions(**({} if job.masks is None else {"mask_path": job.masks})),
+        extraction_options=pycolmap.FeatureExtractionOptions(
+            max_image_size=job.max_size, num_threads=job.threads, use_gpu=False
+        ),
+        device=pycolmap.Device.cpu,
+    )
+    report("Finding features", len(job.names), len(job.names))
+
+
+def _compare(pycolmap: Any, database: Path, job: Job, report: Report) -> None:
+    count = len(job.names)
     pairing: dict[str, Any] = {
-        "matching_options": pycolmap.FeatureMatchingOptions(num_threads=threads, use_gpu=False),
+        "matching_options": pycolmap.FeatureMatchingOptions(num_threads=job.threads, use_gpu=False),
         "device": pycolmap.Device.cpu,
     }
-    if exhaustive:
-        pairs, match = len(names) * (len(names) - 1) // 2, pycolmap.match_exhaustive
+    if job.exhaustive:
+        pairs, match = count * (count - 1) // 2, pycolmap.match_exhaustive
     else:
-        pairs, match = len(names) * NEIGHBOURS, pycolmap.match_sequential
+        near = min(NEIGHBOURS, count - 1)
+        pairs, match = near * count - near * (near + 1) // 2, pycolmap.match_sequential
         pairing["pairing_options"] = pycolmap.SequentialPairingOptions(overlap=NEIGHBOURS, loop_detection=False)
-    with _polled(database, "matches", "Comparing photos", pairs, report):
-        match(database, **pairing)
-    count = 0
+    report("Comparing photos", 0, pairs, Rows(database, "matches"))
+    match(database, **pairing)
+    report("Comparing photos", pairs, pairs)
+
+
+def _place_one_by_one(pycolmap: Any, database: Path, job: Job, report: Report) -> dict[int, Any]:
+    placed, count = 0, len(job.names)
 
     def placed_one() -> None:
-        nonlocal count
-        count += 1
-        report("Placing cameras", min(count + 1, len(names)), len(names))
+        nonlocal placed
+        placed += 1
+        report("Placing cameras", min(placed + 1, count), count)
 
-    report("Placing cameras", 0, len(names))
-    (work / "models").mkdir()
-    models = pycolmap.incremental_mapping(
+    report("Placing cameras", 0, count)
+    return pycolmap.incremental_mapping(
         database,
-        photos,
-        work / "models",
-        options=pycolmap.IncrementalPipelineOptions(num_threads=threads),
+        job.photos,
+        job.work / "models",
+        options=pycolmap.IncrementalPipelineOptions(num_threads=job.threads),
         next_image_callback=placed_one,
     )
-    largest = max(models, key=lambda index: models[index].num_reg_images(), default=None)
-    return None if largest is None else work / "models" / str(largest)
 
 
-@contextlib.contextmanager
-def _polled(database: Path, table: str, phase: str, total: int, report: Progress) -> Iterator[None]:
-    """Reports rows of a table of COLMAP's database every half second: its functions tell nothing themselves."""
-    finished = threading.Event()
+def _place_all(pycolmap: Any, database: Path, job: Job, report: Report) -> dict[int, Any]:
+    report("Placing all cameras at once", 0, 0)
+    if not all(camera.has_prior_focal_length for camera in _cameras(pycolmap, database)):
+        pycolmap.calibrate_view_graph(database)  # focal lengths from pairs of photos
+    options = pycolmap.GlobalPipelineOptions(num_threads=job.threads)
+    return pycolmap.global_mapping(database, job.photos, job.work / "models", options)
 
-    def poll() -> None:
-        while not finished.wait(0.5):
-            # The database may not be there yet, or be locked: then the next poll tells.
-            with contextlib.suppress(sqlite3.Error):
-                connection = sqlite3.connect(f"file:{database}?mode=ro", uri=True, timeout=0.1)
-                try:
-                    rows = connection.execute(f"SELECT count(*) FROM {table}").fetchone()[0]
-                finally:
-                    connection.close()
-                report(phase, min(rows, total), total)
 
-    report(phase, 0, total)
-    thread = threading.Thread(target=poll, daemon=True)
-    thread.start()
+def _cameras(pycolmap: Any, database: Path) -> list[Any]:
+    opened = pycolmap.Database.open(database)
     try:
-        yield
+        return opened.read_all_cameras()
     finally:
-        finished.set()
-        thread.join()
+        opened.close()
 
 
-def undistort_images(report: Progress, model: Path, photos: Path, names: list[str], scene: Path, max_size: int) -> None:
+def _made(folder: Path) -> Path:
+    folder.mkdir()
+    return folder
+
+
+def undistort_images(report: Report, model: Path, photos: Path, names: list[str], scene: Path, max_size: int) -> None:
     """Writes `names` of `photos` without distortion, and a model for them, into the folder `scene`."""
     pycolmap = import_pycolmap()
     options = pycolmap.UndistortCameraOptions(max_image_size=max_size)
+    report("Removing lens distortion", 0, len(names), Files(scene / "images"))
     pycolmap.undistort_images(scene, model, photos, names, undistort_options=options)
+    report("Removing lens distortion", len(names), len(names))

@@ -12,6 +12,7 @@ from torch import Tensor
 from etsplat.core.cameras import Cameras, camera_centers
 from etsplat.core.errors import InputError
 from etsplat.data.pictures import Pictures, as_float, halved
+from etsplat.io.georeference import Georeference
 
 WATCHED_ONE_IN, WATCHED_FROM = 16, 24
 """One in so many training photos is kept aside to watch runs by, where there are at least so many."""
@@ -56,10 +57,12 @@ class Dataset:
         names: B names, unique, fit for files.
         train: indices of the views to optimise on, ascending.
         test: indices of the views held out, ascending. Disjoint from `train`.
-        watched: indices of the views kept from training to watch runs by, ascending. Disjoint from both.
         exact_points: (P, 3) float64, P > 0, or None.
         point_colors: (P, 3) float32 in [0, 1] as displayed, or None without points.
         normalization: from the input's own units to the present frame.
+        watched: indices of the views kept from training to watch runs by, ascending. Disjoint from both.
+        notes: sentences about what of the input is left out or not understood.
+        georeference: where the input's own units lie in the world; None where nobody said so.
 
     Raises:
         ValueError: fields that contradict each other.
@@ -75,6 +78,8 @@ class Dataset:
     point_colors: Float[Tensor, "P 3"] | None = None
     normalization: Normalization = field(default_factory=Normalization)
     watched: list[int] = field(default_factory=list)
+    notes: tuple[str, ...] = ()
+    georeference: Georeference | None = None
 
     def __post_init__(self) -> None:
         B = len(self.viewmats)

@@ -9,6 +9,8 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
 
 from etsplat.core.cameras import Cameras, intrinsics, look_at, sphere_grid
 from etsplat.data.dataset import Dataset, every_eighth
@@ -39,8 +41,7 @@ def demo_scene(
         height: of the photos, in pixels.
         progress: called with (photos taken, photos in all).
     """
-    corners, colors = (np.concatenate(parts) for parts in zip(*_parts(), strict=True))
-    vertices, base = torch.from_numpy(corners.astype(np.float32)), torch.from_numpy(colors.astype(np.float32))
+    vertices, base = demo_surface()
     rings = [
         sphere_grid([elevation], [360 / 21 * k + 8 * elevation for k in range(21)], 4.2) for elevation in (16.0, 38.0)
     ]
@@ -50,7 +51,7 @@ def demo_scene(
     photos = []
     with one_torch_thread():
         for index, viewmat in enumerate(viewmats):
-            photos.append(_photo(vertices, base, Cameras(viewmat[None], K[None], width, height)))
+            photos.append(demo_photo(vertices, base, Cameras(viewmat[None], K[None], width, height)))
             if progress is not None:
                 progress(index + 1, len(viewmats))
     names = [f"view_{index:02d}" for index in range(len(viewmats))]
@@ -68,8 +69,14 @@ def demo_scene(
     )
 
 
-def _photo(vertices: torch.Tensor, base: torch.Tensor, camera: Cameras) -> torch.Tensor:
-    """(H, W, 3) bytes; the part of the colour above 1 in blue marks how shiny a face is."""
+def demo_surface() -> tuple[Float[Tensor, "F 3 3"], Float[Tensor, "F 3"]]:
+    """Corners and colours of all faces of the scene, its sky among them; blue above 1 marks a face as shiny."""
+    corners, colors = (np.concatenate(parts) for parts in zip(*_parts(), strict=True))
+    return torch.from_numpy(corners.astype(np.float32)), torch.from_numpy(colors.astype(np.float32))
+
+
+def demo_photo(vertices: Float[Tensor, "F 3 3"], base: Float[Tensor, "F 3"], camera: Cameras) -> UInt8[Tensor, "H W 3"]:
+    """A photograph of the surface that `demo_surface` gives, by a camera anywhere: (H, W, 3) bytes."""
     first, second = vertices[:, 1] - vertices[:, 0], vertices[:, 2] - vertices[:, 0]
     normals = torch.nn.functional.normalize(torch.linalg.cross(first, second), dim=1)
     towards = torch.nn.functional.normalize(camera.centers - vertices.mean(dim=1), dim=1)

@@ -5,7 +5,8 @@ import os
 from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Literal
 
@@ -16,15 +17,17 @@ from torch import Tensor
 from etsplat.core.errors import InputError
 from etsplat.data.dataset import Dataset, every_eighth
 from etsplat.data.pictures import LazyPictures, Picture
+from etsplat.io.depth_maps import DEPTH_SUFFIXES, load_depth, resize_depth
+from etsplat.io.georeference import Georeference
 from etsplat.io.images import (
     IMAGE_SUFFIXES,
-    image_size,
     load_image,
     load_mask,
     load_mask_pixels,
     load_pixels,
     premultiply,
     resize_image,
+    size_for,
 )
 from etsplat.io.paths import kind_of, path_remedy, path_within
 
@@ -36,6 +39,9 @@ _SAMPLE = 4096
 
 LARGEST = 1e18
 """Of all numbers of poses and cameras: float32 holds their squares."""
+
+DEPTH_FOLDERS = ("depths", "depth")
+"""Of a scene, with a depth map for each image, called like it."""
 
 MasksAs = Literal["ignore", "alpha"]
 
@@ -70,6 +76,8 @@ class Frame:
         K: (3, 3) float64, pixels of an image of `size`.
         size: (width, height) that K refers to; the file may be a smaller or larger copy.
         lens: its distortion, which has to be removed before a data set is made of it; None without.
+        depth: its depth map, or None.
+        depth_unit: units of the capture in a step of the map's numbers; None for what its kind of file has.
     """
 
     name: str
@@ -79,6 +87,27 @@ class Frame:
     K: Float[Tensor, "3 3"]
     size: tuple[int, int]
     lens: Lens | None = None
+    depth: Path | None = None
+    depth_unit: float | None = None
+
+
+@dataclass(frozen=True)
+class Listing:
+    """What the files of a scene say, before an image is opened.
+
+    Attributes:
+        frames: the posed images.
+        split: (train, test) indices; None for every 8th frame as test, the frames being sorted by name.
+        points: of the scene, in the frame of the poses; None without.
+        notes: sentences about what is left out or not understood.
+        georeference: where the frame of the poses lies in the world; None where nobody said so.
+    """
+
+    frames: Sequence[Frame]
+    split: tuple[list[int], list[int]] | None = None
+    points: Points | None = None
+    notes: tuple[str, ...] = ()
+    georeference: Georeference | None = None
 
 
 @dataclass(frozen=True)
@@ -90,15 +119,37 @@ class Wanted:
     width: int | None = None
     masks: Path | None = None
     memory: int | None = None
+    depths: bool | Path = False
+    depth_unit: float | None = None
 
     def mask_of(self, scene: Path, name: str, source: Path) -> Path | None:
         """The mask of image `name`, which the file `source` names: in `masks`, or in the scene's own, if it has any.
+
+        By the name with the folders in it, or else by its last part.
 
         Raises:
             InputError: the folder lacks it; or as `path_within`.
         """
         folder = self.masks or scene / "masks"
-        return find_mask(folder, name, source) if self.masks or folder.is_dir() else None
+        if self.masks is None and not folder.is_dir():
+            return None
+        with suppress(InputError):
+            return find_mask(folder, name, source)
+        return find_mask(folder, PurePosixPath(name).name, source)
+
+    def depth_of(self, scene: Path, name: str, source: Path) -> Path | None:
+        """The depth map of image `name`: in the folder `depths`, or in the scene's own; None if it has none.
+
+        Raises:
+            InputError: there is no such folder; or as `path_within`.
+        """
+        if self.depths is False:
+            return None
+        folders = [scene / own for own in DEPTH_FOLDERS] if self.depths is True else [self.depths]
+        if self.depths is not True and not self.depths.is_dir():
+            raise InputError(f"depths {self.depths}: no such folder; {path_remedy(self.depths)}")
+        paths = [path_within(folder, name, source) for folder in folders]
+        return next((found for path in paths if (found := _with_any_ending(path, DEPTH_SUFFIXES))), None)
 
 
 def pinhole(fx: float, fy: float, cx: float, cy: float) -> Float[Tensor, "3 3"]:
@@ -106,27 +157,19 @@ def pinhole(fx: float, fy: float, cx: float, cy: float) -> Float[Tensor, "3 3"]:
     return torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
 
 
-def posed(
-    scene: Path,
-    frames: Sequence[Frame],
-    wanted: Wanted,
-    *,
-    split: tuple[list[int], list[int]] | None = None,
-    points: Points | None = None,
-) -> Dataset:
+def posed(scene: Path, listing: Listing, wanted: Wanted) -> Dataset:
     """The data set of a scene's frames in its own units; no image has been decoded yet.
 
     Args:
         scene: its folder, for error messages.
-        frames: of one scene.
+        listing: what its files say.
         wanted: width and kind of the images.
-        split: (train, test) indices; None for every 8th frame as test, `frames` being sorted by name.
-        points: of the scene, P > 0.
 
     Raises:
         InputError: fewer than two frames, frames with one name, missing images, images of another shape than their
             camera, lens distortion, numbers beyond `LARGEST`.
     """
+    frames, points = listing.frames, listing.points
     check_frames(scene, frames)
     for frame in frames:
         if frame.lens is not None:
@@ -140,26 +183,41 @@ def posed(
         raise InputError(f"scene {scene}: has {len(frames)} posed images; at least 2 are needed, better 20")
     Ks, sizes = [], []
     for frame in frames:
-        size = image_size(frame.image)
+        size = size_for(frame.image, frame.size)
         across = min(size[0], wanted.width or MAX_WIDTH)
         sizes.append((across, max(1, round(size[1] * across / size[0]))))
         Ks.append(scaled_intrinsics(scene, frame, size, sizes[-1]))
     decode = _DECODERS[wanted.masks_as]
-    files = [file for frame in frames for file in (frame.image, frame.mask) if file is not None]
+    files = [file for frame in frames for file in (frame.image, frame.mask, frame.depth) if file is not None]
+    units = {frame.depth_unit for frame in frames if frame.depth is not None}
+
+    def make(view: int) -> Picture:
+        frame, size = frames[view], sizes[view]
+        picture = decode(frame, size)
+        return picture if frame.depth is None else replace(picture, depth=_depth(frame.depth, frame.depth_unit, size))
+
     pictures = LazyPictures(
-        lambda view: decode(frames[view], sizes[view]),
+        make,
         sizes,
         [_size_in_bytes(frame, size, wanted.masks_as) for frame, size in zip(frames, sizes, strict=True)],
-        lambda: _fingerprint(files),
+        lambda: _fingerprint(files) + (repr(sorted(map(str, units))).encode() if units else b""),
         wanted.memory,
+        [view for view, frame in enumerate(frames) if frame.depth is not None],
     )
-    train, test = split or every_eighth(len(frames))
+    train, test = listing.split or every_eighth(len(frames))
     viewmats = torch.stack([frame.viewmat for frame in frames])
-    return Dataset(viewmats, torch.stack(Ks), pictures, _view_names(frames), train, test, *(points or (None, None)))
+    names, (places, colors) = _view_names(frames), points or (None, None)
+    return Dataset(
+        *(viewmats, torch.stack(Ks), pictures, names, train, test, places, colors),
+        notes=listing.notes,
+        georeference=listing.georeference,
+    )
 
 
 def check_frames(scene: Path, frames: Sequence[Frame]) -> None:
     """Raises InputError where two have one name, images are missing, or numbers cannot be meant."""
+    if not frames:
+        raise InputError(f"scene {scene}: has no posed images; at least 2 are needed, better 20")
     name, count = Counter(frame.name for frame in frames).most_common(1)[0]
     if count > 1:
         raise InputError(f"scene {scene}: {count} frames have the image {name}; keep one of them")
@@ -214,9 +272,9 @@ def find_mask(folder: Path, name: str, source: Path) -> Path:
     return found
 
 
-def _with_any_ending(path: Path) -> Path | None:
-    """The file at a path, or one with an image's ending, small or large, in place of its own or added to it."""
-    endings = [ending for suffix in IMAGE_SUFFIXES for ending in (suffix, suffix.upper())]
+def _with_any_ending(path: Path, suffixes: Sequence[str] = IMAGE_SUFFIXES) -> Path | None:
+    """The file at a path, or one with one of the endings, small or large, in place of its own or added to it."""
+    endings = [ending for suffix in suffixes for ending in (suffix, suffix.upper())]
     candidates = [path, *(path.with_suffix(ending) for ending in endings), *(Path(f"{path}{s}") for s in endings)]
     return next((candidate for candidate in candidates if candidate.is_file()), None)
 
@@ -242,7 +300,8 @@ def scaled_intrinsics(
 def _size_in_bytes(frame: Frame, size: tuple[int, int], masks_as: MasksAs) -> int:
     """An upper bound: PNG files may turn out to have no transparency."""
     channels = (4 if kind_of(frame.image) == ".png" else 3) + (frame.mask is not None)
-    return size[0] * size[1] * (16 if masks_as == "alpha" else channels)
+    depth = 0 if frame.depth is None else 4
+    return size[0] * size[1] * ((16 if masks_as == "alpha" else channels) + depth)
 
 
 def _bytes_and_mask(frame: Frame, size: tuple[int, int]) -> Picture:
@@ -252,7 +311,7 @@ def _bytes_and_mask(frame: Frame, size: tuple[int, int]) -> Picture:
 
 def _masked_rgba(frame: Frame, size: tuple[int, int]) -> Picture:
     """Shrunk in float, after the mask: a silhouette keeps its place to a part of a pixel."""
-    image = premultiply(load_image(frame.image))
+    image = premultiply(load_image(frame.image, frame.size))
     if frame.mask is not None:
         mask = load_mask(frame.mask)
         if mask.shape != image.shape[:2]:
@@ -262,6 +321,15 @@ def _masked_rgba(frame: Frame, size: tuple[int, int]) -> Picture:
             )
         image = image * mask[..., None]
     return Picture(image if size == (image.shape[1], image.shape[0]) else resize_image(image, *size))
+
+
+def _depth(path: Path, unit: float | None, size: tuple[int, int]) -> Float[Tensor, "H W"]:
+    """A depth map in the size of its photo; scanners' are often much smaller."""
+    depth, (width, height) = load_depth(path, unit), size
+    H, W = depth.shape
+    if abs(H * width / W - height) > max(2, width / W):
+        raise InputError(f"depth map {path}: is {W}x{H}, its image is {width}x{height}; resize or crop the map")
+    return resize_depth(depth, width, height)
 
 
 _DECODERS: dict[MasksAs, Callable[[Frame, tuple[int, int]], Picture]] = {

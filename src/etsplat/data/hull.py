@@ -11,7 +11,7 @@ from torch import Tensor
 
 from etsplat.core.cameras import camera_centers
 from etsplat.core.errors import InputError
-from etsplat.data.camera_paths import axes_meeting_point
+from etsplat.data.camera_coverage import axes_meeting_point
 from etsplat.data.dataset import Dataset
 from etsplat.data.silhouettes import silhouette, touches_border
 
@@ -100,7 +100,8 @@ def _silhouettes(dataset: Dataset, names: list[str], steps: np.ndarray) -> list[
     if len(full) == len(names):
         raise InputError(
             "masks: the images have neither transparency nor masks, so the object cannot be told from its background;"
-            " add a folder masks/ with a white-on-black picture for every image"
+            " add a folder masks/ with a white-on-black picture for every image, as `etsplat data masks` writes them of"
+            " an object before a plain background"
         )
     if full:
         raise InputError(

@@ -9,10 +9,11 @@ from typing import Protocol, cast
 from etsplat.core.errors import InputError
 from etsplat.data import formats
 from etsplat.data.dataset import Dataset
-from etsplat.data.frames import MasksAs, Wanted
+from etsplat.data.frames import LARGEST, Listing, MasksAs, Wanted, posed
+from etsplat.data.georeferencing import near_origin
 from etsplat.data.pictures import LazyPictures
-from etsplat.io.images import IMAGE_SUFFIXES
 from etsplat.io.paths import kind_of, path_remedy
+from etsplat.io.photos import PHOTO_SUFFIXES
 from etsplat.io.run_directory import is_run
 
 
@@ -31,8 +32,12 @@ class Format(Protocol):
         """Whether a folder is of this layout."""
         ...
 
-    def read(self, folder: Path, wanted: Wanted) -> Dataset:
-        """The posed photos in a folder; `etsplat.data.frames.posed` makes them of frames. None is decoded yet."""
+    def list_frames(self, folder: Path, wanted: Wanted) -> Listing:
+        """What the files in a folder say of its posed photos; `etsplat.data.frames.posed` makes a data set of it.
+
+        Raises:
+            InputError: a file is missing, damaged, or says what is not understood.
+        """
         ...
 
 
@@ -44,10 +49,17 @@ def load_dataset(
     width: int | None = None,
     masks: Path | str | None = None,
     memory: int | None = None,
+    depths: bool | Path | str = False,
+    depth_unit: float | None = None,
     preload: bool = True,
     progress: Callable[[int, int], None] | None = None,
 ) -> Dataset:
-    """Read a folder with posed photos (COLMAP, nerfstudio, Blender) in its own units; images are decoded in parallel.
+    """Read a folder with posed photos in its own units; images are decoded in parallel.
+
+    Coordinates of maps are made relative to an origin nearby; `Dataset.georeference` says where that is.
+
+    `docs/captures.md` lists the programs whose files are read: COLMAP, nerfstudio, Blender, Polycam, Record3D,
+    RealityCapture, Metashape, Meshroom, OpenMVG, Bundler.
 
     Args:
         path: the folder.
@@ -57,14 +69,19 @@ def load_dataset(
         width: shrink images to this many pixels across (never enlarges); None shrinks those wider than 1600 to 1600.
         masks: folder with a mask for every image, white inside; None for the scene's own, if any.
         memory: bytes that decoded images may take, beyond which they are streamed; None for half of what is free.
+        depths: read depth maps too: the scene's own, if any, or those in a folder. Images without one are fine.
+        depth_unit: units of the capture in a step of their numbers; None for what the scene says, or else 0.001 for
+            integers and 1 for others.
         preload: decode the images now, so that damaged ones are found; else each when it is first asked for.
         progress: called with (images decoded, images in all) while loading.
 
     Raises:
         InputError: no such folder, none of the layouts, or what the layout's reader refuses; fewer than two images;
-            damaged images or masks; images of another shape than their camera.
-        ValueError: a width below 1.
+            damaged images, masks or depth maps; images of another shape than their camera, or maps than their image.
+        ValueError: a width below 1, a unit that is not positive.
     """
+    if depth_unit is not None and not 0 < depth_unit <= LARGEST:
+        raise ValueError(f"depth_unit: expected a positive number, got {depth_unit}")
     if width is not None and width < 1:
         raise ValueError(f"width: expected at least 1, got {width}")
     path = Path(path)
@@ -73,27 +90,33 @@ def load_dataset(
         raise InputError(f"scene {path}: {wrong}")
     if images is not None and not (path / images).is_dir():
         raise InputError(f"scene {path}: no folder {images} in it; choose another or leave it out")
-    wanted = Wanted(masks_as, images, width, None if masks is None else Path(masks), memory)
-    dataset = _format_of(path).read(path, wanted)
+    folder = depths if isinstance(depths, bool) else Path(depths)
+    wanted = Wanted(masks_as, images, width, None if masks is None else Path(masks), memory, folder, depth_unit)
+    dataset = posed(path, near_origin(path, format_of(path).list_frames(path, wanted)), wanted)
     if preload and isinstance(dataset.images, LazyPictures):
         dataset.images.preload(progress)
     return dataset
 
 
-def _format_of(path: Path) -> Format:
+def format_of(path: Path) -> Format:
+    """The layout of a folder.
+
+    Raises:
+        InputError: none is recognised.
+    """
     names = [f"{formats.__name__}.{module.name}" for module in pkgutil.iter_modules(formats.__path__)]
     known = sorted((cast(Format, importlib.import_module(name)) for name in names), key=lambda known: known.RANK)
     for layout in known:
         if layout.recognises(path):
             return layout
-    marks = " nor ".join(layout.MARK for layout in known)
-    raise InputError(f"scene {path}: neither {marks} in it; choose the scene's folder{_offer(path)}")
+    marks = ", ".join(layout.MARK for layout in known)
+    raise InputError(f"scene {path}: none of {marks} in it; choose the scene's folder{_offer(path)}")
 
 
 def _offer(path: Path) -> str:
     """For a run: that it is one. For a folder of photos: how to find the cameras."""
     if is_run(path):
         return " that this run was made from"
-    if any(kind_of(file) in IMAGE_SUFFIXES for file in path.iterdir()):
+    if any(kind_of(file) in PHOTO_SUFFIXES for file in path.iterdir()):
         return f", or find the cameras of these photos: etsplat data sfm {path} --out SCENE"
     return ""

@@ -1,7 +1,7 @@
 """Cameras, photos and masks of a data set on the device where a model is fitted to them."""
 
 from collections.abc import Callable, Hashable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Int, UInt8
@@ -9,7 +9,7 @@ from torch import Tensor
 
 from etsplat.core.cameras import Cameras
 from etsplat.data.dataset import Dataset
-from etsplat.data.pictures import Pixels
+from etsplat.data.pictures import Picture
 
 DEVICE_SHARE = 0.5
 """Photos stay on a GPU if they fill no more than this part of its free memory."""
@@ -24,12 +24,14 @@ class View:
         photo: (1, H, W, C): bytes of 3 channels, or of 4 premultiplied; or float32 premultiplied RGBA.
         mask: (1, H, W), 255 where pixels count; None where all do.
         index: (1,) int64, of the view in its data set.
+        depth: (1, H, W) along the optical axis, in units of the data set's frame, 0 where not known; None without.
     """
 
     camera: Cameras
     photo: Tensor
     mask: UInt8[Tensor, "1 H W"] | None
     index: Int[Tensor, "1"]
+    depth: Float[Tensor, "1 H W"] | None = None
 
 
 @dataclass(frozen=True)
@@ -41,6 +43,7 @@ class PhotoKind:
     channels: int
     dtype: torch.dtype
     masked: bool
+    deep: bool = False
 
 
 @dataclass
@@ -49,6 +52,14 @@ class _Stack:
 
     pixels: Tensor
     masks: UInt8[Tensor, "P H W"] | None
+    depths: Float[Tensor, "P H W"] | None
+
+    def put(self, picture: Picture, place: int) -> None:
+        """A photo in its place; queued behind what reads it now."""
+        _copy(picture.pixels, self.pixels[place])
+        for source, target in ((picture.mask, self.masks), (picture.depth, self.depths)):
+            if source is not None and target is not None:
+                _copy(source, target[place])
 
 
 class ViewLoader:
@@ -71,6 +82,7 @@ class ViewLoader:
             batch: views of a queued step.
         """
         self._images, self._train, self._device, self._batch = dataset.images, dataset.train, device, batch
+        self._radius = dataset.normalization.radius
         self._cameras = [camera.to(device) for camera in dataset.cameras]
         self._viewmats = torch.cat([camera.viewmats for camera in self._cameras])
         self._Ks = torch.cat([camera.Ks for camera in self._cameras])
@@ -93,9 +105,13 @@ class ViewLoader:
         """
         if index in self._kept:
             return self._kept[index]
-        mask, photo = self._images.mask(index), self._images[index].to(self._device)[None]
-        mask = None if mask is None else mask.to(self._device)[None]
-        view = View(self._cameras[index], photo, mask, self._indices[index : index + 1])
+        picture = self._picture(index)
+        photo, mask, depth = (
+            None if plane is None else plane.to(self._device)[None]
+            for plane in (picture.pixels, picture.mask, picture.depth)
+        )
+        assert photo is not None
+        view = View(self._cameras[index], photo, mask, self._indices[index : index + 1], depth)
         if self._device.type == "cuda" and not self.streamed:
             self._kept[index] = view
         return view
@@ -128,14 +144,8 @@ class ViewLoader:
         kind = self._kinds[index]
         if kind not in self._stacks:
             self._stacks[kind] = self._room(kind, self._batch)
-        stack, pixels, mask = self._stacks[kind], self._images[index], self._images.mask(index)
-
-        def run() -> None:
-            _copy(pixels, stack.pixels[number])
-            if stack.masks is not None and mask is not None:
-                _copy(mask, stack.masks[number])
-
-        return run
+        stack, picture = self._stacks[kind], self._picture(index)
+        return lambda: stack.put(picture, number)
 
     def look_up(self, kind: Hashable, place: Float[Tensor, "2"]) -> View:
         """A queued view, by launches that read its place.
@@ -153,7 +163,8 @@ class ViewLoader:
             at = at.clamp_max(len(stack.pixels) - 1)
         camera = Cameras(self._viewmats.index_select(0, view), self._Ks.index_select(0, view), kind.width, kind.height)
         mask = None if stack.masks is None else stack.masks.index_select(0, at)
-        return View(camera, stack.pixels.index_select(0, at), mask, view)
+        depth = None if stack.depths is None else stack.depths.index_select(0, at)
+        return View(camera, stack.pixels.index_select(0, at), mask, view, depth)
 
     def _keep_all(self) -> None:
         counts: dict[PhotoKind, int] = {}
@@ -163,25 +174,28 @@ class ViewLoader:
             counts[kind] = self._places[index] + 1
         self._stacks = {kind: self._room(kind, count) for kind, count in counts.items()}
         for index in self._train:
-            stack, place = self._stacks[self._kinds[index]], self._places[index]
-            stack.pixels[place].copy_(self._images[index])
-            mask = self._images.mask(index)
-            if stack.masks is not None and mask is not None:
-                stack.masks[place].copy_(mask)
+            self._stacks[self._kinds[index]].put(self._picture(index), self._places[index])
+
+    def _picture(self, index: int) -> Picture:
+        """With its depth in units of the data set's frame."""
+        picture = self._images.picture(index)
+        return picture if picture.depth is None else replace(picture, depth=picture.depth / self._radius)
 
     def _kind(self, index: int) -> PhotoKind:
-        photo = self._images[index]
-        height, width, channels = photo.shape
-        return PhotoKind(width, height, channels, photo.dtype, self._images.mask(index) is not None)
+        picture = self._images.picture(index)
+        height, width, channels = picture.pixels.shape
+        known = picture.mask is not None, picture.depth is not None
+        return PhotoKind(width, height, channels, picture.pixels.dtype, *known)
 
     def _room(self, kind: PhotoKind, count: int) -> _Stack:
         image = (count, kind.height, kind.width)
         pixels = torch.empty((*image, kind.channels), dtype=kind.dtype, device=self._device)
         masks = torch.empty(image, dtype=torch.uint8, device=self._device) if kind.masked else None
-        return _Stack(pixels, masks)
+        depths = torch.empty(image, device=self._device) if kind.deep else None
+        return _Stack(pixels, masks, depths)
 
 
-def _copy(source: Pixels, target: Tensor) -> None:
+def _copy(source: Tensor, target: Tensor) -> None:
     """Queued behind what reads the target now; torch keeps the pinned copy until it has been read."""
     pinned = source.pin_memory() if target.is_cuda and not source.is_cuda else source
     target.copy_(pinned, non_blocking=True)

@@ -6,7 +6,7 @@ import os
 import threading
 from abc import ABC, abstractmethod
 from collections import OrderedDict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 
@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from etsplat.io.depth_maps import resize_depth
 from etsplat.io.memory import available_memory
 
 Pixels = UInt8[Tensor, "H W C"] | Float[Tensor, "H W 4"]
@@ -32,10 +33,13 @@ class Picture:
     Attributes:
         pixels: bytes of 3 channels, or of 4 premultiplied; or premultiplied RGBA in [0, 1].
         mask: (H, W), 255 where pixels count and 0 where they are to be ignored; None if all count.
+        depth: (H, W) distances along the optical axis, in the units of the capture's files whatever frame the data set
+            is in; 0 where they are not known. None without.
     """
 
     pixels: Pixels
     mask: UInt8[Tensor, "H W"] | None = None
+    depth: Float[Tensor, "H W"] | None = None
 
 
 class Pictures(ABC):
@@ -45,11 +49,13 @@ class Pictures(ABC):
         sizes: (width, height) of each.
         total_bytes: what all of them take in memory.
         streamed: whether they do not fit into memory, so that each is made anew when it is needed.
+        with_depth: the views whose photos have depth maps.
     """
 
     sizes: list[tuple[int, int]]
     total_bytes: int
     streamed: bool = False
+    with_depth: frozenset[int] = frozenset()
 
     @abstractmethod
     def picture(self, index: int) -> Picture:
@@ -73,14 +79,33 @@ class Pictures(ABC):
         """(H, W), 255 where pixels of the view count and 0 where they are to be ignored; None if all count."""
         return self.picture(index).mask
 
+    def depth(self, index: int) -> Float[Tensor, "H W"] | None:
+        """(H, W), as of `Picture`; None if the view has no depth map."""
+        return self.picture(index).depth
+
 
 class StoredPictures(Pictures):
     """Photos that are in memory already."""
 
-    def __init__(self, pixels: Sequence[Pixels], masks: Sequence[UInt8[Tensor, "H W"] | None] | None = None) -> None:
+    def __init__(
+        self,
+        pixels: Sequence[Pixels],
+        masks: Sequence[UInt8[Tensor, "H W"] | None] | None = None,
+        depths: Sequence[Float[Tensor, "H W"] | None] | None = None,
+    ) -> None:
+        """Takes them, with masks and depth maps of some or all.
+
+        Raises:
+            ValueError: a depth map of another shape than its photo.
+        """
         masks = [None] * len(pixels) if masks is None else masks
-        self._pictures = [Picture(image, mask) for image, mask in zip(pixels, masks, strict=True)]
-        self._tensors = [*pixels, *masks]
+        maps = [None] * len(pixels) if depths is None else depths
+        self._pictures = [Picture(*each) for each in zip(pixels, masks, maps, strict=True)]
+        for index, (image, depth) in enumerate(zip(pixels, maps, strict=True)):
+            if depth is not None and depth.shape != image.shape[:2]:
+                raise ValueError(f"depths[{index}]: expected {tuple(image.shape[:2])}, got {tuple(depth.shape)}")
+        self.with_depth = frozenset(index for index, depth in enumerate(maps) if depth is not None)
+        self._tensors = [*pixels, *masks, *(maps if self.with_depth else [])]
         self.sizes = [(image.shape[1], image.shape[0]) for image in pixels]
         self.total_bytes = sum(image.numel() * image.element_size() for image in self._tensors if image is not None)
 
@@ -89,7 +114,7 @@ class StoredPictures(Pictures):
         return self._pictures[index]
 
     def fingerprint(self) -> bytes:
-        """Of all pixels and masks."""
+        """Of all pixels, masks and depth maps."""
         digest = hashlib.sha256()
         for image in self._tensors:
             digest.update(b"none" if image is None else image.contiguous().cpu().numpy().data)
@@ -110,6 +135,7 @@ class LazyPictures(Pictures):
         sizes_in_bytes: Sequence[int],
         fingerprint: Callable[[], bytes],
         limit: int | None = None,
+        with_depth: Collection[int] = (),
     ) -> None:
         """Makes nothing yet.
 
@@ -119,7 +145,9 @@ class LazyPictures(Pictures):
             sizes_in_bytes: upper bounds.
             fingerprint: of all of them, without making any.
             limit: bytes that may be kept; None for half of the memory that is free.
+            with_depth: the views whose photos have depth maps.
         """
+        self.with_depth = frozenset(with_depth)
         self.sizes, self.total_bytes = list(sizes), sum(sizes_in_bytes)
         self._make, self._bytes, self._fingerprint = make, list(sizes_in_bytes), fingerprint
         self._limit = available_memory() // 2 if limit is None else limit
@@ -188,16 +216,21 @@ class LazyPictures(Pictures):
 
 
 def halved(pictures: Pictures) -> LazyPictures:
-    """Photos and masks at half the size, each pixel the mean of those it replaces; odd sizes are rounded down."""
+    """Photos and masks at half the size, each pixel the mean of those it replaces; odd sizes are rounded down.
+
+    Depths are not averaged (`resize_depth`).
+    """
     sizes = [(max(1, width // 2), max(1, height // 2)) for width, height in pictures.sizes]
 
     def make(index: int) -> Picture:
-        mask, (width, height) = pictures.mask(index), sizes[index]
-        small = None if mask is None else _area_mean(mask[..., None], width, height)[..., 0]
-        return Picture(_area_mean(pictures[index], width, height), small)
+        picture, (width, height) = pictures.picture(index), sizes[index]
+        mask = None if picture.mask is None else _area_mean(picture.mask[..., None], width, height)[..., 0]
+        depth = None if picture.depth is None else resize_depth(picture.depth, width, height)
+        return Picture(_area_mean(picture.pixels, width, height), mask, depth)
 
     per_pixel = math.ceil(pictures.total_bytes / sum(width * height for width, height in pictures.sizes))
-    return LazyPictures(make, sizes, [per_pixel * width * height for width, height in sizes], pictures.fingerprint)
+    sizes_in_bytes = [per_pixel * width * height for width, height in sizes]
+    return LazyPictures(make, sizes, sizes_in_bytes, pictures.fingerprint, with_depth=pictures.with_depth)
 
 
 def _area_mean(image: Pixels, width: int, height: int) -> Pixels:

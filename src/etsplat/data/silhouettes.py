@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from etsplat.core.cameras import camera_centers
-from etsplat.data.camera_paths import axes_meeting_point
+from etsplat.data.camera_coverage import axes_meeting_point
 from etsplat.data.dataset import Dataset
 from etsplat.data.pictures import Pixels, as_float
 

@@ -6,21 +6,34 @@ from pathlib import Path
 from typing import Literal
 
 from etsplat.core.errors import InputError
-from etsplat.data.colmap_process import Progress, import_pycolmap, place_photos, run_apart
-from etsplat.data.undistortion import check_output, check_space, undistort_model, working_folder
-from etsplat.io.images import IMAGE_SUFFIXES, image_size
-from etsplat.io.paths import kind_of, path_remedy
+from etsplat.data.colmap_process import Job, Mapper, Progress, import_pycolmap, place_photos, run_apart
+from etsplat.data.photo_intake import LEAST_COUNT, CameraSharing, Photo, by_camera, list_photos, take_in
+from etsplat.data.photo_masks import mask_file, write_masks
+from etsplat.data.undistortion import (
+    check_output,
+    check_size,
+    check_space,
+    undistort_masks,
+    undistort_model,
+    working_folder,
+)
+from etsplat.data.video_intake import FRAMES, frames_of_video
+from etsplat.io.atomic import write_error
+from etsplat.io.paths import kind_of
+from etsplat.io.photos import PHOTO_SUFFIXES
 
 Matching = Literal["auto", "exhaustive", "sequential"]
+Masks = Literal["none", "auto"]
 
 EXHAUSTIVE_UP_TO = 120
 """With matching "auto", every pair of so many photos is compared; of more, only those near in order of names."""
 
 LEAST_SHARE = 0.25
 """If fewer of the photos can be placed, something is wrong with them, and there is no scene."""
-LEAST_COUNT = 3
 BYTES_PER_PHOTO = 3 << 20
 """What COLMAP writes down of a photo at most: 8,192 features of 152 bytes, and its matches."""
+TURNED_GROWTH = 4
+"""A HEIC file grows about so many times as a JPEG with few losses."""
 
 
 @dataclass(frozen=True)
@@ -32,12 +45,16 @@ class Placement:
         placed: names of the photos with a camera.
         unplaced: names of those without.
         points: how many points were triangulated.
+        cameras: how many different cameras took the placed photos.
+        unmasked: photos that were left out because no mask could be found for them, and why; empty without masks.
     """
 
     scene: Path
     placed: list[str]
     unplaced: list[str]
     points: int
+    cameras: int
+    unmasked: dict[str, str]
 
 
 def find_cameras(
@@ -45,6 +62,10 @@ def find_cameras(
     out: Path | str,
     *,
     matching: Matching = "auto",
+    cameras: CameraSharing = "auto",
+    mapper: Mapper = "incremental",
+    frames: int = 120,
+    masks: Masks = "none",
     max_size: int = 1600,
     threads: int | None = None,
     progress: Progress | None = None,
@@ -52,47 +73,96 @@ def find_cameras(
     """Find where photos were taken from, and write an undistorted COLMAP scene.
 
     Args:
-        photos: folder of JPEG or PNG files, of one camera with one lens setting at best.
-        out: folder of the scene; must not exist or be empty.
+        photos: folder of JPEG, PNG or HEIC files, also in subfolders; turned upright as their EXIF says. Or a video.
+        out: folder of the scene; must not exist or be empty. Of a video the chosen frames are kept in its `frames/`,
+            also where no scene comes of them; a second call takes them from there.
         matching: which photos are compared with each other.
+        cameras: which photos have one camera and lens setting.
+        mapper: place one camera after the other, or all at once.
+        masks: "auto" writes `masks/` of an object in front of a plain background; photos whose background is not plain
+            are left out. Cameras are then found by the object alone, which may turn in front of the background.
+        frames: of a video, so many are chosen by sharpness and motion, fewer where less moves.
         max_size: longer sides are shrunk to this many pixels, for finding features and in the scene.
         threads: None for all cores.
         progress: called with (phase, done, of how many).
 
     Raises:
-        InputError: pycolmap is missing; too few photos; too few of them could be placed; `out` cannot be used.
+        InputError: pycolmap is missing (of videos, imageio-ffmpeg); too few photos, or damaged ones; too few of them
+            could be placed; most have no plain background, and masks are wanted; `out` cannot be used.
     """
     pycolmap = import_pycolmap()
-    photos, out = Path(photos), Path(out)
-    names = _photo_names(photos)
-    check_output(out, max_size)
-    files = [photos / name for name in names]
-    check_space(out, files, BYTES_PER_PHOTO * len(files))
-    report = progress or (lambda phase, done, total: None)
-    exhaustive = matching == "exhaustive" or (matching == "auto" and len(names) <= EXHAUSTIVE_UP_TO)
-    one_camera = len({image_size(file) for file in files}) == 1
-    with working_folder(out) as work:
-        found = run_apart(
-            place_photos, photos, names, work, exhaustive, one_camera, max_size, threads or -1, report=report
+    source, out = Path(photos), Path(out)
+    is_video = source.is_file() and kind_of(source) not in PHOTO_SUFFIXES
+    check_size(max_size)
+    check_output(out, (FRAMES,) if is_video else ())
+    if out.resolve().is_relative_to(source.resolve()):
+        raise InputError(
+            f"{out}: lies in the folder of the photos, whose subfolders are read too; choose another folder"
         )
-        model = pycolmap.Reconstruction() if found is None else pycolmap.Reconstruction(found)
-        placed = sorted(image.name for image in model.images.values() if image.has_pose)
+    report = progress or (lambda phase, done, total: None)
+    if is_video:
+        source = _frames(source, out, frames, report)
+    found = list_photos(source)
+    check_space(out, [photo.path for photo in found], _space_for(found))
+    with working_folder(out) as work:
+        upright = work / "photos"
+        take_in(found, upright, threads, report)
+        names = [photo.name for photo in found]
+        unmasked = (
+            write_masks({name: upright / name for name in names}, work / "masks", report) if masks == "auto" else {}
+        )
+        found = [photo for photo in found if photo.name not in unmasked]
+        names = [photo.name for photo in found]
+        job = Job(
+            photos=upright,
+            cameras=by_camera(found, cameras),
+            work=work,
+            exhaustive=matching == "exhaustive" or (matching == "auto" and len(names) <= EXHAUSTIVE_UP_TO),
+            mapper=mapper,
+            max_size=max_size,
+            threads=threads or -1,
+            masks=work / "masks" if masks == "auto" else None,
+        )
+        folder = run_apart(place_photos, job, report=report)
+        model = pycolmap.Reconstruction() if folder is None else pycolmap.Reconstruction(folder)
+        images = [image for image in model.images.values() if image.has_pose]
+        placed = sorted(image.name for image in images)
         if len(placed) < max(LEAST_COUNT, LEAST_SHARE * len(names)):
-            raise InputError(_too_few(photos, len(placed), len(names)))
-        report("Removing lens distortion", 0, 0)
-        undistort_model(model, photos, placed, work, max_size)
-        os.replace(work / "scene", out)
-    unplaced = [name for name in names if name not in set(placed)]
-    return Placement(out, placed, unplaced, len(model.points3D))
+            raise InputError(_too_few(source, len(placed), len(names)))
+        undistort_model(model, upright, placed, work, max_size, report)
+        if masks == "auto":
+            undistort_masks(model, {name: mask_file(work / "masks", name) for name in placed}, work, max_size)
+        _hand_over(work / "scene", out)
+    return Placement(
+        out,
+        placed,
+        [name for name in names if name not in set(placed)],
+        len(model.points3D),
+        len({image.camera_id for image in images}),
+        unmasked,
+    )
 
 
-def _photo_names(photos: Path) -> list[str]:
-    if not photos.is_dir():
-        raise InputError(f"photos {photos}: no such folder; {path_remedy(photos)}")
-    names = sorted(path.name for path in photos.iterdir() if kind_of(path) in IMAGE_SUFFIXES)
-    if len(names) < LEAST_COUNT:
-        raise InputError(f"photos {photos}: {len(names)} JPEG or PNG files; at least 3 are needed, better 20 or more")
-    return names
+def _frames(video: Path, out: Path, count: int, report: Progress) -> Path:
+    try:
+        return frames_of_video(video, out / FRAMES, count, report)
+    except OSError as error:
+        raise write_error(out / FRAMES, error) from error
+
+
+def _hand_over(scene: Path, out: Path) -> None:
+    """A whole scene gets its name; beside frames, part by part, and `sparse`, which makes it one, at last."""
+    if not (out / FRAMES).is_dir():
+        os.replace(scene, out)
+        return
+    for part in sorted(scene.iterdir()):
+        os.replace(part, out / part.name)
+
+
+def _space_for(photos: list[Photo]) -> int:
+    """Bytes of COLMAP's database, and of the copies of photos that have to be turned or are HEIC."""
+    copies = sum(photo.path.stat().st_size for photo in photos if not photo.file.upright)
+    return BYTES_PER_PHOTO * len(photos) + TURNED_GROWTH * copies
 
 
 def _too_few(photos: Path, placed: int, count: int) -> str:

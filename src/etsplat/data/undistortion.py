@@ -8,11 +8,12 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from etsplat.core.errors import InputError
-from etsplat.data.colmap_process import import_pycolmap, run_apart, undistort_images
+from etsplat.data.colmap_process import Progress, import_pycolmap, run_apart, undistort_images
 from etsplat.data.formats.colmap import find_model
-from etsplat.data.formats.transforms import read_frames
-from etsplat.data.frames import Frame, Points, Wanted, scaled_intrinsics
+from etsplat.data.frames import Frame, Points, Wanted, check_frames, scaled_intrinsics
+from etsplat.data.load import format_of
 from etsplat.io.atomic import write_error
+from etsplat.io.georeference import GEOREFERENCE_FILE
 from etsplat.io.images import image_size, load_pixels
 from etsplat.io.locks import scratch_folder
 from etsplat.io.paths import kind_of, path_remedy, path_within
@@ -30,13 +31,13 @@ def undistort_scene(scene: Path | str, out: Path | str, *, max_size: int = 1600)
     """Write a scene anew in COLMAP's layout without lens distortion: images, masks, cameras, points.
 
     Args:
-        scene: folder with `images/` and `sparse/0/` (or `sparse/`), of any of COLMAP's camera models; or with
-            `transforms.json` of nerfstudio or instant-ngp. `masks/`, or the masks that it names, come along.
+        scene: folder with `images/` and `sparse/0/` (or `sparse/`), of any of COLMAP's camera models; or of any other
+            layout that is read (`docs/captures.md`). `masks/`, or the masks that it names, come along.
         out: folder of the new scene; must not exist or be empty.
         max_size: longer sides are shrunk to this many pixels.
 
     Returns:
-        The names of the images. Every 8th is for testing, whatever `transforms.json` said.
+        The names of the images. Every 8th is for testing, whatever the scene said.
 
     Raises:
         InputError: pycolmap is missing; there is no scene, or it cannot be read; images are missing or transparent;
@@ -47,16 +48,17 @@ def undistort_scene(scene: Path | str, out: Path | str, *, max_size: int = 1600)
     if not scene.is_dir():
         raise InputError(f"scene {scene}: no such folder; {path_remedy(scene)}")
     colmap = find_model(scene)
-    if colmap is None and not (scene / "transforms.json").is_file():
-        raise InputError(f"scene {scene}: neither sparse/0/cameras.bin or .txt nor transforms.json; choose a scene")
-    check_output(out, max_size)
+    check_size(max_size)
+    check_output(out)
     if colmap is not None:
         photos = scene / "images"
         model, masks = _read_model(pycolmap, scene, colmap)
     else:
-        frames, points = read_frames(scene)
+        listing = format_of(scene).list_frames(scene, Wanted())
+        frames = sorted(listing.frames, key=lambda frame: frame.name)
+        check_frames(scene, frames)
         photos = _common_folder(scene, frames)
-        model, masks = _make_model(pycolmap, scene, photos, frames, points)
+        model, masks = _make_model(pycolmap, scene, photos, frames, listing.points)
     names = _placed(model)
     for photo in (photos / name for name in names):
         if kind_of(photo) == ".png" and load_pixels(photo, *image_size(photo)).shape[2] == 4:
@@ -65,18 +67,22 @@ def undistort_scene(scene: Path | str, out: Path | str, *, max_size: int = 1600)
     with working_folder(out) as work:
         undistort_model(model, photos, names, work, max_size)
         if masks:
-            _undistort_masks(model, masks, work, max_size)
+            undistort_masks(model, masks, work, max_size)
+        if (scene / GEOREFERENCE_FILE).is_file():
+            shutil.copyfile(scene / GEOREFERENCE_FILE, work / "scene" / GEOREFERENCE_FILE)
         os.replace(work / "scene", out)
     return names
 
 
-def undistort_model(model: Any, photos: Path, names: list[str], work: Path, max_size: int) -> None:
+def undistort_model(
+    model: Any, photos: Path, names: list[str], work: Path, max_size: int, report: Progress | None = None
+) -> None:
     """Writes images/ and sparse/0/ of a model's images into WORK/scene."""
     shutil.rmtree(work / "model", ignore_errors=True)
     (work / "model").mkdir()
     model.write(work / "model")
     scene = work / "scene"
-    run_apart(undistort_images, work / "model", photos, names, scene, max_size)
+    run_apart(undistort_images, work / "model", photos, names, scene, max_size, report=report)
     # Left of what COLMAP writes for its dense reconstruction are images/ and sparse/0/.
     for entry in scene.iterdir():
         if entry.name == "stereo":
@@ -91,12 +97,21 @@ def undistort_model(model: Any, photos: Path, names: list[str], work: Path, max_
         raise RuntimeError(f"{written} of {len(names)} images could be written")
 
 
-def check_output(out: Path, max_size: int) -> None:
-    """Raises InputError if `out` exists and is not an empty folder, or cannot be made; or if images would vanish."""
+def check_size(max_size: int) -> None:
+    """Raises InputError if images would vanish."""
     if max_size < LEAST_SIZE:
         raise InputError(f"max_size: is {max_size}; it must be at least {LEAST_SIZE}")
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise InputError(f"{out}: is there already and not empty; choose another folder for the scene")
+
+
+def check_output(out: Path, may_hold: tuple[str, ...] = ()) -> None:
+    """Raises InputError if `out` exists and is not an empty folder, or cannot be made.
+
+    Args:
+        out: folder that is to be written.
+        may_hold: names of what may lie in it all the same.
+    """
+    if out.exists() and (not out.is_dir() or any(entry.name not in may_hold for entry in out.iterdir())):
+        raise InputError(f"{out}: is there already and not empty; choose another folder")
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -190,7 +205,7 @@ def _make_model(
     return model, masks
 
 
-def _undistort_masks(model: Any, masks: dict[str, Path], work: Path, max_size: int) -> None:
+def undistort_masks(model: Any, masks: dict[str, Path], work: Path, max_size: int) -> None:
     """Masks go the way of the images, under their names, into WORK/scene/masks."""
     (work / "images").mkdir()
     (work / "scene").rename(work / "whole")

@@ -109,9 +109,9 @@ def test_the_bounding_sphere_brings_the_object_into_the_unit_sphere(scene, truth
         (lambda d: d.update(frames=d["frames"][:1]), "at least 2"),
         (lambda d: d["frames"][2].pop("file_path"), "without `file_path`"),
         (lambda d: d["frames"][2].update(file_path="images/absent"), "1 of 10 images are missing"),
-        (lambda d: d["frames"][2].pop("transform_matrix"), "002 has no 4x4 transform_matrix"),
-        (lambda d: d["frames"][2].update(transform_matrix=[[1, 2], [3]]), "no 4x4 transform_matrix"),
-        (lambda d: d["frames"][2]["transform_matrix"][0].__setitem__(0, float("nan")), "no 4x4 transform_matrix"),
+        (lambda d: d["frames"][2].pop("transform_matrix"), "002 has no transform_matrix of 16"),
+        (lambda d: d["frames"][2].update(transform_matrix=[[1, 2], [3]]), "no transform_matrix of 16"),
+        (lambda d: d["frames"][2]["transform_matrix"][0].__setitem__(0, float("nan")), "no transform_matrix of 16"),
         (lambda d: d["frames"][2].update(transform_matrix=torch.diag(torch.tensor([2.0, 2, 2, 1])).tolist()), "scales"),
         (lambda d: d.pop("camera_angle_x"), "neither fl_x nor camera_angle_x"),
         (lambda d: d.update(fl_x=-3), "not positive"),
@@ -128,7 +128,7 @@ def test_the_bounding_sphere_brings_the_object_into_the_unit_sphere(scene, truth
         (lambda d: d.update(camera_angle_x=0), "camera_angle_x = 0, not an angle"),
         (lambda d: d.update(camera_angle_x=float("nan")), "camera_angle_x = nan"),
         (lambda d: d.update(camera_angle_x=10**400), "camera_angle_x = 1000"),
-        (lambda d: d["frames"][2].update(transform_matrix=[[10**400] * 4] * 4), "no 4x4 transform_matrix"),
+        (lambda d: d["frames"][2].update(transform_matrix=[[10**400] * 4] * 4), "no transform_matrix of 16"),
         (lambda d: d["frames"][2]["transform_matrix"][0].__setitem__(3, 1e308), "002 has .* numbers beyond"),
         (lambda d: d["frames"][2].update(file_path="/"), "'/' leads out"),
         (lambda d: d["frames"][2].update(file_path="a" * 300), "is no file name"),
@@ -180,7 +180,7 @@ def test_folders_without_a_scene_are_input_errors(tmp_path):
         load_dataset(tmp_path / "mesh.obj")
     with pytest.raises(InputError, match="choose the scene's folder"):
         load_dataset(tmp_path)
-    with pytest.raises(InputError, match=r"neither transforms\.json"):
+    with pytest.raises(InputError, match=r"none of transforms\.json"):
         load_transforms(tmp_path)
 
 

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from etsplat.core.errors import InputError
 from etsplat.data.colmap_model import PARAMETERS, ColmapImage, read_cameras, read_images, read_points
-from etsplat.data.dataset import Dataset
-from etsplat.data.frames import Frame, Lens, Wanted, find_image, pinhole, posed
+from etsplat.data.frames import Frame, Lens, Listing, Wanted, find_image, pinhole
+from etsplat.data.scene_files import quaternion_rotation
 
 MARK = "sparse/"
 RANK = 2
@@ -24,19 +24,17 @@ def recognises(folder: Path) -> bool:
     return (folder / "sparse").is_dir()
 
 
-def read(folder: Path, wanted: Wanted) -> Dataset:
-    """Read an undistorted COLMAP scene; every 8th image by name is test.
+def list_frames(folder: Path, wanted: Wanted) -> Listing:
+    """The registered images of a COLMAP scene, and the model's points; every 8th image by name is test.
 
     Args:
         folder: holds `images/` and `sparse/0/` (or `sparse/`), binary or text; binary is preferred. Its `masks/`, if it
-            is there, has a mask for every image; images with an alpha channel need none.
+            is there, has a mask for every image; images with an alpha channel need none. Its `depths/` or `depth/` may
+            have depth maps.
         wanted: other images and masks. `images_4` and the like may hold smaller copies, also with other endings.
 
-    Returns:
-        Views in COLMAP's own units, with the model's points.
-
     Raises:
-        InputError: files are missing, cut short or malformed; a mask is missing; as `posed`.
+        InputError: files are missing, cut short or malformed; a mask is missing.
     """
     model = find_model(folder)
     if model is None:
@@ -66,13 +64,15 @@ def read(folder: Path, wanted: Wanted) -> Dataset:
                 pinhole(fx, fy, cx, cy),
                 (camera.width, camera.height),
                 lens if distortion else None,
+                wanted.depth_of(folder, image.name, model),
+                wanted.depth_unit,
             )
         )
     found = read_points(model)
     if found is None or not len(found[0]):
-        return posed(folder, frames, wanted)
+        return Listing(frames)
     points, colors = torch.from_numpy(found[0]), torch.from_numpy(found[1].astype(np.float32) / 255)
-    return posed(folder, frames, wanted, points=(points, colors))
+    return Listing(frames, points=(points, colors))
 
 
 def find_model(folder: Path) -> Path | None:
@@ -87,14 +87,7 @@ def _viewmat(image: ColmapImage) -> Float[Tensor, "4 4"]:
         norm = float(np.linalg.norm(q))
     if not np.isfinite([norm, *image.translation]).all() or norm < 1e-9:
         raise InputError(f"scene: the pose of {image.name} is not finite; run COLMAP's mapper again")
-    w, x, y, z = q / norm
     viewmat = torch.eye(4, dtype=torch.float64)
-    viewmat[:3, :3] = torch.tensor(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    viewmat[:3, :3] = quaternion_rotation(*(q / norm))
     viewmat[:3, 3] = torch.tensor(image.translation)
     return viewmat

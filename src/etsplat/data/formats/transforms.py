@@ -5,20 +5,15 @@ inverting gives our world-to-camera matrices with OpenCV axes.
 """
 
 import math
-from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from etsplat.core.errors import InputError
-from etsplat.data.dataset import Dataset
-from etsplat.data.frames import Frame, Lens, Points, Wanted, check_frames, find_image, pinhole, posed
-from etsplat.io.images import image_size
-from etsplat.io.json_text import parse_json
+from etsplat.data.frames import LARGEST, Frame, Lens, Listing, Points, Wanted, find_image, pinhole
+from etsplat.data.scene_files import OPENGL, Entry, brown_lens, name_below, read_object, size_of
 from etsplat.io.paths import path_within
 from etsplat.io.ply_tables import load_points
 
@@ -29,91 +24,41 @@ _DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 _PERSPECTIVE, _FISHEYE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE"), ("OPENCV_FISHEYE", "FISHEYE")
 
 
-@dataclass(frozen=True)
-class _Entry:
-    """What a file says of a frame: of this one, or else of all.
-
-    Attributes:
-        path: of the file.
-        name: of the frame.
-        said: by key.
-    """
-
-    path: Path
-    name: str
-    said: dict[str, Any]
-
-    def wrong(self, what: str) -> InputError:
-        return InputError(f"scene {self.path}: {self.name} {what}")
-
-    def number(self, key: str, default: float = 0.0) -> float:
-        value = self.said.get(key, default)
-        if isinstance(value, int | float) and not isinstance(value, bool):
-            with suppress(OverflowError):  # an integer of hundreds of digits
-                return float(value)
-        raise self.wrong(f"has {key} = {value!r:.40}, which is not a number; export the poses again")
-
-
 def recognises(folder: Path) -> bool:
     """Whether one of the files is there."""
     return any((folder / name).is_file() for name in ("transforms.json", "transforms_train.json"))
 
 
-def read(folder: Path, wanted: Wanted) -> Dataset:
-    """Read a scene folder with `transforms.json`, or with `transforms_train.json` and `transforms_test.json`.
+def list_frames(folder: Path, wanted: Wanted) -> Listing:
+    """The frames of a folder with `transforms.json`, or with `transforms_train.json` and `transforms_test.json`.
 
     Masks come from each frame's `mask_path`, or from a folder `masks/` with a file for every image; RGBA images need
-    none. With one `transforms.json` its `train_filenames` and `test_filenames` make the split; without them, every 8th
-    image by name is test. `transforms_val.json` is not used. `ply_file_path` names the points.
+    none. Depth maps, where they are wanted, come from each frame's `depth_file_path`, in steps of
+    `depth_unit_scale_factor` if that is there, or from a folder `depths/` or `depth/`. With one `transforms.json` its
+    `train_filenames` and `test_filenames` make the split; without them, every 8th image by name is test.
+    `transforms_val.json` is not used. `ply_file_path` names the points.
 
     Args:
         folder: the scene.
         wanted: other masks; other images, in a folder that replaces the first of each image's path (`images_4`).
 
-    Returns:
-        Views in the scene's own units.
-
     Raises:
-        InputError: a file is missing, damaged or of another layout; as `posed`.
+        InputError: a file is missing, damaged or of another layout.
     """
     path, split = folder / "transforms.json", None
     if path.is_file():
-        document = _read(path)
+        document = read_object(path)
         frames = sorted(_frames(path, document, wanted), key=lambda frame: frame.name)
         split = _named_split(path, document, frames)
     else:
         path, test_file = folder / "transforms_train.json", folder / "transforms_test.json"
-        document = _read(path)
+        document = read_object(path)
         frames = _frames(path, document, wanted)
         if test_file.is_file():
             count = len(frames)
-            frames += _frames(test_file, _read(test_file), wanted)
+            frames += _frames(test_file, read_object(test_file), wanted)
             split = list(range(count)), list(range(count, len(frames)))
-    return posed(folder, frames, wanted, split=split, points=_points(path, document))
-
-
-def read_frames(folder: Path) -> tuple[list[Frame], Points | None]:
-    """What `transforms.json` says: frames by name, with their lenses (k1 to k4, p1, p2, OPENCV_FISHEYE), and points.
-
-    Raises:
-        InputError: as `read`, but for lenses.
-    """
-    path = folder / "transforms.json"
-    document = _read(path)
-    frames = sorted(_frames(path, document, Wanted()), key=lambda frame: frame.name)
-    check_frames(folder, frames)
-    return frames, _points(path, document)
-
-
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        document = parse_json(path.read_text(encoding="utf-8"))
-    except (ValueError, OSError) as error:
-        detail = str(error).splitlines()[0]
-        raise InputError(f"scene {path}: not valid JSON ({detail}); export the poses again") from error
-    if not isinstance(document, dict):
-        raise InputError(f"scene {path}: expected a JSON object with a list `frames`; export the poses again")
-    return document
+    return Listing(frames, split, _points(path, document))
 
 
 def _named_split(path: Path, document: dict[str, Any], frames: list[Frame]) -> tuple[list[int], list[int]] | None:
@@ -157,7 +102,7 @@ def _frames(path: Path, document: dict[str, Any], wanted: Wanted) -> list[Frame]
 def _frame(path: Path, document: dict[str, Any], own: Any, wanted: Wanted) -> Frame:
     if not isinstance(own, dict) or not isinstance(own.get("file_path"), str):
         raise InputError(f"scene {path}: a frame without `file_path`; export the poses again")
-    entry = _Entry(path, _plain(own["file_path"]), {**document, **own})
+    entry = Entry(path, _plain(own["file_path"]), {**document, **own})
     if wanted.images is None:
         image = find_image(path.parent, entry.name, path)
     else:  # it replaces the first folder
@@ -165,41 +110,55 @@ def _frame(path: Path, document: dict[str, Any], own: Any, wanted: Wanted) -> Fr
     if wanted.masks is None and isinstance(own.get("mask_path"), str):
         mask = path_within(path.parent, _plain(own["mask_path"]), path)
     else:
-        mask = wanted.mask_of(path.parent, image.name, path)
+        mask = wanted.mask_of(path.parent, name_below(image, path.parent), path)
     size = _size(entry, image)
-    return Frame(entry.name, image, mask, _viewmat(entry), _intrinsics(entry, size), size, _lens(entry))
+    depth, unit = _depth(entry, image, wanted)
+    return Frame(entry.name, image, mask, _viewmat(entry), _intrinsics(entry, size), size, _lens(entry), depth, unit)
 
 
-def _lens(entry: _Entry) -> Lens | None:
+def _depth(entry: Entry, image: Path, wanted: Wanted) -> tuple[Path | None, float | None]:
+    """The depth map of a frame, and its unit: as somebody says, or the file."""
+    unit = wanted.depth_unit
+    if unit is None and wanted.depths is not False and "depth_unit_scale_factor" in entry.said:
+        unit = entry.number("depth_unit_scale_factor")
+        if not 0 < unit <= LARGEST:
+            raise entry.wrong(f"has depth_unit_scale_factor = {unit:g}; write a positive number")
+    named = entry.said.get("depth_file_path")
+    if wanted.depths is True and isinstance(named, str):
+        path = path_within(entry.path.parent, _plain(named), entry.path)
+        if not path.is_file():
+            raise entry.wrong(f"has the depth map {path}, which is not there; copy it there or remove depth_file_path")
+        return path, unit
+    return wanted.depth_of(entry.path.parent, name_below(image, entry.path.parent), entry.path), unit
+
+
+def _lens(entry: Entry) -> Lens | None:
     """None without distortion."""
     model = entry.said.get("camera_model", "OPENCV")
-    values = {key: entry.number(key) for key in _DISTORTION}
+    values = {key: entry.number(key, 0.0) for key in _DISTORTION}
     k1, k2, k3, k4, k5, k6, p1, p2 = values.values()
     if entry.said.get("is_fisheye") or model in _FISHEYE:  # the former is instant-ngp's
         if p1 == p2 == k5 == k6 == 0:
             return Lens("OPENCV_FISHEYE", (k1, k2, k3, k4), f"a {model} camera")
     elif model in _PERSPECTIVE and k4 == k5 == k6 == 0:  # of k4 on, programs disagree what it means
         told = f"lens distortion ({', '.join(key for key, value in values.items() if value != 0)})"
-        if k3 != 0:
-            return Lens("FULL_OPENCV", (k1, k2, p1, p2, k3, 0.0, 0.0, 0.0), told)
-        return Lens("OPENCV", (k1, k2, p1, p2), told) if any(values.values()) else None
+        return brown_lens(told, k1, k2, k3, p1, p2)
     raise entry.wrong(
         f"has a {model!s:.40} camera with coefficients that are not known here; undistort its images with the program"
         " that made them"
     )
 
 
-def _size(entry: _Entry, image: Path) -> tuple[int, int]:
+def _size(entry: Entry, image: Path) -> tuple[int, int]:
     if "w" in entry.said and "h" in entry.said:
         width, height = entry.number("w"), entry.number("h")
         if not (1 <= width < 2**31 and 1 <= height < 2**31):
             raise entry.wrong(f"has the size {width:g}x{height:g}; correct w and h")
         return int(width), int(height)
-    # A missing image is reported later, together with all others.
-    return image_size(image) if image.is_file() else (1, 1)
+    return size_of(image)
 
 
-def _intrinsics(entry: _Entry, size: tuple[int, int]) -> Float[Tensor, "3 3"]:
+def _intrinsics(entry: Entry, size: tuple[int, int]) -> Float[Tensor, "3 3"]:
     def focal(axis: str, extent: int) -> float | None:
         if f"fl_{axis}" in entry.said:
             return entry.number(f"fl_{axis}")
@@ -216,18 +175,7 @@ def _intrinsics(entry: _Entry, size: tuple[int, int]) -> Float[Tensor, "3 3"]:
     return pinhole(fx, fx if fy is None else fy, entry.number("cx", size[0] / 2), entry.number("cy", size[1] / 2))
 
 
-def _viewmat(entry: _Entry) -> Float[Tensor, "4 4"]:
-    try:
-        matrix = torch.tensor(entry.said.get("transform_matrix"), dtype=torch.float64)
-    except (TypeError, ValueError, RuntimeError, OverflowError):
-        matrix = torch.empty(0)
-    if tuple(matrix.shape) not in ((4, 4), (3, 4)) or not bool(torch.isfinite(matrix).all()):
-        raise entry.wrong("has no 4x4 transform_matrix of finite numbers; export the poses again")
-    camera_to_world = torch.eye(4, dtype=torch.float64)
-    camera_to_world[:3] = matrix[:3]
-    rotation = camera_to_world[:3, :3]
-    if not torch.allclose(rotation.T @ rotation, torch.eye(3, dtype=torch.float64), atol=1e-3) or rotation.det() < 0:
-        raise InputError(
-            f"scene {entry.path}: the transform_matrix of {entry.name} scales or mirrors; export rigid poses"
-        )
-    return torch.linalg.inv(camera_to_world * torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
+def _viewmat(entry: Entry) -> Float[Tensor, "4 4"]:
+    rows = entry.said.get("transform_matrix")
+    matrix = entry.numbers("transform_matrix", 12 if isinstance(rows, list) and len(rows) == 3 else 16).reshape(-1, 4)
+    return entry.viewmat(matrix[:3, :3], matrix[:3, 3], OPENGL)

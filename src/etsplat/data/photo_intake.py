@@ -1,0 +1,112 @@
+"""A folder of photos, as its owner has it, becomes what COLMAP reads: upright JPEG and PNG, sorted by their cameras."""
+
+import os
+import shutil
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Literal
+
+from etsplat.core.errors import InputError
+from etsplat.io.images import IMAGE_SUFFIXES
+from etsplat.io.paths import kind_of, path_remedy
+from etsplat.io.photos import PHOTO_SUFFIXES, PhotoFile, inspect_photo, write_upright
+
+CameraSharing = Literal["auto", "folder", "photo"]
+"""Which photos have one camera: those that say the same of camera and focal length, or else are of one subfolder; those
+of one subfolder; or none. Photos of different sizes never do."""
+
+LEAST_COUNT = 3
+
+
+@dataclass(frozen=True)
+class Photo:
+    """A photo of a folder.
+
+    Attributes:
+        path: the file.
+        name: of its copy that COLMAP reads, relative to the folder, with forward slashes.
+        file: what is known of it.
+    """
+
+    path: Path
+    name: str
+    file: PhotoFile
+
+
+def list_photos(folder: Path) -> list[Photo]:
+    """The photos in a folder and its subfolders, in order of their names; what is hidden is left alone.
+
+    Raises:
+        InputError: no such folder; fewer than three photos; one cannot be opened; two would have one name.
+    """
+    if not folder.is_dir():
+        raise InputError(f"photos {folder}: no such folder; {path_remedy(folder)}")
+    paths = sorted(path for path in folder.rglob("*") if kind_of(path) in PHOTO_SUFFIXES and path.is_file())
+    shown = [path for path in paths if not any(part.startswith(".") for part in path.relative_to(folder).parts)]
+    if len(shown) < LEAST_COUNT:
+        raise InputError(
+            f"photos {folder}: {len(shown)} JPEG, PNG or HEIC files; at least 3 are needed, better 20 or more"
+        )
+    photos: dict[str, Photo] = {}
+    for path in shown:
+        name = path.relative_to(folder)
+        name = (name if kind_of(name) in IMAGE_SUFFIXES else name.with_suffix(".jpg")).as_posix()
+        if name in photos:
+            raise InputError(
+                f"photos {folder}: {photos[name].path.name} and {path.name} would both be {name}; keep one of them"
+            )
+        photos[name] = Photo(path, name, inspect_photo(path))
+    return list(photos.values())
+
+
+def take_in(photos: list[Photo], folder: Path, threads: int | None, report: Callable[[str, int, int], None]) -> None:
+    """Puts photos into a folder by their names: links to those that are upright, upright copies of the others.
+
+    Raises:
+        InputError: a photo is damaged.
+        OSError: it cannot be written.
+    """
+    for photo in photos:
+        (folder / photo.name).parent.mkdir(parents=True, exist_ok=True)
+        if photo.file.upright:
+            _link(photo.path, folder / photo.name)
+    turned = [photo for photo in photos if not photo.file.upright]
+    with ThreadPoolExecutor(threads or os.cpu_count()) as pool:
+        futures = [pool.submit(write_upright, photo.path, folder / photo.name) for photo in turned]
+        try:
+            for done, future in enumerate(futures):
+                report("Turning photos upright", done, len(turned))
+                future.result()
+        finally:
+            for future in futures:
+                future.cancel()
+    if turned:
+        report("Turning photos upright", len(turned), len(turned))
+
+
+def by_camera(photos: list[Photo], sharing: CameraSharing) -> list[list[str]]:
+    """Names of photos, those with one camera together."""
+    groups: dict[object, list[str]] = {}
+    keys: Mapping[CameraSharing, Callable[[Photo], object]] = {
+        "auto": _camera_of,
+        "folder": lambda photo: PurePosixPath(photo.name).parent,
+        "photo": lambda photo: photo.name,
+    }
+    for photo in photos:
+        groups.setdefault((photo.file.size, keys[sharing](photo)), []).append(photo.name)
+    return list(groups.values())
+
+
+def _camera_of(photo: Photo) -> object:
+    camera = photo.file.taken_with
+    says = camera.model or camera.focal_mm or camera.focal_35mm
+    return camera if says else PurePosixPath(photo.name).parent
+
+
+def _link(path: Path, link: Path) -> None:
+    try:
+        link.symlink_to(path.resolve())
+    except OSError:  # a system or a disk without links
+        shutil.copyfile(path, link)

@@ -1,0 +1,97 @@
+"""Masks for photos of an object in front of a plain background."""
+
+import os
+from collections.abc import Callable, Mapping
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+from PIL import Image
+
+from etsplat.core.errors import InputError
+from etsplat.data.frames import Wanted
+from etsplat.data.load import format_of
+from etsplat.data.plain_backgrounds import WORK_SIZE, find_object
+from etsplat.data.scene_files import name_below
+from etsplat.data.undistortion import check_output
+from etsplat.io.atomic import write_error
+from etsplat.io.images import encode_png, image_size, load_pixels
+from etsplat.io.locks import scratch_folder
+
+LEAST_SHARE = 0.5
+"""Of the photos must have a plain background: else the few that seem to have one seem so by chance."""
+
+
+def mask_file(folder: Path, name: str) -> Path:
+    """Where the mask of a photo lies, as COLMAP names it."""
+    return folder / f"{name}.png"
+
+
+def mask_capture(
+    scene: Path | str, out: Path | str, *, progress: Callable[[str, int, int], None] | None = None
+) -> tuple[int, dict[str, str]]:
+    """Writes a mask for each posed photo of an object whose background is plain.
+
+    Args:
+        scene: a folder with posed photos, of any layout.
+        out: folder for the masks, which every reader of photos then takes; must not exist or be empty.
+        progress: called with (phase, done, of how many).
+
+    Returns:
+        How many there are, and why there is none, for the photos without.
+
+    Raises:
+        InputError: there is none for more than half of the photos; the scene or a photo cannot be read; `out` cannot be
+            used.
+    """
+    scene, out = Path(scene), Path(out)
+    check_output(out)
+    images = [frame.image for frame in format_of(scene).list_frames(scene, Wanted()).frames]
+    alone = len({image.stem for image in images}) == len(images)
+    paths = [PurePosixPath(image.name if alone else name_below(image, scene)) for image in images]
+    names = [str(path.with_suffix("")) for path in paths]
+    photos = dict(zip(names, images, strict=True))
+    try:
+        with scratch_folder(out) as work:
+            refused = write_masks(photos, work / "masks", progress or (lambda phase, done, total: None))
+            os.replace(work / "masks", out)
+    except OSError as error:
+        raise write_error(out, error) from error
+    return len(photos) - len(refused), refused
+
+
+def write_masks(photos: Mapping[str, Path], folder: Path, report: Callable[[str, int, int], None]) -> dict[str, str]:
+    """Writes a mask for each photo whose background is plain.
+
+    Args:
+        photos: upright photos by name.
+        folder: for the masks, see `mask_file`.
+        report: called with (phase, done, of how many).
+
+    Returns:
+        Why there is none, for the photos without.
+
+    Raises:
+        InputError: there is none for more than half of the photos; or one is damaged.
+    """
+    refused: dict[str, str] = {}
+    for done, (name, photo) in enumerate(photos.items()):
+        report("Masking", done, len(photos))
+        size = image_size(photo)
+        scale = min(1.0, WORK_SIZE / max(size))
+        small = max(1, round(size[0] * scale)), max(1, round(size[1] * scale))
+        found = find_object(load_pixels(photo, *small)[..., :3].numpy())
+        if found.mask is None:
+            refused[name] = found.problem
+            continue
+        mask = Image.fromarray(found.mask.astype(np.uint8) * 255).resize(size, Image.Resampling.BILINEAR)
+        path = mask_file(folder, name)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(encode_png(np.asarray(mask)))
+    report("Masking", len(photos), len(photos))
+    if len(refused) > (1 - LEAST_SHARE) * len(photos):
+        name, problem = next(iter(refused.items()))
+        raise InputError(
+            f"masks: can be found before a plain background alone, which {len(refused)} of {len(photos)} photos lack"
+            f" ({name}: {problem}); leave the masks out, or photograph before a plain wall or sheet"
+        )
+    return refused
