@@ -8,6 +8,7 @@ import torch
 from etsplat.data.dataset import Dataset
 from etsplat.data.demo_scene import demo_scene
 from etsplat.model.soup_appearance import SoupAppearance
+from etsplat.model.soup_init import StartPoints
 from etsplat.model.surroundings import Surroundings
 from etsplat.model.triangle_soup import TriangleSoup
 
@@ -57,3 +58,32 @@ def test_colours_are_those_of_the_photos_there_and_next_to_it(capture: Dataset) 
     red = replace(capture, images=Red())  # type: ignore[arg-type]
     colors = Surroundings.of(red).soup(red, 0).display_colors()
     torch.testing.assert_close(colors, torch.tensor([[1.0, 0, 0]]).expand_as(colors), rtol=0, atol=1e-3)
+
+
+def test_a_note_tells_the_sphere_to_the_last_bit(capture: Dataset) -> None:
+    """What is no note of one tells none."""
+    told = Surroundings.of(capture)
+    again = Surroundings.of_note(told.note)
+    assert again is not None
+    assert again.radius == told.radius
+    assert torch.equal(again.middle.float(), told.middle)
+    for note in ("none", "", "1 2 3", "1 2 3 0", "1 2 nan 4", "1 2 3 x"):
+        assert Surroundings.of_note(note) is None
+
+
+def test_a_dome_is_about_the_origin_where_the_start_puts_it() -> None:
+    points = StartPoints(torch.tensor([[0.5, -3.0, 1.0], [0.0, 0.0, 0.1]]).repeat(20, 1), torch.rand(40, 3))
+    dome = points.with_sky().positions[:2, None].expand(2, 3, 3)
+    told = Surroundings.dome(points.positions)
+    assert bool(told.outermost(dome).all())
+    assert told.radius == 3
+
+
+def test_it_is_told_which_triangles_face_outwards(capture: Dataset, sphere: TriangleSoup) -> None:
+    """Its own are seen from inside; turned around, they are not."""
+    surroundings, vertices = Surroundings.of(capture), sphere.vertices.detach()
+    a, b, c = vertices.unbind(dim=1)
+    inwards = (torch.linalg.cross(b - a, c - a) * (surroundings.middle - vertices.mean(dim=1))).sum(dim=1) > 0
+    mixed = torch.cat([vertices[:100].flip(1), vertices[100:]])
+    assert torch.equal(surroundings.facing_outwards(vertices), ~inwards)
+    assert torch.equal(surroundings.facing_outwards(mixed), torch.cat([inwards[:100], ~inwards[100:]]))

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -43,3 +45,14 @@ def test_wrong_shapes_are_refused(rng):
         TriangleSoup(**{**parts, "sigma_raw": torch.zeros(4)})
     with pytest.raises(ValueError, match="sh_rest"):
         TriangleSoup(**{**parts, "sh_rest": torch.zeros(5, 4, 3)})
+
+
+def test_some_of_the_triangles_are_a_soup_of_the_same_kind(rng):
+    """With its appearance and notes; detached."""
+    whole = replace(soup(rng), notes={"iteration": "3"})
+    rows = torch.tensor([True, False, False, True, True])
+    some = whole.kept(rows)
+    assert (len(some), some.notes, some.appearance) == (3, whole.notes, whole.appearance)
+    for name, values in some.parameters().items():
+        assert torch.equal(values, getattr(whole, name)[rows])
+        assert not values.requires_grad

@@ -9,6 +9,7 @@ import torch
 
 from etsplat.core.errors import InputError
 from etsplat.io.tensors import read_tensors, save_tensors
+from etsplat.optim import checkpoints
 from etsplat.optim.checkpoints import list_checkpoints, load_latest_checkpoint, save_checkpoint
 
 
@@ -98,3 +99,21 @@ def test_a_full_disk_leaves_the_earlier_checkpoint(
     with pytest.raises(InputError, match="No space left"):
         save_checkpoint(tmp_path, 20, some_tensors(rng), "run")
     assert [path.name for path in tmp_path.iterdir()] == ["step_000010.safetensors"]
+
+
+def test_a_folder_that_goes_while_a_checkpoint_is_written_is_named_by_the_next(
+    tmp_path: Path, rng: torch.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nobody promises that what was written is still there when the older ones are deleted."""
+    folder = tmp_path / "checkpoints"
+    folder.mkdir()
+
+    def save_and_remove(*arguments: object) -> None:
+        save_tensors(*arguments)  # type: ignore[arg-type]
+        folder.rename(tmp_path / "gone")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(checkpoints, "save_tensors", save_and_remove)
+        save_checkpoint(folder, 10, some_tensors(rng), "run")
+    with pytest.raises(InputError, match="cannot write"):
+        save_checkpoint(folder, 20, some_tensors(rng), "run")

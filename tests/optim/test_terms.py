@@ -1,6 +1,7 @@
 """Terms of objectives: the paper's L_mesh and L_nvs, one by one and together."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -10,11 +11,14 @@ import etsplat
 from etsplat.core.cameras import Cameras, intrinsics, look_at
 from etsplat.core.rasterization import Rasterization
 from etsplat.engines.threads import num_threads, set_num_threads
+from etsplat.metrics.depth import DepthKind
 from etsplat.model.triangle_mesh import TriangleMesh
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.ops.triangle_area import mean_area
+from etsplat.optim.depth_trust import DepthTrust
 from etsplat.optim.objective import Custom, Drawing, Objective, Term
 from etsplat.optim.terms import named_terms
+from etsplat.optim.terms.depth import Depth
 from etsplat.optim.terms.mesh import EdgeLength, Laplacian, SmoothNormals, Softness
 from etsplat.optim.terms.photometric import Photometric
 from etsplat.optim.terms.soup import DepthNormals, Distortion, Opacity, Size
@@ -242,3 +246,58 @@ def test_every_weight_among_the_settings_is_that_of_a_term() -> None:
     groups = (ReconstructConfig().regularization, TrainConfig().loss)
     weights = {name for group in groups for name in vars(group) if name.startswith("lambda_")}
     assert weights - {"lambda_dssim"} == {f"lambda_{name}" for name in named_terms()}
+
+
+def a_depth_drawing(depth: Tensor, said: Tensor, alpha: float = 1.0) -> Drawing:
+    color = torch.zeros(1, *depth.shape, 3)
+    rendering = Rasterization(color, torch.full((1, *depth.shape, 1), alpha), depth=depth[None, ..., None])
+    index = torch.tensor([0])
+    return Drawing(None, CAMERA, color, None, torch.zeros(1, 3), rendering, index=index, depth=said[None])
+
+
+def believing(kind: DepthKind, *, inverse: bool = False, used: float = 1.0) -> DepthTrust:
+    trust = DepthTrust([0])
+    trust.load_state(
+        {"decided": torch.tensor([1 + (kind == "pearson"), inverse, 1, 0, 0]), "used": torch.tensor([used])}
+    )
+    return trust
+
+
+def test_depth_is_compared_where_it_is_known():
+    """2 |z - d| / (z + d), mean over the known pixels; its gradient has the sign of the error and no more anywhere."""
+    depth = torch.tensor([[2.0, 3.0], [4.0, 0.0]], requires_grad=True)
+    said = torch.tensor([[1.0, 3.0], [0.0, 5.0]])
+    loss = Depth(1.0, believing("l1"))(a_depth_drawing(depth, said))
+    assert float(loss.detach()) == pytest.approx((2 * 1 / 3 + 0) / 2)
+    loss.backward()
+    assert depth.grad is not None
+    assert depth.grad[0, 0] > 0
+    assert depth.grad[1].tolist() == [0.0, 0.0]
+    far = torch.full((2, 2), 1e6)
+    assert float(Depth()(a_depth_drawing(depth.detach(), far))) <= 2
+
+
+def test_correlation_does_not_see_scale_shift_and_few_wild_numbers():
+    rng = torch.Generator().manual_seed(0)
+    depth = 1 + torch.rand((20, 20), generator=rng)
+    term = Depth(1.0, believing("pearson"))
+    assert float(term(a_depth_drawing(depth, 3 * depth + 2))) == pytest.approx(0, abs=1e-5)
+    assert float(term(a_depth_drawing(depth, 9 - 3 * depth))) == pytest.approx(2, abs=1e-5)
+    wild = 3 * depth + 2
+    wild[0, 0] = 1e4
+    assert float(term(a_depth_drawing(depth, wild))) == pytest.approx(0, abs=1e-4)
+    inverse = Depth(1.0, believing("pearson", inverse=True))
+    assert float(inverse(a_depth_drawing(depth, 1 / depth))) == pytest.approx(0, abs=1e-5)
+
+
+def test_a_map_that_is_not_believed_counts_nothing():
+    """Nor a photo without a map, nor, as a weight, anything before maps are believed."""
+    depth, said = torch.full((2, 2), 2.0), torch.full((2, 2), 3.0)
+    for kind in ("l1", "pearson"):
+        assert float(Depth(1.0, believing(kind, used=0.0))(a_depth_drawing(depth, said))) == 0
+    assert float(Depth()(replace(a_depth_drawing(depth, said), depth=None))) == 0
+    trust = believing("l1")
+    objective = Objective(Photometric(), [Depth(0.5, trust)])
+    assert objective.weights(1) == (0.5,)
+    trust.kind = None
+    assert objective.weights(1) == (0.0,)

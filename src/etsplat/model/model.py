@@ -68,6 +68,11 @@ class Model(Protocol):
         found = {name: getattr(self, name) for name in self.RATES}
         return {name: parameter for name, parameter in found.items() if parameter is not None}
 
+    @property
+    def rates(self) -> dict[str, float]:
+        """`RATES` of the parameters that it has, by name."""
+        return {name: self.RATES[name] for name in self.parameters()}
+
     def learnable(self: M) -> M:
         """This one, with parameters that require gradients."""
         for parameter in self.parameters().values():

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from etsplat.core.errors import InputError
-from etsplat.core.harmonics import MAX_DEGREE
+from etsplat.core.harmonics import MAX_DEGREE, SH_CONSTANT
 from etsplat.core.kernels import DISTANCES, KERNELS
 from etsplat.core.rasterization import SOUP_SIGMA_FLOOR
 from etsplat.io.mesh_files import load_mesh
@@ -17,7 +17,8 @@ from etsplat.io.paths import kind_of
 from etsplat.io.ply_tables import CORNERS, columns, read_ply_header, read_ply_tables
 from etsplat.io.tensors import read_state_dict
 from etsplat.model.soup_appearance import SoupAppearance
-from etsplat.model.triangle_soup import SH_CONSTANT, TriangleSoup
+from etsplat.model.soup_compact import open_compact
+from etsplat.model.triangle_soup import TriangleSoup
 
 GAUSSIAN_SIGMA = 1.0
 """With it the elastic kernel is exp(-x^2): the profile of a Gaussian."""
@@ -35,8 +36,9 @@ def open_soup(path: Path | str) -> TriangleSoup:
     """Read triangles from any file that holds some.
 
     Args:
-        path: `.safetensors` of `etsplat train`; `.pt` of Triangle Splatting (`point_cloud_state_dict.pt`); `.ply` that
-            `etsplat export` wrote, of a Gaussian scene or of a mesh; `.obj`, `.off`, `.glb`, `.gltf`, `.stl`.
+        path: `.safetensors` of `etsplat train`; `.etz` of `etsplat export`; `.pt` of Triangle Splatting
+            (`point_cloud_state_dict.pt`); `.ply` that `etsplat export` wrote, of a Gaussian scene or of a mesh; `.obj`,
+            `.off`, `.glb`, `.gltf`, `.stl`.
 
     Raises:
         InputError: the file is missing, damaged or of another kind.
@@ -46,6 +48,8 @@ def open_soup(path: Path | str) -> TriangleSoup:
         raise InputError(f"soup {path}: no such file; check the path")
     if kind_of(path) == ".safetensors":
         soup = TriangleSoup.load(path)
+    elif kind_of(path) == ".etz":
+        soup = open_compact(path)
     else:
         soup = {".pt": _read_triangle_splatting, ".ply": _read_ply}.get(kind_of(path), _read_mesh)(path)
         soup = replace(soup, **soup.state(), notes={"source": path.name})

@@ -1,10 +1,12 @@
-"""What lies behind everything in a scene: a closed sphere of triangles, coloured by the photos.
+"""What lies behind everything in a scene, its sky: a closed sphere of triangles, coloured by the photos.
 
 Photos of few views leave gaps between what they show. Without anything behind them a gap is a hole, and the background
 of a photo is learned by triangles in the air before its camera, where no other view expects them.
 """
 
+import math
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import torch
 from jaxtyping import Bool, Float
@@ -40,6 +42,9 @@ class Surroundings:
         radius: of the sphere.
     """
 
+    NOTE: ClassVar[str] = "sky"
+    """Under this name a soup's notes say where its sky is, as `note` does; or that it has none, by any other word."""
+
     middle: Float[Tensor, "3"]
     radius: float
 
@@ -50,6 +55,26 @@ class Surroundings:
         middle = centers.mean(dim=0)
         everything = centers if dataset.points is None else torch.cat([centers, dataset.points])
         return cls(middle, REACH * float((everything - middle).norm(dim=1).quantile(_NEARLY_ALL)))
+
+    @classmethod
+    def dome(cls, points: Float[Tensor, "P 3"]) -> "Surroundings":
+        """Where `StartPoints.with_sky` puts its triangles: about the origin, as far as the farthest coordinate."""
+        return cls(torch.zeros(3), float(points.abs().max()))
+
+    @classmethod
+    def of_note(cls, note: str) -> "Surroundings | None":
+        """What `note` wrote; None if that was of a soup without a sky, or is none of its notes."""
+        try:
+            x, y, z, radius = (float(word) for word in note.split())
+        except ValueError:
+            return None
+        known = all(map(math.isfinite, (x, y, z, radius))) and radius > 0
+        return cls(torch.tensor([x, y, z], dtype=torch.float64), radius) if known else None
+
+    @property
+    def note(self) -> str:
+        """Middle and radius as a soup's notes keep them, each number to its last bit."""
+        return " ".join(repr(number) for number in (*self.middle.double().tolist(), self.radius))
 
     def to(self, device: torch.device) -> "Surroundings":
         """The same on a device."""
@@ -76,6 +101,13 @@ class Surroundings:
     def outermost(self, vertices: Float[Tensor, "N 3 3"]) -> Bool[Tensor, " N"]:
         """Which triangles are on the sphere or beyond."""
         return (vertices.mean(dim=1) - self.middle).norm(dim=1) > _INSIDE * self.radius
+
+    @torch.no_grad()
+    def facing_outwards(self, vertices: Float[Tensor, "N 3 3"]) -> Bool[Tensor, " N"]:
+        """Which triangles have their corners clockwise as seen from the middle."""
+        a, b, c = vertices.unbind(dim=1)
+        across = torch.linalg.cross(b - a, c - a)
+        return (across * (vertices.mean(dim=1) - self.middle.to(vertices))).sum(dim=1) > 0
 
 
 def _blended(

@@ -1,5 +1,6 @@
 """The learnable mesh of shape reconstruction."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -10,6 +11,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from etsplat.core.cameras import Cameras
+from etsplat.core.harmonics import SH_CONSTANT
 from etsplat.core.rasterization import Rasterization
 from etsplat.core.validation import check_memory, check_shape
 from etsplat.data.dataset import Normalization
@@ -19,6 +21,12 @@ from etsplat.model.model import Appearance, Depth, Model
 from etsplat.ops.antialias import rasterize_antialiased
 from etsplat.ops.rasterize import rasterize
 from etsplat.ops.rasterize_opaque import render_opaque
+from etsplat.ops.soup_colors import soup_colors
+from etsplat.ops.spherical_harmonics import spherical_harmonics
+
+_SEEN_FROM_FRONT = (2 / 3, 1 / 4, 0.0)
+"""Bands 1 to 3, averaged over the directions in front of a face, each with the area that the face shows there: these
+parts of their values towards its normal (a clamped cosine in harmonics; Ramamoorthi and Hanrahan 2001)."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +61,8 @@ class TriangleMesh(Model):
         colors: (F, 3) face colours, or (V, 3) if `vertex_colored`; learnable.
         opacity_logits: (F,) learnable; None for a mesh of opaque triangles.
         log_sigma: () learnable; None for a mesh of opaque triangles.
+        harmonics: (F, R, 3) what depends on the direction in colours of soft faces: coefficients of bands 1 and up of
+            `etsplat.spherical_harmonics`, R = 3, 8 or 15; learnable. None for colours that are the same from all sides.
         topology: connectivity of the faces.
         vertex_colored: whether colours belong to vertices, and are interpolated over the faces.
         appearance: how it is drawn.
@@ -63,6 +73,7 @@ class TriangleMesh(Model):
         "colors": 1e-2,
         "opacity_logits": 1e-3,
         "log_sigma": 1e-4,
+        "harmonics": 5e-4,
     }
     OPAQUE: ClassVar[str] = "mesh"
 
@@ -73,6 +84,7 @@ class TriangleMesh(Model):
     topology: MeshTopology
     vertex_colored: bool = False
     appearance: MeshAppearance = field(default_factory=MeshAppearance)
+    harmonics: Float[Tensor, "F R 3"] | None = None
 
     @classmethod
     def from_mesh(
@@ -85,6 +97,7 @@ class TriangleMesh(Model):
         sigma: float | None,
         vertex_colored: bool = False,
         appearance: MeshAppearance | None = None,
+        harmonics: int = 0,
     ) -> "TriangleMesh":
         """A mesh to start from.
 
@@ -96,6 +109,10 @@ class TriangleMesh(Model):
             sigma: softness, > 0.
             vertex_colored: whether colours belong to vertices.
             appearance: how it is drawn; None for the elastic kernel, or as opaque triangles where it is not soft.
+            harmonics: degree, 0 to 3, up to which colours depend on the direction; of soft triangles with face colours.
+
+        Raises:
+            ValueError: wrong shapes or dtypes; harmonics of opaque triangles or of colours of vertices.
         """
         check_shape("vertices", vertices, ("V", 3))
         check_shape("faces", faces, ("F", 3))
@@ -105,6 +122,9 @@ class TriangleMesh(Model):
         count = len(vertices) if vertex_colored else len(faces)
         start = colors if isinstance(colors, Tensor) else torch.full((count, 3), colors)
         soft = opacity is not None and sigma is not None
+        if harmonics and (vertex_colored or not soft):
+            raise ValueError("harmonics must be 0 where triangles are opaque or colours belong to vertices")
+        rest = vertices.new_zeros(len(faces), (harmonics + 1) ** 2 - 1, 3) if harmonics else None
         logit = torch.logit(torch.tensor(opacity, dtype=torch.float64)).to(vertices) if soft else None
         return cls(
             vertices=vertices,
@@ -114,6 +134,7 @@ class TriangleMesh(Model):
             topology=MeshTopology.from_faces(faces, len(vertices)),
             vertex_colored=vertex_colored,
             appearance=appearance or MeshAppearance("elastic" if soft else None),
+            harmonics=rest,
         ).learnable()
 
     @classmethod
@@ -188,7 +209,7 @@ class TriangleMesh(Model):
             self.vertices,
             opacities=self.opacities,
             sigma=self.sigma,
-            **self.named(self.colors),
+            **self.named(self._colors_towards(cameras)),
             cameras=cameras,
             faces=self.faces,
             kernel=look.kernel,
@@ -241,8 +262,9 @@ class TriangleMesh(Model):
     @property
     def face_parameters(self) -> tuple[str, ...]:
         """Names of the parameters with one row per face."""
-        colors = () if self.vertex_colored else ("colors",)
-        return (*colors, "opacity_logits") if self.opacity_logits is not None else colors
+        named = {"colors": not self.vertex_colored}
+        named |= {name: getattr(self, name) is not None for name in ("opacity_logits", "harmonics")}
+        return tuple(name for name, there in named.items() if there)
 
     @property
     def faces(self) -> Int[Tensor, "F 3"]:
@@ -263,8 +285,33 @@ class TriangleMesh(Model):
 
     @property
     def display_colors(self) -> Float[Tensor, "F 3"] | Float[Tensor, "V 3"]:
-        """In [0, 1], detached: the colours that an exported mesh carries."""
-        return self.colors.detach().clamp(0.0, 1.0)
+        """In [0, 1], detached: the colours that an exported mesh carries.
+
+        Where colours depend on the direction, each face's mean over the directions in front of it.
+        """
+        if self.harmonics is None:
+            return self.colors.detach().clamp(0.0, 1.0)
+        corners = self.vertices.detach()[self.faces]
+        normals = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        parts = [part for band, part in enumerate(_SEEN_FROM_FRONT, 1) for _ in range(2 * band + 1)]
+        weights = normals.new_tensor(parts[: self.harmonics.shape[1]])[:, None]
+        coefficients = torch.cat([self._constant_band(), weights * self.harmonics], dim=1).detach()
+        return spherical_harmonics(coefficients, -normals, self.degree).clamp(0.0, 1.0)
+
+    @property
+    def degree(self) -> int:
+        """Of the harmonics; 0 where there are none."""
+        return 0 if self.harmonics is None else math.isqrt(self.harmonics.shape[1] + 1) - 1
+
+    def _constant_band(self) -> Float[Tensor, "F 1 3"]:
+        return ((self.colors - 0.5) / SH_CONSTANT)[:, None]
+
+    def _colors_towards(self, cameras: Cameras) -> Tensor:
+        """Of vertices, of faces, or of faces in each of B pictures."""
+        if self.harmonics is None:
+            return self.colors
+        corners = self.vertices[self.faces]
+        return soup_colors(corners, self._constant_band(), self.harmonics, cameras.centers, self.degree)
 
     def named(self, colors: Tensor) -> dict[str, Any]:
         """Colours of this mesh as an argument: {"face_colors": colors} or {"vertex_colors": colors}."""

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from etsplat.core.cameras import Cameras
 from etsplat.core.errors import InputError
-from etsplat.core.harmonics import MAX_DEGREE
+from etsplat.core.harmonics import MAX_DEGREE, SH_CONSTANT
 from etsplat.core.rasterization import SOUP_SIGMA_FLOOR, Rasterization, joined
 from etsplat.core.validation import check_shape
 from etsplat.io.kernel_files import adopt_kernel, kernel_tensors
@@ -28,8 +28,14 @@ from etsplat.ops.spherical_harmonics import spherical_harmonics
 
 FORMAT = "etsplat soup 1"
 
-SH_CONSTANT = 0.28209479177387814
-"""The constant basis function Y_0: a colour c is the coefficient (c - 1/2) / Y_0."""
+FOCAL_NOTE = "focal"
+"""Note of a trained soup: the mean focal length of the photos, in pixels of the size at which they were seen."""
+
+GEOREFERENCE_NOTE = "georeference"
+"""Note of a trained soup: where its units lie in the world, as `etsplat.io.georeference.Georeference` writes it."""
+
+_NEAR_ONE = 1 - 2.0**-24
+"""The largest float below 1: what the floor brings to 1 has no finite logit."""
 
 
 @dataclass
@@ -166,6 +172,11 @@ class TriangleSoup(Model):
         both = {name: torch.cat([mine, theirs[name]]) for name, mine in self.parameters().items()}
         return replace(self, **both).learnable()
 
+    @torch.no_grad()
+    def kept(self, rows: Bool[Tensor, " N"]) -> "TriangleSoup":
+        """Some of the triangles, detached."""
+        return replace(self, **{name: values.detach()[rows] for name, values in self.parameters().items()})
+
     @property
     def count(self) -> int:
         """Number of triangles."""
@@ -262,7 +273,8 @@ class TriangleSoup(Model):
         """The same with all that its appearance squeezes written into its parameters, detached."""
         look, parameters = self.appearance, self.state()
         if look.opacity_floor > 0:
-            parameters["opacity_logits"] = torch.logit(self.drawn_opacities.detach().double()).float()
+            drawn = self.drawn_opacities.detach().double().clamp_max(_NEAR_ONE)
+            parameters["opacity_logits"] = torch.logit(drawn).float()
         if look.sigma_ceiling < float("inf"):
             highest = torch.tensor(look.sigma_ceiling - SOUP_SIGMA_FLOOR).log()
             parameters["sigma_raw"] = parameters["sigma_raw"].clamp_max(float(highest))

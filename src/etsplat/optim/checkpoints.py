@@ -12,7 +12,6 @@ from etsplat.core.errors import InputError
 from etsplat.io.tensors import read_tensors, save_tensors
 
 FORMAT = "etsplat checkpoint 1"
-KEEP = 2
 
 
 @dataclass(frozen=True)
@@ -52,16 +51,16 @@ def save_checkpoint(folder: Path, iteration: int, tensors: Mapping[str, Tensor],
     path = checkpoint_path(folder, iteration)
     metadata = {"format": FORMAT, "iteration": str(iteration), "run_hash": run_hash}
     save_tensors(path, tensors, metadata)
-    paths = list_checkpoints(folder)
-    newest = paths.index(path) + 1
-    for old in [*paths[: max(0, newest - KEEP)], *paths[newest:]]:
-        old.unlink(missing_ok=True)
+    others = [other for other in list_checkpoints(folder) if other != path]
+    earlier = [other for other in others if _by_iteration(other) < _by_iteration(path)]
+    for other in set(others) - set(earlier[-1:]):
+        other.unlink(missing_ok=True)
     return path
 
 
 def list_checkpoints(folder: Path) -> list[Path]:
     """Checkpoint files of a folder, oldest first; empty if the folder does not exist."""
-    return sorted(folder.glob("step_*.safetensors"), key=lambda path: (len(path.name), path.name))
+    return sorted(folder.glob("step_*.safetensors"), key=_by_iteration)
 
 
 def load_latest_checkpoint(folder: Path, run_hash: str) -> Checkpoint | None:
@@ -90,6 +89,10 @@ def load_latest_checkpoint(folder: Path, run_hash: str) -> Checkpoint | None:
     if not re.fullmatch(r"[0-9]{1,18}", iteration):
         raise InputError(f"{path}: does not say which iteration it is of; {remedy}")
     return Checkpoint(path, int(iteration), tensors)
+
+
+def _by_iteration(path: Path) -> tuple[int, str]:
+    return len(path.name), path.name
 
 
 def _first_line(error: Exception) -> str:

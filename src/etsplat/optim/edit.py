@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import torch
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from etsplat.core.validation import check_indices, check_memory, check_shape
@@ -139,6 +139,35 @@ def apply_rows(
 
     parameters = {name: _carry(name, set_values(name), start_at_zero, adam, {}) for name in list(adam.parameters)}
     return parameters, {name: start_at_zero(tensor) for name, tensor in statistics.items()}
+
+
+def halves_plan(vertices: Float[Tensor, "N3 3"], colors: Float[Tensor, "N3 3"], halved: Int[Tensor, " K"]) -> RowPlan:
+    """Halves some of N separate triangles at the middle of their longest edges; rows are their corners.
+
+    Args:
+        vertices: (3N, 3) corners, three of each triangle after the other.
+        colors: (3N, 3) likewise; the middle has the mean of its edge's ends.
+        halved: (K,) which triangles, each once. Their halves come last: one of each, then the others.
+    """
+    corners, tones = (tensor.reshape(-1, 3, 3) for tensor in (vertices, colors))
+    halved = halved.to(corners.device)
+    kept = torch.ones(len(corners), dtype=torch.bool, device=corners.device)
+    kept[halved] = False
+    triangles = torch.cat([kept.nonzero()[:, 0], halved, halved])
+    source = (3 * triangles[:, None] + torch.arange(3, device=corners.device)).flatten()
+    fresh = torch.arange(len(source), device=corners.device) >= 3 * int(kept.sum())
+    chosen = corners[halved]
+    longest = (chosen.roll(-1, dims=1) - chosen).norm(dim=2).argmax(dim=1)  # edge k runs from corner k to the next
+    rows, following = torch.arange(len(halved), device=corners.device), (longest + 1) % 3
+
+    def halves(values: Tensor) -> Tensor:
+        middle = (values[rows, longest] + values[rows, following]) / 2
+        first, second = values.clone(), values.clone()
+        first[rows, following] = middle
+        second[rows, longest] = middle
+        return torch.cat([first, second]).reshape(-1, 3)
+
+    return RowPlan(len(vertices), source, fresh, {"vertices": halves(chosen), "colors": halves(tones[halved])})
 
 
 def _check_flags_of_rows(name: str, flags: Tensor, rows: str | int) -> None:

@@ -39,6 +39,24 @@ class PrepareEvent:
 
 
 @dataclass(frozen=True)
+class StageEvent:
+    """While something is made that belongs to the result beside what the run optimizes.
+
+    Attributes:
+        name: what is made.
+        done: steps done.
+        total: steps in all.
+    """
+
+    name: str
+    done: int
+    total: int
+
+    def __str__(self) -> str:
+        return f"{self.name}: {self.done}/{self.total}"
+
+
+@dataclass(frozen=True)
 class NoteEvent:
     """Something that the owner of the run should know, such as a repair made while reading the input.
 
@@ -163,8 +181,8 @@ class DoneEvent:
         return f"{self.iteration} iterations in {self.seconds:.1f} s"
 
 
-Event = PrepareEvent | NoteEvent | StepEvent | RefineEvent | UndoEvent | CheckpointEvent | DoneEvent
-"""The first two are told by tasks, before the loop begins."""
+Event = PrepareEvent | StageEvent | NoteEvent | StepEvent | RefineEvent | UndoEvent | CheckpointEvent | DoneEvent
+"""The first three are told by tasks, before the loop begins or after it ended."""
 
 Callback = Callable[[Event], None]
 

@@ -11,7 +11,7 @@ from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal
 
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from etsplat.core.cameras import Cameras
@@ -34,6 +34,8 @@ class Drawing:
         background: (1, 3) behind the picture, and to be put behind the photo.
         rendering: the picture, as the photo was exposed, with the outputs that the terms ask for.
         shared: what one term has computed of this view for others, by its name.
+        index: (1,) of the view in its data set.
+        depth: (1, H, W) along the optical axis, in units of the model's frame, 0 where not known; None without.
     """
 
     model: Any
@@ -43,6 +45,8 @@ class Drawing:
     background: Float[Tensor, "1 3"]
     rendering: Rasterization
     shared: dict[Hashable, Any] = field(default_factory=dict)
+    index: Int[Tensor, "1"] | None = None
+    depth: Float[Tensor, "1 H W"] | None = None
 
 
 class Term(ABC):

@@ -15,6 +15,7 @@ from etsplat.data.loader import View, ViewLoader
 from etsplat.engines.choice import engine_for
 from etsplat.model.model import Model
 from etsplat.ops.adam import Adam
+from etsplat.optim.depth_trust import DepthTrust
 from etsplat.optim.exposure import Exposure
 from etsplat.optim.objective import Drawing, Objective
 from etsplat.optim.schedules import Schedule, at
@@ -148,6 +149,12 @@ class Stepper(Generic[M]):
         if self._exposure.learned:
             self.restart()
 
+    def measure_depths(self, trust: DepthTrust) -> None:
+        """Compares depth maps with the model as it is now."""
+        with_maps = (index for index in self._dataset.train if index in self._dataset.images.with_depth)
+        trust.measure(self._model, (self._loader.view(index) for index in with_maps))
+        self.restart()
+
     def _step(self, iteration: int) -> float:
         self.arrive(iteration)
         chosen = self._choose()
@@ -222,7 +229,9 @@ class Stepper(Generic[M]):
                 view.camera, backgrounds=background, outputs=outputs, depth_of=self._objective.depth_of
             )
             shot = exposure.applied(rendering, view, background) if exposure.learned else rendering
-            drawing = Drawing(self._model, view.camera, view.photo, view.mask, background, shot)
+            drawing = Drawing(
+                self._model, view.camera, view.photo, view.mask, background, shot, index=view.index, depth=view.depth
+            )
             whole = number == self._batch
             loss = self._objective(drawing, weights, scale, views=self._batch, whole=whole)
             if exposure.learned:

@@ -1,10 +1,11 @@
 """When triangles are added and removed, and which: strategies. They edit through `optim/edit.py` alone."""
 
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from etsplat.core.rasterization import Rasterization
@@ -15,7 +16,7 @@ from etsplat.model.triangle_mesh import TriangleMesh
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.ops.adam import Adam
 from etsplat.optim.densification import PruneRules, SoupStatistics, dead_triangles, densify_plan, grown_count
-from etsplat.optim.edit import RowPlan, apply_rows, apply_subdivision
+from etsplat.optim.edit import RowPlan, apply_rows, apply_subdivision, halves_plan
 from etsplat.optim.loop import DivergedError
 from etsplat.optim.schedules import NEVER
 from etsplat.optim.terms.soup import Spared
@@ -127,6 +128,42 @@ class SubdivideAndUntangle(Strategy):
             topology, reach = model.topology.to(torch.device("cpu")), self._reaches[self.undone]
             with torch.no_grad():
                 model.vertices.copy_(untangle(model.vertices.cpu(), topology, reach=reach)[0])
+
+
+class HalveWhereWrong(Strategy):
+    """Halves those of a mesh's separate triangles, at given times, that pictures are most wrong in.
+
+    Each corner is a vertex of its own, before and after: halves that shared the new corner would keep its colour and
+    place in common, and fit photos worse (research/ablations.md).
+    """
+
+    def __init__(self, budgets: Mapping[int, int], wrong: Callable[[TriangleMesh], Float[Tensor, " F"]]) -> None:
+        """Takes the times.
+
+        Args:
+            budgets: by iteration, how many triangles there may be after it (`optim.schedules.face_budgets`).
+            wrong: (F,) how wrong pictures are in each triangle.
+        """
+        self._budgets, self._wrong = dict(budgets), wrong
+
+    def next_edit(self, iteration: int) -> int:
+        """The next of the given times."""
+        return min((i for i in self._budgets if i >= iteration), default=NEVER)
+
+    def edit(self, iteration: int) -> bool:
+        """Halves them, at the middles of their longest edges."""
+        if iteration not in self._budgets:
+            return False
+        mesh: TriangleMesh = self.model
+        wrong = self._wrong(mesh)
+        most = min(self._budgets[iteration] - mesh.count, int((wrong > 0).sum()))
+        if most <= 0:
+            return False
+        plan = halves_plan(mesh.vertices.detach(), mesh.colors.detach(), wrong.topk(most).indices)
+        parameters, _ = apply_rows(plan, self.adam, {})
+        faces = torch.arange(len(plan.source), device=mesh.vertices.device).reshape(-1, 3)
+        mesh.load_state({**parameters, "faces": faces})
+        return True
 
 
 @dataclass

@@ -19,6 +19,7 @@ from etsplat.io.locks import writing_run
 from etsplat.io.run_directory import RunDirectory, is_run
 from etsplat.model.model import Model
 from etsplat.ops.adam import Adam
+from etsplat.optim.depth_trust import DepthTrust
 from etsplat.optim.drive import drive
 from etsplat.optim.exposure import Exposure
 from etsplat.optim.gauge import Gauge
@@ -48,9 +49,13 @@ class Trainer(Generic[M]):
         adam: its optimizer.
         strategy: what adds and removes triangles.
         exposure: what is learned of each photo's exposure.
+        depths: which depth maps are believed.
         progress: where the run stands.
         guard: what undoes edits; None lets all of them stay.
+        onlooker: called after steps, before an edit, with the iterations done; it may look at the model, not change it.
     """
+
+    onlooker: Callable[[int], None] | None = None
 
     def __init__(
         self,
@@ -63,6 +68,7 @@ class Trainer(Generic[M]):
         batch: int = 1,
         background: Sequence[float] | None = None,
         exposure: Exposure | None = None,
+        depths: DepthTrust | None = None,
         update: Callable[[Adam, Any], None] | None = None,
         evaluate: Callable[[Any], dict[str, float]] | None = None,
         guard: Guard | None = None,
@@ -80,13 +86,14 @@ class Trainer(Generic[M]):
             batch: views that each step sees.
             background: colour behind the pictures; None for another random one behind each.
             exposure: what is learned of each photo's exposure; None for photos that were all exposed alike.
+            depths: which depth maps are believed, as the objective's term has it; None where none are used.
             update: takes the step from the gradients, in the place of `Adam.step`.
             evaluate: cheap metrics of the model.
             guard: undoes edits of the strategy after which the training photos are explained worse.
             seed: of the order of views and every other random choice; or a generator to go on with.
         """
         self.model, self.strategy, self.progress = model, strategy or Fixed(), Progress()
-        self.exposure, self.guard = exposure or Exposure(NEVER), guard
+        self.exposure, self.depths, self.guard = exposure or Exposure(NEVER), depths or DepthTrust([]), guard
         self._objective, self._dataset, self._batch, self._evaluate = objective, dataset, batch, evaluate
         generator = seed if isinstance(seed, torch.Generator) else torch.Generator().manual_seed(seed)
         self._began = generator.get_state()
@@ -96,7 +103,7 @@ class Trainer(Generic[M]):
             dataset,
             objective,
             self.strategy,
-            schedule or Schedule(model.RATES),
+            schedule or Schedule(model.rates),
             self.exposure,
             batch=batch,
             background=behind,
@@ -114,6 +121,7 @@ class Trainer(Generic[M]):
             self._watch = Watch(kept, objective, self._stepper.look)
         self.strategy.start(model, self.adam, len(dataset.train), generator)
         self.exposure.start(dataset.train, batch, some)
+        self.depths.start(some)
 
     def fit(
         self,
@@ -172,13 +180,19 @@ class Trainer(Generic[M]):
     def advance(self, first: int, last: int) -> list[float]:
         """Steps; on a device many together. Returns the losses before them."""
         judged = NEVER if self.guard is None else self.guard.due
-        stops = self.strategy.next_edit(first), judged, self.exposure.next_measurement(first)
-        return self._stepper.advance(first, last, stops)
+        measured = self.exposure.next_measurement(first), self.depths.next_measurement(first)
+        stops = self.strategy.next_edit(first), judged, *measured
+        losses = self._stepper.advance(first, last, stops)
+        if self.onlooker is not None:
+            self.onlooker(first + len(losses) - 1)
+        return losses
 
     def refine(self, iteration: int) -> int:
         """Edits if it is time to; returns by how many triangles the model grew."""
         if iteration == self.exposure.measured_at:
             self._stepper.measure_exposure()
+        if iteration == self.depths.measured_at:
+            self._stepper.measure_depths(self.depths)
         return self._edit(iteration)
 
     def _edit(self, iteration: int) -> int:
@@ -216,7 +230,10 @@ class Trainer(Generic[M]):
     def evaluate(self) -> dict[str, float]:
         """Cheap metrics of the present state, which is kept if the watched photos speak for it."""
         metrics = self._evaluate(self.model) if self._evaluate else {}
-        return metrics | (self._watch.observe(self.model, self.progress.iteration) if self._watch else {})
+        watched = self._watch.observe(self.model, self.progress.iteration) if self._watch else {}
+        if watched:
+            self.depths.observe(watched["watched_psnr"])
+        return metrics | watched
 
     def outcome(self) -> Outcome[M]:
         """What the run gives: the last state, or an earlier one where the watched photos speak for it (optim/watch.py).
@@ -253,6 +270,7 @@ class Trainer(Generic[M]):
             "sampler": self._stepper.sampler.state(),
             "watch": self._watch.state() if self._watch else {},
             "exposure": self.exposure.state(),
+            "depths": self.depths.state(),
         }
         state = {f"{part}.{name}": tensor for part, tensors in parts.items() for name, tensor in tensors.items()}
         return {**state, **kernel_tensors(self._kernel), "adam.step_count": torch.tensor(self.adam.step_count)}
@@ -275,6 +293,7 @@ class Trainer(Generic[M]):
         if self._watch is not None:
             self._watch.load_state(_part(state, "watch"))
         self.exposure.load_state(_part(state, "exposure"))
+        self.depths.load_state(_part(state, "depths"))
         self._stepper.arrive(iteration)
         self.edited()
 
