@@ -29,12 +29,14 @@ from etsplat.engines.threads import set_num_threads as set_num_threads
 from etsplat.geometry.icosphere import icosphere as icosphere
 from etsplat.geometry.subdivision import longest_edge_plan as longest_edge_plan
 from etsplat.geometry.topology import MeshTopology as MeshTopology
+from etsplat.io.georeference import Georeference as Georeference
 from etsplat.io.images import load_image as load_image
 from etsplat.io.images import save_image as save_image
 from etsplat.io.mesh_files import MeshFile as MeshFile
 from etsplat.io.mesh_files import load_mesh as load_mesh
 from etsplat.io.mesh_files import save_mesh as save_mesh
 from etsplat.io.videos import open_video as open_video
+from etsplat.metrics.flip import flip as flip
 from etsplat.metrics.geometry import GeometryMetrics as GeometryMetrics
 from etsplat.metrics.geometry import geometry_metrics as geometry_metrics
 from etsplat.metrics.image import Lpips as Lpips
@@ -44,6 +46,8 @@ from etsplat.metrics.image import ssim as ssim
 from etsplat.model.soup_appearance import SoupAppearance as SoupAppearance
 from etsplat.model.soup_init import StartPoints as StartPoints
 from etsplat.model.soup_init import start_soup as start_soup
+from etsplat.model.textured_mesh import TextureAppearance as TextureAppearance
+from etsplat.model.textured_mesh import TexturedMesh as TexturedMesh
 from etsplat.model.triangle_mesh import MeshAppearance as MeshAppearance
 from etsplat.model.triangle_mesh import TriangleMesh as TriangleMesh
 from etsplat.model.triangle_soup import TriangleSoup as TriangleSoup
@@ -57,6 +61,7 @@ from etsplat.ops.rasterize import rasterize as rasterize
 from etsplat.ops.rasterize_opaque import rasterize_opaque as rasterize_opaque
 from etsplat.ops.rasterize_opaque import render_opaque as render_opaque
 from etsplat.ops.spherical_harmonics import spherical_harmonics as spherical_harmonics
+from etsplat.ops.texture import sample_texture as sample_texture
 from etsplat.optim.densification import PruneRules as PruneRules
 from etsplat.optim.edit import RowPlan as RowPlan
 from etsplat.optim.edit import apply_rows as apply_rows
@@ -69,6 +74,7 @@ from etsplat.optim.loop import DoneEvent as DoneEvent
 from etsplat.optim.loop import NoteEvent as NoteEvent
 from etsplat.optim.loop import PrepareEvent as PrepareEvent
 from etsplat.optim.loop import RefineEvent as RefineEvent
+from etsplat.optim.loop import StageEvent as StageEvent
 from etsplat.optim.loop import StepEvent as StepEvent
 from etsplat.optim.loop import UndoEvent as UndoEvent
 from etsplat.optim.objective import Custom as Custom
@@ -96,6 +102,7 @@ from etsplat.optim.trainer import Trainer as Trainer
 from etsplat.optim.vertex_updates import UniformSteps as UniformSteps
 from etsplat.optim.watch import Outcome as Outcome
 from etsplat.report.html import write_report as write_report
+from etsplat.tasks.export_mesh import texture_mesh as texture_mesh
 from etsplat.tasks.reconstruct import ReconstructResult as ReconstructResult
 from etsplat.tasks.reconstruct import reconstruct as reconstruct
 from etsplat.tasks.reconstruct_config import ReconstructConfig as ReconstructConfig

@@ -7,6 +7,7 @@ import pytest
 
 from etsplat.cli.parse import parse
 from etsplat.cli.runs import DemoObject, DemoScene, Reconstruct, Train
+from etsplat.cli.soups import Export, Render
 from etsplat.core.errors import InputError
 from etsplat.io.run_directory import FORMAT
 from etsplat.tasks.reconstruct_config import ReconstructConfig
@@ -120,3 +121,18 @@ def test_numbers_that_cannot_be_meant_are_refused_by_name(etsplat: Run, name: st
     """Before memory or time is spent on them."""
     option = f"--{name.replace('_', '-')}"
     assert_one_line_error(etsplat("demo", option, value), name, "it must be")
+
+
+def test_the_sky_is_left_out_by_the_same_word_in_export_and_render() -> None:
+    """`export` has more to choose from: --no-sky is --sky none."""
+    export, render = parse(["export", "run", "--no-sky"]), parse(["render", "run", "--no-sky"])
+    assert isinstance(export, Export)
+    assert isinstance(render, Render)
+    assert (export.settings.sky, render.settings.sky) == ("none", False)
+    assert export == parse(["export", "run", "--sky", "none"])
+
+
+@pytest.mark.parametrize("command", ["export", "render"])
+def test_a_crop_that_is_none_is_refused_before_anything_is_read(command: str) -> None:
+    with pytest.raises(InputError, match=r"--crop: is 'cube:1'; write auto, sphere:X,Y,Z,R or box:X0,Y0,Z0,X1,Y1,Z1"):
+        parse([command, "nowhere", "--crop", "cube:1"]).run([])

@@ -86,9 +86,13 @@ def test_presets_of_reconstruct_are_what_they_were(preset: str) -> None:
     config = flatten(ReconstructConfig.of(preset).to_dict())
     since = {"start.hull_faces": 0.5, "start.near": 0.3, "start.near_edge": 0.02, "start.near_reach": 2.0}
     since["refinement.reach"] = 0.5
+    since |= {"drawing.harmonics": 0, "optimizer.lr_harmonics": 5e-4}
     since["start.shape"] = "sphere" if preset in ("paper", "study", "tiny") else "auto"
+    since |= {"texture": None, "output.texture_faces": 10_000}
     since["watch"] = 0 if preset in ("paper", "study", "tiny") else None
     since["exposure"] = "off" if preset in ("paper", "study", "tiny") else "auto"
+    since["regularization.depth"] = "off" if preset in ("paper", "study", "tiny") else "auto"
+    since["regularization.lambda_depth"] = 0.5
     since["refinement.guard"] = 0.0 if preset in ("paper", "study", "tiny") else 0.02
     expected = {**before.RECONSTRUCT_PAPER, **before.RECONSTRUCT_CHANGES[preset]}
     named = {before.RECONSTRUCT_NAMES[name]: expected[name] for name in expected}
@@ -105,6 +109,8 @@ def test_presets_of_train_are_what_they_were(preset: str, scene: str) -> None:
     off = preset == "paper"
     since = {"batch": 1, "watch": 0 if off else None, "exposure": "off" if off else "auto"}
     since |= {"optimizer.lr_vertices_unit": "frame" if off else "view", "pixels_per_triangle": None if off else 75.0}
+    since |= {"loss.depth": "off" if off else "auto", "loss.lambda_depth": 0.02, "loss.depth_from": 6000}
+    since["asset"] = preset not in ("paper", "tiny")
     if not off:  # 0.0015, and 0.0004 of objects, in the unit of the frame
         since["optimizer.lr_vertices"] = 0.0006
     assert config == {"preset": preset, "scene_type": scene, **named, **since}

@@ -14,7 +14,8 @@ from etsplat.data.demo_scene import demo_scene
 from etsplat.data.pictures import StoredPictures
 from etsplat.engines.cuda.steps import Repeated
 from etsplat.model.soup_init import StartPoints, start_soup
-from etsplat.tasks.train import make_trainer, train
+from etsplat.tasks.soup_trainer import make_trainer
+from etsplat.tasks.train import train
 from etsplat.tasks.train_config import TrainConfig
 from helpers.simt.build import Simt
 from helpers.simt.calls import Calls

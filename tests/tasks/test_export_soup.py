@@ -1,6 +1,8 @@
-import json
+"""What leaves a soup, in every kind of file."""
+
+import base64
 import math
-import struct
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -8,63 +10,28 @@ import pytest
 import torch
 import trimesh
 
-from etsplat import intrinsics, look_at
+from etsplat import look_at
 from etsplat.cli.parse import parse
 from etsplat.core.cameras import Cameras
 from etsplat.core.errors import InputError
+from etsplat.geometry.icosphere import icosphere
+from etsplat.geometry.regions import Sphere
 from etsplat.io import writers
-from etsplat.io.mesh_files import save_mesh
+from etsplat.io.compact_soups import decode_compact
+from etsplat.io.mesh_files import MeshFile, save_mesh
 from etsplat.io.ply_tables import encode_ply, read_ply_tables
 from etsplat.io.srgb import srgb_from_linear
 from etsplat.model.soup_appearance import SoupAppearance
 from etsplat.model.soup_import import open_soup
-from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.tasks.export_config import ExportConfig
 from etsplat.tasks.export_soup import bake_colors, export_soup
-from etsplat.tasks.sources import SoupRun, rotation_to_y_up, world_up
-
-CAMERA = Cameras(
-    look_at(torch.tensor([[0.5, 0.8, 4.0]]), torch.zeros(3), torch.tensor([0.0, 1.0, 0.0])),
-    intrinsics(45, 64, 48)[None],
-    64,
-    48,
-)
+from helpers.exported_soups import CAMERA, difference, flat, odd_soup, run_of
+from helpers.gltf import check_glb
 
 
 @pytest.fixture
 def soup(rng):
-    """Triangles of many opacities, softnesses and colours that depend on the direction."""
-    count = 60
-    made = TriangleSoup.from_triangles(
-        torch.randn(count, 1, 3, generator=rng) * 0.7 + torch.randn(count, 3, 3, generator=rng) * 0.3,
-        torch.rand(count, 3, generator=rng),
-        opacity=0.5,
-        sigma=0.5,
-        sh_degree=2,
-    )
-    return TriangleSoup(
-        made.vertices.detach(),
-        torch.randn(count, generator=rng) * 2,
-        torch.randn(count, generator=rng) * 0.3 - 1,
-        made.sh_dc.detach(),
-        torch.randn(count, 8, 3, generator=rng) * 0.1,
-    )
-
-
-def run_of(soup, **appearance):
-    drawn = replace(soup, appearance=SoupAppearance(**appearance))
-    return SoupRun(path=None, soup=drawn, capture=None)  # pyright: ignore
-
-
-def flat(soup):
-    """The soup with colours that are the same from every side, as a file without harmonics holds them."""
-    return TriangleSoup(
-        soup.vertices, soup.opacity_logits, soup.sigma_raw, soup.sh_dc, soup.sh_rest[:, :0].contiguous()
-    )
-
-
-def difference(a, b):
-    return float((a - b).abs().max())
+    return odd_soup(rng)
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".obj", ".off", ".glb"])
@@ -118,8 +85,7 @@ def test_with_alpha_only_faint_faces_of_a_glb_blend(tmp_path, soup):
     """What blends hides nothing in a viewer, so faces that are all but opaque must not."""
     soup.opacity_logits[:] = torch.where(torch.arange(60) < 20, 9.0, 1.0)
     export_soup(run_of(soup), tmp_path / "soup.glb", ExportConfig(colors="constant", alpha=True, min_opacity=0.0))
-    length = struct.unpack("<I", (tmp_path / "soup.glb").read_bytes()[12:16])[0]
-    document = json.loads((tmp_path / "soup.glb").read_bytes()[20 : 20 + length])
+    document = check_glb(tmp_path / "soup.glb")
     modes = {}
     for part in document["meshes"][0]["primitives"]:
         count = document["accessors"][part["indices"]]["count"]
@@ -137,18 +103,6 @@ def test_baked_colours_are_what_the_cameras_see(soup):
     direct = soup.display_colors(soup.vertices.mean(dim=1) - CAMERA.centers[0])
     torch.testing.assert_close(baked[shown], direct[shown], atol=1e-5, rtol=0)
     assert torch.equal(baked[~shown], soup.display_colors()[~shown])
-
-
-def test_up_is_the_cameras_mean_up_and_becomes_y():
-    directions = torch.nn.functional.normalize(torch.randn(5, 3, dtype=torch.float64), dim=1)
-    eyes = torch.tensor([[3.0, 0, 0], [0, 0, 3.0], [-3.0, 0, 0], [0, 0, -3.0]], dtype=torch.float64)
-    viewmats = look_at(eyes, torch.zeros(3), torch.tensor([0.0, -1.0, 0.0]))
-    up = world_up(viewmats)
-    torch.testing.assert_close(up, torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64))
-    for direction in [up, *directions]:
-        turned = rotation_to_y_up(direction) @ direction
-        torch.testing.assert_close(turned, torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64))
-    assert world_up(torch.cat([viewmats, look_at(eyes, torch.zeros(3), torch.tensor([0.0, 1.0, 0.0]))])) is None
 
 
 def test_triangle_splatting_states_come_in_safely(tmp_path, soup):
@@ -191,15 +145,48 @@ def test_the_kind_of_file_follows_from_its_name(tmp_path, soup, capsys):
     assert {"a.ply", "soup.off"} <= {path.name for path in tmp_path.iterdir()}
     with pytest.raises(InputError, match=r"does not end in \.glb; rename"):
         parse(["export", str(tmp_path / "soup.safetensors"), "--format", "glb", "--out", "b.ply"]).run([])
-    with pytest.raises(InputError, match=r"does not end in \.glb or \.obj or \.off or \.ply or \.safetensors; rename"):
+    with pytest.raises(
+        InputError,
+        match=r"does not end in \.glb or \.obj or \.off or \.ply or \.etz or \.html or \.safetensors; rename",
+    ):
         parse(["export", str(tmp_path / "soup.safetensors"), "--out", "b.xyz"]).run([])
+
+
+@pytest.mark.parametrize("kind", ["etz", "html"])
+def test_files_to_send_hold_the_soup_as_soft_as_it_is(tmp_path, soup, capsys, kind):
+    """In the capture's own units and axes; what is cropped away is not in them."""
+    soup.save(tmp_path / "soup.safetensors")
+    command = ["export", str(tmp_path / "soup.safetensors"), "--format", kind]
+    assert parse([*command, "--crop", "sphere:0,0,0,1"]).run([]) == 0
+    kept = int((soup.vertices.mean(dim=1).norm(dim=1) <= 1).sum())
+    assert 0 < kept < len(soup)
+    assert f"soup.{kind}: {kept} triangles" in capsys.readouterr().out
+    if kind == "etz":
+        assert len(open_soup(tmp_path / "soup.etz")) == kept
+    with pytest.raises(InputError, match=r"keeps the units and axes of the capture; leave out --up, --scale"):
+        parse([*command, "--scale", "2"]).run([])
+
+
+def test_the_page_of_a_cropped_run_has_the_cropped_mesh(tmp_path, soup):
+    vertices, faces = icosphere(2)
+    mesh = MeshFile(vertices, faces, vertex_colors=vertices * 0.5 + 0.5)
+    run = replace(run_of(soup), path=tmp_path, opaque=mesh)
+    sizes = {}
+    for name, config in (("mesh", ExportConfig()), ("soup", ExportConfig(triangles="soup"))):
+        export_soup(run, tmp_path / f"{name}.html", config, crop=Sphere((0.0, 0.0, 1.0), 0.9))
+        parts = re.findall(r'id="scene-(\w+)">(.*?)</script>', (tmp_path / f"{name}.html").read_text())
+        found = {part: base64.b64decode(text) for part, text in parts if part != "data"}
+        sizes[name] = {part: len(decode_compact(data)) for part, data in found.items()}
+    inside = vertices[faces].mean(dim=1) - torch.tensor([0.0, 0.0, 1.0])
+    assert sizes["mesh"]["mesh"] == int((inside.norm(dim=1) <= 0.9).sum())
+    assert sizes["soup"] == {"soup": sizes["mesh"]["soup"]}
 
 
 @pytest.mark.parametrize(("floor", "advised"), [("0", False), ("0.97", True)])
 def test_an_export_that_leaves_out_most_says_what_to_do(tmp_path, soup, capsys, floor, advised):
     soup.save(tmp_path / "soup.safetensors")
     assert parse(["export", str(tmp_path / "soup.safetensors"), "--min-opacity", floor]).run([]) == 0
-    assert ("train with --finish opaque" in capsys.readouterr().out) is advised
+    assert ("train with --asset" in capsys.readouterr().out) is advised
 
 
 @pytest.mark.parametrize("kind", ["PLY", "OBJ", "OFF", "GLB", "SafeTensors"])

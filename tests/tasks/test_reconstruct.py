@@ -74,8 +74,9 @@ def test_the_result_is_a_closed_oriented_mesh(owl: tuple[ReconstructResult, list
 def test_a_run_directory_holds_everything(owl: tuple[ReconstructResult, list[Event]]) -> None:
     """Meshes, metrics with every key, history, pictures of all 8 test views, two checkpoints, config, README."""
     run = RunDirectory(owl[0].path)
-    keys = """chamfer chamfer_floor chamfer_exact f_score psnr psnr_mesh ssim lpips faces vertices degenerate_faces
-        self_intersections iterations seconds seconds_per_iteration engine method preset seed versions"""
+    keys = """chamfer chamfer_floor chamfer_exact f_score psnr psnr_mesh ssim flip flip_mesh lpips faces vertices
+        degenerate_faces self_intersections iterations seconds seconds_per_iteration engine method preset seed
+        versions"""
     assert set(keys.split()) <= set(run.read_metrics())
     assert sorted(path.name for path in run.test.iterdir()) == sorted(
         f"{view:03d}_{kind}.png" for view in range(8) for kind in ("render", "truth", "mesh")
@@ -175,12 +176,18 @@ def test_another_seed_gives_another_result(pebble: MeshFile, whole_run: Reconstr
     assert not torch.equal(result.mesh.vertices, whole_run.mesh.vertices)
 
 
-@pytest.mark.parametrize("method", ["bilateral", "single-sided", "raster-face", "raster-vertex"])
-def test_the_other_methods_run_too(pebble: MeshFile, tmp_path: Path, method: str) -> None:
-    """All baselines go through the same call, record their name, and resume to the same bits."""
-    config = replace(SHORT, method=method)
+@pytest.mark.parametrize(
+    "changes",
+    [
+        *({"method": method} for method in ("bilateral", "single-sided", "raster-face", "raster-vertex")),
+        {"drawing.harmonics": 2},
+    ],
+)
+def test_the_other_methods_run_too(pebble: MeshFile, tmp_path: Path, changes: dict[str, object]) -> None:
+    """All baselines go through the same call, record their name, and resume to the same bits; so do harmonics."""
+    config = SHORT.changed(changes)
     metrics = reconstruct(pebble, tmp_path / "whole", config).metrics
-    assert metrics["method"] == method
+    assert metrics["method"] == changes.get("method", "elastic")
     with pytest.raises(KilledError):
         reconstruct(pebble, tmp_path / "killed", config, callbacks=[kill_at(27)])
     reconstruct(pebble, tmp_path / "killed", config, resume=True)

@@ -8,16 +8,19 @@ import torch
 from etsplat.core.errors import InputError
 from etsplat.data.camera_paths import PATHS, camera_centers, focus_point
 from etsplat.data.load import load_dataset
+from etsplat.geometry.regions import Sphere
 from etsplat.io import videos
+from etsplat.io.camera_path_files import KeyPoses
 from etsplat.io.images import load_image, over_background
 from etsplat.io.videos import open_video
 from etsplat.model.soup_appearance import SoupAppearance
-from etsplat.model.triangle_soup import TriangleSoup
+from etsplat.model.triangle_soup import FOCAL_NOTE, TriangleSoup
 from etsplat.tasks.render_config import RenderConfig
-from etsplat.tasks.render_soup import color_depth, render_run
+from etsplat.tasks.render_soup import color_depth, draw, drawn_soup, render_run, samples_of
 from etsplat.tasks.sources import SoupRun
 from helpers.captures import circle_poses, write_colmap
 
+ALIASED = RenderConfig(antialias=False)
 UP = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
 
 
@@ -34,6 +37,28 @@ def run(tmp_path, rng):
     return SoupRun(
         tmp_path, replace(soup, appearance=SoupAppearance(background=(0.0, 0.0, 1.0))), load_dataset(tmp_path / "scene")
     )
+
+
+def test_small_pictures_have_as_many_samples_as_the_photos_had(run):
+    """By the focal length that the soup notes; a quarter of the size is the mean over 4 x 4 pixels."""
+    camera = run.capture.cameras[0].scaled(4)
+    small, focal = camera.scaled(1 / 4), float(camera.Ks[0, 0, 0])
+    noted = replace(run.soup, notes={FOCAL_NOTE: str(focal)})
+    whole = draw(noted, camera, RenderConfig())["color"]
+    assert torch.equal(whole, draw(run.soup, camera, RenderConfig())["color"])
+    shrunk = torch.nn.functional.avg_pool2d(whole.movedim(-1, 0)[None], 4)[0].movedim(0, -1)
+    drawn = draw(noted, small, RenderConfig(depth=True))
+    torch.testing.assert_close(drawn["color"], shrunk)
+    assert drawn["depth"].shape == (small.height, small.width)
+    single = draw(run.soup, small, RenderConfig())["color"]
+    assert torch.equal(draw(noted, small, ALIASED)["color"], single)
+    assert float((single - shrunk).abs().max()) > 0.01
+    assert [samples_of(replace(noted, notes={FOCAL_NOTE: odd}), small) for odd in ("nan", "x", "-3", "1e30")] == [
+        1,
+        1,
+        1,
+        8,
+    ]
 
 
 @pytest.mark.parametrize("name", ["orbit.mp4", "there.txt"])
@@ -119,6 +144,41 @@ def test_without_the_extra_frames_are_offered_and_nothing_is_left(run, tmp_path,
     assert videos.__doc__
 
 
+def test_what_a_path_does_not_do_is_told(run, tmp_path):
+    """An orbit of photos from one side goes there and back, and says so; others say nothing."""
+    some = replace(run, capture=replace(run.capture, train=run.capture.train[:3]))
+    told = []
+    config = RenderConfig(path="orbit", frames=3, format="frames", width=16)
+    render_run(some, tmp_path / "out", config, tell=told.append)
+    assert len(told) == 1
+    assert "there and back" in told[0]
+    render_run(
+        replace(run, capture=replace(run.capture, train=list(range(9)), test=[])), tmp_path, config, tell=told.append
+    )
+    assert len(told) == 1
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_a_recorded_path_is_played_also_without_the_capture(run, tmp_path, known):
+    """In the shape of the photos, or the one that the file names."""
+    aspect = None if known else 1.25
+    keys = KeyPoses(circle_poses(2), torch.tensor([40.0, 50.0], dtype=torch.float64), aspect)
+    (tmp_path / "my_way.json").write_text(keys.to_json())
+    source = run if known else SoupRun(tmp_path / "soup.ply", run.soup, None)
+    config = RenderConfig(path=str(tmp_path / "my_way.json"), frames=3, format="frames", width=50)
+    files = render_run(source, tmp_path / "out", config)
+    assert [path.name for path in files] == [f"my_way_{index:04d}_color.png" for index in range(3)]
+    assert load_image(files[0]).shape == ((36 if known else 40), 50, 3)
+    assert float(load_image(files[0])[..., :2].max()) > 0.2  # it looks at the soup
+
+
+def test_a_path_that_there_is_not_is_refused_and_those_that_there_are_named():
+    with pytest.raises(InputError, match=r"path: is 'orbti'; choose one of test, train, photos, .*, FILE\.json"):
+        RenderConfig(path="orbti")
+    assert RenderConfig(path="my_way.JSON").recorded
+    assert RenderConfig(path="my_way.json").video
+
+
 def test_a_file_without_its_scene_says_what_to_name(run, tmp_path):
     with pytest.raises(InputError, match="--scene"):
         render_run(SoupRun(tmp_path / "soup.ply", run.soup, None), tmp_path / "out", RenderConfig())
@@ -139,3 +199,24 @@ def test_a_disk_that_fills_while_a_video_is_written_is_one_line_and_leaves_nothi
     with pytest.raises(InputError, match=r"a\.mp4: No space left on device; free some space"):
         write()
     assert [path.name for path in tmp_path.iterdir()] == ["ffmpeg"]
+
+
+def test_what_is_drawn_is_what_would_be_exported(run, tmp_path):
+    """Without the sky, cropped and cleaned; soft, opaque, and with depths, for which soft triangles are drawn too."""
+    crop = Sphere((0.0, 0.0, 0.0), 0.5)
+    inside = crop.holds(run.soup.vertices.detach().mean(dim=1))
+    assert 0 < int(inside.sum()) < 40
+    assert torch.equal(drawn_soup(run, RenderConfig(), crop).vertices, run.soup.vertices.detach()[inside])
+    assert drawn_soup(run, RenderConfig()) is run.soup
+    noted = replace(run, soup=replace(run.soup, notes={"sky": "0 0 0 1"}))
+    assert len(drawn_soup(noted, RenderConfig(sky=False))) < 40
+    assert len(drawn_soup(run, RenderConfig(clean=True, opaque=True))) <= 40
+    faint = replace(run.soup, opacity_logits=torch.where(inside, -3.0, run.soup.opacity_logits.detach()))
+    dim = replace(run, soup=faint)
+    assert len(drawn_soup(dim, RenderConfig(opaque=True, depth=True), crop)) == int(inside.sum())
+    with pytest.raises(InputError, match=r"nothing is left of it \(\d+ too faint, \d+ outside of the crop\)"):
+        drawn_soup(dim, RenderConfig(opaque=True), crop)
+    (written,) = render_run(
+        replace(run, capture=replace(run.capture, test=[0])), tmp_path / "a", RenderConfig(), crop=crop
+    )
+    assert float((load_image(written) - torch.tensor([0.0, 0, 1])).abs().max()) > 0.1

@@ -6,6 +6,7 @@ from PIL import Image
 from etsplat.core.errors import InputError
 from etsplat.data.load import load_dataset
 from etsplat.io.images import save_image
+from etsplat.metrics.flip import flip
 from etsplat.metrics.image import colors_fitted, psnr, ssim
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.tasks.scoring import evaluate_run
@@ -37,6 +38,8 @@ def test_numbers_are_the_metrics_of_each_view_and_their_mean(tmp_path, soup):
         assert row["psnr_8bit"] == pytest.approx(psnr(image, photo), abs=0.02)
         assert row["ssim"] == pytest.approx(ssim(image, photo))
         assert row["ssim_interior"] == pytest.approx(ssim(image, photo, interior=True))
+        assert row["flip"] == pytest.approx(float(flip(image, photo)))
+        assert row["flip_opaque"] == pytest.approx(float(flip(opaque, photo)))
         assert row["psnr_opaque"] == pytest.approx(psnr(opaque, photo))
         assert row["psnr_affine"] == pytest.approx(psnr(colors_fitted(image, photo), photo))
         assert row["psnr_affine"] > row["psnr"]

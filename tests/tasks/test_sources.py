@@ -75,6 +75,7 @@ def test_a_scene_that_moved_is_named_with_an_option(trained, tmp_path):
     ("group", "name", "value", "message"),
     [
         ("config", "width", "800", "width: is '800'; it must be a whole number"),
+        ("config", "width", {}, "width: is {}; it must be a whole number"),
         ("config", "width", -5, "width: is -5; it must be between 1 and 16384"),
         ("paths", "source", 5, "`paths.source` is 5, but must be a text or null"),
         ("paths", "images", ["images_2"], "`paths.images` is"),
@@ -97,7 +98,7 @@ def test_a_run_whose_config_is_damaged_is_named(tmp_path, trained, group, name, 
 
 
 def test_a_run_is_no_scene(trained):
-    with pytest.raises(InputError, match=r"run: neither .* choose the scene's folder that this run was made from"):
+    with pytest.raises(InputError, match=r"run: none of .* choose the scene's folder that this run was made from"):
         load_dataset(trained[0] / "run")
 
 

@@ -9,19 +9,21 @@ import pytest
 import torch
 
 from etsplat.core.errors import InputError
-from etsplat.data.dataset import Dataset
-from etsplat.data.demo_scene import demo_scene
+from etsplat.data.dataset import Dataset, Normalization
 from etsplat.data.shown_width import shown_width
 from etsplat.io.run_directory import RunDirectory
+from etsplat.model.surroundings import SPHERE_TRIANGLES, Surroundings
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.optim.loop import CheckpointEvent, DivergedError, NoteEvent, RefineEvent, StepEvent
 from etsplat.optim.schedules import at
 from etsplat.optim.strategies import DensifyAndPrune
 from etsplat.optim.trainer import Trainer
 from etsplat.tasks import train_checks
-from etsplat.tasks.train import TrainResult, start_trainer, train
+from etsplat.tasks.soup_trainer import start_trainer
+from etsplat.tasks.train import TrainResult, train
 from etsplat.tasks.train_checks import check_train, predicted_bytes, triangle_limit
 from etsplat.tasks.train_config import TrainConfig
+from helpers.captures import small_demo_scene
 
 TINY = TrainConfig.tiny().changed(
     {"iterations": 120, "output.log_every": 10, "output.checkpoint_every": 30, "output.evaluate_every": 60}
@@ -39,11 +41,7 @@ SHORT = TINY.changed(
 
 @pytest.fixture(scope="module")
 def capture() -> Dataset:
-    scene = demo_scene(64, 48)
-    keep = torch.arange(0, 4000, 10)
-    assert scene.exact_points is not None
-    assert scene.point_colors is not None
-    return replace(scene, exact_points=scene.exact_points[keep], point_colors=scene.point_colors[keep])
+    return small_demo_scene()
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +76,8 @@ def test_a_run_directory_holds_everything(run: tuple[TrainResult, list[object]])
     assert torch.equal(saved.vertices, result.soup.vertices)
     assert saved.appearance.kernel == "elastic"
     assert float(result.soup.vertices.detach().median(dim=0).values.abs().max()) < 5
-    assert {"psnr", "ssim", "psnr_opaque", "triangles", "seconds", "test_views"} <= result.metrics.keys()
+    keys = "psnr ssim flip psnr_opaque flip_opaque triangles seconds test_views"
+    assert set(keys.split()) <= result.metrics.keys()
     assert len(result.metrics["test_views"]) == 6
     line = directory.read_history()[-1]
     assert line["sigma_10"] <= line["sigma"] <= line["sigma_90"]
@@ -303,3 +302,46 @@ def test_the_schedule_scales_with_the_length_of_the_run() -> None:
     assert replace(TrainConfig.paper(), iterations=3000).at(25_000) == 2500
     assert replace(TrainConfig.paper(), iterations=30).at(100) == 1
     assert TrainConfig.paper().at(0) == 0
+
+
+@pytest.mark.parametrize("sky", ["sphere", "dome", "none"])
+def test_a_soup_notes_where_its_sky_is_in_the_units_of_its_capture(capture: Dataset, tmp_path: Path, sky: str) -> None:
+    """So that its triangles are known without the capture; training has moved them only a little."""
+    large = capture.renormalized(torch.tensor([3.0, 0, 0], dtype=torch.float64), 0.1)
+    config = SHORT.changed({"sky": sky, "iterations": 20, "densification.begin": 3000})
+    soup = train(replace(large, normalization=Normalization()), tmp_path / "run", config).soup
+    again = TriangleSoup.load(tmp_path / "run" / "soup.safetensors")
+    assert again.notes == soup.notes
+    found = Surroundings.of_note(again.notes[Surroundings.NOTE])
+    if sky == "none":
+        assert found is None
+        return
+    assert found is not None
+    assert large.points is not None
+    added = SPHERE_TRIANGLES if sky == "sphere" else int(0.05 * len(large.points))
+    outermost = found.outermost(again.vertices)
+    assert 0.9 * added <= int(outermost.sum()) < len(again) - 0.5 * len(large.points)
+    if sky == "sphere":
+        middle = large.centers[large.train].mean(dim=0)
+        # Not exactly: some of these views are watched, not trained on.
+        torch.testing.assert_close(found.middle, middle, rtol=0, atol=0.02 * found.radius)
+        assert found.radius == pytest.approx(Surroundings.of(large).radius, rel=0.05)
+
+
+def test_how_a_run_ended_early_is_in_its_folder_until_it_goes_on(capture: Dataset, tmp_path: Path) -> None:
+    """Interrupted, or failed with what message; a run that is done says nothing."""
+    for number, (error, text) in enumerate(
+        [(KeyboardInterrupt(), "interrupted"), (RuntimeError("no\nmemory"), "failed: no memory")]
+    ):
+
+        def stop(event: object, error: BaseException = error) -> None:
+            if isinstance(event, CheckpointEvent):
+                raise error
+
+        run = RunDirectory(tmp_path / f"run{number}")
+        with pytest.raises(type(error)):
+            train(capture, run.path, SHORT, callbacks=[stop])
+        assert run.read_end() == text
+        train(capture, run.path, SHORT, callbacks=[lambda _: None], resume=True)
+        assert run.read_end() == ""
+        assert not (run.path / "ended.txt").exists()

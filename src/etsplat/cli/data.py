@@ -12,21 +12,35 @@ from etsplat.cli.command import Command
 
 @dataclass(frozen=True, kw_only=True)
 class Sfm(Command):
-    """Find the cameras of photos (structure from motion, on the CPU), so that they can be trained on.
+    """Find the cameras of photos or of a video (structure from motion, on the CPU), so that they can be trained on.
 
-    Needs pycolmap: pip install 'etsplat[sfm]'.
+    Needs pycolmap: pip install 'etsplat[sfm]'; HEIC also needs pillow-heif (extra heic), videos imageio-ffmpeg (video).
+    Photos are turned upright as their EXIF says, which also gives focal lengths to start from.
 
     Examples:
         etsplat data sfm photos/ --out my_scene
-        etsplat data sfm video_frames/ --out my_scene --matching sequential
+        etsplat data sfm walk.mp4 --out my_scene --frames 200
     """
 
     photos: tyro.conf.Positional[Path]
-    """Folder of JPEG or PNG files, taken with one camera while walking around; 20 to 300 are good."""
+    """Folder of JPEG, PNG or HEIC files, also in subfolders, taken while walking around; 20 to 300 are good.
+    Or a video: its sharpest frames are taken, evenly spread over what moves, and kept in OUT/frames."""
     out: Path
     """Folder for the scene: images/ without lens distortion and sparse/0/."""
     matching: Literal["auto", "exhaustive", "sequential"] = "auto"
-    """Compare every pair of photos; or only those near in order of names, as for video. Auto: every pair up to 120."""
+    """Compare every pair of photos; or only those near in order of names. Auto: every pair up to 120."""
+    cameras: Literal["auto", "folder", "photo"] = "auto"
+    """Which photos of one size share a camera and its lens setting.
+    Auto: those whose EXIF names the same camera and focal length; without EXIF, those of one subfolder.
+    Folder: those of one subfolder, whatever EXIF says. Photo: none."""
+    mapper: Literal["incremental", "global"] = "incremental"
+    """Place cameras one after the other; or all at once (GLOMAP)."""
+    frames: int = 120
+    """Of a video: how many frames are chosen; fewer where less moves."""
+    masks: Literal["none", "auto"] = "none"
+    """Auto: write masks/ of an object, for `etsplat reconstruct`, by the colours of a plain background.
+    Photos whose background is not plain are left out.
+    Shadows and what the object stands on count as object; parts that have the background's colour are lost."""
     max_size: int = 1600
     """Longer sides are shrunk to this many pixels."""
 
@@ -37,15 +51,57 @@ class Sfm(Command):
 
         with PhaseBar() as bar:
             found = find_cameras(
-                self.photos, self.out, matching=self.matching, max_size=self.max_size, progress=bar.show
+                self.photos,
+                self.out,
+                matching=self.matching,
+                cameras=self.cameras,
+                mapper=self.mapper,
+                frames=self.frames,
+                masks=self.masks,
+                max_size=self.max_size,
+                progress=bar.show,
             )
         count = len(found.placed) + len(found.unplaced)
-        print(f"{len(found.placed)} of {count} photos placed, {found.points:,} points; scene in {found.scene}")
+        cameras = f" of {found.cameras} cameras" if found.cameras > 1 else ""
+        print(f"{len(found.placed)} of {count} photos{cameras} placed, {found.points:,} points; scene in {found.scene}")
         if found.unplaced:
             shown = ", ".join(found.unplaced[:8]) + (", ..." if len(found.unplaced) > 8 else "")
             print(f"Without a place, and left out: {shown}")
+        if found.unmasked:
+            why = "; ".join(f"{name}: {problem}" for name, problem in list(found.unmasked.items())[:8])
+            print(f"Without a mask, and left out: {len(found.unmasked)} photos ({why})")
         if len(found.placed) < count / 2:
             print("That is less than half: the scene will have gaps. Let photos overlap by two thirds.")
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Masks(Command):
+    """Write masks for the posed photos of an object in front of a plain background, by its colours.
+
+    Nothing is learned or fetched. Shadows and what the object stands on count as object;
+    parts that have the background's colour are lost.
+
+    Examples:
+        etsplat data masks my_scene/ --out my_scene/masks
+        etsplat reconstruct my_scene/ --out runs/my_object
+    """
+
+    source: tyro.conf.Positional[Path]
+    """Folder with posed photos, of any layout that `etsplat reconstruct` reads."""
+    out: Path
+    """Folder for the masks: masks/ in the scene, where they are found, or any other, for `--masks`."""
+
+    def run(self, arguments: Sequence[str]) -> int:
+        """Writes them, and says which photos have none."""
+        from etsplat.cli.progress import PhaseBar
+        from etsplat.data.photo_masks import mask_capture
+
+        with PhaseBar() as bar:
+            count, refused = mask_capture(self.source, self.out, progress=bar.show)
+        print(f"{count} masks in {self.out}")
+        for name, problem in refused.items():
+            print(f"Without a mask: {name}, as {problem}. Draw one, or take the photo out of the scene.")
         return 0
 
 
@@ -61,8 +117,9 @@ class Undistort(Command):
     """
 
     source: tyro.conf.Positional[Path]
-    """Folder with images/ and sparse/0/, of any of COLMAP's camera models; or with transforms.json of nerfstudio.
-    Masks come along; every 8th image is for testing, whatever transforms.json says."""
+    """Folder with images/ and sparse/0/, of any of COLMAP's camera models;
+    or of any other program whose files are read: nerfstudio, Metashape, RealityCapture and others.
+    Masks come along; every 8th image is for testing, whatever the scene says."""
     out: Path
     """Folder for the new scene."""
     max_size: int = 1600

@@ -49,8 +49,12 @@ def examine(console: Console) -> bool:
             "compiler": "not needed: the native engine is compiled already",
             "GPU (CUDA)": _gpu(),
             "etsplat data sfm": _extra("sfm", "pycolmap"),
+            "photos in HEIC": _extra("heic", "pillow-heif"),
             "etsplat view": _extra("viewer", "viser"),
             "videos": _extra("video", "imageio-ffmpeg"),
+            "depth maps in EXR": _extra("depth", "OpenEXR"),
+            "clouds in LAS": _extra("depth", "laspy"),
+            "export --texture": _extra("texture", "xatlas"),
             "--tensorboard": _extra("tensorboard", "tensorboard"),
         },
     )

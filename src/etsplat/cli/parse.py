@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, Union, get_type_hints
 import tyro
 
 from etsplat.cli.command import Command
-from etsplat.cli.data import Download, Sfm, Undistort
+from etsplat.cli.data import Download, Masks, Sfm, Undistort
 from etsplat.cli.doctor import Doctor
 from etsplat.cli.runs import DemoObject, DemoScene, Reconstruct, Train
 from etsplat.cli.soups import Evaluate, Export, Render, View
@@ -39,7 +39,7 @@ COMMANDS: dict[str, type[Command] | Group] = {
     "train": Train,
     "data": Group(
         "Where captures come from: find the cameras of photos, remove lens distortion, fetch data sets.",
-        {"sfm": Sfm, "undistort": Undistort, "download": Download},
+        {"sfm": Sfm, "masks": Masks, "undistort": Undistort, "download": Download},
     ),
     "eval": Evaluate,
     "view": View,
@@ -68,6 +68,8 @@ def parse(arguments: Sequence[str]) -> Command:
     words = [re.sub(r"^(--method=)?single_sided$", r"\1single-sided", word) for word in arguments] or ["--help"]
     if words[0] == "demo" and (len(words) == 1 or (words[1].startswith("-") and words[1] not in ("-h", "--help"))):
         words.insert(1, "object")
+    if words[0] == "export":
+        words = ["--sky=none" if word == "--no-sky" else word for word in words]  # as of `etsplat render`
     registry = _registry(brief=("--help" in words or "-h" in words) and "--help-all" not in words)
     entry: type[Command] | Group = Group(_ETSPLAT, COMMANDS)
     program = ["etsplat"]
@@ -100,8 +102,10 @@ def _named(name: str, entry: type[Command] | Group) -> Any:
 
 
 def _offered(setting: Setting) -> Any:
-    """A type that tyro reads as one of the words that there are by now."""
+    """A type that tyro reads as one of the words that there are by now; of files, which the setting itself checks."""
     words: Any = Literal[setting.choices]  # pyright: ignore[reportInvalidTypeForm]
+    if setting.suffix:
+        words = Annotated[str, tyro.conf.arg(metavar=f"{{{','.join(setting.choices)},FILE{setting.suffix}}}")]
     return words | None if setting.optional else words
 
 

@@ -1,6 +1,7 @@
 """The commands that make a run: `etsplat reconstruct`, `etsplat train` and both `etsplat demo`."""
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
@@ -8,12 +9,17 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 import tyro
 
 from etsplat.cli.command import FAILED, INTERRUPTED, Command, Flag, fail, resume_line, settings_before_options
+from etsplat.core.errors import InputError
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.settings import Rare, Settings
 from etsplat.tasks.train_config import TrainConfig
 
 if TYPE_CHECKING:
     from etsplat.optim.loop import Callback
+    from etsplat.viewer.live import LiveView
+
+VIEW_WIDTH = 960
+"""Pixels of the pictures of a run that is watched, when the camera stands still."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,6 +63,10 @@ class RunCommand(Command):
         """What is told of the run beside the progress bar."""
         return []
 
+    def onlooker(self) -> "LiveView | None":
+        """Who watches the run, beside the callbacks; None where nobody does."""
+        return None
+
     def run(self, arguments: Sequence[str]) -> int:
         """Does the run with a progress bar, writes its report and prints what came out."""
         from rich.console import Console
@@ -65,21 +75,27 @@ class RunCommand(Command):
         from etsplat.cli.progress import RunProgress, print_summary
         from etsplat.io.run_directory import is_run
 
-        console, options = Console(), vars(self)
+        console, options, live = Console(), vars(self), self.onlooker()
         try:
-            with RunProgress(console, preparing=self.PREPARING) as progress:
-                progress.show("Reading the input")
-                getattr(etsplat, self.CONFIG.TASK)(
-                    options.get("source", self.SOURCE),
-                    self.out,
-                    self.settings,
-                    **{name: options[name] for name in self.INPUT},
-                    callbacks=[progress, *self.callbacks()],
-                    resume=self.resume,
-                    overwrite=self.overwrite,
-                )
-                progress.show("Writing the report")
-                etsplat.write_report(self.out)
+            with live or nullcontext():
+                with RunProgress(console, preparing=self.PREPARING) as progress:
+                    progress.show("Reading the input")
+                    result = getattr(etsplat, self.CONFIG.TASK)(
+                        options.get("source", self.SOURCE),
+                        self.out,
+                        self.settings,
+                        **{name: options[name] for name in self.INPUT},
+                        **({"onlooker": live.look} if live else {}),
+                        callbacks=[progress, *([live] if live else []), *self.callbacks()],
+                        resume=self.resume,
+                        overwrite=self.overwrite,
+                    )
+                    progress.show("Writing the report")
+                    etsplat.write_report(self.out)
+                print_summary(console, self.out)
+                if live:
+                    live.finish(result.soup)
+                    live.stay(print)
         except KeyboardInterrupt:
             if not is_run(self.out):
                 raise
@@ -88,7 +104,6 @@ class RunCommand(Command):
             if self.debug:
                 raise
             fail(str(error), FAILED)
-        print_summary(console, self.out)
         return 0
 
 
@@ -122,14 +137,16 @@ class Reconstruct(RunCommand):
         etsplat reconstruct bunny.obj --out runs/paper --preset paper --method bilateral
         etsplat reconstruct boot.obj --out runs/boot --config runs/bunny/config.json
         etsplat reconstruct my_scene/ --out runs/scene --iterations 4000
+        etsplat reconstruct my_scene/ --out runs/asset --texture 2048
     """
 
     CONFIG = ReconstructConfig
     PRESET: ClassVar[dict[str, str]] = {"preset": "best"}
-    INPUT = ("init_mesh", "masks")
+    INPUT = ("init_mesh", "masks", "depths", "depth_unit")
 
     source: tyro.conf.Positional[Path]
-    """A mesh file, which is photographed from 40 sides; or a folder with posed images (transforms.json or COLMAP)."""
+    """A mesh file, which is photographed from 40 sides;
+    or a folder with posed images (transforms.json, COLMAP, or of another program in docs/captures.md)."""
     out: Path
     """Folder for the results: mesh.ply, mesh.obj, mesh.glb, metrics.json, report.html and more."""
     settings: Annotated[ReconstructConfig, tyro.conf.arg(name="")]
@@ -137,26 +154,56 @@ class Reconstruct(RunCommand):
     """Start from this mesh; in the units of the source."""
     masks: Annotated[Path | None, Rare] = None
     """Folder with a mask (white inside the object) for every image; else masks/ of the source, or transparency."""
+    depths: Annotated[Path | None, Rare] = None
+    """Folder with depth maps of images (16-bit PNG, NPY, EXR), distances along the optical axis, 0 where unknown;
+    else depths/ or depth/ of the source, or what its transforms.json names."""
+    depth_unit: Annotated[float | None, Rare] = None
+    """Units of the source in a step of their numbers; else what transforms.json says, 0.001 for integers, or 1."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Train(RunCommand):
+class SceneCommand(RunCommand):
+    """Base of the commands that fit a soup, which can be watched meanwhile."""
+
+    view: Annotated[Flag, Rare] = False
+    """Serve the soup for a web browser while it is trained (needs the extra "viewer")."""
+    view_port: Annotated[int, Rare] = 8080
+    """Port to serve it on, at localhost; the next free one if it is in use."""
+
+    def onlooker(self) -> "LiveView | None":
+        """A viewer of the soup in memory, if it is asked for."""
+        if not 0 <= self.view_port <= 65535:
+            raise InputError(f"view-port: is {self.view_port}; it must be between 0 and 65535")
+        if not self.view:
+            return None
+        from etsplat.viewer.live import LiveView
+
+        def announce(port: int) -> None:
+            print(f"  watch it at http://localhost:{port}", flush=True)
+
+        return LiveView(self.out, "localhost", self.view_port, VIEW_WIDTH, announce)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Train(SceneCommand):
     """Fit a triangle soup to the photos of a scene.
 
     Examples:
         etsplat train my_scene/ --out runs/scene
         etsplat train my_scene/ --out runs/scene --scene-type indoor --width 1000 --iterations 8000
         etsplat train my_scene/ --out runs/scene --preset paper --images images_4
+        etsplat train my_scene/ --out runs/scene --view
         etsplat train my_scene/ --out runs/again --config runs/scene/config.json --finish opaque
     """
 
     CONFIG = TrainConfig
     PRESET: ClassVar[dict[str, str]] = {"preset": "quick", "scene_type": "outdoor"}
-    INPUT = ("images", "masks")
+    INPUT = ("images", "masks", "depths", "depth_unit", "init_points")
     PREPARING = "Reading the photos"
 
     source: tyro.conf.Positional[Path]
-    """A folder with posed photos: COLMAP, nerfstudio or Blender. For photos alone: `etsplat data sfm`."""
+    """A folder with posed photos: COLMAP, nerfstudio, Blender; or of another program in docs/captures.md.
+    For photos alone: `etsplat data sfm`."""
     out: Path
     """Folder for the results: soup.safetensors, metrics.json, report.html and more."""
     settings: Annotated[TrainConfig, tyro.conf.arg(name="")]
@@ -164,6 +211,13 @@ class Train(RunCommand):
     """Folder in the scene to take the photos from, such as images_4."""
     masks: Annotated[Path | None, Rare] = None
     """Folder with a mask for every photo, white where pixels count."""
+    depths: Annotated[Path | None, Rare] = None
+    """Folder with depth maps of photos (16-bit PNG, NPY, EXR), distances along the optical axis, 0 where unknown;
+    else depths/ or depth/ of the scene, or what its transforms.json names."""
+    depth_unit: Annotated[float | None, Rare] = None
+    """Units of the scene in a step of their numbers; else what transforms.json says, 0.001 for integers, or 1."""
+    init_points: Annotated[Path | None, Rare] = None
+    """Start from this dense cloud (PLY or LAS), in the units of the scene, as far as photos speak for it."""
     tensorboard: Annotated[Flag, Rare] = False
     """Write curves for tensorboard into the folder as well."""
 
@@ -177,7 +231,7 @@ class Train(RunCommand):
 
 
 @dataclass(frozen=True, kw_only=True)
-class DemoScene(RunCommand):
+class DemoScene(SceneCommand):
     """Fit a triangle soup to pictures of a small scene that is built in code: no photos needed.
 
     Examples:

@@ -18,6 +18,8 @@ from etsplat.tasks.settings import Device
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from etsplat.tasks.soup_selection import Crop
+
 AnySettings = TypeVar("AnySettings")
 Unnamed = Annotated[AnySettings, tyro.conf.arg(name=""), tyro.conf.OmitArgPrefixes]
 
@@ -25,13 +27,19 @@ _COLUMNS = {
     "psnr": ("PSNR", ".2f"),
     "ssim": ("SSIM", ".4f"),
     "ssim_interior": ("SSIM interior", ".4f"),
+    "flip": ("FLIP", ".4f"),
     "lpips_3dgs": ("LPIPS as 3DGS", ".4f"),
     "lpips": ("LPIPS", ".4f"),
     "psnr_opaque": ("PSNR opaque", ".2f"),
     "psnr_affine": ("PSNR, colours fitted", ".2f"),
 }
 
-PURPOSES = {**purposes(), "safetensors": "For etsplat."}
+PURPOSES = {
+    **purposes(),
+    "etz": "To send: small, soft, for etsplat and for what reads docs/compact_format.md.",
+    "html": "To send: a page that shows the scene, soft or opaque, in browsers with WebGL 2, without a network.",
+    "safetensors": "For etsplat.",
+}
 if TYPE_CHECKING:
     Kind = str
 else:
@@ -45,8 +53,8 @@ _FORMAT = "\n".join(
 class Evaluate(Command):
     """Measure a trained soup on the views that training never saw, and how fast it is drawn.
 
-    PSNR; SSIM zero-padded as 3DGS has it, and in the interior; LPIPS in both conventions where its weights are. Beside
-    them PSNR after a fit of the colours to each photo, which has seen what it is measured on.
+    PSNR; SSIM zero-padded as 3DGS has it, and in the interior; FLIP; LPIPS in both conventions where its weights are.
+    Beside them PSNR after a fit of the colours to each photo, which has seen what it is measured on.
 
     Examples:
         etsplat eval runs/kitchen
@@ -112,14 +120,25 @@ def _print(console: "Console", found: dict[str, Any]) -> None:
     )
 
 
+def _crop(text: str | None) -> "Crop | None":
+    """What --crop says."""
+    from etsplat.geometry.regions import region_of
+
+    if text is None or text == "auto":
+        return text
+    return region_of(text, "--crop")
+
+
 @dataclass(frozen=True, kw_only=True)
 class Render(Command):
     """Draw a trained soup: its test views, or a path through the scene as a video.
 
     Examples:
         etsplat render runs/kitchen
+        etsplat render runs/kitchen --path photos
         etsplat render runs/kitchen --path orbit --frames 240
         etsplat render runs/kitchen --path ellipse --opaque --depth --normals
+        etsplat render runs/kitchen --path orbit --opaque --no-sky --crop auto --clean
         etsplat render soup.ply --scene scenes/kitchen --path interpolated --format frames
     """
 
@@ -131,6 +150,10 @@ class Render(Command):
     """The capture's folder, if it has moved or a file is given."""
     device: Device | None = None
     """Where it is drawn: cpu, cuda (an NVIDIA GPU), or None for cuda where there is one."""
+    crop: str | None = None
+    """Draw only triangles whose middle is in a region, in the capture's own units and axes.
+    sphere:X,Y,Z,R: a ball by its middle and radius; box:X0,Y0,Z0,X1,Y1,Z1: a box by two corners;
+    auto: the ball around what the photos look at."""
     settings: Unnamed[RenderConfig] = field(default_factory=RenderConfig)
 
     def run(self, arguments: Sequence[str]) -> int:
@@ -139,11 +162,17 @@ class Render(Command):
         from etsplat.tasks.render_soup import render_run
         from etsplat.tasks.sources import open_run
 
+        crop = _crop(self.crop)
         opened = open_run(self.run_dir, self.scene, self.device)
         out = self.out or opened.folder / "renders"
         with PhaseBar() as bar:
             files = render_run(
-                opened, out, self.settings, progress=lambda done, total: bar.show("Drawing", done, total)
+                opened,
+                out,
+                self.settings,
+                crop=crop,
+                progress=lambda done, total: bar.show("Drawing", done, total),
+                tell=lambda text: print(f"  {text}", flush=True),
             )
         print(f"{len(files)} files in {out}" if len(files) != 1 else files[0])
         return 0
@@ -151,45 +180,89 @@ class Render(Command):
 
 @dataclass(frozen=True, kw_only=True)
 class Export(Command):
-    """Write a trained soup for Blender, game engines or the web; or turn another program's file into a soup.
+    """Write a trained soup or a reconstructed mesh for Blender, game engines or the web.
+
+    It also turns another program's file into a soup.
 
     Examples:
+        etsplat export runs/bunny --texture 2048 --faces 10000 --lods 3
         etsplat export runs/kitchen
-        etsplat export runs/kitchen --out kitchen.ply
+        etsplat export runs/kitchen --format html
+        etsplat export runs/kitchen --no-sky --crop auto --clean --place ground
+        etsplat export runs/kitchen --crop sphere:0.2,-1,3.5,2 --up z --scale 0.01 --out kitchen.ply
         etsplat export runs/kitchen --format ply --colors keep --min-opacity 0 --up keep
         etsplat export point_cloud_state_dict.pt --format safetensors
     """
 
     run_dir: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(name="dir")]
-    """A run of `etsplat train`; or a file: .safetensors, .pt of Triangle Splatting, Gaussian .ply, or a mesh."""
+    """A run of `etsplat train` or `etsplat reconstruct`;
+    or a file: .safetensors, .etz, .pt of Triangle Splatting, Gaussian .ply, or a mesh."""
     format: Annotated[Kind | None, tyro.conf.arg(help=_FORMAT)] = None
     out: Path | None = None
-    """The file to write; by default soup.FORMAT in the run's folder."""
+    """The file to write; by default soup.FORMAT in the run's folder;
+    of a reconstruction textured.FORMAT, or light.FORMAT with --faces alone."""
     scene: Path | None = None
     """The capture's folder, if it has moved or a file is given: for colours as the cameras saw them, and for up."""
     device: Device | None = None
     """Where it is drawn: cpu, cuda (an NVIDIA GPU), or None for cuda where there is one."""
+    crop: str | None = None
+    """Write only triangles whose middle is in a region, in the capture's own units and axes.
+    sphere:X,Y,Z,R: a ball by its middle and radius; box:X0,Y0,Z0,X1,Y1,Z1: a box by two corners;
+    auto: the ball around what the photos look at."""
     settings: Unnamed[ExportConfig] = field(default_factory=ExportConfig)
 
     def run(self, arguments: Sequence[str]) -> int:
         """Writes the file and says what is in it."""
-        from etsplat.io.paths import kind_of
+        from etsplat.tasks.export_mesh import is_reconstruction
         from etsplat.tasks.export_soup import export_soup
+        from etsplat.tasks.soup_selection import in_words
         from etsplat.tasks.sources import open_run
 
+        if is_reconstruction(self.run_dir):
+            return self._export_mesh()
+        for name in ("texture", "faces"):  # and --lods wants --texture
+            if getattr(self.settings, name) is not None:
+                raise InputError(f"--{name}: is for runs of `etsplat reconstruct`; leave it out for soups")
+        crop = _crop(self.crop)
         opened = open_run(self.run_dir, self.scene, self.device)
-        out = self.out or opened.folder / f"soup.{self.format or 'glb'}"
-        kinds = [self.format] if self.format else list(PURPOSES)
-        if kind_of(out).removeprefix(".") not in kinds:
-            raise InputError(f"--out {out}: does not end in .{' or .'.join(kinds)}; rename it or change --format")
+        out = self._out(opened.folder, "soup")
         read = self.run_dir / "soup.safetensors" if self.run_dir.is_dir() else self.run_dir
         if out.resolve() == read.resolve():
             raise InputError(f"--out {out}: is what is read; choose another file")
-        written = export_soup(opened, out, self.settings)
-        left_out = f", {written.dropped:,} fainter ones left out" if written.dropped else ""
-        print(f"{written.path}: {written.triangles:,} triangles{left_out}")
+        written = export_soup(opened, out, self.settings, crop)
+        sky = f", {written.sky:,} of them in the object sky" if written.sky else ""
+        print(f"{written.path}: {written.triangles:,} triangles{sky}")
+        if written.removed:
+            print(f"Left out: {in_words(written.removed)}.")
         if written.dropped > written.triangles:
-            print("Most of it is too faint to be drawn opaque; train with --finish opaque, or lower --min-opacity.")
+            print("Most of it is too faint to be drawn opaque; train with --asset, or lower --min-opacity.")
+        return 0
+
+    def _out(self, folder: Path, name: str) -> Path:
+        """The file to write."""
+        from etsplat.io.paths import kind_of
+
+        out = self.out or folder / f"{name}.{self.format or 'glb'}"
+        kinds = [self.format] if self.format else list(PURPOSES)
+        if kind_of(out).removeprefix(".") not in kinds:
+            raise InputError(f"--out {out}: does not end in .{' or .'.join(kinds)}; rename it or change --format")
+        return out
+
+    def _export_mesh(self) -> int:
+        from etsplat.cli.progress import PhaseBar
+        from etsplat.io.run_directory import RunDirectory
+        from etsplat.tasks.export_mesh import export_mesh
+
+        if self.crop is not None:
+            raise InputError("--crop: is for soups; leave it out for the mesh of a reconstruction")
+        name = "textured" if self.settings.texture else "light" if self.settings.faces else "mesh"
+        out = self._out(self.run_dir, name)
+        if out.resolve() == RunDirectory(self.run_dir).mesh_path(".ply").resolve():
+            raise InputError(f"--out {out}: is what is read; choose another file")
+        with PhaseBar() as bar:
+            written = export_mesh(self.run_dir, out, self.settings, self.scene, self.device, bar.show)
+        for path, faces in written.items():
+            print(f"{path}: {faces:,} faces, {path.stat().st_size / 1e6:.2f} MB")
         return 0
 
 

@@ -25,6 +25,10 @@ _PSNR_MESH = (
     "The same with the exported mesh drawn as opaque triangles: what a mesh viewer shows. Close to the PSNR of the "
     "splats means that nothing depends on their softness."
 )
+_TEXTURED = (
+    "The test views of textured.glb, a light mesh under a texture that was fitted to the training photos, with 4 × 4 "
+    "supersampling: what a mesh viewer shows."
+)
 _F_SCORE = (
     "Points of each surface that lie within 0.005 of the other one, object at radius 1; harmonic mean of both "
     "directions. 100 % is a perfect match."
@@ -42,6 +46,10 @@ _PSNR_AFFINE = (
     "and white balance of test views were known. It has seen what it is measured on; PSNR is the score."
 )
 _SSIM = "Structural similarity on the test views: 11 × 11 Gaussian window, σ 1.5, zero padding. 1 is identical."
+_FLIP = (
+    "How visible the differences from the photographs of the test views are to who flips between both, at 67 pixels "
+    "per degree; mean over pixels and views. 0 is identical, lower is better."
+)
 _LPIPS = "Learned perceptual distance (VGG16) on the test views. Lower is better."
 
 
@@ -51,7 +59,11 @@ _SOUP_PSNR = (
 )
 _OPAQUE = (
     "The same with the triangles drawn sharp and opaque, with 4 × 4 supersampling: what a mesh viewer shows of an "
-    "export. Without --finish opaque, soft triangles lose much by this."
+    "export. Soft triangles lose much by this; --asset makes an opaque mesh beside them."
+)
+_ASSET = (
+    "The test views of opaque.glb with 4 × 4 supersampling: opaque triangles in colours that are the same from every "
+    "side, as any mesh viewer shows them."
 )
 _SOUP_SSIM = (
     "Structural similarity on the test views: 11 × 11 Gaussian window, σ 1.5, zeros beyond the border, as 3DGS."
@@ -82,10 +94,23 @@ def describe_mesh(metrics: dict[str, Any]) -> list[Metric]:
         number_card(metrics, "chamfer_exact", "Exact Chamfer", "× 10⁻³", _thousandths, _EXACT, no_mesh),
         number_card(metrics, "silhouette_iou", "Silhouette IoU", "%", _percent, _IOU, "no masks, or no test views"),
         number_card(metrics, "ssim", "SSIM", "", fixed(4), _SSIM, "no test views"),
+        number_card(metrics, "flip", "FLIP", "", fixed(4), _FLIP, "no test views"),
         number_card(metrics, "lpips", "LPIPS", "", fixed(4), _LPIPS, metrics.get("lpips_reason") or "no weights"),
         number_card(metrics, "psnr_affine", "PSNR, colours fitted", "dB", fixed(2), _PSNR_AFFINE, "no test views"),
         Metric("Mesh", f"{metrics['faces']:,}", "faces", _mesh_meaning(metrics)),
+        *_textured_cards(metrics),
         time_card(metrics),
+    ]
+
+
+def _textured_cards(metrics: dict[str, Any]) -> list[Metric]:
+    """Of the light mesh under a texture, where the run made one."""
+    if metrics.get("textured_faces") is None:
+        return []
+    side = f" of {metrics['texture']} × {metrics['texture']} texels" if metrics.get("texture") else ""
+    return [
+        number_card(metrics, "psnr_textured", "PSNR of the textured mesh", "dB", fixed(2), _TEXTURED, "no test views"),
+        Metric("Textured mesh", f"{metrics['textured_faces']:,}", "faces", f"textured.glb, under a texture{side}."),
     ]
 
 
@@ -96,13 +121,26 @@ def describe_soup(metrics: dict[str, Any]) -> list[Metric]:
     return [
         number_card(metrics, "psnr", "PSNR", "dB", fixed(2), _SOUP_PSNR, no_views),
         number_card(metrics, "ssim", "SSIM", "", fixed(4), _SOUP_SSIM, no_views),
+        number_card(metrics, "flip", "FLIP", "", fixed(4), _FLIP, no_views),
         number_card(metrics, "lpips_3dgs", "LPIPS", "", fixed(4), _SOUP_LPIPS, metrics.get("lpips_reason") or ask),
-        number_card(metrics, "psnr_opaque", "PSNR of opaque triangles", "dB", fixed(2), _OPAQUE, no_views),
+        *_opaque_cards(metrics),
         number_card(metrics, "psnr_affine", "PSNR, colours fitted", "dB", fixed(2), _PSNR_AFFINE, no_views),
         Metric("Triangles", f"{metrics['triangles']:,}", "", _triangles_meaning(metrics)),
         number_card(metrics, "fps", "Speed", "frames/s", fixed(1), _speed(metrics), ask),
         number_card(metrics, "ms_per_million", "Time per million triangles", "ms", fixed(1), _PER_MILLION, ask),
         time_card(metrics),
+    ]
+
+
+def _opaque_cards(metrics: dict[str, Any]) -> list[Metric]:
+    """Of the opaque mesh where the run made one, of the soup drawn opaque otherwise."""
+    if metrics.get("asset_triangles") is None:
+        return [
+            number_card(metrics, "psnr_opaque", "PSNR of opaque triangles", "dB", fixed(2), _OPAQUE, "no test views")
+        ]
+    return [
+        number_card(metrics, "psnr_asset", "PSNR of the opaque mesh", "dB", fixed(2), _ASSET, "no test views"),
+        Metric("Opaque mesh", f"{metrics['asset_triangles']:,}", "triangles", "opaque.glb, in one colour per corner."),
     ]
 
 

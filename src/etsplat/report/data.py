@@ -25,7 +25,8 @@ _COUNTS = {"reconstruct": "faces", "train": "triangles"}
 """What the result has so many of, by task."""
 
 _MEASURED = (
-    *("psnr", "psnr_affine", "ssim", "lpips", "lpips_3dgs", "psnr_mesh", "psnr_opaque", "silhouette_iou"),
+    *("psnr", "psnr_affine", "ssim", "flip", "lpips", "lpips_3dgs"),
+    *("psnr_mesh", "psnr_opaque", "psnr_asset", "psnr_textured", "silhouette_iou"),
     *("chamfer", "chamfer_floor", "chamfer_exact", "f_score", "fps", "ms_per_million"),
     *("watched_psnr", "watched_psnr_last"),
     *("sigma", "sigma_10", "sigma_90", "opacity", "opacity_10", "opacity_90"),
@@ -34,7 +35,7 @@ _MEASURED = (
 
 _COUNTED = (
     *("vertices", "degenerate_faces", "self_intersections", "edits_undone"),
-    *("watched_views", "result_iteration"),
+    *("watched_views", "result_iteration", "asset_triangles", "textured_faces", "texture"),
 )
 """Whole numbers of that kind."""
 

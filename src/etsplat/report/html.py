@@ -1,13 +1,10 @@
 """`report.html`: one self-contained page about a run, readable offline and for years."""
 
-import base64
 import io
 import json
 from html import escape
 from importlib.metadata import version
-from importlib.resources import files
 from pathlib import Path
-from string import Template
 
 import numpy as np
 import torch
@@ -21,7 +18,9 @@ from etsplat.report.cards import Metric, cards_of
 from etsplat.report.command import reproduce_command
 from etsplat.report.curves import curves_of, draw_svg, plot_convergence, short_number
 from etsplat.report.data import Run, read_run
+from etsplat.report.scene import own_asset, scene_section
 from etsplat.tasks.settings import flatten
+from etsplat.web.pages import SCENE_SCRIPTS, SHARED_SCRIPTS, asset, filled, in_base64, scripts
 
 MAX_VIEWS = 12
 MAX_PICTURE = 800
@@ -59,18 +58,19 @@ def render_page(run: Run) -> str:
     """The page as text."""
     command = reproduce_command(run.config, version("etsplat"))
     versions = ", ".join(f"{name} {number}" for name, number in run.metrics["versions"].items())
+    scene = "" if run.task != "train" else scene_section(run)
     said = {name: v if isinstance(v, str) else json.dumps(v) for name, v in flatten(run.config).items()}
-    return _filled(
-        "page.html",
+    viewer = own_asset("viewer.js") if run.mesh is not None else scripts(*SCENE_SCRIPTS) if scene else ""
+    return filled(
+        own_asset("page.html"),
         version=version("etsplat"),
         title=escape(_title(run)),
         subtitle=escape(_subtitle(run)),
         verdict="" if run.verdict is None else _verdict(run.verdict),
-        style=asset("page.css"),
-        viewer_script=asset("viewer.js"),
-        page_script=asset("page.js"),
+        style="\n".join([asset("base.css"), asset("scene.css"), own_asset("page.css")]),
+        scripts="\n".join([scripts(*SHARED_SCRIPTS), viewer, own_asset("page.js")]),
         metrics="".join(_card(card) for card in cards_of(run)),
-        mesh="" if run.mesh is None else _mesh_section(run.mesh),
+        shape=scene if run.mesh is None else _mesh_section(run.mesh),
         views=_views_section(run),
         curves=_curves_section(run),
         command=f"<pre>{escape(command)}</pre>" if command else f"<p>{FROM_PYTHON}</p>",
@@ -78,16 +78,6 @@ def render_page(run: Run) -> str:
         engine=escape(str(run.metrics["engine"])),
         config="".join(f"<tr><td>{escape(name)}</td><td>{escape(value)}</td></tr>" for name, value in said.items()),
     )
-
-
-def asset(name: str) -> str:
-    """A file of the page's parts, such as page.css, as text."""
-    return (files("etsplat.report") / "assets" / name).read_text(encoding="utf-8")
-
-
-def _filled(template: str, **values: str) -> str:
-    """A template of the assets with these values in it."""
-    return Template(asset(template)).substitute(values)
 
 
 def _title(run: Run) -> str:
@@ -129,11 +119,11 @@ def _mesh_section(path: Path) -> str:
     if mesh.vertex_colors is not None:
         colors = mesh.vertex_colors[mesh.faces].mean(dim=1)
     data = {
-        "vertices": _base64(mesh.vertices.numpy().astype("<f4").tobytes()),
-        "faces": _base64(mesh.faces.numpy().astype("<u4").tobytes()),
-        "colors": _base64(np.rint(colors.numpy() * 255).astype("u1").tobytes()),
+        "vertices": in_base64(mesh.vertices.numpy().astype("<f4").tobytes()),
+        "faces": in_base64(mesh.faces.numpy().astype("<u4").tobytes()),
+        "colors": in_base64(np.rint(colors.numpy() * 255).astype("u1").tobytes()),
     }
-    return _filled("mesh.html", data=json.dumps(data))
+    return filled(own_asset("mesh.html"), data=json.dumps(data))
 
 
 def _views_section(run: Run) -> str:
@@ -143,12 +133,12 @@ def _views_section(run: Run) -> str:
     opaque, label = ("opaque", "Opaque triangles") if run.mesh is None else ("mesh", "Exported mesh")
     shown = "" if len(views) == len(run.views) else f" {len(views)} of {len(run.views)} are shown."
     figures = "".join(_comparison(view, opaque) for view in views)
-    return _filled("views.html", shown=shown, opaque=opaque, label=label, views=figures)
+    return filled(own_asset("views.html"), shown=shown, opaque=opaque, label=label, views=figures)
 
 
 def _comparison(view: TestView, kind: str) -> str:
     pictures = {"truth": _picture(view.truth), "render": _picture(view.render), "opaque": _picture(view.opaque)}
-    return _filled("view.html", name=escape(view.name), kind=kind, **pictures)
+    return filled(own_asset("view.html"), name=escape(view.name), kind=kind, **pictures)
 
 
 def _picture(path: Path) -> str:
@@ -156,7 +146,7 @@ def _picture(path: Path) -> str:
     image.thumbnail((MAX_PICTURE, MAX_PICTURE), Image.Resampling.LANCZOS)
     buffer = io.BytesIO()
     image.save(buffer, "PNG", optimize=True)
-    return "data:image/png;base64," + _base64(buffer.getvalue())
+    return "data:image/png;base64," + in_base64(buffer.getvalue())
 
 
 def _curves_section(run: Run) -> str:
@@ -165,8 +155,4 @@ def _curves_section(run: Run) -> str:
         f'<span class="last">{short_number(curve.mean[-1])}</span></h3>{draw_svg(curve)}</div>'
         for curve in curves_of(run)
     )
-    return _filled("curves.html", charts=charts) if charts else ""
-
-
-def _base64(content: bytes) -> str:
-    return base64.b64encode(content).decode("ascii")
+    return filled(own_asset("curves.html"), charts=charts) if charts else ""

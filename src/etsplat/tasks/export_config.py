@@ -3,15 +3,36 @@
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from etsplat.tasks.settings import Range, Settings
+from etsplat.tasks.settings import Only, Range, Settings
 
 Bake = Literal["mean", "constant", "keep"]
+
+SMALLEST = 64
+TEXELS = Range(SMALLEST, 8192)
+"""Along each side of a texture."""
+
+LIGHT_FACES = 10_000
+"""Of a textured mesh, unless told otherwise."""
+
+_TEXTURED = Only("with --texture", lambda config: config.texture is not None)
 
 
 @dataclass(frozen=True)
 class ExportConfig(Settings):
-    """How a soup leaves for other programs."""
+    """How a soup, or the mesh of a reconstruction, leaves for other programs."""
 
+    texture: Annotated[int | None, TEXELS] = None
+    """Of a run of `etsplat reconstruct`: a light mesh under a texture with so many texels along each side.
+    It is fitted to the run's photos, and has --faces faces, or 10,000. Needs pip install 'etsplat[texture]'."""
+    faces: Annotated[int | None, Range(4, 10_000_000)] = None
+    """Of a run of `etsplat reconstruct`: at most so many faces; without --texture in the colours they have.
+    Needs pip install 'etsplat[texture]'."""
+    normals: Annotated[bool, _TEXTURED] = False
+    """With --texture, in GLB: a material that programs light, with the full mesh's relief as a normal map.
+    The light of the photos stays in the colours; without it they are shown as they are."""
+    lods: Annotated[int, Range(0, 7), _TEXTURED] = 0
+    """With --texture: so many coarser levels beside it, in files of their own, NAME_lod1 and on.
+    Each has a quarter of the faces of the one before, and half its texels along each side, for twice the distance."""
     colors: Bake = "mean"
     """What becomes of colours that depend on the direction.
     mean: one per triangle, of what the training views see;
@@ -23,5 +44,40 @@ class ExportConfig(Settings):
     """Write opacities as alpha too (PLY, OFF, GLB). Most viewers sort transparent triangles badly."""
     weld: bool = False
     """Let triangles share vertices where positions and colours are equal."""
-    up: Literal["y", "keep"] = "y"
-    """Turn the scene so that the training cameras' mean up direction is +y, or keep the capture's axes."""
+    triangles: Literal["opaque", "soup"] = "opaque"
+    """opaque: the opaque mesh that the run made;
+    where it made none, and in files with opacities or colours for each direction, the soup.
+    soup: the triangles of the soup in any case."""
+    sky: Literal["apart", "joined", "none"] = "apart"
+    """What is behind everything, at the distance of the sky.
+    apart: an object of its own (GLB, OBJ), in GLB with a material that is seen from inside alone;
+    files that hold one object (PLY, OFF) are without it, but those for etsplat (safetensors, --colors keep) have it;
+    joined: with the scene in one;
+    none, or --no-sky: left out."""
+    clean: bool = False
+    """Leave out triangles that are out of every training photo's frame, or that none of them shows;
+    in files of soft triangles, of 16 photos and more, those that a single one shows;
+    then small groups that stand alone.
+    What photos show changes next to nothing."""
+    up: Literal["y", "z", "keep"] = "y"
+    """Turn the scene so that the training cameras' mean up direction is +y or +z, or keep the capture's axes.
+    GLB has +y up, which programs with another axis turn by themselves: z is for the other kinds of files."""
+    scale: Annotated[float, Range(1e-6, 1e6)] = 1.0
+    """Multiply all lengths: 0.01 if a unit of the capture is a centimetre, and metres are wanted."""
+    place: Literal["keep", "center", "ground", "world"] = "keep"
+    """Where the origin is. keep: where the capture has it; center: in the middle of what is exported, but its sky;
+    ground: below that, at the height of its lowest parts;
+    world: where georeference.json says, in the world's units and axes, whatever --up says: GLB alone has +y up."""
+
+    def contradiction(self) -> str | None:
+        """What is wrong with settings that are right one by one."""
+        if problem := texture_problem(self.texture):
+            return problem
+        if self.texture is not None and (self.texture >> self.lods < SMALLEST or self.texture % (1 << self.lods)):
+            return f"lods: {self.lods} times half of {self.texture} texels is less than {SMALLEST}, or no whole number"
+        return None
+
+
+def texture_problem(size: int | None) -> str | None:
+    """What is wrong with a texture of so many texels along each side, which is halved twice; None for none."""
+    return f"texture: is {size}; it must be a multiple of 4" if size is not None and size % 4 else None

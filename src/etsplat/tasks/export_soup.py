@@ -1,7 +1,9 @@
-"""A soup as a file for other programs: colours baked, faint triangles dropped, up along +y."""
+"""A soup as a file for other programs: colours baked, what is not wanted left out, turned, scaled and placed."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -9,67 +11,232 @@ from torch import Tensor
 
 from etsplat.core.cameras import Cameras
 from etsplat.core.errors import InputError
+from etsplat.geometry.similarity import Similarity, rotation_between
+from etsplat.io.atomic import atomic_write
+from etsplat.io.georeference import GEOREFERENCE_FILE, Georeference
 from etsplat.io.mesh_files import save_triangles
 from etsplat.io.paths import kind_of
 from etsplat.io.writers import suffixes, writer_of
+from etsplat.model.solid_soup import SolidSoup
 from etsplat.model.soup_appearance import OPAQUE_FROM
-from etsplat.model.triangle_soup import TriangleSoup
+from etsplat.model.triangle_soup import GEOREFERENCE_NOTE, TriangleSoup
 from etsplat.ops.soup_colors import soup_colors
 from etsplat.tasks.export_config import ExportConfig
-from etsplat.tasks.sources import SoupRun, rotation_to_y_up, training_cameras, world_up
+from etsplat.tasks.scene_page import compact_bytes, scene_of, small_camera
+from etsplat.tasks.soup_selection import Crop, Reason, Selection, select
+from etsplat.tasks.sources import SoupRun, training_cameras, world_up
+from etsplat.web.pages import render_scene_page
 
-BAKING_WIDTH = 400
-"""Training views are drawn this wide to find how much each shows of a triangle."""
+WHOLE = (".safetensors", ".etz", ".html")
+"""Kinds of files that hold a soup as soft as it is, in the units and axes of its capture."""
+
+_LOWEST, _HIGHEST = 0.01, 0.99
+"""Quantiles of coordinates between which nearly everything lies, whatever strays."""
 
 
 @dataclass(frozen=True)
 class Export:
-    """What was written: the file, how many triangles, and how many were left out as too faint."""
+    """What was written.
+
+    Attributes:
+        path: the file.
+        triangles: in it, the sky's too.
+        sky: those of the sky, where they are an object of their own.
+        removed: how many were left out, by the reason (`etsplat.tasks.soup_selection.REASONS`).
+        transform: from the capture's own units and axes to those of the file.
+    """
 
     path: Path
     triangles: int
-    dropped: int
+    sky: int
+    removed: Mapping[Reason, int]
+    transform: Similarity
+
+    @property
+    def dropped(self) -> int:
+        """How many were left out as too faint."""
+        return self.removed.get("faint", 0)
 
 
-def export_soup(run: SoupRun, path: Path | str, config: ExportConfig) -> Export:
-    """Write a soup to `path`, whose suffix chooses the format: .safetensors, or one of `etsplat.io.writers`.
+def export_soup(run: SoupRun, path: Path | str, config: ExportConfig, crop: Crop | None = None) -> Export:
+    """Write a soup to `path`, whose suffix chooses the format: one of `WHOLE`, or of `etsplat.io.writers`.
+
+    Args:
+        run: the soup, and where it is known its capture.
+        path: of the file.
+        config: what is written, and how.
+        crop: what is kept of the soup, in the capture's own units and axes.
 
     Raises:
         InputError: settings that contradict each other; nothing is left; the file cannot be written.
     """
     path = Path(path)
-    if kind_of(path) == ".safetensors":
-        run.soup.save(path)
-        return Export(path, run.soup.count, 0)
+    _check(path, config)
+    keeps_all = kind_of(path) in WHOLE
+    soft = keeps_all or config.alpha or config.colors == "keep"
+    apart = config.sky == "apart" and not keeps_all and "objects" in writer_of(path).HOLDS
+    least = (0.0 if keeps_all else OPAQUE_FROM) if config.min_opacity is None else config.min_opacity
+    if run.solid is not None and config.triangles == "opaque" and not soft and config.min_opacity is None:
+        run = replace(run, soup=run.solid)
+    chosen = select(
+        run,
+        crop=crop,
+        clean=config.clean,
+        sky=apart or config.sky == "joined" or (config.sky == "apart" and (keeps_all or config.colors == "keep")),
+        min_opacity=least,
+        opaque=not soft,
+    )
+    if keeps_all:
+        _write_whole(run, path, config, chosen)
+        return Export(path, int(chosen.kept.sum()), 0, chosen.removed, Similarity())
+    return _write(run, path, config, chosen, apart=apart)
+
+
+def _check(path: Path, config: ExportConfig) -> None:
+    """Raises InputError for settings that files of a kind have no room for, or that contradict each other."""
+    moved = config.scale != 1 or config.place != "keep"
+    if kind_of(path) in WHOLE:
+        if moved or config.up == "z":
+            raise InputError(f"{path}: keeps the units and axes of the capture; leave out --up, --scale and --place")
+        return
     holds = writer_of(path).HOLDS
-    if config.colors == "keep" and ("numbers" not in holds or config.up == "y"):
+    if config.colors == "keep" and ("numbers" not in holds or config.up != "keep"):
         kinds = " or ".join(suffix[1:] for suffix in suffixes("numbers"))
         raise InputError(f"colours that depend on the direction (--colors keep) need --format {kinds} and --up keep")
     if config.alpha and "alpha" not in holds:
         raise InputError(f"{path}: files of this kind hold no opacities; leave out --alpha, or choose another --format")
-    soup = run.soup
-    opacities = soup.drawn_opacities.detach()
-    kept = opacities >= (OPAQUE_FROM if config.min_opacity is None else config.min_opacity)
-    if not bool(kept.any()):
+    if config.up == "z" and "z_up" not in holds:
+        kinds = " or ".join(suffix[1:] for suffix in suffixes("z_up"))
         raise InputError(
-            f"{run.path}: no triangle is opaque enough; lower --min-opacity, or train with --finish opaque"
+            f"{path}: files of this kind have +y up, which programs turn to their own axis; leave out --up z, "
+            f"or choose --format {kinds}"
         )
-    if config.colors == "mean" and run.capture is not None:
+    if config.place == "world" and "offset" not in holds:
+        kinds = " or ".join(suffix[1:] for suffix in suffixes("offset"))
+        raise InputError(f"{path}: files of this kind hold no coordinates of maps; choose --format {kinds}")
+    if config.place == "ground" and config.up == "keep":
+        raise InputError("--place ground needs to know which way is up; take --up y or z")
+
+
+def _write_whole(run: SoupRun, path: Path, config: ExportConfig, chosen: Selection) -> None:
+    """What was chosen of the soup in one of the kinds `WHOLE`."""
+    soup = chosen.of(run.soup)
+    if kind_of(path) == ".safetensors":
+        soup.save(path)
+        return
+    with atomic_write(path) as temporary:
+        if kind_of(path) == ".etz":
+            temporary.write_bytes(compact_bytes(soup, run.capture))
+            return
+        solid = _chosen_solid(run, config, chosen)
+        temporary.write_text(render_scene_page(scene_of(run, soup, solid)), encoding="utf-8", errors="replace")
+
+
+def _chosen_solid(run: SoupRun, config: ExportConfig, chosen: Selection) -> SolidSoup | None:
+    """The opaque mesh without what the soup is left without, for pages; None if there is none."""
+    solid = run.solid
+    if solid is None or config.triangles == "soup":
+        return None
+    shown = replace(run, soup=solid)
+    return solid.kept(select(shown, crop=chosen.crop, clean=config.clean, sky=config.sky != "none", opaque=True).kept)
+
+
+def _write(run: SoupRun, path: Path, config: ExportConfig, chosen: Selection, *, apart: bool) -> Export:
+    """Colours, places and numbers of what was chosen."""
+    soup, kept = run.soup, chosen.kept
+    sky = (chosen.sky & kept)[kept].cpu() if apart else torch.zeros(int(kept.sum()), dtype=torch.bool)
+    if bool(sky.all()):
+        raise InputError(f"{run.path}: nothing but its sky is left; train with --asset, or take --sky joined")
+    if isinstance(soup, SolidSoup):
+        colors = soup.corner_colors[kept]
+    elif config.colors == "mean" and run.capture is not None:
         colors = bake_colors(soup, training_cameras(run.capture))[kept]
     else:
         colors = soup.display_colors()[kept]
+    opacities = soup.drawn_opacities.detach()[kept]
     vertices = soup.vertices.detach()[kept].cpu()
-    up = None if run.capture is None or config.colors == "keep" else world_up(run.capture.viewmats)
-    if config.up == "y" and up is not None:
-        vertices = (vertices.double() @ rotation_to_y_up(up).T).float()
+    if bool(sky.any()) and chosen.surroundings is not None:
+        turned = sky & chosen.surroundings.facing_outwards(vertices)  # in a file it is seen from inside alone
+        vertices[turned] = vertices[turned].flip(1)
+        if isinstance(soup, SolidSoup):
+            colors[turned.to(colors.device)] = colors[turned.to(colors.device)].flip(1)
+    transform = transform_of(run, config, vertices[~(chosen.sky[kept].cpu())])
+    georeference, world, near = _georeference(run), None, transform
+    if config.place == "world" and georeference is not None:  # the sum of both float32 could not hold
+        x, y, z = transform.translation.tolist()
+        world, near = replace(georeference, offset=(x, y, z)), replace(transform, translation=torch.zeros(3).double())
+    vertices = near.apply(vertices).float()
     if config.alpha:
-        colors = torch.cat([colors, opacities[kept, None]], dim=1)
-    numbers = {"opacity": opacities[kept], "sigma": soup.drawn_sigma.detach()[kept]}
+        colors = torch.cat([colors, opacities[:, None]], dim=1)
+    numbers = {"opacity": opacities, "sigma": soup.drawn_sigma.detach()[kept]}
     if config.colors == "keep":
         numbers |= _coefficients(soup, kept)
-    comment = f"etsplat {soup.appearance.kernel} {soup.appearance.distance}"
-    save_triangles(path, vertices, colors, weld=config.weld, numbers=numbers, comment=comment)
-    return Export(path, len(vertices), int((~kept).sum()))
+    save_triangles(
+        path,
+        vertices,
+        colors,
+        weld=config.weld or isinstance(soup, SolidSoup),  # whose neighbours share corners as they are
+        numbers=numbers,
+        comment=f"etsplat {soup.appearance.kernel} {soup.appearance.distance}",
+        record=_record(config, chosen, transform, georeference),
+        sky=sky if bool(sky.any()) else None,
+        world=world,
+    )
+    return Export(path, len(vertices), int(sky.sum()), chosen.removed, transform)
+
+
+def transform_of(run: SoupRun, config: ExportConfig, corners: Float[Tensor, "N 3 3"]) -> Similarity:
+    """How the capture's frame is turned, scaled and moved.
+
+    Args:
+        run: with its capture, to know where up is; without one, or where the cameras contradict each other, nothing is
+            turned, and +y or +z is up as it is.
+        config: up, scale and place. The world's axes are those of the capture, and GLB's nodes turn them if need be.
+        corners: of what is placed, on the CPU. Between the 1st and 99th of a hundred parts of their coordinates
+            along each axis is what the middle is the middle of; at the 1st is the ground.
+    """
+    georeference = _georeference(run)
+    if config.place == "world":
+        if georeference is None:
+            raise InputError(
+                f"{run.path}: does not say where it lies in the world; write {GEOREFERENCE_FILE}, or train anew"
+            )
+        place = torch.tensor(georeference.offset, dtype=torch.float64)
+        return Similarity(scale=georeference.scale * config.scale, translation=place * config.scale)
+    up = None if run.capture is None or config.up == "keep" else world_up(run.capture.viewmats)
+    if georeference is not None and georeference.up is not None and config.up != "keep":
+        up = torch.eye(3, dtype=torch.float64)["xyz".index(georeference.up)]
+    axis = torch.eye(3, dtype=torch.float64)[2 if config.up == "z" else 1]
+    turned = Similarity(scale=config.scale)
+    if up is not None:
+        turned = replace(turned, rotation=rotation_between(up, axis))
+    if config.place == "keep" or not len(corners):
+        return turned
+    ordered = turned.apply(corners.reshape(-1, 3)).sort(dim=0).values
+    last = len(ordered) - 1
+    low, high = ordered[round(_LOWEST * last)], ordered[round(_HIGHEST * last)]
+    middle = (low + high) / 2
+    return turned.moved(-(middle if config.place == "center" else middle + (low - middle) * axis))
+
+
+def _georeference(run: SoupRun) -> Georeference | None:
+    """Where the capture lies in the world: as the soup says, or else the capture; None where neither does."""
+    if (note := run.soup.notes.get(GEOREFERENCE_NOTE)) is not None:
+        return Georeference.from_json(note, run.path)
+    return None if run.capture is None else run.capture.georeference
+
+
+def _record(
+    config: ExportConfig, chosen: Selection, transform: Similarity, georeference: Georeference | None
+) -> dict[str, Any]:
+    """What the file says of how it was made."""
+    return {
+        **({} if georeference is None else {"georeference": asdict(georeference)}),
+        "transform": transform.matrix.tolist(),
+        **{name: getattr(config, name) for name in ("up", "scale", "place", "sky", "clean")},
+        "crop": None if chosen.crop is None else str(chosen.crop),
+        "removed": dict(chosen.removed),
+    }
 
 
 @torch.no_grad()
@@ -82,7 +249,7 @@ def bake_colors(soup: TriangleSoup, cameras: list[Cameras]) -> Float[Tensor, "N 
     device = soup.vertices.device
     total, weight = torch.zeros(len(soup), 3, device=device), torch.zeros(len(soup), 1, device=device)
     for camera in cameras:
-        small = camera.scaled(min(1.0, BAKING_WIDTH / camera.width)).to(device)
+        small = small_camera(camera).to(device)
         seen = soup.render(small, outputs=("statistics",)).statistics
         assert seen is not None
         colors = soup_colors(soup.vertices, soup.sh_dc, soup.sh_rest, small.centers, soup.drawn_degree)[0]

@@ -11,7 +11,7 @@ from typing import Any
 
 from etsplat.io.overview import draw_overview, find_test_views
 from etsplat.io.run_directory import RunDirectory
-from etsplat.optim.loop import Callback, DoneEvent, Event, NoteEvent, PrepareEvent, StepEvent, UndoEvent
+from etsplat.optim.loop import Callback, DoneEvent, Event, NoteEvent, PrepareEvent, StageEvent, StepEvent, UndoEvent
 
 _SHOWN = (
     ("psnr", "PSNR", "{:.2f} dB"),
@@ -36,7 +36,7 @@ class NotebookProgress:
             print(event)
         elif isinstance(event, PrepareEvent):
             self._show(f"preparing the pictures: {event.done}/{event.total}")
-        elif isinstance(event, StepEvent | DoneEvent):
+        elif isinstance(event, StageEvent | StepEvent | DoneEvent):
             self._show(str(event))
 
     def _show(self, text: str) -> None:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,9 +13,10 @@ from etsplat.geometry.parts import Shape, genera, shape_of
 from etsplat.io.mesh_files import MeshFile
 from etsplat.model.triangle_mesh import TriangleMesh
 from etsplat.ops.antialias_nvdiffrast import load_nvdiffrast
+from etsplat.optim.depth_trust import DepthTrust
 from etsplat.optim.exposure import Exposure
 from etsplat.optim.guard import Guard
-from etsplat.optim.loop import Callback, NoteEvent
+from etsplat.optim.loop import Callback, NoteEvent, StageEvent
 from etsplat.optim.objective import Objective
 from etsplat.optim.schedules import (
     Schedule,
@@ -29,6 +30,8 @@ from etsplat.optim.strategies import SubdivideAndUntangle
 from etsplat.optim.terms.photometric import Photometric
 from etsplat.optim.trainer import Trainer
 from etsplat.optim.vertex_updates import UniformSteps
+from etsplat.tasks.depths import trusted_depths, wanted_depths
+from etsplat.tasks.export_mesh import Reconstruction
 from etsplat.tasks.judgement import (
     TRAINING_VIEWS,
     Judgement,
@@ -44,6 +47,10 @@ from etsplat.tasks.running import Job, Result, path_of, terms_of
 from etsplat.tasks.scoring import Scorer, load_lpips
 from etsplat.tasks.sources import Source, fingerprint, load_source, make_subject
 from etsplat.tasks.starts import load_start, make_start, nearby
+from etsplat.tasks.texturing import check_installed
+
+DEPTHS_NEAR, DEPTHS_FAR = 0.02, 0.15
+"""When depth maps are compared with the mesh, as a fraction of a run that starts near the surface, or far from it."""
 
 
 @dataclass(frozen=True)
@@ -73,6 +80,8 @@ def reconstruct(
     *,
     init_mesh: str | Path | MeshFile | None = None,
     masks: str | Path | None = None,
+    depths: str | Path | None = None,
+    depth_unit: float | None = None,
     callbacks: Sequence[Callback] = (),
     resume: bool = False,
     overwrite: bool = False,
@@ -91,6 +100,10 @@ def reconstruct(
         init_mesh: a mesh to start from, in the units of the source.
         masks: folder with a mask (white inside the object) for every image of a scene folder, instead of its own masks/
             or the images' transparency.
+        depths: folder with depth maps of images (16-bit PNG, NPY or EXR); None for the scene's own, if it has any.
+            What becomes of them `regularization.depth` says.
+        depth_unit: units of the scene in a step of their numbers; None for what the scene says of them, or else 0.001
+            for integers and 1 for others.
         callbacks: each is called with every event, in the thread of the caller. With none a notebook shows a line.
         resume: continue the run in `out`, which must have been started with the same source and settings; from the
             beginning if it has no checkpoint yet.
@@ -102,15 +115,20 @@ def reconstruct(
     """
     config = config or ReconstructConfig()
     job = Job(config, out, callbacks, resume=resume, overwrite=overwrite)
-    (loaded, notes), start = load_source(source, config, masks), load_start(init_mesh)
+    maps = wanted_depths(depths, depth_unit, config.regularization.depth)
+    loaded, notes = load_source(source, config, masks, depths=maps, depth_unit=depth_unit)
+    start = load_start(init_mesh)
     hashes = {"fingerprint": fingerprint(loaded), "init_mesh": fingerprint(start)}
-    job.identify(hashes, {"source": path_of(source), "init_mesh": path_of(init_mesh)})
+    paths = {"source": source, "init_mesh": init_mesh, "masks": masks, "depths": depths}
+    job.identify(hashes, {name: path_of(path) for name, path in paths.items()})
     for name, found in (("source", notes), ("init_mesh", start.notes if start else [])):
         for note in found:
             job.announce(NoteEvent(f"{name}: {note}"))
     views, truth = make_subject(loaded, config, job.prepared, job.device)
     if config.drawing.backend == "nvdiffrast":
         load_nvdiffrast()  # now rather than at the first step
+    if config.texture is not None:
+        check_installed()
     with engine(config.engine):
         scorer = Scorer(
             views,
@@ -126,8 +144,11 @@ def reconstruct(
             holes = genera(mesh.faces.cpu(), len(mesh.vertices))
             job.announce(NoteEvent(f"start: the visual hull, {mesh.count:,} faces; holes in each part: {holes}"))
             config = nearby(config)
-        trainer = make_trainer(mesh, views, config, scorer.cheap)
+        trust = _trusted_depths(views, config, begun, job)
+        trainer = make_trainer(mesh, views, config, scorer.cheap, trust)
         with job.writing():
+            if views.georeference is not None:
+                views.georeference.write(job.run.path)
             outcome, frame = job.fit(trainer), views.normalization
             mesh = outcome.model
             for suffix in (".ply", ".obj", ".glb"):
@@ -136,10 +157,37 @@ def reconstruct(
             sizes["edits_undone"] = len(trainer.guard.undone) if trainer.guard else 0
             exposed = job.exposed(trainer.exposure, views.names)
             found = {**scorer.full(mesh, job.run.test), **sizes, **outcome.metrics, **exposed}
+            found |= {} if trust is None else trust.metrics()
             judgement = judging(mesh, found)
+            found |= _texture(job, views, scorer, config)
             metrics = job.finish(trainer.progress, {**found, "judgement": judgement.to_dict()}, mesh.vertices)
             job.run.conclude(judgement.verdict)
     return ReconstructResult(job.run.path, metrics, mesh.to_file(frame))
+
+
+def _trusted_depths(views: Dataset, config: ReconstructConfig, begun: Start, job: Job) -> DepthTrust | None:
+    """Compared with the mesh soon where that starts near the surface, or else when photos have shaped it."""
+    weights = config.regularization
+    first = DEPTHS_NEAR if begun != "sphere" else DEPTHS_FAR
+    choice = weights.depth if weights.lambda_depth and config.soft else "off"
+    return trusted_depths(views, choice, max(1, round(first * config.iterations)), job.announce)
+
+
+def _texture(job: Job, views: Dataset, scorer: Scorer, config: ReconstructConfig) -> dict[str, Any]:
+    """Makes textured.glb of the mesh that the run has written, where that is asked for; for metrics.json, what it is.
+
+    The same file as of `etsplat export`. A run that is interrupted here makes it anew.
+    """
+    if config.texture is None:
+        return {}
+    views = replace(views, train=sorted([*views.train, *views.watched]), watched=[])
+    done = Reconstruction.of(job.run, views, job.device)
+    mesh = done.textured(
+        config.texture, config.output.texture_faces, tell=lambda *state: job.announce(StageEvent(*state))
+    )
+    done.in_own_units(mesh).save(job.run.textured_path)
+    seen = scorer.opaque(mesh.to(job.device), views.test)
+    return {"psnr_textured": seen["psnr_mesh"], "textured_faces": mesh.count, "texture": config.texture}
 
 
 def _judge(
@@ -177,6 +225,7 @@ def make_trainer(
     views: Dataset,
     config: ReconstructConfig,
     evaluate: Callable[[TriangleMesh], dict[str, float]] | None = None,
+    depths: DepthTrust | None = None,
 ) -> Trainer[TriangleMesh]:
     """The paper's way from a start to the object that views show: L_mesh, Adam, subdivision.
 
@@ -185,12 +234,13 @@ def make_trainer(
         views: what it is fitted to.
         config: settings.
         evaluate: cheap metrics of a mesh.
+        depths: which depth maps are believed; None where none are used.
     """
     length, regularization, refinement = config.iterations, config.regularization, config.refinement
     terms = terms_of(
         regularization,
-        leaving=() if config.soft else ("sigma",),
-        arguments={"edge": {"power": regularization.edge_power}},
+        leaving=[*([] if config.soft else ["sigma"]), *(["depth"] if depths is None else [])],
+        arguments={"edge": {"power": regularization.edge_power}, "depth": {"trust": depths}},
     )
     gamma = partial(regularization_weight, iterations=length, hold=regularization.hold, final=regularization.final)
     budgets = face_budgets(
@@ -211,6 +261,7 @@ def make_trainer(
         schedule=_schedule(config),
         batch=config.batch,
         exposure=Exposure.of(config.exposure, length, len(views.train) / config.batch),
+        depths=depths,
         update=None if config.optimizer.vertex_update == "adam" else UniformSteps(smoothing),
         evaluate=evaluate,
         guard=Guard(tolerance=refinement.guard, until=length) if refinement.guard else None,
@@ -235,6 +286,7 @@ def _schedule(config: ReconstructConfig) -> Schedule:
             "colors": rates.lr_colors,
             "opacity_logits": rates.lr_opacities,
             "log_sigma": 0.0 if annealed else rates.lr_sigma,
+            "harmonics": rates.lr_harmonics,
         },
         values={"log_sigma": log_sigma} if annealed else {},
         halvings=partial(coarse_level, iterations=length, levels=pictures.coarse_levels, until=pictures.coarse_until),

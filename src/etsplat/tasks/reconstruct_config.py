@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, get_args
 
+from etsplat.tasks.export_config import LIGHT_FACES, TEXELS, texture_problem
 from etsplat.tasks.settings import Device, OneOf, Only, Range, Rare, Settings, SoftMethod, engine_names, kernel_methods
 
 RasterMethod = Literal["raster-face", "raster-vertex"]
@@ -12,6 +13,7 @@ Method = Literal[SoftMethod, RasterMethod]
 METHODS: tuple[Method, ...] = get_args(Method)
 Preset = Literal["best", "paper", "study", "quick", "demo", "tiny"]
 
+_DEPTH = Only("with regularization.depth", lambda config: config.soft and config.regularization.depth != "off")
 _SOFT = Only("with soft triangles (elastic, bilateral, single-sided)", lambda config: config.soft)
 _COARSE = Only("with coarse levels", lambda config: config.pictures.coarse_levels > 0)
 _HULL = Only("with start.shape hull or auto", lambda config: config.start.shape != "sphere")
@@ -19,8 +21,13 @@ _SPHERE = Only("with start.shape sphere or auto", lambda config: config.start.sh
 _LARGE = Only("with vertex_update large-steps", lambda config: config.optimizer.vertex_update == "large-steps")
 _LEARNED = Only("where softness is learned", lambda config: config.soft and not config.optimizer.sigma_final)
 _EDGES = Only("with lambda_edge", lambda config: config.regularization.lambda_edge > 0)
+_FACE_COLORED = Only(
+    "with soft triangles that have a colour for each face", lambda config: config.soft and not config.vertex_colored
+)
+_HARMONICS = Only("with harmonics", lambda config: config.drawing.harmonics > 0)
 _UNTANGLED = Only("with untanglings", lambda config: config.refinement.untanglings > 0)
 _SUBDIVIDED = Only("with subdivisions", lambda config: config.refinement.subdivisions > 0)
+_TEXTURED = Only("with a texture", lambda config: config.texture is not None)
 
 
 @dataclass(frozen=True)
@@ -43,6 +50,9 @@ class Drawing:
     """Colours of soft triangles: one for each face, or one for each vertex, interpolated between."""
     distance: Annotated[Literal["barycentric", "sdf"], _SOFT] = "barycentric"
     """How far a pixel is from a soft triangle: by barycentric coordinates or by signed distance."""
+    harmonics: Annotated[int, Range(0, 3), _FACE_COLORED] = 0
+    """Degree of the harmonics by which colours of faces depend on the direction, as gloss does; 0 for none.
+    Meshes that are written carry each face's mean over the directions in front of it."""
     backend: Literal["etsplat", "nvdiffrast"] = "etsplat"
     """Whose rasterizer the raster methods use; nvdiffrast must be installed and wants a CUDA device."""
 
@@ -88,6 +98,8 @@ class Optimizer:
     """Ratio of that rate's last value to its first; it falls exponentially."""
     lr_colors: Annotated[float, Range(0)] = 1e-2
     """Adam learning rate of colours."""
+    lr_harmonics: Annotated[float, Range(0), _HARMONICS] = 5e-4
+    """Adam learning rate of what depends on the direction in colours."""
     lr_opacities: Annotated[float, Range(0), _SOFT] = 1e-3
     """Adam learning rate of opacities, before their sigmoid."""
     lr_sigma: Annotated[float, Range(0), _LEARNED] = 1e-4
@@ -114,6 +126,13 @@ class Regularization:
     """The weights above are multiplied by a cosine that falls from 1 at this iteration to `final` at the last."""
     final: Annotated[float, Range(0, 1)] = 0.03
     """Where that cosine ends; the paper's ends at 0."""
+    depth: Annotated[Literal["auto", "l1", "pearson", "off"], _SOFT] = "auto"
+    """What depth maps are taken for, where the capture has them and they do not contradict its photos.
+    l1: depths in the capture's units; pearson: depths, or inverse ones, of unknown scale and shift;
+    auto: the first of these that agrees with the capture's points, or with the mesh as photos have shaped it."""
+    lambda_depth: Annotated[float, Range(0), _DEPTH] = 0.5
+    """Weight of the distance from depth maps, of soft triangles: relative (l1), or 1 minus the correlation (pearson).
+    The cosine multiplies it too."""
 
 
 @dataclass(frozen=True)
@@ -148,6 +167,8 @@ class Output:
     """Iterations between checkpoints; 0 for one at the end only."""
     chamfer_samples: Annotated[int, Range(1, 10**7)] = 100_000
     """Points per surface for the Chamfer distance."""
+    texture_faces: Annotated[int, Range(4, 10_000_000), _TEXTURED] = LIGHT_FACES
+    """At most so many faces under the texture."""
     lpips_weights: Path | None = None
     """Weights file for LPIPS; "download" fetches it; None uses the one in torch's cache or goes without."""
 
@@ -179,6 +200,9 @@ class ReconstructConfig(Settings):
     """Side of the pictures taken of a mesh, in pixels; wider images of a scene are scaled down to this width."""
     max_faces: Annotated[int, Range(1)] = 100_000
     """Subdivision stops here."""
+    texture: Annotated[int | None, TEXELS] = None
+    """Make a light mesh too, textured.glb: few faces under a texture with so many texels along each side, say 2048.
+    It is what `etsplat export --texture` makes of a run. Needs pip install 'etsplat[texture]'."""
     watch: Annotated[int | None, Range(0)] = None
     """One in so many training photos is kept from training, to watch the run by; 0 keeps none.
     None keeps one in 16 where there are at least 24, and none of those that are taken of a mesh.
@@ -257,7 +281,7 @@ class ReconstructConfig(Settings):
             return "watch: 1 would keep all photos from training; choose 0 or at least 2"
         if self.refinement.first > self.refinement.last:
             return "refinement.first: is after refinement.last; make it smaller"
-        return None
+        return texture_problem(self.texture)
 
 
 # The paper does without what measurements support beyond it: coarse pictures at first, weights that stay, untangling
@@ -270,6 +294,7 @@ _PAPER: dict[str, Any] = {
     "pictures.coarse_levels": 0,
     "pictures.coarse_until": 0.5,
     "regularization.final": 0.0,
+    "regularization.depth": "off",
     "refinement.untanglings": 0,
     "refinement.guard": 0.0,
 }

@@ -1,5 +1,6 @@
 """Pictures and videos of a trained soup."""
 
+import math
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
@@ -11,26 +12,44 @@ from jaxtyping import Float
 from matplotlib import colormaps
 from torch import Tensor
 
-from etsplat.core.cameras import Cameras
+from etsplat.core.cameras import Cameras, intrinsics
 from etsplat.core.errors import InputError
-from etsplat.data.camera_paths import PATHS
+from etsplat.data.camera_coverage import upright
+from etsplat.data.camera_paths import PATHS, path_note, played, usual_frames
 from etsplat.data.dataset import Dataset
 from etsplat.io.atomic import atomic_write, write_error
+from etsplat.io.camera_path_files import read_camera_path
 from etsplat.io.images import over_background, save_image
 from etsplat.io.paths import kind_of
 from etsplat.io.videos import VideoSink, open_video
-from etsplat.model.triangle_soup import TriangleSoup
+from etsplat.model.soup_appearance import OPAQUE_FROM
+from etsplat.model.triangle_soup import FOCAL_NOTE, TriangleSoup
 from etsplat.tasks.render_config import RenderConfig
+from etsplat.tasks.soup_selection import Crop, select
 from etsplat.tasks.sources import SoupRun, world_up
+
+_MOST_SAMPLES = 8
 
 _NEAREST = 0.02
 """Quantile of depths that is shown as nearest, and as farthest from the other end."""
 
 _PROBE_WIDTH = 160
 
+KEY_FRAMES = 60
+"""From pose to pose of a recorded path, unless somebody says how many in all."""
+
+USUAL_WIDTH, USUAL_ASPECT = 960, 1.5
+"""Of the pictures of a recorded path where neither it nor a capture says."""
+
 
 def render_run(
-    run: SoupRun, out: Path | str, config: RenderConfig, *, progress: Callable[[int, int], None] | None = None
+    run: SoupRun,
+    out: Path | str,
+    config: RenderConfig,
+    *,
+    crop: Crop | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    tell: Callable[[str], None] | None = None,
 ) -> list[Path]:
     """Draw views or a path of a run into a folder.
 
@@ -39,28 +58,32 @@ def render_run(
         out: folder; made if it does not exist. Gets NAME_color.png (and _depth.png, _depth.npy, _normal.png) or
             PATH_color.mp4 and so on.
         config: what, from where, how.
+        crop: what is drawn of the soup, in the capture's own units and axes.
         progress: called with (pictures drawn, pictures in all).
+        tell: called with a sentence where a path is otherwise than its name says, as an orbit that is no whole turn.
 
     Returns:
         The files written.
 
     Raises:
-        InputError: the run has no capture or no views of that kind; MP4 cannot be written; the disk is full.
+        InputError: the run has no capture or no views of that kind; nothing is left to draw; MP4 cannot be written; the
+            disk is full.
     """
     out = Path(out)
     if out.is_file() or kind_of(out) in (".mp4", ".png"):
         raise InputError(f"{out}: pictures get names of their own; name a folder for them")
-    names, cameras = views_of(run.needed_capture(), config)
+    names, cameras = recorded_views(run, config) if config.recorded else views_of(run.needed_capture(), config, tell)
+    soup = drawn_soup(run, config, crop)
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise write_error(out, error) from error
     written: list[Path] = []
-    span = _path_span(run.soup, cameras) if config.video and config.depth else None
+    span = _path_span(soup, cameras) if config.video and config.depth else None
     with ExitStack() as stack:
         sinks: dict[str, VideoSink] = {}
         for index, (name, camera) in enumerate(zip(names, cameras, strict=True)):
-            pictures = draw(run.soup, camera, config)
+            pictures = draw(soup, camera, config)
             if "depth" in pictures:
                 depth = pictures["depth"]
                 if not config.video:
@@ -72,7 +95,7 @@ def render_run(
                     save_image(written[-1], picture)
                     continue
                 if kind not in sinks:
-                    written.append(out / f"{config.path}_{kind}.mp4")
+                    written.append(out / f"{path_name(config)}_{kind}.mp4")
                     sinks[kind] = stack.enter_context(open_video(written[-1], config.fps))
                 sinks[kind](picture)
             if progress is not None:
@@ -80,8 +103,49 @@ def render_run(
     return written
 
 
-def views_of(capture: Dataset, config: RenderConfig) -> tuple[list[str], list[Cameras]]:
-    """Names and single cameras of what is to be drawn.
+def drawn_soup(run: SoupRun, config: RenderConfig, crop: Crop | None = None) -> TriangleSoup:
+    """What is drawn of a run's soup.
+
+    Raises:
+        InputError: nothing is.
+    """
+    solid = config.opaque and not (config.depth or config.normals)  # which are of the soft triangles
+    run = replace(run, soup=run.solid) if solid and run.solid is not None else run
+    if config.sky and not config.clean and crop is None:
+        return run.soup
+    least = OPAQUE_FROM if solid else 0.0
+    return select(run, crop=crop, clean=config.clean, sky=config.sky, min_opacity=least, opaque=solid).of(run.soup)
+
+
+def path_name(config: RenderConfig) -> str:
+    """What files of a path are called."""
+    return Path(config.path).stem if config.recorded else config.path
+
+
+def recorded_views(run: SoupRun, config: RenderConfig) -> tuple[list[str], list[Cameras]]:
+    """Names and single cameras of the frames of a path in a file. They have the shape of the photos unless it says.
+
+    Raises:
+        InputError: the file cannot be used.
+    """
+    keys = read_camera_path(config.path)
+    frames = config.frames or max(1, KEY_FRAMES * (len(keys) - 1))
+    viewmats, fovs = played(keys.viewmats, keys.fovs, frames)
+    photo = None if run.capture is None else run.capture.images.sizes[run.capture.train[0]]
+    width = config.width or (photo[0] if photo else USUAL_WIDTH)
+    aspect = keys.aspect or (photo[0] / photo[1] if photo else USUAL_ASPECT)
+    height = max(1, round(width / aspect))
+    cameras = [
+        Cameras(viewmats[index : index + 1].float(), intrinsics(float(fov), width, height)[None], width, height)
+        for index, fov in enumerate(fovs)
+    ]
+    return [f"{path_name(config)}_{index:04d}" for index in range(frames)], cameras
+
+
+def views_of(
+    capture: Dataset, config: RenderConfig, tell: Callable[[str], None] | None = None
+) -> tuple[list[str], list[Cameras]]:
+    """Names and single cameras of what is to be drawn; `tell` as of `render_run`.
 
     Raises:
         InputError: the capture has no test views.
@@ -95,10 +159,15 @@ def views_of(capture: Dataset, config: RenderConfig) -> tuple[list[str], list[Ca
     up = world_up(capture.viewmats)
     if up is None:  # the cameras contradict each other: take the first one's
         up = -capture.viewmats[0, 1, :3]
-    viewmats = PATHS[config.path](capture.viewmats[capture.train], up, config.frames).float()
+    photographed = capture.viewmats[capture.train]
+    up = upright(photographed, up)
+    frames = config.frames or usual_frames(config.path, photographed)
+    viewmats = PATHS[config.path](photographed, up, frames).float()
+    if tell is not None and (note := path_note(config.path, photographed, up)):
+        tell(note)
     first = _sized(capture.cameras[capture.train[0]], config.width)
-    names = [f"{config.path}_{index:04d}" for index in range(config.frames)]
-    return names, [replace(first, viewmats=viewmats[index : index + 1]) for index in range(config.frames)]
+    names = [f"{config.path}_{index:04d}" for index in range(frames)]
+    return names, [replace(first, viewmats=viewmats[index : index + 1]) for index in range(frames)]
 
 
 @torch.no_grad()
@@ -116,6 +185,9 @@ def draw(soup: TriangleSoup, camera: Cameras, config: RenderConfig) -> dict[str,
         return {"color": pictures["color"].cpu()}
     outputs = ("color", *(["depth"] if config.depth else []), *(["normal"] if config.normals else []))
     rendering = soup.render(camera, backgrounds=background[None], outputs=outputs)
+    if config.antialias and not config.opaque and (samples := samples_of(soup, camera)) > 1:
+        fine = soup.render(camera.scaled(samples), backgrounds=background[None]).color.movedim(-1, 1)
+        pictures["color"] = torch.nn.functional.avg_pool2d(fine, samples)[0].movedim(0, -1).clamp(0, 1)
     pictures.setdefault("color", rendering.color[0].clamp(0, 1))
     if rendering.depth is not None:
         pictures["depth"] = rendering.depth[0, ..., 0]
@@ -123,6 +195,18 @@ def draw(soup: TriangleSoup, camera: Cameras, config: RenderConfig) -> dict[str,
         normals = torch.nn.functional.normalize(rendering.normal[0], dim=-1)
         pictures["normal"] = (0.5 + 0.5 * normals) * rendering.alpha[0]
     return {kind: picture.cpu() for kind, picture in pictures.items()}
+
+
+def samples_of(soup: TriangleSoup, camera: Cameras) -> int:
+    """How many samples along each side of a pixel are as fine as the photos that a soup was trained with; 1 to 8.
+
+    1 of soups of which nobody knows.
+    """
+    try:
+        focal = float(soup.notes.get(FOCAL_NOTE, "0"))
+    except ValueError:
+        return 1
+    return min(_MOST_SAMPLES, max(1, round(focal / float(camera.Ks[0, 0, 0])))) if math.isfinite(focal) else 1
 
 
 def depth_span(depth: Float[Tensor, "H W"]) -> tuple[float, float]:

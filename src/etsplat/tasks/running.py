@@ -20,7 +20,7 @@ from etsplat.io.kernel_files import kernel_digest, write_kernel
 from etsplat.io.locks import check_nobody_writes, writing_run
 from etsplat.io.run_directory import RunDirectory, is_run
 from etsplat.optim.exposure import Exposure
-from etsplat.optim.loop import Callback, Event, NoteEvent, PrepareEvent, Progress
+from etsplat.optim.loop import Callback, Event, NoteEvent, PrepareEvent, Progress, StageEvent, StepEvent
 from etsplat.optim.objective import Term
 from etsplat.optim.schedules import Scheduled
 from etsplat.optim.terms import named_terms
@@ -161,7 +161,12 @@ class Job:
             InputError: somebody does; or as `Place.open`.
         """
         with self._place.open(self._record, lambda text: self.announce(NoteEvent(text))) as self.run:
-            yield
+            self.run.forget_end()
+            try:
+                yield
+            except BaseException as error:
+                self.run.write_end(end_of(error))
+                raise
 
     def fit(self, trainer: Trainer[M], first: Callback | None = None) -> Outcome[M]:
         """Runs a trainer from the last checkpoint to the end; see `Trainer.fit`. `first` is told before the others."""
@@ -179,6 +184,34 @@ class Job:
         if outcome.note is not None:
             self.announce(NoteEvent(outcome.note))
         return outcome
+
+    def fit_stage(self, trainer: Trainer[M], iterations: int, folder: str, name: str) -> M:
+        """Runs a trainer that makes something beside what the run optimizes, from its own last checkpoint to the end.
+
+        Args:
+            trainer: of what is made.
+            iterations: its steps.
+            folder: in the run's directory, for its checkpoints and history.
+            name: what is made, for those who watch.
+
+        Returns:
+            What was made.
+        """
+
+        def tell(event: Event) -> None:
+            if isinstance(event, StepEvent):
+                self.announce(StageEvent(name, event.iteration, event.iterations))
+
+        output = self.config.output
+        trainer.fit(
+            iterations,
+            callbacks=[tell],
+            log_every=output.log_every,
+            checkpoint_every=output.checkpoint_every,
+            run=self.run.stage(folder, iterations),
+            run_hash=hash_record(self._record),
+        )
+        return trainer.outcome().model
 
     def exposed(self, exposure: Exposure, names: Sequence[str]) -> dict[str, Any]:
         """Writes exposure.json where exposures were learned, and says so.
@@ -268,6 +301,13 @@ def make_record(
         "paths": paths,
         "versions": versions(),
     }
+
+
+def end_of(error: BaseException) -> str:
+    """What became of a run that an error ended, in a line."""
+    if isinstance(error, KeyboardInterrupt):
+        return "interrupted"
+    return " ".join(f"failed: {error or type(error).__name__}".split())
 
 
 def hash_record(record: dict[str, Any]) -> str:

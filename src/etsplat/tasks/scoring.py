@@ -27,6 +27,7 @@ from etsplat.geometry.intersections import count_degenerate_faces, count_self_in
 from etsplat.io.atomic import write_error
 from etsplat.io.images import over_background, save_image, to_8_bit
 from etsplat.io.mesh_files import MeshFile
+from etsplat.metrics.flip import flip
 from etsplat.metrics.geometry import SAMPLES, chamfer, geometry_metrics, sample_pair
 from etsplat.metrics.image import WINDOW, Lpips, colors_fitted, find_lpips_weights, psnr, silhouette_iou, ssim
 from etsplat.model.model import Model
@@ -37,9 +38,12 @@ from etsplat.tasks.sources import SoupRun
 SMALLEST = 16
 """Pixels a side below which LPIPS is not defined."""
 
-METRICS = ("psnr", "psnr_8bit", "ssim", "ssim_interior", "lpips", "lpips_3dgs")
+METRICS = ("psnr", "psnr_8bit", "ssim", "ssim_interior", "flip", "lpips", "lpips_3dgs")
 """Of a view: psnr_8bit is that of images rounded to 8 bits, as published numbers are; ssim is zero-padded; lpips has
 inputs in [-1, 1], lpips_3dgs in [0, 1]."""
+
+BRIEF = ("psnr", "ssim", "flip")
+"""Those of them that runs end with, of the model and of what a mesh viewer shows."""
 
 REPEATS = 3
 """Every view is timed so often, after one picture that is not counted; the best time counts."""
@@ -164,14 +168,29 @@ class Scorer:
             "psnr",
             "psnr_affine",
             "ssim",
-            f"psnr_{model.OPAQUE}",
-            f"ssim_{model.OPAQUE}",
+            "flip",
+            *(f"{name}_{model.OPAQUE}" for name in BRIEF),
             "lpips",
             "silhouette_iou",
         )
         means = {name: _mean([row[name] for row in rows]) for name in names}
         reason = self.lpips_reason if rows else "no test views"
         return {**self._geometry(model), **means, "lpips_reason": reason, "test_views": rows}
+
+    def asset(self, mesh: TriangleMesh, folder: Path) -> dict[str, float | None]:
+        """How a mesh viewer draws the opaque mesh of a scene: means over the test views, and how many triangles it has.
+
+        Args:
+            mesh: what to measure.
+            folder: gets NNN_opaque.png for every test view, in the place of the soup's.
+        """
+        rows = []
+        for number, index in enumerate(self._dataset.test):
+            seen = self.see(mesh, index)
+            rows.append(image_scores(seen.counting(seen.opaque), seen.photo, names=BRIEF, suffix="_asset"))
+            save_image(folder / f"{number:03d}_opaque.png", seen.opaque)
+        means = {name: _mean([row[name] for row in rows]) for name in (f"{each}_asset" for each in BRIEF)}
+        return {**means, "asset_triangles": mesh.count}
 
     def opaque(self, model: Model, views: Sequence[int]) -> dict[str, float | None]:
         """Means over some views, by index, of how a mesh viewer draws a model: "psnr_mesh" and "silhouette_iou".
@@ -191,9 +210,9 @@ class Scorer:
     def _scores(self, seen: Seen, opaque: str) -> dict[str, float | None]:
         splatted, drawn = seen.counting(seen.splatted), seen.counting(seen.opaque)
         return {
-            **image_scores(splatted, seen.photo, names=("psnr", "ssim")),
+            **image_scores(splatted, seen.photo, names=BRIEF),
             **fitted_score(seen),
-            **image_scores(drawn, seen.photo, names=("psnr", "ssim"), suffix=f"_{opaque}"),
+            **image_scores(drawn, seen.photo, names=BRIEF, suffix=f"_{opaque}"),
             **image_scores(splatted, seen.photo, self._lpips, ("lpips",)),
             "silhouette_iou": self._outline_iou(seen),
         }
@@ -241,6 +260,7 @@ def image_scores(
         "psnr": lambda: psnr(image, photo),
         "psnr_8bit": lambda: psnr(to_8_bit(image).float() / 255, to_8_bit(photo).float() / 255),
         "ssim": lambda: ssim(image, photo),
+        "flip": lambda: float(flip(image, photo)),
     }
     if smallest >= WINDOW:
         measures["ssim_interior"] = lambda: ssim(image, photo, interior=True)
@@ -286,10 +306,10 @@ def evaluate_run(
 
     Returns:
         Means over the test views by name: psnr and psnr_8bit (of renders rounded to 8 bits, as published numbers are),
-        ssim (zero-padded), ssim_interior, lpips (inputs scaled to [-1, 1]) and lpips_3dgs (not scaled), each also with
-        `_opaque` for the opaque triangles; psnr_affine, after a fit of the colours to each photograph; `views`, the
-        same for each; fps, ms_per_frame, ms_per_million and their circumstances. null where something could not be
-        measured, `lpips_reason` says why.
+        ssim (zero-padded), ssim_interior, flip, lpips (inputs scaled to [-1, 1]) and lpips_3dgs (not scaled), each
+        also with `_opaque` for the opaque triangles; psnr_affine, after a fit of the colours to each photograph;
+        `views`, the same for each; fps, ms_per_frame, ms_per_million and their circumstances. null where something
+        could not be measured, `lpips_reason` says why.
 
     Raises:
         InputError: no capture, no test views, weights that cannot be read, `pictures` cannot be written to.

@@ -30,7 +30,6 @@ AnySettings = TypeVar("AnySettings", bound="Settings")
 
 _KINDS = {bool: "true or false", int: "a whole number", float: "a number", str: "a word", Path: "a path"}
 
-
 _LARGEST = {int: 1e9, float: 1e30}
 """Of numbers that are not bounded otherwise: nobody counts further, and float32 holds what is computed from it."""
 
@@ -52,9 +51,10 @@ class Range:
 
 @dataclass(frozen=True)
 class OneOf:
-    """At a field of words, where more may be registered in the course of a program: which there are by now."""
+    """At a field of words: which there are by now, as more may be registered, and what a file that will do ends in."""
 
     names: Callable[[], tuple[str, ...]]
+    suffix: str | None = None
 
 
 @dataclass(frozen=True)
@@ -84,6 +84,7 @@ class Setting:
         names: gives all values; none where any of its kind and range will do.
         range: of numbers.
         only: when it has an effect.
+        suffix: of a file that will do instead of a word.
         default: of its class.
     """
 
@@ -92,6 +93,7 @@ class Setting:
     names: Callable[[], tuple[Any, ...]]
     range: Range | None
     only: Only | None
+    suffix: str | None
     default: Any
 
     @property
@@ -104,10 +106,10 @@ class Setting:
         if value is None and self.optional:
             return None
         if choices := self.choices:
-            if value in choices:
+            if value in choices or (self.suffix and str(value).lower().endswith(self.suffix)):
                 return None
-            choices = (None, *choices) if self.optional else choices
-            return f"choose one of {', '.join(map(str, choices))}"
+            others = [*([None] if self.optional else []), *choices, *([f"FILE{self.suffix}"] if self.suffix else [])]
+            return f"choose one of {', '.join(map(str, others))}"
         kinds = (int, float) if self.kind is float else self.kind
         if not isinstance(value, kinds) or isinstance(value, bool) != (self.kind is bool):
             return f"it must be {_KINDS[self.kind]}"
@@ -160,7 +162,7 @@ class Settings:
         known = settings_of(type(self))
         for name, setting in known.items():
             value = get(self, name)
-            if isinstance(value, str) and value not in setting.choices and "." not in name:
+            if isinstance(value, str) and value not in setting.choices and "." not in name + value:
                 value = value.replace("_", "-")  # single_sided, as the rasterizer has it
                 object.__setattr__(self, name, value)
             setting.check(name, value)
@@ -364,19 +366,18 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
 
 
 def _setting(hint: Any, default: Any) -> Setting:
-    extras: tuple[Any, ...] = ()
+    extras: list[Any] = []
     if get_origin(hint) is Annotated:
-        hint, *rest = get_args(hint)
-        extras = tuple(rest)
+        hint, *extras = get_args(hint)
     parts = get_args(hint)
     optional = NoneType in parts
     if optional:
         (hint,) = (part for part in parts if part is not NoneType)
     choices = get_args(hint) if get_origin(hint) is Literal else ()
-    named = next((extra.names for extra in extras if isinstance(extra, OneOf)), lambda: choices)
+    words = next((extra for extra in extras if isinstance(extra, OneOf)), OneOf(lambda: choices))
     limits = next((extra for extra in extras if isinstance(extra, Range)), None)
     only = next((extra for extra in extras if isinstance(extra, Only)), None)
-    return Setting(type(choices[0]) if choices else hint, optional, named, limits, only, default)
+    return Setting(type(choices[0]) if choices else hint, optional, words.names, limits, only, words.suffix, default)
 
 
 def _typed(setting: Setting, value: Any) -> Any:

@@ -6,6 +6,8 @@ A `SoupRun` is what every command that comes after training starts from.
 import hashlib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property, reduce
+from operator import getitem
 from pathlib import Path
 from typing import Any
 
@@ -18,14 +20,18 @@ from etsplat.core.errors import InputError
 from etsplat.data.dataset import Dataset
 from etsplat.data.demo_object import demo_object
 from etsplat.data.demo_scene import HEIGHT, WIDTH, demo_scene
+from etsplat.data.dense_cloud import dense_start
 from etsplat.data.hull import bounding_sphere
 from etsplat.data.load import load_dataset
 from etsplat.data.photograph import normalize_mesh, photograph
 from etsplat.data.silhouettes import contradicting
 from etsplat.engines.choice import resolve_device
 from etsplat.io.mesh_files import MeshFile, load_mesh
+from etsplat.io.opaque_files import load_opaque
 from etsplat.io.paths import path_remedy
+from etsplat.io.point_clouds import load_cloud
 from etsplat.io.run_directory import RunDirectory, is_run
+from etsplat.model.solid_soup import SolidSoup
 from etsplat.model.soup_import import open_soup
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.tasks.reconstruct_config import ReconstructConfig
@@ -37,9 +43,17 @@ Source = str | Path | MeshFile | Dataset
 DEMO_OBJECT, DEMO_SCENE = "demo:owl", "demo:scene"
 """Name what is built in code."""
 
+FEWEST_POINTS = 100
+"""Of a dense cloud that photos speak for."""
+
 
 def load_source(
-    source: Source, config: ReconstructConfig, masks: str | Path | None = None
+    source: Source,
+    config: ReconstructConfig,
+    masks: str | Path | None = None,
+    *,
+    depths: bool | Path | str = False,
+    depth_unit: float | None = None,
 ) -> tuple[MeshFile | Dataset, Sequence[str]]:
     """Reads a mesh file or a scene folder, or makes the demo's object; objects are passed through.
 
@@ -49,6 +63,8 @@ def load_source(
         source: what to read.
         config: the resolution of a scene's images.
         masks: folder with a mask for every image of a scene folder, instead of the scene's own.
+        depths: as of `load_dataset`.
+        depth_unit: likewise.
 
     Returns:
         What is to be reconstructed, and notes about what of it is not used.
@@ -57,8 +73,9 @@ def load_source(
         InputError: there is nothing at the path, or what is there cannot be used; masks for something else than a
             scene folder.
     """
-    if masks is not None and (isinstance(source, MeshFile | Dataset) or not Path(source).is_dir()):
-        raise InputError(f"masks {masks}: belong to a folder with posed images; leave them out for a mesh")
+    for name, folder in (("masks", masks), ("depths", None if isinstance(depths, bool) else depths)):
+        if folder is not None and (isinstance(source, MeshFile | Dataset) or not Path(source).is_dir()):
+            raise InputError(f"{name} {folder}: belong to a folder with posed images; leave them out for a mesh")
     if isinstance(source, MeshFile):
         return source, source.notes
     if isinstance(source, Dataset):
@@ -67,8 +84,11 @@ def load_source(
         return demo_object(), []
     path = Path(source)
     if path.is_dir():
-        scene, notes = _agreeing(load_dataset(path, masks_as="alpha", width=config.resolution, masks=masks))
-        return scene.renormalized(*bounding_sphere(scene)), notes
+        loaded = load_dataset(
+            path, masks_as="alpha", width=config.resolution, masks=masks, depths=depths, depth_unit=depth_unit
+        )
+        scene, notes = _agreeing(loaded)
+        return scene.renormalized(*bounding_sphere(scene)), [*scene.notes, *notes]
     if path.is_file():
         mesh = load_mesh(path)
         return mesh, mesh.notes
@@ -93,6 +113,8 @@ def load_scene(
     masks: str | Path | None = None,
     progress: Callable[[int, int], None] | None = None,
     *,
+    depths: bool | Path | str = False,
+    depth_unit: float | None = None,
     preload: bool = True,
 ) -> Dataset:
     """Reads a scene's folder as `load_dataset` does, or makes the demo's scene in photos no wider than its own.
@@ -103,6 +125,8 @@ def load_scene(
         images: folder in the scene to take the photos from.
         masks: folder with a mask for every photo.
         progress: called with (views done, views in all).
+        depths: as of `load_dataset`.
+        depth_unit: likewise.
         preload: decode all photos now.
     """
     if isinstance(source, Dataset):
@@ -110,7 +134,42 @@ def load_scene(
     if str(source) == DEMO_SCENE:
         width = min(WIDTH, width or WIDTH)
         return demo_scene(width, max(1, round(HEIGHT * width / WIDTH)), progress=progress)
-    return load_dataset(source, images=images, width=width, masks=masks, progress=progress, preload=preload)
+    return load_dataset(
+        source,
+        images=images,
+        width=width,
+        masks=masks,
+        depths=depths,
+        depth_unit=depth_unit,
+        progress=progress,
+        preload=preload,
+    )
+
+
+def with_cloud(
+    scene: Dataset, path: str | Path, most: int, progress: Callable[[int, int], None] | None = None
+) -> tuple[Dataset, str]:
+    """A scene with the points of a dense cloud that its photos speak for, in the place of its own; and a note.
+
+    Args:
+        scene: in its own units.
+        path: of the cloud, in the same units; in the world's, where a georeference says how the scene lies in that.
+        most: triangles that there may be; half as many points are taken at most.
+        progress: called with (photos compared, photos in all).
+
+    Raises:
+        InputError: as `load_cloud`; or photos speak for fewer than 100 points.
+    """
+    points, colors = load_cloud(path)
+    if scene.georeference is not None:
+        far = scene.georeference
+        points = (points - torch.tensor(far.offset, dtype=torch.float64)) / far.scale
+    found = dense_start(points, colors, scene, max(1, most // 2), progress)
+    if len(found.positions) < FEWEST_POINTS:
+        raise InputError(
+            f"points {path}: {found.note}; they must be in the frame and units of the photos' poses: align them first"
+        )
+    return replace(scene, exact_points=found.positions, point_colors=found.colors), f"points {path}: {found.note}"
 
 
 def make_subject(
@@ -167,16 +226,23 @@ class SoupRun:
         path: what was opened: a run directory or a file.
         soup: the triangles.
         capture: cameras and photos; images are decoded when they are asked for. None for a file without its scene.
+        opaque: the opaque mesh that the run made beside the soup, on the CPU; None if it made none.
     """
 
     path: Path
     soup: TriangleSoup
     capture: Dataset | None
+    opaque: MeshFile | None = None
 
     @property
     def device(self) -> torch.device:
         """Where the soup is, and pictures of it are drawn."""
         return self.soup.vertices.device
+
+    @cached_property
+    def solid(self) -> SolidSoup | None:
+        """The faces of the opaque mesh in the place of the soup, on its device; None if the run made none."""
+        return None if self.opaque is None else SolidSoup.of(self.opaque, self.soup)
 
     @property
     def folder(self) -> Path:
@@ -246,7 +312,7 @@ def read_record(run: RunDirectory, kind: type[Settings], names: Iterable[str], *
     record = run.read_config(*needed, "config", *(f"config.{name}" for name in names))
     try:
         for name in names:
-            settings_of(kind)[name].check(name, record["config"][name])
+            settings_of(kind)[name].check(name, reduce(getitem, name.split("."), record["config"]))
     except InputError as error:
         raise InputError(f"{run.config_path}: {error}") from error
     return record
@@ -278,19 +344,10 @@ def _open_directory(path: Path, scene: Path | str | None, device: torch.device) 
     config = read_record(run, TrainConfig, ["width"], "paths.source")
     paths, width = config["paths"], config["config"]["width"]
     source = scene or paths["source"]
+    opaque = load_opaque(run.opaque_path) if run.opaque_path.is_file() else None
     if source is None:
-        return SoupRun(path, soup, None)
+        return SoupRun(path, soup, None, opaque)
     if scene is None and source != DEMO_SCENE and not Path(source).is_dir():
         raise InputError(f"{path}: its scene {source} has gone; name where it is now with --scene")
-    return SoupRun(path, soup, load_scene(source, width, paths.get("images"), paths.get("masks"), preload=False))
-
-
-def rotation_to_y_up(up: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
-    """The smallest rotation that takes the unit vector `up` to +y, float64."""
-    target = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
-    axis, cosine = torch.linalg.cross(up.double(), target), float(up.double() @ target)
-    if cosine < -1 + 1e-9:  # upside down: half a turn about x
-        return torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
-    x, y, z = axis.tolist()
-    skew = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
-    return torch.eye(3, dtype=torch.float64) + skew + skew @ skew / (1 + cosine)
+    capture = load_scene(source, width, paths.get("images"), paths.get("masks"), preload=False)
+    return SoupRun(path, soup, capture, opaque)

@@ -78,6 +78,7 @@ def make_start(
         sigma=config.start.sigma if config.soft else None,
         vertex_colored=config.vertex_colored,
         appearance=MeshAppearance(kernel, config.drawing.distance, config.drawing.backend),
+        harmonics=config.drawing.harmonics,
     )
     return mesh, begun
 

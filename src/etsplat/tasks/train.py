@@ -1,48 +1,35 @@
 """Novel-view synthesis (paper section 3.4): photos in, a run directory with a triangle soup out."""
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import torch
 
 from etsplat.data.dataset import Dataset
-from etsplat.data.shown_width import shown_width
 from etsplat.engines.choice import engine, engine_for
-from etsplat.model.soup_appearance import SoupAppearance
-from etsplat.model.soup_init import StartPoints, random_points, start_soup
+from etsplat.io.mesh_files import MeshFile
+from etsplat.io.opaque_files import save_opaque
 from etsplat.model.surroundings import Surroundings
-from etsplat.model.triangle_soup import TriangleSoup
-from etsplat.optim.densification import PruneRules
+from etsplat.model.triangle_mesh import TriangleMesh
+from etsplat.model.triangle_soup import FOCAL_NOTE, GEOREFERENCE_NOTE, TriangleSoup
 from etsplat.optim.exposure import Exposure
 from etsplat.optim.loop import Callback, CheckpointEvent, DivergedError, Event, NoteEvent
-from etsplat.optim.objective import Objective
-from etsplat.optim.schedules import Schedule, Scheduled, exponential_decay, limited_iterations, ramp
-from etsplat.optim.strategies import DensifyAndPrune
-from etsplat.optim.terms.photometric import Photometric
-from etsplat.optim.terms.soup import Spared
-from etsplat.optim.trainer import Trainer
-from etsplat.tasks.running import Job, Result, path_of, terms_of
+from etsplat.optim.schedules import limited_iterations
+from etsplat.tasks.depths import trusted_depths, wanted_depths
+from etsplat.tasks.export_config import ExportConfig
+from etsplat.tasks.export_soup import export_soup
+from etsplat.tasks.opaque import fit_opaque_mesh
+from etsplat.tasks.running import Job, Result, path_of
 from etsplat.tasks.scoring import Scorer
-from etsplat.tasks.sources import load_scene
+from etsplat.tasks.soup_trainer import background_of, start_trainer
+from etsplat.tasks.sources import SoupRun, load_scene, with_cloud
 from etsplat.tasks.train_checks import check_train, doubtful_scale, triangle_limit
 from etsplat.tasks.train_config import TrainConfig
 
-LARGE_SPAN = 300.0
-"""Above this many units across, Triangle Splatting compares outdoor scenes by squares."""
-
-SETTLED = 0.1
-"""What is left, at the end of a run, of the learning rates that settle (`lr_settle`)."""
-
-FINAL_FLOOR, OPAQUE_AT = 0.995, 0.2
-FIRST_CEILING, FINAL_CEILING, SHARP_FROM, SHARP_AT = 1.0, 0.05, 0.3, 0.95
-HIDDEN = 0.005
-"""The opaque finish, as fractions of a run: opacities are squeezed above a floor that soon has its final height, so
-that most of the run is spent on an opaque soup, while its edges still give wide gradients. Then sigma is cut at a
-ceiling that falls. What is hidden meanwhile is removed (its blend weight stays below the last number), and others
-multiply in its place. The thresholds of soft soups take too much away (research/ablations.md)."""
+Onlooker = Callable[[Dataset, int, Callable[[], TriangleSoup]], None]
+"""Called with the capture, in its own units; iterations done; and what gives a copy of the soup as it is now, in these
+units, on the CPU, while the call lasts. It costs nothing but what the onlooker takes."""
 
 
 @dataclass(frozen=True)
@@ -52,12 +39,14 @@ class TrainResult(Result):
     Attributes:
         path: the run directory.
         soup: the triangles, in the units of the input.
+        opaque: the opaque mesh beside it, likewise, with a colour at each vertex; None if none was asked for.
         metrics: as in metrics.json.
     """
 
     OPAQUE = TriangleSoup.OPAQUE
 
     soup: TriangleSoup
+    opaque: MeshFile | None = None
 
 
 def train(
@@ -67,22 +56,34 @@ def train(
     *,
     images: str | None = None,
     masks: str | Path | None = None,
+    depths: str | Path | None = None,
+    depth_unit: float | None = None,
+    init_points: str | Path | None = None,
     callbacks: Sequence[Callback] = (),
+    onlooker: Onlooker | None = None,
     resume: bool = False,
     overwrite: bool = False,
 ) -> TrainResult:
-    """Fits a triangle soup to the photos of a scene.
+    """Fits a triangle soup to the photos of a scene, and makes an opaque mesh beside it if that is asked for.
 
     A run ends with the same bits on the same machine, torch and number of threads, also if it was killed and resumed
     any number of times. Ctrl-C leaves a checkpoint of the last whole iteration.
 
     Args:
-        source: a folder with posed photos (COLMAP, nerfstudio, Blender), a `Dataset` in its own units, or "demo:scene".
+        source: a folder with posed photos (of the programs in `docs/captures.md`), a `Dataset` in its own units, or
+            "demo:scene".
         out: the run directory; made if it does not exist. README.txt in it explains what is there.
         config: settings; None for preset "quick", outdoor. See `TrainConfig`.
         images: folder in the scene to take the photos from, such as "images_4".
         masks: folder with a mask for every photo, white where pixels count.
+        depths: folder with depth maps of photos (16-bit PNG, NPY or EXR); None for the scene's own, if it has any. What
+            becomes of them `loss.depth` says.
+        depth_unit: units of the scene in a step of their numbers; None for what the scene says of them, or else 0.001
+            for integers and 1 for others.
+        init_points: a dense cloud (PLY or LAS) in the scene's units, to start from instead of its own points. What
+            photos do not speak for is left out, and it is thinned to half of the triangles that there may be.
         callbacks: each is called with every event, in the thread of the caller. With none a notebook shows a line.
+        onlooker: told of the soup before the first step and after steps, in the thread of the caller.
         resume: continue the run in `out`, which must have been started with the same source and settings.
         overwrite: replace a run in `out`. Nothing but files of a run is ever removed.
 
@@ -92,24 +93,41 @@ def train(
     """
     config = config or TrainConfig()
     job = Job(config, out, callbacks, resume=resume, overwrite=overwrite)
-    own = load_scene(source, config.width, images, masks, job.prepared).watching(config.watch)
+    maps = wanted_depths(depths, depth_unit, config.loss.depth)
+    own = load_scene(source, config.width, images, masks, job.prepared, depths=maps, depth_unit=depth_unit).watching(
+        config.watch
+    )
+    if init_points is not None:
+        own, note = with_cloud(own, init_points, triangle_limit(own, config), job.prepared)
+        job.announce(NoteEvent(note))
     capture = own.normalized() if config.normalize else own
     iterations = limited_iterations(config.iterations, config.schedule.max_epochs, len(own.train), config.batch)
-    for note in check_train(own, config, iterations, job.device):
+    for note in (*own.notes, *check_train(own, config, iterations, job.device)):
         job.announce(NoteEvent(note))
-    paths = {"source": path_of(source), "images": images, "masks": path_of(masks)}
+    folders = {"masks": path_of(masks), "depths": path_of(depths), "init_points": path_of(init_points)}
+    paths = {"source": path_of(source), "images": images, **folders}
     job.identify({"fingerprint": own.fingerprint()}, paths, iterations)
     job.config = config = replace(config, iterations=iterations)
     with engine(config.engine):
-        scorer = Scorer(capture, job.device, background=_background(config))
-        trainer = start_trainer(capture, config, scorer.cheap, job.device)
+        scorer = Scorer(capture, job.device, background=background_of(config))
+        loss, first = config.loss, config.at(config.loss.depth_from)
+        trust = trusted_depths(capture, loss.depth if loss.lambda_depth else "off", first, job.announce)
+        trainer = start_trainer(capture, config, scorer.cheap, job.device, trust)
+
+        def look(iteration: int) -> None:
+            if onlooker is not None:
+                onlooker(own, iteration, lambda: _copy(_in_own_units(trainer.model, iteration, capture, config)))
 
         def keep(event: Event) -> None:
             if isinstance(event, CheckpointEvent):  # so that `etsplat view` can follow
                 _in_own_units(trainer.model, event.iteration, capture, config).save(job.run.soup_path)
 
         with job.writing(), engine_for(trainer.model.vertices).looping():
+            if capture.georeference is not None:
+                capture.georeference.write(job.run.path)
             try:
+                look(0)
+                trainer.onlooker = look
                 outcome = job.fit(trainer, keep)
             except DivergedError as error:
                 if doubt := doubtful_scale(own, config):
@@ -119,188 +137,42 @@ def train(
             scores = scorer.full(soup, job.run.test)
             result = _in_own_units(soup, outcome.iteration, capture, config)
             result.save(job.run.soup_path)
+            opaque, about_opaque = None, {}
+            if config.asset and (mesh := _opaque_mesh(job, soup, trainer.exposure, capture, config)) is not None:
+                about_opaque, opaque = scorer.asset(mesh, job.run.test), mesh.to_file(capture.normalization)
+                save_opaque(job.run.opaque_path, opaque)
+                export_soup(SoupRun(job.run.path, result, own, opaque), job.run.path / "opaque.glb", ExportConfig())
             found = {
                 **scores,
+                **about_opaque,
                 "psnr_opaque_loss": None if scores["psnr"] is None else scores["psnr"] - scores["psnr_opaque"],
                 **outcome.model.describe(),
                 **outcome.metrics,
                 **job.exposed(trainer.exposure, capture.names),
+                **({} if trust is None else trust.metrics()),
                 "width": capture.images.sizes[0][0],
                 "height": capture.images.sizes[0][1],
                 "train_views": len(capture.train),
                 "scene_type": config.scene_type,
                 "finish": config.finish,
             }
-            return TrainResult(job.run.path, job.finish(trainer.progress, found, soup.vertices), result)
+            return TrainResult(job.run.path, job.finish(trainer.progress, found, soup.vertices), result, opaque)
 
 
-def start_trainer(
-    capture: Dataset,
-    config: TrainConfig,
-    evaluate: Callable[[TriangleSoup], dict[str, float]] | None = None,
-    device: torch.device | None = None,
-) -> Trainer[TriangleSoup]:
-    """The start of a run: triangles at the capture's points, or at random ones.
-
-    Args:
-        capture: photos in the frame that is trained in.
-        config: settings.
-        evaluate: cheap metrics of a soup.
-        device: where the soup lives; None for the CPU.
-    """
-    generator = torch.Generator().manual_seed(config.seed)
-    points = _start_points(capture, config, generator)
-    soup = start_soup(
-        points,
-        generator,
-        scale=config.start.scale,
-        opacity=config.start.opacity,
-        sigma=config.start.sigma,
-        sh_degree=config.drawing.sh_degree,
-        centers=capture.centers[capture.train],
-        limit=config.start.limit,
-    )
-    if config.sky == "sphere":
-        soup = soup.joined(Surroundings.of(capture).soup(capture, config.drawing.sh_degree))
-    squared = config.scene_type == "outdoor" and not config.normalize and points.span > LARGE_SPAN
-    soup = soup.to(device or torch.device("cpu"))
-    return make_trainer(soup, capture, config, evaluate, generator, squared=squared)
+def _opaque_mesh(
+    job: Job, soup: TriangleSoup, exposure: Exposure, capture: Dataset, config: TrainConfig
+) -> TriangleMesh | None:
+    """The opaque mesh; without one the soup is still a result, and the run says why there is none."""
+    try:
+        return fit_opaque_mesh(job, soup, exposure, capture, config)
+    except DivergedError as error:
+        job.announce(NoteEvent(f"no opaque mesh: {error}"))
+        return None
 
 
-def make_trainer(
-    soup: TriangleSoup,
-    capture: Dataset,
-    config: TrainConfig,
-    evaluate: Callable[[TriangleSoup], dict[str, float]] | None = None,
-    generator: torch.Generator | None = None,
-    *,
-    squared: bool = False,
-) -> Trainer[TriangleSoup]:
-    """The paper's way from a start to the scene that photos show: L_nvs, Adam, densification and pruning.
-
-    Args:
-        soup: the start; changed in place.
-        capture: what it is fitted to.
-        config: settings.
-        evaluate: cheap metrics of a soup.
-        generator: of every random choice; None for a new one with the seed of `config`.
-        squared: photos are compared by squares.
-    """
-    closed = Surroundings.of(capture).to(soup.vertices.device) if config.sky == "sphere" else None
-    spared = None if closed is None else closed.outermost
-    return Trainer(
-        soup,
-        capture,
-        _objective(config, spared, squared=squared),
-        _strategy(config, triangle_limit(capture, config), spared),
-        schedule=_schedule(config, _vertex_unit(soup, capture, config)),
-        batch=config.batch,
-        background=None if config.background == "random" else _background(config),
-        exposure=Exposure.of(config.exposure, config.iterations, len(capture.train) / config.batch),
-        evaluate=evaluate,
-        seed=generator or config.seed,
-    )
-
-
-def _objective(config: TrainConfig, spared: Spared | None, *, squared: bool) -> Objective:
-    """L_nvs. Where no view looks, nothing would hold what is spared against the pull to transparency."""
-
-    def late(weight: float) -> Scheduled:
-        return lambda iteration: weight if iteration > config.at(config.loss.regularize_from) else 0.0
-
-    def early(weight: float) -> Scheduled:
-        return lambda iteration: weight if iteration < config.at(config.densification.end) else 0.0
-
-    terms = terms_of(
-        config.loss,
-        leaving=("dssim", "opacity") if config.finish == "opaque" else ("dssim",),
-        scheduled={"size": early, "depth_normal": late, "distortion": late},
-        arguments={"opacity": {"spared": spared}},
-    )
-    photometric = Photometric(config.loss.lambda_dssim, "l2" if squared else "l1")
-    return Objective(photometric, terms, depth_of="centroid")
-
-
-def _strategy(config: TrainConfig, most: int, spared: Spared | None) -> DensifyAndPrune:
-    times = {name: config.at(getattr(config.densification, name)) for name in ("begin", "end", "every")}
-    rules = {**vars(config.pruning), "screen_size": config.pruning.screen_size or math.inf}
-    if config.finish == "opaque":
-        rules["importance"] = min(config.pruning.importance, HIDDEN)
-    return DensifyAndPrune(
-        **{**vars(config.densification), **times},
-        last=config.iterations,
-        max_triangles=most,
-        prune=PruneRules(**rules),
-        spared=spared,
-    )
-
-
-def _vertex_unit(soup: TriangleSoup, capture: Dataset, config: TrainConfig) -> float:
-    """What the rate of positions is a fraction of, in units of the frame."""
-    if config.optimizer.lr_vertices_unit == "frame":
-        return 1.0
-    points = soup.vertices.detach().mean(dim=1).cpu() if capture.points is None else capture.points
-    return shown_width(capture, points) or 1.0
-
-
-def _schedule(config: TrainConfig, unit: float) -> Schedule:
-    length, given = config.iterations, config.optimizer
-    faster = 1.0 if given.lr_vertices_length is None else math.sqrt(given.lr_vertices_length / length)
-
-    def vertices(iteration: int) -> float:
-        return unit * given.lr_vertices * exponential_decay(iteration, length, given.lr_vertices_final) * faster
-
-    def settling(rate: float) -> Scheduled:
-        if given.lr_settle is None:
-            return rate
-        first = config.at(given.lr_settle)
-        return lambda iteration: rate * SETTLED ** ramp(iteration, first, length)
-
-    rates: dict[str, Scheduled] = {
-        "vertices": vertices,
-        "opacity_logits": settling(given.lr_opacities),
-        "sigma_raw": settling(given.lr_sigma),
-        "sh_dc": settling(given.lr_sh_dc),
-        "sh_rest": settling(given.lr_sh_rest),
-    }
-    return Schedule(rates, appearance=partial(_appearance, config))
-
-
-def _appearance(config: TrainConfig, iteration: int) -> SoupAppearance:
-    """How the soup is drawn at an iteration: bands of the colours come one by one; the opaque finish."""
-    plain = SoupAppearance(
-        kernel=config.kernel,
-        distance=config.distance,
-        sh_degree=min(config.drawing.sh_degree, iteration // config.at(config.schedule.sh_every)),
-        cull_small=config.drawing.cull_small,
-        cull_large=math.inf if config.drawing.cull_large is None else config.drawing.cull_large,
-        freeze_inradius=config.drawing.freeze_inradius and config.distance == "sdf",
-        near_plane=config.drawing.near_plane,
-        background=_background(config),
-    )
-    if config.finish == "none":
-        return plain
-    opaque = ramp(iteration, 0, round(OPAQUE_AT * config.iterations))
-    sharp = ramp(iteration, round(SHARP_FROM * config.iterations), round(SHARP_AT * config.iterations))
-    ceiling = FIRST_CEILING * (FINAL_CEILING / FIRST_CEILING) ** sharp
-    return replace(plain, opacity_floor=FINAL_FLOOR * opaque, sigma_ceiling=ceiling)
-
-
-def _start_points(capture: Dataset, config: TrainConfig, generator: torch.Generator) -> StartPoints:
-    """The capture's points, or random ones in a cube that holds what the cameras look at."""
-    positions, colors = capture.points, capture.point_colors
-    if positions is None:
-        points = random_points(config.start.points, capture.viewmats[capture.train], generator)
-    else:
-        grey = torch.full_like(positions, 0.5)
-        points = StartPoints(positions, grey if colors is None else colors)
-    return points.with_sky() if config.sky == "dome" else points
-
-
-def _background(config: TrainConfig) -> tuple[float, float, float]:
-    """Behind the pictures that are measured."""
-    grey = 1.0 if config.background == "white" else 0.0
-    return grey, grey, grey
+def _copy(soup: TriangleSoup) -> TriangleSoup:
+    """The same in tensors of its own, which training does not change."""
+    return replace(soup, **{name: tensor.clone() for name, tensor in soup.state().items()})
 
 
 def _in_own_units(soup: TriangleSoup, iteration: int, capture: Dataset, config: TrainConfig) -> TriangleSoup:
@@ -310,5 +182,24 @@ def _in_own_units(soup: TriangleSoup, iteration: int, capture: Dataset, config: 
         soup,
         vertices=own.invert(soup.vertices.double()).float(),
         appearance=replace(soup.appearance, near_plane=soup.appearance.near_plane * own.radius),
-        notes={"iteration": str(iteration), "method": config.method, "preset": config.preset},
+        notes={
+            "iteration": str(iteration),
+            "method": config.method,
+            "preset": config.preset,
+            Surroundings.NOTE: _sky_note(capture, config),
+            **({} if capture.georeference is None else {GEOREFERENCE_NOTE: capture.georeference.to_json()}),
+            FOCAL_NOTE: f"{float(capture.Ks[capture.train, 0, 0].mean()):.9g}",
+        },
     )
+
+
+def _sky_note(capture: Dataset, config: TrainConfig) -> str:
+    """For those who use the soup: where its sky is, in the capture's own units."""
+    if config.sky == "sphere":
+        sky = Surroundings.of(capture)
+    elif config.sky == "dome" and capture.points is not None:
+        sky = Surroundings.dome(capture.points)
+    else:  # among random points, some of which are beyond it, nobody can tell a dome
+        return "none"
+    own = capture.normalization
+    return Surroundings(own.invert(sky.middle.double()), sky.radius * own.radius).note

@@ -1,25 +1,5 @@
-// The page's switches: theme, how pictures are compared, what the viewer shows.
+// The page's switches: how pictures are compared, what the viewer shows.
 "use strict";
-
-function chooseOne(group, apply) {
-    const buttons = [...group.querySelectorAll("button")];
-    for (const button of buttons) {
-        button.addEventListener("click", () => {
-            for (const other of buttons) other.setAttribute("aria-pressed", String(other === button));
-            apply(button.value);
-        });
-    }
-}
-
-function listenToTheme() {
-    const root = document.documentElement;
-    document.getElementById("theme").addEventListener("click", () => {
-        const dark = root.dataset.theme
-            ? root.dataset.theme === "dark"
-            : window.matchMedia("(prefers-color-scheme: dark)").matches;
-        root.dataset.theme = dark ? "light" : "dark";
-    });
-}
 
 function listenToComparisons() {
     const views = document.getElementById("views");
@@ -55,6 +35,5 @@ function listenToViewer() {
     }
 }
 
-listenToTheme();
 listenToComparisons();
 listenToViewer();

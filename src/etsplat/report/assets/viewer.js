@@ -3,8 +3,7 @@
 "use strict";
 
 const VERTEX_SHADER = `#version 300 es
-uniform mat4 clipFromModel;
-uniform mat3 viewFromModel;
+${CAMERA_UNIFORMS}
 in vec3 position;
 in vec3 faceNormal;
 in vec3 faceColor;
@@ -14,9 +13,9 @@ out vec3 corner;
 void main() {
     int k = gl_VertexID % 3;
     corner = vec3(k == 0, k == 1, k == 2);
-    normal = viewFromModel * faceNormal;
+    normal = vec3(1.0, -1.0, -1.0) * (faceNormal * turn);  // y up, z towards the eye: light comes from above
     color = faceColor;
-    gl_Position = clipFromModel * vec4(position, 1.0);
+    gl_Position = clipped(seen(position));
 }`;
 
 const FRAGMENT_SHADER = `#version 300 es
@@ -43,13 +42,6 @@ void main() {
     }
     pixel = vec4(surface, 1.0);
 }`;
-
-function bytesOf(base64) {
-    const text = atob(base64);
-    const bytes = new Uint8Array(text.length);
-    for (let i = 0; i < text.length; ++i) bytes[i] = text.charCodeAt(i);
-    return bytes.buffer;
-}
 
 function decodeMesh(data) {
     return {
@@ -97,20 +89,6 @@ function expandCorners(mesh) {
     return { count, positions, normals, colors };
 }
 
-function compileProgram(gl) {
-    const program = gl.createProgram();
-    for (const [kind, source] of [[gl.VERTEX_SHADER, VERTEX_SHADER], [gl.FRAGMENT_SHADER, FRAGMENT_SHADER]]) {
-        const shader = gl.createShader(kind);
-        gl.shaderSource(shader, source);
-        gl.compileShader(shader);
-        if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) throw new Error(gl.getShaderInfoLog(shader));
-        gl.attachShader(program, shader);
-    }
-    gl.linkProgram(program);
-    if (!gl.getProgramParameter(program, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(program));
-    return program;
-}
-
 function upload(gl, program, name, array, type, normalized) {
     const location = gl.getAttribLocation(program, name);
     gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
@@ -119,118 +97,28 @@ function upload(gl, program, name, array, type, normalized) {
     gl.vertexAttribPointer(location, 3, type, normalized, 0, 0);
 }
 
-// Turntable camera around `target`: yaw about +y, then pitch. Matrices are column-major.
-class Orbit {
-    constructor(bounds) {
-        this.bounds = bounds;
-        this.reset();
-    }
-
-    reset() {
-        this.yaw = 0.6;
-        this.pitch = 0.25;
-        this.zoom = 1;
-        this.target = [...this.bounds.center];
-    }
-
-    axes() {
-        const [cy, sy, cp, sp] = [Math.cos(this.yaw), Math.sin(this.yaw), Math.cos(this.pitch), Math.sin(this.pitch)];
-        return { right: [cy, 0, -sy], up: [-sy * sp, cp, -cy * sp], back: [sy * cp, sp, cy * cp] };
-    }
-
-    turn(dx, dy) {
-        this.yaw -= dx;
-        this.pitch = Math.max(-1.55, Math.min(1.55, this.pitch + dy));
-    }
-
-    pan(dx, dy) {
-        const { right, up } = this.axes();
-        const step = (2 * this.bounds.radius) / this.zoom;
-        this.target = this.target.map((value, k) => value - step * (dx * right[k] - dy * up[k]));
-    }
-
-    scale(factor) {
-        this.zoom = Math.max(0.3, Math.min(60, this.zoom * factor));
-    }
-
-    matrices(aspect) {
-        const { right, up, back } = this.axes();
-        const dot = (a) => a[0] * this.target[0] + a[1] * this.target[1] + a[2] * this.target[2];
-        const focal = 2.2 * Math.min(1, aspect);
-        const distance = (2.5 * this.bounds.radius) / this.zoom;
-        const near = Math.max(distance - 2 * this.bounds.radius, 0.01 * distance);
-        const far = distance + 4 * this.bounds.radius;
-        const [a, b] = [(far + near) / (near - far), (2 * far * near) / (near - far)];
-        const clip = [];
-        for (let k = 0; k < 3; ++k) clip.push((focal / aspect) * right[k], focal * up[k], a * back[k], -back[k]);
-        const depth = -dot(back) - distance;
-        clip.push((-focal / aspect) * dot(right), -focal * dot(up), a * depth + b, -depth);
-        const view = [0, 1, 2].flatMap((k) => [right[k], up[k], back[k]]);
-        return { clip, view };
-    }
-}
-
-function listen(canvas, orbit, draw) {
-    const touches = new Map();
-    canvas.addEventListener("pointerdown", (event) => {
-        canvas.setPointerCapture(event.pointerId);
-        touches.set(event.pointerId, event);
-    });
-    for (const name of ["pointerup", "pointercancel"]) {
-        canvas.addEventListener(name, (event) => touches.delete(event.pointerId));
-    }
-    canvas.addEventListener("pointermove", (event) => {
-        const before = touches.get(event.pointerId);
-        if (!before) return;
-        const size = canvas.clientHeight;
-        const [dx, dy] = [(event.clientX - before.clientX) / size, (event.clientY - before.clientY) / size];
-        if (touches.size === 2) {
-            const other = [...touches.values()].find((touch) => touch.pointerId !== event.pointerId);
-            const span = (touch) => Math.hypot(touch.clientX - other.clientX, touch.clientY - other.clientY) || 1;
-            orbit.scale(span(event) / span(before));
-            orbit.pan(dx / 2, dy / 2);
-        } else if (event.shiftKey || event.buttons & 6) {
-            orbit.pan(dx, dy);
-        } else {
-            orbit.turn(4 * dx, 4 * dy);
-        }
-        touches.set(event.pointerId, event);
-        draw();
-    });
-    canvas.addEventListener("wheel", (event) => {
-        event.preventDefault();
-        orbit.scale(Math.exp(-event.deltaY * (event.deltaMode ? 0.05 : 0.0015)));
-        draw();
-    }, { passive: false });
-    canvas.addEventListener("contextmenu", (event) => event.preventDefault());
-    canvas.addEventListener("dblclick", () => { orbit.reset(); draw(); });
-    canvas.addEventListener("keydown", (event) => {
-        const actions = {
-            ArrowLeft: () => orbit.turn(-0.1, 0), ArrowRight: () => orbit.turn(0.1, 0),
-            ArrowUp: () => orbit.turn(0, 0.1), ArrowDown: () => orbit.turn(0, -0.1),
-            "+": () => orbit.scale(1.15), "=": () => orbit.scale(1.15), "-": () => orbit.scale(1 / 1.15), "0": () => orbit.reset(),
-        };
-        if (!actions[event.key]) return;
-        event.preventDefault();
-        actions[event.key]();
-        draw();
-    });
+// Stands before the mesh, a little above and beside it, with +y up.
+function cameraFor({ center, radius }) {
+    const [yaw, pitch] = [0.6, 0.25];
+    const back = [Math.sin(yaw) * Math.cos(pitch), Math.sin(pitch), Math.cos(yaw) * Math.cos(pitch)];
+    // The picture is one high and wide, and 1.1 focal lengths of it are 2.5 radii away.
+    const lens = [1.1, 1.1, 0.5, 0.5, 1, 1];
+    return new Camera({ eye: along(center, back, 2.5 * radius), target: center, up: [0, 1, 0], lens }, radius);
 }
 
 // Shows `data` in `canvas`; returns {set(name, on)} for the options "shaded" and "wireframe".
 function showMesh(canvas, data) {
-    const gl = canvas.getContext("webgl2", { antialias: true, alpha: true });
-    if (!gl) throw new Error("this browser has no WebGL 2");
+    const gl = context(canvas, { antialias: true, alpha: true });
     const mesh = decodeMesh(data);
     const corners = expandCorners(mesh);
-    const program = compileProgram(gl);
+    const { program, at } = compileProgram(gl, VERTEX_SHADER, FRAGMENT_SHADER);
     gl.useProgram(program);
     upload(gl, program, "position", corners.positions, gl.FLOAT, false);
     upload(gl, program, "faceNormal", corners.normals, gl.BYTE, true);
     upload(gl, program, "faceColor", corners.colors, gl.UNSIGNED_BYTE, true);
     gl.enable(gl.DEPTH_TEST);
-    const uniform = (name) => gl.getUniformLocation(program, name);
-    const orbit = new Orbit(boundsOf(mesh.vertices));
+    const bounds = boundsOf(mesh.vertices);
+    const camera = cameraFor(bounds);
     const options = { shaded: false, wireframe: false };
     let pending = false;
 
@@ -242,12 +130,11 @@ function showMesh(canvas, data) {
         gl.viewport(0, 0, width, height);
         gl.clearColor(0, 0, 0, 0);
         gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
-        const { clip, view } = orbit.matrices(width / height);
-        gl.uniformMatrix4fv(uniform("clipFromModel"), false, clip);
-        gl.uniformMatrix3fv(uniform("viewFromModel"), false, view);
-        gl.uniform1i(uniform("shaded"), options.shaded);
-        gl.uniform1i(uniform("wireframe"), options.wireframe);
-        gl.uniform3f(uniform("inkColor"), 0.05, 0.16, 0.32);
+        const near = Math.max(camera.distance - 2 * bounds.radius, 0.01 * camera.distance);
+        setCamera(gl, at, camera, camera.lensFor(width, height), [width, height], near);
+        gl.uniform1i(at.shaded, options.shaded);
+        gl.uniform1i(at.wireframe, options.wireframe);
+        gl.uniform3f(at.inkColor, 0.05, 0.16, 0.32);
         gl.drawArrays(gl.TRIANGLES, 0, corners.count);
     }
 
@@ -256,7 +143,7 @@ function showMesh(canvas, data) {
         pending = true;
     }
 
-    listen(canvas, orbit, draw);
+    listenToMotion(canvas, camera, draw);
     new ResizeObserver(draw).observe(canvas);
     draw();
     return { set(name, on) { options[name] = on; draw(); } };

@@ -1,0 +1,246 @@
+"""The mesh of a reconstruction as a file for other programs: as it is, with fewer faces, or light under a texture."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from etsplat.core.errors import InputError
+from etsplat.data.dataset import Dataset
+from etsplat.engines.choice import resolve_device
+from etsplat.geometry.decimation import decimated
+from etsplat.io.georeference import GEOREFERENCE_FILE, Georeference
+from etsplat.io.mesh_files import MeshFile, load_mesh, save_mesh
+from etsplat.io.paths import kind_of
+from etsplat.io.run_directory import RunDirectory, is_run
+from etsplat.io.writers import suffixes
+from etsplat.model.textured_mesh import TexturedMesh
+from etsplat.tasks.export_config import LIGHT_FACES, ExportConfig
+from etsplat.tasks.normal_map import normal_map_of
+from etsplat.tasks.reconstruct_config import Pictures, ReconstructConfig
+from etsplat.tasks.settings import settings_of
+from etsplat.tasks.sources import fingerprint, load_source, make_subject, read_record
+from etsplat.tasks.texturing import Tell, check_installed, coarser, colors_at, texture_object
+
+_OF_MESHES = ("texture", "faces", "normals", "lods", "place")
+"""Settings that meshes of reconstructions know."""
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """A finished run of `etsplat reconstruct`.
+
+    Attributes:
+        path: the run directory.
+        mesh: its result, in the frame of the views.
+        views: its photos, in the frame where the object has radius 1.
+        exposures: colour matrices of the training views by their index; empty where the run learned none.
+        device: where it is drawn.
+    """
+
+    path: Path
+    mesh: MeshFile
+    views: Dataset
+    exposures: Mapping[int, Float[Tensor, "3 3"]]
+    device: torch.device
+
+    @classmethod
+    def of(cls, run: RunDirectory, views: Dataset, device: torch.device) -> "Reconstruction":
+        """Of a run that has its mesh, and its photos, those that watched it too.
+
+        Raises:
+            InputError: there is no mesh, or a file is damaged.
+        """
+        mesh = load_mesh(_mesh_of(run))
+        mesh = replace(mesh, vertices=views.normalization.apply(mesh.vertices))
+        known = _exposures(run, views)
+        if known:
+            views = replace(views, train=sorted(known))  # of those that watched the run it is not known
+        return cls(run.path, mesh, views, known, device)
+
+    def textured(
+        self, size: int, faces: int, seed: int = 0, tell: Tell = lambda phase, done, total: None
+    ) -> TexturedMesh:
+        """A light mesh under a texture, in the frame of the views; see `texture_mesh`."""
+        return texture_object(
+            self.mesh,
+            self.views,
+            size=size,
+            faces=faces,
+            exposures=self.exposures,
+            device=self.device,
+            seed=seed,
+            tell=tell,
+        )
+
+    def in_own_units(self, mesh: TexturedMesh) -> TexturedMesh:
+        """A mesh in the units of the input."""
+        return replace(mesh, vertices=self.views.normalization.invert(mesh.vertices.detach())).learnable()
+
+
+def is_reconstruction(path: Path) -> bool:
+    """Whether a folder holds a run of `etsplat reconstruct`."""
+    return is_run(path) and RunDirectory(path).read_config()["task"] == ReconstructConfig.TASK
+
+
+def open_reconstruction(
+    path: Path | str,
+    scene: Path | str | None = None,
+    device: str | None = None,
+    tell: Tell = lambda phase, done, total: None,
+) -> Reconstruction:
+    """Open a run with its photos; those of a mesh are taken again.
+
+    Args:
+        path: the run directory.
+        scene: the folder or mesh that the run is of, where it has moved or is not known.
+        device: "cpu", "cuda", or None for cuda where there is a GPU.
+        tell: is told how far it is.
+
+    Raises:
+        InputError: it is no such run, has no mesh yet, or its photos have gone or changed.
+    """
+    run, place = RunDirectory(Path(path)), resolve_device(device, None)
+    if not is_reconstruction(run.path):
+        raise InputError(f"{path}: is no run of `etsplat reconstruct`, whose photos a texture is made of; name one")
+    _mesh_of(run)
+    record = read_record(run, ReconstructConfig, ["resolution", "pictures.supersampling"], "paths.source", "source")
+    paths, source = record["paths"], scene or record["paths"]["source"]
+    if source is None:
+        raise InputError(f"{path}: does not say what it is of; name the folder with its photos with --scene")
+    then = record["config"]
+    config = ReconstructConfig(
+        resolution=then["resolution"], pictures=Pictures(supersampling=then["pictures"]["supersampling"])
+    )
+    tell("Reading the photos", 0, 0)
+    loaded, _ = load_source(source, config, paths.get("masks"))
+    if fingerprint(loaded) != record["source"].get("fingerprint"):
+        raise InputError(f"{path}: {source} is not what the run was made of; name that with --scene")
+    views, _ = make_subject(loaded, replace(config, watch=0), partial(tell, "Photographing"), place)
+    return Reconstruction.of(run, views, place)
+
+
+def _exposures(run: RunDirectory, views: Dataset) -> dict[int, Float[Tensor, "3 3"]]:
+    matrices = run.read_exposure().get("matrices", {})
+    return {view: torch.tensor(matrices[name]) for view in views.train if (name := views.names[view]) in matrices}
+
+
+def texture_mesh(
+    run: Path | str,
+    *,
+    size: int = 2048,
+    faces: int = LIGHT_FACES,
+    scene: Path | str | None = None,
+    device: str | None = None,
+    seed: int = 0,
+    tell: Tell = lambda phase, done, total: None,
+) -> TexturedMesh:
+    """A light mesh of a reconstructed object: few faces under a texture, both fitted to the run's training photos.
+
+    Needs xatlas and fast-simplification: pip install 'etsplat[texture]'.
+
+    Args:
+        run: directory of a finished run of `etsplat reconstruct`.
+        size: texels along each side of the texture, a multiple of 4 from 64 to 8192.
+        faces: at most so many.
+        scene: the folder or mesh that the run is of, where it has moved.
+        device: "cpu", "cuda", or None for cuda where there is a GPU.
+        seed: of the order of the photos and the backgrounds; one gives the same bits on the same machine.
+        tell: is called with a phase, steps done and steps in all.
+
+    Returns:
+        The mesh in the units of the input, on the CPU; `save` writes GLB or OBJ.
+
+    Raises:
+        InputError: a package is missing, the run or its photos cannot be used, or a number is out of range.
+    """
+    ExportConfig(texture=size, faces=faces)
+    check_installed()
+    opened = open_reconstruction(run, scene, device, tell)
+    return opened.in_own_units(opened.textured(size, faces, seed, tell))
+
+
+def export_mesh(
+    run: Path,
+    path: Path,
+    config: ExportConfig,
+    scene: Path | None = None,
+    device: str | None = None,
+    tell: Tell = lambda phase, done, total: None,
+) -> dict[Path, int]:
+    """Write the mesh of a run of `etsplat reconstruct`; the suffix of `path` chooses the format.
+
+    Returns:
+        The files, that at `path` first, and how many faces are in each.
+
+    Raises:
+        InputError: settings that meshes do not know; as `texture_mesh`; the file cannot be written.
+    """
+    for name in settings_of(ExportConfig):
+        if name not in _OF_MESHES and getattr(config, name) != getattr(ExportConfig(), name):
+            option = name.replace("_", "-")
+            ours = ", ".join(f"--{other}" for other in _OF_MESHES)
+            raise InputError(f"--{option}: is for soups; of a reconstruction's mesh there are {ours}")
+    if config.place not in ("keep", "world") or (config.place == "world" and config.texture is not None):
+        raise InputError(f"--place {config.place}: is for soups; a mesh without --texture knows --place world")
+    if config.texture is not None:
+        return _export_textured(run, path, config, scene, device, tell)
+    if kind_of(path) not in suffixes():
+        raise InputError(f"{path}: files of this kind are for soups; choose one of {', '.join(suffixes())} for a mesh")
+    mesh = load_mesh(_mesh_of(RunDirectory(run)))
+    if config.faces is not None and config.faces < len(mesh.faces):
+        vertices, faces = decimated(mesh.vertices, mesh.faces, config.faces)
+        colors = colors_at(mesh, vertices[faces].mean(dim=1))
+        mesh = MeshFile(vertices, faces, face_colors=colors)
+    far = None if config.place != "world" else _georeference(run)
+    vertices = mesh.vertices if far is None else mesh.vertices * far.scale
+    save_mesh(path, vertices, mesh.faces, mesh.face_colors, vertex_colors=_only_by_vertex(mesh), world=far)
+    return {path: len(mesh.faces)}
+
+
+def _export_textured(
+    run: Path, path: Path, config: ExportConfig, scene: Path | None, device: str | None, tell: Tell
+) -> dict[Path, int]:
+    """The light mesh at `path`, and its coarser levels beside it, each made of the one before."""
+    assert config.texture is not None
+    if kind_of(path) not in (*suffixes("texture"), ".safetensors"):
+        kinds = " or ".join(suffix[1:] for suffix in suffixes("texture"))
+        raise InputError(f"{path}: files of this kind hold no texture; choose --format {kinds}")
+    if config.normals and kind_of(path) != ".glb":
+        raise InputError(f"{path}: files of this kind hold no normal map; leave out --normals, or choose --format glb")
+    if not path.parent.is_dir():  # rather than after a minute
+        raise InputError(f"{path}: there is no folder {path.parent}; create the folder first")
+    check_installed()
+    opened, written = open_reconstruction(run, scene, device, tell), {}
+    mesh = opened.textured(config.texture, config.faces or LIGHT_FACES, tell=tell)
+    for level in range(config.lods + 1):
+        if level:
+            tell("Making coarser levels", level, config.lods)
+            mesh = coarser(mesh, max(4, mesh.count // 4), config.texture >> level)
+        place = path.with_name(f"{path.stem}_lod{level}{path.suffix}") if level else path
+        relief = normal_map_of(mesh, opened.mesh) if config.normals else None
+        opened.in_own_units(mesh).save(place, relief)
+        written[place] = mesh.count
+    return written
+
+
+def _georeference(run: Path) -> Georeference:
+    """Where the mesh lies in the world."""
+    if not (run / GEOREFERENCE_FILE).is_file():
+        raise InputError(f"{run}: has no {GEOREFERENCE_FILE}; write one beside the photos and reconstruct anew")
+    return Georeference.read(run / GEOREFERENCE_FILE)
+
+
+def _only_by_vertex(mesh: MeshFile) -> Tensor | None:
+    return None if mesh.face_colors is not None else mesh.vertex_colors
+
+
+def _mesh_of(run: RunDirectory) -> Path:
+    path = run.mesh_path(".ply")
+    if not path.is_file():
+        raise InputError(f"{run.path}: has no {path.name} (yet); let the run finish, continue it with --resume")
+    return path

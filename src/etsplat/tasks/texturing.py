@@ -1,0 +1,222 @@
+"""A light mesh of a reconstructed object: few faces, and a texture fitted to the run's photos.
+
+The mesh is decimated, untangled and cut into charts. The texture begins with the colours of the full mesh, small, and
+is fitted with the antialiased z-buffer, the picture that a viewer draws; twice it is enlarged, so that where photos
+show less than its texels hold it stays smooth. The vertices follow, slowly, for the silhouettes that decimation moved,
+and are untangled once more. Texels that no photo shows take the colour of the nearest place on the surface that one
+does; those between charts that of the nearest texel of a chart, so that coarser levels do not bleed.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from scipy.ndimage import distance_transform_edt
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from etsplat.data.dataset import Dataset
+from etsplat.geometry.decimation import decimated, load_simplifier
+from etsplat.geometry.distance import closest_places, closest_points
+from etsplat.geometry.topology import MeshTopology
+from etsplat.geometry.untangle import untangle
+from etsplat.geometry.unwrap import load_xatlas, texel_points, unwrapped
+from etsplat.io.mesh_files import MeshFile
+from etsplat.model.textured_mesh import TexturedMesh
+from etsplat.ops.texture import sample_texture
+from etsplat.optim.exposure import Exposure
+from etsplat.optim.known_exposure import KnownExposure
+from etsplat.optim.loop import Event, StepEvent
+from etsplat.optim.objective import Objective
+from etsplat.optim.schedules import Schedule, exponential_decay
+from etsplat.optim.terms.photometric import Photometric
+from etsplat.optim.trainer import Trainer
+
+EPOCHS = (4, 3, 3)
+"""How often every photo is seen by textures of a quarter and half of the size, and of the size itself."""
+
+VERTEX_RATE, VERTEX_FINAL = 3e-5, 0.1
+"""Adam's rate of vertices, where the object has radius 1, and what is left of it at the end of the last stage. At ten
+times the rate faces cut through others by the hundred (research/results.md)."""
+
+TEXTURE_RATES, TEXTURE_FINAL = (2e-2, 1e-2, 1e-2), 0.2
+"""Adam's rate of texels in each stage, and what is left of it at the stage's end."""
+
+SHOWN = 1e-4
+"""Photos show a texel whose second moment is at least this part of the median of those that they do."""
+
+Tell = Callable[[str, int, int], None]
+"""Called with a phase, steps done and steps in all."""
+
+
+def check_installed() -> None:
+    """Raises InputError where a package is missing; better now than after a run."""
+    load_simplifier()
+    load_xatlas()
+
+
+def texture_object(
+    mesh: MeshFile,
+    views: Dataset,
+    *,
+    size: int,
+    faces: int,
+    exposures: Mapping[int, Float[Tensor, "3 3"]] | None = None,
+    device: torch.device | None = None,
+    seed: int = 0,
+    tell: Tell = lambda phase, done, total: None,
+) -> TexturedMesh:
+    """Fit a light, textured mesh to photos of an object.
+
+    Args:
+        mesh: the full mesh with colours of faces or vertices, in the frame of the views.
+        views: photos with transparency; those in `train` are fitted to. The object has a radius of about 1.
+        size: texels along each side of the texture, a multiple of 4.
+        faces: at most so many.
+        exposures: what the camera made of colours, a matrix for each training view by its index; None or empty for
+            photos that were all exposed alike.
+        device: where it is fitted; None for the CPU.
+        seed: of the order of views and the backgrounds.
+        tell: is told how far it is.
+
+    Returns:
+        The mesh, on the CPU, in the frame of the views.
+
+    Raises:
+        InputError: a package is missing; the mesh does not stay whole with so few faces.
+    """
+    tell("Simplifying", 0, 0)
+    vertices, triangles = decimated(mesh.vertices, mesh.faces, faces)
+    topology = MeshTopology.from_faces(triangles, len(vertices))
+    vertices = _untangled(vertices, topology)
+    tell("Unwrapping", 0, 0)
+    uvs = unwrapped(vertices, triangles, size)
+    side = size >> (len(EPOCHS) - 1)
+    covered, points, _ = texel_points(vertices, triangles, uvs, side)
+    texture = vertices.new_zeros(side, side, 3)
+    texture[covered] = colors_at(mesh, points)
+    texture = spread(texture, covered)
+    model = TexturedMesh.from_mesh(vertices, triangles, texture, uvs).to(device or torch.device("cpu"))
+    total, done = sum(EPOCHS) * len(views.train), 0
+    for stage, epochs in enumerate(EPOCHS):
+        if stage:
+            model = _with_texture(model, _enlarged(model.texture.detach()))
+        steps = epochs * len(views.train)
+        trainer = _make_trainer(
+            model, views, stage, done, steps, total, KnownExposure(exposures) if exposures else None, seed
+        )
+
+        def hear(event: Event, before: int = done) -> None:
+            if isinstance(event, StepEvent):
+                tell("Fitting the texture", before + event.iteration, total)
+
+        trainer.fit(steps, callbacks=[hear], log_every=10)
+        done += steps
+        model = _completed(model, trainer.adam.second_moments["texture"].amax(dim=-1).cpu())
+    model = model.to(torch.device("cpu"))
+    return replace(model, vertices=_untangled(model.vertices.detach(), topology)).learnable()
+
+
+@torch.no_grad()
+def coarser(mesh: TexturedMesh, faces: int, size: int) -> TexturedMesh:
+    """A textured mesh for larger distances: decimated, unwrapped anew, and in the colours of the given one.
+
+    Args:
+        mesh: what it is made of, with a radius of about 1.
+        faces: at most so many.
+        size: texels along each side. Each takes the colour of the nearest place, of the level of the given texture
+            whose texels are about as large.
+
+    Raises:
+        InputError: a package is missing; the mesh does not stay whole with so few faces.
+    """
+    fine, triangles = mesh.surface()
+    vertices, light = decimated(fine, triangles, faces)
+    vertices = _untangled(vertices, MeshTopology.from_faces(light, len(vertices)))
+    uvs = unwrapped(vertices, light, size)
+    covered, points, _ = texel_points(vertices, light, uvs, size)
+    face, weights = closest_places(points, fine, triangles)
+    places = (weights[..., None].float() * mesh.face_uvs.cpu()[face]).sum(dim=1)
+    level = torch.full((len(places),), max(0.0, math.log2(len(mesh.texture) / size)))
+    texture = vertices.new_zeros(size, size, 3)
+    texture[covered] = sample_texture(mesh.texture.detach().cpu(), places, lod=level).clamp(0, 1)
+    return TexturedMesh.from_mesh(vertices, light, spread(texture, covered), uvs)
+
+
+def _untangled(vertices: Float[Tensor, "V 3"], topology: MeshTopology) -> Float[Tensor, "V 3"]:
+    """Without faces that cut through others, as far as that goes, where there is an inside."""
+    return untangle(vertices, topology)[0] if topology.is_closed() else vertices
+
+
+def _make_trainer(
+    model: TexturedMesh,
+    views: Dataset,
+    stage: int,
+    done: int,
+    steps: int,
+    total: int,
+    exposure: Exposure | None,
+    seed: int,
+) -> Trainer[TexturedMesh]:
+    """Of one stage, `done` of whose `total` steps are made."""
+
+    def vertices(iteration: int) -> float:
+        return VERTEX_RATE * exponential_decay(done + iteration, total, VERTEX_FINAL)
+
+    def texture(iteration: int) -> float:
+        return TEXTURE_RATES[stage] * exponential_decay(iteration, steps, TEXTURE_FINAL)
+
+    rates = {"vertices": vertices, "texture": texture}
+    return Trainer(
+        model, views, Objective(Photometric()), schedule=Schedule(rates), exposure=exposure, seed=seed + stage
+    )
+
+
+def _completed(model: TexturedMesh, moments: Float[Tensor, "H W"]) -> TexturedMesh:
+    """With texels that photos hardly show, and those between charts, from the nearest that they do.
+
+    Adam's second moments say what photos show: those of texels that none does are zero.
+    """
+    vertices, faces = model.surface()
+    texture, size = model.texture.detach().cpu().clamp(0, 1), len(model.texture)
+    covered, points, _ = texel_points(vertices, faces, model.face_uvs.cpu(), size)
+    colors, moments = texture[covered], moments[covered]
+    if bool((moments > 0).any()):
+        shown = moments > SHOWN * moments[moments > 0].median()
+        if not bool(shown.all()):
+            _, nearest = KDTree(points[shown].numpy()).query(points[~shown].numpy())
+            colors[~shown] = colors[shown][torch.from_numpy(np.asarray(nearest))]
+    texture[covered] = colors
+    return _with_texture(model, spread(texture, covered))
+
+
+def spread(texture: Float[Tensor, "H W 3"], known: Bool[Tensor, "H W"]) -> Float[Tensor, "H W 3"]:
+    """Every other texel takes the colour of the nearest known one."""
+    nearest = distance_transform_edt(~known.numpy(), return_distances=False, return_indices=True)
+    rows, columns = torch.from_numpy(np.asarray(nearest)).long()
+    return texture[rows, columns]
+
+
+def _enlarged(texture: Float[Tensor, "H W 3"]) -> Float[Tensor, "2H 2W 3"]:
+    """Twice as many texels along each side, bilinear between those that were."""
+    planes = texture.permute(2, 0, 1)[None]
+    large = torch.nn.functional.interpolate(planes, scale_factor=2, mode="bilinear", align_corners=False)
+    return large[0].permute(1, 2, 0).contiguous()
+
+
+def _with_texture(model: TexturedMesh, texture: Float[Tensor, "H W 3"]) -> TexturedMesh:
+    return replace(model, texture=texture.to(model.vertices.device)).learnable()
+
+
+def colors_at(mesh: MeshFile, points: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+    """Display colours of a mesh where it is nearest to points; grey if it has none."""
+    if mesh.face_colors is None and mesh.vertex_colors is None:
+        return torch.full_like(points, 0.5)
+    _, face = closest_points(points, mesh.vertices, mesh.faces)
+    if mesh.face_colors is not None:
+        return mesh.face_colors[face].to(points)
+    assert mesh.vertex_colors is not None
+    return mesh.vertex_colors[mesh.faces[face]].mean(dim=1).to(points)

@@ -1,0 +1,187 @@
+"""Runs with depth maps and dense clouds, by the functions that the command line calls."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+import etsplat
+from etsplat.core.errors import InputError
+from etsplat.data.load import load_dataset
+from etsplat.io.georeference import Georeference
+from etsplat.io.ply_tables import encode_ply
+from etsplat.optim.loop import NoteEvent
+from etsplat.tasks.depths import trusted_depths, wanted_depths
+from etsplat.tasks.sources import with_cloud
+from helpers.depths import ball_with_depths
+
+TRAIN = etsplat.TrainConfig.tiny("object").changed({"iterations": 40, "exposure": "off", "output.evaluate_every": 0})
+FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
+
+
+def garbage(depth, view):
+    """Another smooth surface in every photo."""
+    rng = torch.Generator().manual_seed(view)
+    field = torch.nn.functional.interpolate(torch.rand((1, 1, 4, 4), generator=rng), depth.shape, mode="bilinear")
+    return torch.where(depth > 0, 2 + 2 * field[0, 0], 0.0)
+
+
+def write_ball(folder, *, change=lambda depth, view: depth, named=False, unit=1.0):
+    """In nerfstudio's layout, with depth maps that the file names, or in depths/."""
+    ball = ball_with_depths(32, 8, change)
+    frames = []
+    (folder / "images").mkdir(parents=True)
+    for index, name in enumerate(ball.names):
+        etsplat.save_image(folder / "images" / f"{name}.png", ball.images[index])
+        path = folder / ("maps" if named else "depths") / f"{name}.npy"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        np.save(path, ball.images.depth(index).numpy() / unit)
+        pose = torch.linalg.inv(ball.viewmats[index]) @ FLIP
+        frame = {"file_path": f"images/{name}.png", "transform_matrix": pose.tolist()}
+        frames.append({**frame, **({"depth_file_path": f"maps/{name}.npy"} if named else {})})
+    K = ball.Ks[0]
+    about = {"fl_x": float(K[0, 0]), "cx": 16.0, "cy": 16.0, "w": 32, "h": 32, "frames": frames}
+    about |= {"depth_unit_scale_factor": unit} if named else {}
+    (folder / "transforms.json").write_text(json.dumps(about))
+    return ball
+
+
+@pytest.mark.parametrize("named", [False, True])
+def test_depth_maps_are_found_beside_photos(tmp_path, named):
+    """In depths/, or where transforms.json names them, in its unit; only where they are wanted."""
+    ball = write_ball(tmp_path, named=named, unit=0.25 if named else 1.0)
+    found, without = load_dataset(tmp_path, depths=True), load_dataset(tmp_path)
+    assert found.images.with_depth == frozenset(range(len(ball)))
+    for index in range(len(ball)):
+        assert torch.allclose(found.images.depth(index), ball.images.depth(index))
+        assert without.images.depth(index) is None
+    assert found.fingerprint() != without.fingerprint()
+    other = load_dataset(tmp_path, depths=True, depth_unit=3.0)
+    assert torch.allclose(other.images.depth(0) * (0.25 if named else 1) / 3, ball.images.depth(0))
+    assert other.fingerprint() != found.fingerprint()
+
+
+def test_a_folder_of_maps_may_be_named_and_lack_some(tmp_path):
+    write_ball(tmp_path)
+    (tmp_path / "depths").rename(tmp_path / "elsewhere")
+    next((tmp_path / "elsewhere").glob("*.npy")).unlink()
+    assert not load_dataset(tmp_path, depths=True).images.with_depth
+    assert len(load_dataset(tmp_path, depths=tmp_path / "elsewhere").images.with_depth) == 15
+    with pytest.raises(InputError, match=r"depths .*gone: no such folder"):
+        load_dataset(tmp_path, depths=tmp_path / "gone")
+
+
+def test_maps_of_another_shape_are_refused(tmp_path):
+    write_ball(tmp_path)
+    np.save(next((tmp_path / "depths").glob("*.npy")), np.ones((32, 20)))
+    with pytest.raises(InputError, match="is 20x32, its image is 32x32; resize or crop the map"):
+        load_dataset(tmp_path, depths=True)
+
+
+def test_a_run_uses_right_maps_and_wrong_ones_change_no_bit(tmp_path):
+    """Of the soup; the run says so either way."""
+    soups, said = {}, {}
+    for kind, change in (("right", lambda depth, view: depth), ("wrong", garbage)):
+        folder, notes = tmp_path / kind, []
+        write_ball(folder, change=change)
+        for setting in ("auto", "off"):
+            result = etsplat.train(
+                folder, tmp_path / f"{kind}_{setting}", TRAIN.changed({"loss.depth": setting}), callbacks=[notes.append]
+            )
+            soups[kind, setting] = result.soup.vertices
+            if setting == "auto":
+                said[kind] = result.metrics["depth_used"]
+        told = " ".join(str(note) for note in notes if isinstance(note, NoteEvent))
+        assert ("depth maps: not used" in told) == (kind == "wrong")
+    assert said == {"right": "l1", "wrong": None}
+    assert torch.equal(soups["wrong", "auto"], soups["wrong", "off"])
+    assert not torch.equal(soups["right", "auto"], soups["right", "off"])
+
+
+def test_a_resumed_run_ends_with_the_same_bits(tmp_path):
+    """Stopped after the maps were compared with the soup, and before."""
+    write_ball(tmp_path / "scene")
+    config = TRAIN.changed({"loss.depth": "pearson", "loss.depth_from": 15_000, "output.checkpoint_every": 10})
+
+    class StopError(Exception):
+        pass
+
+    def stop_at(iteration):
+        def callback(event):
+            if type(event).__name__ == "CheckpointEvent" and event.iteration == iteration:
+                raise StopError
+
+        return callback
+
+    whole = etsplat.train(tmp_path / "scene", tmp_path / "whole", config, callbacks=[lambda event: None])
+    for iteration in (10, 30):
+        out = tmp_path / str(iteration)
+        with pytest.raises(StopError):
+            etsplat.train(tmp_path / "scene", out, config, callbacks=[stop_at(iteration)])
+        again = etsplat.train(tmp_path / "scene", out, config, callbacks=[lambda event: None], resume=True)
+        assert torch.equal(again.soup.vertices, whole.soup.vertices)
+        assert again.metrics["depth_used"] == whole.metrics["depth_used"]
+
+
+def test_a_mesh_uses_right_maps_and_wrong_ones_change_no_bit(tmp_path):
+    """As a soup."""
+    meshes, used = {}, {}
+    for kind, change in (("right", lambda depth, view: depth), ("wrong", garbage)):
+        write_ball(tmp_path / kind, change=change)
+        for setting in ("auto", "off"):
+            config = etsplat.ReconstructConfig.tiny().changed({"iterations": 20, "regularization.depth": setting})
+            out = tmp_path / f"{kind}_{setting}"
+            result = etsplat.reconstruct(tmp_path / kind, out, config, callbacks=[lambda event: None])
+            meshes[kind, setting], used[kind, setting] = result.mesh.vertices, result.metrics.get("depth_used")
+    assert used == {("right", "auto"): "l1", ("right", "off"): None, ("wrong", "auto"): None, ("wrong", "off"): None}
+    assert torch.equal(meshes["wrong", "auto"], meshes["wrong", "off"])
+    assert not torch.equal(meshes["right", "auto"], meshes["right", "off"])
+
+
+def test_settings_that_would_do_nothing_are_refused():
+    assert wanted_depths(None, None, "off") is False
+    assert wanted_depths(None, None, "auto") is True
+    for arguments, why in (
+        (("maps", None, "off"), "depths: has no effect"),
+        ((None, 0.001, "off"), "depth_unit: has no effect"),
+        ((None, -1.0, "auto"), "must be positive"),
+    ):
+        with pytest.raises(InputError, match=why):
+            wanted_depths(*arguments)
+    ball = ball_with_depths(azimuths=2)
+    assert trusted_depths(ball, "off", 1, lambda event: None) is None
+
+
+def test_a_run_starts_from_a_dense_cloud(tmp_path):
+    """What photos speak for of it; a cloud in another frame is refused."""
+    ball = write_ball(tmp_path)
+    assert ball.exact_points is not None
+    places = np.concatenate([ball.exact_points.numpy(), np.random.default_rng(0).uniform(-3, 3, (200, 3))])
+    for name, moved in (("good.ply", places), ("bad.ply", places + 50)):
+        table = np.empty(len(places), [(axis, "f4") for axis in "xyz"])
+        for axis, values in zip("xyz", moved.T, strict=True):
+            table[axis] = values
+        (tmp_path / name).write_bytes(encode_ply({"vertex": table}))
+    notes = []
+    config = TRAIN.changed({"pixels_per_triangle": None, "loss.depth": "off"})
+    etsplat.train(tmp_path, tmp_path / "run", config, init_points=tmp_path / "good.ply", callbacks=[notes.append])
+    assert any("good.ply: starting from" in str(note) for note in notes)
+    with pytest.raises(InputError, match="align them first"):
+        etsplat.train(tmp_path, tmp_path / "other", config, init_points=tmp_path / "bad.ply")
+
+
+def test_a_cloud_is_in_the_world_where_the_scene_says_how_it_lies_there(tmp_path):
+    """As laser scans are, whose coordinates are those of maps."""
+    ball = write_ball(tmp_path)
+    assert ball.exact_points is not None
+    Georeference((500_000.0, 5_400_000.0, 300.0), 0.5).write(tmp_path)
+    table = np.empty(len(ball.exact_points), [(axis, "f8") for axis in "xyz"])
+    for axis, local, origin in zip("xyz", ball.exact_points.numpy().T, (500_000, 5_400_000, 300), strict=True):
+        table[axis] = origin + 0.5 * local  # doubles have a nanometre there
+    (tmp_path / "scan.ply").write_bytes(encode_ply({"vertex": table}))
+    scene, note = with_cloud(load_dataset(tmp_path), tmp_path / "scan.ply", 10_000)
+    assert "starting from" in note
+    assert scene.exact_points is not None
+    off = torch.cdist(scene.exact_points, ball.exact_points).amin(dim=1)
+    assert float(off.max()) < 1e-6

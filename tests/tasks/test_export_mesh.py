@@ -1,0 +1,171 @@
+"""The mesh of a reconstruction as a file, through the command line."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+import etsplat
+from etsplat.cli.parse import parse
+from etsplat.core.errors import InputError
+from etsplat.geometry.icosphere import icosphere
+from etsplat.io.georeference import Georeference
+from etsplat.io.mesh_files import load_mesh, save_mesh
+from etsplat.io.ply_tables import read_ply_tables
+from etsplat.io.run_directory import RunDirectory
+from etsplat.model.textured_mesh import TexturedMesh
+from etsplat.tasks import texturing
+from etsplat.tasks.reconstruct import reconstruct
+from etsplat.tasks.reconstruct_config import ReconstructConfig
+from etsplat.tasks.sources import open_run
+from helpers.gltf import check_glb
+
+pytest.importorskip("xatlas")
+pytest.importorskip("fast_simplification")
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of a few steps, of a sphere far from the origin."""
+    folder = tmp_path_factory.mktemp("runs")
+    vertices, faces = icosphere(2)
+    save_mesh(folder / "ball.ply", 3 * vertices + 10, faces, face_colors=0.5 + 0.4 * vertices[faces].mean(dim=1))
+    tiny = ReconstructConfig.tiny().changed({"iterations": 20, "resolution": 32, "start.level": 3})
+    return reconstruct(folder / "ball.ply", folder / "run", tiny).path
+
+
+@pytest.fixture(autouse=True)
+def short(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(texturing, "EPOCHS", (1, 1, 1))
+
+
+def export(*words: str | Path) -> None:
+    arguments = ["export", *map(str, words)]
+    assert parse(arguments).run(arguments) == 0
+
+
+def test_a_light_textured_file_lies_where_the_mesh_of_the_run_does(
+    run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    export(run, "--texture", "64", "--faces", "200")
+    found, full = trimesh.load_mesh(run / "textured.glb"), load_mesh(run / "mesh.ply")
+    assert 0 < len(found.faces) <= 200
+    assert found.visual.material.baseColorTexture.size == (64, 64)
+    bounds = torch.stack([full.vertices.amin(0), full.vertices.amax(0)])
+    assert (torch.tensor(found.bounds) - bounds).abs().max() < 0.4  # of a ball of radius 3
+    assert f"{run / 'textured.glb'}: {len(found.faces)} faces" in capsys.readouterr().out
+
+
+def test_other_kinds_of_files(run: Path, tmp_path: Path) -> None:
+    export(run, "--texture", "64", "--faces", "200", "--out", tmp_path / "ball.obj")
+    assert (tmp_path / "ball.png").is_file()
+    assert TexturedMesh.load(tmp_path / "ball.obj").count <= 200
+    with pytest.raises(InputError, match="hold no texture"):
+        export(run, "--texture", "64", "--format", "off")
+
+
+def test_coarser_levels_are_files_of_their_own(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Each with a quarter of the faces and half the texels; the first is the file that there is without them."""
+    export(run, "--texture", "256", "--faces", "400", "--lods", "2", "--out", tmp_path / "ball.glb")
+    export(run, "--texture", "256", "--faces", "400", "--out", tmp_path / "alone.glb")
+    levels = [check_glb(tmp_path / f"ball{end}.glb") for end in ("", "_lod1", "_lod2")]
+    assert [document["meshes"][0]["name"] for document in levels] == ["ball", "ball_lod1", "ball_lod2"]
+    found = [trimesh.load_mesh(tmp_path / f"ball{end}.glb") for end in ("", "_lod1", "_lod2")]
+    assert [mesh.visual.material.baseColorTexture.size[0] for mesh in found] == [256, 128, 64]
+    assert [len(mesh.faces) <= most for mesh, most in zip(found, (400, 100, 25), strict=True)] == [True] * 3
+    alone = trimesh.load_mesh(tmp_path / "alone.glb")
+    assert (alone.vertices == found[0].vertices).all()
+    for mesh in found[1:]:
+        assert abs(mesh.bounds - found[0].bounds).max() < 1  # of a ball of radius 3
+    assert "ball_lod2.glb: " in capsys.readouterr().out
+
+
+def test_a_lit_file_has_the_relief_of_the_full_mesh(run: Path, tmp_path: Path) -> None:
+    export(run, "--texture", "128", "--faces", "100", "--normals", "--lods", "1", "--out", tmp_path / "ball.glb")
+    for end, size in (("", 128), ("_lod1", 64)):
+        material = trimesh.load_mesh(tmp_path / f"ball{end}.glb").visual.material
+        assert material.normalTexture.size == material.baseColorTexture.size == (size, size)
+        assert check_glb(tmp_path / f"ball{end}.glb")["materials"][0].get("extensions") is None
+
+
+def test_fewer_faces_in_the_colours_they_have(run: Path) -> None:
+    export(run, "--faces", "100", "--format", "ply")
+    light = load_mesh(run / "light.ply")
+    assert 0 < len(light.faces) <= 100
+    assert light.face_colors is not None
+    full = load_mesh(run / "mesh.ply")
+    assert full.face_colors is not None
+    assert (light.face_colors.mean(dim=0) - full.face_colors.mean(dim=0)).abs().max() < 0.05
+
+
+def test_the_mesh_as_it_is(run: Path, tmp_path: Path) -> None:
+    export(run, "--out", tmp_path / "same.ply")
+    same, full = load_mesh(tmp_path / "same.ply"), load_mesh(run / "mesh.ply")
+    assert torch.equal(same.vertices, full.vertices)
+    assert same.face_colors is not None
+    assert full.face_colors is not None
+    assert torch.equal(same.face_colors, full.face_colors)
+
+
+def test_the_python_function_writes_the_same(run: Path, tmp_path: Path) -> None:
+    etsplat.texture_mesh(run, size=64, faces=200).save(tmp_path / "textured.glb")
+    export(run, "--texture", "64", "--faces", "200", "--out", tmp_path / "textured2.glb")
+    first, second = (trimesh.load_mesh(tmp_path / name) for name in ("textured.glb", "textured2.glb"))
+    assert (first.vertices == second.vertices).all()
+
+
+def test_what_does_not_go_together_is_refused(run: Path, tmp_path: Path) -> None:
+    for words, about in [
+        (["--alpha"], "--alpha: is for soups"),
+        (["--crop", "auto"], "--crop: is for soups"),
+        (["--texture", "66"], "multiple of 4"),
+        (["--texture", "5"], "texture: is 5"),
+        (["--texture", "64", "--normals", "--format", "obj"], "hold no normal map"),
+        (["--normals"], "normals: has an effect only with --texture"),
+        (["--texture", "128", "--lods", "2"], "lods: 2 times half of 128 texels is less than 64"),
+        (["--lods", "1"], "lods: has an effect only with --texture"),
+        (["--texture", "64", "--out", tmp_path / "none" / "ball.glb"], "create the folder first"),
+        (["--out", run / "mesh.ply"], "is what is read"),
+        (["--format", "html"], r"mesh\.html: files of this kind are for soups; choose one of \.glb, \.obj"),
+    ]:
+        with pytest.raises(InputError, match=about):
+            export(run, *words)
+    with pytest.raises(InputError, match="of `etsplat reconstruct`"):
+        etsplat.texture_mesh(tmp_path)
+    with pytest.raises(InputError, match="name a run of `etsplat train`"):
+        open_run(run)
+
+
+def test_a_run_of_something_else_by_now_is_refused(run: Path, tmp_path: Path) -> None:
+    config = RunDirectory(run).read_config()
+    source = Path(config["paths"]["source"])
+    vertices, faces = icosphere(1)
+    save_mesh(tmp_path / source.name, vertices, faces)
+    with pytest.raises(InputError, match="is not what the run was made of"):
+        etsplat.texture_mesh(run, size=64, scene=tmp_path / source.name)
+    copy = tmp_path / "copy"
+    RunDirectory.create(copy, {key: value for key, value in config.items() if key != "format"})
+    with pytest.raises(InputError, match=r"has no mesh\.ply"):
+        etsplat.texture_mesh(copy, size=64)
+    assert json.loads((copy / "config.json").read_text())["task"] == "reconstruct"
+
+
+def test_a_mesh_goes_to_the_world_where_the_run_says(run: Path, tmp_path: Path) -> None:
+    """In doubles; without a record, under a texture, and to a place of its own it is refused."""
+    with pytest.raises(InputError, match=r"has no georeference\.json"):
+        export(run, "--place", "world", "--out", tmp_path / "a.ply")
+    Georeference((500_000.0, 5_400_000.0, 300.0), 2.0, "z").write(run)
+    try:
+        export(run, "--place", "world", "--out", tmp_path / "a.ply")
+        table, own = read_ply_tables(tmp_path / "a.ply")["vertex"], load_mesh(run / "mesh.ply")
+        found = np.stack([table[axis] for axis in "xyz"], axis=1)
+        expected = 2 * own.vertices.double().numpy() + [500_000.0, 5_400_000.0, 300.0]
+        assert np.abs(found - expected).max() < 1e-5
+        for words in (("--place", "center"), ("--place", "world", "--texture", "64")):
+            with pytest.raises(InputError, match="a mesh without --texture knows --place world"):
+                export(run, *words, "--out", tmp_path / "b.glb")
+    finally:
+        (run / "georeference.json").unlink()
