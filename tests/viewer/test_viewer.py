@@ -1,4 +1,6 @@
 import math
+import os
+import socket
 import threading
 import urllib.request
 from types import SimpleNamespace
@@ -12,7 +14,7 @@ from etsplat.data.load import load_dataset
 from etsplat.io.run_directory import RunDirectory
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.tasks.sources import SoupRun
-from etsplat.viewer import follow, server
+from etsplat.viewer import follow, server, standing
 from etsplat.viewer.follow import Followed, wait_for_soup
 from etsplat.viewer.pace import SMALLEST, Pace
 from etsplat.viewer.pictures import MODES, picture
@@ -41,7 +43,7 @@ def browser_camera(capture, index):
     """A camera as viser tells it: camera to world as a quaternion (w, x, y, z) and a position."""
     width, height = capture.images.sizes[index]
     return SimpleNamespace(
-        wxyz=server._quaternion(capture.viewmats[index, :3, :3].T),
+        wxyz=standing.quaternion(capture.viewmats[index, :3, :3].T),
         position=capture.centers[index].numpy(),
         fov=2 * math.atan(height / (2 * float(capture.Ks[index, 1, 1]))),
         aspect=width / height,
@@ -88,7 +90,20 @@ def test_a_run_is_followed_through_its_files(tmp_path):
     make_soup(5).save(folder.soup_path)
     assert len(followed.poll()) == 5
     folder.append_history({"iteration": 50, "seconds": 1.0, "loss": 0.1, "psnr": 21.5})
-    assert followed.status() == "running: iteration 50 of 100, 21.50 dB on test views"
+    reached = "iteration 50 of 100, 21.50 dB on test views"
+    assert followed.status() == f"running: {reached}"
+    folder.write_end("failed: the disk is full")
+    assert followed.status() == f"failed: the disk is full (after {reached})"
+    folder.forget_end()
+    (folder.path / ".lock").write_text(f"process {os.getpid()} on {socket.gethostname()}")
+    assert followed.status() == f"running: {reached}"
+    (folder.path / ".lock").write_text(f"process {2**22 + 1} on {socket.gethostname()}")  # beyond what Linux numbers
+    assert followed.status() == f"killed (after {reached})"
+    for nobody in (f"process {2**22 + 1} on elsewhere", "process", ""):
+        (folder.path / ".lock").write_text(nobody)
+        assert followed.status() == f"running: {reached}"
+    folder.write_metrics({})
+    assert followed.status() == f"finished: {reached}"
     folder.soup_path.unlink()
     assert followed.poll() is None
 
@@ -102,12 +117,15 @@ def test_a_run_that_is_about_to_begin_is_waited_for(tmp_path, monkeypatch):
         steps.append(None)
         if len(steps) == 2:
             RunDirectory.create(path, {"task": "train", "iterations": 100, "config": {}})
+        if len(steps) == 3:
+            RunDirectory(path).write_end("failed: no memory")
         if len(steps) == 4:
             make_soup(3).save(path / "soup.safetensors")
 
     monkeypatch.setattr(follow.time, "sleep", happen)
     wait_for_soup(path, told.append)
     assert len(steps) == 4
+    assert told.pop() == f"{path}: failed: no memory; waiting for it to go on"
     waited = [text.split("waiting for ")[1] for text in told]
     assert waited == ["`etsplat train` to begin there", "the first checkpoint"]
     old = RunDirectory.create(tmp_path / "old", {"task": "train", "config": {}})
@@ -162,7 +180,7 @@ def test_an_address_that_is_not_ones_own_is_an_input_error(run):
         Viewer(run, "192.0.2.1", 8933, 64)  # of a network for documentation
 
 
-def test_a_browser_that_is_closed_while_its_picture_is_drawn_gets_none(run, monkeypatch):
+def test_a_browser_that_is_closed_while_its_picture_is_drawn_gets_none(run):
     """One thread, which ends; a picture for nobody would be a warning of viser's on the terminal."""
     sent, drawing, closed = [], threading.Event(), threading.Event()
 
@@ -171,14 +189,12 @@ def test_a_browser_that_is_closed_while_its_picture_is_drawn_gets_none(run, monk
         assert closed.wait(10)
         return torch.zeros(2, 2, 3, dtype=torch.uint8)
 
-    monkeypatch.setattr(server, "picture", draw)
     camera = browser_camera(run.capture, 0)
     camera.on_update = lambda call: None
     scene = SimpleNamespace(set_background_image=lambda *arguments, **options: sent.append(arguments))
     before = set(threading.enumerate())
-    client = server._Client(
-        SimpleNamespace(soup=run.soup, mode="soft"), SimpleNamespace(camera=camera, scene=scene), 64
-    )
+    viewer = SimpleNamespace(kept=lambda camera: camera, drawn=draw)
+    client = server._Client(viewer, SimpleNamespace(camera=camera, scene=scene), 64)
     (worker,) = set(threading.enumerate()) - before
     assert drawing.wait(10)
     client.close()

@@ -8,6 +8,7 @@ import torch
 
 from etsplat.core.errors import InputError
 from etsplat.io.json_text import is_number
+from etsplat.io.locks import was_killed
 from etsplat.io.run_directory import RunDirectory, is_empty, is_run
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.tasks.sources import check_trains
@@ -36,6 +37,8 @@ def wait_for_soup(folder: Path, announce: Callable[[str], None]) -> None:
         if begun:
             check_trains(folder)
         text = f"{folder}: waiting for " + ("the first checkpoint" if begun else "`etsplat train` to begin there")
+        if begun and (end := RunDirectory(folder).read_end()):
+            text = f"{folder}: {end}; waiting for it to go on"
         if text != told:
             announce(told := text)
         time.sleep(WAITING_SECONDS)
@@ -72,8 +75,12 @@ class Followed:
         last = history[-1]
         known = [line["psnr"] for line in history if is_number(line.get("psnr"))]
         quality = f", {known[-1]:.2f} dB on test views" if known else ""
-        state = "done" if self._run.metrics_path.is_file() else "running"
-        return f"{state}: iteration {last['iteration']:,} of {iterations:,}{quality}"
+        reached = f"iteration {last['iteration']:,} of {iterations:,}{quality}"
+        if self._run.metrics_path.is_file():
+            return f"finished: {reached}"
+        if end := self._run.read_end():
+            return f"{end} (after {reached})"
+        return f"killed (after {reached})" if was_killed(self._run.path) else f"running: {reached}"
 
     def _stamp(self) -> tuple[int, int] | None:
         try:

@@ -4,7 +4,9 @@ Every browser has a thread of its own that waits for its camera to move. It draw
 width that `Pace` allows, and one of full width as soon as it stands still.
 """
 
+import contextlib
 import errno
+import io
 import math
 import socket
 import threading
@@ -15,18 +17,29 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import UInt8
 from scipy.spatial.transform import Rotation
+from torch import Tensor
 
 from etsplat.core.cameras import Cameras, intrinsics
 from etsplat.core.errors import InputError
-from etsplat.data.camera_paths import focus_point
-from etsplat.data.dataset import Dataset
+from etsplat.data.looked_at import middle_photo
+from etsplat.io.camera_path_files import KeyPoses
 from etsplat.model.triangle_soup import TriangleSoup
-from etsplat.tasks.sources import SoupRun, world_up
+from etsplat.tasks.sources import SoupRun
 from etsplat.viewer.follow import Followed
 from etsplat.viewer.guard import Guard
 from etsplat.viewer.pace import Pace
-from etsplat.viewer.pictures import MODES, picture
+from etsplat.viewer.panel import Panel
+from etsplat.viewer.pictures import beside_photo, cropped, picture, png_of
+from etsplat.viewer.standing import (
+    Neighbourhood,
+    add_frusta,
+    nearest_photo,
+    stand_at,
+    stand_before,
+    up_of,
+)
 
 MOVING_SECONDS = 0.08
 """What a picture may take while the camera moves."""
@@ -41,14 +54,14 @@ POLL_SECONDS = 2.0
 CLOSING_SECONDS = 5.0
 """For which pictures that are being drawn are waited for at the end."""
 
-FRUSTUM = 0.04
-"""Size of the pictured cameras, relative to the scene's extent."""
+MOST_KEYS = 1000
+"""Poses that a browser may add to its film."""
 
 
 class Viewer:
     """Serves one soup; `close` ends it."""
 
-    def __init__(self, run: SoupRun, host: str, port: int, width: int) -> None:
+    def __init__(self, run: SoupRun, host: str, port: int, width: int, *, follow: bool = True) -> None:
         """Starts the server.
 
         Args:
@@ -56,22 +69,25 @@ class Viewer:
             host: address to listen on.
             port: to listen on; the next free one is taken if it is in use.
             width: of still pictures, at most.
+            follow: show what a run directory has, as it changes. Without it, whoever made this calls `show` and `say`.
 
         Raises:
             InputError: viser is missing, or the address cannot be used.
         """
-        server_class = _server_class()
+        server_class = check_can_serve(host, port)
         self._run, self._width = run, width
-        self._soup = run.soup
+        self._soup = self._cropped = run.soup
+        self._solid = self._cropped_solid = run.solid
+        self._near = None if run.capture is None else Neighbourhood.of(run.capture)
         self._clients: dict[int, _Client] = {}
+        self._keys: dict[int, list[tuple[Cameras, float]]] = {}
         self._closed = threading.Event()
-        _check_address(host, port)
-        with Guard(host).installed():
+        with Guard(host).installed(), _without_banner():
             self.server = server_class(host=host, port=port, verbose=False)
         self._build_page()
         self.server.on_client_connect(self._connected)
         self.server.on_client_disconnect(lambda client: self._disconnected(client.client_id))
-        if run.path.is_dir():
+        if follow and run.path.is_dir():
             threading.Thread(target=self._follow, args=(Followed(run.path, run.device),), daemon=True).start()
 
     @property
@@ -81,13 +97,43 @@ class Viewer:
 
     @property
     def soup(self) -> TriangleSoup:
-        """What is shown now."""
-        return self._soup
+        """What is shown now: the opaque mesh, if there is one, where triangles are drawn opaque."""
+        solid = self._cropped_solid if self.mode in ("opaque", "wireframe") else None
+        return self._cropped if solid is None else solid
 
     @property
     def mode(self) -> Any:
         """The chosen mode."""
-        return self._mode.value
+        return self._panel.mode
+
+    @property
+    def watched(self) -> bool:
+        """Whether a browser looks."""
+        return bool(self._clients)
+
+    @property
+    def seconds_to_draw(self) -> float:
+        """What the last full picture of each browser took, together."""
+        return sum(client.seconds for client in list(self._clients.values()))
+
+    def show(self, soup: TriangleSoup) -> None:
+        """Shows another soup from now on; what is drawn of it is drawn on its device."""
+        self._soup, self._solid = soup, None
+        self._refresh()
+
+    def say(self, text: str) -> None:
+        """Says how the run stands, below how many triangles there are."""
+        self._panel.status.content = "\n\n".join(part for part in (_describe(self._soup), text) if part)
+
+    def kept(self, camera: Cameras) -> Cameras:
+        """The camera from which is drawn for a browser: its own, or the nearest one that is near photos."""
+        return camera if self._near is None or not self._panel.near else self._near.kept(camera)
+
+    def drawn(self, camera: Cameras) -> UInt8[Tensor, "H W 3"]:
+        """The picture of a camera, with the photo nearest to it beside it if that is wanted."""
+        if self._run.capture is None or not self._panel.beside:
+            return picture(self.soup, camera, self.mode)
+        return beside_photo(self.soup, camera, self.mode, self._run.capture, nearest_photo(self._run.capture, camera))
 
     def close(self) -> None:
         """Ends the server and its threads."""
@@ -95,46 +141,74 @@ class Viewer:
         clients = list(self._clients.values())
         for client in clients:
             client.close()
-        self.server.stop()
+        with _without_banner():
+            self.server.stop()
         for client in clients:
             client.worker.join(CLOSING_SECONDS)
 
     def _build_page(self) -> None:
-        gui = self.server.gui
-        gui.configure_theme(show_share_button=False)
-        self._mode = gui.add_dropdown("Mode", MODES, initial_value="soft")
-        self._show_cameras = gui.add_checkbox("Training cameras", False, disabled=self._run.capture is None)
-        self._status = gui.add_markdown(_describe(self._soup))
-        self._mode.on_update(lambda _: self._refresh())
-        frusta: list[Any] = []
-        if self._run.capture is not None:
-            up = world_up(self._run.capture.viewmats)
+        self.server.gui.configure_theme(show_share_button=False)
+        if hasattr(self.server.gui, "main_panel"):  # not in the oldest viser that works
+            self.server.gui.main_panel.dock_right()  # beside the picture, not over it
+        self._panel = panel = Panel(self.server.gui, self._run.capture, self._soup, self._refresh)
+        self.say("")
+        if (capture := self._run.capture) is not None:
+            up = up_of(capture)
             if up is not None:
                 self.server.scene.set_up_direction(tuple(up.tolist()))
-            frusta = _add_frusta(self.server, self._run.capture)
+            frusta = add_frusta(self.server, capture)
 
-        def show_cameras(_: Any) -> None:
-            for frustum in frusta:
-                frustum.visible = self._show_cameras.value
+            def show_cameras(_: Any) -> None:
+                for frustum in frusta:
+                    frustum.visible = panel.show_cameras.value
 
-        self._show_cameras.on_update(show_cameras)
+            panel.show_cameras.on_update(show_cameras)
+            panel.on_go(lambda client, index: stand_at(client, capture, index))
+        panel.snapshot.on_click(lambda event: self._snapshot(event.client))
+        panel.add_key.on_click(lambda event: self._film(event.client, "add"))
+        panel.drop_key.on_click(lambda event: self._film(event.client, "drop"))
+        panel.save_keys.on_click(lambda event: self._film(event.client, "save"))
+
+    def _snapshot(self, client: Any) -> None:
+        """Sends a browser its picture as a file."""
+        if client is not None and (camera := camera_of(client.camera, self._width)) is not None:
+            client.send_file_download("snapshot.png", png_of(self.drawn(self.kept(camera))), save_immediately=True)
+
+    def _film(self, client: Any, what: str) -> None:
+        """Adds a browser's pose to its film, takes the last one away, or sends the film as a file."""
+        if client is None or (camera := camera_of(client.camera, self._width)) is None:
+            return
+        keys = self._keys.setdefault(client.client_id, [])
+        if what == "add" and len(keys) < MOST_KEYS:
+            keys.append((self.kept(camera), math.degrees(client.camera.fov)))
+        elif what == "drop" and keys:
+            keys.pop()
+        elif what == "save" and keys:
+            viewmats = torch.cat([key.viewmats for key, _ in keys]).double()
+            fovs = torch.tensor([min(max(fov, 1.0), 170.0) for _, fov in keys], dtype=torch.float64)
+            path = KeyPoses(viewmats, fovs, min(max(camera.width / camera.height, 0.05), 20.0))
+            client.send_file_download("path.json", path.to_json().encode(), save_immediately=True)
+        self._panel.keys.content = f"{len(keys)} poses" if len(keys) != 1 else "1 pose"
 
     def _connected(self, client: Any) -> None:
         if self._run.capture is not None:
-            _stand_at_first_camera(client, self._run.capture)
+            stand_at(client, self._run.capture, middle_photo(self._run.capture))
         else:
-            _stand_before(client, self._soup)
+            stand_before(client, self._soup)
         self._clients[client.client_id] = _Client(self, client, self._width)
         # viser calls this in a thread, maybe after the browser has gone and `_disconnected` was called.
         if self._closed.is_set() or client.client_id not in self.server.get_clients():
             self._disconnected(client.client_id)
 
     def _disconnected(self, identity: int) -> None:
+        self._keys.pop(identity, None)
         gone = self._clients.pop(identity, None)
         if gone is not None:
             gone.close()
 
     def _refresh(self) -> None:
+        self._cropped = cropped(self._soup, self._panel.crop)
+        self._cropped_solid = None if self._solid is None else cropped(self._solid, self._panel.crop)
         for client in list(self._clients.values()):
             client.redraw()
 
@@ -142,9 +216,8 @@ class Viewer:
         while not self._closed.wait(POLL_SECONDS):
             soup = followed.poll()
             if soup is not None:
-                self._soup = soup
-                self._refresh()
-            self._status.content = "\n\n".join(text for text in (_describe(self._soup), followed.status()) if text)
+                self.show(soup)
+            self.say(followed.status())
 
 
 class _Client:
@@ -155,6 +228,7 @@ class _Client:
         self._pace = Pace(width, MOVING_SECONDS)
         self._changed = threading.Event()
         self._closed = self._failing = False
+        self.seconds = 0.0
         client.camera.on_update(lambda _: self.redraw())
         self.worker = threading.Thread(target=self._work, daemon=True)
         self.worker.start()
@@ -180,14 +254,24 @@ class _Client:
                 self._changed.wait(STILL_AFTER)
             if self._closed:
                 return
+            self._come_back()
+            start = time.perf_counter()
             self._draw(self._pace.full_width, quality=92)
+            self.seconds = time.perf_counter() - start
+
+    def _come_back(self) -> None:
+        """Takes the browser's camera, now that it stands still, to where its pictures are drawn from."""
+        camera = camera_of(self._client.camera, self._pace.full_width)
+        if camera is None or (kept := self._viewer.kept(camera)) is camera:
+            return
+        self._client.camera.position = kept.centers[0].double().numpy()
 
     def _draw(self, width: int, quality: int = 70) -> None:
         camera = camera_of(self._client.camera, width)
         if camera is None:
             return
         try:
-            pixels = picture(self._viewer.soup, camera, self._viewer.mode)
+            pixels = self._viewer.drawn(self._viewer.kept(camera))
         except Exception:  # whatever it was, such as no memory for this soup: the next picture may come out
             if not self._failing:
                 traceback.print_exc()
@@ -237,8 +321,14 @@ def serve(run: SoupRun, host: str, port: int, width: int, announce: Callable[[in
         viewer.close()
 
 
-def _check_address(host: str, port: int) -> None:
-    """Listens there for a moment: viser does so in a thread, where nobody hears of errors, and would wait for ever."""
+def check_can_serve(host: str, port: int) -> Any:
+    """Sees to it that a viewer can listen at an address, and gives the class of its server.
+
+    Raises:
+        InputError: viser is missing, or the address cannot be used.
+    """
+    found = _server_class()
+    # viser listens in a thread, where nobody hears of errors, and would wait for ever.
     try:
         family, kind, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         with socket.socket(family, kind) as probe:
@@ -248,6 +338,7 @@ def _check_address(host: str, port: int) -> None:
             raise InputError(
                 f"--host {host} --port {port}: cannot listen there ({error.strerror}); choose others"
             ) from error
+    return found
 
 
 def _describe(soup: TriangleSoup) -> str:
@@ -255,62 +346,9 @@ def _describe(soup: TriangleSoup) -> str:
     return f"{len(soup):,} triangles" + (f" after {int(iteration):,} iterations" if iteration else "")
 
 
-def _add_frusta(server: Any, capture: Dataset) -> list[Any]:
-    """A pyramid for every training camera, hidden; a click on one goes there."""
-    rotations = capture.viewmats[:, :3, :3].mT
-    frusta = []
-    for index in capture.train:
-        width, height = capture.images.sizes[index]
-        frustum = server.scene.add_camera_frustum(
-            f"/cameras/{capture.names[index]}",
-            fov=2 * float(torch.atan(height / (2 * capture.Ks[index, 1, 1]))),
-            aspect=width / height,
-            scale=FRUSTUM * capture.extent,
-            color=(230, 120, 40),
-            wxyz=_quaternion(rotations[index]),
-            position=capture.centers[index].numpy(),
-            visible=False,
-        )
-
-        def go(event: Any, index: int = index) -> None:
-            _stand_at(event.client, capture, index)
-
-        frustum.on_click(go)
-        frusta.append(frustum)
-    return frusta
-
-
-def _stand_at_first_camera(client: Any, capture: Dataset) -> None:
-    _stand_at(client, capture, capture.train[0])
-
-
-def _stand_at(client: Any, capture: Dataset, index: int) -> None:
-    position = capture.centers[index]
-    forward = capture.viewmats[index, 2, :3]
-    # The point to turn about: on the line of sight, beside what all cameras look at.
-    distance = float(((focus_point(capture.viewmats) - position) @ forward).clamp_min(0.05 * capture.extent))
-    up = world_up(capture.viewmats)
-    with client.atomic():
-        client.camera.up_direction = (-capture.viewmats[index, 1, :3] if up is None else up).numpy()
-        client.camera.position = position.numpy()
-        client.camera.look_at = (position + distance * forward).numpy()
-        client.camera.fov = 2 * float(torch.atan(capture.images.sizes[index][1] / (2 * capture.Ks[index, 1, 1])))
-
-
-def _stand_before(client: Any, soup: TriangleSoup) -> None:
-    """Without cameras: far enough away to see nine tenths of the triangles."""
-    centers = soup.vertices.detach().mean(dim=1).cpu()
-    middle = centers.median(dim=0).values
-    distance = 2.5 * float(torch.quantile((centers - middle).norm(dim=1)[:1_000_000], 0.9))
-    with client.atomic():
-        client.camera.position = (middle + torch.tensor([0.3, 0.3, 0.9]) * distance).numpy()
-        client.camera.look_at = middle.numpy()
-
-
-def _quaternion(rotation: torch.Tensor) -> np.ndarray:
-    """(w, x, y, z) of a rotation matrix."""
-    x, y, z, w = Rotation.from_matrix(rotation.numpy()).as_quat()
-    return np.array([w, x, y, z])
+def _without_banner() -> contextlib.AbstractContextManager[Any]:
+    """Keeps viser from printing what it does: who started it says where the page is."""
+    return contextlib.redirect_stdout(io.StringIO())
 
 
 def _server_class() -> Any:

@@ -1,0 +1,174 @@
+// The viewer of a scene: its parts, its switches, and when it draws.
+"use strict";
+
+const STILL_AFTER = 250; // milliseconds after the last motion
+const SLOW = 45, FAST = 24; // milliseconds of a frame: above and below, pictures of a moving camera get smaller and larger
+const SMALLEST = 0.2, FIRST = { soft: 0.5, opaque: 1 }; // of their sizes, along each side
+
+class SceneViewer {
+    constructor(root, scene, soup, mesh) {
+        [this.root, this.scene, this.soup, this.mesh] = [root, scene, soup, mesh];
+        this.canvas = root.querySelector("canvas");
+        this.gl = context(this.canvas, { antialias: false, alpha: false });
+        this.painter = new Painter(this.gl, soup, mesh);
+        this.canvas.addEventListener("webglcontextlost", (event) => event.preventDefault()); // so that it comes back
+        this.canvas.addEventListener("webglcontextrestored", () => this.restore());
+        const degree = Math.round(Math.sqrt(soup.bases)) - 1;
+        this.sorter = new Sorter(soup, Math.min(degree, soup.look.sh_degree ?? 3));
+        this.options = { mode: "soft", fraction: 1, resolution: 1 };
+        [this.moved, this.pace, this.before, this.sorting, this.frame] = [0, { ...FIRST }, 0, false, 0];
+        const first = scene.cameras[scene.start];
+        const up = scene.up || first.rows[1].map((value) => -value);
+        const target = along(first.eye, first.rows[2], Math.max(dot(along(scene.focus, first.eye, -1), first.rows[2]), 0.05 * scene.radius));
+        this.camera = new Camera({ eye: first.eye, target, down: first.rows[1], up, lens: first.lens }, scene.radius);
+        this.photo = scene.start;
+        this.stand(scene.start);
+        listenToMotion(this.canvas, this.camera, () => this.change(), () => this.stand(this.photo));
+        new ResizeObserver(() => this.change()).observe(this.canvas);
+    }
+
+    // Goes to a photo's camera.
+    stand(index) {
+        this.photo = index;
+        this.camera.stand(this.scene.cameras[index], this.scene.focus);
+        this.change();
+    }
+
+    set(name, value) {
+        this.options[name] = value;
+        this.change();
+    }
+
+    change() {
+        this.moved = performance.now();
+        if (!this.frame) this.frame = requestAnimationFrame((now) => this.step(now));
+    }
+
+    get amount() {
+        const { ends, count } = this.soup;
+        const asked = this.options.fraction * count;
+        return Math.min(count, ends.find((end) => end >= asked) ?? count);
+    }
+
+    request() {
+        const { eye, forward } = this.camera;
+        return { eye: [...eye], forward: [...forward], near: this.soup.look.near_plane, amount: this.amount };
+    }
+
+    resize() {
+        const scale = Math.min(window.devicePixelRatio || 1, 2) * this.options.resolution;
+        const sides = [this.canvas.clientWidth, this.canvas.clientHeight].map((side) => Math.max(1, Math.round(side * scale)));
+        if (this.canvas.width !== sides[0] || this.canvas.height !== sides[1]) [this.canvas.width, this.canvas.height] = sides;
+    }
+
+    // A device takes what it holds from pages that are not looked at for long: all of it is made anew.
+    restore() {
+        this.painter = new Painter(this.gl, this.soup, this.mesh);
+        this.sorted = "";
+        this.change();
+    }
+
+    // One frame: small while the camera moves, as fast as the last ones were drawn; whole when it stands.
+    step(now) {
+        this.frame = 0;
+        if (this.gl.isContextLost()) return; // `restore` goes on
+        this.resize();
+        const moving = performance.now() - this.moved < STILL_AFTER;
+        const { pace, options: { mode } } = this;
+        if (moving && this.before) {
+            const took = now - this.before;
+            if (took > SLOW) pace[mode] = Math.max(SMALLEST, pace[mode] * 0.9);
+            if (took < FAST) pace[mode] = Math.min(1, pace[mode] * 1.03);
+        }
+        this.before = moving ? now : 0;
+        this.painter.draw(this.camera, mode, { scale: pace[mode], still: !moving });
+        this.sortSoon();
+        if (moving) this.frame = requestAnimationFrame((later) => this.step(later));
+    }
+
+    // Asks for the order from here, unless that is under way: then anew when it has come.
+    sortSoon() {
+        const wanted = JSON.stringify(this.request());
+        const needless = this.options.mode === "opaque" && this.painter.mesh;
+        if (needless || this.sorting || wanted === this.sorted) return;
+        this.sorting = true;
+        this.sorter.sort(this.request()).then((found) => {
+            [this.sorting, this.sorted] = [false, wanted];
+            this.painter.take(found);
+            if (!this.frame) this.frame = requestAnimationFrame((now) => this.step(now));
+        });
+    }
+
+    // For scripts: the canvas with a photo's picture of so many pixels, when it is drawn; until the camera moves.
+    async picture({ photo, mode, width, height }) {
+        const camera = new Camera(this.camera.home, this.scene.radius);
+        camera.stand(this.scene.cameras[photo], this.scene.focus);
+        const { eye, forward } = camera;
+        this.painter.take(await this.sorter.sort({ ...this.request(), eye, forward }));
+        this.sorted = "";
+        [this.canvas.width, this.canvas.height] = [width, height];
+        this.painter.draw(camera, mode);
+        return this.canvas;
+    }
+}
+
+function fillList(root, viewer) {
+    const list = root.querySelector("[data-list=photos]");
+    viewer.scene.cameras.forEach(({ name }, index) => list.add(new Option(name, index)));
+    list.value = viewer.photo;
+    const go = (index) => {
+        const count = viewer.scene.cameras.length;
+        list.value = (index + count) % count;
+        viewer.stand(Number(list.value));
+    };
+    list.addEventListener("change", () => go(Number(list.value)));
+    for (const button of root.querySelectorAll("[data-step]")) {
+        button.addEventListener("click", () => go(viewer.photo + Number(button.dataset.step)));
+    }
+}
+
+function listenToSwitches(root, viewer) {
+    fillList(root, viewer);
+    const apply = {
+        mode: (value) => viewer.set("mode", value),
+        motion: (value) => { viewer.camera.flying = value === "fly"; },
+    };
+    for (const group of root.querySelectorAll("[data-switch]")) {
+        chooseOne(group, apply[group.dataset.switch]);
+    }
+    for (const name of ["fraction", "resolution"]) {
+        const list = root.querySelector(`[data-list=${name}]`);
+        list.addEventListener("change", () => viewer.set(name, Number(list.value)));
+    }
+    const help = root.querySelector("[data-help]"), button = root.querySelector("[data-open=help]");
+    const show = (on) => { help.hidden = !on; button.setAttribute("aria-pressed", String(on)); };
+    button.addEventListener("click", () => show(help.hidden));
+    help.addEventListener("click", () => show(false));
+    root.addEventListener("keydown", (event) => {
+        if (event.key === "Escape") show(false);
+        if (event.key === "?") show(help.hidden);
+    });
+}
+
+// Shows the scene that the page holds, if it holds one; returns its viewer.
+async function showScene() {
+    const root = document.getElementById("scene");
+    if (!root) return null;
+    try {
+        const part = (name) => document.getElementById(`scene-${name}`);
+        const read = (name) => (part(name) ? readCompact(bytesOf(part(name).textContent)) : null);
+        const scene = JSON.parse(part("data").textContent);
+        const viewer = new SceneViewer(root, scene, await read("soup"), await read("mesh"));
+        listenToSwitches(root, viewer);
+        root.dataset.ready = "true";
+        return viewer;
+    } catch (error) {
+        const note = document.createElement("p");
+        note.className = "note";
+        note.textContent = `The scene cannot be shown here: ${error.message}. A recent browser with WebGL 2 shows it.`;
+        root.replaceChildren(note);
+        return null;
+    }
+}
+
+const sceneViewer = showScene();

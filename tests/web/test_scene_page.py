@@ -1,0 +1,270 @@
+"""The page of a scene holds all that it shows, and a browser draws with it what the rasterizer draws."""
+
+import json
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import pytest
+import torch
+
+import etsplat
+from etsplat.data.load import load_dataset
+from etsplat.io.mesh_files import MeshFile
+from etsplat.io.run_directory import RunDirectory
+from etsplat.model.soup_appearance import SoupAppearance
+from etsplat.model.triangle_soup import TriangleSoup
+from etsplat.report import write_report
+from etsplat.tasks.export_config import ExportConfig
+from etsplat.tasks.export_soup import export_soup
+from etsplat.tasks.sources import SoupRun
+from etsplat.web.pages import SCENE_SCRIPTS, SHARED_SCRIPTS, asset
+from helpers.browser import browser_page, find_browser
+from helpers.captures import write_transforms
+from helpers.finished_runs import write_run, write_soup_run
+
+SIZE = (400, 300)
+STILL = """new Promise((done) => {
+    const look = () => { if (v.frame || v.sorting || !v.sorted) setTimeout(look, 50); else done(true); };
+    look();
+})"""
+
+
+@pytest.fixture(scope="module")
+def page():
+    if find_browser() is None:
+        pytest.skip("there is no Chromium")
+    pytest.importorskip("websockets")
+    with browser_page() as opened:
+        yield opened
+
+
+def make_soup(count=150, **appearance):
+    """Triangles around the origin, with colours that depend on the direction, before a large one and a far one."""
+    rng = torch.Generator().manual_seed(5)
+    corners = torch.randn(count, 1, 3, generator=rng) * 0.6 + torch.randn(count, 3, 3, generator=rng) * 0.25
+    corners[0], corners[1] = 4 * corners[0], 20 * corners[1]
+    made = TriangleSoup.from_triangles(
+        corners, torch.rand(count, 3, generator=rng), opacity=0.5, sigma=0.5, sh_degree=3
+    )
+    state = made.state()
+    state["opacity_logits"] = torch.randn(count, generator=rng) * 2 + 1
+    state["sigma_raw"] = torch.randn(count, generator=rng) * 0.8 - 1
+    state["sh_rest"] = torch.randn(count, 15, 3, generator=rng) * 0.1
+    return TriangleSoup(**state, appearance=SoupAppearance(**appearance))
+
+
+@pytest.fixture
+def capture(tmp_path):
+    """Eight cameras around the origin, of an odd lens."""
+    write_transforms(tmp_path / "scene", 8, cx=8.5, cy=5.5, fl_y=15.0)
+    return load_dataset(tmp_path / "scene", preload=False)
+
+
+def written(tmp_path, soup, capture=None, opaque=None, **config):
+    path = tmp_path / "a <b> scene.html"
+    run = SoupRun(path.with_suffix(".safetensors"), soup, capture, opaque)
+    export_soup(run, path, ExportConfig(**config))
+    return path
+
+
+def picture(page, photo, mode):
+    drawn = f"v.picture({{photo: {photo}, mode: '{mode}', width: {SIZE[0]}, height: {SIZE[1]}}})"
+    return torch.from_numpy(page.picture(f"sceneViewer.then(v => {drawn})")).float()
+
+
+def decibels(a, b):
+    return float(-10 * (a.clamp(0, 1) - b.clamp(0, 1)).square().mean().log10())
+
+
+def camera_of(capture, index):
+    camera = capture.cameras[index]
+    return camera.scaled(SIZE[0] / camera.width)
+
+
+def test_a_page_needs_no_network_and_no_other_file(tmp_path, capture):
+    names = []
+
+    class Parts(HTMLParser):
+        def handle_starttag(self, tag, attrs):
+            names.extend(name for name, value in attrs if name in ("src", "href") or (value and "://" in value))
+
+    text = written(tmp_path, make_soup(), capture).read_text(encoding="utf-8")
+    Parts().feed(text)
+    assert names == []
+    assert not re.search(r"https?://|@import|url\(|fetch\(|XMLHttpRequest|import\(", text)
+    assert "<title>a &lt;b&gt; scene</title>" in text
+
+
+def test_a_photo_whose_name_would_end_the_script_does_not(tmp_path, capture):
+    names = ["</script><b>", *capture.names[1:]]
+    text = written(tmp_path, make_soup(), replace(capture, names=names)).read_text(encoding="utf-8")
+    data = re.search(r'id="scene-data">(.*?)</script>', text)
+    assert data
+    cameras = json.loads(data[1])["cameras"]
+    assert cameras[0]["name"] == "script><b>"
+    assert len(cameras) == 8
+
+
+def test_parts_of_the_code_stay_small():
+    assert all(len(asset(name).splitlines()) < 400 for name in (*SHARED_SCRIPTS, *SCENE_SCRIPTS))
+
+
+@pytest.mark.parametrize(
+    "appearance",
+    [
+        {"kernel": "elastic", "background": (0.9, 0.5, 0.1)},
+        {"kernel": "bilateral", "sh_degree": 1},
+        {"kernel": "single_sided", "distance": "sdf", "cull_small": True, "near_plane": 0.2},
+        {"kernel": "elastic", "distance": "sdf", "cull_large": 0.4},
+    ],
+    ids=str,
+)
+def test_a_browser_draws_what_the_rasterizer_draws(tmp_path, page, capture, appearance):
+    """Soft, and opaque without an opaque mesh, at the cameras of photos."""
+    soup = make_soup(**appearance)
+    page.open(written(tmp_path, soup, capture))
+    for photo in (1, 6):
+        camera = camera_of(capture, photo)
+        behind = torch.tensor([soup.appearance.background])
+        soft = soup.render(camera, backgrounds=behind).color[0]
+        assert float(soft.std()) > 0.1
+        assert decibels(picture(page, photo, "soft"), soft) > 40
+        rgba = soup.render_opaque(camera)[0]
+        assert decibels(picture(page, photo, "opaque"), rgba[..., :3] + (1 - rgba[..., 3:]) * behind) > 35
+    assert page.errors == []
+
+
+def test_a_browser_draws_the_opaque_mesh(tmp_path, page, capture):
+    """With colours at its corners, where the run has one; without the sky if that is left out."""
+    soup = make_soup()
+    vertices, faces = etsplat.icosphere(2)
+    mesh = MeshFile(vertices.float(), faces, vertex_colors=vertices.float() * 0.5 + 0.5)
+    page.open(written(tmp_path, soup, capture, mesh))
+    run = SoupRun(tmp_path, soup, capture, mesh)
+    assert run.solid is not None
+    expected = run.solid.render_opaque(camera_of(capture, 3))[0]
+    assert 0.05 < float(expected[..., 3].mean()) < 0.95
+    assert decibels(picture(page, 3, "opaque"), expected[..., :3]) > 35
+    assert decibels(picture(page, 3, "soft"), soup.render(camera_of(capture, 3)).color[0]) > 40
+
+
+def test_a_scene_can_be_looked_around_in(tmp_path, page, capture):
+    """Dragging turns about what is looked at, keys move, the list goes to photos, help can be read."""
+    page.open(written(tmp_path, make_soup(), capture), 400, 300)
+    page.value(f"sceneViewer.then(v => {STILL})")
+
+    def state():
+        return page.value("sceneViewer.then(v => [v.camera.eye, v.camera.target, v.camera.forward, v.camera.right])")
+
+    def drag(dx, dy):
+        for kind, x, y in (
+            ("mousePressed", 200, 100),
+            ("mouseMoved", 200 + dx, 100 + dy),
+            ("mouseReleased", 200 + dx, 100 + dy),
+        ):
+            page.ask("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", buttons=1, clickCount=1)
+
+    before = state()
+    drag(30, 0)
+    after = state()
+    assert torch.allclose(torch.tensor(before[1]), torch.tensor(after[1]), atol=1e-6)
+    moved = torch.tensor(after[0]) - torch.tensor(before[0])
+    assert float(moved @ torch.tensor(before[3])) < -0.1  # what is looked at follows the pointer to the right
+    up = torch.tensor(page.value("sceneViewer.then(v => v.camera.up)"))
+    drag(0, 30)
+    assert float((torch.tensor(state()[0]) - torch.tensor(after[0])) @ up) > 0.1  # and down, seen from higher up
+    page.value("sceneViewer.then(v => { v.root.querySelector('[value=fly]').click(); v.canvas.focus(); })")
+    before = state()
+    drag(30, 0)
+    after = state()
+    assert before[0] == after[0]
+    assert float(torch.tensor(after[2]) @ torch.tensor(before[3])) < -0.05  # what was ahead is to the right now
+    page.ask("Input.dispatchKeyEvent", type="keyDown", key="w")
+    page.value("new Promise(done => setTimeout(done, 200))")
+    page.ask("Input.dispatchKeyEvent", type="keyUp", key="w")
+    ahead = torch.tensor(state()[0]) - torch.tensor(after[0])
+    assert float(ahead @ torch.tensor(after[2])) > 0
+    page.value("sceneViewer.then(v => v.root.querySelector('[data-step=\"1\"]').click())")
+    photo = page.value("sceneViewer.then(v => v.photo)")
+    eye = capture.centers[photo].float()
+    assert torch.allclose(torch.tensor(state()[0]), eye, atol=1e-5)
+    page.value("sceneViewer.then(v => v.root.querySelector('[data-open=help]').click())")
+    assert page.value("sceneViewer.then(v => v.root.querySelector('[data-help]').checkVisibility())")
+
+
+def test_a_browser_without_workers_sorts_all_the_same(tmp_path, page, capture):
+    soup = make_soup()
+    path = written(tmp_path, soup, capture)
+    for source in (
+        "Worker = class { constructor() { throw new Error(); } }",
+        "URL.createObjectURL = () => 'blob:none'",
+    ):
+        added = page.ask("Page.addScriptToEvaluateOnNewDocument", source=source)
+        page.open(path)
+        page.ask("Page.removeScriptToEvaluateOnNewDocument", **added)
+        assert decibels(picture(page, 2, "soft"), soup.render(camera_of(capture, 2)).color[0]) > 40
+
+
+def test_a_browser_without_webgl_says_so(tmp_path, page):
+    source = "HTMLCanvasElement.prototype.getContext = () => null"
+    added = page.ask("Page.addScriptToEvaluateOnNewDocument", source=source)
+    page.open(written(tmp_path, make_soup(5)))
+    page.ask("Page.removeScriptToEvaluateOnNewDocument", **added)
+    assert page.value("sceneViewer.then(v => v === null)")
+    assert "has no WebGL 2" in page.value("document.body.textContent")
+
+
+def test_the_mesh_of_a_report_is_drawn(tmp_path, page):
+    """By the same camera: the sphere is in the middle of its canvas, nothing in the corner, and no script fails."""
+    page.open(write_report(write_run(tmp_path / "run", views=0, steps=2)), 800, 600)
+    page.value("document.getElementById('mesh').scrollIntoView({block: 'center'})")
+    page.value("new Promise(done => setTimeout(done, 500))")
+    shown = torch.from_numpy(page.screenshot())
+    assert page.errors == []
+    middle, corner = shown[280:320, 380:420], shown[280:320, 60:100]
+    assert float(middle.std()) > float(corner.std()) + 0.01
+
+
+def test_the_report_of_a_soup_shows_its_scene(tmp_path, page):
+    """Also where its capture has gone: from one side, opaque and soft."""
+    folder = write_soup_run(tmp_path / "run")
+    make_soup().save(RunDirectory(folder).soup_path)
+    page.open(write_report(folder), 800, 600)
+    assert page.value("sceneViewer.then(v => v.scene.cameras.map(camera => camera.name))") == ["overview"]
+    for mode in ("soft", "opaque"):
+        assert float(picture(page, 0, mode).std()) > 0.1
+    assert page.errors == []
+
+
+def test_pictures_come_back_where_the_device_took_what_it_held(tmp_path, page, capture):
+    """As phones do with pages in the background."""
+    soup, (vertices, faces) = make_soup(), etsplat.icosphere(2)
+    mesh = MeshFile(vertices.float(), faces, vertex_colors=vertices.float() * 0.5 + 0.5)
+    page.open(written(tmp_path, soup, capture, mesh))
+    before = [picture(page, 2, mode) for mode in ("soft", "opaque")]
+    page.value("sceneViewer.then(v => (window.taken = v.gl.getExtension('WEBGL_lose_context')).loseContext())")
+    page.value("sceneViewer.then(v => { v.stand(1); return new Promise(done => setTimeout(done, 300)); })")
+    assert page.value("sceneViewer.then(v => v.gl.isContextLost())")
+    page.value("taken.restoreContext()")
+    page.value("new Promise(done => setTimeout(done, 300))")
+    page.value(f"sceneViewer.then(v => {STILL})")
+    for mode, expected in zip(("soft", "opaque"), before, strict=True):
+        assert torch.equal(picture(page, 2, mode), expected)
+    assert page.errors == []
+
+
+def test_an_opaque_picture_of_a_moving_camera_is_the_same_but_for_its_edges(tmp_path, page, capture):
+    """It has fewer samples, and a depth buffer all the same."""
+    page.open(written(tmp_path, make_soup(), capture))
+    still = picture(page, 6, "opaque")
+    size = f"width: {SIZE[0]}, height: {SIZE[1]}"
+    drawn = f"""sceneViewer.then(async v => {{
+        await v.picture({{photo: 6, mode: 'opaque', {size}}});
+        const camera = new Camera(v.camera.home, v.scene.radius);
+        camera.stand(v.scene.cameras[6], v.scene.focus);
+        v.painter.draw(camera, 'opaque', {{still: false}});
+        return v.canvas;
+    }})"""
+    moving = torch.from_numpy(page.picture(drawn)).float()
+    assert float(((moving - still).abs() < 0.02).all(dim=-1).float().mean()) > 0.9
