@@ -10,7 +10,7 @@ from etsplat.data.demo_scene import demo_scene
 from etsplat.engines.choice import engine
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.optim.trainer import Trainer
-from etsplat.tasks.train import make_trainer
+from etsplat.tasks.soup_trainer import make_trainer
 from etsplat.tasks.train_config import TrainConfig
 
 SIZE = (1237, 822)

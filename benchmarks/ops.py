@@ -28,6 +28,7 @@ from etsplat.ops.spherical_harmonics import spherical_harmonics
 from etsplat.ops.triangle_channels import triangle_channels
 
 Operation = tuple[str, str, Callable[[], object]]
+_TEXTURE, _PICTURE = 2048, (1600, 1200)
 
 
 def torus(rings: int, sides: int) -> tuple[torch.Tensor, torch.Tensor]:
@@ -98,6 +99,49 @@ def training(size: int, vertices: torch.Tensor, faces: torch.Tensor) -> list[Ope
     ]
 
 
+def textures(size: int, vertices: torch.Tensor, faces: torch.Tensor) -> list[Operation]:
+    """Texture and image of sizes of their own; beside torch's sampling of level 0, on as many threads."""
+    texture = torch.rand(_TEXTURE, _TEXTURE, 3).requires_grad_()
+    width, height = _PICTURE
+    # A surface seen at an angle: neighbouring pixels lie close to each other in the texture.
+    rows, columns = torch.meshgrid(torch.linspace(0, 1, height), torch.linspace(0, 1, width), indexing="ij")
+    uv = torch.stack([columns * (0.5 + 0.5 * rows), 0.2 * columns + 0.8 * rows], dim=-1).requires_grad_()
+    lod = (1.5 * rows).contiguous()
+    channels_first = texture.detach().permute(2, 0, 1)[None].contiguous().requires_grad_()
+    picture = f"{_TEXTURE} x {_TEXTURE}, {width} x {height}"
+    viewmats = look_at(torch.tensor([[0.3, 0.4, 2.2]]), torch.zeros(3), torch.tensor([0.0, 1.0, 0.0])).float()
+    camera = Cameras(viewmats, intrinsics(40.0, width, height).float()[None], width, height)
+    connectivity = MeshTopology.from_faces(faces, len(vertices)).connectivity
+    points, face_uvs = vertices.clone().requires_grad_(), vertices[faces][..., :2] * 0.5 + 0.5
+
+    def sample(lod: torch.Tensor | None) -> None:
+        texture.grad = uv.grad = None
+        etsplat.sample_texture(texture, uv, lod=lod).sum().backward()
+
+    def peer() -> None:
+        channels_first.grad = uv.grad = None
+        before = torch.get_num_threads()
+        torch.set_num_threads(num_threads())
+        found = torch.nn.functional.grid_sample(
+            channels_first, 2 * uv[None] - 1, mode="bilinear", padding_mode="border", align_corners=False
+        )
+        found.sum().backward()
+        torch.set_num_threads(before)
+
+    def draw() -> None:
+        texture.grad = points.grad = None
+        etsplat.rasterize_antialiased(
+            points, connectivity=connectivity, cameras=camera, texture=texture, face_uvs=face_uvs
+        ).color.sum().backward()
+
+    return [
+        ("sample_texture, with gradients", picture, partial(sample, None)),
+        ("sample_texture between levels, with gradients", picture, partial(sample, lod)),
+        ("torch's grid_sample, with gradients", picture, peer),
+        ("rasterize_antialiased of a texture, with gradients", f"{picture}, {len(faces):,} faces", draw),
+    ]
+
+
 def soup_losses(size: int, vertices: torch.Tensor, faces: torch.Tensor) -> list[Operation]:
     """What preset paper of novel-view synthesis adds to a step; and in PyTorch, on one thread, as training has it."""
     corners = vertices[faces].clone().requires_grad_()
@@ -158,7 +202,7 @@ def main() -> None:
     table = Table(title=f"Operations beside the rasterizer, {num_threads()} threads, {arguments.repeats} runs each")
     for name, justify in [("operation", "left"), ("size", "left"), ("median ms", "right"), ("best ms", "right")]:
         table.add_column(name, justify=justify, no_wrap=True)
-    for build in (rendering, training, soup_losses):
+    for build in (rendering, training, textures, soup_losses):
         for name, shape, operation in build(arguments.size, vertices, faces):
             times = milliseconds(operation, arguments.repeats)
             table.add_row(name, shape, f"{statistics.median(times):.2f}", f"{min(times):.2f}")

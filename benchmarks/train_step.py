@@ -24,7 +24,7 @@ from etsplat.ops.rasterize import rasterize
 from etsplat.ops.soup_colors import soup_colors
 from etsplat.optim.strategies import DensifyAndPrune
 from etsplat.optim.trainer import Trainer
-from etsplat.tasks.train import start_trainer
+from etsplat.tasks.soup_trainer import start_trainer
 from etsplat.tasks.train_config import TrainConfig
 
 WARM_UP = 60

@@ -29,7 +29,7 @@ def fit(photos: etsplat.Dataset, weight: float, iterations: int) -> etsplat.Tria
     mesh = etsplat.TriangleMesh.from_mesh(vertices, faces, colors=0.7, opacity=0.98, sigma=0.25)
     own = etsplat.Custom(asymmetry, weight, outputs=("color",))
     terms = [etsplat.EdgeLength(0.5), etsplat.SmoothNormals(0.02), etsplat.Laplacian(0.2), own]
-    faster = etsplat.Schedule({**mesh.RATES, "vertices": 1e-2})
+    faster = etsplat.Schedule({**mesh.rates, "vertices": 1e-2})
     trainer = etsplat.Trainer(mesh, photos, etsplat.Objective(etsplat.Photometric(), terms), schedule=faster)
     trainer.fit(iterations, callbacks=[print], log_every=100)
     return trainer.model

@@ -57,7 +57,7 @@ def main() -> None:
         vertices, faces = etsplat.icosphere(2)
         mesh = etsplat.TriangleMesh.from_mesh(vertices, faces, colors=0.7, opacity=0.98, sigma=0.25)
         objective = etsplat.Objective(etsplat.Photometric(), [etsplat.EdgeLength(0.5), etsplat.Laplacian(0.2)])
-        faster = etsplat.Schedule({**mesh.RATES, "vertices": 1e-2})
+        faster = etsplat.Schedule({**mesh.rates, "vertices": 1e-2})
         trainer = etsplat.Trainer(mesh, photos, objective, strategy, schedule=faster)
         trainer.fit(options.iterations, callbacks=[print], log_every=200)
         pictures.append(mesh.render(camera).color[0].detach())

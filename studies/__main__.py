@@ -5,11 +5,12 @@ from studies.famous import Famous
 from studies.figures import Figures
 from studies.gallery import Gallery
 from studies.nvs import Nvs
+from studies.opensplat import OpenSplat
 from studies.regularizers import Regularizers
 from studies.settings import Settings
 from studies.study import Study
 
-STUDIES: tuple[type[Study], ...] = (Famous, Nvs, Regularizers, Distance, Settings, Gallery, Figures)
+STUDIES: tuple[type[Study], ...] = (Famous, Nvs, Regularizers, Distance, Settings, Gallery, Figures, OpenSplat)
 
 
 def main() -> None:

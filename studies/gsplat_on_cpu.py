@@ -16,6 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from etsplat.core.errors import InputError
 from studies.peers import settings
 
 VERSION = "1.5.3"
@@ -27,7 +28,10 @@ DRAWN_AHEAD = 1.0
 
 def replacements() -> Iterator[tuple[Any, str, Any]]:
     """What takes the place of gsplat's compiled part: module, name, value."""
-    gsplat = importlib.import_module("gsplat")
+    try:
+        gsplat = importlib.import_module("gsplat")
+    except ImportError as error:
+        raise InputError("drawing Gaussians needs gsplat: pip install --group studies") from error
     if gsplat.__version__ != VERSION:
         raise SystemExit(f"gsplat {gsplat.__version__}: this needs {VERSION}; pip install gsplat=={VERSION}")
     wrapper = importlib.import_module("gsplat.cuda._wrapper")
@@ -42,6 +46,17 @@ def replacements() -> Iterator[tuple[Any, str, Any]]:
         yield wrapper, name, SimpleNamespace(apply=function)
     yield wrapper, "_make_lazy_cuda_func", compositing.compiled
     yield importlib.import_module("gsplat.rendering"), "torch", _TorchOnCpu("torch")
+
+
+def load_gsplat_on_cpu() -> tuple[Any, torch.device]:
+    """gsplat, with its compiled part replaced in this process, and the CPU.
+
+    Raises:
+        InputError: it is not installed.
+    """
+    for module, name, value in replacements():
+        setattr(module, name, value)
+    return importlib.import_module("gsplat"), torch.device("cpu")
 
 
 class _TorchOnCpu(ModuleType):
@@ -254,14 +269,9 @@ def _over(backgrounds: Tensor | None, colors: Tensor, covered: Tensor) -> tuple[
     return colors, covered
 
 
-def _gsplat_on_cpu() -> tuple[Any, torch.device]:
-    return importlib.import_module("gsplat"), torch.device("cpu")
-
-
 if __name__ in ("__main__", "__mp_main__"):  # the processes of a grid import this too
-    for _module, _name, _value in replacements():
-        setattr(_module, _name, _value)
-    settings.load_gsplat = _gsplat_on_cpu
+    load_gsplat_on_cpu()
+    settings.load_gsplat = load_gsplat_on_cpu
 
 if __name__ == "__main__":
     from studies.nvs import Nvs

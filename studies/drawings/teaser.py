@@ -16,8 +16,8 @@ from etsplat.io.run_directory import RunDirectory, is_run
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.render_config import RenderConfig
 from etsplat.tasks.render_soup import draw
+from etsplat.tasks.soup_trainer import start_trainer
 from etsplat.tasks.sources import open_run
-from etsplat.tasks.train import start_trainer
 from etsplat.tasks.train_config import TrainConfig
 from studies.objects.pictures import draw_shape
 

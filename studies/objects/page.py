@@ -15,11 +15,12 @@ from PIL import Image
 from torch import Tensor
 
 from etsplat.geometry.measures import bounding_ball
+from etsplat.geometry.similarity import rotation_between
 from etsplat.io.images import load_image, to_8_bit
 from etsplat.io.mesh_files import load_mesh
 from etsplat.io.overview import find_test_views
-from etsplat.report.html import asset
-from etsplat.tasks.sources import rotation_to_y_up
+from etsplat.report.scene import own_asset
+from etsplat.web.pages import asset
 from studies.grid.cells import Cell
 from studies.grid.writing import origin_of, versions_of, write_text
 from studies.objects.hulls import Hull
@@ -85,7 +86,7 @@ def write_gallery(shown: Sequence[Shown], failed: Sequence[Cell], out: Path, com
     write_text(out / "results.md", "\n\n".join(lines) + "\n")
     page = Template(_TEMPLATE.read_text(encoding="utf-8")).substitute(
         title="Reconstructed objects",
-        style=asset("page.css"),
+        style="\n".join([asset("base.css"), own_asset("page.css")]),
         origin=f"<code>{escape(command)}</code>, {escape(told)}",
         about=escape(_ABOUT),
         order=escape(_ORDER),
@@ -183,7 +184,11 @@ class _Placement:
         surface = load_mesh(shown.subject.surface or run.mesh)
         self._center, self._radius = bounding_ball(surface.vertices)
         up = shown.hull.up
-        self._turn = torch.eye(3).double() if up is None else rotation_to_y_up(torch.tensor(up, dtype=torch.float64))
+        self._turn = (
+            torch.eye(3).double()
+            if up is None
+            else rotation_between(torch.tensor(up, dtype=torch.float64), torch.eye(3)[1])
+        )
 
     def drawn(self, path: Path, title: str, *, normals: bool = False) -> str:
         """A figure of a surface."""

@@ -15,6 +15,7 @@ METRICS = (
     "psnr",
     "psnr_mesh",
     "ssim",
+    "flip",
     "lpips",
     "degenerate_faces",
     "self_intersections",

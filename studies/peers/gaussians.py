@@ -13,9 +13,9 @@ from torch import Tensor, nn
 
 from etsplat.core.cameras import Cameras
 from etsplat.core.errors import InputError
+from etsplat.core.harmonics import SH_CONSTANT
 from etsplat.io.tensors import save_tensors
 from etsplat.model.soup_init import StartPoints, spacing
-from etsplat.model.triangle_soup import SH_CONSTANT
 from studies.peers.settings import PeerConfig
 
 NAMES = ("means", "scales", "quats", "opacities", "sh0", "shN")

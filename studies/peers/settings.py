@@ -13,6 +13,9 @@ if TYPE_CHECKING:
 Peer = Literal["3dgs", "2dgs"]
 PEERS: tuple[Peer, ...] = get_args(Peer)
 
+Schedule = Literal["scaled", "own"]
+"""OpenSplat's settings for 30,000 steps, scaled to the length of a run or as they are."""
+
 
 @dataclass(frozen=True)
 class PeerConfig(Settings):

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from etsplat.core.cameras import Cameras
@@ -110,10 +111,17 @@ class PeerDrawing:
     """Pictures of finished Gaussians, and how they compare with the photos of the test views."""
 
     def __init__(
-        self, gsplat: Any, gaussians: nn.ParameterDict, capture: Dataset, config: PeerConfig, device: torch.device
+        self,
+        gsplat: Any,
+        gaussians: nn.ParameterDict,
+        capture: Dataset,
+        config: PeerConfig,
+        device: torch.device,
+        background: Float[Tensor, "1 3"] | None = None,
     ) -> None:
+        """Takes what drawing needs; behind everything is the background, or that of the settings for None."""
         self._gsplat, self._gaussians, self._capture, self._config = gsplat, gaussians, capture, config
-        self._background = _background(config, device)
+        self._background = _background(config, device) if background is None else background
         self._scorer = Scorer(capture, device, background=self._background[0].tolist())
         self._device = device
 

@@ -14,8 +14,8 @@ from studies.grid.cells import AnyConfig, Cell, is_finished
 from studies.peers.settings import PEERS, Peer, PeerConfig, load_gsplat, peer_config
 from studies.scenes.paper import SCENES
 
-ALL_PHOTOS = {"watch": 0}
-"""Published numbers are of runs on all training photos; a setting may say otherwise."""
+STUDIED = {"watch": 0, "asset": False}
+"""Published numbers are of soups, trained on all training photos; a setting may say otherwise."""
 
 CULLED = "culling"
 """What is added to the name of a method whose small triangles are culled."""
@@ -24,6 +24,7 @@ METRICS = (
     "psnr",
     "ssim",
     "ssim_interior",
+    "flip",
     "lpips_3dgs",
     "lpips",
     "psnr_opaque",
@@ -175,8 +176,8 @@ def evaluate_cells(
 def _settings(scene: Scene, preset: str) -> tuple[TrainConfig, str | None]:
     known = SCENES.get(scene.name) if preset == "paper" else None
     if known is None or scene.scene_type is not None:
-        return TrainConfig.of(preset, scene.scene_type or "outdoor").changed(ALL_PHOTOS), None
-    config = replace(TrainConfig.of(preset, known.scene_type).changed(ALL_PHOTOS), max_triangles=known.max_triangles)
+        return TrainConfig.of(preset, scene.scene_type or "outdoor").changed(STUDIED), None
+    config = replace(TrainConfig.of(preset, known.scene_type).changed(STUDIED), max_triangles=known.max_triangles)
     return config, known.images if (scene.folder / known.images).is_dir() else None
 
 

@@ -11,9 +11,9 @@ import pytest
 import torch
 
 from etsplat.core.errors import InputError
+from etsplat.core.harmonics import SH_CONSTANT
 from etsplat.io.run_directory import RunDirectory
 from etsplat.model.soup_init import StartPoints
-from etsplat.model.triangle_soup import SH_CONSTANT
 from helpers import fake_gsplat
 from helpers.captures import write_colmap
 from studies import gsplat_on_cpu

@@ -1,0 +1,1 @@
+"""Exported GLB files as other programs show them."""

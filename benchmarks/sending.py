@@ -1,0 +1,134 @@
+"""What a scene to send is worth: sizes, what the compact file costs on test views, and how a browser draws the page.
+
+    python -m benchmarks.sending runs/fox runs/bonsai
+
+A table in Markdown for each run. Pictures of the browser (Chromium, WebGL in software) are compared with ours from the
+exact soup and mesh, 400 pixels wide at the first test view; frames are 1280 x 720 from the camera that a page begins
+at, the best of three, with the pixels read back.
+"""
+
+import sys
+import time
+from pathlib import Path
+from statistics import fmean
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from etsplat.core.cameras import Cameras
+from etsplat.metrics.image import psnr
+from etsplat.model.soup_import import open_soup
+from etsplat.model.triangle_soup import TriangleSoup
+from etsplat.tasks.export_config import ExportConfig
+from etsplat.tasks.export_soup import export_soup
+from etsplat.tasks.scoring import Scorer
+from etsplat.tasks.sources import SoupRun, open_run
+from tests.helpers.browser import Page, browser_page
+
+FRAME = """sceneViewer.then((v) => {
+    [v.canvas.width, v.canvas.height] = [1280, 720];
+    const begin = performance.now();
+    v.painter.draw(v.camera, "MODE", OPTIONS);
+    v.gl.readPixels(0, 0, 1, 1, v.gl.RGBA, v.gl.UNSIGNED_BYTE, new Uint8Array(4));
+    return performance.now() - begin;
+})"""
+STILL = """sceneViewer.then((v) => new Promise((done) => {
+    const look = () => { if (v.frame || v.sorting || !v.sorted) setTimeout(look, 50); else done(true); };
+    look();
+}))"""
+SORT = """sceneViewer.then(async (v) => {
+    const begin = performance.now();
+    await v.sorter.sort(v.request());
+    return performance.now() - begin;
+})"""
+
+
+def psnr_of(run: SoupRun, soup: TriangleSoup) -> float:
+    """Mean over the test views."""
+    capture = run.needed_capture()
+    scorer = Scorer(capture, run.device, background=soup.appearance.background)
+    seen = [scorer.see(soup, view) for view in capture.test]
+    return fmean(psnr(view.counting(view.splatted), view.photo) for view in seen)
+
+
+def decibels(found: Tensor, expected: Tensor) -> float:
+    return float(-10 * (found - expected.clamp(0, 1)).square().mean().log10())
+
+
+def rows_of(run: SoupRun, folder: Path, page: Page) -> list[tuple[str, str]]:
+    """What is measured of a run, and what it came to."""
+    compact, html = folder / "soup.etz", folder / "soup.html"
+    begin = time.perf_counter()
+    export_soup(run, compact, ExportConfig())
+    seconds = time.perf_counter() - begin
+    export_soup(run, html, ExportConfig())
+    exact, found = psnr_of(run, run.soup), open_soup(compact)
+    rows = [
+        ("triangles, of the opaque mesh", f"{len(run.soup):,}, {0 if run.solid is None else len(run.solid):,}"),
+        (".safetensors", _size(run.folder / "soup.safetensors")),
+        (".etz", f"{_size(compact)}, {compact.stat().st_size / len(run.soup):.1f} bytes a triangle"),
+        (".html", _size(html)),
+        ("to write .etz", f"{seconds:.1f} s"),
+        ("PSNR, exact → .etz", f"{exact:.3f} → {psnr_of(run, found):.3f} dB"),
+    ]
+    for share in (0.75, 0.5, 0.25):
+        first = torch.arange(len(found)) < share * len(found)
+        rows.append((f"of the first {share:.0%}", f"{psnr_of(run, found.kept(first)):.2f} dB"))
+    return rows + drawn(run, html, page)
+
+
+def drawn(run: SoupRun, html: Path, page: Page) -> list[tuple[str, str]]:
+    """What the browser makes of the page."""
+    capture = run.needed_capture()
+    photo = capture.test[0]
+    camera = capture.cameras[photo]
+    camera = camera.scaled(400 / camera.width)
+    begin = time.perf_counter()
+    page.open(html)
+    page.value(STILL)
+    rows = [("until the first whole picture", f"{time.perf_counter() - begin:.1f} s")]
+    place = sorted([*capture.train, *capture.test, *capture.watched]).index(photo)
+    for mode, ours in _ours(run, camera).items():
+        wanted: dict[str, Any] = {"photo": place, "mode": mode, "width": camera.width, "height": camera.height}
+        shown = torch.from_numpy(page.picture(f"sceneViewer.then(v => v.picture({wanted}))")).float()
+        rows.append((f"{mode}, against ours", f"{decibels(shown, ours):.1f} dB"))
+    page.open(html)
+    page.value(STILL)
+    for name, mode, options in (
+        ("opaque, moving", "opaque", "{still: false}"),
+        ("opaque, standing", "opaque", "{}"),
+        ("soft, moving (a fifth of the width)", "soft", "{scale: 0.2, still: false}"),
+        ("soft, standing", "soft", "{}"),
+    ):
+        frame = FRAME.replace("MODE", mode).replace("OPTIONS", options)
+        best = min(page.value(frame) for _ in range(4))
+        rows.append((f"{name}, 1280 x 720", f"{best:.0f} ms, {1000 / best:.2g} frames/s"))
+    rows.append(("to sort and colour", f"{min(page.value(SORT) for _ in range(4)):.0f} ms"))
+    return rows
+
+
+def _ours(run: SoupRun, camera: Cameras) -> dict[str, Tensor]:
+    behind = torch.tensor([run.soup.appearance.background])
+    shown = run.soup if run.solid is None else run.solid
+    rgba = shown.render_opaque(camera)[0]
+    opaque = rgba[..., :3] + (1 - rgba[..., 3:]) * behind
+    return {"soft": run.soup.render(camera, backgrounds=behind).color[0], "opaque": opaque}
+
+
+def _size(path: Path) -> str:
+    return f"{path.stat().st_size / 1e6:.2f} MB"
+
+
+def main(folders: list[str]) -> None:
+    for folder in folders:
+        run = open_run(folder, device="cpu")
+        with TemporaryDirectory() as place, browser_page() as page, torch.no_grad():
+            rows = rows_of(run, Path(place), page)
+        print(f"| {Path(folder).name} | |\n|---|---|")
+        print("\n".join(f"| {name} | {value} |" for name, value in rows), flush=True)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

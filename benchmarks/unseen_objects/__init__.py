@@ -1,0 +1,1 @@
+"""Objects that no setting was chosen by, made in code, with their photos."""

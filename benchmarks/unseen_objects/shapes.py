@@ -1,0 +1,149 @@
+"""Solids as signed distances on a grid: thin legs, links, walls around a hollow, sheets, holes, parts."""
+
+import math
+from collections.abc import Callable, Sequence
+from functools import reduce
+
+import numpy as np
+
+Field = np.ndarray
+"""(N, N, N) distances, negative inside; or coordinates."""
+
+Point = Sequence[float] | np.ndarray
+
+
+class Grid:
+    """The places of an N x N x N grid over the cube from -1.1 to 1.1, and solids on it."""
+
+    def __init__(self, count: int) -> None:
+        self.axis = np.linspace(-1.1, 1.1, count)
+        self.x, self.y, self.z = np.meshgrid(self.axis, self.axis, self.axis, indexing="ij")
+
+    @property
+    def around(self) -> Field:
+        """Distance from the z axis."""
+        return np.hypot(self.x, self.y)
+
+    def ball(self, center: Point, radius: float) -> Field:
+        """Round."""
+        return np.sqrt(sum(place**2 for place in self._from(center))) - radius
+
+    def rod(self, a: Point, b: Point, radius: float) -> Field:
+        """With round ends."""
+        way = np.subtract(b, a)
+        places = self._from(a)
+        along = np.clip(sum(p * w for p, w in zip(places, way, strict=True)) / (way @ way), 0, 1)
+        return np.sqrt(sum((p - along * w) ** 2 for p, w in zip(places, way, strict=True))) - radius
+
+    def block(self, center: Point, half: Point, rounding: float = 0.02) -> Field:
+        """Along the axes."""
+        over = [np.abs(place) - size + rounding for place, size in zip(self._from(center), half, strict=True)]
+        outside = np.sqrt(sum(np.maximum(value, 0) ** 2 for value in over))
+        return outside + np.minimum(np.maximum.reduce(over), 0) - rounding
+
+    def ring(self, center: Point, radius: float, thickness: float, axis: int = 2) -> Field:
+        """About an axis."""
+        places = self._from(center)
+        height = places.pop(axis)
+        return np.hypot(np.hypot(*places) - radius, height) - thickness
+
+    def disc(self, height: float, radius: float, half: float) -> Field:
+        """About the z axis."""
+        return np.maximum(self.around - radius, np.abs(self.z - height) - half)
+
+    def ellipsoid(self, center: Point, axes: np.ndarray, radii: Point) -> Field:
+        """Its axes are rows; distances are about right near the surface."""
+        places = np.stack(self._from(center), axis=-1) @ axes.T
+        return (np.sqrt(((places / np.asarray(radii)) ** 2).sum(axis=-1)) - 1) * min(radii)
+
+    def _from(self, center: Point) -> list[Field]:
+        return [place - value for place, value in zip((self.x, self.y, self.z), center, strict=True)]
+
+
+def union(*solids: Field) -> Field:
+    return reduce(np.minimum, solids)
+
+
+def chair(g: Grid) -> Field:
+    """Six holes: four between the slats of its back, two below."""
+    sides = (-1, 1)
+    legs = [g.rod((0.37 * i, 0.37 * j, 0), (0.42 * i, 0.42 * j, -0.8), 0.04) for i in sides for j in sides]
+    posts = [g.rod((0.38 * i, 0.38, 0), (0.4 * i, 0.48, 0.8), 0.04) for i in sides]
+    slats = [g.rod((x, 0.39, 0), (x, 0.48, 0.78), 0.025) for x in (-0.2, 0, 0.2)]
+    bars = [g.rod((-0.4, 0.4 * j, -0.45), (0.4, 0.4 * j, -0.45), 0.025) for j in sides]
+    top = g.rod((-0.4, 0.48, 0.78), (0.4, 0.48, 0.78), 0.045)
+    return union(g.block((0, 0, 0), (0.42, 0.42, 0.04)), top, *legs, *posts, *slats, *bars)
+
+
+def chain(g: Grid) -> Field:
+    """Three parts that hang in each other, with a hole each."""
+    return union(*(g.ring((0.44 * i, 0, 0), 0.32, 0.08, 1 if i == 0 else 2) for i in (-1, 0, 1)))
+
+
+def bowl(g: Grid) -> Field:
+    """A thin wall, and a handle over the opening."""
+    wall = np.maximum(np.abs(g.ball((0, 0, 0.1), 0.8)) - 0.035, g.z - 0.15)
+    handle = np.maximum(g.ring((0, 0, 0.1), 0.8, 0.045, 1), 0.1 - g.z)
+    return union(wall, handle, g.disc(-0.72, 0.3, 0.06))
+
+
+def vase(g: Grid) -> Field:
+    """A hollow that widens behind its opening."""
+    radius = 0.32 + 0.16 * np.sin(3.2 * (g.z + 0.3)) + 0.05 * g.z
+    wall = np.maximum(0.8 * np.abs(g.around - radius) - 0.035, np.abs(g.z) - 0.9)
+    return union(wall, g.disc(-0.87, 0.36, 0.05))
+
+
+def plant(g: Grid) -> Field:
+    """A pot, thin stems, leaves like sheets."""
+    rng, up = np.random.default_rng(3), np.array([0, 0, 1.0])
+    parts = [np.maximum(g.around - (0.32 + 0.12 * (g.z + 0.6)), np.abs(g.z + 0.65) - 0.3)]
+    for angle in 2 * math.pi * np.arange(7) / 7 + 0.2 * rng.random(7):
+        out = np.array([math.cos(angle), math.sin(angle), 0])
+        tip = (0.5 + 0.35 * rng.random()) * out + (0.1 + 0.75 * rng.random()) * up
+        parts.append(g.rod(0.05 * out - 0.4 * up, 0.75 * tip - 0.05 * up, 0.022))
+        normal = np.cross(np.cross(up, out), tip + 0.2 * up)
+        normal, along = normal / np.linalg.norm(normal), tip / np.linalg.norm(tip)
+        parts.append(g.ellipsoid(0.85 * tip, np.stack([along, np.cross(normal, along), normal]), (0.26, 0.13, 0.028)))
+    return union(*parts)
+
+
+def gear(g: Grid) -> Field:
+    """Teeth, and six holes through a disc."""
+    teeth = 0.78 + 0.1 * np.tanh(4 * np.sin(12 * np.arctan2(g.y, g.x)))
+    solid = np.maximum(np.maximum(g.around - teeth, np.abs(g.z) - 0.16), 0.2 - g.around)
+    for angle in 2 * math.pi * np.arange(5) / 5:
+        hole = np.hypot(g.x - 0.48 * math.cos(angle), g.y - 0.48 * math.sin(angle)) - 0.14
+        solid = np.maximum(solid, -hole)
+    return solid
+
+
+def cage(g: Grid) -> Field:
+    """The edges of a cube around a ball."""
+    e, sides = 0.62, [(i, j) for i in (-1, 1) for j in (-1, 1)]
+    bars = [
+        g.rod(np.roll((-e, i * e, j * e), turn), np.roll((e, i * e, j * e), turn), 0.05)
+        for turn in range(3)
+        for i, j in sides
+    ]
+    return union(g.ball((0, 0, 0), 0.3), *bars)
+
+
+def plate(g: Grid) -> Field:
+    """A bent sheet."""
+    return np.maximum(np.abs(g.z - 0.25 * g.around**2) - 0.02, g.around - 0.9)
+
+
+def figures(g: Grid) -> Field:
+    """Three parts side by side, with thin limbs."""
+    parts = []
+    for x, h in ((-0.6, 0.0), (0.0, 0.1), (0.6, 0.2)):
+        parts += [g.rod((x, 0, -0.6), (x, 0, h), 0.13), g.ball((x, 0, 0.25 + h), 0.15)]
+        parts += [g.rod((x - 0.2, 0, -0.25), (x + 0.2, 0, -0.05), 0.05)]
+        parts += [g.rod((x + 0.09 * i, 0, -0.6), (x + 0.11 * i, 0, -0.9), 0.06) for i in (-1, 1)]
+    return union(*parts)
+
+
+SHAPES: dict[str, Callable[[Grid], Field]] = {
+    shape.__name__: shape for shape in (chair, chain, bowl, vase, plant, gear, cage, plate, figures)
+}
