@@ -135,7 +135,7 @@ check-neon:
 # The newest versions that fit, for every Python and system, with the hashes of the registry's files. torch is left out: which
 # build of it is right (CPU, CUDA) depends on the machine, and with it the hash; constraints.txt has its version.
 LOCK := $(PY) -m uv pip compile --universal --python-version 3.10 --generate-hashes --no-annotate --no-header \
-	-c constraints.txt --extra cuda --extra sfm --extra video --extra viewer --group pyproject.toml:dev pyproject.toml
+	-c constraints.txt --extra cuda --extra depth --extra heic --extra sfm --extra texture --extra video --extra viewer --group pyproject.toml:dev pyproject.toml
 lock: setup
 	$(PIP) uv
 	printf "torch ; python_version < '3'\netsplat ; python_version < '3'\n" > build/without.txt
@@ -146,9 +146,10 @@ audit: setup
 	$(PIP) pip-audit
 	$(PY) -m pip_audit --disable-pip --require-hashes --requirement requirements.lock
 
+# By the tools of `setup`, in its build folder: what the one has compiled the other need not.
 wheel: $(TOOLS)
 	rm -rf dist
-	$(PY) -m pip --disable-pip-version-check wheel --quiet --no-deps --wheel-dir dist .
+	$(PY) -m pip --disable-pip-version-check wheel --quiet --no-deps --no-build-isolation --check-build-dependencies --wheel-dir dist .
 
 # What a user gets: the wheel alone, in an environment with nothing else, away from the source tree. That environment is
 # a gigabyte, byte code left out, so it goes when it has passed.

@@ -4,15 +4,28 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
-from benchmarks import gpu, gpu_floors, gpu_reconstruct, gpu_scenes, gpu_timing, gpu_train, rasterizer, scenes, tables
+from benchmarks import (
+    floaters,
+    gpu,
+    gpu_floors,
+    gpu_reconstruct,
+    gpu_scenes,
+    gpu_timing,
+    gpu_train,
+    rasterizer,
+    scenes,
+    tables,
+)
 from benchmarks.measure import native_state
 from etsplat import _native, rasterize
 from etsplat.core.cameras import Cameras
+from etsplat.data.demo_scene import demo_scene
 from helpers.scenes import mesh
 
 
@@ -149,3 +162,33 @@ def test_the_gpu_run_stops_where_there_is_no_gpu(tmp_path):
     assert result.returncode == 1
     assert result.stderr.strip() == "no GPU that torch can use"
     assert result.stdout == ""
+
+
+def test_off_the_path_counts_what_a_photo_shows():
+    """Unmoved, a camera sees its photo, and all that is in it counts where that photo was trained on; where that of
+    the other side was, less does, or it is left out. Moved half as near it looks at the same point."""
+    scene = demo_scene(32, 24)
+    viewmats = scene.viewmats.clone()
+    viewmats[1] = viewmats[0]
+    near = replace(scene, viewmats=viewmats, train=[1], test=[0])
+    (still,) = floaters.off_path(near, (0.0, 0.0, 0.0))
+    assert float(still.counts.float().mean()) > 0.99
+    assert float((still.truth - scene.images[0].float() / 255).abs().mean()) < 1e-3
+    opposite = list(floaters.off_path(replace(near, train=[10]), (0.0, 0.0, 0.0)))
+    assert all(float(view.counts.float().mean()) < float(still.counts.float().mean()) for view in opposite)
+
+    (moved,) = floaters.off_path(near, (0.0, 0.0, 0.5))
+    step = moved.camera.centers[0] - still.camera.centers[0]
+    torch.testing.assert_close(torch.nn.functional.normalize(step, dim=0), still.camera.viewmats[0, 2, :3])
+    torch.testing.assert_close(moved.camera.viewmats[0, 2, :3], still.camera.viewmats[0, 2, :3])
+
+
+def test_rough_photos_are_off_by_a_tenth_of_a_degree_and_as_bright_as_they_were():
+    scene = demo_scene(32, 24)
+    rough = floaters.rough(scene)
+    turned = rough.viewmats[:, :3, :3] @ scene.viewmats[:, :3, :3].mT
+    angles = turned.diagonal(dim1=1, dim2=2).sum(dim=1).sub(1).div(2).clamp(-1, 1).arccos().rad2deg()
+    assert 0.1 < float(angles[scene.train].mean()) < 0.25  # of three axes
+    assert torch.equal(rough.viewmats[scene.test], scene.viewmats[scene.test])
+    before, after = (torch.stack([each.images[i].float() for i in scene.train]).mean() for each in (scene, rough))
+    assert float(after / before) == pytest.approx(1, abs=0.03)

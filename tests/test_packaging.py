@@ -12,6 +12,7 @@ import pytest
 
 from etsplat import _native
 from etsplat.engines.cuda.program import source_root
+from etsplat.web.pages import SCENE_SCRIPTS, SHARED_SCRIPTS
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 
@@ -41,9 +42,11 @@ def test_tests_mirror_the_sources() -> None:
 
 
 def test_report_assets_are_installed() -> None:
-    """The report's page, style and scripts come with the package, and so does the typing marker."""
-    for name in ("page.html", "page.css", "page.js", "viewer.js"):
+    """The pages of reports and scenes, styles and scripts come with the package, and so does the typing marker."""
+    for name in ("page.html", "page.css", "page.js", "viewer.js", "scene.html"):
         assert (files("etsplat.report") / "assets" / name).is_file()
+    for name in ("scene_page.html", "scene.html", "base.css", "scene.css", *SHARED_SCRIPTS, *SCENE_SCRIPTS):
+        assert (files("etsplat.web") / "assets" / name).is_file()
     assert (files("etsplat") / "py.typed").is_file()
 
 

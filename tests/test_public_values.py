@@ -24,6 +24,11 @@ def _mesh() -> TriangleMesh:
     return TriangleMesh.from_mesh(MESH.vertices, MESH.faces, colors=0.5, opacity=0.9, sigma=0.3)
 
 
+def _textured() -> etsplat.TexturedMesh:
+    texture, uvs = torch.rand(8, 8, 3), torch.rand(80, 3, 2)
+    return etsplat.TexturedMesh.from_mesh(MESH.vertices, MESH.faces, texture, uvs)
+
+
 def _soup() -> TriangleSoup:
     return TriangleSoup.from_triangles(
         MESH.vertices[MESH.faces], torch.rand(80, 3), opacity=0.5, sigma=0.5, sh_degree=1
@@ -75,6 +80,7 @@ VALUES: dict[str, Callable[[], Any]] = {
     "MeshEnergies": lambda: etsplat.mesh_energies(MESH.vertices, MeshTopology.from_faces(MESH.faces, 42).connectivity),
     "MeshFile": lambda: MESH,
     "MeshTopology": lambda: MeshTopology.from_faces(MESH.faces, 42),
+    "Georeference": lambda: etsplat.Georeference((1.0, 2.0, 3.0), 0.5, "z", "EPSG:25832"),
     "Normalization": lambda: etsplat.Normalization(torch.rand(3), 2.0),
     "NoteEvent": lambda: etsplat.NoteEvent("text"),
     "Objective": lambda: etsplat.Objective(etsplat.Photometric(0.2), [etsplat.EdgeLength(0.5)]),
@@ -95,10 +101,13 @@ VALUES: dict[str, Callable[[], Any]] = {
     "Softness": lambda: etsplat.Softness(0.5),
     "SoupAppearance": lambda: etsplat.SoupAppearance(sh_degree=2),
     "StartPoints": lambda: etsplat.StartPoints(torch.rand(5, 3), torch.rand(5, 3)),
+    "StageEvent": lambda: etsplat.StageEvent("mesh", 1, 2),
     "StepEvent": lambda: etsplat.StepEvent(1, 2, 0.1, 0.2, {"faces": 3.0}, {}),
     "StoredPictures": lambda: PICTURES,
     "Strategy": lambda: etsplat.Strategy(),
     "SubdivideAndUntangle": lambda: etsplat.SubdivideAndUntangle({100: 500}),
+    "TextureAppearance": lambda: etsplat.TextureAppearance(max_level=3),
+    "TexturedMesh": _textured,
     "TrainConfig": lambda: etsplat.TrainConfig.tiny(),
     "TrainResult": lambda: etsplat.TrainResult(Path("x"), _soup(), {"psnr": 30.0}),
     "TriangleMesh": _mesh,

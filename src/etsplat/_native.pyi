@@ -27,7 +27,16 @@ def adam_step(
 class AntialiasState:
     pass
 
-class AntialiasViews:
+class ColorsOf(enum.IntEnum):
+    FACES = 0
+
+    VERTICES = 1
+
+    CORNERS = 2
+
+    PIXELS = 3
+
+class ShadedViews:
     def __init__(
         self,
         *,
@@ -35,22 +44,35 @@ class AntialiasViews:
         faces: torch.Tensor,
         viewmats: torch.Tensor,
         Ks: torch.Tensor,
-        near_plane: float,
-        pair_offsets: torch.Tensor,
-        paired_faces: torch.Tensor,
         triangle: torch.Tensor,
         barycentrics: torch.Tensor,
-        depth: torch.Tensor,
         colors: torch.Tensor,
-        per_face: bool,
-        backgrounds: torch.Tensor,
+        colors_of: ColorsOf,
+        backgrounds: torch.Tensor | None,
     ) -> None: ...
 
-def antialias_forward(*, views: AntialiasViews, shaded: torch.Tensor, color: torch.Tensor) -> list[AntialiasState]: ...
+class Silhouettes:
+    def __init__(
+        self, *, near_plane: float, pair_offsets: torch.Tensor, paired_faces: torch.Tensor, depth: torch.Tensor
+    ) -> None: ...
+
+def shade(*, views: ShadedViews, shaded: torch.Tensor) -> None: ...
+def shade_backward(
+    *,
+    views: ShadedViews,
+    grad_shaded: torch.Tensor,
+    grad_vertices: torch.Tensor | None,
+    grad_colors: torch.Tensor | None,
+) -> None: ...
+def texture_detail(*, views: ShadedViews, depth: torch.Tensor, width: int, height: int, lod: torch.Tensor) -> None: ...
+def antialias_forward(
+    *, views: ShadedViews, silhouettes: Silhouettes, shaded: torch.Tensor, color: torch.Tensor
+) -> list[AntialiasState]: ...
 def antialias_backward(
     *,
     states: Sequence[AntialiasState],
-    views: AntialiasViews,
+    views: ShadedViews,
+    silhouettes: Silhouettes,
     grad_color: torch.Tensor,
     shaded: torch.Tensor,
     scratch: torch.Tensor,
@@ -320,6 +342,28 @@ def spherical_harmonics_backward(
     grad_colors: torch.Tensor,
     grad_coefficients: torch.Tensor,
     grad_directions: torch.Tensor,
+) -> None: ...
+def texture_levels(*, texture: torch.Tensor, levels: int, coarser: torch.Tensor) -> None: ...
+
+class SampledTexture:
+    def __init__(
+        self,
+        *,
+        texture: torch.Tensor,
+        coarser: torch.Tensor | None,
+        levels: int,
+        uv: torch.Tensor,
+        lod: torch.Tensor | None,
+    ) -> None: ...
+
+def sample_texture(*, sampled: SampledTexture, values: torch.Tensor) -> None: ...
+def sample_texture_backward(
+    *,
+    sampled: SampledTexture,
+    grad_values: torch.Tensor,
+    grad_texture: torch.Tensor | None,
+    grad_coarser: torch.Tensor | None,
+    grad_uv: torch.Tensor | None,
 ) -> None: ...
 def mean_area(*, vertices: torch.Tensor, gradient: torch.Tensor) -> float: ...
 def triangle_channels(

@@ -51,7 +51,7 @@ OPTIONS: dict[str, dict[str, str]] = {
         # No photo was kept from training to watch runs by, and exposures were not looked at; the rate of positions and
         # the number of triangles did not depend on the photos.
         **{
-            f"--preset {preset}": f"--preset {preset} --watch 0 --exposure off --pixels-per-triangle None"
+            f"--preset {preset}": f"--preset {preset} --watch 0 --exposure off --pixels-per-triangle None --no-asset"
             " --optimizer.lr-vertices-unit frame --optimizer.lr-vertices 0.0015"
             for preset in ("quick", "demo", "tiny")
         },
@@ -144,7 +144,7 @@ METRICS = Names(
     added=frozenset(
         {"edits_undone", "ssim_mesh", "test_views", "lpips", "lpips_reason", "silhouette_iou", "judgement", *_GEOMETRY}
     )
-    | {"psnr_affine", "exposure_learned", "exposure_explained"},
+    | {"psnr_affine", "exposure_learned", "exposure_explained", "flip", "flip_mesh", "flip_opaque", "flip_asset"},
     ignored=frozenset({"seconds", "seconds_per_iteration", "versions"}),
 )
 """Of metrics.json."""

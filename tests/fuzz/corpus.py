@@ -15,13 +15,22 @@ import trimesh
 from PIL import Image
 
 import etsplat
+from etsplat.io.camera_path_files import KeyPoses
+from etsplat.io.compact_soups import encode_compact
+from etsplat.io.georeference import Georeference
 from etsplat.io.kernel_files import write_kernel
+from etsplat.io.mesh_files import MeshFile
+from etsplat.io.opaque_files import save_opaque
 from etsplat.io.ply_tables import encode_ply
+from etsplat.model.solid_soup import SolidSoup
+from etsplat.model.soup_compact import compact_of
 from etsplat.optim.checkpoints import save_checkpoint
 from etsplat.tasks.export_config import ExportConfig
 from etsplat.tasks.export_soup import export_soup
 from etsplat.tasks.sources import SoupRun
+from helpers import foreign_captures
 from helpers.captures import write_colmap, write_transforms
+from helpers.photos import upright_picture, write_phone_photo
 
 RUN_HASH = "0123456789abcdef"
 
@@ -162,6 +171,15 @@ def pictures() -> list[bytes]:
     return found
 
 
+def phone_photos(suffix: str) -> list[bytes]:
+    """On their side and upright, with EXIF."""
+    name = f"photo{suffix}"
+    tags = {"model": "Phone 7", "focal_mm": 4.25, "focal_35mm": 28}
+    return [
+        made(lambda folder, o=o: write_phone_photo(folder / name, upright_picture(), o, **tags))[name] for o in (1, 6)
+    ]
+
+
 def masks() -> list[bytes]:
     found = []
     for values in (np.eye(12, 16) > 0, np.ones((12, 16)) > 0):
@@ -215,6 +233,16 @@ def blender() -> Files:
     return files
 
 
+def foreign(kind: str) -> Files:
+    """A small capture as another program writes it; see `helpers.foreign_captures.WRITERS`."""
+    return made(lambda folder: foreign_captures.WRITERS[kind](folder, foreign_captures.truth(3)))
+
+
+def georeferences() -> list[bytes]:
+    far = (500_000.25, 5_400_000.5, 300.0)
+    return [found.to_json().encode() for found in (Georeference(far), Georeference(far, 0.5, "z", "EPSG:25832"))]
+
+
 def point_clouds() -> list[bytes]:
     rng = np.random.default_rng(0)
     plain = np.zeros(6, dtype=[(axis, "<f4") for axis in "xyz"])
@@ -250,12 +278,30 @@ def soups() -> list[bytes]:
     return [made(lambda f, s=s: s.save(f / "s.safetensors"))["s.safetensors"] for s in (soup(), soup(0, "bilateral"))]
 
 
+def opaque_meshes() -> list[bytes]:
+    mesh = MeshFile(torch.rand(5, 3), torch.tensor([[0, 1, 2], [2, 3, 4]]), vertex_colors=torch.rand(5, 3))
+    return [made(lambda f: save_opaque(f / "o.safetensors", mesh))["o.safetensors"]]
+
+
+def camera_paths() -> list[bytes]:
+    poses = torch.eye(4, dtype=torch.float64).repeat(3, 1, 1)
+    fovs = torch.tensor([40.0, 50.0, 60.0], dtype=torch.float64)
+    return [KeyPoses(poses, fovs, aspect).to_json().encode() for aspect in (None, 1.5)]
+
+
 def exported() -> list[bytes]:
     """PLY of `etsplat export`, with all its numbers."""
     config = ExportConfig(colors="keep", up="keep", alpha=False)
     run = SoupRun(path=Path("soup"), soup=soup(), capture=None)
     plain = ExportConfig(colors="constant", up="keep")
     return [made(lambda f, c=c: export_soup(run, f / "s.ply", c))["s.ply"] for c in (config, plain)]
+
+
+def compact_soups() -> list[bytes]:
+    """A soft one, and the opaque mesh of a page."""
+    soft = compact_of(soup(), torch.arange(6.0))
+    solid = SolidSoup.of_corners(soup().vertices, torch.rand(6, 3, 3), etsplat.SoupAppearance(), {})
+    return [encode_compact(soft), encode_compact(compact_of(solid, torch.arange(6.0)))]
 
 
 def states() -> list[bytes]:
@@ -307,3 +353,34 @@ def config_files() -> list[bytes]:
     """For --config: some settings, and a run's own."""
     some = {"preset": "demo", "iterations": 100, "optimizer": {"lr_vertices": 0.01}, "method": "bilateral"}
     return [json.dumps(some).encode(), run()["run/config.json"]]
+
+
+def depth_maps() -> list[Files]:
+    """Of every kind, with unknown places."""
+    depth = np.random.default_rng(0).uniform(0.5, 4.0, (9, 12)).astype(np.float32)
+    depth[2:4] = 0.0
+    npy, png = io.BytesIO(), io.BytesIO()
+    np.save(npy, depth)
+    Image.fromarray((1000 * depth).astype(np.uint16)).save(png, format="PNG")
+
+    def exr(path: Path) -> None:
+        import OpenEXR
+
+        header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+        OpenEXR.File(header, {"Z": depth}).write(str(path / "input.exr"))
+
+    return [{"input.npy": npy.getvalue()}, {"input.png": png.getvalue()}, made(exr)]
+
+
+def laser_scans() -> list[Files]:
+    """LAS, with colours and without."""
+    import laspy
+
+    found = []
+    for kind in (3, 0):
+        cloud = laspy.LasData(laspy.LasHeader(point_format=kind, version="1.2"))
+        cloud.x, cloud.y, cloud.z = np.random.default_rng(0).normal(size=(3, 40))
+        if kind == 3:
+            cloud.red = cloud.green = cloud.blue = np.arange(40, dtype=np.uint16) << 8
+        found.append(made(lambda folder, cloud=cloud: cloud.write(str(folder / "input.las"))))
+    return found

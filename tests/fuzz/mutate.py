@@ -128,7 +128,7 @@ def _change_bytes(data: bytes, rng: np.random.Generator, others: Sequence[bytes]
 
 
 def _parts_of(data: bytes) -> Parts | None:
-    """Of GLB, safetensors, PNG, and zip files, as torch's are; None for everything else and what is damaged."""
+    """Of GLB, safetensors, PNG, compact soups, zip files (torch's are some); None for all else and what is damaged."""
     try:
         if data[:4] == b"glTF":
             return _glb(data)
@@ -136,9 +136,11 @@ def _parts_of(data: bytes) -> Parts | None:
             return _zip(data)
         if data[:8] == b"\x89PNG\r\n\x1a\n":
             return _png(data)
+        if data[:4] == b"ETSZ":
+            return _compact(data)
         if len(data) > 10 and data[8:9] == b"{":
             return _safetensors(data)
-    except (struct.error, zipfile.BadZipFile, ValueError, NotImplementedError, EOFError):
+    except (struct.error, zipfile.BadZipFile, zlib.error, ValueError, KeyError, NotImplementedError, EOFError):
         pass
     return None
 
@@ -186,6 +188,28 @@ def _png(data: bytes) -> Parts:
         return b"".join(found)
 
     return contents, joined
+
+
+def _compact(data: bytes) -> Parts:
+    """The header, and what each chunk inflates to."""
+    length = struct.unpack_from("<I", data, 8)[0]
+    text, at, chunks = data[12 : 12 + length], 12 + length, []
+    for _, size in json.loads(text)["chunks"]:
+        chunks.append(zlib.decompress(data[at : at + size]))
+        at += size
+
+    def joined(parts: list[bytes]) -> bytes:
+        header, packed = parts[0], [zlib.compress(part) for part in parts[1:]]
+        if header == text:
+            document = json.loads(text)
+            counts = [count for count, _ in document["chunks"]]
+            document["chunks"] = [[count, len(part)] for count, part in zip(counts, packed, strict=True)]
+            header = json.dumps(document).encode()
+        else:
+            packed = [data[12 + length :]]
+        return data[:8] + struct.pack("<I", len(header)) + header + b"".join(packed)
+
+    return [text, *chunks], joined
 
 
 def _zip(data: bytes) -> Parts:

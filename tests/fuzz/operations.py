@@ -130,8 +130,15 @@ def _opaque() -> list[Arguments]:
 def _antialiased() -> list[Arguments]:
     scene = _meshes()
     connectivity = MeshTopology.from_faces(scene.pop("faces"), 12).connectivity
-    colors = torch.rand(20, 3, generator=RNG)
-    return [_grown({**scene, "connectivity": connectivity, "face_colors": colors, "near_plane": 0.01})]
+    scene |= {"connectivity": connectivity, "near_plane": 0.01}
+    texture = {"texture": torch.rand(8, 6, 3, generator=RNG), "face_uvs": torch.rand(20, 3, 2, generator=RNG)}
+    colored = _grown({**scene, "face_colors": torch.rand(20, 3, generator=RNG)})
+    return [colored, _grown({**scene, **texture, "max_level": 1})]
+
+
+def _textures() -> list[Arguments]:
+    sampled = {"texture": torch.rand(8, 6, 3, generator=RNG), "uv": torch.rand(5, 4, 2, generator=RNG)}
+    return [_grown(sampled), {**sampled, "lod": torch.rand(5, 4, generator=RNG), "max_level": 2}]
 
 
 def _photos() -> list[Arguments]:
@@ -215,6 +222,7 @@ OPERATIONS = [
     Operation("rasterize_antialiased", etsplat.rasterize_antialiased, _antialiased),
     Operation("rasterize_opaque", etsplat.rasterize_opaque, lambda: [{**_meshes(), "near_plane": 0.01}]),
     Operation("render_opaque", etsplat.render_opaque, _opaque),
+    Operation("sample_texture", etsplat.sample_texture, _textures),
     Operation("photometric_loss", etsplat.photometric_loss, _photos),
     Operation("normal_consistency", etsplat.normal_consistency, _normals),
     Operation(
@@ -258,6 +266,7 @@ OPERATIONS = [
     ),
     Operation("geometry_metrics", geometry_metrics, _surfaces),
     Operation("psnr", etsplat.psnr, _pairs),
+    Operation("flip", etsplat.flip, _pairs),
     Operation("ssim", etsplat.ssim, lambda: [{**_pairs()[0], "interior": True}]),
     Operation(
         "silhouette_iou", etsplat.silhouette_iou, lambda: [{"coverage": torch.rand(5, 6), "truth": torch.rand(5, 6)}]

@@ -1,8 +1,10 @@
 """One target for each reader of files."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +13,19 @@ import torch
 import etsplat
 from etsplat.core.errors import InputError
 from etsplat.core.kernels import KERNELS
-from etsplat.data.formats.transforms import read_frames
-from etsplat.data.load import load_dataset
+from etsplat.data.frames import Wanted, check_frames
+from etsplat.data.georeferencing import near_origin
+from etsplat.data.load import format_of, load_dataset
+from etsplat.io.camera_path_files import read_camera_path
+from etsplat.io.depth_maps import load_depth, resize_depth
+from etsplat.io.georeference import Georeference
 from etsplat.io.images import image_size, load_image, load_mask, load_pixels
 from etsplat.io.kernel_files import adopt_kernel_of
 from etsplat.io.mesh_files import load_mesh
+from etsplat.io.opaque_files import load_opaque
+from etsplat.io.photos import inspect_photo, write_upright
 from etsplat.io.ply_tables import load_points
+from etsplat.io.point_clouds import load_cloud
 from etsplat.io.run_directory import RunDirectory, is_run
 from etsplat.metrics.image import Lpips
 from etsplat.model.soup_import import open_soup
@@ -112,10 +121,30 @@ def _mesh(path: Path) -> None:
 CAMERA = etsplat.orbit_cameras(16, 12, azimuths=1)[0]
 
 
+def _opaque(path: Path) -> None:
+    mesh = load_opaque(path)
+    assert mesh.vertex_colors is not None
+    assert mesh.vertices.isfinite().all()
+    assert mesh.vertex_colors[mesh.faces].isfinite().all()
+
+
+def _camera_path(path: Path) -> None:
+    keys = read_camera_path(path)
+    assert keys.viewmats.shape == (len(keys), 4, 4)
+    assert keys.viewmats.isfinite().all()
+    assert ((keys.fovs > 0) & (keys.fovs < 180)).all()
+
+
 def _soup(path: Path) -> None:
     soup = open_soup(path)
     assert all(parameter.isfinite().all() for parameter in soup.parameters().values())
     assert soup.render(CAMERA).color.shape == (1, 12, 16, 3)
+
+
+def _georeference(path: Path) -> None:
+    found = Georeference.read(path)
+    assert all(math.isfinite(value) for value in (*found.offset, found.scale))
+    assert found.scale > 0
 
 
 def _picture(path: Path) -> None:
@@ -127,10 +156,31 @@ def _picture(path: Path) -> None:
     assert load_pixels(path, 8, 6).shape[:2] == (6, 8)
 
 
+def _photo(path: Path) -> None:
+    known, copy = inspect_photo(path), path.with_name("upright.jpg")
+    write_upright(path, copy)
+    assert inspect_photo(copy).size == known.size
+    assert inspect_photo(copy).upright
+
+
 def _mask(path: Path) -> None:
     mask = load_mask(path)
     assert mask.ndim == 2
     assert 0 <= mask.min() <= mask.max() <= 1
+
+
+def _depth(path: Path) -> None:
+    depth = load_depth(path)
+    assert depth.dtype == torch.float32
+    assert depth.isfinite().all()
+    assert depth.min() >= 0
+    assert resize_depth(depth, 5, 4).shape == (4, 5)
+
+
+def _cloud(path: Path) -> None:
+    points, colors = load_cloud(path)
+    assert points.isfinite().all()
+    assert colors is None or (colors.shape == points.shape and 0 <= colors.min() <= colors.max() <= 1)
 
 
 def _points(path: Path) -> None:
@@ -152,8 +202,9 @@ def _decoded(folder: Path) -> None:
     _scene(folder, preload=True)
 
 
-def _distorted(folder: Path) -> None:
-    frames, _ = read_frames(folder)
+def _listed(folder: Path) -> None:
+    frames = near_origin(folder, format_of(folder).list_frames(folder, Wanted())).frames
+    check_frames(folder, frames)
     assert all(frame.viewmat.isfinite().all() and frame.K.isfinite().all() for frame in frames)
 
 
@@ -207,6 +258,23 @@ def _prefixed(make: Callable[[], corpus.Files]) -> Callable[[], list[corpus.File
     return lambda: [make()]
 
 
+_FOREIGN = {
+    "polycam": (".json", ".ply"),
+    "record3d": (".json", ".ply"),
+    "bundler": (".out", ".txt"),
+    "openmvg": (".json",),
+    "meshroom": (".json",),
+    "metashape": (".xml", ".ply"),
+    "reality_capture_csv": (".csv", ".ply"),
+    "reality_capture_xmp": (".xmp", ".ply"),
+}
+
+
+def _foreign(kind: str) -> Reader:
+    """Of captures that another program wrote, with lenses or without: what lists their frames."""
+    return Reader(f"capture of {kind}", lambda: [corpus.foreign(kind)], _FOREIGN[kind], _listed)
+
+
 _MODEL = ("cameras.txt", "images.txt", "points3D.txt", "cameras.bin", "images.bin", "points3D.bin")
 
 READERS = [
@@ -219,7 +287,10 @@ READERS = [
     Reader("textured .obj", _prefixed(corpus.textured_obj), (".obj", ".mtl", ".png"), _file(_mesh)),
     Reader("textured .glb, .gltf", corpus.textured_gltfs, (".glb", ".gltf", ".bin", ".png"), _file(_mesh)),
     Reader("picture", _single(".png", corpus.pictures), (".png",), _file(_picture)),
+    Reader("photo with EXIF", _single(".jpg", lambda: corpus.phone_photos(".jpg")), (".jpg",), _file(_photo)),
     Reader("mask", _single(".png", corpus.masks), (".png",), _file(_mask)),
+    Reader("depth map", corpus.depth_maps, (".png", ".npy", ".exr"), _file(_depth)),
+    Reader("laser scan", corpus.laser_scans, (".las",), _file(_cloud)),
     Reader("points", _single(".ply", corpus.point_clouds), (".ply",), _file(_points)),
     Reader("colmap text", _prefixed(corpus.colmap_text), _MODEL, _scene),
     Reader("colmap binary", _prefixed(corpus.colmap_binary), _MODEL, _scene),
@@ -230,12 +301,18 @@ READERS = [
         "transforms.json, distorted",
         lambda: [corpus.transforms(k1=0.1, k2=0.01, p1=0.001, p2=0.0, camera_model="OPENCV")],
         (".json",),
-        _distorted,
+        _listed,
     ),
+    *(_foreign(kind) for kind in _FOREIGN),
+    Reader("georeference.json", _single(".json", corpus.georeferences), (".json",), _file(_georeference)),
     Reader("soup .safetensors", _single(".safetensors", corpus.soups), (".safetensors",), _file(_soup)),
     Reader("soup .ply, Gaussians", _single(".ply", corpus.gaussians), (".ply",), _file(_soup)),
     Reader("soup .ply, exported", _single(".ply", corpus.exported), (".ply",), _file(_soup)),
+    Reader("soup .etz", _single(".etz", corpus.compact_soups), (".etz",), _file(_soup)),
     Reader("soup .pt", _single(".pt", corpus.states), (".pt",), _file(_soup)),
+    Reader("opaque mesh", _single(".safetensors", corpus.opaque_meshes), (".safetensors",), _file(_opaque)),
+    # Nearly every number in it is of a rotation, which must stay one.
+    Reader("camera path", _single(".json", corpus.camera_paths), (".json",), _file(_camera_path), 0.04),
     Reader(
         "kernel.safetensors",
         lambda: [{"kernel.safetensors": data} for data in corpus.kernels()],
@@ -253,3 +330,8 @@ READERS = [
     Reader("--config", _single(".json", corpus.config_files), (".json",), _file(_settings)),
     Reader("LPIPS weights", _single(".pth", corpus.weights), (".pth",), _file(_weights)),
 ]
+
+if find_spec("pillow_heif"):  # an extra
+    READERS.append(
+        Reader("photo .heic", _single(".heic", lambda: corpus.phone_photos(".heic")), (".heic",), _file(_photo))
+    )
