@@ -128,6 +128,14 @@ def test_a_header_that_says_what_cannot_be_is_refused(changes, message):
         decode_compact(with_header(encode_compact(soup_of(10)), **changes))
 
 
+def test_scales_may_be_whole_numbers_of_any_size():
+    large = 10**20
+    changes = {"center": {"origin": [large, 0, 0], "step": large}, "constant": {"step": large}, "rest": {"step": large}}
+    found = decode_compact(with_header(encode_compact(soup_of(10)), **changes))
+    assert found.vertices[:, 0, 0].min() == pytest.approx(large)
+    assert np.isfinite(found.harmonics).all()
+
+
 def test_another_version_is_named():
     data = encode_compact(soup_of(10))
     with pytest.raises(ValueError, match="of version 2, and this etsplat reads version 1"):

@@ -71,7 +71,7 @@ def test_bad_arguments_are_named():
         flip(image[..., :1], image[..., :1])
     with pytest.raises(ValueError, match="truth: expected the image's shape"):
         flip(image, image[1:])
-    with pytest.raises(ValueError, match="image must be of floating-point numbers, got torch.uint8"):
+    with pytest.raises(ValueError, match="image must be of floating-point numbers"):
         flip(image.byte(), image)
     with pytest.raises(ValueError, match=r"image: expected a pixel or more, got shape \(0, 5, 3\)"):
         flip(image[:0], image[:0])

@@ -184,7 +184,8 @@ def _quantised_colors(soup: CompactSoup) -> tuple[dict[str, Any], Places]:
 
 def _restored(header: Mapping[str, Any], table: Places) -> CompactSoup:
     """Whole numbers to what they stand for."""
-    centers = np.array(header["center"]["origin"]) + header["center"]["step"] * table["center"]
+    # Numbers that JSON has without a point may be larger than whole numbers of numpy.
+    centers = np.array(header["center"]["origin"], dtype=np.float64) + float(header["center"]["step"]) * table["center"]
     size = header["size"]["least"] * 2.0 ** (table["size"] / header["size"]["per_octave"])
     first = (size / header["offset"]["steps"] * table["offsets"]).reshape(-1, 2, 3)
     offsets = np.concatenate([first, -first.sum(axis=1, keepdims=True)], axis=1)
@@ -196,9 +197,9 @@ def _restored(header: Mapping[str, Any], table: Places) -> CompactSoup:
     }
     if not header["bases"]:
         return CompactSoup(**place, corner_colors=(table["colors"].reshape(-1, 3, 3) / 255).astype(np.float32))
-    bands = [header["constant"]["step"] * table["constant"], header["rest"]["step"] * table["rest"]]
+    bands = [float(header[name]["step"]) * table[name] for name in ("constant", "rest")]
     harmonics = np.concatenate(bands, axis=1).reshape(len(centers), header["bases"], 3)
-    sigma = np.exp(header["sigma"]["low"] + header["sigma"]["step"] * table["sigma"][:, 0])
+    sigma = np.exp(header["sigma"]["low"] + float(header["sigma"]["step"]) * table["sigma"][:, 0])
     return CompactSoup(
         **place,
         opacities=(table["opacity"][:, 0] / 255).astype(np.float32),
