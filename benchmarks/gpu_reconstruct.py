@@ -35,7 +35,7 @@ def step_milliseconds(
     )
     views = photograph(demo_object(), resolution, resolution, supersampling=1, device=device)
     with engine("cuda"):
-        trainer = make_trainer(make_start(None, views, config, device)[0], views, config)
+        trainer = make_trainer(make_start(None, views, config, device).mesh, views, config)
         _advance(trainer, 0, config.iterations - steps)
         begin = time.perf_counter()
         _advance(trainer, config.iterations - steps, config.iterations)

@@ -46,7 +46,7 @@ def views() -> Dataset:
 
 
 def fitting(views: Dataset, engine: str, config: ReconstructConfig = CONFIG, device: torch.device = CPU) -> OnEngine:
-    return OnEngine(engine, lambda: make_trainer(make_start(None, views, config, device)[0], views, config))
+    return OnEngine(engine, lambda: make_trainer(make_start(None, views, config, device).mesh, views, config))
 
 
 @pytest.mark.parametrize(

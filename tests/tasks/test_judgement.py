@@ -47,9 +47,20 @@ def judged(
     preset: str = "quick",
     untangled: bool = True,
     shown: bool = True,
+    contradicted: float = 0.0,
 ) -> Judgement:
     wanted = Expected(expected, None if expected.unclear else "input mesh", shown)
-    return judge("test", scores, intersecting, found, wanted, begun=begun, preset=preset, untangled=untangled)
+    said = {"begun": begun, "preset": preset, "untangled": untangled, "contradicted": contradicted}
+    return judge("test", scores, intersecting, found, wanted, **said)
+
+
+def test_a_patch_that_photos_contradict_is_told():
+    assert judged(contradicted=0.01).verdict.startswith("good")
+    verdict = judged(contradicted=0.028).verdict
+    assert verdict == (
+        "poor: photos contradict each other on 2.8 % of its surface, where a hollow may be closed: "
+        "try more photos that look into it, or depth maps"
+    )
 
 
 def test_of_a_good_result_nothing_is_said_but_its_numbers():

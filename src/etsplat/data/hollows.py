@@ -5,27 +5,29 @@ seen by those photos whose line of sight enters the hull through a lid, since al
 itself. With only these asked, they agree where the bottom of the hollow is, and hardly anywhere else.
 """
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
-from torch.nn.functional import grid_sample, max_pool2d, normalize
 
-from etsplat.core.cameras import camera_centers
+from etsplat.data.agreement import (
+    Photo,
+    agreement,
+    averaged,
+    contradicted_share,
+    first_hits,
+    photos_of,
+    pixel_size,
+    reduced,
+    seen_by,
+    surface_agreement,
+)
 from etsplat.data.dataset import Dataset
-from etsplat.data.pictures import as_float
 from etsplat.data.visual_hull import Distance, outside_hull
 from etsplat.geometry.measures import vertex_normals
 from etsplat.geometry.subdivision import longest_edge_plan
 from etsplat.geometry.topology import MeshTopology, connected
-from etsplat.ops.rasterize_opaque import rasterize_opaque
-
-_WIDEST = 320
-"""Photos are halved until none is wider: agreement asks for texture, not for detail."""
-
-_PATCH = 7
-"""Pixels across the patches that are compared."""
 
 _STEP = 1.5
 """Pixels between two depths that are tried: an agreement is about three wide."""
@@ -33,17 +35,8 @@ _STEP = 1.5
 _DEEPEST = 1.5
 """Depths end here, in units of the object's radius."""
 
-_ASKED = 12
-"""At most so many photos are compared at a point: those that look at it most squarely."""
-
-_SLANT = 0.2
-"""Cosine of the angle to the normal, below which a photo is not asked."""
-
 _AGREED = 0.75
 """Correlation of photos that show one surface; those of different ones have about 0.3."""
-
-_FLAT = 0.01
-"""Standard deviation of colours below which a patch shows nothing to compare."""
 
 _UNKNOWN = 0.6
 """Cost of a depth where nobody can be asked; elsewhere it is 1 - agreement."""
@@ -54,8 +47,8 @@ _BEND, _TEAR = 0.03, 0.3
 _ROUNDS = 30
 """Of belief propagation."""
 
-_SMOOTH, _SMOOTH_LID = 3, 20
-"""Rounds in which normals of the hull, and of lids by themselves, are averaged with their neighbours'."""
+_SMOOTH_LID = 20
+"""Rounds in which normals of lids by themselves are averaged with their neighbours'."""
 
 _SLENDER = 2.0
 """Hollows are at most so many times as deep as they are wide."""
@@ -73,82 +66,67 @@ _FEWEST = 8
 """Vertices of a lid that is worth moving."""
 
 
-@dataclass(frozen=True)
-class _Photo:
-    """A photo with its camera: (1, 4, H, W) pixels, (4, 4), (3, 3) and (3,)."""
+class Opened(NamedTuple):
+    """A hull whose hollows are open as far as photos show them.
 
-    pixels: Tensor
-    viewmat: Tensor
-    K: Tensor
-    center: Tensor
+    Attributes:
+        vertices: (V2, 3).
+        faces: (F2, 3), at most half as many again as before.
+        moved: how many vertices moved.
+        contradicted: the largest patch that photos contradicted when they were last asked (`contradicted_share`).
+    """
 
-    def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """(..., 2) places as `grid_sample` has them, and (...) depths, of (..., 3) points."""
-        camera = points @ self.viewmat[:3, :3].T + self.viewmat[:3, 3]
-        z = camera[..., 2]
-        height, width = self.pixels.shape[2:]
-        pixel = (camera @ self.K.T)[..., :2] / torch.where(z > 0, z, 1.0)[..., None]
-        place = 2 * pixel / torch.tensor([width, height]) - 1
-        return torch.where(z[..., None] > 0, place, 2.0), z
-
-    def look_up(self, planes: Tensor, places: Tensor, mode: str = "bilinear") -> Tensor:
-        """(C, N, M) values of (1, C, H, W) planes at (N, M, 2) places; 0 outside."""
-        return grid_sample(planes, places[None], mode=mode, align_corners=False)[0]
+    vertices: Float[Tensor, "V2 3"]
+    faces: Int64[Tensor, "F2 3"]
+    moved: int
+    contradicted: float
 
 
 @torch.no_grad()
-def open_hollows(
-    dataset: Dataset, vertices: Float[Tensor, "V 3"], faces: Int64[Tensor, "F 3"]
-) -> tuple[Float[Tensor, "V2 3"], Int64[Tensor, "F2 3"], int]:
+def open_hollows(dataset: Dataset, vertices: Float[Tensor, "V 3"], faces: Int64[Tensor, "F 3"]) -> Opened:
     """Pushes lids of the visual hull in to where the training views agree.
 
-    Agreement is the normalised cross-correlation of patches of the photos, so exposure does not matter; where there is
-    no texture nothing moves. Depths along a lid's normal are chosen by belief propagation, smooth but for tears at the
-    walls. Lids under which the photos do not agree either stay. What was stretched into walls is divided, and looked at
-    again.
+    Where there is no texture nothing moves. Depths along a lid's normal are chosen by belief propagation, smooth but
+    for tears at the walls. Lids under which the photos do not agree either stay. What was stretched into walls is
+    divided, and looked at again.
 
     Args:
         dataset: photos with alpha around an object in the unit ball.
         vertices: (V, 3) of the hull, from `visual_hull`.
         faces: (F, 3) of it.
-
-    Returns:
-        Vertices (V2, 3), faces (F2, 3), at most half as many again, and how many vertices moved.
     """
-    while max(dataset.images.sizes[index][0] for index in dataset.train) > _WIDEST:
-        dataset = dataset.halved()
-    photos = _photos(dataset)
+    dataset = reduced(dataset)
+    photos = photos_of(dataset)
     if len(photos) < 2 or len(vertices) == 0:
-        return vertices, faces, 0
+        return Opened(vertices, faces, 0, 0.0)
     edge, most = float(_edge_lengths(vertices, faces).mean()), len(faces) * 3 // 2
-    outside, total = outside_hull(dataset), 0
+    outside, total, share = outside_hull(dataset), 0, 0.0
     for _ in range(_PASSES):
-        vertices, moved = _push(photos, outside, vertices, faces)
+        vertices, moved, share = _push(photos, outside, vertices, faces)
         if moved == 0:
             break
         total += moved
         vertices, faces = _divided(vertices, faces, _LONGEST * edge, most)
-    return vertices, faces, total
+    return Opened(vertices, faces, total, share)
 
 
-def _push(photos: list[_Photo], outside: Distance, vertices: Tensor, faces: Tensor) -> tuple[Tensor, int]:
-    """Moved vertices, and how many: one look at all lids."""
+def _push(photos: list[Photo], outside: Distance, vertices: Tensor, faces: Tensor) -> tuple[Tensor, int, float]:
+    """Moved vertices, how many, and what photos contradict before: one look at all lids."""
     edges = MeshTopology.from_faces(faces, len(vertices)).edges.long()
-    distance = torch.stack([photo.center.norm() for photo in photos]).mean()
-    pixel = float(distance / photos[0].K[0, 0])
-    hits = [_first_hits(photo, vertices, faces) for photo in photos]
+    pixel = pixel_size(photos)
+    hits = [first_hits(photo, vertices, faces) for photo in photos]
 
-    raw = vertex_normals(vertices, faces)
-    score = _surface_agreement(photos, hits, vertices, _averaged(raw, edges, _SMOOTH), pixel)
-    lid = _ring_mean(score, edges) < _AGREED
+    score = surface_agreement(photos, hits, vertices, faces, edges)
+    share = contradicted_share(score, vertices, faces, edges)
+    lid = score < _AGREED
     own = lid.nonzero()[:, 0]
     if len(own) < _FEWEST:
-        return vertices, 0
+        return vertices, 0, share
     number = torch.full((len(vertices),), -1)
     number[own] = torch.arange(len(own))
     links = number[edges[lid[edges].all(dim=1)]]
 
-    inward = -_averaged(raw[own], links, _SMOOTH_LID)
+    inward = -averaged(vertex_normals(vertices, faces)[own], links, _SMOOTH_LID)
     depths = _STEP * pixel * torch.arange(int(_DEEPEST / (_STEP * pixel)) + 1)
     lids = [((hit >= 0) & (lid[faces].sum(dim=1) >= 2)[hit.clamp_min(0)]).float()[None, None] for _, hit in hits]
     free = _within(outside, vertices[own], inward, depths)
@@ -163,10 +141,10 @@ def _push(photos: list[_Photo], outside: Distance, vertices: Tensor, faces: Tens
     depth = _where_agreed(depth, found, links, edge / float(depths[1]))
     way, moved = depths[depth], vertices.clone()
     moved[own] += way[:, None] * inward
-    seen = _seen(photos, [_first_hits(photo, moved, faces) for photo in photos], moved[own], pixel)
+    seen = seen_by(photos, [first_hits(photo, moved, faces) for photo in photos], moved[own], pixel)
     way = _without_unseen(way, seen, edges.flatten().bincount(minlength=len(vertices))[own], links)
     moved[own] = vertices[own] + way[:, None] * inward
-    return moved, int((way > depths[1]).sum())
+    return moved, int((way > depths[1]).sum()), share
 
 
 def _divided(vertices: Tensor, faces: Tensor, longest: float, most: int) -> tuple[Tensor, Tensor]:
@@ -190,45 +168,7 @@ def _edge_lengths(vertices: Tensor, faces: Tensor) -> Tensor:
     return (vertices[faces] - vertices[faces.roll(1, dims=1)]).norm(dim=2)
 
 
-def _photos(dataset: Dataset) -> list[_Photo]:
-    viewmats, Ks = dataset.viewmats[dataset.train].float(), dataset.Ks[dataset.train].float()
-    pixels = [as_float(dataset.images[index]).permute(2, 0, 1)[None] for index in dataset.train]
-    return [_Photo(*each) for each in zip(pixels, viewmats, Ks, camera_centers(viewmats), strict=True)]
-
-
-def _first_hits(photo: _Photo, vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
-    """(H, W) depth of the surface at each pixel, 0 where there is none, and (H, W) its face, else -1."""
-    height, width = photo.pixels.shape[2:]
-    drawn = rasterize_opaque(
-        vertices, faces=faces, viewmats=photo.viewmat[None], Ks=photo.K[None], width=width, height=height
-    )
-    assert drawn.triangle is not None
-    assert drawn.depth is not None
-    triangle = drawn.triangle[0].long()
-    return torch.where(triangle >= 0, drawn.depth[0, ..., 0], 0.0), triangle
-
-
-def _surface_agreement(
-    photos: list[_Photo], hits: list[tuple[Tensor, Tensor]], points: Tensor, normals: Tensor, pixel: float
-) -> Tensor:
-    """(V,) how far photos agree at points of the surface that they see."""
-    masks = [(photo.pixels[:, 3:] >= 0.95).float() for photo in photos]
-    return _agreement(photos, masks, points, normals, _seen(photos, hits, points, pixel), pixel, fewest=3)
-
-
-def _seen(photos: list[_Photo], hits: list[tuple[Tensor, Tensor]], points: Tensor, pixel: float) -> Bool[Tensor, "B V"]:
-    """Which photos see which points of the surface."""
-    seen = []
-    for photo, (depth, _) in zip(photos, hits, strict=True):
-        place, z = photo.project(points)
-        around = max_pool2d(depth[None, None], 3, stride=1, padding=1)
-        seen.append(z <= photo.look_up(around, place[None], "nearest")[0, 0] + 1.5 * pixel)
-    return torch.stack(seen)
-
-
-def _agreement_behind(
-    photos: list[_Photo], lids: list[Tensor], points: Tensor, normals: Tensor, pixel: float
-) -> Tensor:
+def _agreement_behind(photos: list[Photo], lids: list[Tensor], points: Tensor, normals: Tensor, pixel: float) -> Tensor:
     """(N,) how far photos agree at points that they see through lids, which are masks (1, 1, H, W)."""
     seen = torch.stack(
         [
@@ -238,53 +178,8 @@ def _agreement_behind(
     )
     enough = seen.sum(dim=0) >= 2
     found = torch.full((len(points),), torch.nan)
-    found[enough] = _agreement(photos, lids, points[enough], normals[enough], seen[:, enough], pixel, fewest=2)
+    found[enough] = agreement(photos, lids, points[enough], normals[enough], seen[:, enough], pixel, fewest=2)
     return found
-
-
-def _agreement(
-    photos: list[_Photo],
-    masks: list[Tensor],
-    points: Float[Tensor, "N 3"],
-    normals: Float[Tensor, "N 3"],
-    seen: Bool[Tensor, "B N"],
-    pixel: float,
-    *,
-    fewest: int,
-) -> Float[Tensor, " N"]:
-    """Mean of the upper half of the correlations between the photos that see each point; NaN if too few do."""
-    directions = normalize(torch.stack([photo.center for photo in photos])[:, None] - points, dim=2)
-    square = torch.where(seen, (directions * normals).sum(dim=2), -1.0)
-    cosine, asked = square.topk(min(_ASKED, len(photos)), dim=0)
-    patch = _patches(points, normals, pixel)
-    colors = torch.zeros(len(points), len(asked), patch.shape[1], 3)
-    valid = torch.zeros(*colors.shape[:3])
-    for index, photo in enumerate(photos):
-        rank, who = ((asked == index) & (cosine > _SLANT)).nonzero(as_tuple=True)
-        place = photo.project(patch[who])[0]
-        colors[who, rank] = photo.look_up(photo.pixels[:, :3], place).permute(1, 2, 0)
-        valid[who, rank] = photo.look_up(masks[index], place, "nearest")[0]
-    mean = (colors * valid[..., None]).sum(dim=2) / valid.sum(dim=2).clamp_min(1)[..., None]
-    colors = (colors - mean[:, :, None]) * valid[..., None]
-    length = colors.square().sum(dim=(2, 3)).sqrt()
-    shows = (valid.mean(dim=2) > 0.7) & (length > _FLAT * (3 * patch.shape[1]) ** 0.5)
-    unit = (colors / length.clamp_min(1e-6)[..., None, None]).flatten(2)
-    first, second = torch.triu_indices(len(asked), len(asked), 1)
-    both = shows[:, first] & shows[:, second]
-    ranked = torch.where(both, (unit @ unit.mT)[:, first, second], -torch.inf).sort(dim=1, descending=True).values
-    half = (both.sum(dim=1) + 1) // 2
-    kept = torch.where(torch.arange(ranked.shape[1]) < half[:, None], ranked, 0.0).sum(dim=1)
-    return torch.where(shows.sum(dim=1) >= fewest, kept / half, torch.nan)
-
-
-def _patches(points: Tensor, normals: Tensor, pixel: float) -> Tensor:
-    """(N, P, 3) grids of points across the normals, a pixel apart."""
-    across = torch.where(normals[:, :1].abs() < 0.7, torch.tensor([1.0, 0.0, 0.0]), torch.tensor([0.0, 1.0, 0.0]))
-    u = normalize(torch.linalg.cross(normals, across), dim=1)
-    v = torch.linalg.cross(normals, u)
-    steps = pixel * (torch.arange(_PATCH) - (_PATCH - 1) / 2)
-    y, x = torch.meshgrid(steps, steps, indexing="ij")
-    return points[:, None] + x.reshape(-1, 1) * u[:, None] + y.reshape(-1, 1) * v[:, None]
 
 
 def _within(outside: Distance, points: Tensor, inward: Tensor, depths: Tensor) -> Bool[Tensor, "N D"]:
@@ -353,17 +248,3 @@ def _without_unseen(way: Tensor, seen: Bool[Tensor, "B N"], neighbours: Tensor, 
         mean = torch.zeros_like(way).index_add(0, target, way[source]) / neighbours
         way = torch.where(doubtful, mean, way)
     return way
-
-
-def _averaged(normals: Tensor, edges: Tensor, rounds: int) -> Tensor:
-    source, target = torch.cat([edges, edges.flip(1)]).T
-    for _ in range(rounds):
-        normals = normalize(normals.index_add(0, target, normals[source]), dim=1)
-    return normals
-
-
-def _ring_mean(values: Tensor, edges: Tensor) -> Tensor:
-    """(V,) the mean over a vertex and its neighbours of what is not NaN."""
-    source, target = torch.cat([edges, edges.flip(1)]).T
-    known, value = (~values.isnan()).float(), values.nan_to_num()
-    return value.index_add(0, target, value[source]) / known.index_add(0, target, known[source])

@@ -22,6 +22,9 @@ GOOD_IOU = 0.97
 GOOD_INTERSECTING = 1.0
 """Percentage of faces that cut through others, which good results have at most."""
 
+CONTRADICTED = 0.01
+"""Share of the surface that photos contradict in one patch, which good results have at most."""
+
 TRAINING_VIEWS = 16
 """So many training views, evenly spaced, are looked at where there are no test views."""
 
@@ -136,6 +139,7 @@ def judge(
     found: Shape,
     expected: Expected,
     *,
+    contradicted: float,
     begun: Start,
     preset: str,
     untangled: bool,
@@ -148,6 +152,7 @@ def judge(
         intersecting_percent: faces that cut through others.
         found: what the result looks like.
         expected: what it should look like.
+        contradicted: the largest patch that photos contradict, as a fraction of the surface.
         begun: what the run started from; with the rest it decides what to try next.
         preset: of the run.
         untangled: whether faces that cut through others were smoothed away.
@@ -165,6 +170,11 @@ def judge(
     if intersecting_percent > GOOD_INTERSECTING:
         remedy = (hull or longer or "--init-mesh") if untangled else "--refinement.untanglings 6"
         poor.append(f"{intersecting_percent:.1f} % of its faces cut through others: try {remedy}")
+    if contradicted > CONTRADICTED:
+        poor.append(
+            f"photos contradict each other on {100 * contradicted:.1f} % of its surface, where a hollow may be closed: "
+            "try more photos that look into it, or depth maps"
+        )
     return Judgement(
         views=views,
         silhouette_iou=iou,

@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from etsplat.data.agreement import contradicted
 from etsplat.data.dataset import Dataset
 from etsplat.engines.choice import engine
 from etsplat.geometry.parts import Shape, genera, shape_of
@@ -33,6 +34,7 @@ from etsplat.optim.vertex_updates import UniformSteps
 from etsplat.tasks.depths import trusted_depths, wanted_depths
 from etsplat.tasks.export_mesh import Reconstruction
 from etsplat.tasks.judgement import (
+    CONTRADICTED,
     TRAINING_VIEWS,
     Judgement,
     Start,
@@ -46,7 +48,7 @@ from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.running import Job, Result, path_of, terms_of
 from etsplat.tasks.scoring import Scorer, load_lpips
 from etsplat.tasks.sources import Source, fingerprint, load_source, make_subject
-from etsplat.tasks.starts import load_start, make_start, nearby
+from etsplat.tasks.starts import Started, load_start, make_start, nearby
 from etsplat.tasks.texturing import check_installed
 
 DEPTHS_NEAR, DEPTHS_FAR = 0.02, 0.15
@@ -138,8 +140,9 @@ def reconstruct(
             supersampling=config.pictures.supersampling,
             lpips=load_lpips(config.output.lpips_weights, job.device),
         )
-        mesh, begun = make_start(start, views, config, job.device)
-        judging = partial(_judge, scorer, views, truth, config, begun, shape_of(*mesh.surface()))
+        started = make_start(start, views, config, job.device)
+        mesh, begun, _ = started
+        judging = partial(_judge, scorer, views, truth, config, started, shape_of(*mesh.surface()))
         if begun == "hull":
             holes = genera(mesh.faces.cpu(), len(mesh.vertices))
             job.announce(NoteEvent(f"start: the visual hull, {mesh.count:,} faces; holes in each part: {holes}"))
@@ -195,16 +198,28 @@ def _judge(
     views: Dataset,
     truth: MeshFile | None,
     config: ReconstructConfig,
-    begun: Start,
+    started: Started,
     start: Shape,
     mesh: TriangleMesh,
     scores: Mapping[str, Any],
 ) -> Judgement:
-    """A run ends with the parts and holes of its start, so those of a hull are what its silhouettes show."""
+    """A run ends with the parts and holes of its start, so those of a hull are what its silhouettes show.
+
+    Args:
+        scorer: of the run.
+        views: all of them.
+        truth: the mesh that was photographed, if one was.
+        config: of the run.
+        started: from what.
+        start: the parts and holes that it had, before it was fitted.
+        mesh: the result.
+        scores: of it.
+    """
     found = shape_of(*mesh.surface())
+    doubtful = started.contradicted > CONTRADICTED
     if truth is not None:
         expected = expect_mesh(truth, views, found, config.start.radius)
-    elif begun == "hull":
+    elif started.kind == "hull":
         expected = expect_hull(start)
     else:
         expected = expect_photos(views, found, config.start.radius)
@@ -214,7 +229,8 @@ def _judge(
         100 * scores["self_intersections"] / mesh.count,
         found,
         expected,
-        begun=begun,
+        contradicted=contradicted(views, *mesh.surface()) if doubtful else 0.0,
+        begun=started.kind,
         preset=config.preset,
         untangled=config.refinement.untanglings > 0,
     )

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -19,6 +19,20 @@ from etsplat.io.mesh_files import MeshFile, load_mesh, weld_vertices
 from etsplat.model.triangle_mesh import MeshAppearance, TriangleMesh
 from etsplat.tasks.judgement import Start
 from etsplat.tasks.reconstruct_config import ReconstructConfig
+
+
+class Started(NamedTuple):
+    """What a run starts from.
+
+    Attributes:
+        mesh: in the unit frame.
+        kind: where it comes from.
+        contradicted: the largest patch of a hull that photos contradict, as a fraction of its area; 0 otherwise.
+    """
+
+    mesh: TriangleMesh
+    kind: Start
+    contradicted: float
 
 
 def load_start(start: str | Path | MeshFile | None) -> MeshFile | None:
@@ -43,10 +57,8 @@ def start_shape(config: ReconstructConfig, views: Dataset) -> Literal["sphere", 
 
 def make_start(
     start: MeshFile | None, views: Dataset, config: ReconstructConfig, device: torch.device | None = None
-) -> tuple[TriangleMesh, Start]:
+) -> Started:
     """The mesh that a run starts from, in the unit frame: an icosphere around the object, its hull, or the given mesh.
-
-    With it what it is.
 
     Args:
         start: from `load_start`, in the input's units; its colours are used if it has the kind that is optimised.
@@ -58,9 +70,10 @@ def make_start(
         InputError: the hull is asked for, and the views have no masks, or masks that exclude everything.
     """
     colors: Tensor | float = config.start.color
-    begun: Start = start_shape(config, views) if start is None else "mesh"
-    if begun == "hull":
-        vertices, faces, _ = open_hollows(views, *plain_hull(views, config))
+    kind: Start = start_shape(config, views) if start is None else "mesh"
+    contradicted = 0.0
+    if kind == "hull":
+        vertices, faces, _, contradicted = open_hollows(views, *plain_hull(views, config))
         vertices = untangle(vertices, MeshTopology.from_faces(faces, len(vertices)))[0]
     elif start is None:
         vertices, faces = icosphere(config.start.level)
@@ -80,7 +93,7 @@ def make_start(
         appearance=MeshAppearance(kernel, config.drawing.distance, config.drawing.backend),
         harmonics=config.drawing.harmonics,
     )
-    return mesh, begun
+    return Started(mesh, kind, contradicted)
 
 
 def plain_hull(views: Dataset, config: ReconstructConfig) -> tuple[Tensor, Tensor]:

@@ -1,0 +1,216 @@
+"""How far photos agree on what they show at points of a surface.
+
+That is the normalised cross-correlation of patches, so exposure does not matter, and where there is no texture nothing
+is known.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int64
+from torch import Tensor
+from torch.nn.functional import grid_sample, max_pool2d, normalize
+
+from etsplat.core.cameras import camera_centers
+from etsplat.data.dataset import Dataset
+from etsplat.data.pictures import as_float
+from etsplat.geometry.measures import face_areas, vertex_normals
+from etsplat.geometry.topology import MeshTopology, connected
+from etsplat.ops.rasterize_opaque import rasterize_opaque
+
+_WIDEST = 320
+"""Photos are halved until none is wider: agreement asks for texture, not for detail."""
+
+_PATCH = 7
+"""Pixels across the patches that are compared."""
+
+_ASKED = 12
+"""At most so many photos are compared at a point: those that look at it most squarely."""
+
+_SLANT = 0.2
+"""Cosine of the angle to the normal, below which a photo is not asked."""
+
+_FLAT = 0.01
+"""Standard deviation of colours below which a patch shows nothing to compare."""
+
+_SMOOTH = 3
+"""Rounds in which normals are averaged with their neighbours'."""
+
+_CONTRADICTED = 0.4
+"""Correlation below which photos show different things, as on a lid over a hollow; gloss seldom goes so low."""
+
+
+@dataclass(frozen=True)
+class Photo:
+    """A photo with its camera: (1, 4, H, W) pixels, (4, 4), (3, 3) and (3,)."""
+
+    pixels: Tensor
+    viewmat: Tensor
+    K: Tensor
+    center: Tensor
+
+    def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """(..., 2) places as `grid_sample` has them, and (...) depths, of (..., 3) points."""
+        camera = points @ self.viewmat[:3, :3].T + self.viewmat[:3, 3]
+        z = camera[..., 2]
+        height, width = self.pixels.shape[2:]
+        pixel = (camera @ self.K.T)[..., :2] / torch.where(z > 0, z, 1.0)[..., None]
+        place = 2 * pixel / torch.tensor([width, height]) - 1
+        return torch.where(z[..., None] > 0, place, 2.0), z
+
+    def look_up(self, planes: Tensor, places: Tensor, mode: str = "bilinear") -> Tensor:
+        """(C, N, M) values of (1, C, H, W) planes at (N, M, 2) places; 0 outside."""
+        return grid_sample(planes, places[None], mode=mode, align_corners=False)[0]
+
+
+def reduced(dataset: Dataset) -> Dataset:
+    """Halved until no training view is wider than agreement asks for."""
+    while dataset.train and max(dataset.images.sizes[index][0] for index in dataset.train) > _WIDEST:
+        dataset = dataset.halved()
+    return dataset
+
+
+def photos_of(dataset: Dataset) -> list[Photo]:
+    """Of the training views, as `reduced` makes them."""
+    dataset = reduced(dataset)
+    viewmats, Ks = dataset.viewmats[dataset.train].float(), dataset.Ks[dataset.train].float()
+    pixels = [as_float(dataset.images[index]).permute(2, 0, 1)[None] for index in dataset.train]
+    return [Photo(*each) for each in zip(pixels, viewmats, Ks, camera_centers(viewmats), strict=True)]
+
+
+def pixel_size(photos: list[Photo]) -> float:
+    """How large a pixel is at the object, in its units."""
+    distance = torch.stack([photo.center.norm() for photo in photos]).mean()
+    return float(distance / photos[0].K[0, 0])
+
+
+def first_hits(photo: Photo, vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
+    """(H, W) depth of the surface at each pixel, 0 where there is none, and (H, W) its face, else -1."""
+    height, width = photo.pixels.shape[2:]
+    drawn = rasterize_opaque(
+        vertices, faces=faces, viewmats=photo.viewmat[None], Ks=photo.K[None], width=width, height=height
+    )
+    assert drawn.triangle is not None
+    assert drawn.depth is not None
+    triangle = drawn.triangle[0].long()
+    return torch.where(triangle >= 0, drawn.depth[0, ..., 0], 0.0), triangle
+
+
+def surface_agreement(
+    photos: list[Photo], hits: list[tuple[Tensor, Tensor]], vertices: Tensor, faces: Tensor, edges: Tensor
+) -> Float[Tensor, " V"]:
+    """How far photos agree at the vertices that they see, mean over a vertex and its neighbours; NaN if none is known.
+
+    Args:
+        photos: from `photos_of`.
+        hits: of each, from `first_hits`.
+        vertices: (V, 3) of the surface.
+        faces: (F, 3).
+        edges: (E, 2).
+    """
+    pixel = pixel_size(photos)
+    masks = [(photo.pixels[:, 3:] >= 0.95).float() for photo in photos]
+    normals = averaged(vertex_normals(vertices, faces), edges, _SMOOTH)
+    seen = seen_by(photos, hits, vertices, pixel)
+    return _ring_mean(agreement(photos, masks, vertices, normals, seen, pixel, fewest=3), edges)
+
+
+@torch.no_grad()
+def contradicted(dataset: Dataset, vertices: Float[Tensor, "V 3"], faces: Int64[Tensor, "F 3"]) -> float:
+    """`contradicted_share` of a surface around which the photos of a dataset were taken; 0 where there are none."""
+    photos = photos_of(dataset)
+    if len(photos) < 2 or len(vertices) == 0:
+        return 0.0
+    edges = MeshTopology.from_faces(faces, len(vertices)).edges.long()
+    hits = [first_hits(photo, vertices, faces) for photo in photos]
+    score = surface_agreement(photos, hits, vertices, faces, edges)
+    return contradicted_share(score, vertices, faces, edges)
+
+
+def contradicted_share(score: Float[Tensor, " V"], vertices: Tensor, faces: Tensor, edges: Tensor) -> float:
+    """The largest patch of a surface on which photos show different things, as a fraction of its area.
+
+    Args:
+        score: (V,) from `surface_agreement`.
+        vertices: (V, 3).
+        faces: (F, 3).
+        edges: (E, 2).
+    """
+    low = score < _CONTRADICTED
+    count, patch = connected(edges[low[edges].all(dim=1)], len(vertices))
+    area = face_areas(vertices, faces)
+    within = low[faces].all(dim=1)
+    patches = torch.zeros(count).index_add(0, patch[faces[within, 0]], area[within])
+    return float(patches.amax() / area.sum())
+
+
+def seen_by(
+    photos: list[Photo], hits: list[tuple[Tensor, Tensor]], points: Tensor, pixel: float
+) -> Bool[Tensor, "B V"]:
+    """Which photos see which points of the surface (V, 3), whose pixels are so large."""
+    seen = []
+    for photo, (depth, _) in zip(photos, hits, strict=True):
+        place, z = photo.project(points)
+        around = max_pool2d(depth[None, None], 3, stride=1, padding=1)
+        seen.append(z <= photo.look_up(around, place[None], "nearest")[0, 0] + 1.5 * pixel)
+    return torch.stack(seen)
+
+
+def agreement(
+    photos: list[Photo],
+    masks: list[Tensor],
+    points: Float[Tensor, "N 3"],
+    normals: Float[Tensor, "N 3"],
+    seen: Bool[Tensor, "B N"],
+    pixel: float,
+    *,
+    fewest: int,
+) -> Float[Tensor, " N"]:
+    """Mean of the upper half of the correlations between the photos that see each point; NaN if too few do."""
+    directions = normalize(torch.stack([photo.center for photo in photos])[:, None] - points, dim=2)
+    square = torch.where(seen, (directions * normals).sum(dim=2), -1.0)
+    cosine, asked = square.topk(min(_ASKED, len(photos)), dim=0)
+    patch = _patches(points, normals, pixel)
+    colors = torch.zeros(len(points), len(asked), patch.shape[1], 3)
+    valid = torch.zeros(*colors.shape[:3])
+    for index, photo in enumerate(photos):
+        rank, who = ((asked == index) & (cosine > _SLANT)).nonzero(as_tuple=True)
+        place = photo.project(patch[who])[0]
+        colors[who, rank] = photo.look_up(photo.pixels[:, :3], place).permute(1, 2, 0)
+        valid[who, rank] = photo.look_up(masks[index], place, "nearest")[0]
+    mean = (colors * valid[..., None]).sum(dim=2) / valid.sum(dim=2).clamp_min(1)[..., None]
+    colors = (colors - mean[:, :, None]) * valid[..., None]
+    length = colors.square().sum(dim=(2, 3)).sqrt()
+    shows = (valid.mean(dim=2) > 0.7) & (length > _FLAT * (3 * patch.shape[1]) ** 0.5)
+    unit = (colors / length.clamp_min(1e-6)[..., None, None]).flatten(2)
+    first, second = torch.triu_indices(len(asked), len(asked), 1)
+    both = shows[:, first] & shows[:, second]
+    ranked = torch.where(both, (unit @ unit.mT)[:, first, second], -torch.inf).sort(dim=1, descending=True).values
+    half = (both.sum(dim=1) + 1) // 2
+    kept = torch.where(torch.arange(ranked.shape[1]) < half[:, None], ranked, 0.0).sum(dim=1)
+    return torch.where(shows.sum(dim=1) >= fewest, kept / half, torch.nan)
+
+
+def _patches(points: Tensor, normals: Tensor, pixel: float) -> Tensor:
+    """(N, P, 3) grids of points across the normals, a pixel apart."""
+    across = torch.where(normals[:, :1].abs() < 0.7, torch.tensor([1.0, 0.0, 0.0]), torch.tensor([0.0, 1.0, 0.0]))
+    u = normalize(torch.linalg.cross(normals, across), dim=1)
+    v = torch.linalg.cross(normals, u)
+    steps = pixel * (torch.arange(_PATCH) - (_PATCH - 1) / 2)
+    y, x = torch.meshgrid(steps, steps, indexing="ij")
+    return points[:, None] + x.reshape(-1, 1) * u[:, None] + y.reshape(-1, 1) * v[:, None]
+
+
+def averaged(normals: Float[Tensor, "V 3"], edges: Int64[Tensor, "E 2"], rounds: int) -> Float[Tensor, "V 3"]:
+    """Unit normals, each so many times averaged with its neighbours'."""
+    source, target = torch.cat([edges, edges.flip(1)]).T
+    for _ in range(rounds):
+        normals = normalize(normals.index_add(0, target, normals[source]), dim=1)
+    return normals
+
+
+def _ring_mean(values: Tensor, edges: Tensor) -> Tensor:
+    """(V,) the mean over a vertex and its neighbours of what is not NaN."""
+    source, target = torch.cat([edges, edges.flip(1)]).T
+    known, value = (~values.isnan()).float(), values.nan_to_num()
+    return value.index_add(0, target, value[source]) / known.index_add(0, target, known[source])
