@@ -1,9 +1,10 @@
 """Operations compute in the precision of their arguments."""
 
+import sys
 from collections.abc import Callable
 from contextlib import ExitStack
-from functools import wraps
-from typing import ParamSpec, TypeVar
+from functools import cache, wraps
+from typing import ParamSpec, TypeVar, cast
 
 import torch
 
@@ -12,7 +13,10 @@ Result = TypeVar("Result")
 
 
 def as_given(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
-    """The same function, for which `torch.autocast` around it is off: bfloat16 would spoil positions and depths."""
+    """The same function, for which `torch.autocast` around it is off: bfloat16 would spoil positions and depths.
+
+    `torch.compile` calls it as it is: there is nothing to gain in native calls, and old versions end at them.
+    """
 
     @wraps(function)
     def called(*arguments: Arguments.args, **named: Arguments.kwargs) -> Result:
@@ -22,4 +26,11 @@ def as_given(function: Callable[Arguments, Result]) -> Callable[Arguments, Resul
                 stack.enter_context(torch.autocast(device, enabled=False))
             return function(*arguments, **named)
 
-    return called
+    uncompiled = cache(lambda: cast(Callable[Arguments, Result], torch.compiler.disable(called)))
+
+    @wraps(function)
+    def chosen(*arguments: Arguments.args, **named: Arguments.kwargs) -> Result:
+        # To disable imports the compiler, which takes seconds: only where it is at work.
+        return (uncompiled() if "torch._dynamo" in sys.modules else called)(*arguments, **named)
+
+    return chosen

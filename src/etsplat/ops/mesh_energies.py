@@ -14,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from etsplat.core.connectivity import MeshConnectivity
+from etsplat.core.precision import as_given
 from etsplat.core.validation import check_shape
 from etsplat.engines.choice import engine_for
 
@@ -32,6 +33,7 @@ class MeshEnergies(NamedTuple):
     laplacian: Float[Tensor, ""]
 
 
+@as_given
 def mesh_energies(
     vertices: Float[Tensor, "V 3"],
     connectivity: MeshConnectivity,

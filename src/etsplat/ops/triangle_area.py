@@ -3,10 +3,12 @@
 from jaxtyping import Float
 from torch import Tensor
 
+from etsplat.core.precision import as_given
 from etsplat.core.validation import check_shape
 from etsplat.engines.choice import engine_for
 
 
+@as_given
 def mean_area(vertices: Float[Tensor, "N 3 3"]) -> Float[Tensor, ""]:
     """Mean of |(v1 - v0) x (v2 - v0)| / 2.
 
