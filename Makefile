@@ -13,11 +13,12 @@ PY := $(VENV)/bin/python
 PIP := $(PY) -m pip --disable-pip-version-check install --quiet
 TOOLS := $(VENV)/.stamp-tools
 INSTALLED := $(VENV)/.stamp-installed
+DOCS := $(VENV)/.stamp-docs
 SANITIZED := build/sanitize/.stamp
 # Folders are listed too: their time changes when a file is added or removed.
 NATIVE := CMakeLists.txt $(shell find csrc)
 
-.PHONY: help setup demo test lint format stubs bench equal-bits fuzz fuzz-short sanitize races soak lock audit \
+.PHONY: help setup demo test lint docs format stubs bench equal-bits fuzz fuzz-short sanitize races soak lock audit \
 	check-neon wheel check-wheel clean
 
 help:
@@ -25,6 +26,7 @@ help:
 	@echo "make demo         reconstruct a built-in object into runs/demo"
 	@echo "make test         run the tests"
 	@echo "make lint         ruff, pyright, import-linter"
+	@echo "make docs         the documentation as a site, build/docs/index.html; warnings are errors"
 	@echo "make stubs        describe the native calls to Python (src/etsplat/_native.pyi)"
 	@echo "make bench        measure the CPU engine"
 	@echo "make equal-bits BASE=COMMIT  small runs end with the same bits as at that commit; CASES='scene-*' for some"
@@ -70,6 +72,15 @@ lint: setup
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/pyright
 	$(VENV)/bin/lint-imports --no-cache
+
+# Sphinx and its like come from the group `docs`, at their newest: the lock does not name them.
+$(DOCS): $(INSTALLED)
+	$(PIP) -c constraints.txt --group docs
+	@touch $@
+
+docs: $(DOCS)
+	$(PY) -m sphinx --builder html --fresh-env --write-all --fail-on-warning --keep-going --quiet \
+		--conf-dir docs --doctree-dir build/doctrees . build/docs
 
 format: setup
 	$(VENV)/bin/ruff check --fix .
@@ -166,5 +177,5 @@ check-wheel: wheel
 	rm -rf build/wheel-check
 
 clean:
-	rm -rf $(VENV) build dist .pytest_cache .ruff_cache .hypothesis
-	find src tests benchmarks studies examples -name __pycache__ -type d -prune -exec rm -rf {} +
+	rm -rf $(VENV) build dist docs/generated .pytest_cache .ruff_cache .hypothesis
+	find src tests benchmarks docs studies examples -name __pycache__ -type d -prune -exec rm -rf {} +

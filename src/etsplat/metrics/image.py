@@ -140,7 +140,7 @@ class Lpips(nn.Module):
 
     At five layers l of VGG16 the features of both images are scaled to unit length at every pixel, subtracted, squared,
     weighted per channel by w_l >= 0 and averaged over pixels; LPIPS is the sum over the layers:
-    sum_l mean_hw sum_c w_lc (f_lc(a) / |f_l(a)| - f_lc(b) / |f_l(b)|)^2.
+    ``sum_l mean_hw sum_c w_lc (f_lc(a) / |f_l(a)| - f_lc(b) / |f_l(b)|)^2``.
 
     The state dict has exactly these entries (float32), which are torchvision's and LPIPS's own names:
     `features.{0,2,5,7,10,12,14,17,19,21,24,26,28}.{weight,bias}` (3x3 convolutions of torchvision's vgg16 with weights
