@@ -4,8 +4,9 @@ import sys
 from importlib import metadata
 from pathlib import Path
 
+from docutils import nodes
 from sphinx.application import Sphinx
-from sphinx.domains.python import PythonDomain
+from sphinx.domains.python import PyFunction
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
@@ -46,6 +47,9 @@ python_display_short_literal_types = True
 add_module_names = False
 toc_object_entries_show_parents = "hide"
 
+copybutton_prompt_text = r">>> |\.\.\. "  # and what is printed is not copied
+copybutton_prompt_is_regexp = True
+
 html_theme = "furo"
 html_title = f"etsplat {release}"
 html_static_path = ["_static"]
@@ -59,7 +63,7 @@ pygments_dark_style = "github-dark"
 
 def setup(app: Sphinx) -> None:
     """What Sphinx has no settings for."""
-    for field in PythonDomain.directives["class"].doc_field_types:  # one list for all kinds of names
+    for field in PyFunction.doc_field_types:  # one list for all kinds of names
         field.label = {"variable": "Attributes"}.get(field.name, field.label)
 
     def skip(app: Sphinx, what: str, name: str, member: object, skip: bool, options: object) -> bool | None:
@@ -73,5 +77,12 @@ def setup(app: Sphinx) -> None:
             page += '<meta http-equiv="refresh" content="0; url=docs/index.html"><a href="docs/index.html">etsplat</a>'
             (Path(app.outdir) / "index.html").write_text(page + "\n", encoding="utf-8")
 
+    def dashes(app: Sphinx, doctree: nodes.document) -> None:
+        """Between a parameter and what it is."""
+        for text in list(doctree.findall(nodes.Text)):
+            if text == " -- ":
+                text.parent.replace(text, nodes.Text(" – "))
+
     app.connect("autodoc-skip-member", skip)
+    app.connect("doctree-read", dashes)
     app.connect("build-finished", lead_on)

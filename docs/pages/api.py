@@ -12,7 +12,7 @@ TOPICS: Mapping[str, tuple[str, str, tuple[str, ...]]] = {
     "rendering": (
         "Rendering",
         "Triangles to pictures, with gradients.",
-        ("ops", "core.registered_kernels", "core.rasterization"),
+        ("ops.rasterize", "ops", "core.registered_kernels", "core.rasterization"),
     ),
     "cameras": ("Cameras and paths", "Where pictures are taken from.", ("core.cameras", "data.camera_paths")),
     "data": ("Posed photos", "Captures, photographs of a mesh, and what is built in code.", ("data",)),
@@ -71,7 +71,8 @@ def api_pages() -> dict[str, str]:
 
 _ABOUT = (
     "Everything that ``import etsplat`` offers. Capital letters in shapes are sizes: ``N`` triangles, ``V`` vertices,\n"
-    "``B`` views, ``H`` and ``W`` pixels, ``C`` channels. :doc:`/docs/conventions` says what axes and colours mean."
+    "``B`` views, ``H`` and ``W`` pixels, ``C`` channels. :doc:`/docs/conventions` says what axes and colours\n"
+    "mean. The examples know ``torch`` and ``etsplat``, and the tests run them."
 )
 
 

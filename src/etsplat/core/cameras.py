@@ -24,6 +24,13 @@ class Cameras:
         Ks: (B, 3, 3) intrinsics in pixels; pixel (i, j) has its centre at (j + 0.5, i + 0.5).
         width: Image width in pixels.
         height: Image height in pixels.
+
+    Example:
+        >>> around = etsplat.orbit_cameras(64, 48, elevations=(0.0, 30.0), azimuths=4)
+        >>> len(around), around.viewmats.shape
+        (8, torch.Size([8, 4, 4]))
+        >>> around[2].width  # one of them, or a slice
+        64
     """
 
     viewmats: Float[Tensor, "B 4 4"]
@@ -134,6 +141,12 @@ def look_at(
     Raises:
         ValueError: A wrong shape or dtype; ``eye`` coincides with ``target``, or ``up`` is parallel to the line of
             sight.
+
+    Example:
+        >>> eye = torch.tensor([0.0, 0.0, 3.0])
+        >>> viewmat = etsplat.look_at(eye, target=torch.zeros(3), up=torch.tensor([0.0, 1.0, 0.0]))
+        >>> (viewmat @ torch.tensor([0.0, 0.0, 0.0, 1.0])).tolist()[2]  # the target is three units ahead
+        3.0
     """
     check_memory("eye", eye)
     check_floating("eye", eye)
@@ -188,6 +201,10 @@ def intrinsics(
 
     Raises:
         ValueError: The field of view is outside (0, 180).
+
+    Example:
+        >>> etsplat.intrinsics(90.0, 200, 100).tolist()
+        [[50.0, 0.0, 100.0], [0.0, 50.0, 50.0], [0.0, 0.0, 1.0]]
     """
     if not 0.0 < fov_y_degrees < 180.0:
         raise ValueError(f"fov_y_degrees must be between 0 and 180, got {fov_y_degrees}")
@@ -208,6 +225,10 @@ def sphere_grid(
 
     Returns:
         (len(elevations) * len(azimuths), 3); the azimuth varies fastest.
+
+    Example:
+        >>> etsplat.sphere_grid([0.0], [0.0, 90.0], distance=2.0).round(decimals=4).abs().tolist()
+        [[0.0, 0.0, 2.0], [2.0, 0.0, 0.0]]
     """
     elevation, azimuth = torch.meshgrid(
         torch.deg2rad(torch.as_tensor(elevations, dtype=torch.float64)),

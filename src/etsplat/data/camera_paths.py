@@ -39,6 +39,11 @@ def orbit(viewmats: Viewmats, up: Float[Tensor, "3"], frames: int) -> Viewmats:
 
     Where they leave a gap of more than 60 degrees, from one end of what they cover to the other and back; where they do
     not look at one place, along the photos. `path_note` says which.
+
+    Example:
+        >>> cameras = etsplat.orbit_cameras(64, 64, elevations=(20.0,), azimuths=8)
+        >>> etsplat.orbit(cameras.viewmats, torch.tensor([0.0, 1.0, 0.0]), frames=30).shape
+        torch.Size([30, 4, 4])
     """
     _check(viewmats, up, frames)
     covered = coverage(viewmats, up)

@@ -20,6 +20,11 @@ def demo_object() -> MeshFile:
     """The demo's mesh: closed, manifold, genus 0, about 16,000 faces, all white; +y up, looking along +z.
 
     Deterministic. Takes about a second.
+
+    Example:
+        >>> owl = etsplat.demo_object()
+        >>> owl.vertices.shape[1], len(owl.faces) > 10_000
+        (3, True)
     """
     vertices, faces = dual_contour(owl, _LOWER, _CELL, _CELLS)
     return MeshFile(

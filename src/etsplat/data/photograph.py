@@ -44,6 +44,11 @@ def normalize_mesh(mesh: MeshFile) -> tuple[MeshFile, Normalization]:
 
     Raises:
         InputError: all vertices coincide.
+
+    Example:
+        >>> owl, placed = etsplat.normalize_mesh(etsplat.demo_object())
+        >>> round(float(owl.vertices.norm(dim=1).max()), 4)
+        1.0
     """
     center, radius = bounding_ball(mesh.vertices)
     if radius <= 0:
@@ -81,6 +86,11 @@ def photograph(
     Raises:
         ValueError: `width` below `height`, or elevations that look along the vertical.
         InputError: as `normalize_mesh`.
+
+    Example:
+        >>> photos = etsplat.photograph(etsplat.demo_object(), 32, 32, elevations=(0.0,), azimuths=5, supersampling=1)
+        >>> len(photos.cameras), photos.images[0].shape, list(photos.test)
+        (5, torch.Size([32, 32, 4]), [2])
     """
     if width < height:
         raise ValueError(f"width: expected at least the height ({height}), got {width}")
@@ -150,7 +160,12 @@ def draw_textured(
 
 
 def orbit_cameras(width: int, height: int, *, elevations: Sequence[float] = ELEVATIONS, azimuths: int = 8) -> Cameras:
-    """Cameras on the sphere of radius CAMERA_DISTANCE that look at the origin, +y up; the azimuth varies fastest."""
+    """Cameras on the sphere of radius CAMERA_DISTANCE that look at the origin, +y up; the azimuth varies fastest.
+
+    Example:
+        >>> len(etsplat.orbit_cameras(64, 64))
+        40
+    """
     degrees = [360.0 * k / azimuths for k in range(azimuths)]
     eyes = sphere_grid(elevations, degrees, CAMERA_DISTANCE, dtype=torch.float64)
     viewmats = look_at(eyes, torch.zeros(3, dtype=torch.float64), torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64))

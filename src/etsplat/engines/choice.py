@@ -51,6 +51,12 @@ def engine(name: str | None) -> Iterator[None]:
 
     Raises:
         ValueError: There is no such engine.
+
+    Example:
+        >>> with etsplat.engine("reference"):
+        ...     loss = etsplat.photometric_loss(torch.zeros(1, 8, 8, 3), torch.ones(1, 8, 8, 3), 0.0)
+        >>> float(loss)
+        1.0
     """
     token = _chosen.set(_chosen.get() if name is None else _named(name))
     try:

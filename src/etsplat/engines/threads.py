@@ -20,6 +20,13 @@ def set_num_threads(count: int) -> None:
 
     Raises:
         ValueError: ``count`` is negative.
+
+    Example:
+        >>> before = etsplat.num_threads()
+        >>> etsplat.set_num_threads(1)
+        >>> etsplat.num_threads()
+        1
+        >>> etsplat.set_num_threads(before)
     """
     if count < 0:
         raise ValueError(f"count must be 0 (all cores) or positive, got {count}")

@@ -21,6 +21,11 @@ def icosphere(level: int) -> tuple[Float[Tensor, "V 3"], Int[Tensor, "F 3"]]:
 
     Raises:
         ValueError: `level` is negative.
+
+    Example:
+        >>> vertices, faces = etsplat.icosphere(4)
+        >>> vertices.shape, faces.shape
+        (torch.Size([2562, 3]), torch.Size([5120, 3]))
     """
     if level < 0:
         raise ValueError(f"level must be at least 0, got {level}")

@@ -71,6 +71,13 @@ def longest_edge_plan(
 
     Raises:
         ValueError: a shape does not fit the topology, or a score is not finite.
+
+    Example:
+        >>> vertices, faces = etsplat.icosphere(0)
+        >>> topology = etsplat.MeshTopology.from_faces(faces, len(vertices))
+        >>> plan = etsplat.longest_edge_plan(vertices, topology, scores=torch.ones(20), budget_faces=30)
+        >>> len(plan.faces)
+        30
     """
     _check(vertices, topology, scores)
     order = torch.sort(scores.detach().cpu(), descending=True, stable=True).indices

@@ -33,6 +33,12 @@ class MeshTopology:
             with k faces gives all k (k - 1) / 2 pairs.
         neighbor_offsets: (V + 1,) where each vertex's neighbours start in `neighbor_indices`.
         neighbor_indices: (2E,) the vertices joined to each vertex by an edge, ascending.
+
+    Example:
+        >>> vertices, faces = etsplat.icosphere(0)
+        >>> topology = etsplat.MeshTopology.from_faces(faces, num_vertices=12)
+        >>> len(topology.edges), len(topology.face_pairs)
+        (30, 30)
     """
 
     num_vertices: int

@@ -218,6 +218,11 @@ def save_image(path: Path | str, image: Float[Tensor, "H W C"]) -> None:
     Raises:
         ValueError: wrong shape, or values that are not finite.
         InputError: the file cannot be written.
+
+    Example:
+        >>> etsplat.save_image("grey.png", torch.full((4, 6, 3), 0.5))
+        >>> etsplat.load_image("grey.png").shape
+        torch.Size([4, 6, 3])
     """
     path = Path(path)
     channels = (1, 3) if kind_of(path) in (".jpg", ".jpeg") else (1, 3, 4)

@@ -108,6 +108,12 @@ def save_mesh(
     Raises:
         ValueError: wrong shapes, indices out of range, or values that are not finite.
         InputError: the file cannot be written.
+
+    Example:
+        >>> vertices, faces = etsplat.icosphere(1)
+        >>> etsplat.save_mesh("ball.ply", vertices, faces, face_colors=torch.rand(len(faces), 3))
+        >>> len(etsplat.load_mesh("ball.ply").faces)
+        80
     """
     path = Path(path)
     writer_of(path, holding="vertex_colors" if texture is None else "texture" if normal_map is None else "normals")

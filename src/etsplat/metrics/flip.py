@@ -53,6 +53,11 @@ def flip(
     Raises:
         ValueError: shapes differ or are not (H, W, 3), there are no pixels, or no floating-point numbers;
             `pixels_per_degree` is not positive.
+
+    Example:
+        >>> black, white = torch.zeros(8, 8, 3), torch.ones(8, 8, 3)
+        >>> float(etsplat.flip(black, black)), float(etsplat.flip(black, white)) > 0.9
+        (0.0, True)
     """
     check_memory("image", image)
     check_memory("truth", truth)

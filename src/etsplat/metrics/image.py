@@ -47,6 +47,11 @@ def psnr(image: Float[Tensor, "H W C"], truth: Float[Tensor, "H W C"]) -> float:
 
     Raises:
         ValueError: shapes differ or are not (H, W, C).
+
+    Example:
+        >>> truth = torch.zeros(8, 8, 3)
+        >>> round(etsplat.psnr(truth + 0.1, truth), 2)
+        20.0
     """
     _check_pair(image, truth)
     error = float(((image.double() - truth.double()) ** 2).mean())
@@ -96,6 +101,12 @@ def silhouette_iou(coverage: Float[Tensor, "H W"], truth: Float[Tensor, "H W"]) 
 
     Raises:
         ValueError: shapes or devices differ.
+
+    Example:
+        >>> left, all_of_it = torch.zeros(4, 4), torch.ones(4, 4)
+        >>> left[:, :2] = 1
+        >>> etsplat.silhouette_iou(left, all_of_it)
+        0.5
     """
     check_memory("coverage", coverage)
     check_memory("truth", truth)
@@ -120,6 +131,11 @@ def ssim(image: Float[Tensor, "H W C"], truth: Float[Tensor, "H W C"], *, interi
 
     Raises:
         ValueError: shapes differ or are not (H, W, C); with `interior`, an image smaller than the window.
+
+    Example:
+        >>> picture = torch.rand(16, 16, 3, generator=torch.Generator().manual_seed(0))
+        >>> round(etsplat.ssim(picture, picture), 6)
+        1.0
     """
     _check_pair(image, truth)
     if interior and min(image.shape[:2]) < WINDOW:

@@ -66,6 +66,13 @@ class TriangleMesh(Model):
         topology: connectivity of the faces.
         vertex_colored: whether colours belong to vertices, and are interpolated over the faces.
         appearance: how it is drawn.
+
+    Example:
+        >>> mesh = etsplat.TriangleMesh.from_mesh(*etsplat.icosphere(2), colors=0.7, opacity=0.98, sigma=0.25)
+        >>> mesh.count, sorted(mesh.parameters())
+        (320, ['colors', 'log_sigma', 'opacity_logits', 'vertices'])
+        >>> mesh.render(etsplat.orbit_cameras(32, 32, azimuths=1)[0]).color.shape
+        torch.Size([1, 32, 32, 3])
     """
 
     RATES: ClassVar[Mapping[str, float]] = {

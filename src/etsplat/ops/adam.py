@@ -31,6 +31,14 @@ class Adam:
         first_moments: m, shaped as the parameters.
         second_moments: v, shaped as the parameters.
         step_count: t, the number of steps taken.
+
+    Example:
+        >>> place = torch.tensor([1.0, 2.0], requires_grad=True)
+        >>> adam = etsplat.Adam({"place": place}, {"place": 0.1})
+        >>> place.square().sum().backward()
+        >>> adam.step()
+        >>> place.detach()  # the first step of Adam is the rate
+        tensor([0.9000, 1.9000])
     """
 
     def __init__(

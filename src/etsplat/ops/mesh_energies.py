@@ -53,6 +53,14 @@ def mesh_energies(
 
     Raises:
         ValueError: Wrong shape, dtype or device, or another power.
+
+    Example:
+        >>> vertices, faces = etsplat.icosphere(2)
+        >>> topology = etsplat.MeshTopology.from_faces(faces, len(vertices))
+        >>> energies = etsplat.mesh_energies(vertices.requires_grad_(), topology.connectivity)
+        >>> (energies.edge + energies.laplacian).backward()
+        >>> vertices.grad.shape
+        torch.Size([162, 3])
     """
     check_shape("vertices", vertices, (connectivity.num_vertices, 3))
     if connectivity.faces.device != vertices.device:

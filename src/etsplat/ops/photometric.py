@@ -43,6 +43,11 @@ def photometric_loss(
 
     Raises:
         ValueError: Wrong shape, dtype, device or range; an empty image; a constant that wants a gradient.
+
+    Example:
+        >>> photo = torch.full((1, 16, 16, 3), 0.5)
+        >>> etsplat.photometric_loss(photo, photo + 0.25, dssim_weight=0.0)
+        tensor(0.2500)
     """
     _check(color, target, mask, backgrounds)
     check_choice("pixel", pixel, ("l1", "l2"))

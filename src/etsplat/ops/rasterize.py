@@ -105,6 +105,19 @@ def rasterize(
 
     Raises:
         ValueError: An argument has the wrong shape, dtype, device or range; the message names it.
+
+    Example:
+        One triangle seen from the origin, and how the red of the picture pulls at its corners:
+
+        >>> corners = torch.tensor([[[-0.5, -0.5, 2.0], [0.5, -0.5, 2.0], [0.0, 0.5, 2.0]]], requires_grad=True)
+        >>> cameras = etsplat.Cameras(torch.eye(4)[None], etsplat.intrinsics(60.0, 32, 24)[None], 32, 24)
+        >>> one = torch.ones(1)
+        >>> out = etsplat.rasterize(corners, opacities=one, sigma=0.5, face_colors=torch.eye(3)[:1], cameras=cameras)
+        >>> out.color.shape, out.alpha.shape
+        (torch.Size([1, 24, 32, 3]), torch.Size([1, 24, 32, 1]))
+        >>> out.color[..., 0].mean().backward()
+        >>> corners.grad.shape
+        torch.Size([1, 3, 3])
     """
     viewmats, Ks, width, height = view_arguments(cameras, viewmats, Ks, width, height)
     settings = RasterizeSettings(

@@ -56,6 +56,13 @@ def rasterize_opaque(
 
     Raises:
         ValueError: Wrong shape, dtype, device or index; the message names the argument.
+
+    Example:
+        >>> vertices, faces = etsplat.icosphere(2)
+        >>> cameras = etsplat.orbit_cameras(32, 32, elevations=(0.0,), azimuths=4)
+        >>> nearest = etsplat.rasterize_opaque(vertices, faces=faces, cameras=cameras).triangle
+        >>> nearest.shape, int(nearest[0, 0, 0])  # the corner of the picture shows none
+        (torch.Size([4, 32, 32]), -1)
     """
     points, triangles = _check_mesh(vertices, faces)
     views = _check_views(vertices, *view_arguments(cameras, viewmats, Ks, width, height), near_plane)
@@ -114,6 +121,14 @@ def render_opaque(
 
     Raises:
         ValueError: Wrong shape, dtype, device or index; the message names the argument.
+
+    Example:
+        >>> vertices, faces = etsplat.icosphere(2)
+        >>> cameras = etsplat.orbit_cameras(32, 32, elevations=(0.0,), azimuths=1)
+        >>> red = torch.tensor([[1.0, 0.0, 0.0]]).expand(len(faces), 3)
+        >>> picture = etsplat.render_opaque(vertices, faces=faces, face_colors=red, cameras=cameras)
+        >>> picture.color[0, 16, 16].tolist(), picture.alpha[0, 0, 0].item()
+        ([1.0, 0.0, 0.0], 0.0)
     """
     points, triangles = _check_mesh(vertices, faces)
     views = _check_views(vertices, *view_arguments(cameras, viewmats, Ks, width, height), near_plane)

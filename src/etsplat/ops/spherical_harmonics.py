@@ -33,6 +33,11 @@ def spherical_harmonics(
 
     Raises:
         ValueError: Wrong shape, dtype, device or degree; the message names the argument.
+
+    Example:
+        >>> coefficients = torch.zeros(1, 4, 3)  # degree 1; all zero is grey from everywhere
+        >>> etsplat.spherical_harmonics(coefficients, torch.tensor([[0.0, 0.0, 1.0]]), degree=1).tolist()
+        [[0.5, 0.5, 0.5]]
     """
     if not 0 <= degree <= MAX_DEGREE:
         raise ValueError(f"degree must be from 0 to {MAX_DEGREE}, got {degree}")

@@ -41,6 +41,11 @@ def sample_texture(
 
     Raises:
         ValueError: Wrong shape, dtype, device or number; the message names the argument.
+
+    Example:
+        >>> texture = torch.tensor([[[0.0], [1.0]]])  # a black texel, and a white one to the right
+        >>> etsplat.sample_texture(texture, torch.tensor([[0.0, 0.5], [0.5, 0.5], [1.0, 0.5]])).flatten().tolist()
+        [0.0, 0.5, 1.0]
     """
     check_shape("texture", texture, ("H", "W", "C"))
     if 0 in texture.shape:

@@ -73,7 +73,14 @@ class Term(ABC):
 
 
 class Custom(Term):
-    """A term of one's own from a function of the drawing."""
+    """A term of one's own from a function of the drawing.
+
+    Example:
+        >>> def flat(drawing):
+        ...     return drawing.rendering.depth.diff(dim=1).abs().mean()
+        >>> term = etsplat.Custom(flat, 0.01, outputs=("depth",))
+        >>> objective = etsplat.Objective(etsplat.Photometric(dssim=0.2), [term])
+    """
 
     def __init__(
         self, value: Callable[[Drawing], Float[Tensor, ""]], weight: Scheduled = 1.0, *, outputs: tuple[str, ...] = ()

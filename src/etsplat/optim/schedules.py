@@ -50,6 +50,10 @@ def regularization_weight(iteration: int, iterations: int, hold: int, final: flo
         iterations: length of the run.
         hold: last iteration at full weight, 0 <= hold. A run no longer than `hold` keeps 1 throughout.
         final: in [0, 1].
+
+    Example:
+        >>> [etsplat.regularization_weight(k, 1000, hold=500) for k in (1, 500, 750, 1000)]
+        [1.0, 1.0, 0.5, 0.0]
     """
     if iteration <= hold:
         return 1.0
@@ -76,6 +80,10 @@ def exponential_decay(iteration: int, iterations: int, ratio: float) -> float:
         iteration: 1..iterations.
         iterations: length of the run.
         ratio: factor at the last iteration, > 0.
+
+    Example:
+        >>> [round(etsplat.exponential_decay(k, 101, 0.01), 4) for k in (1, 51, 101)]
+        [1.0, 0.1, 0.01]
     """
     if iterations <= 1:
         return 1.0
@@ -118,6 +126,10 @@ def face_budgets(
 
     Returns:
         Budget by iteration, ascending. Where several fall on one iteration it has the largest of their budgets.
+
+    Example:
+        >>> etsplat.face_budgets(1000, steps=2, first=0.1, last=0.6, start_faces=1000, max_faces=4000)
+        {100: 2000, 600: 4000}
     """
     budgets = {}
     if max_faces > start_faces:
