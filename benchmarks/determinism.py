@@ -15,7 +15,7 @@ from pathlib import Path
 from benchmarks.machine import commit, cpu_model
 
 RUNS = {
-    "reconstruct": (["reconstruct", "demo:owl", "--preset", "demo"], ("mesh.ply", "mesh.glb")),
+    "reconstruct": (["reconstruct", "demo:owl", "--preset", "tiny"], ("mesh.ply", "mesh.glb")),
     "train": (["train", "demo:scene", "--preset", "tiny"], ("soup.safetensors",)),
 }
 """By name: the command, and the files of its folder that are compared."""

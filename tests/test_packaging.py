@@ -37,7 +37,7 @@ def test_tests_mirror_the_sources() -> None:
     """Each folder of tests is named as a layer, but for helpers, and what is beside the package."""
     tests = {path.name for path in (REPOSITORY / "tests").iterdir() if path.is_dir() and any(path.glob("**/*.py"))}
     layers = {path.parent.name for path in (REPOSITORY / "src" / "etsplat").glob("*/__init__.py")}
-    assert tests - layers == {"equal_bits", "fuzz", "helpers", "soak", "studies"}
+    assert tests - layers == {"docs", "equal_bits", "fuzz", "helpers", "soak", "studies"}
     assert layers - tests == set()
 
 

@@ -3,8 +3,8 @@
 import ast
 from pathlib import Path
 
-DRAWN = {"01_fit_one_triangle": "triangle.png", "02_depth_and_normals": "views.png"}
-"""The examples that take seconds, with what they write: their pictures are made with the pages."""
+DRAWN = ("01_fit_one_triangle", "02_depth_and_normals")
+"""Those that take seconds: their pictures are made with the pages."""
 
 
 def example_pages(folder: Path) -> dict[str, str]:
