@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from benchmarks import (
+    determinism,
     floaters,
     gpu,
     gpu_floors,
@@ -192,3 +193,15 @@ def test_rough_photos_are_off_by_a_tenth_of_a_degree_and_as_bright_as_they_were(
     assert torch.equal(rough.viewmats[scene.test], scene.viewmats[scene.test])
     before, after = (torch.stack([each.images[i].float() for i in scene.train]).mean() for each in (scene, rough))
     assert float(after / before) == pytest.approx(1, abs=0.03)
+
+
+@pytest.mark.parametrize(("last", "status"), [("abc", 0), ("abd", 1)])
+def test_runs_that_differ_are_told(monkeypatch, capsys, last, status):
+    """Equal hashes end with status 0; one other among runs on as many threads with 1. Threads may differ."""
+    found = iter([("abc",), ("abc",), ("xyz",), ("xyz",), ("abc",), (last,), ("abc",), ("abc",)])
+    monkeypatch.setattr(determinism, "hashes", lambda *_: next(found))
+    monkeypatch.setattr(sys, "argv", ["determinism", "--runs", "2"])
+    with pytest.raises(SystemExit) as end:
+        determinism.main()
+    assert end.value.code == status
+    assert f"| 1 | 2 | `{last}` |" in capsys.readouterr().out
