@@ -28,6 +28,11 @@ class Normalization:
     Attributes:
         center: (3,) in input units.
         radius: > 0, in input units.
+
+    Example:
+        >>> frame = etsplat.Normalization(torch.tensor([1.0, 0.0, 0.0]), radius=2.0)
+        >>> frame.invert(frame.apply(torch.tensor([[3.0, 0.0, 0.0]]))).tolist()
+        [[3.0, 0.0, 0.0]]
     """
 
     center: Float[Tensor, "3"] = field(default_factory=lambda: torch.zeros(3, dtype=torch.float64))

@@ -85,7 +85,13 @@ class Pictures(ABC):
 
 
 class StoredPictures(Pictures):
-    """Photos that are in memory already."""
+    """Photos that are in memory already.
+
+    Example:
+        >>> pictures = etsplat.StoredPictures([torch.zeros(48, 64, 3, dtype=torch.uint8)])
+        >>> pictures[0].shape
+        torch.Size([48, 64, 3])
+    """
 
     def __init__(
         self,

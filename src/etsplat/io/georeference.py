@@ -24,6 +24,10 @@ class Georeference:
         scale: > 0, of lengths.
         up: which axis of the world points up; None where that is not known.
         crs: the world's coordinate system, as text such as "EPSG:25832"; empty where that is not known.
+
+    Example:
+        >>> etsplat.Georeference(offset=(500000.0, 4600000.0, 0.0), crs="EPSG:32633").scale
+        1.0
     """
 
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)

@@ -114,6 +114,12 @@ def start_soup(
         centers: positions of the cameras, where there is a limit.
         limit: no triangle is larger than this times its distance to the nearest camera; None for any size. Without it,
             triangles at stray points near the cameras cover whole pictures.
+
+    Example:
+        >>> points = etsplat.StartPoints(torch.rand(50, 3), torch.rand(50, 3))
+        >>> chance = torch.Generator().manual_seed(0)
+        >>> etsplat.start_soup(points, chance, scale=1.0, opacity=0.5, sigma=1.0, sh_degree=1).count
+        50
     """
     count = len(points)
     radius = scale * spacing(points.positions)

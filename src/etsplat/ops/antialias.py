@@ -77,6 +77,19 @@ def rasterize_antialiased(
 
     Raises:
         ValueError: Wrong shape, dtype, device or values; the message names the argument.
+
+    Example:
+        >>> vertices, faces = etsplat.icosphere(2)
+        >>> topology = etsplat.MeshTopology.from_faces(faces, len(vertices))
+        >>> picture = etsplat.rasterize_antialiased(
+        ...     vertices.requires_grad_(),
+        ...     connectivity=topology.connectivity,
+        ...     face_colors=torch.ones(len(faces), 3),
+        ...     cameras=etsplat.orbit_cameras(32, 32, elevations=(0.0,), azimuths=1),
+        ... )
+        >>> picture.color.mean().backward()  # through the outline alone: all faces are white
+        >>> bool(vertices.grad.abs().sum() > 0)
+        True
     """
     viewmats, Ks, width, height = view_arguments(cameras, viewmats, Ks, width, height)
     check_shape("vertices", vertices, (connectivity.num_vertices, 3))

@@ -71,6 +71,11 @@ class RowPlan:
         fresh: (M,) whether the row is made by this edit: it starts with zero moments and statistics.
         values: by name of a parameter, its values in the fresh rows, in their order. The parameters that are not named
             are copied from the source.
+
+    Example:
+        >>> plan = etsplat.RowPlan.keeping(torch.tensor([True, False, True]))
+        >>> plan.source.tolist()
+        [0, 2]
     """
 
     num_rows: int

@@ -31,6 +31,11 @@ class Schedule:
         values: parameters of one number that are set instead of learned, by name.
         appearance: how the model is drawn, by iteration (0 is the start); None for what the model says.
         halvings: how often the photos are halved, by iteration.
+
+    Example:
+        >>> falling = etsplat.Schedule({"vertices": lambda k: 1e-2 * etsplat.exponential_decay(k, 1000, 0.1)})
+        >>> round(falling.rates["vertices"](1000), 6)
+        0.001
     """
 
     rates: Mapping[str, Scheduled]

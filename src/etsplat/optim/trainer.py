@@ -53,6 +53,15 @@ class Trainer(Generic[M]):
         progress: where the run stands.
         guard: what undoes edits; None lets all of them stay.
         onlooker: called after steps, before an edit, with the iterations done; it may look at the model, not change it.
+
+    Example:
+        >>> photos = etsplat.photograph(etsplat.demo_object(), 32, 32, elevations=(0.0,), azimuths=5, supersampling=1)
+        >>> mesh = etsplat.TriangleMesh.from_mesh(*etsplat.icosphere(2), colors=0.7, opacity=0.98, sigma=0.25)
+        >>> objective = etsplat.Objective(etsplat.Photometric(), [etsplat.EdgeLength(0.5)])
+        >>> trainer = etsplat.Trainer(mesh, photos, objective, etsplat.SubdivideAndUntangle({2: 400}))
+        >>> outcome = trainer.fit(4)
+        >>> 320 < mesh.count <= 400
+        True
     """
 
     onlooker: Callable[[int], None] | None = None

@@ -178,6 +178,11 @@ class ReconstructConfig(Settings):
     """Settings of `etsplat.reconstruct`; the defaults are preset "best".
 
     Raises InputError where a setting is out of its range, is none of its choices, or would have no effect.
+
+    Example:
+        >>> config = etsplat.ReconstructConfig.of("quick").changed({"iterations": 1000, "optimizer.lr_vertices": 1e-3})
+        >>> config.optimizer.lr_vertices
+        0.001
     """
 
     TASK: ClassVar[str] = "reconstruct"

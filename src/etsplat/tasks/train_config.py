@@ -173,6 +173,10 @@ class TrainConfig(Settings):
     """Settings of `etsplat.train`; the defaults are preset "quick" for outdoor scenes.
 
     Raises InputError where a setting is out of its range, is none of its choices, or would have no effect.
+
+    Example:
+        >>> etsplat.TrainConfig.of("quick", "indoor").changed({"max_triangles": 50_000}).scene_type
+        'indoor'
     """
 
     TASK: ClassVar[str] = "train"
