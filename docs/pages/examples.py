@@ -1,10 +1,13 @@
-"""Pages of the programs in examples/: what each is for, its picture if there is one, its source."""
+"""Pages of the programs in examples/: what each is for, its picture, its source."""
 
 import ast
 from pathlib import Path
 
-DRAWN = ("01_fit_one_triangle", "02_depth_and_normals")
-"""Those that take seconds: their pictures are made with the pages."""
+SHORTER = {
+    "03_own_kernel": ("--preset", "tiny"),
+    "06_scene_and_path": ("--iterations", "300", "--width", "160"),
+}
+"""Options with which an example takes seconds, where it does not without."""
 
 
 def example_pages(folder: Path) -> dict[str, str]:
@@ -36,6 +39,7 @@ def _title(path: Path) -> str:
 def _page(path: Path) -> str:
     first, rest = _docstring(path)
     lines = [f"# {_title(path)}", "", first, "", rest, ""]
-    if path.stem in DRAWN:
-        lines += [f"![What {path.name} draws](../images/{path.stem}.png)", ""]
+    lines += [f"![What {path.name} draws](../images/{path.stem}.png)", ""]
+    if path.stem in SHORTER:
+        lines += [f"(With `{' '.join(SHORTER[path.stem])}`.)", ""]
     return "\n".join([*lines, f"```{{literalinclude}} ../../../examples/{path.name}", ":language: python", "```", ""])

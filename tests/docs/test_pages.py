@@ -1,6 +1,7 @@
 """The pages that are made of docstrings, settings, examples and README.md; and the pages that are written."""
 
 import ast
+import os
 import re
 import sys
 from pathlib import Path
@@ -10,7 +11,8 @@ import pytest
 import etsplat
 from docs.pages import pages
 from docs.pages.api import topic_of
-from docs.pages.examples import DRAWN
+from docs.pages.examples import SHORTER
+from docs.pages.pictures import draw
 from docs.pages.readme import rebased
 from docs.pages.settings import TASKS, settings_page, values_of
 from etsplat.tasks.reconstruct_config import ReconstructConfig
@@ -68,12 +70,30 @@ def test_values_are_named_in_words() -> None:
 
 
 def test_every_example_has_a_page(made: dict[str, str]) -> None:
-    """With its source, and a picture where that is drawn."""
+    """With its source and its picture."""
     for path in (ROOT / "examples").glob("*.py"):
         page = made[f"examples/{path.stem}.md"]
         assert f"../../../examples/{path.name}" in page
         assert f"python examples/{path.name}" in page
-        assert (f"../images/{path.stem}.png" in page) == (path.stem in DRAWN)
+        assert f"../images/{path.stem}.png" in page
+
+
+def test_pictures_are_drawn_once(tmp_path: Path) -> None:
+    """And again when the example has changed; whether it writes a picture or a folder with one."""
+    examples, images = tmp_path / "examples", tmp_path / "images"
+    examples.mkdir()
+    start = "import sys, pathlib; out = pathlib.Path(sys.argv[-1])\n"
+    plain, folder = examples / "a.py", examples / "b.py"
+    plain.write_text(start + "out.write_text(f'{len(sys.argv)}')")
+    folder.write_text(start + "out.mkdir(); (out / 'x.png').write_text('b')")
+    draw(images, examples)
+    assert {path.name: path.read_text() for path in images.iterdir()} == {"a.png": "3", "b.png": "b"}
+    (images / "a.png").write_text("kept")
+    folder.write_text(folder.read_text().replace("'b')", "'c')"))
+    os.utime(folder, (2e9, 2e9))
+    draw(images, examples)
+    assert {path.name: path.read_text() for path in images.iterdir()} == {"a.png": "kept", "b.png": "c"}
+    assert set(SHORTER) < {path.stem for path in (ROOT / "examples").glob("*.py")}
 
 
 def test_parts_of_the_readme_keep_their_links() -> None:
