@@ -55,7 +55,7 @@ def judged(
 
 
 def test_a_patch_that_photos_contradict_is_told():
-    assert judged(contradicted=0.01).verdict.startswith("good")
+    assert judged(contradicted=0.004).verdict.startswith("good")
     verdict = judged(contradicted=0.028).verdict
     assert verdict == (
         "poor: photos contradict each other on 2.8 % of its surface, where a hollow may be closed: "

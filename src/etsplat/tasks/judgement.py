@@ -22,7 +22,7 @@ GOOD_IOU = 0.97
 GOOD_INTERSECTING = 1.0
 """Percentage of faces that cut through others, which good results have at most."""
 
-CONTRADICTED = 0.01
+CONTRADICTED = 0.005
 """Share of the surface that photos contradict in one patch, which good results have at most."""
 
 TRAINING_VIEWS = 16
