@@ -1,5 +1,6 @@
 """The commands that make a run: `etsplat reconstruct`, `etsplat train` and both `etsplat demo`."""
 
+import sys
 from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
@@ -68,43 +69,66 @@ class RunCommand(Command):
         return None
 
     def run(self, arguments: Sequence[str]) -> int:
-        """Does the run with a progress bar, writes its report and prints what came out."""
-        from rich.console import Console
+        """Does the run with a progress bar, writes its report and prints what came out.
 
+        Of several workers the first does so, and of those that end early one says why.
+        """
         import etsplat
-        from etsplat.cli.progress import RunProgress, print_summary
+        from etsplat.core.workers import WorkerLostError, together
         from etsplat.io.run_directory import is_run
 
-        console, options, live = Console(), vars(self), self.onlooker()
         try:
-            with live or nullcontext():
-                with RunProgress(console, preparing=self.PREPARING) as progress:
-                    progress.show("Reading the input")
-                    result = getattr(etsplat, self.CONFIG.TASK)(
-                        options.get("source", self.SOURCE),
-                        self.out,
-                        self.settings,
-                        **{name: options[name] for name in self.INPUT},
-                        **({"onlooker": live.look} if live else {}),
-                        callbacks=[progress, *([live] if live else []), *self.callbacks()],
-                        resume=self.resume,
-                        overwrite=self.overwrite,
-                    )
-                    progress.show("Writing the report")
-                    etsplat.write_report(self.out)
-                print_summary(console, self.out)
-                if live:
-                    live.finish(result.soup)
-                    live.stay(print)
+            with together() as group:
+                try:
+                    self._do() if group.leads else self._make([])
+                except BaseException as error:
+                    if not group.first_to_report():
+                        sys.exit(INTERRUPTED if isinstance(error, KeyboardInterrupt) else FAILED)
+                    raise
         except KeyboardInterrupt:
             if not is_run(self.out):
                 raise
             fail(f"interrupted; continue with: {resume_line(arguments)}", INTERRUPTED)
-        except etsplat.DivergedError as error:
+        except (etsplat.DivergedError, WorkerLostError) as error:
             if self.debug:
                 raise
-            fail(str(error), FAILED)
+            remedy = "" if isinstance(error, etsplat.DivergedError) else "; start all workers again with --resume"
+            fail(f"{error}{remedy}", FAILED)
         return 0
+
+    def _do(self) -> None:
+        from rich.console import Console
+
+        import etsplat
+        from etsplat.cli.progress import RunProgress, print_summary
+
+        console, live = Console(), self.onlooker()
+        with live or nullcontext():
+            with RunProgress(console, preparing=self.PREPARING) as progress:
+                progress.show("Reading the input")
+                result = self._make([progress, *([live] if live else []), *self.callbacks()], live)
+                progress.show("Writing the report")
+                etsplat.write_report(self.out)
+            print_summary(console, self.out)
+            if live:
+                live.finish(result.soup)
+                live.stay(print)
+
+    def _make(self, callbacks: "list[Callback]", live: "LiveView | None" = None) -> Any:
+        """Calls the task."""
+        import etsplat
+
+        options = vars(self)
+        return getattr(etsplat, self.CONFIG.TASK)(
+            options.get("source", self.SOURCE),
+            self.out,
+            self.settings,
+            **{name: options[name] for name in self.INPUT},
+            **({"onlooker": live.look} if live else {}),
+            callbacks=callbacks,
+            resume=self.resume,
+            overwrite=self.overwrite,
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, replace
+from typing import overload
 
 import torch
 from jaxtyping import Float, Int, UInt8
@@ -116,6 +117,10 @@ class ViewLoader:
             self._kept[index] = view
         return view
 
+    def views(self, indices: Sequence[int]) -> "Views":
+        """Some by their indices, each loaded when it is looked at."""
+        return Views(self, indices)
+
     def kind_and_place(self, index: int, number: int = 0) -> tuple[Hashable, tuple[float, float]]:
         """Of a view that is to be queued. The first call uploads all photos of the training views if they can stay.
 
@@ -193,6 +198,28 @@ class ViewLoader:
         masks = torch.empty(image, dtype=torch.uint8, device=self._device) if kind.masked else None
         depths = torch.empty(image, device=self._device) if kind.deep else None
         return _Stack(pixels, masks, depths)
+
+
+class Views(Sequence[View]):
+    """Views of a loader, each loaded when it is looked at."""
+
+    def __init__(self, loader: ViewLoader, indices: Sequence[int]) -> None:
+        self._loader, self._indices = loader, indices
+
+    def __len__(self) -> int:
+        return len(self._indices)
+
+    @overload
+    def __getitem__(self, place: int) -> View: ...
+
+    @overload
+    def __getitem__(self, place: slice) -> "Views": ...
+
+    def __getitem__(self, place: int | slice) -> "View | Views":
+        """Raises InputError where a photo is damaged or has gone."""
+        if isinstance(place, slice):
+            return Views(self._loader, self._indices[place])
+        return self._loader.view(self._indices[place])
 
 
 def _copy(source: Tensor, target: Tensor) -> None:

@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from etsplat.core.workers import workers
 from etsplat.io.depth_maps import resize_depth
 from etsplat.io.memory import available_memory
 
@@ -150,13 +151,13 @@ class LazyPictures(Pictures):
             sizes: (width, height) of each.
             sizes_in_bytes: upper bounds.
             fingerprint: of all of them, without making any.
-            limit: bytes that may be kept; None for half of the memory that is free.
+            limit: bytes that may be kept; None for half of the memory that is free, shared with other workers.
             with_depth: the views whose photos have depth maps.
         """
         self.with_depth = frozenset(with_depth)
         self.sizes, self.total_bytes = list(sizes), sum(sizes_in_bytes)
         self._make, self._bytes, self._fingerprint = make, list(sizes_in_bytes), fingerprint
-        self._limit = available_memory() // 2 if limit is None else limit
+        self._limit = available_memory() // 2 // workers().neighbours if limit is None else limit
         self.streamed = self.total_bytes > self._limit
         self._kept: OrderedDict[int, Future[Picture]] = OrderedDict()
         self._lock = threading.Lock()
@@ -189,13 +190,16 @@ class LazyPictures(Pictures):
     def preload(self, progress: Callable[[int, int], None] | None = None) -> None:
         """Make everything once, so that damaged files are found now, and keep it, if it fits.
 
+        Of several workers each makes those that are its own (`optim.shared_steps.owners`).
+
         Args:
             progress: called with (photos made, photos in all).
 
         Raises:
             InputError: a file is damaged.
         """
-        views = range(len(self.sizes))
+        group = workers()
+        views = range(group.rank, len(self.sizes), group.count)
         futures = [self._pool.submit(self._check, view) if self.streamed else self._future(view) for view in views]
         try:
             for done, future in enumerate(as_completed(futures), 1):

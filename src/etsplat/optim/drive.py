@@ -1,13 +1,16 @@
 """The loop from the last checkpoint on, with checkpoints and the history of a run."""
 
-from collections.abc import Sequence
+import hashlib
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
+from etsplat.core.workers import about_this, workers
 from etsplat.io.run_directory import RunDirectory
-from etsplat.optim.checkpoints import load_latest_checkpoint, save_checkpoint
+from etsplat.optim.checkpoints import checkpoint_path, load_latest_checkpoint, save_checkpoint
 from etsplat.optim.loop import Callback, Event, LoopSettings, Problem, Progress, StepEvent, UndoEvent, optimize
 
 
@@ -19,7 +22,7 @@ def drive(
     run: RunDirectory | None,
     run_hash: str,
 ) -> None:
-    """Runs the loop to the last iteration.
+    """Runs the loop to the last iteration; on several workers with the same state on all. The first one keeps the run.
 
     Args:
         problem: changed in place.
@@ -33,24 +36,46 @@ def drive(
         DivergedError: a loss or parameter is not finite.
         InputError: the checkpoint is damaged or of another run; the disk is full.
     """
+    group = workers()
     if run is not None:
-        checkpoint = load_latest_checkpoint(run.checkpoints, run_hash)
+        checkpoint = group.from_first(lambda: load_latest_checkpoint(run.checkpoints, run_hash))
         if checkpoint is not None:
             problem.load_state(checkpoint.tensors, checkpoint.iteration)
             progress.iteration = checkpoint.iteration
             progress.seconds, progress.loss_sum, loss_count = checkpoint.tensors["progress"].tolist()
             progress.loss_count = int(loss_count)
-        run.truncate_history(progress.iteration)
+        if group.leads:
+            run.truncate_history(progress.iteration)
+    _check_same(problem, {**about_this(), "length of the run": settings.iterations, "settings": (settings, run_hash)})
 
     def save(at: Progress) -> Path:
         assert run is not None
+        if not group.leads:
+            return checkpoint_path(run.checkpoints, at.iteration)
         place = torch.tensor([at.seconds, at.loss_sum, at.loss_count], dtype=torch.float64)
         return save_checkpoint(run.checkpoints, at.iteration, {**problem.state(), "progress": place}, run_hash)
 
-    told = callbacks if run is None else [History(run), *callbacks]
+    told = callbacks if run is None or not group.leads else [History(run), *callbacks]
     for event in optimize(problem, settings, progress, save if run else None, run.checkpoints if run else None):
+        if isinstance(event, StepEvent):
+            _check_same(problem, {"iteration": event.iteration})
         for callback in told:
             callback(event)
+
+
+def _check_same(problem: Problem, about: Mapping[str, object]) -> None:
+    """Raises InputError on all workers where these values, or the states, are not the same on all."""
+    if workers().count > 1:
+        workers().agree({**about, "state of the run": digest_of(problem.state())})
+
+
+def digest_of(tensors: Mapping[str, Tensor]) -> str:
+    """Names the bits of tensors, and what these are called."""
+    digest = hashlib.sha256()
+    for name, tensor in sorted(tensors.items()):
+        digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
+        digest.update(tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().data)
+    return digest.hexdigest()
 
 
 class History:

@@ -10,7 +10,7 @@ as they are displayed.
 """
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Literal
@@ -20,6 +20,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from etsplat.core.rasterization import Rasterization
+from etsplat.core.workers import workers
 from etsplat.data.loader import View
 from etsplat.data.pictures import as_float
 from etsplat.model.model import Model
@@ -152,7 +153,7 @@ class Exposure:
         self.adam.step_on_device(rates, halted)
         self._center(halted)
 
-    def measure(self, model: Model, views: Iterable[View], background: Float[Tensor, "1 3"]) -> None:
+    def measure(self, model: Model, views: Sequence[View], background: Float[Tensor, "1 3"]) -> None:
         """Measures whether photos need it, and learns from now on if they do. Changes nothing else.
 
         Args:
@@ -218,7 +219,7 @@ def _falling(iteration: int, iterations: int) -> float:
 
 @torch.no_grad()
 def explained_error(
-    model: Model, views: Iterable[View], background: Float[Tensor, "1 3"]
+    model: Model, views: Sequence[View], background: Float[Tensor, "1 3"]
 ) -> tuple[float, Float[Tensor, "P 3"]]:
     """The part of the squared error of a model's pictures that exposures of their photos explain, and these.
 
@@ -234,17 +235,8 @@ def explained_error(
     Returns:
         That part, at most 1; and the logarithm of the gain of each channel of each photo, beside the mean photo.
     """
-    sums = []
-    for view in views:
-        photo = as_float(view.photo[0])
-        rendering = model.render(view.camera, backgrounds=background)
-        counts = torch.ones_like(photo[..., 0]) if view.mask is None else as_float(view.mask[0])
-        if photo.shape[-1] == 4:
-            counts = counts * ((photo[..., 3] > COVERED) & (rendering.alpha[0, ..., 0] > COVERED))
-        for field in _chess_board(counts):
-            x, y = (field[..., None] * image[..., :3].double() for image in (rendering.color[0], photo))
-            sums.append(torch.stack([(x * x).sum(dim=(0, 1)), (x * y).sum(dim=(0, 1)), (y * y).sum(dim=(0, 1))]))
-    squares, products, wanted = torch.stack(sums).cpu().view(-1, 2, 3, 3).unbind(dim=2)
+    sums = workers().map(lambda view: _products(model, view, background), views)
+    squares, products, wanted = torch.stack(sums).unbind(dim=2)
 
     def error(gains: Float[Tensor, "P 2 3"]) -> float:
         return float((wanted - 2 * gains * products + gains**2 * squares).sum())
@@ -255,6 +247,19 @@ def explained_error(
     logs = _ratio(products.sum(dim=1), squares.sum(dim=1)).clamp_min(1e-3).log()
     gains = (logs - logs.mean(dim=0)).clamp(-FARTHEST, FARTHEST)
     return (1 - error(predicted) / before if before > 0 else 0.0), gains
+
+
+def _products(model: Model, view: View, background: Float[Tensor, "1 3"]) -> Float[Tensor, "2 3 3"]:
+    """Of black and white fields: the sums over pixels of x^2, x y and y^2 of each channel, x drawn, y in the photo."""
+    photo, sums = as_float(view.photo[0]), []
+    rendering = model.render(view.camera, backgrounds=background)
+    counts = torch.ones_like(photo[..., 0]) if view.mask is None else as_float(view.mask[0])
+    if photo.shape[-1] == 4:
+        counts = counts * ((photo[..., 3] > COVERED) & (rendering.alpha[0, ..., 0] > COVERED))
+    for field in _chess_board(counts):
+        x, y = (field[..., None] * image[..., :3].double() for image in (rendering.color[0], photo))
+        sums.append(torch.stack([(x * x).sum(dim=(0, 1)), (x * y).sum(dim=(0, 1)), (y * y).sum(dim=(0, 1))]))
+    return torch.stack(sums).cpu()
 
 
 def _ratio(products: Tensor, squares: Tensor) -> Tensor:

@@ -18,6 +18,7 @@ from typing import Protocol
 
 from torch import Tensor
 
+from etsplat.core.workers import workers
 from etsplat.optim.checkpoints import list_checkpoints
 
 
@@ -278,8 +279,8 @@ def optimize(
 ) -> Iterator[Event]:
     """Runs `problem` from `progress` to the last iteration.
 
-    Ctrl-C finishes the iteration at hand, saves a checkpoint, and then raises KeyboardInterrupt; a second Ctrl-C
-    raises at once.
+    Ctrl-C finishes the iteration at hand, saves a checkpoint, and then raises KeyboardInterrupt, on all workers where
+    one was interrupted; a second Ctrl-C raises at once.
 
     Args:
         problem: what to optimise; changed in place.
@@ -301,7 +302,7 @@ def optimize(
             iteration = progress.iteration
             last = iteration == settings.iterations
             evaluating = last or _due(iteration, settings.evaluate_every)
-            stopping = interrupted()
+            stopping = workers().any(interrupted())
             saving = save is not None and (
                 last or stopping or undone is not None or _due(iteration, settings.checkpoint_every)
             )
@@ -318,7 +319,7 @@ def optimize(
                 yield CheckpointEvent(iteration, save(progress))
             if stopping:
                 raise KeyboardInterrupt
-        if interrupted():
+        if workers().any(interrupted()):
             raise KeyboardInterrupt
     yield DoneEvent(progress.iteration, progress.seconds)
 

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from etsplat.core.rasterization import Rasterization
+from etsplat.core.workers import workers
 from etsplat.data.dataset import Dataset
 from etsplat.data.loader import View, ViewLoader
 from etsplat.engines.choice import engine_for
@@ -19,6 +20,7 @@ from etsplat.optim.depth_trust import DepthTrust
 from etsplat.optim.exposure import Exposure
 from etsplat.optim.objective import Drawing, Objective
 from etsplat.optim.schedules import Schedule, at
+from etsplat.optim.shared_steps import owners, shared_gradients
 from etsplat.optim.step_queue import MAX_STEPS, QueuedStep, RowLayout, StepQueue
 from etsplat.optim.strategies import Strategy
 from etsplat.optim.view_sampler import ViewSampler
@@ -81,7 +83,7 @@ class Stepper(Generic[M]):
         self._phase: tuple[Any, ...] = ()
         self._seen: list[Rasterization] = []  # by the step that is being captured
         queues = engine_for(next(iter(parameters.values()))).queues_steps
-        if queues and update is None and not model.appearance.needs_host:
+        if queues and update is None and not model.appearance.needs_host and workers().count == 1:
             self._row = RowLayout(
                 places=2 * batch,
                 backgrounds=3 * batch,
@@ -144,8 +146,7 @@ class Stepper(Generic[M]):
     def measure_exposure(self) -> None:
         """Measures whether the photos that are fitted to were exposed unlike each other."""
         behind = torch.zeros(1, 3) if self._background is None else self._background
-        views = (self._loader.view(index) for index in self._dataset.train)
-        self._exposure.measure(self._model, views, behind.to(self._device))
+        self._exposure.measure(self._model, self._loader.views(self._dataset.train), behind.to(self._device))
         if self._exposure.learned:
             self.restart()
 
@@ -158,9 +159,15 @@ class Stepper(Generic[M]):
     def _step(self, iteration: int) -> float:
         self.arrive(iteration)
         chosen = self._choose()
-        views = ((self._loader.view(c.view), c.background.to(self._device)) for c in chosen)
         weights, scale = self._objective.weights(iteration), at(self._objective.scale, iteration)
-        loss, seen = self._gradients(views, weights, scale)
+
+        def gradients(places: range) -> tuple[Tensor, list[Rasterization]]:
+            some = (chosen[place] for place in places)
+            views = ((self._loader.view(c.view), c.background.to(self._device)) for c in some)
+            return self._gradients(views, weights, scale, first=places.start)
+
+        indices, optimizers = [c.view for c in chosen], [self.adam, self._exposure.adam]
+        loss, seen = shared_gradients(workers(), indices, gradients, optimizers, self._strategy.outputs)
         self.adam.learning_rates = self._rates(iteration)
         if self._update is None:
             self.adam.step()
@@ -219,12 +226,12 @@ class Stepper(Generic[M]):
         self._seen = []
 
     def _gradients(
-        self, views: Iterable[tuple[View, Tensor]], weights: Sequence[float], scale: float | Tensor
+        self, views: Iterable[tuple[View, Tensor]], weights: Sequence[float], scale: float | Tensor, first: int = 0
     ) -> tuple[Tensor, list[Rasterization]]:
-        """Those of the objective, one view after the other; its value, and what was seen."""
+        """Those of the objective, one view after the other, from place `first` on; its value, and what was seen."""
         outputs = (*self._objective.outputs(weights), *self._strategy.outputs)
         losses, seen, exposure = [], [], self._exposure
-        for number, (view, background) in enumerate(views, start=1):
+        for number, (view, background) in enumerate(views, start=first + 1):
             rendering = self._model.render(
                 view.camera, backgrounds=background, outputs=outputs, depth_of=self._objective.depth_of
             )
@@ -250,9 +257,16 @@ class Stepper(Generic[M]):
         for _ in range(self._batch):
             views.append(self.sampler.next_view())
             firsts.append(self.sampler.epoch_starts)
-        self._loader.expect([*views, *self.sampler.upcoming(READ_AHEAD)])
+        self._loader.expect(self._own([*views, *self.sampler.upcoming(READ_AHEAD)]))
         backgrounds = [self.sampler.background() if self._background is None else self._background for _ in views]
         return [_Chosen(*each) for each in zip(views, backgrounds, firsts, strict=True)]
+
+    def _own(self, views: list[int]) -> list[int]:
+        """Those of the views to come that this worker is going to draw."""
+        group, size = workers(), self._batch
+        steps = [views[start : start + size] for start in range(0, len(views), size)]
+        whose = [owner for step in steps for owner in owners(step, group.count)]
+        return [view for view, owner in zip(views, whose, strict=True) if owner == group.rank]
 
     def _phase_at(self, iteration: int) -> tuple[Any, ...]:
         """What changes seldom: how often photos are halved, how the model is drawn, the weights of the objective."""

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from etsplat.core.validation import first_not_finite
+from etsplat.core.workers import workers
 from etsplat.data.dataset import Dataset, middles_of
 from etsplat.engines.choice import engine_for
 from etsplat.io.kernel_files import adopt_kernel, kernel_tensors
@@ -97,7 +98,7 @@ class Trainer(Generic[M]):
             exposure: what is learned of each photo's exposure; None for photos that were all exposed alike.
             depths: which depth maps are believed, as the objective's term has it; None where none are used.
             update: takes the step from the gradients, in the place of `Adam.step`.
-            evaluate: cheap metrics of the model.
+            evaluate: cheap metrics of the model; of several workers the first one measures them.
             guard: undoes edits of the strategy after which the training photos are explained worse.
             seed: of the order of views and every other random choice; or a generator to go on with.
         """
@@ -166,11 +167,13 @@ class Trainer(Generic[M]):
             InputError: a checkpoint is damaged or of another run; somebody else writes the run; the disk is full.
         """
         settings = LoopSettings(iterations, log_every, evaluate_every, checkpoint_every)
-        if run is not None and run_hash is None:
+        if run_hash is None and (run is not None or workers().count > 1):
             run_hash = self._hash()
         with contextlib.ExitStack() as stack:
             stack.enter_context(engine_for(next(iter(self.model.parameters().values()))).looping())
-            if isinstance(run, Path | str):
+            if isinstance(run, Path | str) and not workers().leads:
+                run = RunDirectory(Path(run))
+            elif isinstance(run, Path | str):
                 stack.enter_context(writing_run(Path(run), warnings.warn))
                 record = {"task": "fit", "iterations": iterations}
                 run = RunDirectory(Path(run)) if is_run(run) else RunDirectory.create(run, record)
@@ -238,7 +241,7 @@ class Trainer(Generic[M]):
 
     def evaluate(self) -> dict[str, float]:
         """Cheap metrics of the present state, which is kept if the watched photos speak for it."""
-        metrics = self._evaluate(self.model) if self._evaluate else {}
+        metrics = self._evaluate(self.model) if self._evaluate and workers().leads else {}
         watched = self._watch.observe(self.model, self.progress.iteration) if self._watch else {}
         if watched:
             self.depths.observe(watched["watched_psnr"])

@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from etsplat.core.workers import together
 from etsplat.data.agreement import contradicted
 from etsplat.data.dataset import Dataset
 from etsplat.engines.choice import engine
@@ -75,6 +76,7 @@ class ReconstructResult(Result):
         return self.metrics["judgement"]["verdict"]
 
 
+@together()
 def reconstruct(
     source: Source,
     out: str | Path,
@@ -91,7 +93,8 @@ def reconstruct(
     """Deforms a sphere, or the visual hull, into the object that the source shows.
 
     A run ends with the same bits on the same machine, torch and number of threads, also if it was killed and resumed
-    any number of times. Ctrl-C leaves a checkpoint of the last whole iteration.
+    any number of times, or made by several workers of torchrun (docs/distributed.md), which all call this. Ctrl-C
+    leaves a checkpoint of the last whole iteration.
 
     Args:
         source: a mesh file or `MeshFile`, which is photographed from 40 sides; "demo:owl", an object built in code; a
@@ -149,22 +152,23 @@ def reconstruct(
             config = nearby(config)
         trust = _trusted_depths(views, config, begun, job)
         trainer = make_trainer(mesh, views, config, scorer.cheap, trust)
-        with job.writing():
+        with job.writing():  # what only the first of several workers does goes through `job.first`
             if views.georeference is not None:
-                views.georeference.write(job.run.path)
+                job.first(partial(views.georeference.write, job.run.path))
             outcome, frame = job.fit(trainer), views.normalization
             mesh = outcome.model
             for suffix in (".ply", ".obj", ".glb"):
-                mesh.save(job.run.mesh_path(suffix), frame)
+                job.first(partial(mesh.save, job.run.mesh_path(suffix), frame))
             sizes = {"faces": len(mesh.faces), "vertices": len(mesh.vertices)}
             sizes["edits_undone"] = len(trainer.guard.undone) if trainer.guard else 0
             exposed = job.exposed(trainer.exposure, views.names)
-            found = {**scorer.full(mesh, job.run.test), **sizes, **outcome.metrics, **exposed}
+            scores = job.first(lambda: scorer.full(mesh, job.run.test))
+            found = {**scores, **sizes, **outcome.metrics, **exposed}
             found |= {} if trust is None else trust.metrics()
-            judgement = judging(mesh, found)
-            found |= _texture(job, views, scorer, config)
+            judgement = job.first(partial(judging, mesh, found))
+            found |= job.first(lambda: _texture(job, views, scorer, config))
             metrics = job.finish(trainer.progress, {**found, "judgement": judgement.to_dict()}, mesh.vertices)
-            job.run.conclude(judgement.verdict)
+            job.first(lambda: job.run.conclude(judgement.verdict))
     return ReconstructResult(job.run.path, metrics, mesh.to_file(frame))
 
 

@@ -8,12 +8,13 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import torch
 from torch import Tensor
 
 from etsplat.core.errors import InputError
+from etsplat.core.workers import about_this, workers
 from etsplat.engines.choice import engine_for, resolve_device
 from etsplat.engines.threads import num_threads
 from etsplat.io.kernel_files import kernel_digest, write_kernel
@@ -35,6 +36,9 @@ ABOUT_EXPOSURE = (
     "colour in a training photo = matrix times colour of the result, both as displayed, red, green and blue in [0, 1]; "
     "the mean photo is neutral"
 )
+
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -109,6 +113,8 @@ class Result:
 class Job:
     """A run of a task, from its settings to its metrics: what all tasks do around their trainers.
 
+    Of several workers all fit; one of them, the first, tells, writes and measures.
+
     Attributes:
         config: settings.
         device: where it runs.
@@ -128,9 +134,17 @@ class Job:
     ) -> None:
         """Raises InputError where there is no run to continue, or no place for a new one."""
         self.config, self.device = config, resolve_device(config.device, config.engine)
-        self._callbacks = callbacks or notebook_callbacks()
+        self._callbacks = (callbacks or notebook_callbacks()) if workers().leads else []
         self._place = Place(Path(out), resume, overwrite)
-        self._place.check()
+        self.first(self._place.check)
+        if workers().count > config.batch:
+            text = f"batch is {config.batch}: of {workers().count} workers no more have something to do in a step"
+            self.announce(NoteEvent(text))
+
+    @staticmethod
+    def first(make: Callable[[], T]) -> T:
+        """What the first worker makes of it, also for the others: for whatever writes, and what measures a result."""
+        return workers().from_first(make)
 
     def announce(self, event: Event) -> None:
         """Tells all callbacks."""
@@ -150,8 +164,10 @@ class Job:
             InputError: the run in the folder was started with other settings or input.
         """
         self._record = make_record(self.config, iterations or self.config.iterations, hashes, paths)
+        about = {"device": device_name(self.device), "iterations": self._record["iterations"], **self._record["source"]}
+        workers().agree({**about_this(), **about, **flattened(self._record["config"])})
         if self._place.resume:
-            RunDirectory.resume(self._place.path, self._record)
+            self.first(lambda: RunDirectory.resume(self._place.path, self._record))
 
     @contextlib.contextmanager
     def writing(self) -> Iterator[None]:
@@ -160,6 +176,10 @@ class Job:
         Raises:
             InputError: somebody does; or as `Place.open`.
         """
+        if not workers().leads:
+            self.run = RunDirectory(self._place.path)
+            yield
+            return
         with self._place.open(self._record, lambda text: self.announce(NoteEvent(text))) as self.run:
             self.run.forget_end()
             try:
@@ -173,7 +193,7 @@ class Job:
         output = self.config.output
         trainer.fit(
             self.config.iterations,
-            callbacks=[self.announce] if first is None else [first, self.announce],
+            callbacks=[each for each in (first, self.announce) if each is not None and workers().leads],
             log_every=output.log_every,
             evaluate_every=output.evaluate_every,
             checkpoint_every=output.checkpoint_every,
@@ -208,7 +228,7 @@ class Job:
             callbacks=[tell],
             log_every=output.log_every,
             checkpoint_every=output.checkpoint_every,
-            run=self.run.stage(folder, iterations),
+            run=self.first(lambda: self.run.stage(folder, iterations)),
             run_hash=hash_record(self._record),
         )
         return trainer.outcome().model
@@ -225,7 +245,7 @@ class Job:
         """
         if exposure.learned:
             matrices = {names[view]: matrix.tolist() for view, matrix in exposure.matrices().items()}
-            self.run.write_exposure({"about": ABOUT_EXPOSURE, "matrices": matrices})
+            self.first(lambda: self.run.write_exposure({"about": ABOUT_EXPOSURE, "matrices": matrices}))
             text = "the photos were exposed unlike each other; exposure.json has what was learned of each"
             self.announce(NoteEvent(f"exposure: {text}"))
         return {"exposure_learned": exposure.learned, "exposure_explained": exposure.explained}
@@ -239,22 +259,22 @@ class Job:
             result: a tensor of the result, for its device and precision.
         """
         config = self.config
-        self.run.write_metrics(
-            {
-                **found,
-                "iterations": progress.iteration,
-                "seconds": progress.seconds,
-                "seconds_per_iteration": progress.seconds / progress.iteration,
-                "engine": engine_for(result).name,
-                "device": device_name(result.device),
-                "threads": num_threads(),
-                "method": config.method,
-                "preset": config.preset,
-                "seed": config.seed,
-                "versions": versions(),
-            }
-        )
-        return self.run.read_metrics()
+        metrics = {
+            **found,
+            "iterations": progress.iteration,
+            "seconds": progress.seconds,
+            "seconds_per_iteration": progress.seconds / progress.iteration,
+            "engine": engine_for(result).name,
+            "device": device_name(result.device),
+            "threads": num_threads(),
+            **({"workers": workers().count} if workers().count > 1 else {}),
+            "method": config.method,
+            "preset": config.preset,
+            "seed": config.seed,
+            "versions": versions(),
+        }
+        self.first(lambda: self.run.write_metrics(metrics))
+        return self.first(self.run.read_metrics)
 
 
 def terms_of(
@@ -301,6 +321,15 @@ def make_record(
         "paths": paths,
         "versions": versions(),
     }
+
+
+def flattened(settings: Mapping[str, Any], before: str = "") -> dict[str, Any]:
+    """Settings by their dotted names."""
+    found = {}
+    for name, value in settings.items():
+        inner = flattened(value, f"{before}{name}.") if isinstance(value, Mapping) else {f"{before}{name}": value}
+        found |= inner
+    return found
 
 
 def end_of(error: BaseException) -> str:

@@ -2,14 +2,17 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import torch
 
+from etsplat.core.workers import together, workers
 from etsplat.data.dataset import Dataset
 from etsplat.engines.choice import engine, engine_for
 from etsplat.io.mesh_files import MeshFile
 from etsplat.io.opaque_files import save_opaque
+from etsplat.io.run_directory import RunDirectory
 from etsplat.model.surroundings import Surroundings
 from etsplat.model.triangle_mesh import TriangleMesh
 from etsplat.model.triangle_soup import FOCAL_NOTE, GEOREFERENCE_NOTE, TriangleSoup
@@ -49,6 +52,7 @@ class TrainResult(Result):
     opaque: MeshFile | None = None
 
 
+@together()
 def train(
     source: str | Path | Dataset,
     out: str | Path,
@@ -67,7 +71,8 @@ def train(
     """Fits a triangle soup to the photos of a scene, and makes an opaque mesh beside it if that is asked for.
 
     A run ends with the same bits on the same machine, torch and number of threads, also if it was killed and resumed
-    any number of times. Ctrl-C leaves a checkpoint of the last whole iteration.
+    any number of times, or made by several workers of torchrun (docs/distributed.md), which all call this. Ctrl-C
+    leaves a checkpoint of the last whole iteration.
 
     Args:
         source: a folder with posed photos (of the programs in `docs/captures.md`), a `Dataset` in its own units, or
@@ -90,6 +95,7 @@ def train(
     Raises:
         InputError: something handed in cannot be used; earlier results in `out` are as they were.
         DivergedError: the optimization went to NaN or infinity.
+        WorkerLostError: another worker ended.
     """
     config = config or TrainConfig()
     job = Job(config, out, callbacks, resume=resume, overwrite=overwrite)
@@ -115,16 +121,17 @@ def train(
         trainer = start_trainer(capture, config, scorer.cheap, job.device, trust)
 
         def look(iteration: int) -> None:
-            if onlooker is not None:
+            if onlooker is not None and workers().leads:
                 onlooker(own, iteration, lambda: _copy(_in_own_units(trainer.model, iteration, capture, config)))
 
         def keep(event: Event) -> None:
             if isinstance(event, CheckpointEvent):  # so that `etsplat view` can follow
                 _in_own_units(trainer.model, event.iteration, capture, config).save(job.run.soup_path)
 
+        # What only the first of several workers does goes through `job.first`.
         with job.writing(), engine_for(trainer.model.vertices).looping():
             if capture.georeference is not None:
-                capture.georeference.write(job.run.path)
+                job.first(partial(capture.georeference.write, job.run.path))
             try:
                 look(0)
                 trainer.onlooker = look
@@ -134,14 +141,14 @@ def train(
                     raise DivergedError(f"{error}. But first: {doubt}") from error
                 raise
             soup = outcome.model.finished()
-            scores = scorer.full(soup, job.run.test)
+            scores = job.first(lambda: scorer.full(soup, job.run.test))
             result = _in_own_units(soup, outcome.iteration, capture, config)
-            result.save(job.run.soup_path)
+            job.first(lambda: result.save(job.run.soup_path))
             opaque, about_opaque = None, {}
             if config.asset and (mesh := _opaque_mesh(job, soup, trainer.exposure, capture, config)) is not None:
-                about_opaque, opaque = scorer.asset(mesh, job.run.test), mesh.to_file(capture.normalization)
-                save_opaque(job.run.opaque_path, opaque)
-                export_soup(SoupRun(job.run.path, result, own, opaque), job.run.path / "opaque.glb", ExportConfig())
+                about_opaque = job.first(partial(scorer.asset, mesh, job.run.test))
+                opaque = mesh.to_file(capture.normalization)
+                job.first(partial(_write_opaque, SoupRun(job.run.path, result, own, opaque), job.run, opaque))
             found = {
                 **scores,
                 **about_opaque,
@@ -168,6 +175,11 @@ def _opaque_mesh(
     except DivergedError as error:
         job.announce(NoteEvent(f"no opaque mesh: {error}"))
         return None
+
+
+def _write_opaque(done: SoupRun, run: RunDirectory, opaque: MeshFile) -> None:
+    save_opaque(run.opaque_path, opaque)
+    export_soup(done, run.path / "opaque.glb", ExportConfig())
 
 
 def _copy(soup: TriangleSoup) -> TriangleSoup:

@@ -1,0 +1,276 @@
+"""The processes that make one run together: one alone, or as many as torchrun started.
+
+A worker computes what nobody else does, and gets the rest from the others. Nothing is ever added up on the way: what
+workers hand each other are whole results, which each of them then adds in the same order. So all hold the same bits,
+those of one process alone.
+"""
+
+import contextlib
+import os
+import pickle
+import platform
+import socket
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from datetime import timedelta
+from importlib.metadata import version
+from typing import Any, TypeVar
+
+import torch
+import torch.distributed as dist
+from torch import Tensor
+
+from etsplat import _native
+from etsplat.core.errors import InputError
+
+T = TypeVar("T")
+S = TypeVar("S")
+
+PATIENCE = timedelta(hours=12)
+"""So long workers wait for one that is alive and silent, such as the first while it measures a large result. One that
+was killed is found at once, by its closed connections."""
+
+_LAUNCHED = ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")
+_REPORTED = "etsplat/reported"
+
+
+class WorkerLostError(RuntimeError):
+    """Another worker of the run ended, or cannot be reached any more. The message is one line."""
+
+
+class Workers:
+    """Those that run together, as one of them sees it. With one all methods give back what they were given.
+
+    Attributes:
+        rank: which this is, from 0.
+        count: how many there are.
+        neighbours: how many of them, with this one, are on the same machine.
+        sent: bytes that this one has handed to each other in `hand_round`, and how often.
+    """
+
+    def __init__(self, rank: int = 0, count: int = 1, store: Any = None) -> None:
+        """Takes its place; more than one need torch's default process group. Use `together`."""
+        self.rank, self.count, self.neighbours = rank, count, 1
+        self.sent = {"bytes": 0, "messages": 0}
+        self._store = store
+
+    @property
+    def leads(self) -> bool:
+        """Whether this is the one that writes, prints and measures."""
+        return self.rank == 0
+
+    def any(self, flag: bool) -> bool:
+        """Whether it is so on any of them; the same answer on all."""
+        if self.count == 1:
+            return flag
+        return any(bool(other) for other in self._gather(torch.tensor([int(flag)])))
+
+    def map(self, function: Callable[[S], T], items: Sequence[S]) -> list[T]:
+        """The function's values, in the order of the items, of each of which one worker takes care."""
+        if self.count == 1:
+            return [function(items[index]) for index in range(len(items))]
+        own = [function(items[index]) for index in range(self.rank, len(items), self.count)]
+        found = self._gather_objects(own)
+        return [found[index % self.count][index // self.count] for index in range(len(items))]
+
+    def from_first(self, make: Callable[[], T]) -> T:
+        """What the first one makes; an error that it runs into is raised on all."""
+        if self.count == 1:
+            return make()
+        made: list[Any] = [None, None]
+        if self.leads:
+            try:
+                made[0] = make()
+            except Exception as error:
+                made[1] = error
+        with _reaching():
+            dist.broadcast_object_list(made, src=0)
+        if made[1] is not None:
+            raise made[1]
+        return made[0]
+
+    def agree(self, about: Mapping[str, object]) -> None:
+        """Checks that all have the same.
+
+        Args:
+            about: values by what they are called; their texts are compared.
+
+        Raises:
+            InputError: on all of them; the message names what differs first.
+        """
+        if self.count == 1:
+            return
+        texts = [dict(each) for each in self._gather_objects({name: str(value) for name, value in about.items()})]
+        for rank, other in enumerate(texts):
+            for name in sorted({*texts[0], *other}):
+                mine, theirs = texts[0].get(name, "none"), other.get(name, "none")
+                if mine != theirs:
+                    raise InputError(
+                        f"{name}: worker 0 has {mine}, worker {rank} has {theirs}; the bits of a run need the same on "
+                        "all workers"
+                    )
+
+    def hand_round(self, own: Mapping[int, Tensor], owners: Sequence[int]) -> Iterator[Tensor]:
+        """Messages of all workers, in their order; the later ones travel while the earlier ones are used.
+
+        Args:
+            own: by number, those of this worker: (K,) uint8 on the CPU.
+            owners: whose each message is.
+
+        Yields:
+            (K,) uint8 on the CPU.
+        """
+        if self.count == 1:
+            yield from (own[number] for number in range(len(owners)))
+            return
+        mine = torch.tensor([len(own[n]) if n in own else 0 for n in range(len(owners))])
+        lengths = torch.stack(self._gather(mine))
+        device = _wire()
+        buffers, travelling = [], []
+        with _reaching():
+            for number, owner in enumerate(owners):
+                length = int(lengths[owner, number])
+                buffer = own[number].to(device) if number in own else torch.empty(length, dtype=torch.uint8).to(device)
+                buffers.append(buffer)
+                travelling.append(dist.broadcast(buffer, src=owner, async_op=True))
+                if owner == self.rank:
+                    self.sent["bytes"] += length
+                    self.sent["messages"] += 1
+        for number, work in enumerate(travelling):
+            with _reaching():
+                work.wait()
+            yield buffers[number].cpu()
+            buffers[number] = torch.empty(0)
+
+    def first_to_report(self) -> bool:
+        """Whether no other worker has said yet that the run ends early; from now on this one has."""
+        if self.count == 1:
+            return True
+        try:
+            return self._store.add(_REPORTED, 1) == 1
+        except (RuntimeError, AttributeError):  # nobody is there to ask
+            return True
+
+    def _gather(self, own: Tensor) -> list[Tensor]:
+        """Of all, in their order; small integers of one shape."""
+        device = _wire()
+        found = [torch.empty_like(own, device=device) for _ in range(self.count)]
+        with _reaching():
+            dist.all_gather(found, own.to(device))
+        return [each.cpu() for each in found]
+
+    def _gather_objects(self, own: T) -> list[T]:
+        found: list[Any] = [None] * self.count
+        with _reaching():
+            dist.all_gather_object(found, own)
+        return found
+
+
+ALONE = Workers()
+_current = ALONE
+
+
+def workers() -> Workers:
+    """Those of the block `together`; elsewhere one alone."""
+    return _current
+
+
+def launched() -> bool:
+    """Whether torchrun, or what sets the same variables, started more than this process."""
+    return all(name in os.environ for name in _LAUNCHED) and os.environ["WORLD_SIZE"] not in ("", "1")
+
+
+@contextlib.contextmanager
+def together(init_method: str = "env://", *, rank: int | None = None, count: int | None = None) -> Iterator[Workers]:
+    """Within the block processes make one run together, if torchrun started several; nothing is done otherwise.
+
+    The process group is made here, or taken as it is where there is one.
+
+    Args:
+        init_method: where they meet, as of `torch.distributed.init_process_group`.
+        rank: which of them this is; None for the environment's.
+        count: how many there are; None for the environment's.
+
+    Raises:
+        InputError: they do not find each other, or this torch cannot do it.
+    """
+    global _current
+    if _current is not ALONE or (count is None and not launched()):
+        yield _current
+        return
+    rank = int(os.environ["RANK"]) if rank is None else rank
+    count = int(os.environ["WORLD_SIZE"]) if count is None else count
+    if not dist.is_available():
+        raise InputError("torchrun: this build of torch has no torch.distributed; start one process, without torchrun")
+    joined, store = not dist.is_initialized(), None
+    if joined:
+        store = _join(init_method, rank, count)
+    threads = _native.num_threads()
+    _current = Workers(dist.get_rank(), dist.get_world_size(), store)
+    try:
+        _share_cores(_current)
+        yield _current
+    finally:
+        _current = ALONE
+        _native.set_num_threads(count=threads)
+        if joined:
+            with contextlib.suppress(RuntimeError):
+                dist.destroy_process_group()
+
+
+def about_this() -> dict[str, str]:
+    """What must be the same on all workers of a run whatever it is, because bits depend on it."""
+    gpu = torch.cuda.get_device_name() if torch.cuda.is_available() else "none"
+    return {
+        "etsplat": version("etsplat"),
+        "torch": torch.__version__,
+        "instruction set": _native.instruction_set(),
+        "machine": platform.machine(),
+        "GPU": gpu,
+    }
+
+
+def _join(init_method: str, rank: int, count: int) -> Any:
+    """Makes the process group; returns its store."""
+    from torch.distributed.rendezvous import rendezvous  # late: builds without torch.distributed have none
+
+    gpus = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    if gpus:
+        torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", "0")) % gpus)
+    each_its_own = dist.is_nccl_available() and 0 < int(os.environ.get("LOCAL_WORLD_SIZE", count)) <= gpus
+    try:
+        store, _, _ = next(iter(rendezvous(init_method, rank, count, timeout=PATIENCE)))
+        backend = "nccl" if each_its_own else "gloo"
+        dist.init_process_group(backend, store=store, rank=rank, world_size=count, timeout=PATIENCE)
+    except (RuntimeError, ValueError) as error:
+        raise InputError(f"torchrun: the {count} workers do not find each other ({_first_line(error)})") from error
+    return store
+
+
+def _share_cores(group: Workers) -> None:
+    """Workers that may use the same cores of one machine take their part of them each, if nobody said otherwise."""
+    cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+    place = socket.gethostname(), cores
+    places = group._gather_objects(place)
+    group.neighbours, sharing = [host for host, _ in places].count(place[0]), places.count(place)
+    if sharing > 1 and not os.environ.get("ETSPLAT_NUM_THREADS"):
+        _native.set_num_threads(count=max(1, _native.num_threads() // sharing))
+
+
+def _wire() -> torch.device:
+    """Where tensors are while they travel: gloo's on the CPU, NCCL's on the GPU."""
+    return torch.device("cuda" if dist.get_backend() == "nccl" else "cpu")
+
+
+@contextlib.contextmanager
+def _reaching() -> Iterator[None]:
+    """What torch says where a worker is gone, in one kind of error."""
+    try:
+        yield
+    except (WorkerLostError, InputError):
+        raise
+    except (RuntimeError, EOFError, pickle.UnpicklingError) as error:
+        raise WorkerLostError(f"another worker of the run ended or cannot be reached ({_first_line(error)})") from error
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error) or type(error).__name__).splitlines()[0]

@@ -1,0 +1,142 @@
+"""Small runs that any number of workers make, and what became of them."""
+
+import hashlib
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors.torch import load_file
+
+from etsplat.core.workers import workers
+from etsplat.data.dataset import Dataset
+from etsplat.data.demo_object import demo_object
+from etsplat.data.demo_scene import demo_scene
+from etsplat.data.photograph import photograph
+from etsplat.data.pictures import StoredPictures
+from etsplat.geometry.icosphere import icosphere
+from etsplat.io.run_directory import RunDirectory
+from etsplat.model.soup_init import StartPoints, start_soup
+from etsplat.model.triangle_mesh import TriangleMesh
+from etsplat.optim import shared_steps
+from etsplat.optim.checkpoints import list_checkpoints
+from etsplat.optim.drive import digest_of
+from etsplat.optim.exposure import Exposure
+from etsplat.optim.guard import Guard
+from etsplat.optim.loop import RefineEvent
+from etsplat.optim.objective import Objective
+from etsplat.optim.schedules import Schedule, face_budgets
+from etsplat.optim.strategies import DensifyAndPrune, SubdivideAndUntangle
+from etsplat.optim.terms.mesh import EdgeLength, Laplacian, SmoothNormals, Softness
+from etsplat.optim.terms.photometric import Photometric
+from etsplat.optim.terms.soup import DepthNormals, Opacity, Size
+from etsplat.optim.trainer import Trainer
+
+ITERATIONS = 14
+
+
+def a_scene() -> Dataset:
+    """Photos of two sizes, a mask for every third, few points."""
+    scene = demo_scene(32, 24)
+    assert scene.exact_points is not None
+    assert scene.point_colors is not None
+    scene = replace(scene, exact_points=scene.exact_points[::20], point_colors=scene.point_colors[::20])
+    pixels, masks, Ks = [], [], scene.Ks.clone()
+    for index in range(len(scene)):
+        photo = scene.images[index]
+        if index % 2:
+            photo = photo[2:22, 4:28].contiguous()
+            Ks[index, 0, 2] -= 4
+            Ks[index, 1, 2] -= 2
+        mask = torch.full(photo.shape[:2], 255, dtype=torch.uint8)
+        mask[:, : photo.shape[1] // 3] = 0
+        pixels.append(photo)
+        masks.append(mask if index % 3 == 0 else None)
+    return replace(scene, Ks=Ks, images=StoredPictures(pixels, masks)).normalized()
+
+
+def an_object() -> Dataset:
+    """Photos with transparency; two are kept aside to watch the run by."""
+    views = photograph(demo_object(), 20, 20, elevations=(-35.0, 35.0), azimuths=6, supersampling=1)
+    return replace(views, train=views.train[2:], watched=views.train[:2])
+
+
+def with_nan(dataset: Dataset, view: int) -> Dataset:
+    """One photo is not a number somewhere."""
+    pixels = [dataset.images[index].clone() for index in range(len(dataset))]
+    pixels[view][3, 4] = math.nan
+    return replace(dataset, images=StoredPictures(pixels))
+
+
+def trainer_of(kind: str, batch: int) -> Trainer[Any]:
+    """Of a soup that grows and is pruned, or a mesh that is subdivided, with a guard."""
+    if kind == "soup":
+        data, rng = a_scene(), torch.Generator().manual_seed(1)
+        assert data.points is not None
+        assert data.point_colors is not None
+        soup = start_soup(
+            StartPoints(data.points, data.point_colors), rng, scale=2.0, opacity=0.4, sigma=0.8, sh_degree=1
+        )
+        objective = Objective(Photometric(0.2), [Opacity(0.005), Size(1e-6), DepthNormals(1e-3)], depth_of="centroid")
+        strategy = DensifyAndPrune(begin=3, every=4, max_triangles=400)
+        exposure = Exposure(6, needed=-math.inf)
+        return Trainer(soup, data, objective, strategy, batch=batch, exposure=exposure)
+    data = an_object()
+    if kind == "nan":
+        data = with_nan(data, data.train[5])
+    vertices, faces = icosphere(2)
+    mesh = TriangleMesh.from_mesh(1.05 * vertices, faces, colors=0.5, opacity=0.9, sigma=0.5)
+    terms = [EdgeLength(0.5), SmoothNormals(0.01), Laplacian(0.2), Softness(1e-4)]
+    budgets = face_budgets(ITERATIONS, steps=2, first=0.3, last=0.6, start_faces=mesh.count, max_faces=500)
+    rates = Schedule({"vertices": 1e-2, "colors": 2e-2, "opacity_logits": 1e-2, "log_sigma": 1e-2})
+    strategy = SubdivideAndUntangle(budgets)
+    return Trainer(
+        mesh, data, Objective(Photometric(), terms), strategy, schedule=rates, batch=batch, guard=Guard(steps=3)
+    )
+
+
+def fit(kind: str, batch: int, folder: Path | None = None, until: int = ITERATIONS) -> dict[str, Any]:
+    """A run, or what is left of it: the state at its end, and what it said of edits."""
+    trainer, edits = trainer_of(kind, batch), []
+
+    def tell(event: object) -> None:
+        if isinstance(event, RefineEvent):
+            edits.append(event.added)
+
+    options = {"run": folder, "run_hash": kind} if folder else {}
+    trainer.fit(until, callbacks=[tell], log_every=5, checkpoint_every=5, **options)
+    sent = dict(workers().sent)
+    return {"state": digest_of(trainer.state()), "count": trainer.count, "edits": edits, "sent": sent}
+
+
+def fit_swapped(kind: str, batch: int) -> dict[str, Any]:
+    """A run in whose sums the second view of a step changes places with the third."""
+    honest = shared_steps.in_order
+
+    def swapped(messages: Any) -> Any:
+        first, second, third, *others = honest(messages)
+        return iter([first, third, second, *others])
+
+    shared_steps.in_order = swapped
+    try:
+        return fit(kind, batch)
+    finally:
+        shared_steps.in_order = honest
+
+
+def digest_of_checkpoint(folder: Path) -> str:
+    """Of the last one of a run, but for the seconds that it took, and of what it is called."""
+    path = list_checkpoints(RunDirectory(folder).checkpoints)[-1]
+    tensors = load_file(path)
+    tensors["progress"] = tensors["progress"][1:]
+    return f"{path.name} {digest_of(tensors)}"
+
+
+def digest_of_file(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def same(values: Sequence[Any]) -> bool:
+    return all(value == values[0] for value in values)
