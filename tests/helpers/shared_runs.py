@@ -1,16 +1,20 @@
 """Small runs that any number of workers make, and what became of them."""
 
-import hashlib
 import math
+import os
+import signal
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
 from safetensors.torch import load_file
 
-from etsplat.core.workers import workers
+from etsplat.core.errors import InputError
+from etsplat.core.workers import Workers, workers
 from etsplat.data.dataset import Dataset
 from etsplat.data.demo_object import demo_object
 from etsplat.data.demo_scene import demo_scene
@@ -20,7 +24,7 @@ from etsplat.geometry.icosphere import icosphere
 from etsplat.io.run_directory import RunDirectory
 from etsplat.model.soup_init import StartPoints, start_soup
 from etsplat.model.triangle_mesh import TriangleMesh
-from etsplat.optim import shared_steps
+from etsplat.optim import drive
 from etsplat.optim.checkpoints import list_checkpoints
 from etsplat.optim.drive import digest_of
 from etsplat.optim.exposure import Exposure
@@ -37,17 +41,18 @@ from etsplat.optim.trainer import Trainer
 ITERATIONS = 14
 
 
+@cache
 def a_scene() -> Dataset:
     """Photos of two sizes, a mask for every third, few points."""
-    scene = demo_scene(32, 24)
+    scene = demo_scene(28, 24)
     assert scene.exact_points is not None
     assert scene.point_colors is not None
-    scene = replace(scene, exact_points=scene.exact_points[::20], point_colors=scene.point_colors[::20])
+    scene = replace(scene, exact_points=scene.exact_points[::30], point_colors=scene.point_colors[::30])
     pixels, masks, Ks = [], [], scene.Ks.clone()
     for index in range(len(scene)):
         photo = scene.images[index]
         if index % 2:
-            photo = photo[2:22, 4:28].contiguous()
+            photo = photo[2:22, 4:24].contiguous()
             Ks[index, 0, 2] -= 4
             Ks[index, 1, 2] -= 2
         mask = torch.full(photo.shape[:2], 255, dtype=torch.uint8)
@@ -57,6 +62,7 @@ def a_scene() -> Dataset:
     return replace(scene, Ks=Ks, images=StoredPictures(pixels, masks)).normalized()
 
 
+@cache
 def an_object() -> Dataset:
     """Photos with transparency; two are kept aside to watch the run by."""
     views = photograph(demo_object(), 20, 20, elevations=(-35.0, 35.0), azimuths=6, supersampling=1)
@@ -111,19 +117,80 @@ def fit(kind: str, batch: int, folder: Path | None = None, until: int = ITERATIO
     return {"state": digest_of(trainer.state()), "count": trainer.count, "edits": edits, "sent": sent}
 
 
+@cache
+def fit_alone(kind: str, batch: int) -> dict[str, Any]:
+    """What one process makes of it, and the digest of its checkpoint."""
+    with TemporaryDirectory() as folder:
+        run = fit(kind, batch, Path(folder) / "run")
+        return {**run, "checkpoint": digest_of_checkpoint(Path(folder) / "run")}
+
+
 def fit_swapped(kind: str, batch: int) -> dict[str, Any]:
     """A run in whose sums the second view of a step changes places with the third."""
-    honest = shared_steps.in_order
+    honest = Workers.hand_round
 
-    def swapped(messages: Any) -> Any:
-        first, second, third, *others = honest(messages)
+    def swapped(self: Workers, own: Any, owners: Any) -> Any:
+        first, second, third, *others = honest(self, own, owners)
         return iter([first, third, second, *others])
 
-    shared_steps.in_order = swapped
+    Workers.hand_round = swapped
     try:
         return fit(kind, batch)
     finally:
-        shared_steps.in_order = honest
+        Workers.hand_round = honest
+
+
+def fit_unlike(what: str) -> None:
+    """A run of workers of which the second differs from the first."""
+    second = workers().rank == 1
+    trainer = trainer_of("mesh", 4)
+    if what == "seed" and second:
+        trainer = trainer_of("soup", 4)
+    if what == "parameter":
+
+        def disturb(iteration: int) -> None:
+            if second and iteration == 7:
+                trainer.model.colors.data[0, 0] += 1e-6
+
+        trainer.onlooker = disturb
+    said = drive.about_this
+    if what == "instruction set" and second:
+        drive.about_this = lambda: {**said(), "instruction set": "another"}
+    try:
+        trainer.fit(ITERATIONS, log_every=5)
+    finally:
+        drive.about_this = said
+
+
+def fit_interrupted(kind: str, batch: int, folder: Path) -> int:
+    """A run of which one worker is asked to stop; which iteration it stopped at."""
+    trainer = trainer_of(kind, batch)
+
+    def stop(iteration: int) -> None:
+        if workers().rank == 1 and iteration == 7:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    trainer.onlooker = stop
+    try:
+        trainer.fit(ITERATIONS, log_every=5, checkpoint_every=5, run=folder, run_hash=kind)
+    except KeyboardInterrupt:
+        return trainer.progress.iteration
+    raise AssertionError("nobody was interrupted")
+
+
+def made_by_first() -> int:
+    return workers().from_first(lambda: workers().rank)
+
+
+def failed_by_first() -> None:
+    def fail() -> None:
+        raise InputError("disk: full")
+
+    workers().from_first(fail)
+
+
+def mapped(count: int) -> list[int]:
+    return workers().map(lambda number: number**2, range(count))
 
 
 def digest_of_checkpoint(folder: Path) -> str:
@@ -132,10 +199,6 @@ def digest_of_checkpoint(folder: Path) -> str:
     tensors = load_file(path)
     tensors["progress"] = tensors["progress"][1:]
     return f"{path.name} {digest_of(tensors)}"
-
-
-def digest_of_file(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def same(values: Sequence[Any]) -> bool:
