@@ -24,8 +24,9 @@ OBJECT = ("demo", "object", "--preset", "tiny", "--batch", "3", "--iterations", 
 PATIENCE = 60.0
 
 
-def torchrun(folder: Path, *arguments: str) -> "subprocess.Popen[str]":
-    launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m", "etsplat"]
+def torchrun(folder: Path, *arguments: str, restarts: int = 0) -> "subprocess.Popen[str]":
+    launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+    launcher += ["--max-restarts", str(restarts), "-m", "etsplat"]
     threads = {"OMP_NUM_THREADS": "1", "ETSPLAT_NUM_THREADS": "1"}
     environment = {**os.environ, **threads, "PYTHONPATH": os.pathsep.join(sys.path)}
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
@@ -57,12 +58,7 @@ def test_a_killed_worker_ends_the_run_which_goes_on_later(etsplat: Run, tmp_path
     """Whichever it is: within a minute, with one line; one process ends the run with the bits of an undisturbed one."""
     options = [*OBJECT[:-1], "400", "--output.checkpoint-every", "10", "--out"]
     launched = torchrun(tmp_path, *options, "run")
-    waiting = time.monotonic()
-    while len(list_checkpoints(tmp_path / "run" / "checkpoints")) < 2:
-        assert launched.poll() is None, launched.communicate()
-        assert time.monotonic() - waiting < 300
-        time.sleep(0.05)
-    os.kill(workers_of(launched.pid)[killed], signal.SIGKILL)
+    kill_one(launched, tmp_path / "run", killed)
     _, errors = launched.communicate(timeout=PATIENCE)
     assert launched.returncode != 0
     said = [line for line in errors.splitlines() if line.startswith("etsplat: ")]
@@ -73,6 +69,27 @@ def test_a_killed_worker_ends_the_run_which_goes_on_later(etsplat: Run, tmp_path
     assert etsplat(*options, "run", "--resume", cwd=tmp_path).returncode == 0
     assert etsplat(*options, "whole", cwd=tmp_path).returncode == 0
     assert digest_of_checkpoint(tmp_path / "run") == digest_of_checkpoint(tmp_path / "whole")
+
+
+def test_torchrun_starts_killed_workers_again(etsplat: Run, tmp_path: Path) -> None:
+    """They go on from the last checkpoint, though nobody said --resume."""
+    options = [*OBJECT[:-1], "120", "--output.checkpoint-every", "10", "--out"]
+    launched = torchrun(tmp_path, *options, "run", restarts=1)
+    kill_one(launched, tmp_path / "run", 1)
+    _, errors = launched.communicate(timeout=180)
+    assert launched.returncode == 0, errors
+    assert etsplat(*options, "whole", cwd=tmp_path).returncode == 0
+    assert digest_of_checkpoint(tmp_path / "run") == digest_of_checkpoint(tmp_path / "whole")
+
+
+def kill_one(launched: "subprocess.Popen[str]", run: Path, rank: int) -> None:
+    """When the run has two checkpoints."""
+    waiting = time.monotonic()
+    while len(list_checkpoints(run / "checkpoints")) < 2:
+        assert launched.poll() is None, launched.communicate()
+        assert time.monotonic() - waiting < 300
+        time.sleep(0.05)
+    os.kill(workers_of(launched.pid)[rank], signal.SIGKILL)
 
 
 def workers_of(launcher: int) -> list[int]:

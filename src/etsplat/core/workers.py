@@ -9,6 +9,7 @@ import contextlib
 import os
 import pickle
 import platform
+import re
 import socket
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from datetime import timedelta
@@ -28,6 +29,9 @@ S = TypeVar("S")
 PATIENCE = timedelta(hours=12)
 """So long workers wait for one that is alive and silent, such as the first while it measures a large result. One that
 was killed is found at once, by its closed connections."""
+
+MEETING = timedelta(minutes=10)
+"""So long those that have come wait for the others at the start."""
 
 _LAUNCHED = ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")
 _REPORTED = "etsplat/reported"
@@ -179,6 +183,11 @@ def launched() -> bool:
     return all(name in os.environ for name in _LAUNCHED) and os.environ["WORLD_SIZE"] not in ("", "1")
 
 
+def restarted() -> bool:
+    """Whether torchrun has started these workers again after one of them failed (`--max-restarts`)."""
+    return os.environ.get("TORCHELASTIC_RESTART_COUNT", "0") not in ("", "0")
+
+
 @contextlib.contextmanager
 def together(init_method: str = "env://", *, rank: int | None = None, count: int | None = None) -> Iterator[Workers]:
     """Within the block processes make one run together, if torchrun started several; nothing is done otherwise.
@@ -238,7 +247,9 @@ def _join(init_method: str, rank: int, count: int) -> Any:
         torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", "0")) % gpus)
     each_its_own = dist.is_nccl_available() and 0 < int(os.environ.get("LOCAL_WORLD_SIZE", count)) <= gpus
     try:
-        store, _, _ = next(iter(rendezvous(init_method, rank, count, timeout=PATIENCE)))
+        shared, _, _ = next(iter(rendezvous(init_method, rank, count, timeout=MEETING)))
+        # torchrun keeps its store when it starts workers again: the addresses of those before must not be found.
+        store = dist.PrefixStore(f"etsplat/{os.environ.get('TORCHELASTIC_RESTART_COUNT', '0')}", shared)
         backend = "nccl" if each_its_own else "gloo"
         dist.init_process_group(backend, store=store, rank=rank, world_size=count, timeout=PATIENCE)
     except (RuntimeError, ValueError) as error:
@@ -273,4 +284,6 @@ def _reaching() -> Iterator[None]:
 
 
 def _first_line(error: Exception) -> str:
-    return (str(error) or type(error).__name__).splitlines()[0]
+    """What happened, without the place in torch's sources before it, and what gloo adds."""
+    line = (str(error) or type(error).__name__).splitlines()[0]
+    return re.sub(r"^\[[^\]]*:\d+\] ", "", line).partition(". ")[0]

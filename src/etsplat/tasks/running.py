@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from etsplat.core.errors import InputError
-from etsplat.core.workers import about_this, workers
+from etsplat.core.workers import about_this, restarted, workers
 from etsplat.engines.choice import engine_for, resolve_device
 from etsplat.engines.threads import num_threads
 from etsplat.io.kernel_files import kernel_digest, write_kernel
@@ -135,7 +135,8 @@ class Job:
         """Raises InputError where there is no run to continue, or no place for a new one."""
         self.config, self.device = config, resolve_device(config.device, config.engine)
         self._callbacks = (callbacks or notebook_callbacks()) if workers().leads else []
-        self._place = Place(Path(out), resume, overwrite)
+        again = restarted() and self.first(lambda: is_run(out))
+        self._place = Place(Path(out), resume or again, overwrite and not again)
         self.first(self._place.check)
         if workers().count > config.batch:
             text = f"batch is {config.batch}: of {workers().count} workers no more have something to do in a step"
