@@ -54,6 +54,7 @@ class Recorder(Workers):
         self.message = torch.empty(0, dtype=torch.uint8)
 
     def hand_round(self, own: Mapping[int, Tensor], owners: Sequence[int]) -> Iterator[Tensor]:
+        """Its own, each time."""
         self.message = next(iter(own.values()))
         return iter([self.message] * len(owners))
 

@@ -8,6 +8,7 @@ from etsplat.core.rasterization import Cutoffs as Cutoffs
 from etsplat.core.rasterization import Rasterization as Rasterization
 from etsplat.core.rasterization import TriangleStatistics as TriangleStatistics
 from etsplat.core.registered_kernels import register_kernel as register_kernel
+from etsplat.core.workers import together as together
 from etsplat.data.camera_paths import ellipse as ellipse
 from etsplat.data.camera_paths import interpolated as interpolated
 from etsplat.data.camera_paths import orbit as orbit
