@@ -249,7 +249,7 @@ def _join(init_method: str, rank: int, count: int) -> Any:
     try:
         shared, _, _ = next(iter(rendezvous(init_method, rank, count, timeout=MEETING)))
         # torchrun keeps its store when it starts workers again: the addresses of those before must not be found.
-        store = dist.PrefixStore(f"etsplat/{os.environ.get('TORCHELASTIC_RESTART_COUNT', '0')}", shared)
+        store = dist.PrefixStore(f"etsplat/{os.environ.get('TORCHELASTIC_RESTART_COUNT', '0')}", shared)  # pyright: ignore[reportPrivateImportUsage]
         backend = "nccl" if each_its_own else "gloo"
         dist.init_process_group(backend, store=store, rank=rank, world_size=count, timeout=PATIENCE)
     except (RuntimeError, ValueError) as error:
