@@ -3,16 +3,23 @@
 import io
 import json
 import struct
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from PIL import Image
 
-_TYPES = {5121: "u1", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+needs_meshopt = pytest.mark.skipif(find_spec("meshoptimizer") is None, reason="meshoptimizer is not installed")
+
+_TYPES = {5120: "i1", 5121: "u1", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 _ATTRIBUTES = {"POSITION": "VEC3", "NORMAL": "VEC3", "TANGENT": "VEC4", "TEXCOORD_0": "VEC2", "COLOR_0": "VEC4"}
 _ARRAYS, _INDICES = 34962, 34963
+_WHOLE = {"POSITION": "<u2", "NORMAL": "i1", "TANGENT": "i1"}
+"""What KHR_mesh_quantization adds, as far as it is written."""
+_MESHOPT, _WEBP = "EXT_meshopt_compression", "EXT_texture_webp"
 
 
 def read_glb(path: Path) -> tuple[dict[str, Any], bytes]:
@@ -29,28 +36,60 @@ def read_glb(path: Path) -> tuple[dict[str, Any], bytes]:
 
 
 def array_of(document: dict[str, Any], buffer: bytes, number: int) -> np.ndarray:
-    """What an accessor holds, a row for each element."""
+    """What an accessor holds, a row for each element, as it is stored."""
     accessor = document["accessors"][number]
     view = document["bufferViews"][accessor["bufferView"]]
-    kind, width = _TYPES[accessor["componentType"]], _WIDTHS[accessor["type"]]
-    start = view["byteOffset"] + accessor.get("byteOffset", 0)
-    found = np.frombuffer(buffer, kind, accessor["count"] * width, start)
-    assert start % found.itemsize == 0
-    assert accessor.get("byteOffset", 0) + found.nbytes <= view["byteLength"]
-    return found.reshape(accessor["count"], width)
+    kind, width = np.dtype(_TYPES[accessor["componentType"]]), _WIDTHS[accessor["type"]]
+    data = _view_bytes(buffer, view)
+    assert len(data) == view["byteLength"]
+    stride = view.get("byteStride", width * kind.itemsize)
+    assert stride % (4 if view["target"] == _ARRAYS else 1) == 0
+    assert stride >= width * kind.itemsize
+    assert accessor["count"] * stride <= len(data)
+    return np.ndarray((accessor["count"], width), kind, data, 0, (stride, kind.itemsize))
+
+
+def values_of(document: dict[str, Any], buffer: bytes, number: int) -> np.ndarray:
+    """What an accessor means: that in [-1, 1] where its whole numbers are so."""
+    found, accessor = array_of(document, buffer, number), document["accessors"][number]
+    if not accessor.get("normalized"):
+        return found
+    return np.maximum(found / np.iinfo(found.dtype).max, -1)
+
+
+def _view_bytes(buffer: bytes, view: dict[str, Any]) -> bytes:
+    packed = view.get("extensions", {}).get(_MESHOPT)
+    place = view if packed is None else packed
+    data = buffer[place["byteOffset"] : place["byteOffset"] + place["byteLength"]]
+    if packed is None:
+        return data
+    import meshoptimizer
+
+    stride, count = packed["byteStride"], packed["count"]
+    if packed["mode"] == "TRIANGLES":
+        assert view["target"] == _INDICES
+        return meshoptimizer.decode_index_buffer(count, 4, data).astype(f"<u{stride}").tobytes()
+    assert packed["mode"] == "ATTRIBUTES"
+    assert view["byteStride"] == stride
+    assert data[0] == 0xA0, "the extension knows no other version"
+    return meshoptimizer.decode_vertex_buffer(count, stride, data, np.dtype(f"V{stride}")).tobytes()
 
 
 def check_glb(path: Path) -> dict[str, Any]:
     """The document of a file in which everything fits together; AssertionError where something does not."""
     document, buffer = read_glb(path)
     assert document["asset"]["version"] == "2.0"
-    assert [entry["byteLength"] for entry in document["buffers"]] == [len(buffer)]
-    end = 0
-    for view in document["bufferViews"]:
+    sizes = [entry["byteLength"] for entry in document["buffers"]]
+    assert sizes[0] == len(buffer)
+    fallback = {"extensions": {_MESHOPT: {"fallback": True}}}
+    assert [entry | fallback == entry for entry in document["buffers"][1:]] == [True] * (len(sizes) - 1)
+    ends = [0] * len(sizes)
+    stored = [view["extensions"][_MESHOPT] for view in document["bufferViews"] if "extensions" in view]
+    for view in sorted([*document["bufferViews"], *stored], key=lambda view: view["byteOffset"]):
         assert view["byteOffset"] % 4 == 0
-        assert view["byteOffset"] >= end, "views overlap"
-        end = view["byteOffset"] + view["byteLength"]
-        assert 0 < view["byteLength"] <= len(buffer) - view["byteOffset"]
+        assert view["byteOffset"] >= ends[view["buffer"]], "views overlap"
+        ends[view["buffer"]] = view["byteOffset"] + view["byteLength"]
+        assert 0 < view["byteLength"] <= sizes[view["buffer"]] - view["byteOffset"]
     for mesh in document["meshes"]:
         assert mesh["primitives"]
         for primitive in mesh["primitives"]:
@@ -65,20 +104,24 @@ def check_glb(path: Path) -> dict[str, Any]:
 
 
 def _check_primitive(document: dict[str, Any], buffer: bytes, primitive: dict[str, Any]) -> None:
-    arrays = {name: array_of(document, buffer, number) for name, number in primitive["attributes"].items()}
+    arrays = {name: values_of(document, buffer, number) for name, number in primitive["attributes"].items()}
     vertices = len(arrays["POSITION"])
     for name, number in primitive["attributes"].items():
         accessor = document["accessors"][number]
         assert accessor["type"] == _ATTRIBUTES[name]
         assert document["bufferViews"][accessor["bufferView"]]["target"] == _ARRAYS
         assert len(arrays[name]) == vertices
+        if _TYPES[accessor["componentType"]] != "<f4":
+            whole = _WHOLE.get(name, "<u2")
+            assert (_TYPES[accessor["componentType"]], accessor.get("normalized", False)) == (whole, name != "POSITION")
         assert np.isfinite(arrays[name]).all()
     position = document["accessors"][primitive["attributes"]["POSITION"]]
     assert position["min"] == arrays["POSITION"].min(axis=0).tolist()
     assert position["max"] == arrays["POSITION"].max(axis=0).tolist()
     for name in ("NORMAL", "TANGENT"):
         if name in arrays:
-            assert np.allclose(np.linalg.norm(arrays[name][:, :3].astype(float), axis=1), 1, atol=5e-4)
+            near = 5e-4 if arrays[name].dtype == np.float32 else 0.0068  # half of 1/127 along each axis
+            assert np.allclose(np.linalg.norm(arrays[name][:, :3].astype(float), axis=1), 1, atol=near)
     if "TANGENT" in arrays:
         assert np.isin(arrays["TANGENT"][:, 3], (-1, 1)).all()
     if "COLOR_0" in arrays:
@@ -103,7 +146,7 @@ def _check_references(document: dict[str, Any]) -> None:
             used["textures"] |= set(textures)
             assert bool(textures) == ("TEXCOORD_0" in primitive["attributes"])
     for texture in document.get("textures", []):
-        used["images"].add(texture["source"])
+        used["images"].add(texture.get("extensions", {}).get(_WEBP, texture)["source"])
         used["samplers"].add(texture["sampler"])
     views = [entry["bufferView"] for key in ("accessors", "images") for entry in document.get(key, [])]
     assert sorted(views) == list(range(len(document["bufferViews"])))
@@ -113,9 +156,20 @@ def _check_references(document: dict[str, Any]) -> None:
     nodes = range(len(document["nodes"]))
     assert [scene["nodes"] for scene in document["scenes"]] == [list(nodes)]
     assert {node["mesh"] for node in document["nodes"]} == set(range(len(document["meshes"])))
-    extensions = {name for material in document["materials"] for name in material.get("extensions", {})}
-    assert set(document.get("extensionsUsed", [])) == extensions
-    assert "extensionsUsed" not in document or document["extensionsUsed"]
+    optional = {name for material in document["materials"] for name in material.get("extensions", {})}
+    needed = {name for texture in document.get("textures", []) for name in texture.get("extensions", {})}
+    needed |= {name for view in document["bufferViews"] for name in view.get("extensions", {})}
+    kinds = {
+        document["accessors"][primitive["attributes"][name]]["componentType"]
+        for mesh in document["meshes"]
+        for primitive in mesh["primitives"]
+        for name in primitive["attributes"]
+        if name in _WHOLE
+    }
+    needed |= set() if kinds == {5126} else {"KHR_mesh_quantization"}
+    for key, expected in (("extensionsUsed", optional | needed), ("extensionsRequired", needed)):
+        assert set(document.get(key, [])) == expected
+        assert key not in document or document[key]
 
 
 def _textures(entry: Any) -> Any:

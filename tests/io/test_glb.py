@@ -11,7 +11,8 @@ from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.tangents import corner_tangents
 from etsplat.io.mesh_files import save_mesh, save_triangles
 from etsplat.io.textures import NormalMap, Texture
-from helpers.gltf import check_glb
+from etsplat.io.writers import Compression
+from helpers.gltf import check_glb, needs_meshopt
 
 VERTICES, FACES = icosphere(1)
 CORNERS = VERTICES[FACES]
@@ -32,29 +33,39 @@ def relief() -> NormalMap:
     return NormalMap(pixels, normals[FACES], corner_tangents(VERTICES, FACES, normals, UVS))
 
 
-WRITES: dict[str, Callable[[Path], None]] = {
-    "plain": lambda path: save_mesh(path, VERTICES, FACES),
-    "colours of faces": lambda path: save_mesh(path, VERTICES, FACES, TONES[:, :3]),
-    "split": lambda path: save_mesh(path, VERTICES, FACES, TONES[:, :3], split=True),
-    "white": lambda path: save_mesh(path, VERTICES, FACES, vertex_colors=torch.ones_like(VERTICES)),
-    "far": lambda path: save_mesh(path, 1e6 * VERTICES + 1e9, FACES),
-    "tiny": lambda path: save_mesh(path, 1e-30 * VERTICES, FACES),
-    "texture": lambda path: save_mesh(path, VERTICES, FACES, texture=texture(16, 16)),
-    "odd texture": lambda path: save_mesh(path, VERTICES, FACES, texture=texture(5, 3), mipmaps=False),
-    "lit": lambda path: save_mesh(path, VERTICES, FACES, texture=texture(16, 16), normal_map=relief()),
-    "soup": lambda path: save_triangles(path, CORNERS, TONES[:, :3]),
-    "alpha": lambda path: save_triangles(path, CORNERS, TONES),
-    "welded": lambda path: save_triangles(path, COLLAPSED, TONES[:, :3], weld=True),
-    "sky": lambda path: save_triangles(
-        path, torch.cat([CORNERS, 9 * CORNERS]), torch.cat([TONES, TONES]), sky=OUTSIDE, record={"crop": None, "a": [1]}
+Write = Callable[..., None]
+
+WRITES: dict[str, Write] = {
+    "plain": lambda path, **more: save_mesh(path, VERTICES, FACES, **more),
+    "colours of faces": lambda path, **more: save_mesh(path, VERTICES, FACES, TONES[:, :3], **more),
+    "split": lambda path, **more: save_mesh(path, VERTICES, FACES, TONES[:, :3], split=True, **more),
+    "white": lambda path, **more: save_mesh(path, VERTICES, FACES, vertex_colors=torch.ones_like(VERTICES), **more),
+    "far": lambda path, **more: save_mesh(path, 1e6 * VERTICES + 1e9, FACES, **more),
+    "tiny": lambda path, **more: save_mesh(path, 1e-30 * VERTICES, FACES, **more),
+    "texture": lambda path, **more: save_mesh(path, VERTICES, FACES, texture=texture(16, 16), **more),
+    "odd texture": lambda path, **more: save_mesh(path, VERTICES, FACES, texture=texture(5, 3), mipmaps=False, **more),
+    "lit": lambda path, **more: save_mesh(path, VERTICES, FACES, texture=texture(16, 16), normal_map=relief(), **more),
+    "soup": lambda path, **more: save_triangles(path, CORNERS, TONES[:, :3], **more),
+    "alpha": lambda path, **more: save_triangles(path, CORNERS, TONES, **more),
+    "welded": lambda path, **more: save_triangles(path, COLLAPSED, TONES[:, :3], weld=True, **more),
+    "sky": lambda path, **more: save_triangles(
+        path,
+        torch.cat([CORNERS, 9 * CORNERS]),
+        torch.cat([TONES, TONES]),
+        sky=OUTSIDE,
+        record={"crop": None, "a": [1]},
+        **more,
     ),
 }
 
+COMPRESS = ["none", "quantize", pytest.param("meshopt", marks=needs_meshopt)]
 
+
+@pytest.mark.parametrize("compress", COMPRESS)
 @pytest.mark.parametrize("name", WRITES)
-def test_everything_in_a_file_fits_together(tmp_path: Path, name: str) -> None:
+def test_everything_in_a_file_fits_together(tmp_path: Path, name: str, compress: Compression) -> None:
     """Chunks, views, accessors with their bounds, indices, pictures, extensions: by the specification's rules."""
-    WRITES[name](tmp_path / "a.glb")
+    WRITES[name](tmp_path / "a.glb", compress=compress)
     document = check_glb(tmp_path / "a.glb")
     assert [mesh["name"] for mesh in document["meshes"]] == ["a", *(["sky"] if name == "sky" else [])]
 

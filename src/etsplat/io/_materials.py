@@ -1,7 +1,6 @@
 """Textures that mesh files name: MTL beside OBJ, materials of glTF. What is left out has a note that says why."""
 
 import base64
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,13 +10,16 @@ import numpy as np
 import torch
 
 from etsplat.core.errors import InputError
-from etsplat.io.images import MAX_PIXELS, load_colors
-from etsplat.io.paths import path_within
+from etsplat.io._gltf import local_file, view_bytes
+from etsplat.io.images import IMAGE_FORMATS, MAX_PIXELS, load_colors
 from etsplat.io.srgb import linear_from_srgb, srgb_from_linear
 from etsplat.io.textures import Texture
 
 UV = "_ETSPLAT_MATERIAL_"
 """Beginning of an attribute of glTF vertices: the number of the material follows, its values are where they are."""
+
+GLTF_FORMATS = (*IMAGE_FORMATS, "WEBP")
+"""Pillow's names of what pictures may be."""
 
 _OPTIONS = {"-s": 3, "-o": 3, "-t": 3, "-mm": 2}
 """Numbers that follow an option of a picture in an MTL file, at most; others are followed by one word."""
@@ -63,7 +65,7 @@ class Pictures:
 
         def load() -> np.ndarray:
             path, data = find()
-            image, transparent = load_colors(path, data)
+            image, transparent = load_colors(path, data, GLTF_FORMATS)
             if transparent:
                 self.note(f"{path.name}: its transparency is ignored")
             if not np.array_equal(tint, np.ones(3)):
@@ -99,20 +101,6 @@ class Pictures:
             self._numbers[key] = len(self._images)
             self._images.append(image)
         return self._numbers[key]
-
-
-def local_file(folder: Path, name: str, source: Path) -> Path:
-    """Where a picture is that a file names.
-
-    Raises:
-        InputError: it is in the network, leads out of the folder, or is not there.
-    """
-    if "://" in name:
-        raise InputError(f"{source}: {name[:80]!r} is in the network; copy the picture beside it and name it there")
-    path = path_within(folder, name.replace("\\", "/"), source)
-    if not path.resolve().is_relative_to(folder.resolve()):
-        raise InputError(f"{source}: {name!r} leads out of {folder}; copy the picture there")
-    return path
 
 
 def read_mtl(path: Path) -> tuple[dict[str, dict[str, str]], list[str]]:
@@ -266,7 +254,7 @@ class GltfMaterials:
             self.pictures.note(f"{self._path.name}: {names} of baseColorTexture is ignored")
         texture = self._document["textures"][base["baseColorTexture"]["index"]]
         self._check_wrap(texture)
-        source = texture.get("source")
+        source = texture.get("extensions", {}).get("EXT_texture_webp", texture).get("source")
         return self.pictures.read((source, *tint), lambda: self._image(source), tint, color)
 
     def _check_wrap(self, texture: dict[str, Any]) -> None:
@@ -275,47 +263,17 @@ class GltfMaterials:
             self.pictures.note(f"{self._path.name}: a texture repeats here that is clamped or mirrored at its border")
 
     def _image(self, number: int | None) -> tuple[Path, bytes | None]:
-        if number is None:  # an extension has it: WebP, KTX2
-            raise InputError(f"{self._path}: a texture that is no PNG or JPEG; convert it")
+        if number is None:  # an extension has it: KTX2
+            raise InputError(f"{self._path}: a texture that is no PNG, JPEG or WebP; convert it")
         image = self._document["images"][number]
         if "bufferView" in image:
-            return self._path, self._view(self._document["bufferViews"][image["bufferView"]])
+            view = self._document["bufferViews"][image["bufferView"]]
+            return self._path, view_bytes(self._path, self._document, self._binary, view)
         uri = image["uri"]
         if uri.startswith("data:"):
             return self._path, base64.b64decode(uri.partition(",")[2])
         return local_file(self._path.parent, unquote(uri), self._path), None
 
-    def _view(self, view: dict[str, Any]) -> bytes:
-        uri = self._document["buffers"][view["buffer"]].get("uri")
-        if uri is None:
-            data = self._binary
-        elif uri.startswith("data:"):
-            data = base64.b64decode(uri.partition(",")[2])
-        else:
-            data = local_file(self._path.parent, unquote(uri), self._path).read_bytes()
-        start = view.get("byteOffset", 0)
-        return data[start : start + view["byteLength"]]
-
 
 def _base(material: dict[str, Any]) -> dict[str, Any]:
     return material.get("pbrMetallicRoughness", {})
-
-
-def split_gltf(data: bytes) -> tuple[dict[str, Any], bytes]:
-    """The document and the binary chunk of GLB or glTF, which is empty where there is none."""
-    if not data.startswith(b"glTF"):
-        return json.loads(data), b""
-    end = 20 + int.from_bytes(data[12:16], "little")
-    size = int.from_bytes(data[end : end + 4], "little")
-    return json.loads(data[20:end]), data[end + 8 : end + 8 + size]
-
-
-def join_gltf(data: bytes, document: dict[str, Any]) -> bytes:
-    """The same file with another document."""
-    text = json.dumps(document).encode()
-    if not data.startswith(b"glTF"):
-        return text
-    text += b" " * (-len(text) % 4)
-    rest = data[20 + int.from_bytes(data[12:16], "little") :]
-    total = 20 + len(text) + len(rest)
-    return data[:8] + total.to_bytes(4, "little") + len(text).to_bytes(4, "little") + b"JSON" + text + rest

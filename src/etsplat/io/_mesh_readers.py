@@ -12,8 +12,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from etsplat.core.errors import InputError
-from etsplat.io._materials import GltfMaterials, join_gltf, obj_texture, split_gltf
-from etsplat.io.paths import kind_of, path_within
+from etsplat.io._gltf import check_gltf, is_compressed, join_gltf, split_gltf, unpack
+from etsplat.io._materials import GltfMaterials, obj_texture
+from etsplat.io.meshopt import load_meshopt
+from etsplat.io.paths import kind_of
 from etsplat.io.srgb import srgb_from_linear
 from etsplat.io.textures import Texture
 
@@ -24,11 +26,6 @@ Corners = tuple[int, int, int]
 
 _MOST_VERTICES = 1 << 26
 """Of all copies of meshes that the nodes of a glTF scene place."""
-
-_COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
-_COMPONENT_BYTES = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}
-_SHARING = 4
-"""glTF accessors may share bytes; together they have no more than this many times those that there are."""
 
 
 @dataclass
@@ -181,17 +178,31 @@ def read_ply(path: Path) -> RawMesh:
 
 
 def read_gltf(path: Path) -> RawMesh:
-    """GLB and glTF through trimesh: all meshes of the scene in its frame; linear COLOR_0 becomes display values."""
+    """GLB and glTF through trimesh: all meshes of the scene in its frame; linear COLOR_0 becomes display values.
+
+    Quantised and compressed arrays (KHR_mesh_quantization, EXT_meshopt_compression) are unpacked before.
+    """
     try:
-        data = _check_gltf(path)
+        data = check_gltf(path)
         document, binary = split_gltf(data)
+        compressed = is_compressed(document)
+    except Exception as error:
+        raise _unreadable(path, error) from error
+    if compressed:
+        try:
+            load_meshopt()
+        except InputError as error:
+            raise InputError(f"mesh {path}: {error}") from error
+    try:
         materials = GltfMaterials(path, document, binary)
+        changed = unpack(path, document, binary)
         if materials.wanted:
             materials.mark()
+        if changed or materials.wanted:
             data = join_gltf(data, document)
     except Exception as error:
         raise _unreadable(path, error) from error
-    mesh = _read_with_trimesh(path, (data, materials) if materials.wanted else None)
+    mesh = _read_with_trimesh(path, data if changed or materials.wanted else None, materials)
     if mesh.vertex_colors is not None:
         mesh.vertex_colors = srgb_from_linear(mesh.vertex_colors)
     return mesh
@@ -205,18 +216,25 @@ def _unreadable(path: Path, error: Exception) -> InputError:
     return InputError(f"mesh {path}: cannot be read as {kind} ({detail}); is the file cut short? Export it again")
 
 
-def _read_with_trimesh(path: Path, textured: tuple[bytes, GltfMaterials] | None = None) -> RawMesh:
-    """All meshes of the file in one, vertices and faces as stored; of glTF with textures what is read, and these."""
+def _read_with_trimesh(path: Path, changed: bytes | None = None, materials: GltfMaterials | None = None) -> RawMesh:
+    """All meshes of the file in one, vertices and faces as stored.
+
+    Args:
+        path: of the file.
+        changed: what is read in its place.
+        materials: of glTF, whose textures are read where there are any.
+    """
     import trimesh
     from trimesh.resolvers import FilePathResolver
 
+    textured = materials is not None and materials.wanted
     # trimesh's readers signal damage with whatever their parsing runs into, missing optional modules included.
     try:
-        file = str(path) if textured is None else io.BytesIO(textured[0])
+        file = str(path) if changed is None else io.BytesIO(changed)
         scene = trimesh.load_scene(
             file,
-            file_type=None if textured is None else kind_of(path)[1:],
-            resolver=None if textured is None else FilePathResolver(str(path)),
+            file_type=None if changed is None else kind_of(path)[1:],
+            resolver=None if changed is None else FilePathResolver(str(path)),
             process=False,
             skip_materials=True,
         )
@@ -224,7 +242,7 @@ def _read_with_trimesh(path: Path, textured: tuple[bytes, GltfMaterials] | None 
         if sum(len(scene.geometry[scene.graph[node][1]].vertices) for node in nodes) > _MOST_VERTICES:
             raise ValueError(f"its {len(nodes)} nodes have more than {_MOST_VERTICES} vertices")
         parts = [_placed(scene, node) for node in nodes]
-        texture = None if textured is None else _gltf_texture(scene, parts, textured[1])
+        texture = _gltf_texture(scene, parts, materials) if textured and materials is not None else None
     except Exception as error:
         raise _unreadable(path, error) from error
     if not parts:
@@ -236,7 +254,7 @@ def _read_with_trimesh(path: Path, textured: tuple[bytes, GltfMaterials] | None 
         _joined([part.face_colors for part in parts]),
         _joined([part.vertex_colors for part in parts]),
         texture=texture,
-        notes=[] if textured is None else textured[1].pictures.notes,
+        notes=materials.pictures.notes if textured and materials is not None else [],
     )
 
 
@@ -251,29 +269,6 @@ def _gltf_texture(scene: "trimesh.Scene", parts: list[RawMesh], materials: GltfM
             images.append(np.full(len(part.faces), number))
             corners.append(uvs[part.faces])
     return materials.pictures.texture(np.concatenate(images), np.concatenate(corners)) if images else None
-
-
-def _check_gltf(path: Path) -> bytes:
-    """The file. Raises what damage leads to, and ValueError where arrays are larger than the files."""
-    data = path.read_bytes()
-    room, at = len(data), 12
-    if data.startswith(b"glTF"):
-        while at < min(room, int.from_bytes(data[8:12], "little")):
-            at += 8 + int.from_bytes(data[at : at + 4], "little")
-        if at > room + 8:  # of what follows the last chunk only a part may be there
-            raise ValueError(f"chunks of {at} bytes in {room}")
-    document = split_gltf(data)[0]
-    for uri in [buffer["uri"] for buffer in document.get("buffers", []) if "uri" in buffer]:
-        if not uri.startswith("data:"):
-            room += path_within(path.parent, uri, path).stat().st_size
-    claimed = 0
-    for accessor in document.get("accessors", []):
-        if accessor["count"] < 0:
-            raise ValueError(f"an array of {accessor['count']} elements")
-        claimed += accessor["count"] * _COMPONENTS[accessor["type"]] * _COMPONENT_BYTES[accessor["componentType"]]
-    if claimed > _SHARING * room:
-        raise ValueError(f"arrays of {claimed} bytes in {room}")
-    return data
 
 
 def _joined(colors: list[np.ndarray | None]) -> np.ndarray | None:

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
-from PIL import Image, UnidentifiedImageError
+from PIL import Image, UnidentifiedImageError, features
 from torch import Tensor
 
 from etsplat.core.errors import InputError
@@ -23,6 +23,11 @@ MAX_PIXELS = 160_000_000
 
 IMAGE_FORMATS = ("PNG", "JPEG")
 """Pillow's names of them."""
+
+WEBP_QUALITY = 90
+"""Of lossy pictures, of 100 (docs/conventions.md has what that takes away)."""
+
+_WEBP_SIDE = 16383
 
 _DENSEST = 520
 """Pixels of 16 bits in a byte of PNG, of which deflate makes at most 1032; JPEG needs a bit for 64 pixels at least."""
@@ -120,17 +125,20 @@ def load_image(path: Path | str, shape: tuple[int, int] | None = None) -> Float[
     return torch.from_numpy(np.array(decoded)).to(torch.float32) / 255
 
 
-def load_colors(path: Path | str, data: bytes | None = None) -> tuple[np.ndarray, bool]:
+def load_colors(
+    path: Path | str, data: bytes | None = None, formats: tuple[str, ...] = IMAGE_FORMATS
+) -> tuple[np.ndarray, bool]:
     """The straight colours of an image, (H, W, 3) uint8, and whether some of it is transparent.
 
     Args:
         path: of its file.
         data: the image, where it is only a part of that file.
+        formats: Pillow's names of those that it may have.
 
     Raises:
         InputError: as `load_image`.
     """
-    decoded = _decoded(path, data)
+    decoded = _decoded(path, data, formats=formats)
     if isinstance(decoded, Tensor):
         return to_8_bit(decoded)[..., None].repeat(1, 1, 3).numpy(), False
     pixels = np.array(decoded)
@@ -247,6 +255,22 @@ def encode_png(pixels: np.ndarray) -> bytes:
     return encoded.getvalue()
 
 
+def encode_webp(pixels: np.ndarray, *, lossy: bool) -> bytes:
+    """A WebP file of uint8, (H, W, 3), or (H, W) for grey; lossy at `WEBP_QUALITY`.
+
+    Raises:
+        InputError: this Pillow writes no WebP, or no such file is so large.
+    """
+    if not features.check("webp"):
+        raise InputError("this Pillow was built without WebP; install one from PyPI, or take pictures in PNG")
+    if max(pixels.shape[:2]) > _WEBP_SIDE:
+        raise InputError(f"WebP has at most {_WEBP_SIDE} pixels along a side; take pictures in PNG")
+    encoded = io.BytesIO()
+    image = Image.fromarray(pixels).convert("RGB")
+    image.save(encoded, format="WEBP", lossless=not lossy, quality=WEBP_QUALITY if lossy else 100, method=4)
+    return encoded.getvalue()
+
+
 def to_8_bit(image: Float[Tensor, "..."]) -> UInt8[Tensor, "..."]:
     """Round values in [0, 1] (others are clamped) to uint8, half up. Raises ValueError for NaN and Inf."""
     if not bool(torch.isfinite(image).all()):
@@ -281,10 +305,13 @@ def _is_to_turn(image: Image.Image, shape: tuple[int, int]) -> bool:
 
 
 def _decoded(
-    path: Path | str, data: bytes | None = None, shape: tuple[int, int] | None = None
+    path: Path | str,
+    data: bytes | None = None,
+    shape: tuple[int, int] | None = None,
+    formats: tuple[str, ...] = IMAGE_FORMATS,
 ) -> Image.Image | Float[Tensor, "H W"]:
     """8-bit RGB, or RGBA with transparency; or levels of 16-bit grey, which Pillow would clip instead of scale."""
-    with open_image(path, data) as image:
+    with open_image(path, data, formats) as image:
         turn = turn_of(image) if shape is not None and _is_to_turn(image, shape) else None
         deep = image.mode.startswith("I")
         transparent = image.mode in ("RGBA", "LA", "PA", "La", "RGBa") or "transparency" in image.info

@@ -16,7 +16,15 @@ from etsplat.io._mesh_readers import READERS, RawMesh
 from etsplat.io.georeference import Georeference
 from etsplat.io.paths import kind_of, path_remedy
 from etsplat.io.textures import NormalMap, Texture
-from etsplat.io.writers import Surface, SurfaceNormals, SurfaceTexture, save_surface, writer_of
+from etsplat.io.writers import (
+    Compression,
+    PictureKind,
+    Surface,
+    SurfaceNormals,
+    SurfaceTexture,
+    save_surface,
+    writer_of,
+)
 
 
 @dataclass(frozen=True)
@@ -84,6 +92,8 @@ def save_mesh(
     mipmaps: bool = True,
     split: bool = False,
     world: Georeference | None = None,
+    compress: Compression = "none",
+    pictures: PictureKind = "png",
 ) -> None:
     """Write a triangle mesh with colours per face or per vertex, or a texture. Atomic.
 
@@ -104,10 +114,13 @@ def save_mesh(
         split: unshare all vertices.
         world: its offset is added to all vertices in float64: PLY holds doubles then, OBJ and OFF the digits, GLB has
             it as the translation of its nodes, which turn z to +y where that is up. Vertices are scaled already.
+        compress: how GLB stores arrays: "none": 32 bits; "quantize": positions, coordinates and colours of 16 bits,
+            normals of 8; "meshopt": those compressed, for which pip install 'etsplat[compress]' is needed.
+        pictures: how GLB stores the texture and what lies beside it.
 
     Raises:
         ValueError: wrong shapes, indices out of range, or values that are not finite.
-        InputError: the file cannot be written.
+        InputError: the file cannot be written; a package is missing.
 
     Example:
         >>> vertices, faces = etsplat.icosphere(1)
@@ -116,6 +129,8 @@ def save_mesh(
         80
     """
     path = Path(path)
+    if compress != "none" or pictures != "png":
+        writer_of(path, holding="compressed")
     writer_of(path, holding="vertex_colors" if texture is None else "texture" if normal_map is None else "normals")
     if texture is not None and (face_colors is not None or vertex_colors is not None):
         raise ValueError("texture: expected no colours beside it")
@@ -128,12 +143,14 @@ def save_mesh(
         v, f = v[f].reshape(-1, 3), np.arange(f.size).reshape(-1, 3)
     if per_face is not None:
         per_vertex = np.repeat(per_face, 3, axis=0) if split else _vertex_means(v, f, per_face)
-    skin = None if texture is None else _surface_texture(texture, len(faces), mipmaps, normal_map)
-    far = _far(path, world)
-    save_surface(path, Surface(v.astype(np.float32), f, per_vertex, per_face, name=path.stem, texture=skin, **far))
+    skin = None if texture is None else _surface_texture(texture, len(faces), mipmaps, normal_map, pictures)
+    more: dict[str, Any] = {"name": path.stem, "texture": skin, "compress": compress, **_far(path, world)}
+    save_surface(path, Surface(v.astype(np.float32), f, per_vertex, per_face, **more))
 
 
-def _surface_texture(texture: Texture, faces: int, mipmaps: bool, normal_map: NormalMap | None) -> SurfaceTexture:
+def _surface_texture(
+    texture: Texture, faces: int, mipmaps: bool, normal_map: NormalMap | None, kind: PictureKind
+) -> SurfaceTexture:
     """As writers take it, whose coordinates count from the top.
 
     Raises:
@@ -144,9 +161,10 @@ def _surface_texture(texture: Texture, faces: int, mipmaps: bool, normal_map: No
         given = f"{len(texture.face_images.unique())} over {len(texture.corner_uvs)}"
         raise ValueError(f"texture: expected one picture over {faces} faces, got {given}")
     uvs = texture.corner_uvs.detach().cpu().numpy().astype(np.float64)
-    arrays = {} if normal_map is None else {name: value.cpu().numpy() for name, value in vars(normal_map).items()}
-    relief = SurfaceNormals(**arrays) if arrays else None
-    return SurfaceTexture(picture.cpu().numpy(), np.stack([uvs[..., 0], 1 - uvs[..., 1]], axis=-1), mipmaps, relief)
+    given = {} if normal_map is None else {name: value for name, value in vars(normal_map).items() if value is not None}
+    relief = SurfaceNormals(**{name: value.cpu().numpy() for name, value in given.items()}) if given else None
+    from_above = np.stack([uvs[..., 0], 1 - uvs[..., 1]], axis=-1)
+    return SurfaceTexture(picture.cpu().numpy(), from_above, mipmaps, relief, kind)
 
 
 def save_triangles(
@@ -160,6 +178,7 @@ def save_triangles(
     record: Mapping[str, Any] | None = None,
     sky: Bool[Tensor, " N"] | None = None,
     world: Georeference | None = None,
+    compress: Compression = "none",
 ) -> None:
     """Write separate triangles, each or each of its corners in exactly its colour, as other programs read them. Atomic.
 
@@ -180,6 +199,7 @@ def save_triangles(
         sky: which triangles are an object of their own, the sky, to be seen from the side from which their corners run
             counterclockwise; neither all nor none. Only OBJ and GLB have room for more than one object.
         world: as of `save_mesh`.
+        compress: so.
 
     Raises:
         ValueError: another suffix or wrong shapes; a sky where there is no room for it.
@@ -187,6 +207,8 @@ def save_triangles(
     """
     path = Path(path)
     writer_of(path, holding=None if sky is None else "objects")
+    if compress != "none":
+        writer_of(path, holding="compressed")
     far = _far(path, world)
     N = len(vertices)
     if vertices.shape[1:] != (3, 3) or colors.shape not in ((N, 3), (N, 4), (N, 3, 3), (N, 3, 4)):
@@ -200,7 +222,8 @@ def save_triangles(
     scene = replace(_triangles(path, points[rows], tones[rows], weld=weld), **far)
     apart = None if sky is None else replace(_triangles(path, points[~rows], tones[~rows], weld=weld), **far)
     extra = {name: value[rows] for name, value in extra.items()}
-    save_surface(path, replace(scene, numbers=extra, comment=comment, name=path.stem, record=record or {}, sky=apart))
+    said = {"comment": comment, "name": path.stem, "record": record or {}, "compress": compress}
+    save_surface(path, replace(scene, numbers=extra, sky=apart, **said))
 
 
 def _far(path: Path, world: Georeference | None) -> dict[str, Any]:

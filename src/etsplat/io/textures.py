@@ -85,8 +85,10 @@ class NormalMap:
         pixels: (H, W, 3) normals in tangent space, -1 to 1 as 0 to 255, row by row from the top, where the texture is.
         normals: (F, 3, 3) unit normals of the corners.
         tangents: (F, 3, 4) their tangents and signs, as of `etsplat.geometry.tangents`.
+        occlusion: (H, W) how much of the light from all around comes to each texel, 0 to 1 as 0 to 255; or None.
     """
 
     pixels: UInt8[Tensor, "H W 3"]
     normals: Float[Tensor, "F 3 3"]
     tangents: Float[Tensor, "F 3 4"]
+    occlusion: UInt8[Tensor, "H W"] | None = None

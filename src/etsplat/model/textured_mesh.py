@@ -14,11 +14,13 @@ from etsplat.core.errors import InputError
 from etsplat.core.rasterization import Rasterization
 from etsplat.core.validation import check_like, check_shape
 from etsplat.geometry.topology import MeshTopology
+from etsplat.io.georeference import Georeference
 from etsplat.io.images import to_8_bit
 from etsplat.io.mesh_files import load_mesh, save_mesh, weld_vertices
 from etsplat.io.opaque_files import TexturedFile, load_textured, save_textured
 from etsplat.io.paths import kind_of
 from etsplat.io.textures import NormalMap, Texture
+from etsplat.io.writers import Compression, PictureKind
 from etsplat.model.model import Appearance, Depth, Model
 from etsplat.ops.antialias import rasterize_antialiased
 from etsplat.ops.rasterize_opaque import rasterize_opaque
@@ -111,10 +113,24 @@ class TexturedMesh(Model):
             raise InputError(f"mesh {path}: texture coordinates beyond [0, 1], where it repeats; bake it without")
         return cls.from_mesh(mesh.vertices, mesh.faces, picture.float() / 255, uvs)
 
-    def save(self, path: Path | str, normal_map: NormalMap | None = None) -> None:
+    def save(
+        self,
+        path: Path | str,
+        normal_map: NormalMap | None = None,
+        *,
+        world: Georeference | None = None,
+        compress: Compression = "none",
+        pictures: PictureKind = "png",
+    ) -> None:
         """Write a file, atomically: .safetensors exactly; .glb, or .obj and .ply with a .png beside them, of 8 bits.
 
-        With a normal map, for .glb alone, its material is lit.
+        Args:
+            path: of the file.
+            normal_map: for .glb alone, whose material is lit then.
+            world: where it lies; as the two after it of `etsplat.io.mesh_files.save_mesh`, for other files than
+                .safetensors.
+            compress: for .glb alone.
+            pictures: so.
         """
         vertices, faces = self.surface()
         texture, uvs = self.texture.detach().cpu(), self.face_uvs.cpu()
@@ -125,7 +141,8 @@ class TexturedMesh(Model):
         from_below = torch.stack([uvs[..., 0], 1 - uvs[..., 1]], dim=-1)
         picture = Texture.of([to_8_bit(texture)], torch.zeros(len(faces), dtype=torch.int64), from_below)
         mipmaps = self.appearance.max_level != 0
-        save_mesh(path, vertices, faces.long(), texture=picture, normal_map=normal_map, mipmaps=mipmaps)
+        look = {"texture": picture, "normal_map": normal_map, "mipmaps": mipmaps, "pictures": pictures}
+        save_mesh(path, vertices, faces.long(), **look, world=world, compress=compress)
 
     def to(self, device: torch.device) -> "TexturedMesh":
         """The same mesh on another device, its parameters leaf tensors as they are here."""

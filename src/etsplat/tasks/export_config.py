@@ -16,6 +16,8 @@ LIGHT_FACES = 10_000
 
 _TEXTURED = Only("with --texture", lambda config: config.texture is not None)
 
+_WITH_NORMALS = Only("with --normals", lambda config: config.normals)
+
 
 @dataclass(frozen=True)
 class ExportConfig(Settings):
@@ -33,6 +35,15 @@ class ExportConfig(Settings):
     lods: Annotated[int, Range(0, 7), _TEXTURED] = 0
     """With --texture: so many coarser levels beside it, in files of their own, NAME_lod1 and on.
     Each has a quarter of the faces of the one before, and half its texels along each side, for twice the distance."""
+    occlusion: Annotated[bool, _WITH_NORMALS] = False
+    """With --normals: ambient occlusion of the full mesh beside them, for programs that light it from all around."""
+    compress: Literal["none", "quantize", "meshopt"] = "none"
+    """Of GLB: how what vertices have is stored.
+    none: in 32 bits; quantize: positions in 16 bits of the longest side, normals in 8 (KHR_mesh_quantization);
+    meshopt: those compressed (EXT_meshopt_compression); needs pip install 'etsplat[compress]'."""
+    pictures: Annotated[Literal["png", "webp"], _TEXTURED] = "png"
+    """With --texture, in GLB: how its pictures are stored.
+    webp: a third of the size, or less, for programs that know EXT_texture_webp; others refuse the file."""
     colors: Bake = "mean"
     """What becomes of colours that depend on the direction.
     mean: one per triangle, of what the training views see;

@@ -15,6 +15,7 @@ from etsplat.engines.choice import resolve_device
 from etsplat.geometry.decimation import decimated
 from etsplat.io.georeference import GEOREFERENCE_FILE, Georeference
 from etsplat.io.mesh_files import MeshFile, load_mesh, save_mesh
+from etsplat.io.meshopt import load_meshopt
 from etsplat.io.paths import kind_of
 from etsplat.io.run_directory import RunDirectory, is_run
 from etsplat.io.writers import suffixes
@@ -26,7 +27,7 @@ from etsplat.tasks.settings import settings_of
 from etsplat.tasks.sources import fingerprint, load_source, make_subject, read_record
 from etsplat.tasks.texturing import Tell, check_installed, coarser, colors_at, texture_object
 
-_OF_MESHES = ("texture", "faces", "normals", "lods", "place")
+_OF_MESHES = ("texture", "faces", "normals", "occlusion", "lods", "compress", "pictures", "place")
 """Settings that meshes of reconstructions know."""
 
 
@@ -185,8 +186,9 @@ def export_mesh(
             option = name.replace("_", "-")
             ours = ", ".join(f"--{other}" for other in _OF_MESHES)
             raise InputError(f"--{option}: is for soups; of a reconstruction's mesh there are {ours}")
-    if config.place not in ("keep", "world") or (config.place == "world" and config.texture is not None):
-        raise InputError(f"--place {config.place}: is for soups; a mesh without --texture knows --place world")
+    if config.place not in ("keep", "world"):
+        raise InputError(f"--place {config.place}: is for soups; a mesh knows --place world")
+    check_stored(path, config)
     if config.texture is not None:
         return _export_textured(run, path, config, scene, device, tell)
     if kind_of(path) not in suffixes():
@@ -196,9 +198,10 @@ def export_mesh(
         vertices, faces = decimated(mesh.vertices, mesh.faces, config.faces)
         colors = colors_at(mesh, vertices[faces].mean(dim=1))
         mesh = MeshFile(vertices, faces, face_colors=colors)
-    far = None if config.place != "world" else _georeference(run)
+    far = _georeference(run) if config.place == "world" else None
     vertices = mesh.vertices if far is None else mesh.vertices * far.scale
-    save_mesh(path, vertices, mesh.faces, mesh.face_colors, vertex_colors=_only_by_vertex(mesh), world=far)
+    colors = {"face_colors": mesh.face_colors, "vertex_colors": _only_by_vertex(mesh)}
+    save_mesh(path, vertices, mesh.faces, **colors, world=far, compress=config.compress)
     return {path: len(mesh.faces)}
 
 
@@ -212,9 +215,13 @@ def _export_textured(
         raise InputError(f"{path}: files of this kind hold no texture; choose --format {kinds}")
     if config.normals and kind_of(path) != ".glb":
         raise InputError(f"{path}: files of this kind hold no normal map; leave out --normals, or choose --format glb")
+    if config.place == "world" and kind_of(path) not in suffixes("offset"):
+        kinds = " or ".join(suffix[1:] for suffix in suffixes("texture"))
+        raise InputError(f"{path}: files of this kind hold no coordinates of maps; choose --format {kinds}")
     if not path.parent.is_dir():  # rather than after a minute
         raise InputError(f"{path}: there is no folder {path.parent}; create the folder first")
     check_installed()
+    far = _georeference(run) if config.place == "world" else None
     opened, written = open_reconstruction(run, scene, device, tell), {}
     mesh = opened.textured(config.texture, config.faces or LIGHT_FACES, tell=tell)
     for level in range(config.lods + 1):
@@ -222,10 +229,22 @@ def _export_textured(
             tell("Making coarser levels", level, config.lods)
             mesh = coarser(mesh, max(4, mesh.count // 4), config.texture >> level)
         place = path.with_name(f"{path.stem}_lod{level}{path.suffix}") if level else path
-        relief = normal_map_of(mesh, opened.mesh) if config.normals else None
-        opened.in_own_units(mesh).save(place, relief)
+        relief = normal_map_of(mesh, opened.mesh, occlusion=config.occlusion) if config.normals else None
+        placed = opened.in_own_units(mesh)
+        if far is not None:
+            placed = replace(placed, vertices=placed.vertices.detach() * far.scale).learnable()
+        placed.save(place, relief, world=far, compress=config.compress, pictures=config.pictures)
         written[place] = mesh.count
     return written
+
+
+def check_stored(path: Path, config: ExportConfig) -> None:
+    """Raises InputError where a file of this kind cannot be stored as the settings say, or a package is missing."""
+    for name in ("compress", "pictures"):
+        if getattr(config, name) != getattr(ExportConfig(), name) and kind_of(path) not in suffixes("compressed"):
+            raise InputError(f"{path}: is not stored in another way; leave out --{name}, or choose --format glb")
+    if config.compress == "meshopt":
+        load_meshopt()
 
 
 def _georeference(run: Path) -> Georeference:

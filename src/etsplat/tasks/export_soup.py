@@ -22,6 +22,7 @@ from etsplat.model.soup_appearance import OPAQUE_FROM
 from etsplat.model.triangle_soup import GEOREFERENCE_NOTE, TriangleSoup
 from etsplat.ops.soup_colors import soup_colors
 from etsplat.tasks.export_config import ExportConfig
+from etsplat.tasks.export_mesh import check_stored
 from etsplat.tasks.scene_page import compact_bytes, scene_of, small_camera
 from etsplat.tasks.soup_selection import Crop, Reason, Selection, select
 from etsplat.tasks.sources import SoupRun, training_cameras, world_up
@@ -94,6 +95,7 @@ def export_soup(run: SoupRun, path: Path | str, config: ExportConfig, crop: Crop
 
 def _check(path: Path, config: ExportConfig) -> None:
     """Raises InputError for settings that files of a kind have no room for, or that contradict each other."""
+    check_stored(path, config)
     moved = config.scale != 1 or config.place != "keep"
     if kind_of(path) in WHOLE:
         if moved or config.up == "z":
@@ -181,6 +183,7 @@ def _write(run: SoupRun, path: Path, config: ExportConfig, chosen: Selection, *,
         record=_record(config, chosen, transform, georeference),
         sky=sky if bool(sky.any()) else None,
         world=world,
+        compress=config.compress,
     )
     return Export(path, len(vertices), int(sky.sum()), chosen.removed, transform)
 

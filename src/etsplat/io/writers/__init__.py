@@ -16,9 +16,17 @@ if TYPE_CHECKING:  # help, which lists the kinds, must not wait for it
     import numpy as np
 
 Colors: TypeAlias = "np.ndarray | None"
-Content = Literal["vertex_colors", "face_colors", "texture", "alpha", "numbers", "objects", "z_up", "normals", "offset"]
+Content = Literal[
+    "vertex_colors", "face_colors", "texture", "alpha", "numbers", "objects", "z_up", "normals", "offset", "compressed"
+]
 """What a kind of file may have room for, beside vertices and faces: several objects; +z up, where no rule says +y;
-an offset in float64."""
+an offset in float64; fewer bits."""
+
+Compression = Literal["none", "quantize", "meshopt"]
+"""How arrays are stored: in 32 bits; in 8 and 16; or those compressed."""
+
+PictureKind = Literal["png", "webp"]
+"""How pictures within a file are stored."""
 
 
 @dataclass(frozen=True)
@@ -31,12 +39,14 @@ class SurfaceTexture:
             lower right one.
         mipmaps: whether viewers may shrink it; not if parts that lie side by side belong to faces apart.
         relief: how light falls on it, or None for colours that are shown as they are.
+        kind: how it is stored within a file; beside one it is a PNG.
     """
 
     pixels: "np.ndarray"
     corner_uvs: "np.ndarray"
     mipmaps: bool = True
     relief: "SurfaceNormals | None" = None
+    kind: PictureKind = "png"
 
 
 @dataclass(frozen=True)
@@ -47,11 +57,13 @@ class SurfaceNormals:
         pixels: (H, W, 3) uint8, normals in tangent space.
         normals: (F, 3, 3) of the corners.
         tangents: (F, 3, 4) of the corners.
+        occlusion: (H, W) uint8, or None.
     """
 
     pixels: "np.ndarray"
     normals: "np.ndarray"
     tangents: "np.ndarray"
+    occlusion: "np.ndarray | None" = None
 
 
 @dataclass(frozen=True)
@@ -73,6 +85,7 @@ class Surface:
         z_up: whether z is known to be up, so that files that have +y up by their standard turn it.
         sky: what lies behind the scene, as an object of its own whose triangles are to be seen from one side: that from
             which their corners run counterclockwise.
+        compress: how its arrays are stored where there is a choice ("compressed").
     """
 
     vertices: "np.ndarray"
@@ -87,6 +100,7 @@ class Surface:
     offset: "np.ndarray | None" = None
     z_up: bool = False
     sky: "Surface | None" = None
+    compress: Compression = "none"
 
     @property
     def places(self) -> "np.ndarray":

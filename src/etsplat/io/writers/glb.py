@@ -10,13 +10,18 @@ from typing import Any
 
 import numpy as np
 
-from etsplat.io.images import encode_png
+from etsplat.io.images import encode_png, encode_webp
+from etsplat.io.meshopt import in_drawing_order
 from etsplat.io.srgb import linear_from_srgb
-from etsplat.io.writers import Content, Surface, SurfaceTexture
+from etsplat.io.writers import Compression, Content, Surface, SurfaceTexture
+from etsplat.io.writers._glb_arrays import Arrays, Grid
 
-HOLDS: frozenset[Content] = frozenset({"vertex_colors", "texture", "alpha", "objects", "normals", "offset"})
+HOLDS: frozenset[Content] = frozenset(
+    {"vertex_colors", "texture", "alpha", "objects", "normals", "offset", "compressed"}
+)
 
 _LINEAR, _LINEAR_MIPMAP_LINEAR, _CLAMP_TO_EDGE = 9729, 9987, 33071
+_WEBP = "EXT_texture_webp"
 
 OPAQUE_ALPHA = 0.99
 """Faces with this alpha or more do not blend."""
@@ -35,64 +40,71 @@ def write(path: Path, surface: Surface) -> None:
     call the object. The sky is a node of its own, seen from inside alone: from outside one looks through it. The record
     is in the extras of `asset`. An offset is the translation of the nodes, which JSON has in float64; they turn z to +y
     where that is up.
+
+    Quantised (`compress`), positions are whole numbers of 16 bits on a grid of each node's own, which its scale and
+    translation place; what else vertices have, 16 bits, normals and tangents 8. Compressed, triangles and vertices are
+    in another order too. Programs that know neither extension refuse such files, as they do those with WebP.
     """
-    content = _Content()
+    content = _Content(surface.compress)
     content.add(surface.name, surface, lambda mode: mode.lower(), double_sided=True)
     if surface.sky is not None:
         solid = surface.sky.vertex_colors
         solid = None if solid is None else solid[:, :3]  # nothing is behind it to blend with
         content.add("sky", replace(surface.sky, vertex_colors=solid), lambda mode: "sky", double_sided=False)
-    placed = _node(surface)
     document = {
         "asset": {"version": "2.0", "generator": "etsplat"},
         "scene": 0,
         "scenes": [{"nodes": list(range(len(content.meshes)))}],
-        "nodes": [{"mesh": index, "name": mesh["name"], **placed} for index, mesh in enumerate(content.meshes)],
+        "nodes": [
+            {"mesh": index, "name": mesh["name"], **_node(surface, grid)}
+            for index, (mesh, grid) in enumerate(zip(content.meshes, content.grids, strict=True))
+        ],
         "meshes": content.meshes,
         "materials": content.materials,
-        "buffers": [{"byteLength": content.size}],
-        "bufferViews": content.views,
-        "accessors": content.accessors,
+        **content.arrays.document(),
     }
     if content.images:
         document |= {"images": content.images, "textures": content.textures, "samplers": content.samplers}
     if surface.record:
         document["asset"]["extras"] = {"etsplat": dict(surface.record)}
-    if any("extensions" in material for material in content.materials):
-        document["extensionsUsed"] = ["KHR_materials_unlit"]
+    needed, unlit = content.extensions(), any("extensions" in material for material in content.materials)
+    if needed or unlit:
+        document["extensionsUsed"] = (["KHR_materials_unlit"] if unlit else []) + needed
+    if needed:
+        document["extensionsRequired"] = needed
     text = json.dumps(document, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
-    data = b"".join(content.data)
+    data = b"".join(content.arrays.data)
     with open(path, "wb") as file:
         file.write(struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + len(data)))
         file.write(struct.pack("<I4s", len(text), b"JSON") + text)
         file.write(struct.pack("<I4s", len(data), b"BIN\0") + data)
 
 
-def _node(surface: Surface) -> dict[str, Any]:
+def _node(surface: Surface, grid: Grid | None) -> dict[str, Any]:
     """Where a node lies; nothing at the origin."""
+    x, y, z = (0.0, 0.0, 0.0) if grid is None else grid.origin.tolist()
+    placed: dict[str, Any] = {} if grid is None else {"scale": [grid.step] * 3}
     if surface.offset is None:
-        return {}
-    x, y, z = surface.offset.tolist()
+        return placed if grid is None else {"translation": [x, y, z], **placed}
+    x, y, z = (x + surface.offset[0], y + surface.offset[1], z + surface.offset[2])
     if not surface.z_up:
-        return {"translation": [x, y, z]}
+        return {"translation": [float(x), float(y), float(z)], **placed}
     half = math.sqrt(0.5)
-    return {"translation": [x, z, -y], "rotation": [-half, 0, 0, half]}
+    return {"translation": [float(x), float(z), -float(y)], "rotation": [-half, 0, 0, half], **placed}
 
 
 class _Content:
     """Meshes with their materials, and the arrays that they are of."""
 
-    def __init__(self) -> None:
+    def __init__(self, compress: Compression) -> None:
+        self.arrays = Arrays(compress)
         self.meshes: list[dict[str, Any]] = []
+        self.grids: list[Grid | None] = []
         self.materials: list[dict[str, Any]] = []
-        self.views: list[dict[str, Any]] = []
-        self.accessors: list[dict[str, Any]] = []
         self.images: list[dict[str, Any]] = []
         self.textures: list[dict[str, Any]] = []
         self.samplers: list[dict[str, Any]] = []
-        self.data: list[bytes] = []
-        self.size = 0
 
     def add(self, name: str, surface: Surface, material: Callable[[str], str], *, double_sided: bool) -> None:
         """Append a mesh; `material` names the material of an alpha mode."""
@@ -100,24 +112,24 @@ class _Content:
         about = {}
         if surface.texture is not None:
             surface, about = _by_vertex(surface, surface.texture)
-        vertices, colors = surface.vertices, surface.vertex_colors
-        attributes = {"POSITION": self._array("VEC3", vertices.astype("<f4"))}
-        self.accessors[-1] |= {"min": vertices.min(axis=0).tolist(), "max": vertices.max(axis=0).tolist()}
-        if colors is not None:
+        parts = _parts(surface)
+        values = {"POSITION": surface.vertices, **about}
+        if (colors := surface.vertex_colors) is not None:
             linear = np.ones((len(colors), 4))
             linear[:, : colors.shape[1]] = np.hstack([linear_from_srgb(colors[:, :3]), colors[:, 3:]])
-            attributes["COLOR_0"] = self._array("VEC4", linear.astype("<f4"))
-        for attribute, values in about.items():
-            attributes[attribute] = self._array(f"VEC{values.shape[1]}", values)
-        pictures = {}
-        if surface.texture is not None:
-            sampler = self._sampler(surface.texture)
-            pictures["baseColorTexture"] = self._picture(surface.texture.pixels, sampler)
-            if relief is not None:
-                pictures["normalTexture"] = self._picture(relief.pixels, sampler)
+            values["COLOR_0"] = linear
+        if self.arrays.compress == "meshopt":
+            faces, rows = in_drawing_order([part for part, _ in parts], len(surface.vertices))
+            parts = list(zip(faces, (mode for _, mode in parts), strict=True))
+            values = {attribute: array[rows] for attribute, array in values.items()}
+        grid = Grid.around(values["POSITION"]) if self.arrays.quantized else None
+        if grid is not None:
+            values["POSITION"] = grid.numbers(values["POSITION"])
+        attributes = {attribute: self.arrays.attribute(attribute, array) for attribute, array in values.items()}
+        pictures = {} if surface.texture is None else self._pictures(surface.texture)
         primitives = []
-        for part, mode in _parts(surface):
-            indices = self._array("SCALAR", part.astype("<u4").reshape(-1))
+        for part, mode in parts:
+            indices = self.arrays.indices(part, len(values["POSITION"]))
             primitives.append(
                 {"attributes": attributes, "indices": indices, "mode": 4, "material": len(self.materials)}
             )
@@ -128,34 +140,35 @@ class _Content:
                 owner[role] = {"index": picture}
             self.materials.append(made)
         self.meshes.append({"primitives": primitives, "name": name})
+        self.grids.append(grid)
 
-    def _array(self, kind: str, array: np.ndarray) -> int:
-        """Append an array; the number of its accessor."""
-        component, target = (5125, 34963) if kind == "SCALAR" else (5126, 34962)
-        view = self._view(array.tobytes(), target=target)
-        self.accessors.append({"bufferView": view, "count": len(array), "componentType": component, "type": kind})
-        return len(self.accessors) - 1
+    def extensions(self) -> list[str]:
+        """Without which the file cannot be read."""
+        webp = any("extensions" in texture for texture in self.textures)
+        return self.arrays.extensions() + ([_WEBP] if webp else [])
 
-    def _sampler(self, texture: SurfaceTexture) -> int:
-        """Append how a texture is read, which ends at its border; its number."""
+    def _pictures(self, texture: SurfaceTexture) -> dict[str, int]:
+        """Append the pictures of a material, all read alike, which end at their borders; the numbers by their roles."""
         smaller = _LINEAR_MIPMAP_LINEAR if texture.mipmaps else _LINEAR
         edge = {"wrapS": _CLAMP_TO_EDGE, "wrapT": _CLAMP_TO_EDGE}
         self.samplers.append({"magFilter": _LINEAR, "minFilter": smaller, **edge})
-        return len(self.samplers) - 1
+        webp = texture.kind == "webp"
+        found = {"baseColorTexture": self._picture(texture.pixels, webp=webp, lossy=True)}
+        if texture.relief is not None:
+            found["normalTexture"] = self._picture(texture.relief.pixels, webp=webp, lossy=False)
+            if texture.relief.occlusion is not None:
+                found["occlusionTexture"] = self._picture(texture.relief.occlusion, webp=webp, lossy=True)
+        return found
 
-    def _picture(self, pixels: np.ndarray, sampler: int) -> int:
+    def _picture(self, pixels: np.ndarray, *, webp: bool, lossy: bool) -> int:
         """Append a picture as a texture; its number."""
-        self.images.append({"bufferView": self._view(encode_png(pixels)), "mimeType": "image/png"})
-        self.textures.append({"sampler": sampler, "source": len(self.images) - 1})
+        data = encode_webp(pixels, lossy=lossy) if webp else encode_png(pixels)
+        self.images.append({"bufferView": self.arrays.view(data), "mimeType": "image/webp" if webp else "image/png"})
+        source = {"source": len(self.images) - 1}
+        self.textures.append(
+            {"sampler": len(self.samplers) - 1, **({"extensions": {_WEBP: source}} if webp else source)}
+        )
         return len(self.textures) - 1
-
-    def _view(self, data: bytes, **more: int) -> int:
-        """Append bytes, from a multiple of 4 on; the number of their view."""
-        self.views.append({"buffer": 0, "byteOffset": self.size, "byteLength": len(data), **more})
-        data += bytes(-len(data) % 4)
-        self.data.append(data)
-        self.size += len(data)
-        return len(self.views) - 1
 
 
 def _by_vertex(surface: Surface, texture: SurfaceTexture) -> tuple[Surface, dict[str, np.ndarray]]:
