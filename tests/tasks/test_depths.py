@@ -139,6 +139,18 @@ def test_a_mesh_uses_right_maps_and_wrong_ones_change_no_bit(tmp_path):
     assert not torch.equal(meshes["right", "auto"], meshes["right", "off"])
 
 
+def test_opaque_triangles_say_that_they_leave_maps_out(tmp_path):
+    """A note of those that the capture has; those that are named are refused."""
+    write_ball(tmp_path)
+    config = etsplat.ReconstructConfig.tiny().changed({"iterations": 2, "method": "raster-face", "regularization.depth": "auto"})
+    notes = []
+    etsplat.reconstruct(tmp_path, tmp_path / "run", config, callbacks=[notes.append])
+    assert any("depth maps: method raster-face has no use for them" in str(note) for note in notes)
+    for given in ({"depths": tmp_path / "depths"}, {"depth_unit": 0.001}):
+        with pytest.raises(InputError, match=f"{next(iter(given))}: has no effect with method raster-face"):
+            etsplat.reconstruct(tmp_path, tmp_path / "other", config, **given)
+
+
 def test_settings_that_would_do_nothing_are_refused():
     assert wanted_depths(None, None, "off") is False
     assert wanted_depths(None, None, "auto") is True

@@ -154,7 +154,7 @@ def test_a_run_of_something_else_by_now_is_refused(run: Path, tmp_path: Path) ->
 
 
 def test_a_mesh_goes_to_the_world_where_the_run_says(run: Path, tmp_path: Path) -> None:
-    """In doubles; without a record, under a texture, and to a place of its own it is refused."""
+    """In doubles; without a record, and to a place of its own it is refused."""
     with pytest.raises(InputError, match=r"has no georeference\.json"):
         export(run, "--place", "world", "--out", tmp_path / "a.ply")
     Georeference((500_000.0, 5_400_000.0, 300.0), 2.0, "z").write(run)
@@ -164,8 +164,60 @@ def test_a_mesh_goes_to_the_world_where_the_run_says(run: Path, tmp_path: Path) 
         found = np.stack([table[axis] for axis in "xyz"], axis=1)
         expected = 2 * own.vertices.double().numpy() + [500_000.0, 5_400_000.0, 300.0]
         assert np.abs(found - expected).max() < 1e-5
-        for words in (("--place", "center"), ("--place", "world", "--texture", "64")):
-            with pytest.raises(InputError, match="a mesh without --texture knows --place world"):
-                export(run, *words, "--out", tmp_path / "b.glb")
+        with pytest.raises(InputError, match="a mesh knows --place world"):
+            export(run, "--place", "center", "--out", tmp_path / "b.glb")
     finally:
         (run / "georeference.json").unlink()
+
+
+def test_a_textured_mesh_goes_to_the_world_too(run: Path, tmp_path: Path) -> None:
+    """By the same scale and offset, quantised or not, as digits or as the place of a node; not exactly."""
+    Georeference((500_000.0, 5_400_000.0, 300.0), 2.0, "z").write(run)
+    light = ("--texture", "64", "--faces", "100")
+    try:
+        export(run, *light, "--out", tmp_path / "near.glb")
+        for end, more in ((".glb", ("--compress", "quantize")), (".obj", ())):
+            export(run, *light, *more, "--place", "world", "--out", tmp_path / f"far{end}")
+        with pytest.raises(InputError, match=r"hold no coordinates of maps; choose --format glb or obj or ply"):
+            export(run, *light, "--place", "world", "--format", "safetensors")
+    finally:
+        (run / "georeference.json").unlink()
+    near = load_mesh(tmp_path / "near.glb").vertices.double()
+    low, high = 2 * near.amin(0), 2 * near.amax(0)
+    (node,) = check_glb(tmp_path / "far.glb")["nodes"]
+    x, y, z = node["translation"]
+    assert [x, -z, y] == pytest.approx((low + torch.tensor([500_000, 5_400_000, 300])).tolist(), abs=1e-4)
+    rows = [line.split()[1:] for line in (tmp_path / "far.obj").read_text().splitlines() if line.startswith("v ")]
+    places = np.array(rows, dtype=np.float64) - [500_000, 5_400_000, 300]
+    assert abs(places - np.clip(places, low.numpy() - 1e-4, high.numpy() + 1e-4)).max() == 0
+
+
+def test_how_a_file_is_stored(run: Path, tmp_path: Path) -> None:
+    """Smaller, and with the same faces; other kinds of files, and soups' settings without effect, are refused."""
+    light = ("--texture", "128", "--faces", "300")
+    export(run, *light, "--out", tmp_path / "a.glb")
+    export(run, *light, "--compress", "quantize", "--pictures", "webp", "--out", tmp_path / "b.glb")
+    first, second = (load_mesh(tmp_path / name) for name in ("a.glb", "b.glb"))
+    assert len(first.faces) == len(second.faces)
+    assert (first.vertices.amax(0) - second.vertices.amax(0)).abs().max() < 6 / 65535
+    assert (tmp_path / "b.glb").stat().st_size < 0.8 * (tmp_path / "a.glb").stat().st_size
+    export(run, "--compress", "quantize", "--out", tmp_path / "c.glb")
+    assert check_glb(tmp_path / "c.glb")["extensionsRequired"] == ["KHR_mesh_quantization"]
+    for words, about in [
+        (["--compress", "quantize", "--format", "obj"], r"leave out --compress, or choose --format glb"),
+        ([*light, "--pictures", "webp", "--format", "obj"], r"leave out --pictures, or choose --format glb"),
+        (["--pictures", "webp"], "pictures: has an effect only with --texture"),
+        ([*light, "--occlusion"], "occlusion: has an effect only with --normals"),
+    ]:
+        with pytest.raises(InputError, match=about):
+            export(run, *words)
+
+
+def test_ambient_occlusion_lies_beside_normals(run: Path, tmp_path: Path) -> None:
+    """Of a ball, which nothing shades, nearly white; half as many texels along each side."""
+    export(run, "--texture", "128", "--faces", "100", "--normals", "--occlusion", "--out", tmp_path / "ball.glb")
+    (material,) = check_glb(tmp_path / "ball.glb")["materials"]
+    assert material["occlusionTexture"] == {"index": 2}
+    shade = np.asarray(trimesh.load_mesh(tmp_path / "ball.glb").visual.material.occlusionTexture)
+    assert shade.shape == (64, 64)
+    assert np.median(shade) > 230

@@ -12,13 +12,17 @@ from etsplat.geometry.manifold import taken_apart
 from etsplat.geometry.topology import MeshTopology
 
 HASTES = (5.0, 3.0, 7.0)
-"""How fast the error that a collapse may make grows: tried in this order until the result is as sound as the input."""
+"""How fast the error that a collapse may make grows: tried in this order until the result is as sound as the input, and
+has no more faces than asked for."""
+
+_TRIES = 4
+"""How often a result of too many faces is made again with fewer, each time by twice what there were too many."""
 
 
 def decimated(
     vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], count: int
 ) -> tuple[Float[Tensor, "V2 3"], Int64[Tensor, "F2 3"]]:
-    """A mesh of at most so many faces, or nearly so where fewer would tear it. The same for the same input.
+    """A mesh of at most so many faces. The same for the same input.
 
     Args:
         vertices: (V, 3) finite.
@@ -30,7 +34,7 @@ def decimated(
 
     Raises:
         ValueError: wrong shape, index or number.
-        InputError: fast-simplification is not installed; or a sound mesh would be torn.
+        InputError: fast-simplification is not installed; or a mesh does not come to so few without being torn.
     """
     check_shape("vertices", vertices, ("V", 3))
     check_shape("faces", faces, ("F", 3))
@@ -42,13 +46,17 @@ def decimated(
     simplify = load_simplifier().simplify
     sound = _is_sound(faces, len(vertices))
     for haste in HASTES:
-        points, triangles = simplify(vertices.numpy(), faces.int().numpy(), target_count=count, agg=haste)
-        found = torch.from_numpy(points).to(vertices), _clean(torch.from_numpy(triangles).long())
-        if not sound:
-            return _compact(*found)
-        if (whole := _repaired(*found)) is not None:
-            return whole
-    raise InputError(f"faces: at {count} the mesh would not stay closed; ask for more")
+        target = count
+        for _ in range(_TRIES):
+            points, triangles = simplify(vertices.numpy(), faces.int().numpy(), target_count=target, agg=haste)
+            found = torch.from_numpy(points).to(vertices), _clean(torch.from_numpy(triangles).long())
+            whole = _repaired(*found) if sound else _compact(*found)
+            if whole is None:
+                break
+            if len(whole[1]) <= count:
+                return whole
+            target = max(4, target - 2 * (len(whole[1]) - count))
+    raise InputError(f"faces: at {count} the mesh would not stay {'closed' if sound else 'whole'}; ask for more")
 
 
 def _repaired(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor] | None:

@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from etsplat.core.errors import InputError
 from etsplat.core.workers import together
 from etsplat.data.agreement import contradicted
 from etsplat.data.dataset import Dataset
@@ -120,6 +121,9 @@ def reconstruct(
     """
     config = config or ReconstructConfig()
     job = Job(config, out, callbacks, resume=resume, overwrite=overwrite)
+    for name, given in (("depths", depths), ("depth_unit", depth_unit)):
+        if given is not None and not config.soft:
+            raise InputError(f"{name}: has no effect with method {config.method}; leave it out, or take soft triangles")
     maps = wanted_depths(depths, depth_unit, config.regularization.depth)
     loaded, notes = load_source(source, config, masks, depths=maps, depth_unit=depth_unit)
     start = load_start(init_mesh)
@@ -176,6 +180,8 @@ def _trusted_depths(views: Dataset, config: ReconstructConfig, begun: Start, job
     """Compared with the mesh soon where that starts near the surface, or else when photos have shaped it."""
     weights = config.regularization
     first = DEPTHS_NEAR if begun != "sphere" else DEPTHS_FAR
+    if not config.soft and views.images.with_depth:
+        job.announce(NoteEvent(f"depth maps: method {config.method} has no use for them; they are left out"))
     choice = weights.depth if weights.lambda_depth and config.soft else "off"
     return trusted_depths(views, choice, max(1, round(first * config.iterations)), job.announce)
 
