@@ -268,3 +268,20 @@ def test_an_opaque_picture_of_a_moving_camera_is_the_same_but_for_its_edges(tmp_
     }})"""
     moving = torch.from_numpy(page.picture(drawn)).float()
     assert float(((moving - still).abs() < 0.02).all(dim=-1).float().mean()) > 0.9
+
+
+def test_a_large_scene_is_shown_before_all_of_it_is_read(tmp_path, page, capture):
+    """The first chunk alone; then the same picture as of a page that reads everything at once."""
+    file = written(tmp_path, make_soup(9000), capture)
+    page.open(file)
+    expected = picture(page, 2, "soft")
+    assert page.value("document.getElementById('scene').dataset.early ?? null") is None
+    text, constant = file.read_text(encoding="utf-8"), "const EARLY = 1 << 22;"
+    assert constant in text
+    soup = re.search(r'id="scene-soup">([^<]*)<', text)
+    assert soup is not None
+    file.write_text(text.replace(constant, f"const EARLY = {len(soup[1]) // 2 & ~3};"), encoding="utf-8")
+    page.open(file)
+    assert page.value("sceneViewer.then(v => [v.root.dataset.early, v.soup.count])") == ["4096", 9000]
+    assert torch.equal(picture(page, 2, "soft"), expected)
+    assert page.errors == []

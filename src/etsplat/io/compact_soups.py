@@ -66,12 +66,13 @@ def encode_compact(soup: CompactSoup) -> bytes:
     Args:
         soup: with at least one triangle; all of its numbers are finite.
     """
-    scales, table = _quantised(soup)
+    scales = _scales(soup)
     bases = 0 if soup.harmonics is None else soup.harmonics.shape[1]
     channels = _channels(bases)
     chunks = []
-    for start in range(0, len(soup), CHUNK):
-        rows = start + _along_a_curve(table["center"][start : start + CHUNK])
+    for start in range(0, len(soup), CHUNK):  # one by one: whole numbers of all at once would be the largest array here
+        table = _quantised(soup, scales, slice(start, start + CHUNK))
+        rows = _along_a_curve(table["center"])
         chunks.append((len(rows), pack_chunk(channels, {name: values[rows] for name, values in table.items()})))
     header = {
         "format": "etsplat compact soup",
@@ -129,15 +130,11 @@ def _channels(bases: int) -> list[Channel]:
     return [*place, *soft, Channel("rest", 3 * (bases - 1), 2, signed=True)]
 
 
-def _quantised(soup: CompactSoup) -> tuple[dict[str, Any], Places]:
-    """The header's scales, and whole numbers (N, width) of each channel."""
-    vertices = soup.vertices.astype(np.float64)
-    centers = vertices.mean(axis=1)
-    offsets = (vertices - centers[:, None])[:, :2].reshape(-1, 6)  # the third corner follows
-    reach = np.abs(offsets).max(axis=1)
+def _scales(soup: CompactSoup) -> dict[str, Any]:
+    """What the header says of the numbers."""
+    centers = soup.vertices.mean(axis=1, dtype=np.float64)
+    reach = np.abs(_offsets(soup.vertices, centers)).max(axis=1)
     least = max(float(reach.max()) * 2.0 ** (-255 / _SIZES_PER_OCTAVE), 1e-30)
-    size = np.ceil(_SIZES_PER_OCTAVE * np.log2(np.maximum(reach, least) / least)).clip(0, 255)
-    unit = least * 2.0 ** (size / _SIZES_PER_OCTAVE) / _OFFSET_STEPS
     origin = centers.min(axis=0)
     span = float((centers - origin).max())
     # Small triangles are placed to a fraction of their size, as far as 24 bits go.
@@ -147,38 +144,66 @@ def _quantised(soup: CompactSoup) -> tuple[dict[str, Any], Places]:
         "size": {"least": least, "per_octave": _SIZES_PER_OCTAVE},
         "offset": {"steps": _OFFSET_STEPS},
     }
+    if soup.corner_colors is not None:
+        return scales
+    assert soup.sigma is not None
+    assert soup.harmonics is not None
+    logs = _logs(soup.sigma)
+    low, high = float(logs.min()), float(logs.max())
+    # Where coefficients are out of proportion the step grows: 16 bits hold them all.
+    largest = [
+        max(float(part.max(initial=0.0)), -float(part.min(initial=0.0))) / 32767
+        for part in (soup.harmonics[:, :1], soup.harmonics[:, 1:])
+    ]
+    return scales | {
+        "sigma": {"low": low, "step": max((high - low) / 255, 1e-9)},
+        "constant": {"step": max(_CONSTANT_STEP, largest[0])},
+        "rest": {"step": max(_BAND_STEP, largest[1])},
+    }
+
+
+def _offsets(vertices: np.ndarray, centers: np.ndarray) -> np.ndarray:
+    """(n, 6) of the first two corners from the middle; the third corner follows."""
+    return (vertices.astype(np.float64) - centers[:, None])[:, :2].reshape(-1, 6)
+
+
+def _logs(sigma: np.ndarray) -> np.ndarray:
+    return np.log(np.maximum(sigma.astype(np.float64), 1e-30))
+
+
+def _quantised(soup: CompactSoup, scales: Mapping[str, Any], rows: slice) -> Places:
+    """Whole numbers (n, width) of each channel, of some of the triangles."""
+    vertices, least = soup.vertices[rows], scales["size"]["least"]
+    centers = vertices.mean(axis=1, dtype=np.float64)
+    offsets = _offsets(vertices, centers)
+    reach = np.abs(offsets).max(axis=1)
+    size = np.ceil(_SIZES_PER_OCTAVE * np.log2(np.maximum(reach, least) / least)).clip(0, 255)
+    unit = least * 2.0 ** (size / _SIZES_PER_OCTAVE) / _OFFSET_STEPS
+    places = (centers - np.array(scales["center"]["origin"])) / scales["center"]["step"]
     table = {
-        "center": np.rint((centers - origin) / step).clip(0, _FINEST),
+        "center": np.rint(places).clip(0, _FINEST),
         "size": size[:, None],
         "offsets": np.rint(offsets / unit[:, None]).clip(-_OFFSET_STEPS, _OFFSET_STEPS),
+        **_quantised_colors(soup, scales, rows),
     }
-    colors, more = _quantised_colors(soup)
-    return {**scales, **colors}, {name: values.astype(np.int64) for name, values in {**table, **more}.items()}
+    return {name: values.astype(np.int64) for name, values in table.items()}
 
 
-def _quantised_colors(soup: CompactSoup) -> tuple[dict[str, Any], Places]:
+def _quantised_colors(soup: CompactSoup, scales: Mapping[str, Any], rows: slice) -> Places:
     if soup.corner_colors is not None:
-        return {}, {"colors": np.rint(soup.corner_colors.reshape(-1, 9) * 255).clip(0, 255)}
+        return {"colors": np.rint(soup.corner_colors[rows].reshape(-1, 9) * 255).clip(0, 255)}
     assert soup.opacities is not None
     assert soup.sigma is not None
     assert soup.harmonics is not None
-    logs = np.log(np.maximum(soup.sigma.astype(np.float64), 1e-30))
-    low, high = float(logs.min()), float(logs.max())
-    rest = soup.harmonics[:, 1:].reshape(len(soup), -1).astype(np.float64)
-    # Where coefficients are out of proportion the step grows: 16 bits hold them all.
-    largest = [float(np.abs(values).max(initial=0.0)) / 32767 for values in (soup.harmonics[:, :1], rest)]
-    constant, band = max(_CONSTANT_STEP, largest[0]), max(_BAND_STEP, largest[1])
-    sigma_step = max((high - low) / 255, 1e-9)
-    scales = {
-        "sigma": {"low": low, "step": sigma_step},
-        "constant": {"step": constant},
-        "rest": {"step": band},
-    }
-    return scales, {
-        "opacity": np.rint(soup.opacities[:, None] * 255.0).clip(0, 255),
-        "sigma": np.rint((logs[:, None] - low) / sigma_step).clip(0, 255),
-        "constant": np.rint(soup.harmonics[:, 0] / constant),
-        "rest": np.rint(rest / band),
+    harmonics = soup.harmonics[rows]
+    rest = harmonics[:, 1:].reshape(len(harmonics), -1).astype(np.float64)
+    return {
+        "opacity": np.rint(soup.opacities[rows, None] * 255.0).clip(0, 255),
+        "sigma": np.rint((_logs(soup.sigma[rows])[:, None] - scales["sigma"]["low"]) / scales["sigma"]["step"]).clip(
+            0, 255
+        ),
+        "constant": np.rint(harmonics[:, 0] / scales["constant"]["step"]),
+        "rest": np.rint(rest / scales["rest"]["step"]),
     }
 
 

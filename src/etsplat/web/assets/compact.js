@@ -67,7 +67,13 @@ async function readCompact(buffer) {
     const [magic, version, length] = [0, 4, 8].map((at) => view.getUint32(at, true));
     if (magic !== 0x5a535445 || version !== 1) throw new Error("this is no compact soup of version 1");
     const header = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 12, length)));
-    const { count, bases } = header;
+    const { bases } = header;
+    let [count, end] = [0, 12 + length];
+    for (const [rows, size] of header.chunks) {
+        end += size;
+        if (end > buffer.byteLength) break; // cut short: what is there draws
+        count += rows;
+    }
     const soup = { count, bases, look: header.appearance, corners: new Float32Array(9 * count), ends: [] };
     if (bases) {
         [soup.opacities, soup.sigma] = [new Float32Array(count), new Float32Array(count)];
@@ -77,7 +83,7 @@ async function readCompact(buffer) {
     }
     let [at, first] = [12 + length, 0];
     for (const [rows, size] of header.chunks) {
-        if (at + size > buffer.byteLength) break; // cut short: what is there draws
+        if (first === count) break;
         const planes = new Planes(await inflated(new Uint8Array(buffer, at, size)), rows);
         readCorners(planes, header, soup.corners.subarray(9 * first));
         if (bases) {
@@ -90,6 +96,5 @@ async function readCompact(buffer) {
         [at, first] = [at + size, first + rows];
         soup.ends.push(first);
     }
-    soup.count = first;
     return soup;
 }

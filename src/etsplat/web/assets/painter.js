@@ -131,6 +131,13 @@ class Painter {
         gl.disable(gl.DITHER);
     }
 
+    // Gives back what it holds of the scene.
+    free() {
+        const { gl, mesh } = this;
+        for (const texture of [this.places, this.colors, mesh?.places, mesh?.colors]) if (texture) gl.deleteTexture(texture);
+        gl.deleteBuffer(this.elements);
+    }
+
     // What `Sorter` found.
     take({ elements, colors }) {
         const { gl } = this;

@@ -4,19 +4,18 @@
 const STILL_AFTER = 250; // milliseconds after the last motion
 const SLOW = 45, FAST = 24; // milliseconds of a frame: above and below, pictures of a moving camera get smaller and larger
 const SMALLEST = 0.2, FIRST = { soft: 0.5, opaque: 1 }; // of their sizes, along each side
+const EARLY = 1 << 22; // characters of base64, a multiple of four: as much of a scene is shown before the rest is read
 
 class SceneViewer {
     constructor(root, scene, soup, mesh) {
-        [this.root, this.scene, this.soup, this.mesh] = [root, scene, soup, mesh];
+        [this.root, this.scene] = [root, scene];
         this.canvas = root.querySelector("canvas");
         this.gl = context(this.canvas, { antialias: false, alpha: false });
-        this.painter = new Painter(this.gl, soup, mesh);
+        this.hold(soup, mesh);
         this.canvas.addEventListener("webglcontextlost", (event) => event.preventDefault()); // so that it comes back
         this.canvas.addEventListener("webglcontextrestored", () => this.restore());
-        const degree = Math.round(Math.sqrt(soup.bases)) - 1;
-        this.sorter = new Sorter(soup, Math.min(degree, soup.look.sh_degree ?? 3));
         this.options = { mode: "soft", fraction: 1, resolution: 1 };
-        [this.moved, this.pace, this.before, this.sorting, this.frame] = [0, { ...FIRST }, 0, false, 0];
+        [this.moved, this.pace, this.before, this.frame] = [0, { ...FIRST }, 0, 0];
         const first = scene.cameras[scene.start];
         const up = scene.up || first.rows[1].map((value) => -value);
         const target = along(first.eye, first.rows[2], Math.max(dot(along(scene.focus, first.eye, -1), first.rows[2]), 0.05 * scene.radius));
@@ -25,6 +24,16 @@ class SceneViewer {
         this.stand(scene.start);
         listenToMotion(this.canvas, this.camera, () => this.change(), () => this.stand(this.photo));
         new ResizeObserver(() => this.change()).observe(this.canvas);
+    }
+
+    // Shows these triangles from now on.
+    hold(soup, mesh) {
+        this.painter?.free();
+        this.sorter?.end();
+        [this.soup, this.mesh, this.sorting, this.sorted] = [soup, mesh, false, ""];
+        this.painter = new Painter(this.gl, soup, mesh);
+        const degree = Math.round(Math.sqrt(soup.bases)) - 1;
+        this.sorter = new Sorter(soup, Math.min(degree, soup.look.sh_degree ?? 3));
     }
 
     // Goes to a photo's camera.
@@ -92,7 +101,9 @@ class SceneViewer {
         const needless = this.options.mode === "opaque" && this.painter.mesh;
         if (needless || this.sorting || wanted === this.sorted) return;
         this.sorting = true;
-        this.sorter.sort(this.request()).then((found) => {
+        const { sorter } = this;
+        sorter.sort(this.request()).then((found) => {
+            if (sorter !== this.sorter) return; // of fewer triangles
             [this.sorting, this.sorted] = [false, wanted];
             this.painter.take(found);
             if (!this.frame) this.frame = requestAnimationFrame((now) => this.step(now));
@@ -156,10 +167,17 @@ async function showScene() {
     if (!root) return null;
     try {
         const part = (name) => document.getElementById(`scene-${name}`);
-        const read = (name) => (part(name) ? readCompact(bytesOf(part(name).textContent)) : null);
+        const text = (name) => part(name)?.textContent ?? "";
+        const read = (name, most) => (text(name) ? readCompact(bytesOf(text(name).slice(0, most))) : null);
         const scene = JSON.parse(part("data").textContent);
-        const viewer = new SceneViewer(root, scene, await read("soup"), await read("mesh"));
+        const some = text("soup").length > EARLY ? EARLY : undefined;
+        const viewer = new SceneViewer(root, scene, await read("soup", some), await read("mesh", some));
         listenToSwitches(root, viewer);
+        if (some) {
+            root.dataset.early = viewer.soup.count;
+            viewer.hold(await read("soup"), await read("mesh"));
+            viewer.change();
+        }
         root.dataset.ready = "true";
         return viewer;
     } catch (error) {

@@ -110,6 +110,11 @@ class Sorter {
         this.last = Promise.resolve();
     }
 
+    // Answers no more.
+    end() {
+        this.worker?.terminate();
+    }
+
     sort(request) {
         const here = () => (this.own ??= makeSorter(this.data))(request);
         const ask = () => new Promise((resolve) => {
