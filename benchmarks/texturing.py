@@ -2,9 +2,11 @@
 
     python -m benchmarks.texturing RUNS [--texture 2048] [--faces 10000]
     python -m benchmarks.texturing RUNS --lods 3
+    python -m benchmarks.texturing RUNS --stored
 
 With --lods the coarser levels that `etsplat export RUN --texture N --lods N` has written: PSNR of the test views, at
-their size, and halved as often as the level says, where that of the first level stands beside it.
+their size, and halved as often as the level says, where that of the first level stands beside it. With --stored one
+light mesh in every way in which GLB stores it: its size, PSNR of the test views, and of the texture in the file.
 """
 
 import argparse
@@ -31,7 +33,13 @@ def main() -> None:
     parser.add_argument("--faces", type=int, default=10_000)
     parser.add_argument("--lods", type=int, default=0)
     parser.add_argument("--keep", type=Path, help="folder for the files")
+    parser.add_argument("--stored", action="store_true")
     options = parser.parse_args()
+    if options.stored:
+        print("run | --compress | --pictures | MB | PSNR | of the texture")
+        for run in options.runs:
+            measure_stored(run, options.texture, options.faces)
+        return
     if options.lods:
         print("run, level | faces | MB | PSNR | halved | of level 0, halved")
         for run in options.runs:
@@ -69,6 +77,22 @@ def measure(run: Path, size: int, faces: int, keep: Path | None) -> None:
         found = scorer.opaque(model, views.test)
         rows.append(f"{model.count} {found['psnr_mesh']:.2f} {found['silhouette_iou']:.4f}")
     print(f"{run.name} | {rows[0]} | {rows[1]} {sound} | {size_mb:.2f} | {end - before:.0f} {seconds}", flush=True)
+
+
+def measure_stored(run: Path, size: int, faces: int) -> None:
+    opened = open_reconstruction(run)
+    light = texture_mesh(run, size=size, faces=faces)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "light.glb"
+        for pictures in ("png", "webp"):
+            for compress in ("none", "quantize", "meshopt"):
+                light.save(path, compress=compress, pictures=pictures)
+                read = TexturedMesh.load(path)
+                shown = replace(read, vertices=opened.views.normalization.apply(read.vertices.detach()))
+                found = quality(shown, opened.views, 0)
+                texture = psnr(read.texture.detach(), light.texture.detach().clamp(0, 1))
+                stored = f"{compress} | {pictures} | {path.stat().st_size / 1e6:.2f}"
+                print(f"{run.name} | {stored} | {found:.3f} | {texture:.1f}", flush=True)
 
 
 @torch.no_grad()

@@ -109,16 +109,17 @@ def decode_compact(data: bytes) -> CompactSoup:
     """
     header, start = _header(data)
     channels = _channels(header["bases"])
-    tables = []
+    parts = []
     for rows, size in header["chunks"]:
         if start + size > len(data):
             break
-        tables.append(unpack_chunk(channels, rows, data[start : start + size]))
+        parts.append(_restored(header, unpack_chunk(channels, rows, data[start : start + size])))
         start += size
-    if not tables:
+    if not parts:
         raise ValueError("it is cut short before its first triangles")
-    table = {channel.name: np.concatenate([part[channel.name] for part in tables]) for channel in channels}
-    return _restored(header, table)
+    arrays = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    left_out = header["count"] - len(arrays["vertices"])
+    return CompactSoup(**arrays, appearance=header["appearance"], notes=header["notes"], left_out=left_out)
 
 
 def _channels(bases: int) -> list[Channel]:
@@ -207,30 +208,24 @@ def _quantised_colors(soup: CompactSoup, scales: Mapping[str, Any], rows: slice)
     }
 
 
-def _restored(header: Mapping[str, Any], table: Places) -> CompactSoup:
-    """Whole numbers to what they stand for."""
+def _restored(header: Mapping[str, Any], table: Places) -> dict[str, np.ndarray]:
+    """Whole numbers to what they stand for, by the names of `CompactSoup`."""
     # Numbers that JSON has without a point may be larger than whole numbers of numpy.
     centers = np.array(header["center"]["origin"], dtype=np.float64) + float(header["center"]["step"]) * table["center"]
     size = header["size"]["least"] * 2.0 ** (table["size"] / header["size"]["per_octave"])
     first = (size / header["offset"]["steps"] * table["offsets"]).reshape(-1, 2, 3)
     offsets = np.concatenate([first, -first.sum(axis=1, keepdims=True)], axis=1)
-    place: dict[str, Any] = {
-        "vertices": (centers[:, None] + offsets).astype(np.float32),
-        "appearance": header["appearance"],
-        "notes": header["notes"],
-        "left_out": header["count"] - len(centers),
-    }
+    place = {"vertices": (centers[:, None] + offsets).astype(np.float32)}
     if not header["bases"]:
-        return CompactSoup(**place, corner_colors=(table["colors"].reshape(-1, 3, 3) / 255).astype(np.float32))
+        return {**place, "corner_colors": (table["colors"].reshape(-1, 3, 3) / 255).astype(np.float32)}
     bands = [float(header[name]["step"]) * table[name] for name in ("constant", "rest")]
-    harmonics = np.concatenate(bands, axis=1).reshape(len(centers), header["bases"], 3)
     sigma = np.exp(header["sigma"]["low"] + float(header["sigma"]["step"]) * table["sigma"][:, 0])
-    return CompactSoup(
+    return {
         **place,
-        opacities=(table["opacity"][:, 0] / 255).astype(np.float32),
-        sigma=sigma.astype(np.float32),
-        harmonics=harmonics.astype(np.float32),
-    )
+        "opacities": (table["opacity"][:, 0] / 255).astype(np.float32),
+        "sigma": sigma.astype(np.float32),
+        "harmonics": np.concatenate(bands, axis=1).reshape(len(centers), header["bases"], 3).astype(np.float32),
+    }
 
 
 def _header(data: bytes) -> tuple[dict[str, Any], int]:
