@@ -6,6 +6,7 @@ import json
 import struct
 from collections.abc import Callable
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -22,6 +23,7 @@ from etsplat.io.kernel_files import write_kernel
 from etsplat.io.mesh_files import MeshFile
 from etsplat.io.opaque_files import save_opaque
 from etsplat.io.ply_tables import encode_ply
+from etsplat.io.textures import Texture
 from etsplat.model.solid_soup import SolidSoup
 from etsplat.model.soup_compact import compact_of
 from etsplat.optim.checkpoints import save_checkpoint
@@ -56,6 +58,17 @@ def meshes(suffix: str) -> list[bytes]:
         made(lambda folder, colors=colors: etsplat.save_mesh(folder / name, vertices, faces, **colors))[name]
         for colors in kinds
     ]
+
+
+def packed_glbs() -> list[bytes]:
+    """Quantised with colours; compressed where the package is; with a picture in WebP."""
+    vertices, faces = etsplat.icosphere(1)
+    picture, uvs = torch.arange(48, dtype=torch.uint8).reshape(4, 4, 3), vertices[faces][..., :2].abs()
+    skin = {"texture": Texture.of([picture], torch.zeros(80, dtype=torch.int64), uvs)}
+    kinds = [{"compress": "quantize", "vertex_colors": 0.5 + 0.5 * vertices}, {**skin, "pictures": "webp"}]
+    if find_spec("meshoptimizer") is not None:
+        kinds += [{"compress": "meshopt"}, {**skin, "compress": "meshopt"}]
+    return [made(lambda at, k=k: etsplat.save_mesh(at / "a.glb", vertices, faces, **k))["a.glb"] for k in kinds]
 
 
 def objs() -> list[bytes]:

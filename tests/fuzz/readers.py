@@ -283,6 +283,7 @@ READERS = [
     Reader("mesh .off", _single(".off", corpus.offs), (".off",), _file(_mesh)),
     Reader("mesh .stl", _single(".stl", corpus.stls), (".stl",), _file(_mesh)),
     Reader("mesh .glb", _single(".glb", lambda: corpus.meshes(".glb")), (".glb",), _file(_mesh)),
+    Reader("packed .glb", _single(".glb", corpus.packed_glbs), (".glb",), _file(_mesh)),
     Reader("mesh .gltf", _single(".gltf", corpus.gltfs), (".gltf",), _file(_mesh)),
     Reader("textured .obj", _prefixed(corpus.textured_obj), (".obj", ".mtl", ".png"), _file(_mesh)),
     Reader("textured .glb, .gltf", corpus.textured_gltfs, (".glb", ".gltf", ".bin", ".png"), _file(_mesh)),

@@ -55,6 +55,7 @@ def examine(console: Console) -> bool:
             "depth maps in EXR": _extra("depth", "OpenEXR"),
             "clouds in LAS": _extra("depth", "laspy"),
             "export --texture": _extra("texture", "xatlas"),
+            "export --compress meshopt": _extra("compress", "meshoptimizer"),
             "--tensorboard": _extra("tensorboard", "tensorboard"),
         },
     )

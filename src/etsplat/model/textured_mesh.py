@@ -141,8 +141,17 @@ class TexturedMesh(Model):
         from_below = torch.stack([uvs[..., 0], 1 - uvs[..., 1]], dim=-1)
         picture = Texture.of([to_8_bit(texture)], torch.zeros(len(faces), dtype=torch.int64), from_below)
         mipmaps = self.appearance.max_level != 0
-        look = {"texture": picture, "normal_map": normal_map, "mipmaps": mipmaps, "pictures": pictures}
-        save_mesh(path, vertices, faces.long(), **look, world=world, compress=compress)
+        save_mesh(
+            path,
+            vertices,
+            faces.long(),
+            texture=picture,
+            normal_map=normal_map,
+            mipmaps=mipmaps,
+            world=world,
+            compress=compress,
+            pictures=pictures,
+        )
 
     def to(self, device: torch.device) -> "TexturedMesh":
         """The same mesh on another device, its parameters leaf tensors as they are here."""

@@ -200,8 +200,8 @@ def export_mesh(
         mesh = MeshFile(vertices, faces, face_colors=colors)
     far = _georeference(run) if config.place == "world" else None
     vertices = mesh.vertices if far is None else mesh.vertices * far.scale
-    colors = {"face_colors": mesh.face_colors, "vertex_colors": _only_by_vertex(mesh)}
-    save_mesh(path, vertices, mesh.faces, **colors, world=far, compress=config.compress)
+    by_face, by_vertex = mesh.face_colors, _only_by_vertex(mesh)
+    save_mesh(path, vertices, mesh.faces, by_face, vertex_colors=by_vertex, world=far, compress=config.compress)
     return {path: len(mesh.faces)}
 
 
