@@ -1,5 +1,4 @@
 import pytest
-import torch
 from torch.nn.functional import normalize
 
 from etsplat.geometry.icosphere import icosphere
@@ -10,7 +9,8 @@ VERTICES, FACES = icosphere(4)
 
 def test_nothing_shades_a_ball() -> None:
     points = VERTICES[FACES[::50]].mean(dim=1)
-    found = ambient_occlusion(7 * VERTICES + 3, FACES, 7 * points + 3, normalize(points, dim=1), directions=48, width=256)
+    normals = normalize(points, dim=1)
+    found = ambient_occlusion(7 * VERTICES + 3, FACES, 7 * points + 3, normals, directions=48, width=256)
     assert found.min() > 0.99
 
 

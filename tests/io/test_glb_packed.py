@@ -66,7 +66,8 @@ def test_a_lit_texture_keeps_its_places_and_normals(tmp_path: Path, compress: st
         torch.full((64, 64, 3), 128, dtype=torch.uint8), normals[FACES], corner_tangents(VERTICES, FACES, normals, UVS)
     )
     path = tmp_path / "a.glb"
-    save_mesh(path, PLACED, FACES, texture=textured(smooth_picture()), normal_map=relief, compress=compress)  # pyright: ignore
+    skin = textured(smooth_picture())
+    save_mesh(path, PLACED, FACES, texture=skin, normal_map=relief, compress=compress)  # pyright: ignore
     check_glb(path)
     read = load_mesh(path)
     assert read.texture is not None
@@ -77,7 +78,9 @@ def test_a_lit_texture_keeps_its_places_and_normals(tmp_path: Path, compress: st
     attributes = document["meshes"][0]["primitives"][0]["attributes"]
     stored, places = (values_of(document, buffer, attributes[name]) for name in ("NORMAL", "TEXCOORD_0"))
     expected_uvs = np.stack([UVS[..., 0], 1 - UVS[..., 1]], axis=-1).reshape(-1, 2)
-    distances, nearest = torch.cdist(torch.from_numpy(expected_uvs).double(), torch.from_numpy(places).double()).min(dim=1)
+    distances, nearest = torch.cdist(torch.from_numpy(expected_uvs).double(), torch.from_numpy(places).double()).min(
+        dim=1
+    )
     assert distances.max() <= 2**0.5 * 0.5 / 65535 + 1e-7
     found = normalize(torch.from_numpy(stored)[nearest].double(), dim=1)
     cosines = (found * normals[FACES].reshape(-1, 3)).sum(dim=1)

@@ -142,7 +142,8 @@ def test_a_mesh_uses_right_maps_and_wrong_ones_change_no_bit(tmp_path):
 def test_opaque_triangles_say_that_they_leave_maps_out(tmp_path):
     """A note of those that the capture has; those that are named are refused."""
     write_ball(tmp_path)
-    config = etsplat.ReconstructConfig.tiny().changed({"iterations": 2, "method": "raster-face", "regularization.depth": "auto"})
+    changes = {"iterations": 2, "method": "raster-face", "regularization.depth": "auto"}
+    config = etsplat.ReconstructConfig.tiny().changed(changes)
     notes = []
     etsplat.reconstruct(tmp_path, tmp_path / "run", config, callbacks=[notes.append])
     assert any("depth maps: method raster-face has no use for them" in str(note) for note in notes)
