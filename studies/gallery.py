@@ -36,16 +36,16 @@ class Gallery(GridStudy):
 
     def run(self, arguments: Sequence[str]) -> int:
         """Runs what is not finished yet, then writes tables and the page."""
-        from studies.grid.cells import count_jobs, make_cells
-        from studies.grid.live import conclude
+        from etsplat.cli.live_table import CHAMFER, conclude
+        from studies.grid.cells import make_cells
         from studies.objects.subjects import find_subjects
 
-        jobs, base = count_jobs(self.jobs), self.base()
+        where, base = self.where(), self.base()
         subjects = find_subjects(self.inputs, self.objects)
         variants = [Variant(name, {} if name == "default" else {"start.shape": name}) for name in self.starts]
         sources = {subject.name: subject.source for subject in subjects}
         cells = make_cells(sources, variants, base, self.seeds, self.out)
-        self.run_cells(cells, jobs)
+        self.run_cells(cells, where, CHAMFER)
         try:
             self._report(subjects, cells, base, arguments)
         except KeyboardInterrupt:

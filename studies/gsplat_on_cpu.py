@@ -269,11 +269,12 @@ def _over(backgrounds: Tensor | None, colors: Tensor, covered: Tensor) -> tuple[
     return colors, covered
 
 
-if __name__ in ("__main__", "__mp_main__"):  # the processes of a grid import this too
-    load_gsplat_on_cpu()
-    settings.load_gsplat = load_gsplat_on_cpu
-
 if __name__ == "__main__":
+    from studies import gsplat_on_cpu  # under its own name, by which the processes of a grid find the function
+
+    gsplat_on_cpu.load_gsplat_on_cpu()
+    settings.load_gsplat = gsplat_on_cpu.load_gsplat_on_cpu
+
     from studies.nvs import Nvs
 
     Nvs.main()

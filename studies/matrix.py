@@ -5,13 +5,13 @@ from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 
-from etsplat.cli.command import INTERRUPTED, fail
+from etsplat.cli.placed import Placed
 from etsplat.tasks.train_config import Preset
 from studies.study import Study
 
 
 @dataclass(frozen=True, kw_only=True)
-class Matrix(Study):
+class Matrix(Study, Placed):
     """Captures by widths by limits of triangles: whether a preset falls apart anywhere.
 
     A row is a capture at a width. No cell should be more than half a dB below the best of its row, and no row's best
@@ -44,15 +44,11 @@ class Matrix(Study):
 
     def run(self, arguments: Sequence[str]) -> int:
         """Runs what is not finished yet, then writes the table."""
-        from rich.console import Console
-
-        from etsplat.engines.threads import num_threads
-        from studies.grid.cells import count_jobs, run_grid
-        from studies.grid.live import PSNR, LiveTable, conclude
+        from etsplat.cli.live_table import PSNR, conclude
         from studies.scenes.cells import make_nvs_cells, read_scene_argument
         from studies.scenes.matrix import read_bar, write_matrix
 
-        bar = read_bar(self.against) if self.against else {}
+        where, bar = self.where(), read_bar(self.against) if self.against else {}
         cells = make_nvs_cells(
             [read_scene_argument(scene) for scene in self.scenes],
             ["elastic"],
@@ -63,11 +59,7 @@ class Matrix(Study):
             settings=[f"width={width},max_triangles={limit}" for width, limit in product(self.widths, self.limits)],
             seeds=(self.seed,),
         )
-        try:
-            with LiveTable(Console(), cells, PSNR) as table:
-                run_grid(cells, min(count_jobs(self.jobs), num_threads()), table.update)
-        except KeyboardInterrupt:
-            fail("interrupted; give the same command to go on", INTERRUPTED)
+        self.run_cells(cells, where, PSNR)
         if any(cell.state == "done" for cell in cells):
             write_matrix(cells, self.out, self.command_line(arguments), bar)
             print((self.out / "matrix.md").read_text(encoding="utf-8"))

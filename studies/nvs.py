@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from etsplat.cli.command import INTERRUPTED, fail
+from etsplat.cli.placed import Placed
 from etsplat.tasks.settings import SoftMethod
 from etsplat.tasks.train_config import Preset
 from studies.peers.settings import Peer
@@ -13,7 +14,7 @@ from studies.study import Study
 
 
 @dataclass(frozen=True, kw_only=True)
-class Nvs(Study):
+class Nvs(Study, Placed):
     """The paper's tables nvs, per-scene, filter and efficiency, and its figures nvs and trisoup.
 
     Scenes of the paper get Triangle Splatting's settings for them with `--preset paper`.
@@ -51,15 +52,11 @@ class Nvs(Study):
 
     def run(self, arguments: Sequence[str]) -> int:
         """Runs what is not finished yet, measures it, then writes tables and figures."""
-        from rich.console import Console
-
+        from etsplat.cli.live_table import PSNR, conclude
         from etsplat.cli.progress import PhaseBar
-        from etsplat.engines.threads import num_threads
-        from studies.grid.cells import count_jobs, run_grid
-        from studies.grid.live import PSNR, LiveTable, conclude
         from studies.scenes.cells import evaluate_cells, make_nvs_cells, read_scene_argument
 
-        jobs = min(count_jobs(self.jobs), num_threads())
+        where = self.where()
         cells = make_nvs_cells(
             [read_scene_argument(scene) for scene in self.scenes],
             self.methods,
@@ -70,11 +67,9 @@ class Nvs(Study):
             settings=self.settings,
             seeds=self.seeds,
         )
-        console = Console()
+        self.run_cells(cells, where, PSNR)
         try:
-            with LiveTable(console, cells, PSNR) as table:
-                run_grid(cells, jobs, table.update)
-            with PhaseBar(console) as bar:
+            with PhaseBar() as bar:
                 rows = evaluate_cells(cells, self.lpips_weights, lambda done, total: bar.show("Measuring", done, total))
         except KeyboardInterrupt:
             fail("interrupted; give the same command to go on", INTERRUPTED)

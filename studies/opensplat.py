@@ -64,7 +64,7 @@ class OpenSplat(Study):
         peers = []
         for cell in cells:
             assert isinstance(cell.config, TrainConfig)
-            capture = load_dataset(cell.mesh, images=cell.images, width=cell.config.width).normalized()
+            capture = load_dataset(cell.source, images=cell.images, width=cell.config.width).normalized()
             folder = cell.folder.parent / "opensplat"
             program = opensplat.Program(self.opensplat, gsplat, num_threads(), self.schedule)
             peers.append(opensplat.OpenSplat(program, cell.object, capture, folder))

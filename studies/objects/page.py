@@ -136,7 +136,7 @@ def _topology(row: Row) -> str:
 
 
 def _failures(cells: Sequence[Cell]) -> list[str]:
-    return [f"{cell.object}, {cell.variant}, seed {cell.config.seed}: failed: {cell.error}" for cell in cells]
+    return [f"{cell.object}, {cell.variant}, seed {cell.seed}: failed: {cell.error}" for cell in cells]
 
 
 def _markdown(table: Table) -> str:

@@ -73,7 +73,7 @@ def draw_qualitative(cells: Sequence[Cell], variants: Sequence[str], path: Path)
     grid: Any = figure.subplots(2 * len(objects), len(variants) + 1, squeeze=False)
     for row, name in enumerate(objects):
         done = {cell.variant: cell for cell in reversed(cells) if cell.object == name and cell.state == "done"}
-        truth = load_mesh(next(iter(done.values())).mesh)
+        truth = load_mesh(next(iter(done.values())).source)
         center, radius = bounding_ball(truth.vertices)
         meshes = {"truth": (truth.vertices, truth.faces)}
         for variant in variants:

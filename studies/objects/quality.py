@@ -149,7 +149,7 @@ def row_of_run(cell: Cell, surface: MeshFile | None, true: Shape, samples: int) 
     return Row(
         object=cell.object,
         variant=cell.variant,
-        seed=cell.config.seed,
+        seed=cell.seed,
         mesh=str(path),
         chamfer=distances[0],
         chamfer_exact=distances[1],

@@ -73,7 +73,7 @@ def rows_of(cells: Sequence[Cell]) -> list[dict[str, Any]]:
     for cell in cells:
         if cell.state == "done":
             metrics = cell.metrics()
-            row = {"object": cell.object, "variant": cell.variant, "seed": cell.config.seed}
+            row = {"object": cell.object, "variant": cell.variant, "seed": cell.seed}
             row |= {name: metrics.get(name) for name in METRICS}
             rows.append(row | {"paper_chamfer": paper_chamfer(cell.object, cell.variant)})
     return rows

@@ -4,11 +4,9 @@ from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-import tyro
-
-from etsplat.cli.command import INTERRUPTED, fail
+from etsplat.cli.placed import Placed
 from etsplat.tasks.reconstruct_config import Preset, ReconstructConfig
 from studies.grid.variants import Variant, find_meshes
 from studies.study import Study
@@ -18,7 +16,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class GridStudy(Study):
+class GridStudy(Study, Placed):
     """Base of the studies that are a grid of reconstructions."""
 
     out: Path
@@ -31,26 +29,11 @@ class GridStudy(Study):
     """More changes for all runs, such as resolution=256,iterations=1500."""
     seeds: tuple[int, ...] = (0,)
     """Each run is repeated with each of them."""
-    jobs: Annotated[int, tyro.conf.arg(help_behavior_hint="(default: one for each core)")] = 0
-    """Runs beside each other; 0 for one on each core. They share the cores evenly."""
 
     def base(self) -> ReconstructConfig:
         """The settings that all runs have in common."""
         preset = ReconstructConfig.of(self.preset)
         return preset.changed(preset.read_changes(self.set))
-
-    def run_cells(self, cells: list["Cell"], jobs: int) -> None:
-        """Runs what is not finished yet, so many beside each other; Ctrl-C ends the process, which can be repeated."""
-        from rich.console import Console
-
-        from studies.grid.cells import run_grid
-        from studies.grid.live import LiveTable
-
-        try:
-            with LiveTable(Console(), cells) as table:
-                run_grid(cells, jobs, table.update)
-        except KeyboardInterrupt:
-            fail("interrupted; give the same command to go on", INTERRUPTED)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,14 +49,13 @@ class ObjectStudy(GridStudy):
 
     def run(self, arguments: Sequence[str]) -> int:
         """Runs what is not finished yet, then writes tables and figures."""
-        from studies.grid.cells import count_jobs, make_cells
-        from studies.grid.live import conclude
+        from etsplat.cli.live_table import CHAMFER, conclude
+        from studies.grid.cells import make_cells
 
-        jobs = count_jobs(self.jobs)
-        base = self.base()
+        where, base = self.where(), self.base()
         variants = self.variants(base)
         cells = make_cells(find_meshes(self.meshes, self.objects), variants, base, self.seeds, self.out)
-        self.run_cells(cells, jobs)
+        self.run_cells(cells, where, CHAMFER)
         self._report(cells, [variant.name for variant in variants], arguments)
         return conclude(cells)
 

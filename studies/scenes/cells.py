@@ -10,7 +10,7 @@ from etsplat.core.errors import InputError
 from etsplat.io.run_directory import RunDirectory
 from etsplat.tasks.sources import DEMO_SCENE
 from etsplat.tasks.train_config import SCENE_TYPES, TrainConfig
-from studies.grid.cells import AnyConfig, Cell, is_finished
+from studies.grid.cells import Cell
 from studies.peers.settings import PEERS, Peer, PeerConfig, load_gsplat, peer_config
 from studies.scenes.paper import SCENES
 
@@ -117,7 +117,7 @@ def make_nvs_cells(
     for scene, name in zip(scenes, names, strict=True):
         base, images = _settings(scene, preset)
         base = base.changed({**base.read_changes(setting), **base.read_changes(scene.setting)})
-        variants: dict[str, AnyConfig] = {
+        variants: dict[str, TrainConfig | PeerConfig] = {
             " ".join(filter(None, (text, method, CULLED if culled else ""))): base.changed(
                 {"method": method, "drawing.cull_small": culled, **base.read_changes(text)}
             )
@@ -130,7 +130,7 @@ def make_nvs_cells(
         for seed, (variant, config) in product(seeds, variants.items()):
             folder = out / "runs" / name / (variant if len(seeds) == 1 else f"{variant} seed {seed}")
             cell = Cell(name, scene.folder, variant, replace(config, seed=seed), folder, images=images)
-            cell.state = "done" if is_finished(cell) else "waiting"
+            cell.look()
             cells.append(cell)
     return cells
 
@@ -161,7 +161,7 @@ def evaluate_cells(
             {
                 "scene": cell.object,
                 "variant": cell.variant,
-                "seed": cell.config.seed,
+                "seed": cell.seed,
                 **{name: evaluation[name] for name in METRICS},
                 "triangles": metrics["triangles"],
                 "iterations": metrics["iterations"],

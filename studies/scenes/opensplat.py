@@ -8,7 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from etsplat.core.errors import InputError
-from studies.grid.cells import Cell, run_grid
+from etsplat.tasks.sweeps.cells import run_cells
+from etsplat.tasks.sweeps.executors import Where
+from studies.grid.cells import Cell
 from studies.grid.writing import bold, origin_of, versions_of, write_text
 from studies.peers.opensplat import OpenSplat, OpenSplatRun, processor_seconds
 
@@ -64,7 +66,7 @@ def train_ours(cell: Cell) -> dict[str, float]:
     if cell.state != "done" or not record.is_file():
         shutil.rmtree(cell.folder, ignore_errors=True)
         cell.state, before = "waiting", processor_seconds()
-        run_grid([cell], 1, lambda: None)
+        run_cells([cell], Where(jobs=1), lambda: None)
         if cell.state != "done":
             raise InputError(f"{cell.folder}: {cell.error}")
         write_text(record, json.dumps({"processor_seconds": processor_seconds() - before}))

@@ -1,6 +1,5 @@
 """Grids of runs: what is compared, that nothing is done twice, and that the tables say what the runs came to."""
 
-import contextlib
 import json
 import os
 import shutil
@@ -15,13 +14,15 @@ from pathlib import Path
 import pytest
 
 from etsplat.core.errors import InputError
-from etsplat.engines.threads import num_threads
 from etsplat.geometry.icosphere import icosphere
 from etsplat.io.mesh_files import save_mesh
 from etsplat.io.run_directory import RunDirectory
 from etsplat.tasks.reconstruct_config import METHODS, ReconstructConfig
+from etsplat.tasks.sweeps.cells import run_cells
+from etsplat.tasks.sweeps.executors import Where
+from etsplat.tasks.sweeps.work import wait_for_writer
 from studies.famous import Famous
-from studies.grid.cells import Cell, count_jobs, make_cells, run_grid
+from studies.grid.cells import Cell, make_cells
 from studies.grid.variants import (
     Variant,
     distance_variants,
@@ -60,7 +61,7 @@ def grid(sphere: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, 
     shutil.copy(sphere, folder)
     (folder / "broken.obj").write_text("v 0 0 0\n")
     cells = make_cells(find_meshes(folder, ()), VARIANTS, SHORT, [0], folder / "out")[:3]  # a process costs seconds
-    run_grid(cells, 2, lambda: None)
+    run_cells(cells, Where(jobs=2), lambda: None)
     return folder, cells
 
 
@@ -77,20 +78,20 @@ def test_runs_end_and_failures_are_told(grid: tuple[Path, list[Cell]]) -> None:
 
 GRID = """
 import signal
-from dataclasses import replace
 from pathlib import Path
 
-from studies.grid.cells import make_cells, run_grid
-from studies.grid.variants import Variant
 from etsplat.tasks.reconstruct_config import ReconstructConfig
+from etsplat.tasks.sweeps.cells import run_cells
+from etsplat.tasks.sweeps.executors import Where
+from studies.grid.cells import make_cells
+from studies.grid.variants import Variant
 
-if __name__ == "__main__":
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored where the tests run in a shell's background
-    config = ReconstructConfig.tiny().changed({"iterations": 1_000_000, "output.checkpoint_every": 0})
-    cells = make_cells({"ball": Path("demo:owl")}, [Variant("long", {})], config, [0], Path())
-    run_grid(cells, 1, lambda: print(cells[0]._process.pid, flush=True))
+signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored where the tests run in a shell's background
+config = ReconstructConfig.tiny().changed({"iterations": 1_000_000, "output.checkpoint_every": 0})
+cells = make_cells({"ball": Path("demo:owl")}, [Variant("long", {})], config, [0], Path())
+run_cells(cells, Where(jobs=1), lambda: print(cells[0].state, flush=True))
 """
-"""A program that runs a grid, of one cell, in the folder where it is started, and prints its worker's process."""
+"""A program that runs a grid, of one cell, in the folder where it is started, and says how that stands."""
 
 
 def start_grid(folder: Path, *, start_new_session: bool = False) -> subprocess.Popen[str]:
@@ -99,7 +100,7 @@ def start_grid(folder: Path, *, start_new_session: bool = False) -> subprocess.P
     return subprocess.Popen(
         [sys.executable, "grid.py"],
         cwd=folder,
-        env={**os.environ, "PYTHONPATH": str(REPOSITORY)},
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(map(os.path.abspath, [REPOSITORY, *sys.path]))},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -111,16 +112,11 @@ def start_grid(folder: Path, *, start_new_session: bool = False) -> subprocess.P
 def test_runs_are_interrupted_when_the_grid_is(number: signal.Signals, tmp_path: Path) -> None:
     """Also when it is killed: the worker saves a checkpoint and ends, and says nothing."""
     process = start_grid(tmp_path)
-    assert process.stdout is not None
-    worker = int(process.stdout.readline())
     folder = tmp_path / "runs" / "ball" / "long"
-    try:
-        wait_until(lambda: (folder / "history.jsonl").exists())
-        process.send_signal(number)
-        _, errors = process.communicate(timeout=20)  # which waits for the worker too: it has the same standard error
-    finally:
-        with contextlib.suppress(ProcessLookupError):
-            os.kill(worker, signal.SIGKILL)
+    wait_until(lambda: (folder / "history.jsonl").exists())
+    process.send_signal(number)
+    _, errors = process.communicate(timeout=20)
+    wait_for_writer(folder)
     assert [path.suffix for path in (folder / "checkpoints").iterdir()] == [".safetensors"]  # whole
     assert errors.count("Traceback") == (1 if number == signal.SIGINT else 0)  # of the program above
 
@@ -130,17 +126,17 @@ def test_an_interrupt_while_processes_start_is_quiet(tmp_path: Path) -> None:
     process = start_grid(tmp_path, start_new_session=True)
     assert process.stdout is not None
     process.stdout.readline()
-    time.sleep(0.1)  # until Python is awake in the worker
     os.killpg(process.pid, signal.SIGINT)
     _, errors = process.communicate(timeout=20)
     assert errors.count("Traceback") == 1  # of the program above
     assert not list(tmp_path.glob("runs/ball/long/checkpoints/*"))
+    assert "Traceback" not in (tmp_path / "runs" / "ball" / "long.log").read_text()
 
 
 def test_a_run_whose_folder_is_removed_fails_in_one_line(
     sphere: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """Its worker has nowhere to write what went wrong, and says it on standard error."""
+    """And nothing is said on the terminal but by whoever started the grid."""
     config = SHORT.changed({"output.checkpoint_every": 1, "iterations": 1_000_000})
     cells = make_cells({"ball": sphere}, VARIANTS[:1], config, [0], tmp_path / "out")
 
@@ -148,11 +144,10 @@ def test_a_run_whose_folder_is_removed_fails_in_one_line(
         if (cells[0].folder / "history.jsonl").exists():
             (tmp_path / "out").rename(tmp_path / "gone")  # at once: a worker makes files while they are deleted
 
-    run_grid(cells, 1, remove)
-    assert (cells[0].state, cells[0].error) == ("failed", "ended with status 1")
-    errors = capfd.readouterr().err
-    assert "cannot write" in errors
-    assert errors.count("\n") == 1
+    run_cells(cells, Where(jobs=1), remove)
+    assert cells[0].state == "failed"
+    assert "cannot write" in cells[0].error
+    assert capfd.readouterr().err == ""
 
 
 def wait_until(happened: Callable[[], bool]) -> None:
@@ -165,13 +160,13 @@ def wait_until(happened: Callable[[], bool]) -> None:
 def test_a_file_where_the_grid_goes_is_named(sphere: Path) -> None:
     """Before any process is started."""
     with pytest.raises(InputError, match=r"cannot write .*ball\.ply/.*a part of the path is a file"):
-        run_grid(make_cells({"ball": sphere}, VARIANTS, SHORT, [0], sphere), 1, lambda: None)
+        run_cells(make_cells({"ball": sphere}, VARIANTS, SHORT, [0], sphere), Where(jobs=1), lambda: None)
 
 
 def test_a_grid_of_nothing_is_refused() -> None:
     """As `--seeds` without a number asks for."""
     with pytest.raises(InputError, match="nothing to run"):
-        run_grid([], 1, lambda: None)
+        run_cells([], Where(), lambda: None)
 
 
 @pytest.mark.parametrize(("study", "source"), [(Famous, "--meshes"), (Nvs, "--scenes")])
@@ -179,8 +174,6 @@ def test_a_negative_number_of_jobs_is_named(study: type[Study], source: str, tmp
     """Before anything is read. 0 asks for one on each core."""
     with pytest.raises(InputError, match="jobs: is -2; it must be at least 1, or 0 for one on each core"):
         study.parse([source, "none", "--out", str(tmp_path), "--jobs", "-2"]).run([])
-    assert count_jobs(0) == num_threads()
-    assert count_jobs(3) == 3
 
 
 def test_a_run_of_an_earlier_version_is_named(tmp_path: Path) -> None:
@@ -189,7 +182,7 @@ def test_a_run_of_an_earlier_version_is_named(tmp_path: Path) -> None:
     run = RunDirectory.create(cells[1].folder, {"task": "reconstruct", "config": {}})
     run.append_history({"iteration": 3})
     with pytest.raises(InputError, match=r"config\.json: an earlier version .* lacks `iterations`; remove the folder"):
-        run_grid(cells, 1, lambda: None)
+        run_cells(cells, Where(jobs=1), lambda: None)
     assert [cell.state for cell in cells] == ["waiting", "waiting"]
 
 

@@ -6,9 +6,10 @@ import pytest
 from PIL import Image
 
 from etsplat.core.errors import InputError
+from etsplat.tasks.sweeps.cells import run_cells
+from etsplat.tasks.sweeps.executors import Where
 from etsplat.tasks.train_config import TrainConfig
 from helpers.captures import write_colmap
-from studies.grid.cells import run_grid
 from studies.scenes.cells import Scene, evaluate_cells, make_nvs_cells, read_scene_argument
 from studies.scenes.paper import NVS, PER_SCENE, SCENES
 from studies.scenes.pictures import draw_nvs
@@ -29,7 +30,7 @@ def cells_of(folder, **options):
 def test_a_grid_runs_is_measured_and_goes_on_where_it_was(tmp_path):
     write_colmap(tmp_path / "toy", [(48, 36)] * 3)
     cells = cells_of(tmp_path)
-    run_grid(cells, 2, lambda: None)
+    run_cells(cells, Where(jobs=2), lambda: None)
     assert [(cell.state, cell.error) for cell in cells] == [("done", ""), ("done", "")]
     assert [cell.metrics()["iterations"] for cell in cells] == [4, 4]  # two epochs of two training views
     told = []
@@ -100,7 +101,7 @@ def test_the_built_in_scene_is_one_of_a_grid_in_photos_no_wider_than_asked_for(t
     cells = make_nvs_cells(
         [scene], ["elastic"], tmp_path, preset="tiny", culling=(False,), setting="iterations=4,width=40"
     )
-    run_grid(cells, 1, lambda: None)
+    run_cells(cells, Where(jobs=1), lambda: None)
     measured = evaluate_cells(cells, None, lambda done, total: None)[0]
     assert (measured["scene"], measured["width"], measured["height"]) == ("demo", 40, 30)
     assert measured["psnr"] == pytest.approx(cells[0].metrics()["psnr"], abs=1e-3)

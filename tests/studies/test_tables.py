@@ -12,10 +12,12 @@ from etsplat.tasks.reconstruct import reconstruct
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.scoring import evaluate_run
 from etsplat.tasks.sources import open_run
+from etsplat.tasks.sweeps.cells import run_cells
+from etsplat.tasks.sweeps.executors import Where
 from etsplat.tasks.train import train
 from studies.distance import Distance
 from studies.famous import Famous
-from studies.grid.cells import Cell, make_cells, run_grid
+from studies.grid.cells import Cell, make_cells
 from studies.grid.variants import find_meshes
 from studies.objects.results import METRICS, rows_of
 from studies.objects.tables import write_tables
@@ -64,7 +66,7 @@ def cells(shared_data: Path, one_thread: None, tmp_path_factory: pytest.TempPath
     for name, (command, variants) in TABLES.items():
         everything = make_cells(meshes, command.variants(SMALL), SMALL, [0], tmp_path_factory.mktemp(name))
         made[name] = [cell for cell in everything if cell.variant in variants]
-    run_grid([cell for table in made.values() for cell in table], 2, lambda: None)
+    run_cells([cell for table in made.values() for cell in table], Where(jobs=2), lambda: None)
     return made
 
 
@@ -99,7 +101,7 @@ def test_a_cell_of_nvs_holds_what_its_run_comes_to(shared_data: Path, one_thread
         culling=(False,),
         setting="iterations=20,max_triangles=3000",
     )
-    run_grid(cells, 1, lambda: None)
+    run_cells(cells, Where(jobs=1), lambda: None)
     write_nvs_tables(evaluate_cells(cells, None, lambda done, total: None), tmp_path, "python -m studies.nvs")
     in_json = json.loads((tmp_path / "nvs.json").read_text())["rows"][0]
     in_csv = next(csv.DictReader((tmp_path / "nvs.csv").open()))

@@ -10,7 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from etsplat.cli.command import FAILED
-from studies.grid.cells import Cell
+from etsplat.tasks.sweeps.cells import Cell
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class LiveTable:
             if index not in self._told:
                 self._told.add(index)
                 cell = self._cells[index]
-                name = f"{cell.object}, {cell.variant}, seed {cell.config.seed}"
+                name = f"{cell.object}, {cell.variant}, seed {cell.seed}"
                 print(f"  {len(ended)}/{len(self._cells)} {name}: {_result(cell, self._headline)}", flush=True)
 
     def _table(self) -> Table:
@@ -82,7 +82,7 @@ def conclude(cells: Sequence[Cell]) -> int:
     """Names the runs that failed; returns the exit status."""
     failed = [cell for cell in cells if cell.state == "failed"]
     for cell in failed:
-        print(f"{cell.object}, {cell.variant}: failed: {cell.error}")
+        print(f"{cell.object}, {cell.variant}, seed {cell.seed}: failed: {cell.error}; {cell.log} has more")
     return FAILED if failed else 0
 
 
