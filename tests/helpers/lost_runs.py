@@ -2,6 +2,7 @@
 
 import hashlib
 import os
+import shutil
 import signal
 import time
 from collections.abc import Sequence
@@ -17,10 +18,11 @@ from tests.helpers.reconstructions import untimed
 
 
 class LostCell(Cell):
-    """A cell whose first attempt is killed after its first checkpoint."""
+    """A cell whose first attempt is killed after its first checkpoint; its folder is lost too where a copy is kept."""
 
     def work(self, threads: int) -> Work:
-        return Work(die_once, str(self.source), self.folder, self.config, {}, threads, self.store)
+        options = {"forget": self.store is not None}
+        return Work(die_once, str(self.source), self.folder, self.config, options, threads, self.store)
 
 
 class StuckCell(Cell):
@@ -32,9 +34,13 @@ class StuckCell(Cell):
         return Work(stop_on, str(self.source), self.folder, self.config, {"node": self.doomed}, threads)
 
 
-def die_once(source: str, folder: Path, config: Any, *, resume: bool, callbacks: Sequence[Callback]) -> None:
+def die_once(
+    source: str, folder: Path, config: Any, *, forget: bool, resume: bool, callbacks: Sequence[Callback]
+) -> None:
     def die(event: object) -> None:
         if isinstance(event, CheckpointEvent) and not resume:
+            if forget:
+                shutil.rmtree(folder)
             os.kill(os.getpid(), signal.SIGKILL)
 
     run_task(source, folder, config, resume=resume, callbacks=[*callbacks, die])

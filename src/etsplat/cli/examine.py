@@ -57,6 +57,10 @@ def examine(console: Console) -> bool:
             "export --texture": _extra("texture", "xatlas"),
             "export --compress meshopt": _extra("compress", "meshoptimizer"),
             "--tensorboard": _extra("tensorboard", "tensorboard"),
+            "--cluster auto": _extra("cluster", "ray"),
+            "--cluster slurm": _extra("slurm", "submitit"),
+            "--store s3://": _extra("s3", "s3fs"),
+            "etsplat tune": _extra("tune", "optuna"),
         },
     )
     table = Table(box=None, show_header=False, pad_edge=False)

@@ -13,6 +13,8 @@ from etsplat.cli.data import Download, Masks, Sfm, Undistort
 from etsplat.cli.doctor import Doctor
 from etsplat.cli.runs import DemoObject, DemoScene, Reconstruct, Train
 from etsplat.cli.soups import Evaluate, Export, Render, View
+from etsplat.cli.sweeps import SweepReconstruct, SweepTrain
+from etsplat.cli.tuning import TuneReconstruct, TuneTrain
 from etsplat.core.errors import InputError
 from etsplat.tasks.settings import OneOf, Rare, Setting, Settings, did_you_mean, docs_of, settings_of
 
@@ -40,6 +42,14 @@ COMMANDS: dict[str, type[Command] | Group] = {
     "data": Group(
         "Where captures come from: find the cameras of photos, remove lens distortion, fetch data sets.",
         {"sfm": Sfm, "masks": Masks, "undistort": Undistort, "download": Download},
+    ),
+    "sweep": Group(
+        "Any settings against each other on any inputs, on this machine or a cluster; a table and a page at the end.",
+        {"reconstruct": SweepReconstruct, "train": SweepTrain},
+    ),
+    "tune": Group(
+        "Search good settings, where a sweep of all combinations would take too long (needs optuna).",
+        {"reconstruct": TuneReconstruct, "train": TuneTrain},
     ),
     "eval": Evaluate,
     "view": View,
