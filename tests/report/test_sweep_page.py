@@ -2,6 +2,7 @@
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -56,6 +57,8 @@ def test_means_are_over_seeds_and_the_best_is_by_what_all_have(found: Found) -> 
     assert best is not None
     assert best.chosen[RATE] == 0.001  # less is better
     assert found.best("<cup>", chamfer) is None
+    faces = replace(next(m for m in found.measures if m.key == "faces"), better=1)
+    assert found.best("owl", faces) is None  # all the same
 
 
 def test_files_hold_every_run(found: Found, tmp_path: Path) -> None:

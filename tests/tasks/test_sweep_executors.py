@@ -1,6 +1,7 @@
 """Three executors, one interface: runs that are lost in the middle end as if nothing had happened."""
 
 import os
+import socket
 import sys
 from pathlib import Path
 
@@ -126,6 +127,15 @@ def test_a_ray_cluster_loses_a_node(ball: Path, undisturbed: str, tmp_path: Path
     assert removed
     assert [(cell.state, cell.error) for cell in cells] == [("done", "")] * 3
     assert [digest(cell.folder) for cell in cells] == [undisturbed] * 3
+
+
+def test_a_ray_cluster_that_is_not_there_is_named_at_once() -> None:
+    """Ray itself would wait for many minutes."""
+    pytest.importorskip("ray", reason="Ray is not installed (the extra cluster)")
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+    with pytest.raises(InputError, match=f"cluster 127.0.0.1:{port}: nobody answers there"):
+        Where(cluster=f"127.0.0.1:{port}").executor(1)
 
 
 def test_ray_that_is_missing_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

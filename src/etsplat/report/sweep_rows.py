@@ -158,9 +158,9 @@ class Found:
         return [(f"{c.object}, {c.variant}, seed {c.seed}: failed: {c.error}", c.log) for c in self.failed]
 
     def best(self, name: str, measure: Measure) -> Line | None:
-        """The line of an input that is best by a measure; None if there is none, or nothing to choose from."""
+        """The line of an input that is best by a measure; None if there is none, or nothing between them."""
         lines = [line for line in self.lines if line.input == name and line.values(measure)]
-        if len(lines) < 2 or not measure.better:
+        if len({line.mean(measure) for line in lines}) < 2 or not measure.better:
             return None
         return max(lines, key=lambda line: measure.better * (line.mean(measure) or 0.0))
 

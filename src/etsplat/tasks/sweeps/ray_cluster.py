@@ -2,6 +2,7 @@
 
 import importlib
 import logging
+import socket
 from concurrent.futures import Future
 from typing import Any
 
@@ -9,7 +10,7 @@ from etsplat.core.errors import InputError
 from etsplat.tasks.sweeps.executors import Executor, LostError
 from etsplat.tasks.sweeps.work import Work, perform
 
-_CANCELLED_SECONDS = 60.0
+_CANCELLED_SECONDS, _REACH_SECONDS = 60.0, 10.0
 
 
 class RayExecutor(Executor):
@@ -32,6 +33,7 @@ class RayExecutor(Executor):
         self._ray, self.threads = ray, cores
         self._connected = not ray.is_initialized()
         if self._connected:
+            _reach(address)
             try:
                 ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
             except (ConnectionError, ValueError, RuntimeError) as error:
@@ -58,6 +60,19 @@ class RayExecutor(Executor):
         """As of `Executor`."""
         if self._connected:
             self._ray.shutdown()
+
+
+def _reach(address: str) -> None:
+    """Raises InputError where nobody listens at HOST:PORT, for which Ray itself would wait for many minutes."""
+    host, colon, port = address.rpartition("://")[2].rpartition(":")
+    if not (colon and port.isdigit()):
+        return
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), timeout=_REACH_SECONDS).close()
+    except (OSError, OverflowError) as error:
+        raise InputError(
+            f"cluster {address}: nobody answers there ({error}); start one with `ray start --head`"
+        ) from error
 
 
 class _Task:

@@ -133,8 +133,8 @@ class Search(Generic[AnySettings]):
         """
         if any(cell.state != "done" for cell in cells):
             return None
-        values = [cell.metrics().get(self.goal) for cell in cells]
-        if None in values:
+        values = [value for cell in cells if (value := cell.metrics().get(self.goal)) is not None]
+        if len(values) < len(cells):
             raise InputError(f"goal {self.goal}: was not measured in {cells[0].folder}; choose another")
         return statistics.fmean(values)
 
