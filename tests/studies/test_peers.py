@@ -92,7 +92,7 @@ def test_a_peer_is_trained_measured_and_tabulated_as_our_methods_are(tmp_path, g
     write_colmap(tmp_path / "toy", [(48, 36)] * 9)
     (cell,) = cells_of(tmp_path, [method])
     assert (cell.variant, cell.config.iterations, cell.config.width) == (method, 30, 24)
-    train_peer(cell.mesh, cell.folder, cell.config)
+    train_peer(cell.source, cell.folder, cell.config)
     again = cells_of(tmp_path, [method])[0]
     assert again.state == "done"
     strategy = fake_gsplat.DefaultStrategy.made[-1]
@@ -165,7 +165,7 @@ def test_2dgs_fits_normals_except_on_objects(tmp_path, gsplat, monkeypatch, kind
     scene = read_scene_argument(f"{tmp_path / 'toy'}:{kind}")
     setting = "iterations=30,width=24"
     (cell,) = make_nvs_cells([scene], ["2dgs"], tmp_path / "out", preset="tiny", culling=(False,), setting=setting)
-    train_peer(cell.mesh, cell.folder, cell.config)
+    train_peer(cell.source, cell.folder, cell.config)
     assert seen == modes
 
 

@@ -77,7 +77,7 @@ def test_a_cell_holds_what_its_run_comes_to(table: str, cells: dict[str, list[Ce
     in_json = json.loads((tmp_path / "results.json").read_text())["rows"][0]
     in_csv = next(csv.DictReader((tmp_path / "results.csv").open()))
     cell = cells[table][0]
-    metrics = reconstruct(cell.mesh, tmp_path / "alone", cell.config).metrics  # pyright: ignore[reportArgumentType]
+    metrics = reconstruct(cell.source, tmp_path / "alone", cell.config).metrics  # pyright: ignore[reportArgumentType]
     assert metrics["chamfer"] > 0
     for name in set(METRICS) - SECONDS:
         assert in_json[name] == metrics.get(name), name
