@@ -9,7 +9,7 @@ from typing import Any
 
 from etsplat.core.errors import InputError
 from etsplat.tasks.sweeps.cells import run_cells
-from etsplat.tasks.sweeps.executors import Where
+from etsplat.tasks.sweeps.places import Where
 from studies.grid.cells import Cell
 from studies.grid.writing import bold, origin_of, versions_of, write_text
 from studies.peers.opensplat import OpenSplat, OpenSplatRun, processor_seconds

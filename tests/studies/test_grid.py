@@ -19,7 +19,7 @@ from etsplat.io.mesh_files import save_mesh
 from etsplat.io.run_directory import RunDirectory
 from etsplat.tasks.reconstruct_config import METHODS, ReconstructConfig
 from etsplat.tasks.sweeps.cells import run_cells
-from etsplat.tasks.sweeps.executors import Where
+from etsplat.tasks.sweeps.places import Where
 from etsplat.tasks.sweeps.work import wait_for_writer
 from studies.famous import Famous
 from studies.grid.cells import Cell, make_cells
@@ -82,7 +82,7 @@ from pathlib import Path
 
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.sweeps.cells import run_cells
-from etsplat.tasks.sweeps.executors import Where
+from etsplat.tasks.sweeps.places import Where
 from studies.grid.cells import make_cells
 from studies.grid.variants import Variant
 

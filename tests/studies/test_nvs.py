@@ -7,7 +7,7 @@ from PIL import Image
 
 from etsplat.core.errors import InputError
 from etsplat.tasks.sweeps.cells import run_cells
-from etsplat.tasks.sweeps.executors import Where
+from etsplat.tasks.sweeps.places import Where
 from etsplat.tasks.train_config import TrainConfig
 from helpers.captures import write_colmap
 from studies.scenes.cells import Scene, evaluate_cells, make_nvs_cells, read_scene_argument

@@ -13,7 +13,7 @@ from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.scoring import evaluate_run
 from etsplat.tasks.sources import open_run
 from etsplat.tasks.sweeps.cells import run_cells
-from etsplat.tasks.sweeps.executors import Where
+from etsplat.tasks.sweeps.places import Where
 from etsplat.tasks.train import train
 from studies.distance import Distance
 from studies.famous import Famous

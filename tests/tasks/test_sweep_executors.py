@@ -15,7 +15,8 @@ from etsplat.io.run_directory import RunDirectory
 from etsplat.tasks.reconstruct import reconstruct
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.sweeps.cells import RETRIES, Cell, run_cells
-from etsplat.tasks.sweeps.executors import Executor, LostError, Where
+from etsplat.tasks.sweeps.executors import Executor, LostError
+from etsplat.tasks.sweeps.places import Where
 from etsplat.tasks.sweeps.slurm import SlurmExecutor
 from etsplat.tasks.sweeps.work import perform, wait_for_writer
 from tests.helpers.lost_runs import LostCell, StuckCell, digest

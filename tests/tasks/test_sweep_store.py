@@ -4,6 +4,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import fsspec
 import pytest
 
 from etsplat.core.errors import InputError
@@ -11,7 +12,7 @@ from etsplat.geometry.icosphere import icosphere
 from etsplat.io.mesh_files import save_mesh
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.sweeps.cells import Cell, run_cells
-from etsplat.tasks.sweeps.executors import Where
+from etsplat.tasks.sweeps.places import Where
 from etsplat.tasks.sweeps.store import Store, open_store
 from etsplat.tasks.sweeps.work import perform
 from tests.helpers.lost_runs import LostCell, digest
@@ -84,6 +85,7 @@ def test_a_folder_is_kept_as_it_is(tmp_path: Path) -> None:
 def test_places_that_cannot_be_reached_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(InputError, match=r"store nowhere://a: .*write it as fsspec does"):
         Store("nowhere://a", tmp_path)
+    monkeypatch.delitem(fsspec.registry._registry, "s3", raising=False)  # where an earlier test has used it
     monkeypatch.setitem(sys.modules, "s3fs", None)
     with pytest.raises(InputError, match=r"store s3://a: needs a package .*pip install 'etsplat\[s3\]'"):
         Store("s3://a", tmp_path)

@@ -12,7 +12,7 @@ from etsplat.io.run_directory import RunDirectory
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.sweeps import tuning
 from etsplat.tasks.sweeps.cells import Cell
-from etsplat.tasks.sweeps.executors import Where
+from etsplat.tasks.sweeps.places import Where
 from etsplat.tasks.sweeps.tuning import Range, Search, Study, read_ranges
 
 RATE, COLORS = "optimizer.lr_vertices", "drawing.colors"

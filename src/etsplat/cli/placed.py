@@ -9,7 +9,7 @@ import tyro
 
 from etsplat.cli.command import INTERRUPTED, Command, fail
 from etsplat.core.errors import InputError
-from etsplat.tasks.sweeps.executors import Where
+from etsplat.tasks.sweeps.places import Where
 
 if TYPE_CHECKING:
     from etsplat.cli.live_table import Headline

@@ -12,7 +12,8 @@ from etsplat.io.locks import RUN_LOCK
 from etsplat.io.run_directory import RunDirectory, is_run
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.settings import Settings, get
-from etsplat.tasks.sweeps.executors import Executor, LostError, Pending, Where
+from etsplat.tasks.sweeps.executors import Executor, LostError, Pending
+from etsplat.tasks.sweeps.places import Where
 from etsplat.tasks.sweeps.work import Work, log_of
 
 RETRIES = 2

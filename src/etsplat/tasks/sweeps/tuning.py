@@ -13,7 +13,7 @@ from etsplat.io.atomic import atomic_write, write_error
 from etsplat.io.json_text import as_json, json_differences
 from etsplat.tasks.settings import AnySettings, did_you_mean, settings_of
 from etsplat.tasks.sweeps.cells import Cell, run_cells
-from etsplat.tasks.sweeps.executors import Where
+from etsplat.tasks.sweeps.places import Where
 
 GOALS = {"chamfer": -1, "psnr": 1, "ssim": 1, "flip": -1, "silhouette_iou": 1, "psnr_opaque": 1}
 """What may be searched for, a mean over inputs of a number of metrics.json: 1 where more is better."""
