@@ -92,6 +92,8 @@ VALUES: dict[str, Callable[[], Any]] = {
     "Rasterization": _rasterization,
     "ReconstructConfig": lambda: etsplat.ReconstructConfig.demo(),
     "ReconstructResult": lambda: etsplat.ReconstructResult(Path("x"), MESH, {"psnr": 30.0}),
+    "CameraRefinement": lambda: etsplat.CameraRefinement.of("poses", 1000, 40),
+    "CamerasEvent": lambda: etsplat.CamerasEvent(100, 10, 100, 25.0, 26.0, True),
     "UndoEvent": lambda: etsplat.UndoEvent(10, 110, 0.1, 0.2),
     "RefineEvent": lambda: etsplat.RefineEvent(1, 2, 3),
     "RowPlan": lambda: etsplat.RowPlan.keeping(torch.tensor([True, False, True])),

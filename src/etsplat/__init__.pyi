@@ -63,6 +63,8 @@ from etsplat.ops.rasterize_opaque import rasterize_opaque as rasterize_opaque
 from etsplat.ops.rasterize_opaque import render_opaque as render_opaque
 from etsplat.ops.spherical_harmonics import spherical_harmonics as spherical_harmonics
 from etsplat.ops.texture import sample_texture as sample_texture
+from etsplat.optim.camera_event import CamerasEvent as CamerasEvent
+from etsplat.optim.camera_refinement import CameraRefinement as CameraRefinement
 from etsplat.optim.densification import PruneRules as PruneRules
 from etsplat.optim.edit import RowPlan as RowPlan
 from etsplat.optim.edit import apply_rows as apply_rows

@@ -23,6 +23,7 @@ from etsplat.io.kernel_files import write_kernel
 from etsplat.io.mesh_files import MeshFile
 from etsplat.io.opaque_files import save_opaque
 from etsplat.io.ply_tables import encode_ply
+from etsplat.io.refined_camera_files import RefinedCamera, write_refined_cameras
 from etsplat.io.textures import Texture
 from etsplat.model.solid_soup import SolidSoup
 from etsplat.model.soup_compact import compact_of
@@ -300,6 +301,12 @@ def camera_paths() -> list[bytes]:
     poses = torch.eye(4, dtype=torch.float64).repeat(3, 1, 1)
     fovs = torch.tensor([40.0, 50.0, 60.0], dtype=torch.float64)
     return [KeyPoses(poses, fovs, aspect).to_json().encode() for aspect in (None, 1.5)]
+
+
+def refined_cameras() -> Files:
+    pose, K = torch.eye(4).tolist(), [[90.0, 0.0, 32.0], [0.0, 91.0, 24.0], [0.0, 0.0, 1.0]]
+    cameras = {name: RefinedCamera(pose, K, 64, 48, name != "b", 0.4, 0.02, 0.01) for name in ("a", "b")}
+    return made(lambda f: write_refined_cameras(f, cameras))
 
 
 def exported() -> list[bytes]:

@@ -26,6 +26,7 @@ from etsplat.io.opaque_files import load_opaque
 from etsplat.io.photos import inspect_photo, write_upright
 from etsplat.io.ply_tables import load_points
 from etsplat.io.point_clouds import load_cloud
+from etsplat.io.refined_camera_files import read_refined_cameras
 from etsplat.io.run_directory import RunDirectory, is_run
 from etsplat.metrics.image import Lpips
 from etsplat.model.soup_import import open_soup
@@ -126,6 +127,15 @@ def _opaque(path: Path) -> None:
     assert mesh.vertex_colors is not None
     assert mesh.vertices.isfinite().all()
     assert mesh.vertex_colors[mesh.faces].isfinite().all()
+
+
+def _refined_cameras(folder: Path) -> None:
+    for camera in read_refined_cameras(folder).values():
+        pose, K = torch.tensor(camera.viewmat, dtype=torch.float64), torch.tensor(camera.K, dtype=torch.float64)
+        etsplat.Cameras(pose[None], K[None], camera.width, camera.height)
+        assert pose.isfinite().all(), camera
+        assert K.isfinite().all(), camera
+        assert math.isfinite(camera.shifted_of_distance), camera
 
 
 def _camera_path(path: Path) -> None:
@@ -314,6 +324,7 @@ READERS = [
     Reader("opaque mesh", _single(".safetensors", corpus.opaque_meshes), (".safetensors",), _file(_opaque)),
     # Nearly every number in it is of a rotation, which must stay one.
     Reader("camera path", _single(".json", corpus.camera_paths), (".json",), _file(_camera_path), 0.04),
+    Reader("cameras.json", _prefixed(corpus.refined_cameras), (".json",), _refined_cameras),
     Reader(
         "kernel.safetensors",
         lambda: [{"kernel.safetensors": data} for data in corpus.kernels()],

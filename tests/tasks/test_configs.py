@@ -88,7 +88,7 @@ def test_presets_of_reconstruct_are_what_they_were(preset: str) -> None:
     since["refinement.reach"] = 0.5
     since |= {"drawing.harmonics": 0, "optimizer.lr_harmonics": 5e-4}
     since["start.shape"] = "sphere" if preset in ("paper", "study", "tiny") else "auto"
-    since |= {"texture": None, "output.texture_faces": 10_000}
+    since |= {"texture": None, "output.texture_faces": 10_000, "refine_cameras": "off"}
     since["watch"] = 0 if preset in ("paper", "study", "tiny") else None
     since["exposure"] = "off" if preset in ("paper", "study", "tiny") else "auto"
     since["regularization.depth"] = "off" if preset in ("paper", "study", "tiny") else "auto"
@@ -111,6 +111,7 @@ def test_presets_of_train_are_what_they_were(preset: str, scene: str) -> None:
     since |= {"optimizer.lr_vertices_unit": "frame" if off else "view", "pixels_per_triangle": None if off else 75.0}
     since |= {"loss.depth": "off" if off else "auto", "loss.lambda_depth": 0.02, "loss.depth_from": 6000}
     since["asset"] = preset not in ("paper", "tiny")
+    since["refine_cameras"] = "off"
     if not off:  # 0.0015, and 0.0004 of objects, in the unit of the frame
         since["optimizer.lr_vertices"] = 0.0006
     assert config == {"preset": preset, "scene_type": scene, **named, **since}

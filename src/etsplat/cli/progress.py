@@ -12,7 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from etsplat.io.images import open_image
-from etsplat.optim.loop import DoneEvent, Event, NoteEvent, PrepareEvent, StageEvent, StepEvent, UndoEvent
+from etsplat.optim.loop import DoneEvent, Event, NoteEvent, PrepareEvent, Return, StageEvent, StepEvent
 
 LINES, LINE_SECONDS = 10, 60.0
 """Without a terminal, so many lines tell of a phase, and more where they come less often than that."""
@@ -122,7 +122,7 @@ class RunProgress(PhaseBar):
             self.show(self._preparing, event.done, event.total)
         elif isinstance(event, StageEvent):
             self.show(event.name, event.done, event.total)
-        elif isinstance(event, NoteEvent | UndoEvent):
+        elif isinstance(event, NoteEvent | Return):
             self._console.print(f"  {event}", highlight=False, markup=False, soft_wrap=True)
         elif isinstance(event, StepEvent):
             self._step(event)

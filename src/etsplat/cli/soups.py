@@ -32,6 +32,7 @@ _COLUMNS = {
     "lpips": ("LPIPS", ".4f"),
     "psnr_opaque": ("PSNR opaque", ".2f"),
     "psnr_affine": ("PSNR, colours fitted", ".2f"),
+    "psnr_aligned": ("PSNR, poses fitted", ".2f"),
 }
 
 PURPOSES = {
@@ -105,7 +106,7 @@ def _print(console: "Console", found: dict[str, Any]) -> None:
     from rich.table import Table
 
     table = Table("view", box=None)
-    shown = {key: column for key, column in _COLUMNS.items() if found[key] is not None}
+    shown = {key: column for key, column in _COLUMNS.items() if found.get(key) is not None}
     for title, _ in shown.values():
         table.add_column(title, justify="right")
     for row in [*found["views"], {**found, "name": "mean"}]:

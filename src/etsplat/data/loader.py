@@ -117,9 +117,9 @@ class ViewLoader:
             self._kept[index] = view
         return view
 
-    def views(self, indices: Sequence[int]) -> "Views":
-        """Some by their indices, each loaded when it is looked at."""
-        return Views(self, indices)
+    def views(self, indices: Sequence[int], seen: Callable[[View], View] = lambda view: view) -> "Views":
+        """Some by their indices, each loaded when it is looked at, and handed to `seen`."""
+        return Views(self, indices, seen)
 
     def kind_and_place(self, index: int, number: int = 0) -> tuple[Hashable, tuple[float, float]]:
         """Of a view that is to be queued. The first call uploads all photos of the training views if they can stay.
@@ -203,8 +203,8 @@ class ViewLoader:
 class Views(Sequence[View]):
     """Views of a loader, each loaded when it is looked at."""
 
-    def __init__(self, loader: ViewLoader, indices: Sequence[int]) -> None:
-        self._loader, self._indices = loader, indices
+    def __init__(self, loader: ViewLoader, indices: Sequence[int], seen: Callable[[View], View]) -> None:
+        self._loader, self._indices, self._seen = loader, indices, seen
 
     def __len__(self) -> int:
         return len(self._indices)
@@ -218,8 +218,8 @@ class Views(Sequence[View]):
     def __getitem__(self, place: int | slice) -> "View | Views":
         """Raises InputError where a photo is damaged or has gone."""
         if isinstance(place, slice):
-            return Views(self._loader, self._indices[place])
-        return self._loader.view(self._indices[place])
+            return Views(self._loader, self._indices[place], self._seen)
+        return self._seen(self._loader.view(self._indices[place]))
 
 
 def _copy(source: Tensor, target: Tensor) -> None:

@@ -77,16 +77,21 @@ def _problem(key: object) -> str | None:
         return "is no object with `viewmat` and `fov`"
     if not (is_number(key.get("fov")) and 1 <= key["fov"] <= 170):
         return "`fov` must be a number of degrees between 1 and 170"
-    rows = key.get("viewmat")
+    problem = pose_problem(key.get("viewmat"))
+    return None if problem is None else f"`viewmat` {problem}"
+
+
+def pose_problem(rows: object) -> str | None:
+    """What is wrong with a world-to-camera matrix of a JSON file, or None."""
     if not (
         isinstance(rows, list)
         and len(rows) == 4
         and all(isinstance(row, list) and len(row) == 4 and all(map(is_number, row)) for row in rows)
     ):
-        return "`viewmat` must be 4 rows of 4 numbers"
+        return "must be 4 rows of 4 numbers"
     viewmat = torch.tensor(rows, dtype=torch.float64)
     rotation = viewmat[:3, :3]
     rigid = (rotation @ rotation.T - torch.eye(3)).abs().max() < _STRAIGHT and torch.linalg.det(rotation) > 0
     if not rigid or viewmat[3].tolist() != [0, 0, 0, 1]:
-        return "`viewmat` must be a rotation and a shift, with 0 0 0 1 below"
+        return "must be a rotation and a shift, with 0 0 0 1 below"
     return None

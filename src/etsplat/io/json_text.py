@@ -11,7 +11,14 @@ from etsplat.core.errors import InputError
 _LARGEST = {int: 1e15, float: 1e30}
 """Of numbers: nobody counts further, and what is computed from them stays finite."""
 
-_NAMES = {int: "a whole number", float: "a number", str: "a text", dict: "an object", NoneType: "null"}
+_NAMES = {
+    int: "a whole number",
+    float: "a number",
+    bool: "true or false",
+    str: "a text",
+    dict: "an object",
+    NoneType: "null",
+}
 
 
 def parse_json(text: str | bytes) -> Any:

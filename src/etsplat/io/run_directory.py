@@ -32,7 +32,7 @@ _FILES = (
     *("mesh.ply", "mesh.obj", "mesh.glb", "textured.glb"),
     *("soup.safetensors", "opaque.glb", "opaque.safetensors", "gaussians.safetensors"),
     KERNEL_FILE,
-    *("metrics.json", "evaluation.json", "exposure.json"),
+    *("metrics.json", "evaluation.json", "exposure.json", "cameras.json"),
     GEOREFERENCE_FILE,
     "history.jsonl",
     "convergence.png",

@@ -10,6 +10,7 @@ metrics.json    how good it is; docs/conventions.md of etsplat says how each num
 history.jsonl   one line per log step: iteration, seconds of optimisation, loss, state, and what was evaluated
 convergence.png how loss, quality and the number of triangles went; overview.png shows test views
 exposure.json   if it is there: the photos were exposed unlike each other; how each saw the colours of the result
+cameras.json    if it is there: cameras of the training photos as they were refined, and how far each moved
 georeference.json  if it is there: world coordinates = offset + scale * coordinates of the result, before it was turned
 ended.txt       if it is there: how the run ended before it was done
 config.json     the settings that made it

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from etsplat.core.workers import about_this, workers
 from etsplat.io.run_directory import RunDirectory
+from etsplat.optim.camera_event import CamerasEvent
 from etsplat.optim.checkpoints import checkpoint_path, load_latest_checkpoint, save_checkpoint
 from etsplat.optim.loop import Callback, Event, LoopSettings, Problem, Progress, StepEvent, UndoEvent, optimize
 
@@ -100,3 +101,5 @@ class History:
             losses = {"loss_before": event.loss_before, "loss_after": event.loss_after}
             self._undone = {"iteration": event.iteration, "undone": {"judged": event.judged, **losses}}
             self._run.append_history(self._undone)
+        elif isinstance(event, CamerasEvent) and event.forgets:
+            self._run.truncate_history(event.begin - (event.refined is None))  # whose line comes again

@@ -1,12 +1,14 @@
 """What a model is measured on in the course of a run: some views at a small size, kept."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from copy import copy
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
 from torch import Tensor
 
+from etsplat.core.cameras import Cameras
 from etsplat.data.dataset import Dataset
 from etsplat.data.loader import View, ViewLoader
 from etsplat.model.model import Model
@@ -48,6 +50,8 @@ class Gauge:
         side: int,
         device: torch.device,
         background: Tensor | None = None,
+        *,
+        placed: Callable[[View], View] = lambda view: view,
     ) -> None:
         """Takes what to measure on.
 
@@ -57,11 +61,24 @@ class Gauge:
             side: of the largest picture, in pixels, at most.
             device: of the models.
             background: (1, 3) behind pictures and photos; None for the corners of the colour cube, in turn.
+            placed: gives views the cameras that they are to be seen by.
         """
         self.views = len(views)
         self._dataset, self._indices, self._side, self._device = dataset, list(views), side, device
         colors = torch.tensor(_CORNERS) if background is None else background
-        self._backgrounds = colors.to(device)
+        self._backgrounds, self._placed = colors.to(device), placed
+
+    def placing(self, cameras: Mapping[int, Cameras]) -> "Gauge":
+        """One of the same views from other cameras, by their indices."""
+        other = copy(self)
+        other._placed = lambda view: replace(view, camera=cameras[int(view.index)])
+        return other
+
+    @property
+    def scenes(self) -> Iterator[tuple[View, Tensor]]:
+        """Every view with its camera as given, and the (1, 3) colour behind it."""
+        for number, view in enumerate(self._views):
+            yield view, self._backgrounds[number % len(self._backgrounds)][None]
 
     @torch.no_grad()
     def measure(self, model: Model, objective: Objective, exposure: Exposure | None = None) -> Measured:
@@ -73,8 +90,7 @@ class Gauge:
             exposure: of training photos, as which their pictures are exposed where it is learned; None for others.
         """
         term, losses, errors = objective.photometric, [], []
-        for number, view in enumerate(self._views):
-            background = self._backgrounds[number % len(self._backgrounds)][None]
+        for view, background in ((self._placed(view), background) for view, background in self.scenes):
             rendering = model.render(
                 view.camera, backgrounds=background, outputs=("color", *term.outputs), depth_of=objective.depth_of
             )

@@ -19,6 +19,7 @@ from typing import Protocol
 from torch import Tensor
 
 from etsplat.core.workers import workers
+from etsplat.optim.camera_event import CamerasEvent
 from etsplat.optim.checkpoints import list_checkpoints
 
 
@@ -182,7 +183,10 @@ class DoneEvent:
         return f"{self.iteration} iterations in {self.seconds:.1f} s"
 
 
-Event = PrepareEvent | StageEvent | NoteEvent | StepEvent | RefineEvent | UndoEvent | CheckpointEvent | DoneEvent
+Return = UndoEvent | CamerasEvent
+"""Of runs that may have gone back, and have changed otherwise than by a step or an edit."""
+
+Event = PrepareEvent | StageEvent | NoteEvent | StepEvent | RefineEvent | Return | CheckpointEvent | DoneEvent
 """The first three are told by tasks, before the loop begins or after it ended."""
 
 Callback = Callable[[Event], None]
@@ -215,8 +219,8 @@ class Problem(Protocol):
         """Adds or removes primitives if this iteration is one for that; returns how many were added."""
         ...
 
-    def review(self, progress: "Progress") -> UndoEvent | None:
-        """Judges an earlier edit if it is time to. If it is undone, everything, `progress` too, is as it was before."""
+    def review(self, progress: "Progress") -> Return | None:
+        """Judges what was done earlier if it is time to. If it is undone, all, `progress` too, is as it was before."""
         ...
 
     def evaluate(self) -> dict[str, float]:
@@ -324,7 +328,7 @@ def optimize(
     yield DoneEvent(progress.iteration, progress.seconds)
 
 
-def _advance(problem: Problem, progress: Progress, stop: int, folder: Path | None) -> tuple[int, UndoEvent | None]:
+def _advance(problem: Problem, progress: Progress, stop: int, folder: Path | None) -> tuple[int, Return | None]:
     """Steps and edits; returns how many triangles were added, and what was undone."""
     start = time.perf_counter()
     for loss in problem.advance(progress.iteration + 1, stop):

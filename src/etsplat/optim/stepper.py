@@ -16,6 +16,7 @@ from etsplat.data.loader import View, ViewLoader
 from etsplat.engines.choice import engine_for
 from etsplat.model.model import Model
 from etsplat.ops.adam import Adam
+from etsplat.optim.camera_refinement import CameraRefinement
 from etsplat.optim.depth_trust import DepthTrust
 from etsplat.optim.exposure import Exposure
 from etsplat.optim.objective import Drawing, Objective
@@ -61,6 +62,7 @@ class Stepper(Generic[M]):
         strategy: Strategy,
         schedule: Schedule,
         exposure: Exposure,
+        cameras: CameraRefinement,
         *,
         batch: int,
         background: Float[Tensor, "1 3"] | None,
@@ -68,7 +70,7 @@ class Stepper(Generic[M]):
         generator: torch.Generator,
     ) -> None:
         """Arrives at the start of a run; arguments are those of `Trainer`."""
-        self._model, self._strategy, self._exposure = model, strategy, exposure
+        self._model, self._strategy, self._exposure, self._cameras = model, strategy, exposure, cameras
         self._objective, self._dataset, self._batch = objective, dataset, batch
         self._schedule, appearance = schedule, model.appearance
         self._appearance = schedule.appearance or (lambda _: appearance)
@@ -93,6 +95,7 @@ class Stepper(Generic[M]):
                 values=len(schedule.values),
                 rates=len(parameters) + 1,
                 exposure=2,
+                cameras=cameras.row,
             )
             self.queue = StepQueue(self._queued_gradients, self._commit, self._row.width, self._device)
 
@@ -139,32 +142,35 @@ class Stepper(Generic[M]):
             self._halvings, self._loader = halvings, ViewLoader(dataset, self._device, self._batch)
 
     def look(self, iteration: int) -> tuple[Any, ...]:
-        """How the model is drawn after an iteration, and which photos it is fitted to."""
+        """How the model is drawn after an iteration, which photos it is fitted to, and where photos are seen from."""
         values = self._values(iteration) if iteration else {}
-        return self._appearance(iteration), self._schedule.halvings(max(1, iteration)), values
+        halvings = self._schedule.halvings(max(1, iteration))
+        return self._appearance(iteration), halvings, values, self._cameras.stage(iteration)
 
     def measure_exposure(self) -> None:
         """Measures whether the photos that are fitted to were exposed unlike each other."""
         behind = torch.zeros(1, 3) if self._background is None else self._background
-        self._exposure.measure(self._model, self._loader.views(self._dataset.train), behind.to(self._device))
+        views = self._loader.views(self._dataset.train, self._cameras.placed)
+        self._exposure.measure(self._model, views, behind.to(self._device))
         if self._exposure.learned:
             self.restart()
 
     def measure_depths(self, trust: DepthTrust) -> None:
         """Compares depth maps with the model as it is now."""
         with_maps = (index for index in self._dataset.train if index in self._dataset.images.with_depth)
-        trust.measure(self._model, (self._loader.view(index) for index in with_maps))
+        trust.measure(self._model, (self._cameras.placed(self._loader.view(index)) for index in with_maps))
         self.restart()
 
     def _step(self, iteration: int) -> float:
         self.arrive(iteration)
         chosen = self._choose()
         weights, scale = self._objective.weights(iteration), at(self._objective.scale, iteration)
+        moving = self._cameras.moving(iteration)
 
         def gradients(places: range) -> tuple[Tensor, list[Rasterization]]:
             some = (chosen[place] for place in places)
             views = ((self._loader.view(c.view), c.background.to(self._device)) for c in some)
-            return self._gradients(views, weights, scale, first=places.start)
+            return self._gradients(views, weights, scale, moving=moving, first=places.start)
 
         indices, optimizers = [c.view for c in chosen], [self.adam, self._exposure.adam]
         loss, seen = shared_gradients(workers(), indices, gradients, optimizers, self._strategy.outputs)
@@ -175,6 +181,8 @@ class Stepper(Generic[M]):
             self._update(self.adam, self._model)
         if self._exposure.learned:
             self._exposure.step(iteration)
+        if moving:
+            self._cameras.step(iteration)
         for each, rendering in zip(chosen, seen, strict=True):
             self._strategy.observe(rendering, epoch_starts=each.epoch_starts)
         return float(loss)
@@ -194,6 +202,7 @@ class Stepper(Generic[M]):
             values=list(self._values(iteration).values()),
             rates=self.adam.rates(list(self.adam.parameters)),
             exposure=self._exposure.queued_rates(iteration),
+            cameras=self._cameras.queued_rates(iteration),
         )
 
         def prepare() -> None:
@@ -205,7 +214,7 @@ class Stepper(Generic[M]):
     def _queued_gradients(self, row: Tensor, kinds: Hashable) -> Tensor:
         assert isinstance(kinds, tuple)
         fields = self._row.unpack(row)
-        _, structure, weights = self._phase
+        _, structure, weights, moving = self._phase
         self._model.appearance = structure.on_device(fields["appearance"])
         self._set(dict(zip(self._schedule.values, fields["values"].unbind(), strict=True)))
         places, backgrounds = fields["places"].split(2), fields["backgrounds"].split(3)
@@ -213,7 +222,7 @@ class Stepper(Generic[M]):
             (self._loader.look_up(kind, place), background[None])
             for kind, place, background in zip(kinds, places, backgrounds, strict=True)
         )
-        loss, self._seen = self._gradients(views, weights, fields["scale"][0])
+        loss, self._seen = self._gradients(views, weights, fields["scale"][0], moving=moving)
         return loss
 
     def _commit(self, row: Tensor, halted: Tensor) -> None:
@@ -221,17 +230,26 @@ class Stepper(Generic[M]):
         self.adam.step_on_device(fields["rates"], halted)
         if self._exposure.learned:
             self._exposure.step_on_device(fields["exposure"], halted)
+        if self._phase[-1]:
+            self._cameras.step_on_device(fields["cameras"], halted)
         for rendering, epoch_starts in zip(self._seen, fields["epochs"].split(1), strict=True):
             self._strategy.observe_on_device(rendering, epoch_starts, halted)
         self._seen = []
 
     def _gradients(
-        self, views: Iterable[tuple[View, Tensor]], weights: Sequence[float], scale: float | Tensor, first: int = 0
+        self,
+        views: Iterable[tuple[View, Tensor]],
+        weights: Sequence[float],
+        scale: float | Tensor,
+        *,
+        moving: bool,
+        first: int = 0,
     ) -> tuple[Tensor, list[Rasterization]]:
         """Those of the objective, one view after the other, from place `first` on; its value, and what was seen."""
         outputs = (*self._objective.outputs(weights), *self._strategy.outputs)
         losses, seen, exposure = [], [], self._exposure
         for number, (view, background) in enumerate(views, start=first + 1):
+            view = self._cameras.placed(view, learning=moving)
             rendering = self._model.render(
                 view.camera, backgrounds=background, outputs=outputs, depth_of=self._objective.depth_of
             )
@@ -246,6 +264,7 @@ class Stepper(Generic[M]):
             if not losses:
                 self.adam.zero_grad()
                 exposure.adam.zero_grad()
+                self._cameras.adam.zero_grad()
             loss.backward()
             losses.append(loss.detach())
             seen.append(rendering)
@@ -269,9 +288,9 @@ class Stepper(Generic[M]):
         return [view for view, owner in zip(views, whose, strict=True) if owner == group.rank]
 
     def _phase_at(self, iteration: int) -> tuple[Any, ...]:
-        """What changes seldom: how often photos are halved, how the model is drawn, the weights of the objective."""
-        look = self._appearance(iteration).structure
-        return self._schedule.halvings(iteration), look, self._objective.weights(iteration)
+        """What changes seldom: how often photos are halved, how the model is drawn, weights, whether cameras move."""
+        look, moving = self._appearance(iteration).structure, self._cameras.moving(iteration)
+        return self._schedule.halvings(iteration), look, self._objective.weights(iteration), moving
 
     def _rates(self, iteration: int) -> dict[str, float]:
         return {name: at(self._schedule.rates[name], iteration) for name in self._model.parameters()}

@@ -20,12 +20,14 @@ from etsplat.io.locks import writing_run
 from etsplat.io.run_directory import RunDirectory, is_run
 from etsplat.model.model import Model
 from etsplat.ops.adam import Adam
+from etsplat.optim.camera_refinement import CameraRefinement
+from etsplat.optim.camera_trial import CameraTrial
 from etsplat.optim.depth_trust import DepthTrust
 from etsplat.optim.drive import drive
 from etsplat.optim.exposure import Exposure
 from etsplat.optim.gauge import Gauge
 from etsplat.optim.guard import Guard
-from etsplat.optim.loop import Callback, LoopSettings, Progress, UndoEvent
+from etsplat.optim.loop import Callback, LoopSettings, Progress, Return, UndoEvent
 from etsplat.optim.objective import Objective
 from etsplat.optim.schedules import NEVER, Schedule
 from etsplat.optim.stepper import Stepper
@@ -51,6 +53,8 @@ class Trainer(Generic[M]):
         strategy: what adds and removes triangles.
         exposure: what is learned of each photo's exposure.
         depths: which depth maps are believed.
+        cameras: what is learned of each photo's camera.
+        trial: whether that stays.
         progress: where the run stands.
         guard: what undoes edits; None lets all of them stay.
         onlooker: called after steps, before an edit, with the iterations done; it may look at the model, not change it.
@@ -79,6 +83,7 @@ class Trainer(Generic[M]):
         background: Sequence[float] | None = None,
         exposure: Exposure | None = None,
         depths: DepthTrust | None = None,
+        cameras: CameraRefinement | None = None,
         update: Callable[[Adam, Any], None] | None = None,
         evaluate: Callable[[Any], dict[str, float]] | None = None,
         guard: Guard | None = None,
@@ -97,13 +102,19 @@ class Trainer(Generic[M]):
             background: colour behind the pictures; None for another random one behind each.
             exposure: what is learned of each photo's exposure; None for photos that were all exposed alike.
             depths: which depth maps are believed, as the objective's term has it; None where none are used.
+            cameras: what is learned of the cameras of photos, judged by those in `dataset.watched`; None for cameras
+                as they are given.
             update: takes the step from the gradients, in the place of `Adam.step`.
             evaluate: cheap metrics of the model; of several workers the first one measures them.
             guard: undoes edits of the strategy after which the training photos are explained worse.
             seed: of the order of views and every other random choice; or a generator to go on with.
+
+        Raises:
+            ValueError: cameras are to be refined, and no photos are kept aside to judge them.
         """
         self.model, self.strategy, self.progress = model, strategy or Fixed(), Progress()
         self.exposure, self.depths, self.guard = exposure or Exposure(NEVER), depths or DepthTrust([]), guard
+        self.cameras = cameras or CameraRefinement()
         self._objective, self._dataset, self._batch, self._evaluate = objective, dataset, batch, evaluate
         generator = seed if isinstance(seed, torch.Generator) else torch.Generator().manual_seed(seed)
         self._began = generator.get_state()
@@ -115,6 +126,7 @@ class Trainer(Generic[M]):
             self.strategy,
             schedule or Schedule(model.rates),
             self.exposure,
+            self.cameras,
             batch=batch,
             background=behind,
             update=update,
@@ -124,13 +136,17 @@ class Trainer(Generic[M]):
         some = next(iter(model.parameters().values()))
         self._device = some.device
         judges = middles_of(dataset.train, min(len(dataset.train), GUARD_VIEWS))
-        self._judging = Gauge(dataset, judges, GUARD_SIDE, self._device, behind)
-        self._watch: Watch | None = None
+        placed = self.cameras.placed
+        self._judging = Gauge(dataset, judges, GUARD_SIDE, self._device, behind, placed=placed)
+        kept = None
         if dataset.watched:
-            kept = Gauge(dataset, dataset.watched, WATCH_SIDE, self._device, behind)
-            self._watch = Watch(kept, objective, self._stepper.look)
+            kept = Gauge(dataset, dataset.watched, WATCH_SIDE, self._device, behind, placed=placed)
+        self._watch = None if kept is None else Watch(kept, objective, self._stepper.look)
+        self.trial = CameraTrial(self.cameras, kept, objective)
+        self._edited_after = -1
         self.strategy.start(model, self.adam, len(dataset.train), generator)
         self.exposure.start(dataset.train, batch, some)
+        self.cameras.start(dataset, batch, some)
         self.depths.start(some)
 
     def fit(
@@ -205,6 +221,7 @@ class Trainer(Generic[M]):
             self._stepper.measure_exposure()
         if iteration == self.depths.measured_at:
             self._stepper.measure_depths(self.depths)
+        self._edited_after = iteration
         return self._edit(iteration)
 
     def _edit(self, iteration: int) -> int:
@@ -221,8 +238,20 @@ class Trainer(Generic[M]):
             self.guard.release_if_same(self._state())
         return self.count - before
 
-    def review(self, progress: Progress) -> UndoEvent | None:
-        """Judges the last edit if it is time to; if it is undone, everything is as it was, and a milder one is made."""
+    def review(self, progress: Progress) -> Return | None:
+        """Judges the last edit, or refined cameras, if it is time to.
+
+        If an edit is undone, everything is as it was, and a milder one is made.
+        """
+        undone = self._review_edit(progress)
+        if undone is not None or not self.cameras.wanted or self._edited_after != progress.iteration:
+            return undone
+        event = self.trial.review(self.model, progress, self._state_of_run, self._go_back)
+        if event is not None and event.refined is None and self.guard is not None:
+            self.guard.held = None  # an edit before it stays: what is held of it knows nothing of refined cameras
+        return event
+
+    def _review_edit(self, progress: Progress) -> UndoEvent | None:
         if self.guard is None or progress.iteration < self.guard.due:
             return None
         loss = self._loss()
@@ -233,7 +262,7 @@ class Trainer(Generic[M]):
         self._load(held.state, held.iteration)
         progress.iteration, (progress.loss_sum, progress.loss_count) = held.iteration, held.losses
         self._edit(held.iteration)
-        return self.review(progress) or undone
+        return self._review_edit(progress) or undone
 
     def edited(self) -> None:
         """To be called when tensors of the model were replaced."""
@@ -265,10 +294,15 @@ class Trainer(Generic[M]):
 
     def first_not_finite(self) -> str | None:
         """The name of a parameter that holds NaN or infinity, or None."""
-        return first_not_finite({**self.model.parameters(), "exposure": self.exposure.values})
+        cameras = {f"cameras.{name}": learned for name, learned in self.cameras.adam.parameters.items()}
+        return first_not_finite({**self.model.parameters(), "exposure": self.exposure.values, **cameras})
 
     def state(self) -> dict[str, Tensor]:
         """Everything that the rest of the run depends on, by name, for a checkpoint."""
+        return {**self._state_of_run(), **{f"trial.{name}": tensor for name, tensor in self.trial.state().items()}}
+
+    def _state_of_run(self) -> dict[str, Tensor]:
+        """All but the trial's."""
         judgements = {} if self.guard is None else self.guard.state()
         return {**self._state(), **{f"guard.{name}": tensor for name, tensor in judgements.items()}}
 
@@ -283,15 +317,22 @@ class Trainer(Generic[M]):
             "watch": self._watch.state() if self._watch else {},
             "exposure": self.exposure.state(),
             "depths": self.depths.state(),
+            "cameras": self.cameras.state(),
         }
         state = {f"{part}.{name}": tensor for part, tensors in parts.items() for name, tensor in tensors.items()}
         return {**state, **kernel_tensors(self._kernel), "adam.step_count": torch.tensor(self.adam.step_count)}
 
     def load_state(self, state: dict[str, Tensor], iteration: int) -> None:
         """Continues where `state` was taken."""
+        self._go_back(state, iteration)
+        self.trial.load_state(_part(state, "trial"))
+
+    def _go_back(self, state: dict[str, Tensor], iteration: int) -> None:
+        """To where the state of the run was taken, whatever the trial holds."""
         self._load(state, iteration)
         if self.guard is not None:
             self.guard.load_state(_part(state, "guard"))
+        self._edited_after = -1
 
     def _load(self, state: dict[str, Tensor], iteration: int) -> None:
         adopt_kernel(Path("checkpoint"), self._kernel, state)  # refuses one of another kernel of this name
@@ -306,6 +347,7 @@ class Trainer(Generic[M]):
             self._watch.load_state(_part(state, "watch"))
         self.exposure.load_state(_part(state, "exposure"))
         self.depths.load_state(_part(state, "depths"))
+        self.cameras.load_state(_part(state, "cameras"))
         self._stepper.arrive(iteration)
         self.edited()
 

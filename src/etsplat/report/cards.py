@@ -45,6 +45,10 @@ _PSNR_AFFINE = (
     "PSNR after the colours of each picture were fitted to those of its photograph: what it would be if the exposure "
     "and white balance of test views were known. It has seen what it is measured on; PSNR is the score."
 )
+_PSNR_ALIGNED = (
+    "PSNR after the pose of each test photograph was fitted to the result: what it would be if test views had poses "
+    "as good as those that the run refined. It has seen what it is measured on; PSNR is the score."
+)
 _SSIM = "Structural similarity on the test views: 11 × 11 Gaussian window, σ 1.5, zero padding. 1 is identical."
 _FLIP = (
     "How visible the differences from the photographs of the test views are to who flips between both, at 67 pixels "
@@ -80,7 +84,25 @@ def cards_of(run: Run) -> list[Metric]:
     """The cards of a run, most telling first."""
     cards = describe_mesh(run.metrics) if run.task == "reconstruct" else describe_soup(run.metrics)
     watched = [_watched_card(run.metrics)] if run.metrics.get("watched_psnr") is not None else []
-    return [cards[0], *watched, *cards[1:]]
+    return [cards[0], *watched, *cards[1:], *_aligned_cards(run.metrics)]
+
+
+def _aligned_cards(metrics: dict[str, Any]) -> list[Metric]:
+    """Of runs that were to refine cameras: test photos from where they look best, and what became of cameras."""
+    if "cameras_refined" not in metrics:
+        return []
+    given, refined = (metrics.get(f"watched_psnr_{kind}_cameras") for kind in ("given", "refined"))
+    judged = "The run was too short to judge."
+    if given is not None and refined is not None:
+        judged = (
+            f"Photos kept from training, aligned to the model, had {refined:.2f} dB with refined cameras and "
+            f"{given:.2f} dB with those given."
+        )
+    what = "refined" if metrics["cameras_refined"] else "as given"
+    return [
+        number_card(metrics, "psnr_aligned", "PSNR, poses fitted", "dB", fixed(2), _PSNR_ALIGNED, "no test views"),
+        Metric("Cameras", what, "", judged),
+    ]
 
 
 def describe_mesh(metrics: dict[str, Any]) -> list[Metric]:

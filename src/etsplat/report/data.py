@@ -25,10 +25,10 @@ _COUNTS = {"reconstruct": "faces", "train": "triangles"}
 """What the result has so many of, by task."""
 
 _MEASURED = (
-    *("psnr", "psnr_affine", "ssim", "flip", "lpips", "lpips_3dgs"),
+    *("psnr", "psnr_affine", "psnr_aligned", "ssim", "flip", "lpips", "lpips_3dgs"),
     *("psnr_mesh", "psnr_opaque", "psnr_asset", "psnr_textured", "silhouette_iou"),
     *("chamfer", "chamfer_floor", "chamfer_exact", "f_score", "fps", "ms_per_million"),
-    *("watched_psnr", "watched_psnr_last"),
+    *("watched_psnr", "watched_psnr_last", "watched_psnr_given_cameras", "watched_psnr_refined_cameras"),
     *("sigma", "sigma_10", "sigma_90", "opacity", "opacity_10", "opacity_90"),
 )
 """Numbers that may be missing, or null, where they were not measured."""
@@ -42,6 +42,7 @@ _COUNTED = (
 _OPTIONAL: dict[str, Any] = {
     **dict.fromkeys(_MEASURED, float | None),
     **dict.fromkeys(_COUNTED, int | None),
+    "cameras_refined": bool,
     "lpips_reason": str | None,
     "judgement": dict,
     "judgement.verdict": str,

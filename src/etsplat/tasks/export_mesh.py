@@ -23,6 +23,7 @@ from etsplat.model.textured_mesh import TexturedMesh
 from etsplat.tasks.export_config import LIGHT_FACES, ExportConfig
 from etsplat.tasks.normal_map import normal_map_of
 from etsplat.tasks.reconstruct_config import Pictures, ReconstructConfig
+from etsplat.tasks.refined_cameras import refined_capture
 from etsplat.tasks.settings import settings_of
 from etsplat.tasks.sources import fingerprint, load_source, make_subject, read_record
 from etsplat.tasks.texturing import Tell, check_installed, coarser, colors_at, texture_object
@@ -57,6 +58,7 @@ class Reconstruction:
             InputError: there is no mesh, or a file is damaged.
         """
         mesh = load_mesh(_mesh_of(run))
+        views = refined_capture(views, run.path)
         mesh = replace(mesh, vertices=views.normalization.apply(mesh.vertices))
         known = _exposures(run, views)
         if known:

@@ -11,7 +11,7 @@ from typing import Any
 
 from etsplat.io.overview import draw_overview, find_test_views
 from etsplat.io.run_directory import RunDirectory
-from etsplat.optim.loop import Callback, DoneEvent, Event, NoteEvent, PrepareEvent, StageEvent, StepEvent, UndoEvent
+from etsplat.optim.loop import Callback, DoneEvent, Event, NoteEvent, PrepareEvent, Return, StageEvent, StepEvent
 
 _SHOWN = (
     ("psnr", "PSNR", "{:.2f} dB"),
@@ -32,7 +32,7 @@ class NotebookProgress:
 
     def __call__(self, event: Event) -> None:
         """Takes in an event of the run."""
-        if isinstance(event, NoteEvent | UndoEvent):
+        if isinstance(event, NoteEvent | Return):
             print(event)
         elif isinstance(event, PrepareEvent):
             self._show(f"preparing the pictures: {event.done}/{event.total}")

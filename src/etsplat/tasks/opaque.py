@@ -107,6 +107,7 @@ def _towards_opaque(capture: Dataset, config: TrainConfig) -> TrainConfig:
         {
             **{name: get(usual, name) for name in without},
             "finish": "opaque",
+            "refine_cameras": "off",  # the capture has refined ones by now
             "drawing.sh_degree": 0,
             "iterations": max(1, round(SOUP_SHARE * config.iterations)),
             "max_triangles": max(1, round(SOUP_TRIANGLES * triangle_limit(capture, config))),

@@ -16,6 +16,7 @@ from etsplat.geometry.parts import Shape, genera, shape_of
 from etsplat.io.mesh_files import MeshFile
 from etsplat.model.triangle_mesh import TriangleMesh
 from etsplat.ops.antialias_nvdiffrast import load_nvdiffrast
+from etsplat.optim.camera_refinement import CameraRefinement
 from etsplat.optim.depth_trust import DepthTrust
 from etsplat.optim.exposure import Exposure
 from etsplat.optim.guard import Guard
@@ -33,6 +34,7 @@ from etsplat.optim.strategies import SubdivideAndUntangle
 from etsplat.optim.terms.photometric import Photometric
 from etsplat.optim.trainer import Trainer
 from etsplat.optim.vertex_updates import UniformSteps
+from etsplat.tasks.camera_results import conclude_cameras
 from etsplat.tasks.depths import trusted_depths, wanted_depths
 from etsplat.tasks.export_mesh import Reconstruction
 from etsplat.tasks.judgement import (
@@ -134,6 +136,9 @@ def reconstruct(
         for note in found:
             job.announce(NoteEvent(f"{name}: {note}"))
     views, truth = make_subject(loaded, config, job.prepared, job.device)
+    for note in views.notes:
+        if note not in notes:
+            job.announce(NoteEvent(note))
     if config.drawing.backend == "nvdiffrast":
         load_nvdiffrast()  # now rather than at the first step
     if config.texture is not None:
@@ -160,14 +165,14 @@ def reconstruct(
             if views.georeference is not None:
                 job.first(partial(views.georeference.write, job.run.path))
             outcome, frame = job.fit(trainer), views.normalization
-            mesh = outcome.model
+            mesh, views = outcome.model, conclude_cameras(job, trainer, views, scorer)
             for suffix in (".ply", ".obj", ".glb"):
                 job.first(partial(mesh.save, job.run.mesh_path(suffix), frame))
             sizes = {"faces": len(mesh.faces), "vertices": len(mesh.vertices)}
             sizes["edits_undone"] = len(trainer.guard.undone) if trainer.guard else 0
             exposed = job.exposed(trainer.exposure, views.names)
             scores = job.first(lambda: scorer.full(mesh, job.run.test))
-            found = {**scores, **sizes, **outcome.metrics, **exposed}
+            found = {**scores, **sizes, **outcome.metrics, **trainer.trial.metrics, **exposed}
             found |= {} if trust is None else trust.metrics()
             judgement = job.first(partial(judging, mesh, found))
             found |= job.first(lambda: _texture(job, views, scorer, config))
@@ -288,6 +293,7 @@ def make_trainer(
         batch=config.batch,
         exposure=Exposure.of(config.exposure, length, len(views.train) / config.batch),
         depths=depths,
+        cameras=CameraRefinement.of(config.refine_cameras, length, len(views.train) / config.batch),
         update=None if config.optimizer.vertex_update == "adam" else UniformSteps(smoothing),
         evaluate=evaluate,
         guard=Guard(tolerance=refinement.guard, until=length) if refinement.guard else None,

@@ -216,6 +216,10 @@ class ReconstructConfig(Settings):
     """Whether photos were exposed unlike each other, or with other white balances:
     then a gain and a colour matrix of each are learned, which are not part of the result.
     auto: if an early measurement says that they were."""
+    refine_cameras: Annotated[Literal["off", "poses", "all"], Rare] = "off"
+    """Correct the cameras of training photos beside the model: their poses, or focal lengths and centres too (all).
+    Photos that are kept from training judge whether that does good; if not, cameras stay as given.
+    cameras.json has what was found. The steps in which that is judged are made twice."""
     batch: Annotated[int, Range(1, 1024), Rare] = 1
     """Views that each step sees; the paper's method sees one."""
     seed: Annotated[int, Range(0, 2**63 - 1), Rare] = 0

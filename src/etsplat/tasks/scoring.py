@@ -5,10 +5,11 @@
 
 import statistics
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from functools import cached_property
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import torch
@@ -17,22 +18,21 @@ from torch import Tensor
 
 from etsplat.core.cameras import Cameras
 from etsplat.core.errors import InputError
-from etsplat.core.rasterization import Rasterization
 from etsplat.data.dataset import Dataset
-from etsplat.data.loader import View, ViewLoader
-from etsplat.data.pictures import as_float
+from etsplat.data.loader import ViewLoader
 from etsplat.engines.choice import engine_for
 from etsplat.engines.threads import num_threads
 from etsplat.geometry.intersections import count_degenerate_faces, count_self_intersections
 from etsplat.io.atomic import write_error
-from etsplat.io.images import over_background, save_image, to_8_bit
+from etsplat.io.images import save_image, to_8_bit
 from etsplat.io.mesh_files import MeshFile
 from etsplat.metrics.flip import flip
 from etsplat.metrics.geometry import SAMPLES, chamfer, geometry_metrics, sample_pair
-from etsplat.metrics.image import WINDOW, Lpips, colors_fitted, find_lpips_weights, psnr, silhouette_iou, ssim
+from etsplat.metrics.image import WINDOW, Lpips, find_lpips_weights, psnr, silhouette_iou, ssim
 from etsplat.model.model import Model
 from etsplat.model.triangle_mesh import TriangleMesh
 from etsplat.tasks.running import device_name
+from etsplat.tasks.seen import Seen
 from etsplat.tasks.sources import SoupRun
 
 SMALLEST = 16
@@ -52,60 +52,18 @@ FoundLpips = tuple[Lpips | None, str | None]
 """The metric, or why it is not measured."""
 
 
-class Seen:
-    """One view of a model beside its photograph; colours over the background, in [0, 1]. Drawn when it is asked for.
-
-    Attributes:
-        photo: (H, W, 3) the photograph.
-        alpha: (H, W) of the photograph; None where it has none.
-    """
-
-    def __init__(self, model: Model, view: View, background: Float[Tensor, "3"], supersampling: int) -> None:
-        self._model, self._view, self._background, self._supersampling = model, view, background, supersampling
-        photo = as_float(view.photo[0])
-        self.alpha = photo[..., 3] if photo.shape[-1] == 4 else None
-        self.photo: Float[Tensor, "H W 3"] = photo if self.alpha is None else over_background(photo, background)
-
-    @cached_property
-    def splatted(self) -> Float[Tensor, "H W 3"]:
-        """(H, W, 3) the model as it is trained."""
-        return self._rendered.color[0].clamp(0.0, 1.0)
-
-    @property
-    def fitted(self) -> Float[Tensor, "H W 3"]:
-        """(H, W, 3) the same with its colours mapped to those of the photograph, as another exposure would."""
-        mask, coverage = self._view.mask, None if self.alpha is None else self._rendered.alpha[0, ..., 0]
-        counts = None if mask is None else as_float(mask[0])
-        behind = self._background
-        return colors_fitted(self.splatted, self.photo, counts=counts, coverage=coverage, background=behind)
-
-    @cached_property
-    @torch.no_grad()
-    def _rendered(self) -> Rasterization:
-        return self._model.render(self._view.camera, backgrounds=self._background[None])
-
-    @cached_property
-    def covered(self) -> Float[Tensor, "H W 4"]:
-        """(H, W, 4) as a mesh viewer draws it, premultiplied."""
-        return self._model.render_opaque(self._view.camera, supersampling=self._supersampling)[0]
-
-    @property
-    def opaque(self) -> Float[Tensor, "H W 3"]:
-        """(H, W, 3) the same over the background."""
-        return over_background(self.covered, self._background).clamp(0.0, 1.0)
-
-    def counting(self, picture: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:
-        """A picture with the photograph's pixels where the view's mask leaves them out."""
-        mask = self._view.mask
-        return picture if mask is None else self.photo + as_float(mask[0])[..., None] * (picture - self.photo)
-
-
 class Scorer:
     """Measures models on one data set. Measuring changes nothing and draws no random number of a run.
 
     Images are compared over the background, in float, renders clamped to [0, 1]; pixels that a mask excludes count as
     right.
+
+    Attributes:
+        starts: cameras of test views from which these are aligned to the model (`fitted_scores`); empty for views
+            whose poses are not in doubt.
     """
+
+    starts: Mapping[int, Cameras] = MappingProxyType({})
 
     def __init__(
         self,
@@ -129,12 +87,16 @@ class Scorer:
             supersampling: samples along each axis of a pixel of opaque pictures.
             lpips: from `load_lpips`; not measured by default.
         """
-        self._dataset, self._views = dataset, ViewLoader(dataset, device)
+        self._dataset, self._views, self._device = dataset, ViewLoader(dataset, device), device
         self._background = torch.tensor(background, device=device)
         self._truth, self._samples, self._supersampling = truth, samples, supersampling
         sides = [min(camera.width, camera.height) for camera in (dataset.cameras[index] for index in dataset.test)]
         too_small = min(sides, default=SMALLEST) < SMALLEST
         self._lpips, self.lpips_reason = (None, "the images are smaller than 16 pixels") if too_small else lpips
+
+    def see_by(self, dataset: Dataset, starts: Mapping[int, Cameras]) -> None:
+        """From now on training views have the cameras of this data set of the same photos; for `starts` see there."""
+        self._dataset, self._views, self.starts = dataset, ViewLoader(dataset, self._device), starts
 
     def cheap(self, model: Model) -> dict[str, float]:
         """For the history: "psnr" if there are test views, "chamfer" (an estimate) if there is a true mesh."""
@@ -167,6 +129,7 @@ class Scorer:
         names = (
             "psnr",
             "psnr_affine",
+            *(["psnr_aligned"] if self.starts else []),
             "ssim",
             "flip",
             *(f"{name}_{model.OPAQUE}" for name in BRIEF),
@@ -205,13 +168,13 @@ class Scorer:
 
     def see(self, model: Model, index: int) -> Seen:
         """A view of the data set, by its index, beside the model's."""
-        return Seen(model, self._views.view(index), self._background, self._supersampling)
+        return Seen(model, self._views.view(index), self._background, self._supersampling, self.starts.get(index))
 
     def _scores(self, seen: Seen, opaque: str) -> dict[str, float | None]:
         splatted, drawn = seen.counting(seen.splatted), seen.counting(seen.opaque)
         return {
             **image_scores(splatted, seen.photo, names=BRIEF),
-            **fitted_score(seen),
+            **fitted_scores(seen),
             **image_scores(drawn, seen.photo, names=BRIEF, suffix=f"_{opaque}"),
             **image_scores(splatted, seen.photo, self._lpips, ("lpips",)),
             "silhouette_iou": self._outline_iou(seen),
@@ -270,9 +233,15 @@ def image_scores(
     return {f"{name}{suffix}": measures[name]() if name in measures else None for name in names}
 
 
-def fitted_score(seen: Seen) -> dict[str, float | None]:
-    """What the PSNR of a view would be if its photograph's exposure and white balance were known, by its own name."""
-    return {"psnr_affine": psnr(seen.counting(seen.fitted), seen.photo)}
+def fitted_scores(seen: Seen) -> dict[str, float | None]:
+    """What the PSNR of a view would be if more were known of its photograph, by names of their own.
+
+    "psnr_affine" if its exposure and white balance were; and where it may be aligned, "psnr_aligned" if its pose were.
+    """
+    scores: dict[str, float | None] = {"psnr_affine": psnr(seen.counting(seen.fitted), seen.photo)}
+    if seen.start is not None:
+        scores["psnr_aligned"] = psnr(seen.counting(seen.aligned), seen.photo)
+    return scores
 
 
 def load_lpips(weights: Path | str | None, device: torch.device) -> FoundLpips:
@@ -308,6 +277,7 @@ def evaluate_run(
         Means over the test views by name: psnr and psnr_8bit (of renders rounded to 8 bits, as published numbers are),
         ssim (zero-padded), ssim_interior, flip, lpips (inputs scaled to [-1, 1]) and lpips_3dgs (not scaled), each
         also with `_opaque` for the opaque triangles; psnr_affine, after a fit of the colours to each photograph;
+        psnr_aligned, of runs that refined cameras, after a fit of the pose of each;
         `views`, the same for each; fps, ms_per_frame, ms_per_million and their circumstances. null where something
         could not be measured, `lpips_reason` says why.
 
@@ -326,12 +296,13 @@ def evaluate_run(
     lpips, reason = load_lpips(lpips_weights, place)
     background = soup.appearance.background
     scorer = Scorer(capture, place, background=background)
+    scorer.starts = run.test_cameras
     rows: list[dict[str, Any]] = []
     for index, view in enumerate(capture.test):
         seen = scorer.see(soup, view)
         photo, soft, opaque = seen.photo, seen.counting(seen.splatted), seen.counting(seen.opaque)
         name, scores = capture.names[view], image_scores(soft, photo, lpips)
-        scores |= fitted_score(seen) | image_scores(opaque, photo, lpips, suffix="_opaque")
+        scores |= fitted_scores(seen) | image_scores(opaque, photo, lpips, suffix="_opaque")
         rows.append({"name": name, **scores})
         if pictures is not None:
             error = (4 * (soft - photo).abs()).clamp(0, 1)

@@ -13,6 +13,7 @@ from etsplat.model.soup_appearance import SoupAppearance
 from etsplat.model.soup_init import StartPoints, random_points, start_soup
 from etsplat.model.surroundings import Surroundings
 from etsplat.model.triangle_soup import TriangleSoup
+from etsplat.optim.camera_refinement import CameraRefinement
 from etsplat.optim.densification import PruneRules
 from etsplat.optim.depth_trust import DepthTrust
 from etsplat.optim.exposure import Exposure
@@ -116,6 +117,7 @@ def make_trainer(
         background=None if config.background == "random" else background_of(config),
         exposure=Exposure.of(config.exposure, config.iterations, len(capture.train) / config.batch),
         depths=depths,
+        cameras=CameraRefinement.of(config.refine_cameras, config.iterations, len(capture.train) / config.batch),
         evaluate=evaluate,
         seed=generator or config.seed,
     )

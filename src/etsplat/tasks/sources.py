@@ -4,8 +4,8 @@ A `SoupRun` is what every command that comes after training starts from.
 """
 
 import hashlib
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property, reduce
 from operator import getitem
 from pathlib import Path
@@ -35,6 +35,7 @@ from etsplat.model.solid_soup import SolidSoup
 from etsplat.model.soup_import import open_soup
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.tasks.reconstruct_config import ReconstructConfig
+from etsplat.tasks.refined_cameras import alignment_starts, kept_aside, refined_capture
 from etsplat.tasks.settings import Settings, settings_of
 from etsplat.tasks.train_config import TrainConfig
 
@@ -197,10 +198,15 @@ def make_subject(
         side, samples = config.resolution, config.pictures.supersampling
         views = photograph(source, side, side, supersampling=samples, progress=progress, device=device)
         # There is the mesh itself to compare with, so photos are kept only where that is asked for.
-        return views if config.watch is None else views.watching(config.watch), normalize_mesh(source)[0]
+        kept = views if (config.watch, config.refine_cameras) == (None, "off") else _kept(views, config)
+        return kept, normalize_mesh(source)[0]
     if not source.train:
         raise InputError("views: none to train on; name some in `train`")
-    return source.watching(config.watch), None
+    return _kept(source, config), None
+
+
+def _kept(views: Dataset, config: ReconstructConfig) -> Dataset:
+    return kept_aside(views, config.watch, config.refine_cameras)
 
 
 def fingerprint(source: MeshFile | Dataset | None) -> str | None:
@@ -227,12 +233,14 @@ class SoupRun:
         soup: the triangles.
         capture: cameras and photos; images are decoded when they are asked for. None for a file without its scene.
         opaque: the opaque mesh that the run made beside the soup, on the CPU; None if it made none.
+        test_cameras: of a run that refined cameras, those of test views, by their index, from which they are aligned.
     """
 
     path: Path
     soup: TriangleSoup
     capture: Dataset | None
     opaque: MeshFile | None = None
+    test_cameras: Mapping[int, Cameras] = field(default_factory=dict)
 
     @property
     def device(self) -> torch.device:
@@ -349,5 +357,6 @@ def _open_directory(path: Path, scene: Path | str | None, device: torch.device) 
         return SoupRun(path, soup, None, opaque)
     if scene is None and source != DEMO_SCENE and not Path(source).is_dir():
         raise InputError(f"{path}: its scene {source} has gone; name where it is now with --scene")
-    capture = load_scene(source, width, paths.get("images"), paths.get("masks"), preload=False)
-    return SoupRun(path, soup, capture, opaque)
+    given = load_scene(source, width, paths.get("images"), paths.get("masks"), preload=False)
+    capture = refined_capture(given, path)
+    return SoupRun(path, soup, capture, opaque, {} if capture is given else alignment_starts(given, capture))

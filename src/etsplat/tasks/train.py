@@ -19,10 +19,12 @@ from etsplat.model.triangle_soup import FOCAL_NOTE, GEOREFERENCE_NOTE, TriangleS
 from etsplat.optim.exposure import Exposure
 from etsplat.optim.loop import Callback, CheckpointEvent, DivergedError, Event, NoteEvent
 from etsplat.optim.schedules import limited_iterations
+from etsplat.tasks.camera_results import conclude_cameras
 from etsplat.tasks.depths import trusted_depths, wanted_depths
 from etsplat.tasks.export_config import ExportConfig
 from etsplat.tasks.export_soup import export_soup
 from etsplat.tasks.opaque import fit_opaque_mesh
+from etsplat.tasks.refined_cameras import kept_aside
 from etsplat.tasks.running import Job, Result, path_of
 from etsplat.tasks.scoring import Scorer
 from etsplat.tasks.soup_trainer import background_of, start_trainer
@@ -100,9 +102,8 @@ def train(
     config = config or TrainConfig()
     job = Job(config, out, callbacks, resume=resume, overwrite=overwrite)
     maps = wanted_depths(depths, depth_unit, config.loss.depth)
-    own = load_scene(source, config.width, images, masks, job.prepared, depths=maps, depth_unit=depth_unit).watching(
-        config.watch
-    )
+    own = load_scene(source, config.width, images, masks, job.prepared, depths=maps, depth_unit=depth_unit)
+    own = kept_aside(own, config.watch, config.refine_cameras)
     if init_points is not None:
         own, note = with_cloud(own, init_points, triangle_limit(own, config), job.prepared)
         job.announce(NoteEvent(note))
@@ -141,6 +142,7 @@ def train(
                     raise DivergedError(f"{error}. But first: {doubt}") from error
                 raise
             soup = outcome.model.finished()
+            capture = conclude_cameras(job, trainer, capture, scorer)
             scores = job.first(lambda: scorer.full(soup, job.run.test))
             result = _in_own_units(soup, outcome.iteration, capture, config)
             job.first(lambda: result.save(job.run.soup_path))
@@ -155,6 +157,7 @@ def train(
                 "psnr_opaque_loss": None if scores["psnr"] is None else scores["psnr"] - scores["psnr_opaque"],
                 **outcome.model.describe(),
                 **outcome.metrics,
+                **trainer.trial.metrics,
                 **job.exposed(trainer.exposure, capture.names),
                 **({} if trust is None else trust.metrics()),
                 "width": capture.images.sizes[0][0],
