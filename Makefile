@@ -146,7 +146,8 @@ check-neon:
 # The newest versions that fit, for every Python and system, with the hashes of the registry's files. torch is left out: which
 # build of it is right (CPU, CUDA) depends on the machine, and with it the hash; constraints.txt has its version.
 LOCK := $(PY) -m uv pip compile --universal --python-version 3.10 --generate-hashes --no-annotate --no-header \
-	-c constraints.txt --extra cuda --extra depth --extra heic --extra sfm --extra texture --extra video --extra viewer --group pyproject.toml:dev pyproject.toml
+	-c constraints.txt --extra cuda --extra compress --extra depth --extra heic --extra sfm --extra slurm --extra texture --extra tune \
+	--extra video --extra viewer --group pyproject.toml:dev --group pyproject.toml:docs pyproject.toml
 lock: setup
 	$(PIP) uv
 	printf "torch ; python_version < '3'\netsplat ; python_version < '3'\n" > build/without.txt
