@@ -9,6 +9,7 @@ from etsplat import look_at, orbit_cameras
 from etsplat.core.cameras import camera_centers
 from etsplat.data.camera_coverage import focus_point, upright
 from etsplat.data.camera_paths import PATHS, path_note, played, usual_frames
+from etsplat.data.camera_tour import splined
 
 UP = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
 
@@ -176,6 +177,16 @@ def test_photos_that_stand_apart_are_left_out_and_that_is_told():
     assert "1 photo stands apart" in path_note("photos", standing_at([0, 10, 20, 30, 40, 170]), UP)
     assert path_note("photos", standing_at([0, 90, 180, 270]), UP) is None
     assert path_note("spiral", CAPTURES["two sides"], UP) is None
+
+
+def test_steps_that_are_lost_beside_a_long_one_take_no_time():
+    """Three cameras, the last two so near each other that the sum of steps does not show it."""
+    viewmats = torch.eye(4).repeat(3, 1, 1).double()
+    viewmats[1:, 0, 3] = -1.0
+    positions, rotations = splined(viewmats, torch.tensor([1e20, 1e-9], dtype=torch.float64), 5)
+    assert positions.isfinite().all()
+    assert positions[[0, -1], 0].tolist() == [0.0, 1.0]
+    assert torch.equal(rotations, torch.eye(3, dtype=torch.float64).expand(5, 3, 3))
 
 
 def test_a_path_along_photos_has_as_many_frames_as_keep_it_calm():

@@ -158,7 +158,8 @@ def splined(
     time = torch.cat([torch.zeros(1, dtype=torch.float64), steps.cumsum(dim=0)])
     at = torch.linspace(0, 1, frames, dtype=torch.float64) * time[-1]
     segment = (torch.searchsorted(time, at, right=True) - 1).clamp(0, count - 2)
-    t = ((at - time[segment]) / (time[segment + 1] - time[segment]))[:, None]
+    # Beside a long step a short one is lost, and takes no time.
+    t = ((at - time[segment]) / (time[segment + 1] - time[segment]).clamp_min(1e-300))[:, None]
     p0, p1, p2, p3 = (centers[(segment + k).clamp(0, count - 1)] for k in (-1, 0, 1, 2))
     curve = p1 + 0.5 * t * (p2 - p0 + t * (2 * p0 - 5 * p1 + 4 * p2 - p3 + t * (3 * (p1 - p2) + p3 - p0)))
     return curve, _turn(rotations[segment], rotations[segment + 1], t[:, 0])
