@@ -17,7 +17,11 @@ TOPICS: Mapping[str, tuple[str, str, tuple[str, ...]]] = {
     "cameras": ("Cameras and paths", "Where pictures are taken from.", ("core.cameras", "data.camera_paths")),
     "data": ("Posed photos", "Captures, photographs of a mesh, and what is built in code.", ("data",)),
     "models": ("Models", "Triangles that learn, and how they are drawn.", ("model",)),
-    "training": ("Training", "The trainer, its strategies, schedules and events.", ("optim", "ops.adam")),
+    "training": (
+        "Training",
+        "The trainer, its strategies, schedules and events.",
+        ("optim", "ops.adam", "core.workers"),
+    ),
     "losses": (
         "Losses and terms",
         "What is minimised.",

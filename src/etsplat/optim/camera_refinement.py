@@ -197,7 +197,7 @@ class CameraRefinement:
 
     @property
     def poses(self) -> Float[Tensor, "P 6"]:
-        """What is learned of each camera's pose: |v| is how far its picture moves, in parts of the longer side."""
+        """What is learned of each camera's pose; as long as its picture moves, in parts of its longer side."""
         return self.adam.parameters["poses"]
 
     @torch.no_grad()
