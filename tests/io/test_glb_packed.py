@@ -14,6 +14,7 @@ from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.tangents import corner_tangents
 from etsplat.io.georeference import Georeference
 from etsplat.io.mesh_files import load_mesh, save_mesh, save_triangles
+from etsplat.io.meshopt import checked_size
 from etsplat.io.srgb import srgb_from_linear
 from etsplat.io.textures import NormalMap, Texture
 from helpers.gltf import check_glb, needs_meshopt, read_glb, values_of
@@ -141,7 +142,7 @@ def test_without_the_package_it_says_what_to_install(tmp_path: Path, monkeypatch
     data = (tmp_path / "a.glb").read_bytes()
     view = b'{"buffer":0,"byteOffset":0,'
     assert view in data
-    said = b'{"EXT_meshopt_compression":{"byteStride":8,"count":1,"byteLength":8}}'
+    said = b'{"EXT_meshopt_compression":{"mode":"ATTRIBUTES","byteStride":8,"count":1,"byteLength":8}}'
     packed = b'{"extensions":' + said + b',"buffer":0,"byteOffset":0,'
     longer = data.replace(view, packed, 1)
     length = int.from_bytes(data[12:16], "little") + len(packed) - len(view)
@@ -149,6 +150,30 @@ def test_without_the_package_it_says_what_to_install(tmp_path: Path, monkeypatch
     (tmp_path / "a.glb").write_bytes(longer[:8] + len(longer).to_bytes(4, "little") + longer[12:])
     with pytest.raises(InputError, match=r"a\.glb: compressed glTF needs meshoptimizer: pip install"):
         load_mesh(tmp_path / "a.glb")
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        {"mode": "TRIANGLES", "byteStride": 4, "count": 4},
+        {"mode": "TRIANGLES", "byteStride": 8, "count": 3},
+        {"mode": "INDICES", "byteStride": 1, "count": 3},
+        {"mode": "ATTRIBUTES", "byteStride": 6, "count": 3},
+        {"mode": "ATTRIBUTES", "byteStride": 260, "count": 3},
+        {"mode": "ATTRIBUTES", "byteStride": True, "count": 3},
+        {"mode": "ATTRIBUTES", "byteStride": 4, "count": 3, "filter": "QUATERNION"},
+        {"mode": "ATTRIBUTES", "byteStride": 12, "count": 3, "filter": "OCTAHEDRAL"},
+        {"mode": "ATTRIBUTES", "byteStride": 4, "count": 3, "filter": "OTHER"},
+        {"mode": "OTHER", "byteStride": 4, "count": 3},
+        {"mode": "ATTRIBUTES", "byteStride": 4, "count": 10**9},
+    ],
+)
+def test_what_the_package_would_write_beyond_its_memory_is_refused(said):
+    assert (
+        checked_size({"mode": "ATTRIBUTES", "byteStride": 8, "count": 3, "byteLength": 9, "filter": "QUATERNION"}) == 24
+    )
+    with pytest.raises(ValueError, match="EXT_meshopt_compression: "):
+        checked_size({**said, "byteLength": 9})
 
 
 def test_other_kinds_of_files_hold_none_of_it(tmp_path: Path) -> None:

@@ -8,8 +8,12 @@ from etsplat.core.errors import InputError
 
 EXTENSION = "EXT_meshopt_compression"
 
-_TRIANGLES, _ATTRIBUTES = "TRIANGLES", "ATTRIBUTES"
+_TRIANGLES, _ATTRIBUTES, _INDICES = "TRIANGLES", "ATTRIBUTES", "INDICES"
 _FILTERS = {"OCTAHEDRAL": "decode_filter_oct", "QUATERNION": "decode_filter_quat", "EXPONENTIAL": "decode_filter_exp"}
+_INDEX_BYTES, _ROW_BYTES = (2, 4), range(4, 257, 4)
+_STRIDES = {"NONE": _ROW_BYTES, "OCTAHEDRAL": (4, 8), "QUATERNION": (8,), "EXPONENTIAL": _ROW_BYTES}
+"""Of rows, by their filter; the package writes beyond its memory where others are asked for."""
+
 _DENSEST, _TAIL = 64, 4096
 """A byte of what is stored holds at most so many, and what is at an end no more than these."""
 
@@ -71,7 +75,12 @@ def checked_size(said: dict[str, Any]) -> int:
         ValueError: no such view, or one that claims to hold more than it can.
     """
     stride, count, stored = said["byteStride"], said["count"], said["byteLength"]
-    if not all(isinstance(value, int) and value > 0 for value in (stride, count, stored)):
+    mode, kind = said["mode"], said.get("filter", "NONE")
+    if mode not in (_TRIANGLES, _ATTRIBUTES, _INDICES) or kind not in _STRIDES:
+        raise ValueError(f"{EXTENSION}: mode {mode!r}, filter {kind!r}")
+    strides = _STRIDES[kind] if mode == _ATTRIBUTES else _INDEX_BYTES
+    whole = all(type(value) is int and value > 0 for value in (stride, count, stored))
+    if not whole or stride not in strides or (mode == _TRIANGLES and count % 3):
         raise ValueError(f"{EXTENSION}: {count!r} rows of {stride!r} bytes in {stored!r}")
     if count * stride > _DENSEST * stored + _TAIL:
         raise ValueError(f"{EXTENSION}: {count * stride} bytes in {stored}")
@@ -93,8 +102,6 @@ def decoded(data: bytes, said: dict[str, Any]) -> bytes:
         if (kind := said.get("filter", "NONE")) != "NONE":
             found = getattr(package, _FILTERS[kind])(found, count, stride)
         return found.tobytes()
-    if stride not in (2, 4):
-        raise ValueError(f"{EXTENSION}: indices of {stride} bytes")
     decode = package.decode_index_buffer if said["mode"] == _TRIANGLES else package.decode_index_sequence
     found = decode(count, 4, data).astype(f"<u{stride}").tobytes()
     assert len(found) == size
