@@ -76,9 +76,6 @@ def perform(work: Work) -> str:
 
 
 def _perform(work: Work, tell: Callable[[str], None]) -> None:
-    import torch
-
-    from etsplat.engines.threads import set_num_threads
     from etsplat.optim.loop import CheckpointEvent, Event, NoteEvent, UndoEvent
 
     store = None
@@ -91,8 +88,6 @@ def _perform(work: Work, tell: Callable[[str], None]) -> None:
         store.fetch()
     resume = is_run(work.folder)
     tell(f"{'goes on' if resume else 'begins'} with {work.threads} thread{'s' * (work.threads != 1)}")
-    set_num_threads(work.threads)
-    torch.set_num_threads(work.threads)  # of which some sums depend, so that it must not be the machine's number
 
     def note(event: Event) -> None:
         if isinstance(event, NoteEvent | UndoEvent | CheckpointEvent):
@@ -101,11 +96,29 @@ def _perform(work: Work, tell: Callable[[str], None]) -> None:
             store.keep()
 
     try:
-        work.run(work.source, work.folder, work.config, resume=resume, callbacks=[note], **work.options)
+        with _on_threads(work.threads):
+            work.run(work.source, work.folder, work.config, resume=resume, callbacks=[note], **work.options)
     finally:
         if store is not None and is_run(work.folder):
             store.keep()
     tell("done")
+
+
+@contextlib.contextmanager
+def _on_threads(count: int) -> Iterator[None]:
+    """Within the block the engine and torch use so many; some of torch's sums depend on their number."""
+    import torch
+
+    from etsplat.engines.threads import num_threads, set_num_threads
+
+    before = num_threads(), torch.get_num_threads()
+    set_num_threads(count)
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        set_num_threads(before[0])
+        torch.set_num_threads(before[1])
 
 
 def wait_for_writer(folder: Path, patience: float = PATIENCE) -> None:
