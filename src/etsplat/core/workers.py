@@ -11,6 +11,7 @@ import pickle
 import platform
 import re
 import socket
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from datetime import timedelta
 from importlib.metadata import version
@@ -32,6 +33,9 @@ was killed is found at once, by its closed connections."""
 
 MEETING = timedelta(minutes=10)
 """So long those that have come wait for the others at the start."""
+
+_DROPPED = 0.2
+"""Seconds in which gloo's threads let go of the last message."""
 
 _LAUNCHED = ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")
 _REPORTED = "etsplat/reported"
@@ -222,6 +226,9 @@ def together(init_method: str = "env://", *, rank: int | None = None, count: int
         _current = ALONE
         _native.set_num_threads(count=threads)
         if joined:
+            # Torch 2.6 waits here for threads that want the interpreter's lock, which it holds, to drop what was sent
+            # last: they have it first.
+            time.sleep(_DROPPED)
             with contextlib.suppress(RuntimeError):
                 dist.destroy_process_group()
 
