@@ -9,11 +9,11 @@ COPY . .
 RUN python -m pip wheel --no-deps --wheel-dir /wheels .
 
 FROM python:3.12-slim-bookworm
-# torch without CUDA, from PyTorch's own index.
-ARG TORCH_INDEX=https://download.pytorch.org/whl/cpu
+# --build-arg TORCH_INDEX=URL: PyTorch's own index of CPU builds, without which torch brings several GB of CUDA.
+ARG TORCH_INDEX
 COPY --from=build /wheels /wheels
 COPY constraints.txt /wheels/
-RUN python -m pip install --no-cache-dir --no-compile --index-url "$TORCH_INDEX" --constraint /wheels/constraints.txt torch \
+RUN python -m pip install --no-cache-dir --no-compile ${TORCH_INDEX:+--index-url "$TORCH_INDEX"} --constraint /wheels/constraints.txt torch \
     && python -m pip install --no-cache-dir --no-compile "$(echo /wheels/*.whl)[sfm,texture,video,viewer]" \
     && rm -rf /wheels \
     && useradd --create-home --uid 1000 etsplat
