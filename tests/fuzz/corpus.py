@@ -298,8 +298,9 @@ def opaque_meshes() -> list[bytes]:
 
 
 def camera_paths() -> list[bytes]:
-    poses = torch.eye(4, dtype=torch.float64).repeat(3, 1, 1)
-    fovs = torch.tensor([40.0, 50.0, 60.0], dtype=torch.float64)
+    """Poses of many digits, as the viewer saves them."""
+    poses = etsplat.orbit_cameras(8, 8, elevations=(20.0,), azimuths=12).viewmats.double()
+    fovs = torch.linspace(40.3, 60.7, 12, dtype=torch.float64)
     return [KeyPoses(poses, fovs, aspect).to_json().encode() for aspect in (None, 1.5)]
 
 

@@ -323,7 +323,7 @@ READERS = [
     Reader("soup .pt", _single(".pt", corpus.states), (".pt",), _file(_soup)),
     Reader("opaque mesh", _single(".safetensors", corpus.opaque_meshes), (".safetensors",), _file(_opaque)),
     # Nearly every number in it is of a rotation, which must stay one.
-    Reader("camera path", _single(".json", corpus.camera_paths), (".json",), _file(_camera_path), 0.04),
+    Reader("camera path", _single(".json", corpus.camera_paths), (".json",), _file(_camera_path)),
     Reader("cameras.json", _prefixed(corpus.refined_cameras), (".json",), _refined_cameras),
     Reader(
         "kernel.safetensors",
