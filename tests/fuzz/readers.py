@@ -322,7 +322,6 @@ READERS = [
     Reader("soup .etz", _single(".etz", corpus.compact_soups), (".etz",), _file(_soup)),
     Reader("soup .pt", _single(".pt", corpus.states), (".pt",), _file(_soup)),
     Reader("opaque mesh", _single(".safetensors", corpus.opaque_meshes), (".safetensors",), _file(_opaque)),
-    # Nearly every number in it is of a rotation, which must stay one.
     Reader("camera path", _single(".json", corpus.camera_paths), (".json",), _file(_camera_path)),
     Reader("cameras.json", _prefixed(corpus.refined_cameras), (".json",), _refined_cameras),
     Reader(
