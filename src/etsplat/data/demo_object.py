@@ -90,8 +90,9 @@ def _feet(p: np.ndarray) -> np.ndarray:
 def _plinth(p: np.ndarray) -> np.ndarray:
     # A corner points forward: the sides then take the light differently from the top.
     sector = np.pi / 4
-    angle = np.arctan2(p[:, 0], p[:, 2]) % sector - sector / 2
-    octagon = np.hypot(p[:, 0], p[:, 2]) * np.cos(angle)
+    x, z = np.ascontiguousarray(p.T[[0, 2]])  # of columns numpy 1.26 gives one of two results
+    angle = np.arctan2(x, z) % sector - sector / 2
+    octagon = np.hypot(x, z) * np.cos(angle)
     upper = np.maximum(octagon - 0.63, np.abs(p[:, 1] + 0.89) - 0.08)
     lower = np.maximum(octagon - 0.78, np.abs(p[:, 1] + 1.03) - 0.1)
     return np.maximum(np.minimum(upper, lower), -_sphere(p, (0, -1.62, 0), 0.66))

@@ -147,7 +147,7 @@ def _spiral(p: np.ndarray) -> np.ndarray:
 
 def _sky(p: np.ndarray) -> np.ndarray:
     height = p[:, 1] / _SKY_RADIUS
-    angle = np.arctan2(p[:, 2], p[:, 0])
+    angle = np.arctan2(*np.ascontiguousarray(p.T[[2, 0]]))  # of columns numpy 1.26 gives one of two results
     hills = 0.06 + 0.05 * np.sin(3 * angle) + 0.03 * np.sin(7 * angle + 1)
     up = np.clip((height - hills) / 0.8, 0, 1)[:, None]
     sky = (1 - up) * [0.8, 0.88, 0.95] + up * [0.25, 0.45, 0.8]
