@@ -2,7 +2,9 @@
 
 import json
 import re
+import shutil
 import struct
+import sys
 
 import numpy as np
 import pytest
@@ -14,6 +16,7 @@ from equal_bits.cases import CASES, CONTROLS
 from equal_bits.compare import array_difference, compare_runs, matched
 from equal_bits.names import Names, translated
 from equal_bits.session import flip_bit
+from equal_bits.trees import names_of
 from etsplat.cli.parse import parse
 
 TENSORS = {"vertices": np.linspace(-1, 1, 27, dtype=np.float32).reshape(3, 3, 3), "progress": np.array([1.5, 3.0])}
@@ -153,6 +156,21 @@ def test_every_line_of_the_table_names_an_option_that_exists(task, capsys, monke
     known = set(re.findall(r"--[a-z][a-z.-]*", capsys.readouterr().out))
     here = {word for new in names.OPTIONS[task].values() for word in new.split() if word.startswith("--")}
     assert here - known == set()
+
+
+def test_a_later_base_has_names_of_its_own(tmp_path, monkeypatch):
+    """By which the cases are translated for it; an earlier one has none."""
+    assert names_of(tmp_path) is None
+    folder = tmp_path / "tree" / "tests" / "equal_bits"
+    folder.mkdir(parents=True)
+    shutil.copy(names.__file__, folder)
+    with (folder / "names.py").open("a") as file:
+        file.write('OPTIONS["train"]["--growth"] = "--densification.faster"\n')
+    monkeypatch.setitem(sys.modules, "names_of_base", None)
+    found = names_of(tmp_path)
+    assert found is not None
+    assert found.translated("train", ["--growth", "2"]) == ["--densification.faster", "2"]
+    assert translated("train", ["--growth", "2"]) == ["--densification.growth", "2"]
 
 
 def test_names_of_cases_are_unique_and_those_in_other_tables_exist():

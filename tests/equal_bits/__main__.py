@@ -16,7 +16,7 @@ from rich.table import Table
 from .cases import CASES, CONTROLS
 from .inputs import write_inputs
 from .session import COLUMNS, Outcome, Session
-from .trees import ROOT, base_tree, digest, locked, machine, resolve_commit, this_tree
+from .trees import ROOT, base_tree, digest, locked, machine, names_of, resolve_commit, this_tree
 
 FOLDER = ROOT / "build" / "equal_bits"
 SHOWN = 4
@@ -60,7 +60,8 @@ def open_session(base: str, *, fresh: bool) -> Session:
     with locked(FOLDER):
         write_inputs(inputs)
     drafts = Path(tempfile.mkdtemp(prefix="here-", dir=FOLDER))
-    return Session(tree, this_tree(drafts / "site"), inputs, of_base / "runs", drafts, instruction_set, about, fresh)
+    here, names = this_tree(drafts / "site"), names_of(of_base)
+    return Session(tree, here, inputs, of_base / "runs", drafts, instruction_set, about, fresh, names)
 
 
 def report(outcomes: list[Outcome], base: str, seconds: float) -> None:

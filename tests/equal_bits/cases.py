@@ -1,4 +1,4 @@
-"""What is run: every method of every preset, small. Options have the names that BASE has; `names` translates them."""
+"""What is run: every method of every preset, small. Options have the names of e629b5e; `names` translates them."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -11,7 +11,7 @@ class Case:
     Attributes:
         name: of the case, and of its folder.
         command: what follows `etsplat`; paths are relative to the folder of the inputs (`inputs.py`).
-        options: with the names that BASE has.
+        options: with the names of e629b5e.
         stop: how the run that is resumed ended (`runner.Job`).
     """
 

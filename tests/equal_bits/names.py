@@ -1,6 +1,7 @@
 """What is called otherwise in this tree than in BASE, and where bits change on purpose. The only place that says so.
 
-Cases are written with BASE's names. Whoever renames an option, a tensor of a checkpoint or a number adds a line here.
+Cases are written with the names of e629b5e, and BASE is that one, or a later one that has this file too: what it says
+is the same in both is the same. Whoever renames an option, a tensor of a checkpoint or a number adds a line here.
 """
 
 import re

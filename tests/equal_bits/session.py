@@ -6,6 +6,7 @@ import struct
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import ModuleType
 from typing import Literal
 
 import numpy as np
@@ -60,6 +61,7 @@ class Session:
         instruction_set: the engine's.
         machine: hash of all else that bits depend on.
         fresh: whether BASE's results are made anew.
+        names: BASE's own `names`, if it has any: the cases have the names of a commit before it.
     """
 
     base: Tree
@@ -70,6 +72,7 @@ class Session:
     instruction_set: str
     machine: str
     fresh: bool = False
+    names: ModuleType | None = None
 
     def check(self, case: Case) -> Outcome:
         """Compares a run of this tree with BASE's, and a stopped and resumed run of this tree with that."""
@@ -82,7 +85,7 @@ class Session:
         cells = {column: f"{len(found[column])} differ" if found[column] else "equal" for column in COLUMNS}
         notes = [f"{column}: {text}" for column in COLUMNS for text in found[column]]
         why = CHANGED.get(case.name)
-        if why is None:
+        if why is None or (self.names is not None and self.names.CHANGED.get(case.name) == why):
             return Outcome(case.name, cells, not notes, notes)
         changed = any(found[column] for column in COLUMNS[:3])
         intended = f"changes on purpose: {why}" if changed else f"is equal, though names.CHANGED says: {why}"
@@ -103,7 +106,8 @@ class Session:
 
     def _base(self, case: Case) -> Path:
         """BASE's run, made or found."""
-        words = [*case.command.split(), *case.options.split()]
+        options = case.options.split()
+        words = [*case.command.split(), *(options if self.names is None else self.names.translated(case.task, options))]
         folder = self.kept / case.name
         kept = folder / digest([words, self.machine, self.inputs.name])
         with locked(folder):

@@ -1,6 +1,7 @@
 """The two trees: a copy of this one, and BASE in a git work tree with a native build of its own."""
 
 import hashlib
+import importlib.util
 import json
 import os
 import platform
@@ -13,6 +14,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
+from types import ModuleType
 
 from .runner import Job
 
@@ -85,6 +87,19 @@ def base_tree(commit: str, folder: Path) -> Tree:
         if not (folder / "site").is_dir():
             _build(commit, folder)
     return _tree(folder / "site")
+
+
+def names_of(folder: Path) -> ModuleType | None:
+    """The `names` of the tree that `base_tree` built in a folder; None of one from before there were any."""
+    path = folder / "tree" / "tests" / "equal_bits" / "names.py"
+    if not path.is_file():
+        return None
+    spec = importlib.util.spec_from_file_location("names_of_base", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)  # dataclasses look for it there
+    spec.loader.exec_module(module)
+    return module
 
 
 def resolve_commit(name: str) -> str:
