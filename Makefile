@@ -14,6 +14,7 @@ PIP := $(PY) -m pip --disable-pip-version-check install --quiet
 TOOLS := $(VENV)/.stamp-tools
 INSTALLED := $(VENV)/.stamp-installed
 DOCS := $(VENV)/.stamp-docs
+LINTERS := $(VENV)/.stamp-linters
 SANITIZED := build/sanitize/.stamp
 # Folders are listed too: their time changes when a file is added or removed.
 NATIVE := CMakeLists.txt $(shell find csrc)
@@ -25,7 +26,7 @@ help:
 	@echo "make setup        create .venv and build the package into it"
 	@echo "make demo         reconstruct a built-in object into runs/demo"
 	@echo "make test         run the tests"
-	@echo "make lint         ruff, pyright, import-linter"
+	@echo "make lint         ruff, pyright, import-linter; zizmor and hadolint for workflows and containers"
 	@echo "make docs         the documentation as a site, build/docs/index.html; warnings are errors"
 	@echo "make stubs        describe the native calls to Python (src/etsplat/_native.pyi)"
 	@echo "make bench        measure the CPU engine"
@@ -67,7 +68,14 @@ demo: setup
 test: setup
 	$(PY) -m pytest -n auto $(PYTEST_ARGS)
 
-lint: setup
+# Of workflows and containers; they come from the group `lint`, at their newest.
+$(LINTERS): $(INSTALLED)
+	$(PIP) --group lint
+	@touch $@
+
+lint: $(LINTERS)
+	$(VENV)/bin/zizmor --offline --quiet .github/workflows
+	$(VENV)/bin/hadolint Dockerfile .devcontainer/Dockerfile
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/pyright
