@@ -20,13 +20,13 @@ SANITIZED := build/sanitize/.stamp
 NATIVE := CMakeLists.txt $(shell find csrc)
 
 .PHONY: help setup demo test lint docs format stubs bench equal-bits fuzz fuzz-short sanitize races soak lock audit \
-	check-neon wheel check-wheel clean
+	check-neon wheel check-wheel wheels clean
 
 help:
 	@echo "make setup        create .venv and build the package into it"
 	@echo "make demo         reconstruct a built-in object into runs/demo"
 	@echo "make test         run the tests"
-	@echo "make lint         ruff, pyright, import-linter; zizmor and hadolint for workflows and containers"
+	@echo "make lint         ruff, pyright, import-linter; zizmor, hadolint, the conda recipe"
 	@echo "make docs         the documentation as a site, build/docs/index.html; warnings are errors"
 	@echo "make stubs        describe the native calls to Python (src/etsplat/_native.pyi)"
 	@echo "make bench        measure the CPU engine"
@@ -38,6 +38,7 @@ help:
 	@echo "make lock         requirements.lock: the newest versions that fit, with hashes; make audit: known holes in them"
 	@echo "make check-neon   run the rasterizer's NEON path under QEMU (AArch64 cross compiler)"
 	@echo "make check-wheel  build the wheel, install it into an empty environment, run a tiny demo"
+	@echo "make wheels       wheels of every platform by Zig's compilers, under dist/wheels (Python 3.12 or newer); WHEELS='macos-arm64' for one"
 	@echo "make clean        remove .venv, build, dist and caches"
 
 # The pinned torch goes first and alone, so that no later call has a reason to bring another build of it.
@@ -68,7 +69,7 @@ demo: setup
 test: setup
 	$(PY) -m pytest -n auto $(PYTEST_ARGS)
 
-# Of workflows and containers; they come from the group `lint`, at their newest.
+# Of workflows, containers and the conda recipe; they come from the group `lint`, at their newest.
 $(LINTERS): $(INSTALLED)
 	$(PIP) --group lint
 	@touch $@
@@ -76,6 +77,7 @@ $(LINTERS): $(INSTALLED)
 lint: $(LINTERS)
 	$(VENV)/bin/zizmor --offline --quiet .github/workflows
 	$(VENV)/bin/hadolint Dockerfile .devcontainer/Dockerfile
+	$(PY) release/recipe.py
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/pyright
@@ -184,6 +186,17 @@ check-wheel: wheel
 	cd build/wheel-check && venv/bin/etsplat demo --out demo --preset tiny
 	test -s build/wheel-check/demo/report.html
 	rm -rf build/wheel-check
+
+# They hold nanobind, so they need no other compiler's exceptions to be theirs; in an environment of its own, without torch.
+WHEELS ?=
+CROSS := build/wheels/venv
+wheels:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 12))' || \
+		{ echo "make wheels needs Python 3.12 or newer; choose one with: make wheels PYTHON=python3.12" >&2; exit 1; }
+	test -x $(CROSS)/bin/python || $(PYTHON) -m venv $(CROSS)
+	$(CROSS)/bin/python -m pip --disable-pip-version-check install --quiet 'pip>=25.1'
+	$(CROSS)/bin/python -m pip --disable-pip-version-check install --quiet --group wheels
+	PATH="$(CURDIR)/$(CROSS)/bin:$$PATH" $(CROSS)/bin/python release/wheels.py $(WHEELS)
 
 clean:
 	rm -rf $(VENV) build dist docs/generated .pytest_cache .ruff_cache .hypothesis
