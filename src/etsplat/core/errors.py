@@ -6,6 +6,11 @@ class InputError(ValueError):
 
     The message is one line that names the file or argument, says what is wrong and what to do. The command line prints
     it without a traceback. Wrong shapes, dtypes and devices of tensors are plain ``ValueError``.
+
+    Example:
+        >>> etsplat.load_mesh("nowhere.obj")
+        Traceback (most recent call last):
+        etsplat.core.errors.InputError: mesh nowhere.obj: no such file; check the path
     """
 
     def __init__(self, message: str) -> None:

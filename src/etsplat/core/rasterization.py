@@ -26,6 +26,11 @@ class Cutoffs(NamedTuple):
         x_max: A pixel skips a triangle whose distance x exceeds this.
         transmittance_min: A pixel stops for good, without drawing, at the first triangle that would bring the
             transmittance below this. Not 1e-4, because two layers clamped at 0.99 land exactly there.
+
+    Example:
+        >>> sharp = etsplat.Cutoffs(alpha_min=0.05)
+        >>> sharp.alpha_max
+        0.99
     """
 
     alpha_min: float = 1 / 255
@@ -126,6 +131,13 @@ class Rasterization:
         statistics: Per-triangle statistics.
         triangle: int32 index of the nearest triangle, -1 where there is none.
         barycentrics: Perspective-correct weights of its vertices, summing to 1; 0 where there is none.
+
+    Example:
+        >>> owl, _ = etsplat.normalize_mesh(etsplat.demo_object())
+        >>> camera = etsplat.orbit_cameras(16, 16)[0]
+        >>> seen = etsplat.render_opaque(owl.vertices, faces=owl.faces, vertex_colors=0 * owl.vertices, cameras=camera)
+        >>> seen.alpha.shape, seen.depth is None
+        (torch.Size([1, 16, 16, 1]), True)
     """
 
     color: Float[Tensor, "B H W C"]

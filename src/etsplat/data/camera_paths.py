@@ -56,6 +56,11 @@ def ellipse(viewmats: Viewmats, up: Float[Tensor, "3"], frames: int) -> Viewmats
     """An orbit that rises on one side and sinks on the other, as far as half of the cameras do there.
 
     Where they do not go all around, to the other end of what they cover above their mean height, and back below it.
+
+    Example:
+        >>> cameras = etsplat.orbit_cameras(64, 64, elevations=(20.0,), azimuths=8)
+        >>> etsplat.ellipse(cameras.viewmats, torch.tensor([0.0, 1.0, 0.0]), frames=30).shape
+        torch.Size([30, 4, 4])
     """
     _check(viewmats, up, frames)
     covered = coverage(viewmats, up)
@@ -69,6 +74,11 @@ def spiral(viewmats: Viewmats, up: Float[Tensor, "3"], frames: int) -> Viewmats:
     """Two turns around the middle camera, within half of the cameras' spread; for scenes that are seen from one side.
 
     `up` is not used: it is the middle camera's own.
+
+    Example:
+        >>> cameras = etsplat.orbit_cameras(64, 64, elevations=(20.0,), azimuths=8)
+        >>> etsplat.spiral(cameras.viewmats, torch.tensor([0.0, 1.0, 0.0]), frames=30).shape
+        torch.Size([30, 4, 4])
     """
     _check(viewmats, up, frames)
     focus, centers = focus_point(viewmats), camera_centers(viewmats.double())
@@ -104,6 +114,11 @@ def interpolated(viewmats: Viewmats, up: Float[Tensor, "3"], frames: int) -> Vie
     """From camera to camera in order, at even speed: positions on Catmull-Rom splines, orientations turned evenly.
 
     `up` is not used: orientations are the cameras' own.
+
+    Example:
+        >>> cameras = etsplat.orbit_cameras(64, 64, elevations=(20.0,), azimuths=8)
+        >>> etsplat.interpolated(cameras.viewmats, torch.tensor([0.0, 1.0, 0.0]), frames=30).shape
+        torch.Size([30, 4, 4])
     """
     _check(viewmats, up, frames)
     if len(viewmats) == 1:

@@ -71,6 +71,11 @@ class Dataset:
 
     Raises:
         ValueError: fields that contradict each other.
+
+    Example:
+        >>> photos = etsplat.photograph(etsplat.demo_object(), 16, 16)
+        >>> len(photos.train), len(photos.test), photos.images[0].shape
+        (32, 8, torch.Size([16, 16, 4]))
     """
 
     viewmats: Float[Tensor, "B 4 4"]

@@ -40,6 +40,11 @@ def demo_scene(
         width: of the photos, in pixels.
         height: of the photos, in pixels.
         progress: called with (photos taken, photos in all).
+
+    Example:
+        >>> photos = etsplat.demo_scene(16, 12)
+        >>> len(photos.train), len(photos.test)
+        (36, 6)
     """
     vertices, base = demo_surface()
     rings = [

@@ -45,6 +45,11 @@ def bounding_sphere(dataset: Dataset) -> tuple[Float[Tensor, "3"], float]:
     Raises:
         InputError: no masks; a view that sees nothing of the object or nothing else; axes that do not meet in front
             of the cameras; silhouettes that have no common point; a camera inside the hull.
+
+    Example:
+        >>> center, radius = etsplat.bounding_sphere(etsplat.photograph(etsplat.demo_object(), 32, 32))
+        >>> 0.9 < radius < 1.1
+        True
     """
     names = [dataset.names[index] for index in dataset.train]
     steps = np.array([max(1, dataset.images.sizes[index][0] // _MASK_WIDTH) for index in dataset.train])

@@ -9,7 +9,12 @@ from etsplat import _native
 
 
 def num_threads() -> int:
-    """Number of threads the native engine uses."""
+    """Number of threads the native engine uses.
+
+    Example:
+        >>> etsplat.num_threads() >= 1
+        True
+    """
     return _native.num_threads()
 
 

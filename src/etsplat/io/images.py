@@ -118,6 +118,11 @@ def load_image(path: Path | str, shape: tuple[int, int] | None = None) -> Float[
 
     Raises:
         InputError: the file is missing, empty, cut short, too large, or not an image.
+
+    Example:
+        >>> etsplat.save_image("grey.png", torch.full((2, 3, 3), 0.2))
+        >>> etsplat.load_image("grey.png").shape
+        torch.Size([2, 3, 3])
     """
     decoded = _decoded(path, shape=shape)
     if isinstance(decoded, Tensor):

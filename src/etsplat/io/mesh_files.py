@@ -39,6 +39,11 @@ class MeshFile:
         notes: one sentence for each repair made while reading (polygons cut into triangles, faces dropped), and for
             what of its textures is left out.
         texture: pictures over the faces (OBJ with MTL, glTF), or None.
+
+    Example:
+        >>> vertices, faces = etsplat.icosphere(1)
+        >>> mesh = etsplat.MeshFile(vertices, faces, face_colors=torch.ones(len(faces), 3))
+        >>> etsplat.save_mesh("sphere.ply", mesh.vertices, mesh.faces, mesh.face_colors)
     """
 
     vertices: Float[Tensor, "V 3"]
@@ -65,6 +70,11 @@ def load_mesh(path: Path | str) -> MeshFile:
     Raises:
         InputError: the file is missing, empty, cut short, of another kind, has no faces, non-finite vertices, or
             indices out of range.
+
+    Example:
+        >>> etsplat.save_mesh("sphere.ply", *etsplat.icosphere(1))
+        >>> etsplat.load_mesh("sphere.ply").faces.shape
+        torch.Size([80, 3])
     """
     path = Path(path)
     if not path.exists():

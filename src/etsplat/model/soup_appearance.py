@@ -37,6 +37,10 @@ class SoupAppearance(Appearance):
         opacity_floor: opacities are squeezed into [floor, 1].
         sigma_ceiling: softness is cut here.
         limits: (2,) floor and ceiling in device memory, in the place of the two above, within a queued step.
+
+    Example:
+        >>> etsplat.SoupAppearance(kernel="bilateral", background=(1.0, 1.0, 1.0)).distance
+        'barycentric'
     """
 
     kernel: str = "elastic"

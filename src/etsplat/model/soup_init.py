@@ -25,6 +25,12 @@ class StartPoints:
     Attributes:
         positions: (P, 3).
         colors: (P, 3) in [0, 1].
+
+    Example:
+        >>> points = etsplat.StartPoints(torch.rand(100, 3), torch.full((100, 3), 0.5))
+        >>> soup = etsplat.start_soup(points, torch.Generator(), scale=1.0, opacity=0.3, sigma=1.0, sh_degree=0)
+        >>> soup.count
+        100
     """
 
     positions: Float[Tensor, "P 3"]

@@ -37,6 +37,11 @@ class MeshAppearance(Appearance):
         kernel: "elastic", "bilateral", "single_sided", or None for opaque triangles with antialiased silhouettes.
         distance: "barycentric" or "sdf".
         backend: whose antialiased rasterizer draws opaque triangles.
+
+    Example:
+        >>> vertices, faces = etsplat.icosphere(2)
+        >>> look = dict(colors=0.5, opacity=None, sigma=None, appearance=etsplat.MeshAppearance(kernel=None))
+        >>> mesh = etsplat.TriangleMesh.from_mesh(vertices, faces, **look)
     """
 
     kernel: str | None = "elastic"

@@ -54,6 +54,12 @@ class TriangleSoup(Model):
         sh_rest: (N, K - 1, 3) those of the other bands, learnable.
         appearance: how it is drawn; its near plane is in the same units as the corners.
         notes: whatever else its maker wrote down, as text (iteration, source).
+
+    Example:
+        >>> points = etsplat.StartPoints(torch.rand(50, 3), torch.full((50, 3), 0.5))
+        >>> soup = etsplat.start_soup(points, torch.Generator(), scale=1.0, opacity=0.3, sigma=1.0, sh_degree=1)
+        >>> soup.render(etsplat.orbit_cameras(16, 12)[0]).color.shape
+        torch.Size([1, 12, 16, 3])
     """
 
     RATES: ClassVar[Mapping[str, float]] = {

@@ -26,6 +26,13 @@ class MeshEnergies(NamedTuple):
         edge: L_e.
         normal: L_n, in [0, 2].
         laplacian: L_lap.
+
+    Example:
+        >>> vertices, faces = etsplat.icosphere(2)
+        >>> connectivity = etsplat.MeshTopology.from_faces(faces, len(vertices)).connectivity
+        >>> edge, normal, laplacian = etsplat.mesh_energies(vertices, connectivity)
+        >>> bool(normal > 0)
+        True
     """
 
     edge: Float[Tensor, ""]

@@ -36,6 +36,15 @@ def normal_consistency(
 
     Raises:
         ValueError: Wrong shape, dtype or device; an empty image.
+
+    Example:
+        >>> camera = etsplat.orbit_cameras(16, 16)[0]
+        >>> vertices, faces = etsplat.icosphere(3)
+        >>> look = dict(vertex_colors=0 * vertices, opacities=torch.ones(len(faces)), sigma=0.1)
+        >>> drawn = etsplat.rasterize(vertices, faces=faces, cameras=camera, outputs=("median_depth", "normal"), **look)
+        >>> loss = etsplat.normal_consistency(drawn.normal, drawn.median_depth, drawn.alpha, camera.viewmats, camera.Ks)
+        >>> bool(0 < loss < 1)
+        True
     """
     check_shape("normals", normals, ("B", "H", "W", 3))
     image = tuple(normals.shape[:3])

@@ -88,6 +88,10 @@ class PruneRules:
         importance: its importance stays below it.
         views: it is larger than a pixel in fewer views than this.
         screen_size: it grows larger than this on some view's screen, in pixels.
+
+    Example:
+        >>> rules = etsplat.PruneRules(opacity=0.02, screen_size=200.0)
+        >>> strategy = etsplat.DensifyAndPrune(max_triangles=5000, prune=rules)
     """
 
     opacity: float = 0.014

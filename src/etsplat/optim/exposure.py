@@ -53,6 +53,11 @@ class Exposure:
         learned: whether it is, by now.
         explained: the part of the squared error that exposures explained when it was measured; None before.
         adam: the optimizer of "values", (P, 10): of each photo g, then D by rows.
+
+    Example:
+        >>> exposure = etsplat.Exposure(measured_at=500)
+        >>> exposure.learned, exposure.explained
+        (False, None)
     """
 
     adam: Adam

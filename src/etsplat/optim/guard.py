@@ -41,6 +41,10 @@ class Guard:
     Attributes:
         held: the edit on trial, if there is one.
         undone: iterations whose edits were undone, ascending; each as often as that happened.
+
+    Example:
+        >>> etsplat.Guard(tolerance=0.05, until=1000).undone
+        []
     """
 
     def __init__(self, *, tolerance: float = 0.02, steps: int = 100, until: int = NEVER) -> None:

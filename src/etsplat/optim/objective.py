@@ -58,6 +58,13 @@ class Term(ABC):
             captures the steps anew, so what changes at every step belongs into the objective's `scale`.
         outputs: what it needs of `etsplat.rasterize`; nothing for a term that depends on the parameters alone.
         power: of the value.
+
+    Example:
+        >>> class Centred(etsplat.Term):
+        ...     def __call__(self, drawing):
+        ...         return drawing.model.vertices.mean(dim=0).square().sum()
+        >>> Centred(weight=0.1).weight
+        0.1
     """
 
     name: ClassVar[str | None] = None
@@ -101,6 +108,12 @@ class Objective:
         terms: the others, added in their order.
         scale: of all others together: a number, or a function of the iteration.
         depth_of: where depths of the outputs are measured: on a triangle's "plane" or at its "centroid".
+
+    Example:
+        >>> terms = [etsplat.EdgeLength(0.5), etsplat.Laplacian(0.2)]
+        >>> objective = etsplat.Objective(etsplat.Photometric(), terms, scale=lambda iteration: 0.99**iteration)
+        >>> [term.weight for term in objective.terms]
+        [0.5, 0.2]
     """
 
     def __init__(

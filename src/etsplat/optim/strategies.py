@@ -35,6 +35,13 @@ class Strategy:
         views: number of training views.
         generator: of every random choice.
         undone: how many attempts at the edit that is to be made were undone, because the pictures got worse.
+
+    Example:
+        >>> class Thin(etsplat.Strategy):
+        ...     def next_edit(self, iteration):
+        ...         return -(-iteration // 100) * 100
+        >>> Thin().next_edit(101)
+        200
     """
 
     outputs: tuple[str, ...] = ()
@@ -82,7 +89,13 @@ class Fixed(Strategy):
 
 
 class SubdivideAndUntangle(Strategy):
-    """Divides a mesh's largest faces at given times (paper, appendix Adaptive Refinement), and undoes folds."""
+    """Divides a mesh's largest faces at given times (paper, appendix Adaptive Refinement), and undoes folds.
+
+    Example:
+        >>> strategy = etsplat.SubdivideAndUntangle({100: 2500, 200: 5000}, untangle_after=[150])
+        >>> [strategy.next_edit(iteration) for iteration in (0, 101, 151)]
+        [100, 150, 200]
+    """
 
     def __init__(
         self, budgets: Mapping[int, int], untangle_after: Collection[int] = (), *, reach: float = _SHORT
@@ -183,6 +196,11 @@ class DensifyAndPrune(Strategy):
         clone_noise: how far a clone is shifted, as a multiple of the triangle's extent.
         prune: when a triangle dies.
         spared: of which triangles, by their corners, those that no view has seen stay.
+
+    Example:
+        >>> strategy = etsplat.DensifyAndPrune(begin=200, every=50, max_triangles=20_000)
+        >>> strategy.max_triangles
+        20000
     """
 
     begin: int = 100

@@ -120,6 +120,12 @@ def reconstruct(
     Raises:
         InputError: something handed in cannot be used; earlier results in `out` are as they were.
         DivergedError: the optimization went to NaN or infinity.
+
+    Example:
+        >>> tiny = etsplat.ReconstructConfig.tiny().changed({"resolution": 32, "iterations": 10})
+        >>> result = etsplat.reconstruct("demo:owl", "runs/owl", tiny)
+        >>> result.mesh.vertices.shape[1], sorted(path.name for path in result.path.glob("mesh.*"))
+        (3, ['mesh.glb', 'mesh.obj', 'mesh.ply'])
     """
     config = config or ReconstructConfig()
     job = Job(config, out, callbacks, resume=resume, overwrite=overwrite)

@@ -98,6 +98,12 @@ def train(
         InputError: something handed in cannot be used; earlier results in `out` are as they were.
         DivergedError: the optimization went to NaN or infinity.
         WorkerLostError: another worker ended.
+
+    Example:
+        >>> tiny = etsplat.TrainConfig.tiny().changed({"width": 32, "iterations": 10})
+        >>> result = etsplat.train("demo:scene", "runs/scene", tiny)
+        >>> result.metrics["triangles"] > 0
+        True
     """
     config = config or TrainConfig()
     job = Job(config, out, callbacks, resume=resume, overwrite=overwrite)

@@ -10,7 +10,11 @@ from etsplat.optim.objective import Drawing, Term
 
 
 class Photometric(Term):
-    """(1 - l) L_1 + l (1 - SSIM) over the same background; with l = 0 the paper's L_c (ops/photometric.py)."""
+    """(1 - l) L_1 + l (1 - SSIM) over the same background; with l = 0 the paper's L_c (ops/photometric.py).
+
+    Example:
+        >>> objective = etsplat.Objective(etsplat.Photometric(dssim=0.2, pixel="l1"))
+    """
 
     outputs = ("color",)
 
