@@ -10,7 +10,7 @@ import tyro
 from etsplat.core.errors import InputError
 from studies.study import Study
 
-Name = Literal["kernels", "edges", "soft-triangle", "axes", "dead-zone", "teaser"]
+Name = Literal["kernels", "edges", "soft-triangle", "axes", "dead-zone", "growth", "teaser"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,18 +19,20 @@ class Figures(Study):
 
     kernels: G(x) and its slope for several sigma. edges: the seam between two faces. soft-triangle: one triangle and
     the level sets of x. axes: the table of kernel properties. dead-zone: from how far each kernel pulls a triangle
-    back. teaser: from the sphere to a reconstruction, and from points to a scene, of finished runs.
+    back. growth: the built-in owl from a sphere, moving, while it is reconstructed. teaser: from the sphere to a
+    reconstruction, and from points to a scene, of finished runs.
 
     Examples:
         python -m studies.figures kernels
         python -m studies.figures dead-zone --out dead_zone.pdf
+        python -m studies.figures growth --out docs/images/growth.webp
         python -m studies.figures teaser --runs runs/bunny runs/kitchen
     """
 
     name: tyro.conf.Positional[Name]
     """Which figure."""
     out: Path | None = None
-    """File to write, .png, .pdf or .svg; NAME.png if not given."""
+    """File to write, .png, .pdf or .svg, of growth .webp; NAME.png or growth.webp if not given."""
     runs: tuple[Path, ...] = ()
     """Finished runs of `etsplat reconstruct` and `train` that the teaser shows."""
 
@@ -38,19 +40,28 @@ class Figures(Study):
         """Draws it."""
         from etsplat.io.atomic import atomic_write
         from etsplat.io.paths import kind_of
+
+        kinds = (".webp",) if self.name == "growth" else (".png", ".pdf", ".svg")
+        path = self.out or Path(f"{self.name}{kinds[0]}")
+        if kind_of(path) not in kinds:
+            raise InputError(f"{path}: unknown kind of picture; end the name in {' or '.join(kinds)}")
+        if self.name == "teaser" and not self.runs:
+            raise InputError("teaser: needs finished runs to show; name their folders with --runs")
+        with atomic_write(path) as temporary:
+            self._draw(temporary, kind_of(path))
+        print(path)
+        return 0
+
+    def _draw(self, path: Path, kind: str) -> None:
+        from studies.drawings.growth import save_growth
         from studies.drawings.kernels import FIGURES
         from studies.drawings.teaser import draw_teaser
 
-        path = self.out or Path(f"{self.name}.png")
-        if kind_of(path) not in (".png", ".pdf", ".svg"):
-            raise InputError(f"{path}: unknown kind of picture; end the name in .png, .pdf or .svg")
-        if self.name == "teaser" and not self.runs:
-            raise InputError("teaser: needs finished runs to show; name their folders with --runs")
+        if self.name == "growth":
+            save_growth(path)
+            return
         figure = draw_teaser(self.runs) if self.name == "teaser" else FIGURES[self.name]()
-        with atomic_write(path) as temporary:
-            figure.savefig(temporary, dpi=150, format=kind_of(path)[1:])
-        print(path)
-        return 0
+        figure.savefig(path, dpi=150, format=kind[1:])
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from etsplat.core.cameras import Cameras
 from etsplat.data.photograph import orbit_cameras, shade_faces
 from etsplat.geometry.measures import bounding_ball
 from etsplat.io.atomic import atomic_write
@@ -118,9 +119,11 @@ def _bounds(pictures: Sequence[Float[Tensor, "H W 3"]]) -> tuple[slice, slice]:
     return slices[0], slices[1]
 
 
-def draw_shape(vertices: Tensor, faces: Tensor, *, normals: bool = False) -> Float[Tensor, "H W 3"]:
+def draw_shape(
+    vertices: Tensor, faces: Tensor, *, normals: bool = False, camera: Cameras | None = None
+) -> Float[Tensor, "H W 3"]:
     """One picture over white, of the shape in the photographs' light or of its normals as colours."""
-    camera = orbit_cameras(TILE, TILE)[_VIEW]
+    camera = orbit_cameras(TILE, TILE)[_VIEW] if camera is None else camera
     if normals:
         corners = vertices[faces].double()
         cross = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

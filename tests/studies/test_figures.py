@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from etsplat.core.errors import InputError
 from etsplat.tasks.reconstruct import reconstruct
@@ -12,6 +13,7 @@ from etsplat.tasks.train import train
 from etsplat.tasks.train_config import TrainConfig
 from helpers.captures import write_colmap
 from studies.drawings.dead_zone import pull, remaining_distance
+from studies.drawings.growth import TILE, save_growth, watch_growth
 from studies.drawings.kernels import FIGURES, draw_edges
 from studies.drawings.teaser import draw_teaser
 from studies.figures import Figures
@@ -33,6 +35,22 @@ def test_the_seam_of_single_sided_triangles_goes_down_to_nothing() -> None:
     assert elastic[2][len(elastic[2]) // 2] > 0.99
 
 
+def test_the_growing_object_is_watched_from_all_around(tmp_path: Path) -> None:
+    """From the start, which is as grey as its sphere, to the last iteration; the file moves, and stays at its end."""
+    tiny = ReconstructConfig.tiny().changed({"resolution": 32, "iterations": 9})
+    frames = watch_growth(tiny, 4)
+    assert [frame.iteration for frame in frames] == [0, 1, 4, 9]
+    assert float(frames[0].splatted.std(dim=2).max()) < 1e-3 < float(frames[-1].splatted.std(dim=2).max())
+    assert all(float(frame.shape.std()) > 0.02 for frame in frames)
+    save_growth(tmp_path / "owl.webp", frames)
+    with Image.open(tmp_path / "owl.webp") as film:
+        assert getattr(film, "n_frames", 1) == 4
+        assert film.size == (2 * TILE, TILE)
+        film.seek(3)
+        film.load()
+        assert film.info["duration"] > 1000
+
+
 def test_every_kernel_pulls_an_overlapping_triangle_back() -> None:
     """Displaced by one inradius, each soft kernel pulls towards the target, and Adam brings the triangle home."""
     for kernel in ("single_sided", "bilateral", "elastic"):
@@ -44,6 +62,8 @@ def test_wrong_requests_are_input_errors(tmp_path: Path) -> None:
     """An unknown kind of file, and a teaser without runs."""
     with pytest.raises(InputError, match="unknown kind of picture"):
         Figures(name="kernels", out=tmp_path / "kernels.bmp").run([])
+    with pytest.raises(InputError, match=r"growth.png: .* \.webp"):
+        Figures(name="growth", out=tmp_path / "growth.png").run([])
     with pytest.raises(InputError, match="--runs"):
         Figures(name="teaser", out=tmp_path / "teaser.png").run([])
 
@@ -59,7 +79,7 @@ def test_the_teaser_shows_a_mesh_and_a_soup(tmp_path: Path) -> None:
     soup = TrainConfig.tiny().changed({"iterations": 3, "start.opacity": 0.8, **quick})
     train(tmp_path / "scene", tmp_path / "soup", soup)
     figure = draw_teaser([tmp_path / "mesh", tmp_path / "soup"])
-    pictures = [axis.images[0].get_array() for axis in figure.axes]
+    pictures = [np.asarray(axis.images[0].get_array()) for axis in figure.axes]
     assert len(pictures) == 10
     assert all(float(picture.std()) > 0.02 for picture in pictures)
     assert [axis.get_title() for axis in figure.axes[5:7]] == ["start", "opaque triangles"]
