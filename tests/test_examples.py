@@ -114,3 +114,20 @@ def test_the_call_of_the_readme_runs(tmp_path: Path) -> None:
     code = code_of("README.md", "etsplat.rasterize(")
     printed = run(["-c", f"{GIVEN}\n{code}\nprint(float(vertices.grad.abs().sum()))"], tmp_path)
     assert float(printed) > 0
+
+
+def test_the_notebook_runs(tmp_path: Path) -> None:
+    """At its smallest: a result, a curve and four views of the mesh."""
+    import nbformat
+    from nbclient import NotebookClient
+
+    notebook = nbformat.read(ROOT / "examples" / "owl.ipynb", as_version=4)
+    code = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    assert all(not cell.outputs for cell in code), "it is kept without outputs"
+    sizes = "RESOLUTION, ITERATIONS, FACES = 200, 2000, 10_000"
+    assert sizes in code[1].source
+    code[1].source = code[1].source.replace(sizes, "RESOLUTION, ITERATIONS, FACES = 32, 20, 2000")
+    NotebookClient(notebook, timeout=300, kernel_name="python3", resources={"metadata": {"path": tmp_path}}).execute()
+    assert (tmp_path / "runs" / "owl" / "mesh.glb").is_file()
+    assert "PSNR" in code[1].outputs[-1]["data"]["text/html"]
+    assert all("image/png" in cell.outputs[-1]["data"] for cell in code[2:])
