@@ -88,7 +88,7 @@ def build(platform: Platform, work: Path, out: Path) -> Path:
     made = work / "made"
     shutil.rmtree(made, ignore_errors=True)
     out.mkdir(parents=True, exist_ok=True)
-    defines = {
+    defines: dict[str, Path | str] = {
         "CMAKE_TOOLCHAIN_FILE": ROOT / "release" / "zig.cmake",
         "ETSPLAT_SYSTEM": platform.system,
         "ETSPLAT_PROCESSOR": platform.processor,
@@ -98,6 +98,7 @@ def build(platform: Platform, work: Path, out: Path) -> Path:
     }
     if platform.system == "Windows":
         defines["Python_SABI_LIBRARY"] = import_library(work)
+        defines["SKBUILD_SOSABI"] = ""  # no .abi3 before .pyd
         # CMake wants that of one Python too, whose version it reads from the name; nothing is linked with it.
         defines["Python_LIBRARY"] = work / f"python{sys.version_info.major}{sys.version_info.minor}.lib"
         shutil.copy2(defines["Python_SABI_LIBRARY"], defines["Python_LIBRARY"])
@@ -130,7 +131,8 @@ def compilers(platform: Platform, folder: Path) -> Path:
     """A folder with programs of the names that CMake asks for, which call Zig for this platform."""
     folder.mkdir(parents=True, exist_ok=True)
     # A bundle and nanobind's list of Python's symbols (@FILE) are for Apple's linker; to Python a library does as well.
-    cases = "-bundle) word=-dynamiclib;; -Wl,@*.sym) word='-Wl,-undefined,dynamic_lookup';;"
+    # What the Python of this machine is linked with (-ldl) is part of the C library elsewhere.
+    cases = "-bundle) word=-dynamiclib;; -ldl) continue;; -Wl,@*.sym) word='-Wl,-undefined,dynamic_lookup';;"
     translate = f'for word; do shift; case $word in {cases} esac; set -- "$@" "$word"; done'
     zig = zig_program()
     scripts = {"c++": f"{translate}\nexec '{zig}' c++ -target {platform.target} -O2 \"$@\""}

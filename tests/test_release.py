@@ -54,13 +54,13 @@ def test_wheels_that_promise_too_little_are_refused(
 
 
 def test_what_zig_does_not_know_is_translated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of a Mac's linker: bundles, and lists of symbols. All other words pass as they are."""
+    """Of a Mac's linker: bundles, and lists of symbols; a library of Linux. All other words pass as they are."""
     echo = tmp_path / "zig"
     echo.write_text('#!/bin/sh\nfor word; do echo "$word"; done\n')
     echo.chmod(0o755)
     monkeypatch.setattr(wheels, "zig_program", lambda: echo)
     tools = wheels.compilers(wheels.PLATFORMS["macos-arm64"], tmp_path / "tools")
-    command = [str(tools / "c++"), "-bundle", "-DNAME=two words", "-Wl,@python.sym", "-Wl,-x"]
+    command = [str(tools / "c++"), "-bundle", "-DNAME=two words", "-ldl", "-Wl,@python.sym", "-Wl,-x"]
     words = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
     assert words[:3] == ["c++", "-target", "aarch64-macos.11.0"]
     assert words[-4:] == ["-dynamiclib", "-DNAME=two words", "-Wl,-undefined,dynamic_lookup", "-Wl,-x"]
