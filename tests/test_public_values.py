@@ -73,6 +73,7 @@ VALUES: dict[str, Callable[[], Any]] = {
     "Fixed": lambda: etsplat.Fixed(),
     "GeometryMetrics": lambda: etsplat.GeometryMetrics(0.1, 0.0, 0.1, 0.9, 1, 2),
     "Guard": lambda: etsplat.Guard(tolerance=0.1),
+    "Harmonics": lambda: etsplat.Harmonics(0.5),
     "InputError": lambda: etsplat.InputError("mesh x: no such file"),
     "Laplacian": lambda: etsplat.Laplacian(0.5),
     "Lpips": lambda: etsplat.Lpips(),

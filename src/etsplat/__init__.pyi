@@ -99,6 +99,7 @@ from etsplat.optim.terms.mesh import Softness as Softness
 from etsplat.optim.terms.photometric import Photometric as Photometric
 from etsplat.optim.terms.soup import DepthNormals as DepthNormals
 from etsplat.optim.terms.soup import Distortion as Distortion
+from etsplat.optim.terms.soup import Harmonics as Harmonics
 from etsplat.optim.terms.soup import Opacity as Opacity
 from etsplat.optim.terms.soup import Size as Size
 from etsplat.optim.trainer import Trainer as Trainer

@@ -50,10 +50,10 @@ OPTIONS: dict[str, dict[str, str]] = {
     },
     "train": {
         # No photo was kept from training to watch runs by, and exposures were not looked at; the rate of positions and
-        # the number of triangles did not depend on the photos.
+        # the number of triangles did not depend on the photos; colours might depend on the direction as they liked.
         **{
             f"--preset {preset}": f"--preset {preset} --watch 0 --exposure off --pixels-per-triangle None --no-asset"
-            " --optimizer.lr-vertices-unit frame --optimizer.lr-vertices 0.0015"
+            " --optimizer.lr-vertices-unit frame --optimizer.lr-vertices 0.0015 --loss.lambda-harmonics 0"
             for preset in ("quick", "demo", "tiny")
         },
         "--near-plane": "--drawing.near-plane",

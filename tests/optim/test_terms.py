@@ -21,7 +21,7 @@ from etsplat.optim.terms import named_terms
 from etsplat.optim.terms.depth import Depth
 from etsplat.optim.terms.mesh import EdgeLength, Laplacian, SmoothNormals, Softness
 from etsplat.optim.terms.photometric import Photometric
-from etsplat.optim.terms.soup import DepthNormals, Distortion, Opacity, Size
+from etsplat.optim.terms.soup import DepthNormals, Distortion, Harmonics, Opacity, Size
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.train_config import TrainConfig
 from helpers.engines import on
@@ -239,6 +239,22 @@ def test_spared_triangles_count_as_transparent(rng: torch.Generator) -> None:
     _, drawing = a_soups_drawing(rng, ("color",))
     spared = torch.arange(30) < 10
     assert float(Opacity(spared=lambda _: spared)(drawing).detach()) == pytest.approx(0.4, rel=1e-5)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 3])
+def test_harmonics_are_the_squares_of_a_triangle_in_the_mean(rng: torch.Generator, degree: int) -> None:
+    """Its gradient is 2 c / N; the constant band does not count, and colours without others have 0."""
+    _, drawing = a_soups_drawing(rng, ("color",))
+    vertices, colors = torch.rand((7, 3, 3), generator=rng), torch.rand((7, 3), generator=rng)
+    soup = TriangleSoup.from_triangles(vertices, colors, opacity=0.5, sigma=0.5, sh_degree=degree)
+    with torch.no_grad():
+        soup.sh_rest.copy_(torch.randn(soup.sh_rest.shape, generator=rng))
+    of_soup = Harmonics()(replace(drawing, model=soup))
+    of_soup.backward()
+    expected = soup.sh_rest.detach().double().square().sum() / 7
+    assert float(of_soup.detach()) == pytest.approx(float(expected), rel=1e-5)
+    torch.testing.assert_close(soup.sh_rest.grad, 2 * soup.sh_rest.detach() / 7)
+    assert soup.sh_dc.grad is None
 
 
 def test_every_weight_among_the_settings_is_that_of_a_term() -> None:

@@ -135,6 +135,19 @@ def test_other_kernels_and_scenes_fit_too(capture: Dataset, tmp_path: Path, meth
     assert losses[-1] < losses[0]
 
 
+def test_fewer_photos_hold_colours_of_directions_more(capture: Dataset) -> None:
+    """The weight is shared by the photos; preset paper and colours for all directions have no such term."""
+
+    def weights(config: TrainConfig, photos: int) -> dict[str | None, float]:
+        objective = start_trainer(replace(capture, train=capture.train[:photos]), config)._objective
+        return {term.name: at(term.weight, 1) for term in objective.terms}
+
+    few, many = (weights(TINY, photos)["harmonics"] for photos in (3, 12))
+    assert few == pytest.approx(4 * many) == pytest.approx(2.0 / 3)
+    assert weights(TrainConfig.paper(), 3)["harmonics"] == 0.0
+    assert "harmonics" not in weights(TINY.changed({"drawing.sh_degree": 0}), 3)
+
+
 def test_the_opaque_finish_leaves_nothing_soft(capture: Dataset, tmp_path: Path) -> None:
     """At the end opacities are near 1 and sigma near 0, in the file too, and opaque drawing loses little."""
     result = train(capture, tmp_path / "run", replace(TINY, finish="opaque"))

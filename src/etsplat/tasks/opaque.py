@@ -102,7 +102,13 @@ def _with_points(capture: Dataset, soup: TriangleSoup, most: int) -> Dataset:
 def _towards_opaque(capture: Dataset, config: TrainConfig) -> TrainConfig:
     """Settings of the soup that becomes opaque beside a soft one. The mesh has no colours for each direction."""
     usual = TrainConfig.of(config.preset, config.scene_type)
-    without = ("loss.lambda_opacity", "densification.replace_dead", "optimizer.lr_sh_rest", "schedule.sh_every")
+    without = (
+        "loss.lambda_opacity",
+        "loss.lambda_harmonics",
+        "densification.replace_dead",
+        "optimizer.lr_sh_rest",
+        "schedule.sh_every",
+    )
     return config.changed(
         {
             **{name: get(usual, name) for name in without},

@@ -110,7 +110,7 @@ def make_trainer(
     return Trainer(
         soup,
         capture,
-        _objective(config, spared, depths, squared=squared),
+        _objective(config, len(capture.train), spared, depths, squared=squared),
         _strategy(config, triangle_limit(capture, config), spared),
         schedule=_schedule(config, vertex_unit(soup, capture, config)),
         batch=config.batch,
@@ -123,7 +123,9 @@ def make_trainer(
     )
 
 
-def _objective(config: TrainConfig, spared: Spared | None, depths: DepthTrust | None, *, squared: bool) -> Objective:
+def _objective(
+    config: TrainConfig, photos: int, spared: Spared | None, depths: DepthTrust | None, *, squared: bool
+) -> Objective:
     """L_nvs. Where no view looks, nothing would hold what is spared against the pull to transparency."""
 
     def late(weight: float) -> Scheduled:
@@ -140,9 +142,16 @@ def _objective(config: TrainConfig, spared: Spared | None, depths: DepthTrust | 
         leaving=[
             "dssim",
             *(["opacity"] if config.finish == "opaque" else []),
+            *(["harmonics"] if config.drawing.sh_degree == 0 else []),
             *(["depth"] if depths is None else []),
         ],
-        scheduled={"size": early, "depth_normal": late, "distortion": late, "depth": shaping},
+        scheduled={
+            "harmonics": lambda weight: weight / photos,
+            "size": early,
+            "depth_normal": late,
+            "distortion": late,
+            "depth": shaping,
+        },
         arguments={"opacity": {"spared": spared}, "depth": {"trust": depths}},
     )
     photometric = Photometric(config.loss.lambda_dssim, "l2" if squared else "l1")

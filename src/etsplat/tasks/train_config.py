@@ -100,6 +100,9 @@ class Loss:
     """Share of 1 - SSIM in the photometric loss; the rest is L1."""
     lambda_opacity: Annotated[float, Range(0), _TRANSPARENT] = 0.0055
     """Weight of the mean opacity."""
+    lambda_harmonics: Annotated[float, Range(0), _HARMONICS] = 2.0
+    """Weight of how much colours depend on the direction, divided by the number of photos to train on.
+    Without it few photos are each fitted by it, and other views have streaks and patches."""
     lambda_size: Annotated[float, Range(0)] = 0.0
     """Weight of the reciprocal of the mean area, until densification ends."""
     lambda_depth_normal: Annotated[float, Range(0)] = 0.0
@@ -314,6 +317,7 @@ _PAPER: dict[str, Any] = {
     "optimizer.lr_opacities": 0.014,
     "optimizer.lr_sigma": 0.0008,
     "optimizer.lr_settle": None,
+    "loss.lambda_harmonics": 0.0,
     "loss.lambda_size": 1e-8,
     "loss.lambda_depth_normal": 1e-4,
     "loss.depth": "off",

@@ -43,6 +43,21 @@ class Size(Term):
         return mean_area(drawing.model.vertices)
 
 
+class Harmonics(Term):
+    """How much colours depend on the direction: the sum of squares of a triangle's coefficients, the mean over all.
+
+    The constant band does not count. By the others a triangle that few photos show fits each of them, and other views
+    then see streaks and patches.
+    """
+
+    name = "harmonics"
+
+    def __call__(self, drawing: Drawing) -> Float[Tensor, ""]:
+        """Of the soup."""
+        coefficients = drawing.model.sh_rest
+        return coefficients.square().sum() / len(coefficients)
+
+
 class DepthNormals(Term):
     """How far normals are from those of the depth image, where something is opaque (ops/normal_consistency.py)."""
 
