@@ -20,7 +20,7 @@ SANITIZED := build/sanitize/.stamp
 NATIVE := CMakeLists.txt $(shell find csrc)
 
 .PHONY: help setup demo test lint docs format stubs bench equal-bits fuzz fuzz-short sanitize races soak lock audit \
-	check-neon wheel check-wheel wheels clean
+	ptx check-neon wheel check-wheel wheels clean
 
 help:
 	@echo "make setup        create .venv and build the package into it"
@@ -34,6 +34,7 @@ help:
 	@echo "make sanitize     run the tests of the C++ under ASan, LSan and UBSan (GCC, Linux)"
 	@echo "make fuzz         a million changed files and 100,000 odd calls; FUZZ='--targets mesh*' for some; fuzz-short for a minute"
 	@echo "make races        threads and forks under ThreadSanitizer (GCC, Linux); RACES=300 for so many seconds"
+	@echo "make ptx          tests of the GPU engine on the CPU, on what NVRTC compiles; PTX=compute_75 for one architecture"
 	@echo "make soak         kill runs, fill their disk, move their clock; SOAK=100 for so many of each (Linux)"
 	@echo "make lock         requirements.lock: the newest versions that fit, with hashes; make audit: known holes in them"
 	@echo "make check-neon   run the rasterizer's NEON path under QEMU (AArch64 cross compiler)"
@@ -148,6 +149,16 @@ RACES ?= 60
 races:
 	tests/native/run.sh races $(RACES)
 	tests/native/run.sh forks $(RACES)
+
+# Kernels as NVRTC compiles them, translated to C++ (tests/helpers/simt/ptx.py), in all tests that run them on the CPU.
+PTX ?= compute_75 compute_90
+PTX_TESTS ?= tests
+# Every program, most of them in all that they are defined to: what .ci/run has time for.
+PTX_SHORT := tests/engines tests/ops/test_cuda_ops.py tests/ops/test_texture.py tests/ops/test_triangle_channels.py \
+	tests/ops/test_normal_consistency.py tests/ops/test_soup_activation.py \
+	tests/ops/test_rasterize_engines.py::test_softness_from_sharp_to_flat
+ptx: setup
+	for architecture in $(PTX); do $(PY) -m pytest -n auto --ptx $$architecture $(PTX_TESTS) $(PYTEST_ARGS) || exit 1; done
 
 # The NEON path under an emulator, where there is no ARM machine (Debian: g++-aarch64-linux-gnu qemu-user).
 check-neon:

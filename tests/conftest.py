@@ -25,9 +25,15 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--engine", choices=ENGINES, default=None, help="run the engine-parameterised tests on this engine only"
     )
+    parser.addoption(
+        "--ptx",
+        metavar="ARCHITECTURE",
+        help="run kernels as NVRTC compiles them, for compute_75 or newer; other tests not at all",
+    )
 
 
 def pytest_configure(config: pytest.Config) -> None:
+    Simt.architecture = config.getoption("--ptx")
     # Workers side by side, each with a thread per core, would wait for each other. Subprocesses inherit the variables.
     if "PYTEST_XDIST_WORKER" in os.environ:
         os.environ.setdefault("ETSPLAT_NUM_THREADS", "2")
@@ -38,6 +44,22 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     if "engine" in metafunc.fixturenames:
         only = metafunc.config.getoption("--engine")
         metafunc.parametrize("engine", [only] if only else ENGINES, indirect=True)
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    if config.getoption("--ptx"):
+        chosen = [item for item in items if isinstance(item, pytest.Function) and _runs_kernels(item)]
+        config.hook.pytest_deselected(items=[item for item in items if item not in chosen])
+        items[:] = chosen
+
+
+def _runs_kernels(test: pytest.Function) -> bool:
+    """Whether it takes a fixture by which CUDA kernels may run on the CPU."""
+    parameters = test.callspec.params if hasattr(test, "callspec") else {}
+    others = {"reference", "cpu", "device"}
+    if any(parameters.get(name) in others for name in ("engine", "native", "cuda_engine")):
+        return False
+    return not {"simt", "cuda_engine", "engine_of"}.isdisjoint(test.fixturenames)
 
 
 @pytest.fixture

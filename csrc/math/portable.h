@@ -37,6 +37,17 @@ ETSPLAT_FN void vlookup4(const float* table, float index, float* out) {
     for (int k = 0; k < 4; ++k) out[k] = table[static_cast<int>(index) + k];
 }
 
+// a b, rounded before anything is added to it, also where contraction is on.
+#if defined(__CUDACC__) || defined(__CUDACC_RTC__)
+ETSPLAT_FN float vproduct(float a, float b) { return __fmul_rn(a, b); }
+ETSPLAT_FN double vproduct(double a, double b) { return __dmul_rn(a, b); }
+#else
+template <class T>
+ETSPLAT_FN T vproduct(T a, T b) {
+    return a * b;
+}
+#endif
+
 // What a comparison of two T gives.
 template <class T>
 using MaskOf = decltype(T() < T());

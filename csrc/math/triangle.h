@@ -52,11 +52,13 @@ ETSPLAT_FN void to_camera(const PinholeCamera& camera, const T* world, T* view) 
                   T(camera.translation[i]);
 }
 
+// Rounded alike in every program and by every engine: a sharp kernel magnifies where in a pixel a corner of a thin triangle is.
 template <class T>
 ETSPLAT_FN void project(const PinholeCamera& camera, const T* view, T& x, T& y) {
     const T inverse_z = T(1.0f) / view[2];
-    x = (T(camera.fx) * view[0] + T(camera.skew) * view[1]) * inverse_z + T(camera.cx);
-    y = T(camera.fy) * view[1] * inverse_z + T(camera.cy);
+    const T right = vproduct(T(camera.fx), view[0]) + vproduct(T(camera.skew), view[1]);
+    x = vproduct(right, inverse_z) + T(camera.cx);
+    y = vproduct(vproduct(T(camera.fy), view[1]), inverse_z) + T(camera.cy);
 }
 
 // Completes x, y to the rest. False for a triangle without screen area (docs/conventions.md) or not finite.

@@ -1,4 +1,4 @@
-"""The SIMT shim itself: it computes what a GPU would, and says when a kernel is wrong."""
+"""The SIMT shim itself: it computes what a GPU would, and says when a kernel is wrong, be it compiled or as PTX."""
 
 import ctypes
 
@@ -7,7 +7,9 @@ import torch
 
 from etsplat.engines.cuda.launch import launch
 from etsplat.engines.cuda.program import Program
-from helpers.simt.build import library
+from helpers.simt import build
+from helpers.simt.build import Simt
+from helpers.simt.inline import Inline
 
 FILL = Program("fill.cu")
 
@@ -43,7 +45,7 @@ KERNELS = {
         atomicCAS(cells + 4, 0, 9);
         atomicExch(cells + 5, 3);
     }""",
-    "poison": "(float* out) { __shared__ float s[2]; out[blockIdx.x] = s[1]; s[1] = 5.0f; }",
+    "poison": "(float* out) { __shared__ volatile float s[2]; out[blockIdx.x] = s[1]; s[1] = 5.0f; }",
     "right": "() { __syncthreads(); }",
     "stuck": "() { if (threadIdx.x < 40) __syncthreads(); else __ballot_sync(~0u, 1); }",
     "leaves": "() { if (threadIdx.x != 3) __syncwarp(); }",
@@ -54,13 +56,21 @@ KERNELS = {
 SOURCE = "".join(f'extern "C" __global__ void {name}{rest}\n' for name, rest in KERNELS.items())
 
 
-def run(name, grid, block, *tensors, flags=(), seed=0):
-    kernel = getattr(library(SOURCE, flags), f"simt_launch_{name}")
-    kernel.restype = ctypes.c_char_p
-    values = [ctypes.c_void_p(t.data_ptr()) for t in tensors]
-    pointers = (ctypes.c_void_p * len(values))(*(ctypes.addressof(v) for v in values))
-    failure = kernel((ctypes.c_uint * 3)(*grid), (ctypes.c_uint * 3)(*block), pointers, seed)
-    return None if failure is None else failure.decode()
+SOURCES = "sources"
+COMPILED = ("compute_75", "compute_90")
+
+
+@pytest.fixture(params=[SOURCES, *COMPILED])
+def run(request, monkeypatch):
+    """Launches a kernel from its source, or from what NVRTC makes of it; what went wrong, or None."""
+    if request.param != SOURCES:
+        monkeypatch.setattr(Simt, "architecture", request.param)
+
+    def launched(name, grid, block, *tensors, flags=(), seed=0):
+        kernels = build.library(SOURCE, flags) if flags else Simt().library(Inline(SOURCE))
+        return build.run(kernels, name, grid, block, [ctypes.c_void_p(t.data_ptr()) for t in tensors], seed)
+
+    return launched
 
 
 @pytest.mark.sanitize
@@ -74,16 +84,24 @@ def test_launch_runs_a_kernel_of_the_package(simt):
 
 
 @pytest.mark.sanitize
-@pytest.mark.parametrize("flags", [(), ("-DSIMT_UCONTEXT",)])
 @pytest.mark.parametrize("seed", [0, 5])
-def test_block_sum(flags, seed, rng):
-    """Shuffles, shared memory and barriers, in both ways of switching and in any order of threads."""
+def test_block_sum(run, seed, rng):
+    """Shuffles, shared memory and barriers, in any order of threads."""
     values, sums = torch.rand(6, 128, generator=rng), torch.zeros(6)
-    assert run("block_sum", (6, 1, 1), (16, 8, 1), values, sums, flags=flags, seed=seed) is None
+    assert run("block_sum", (6, 1, 1), (16, 8, 1), values, sums, seed=seed) is None
     torch.testing.assert_close(sums, values.sum(1))
 
 
-def test_warp_operations():
+@pytest.mark.sanitize
+@pytest.mark.parametrize("run", [SOURCES], indirect=True)
+def test_switching_by_the_system(run, rng):
+    """The same where there is no assembly to switch threads by."""
+    values, sums = torch.rand(6, 128, generator=rng), torch.zeros(6)
+    assert run("block_sum", (6, 1, 1), (16, 8, 1), values, sums, flags=("-DSIMT_UCONTEXT",)) is None
+    torch.testing.assert_close(sums, values.sum(1))
+
+
+def test_warp_operations(run):
     """Every shuffle, with segments, and the votes give what the programming guide says."""
     out = torch.zeros(32, 8, dtype=torch.int32)
     assert run("warp_operations", (1, 1, 1), (32, 1, 1), out) is None
@@ -94,7 +112,7 @@ def test_warp_operations():
     assert torch.equal(out, torch.stack(expected, dim=1).int())
 
 
-def test_atomics():
+def test_atomics(run):
     """Each returns the old value and leaves the new one."""
     cells, old = torch.zeros(6, dtype=torch.int32), torch.zeros(20, dtype=torch.int32)
     assert run("atomics", (1, 1, 1), (20, 1, 1), cells, old) is None
@@ -102,7 +120,7 @@ def test_atomics():
     assert sorted(old.tolist()) == list(range(20))
 
 
-def test_shared_memory_starts_poisoned():
+def test_shared_memory_starts_poisoned(run):
     """In every block: what the one before left there is not to be relied on."""
     out = torch.zeros(3)
     assert run("poison", (3, 1, 1), (1, 1, 1), out) is None
@@ -119,7 +137,7 @@ def test_shared_memory_starts_poisoned():
         ("reads_outside", "reads a lane outside of its mask"),
     ],
 )
-def test_wrong_kernels_are_reported(kernel_name, message):
+def test_wrong_kernels_are_reported(run, kernel_name, message):
     """With what happened; the machine works again afterwards."""
     failure = run(kernel_name, (2, 1, 1), (64, 1, 1))
     assert failure is not None
@@ -127,9 +145,20 @@ def test_wrong_kernels_are_reported(kernel_name, message):
     assert run("right", (2, 1, 1), (64, 1, 1)) is None
 
 
-def test_deadlock_says_who_waits():
+def test_deadlock_says_who_waits(run):
     """And where, one line for neighbours that wait for the same."""
     failure = run("stuck", (1, 1, 1), (64, 1, 1))
     assert failure is not None
     assert "from thread (0, 0, 0) on: waiting in __syncthreads" in failure
     assert "from thread (40, 0, 0) on: waiting in __ballot_sync, mask ffffffff" in failure
+
+
+@pytest.mark.parametrize(
+    "arguments", [[ctypes.c_int32(0)], [], [ctypes.c_void_p(0)] * 2], ids=["width", "less", "more"]
+)
+def test_arguments_have_the_sizes_of_the_parameters(arguments):
+    """Or nothing is launched: a device would take what lies beside them."""
+    for kernels in (build.library(SOURCE), build.ptx_library(Inline(SOURCE), COMPILED[0])):
+        failure = build.run(kernels, "poison", (1, 1, 1), (1, 1, 1), arguments)
+        assert failure is not None
+        assert failure.endswith("the parameters [8]")

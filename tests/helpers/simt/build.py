@@ -1,4 +1,7 @@
-"""Kernels as CPU programs: each compiled with simt.h into a shared library, run on CPU tensors by ctypes."""
+"""Kernels as CPU programs: each compiled with simt.h into a shared library, run on CPU tensors by ctypes.
+
+What is compiled is their source or the PTX that NVRTC makes of it.
+"""
 
 import ctypes
 import hashlib
@@ -9,11 +12,16 @@ import sys
 import tempfile
 from collections.abc import Callable, Sequence
 from functools import cache
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
+import torch
+
+from etsplat.engines.cuda.compile import compile_without_cache, program_key
 from etsplat.engines.cuda.device import pointers_to
 from etsplat.engines.cuda.program import Program
+from helpers.simt import ptx
 from helpers.simt.calls import Recording
 
 HERE = Path(__file__).resolve().parent
@@ -22,6 +30,9 @@ _KERNEL = re.compile(r'extern "C" __global__ void (?:__launch_bounds__\([^)]*\) 
 FLAGS = ["-std=c++20", "-O1", "-g1", "-fPIC", "-shared", "-ffp-contract=off", "-fno-gnu-unique", "-fvisibility=hidden"]
 FLAGS += ["-Wall", "-Wextra", "-Wno-unknown-pragmas", "-Wno-unused-function", "-Wno-unused-parameter"]
 # always_inline into sanitized or unoptimised code takes minutes
+# Of PTX. Where it has no instruction for it, fmaf is a call of libm, which is as exact.
+PTX_FLAGS = ["-fno-strict-aliasing", "-Wno-unused-label", "-Wno-unused-variable", "-Wno-unused-but-set-variable"]
+PTX_FLAGS += ["-mfma"] if torch.backends.cpu.get_cpu_capability().startswith("AVX") else []
 SANITIZE = ["-fsanitize=address,undefined", "-fno-sanitize-recover=undefined", "-DETSPLAT_SANITIZE"]
 
 
@@ -29,6 +40,8 @@ class Simt:
     """In the place of ``etsplat.engines.cuda.device.Device``: runs kernels in this process, on CPU tensors."""
 
     device_type = "cpu"
+    architecture: str | None = None
+    """Of the PTX that is run, such as "compute_75"; None for the sources (``pytest --ptx`` sets it for all)."""
 
     def __init__(self, order_seed: int = 0) -> None:
         self.order_seed = order_seed
@@ -63,11 +76,27 @@ class Simt:
             kept = [type(value).from_buffer_copy(value) for value in values]
             self._recording.steps.append(lambda: self.launch(program, name, grid, block, kept))
         self.launches.append(name)
-        run = getattr(library(program.source), f"simt_launch_{name}")
-        run.restype = ctypes.c_char_p
-        failure = run((ctypes.c_uint * 3)(*grid), (ctypes.c_uint * 3)(*block), pointers_to(values), self.order_seed)
+        failure = run(self.library(program), name, grid, block, values, self.order_seed)
         if failure is not None:
-            raise RuntimeError(f"{name} ({program}): {failure.decode()}")
+            raise RuntimeError(f"{name} ({program}): {failure}")
+
+    def library(self, program: Program) -> ctypes.CDLL:
+        """What holds the program's kernels."""
+        return library(program.source) if self.architecture is None else ptx_library(program, self.architecture)
+
+
+def run(
+    kernels: ctypes.CDLL, name: str, grid: Sequence[int], block: Sequence[int], values: Sequence[Any], seed: int = 0
+) -> str | None:
+    """Launches a kernel; what went wrong, or None."""
+    given = [ctypes.sizeof(value) for value in values]
+    expected = list(takewhile(bool, (ctypes.c_uint * (len(values) + 1)).in_dll(kernels, f"simt_parameters_{name}")))
+    if given != expected:
+        return f"the arguments have {given} bytes, the parameters {expected}"
+    launch = getattr(kernels, f"simt_launch_{name}")
+    launch.restype = ctypes.c_char_p
+    failure = launch((ctypes.c_uint * 3)(*grid), (ctypes.c_uint * 3)(*block), pointers_to(values), seed)
+    return None if failure is None else failure.decode()
 
 
 def sanitized() -> bool:
@@ -88,6 +117,17 @@ def library(source: str, extra_flags: tuple[str, ...] = ()) -> ctypes.CDLL:
 
 
 @cache
+def ptx_library(program: Program, architecture: str) -> ctypes.CDLL:
+    """The same of the PTX for a virtual architecture."""
+    flags = (*FLAGS, *PTX_FLAGS, f"-I{HERE}")
+    path = FOLDER / f"{_digest(program_key(program, architecture), *flags)}.so"
+    if not path.is_file():
+        text = ptx.translate(compile_without_cache(program, architecture).decode())
+        _compile(text, "kernel.cpp", [f"-I{_precompiled_shim(flags)}", *flags], path)
+    return ctypes.CDLL(str(path))
+
+
+@cache
 def _precompiled_shim(flags: tuple[str, ...]) -> Path:
     """A folder in which g++ finds simt.h compiled: half of the time that a kernel would take."""
     folder = FOLDER / f"{_digest(*flags)}.shim"
@@ -98,7 +138,7 @@ def _precompiled_shim(flags: tuple[str, ...]) -> Path:
 
 
 def _digest(*parts: str) -> str:
-    shim = ((HERE / name).read_text() for name in ("simt.h", "intrinsics.h"))
+    shim = ((HERE / name).read_text() for name in ("simt.h", "intrinsics.h", "ptx.h", "ptx.py"))
     return hashlib.sha256("\0".join([*parts, *shim, _compiler()]).encode()).hexdigest()[:24]
 
 

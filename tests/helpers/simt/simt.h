@@ -12,6 +12,7 @@
 
 #include <sys/mman.h>
 
+#include <array>
 #include <bit>
 #include <cmath>
 #include <cstdint>
@@ -324,10 +325,20 @@ const char* launch(void (*kernel)(P...), const unsigned* grid, const unsigned* b
     return launch(kernel, grid, block, arguments, std::index_sequence_for<P...>());
 }
 
+template <class Kernel>
+struct Parameters;
+template <class... P>
+struct Parameters<void (*)(P...)> {
+    static constexpr std::array<unsigned, sizeof...(P) + 1> kSizes{sizeof(P)...};  // and 0 behind
+};
+
 }  // namespace simt
 
-// What a test calls to run a kernel; the build adds one for each.
+// What a test calls to run a kernel, and the sizes of its parameters; the build adds these for each.
 #define SIMT_EXPORT(kernel)                                                                                       \
+    extern "C" {                                                                                                  \
+    __attribute__((visibility("default"))) auto simt_parameters_##kernel = simt::Parameters<decltype(&kernel)>::kSizes; \
+    }                                                                                                             \
     extern "C" __attribute__((visibility("default"))) const char* simt_launch_##kernel(                           \
         const unsigned* grid, const unsigned* block, void** arguments, unsigned order_seed) {                     \
         simt::machine.order_seed = order_seed;                                                                    \

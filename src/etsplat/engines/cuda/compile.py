@@ -26,8 +26,7 @@ def compile_program(program: Program, architecture: str) -> bytes:
         InputError: Others can write to the folder of the cache.
         RuntimeError: The source does not compile; the message is the compiler's.
     """
-    nvrtc = import_nvrtc()
-    path = cache_folder() / f"{_key(program, architecture, nvrtc_version(nvrtc))}.cubin"
+    path = cache_folder() / f"{program_key(program, architecture)}.cubin"
     cubin = _load(path)
     if cubin is None:
         start = time.perf_counter()
@@ -38,7 +37,10 @@ def compile_program(program: Program, architecture: str) -> bytes:
 
 
 def compile_without_cache(program: Program, architecture: str) -> bytes:
-    """As ``compile_program``, without looking at the cache or writing to it."""
+    """As ``compile_program``, without looking at the cache or writing to it.
+
+    For a virtual architecture such as "compute_75" it is the PTX, as text.
+    """
     nvrtc = import_nvrtc()
     handle = _checked(nvrtc, nvrtc.nvrtcCreateProgram(program.source.encode(), program.file.encode(), 0, [], []))
     try:
@@ -50,6 +52,10 @@ def compile_without_cache(program: Program, architecture: str) -> bytes:
             raise RuntimeError(
                 f"{program} for {architecture}: {status.name}\n{log.decode(errors='replace').rstrip(chr(0))}"
             )
+        if architecture.startswith("compute_"):
+            ptx = b" " * _checked(nvrtc, nvrtc.nvrtcGetPTXSize(handle))
+            _checked(nvrtc, nvrtc.nvrtcGetPTX(handle, ptx))
+            return ptx.rstrip(b"\0")
         cubin = b" " * _checked(nvrtc, nvrtc.nvrtcGetCUBINSize(handle))
         _checked(nvrtc, nvrtc.nvrtcGetCUBIN(handle, cubin))
         return cubin
@@ -122,8 +128,13 @@ def _options(program: Program, architecture: str) -> tuple[str, ...]:
     return (*OPTIONS, f"--fmad={contraction}", f"--gpu-architecture={architecture}")
 
 
-def _key(program: Program, architecture: str, version: tuple[int, int]) -> str:
-    parts = (program.source, *_options(program, architecture), str(version))
+def program_key(program: Program, architecture: str) -> str:
+    """A name for what is compiled: that of the source, the options and the version of NVRTC.
+
+    Raises:
+        EngineUnavailableError: NVRTC is not installed.
+    """
+    parts = (program.source, *_options(program, architecture), str(nvrtc_version(import_nvrtc())))
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()
 
 
