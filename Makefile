@@ -153,10 +153,13 @@ races:
 # Kernels as NVRTC compiles them, translated to C++ (tests/helpers/simt/ptx.py), in all tests that run them on the CPU.
 PTX ?= compute_75 compute_90
 PTX_TESTS ?= tests
-# Every program, most of them in all that they are defined to: what .ci/run has time for.
+# Every file of kernels, and whole steps: what .ci/run has time for, 80 s of one processor with all that is compiled.
 PTX_SHORT := tests/engines tests/ops/test_cuda_ops.py tests/ops/test_texture.py tests/ops/test_triangle_channels.py \
 	tests/ops/test_normal_consistency.py tests/ops/test_soup_activation.py \
-	tests/ops/test_rasterize_engines.py::test_softness_from_sharp_to_flat
+	tests/ops/test_rasterize_engines.py::test_softness_from_sharp_to_flat \
+	tests/optim/test_terms.py::test_mean_area_agrees_with_the_float64_reference \
+	tests/tasks/test_cuda_train.py::test_replayed_steps_are_those_that_are_called \
+	tests/tasks/test_cuda_reconstruct.py::test_replayed_steps_are_those_that_are_called
 ptx: setup
 	for architecture in $(PTX); do $(PY) -m pytest -n auto --ptx $$architecture $(PTX_TESTS) $(PYTEST_ARGS) || exit 1; done
 
