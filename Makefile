@@ -33,7 +33,7 @@ help:
 	@echo "make equal-bits BASE=COMMIT  small runs end with the same bits as at that commit; CASES='scene-*' for some"
 	@echo "make sanitize     run the tests of the C++ under ASan, LSan and UBSan (GCC, Linux)"
 	@echo "make fuzz         a million changed files and 100,000 odd calls; FUZZ='--targets mesh*' for some; fuzz-short for a minute"
-	@echo "make races        threads and forks under ThreadSanitizer (GCC, Linux); RACES=300 for so many seconds"
+	@echo "make races        threads, forks and GPU kernels under ThreadSanitizer (GCC, Linux); RACES=300 for so many seconds"
 	@echo "make ptx          tests of the GPU engine on the CPU, on what NVRTC compiles; PTX=compute_75 for one architecture"
 	@echo "make soak         kill runs, fill their disk, move their clock; SOAK=100 for so many of each (Linux)"
 	@echo "make lock         requirements.lock: the newest versions that fit, with hashes; make audit: known holes in them"
@@ -145,21 +145,31 @@ SOAK ?= 20
 soak: setup
 	PYTHONPATH=tests $(PY) -m tests.soak --trials $(SOAK)
 
-RACES ?= 60
-races:
-	tests/native/run.sh races $(RACES)
-	tests/native/run.sh forks $(RACES)
-
-# Kernels as NVRTC compiles them, translated to C++ (tests/helpers/simt/ptx.py), in all tests that run them on the CPU.
-PTX ?= compute_75 compute_90
-PTX_TESTS ?= tests
-# Every file of kernels, and whole steps: what .ci/run has time for, 80 s of one processor with all that is compiled.
-PTX_SHORT := tests/engines tests/ops/test_cuda_ops.py tests/ops/test_texture.py tests/ops/test_triangle_channels.py \
+# Every file of kernels, and whole steps: what .ci/run has time for, up to 100 s of one processor with all that is compiled.
+KERNEL_TESTS := tests/engines tests/ops/test_cuda_ops.py tests/ops/test_texture.py tests/ops/test_triangle_channels.py \
 	tests/ops/test_normal_consistency.py tests/ops/test_soup_activation.py \
 	tests/ops/test_rasterize_engines.py::test_softness_from_sharp_to_flat \
 	tests/optim/test_terms.py::test_mean_area_agrees_with_the_float64_reference \
 	tests/tasks/test_cuda_train.py::test_replayed_steps_are_those_that_are_called \
 	tests/tasks/test_cuda_reconstruct.py::test_replayed_steps_are_those_that_are_called
+
+# The threads of the C++, and those of the GPU engine's kernels: all tests that run kernels on the CPU, where only what orders
+# memory on a device orders it (tests/helpers/simt/races.h). Each test fails for what is reported in it.
+RACES ?= 60
+RACES_TESTS ?= tests
+RACER = TSAN_OPTIONS="log_path=$(CURDIR)/build/races/report exitcode=0 ignore_noninstrumented_modules=1 \
+	report_signal_unsafe=0 report_thread_leaks=0 suppress_equal_addresses=0 history_size=2" \
+	LD_PRELOAD="$$($(CXX) -print-file-name=libtsan.so)" setarch --addr-no-randomize
+races: setup
+	tests/native/run.sh races $(RACES)
+	tests/native/run.sh forks $(RACES)
+	rm -rf build/races
+	mkdir -p build/races
+	$(RACER) $(PY) -m pytest -p no:cacheprovider -n auto $(RACES_TESTS) $(PYTEST_ARGS)
+
+# Kernels as NVRTC compiles them, translated to C++ (tests/helpers/simt/ptx.py), in all tests that run them on the CPU.
+PTX ?= compute_75 compute_90
+PTX_TESTS ?= tests
 ptx: setup
 	for architecture in $(PTX); do $(PY) -m pytest -n auto --ptx $$architecture $(PTX_TESTS) $(PYTEST_ARGS) || exit 1; done
 

@@ -10,7 +10,7 @@ import torch
 
 from etsplat.core.kernels import DISTANCES, KERNELS
 from etsplat.engines.cuda.launch import device_type, use_backend
-from helpers.simt.build import Simt
+from helpers.simt.build import Races, Simt, watched
 
 # Tests run side by side, on small tensors: torch's own threads would only wait for each other.
 torch.set_num_threads(1)
@@ -47,7 +47,7 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    if config.getoption("--ptx"):
+    if config.getoption("--ptx") or watched():
         chosen = [item for item in items if isinstance(item, pytest.Function) and _runs_kernels(item)]
         config.hook.pytest_deselected(items=[item for item in items if item not in chosen])
         items[:] = chosen
@@ -59,7 +59,21 @@ def _runs_kernels(test: pytest.Function) -> bool:
     others = {"reference", "cpu", "device"}
     if any(parameters.get(name) in others for name in ("engine", "native", "cuda_engine")):
         return False
-    return not {"simt", "cuda_engine", "engine_of"}.isdisjoint(test.fixturenames)
+    return not {"simt", "cuda_engine", "engine_of", "races"}.isdisjoint(test.fixturenames)
+
+
+@pytest.fixture(scope="session")
+def reported() -> Races | None:
+    """What ThreadSanitizer says, where it watches."""
+    return Races() if watched() else None
+
+
+@pytest.fixture(autouse=True)
+def no_races(reported: Races | None) -> Iterator[None]:
+    """A race in a kernel fails the test in which it is found."""
+    yield
+    if reported:
+        assert reported.new() == []
 
 
 @pytest.fixture

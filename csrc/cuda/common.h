@@ -16,6 +16,12 @@ constexpr unsigned kAllLanes = 0xffffffffu;
 __device__ __forceinline__ int lane_index() { return static_cast<int>(threadIdx.x % kWarp); }
 __device__ __forceinline__ int warp_index() { return static_cast<int>(threadIdx.x / kWarp); }
 
+// A number that others may change at once by atomics: relaxed, as PTX has reads that are volatile. It may be of any time before.
+template <class T>
+__device__ __forceinline__ T load_relaxed(const T* address) {
+    return *static_cast<const volatile T*>(address);
+}
+
 // Sum over the lanes of the warp, for all of them; the order of additions is fixed.
 template <class T>
 __device__ __forceinline__ T warp_sum(T value) {

@@ -15,7 +15,7 @@ __device__ __forceinline__ void record_largest(float magnitude, unsigned* larges
         const unsigned other = __shfl_xor_sync(kAllLanes, bits, distance);
         bits = other > bits ? other : bits;
     }
-    if (lane_index() == 0 && bits > *largest) atomicMax(largest, bits);
+    if (lane_index() == 0 && bits > load_relaxed(largest)) atomicMax(largest, bits);
 }
 
 // 2^38 over the power of two above the largest value; fewer than 2^25 such values fit into a sum (engines/cuda/capacity.py checks it).

@@ -73,7 +73,7 @@ __device__ void draw(const OpaqueTriangle& t, long long face, int begin, int end
             const float w = t.inverse_depth_at(row, slope, x - t.x_begin);
             if (!(w > 0.0f)) continue;
             const Sample sample = static_cast<Sample>(__float_as_uint(w)) << 32 | complement;
-            if (sample > line[x]) atomicMax(line + x, sample);
+            if (sample > load_relaxed(line + x)) atomicMax(line + x, sample);
         }
     }
 }

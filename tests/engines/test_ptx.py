@@ -157,7 +157,7 @@ def test_what_a_device_refuses_is_reported(name, threads, message):
     assert run(compiled(WRONG), "bounded", cells) is None
 
 
-def test_kernels_of_the_package_run_as_compiled(simt, monkeypatch):
+def test_kernels_of_the_package_run_as_compiled(monkeypatch):
     """Through the call that the engine makes."""
     words = torch.zeros(1000, dtype=torch.int32)
     with use_backend(Simt()), monkeypatch.context() as patch:

@@ -34,6 +34,8 @@ FLAGS += ["-Wall", "-Wextra", "-Wno-unknown-pragmas", "-Wno-unused-function", "-
 PTX_FLAGS = ["-fno-strict-aliasing", "-Wno-unused-label", "-Wno-unused-variable", "-Wno-unused-but-set-variable"]
 PTX_FLAGS += ["-mfma"] if torch.backends.cpu.get_cpu_capability().startswith("AVX") else []
 SANITIZE = ["-fsanitize=address,undefined", "-fno-sanitize-recover=undefined", "-DETSPLAT_SANITIZE"]
+# One instance of what is shared by all libraries (races.h) is what -fno-gnu-unique would prevent.
+RACES = ["-fsanitize=thread", "--param=tsan-distinguish-volatile=1", "-fgnu-unique", "-DETSPLAT_SANITIZE"]
 
 
 class Simt:
@@ -104,12 +106,34 @@ def sanitized() -> bool:
     return "libasan" in os.environ.get("LD_PRELOAD", "")
 
 
+def watched() -> bool:
+    """Whether this process has ThreadSanitizer loaded, as ``make races`` runs it."""
+    return "libtsan" in os.environ.get("LD_PRELOAD", "")
+
+
+class Races:
+    """The reports of ThreadSanitizer in this process, which it writes to the path in its options."""
+
+    def __init__(self) -> None:
+        path = re.search(r"log_path=(\S+)", os.environ["TSAN_OPTIONS"])
+        assert path, "TSAN_OPTIONS has no log_path"
+        self._file = Path(f"{path[1]}.{os.getpid()}")
+        self._read = 0
+        self.new()
+
+    def new(self) -> list[str]:
+        """Those since this was asked last, a line each: what raced."""
+        text = self._file.read_text(errors="replace") if self._file.exists() else ""
+        new, self._read = text[self._read :], len(text)
+        return re.findall(r"^SUMMARY: ThreadSanitizer: (.*)$", new, re.MULTILINE)
+
+
 @cache
 def library(source: str, extra_flags: tuple[str, ...] = ()) -> ctypes.CDLL:
     """The shared library of a CUDA source, from build/simt if it is there."""
     exports = "".join(f"SIMT_EXPORT({name})\n" for name in _KERNEL.findall(source))
     text = f'#include "simt.h"\n{source}\n#line 1 "exports"\n{exports}'
-    flags = (*FLAGS, *(SANITIZE if sanitized() else []), *extra_flags, f"-I{HERE}")
+    flags = (*FLAGS, *(SANITIZE if sanitized() else RACES if watched() else []), *extra_flags, f"-I{HERE}")
     path = FOLDER / f"{_digest(text, *flags)}.so"
     if not path.is_file():
         _compile(text, "kernel.cpp", [f"-I{_precompiled_shim(flags)}", *flags], path)
@@ -138,7 +162,7 @@ def _precompiled_shim(flags: tuple[str, ...]) -> Path:
 
 
 def _digest(*parts: str) -> str:
-    shim = ((HERE / name).read_text() for name in ("simt.h", "intrinsics.h", "ptx.h", "ptx.py"))
+    shim = ((HERE / name).read_text() for name in ("simt.h", "intrinsics.h", "races.h", "ptx.h", "ptx.py"))
     return hashlib.sha256("\0".join([*parts, *shim, _compiler()]).encode()).hexdigest()[:24]
 
 

@@ -46,7 +46,7 @@ T from_lane(unsigned mask, T value, const char* operation, int source) {
 inline int lane() { return static_cast<int>(machine.current->lane()); }
 }  // namespace simt
 
-inline void __syncwarp(unsigned mask = ~0u) { simt::exchange(mask, 0, "__syncwarp"); }
+inline void __syncwarp(unsigned mask = ~0u) { simt::exchange(mask, 0, "__syncwarp", true); }
 template <class T>
 T __shfl_sync(unsigned mask, T value, int source, int width = 32) {
     return simt::from_lane(mask, value, "__shfl_sync", (simt::lane() & ~(width - 1)) | (source & (width - 1)));
@@ -86,11 +86,13 @@ unsigned __match_any_sync(unsigned mask, T value) {
 inline int __any_sync(unsigned mask, int predicate) { return __ballot_sync(mask, predicate) != 0; }
 inline int __all_sync(unsigned mask, int predicate) { return __ballot_sync(mask, predicate) == mask; }
 
-// Atomics: fibers give way nowhere inside of them.
+// Atomics: fibers give way nowhere inside of them. They order no other memory.
 template <class T, class F>
 T simt_update(T* address, F&& change) {
-    const T old = *address;
-    *address = change(old);
+    T old;
+    __atomic_load(address, &old, __ATOMIC_RELAXED);
+    T changed = change(old);
+    while (!__atomic_compare_exchange(address, &old, &changed, false, __ATOMIC_RELAXED, __ATOMIC_RELAXED)) changed = change(old);
     return old;
 }
 template <class T> T atomicAdd(T* p, T v) { return simt_update(p, [=](T old) { return static_cast<T>(old + v); }); }

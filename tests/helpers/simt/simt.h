@@ -3,8 +3,8 @@
 // Blocks run one after another, in order; the threads of a block are fibers. A fiber runs until a barrier or a warp
 // operation makes it wait, then another one goes on, its own warp first. So this finds wrong results, wrong masks, missing
 // arrivals (reported as a deadlock, with who waits where) and, with sanitizers, wrong addresses. Shared memory is
-// poisoned before each block. It is no model of memory order and no race detector: `order_seed` starts the threads in
-// another order, which exposes some races.
+// poisoned before each block. `order_seed` starts the threads in another order, which exposes some races; ThreadSanitizer,
+// where it is, reports those of any order, as races.h tells it what orders memory on a device.
 //
 // A failure ends the launch and comes back as a message. Kernels need no change, but: shared arrays are declared in the
 // kernel itself and not in templates, and kernels are extern "C".
@@ -27,6 +27,7 @@
 #ifdef __SANITIZE_ADDRESS__
 #include <sanitizer/asan_interface.h>
 #endif
+#include "races.h"
 
 #if !defined(__x86_64__) || defined(SIMT_UCONTEXT)
 #define SIMT_USES_UCONTEXT 1
@@ -70,6 +71,7 @@ struct Fiber {
     const char* operation = "";
     unsigned mask = 0;
     unsigned exchanges = 0;
+    void* context_of_races = nullptr;
 
     unsigned lane() const { return index % kWarpSize; }
     bool runnable() const { return !done && (!awaited || *awaited != seen); }
@@ -124,10 +126,11 @@ simt_switch:
 )");
 #endif
 
-inline void switch_to(Fiber& next) {
+SIMT_MACHINE void switch_to(Fiber& next) {
     Fiber& self = *machine.current;
     if (&self == &next) return;
     machine.current = &next;
+    races::switch_to(next.context_of_races);
 #ifdef SIMT_USES_UCONTEXT
     swapcontext(&self.context, &next.context);
 #else
@@ -136,7 +139,7 @@ inline void switch_to(Fiber& next) {
 }
 
 // Ends the launch; the fibers are left where they are and their stacks used again.
-[[noreturn]] inline void fail(const std::string& what) {
+[[noreturn]] SIMT_MACHINE void fail(const std::string& what) {
     const uint3 b = machine.block;
     machine.failure = what + " in block (" + std::to_string(b.x) + ", " + std::to_string(b.y) + ", " +
                       std::to_string(b.z) + ")";
@@ -155,7 +158,7 @@ inline void switch_to(Fiber& next) {
 }
 
 // Lets another fiber run: of the same warp if one can, else of the block. Returns when this one is chosen again.
-inline void give_way() {
+SIMT_MACHINE void give_way() {
     Machine& m = machine;
     const unsigned self = m.current->index, total = static_cast<unsigned>(m.fibers.size());
     const unsigned base = self / kWarpSize * kWarpSize, lanes = std::min(kWarpSize, total - base);
@@ -171,7 +174,7 @@ inline void give_way() {
     fail("deadlock");
 }
 
-inline void wait_for(const unsigned& generation, const char* operation, unsigned mask) {
+SIMT_MACHINE void wait_for(const unsigned& generation, const char* operation, unsigned mask) {
     Fiber& self = *machine.current;
     self.awaited = &generation;
     self.seen = generation;
@@ -181,7 +184,7 @@ inline void wait_for(const unsigned& generation, const char* operation, unsigned
     self.awaited = nullptr;
 }
 
-inline void release_barrier() {
+SIMT_MACHINE void release_barrier() {
     machine.arrived = 0;
     machine.result = machine.count;
     machine.count = 0;
@@ -189,17 +192,19 @@ inline void release_barrier() {
 }
 
 // Number of threads of the block with the predicate, when all that have not ended are here.
-inline int barrier(bool predicate, const char* operation) {
+SIMT_MACHINE int barrier(bool predicate, const char* operation) {
     machine.count += predicate;
+    races::Order order = races::of_block(machine.generation);
     if (++machine.arrived == machine.alive)
         release_barrier();
     else
         wait_for(machine.generation, operation, 0);
+    order.joined();
     return machine.result;
 }
 
 // Values of the lanes in the mask, when all of them are here.
-inline const uint64_t* exchange(unsigned mask, uint64_t value, const char* operation) {
+SIMT_MACHINE const uint64_t* exchange(unsigned mask, uint64_t value, const char* operation, bool orders_memory = false) {
     Fiber& self = *machine.current;
     Warp& warp = machine.warps[self.index / kWarpSize];
     if (!(mask >> self.lane() & 1)) fail(std::string(operation) + ": the calling lane is not in its mask");
@@ -220,19 +225,22 @@ inline const uint64_t* exchange(unsigned mask, uint64_t value, const char* opera
     uint64_t* values = warp.values[parity];
     values[self.lane()] = value;
     meeting->arrived |= 1u << self.lane();
+    races::Order order = races::of_lanes(orders_memory, self.index / kWarpSize, meeting - warp.meetings, meeting->generation);
     if (meeting->arrived == mask) {
         meeting->arrived = 0;
         ++meeting->generation;
     } else {
         wait_for(meeting->generation, operation, mask);
     }
+    order.joined();
     return values;
 }
 
-inline void end_thread() {
+SIMT_MACHINE void end_thread() {
     Machine& m = machine;
     Fiber& self = *m.current;
     self.done = true;
+    races::thread_ends();
     --m.alive;
     Warp& warp = m.warps[self.index / kWarpSize];
     warp.exited |= 1u << self.lane();
@@ -242,18 +250,20 @@ inline void end_thread() {
     if (m.alive > 0 && m.arrived == m.alive) release_barrier();
 }
 
-inline void run_thread() {
+SIMT_MACHINE void run_thread() {
+    races::thread_begins();
     machine.kernel();
     end_thread();
     for (;;) give_way();
 }
 
-inline void prepare(Fiber& fiber, unsigned index) {
+SIMT_MACHINE void prepare(Fiber& fiber, unsigned index) {
     const dim3 size = machine.block_size;
     fiber = Fiber();
     fiber.index = index;
+    fiber.context_of_races = races::context(index);
     fiber.thread = {index % size.x, index / size.x % size.y, index / (size.x * size.y)};
-    char* stack = machine.stacks + index * kStackSize;
+    char* stack = machine.stacks + (races::set_of_block() * kMostThreads + index) * kStackSize;
 #ifdef SIMT_USES_UCONTEXT
     getcontext(&fiber.context);
     fiber.context.uc_stack.ss_sp = stack;
@@ -274,8 +284,9 @@ inline void prepare(Fiber& fiber, unsigned index) {
 #endif
 }
 
-inline void run_block(uint3 block) {
+SIMT_MACHINE void run_block(uint3 block) {
     Machine& m = machine;
+    races::machine_begins();
     m.block = block;
     const unsigned threads = m.block_size.x * m.block_size.y * m.block_size.z;
     m.fibers.resize(threads);
@@ -284,14 +295,17 @@ inline void run_block(uint3 block) {
     m.arrived = m.generation = 0;
     m.count = 0;
     if (__start_simt_shared) memset(__start_simt_shared, kPoison, static_cast<size_t>(__stop_simt_shared - __start_simt_shared));
+    races::block_begins(__start_simt_shared, __stop_simt_shared);
     for (unsigned i = 0; i < threads; ++i) prepare(m.fibers[i], i);
+    m.host.context_of_races = races::current_context();
     const unsigned first = m.order_seed == 0 ? 0 : (m.order_seed * 2654435761u + block.x * 97 + block.y * 31) % threads;
     m.current = &m.host;
+    races::machine_ends();
     switch_to(m.fibers[first]);
 }
 
 // Runs the grid; nullptr, or what went wrong.
-inline const char* run_grid(const unsigned* grid, const unsigned* block, std::function<void()> kernel) {
+SIMT_MACHINE const char* run_grid(const unsigned* grid, const unsigned* block, std::function<void()> kernel) {
     Machine& m = machine;
     m.grid_size = {grid[0], grid[1], grid[2]};
     m.block_size = {block[0], block[1], block[2]};
@@ -300,18 +314,20 @@ inline const char* run_grid(const unsigned* grid, const unsigned* block, std::fu
     if (threads == 0 || threads > kMostThreads) return "a block has 1 to 1024 threads";
     // Never unmapped: AddressSanitizer goes on to guard what frames on them it has seen.
     if (!m.stacks)
-        m.stacks = static_cast<char*>(mmap(nullptr, kMostThreads * kStackSize, PROT_READ | PROT_WRITE,
+        m.stacks = static_cast<char*>(mmap(nullptr, races::kSets * kMostThreads * kStackSize, PROT_READ | PROT_WRITE,
                                            MAP_PRIVATE | MAP_ANONYMOUS | MAP_NORESERVE, -1, 0));
 #ifdef __SANITIZE_ADDRESS__
     if (!m.failure.empty()) __asan_unpoison_memory_region(m.stacks, kMostThreads * kStackSize);  // frames left behind
 #endif
     m.failure.clear();
+    races::launch_begins();
     for (unsigned z = 0; z < grid[2]; ++z)
         for (unsigned y = 0; y < grid[1]; ++y)
             for (unsigned x = 0; x < grid[0]; ++x) {
                 run_block({x, y, z});
                 if (!m.failure.empty()) return m.failure.c_str();
             }
+    races::launch_ends();
     return nullptr;
 }
 
