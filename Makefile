@@ -145,7 +145,7 @@ SOAK ?= 20
 soak: setup
 	PYTHONPATH=tests $(PY) -m tests.soak --trials $(SOAK)
 
-# Every file of kernels, and whole steps: what .ci/run has time for, up to 100 s of one processor with all that is compiled.
+# Every file of kernels, and whole steps: what .ci/run has time for, some 100 s of one processor with all that is compiled.
 KERNEL_TESTS := tests/engines tests/ops/test_cuda_ops.py tests/ops/test_texture.py tests/ops/test_triangle_channels.py \
 	tests/ops/test_normal_consistency.py tests/ops/test_soup_activation.py \
 	tests/ops/test_rasterize_engines.py::test_softness_from_sharp_to_flat \
