@@ -1,10 +1,12 @@
 """Terms that keep a soup in order (paper section 3.4, L_nvs)."""
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from etsplat.ops.normal_consistency import normal_consistency
 from etsplat.ops.triangle_area import mean_area
@@ -55,7 +57,22 @@ class Harmonics(Term):
     def __call__(self, drawing: Drawing) -> Float[Tensor, ""]:
         """Of the soup."""
         coefficients = drawing.model.sh_rest
-        return coefficients.square().sum() / len(coefficients)
+        return _SquaredNorm.apply(coefficients) / len(coefficients)
+
+
+class _SquaredNorm(torch.autograd.Function):
+    """The sum of squares. By torch's own derivatives arrays as large as the soup's largest are written thrice."""
+
+    @staticmethod
+    def forward(ctx: Any, values: Tensor) -> Tensor:
+        ctx.save_for_backward(values)
+        return torch.linalg.vector_norm(values).square()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> Tensor:
+        (values,) = ctx.saved_tensors
+        return values * (2 * gradient)
 
 
 class DepthNormals(Term):
