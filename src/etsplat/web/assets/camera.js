@@ -92,7 +92,7 @@ function pressedKeys(canvas, camera, changed) {
     let last = 0;
     function fly(now) {
         if (!pressed.size) return;
-        const step = FLIGHT_SPEED * Math.min((now - last) / 1000, 0.1);
+        const step = FLIGHT_SPEED * Math.min(Math.max(now - last, 0) / 1000, 0.1); // a frame may have begun before the key
         last = now;
         for (const key of pressed) camera.move(FLIGHT[key].map((value) => value * step));
         changed();
