@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from etsplat.core.errors import InputError
-from etsplat.io.compact_soups import CHUNK, CompactSoup, decode_compact, encode_compact, read_compact
+from etsplat.io.compact_soups import CHUNK, CompactSoup, decode_compact, encode_compact, enlargement, read_compact
 
 
 def soup_of(count, degree=3, seed=0):
@@ -81,11 +81,31 @@ def test_a_file_that_is_cut_short_draws_its_most_important_triangles(tmp_path):
         path.write_bytes(data[:cut])
         found = read_compact(path)
         assert (len(found), found.left_out) == (kept, len(soup) - kept)
-        assert np.array_equal(found.vertices, whole.vertices[:kept])
+        middles = whole.vertices[:kept].mean(axis=1, keepdims=True)
+        larger = middles + enlargement(kept / len(soup)) * (whole.vertices[:kept] - middles)
+        np.testing.assert_allclose(found.vertices, larger, rtol=1e-4, atol=1e-3)
     for cut in (0, 3, 11, 40, ends[0], ends[1] - 1):
         path.write_bytes(data[:cut])
         with pytest.raises(InputError, match=r"soup\.etz: cannot be read \(.*\); export it again"):
             read_compact(path)
+
+
+def test_the_fewer_triangles_the_larger_they_are():
+    """Never larger than equal ones must be to cover the same; and not at all where none is missing."""
+    shares = np.linspace(0.001, 1, 100)
+    factors = np.array([enlargement(share) for share in shares])
+    assert (np.diff(factors) < 0).all()
+    assert (factors <= shares**-0.5).all()
+    assert factors[-1] == 1
+
+
+def test_a_file_that_enlarges_nothing_is_read_as_it_is():
+    """As they were written before."""
+    data = encode_compact(soup_of(CHUNK + 10, degree=0))
+    header = {name: value for name, value in header_of(data).items() if name != "enlarged"}
+    text = json.dumps(header).encode()
+    before = data[:8] + struct.pack("<I", len(text)) + text + data[start_of(data) :]
+    assert np.array_equal(decode_compact(before[:-1]).vertices, decode_compact(data).vertices[:CHUNK])
 
 
 def start_of(data):
@@ -121,6 +141,11 @@ def with_header(data, **changes):
         ({"sigma": {"low": 0, "step": 1}}, "softness that is none"),
         ({"sigma": {}}, r"lacks `sigma\.low`"),
         ({"notes": {"focal": 3}}, "no text"),
+        ({"enlarged": 2}, "no factor"),
+        ({"enlarged": [1, 1]}, "no factor"),
+        ({"enlarged": [0.5]}, "no factor"),
+        ({"enlarged": [1e9]}, "no factor"),
+        ({"enlarged": [True]}, "no factor"),
     ],
 )
 def test_a_header_that_says_what_cannot_be_is_refused(changes, message):

@@ -8,10 +8,10 @@ import torch
 import etsplat
 from etsplat.core.errors import InputError
 from etsplat.core.kernels import KERNELS
-from etsplat.io.compact_soups import CHUNK, encode_compact
+from etsplat.io.compact_soups import CHUNK, encode_compact, enlargement
 from etsplat.metrics.image import psnr
 from etsplat.model.soup_appearance import SoupAppearance
-from etsplat.model.soup_compact import CUT_SHORT, compact_of, importance
+from etsplat.model.soup_compact import CUT_SHORT, compact_of, importance, ranks
 from etsplat.model.soup_import import open_soup
 from etsplat.model.triangle_soup import TriangleSoup
 
@@ -73,6 +73,41 @@ def test_what_shows_most_comes_first(rng):
     alone = importance(soup)
     assert alone.shape == (4,)
     assert bool((alone > 0).all())
+
+
+def test_parts_show_more_by_ranks_and_enlarged():
+    """Spheres of triangles that lie over each other: 2 dB by the size, something by the order too."""
+    shown = torch.tensor([decibels_of_parts(torch.Generator().manual_seed(seed)) for seed in range(4)]).mean(dim=0)
+    as_they_are, enlarged, ranked = shown.tolist()
+    assert enlarged > as_they_are + 2
+    assert ranked > enlarged + 0.1
+
+
+def decibels_of_parts(rng):
+    """Of the 90 most important of 600 triangles as they are and enlarged, and of the 90 first by rank, enlarged."""
+    middles = torch.nn.functional.normalize(torch.randn(600, 1, 3, generator=rng), dim=-1)
+    corners = 0.8 * middles * (1 + 0.02 * torch.randn(600, 1, 1, generator=rng))
+    corners = corners + 0.12 * torch.randn(600, 3, 3, generator=rng)
+    colors = 0.3 * torch.rand(600, 3, generator=rng) + 0.5
+    soup = TriangleSoup.from_triangles(corners, colors, opacity=0.6, sigma=0.5, sh_degree=0)
+    by_importance, by_rank = importance(soup, [CAMERA]), ranks(soup, [CAMERA])
+    assert sorted(by_rank.tolist()) == list(range(1, 601))
+    whole = picture_of(soup)
+    return [
+        float(psnr(picture_of(soup.kept(order.argsort(descending=True)[:90]), factor), whole))
+        for order, factor in ((by_importance, 1.0), (by_importance, enlargement(0.15)), (by_rank, enlargement(0.15)))
+    ]
+
+
+@torch.no_grad()
+def picture_of(soup, factor=1.0):
+    middles = soup.vertices.mean(dim=1, keepdim=True)
+    return replace(soup, vertices=middles + factor * (soup.vertices - middles)).render(CAMERA).color[0].clamp(0, 1)
+
+
+def test_without_cameras_ranks_are_those_of_importance(rng):
+    soup = make_soup(rng)
+    assert ranks(soup).argsort().tolist() == importance(soup).argsort().tolist()
 
 
 def test_a_part_of_a_soup_says_that_it_is_one(tmp_path, rng):

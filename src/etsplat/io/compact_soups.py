@@ -3,6 +3,8 @@
 The format is described in docs/compact_format.md. Files end in .etz.
 """
 
+import bisect
+import itertools
 import json
 import math
 import struct
@@ -28,6 +30,7 @@ _OFFSET_STEPS = 1023
 _CONSTANT_STEP = 1 / 128
 _BAND_STEP = 1 / 64
 _FINEST = (1 << 24) - 1  # of a centre's coordinate
+_MOST_ENLARGED = 1e4
 
 Places = dict[str, np.ndarray]
 
@@ -44,7 +47,7 @@ class CompactSoup:
         corner_colors: (N, 3, 3) in [0, 1]; None of soft triangles.
         appearance: how they are drawn, as `SoupAppearance.to_json` says it.
         notes: text by name.
-        left_out: how many triangles are missing at the end of a file that was cut short.
+        left_out: how many triangles are missing at the end of a file that was cut short; soft ones are larger for them.
     """
 
     vertices: np.ndarray
@@ -58,6 +61,16 @@ class CompactSoup:
 
     def __len__(self) -> int:
         return len(self.vertices)
+
+
+def enlargement(share: float) -> float:
+    """How much larger soft triangles are drawn about their centres if only the first `share` of a soup is, in (0, 1].
+
+    So that they cover what the others would: fitted to prefixes of two scenes (research/results.md). At most as
+    large as equal triangles would have to be, and with many left out less than that.
+    """
+    octaves = -math.log(share)
+    return math.exp(min(0.08 * octaves, 0.2) * octaves)
 
 
 def encode_compact(soup: CompactSoup) -> bytes:
@@ -79,6 +92,7 @@ def encode_compact(soup: CompactSoup) -> bytes:
         "count": len(soup),
         "bases": bases,
         "chunks": [[count, len(data)] for count, data in chunks],
+        **({"enlarged": _enlarged([count for count, _ in chunks])} if bases else {}),
         **scales,
         "appearance": dict(soup.appearance),
         "notes": dict(sorted(soup.notes.items())),  # safetensors gives them in any order
@@ -109,17 +123,23 @@ def decode_compact(data: bytes) -> CompactSoup:
     """
     header, start = _header(data)
     channels = _channels(header["bases"])
-    parts = []
-    for rows, size in header["chunks"]:
-        if start + size > len(data):
-            break
-        parts.append(_restored(header, unpack_chunk(channels, rows, data[start : start + size])))
-        start += size
-    if not parts:
+    ends = list(itertools.accumulate((size for _, size in header["chunks"]), initial=start))
+    whole = bisect.bisect_right(ends, len(data)) - 1
+    if whole < 1:
         raise ValueError("it is cut short before its first triangles")
+    factor = float(header["enlarged"][whole - 1]) if "enlarged" in header else 1.0
+    parts = []
+    for (rows, _), first, end in zip(header["chunks"][:whole], ends, ends[1:], strict=False):
+        parts.append(_restored(header, unpack_chunk(channels, rows, data[first:end]), factor))
     arrays = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     left_out = header["count"] - len(arrays["vertices"])
     return CompactSoup(**arrays, appearance=header["appearance"], notes=header["notes"], left_out=left_out)
+
+
+def _enlarged(counts: Sequence[int]) -> list[float]:
+    """How much larger triangles are drawn where chunks end after this one; of the last one 1."""
+    ends = list(itertools.accumulate(counts))
+    return [round(enlargement(end / ends[-1]), 4) for end in ends]
 
 
 def _channels(bases: int) -> list[Channel]:
@@ -208,12 +228,12 @@ def _quantised_colors(soup: CompactSoup, scales: Mapping[str, Any], rows: slice)
     }
 
 
-def _restored(header: Mapping[str, Any], table: Places) -> dict[str, np.ndarray]:
-    """Whole numbers to what they stand for, by the names of `CompactSoup`."""
+def _restored(header: Mapping[str, Any], table: Places, factor: float) -> dict[str, np.ndarray]:
+    """Whole numbers to what they stand for, by the names of `CompactSoup`; triangles `factor` times as large."""
     # Numbers that JSON has without a point may be larger than whole numbers of numpy.
     centers = np.array(header["center"]["origin"], dtype=np.float64) + float(header["center"]["step"]) * table["center"]
     size = header["size"]["least"] * 2.0 ** (table["size"] / header["size"]["per_octave"])
-    first = (size / header["offset"]["steps"] * table["offsets"]).reshape(-1, 2, 3)
+    first = (factor * size / header["offset"]["steps"] * table["offsets"]).reshape(-1, 2, 3)
     offsets = np.concatenate([first, -first.sum(axis=1, keepdims=True)], axis=1)
     place = {"vertices": (centers[:, None] + offsets).astype(np.float32)}
     if not header["bases"]:
@@ -276,6 +296,9 @@ def _check_chunks(header: Mapping[str, Any]) -> None:
         raise ValueError("its header has chunks that cannot hold their triangles")
     if sum(rows for rows, _ in chunks) != header["count"]:
         raise ValueError("its header has another number of triangles than its chunks")
+    factors = header.get("enlarged", len(chunks) * [1])
+    if not isinstance(factors, list) or len(factors) != len(chunks) or not all(map(_is_factor, factors)):
+        raise ValueError("its header enlarges triangles by what is no factor of each chunk")
 
 
 def _is_pair(chunk: object) -> bool:
@@ -284,6 +307,10 @@ def _is_pair(chunk: object) -> bool:
         and len(chunk) == 2
         and all(isinstance(number, int) and not isinstance(number, bool) and number > 0 for number in chunk)
     )
+
+
+def _is_factor(factor: object) -> bool:
+    return is_number(factor) and 1 <= factor <= _MOST_ENLARGED
 
 
 def _along_a_curve(centers: np.ndarray) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from etsplat.core.cameras import Cameras
 from etsplat.core.errors import InputError
 from etsplat.core.kernels import KERNELS
 from etsplat.core.rasterization import SOUP_SIGMA_FLOOR
-from etsplat.io.compact_soups import CompactSoup, read_compact
+from etsplat.io.compact_soups import CompactSoup, enlargement, read_compact
 from etsplat.io.json_text import parse_json
 from etsplat.model.solid_soup import SolidSoup
 from etsplat.model.soup_appearance import SoupAppearance
@@ -24,6 +25,9 @@ CUT_SHORT = "cut_short"
 
 _LEAST = 1e-3
 """Opacity of what is written as 0: below 1/255 nothing is drawn."""
+
+_STAYING, _FEWEST = 0.7, 0.06
+"""In each round of `ranks` this share of the triangles stays; it is the last where fewer than that of all would."""
 
 
 @torch.no_grad()
@@ -50,6 +54,40 @@ def importance(soup: TriangleSoup, cameras: Sequence[Cameras] = ()) -> Float[Ten
     distance2 = (middles - middle).square().sum(dim=1) + spread.square().clamp_min(1e-30)
     sides = vertices[:, 1:] - vertices[:, :1]
     return soup.drawn_opacities.detach() * torch.linalg.cross(sides[:, 0], sides[:, 1]).norm(dim=1) / distance2
+
+
+@torch.no_grad()
+def ranks(soup: TriangleSoup, cameras: Sequence[Cameras] = ()) -> Float[Tensor, " N"]:
+    """How early each triangle is to be sent: of those with the highest ranks, however few, pictures show most.
+
+    Found from the end: what of the triangles that are left matters least (`importance`), drawn as large as a file that
+    is cut short draws them, goes, round by round. Those that stand alone where others went come to matter more.
+
+    Args:
+        soup: of N triangles.
+        cameras: single ones; without any ranks are those of `importance`.
+
+    Returns:
+        (N,) float64, on the soup's device.
+    """
+    count = len(soup)
+    left, gone = torch.arange(count, device=soup.vertices.device), []
+    while True:
+        scores = importance(_enlarged(soup.kept(left), enlargement(len(left) / count)), cameras)
+        left = left[scores.argsort(descending=True, stable=True)]
+        kept = int(_STAYING * len(left))
+        if not cameras or kept < _FEWEST * count:
+            break
+        gone.append(left[kept:])
+        left = left[:kept]
+    found = torch.empty(count, dtype=torch.float64, device=left.device)
+    found[torch.cat([left, *gone[::-1]])] = torch.arange(count, 0, -1, dtype=torch.float64, device=left.device)
+    return found
+
+
+def _enlarged(soup: TriangleSoup, factor: float) -> TriangleSoup:
+    middles = soup.vertices.mean(dim=1, keepdim=True)
+    return replace(soup, vertices=middles + factor * (soup.vertices - middles))
 
 
 def compact_of(soup: TriangleSoup, order: Float[Tensor, " N"], most: int | None = None) -> CompactSoup:

@@ -13,7 +13,7 @@ from etsplat.data.dataset import Dataset
 from etsplat.data.looked_at import middle_photo
 from etsplat.io.compact_soups import encode_compact
 from etsplat.model.solid_soup import SolidSoup
-from etsplat.model.soup_compact import compact_of, importance
+from etsplat.model.soup_compact import compact_of, ranks
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.tasks.sources import SoupRun, training_cameras, world_up
 from etsplat.web.pages import ScenePage
@@ -30,7 +30,7 @@ def small_camera(camera: Cameras) -> Cameras:
 
 
 def compact_bytes(soup: TriangleSoup, capture: Dataset | None, most: int | None = None) -> bytes:
-    """The compact file of a soup or an opaque mesh: what the training photos show most of comes first.
+    """The compact file of a soup or an opaque mesh, of which any part from the start shows as much as so many can.
 
     Args:
         soup: what is written.
@@ -41,7 +41,7 @@ def compact_bytes(soup: TriangleSoup, capture: Dataset | None, most: int | None 
         InputError: the soup is drawn with a kernel that was registered from Python.
     """
     cameras = [] if capture is None else [small_camera(camera) for camera in training_cameras(capture)]
-    return encode_compact(compact_of(soup, importance(soup, cameras), most))
+    return encode_compact(compact_of(soup, ranks(soup, cameras), most))
 
 
 def scene_of(run: SoupRun, soup: TriangleSoup, solid: SolidSoup | None, most: int | None = None) -> ScenePage:
