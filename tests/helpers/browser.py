@@ -86,13 +86,14 @@ class Page:
 
     def picture(self, code: str) -> np.ndarray:
         """(H, W, 3) in [0, 1] of a canvas, or of the promise of one."""
-        return self._decoded(self.value(f"(async () => (await ({code})).toDataURL('image/png'))()").split(",")[1])
+        return self.decoded(self.value(f"(async () => (await ({code})).toDataURL('image/png'))()").split(",")[1])
 
     def screenshot(self) -> np.ndarray:
         """(H, W, 3) in [0, 1] of the window."""
-        return self._decoded(self.ask("Page.captureScreenshot", format="png")["data"])
+        return self.decoded(self.ask("Page.captureScreenshot", format="png")["data"])
 
-    def _decoded(self, text: str) -> np.ndarray:
+    def decoded(self, text: str) -> np.ndarray:
+        """(H, W, 3) in [0, 1] of a picture file in base64."""
         return np.asarray(Image.open(io.BytesIO(base64.b64decode(text))).convert("RGB")) / 255
 
 

@@ -13,6 +13,7 @@ from etsplat.data.load import load_dataset
 from etsplat.io.mesh_files import MeshFile
 from etsplat.io.run_directory import RunDirectory
 from etsplat.model.soup_appearance import SoupAppearance
+from etsplat.model.soup_import import open_soup
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.report import write_report
 from etsplat.tasks.export_config import ExportConfig
@@ -181,7 +182,7 @@ def test_a_scene_can_be_looked_around_in(tmp_path, page, capture):
     assert before[0] == after[0]
     assert float(torch.tensor(after[2]) @ torch.tensor(before[3])) < -0.05  # what was ahead is to the right now
     page.ask("Input.dispatchKeyEvent", type="keyDown", key="w")
-    page.value("new Promise(done => setTimeout(done, 200))")
+    page.value("new Promise(done => [1, 2].reduce(next => () => requestAnimationFrame(next), done)())")
     page.ask("Input.dispatchKeyEvent", type="keyUp", key="w")
     ahead = torch.tensor(state()[0]) - torch.tensor(after[0])
     assert float(ahead @ torch.tensor(after[2])) > 0
@@ -252,6 +253,58 @@ def test_pictures_come_back_where_the_device_took_what_it_held(tmp_path, page, c
     for mode, expected in zip(("soft", "opaque"), before, strict=True):
         assert torch.equal(picture(page, 2, mode), expected)
     assert page.errors == []
+
+
+def test_a_part_of_a_scene_is_drawn_larger(tmp_path, page, capture):
+    """By the switch, as a file of that part is by the rasterizer."""
+    soup = replace(small := make_soup(9000), vertices=0.2 * small.vertices)
+    page.open(written(tmp_path, soup, capture), 64, 48)
+    export_soup(SoupRun(tmp_path, soup, capture, None), tmp_path / "soup.etz", ExportConfig())
+    data = (tmp_path / "soup.etz").read_bytes()
+    header = json.loads(data[12 : 12 + int.from_bytes(data[8:12], "little")])
+    (tmp_path / "soup.etz").write_bytes(data[: -header["chunks"][-1][1]])
+    part = open_soup(tmp_path / "soup.etz")
+    assert len(part) == 8192
+    page.value("sceneViewer.then(v => { v.options.fraction = 0.7; })")
+    assert decibels(picture(page, 2, "soft"), part.render(camera_of(capture, 2)).color[0]) > 40
+    assert page.value("sceneViewer.then(v => v.painter.enlarged)") == header["enlarged"][1] > 1
+
+
+def test_a_soft_picture_that_is_refined_ends_as_one_that_is_drawn_at_once(tmp_path, page, capture):
+    """Part by part over a small one, each nearer to it than the small one; then nothing is drawn any more."""
+    page.open(written(tmp_path, make_soup(), capture), 160, 120)
+    page.value(f"sceneViewer.then(v => {STILL})")
+    drawn = """sceneViewer.then(v => {
+        const pictures = [], { painter, camera, canvas } = v, take = () => pictures.push(canvas.toDataURL());
+        painter.draw(camera, "soft"); take();
+        painter.draw(camera, "soft", { scale: 0.1, still: false }); take();
+        for (let whole = false, fresh = true; !whole; fresh = false) {
+            whole = painter.refine(camera, 0.3, fresh);
+            take();
+        }
+        return pictures;
+    })"""
+    found = [torch.from_numpy(page.decoded(each.split(",")[1])).float() for each in page.value(drawn)]
+    assert len(found) == 2 + 4
+    assert torch.equal(found[0], found[-1])
+    small, *parts = (decibels(each, found[0]) for each in found[1:-1])
+    assert small < min(parts)
+    shares = f"""sceneViewer.then(async v => {{
+        const shares = [], refine = v.painter.refine.bind(v.painter);
+        v.painter.refine = (camera, share, fresh) => {{
+            const whole = refine(camera, share, fresh);
+            shares.push([fresh, whole]);
+            return whole;
+        }};
+        [v.moved, v.pace.soft] = [0, 0.3];
+        v.step(performance.now());
+        await {STILL};
+        return shares;
+    }})"""
+    steps = page.value(shares)
+    assert [fresh for fresh, _ in steps] == [True] + [False] * (len(steps) - 1)
+    assert [whole for _, whole in steps] == [False] * (len(steps) - 1) + [True]
+    assert len(steps) > 2
 
 
 def test_an_opaque_picture_of_a_moving_camera_is_the_same_but_for_its_edges(tmp_path, page, capture):

@@ -55,16 +55,22 @@ class Target {
     begin(width, height) {
         const { gl } = this;
         if (width !== this.width || height !== this.height) this.resize(width, height);
-        gl.bindFramebuffer(gl.FRAMEBUFFER, this.multisampled ? this.frame : this.shown);
-        gl.viewport(0, 0, width, height);
+        this.resume();
         gl.clearColor(0, 0, 0, 0);
         gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
+    }
+
+    // Binds it with what was drawn.
+    resume() {
+        const { gl } = this;
+        gl.bindFramebuffer(gl.FRAMEBUFFER, this.multisampled ? this.frame : this.shown);
+        gl.viewport(0, 0, this.width, this.height);
     }
 
     resize(width, height) {
         const { gl } = this;
         [this.width, this.height] = [width, height];
-        for (const texture of [this.texture]) gl.deleteTexture(texture);
+        gl.deleteTexture(this.texture);
         for (const buffer of this.buffers || []) gl.deleteRenderbuffer(buffer);
         this.texture = gl.createTexture();
         gl.bindTexture(gl.TEXTURE_2D, this.texture);
@@ -108,10 +114,8 @@ class Painter {
         const exact = gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float");
         const kernel = `#version 300 es\n#define KERNEL ${KERNEL_IDS[this.look.kernel]}\n#define SDF ${Number(this.look.distance === "sdf")}`;
         const defined = (source) => source.replace("#version 300 es", kernel);
-        this.soft = {
-            ...compileProgram(gl, defined(SOFT_VERTEX), defined(SOFT_FRAGMENT)),
-            target: new Target(gl, exact ? gl.RGBA16F : gl.RGBA8, 0),
-        };
+        const [whole, small] = [0, 1].map(() => new Target(gl, exact ? gl.RGBA16F : gl.RGBA8, 0));
+        this.soft = { ...compileProgram(gl, defined(SOFT_VERTEX), defined(SOFT_FRAGMENT)), whole, small };
         this.opaque = {
             ...compileProgram(gl, OPAQUE_VERTEX, OPAQUE_FRAGMENT),
             still: new Target(gl, gl.RGBA8, 4),
@@ -120,7 +124,7 @@ class Painter {
         this.resolve = compileProgram(gl, RESOLVE_VERTEX, RESOLVE_FRAGMENT);
         this.places = placesTexture(gl, soup.corners, soup.opacities, soup.sigma);
         this.colors = dataTexture(gl, gl.RGBA16F, soup.count);
-        [this.elements, this.shown] = [gl.createBuffer(), 0];
+        [this.elements, this.shown, this.drawn, this.enlarged] = [gl.createBuffer(), 0, 0, 1];
         if (mesh) {
             this.mesh = { count: mesh.count, places: placesTexture(gl, mesh.corners), colors: dataTexture(gl, gl.RGBA8, 3 * mesh.count) };
             const colors = new Uint8Array(12 * mesh.count);
@@ -140,7 +144,8 @@ class Painter {
 
     // What `Sorter` found.
     take({ elements, colors }) {
-        const { gl } = this;
+        const { gl, soup } = this;
+        this.enlarged = soup.enlarged[soup.ends.indexOf(colors.length / 4)] ?? 1;
         fillTexture(gl, this.colors, gl.RGBA, gl.FLOAT, colors, 4);
         gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, this.elements);
         gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, elements, gl.DYNAMIC_DRAW);
@@ -157,19 +162,38 @@ class Painter {
         });
     }
 
-    drawSoft(camera, width, height) {
+    // Elements from `first` to `end`, nearest first, under what `target` has.
+    drawSoft(camera, target, first, end) {
         const { gl, soft, look } = this;
-        soft.target.begin(width, height);
+        const { width, height } = target;
         this.use(soft, [["places", this.places], ["colors", this.colors]]);
         setCamera(gl, soft.at, camera, camera.lensFor(width, height), [width, height], look.near_plane);
         gl.uniform1f(soft.at.cullLarge, look.cull_large ?? 1e30);
         gl.uniform1f(soft.at.cullSmall, look.cull_small ? 1 : 0);
+        gl.uniform1f(soft.at.enlarged, this.enlarged);
         gl.enable(gl.BLEND);
-        gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
+        gl.blendFunc(gl.ONE_MINUS_DST_ALPHA, gl.ONE);
         gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, this.elements);
-        gl.drawElements(gl.TRIANGLES, this.shown, gl.UNSIGNED_INT, 0);
+        gl.drawElements(gl.TRIANGLES, end - first, gl.UNSIGNED_INT, 4 * first);
         gl.disable(gl.BLEND);
-        return soft.target.end();
+    }
+
+    // The next `share` of the triangles of the soft picture, which is begun anew where it is `fresh`. Where what is drawn of it
+    // is not opaque yet, the picture of the camera in motion is seen through it. Returns whether that was all: then it
+    // is the picture of `draw`, to the bit.
+    refine(camera, share, fresh) {
+        const { gl, shown, soft: { whole, small } } = this;
+        if (fresh) {
+            whole.begin(gl.canvas.width, gl.canvas.height);
+            this.drawn = 0;
+        } else {
+            whole.resume();
+        }
+        const end = Math.min(shown, this.drawn + 3 * Math.ceil(share * shown / 3));
+        this.drawSoft(camera, whole, this.drawn, end);
+        this.drawn = end;
+        this.show(whole.end(), 1, end < shown ? small.texture : null);
+        return end === shown;
     }
 
     drawOpaque(camera, width, height, target) {
@@ -188,14 +212,27 @@ class Painter {
     // A picture of `mode`, "soft" or "opaque", in the canvas. Where it is not `still`, it is drawn `scale` times as large,
     // 1 or less; where it is, an opaque one is drawn with many samples of a pixel.
     draw(camera, mode, { scale = 1, still = true } = {}) {
-        const { gl, opaque, resolve } = this;
+        const { gl, opaque, soft } = this;
         const { width, height } = gl.canvas;
-        const samples = mode === "opaque" && still ? STILL_SAMPLES : 1;
+        if (mode === "soft" && still) { this.refine(camera, 1, true); return; }
+        const samples = still ? STILL_SAMPLES : 1;
         const [w, h] = [width, height].map((side) => Math.max(1, Math.round((still ? samples : scale) * side)));
-        const target = still ? opaque.still : opaque.moving;
-        const texture = mode === "soft" ? this.drawSoft(camera, w, h) : this.drawOpaque(camera, w, h, target);
+        if (mode === "soft") {
+            soft.small.begin(w, h);
+            this.drawSoft(camera, soft.small, 0, this.shown);
+            this.show(soft.small.end(), 1);
+        } else {
+            this.show(this.drawOpaque(camera, w, h, still ? opaque.still : opaque.moving), samples);
+        }
+    }
+
+    // A texture of `samples` times the canvas's size along each side, or of another one, over the texture `below` and the background.
+    show(texture, samples, below = null) {
+        const { gl, resolve } = this;
+        const { width, height } = gl.canvas;
         gl.viewport(0, 0, width, height);
-        this.use(resolve, [["drawn", texture]]);
+        this.use(resolve, [["drawn", texture], ["below", below ?? texture]]);
+        gl.uniform1i(resolve.at.unfinished, below ? 1 : 0);
         gl.uniform3fv(resolve.at.background, this.look.background || [0, 0, 0]);
         gl.uniform2f(resolve.at.size, width, height);
         gl.uniform1i(resolve.at.samples, samples);

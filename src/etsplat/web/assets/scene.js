@@ -3,6 +3,7 @@
 
 const STILL_AFTER = 250; // milliseconds after the last motion
 const SLOW = 45, FAST = 24; // milliseconds of a frame: above and below, pictures of a moving camera get smaller and larger
+const PART = 120, LEAST = 0.04; // milliseconds that a part of a soft picture may take, and how much of it that is at least
 const SMALLEST = 0.2, FIRST = { soft: 0.5, opaque: 1 }; // of their sizes, along each side
 const EARLY = 1 << 22; // characters of base64, a multiple of four: as much of a scene is shown before the rest is read
 
@@ -15,7 +16,7 @@ class SceneViewer {
         this.canvas.addEventListener("webglcontextlost", (event) => event.preventDefault()); // so that it comes back
         this.canvas.addEventListener("webglcontextrestored", () => this.restore());
         this.options = { mode: "soft", fraction: 1, resolution: 1 };
-        [this.moved, this.pace, this.before, this.frame] = [0, { ...FIRST }, 0, 0];
+        [this.moved, this.pace, this.before, this.frame, this.share, this.fence] = [0, { ...FIRST }, 0, 0, 0, null];
         const first = scene.cameras[scene.start];
         const up = scene.up || first.rows[1].map((value) => -value);
         const target = along(first.eye, first.rows[2], Math.max(dot(along(scene.focus, first.eye, -1), first.rows[2]), 0.05 * scene.radius));
@@ -77,22 +78,49 @@ class SceneViewer {
         this.change();
     }
 
-    // One frame: small while the camera moves, as fast as the last ones were drawn; whole when it stands.
+    // One frame: small while the camera moves, as fast as the last ones were drawn; whole when it stands, a soft one a part
+    // after the other.
     step(now) {
         this.frame = 0;
         if (this.gl.isContextLost()) return; // `restore` goes on
         this.resize();
         const moving = performance.now() - this.moved < STILL_AFTER;
         const { pace, options: { mode } } = this;
-        if (moving && this.before) {
-            const took = now - this.before;
-            if (took > SLOW) pace[mode] = Math.max(SMALLEST, pace[mode] * 0.9);
-            if (took < FAST) pace[mode] = Math.min(1, pace[mode] * 1.03);
+        const took = this.before ? now - this.before : 0;
+        if (moving && took > SLOW) pace[mode] = Math.max(SMALLEST, pace[mode] * 0.9);
+        if (moving && took && took < FAST) pace[mode] = Math.min(1, pace[mode] * 1.03);
+        const refining = mode === "soft" && !moving && !this.sorting;
+        if (!refining) {
+            this.share = 0;
+            this.painter.draw(this.camera, mode, { scale: pace[mode], still: !moving && mode === "opaque" });
         }
-        this.before = moving ? now : 0;
-        this.painter.draw(this.camera, mode, { scale: pace[mode], still: !moving });
+        const unfinished = refining && !this.refine();
+        this.before = moving || unfinished ? now : 0;
         this.sortSoon();
-        if (moving) this.frame = requestAnimationFrame((later) => this.step(later));
+        if (moving || unfinished) this.frame = requestAnimationFrame((later) => this.step(later));
+    }
+
+    // The small picture again, in the order that has come, or the next part of the whole one; returns whether it is whole.
+    refine() {
+        const { gl, painter, camera, pace: { soft } } = this;
+        if (!this.share && soft < 1) {
+            this.share = Math.max(LEAST, soft * soft); // so many pixels took the time of a frame
+            [this.fresh, this.fence] = [true, null];
+            painter.draw(camera, "soft", { scale: soft, still: false });
+            return false;
+        }
+        if (this.fence) { // frames come before the device is done with the last part
+            if (gl.getSyncParameter(this.fence, gl.SYNC_STATUS) !== gl.SIGNALED) return false;
+            gl.deleteSync(this.fence);
+            const took = performance.now() - this.begun;
+            this.share = Math.max(LEAST, this.share * Math.min(2, Math.max(0.5, PART / took)));
+        }
+        this.begun = performance.now();
+        const whole = painter.refine(camera, this.share || 1, this.fresh || !this.share);
+        this.fresh = false;
+        if (whole) this.share = 0;
+        else this.fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+        return whole;
     }
 
     // Asks for the order from here, unless that is under way: then anew when it has come.
@@ -106,6 +134,7 @@ class SceneViewer {
             if (sorter !== this.sorter) return; // of fewer triangles
             [this.sorting, this.sorted] = [false, wanted];
             this.painter.take(found);
+            this.share = 0;
             if (!this.frame) this.frame = requestAnimationFrame((now) => this.step(now));
         });
     }
@@ -116,7 +145,7 @@ class SceneViewer {
         camera.stand(this.scene.cameras[photo], this.scene.focus);
         const { eye, forward } = camera;
         this.painter.take(await this.sorter.sort({ ...this.request(), eye, forward }));
-        this.sorted = "";
+        [this.sorted, this.share] = ["", 0];
         [this.canvas.width, this.canvas.height] = [width, height];
         this.painter.draw(camera, mode);
         return this.canvas;

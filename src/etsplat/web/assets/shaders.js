@@ -19,7 +19,7 @@ ${CAMERA_UNIFORMS}`;
 // The forms f_k, of which x is the largest, are affine on the image: X (1 - w_k) at corner k, X at the two others
 // (docs/method.md, csrc/math/triangle.h). What is left out, and when, is in docs/conventions.md.
 const SOFT_VERTEX = `${TRIANGLE_DATA}
-uniform float cullLarge, cullSmall;
+uniform float cullLarge, cullSmall, enlarged;
 out vec3 forms;
 flat out vec4 color;
 flat out vec2 curve;
@@ -41,7 +41,10 @@ float support(float ratio, float sigma) {
 void main() {
     int triangle = gl_VertexID / 3, corner = gl_VertexID % 3;
     vec4 a = place(3 * triangle), b = place(3 * triangle + 1), c = place(3 * triangle + 2);
-    vec3 p0 = seen(a.xyz), p1 = seen(b.xyz), p2 = seen(c.xyz);
+    vec3 middle = (a.xyz + b.xyz + c.xyz) / 3.0;
+    vec3 p0 = seen(a.xyz + (enlarged - 1.0) * (a.xyz - middle));
+    vec3 p1 = seen(b.xyz + (enlarged - 1.0) * (b.xyz - middle));
+    vec3 p2 = seen(c.xyz + (enlarged - 1.0) * (c.xyz - middle));
     float opacity = a.w, sigma = max(b.w, 1e-6);
     gl_Position = NOWHERE;
     forms = vec3(0.0);
@@ -79,7 +82,7 @@ void main() {
     gl_Position = vec4(ndc.x, -ndc.y, 0.0, 1.0);
 }`;
 
-// csrc/math/kernels.h: 0 single-sided, 1 bilateral, 2 elastic, 3 hard. Drawn farthest first, premultiplied.
+// csrc/math/kernels.h: 0 single-sided, 1 bilateral, 2 elastic, 3 hard. Drawn nearest first, premultiplied.
 const SOFT_FRAGMENT = `#version 300 es
 precision highp float;
 in vec3 forms;
@@ -121,7 +124,8 @@ in vec3 color;
 out vec4 pixel;
 void main() { pixel = vec4(color, 1.0); }`;
 
-// One triangle over everything: what was drawn at `samples` times the size, or at a smaller one, over the background.
+// One triangle over everything: what was drawn at `samples` times the size, or at a smaller one, over the background; over
+// another picture where it is `unfinished`.
 const RESOLVE_VERTEX = `#version 300 es
 void main() {
     gl_Position = vec4(gl_VertexID == 1 ? 3.0 : -1.0, gl_VertexID == 2 ? 3.0 : -1.0, 0.0, 1.0);
@@ -129,7 +133,8 @@ void main() {
 
 const RESOLVE_FRAGMENT = `#version 300 es
 precision highp float;
-uniform highp sampler2D drawn;
+uniform highp sampler2D drawn, below;
+uniform bool unfinished;
 uniform vec3 background;
 uniform vec2 size;
 uniform int samples;
@@ -144,5 +149,10 @@ void main() {
     } else {
         sum = texture(drawn, gl_FragCoord.xy / size);
     }
-    pixel = vec4(sum.rgb + (1.0 - sum.a) * background, 1.0);
+    vec3 behind = background;
+    if (unfinished) {
+        vec4 coarse = texture(below, gl_FragCoord.xy / size);
+        behind = coarse.rgb + (1.0 - coarse.a) * background;
+    }
+    pixel = vec4(sum.rgb + (1.0 - sum.a) * behind, 1.0);
 }`;

@@ -57,7 +57,7 @@ function makeSorter({ corners, harmonics, bases, degree }) {
         for (let i = 0; i < amount; ++i) to[buckets[(bits[from[i]] >>> shift) & 65535]++] = from[i];
     }
 
-    // Triangles of the first `amount` whose middle is before the camera, farthest first, as three elements each. Floats above 0
+    // Triangles of the first `amount` whose middle is before the camera, nearest first, as three elements each. Floats above 0
     // are in the order of their bits, so two passes sort as the rasterizer does: by depth, then by index.
     function elementsFor(eye, forward, near, amount) {
         let shown = 0;
@@ -74,7 +74,7 @@ function makeSorter({ corners, harmonics, bases, degree }) {
         pass(other, keys, shown, 16);
         const elements = new Uint32Array(3 * shown);
         for (let i = 0; i < shown; ++i) {
-            const first = 3 * keys[shown - 1 - i];
+            const first = 3 * keys[i];
             elements[3 * i] = first;
             elements[3 * i + 1] = first + 1;
             elements[3 * i + 2] = first + 2;
