@@ -158,7 +158,8 @@ CLOCKS = {"progress": 0}
 """Tensors with an element that is a time: its index. By the names of either tree."""
 
 CHANGED: dict[str, str] = {
-    "owl-batch": "each view of a step is differentiated by itself; their gradients are added in the order of the views",
+    "owl-batch": "each view of a step is differentiated by itself; their gradients are added in the order of the "
+    "views; rates are multiplied by the square root of the batch",
 }
 """Cases whose bits change on purpose, and why. They must differ: a line that is not true any more is an error."""
 

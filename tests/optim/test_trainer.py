@@ -82,6 +82,21 @@ def combination(model: str, data: Dataset, **options: Any) -> Trainer[Any]:
     return Trainer(a_soup(data), data, soup_objective(), strategy, **options)
 
 
+@pytest.mark.parametrize("batch", [1, 2, 9])
+def test_rates_grow_with_the_square_root_of_the_batch(object_views: Dataset, batch: int) -> None:
+    """Those of a schedule at every iteration; a first step of Adam is that long."""
+    rates = {"vertices": lambda k: 1e-3 / k, "colors": 2e-3, "opacity_logits": 1e-2, "log_sigma": 1e-2}
+    mesh = a_mesh()
+    before = mesh.colors.detach().clone()
+    trainer = Trainer(mesh, object_views, mesh_objective(), schedule=Schedule(rates), batch=batch)
+    trainer.fit(1)
+    assert float((trainer.model.colors.detach() - before).abs().max()) == pytest.approx(2e-3 * batch**0.5, rel=1e-3)
+    trainer.fit(4)
+    assert trainer.adam.learning_rates["vertices"] == pytest.approx(1e-3 / 4 * batch**0.5, rel=1e-12)
+    if batch == 1:
+        assert trainer.adam.learning_rates["colors"] == 2e-3
+
+
 @pytest.mark.parametrize("batch", [1, 2])
 @pytest.mark.parametrize("data", ["object", "scene"])
 @pytest.mark.parametrize("model", ["mesh", "soup"])

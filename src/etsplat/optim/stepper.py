@@ -1,5 +1,6 @@
 """How a model steps: draws some views, adds up their gradients and updates; on a device many steps together."""
 
+import math
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import takewhile
@@ -293,7 +294,9 @@ class Stepper(Generic[M]):
         return self._schedule.halvings(iteration), look, self._objective.weights(iteration), moving
 
     def _rates(self, iteration: int) -> dict[str, float]:
-        return {name: at(self._schedule.rates[name], iteration) for name in self._model.parameters()}
+        """Times the square root of the batch: by that the gradients of so many views have less noise."""
+        longer = math.sqrt(self._batch)
+        return {name: longer * at(self._schedule.rates[name], iteration) for name in self._model.parameters()}
 
     def _values(self, iteration: int) -> dict[str, float]:
         return {name: at(value, iteration) for name, value in self._schedule.values.items()}

@@ -98,7 +98,7 @@ class Trainer(Generic[M]):
             objective: what is minimised.
             strategy: what adds and removes triangles; None for `Fixed`.
             schedule: learning rates, and what else changes over the run; None for the model's own rates throughout.
-            batch: views that each step sees.
+            batch: views that each step sees; the rates are multiplied by its square root.
             background: colour behind the pictures; None for another random one behind each.
             exposure: what is learned of each photo's exposure; None for photos that were all exposed alike.
             depths: which depth maps are believed, as the objective's term has it; None where none are used.

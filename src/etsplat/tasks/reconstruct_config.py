@@ -221,7 +221,8 @@ class ReconstructConfig(Settings):
     Photos that are kept from training judge whether that does good; if not, cameras stay as given.
     cameras.json has what was found. The steps in which that is judged are made twice."""
     batch: Annotated[int, Range(1, 1024), Rare] = 1
-    """Views that each step sees; the paper's method sees one."""
+    """Views that each step sees; the paper's method sees one.
+    All learning rates are multiplied by its square root."""
     seed: Annotated[int, Range(0, 2**63 - 1), Rare] = 0
     """Of the order of views and the backgrounds. (Metrics always sample with the same seed.)"""
     device: Device | None = None
