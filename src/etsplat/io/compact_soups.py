@@ -309,7 +309,7 @@ def _is_pair(chunk: object) -> bool:
     )
 
 
-def _is_factor(factor: object) -> bool:
+def _is_factor(factor: Any) -> bool:
     return is_number(factor) and 1 <= factor <= _MOST_ENLARGED
 
 
