@@ -232,6 +232,26 @@ def test_distortion_of_transforms_json_is_removed_once(tmp_path, model):
     torch.testing.assert_close(capture.viewmats[1], circle_poses(3)[1], atol=1e-6, rtol=0)
 
 
+@pytest.mark.parametrize("layout", ["transforms.json", "COLMAP"])
+def test_photos_that_lie_on_their_side_are_undistorted_upright(tmp_path, layout):
+    """As EXIF says, where their cameras do not lie: the same pictures as of photos that are stored upright."""
+    pytest.importorskip("pycolmap")
+    for name in ("stored", "upright"):
+        scene = tmp_path / name
+        if layout == "COLMAP":
+            write_colmap(scene, [(64, 48)] * 3, model="RADIAL", extra=(0.05, -0.02))
+        else:
+            write_transforms(scene, 3, width=64, height=48, fl_y=60, camera_model="OPENCV", **LENSES["OPENCV"])
+        for index, path in enumerate(sorted((scene / "images").iterdir())):
+            picture = Image.linear_gradient("L").resize((64, 48)).rotate(30 * index).convert("RGB")
+            write_phone_photo(path, picture, 6 if name == "stored" and index else 1)
+        undistort_scene(scene, tmp_path / f"new {name}")
+    stored, upright = (load_dataset(tmp_path / f"new {name}") for name in ("stored", "upright"))
+    assert stored.images.sizes == upright.images.sizes
+    for index in range(3):  # JPEG has lost some of 255 twice
+        assert float((stored.images[index].float() - upright.images[index].float()).abs().mean()) < 3
+
+
 def test_transparency_that_undistortion_would_lose_is_refused(tmp_path):
     pytest.importorskip("pycolmap")
     write_transforms(tmp_path / "scene", 3, channels=4, k1=-0.1)

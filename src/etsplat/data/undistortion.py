@@ -14,9 +14,10 @@ from etsplat.data.frames import Frame, Points, Wanted, check_frames, scaled_intr
 from etsplat.data.load import format_of
 from etsplat.io.atomic import write_error
 from etsplat.io.georeference import GEOREFERENCE_FILE
-from etsplat.io.images import image_size, load_pixels
+from etsplat.io.images import image_size, load_pixels, size_for
 from etsplat.io.locks import scratch_folder
 from etsplat.io.paths import kind_of, path_remedy, path_within
+from etsplat.io.photos import write_upright
 
 LEAST_SIZE = 16
 """Pixels of the longer side of an image."""
@@ -65,13 +66,30 @@ def undistort_scene(scene: Path | str, out: Path | str, *, max_size: int = 1600)
             raise InputError(f"image {photo}: has transparency, which would be lost; put it into {scene}/masks")
     check_space(out, [*(photos / name for name in names), *masks.values(), *masks.values()])
     with working_folder(out) as work:
-        undistort_model(model, photos, names, work, max_size)
+        undistort_model(model, _as_cameras_have_them(model, photos, names, work), names, work, max_size)
         if masks:
             undistort_masks(model, masks, work, max_size)
         if (scene / GEOREFERENCE_FILE).is_file():
             shutil.copyfile(scene / GEOREFERENCE_FILE, work / "scene" / GEOREFERENCE_FILE)
         os.replace(work / "scene", out)
     return names
+
+
+def _as_cameras_have_them(model: Any, photos: Path, names: list[str], work: Path) -> Path:
+    """The folder of the photos; WORK/upright with all of them, where some lie on their side and their cameras do not.
+
+    COLMAP reads pixels as they are stored.
+    """
+    cameras = {image.name: model.cameras[image.camera_id] for image in model.images.values()}
+    shapes = {name: (cameras[name].width, cameras[name].height) for name in names}
+    lying = {name for name in names if size_for(photos / name, shapes[name]) != image_size(photos / name)}
+    if not lying:
+        return photos
+    for name in names:
+        copy = work / "upright" / name
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        (write_upright if name in lying else shutil.copyfile)(photos / name, copy)
+    return work / "upright"
 
 
 def undistort_model(
@@ -189,7 +207,7 @@ def _make_model(
     """A model of frames with their lenses, at the size of their files, and of points; and masks by image."""
     model, masks = pycolmap.Reconstruction(), {}
     for index, frame in enumerate(frames, 1):
-        name, size = frame.image.relative_to(photos).as_posix(), image_size(frame.image)
+        name, size = frame.image.relative_to(photos).as_posix(), size_for(frame.image, frame.size)
         K = scaled_intrinsics(scene, frame, size, size)
         lens, coefficients = ("PINHOLE", ()) if frame.lens is None else (frame.lens.model, frame.lens.coefficients)
         params = [float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]), *coefficients]
