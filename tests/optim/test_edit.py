@@ -175,3 +175,17 @@ def test_plans_that_cannot_be_are_refused_before_anything_changes(odd, text):
     with pytest.raises(ValueError, match=text):
         apply_rows(RowPlan(**{**plan, **odd}), adam, {})
     assert adam.parameters["p"] is value
+
+
+def test_gradients_of_what_an_edit_replaces_are_let_go(rng):
+    """They would stand beside the copies; the next step makes new ones."""
+    adam = Adam({"x": torch.rand(6, 2, generator=rng, requires_grad=True)}, {"x": 0.1})
+    old = adam.parameters["x"]
+    take_step(adam, rng)
+    assert old.grad is not None
+    first, second = adam.first_moments["x"].clone(), adam.second_moments["x"].clone()
+    kept = torch.tensor([True, False, True, True, False, True])
+    apply_rows(RowPlan.keeping(kept), adam, {})
+    assert old.grad is None
+    assert torch.equal(adam.first_moments["x"], first[kept])
+    assert torch.equal(adam.second_moments["x"], second[kept])

@@ -45,6 +45,7 @@ def drive(
             progress.iteration = checkpoint.iteration
             progress.seconds, progress.loss_sum, loss_count = checkpoint.tensors["progress"].tolist()
             progress.loss_count = int(loss_count)
+        del checkpoint  # or its tensors would stay beside those that edits make of them
         if group.leads:
             run.truncate_history(progress.iteration)
     _check_same(problem, {**about_this(), "length of the run": settings.iterations, "settings": (settings, run_hash)})

@@ -192,6 +192,9 @@ def _carry(
     if name in statistics:
         return move(statistics[name])
     old = adam.parameters[name]
+    old.grad = None  # nobody needs it any more; copies are made one by one, so that few of them are there at a time
     new = move(old.detach()).requires_grad_(old.requires_grad)
-    adam.replace(name, new, move_moment(adam.first_moments[name]), move_moment(adam.second_moments[name]))
+    for moments in (adam.first_moments, adam.second_moments):
+        moments[name] = move_moment(moments[name])
+    adam.replace(name, new, adam.first_moments[name], adam.second_moments[name])
     return new

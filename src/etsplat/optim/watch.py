@@ -89,6 +89,7 @@ class Watch:
         measured = self._gauge.measure(model, self._objective)
         psnr = measured.psnr
         if math.isfinite(psnr) and psnr > self._to_beat(iteration):
+            self._best = None  # first, so that there are not two of them beside the model
             state = {name: tensor.clone() for name, tensor in model.state().items()}
             self._best = _Best(iteration, psnr, state)
         return {"watched_loss": measured.loss, "watched_psnr": psnr}
