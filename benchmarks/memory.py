@@ -34,7 +34,7 @@ def _measure(name: str, threads: int, instruction_set: str, answer: "SimpleQueue
     out = scene.render()
     state = out.color.grad_fn.constants[0].states[0]  # pyright: ignore[reportOptionalMemberAccess]
     out.color.backward(scene.cotangent)
-    grown = None if before is None else (_kibibytes("VmHWM") - before) / 1024
+    grown = None if before is None else (kibibytes("VmHWM") - before) / 1024
     outputs = [out.color, out.alpha, *(leaf.grad for leaf in scene.leaves)]
     held = state.bytes + sum(t.numel() * t.element_size() for t in outputs if t is not None)
     answer.put((held / 2**20, grown))
@@ -44,9 +44,9 @@ def _reset_peak() -> int | None:
     if not RESET.exists():
         return None
     RESET.write_text("5", encoding="utf-8")
-    return _kibibytes("VmRSS")
+    return kibibytes("VmRSS")
 
 
-def _kibibytes(field: str) -> int:
+def kibibytes(field: str) -> int:
     line = next(line for line in STATUS.read_text(encoding="utf-8").splitlines() if line.startswith(field))
     return int(line.split()[1])

@@ -18,10 +18,9 @@ from etsplat.optim.loop import CheckpointEvent, DivergedError, NoteEvent, Refine
 from etsplat.optim.schedules import at
 from etsplat.optim.strategies import DensifyAndPrune
 from etsplat.optim.trainer import Trainer
-from etsplat.tasks import train_checks
 from etsplat.tasks.soup_trainer import start_trainer
 from etsplat.tasks.train import TrainResult, train
-from etsplat.tasks.train_checks import check_train, predicted_bytes, triangle_limit
+from etsplat.tasks.train_checks import check_train, triangle_limit
 from etsplat.tasks.train_config import TrainConfig
 from helpers.captures import small_demo_scene
 
@@ -184,18 +183,6 @@ def test_a_capture_without_points_starts_at_random(capture: Dataset, tmp_path: P
     result = train(bare, tmp_path / "run", SHORT.changed({"start.points": 300}), callbacks=[notes.append])
     assert result.metrics["triangles"] > 100
     assert any("no points" in getattr(note, "text", "") for note in notes)
-
-
-def test_too_many_triangles_for_the_memory_are_refused(
-    capture: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Memory is predicted before anything is written, and the message says what would fit."""
-    monkeypatch.setattr(train_checks, "available_memory", lambda: 1 << 30)
-    config = replace(SHORT, max_triangles=10_000_000, pixels_per_triangle=None)
-    assert predicted_bytes(capture, config) > 10 << 30
-    with pytest.raises(InputError, match=r"max_triangles.*set it to"):
-        train(capture, tmp_path / "run", config)
-    assert not (tmp_path / "run").exists()
 
 
 def test_absolute_units_far_off_are_pointed_out(capture: Dataset, tmp_path: Path) -> None:

@@ -58,6 +58,11 @@ class Pictures(ABC):
     streamed: bool = False
     with_depth: frozenset[int] = frozenset()
 
+    @property
+    @abstractmethod
+    def held_bytes(self) -> int:
+        """What those that are in memory now take."""
+
     @abstractmethod
     def picture(self, index: int) -> Picture:
         """Raises IndexError where there is no such view, InputError where its file is damaged or has gone."""
@@ -65,6 +70,10 @@ class Pictures(ABC):
     @abstractmethod
     def fingerprint(self) -> bytes:
         """A hash of what they show; the same for a copy."""
+
+    @abstractmethod
+    def subset(self, indices: Sequence[int]) -> "Pictures":
+        """Some of them, in this order, which are kept and let go of apart from these."""
 
     def expect(self, indices: Sequence[int]) -> None:  # noqa: B027 -- a wish, which a subclass may leave
         """Start to make those that are needed soon, as many as fit."""
@@ -116,9 +125,19 @@ class StoredPictures(Pictures):
         self.sizes = [(image.shape[1], image.shape[0]) for image in pixels]
         self.total_bytes = sum(image.numel() * image.element_size() for image in self._tensors if image is not None)
 
+    @property
+    def held_bytes(self) -> int:
+        """All."""
+        return self.total_bytes
+
     def picture(self, index: int) -> Picture:
         """As handed in."""
         return self._pictures[index]
+
+    def subset(self, indices: Sequence[int]) -> "StoredPictures":
+        """The same tensors."""
+        some = [self._pictures[index] for index in indices]
+        return StoredPictures([one.pixels for one in some], [one.mask for one in some], [one.depth for one in some])
 
     def fingerprint(self) -> bytes:
         """Of all pixels, masks and depth maps."""
@@ -163,6 +182,12 @@ class LazyPictures(Pictures):
         self._lock = threading.Lock()
         self._pool = ThreadPoolExecutor(max_workers=min(os.cpu_count() or 1, 8), thread_name_prefix="images")
 
+    @property
+    def held_bytes(self) -> int:
+        """Of those that were made, or are being made, and are kept."""
+        with self._lock:
+            return sum(self._bytes[kept] for kept in self._kept)
+
     def picture(self, index: int) -> Picture:
         """Raises IndexError where there is no such view, and what making it raises."""
         if not 0 <= index < len(self.sizes):
@@ -173,6 +198,21 @@ class LazyPictures(Pictures):
             with self._lock:
                 self._kept.pop(index, None)
             raise
+
+    def subset(self, indices: Sequence[int]) -> "LazyPictures":
+        """Made anew, and kept where they fit into what is free now."""
+        chosen = list(indices)
+
+        def fingerprint() -> bytes:
+            return hashlib.sha256(self._fingerprint() + repr(chosen).encode()).digest()
+
+        return LazyPictures(
+            lambda index: self._make(chosen[index]),
+            [self.sizes[index] for index in chosen],
+            [self._bytes[index] for index in chosen],
+            fingerprint,
+            with_depth=[place for place, index in enumerate(chosen) if index in self.with_depth],
+        )
 
     def fingerprint(self) -> bytes:
         """Made by what it was constructed with."""
