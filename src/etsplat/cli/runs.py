@@ -217,12 +217,13 @@ class Train(SceneCommand):
         etsplat train my_scene/ --out runs/scene --scene-type indoor --width 1000 --iterations 8000
         etsplat train my_scene/ --out runs/scene --preset paper --images images_4
         etsplat train my_scene/ --out runs/scene --view
+        etsplat train my_city/ --out runs/city --blocks 3x2 --max-triangles 2000000
         etsplat train my_scene/ --out runs/again --config runs/scene/config.json --finish opaque
     """
 
     CONFIG = TrainConfig
     PRESET: ClassVar[dict[str, str]] = {"preset": "quick", "scene_type": "outdoor"}
-    INPUT = ("images", "masks", "depths", "depth_unit", "init_points")
+    INPUT = ("images", "masks", "depths", "depth_unit", "init_points", "blocks")
     PREPARING = "Reading the photos"
 
     source: tyro.conf.Positional[Path]
@@ -242,6 +243,9 @@ class Train(SceneCommand):
     """Units of the scene in a step of their numbers; else what transforms.json says, 0.001 for integers, or 1."""
     init_points: Annotated[Path | None, Rare] = None
     """Start from this dense cloud (PLY or LAS), in the units of the scene, as far as photos speak for it."""
+    blocks: Annotated[str | None, Rare] = None
+    """Cut the scene into columns and rows of blocks, as 3x2, or auto, and train one after the other:
+    for scenes larger than memory. Settings are those of each block (docs/blocks.md)."""
     tensorboard: Annotated[Flag, Rare] = False
     """Write curves for tensorboard into the folder as well."""
 

@@ -167,6 +167,26 @@ class Dataset:
         watched = middles_of(self.train, kept)
         return replace(self, train=[index for index in self.train if index not in watched], watched=watched)
 
+    def of_views(self, views: Sequence[int]) -> "Dataset":
+        """Some of the views alone, in their order; all else stays. Their photos are kept apart from those of this one.
+
+        Args:
+            views: indices, without repetition.
+        """
+        place = {view: number for number, view in enumerate(views)}
+        chosen = list(views)
+        return replace(
+            self,
+            viewmats=self.viewmats[chosen],
+            Ks=self.Ks[chosen],
+            images=self.images.subset(chosen),
+            names=[self.names[view] for view in chosen],
+            **{
+                split: sorted(place[view] for view in getattr(self, split) if view in place)
+                for split in ("train", "test", "watched")
+            },
+        )
+
     def halved(self) -> "Dataset":
         """The same views at half the size, each pixel the mean of those it replaces (odd sizes are rounded down)."""
         images = halved(self.images)
@@ -182,7 +202,13 @@ class Dataset:
 
         `normalization.invert` of the result leads back to the input's own units.
         """
-        return self.renormalized(*self._center_and_extent())
+        frame = self.frame
+        return self.renormalized(frame.center, frame.radius)
+
+    @property
+    def frame(self) -> Normalization:
+        """From the present frame to that of `normalized`."""
+        return Normalization(*self._center_and_extent())
 
     def renormalized(self, center: Float[Tensor, "3"], radius: float) -> "Dataset":
         """The same views in the frame where the sphere (center, radius) of the present frame is the unit sphere.

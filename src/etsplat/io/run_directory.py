@@ -43,7 +43,7 @@ _FILES = (
     "config.json",
 )
 _STAGES = "stages"
-_FOLDERS = ("test", "checkpoints", "tensorboard", _STAGES)
+_FOLDERS = ("test", "checkpoints", "tensorboard", "blocks", _STAGES)
 
 _CONFIG_KINDS: dict[str, Any] = {
     "task": str,

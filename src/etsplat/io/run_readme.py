@@ -15,6 +15,7 @@ georeference.json  if it is there: world coordinates = offset + scale * coordina
 ended.txt       if it is there: how the run ended before it was done
 config.json     the settings that made it
 checkpoints/    where an interrupted run continues with --resume; safe to delete once the run is done
+blocks/         if it is there: a run for each block of the scene, with its checkpoints; as safe to delete at the end
 stages/         if it is there: the same of what was made beside it; as safe to delete
 """
 

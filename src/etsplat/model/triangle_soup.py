@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -33,6 +33,23 @@ FOCAL_NOTE = "focal"
 
 GEOREFERENCE_NOTE = "georeference"
 """Note of a trained soup: where its units lie in the world, as `etsplat.io.georeference.Georeference` writes it."""
+
+
+class Drawn(NamedTuple):
+    """What pictures of N triangles are made of.
+
+    Attributes:
+        vertices: (N, 3, 3).
+        opacities: (N,).
+        sigma: (N,).
+        colors: (B, N, 3), as B cameras see them.
+    """
+
+    vertices: Any
+    opacities: Any
+    sigma: Any
+    colors: Any
+
 
 _NEAR_ONE = 1 - 2.0**-24
 """The largest float below 1: what the floor brings to 1 has no finite logit."""
@@ -219,21 +236,12 @@ class TriangleSoup(Model):
             behind = [None] * len(cameras) if backgrounds is None else backgrounds.split(1)
             views = [(cameras[index], behind[index]) for index in range(len(cameras))]
             return joined([self.render(v, backgrounds=b, outputs=outputs, depth_of=depth_of) for v, b in views])
-        colors = soup_colors(self.vertices, self.sh_dc, self.sh_rest, cameras.centers, self.drawn_degree)
-        opacities, sigma = soup_activation(
-            self.vertices,
-            self.opacity_logits,
-            self.sigma_raw,
-            look.numbers if look.limits is None else look.limits,
-            cameras if culls else None,
-            smallest=SMALLEST_INRADIUS if look.cull_small else 0.0,
-            largest=look.cull_large * max(cameras.width, cameras.height),
-        )
+        drawn = self.drawn(cameras, culls=culls)
         return rasterize(
-            self.vertices,
-            opacities=opacities,
-            sigma=sigma,
-            face_colors=colors,
+            drawn.vertices,
+            opacities=drawn.opacities,
+            sigma=drawn.sigma,
+            face_colors=drawn.colors,
             cameras=cameras,
             kernel=look.kernel,
             distance=look.distance,
@@ -244,6 +252,26 @@ class TriangleSoup(Model):
             freeze_inradius=look.freeze_inradius,
             validate=False,
         )
+
+    def drawn(self, cameras: Cameras, *, culls: bool) -> Drawn:
+        """What is rasterized, differentiable.
+
+        Args:
+            cameras: B cameras; one where `culls`.
+            culls: triangles that the appearance leaves out are transparent.
+        """
+        look = self.appearance
+        colors = soup_colors(self.vertices, self.sh_dc, self.sh_rest, cameras.centers, self.drawn_degree)
+        opacities, sigma = soup_activation(
+            self.vertices,
+            self.opacity_logits,
+            self.sigma_raw,
+            look.numbers if look.limits is None else look.limits,
+            cameras if culls else None,
+            smallest=SMALLEST_INRADIUS if look.cull_small else 0.0,
+            largest=look.cull_large * max(cameras.width, cameras.height),
+        )
+        return Drawn(self.vertices, opacities, sigma, colors)
 
     @torch.no_grad()
     def render_opaque(self, cameras: Cameras, *, supersampling: int = 4) -> Float[Tensor, "B H W 4"]:

@@ -25,7 +25,7 @@ def reproduce_command(config: dict[str, Any], version: str) -> str | None:
     words = [f"etsplat {config['task']} {shlex.quote(paths['source'])} --out DIR"]
     if paths["source"] == "demo:scene":
         words = ["etsplat demo scene --out DIR"]
-    words += [_option(name, paths[name]) for name in ("init_mesh", "images", "masks") if paths.get(name)]
+    words += [_option(name, paths[name]) for name in ("init_mesh", "images", "masks", "blocks") if paths.get(name)]
     words += [_option(name, settings[name]) for name in kind.LABELS]
     for name, value in flatten(settings).items():
         if name not in kind.LABELS and (not same or name not in implied or implied[name] != value):

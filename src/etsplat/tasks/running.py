@@ -119,6 +119,7 @@ class Job:
         config: settings.
         device: where it runs.
         run: the run directory, within `writing`.
+        place: where it is.
     """
 
     run: RunDirectory
@@ -136,8 +137,8 @@ class Job:
         self.config, self.device = config, resolve_device(config.device, config.engine)
         self._callbacks = (callbacks or notebook_callbacks()) if workers().leads else []
         again = restarted() and self.first(lambda: is_run(out))
-        self._place = Place(Path(out), resume or again, overwrite and not again)
-        self.first(self._place.check)
+        self.place = Place(Path(out), resume or again, overwrite and not again)
+        self.first(self.place.check)
         if workers().count > config.batch:
             text = f"batch is {config.batch}: of {workers().count} workers no more have something to do in a step"
             self.announce(NoteEvent(text))
@@ -157,7 +158,7 @@ class Job:
         self.announce(PrepareEvent(done, total))
 
     def identify(
-        self, hashes: dict[str, str | None], paths: dict[str, str | None], iterations: int | None = None
+        self, hashes: Mapping[str, str | None], paths: Mapping[str, str | None], iterations: int | None = None
     ) -> None:
         """Takes what the run is of, as `make_record` does. A run that goes on must be of the same.
 
@@ -167,8 +168,13 @@ class Job:
         self._record = make_record(self.config, iterations or self.config.iterations, hashes, paths)
         about = {"device": device_name(self.device), "iterations": self._record["iterations"], **self._record["source"]}
         workers().agree({**about_this(), **about, **flattened(self._record["config"])})
-        if self._place.resume:
-            self.first(lambda: RunDirectory.resume(self._place.path, self._record))
+        if self.place.resume:
+            self.first(lambda: RunDirectory.resume(self.place.path, self._record))
+
+    def measured(self) -> dict[str, Any] | None:
+        """metrics.json of a run that goes on after it was done, once it is identified; None of others."""
+        run = RunDirectory(self.place.path)
+        return self.first(lambda: run.read_metrics() if self.place.resume and run.metrics_path.is_file() else None)
 
     @contextlib.contextmanager
     def writing(self) -> Iterator[None]:
@@ -178,10 +184,10 @@ class Job:
             InputError: somebody does; or as `Place.open`.
         """
         if not workers().leads:
-            self.run = RunDirectory(self._place.path)
+            self.run = RunDirectory(self.place.path)
             yield
             return
-        with self._place.open(self._record, lambda text: self.announce(NoteEvent(text))) as self.run:
+        with self.place.open(self._record, lambda text: self.announce(NoteEvent(text))) as self.run:
             self.run.forget_end()
             try:
                 yield
@@ -303,7 +309,7 @@ def terms_of(
 
 
 def make_record(
-    config: Settings, iterations: int, hashes: dict[str, str | None], paths: dict[str, str | None]
+    config: Settings, iterations: int, hashes: Mapping[str, str | None], paths: Mapping[str, str | None]
 ) -> dict[str, Any]:
     """What config.json holds. Inputs are identified by their hashes; paths are for the reader.
 

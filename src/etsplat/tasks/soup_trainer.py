@@ -7,10 +7,11 @@ from functools import partial
 
 import torch
 
-from etsplat.data.dataset import Dataset
+from etsplat.data.dataset import Dataset, Normalization
 from etsplat.data.shown_width import shown_width
 from etsplat.model.soup_appearance import SoupAppearance
 from etsplat.model.soup_init import StartPoints, random_points, start_soup
+from etsplat.model.surrounded_soup import SurroundedSoup
 from etsplat.model.surroundings import Surroundings
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.optim.camera_refinement import CameraRefinement
@@ -24,6 +25,7 @@ from etsplat.optim.terms.photometric import Photometric
 from etsplat.optim.terms.soup import Spared
 from etsplat.optim.trainer import Trainer
 from etsplat.tasks.running import terms_of
+from etsplat.tasks.scene_part import ScenePart, in_frame, sphere_in_frame
 from etsplat.tasks.train_checks import triangle_limit
 from etsplat.tasks.train_config import TrainConfig
 
@@ -55,6 +57,7 @@ def start_trainer(
     evaluate: Callable[[TriangleSoup], dict[str, float]] | None = None,
     device: torch.device | None = None,
     depths: DepthTrust | None = None,
+    part: ScenePart | None = None,
 ) -> Trainer[TriangleSoup]:
     """The start of a run: triangles at the capture's points, or at random ones.
 
@@ -64,9 +67,10 @@ def start_trainer(
         evaluate: cheap metrics of a soup.
         device: where the soup lives; None for the CPU.
         depths: which depth maps are believed; None where none are used.
+        part: of a capture that is a part of a scene, what it has from the whole.
     """
     generator = torch.Generator().manual_seed(config.seed)
-    points = _start_points(capture, config, generator)
+    points = _start_points(capture, config, generator, whole=part is None)
     soup = start_soup(
         points,
         generator,
@@ -77,11 +81,13 @@ def start_trainer(
         centers=capture.centers[capture.train],
         limit=config.start.limit,
     )
-    if config.sky == "sphere":
+    if part is not None:
+        soup = _among_the_rest(soup, part, capture.normalization)
+    elif config.sky == "sphere":
         soup = soup.joined(Surroundings.of(capture).soup(capture, config.drawing.sh_degree))
     squared = config.scene_type == "outdoor" and not config.normalize and points.span > LARGE_SPAN
     soup = soup.to(device or torch.device("cpu"))
-    return make_trainer(soup, capture, config, evaluate, generator, depths, squared=squared)
+    return make_trainer(soup, capture, config, evaluate, generator, depths, part, squared=squared)
 
 
 def make_trainer(
@@ -91,6 +97,7 @@ def make_trainer(
     evaluate: Callable[[TriangleSoup], dict[str, float]] | None = None,
     generator: torch.Generator | None = None,
     depths: DepthTrust | None = None,
+    part: ScenePart | None = None,
     *,
     squared: bool = False,
 ) -> Trainer[TriangleSoup]:
@@ -103,10 +110,14 @@ def make_trainer(
         evaluate: cheap metrics of a soup.
         generator: of every random choice; None for a new one with the seed of `config`.
         depths: which depth maps are believed; None where none are used.
+        part: as of `start_trainer`.
         squared: photos are compared by squares.
     """
-    closed = Surroundings.of(capture).to(soup.vertices.device) if config.sky == "sphere" else None
-    spared = None if closed is None else closed.outermost
+    closed = Surroundings.of(capture) if config.sky == "sphere" and part is None else None
+    if part is not None and part.closed is not None:
+        closed = sphere_in_frame(part.closed, capture.normalization)
+    spared = None if closed is None else closed.to(soup.vertices.device).outermost
+    exposure = Exposure.of(config.exposure, config.iterations, len(capture.train) / config.batch)
     return Trainer(
         soup,
         capture,
@@ -115,7 +126,7 @@ def make_trainer(
         schedule=_schedule(config, vertex_unit(soup, capture, config)),
         batch=config.batch,
         background=None if config.background == "random" else background_of(config),
-        exposure=Exposure.of(config.exposure, config.iterations, len(capture.train) / config.batch),
+        exposure=exposure if part is None else part.exposures(capture),
         depths=depths,
         cameras=CameraRefinement.of(config.refine_cameras, config.iterations, len(capture.train) / config.batch),
         evaluate=evaluate,
@@ -225,7 +236,13 @@ def _appearance(config: TrainConfig, iteration: int) -> SoupAppearance:
     return replace(plain, opacity_floor=FINAL_FLOOR * opaque, sigma_ceiling=ceiling)
 
 
-def _start_points(capture: Dataset, config: TrainConfig, generator: torch.Generator) -> StartPoints:
+def _among_the_rest(soup: TriangleSoup, part: ScenePart, frame: Normalization) -> TriangleSoup:
+    if part.sky is not None:
+        soup = soup.joined(in_frame(part.sky, frame))
+    return SurroundedSoup.among(soup, in_frame(part.rest, frame))
+
+
+def _start_points(capture: Dataset, config: TrainConfig, generator: torch.Generator, *, whole: bool) -> StartPoints:
     """The capture's points, or random ones in a cube that holds what the cameras look at."""
     positions, colors = capture.points, capture.point_colors
     if positions is None:
@@ -233,7 +250,7 @@ def _start_points(capture: Dataset, config: TrainConfig, generator: torch.Genera
     else:
         grey = torch.full_like(positions, 0.5)
         points = StartPoints(positions, grey if colors is None else colors)
-    return points.with_sky() if config.sky == "dome" else points
+    return points.with_sky() if config.sky == "dome" and whole else points
 
 
 def background_of(config: TrainConfig) -> tuple[float, float, float]:

@@ -117,6 +117,7 @@ def load_scene(
     depths: bool | Path | str = False,
     depth_unit: float | None = None,
     preload: bool = True,
+    memory: int | None = None,
 ) -> Dataset:
     """Reads a scene's folder as `load_dataset` does, or makes the demo's scene in photos no wider than its own.
 
@@ -129,6 +130,7 @@ def load_scene(
         depths: as of `load_dataset`.
         depth_unit: likewise.
         preload: decode all photos now.
+        memory: as of `load_dataset`.
     """
     if isinstance(source, Dataset):
         return source
@@ -144,6 +146,7 @@ def load_scene(
         depth_unit=depth_unit,
         progress=progress,
         preload=preload,
+        memory=memory,
     )
 
 

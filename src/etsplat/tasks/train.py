@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -19,6 +20,7 @@ from etsplat.model.triangle_soup import FOCAL_NOTE, GEOREFERENCE_NOTE, TriangleS
 from etsplat.optim.exposure import Exposure
 from etsplat.optim.loop import Callback, CheckpointEvent, DivergedError, Event, NoteEvent
 from etsplat.optim.schedules import limited_iterations
+from etsplat.tasks.block_training import check_blocks, shape_of, train_blocks
 from etsplat.tasks.camera_results import conclude_cameras
 from etsplat.tasks.depths import trusted_depths, wanted_depths
 from etsplat.tasks.export_config import ExportConfig
@@ -26,6 +28,7 @@ from etsplat.tasks.export_soup import export_soup
 from etsplat.tasks.opaque import fit_opaque_mesh
 from etsplat.tasks.refined_cameras import kept_aside
 from etsplat.tasks.running import Job, Result, path_of
+from etsplat.tasks.scene_part import ScenePart
 from etsplat.tasks.scoring import Scorer
 from etsplat.tasks.soup_trainer import background_of, start_trainer
 from etsplat.tasks.sources import SoupRun, load_scene, with_cloud
@@ -65,6 +68,7 @@ def train(
     depths: str | Path | None = None,
     depth_unit: float | None = None,
     init_points: str | Path | None = None,
+    blocks: str | None = None,
     callbacks: Sequence[Callback] = (),
     onlooker: Onlooker | None = None,
     resume: bool = False,
@@ -89,6 +93,8 @@ def train(
             for integers and 1 for others.
         init_points: a dense cloud (PLY or LAS) in the scene's units, to start from instead of its own points. What
             photos do not speak for is left out, and it is thinned to half of the triangles that there may be.
+        blocks: cuts the scene into so many columns and rows of blocks, as "3x2", or "auto", and trains one after the
+            other, for scenes larger than memory (docs/blocks.md). Settings are those of each block.
         callbacks: each is called with every event, in the thread of the caller. With none a notebook shows a line.
         onlooker: told of the soup before the first step and after steps, in the thread of the caller.
         resume: continue the run in `out`, which must have been started with the same source and settings.
@@ -106,26 +112,57 @@ def train(
         True
     """
     config = config or TrainConfig()
+    if blocks is not None:
+        check_blocks(blocks, config, watched=onlooker is not None)
     job = Job(config, out, callbacks, resume=resume, overwrite=overwrite)
     maps = wanted_depths(depths, depth_unit, config.loss.depth)
-    own = load_scene(source, config.width, images, masks, job.prepared, depths=maps, depth_unit=depth_unit)
+    memory = None if blocks is None else 0  # in blocks, photos are those of one block
+    own = load_scene(
+        source, config.width, images, masks, job.prepared, depths=maps, depth_unit=depth_unit, memory=memory
+    )
     own = kept_aside(own, config.watch, config.refine_cameras)
     if init_points is not None:
         own, note = with_cloud(own, init_points, triangle_limit(own, config), job.prepared)
         job.announce(NoteEvent(note))
-    capture = own.normalized() if config.normalize else own
-    iterations = limited_iterations(config.iterations, config.schedule.max_epochs, len(own.train), config.batch)
-    for note in (*own.notes, *check_train(own, config, iterations, job.device)):
-        job.announce(NoteEvent(note))
     folders = {"masks": path_of(masks), "depths": path_of(depths), "init_points": path_of(init_points)}
     paths = {"source": path_of(source), "images": images, **folders}
-    job.identify({"fingerprint": own.fingerprint()}, paths, iterations)
+    if blocks is None or (shape := shape_of(blocks, own, config)) == (1, 1):
+        return _fit(job, own, paths, onlooker)
+
+    def fit(each: Job, capture: Dataset, part: ScenePart | None) -> tuple[TriangleSoup, dict[str, Any]]:
+        done = _fit(each, capture, paths, part=part)
+        return done.soup, done.metrics
+
+    soup, metrics = train_blocks(job, own, shape, {**paths, "blocks": blocks}, fit)
+    return TrainResult(job.run.path, metrics, soup)
+
+
+def _fit(
+    job: Job,
+    own: Dataset,
+    paths: dict[str, str | None],
+    onlooker: Onlooker | None = None,
+    part: ScenePart | None = None,
+) -> TrainResult:
+    """A run over a capture in its own units, or over a part of one."""
+    config: TrainConfig = job.config  # pyright: ignore[reportAssignmentType]
+    frame = own.frame if part is None else part.frame
+    capture = own.renormalized(frame.center, frame.radius) if config.normalize else own
+    iterations = limited_iterations(config.iterations, config.schedule.max_epochs, len(own.train), config.batch)
+    around = 0 if part is None else len(part.rest)
+    for note in (*own.notes, *check_train(own, config, iterations, job.device, around)):
+        job.announce(NoteEvent(note))
+    hashes = {"fingerprint": own.fingerprint(), **({} if part is None else {"part": part.digest()})}
+    job.identify(hashes, paths, iterations)
+    if part is not None and (metrics := job.measured()) is not None:  # a block that is done
+        path = job.place.path
+        return TrainResult(path, metrics, job.first(lambda: TriangleSoup.load(RunDirectory(path).soup_path)))
     job.config = config = replace(config, iterations=iterations)
     with engine(config.engine):
         scorer = Scorer(capture, job.device, background=background_of(config))
         loss, first = config.loss, config.at(config.loss.depth_from)
         trust = trusted_depths(capture, loss.depth if loss.lambda_depth else "off", first, job.announce)
-        trainer = start_trainer(capture, config, scorer.cheap, job.device, trust)
+        trainer = start_trainer(capture, config, scorer.cheap, job.device, trust, part)
 
         def look(iteration: int) -> None:
             if onlooker is not None and workers().leads:
@@ -199,9 +236,8 @@ def _copy(soup: TriangleSoup) -> TriangleSoup:
 def _in_own_units(soup: TriangleSoup, iteration: int, capture: Dataset, config: TrainConfig) -> TriangleSoup:
     """The soup as it is now, on the CPU."""
     soup, own = soup.finished().to(torch.device("cpu")), capture.normalization
-    return replace(
-        soup,
-        vertices=own.invert(soup.vertices.double()).float(),
+    return TriangleSoup(
+        **{**soup.state(), "vertices": own.invert(soup.vertices.double()).float()},
         appearance=replace(soup.appearance, near_plane=soup.appearance.near_plane * own.radius),
         notes={
             "iteration": str(iteration),

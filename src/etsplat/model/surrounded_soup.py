@@ -1,0 +1,75 @@
+"""A soup that is fitted to photos which show other triangles as well: these are drawn with it, and stay as they are."""
+
+from dataclasses import dataclass, field, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from etsplat.core.cameras import Cameras
+from etsplat.core.rasterization import Rasterization, TriangleStatistics
+from etsplat.model.model import Depth
+from etsplat.model.triangle_soup import Drawn, TriangleSoup
+
+
+def _nothing() -> TriangleSoup:
+    none = torch.zeros(0)
+    return TriangleSoup(none.view(0, 3, 3), none, none.clone(), none.view(0, 1, 3), none.view(0, 0, 3))
+
+
+@dataclass
+class SurroundedSoup(TriangleSoup):
+    """N learnable triangles among others. All but pictures is of the learnable ones alone: parameters, count, files.
+
+    Attributes:
+        rest: the others, in the same frame, as they are drawn.
+    """
+
+    rest: TriangleSoup = field(default_factory=_nothing)
+
+    @classmethod
+    def among(cls, soup: TriangleSoup, rest: TriangleSoup) -> "SurroundedSoup":
+        """The soup's tensors, not copies, among the rest."""
+        return cls(**soup.parameters(), appearance=soup.appearance, notes=soup.notes, rest=rest)
+
+    def to(self, device: torch.device) -> "SurroundedSoup":
+        """Both on another device."""
+        moved = super().to(device)
+        moved.rest = self.rest.to(device)
+        return moved
+
+    def drawn(self, cameras: Cameras, *, culls: bool) -> Drawn:
+        """What is rasterized: the learnable triangles, then the rest."""
+        with torch.no_grad():
+            rest = self.rest.drawn(cameras, culls=culls)
+        own = super().drawn(cameras, culls=culls)
+        return Drawn(*(torch.cat(pair, dim=axis) for pair, axis in zip(zip(own, rest, strict=True), AXES, strict=True)))
+
+    def render(
+        self,
+        cameras: Cameras,
+        *,
+        backgrounds: Float[Tensor, "B 3"] | None = None,
+        outputs: tuple[str, ...] = ("color",),
+        depth_of: Depth = "plane",
+    ) -> Rasterization:
+        """All triangles, with statistics of the learnable ones."""
+        seen = super().render(cameras, backgrounds=backgrounds, outputs=outputs, depth_of=depth_of)
+        if seen.statistics is None:
+            return seen
+        own = {name: values[:, : len(self)] for name, values in vars(seen.statistics).items()}
+        return replace(seen, statistics=TriangleStatistics(**own))
+
+    def render_opaque(self, cameras: Cameras, *, supersampling: int = 4) -> Float[Tensor, "B H W 4"]:
+        """All triangles."""
+        return self.everything().render_opaque(cameras, supersampling=supersampling)
+
+    @torch.no_grad()
+    def everything(self) -> TriangleSoup:
+        """All triangles as one soup, in new tensors; appearances are written into it."""
+        own = self.finished()
+        alone = TriangleSoup(**own.state(), appearance=own.appearance, notes=own.notes)
+        return alone.joined(self.rest)
+
+
+AXES = Drawn(vertices=0, opacities=0, sigma=0, colors=1)

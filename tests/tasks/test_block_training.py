@@ -1,0 +1,183 @@
+"""A run in blocks: each block is a run that goes on where it was, and together they are one soup without seams."""
+
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+import etsplat
+from etsplat.core.errors import InputError
+from etsplat.data.blocks import cut
+from etsplat.data.dataset import Dataset
+from etsplat.io.run_directory import RunDirectory
+from etsplat.model.triangle_soup import TriangleSoup
+from etsplat.optim.loop import NoteEvent, StageEvent
+from etsplat.tasks import block_training, train_memory
+from etsplat.tasks.export_config import ExportConfig
+from etsplat.tasks.export_soup import export_soup
+from etsplat.tasks.sources import open_run, world_up
+from etsplat.tasks.train import TrainResult, train
+from etsplat.tasks.train_config import TrainConfig
+from helpers.captures import small_demo_scene
+
+CONFIG = TrainConfig.tiny().changed(
+    {"iterations": 24, "output.log_every": 4, "output.checkpoint_every": 8, "sky": "sphere", "max_triangles": 700}
+)
+
+
+@pytest.fixture(scope="module")
+def capture() -> Dataset:
+    return small_demo_scene()
+
+
+@pytest.fixture(scope="module")
+def run(capture: Dataset, tmp_path_factory: pytest.TempPathFactory) -> tuple[TrainResult, list[object]]:
+    events: list[object] = []
+    out = tmp_path_factory.mktemp("blocks") / "run"
+    return train(capture, out, CONFIG, blocks="2x1", callbacks=[events.append]), events
+
+
+def triangles(soup: TriangleSoup) -> torch.Tensor:
+    return soup.vertices.detach()
+
+
+def test_each_triangle_is_of_the_block_in_which_its_middle_lies(
+    run: tuple[TrainResult, list[object]], capture: Dataset
+) -> None:
+    """Of every block's run exactly what lies in its cell, margins dropped, and nothing of the coarse soup."""
+    result = run[0]
+    grid = cut(capture, (2, 1), world_up(capture.viewmats))
+    kept, dropped = [], 0
+    for block in range(2):
+        own = TriangleSoup.load(result.path / "blocks" / grid.name(block) / "soup.safetensors")
+        inside = grid.block_of(triangles(own).double().mean(dim=1)) == block
+        dropped += int((~inside).sum())
+        kept.append(triangles(own)[inside])
+    assert torch.equal(triangles(result.soup), torch.cat(kept))
+    assert dropped > 0
+    assert result.soup.count == result.metrics["triangles"]
+
+
+def test_the_run_is_one_for_all_that_comes_after(run: tuple[TrainResult, list[object]], capture: Dataset) -> None:
+    """Its folder opens, exports and is reported; it is better than its coarse soup, and has a sky all around."""
+    result, path = run[0], run[0].path
+    opened = open_run(path)
+    assert torch.equal(triangles(opened.soup), triangles(result.soup))
+    export_soup(opened, path / "out.glb", ExportConfig(sky="none", min_opacity=0.05))
+    assert (path / "out.glb").is_file()
+    etsplat.write_report(path)
+    assert (path / "report.html").is_file()
+    blocks = {each["name"]: each for each in result.metrics["blocks"]}
+    assert set(blocks) == {"coarse", "0_0", "1_0"}
+    assert result.metrics["psnr"] > blocks["coarse"]["psnr"] - 0.5
+    assert result.metrics["iterations"] == 12 + 24 + 24
+    assert RunDirectory(path).read_iterations() == 12 + 24 + 24
+    assert "sky" in result.soup.notes
+    whole = TriangleSoup.load(path / "blocks" / "coarse" / "soup.safetensors")
+    assert result.soup.notes["sky"] == whole.notes["sky"]
+    assert len(result.metrics["test_views"]) == len(capture.test)
+
+
+def test_what_is_there_and_needed_is_said_beforehand(run: tuple[TrainResult, list[object]]) -> None:
+    notes = [event.text for event in run[1] if isinstance(event, NoteEvent)]
+    assert notes[0].startswith("2 blocks of ")
+    assert "bytes for each of" in notes[0]
+    stages = [event.name for event in run[1] if isinstance(event, StageEvent)]
+    assert list(dict.fromkeys(stages)) == [f"Optimizing {name}" for name in ("coarse", "0_0", "1_0")]
+
+
+def stop_in(name: str, iteration: int) -> Callable[[object], None]:
+    def callback(event: object) -> None:
+        if isinstance(event, StageEvent) and event.name.endswith(name) and event.done >= iteration:
+            raise RuntimeError("killed")
+
+    return callback
+
+
+@pytest.mark.parametrize("name", ["coarse", "1_0"])
+def test_a_run_that_is_killed_in_a_block_goes_on_there(
+    run: tuple[TrainResult, list[object]], capture: Dataset, tmp_path: Path, name: str
+) -> None:
+    """To the same bits; blocks that are done are not made again."""
+    out = tmp_path / "run"
+    with pytest.raises(RuntimeError, match="killed"):
+        train(capture, out, CONFIG, blocks="2x1", callbacks=[stop_in(name, 12)])
+    done = out / "blocks" / "0_0" / "metrics.json"
+    before = done.stat().st_mtime_ns if done.is_file() else None
+    result = train(capture, out, CONFIG, blocks="2x1", resume=True)
+    if before is not None:
+        assert done.stat().st_mtime_ns == before
+    assert (before is None) == (name == "coarse")
+    for parameter, wanted in run[0].soup.state().items():
+        assert torch.equal(result.soup.state()[parameter], wanted)
+
+
+def test_resuming_takes_the_same_blocks_and_settings(
+    run: tuple[TrainResult, list[object]], capture: Dataset, tmp_path: Path
+) -> None:
+    out = tmp_path / "run"
+    shutil.copytree(run[0].path, out)
+    with pytest.raises(InputError, match="was started with"):
+        train(capture, out, CONFIG, blocks="1x2", resume=True)
+    with pytest.raises(InputError, match="was started with"):
+        train(capture, out, replace(CONFIG, seed=5), blocks="2x1", resume=True)
+    with pytest.raises(InputError, match="was started with"):
+        train(capture, out, CONFIG, resume=True)
+
+
+def test_exposures_are_shared(capture: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the coarse run learned of each photo holds in all blocks, which learn none of their own."""
+    known = []
+    inner = block_training._part
+
+    def spy(*arguments):
+        part = inner(*arguments)
+        known.append(part.exposure)
+        return part
+
+    monkeypatch.setattr(block_training, "_part", spy)
+    config = CONFIG.changed({"exposure": "on", "iterations": 16})
+    result = train(capture, tmp_path / "run", config, blocks="2x1")
+    shared = RunDirectory(result.path).read_exposure()["matrices"]
+    assert set(shared) == {capture.names[view] for view in capture.watching(None).train}
+    assert max(abs(shared[name][0][0] - 1) for name in shared) > 1e-4
+    for name in ("0_0", "1_0"):
+        own = RunDirectory(result.path / "blocks" / name).read_exposure()["matrices"]
+        assert all(torch.allclose(torch.tensor(own[each]), torch.tensor(shared[each])) for each in own)
+    assert len(known) == 2
+
+
+def test_what_needs_more_than_there_is_is_refused_before_the_first_step(
+    capture: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of one block, and of all together at the end."""
+    large = replace(CONFIG, max_triangles=50_000_000, pixels_per_triangle=None)
+    monkeypatch.setattr(train_memory, "available_memory", lambda: 1 << 30)
+    with pytest.raises(InputError, match=r"max_triangles: 50,000,000 .*set it to \d+ or less"):
+        train(capture, tmp_path / "run", large, blocks="2x1")
+    monkeypatch.setattr(train_memory, "available_memory", lambda: 1 << 40)
+    monkeypatch.setattr(block_training, "available_memory", lambda: 1 << 30)
+    with pytest.raises(InputError, match="all blocks may have 100,000,000 triangles"):
+        train(capture, tmp_path / "run", large, blocks="2x1")
+    assert not (tmp_path / "run").exists()
+
+
+def test_what_cannot_be_done_in_blocks_is_refused(capture: Dataset, tmp_path: Path) -> None:
+    refined = CONFIG.changed({"refine_cameras": "poses"})
+    with pytest.raises(InputError, match="refine_cameras: cannot be done in blocks"):
+        train(capture, tmp_path / "run", refined, blocks="2x1")
+    with pytest.raises(InputError, match="view: cannot be done in blocks"):
+        train(capture, tmp_path / "run", CONFIG, blocks="2x1", onlooker=lambda *_: None)
+    with pytest.raises(InputError, match="blocks: is many"):
+        train(capture, tmp_path / "run", CONFIG, blocks="many")
+
+
+def test_one_block_is_an_ordinary_run(capture: Dataset, tmp_path: Path) -> None:
+    """Where auto finds that one is enough."""
+    few = replace(CONFIG, iterations=4, max_triangles=5000)
+    result = train(capture, tmp_path / "run", few, blocks="auto")
+    assert "blocks" not in result.metrics
+    assert not (tmp_path / "run" / "blocks").exists()
