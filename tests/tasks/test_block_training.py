@@ -1,6 +1,7 @@
 """A run in blocks: each block is a run that goes on where it was, and together they are one soup without seams."""
 
 import shutil
+import weakref
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +16,9 @@ from etsplat.data.dataset import Dataset
 from etsplat.io.run_directory import RunDirectory
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.optim.loop import NoteEvent, StageEvent
+from etsplat.optim.trainer import Trainer
 from etsplat.tasks import block_training, train_memory
+from etsplat.tasks import train as tasks_train
 from etsplat.tasks.export_config import ExportConfig
 from etsplat.tasks.export_soup import export_soup
 from etsplat.tasks.sources import open_run, world_up
@@ -181,3 +184,21 @@ def test_one_block_is_an_ordinary_run(capture: Dataset, tmp_path: Path) -> None:
     result = train(capture, tmp_path / "run", few, blocks="auto")
     assert "blocks" not in result.metrics
     assert not (tmp_path / "run" / "blocks").exists()
+
+
+def test_a_run_that_is_done_leaves_nothing_in_memory(
+    capture: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before the next begins its trainer is gone, so that memory is that of one block."""
+    alive: list[weakref.ref[Trainer[TriangleSoup]]] = []
+    inner = tasks_train.start_trainer
+
+    def spy(*arguments):
+        assert all(trainer() is None for trainer in alive)
+        trainer = inner(*arguments)
+        alive.append(weakref.ref(trainer))
+        return trainer
+
+    monkeypatch.setattr(tasks_train, "start_trainer", spy)
+    train(capture, tmp_path / "run", CONFIG.changed({"iterations": 4}), blocks="2x1")
+    assert len(alive) == 3

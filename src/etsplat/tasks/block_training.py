@@ -5,6 +5,7 @@ starts from its own points, and from the sky of the coarse soup that lies in its
 is drawn with it and does not learn. In the result each triangle is of the run of that block in which its middle lies.
 """
 
+import gc
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -149,7 +150,9 @@ def _run(job: Job, name: str, config: TrainConfig, capture: Dataset, part: Scene
             job.announce(NoteEvent(f"{name}: {event.text}"))
 
     own = Job(config, folder, [tell], resume=is_run(folder), overwrite=False)
-    return _Done(name, len(capture.train), *fit(own, capture, part))
+    done = _Done(name, len(capture.train), *fit(own, capture, part))
+    gc.collect()  # a trainer and what looks at it hold each other; the next run needs the room
+    return done
 
 
 def _settings(own: Dataset, config: TrainConfig, blocks: int) -> tuple[TrainConfig, TrainConfig]:
