@@ -70,7 +70,7 @@ class _SquaredNorm(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> Tensor:
+    def backward(ctx: Any, gradient: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
         (values,) = ctx.saved_tensors
         return values * (2 * gradient)
 
