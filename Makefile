@@ -70,7 +70,7 @@ demo: setup
 test: setup
 	$(PY) -m pytest -n auto $(PYTEST_ARGS)
 
-# Of workflows, containers and the conda recipe; they come from the group `lint`, at their newest.
+# Of workflows, containers and the conda recipe; they come from the group `lint`; where LOCKED, `setup` has brought them.
 $(LINTERS): $(INSTALLED)
 	$(PIP) --group lint
 	@touch $@
@@ -84,7 +84,7 @@ lint: $(LINTERS)
 	$(VENV)/bin/pyright
 	$(VENV)/bin/lint-imports --no-cache
 
-# Sphinx and its like come from the group `docs`, at their newest: the lock does not name them.
+# Sphinx and its like come from the group `docs`, likewise.
 $(DOCS): $(INSTALLED)
 	$(PIP) -c constraints.txt --group docs
 	@touch $@
@@ -181,7 +181,8 @@ check-neon:
 # build of it is right (CPU, CUDA) depends on the machine, and with it the hash; constraints.txt has its version.
 LOCK := $(PY) -m uv pip compile --universal --python-version 3.10 --generate-hashes --no-annotate --no-header \
 	-c constraints.txt --extra cuda --extra compress --extra depth --extra heic --extra sfm --extra slurm --extra texture --extra tune \
-	--extra video --extra viewer --group pyproject.toml:dev --group pyproject.toml:docs pyproject.toml
+	--extra video --extra viewer --group pyproject.toml:dev --group pyproject.toml:docs \
+	--group pyproject.toml:lint pyproject.toml
 lock: setup
 	$(PIP) uv
 	printf "torch ; python_version < '3'\netsplat ; python_version < '3'\n" > build/without.txt
