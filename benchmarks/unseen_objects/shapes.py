@@ -144,6 +144,50 @@ def figures(g: Grid) -> Field:
     return union(*parts)
 
 
+def teapot(g: Grid) -> Field:
+    """A closed body with a handle, a spout and a knob."""
+    body = g.ellipsoid((0, 0, 0), np.eye(3), (0.52, 0.52, 0.42))
+    handle = g.ring((-0.58, 0, 0.02), 0.24, 0.05, 1)
+    spout = union(g.rod((0.35, 0, -0.15), (0.68, 0, 0.02), 0.1), g.rod((0.68, 0, 0.02), (0.86, 0, 0.32), 0.06))
+    return union(body, handle, spout, g.ball((0, 0, 0.48), 0.08), g.disc(-0.42, 0.28, 0.04))
+
+
+def comb(g: Grid) -> Field:
+    """Fourteen teeth with gaps as narrow as they are."""
+    teeth = [g.block((x, 0, -0.1), (0.032, 0.05, 0.4), 0.01) for x in np.linspace(-0.84, 0.84, 14)]
+    return union(g.block((0, 0, 0.4), (0.9, 0.07, 0.14)), *teeth)
+
+
+def clasp(g: Grid) -> Field:
+    """A ring on a stand, with a slit so narrow that few photos see light through it."""
+    ring = np.maximum(g.ring((0, 0, 0.3), 0.45, 0.13, 1), -g.block((0, 0, 0.8), (0.025, 0.3, 0.3), 0.0))
+    return union(ring, g.rod((0, 0, -0.1), (0, 0, -0.7), 0.09), g.disc(-0.75, 0.5, 0.06))
+
+
+def basket(g: Grid) -> Field:
+    """An open cup whose wall has two rows of windows."""
+    wall = np.maximum(np.abs(g.around - 0.6) - 0.045, np.abs(g.z) - 0.6)
+    for row, z in enumerate((-0.2, 0.25)):
+        for angle in 2 * math.pi * (np.arange(8) + 0.5 * row) / 8:
+            hole = np.hypot(g.y * math.cos(angle) - g.x * math.sin(angle), g.z - z) - 0.13
+            outwards = g.x * math.cos(angle) + g.y * math.sin(angle)
+            wall = np.maximum(wall, -np.maximum(hole, -outwards))
+    return union(wall, g.disc(-0.6, 0.64, 0.05))
+
+
+def shelf(g: Grid) -> Field:
+    """Six deep compartments before a back wall."""
+    case = g.block((0, 0, 0), (0.62, 0.32, 0.72))
+    for x in (-0.3, 0.3):
+        for z in (-0.45, 0.0, 0.45):
+            case = np.maximum(case, -g.block((x, -0.1, z), (0.26, 0.36, 0.19)))
+    return case
+
+
 SHAPES: dict[str, Callable[[Grid], Field]] = {
-    shape.__name__: shape for shape in (chair, chain, bowl, vase, plant, gear, cage, plate, figures)
+    shape.__name__: shape
+    for shape in (
+        *(chair, chain, bowl, vase, plant, gear, cage, plate, figures),
+        *(teapot, comb, clasp, basket, shelf),
+    )
 }
