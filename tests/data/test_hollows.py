@@ -8,15 +8,12 @@ import torch
 
 from etsplat.data.agreement import contradicted
 from etsplat.data.hollows import _where_agreed, _without_unseen, open_hollows
-from etsplat.data.photograph import orbit_cameras, photograph
-from etsplat.data.pictures import StoredPictures
 from etsplat.data.visual_hull import visual_hull
 from etsplat.geometry.distance import closest_points
 from etsplat.geometry.measures import face_areas
 from etsplat.geometry.topology import MeshTopology
-from etsplat.io.mesh_files import MeshFile
-from etsplat.ops.rasterize_opaque import render_opaque
 from etsplat.tasks.judgement import CONTRADICTED
+from helpers.painting import painted_pictures
 
 
 def revolved(profile: list[tuple[float, float]], rounds: int = 96) -> tuple[torch.Tensor, torch.Tensor]:
@@ -41,20 +38,8 @@ def line(start: tuple[float, float], end: tuple[float, float], parts: int = 16) 
 
 
 def pictures_of(profile: list[tuple[float, float]], *, painted: bool):
-    """Vertices and faces in the frame of the views, and the views: of one colour, or with soft spots."""
-    vertices, faces = revolved(profile)
-    views = photograph(MeshFile(vertices, faces), 160, 160, supersampling=2)
-    unit = views.normalization.apply(vertices)
-    waves = 8 * torch.randn(3, 3, 4, generator=torch.Generator().manual_seed(1))
-    phases = torch.einsum("fk,kcw->fcw", unit[faces].mean(dim=1), waves) * float(painted)
-    images = render_opaque(
-        unit,
-        face_colors=0.5 + 0.4 * phases.sin().mean(dim=2),
-        cameras=orbit_cameras(160, 160),
-        faces=faces,
-        supersampling=2,
-    ).rgba
-    return unit, faces, replace(views, images=StoredPictures(list(images)))
+    """Vertices and faces in the frame of the views, and the views."""
+    return painted_pictures(*revolved(profile), painted=painted)
 
 
 BOWL = [

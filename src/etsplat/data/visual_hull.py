@@ -78,7 +78,7 @@ def visual_hull(
         wanted = round(cells * (faces / len(triangles)) ** 0.5)
         if cells == (cells := min(max(wanted, _FIRST_CELLS // 2), _MOST_CELLS)):
             break
-    return _without_specks(*taken_apart(torch.from_numpy(vertices).float(), torch.from_numpy(triangles)))
+    return without_specks(*taken_apart(torch.from_numpy(vertices).float(), torch.from_numpy(triangles)))
 
 
 def outside_hull(dataset: Dataset) -> Distance:
@@ -103,8 +103,8 @@ def outside_hull(dataset: Dataset) -> Distance:
     return outside
 
 
-def _without_specks(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
-    """Only the large parts, and the vertices that these use."""
+def without_specks(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
+    """Only the large parts of a surface, and the vertices that these use."""
     if len(faces) == 0:
         return vertices[:0], faces
     part = face_parts(faces, len(vertices))

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from etsplat.core.errors import InputError
 from etsplat.data.dataset import Dataset
+from etsplat.data.false_handles import without_false_handles
 from etsplat.data.hollows import open_hollows
 from etsplat.data.silhouettes import silhouette, touches_border
 from etsplat.data.visual_hull import visual_hull
@@ -73,7 +74,8 @@ def make_start(
     kind: Start = start_shape(config, views) if start is None else "mesh"
     contradicted = 0.0
     if kind == "hull":
-        vertices, faces, _, contradicted = open_hollows(views, *plain_hull(views, config))
+        hull = without_false_handles(views, *plain_hull(views, config))
+        vertices, faces, _, contradicted = open_hollows(views, *hull)
         vertices = untangle(vertices, MeshTopology.from_faces(faces, len(vertices)))[0]
     elif start is None:
         vertices, faces = icosphere(config.start.level)
@@ -97,7 +99,7 @@ def make_start(
 
 
 def plain_hull(views: Dataset, config: ReconstructConfig) -> tuple[Tensor, Tensor]:
-    """The visual hull that a run starts from, before its hollows are opened: (V, 3) and (F, 3), in the unit frame.
+    """The visual hull, before false handles go and hollows are opened: (V, 3) and (F, 3), in the unit frame.
 
     Args:
         views: of the unit frame.

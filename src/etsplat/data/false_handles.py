@@ -1,0 +1,109 @@
+"""Handles of a visual hull that are none of the object's: matter in its hollows that lines of sight cut into bridges.
+
+Where several silhouettes cut into a hollow from several sides, what they leave of its filling stands in it as posts and
+arches. Photos contradict each other on all of their surface, and no silhouette needs them. So a region that photos
+contradict and that is no disc is replaced by discs, as long as all silhouettes stay as they are, nearly: a true handle
+would leave a gap in some, and a true hole that is closed would block the light in some.
+"""
+
+import torch
+from jaxtyping import Bool, Float, Int64
+from torch import Tensor
+
+from etsplat.data.agreement import Photo, first_hits, photos_of, surface_agreement
+from etsplat.data.dataset import Dataset
+from etsplat.data.visual_hull import without_specks
+from etsplat.geometry.discs import with_discs
+from etsplat.geometry.parts import genera
+from etsplat.geometry.topology import MeshTopology, connected
+
+_LEVELS = (0.4, 0.5, 0.6, 0.7)
+"""Correlations below which photos are said to contradict each other, the surest first."""
+
+_FEWEST = 8
+"""Faces of a region that is looked at."""
+
+_LOST, _ADDED = 0.001, 0.01
+"""So much of a silhouette, in any view, may be uncovered, and so much beside it covered. A crossbar is little of it,
+what is seen through a hole in the view that shows it best is more."""
+
+
+@torch.no_grad()
+def without_false_handles(
+    dataset: Dataset, vertices: Float[Tensor, "V 3"], faces: Int64[Tensor, "F 3"]
+) -> tuple[Float[Tensor, "V2 3"], Int64[Tensor, "F2 3"]]:
+    """A hull with discs for those regions with handles that photos contradict and no silhouette needs.
+
+    Each replacement makes the sum of the genera less, and leaves the number of parts as it is. A surface without
+    handles is returned as it is.
+
+    Args:
+        dataset: photos with alpha around an object in the unit ball.
+        vertices: (V, 3) of the hull, from `visual_hull`.
+        faces: (F, 3) of it.
+    """
+    if not any(genera(faces, len(vertices))):
+        return vertices, faces
+    photos = photos_of(dataset)
+    if len(photos) < 2:
+        return vertices, faces
+    most = _wrong(photos, vertices, faces) + torch.tensor([_LOST, _ADDED])
+    for level in _LEVELS:
+        while (simpler := _simpler(photos, vertices, faces, level, most)) is not None:
+            vertices, faces = simpler
+    return vertices, faces
+
+
+def _simpler(
+    photos: list[Photo], vertices: Tensor, faces: Tensor, level: float, most: Tensor
+) -> tuple[Tensor, Tensor] | None:
+    """The surface with a smaller genus, if there is one: the largest region is tried first."""
+    before = genera(faces, len(vertices))
+    if not any(before):
+        return None
+    edges = MeshTopology.from_faces(faces, len(vertices)).edges.long()
+    hits = [first_hits(photo, vertices, faces) for photo in photos]
+    score = surface_agreement(photos, hits, vertices, faces, edges)
+    low, unseen = score < level, score.isnan()
+    # Of most posts photos see one side. With the other they are handles, but what is not seen may join several.
+    regions = _regions(faces, low[faces].all(dim=1))
+    hidden = _regions(faces, (low | unseen)[faces].all(dim=1))
+    for region in [*regions, *(each for each in hidden if 2 * low[faces[each]].float().mean() >= 1)]:
+        found = without_specks(*with_discs(vertices, faces, region))
+        after = genera(found[1], len(found[0]))
+        if sum(after) >= sum(before) or len(after) != len(before):
+            continue
+        if bool((_wrong(photos, *found) <= most).all()):
+            return found
+    return None
+
+
+def _regions(faces: Tensor, low: Bool[Tensor, " F"]) -> list[Bool[Tensor, " F"]]:
+    """The connected regions of some faces that are no discs, the largest first."""
+    own = low.nonzero()[:, 0]
+    topology = MeshTopology.from_faces(faces, int(faces.max()) + 1)
+    edge, face = topology.face_edges[own].reshape(-1), torch.arange(len(own)).repeat_interleave(3)
+    order = torch.argsort(edge, stable=True)
+    shared = (edge[order][1:] == edge[order][:-1]).nonzero()[:, 0]
+    count, label = connected(torch.stack([face[order[shared]], face[order[shared + 1]]], dim=1), len(own))
+    sizes = label.bincount(minlength=count)
+    found = []
+    for number in torch.argsort(sizes, descending=True, stable=True).tolist():
+        if sizes[number] < _FEWEST:
+            break
+        region = torch.zeros_like(low)
+        region[own[label == number]] = True
+        inside = faces[region]
+        if len(inside.unique()) - len(topology.face_edges[region].unique()) + len(inside) != 1:
+            found.append(region)
+    return found
+
+
+def _wrong(photos: list[Photo], vertices: Tensor, faces: Tensor) -> Float[Tensor, "B 2"]:
+    """Of each view, the pixels that the surface should cover and does not, and the reverse, per silhouette."""
+    found = []
+    for photo in photos:
+        alpha, covered = photo.pixels[0, 3], first_hits(photo, vertices, faces)[1] >= 0
+        lost, added = ~covered & (alpha > 0.95), covered & (alpha < 0.05)
+        found.append(torch.stack([lost.sum(), added.sum()]) / (alpha > 0.5).sum())
+    return torch.stack(found)

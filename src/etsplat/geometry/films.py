@@ -1,0 +1,31 @@
+"""A film of soap: the part of a surface of which nothing is known, as small as what is around it lets it be."""
+
+import torch
+from jaxtyping import Bool, Float, Int64
+from torch import Tensor
+
+from etsplat.geometry.topology import MeshTopology
+
+_SWEEPS = 200
+"""Of vertices between their neighbours."""
+
+
+def film(vertices: Float[Tensor, "V 3"], faces: Int64[Tensor, "F 3"], free: Bool[Tensor, " V"]) -> Float[Tensor, "V 3"]:
+    """Moves the free vertices between their neighbours until they hardly move; a slit in them closes.
+
+    Args:
+        vertices: (V, 3).
+        faces: (F, 3).
+        free: (V,) which move. Where all of a part are free, it shrinks.
+    """
+    edges = MeshTopology.from_faces(faces, len(vertices)).edges.long()
+    source, target = torch.cat([edges, edges.flip(1)]).T
+    own = free.nonzero()[:, 0]
+    number = torch.full((len(vertices),), -1)
+    number[own] = torch.arange(len(own))
+    source, target = source[free[target]], number[target[free[target]]]
+    counts = target.bincount(minlength=len(own)).clamp_min(1)[:, None]
+    places = vertices.clone()
+    for _ in range(_SWEEPS if len(own) else 0):
+        places[own] = places.new_zeros((len(own), 3)).index_add(0, target, places[source]) / counts
+    return places

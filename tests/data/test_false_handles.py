@@ -1,0 +1,98 @@
+"""A painted bowl whose hull had an arch in it that the bowl has not, or has."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from etsplat.data.dataset import Dataset
+from etsplat.data.false_handles import without_false_handles
+from etsplat.data.meshing import SignedDistance, dual_contour
+from etsplat.data.pictures import StoredPictures
+from etsplat.geometry.distance import closest_points
+from etsplat.geometry.parts import genera
+from etsplat.geometry.topology import MeshTopology
+from helpers.painting import painted_pictures
+
+Surface = tuple[torch.Tensor, torch.Tensor]
+
+
+def bowl(places: np.ndarray) -> np.ndarray:
+    """A can 0.9 high, with a hollow down to a third of its height."""
+    x, y, z = places.T
+    around = np.hypot(x, z)
+    solid = np.maximum(around - 0.7, np.abs(y) - 0.45)
+    return np.maximum(solid, -np.maximum(around - 0.58, -0.2 - y))
+
+
+def arched(places: np.ndarray) -> np.ndarray:
+    """The same with a rod from wall to wall, well below the rim, so that no silhouette shows it."""
+    x, y, z = places.T
+    return np.minimum(bowl(places), np.maximum(np.hypot(y - 0.05, z) - 0.1, np.abs(x) - 0.62))
+
+
+def handled(places: np.ndarray) -> np.ndarray:
+    """The same with a handle at its side, which silhouettes show."""
+    x, y, z = places.T
+    return np.minimum(bowl(places), np.maximum(np.hypot(np.hypot(x - 0.75, y) - 0.25, z) - 0.07, 0.62 - x))
+
+
+def surface(shape: SignedDistance) -> Surface:
+    vertices, faces = dual_contour(shape, (-1.2, -1.2, -1.2), 0.08, (30, 30, 30))
+    return torch.from_numpy(vertices).float(), torch.from_numpy(faces)
+
+
+def photographed(shape: SignedDistance) -> tuple[Surface, Dataset]:
+    """A surface in the frame of its views, and these."""
+    vertices, faces, views = painted_pictures(*surface(shape))
+    return (vertices, faces), views
+
+
+def placed(shape: SignedDistance, views: Dataset) -> Surface:
+    vertices, faces = surface(shape)
+    return views.normalization.apply(vertices), faces
+
+
+@pytest.mark.parametrize(("shape", "holes"), [(bowl, 0), (handled, 1)])
+def test_an_arch_that_photos_contradict_goes(shape: SignedDistance, holes: int) -> None:
+    """And a true handle beside it stays."""
+    truth, views = photographed(shape)
+    false = placed(lambda places: np.minimum(shape(places), arched(places)), views)
+    assert genera(false[1], len(false[0])) == [holes + 1]
+    vertices, faces = without_false_handles(views, *false)
+    assert genera(faces, len(vertices)) == [holes]
+    topology = MeshTopology.from_faces(faces, len(vertices))
+    assert topology.is_closed()
+    assert topology.is_manifold()
+    assert topology.is_oriented()
+    before, after = (closest_points(points, *truth)[0].mean() for points in (false[0], vertices))
+    assert after < before / 2
+
+
+def test_an_arch_that_the_object_has_stays() -> None:
+    truth, views = photographed(arched)
+    assert genera(truth[1], len(truth[0])) == [1]
+    vertices, faces = without_false_handles(views, *truth)
+    assert vertices is truth[0]
+    assert faces is truth[1]
+
+
+def test_a_handle_that_silhouettes_need_stays_whatever_photos_say() -> None:
+    """The views of an object with a handle, painted anew in each so that they agree nowhere."""
+    truth, views = photographed(handled)
+    noise = torch.Generator().manual_seed(0)
+    images = []
+    for image in views.images:
+        colors = torch.rand(*image.shape[:2], 3, generator=noise) * image[..., 3:]
+        images.append(torch.cat([colors, image[..., 3:]], dim=2))
+    noisy = replace(views, images=StoredPictures(images))
+    vertices, faces = without_false_handles(noisy, *truth)
+    assert genera(faces, len(vertices)) == [1]
+
+
+def test_a_surface_without_handles_is_left_alone() -> None:
+    truth, views = photographed(bowl)
+    found = without_false_handles(views, *truth)
+    assert found[0] is truth[0]
+    assert found[1] is truth[1]

@@ -1,0 +1,23 @@
+"""A film over what nobody sees: a slit closes, and what is held stays."""
+
+import torch
+
+from etsplat.geometry.films import film
+from etsplat.geometry.icosphere import icosphere
+from etsplat.geometry.measures import enclosed_volume
+
+
+def test_a_slit_in_a_ball_closes() -> None:
+    vertices, faces = icosphere(4)
+    slit = (vertices[:, 0].abs() < 0.1) & (vertices[:, 1] > 0.5)
+    cut = vertices.clone()
+    cut[slit, 1] -= 0.4
+    closed = film(cut, faces, slit)
+    assert torch.equal(closed[~slit], vertices[~slit])
+    assert (closed[slit] - vertices[slit]).norm(dim=1).max() < 0.05
+    assert 0.98 * enclosed_volume(vertices, faces) < enclosed_volume(closed, faces) <= enclosed_volume(vertices, faces)
+
+
+def test_where_nothing_is_free_nothing_moves() -> None:
+    vertices, faces = icosphere(1)
+    assert torch.equal(film(vertices, faces, torch.zeros(len(vertices), dtype=torch.bool)), vertices)
