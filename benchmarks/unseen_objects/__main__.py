@@ -17,27 +17,14 @@ import bpy  # pyright: ignore[reportMissingImports]
 import numpy as np
 import trimesh
 from mathutils import Matrix, Vector  # pyright: ignore[reportMissingImports]
-from skimage.measure import marching_cubes  # pyright: ignore[reportMissingImports]
 
-from benchmarks.unseen_objects.shapes import SHAPES, Grid
+from benchmarks.unseen_objects.shapes import SHAPES
+from benchmarks.unseen_objects.surfaces import surface
 
-GRID = 160
 VIEWS = {"train": (56, -60, 80, 16), "test": (8, -45, 65, 32)}
 """How many, lowest and highest elevation in degrees, paths for each pixel."""
 
 ANGLE, DISTANCE = math.pi / 4, 3.35
-
-
-def surface(name: str) -> trimesh.Trimesh:
-    """Around the origin, its farthest vertex at distance 1."""
-    grid = Grid(GRID)
-    vertices, faces, _, _ = marching_cubes(SHAPES[name](grid), 0.0)
-    mesh = trimesh.Trimesh(vertices, faces)
-    if mesh.volume < 0:
-        mesh.invert()
-    mesh.vertices -= mesh.bounds.mean(axis=0)
-    mesh.vertices /= np.linalg.norm(mesh.vertices, axis=1).max()
-    return mesh
 
 
 def material(rng: np.random.Generator):

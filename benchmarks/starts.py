@@ -1,0 +1,69 @@
+"""What runs start from: the visual hull, that without false handles, and that with its hollows open.
+
+    python -m benchmarks.starts FOLDERS [--objects NAMES]
+
+Inputs are those of `python -m studies.gallery`, with a known surface. Of each of the three its holes, and the exact
+Chamfer distance x 1e-3 of 20,000 samples; photos, faces and frame are those of preset quick. With CPU seconds.
+"""
+
+import argparse
+import time
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from etsplat.data.false_handles import without_false_handles
+from etsplat.data.hollows import open_hollows
+from etsplat.geometry.parts import genera
+from etsplat.io.mesh_files import load_mesh
+from etsplat.metrics.geometry import chamfer_exact, exact_squared_distances, sample_pair
+from etsplat.tasks.reconstruct_config import ReconstructConfig
+from etsplat.tasks.sources import load_source, make_subject
+from etsplat.tasks.starts import plain_hull
+from studies.objects.subjects import Subject, find_subjects
+
+SAMPLES = 20_000
+
+
+def rows(subject: Subject) -> list[str]:
+    """One of the table for each of the three."""
+    if subject.surface is None:
+        raise SystemExit(f"{subject.name}: its surface is not known")
+    config = ReconstructConfig.quick()
+    views, _ = make_subject(load_source(subject.source, config)[0], config, lambda *_: None, torch.device("cpu"))
+    truth = load_mesh(subject.surface)
+    found, surface, begun = [], (torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.int64)), time.process_time()
+    for name in ("hull", "without false handles", "opened"):
+        if name == "hull":
+            surface = plain_hull(views, config)
+        elif name == "opened":
+            surface = open_hollows(views, *surface)[:2]
+        else:
+            surface = without_false_handles(views, *surface)
+        seconds = time.process_time() - begun
+        score = distance(surface, views.normalization.apply(truth.vertices), truth.faces)
+        holes = ", ".join(str(count) for count in genera(surface[1], len(surface[0])))
+        found.append(f"| {subject.name} | {name} | {len(surface[1]):,} | {holes} | {1e3 * score:.3f} | {seconds:.1f} |")
+        begun = time.process_time()
+    return found
+
+
+def distance(surface: tuple[Tensor, Tensor], vertices: Tensor, faces: Tensor) -> float:
+    """From a surface to the true one and back."""
+    return chamfer_exact(*exact_squared_distances(*sample_pair(*surface, vertices, faces, SAMPLES)))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("inputs", nargs="+", type=Path)
+    parser.add_argument("--objects", nargs="*", default=())
+    options = parser.parse_args()
+    print("| object | start | faces | holes of each part | Chamfer | CPU s |\n|---|---|---|---|---|---|", flush=True)
+    with torch.no_grad():
+        for subject in find_subjects(options.inputs, options.objects):
+            print("\n".join(rows(subject)), flush=True)
+
+
+if __name__ == "__main__":
+    main()
