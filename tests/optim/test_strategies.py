@@ -50,6 +50,25 @@ def test_a_fixed_model_is_never_edited() -> None:
     assert not strategy.edit(1)
 
 
+def test_what_no_picture_shows_becomes_a_film_where_meshes_are_untangled() -> None:
+    """And nowhere else, nor at another time; without being told what that is nothing moves."""
+    hidden = icosphere(2)[0][:, 1] > 0.7
+    meshes = []
+    for unseen in (None, lambda vertices, faces: hidden):
+        strategy, mesh = SubdivideAndUntangle({}, [5], unseen=unseen), a_mesh()
+        with torch.no_grad():
+            mesh.vertices[hidden, 1] -= 0.3
+        before = mesh.vertices.detach().clone()
+        started(strategy, mesh)
+        strategy.edit(4)
+        assert torch.equal(mesh.vertices, before)
+        strategy.edit(5)
+        assert torch.equal(mesh.vertices[~hidden], before[~hidden])
+        meshes.append(mesh.vertices.detach())
+    assert torch.equal(meshes[0], before)
+    assert meshes[1][hidden, 1].std() < before[hidden, 1].std() / 2
+
+
 def test_a_mesh_is_subdivided_at_its_times_and_only_then() -> None:
     """The model, its topology and the optimizer's state have the new faces; in between nothing changes."""
     strategy, mesh = SubdivideAndUntangle({3: 400, 7: 450}, [5]), a_mesh()

@@ -4,6 +4,7 @@ That is the normalised cross-correlation of patches, so exposure does not matter
 is known.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -76,6 +77,21 @@ def photos_of(dataset: Dataset) -> list[Photo]:
     viewmats, Ks = dataset.viewmats[dataset.train].float(), dataset.Ks[dataset.train].float()
     pixels = [as_float(dataset.images[index]).permute(2, 0, 1)[None] for index in dataset.train]
     return [Photo(*each) for each in zip(pixels, viewmats, Ks, camera_centers(viewmats), strict=True)]
+
+
+def unseen_vertices(dataset: Dataset) -> Callable[[Tensor, Tensor], Bool[Tensor, " V"]]:
+    """Of a surface (V, 3), (F, 3), on the CPU, the vertices that no training view sees, as a function of it."""
+    dataset = reduced(dataset)
+    viewmats, Ks = dataset.viewmats[dataset.train].float(), dataset.Ks[dataset.train].float()
+    sizes = [dataset.images.sizes[index] for index in dataset.train]
+    blank = [torch.zeros(1).expand(1, 4, height, width) for width, height in sizes]
+    photos = [Photo(*each) for each in zip(blank, viewmats, Ks, camera_centers(viewmats), strict=True)]
+
+    def unseen(vertices: Tensor, faces: Tensor) -> Tensor:
+        hits = [first_hits(photo, vertices, faces) for photo in photos]
+        return ~seen_by(photos, hits, vertices, pixel_size(photos)).any(dim=0)
+
+    return unseen
 
 
 def pixel_size(photos: list[Photo]) -> float:

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from etsplat.core.rasterization import Rasterization
+from etsplat.geometry.films import film
 from etsplat.geometry.measures import face_areas
 from etsplat.geometry.subdivision import longest_edge_plan
 from etsplat.geometry.untangle import untangle
@@ -98,7 +99,12 @@ class SubdivideAndUntangle(Strategy):
     """
 
     def __init__(
-        self, budgets: Mapping[int, int], untangle_after: Collection[int] = (), *, reach: float = _SHORT
+        self,
+        budgets: Mapping[int, int],
+        untangle_after: Collection[int] = (),
+        *,
+        reach: float = _SHORT,
+        unseen: Callable[[Tensor, Tensor], Tensor] | None = None,
     ) -> None:
         """Takes the times.
 
@@ -107,8 +113,10 @@ class SubdivideAndUntangle(Strategy):
             untangle_after: iterations after which faces that cut through others are put right.
             reach: folds in which a vertex would have to move farther stay (`geometry.untangle`). If it is more than a
                 half, and that spoils the pictures, a half is tried.
+            unseen: of vertices and faces, on the CPU, which vertices no picture shows. Before each untangling they
+                become a film (`geometry.films`): regularizers alone leave slits in what nobody sees, and deepen them.
         """
-        self._budgets, self._untangle_after = dict(budgets), set(untangle_after)
+        self._budgets, self._untangle_after, self._unseen = dict(budgets), set(untangle_after), unseen
         self._reaches = (reach, _SHORT) if reach > _SHORT else (reach,)
 
     def next_edit(self, iteration: int) -> int:
@@ -140,7 +148,10 @@ class SubdivideAndUntangle(Strategy):
         if self._untangle_after:
             topology, reach = model.topology.to(torch.device("cpu")), self._reaches[self.undone]
             with torch.no_grad():
-                model.vertices.copy_(untangle(model.vertices.cpu(), topology, reach=reach)[0])
+                vertices, faces = model.vertices.detach().cpu(), topology.faces.long()
+                if self._unseen is not None:
+                    vertices = film(vertices, faces, self._unseen(vertices, faces))
+                model.vertices.copy_(untangle(vertices, topology, reach=reach)[0])
 
 
 class HalveWhereWrong(Strategy):

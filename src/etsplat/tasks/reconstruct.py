@@ -9,7 +9,7 @@ from typing import Any
 
 from etsplat.core.errors import InputError
 from etsplat.core.workers import together
-from etsplat.data.agreement import contradicted
+from etsplat.data.agreement import contradicted, unseen_vertices
 from etsplat.data.dataset import Dataset
 from etsplat.engines.choice import engine
 from etsplat.geometry.parts import Shape, genera, shape_of
@@ -166,7 +166,7 @@ def reconstruct(
             job.announce(NoteEvent(f"start: the visual hull, {mesh.count:,} faces; holes in each part: {holes}"))
             config = nearby(config)
         trust = _trusted_depths(views, config, begun, job)
-        trainer = make_trainer(mesh, views, config, scorer.cheap, trust)
+        trainer = make_trainer(mesh, views, config, scorer.cheap, trust, near=begun == "hull")
         with job.writing():  # what only the first of several workers does goes through `job.first`
             if views.georeference is not None:
                 job.first(partial(views.georeference.write, job.run.path))
@@ -263,6 +263,8 @@ def make_trainer(
     config: ReconstructConfig,
     evaluate: Callable[[TriangleMesh], dict[str, float]] | None = None,
     depths: DepthTrust | None = None,
+    *,
+    near: bool = False,
 ) -> Trainer[TriangleMesh]:
     """The paper's way from a start to the object that views show: L_mesh, Adam, subdivision.
 
@@ -272,6 +274,7 @@ def make_trainer(
         config: settings.
         evaluate: cheap metrics of a mesh.
         depths: which depth maps are believed; None where none are used.
+        near: whether the start is near the surface, so that what no view sees of the mesh is no part of it on its way.
     """
     length, regularization, refinement = config.iterations, config.regularization, config.refinement
     terms = terms_of(
@@ -294,7 +297,9 @@ def make_trainer(
         mesh,
         views,
         Objective(Photometric(), terms, scale=gamma),
-        SubdivideAndUntangle(budgets, untanglings, reach=refinement.reach),
+        SubdivideAndUntangle(
+            budgets, untanglings, reach=refinement.reach, unseen=unseen_vertices(views) if near else None
+        ),
         schedule=_schedule(config),
         batch=config.batch,
         exposure=Exposure.of(config.exposure, length, len(views.train) / config.batch),
