@@ -14,9 +14,7 @@ photos and points (VmHWM, Linux), of one run, and of each run of the same in blo
 """
 
 import argparse
-import multiprocessing
 import time
-from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -27,7 +25,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 import etsplat
-from benchmarks.memory import RESET, kibibytes
+from benchmarks.memory import in_a_process, kibibytes, reset_peak
 from etsplat.core.cameras import Cameras, intrinsics, look_at, sphere_grid
 from etsplat.data.blocks import Grid, cut
 from etsplat.data.dataset import Dataset, every_eighth
@@ -162,7 +160,7 @@ def memory(points: int, blocks: str | None, width: int, pipe: Any) -> None:
         }
     )
     marks: list[tuple[str, int]] = []
-    before = _reset()
+    before = reset_peak()
     stage = "coarse" if blocks else "one run"
 
     def tell(event: Event) -> None:
@@ -170,29 +168,11 @@ def memory(points: int, blocks: str | None, width: int, pipe: Any) -> None:
         if isinstance(event, NoteEvent) and event.text.startswith("block "):
             marks.append((stage, kibibytes("VmHWM") - before))
             stage = event.text.split(",")[0]
-            _reset()
+            reset_peak()
 
     with TemporaryDirectory() as place:
         etsplat.train(views, Path(place) / "run", config, blocks=blocks, callbacks=[tell])
     pipe.send([*marks, (stage, kibibytes("VmHWM") - before)])
-
-
-def _reset() -> int:
-    RESET.write_text("5", encoding="utf-8")
-    return kibibytes("VmRSS")
-
-
-def in_a_process(action: Callable[..., None], *arguments: Any) -> Any:
-    """What an action sends, in a process of its own."""
-    context = multiprocessing.get_context("spawn")
-    mine, other = context.Pipe()
-    process = context.Process(target=action, args=(*arguments, other))
-    process.start()
-    other.close()
-    try:
-        return mine.recv()
-    finally:
-        process.join()
 
 
 def _tell(event: Event) -> None:

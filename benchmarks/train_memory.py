@@ -9,7 +9,6 @@ held with its photos and points, and "said" is what `train` says beforehand.
 """
 
 import argparse
-import multiprocessing
 import time
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -18,7 +17,7 @@ from typing import Any
 import torch
 
 import etsplat
-from benchmarks.memory import kibibytes
+from benchmarks.memory import in_a_process, kibibytes
 from etsplat.data.dataset import Dataset
 from etsplat.data.demo_scene import demo_scene, demo_surface
 from etsplat.data.pictures import StoredPictures
@@ -97,19 +96,6 @@ def train_once(triangles: int, width: int, copies: int, steps: int, pipe: Any) -
     )
 
 
-def measured(*arguments: int) -> dict[str, Any]:
-    """A run in a process of its own."""
-    context = multiprocessing.get_context("spawn")
-    mine, other = context.Pipe()
-    process = context.Process(target=train_once, args=(*arguments, other))
-    process.start()
-    other.close()
-    try:
-        return mine.recv()
-    finally:
-        process.join()
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("triangles", nargs="+", type=int)
@@ -122,7 +108,7 @@ def main() -> None:
     for triangles in options.triangles:
         for width in options.width:
             for copies in options.copies:
-                found = measured(triangles, width, copies, options.steps)
+                found = in_a_process(train_once, triangles, width, copies, options.steps)
                 sizes = (found["before"], found["peak"], found["peak"] - found["before"], found["said"])
                 numbers = [f"{size / 2**20:,.0f} MiB" for size in sizes]
                 about = [f"{found['triangles']:,}", str(found["photos"]), str(width)]
