@@ -184,6 +184,34 @@ def test_a_folder_that_cannot_be_written_to_is_named(
     assert_one_line(error, str(tmp_path / "run"), os.strerror(code))
 
 
+@pytest.mark.parametrize("again", ["resume", "overwrite"])
+def test_what_a_killed_process_was_writing_goes(tmp_path: Path, again: str) -> None:
+    """Of the run's own files, wherever they are; files that only look like it stay."""
+    run = RunDirectory.create(tmp_path / "run", {"task": "fit"})
+    left = [
+        ".convergence.da9cd65f.png",
+        "test/.007_mesh.f0be6e5f.png",
+        "stages/soup/checkpoints/.step_000004.01234567.safetensors",
+    ]
+    others = [".mine.da9cd65f.png", ".convergence.png", ".config.json"]
+    for name in [*left, *others]:
+        (run.path / name).parent.mkdir(parents=True, exist_ok=True)
+        (run.path / name).write_text("half")
+    if again == "resume":
+        RunDirectory.resume(run.path, {"task": "fit"})
+    else:
+        RunDirectory.create(run.path, {"task": "fit"}, overwrite=True)
+    assert not [name for name in left if (run.path / name).exists()]
+    assert all((run.path / name).exists() for name in others)
+
+
+def test_a_folder_in_which_a_run_was_killed_before_it_began_is_empty(tmp_path: Path) -> None:
+    """Be it while its first file was written."""
+    (tmp_path / ".config.0123abcd.json").write_text("half")
+    RunDirectory.create(tmp_path, {"task": "fit"})
+    assert not (tmp_path / ".config.0123abcd.json").exists()
+
+
 def test_resume_wants_a_run(tmp_path: Path) -> None:
     """Resuming a folder that does not exist or holds no run is an error that says to start it."""
     with pytest.raises(InputError) as error:

@@ -2,6 +2,7 @@
 
 import errno
 import os
+import re
 import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -21,6 +22,8 @@ _REMEDIES = {
     errno.ENOTDIR: "a part of the path is a file: choose another folder",
     errno.EISDIR: "the path is a folder: choose a file name",
 }
+
+_TEMPORARY = re.compile(r"\.(.+)\.[0-9a-f]{8}(\.[^.]*)?")
 
 
 @contextmanager
@@ -49,6 +52,12 @@ def atomic_write(path: Path | str) -> Iterator[Path]:
         raise write_error(path, error) from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def destination_of(temporary: Path) -> Path | None:
+    """Which file `atomic_write` was writing under a temporary path; None if that is none of its names."""
+    found = _TEMPORARY.fullmatch(temporary.name)
+    return found and temporary.with_name(found[1] + (found[2] or ""))
 
 
 def write_error(path: Path | str, error: OSError) -> InputError:

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from etsplat.core.errors import InputError
-from etsplat.io.atomic import atomic_write, write_error
+from etsplat.io.atomic import atomic_write, destination_of, write_error
 from etsplat.io.georeference import GEOREFERENCE_FILE
 from etsplat.io.json_text import as_json, check_entries, entries_problem, json_differences, parse_json
 from etsplat.io.locks import RUN_LOCK
@@ -204,6 +204,7 @@ class RunDirectory:
                     f"{path}: was started with {'; '.join(differences)}; resume with the same, or choose another folder"
                 )
         _check_writable(path)
+        run._remove_unfinished()
         run._furnish(stored["task"])
         return run
 
@@ -328,7 +329,14 @@ class RunDirectory:
         if not readme.is_file():
             _write_text(readme, readme_of(task))
 
+    def _remove_unfinished(self) -> None:
+        # A process that was killed while it wrote a file leaves its beginning under a name that nobody would look for.
+        inside = (path for name in _FOLDERS for path in (self.path / name).rglob("*"))
+        for path in [*filter(_is_unfinished, self.path.iterdir()), *filter(destination_of, inside)]:
+            path.unlink()
+
     def _remove_results(self) -> None:
+        self._remove_unfinished()
         # config.json goes last: until then the folder still says whose it is.
         for name in _FILES:
             (self.path / name).unlink(missing_ok=True)
@@ -339,7 +347,12 @@ class RunDirectory:
 
 def is_empty(folder: Path) -> bool:
     """Whether a folder holds nothing but what a run leaves that was killed before it began."""
-    return all(path.name == RUN_LOCK for path in folder.iterdir())
+    return all(path.name == RUN_LOCK or _is_unfinished(path) for path in folder.iterdir())
+
+
+def _is_unfinished(path: Path) -> bool:
+    destination = destination_of(path)
+    return destination is not None and destination.name in _FILES
 
 
 def is_run(path: Path | str) -> bool:
