@@ -19,7 +19,7 @@ PASSING = 160
 """Bytes that come and go for each triangle in a step: what it is drawn from (colour, opacity, softness) with gradients,
 statistics of the view, its outline in the picture, its place in the order of depth."""
 
-PLANNED = 120
+PLANNED = 200
 """Bytes of an edit for each triangle: where it comes from, how likely it has children, those in their places."""
 
 ON_DEVICES = 1500
