@@ -157,9 +157,17 @@ FILES = Names({})
 CLOCKS = {"progress": 0}
 """Tensors with an element that is a time: its index. By the names of either tree."""
 
+_SPACED = "edits of scenes are thirty iterations, or a tenth of a short run, apart, and begin after two of these"
+
 CHANGED: dict[str, str] = {
     "owl-batch": "each view of a step is differentiated by itself; their gradients are added in the order of the "
     "views; rates are multiplied by the square root of the batch",
+    **{
+        f"scene-{name}": _SPACED
+        for name in ("elastic", "bilateral", "single-sided", "not-frozen", "opaque", "sphere", "no-sky", "random")
+    },
+    **{f"scene-{name}": _SPACED for name in ("demo", "paper", "paper-indoor", "paper-object", "paper-sided")},
+    **{f"soup-{name}": _SPACED for name in ("reference", "quick", "indoor", "masks", "other-masks", "pointless")},
 }
 """Cases whose bits change on purpose, and why. They must differ: a line that is not true any more is an error."""
 
