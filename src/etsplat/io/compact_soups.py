@@ -69,8 +69,8 @@ def enlargement(share: float) -> float:
     So that they cover what the others would: fitted to prefixes of two scenes (research/results.md). At most as
     large as equal triangles would have to be, and with many left out less than that.
     """
-    octaves = -math.log(share)
-    return math.exp(min(0.08 * octaves, 0.2) * octaves)
+    depth = -math.log(share)
+    return math.exp(min(0.08 * depth, 0.2) * depth)
 
 
 def encode_compact(soup: CompactSoup) -> bytes:
