@@ -38,7 +38,7 @@ FOLDER, COARSE = "blocks", "coarse"
 COARSE_TRIANGLES, COARSE_STEPS = 0.5, 0.5
 """Of the coarse soup of the whole, as parts of those of a block."""
 
-Fit = Callable[[Job, Dataset, ScenePart | None], tuple[TriangleSoup, dict[str, Any]]]
+Fit = Callable[[Job[TrainConfig], Dataset, ScenePart | None], tuple[TriangleSoup, dict[str, Any]]]
 """An ordinary run of a capture, or of a part of one: its soup in the capture's own units, and its metrics."""
 
 
@@ -78,7 +78,7 @@ def shape_of(blocks: str, capture: Dataset, config: TrainConfig) -> tuple[int, i
 
 
 def train_blocks(
-    job: Job, own: Dataset, shape: tuple[int, int], paths: dict[str, str | None], fit: Fit
+    job: Job[TrainConfig], own: Dataset, shape: tuple[int, int], paths: dict[str, str | None], fit: Fit
 ) -> tuple[TriangleSoup, dict[str, Any]]:
     """All runs, one after the other, and what they make together, in the job's folder. Those that are done stay.
 
@@ -95,7 +95,7 @@ def train_blocks(
     Raises:
         InputError: there are too many blocks for the scene, or too many triangles for the memory; as `Job`.
     """
-    config: TrainConfig = job.config  # pyright: ignore[reportAssignmentType]
+    config = job.config
     grid = cut(own, shape, world_up(own.viewmats))
     parts = parts_of(own, grid)
     coarse, each = _settings(own, config, len(grid))
@@ -139,7 +139,9 @@ def merged(
     return TriangleSoup(**together, appearance=whole.appearance, notes=notes)
 
 
-def _run(job: Job, name: str, config: TrainConfig, capture: Dataset, part: ScenePart | None, fit: Fit) -> _Done:
+def _run(
+    job: Job[TrainConfig], name: str, config: TrainConfig, capture: Dataset, part: ScenePart | None, fit: Fit
+) -> _Done:
     """A run in a folder of its own, which goes on where it was."""
     folder = job.run.path / FOLDER / name
 
@@ -222,7 +224,9 @@ def _exposures(folder: Path) -> dict[str, torch.Tensor]:
     return {name: torch.tensor(matrix) for name, matrix in found.items()}
 
 
-def _conclude(job: Job, own: Dataset, soup: TriangleSoup, runs: Sequence[_Done], config: TrainConfig) -> dict[str, Any]:
+def _conclude(
+    job: Job[TrainConfig], own: Dataset, soup: TriangleSoup, runs: Sequence[_Done], config: TrainConfig
+) -> dict[str, Any]:
     """Measures and writes what all runs made together."""
     if exposure := RunDirectory(job.run.path / FOLDER / COARSE).read_exposure():
         job.run.write_exposure(exposure)

@@ -8,7 +8,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 import torch
 from torch import Tensor
@@ -39,6 +39,7 @@ ABOUT_EXPOSURE = (
 
 
 T = TypeVar("T")
+C = TypeVar("C", bound=ReconstructConfig | TrainConfig)
 
 
 @dataclass(frozen=True)
@@ -110,7 +111,7 @@ class Result:
         return result_html(self.path, self.metrics, self.OPAQUE)
 
 
-class Job:
+class Job(Generic[C]):
     """A run of a task, from its settings to its metrics: what all tasks do around their trainers.
 
     Of several workers all fit; one of them, the first, tells, writes and measures.
@@ -126,7 +127,7 @@ class Job:
 
     def __init__(
         self,
-        config: ReconstructConfig | TrainConfig,
+        config: C,
         out: str | Path,
         callbacks: Sequence[Callback],
         *,

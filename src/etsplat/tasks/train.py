@@ -126,10 +126,12 @@ def train(
         job.announce(NoteEvent(note))
     folders = {"masks": path_of(masks), "depths": path_of(depths), "init_points": path_of(init_points)}
     paths = {"source": path_of(source), "images": images, **folders}
-    if blocks is None or (shape := shape_of(blocks, own, config)) == (1, 1):
+    if blocks is None:
         return _fit(job, own, paths, onlooker)
+    if (shape := shape_of(blocks, own, config)) == (1, 1):  # its photos may stay in memory after all
+        return _fit(job, own.of_views(range(len(own))), paths)
 
-    def fit(each: Job, capture: Dataset, part: ScenePart | None) -> tuple[TriangleSoup, dict[str, Any]]:
+    def fit(each: Job[TrainConfig], capture: Dataset, part: ScenePart | None) -> tuple[TriangleSoup, dict[str, Any]]:
         done = _fit(each, capture, paths, part=part)
         return done.soup, done.metrics
 
@@ -138,14 +140,14 @@ def train(
 
 
 def _fit(
-    job: Job,
+    job: Job[TrainConfig],
     own: Dataset,
     paths: dict[str, str | None],
     onlooker: Onlooker | None = None,
     part: ScenePart | None = None,
 ) -> TrainResult:
     """A run over a capture in its own units, or over a part of one."""
-    config: TrainConfig = job.config  # pyright: ignore[reportAssignmentType]
+    config = job.config
     frame = own.frame if part is None else part.frame
     capture = own.renormalized(frame.center, frame.radius) if config.normalize else own
     iterations = limited_iterations(config.iterations, config.schedule.max_epochs, len(own.train), config.batch)
