@@ -49,6 +49,7 @@ $(TOOLS): constraints.txt
 	test -x $(PY) || $(PYTHON) -m venv $(VENV)
 	$(PIP) -c constraints.txt torch
 	$(PIP) -c constraints.txt scikit-build-core nanobind cmake ninja
+	$(PIP) -c constraints.txt numpy setuptools setuptools_scm wheel  # of meshoptimizer: no wheel, built beside ours
 	@touch $@
 
 # No build isolation: the build folder then survives, and a changed C++ file is rebuilt in seconds.
