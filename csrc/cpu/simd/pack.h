@@ -1,4 +1,4 @@
-// Sixteen float lanes on every instruction set: one AVX-512 register, two of AVX2, four of NEON, or plain C++.
+// Sixteen float lanes on every instruction set: one AVX-512 register, two of AVX2, four of NEON or of the compiler's own.
 //
 // The engine is written once against Vec and VecMask. ETSPLAT_SIMD names the instruction set that this translation unit
 // is compiled for (CMakeLists.txt); everything lives in the namespace of that name, so that no function compiled for a
