@@ -1,5 +1,7 @@
 """Where pictures of separate opaque triangles are wrong, and how these are halved there."""
 
+import math
+
 import pytest
 import torch
 
@@ -10,7 +12,8 @@ from etsplat.data.pictures import StoredPictures
 from etsplat.model.triangle_mesh import TriangleMesh
 from etsplat.ops.adam import Adam
 from etsplat.optim.edit import apply_rows, halves_plan
-from etsplat.optim.picture_errors import PictureErrors
+from etsplat.optim.exposure import Exposure
+from etsplat.optim.picture_errors import FaceErrors, PictureErrors
 from etsplat.optim.schedules import NEVER
 from etsplat.optim.strategies import HalveWhereWrong
 
@@ -36,14 +39,18 @@ def a_mesh(colors: torch.Tensor) -> TriangleMesh:
     )
 
 
-def photographed(mesh: TriangleMesh) -> Dataset:
-    """Pictures of a mesh from two places, as photos."""
-    eyes = torch.tensor([[0.0, 0, 6], [0.3, 0, 6]])
+def photographed(mesh: TriangleMesh, photos: int = 2) -> Dataset:
+    """Pictures of a mesh from one or two places, as photos."""
+    eyes = torch.tensor([[0.0, 0, 6], [0.3, 0, 6]])[:photos]
     viewmats = look_at(eyes, torch.zeros(3), torch.tensor([0.0, 1, 0]))
-    cameras = Cameras(viewmats, intrinsics(45, SIZE, SIZE).expand(2, 3, 3).clone(), SIZE, SIZE)
+    cameras = Cameras(viewmats, intrinsics(45, SIZE, SIZE).expand(photos, 3, 3).clone(), SIZE, SIZE)
     pictures = mesh.render(cameras).color.detach().clamp(0, 1)
-    photos = StoredPictures([(picture * 255).round().to(torch.uint8) for picture in pictures])
-    return Dataset(viewmats.double(), cameras.Ks.double(), photos, ["a", "b"], [0, 1], [])
+    stored = StoredPictures([(picture * 255).round().to(torch.uint8) for picture in pictures])
+    return Dataset(viewmats.double(), cameras.Ks.double(), stored, list("ab")[:photos], list(range(photos)), [])
+
+
+def errors_of(capture: Dataset, mesh: TriangleMesh) -> FaceErrors:
+    return PictureErrors(capture, 48, torch.device("cpu"), torch.zeros(3), Exposure(NEVER))(mesh)
 
 
 RATES = {"vertices": 1e-3, "colors": 1e-2}
@@ -53,18 +60,43 @@ GREY = torch.full((3, 3), 0.5)
 def test_errors_are_those_of_the_pixels_in_which_a_face_is_the_nearest() -> None:
     """None where colours are right; of a wrong one its squared difference times its pixels; none of what is hidden."""
     capture = photographed(a_mesh(GREY))
-    errors = PictureErrors(capture, 48, torch.device("cpu"), torch.zeros(3))
-    assert float(errors(a_mesh(GREY)).max()) < 0.01
+    assert float(errors_of(capture, a_mesh(GREY)).wrong.max()) < 0.01
     wrong = GREY.clone()
     wrong[1], wrong[2] = 0.9, 0.0
     mesh = a_mesh(wrong)
-    found = errors(mesh)
+    found = errors_of(capture, mesh).wrong
     nearest = mesh.render(Cameras(capture.viewmats.float(), capture.Ks.float(), SIZE, SIZE)).triangle
     assert nearest is not None
     expected = 3 * 0.4**2 * float((nearest == 1).sum())
     assert float(found[1]) == pytest.approx(expected, rel=0.15)  # borders are blended
     assert float(found[2]) == 0
     assert float(found[0]) < 0.05 * float(found[1])
+
+
+def test_a_face_is_in_the_way_if_photos_show_what_is_behind_it() -> None:
+    """The one before another of the right colour, where it has a wrong one; not where a single photo says so, nor one
+    that is wrong with worse behind it, nor one that no photo shows."""
+    fitting, before, behind = CORNERS
+    covering = before + torch.tensor([0.0, 0, 1])
+    shown = torch.stack([fitting, before, behind])
+    white = torch.tensor([[0.2, 0.2, 0.2], [0.9, 0.9, 0.9], [0.5, 0.5, 0.5], [0.4, 0.1, 0.1]])
+
+    def of(corners: torch.Tensor, colors: torch.Tensor) -> TriangleMesh:
+        faces = torch.arange(3 * len(corners)).reshape(-1, 3)
+        return TriangleMesh.from_mesh(
+            corners.reshape(-1, 3),
+            faces,
+            colors=colors.repeat_interleave(3, dim=0),
+            opacity=None,
+            sigma=None,
+            vertex_colored=True,
+        )
+
+    truth, mesh = of(shown, white[:3]), of(torch.cat([shown, covering[None]]), white)
+    found = errors_of(photographed(truth), mesh)
+    assert found.in_the_way.tolist() == [False, False, False, True]
+    assert not errors_of(photographed(truth, photos=1), mesh).in_the_way.any()
+    assert not errors_of(photographed(truth), of(shown, white[:3] * 0.8)).in_the_way.any()
 
 
 def test_halves_cover_what_was_halved_in_the_colours_that_it_had() -> None:
@@ -88,7 +120,11 @@ def test_the_most_wrong_triangles_are_halved_at_their_time() -> None:
     """As many as there may be; those in which nothing is wrong stay whole, and no corner is shared."""
     mesh = a_mesh(GREY)
     wrong = torch.tensor([1.0, 3.0, 0.0], dtype=torch.float64)
-    strategy = HalveWhereWrong({2: 4, 5: 90}, lambda mesh: torch.cat([wrong, torch.zeros(mesh.count - 3)]))
+
+    def errors(mesh: TriangleMesh) -> FaceErrors:
+        return FaceErrors(torch.cat([wrong, torch.zeros(mesh.count - 3)]), torch.zeros(mesh.count, dtype=torch.bool))
+
+    strategy = HalveWhereWrong({2: 4, 5: 90}, errors)
     adam = Adam(mesh.parameters(), RATES)
     strategy.start(mesh, adam, 2, torch.Generator())
     assert [strategy.next_edit(i) for i in (1, 2, 3, 6)] == [2, 2, 5, NEVER]
@@ -100,3 +136,32 @@ def test_the_most_wrong_triangles_are_halved_at_their_time() -> None:
     assert strategy.edit(5)
     assert mesh.count == 6  # two of four were wrong
     assert adam.parameters["vertices"] is mesh.vertices
+
+
+@pytest.mark.parametrize(("in_the_way", "first"), [([False, True, False], [0]), ([True, True, True], [0, 1])])
+def test_what_is_in_the_way_is_removed_before_others_are_halved(in_the_way: list[bool], first: list[int]) -> None:
+    """Others are halved in its place, with the moments of what stays; but a mesh is not left without a triangle."""
+    mesh = a_mesh(GREY)
+    errors = FaceErrors(torch.tensor([1.0, 9.0, 2.0]).double(), torch.tensor(in_the_way))
+    strategy, adam = HalveWhereWrong({1: 3}, lambda _: errors), Adam(mesh.parameters(), RATES)
+    adam.first_moments["vertices"][:3] = 7.0
+    strategy.start(mesh, adam, 2, torch.Generator())
+    assert strategy.edit(1) == (not all(in_the_way))
+    assert mesh.count == 3
+    assert torch.equal(mesh.vertices.detach().reshape(-1, 3, 3)[: len(first)], CORNERS[first])
+    assert bool((adam.first_moments["vertices"][:3] == 7.0).all())
+    assert adam.parameters["colors"] is mesh.colors
+
+
+def test_errors_are_of_pictures_as_the_photos_were_exposed() -> None:
+    """What was learned of exposures explains what a photo is darker by."""
+    truth = a_mesh(GREY)
+    capture, exposure = photographed(truth), Exposure(NEVER)
+    exposure.start(capture.train, 1, truth.vertices)
+    exposure.learned = True
+    errors = PictureErrors(capture, 48, torch.device("cpu"), torch.zeros(3), exposure)
+    bright = a_mesh(GREY * 1.4)
+    assert float(errors(bright).wrong.sum()) > 10
+    with torch.no_grad():
+        exposure.values[:, 0] = -math.log(1.4)
+    assert float(errors(bright).wrong.sum()) < 0.01

@@ -99,6 +99,23 @@ def test_the_photometric_term_compares_over_the_same_background(rng: torch.Gener
     assert value(drawing, [EdgeLength(1.5)], 0.0) == pytest.approx(difference, rel=1e-12)
 
 
+@pytest.mark.parametrize("dssim", [0.0, 0.2])
+def test_the_root_of_squares_stands_in_the_place_of_the_mean_difference(rng: torch.Generator, dssim: float) -> None:
+    """Beside SSIM, whose share is the same; where the picture is the photo its gradient is finite."""
+    drawing = a_drawing(rng)
+    backgrounds = drawing.background
+    composited = drawing.photo[..., :3] + (1 - drawing.photo[..., 3:]) * backgrounds[:, None, None]
+    root = float((drawing.rendering.color - composited).square().mean().sqrt())
+    mean = float((drawing.rendering.color - composited).abs().mean())
+    expected = float(Photometric(dssim)(drawing)) + (1 - dssim) * (root - mean)
+    assert float(Photometric(dssim, pixel="rms")(drawing)) == pytest.approx(expected, rel=1e-8)
+    same = composited.clone().requires_grad_(True)
+    picture = replace(drawing, rendering=Rasterization(same, same[..., :1]))
+    Photometric(dssim, pixel="rms")(picture).backward()
+    assert same.grad is not None
+    assert float(same.grad.abs().max()) < 1e-3
+
+
 @pytest.mark.parametrize("first", ["edge", "normal"])
 def test_the_papers_weights_add_up(rng: torch.Generator, first: str) -> None:
     """With lambda 1.5, 0.01, 0.5 and 1e-4 the objective is L_c + gamma times the weighted sum, in whatever order."""

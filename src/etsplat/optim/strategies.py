@@ -5,7 +5,6 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from etsplat.core.rasterization import Rasterization
@@ -19,6 +18,7 @@ from etsplat.ops.adam import Adam
 from etsplat.optim.densification import PruneRules, SoupStatistics, dead_triangles, densify_plan, grown_count
 from etsplat.optim.edit import RowPlan, apply_rows, apply_subdivision, halves_plan
 from etsplat.optim.loop import DivergedError
+from etsplat.optim.picture_errors import FaceErrors
 from etsplat.optim.schedules import NEVER
 from etsplat.optim.terms.soup import Spared
 
@@ -155,39 +155,46 @@ class SubdivideAndUntangle(Strategy):
 
 
 class HalveWhereWrong(Strategy):
-    """Halves those of a mesh's separate triangles, at given times, that pictures are most wrong in.
+    """Removes those of a mesh's separate triangles, at given times, that are in the way, and halves the most wrong.
 
     Each corner is a vertex of its own, before and after: halves that shared the new corner would keep its colour and
     place in common, and fit photos worse (research/ablations.md).
     """
 
-    def __init__(self, budgets: Mapping[int, int], wrong: Callable[[TriangleMesh], Float[Tensor, " F"]]) -> None:
+    def __init__(self, budgets: Mapping[int, int], errors: Callable[[TriangleMesh], FaceErrors]) -> None:
         """Takes the times.
 
         Args:
             budgets: by iteration, how many triangles there may be after it (`optim.schedules.face_budgets`).
-            wrong: (F,) how wrong pictures are in each triangle.
+            errors: what pictures say of each triangle.
         """
-        self._budgets, self._wrong = dict(budgets), wrong
+        self._budgets, self._errors = dict(budgets), errors
 
     def next_edit(self, iteration: int) -> int:
         """The next of the given times."""
         return min((i for i in self._budgets if i >= iteration), default=NEVER)
 
     def edit(self, iteration: int) -> bool:
-        """Halves them, at the middles of their longest edges."""
+        """Halves them at the middles of their longest edges."""
         if iteration not in self._budgets:
             return False
         mesh: TriangleMesh = self.model
-        wrong = self._wrong(mesh)
+        before, errors = mesh.vertices, self._errors(mesh)
+        kept = ~errors.in_the_way
+        if bool(kept.any()) and not bool(kept.all()):
+            self._carry_out(RowPlan.keeping(kept.repeat_interleave(3).to(before.device)))
+        wrong = errors.wrong[kept] if mesh.vertices is not before else errors.wrong
         most = min(self._budgets[iteration] - mesh.count, int((wrong > 0).sum()))
-        if most <= 0:
-            return False
-        plan = halves_plan(mesh.vertices.detach(), mesh.colors.detach(), wrong.topk(most).indices)
+        if most > 0:
+            chosen = wrong.topk(most).indices
+            self._carry_out(halves_plan(mesh.vertices.detach(), mesh.colors.detach(), chosen))
+        return mesh.vertices is not before
+
+    def _carry_out(self, plan: RowPlan) -> None:
+        """Rows are corners, three of each triangle after the other."""
         parameters, _ = apply_rows(plan, self.adam, {})
-        faces = torch.arange(len(plan.source), device=mesh.vertices.device).reshape(-1, 3)
-        mesh.load_state({**parameters, "faces": faces})
-        return True
+        faces = torch.arange(len(plan.source), device=plan.source.device).reshape(-1, 3)
+        self.model.load_state({**parameters, "faces": faces})
 
 
 @dataclass

@@ -161,15 +161,17 @@ def make_opaque_trainer(
         start_faces=mesh.count,
         max_faces=max_faces,
     )
-    behind = torch.tensor(background)
+    exposure = Exposure(NEVER)
+    errors = PictureErrors(capture, JUDGES, mesh.vertices.device, torch.tensor(background), exposure)
     return Trainer(
         mesh,
         capture,
-        Objective(Photometric(DSSIM)),
-        HalveWhereWrong(budgets, PictureErrors(capture, JUDGES, mesh.vertices.device, behind)),
+        Objective(Photometric(DSSIM, pixel="rms")),
+        HalveWhereWrong(budgets, errors),
         schedule=Schedule({"vertices": _corners(iterations, unit), "colors": _colors(iterations)}),
         batch=batch,
         background=background,
+        exposure=exposure,
         seed=seed,
     )
 
