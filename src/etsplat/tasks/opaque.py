@@ -4,8 +4,8 @@ Most triangles of a soft soup are half transparent, and it is sorted by centroid
 mesh is made in two steps. A soup becomes opaque while it is trained (`--finish opaque`), which puts its triangles where
 the surfaces are. Then each of its corners gets a colour of its own, the same from every side, and corners and colours
 are fitted by the z-buffer with antialiased edges (`ops/antialias.py`): the very picture that a viewer draws. Triangles
-are halved where that is most wrong. Nothing is removed: what no training photo shows, other views do. What was tried
-besides is in research/ablations.md.
+in the way of what photos show are removed, and others halved where pictures are most wrong. What no training photo
+shows stays: other views do. What was tried besides is in research/ablations.md.
 """
 
 from collections.abc import Callable
