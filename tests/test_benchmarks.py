@@ -19,6 +19,7 @@ from benchmarks import (
     gpu_scenes,
     gpu_timing,
     gpu_train,
+    opaque_mesh,
     rasterizer,
     scenes,
     tables,
@@ -27,6 +28,8 @@ from benchmarks.measure import native_state
 from etsplat import _native, rasterize
 from etsplat.core.cameras import Cameras
 from etsplat.data.demo_scene import demo_scene
+from etsplat.tasks.train_config import TrainConfig
+from helpers.captures import small_demo_scene
 from helpers.scenes import mesh
 
 
@@ -205,3 +208,17 @@ def test_runs_that_differ_are_told(monkeypatch, capsys, last, status):
         determinism.main()
     assert end.value.code == status
     assert f"| 1 | 2 | `{last}` |" in capsys.readouterr().out
+
+
+def test_opaque_meshes_are_compared_from_the_same_soup(tmp_path):
+    """Which is made once: what the mesh starts from is found where it was kept, and the mesh has the same bits."""
+    own = small_demo_scene()
+    capture = own.renormalized(own.frame.center, own.frame.radius)
+    config = TrainConfig.tiny().changed({"iterations": 40, "max_triangles": 800})
+    first, _ = opaque_mesh.fitted(capture, config, tmp_path / "soup")
+    kept = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.safetensors")}
+    again, _ = opaque_mesh.fitted(capture, config, tmp_path / "soup")
+    assert kept
+    assert kept == {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.safetensors")}
+    assert torch.equal(first.vertices, again.vertices)
+    assert torch.equal(first.colors, again.colors)

@@ -62,15 +62,20 @@ def fit_opaque_mesh(
         config: settings of the run.
     """
     if config.finish == "none":
-        shorter = _towards_opaque(capture, config)
+        shorter = towards_opaque(capture, config)
         trainer = start_trainer(_with_points(capture, soup, shorter.max_triangles), shorter, None, job.device)
         _take_over(trainer.exposure, exposure)
         soup = job.fit_stage(trainer, shorter.iterations, "soup", "Making opaque triangles").finished()
-    mesh, steps = opaque_mesh(soup), max(1, round(MESH_SHARE * config.iterations))
+    trainer = start_mesh(soup, exposure, capture, config)
+    return job.fit_stage(trainer, mesh_steps(config), "mesh", "Fitting the opaque mesh")
+
+
+def start_mesh(soup: TriangleSoup, exposure: Exposure, capture: Dataset, config: TrainConfig) -> Trainer[TriangleMesh]:
+    """The start of the mesh of an opaque soup; arguments are those of `fit_opaque_mesh`."""
     trainer = make_opaque_trainer(
-        mesh,
+        opaque_mesh(soup),
         capture,
-        iterations=steps,
+        iterations=mesh_steps(config),
         unit=vertex_unit(soup, capture, config),
         max_faces=triangle_limit(capture, config),
         background=background_of(config),
@@ -78,7 +83,12 @@ def fit_opaque_mesh(
         seed=config.seed,
     )
     _take_over(trainer.exposure, exposure)
-    return job.fit_stage(trainer, steps, "mesh", "Fitting the opaque mesh")
+    return trainer
+
+
+def mesh_steps(config: TrainConfig) -> int:
+    """How many steps the mesh of a run is fitted for."""
+    return max(1, round(MESH_SHARE * config.iterations))
 
 
 def _take_over(exposure: Exposure, known: Exposure) -> None:
@@ -99,7 +109,7 @@ def _with_points(capture: Dataset, soup: TriangleSoup, most: int) -> Dataset:
     return replace(capture, exact_points=points, point_colors=soup.display_colors()[kept].cpu())
 
 
-def _towards_opaque(capture: Dataset, config: TrainConfig) -> TrainConfig:
+def towards_opaque(capture: Dataset, config: TrainConfig) -> TrainConfig:
     """Settings of the soup that becomes opaque beside a soft one. The mesh has no colours for each direction."""
     usual = TrainConfig.of(config.preset, config.scene_type)
     without = (

@@ -1,0 +1,66 @@
+"""The opaque mesh of a capture alone, without the soft soup beside which `etsplat train` makes it.
+
+    python -m benchmarks.opaque_mesh data/fox --width 270 --soups runs/soups
+    python -m benchmarks.opaque_mesh data/lego --scene-type object --background white --soups runs/soups
+
+A row of a table in Markdown: PSNR and SSIM of the test views as a mesh viewer draws them, triangles, and seconds of one
+processor's time that fitting the mesh took. The soup that it begins with is kept in the folder: what changes in the
+mesh's own stage is compared from the same start. The soup learns exposures itself, where a run's mesh takes over
+those of its soft soup, so these numbers are not quite those of a run. The capture must have points.
+"""
+
+import argparse
+import time
+from pathlib import Path
+
+import torch
+
+from etsplat.data.dataset import Dataset
+from etsplat.model.triangle_mesh import TriangleMesh
+from etsplat.optim.schedules import limited_iterations
+from etsplat.tasks.opaque import mesh_steps, start_mesh, towards_opaque
+from etsplat.tasks.scoring import Scorer
+from etsplat.tasks.soup_trainer import background_of, start_trainer
+from etsplat.tasks.sources import kept_aside, load_scene
+from etsplat.tasks.train_config import TrainConfig
+
+
+def fitted(capture: Dataset, config: TrainConfig, kept: Path) -> tuple[TriangleMesh, float]:
+    """The mesh, and the seconds of processor time that its stage took; the soup is kept in a folder, or found there."""
+    assert capture.exact_points is not None, "the capture must have points"
+    shorter = towards_opaque(capture, config)
+    before = start_trainer(capture, shorter)
+    before.fit(shorter.iterations, run=kept)
+    soup = before.outcome().model.finished()
+    trainer = start_mesh(soup, before.exposure, capture, config)
+    began = time.process_time()
+    trainer.fit(mesh_steps(config))
+    return trainer.outcome().model, time.process_time() - began
+
+
+def main() -> None:
+    """One capture."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scene", type=Path)
+    parser.add_argument("--scene-type", default="outdoor")
+    parser.add_argument("--width", type=int, default=400)
+    parser.add_argument("--max-triangles", type=int, default=40_000)
+    parser.add_argument("--background", default="black")
+    parser.add_argument("--soups", type=Path, required=True)
+    given = parser.parse_args()
+    settings = {name: getattr(given, name) for name in ("width", "max_triangles", "background")}
+    config = TrainConfig.of("quick", given.scene_type).changed(settings)
+    own = kept_aside(load_scene(given.scene, config.width, None, None), config.watch, config.refine_cameras)
+    capture = own.renormalized(own.frame.center, own.frame.radius)
+    steps = limited_iterations(config.iterations, config.schedule.max_epochs, len(own.train), config.batch)
+    config = config.changed({"iterations": steps})
+    kept = given.soups / f"{given.scene.name}-{given.width}-{given.max_triangles}"
+    mesh, seconds = fitted(capture, config, kept)
+    scorer = Scorer(capture, torch.device("cpu"), background=background_of(config))
+    (kept / "test").mkdir(exist_ok=True)
+    found = scorer.asset(mesh, kept / "test")
+    print(f"| {kept.name} | {found['psnr_asset']:.2f} / {found['ssim_asset']:.3f} | {mesh.count:,} | {seconds:.0f} |")
+
+
+if __name__ == "__main__":
+    main()
