@@ -58,14 +58,16 @@ GREY = torch.full((3, 3), 0.5)
 
 
 def test_errors_are_those_of_the_pixels_in_which_a_face_is_the_nearest() -> None:
-    """None where colours are right; of a wrong one its squared difference times its pixels; none of what is hidden."""
+    """Outlines alone where colours are right; of a wrong one its squared difference times its pixels, at half the size;
+    none of what is hidden."""
     capture = photographed(a_mesh(GREY))
-    assert float(errors_of(capture, a_mesh(GREY)).wrong.max()) < 0.01
+    assert float(errors_of(capture, a_mesh(GREY)).wrong.max()) < 0.15
     wrong = GREY.clone()
     wrong[1], wrong[2] = 0.9, 0.0
     mesh = a_mesh(wrong)
     found = errors_of(capture, mesh).wrong
-    nearest = mesh.render(Cameras(capture.viewmats.float(), capture.Ks.float(), SIZE, SIZE)).triangle
+    half = capture.halved()
+    nearest = mesh.render(Cameras(half.viewmats.float(), half.Ks.float(), SIZE // 2, SIZE // 2)).triangle
     assert nearest is not None
     expected = 3 * 0.4**2 * float((nearest == 1).sum())
     assert float(found[1]) == pytest.approx(expected, rel=0.15)  # borders are blended
@@ -161,7 +163,7 @@ def test_errors_are_of_pictures_as_the_photos_were_exposed() -> None:
     exposure.learned = True
     errors = PictureErrors(capture, 48, torch.device("cpu"), torch.zeros(3), exposure)
     bright = a_mesh(GREY * 1.4)
-    assert float(errors(bright).wrong.sum()) > 10
+    assert float(errors(bright).wrong.sum()) > 3
     with torch.no_grad():
         exposure.values[:, 0] = -math.log(1.4)
-    assert float(errors(bright).wrong.sum()) < 0.01
+    assert float(errors(bright).wrong.sum()) < 0.3

@@ -1,11 +1,10 @@
 """Where the pictures of an opaque mesh are wrong: what each face has to answer for, and which are in the way.
 
 A face is in the way if photos are explained better by what is behind it. That is drawn without a third of the faces at
-a time, and compared in the pixels in which one of these was the nearest; at half the size, which is less than a third
-of the work, and where a face that is right but for its outline is not blamed for that.
+a time, and compared in the pixels in which one of these was the nearest. All is looked at at half the size, which is
+less than a third of the work, and where a face that is right but for its outline is hardly blamed for that.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import torch
@@ -32,8 +31,8 @@ class FaceErrors:
     """What pictures say of the faces of a mesh, on the CPU.
 
     Attributes:
-        wrong: (F,) float64, the squared differences between pictures and photos, added up over the pixels in which a
-            face is the nearest; 0 for one that none of the views shows.
+        wrong: (F,) float64, the squared differences between pictures and photos of half the size, added up over the
+            pixels in which a face is the nearest; 0 for one that none of the views shows.
         in_the_way: (F,) whether at least two views show a face, and all of them together would be less wrong without.
     """
 
@@ -50,14 +49,14 @@ class PictureErrors:
         """Takes what to look at.
 
         Args:
-            dataset: some of its training views are looked at, evenly spread, at the size that they have and half of it.
+            dataset: some of its training views are looked at, evenly spread.
             views: how many, at most.
             device: of the mesh.
             background: behind pictures and photos.
             exposure: of the photos, as which pictures are exposed where it is learned.
         """
         self._views = middles_of(dataset.train, min(len(dataset.train), views))
-        self._full, self._half = (ViewLoader(each, device) for each in (dataset, dataset.halved()))
+        self._loader = ViewLoader(dataset.halved(), device)
         self._background, self._exposure = background.to(device), exposure
 
     @torch.no_grad()
@@ -65,22 +64,19 @@ class PictureErrors:
         """Of a mesh as it is now."""
         wrong, without = (torch.zeros(mesh.count, dtype=torch.float64) for _ in range(2))
         photos = torch.zeros(mesh.count, dtype=torch.int64)
-        for view in self._each(self._full):
-            _add(wrong, *self._compared(mesh, view))
         part = torch.arange(mesh.count, device=mesh.vertices.device) % _PARTS
         others = [_of(mesh, part != taken) for taken in range(_PARTS)]
-        for view in self._each(self._half):
+        self._loader.expect(self._views)
+        for index in self._views:
+            view = self._loader.view(index)
             face, error = self._compared(mesh, view)
+            _add(wrong, face, error)
             for taken, rest in enumerate(others):
                 chosen = (face >= 0) & (part[face.clamp(min=0)] == taken)
                 _, behind = self._compared(rest, view)
                 _add(without, torch.where(chosen, face, -1), behind - error)
             photos += torch.bincount(face[face >= 0], minlength=mesh.count).cpu() > 0
         return FaceErrors(wrong, (photos >= _PHOTOS) & (without < 0))
-
-    def _each(self, loader: ViewLoader) -> Iterator[View]:
-        loader.expect(self._views)
-        return (loader.view(index) for index in self._views)
 
     def _compared(self, mesh: TriangleMesh, view: View) -> tuple[Int[Tensor, " P"], Float[Tensor, " P"]]:
         """Of each pixel: which face is the nearest, -1 where there is none, and the squared difference."""
