@@ -35,6 +35,7 @@ from etsplat.tasks.sources import open_run
 from tests.fuzz import corpus
 from tests.fuzz.mutate import mutated
 from tests.fuzz.session import Refused
+from tests.fuzz.videos import read_video, small_videos
 
 
 @dataclass
@@ -346,3 +347,5 @@ if find_spec("pillow_heif"):  # an extra
     READERS.append(
         Reader("photo .heic", _single(".heic", lambda: corpus.phone_photos(".heic")), (".heic",), _file(_photo))
     )
+if find_spec("imageio_ffmpeg"):  # another
+    READERS.append(Reader("video", small_videos, (".mp4", ".mkv", ".avi", ".mov"), _file(read_video)))

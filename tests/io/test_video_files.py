@@ -53,6 +53,17 @@ def test_frames_at_an_uneven_pace_are_neither_repeated_nor_dropped(video, tmp_pa
         assert np.abs(frame.astype(float) - every[number]).mean() < 5
 
 
+def test_a_video_whose_frames_are_all_skipped_is_refused(video):
+    """By an edit list that begins behind the last frame: FFmpeg counts them, and decodes none."""
+    data = bytearray(video.read_bytes())
+    begin = data.index(b"elst") + 16
+    data[begin : begin + 4] = (1 << 30).to_bytes(4, "big")
+    video.write_bytes(data)
+    assert count_frames(video) > 0
+    with pytest.raises(InputError, match="none of its frames can be decoded; convert it to MP4 anew"):
+        list(grey_frames(video, 80))
+
+
 def test_what_is_no_video_is_refused_in_one_line(video, tmp_path):
     """Empty, text, cut short, damaged, sound alone, and lists of other files, which are not opened."""
     whole = video.read_bytes()

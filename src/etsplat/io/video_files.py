@@ -46,8 +46,9 @@ def grey_frames(path: Path, longest: int) -> Iterator[UInt8[np.ndarray, "H W"]]:
     """All frames of a video in order, upright, grey, shrunk until no side is longer than `longest` pixels.
 
     Raises:
-        InputError: as `count_frames`; or a frame is damaged.
+        InputError: as `count_frames`; or a frame is damaged, or none can be decoded.
     """
+    count = 0
     fit = f"scale='min({longest},iw)':'min({longest},ih)':force_original_aspect_ratio=decrease:flags=area"
     output_as = ["-vf", f"{fit},format=gray", "-c:v", "pgm", "-f", "image2pipe", "-"]
     with _ffmpeg(path, [*_EVERY_FRAME, *output_as]) as output:
@@ -57,9 +58,12 @@ def grey_frames(path: Path, longest: int) -> Iterator[UInt8[np.ndarray, "H W"]]:
             data = output.read(width * height)
             if len(data) < width * height:
                 break
+            count += 1
             yield np.frombuffer(data, np.uint8).reshape(height, width)
         if header:
             output.read()
+    if count == 0:  # which FFmpeg does not mind where what they begin from is missing
+        raise InputError(f"video {path}: none of its frames can be decoded; convert it to MP4 anew")
 
 
 def write_video_frames(
