@@ -1,4 +1,4 @@
-"""Videos that are changed, and how they are read: as `etsplat data sfm` does, but without choosing among their frames."""
+"""Videos that are changed, and how they are read: as `etsplat data sfm` does, without choosing among their frames."""
 
 from pathlib import Path
 from tempfile import TemporaryDirectory
