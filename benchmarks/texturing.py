@@ -4,6 +4,8 @@
     python -m benchmarks.texturing RUNS --lods 3
     python -m benchmarks.texturing RUNS --stored
 
+Seconds are of the processor, all threads together: the same beside other jobs, and about what one core would take.
+
 With --lods the coarser levels that `etsplat export RUN --texture N --lods N` has written: PSNR of the test views, at
 their size, and halved as often as the level says, where that of the first level stands beside it. With --stored one
 light mesh in every way in which GLB stores it: its size, PSNR of the test views, and of the texture in the file.
@@ -45,7 +47,7 @@ def main() -> None:
         for run in options.runs:
             measure_levels(run, options.lods)
         return
-    print("run | full: faces, PSNR, IoU | textured: faces, PSNR, IoU, sound | MB | seconds")
+    print("run | full: faces, PSNR, IoU | textured: faces, PSNR, IoU, sound | MB | processor seconds")
     for run in options.runs:
         measure(run, options.texture, options.faces, options.keep)
 
@@ -58,12 +60,12 @@ def measure(run: Path, size: int, faces: int, keep: Path | None) -> None:
     full = TriangleMesh.from_mesh(mesh.vertices, mesh.faces, colors=mesh.face_colors, opacity=None, sigma=None)
 
     def note(phase: str, *_: int) -> None:
-        phases.setdefault(phase, time.perf_counter())
+        phases.setdefault(phase, time.process_time())
 
     phases: dict[str, float] = {}
-    before = time.perf_counter()
+    before = time.process_time()
     light = texture_mesh(run, size=size, faces=faces, tell=note)
-    end = time.perf_counter()
+    end = time.process_time()
     starts = [*phases.values(), end]
     seconds = {phase: round(after - start, 1) for (phase, start), after in zip(phases.items(), starts[1:], strict=True)}
     with tempfile.TemporaryDirectory() as folder:

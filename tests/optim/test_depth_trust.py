@@ -44,6 +44,25 @@ def test_maps_in_another_unit_are_believed_up_to_scale_and_the_factor_is_told():
     assert asked.kind is None
 
 
+def test_maps_in_a_unit_that_is_found_are_believed_as_depths():
+    """Unless what they are compared with has another one, or they are asked to count up to scale."""
+    told = []
+    wrong = pairs(lambda depth, _: depth / 4)
+    trust = DepthTrust(range(6), tell=told.append, unit_near=lambda factor: 1.001 * factor)
+    trust.judge(wrong, "the truth")
+    assert trust.kind == "l1"
+    assert trust.unit == pytest.approx(4.004)
+    assert "4.004 times as far away, with which maps agree: they are multiplied by that" in told[0]
+    assert trust.metrics()["depth_factor"] == trust.unit
+    again = DepthTrust(range(6))
+    again.load_state(trust.state())
+    assert again.unit == trust.unit
+    for choice, found in (("auto", 1.1), ("pearson", 1.0), ("auto", None)):
+        other = DepthTrust(range(6), choice, unit_near=lambda factor, by=found: by and by * factor)
+        other.judge(wrong, "the truth")
+        assert (other.kind, other.unit) == ("pearson", 1)
+
+
 def test_inverse_depths_are_believed_as_such():
     trust = DepthTrust(range(6))
     trust.judge(pairs(lambda depth, _: 0.1 + 3 / depth), "the truth")

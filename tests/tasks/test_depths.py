@@ -1,6 +1,7 @@
 """Runs with depth maps and dense clouds, by the functions that the command line calls."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from etsplat.data.load import load_dataset
 from etsplat.io.georeference import Georeference
 from etsplat.io.ply_tables import encode_ply
 from etsplat.optim.loop import NoteEvent
-from etsplat.tasks.depths import trusted_depths, wanted_depths
+from etsplat.tasks.depths import trusted_depths, unit_of_maps, wanted_depths
 from etsplat.tasks.sources import with_cloud
 from helpers.depths import ball_with_depths
 
@@ -97,6 +98,30 @@ def test_a_run_uses_right_maps_and_wrong_ones_change_no_bit(tmp_path):
     assert said == {"right": "l1", "wrong": None}
     assert torch.equal(soups["wrong", "auto"], soups["wrong", "off"])
     assert not torch.equal(soups["right", "auto"], soups["right", "off"])
+
+
+def test_the_unit_of_maps_is_found_by_what_they_show_of_each_other():
+    """From a tenth beside it; not of garbage, and not of photos from nearly one place, which agree in any."""
+    ball = ball_with_depths(change=lambda depth, view: depth / 4)
+    found = unit_of_maps(ball, ball.train, 4.4)
+    assert found == pytest.approx(4, rel=0.005)
+    assert unit_of_maps(ball_with_depths(change=garbage), ball.train, 1.0) is None
+    still = replace(ball, viewmats=ball.viewmats[:1].expand_as(ball.viewmats))
+    assert unit_of_maps(still, still.train, 4.0) is None
+
+
+def test_maps_in_a_wrong_unit_are_used_as_depths_where_it_is_found():
+    """By points, near what they say."""
+    told = []
+    ball = ball_with_depths(change=lambda depth, view: 1000 * depth)
+    trust = trusted_depths(ball, "auto", 10, told.append)
+    assert trust is not None
+    assert trust.kind == "l1"
+    assert trust.unit == pytest.approx(0.001, rel=0.005)
+    assert "they are multiplied by that" in str(told[0])
+    right = trusted_depths(ball_with_depths(), "auto", 10, told.append)
+    assert right is not None
+    assert (right.kind, right.unit) == ("l1", 1)
 
 
 def test_a_resumed_run_ends_with_the_same_bits(tmp_path):

@@ -30,7 +30,7 @@ def points_on_maps(dataset: Dataset, views: Sequence[int]) -> dict[int, Pairs]:
     return {view: _seen(dataset, view, dataset.exact_points) for view in views}
 
 
-def maps_on_maps(dataset: Dataset, views: Sequence[int]) -> dict[int, Pairs]:
+def maps_on_maps(dataset: Dataset, views: Sequence[int], unit: float = 1.0) -> dict[int, Pairs]:
     """Of each view, which has a depth map, depths of what its neighbours' maps show, and of its own.
 
     Maps in another unit than the poses contradict each other here, however right each of them is by itself.
@@ -38,25 +38,26 @@ def maps_on_maps(dataset: Dataset, views: Sequence[int]) -> dict[int, Pairs]:
     Args:
         dataset: with depth maps.
         views: indices.
+        unit: all maps are multiplied by this first.
     """
-    shown = {view: _surface(dataset, view) for view in views}
+    shown = {view: _surface(dataset, view, unit) for view in views}
     forward, centers = dataset.viewmats[list(views), 2, :3], dataset.centers[list(views)]
     reach = (centers - centers.mean(dim=0)).norm(dim=1).max().clamp_min(1e-12)
     apart = torch.cdist(centers, centers) / reach + torch.cdist(forward, forward)
     nearest = apart.argsort(dim=1)[:, 1 : 1 + NEIGHBOURS].tolist()
     return {
-        view: _seen(dataset, view, torch.cat([shown[views[other]] for other in others]))
+        view: _seen(dataset, view, torch.cat([shown[views[other]] for other in others]), unit)
         for view, others in zip(views, nearest, strict=True)
         if others
     }
 
 
-def _surface(dataset: Dataset, view: int) -> Float[Tensor, "P 3"]:
+def _surface(dataset: Dataset, view: int, unit: float) -> Float[Tensor, "P 3"]:
     """What a depth map shows, at some of its pixels; float64, in the frame."""
     said, viewmat, K = dataset.images.depth(view), dataset.viewmats[view], dataset.Ks[view]
     assert said is not None
     step = max(1, said.shape[1] // SAMPLES)
-    depth = said[::step, ::step].double() / dataset.normalization.radius
+    depth = said[::step, ::step].double() * unit / dataset.normalization.radius
     rows, columns = depth.nonzero().unbind(dim=1)
     depth = depth[rows, columns]
     across = (columns * step + 0.5 - K[0, 2]) / K[0, 0] * depth
@@ -64,7 +65,7 @@ def _surface(dataset: Dataset, view: int) -> Float[Tensor, "P 3"]:
     return (torch.stack([across, down, depth], dim=1) - viewmat[:3, 3]) @ viewmat[:3, :3]
 
 
-def _seen(dataset: Dataset, view: int, points: Float[Tensor, "P 3"]) -> Pairs:
+def _seen(dataset: Dataset, view: int, points: Float[Tensor, "P 3"], unit: float = 1.0) -> Pairs:
     """Of points that no other hides, where the map knows a depth."""
     said = dataset.images.depth(view)
     assert said is not None
@@ -76,7 +77,7 @@ def _seen(dataset: Dataset, view: int, points: Float[Tensor, "P 3"]) -> Pairs:
     cell = (row * cells // width) * cells + column * cells // width
     nearest = torch.full((int(cell.max()) + 1 if len(cell) else 0,), torch.inf, dtype=depth.dtype)
     nearest = nearest.scatter_reduce(0, cell, depth, "amin")
-    maps = said[row, column].double() / dataset.normalization.radius
+    maps = said[row, column].double() * unit / dataset.normalization.radius
     kept = (maps > 0) & (depth <= BEHIND * nearest[cell])
     return depth[kept], maps[kept]
 

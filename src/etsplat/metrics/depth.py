@@ -63,8 +63,12 @@ def depth_agreement(views: Sequence[Pairs]) -> DepthAgreement:
     ratios = torch.cat([(z / d).log() for z, d in said]) if said else torch.full((1,), math.nan)
     fits = {inverse: torch.tensor([_fitted(z, d, inverse) for z, d in views]) for inverse in (False, True)}
     inverse = bool(fits[True].nanmedian() > fits[False].nanmedian())
-    plain = torch.tensor([_explained(z.double(), z.double() - d.double()) for z, d in views])
-    return DepthAgreement(float(ratios.median().exp()), plain, fits[inverse], inverse)
+    return DepthAgreement(float(ratios.median().exp()), explained_as_they_are(views), fits[inverse], inverse)
+
+
+def explained_as_they_are(views: Sequence[Pairs]) -> Float[Tensor, " V"]:
+    """What each map explains, without scale or shift; NaN of views with too few pixels."""
+    return torch.tensor([_explained(z.double(), z.double() - d.double()) for z, d in views])
 
 
 def _explained(known: Float[Tensor, " K"], errors: Float[Tensor, " K"]) -> float:

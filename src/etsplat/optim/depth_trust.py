@@ -41,6 +41,7 @@ class DepthTrust:
         inverse: whether they are of inverse depths.
         explained: what they explained when they were compared; None before.
         photos: how many maps are believed.
+        unit: maps that are believed as depths are multiplied by this: 1, or what was found where it was wrong.
     """
 
     def __init__(
@@ -49,6 +50,7 @@ class DepthTrust:
         choice: Choice = "auto",
         measured_at: int = NEVER,
         tell: Callable[[str], None] = lambda text: None,
+        unit_near: Callable[[float], float | None] = lambda factor: None,
     ) -> None:
         """Believes in nothing yet.
 
@@ -57,8 +59,10 @@ class DepthTrust:
             choice: as what they may be believed.
             measured_at: iteration after which they are compared with the model.
             tell: called with a sentence when something is decided.
+            unit_near: finds the factor, near a rough one, with which maps agree with each other; None where none does.
         """
         self._maps, self._kinds, self.measured_at, self._tell = list(maps), _KINDS[choice], measured_at, tell
+        self._unit_near, self.unit = unit_near, 1.0
         self.kind: DepthKind | None = None
         self.explained: float | None = None
         self.inverse, self.dropped = False, False
@@ -91,6 +95,8 @@ class DepthTrust:
             Whether maps are believed.
         """
         found = depth_agreement([pairs[view] for view in pairs])
+        if only is None and "l1" in self._kinds:
+            found = self._in_unit(found, pairs)
         kinds: list[DepthKind] = [kind for kind in self._kinds if only is None or kind == only]
         agreeing: list[DepthKind] = [kind for kind in kinds if self._agrees(found, kind)]
         if not agreeing and only is not None:
@@ -139,28 +145,42 @@ class DepthTrust:
         return NEVER if self.measured_at < iteration else self.measured_at
 
     def metrics(self) -> dict[str, object]:
-        """For metrics.json: as what the maps were believed at the end, how many, and what they explained."""
+        """For metrics.json: as what the maps were believed at the end, how many, what they explained, in which unit."""
         explained = self.explained if self.explained is not None and math.isfinite(self.explained) else None
+        unit = {"depth_factor": self.unit} if self.unit != 1 else {}
         kind = f"inverse {self.kind}" if self.kind and self.inverse else self.kind
-        return {"depth_used": kind, "depth_photos": self.photos, "depth_explained": explained}
+        return {"depth_used": kind, "depth_photos": self.photos, "depth_explained": explained, **unit}
 
     def state(self) -> dict[str, Tensor]:
         """Everything that the rest of the run depends on, by name, for a checkpoint; empty before maps are compared."""
         if self.explained is None:
             return {}
         code = 0 if self.kind is None else _KINDS["auto"].index(self.kind) + 1
-        numbers = [code, self.inverse, self.explained, self.dropped, self._best]
+        numbers = [code, self.inverse, self.explained, self.dropped, self._best, self.unit]
         return {"decided": torch.tensor(numbers, dtype=torch.float64), "used": self._used}
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
         """Continues where `state` was taken."""
-        self.kind, self.explained = None, None
+        self.kind, self.explained, self.unit = None, None, 1.0
         if "decided" not in state:
             return
-        code, inverse, explained, dropped, self._best = state["decided"].tolist()
+        code, inverse, explained, dropped, self._best, self.unit = state["decided"].tolist()
         self.kind = _KINDS["auto"][int(code) - 1] if code else None
         self.inverse, self.explained, self.dropped = bool(inverse), explained, bool(dropped)
         self._used = state["used"].to(self._used)
+
+    def _in_unit(self, found: DepthAgreement, pairs: Mapping[int, Pairs]) -> DepthAgreement:
+        """How maps agree in the unit in which they do with each other, where theirs is another; takes that unit."""
+        if not math.isfinite(found.factor) or abs(math.log(found.factor)) <= NEAR_ONE or found.inverse:
+            return found
+        unit = self._unit_near(found.factor)
+        if unit is None:
+            return found
+        again = depth_agreement([(known, unit * said) for known, said in pairs.values()])
+        if not self._agrees(again, "l1"):
+            return found
+        self.unit = unit
+        return again
 
     def _agrees(self, found: DepthAgreement, kind: DepthKind) -> bool:
         right = kind == "pearson" or abs(math.log(found.factor)) <= NEAR_ONE
@@ -169,7 +189,9 @@ class DepthTrust:
     def _sentence(self, found: DepthAgreement, elsewhere: str) -> str:
         total, explained = len(self._maps), 100 * max(0.0, found.overall(self.kind or "pearson"))
         unit = ""
-        if math.isfinite(found.factor) and abs(math.log(found.factor)) > NEAR_ONE and not found.inverse:
+        if self.unit != 1:
+            unit = f"; {elsewhere} is {self.unit:.4g} times as far away, with which maps agree: they are multiplied by that"
+        elif math.isfinite(found.factor) and abs(math.log(found.factor)) > NEAR_ONE and not found.inverse:
             unit = f"; {elsewhere} is {found.factor:.4g} times as far away: correct the unit with --depth-unit"
         if self.kind is None:
             known = (

@@ -1,17 +1,28 @@
 """Depth maps of a run: whether they are read, and what they are compared with before they count."""
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Literal
+
+from scipy.optimize import minimize_scalar
 
 from etsplat.core.errors import InputError
 from etsplat.data.dataset import Dataset
 from etsplat.data.depth_points import maps_on_maps, points_on_maps
 from etsplat.data.frames import LARGEST
-from etsplat.metrics.depth import FEWEST
-from etsplat.optim.depth_trust import DepthTrust
+from etsplat.metrics.depth import FEWEST, explained_as_they_are
+from etsplat.optim.depth_trust import NEEDED, DepthTrust
 from etsplat.optim.loop import Event, NoteEvent
 from etsplat.optim.schedules import NEVER
+
+REACH, STEPS, SHARP = 0.15, 13, 0.2
+"""A unit is looked for between a rough one times exp(-REACH) and exp(REACH), at so many places and around the best of
+them. It counts where maps explain more of each other by SHARP there than at both ends: photos from nearly one place
+would agree in any."""
+
+UNIT_PHOTOS = 24
+"""So many maps at most are asked for their unit."""
 
 Setting = Literal["auto", "l1", "pearson", "off"]
 
@@ -56,7 +67,10 @@ def trusted_depths(
     def tell(text: str) -> None:
         announce(NoteEvent(text))
 
-    early = DepthTrust(maps, setting, NEVER, tell)
+    def unit_near(factor: float) -> float | None:
+        return unit_of_maps(capture, maps[:: -(-len(maps) // UNIT_PHOTOS)], factor)
+
+    early = DepthTrust(maps, setting, NEVER, tell, unit_near)
     if capture.exact_points is not None:
         pairs = points_on_maps(capture, maps)
         if 2 * sum(len(known) >= FEWEST for known, _ in pairs.values()) >= len(maps):
@@ -64,4 +78,30 @@ def trusted_depths(
             return early
     if early.judge(maps_on_maps(capture, maps), "what the maps of other photos show", only="l1"):
         return early
-    return DepthTrust(maps, setting, compared_at, tell)
+    return DepthTrust(maps, setting, compared_at, tell, unit_near)
+
+
+def unit_of_maps(capture: Dataset, maps: Sequence[int], near: float) -> float | None:
+    """The factor with which depth maps agree with each other, as the poses have it.
+
+    Args:
+        capture: with poses and maps.
+        maps: views whose maps are compared.
+        near: about what it is.
+
+    Returns:
+        None where they agree with none near that, or with any.
+    """
+
+    def explained(log: float) -> float:
+        found = explained_as_they_are(list(maps_on_maps(capture, maps, near * math.exp(log)).values()))
+        return float(found.nanmedian().nan_to_num(-math.inf))
+
+    step = 2 * REACH / (STEPS - 1)
+    values = {place: explained(place * step) for place in range(-(STEPS // 2), STEPS // 2 + 1)}
+    best = max(values, key=values.__getitem__)
+    if values[best] < max(NEEDED, SHARP + values[-(STEPS // 2)], SHARP + values[STEPS // 2]):
+        return None
+    bounds = ((best - 1) * step, (best + 1) * step)
+    found = minimize_scalar(lambda log: -explained(log), bounds=bounds, method="bounded", options={"xatol": step / 100})
+    return near * math.exp(float(found.x))

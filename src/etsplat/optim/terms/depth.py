@@ -38,7 +38,7 @@ class Depth(Term):
         z, said = rendered[0, ..., 0], drawing.depth[0]
         counts = drawing.rendering.alpha.detach()[0, ..., 0] * ((said > 0) & (z.detach() > 0))
         if trust is not None:
-            counts = counts * trust.believed(drawing.index)
+            counts, said = counts * trust.believed(drawing.index), said * trust.unit
         if trust is None or trust.kind == "l1":
             apart = 2 * (z - said).abs() / (z + said).clamp_min(_NEAR_ZERO)
             return (counts * apart).sum() / counts.sum().clamp_min(1.0)
