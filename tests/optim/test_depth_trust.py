@@ -52,7 +52,7 @@ def test_maps_in_a_unit_that_is_found_are_believed_as_depths():
     trust.judge(wrong, "the truth")
     assert trust.kind == "l1"
     assert trust.unit == pytest.approx(4.004)
-    assert "4.004 times as far away, with which maps agree: they are multiplied by that" in told[0]
+    assert "4.004 times as far away, where maps agree: they are multiplied by it" in told[0]
     assert trust.metrics()["depth_factor"] == trust.unit
     again = DepthTrust(range(6))
     again.load_state(trust.state())

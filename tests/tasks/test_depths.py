@@ -118,7 +118,7 @@ def test_maps_in_a_wrong_unit_are_used_as_depths_where_it_is_found():
     assert trust is not None
     assert trust.kind == "l1"
     assert trust.unit == pytest.approx(0.001, rel=0.005)
-    assert "they are multiplied by that" in str(told[0])
+    assert "they are multiplied by it" in str(told[0])
     right = trusted_depths(ball_with_depths(), "auto", 10, told.append)
     assert right is not None
     assert (right.kind, right.unit) == ("l1", 1)

@@ -190,7 +190,7 @@ class DepthTrust:
         total, explained = len(self._maps), 100 * max(0.0, found.overall(self.kind or "pearson"))
         unit = ""
         if self.unit != 1:
-            unit = f"; {elsewhere} is {self.unit:.4g} times as far away, with which maps agree: they are multiplied by that"
+            unit = f"; {elsewhere} is {self.unit:.4g} times as far away, where maps agree: they are multiplied by it"
         elif math.isfinite(found.factor) and abs(math.log(found.factor)) > NEAR_ONE and not found.inverse:
             unit = f"; {elsewhere} is {found.factor:.4g} times as far away: correct the unit with --depth-unit"
         if self.kind is None:
