@@ -1,7 +1,7 @@
 """Exported GLB files as three.js, <model-viewer> and Blender show them, beside our own picture and the test photos.
 
     npm install --prefix FOLDER three @google/model-viewer gltf-validator
-    python -m benchmarks.elsewhere RUNS --npm FOLDER [--blender PYTHON] [--file NAME.glb] [--keep FOLDER]
+    python -m benchmarks.elsewhere RUNS [--npm FOLDER] [--blender PYTHON] [--samples N] [--file NAME.glb] [--keep FOLDER]
 
 Of each run it takes textured.glb (`etsplat reconstruct --texture`, `etsplat export --texture`) or opaque.glb (`etsplat
 train`). A row for each program: PSNR of the test views against the photos, and against our own picture with 4 x 4
@@ -38,7 +38,6 @@ const [folder, file] = process.argv.slice(1);
 require(folder + "/gltf-validator").validateBytes(new Uint8Array(require("fs").readFileSync(file)))
   .then((report) => console.log(JSON.stringify(report.issues)));
 """
-BLENDER_SAMPLES = 64
 
 
 @dataclass(frozen=True)
@@ -69,7 +68,7 @@ def rows_of(subject: Subject, options: argparse.Namespace) -> Iterator[Row]:
             circle = around(subject)
             yield compared("model-viewer", circle, model_viewer_pictures(page, server, circle), options.keep)
     if options.blender:
-        pictures = blender_pictures(options.blender, subject, shots)
+        pictures = blender_pictures(options.blender, subject, shots, options.samples)
         yield compared("Blender, Cycles", shots, pictures, options.keep)
 
 
@@ -120,12 +119,12 @@ def _complain(page: Page) -> None:
             print(f"    the page says: {error}", flush=True)
 
 
-def blender_pictures(python: Path, subject: Subject, shots: Sequence[Shot]) -> list[Tensor]:
-    """Each test view over the background."""
+def blender_pictures(python: Path, subject: Subject, shots: Sequence[Shot], samples: int) -> list[Tensor]:
+    """Each test view over the background, of so many samples a pixel."""
     with TemporaryDirectory() as folder:
         places = [Path(folder) / f"{number}.png" for number in range(len(shots))]
         views = [{**shot.view(1), "picture": str(place)} for shot, place in zip(shots, places, strict=True)]
-        request = {"file": str(subject.file.resolve()), "samples": BLENDER_SAMPLES, "views": views}
+        request = {"file": str(subject.file.resolve()), "samples": samples, "views": views}
         (Path(folder) / "request.json").write_text(json.dumps(request))
         command = [python, PAGES / "in_blender.py", Path(folder) / "request.json"]
         ended = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -162,6 +161,7 @@ def main() -> None:
         "--npm", type=Path, help="folder with node_modules: three, @google/model-viewer, gltf-validator"
     )
     parser.add_argument("--blender", type=Path, help="a Python that has bpy")
+    parser.add_argument("--samples", type=int, default=64, help="of Blender, a pixel")
     parser.add_argument("--file", help="in the run's folder, in the place of textured.glb or opaque.glb")
     parser.add_argument(
         "--keep", type=Path, help="folder for photo, our picture, theirs, and four times the difference"
