@@ -1,7 +1,7 @@
 """Exported GLB files as three.js, <model-viewer> and Blender show them, beside our own picture and the test photos.
 
     npm install --prefix FOLDER three @google/model-viewer gltf-validator
-    python -m benchmarks.elsewhere RUNS [--npm FOLDER] [--blender PYTHON] [--samples N] [--file NAME.glb] [--keep FOLDER]
+    python -m benchmarks.elsewhere RUNS [--npm FOLDER] [--blender PYTHON] [--samples N] [--file NAME] [--keep FOLDER]
 
 Of each run it takes textured.glb (`etsplat reconstruct --texture`, `etsplat export --texture`) or opaque.glb (`etsplat
 train`). A row for each program: PSNR of the test views against the photos, and against our own picture with 4 x 4
