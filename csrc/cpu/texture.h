@@ -14,7 +14,9 @@ struct TextureSamples {
 
     float detail(int64_t n) const { return lod ? lod[n] : 0.0f; }
     int levels(const Texture& texture, int64_t n, LevelSample* sample) const {
-        return find_levels(texture, uv[2 * n], uv[2 * n + 1], detail(n), sample);
+        const Levels found = find_levels(texture, detail(n));
+        for (int i = 0; i < found.count; ++i) sample[i] = sample_level(texture, found, i, uv[2 * n], uv[2 * n + 1]);
+        return found.count;
     }
 };
 

@@ -117,10 +117,10 @@ __device__ bool find_pair(const Scene& scene, int x, int y, int axis, PairBlend&
     const bool exists = x >= 0 && y >= 0 && x + (axis == 0) < view.width && y + (axis == 1) < view.height;
     if (!exists) return false;
     const long long first = static_cast<long long>(y) * view.width + x, second = first + (axis == 0 ? 1 : view.width);
-    const int face[2] = {view.triangle[first], view.triangle[second]};
-    if (face[0] == face[1]) return false;
-    const bool forward = face[1] < 0 || (face[0] >= 0 && depth[first] <= depth[second]);
-    const long long nearer = face[forward ? 0 : 1];
+    const int first_face = view.triangle[first], second_face = view.triangle[second];
+    if (first_face == second_face) return false;
+    const bool forward = second_face < 0 || (first_face >= 0 && depth[first] <= depth[second]);
+    const long long nearer = forward ? first_face : second_face;
     const int silhouettes = scene.silhouettes[nearer];
     const double along = (axis == 0 ? x : y) + (forward ? 0.5 : 1.5), across = (axis == 0 ? y : x) + 0.5;
 #pragma unroll 1  // one in a hundred pixels gets here
@@ -187,6 +187,7 @@ __device__ void collect_silhouette(const Scene& scene, const PairBlend& pair, co
         by_weight += static_cast<double>(grad_image[pair.to * channels + c]) * step;
     }
     const PinholeCamera camera = camera_of(scene.view.shaded);
+#pragma unroll  // so that no index is a variable
     for (int end = 0; end < 2; ++end) {
         const float* p = scene.view.shaded.vertices + 3 * static_cast<long long>(pair.ends[end]);
         const double world[3] = {p[0], p[1], p[2]};

@@ -119,7 +119,7 @@ __device__ __forceinline__ void differentiate(const RasterPass& pass, const Stag
         extras.add(pass, s, f, p, w, sums);
     }
     p.remaining -= w * cotangent;
-    const float grad_alpha = p.transmittance * cotangent - p.remaining / (1.0f - alpha);
+    const float grad_alpha = p.transmittance * cotangent - p.remaining * vreciprocal(1.0f - alpha);
     p.transmittance = rest;
     if (!(raw_alpha < pass.alpha_max)) return;
     const float grad_kernel = grad_alpha * s.opacity, grad_x = grad_kernel * gain.dx;
@@ -129,19 +129,25 @@ __device__ __forceinline__ void differentiate(const RasterPass& pass, const Stag
     for (int k = 0; k < 3; ++k) add_moments(f, k, k == largest ? grad_x : 0.0f, sums);
 }
 
+// A step of the exchange: each lane gives the values of one half and keeps the sums of the other. Templates, as a loop over
+// the half is not unrolled: its values would be indexed, in local memory.
+template <int Half>
+__device__ __forceinline__ void exchange_halves(float (&v)[16]) {
+    const bool upper = (lane_index() & 2 * Half) != 0;
+#pragma unroll
+    for (int j = 0; j < Half; ++j) {
+        const float low = v[j], high = v[Half + j];
+        v[j] = (upper ? high : low) + __shfl_xor_sync(kAllLanes, upper ? low : high, 2 * Half);
+    }
+    if constexpr (Half > 1) exchange_halves<Half / 2>(v);
+}
+
 // Sums over the warp of 16 values; lane 2 j gets that of values[j].
 __device__ __forceinline__ float sum_sixteen(const float* values) {
     float v[16];
+#pragma unroll
     for (int j = 0; j < 16; ++j) v[j] = values[j];
-#pragma unroll
-    for (int half = 8; half > 0; half /= 2) {
-        const bool upper = (lane_index() & 2 * half) != 0;
-#pragma unroll
-        for (int j = 0; j < half; ++j) {
-            const float given = upper ? v[j] : v[half + j], kept = upper ? v[half + j] : v[j];
-            v[j] = kept + __shfl_xor_sync(kAllLanes, given, 2 * half);
-        }
-    }
+    exchange_halves<8>(v);
     return v[0] + __shfl_xor_sync(kAllLanes, v[0], 1);
 }
 
@@ -208,6 +214,7 @@ extern "C" __global__ void __launch_bounds__(256) raster_backward(const __grid_c
                 const int k = __ffs(static_cast<int>(todo)) - 1;
                 float sums[kStride] = {};
                 differentiate(pass, staged[k], pixel, first_inverse_z, p, sums);
+#pragma unroll
                 for (int j = 0; j < kStride; j += 16) {
                     const float sum = sum_sixteen(sums + j);
                     if (lane % 2 == 0) warp_sums[warp][k][j + lane / 2] = sum;

@@ -56,16 +56,15 @@ extern "C" __global__ void texture_scatter(Texture texture, Samples samples, con
     if (n >= samples.count) return;
     const double scale = fixed_scale(*largest);
     const int channels = texture.channels;
-    LevelSample sample[2];
-    const int count = find_levels(texture, samples.uv[2 * n], samples.uv[2 * n + 1], detail_of(samples, n), sample);
-    for (int i = 0; i < count; ++i) {
-        const int level = sample[i].level;
+    const Levels levels = find_levels(texture, detail_of(samples, n));
+    for (int i = 0; i < levels.count; ++i) {
+        const LevelSample sample = sample_level(texture, levels, i, samples.uv[2 * n], samples.uv[2 * n + 1]);
         FixedSum* sums = base;
-        if (level > 0) sums = coarser + coarser_offset(texture.width, texture.height, level) * channels;
+        if (sample.level > 0) sums = coarser + coarser_offset(texture.width, texture.height, sample.level) * channels;
         float w[4];
         long long at[4];
-        sample[i].weights(w);
-        sample[i].places(texture.width >> level, at);
+        sample.weights(w);
+        sample.places(texture.width >> sample.level, at);
         for (int k = 0; k < 4; ++k) {
             for (int c = 0; c < channels; ++c) {
                 add_fixed(sums + at[k] * channels + c, static_cast<double>(w[k]) * grad_values[n * channels + c], scale);

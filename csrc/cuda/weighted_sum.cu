@@ -16,7 +16,10 @@ __device__ float power_of(float value, int power) {
 // *first + *scale sum_k weight_k value_k^power_k; `scale` null for 1.
 extern "C" __global__ void weighted_sum(const float* first, WeightedTerms terms, const float* scale, float* sum) {
     float total = 0.0f;
-    for (int k = 0; k < terms.count; ++k) total += terms.weights[k] * power_of(*terms.values[k], terms.powers[k]);
+#pragma unroll  // so that no index is a variable
+    for (int k = 0; k < kMaxTerms; ++k) {
+        if (k < terms.count) total += terms.weights[k] * power_of(*terms.values[k], terms.powers[k]);
+    }
     *sum = *first + (scale ? *scale : 1.0f) * total;
 }
 
@@ -25,7 +28,9 @@ extern "C" __global__ void weighted_sum_backward(WeightedTerms terms, const floa
                                                  float* gradients) {
     gradients[0] = *grad_sum;
     const float scaled = *grad_sum * (scale ? *scale : 1.0f);
-    for (int k = 0; k < terms.count; ++k) {
+#pragma unroll
+    for (int k = 0; k < kMaxTerms; ++k) {
+        if (k >= terms.count) continue;
         const int power = terms.powers[k];
         const float slope = power == 1 ? 1.0f : static_cast<float>(power) * power_of(*terms.values[k], power) / *terms.values[k];
         gradients[1 + k] = scaled * terms.weights[k] * slope;

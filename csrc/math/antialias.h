@@ -63,8 +63,10 @@ ETSPLAT_FN bool silhouette_blend(const double* a, const double* b, int axis, dou
     blend.into_second = overruns == forward;
     blend.weight = static_cast<float>(overruns ? reach - 0.5 : 0.5 - reach);
     for (int end = 0; end < 2; ++end) {
-        blend.derivative[end][axis] = static_cast<float>(sign * derivative[2 * end]);
-        blend.derivative[end][other] = static_cast<float>(sign * derivative[2 * end + 1]);
+        const float by_along = static_cast<float>(sign * derivative[2 * end]);
+        const float by_across = static_cast<float>(sign * derivative[2 * end + 1]);
+        blend.derivative[end][0] = axis == 0 ? by_along : by_across;
+        blend.derivative[end][1] = axis == 0 ? by_across : by_along;
     }
     return true;
 }

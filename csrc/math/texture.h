@@ -71,33 +71,37 @@ struct LevelSample {
     }
 };
 
-// The levels that a sample lies between: how many, one or two.
-ETSPLAT_FN int find_levels(const Texture& t, float u, float v, float lod, LevelSample* sample) {
+// The levels that a sample lies between: one, or two where there is a fraction.
+struct Levels {
+    int first, count;
+    float fraction;  // from the first to the second
+};
+
+ETSPLAT_FN Levels find_levels(const Texture& t, float lod) {
     const float last = static_cast<float>(t.levels - 1);
     const float clamped = lod > 0.0f ? (lod < last ? lod : last) : 0.0f;
     const int level = static_cast<int>(clamped);
     const float fraction = clamped - static_cast<float>(level);
-    const int count = fraction > 0.0f ? 2 : 1;
-    for (int i = 0; i < count; ++i) {
-        sample[i].level = level + i;
-        sample[i].x = between(u, t.width >> (level + i));
-        sample[i].y = between(v, t.height >> (level + i));
-        sample[i].weight = i == 0 ? 1.0f - fraction : fraction;
-    }
-    return count;
+    return {level, fraction > 0.0f ? 2 : 1, fraction};
+}
+
+ETSPLAT_FN LevelSample sample_level(const Texture& t, const Levels& levels, int i, float u, float v) {
+    const int level = levels.first + i;
+    return {level, between(u, t.width >> level), between(v, t.height >> level),
+            i == 0 ? 1.0f - levels.fraction : levels.fraction};
 }
 
 // values (channels) of one sample
 ETSPLAT_FN void sample_texture(const Texture& t, float u, float v, float lod, float* values) {
-    LevelSample sample[2];
-    const int count = find_levels(t, u, v, lod, sample);
+    const Levels levels = find_levels(t, lod);
     for (int c = 0; c < t.channels; ++c) values[c] = 0.0f;
-    for (int i = 0; i < count; ++i) {
-        const float* texels = level_texels(t, sample[i].level);
+    for (int i = 0; i < levels.count; ++i) {
+        const LevelSample s = sample_level(t, levels, i, u, v);
+        const float* texels = level_texels(t, s.level);
         float w[4];
         long long at[4];
-        sample[i].weights(w);
-        sample[i].places(t.width >> sample[i].level, at);
+        s.weights(w);
+        s.places(t.width >> s.level, at);
         for (int c = 0; c < t.channels; ++c) {
             float value = w[0] * texels[at[0] * t.channels + c];
             for (int k = 1; k < 4; ++k) value += w[k] * texels[at[k] * t.channels + c];
@@ -109,11 +113,10 @@ ETSPLAT_FN void sample_texture(const Texture& t, float u, float v, float lod, fl
 // Gradient by u, v from that of the values.
 ETSPLAT_FN void sample_texture_backward(const Texture& t, float u, float v, float lod, const float* grad,
                                         float* grad_uv) {
-    LevelSample sample[2];
-    const int count = find_levels(t, u, v, lod, sample);
+    const Levels levels = find_levels(t, lod);
     grad_uv[0] = grad_uv[1] = 0.0f;
-    for (int i = 0; i < count; ++i) {
-        const LevelSample& s = sample[i];
+    for (int i = 0; i < levels.count; ++i) {
+        const LevelSample s = sample_level(t, levels, i, u, v);
         const float* texels = level_texels(t, s.level);
         long long at[4];
         s.places(t.width >> s.level, at);

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from benchmarks.gpu_programs import PROGRAMS, VARIANTS
 from etsplat.core.errors import EngineUnavailableError, InputError
 from etsplat.engines.cuda import compile as compile_module
 from etsplat.engines.cuda import device
@@ -18,33 +19,6 @@ OLDEST, NEWEST = "sm_75", "sm_120"
 BETWEEN = ("sm_80", "sm_86", "sm_89", "sm_90", "sm_100")
 
 
-def tile_loops(kernel: str, *values: int) -> tuple[tuple[str, int | str], ...]:
-    names = ("FLAT", "CORNER", "DISTORTION", "MEDIAN", "WEIGHTS")
-    return (("KERNEL", kernel), *zip(names, values, strict=True))
-
-
-PROGRAMS = [
-    Program("raster_project.cu"),
-    Program("radix_sort.cu"),
-    Program("raster_forward.cu", tile_loops("Elastic", 3, 0, 0, 0, 0)),
-    Program("raster_backward.cu", tile_loops("Elastic", 3, 0, 0, 0, 0)),
-    Program("raster_reduce.cu", tile_loops("Elastic", 3, 0, 0, 0, 0)[1:]),
-    Program("fill.cu"),
-    *(Program(file, contract=False) for file in ("adam.cu", "antialias.cu", "mesh_energies.cu", "photometric.cu")),
-    *(Program(file, contract=False) for file in ("rasterize_opaque.cu", "soup_statistics.cu", "step.cu")),
-    *(Program(file, contract=False) for file in ("normal_consistency.cu", "pick_values.cu", "triangle_channels.cu")),
-    *(Program(file, contract=False) for file in ("texture.cu", "triangle_area.cu", "weighted_sum.cu")),
-    *(Program(file) for file in ("soup_activation.cu", "spherical_harmonics.cu")),
-]
-# Other definitions of what is compiled above.
-VARIANTS = [
-    Program("raster_forward.cu", tile_loops("SingleSided", 6, 1, 1, 1, 1)),
-    Program("raster_backward.cu", tile_loops("Bilateral", 16, 0, 2, 0, 0)),
-    Program("raster_backward.cu", tile_loops("Hard", 0, 16, 1, 0, 0)),
-    Program("raster_reduce.cu", tile_loops("Elastic", 6, 1, 1, 0, 0)[1:]),
-    Program("raster_forward.cu", tile_loops("Tabulated", 3, 0, 0, 0, 0)),
-    Program("raster_backward.cu", tile_loops("Tabulated", 3, 0, 0, 0, 0)),
-]
 ELF = b"\x7fELF"
 
 
@@ -58,6 +32,14 @@ def test_compiles(program, architecture):
 def test_compiles_for_architectures_between(architecture):
     """One program stands for all: no source asks for the architecture."""
     assert compile_without_cache(PROGRAMS[3], architecture).startswith(ELF)
+
+
+@pytest.mark.parametrize("program", [*PROGRAMS, *VARIANTS], ids=str)
+def test_nothing_is_kept_in_local_memory(program):
+    """An array that is indexed by what the compiler does not know lies there: slower than registers by far."""
+    ptx = compile_without_cache(program, "compute_75").decode()
+    assert ".entry" in ptx
+    assert not [line for line in ptx.splitlines() if line.strip().startswith(".local")]
 
 
 def test_no_source_asks_for_the_architecture():

@@ -124,8 +124,8 @@ def _is_trusted(found: os.stat_result) -> bool:
 
 def _options(program: Program, architecture: str) -> tuple[str, ...]:
     # Where contraction is on, what forward and backward must compute alike is written with vfma (csrc/math/portable.h).
-    contraction = "true" if program.contract else "false"
-    return (*OPTIONS, f"--fmad={contraction}", f"--gpu-architecture={architecture}")
+    contraction, flush = ("true" if wanted else "false" for wanted in (program.contract, program.flush))
+    return (*OPTIONS, f"--fmad={contraction}", f"--ftz={flush}", f"--gpu-architecture={architecture}")
 
 
 def program_key(program: Program, architecture: str) -> str:

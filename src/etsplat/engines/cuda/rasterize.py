@@ -129,7 +129,8 @@ class CudaRender:
         launch_each(_PROJECT, "raster_ranges", capacity, [a])
         settings = self.plan.settings
         defines = self._defines(self.distortion, settings.wants("median_depth"), settings.wants("statistics"))
-        launch(Program("raster_forward.cu", defines), "raster_forward", self.tile_count, _TILE_THREADS, [a])
+        program = Program("raster_forward.cu", defines, flush=True)
+        launch(program, "raster_forward", self.tile_count, _TILE_THREADS, [a])
         del self.temporary, self.tile_zeros
 
     def backward(
@@ -171,7 +172,8 @@ class CudaRender:
         a.set(grad_opacities=grads.opacities, grad_sigmas=None if shared_sigma else grads.sigma)
         a.set(sigma_sums=sigma_sums, camera_sums=camera_sums, tile_background=background)
         reduction = Program("raster_reduce.cu", defines[1:])
-        launch(Program("raster_backward.cu", defines), "raster_backward", self.tile_count, _TILE_THREADS, [a])
+        program = Program("raster_backward.cu", defines, flush=True)
+        launch(program, "raster_backward", self.tile_count, _TILE_THREADS, [a])
         launch(reduction, "raster_reduce", grid, _REDUCE_BLOCK, [a])
         if gathered:
             count = geometry.vertex_count

@@ -1,0 +1,33 @@
+"""What there is to compile for a GPU: every file of csrc/cuda, and variants of those that definitions specialise."""
+
+from etsplat.engines.cuda.program import Program
+
+
+def tile_loops(kernel: str, *values: int) -> tuple[tuple[str, int | str], ...]:
+    """Definitions of csrc/cuda/raster_tile.h: FLAT, CORNER, DISTORTION, MEDIAN, WEIGHTS."""
+    names = ("FLAT", "CORNER", "DISTORTION", "MEDIAN", "WEIGHTS")
+    return (("KERNEL", kernel), *zip(names, values, strict=True))
+
+
+PROGRAMS = [
+    Program("raster_project.cu"),
+    Program("radix_sort.cu"),
+    Program("raster_forward.cu", tile_loops("Elastic", 3, 0, 0, 0, 0), flush=True),
+    Program("raster_backward.cu", tile_loops("Elastic", 3, 0, 0, 0, 0), flush=True),
+    Program("raster_reduce.cu", tile_loops("Elastic", 3, 0, 0, 0, 0)[1:]),
+    Program("fill.cu"),
+    *(Program(file, contract=False) for file in ("adam.cu", "antialias.cu", "mesh_energies.cu", "photometric.cu")),
+    *(Program(file, contract=False) for file in ("rasterize_opaque.cu", "soup_statistics.cu", "step.cu")),
+    *(Program(file, contract=False) for file in ("normal_consistency.cu", "pick_values.cu", "triangle_channels.cu")),
+    *(Program(file, contract=False) for file in ("texture.cu", "triangle_area.cu", "weighted_sum.cu")),
+    *(Program(file) for file in ("soup_activation.cu", "spherical_harmonics.cu")),
+]
+# Other definitions of what is compiled above.
+VARIANTS = [
+    Program("raster_forward.cu", tile_loops("SingleSided", 6, 1, 1, 1, 1), flush=True),
+    Program("raster_backward.cu", tile_loops("Bilateral", 16, 0, 2, 0, 0), flush=True),
+    Program("raster_backward.cu", tile_loops("Hard", 0, 16, 1, 0, 0), flush=True),
+    Program("raster_reduce.cu", tile_loops("Elastic", 6, 1, 1, 0, 0)[1:]),
+    Program("raster_forward.cu", tile_loops("Tabulated", 3, 0, 0, 0, 0), flush=True),
+    Program("raster_backward.cu", tile_loops("Tabulated", 3, 0, 0, 0, 0), flush=True),
+]
