@@ -62,8 +62,8 @@ class Kernel:
         threads: of a block.
         shared, stack: bytes of a block and of a thread.
         instructions: of the whole kernel, each counted once.
-        pair: instructions of the innermost loop that evaluates the kernel function G, once a (slot, sub-tile) pair in the
-            tile loops; 0 where there is none.
+        pair: instructions of the innermost loop that evaluates the kernel function G, in the tile loops once a (slot,
+            sub-tile) pair; 0 where there is none.
         local: loads and stores of local memory.
     """
 
@@ -111,7 +111,7 @@ def kernels(program: Program, architecture: str) -> list[Kernel]:
 def pair_instructions(lines: list[tuple[str, str]]) -> int:
     """Instructions of the innermost loop with a logarithm, from (label, instruction) pairs of which one is empty.
 
-    A loop reaches from a label to the last branch back to it; what lies between is counted, also what a thread may skip.
+    A loop reaches from a label to the last branch back to it; all between is counted, also what a thread may skip.
     """
     places, loops, count = {}, {}, 0
     counts, logarithms = [], []

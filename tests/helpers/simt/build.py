@@ -57,6 +57,10 @@ class Simt:
     def memory_pool(self) -> None:
         """Recordings keep what they use."""
 
+    def warm_up(self, body: Callable[[], None]) -> None:
+        """As any call."""
+        body()
+
     def capture(self, body: Callable[[], None], pool: None) -> Callable[[], None]:
         """Records the launches and the operations of torch, on the memory that they had, while the body runs."""
         with Recording() as self._recording:
@@ -149,6 +153,15 @@ def ptx_library(program: Program, architecture: str) -> ctypes.CDLL:
         text = ptx.translate(compile_without_cache(program, architecture).decode())
         _compile(text, "kernel.cpp", [f"-I{_precompiled_shim(flags)}", *flags], path)
     return ctypes.CDLL(str(path))
+
+
+@cache
+def host_library(source: str, name: str) -> Path:
+    """C++ that needs no shim, compiled to a library that other libraries know by this name."""
+    path = FOLDER / f"{_digest(source, name)}.so"
+    if not path.is_file():
+        _compile(source, "library.cpp", ["-std=c++20", "-fPIC", "-shared", f"-Wl,-soname,{name}"], path)
+    return path
 
 
 @cache

@@ -1,4 +1,4 @@
-"""Programs to CUBIN by NVRTC, which needs neither a GPU nor a driver, and a cache of the results on disk."""
+"""Programs to machine code by NVRTC, which needs neither a GPU nor a driver, and a cache of the results on disk."""
 
 import hashlib
 import importlib
@@ -14,26 +14,48 @@ from etsplat.core.errors import EngineUnavailableError, InputError
 from etsplat.engines.cuda.program import Program
 
 INSTALL = "pip install 'etsplat[cuda]'"
+OLDER_INSTALL = "pip install 'etsplat[cuda12]'"
 OPTIONS = ("--std=c++17",)
 _DIGEST_SIZE = 32
 
 
 def compile_program(program: Program, architecture: str) -> bytes:
-    """CUBIN of ``program`` for an architecture such as "sm_90", from the cache if it is there.
+    """Machine code of ``program`` for an architecture such as "sm_90", from the cache if it is there.
+
+    For a virtual architecture such as "compute_90" it is PTX that ends with a 0, as drivers want it.
 
     Raises:
         EngineUnavailableError: NVRTC is not installed.
         InputError: Others can write to the folder of the cache.
         RuntimeError: The source does not compile; the message is the compiler's.
     """
-    path = cache_folder() / f"{program_key(program, architecture)}.cubin"
-    cubin = _load(path)
-    if cubin is None:
+    virtual = architecture.startswith("compute_")
+    path = cache_folder() / f"{program_key(program, architecture)}.{'ptx' if virtual else 'cubin'}"
+    code = _load(path)
+    if code is None:
         start = time.perf_counter()
-        cubin = compile_without_cache(program, architecture)
+        code = compile_without_cache(program, architecture) + (b"\0" if virtual else b"")
         print(f"compiled {program} for {architecture} in {time.perf_counter() - start:.1f} s", file=sys.stderr)
-        _store(path, cubin)
-    return cubin
+        _store(path, code)
+    return code
+
+
+def target_architecture(major: int, minor: int) -> str:
+    """What to compile for a GPU of this compute capability: its own architecture, such as "sm_90".
+
+    For a GPU newer than NVRTC it is the newest virtual one, such as "compute_120": the driver compiles the rest.
+
+    Raises:
+        EngineUnavailableError: NVRTC is missing, or the GPU is older than all that it knows.
+    """
+    nvrtc = import_nvrtc()
+    known = [number for number in _checked(nvrtc, nvrtc.nvrtcGetSupportedArchs()) if number <= 10 * major + minor]
+    if not known:
+        raise EngineUnavailableError(
+            f"NVRTC {'.'.join(map(str, nvrtc_version(nvrtc)))} compiles for no GPU as old as this one (compute "
+            f"capability {major}.{minor}): compute on the CPU"
+        )
+    return f"{'sm' if max(known) == 10 * major + minor else 'compute'}_{max(known)}"
 
 
 def compile_without_cache(program: Program, architecture: str) -> bytes:

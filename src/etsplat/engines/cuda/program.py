@@ -19,8 +19,8 @@ class Program:
         defines: (name, value) pairs; constants that the compiler should know.
         contract: Whether a b + c may be rounded once. Without, results are those of the CPU engine to the bit; that
             costs nothing where bytes are the bound.
-        flush: Whether numbers nearer to 0 than 1.2e-38 are 0, which spares what powers, logarithms and quotients need to
-            know them.
+        flush: Whether numbers nearer to 0 than 1.2e-38 are 0, which spares what powers, logarithms and quotients need
+            to know them.
     """
 
     file: str

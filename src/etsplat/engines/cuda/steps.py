@@ -73,7 +73,7 @@ class Repeated:
         elif self._called:
             self._replay = backend().capture(self._body, self._pool)
         else:
-            self._body()
+            backend().warm_up(self._body)
             self._called = True
 
 
