@@ -1,7 +1,7 @@
-"""A driver without a GPU: cuda-bindings finds these functions under the driver's name, and their launches run on the shim.
+"""A driver without a GPU: cuda-bindings finds these functions under the driver's name; launches run on the shim.
 
-What a driver checks is checked: handles, the context of the calling thread, sizes of grids and blocks, and what must not be
-done while a stream is captured. Streams and graphs of torch, which has none on the CPU, stand beside it and tell it of
+What a driver checks is checked: handles, the context of the calling thread, sizes of grids and blocks, and what must not
+be done while a stream is captured. Streams and graphs of torch, which has none on the CPU, stand beside it and tell it of
 captures.
 """
 
@@ -36,7 +36,7 @@ _SIGNATURES: dict[str, tuple[Any, ...]] = {
 
 
 class Driver:
-    """What the driver knows, and what was called: `calls` counts by name, `events` is their order with that of streams."""
+    """What the driver knows, and what was called: `calls` counts by name, `events` has launches and waits in order."""
 
     def __init__(self) -> None:
         self.version = 13000
