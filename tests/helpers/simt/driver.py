@@ -1,8 +1,8 @@
 """A driver without a GPU: cuda-bindings finds these functions under the driver's name; launches run on the shim.
 
-What a driver checks is checked: handles, the context of the calling thread, sizes of grids and blocks, and what must not
-be done while a stream is captured. Streams and graphs of torch, which has none on the CPU, stand beside it and tell it of
-captures.
+What a driver checks is checked: handles, the context of the calling thread, sizes of grids and blocks, and what must
+not be done while a stream is captured. Streams and graphs of torch, which has none on the CPU, stand beside it and tell
+it of captures.
 """
 
 import ctypes
