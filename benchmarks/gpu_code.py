@@ -38,19 +38,23 @@ _BOUNDS = re.compile(r"__launch_bounds__\((\d+)\)\s+(\w+)\(")
 
 @dataclass(frozen=True)
 class Multiprocessor:
-    """What a multiprocessor has room for: warps, blocks, and bytes of shared memory for all blocks."""
+    """What a multiprocessor has room for: warps, blocks, and bytes of shared memory for all blocks.
+
+    `reserved` are the bytes of a block that the driver takes and that are not among those of the compiled kernel.
+    """
 
     warps: int
     blocks: int
     shared: int
+    reserved: int
 
 
 MULTIPROCESSORS = {
-    "sm_75": Multiprocessor(32, 16, 64 << 10),
-    "sm_80": Multiprocessor(64, 32, 164 << 10),
-    "sm_86": Multiprocessor(48, 16, 100 << 10),
-    "sm_89": Multiprocessor(48, 24, 100 << 10),
-    "sm_90": Multiprocessor(64, 32, 228 << 10),
+    "sm_75": Multiprocessor(32, 16, 64 << 10, 0),
+    "sm_80": Multiprocessor(64, 32, 164 << 10, 1024),
+    "sm_86": Multiprocessor(48, 16, 100 << 10, 1024),
+    "sm_89": Multiprocessor(48, 24, 100 << 10, 1024),
+    "sm_90": Multiprocessor(64, 32, 228 << 10, 0),
 }
 
 
@@ -85,8 +89,7 @@ class Kernel:
         warps = -(-self.threads // 32)
         per_warp = -(-self.registers * 32 // 256) * 256
         by_registers = _REGISTERS // per_warp // warps
-        # From sm_80 on the driver keeps a kilobyte of each block, which is in `shared` where a kernel has any.
-        by_shared = room.shared // self.shared if self.shared else room.blocks
+        by_shared = room.shared // max(self.shared + room.reserved, 1)
         return min(room.blocks, room.warps // warps, by_registers, by_shared) * warps / room.warps
 
 
@@ -152,10 +155,16 @@ def _run(name: str, *arguments: str) -> str:
     return subprocess.run([_tool(name), *arguments], capture_output=True, text=True, check=True).stdout
 
 
+def label(program: Program) -> str:
+    """The file, and the definitions that ask for something."""
+    return " ".join([program.file, *(f"{name}={value}" for name, value in program.defines if value)])
+
+
 def table(chosen: list[Kernel]) -> Table:
+    """A row for each."""
     rows = [
         [
-            str(kernel.program).removesuffix(" MEDIAN=0 WEIGHTS=0"),
+            label(kernel.program),
             kernel.name,
             kernel.architecture,
             str(kernel.registers),

@@ -1,7 +1,7 @@
 """The least time that each kernel of the GPU rasterizer can take, from what it must read, write and compute.
 
 Bytes are those that have to cross device memory once; what is read again from the caches is not counted. Instructions
-are warp instructions of the loops, counted in the machine code for sm_90, times how often they run.
+are warp instructions of the loops, counted in the machine code (benchmarks.gpu_code), times how often they run.
 """
 
 from dataclasses import dataclass
@@ -19,6 +19,8 @@ PEAKS = {
     # 132 multiprocessors of four schedulers at 1.755 GHz; HBM3
     "H100": Peaks(3.35e12, 132 * 4 * 1.755e9),
     "H200": Peaks(4.8e12, 132 * 4 * 1.755e9),
+    # 128 multiprocessors at the boost clock; GDDR6X
+    "RTX 4090": Peaks(1.008e12, 128 * 4 * 2.52e9),
 }
 
 
@@ -58,12 +60,12 @@ class Floor:
         return "bytes" if self.memory_ms >= self.instruction_ms else "instructions"
 
 
-# Warp instructions in the machine code of FLAT=3, elastic, sm_90 (NVRTC 13.5, nvdisasm): loop bodies, and the rest of a
-# batch spread over its slots.
+# Warp instructions in the machine code of FLAT=3, elastic, sm_90 (NVRTC 13.5, nvdisasm); sm_89 differs by 2 at most. Of
+# pairs by `python -m benchmarks.gpu_code`; those of slots are the rest of a batch, spread over them.
 PROJECT_INSTRUCTIONS = 1500  # per 32 triangles of up to four tiles
-FORWARD_PAIR_INSTRUCTIONS = 75  # per (slot, sub-tile) pair
+FORWARD_PAIR_INSTRUCTIONS = 66  # per (slot, sub-tile) pair
 FORWARD_SLOT_INSTRUCTIONS = 22  # staging, the test of eight sub-tiles, eight warps looking for theirs
-BACKWARD_PAIR_INSTRUCTIONS = 132  # per pair, 16 shuffles among them
+BACKWARD_PAIR_INSTRUCTIONS = 211  # per pair, 16 shuffles among them
 BACKWARD_SLOT_INSTRUCTIONS = 45  # staging, adding the warps' sums, compaction
 REDUCE_INSTRUCTIONS = 1650  # per 32 triangles
 

@@ -1,10 +1,17 @@
 #!/usr/bin/env bash
 # Everything that wants a GPU, on a machine with Python 3.12, a CUDA build of torch >= 2.11, nanobind, scikit-build-core and
-# ninja, and no network: builds, runs the tests marked cuda, compute-sanitizer, the benchmarks, one full-size
+# ninja, and no network: builds, runs the tests marked cuda, the benchmarks, compute-sanitizer, one full-size
 # reconstruction and one soup; prints a short table last. A step that fails does not stop the others.
 #
-#   benchmarks/gpu_run.sh              all steps
-#   benchmarks/gpu_run.sh test bench   some of: build test sanitize bench reconstruct train
+#   benchmarks/gpu_run.sh              all steps, in the order of what they tell
+#   benchmarks/gpu_run.sh test bench   some of: build doctor test bench sanitize reconstruct train
+#
+# For a device of which there are ten minutes: `build doctor first sphere`, some three of them the build; then `bench`.
+#   doctor     what is seen: driver, torch, NVRTC. If this fails, nothing else can work.
+#   first      tests of launches, sorting and the rasterizer, which say which kernel is wrong where one is
+#   sphere     one scene: compare "measured" with the floors beside it (docs/gpu_kernels.md has those of other devices), and
+#              the graph's time with the sum of the kernels': more than some 3 us a launch apart is the host
+# Send back $OUT/report.tar.gz, whatever failed: logs, results, and what the device is.
 #
 #   PYTHON=python3.12    the interpreter that has torch
 #   WHEELS=folder        wheels of packages that it lacks (nanobind-backend, tyro, trimesh, hypothesis, ...)
@@ -18,7 +25,7 @@ SITE=$PWD/build/gpu/site
 mkdir -p "$OUT" "$SITE"
 export PYTHONPATH=$SITE PYTHONUNBUFFERED=1 ETSPLAT_CACHE_DIR=$PWD/build/gpu/kernels
 steps=("$@")
-[ $# -gt 0 ] || steps=(build test sanitize bench reconstruct train)
+[ $# -gt 0 ] || steps=(build doctor test bench sanitize reconstruct train)
 summary=()
 "$PYTHON" -c 'import sys, torch; sys.exit(not torch.cuda.is_available())' || { echo "no GPU that torch can use" >&2; exit 1; }
 
@@ -40,6 +47,7 @@ build() {
     step build 420 "${pip_target[@]}" --no-build-isolation .
 }
 
+first() { step first 240 "${pytest_cuda[@]}" -m cuda tests/engines tests/ops/test_rasterize_engines.py; }
 run_tests() { step tests 540 "${pytest_cuda[@]}" -m cuda tests; }
 
 # Small scenes: memcheck makes a kernel some fifty times slower, racecheck more.
@@ -57,8 +65,10 @@ sanitize() {
 }
 
 bench() { step bench 540 "$PYTHON" -m benchmarks.gpu; }
+sphere() { step sphere 180 "$PYTHON" -m benchmarks.gpu --scene sphere6; }
 
 etsplat=("$PYTHON" -c 'import sys; from etsplat.cli import main; sys.exit(main())')
+doctor() { step doctor 120 "${etsplat[@]}" doctor; }
 # A captured graph for each size of photos, densification, opaque evaluation: 3,000 steps.
 train() { step train 540 "${etsplat[@]}" demo scene --device cuda --out "$OUT/train" --overwrite; }
 reconstruct() { step reconstruct 540 "${etsplat[@]}" demo --device cuda --out "$OUT/reconstruct" --overwrite; }
@@ -66,12 +76,15 @@ reconstruct() { step reconstruct 540 "${etsplat[@]}" demo --device cuda --out "$
 for name in "${steps[@]}"; do
     case $name in
         build) build ;;
+        doctor) doctor ;;
+        first) first ;;
+        sphere) sphere ;;
         test) run_tests ;;
         sanitize) sanitize ;;
         bench) bench ;;
         reconstruct) reconstruct ;;
         train) train ;;
-        *) echo "no step $name: choose from build test sanitize bench reconstruct train" >&2; exit 2 ;;
+        *) echo "no step $name: choose from build doctor first sphere test bench sanitize reconstruct train" >&2; exit 2 ;;
     esac
 done
 
@@ -80,3 +93,6 @@ echo "== summary, $(date -u +%Y-%m-%d), $(nvidia-smi --query-gpu=name,driver_ver
 printf '%s\n' "${summary[@]}"
 grep -hE "forward|backward|a whole" "$OUT/bench.log" 2>/dev/null | grep -E "sphere|soup|whole" | tail -14
 grep -hE "passed|failed" "$OUT"/tests.log 2>/dev/null | tail -1
+nvidia-smi -q > "$OUT/device.txt" 2>&1
+tar --create --gzip --file "$OUT/report.tar.gz" "$OUT"/*.log "$OUT/device.txt" $(ls benchmarks/results/gpu_*.json 2>/dev/null) &&
+    echo "to send back: $OUT/report.tar.gz"

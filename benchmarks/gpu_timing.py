@@ -122,6 +122,10 @@ class _Nothing:
     def memory_pool(self) -> None:
         """None."""
 
+    def warm_up(self, body: Callable[[], None]) -> None:
+        """As any call."""
+        body()
+
     def capture(self, body: Callable[[], None], pool: Any) -> Callable[[], None]:
         """The body itself."""
         body()
