@@ -29,7 +29,7 @@ LISTING = """
 
 
 def test_the_loop_of_pairs_is_the_innermost_one_with_a_logarithm():
-    """Four instructions from the label to the branch back; the loop around it has seven, and the last has no logarithm."""
+    """Four instructions from the label to the branch back; the loop around it has seven, the last has no logarithm."""
     lines = gpu_code._LINE.findall(LISTING)
     assert sum(bool(text) for _, text in lines) == 11
     assert gpu_code.pair_instructions(lines) == 4
