@@ -22,7 +22,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from benchmarks.gpu_programs import PROGRAMS
+from benchmarks.gpu_programs import PROGRAMS, block_size
 from benchmarks.tables import Table
 from etsplat.engines.cuda.compile import compile_without_cache
 from etsplat.engines.cuda.program import Program
@@ -107,7 +107,7 @@ def kernels(program: Program, architecture: str) -> list[Kernel]:
         instructions = [text for _, text in lines if text and "NOP" not in text]
         local = sum(bool(re.search(r"\b(LDL|STL)\b", text)) for text in instructions)
         numbers = (int(registers), int(shared), int(stack), len(instructions), pair_instructions(lines), local)
-        result.append(Kernel(program, name, architecture, threads.get(name, 256), *numbers))
+        result.append(Kernel(program, name, architecture, threads.get(name, block_size(program)), *numbers))
     return result
 
 

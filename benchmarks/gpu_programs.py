@@ -1,6 +1,22 @@
 """What there is to compile for a GPU: every file of csrc/cuda, and variants of those that definitions specialise."""
 
+from etsplat.engines.cuda.channels import CHANNELS_THREADS
+from etsplat.engines.cuda.launch import BLOCK
 from etsplat.engines.cuda.program import Program
+from etsplat.engines.cuda.structs import constant
+
+# Threads of a block, of kernels that do not say it themselves; BLOCK in other files.
+THREADS = {
+    **{file: constant(f"cuda/{file}", "kThreads") for file in ("rasterize_opaque.cu", "spherical_harmonics.cu")},
+    "triangle_channels.cu": CHANNELS_THREADS,
+    "step.cu": 1,
+    "weighted_sum.cu": 1,
+}
+
+
+def block_size(program: Program) -> int:
+    """Threads of a block of the program's kernels that have no launch bounds."""
+    return THREADS.get(program.file, BLOCK)
 
 
 def tile_loops(kernel: str, *values: int) -> tuple[tuple[str, int | str], ...]:

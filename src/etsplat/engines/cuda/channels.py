@@ -14,7 +14,7 @@ from etsplat.engines.native.operation import differentiable
 
 _CHANNELS = Program("triangle_channels.cu", contract=False)
 _PICK = Program("pick_values.cu", contract=False)
-_CHANNELS_THREADS = 128
+CHANNELS_THREADS = 128
 _PICK_THREADS = 256
 
 
@@ -31,7 +31,7 @@ def channels_backward(
 
 
 def _run(kernel: str, struct: Any, *images: Tensor) -> None:
-    launch_each(_CHANNELS, kernel, struct.triangles, (struct, *images), _CHANNELS_THREADS)
+    launch_each(_CHANNELS, kernel, struct.triangles, (struct, *images), CHANNELS_THREADS)
 
 
 def _channels_of(corners: Tensor, viewmats: Tensor, depth: bool, normals: bool) -> Any:
