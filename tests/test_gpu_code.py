@@ -1,12 +1,14 @@
 """What is counted in the machine code of GPU kernels."""
 
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
-from benchmarks import gpu_code
+from benchmarks import gpu_code, gpu_floors
 from benchmarks.gpu_code import Kernel
-from etsplat.engines.cuda.program import Program
+from etsplat.engines.cuda.program import Program, source_root
 
 LISTING = """
 .text.drawn:
@@ -52,3 +54,16 @@ def test_occupancy(architecture, threads, registers, shared, expected):
     kernel = Kernel(Program("fill.cu"), "fill", architecture, threads, registers, shared, 0, 1, 0, 0)
     assert kernel.occupancy == pytest.approx(expected)
     assert replace(kernel, shared=0, registers=16).occupancy == 1.0
+
+
+def test_the_page_has_every_kernel_and_the_counts_of_the_floors():
+    """Whoever adds a kernel, or changes the tile loops, makes the page anew."""
+    page = (Path(__file__).parent.parent / "docs" / "gpu_kernels.md").read_text(encoding="utf-8")
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in page.splitlines() if line.startswith("|")]
+    pairs = {row[1]: row[6] for row in rows if ".cu" in row[0]}
+    sources = "".join(path.read_text(encoding="utf-8") for path in (source_root() / "cuda").glob("*.cu"))
+    names = re.findall(r'extern "C" __global__ void (?:__launch_bounds__\(\d+\) )?(\w+)\(', sources)
+    assert len(names) > 50
+    assert pairs.keys() == set(names)
+    assert pairs["raster_forward"] == str(gpu_floors.FORWARD_PAIR_INSTRUCTIONS)
+    assert pairs["raster_backward"] == str(gpu_floors.BACKWARD_PAIR_INSTRUCTIONS)
