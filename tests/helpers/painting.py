@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import torch
 
+from etsplat.data.agreement import first_hits, photos_of
 from etsplat.data.dataset import Dataset
 from etsplat.data.photograph import orbit_cameras, photograph
 from etsplat.data.pictures import StoredPictures
@@ -27,3 +28,13 @@ def painted_pictures(
         supersampling=2,
     ).rgba
     return unit, faces, replace(views, images=StoredPictures(list(images)))
+
+
+def mean_colors(views: Dataset, vertices: torch.Tensor, faces: torch.Tensor) -> torch.Tensor:
+    """(F, 3) of each face, what the training photos show there in the mean."""
+    sums = torch.zeros(len(faces), 4)
+    for photo in photos_of(views):
+        hit = first_hits(photo, vertices, faces)[1]
+        at = (hit >= 0) & (photo.pixels[0, 3] > 0.95)
+        sums.index_add_(0, hit[at], torch.cat([torch.ones(int(at.sum()), 1), photo.pixels[0, :3, at].T], dim=1))
+    return sums[:, 1:] / sums[:, :1].clamp_min(1)

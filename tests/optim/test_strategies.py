@@ -69,6 +69,33 @@ def test_what_no_picture_shows_becomes_a_film_where_meshes_are_untangled() -> No
     assert meshes[1][hidden, 1].std() < before[hidden, 1].std() / 2
 
 
+def test_lids_are_removed_before_each_untangling_but_the_last_with_all_that_belongs_to_them() -> None:
+    """Parameters and moments of the other faces and their vertices stay as they are; where that was undone, all do."""
+    strategy, mesh = (
+        SubdivideAndUntangle({}, [5, 9], lids=lambda vertices, faces, _: vertices[faces][..., 1].amin(1) > 0),
+        a_mesh(),
+    )
+    adam = started(strategy, mesh)
+    adam.first_moments["colors"].copy_(torch.arange(320.0)[:, None].expand(320, 3))
+    vertices, faces = mesh.surface()
+    lid = vertices[faces][..., 1].amin(dim=1) > 0
+    assert (strategy.attempts(4), strategy.attempts(5), strategy.attempts(9)) == (1, 2, 1)
+    strategy.undone = 1
+    assert not strategy.edit(5)
+    assert mesh.count == 320
+    strategy.undone = 0
+    assert not strategy.edit(9)
+    assert strategy.edit(5)
+    assert mesh.count == int((~lid).sum())
+    assert torch.equal(mesh.vertices[mesh.faces], vertices[faces[~lid]])
+    assert torch.equal(mesh.faces.unique(), torch.arange(len(mesh.vertices)))
+    assert torch.equal(adam.first_moments["colors"][:, 0], torch.arange(320.0)[~lid])
+    assert len(adam.second_moments["vertices"]) == len(mesh.vertices)
+    assert all(adam.parameters[name] is parameter for name, parameter in mesh.parameters().items())
+    assert mesh.topology.is_manifold()
+    assert (strategy.attempts(5), strategy.edit(5)) == (1, False)  # nothing is left of it
+
+
 def test_a_mesh_is_subdivided_at_its_times_and_only_then() -> None:
     """The model, its topology and the optimizer's state have the new faces; in between nothing changes."""
     strategy, mesh = SubdivideAndUntangle({3: 400, 7: 450}, [5]), a_mesh()

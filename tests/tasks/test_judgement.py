@@ -110,6 +110,13 @@ def test_faces_that_cut_through_others_are_said():
     assert judged(intersecting=0.9).verdict.startswith("good")
 
 
+def test_an_open_result_of_a_closed_input_is_poor():
+    found = judged(found=Shape(None, None, "is not closed"), begun="hull")
+    assert found.verdict == (
+        "poor: the result is not closed, the input mesh is a closed surface: try --start.shape sphere"
+    )
+
+
 def test_an_open_input_is_said_and_not_compared():
     found = judged(expected=Shape(None, None, "the input mesh is not closed"))
     assert found.verdict.endswith("parts and holes were not compared: the input mesh is not closed")

@@ -41,6 +41,14 @@ _CONTRADICTED = 0.4
 """Correlation below which photos show different things, as on a lid over a hollow; gloss seldom goes so low."""
 
 
+_WRONG, _UNUSUAL = 0.02, 2.0
+"""Mean difference of colours from which photos are said to show something else than a face does, and so many times
+what it is on half of the surface: coarse faces do not show all of a texture."""
+
+_SPREAD = 4
+"""Rounds in which differences are summed over neighbouring faces."""
+
+
 @dataclass(frozen=True)
 class Photo:
     """A photo with its camera: (1, 4, H, W) pixels, (4, 4), (3, 3) and (3,)."""
@@ -132,18 +140,36 @@ def surface_agreement(
 
 
 @torch.no_grad()
-def contradicted(dataset: Dataset, vertices: Float[Tensor, "V 3"], faces: Int64[Tensor, "F 3"]) -> float:
-    """`contradicted_share` of a surface around which the photos of a dataset were taken; 0 where there are none."""
+def contradicted(
+    dataset: Dataset, vertices: Float[Tensor, "V 3"], faces: Int64[Tensor, "F 3"], colors: Float[Tensor, "F 3"]
+) -> float:
+    """As `contradicted_share`, of a surface whose colours were fitted to the photos of a dataset.
+
+    Where the photos do not correlate and yet the colours explain them, what they show there is noise: a plain surface
+    is no lid. 0 where there are no photos.
+
+    Args:
+        dataset: photos with alpha around it.
+        vertices: (V, 3).
+        faces: (F, 3).
+        colors: (F, 3) in [0, 1].
+    """
     photos = photos_of(dataset)
     if len(photos) < 2 or len(vertices) == 0:
         return 0.0
-    edges = MeshTopology.from_faces(faces, len(vertices)).edges.long()
+    topology = MeshTopology.from_faces(faces, len(vertices))
+    edges = topology.edges.long()
     hits = [first_hits(photo, vertices, faces) for photo in photos]
     score = surface_agreement(photos, hits, vertices, faces, edges)
-    return contradicted_share(score, vertices, faces, edges)
+    sums = torch.stack([differences(photo, hit, hit, colors) for photo, (_, hit) in zip(photos, hits, strict=True)])
+    wrong = per_pixel(sums.sum(dim=0), topology.face_pairs.long())[:, 0]
+    usual = wrong[wrong > 0].median() if bool((wrong > 0).any()) else wrong.new_zeros(())
+    return contradicted_share(score, vertices, faces, edges, wrong > torch.maximum(_UNUSUAL * usual, usual + _WRONG))
 
 
-def contradicted_share(score: Float[Tensor, " V"], vertices: Tensor, faces: Tensor, edges: Tensor) -> float:
+def contradicted_share(
+    score: Float[Tensor, " V"], vertices: Tensor, faces: Tensor, edges: Tensor, wrong: Bool[Tensor, " F"] | None = None
+) -> float:
     """The largest patch of a surface on which photos show different things, as a fraction of its area.
 
     Args:
@@ -151,13 +177,40 @@ def contradicted_share(score: Float[Tensor, " V"], vertices: Tensor, faces: Tens
         vertices: (V, 3).
         faces: (F, 3).
         edges: (E, 2).
+        wrong: (F,) only these faces count; None for all.
     """
     low = score < _CONTRADICTED
     count, patch = connected(edges[low[edges].all(dim=1)], len(vertices))
     area = face_areas(vertices, faces)
     within = low[faces].all(dim=1)
+    if wrong is not None:
+        within &= wrong
     patches = torch.zeros(count).index_add(0, patch[faces[within, 0]], area[within])
     return float(patches.amax() / area.sum())
+
+
+def differences(
+    photo: Photo, seen: Int64[Tensor, "H W"], shown: Int64[Tensor, "H W"], colors: Float[Tensor, "F 3"]
+) -> Float[Tensor, "F 2"]:
+    """Of each face, at how many pixels a photo of the object sees it, and the sum there of mean absolute differences.
+
+    Args:
+        photo: one of `photos_of`.
+        seen: (H, W) the face at each pixel, -1 where there is none.
+        shown: (H, W) the face whose colour is compared there.
+        colors: (F, 3) in [0, 1].
+    """
+    at = (seen >= 0) & (photo.pixels[0, 3] > 0.95)
+    error = (photo.pixels[0, :3, at].T - colors[shown[at]]).abs().mean(dim=1)
+    return torch.zeros(len(colors), 2).index_add(0, seen[at], torch.stack([torch.ones_like(error), error], dim=1))
+
+
+def per_pixel(sums: Float[Tensor, "F K"], pairs: Int64[Tensor, "P 2"]) -> Float[Tensor, "F K-1"]:
+    """Sums over each face and those around it, divided by their pixels, which come first; 0 where there is no pixel."""
+    source, target = torch.cat([pairs, pairs.flip(1)]).T
+    for _ in range(_SPREAD):
+        sums = sums.index_add(0, target, sums[source]) / 4
+    return sums[:, 1:] / sums[:, :1].clamp_min(1e-30)
 
 
 def seen_by(

@@ -27,7 +27,8 @@ def with_discs(
     Returns:
         A closed, oriented manifold: vertices, those that no face uses left out, and faces, first those that stay.
     """
-    places, kept, border = _opened(vertices, faces[~removed])
+    source, kept, border = cut_open(faces[~removed], len(vertices))
+    places = vertices[source]
     parts, triangles, count = [places], [kept], len(places)
     for loop in _loops(border):
         own = torch.tensor(loop)
@@ -40,10 +41,21 @@ def with_discs(
     return film(found, joined, torch.arange(count) >= len(places)), joined
 
 
-def _opened(vertices: Tensor, kept: Tensor) -> tuple[Tensor, Tensor, Int64[Tensor, "B 2"]]:
-    """The faces that stay, with a vertex for each fan around it, and the edges at which they end, head first."""
+def cut_open(
+    kept: Int64[Tensor, "F 3"], num_vertices: int
+) -> tuple[Int64[Tensor, " V2"], Int64[Tensor, "F 3"], Int64[Tensor, "B 2"]]:
+    """What is left of a closed, oriented manifold, as a manifold with a border.
+
+    Args:
+        kept: (F, 3) the faces that stay.
+        num_vertices: of the manifold.
+
+    Returns:
+        source (V2,): the old vertex of each new one, of which there is one for each fan of faces around it; the faces
+        with these; and the edges (B, 2) at which they end, head first.
+    """
     tail, head = kept.reshape(-1), kept.roll(-1, dims=1).reshape(-1)
-    edge = torch.minimum(tail, head) * len(vertices) + torch.maximum(tail, head)
+    edge = torch.minimum(tail, head) * num_vertices + torch.maximum(tail, head)
     order = torch.argsort(edge, stable=True)
     pair = (edge[order][1:] == edge[order][:-1]).nonzero()[:, 0]
     first, second = order[pair], order[pair + 1]
@@ -54,7 +66,7 @@ def _opened(vertices: Tensor, kept: Tensor) -> tuple[Tensor, Tensor, Int64[Tenso
     apart, alone = fan.reshape(-1, 3), torch.ones(len(tail), dtype=torch.bool)
     alone[torch.cat([first, second])] = False
     border = torch.stack([apart.roll(-1, dims=1).reshape(-1)[alone], fan[alone]], dim=1)
-    return vertices[tail[corner]], apart, border
+    return tail[corner], apart, border
 
 
 def _loops(border: Tensor) -> list[list[int]]:

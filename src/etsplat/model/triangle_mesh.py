@@ -311,6 +311,11 @@ class TriangleMesh(Model):
         return spherical_harmonics(coefficients, -normals, self.degree).clamp(0.0, 1.0)
 
     @property
+    def display_face_colors(self) -> Float[Tensor, "F 3"]:
+        """As `display_colors`, of faces: of colours of vertices the mean of a face's three."""
+        return self.display_colors[self.faces].mean(dim=1) if self.vertex_colored else self.display_colors
+
+    @property
     def degree(self) -> int:
         """Of the harmonics; 0 where there are none."""
         return 0 if self.harmonics is None else math.isqrt(self.harmonics.shape[1] + 1) - 1

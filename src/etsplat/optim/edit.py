@@ -146,6 +146,31 @@ def apply_rows(
     return parameters, {name: start_at_zero(tensor) for name, tensor in statistics.items()}
 
 
+def apply_sources(sources: Mapping[str, Int[Tensor, " M"]], adam: Adam) -> dict[str, Tensor]:
+    """Gives parameters, and their moments, copies of some of their rows, where what they belong to is removed.
+
+    Args:
+        sources: by name of a parameter, the old row (M,) of each new one. Those not named stay as they are.
+        adam: the optimizer; its parameters and moments are replaced in place.
+
+    Returns:
+        The new parameters, leaf tensors with the old requires_grad, by name.
+
+    Raises:
+        ValueError: a name is unknown, or a row is out of range. Nothing has been changed then.
+    """
+    for name, source in sources.items():
+        if name not in adam.parameters:
+            raise ValueError(f"sources must name parameters, got {name!r}")
+        check_memory(name, adam.parameters[name])
+        check_indices(f"sources of {name}", source, len(adam.parameters[name]))
+
+    def pick(rows: Tensor) -> Callable[[Tensor], Tensor]:
+        return lambda tensor: tensor[rows.to(tensor.device)]
+
+    return {name: _carry(name, pick(source), pick(source), adam, {}) for name, source in sources.items()}
+
+
 def halves_plan(vertices: Float[Tensor, "N3 3"], colors: Float[Tensor, "N3 3"], halved: Int[Tensor, " K"]) -> RowPlan:
     """Halves some of N separate triangles at the middle of their longest edges; rows are their corners.
 

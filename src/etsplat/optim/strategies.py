@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from etsplat.core.rasterization import Rasterization
+from etsplat.geometry.discs import cut_open
 from etsplat.geometry.films import film
 from etsplat.geometry.measures import face_areas
 from etsplat.geometry.subdivision import longest_edge_plan
@@ -16,7 +17,7 @@ from etsplat.model.triangle_mesh import TriangleMesh
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.ops.adam import Adam
 from etsplat.optim.densification import PruneRules, SoupStatistics, dead_triangles, densify_plan, grown_count
-from etsplat.optim.edit import RowPlan, apply_rows, apply_subdivision, halves_plan
+from etsplat.optim.edit import RowPlan, apply_rows, apply_sources, apply_subdivision, halves_plan
 from etsplat.optim.loop import DivergedError
 from etsplat.optim.picture_errors import FaceErrors
 from etsplat.optim.schedules import NEVER
@@ -90,7 +91,7 @@ class Fixed(Strategy):
 
 
 class SubdivideAndUntangle(Strategy):
-    """Divides a mesh's largest faces at given times (paper, appendix Adaptive Refinement), and undoes folds.
+    """Divides a mesh's largest faces at given times (paper, appendix Adaptive Refinement), undoes folds, removes lids.
 
     Example:
         >>> strategy = etsplat.SubdivideAndUntangle({100: 2500, 200: 5000}, untangle_after=[150])
@@ -105,6 +106,7 @@ class SubdivideAndUntangle(Strategy):
         *,
         reach: float = _SHORT,
         unseen: Callable[[Tensor, Tensor], Tensor] | None = None,
+        lids: Callable[[Tensor, Tensor, Tensor], Tensor] | None = None,
     ) -> None:
         """Takes the times.
 
@@ -115,29 +117,39 @@ class SubdivideAndUntangle(Strategy):
                 half, and that spoils the pictures, a half is tried.
             unseen: of vertices and faces, on the CPU, which vertices no picture shows. Before each untangling they
                 become a film (`geometry.films`): regularizers alone leave slits in what nobody sees, and deepen them.
+            lids: of vertices, faces and their colours, on the CPU, which faces pictures look through. They are removed
+                before each untangling but the last, or stay where that spoils the pictures.
         """
         self._budgets, self._untangle_after, self._unseen = dict(budgets), set(untangle_after), unseen
         self._reaches = (reach, _SHORT) if reach > _SHORT else (reach,)
+        self._lids = lids
+        self._found: dict[int, Tensor | None] = {}
 
     def next_edit(self, iteration: int) -> int:
         """The next of the given times."""
         return min((i for i in (*self._budgets, *self._untangle_after) if i >= iteration), default=NEVER)
 
     def attempts(self, iteration: int) -> int:
-        """Untangling has one for each reach."""
-        return len(self._reaches) if iteration in self._untangle_after else 1
+        """Untangling has one for each reach, after one that removes lids, if there are any."""
+        if iteration not in self._untangle_after:
+            return 1
+        return len(self._reaches) + (self._lids_at(iteration) is not None)
 
     def edit(self, iteration: int) -> bool:
-        """Untangles, then divides. Raises DivergedError where faces have no finite area."""
+        """Removes lids, untangles, then divides. Raises DivergedError where faces have no finite area."""
         mesh: TriangleMesh = self.model
-        topology = mesh.topology.to(torch.device("cpu"))
-        if not bool(face_areas(mesh.vertices.detach().cpu(), topology.faces).isfinite().all()):
+        if not bool(face_areas(*mesh.surface()).isfinite().all()):
             raise DivergedError(f"the areas of faces are not finite at iteration {iteration}; lower the learning rates")
+        lid = self._lids_at(iteration)
+        opened = lid is not None and self.undone == 0
+        if lid is not None and opened:
+            self._remove(lid)
         if iteration in self._untangle_after:
-            self.finish(mesh)
+            self._untangle(mesh, self.undone - (lid is not None and not opened))
+        self._found.clear()
         if iteration not in self._budgets:
-            return False
-        vertices = mesh.vertices.detach().cpu()
+            return opened
+        vertices, topology = mesh.vertices.detach().cpu(), mesh.topology.to(torch.device("cpu"))
         plan = longest_edge_plan(vertices, topology, face_areas(vertices, topology.faces), self._budgets[iteration])
         carried = apply_subdivision(plan, self.adam, per_vertex=mesh.vertex_parameters, per_face=mesh.face_parameters)
         mesh.load_state({**carried, "faces": plan.faces})
@@ -146,12 +158,38 @@ class SubdivideAndUntangle(Strategy):
     def finish(self, model: TriangleMesh) -> None:
         """Untangles it as far as the reach of this attempt goes, if any untangling was asked for."""
         if self._untangle_after:
-            topology, reach = model.topology.to(torch.device("cpu")), self._reaches[self.undone]
-            with torch.no_grad():
-                vertices, faces = model.vertices.detach().cpu(), topology.faces.long()
-                if self._unseen is not None:
-                    vertices = film(vertices, faces, self._unseen(vertices, faces))
-                model.vertices.copy_(untangle(vertices, topology, reach=reach)[0])
+            self._untangle(model, self.undone)
+
+    def load_state(self, state: Mapping[str, Tensor]) -> None:
+        """Forgets which lids another mesh had."""
+        self._found.clear()
+
+    def _untangle(self, model: TriangleMesh, attempt: int) -> None:
+        topology, reach = model.topology.to(torch.device("cpu")), self._reaches[attempt]
+        with torch.no_grad():
+            vertices, faces = model.vertices.detach().cpu(), topology.faces.long()
+            if self._unseen is not None:
+                vertices = film(vertices, faces, self._unseen(vertices, faces))
+            model.vertices.copy_(untangle(vertices, topology, reach=reach)[0])
+
+    def _lids_at(self, iteration: int) -> Tensor | None:
+        """(F,) which faces are lids, if any are and it is time to remove them; they are looked for once."""
+        if self._lids is None or iteration not in self._untangle_after or iteration == max(self._untangle_after):
+            return None
+        if iteration not in self._found:
+            mesh: TriangleMesh = self.model
+            vertices, faces = mesh.surface()
+            lid = self._lids(vertices, faces.long(), mesh.display_face_colors.cpu())
+            self._found[iteration] = lid if bool(lid.any()) and not bool(lid.all()) else None
+        return self._found[iteration]
+
+    def _remove(self, removed: Tensor) -> None:
+        mesh: TriangleMesh = self.model
+        faces = mesh.faces.cpu().long()
+        source, kept, _ = cut_open(faces[~removed], len(mesh.vertices))
+        rows = dict.fromkeys(mesh.vertex_parameters, source)
+        rows |= dict.fromkeys(mesh.face_parameters, (~removed).nonzero()[:, 0])
+        mesh.load_state({**apply_sources(rows, self.adam), "faces": kept})
 
 
 class HalveWhereWrong(Strategy):

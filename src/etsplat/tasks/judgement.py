@@ -164,6 +164,8 @@ def judge(
         fewer = begun == "hull" and (found.holes or 0) > (expected.shape.holes or 0)
         remedy = hull or f"{'--start.shape sphere or ' * fewer}--init-mesh with a mesh that has them"
         poor.append(f"the result has {_counted(found)}, the {expected.of} {_counted(expected.shape)}: try {remedy}")
+    if found.unclear and expected.of == "input mesh":
+        poor.append(f"the result {found.unclear}, the input mesh is a closed surface: try --start.shape sphere")
     if iou is not None and iou < GOOD_IOU:
         remedies = " or ".join(filter(None, (hull, longer))) or "--init-mesh, and check masks and poses"
         poor.append(f"silhouette IoU {iou:.3f} where good results have {GOOD_IOU:.2f} on {views} views: try {remedies}")

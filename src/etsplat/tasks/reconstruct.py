@@ -11,6 +11,7 @@ from etsplat.core.errors import InputError
 from etsplat.core.workers import together
 from etsplat.data.agreement import contradicted, unseen_vertices
 from etsplat.data.dataset import Dataset
+from etsplat.data.lids import lids
 from etsplat.engines.choice import engine
 from etsplat.geometry.parts import Shape, genera, shape_of
 from etsplat.io.mesh_files import MeshFile
@@ -250,7 +251,7 @@ def _judge(
         100 * scores["self_intersections"] / mesh.count,
         found,
         expected,
-        contradicted=contradicted(views, *mesh.surface()) if doubtful else 0.0,
+        contradicted=contradicted(views, *mesh.surface(), mesh.display_face_colors.cpu()) if doubtful else 0.0,
         begun=started.kind,
         preset=config.preset,
         untangled=config.refinement.untanglings > 0,
@@ -298,7 +299,11 @@ def make_trainer(
         views,
         Objective(Photometric(), terms, scale=gamma),
         SubdivideAndUntangle(
-            budgets, untanglings, reach=refinement.reach, unseen=unseen_vertices(views) if near else None
+            budgets,
+            untanglings,
+            reach=refinement.reach,
+            unseen=unseen_vertices(views) if near else None,
+            lids=lids(views) if near else None,
         ),
         schedule=_schedule(config),
         batch=config.batch,

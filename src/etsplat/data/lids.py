@@ -1,0 +1,76 @@
+"""Lids over what is open: faces that photos look through, onto the inner side of the surface behind them.
+
+A start has no openings, so an object that is open below, a bust or a mask, gets a lid there. No silhouette shows it. If
+the photos explain the lid's pixels better by the next surface behind it, which is seen from its inner side, than by the
+lid itself, then nothing is where the lid is. A hollow of a solid has walls of its own, which show something else than
+the inner side of the outer surface, unless all of it looks the same: then neither explains pixels better.
+"""
+
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Bool, Float, Int64
+from torch import Tensor
+
+from etsplat.data.agreement import Photo, differences, first_hits, per_pixel, photos_of
+from etsplat.data.dataset import Dataset
+from etsplat.geometry.topology import MeshTopology, connected
+
+_WRONG = 0.02
+"""Mean difference of colours from which the photos are said to show something else than a face."""
+
+_BETTER, _CLEARLY = 0.9, 0.5
+"""What is behind a lid differs from the photos at most so many times as much as its faces, and the lid as a whole."""
+
+_FEWEST = 16
+"""Faces of a lid that is worth removing."""
+
+Lids = Callable[[Float[Tensor, "V 3"], Int64[Tensor, "F 3"], Float[Tensor, "F 3"]], Bool[Tensor, " F"]]
+"""Of vertices, faces and their colours, on the CPU, which faces are lids."""
+
+
+def lids(dataset: Dataset) -> Lids:
+    """Which faces of a surface the training views look through, as a function of it and its colours.
+
+    Args:
+        dataset: photos with alpha around an object in the unit ball.
+    """
+    photos = photos_of(dataset)
+
+    @torch.no_grad()
+    def found(vertices: Tensor, faces: Tensor, colors: Tensor) -> Tensor:
+        wrong = torch.zeros(len(faces), 3)
+        for photo in photos:
+            wrong += _wrong(photo, vertices, faces, colors)
+        return _patches(wrong, MeshTopology.from_faces(faces, len(vertices)).face_pairs.long())
+
+    return found
+
+
+def _wrong(photo: Photo, vertices: Tensor, faces: Tensor, colors: Tensor) -> Float[Tensor, "F 3"]:
+    """Of each face, the pixels at which a photo sees it, and the sums there of two differences.
+
+    The first is that of the face, the second of the nearest face behind it that turns its back to the camera: on a
+    closed surface that is where the line of sight leaves the matter that it enters here.
+    """
+    corners = vertices[faces]
+    normals = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    turned = ((corners[:, 0] - photo.center) * normals).sum(dim=1) > 0
+    backs = turned.nonzero()[:, 0]
+    front, behind = first_hits(photo, vertices, faces)[1], first_hits(photo, vertices, faces[turned])[1]
+    entered = (front >= 0) & ~turned[front.clamp_min(0)] & (behind >= 0)
+    front = torch.where(entered, front, -1)
+    left = torch.where(entered, backs[behind.clamp_min(0)], -1) if len(backs) else front
+    return torch.cat([differences(photo, front, front, colors), differences(photo, front, left, colors)[:, 1:]], dim=1)
+
+
+def _patches(wrong: Float[Tensor, "F 3"], pairs: Int64[Tensor, "P 2"]) -> Bool[Tensor, " F"]:
+    """The patches of faces that what is behind explains better, and large, and as a whole much better."""
+    own, behind = per_pixel(wrong, pairs).unbind(dim=1)
+    marked = (own > _WRONG) & (behind < _BETTER * own)
+    count, patch = connected(pairs[marked[pairs].all(dim=1)], len(marked))
+    sums = torch.zeros(count, 4).index_add(
+        0, patch, torch.cat([marked.float()[:, None], wrong], dim=1) * marked[:, None]
+    )
+    lid = (sums[:, 0] >= _FEWEST) & (sums[:, 3] < _CLEARLY * sums[:, 2])
+    return marked & lid[patch]

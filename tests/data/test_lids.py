@@ -1,0 +1,60 @@
+"""A bowl of one sheet, open below, and a lid across it: photos look through the lid onto the inner side."""
+
+import pytest
+import torch
+
+from etsplat.data.agreement import differences, first_hits, per_pixel, photos_of
+from etsplat.data.dataset import Dataset
+from etsplat.data.lids import lids
+from etsplat.data.photograph import photograph, shade_faces
+from etsplat.geometry.icosphere import icosphere
+from etsplat.geometry.topology import MeshTopology
+from etsplat.io.mesh_files import MeshFile
+from helpers.painting import mean_colors
+
+BRIM = -0.4
+
+
+def photos_and_lid(*, opened: bool) -> tuple[Dataset, torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Photos of a flat-bottomed ball with or without its bottom; the whole ball, and which faces are its bottom."""
+    vertices, faces = icosphere(4)
+    vertices[:, 1] = vertices[:, 1].clamp_min(BRIM)
+    bottom = (vertices[faces][:, :, 1] <= BRIM).all(dim=1)
+    views = photograph(MeshFile(vertices, faces[~bottom] if opened else faces), 160, 160, supersampling=2)
+    return views, views.normalization.apply(vertices), faces, bottom
+
+
+def test_a_lid_is_found_and_nothing_else() -> None:
+    views, vertices, faces, bottom = photos_and_lid(opened=True)
+    found = lids(views)(vertices, faces, mean_colors(views, vertices, faces))
+    assert found[bottom].float().mean() > 0.75
+    assert found[~bottom].float().mean() < 0.01
+
+
+def test_a_bottom_that_photos_show_is_no_lid_nor_is_what_is_left_of_an_open_surface() -> None:
+    views, vertices, faces, _ = photos_and_lid(opened=False)
+    assert not lids(views)(vertices, faces, mean_colors(views, vertices, faces)).any()
+    views, vertices, faces, bottom = photos_and_lid(opened=True)
+    assert not lids(views)(vertices, faces[~bottom], mean_colors(views, vertices, faces[~bottom])).any()
+
+
+def test_a_lid_of_which_the_inner_side_looks_otherwise_stays() -> None:
+    """A hollow with walls of its own: black inside, white outside."""
+    views, vertices, faces, bottom = photos_and_lid(opened=True)
+    colors = mean_colors(views, vertices, faces)
+    colors[~bottom] = 1 - shade_faces(vertices, faces)[~bottom]
+    assert not lids(views)(vertices, faces, colors)[bottom].any()
+
+
+def test_differences_are_of_the_pixels_that_show_a_face() -> None:
+    views, vertices, faces, _ = photos_and_lid(opened=False)
+    colors = shade_faces(vertices, faces)
+    photo = photos_of(views)[0]
+    hit = first_hits(photo, vertices, faces)[1]
+    sums = differences(photo, hit, hit, colors)
+    seen = hit[(hit >= 0) & (photo.pixels[0, 3] > 0.95)].unique()
+    assert torch.equal(sums[:, 0].nonzero()[:, 0], seen)
+    pairs = MeshTopology.from_faces(faces, len(vertices)).face_pairs.long()
+    assert per_pixel(sums, pairs)[seen, 0].median() < 0.01  # its own colours, but for the brim
+    wrong = per_pixel(differences(photo, hit, hit, (colors - 0.2).clamp_min(0)), pairs)[seen, 0]
+    assert wrong.median() == pytest.approx(0.2, abs=0.02)
