@@ -5,7 +5,7 @@ import torch
 
 from etsplat.data.agreement import differences, first_hits, per_pixel, photos_of
 from etsplat.data.dataset import Dataset
-from etsplat.data.lids import lids
+from etsplat.data.lids import _without_gaps, lids
 from etsplat.data.photograph import photograph, shade_faces
 from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.topology import MeshTopology
@@ -58,3 +58,15 @@ def test_differences_are_of_the_pixels_that_show_a_face() -> None:
     assert per_pixel(sums, pairs)[seen, 0].median() < 0.01  # its own colours, but for the brim
     wrong = per_pixel(differences(photo, hit, hit, (colors - 0.2).clamp_min(0)), pairs)[seen, 0]
     assert wrong.median() == pytest.approx(0.2, abs=0.02)
+
+
+def test_a_gap_in_a_lid_belongs_to_it_and_what_is_beside_it_does_not() -> None:
+    vertices, faces = icosphere(4)
+    middle = vertices[faces].mean(dim=1)
+    cap = middle[:, 1] > 0.5
+    gap = cap & (middle[:, 0].abs() < 0.06)
+    whole = _without_gaps(cap & ~gap, faces)
+    inner = middle[:, 1] > 0.6
+    assert gap[inner].sum() > 20
+    assert whole[inner].all()
+    assert whole[~cap].float().mean() < 0.005  # at the ends of the gap

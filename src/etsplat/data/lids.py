@@ -25,6 +25,9 @@ _BETTER, _CLEARLY = 0.9, 0.5
 _FEWEST = 16
 """Faces of a lid that is worth removing."""
 
+_GAP = 6
+"""Gaps in lids belong to them where they are narrower than a third of a square with as many faces."""
+
 Lids = Callable[[Float[Tensor, "V 3"], Int64[Tensor, "F 3"], Float[Tensor, "F 3"]], Bool[Tensor, " F"]]
 """Of vertices, faces and their colours, on the CPU, which faces are lids."""
 
@@ -38,13 +41,14 @@ def lids(dataset: Dataset) -> Lids:
     photos = photos_of(dataset)
 
     @torch.no_grad()
-    def found(vertices: Tensor, faces: Tensor, colors: Tensor) -> Tensor:
+    def marked(vertices: Tensor, faces: Tensor, colors: Tensor) -> Tensor:
         wrong = torch.zeros(len(faces), 3)
         for photo in photos:
             wrong += _wrong(photo, vertices, faces, colors)
-        return _patches(wrong, MeshTopology.from_faces(faces, len(vertices)).face_pairs.long())
+        found = _patches(wrong, MeshTopology.from_faces(faces, len(vertices)).face_pairs.long())
+        return _without_gaps(found, faces) if bool(found.any()) else found
 
-    return found
+    return marked
 
 
 def _wrong(photo: Photo, vertices: Tensor, faces: Tensor, colors: Tensor) -> Float[Tensor, "F 3"]:
@@ -74,3 +78,22 @@ def _patches(wrong: Float[Tensor, "F 3"], pairs: Int64[Tensor, "P 2"]) -> Bool[T
     )
     lid = (sums[:, 0] >= _FEWEST) & (sums[:, 3] < _CLEARLY * sums[:, 2])
     return marked & lid[patch]
+
+
+def _without_gaps(lid: Bool[Tensor, " F"], faces: Int64[Tensor, "F 3"]) -> Bool[Tensor, " F"]:
+    """A lid with the gaps in it: what is left when it has grown, and what is around that as much."""
+    rings = max(1, round(float(lid.sum()) ** 0.5 / _GAP))
+    around = lid
+    for _ in range(rings):
+        around = _grown(around, faces)
+    around = ~around
+    for _ in range(rings):
+        around = _grown(around, faces)
+    return lid | ~around
+
+
+def _grown(some: Bool[Tensor, " F"], faces: Int64[Tensor, "F 3"]) -> Bool[Tensor, " F"]:
+    """Some faces, and all that have a vertex of theirs."""
+    corner = torch.zeros(int(faces.max()) + 1, dtype=torch.bool)
+    corner[faces[some]] = True
+    return corner[faces].any(dim=1)
