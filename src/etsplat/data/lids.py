@@ -14,6 +14,7 @@ from torch import Tensor
 
 from etsplat.data.agreement import Photo, differences, first_hits, per_pixel, photos_of
 from etsplat.data.dataset import Dataset
+from etsplat.geometry.measures import face_areas
 from etsplat.geometry.topology import MeshTopology, connected
 
 _WRONG = 0.02
@@ -22,8 +23,8 @@ _WRONG = 0.02
 _BETTER, _CLEARLY = 0.9, 0.5
 """What is behind a lid differs from the photos at most so many times as much as its faces, and the lid as a whole."""
 
-_FEWEST = 16
-"""Faces of a lid that is worth removing."""
+_LEAST = 0.005
+"""Share of the surface that a lid has at least: for less a mesh is better closed."""
 
 _GAP = 6
 """Gaps in lids belong to them where they are narrower than a third of a square with as many faces."""
@@ -45,7 +46,8 @@ def lids(dataset: Dataset) -> Lids:
         wrong = torch.zeros(len(faces), 3)
         for photo in photos:
             wrong += _wrong(photo, vertices, faces, colors)
-        found = _patches(wrong, MeshTopology.from_faces(faces, len(vertices)).face_pairs.long())
+        pairs = MeshTopology.from_faces(faces, len(vertices)).face_pairs.long()
+        found = _patches(wrong, face_areas(vertices, faces), pairs)
         return _without_gaps(found, faces) if bool(found.any()) else found
 
     return marked
@@ -68,15 +70,13 @@ def _wrong(photo: Photo, vertices: Tensor, faces: Tensor, colors: Tensor) -> Flo
     return torch.cat([differences(photo, front, front, colors), differences(photo, front, left, colors)[:, 1:]], dim=1)
 
 
-def _patches(wrong: Float[Tensor, "F 3"], pairs: Int64[Tensor, "P 2"]) -> Bool[Tensor, " F"]:
+def _patches(wrong: Float[Tensor, "F 3"], area: Float[Tensor, " F"], pairs: Int64[Tensor, "P 2"]) -> Bool[Tensor, " F"]:
     """The patches of faces that what is behind explains better, and large, and as a whole much better."""
     own, behind = per_pixel(wrong, pairs).unbind(dim=1)
     marked = (own > _WRONG) & (behind < _BETTER * own)
     count, patch = connected(pairs[marked[pairs].all(dim=1)], len(marked))
-    sums = torch.zeros(count, 4).index_add(
-        0, patch, torch.cat([marked.float()[:, None], wrong], dim=1) * marked[:, None]
-    )
-    lid = (sums[:, 0] >= _FEWEST) & (sums[:, 3] < _CLEARLY * sums[:, 2])
+    sums = torch.zeros(count, 4).index_add(0, patch, torch.cat([area[:, None], wrong], dim=1) * marked[:, None])
+    lid = (sums[:, 0] > _LEAST * area.sum()) & (sums[:, 3] < _CLEARLY * sums[:, 2])
     return marked & lid[patch]
 
 
