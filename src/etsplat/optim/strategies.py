@@ -114,16 +114,14 @@ class SubdivideAndUntangle(Strategy):
             budgets: by iteration, how many faces there may be after it (`optim.schedules.face_budgets`).
             untangle_after: iterations after which faces that cut through others are put right.
             reach: folds in which a vertex would have to move farther stay (`geometry.untangle`). If it is more than a
-                half, and that spoils the pictures, half of it is tried, down to a half.
+                half, and that spoils the pictures, a half is tried.
             unseen: of vertices and faces, on the CPU, which vertices no picture shows. Before each untangling they
                 become a film (`geometry.films`): regularizers alone leave slits in what nobody sees, and deepen them.
             lids: of vertices, faces and their colours, on the CPU, which faces pictures look through. They are removed
                 before each untangling but the last, or stay where that spoils the pictures.
         """
         self._budgets, self._untangle_after, self._unseen = dict(budgets), set(untangle_after), unseen
-        self._reaches = [reach]
-        while self._reaches[-1] > _SHORT:
-            self._reaches.append(max(self._reaches[-1] / 2, _SHORT))
+        self._reaches = (reach, _SHORT) if reach > _SHORT else (reach,)
         self._lids = lids
         self._found: dict[int, Tensor | None] = {}
 

@@ -149,7 +149,7 @@ class Refinement:
     """How often faces that cut through others are pushed apart, from the last subdivision to the last step."""
     reach: Annotated[float, Range(0), _UNTANGLED] = 0.5
     """Folds stay in which a vertex would have to move farther than so many lengths of its edges.
-    They may hold up the shape. If it is more than a half, and that spoils the photos, half of it is (`guard`)."""
+    They may hold up the shape. If it is more than a half, and that spoils the photos, a half is tried (`guard`)."""
     guard: Annotated[float, Range(0)] = 0.02
     """A subdivision or untangling is undone where 100 steps later training photos are explained worse;
     that is where their loss, at a small size, is higher by more than this part; 0 lets all of them stay."""
