@@ -6,7 +6,7 @@ from etsplat.geometry.measures import face_areas
 from etsplat.geometry.subdivision import longest_edge_plan
 from etsplat.geometry.topology import MeshTopology
 from etsplat.ops.adam import Adam
-from etsplat.optim.edit import RowPlan, apply_rows, apply_subdivision
+from etsplat.optim.edit import RowPlan, apply_rows, apply_sources, apply_subdivision
 
 RATES = {"vertices": 1e-2, "colors": 1e-1, "opacities": 1e-1, "sigma": 1e-3}
 
@@ -189,3 +189,22 @@ def test_gradients_of_what_an_edit_replaces_are_let_go(rng):
     assert old.grad is None
     assert torch.equal(adam.first_moments["x"], first[kept])
     assert torch.equal(adam.second_moments["x"], second[kept])
+
+
+def test_copies_of_rows_have_their_moments_and_bad_ones_change_nothing(problem):
+    adam, _ = problem
+    before, rows = snapshot(adam), torch.tensor([5, 2, 2])
+    for wrong in ({"colors": rows, "color": rows}, {"colors": rows, "sigma": rows}, {"colors": torch.tensor([10_000])}):
+        with pytest.raises((ValueError, IndexError)):
+            apply_sources(wrong, adam)
+        assert all(
+            torch.equal(*pair)
+            for name, tables in snapshot(adam).items()
+            for pair in zip(tables, before[name], strict=True)
+        )
+    found = apply_sources({"colors": rows}, adam)
+    assert adam.parameters["colors"] is found["colors"]
+    assert found["colors"].requires_grad
+    after = snapshot(adam)
+    assert all(torch.equal(new, old[rows]) for new, old in zip(after["colors"], before["colors"], strict=True))
+    assert all(torch.equal(new, old) for new, old in zip(after["vertices"], before["vertices"], strict=True))

@@ -205,6 +205,24 @@ def test_an_edit_that_changes_nothing_is_not_judged(views: Dataset) -> None:
     assert run.guard.held is None
 
 
+def test_lids_that_pictures_need_come_back_and_the_untangling_without_them_is_made(views: Dataset) -> None:
+    """With the bits of a run that looked for none."""
+
+    def nearly_all(vertices: torch.Tensor, faces: torch.Tensor, colors: torch.Tensor) -> torch.Tensor:
+        assert colors.shape == faces.shape
+        return vertices[faces][..., 1].amin(dim=1) > -0.7
+
+    runs = []
+    for lids in (nearly_all, None):
+        run = trainer(views)
+        run.strategy = SubdivideAndUntangle({10: 400, 40: 500}, [20, 50], lids=lids)
+        run.strategy.start(run.model, run.adam, 8, torch.Generator())
+        run.fit(LENGTH)
+        runs.append(run)
+    assert [run.guard.undone for run in runs] == [[20], []]
+    assert_equal(*runs)
+
+
 def test_a_guard_that_tolerates_more_lets_it_stay(views: Dataset) -> None:
     run = trainer(views, 20)
     run.guard = Guard(tolerance=1e9, steps=8)

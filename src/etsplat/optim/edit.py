@@ -157,12 +157,14 @@ def apply_sources(sources: Mapping[str, Int[Tensor, " M"]], adam: Adam) -> dict[
         The new parameters, leaf tensors with the old requires_grad, by name.
 
     Raises:
-        ValueError: a name is unknown, or a row is out of range. Nothing has been changed then.
+        ValueError: a name is unknown or has no rows, or a row is out of range. Nothing has been changed then.
     """
     for name, source in sources.items():
         if name not in adam.parameters:
             raise ValueError(f"sources must name parameters, got {name!r}")
         check_memory(name, adam.parameters[name])
+        if adam.parameters[name].ndim == 0:
+            raise ValueError(f"sources must name parameters with rows, got {name!r}")
         check_indices(f"sources of {name}", source, len(adam.parameters[name]))
 
     def pick(rows: Tensor) -> Callable[[Tensor], Tensor]:
