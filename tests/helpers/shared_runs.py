@@ -30,12 +30,12 @@ from etsplat.optim.drive import digest_of
 from etsplat.optim.exposure import Exposure
 from etsplat.optim.guard import Guard
 from etsplat.optim.loop import RefineEvent
-from etsplat.optim.objective import Objective
+from etsplat.optim.objective import Custom, Drawing, Objective, Term
 from etsplat.optim.schedules import Schedule, face_budgets
 from etsplat.optim.strategies import DensifyAndPrune, SubdivideAndUntangle
 from etsplat.optim.terms.mesh import EdgeLength, Laplacian, SmoothNormals, Softness
 from etsplat.optim.terms.photometric import Photometric
-from etsplat.optim.terms.soup import DepthNormals, Opacity, Size
+from etsplat.optim.terms.soup import DepthNormals, Harmonics, Opacity, Size
 from etsplat.optim.trainer import Trainer
 
 ITERATIONS = 14
@@ -78,14 +78,19 @@ def with_nan(dataset: Dataset, view: int) -> Dataset:
 
 def trainer_of(kind: str, batch: int) -> Trainer[Any]:
     """Of a soup that grows and is pruned, or a mesh that is subdivided, with a guard."""
-    if kind == "soup":
+    if kind in ("soup", "normals", "inseparable"):
         data, rng = a_scene(), torch.Generator().manual_seed(1)
         assert data.points is not None
         assert data.point_colors is not None
         soup = start_soup(
-            StartPoints(data.points, data.point_colors), rng, scale=2.0, opacity=0.4, sigma=0.8, sh_degree=1
+            StartPoints(data.points, data.point_colors), rng, scale=2.0, opacity=0.4, sigma=0.8, sh_degree=2
         )
-        objective = Objective(Photometric(0.2), [Opacity(0.005), Size(1e-6), DepthNormals(1e-3)], depth_of="centroid")
+        terms: list[Term] = [Opacity(0.005), Harmonics(0.1), Size(1e-6)]
+        if kind == "normals":
+            terms.append(DepthNormals(1e-3))
+        if kind == "inseparable":
+            terms += [Custom(_near_what_is_seen, 1e-3, outputs=("depth",)), Custom(_small, 1e-3)]
+        objective = Objective(Photometric(0.2), terms, depth_of="centroid")
         strategy = DensifyAndPrune(begin=3, every=4, max_triangles=400)
         exposure = Exposure(6, needed=-math.inf)
         return Trainer(soup, data, objective, strategy, batch=batch, exposure=exposure)
@@ -103,6 +108,17 @@ def trainer_of(kind: str, batch: int) -> Trainer[Any]:
     )
 
 
+def _near_what_is_seen(drawing: Drawing) -> torch.Tensor:
+    """Of parameters and pictures at once."""
+    assert drawing.rendering.depth is not None
+    return drawing.rendering.depth.mean() * drawing.model.vertices.square().mean()
+
+
+def _small(drawing: Drawing) -> torch.Tensor:
+    """Of corners and of colours, by nobody's word of parameters alone."""
+    return drawing.model.vertices.square().mean() + drawing.model.sh_dc.square().mean()
+
+
 def fit(kind: str, batch: int, folder: Path | None = None, until: int = ITERATIONS) -> dict[str, Any]:
     """A run, or what is left of it: the state at its end, and what it said of edits."""
     trainer, edits = trainer_of(kind, batch), []
@@ -115,6 +131,34 @@ def fit(kind: str, batch: int, folder: Path | None = None, until: int = ITERATIO
     trainer.fit(until, callbacks=[tell], log_every=5, checkpoint_every=5, **options)
     sent = dict(workers().sent)
     return {"state": digest_of(trainer.state()), "count": trainer.count, "edits": edits, "sent": sent}
+
+
+def gradients_of_steps(kind: str, batch: int, steps: int) -> list[dict[str, bytes]]:
+    """The bits of all gradients that Adam gets, and the loss, step by step."""
+    trainer, found = trainer_of(kind, batch), list[dict[str, bytes]]()
+    make_step = trainer.adam.step
+
+    def step() -> None:
+        found.append({name: t.grad.contiguous().numpy().tobytes() for name, t in trainer.adam.parameters.items()})
+        make_step()
+
+    trainer.adam.step = step
+    for iteration in range(1, steps + 1):
+        loss = trainer._stepper.advance(iteration, iteration, ())
+        found[-1]["loss"] = repr(loss).encode()
+    return found
+
+
+class TwoInOne(Workers):
+    """The first of two workers, who makes the part of the second as well."""
+
+    def __init__(self) -> None:
+        super().__init__(0, 2)
+        self.messages: list[torch.Tensor] = []
+
+    def hand_round(self, own: Any, owners: Any) -> Any:
+        self.messages += [own[number] for number in range(len(owners))]
+        return iter(self.messages[-len(owners) :])
 
 
 @cache

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from etsplat.core.errors import InputError
+from etsplat.optim import shared_steps, stepper
 from etsplat.optim.loop import DivergedError
 from etsplat.optim.shared_steps import owners, pack, unpack
 from helpers import shared_runs
@@ -22,8 +23,8 @@ def crew(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Crew]:
         yield crew
 
 
-@pytest.mark.parametrize(("batch", "counts"), [(1, (2,)), (4, (1, 2, 3)), (5, (2, 3))])
-@pytest.mark.parametrize("kind", ["soup", "mesh"])
+@pytest.mark.parametrize(("batch", "counts"), [(1, (2,)), (4, (1, 2, 3, 4)), (5, (2, 3, 4))])
+@pytest.mark.parametrize("kind", ["soup", "normals", "inseparable", "mesh"])
 def test_any_number_of_workers_gives_the_same_bits(
     crew: Crew, kind: str, batch: int, counts: tuple[int, ...], tmp_path: Path
 ) -> None:
@@ -36,6 +37,28 @@ def test_any_number_of_workers_gives_the_same_bits(
         assert digest_of_checkpoint(tmp_path / f"run_{count}") == alone["checkpoint"]
         messages = sum(run["sent"]["messages"] for run in runs)
         assert messages == (0 if count == 1 else shared_runs.ITERATIONS * batch)
+
+
+@pytest.mark.parametrize("batch", [1, 3])
+@pytest.mark.parametrize("kind", ["soup", "normals", "inseparable", "mesh"])
+def test_what_travels_adds_up_to_the_gradients_of_one_process(
+    kind: str, batch: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """To the bit, step by step, whatever the objective looks at; what all can compute for themselves is not sent."""
+    alone = shared_runs.gradients_of_steps(kind, batch, 4)
+    group = shared_runs.TwoInOne()
+    monkeypatch.setattr(stepper, "workers", lambda: group)
+    for module in (stepper, shared_steps):
+        monkeypatch.setattr(module, "owners", lambda views, _: [0] * len(views))
+    assert shared_runs.gradients_of_steps(kind, batch, 4) == alone
+    sent = [set(unpack(message)) for message in group.messages]
+    if kind == "mesh":
+        assert not any("colors" in names for names in sent)
+        return
+    assert all({"colors", "center", "degree"} <= names for names in sent)
+    of_parameters = [{"gradient.0.sh_rest", "gradient.0.sh_dc"} & names for names in sent]
+    last = {"soup": set(), "normals": {"gradient.0.sh_rest"}}.get(kind, {"gradient.0.sh_rest", "gradient.0.sh_dc"})
+    assert of_parameters == 4 * [*(batch - 1) * [set()], last]
 
 
 @pytest.mark.parametrize("kind", ["soup", "mesh"])

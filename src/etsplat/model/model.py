@@ -52,11 +52,15 @@ class Model(Protocol):
         appearance: how they are drawn, in training and ever after.
         RATES: Adam's learning rate of each parameter where nobody says otherwise, for a model of about unit size.
         OPAQUE: what its picture is called where a mesh viewer draws it.
+        COLORED: of a model that calls `soup_colors` once for a view: the parameters that it hands over, in their order.
+            Such a model uses each of its parameters but once otherwise for the colours of a view: workers rely on it.
+            None for any other.
     """
 
     appearance: Any
     RATES: ClassVar[Mapping[str, float]]
     OPAQUE: ClassVar[str]
+    COLORED: ClassVar[tuple[str, str, str] | None] = None
 
     @property
     def count(self) -> int:

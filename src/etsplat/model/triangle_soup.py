@@ -87,6 +87,7 @@ class TriangleSoup(Model):
         "sh_rest": 0.0005,
     }
     OPAQUE: ClassVar[str] = "opaque"
+    COLORED: ClassVar[tuple[str, str, str] | None] = ("vertices", "sh_dc", "sh_rest")
 
     vertices: Float[Tensor, "N 3 3"]
     opacity_logits: Float[Tensor, " N"]

@@ -1,5 +1,9 @@
 """Colours of a triangle soup as cameras see it: spherical harmonics along the line of sight to each centroid."""
 
+from contextvars import ContextVar, Token
+from typing import Any
+
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -43,4 +47,73 @@ def soup_colors(
         check_like(name, tensor, "vertices", vertices)
     if sh_rest.shape[1] < (degree + 1) ** 2 - 1:
         raise ValueError(f"sh_rest must have {(degree + 1) ** 2 - 1} bases for degree {degree}, got {sh_rest.shape[1]}")
-    return engine_for(vertices).soup_colors(vertices, sh_dc, sh_rest[:, :MAX_REST], centers.detach(), degree)
+    colors = engine_for(vertices).soup_colors(vertices, sh_dc, sh_rest[:, :MAX_REST], centers.detach(), degree)
+    ending = _ending.get()
+    return colors if ending is None else ending.taken(colors, (vertices, sh_dc, sh_rest), centers, degree)
+
+
+class EndAtColors:
+    """Within the block gradients end at the colours that `soup_colors` makes of these tensors, once.
+
+    So whoever gets the gradient of a view's colours, three numbers for each triangle, can carry it on to the
+    coefficients, which are up to 48, in another place (`colors_backward`).
+
+    Attributes:
+        colors: (B, N, 3) leaf, which gets the gradient; None before it was made.
+        centers: (B, 3) positions of the cameras.
+        degree: of the harmonics.
+    """
+
+    def __init__(self, vertices: Tensor, sh_dc: Tensor, sh_rest: Tensor) -> None:
+        """Takes the tensors, which are recognised by being the same objects."""
+        self._of = (vertices, sh_dc, sh_rest)
+        self.colors: Tensor | None = None
+        self.centers, self.degree = vertices.new_zeros((0, 3)), 0
+
+    def __enter__(self) -> "EndAtColors":
+        self._token: Token[EndAtColors | None] = _ending.set(self)
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        _ending.reset(self._token)
+
+    def taken(self, colors: Tensor, of: tuple[Tensor, ...], centers: Tensor, degree: int) -> Tensor:
+        """A leaf in the place of colours of the tensors; others are given back.
+
+        Raises:
+            RuntimeError: It is the second time.
+        """
+        if not colors.requires_grad or any(one is not other for one, other in zip(of, self._of, strict=True)):
+            return colors
+        if self.colors is not None:
+            raise RuntimeError("colours of one view were made twice")
+        self.colors, self.centers, self.degree = colors.detach().requires_grad_(), centers.detach(), degree
+        return self.colors
+
+
+_ending: ContextVar[EndAtColors | None] = ContextVar("etsplat.ending", default=None)
+
+
+def colors_backward(
+    grad_colors: Float[Tensor, "B N 3"],
+    vertices: Float[Tensor, "N 3 3"],
+    sh_dc: Float[Tensor, "N 1 3"],
+    sh_rest: Float[Tensor, "N R 3"],
+    centers: Float[Tensor, "B 3"],
+    degree: int,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The gradients by the first three arguments of `soup_colors`, from that by its result: to the bit autograd's.
+
+    Args:
+        grad_colors: (B, N, 3).
+        vertices: As there, and so are the others.
+        sh_dc: .
+        sh_rest: .
+        centers: .
+        degree: .
+    """
+    with torch.enable_grad():
+        leaves = tuple(tensor.detach().requires_grad_() for tensor in (vertices, sh_dc, sh_rest))
+        colors = soup_colors(*leaves, centers, degree)
+    by_vertices, by_dc, by_rest = torch.autograd.grad(colors, leaves, grad_colors)
+    return by_vertices, by_dc, by_rest

@@ -11,6 +11,7 @@ from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal
 
+import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
@@ -49,6 +50,17 @@ class Drawing:
     depth: Float[Tensor, "1 H W"] | None = None
 
 
+@dataclass(frozen=True)
+class OfParameters:
+    """What terms look at that depend on the parameters alone.
+
+    Attributes:
+        model: as it is now.
+    """
+
+    model: Any
+
+
 class Term(ABC):
     """One summand: weight * value ^ power. A term of one's own overrides `__call__`, or is made by `Custom`.
 
@@ -58,6 +70,8 @@ class Term(ABC):
             captures the steps anew, so what changes at every step belongs into the objective's `scale`.
         outputs: what it needs of `etsplat.rasterize`; nothing for a term that depends on the parameters alone.
         power: of the value.
+        looks_at: what it looks at, if that is parameters alone, or colours of pictures alone: workers of a run then
+            need not send each other what they can compute for themselves. None for more, or where nobody says.
 
     Example:
         >>> class Centred(etsplat.Term):
@@ -70,6 +84,7 @@ class Term(ABC):
     name: ClassVar[str | None] = None
     outputs: tuple[str, ...] = ()
     power: Literal[1, -1, -2] = 1
+    looks_at: ClassVar[Literal["parameters", "colors"] | None] = None
 
     def __init__(self, weight: Scheduled = 1.0) -> None:
         self.weight = weight
@@ -139,6 +154,7 @@ class Objective:
         *,
         views: int = 1,
         whole: bool = True,
+        apart: bool = False,
     ) -> Float[Tensor, ""]:
         """The part of a step's objective that belongs to one of its views.
 
@@ -148,15 +164,41 @@ class Objective:
             scale: of them all; at the number 0 they are not computed.
             views: how many the step has.
             whole: whether terms that depend on the parameters alone belong to this view.
+            apart: whether those count with their values alone, and `of_parameters` has their gradients.
         """
         first = self.photometric(drawing)
         if views > 1:
             first = first / views
         if not isinstance(scale, Tensor) and scale == 0.0:
             return first
-        summands = [
-            Summand(weight / views if term.outputs else weight, term(drawing), term.power)
-            for term, weight in zip(self.terms, weights, strict=True)
-            if weight and (whole or term.outputs)
-        ]
+        summands = []
+        for term, weight in zip(self.terms, weights, strict=True):
+            if weight and (whole or term.outputs):
+                with torch.set_grad_enabled(torch.is_grad_enabled() and not (apart and not term.outputs)):
+                    value = term(drawing)
+                summands.append(Summand(weight / views if term.outputs else weight, value, term.power))
         return weighted_sum(first, summands, scale)
+
+    def separable(self, weights: Sequence[float]) -> bool:
+        """Whether terms that count look at parameters alone, and the photometric one at colours alone.
+
+        Then a view's picture gives each parameter one gradient, to which that of the others can be added in any place.
+        """
+        counting = [term for term, weight in zip(self.terms, weights, strict=True) if weight]
+        return self.photometric.looks_at == "colors" and all(term.looks_at == "parameters" for term in counting)
+
+    def of_parameters(self, model: Any, weights: Sequence[float], scale: float) -> Float[Tensor, ""] | None:
+        """The part of a step's objective that depends on the parameters alone; None where nothing does.
+
+        Args:
+            model: as it is now.
+            weights: of the terms, as of `weights`.
+            scale: of them all.
+        """
+        counting = zip(self.terms, weights, strict=True)
+        alone = [(term, weight) for term, weight in counting if weight and not term.outputs]
+        if not alone or scale == 0.0:
+            return None
+        drawing: Any = OfParameters(model)
+        summands = [Summand(weight, term(drawing), term.power) for term, weight in alone]
+        return weighted_sum(torch.zeros_like(summands[0].value), summands, scale)

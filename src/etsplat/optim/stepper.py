@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import takewhile
 from typing import Any, Generic, TypeVar
 
@@ -22,7 +23,7 @@ from etsplat.optim.depth_trust import DepthTrust
 from etsplat.optim.exposure import Exposure
 from etsplat.optim.objective import Drawing, Objective
 from etsplat.optim.schedules import Schedule, at
-from etsplat.optim.shared_steps import owners, shared_gradients
+from etsplat.optim.shared_steps import Apart, owners, shared_gradients
 from etsplat.optim.step_queue import MAX_STEPS, QueuedStep, RowLayout, StepQueue
 from etsplat.optim.strategies import Strategy
 from etsplat.optim.view_sampler import ViewSampler
@@ -171,10 +172,15 @@ class Stepper(Generic[M]):
         def gradients(places: range) -> tuple[Tensor, list[Rasterization]]:
             some = (chosen[place] for place in places)
             views = ((self._loader.view(c.view), c.background.to(self._device)) for c in some)
-            return self._gradients(views, weights, scale, moving=moving, first=places.start)
+            separate = apart is not None and apart.of_parameters is not None
+            return self._gradients(views, weights, scale, moving=moving, first=places.start, separate=separate)
 
+        group, apart = workers(), None
+        if group.count > 1 and self._model.COLORED is not None:
+            separable = self._objective.separable(weights)
+            apart = Apart(self._model.COLORED, partial(self._of_parameters, weights, scale) if separable else None)
         indices, optimizers = [c.view for c in chosen], [self.adam, self._exposure.adam]
-        loss, seen = shared_gradients(workers(), indices, gradients, optimizers, self._strategy.outputs)
+        loss, seen = shared_gradients(group, indices, gradients, optimizers, self._strategy.outputs, apart)
         self.adam.learning_rates = self._rates(iteration)
         if self._update is None:
             self.adam.step()
@@ -245,8 +251,12 @@ class Stepper(Generic[M]):
         *,
         moving: bool,
         first: int = 0,
+        separate: bool = False,
     ) -> tuple[Tensor, list[Rasterization]]:
-        """Those of the objective, one view after the other, from place `first` on; its value, and what was seen."""
+        """Those of the objective, one view after the other, from place `first` on; its value, and what was seen.
+
+        Where `separate`, terms that depend on the parameters alone have their gradients in `_of_parameters`.
+        """
         outputs = (*self._objective.outputs(weights), *self._strategy.outputs)
         losses, seen, exposure = [], [], self._exposure
         for number, (view, background) in enumerate(views, start=first + 1):
@@ -259,7 +269,7 @@ class Stepper(Generic[M]):
                 self._model, view.camera, view.photo, view.mask, background, shot, index=view.index, depth=view.depth
             )
             whole = number == self._batch
-            loss = self._objective(drawing, weights, scale, views=self._batch, whole=whole)
+            loss = self._objective(drawing, weights, scale, views=self._batch, whole=whole, apart=separate)
             if exposure.learned:
                 loss = loss + exposure.penalty(view) / self._batch
             if not losses:
@@ -270,6 +280,11 @@ class Stepper(Generic[M]):
             losses.append(loss.detach())
             seen.append(rendering)
         return sum(losses[1:], start=losses[0]), seen
+
+    def _of_parameters(self, weights: Sequence[float], scale: float) -> None:
+        value = self._objective.of_parameters(self._model, weights, scale)
+        if value is not None:
+            value.backward()
 
     def _choose(self) -> list[_Chosen]:
         """Views and backgrounds of the next step; photos that come after them are decoded ahead."""

@@ -23,6 +23,7 @@ class Photometric(Term):
     """
 
     outputs = ("color",)
+    looks_at = "colors"
 
     def __init__(self, dssim: float = 0.0, pixel: Literal["l1", "l2", "rms"] = "l1") -> None:
         """Takes its settings.

@@ -20,6 +20,7 @@ class Opacity(Term):
     """The mean opacity."""
 
     name = "opacity"
+    looks_at = "parameters"
 
     def __init__(self, weight: Scheduled = 1.0, spared: Spared | None = None) -> None:
         """Takes its weight, and which triangles count as transparent, by their corners; None for none."""
@@ -38,6 +39,7 @@ class Size(Term):
     """The reciprocal of the mean area."""
 
     name = "size"
+    looks_at = "parameters"
     power = -1
 
     def __call__(self, drawing: Drawing) -> Float[Tensor, ""]:
@@ -53,6 +55,7 @@ class Harmonics(Term):
     """
 
     name = "harmonics"
+    looks_at = "parameters"
 
     def __call__(self, drawing: Drawing) -> Float[Tensor, ""]:
         """Of the soup."""
