@@ -3,39 +3,86 @@
 python -m benchmarks.workers --triangles 50000 --width 640
 python -m benchmarks.workers ../shared/data/scenes/kitchen25 --triangles 100000 --width 800 --cores 16
 
+    python -m benchmarks.workers --check --triangles 20000 --width 320
+
 Bytes are counted. Compute is measured on one core, in seconds of this process, which other processes disturb less than
 those of the clock. The rest is a model, not a measurement:
 
-    step = share * view / cores + B * (unpack + add) + pack * share + Adam + (B - share) * bytes / network
+    step = share (view / cores + pack) + B (unpack + add + colors / cores) + parameters + Adam
+         + (B - share) bytes / network + (B + 2) hops latency
 
-with B views and share = ceil(B / workers): drawing has as many cores as a worker has, all else one.
+with B views, share = ceil(B / workers) and hops = ceil(log2(workers)): drawing, and what leads from colours to
+coefficients, have as many cores as a worker has, all else one. A step has a broadcast for each view and two gatherings
+of small numbers. One process neither packs nor unpacks.
+
+With --check two views a step are made by one process and by two, and the processor's time of a step, and the bytes,
+are compared with what the model says of them.
 """
 
 import argparse
 import math
+import multiprocessing
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from benchmarks.machine import description
-from etsplat.core.rasterization import Rasterization
-from etsplat.core.workers import Workers
+from etsplat.core.workers import Workers, together
+from etsplat.core.workers import workers as present
 from etsplat.data.demo_scene import demo_scene
 from etsplat.data.load import load_dataset
 from etsplat.engines.threads import one_torch_thread, set_num_threads
+from etsplat.ops.soup_colors import EndAtColors, colors_backward
 from etsplat.optim import shared_steps
 from etsplat.optim.trainer import Trainer
 from etsplat.tasks.soup_trainer import start_trainer
 from etsplat.tasks.train_config import TrainConfig
 
+STEPS = 4
+"""Of a check."""
+
 WORKERS = (1, 2, 4, 8, 16, 32, 64)
 NETWORKS = (1, 10, 100)
 """Gbit/s."""
+
+LATENCY = 50e-6
+"""Seconds of a hop of a message, a stated number as the networks' are."""
+
+
+@dataclass(frozen=True)
+class Traffic:
+    """What a step of several workers takes of a network.
+
+    Attributes:
+        broadcasts: of a view's message each, by its worker to all others.
+        gatherings: of a few numbers of all: how long messages are, and whether one worker was interrupted.
+        received: messages that the worker receives which draws most.
+        hops: of a broadcast, from one worker to others and from these on.
+    """
+
+    broadcasts: int
+    gatherings: int
+    received: int
+    hops: int
+
+    @staticmethod
+    def of(views: int, workers: int) -> "Traffic":
+        """Of so many views; nothing of one worker."""
+        if workers == 1:
+            return Traffic(0, 0, 0, 0)
+        return Traffic(views, 2, views - math.ceil(views / workers), math.ceil(math.log2(workers)))
+
+    @property
+    def calls(self) -> int:
+        """All of them."""
+        return self.broadcasts + self.gatherings
 
 
 def seconds(action: Callable[[], object], repeats: int) -> float:
@@ -60,53 +107,135 @@ class Recorder(Workers):
 
 
 def message_of(trainer: Trainer[Any], iteration: int) -> Tensor:
-    """What a view of a step sends: that of a step of two views, in which only the first is drawn.
-
-    Terms of parameters alone, which travel with the last view, are not in it.
-    """
-    recorder, honest = Recorder(), shared_steps.owners
-    stepper = trainer._stepper
-    chosen = stepper._choose()[0]
-    view, background = stepper._loader.view(chosen.view), chosen.background
+    """What a view of a step sends: that of a step of two views, in which only the first is drawn."""
+    recorder, honest, stepper = Recorder(), shared_steps.owners, trainer._stepper
     weights = stepper._objective.weights(iteration)
-
-    def gradients(places: range) -> tuple[Tensor, list[Rasterization]]:
-        return stepper._gradients([(view, background)], weights, 1.0, first=places.start)
-
+    apart = shared_steps.Apart(trainer.model.COLORED, partial(stepper._of_parameters, weights, 1.0))
     shared_steps.owners = lambda views, count: [0, 1]
     try:
-        shared_steps.shared_gradients(recorder, [0, 1], gradients, [trainer.adam], trainer.strategy.outputs)
+        draw = drawing(trainer, iteration)
+        shared_steps.shared_gradients(recorder, [0, 1], draw, [trainer.adam], trainer.strategy.outputs, apart)
     finally:
         shared_steps.owners = honest
     return recorder.message
 
 
+def drawing(trainer: Trainer[Any], iteration: int) -> shared_steps.Gradients:
+    """Of the next view."""
+    stepper = trainer._stepper
+    chosen, weights = stepper._choose()[0], stepper._objective.weights(iteration)
+    views = [(stepper._loader.view(chosen.view), chosen.background)]
+    return lambda places: stepper._gradients(views, weights, 1.0, moving=False, first=places.start, separate=True)
+
+
 def measure(trainer: Trainer[Any], config: TrainConfig) -> dict[str, float]:
-    """Seconds of a core and bytes, each of one view; Adam's of a step."""
-    iteration = config.iterations
-    trainer._stepper.arrive(iteration)
+    """Seconds of a core and bytes, each of one view; those of parameters and Adam of a step."""
+    iteration, model, stepper = config.iterations, trainer.model, trainer._stepper
+    stepper.arrive(iteration)
     messages = [message_of(trainer, iteration) for _ in range(4)]
     tensors = shared_steps.unpack(messages[0])
     gradients = [tensor for name, tensor in tensors.items() if name.startswith("gradient.")]
-    sums = [gradient.clone() for gradient in gradients]
-    return {
-        "view": seconds(lambda: message_of(trainer, iteration), 4),
+    sums, colored = [gradient.clone() for gradient in gradients], [getattr(model, name) for name in model.COLORED]
+    by_colors = partial(colors_backward, tensors["colors"][None], *colored, tensors["center"], int(tensors["degree"]))
+    more = [torch.zeros_like(tensor) for tensor in by_colors()]
+    sums, gradients = [*sums, *more], [*gradients, *by_colors()]
+    draw = drawing(trainer, iteration)
+
+    def view() -> None:
+        with EndAtColors(*colored):
+            draw(range(1))
+
+    cost = {
+        "view": seconds(view, 4),
+        "colors": seconds(by_colors, 5),
         "pack": seconds(lambda: shared_steps.pack(tensors), 5),
         "unpack": seconds(lambda: shared_steps.unpack(messages[0]), 5),
         "add": seconds(lambda: [total.add_(each) for total, each in zip(sums, gradients, strict=True)], 5),
-        "adam": seconds(trainer.adam.step, 5),
+        "parameters": seconds(partial(stepper._of_parameters, stepper._objective.weights(iteration), 1.0), 5),
         "bytes": sum(map(len, messages)) / len(messages),
-        "dense": sum(tensor.numel() * tensor.element_size() for tensor in tensors.values()),
+        "shown": float(tensors["seen.statistics.visible"].float().mean()),
     }
+    for parameter in trainer.adam.parameters.values():
+        parameter.grad = torch.zeros_like(parameter)
+    return {**cost, "adam": seconds(trainer.adam.step, 5)}
 
 
-def modelled(found: dict[str, float], views: int, workers: int, cores: int, gigabits: float) -> float:
-    """Seconds of a step."""
+def computed(found: Mapping[str, float], views: int, workers: int, cores: int) -> float:
+    """Seconds of a step in which a worker computes."""
     share = math.ceil(views / workers)
-    drawing = max(0.0, found["view"] - found["pack"] - 2 * (found["unpack"] + found["add"]))
-    shared = views * (found["unpack"] + found["add"]) + share * found["pack"] if workers > 1 else 0.0
-    sending = (views - share) * found["bytes"] * 8 / (gigabits * 1e9) if workers > 1 else 0.0
-    return share * drawing / cores + shared + found["adam"] + sending
+    once = found["parameters"] + found["adam"]
+    if workers == 1:
+        return views * ((found["view"] + found["colors"]) / cores + found["add"]) + once
+    each = found["unpack"] + found["add"] + found["colors"] / cores
+    return share * (found["view"] / cores + found["pack"]) + views * each + once
+
+
+def modelled(found: Mapping[str, float], views: int, workers: int, cores: int, gigabits: float) -> float:
+    """Seconds of a step."""
+    traffic = Traffic.of(views, workers)
+    sending = traffic.received * found["bytes"] * 8 / (gigabits * 1e9) + traffic.calls * traffic.hops * LATENCY
+    return computed(found, views, workers, cores) + sending
+
+
+def overlapped(found: Mapping[str, float], views: int, workers: int, cores: int, gigabits: float) -> float:
+    """Seconds of a step whose messages travel, all but the last of each worker, while the next view is drawn."""
+    share = math.ceil(views / workers)
+    whole, drawn = modelled(found, views, workers, cores, gigabits), share * found["view"] / cores
+    sending = whole - computed(found, views, workers, cores)
+    return whole - min(sending, drawn) * (share - 1) / share
+
+
+def steps_of(trainer: Trainer[Any], config: TrainConfig, steps: int) -> dict[str, float]:
+    """Processor seconds of a step, and what it handed to others; the first step, which warms up, does not count."""
+    first, group = config.iterations - steps, present()
+    trainer._stepper.advance(first, first, ())
+    start, before = time.process_time(), dict(group.sent)
+    for iteration in range(first + 1, config.iterations + 1):
+        trainer._stepper.advance(iteration, iteration, ())
+    sent = {name: (group.sent[name] - before[name]) / steps for name in before}
+    return {"seconds": (time.process_time() - start) / steps, **sent}
+
+
+def take_part(place: str, rank: int, count: int, arguments: argparse.Namespace, pipe: Any) -> None:
+    """One of the processes of a check."""
+    set_num_threads(1)
+    trainer, config = start(arguments)
+    with one_torch_thread(), together(place, rank=rank, count=count):
+        pipe.send(steps_of(trainer, config, STEPS))
+
+
+def check(arguments: argparse.Namespace, found: Mapping[str, float]) -> None:
+    """Compares the model with steps of two views, of one process and of two."""
+    print("\n| processes | ms of a core in a step | model | messages | model | MB handed on | model |")
+    print("| --: |" + " --: |" * 6)
+    context = multiprocessing.get_context("spawn")
+    for count in (1, 2):
+        with TemporaryDirectory() as folder:
+            pipes = [context.Pipe() for _ in range(count)]
+            place = f"file://{folder}/meeting"
+            processes = [
+                context.Process(target=take_part, args=(place, rank, count, arguments, there))
+                for rank, (_, there) in enumerate(pipes)
+            ]
+            for process in processes:
+                process.start()
+            each = [here.recv() for here, _ in pipes]
+            for process in processes:
+                process.join()
+        took, traffic = 1000 * sum(one["seconds"] for one in each) / count, Traffic.of(2, count)
+        messages, megabytes = (sum(one[name] for one in each) for name in ("messages", "bytes"))
+        said = 1000 * computed(found, 2, count, 1), traffic.broadcasts, traffic.broadcasts * found["bytes"] / 1e6
+        print(f"| {count} | {took:.0f} | {said[0]:.0f} | {messages:.1f} | {said[1]} ", end="")
+        print(f"| {megabytes / 1e6:.2f} | {said[2]:.2f} |", flush=True)
+
+
+def start(arguments: argparse.Namespace) -> tuple[Trainer[Any], TrainConfig]:
+    """A run of steps of two views, with random triangles, as many as asked."""
+    width = arguments.width
+    capture = load_dataset(arguments.scene, width=width) if arguments.scene else demo_scene(width, width * 3 // 4)
+    config = TrainConfig.of("quick", "outdoor").changed({"start.points": arguments.triangles, "batch": 2})
+    with one_torch_thread():
+        return start_trainer(replace(capture.normalized(), exact_points=None, point_colors=None), config), config
 
 
 def main() -> None:
@@ -115,29 +244,31 @@ def main() -> None:
     parser.add_argument("--triangles", type=int, default=50_000)
     parser.add_argument("--width", type=int, default=640)
     parser.add_argument("--cores", type=int, default=8, help="of each worker, in the model")
+    parser.add_argument("--check", action="store_true", help="compare with one process and two")
     arguments = parser.parse_args()
     set_num_threads(1)
-    width = arguments.width
-    capture = load_dataset(arguments.scene, width=width) if arguments.scene else demo_scene(width, width * 3 // 4)
-    config = TrainConfig.of("quick", "outdoor").changed({"start.points": arguments.triangles, "batch": 2})
-    capture = replace(capture.normalized(), exact_points=None, point_colors=None)  # random triangles, as many as asked
+    trainer, config = start(arguments)
     with one_torch_thread():
-        trainer = start_trainer(capture, config)
         found = measure(trainer, config)
     print(description())
-    count, (width, height) = trainer.count, capture.images.sizes[0]
+    count, (width, height) = trainer.count, trainer._dataset.images.sizes[0]
     print(f"{count:,} triangles, {width} x {height}: of one view {found['bytes'] / 1e6:.2f} MB are sent, ", end="")
-    print(f"{found['bytes'] / count:.0f} bytes per triangle; without leaving out rows {found['dense'] / count:.0f}")
-    names = ("view", "pack", "unpack", "add", "adam")
+    print(f"{found['bytes'] / count:.0f} bytes per triangle")
+    names = ("view", "colors", "pack", "unpack", "add", "parameters", "adam")
     print("ms of one core: " + ", ".join(f"{name} {1000 * found[name]:.1f}" for name in names))
+    print(f"a view shows {found['shown']:.0%} of them")
+    if arguments.check:
+        check(arguments, found)
+        return
     for each in (1, 4):
-        print(f"\nModel: views per second, {each} of each worker in a step, {arguments.cores} cores each\n")
+        print(f"\nModel: views per second, {each} of each worker in a step, {arguments.cores} cores each")
+        print("(with messages that travel while the next view is drawn)\n")
         print("| workers | " + " | ".join(f"{speed} Gbit/s" for speed in NETWORKS) + " |")
         print("| --: |" + " --: |" * len(NETWORKS))
         for workers in WORKERS:
-            views = each * workers
-            rates = [views / modelled(found, views, workers, arguments.cores, speed) for speed in NETWORKS]
-            print(f"| {workers} | " + " | ".join(f"{rate:.1f}" for rate in rates) + " |")
+            views, about = each * workers, (found, each * workers, workers, arguments.cores)
+            rates = [(views / modelled(*about, speed), views / overlapped(*about, speed)) for speed in NETWORKS]
+            print(f"| {workers} | " + " | ".join(f"{one:.1f} ({other:.1f})" for one, other in rates) + " |")
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
+import torch.distributed as dist
 from safetensors.torch import load_file
 
 from etsplat.core.errors import InputError
@@ -29,7 +30,7 @@ from etsplat.optim.checkpoints import list_checkpoints
 from etsplat.optim.drive import digest_of
 from etsplat.optim.exposure import Exposure
 from etsplat.optim.guard import Guard
-from etsplat.optim.loop import RefineEvent
+from etsplat.optim.loop import LoopSettings, RefineEvent, optimize
 from etsplat.optim.objective import Custom, Drawing, Objective, Term
 from etsplat.optim.schedules import Schedule, face_budgets
 from etsplat.optim.strategies import DensifyAndPrune, SubdivideAndUntangle
@@ -67,6 +68,30 @@ def an_object() -> Dataset:
     """Photos with transparency; two are kept aside to watch the run by."""
     views = photograph(demo_object(), 20, 20, elevations=(-35.0, 35.0), azimuths=6, supersampling=1)
     return replace(views, train=views.train[2:], watched=views.train[:2])
+
+
+def fit_counted(kind: str, batch: int) -> dict[str, Any]:
+    """What the steps of a run ask of torch.distributed: calls, and bytes of this worker's own and of others'."""
+    counted = dict.fromkeys(("broadcasts", "gatherings", "own", "received"), 0)
+    broadcast, all_gather, rank = dist.broadcast, dist.all_gather, workers().rank
+
+    def broadcasting(tensor: torch.Tensor, src: int, **options: Any) -> Any:
+        counted["broadcasts"] += 1
+        counted["own" if src == rank else "received"] += tensor.numel() * tensor.element_size()
+        return broadcast(tensor, src=src, **options)
+
+    def gathering(found: list[torch.Tensor], tensor: torch.Tensor, **options: Any) -> Any:
+        counted["gatherings"] += 1
+        return all_gather(found, tensor, **options)
+
+    dist.broadcast, dist.all_gather = broadcasting, gathering
+    trainer = trainer_of(kind, batch)
+    try:
+        for event in optimize(trainer, LoopSettings(ITERATIONS, ITERATIONS, 0, 0), trainer.progress, None, None):
+            assert event is not None
+    finally:
+        dist.broadcast, dist.all_gather = broadcast, all_gather
+    return {**counted, "sent": dict(workers().sent), "rank": rank}
 
 
 def with_nan(dataset: Dataset, view: int) -> Dataset:

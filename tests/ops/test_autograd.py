@@ -20,6 +20,7 @@ from helpers.operations import CASES, COMPOSED, SMOOTH, loss
 WITHOUT_GRADIENTS = {
     "rasterize_opaque": "z-buffer: runs without gradients",
     "render_opaque": "z-buffer: runs without gradients",
+    "colors_backward": "gives gradients itself: tests/optim/test_shared_steps.py",
     "update_statistics": "in place, of detached statistics",
     "one_kind_of_colors": "a check",
     "count_levels": "returns a number",

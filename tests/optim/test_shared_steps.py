@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 import torch
 
+from benchmarks.workers import Traffic
 from etsplat.core.errors import InputError
 from etsplat.optim import shared_steps, stepper
 from etsplat.optim.loop import DivergedError
@@ -37,6 +38,21 @@ def test_any_number_of_workers_gives_the_same_bits(
         assert digest_of_checkpoint(tmp_path / f"run_{count}") == alone["checkpoint"]
         messages = sum(run["sent"]["messages"] for run in runs)
         assert messages == (0 if count == 1 else shared_runs.ITERATIONS * batch)
+
+
+def test_four_workers_ask_of_the_network_what_the_model_says(crew: Crew) -> None:
+    """Calls and bytes that reach torch.distributed, against benchmarks/workers.py; the run ends with one more question
+    whether somebody was interrupted."""
+    steps, (batch, count) = shared_runs.ITERATIONS, (4, 4)
+    runs, model = crew.act(count, shared_runs.fit_counted, "soup", batch), Traffic.of(batch, count)
+    messages = sum(run["sent"]["bytes"] for run in runs)
+    for run in runs:
+        assert run["broadcasts"] == steps * model.broadcasts
+        assert run["gatherings"] == steps * model.gatherings + 1
+        assert run["own"] == run["sent"]["bytes"]
+        assert run["received"] == messages - run["own"]
+    received = max(steps * batch - run["sent"]["messages"] for run in runs)
+    assert received == steps * model.received
 
 
 @pytest.mark.parametrize("batch", [1, 3])
