@@ -5,9 +5,8 @@
 
 The scene is made in code: eight of the demo's tables, in fewer faces, on a painted ground, 288 photos around them. The
 run in blocks comes first. The one beside it has as many steps as the coarse run and all blocks together, and as many
-triangles as their result. A pixel of a test photo belongs to the seams where the true surface is within a tenth of a
-block's width of a border between blocks, and to the middle where it is farther than a quarter; the sky belongs to
-neither.
+triangles as their result. A pixel of a test photo belongs to the sky, or to the seams where the true surface is within
+a tenth of a block's width of a border between blocks, to the middle where it is farther than a quarter, or between.
 
 With --memory, nothing is compared: so many points, a few steps; how much each process grows beyond what it held with
 photos and points (VmHWM, Linux), of one run, and of each run of the same in blocks.
@@ -118,31 +117,32 @@ def compare(options: argparse.Namespace) -> None:
         larger = config.changed({"iterations": steps, "max_triangles": blocks.soup.count})
         one = etsplat.train(views, Path(place) / "one", larger, callbacks=[_tell])
         print(f"one run: {steps:,} steps, {time.process_time() - begin - seconds:.0f} s of processor time", flush=True)
-    print("| | triangles | PSNR | SSIM | FLIP | PSNR at seams | PSNR in the middle |\n|---|--:|--:|--:|--:|--:|--:|")
+    print("| | triangles | PSNR | SSIM | FLIP | PSNR of sky | at seams | between | in the middle |")
+    print("|---|--:|--:|--:|--:|--:|--:|--:|--:|")
     for name, result in (("blocks", blocks), ("one run", one)):
-        seams, middle = by_place(result.soup, views, grid)
+        places = " | ".join(f"{psnr:.3f}" for psnr in by_place(result.soup, views, grid))
         numbers = [f"{result.metrics[key]:.3f}" for key in ("psnr", "ssim", "flip")]
-        print(f"| {name} | {result.soup.count:,} | {' | '.join(numbers)} | {seams:.3f} | {middle:.3f} |", flush=True)
+        print(f"| {name} | {result.soup.count:,} | {' | '.join(numbers)} | {places} |", flush=True)
 
 
 @torch.no_grad()
-def by_place(soup: TriangleSoup, views: Dataset, grid: Grid) -> tuple[float, float]:
-    """PSNR of the pixels of all test photos that are near borders between blocks, and far from them."""
+def by_place(soup: TriangleSoup, views: Dataset, grid: Grid) -> list[float]:
+    """PSNR of the pixels of all test photos: of the sky, near borders between blocks, in between, and far from them."""
     corners, _, things = surface()
     distance = grid.distance(corners.mean(dim=1).double())
-    distance[things:] = torch.nan
-    errors: tuple[list[Tensor], list[Tensor]] = [], []
+    distance[things:] = -1
+    errors: list[list[Tensor]] = [[] for _ in range(4)]
     for index in views.test:
         camera = views.cameras[index]
         picture = soup.render(camera, backgrounds=torch.zeros(1, 3)).color[0].clamp(0, 1)
         wrong = (picture - as_float(views.images[index])).square().mean(dim=2)
         nearest = rasterize_opaque(corners, cameras=camera).triangle
         assert nearest is not None
-        away = torch.where(nearest[0] >= 0, distance[nearest[0].long().clamp_min(0)], torch.nan)
-        errors[0].append(wrong[away < BORDER])
-        errors[1].append(wrong[away > MIDDLE])
-    seams, middle = (float(-10 * torch.cat(some).double().mean().log10()) for some in errors)
-    return seams, middle
+        away = torch.where(nearest[0] >= 0, distance[nearest[0].long().clamp_min(0)], -1.0)
+        place = torch.bucketize(away, torch.tensor([0.0, BORDER, MIDDLE], dtype=away.dtype), right=True)
+        for number, some in enumerate(errors):
+            some.append(wrong[place == number])
+    return [float(-10 * torch.cat(some).double().mean().log10()) for some in errors]
 
 
 def memory(points: int, blocks: str | None, width: int, pipe: Any) -> None:
