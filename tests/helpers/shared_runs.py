@@ -164,7 +164,8 @@ def gradients_of_steps(kind: str, batch: int, steps: int) -> list[dict[str, byte
     make_step = trainer.adam.step
 
     def step() -> None:
-        found.append({name: t.grad.contiguous().numpy().tobytes() for name, t in trainer.adam.parameters.items()})
+        gradients = {name: parameter.grad for name, parameter in trainer.adam.parameters.items()}
+        found.append({name: t.contiguous().numpy().tobytes() for name, t in gradients.items() if t is not None})
         make_step()
 
     trainer.adam.step = step

@@ -106,14 +106,14 @@ def colors_backward(
 
     Args:
         grad_colors: (B, N, 3).
-        vertices: As there, and so are the others.
-        sh_dc: .
-        sh_rest: .
-        centers: .
-        degree: .
+        vertices: (N, 3, 3), as there, like all that follow.
+        sh_dc: (N, 1, 3).
+        sh_rest: (N, R, 3).
+        centers: (B, 3).
+        degree: 0 to 3.
     """
     with torch.enable_grad():
-        leaves = tuple(tensor.detach().requires_grad_() for tensor in (vertices, sh_dc, sh_rest))
-        colors = soup_colors(*leaves, centers, degree)
-    by_vertices, by_dc, by_rest = torch.autograd.grad(colors, leaves, grad_colors)
+        corners, dc, rest = (tensor.detach().requires_grad_() for tensor in (vertices, sh_dc, sh_rest))
+        colors = soup_colors(corners, dc, rest, centers, degree)
+    by_vertices, by_dc, by_rest = torch.autograd.grad(colors, (corners, dc, rest), grad_colors)
     return by_vertices, by_dc, by_rest

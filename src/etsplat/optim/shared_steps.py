@@ -90,7 +90,7 @@ def shared_gradients(
     if group.count == 1:
         return gradients(range(len(views)))
     named = {f"{number}.{name}": (each, name) for number, each in enumerate(optimizers) for name in each.parameters}
-    colored = () if apart is None else tuple(optimizers[0].parameters[name] for name in apart.colored)
+    colored = [] if apart is None else [optimizers[0].parameters[name] for name in apart.colored]
     whose, own = owners(views, group.count), {}
     for place, owner in enumerate(whose):
         if owner == group.rank:
@@ -108,7 +108,9 @@ def shared_gradients(
         if apart is not None and apart.of_parameters is not None and place == len(views) - 1:
             parts.insert(0, sums.left_by(apart.of_parameters))
         if apart is not None:
-            by_colors = colors_backward(tensors[_COLORS][None], *colored, tensors[_CENTER], int(tensors[_DEGREE]))
+            vertices, dc, rest = colored
+            center, degree = tensors[_CENTER], int(tensors[_DEGREE])
+            by_colors = colors_backward(tensors[_COLORS][None], vertices, dc, rest, center, degree)
             parts.append({f"0.{name}": tensor for name, tensor in zip(apart.colored, by_colors, strict=True)})
         sums.add(parts)
         losses.append(tensors["loss"])
