@@ -106,6 +106,15 @@ class TriangleStatistics:
         screen_size: Largest distance from the mean of the projected vertices to one of them, in pixels.
         inradius: Radius of the incircle of the projected triangle, in pixels.
         visible: Passes the culls, and the box of its visible support meets the image.
+
+    Example:
+        >>> corners = torch.tensor([[[-0.5, -0.5, 2.0], [0.5, -0.5, 2.0], [0.0, 0.5, 2.0]]])
+        >>> camera = etsplat.Cameras(torch.eye(4)[None], etsplat.intrinsics(60.0, 32, 32)[None], 32, 32)
+        >>> look = dict(opacities=torch.ones(1), sigma=0.5, face_colors=torch.ones(1, 3))
+        >>> seen = etsplat.rasterize(corners, **look, cameras=camera, outputs=("color", "statistics"))
+        >>> behind = etsplat.rasterize(-corners, **look, cameras=camera, outputs=("color", "statistics"))
+        >>> seen.statistics.visible.item(), behind.statistics.visible.item()
+        (True, False)
     """
 
     max_weight: Float[Tensor, "B N"]

@@ -205,6 +205,12 @@ def together(init_method: str = "env://", *, rank: int | None = None, count: int
 
     Raises:
         InputError: they do not find each other, or this torch cannot do it.
+
+    Example:
+        >>> with etsplat.together() as workers:  # one, unless torchrun started more
+        ...     share = list(range(10))[workers.rank :: workers.count]
+        >>> len(share)
+        10
     """
     global _current
     if _current is not ALONE or (count is None and not launched()):

@@ -79,6 +79,22 @@ def load_dataset(
         InputError: no such folder, none of the layouts, or what the layout's reader refuses; fewer than two images;
             damaged images, masks or depth maps; images of another shape than their camera, or maps than their image.
         ValueError: a width below 1, a unit that is not positive.
+
+    Example:
+        Two photos, with the file that nerfstudio has beside them:
+
+        >>> import json
+        >>> from pathlib import Path
+        >>> frames = []
+        >>> for index, x in enumerate((-1.0, 1.0)):
+        ...     etsplat.save_image(f"{index}.png", torch.rand(12, 16, 3))
+        ...     pose = [[1, 0, 0, x], [0, 1, 0, 0], [0, 0, 1, 4], [0, 0, 0, 1]]
+        ...     frames.append({"file_path": f"{index}.png", "transform_matrix": pose})
+        >>> lens = {"w": 16, "h": 12, "fl_x": 20.0, "fl_y": 20.0, "cx": 8.0, "cy": 6.0}
+        >>> Path("transforms.json").write_text(json.dumps({**lens, "frames": frames})) > 0
+        True
+        >>> etsplat.load_dataset(".").images[0].shape
+        torch.Size([12, 16, 3])
     """
     if depth_unit is not None and not 0 < depth_unit <= LARGEST:
         raise ValueError(f"depth_unit: expected a positive number, got {depth_unit}")

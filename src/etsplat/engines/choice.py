@@ -24,6 +24,19 @@ def register_engine(engine: Engine) -> None:
 
     It is then what `with etsplat.engine(name)` chooses; and if it has a device of its own that no earlier one has, it
     runs what is on such a device in float32.
+
+    Example:
+        >>> from etsplat.engines.engine import Engine
+        >>> class Doubled(Engine):  # what it does not have itself it has from "reference"
+        ...     name = "doubled"
+        ...
+        ...     @staticmethod
+        ...     def photometric_loss(*arguments):
+        ...         return 2 * Engine.photometric_loss(*arguments)
+        >>> etsplat.register_engine(Doubled())
+        >>> with etsplat.engine("doubled"):
+        ...     float(etsplat.photometric_loss(torch.zeros(1, 8, 8, 3), torch.ones(1, 8, 8, 3), 0.0))
+        2.0
     """
     _engines[engine.name] = engine
 

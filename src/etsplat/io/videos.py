@@ -32,6 +32,11 @@ def open_video(path: Path | str, fps: int) -> Iterator[VideoSink]:
 
     Raises:
         InputError: imageio-ffmpeg is missing; the file cannot be written.
+
+    Example:
+        >>> with etsplat.open_video("fade.mp4", fps=24) as append:
+        ...     for value in torch.linspace(0, 1, 12):
+        ...         append(value.expand(32, 48, 3))
     """
     try:
         import imageio_ffmpeg

@@ -161,6 +161,12 @@ class Lpips(nn.Module):
     The state dict has exactly these entries (float32), which are torchvision's and LPIPS's own names:
     `features.{0,2,5,7,10,12,14,17,19,21,24,26,28}.{weight,bias}` (3x3 convolutions of torchvision's vgg16 with weights
     IMAGENET1K_V1) and `lin{0..4}.model.1.weight`, (1, C, 1, 1) with C = 64, 128, 256, 512, 512 (LPIPS v0.1's vgg.pth).
+
+    Example:
+        >>> lpips = etsplat.Lpips()  # at random; Lpips.from_weights("lpips_vgg16.pth") has what was learned
+        >>> picture = torch.rand(16, 16, 3)
+        >>> float(lpips(picture, picture))
+        0.0
     """
 
     def __init__(self) -> None:

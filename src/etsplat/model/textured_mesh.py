@@ -38,6 +38,13 @@ class TextureAppearance(Appearance):
     Attributes:
         max_level: the coarsest level that is shown, as in `etsplat.sample_texture`: 0 for textures whose parts belong
             to faces apart.
+
+    Example:
+        >>> vertices, faces = etsplat.icosphere(1)
+        >>> apart = torch.rand(len(faces), 3, 2)
+        >>> mesh = etsplat.TexturedMesh.from_mesh(vertices, faces, torch.ones(8, 8, 3), apart, max_level=0)
+        >>> mesh.appearance
+        TextureAppearance(max_level=0)
     """
 
     max_level: int | None = None
@@ -56,6 +63,16 @@ class TexturedMesh(Model):
         face_uvs: (F, 3, 2) texture coordinates of each face's corners, (0, 0) in the upper left corner of the texture.
         topology: connectivity of the faces.
         appearance: how it is drawn.
+
+    Example:
+        A grey sphere, where pixels pull at the texels that they show:
+
+        >>> vertices, faces = etsplat.icosphere(1)
+        >>> uvs = torch.rand(len(faces), 3, 2, generator=torch.Generator().manual_seed(0))
+        >>> mesh = etsplat.TexturedMesh.from_mesh(vertices, faces, torch.full((16, 16, 3), 0.5), uvs)
+        >>> mesh.render(etsplat.orbit_cameras(24, 24)[0]).color.mean().backward()
+        >>> mesh.texture.grad.shape, bool(mesh.texture.grad.any())
+        (torch.Size([16, 16, 3]), True)
     """
 
     RATES: ClassVar[Mapping[str, float]] = {"vertices": 2e-3, "texture": 1e-2}

@@ -18,6 +18,11 @@ class CamerasEvent:
             training photos as given.
         refined: with refined ones; None if that is to come.
         stays: whether cameras stay refined; None likewise.
+
+    Example:
+        >>> event = etsplat.CamerasEvent(iteration=500, begin=500, judged=1000, given=24.31, refined=25.02, stays=True)
+        >>> print(event)
+        cameras: refined; the photos kept aside have 25.02 dB with refined ones, 24.31 dB as given
     """
 
     iteration: int

@@ -48,6 +48,13 @@ class CameraRefinement:
         active: whether refined cameras are in use.
         adam: the optimizer of "poses", (P, 6), of all training views and those kept aside, of which only the former
             move; and, if they are learned, of "lenses", (C, 3), of photos that had the same intrinsics.
+
+    Example:
+        >>> cameras = etsplat.CameraRefinement.of("poses", iterations=3000, epoch=40)
+        >>> 0 < cameras.begin < cameras.judged <= cameras.end <= 3000
+        True
+        >>> etsplat.CameraRefinement.of("off", iterations=3000, epoch=40).wanted
+        False
     """
 
     adam: Adam

@@ -43,6 +43,15 @@ def apply_subdivision(
     Raises:
         ValueError: a name is unknown, given twice, or its tensor does not have the plan's number of rows. Nothing has
             been changed then.
+
+    Example:
+        >>> vertices, faces = etsplat.icosphere(0)
+        >>> adam = etsplat.Adam({"vertices": vertices, "colors": torch.ones(20, 3)}, {"vertices": 1e-3, "colors": 1e-2})
+        >>> topology = etsplat.MeshTopology.from_faces(faces, len(vertices))
+        >>> plan = etsplat.longest_edge_plan(vertices, topology, scores=torch.ones(20), budget_faces=30)
+        >>> new = etsplat.apply_subdivision(plan, adam, per_vertex=["vertices"], per_face=["colors"])
+        >>> len(new["colors"]), len(adam.first_moments["colors"])
+        (30, 30)
     """
     carry = dict.fromkeys(per_vertex, plan.interpolate) | dict.fromkeys(per_face, plan.inherit)
     rows = dict.fromkeys(per_vertex, plan.num_vertices) | dict.fromkeys(per_face, plan.num_faces)
@@ -111,6 +120,13 @@ def apply_rows(
     Raises:
         ValueError: a tensor does not have the plan's number of rows, or values do not fit. Nothing has been changed
             then.
+
+    Example:
+        >>> adam = etsplat.Adam({"opacities": torch.tensor([0.9, 0.1, 0.8])}, {"opacities": 0.05})
+        >>> plan = etsplat.RowPlan.keeping(adam.parameters["opacities"] > 0.5)
+        >>> parameters, statistics = etsplat.apply_rows(plan, adam, {"seen": torch.tensor([7, 0, 3])})
+        >>> len(parameters["opacities"]), statistics["seen"].tolist()
+        (2, [7, 3])
     """
     check_shape("source", plan.source, ("M",))
     check_indices("source", plan.source, plan.num_rows)

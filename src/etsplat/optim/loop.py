@@ -24,7 +24,19 @@ from etsplat.optim.checkpoints import list_checkpoints
 
 
 class DivergedError(RuntimeError):
-    """The loss or a parameter became NaN or infinite. The message is one line that says when and what is left."""
+    """The loss or a parameter became NaN or infinite. The message is one line that says when and what is left.
+
+    Example:
+        >>> photos = etsplat.photograph(etsplat.demo_object(), 16, 16, elevations=(0.0,), azimuths=3, supersampling=1)
+        >>> mesh = etsplat.TriangleMesh.from_mesh(*etsplat.icosphere(1), colors=0.7, opacity=0.98, sigma=0.25)
+        >>> broken = etsplat.Custom(lambda drawing: torch.log(-drawing.model.sigma))
+        >>> try:
+        ...     outcome = etsplat.Trainer(mesh, photos, etsplat.Objective(etsplat.Photometric(), [broken])).fit(5)
+        ... except etsplat.DivergedError as error:
+        ...     found = str(error)
+        >>> "nan" in found
+        True
+    """
 
 
 @dataclass(frozen=True)
@@ -34,6 +46,11 @@ class PrepareEvent:
     Attributes:
         done: views done.
         total: views in all.
+
+    Example:
+        >>> event = etsplat.PrepareEvent(done=12, total=48)
+        >>> f"{event.done / event.total:.0%}"
+        '25%'
     """
 
     done: int
@@ -48,6 +65,10 @@ class StageEvent:
         name: what is made.
         done: steps done.
         total: steps in all.
+
+    Example:
+        >>> print(etsplat.StageEvent("texture", 40, 200))
+        texture: 40/200
     """
 
     name: str
@@ -64,6 +85,15 @@ class NoteEvent:
 
     Attributes:
         text: a sentence.
+
+    Example:
+        What a run has to say before it begins:
+
+        >>> def listen(event):
+        ...     if isinstance(event, etsplat.NoteEvent):
+        ...         print(event.text)
+        >>> listen(etsplat.NoteEvent("source: 3 degenerate faces were left out"))
+        source: 3 degenerate faces were left out
     """
 
     text: str
@@ -84,6 +114,11 @@ class StepEvent:
         loss: mean over the iterations since the last event of this kind.
         state: what the problem says of itself, such as "faces" and "sigma".
         metrics: what was evaluated at this iteration ("psnr", "chamfer"), or empty.
+
+    Example:
+        >>> state, metrics = {"faces": 2500, "sigma": 0.25}, {"psnr": 28.5}
+        >>> print(etsplat.StepEvent(100, 2000, seconds=4.2, loss=0.0312, state=state, metrics=metrics))
+        100/2000 · 4 s · loss 0.0312 · 28.50 dB · 2,500 faces · σ 0.250
     """
 
     iteration: int
@@ -115,6 +150,10 @@ class RefineEvent:
         iteration: iterations done.
         count: number of primitives now.
         added: how many more than before; negative if there are fewer.
+
+    Example:
+        >>> print(etsplat.RefineEvent(iteration=300, count=5000, added=2500))
+        300: 5,000 triangles (+2,500)
     """
 
     iteration: int
@@ -136,6 +175,11 @@ class UndoEvent:
         judged: how many were done.
         loss_before: photometric loss of the training views before the edit.
         loss_after: the same when it was judged.
+
+    Example:
+        >>> event = etsplat.UndoEvent(iteration=300, judged=340, loss_before=0.020, loss_after=0.025)
+        >>> str(event).split(": ")[0], "25.0 % higher than before" in str(event)
+        ('iteration 300', True)
     """
 
     iteration: int
@@ -158,6 +202,15 @@ class CheckpointEvent:
     Attributes:
         iteration: iterations done.
         path: the file.
+
+    Example:
+        >>> photos = etsplat.photograph(etsplat.demo_object(), 16, 16, elevations=(0.0,), azimuths=3, supersampling=1)
+        >>> mesh = etsplat.TriangleMesh.from_mesh(*etsplat.icosphere(1), colors=0.7, opacity=0.98, sigma=0.25)
+        >>> events = []
+        >>> trainer = etsplat.Trainer(mesh, photos, etsplat.Objective(etsplat.Photometric()))
+        >>> outcome = trainer.fit(4, callbacks=[events.append], checkpoint_every=2, run="run")
+        >>> [event.iteration for event in events if isinstance(event, etsplat.CheckpointEvent)]
+        [2, 4]
     """
 
     iteration: int
@@ -174,6 +227,10 @@ class DoneEvent:
     Attributes:
         iteration: iterations done.
         seconds: as in StepEvent.
+
+    Example:
+        >>> print(etsplat.DoneEvent(iteration=2000, seconds=81.4))
+        2000 iterations in 81.4 s
     """
 
     iteration: int

@@ -37,6 +37,15 @@ class Drawing:
         shared: what one term has computed of this view for others, by its name.
         index: (1,) of the view in its data set.
         depth: (1, H, W) along the optical axis, in units of the model's frame, 0 where not known; None without.
+
+    Example:
+        A term on its own, of a drawing that is made by hand:
+
+        >>> mesh = etsplat.TriangleMesh.from_mesh(*etsplat.icosphere(1), colors=1.0, opacity=0.98, sigma=0.25)
+        >>> camera, black = etsplat.orbit_cameras(16, 16)[0], torch.zeros(1, 3)
+        >>> drawing = etsplat.Drawing(mesh, camera, torch.zeros(1, 16, 16, 3), None, black, mesh.render(camera))
+        >>> 0 < etsplat.Photometric()(drawing).item() < 1
+        True
     """
 
     model: Any

@@ -87,7 +87,16 @@ class Strategy:
 
 
 class Fixed(Strategy):
-    """The triangles of the start are those of the end."""
+    """The triangles of the start are those of the end.
+
+    Example:
+        >>> photos = etsplat.photograph(etsplat.demo_object(), 16, 16, elevations=(0.0,), azimuths=3, supersampling=1)
+        >>> mesh = etsplat.TriangleMesh.from_mesh(*etsplat.icosphere(1), colors=0.7, opacity=0.98, sigma=0.25)
+        >>> objective = etsplat.Objective(etsplat.Photometric())
+        >>> outcome = etsplat.Trainer(mesh, photos, objective, etsplat.Fixed()).fit(2)
+        >>> mesh.count
+        80
+    """
 
 
 class SubdivideAndUntangle(Strategy):

@@ -39,7 +39,17 @@ def laplacian_solver(topology: MeshTopology, weight: float) -> Solve:
 
 
 class UniformSteps:
-    """Steps of a mesh's vertices with one scale for all of them; of other parameters Adam's own."""
+    """Steps of a mesh's vertices with one scale for all of them; of other parameters Adam's own.
+
+    Example:
+        >>> photos = etsplat.photograph(etsplat.demo_object(), 16, 16, elevations=(0.0,), azimuths=3, supersampling=1)
+        >>> mesh = etsplat.TriangleMesh.from_mesh(*etsplat.icosphere(2), colors=0.7, opacity=0.98, sigma=0.25)
+        >>> objective, smooth = etsplat.Objective(etsplat.Photometric()), etsplat.UniformSteps(smoothing=10.0)
+        >>> before = mesh.vertices.detach().clone()
+        >>> outcome = etsplat.Trainer(mesh, photos, objective, update=smooth).fit(2)
+        >>> bool((mesh.vertices - before).norm(dim=1).min() > 0)  # also of those that no photo shows
+        True
+    """
 
     def __init__(self, smoothing: float | None = None) -> None:
         """Takes the weight of the Laplacian beside the identity, or None for no smoothing."""

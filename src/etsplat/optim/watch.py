@@ -35,6 +35,12 @@ class Outcome(Generic[M]):
         views: number of photos that were kept aside.
         psnr: of the result on these, in dB; None if there are none.
         last_psnr: of the last state on them.
+
+    Example:
+        >>> mesh = etsplat.TriangleMesh.from_mesh(*etsplat.icosphere(1), colors=0.7, opacity=0.98, sigma=0.25)
+        >>> outcome = etsplat.Outcome(mesh, iteration=800, views=3, psnr=27.5, last_psnr=27.0)
+        >>> outcome.note.split("; ")[-1]
+        'the result is of iteration 800'
     """
 
     model: M

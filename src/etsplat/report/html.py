@@ -41,6 +41,10 @@ def write_report(run_dir: Path | str) -> Path:
 
     Raises:
         InputError: not a finished run, or the folder cannot be written.
+
+    Example:
+        >>> etsplat.write_report("runs/owl").name  # what the example of `etsplat.reconstruct` made
+        'report.html'
     """
     run = read_run(run_dir)
     plot_convergence(run, run.folder / "convergence.png")

@@ -160,6 +160,12 @@ def texture_mesh(
 
     Raises:
         InputError: a package is missing, the run or its photos cannot be used, or a number is out of range.
+
+    Example:
+        >>> asset = etsplat.texture_mesh("runs/owl", size=64, faces=100)  # of the example of `etsplat.reconstruct`
+        >>> asset.texture.shape, asset.count <= 100
+        (torch.Size([64, 64, 3]), True)
+        >>> asset.save("owl.glb")
     """
     ExportConfig(texture=size, faces=faces)
     check_installed()

@@ -61,6 +61,13 @@ class Scorer:
     Attributes:
         starts: cameras of test views from which these are aligned to the model (`fitted_scores`); empty for views
             whose poses are not in doubt.
+
+    Example:
+        >>> photos = etsplat.photograph(etsplat.demo_object(), 16, 16, elevations=(0.0,), azimuths=5, supersampling=1)
+        >>> mesh = etsplat.TriangleMesh.from_mesh(*etsplat.icosphere(1), colors=0.7, opacity=0.98, sigma=0.25)
+        >>> scorer = etsplat.Scorer(photos, torch.device("cpu"))
+        >>> sorted(scorer.cheap(mesh)), photos.test
+        (['psnr'], [2])
     """
 
     starts: Mapping[int, Cameras] = MappingProxyType({})

@@ -49,6 +49,12 @@ class TrainResult(Result):
         soup: the triangles, in the units of the input.
         opaque: the opaque mesh beside it, likewise, with a colour at each vertex; None if none was asked for.
         metrics: as in metrics.json.
+
+    Example:
+        Of the example of `etsplat.train`:
+
+        >>> result.soup.count == result.metrics["triangles"], result.opaque is None
+        (True, True)
     """
 
     OPAQUE = TriangleSoup.OPAQUE

@@ -17,7 +17,17 @@ Spared = Callable[[Float[Tensor, "N 3 3"]], Bool[Tensor, " N"]]
 
 
 class Opacity(Term):
-    """The mean opacity."""
+    """The mean opacity.
+
+    Example:
+        >>> points = etsplat.StartPoints(torch.rand(50, 3), torch.full((50, 3), 0.5))
+        >>> soup = etsplat.start_soup(points, torch.Generator(), scale=1.0, opacity=0.3, sigma=1.0, sh_degree=1)
+        >>> camera, black = etsplat.orbit_cameras(16, 16)[0], torch.zeros(1, 3)
+        >>> drawing = etsplat.Drawing(soup, camera, torch.zeros(1, 16, 16, 3), None, black, soup.render(camera))
+
+        >>> round(etsplat.Opacity()(drawing).item(), 4)
+        0.3
+    """
 
     name = "opacity"
     looks_at = "parameters"
@@ -36,7 +46,18 @@ class Opacity(Term):
 
 
 class Size(Term):
-    """The reciprocal of the mean area."""
+    """The reciprocal of the mean area.
+
+    Example:
+        >>> points = etsplat.StartPoints(torch.rand(50, 3), torch.full((50, 3), 0.5))
+        >>> soup = etsplat.start_soup(points, torch.Generator(), scale=1.0, opacity=0.3, sigma=1.0, sh_degree=1)
+        >>> camera, black = etsplat.orbit_cameras(16, 16)[0], torch.zeros(1, 3)
+        >>> drawing = etsplat.Drawing(soup, camera, torch.zeros(1, 16, 16, 3), None, black, soup.render(camera))
+
+        >>> term = etsplat.Size()
+        >>> (term(drawing) ** term.power).item() > 0
+        True
+    """
 
     name = "size"
     looks_at = "parameters"
@@ -52,6 +73,15 @@ class Harmonics(Term):
 
     The constant band does not count. By the others a triangle that few photos show fits each of them, and other views
     then see streaks and patches.
+
+    Example:
+        >>> points = etsplat.StartPoints(torch.rand(50, 3), torch.full((50, 3), 0.5))
+        >>> soup = etsplat.start_soup(points, torch.Generator(), scale=1.0, opacity=0.3, sigma=1.0, sh_degree=1)
+        >>> camera, black = etsplat.orbit_cameras(16, 16)[0], torch.zeros(1, 3)
+        >>> drawing = etsplat.Drawing(soup, camera, torch.zeros(1, 16, 16, 3), None, black, soup.render(camera))
+
+        >>> etsplat.Harmonics()(drawing).item()  # a soup begins with the same colour from all sides
+        0.0
     """
 
     name = "harmonics"
@@ -79,7 +109,18 @@ class _SquaredNorm(torch.autograd.Function):
 
 
 class DepthNormals(Term):
-    """How far normals are from those of the depth image, where something is opaque (ops/normal_consistency.py)."""
+    """How far normals are from those of the depth image, where something is opaque (ops/normal_consistency.py).
+
+    Example:
+        >>> points = etsplat.StartPoints(torch.rand(50, 3), torch.full((50, 3), 0.5))
+        >>> soup = etsplat.start_soup(points, torch.Generator(), scale=1.0, opacity=0.3, sigma=1.0, sh_degree=1)
+        >>> camera, black = etsplat.orbit_cameras(16, 16)[0], torch.zeros(1, 3)
+        >>> seen = soup.render(camera, outputs=etsplat.DepthNormals.outputs)
+        >>> drawing = etsplat.Drawing(soup, camera, torch.zeros(1, 16, 16, 3), None, black, seen)
+
+        >>> 0 <= etsplat.DepthNormals()(drawing).item() <= 2
+        True
+    """
 
     name = "depth_normal"
     outputs = ("normal", "median_depth")
@@ -95,7 +136,18 @@ class DepthNormals(Term):
 
 
 class Distortion(Term):
-    """The mean spread of triangles along a line of sight."""
+    """The mean spread of triangles along a line of sight.
+
+    Example:
+        >>> points = etsplat.StartPoints(torch.rand(50, 3), torch.full((50, 3), 0.5))
+        >>> soup = etsplat.start_soup(points, torch.Generator(), scale=1.0, opacity=0.3, sigma=1.0, sh_degree=1)
+        >>> camera, black = etsplat.orbit_cameras(16, 16)[0], torch.zeros(1, 3)
+        >>> seen = soup.render(camera, outputs=etsplat.Distortion.outputs)
+        >>> drawing = etsplat.Drawing(soup, camera, torch.zeros(1, 16, 16, 3), None, black, seen)
+
+        >>> etsplat.Distortion()(drawing).item() >= 0
+        True
+    """
 
     name = "distortion"
     outputs = ("distortion",)
