@@ -26,7 +26,7 @@ help:
 	@echo "make setup        create .venv and build the package into it"
 	@echo "make demo         reconstruct a built-in object into runs/demo"
 	@echo "make test         run the tests"
-	@echo "make lint         ruff, pyright, import-linter; zizmor, hadolint, the conda recipe"
+	@echo "make lint         ruff, pyright, import-linter; actionlint, zizmor, hadolint, the conda recipe"
 	@echo "make docs         the documentation as a site, build/docs/index.html; warnings are errors"
 	@echo "make stubs        describe the native calls to Python (src/etsplat/_native.pyi)"
 	@echo "make bench        measure the CPU engine"
@@ -77,6 +77,7 @@ $(LINTERS): $(INSTALLED)
 	@touch $@
 
 lint: $(LINTERS)
+	$(VENV)/bin/actionlint -shellcheck= -pyflakes=  # which it would run where it finds them
 	$(VENV)/bin/zizmor --offline --quiet .github/workflows
 	$(VENV)/bin/hadolint Dockerfile .devcontainer/Dockerfile
 	$(PY) release/recipe.py
