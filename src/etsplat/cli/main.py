@@ -5,10 +5,10 @@ import re
 import signal
 import sys
 from collections.abc import Callable, Sequence
-from importlib.metadata import version
 from types import FrameType
 from typing import NoReturn
 
+import etsplat
 from etsplat.cli.command import FAILED, INTERRUPTED, WRONG_INPUT, Command, fail
 from etsplat.cli.parse import parse
 from etsplat.core.errors import InputError
@@ -17,7 +17,7 @@ from etsplat.core.errors import InputError
 def main() -> NoReturn:
     """Entry point of the `etsplat` command; it ends as `run_command` does."""
     if sys.argv[1:] == ["--version"]:
-        print(f"etsplat {version('etsplat')}")
+        print(f"etsplat {etsplat.__version__}")
         sys.exit(0)
     run_command(parse, sys.argv[1:])
 
