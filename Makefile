@@ -20,7 +20,7 @@ SANITIZED := build/sanitize/.stamp
 NATIVE := CMakeLists.txt $(shell find csrc)
 
 .PHONY: help setup demo test lint docs format stubs bench equal-bits fuzz fuzz-short sanitize races soak lock audit \
-	ptx check-neon wheel check-wheel wheels clean
+	ptx check-neon wheel check-wheel check-sdist wheels clean
 
 help:
 	@echo "make setup        create .venv and build the package into it"
@@ -39,6 +39,7 @@ help:
 	@echo "make lock         requirements.lock: the newest versions that fit, with hashes; make audit: known holes in them"
 	@echo "make check-neon   run the rasterizer's NEON path under QEMU (AArch64 cross compiler)"
 	@echo "make check-wheel  build the wheel, install it into an empty environment, run a tiny demo"
+	@echo "make check-sdist  the same from the source distribution"
 	@echo "make wheels       wheels of every platform by Zig's compilers, under dist/wheels (Python 3.12 or newer); WHEELS='macos-arm64' for one"
 	@echo "make clean        remove .venv, build, dist and caches"
 
@@ -202,8 +203,8 @@ wheel: $(TOOLS)
 
 # What a user gets: the wheel alone, in an environment with nothing else, away from the source tree. That environment is
 # a gigabyte, byte code left out, so it goes when it has passed.
-check-wheel: export PYTHONDONTWRITEBYTECODE = 1
-check-wheel: INSTALL := -m pip --disable-pip-version-check install --quiet --no-compile
+check-wheel check-sdist: export PYTHONDONTWRITEBYTECODE = 1
+check-wheel check-sdist: INSTALL := -m pip --disable-pip-version-check install --quiet --no-compile
 check-wheel: wheel
 	rm -rf build/wheel-check
 	$(PYTHON) -m venv build/wheel-check/venv
@@ -213,6 +214,19 @@ check-wheel: wheel
 	cd build/wheel-check && venv/bin/etsplat demo --out demo --preset tiny
 	test -s build/wheel-check/demo/report.html
 	rm -rf build/wheel-check
+
+# The same of the source distribution, which is compiled with what it asks for itself (build isolation), away from the checkout.
+check-sdist: $(TOOLS)
+	rm -rf build/sdist-check
+	mkdir -p build/sdist-check
+	$(PY) -c 'from scikit_build_core.build import build_sdist; build_sdist("build/sdist-check")'
+	$(PYTHON) -m venv build/sdist-check/venv
+	build/sdist-check/venv/bin/python $(INSTALL) -c constraints.txt torch
+	build/sdist-check/venv/bin/python $(INSTALL) -c constraints.txt build/sdist-check/*.tar.gz
+	cd build/sdist-check && venv/bin/etsplat doctor
+	cd build/sdist-check && venv/bin/etsplat demo --out demo --preset tiny
+	test -s build/sdist-check/demo/report.html
+	rm -rf build/sdist-check
 
 # They hold nanobind, so they need no other compiler's exceptions to be theirs; in an environment of its own, without torch.
 WHEELS ?=
