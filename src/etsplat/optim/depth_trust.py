@@ -156,15 +156,18 @@ class DepthTrust:
         if self.explained is None:
             return {}
         code = 0 if self.kind is None else _KINDS["auto"].index(self.kind) + 1
-        numbers = [code, self.inverse, self.explained, self.dropped, self._best, self.unit]
-        return {"decided": torch.tensor(numbers, dtype=torch.float64), "used": self._used}
+        numbers = [code, self.inverse, self.explained, self.dropped, self._best]
+        unit = {} if self.unit == 1 else {"unit": torch.tensor(self.unit, dtype=torch.float64)}
+        return {"decided": torch.tensor(numbers, dtype=torch.float64), "used": self._used, **unit}
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
         """Continues where `state` was taken."""
         self.kind, self.explained, self.unit = None, None, 1.0
         if "decided" not in state:
             return
-        code, inverse, explained, dropped, self._best, self.unit = state["decided"].tolist()
+        code, inverse, explained, dropped, self._best = state["decided"].tolist()
+        if "unit" in state:
+            self.unit = float(state["unit"])
         self.kind = _KINDS["auto"][int(code) - 1] if code else None
         self.inverse, self.explained, self.dropped = bool(inverse), explained, bool(dropped)
         self._used = state["used"].to(self._used)
