@@ -222,20 +222,21 @@ class HalveWhereWrong(Strategy):
         return min((i for i in self._budgets if i >= iteration), default=NEVER)
 
     def edit(self, iteration: int) -> bool:
-        """Halves them at the middles of their longest edges."""
+        """Removes and halves them, the latter at the middles of their longest edges."""
         if iteration not in self._budgets:
             return False
         mesh: TriangleMesh = self.model
-        before, errors = mesh.vertices, self._errors(mesh)
-        kept = ~errors.in_the_way
-        if bool(kept.any()) and not bool(kept.all()):
-            self._carry_out(RowPlan.keeping(kept.repeat_interleave(3).to(before.device)))
-        wrong = errors.wrong[kept] if mesh.vertices is not before else errors.wrong
+        errors = self._errors(mesh)
+        kept, wrong = ~errors.in_the_way, errors.wrong
+        removes = bool(kept.any()) and not bool(kept.all())
+        if removes:
+            self._carry_out(RowPlan.keeping(kept.repeat_interleave(3).to(mesh.vertices.device)))
+            wrong = wrong[kept]
         most = min(self._budgets[iteration] - mesh.count, int((wrong > 0).sum()))
         if most > 0:
             chosen = wrong.topk(most).indices
             self._carry_out(halves_plan(mesh.vertices.detach(), mesh.colors.detach(), chosen))
-        return mesh.vertices is not before
+        return removes or most > 0
 
     def _carry_out(self, plan: RowPlan) -> None:
         """Rows are corners, three of each triangle after the other."""
