@@ -27,7 +27,6 @@ namespace etsplat {
 
 ETSPLAT_FN float vmin(float a, float b) { return a < b ? a : b; }
 ETSPLAT_FN float vmax(float a, float b) { return a > b ? a : b; }
-ETSPLAT_FN float vabs(float a) { return a < 0.0f ? -a : a; }
 ETSPLAT_FN float vselect(bool mask, float a, float b) { return mask ? a : b; }
 ETSPLAT_FN bool vany(bool mask) { return mask; }
 // Floats of a table at an index, which is a whole number.
@@ -58,6 +57,7 @@ ETSPLAT_FN float vlog2(float a) { return __log2f(a); }
 ETSPLAT_FN float vexp2(float a) { return exp2f(a); }
 ETSPLAT_FN float vsqrt(float a) { return sqrtf(a); }
 ETSPLAT_FN float vfloor(float a) { return floorf(a); }
+ETSPLAT_FN float vabs(float a) { return fabsf(a); }
 ETSPLAT_FN int float_bits(float a) { return __float_as_int(a); }
 ETSPLAT_FN float bits_float(int a) { return __int_as_float(a); }
 #else
@@ -67,6 +67,7 @@ ETSPLAT_FN float vlog2(float a) { return std::log2(a); }
 ETSPLAT_FN float vexp2(float a) { return std::exp2(a); }
 ETSPLAT_FN float vsqrt(float a) { return std::sqrt(a); }
 ETSPLAT_FN float vfloor(float a) { return std::floor(a); }
+ETSPLAT_FN float vabs(float a) { return std::fabs(a); }
 ETSPLAT_FN int float_bits(float a) { return __builtin_bit_cast(int, a); }
 ETSPLAT_FN float bits_float(int a) { return __builtin_bit_cast(float, a); }
 #endif

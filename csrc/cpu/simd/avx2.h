@@ -6,6 +6,7 @@
 namespace etsplat::avx2 {
 
 constexpr int kRegisters = 2;
+constexpr int kTogether = 1;
 using Register = __m256;
 using Mask = __m256;
 
@@ -26,7 +27,6 @@ ETSPLAT_FN Register r_min(Register a, Register b) { return _mm256_min_ps(a, b); 
 ETSPLAT_FN Register r_max(Register a, Register b) { return _mm256_max_ps(a, b); }
 ETSPLAT_FN Register r_sqrt(Register a) { return _mm256_sqrt_ps(a); }
 ETSPLAT_FN Register r_floor(Register a) { return _mm256_round_ps(a, _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC); }
-ETSPLAT_FN Register r_round(Register a) { return _mm256_round_ps(a, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC); }
 ETSPLAT_FN Mask r_lt(Register a, Register b) { return _mm256_cmp_ps(a, b, _CMP_LT_OQ); }
 ETSPLAT_FN Mask r_le(Register a, Register b) { return _mm256_cmp_ps(a, b, _CMP_LE_OQ); }
 ETSPLAT_FN Register r_select(Mask m, Register a, Register b) { return _mm256_blendv_ps(b, a, m); }
@@ -43,13 +43,13 @@ ETSPLAT_FN Mask m_from_bits(unsigned bits) {
 
 ETSPLAT_FN void r_split(Register x, Register& mantissa, Register& exponent) {
     const __m256i bits = _mm256_castps_si256(x);
-    const __m256i e = _mm256_srai_epi32(_mm256_sub_epi32(bits, _mm256_set1_epi32(0x3f400000)), 23);
-    mantissa = _mm256_castsi256_ps(_mm256_sub_epi32(bits, _mm256_slli_epi32(e, 23)));
-    exponent = _mm256_cvtepi32_ps(e);
+    const __m256i above = _mm256_sub_epi32(bits, _mm256_set1_epi32(0x3f400000));
+    mantissa = _mm256_castsi256_ps(_mm256_sub_epi32(bits, _mm256_and_si256(above, _mm256_set1_epi32(-(1 << 23)))));
+    exponent = _mm256_cvtepi32_ps(_mm256_srai_epi32(above, 23));
 }
-ETSPLAT_FN Register r_scale(Register a, Register n) {
+ETSPLAT_FN Register r_scale(Register a, Register shifted) {
     return _mm256_castsi256_ps(
-        _mm256_add_epi32(_mm256_castps_si256(a), _mm256_slli_epi32(_mm256_cvtps_epi32(n), 23)));
+        _mm256_add_epi32(_mm256_castps_si256(a), _mm256_slli_epi32(_mm256_castps_si256(shifted), 23)));
 }
 
 // out[k] lane i = table[index of lane i + k]

@@ -20,9 +20,11 @@ struct BitTable {
 };
 constexpr BitTable kBitTable{};
 
+constexpr int kBatch = 16;  // triangles at most
+
 // (triangle of the batch, block) pairs, triangle by triangle.
 struct PairList {
-    static constexpr int kCapacity = 16 * 16;
+    static constexpr int kCapacity = kBatch * 16;
     uint8_t triangle[kCapacity + 16];
     uint8_t block[kCapacity + 16];
     int count;
@@ -35,6 +37,13 @@ struct PairList {
         const int middle = count + kBitTable.count[low];
         for (int i = 0; i < 8; ++i) block[middle + i] = static_cast<uint8_t>(kBitTable.positions[high][i] + 8);
         count = middle + kBitTable.count[high];
+    }
+    // Repeats the last pair behind the end, so that pairs can be taken kTogether at a time.
+    ETSPLAT_FN void pad() {
+        for (int i = 0; i < kTogether - 1 && count > 0; ++i) {
+            triangle[count + i] = triangle[count + i - 1];
+            block[count + i] = block[count + i - 1];
+        }
     }
 };
 

@@ -28,10 +28,11 @@ void count_tile(const RasterPass& pass, int index, float* scratch, TileCounts& c
         if (alive_blocks == 0) break;
         const int count = end - next < kBatch ? end - next : kBatch;
         prepare(pass, frame, alive_blocks, pass.entries + next, count, count, batch);
+        evaluate<Kernel>(pass, batch);
         for (int p = 0; p < batch.pairs.count; ++p) {
             const int block = batch.pairs.block[p];
             const Vec before = Vec::load(tile.transmittance[block]);
-            draw<Kernel, Shape::kGeneral>(pass, tile, batch, batch.pairs.triangle[p], block);
+            draw<Shape::kGeneral>(pass, tile, batch, p);
             counts.drawn += count_bits((Vec::load(tile.transmittance[block]) < before).bits());
         }
         for (int i = 0; i < count; ++i) counts.backward_vectors += count_bits(batch.hits[i]);

@@ -6,6 +6,7 @@
 namespace etsplat::neon {
 
 constexpr int kRegisters = 4;
+constexpr int kTogether = 1;
 using Register = float32x4_t;
 struct Mask {
     uint32x4_t v;
@@ -24,7 +25,6 @@ ETSPLAT_FN Register r_min(Register a, Register b) { return vminq_f32(a, b); }
 ETSPLAT_FN Register r_max(Register a, Register b) { return vmaxq_f32(a, b); }
 ETSPLAT_FN Register r_sqrt(Register a) { return vsqrtq_f32(a); }
 ETSPLAT_FN Register r_floor(Register a) { return vrndmq_f32(a); }
-ETSPLAT_FN Register r_round(Register a) { return vrndnq_f32(a); }
 ETSPLAT_FN Mask r_lt(Register a, Register b) { return {vcltq_f32(a, b)}; }
 ETSPLAT_FN Mask r_le(Register a, Register b) { return {vcleq_f32(a, b)}; }
 ETSPLAT_FN Register r_select(Mask m, Register a, Register b) { return vbslq_f32(m.v, a, b); }
@@ -43,12 +43,12 @@ ETSPLAT_FN Mask m_from_bits(unsigned bits) { return {vtstq_u32(vdupq_n_u32(bits)
 
 ETSPLAT_FN void r_split(Register x, Register& mantissa, Register& exponent) {
     const int32x4_t bits = vreinterpretq_s32_f32(x);
-    const int32x4_t e = vshrq_n_s32(vsubq_s32(bits, vdupq_n_s32(0x3f400000)), 23);
-    mantissa = vreinterpretq_f32_s32(vsubq_s32(bits, vshlq_n_s32(e, 23)));
-    exponent = vcvtq_f32_s32(e);
+    const int32x4_t above = vsubq_s32(bits, vdupq_n_s32(0x3f400000));
+    mantissa = vreinterpretq_f32_s32(vsubq_s32(bits, vandq_s32(above, vdupq_n_s32(-(1 << 23)))));
+    exponent = vcvtq_f32_s32(vshrq_n_s32(above, 23));
 }
-ETSPLAT_FN Register r_scale(Register a, Register n) {
-    return vreinterpretq_f32_s32(vaddq_s32(vreinterpretq_s32_f32(a), vshlq_n_s32(vcvtnq_s32_f32(n), 23)));
+ETSPLAT_FN Register r_scale(Register a, Register shifted) {
+    return vreinterpretq_f32_s32(vaddq_s32(vreinterpretq_s32_f32(a), vshlq_n_s32(vreinterpretq_s32_f32(shifted), 23)));
 }
 
 // out[k] lane i = table[index of lane i + k]

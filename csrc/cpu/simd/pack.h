@@ -1,6 +1,7 @@
 // Sixteen float lanes on every instruction set: one AVX-512 register, two of AVX2, four of NEON or of the compiler's own.
 //
-// The engine is written once against Vec and VecMask. ETSPLAT_SIMD names the instruction set that this translation unit
+// The engine is written once against Vec and VecMask, and what is evaluated for several vectors at once against Wide, which
+// is as many as keep the processor busy: a chain of dependent operations alone does not. ETSPLAT_SIMD names the instruction set that this translation unit
 // is compiled for (CMakeLists.txt); everything lives in the namespace of that name, so that no function compiled for a
 // wide instruction set can be linked into a narrow one. For the same reason these headers use no std:: templates.
 #pragma once
@@ -18,42 +19,64 @@ namespace etsplat::ETSPLAT_SIMD {
 constexpr int kLanes = 16;
 constexpr int kLanesPerRegister = kLanes / kRegisters;
 
-struct VecMask {
-    Mask m[kRegisters];
+template <int N>
+struct PackMask {
+    Mask m[N];
 
     ETSPLAT_FN unsigned bits() const {
         unsigned bits = 0;
-        for (int i = 0; i < kRegisters; ++i) bits |= m_bits(m[i]) << (i * kLanesPerRegister);
+        for (int i = 0; i < N; ++i) bits |= m_bits(m[i]) << (i * kLanesPerRegister);
         return bits;
     }
-    ETSPLAT_FN static VecMask from_bits(unsigned bits) {
-        VecMask mask;
-        for (int i = 0; i < kRegisters; ++i) mask.m[i] = m_from_bits(bits >> (i * kLanesPerRegister));
+    ETSPLAT_FN static PackMask from_bits(unsigned bits) {
+        PackMask mask;
+        for (int i = 0; i < N; ++i) mask.m[i] = m_from_bits(bits >> (i * kLanesPerRegister));
         return mask;
     }
 };
 
-struct Vec {
-    Register r[kRegisters];
+template <int N>
+struct Pack {
+    Register r[N];
 
-    Vec() = default;
-    ETSPLAT_FN explicit Vec(float a) {
-        for (int i = 0; i < kRegisters; ++i) r[i] = r_set(a);
+    Pack() = default;
+    ETSPLAT_FN explicit Pack(float a) {
+        for (int i = 0; i < N; ++i) r[i] = r_set(a);
     }
-    ETSPLAT_FN static Vec load(const float* p) {
-        Vec v;
-        for (int i = 0; i < kRegisters; ++i) v.r[i] = r_load(p + i * kLanesPerRegister);
+    ETSPLAT_FN static Pack load(const float* p) {
+        Pack v;
+        for (int i = 0; i < N; ++i) v.r[i] = r_load(p + i * kLanesPerRegister);
         return v;
     }
     ETSPLAT_FN void store(float* p) const {
-        for (int i = 0; i < kRegisters; ++i) r_store(p + i * kLanesPerRegister, r[i]);
+        for (int i = 0; i < N; ++i) r_store(p + i * kLanesPerRegister, r[i]);
     }
 };
 
-#define ETSPLAT_LANEWISE(name, op)                                          \
-    ETSPLAT_FN Vec name(Vec a, Vec b) {                                     \
-        for (int i = 0; i < kRegisters; ++i) a.r[i] = op(a.r[i], b.r[i]);   \
-        return a;                                                           \
+using Vec = Pack<kRegisters>;
+using VecMask = PackMask<kRegisters>;
+using Wide = Pack<kTogether * kRegisters>;  // vectors side by side
+using WideMask = PackMask<kTogether * kRegisters>;
+
+ETSPLAT_FN void put(Wide& wide, int vector, Vec v) {
+    for (int i = 0; i < kRegisters; ++i) wide.r[vector * kRegisters + i] = v.r[i];
+}
+ETSPLAT_FN Vec vector_of(const Wide& wide, int vector) {
+    Vec v;
+    for (int i = 0; i < kRegisters; ++i) v.r[i] = wide.r[vector * kRegisters + i];
+    return v;
+}
+ETSPLAT_FN VecMask vector_of(const WideMask& wide, int vector) {
+    VecMask mask;
+    for (int i = 0; i < kRegisters; ++i) mask.m[i] = wide.m[vector * kRegisters + i];
+    return mask;
+}
+
+#define ETSPLAT_LANEWISE(name, op)                                 \
+    template <int N>                                               \
+    ETSPLAT_FN Pack<N> name(Pack<N> a, Pack<N> b) {                \
+        for (int i = 0; i < N; ++i) a.r[i] = op(a.r[i], b.r[i]);   \
+        return a;                                                  \
     }
 ETSPLAT_LANEWISE(operator+, r_add)
 ETSPLAT_LANEWISE(operator-, r_sub)
@@ -63,22 +86,41 @@ ETSPLAT_LANEWISE(vmin, r_min)
 ETSPLAT_LANEWISE(vmax, r_max)
 #undef ETSPLAT_LANEWISE
 
-#define ETSPLAT_COMPARE(name, op)                                           \
-    ETSPLAT_FN VecMask name(Vec a, Vec b) {                                 \
-        VecMask mask;                                                       \
-        for (int i = 0; i < kRegisters; ++i) mask.m[i] = op(a.r[i], b.r[i]); \
-        return mask;                                                        \
+#define ETSPLAT_EACH(name, op)                             \
+    template <int N>                                       \
+    ETSPLAT_FN Pack<N> name(Pack<N> a) {                   \
+        for (int i = 0; i < N; ++i) a.r[i] = op(a.r[i]);   \
+        return a;                                          \
+    }
+ETSPLAT_EACH(vreciprocal, r_reciprocal)
+ETSPLAT_EACH(vfloor, r_floor)
+ETSPLAT_EACH(vsqrt, r_sqrt)
+#undef ETSPLAT_EACH
+
+#define ETSPLAT_COMPARE(name, op)                                   \
+    template <int N>                                                \
+    ETSPLAT_FN PackMask<N> name(Pack<N> a, Pack<N> b) {             \
+        PackMask<N> mask;                                           \
+        for (int i = 0; i < N; ++i) mask.m[i] = op(a.r[i], b.r[i]); \
+        return mask;                                                \
     }
 ETSPLAT_COMPARE(operator<, r_lt)
 ETSPLAT_COMPARE(operator<=, r_le)
 #undef ETSPLAT_COMPARE
-ETSPLAT_FN VecMask operator>(Vec a, Vec b) { return b < a; }
-ETSPLAT_FN VecMask operator>=(Vec a, Vec b) { return b <= a; }
+template <int N>
+ETSPLAT_FN PackMask<N> operator>(Pack<N> a, Pack<N> b) {
+    return b < a;
+}
+template <int N>
+ETSPLAT_FN PackMask<N> operator>=(Pack<N> a, Pack<N> b) {
+    return b <= a;
+}
 
-#define ETSPLAT_MASKWISE(name, op)                                          \
-    ETSPLAT_FN VecMask name(VecMask a, VecMask b) {                         \
-        for (int i = 0; i < kRegisters; ++i) a.m[i] = op(a.m[i], b.m[i]);   \
-        return a;                                                           \
+#define ETSPLAT_MASKWISE(name, op)                                \
+    template <int N>                                              \
+    ETSPLAT_FN PackMask<N> name(PackMask<N> a, PackMask<N> b) {   \
+        for (int i = 0; i < N; ++i) a.m[i] = op(a.m[i], b.m[i]);  \
+        return a;                                                 \
     }
 ETSPLAT_MASKWISE(operator&, m_and)
 ETSPLAT_MASKWISE(operator|, m_or)
@@ -86,46 +128,49 @@ ETSPLAT_MASKWISE(and_not, m_andnot)
 #undef ETSPLAT_MASKWISE
 
 // a b + c, with one rounding where the instruction set has it
-ETSPLAT_FN Vec vfma(Vec a, Vec b, Vec c) {
-    for (int i = 0; i < kRegisters; ++i) c.r[i] = r_fma(a.r[i], b.r[i], c.r[i]);
+template <int N>
+ETSPLAT_FN Pack<N> vfma(Pack<N> a, Pack<N> b, Pack<N> c) {
+    for (int i = 0; i < N; ++i) c.r[i] = r_fma(a.r[i], b.r[i], c.r[i]);
     return c;
 }
-ETSPLAT_FN Vec vselect(VecMask mask, Vec a, Vec b) {
-    for (int i = 0; i < kRegisters; ++i) a.r[i] = r_select(mask.m[i], a.r[i], b.r[i]);
+template <int N>
+ETSPLAT_FN Pack<N> vselect(PackMask<N> mask, Pack<N> a, Pack<N> b) {
+    for (int i = 0; i < N; ++i) a.r[i] = r_select(mask.m[i], a.r[i], b.r[i]);
     return a;
 }
 // a where mask, else 0
-ETSPLAT_FN Vec keep(VecMask mask, Vec a) {
-    for (int i = 0; i < kRegisters; ++i) a.r[i] = r_keep(mask.m[i], a.r[i]);
+template <int N>
+ETSPLAT_FN Pack<N> keep(PackMask<N> mask, Pack<N> a) {
+    for (int i = 0; i < N; ++i) a.r[i] = r_keep(mask.m[i], a.r[i]);
     return a;
 }
-ETSPLAT_FN Vec vreciprocal(Vec a) {
-    for (int i = 0; i < kRegisters; ++i) a.r[i] = r_reciprocal(a.r[i]);
-    return a;
+template <int N>
+ETSPLAT_FN Pack<N> vabs(Pack<N> a) {
+    return vmax(a, Pack<N>(0.0f) - a);
 }
-ETSPLAT_FN Vec vround(Vec a) {
-    for (int i = 0; i < kRegisters; ++i) a.r[i] = r_round(a.r[i]);
-    return a;
-}
-ETSPLAT_FN Vec vfloor(Vec a) {
-    for (int i = 0; i < kRegisters; ++i) a.r[i] = r_floor(a.r[i]);
-    return a;
-}
-ETSPLAT_FN Vec vsqrt(Vec a) {
-    for (int i = 0; i < kRegisters; ++i) a.r[i] = r_sqrt(a.r[i]);
-    return a;
-}
-ETSPLAT_FN Vec vabs(Vec a) { return vmax(a, Vec(0.0f) - a); }
 
-ETSPLAT_FN bool vany(VecMask mask) { return mask.bits() != 0; }
+template <int N>
+ETSPLAT_FN bool vany(PackMask<N> mask) {
+    return mask.bits() != 0;
+}
 // x = mantissa 2^exponent with mantissa in [3/4, 3/2), for positive normal numbers
-ETSPLAT_FN void vsplit(Vec x, Vec& mantissa, Vec& exponent) {
-    for (int i = 0; i < kRegisters; ++i) r_split(x.r[i], mantissa.r[i], exponent.r[i]);
+template <int N>
+ETSPLAT_FN void vsplit(Pack<N> x, Pack<N>& mantissa, Pack<N>& exponent) {
+    for (int i = 0; i < N; ++i) r_split(x.r[i], mantissa.r[i], exponent.r[i]);
+}
+// A whole number n plus this has n in its lowest bits, and any number of magnitude below 2^22 plus it is rounded to the
+// nearest (to even).
+constexpr float kWhole = 12582912.0f;  // 1.5 * 2^23
+// a 2^n, of n + kWhole
+template <int N>
+ETSPLAT_FN Pack<N> vscale_shifted(Pack<N> a, Pack<N> shifted) {
+    for (int i = 0; i < N; ++i) a.r[i] = r_scale(a.r[i], shifted.r[i]);
+    return a;
 }
 // a 2^n for whole numbers n
-ETSPLAT_FN Vec vscale(Vec a, Vec n) {
-    for (int i = 0; i < kRegisters; ++i) a.r[i] = r_scale(a.r[i], n.r[i]);
-    return a;
+template <int N>
+ETSPLAT_FN Pack<N> vscale(Pack<N> a, Pack<N> n) {
+    return vscale_shifted(a, n + Pack<N>(kWhole));
 }
 // A float of a table at each lane's index, a whole number; four in a row.
 ETSPLAT_FN Vec vlookup(const float* table, Vec index) {
@@ -134,8 +179,9 @@ ETSPLAT_FN Vec vlookup(const float* table, Vec index) {
     for (int i = 0; i < kLanes; ++i) lanes[i] = table[static_cast<int>(lanes[i])];
     return Vec::load(lanes);
 }
-ETSPLAT_FN void vlookup4(const float* table, Vec index, Vec* out) {
-    for (int i = 0; i < kRegisters; ++i) {
+template <int N>
+ETSPLAT_FN void vlookup4(const float* table, Pack<N> index, Pack<N>* out) {
+    for (int i = 0; i < N; ++i) {
         Register columns[4];
         r_lookup4(table, index.r[i], columns);
         for (int k = 0; k < 4; ++k) out[k].r[i] = columns[k];
@@ -143,7 +189,9 @@ ETSPLAT_FN void vlookup4(const float* table, Vec index, Vec* out) {
 }
 
 // log2 of a positive normal number: minimax polynomial of log2(1 + t) / t on [-1/4, 1/2], relative error 1.8e-7.
-ETSPLAT_FN Vec vlog2(Vec x) {
+template <int N>
+ETSPLAT_FN Pack<N> vlog2(Pack<N> x) {
+    using Vec = Pack<N>;
     Vec mantissa, exponent;
     vsplit(x, mantissa, exponent);
     const Vec t = mantissa - Vec(1.0f);
@@ -160,17 +208,19 @@ ETSPLAT_FN Vec vlog2(Vec x) {
 
 // 2^x for x <= 126: minimax polynomial on [-1/2, 1/2], relative error 1e-7. Below -100 it stays at 2^-100, so that
 // products with it are no denormals, which cost some processors a hundred cycles.
-ETSPLAT_FN Vec vexp2(Vec x) {
+template <int N>
+ETSPLAT_FN Pack<N> vexp2(Pack<N> x) {
+    using Vec = Pack<N>;
     x = vmax(x, Vec(-100.0f));
-    const Vec n = vround(x);
-    const Vec f = x - n;
+    const Vec shifted = x + Vec(kWhole);
+    const Vec f = x - (shifted - Vec(kWhole));
     Vec p = Vec(0.00132764188f);
     p = vfma(p, f, Vec(0.00967554163f));
     p = vfma(p, f, Vec(0.0555071344f));
     p = vfma(p, f, Vec(0.240221197f));
     p = vfma(p, f, Vec(0.693146967f));
     p = vfma(p, f, Vec(1.00000007f));
-    return vscale(p, n);
+    return vscale_shifted(p, shifted);
 }
 
 ETSPLAT_FN float lane_sum(Vec a) {

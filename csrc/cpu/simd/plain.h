@@ -8,6 +8,8 @@
 
 namespace etsplat::plain {
 
+constexpr int kTogether = 1;
+
 #if defined(__GNUC__) || defined(__clang__)
 
 constexpr int kRegisters = 4;
@@ -89,19 +91,17 @@ ETSPLAT_FN Mask m_andnot(Mask a, Mask b) { return a & ~b; }
 ETSPLAT_FN Register r_keep(Mask m, Register a) { return from_bits(m & to_bits(a)); }
 ETSPLAT_FN Register r_select(Mask m, Register a, Register b) { return from_bits((m & to_bits(a)) | (~m & to_bits(b))); }
 
-// For |a| < 2^22, to even; without a library call, which rounding is on x86 without SSE4.1.
-ETSPLAT_FN Register r_round(Register a) { return (a + r_set(12582912.0f)) - r_set(12582912.0f); }
-// For |a| < 2^31, without one too.
+// For |a| < 2^31, without a library call, which rounding is on x86 without SSE4.1.
 ETSPLAT_FN Register r_floor(Register a) {
     const Register towards_zero = real(whole(a));
     return towards_zero - r_keep(r_lt(a, towards_zero), r_set(1.0f));
 }
 
 ETSPLAT_FN void r_split(Register x, Register& mantissa, Register& exponent) {
-    const Mask bits = to_bits(x), e = (bits - 0x3f400000) >> 23;
-    mantissa = from_bits(bits - (e << 23));
-    exponent = real(e);
+    const Mask bits = to_bits(x), above = bits - 0x3f400000;
+    mantissa = from_bits(bits - (above & -(1 << 23)));
+    exponent = real(above >> 23);
 }
-ETSPLAT_FN Register r_scale(Register a, Register n) { return from_bits(to_bits(a) + (whole(n) << 23)); }
+ETSPLAT_FN Register r_scale(Register a, Register shifted) { return from_bits(to_bits(a) + (to_bits(shifted) << 23)); }
 
 }  // namespace etsplat::plain

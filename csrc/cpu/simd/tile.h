@@ -95,6 +95,8 @@ struct TriangleForms {
         return mask.bits();
     }
     ETSPLAT_FN Vec value(int k, int block) const { return Vec(at_block[k][block]) + Vec::load(in_block[k]); }
+    // The normalised distance x of the lanes
+    ETSPLAT_FN Vec distance(int block) const { return vmax(value(0, block), vmax(value(1, block), value(2, block))); }
     // p - q of the lanes
     ETSPLAT_FN Vec dx(int block) const { return Vec::load(kLaneX) + Vec(center_x + kBlockX[block]); }
     ETSPLAT_FN Vec dy(int block) const { return Vec::load(kLaneY) + Vec(center_y + kBlockY[block]); }

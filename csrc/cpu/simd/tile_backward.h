@@ -7,7 +7,7 @@
 // for any number of threads.
 #pragma once
 
-#include "tile.h"
+#include "backward_batch.h"
 
 namespace etsplat::ETSPLAT_SIMD {
 
@@ -93,6 +93,20 @@ ETSPLAT_FN void begin(const RasterPass& pass, BackwardTile& tile, const TileFram
         Vec(1.0f).store(tile.transmittance[block]);
         if (!rows) load_block(pass, tile, frame, block);
         if (pass.grad_distortion) load_distortion(pass, tile, frame, block);
+    }
+}
+
+// Asks for the pixels of a tile while the one before it is differentiated: its rows lie too far apart to be foreseen.
+ETSPLAT_FN void prefetch_images(const RasterPass& pass, int index) {
+    if (index >= pass.tiles_x * pass.tiles_y || pass.tile_begin[index] == pass.tile_done[index]) return;
+    const TileFrame frame(pass, index);
+    const int channels = pass.channels();
+    for (int row = 0; row < frame.rows; ++row) {
+        const int64_t first = (int64_t{frame.y0 + row} * pass.width + frame.x0) * channels;
+        for (int i = 0; i < frame.columns * channels; i += 16) {
+            prefetch(pass.color + first + i);
+            prefetch(pass.grad_color + first + i);
+        }
     }
 }
 
@@ -227,32 +241,25 @@ struct ExtraGradients {
     }
 };
 
-template <class Kernel, Shape kShape>
-ETSPLAT_FN void differentiate(const RasterPass& pass, BackwardTile& tile, const TileFrame& frame, const TileEntry& entry) {
-    unsigned blocks = pass.hits[entry.slot];
-    if (blocks == 0) return;
-    const TriangleRecord& record = pass.records[entry.triangle];
-    TriangleForms forms;
-    forms.prepare(record, frame);
-
+// Gradients of one triangle of the batch, over the blocks in which it was drawn.
+template <Shape kShape>
+ETSPLAT_FN void differentiate(const RasterPass& pass, BackwardTile& tile, const BackwardBatch& batch, int triangle) {
+    const TileEntry& entry = batch.entries[triangle];
+    const TriangleForms& forms = batch.forms[triangle];
     const int flat = flat_channels<kShape>(pass);
     const float* color = pass.flat_colors + int64_t{entry.triangle} * flat;
-    const Kernel kernel = kernel_with<Kernel>(pass.kernel_table);
-    const Vec exponent(record.exponent), scale(record.scale), opacity(record.opacity), extent(record.extent);
-    const Vec alpha_min(pass.alpha_min), alpha_max(pass.alpha_max), transmittance_min(pass.transmittance_min);
+    const Vec opacity(pass.records[entry.triangle].opacity);
+    const Vec alpha_max(pass.alpha_max), transmittance_min(pass.transmittance_min);
     SlotSums<kShape> sums(pass, tile.sums);
 
-    // not for_each_bit: a lambda of this size would be a call, and the sums no registers
-    for (; blocks != 0; blocks &= blocks - 1) {
-        const int block = lowest_bit(blocks);
-        const Vec form[3] = {forms.value(0, block), forms.value(1, block), forms.value(2, block)};
-        const Vec x = vmax(form[0], vmax(form[1], form[2]));
-        const KernelValue<Vec> gain = kernel.gradient(x, exponent, scale);
-        const Vec raw_alpha = opacity * gain.value;
+    for (int pair = batch.begin[triangle]; pair < batch.begin[triangle + 1]; ++pair) {
+        const int block = batch.pairs.block[pair];
+        const PairGradient& gain = batch.gradients[pair];
+        const Vec value = Vec::load(gain.value), raw_alpha = opacity * value;
         const Vec alpha = vmin(raw_alpha, alpha_max);
         const Vec transmittance = Vec::load(tile.transmittance[block]);
         const unsigned alive = tile.alive[block];
-        const VecMask mask = (x <= extent) & (alpha >= alpha_min) & VecMask::from_bits(alive);
+        const VecMask mask = VecMask::from_bits(alive & batch.visible[pair]);
         Vec w = alpha * transmittance;
         const VecMask stop = mask & (transmittance - w < transmittance_min);
         tile.alive[block] = static_cast<uint16_t>(alive & ~stop.bits());
@@ -269,6 +276,7 @@ ETSPLAT_FN void differentiate(const RasterPass& pass, BackwardTile& tile, const 
         }
         if constexpr (kShape != Shape::kFlat)
             if (kShape == Shape::kCorner || pass.attributes || pass.grad_distortion) {
+                const Vec form[3] = {forms.value(0, block), forms.value(1, block), forms.value(2, block)};
                 ExtraGradients<kShape> extra(pass, entry.triangle);
                 cotangent = cotangent + extra.cotangent(tile, form, block);
                 extra.accumulate(tile, block, drawn, w, sums, grad_form);
@@ -278,16 +286,14 @@ ETSPLAT_FN void differentiate(const RasterPass& pass, BackwardTile& tile, const 
         Vec grad_alpha = transmittance * cotangent - remaining * vreciprocal(Vec(1.0f) - alpha);
         grad_alpha = keep(drawn & (raw_alpha < alpha_max), grad_alpha);
 
-        sums.v[SlotLayout::kOpacity] = vfma(grad_alpha, gain.value, sums.v[SlotLayout::kOpacity]);
+        sums.v[SlotLayout::kOpacity] = vfma(grad_alpha, value, sums.v[SlotLayout::kOpacity]);
         const Vec grad_kernel = grad_alpha * opacity;
-        sums.v[SlotLayout::kSigma] = vfma(grad_kernel, gain.dsigma, sums.v[SlotLayout::kSigma]);
-        const Vec grad_x = grad_kernel * gain.dx;
+        sums.v[SlotLayout::kSigma] = vfma(grad_kernel, Vec::load(gain.dsigma), sums.v[SlotLayout::kSigma]);
 
         const Vec dx = forms.dx(block), dy = forms.dy(block);
-        const VecMask first = form[0] >= x, second = and_not(form[1] >= x, first);
-        const Vec part[3] = {keep(first, grad_x), keep(second, grad_x), keep(and_not(and_not(drawn, first), second), grad_x)};
         for (int k = 0; k < 3; ++k) {
-            grad_form[k] = grad_form[k] + part[k];
+            const Vec part = grad_kernel * Vec::load(gain.slope[k]);
+            grad_form[k] = kShape == Shape::kFlat ? part : grad_form[k] + part;
             sums.v[SlotLayout::kMoment + k] = sums.v[SlotLayout::kMoment + k] + grad_form[k];
             sums.v[SlotLayout::kMomentX + k] = vfma(grad_form[k], dx, sums.v[SlotLayout::kMomentX + k]);
             sums.v[SlotLayout::kMomentY + k] = vfma(grad_form[k], dy, sums.v[SlotLayout::kMomentY + k]);
@@ -300,6 +306,7 @@ ETSPLAT_FN void differentiate(const RasterPass& pass, BackwardTile& tile, const 
 
 template <class Kernel, Shape kShape>
 void backward_tile(const RasterPass& pass, int index, float* scratch) {
+    if (pass.tile_begin[index] == pass.tile_done[index] && !pass.tile_background) return;
     const TileFrame frame(pass, index);
     BackwardTile tile;
     tile.grad_color = scratch;
@@ -308,14 +315,13 @@ void backward_tile(const RasterPass& pass, int index, float* scratch) {
     tile.sums = scratch + 256 * pass.channels();
     begin(pass, tile, frame, kGeneral);
     if (pass.tile_background) background_gradient(pass, tile, frame, pass.tile_background + int64_t{index} * pass.channels());
-    constexpr int kAhead = 8;
+    prefetch_images(pass, index + 1);
+    BackwardBatch batch;
     const int end = pass.tile_done[index];
-    for (int i = pass.tile_begin[index]; i < end; ++i) {
-        const TileEntry& coming = pass.entries[i + kAhead < end ? i + kAhead : end - 1];
-        prefetch(pass.records + coming.triangle);
-        prefetch(pass.hits + coming.slot);
-        prefetch_colors(pass, coming.triangle);
-        differentiate<Kernel, kShape>(pass, tile, frame, pass.entries[i]);
+    for (int next = pass.tile_begin[index]; next < end;) {
+        next = collect(pass, frame, next, end, batch);
+        evaluate<Kernel>(pass, batch);
+        for (int i = 0; i < batch.count; ++i) differentiate<kShape>(pass, tile, batch, i);
     }
 }
 

@@ -1,10 +1,11 @@
 // Front-to-back compositing of one tile (paper, equation 1).
 //
 // Triangles come in batches. For each, one vector test over the 16 blocks finds those it can touch; the (triangle, block)
-// pairs of the batch are listed, and each is one vector of 16 pixels. The list keeps the loop over pairs free of
-// branches that depend on what was just computed: a mispredicted one would wait for the whole chain of a kernel
-// evaluation (some 150 cycles) before work on the next pair could start. For the same reason dead pixels are masked at
-// the end of that chain, and dead blocks drop out between batches only.
+// pairs of the batch are listed, and each is one vector of 16 pixels. First the kernel is evaluated for all of them, then
+// they are drawn in order. A kernel is a chain of some 150 cycles, longer than what a processor looks ahead, so several
+// vectors go through it side by side (Wide), which is possible because nothing in it depends on other triangles: dead
+// pixels are masked when they are drawn, and dead blocks drop out between batches only. The list keeps the loops
+// free of branches that depend on what was just computed.
 // Colour and transmittance of the tile stay in the first-level cache.
 #pragma once
 
@@ -89,14 +90,14 @@ ETSPLAT_FN void draw_extras(const RasterPass& pass, ForwardTile& tile, const Vec
     }
 }
 
-constexpr int kBatch = 16;
-
 struct Batch {
     TriangleForms forms[kBatch];
     Vec largest_weight[kBatch];
     TileEntry entries[kBatch];
     unsigned hits[kBatch];
     PairList pairs;
+    float alpha[PairList::kCapacity + kTogether][16];  // of each pair
+    uint16_t visible[PairList::kCapacity + kTogether];  // lanes within the extent, with enough alpha
 };
 
 ETSPLAT_FN void prepare(const RasterPass& pass, const TileFrame& frame, unsigned alive_blocks, const TileEntry* entries,
@@ -117,23 +118,43 @@ ETSPLAT_FN void prepare(const RasterPass& pass, const TileFrame& frame, unsigned
     }
 }
 
-// One triangle over one block.
-template <class Kernel, Shape kShape>
-ETSPLAT_FN void draw(const RasterPass& pass, ForwardTile& tile, Batch& batch, int i, int block) {
-    const TriangleForms& forms = batch.forms[i];
+// Alpha of all pairs.
+template <class Kernel>
+ETSPLAT_FN void evaluate(const RasterPass& pass, Batch& batch) {
+    const Kernel kernel = kernel_with<Kernel>(pass.kernel_table);
+    batch.pairs.pad();
+    for (int p = 0; p < batch.pairs.count; p += kTogether) {
+        Wide x, exponent, scale, opacity, extent;
+        for (int j = 0; j < kTogether; ++j) {
+            const int i = batch.pairs.triangle[p + j];
+            const TriangleRecord& record = pass.records[batch.entries[i].triangle];
+            put(x, j, batch.forms[i].distance(batch.pairs.block[p + j]));
+            put(exponent, j, Vec(record.exponent));
+            put(scale, j, Vec(record.scale));
+            put(opacity, j, Vec(record.opacity));
+            put(extent, j, Vec(record.extent));
+        }
+        const Wide alpha = vmin(opacity * kernel.value(x, exponent, scale), Wide(pass.alpha_max));
+        const WideMask visible = (x <= extent) & (alpha >= Wide(pass.alpha_min));
+        for (int j = 0; j < kTogether; ++j) {
+            vector_of(alpha, j).store(batch.alpha[p + j]);
+            batch.visible[p + j] = static_cast<uint16_t>(vector_of(visible, j).bits());
+        }
+    }
+}
+
+// Draws a pair: one triangle over one block.
+template <Shape kShape>
+ETSPLAT_FN void draw(const RasterPass& pass, ForwardTile& tile, Batch& batch, int pair) {
+    const int i = batch.pairs.triangle[pair], block = batch.pairs.block[pair];
     const int triangle = batch.entries[i].triangle;
-    const TriangleRecord& record = pass.records[triangle];
     const int flat = flat_channels<kShape>(pass);
     const float* color = pass.flat_colors + int64_t{triangle} * flat;
 
-    const Vec form[3] = {forms.value(0, block), forms.value(1, block), forms.value(2, block)};
-    const Vec x = vmax(form[0], vmax(form[1], form[2]));
-    const Kernel kernel = kernel_with<Kernel>(pass.kernel_table);
-    const Vec gain = kernel.value(x, Vec(record.exponent), Vec(record.scale));
-    const Vec alpha = vmin(Vec(record.opacity) * gain, Vec(pass.alpha_max));
+    const Vec alpha = Vec::load(batch.alpha[pair]);
     const Vec transmittance = Vec::load(tile.transmittance[block]);
     const unsigned alive = tile.alive[block];
-    const VecMask mask = (x <= Vec(record.extent)) & (alpha >= Vec(pass.alpha_min)) & VecMask::from_bits(alive);
+    const VecMask mask = VecMask::from_bits(alive & batch.visible[pair]);
     Vec w = alpha * transmittance;
     const VecMask stop = mask & (transmittance - w < Vec(pass.transmittance_min));
     w = keep(and_not(mask, stop), w);
@@ -145,7 +166,11 @@ ETSPLAT_FN void draw(const RasterPass& pass, ForwardTile& tile, Batch& batch, in
         vfma(w, Vec(color[c]), Vec::load(out)).store(out);
     }
     if (pass.slot_weight) batch.largest_weight[i] = vmax(batch.largest_weight[i], w);
-    if constexpr (kShape != Shape::kFlat) draw_extras<kShape>(pass, tile, form, triangle, block, transmittance, w);
+    if constexpr (kShape != Shape::kFlat) {
+        const TriangleForms& forms = batch.forms[i];
+        const Vec form[3] = {forms.value(0, block), forms.value(1, block), forms.value(2, block)};
+        draw_extras<kShape>(pass, tile, form, triangle, block, transmittance, w);
+    }
 }
 
 // Whole tiles of the fast pass, a row of pixels at a time.
@@ -206,8 +231,8 @@ void forward_tile(const RasterPass& pass, int index, float* scratch) {
         const int count = end - next < kBatch ? end - next : kBatch;
         const int ahead = end - next < 2 * kBatch ? end - next : 2 * kBatch;
         prepare(pass, frame, alive_blocks, pass.entries + next, count, ahead, batch);
-        for (int p = 0; p < batch.pairs.count; ++p)
-            draw<Kernel, kShape>(pass, tile, batch, batch.pairs.triangle[p], batch.pairs.block[p]);
+        evaluate<Kernel>(pass, batch);
+        for (int p = 0; p < batch.pairs.count; ++p) draw<kShape>(pass, tile, batch, p);
         for (int i = 0; i < count; ++i) {
             if (pass.hits) pass.hits[batch.entries[i].slot] = static_cast<uint16_t>(batch.hits[i]);
             if (pass.slot_weight) pass.slot_weight[batch.entries[i].slot] = lane_max(batch.largest_weight[i]);
