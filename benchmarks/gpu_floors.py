@@ -67,7 +67,7 @@ FORWARD_PAIR_INSTRUCTIONS = 66  # per (slot, sub-tile) pair
 FORWARD_SLOT_INSTRUCTIONS = 22  # staging, the test of eight sub-tiles, eight warps looking for theirs
 BACKWARD_PAIR_INSTRUCTIONS = 211  # per pair, 16 shuffles among them
 BACKWARD_SLOT_INSTRUCTIONS = 45  # staging, adding the warps' sums, compaction
-REDUCE_INSTRUCTIONS = 1650  # per 32 triangles
+REDUCE_INSTRUCTIONS = 940  # per 32 triangles of up to five slots, none of which needs a slow path of a quotient or root
 
 
 def floors(work: Work, peaks: Peaks) -> list[Floor]:

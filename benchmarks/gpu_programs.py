@@ -19,6 +19,11 @@ def block_size(program: Program) -> int:
     return THREADS.get(program.file, BLOCK)
 
 
+def reduction(cameras: int, *values: int) -> Program:
+    """What adds up the tile loops' sums, for these definitions of theirs."""
+    return Program("raster_reduce.cu", (*tile_loops("", *values)[1:], ("CAMERAS", cameras)))
+
+
 def tile_loops(kernel: str, *values: int) -> tuple[tuple[str, int | str], ...]:
     """Definitions of csrc/cuda/raster_tile.h: FLAT, CORNER, DISTORTION, MEDIAN, WEIGHTS."""
     names = ("FLAT", "CORNER", "DISTORTION", "MEDIAN", "WEIGHTS")
@@ -30,7 +35,7 @@ PROGRAMS = [
     Program("radix_sort.cu"),
     Program("raster_forward.cu", tile_loops("Elastic", 3, 0, 0, 0, 0), flush=True),
     Program("raster_backward.cu", tile_loops("Elastic", 3, 0, 0, 0, 0), flush=True),
-    Program("raster_reduce.cu", tile_loops("Elastic", 3, 0, 0, 0, 0)[1:]),
+    reduction(0, 3, 0, 0, 0, 0),
     Program("fill.cu"),
     *(Program(file, contract=False) for file in ("adam.cu", "antialias.cu", "mesh_energies.cu", "photometric.cu")),
     *(Program(file, contract=False) for file in ("rasterize_opaque.cu", "soup_statistics.cu", "step.cu")),
@@ -43,7 +48,8 @@ VARIANTS = [
     Program("raster_forward.cu", tile_loops("SingleSided", 6, 1, 1, 1, 1), flush=True),
     Program("raster_backward.cu", tile_loops("Bilateral", 16, 0, 2, 0, 0), flush=True),
     Program("raster_backward.cu", tile_loops("Hard", 0, 16, 1, 0, 0), flush=True),
-    Program("raster_reduce.cu", tile_loops("Elastic", 6, 1, 1, 0, 0)[1:]),
+    reduction(1, 3, 0, 0, 0, 0),
+    reduction(1, 6, 1, 1, 0, 0),
     Program("raster_forward.cu", tile_loops("Tabulated", 3, 0, 0, 0, 0), flush=True),
     Program("raster_backward.cu", tile_loops("Tabulated", 3, 0, 0, 0, 0), flush=True),
 ]

@@ -1,9 +1,11 @@
 // The end of the backward pass: the slots of each triangle are added up in order, and the sums become gradients.
 //
-//   raster_reduce  a thread per triangle, through all views; triangles with more than kManySlots slots are added up by the
-//                  whole warp. What is summed over triangles (one sigma, cameras) is left as a sum per block.
+//   raster_reduce  a thread per triangle, in one view; what is summed over views is added to what the launches for the views
+//                  before have left, as sums over views kept in registers would halve the occupancy. Triangles with more
+//                  than kManySlots slots are added up by the whole warp. What is summed over triangles (one sigma, cameras)
+//                  is left as a sum per view and block.
 //   raster_gather  a thread per vertex adds the gradients of its corners, in order
-// Definitions as in raster_tile.h; every output is written, none is added to.
+// Definitions as in raster_tile.h, and CAMERAS (0, 1: gradients of cameras are wanted).
 #include "cuda/block_sum.h"
 #include "cuda/raster_tile.h"
 
@@ -46,71 +48,76 @@ __device__ __forceinline__ void sum_slots(const RasterPass& pass, int m, bool in
     }
 }
 
-// Adds a triangle's geometry gradient in one view to grad_world (9), and its part of the camera's (kCameraGradients).
-__device__ __forceinline__ void add_geometry(const RasterPass& pass, int triangle, int view_index,
-                                             const float (&sums)[kStride], float* grad_world, float* camera_part) {
-    const PinholeCamera camera = load_camera(pass, view_index);
-    const Distance distance = static_cast<Distance>(pass.distance);
-    float world[9], view[9], grad_view[9], gx[3], gy[3];
-    Triangle2D<float> t;
-    load_corners(pass, triangle, world);
-    project_triangle(camera, pass.near_plane, distance, world, view, t);
-    const SlotLayout layout = kLayout;
-    view_gradient(camera, distance, pass.freeze_inradius != 0, layout, sums, view, t, grad_view, gx, gy);
-    for (int k = 0; k < 3; ++k) {
-        float grad[3];
-        to_world_gradient(camera, grad_view + 3 * k, grad);
-        for (int c = 0; c < 3; ++c) grad_world[3 * k + c] += grad[c];
+// What is summed over views begins with the first.
+__device__ __forceinline__ void accumulate(float& sum, bool first, float value) { sum = (first ? 0.0f : sum) + value; }
+
+// Gradients by what a triangle has beside its corners: opacity, softness, colours.
+__device__ __forceinline__ void store_attributes(const RasterPass& pass, int triangle, long long m, bool first,
+                                                 const float (&sums)[kStride]) {
+    if (pass.grad_opacities) accumulate(pass.grad_opacities[triangle], first, sums[SlotLayout::kOpacity]);
+    if (pass.grad_sigmas) accumulate(pass.grad_sigmas[triangle], first, sums[SlotLayout::kSigma]);
+    if (pass.grad_flat) {
+        float* row = pass.grad_flat + (pass.flat_per_view ? m : triangle) * FLAT;
+        for (int c = 0; c < FLAT; ++c) accumulate(row[c], first || pass.flat_per_view, sums[SlotLayout::kFlat + c]);
     }
-    camera_gradient(world, view, grad_view, gx, gy, [&](int number, const float* a, const float* b) {
-        for (int k = 0; k < 3; ++k) camera_part[number] += a[k] * b[k];
-    });
+    if (pass.grad_corner_colors) {
+        float* row = pass.grad_corner_colors + (pass.corner_per_view ? m : triangle) * 3 * CORNER;
+        for (int j = 0; j < 3 * CORNER; ++j) accumulate(row[j], first || pass.corner_per_view, sums[kLayout.corner() + j]);
+    }
 }
+
+// A triangle's corners in the world and in a view, and the gradients by the latter and by their projections.
+struct Geometry {
+    float world[9] = {}, view[9] = {}, grad_view[9] = {}, gx[3] = {}, gy[3] = {};
+
+    __device__ __forceinline__ void evaluate(const RasterPass& pass, int view_index, int triangle,
+                                             const float (&sums)[kStride]) {
+        const PinholeCamera camera = load_camera(pass, view_index);
+        const Distance distance = static_cast<Distance>(pass.distance);
+        const SlotLayout layout = kLayout;
+        Triangle2D<float> t;
+        load_corners(pass, triangle, world);
+        project_triangle(camera, pass.near_plane, distance, world, view, t);
+        view_gradient(camera, distance, pass.freeze_inradius != 0, layout, sums, view, t, grad_view, gx, gy);
+    }
+};
 
 }  // namespace etsplat
 
 using namespace etsplat;
 
-extern "C" __global__ void __launch_bounds__(128) raster_reduce(const __grid_constant__ RasterPass pass) {
+extern "C" __global__ void __launch_bounds__(128) raster_reduce(const __grid_constant__ RasterPass pass, int view) {
     __shared__ double part[kReduceBlock / kWarp];
     const int triangle = blockIdx.x * kReduceBlock + threadIdx.x;
-    const bool inside = triangle < pass.triangles;
-    const bool geometry = pass.grad_corners || pass.camera_sums;
-    float grad_world[9] = {}, grad_opacity = 0.0f, grad_sigma = 0.0f, flat[FLAT > 0 ? FLAT : 1] = {};
-    float corner[CORNER > 0 ? 3 * CORNER : 1] = {};
-    for (int view = 0; view < pass.views; ++view) {
-        const long long m = static_cast<long long>(view) * pass.triangles + triangle;
-        float sums[kStride], camera_part[kCameraGradients] = {};
-        sum_slots(pass, static_cast<int>(inside ? m : 0), inside, sums);
-        const bool drawn = inside && span_count(pass.spans[2 * m + 1]) > 0;
-        // elsewhere not even the projection may be finite
-        if (drawn && geometry) add_geometry(pass, triangle, view, sums, grad_world, camera_part);
-        grad_opacity += sums[SlotLayout::kOpacity];
-        grad_sigma += sums[SlotLayout::kSigma];
-        for (int c = 0; c < FLAT; ++c) flat[c] = sums[SlotLayout::kFlat + c] + (pass.flat_per_view ? 0.0f : flat[c]);
-        for (int c = 0; c < 3 * CORNER; ++c)
-            corner[c] = sums[kLayout.corner() + c] + (pass.corner_per_view ? 0.0f : corner[c]);
-        if (inside && pass.grad_flat && (pass.flat_per_view || view == pass.views - 1))
-            for (int c = 0; c < FLAT; ++c) pass.grad_flat[(pass.flat_per_view ? m : triangle) * FLAT + c] = flat[c];
-        if (inside && pass.grad_corner_colors && (pass.corner_per_view || view == pass.views - 1))
-            for (int c = 0; c < 3 * CORNER; ++c)
-                pass.grad_corner_colors[(pass.corner_per_view ? m : triangle) * 3 * CORNER + c] = corner[c];
-        if (pass.camera_sums)
-            for (int j = 0; j < kCameraGradients; ++j) {
-                const double sum = block_sum<kReduceBlock>(camera_part[j], part);
-                const long long block = static_cast<long long>(view) * gridDim.x + blockIdx.x;
-                if (threadIdx.x == 0) pass.camera_sums[block * kCameraGradients + j] = sum;
-            }
-    }
+    const long long m = static_cast<long long>(view) * pass.triangles + triangle;
+    const long long block = static_cast<long long>(view) * gridDim.x + blockIdx.x;
+    const bool inside = triangle < pass.triangles, first = view == 0;
+    const bool drawn = inside && span_count(pass.spans[2 * m + 1]) > 0;
+    float sums[kStride];
+    sum_slots(pass, static_cast<int>(inside ? m : 0), inside, sums);
+    if (inside) store_attributes(pass, triangle, m, first, sums);
     if (pass.sigma_sums) {
-        const double sum = block_sum<kReduceBlock>(grad_sigma, part);
-        if (threadIdx.x == 0) pass.sigma_sums[blockIdx.x] = sum;
+        const double sum = block_sum<kReduceBlock>(sums[SlotLayout::kSigma], part);
+        if (threadIdx.x == 0) pass.sigma_sums[block] = sum;
     }
-    if (!inside) return;
-    if (pass.grad_corners)
-        for (int j = 0; j < 9; ++j) pass.grad_corners[9ll * triangle + j] = grad_world[j];
-    if (pass.grad_opacities) pass.grad_opacities[triangle] = grad_opacity;
-    if (pass.grad_sigmas) pass.grad_sigmas[triangle] = grad_sigma;
+    if (!CAMERAS && !pass.grad_corners) return;
+    Geometry geometry;
+    if (drawn) geometry.evaluate(pass, view, triangle, sums);  // elsewhere not even the camera may be finite
+    const PinholeCamera camera = load_camera(pass, view);  // again: to keep it costs registers
+    if (inside && pass.grad_corners)
+        for (int k = 0; k < 3; ++k) {
+            float grad[3] = {};
+            if (drawn) to_world_gradient(camera, geometry.grad_view + 3 * k, grad);
+            for (int c = 0; c < 3; ++c) accumulate(pass.grad_corners[9ll * triangle + 3 * k + c], first, grad[c]);
+        }
+    if constexpr (CAMERAS)
+        camera_gradient(geometry.world, geometry.view, geometry.grad_view, geometry.gx, geometry.gy,
+                        [&](int number, const float* a, const float* b) {
+                            float value = 0.0f;
+                            for (int k = 0; k < 3; ++k) value += a[k] * b[k];
+                            const double sum = block_sum<kReduceBlock>(drawn ? value : 0.0f, part);
+                            if (threadIdx.x == 0) pass.camera_sums[block * kCameraGradients + number] = sum;
+                        });
 }
 
 extern "C" __global__ void raster_gather(const float* grad_corners, const int* offsets, const int* corners, int vertices, float* grad_vertices) {

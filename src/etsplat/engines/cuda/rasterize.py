@@ -162,8 +162,9 @@ class CudaRender:
         grads = PerInput(*(None if t is None else torch.empty_like(t) for t in wanted))
         gathered, shared_sigma = needed.vertices and geometry.faces is not None, inputs.sigma.dim() == 0
         corners = room(True, geometry.count, 3, 3) if gathered else grads.vertices
-        sigma_sums = room(needed.sigma and shared_sigma, grid, dtype=torch.float64)
-        camera_sums = room(needed.viewmats or needed.Ks, views, grid, _native.CAMERA_GRADIENTS, dtype=torch.float64)
+        sigma_sums = room(needed.sigma and shared_sigma, views, grid, dtype=torch.float64)
+        cameras = needed.viewmats or needed.Ks
+        camera_sums = room(cameras, views, grid, _native.CAMERA_GRADIENTS, dtype=torch.float64)
         background = room(needed.backgrounds, views, self.tile_count // views, self.flat + self.corner)
         stride = _native.slot_stride(flat_channels=self.flat, corner_channels=self.corner, distortion=distortion)
         sums = room(True, a.capacity * stride)
@@ -171,10 +172,11 @@ class CudaRender:
         a.set(grad_corners=corners, grad_flat=grads.flat, grad_corner_colors=grads.corner)
         a.set(grad_opacities=grads.opacities, grad_sigmas=None if shared_sigma else grads.sigma)
         a.set(sigma_sums=sigma_sums, camera_sums=camera_sums, tile_background=background)
-        reduction = Program("raster_reduce.cu", defines[1:])
+        reduction = Program("raster_reduce.cu", (*defines[1:], ("CAMERAS", int(cameras))))
         program = Program("raster_backward.cu", defines, flush=True)
         launch(program, "raster_backward", self.tile_count, _TILE_THREADS, [a])
-        launch(reduction, "raster_reduce", grid, _REDUCE_BLOCK, [a])
+        for view in range(views):
+            launch(reduction, "raster_reduce", grid, _REDUCE_BLOCK, [a, view])
         if gathered:
             count = geometry.vertex_count
             launch_each(reduction, "raster_gather", count, [corners, *geometry.corners, count, grads.vertices])
