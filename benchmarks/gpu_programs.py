@@ -7,7 +7,8 @@ from etsplat.engines.cuda.structs import constant
 
 # Threads of a block, of kernels that do not say it themselves; BLOCK in other files.
 THREADS = {
-    **{file: constant(f"cuda/{file}", "kThreads") for file in ("rasterize_opaque.cu", "spherical_harmonics.cu")},
+    "rasterize_opaque.cu": constant("cuda/rasterize_opaque.cu", "kThreads"),
+    **dict.fromkeys(("soup_colors.cu", "spherical_harmonics.cu"), constant("cuda/staged_rows.h", "kThreads")),
     "triangle_channels.cu": CHANNELS_THREADS,
     "step.cu": 1,
     "weighted_sum.cu": 1,
@@ -41,7 +42,9 @@ PROGRAMS = [
     *(Program(file, contract=False) for file in ("rasterize_opaque.cu", "soup_statistics.cu", "step.cu")),
     *(Program(file, contract=False) for file in ("normal_consistency.cu", "pick_values.cu", "triangle_channels.cu")),
     *(Program(file, contract=False) for file in ("texture.cu", "triangle_area.cu", "weighted_sum.cu")),
-    *(Program(file) for file in ("soup_activation.cu", "spherical_harmonics.cu")),
+    Program("soup_activation.cu"),
+    Program("soup_colors.cu", (("DEGREE", 3), ("BASES", 15))),
+    Program("spherical_harmonics.cu", (("DEGREE", 3), ("BASES", 16), ("CHANNELS", 3))),
 ]
 # Other definitions of what is compiled above.
 VARIANTS = [
@@ -50,6 +53,10 @@ VARIANTS = [
     Program("raster_backward.cu", tile_loops("Hard", 0, 16, 1, 0, 0), flush=True),
     reduction(1, 3, 0, 0, 0, 0),
     reduction(1, 6, 1, 1, 0, 0),
+    *(Program("soup_colors.cu", (("DEGREE", degree), ("BASES", 15))) for degree in range(3)),
+    Program("soup_colors.cu", (("DEGREE", 0), ("BASES", 0))),
+    Program("spherical_harmonics.cu", (("DEGREE", 0), ("BASES", 16), ("CHANNELS", 48))),
+    Program("spherical_harmonics.cu", (("DEGREE", 3), ("BASES", 16), ("CHANNELS", 20))),
     Program("raster_forward.cu", tile_loops("Tabulated", 3, 0, 0, 0, 0), flush=True),
     Program("raster_backward.cu", tile_loops("Tabulated", 3, 0, 0, 0, 0), flush=True),
 ]

@@ -123,6 +123,23 @@ def test_what_is_contracted_is_rounded_once(contract):
     assert float(out) == (-(2.0**-26) if contract else 0.0)
 
 
+BESIDE = """
+extern "C" __global__ void beside(const int* in, int* out) {
+    __shared__ int cells[8];
+    cells[threadIdx.x] = 10 * threadIdx.x;
+    __syncthreads();
+    if (threadIdx.x == 0) *out = (cells + 4)[*in];
+}
+"""
+
+
+def test_an_address_in_shared_memory_has_32_bits():
+    """The register may be below the array, and the number beside it lead back."""
+    before, out = torch.tensor([-2], dtype=torch.int32), torch.zeros(1, dtype=torch.int32)
+    assert run(compiled(BESIDE), "beside", before, out, threads=8) is None
+    assert int(out) == 20
+
+
 WRONG = """
 extern "C" __global__ void misaligned(float* out) { *reinterpret_cast<float4*>(out + 1) = make_float4(1, 2, 3, 4); }
 extern "C" __global__ void past_shared(int* out) {

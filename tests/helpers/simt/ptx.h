@@ -60,7 +60,7 @@ T* within(unsigned char (&room)[Size], uint64_t address) {
     return at<T, Count>(address);
 }
 template <class T, int Count, size_t Size>
-T* within_shared(unsigned char (&room)[Size], uint64_t offset) {
+T* within_shared(unsigned char (&room)[Size], uint32_t offset) {  // a register and the number beside it wrap
     if (offset > Size || Size - offset < sizeof(T) * Count)
         simt::fail("an access outside of " + std::to_string(Size) + " bytes of shared memory");
     return at<T, Count>(address_of(room) + offset);

@@ -1,4 +1,4 @@
-"""The GPU engine's side of what a soup is drawn from: csrc/cuda/soup_activation.cu and spherical_harmonics.cu."""
+"""The GPU engine's side of what a soup is drawn from: soup_activation.cu, soup_colors.cu, spherical_harmonics.cu."""
 
 import ctypes
 from typing import Any
@@ -14,8 +14,7 @@ from etsplat.engines.cuda.structs import constant
 from etsplat.engines.native.operation import differentiable
 
 _ACTIVATION = Program("soup_activation.cu")
-_HARMONICS = Program("spherical_harmonics.cu")
-_HARMONICS_THREADS = constant("cuda/spherical_harmonics.cu", "kThreads")
+_HARMONICS_THREADS = constant("cuda/staged_rows.h", "kThreads")
 
 
 def _activation(
@@ -48,26 +47,24 @@ soup_activation = differentiable(_activation, _activation_backward)
 def _harmonics(_keep: bool, coefficients: Tensor, directions: Tensor, degree: int) -> tuple[Tensor, Any]:
     """Colours of points along directions."""
     colors = directions.new_empty((*directions.shape[:-1], coefficients.shape[2]))
-    sizes = _sizes(coefficients, directions, degree)
-    _per_point("sh_forward", coefficients, (coefficients, directions, *sizes, colors))
-    return colors, (coefficients, directions, degree, colors)
+    _on_points(degree, "sh_forward", coefficients, directions, colors)
+    return colors, (degree, coefficients, directions, colors)
 
 
 def _harmonics_backward(kept: Any, _needed: Any, grad_colors: Tensor) -> tuple[Tensor, Tensor]:
     """Through the clamp, the polynomials and the normalisation."""
-    *problem, colors = kept
-    coefficients, directions, _ = problem
+    degree, coefficients, directions, colors = kept
     grads = torch.empty_like(coefficients), torch.empty_like(directions)
-    arguments = (coefficients, directions, *_sizes(*problem), colors, grad_colors, *grads)
-    _per_point("sh_backward", coefficients, arguments)
+    _on_points(degree, "sh_backward", coefficients, directions, colors, grad_colors, *grads)
     return grads
 
 
-def _sizes(coefficients: Tensor, directions: Tensor, degree: int) -> tuple[Any, ...]:
-    """Points, views, bases, channels, degree."""
+def _on_points(degree: int, kernel: str, coefficients: Tensor, directions: Tensor, *others: Tensor) -> None:
     points, bases, channels = coefficients.shape
     views = len(directions) if directions.ndim == 3 else 1
-    return ctypes.c_int64(points), views, bases, channels, degree
+    program = Program("spherical_harmonics.cu", (("DEGREE", degree), ("BASES", bases), ("CHANNELS", channels)))
+    arguments = (coefficients, directions, ctypes.c_int64(points), views, *others)
+    launch_each(program, kernel, points, arguments, _HARMONICS_THREADS)
 
 
 spherical_harmonics = differentiable(_harmonics, _harmonics_backward)
@@ -78,21 +75,22 @@ def _colors(
 ) -> tuple[Tensor, Any]:
     """Colours of triangles as cameras see them."""
     colors = vertices.new_empty((len(centers), len(vertices), 3))
-    sizes = ctypes.c_int64(len(vertices)), len(centers), rest.shape[1], degree
-    _per_point("soup_forward", vertices, (vertices, dc, rest, centers, *sizes, colors))
-    return colors, (vertices, dc, rest, centers, *sizes, colors)
+    sizes = ctypes.c_int64(len(vertices)), len(centers)
+    _on_triangles(degree, rest, "soup_forward", vertices, dc, rest, centers, *sizes, colors)
+    return colors, (degree, dc, vertices, rest, centers, *sizes, colors)
 
 
 def _colors_backward(kept: Any, _needed: Any, grad_colors: Tensor) -> list[Tensor]:
     """Zero for triangles that no view sees."""
-    vertices, dc, rest, *constants = kept
+    degree, dc, vertices, rest, *others = kept
     grads = [torch.empty_like(tensor) for tensor in (vertices, dc, rest)]
-    _per_point("soup_backward", vertices, (vertices, rest, *constants, grad_colors, *grads))
+    _on_triangles(degree, rest, "soup_backward", vertices, rest, *others, grad_colors, *grads)
     return grads
 
 
-def _per_point(name: str, points: Tensor, arguments: tuple[Any, ...]) -> None:
-    launch_each(_HARMONICS, name, len(points), arguments, _HARMONICS_THREADS)
+def _on_triangles(degree: int, rest: Tensor, kernel: str, *arguments: Any) -> None:
+    program = Program("soup_colors.cu", (("DEGREE", degree), ("BASES", rest.shape[1])))
+    launch_each(program, kernel, len(rest), arguments, _HARMONICS_THREADS)
 
 
 soup_colors = differentiable(_colors, _colors_backward)
