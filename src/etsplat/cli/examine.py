@@ -16,6 +16,7 @@ from etsplat.engines.choice import engine
 from etsplat.engines.cuda.compile import cache_folder
 from etsplat.engines.cuda.device import Device
 from etsplat.engines.threads import num_threads
+from etsplat.engines.webgpu.device import gpu
 from etsplat.metrics.image import find_lpips_weights
 from etsplat.ops.rasterize import rasterize
 
@@ -48,6 +49,7 @@ def examine(console: Console) -> bool:
             "LPIPS weights": found,
             "compiler": "not needed: the native engine is compiled already",
             "GPU (CUDA)": _gpu(),
+            "GPU (WebGPU)": _webgpu(),
             "etsplat data sfm": _extra("sfm", "pycolmap"),
             "photos in HEIC": _extra("heic", "pillow-heif"),
             "etsplat view": _extra("viewer", "viser"),
@@ -97,6 +99,13 @@ def _gpu() -> str:
     except EngineUnavailableError as reason:
         return str(reason)
     return f"cuda, on {torch.cuda.get_device_name()}; compiled kernels in {cache_folder()}"
+
+
+def _webgpu() -> str:
+    try:
+        return f"webgpu (draws, without gradients), on {gpu().name}"
+    except EngineUnavailableError as reason:
+        return str(reason)
 
 
 def _extra(name: str, package: str) -> str:

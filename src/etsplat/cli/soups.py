@@ -13,7 +13,7 @@ from etsplat.core.errors import InputError
 from etsplat.io.writers import purposes
 from etsplat.tasks.export_config import ExportConfig
 from etsplat.tasks.render_config import RenderConfig
-from etsplat.tasks.settings import Device
+from etsplat.tasks.settings import Device, OneOf, engine_names
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -151,6 +151,8 @@ class Render(Command):
     """The capture's folder, if it has moved or a file is given."""
     device: Device | None = None
     """Where it is drawn: cpu, cuda (an NVIDIA GPU), or None for cuda where there is one."""
+    engine: Annotated[str | None, OneOf(engine_names)] = None
+    """What draws: cpu, cuda, webgpu (GPUs of AMD, Intel, Apple, NVIDIA), reference, or None for the device's own."""
     crop: str | None = None
     """Draw only triangles whose middle is in a region, in the capture's own units and axes.
     sphere:X,Y,Z,R: a ball by its middle and radius; box:X0,Y0,Z0,X1,Y1,Z1: a box by two corners;
@@ -164,7 +166,7 @@ class Render(Command):
         from etsplat.tasks.sources import open_run
 
         crop = _crop(self.crop)
-        opened = open_run(self.run_dir, self.scene, self.device)
+        opened = open_run(self.run_dir, self.scene, self.device, self.engine)
         out = self.out or opened.folder / "renders"
         with PhaseBar() as bar:
             files = render_run(
@@ -288,6 +290,8 @@ class View(Command):
     """The capture's folder, if it has moved or a file is given: for its cameras."""
     device: Device | None = None
     """Where it is drawn: cpu, cuda (an NVIDIA GPU), or None for cuda where there is one."""
+    engine: Annotated[str | None, OneOf(engine_names)] = None
+    """What draws: cpu, cuda, webgpu (GPUs of AMD, Intel, Apple, NVIDIA), reference, or None for the device's own."""
     host: str = "localhost"
     """Address to listen on; 0.0.0.0 lets other machines look too."""
     port: int = 8080
@@ -311,7 +315,7 @@ class View(Command):
         with contextlib.suppress(KeyboardInterrupt):
             if not self.run_dir.is_file():
                 wait_for_soup(self.run_dir, lambda text: print(f"{text} (Ctrl-C ends it)", flush=True))
-            opened = open_run(self.run_dir, self.scene, self.device)
+            opened = open_run(self.run_dir, self.scene, self.device, self.engine)
             serve(
                 opened,
                 self.host,

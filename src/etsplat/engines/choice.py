@@ -13,6 +13,7 @@ from etsplat.engines.cpu.engine import CpuEngine
 from etsplat.engines.cuda.engine import CudaEngine
 from etsplat.engines.cuda.steps import CudaQueuedSteps
 from etsplat.engines.engine import Engine
+from etsplat.engines.webgpu.engine import WebGpuEngine
 
 _REFERENCE = Engine()
 _engines: dict[str, Engine] = {}
@@ -41,13 +42,18 @@ def register_engine(engine: Engine) -> None:
     _engines[engine.name] = engine
 
 
-for _built_in in (_REFERENCE, CpuEngine(), CudaEngine()):
+for _built_in in (_REFERENCE, CpuEngine(), CudaEngine(), WebGpuEngine()):
     register_engine(_built_in)
 
 
 def engine_names() -> tuple[str, ...]:
     """Of all engines that are registered."""
     return tuple(_engines)
+
+
+def training_engines() -> tuple[str, ...]:
+    """Names of those that have gradients."""
+    return tuple(name for name, engine in _engines.items() if engine.differentiates)
 
 
 @contextmanager
@@ -58,9 +64,10 @@ def engine(name: str | None) -> Iterator[None]:
     pass, wherever that runs.
 
     Args:
-        name: "reference" (plain PyTorch, any precision), "cpu" or "cuda" (native, float32), or another one that is
-            registered. None leaves the choice as it is around the block: where nobody has chosen, cpu or cuda for
-            float32, by the tensors' device, and reference for everything else.
+        name: "reference" (plain PyTorch, any precision), "cpu" or "cuda" (native, float32), "webgpu" (draws on any
+            GPU, without gradients), or another one that is registered. None leaves the choice as it is around the
+            block: where nobody has chosen, cpu or cuda for float32, by the tensors' device, and reference for
+            everything else.
 
     Raises:
         ValueError: There is no such engine.
@@ -119,7 +126,7 @@ def resolve_device(device: str | None, name: str | None) -> torch.device:
         InputError: `device` and the engine exclude each other.
     """
     chosen = None if name is None else _named(name)
-    if chosen is not None and device is not None and chosen.device not in (None, device):
+    if chosen is not None and device is not None and not chosen.computes_on(device):
         raise InputError(f"engine: {name} does not compute on device {device}; leave one of them out")
     if device is not None:
         own = (e for e in _engines.values() if e.device == device)

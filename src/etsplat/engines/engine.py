@@ -32,17 +32,23 @@ class Engine:
     Attributes:
         name: by which it is chosen: `with etsplat.engine(name)`.
         device: type of the devices on which it is chosen by itself, for float32; None if it never is.
+        differentiates: whether it has the gradients of the rasterizer, so that one can train on it.
         queued: how steps are queued on it, as `engines/cuda/steps.py` does; None where each step returns to the host.
     """
 
     name: str = "reference"
     device: str | None = None
+    differentiates: bool = True
     queued: Any = None
 
     @property
     def queues_steps(self) -> bool:
         """Whether steps can run one after the other without the host looking in between."""
         return self.queued is not None
+
+    def computes_on(self, device: str) -> bool:
+        """Whether it takes tensors on devices of this type."""
+        return self.device in (None, device)
 
     def check(self, tensor: Tensor) -> None:
         """Raises ValueError where it does not compute with tensors of this device or dtype."""

@@ -6,7 +6,17 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, get_args
 
 from etsplat.tasks.export_config import LIGHT_FACES, TEXELS, texture_problem
-from etsplat.tasks.settings import Device, OneOf, Only, Range, Rare, Settings, SoftMethod, engine_names, kernel_methods
+from etsplat.tasks.settings import (
+    Device,
+    OneOf,
+    Only,
+    Range,
+    Rare,
+    Settings,
+    SoftMethod,
+    kernel_methods,
+    training_engines,
+)
 
 RasterMethod = Literal["raster-face", "raster-vertex"]
 Method = Literal[SoftMethod, RasterMethod]
@@ -227,7 +237,7 @@ class ReconstructConfig(Settings):
     """Of the order of views and the backgrounds. (Metrics always sample with the same seed.)"""
     device: Device | None = None
     """Where it runs: cpu, cuda (an NVIDIA GPU), or None for cuda where there is one."""
-    engine: Annotated[str | None, OneOf(engine_names), Rare] = None
+    engine: Annotated[str | None, OneOf(training_engines), Rare] = None
     """What computes: cpu, cuda, reference (plain PyTorch, slow), or None for the fastest on the device."""
 
     pictures: Pictures = Pictures()

@@ -17,6 +17,7 @@ from etsplat.core.errors import InputError
 from etsplat.data.camera_coverage import upright
 from etsplat.data.camera_paths import PATHS, path_note, played, usual_frames
 from etsplat.data.dataset import Dataset
+from etsplat.engines.choice import engine
 from etsplat.io.atomic import atomic_write, write_error
 from etsplat.io.camera_path_files import read_camera_path
 from etsplat.io.images import over_background, save_image
@@ -79,8 +80,8 @@ def render_run(
     except OSError as error:
         raise write_error(out, error) from error
     written: list[Path] = []
-    span = _path_span(soup, cameras) if config.video and config.depth else None
-    with ExitStack() as stack:
+    with engine(run.engine), ExitStack() as stack:
+        span = _path_span(soup, cameras) if config.video and config.depth else None
         sinks: dict[str, VideoSink] = {}
         for index, (name, camera) in enumerate(zip(names, cameras, strict=True)):
             pictures = draw(soup, camera, config)

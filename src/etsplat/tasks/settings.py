@@ -320,10 +320,16 @@ def kernel_methods() -> tuple[str, ...]:
     return (*get_args(SoftMethod), *registered)
 
 
-def engine_names() -> tuple[str, ...]:
-    """The engines that there are; before anything of torch is imported, those that come with the package."""
+def training_engines() -> tuple[str, ...]:
+    """The engines that have gradients; before anything of torch is imported, those that come with the package."""
     choice = sys.modules.get("etsplat.engines.choice")
-    return ("reference", "cpu", "cuda") if choice is None else choice.engine_names()
+    return ("reference", "cpu", "cuda") if choice is None else choice.training_engines()
+
+
+def engine_names() -> tuple[str, ...]:
+    """All engines; before anything of torch is imported, those that come with the package."""
+    choice = sys.modules.get("etsplat.engines.choice")
+    return (*training_engines(), "webgpu") if choice is None else choice.engine_names()
 
 
 def docs_of(kind: type) -> dict[str, str]:

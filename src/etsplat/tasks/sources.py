@@ -237,6 +237,7 @@ class SoupRun:
         capture: cameras and photos; images are decoded when they are asked for. None for a file without its scene.
         opaque: the opaque mesh that the run made beside the soup, on the CPU; None if it made none.
         test_cameras: of a run that refined cameras, those of test views, by their index, from which they are aligned.
+        engine: that draws videos, pictures and what the viewer shows; None for the one of the soup's device.
     """
 
     path: Path
@@ -244,6 +245,7 @@ class SoupRun:
     capture: Dataset | None
     opaque: MeshFile | None = None
     test_cameras: Mapping[int, Cameras] = field(default_factory=dict)
+    engine: str | None = None
 
     @property
     def device(self) -> torch.device:
@@ -271,24 +273,28 @@ class SoupRun:
         return self.capture
 
 
-def open_run(path: Path | str, scene: Path | str | None = None, device: str | None = None) -> SoupRun:
+def open_run(
+    path: Path | str, scene: Path | str | None = None, device: str | None = None, engine: str | None = None
+) -> SoupRun:
     """Open the run directory of `etsplat train`, or any file that `etsplat.model.soup_import.open_soup` reads.
 
     Args:
         path: of the run or the file.
         scene: the capture's folder, where it has moved or is not known.
         device: of the soup, and so of what is drawn of it: "cpu", "cuda", or None for cuda where there is a GPU.
+        engine: that draws what is rendered and viewed, by its name; None for the one of the device.
 
     Raises:
-        EngineUnavailableError: `device` asks for a GPU, and something is missing.
+        EngineUnavailableError: `device` or `engine` asks for a GPU, and something is missing.
         InputError: nothing there, neither a run with a soup nor a readable file; the capture has gone.
     """
-    path, place = Path(path), resolve_device(device, None)
+    path, place = Path(path), resolve_device(device, engine)
     if not path.exists():
         raise InputError(f"{path}: no such file or folder; {path_remedy(path)}")
     if path.is_dir():
-        return _open_directory(path, scene, place)
-    return SoupRun(path, open_soup(path).to(place), None if scene is None else load_dataset(scene, preload=False))
+        return replace(_open_directory(path, scene, place), engine=engine)
+    capture = None if scene is None else load_dataset(scene, preload=False)
+    return SoupRun(path, open_soup(path).to(place), capture, engine=engine)
 
 
 def check_trains(run: Path) -> None:

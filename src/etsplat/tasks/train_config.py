@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Literal, get_args
 
-from etsplat.tasks.settings import Device, OneOf, Only, Range, Rare, Settings, engine_names, kernel_methods
+from etsplat.tasks.settings import Device, OneOf, Only, Range, Rare, Settings, kernel_methods, training_engines
 
 Preset = Literal["paper", "quick", "demo", "tiny"]
 SceneType = Literal["outdoor", "indoor", "object"]
@@ -235,7 +235,7 @@ class TrainConfig(Settings):
     """Of every random choice: start, order of views, backgrounds, densification."""
     device: Device | None = None
     """Where it runs: cpu, cuda (an NVIDIA GPU), or None for cuda where there is one."""
-    engine: Annotated[str | None, OneOf(engine_names), Rare] = None
+    engine: Annotated[str | None, OneOf(training_engines), Rare] = None
     """What computes: cpu, cuda, reference (plain PyTorch, slow), or None for the fastest on the device."""
 
     drawing: Drawing = Drawing()

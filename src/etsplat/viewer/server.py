@@ -24,6 +24,7 @@ from torch import Tensor
 from etsplat.core.cameras import Cameras, intrinsics
 from etsplat.core.errors import InputError
 from etsplat.data.looked_at import middle_photo
+from etsplat.engines.choice import engine
 from etsplat.io.camera_path_files import KeyPoses
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.tasks.sources import SoupRun
@@ -131,9 +132,11 @@ class Viewer:
 
     def drawn(self, camera: Cameras) -> UInt8[Tensor, "H W 3"]:
         """The picture of a camera, with the photo nearest to it beside it if that is wanted."""
-        if self._run.capture is None or not self._panel.beside:
-            return picture(self.soup, camera, self.mode)
-        return beside_photo(self.soup, camera, self.mode, self._run.capture, nearest_photo(self._run.capture, camera))
+        with engine(self._run.engine):
+            if self._run.capture is None or not self._panel.beside:
+                return picture(self.soup, camera, self.mode)
+            photo = nearest_photo(self._run.capture, camera)
+            return beside_photo(self.soup, camera, self.mode, self._run.capture, photo)
 
     def close(self) -> None:
         """Ends the server and its threads."""
