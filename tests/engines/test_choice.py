@@ -53,7 +53,7 @@ def test_a_block_chooses_and_blocks_nest():
 
 def test_an_unknown_engine_is_refused_with_the_list():
     with (
-        pytest.raises(ValueError, match="engine must be one of reference, cpu, cuda or None, got 'metal'"),
+        pytest.raises(ValueError, match="engine must be one of reference, cpu, cuda, webgpu or None, got 'metal'"),
         etsplat.engine("metal"),
     ):
         pass
@@ -116,7 +116,7 @@ def test_an_engine_of_ones_own_is_used_where_it_is_chosen(toy: Toy):
         mean_area(vertices[topology.faces])
     assert toy.losses == 1
     torch.testing.assert_close(energies, expected)
-    with pytest.raises(ValueError, match="reference, cpu, cuda, toy or None"), etsplat.engine("metal"):
+    with pytest.raises(ValueError, match="reference, cpu, cuda, webgpu, toy or None"), etsplat.engine("metal"):
         pass
 
 

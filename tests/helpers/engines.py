@@ -4,10 +4,14 @@ from collections.abc import Callable
 from dataclasses import fields, is_dataclass
 from typing import Any
 
+import pytest
 import torch
 from torch import Tensor
 
 import etsplat
+from etsplat.core.rasterization import Rasterization, RasterizeSettings, RasterizeTensors
+from etsplat.engines import choice
+from etsplat.engines.cpu.engine import CpuEngine
 from etsplat.engines.cuda.launch import device_type
 
 
@@ -17,6 +21,28 @@ def on(engine: str | None, function: Callable[..., Any], *arguments: Any, **name
     with etsplat.engine(engine):
         result = function(*_moved(arguments, there), **_moved(named, there))
     return _moved(result, "cpu")
+
+
+class Noted(CpuEngine):
+    """Engine "cpu" by another name, which counts its pictures."""
+
+    name = "noted"
+    device = None
+
+    def __init__(self) -> None:
+        self.pictures = 0
+
+    def rasterize(self, tensors: RasterizeTensors, settings: RasterizeSettings) -> Rasterization:
+        self.pictures += 1
+        return super().rasterize(tensors, settings)
+
+
+def noted_engine(monkeypatch: pytest.MonkeyPatch) -> Noted:
+    """One that is registered as long as the test runs."""
+    monkeypatch.setattr(choice, "_engines", dict(choice._engines))
+    noted = Noted()
+    etsplat.register_engine(noted)
+    return noted
 
 
 def device_of(engine: str | None) -> str:

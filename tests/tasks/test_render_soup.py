@@ -1,5 +1,6 @@
 import subprocess
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from etsplat.tasks.render_config import RenderConfig
 from etsplat.tasks.render_soup import color_depth, draw, drawn_soup, render_run, samples_of
 from etsplat.tasks.sources import SoupRun
 from helpers.captures import circle_poses, write_colmap
+from helpers.engines import noted_engine
 
 ALIASED = RenderConfig(antialias=False)
 UP = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
@@ -220,3 +222,13 @@ def test_what_is_drawn_is_what_would_be_exported(run, tmp_path):
         replace(run, capture=replace(run.capture, test=[0])), tmp_path / "a", RenderConfig(), crop=crop
     )
     assert float((load_image(written) - torch.tensor([0.0, 0, 1])).abs().max()) > 0.1
+
+
+def test_the_engine_of_the_run_draws(run: SoupRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its pictures are what it draws; where none is named, that of the device does."""
+    noted = noted_engine(monkeypatch)
+    plain = render_run(run, tmp_path / "plain", ALIASED)
+    assert noted.pictures == 0
+    drawn = render_run(replace(run, engine="noted"), tmp_path / "noted", ALIASED)
+    assert noted.pictures == len(drawn) == len(plain)
+    assert [path.read_bytes() for path in drawn] == [path.read_bytes() for path in plain]

@@ -3,8 +3,10 @@
 import io
 import json
 import math
+import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -22,6 +24,7 @@ from etsplat.tasks.sources import SoupRun
 from etsplat.viewer.pictures import MODES, beside_photo, cropped, picture
 from etsplat.viewer.server import Viewer
 from helpers.captures import write_colmap
+from helpers.engines import noted_engine
 from viewer.test_browsers import browser
 from viewer.test_viewer import browser_camera, make_soup
 
@@ -159,3 +162,18 @@ def test_who_says_no_camera_gets_no_files(viewer: Viewer) -> None:
         for what in ("add", "drop", "save"):
             viewer._film(who, what)
     assert 9 not in viewer._keys
+
+
+def test_the_engine_of_the_run_draws(run: SoupRun, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whichever thread asks for a picture, as each browser has one."""
+    pytest.importorskip("viser")
+    noted = noted_engine(monkeypatch)
+    viewer = Viewer(replace(run, engine="noted"), "localhost", 0, 64)
+    assert run.capture is not None
+    camera, drawn = run.capture.cameras[0], []
+    thread = threading.Thread(target=lambda: drawn.append(viewer.drawn(camera)))
+    thread.start()
+    thread.join(30)
+    viewer.close()
+    assert noted.pictures == 1
+    assert torch.equal(drawn[0], picture(run.soup, camera, "soft"))

@@ -154,7 +154,7 @@ fn composite(@builtin(local_invocation_index) t: u32, @builtin(workgroup_id) gro
         range_of = tile_ranges[group.y * view.tiles_x + group.x];
     }
     let range = workgroupUniformLoad(&range_of);
-    var pixel: Pixel;
+    var pixel = Pixel();
     pixel.transmittance = 1.0;
     pixel.alive = inside;
     for (var next = range.x; next < range.y; next += BATCH) {

@@ -73,7 +73,7 @@ fn finite(a: vec3<f32>) -> bool {
 }
 
 fn projected(i: u32) -> Triangle {
-    var t: Triangle;
+    var t = Triangle();
     t.valid = true;
     for (var k = 0u; k < 3u; k++) {
         let world = corner(i, k);

@@ -11,7 +11,7 @@ struct Step {
 fn scan(@builtin(local_invocation_index) t: u32) {
     var total = 0u;
     for (var first = 0u; first < step.numbers; first += 1024u) {
-        var own: array<u32, 4>;
+        var own = array<u32, 4>();  // without this it keeps what it had the last time, in some compilers
         var mine = 0u;
         for (var i = 0u; i < 4u; i++) {
             let at = first + 4u * t + i;

@@ -15,7 +15,7 @@ fn tile_search(record: Record, width: u32, height: u32) -> Search {
     let x1 = floor(clamp(q.x + record.box.y - 0.5, -1.0, w - 1.0));
     let y0 = ceil(clamp(q.y + record.box.z - 0.5, 0.0, h));
     let y1 = floor(clamp(q.y + record.box.w - 0.5, -1.0, h - 1.0));
-    var search: Search;
+    var search = Search();
     if (x0 <= x1 && y0 <= y1) {
         search.left = u32(x0) / TILE;
         search.top = u32(y0) / TILE;
