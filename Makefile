@@ -184,7 +184,7 @@ check-neon:
 # build of it is right (CPU, CUDA) depends on the machine, and with it the hash; constraints.txt has its version.
 LOCK := $(PY) -m uv pip compile --universal --python-version 3.10 --generate-hashes --no-annotate --no-header \
 	-c constraints.txt --extra cuda --extra compress --extra depth --extra heic --extra sfm --extra slurm --extra texture --extra tune \
-	--extra video --extra viewer --group pyproject.toml:dev --group pyproject.toml:docs \
+	--extra video --extra viewer --extra webgpu --group pyproject.toml:dev --group pyproject.toml:docs \
 	--group pyproject.toml:lint pyproject.toml
 lock: setup
 	$(PIP) uv
