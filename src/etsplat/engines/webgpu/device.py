@@ -73,6 +73,11 @@ class WebGpu:
         self._modules: dict[Program, tuple[Any, dict[str, int]]] = {}
         self._pipelines: dict[tuple[Program, str], Any] = {}
 
+    @property
+    def held_bytes(self) -> int:
+        """Of all buffers."""
+        return sum(buffer.size for buffer in self._buffers.values())
+
     def room(self, name: str, size: int) -> Any:
         """A buffer of at least so many bytes, kept from one picture to the next; what is in it is anything.
 

@@ -25,7 +25,7 @@ struct Staged {
 
 var<workgroup> staged: array<Staged, BATCH>;     // 12 KiB of the 16 that there are everywhere
 var<workgroup> triangle_of: array<u32, BATCH>;
-var<workgroup> sub_tiles_of: array<u32, BATCH>;
+var<workgroup> todo: array<atomic<u32>, BATCH / 4u>;  // bit b of word 8 w + c: triangle 32 c + b may touch sub-tile w
 var<workgroup> heaviest: array<atomic<u32>, BATCH>;
 var<workgroup> alive: atomic<u32>;
 var<workgroup> range_of: vec2<u32>;
@@ -46,19 +46,18 @@ fn kernel_value(x: f32, exponent: f32, scale: f32) -> f32 {
     return exp2(scale * exp2(min(exponent * log2(max(x, 1e-6)), 30.0)));
 }
 
-// Bit w: the triangle may touch sub-tile w of the tile whose first pixel is `origin`. Conservative.
-fn sub_tiles(record: Record, origin: vec2<u32>) -> u32 {
+// Notes for triangle t of the batch which sub-tiles of the tile whose first pixel is `origin` it may touch. Conservative.
+fn note_sub_tiles(t: u32, record: Record, origin: vec2<u32>) {
     let reach = 0.5 * vec2<f32>(SUB - 1u);
     let slack = vec3(record.place.z * (1.0 + 1e-5) + 1e-5) + reach.x * abs(record.gx.xyz) + reach.y * abs(record.gy.xyz);
-    var bits = 0u;
     for (var w = 0u; w < 8u; w++) {
         let middle = vec2<f32>(origin + SUB * vec2(w % 2u, w / 2u)) + 0.5 + reach - record.place.xy;
         let in_box = middle.x >= record.box.x - reach.x && middle.x <= record.box.y + reach.x &&
                      middle.y >= record.box.z - reach.y && middle.y <= record.box.w + reach.y;
-        let touched = in_box && all(record.gx.xyz * middle.x + record.gy.xyz * middle.y <= slack);
-        bits |= select(0u, 1u, touched) << w;
+        if (in_box && all(record.gx.xyz * middle.x + record.gy.xyz * middle.y <= slack)) {
+            atomicOr(&todo[8u * w + t / 32u], 1u << (t % 32u));
+        }
     }
-    return bits;
 }
 
 fn draw_corners(pixel: ptr<function, Pixel>, triangle: u32, forms: vec3<f32>, weight: f32) {
@@ -110,7 +109,7 @@ fn stage(t: u32, slot: u32, origin: vec2<u32>) {
     let record = records[triangle];
     staged[t] = Staged(record.place, record.gx, record.gy);
     triangle_of[t] = triangle;
-    sub_tiles_of[t] = sub_tiles(record, origin);
+    note_sub_tiles(t, record, origin);
     if (STATISTICS) {
         atomicStore(&heaviest[t], 0u);
     }
@@ -125,11 +124,14 @@ fn write_pixel(pixel: ptr<function, Pixel>, column: u32, row: u32) {
     image[first + CHANNELS + 1u] = (*pixel).median;
 }
 
-// Whether a pixel of the tile goes on; the same in all invocations.
+// Whether a pixel of the tile goes on; the same in all invocations. Makes room for the next batch.
 fn any_alive(t: u32, mine: bool) -> bool {
     workgroupBarrier();
     if (t == 0u) {
         atomicStore(&alive, 0u);
+    }
+    if (t < BATCH / 4u) {
+        atomicStore(&todo[t], 0u);
     }
     workgroupBarrier();
     if (mine) {
@@ -166,9 +168,10 @@ fn composite(@builtin(local_invocation_index) t: u32, @builtin(workgroup_id) gro
             stage(t, next + t, origin);
         }
         workgroupBarrier();
-        for (var k = 0u; k < count && pixel.alive; k++) {
-            if (((sub_tiles_of[k] >> sub_tile) & 1u) != 0u) {
-                draw(&pixel, k, at);
+        for (var chunk = 0u; 32u * chunk < count && pixel.alive; chunk++) {
+            var bits = atomicLoad(&todo[8u * sub_tile + chunk]);
+            for (; bits != 0u && pixel.alive; bits &= bits - 1u) {
+                draw(&pixel, 32u * chunk + firstTrailingBit(bits), at);
             }
         }
         if (STATISTICS) {
