@@ -61,15 +61,18 @@ class Traffic:
         device.filled, device.read, device.run = self.filled, self.read, self.run
 
     def filled(self, name: str, values: Any) -> Any:
+        """As of the device."""
         self.up += len(values) if isinstance(values, bytes) else values.nbytes
         return self._filled(name, values)
 
     def read(self, *arguments: Any) -> Any:
+        """As of the device."""
         numbers = self._read(*arguments)
         self.down += numbers.nbytes
         return numbers
 
     def run(self, steps: Any, *arguments: Any) -> None:
+        """As of the device."""
         self.steps += len(steps)
         self.submissions += 1
         self._run(steps, *arguments)
