@@ -38,7 +38,7 @@ def adapter() -> WebGpu:
     try:
         return gpu()
     except EngineUnavailableError as reason:
-        pytest.skip(str(reason))
+        pytest.skip(f"{reason} (of Debian, in software: mesa-vulkan-drivers)")
 
 
 def compare(scene: Scene, tolerance: float = TOLERANCE, images: tuple[str, ...] = IMAGES, **options) -> None:
