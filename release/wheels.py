@@ -119,12 +119,11 @@ def build(platform: Platform, work: Path, out: Path) -> Path:
     (wheel,) = made.glob("*.whl")
     if platform.system != "Linux":
         return Path(shutil.copy2(wheel, out / wheel.name))
-    glibc = platform.target.rpartition("gnu.")[2].replace(".", "_")
-    named = f"manylinux_{glibc}_{platform.processor}"
-    audit = [sys.executable, "-m", "auditwheel", "repair", "--plat", named, "--only-plat"]
-    subprocess.run([*audit, "--wheel-dir", str(out), str(wheel)], check=True)
-    (repaired,) = out.glob(f"{'-'.join(wheel.name.split('-')[:-1])}-{named}.whl")
-    return repaired
+    # `auto` is the oldest C library that the symbols allow; other processors' tags auditwheel does not take by name.
+    audit = [sys.executable, "-m", "auditwheel", "repair", "--plat", "auto", "--only-plat"]
+    subprocess.run([*audit, "--wheel-dir", str(made), str(wheel)], check=True)
+    (repaired,) = made.glob("*-manylinux_*.whl")
+    return Path(shutil.copy2(repaired, out / repaired.name))
 
 
 def compilers(platform: Platform, folder: Path) -> Path:
@@ -179,6 +178,8 @@ def check(wheel: Path, platform: Platform) -> None:
         raise SystemExit(f"{wheel.name}: {wheel.stat().st_size:,} bytes, and {MAX_BYTES:,} are allowed")
     if f"-{PYTHON}-abi3-" not in wheel.name:
         raise SystemExit(f"{wheel.name}: not for all Pythons from {PYTHON} on")
+    if platform.system == "Linux" and _glibc(wheel.name, r"-manylinux") > _glibc(platform.target, r"gnu"):
+        raise SystemExit(f"{wheel.name}: needs a newer C library than {platform.target}")
     with zipfile.ZipFile(wheel) as archive:
         native = [name for name in archive.namelist() if name.endswith((".so", ".pyd", ".dll", ".dylib"))]
         if native != ["etsplat/_native.pyd" if platform.system == "Windows" else "etsplat/_native.abi3.so"]:
@@ -190,6 +191,12 @@ def check(wheel: Path, platform: Platform) -> None:
     subprocess.run(
         [sys.executable, "-m", "abi3audit", "--strict", "--assume-minimum-abi3", "3.12", str(wheel)], check=True
     )
+
+
+def _glibc(name: str, prefix: str) -> tuple[int, ...]:
+    """The version of the C library in a name; where it has none, one that is newer than all."""
+    version = re.search(prefix + r"[._](\d+)[._](\d+)", name)
+    return tuple(map(int, version.groups())) if version else (sys.maxsize,)
 
 
 def libraries(module: bytes) -> list[str]:

@@ -51,6 +51,20 @@ def test_what_native_code_cannot_read_is_refused_by_the_name_of_its_argument(wro
 
 
 @pytest.mark.sanitize
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="/proc/cpuinfo is Linux's")
+def test_instruction_sets_are_those_of_the_processor():
+    """As Linux tells them, which asks it in other ways."""
+    has = set(Path("/proc/cpuinfo").read_text().split())
+    needed = {
+        "avx512": {"avx512f", "avx512dq", "avx512bw", "avx512vl", "avx2", "fma"},
+        "avx2": {"avx2", "fma"},
+        "neon": {"asimd"},
+        "plain": set(),
+    }
+    assert _native.available_instruction_sets() == [name for name, flags in needed.items() if flags <= has]
+
+
+@pytest.mark.sanitize
 def test_either_of_two_dtypes_is_named():
     with pytest.raises(TypeError, match=r"^target must be a contiguous uint8 or float32 tensor .*, got torch.int64"):
         photometric(target=torch.zeros(1, 4, 4, 3, dtype=torch.int64))

@@ -12,7 +12,7 @@ import pytest
 from release import wheels
 
 LINUX = wheels.PLATFORMS["linux-x64"]
-NAME = "etsplat-0.1.0-cp312-abi3-linux_x86_64.whl"
+NAME = "etsplat-0.1.0-cp312-abi3-manylinux_2_24_x86_64.whl"
 
 
 def mach_o(*names: str) -> bytes:
@@ -38,6 +38,8 @@ def test_libraries_of_a_mac_are_read() -> None:
     ("name", "files", "problem"),
     [
         (NAME.replace("cp312-abi3", "cp312-cp312"), {}, "not for all Pythons"),
+        (NAME.replace("2_24", "2_29"), {}, "needs a newer C library than x86_64-linux-gnu.2.28"),
+        (NAME.replace("manylinux_2_24", "linux"), {}, "needs a newer C library than x86_64-linux-gnu.2.28"),
         (NAME, {"etsplat/_native.abi3.so": b"", "etsplat/libomp.so": b""}, "one native module belongs"),
         (NAME, {"etsplat/big.bin": os.urandom(wheels.MAX_BYTES)}, "are allowed"),
         (NAME, {"etsplat/_native.abi3.so": mach_o("libomp.dylib")}, "asks for libomp.dylib"),

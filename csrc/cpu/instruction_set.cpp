@@ -5,8 +5,12 @@
 
 #include "simd/paths.h"
 
-#if defined(ETSPLAT_X86) && defined(_MSC_VER)
+#if defined(ETSPLAT_X86)
+#if defined(_MSC_VER)
 #include <intrin.h>
+#else
+#include <cpuid.h>
+#endif
 #endif
 
 namespace etsplat {
@@ -21,27 +25,48 @@ struct Path {
 };
 
 #if defined(ETSPLAT_X86)
+// The processor is asked itself: with Zig's runtime library __builtin_cpu_supports is always false.
+struct Registers {
+    unsigned ebx = 0, ecx = 0;
+};
+
+Registers cpuid(unsigned leaf) {
+    Registers r;  // zeros where the processor has no such leaf
 #if defined(_MSC_VER)
-bool has_avx2() {
-    int r[4];
-    __cpuidex(r, 1, 0);
-    const bool os_saves_ymm = (r[2] & (1 << 27)) && (_xgetbv(0) & 6) == 6, fma = r[2] & (1 << 12);
-    __cpuidex(r, 7, 0);
-    return os_saves_ymm && fma && (r[1] & (1 << 5));
-}
-bool has_avx512() {
-    int r[4];
-    __cpuidex(r, 7, 0);
-    const int needed = (1 << 16) | (1 << 17) | (1 << 30) | (1 << 31);  // F, DQ, BW, VL
-    return has_avx2() && (_xgetbv(0) & 0xe6) == 0xe6 && (r[1] & needed) == needed;
-}
+    int v[4];
+    __cpuid(v, 0);
+    if (static_cast<unsigned>(v[0]) < leaf) return r;
+    __cpuidex(v, static_cast<int>(leaf), 0);
+    r.ebx = static_cast<unsigned>(v[1]);
+    r.ecx = static_cast<unsigned>(v[2]);
 #else
-bool has_avx2() { return __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma"); }
-bool has_avx512() {
-    return has_avx2() && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512dq") &&
-           __builtin_cpu_supports("avx512bw") && __builtin_cpu_supports("avx512vl");
-}
+    unsigned eax, edx;
+    __get_cpuid_count(leaf, 0, &eax, &r.ebx, &r.ecx, &edx);
 #endif
+    return r;
+}
+
+// Whether the operating system saves all these parts of the registers (XCR0).
+bool system_saves(unsigned parts) {
+    if (!(cpuid(1).ecx & 1u << 27)) return false;  // OSXSAVE: XCR0 can be read
+#if defined(_MSC_VER)
+    const auto saved = static_cast<unsigned>(_xgetbv(0));
+#else
+    unsigned saved, high;
+    __asm__("xgetbv" : "=a"(saved), "=d"(high) : "c"(0));
+#endif
+    return (saved & parts) == parts;
+}
+
+bool has_avx2() {
+    const unsigned fma = 1u << 12, avx2 = 1u << 5;
+    return system_saves(0x6) && (cpuid(1).ecx & fma) && (cpuid(7).ebx & avx2);
+}
+
+bool has_avx512() {
+    const unsigned needed = 1u << 16 | 1u << 17 | 1u << 30 | 1u << 31;  // F, DQ, BW, VL
+    return has_avx2() && system_saves(0xe6) && (cpuid(7).ebx & needed) == needed;
+}
 #endif
 
 #define ETSPLAT_PATH(name)                                                                                          \
