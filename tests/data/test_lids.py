@@ -5,7 +5,7 @@ import torch
 
 from etsplat.data.agreement import differences, first_hits, per_pixel, photos_of
 from etsplat.data.dataset import Dataset
-from etsplat.data.lids import _without_gaps, lids
+from etsplat.data.lids import _without_gaps, lids, without_lids
 from etsplat.data.photograph import photograph, shade_faces
 from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.topology import MeshTopology
@@ -36,6 +36,20 @@ def test_a_bottom_that_photos_show_is_no_lid_nor_is_what_is_left_of_an_open_surf
     assert not lids(views)(vertices, faces, mean_colors(views, vertices, faces)).any()
     views, vertices, faces, bottom = photos_and_lid(opened=True)
     assert not lids(views)(vertices, faces[~bottom], mean_colors(views, vertices, faces[~bottom])).any()
+
+
+def test_a_hull_loses_its_lid_and_one_without_stays_as_it_is() -> None:
+    views, vertices, faces, bottom = photos_and_lid(opened=True)
+    found, kept = without_lids(views, vertices, faces)
+    topology = MeshTopology.from_faces(kept, len(found))
+    assert topology.is_manifold()
+    assert not topology.is_closed()
+    assert abs(len(kept) - int((~bottom).sum())) < 0.25 * int(bottom.sum())
+    assert found[:, 1].amin() > vertices[:, 1].amin() - 1e-6
+    views, vertices, faces, _ = photos_and_lid(opened=False)
+    same = without_lids(views, vertices, faces)
+    assert torch.equal(same[0], vertices)
+    assert torch.equal(same[1], faces)
 
 
 def test_a_lid_of_which_the_inner_side_looks_otherwise_stays() -> None:

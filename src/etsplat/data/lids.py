@@ -4,6 +4,9 @@ A start has no openings, so an object that is open below, a bust or a mask, gets
 the photos explain the lid's pixels better by the next surface behind it, which is seen from its inner side, than by the
 lid itself, then nothing is where the lid is. A hollow of a solid has walls of its own, which show something else than
 the inner side of the outer surface, unless all of it looks the same: then neither explains pixels better.
+
+A lid that is fitted to photos is drawn in, until it lies on what is behind it, and then it shows the same; so it is
+best found on the hull that a run starts from, and where that is too coarse, early.
 """
 
 from collections.abc import Callable
@@ -14,6 +17,7 @@ from torch import Tensor
 
 from etsplat.data.agreement import Photo, differences, first_hits, per_pixel, photos_of
 from etsplat.data.dataset import Dataset
+from etsplat.geometry.discs import cut_open
 from etsplat.geometry.measures import face_areas
 from etsplat.geometry.topology import MeshTopology, connected
 
@@ -39,8 +43,29 @@ def lids(dataset: Dataset) -> Lids:
     Args:
         dataset: photos with alpha around an object in the unit ball.
     """
-    photos = photos_of(dataset)
+    return _lids(photos_of(dataset))
 
+
+@torch.no_grad()
+def without_lids(
+    dataset: Dataset, vertices: Float[Tensor, "V 3"], faces: Int64[Tensor, "F 3"]
+) -> tuple[Float[Tensor, "V2 3"], Int64[Tensor, "F2 3"]]:
+    """A surface without its lids, with a border where they were; as it is if there are none.
+
+    Args:
+        dataset: photos with alpha around an object in the unit ball.
+        vertices: (V, 3) of a closed, oriented manifold, such as `visual_hull` gives.
+        faces: (F, 3) of it.
+    """
+    photos = photos_of(dataset)
+    lid = _lids(photos)(vertices, faces, _shown(photos, vertices, faces))
+    if not bool(lid.any()) or bool(lid.all()):
+        return vertices, faces
+    source, kept, _ = cut_open(faces[~lid], len(vertices))
+    return vertices[source], kept
+
+
+def _lids(photos: list[Photo]) -> Lids:
     @torch.no_grad()
     def marked(vertices: Tensor, faces: Tensor, colors: Tensor) -> Tensor:
         wrong = torch.zeros(len(faces), 3)
@@ -51,6 +76,17 @@ def lids(dataset: Dataset) -> Lids:
         return _without_gaps(found, faces) if bool(found.any()) else found
 
     return marked
+
+
+def _shown(photos: list[Photo], vertices: Tensor, faces: Tensor) -> Float[Tensor, "F 3"]:
+    """The mean colour that photos show at each face; black where none sees it."""
+    sums = torch.zeros(len(faces), 4)
+    for photo in photos:
+        hit = first_hits(photo, vertices, faces)[1]
+        at = (hit >= 0) & (photo.pixels[0, 3] > 0.95)
+        shown = torch.cat([torch.ones(int(at.sum()), 1), photo.pixels[0, :3, at].T], dim=1)
+        sums.index_add_(0, hit[at], shown)
+    return sums[:, 1:] / sums[:, :1].clamp_min(1)
 
 
 def _wrong(photo: Photo, vertices: Tensor, faces: Tensor, colors: Tensor) -> Float[Tensor, "F 3"]:

@@ -127,7 +127,7 @@ class SubdivideAndUntangle(Strategy):
             unseen: of vertices and faces, on the CPU, which vertices no picture shows. Before each untangling they
                 become a film (`geometry.films`): regularizers alone leave slits in what nobody sees, and deepen them.
             lids: of vertices, faces and their colours, on the CPU, which faces pictures look through. They are removed
-                before each untangling but the last, or stay where that spoils the pictures.
+                at each edit but the last, before what else it does, or stay where that spoils the pictures.
         """
         self._budgets, self._untangle_after, self._unseen = dict(budgets), set(untangle_after), unseen
         self._reaches = (reach, _SHORT) if reach > _SHORT else (reach,)
@@ -139,10 +139,9 @@ class SubdivideAndUntangle(Strategy):
         return min((i for i in (*self._budgets, *self._untangle_after) if i >= iteration), default=NEVER)
 
     def attempts(self, iteration: int) -> int:
-        """Untangling has one for each reach, after one that removes lids, if there are any."""
-        if iteration not in self._untangle_after:
-            return 1
-        return len(self._reaches) + (self._lids_at(iteration) is not None)
+        """Untangling has one for each reach; the first of all removes lids, if there are any."""
+        ways = len(self._reaches) if iteration in self._untangle_after else 1
+        return ways + (self._lids_at(iteration) is not None)
 
     def edit(self, iteration: int) -> bool:
         """Removes lids, untangles, then divides. Raises DivergedError where faces have no finite area."""
@@ -183,7 +182,8 @@ class SubdivideAndUntangle(Strategy):
 
     def _lids_at(self, iteration: int) -> Tensor | None:
         """(F,) which faces are lids, if any are and it is time to remove them; they are looked for once."""
-        if self._lids is None or iteration not in self._untangle_after or iteration == max(self._untangle_after):
+        times = {*self._budgets, *self._untangle_after}
+        if self._lids is None or iteration not in times or iteration == max(times):
             return None
         if iteration not in self._found:
             mesh: TriangleMesh = self.model

@@ -171,8 +171,9 @@ def reconstruct(
         mesh, begun, _ = started
         judging = partial(_judge, scorer, views, truth, config, started, shape_of(*mesh.surface()))
         if begun == "hull":
-            holes = genera(mesh.faces.cpu(), len(mesh.vertices))
-            job.announce(NoteEvent(f"start: the visual hull, {mesh.count:,} faces; holes in each part: {holes}"))
+            holes = f"holes in each part: {genera(mesh.faces.cpu(), len(mesh.vertices))}"
+            form = holes if mesh.topology.is_closed() else "open where photos look onto the inner side of its surface"
+            job.announce(NoteEvent(f"start: the visual hull, {mesh.count:,} faces; {form}"))
             config = nearby(config)
         trust = _trusted_depths(views, config, begun, job)
         trainer = make_trainer(mesh, views, config, scorer.cheap, trust, near=begun == "hull")

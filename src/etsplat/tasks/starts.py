@@ -11,6 +11,7 @@ from etsplat.core.errors import InputError
 from etsplat.data.dataset import Dataset
 from etsplat.data.false_handles import without_false_handles
 from etsplat.data.hollows import open_hollows
+from etsplat.data.lids import without_lids
 from etsplat.data.silhouettes import silhouette, touches_border
 from etsplat.data.visual_hull import visual_hull
 from etsplat.geometry.icosphere import icosphere
@@ -74,7 +75,7 @@ def make_start(
     kind: Start = start_shape(config, views) if start is None else "mesh"
     contradicted = 0.0
     if kind == "hull":
-        hull = without_false_handles(views, *plain_hull(views, config))
+        hull = without_lids(views, *without_false_handles(views, *plain_hull(views, config)))
         vertices, faces, _, contradicted = open_hollows(views, *hull)
         vertices = untangle(vertices, MeshTopology.from_faces(faces, len(vertices)))[0]
     elif start is None:
