@@ -22,10 +22,12 @@ from etsplat.geometry.measures import face_areas
 from etsplat.geometry.topology import MeshTopology, connected
 
 _WRONG = 0.02
-"""Mean difference of colours from which the photos are said to show something else than a face."""
+"""Mean difference of colours from which the photos are said to show something else than a face, and by so much more
+than the median of all faces differs a lid as a whole: how well faces fit depends on how far a run is."""
 
-_BETTER, _CLEARLY = 0.9, 0.5
-"""What is behind a lid differs from the photos at most so many times as much as its faces, and the lid as a whole."""
+_BETTER, _CLEARLY = 0.9, 0.4
+"""What is behind a lid differs from the photos at most so many times as much as its faces do; and for the lid as a
+whole that holds of what is above the median of all faces."""
 
 _LEAST = 0.005
 """Share of the surface that a lid has at least: for less a mesh is better closed."""
@@ -107,12 +109,15 @@ def _wrong(photo: Photo, vertices: Tensor, faces: Tensor, colors: Tensor) -> Flo
 
 
 def _patches(wrong: Float[Tensor, "F 3"], area: Float[Tensor, " F"], pairs: Int64[Tensor, "P 2"]) -> Bool[Tensor, " F"]:
-    """The patches of faces that what is behind explains better, and large, and as a whole much better."""
+    """The patches of faces that what is behind explains better, and large, and as a whole nearly as well as is usual."""
     own, behind = per_pixel(wrong, pairs).unbind(dim=1)
+    seen = wrong[:, 0] > 0
+    usual = own[seen].median() if bool(seen.any()) else own.new_zeros(())
     marked = (own > _WRONG) & (behind < _BETTER * own)
     count, patch = connected(pairs[marked[pairs].all(dim=1)], len(marked))
     sums = torch.zeros(count, 4).index_add(0, patch, torch.cat([area[:, None], wrong], dim=1) * marked[:, None])
-    lid = (sums[:, 0] > _LEAST * area.sum()) & (sums[:, 3] < _CLEARLY * sums[:, 2])
+    more, less = (sums[:, 2:] / sums[:, 1:2].clamp_min(1e-30) - usual).unbind(dim=1)
+    lid = (sums[:, 0] > _LEAST * area.sum()) & (more > _WRONG) & (less < _CLEARLY * more)
     return marked & lid[patch]
 
 
