@@ -109,7 +109,7 @@ def _wrong(photo: Photo, vertices: Tensor, faces: Tensor, colors: Tensor) -> Flo
 
 
 def _patches(wrong: Float[Tensor, "F 3"], area: Float[Tensor, " F"], pairs: Int64[Tensor, "P 2"]) -> Bool[Tensor, " F"]:
-    """The patches of faces that what is behind explains better, and large, and as a whole nearly as well as is usual."""
+    """The patches of faces that what is behind explains better, and large, and as a whole nearly as well as usual."""
     own, behind = per_pixel(wrong, pairs).unbind(dim=1)
     seen = wrong[:, 0] > 0
     usual = own[seen].median() if bool(seen.any()) else own.new_zeros(())
