@@ -14,13 +14,15 @@ from etsplat.core.errors import InputError
 from etsplat.data.blocks import cut
 from etsplat.data.dataset import Dataset
 from etsplat.io.run_directory import RunDirectory
+from etsplat.model.surroundings import Surroundings
 from etsplat.model.triangle_soup import TriangleSoup
-from etsplat.optim.loop import NoteEvent, StageEvent
+from etsplat.optim.loop import DivergedError, NoteEvent, StageEvent
 from etsplat.optim.trainer import Trainer
 from etsplat.tasks import block_training, train_memory
 from etsplat.tasks import train as tasks_train
 from etsplat.tasks.export_config import ExportConfig
 from etsplat.tasks.export_soup import export_soup
+from etsplat.tasks.scene_part import ScenePart
 from etsplat.tasks.sources import open_run, world_up
 from etsplat.tasks.train import TrainResult, train
 from etsplat.tasks.train_config import TrainConfig
@@ -50,15 +52,18 @@ def triangles(soup: TriangleSoup) -> torch.Tensor:
 def test_each_triangle_is_of_the_block_in_which_its_middle_lies(
     run: tuple[TrainResult, list[object]], capture: Dataset
 ) -> None:
-    """Of every block's run exactly what lies in its cell, margins dropped, and nothing of the coarse soup."""
+    """Of every block's run exactly what lies in its cell, without margins, and the sky's run; nothing is coarse."""
     result = run[0]
     grid = cut(capture, (2, 1), world_up(capture.viewmats))
+    sky = Surroundings.of_note(result.soup.notes["sky"])
+    assert sky is not None
     kept, dropped = [], 0
     for block in range(2):
         own = TriangleSoup.load(result.path / "blocks" / grid.name(block) / "soup.safetensors")
         inside = grid.block_of(triangles(own).double().mean(dim=1)) == block
         dropped += int((~inside).sum())
-        kept.append(triangles(own)[inside])
+        kept.append(triangles(own)[inside & ~sky.outermost(triangles(own))])
+    kept.append(triangles(TriangleSoup.load(result.path / "blocks" / "sky" / "soup.safetensors")))
     assert torch.equal(triangles(result.soup), torch.cat(kept))
     assert dropped > 0
     assert result.soup.count == result.metrics["triangles"]
@@ -74,10 +79,12 @@ def test_the_run_is_one_for_all_that_comes_after(run: tuple[TrainResult, list[ob
     etsplat.write_report(path)
     assert (path / "report.html").is_file()
     blocks = {each["name"]: each for each in result.metrics["blocks"]}
-    assert set(blocks) == {"coarse", "0_0", "1_0"}
+    assert list(blocks) == ["coarse", "0_0", "1_0", "sky"]
+    kept = sum(blocks[name]["triangles"] for name in ("0_0", "1_0", "sky"))
+    assert kept == result.soup.count
     assert result.metrics["psnr"] > blocks["coarse"]["psnr"] - 0.5
-    assert result.metrics["iterations"] == 12 + 24 + 24
-    assert RunDirectory(path).read_iterations() == 12 + 24 + 24
+    assert result.metrics["iterations"] == 12 + 24 + 24 + 12
+    assert RunDirectory(path).read_iterations() == 12 + 24 + 24 + 12
     assert "sky" in result.soup.notes
     whole = TriangleSoup.load(path / "blocks" / "coarse" / "soup.safetensors")
     assert result.soup.notes["sky"] == whole.notes["sky"]
@@ -89,7 +96,7 @@ def test_what_is_there_and_needed_is_said_beforehand(run: tuple[TrainResult, lis
     assert notes[0].startswith("2 blocks of ")
     assert "bytes for each of" in notes[0]
     stages = [event.name for event in run[1] if isinstance(event, StageEvent)]
-    assert list(dict.fromkeys(stages)) == [f"Optimizing {name}" for name in ("coarse", "0_0", "1_0")]
+    assert list(dict.fromkeys(stages)) == [f"Optimizing {name}" for name in ("coarse", "0_0", "1_0", "sky")]
 
 
 def stop_in(name: str, iteration: int) -> Callable[[object], None]:
@@ -100,7 +107,7 @@ def stop_in(name: str, iteration: int) -> Callable[[object], None]:
     return callback
 
 
-@pytest.mark.parametrize("name", ["coarse", "1_0"])
+@pytest.mark.parametrize("name", ["coarse", "1_0", "sky"])
 def test_a_run_that_is_killed_in_a_block_goes_on_there(
     run: tuple[TrainResult, list[object]], capture: Dataset, tmp_path: Path, name: str
 ) -> None:
@@ -108,6 +115,8 @@ def test_a_run_that_is_killed_in_a_block_goes_on_there(
     out = tmp_path / "run"
     with pytest.raises(RuntimeError, match="killed"):
         train(capture, out, CONFIG, blocks="2x1", callbacks=[stop_in(name, 12)])
+    if name != "coarse":
+        assert open_run(out).soup.count > 0  # what is there can be looked at and exported meanwhile
     done = out / "blocks" / "0_0" / "metrics.json"
     before = done.stat().st_mtime_ns if done.is_file() else None
     result = train(capture, out, CONFIG, blocks="2x1", resume=True)
@@ -147,7 +156,7 @@ def test_exposures_are_shared(capture: Dataset, tmp_path: Path, monkeypatch: pyt
     shared = RunDirectory(result.path).read_exposure()["matrices"]
     assert set(shared) == {capture.names[view] for view in capture.watching(None).train}
     assert max(abs(shared[name][0][0] - 1) for name in shared) > 1e-4
-    for name in ("0_0", "1_0"):
+    for name in ("0_0", "1_0", "sky"):
         own = RunDirectory(result.path / "blocks" / name).read_exposure()["matrices"]
         assert all(torch.allclose(torch.tensor(own[each]), torch.tensor(shared[each])) for each in own)
     assert len(known) == 2
@@ -201,4 +210,66 @@ def test_a_run_that_is_done_leaves_nothing_in_memory(
 
     monkeypatch.setattr(tasks_train, "start_trainer", spy)
     train(capture, tmp_path / "run", CONFIG.changed({"iterations": 4}), blocks="2x1")
-    assert len(alive) == 3
+    assert len(alive) == 4
+
+
+def test_blocks_leave_the_sky_alone_and_it_learns_among_them(
+    run: tuple[TrainResult, list[object]], capture: Dataset, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Blocks draw all of the coarse sky and start without it; its own run starts from it, among all that they made."""
+    parts: list[ScenePart] = []
+    inner = tasks_train.start_trainer
+
+    def spy(*arguments):
+        if arguments[-1] is not None:
+            parts.append(arguments[-1])
+        return inner(*arguments)
+
+    monkeypatch.setattr(tasks_train, "start_trainer", spy)
+    train(capture, tmp_path / "run", CONFIG, blocks="2x1")
+    *blocks, last = parts
+    whole = TriangleSoup.load(run[0].path / "blocks" / "coarse" / "soup.safetensors")
+    sky = last.closed
+    assert sky is not None
+    coarse = triangles(whole)[sky.outermost(triangles(whole))]
+    assert len(blocks) == 2
+    for part in blocks:
+        assert part.start is None
+        assert torch.equal(triangles(part.rest)[sky.outermost(triangles(part.rest))], coarse)
+    assert last.start is not None
+    assert torch.equal(triangles(last.start), coarse)
+    assert not bool(sky.outermost(triangles(last.rest)).any())
+    learned = TriangleSoup.load(tmp_path / "run" / "blocks" / "sky" / "soup.safetensors")
+    assert torch.equal(triangles(run[0].soup), torch.cat([triangles(last.rest), triangles(learned)]))
+    assert float((learned.sh_dc.mean(dim=0) - last.start.sh_dc.mean(dim=0)).norm()) > 0
+
+
+def test_a_scene_without_a_sky_has_no_run_for_it(capture: Dataset, tmp_path: Path) -> None:
+    result = train(capture, tmp_path / "run", CONFIG.changed({"iterations": 8, "sky": "none"}), blocks="2x1")
+    assert [each["name"] for each in result.metrics["blocks"]] == ["coarse", "0_0", "1_0"]
+    assert result.metrics["iterations"] == 4 + 8 + 8
+    assert RunDirectory(result.path).read_iterations() == 4 + 8 + 8
+
+
+def test_a_sky_that_cannot_be_learned_stays_as_the_coarse_run_left_it(
+    run: tuple[TrainResult, list[object]], capture: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As where the blocks hide all of it: the result is what they made, and a note says why."""
+    inner = tasks_train.start_trainer
+
+    def spy(*arguments):
+        if arguments[-1] is not None and arguments[-1].start is not None:
+            raise DivergedError("no triangle is left")
+        return inner(*arguments)
+
+    monkeypatch.setattr(tasks_train, "start_trainer", spy)
+    events: list[object] = []
+    result = train(capture, tmp_path / "run", CONFIG, blocks="2x1", callbacks=[events.append])
+    notes = [event.text for event in events if isinstance(event, NoteEvent)]
+    assert "the sky stays as the coarse run left it: no triangle is left" in notes
+    sky = Surroundings.of_note(result.soup.notes["sky"])
+    assert sky is not None
+    whole = triangles(TriangleSoup.load(result.path / "blocks" / "coarse" / "soup.safetensors"))
+    assert torch.equal(triangles(result.soup)[sky.outermost(triangles(result.soup))], whole[sky.outermost(whole)])
+    ground = triangles(run[0].soup)[: -run[0].metrics["blocks"][-1]["triangles"]]
+    assert torch.equal(triangles(result.soup)[~sky.outermost(triangles(result.soup))], ground)

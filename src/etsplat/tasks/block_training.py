@@ -1,8 +1,9 @@
-"""A scene in blocks: a coarse soup of the whole, then a run for each block among that, then all of them as one.
+"""A scene in blocks: a coarse soup of the whole, a run for each block among that, then one for the sky among these.
 
 Only one run is in memory at a time. The coarse soup is made of photos at half their size, of few triangles. A block
-starts from its own points, and from the sky of the coarse soup that lies in its direction; the rest of the coarse soup
-is drawn with it and does not learn. In the result each triangle is of the run of that block in which its middle lies.
+starts from its own points; the coarse soup around it, and all of its sky, is drawn with it and does not learn. In the
+result each triangle is of the run of that block in which its middle lies. The sky is what photos of all blocks share:
+it learns last, from all photos, among what the blocks have become, which is drawn and does not learn.
 """
 
 import gc
@@ -21,7 +22,7 @@ from etsplat.io.memory import available_memory
 from etsplat.io.run_directory import RunDirectory, is_run
 from etsplat.model.surroundings import Surroundings
 from etsplat.model.triangle_soup import FOCAL_NOTE, TriangleSoup
-from etsplat.optim.loop import Event, NoteEvent, Progress, StageEvent, StepEvent
+from etsplat.optim.loop import DivergedError, Event, NoteEvent, Progress, StageEvent, StepEvent
 from etsplat.optim.schedules import limited_iterations
 from etsplat.tasks.running import Job
 from etsplat.tasks.scene_part import ScenePart, in_frame
@@ -30,13 +31,17 @@ from etsplat.tasks.soup_trainer import background_of
 from etsplat.tasks.sources import world_up
 from etsplat.tasks.train_checks import triangle_limit
 from etsplat.tasks.train_config import TrainConfig
-from etsplat.tasks.train_memory import bytes_of_values, check_memory, in_words
+from etsplat.tasks.train_memory import bytes_of_values, check_memory, in_words, memory_of
 
-FOLDER, COARSE = "blocks", "coarse"
-"""In the run's folder: the runs of the blocks, and that of the coarse soup among them."""
+FOLDER, COARSE, SKY = "blocks", "coarse", "sky"
+"""In the run's folder: the runs of the blocks, and those of the coarse soup and of the sky among them."""
 
 COARSE_TRIANGLES, COARSE_STEPS = 0.5, 0.5
-"""Of the coarse soup of the whole, as parts of those of a block."""
+"""Of the coarse soup of the whole, and of the sky at the end, as parts of those of a block."""
+
+SKY_RATE = 10.0
+"""So much faster the corners of the sky move when it learns alone: a photo shows little of it, so that each of its few,
+large triangles learns in few steps (measured: research/results.md, "Blocks")."""
 
 Fit = Callable[[Job[TrainConfig], Dataset, ScenePart | None], tuple[TriangleSoup, dict[str, Any]]]
 """An ordinary run of a capture, or of a part of one: its soup in the capture's own units, and its metrics."""
@@ -44,12 +49,39 @@ Fit = Callable[[Job[TrainConfig], Dataset, ScenePart | None], tuple[TriangleSoup
 
 @dataclass(frozen=True)
 class _Done:
-    """A run that is done."""
+    """A run that is done.
 
-    name: str
-    photos: int
+    Attributes:
+        soup: what it made.
+        about: it in metrics.json, but for how much of the soup is in the result.
+    """
+
     soup: TriangleSoup
-    metrics: dict[str, Any]
+    about: dict[str, Any]
+
+    def giving(self, soup: TriangleSoup) -> dict[str, Any]:
+        """For metrics.json, with what of it is in the result."""
+        return {**self.about, "triangles": len(soup)}
+
+
+@dataclass(frozen=True)
+class _Whole:
+    """What the coarse run says of the whole.
+
+    Attributes:
+        soup: its triangles.
+        closed: the sphere that the sky is on; None without a sky.
+        exposure: by names of photos.
+    """
+
+    soup: TriangleSoup
+    closed: Surroundings | None
+    exposure: dict[str, torch.Tensor]
+
+    def on_sky(self, soup: TriangleSoup) -> torch.Tensor:
+        """(N,) which triangles of a soup are of the sky."""
+        nothing = torch.zeros(len(soup), dtype=torch.bool)
+        return nothing if self.closed is None else self.closed.outermost(soup.vertices.detach())
 
 
 def check_blocks(blocks: str, config: TrainConfig, *, watched: bool) -> None:
@@ -99,44 +131,70 @@ def train_blocks(
     grid = cut(own, shape, world_up(own.viewmats))
     parts = parts_of(own, grid)
     coarse, each = _settings(own, config, len(grid))
-    for note in (*own.notes, *_check(parts, coarse, each, job.device, asset=config.asset)):
+    thin = _thinned(own, coarse.max_triangles)
+    for note in (*own.notes, *_check(thin, parts, coarse, each, job.device, asset=config.asset)):
         job.announce(NoteEvent(note))
-    steps = sum(_steps(views, settings) for views, settings in [(own, coarse), *((part, each) for part in parts)])
+    all_runs = [(own, coarse), *((part, each) for part in parts), *([(own, coarse)] if config.sky != "none" else [])]
+    steps = sum(_steps(views, settings) for views, settings in all_runs)
     job.identify({"fingerprint": own.fingerprint(), "blocks": "x".join(map(str, shape))}, paths, steps)
     with job.writing():
-        runs = [_run(job, COARSE, coarse, _thinned(own, coarse.max_triangles).halved(), None, fit)]
-        whole = runs[0].soup
-        notes = {**whole.notes, FOCAL_NOTE: f"{float(own.Ks[own.train, 0, 0].mean()):.9g}"}
-        whole.save(job.run.soup_path)  # so that `etsplat view` has something to follow
-        exposure = _exposures(job.run.path / FOLDER / COARSE)
-        soups: dict[int, TriangleSoup] = {}
+        done = _run(job, COARSE, coarse, thin.halved(), None, fit)
+        runs, whole = [done.giving(done.soup)], _whole(own, done.soup, job.run.path / FOLDER / COARSE)
+        soup, soups = whole.soup, dict[int, TriangleSoup]()
+        soup.save(job.run.soup_path)  # so that `etsplat view` has something to follow
         for block, capture in enumerate(parts):
             job.announce(NoteEvent(f"block {grid.name(block)}, {block + 1} of {len(grid)}: {_about(capture)}"))
-            part = _part(own, grid, block, whole, exposure)
-            done = _run(job, grid.name(block), each, capture, part, fit)
-            runs.append(replace(done, soup=done.soup.kept(_owners(own, grid, done.soup) == block)))
-            soups[block] = runs[-1].soup
-            merged(own, grid, whole, soups, notes).save(job.run.soup_path)
-        soup = merged(own, grid, whole, soups, notes)
+            done = _run(job, grid.name(block), each, capture, _part(own, grid, block, whole), fit)
+            soups[block] = done.soup.kept((_owners(own, grid, done.soup) == block) & ~whole.on_sky(done.soup))
+            runs.append(done.giving(soups[block]))
+            soup = _merged(own, grid, whole, soups)
+            soup.save(job.run.soup_path)
+        soups.clear()  # all of it is in the soup; the sky needs the room
+        if (done := _learned_sky(job, coarse, thin, whole, soup, fit)) is not None:
+            runs.append(done.giving(done.soup))
+            soup = _joined([soup.kept(~whole.on_sky(soup)), done.soup], whole)
+            soup.save(job.run.soup_path)
         return soup, _conclude(job, own, soup, runs, config)
 
 
-def merged(
-    own: Dataset, grid: Grid, whole: TriangleSoup, soups: dict[int, TriangleSoup], notes: dict[str, str]
-) -> TriangleSoup:
-    """The blocks that are done, each with what lies in its cell, and the coarse soup in the place of the others.
+def _merged(own: Dataset, grid: Grid, whole: _Whole, soups: dict[int, TriangleSoup]) -> TriangleSoup:
+    """The blocks that are done, and of the coarse soup what lies in the others, and the sky."""
+    missing = torch.tensor([block not in soups for block in range(len(grid))])
+    rest = whole.soup.kept(missing[_owners(own, grid, whole.soup)] | whole.on_sky(whole.soup))
+    return _joined([rest, *(soups[block] for block in sorted(soups))], whole)
+
+
+def _joined(soups: Sequence[TriangleSoup], whole: _Whole) -> TriangleSoup:
+    together = {name: torch.cat([soup.state()[name] for soup in soups]) for name in whole.soup.state()}
+    return replace(whole.soup, **together)
+
+
+def _learned_sky(
+    job: Job[TrainConfig], config: TrainConfig, own: Dataset, whole: _Whole, soup: TriangleSoup, fit: Fit
+) -> _Done | None:
+    """The sky, from that of the coarse run, by all photos, among all else. None where there is none to learn from.
 
     Args:
+        job: of the whole.
+        config: settings of the coarse run.
         own: the capture.
-        grid: its cut.
         whole: the coarse soup.
-        soups: by block; of these, all is taken.
-        notes: of the result.
+        soup: all blocks, and the coarse sky.
+        fit: makes a run.
     """
-    missing = torch.tensor([block not in soups for block in range(len(grid))])
-    kept = [whole.kept(missing[_owners(own, grid, whole)]), *(soups[block] for block in sorted(soups))]
-    together = {name: torch.cat([soup.state()[name] for soup in kept]) for name in whole.state()}
-    return TriangleSoup(**together, appearance=whole.appearance, notes=notes)
+    on_sky = whole.on_sky(soup)
+    if not bool(on_sky.any()):
+        return None
+    start = soup.kept(on_sky)
+    part = ScenePart(own.frame, soup.kept(~on_sky), start, whole.closed, whole.exposure)
+    middles = own.normalization.apply(start.vertices.double().mean(dim=1))
+    capture = replace(own, exact_points=middles, point_colors=start.display_colors())
+    job.announce(NoteEvent(f"the sky, among all blocks: {_about(capture)}"))
+    try:
+        return _run(job, SKY, _of_sky(config), capture, part, fit)
+    except DivergedError as error:  # all of it is hidden, say; what the blocks have become is a result without it
+        job.announce(NoteEvent(f"the sky stays as the coarse run left it: {error}"))
+        return None
 
 
 def _run(
@@ -152,9 +210,10 @@ def _run(
             job.announce(NoteEvent(f"{name}: {event.text}"))
 
     own = Job(config, folder, [tell], resume=is_run(folder), overwrite=False)
-    done = _Done(name, len(capture.train), *fit(own, capture, part))
+    soup, metrics = fit(own, capture, part)
     gc.collect()  # a trainer and what looks at it hold each other; the next run needs the room
-    return done
+    told = {key: metrics[key] for key in ("iterations", "seconds", "psnr")}
+    return _Done(soup, {"name": name, "photos": len(capture.train), **told})
 
 
 def _settings(own: Dataset, config: TrainConfig, blocks: int) -> tuple[TrainConfig, TrainConfig]:
@@ -167,16 +226,32 @@ def _settings(own: Dataset, config: TrainConfig, blocks: int) -> tuple[TrainConf
     return replace(each, iterations=steps, max_triangles=few), each
 
 
+def _of_sky(coarse: TrainConfig) -> TrainConfig:
+    """Settings of the sky alone. Depth maps say nothing of it."""
+    loss = coarse.loss if coarse.loss.depth == "off" else replace(coarse.loss, lambda_depth=0.0)
+    faster = replace(coarse.optimizer, lr_vertices=SKY_RATE * coarse.optimizer.lr_vertices)
+    return replace(coarse, loss=loss, optimizer=faster)
+
+
 def _check(
-    parts: Sequence[Dataset], coarse: TrainConfig, each: TrainConfig, device: torch.device, *, asset: bool
+    thin: Dataset,
+    parts: Sequence[Dataset],
+    coarse: TrainConfig,
+    each: TrainConfig,
+    device: torch.device,
+    *,
+    asset: bool,
 ) -> list[str]:
     """What the owner of the runs should know. Raises InputError where there is too little memory for one of them."""
     needed = [check_memory(part, each, each.max_triangles, device, coarse.max_triangles) for part in parts]
-    most = max(needed, key=lambda memory: memory.total)
-    result = 2 * len(parts) * each.max_triangles * bytes_of_values(each.drawing.sh_degree)
+    most, all_blocks = max(needed, key=lambda memory: memory.total), len(parts) * each.max_triangles
+    result = 2 * all_blocks * bytes_of_values(each.drawing.sh_degree)
+    if coarse.sky != "none":
+        sky = memory_of(thin, coarse, coarse.max_triangles, device, all_blocks)
+        result = max(result, sky.total - sky.kept)  # its photos are streamed, or there already
     if result > (free := available_memory()):
         raise InputError(
-            f"max_triangles: all blocks may have {len(parts) * each.max_triangles:,} triangles, which need "
+            f"max_triangles: all blocks may have {all_blocks:,} triangles, which need "
             f"{in_words(result)} at the end, and {in_words(free)} are free; set it to less"
         )
     photos = [len(part.train) for part in parts]
@@ -210,22 +285,23 @@ def _owners(own: Dataset, grid: Grid, soup: TriangleSoup) -> torch.Tensor:
     return grid.block_of(own.normalization.apply(soup.vertices.detach().double().mean(dim=1)))
 
 
-def _part(own: Dataset, grid: Grid, block: int, whole: TriangleSoup, exposure: dict[str, torch.Tensor]) -> ScenePart:
-    middles = own.normalization.apply(whole.vertices.detach().double().mean(dim=1))
-    near = grid.around(block, middles)
-    closed = Surroundings.of_note(whole.notes.get(Surroundings.NOTE, ""))
-    on_sky = torch.zeros_like(near) if closed is None else closed.outermost(whole.vertices.detach())
-    sky = whole.kept(near & on_sky) if bool((near & on_sky).any()) else None
-    return ScenePart(own.frame, whole.kept(~near), sky, closed, exposure)
-
-
-def _exposures(folder: Path) -> dict[str, torch.Tensor]:
+def _whole(own: Dataset, soup: TriangleSoup, folder: Path) -> _Whole:
+    """What the coarse run in a folder says of a capture."""
+    notes = {**soup.notes, FOCAL_NOTE: f"{float(own.Ks[own.train, 0, 0].mean()):.9g}"}  # its photos were smaller
     found = RunDirectory(folder).read_exposure().get("matrices", {})
-    return {name: torch.tensor(matrix) for name, matrix in found.items()}
+    exposure = {name: torch.tensor(matrix) for name, matrix in found.items()}
+    closed = Surroundings.of_note(soup.notes.get(Surroundings.NOTE, ""))
+    return _Whole(replace(soup, notes=notes), closed, exposure)
+
+
+def _part(own: Dataset, grid: Grid, block: int, whole: _Whole) -> ScenePart:
+    middles = own.normalization.apply(whole.soup.vertices.detach().double().mean(dim=1))
+    rest = ~grid.around(block, middles) | whole.on_sky(whole.soup)
+    return ScenePart(own.frame, whole.soup.kept(rest), None, whole.closed, whole.exposure)
 
 
 def _conclude(
-    job: Job[TrainConfig], own: Dataset, soup: TriangleSoup, runs: Sequence[_Done], config: TrainConfig
+    job: Job[TrainConfig], own: Dataset, soup: TriangleSoup, runs: list[dict[str, Any]], config: TrainConfig
 ) -> dict[str, Any]:
     """Measures and writes what all runs made together."""
     if exposure := RunDirectory(job.run.path / FOLDER / COARSE).read_exposure():
@@ -234,7 +310,7 @@ def _conclude(
         own.georeference.write(job.run.path)
     scorer = Scorer(own, job.device, background=background_of(config))
     scores = scorer.full(in_frame(soup, own.normalization).to(job.device), job.run.test)
-    done = Progress(sum(run.metrics["iterations"] for run in runs), sum(run.metrics["seconds"] for run in runs))
+    done = Progress(sum(run["iterations"] for run in runs), sum(run["seconds"] for run in runs))
     job.run.truncate_history(0)  # of the same run, resumed when it was done
     job.run.append_history(
         {"iteration": done.iteration, "seconds": done.seconds, **soup.describe(), "psnr": scores["psnr"]}
@@ -243,15 +319,7 @@ def _conclude(
         **scores,
         "psnr_opaque_loss": None if scores["psnr"] is None else scores["psnr"] - scores["psnr_opaque"],
         **soup.describe(),
-        "blocks": [
-            {
-                "name": run.name,
-                "photos": run.photos,
-                "triangles": len(run.soup),
-                **{key: run.metrics[key] for key in ("iterations", "seconds", "psnr")},
-            }
-            for run in runs
-        ],
+        "blocks": runs,
         "exposure_learned": bool(exposure),
         "width": own.images.sizes[0][0],
         "height": own.images.sizes[0][1],

@@ -1,4 +1,4 @@
-"""What a run of a part of a scene has from the whole: its frame, what lies around it, the sky, exposures."""
+"""What a run of a part of a scene has from the whole: its frame, what lies around it, its start, exposures."""
 
 import hashlib
 from collections.abc import Mapping
@@ -24,20 +24,20 @@ class ScenePart:
     Attributes:
         frame: of the whole, from its own units to where it is trained.
         rest: triangles around the part, which are drawn with it and stay as they are.
-        sky: triangles of the sky to start from; None where the part has none of its own.
+        start: triangles to start from; None for those that are put at the capture's points.
         closed: the sphere that the sky is on; None without a sky.
         exposure: by names of photos, how each saw the colours of the scene; empty where all were exposed alike.
     """
 
     frame: Normalization
     rest: TriangleSoup
-    sky: TriangleSoup | None = None
+    start: TriangleSoup | None = None
     closed: Surroundings | None = None
     exposure: Mapping[str, Float[Tensor, "3 3"]] = field(default_factory=dict)
 
     def digest(self) -> str:
         """Names all that a result depends on."""
-        soups = {"rest": self.rest, "sky": self.sky}
+        soups = {"rest": self.rest, "start": self.start}
         tensors = {f"{name}.{key}": t for name, soup in soups.items() if soup for key, t in soup.state().items()}
         tensors |= {f"exposure.{name}": matrix for name, matrix in self.exposure.items()}
         about = repr((self.frame.center.tolist(), self.frame.radius, self.closed and self.closed.note))

@@ -59,7 +59,7 @@ def start_trainer(
     depths: DepthTrust | None = None,
     part: ScenePart | None = None,
 ) -> Trainer[TriangleSoup]:
-    """The start of a run: triangles at the capture's points, or at random ones.
+    """The start of a run: triangles at the capture's points, or at random ones, or those of a part.
 
     Args:
         capture: photos in the frame that is trained in.
@@ -69,20 +69,11 @@ def start_trainer(
         depths: which depth maps are believed; None where none are used.
         part: of a capture that is a part of a scene, what it has from the whole.
     """
-    generator = torch.Generator().manual_seed(config.seed)
+    generator, frame = torch.Generator().manual_seed(config.seed), capture.normalization
     points = _start_points(capture, config, generator, whole=part is None)
-    soup = start_soup(
-        points,
-        generator,
-        scale=config.start.scale,
-        opacity=config.start.opacity,
-        sigma=config.start.sigma,
-        sh_degree=config.drawing.sh_degree,
-        centers=capture.centers[capture.train],
-        limit=config.start.limit,
-    )
+    soup = _placed(points, capture, config, generator) if part is None or part.start is None else _start_of(part, frame)
     if part is not None:
-        soup = _among_the_rest(soup, part, capture.normalization)
+        soup = SurroundedSoup.among(soup, in_frame(part.rest, frame))
     elif config.sky == "sphere":
         soup = soup.joined(Surroundings.of(capture).soup(capture, config.drawing.sh_degree))
     squared = config.scene_type == "outdoor" and not config.normalize and points.span > LARGE_SPAN
@@ -236,10 +227,23 @@ def _appearance(config: TrainConfig, iteration: int) -> SoupAppearance:
     return replace(plain, opacity_floor=FINAL_FLOOR * opaque, sigma_ceiling=ceiling)
 
 
-def _among_the_rest(soup: TriangleSoup, part: ScenePart, frame: Normalization) -> TriangleSoup:
-    if part.sky is not None:
-        soup = soup.joined(in_frame(part.sky, frame))
-    return SurroundedSoup.among(soup, in_frame(part.rest, frame))
+def _placed(points: StartPoints, capture: Dataset, config: TrainConfig, generator: torch.Generator) -> TriangleSoup:
+    return start_soup(
+        points,
+        generator,
+        scale=config.start.scale,
+        opacity=config.start.opacity,
+        sigma=config.start.sigma,
+        sh_degree=config.drawing.sh_degree,
+        centers=capture.centers[capture.train],
+        limit=config.start.limit,
+    )
+
+
+def _start_of(part: ScenePart, frame: Normalization) -> TriangleSoup:
+    assert part.start is not None
+    soup = in_frame(part.start, frame)
+    return replace(soup, **{name: tensor.clone() for name, tensor in soup.state().items()}).learnable()
 
 
 def _start_points(capture: Dataset, config: TrainConfig, generator: torch.Generator, *, whole: bool) -> StartPoints:
