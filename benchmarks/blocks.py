@@ -6,7 +6,8 @@
 The scene is made in code: eight of the demo's tables, in fewer faces, on a painted ground, 288 photos around them. The
 run in blocks comes first. The one beside it has as many steps as the coarse run, all blocks and the sky together, and
 as many triangles as their result. A pixel of a test photo belongs to the sky, or to the seams where the true surface is
-within a tenth of a block's width of a border between blocks, to the middle where it is farther than a quarter, or between.
+within a tenth of a block's width of a border between blocks, to the middle where it is farther than a quarter, or
+between.
 
 With --memory, nothing is compared: so many points, a few steps; how much each process grows beyond what it held with
 photos and points (VmHWM, Linux), of one run, and of each run of the same in blocks.
