@@ -31,11 +31,11 @@ from etsplat.data.blocks import Grid, cut
 from etsplat.data.dataset import Dataset, every_eighth
 from etsplat.data.demo_scene import demo_photo, demo_surface
 from etsplat.data.pictures import StoredPictures, as_float
+from etsplat.data.where_up import up_of
 from etsplat.engines.threads import one_torch_thread
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.ops.rasterize_opaque import rasterize_opaque
 from etsplat.optim.loop import Event, NoteEvent, StageEvent
-from etsplat.tasks.sources import world_up
 from etsplat.tasks.train_config import TrainConfig
 
 TABLES, APART = (4, 2), 3.9
@@ -110,7 +110,7 @@ def compare(options: argparse.Namespace) -> None:
         }
     )
     columns, rows = map(int, options.blocks.split("x"))
-    grid, begin = cut(views, (columns, rows), world_up(views.viewmats)), time.process_time()
+    grid, begin = cut(views, (columns, rows), up_of(views)), time.process_time()
     with TemporaryDirectory() as place:
         blocks = etsplat.train(views, Path(place) / "blocks", config, blocks=options.blocks, callbacks=[_tell])
         steps, seconds = blocks.metrics["iterations"], time.process_time() - begin

@@ -8,12 +8,13 @@ from typing import Any
 
 from etsplat.core.errors import InputError
 from etsplat.data.dataset import Dataset
+from etsplat.data.where_up import up_of
 from etsplat.engines.choice import engine, resolve_device
 from etsplat.io.atomic import write_error
 from etsplat.model.triangle_mesh import TriangleMesh
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.scoring import Scorer
-from etsplat.tasks.sources import load_source, make_subject, world_up
+from etsplat.tasks.sources import load_source, make_subject
 from etsplat.tasks.starts import plain_hull
 from studies.grid.writing import write_text
 from studies.objects.subjects import Subject
@@ -68,7 +69,7 @@ def _carve(subject: Subject, config: ReconstructConfig, path: Path) -> dict[str,
     device = resolve_device(config.device, config.engine)
     views, truth = make_subject(load_source(subject.source, config)[0], config, lambda done, total: None, device)
     # Meshes are photographed with +y up.
-    up = world_up(views.viewmats) if truth is None else None
+    up = up_of(views) if truth is None else None
     found: dict[str, Any] = {"problem": None, "silhouette_iou": None, "up": None if up is None else up.tolist()}
     started = time.perf_counter()
     try:

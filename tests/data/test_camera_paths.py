@@ -7,7 +7,7 @@ import torch
 
 from etsplat import look_at, orbit_cameras
 from etsplat.core.cameras import camera_centers
-from etsplat.data.camera_coverage import focus_point, upright
+from etsplat.data.camera_coverage import focus_point
 from etsplat.data.camera_paths import PATHS, path_note, played, usual_frames
 from etsplat.data.camera_tour import splined
 
@@ -192,18 +192,6 @@ def test_steps_that_are_lost_beside_a_long_one_take_no_time():
 def test_a_path_along_photos_has_as_many_frames_as_keep_it_calm():
     assert usual_frames("photos", cluster()) == usual_frames("orbit", CAPTURES["ring"]) == 120
     assert 150 < usual_frames("photos", CAPTURES["ring"]) < usual_frames("photos", CAPTURES["two rings"]) <= 480
-
-
-def test_up_is_what_cameras_are_level_with_although_all_look_up():
-    """The mean of their own ups leans back at a front; where they stand side by side nothing else is known."""
-    turn = torch.linspace(-0.8, 0.8, 15, dtype=torch.float64)
-    eyes = torch.stack([4 * turn.sin(), 0 * turn, 4 * turn.cos()], dim=1)
-    around = look_at(eyes, torch.tensor([0.0, 2.0, 0.0], dtype=torch.float64), UP)
-    mean = torch.nn.functional.normalize(-around[:, 1, :3].mean(dim=0), dim=0)
-    assert float(mean @ UP) < 0.93
-    torch.testing.assert_close(upright(around, mean), UP, atol=1e-6, rtol=0)
-    side_by_side = look_at(eyes, eyes + torch.tensor([0.0, 2.0, -4.0], dtype=torch.float64), UP)
-    torch.testing.assert_close(upright(side_by_side, mean), mean)
 
 
 def test_key_poses_are_gone_through_with_their_fields_of_view():

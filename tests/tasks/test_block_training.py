@@ -13,6 +13,7 @@ import etsplat
 from etsplat.core.errors import InputError
 from etsplat.data.blocks import cut
 from etsplat.data.dataset import Dataset
+from etsplat.data.where_up import up_of
 from etsplat.io.run_directory import RunDirectory
 from etsplat.model.surroundings import Surroundings
 from etsplat.model.triangle_soup import TriangleSoup
@@ -23,7 +24,7 @@ from etsplat.tasks import train as tasks_train
 from etsplat.tasks.export_config import ExportConfig
 from etsplat.tasks.export_soup import export_soup
 from etsplat.tasks.scene_part import ScenePart
-from etsplat.tasks.sources import open_run, world_up
+from etsplat.tasks.sources import open_run
 from etsplat.tasks.train import TrainResult, train
 from etsplat.tasks.train_config import TrainConfig
 from helpers.captures import small_demo_scene
@@ -54,7 +55,7 @@ def test_each_triangle_is_of_the_block_in_which_its_middle_lies(
 ) -> None:
     """Of every block's run exactly what lies in its cell, without margins, and the sky's run; nothing is coarse."""
     result = run[0]
-    grid = cut(capture, (2, 1), world_up(capture.viewmats))
+    grid = cut(capture, (2, 1), up_of(capture))
     sky = Surroundings.of_note(result.soup.notes["sky"])
     assert sky is not None
     kept, dropped = [], 0

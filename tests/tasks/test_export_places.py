@@ -12,6 +12,7 @@ from etsplat import look_at
 from etsplat.cli.parse import parse
 from etsplat.core.errors import InputError
 from etsplat.data.load import load_dataset
+from etsplat.data.where_up import held_up, up_of
 from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.regions import Box, Sphere
 from etsplat.geometry.similarity import Similarity, rotation_between
@@ -19,8 +20,8 @@ from etsplat.model.soup_import import open_soup
 from etsplat.model.surroundings import Surroundings
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.tasks.export_config import ExportConfig
-from etsplat.tasks.export_soup import export_soup
-from etsplat.tasks.sources import SoupRun, open_run, world_up
+from etsplat.tasks.export_soup import export_soup, transform_of
+from etsplat.tasks.sources import SoupRun, open_run
 from helpers.captures import write_colmap
 from helpers.exported_soups import CAMERA, UP_AXIS, difference, odd_soup
 from helpers.gltf import check_glb
@@ -35,12 +36,24 @@ def test_up_is_the_cameras_mean_up_and_becomes_y():
     directions = torch.nn.functional.normalize(torch.randn(5, 3, dtype=torch.float64), dim=1)
     eyes = torch.tensor([[3.0, 0, 0], [0, 0, 3.0], [-3.0, 0, 0], [0, 0, -3.0]], dtype=torch.float64)
     viewmats = look_at(eyes, torch.zeros(3), torch.tensor([0.0, -1.0, 0.0]))
-    up = world_up(viewmats)
+    up = held_up(viewmats)
     torch.testing.assert_close(up, torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64))
     for direction in [up, *directions]:
         turned = rotation_between(direction, UP_AXIS) @ direction
         torch.testing.assert_close(turned, torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64))
-    assert world_up(torch.cat([viewmats, look_at(eyes, torch.zeros(3), torch.tensor([0.0, 1.0, 0.0]))])) is None
+
+
+def test_a_capture_that_looks_up_does_not_lean_back_in_exports(tmp_path, soup):
+    """As one at a front does whose photos show its roof: the mean of the cameras' own ups is 25 degrees off."""
+    write_colmap(tmp_path / "scene", [(33, 24)] * 9)
+    turn = torch.linspace(-0.8, 0.8, 9, dtype=torch.float64)
+    eyes = torch.stack([4 * turn.sin(), 0 * turn, 4 * turn.cos()], dim=1)
+    level = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
+    viewmats = look_at(eyes, torch.tensor([0.0, 2.0, 0.0], dtype=torch.float64), level)
+    run = SoupRun(tmp_path, soup, replace(load_dataset(tmp_path / "scene"), viewmats=viewmats))
+    torch.testing.assert_close(
+        transform_of(run, ExportConfig(), soup.vertices).rotation @ level, UP_AXIS.double(), atol=1e-6, rtol=0
+    )
 
 
 def scene_with_sky(tmp_path):
@@ -138,7 +151,7 @@ def test_up_may_be_z_but_in_glb(tmp_path, soup):
     """The cameras' up is +y here: it comes to be +z, and nothing is mirrored."""
     write_colmap(tmp_path / "scene", [(33, 24)] * 9)
     run = SoupRun(tmp_path, soup, load_dataset(tmp_path / "scene"))
-    up = world_up(run.capture.viewmats)
+    up = up_of(run.capture)
     written = export_soup(run, tmp_path / "a.ply", ExportConfig(up="z", min_opacity=0.0, sky="joined"))
     torch.testing.assert_close(written.transform.rotation @ up, torch.tensor([0.0, 0, 1], dtype=torch.float64))
     turned = (soup.vertices.double() @ written.transform.rotation.T).float()

@@ -30,9 +30,6 @@ _STEEPEST = math.radians(80)
 _BLUR = math.radians(12)
 """Standard deviation of the azimuths over which distances and heights are averaged, at least."""
 
-_LEVEL, _TURNED = 0.01, 0.03
-"""Mean squares of what the cameras' right sides have along up, at most, and along the next direction, at least."""
-
 INSET = 0.05
 """Of an arc that does not go all around, left out at each end: what is seen there is at the border of all photos."""
 
@@ -66,22 +63,6 @@ def horizontal_basis(up: Float[Tensor, "3"]) -> Float[Tensor, "2 3"]:
     axis = torch.eye(3, dtype=torch.float64)[int(up.abs().argmin())]
     first = torch.nn.functional.normalize(torch.linalg.cross(up.double(), axis), dim=0)
     return torch.stack([first, torch.linalg.cross(up.double(), first)])
-
-
-def upright(viewmats: Float[Tensor, "B 4 4"], up: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
-    """Where up is, float64: what the right sides of the cameras are level with, where they say so together.
-
-    The mean of the cameras' own up directions leans back where all look up at something, as at a front.
-
-    Args:
-        viewmats: (B, 4, 4) world to camera.
-        up: (3,) that mean; kept where cameras stand side by side, or were held on edge.
-    """
-    right = viewmats[:, 0, :3].double()
-    values, vectors = torch.linalg.eigh(right.T @ right / len(right))
-    level = vectors[:, 0] * torch.sign(vectors[:, 0] @ up.double())
-    sure = float(values[0]) < _LEVEL and float(values[1]) > _TURNED and float(level @ up.double()) > math.cos(1.0)
-    return level if sure else up.double()
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from etsplat.core.errors import InputError
 from etsplat.core.workers import workers
 from etsplat.data.blocks import Grid, chosen_shape, cut, parse_blocks, parts_of
 from etsplat.data.dataset import Dataset
+from etsplat.data.where_up import up_of
 from etsplat.io.memory import available_memory
 from etsplat.io.run_directory import RunDirectory, is_run
 from etsplat.model.surroundings import Surroundings
@@ -28,7 +29,6 @@ from etsplat.tasks.running import Job
 from etsplat.tasks.scene_part import ScenePart, in_frame
 from etsplat.tasks.scoring import Scorer
 from etsplat.tasks.soup_trainer import background_of
-from etsplat.tasks.sources import world_up
 from etsplat.tasks.train_checks import triangle_limit
 from etsplat.tasks.train_config import TrainConfig
 from etsplat.tasks.train_memory import bytes_of_values, check_memory, in_words, memory_of
@@ -105,7 +105,7 @@ def shape_of(blocks: str, capture: Dataset, config: TrainConfig) -> tuple[int, i
     Raises:
         InputError: the capture has no points.
     """
-    up = world_up(capture.viewmats)
+    up = up_of(capture)
     return parse_blocks(blocks) or chosen_shape(capture, up, config.max_triangles)
 
 
@@ -128,7 +128,7 @@ def train_blocks(
         InputError: there are too many blocks for the scene, or too many triangles for the memory; as `Job`.
     """
     config = job.config
-    grid = cut(own, shape, world_up(own.viewmats))
+    grid = cut(own, shape, up_of(own))
     parts = parts_of(own, grid)
     coarse, each = _settings(own, config, len(grid))
     thin = _thinned(own, coarse.max_triangles)

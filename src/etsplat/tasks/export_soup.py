@@ -11,6 +11,7 @@ from torch import Tensor
 
 from etsplat.core.cameras import Cameras
 from etsplat.core.errors import InputError
+from etsplat.data.where_up import up_of
 from etsplat.geometry.similarity import Similarity, rotation_between
 from etsplat.io.atomic import atomic_write
 from etsplat.io.georeference import GEOREFERENCE_FILE, Georeference
@@ -25,7 +26,7 @@ from etsplat.tasks.export_config import ExportConfig
 from etsplat.tasks.export_mesh import check_stored
 from etsplat.tasks.scene_page import compact_bytes, scene_of, small_camera
 from etsplat.tasks.soup_selection import Crop, Reason, Selection, select
-from etsplat.tasks.sources import SoupRun, training_cameras, world_up
+from etsplat.tasks.sources import SoupRun, training_cameras
 from etsplat.web.pages import render_scene_page
 
 WHOLE = (".safetensors", ".etz", ".html")
@@ -206,7 +207,7 @@ def transform_of(run: SoupRun, config: ExportConfig, corners: Float[Tensor, "N 3
             )
         place = torch.tensor(georeference.offset, dtype=torch.float64)
         return Similarity(scale=georeference.scale * config.scale, translation=place * config.scale)
-    up = None if run.capture is None or config.up == "keep" else world_up(run.capture.viewmats)
+    up = None if run.capture is None or config.up == "keep" else up_of(run.capture)
     if georeference is not None and georeference.up is not None and config.up != "keep":
         up = torch.eye(3, dtype=torch.float64)["xyz".index(georeference.up)]
     axis = torch.eye(3, dtype=torch.float64)[2 if config.up == "z" else 1]

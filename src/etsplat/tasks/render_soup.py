@@ -14,9 +14,9 @@ from torch import Tensor
 
 from etsplat.core.cameras import Cameras, intrinsics
 from etsplat.core.errors import InputError
-from etsplat.data.camera_coverage import upright
 from etsplat.data.camera_paths import PATHS, path_note, played, usual_frames
 from etsplat.data.dataset import Dataset
+from etsplat.data.where_up import up_of
 from etsplat.engines.choice import engine
 from etsplat.io.atomic import atomic_write, write_error
 from etsplat.io.camera_path_files import read_camera_path
@@ -27,7 +27,7 @@ from etsplat.model.soup_appearance import OPAQUE_FROM
 from etsplat.model.triangle_soup import FOCAL_NOTE, TriangleSoup
 from etsplat.tasks.render_config import RenderConfig
 from etsplat.tasks.soup_selection import Crop, select
-from etsplat.tasks.sources import SoupRun, world_up
+from etsplat.tasks.sources import SoupRun
 
 _MOST_SAMPLES = 8
 
@@ -157,11 +157,10 @@ def views_of(
             raise InputError(f"--path {config.path}: the capture has no such views; draw a path instead")
         cameras = capture.cameras
         return [capture.names[index] for index in chosen], [_sized(cameras[index], config.width) for index in chosen]
-    up = world_up(capture.viewmats)
+    up = up_of(capture)
     if up is None:  # the cameras contradict each other: take the first one's
         up = -capture.viewmats[0, 1, :3]
     photographed = capture.viewmats[capture.train]
-    up = upright(photographed, up)
     frames = config.frames or usual_frames(config.path, photographed)
     viewmats = PATHS[config.path](photographed, up, frames).float()
     if tell is not None and (note := path_note(config.path, photographed, up)):

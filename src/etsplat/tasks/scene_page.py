@@ -11,11 +11,12 @@ from etsplat.core.cameras import Cameras
 from etsplat.data.camera_coverage import focus_point
 from etsplat.data.dataset import Dataset
 from etsplat.data.looked_at import middle_photo
+from etsplat.data.where_up import up_of
 from etsplat.io.compact_soups import encode_compact
 from etsplat.model.solid_soup import SolidSoup
 from etsplat.model.soup_compact import compact_of, ranks
 from etsplat.model.triangle_soup import TriangleSoup
-from etsplat.tasks.sources import SoupRun, training_cameras, world_up
+from etsplat.tasks.sources import SoupRun, training_cameras
 from etsplat.web.pages import ScenePage
 
 SMALL_WIDTH = 400
@@ -66,7 +67,7 @@ def scene_of(run: SoupRun, soup: TriangleSoup, solid: SolidSoup | None, most: in
 def _photos(capture: Dataset) -> dict[str, Any]:
     """The photos by name, from where one looks first, and what they look at."""
     photos = sorted([*capture.train, *capture.test, *capture.watched])
-    up = world_up(capture.viewmats)
+    up = up_of(capture)
     return {
         "cameras": [
             _camera(capture.names[index], capture.viewmats[index], capture.Ks[index], capture.images.sizes[index])

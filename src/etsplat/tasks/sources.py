@@ -12,8 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from etsplat.core.cameras import Cameras
 from etsplat.core.errors import InputError
@@ -333,13 +331,6 @@ def read_record(run: RunDirectory, kind: type[Settings], names: Iterable[str], *
     except InputError as error:
         raise InputError(f"{run.config_path}: {error}") from error
     return record
-
-
-def world_up(viewmats: Float[Tensor, "B 4 4"]) -> Float[Tensor, "3"] | None:
-    """Where up is in the world: the mean of the cameras' own up directions; None if they contradict each other."""
-    up = -viewmats[:, 1, :3].double().mean(dim=0)
-    length = float(up.norm())
-    return up / length if length > 0.3 else None
 
 
 def training_cameras(capture: Dataset) -> list[Cameras]:

@@ -24,6 +24,7 @@ from torch import Tensor
 from etsplat.core.cameras import Cameras, intrinsics
 from etsplat.core.errors import InputError
 from etsplat.data.looked_at import middle_photo
+from etsplat.data.where_up import up_of
 from etsplat.engines.choice import engine
 from etsplat.io.camera_path_files import KeyPoses
 from etsplat.model.triangle_soup import TriangleSoup
@@ -39,7 +40,6 @@ from etsplat.viewer.standing import (
     nearest_photo,
     stand_at,
     stand_before,
-    up_of,
 )
 
 MOVING_SECONDS = 0.08

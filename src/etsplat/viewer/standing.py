@@ -10,10 +10,10 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from etsplat.core.cameras import Cameras
-from etsplat.data.camera_coverage import focus_point, upright
+from etsplat.data.camera_coverage import focus_point
 from etsplat.data.dataset import Dataset
+from etsplat.data.where_up import up_of
 from etsplat.model.triangle_soup import TriangleSoup
-from etsplat.tasks.sources import world_up
 
 FRUSTUM = 0.04
 """Size of the pictured cameras, relative to the scene's extent."""
@@ -73,12 +73,6 @@ def nearest_photo(capture: Dataset, camera: Cameras) -> int:
     turned = 1 - capture.viewmats[:, 2, :3] @ camera.viewmats[0, 2, :3].double()
     candidates = torch.tensor(sorted([*capture.train, *capture.test, *capture.watched]))
     return int(candidates[(offsets + turned)[candidates].argmin()])
-
-
-def up_of(capture: Dataset) -> Float[Tensor, "3"] | None:
-    """Where up is; None if the cameras contradict each other."""
-    up = world_up(capture.viewmats)
-    return None if up is None else upright(capture.viewmats, up)
 
 
 def fov_of(capture: Dataset, index: int) -> float:

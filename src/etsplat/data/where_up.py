@@ -1,0 +1,50 @@
+"""Where up is in a capture: as its place in the world says, or as its cameras were held."""
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from etsplat.data.dataset import Dataset
+
+_AGREE = 0.3
+"""Length of the mean of the cameras' own up directions, at least, for them not to contradict each other."""
+
+_LEVEL, _TURNED = 0.01, 0.03
+"""Mean squares of what the cameras' right sides have along up, at most, and along the next direction, at least."""
+
+_FARTHEST = math.cos(1.0)
+"""Of what the right sides are level with, along the cameras' mean up direction, at least."""
+
+
+def up_of(capture: Dataset) -> Float[Tensor, "3"] | None:
+    """Where up is, a unit vector, float64; None where nothing says it, as the cameras contradict each other.
+
+    What says where the capture lies in the world is asked first (`Georeference.up`): photos that look straight down, as
+    those of drones, have their own up directions along the ground.
+    """
+    if capture.georeference is not None and capture.georeference.up is not None:
+        return torch.eye(3, dtype=torch.float64)["xyz".index(capture.georeference.up)]
+    return held_up(capture.viewmats)
+
+
+def held_up(viewmats: Float[Tensor, "B 4 4"]) -> Float[Tensor, "3"] | None:
+    """Where up is by how cameras were held, float64; None if they contradict each other.
+
+    What their right sides are level with, where they say so together. Else, where cameras stand side by side or were
+    held on edge, the mean of their own up directions, which leans back where all look up at something, as at a front.
+
+    Args:
+        viewmats: (B, 4, 4) world to camera.
+    """
+    viewmats = viewmats.double()
+    mean = -viewmats[:, 1, :3].mean(dim=0)
+    if float(mean.norm()) <= _AGREE:
+        return None
+    mean = torch.nn.functional.normalize(mean, dim=0)
+    right = viewmats[:, 0, :3]
+    values, vectors = torch.linalg.eigh(right.T @ right / len(right))
+    level = vectors[:, 0] * torch.sign(vectors[:, 0] @ mean)
+    sure = float(values[0]) < _LEVEL and float(values[1]) > _TURNED and float(level @ mean) > _FARTHEST
+    return level if sure else mean
