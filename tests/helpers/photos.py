@@ -18,8 +18,14 @@ STORED_AS = {
 """What makes the stored pixels of an upright image, by the tag Orientation (EXIF 2.32, table of 4.6.5)."""
 
 
-def exif_bytes(orientation: int = 1, model: str = "", focal_mm: float = 0, focal_35mm: int = 0) -> bytes:
-    """EXIF with these tags."""
+def exif_bytes(
+    orientation: int = 1,
+    model: str = "",
+    focal_mm: float = 0,
+    focal_35mm: int = 0,
+    gps: dict[int, object] | None = None,
+) -> bytes:
+    """EXIF with these tags; those of GPS by their numbers."""
     exif = Image.Exif()
     exif[ExifTags.Base.Orientation] = orientation
     if model:
@@ -29,6 +35,8 @@ def exif_bytes(orientation: int = 1, model: str = "", focal_mm: float = 0, focal
         details[ExifTags.Base.FocalLength] = focal_mm
     if focal_35mm:
         details[ExifTags.Base.FocalLengthIn35mmFilm] = focal_35mm
+    if gps:
+        exif.get_ifd(ExifTags.IFD.GPSInfo).update(gps)
     return exif.tobytes()
 
 

@@ -3,11 +3,14 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import tyro
 
 from etsplat.cli.command import Command
+
+if TYPE_CHECKING:
+    from etsplat.data.gps_alignment import MapFit
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,9 +73,23 @@ class Sfm(Command):
         if found.unmasked:
             why = "; ".join(f"{name}: {problem}" for name, problem in list(found.unmasked.items())[:8])
             print(f"Without a mask, and left out: {len(found.unmasked)} photos ({why})")
+        if found.on_map is not None:
+            print(_map_note(found.on_map))
         if len(found.placed) < count / 2:
             print("That is less than half: the scene will have gaps. Let photos overlap by two thirds.")
         return 0
+
+
+def _map_note(fit: "MapFit") -> str:
+    """What became of where photos say that they were taken."""
+    beside = f"{fit.error:.2g} m, beside {fit.across:.2g} m that they spread across"
+    if not fit.believed:
+        return f"GPS of {fit.count} photos not used, it is off by {beside}: axes and unit are arbitrary"
+    scale = fit.to_map.scale
+    return (
+        f"GPS of {fit.count} photos agrees to {beside}: z is up, a unit is {scale:.4g} m. georeference.json has the"
+        f" place ({fit.crs}); etsplat export --scale {scale:.4g} writes metres, --place world coordinates of the map"
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

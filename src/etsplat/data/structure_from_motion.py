@@ -3,10 +3,13 @@
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
+
+import torch
 
 from etsplat.core.errors import InputError
 from etsplat.data.colmap_process import Job, Mapper, Progress, import_pycolmap, place_photos, run_apart
+from etsplat.data.gps_alignment import MapFit, fit_to_map
 from etsplat.data.photo_intake import LEAST_COUNT, CameraSharing, Photo, by_camera, list_photos, take_in
 from etsplat.data.photo_masks import mask_file, write_masks
 from etsplat.data.undistortion import (
@@ -19,6 +22,7 @@ from etsplat.data.undistortion import (
 )
 from etsplat.data.video_intake import FRAMES, frames_of_video
 from etsplat.io.atomic import write_error
+from etsplat.io.georeference import Georeference
 from etsplat.io.paths import kind_of
 from etsplat.io.photos import PHOTO_SUFFIXES
 
@@ -47,6 +51,8 @@ class Placement:
         points: how many points were triangulated.
         cameras: how many different cameras took the placed photos.
         unmasked: photos that were left out because no mask could be found for them, and why; empty without masks.
+        on_map: where the photos say that they were taken; None where too few of them say it. Where it is believed the
+            scene has z up and a georeference.json.
     """
 
     scene: Path
@@ -55,6 +61,7 @@ class Placement:
     points: int
     cameras: int
     unmasked: dict[str, str]
+    on_map: MapFit | None = None
 
 
 def find_cameras(
@@ -129,9 +136,12 @@ def find_cameras(
         placed = sorted(image.name for image in images)
         if len(placed) < max(LEAST_COUNT, LEAST_SHARE * len(names)):
             raise InputError(_too_few(source, len(placed), len(names)))
+        on_map = _put_on_map(pycolmap, model, found)
         undistort_model(model, upright, placed, work, max_size, report)
         if masks == "auto":
             undistort_masks(model, {name: mask_file(work / "masks", name) for name in placed}, work, max_size)
+        if on_map is not None and on_map[1] is not None:
+            on_map[1].write(work / "scene")
         _hand_over(work / "scene", out)
     return Placement(
         out,
@@ -140,7 +150,23 @@ def find_cameras(
         len(model.points3D),
         len({image.camera_id for image in images}),
         unmasked,
+        None if on_map is None else on_map[0],
     )
+
+
+def _put_on_map(pycolmap: Any, model: Any, photos: list[Photo]) -> tuple[MapFit, Georeference | None] | None:
+    """Turns a model as its photos' GPS says, if that is believed; the fit, and where the model lies then."""
+    places = {photo.name: photo.file.place for photo in photos}
+    images = [image for image in model.images.values() if image.has_pose]
+    centers = torch.tensor([image.projection_center().tolist() for image in images], dtype=torch.float64)
+    fit = fit_to_map(centers, [places[image.name] for image in images])
+    if fit is None or not fit.believed:
+        return None if fit is None else (fit, None)
+    middle = centers.mean(dim=0)
+    turn = fit.turn_about(middle)
+    rotation = pycolmap.Rotation3d(turn.rotation.numpy())
+    model.transform(pycolmap.Sim3d(turn.scale, rotation, turn.translation.numpy()))
+    return fit, fit.georeference(middle)
 
 
 def _frames(video: Path, out: Path, count: int, report: Progress) -> Path:

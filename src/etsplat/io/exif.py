@@ -1,4 +1,4 @@
-"""What a photo says of how it was taken: which way up, and with which camera at which focal length (EXIF).
+"""What a photo says of how it was taken: which way up, where, and with which camera at which focal length (EXIF).
 
 Tags that cannot be read count as not there: programs write odd ones, and the pixels are as good without.
 """
@@ -43,6 +43,21 @@ class TakenWith:
     focal_35mm: float
 
 
+@dataclass(frozen=True)
+class GpsPlace:
+    """Where a photo was taken, by WGS 84.
+
+    Attributes:
+        latitude: degrees, north is positive.
+        longitude: degrees, east is positive.
+        altitude: metres above the sea.
+    """
+
+    latitude: float
+    longitude: float
+    altitude: float
+
+
 def turn_of(image: Image.Image) -> Image.Transpose | None:
     """What makes an image upright; None where it is, or does not say. Decodes nothing."""
     return _TURNS.get(_orientation(image))
@@ -63,6 +78,20 @@ def taken_with(image: Image.Image) -> TakenWith:
         _positive(details.get(ExifTags.Base.FocalLength)),
         _positive(details.get(ExifTags.Base.FocalLengthIn35mmFilm)),
     )
+
+
+def place_of(image: Image.Image) -> GpsPlace | None:
+    """Where a photo was taken; None where it does not say so whole, height included. Decodes nothing."""
+    try:
+        gps = _exif_of(image).get_ifd(ExifTags.IFD.GPSInfo)
+        latitude = _degrees(gps[ExifTags.GPS.GPSLatitude], str(gps[ExifTags.GPS.GPSLatitudeRef]), "NS")
+        longitude = _degrees(gps[ExifTags.GPS.GPSLongitude], str(gps[ExifTags.GPS.GPSLongitudeRef]), "EW")
+        below = gps.get(ExifTags.GPS.GPSAltitudeRef) in (1, b"\x01")
+        altitude = float(gps[ExifTags.GPS.GPSAltitude]) * (-1 if below else 1)
+    except Exception:  # whatever parsing runs into
+        return None
+    on_earth = abs(latitude) <= 90 and abs(longitude) <= 180 and abs(altitude) < 100_000
+    return GpsPlace(latitude, longitude, altitude) if on_earth and (latitude, longitude) != (0, 0) else None
 
 
 def upright_exif(image: Image.Image) -> bytes:
@@ -97,6 +126,12 @@ def _details_of(exif: Image.Exif) -> dict[int, object]:
         return dict(exif.get_ifd(ExifTags.IFD.Exif))
     except Exception:  # whatever parsing runs into
         return {}
+
+
+def _degrees(parts: tuple[float, ...], side: str, sides: str) -> float:
+    """Of degrees, minutes and seconds on one of two sides; raises what odd tags lead to."""
+    degrees, minutes, seconds = map(float, parts)
+    return (1, -1)[sides.index(side.strip("\0 ").upper()[0])] * (degrees + minutes / 60 + seconds / 3600)
 
 
 def _text(value: object) -> str:

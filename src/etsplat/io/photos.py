@@ -7,7 +7,7 @@ from PIL import Image
 
 from etsplat.core.errors import InputError
 from etsplat.io.atomic import atomic_write
-from etsplat.io.exif import TakenWith, on_its_side, taken_with, turn_of, upright_exif
+from etsplat.io.exif import GpsPlace, TakenWith, on_its_side, place_of, taken_with, turn_of, upright_exif
 from etsplat.io.images import IMAGE_FORMATS, IMAGE_SUFFIXES, decoded_as, open_image
 from etsplat.io.paths import kind_of
 
@@ -26,11 +26,13 @@ class PhotoFile:
         size: (width, height), upright.
         upright: whether its pixels are stored upright, in a file that other programs read too.
         taken_with: its camera, as far as it says.
+        place: where it was taken, if it says so.
     """
 
     size: tuple[int, int]
     upright: bool
     taken_with: TakenWith
+    place: GpsPlace | None = None
 
 
 def open_photo(path: Path | str) -> Image.Image:
@@ -53,7 +55,8 @@ def inspect_photo(path: Path | str) -> PhotoFile:
     """Raises InputError as `open_photo`."""
     with open_photo(path) as image:
         size = (image.height, image.width) if on_its_side(image) else image.size
-        return PhotoFile(size, kind_of(path) in IMAGE_SUFFIXES and turn_of(image) is None, taken_with(image))
+        upright = kind_of(path) in IMAGE_SUFFIXES and turn_of(image) is None
+        return PhotoFile(size, upright, taken_with(image), place_of(image))
 
 
 def write_upright(path: Path | str, target: Path) -> None:
