@@ -29,6 +29,7 @@ from etsplat.tasks.export_soup import export_soup
 from etsplat.tasks.opaque import make_opaque_trainer, opaque_mesh
 from etsplat.tasks.render_config import RenderConfig
 from etsplat.tasks.render_soup import draw, drawn_soup
+from etsplat.tasks.scoring import evaluate_run
 from etsplat.tasks.sources import SoupRun, open_run
 from etsplat.tasks.train import train
 from etsplat.tasks.train_config import TrainConfig
@@ -116,6 +117,15 @@ def test_a_run_ends_with_a_soup_and_a_better_opaque_mesh(run: tuple[RunDirectory
     stages = [event for event in events if isinstance(event, StageEvent)]
     assert list(dict.fromkeys(event.name for event in stages)) == STAGES
     assert all(event.done == event.total for event in stages if event is stages[-1])
+
+
+def test_a_run_is_evaluated_with_its_opaque_mesh(run: tuple[RunDirectory, list[Event]], capture: Dataset) -> None:
+    """As it was scored at its end, and apart from the soup drawn opaque."""
+    directory = run[0]
+    soup, mesh = TriangleSoup.load(directory.soup_path), load_opaque(directory.opaque_path)
+    found, metrics = evaluate_run(SoupRun(directory.path, soup, capture, mesh)), directory.read_metrics()
+    for name in ("psnr_asset", "ssim_asset", "flip_asset", "psnr_opaque"):
+        assert found[name] == pytest.approx(metrics[name], rel=1e-3)
 
 
 @pytest.mark.parametrize("stage", STAGES)

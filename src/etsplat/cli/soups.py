@@ -30,7 +30,8 @@ _COLUMNS = {
     "flip": ("FLIP", ".4f"),
     "lpips_3dgs": ("LPIPS as 3DGS", ".4f"),
     "lpips": ("LPIPS", ".4f"),
-    "psnr_opaque": ("PSNR opaque", ".2f"),
+    "psnr_asset": ("PSNR, opaque mesh", ".2f"),
+    "psnr_opaque": ("PSNR, soup opaque", ".2f"),
     "psnr_affine": ("PSNR, colours fitted", ".2f"),
     "psnr_aligned": ("PSNR, poses fitted", ".2f"),
 }

@@ -277,13 +277,15 @@ def evaluate_run(
     Args:
         run: with its capture; measured on its device.
         lpips_weights: as `etsplat.metrics.image.find_lpips_weights` takes it.
-        pictures: folder for NAME.png of every test view: photograph, soup, opaque triangles, and the error times 4.
+        pictures: folder for NAME.png of every test view: photograph, soup, the opaque mesh (of runs that made none, the
+            soup's opaque triangles), and the error of the soup times 4.
         progress: called with (views done, views in all).
 
     Returns:
         Means over the test views by name: psnr and psnr_8bit (of renders rounded to 8 bits, as published numbers are),
         ssim (zero-padded), ssim_interior, flip, lpips (inputs scaled to [-1, 1]) and lpips_3dgs (not scaled), each
-        also with `_opaque` for the opaque triangles; psnr_affine, after a fit of the colours to each photograph;
+        also with `_opaque` for the soup's opaque triangles, and with `_asset` for the opaque mesh where there is one
+        (psnr, ssim and flip); psnr_affine, after a fit of the colours to each photograph;
         psnr_aligned, of runs that refined cameras, after a fit of the pose of each;
         `views`, the same for each; fps, ms_per_frame, ms_per_million and their circumstances. null where something
         could not be measured, `lpips_reason` says why.
@@ -310,6 +312,9 @@ def evaluate_run(
         photo, soft, opaque = seen.photo, seen.counting(seen.splatted), seen.counting(seen.opaque)
         name, scores = capture.names[view], image_scores(soft, photo, lpips)
         scores |= fitted_scores(seen) | image_scores(opaque, photo, lpips, suffix="_opaque")
+        if run.solid is not None:
+            opaque = seen.counting(scorer.see(run.solid, view).opaque)
+            scores |= image_scores(opaque, photo, names=BRIEF, suffix="_asset")
         rows.append({"name": name, **scores})
         if pictures is not None:
             error = (4 * (soft - photo).abs()).clamp(0, 1)
