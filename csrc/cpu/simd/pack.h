@@ -24,6 +24,7 @@ struct PackMask {
     Mask m[N];
 
     ETSPLAT_FN unsigned bits() const {
+        static_assert(N * kLanesPerRegister <= 32);
         unsigned bits = 0;
         for (int i = 0; i < N; ++i) bits |= m_bits(m[i]) << (i * kLanesPerRegister);
         return bits;
@@ -151,7 +152,9 @@ ETSPLAT_FN Pack<N> vabs(Pack<N> a) {
 
 template <int N>
 ETSPLAT_FN bool vany(PackMask<N> mask) {
-    return mask.bits() != 0;
+    unsigned set = 0;
+    for (int i = 0; i < N; ++i) set |= m_bits(mask.m[i]);
+    return set != 0;
 }
 // x = mantissa 2^exponent with mantissa in [3/4, 3/2), for positive normal numbers
 template <int N>
