@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from etsplat.data.dataset import Dataset
+from etsplat.io.georeference import Georeference
 
 _AGREE = 0.3
 """Length of the mean of the cameras' own up directions, at least, for them not to contradict each other."""
@@ -24,9 +25,15 @@ def up_of(capture: Dataset) -> Float[Tensor, "3"] | None:
     What says where the capture lies in the world is asked first (`Georeference.up`): photos that look straight down, as
     those of drones, have their own up directions along the ground.
     """
-    if capture.georeference is not None and capture.georeference.up is not None:
-        return torch.eye(3, dtype=torch.float64)["xyz".index(capture.georeference.up)]
-    return held_up(capture.viewmats)
+    told = told_up(capture.georeference)
+    return held_up(capture.viewmats) if told is None else told
+
+
+def told_up(georeference: Georeference | None) -> Float[Tensor, "3"] | None:
+    """Where up is by what is said of the place in the world, float64; None where that does not say it."""
+    if georeference is None or georeference.up is None:
+        return None
+    return torch.eye(3, dtype=torch.float64)["xyz".index(georeference.up)]
 
 
 def held_up(viewmats: Float[Tensor, "B 4 4"]) -> Float[Tensor, "3"] | None:

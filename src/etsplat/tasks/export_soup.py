@@ -11,7 +11,7 @@ from torch import Tensor
 
 from etsplat.core.cameras import Cameras
 from etsplat.core.errors import InputError
-from etsplat.data.where_up import up_of
+from etsplat.data.where_up import told_up, up_of
 from etsplat.geometry.similarity import Similarity, rotation_between
 from etsplat.io.atomic import atomic_write
 from etsplat.io.georeference import GEOREFERENCE_FILE, Georeference
@@ -207,9 +207,11 @@ def transform_of(run: SoupRun, config: ExportConfig, corners: Float[Tensor, "N 3
             )
         place = torch.tensor(georeference.offset, dtype=torch.float64)
         return Similarity(scale=georeference.scale * config.scale, translation=place * config.scale)
-    up = None if run.capture is None or config.up == "keep" else up_of(run.capture)
-    if georeference is not None and georeference.up is not None and config.up != "keep":
-        up = torch.eye(3, dtype=torch.float64)["xyz".index(georeference.up)]
+    up = None
+    if config.up != "keep":
+        up = told_up(georeference)
+        if up is None and run.capture is not None:
+            up = up_of(run.capture)
     axis = torch.eye(3, dtype=torch.float64)[2 if config.up == "z" else 1]
     turned = Similarity(scale=config.scale)
     if up is not None:

@@ -19,13 +19,20 @@ from etsplat.engines.cuda.memory import Arena, PendingNumber
 from etsplat.engines.cuda.program import Program
 from etsplat.engines.cuda.sort import RadixSort
 from etsplat.engines.cuda.structs import constant, struct_class
-from etsplat.engines.native.plan import Geometry, Images, Inputs, Outputs, PerInput, Plan
+from etsplat.engines.native.plan import (
+    Images,
+    Inputs,
+    Outputs,
+    PerInput,
+    Plan,
+    alpha_limits,
+    indexed_corners,
+)
 
 _TILE_THREADS = _native.TILE**2
 _PROJECT_BLOCK = constant("cuda/raster_project.cu", "kProjectBlock")
 _EMIT_BLOCK, _EMIT_ITEMS = (constant("cuda/raster_project.cu", name) for name in ("kEmitBlock", "kEmitItems"))
 _REDUCE_BLOCK = constant("cuda/raster_reduce.cu", "kReduceBlock")
-_TINY = 1.17549435e-38
 _PROJECT = Program("raster_project.cu")
 _Depth = _native.DistortionDepth
 
@@ -34,11 +41,7 @@ class CudaRender:
     """One forward pass of all views together, and what its backward pass needs of it."""
 
     most_channels: int | None = _native.MOST_GPU_CHANNELS
-
-    @staticmethod
-    def per_corner(values: Tensor, faces: Tensor, geometry: Geometry) -> Tensor:
-        """See ``Render``."""
-        return values[faces.long()]
+    per_corner = staticmethod(indexed_corners)
 
     def __init__(self, plan: Plan, inputs: Inputs, outputs: Outputs, keep: bool) -> None:
         settings = plan.settings
@@ -213,11 +216,9 @@ class CudaRender:
         a.shared_sigma = inputs.sigma.dim() == 0
         a.flat_per_view, a.corner_per_view = inputs.flat_per_view, inputs.corner_per_view
         a.flat_channels, a.corner_channels = self.flat, self.corner
-        alpha_min, alpha_max, x_max, a.transmittance_min = settings.cutoffs
-        # With the cut-offs off, too: where alpha is 0 x^(2/sigma) may have overflowed, and the backward divides by
-        # 1 - alpha.
-        a.near_plane, a.support_alpha, a.x_max = settings.near_plane, alpha_min, x_max
-        a.alpha_min, a.alpha_max = max(alpha_min, _TINY), min(alpha_max, 1.0 - 1e-6)
+        a.support_alpha, _, a.x_max, a.transmittance_min = settings.cutoffs
+        a.near_plane = settings.near_plane
+        a.alpha_min, a.alpha_max = alpha_limits(settings.cutoffs)
         a.distortion_near, a.distortion_far = DISTORTION_NEAR, DISTORTION_FAR
 
 

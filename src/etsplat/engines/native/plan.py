@@ -7,7 +7,7 @@ from typing import Any, NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from etsplat.core.rasterization import RasterizeSettings, TriangleStatistics
+from etsplat.core.rasterization import Cutoffs, RasterizeSettings, TriangleStatistics
 from etsplat.core.validation import dense
 from etsplat.engines.native.pool import copied_indices, empty
 
@@ -132,6 +132,19 @@ class Render(Protocol):
     ) -> PerInput:
         """Gradients, None where not ``needed``, from those of colour, alpha and distortion."""
         ...
+
+
+def indexed_corners(values: Tensor, faces: Tensor, geometry: Geometry) -> Tensor:
+    """``Render.per_corner`` by torch's own indexing, which devices do well."""
+    return values[faces.long()]
+
+
+def alpha_limits(cutoffs: Cutoffs) -> tuple[float, float]:
+    """The least and the largest alpha that is drawn on a GPU, with the cut-offs off, too.
+
+    Where alpha is 0 x^(2/sigma) may have overflowed, and the backward pass divides by 1 - alpha.
+    """
+    return max(cutoffs.alpha_min, torch.finfo(torch.float32).tiny), min(cutoffs.alpha_max, 1.0 - 1e-6)
 
 
 def channel_count(tensor: Tensor | None) -> int:

@@ -16,7 +16,16 @@ from torch import Tensor
 from etsplat import _native
 from etsplat.core.errors import InputError
 from etsplat.core.rasterization import TriangleStatistics
-from etsplat.engines.native.plan import Geometry, Images, Inputs, Outputs, PerInput, Plan
+from etsplat.engines.native.plan import (
+    Geometry,
+    Images,
+    Inputs,
+    Outputs,
+    PerInput,
+    Plan,
+    alpha_limits,
+    indexed_corners,
+)
 from etsplat.engines.webgpu.device import Program, Step, WebGpu, gpu, spread
 from etsplat.engines.webgpu.sort import scan_step, sort_steps
 
@@ -24,7 +33,6 @@ _KERNELS = ("single_sided", "bilateral", "elastic", "hard")  # in the order of K
 _BIN = Program(("common", "block_scan", "tiles", "bin"))
 _BLOCK, _RANKS = 256, 1024
 _RECORD = 96  # bytes
-_TINY = 1.17549435e-38
 _MOST_SLOTS = 2**30
 
 
@@ -32,11 +40,7 @@ class WebGpuRender:
     """One forward pass. There is no backward pass: `backward` says so."""
 
     most_channels: int | None = _native.MOST_GPU_CHANNELS
-
-    @staticmethod
-    def per_corner(values: Tensor, faces: Tensor, geometry: Geometry) -> Tensor:
-        """See ``Render``."""
-        return values[faces.long()]
+    per_corner = staticmethod(indexed_corners)
 
     def __init__(self, plan: Plan, inputs: Inputs, outputs: Outputs, keep: bool) -> None:
         _check(plan)
@@ -190,9 +194,9 @@ class _View:
         """What the shaders have as `Pass`."""
         settings = self.settings
         viewmat, K = self.inputs.viewmats[self.view], self.inputs.Ks[self.view]
-        alpha_min, alpha_max, x_max, transmittance_min = settings.cutoffs
+        support_alpha, _, x_max, transmittance_min = settings.cutoffs
         floats = [*viewmat[:3].flatten().tolist(), *(K.flatten()[i].item() for i in (0, 1, 2, 4, 5))]
-        cutoffs = [alpha_min, max(alpha_min, _TINY), min(alpha_max, 1.0 - 1e-6), min(x_max, 3e38), transmittance_min]
+        cutoffs = [support_alpha, *alpha_limits(settings.cutoffs), min(x_max, 3e38), transmittance_min]
         sizes = (self.count, settings.width, settings.height, *self.tiles, slots, 0, 0, 0)
         return self.gpu.filled("view", struct.pack("<23f9I", *floats, settings.near_plane, *cutoffs, *sizes))
 
