@@ -5,6 +5,7 @@
 #include "antialias.h"
 #include "math/antialias.h"
 #include "parallel.h"
+#include "scratch.h"
 
 namespace etsplat {
 namespace {
@@ -16,9 +17,8 @@ struct Point {
     bool drawn;
 };
 
-std::vector<Point> project_vertices(const ShadeInput& in) {
+void project_vertices(const ShadeInput& in, Scratch<Point>& points) {
     const PinholeCamera camera = pinhole(in.camera);
-    std::vector<Point> points(in.mesh.num_vertices);
     parallel_for(in.mesh.num_vertices, 4096, [&](int64_t begin, int64_t end) {
         for (int64_t v = begin; v < end; ++v) {
             const float* p = in.mesh.vertices + 3 * v;
@@ -31,11 +31,10 @@ std::vector<Point> project_vertices(const ShadeInput& in) {
                       std::isfinite(q.at[1]);
         }
     });
-    return points;
 }
 
 // Bit k of a face: its edge from corner k to k + 1 is a silhouette, that is, no face across it lies on the other side.
-std::vector<uint8_t> find_silhouettes(const AntialiasInput& in, const std::vector<Point>& points) {
+std::vector<uint8_t> find_silhouettes(const AntialiasInput& in, const Scratch<Point>& points) {
     const OpaqueMesh& mesh = in.shading.mesh;
     std::vector<uint8_t> bits(mesh.num_faces);
     parallel_for(mesh.num_faces, 2048, [&](int64_t begin, int64_t end) {
@@ -65,7 +64,7 @@ std::vector<uint8_t> find_silhouettes(const AntialiasInput& in, const std::vecto
 // Looks for a silhouette of the nearer triangle between two neighbouring pixels that see different ones.
 class PairSearch {
 public:
-    PairSearch(const AntialiasInput& in, const std::vector<Point>& points, const std::vector<uint8_t>& silhouettes)
+    PairSearch(const AntialiasInput& in, const Scratch<Point>& points, const std::vector<uint8_t>& silhouettes)
         : in_(in.shading), depth_(in.depth), points_(points), silhouettes_(silhouettes) {}
 
     // The pair is the pixel (x, y) and its neighbour at the right (axis 0) or below (axis 1).
@@ -105,14 +104,15 @@ private:
 
     const ShadeInput& in_;
     const float* depth_;
-    const std::vector<Point>& points_;
+    const Scratch<Point>& points_;
     const std::vector<uint8_t>& silhouettes_;
 };
 
 }  // namespace
 
 std::vector<Blend> find_blends(const AntialiasInput& in) {
-    const std::vector<Point> points = project_vertices(in.shading);
+    Scratch<Point> points(in.shading.mesh.num_vertices);
+    project_vertices(in.shading, points);
     const std::vector<uint8_t> silhouettes = find_silhouettes(in, points);
     const PairSearch search(in, points, silhouettes);
     const int32_t width = in.shading.camera.width, height = in.shading.camera.height, bands = (height + kRows - 1) / kRows;

@@ -12,6 +12,7 @@
 #include "math/opaque_triangle.h"
 #include "parallel.h"
 #include "prefetch.h"
+#include "scratch.h"
 
 namespace etsplat {
 namespace {
@@ -21,36 +22,33 @@ constexpr int64_t kStripEntries = 8'000'000;  // (tile, triangle) pairs in memor
 constexpr int32_t kAhead = 8;  // triangles of a tile, and pixels of a row: what they read lies anywhere in memory
 
 struct Screen {
-    std::vector<OpaqueVertex> vertices;
-    std::vector<OpaqueTriangle> triangles;
+    Scratch<OpaqueVertex> vertices;
+    Scratch<OpaqueTriangle> triangles;
     int32_t width, height;  // in samples
     int32_t tile, tiles_x, tiles_y;
-};
 
-Screen set_up_screen(const OpaqueMesh& mesh, const OpaqueCamera& camera, int32_t samples, bool cull_backfaces) {
-    Screen screen;
-    screen.width = camera.width * samples;
-    screen.height = camera.height * samples;
-    screen.tile = samples * std::max(1, kTileSamples / samples);  // whole pixels
-    screen.tiles_x = (screen.width + screen.tile - 1) / screen.tile;
-    screen.tiles_y = (screen.height + screen.tile - 1) / screen.tile;
-    screen.vertices.resize(mesh.num_vertices);
-    parallel_for(mesh.num_vertices, 4096, [&](int64_t begin, int64_t end) {
-        for (int64_t v = begin; v < end; ++v) {
-            screen.vertices[v] =
-                project_opaque(camera.viewmat, camera.K, camera.near_plane, samples, mesh.vertices + 3 * v);
-        }
-    });
-    screen.triangles.resize(mesh.num_faces);
-    parallel_for(mesh.num_faces, 2048, [&](int64_t begin, int64_t end) {
-        for (int64_t f = begin; f < end; ++f) {
-            const int32_t* k = mesh.faces + 3 * f;
-            const OpaqueVertex v[3] = {screen.vertices[k[0]], screen.vertices[k[1]], screen.vertices[k[2]]};
-            screen.triangles[f] = set_up_opaque(v, screen.width, screen.height, cull_backfaces);
-        }
-    });
-    return screen;
-}
+    Screen(const OpaqueMesh& mesh, const OpaqueCamera& camera, int32_t samples, bool cull_backfaces)
+        : vertices(mesh.num_vertices),
+          triangles(mesh.num_faces),
+          width(camera.width * samples),
+          height(camera.height * samples),
+          tile(samples * std::max(1, kTileSamples / samples)),  // whole pixels
+          tiles_x((width + tile - 1) / tile),
+          tiles_y((height + tile - 1) / tile) {
+        parallel_for(mesh.num_vertices, 4096, [&](int64_t begin, int64_t end) {
+            for (int64_t v = begin; v < end; ++v) {
+                vertices[v] = project_opaque(camera.viewmat, camera.K, camera.near_plane, samples, mesh.vertices + 3 * v);
+            }
+        });
+        parallel_for(mesh.num_faces, 2048, [&](int64_t begin, int64_t end) {
+            for (int64_t f = begin; f < end; ++f) {
+                const int32_t* k = mesh.faces + 3 * f;
+                const OpaqueVertex v[3] = {vertices[k[0]], vertices[k[1]], vertices[k[2]]};
+                triangles[f] = set_up_opaque(v, width, height, cull_backfaces);
+            }
+        });
+    }
+};
 
 // Ends of strips of tile rows that hold at most kStripEntries pairs each, or are one row high.
 std::vector<int32_t> strip_ends(const Screen& screen) {
@@ -81,7 +79,7 @@ struct Bins {
 };
 
 Bins bin_strip(const Screen& screen, int32_t row_begin, int32_t row_end) {
-    const int64_t n = static_cast<int64_t>(screen.triangles.size());
+    const int64_t n = screen.triangles.size();
     const int64_t tiles = static_cast<int64_t>(row_end - row_begin) * screen.tiles_x;
     const int64_t chunk = std::max<int64_t>(4096, (n + 31) / 32), chunks = (n + chunk - 1) / chunk;
     std::vector<int64_t> places(chunks * tiles, 0);  // counts first, then the place of the chunk's next entry
@@ -228,20 +226,28 @@ struct Shader {
 
 void rasterize_opaque(const OpaqueMesh& mesh, const OpaqueCamera& camera, int32_t* triangle, float* barycentrics,
                       float* depth) {
-    const Screen screen = set_up_screen(mesh, camera, 1, false);
+    const Screen screen(mesh, camera, 1, false);
     for_each_tile(screen, [&](const TileBuffer& tile) {
         for (int32_t y = tile.y0; y < tile.y1; ++y) {
+            const int64_t place = static_cast<int64_t>(y - tile.y0) * tile.stride - tile.x0;
+            const int64_t row = static_cast<int64_t>(y) * screen.width;
+            const int32_t* owners = tile.triangle.data() + place;
+            int32_t known = -1;  // whose corners are at hand
+            OpaqueVertex v[3] = {};
             for (int32_t x = tile.x0; x < tile.x1; ++x) {
-                const int64_t place = static_cast<int64_t>(y - tile.y0) * tile.stride + (x - tile.x0);
-                const int64_t pixel = static_cast<int64_t>(y) * screen.width + x;
-                look_ahead(mesh, screen, &tile.triangle[place], tile.x1 - x);
-                const int32_t face = tile.triangle[place];
-                float* b = barycentrics + 3 * pixel;
-                triangle[pixel] = face;
-                depth[pixel] = b[0] = b[1] = b[2] = 0.0f;
+                look_ahead(mesh, screen, owners + x, tile.x1 - x);
+                const int32_t face = owners[x];
+                float* b = barycentrics + 3 * (row + x);
+                triangle[row + x] = face;
+                depth[row + x] = b[0] = b[1] = b[2] = 0.0f;
                 if (face < 0) continue;
-                barycentrics_at(mesh, screen, face, x, y, b);
-                depth[pixel] = 1.0f / tile.inverse_depth[place];
+                if (face != known) {
+                    known = face;
+                    const int32_t* k = mesh.faces + 3 * static_cast<int64_t>(face);
+                    for (int i = 0; i < 3; ++i) v[i] = screen.vertices[k[i]];
+                }
+                opaque_barycentrics(v, x, y, b);
+                depth[row + x] = 1.0f / tile.inverse_depth[place + x];
             }
         }
     });
@@ -249,7 +255,7 @@ void rasterize_opaque(const OpaqueMesh& mesh, const OpaqueCamera& camera, int32_
 
 void render_opaque(const OpaqueMesh& mesh, const OpaqueCamera& camera, const OpaqueColors& colors,
                    int32_t supersampling, bool cull_backfaces, float* image) {
-    const Screen screen = set_up_screen(mesh, camera, supersampling, cull_backfaces);
+    const Screen screen(mesh, camera, supersampling, cull_backfaces);
     const Shader shader{mesh, colors, screen};
     const int32_t channels = colors.channels, s = supersampling;
     const float scale = 1.0f / static_cast<float>(s * s);

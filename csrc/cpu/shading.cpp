@@ -1,18 +1,20 @@
 // How it is scheduled. Forward: pixels are shaded in parallel. Backward: a fixed number of bands of rows gather the
-// cotangents of colours and of interpolation, each into arrays of its own, run by run of equal triangles; the bands are
-// added up in their order. Nothing depends on which thread runs what.
+// cotangents of colours and of interpolation, each for itself and only for what it shows, run by run of equal triangles; on
+// one thread the bands are added up in their order. Nothing depends on which thread runs what.
 #include "shading.h"
 
 #include <algorithm>
+#include <optional>
 #include <vector>
 
 #include "math/texture.h"
 #include "parallel.h"
+#include "scratch.h"
 
 namespace etsplat {
 namespace {
 
-constexpr int kBands = 8;  // in the backward pass; each has arrays as long as the colours and vertices
+constexpr int kBands = 8;  // in the backward pass
 
 // The camera's centre in world space.
 struct Center {
@@ -48,9 +50,40 @@ void for_each_run(const int32_t* triangle, int32_t width, int64_t y, const Visit
     }
 }
 
+// Sums of some of many rows: those that are asked for, 0 at first. A large mesh shows few of its faces in a band.
+class SparseRows {
+public:
+    SparseRows(int64_t rows, int32_t width) : width_(width), place_(rows) { std::fill(place_.begin(), place_.end(), -1); }
+
+    // Where the sums of a row begin.
+    int64_t place(int64_t row) {
+        int32_t& found = place_[row];
+        if (found < 0) {
+            found = static_cast<int32_t>(rows_.size());
+            rows_.push_back(row);
+            sums_.resize(sums_.size() + width_, 0.0f);
+        }
+        return static_cast<int64_t>(found) * width_;
+    }
+    float& operator[](int64_t place) { return sums_[place]; }
+
+    void add_to(float* out) const {
+        const float* from = sums_.data();
+        for (const int64_t row : rows_) {
+            for (int32_t i = 0; i < width_; ++i) out[row * width_ + i] += *from++;
+        }
+    }
+
+private:
+    int32_t width_;
+    Scratch<int32_t> place_;
+    std::vector<int64_t> rows_;
+    std::vector<float> sums_;
+};
+
 // Cotangents of one band of rows.
 struct BandSums {
-    std::vector<float> colors, vertices;
+    SparseRows colors, vertices;
     std::vector<double> background;
 };
 
@@ -61,45 +94,38 @@ public:
         const int64_t faces = in.mesh.num_faces, vertices = in.mesh.num_vertices;
         interpolates_ = in.colors_of == ColorsOf::kVertices || in.colors_of == ColorsOf::kCorners;
         moves_ = out.vertices && interpolates_;
-        colors_size_ = 0;
+        colored_rows_ = 0;
         if (!out.colors) return;
-        if (in.colors_of == ColorsOf::kFaces) colors_size_ = faces * channels_;
-        if (in.colors_of == ColorsOf::kVertices) colors_size_ = vertices * channels_;
-        if (in.colors_of == ColorsOf::kCorners) colors_size_ = 3 * faces * channels_;
+        if (in.colors_of == ColorsOf::kFaces) colored_rows_ = faces;
+        if (in.colors_of == ColorsOf::kVertices) colored_rows_ = vertices;
+        if (in.colors_of == ColorsOf::kCorners) colored_rows_ = 3 * faces;
     }
 
-    void gather(int band, BandSums& sums) const {
-        sums.colors.assign(colors_size_, 0.0f);
-        sums.vertices.assign(moves_ ? 3 * in_.mesh.num_vertices : 0, 0.0f);
-        sums.background.assign(channels_, 0.0);
+    BandSums gather(int band) const {
+        BandSums sums{{colored_rows_, channels_}, {moves_ ? in_.mesh.num_vertices : 0, 3}, std::vector<double>(channels_, 0.0)};
         const int32_t width = in_.camera.width, height = in_.camera.height;
         for (int32_t y = height * band / kBands; y < height * (band + 1) / kBands; ++y) {
             for_each_run(in_.triangle, width, y, [&](int32_t face, int64_t begin, int64_t end) {
                 run(face, begin, end, sums);
             });
         }
+        return sums;
     }
 
-    void add_up(const std::vector<BandSums>& bands) const {
-        add(bands, &BandSums::colors, colors_size_, out_.colors);
-        if (moves_) add(bands, &BandSums::vertices, 3 * in_.mesh.num_vertices, out_.vertices);
+    void add_up(const std::vector<std::optional<BandSums>>& bands) const {
+        for (const auto& band : bands) {
+            band->colors.add_to(out_.colors);
+            band->vertices.add_to(out_.vertices);
+        }
         if (!out_.background) return;
         for (int32_t c = 0; c < channels_; ++c) {
             double total = 0.0;
-            for (const BandSums& band : bands) total += band.background[c];
+            for (const auto& band : bands) total += band->background[c];
             out_.background[c] += static_cast<float>(total);
         }
     }
 
 private:
-    static void add(const std::vector<BandSums>& bands, std::vector<float> BandSums::* sums, int64_t size, float* out) {
-        parallel_for(size, 1 << 15, [&](int64_t begin, int64_t end) {
-            for (const BandSums& band : bands) {
-                const float* from = (band.*sums).data();
-                for (int64_t i = begin; i < end; ++i) out[i] += from[i];
-            }
-        });
-    }
 
     // Pixels [begin, end) of a row see the same face, or none.
     void run(int32_t face, int64_t begin, int64_t end, BandSums& sums) const {
@@ -111,12 +137,12 @@ private:
             for (int64_t i = 0; i < size; ++i) out_.colors[begin * channels_ + i] += grad[i];
             return;
         }
-        float* into = sums.colors.data() + static_cast<int64_t>(std::max(face, 0)) * channels_;
+        const int64_t into = face < 0 ? 0 : sums.colors.place(face);
         for (int64_t p = begin; p < end; ++p) {
             const float* g = grad_shaded_ + p * channels_;
             for (int32_t c = 0; c < channels_; ++c) {
                 if (face < 0) sums.background[c] += g[c];
-                else into[c] += g[c];
+                else sums.colors[into + c] += g[c];
             }
         }
     }
@@ -125,15 +151,19 @@ private:
         ViewInverse<double> inverse;
         if (moves_) inverse = center_.inverse(in_.mesh, face);
         Vector3<double> moved[3] = {};
+        int64_t from[3], into[3] = {0, 0, 0};
+        for (int i = 0; i < 3; ++i) {
+            from[i] = in_.corner_color(face, i);
+            if (out_.colors) into[i] = sums.colors.place(from[i] / channels_);
+        }
         for (int64_t p = begin; p < end; ++p) {
             const float* g = grad_shaded_ + p * channels_;
             double b[3], cotangent[3] = {0.0, 0.0, 0.0};
             for (int i = 0; i < 3; ++i) {
                 b[i] = in_.barycentrics[3 * p + i];
-                const int64_t place = in_.corner_color(face, i);
                 for (int32_t c = 0; c < channels_; ++c) {
-                    if (out_.colors) sums.colors[place + c] += static_cast<float>(b[i]) * g[c];
-                    cotangent[i] += static_cast<double>(g[c]) * in_.colors[place + c];
+                    if (out_.colors) sums.colors[into[i] + c] += static_cast<float>(b[i]) * g[c];
+                    cotangent[i] += static_cast<double>(g[c]) * in_.colors[from[i] + c];
                 }
             }
             if (!moves_) continue;
@@ -141,10 +171,10 @@ private:
             for (int i = 0; i < 3; ++i) moved[i] = moved[i] - b[i] * u;
         }
         for (int i = 0; moves_ && i < 3; ++i) {
-            float* into = sums.vertices.data() + 3 * static_cast<int64_t>(in_.mesh.faces[3 * face + i]);
-            into[0] += static_cast<float>(moved[i].x);
-            into[1] += static_cast<float>(moved[i].y);
-            into[2] += static_cast<float>(moved[i].z);
+            const int64_t place = sums.vertices.place(in_.mesh.faces[3 * face + i]);
+            sums.vertices[place] += static_cast<float>(moved[i].x);
+            sums.vertices[place + 1] += static_cast<float>(moved[i].y);
+            sums.vertices[place + 2] += static_cast<float>(moved[i].z);
         }
     }
 
@@ -153,7 +183,7 @@ private:
     const ShadeGradients& out_;
     Center center_;
     int32_t channels_;
-    int64_t colors_size_;
+    int64_t colored_rows_;
     bool interpolates_, moves_;
 };
 
@@ -186,9 +216,9 @@ void shade(const ShadeInput& in, float* shaded) {
 
 void shade_backward(const ShadeInput& input, const float* grad_shaded, const ShadeGradients& gradients) {
     const ShadeBackward shading(input, grad_shaded, gradients);
-    std::vector<BandSums> bands(kBands);
+    std::vector<std::optional<BandSums>> bands(kBands);
     parallel_for(kBands, 1, [&](int64_t begin, int64_t end) {
-        for (int64_t band = begin; band < end; ++band) shading.gather(static_cast<int>(band), bands[band]);
+        for (int64_t band = begin; band < end; ++band) bands[band].emplace(shading.gather(static_cast<int>(band)));
     });
     shading.add_up(bands);
 }
