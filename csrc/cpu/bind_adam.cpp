@@ -1,5 +1,5 @@
-// Adam: all parameters of a step in one call, cut into pieces of kPiece elements that threads take one by one; every
-// element is independent.
+// Adam: all parameters of a step in one call, cut into pieces of about kPiece elements, whole rows of them, that threads
+// take one by one; every element is independent.
 #include <algorithm>
 #include <cmath>
 #include <vector>
@@ -12,14 +12,19 @@ namespace etsplat {
 namespace {
 
 constexpr int64_t kPiece = 16384;
+constexpr int64_t kTogether = 1024;  // elements whose paces are looked up before they are updated
 
 struct AdamGroup {
     float* parameter;
     const float* gradient;
     float* first;
     float* second;
-    int64_t size;
+    const float* paces;  // of rows, or null
+    int64_t size, width;  // elements, and those of a row
     AdamCoefficients<float> coefficients;
+
+    // Elements of a piece: whole rows.
+    int64_t piece() const { return paces ? std::max(width, kPiece / width * width) : kPiece; }
 };
 
 void adam_range(const AdamGroup& group, int64_t begin, int64_t end) {
@@ -33,6 +38,36 @@ void adam_range(const AdamGroup& group, int64_t begin, int64_t end) {
     }
 }
 
+// The same where rows have paces; `begin` is that of a row.
+void paced_range(const AdamGroup& group, int64_t begin, int64_t end) {
+    float* __restrict parameter = group.parameter;
+    const float* __restrict gradient = group.gradient;
+    float* __restrict first = group.first;
+    float* __restrict second = group.second;
+    const AdamCoefficients<float> coefficients = group.coefficients;
+    float sizes[kTogether];
+    const float* pace = group.paces + begin / group.width;
+    for (int64_t left = group.width; begin < end;) {  // of the row at hand
+        const int64_t count = std::min(kTogether, end - begin);
+        for (int64_t filled = 0; filled < count;) {
+            const int64_t same = std::min(left, count - filled);
+            std::fill_n(sizes + filled, same, coefficients.step_size * *pace);
+            filled += same;
+            left -= same;
+            if (left == 0) {
+                left = group.width;
+                ++pace;
+            }
+        }
+        for (int64_t i = 0; i < count; ++i) {
+            AdamCoefficients<float> own = coefficients;
+            own.step_size = sizes[i];
+            adam_update(parameter[begin + i], first[begin + i], second[begin + i], gradient[begin + i], own);
+        }
+        begin += count;
+    }
+}
+
 void adam_step(const std::vector<AdamGroup>& groups) {
     struct Piece {
         const AdamGroup* group;
@@ -40,12 +75,12 @@ void adam_step(const std::vector<AdamGroup>& groups) {
     };
     std::vector<Piece> pieces;
     for (const AdamGroup& group : groups) {
-        for (int64_t begin = 0; begin < group.size; begin += kPiece) pieces.push_back({&group, begin});
+        for (int64_t begin = 0; begin < group.size; begin += group.piece()) pieces.push_back({&group, begin});
     }
     parallel_for(static_cast<int64_t>(pieces.size()), 1, [&](int64_t begin, int64_t end) {
         for (int64_t i = begin; i < end; ++i) {
             const auto& [group, first] = pieces[i];
-            adam_range(*group, first, std::min(first + kPiece, group->size));
+            (group->paces ? paced_range : adam_range)(*group, first, std::min(first + group->piece(), group->size));
         }
     });
 }
@@ -53,12 +88,13 @@ void adam_step(const std::vector<AdamGroup>& groups) {
 }  // namespace
 
 void bind_adam(nb::module_& m) {
-    // One tensor of each kind and one rate per parameter; `step` counts from 1.
+    // One tensor of each kind and one rate per parameter, and its rows' paces or None; `step` counts from 1.
     def_function(
         m, "adam_step",
         [](const std::vector<Array<float>>& parameters, const std::vector<Array<const float>>& gradients,
            const std::vector<Array<float>>& firsts, const std::vector<Array<float>>& seconds,
-           const std::vector<double>& learning_rates, double beta1, double beta2, double eps, int64_t step) {
+           const std::vector<OptionalArray<const float, 1>>& paces, const std::vector<double>& learning_rates, double beta1,
+           double beta2, double eps, int64_t step) {
             const double first_correction = 1.0 - std::pow(beta1, static_cast<double>(step));
             const double second_correction = std::sqrt(1.0 - std::pow(beta2, static_cast<double>(step)));
             std::vector<AdamGroup> groups;
@@ -70,12 +106,13 @@ void bind_adam(nb::module_& m) {
                 k.step_size = static_cast<float>(learning_rates.at(i) / first_correction);
                 k.second_correction = static_cast<float>(second_correction);
                 k.eps = static_cast<float>(eps);
-                groups.push_back({parameters[i].data(), gradients.at(i).data(), firsts.at(i).data(),
-                                  seconds.at(i).data(), parameters[i].count(), k});
+                const int64_t size = parameters[i].count(), rows = paces.at(i) ? paces[i]->size(0) : 0;
+                groups.push_back({parameters[i].data(), gradients.at(i).data(), firsts.at(i).data(), seconds.at(i).data(),
+                                  data_or_null(paces[i]), size, rows ? size / rows : 1, k});
             }
             adam_step(groups);
         },
-        "parameters", "gradients", "firsts", "seconds", "learning_rates", "beta1", "beta2", "eps", "step");
+        "parameters", "gradients", "firsts", "seconds", "paces", "learning_rates", "beta1", "beta2", "eps", "step");
 }
 
 }  // namespace etsplat

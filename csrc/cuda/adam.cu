@@ -14,7 +14,9 @@ struct AdamParameters {
     const float* gradients[kMaxParameters];
     float* firsts[kMaxParameters];
     float* seconds[kMaxParameters];
+    const float* paces[kMaxParameters];  // of rows, or null
     long long sizes[kMaxParameters];
+    int widths[kMaxParameters];  // elements of a row
 };
 
 // step_sizes: for each parameter learning rate / (1 - beta1^t); second_correction: sqrt(1 - beta2^t). Where `halted` is
@@ -30,12 +32,16 @@ extern "C" __global__ void adam_step(AdamParameters parameters, int count, const
         if (block < blocks) break;
         block -= blocks;
     }
-    const AdamCoefficients<float> k{first_weight, second_decay, second_weight, step_sizes[p], *second_correction, eps};
+    AdamCoefficients<float> k{first_weight, second_decay, second_weight, step_sizes[p], *second_correction, eps};
+    const float step_size = k.step_size, *pace = parameters.paces[p];
     float *value = parameters.values[p], *first = parameters.firsts[p], *second = parameters.seconds[p];
     const float* gradient = parameters.gradients[p];
     const long long begin = block * kElements, left = parameters.sizes[p] - begin;
+    const int width = parameters.widths[p], within = static_cast<int>(begin % width);  // place in its row where the block begins
+    if (pace) pace += begin / width;
     for (int i = threadIdx.x; i < kElements; i += kThreads) {
         if (i >= left) break;
+        if (pace) k.step_size = step_size * pace[static_cast<unsigned>(within + i) / static_cast<unsigned>(width)];
         adam_update(value[begin + i], first[begin + i], second[begin + i], gradient[begin + i], k);
     }
 }

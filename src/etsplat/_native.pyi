@@ -17,6 +17,7 @@ def adam_step(
     gradients: Sequence[torch.Tensor],
     firsts: Sequence[torch.Tensor],
     seconds: Sequence[torch.Tensor],
+    paces: Sequence[torch.Tensor | None],
     learning_rates: Sequence[float],
     beta1: float,
     beta2: float,

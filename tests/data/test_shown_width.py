@@ -6,7 +6,7 @@ import torch
 from etsplat.core.cameras import intrinsics, look_at
 from etsplat.data.dataset import Dataset
 from etsplat.data.pictures import StoredPictures
-from etsplat.data.shown_width import shown_width
+from etsplat.data.shown_width import ShownWidths, shown_width
 
 
 def capture(width: int, height: int, distance: float, fov: float = 60.0) -> Dataset:
@@ -33,3 +33,22 @@ def test_points_that_training_photos_do_not_show_do_not_count() -> None:
     assert shown_width(views, points) == pytest.approx(2 * 3 * 3**-0.5 * 2, rel=1e-3)
     assert shown_width(replace(views, train=[], test=[]), points) is None
     assert shown_width(views, points[1:2]) is None
+
+
+def test_widths_of_points_are_those_of_the_photos_that_show_them() -> None:
+    """Of the origin that of every photo; elsewhere their harmonic mean; none of what none shows."""
+    views = capture(80, 40, 3.0)
+    widest = 2 * 3**-0.5 * 2  # at a distance of 1
+    points = torch.tensor([[0.0, 0, 0], [1.0, 0, 0], [0, 50, 0], [0, 0, -4.0]])
+    shown = ShownWidths(views)(points)  # trained on: from x = 3, x = -3 and z = 3
+    assert shown[0] == pytest.approx(3 * widest, rel=1e-5)
+    assert shown[1] == pytest.approx(3 / (1 / 2 + 1 / 4 + 1 / 3) * widest, rel=1e-5)
+    assert not shown[2].isfinite()
+    assert shown[3] == pytest.approx(7 * widest, rel=1e-5)
+
+
+def test_widths_grow_with_the_frame_and_not_with_the_photos() -> None:
+    points = torch.randn(50, 3, generator=torch.Generator().manual_seed(0))
+    once = ShownWidths(capture(80, 40, 3.0))(points)
+    torch.testing.assert_close(ShownWidths(capture(160, 80, 3.0))(points), once, equal_nan=True)
+    torch.testing.assert_close(ShownWidths(capture(80, 40, 300.0))(100 * points), 100 * once, equal_nan=True)

@@ -48,6 +48,46 @@ def test_equals_torch_adam_within_rounding(engine, rng, dtype):
         torch.testing.assert_close(adam.first_moments[name], expected.state[theirs[name]]["exp_avg"], **tolerance)
 
 
+@pytest.mark.sanitize
+@pytest.mark.parametrize("shape", [(4001, 3), (300, 3, 3), (3, 5000), (7,), (0, 3)])
+def test_rows_move_at_their_own_pace(engine, rng, shape):
+    """As far as all the others, times the factor of the row; moments know nothing of it."""
+    start = torch.randn(shape, generator=rng).to(dtype_of(engine))
+    gradients = [torch.randn(shape, generator=rng) for _ in range(3)]
+    paces = 10 ** torch.rand(shape[0], generator=rng)
+    ends = []
+    for paced in (True, False):
+        parameter = start.to(device_of(engine), copy=True).requires_grad_()
+        adam = Adam({"p": parameter}, {"p": 0.01})
+        if paced:
+            adam.paces["p"] = paces.to(parameter)
+        for gradient in gradients:
+            parameter.grad = gradient.to(parameter)
+            on(engine, adam.step)
+        ends.append((parameter.detach().cpu() - start, adam.first_moments["p"].cpu(), adam.second_moments["p"].cpu()))
+    (moved, *moments), (usual, *expected) = ends
+    factors = paces.to(usual).reshape(-1, *[1] * (len(shape) - 1))
+    torch.testing.assert_close(moved, factors * usual, rtol=1e-5, atol=1e-5)  # positions of some units are rounded
+    assert all(torch.equal(*pair) for pair in zip(moments, expected, strict=True))
+
+
+def test_paces_must_fit_and_go_with_the_rows_that_they_were_for(rng):
+    """Nothing is updated where they do not fit; a parameter of another length has none."""
+    parameter = torch.zeros(4, 3, requires_grad=True)
+    adam = Adam({"p": parameter}, {"p": 0.1})
+    parameter.grad = torch.ones_like(parameter)
+    adam.paces["p"] = torch.ones(5)
+    with pytest.raises(ValueError, match="paces of p"):
+        adam.step()
+    assert adam.step_count == 0
+    assert not parameter.any()
+    adam.paces["p"] = torch.full((4,), 2.0)
+    adam.replace("p", torch.zeros(4, 3, requires_grad=True), torch.zeros(4, 3), torch.zeros(4, 3))
+    assert adam.paces["p"].tolist() == [2.0] * 4
+    adam.replace("p", torch.zeros(6, 3, requires_grad=True), torch.zeros(6, 3), torch.zeros(6, 3))
+    assert not adam.paces
+
+
 def test_first_step_moves_by_the_learning_rate(engine):
     """After one step every element with a gradient has moved by lr against its sign, whatever its size."""
     parameter = torch.zeros(5, requires_grad=True, device=device_of(engine))
@@ -79,6 +119,7 @@ def test_state_dict_continues_to_the_bit(rng):
     """An optimizer restored in the middle ends where the uninterrupted one does."""
     ours = parameters(rng)
     adam = Adam(ours, RATES)
+    adam.paces["vertices"] = torch.rand(1001, generator=rng)
     set_gradients(rng, ours)
     adam.step()
     resumed = copies(ours)

@@ -79,7 +79,7 @@ def test_weighted_sum_is_that_of_pytorch(cuda_device, scale, rounds):
 
 
 def test_adam_takes_the_steps_of_the_cpu_engine(cuda_device, rng):
-    """Ten parameters, one empty, one not contiguous, rates that change: the same bits after five steps."""
+    """Ten parameters, one empty, one not contiguous, two with paces; rates that change: equal after five steps."""
     shapes = [(1200, 3), (), (0, 3), (7,), (1024,), (2, 2), (3,), (5, 1), (1025,), (40, 30)]
     start = {f"p{i}": torch.randn(shape, generator=rng) for i, shape in enumerate(shapes)}
     start["p9"] = start["p9"].T
@@ -88,6 +88,7 @@ def test_adam_takes_the_steps_of_the_cpu_engine(cuda_device, rng):
     for engine, device in (("cuda", cuda_device), ("cpu", CPU)):
         parameters = {name: p.to(device, copy=True).requires_grad_() for name, p in start.items()}
         adam = Adam(parameters, {name: 0.01 * (i + 1) for i, name in enumerate(start)})
+        adam.paces = {name: torch.linspace(0.1, 9.0, len(parameters[name])).to(device) for name in ("p0", "p9")}
         for step in gradients:
             for name, p in parameters.items():
                 p.grad = step[name].to(device)

@@ -13,6 +13,7 @@ from safetensors.torch import load_file
 from etsplat.core.errors import InputError
 from etsplat.data.dataset import Dataset
 from etsplat.data.demo_scene import demo_scene
+from etsplat.data.shown_width import ShownWidths
 from etsplat.geometry.regions import Sphere
 from etsplat.io.mesh_files import MeshFile, load_mesh
 from etsplat.io.opaque_files import load_opaque, save_opaque
@@ -30,6 +31,7 @@ from etsplat.tasks.opaque import make_opaque_trainer, opaque_mesh
 from etsplat.tasks.render_config import RenderConfig
 from etsplat.tasks.render_soup import draw, drawn_soup
 from etsplat.tasks.scoring import evaluate_run
+from etsplat.tasks.soup_trainer import shown_across
 from etsplat.tasks.sources import SoupRun, open_run
 from etsplat.tasks.train import train
 from etsplat.tasks.train_config import TrainConfig
@@ -103,6 +105,32 @@ def test_fitting_comes_closer_to_the_photos_and_divides_where_they_are_wrong(cap
     trainer.fit(80, callbacks=[lambda event: losses.append(getattr(event, "loss", losses[-1] if losses else 1.0))])
     assert losses[-1] < 0.8 * losses[0]
     assert mesh.count == 500
+
+
+def test_corners_move_as_fast_on_screen_near_and_far(capture: Dataset) -> None:
+    """In proportion to what photos show where they are, within limits, after halving too; unseen ones as usual."""
+    own = capture.normalized()
+    assert own.points is not None
+    middles = torch.cat([own.points[:200], 1e6 * own.points[:1]])[:, None]
+    corners = middles + 0.01 * torch.randn(201, 3, 3, generator=torch.Generator().manual_seed(1))
+    soup = TriangleSoup.from_triangles(corners.float(), torch.full((201, 3), 0.5), opacity=0.9, sigma=0.1, sh_degree=0)
+    unit = shown_across(soup, own)
+    trainer = make_opaque_trainer(
+        opaque_mesh(soup), own, iterations=40, unit=unit, max_faces=300, background=(0.0, 0.0, 0.0)
+    )
+    for edits in (0, 1):
+        trainer.fit(8 * edits)
+        paces, model = trainer.adam.paces["vertices"].reshape(-1, 3), trainer.model
+        assert (len(paces) > 201) == bool(edits)
+        assert (paces == paces[:, :1]).all()
+        places = trainer.adam.parameters["vertices"].detach().reshape(-1, 3, 3).mean(dim=1)
+        shown = ShownWidths(own)(places) / unit
+        seen = shown.isfinite()
+        assert 0 < int((~seen).sum()) < len(seen) == model.count
+        assert (paces[~seen] == 1).all()
+        tolerance = 1e-6 if edits == 0 else 0.2  # they have moved since
+        torch.testing.assert_close(paces[seen, 0], shown[seen].clamp(0.1, 30.0), rtol=tolerance, atol=tolerance)
+        assert paces.max() > 1.2 * paces.min()
 
 
 def test_a_run_ends_with_a_soup_and_a_better_opaque_mesh(run: tuple[RunDirectory, list[Event]]) -> None:

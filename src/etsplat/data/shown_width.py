@@ -1,4 +1,4 @@
-"""How much of the world a photo shows across: the measure of steps that look alike in every capture."""
+"""How much of the world a photo shows across: the measure of steps that look alike in every capture, near and far."""
 
 import torch
 from jaxtyping import Float
@@ -8,6 +8,9 @@ from etsplat.data.dataset import Dataset, middles_of
 
 _POINTS, _VIEWS = 10_000, 64
 """So many of the points are looked at at most, and in so many of the views."""
+
+_OFTEN = 24
+"""Views for what is asked again and again."""
 
 
 def shown_width(capture: Dataset, points: Float[Tensor, "P 3"]) -> float | None:
@@ -31,3 +34,35 @@ def shown_width(capture: Dataset, points: Float[Tensor, "P 3"]) -> float | None:
         widths.append(camera[seen, 2] * max(width, height) / K[0, 0])
     found = torch.cat([torch.empty(0, dtype=torch.float64), *widths])
     return float(found.median()) if len(found) else None
+
+
+class ShownWidths:
+    """The same at each of many points, for the whole of a run.
+
+    All is done number by number, so that the bits do not depend on how many threads there are.
+    """
+
+    def __init__(self, capture: Dataset) -> None:
+        """Takes the cameras.
+
+        Args:
+            capture: photos with cameras; some of its training views count, evenly spread.
+        """
+        views = middles_of(capture.train, min(_OFTEN, len(capture.train)))
+        self._views = [(capture.viewmats[i].tolist(), capture.Ks[i].tolist(), capture.images.sizes[i]) for i in views]
+
+    def __call__(self, points: Float[Tensor, "P 3"]) -> Float[Tensor, " P"]:
+        """The longer side of what photos show at each point: the harmonic mean over those in which it lies.
+
+        Returns:
+            (P,) in units of the capture's frame; not finite for a point that is in none of the views looked at.
+        """
+        nearness, seen = (torch.zeros_like(points[:, 0]) for _ in range(2))
+        x, y, z = points.unbind(dim=1)
+        for viewmat, K, (width, height) in self._views:
+            right, down, depth = (x * a + y * b + z * c + d for a, b, c, d in viewmat[:3])
+            across, along = (right * a + down * b + depth * c for a, b, c in K[:2])
+            inside = (depth > 0) & (across >= 0) & (across < width * depth) & (along >= 0) & (along < height * depth)
+            nearness += torch.where(inside, K[0][0] / max(width, height) / depth, 0.0)
+            seen += inside
+        return seen / nearness

@@ -31,6 +31,8 @@ class Adam:
         first_moments: m, shaped as the parameters.
         second_moments: v, shaped as the parameters.
         step_count: t, the number of steps taken.
+        paces: By name of a parameter, (rows,) factors of its rate, one for each row. Change them freely between steps;
+            those of a parameter are gone when another number of rows takes its place.
 
     Example:
         >>> place = torch.tensor([1.0, 2.0], requires_grad=True)
@@ -76,13 +78,15 @@ class Adam:
         self.step_count = 0
         self.first_moments = {name: _zeros(parameter) for name, parameter in self.parameters.items()}
         self.second_moments = {name: _zeros(parameter) for name, parameter in self.parameters.items()}
+        self.paces: dict[str, Tensor] = {}
 
     @torch.no_grad()
     def step(self) -> None:
         """Update every parameter from its gradient.
 
         Raises:
-            ValueError: A parameter without gradient or without a place for each element; nothing is updated then.
+            ValueError: A parameter without gradient or without a place for each element, or paces that do not fit it;
+                nothing is updated then.
         """
         together: dict[Engine, list[str]] = {}
         for name, parameter in self.parameters.items():
@@ -90,9 +94,10 @@ class Adam:
             if parameter.grad is None:
                 raise ValueError(f"parameter {name} has no gradient: call backward() before step()")
             together.setdefault(engine_for(parameter), []).append(name)
+        groups_of = {engine: self._groups(names) for engine, names in together.items()}
         self.step_count += 1
         for engine, names in together.items():
-            groups, rates = self._groups(names), [self.learning_rates[name] for name in names]
+            groups, rates = groups_of[engine], [self.learning_rates[name] for name in names]
             engine.adam_step(groups, rates, self.betas, self.eps, self.step_count)
             self._store(names, groups)
 
@@ -118,6 +123,8 @@ class Adam:
             check_shape(moment_name, moment, tuple(parameter.shape))
             check_like(moment_name, moment, "parameter", parameter)
         check_like("parameter", parameter, f"parameters[{name}]", self.parameters[name])
+        if name in self.paces and len(self.paces[name]) != len(parameter):
+            del self.paces[name]
         self.parameters[name] = parameter
         self.first_moments[name] = dense(first, "first")
         self.second_moments[name] = dense(second, "second")
@@ -131,6 +138,7 @@ class Adam:
             "eps": self.eps,
             "first_moments": dict(self.first_moments),
             "second_moments": dict(self.second_moments),
+            "paces": dict(self.paces),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -152,6 +160,7 @@ class Adam:
         self.eps = float(state["eps"])
         self.first_moments = {name: _dense_copy(state["first_moments"][name]) for name in self.parameters}
         self.second_moments = {name: _dense_copy(state["second_moments"][name]) for name in self.parameters}
+        self.paces = {name: _dense_copy(paces) for name, paces in state["paces"].items()}
 
     @torch.no_grad()
     def step_on_device(self, rates: Tensor, halted: Tensor) -> None:
@@ -176,7 +185,13 @@ class Adam:
             if not parameter.shape == parameter.grad.shape == first.shape == second.shape:
                 was, got = tuple(first.shape), tuple(parameter.shape)
                 raise ValueError(f"parameter {name}, its gradient and moments must have one shape, {was}, got {got}")
-            groups.append((dense(parameter, name), dense(parameter.grad, f"gradient of {name}"), first, second))
+            paces = self.paces.get(name)
+            if paces is not None:
+                check_shape(f"paces of {name}", paces, (len(parameter),))
+                check_like(f"paces of {name}", paces, name, parameter)
+                paces = dense(paces, f"paces of {name}")
+            gradient = dense(parameter.grad, f"gradient of {name}")
+            groups.append((dense(parameter, name), gradient, first, second, paces))
         return groups
 
     def _store(self, names: Sequence[str], groups: Sequence[AdamGroup]) -> None:

@@ -4,7 +4,7 @@ import contextlib
 import hashlib
 import json
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -85,6 +85,7 @@ class Trainer(Generic[M]):
         depths: DepthTrust | None = None,
         cameras: CameraRefinement | None = None,
         update: Callable[[Adam, Any], None] | None = None,
+        paces: Mapping[str, Callable[[Tensor], Tensor]] | None = None,
         evaluate: Callable[[Any], dict[str, float]] | None = None,
         guard: Guard | None = None,
         seed: int | torch.Generator = 0,
@@ -105,6 +106,8 @@ class Trainer(Generic[M]):
             cameras: what is learned of the cameras of photos, judged by those in `dataset.watched`; None for cameras
                 as they are given.
             update: takes the step from the gradients, in the place of `Adam.step`.
+            paces: by name of a parameter, what says of its values how much faster each row moves than its rate (rows,).
+                Asked at the start and after every edit.
             evaluate: cheap metrics of the model; of several workers the first one measures them.
             guard: undoes edits of the strategy after which the training photos are explained worse.
             seed: of the order of views and every other random choice; or a generator to go on with.
@@ -116,6 +119,7 @@ class Trainer(Generic[M]):
         self.exposure, self.depths, self.guard = exposure or Exposure(NEVER), depths or DepthTrust([]), guard
         self.cameras = cameras or CameraRefinement()
         self._objective, self._dataset, self._batch, self._evaluate = objective, dataset, batch, evaluate
+        self._paces = dict(paces or {})
         generator = seed if isinstance(seed, torch.Generator) else torch.Generator().manual_seed(seed)
         self._began = generator.get_state()
         behind = None if background is None else torch.tensor(background)[None]
@@ -133,6 +137,7 @@ class Trainer(Generic[M]):
             generator=generator,
         )
         self.adam = self._stepper.adam
+        self._set_paces()
         some = next(iter(model.parameters().values()))
         self._device = some.device
         judges = middles_of(dataset.train, min(len(dataset.train), GUARD_VIEWS))
@@ -233,6 +238,7 @@ class Trainer(Generic[M]):
             loss, following = self._loss(), self.strategy.next_edit(iteration + 1)
             self.guard.hold(self.progress, following, loss, self._state())
         if self.strategy.edit(iteration):
+            self._set_paces()
             self.edited()
         elif self.guard is not None:
             self.guard.release_if_same(self._state())
@@ -263,6 +269,10 @@ class Trainer(Generic[M]):
         progress.iteration, (progress.loss_sum, progress.loss_count) = held.iteration, held.losses
         self._edit(held.iteration)
         return self._review_edit(progress) or undone
+
+    def _set_paces(self) -> None:
+        for name, measure in self._paces.items():
+            self.adam.paces[name] = measure(self.adam.parameters[name].detach())
 
     def edited(self) -> None:
         """To be called when tensors of the model were replaced."""
@@ -312,6 +322,7 @@ class Trainer(Generic[M]):
             "model": self.model.state(),
             "adam.first": self.adam.first_moments,
             "adam.second": self.adam.second_moments,
+            "adam.paces": self.adam.paces,
             "strategy": self.strategy.state(),
             "sampler": self._stepper.sampler.state(),
             "watch": self._watch.state() if self._watch else {},
@@ -340,6 +351,7 @@ class Trainer(Generic[M]):
         first, second = _part(state, "adam.first"), _part(state, "adam.second")
         for name, parameter in self.model.parameters().items():
             self.adam.replace(name, parameter, first[name].to(self._device), second[name].to(self._device))
+        self.adam.paces = {name: paces.to(self._device) for name, paces in _part(state, "adam.paces").items()}
         self.adam.step_count = int(state["adam.step_count"])
         self.strategy.load_state(_part(state, "strategy"))
         self._stepper.sampler.load_state(_part(state, "sampler"))

@@ -12,8 +12,11 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from etsplat.data.dataset import Dataset
+from etsplat.data.shown_width import ShownWidths
 from etsplat.model.triangle_mesh import TriangleMesh
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.optim.exposure import Exposure
@@ -25,16 +28,19 @@ from etsplat.optim.terms.photometric import Photometric
 from etsplat.optim.trainer import Trainer
 from etsplat.tasks.running import Job
 from etsplat.tasks.settings import get
-from etsplat.tasks.soup_trainer import background_of, start_trainer, vertex_unit
+from etsplat.tasks.soup_trainer import background_of, shown_across, start_trainer
 from etsplat.tasks.train_checks import triangle_limit
 from etsplat.tasks.train_config import TrainConfig
 
-SOUP_SHARE, SOUP_TRIANGLES, MESH_SHARE = 0.3, 0.5, 0.3
+SOUP_SHARE, SOUP_TRIANGLES, MESH_SHARE = 0.3, 0.5, 0.4
 """Of the soup that becomes opaque, where the run's own is soft: its steps and its triangles, as parts of a run's. The
 others come where the mesh is wrong. And steps of the mesh (research/ablations.md)."""
 
 VERTEX_RATE, VERTEX_FINAL = 3e-4, 0.03
-"""Adam's rate of corners, as a fraction of what photos show across, and what is left of it at the end."""
+"""Adam's rate of corners, as a fraction of what photos show across where they are, and its rest at the end."""
+
+SLOWEST, FASTEST = 0.1, 30.0
+"""Limits of what photos show across at a corner, beside what they do at the capture's points."""
 
 COLOR_RATE, SETTLING_FROM, SETTLED = 5e-3, 0.7, 0.1
 """Adam's rate of colours; from this part of the steps on it falls, to this part of itself."""
@@ -76,7 +82,7 @@ def start_mesh(soup: TriangleSoup, exposure: Exposure, capture: Dataset, config:
         opaque_mesh(soup),
         capture,
         iterations=mesh_steps(config),
-        unit=vertex_unit(soup, capture, config),
+        unit=shown_across(soup, capture),
         max_faces=triangle_limit(capture, config),
         background=background_of(config),
         batch=config.batch,
@@ -157,7 +163,7 @@ def make_opaque_trainer(
         mesh: the start; changed in place.
         capture: what it is fitted to.
         iterations: steps.
-        unit: what the rate of corners is a fraction of.
+        unit: what the rate of corners is a fraction of, where photos show as much across as at the capture's points.
         max_faces: most faces that there may be.
         background: behind the pictures.
         batch: views of each step.
@@ -182,8 +188,23 @@ def make_opaque_trainer(
         batch=batch,
         background=background,
         exposure=exposure,
+        paces={"vertices": corner_paces(capture, unit)},
         seed=seed,
     )
+
+
+def corner_paces(capture: Dataset, unit: float) -> Callable[[Float[Tensor, "N3 3"]], Float[Tensor, " N3"]]:
+    """How much faster than at that unit the corners of separate triangles move: as fast on screen near and far.
+
+    Those of a triangle that no photo shows move at the usual rate.
+    """
+    shown = ShownWidths(capture)
+
+    def paces(corners: Float[Tensor, "N3 3"]) -> Float[Tensor, " N3"]:
+        relative = shown(corners.reshape(-1, 3, 3).mean(dim=1)) / unit
+        return relative.nan_to_num(1.0, posinf=1.0).clamp(SLOWEST, FASTEST).repeat_interleave(3)
+
+    return paces
 
 
 def _corners(iterations: int, unit: float) -> Callable[[int], float]:

@@ -178,8 +178,11 @@ def _strategy(config: TrainConfig, most: int, spared: Spared | None) -> DensifyA
 
 def vertex_unit(soup: TriangleSoup, capture: Dataset, config: TrainConfig) -> float:
     """What the rate of positions is a fraction of, in units of the frame."""
-    if config.optimizer.lr_vertices_unit == "frame":
-        return 1.0
+    return 1.0 if config.optimizer.lr_vertices_unit == "frame" else shown_across(soup, capture)
+
+
+def shown_across(soup: TriangleSoup, capture: Dataset) -> float:
+    """What photos show across at the capture's points, or at the triangles, in units of the frame."""
     points = soup.vertices.detach().mean(dim=1).cpu() if capture.points is None else capture.points
     return shown_width(capture, points) or 1.0
 

@@ -14,12 +14,13 @@ def adam_step(
     step_count: int,
 ) -> None:
     """See `Engine.adam_step`."""
-    parameters, gradients, firsts, seconds = zip(*groups, strict=True)
+    parameters, gradients, firsts, seconds, paces = zip(*groups, strict=True)
     _native.adam_step(
         parameters=parameters,
         gradients=gradients,
         firsts=firsts,
         seconds=seconds,
+        paces=paces,
         learning_rates=learning_rates,
         beta1=betas[0],
         beta2=betas[1],

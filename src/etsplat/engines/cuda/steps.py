@@ -1,5 +1,6 @@
 """Steps of a fit on a GPU, queued as CUDA graphs: csrc/cuda/adam.cu, soup_statistics.cu and step.cu."""
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -118,7 +119,8 @@ class CudaQueuedSteps:
         for first in range(0, len(groups), most):
             chosen = groups[first : first + most]
             sizes = [group[0].numel() for group in chosen]
-            table = table_class(*map(list, zip(*chosen, strict=True)), sizes)
+            widths = [max(1, math.prod(group[0].shape[1:])) for group in chosen]
+            table = table_class(*map(list, zip(*chosen, strict=True)), sizes, widths)
             grid = sum(blocks(size, _ADAM_ELEMENTS) for size in sizes)
             arguments = (table, len(chosen), rates[first:], rates[len(groups) :], *constants, halted)
             launch(_ADAM, "adam_step", grid, _ADAM_THREADS, arguments)

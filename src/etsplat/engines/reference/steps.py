@@ -9,8 +9,8 @@ from etsplat.core.rasterization import TriangleStatistics
 
 _VISIBLE_INRADIUS = 1.0
 
-AdamGroup = tuple[Tensor, Tensor, Tensor, Tensor]
-"""A parameter, its gradient and both moments, contiguous."""
+AdamGroup = tuple[Tensor, Tensor, Tensor, Tensor, Tensor | None]
+"""A parameter, its gradient and both moments, contiguous; and factors of the rate for its rows."""
 
 
 def step_rates(learning_rates: Sequence[float], betas: tuple[float, float], step_count: int) -> list[float]:
@@ -28,11 +28,14 @@ def adam_step(
 ) -> None:
     """Update the parameters and their moments in place; see `etsplat.ops.adam`."""
     beta1, beta2 = betas
-    for (parameter, gradient, first, second), learning_rate in zip(groups, learning_rates, strict=True):
+    for (parameter, gradient, first, second, paces), learning_rate in zip(groups, learning_rates, strict=True):
         first += (1 - beta1) * (gradient - first)
         second.mul_(beta2).add_((1 - beta2) * gradient * gradient)
         root = second.sqrt() / (1 - beta2**step_count) ** 0.5
-        parameter -= learning_rate / (1 - beta1**step_count) * (first / (root + eps))
+        rate = learning_rate / (1 - beta1**step_count)
+        if paces is not None:
+            rate = rate * paces.reshape(-1, *[1] * (parameter.ndim - 1))
+        parameter -= rate * (first / (root + eps))
 
 
 def update_statistics(
