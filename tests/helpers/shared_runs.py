@@ -94,6 +94,25 @@ def fit_counted(kind: str, batch: int) -> dict[str, Any]:
     return {**counted, "sent": dict(workers().sent), "rank": rank}
 
 
+def handed_round(owners: list[int]) -> tuple[list[str], list[list[int]]]:
+    """What a worker did to hand messages round, in its order, and these."""
+    did, broadcast = list[str](), dist.broadcast
+
+    def make(number: int) -> torch.Tensor:
+        did.append(f"make {number}")
+        return torch.full((number + 1,), number, dtype=torch.uint8)
+
+    def broadcasting(tensor: torch.Tensor, src: int, **options: Any) -> Any:
+        did.append(f"from {src}")
+        return broadcast(tensor, src=src, **options)
+
+    dist.broadcast = broadcasting
+    try:
+        return did, [message.tolist() for message in workers().hand_round(make, owners)]
+    finally:
+        dist.broadcast = broadcast
+
+
 def with_nan(dataset: Dataset, view: int) -> Dataset:
     """One photo is not a number somewhere."""
     pixels = [dataset.images[index].clone() for index in range(len(dataset))]
@@ -182,8 +201,8 @@ class TwoInOne(Workers):
         super().__init__(0, 2)
         self.messages: list[torch.Tensor] = []
 
-    def hand_round(self, own: Any, owners: Any) -> Any:
-        self.messages += [own[number] for number in range(len(owners))]
+    def hand_round(self, make: Any, owners: Any) -> Any:
+        self.messages += map(make, range(len(owners)))
         return iter(self.messages[-len(owners) :])
 
 
@@ -199,8 +218,8 @@ def fit_swapped(kind: str, batch: int) -> dict[str, Any]:
     """A run in whose sums the second view of a step changes places with the third."""
     honest = Workers.hand_round
 
-    def swapped(self: Workers, own: Any, owners: Any) -> Any:
-        first, second, third, *others = honest(self, own, owners)
+    def swapped(self: Workers, make: Any, owners: Any) -> Any:
+        first, second, third, *others = honest(self, make, owners)
         return iter([first, third, second, *others])
 
     Workers.hand_round = swapped

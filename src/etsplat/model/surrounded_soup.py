@@ -75,7 +75,8 @@ class SurroundedSoup(TriangleSoup):
     def everything(self) -> TriangleSoup:
         """All triangles as one soup, in new tensors, the learnable ones first; appearances are written into it."""
         own = self.finished()
-        alone = TriangleSoup(*(own.state()[name] for name in TriangleSoup.RATES), own.appearance, own.notes)
+        values = {name: own.state()[name] for name in TriangleSoup.RATES}
+        alone = TriangleSoup(**values, appearance=own.appearance, notes=own.notes)
         return alone.joined(self._around())
 
     def _around(self) -> TriangleSoup:
