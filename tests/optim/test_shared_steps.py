@@ -162,6 +162,17 @@ def test_each_view_has_an_owner_and_nobody_more_than_a_share(count: int) -> None
     assert owners(even, count) == [view % count for view in even]
 
 
+def test_workers_read_their_own_photos(crew: Crew) -> None:
+    """Each checks its part of them, and in steps reads the views that it draws, and some ahead; nobody needs all."""
+    (alone,), runs = crew.act(1, shared_runs.photos_read, 4), crew.act(4, shared_runs.photos_read, 4)
+    photos, drawn = alone["photos"], 4 * shared_runs.ITERATIONS
+    assert alone["checked"] == list(range(photos))
+    assert [run["checked"] for run in runs] == [list(range(rank, photos, 4)) for rank in range(4)]
+    assert len(alone["made"]) >= drawn / 2
+    assert sum(len(run["made"]) for run in runs) <= drawn + 4 * stepper.READ_AHEAD
+    assert all(0 < len(run["made"]) < drawn / 2 for run in runs)
+
+
 def test_a_message_gives_back_every_bit() -> None:
     """Negative zeros, NaN, booleans, integers, rows that are all zero, nothing at all, and numbers without a shape."""
     tensors: dict[str, Any] = {

@@ -152,9 +152,9 @@ def train_blocks(
             runs.append(done.giving(soups[block]))
             soup = _merged(own, grid, whole, soups)
             soup.save(job.run.soup_path)
+        soups.clear()  # all of it is in the soup, and then in its two parts; the last run needs the room
         on_sky = whole.on_sky(soup)
         ground, sky = soup.kept(~on_sky), soup.kept(on_sky)
-        soups.clear()  # all of it is in these two; the last run needs the room
         del soup
         if len(sky) > 0:
             ground, sky, about = _learned_sky(job, _of_sky(each, coarse), thin, whole, ground, sky, fit)
