@@ -17,11 +17,11 @@ small numbers, one for each view of a worker and one more. One process neither p
 last of each worker, travel while its next view is drawn: of their time so much is taken off again as drawing takes.
 
 With --check steps are made by one process and by two, and the processor's time of a step, and the bytes, are compared
-with what the model says of them. What sending while the next view is drawn gives is seen by the clock, on a network
-that is as slow as one says, of which both directions go through the same loopback (Linux):
+with what the model says of them. What sending while the next view is drawn gives is seen by the clock, on a network as
+slow as one says, of which both directions go through the same loopback (Linux):
 
-    unshare -rn sh -c "ip link set lo up && tc qdisc add dev lo root tbf rate 200mbit burst 256kb latency 1s &&
-        python -m benchmarks.workers --check --triangles 20000 --width 320 --views 4 --repeats 3"
+    unshare -rn sh -c "ip link set lo up && tc qdisc add dev lo root tbf rate 400mbit burst 256kb latency 1s &&
+        python -m benchmarks.workers --check --triangles 20000 --width 320 --views 4"
 """
 
 import argparse
@@ -50,8 +50,8 @@ from etsplat.optim.trainer import Trainer
 from etsplat.tasks.soup_trainer import start_trainer
 from etsplat.tasks.train_config import TrainConfig
 
-STEPS = 4
-"""Of a check."""
+STEPS, ROUNDS = 4, 15
+"""Of a check: steps that are measured, and how often messages are handed round."""
 
 WORKERS = (1, 2, 4, 8, 16, 32, 64)
 NETWORKS = (1, 10, 100)
@@ -187,62 +187,67 @@ def modelled(
     return whole if late else whole - min(sending, drawn) * (share - 1) / share
 
 
-def steps_of(trainer: Trainer[Any], config: TrainConfig, steps: int) -> dict[str, float]:
-    """Seconds of a step, of the processor and by the clock, and what it handed to others; after one that warms up."""
-    first, group = config.iterations - steps, present()
-    trainer._stepper.advance(first, first, ())
-    group.any(False)  # all begin together
-    start, clock, before = time.process_time(), time.perf_counter(), dict(group.sent)
-    for iteration in range(first + 1, config.iterations + 1):
-        trainer._stepper.advance(iteration, iteration, ())
-    sent = {name: (group.sent[name] - before[name]) / steps for name in before}
-    took = {"seconds": time.process_time() - start, "clock": time.perf_counter() - clock}
-    return {**{name: each / steps for name, each in took.items()}, **sent}
-
-
-def hand_round_late(self: Workers, make: Callable[[int], Tensor], owners: Sequence[int]) -> Iterator[Tensor]:
-    """As `Workers.hand_round`, but all messages are made before the first travels."""
-    made = {number: make(number) for number, owner in enumerate(owners) if owner == self.rank}
-    return HAND_ROUND(self, made.__getitem__, owners)
-
-
-HAND_ROUND = Workers.hand_round
-
-
-def take_part(place: str, rank: int, count: int, late: bool, arguments: argparse.Namespace, pipe: Any) -> None:
-    """One of the processes of a check."""
+def steps_of(rank: int, count: int, arguments: argparse.Namespace, place: str, pipe: Any) -> None:
+    """In one of so many processes: processor seconds of a step, after a first that warms up, and what it handed on."""
     set_num_threads(1)
-    Workers.hand_round = hand_round_late if late else HAND_ROUND
     trainer, config = start(arguments)
     with one_torch_thread(), together(place, rank=rank, count=count):
-        pipe.send(steps_of(trainer, config, STEPS))
+        first, group = config.iterations - STEPS, present()
+        trainer._stepper.advance(first, first, ())
+        start_time, before = time.process_time(), dict(group.sent)
+        for iteration in range(first + 1, config.iterations + 1):
+            trainer._stepper.advance(iteration, iteration, ())
+        sent = {name: (group.sent[name] - before[name]) / STEPS for name in before}
+        pipe.send({"seconds": (time.process_time() - start_time) / STEPS, **sent})
+
+
+def handed_round(rank: int, late: bool, found: Mapping[str, float], place: str, pipe: Any) -> None:
+    """In one of two processes: seconds by the clock in which both hand round two messages each, the median.
+
+    Views are drawn asleep, so that nothing else on the machine disturbs it. `late` messages travel only when all are
+    made.
+    """
+    message = torch.zeros(int(found["bytes"]), dtype=torch.uint8)
+
+    def make(number: int) -> Tensor:
+        time.sleep(found["view"])
+        return message
+
+    took = []
+    with together(place, rank=rank, count=2) as group:
+        for _ in range(ROUNDS):
+            begin = time.perf_counter()
+            made = {number: make(number) for number in (rank, rank + 2)} if late else None
+            for each in group.hand_round(make if made is None else made.__getitem__, [0, 1, 0, 1]):
+                assert len(each) == len(message)
+            took.append(time.perf_counter() - begin)
+    pipe.send(sorted(took)[ROUNDS // 2])
 
 
 def check(arguments: argparse.Namespace, found: Mapping[str, float]) -> None:
-    """Compares the model with steps of one process and of two, in turn."""
-    print(
-        "\n| processes | ms of a core in a step | model | ms by the clock | messages | model | MB handed on | model |"
-    )
-    print("| --: |" + " --: |" * 7)
-    for count, late in ((1, False), *arguments.repeats * ((2, False), (2, True))):
-        each, views = steps_of_processes(count, late, arguments), arguments.views
-        took, clock = (1000 * sum(one[name] for one in each) / count for name in ("seconds", "clock"))
+    """Compares the model with steps of one process and of two."""
+    views = arguments.views
+    print("\n| processes | ms of a core in a step | model | messages | model | MB handed on | model |")
+    print("| --: |" + " --: |" * 6)
+    for count in (1, 2):
+        each = in_processes(steps_of, count, count, arguments)
+        took, traffic = 1000 * sum(one["seconds"] for one in each) / count, Traffic.of(views, count)
         messages, megabytes = (sum(one[name] for one in each) for name in ("messages", "bytes"))
-        traffic = Traffic.of(views, count)
         said = 1000 * computed(found, views, count, 1), traffic.broadcasts, traffic.broadcasts * found["bytes"] / 1e6
-        print(f"| {count}{', sent late' if late else ''} | {took:.0f} | {said[0]:.0f} | {clock:.0f} ", end="")
-        print(f"| {messages:.1f} | {said[1]} | {megabytes / 1e6:.2f} | {said[2]:.2f} |", flush=True)
+        print(f"| {count} | {took:.0f} | {said[0]:.0f} | {messages:.1f} | {said[1]} ", end="")
+        print(f"| {megabytes / 1e6:.2f} | {said[2]:.2f} |", flush=True)
+    early, late = (1000 * max(in_processes(handed_round, 2, late, found)) for late in (False, True))
+    print(f"\nTwo processes, two views each, asleep while they are drawn: {early:.0f} ms; sent late {late:.0f} ms")
 
 
-def steps_of_processes(count: int, late: bool, arguments: argparse.Namespace) -> list[dict[str, float]]:
-    """What `steps_of` says in each of so many processes."""
+def in_processes(what: Callable[..., None], count: int, *arguments: Any) -> list[Any]:
+    """What a function sends in each of so many processes, which get their rank, these arguments and where they meet."""
     context = multiprocessing.get_context("spawn")
     with TemporaryDirectory() as folder:
         pipes = [context.Pipe() for _ in range(count)]
         place = f"file://{folder}/meeting"
         processes = [
-            context.Process(target=take_part, args=(place, rank, count, late, arguments, there))
-            for rank, (_, there) in enumerate(pipes)
+            context.Process(target=what, args=(rank, *arguments, place, there)) for rank, (_, there) in enumerate(pipes)
         ]
         for process in processes:
             process.start()
@@ -269,7 +274,6 @@ def main() -> None:
     parser.add_argument("--cores", type=int, default=8, help="of each worker, in the model")
     parser.add_argument("--check", action="store_true", help="compare with one process and two")
     parser.add_argument("--views", type=int, default=2, help="of a step of a check")
-    parser.add_argument("--repeats", type=int, default=1, help="of a check of two processes")
     arguments = parser.parse_args()
     set_num_threads(1)
     trainer, config = start(arguments)
