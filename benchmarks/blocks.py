@@ -1,6 +1,6 @@
 """A scene in blocks against one run of the same budget: quality, seams, and memory.
 
-    python -m benchmarks.blocks --steps 1000
+    python -m benchmarks.blocks --steps 1000 --triangles 4000 --seeds 0 1 2
     python -m benchmarks.blocks --memory 1600000
 
 The scene is made in code: eight of the demo's tables, in fewer faces, on a painted ground, 288 photos around them. The
@@ -96,8 +96,8 @@ def capture(width: int, points: int) -> Dataset:
     )
 
 
-def compare(options: argparse.Namespace) -> None:
-    views = capture(options.width, 6000)
+def compare(views: Dataset, options: argparse.Namespace, seed: int) -> None:
+    """A table of both, in which all random numbers follow from a seed."""
     config = TrainConfig.quick().changed(
         {
             "iterations": options.steps,
@@ -107,6 +107,7 @@ def compare(options: argparse.Namespace) -> None:
             "asset": False,
             "output.evaluate_every": 0,
             "output.checkpoint_every": 0,
+            "seed": seed,
         }
     )
     columns, rows = map(int, options.blocks.split("x"))
@@ -114,7 +115,7 @@ def compare(options: argparse.Namespace) -> None:
     with TemporaryDirectory() as place:
         blocks = etsplat.train(views, Path(place) / "blocks", config, blocks=options.blocks, callbacks=[_tell])
         steps, seconds = blocks.metrics["iterations"], time.process_time() - begin
-        print(f"in blocks: {steps:,} steps, {seconds:.0f} s of processor time", flush=True)
+        print(f"seed {seed}, in blocks: {steps:,} steps, {seconds:.0f} s of processor time", flush=True)
         larger = config.changed({"iterations": steps, "max_triangles": blocks.soup.count})
         one = etsplat.train(views, Path(place) / "one", larger, callbacks=[_tell])
         print(f"one run: {steps:,} steps, {time.process_time() - begin - seconds:.0f} s of processor time", flush=True)
@@ -225,10 +226,13 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=1000, help="of each block")
     parser.add_argument("--triangles", type=int, default=5000, help="of each block, at most")
     parser.add_argument("--width", type=int, default=96)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--memory", type=int, default=0, metavar="POINTS")
     options = parser.parse_args()
     if not options.memory:
-        compare(options)
+        views = capture(options.width, 6000)
+        for seed in options.seeds:
+            compare(views, options, seed)
         return
     print("| | MiB by which the process grows |\n|---|--:|")
     for blocks in (None, options.blocks):

@@ -9,14 +9,19 @@ Bytes are counted. Compute is measured on one core, in seconds of this process, 
 those of the clock. The rest is a model, not a measurement:
 
     step = share (view / cores + pack) + B (unpack + add + colors / cores) + parameters + Adam
-         + (B - share) bytes / network + (B + 2) hops latency
+         + (B - share) bytes / network + (B + share + 1) hops latency
 
 with B views, share = ceil(B / workers) and hops = ceil(log2(workers)): drawing, and what leads from colours to
-coefficients, have as many cores as a worker has, all else one. A step has a broadcast for each view and two gatherings
-of small numbers. One process neither packs nor unpacks.
+coefficients, have as many cores as a worker has, all else one. A step has a broadcast for each view, and gatherings of
+small numbers, one for each view of a worker and one more. One process neither packs nor unpacks. Messages, all but the
+last of each worker, travel while its next view is drawn: of their time so much is taken off again as drawing takes.
 
-With --check two views a step are made by one process and by two, and the processor's time of a step, and the bytes,
-are compared with what the model says of them.
+With --check steps are made by one process and by two, and the processor's time of a step, and the bytes, are compared
+with what the model says of them. What sending while the next view is drawn gives is seen by the clock, on a network as
+slow as one says, of which both directions go through the same loopback (Linux):
+
+    unshare -rn sh -c "ip link set lo up && tc qdisc add dev lo root tbf rate 400mbit burst 256kb latency 1s &&
+        python -m benchmarks.workers --check --triangles 20000 --width 320 --views 4"
 """
 
 import argparse
@@ -45,8 +50,8 @@ from etsplat.optim.trainer import Trainer
 from etsplat.tasks.soup_trainer import start_trainer
 from etsplat.tasks.train_config import TrainConfig
 
-STEPS = 4
-"""Of a check."""
+STEPS, ROUNDS = 4, 15
+"""Of a check: steps that are measured, and how often messages are handed round."""
 
 WORKERS = (1, 2, 4, 8, 16, 32, 64)
 NETWORKS = (1, 10, 100)
@@ -62,7 +67,8 @@ class Traffic:
 
     Attributes:
         broadcasts: of a view's message each, by its worker to all others.
-        gatherings: of a few numbers of all: how long messages are, and whether one worker was interrupted.
+        gatherings: of a few numbers of all: how long messages are, for each view of a worker, and whether one was
+            interrupted.
         received: messages that the worker receives which draws most.
         hops: of a broadcast, from one worker to others and from these on.
     """
@@ -77,7 +83,8 @@ class Traffic:
         """Of so many views; nothing of one worker."""
         if workers == 1:
             return Traffic(0, 0, 0, 0)
-        return Traffic(views, 2, views - math.ceil(views / workers), math.ceil(math.log2(workers)))
+        share = math.ceil(views / workers)
+        return Traffic(views, share + 1, views - share, math.ceil(math.log2(workers)))
 
     @property
     def calls(self) -> int:
@@ -100,9 +107,9 @@ class Recorder(Workers):
         super().__init__(0, 2)
         self.message = torch.empty(0, dtype=torch.uint8)
 
-    def hand_round(self, own: Mapping[int, Tensor], owners: Sequence[int]) -> Iterator[Tensor]:
+    def hand_round(self, make: Callable[[int], Tensor], owners: Sequence[int]) -> Iterator[Tensor]:
         """Its own, each time."""
-        self.message = next(iter(own.values()))
+        self.message = make(0)
         return iter([self.message] * len(owners))
 
 
@@ -170,70 +177,91 @@ def computed(found: Mapping[str, float], views: int, workers: int, cores: int) -
     return share * (found["view"] / cores + found["pack"]) + views * each + once
 
 
-def modelled(found: Mapping[str, float], views: int, workers: int, cores: int, gigabits: float) -> float:
-    """Seconds of a step."""
-    traffic = Traffic.of(views, workers)
+def modelled(
+    found: Mapping[str, float], views: int, workers: int, cores: int, gigabits: float, *, late: bool = False
+) -> float:
+    """Seconds of a step; where messages are `late` they travel only when all views are drawn."""
+    traffic, share = Traffic.of(views, workers), math.ceil(views / workers)
     sending = traffic.received * found["bytes"] * 8 / (gigabits * 1e9) + traffic.calls * traffic.hops * LATENCY
-    return computed(found, views, workers, cores) + sending
+    whole, drawn = computed(found, views, workers, cores) + sending, share * found["view"] / cores
+    return whole if late else whole - min(sending, drawn) * (share - 1) / share
 
 
-def overlapped(found: Mapping[str, float], views: int, workers: int, cores: int, gigabits: float) -> float:
-    """Seconds of a step whose messages travel, all but the last of each worker, while the next view is drawn."""
-    share = math.ceil(views / workers)
-    whole, drawn = modelled(found, views, workers, cores, gigabits), share * found["view"] / cores
-    sending = whole - computed(found, views, workers, cores)
-    return whole - min(sending, drawn) * (share - 1) / share
-
-
-def steps_of(trainer: Trainer[Any], config: TrainConfig, steps: int) -> dict[str, float]:
-    """Processor seconds of a step, and what it handed to others; the first step, which warms up, does not count."""
-    first, group = config.iterations - steps, present()
-    trainer._stepper.advance(first, first, ())
-    start, before = time.process_time(), dict(group.sent)
-    for iteration in range(first + 1, config.iterations + 1):
-        trainer._stepper.advance(iteration, iteration, ())
-    sent = {name: (group.sent[name] - before[name]) / steps for name in before}
-    return {"seconds": (time.process_time() - start) / steps, **sent}
-
-
-def take_part(place: str, rank: int, count: int, arguments: argparse.Namespace, pipe: Any) -> None:
-    """One of the processes of a check."""
+def steps_of(rank: int, count: int, arguments: argparse.Namespace, place: str, pipe: Any) -> None:
+    """In one of so many processes: processor seconds of a step, after a first that warms up, and what it handed on."""
     set_num_threads(1)
     trainer, config = start(arguments)
     with one_torch_thread(), together(place, rank=rank, count=count):
-        pipe.send(steps_of(trainer, config, STEPS))
+        first, group = config.iterations - STEPS, present()
+        trainer._stepper.advance(first, first, ())
+        start_time, before = time.process_time(), dict(group.sent)
+        for iteration in range(first + 1, config.iterations + 1):
+            trainer._stepper.advance(iteration, iteration, ())
+        sent = {name: (group.sent[name] - before[name]) / STEPS for name in before}
+        pipe.send({"seconds": (time.process_time() - start_time) / STEPS, **sent})
+
+
+def handed_round(rank: int, late: bool, found: Mapping[str, float], place: str, pipe: Any) -> None:
+    """In one of two processes: seconds by the clock in which both hand round two messages each, the median.
+
+    Views are drawn asleep, so that nothing else on the machine disturbs it. `late` messages travel only when all are
+    made.
+    """
+    message = torch.zeros(int(found["bytes"]), dtype=torch.uint8)
+
+    def make(number: int) -> Tensor:
+        time.sleep(found["view"])
+        return message
+
+    took = []
+    with together(place, rank=rank, count=2) as group:
+        for _ in range(ROUNDS):
+            begin = time.perf_counter()
+            made = {number: make(number) for number in (rank, rank + 2)} if late else None
+            for each in group.hand_round(make if made is None else made.__getitem__, [0, 1, 0, 1]):
+                assert len(each) == len(message)
+            took.append(time.perf_counter() - begin)
+    pipe.send(sorted(took)[ROUNDS // 2])
 
 
 def check(arguments: argparse.Namespace, found: Mapping[str, float]) -> None:
-    """Compares the model with steps of two views, of one process and of two."""
+    """Compares the model with steps of one process and of two."""
+    views = arguments.views
     print("\n| processes | ms of a core in a step | model | messages | model | MB handed on | model |")
     print("| --: |" + " --: |" * 6)
-    context = multiprocessing.get_context("spawn")
     for count in (1, 2):
-        with TemporaryDirectory() as folder:
-            pipes = [context.Pipe() for _ in range(count)]
-            place = f"file://{folder}/meeting"
-            processes = [
-                context.Process(target=take_part, args=(place, rank, count, arguments, there))
-                for rank, (_, there) in enumerate(pipes)
-            ]
-            for process in processes:
-                process.start()
-            each = [here.recv() for here, _ in pipes]
-            for process in processes:
-                process.join()
-        took, traffic = 1000 * sum(one["seconds"] for one in each) / count, Traffic.of(2, count)
+        each = in_processes(steps_of, count, count, arguments)
+        took, traffic = 1000 * sum(one["seconds"] for one in each) / count, Traffic.of(views, count)
         messages, megabytes = (sum(one[name] for one in each) for name in ("messages", "bytes"))
-        said = 1000 * computed(found, 2, count, 1), traffic.broadcasts, traffic.broadcasts * found["bytes"] / 1e6
+        said = 1000 * computed(found, views, count, 1), traffic.broadcasts, traffic.broadcasts * found["bytes"] / 1e6
         print(f"| {count} | {took:.0f} | {said[0]:.0f} | {messages:.1f} | {said[1]} ", end="")
         print(f"| {megabytes / 1e6:.2f} | {said[2]:.2f} |", flush=True)
+    early, late = (1000 * max(in_processes(handed_round, 2, late, found)) for late in (False, True))
+    print(f"\nTwo processes, two views each, asleep while they are drawn: {early:.0f} ms; sent late {late:.0f} ms")
+
+
+def in_processes(what: Callable[..., None], count: int, *arguments: Any) -> list[Any]:
+    """What a function sends in each of so many processes, which get their rank, these arguments and where they meet."""
+    context = multiprocessing.get_context("spawn")
+    with TemporaryDirectory() as folder:
+        pipes = [context.Pipe() for _ in range(count)]
+        place = f"file://{folder}/meeting"
+        processes = [
+            context.Process(target=what, args=(rank, *arguments, place, there)) for rank, (_, there) in enumerate(pipes)
+        ]
+        for process in processes:
+            process.start()
+        each = [here.recv() for here, _ in pipes]
+        for process in processes:
+            process.join()
+    return each
 
 
 def start(arguments: argparse.Namespace) -> tuple[Trainer[Any], TrainConfig]:
-    """A run of steps of two views, with random triangles, as many as asked."""
+    """A run with random triangles, as many as asked."""
     width = arguments.width
     capture = load_dataset(arguments.scene, width=width) if arguments.scene else demo_scene(width, width * 3 // 4)
-    config = TrainConfig.of("quick", "outdoor").changed({"start.points": arguments.triangles, "batch": 2})
+    config = TrainConfig.of("quick", "outdoor").changed({"start.points": arguments.triangles, "batch": arguments.views})
     with one_torch_thread():
         return start_trainer(replace(capture.normalized(), exact_points=None, point_colors=None), config), config
 
@@ -245,6 +273,7 @@ def main() -> None:
     parser.add_argument("--width", type=int, default=640)
     parser.add_argument("--cores", type=int, default=8, help="of each worker, in the model")
     parser.add_argument("--check", action="store_true", help="compare with one process and two")
+    parser.add_argument("--views", type=int, default=2, help="of a step of a check")
     arguments = parser.parse_args()
     set_num_threads(1)
     trainer, config = start(arguments)
@@ -262,12 +291,12 @@ def main() -> None:
         return
     for each in (1, 4):
         print(f"\nModel: views per second, {each} of each worker in a step, {arguments.cores} cores each")
-        print("(with messages that travel while the next view is drawn)\n")
+        print("(in parentheses: were messages to travel only when all are drawn)\n")
         print("| workers | " + " | ".join(f"{speed} Gbit/s" for speed in NETWORKS) + " |")
         print("| --: |" + " --: |" * len(NETWORKS))
         for workers in WORKERS:
             views, about = each * workers, (found, each * workers, workers, arguments.cores)
-            rates = [(views / modelled(*about, speed), views / overlapped(*about, speed)) for speed in NETWORKS]
+            rates = [[views / modelled(*about, speed, late=late) for late in (False, True)] for speed in NETWORKS]
             print(f"| {workers} | " + " | ".join(f"{one:.1f} ({other:.1f})" for one, other in rates) + " |")
 
 

@@ -3,9 +3,11 @@
 import hashlib
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -24,8 +26,13 @@ OBJECT = ("demo", "object", "--preset", "tiny", "--batch", "3", "--iterations", 
 PATIENCE = 60.0
 
 
-def torchrun(folder: Path, *arguments: str, restarts: int = 0) -> "subprocess.Popen[str]":
-    launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+ONE_MACHINE = ("--standalone", "--nproc-per-node", "2")
+
+
+def torchrun(
+    folder: Path, *arguments: str, restarts: int = 0, places: Sequence[str] = ONE_MACHINE
+) -> "subprocess.Popen[str]":
+    launcher = [sys.executable, "-m", "torch.distributed.run", *places]
     launcher += ["--max-restarts", str(restarts), "-m", "etsplat"]
     threads = {"OMP_NUM_THREADS": "1", "ETSPLAT_NUM_THREADS": "1"}
     environment = {**os.environ, **threads, "PYTHONPATH": os.pathsep.join(sys.path)}
@@ -51,6 +58,26 @@ def test_two_workers_write_the_files_of_one(
     assert compared
     for name in compared:
         assert digest_of(one / name) == digest_of(two / name), name
+
+
+def test_machines_meet_by_the_rendezvous_of_torchrun(etsplat: Run, tmp_path: Path) -> None:
+    """Two launchers, as of two machines, each with a worker and a folder of its own: that of the first has the run."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+    places = ["--nnodes", "2", "--nproc-per-node", "1", "--rdzv-backend", "c10d"]
+    places += ["--rdzv-id", "run", "--rdzv-endpoint", f"127.0.0.1:{port}"]
+    folders = [tmp_path / "first", tmp_path / "second"]
+    for folder in folders:
+        folder.mkdir()
+    launched = [torchrun(folder, *OBJECT, "--out", "run", places=places) for folder in folders]
+    assert etsplat(*OBJECT, "--out", "whole", cwd=tmp_path).returncode == 0
+    for each in launched:
+        _, errors = each.communicate(timeout=600)
+        assert each.returncode == 0, errors
+    runs = [folder / "run" for folder in folders if (folder / "run").exists()]
+    assert len(runs) == 1
+    assert digest_of_checkpoint(runs[0]) == digest_of_checkpoint(tmp_path / "whole")
+    assert digest_of(runs[0] / "mesh.ply") == digest_of(tmp_path / "whole" / "mesh.ply")
 
 
 @pytest.mark.parametrize("killed", [0, 1])

@@ -20,11 +20,12 @@ from etsplat.data.dataset import Dataset
 from etsplat.data.demo_object import demo_object
 from etsplat.data.demo_scene import demo_scene
 from etsplat.data.photograph import photograph
-from etsplat.data.pictures import StoredPictures
+from etsplat.data.pictures import LazyPictures, Picture, StoredPictures
 from etsplat.geometry.icosphere import icosphere
 from etsplat.io.run_directory import RunDirectory
 from etsplat.model.soup_init import StartPoints, start_soup
 from etsplat.model.triangle_mesh import TriangleMesh
+from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.optim import drive
 from etsplat.optim.checkpoints import list_checkpoints
 from etsplat.optim.drive import digest_of
@@ -94,6 +95,51 @@ def fit_counted(kind: str, batch: int) -> dict[str, Any]:
     return {**counted, "sent": dict(workers().sent), "rank": rank}
 
 
+def photos_read(batch: int) -> dict[str, Any]:
+    """Which photos a worker reads that may keep a quarter of them: to check them, and in the steps of a run."""
+    scene, made = a_scene(), list[int]()
+    stored, sizes = scene.images, [4 * width * height for width, height in scene.images.sizes]
+
+    def make(index: int) -> Picture:
+        made.append(index)
+        return stored.picture(index)
+
+    photos = LazyPictures(make, stored.sizes, sizes, stored.fingerprint, limit=sum(sizes) // 4)
+    photos.preload()
+    checked = sorted(made)
+    made.clear()
+    trainer = Trainer(_soup(scene), replace(scene, images=photos), Objective(Photometric(0.2)), batch=batch)
+    for _ in optimize(trainer, LoopSettings(ITERATIONS, ITERATIONS, 0, 0), trainer.progress, None, None):
+        assert photos.held_bytes <= sum(sizes) // 4
+    return {"checked": checked, "made": list(made), "photos": len(sizes)}
+
+
+def _soup(data: Dataset) -> TriangleSoup:
+    assert data.points is not None
+    assert data.point_colors is not None
+    points, rng = StartPoints(data.points, data.point_colors), torch.Generator().manual_seed(1)
+    return start_soup(points, rng, scale=2.0, opacity=0.4, sigma=0.8, sh_degree=2)
+
+
+def handed_round(owners: list[int]) -> tuple[list[str], list[list[int]]]:
+    """What a worker did to hand messages round, in its order, and these."""
+    did, broadcast = list[str](), dist.broadcast
+
+    def make(number: int) -> torch.Tensor:
+        did.append(f"make {number}")
+        return torch.full((number + 1,), number, dtype=torch.uint8)
+
+    def broadcasting(tensor: torch.Tensor, src: int, **options: Any) -> Any:
+        did.append(f"from {src}")
+        return broadcast(tensor, src=src, **options)
+
+    dist.broadcast = broadcasting
+    try:
+        return did, [message.tolist() for message in workers().hand_round(make, owners)]
+    finally:
+        dist.broadcast = broadcast
+
+
 def with_nan(dataset: Dataset, view: int) -> Dataset:
     """One photo is not a number somewhere."""
     pixels = [dataset.images[index].clone() for index in range(len(dataset))]
@@ -104,12 +150,7 @@ def with_nan(dataset: Dataset, view: int) -> Dataset:
 def trainer_of(kind: str, batch: int) -> Trainer[Any]:
     """Of a soup that grows and is pruned, or a mesh that is subdivided, with a guard."""
     if kind in ("soup", "normals", "inseparable"):
-        data, rng = a_scene(), torch.Generator().manual_seed(1)
-        assert data.points is not None
-        assert data.point_colors is not None
-        soup = start_soup(
-            StartPoints(data.points, data.point_colors), rng, scale=2.0, opacity=0.4, sigma=0.8, sh_degree=2
-        )
+        data = a_scene()
         terms: list[Term] = [Opacity(0.005), Harmonics(0.1), Size(1e-6)]
         if kind == "normals":
             terms.append(DepthNormals(1e-3))
@@ -118,7 +159,7 @@ def trainer_of(kind: str, batch: int) -> Trainer[Any]:
         objective = Objective(Photometric(0.2), terms, depth_of="centroid")
         strategy = DensifyAndPrune(begin=3, every=4, max_triangles=400)
         exposure = Exposure(6, needed=-math.inf)
-        return Trainer(soup, data, objective, strategy, batch=batch, exposure=exposure)
+        return Trainer(_soup(data), data, objective, strategy, batch=batch, exposure=exposure)
     data = an_object()
     if kind == "nan":
         data = with_nan(data, data.train[5])
@@ -182,8 +223,8 @@ class TwoInOne(Workers):
         super().__init__(0, 2)
         self.messages: list[torch.Tensor] = []
 
-    def hand_round(self, own: Any, owners: Any) -> Any:
-        self.messages += [own[number] for number in range(len(owners))]
+    def hand_round(self, make: Any, owners: Any) -> Any:
+        self.messages += map(make, range(len(owners)))
         return iter(self.messages[-len(owners) :])
 
 
@@ -199,8 +240,8 @@ def fit_swapped(kind: str, batch: int) -> dict[str, Any]:
     """A run in whose sums the second view of a step changes places with the third."""
     honest = Workers.hand_round
 
-    def swapped(self: Workers, own: Any, owners: Any) -> Any:
-        first, second, third, *others = honest(self, own, owners)
+    def swapped(self: Workers, make: Any, owners: Any) -> Any:
+        first, second, third, *others = honest(self, make, owners)
         return iter([first, third, second, *others])
 
     Workers.hand_round = swapped

@@ -71,3 +71,26 @@ def test_count_state_and_files_are_of_those_that_learn(soups: tuple[TriangleSoup
     moved = among.to(torch.device("cpu"))
     assert torch.equal(moved.render(cameras(1)).color, among.render(cameras(1)).color)
     assert len(among.everything()) == 30
+
+
+def test_plain_colors_of_the_rest_learn_where_that_is_asked_for(soups: tuple[TriangleSoup, TriangleSoup]) -> None:
+    """With the gradient that they have in one soup; everything else of the rest stays, the rest itself too."""
+    own, rest = soups
+    given = rest.sh_dc.clone()
+    together, among = own.joined(rest), SurroundedSoup.among(own, rest, recolored=True)
+    for soup in (together, among):
+        soup.render(cameras(1)).color.square().sum().backward()
+    assert list(among.parameters()) == [*TriangleSoup.RATES, "rest_dc"]
+    assert among.rest_dc is not None
+    assert among.rest_dc.grad is not None
+    assert together.sh_dc.grad is not None
+    assert torch.equal(among.rest_dc.grad, together.sh_dc.grad[18:])
+    with torch.no_grad():
+        among.rest_dc += 0.5
+    assert torch.equal(rest.sh_dc, given)
+    assert torch.equal(among.everything().sh_dc[18:], given + 0.5)
+    assert torch.equal(among.finished().render(cameras(1)).color, among.everything().render(cameras(1)).color)
+    few = among.kept(torch.arange(18) < 4)
+    assert isinstance(few, SurroundedSoup)
+    assert len(few) == 4
+    assert torch.equal(few.everything().sh_dc[4:], given + 0.5)

@@ -208,3 +208,20 @@ def test_copies_of_rows_have_their_moments_and_bad_ones_change_nothing(problem):
     after = snapshot(adam)
     assert all(torch.equal(new, old[rows]) for new, old in zip(after["colors"], before["colors"], strict=True))
     assert all(torch.equal(new, old) for new, old in zip(after["vertices"], before["vertices"], strict=True))
+
+
+def test_parameters_that_have_no_rows_stay_as_they_are(rng):
+    """Even where they happen to have as many; those that are not named must fit the plan."""
+    values = {"x": torch.rand(6, 2, generator=rng), "beside": torch.rand(6, 3, generator=rng)}
+    adam = Adam({name: value.requires_grad_() for name, value in values.items()}, {"x": 0.1, "beside": 0.1})
+    take_step(adam, rng)
+    beside, first = values["beside"].detach().clone(), adam.first_moments["beside"].clone()
+    plan = RowPlan.keeping(torch.tensor([True, False, True, True, False, True]))
+    new, _ = apply_rows(plan, adam, {}, others=["beside"])
+    assert set(new) == {"x"}
+    assert len(adam.parameters["x"]) == 4
+    assert adam.parameters["beside"] is values["beside"]
+    assert torch.equal(adam.parameters["beside"], beside)
+    assert torch.equal(adam.first_moments["beside"], first)
+    with pytest.raises(ValueError, match="beside must have 4 rows"):
+        apply_rows(RowPlan.keeping(torch.ones(4) > 0), adam, {})

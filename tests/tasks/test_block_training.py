@@ -15,6 +15,7 @@ from etsplat.data.blocks import cut
 from etsplat.data.dataset import Dataset
 from etsplat.data.where_up import up_of
 from etsplat.io.run_directory import RunDirectory
+from etsplat.io.tensors import read_tensors, save_tensors
 from etsplat.model.surroundings import Surroundings
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.optim.loop import DivergedError, NoteEvent, StageEvent
@@ -84,8 +85,8 @@ def test_the_run_is_one_for_all_that_comes_after(run: tuple[TrainResult, list[ob
     kept = sum(blocks[name]["triangles"] for name in ("0_0", "1_0", "sky"))
     assert kept == result.soup.count
     assert result.metrics["psnr"] > blocks["coarse"]["psnr"] - 0.5
-    assert result.metrics["iterations"] == 12 + 24 + 24 + 12
-    assert RunDirectory(path).read_iterations() == 12 + 24 + 24 + 12
+    assert result.metrics["iterations"] == 12 + 24 + 24 + 24
+    assert RunDirectory(path).read_iterations() == 12 + 24 + 24 + 24
     assert "sky" in result.soup.notes
     whole = TriangleSoup.load(path / "blocks" / "coarse" / "soup.safetensors")
     assert result.soup.notes["sky"] == whole.notes["sky"]
@@ -243,6 +244,42 @@ def test_blocks_leave_the_sky_alone_and_it_learns_among_them(
     learned = TriangleSoup.load(tmp_path / "run" / "blocks" / "sky" / "soup.safetensors")
     assert torch.equal(triangles(run[0].soup), torch.cat([triangles(last.rest), triangles(learned)]))
     assert float((learned.sh_dc.mean(dim=0) - last.start.sh_dc.mean(dim=0)).norm()) > 0
+
+
+def test_what_the_blocks_made_is_recolored_with_the_sky_and_nothing_else(
+    run: tuple[TrainResult, list[object]], capture: Dataset
+) -> None:
+    """Plain colours of the result are those that the last run learned; all other numbers are of the blocks."""
+    grid, path = cut(capture, (2, 1), up_of(capture)), run[0].path / "blocks"
+    sky = Surroundings.of_note(run[0].soup.notes["sky"])
+    assert sky is not None
+    kept = []
+    for block in range(2):
+        own = TriangleSoup.load(path / grid.name(block) / "soup.safetensors")
+        inside = grid.block_of(triangles(own).double().mean(dim=1)) == block
+        kept.append(own.kept(inside & ~sky.outermost(triangles(own))))
+    count = sum(map(len, kept))
+    learned = read_tensors(path / "sky" / "around.safetensors")[0]["sh_dc"]
+    for name, values in run[0].soup.state().items():
+        before = torch.cat([soup.state()[name] for soup in kept])
+        assert torch.equal(values[:count], learned if name == "sh_dc" else before)
+        assert name != "sh_dc" or not torch.equal(learned, before)
+
+
+def test_colors_that_are_lost_are_named(
+    run: tuple[TrainResult, list[object]], capture: Dataset, tmp_path: Path
+) -> None:
+    """The run of the sky is done, but of what it gave the rest nothing is there, or other than it should be."""
+    out = tmp_path / "run"
+    shutil.copytree(run[0].path, out)
+    (out / "metrics.json").unlink()
+    around = out / "blocks" / "sky" / "around.safetensors"
+    save_tensors(around, {"sh_dc": torch.zeros(3, 1, 3)})
+    with pytest.raises(InputError, match=r"around\.safetensors: cannot be read \(of 3 triangles, not"):
+        train(capture, out, CONFIG, blocks="2x1", resume=True)
+    around.unlink()
+    with pytest.raises(InputError, match=r"around\.safetensors: cannot be read"):
+        train(capture, out, CONFIG, blocks="2x1", resume=True)
 
 
 def test_a_scene_without_a_sky_has_no_run_for_it(capture: Dataset, tmp_path: Path) -> None:

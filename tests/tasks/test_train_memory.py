@@ -14,7 +14,15 @@ from etsplat.tasks.soup_trainer import start_trainer
 from etsplat.tasks.train import train
 from etsplat.tasks.train_checks import check_train
 from etsplat.tasks.train_config import TrainConfig
-from etsplat.tasks.train_memory import PLANNED, STATISTICS, bytes_per_triangle, check_memory, memory_of
+from etsplat.tasks.train_memory import (
+    PASSING,
+    PLANNED,
+    STATISTICS,
+    bytes_of_values,
+    bytes_per_triangle,
+    check_memory,
+    memory_of,
+)
 from helpers.captures import small_demo_scene
 
 CPU = torch.device("cpu")
@@ -51,6 +59,14 @@ def test_memory_is_linear_in_triangles_and_photos(capture: Dataset) -> None:
     assert few.kept == sum(3 * width * height for width, height in capture.images.sizes)
     assert "10,000,000 triangles" in str(few)
     assert "for each of 42 photos" in str(few)
+
+
+def test_triangles_around_a_run_count_and_more_where_they_are_recolored(capture: Dataset) -> None:
+    """Their values, corners in the frame of the run, what comes and goes; of plain colours that learn five copies."""
+    alone, among = memory_of(capture, SHORT, 600, CPU), memory_of(capture, SHORT, 600, CPU, 1000)
+    recolored = memory_of(capture, SHORT, 600, CPU, 1000, recolors=True)
+    assert among.total - alone.total == 1000 * (bytes_of_values(1) + 36 + PASSING)
+    assert recolored.total - among.total == 1000 * 5 * 12
 
 
 def test_a_run_says_beforehand_what_it_needs(capture: Dataset) -> None:

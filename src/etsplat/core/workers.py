@@ -117,37 +117,37 @@ class Workers:
                         "all workers"
                     )
 
-    def hand_round(self, own: Mapping[int, Tensor], owners: Sequence[int]) -> Iterator[Tensor]:
-        """Messages of all workers, in their order; the later ones travel while the earlier ones are used.
+    def hand_round(self, make: Callable[[int], Tensor], owners: Sequence[int]) -> Iterator[Tensor]:
+        """Messages of all workers, in their order.
+
+        Those that are made travel while a worker makes its next one, and the later ones while the earlier are used.
 
         Args:
-            own: by number, those of this worker: (K,) uint8 on the CPU.
+            make: one of this worker, by its number: (K,) uint8 on the CPU.
             owners: whose each message is.
 
         Yields:
             (K,) uint8 on the CPU.
         """
         if self.count == 1:
-            yield from (own[number] for number in range(len(owners)))
+            yield from map(make, range(len(owners)))
             return
-        mine = torch.tensor([len(own[n]) if n in own else 0 for n in range(len(owners))])
-        lengths = torch.stack(self._gather(mine))
         device = _wire()
-        buffers, travelling = [], []
-        with _reaching():
-            for number, owner in enumerate(owners):
-                length = int(lengths[owner, number])
-                buffer = own[number].to(device) if number in own else torch.empty(length, dtype=torch.uint8).to(device)
-                buffers.append(buffer)
-                travelling.append(dist.broadcast(buffer, src=owner, async_op=True))
-                if owner == self.rank:
-                    self.sent["bytes"] += length
-                    self.sent["messages"] += 1
-        for number, work in enumerate(travelling):
+        buffers, travelling = dict[int, Tensor](), dict[int, Any]()
+        for some in _rounds(owners):
+            own = {number: make(number) for number in some if owners[number] == self.rank}
+            lengths = torch.stack(self._gather(torch.tensor([len(own.get(number, ())) for number in some])))
             with _reaching():
-                work.wait()
-            yield buffers[number].cpu()
-            buffers[number] = torch.empty(0)
+                for number, length in zip(some, lengths.amax(dim=0).tolist(), strict=True):
+                    buffer = own[number] if number in own else torch.empty(length, dtype=torch.uint8)
+                    buffers[number] = buffer = buffer.to(device)
+                    travelling[number] = dist.broadcast(buffer, src=owners[number], async_op=True)
+            self.sent["bytes"] += sum(map(len, own.values()))
+            self.sent["messages"] += len(own)
+        for number in range(len(owners)):
+            with _reaching():
+                travelling.pop(number).wait()
+            yield buffers.pop(number).cpu()
 
     def first_to_report(self) -> bool:
         """Whether no other worker has said yet that the run ends early; from now on this one has."""
@@ -278,6 +278,17 @@ def _share_cores(group: Workers) -> None:
     group.neighbours, sharing = [host for host, _ in places].count(place[0]), places.count(place)
     if sharing > 1 and not os.environ.get("ETSPLAT_NUM_THREADS"):
         _native.set_num_threads(count=max(1, _native.num_threads() // sharing))
+
+
+def _rounds(owners: Sequence[int]) -> list[list[int]]:
+    """The numbers of the first message of each worker, then of the second of each, and so on."""
+    made, rounds = dict[int, int](), list[list[int]]()
+    for number, owner in enumerate(owners):
+        made[owner] = made.get(owner, 0) + 1
+        if made[owner] > len(rounds):
+            rounds.append([])
+        rounds[made[owner] - 1].append(number)
+    return rounds
 
 
 def _wire() -> torch.device:

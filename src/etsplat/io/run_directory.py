@@ -30,7 +30,7 @@ KERNEL_FILE = "kernel.safetensors"
 
 _FILES = (
     *("mesh.ply", "mesh.obj", "mesh.glb", "textured.glb"),
-    *("soup.safetensors", "opaque.glb", "opaque.safetensors", "gaussians.safetensors"),
+    *("soup.safetensors", "opaque.glb", "opaque.safetensors", "gaussians.safetensors", "around.safetensors"),
     KERNEL_FILE,
     *("metrics.json", "evaluation.json", "exposure.json", "cameras.json"),
     GEOREFERENCE_FILE,

@@ -1,6 +1,8 @@
-"""A soup that is fitted to photos which show other triangles as well: these are drawn with it, and stay as they are."""
+"""A soup that is fitted to photos which show others as well: these are drawn with it, and stay where they are."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float
@@ -23,14 +25,20 @@ class SurroundedSoup(TriangleSoup):
 
     Attributes:
         rest: the others, in the same frame, as they are drawn.
+        rest_dc: (M, 1, 3) the constant band of the others' colours, learnable; None where it stays as well.
     """
 
+    RATES: ClassVar[Mapping[str, float]] = {**TriangleSoup.RATES, "rest_dc": TriangleSoup.RATES["sh_dc"]}
+    BESIDE: ClassVar[tuple[str, ...]] = ("rest_dc",)
+
     rest: TriangleSoup = field(default_factory=_nothing)
+    rest_dc: Float[Tensor, "M 1 3"] | None = None
 
     @classmethod
-    def among(cls, soup: TriangleSoup, rest: TriangleSoup) -> "SurroundedSoup":
-        """The soup's tensors, not copies, among the rest."""
-        return cls(**soup.parameters(), appearance=soup.appearance, notes=soup.notes, rest=rest)
+    def among(cls, soup: TriangleSoup, rest: TriangleSoup, *, recolored: bool = False) -> "SurroundedSoup":
+        """The soup's tensors, not copies, among the rest; which is `recolored` if its plain colours learn too."""
+        dc = rest.sh_dc.detach().clone().requires_grad_(True) if recolored else None
+        return cls(**soup.parameters(), appearance=soup.appearance, notes=soup.notes, rest=rest, rest_dc=dc)
 
     def to(self, device: torch.device) -> "SurroundedSoup":
         """Both on another device."""
@@ -40,8 +48,7 @@ class SurroundedSoup(TriangleSoup):
 
     def drawn(self, cameras: Cameras, *, culls: bool) -> Drawn:
         """What is rasterized: the learnable triangles, then the rest."""
-        with torch.no_grad():
-            rest = self.rest.drawn(cameras, culls=culls)
+        rest = self._around().drawn(cameras, culls=culls)
         own = super().drawn(cameras, culls=culls)
         return Drawn(*(torch.cat(pair, dim=axis) for pair, axis in zip(zip(own, rest, strict=True), AXES, strict=True)))
 
@@ -66,10 +73,14 @@ class SurroundedSoup(TriangleSoup):
 
     @torch.no_grad()
     def everything(self) -> TriangleSoup:
-        """All triangles as one soup, in new tensors; appearances are written into it."""
+        """All triangles as one soup, in new tensors, the learnable ones first; appearances are written into it."""
         own = self.finished()
-        alone = TriangleSoup(**own.state(), appearance=own.appearance, notes=own.notes)
-        return alone.joined(self.rest)
+        values = {name: own.state()[name] for name in TriangleSoup.RATES}
+        alone = TriangleSoup(**values, appearance=own.appearance, notes=own.notes)
+        return alone.joined(self._around())
+
+    def _around(self) -> TriangleSoup:
+        return self.rest if self.rest_dc is None else replace(self.rest, sh_dc=self.rest_dc)
 
 
 AXES = Drawn(vertices=0, opacities=0, sigma=0, colors=1)

@@ -71,6 +71,7 @@ class TriangleSoup(Model):
         sh_rest: (N, K - 1, 3) those of the other bands, learnable.
         appearance: how it is drawn; its near plane is in the same units as the corners.
         notes: whatever else its maker wrote down, as text (iteration, source).
+        BESIDE: parameters that are not of its triangles.
 
     Example:
         >>> points = etsplat.StartPoints(torch.rand(50, 3), torch.full((50, 3), 0.5))
@@ -88,6 +89,7 @@ class TriangleSoup(Model):
     }
     OPAQUE: ClassVar[str] = "opaque"
     COLORED: ClassVar[tuple[str, str, str] | None] = ("vertices", "sh_dc", "sh_rest")
+    BESIDE: ClassVar[tuple[str, ...]] = ()
 
     vertices: Float[Tensor, "N 3 3"]
     opacity_logits: Float[Tensor, " N"]
@@ -199,7 +201,8 @@ class TriangleSoup(Model):
     @torch.no_grad()
     def kept(self, rows: Bool[Tensor, " N"]) -> "TriangleSoup":
         """Some of the triangles, detached."""
-        return replace(self, **{name: values.detach()[rows] for name, values in self.parameters().items()})
+        own = {name: values for name, values in self.parameters().items() if name not in self.BESIDE}
+        return replace(self, **{name: values.detach()[rows] for name, values in own.items()})
 
     @property
     def count(self) -> int:

@@ -5,7 +5,7 @@ triangle: the parameters, Adam's two moments, and statistics. None of them can b
 `_carry`.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -105,14 +105,15 @@ class RowPlan:
 
 
 def apply_rows(
-    plan: RowPlan, adam: Adam, statistics: Mapping[str, Tensor]
+    plan: RowPlan, adam: Adam, statistics: Mapping[str, Tensor], *, others: Collection[str] = ()
 ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """Adds, removes and reorders primitives. Every parameter of `adam` and every statistic has a row for each.
+    """Adds, removes and reorders primitives. Parameters of `adam` and statistics have a row for each.
 
     Args:
         plan: which rows there are afterwards.
         adam: the optimizer; its parameters and moments are replaced in place.
         statistics: tensors that are not parameters but have rows too.
+        others: parameters that have not; they stay as they are.
 
     Returns:
         The new parameters (leaf tensors with the old requires_grad) and statistics, by name.
@@ -131,13 +132,14 @@ def apply_rows(
     check_shape("source", plan.source, ("M",))
     check_indices("source", plan.source, plan.num_rows)
     _check_flags_of_rows("fresh", plan.fresh, len(plan.source))
-    for name, tensor in [*adam.parameters.items(), *statistics.items()]:
+    having = {name: parameter for name, parameter in adam.parameters.items() if name not in others}
+    for name, tensor in [*having.items(), *statistics.items()]:
         check_memory(name, tensor)
         if tensor.ndim == 0 or len(tensor) != plan.num_rows:
             raise ValueError(f"{name} must have {plan.num_rows} rows as the plan, got shape {tuple(tensor.shape)}")
     count = int(plan.fresh.sum())
     for name, values in plan.values.items():
-        if name not in adam.parameters:
+        if name not in having:
             raise ValueError(f"values must name parameters, got {name!r}")
         check_memory(f"values of {name}", values)
         expected = (count, *adam.parameters[name].shape[1:])
@@ -158,7 +160,7 @@ def apply_rows(
 
         return move
 
-    parameters = {name: _carry(name, set_values(name), start_at_zero, adam, {}) for name in list(adam.parameters)}
+    parameters = {name: _carry(name, set_values(name), start_at_zero, adam, {}) for name in having}
     return parameters, {name: start_at_zero(tensor) for name, tensor in statistics.items()}
 
 

@@ -2,7 +2,8 @@
 
 What a view gives is a message of its own: its loss, its gradients, and what the strategy looks at. Of each tensor only
 the rows travel that have a bit that is not zero. All workers add up the messages in the order of the views, which is
-what one process does with its own: `Tensor.grad` of one view, plus that of the next.
+what one process does with its own: `Tensor.grad` of one view, plus that of the next. A message travels while its
+worker draws its next view.
 
 What all can compute for themselves does not travel. Of harmonics it is the gradient of the view's colours that does,
 and each carries it on to the coefficients. Terms that depend on the parameters alone are added by each. Within a view
@@ -91,16 +92,16 @@ def shared_gradients(
         return gradients(range(len(views)))
     named = {f"{number}.{name}": (each, name) for number, each in enumerate(optimizers) for name in each.parameters}
     colored = [] if apart is None else [optimizers[0].parameters[name] for name in apart.colored]
-    whose, own = owners(views, group.count), {}
-    for place, owner in enumerate(whose):
-        if owner == group.rank:
-            with EndAtColors(*colored) if colored else contextlib.nullcontext() as ending:
-                loss, (seen,) = gradients(range(place, place + 1))
-            found = {f"gradient.{key}": each.parameters[name].grad for key, (each, name) in named.items()}
-            found |= {"loss": loss, **_observed(seen, observed), **_colors(ending)}
-            own[place] = pack({key: tensor for key, tensor in found.items() if tensor is not None})
+
+    def draw(place: int) -> Tensor:
+        with EndAtColors(*colored) if colored else contextlib.nullcontext() as ending:
+            loss, (seen,) = gradients(range(place, place + 1))
+        found = {f"gradient.{key}": each.parameters[name].grad for key, (each, name) in named.items()}
+        found |= {"loss": loss, **_observed(seen, observed), **_colors(ending)}
+        return pack({key: tensor for key, tensor in found.items() if tensor is not None})
+
     losses, seen, sums = [], [], _Sums({key: each.parameters[name] for key, (each, name) in named.items()})
-    for place, message in enumerate(group.hand_round(own, whose)):
+    for place, message in enumerate(group.hand_round(draw, owners(views, group.count))):
         tensors = unpack(message)
         device = next(iter(sums.parameters.values())).device
         tensors = {key: tensor.to(device) for key, tensor in tensors.items()}

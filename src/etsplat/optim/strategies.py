@@ -356,7 +356,7 @@ class DensifyAndPrune(Strategy):
         return dead
 
     def _apply(self, plan: RowPlan) -> None:
-        parameters, statistics = apply_rows(plan, self.adam, self.statistics.tensors())
+        parameters, statistics = apply_rows(plan, self.adam, self.statistics.tensors(), others=self.model.BESIDE)
         self.model.load_state(parameters)
         self.statistics = SoupStatistics(**statistics)
         self.statistics.restart(self.statistics.judged(self.views))

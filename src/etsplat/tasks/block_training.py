@@ -3,7 +3,8 @@
 Only one run is in memory at a time. The coarse soup is made of photos at half their size, of few triangles. A block
 starts from its own points; the coarse soup around it, and all of its sky, is drawn with it and does not learn. In the
 result each triangle is of the run of that block in which its middle lies. The sky is what photos of all blocks share:
-it learns last, from all photos, among what the blocks have become, which is drawn and does not learn.
+it learns last, from all photos, among what the blocks have become, whose plain colours learn with it: so what is on
+either side of a border agrees, and with the sky.
 """
 
 import gc
@@ -26,7 +27,7 @@ from etsplat.model.triangle_soup import FOCAL_NOTE, TriangleSoup
 from etsplat.optim.loop import DivergedError, Event, NoteEvent, Progress, StageEvent, StepEvent
 from etsplat.optim.schedules import limited_iterations
 from etsplat.tasks.running import Job
-from etsplat.tasks.scene_part import ScenePart, in_frame
+from etsplat.tasks.scene_part import ScenePart, in_frame, recolored
 from etsplat.tasks.scoring import Scorer
 from etsplat.tasks.soup_trainer import background_of
 from etsplat.tasks.train_checks import triangle_limit
@@ -37,7 +38,8 @@ FOLDER, COARSE, SKY = "blocks", "coarse", "sky"
 """In the run's folder: the runs of the blocks, and those of the coarse soup and of the sky among them."""
 
 COARSE_TRIANGLES, COARSE_STEPS = 0.5, 0.5
-"""Of the coarse soup of the whole, and of the sky at the end, as parts of those of a block."""
+"""Of the coarse soup of the whole, as parts of those of a block. The sky at the end has as few triangles, and as many
+steps as a block."""
 
 SKY_RATE = 10.0
 """So much faster the corners of the sky move when it learns alone: a photo shows little of it, so that each of its few,
@@ -134,7 +136,8 @@ def train_blocks(
     thin = _thinned(own, coarse.max_triangles)
     for note in (*own.notes, *_check(thin, parts, coarse, each, job.device, asset=config.asset)):
         job.announce(NoteEvent(note))
-    all_runs = [(own, coarse), *((part, each) for part in parts), *([(own, coarse)] if config.sky != "none" else [])]
+    last = [] if config.sky == "none" else [(own, _of_sky(each, coarse))]
+    all_runs = [(own, coarse), *((part, each) for part in parts), *last]
     steps = sum(_steps(views, settings) for views, settings in all_runs)
     job.identify({"fingerprint": own.fingerprint(), "blocks": "x".join(map(str, shape))}, paths, steps)
     with job.writing():
@@ -149,11 +152,15 @@ def train_blocks(
             runs.append(done.giving(soups[block]))
             soup = _merged(own, grid, whole, soups)
             soup.save(job.run.soup_path)
-        soups.clear()  # all of it is in the soup; the sky needs the room
-        if (done := _learned_sky(job, coarse, thin, whole, soup, fit)) is not None:
-            runs.append(done.giving(done.soup))
-            soup = _joined([soup.kept(~whole.on_sky(soup)), done.soup], whole)
-            soup.save(job.run.soup_path)
+        soups.clear()  # all of it is in the soup, and then in its two parts; the last run needs the room
+        on_sky = whole.on_sky(soup)
+        ground, sky = soup.kept(~on_sky), soup.kept(on_sky)
+        del soup
+        if len(sky) > 0:
+            ground, sky, about = _learned_sky(job, _of_sky(each, coarse), thin, whole, ground, sky, fit)
+            runs += about
+        soup = _joined([ground, sky], whole)
+        soup.save(job.run.soup_path)
         return soup, _conclude(job, own, soup, runs, config)
 
 
@@ -170,31 +177,35 @@ def _joined(soups: Sequence[TriangleSoup], whole: _Whole) -> TriangleSoup:
 
 
 def _learned_sky(
-    job: Job[TrainConfig], config: TrainConfig, own: Dataset, whole: _Whole, soup: TriangleSoup, fit: Fit
-) -> _Done | None:
-    """The sky, from that of the coarse run, by all photos, among all else. None where there is none to learn from.
+    job: Job[TrainConfig],
+    config: TrainConfig,
+    own: Dataset,
+    whole: _Whole,
+    ground: TriangleSoup,
+    sky: TriangleSoup,
+    fit: Fit,
+) -> tuple[TriangleSoup, TriangleSoup, list[dict[str, Any]]]:
+    """The ground in new colours, and the sky, by all photos; and that run for metrics.json.
 
     Args:
         job: of the whole.
-        config: settings of the coarse run.
+        config: settings of the run.
         own: the capture.
         whole: the coarse soup.
-        soup: all blocks, and the coarse sky.
+        ground: what all blocks have become.
+        sky: of the coarse run; some.
         fit: makes a run.
     """
-    on_sky = whole.on_sky(soup)
-    if not bool(on_sky.any()):
-        return None
-    start = soup.kept(on_sky)
-    part = ScenePart(own.frame, soup.kept(~on_sky), start, whole.closed, whole.exposure)
-    middles = own.normalization.apply(start.vertices.double().mean(dim=1))
-    capture = replace(own, exact_points=middles, point_colors=start.display_colors())
+    part = ScenePart(own.frame, ground, sky, whole.closed, whole.exposure, recolors=True)
+    middles = own.normalization.apply(sky.vertices.double().mean(dim=1))
+    capture = replace(own, exact_points=middles, point_colors=sky.display_colors())
     job.announce(NoteEvent(f"the sky, among all blocks: {_about(capture)}"))
     try:
-        return _run(job, SKY, _of_sky(config), capture, part, fit)
+        done = _run(job, SKY, config, capture, part, fit)
     except DivergedError as error:  # all of it is hidden, say; what the blocks have become is a result without it
         job.announce(NoteEvent(f"the sky stays as the coarse run left it: {error}"))
-        return None
+        return ground, sky, []
+    return recolored(ground, job.run.path / FOLDER / SKY), done.soup, [done.giving(done.soup)]
 
 
 def _run(
@@ -226,11 +237,11 @@ def _settings(own: Dataset, config: TrainConfig, blocks: int) -> tuple[TrainConf
     return replace(each, iterations=steps, max_triangles=few), each
 
 
-def _of_sky(coarse: TrainConfig) -> TrainConfig:
-    """Settings of the sky alone. Depth maps say nothing of it."""
-    loss = coarse.loss if coarse.loss.depth == "off" else replace(coarse.loss, lambda_depth=0.0)
-    faster = replace(coarse.optimizer, lr_vertices=SKY_RATE * coarse.optimizer.lr_vertices)
-    return replace(coarse, loss=loss, optimizer=faster)
+def _of_sky(each: TrainConfig, coarse: TrainConfig) -> TrainConfig:
+    """Settings of the last run. Depth maps say nothing of the sky."""
+    loss = each.loss if each.loss.depth == "off" else replace(each.loss, lambda_depth=0.0)
+    faster = replace(each.optimizer, lr_vertices=SKY_RATE * each.optimizer.lr_vertices)
+    return replace(each, max_triangles=coarse.max_triangles, loss=loss, optimizer=faster)
 
 
 def _check(
@@ -247,7 +258,8 @@ def _check(
     most, all_blocks = max(needed, key=lambda memory: memory.total), len(parts) * each.max_triangles
     result = 2 * all_blocks * bytes_of_values(each.drawing.sh_degree)
     if coarse.sky != "none":
-        sky = memory_of(thin, coarse, coarse.max_triangles, device, all_blocks)
+        last = _of_sky(each, coarse)
+        sky = memory_of(thin, last, last.max_triangles, device, all_blocks, recolors=True)
         result = max(result, sky.total - sky.kept)  # its photos are streamed, or there already
     if result > (free := available_memory()):
         raise InputError(

@@ -73,7 +73,7 @@ def start_trainer(
     points = _start_points(capture, config, generator, whole=part is None)
     soup = _placed(points, capture, config, generator) if part is None or part.start is None else _start_of(part, frame)
     if part is not None:
-        soup = SurroundedSoup.among(soup, in_frame(part.rest, frame))
+        soup = SurroundedSoup.among(soup, in_frame(part.rest, frame), recolored=part.recolors)
     elif config.sky == "sphere":
         soup = soup.joined(Surroundings.of(capture).soup(capture, config.drawing.sh_degree))
     squared = config.scene_type == "outdoor" and not config.normalize and points.span > LARGE_SPAN
@@ -206,6 +206,7 @@ def _schedule(config: TrainConfig, unit: float) -> Schedule:
         "sigma_raw": settling(given.lr_sigma),
         "sh_dc": settling(given.lr_sh_dc),
         "sh_rest": settling(given.lr_sh_rest),
+        "rest_dc": settling(given.lr_sh_dc),
     }
     return Schedule(rates, appearance=partial(_appearance, config))
 

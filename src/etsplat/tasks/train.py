@@ -28,7 +28,7 @@ from etsplat.tasks.export_soup import export_soup
 from etsplat.tasks.opaque import fit_opaque_mesh
 from etsplat.tasks.refined_cameras import kept_aside
 from etsplat.tasks.running import Job, Result, path_of
-from etsplat.tasks.scene_part import ScenePart
+from etsplat.tasks.scene_part import ScenePart, keep_colors
 from etsplat.tasks.scoring import Scorer
 from etsplat.tasks.soup_trainer import background_of, start_trainer
 from etsplat.tasks.sources import SoupRun, load_scene, with_cloud
@@ -157,8 +157,8 @@ def _fit(
     frame = own.frame if part is None else part.frame
     capture = own.renormalized(frame.center, frame.radius) if config.normalize else own
     iterations = limited_iterations(config.iterations, config.schedule.max_epochs, len(own.train), config.batch)
-    around = 0 if part is None else len(part.rest)
-    for note in (*own.notes, *check_train(own, config, iterations, job.device, around)):
+    around, recolors = (0, False) if part is None else (len(part.rest), part.recolors)
+    for note in (*own.notes, *check_train(own, config, iterations, job.device, around, recolors=recolors)):
         job.announce(NoteEvent(note))
     hashes = {"fingerprint": own.fingerprint(), **({} if part is None else {"part": part.digest()})}
     job.identify(hashes, paths, iterations)
@@ -197,6 +197,7 @@ def _fit(
             scores = job.first(lambda: scorer.full(soup, job.run.test))
             result = _in_own_units(soup, outcome.iteration, capture, config)
             job.first(lambda: result.save(job.run.soup_path))
+            keep_colors(soup, job.run.path)
             opaque, about_opaque = None, {}
             if config.asset and (mesh := _opaque_mesh(job, soup, trainer.exposure, capture, config)) is not None:
                 about_opaque = job.first(partial(scorer.asset, mesh, job.run.test))
@@ -245,7 +246,8 @@ def _in_own_units(soup: TriangleSoup, iteration: int, capture: Dataset, config: 
     """The soup as it is now, on the CPU."""
     soup, own = soup.finished().to(torch.device("cpu")), capture.normalization
     return TriangleSoup(
-        **{**soup.state(), "vertices": own.invert(soup.vertices.double()).float()},
+        **{name: soup.state()[name] for name in TriangleSoup.RATES if name != "vertices"},
+        vertices=own.invert(soup.vertices.double()).float(),
         appearance=replace(soup.appearance, near_plane=soup.appearance.near_plane * own.radius),
         notes={
             "iteration": str(iteration),

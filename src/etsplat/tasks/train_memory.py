@@ -19,6 +19,9 @@ PASSING = 160
 """Bytes that come and go for each triangle in a step: what it is drawn from (colour, opacity, softness) with gradients,
 statistics of the view, its outline in the picture, its place in the order of depth."""
 
+RECOLORED = 60
+"""Bytes of plain colours that learn alone: values, gradients, both moments of Adam, those of the best state."""
+
 PLANNED = 200
 """Bytes of an edit for each triangle: where it comes from, how likely it has children, those in their places."""
 
@@ -93,7 +96,15 @@ def bytes_of_values(sh_degree: int) -> int:
     return 4 * (9 + 1 + 1 + 3 * (sh_degree + 1) ** 2)
 
 
-def memory_of(capture: Dataset, config: TrainConfig, most: int, device: torch.device, around: int = 0) -> TrainMemory:
+def memory_of(
+    capture: Dataset,
+    config: TrainConfig,
+    most: int,
+    device: torch.device,
+    around: int = 0,
+    *,
+    recolors: bool = False,
+) -> TrainMemory:
     """What a run may come to need.
 
     Args:
@@ -101,7 +112,8 @@ def memory_of(capture: Dataset, config: TrainConfig, most: int, device: torch.de
         config: settings.
         most: triangles that there may be.
         device: where it runs.
-        around: triangles that are drawn as well and stay as they are.
+        around: triangles that are drawn as well and stay where they are.
+        recolors: their plain colours learn.
     """
     pixels = max(width * height for width, height in capture.images.sizes)
     points = config.start.points if capture.exact_points is None else len(capture.exact_points)
@@ -112,12 +124,19 @@ def memory_of(capture: Dataset, config: TrainConfig, most: int, device: torch.de
     on_cpu = device.type == "cpu"
     pooled = LIBRARIES + (min(POOLED, triangles * each // 4) if on_cpu else 0)
     each = each if on_cpu else max(each, ON_DEVICES)
-    beside = around * (bytes_of_values(config.drawing.sh_degree) + PASSING)
-    return TrainMemory(triangles, each, len(capture), kept, pixels * BYTES_PER_PIXEL, beside, pooled)
+    corners = 36  # once more, in the frame of the run
+    beside = bytes_of_values(config.drawing.sh_degree) + corners + PASSING + (RECOLORED if recolors else 0)
+    return TrainMemory(triangles, each, len(capture), kept, pixels * BYTES_PER_PIXEL, around * beside, pooled)
 
 
 def check_memory(
-    capture: Dataset, config: TrainConfig, most: int, device: torch.device, around: int = 0
+    capture: Dataset,
+    config: TrainConfig,
+    most: int,
+    device: torch.device,
+    around: int = 0,
+    *,
+    recolors: bool = False,
 ) -> TrainMemory:
     """What a run may come to need, where that is there.
 
@@ -127,11 +146,12 @@ def check_memory(
         most: as there.
         device: as there.
         around: as there.
+        recolors: as there.
 
     Raises:
         InputError: it is not; the message says what would fit.
     """
-    needed = memory_of(capture, config, most, device, around)
+    needed = memory_of(capture, config, most, device, around, recolors=recolors)
     if device.type == "cuda":
         free, there = torch.cuda.mem_get_info(device)[0], 0
     else:
