@@ -56,7 +56,12 @@ def tables(results: str) -> Mapping[str, Rows]:
     return {
         "measured": [
             ("measured", "etsplat:", "others:", "`python -m`"),
-            (f"{_CHAMFER}, ten meshes", ours, f"{paper} the paper; {bound} its upper bound", "`studies.famous`"),
+            (
+                f"{_CHAMFER}, ten meshes of the paper",
+                ours,
+                f"{paper} the paper; {bound} its upper bound",
+                "`studies.famous`",
+            ),
             ("fox, 80 pixels, 1,000 steps", elastic, f"{gaussians} gsplat 1.5.3 in PyTorch", "`studies.gsplat_on_cpu`"),
             *(
                 (label, decibels[name][0], f"{decibels[name][1]} OpenSplat 1.1.5", "`studies.opensplat`")
