@@ -198,7 +198,7 @@ audit: setup
 
 # By the tools of `setup`, in its build folder: what the one has compiled the other need not.
 wheel: $(TOOLS)
-	rm -rf dist
+	rm -f dist/*.whl
 	$(PY) -m pip --disable-pip-version-check wheel --quiet --no-deps --no-build-isolation --check-build-dependencies --wheel-dir dist .
 
 # What a user gets: the wheel alone, in an environment with nothing else, away from the source tree. That environment is
