@@ -1,4 +1,6 @@
-# etsplat on CPUs: docker build -t etsplat .; docker run --rm -v "$PWD:/data" etsplat reconstruct photos/ --out runs/photos
+# On CPUs, small: docker build --build-arg TORCH_INDEX=URL -t etsplat . (URL: PyTorch's index of CPU builds, without which torch brings
+#   several GB of CUDA); docker run --rm -v "$PWD:/data" etsplat reconstruct my_scene/ --out runs/scene
+# On NVIDIA GPUs: docker build --build-arg EXTRAS=cuda,sfm,texture,video,viewer -t etsplat .; docker run --gpus all and so on
 FROM python:3.12-slim-bookworm AS build
 SHELL ["/bin/bash", "-o", "pipefail", "-c"]
 # hadolint ignore=DL3008
@@ -9,12 +11,12 @@ COPY . .
 RUN python -m pip wheel --no-deps --wheel-dir /wheels .
 
 FROM python:3.12-slim-bookworm
-# --build-arg TORCH_INDEX=URL: PyTorch's own index of CPU builds, without which torch brings several GB of CUDA.
 ARG TORCH_INDEX
+ARG EXTRAS=sfm,texture,video,viewer
 COPY --from=build /wheels /wheels
 COPY constraints.txt /wheels/
 RUN python -m pip install --no-cache-dir --no-compile ${TORCH_INDEX:+--index-url "$TORCH_INDEX"} --constraint /wheels/constraints.txt torch \
-    && python -m pip install --no-cache-dir --no-compile "$(echo /wheels/*.whl)[sfm,texture,video,viewer]" \
+    && python -m pip install --no-cache-dir --no-compile "$(echo /wheels/*.whl)[$EXTRAS]" \
     && rm -rf /wheels \
     && useradd --create-home --uid 1000 etsplat
 USER 1000

@@ -38,7 +38,7 @@ help:
 	@echo "make soak         kill runs, fill their disk, move their clock; SOAK=100 for so many of each (Linux)"
 	@echo "make lock         requirements.lock: the newest versions that fit, with hashes; make audit: known holes in them"
 	@echo "make check-neon   run the rasterizer's NEON path under QEMU (AArch64 cross compiler)"
-	@echo "make check-wheel  build the wheel, install it into an empty environment, run a tiny demo"
+	@echo "make check-wheel  build the wheel, install it into an empty environment, run a tiny demo; WHEEL=FILE for another, TORCH=2.6.0"
 	@echo "make check-sdist  the same from the source distribution"
 	@echo "make wheels       wheels of every platform by Zig's compilers, under dist/wheels (Python 3.12 or newer); WHEELS='macos-arm64' for one"
 	@echo "make clean        remove .venv, build, dist and caches"
@@ -198,18 +198,21 @@ audit: setup
 
 # By the tools of `setup`, in its build folder: what the one has compiled the other need not.
 wheel: $(TOOLS)
-	rm -rf dist
+	rm -f dist/*.whl
 	$(PY) -m pip --disable-pip-version-check wheel --quiet --no-deps --no-build-isolation --check-build-dependencies --wheel-dir dist .
 
 # What a user gets: the wheel alone, in an environment with nothing else, away from the source tree. That environment is
-# a gigabyte, byte code left out, so it goes when it has passed.
+# a gigabyte, byte code left out, so it goes when it has passed. WHEEL names one that is there already, say of `make wheels`.
+WHEEL ?=
+TORCH ?=
 check-wheel check-sdist: export PYTHONDONTWRITEBYTECODE = 1
 check-wheel check-sdist: INSTALL := -m pip --disable-pip-version-check install --quiet --no-compile
-check-wheel: wheel
+check-wheel check-sdist: INSTALL_TORCH := $(INSTALL) $(if $(TORCH),torch==$(TORCH),-c constraints.txt torch)
+check-wheel: $(if $(WHEEL),,wheel)
 	rm -rf build/wheel-check
 	$(PYTHON) -m venv build/wheel-check/venv
-	build/wheel-check/venv/bin/python $(INSTALL) -c constraints.txt torch
-	build/wheel-check/venv/bin/python $(INSTALL) -c constraints.txt dist/*.whl
+	build/wheel-check/venv/bin/python $(INSTALL_TORCH)
+	build/wheel-check/venv/bin/python $(INSTALL) $(or $(WHEEL),dist/*.whl)
 	cd build/wheel-check && venv/bin/etsplat doctor
 	cd build/wheel-check && venv/bin/etsplat demo --out demo --preset tiny
 	test -s build/wheel-check/demo/report.html
@@ -221,8 +224,8 @@ check-sdist: $(TOOLS)
 	mkdir -p build/sdist-check
 	$(PY) -c 'from scikit_build_core.build import build_sdist; build_sdist("build/sdist-check")'
 	$(PYTHON) -m venv build/sdist-check/venv
-	build/sdist-check/venv/bin/python $(INSTALL) -c constraints.txt torch
-	build/sdist-check/venv/bin/python $(INSTALL) -c constraints.txt build/sdist-check/*.tar.gz
+	build/sdist-check/venv/bin/python $(INSTALL_TORCH)
+	build/sdist-check/venv/bin/python $(INSTALL) build/sdist-check/*.tar.gz
 	cd build/sdist-check && venv/bin/etsplat doctor
 	cd build/sdist-check && venv/bin/etsplat demo --out demo --preset tiny
 	test -s build/sdist-check/demo/report.html

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import etsplat
-from docs.pages import pages
+from docs.pages import benchmarks, pages
 from docs.pages.api import topic_of
 from docs.pages.examples import SHORTER
 from docs.pages.pictures import draw
@@ -112,3 +112,39 @@ def test_every_page_is_in_the_contents() -> None:
     """A page of docs/ that the front page does not list would be found by nobody."""
     listed = set((ROOT / "docs" / "index.md").read_text(encoding="utf-8").splitlines())
     assert {path.stem for path in (ROOT / "docs").glob("*.md")} <= listed | {"index"}
+
+
+RESULTS = """
+### Few
+
+| scene | | PSNR | paper: V / ours |
+|---|---|---|---|
+| fox | ours | **31.5** | 1 / **2** |
+| fox | theirs | 30.5 | 3 / 4 |
+
+### Many
+
+| scene | PSNR |
+|---|---|
+| fox | 7 |
+"""
+
+
+def test_cells_of_results_are_found() -> None:
+    """Within their section alone, by as many first cells as tell rows apart; one of several numbers in a cell."""
+    assert benchmarks.value(RESULTS, "Few", ["fox", "ours"], "PSNR") == "**31.5**"
+    assert benchmarks.value(RESULTS, "Few", ["fox", "ours"], "paper: V / ours", 1) == "**2**"
+    assert benchmarks.value(RESULTS, "Many", ["fox"], "PSNR") == "7"
+    for section, row, column in (("Few", ["fox"], "PSNR"), ("Many", ["fox"], "SSIM"), ("None", ["fox"], "PSNR")):
+        with pytest.raises(LookupError, match=f"{section}: (2|0|no) cells fox, {column}"):
+            benchmarks.value(RESULTS, section, row, column)
+
+
+@pytest.mark.parametrize("page", benchmarks.PAGES)
+def test_tables_beside_peers_are_those_of_results(page: str) -> None:
+    """As `python -m docs.pages.benchmarks` writes them: another number among the results is another one on the page."""
+    text, results = ((ROOT / name).read_text(encoding="utf-8") for name in (page, "research/results.md"))
+    assert benchmarks.filled(text, results) == text
+    marked = re.sub(r"<!-- table.*?<!-- end of table -->", "", text, flags=re.DOTALL)
+    assert not re.search(r"^\|", marked, re.MULTILINE)  # no table is written by hand
+    assert benchmarks.filled(text, results.replace("32.76", "12.34")) == text.replace("32.76", "12.34") != text

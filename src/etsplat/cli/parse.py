@@ -40,7 +40,7 @@ COMMANDS: dict[str, type[Command] | Group] = {
     "reconstruct": Reconstruct,
     "train": Train,
     "data": Group(
-        "Where captures come from: find the cameras of photos, remove lens distortion, fetch data sets.",
+        "Where captures come from: find the cameras of photos, mask objects, remove lens distortion, fetch data sets.",
         {"sfm": Sfm, "masks": Masks, "undistort": Undistort, "download": Download},
     ),
     "sweep": Group(
@@ -66,6 +66,7 @@ _ETSPLAT = """Differentiable triangle splatting: posed images in, triangles out.
     etsplat reconstruct bunny.obj --out runs/bunny    reconstruct a mesh from pictures of it
     etsplat train my_scene/ --out runs/scene          fit a triangle soup to photos
     etsplat train --help                              what can be set; --help-all for the rest
+    etsplat --version                                 which one this is; etsplat doctor says more
 """
 
 
@@ -105,9 +106,8 @@ def parse(arguments: Sequence[str]) -> Command:
 
 
 def _named(name: str, entry: type[Command] | Group) -> Any:
-    """A command with a line of help; nobody asks for its options here."""
-    text = entry.help if isinstance(entry, Group) else inspect.cleandoc(entry.__doc__ or "")
-    text = text.partition("\n\nExamples:")[0]
+    """A command with the first sentences of its help; nobody asks for its options here."""
+    text = entry.help if isinstance(entry, Group) else inspect.cleandoc(entry.__doc__ or "").partition("\n\n")[0]
     return Annotated[make_dataclass(name, []), tyro.conf.subcommand(name, description=text)]
 
 

@@ -71,7 +71,8 @@ class ExportConfig(Settings):
     then small groups that stand alone.
     What photos show changes next to nothing."""
     up: Literal["y", "z", "keep"] = "y"
-    """Turn the scene so that the training cameras' mean up direction is +y or +z, or keep the capture's axes.
+    """Turn the scene so that up, by the photos' place in the world or as cameras were held, is +y or +z;
+    or keep the capture's axes.
     GLB has +y up, which programs with another axis turn by themselves: z is for the other kinds of files."""
     scale: Annotated[float, Range(1e-6, 1e6)] = 1.0
     """Multiply all lengths: 0.01 if a unit of the capture is a centimetre, and metres are wanted."""

@@ -1,4 +1,4 @@
-"""For programs that read neither of the others; colours at faces."""
+"""For programs that read none of the others; colours at faces."""
 
 from pathlib import Path
 
