@@ -1,9 +1,9 @@
-"""What depth maps, right and wrong ones, do to runs of objects whose surface is known: a table for research/results.md.
+"""Depth maps and dense clouds, right and wrong ones, in runs of objects whose surface is known.
 
 python -m benchmarks.depth_maps ../shared/data/objects/mug ... --work runs/depths --iterations 500
 
-Maps are drawn from the true surface by the z-buffer and written beside links to the photos; then the command line is
-run as a user would, and test views are compared with the true depth.
+Maps are drawn from the true surface by the z-buffer and written beside links to the photos, or a cloud of points of it;
+then the command line is run as a user would, and test views are compared with the true depth.
 """
 
 import argparse
@@ -19,13 +19,15 @@ from scipy.ndimage import gaussian_filter
 
 from etsplat.data.dataset import Dataset
 from etsplat.data.load import load_dataset
+from etsplat.geometry.sampling import sample_surface
 from etsplat.io.mesh_files import MeshFile, load_mesh
+from etsplat.io.ply_tables import encode_ply
 from etsplat.metrics.geometry import geometry_metrics
 from etsplat.ops.rasterize_opaque import rasterize_opaque
 from etsplat.tasks.sources import open_run
 
 COMMAND = "import sys; from etsplat.cli import main; sys.exit(main())"
-SAMPLES = 50_000
+SAMPLES, CLOUD = 50_000, "cloud.ply"
 COMMON = {
     "train": "--scene-type object --width {width} --iterations {iterations} --max-triangles 10000 --start.points 5000"
     " --no-asset --exposure off --background random",
@@ -56,6 +58,19 @@ KINDS: dict[str, Callable[[np.ndarray, np.random.Generator], np.ndarray]] = {
 }
 
 
+def _noisy_points(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """1 % of the radius Gaussian noise, and one point in five anywhere in the cube around."""
+    radius = np.abs(points).max()
+    wild = rng.uniform(-1.2 * radius, 1.2 * radius, points.shape)
+    return np.where(rng.random((len(points), 1)) < 0.2, wild, points + 0.01 * radius * rng.normal(size=points.shape))
+
+
+CLOUDS: dict[str, Callable[[np.ndarray, np.random.Generator], np.ndarray]] = {
+    "cloud": lambda points, rng: points,
+    "noisy cloud": _noisy_points,
+}
+
+
 def true_depth(mesh: MeshFile, dataset: Dataset, view: int) -> torch.Tensor:
     """(H, W), 0 where there is nothing."""
     drawn = rasterize_opaque(mesh.vertices, cameras=dataset.cameras[view], faces=mesh.faces).depth
@@ -64,14 +79,20 @@ def true_depth(mesh: MeshFile, dataset: Dataset, view: int) -> torch.Tensor:
 
 
 def write_capture(source: Path, kind: str, folder: Path) -> None:
-    """Links to the photos, and depths/ of a kind for those of training; none for kind "off"."""
+    """Links to the photos, and depths/ of a kind for those of training, or cloud.ply; neither for kind "off"."""
     folder.mkdir(parents=True)
     for path in source.iterdir():
         if path.suffix != ".obj":
             (folder / path.name).symlink_to(path.resolve())
     if kind == "off":
         return
-    dataset, mesh, rng = load_dataset(source, preload=False), load_mesh(source / "mesh.obj"), np.random.default_rng(0)
+    mesh, rng = load_mesh(source / "mesh.obj"), np.random.default_rng(0)
+    if kind in CLOUDS:
+        points = CLOUDS[kind](sample_surface(mesh.vertices, mesh.faces, SAMPLES, seed=0)[0].numpy(), rng)
+        table = np.ascontiguousarray(points).view([(axis, np.float64) for axis in "xyz"])[:, 0]
+        (folder / CLOUD).write_bytes(encode_ply({"vertex": table}))
+        return
+    dataset = load_dataset(source, preload=False)
     frames = json.loads((source / "transforms_train.json").read_text())["frames"]
     for view, frame in zip(dataset.train, frames, strict=True):
         depth = true_depth(mesh, dataset, view).double().numpy()
@@ -105,7 +126,7 @@ def main() -> None:
     parser.add_argument("objects", nargs="+", type=Path)
     parser.add_argument("--work", type=Path, required=True)
     parser.add_argument("--task", choices=list(COMMON), default="train")
-    parser.add_argument("--kinds", nargs="+", choices=["off", *KINDS], default=["off", *KINDS])
+    parser.add_argument("--kinds", nargs="+", choices=["off", *KINDS, *CLOUDS], default=["off", *KINDS])
     parser.add_argument("--width", type=int, default=200)
     parser.add_argument("--iterations", type=int, default=500)
     parser.add_argument("--more", default="", help="more options of the command")
@@ -118,11 +139,12 @@ def main() -> None:
                 write_capture(source, kind, capture)
             out = chosen.work / chosen.task / source.name / kind
             options = COMMON[chosen.task].format(width=chosen.width, iterations=chosen.iterations)
-            words = [chosen.task, capture, "--out", out, "--overwrite", *options.split(), *chosen.more.split()]
+            cloud = ["--init-points", capture / CLOUD] if kind in CLOUDS else []
+            words = [chosen.task, capture, "--out", out, "--overwrite", *options.split(), *cloud, *chosen.more.split()]
             subprocess.run([sys.executable, "-c", COMMAND, *map(str, words)], check=True, stdout=subprocess.DEVNULL)
             metrics = json.loads((out / "metrics.json").read_text())
             error = depth_error(out, source, chosen.width) if chosen.task == "train" else chamfer(out, source)
-            used = f"{metrics.get('depth_used')}, {metrics.get('depth_photos')}" if kind != "off" else ""
+            used = f"{metrics.get('depth_used')}, {metrics.get('depth_photos')}" if kind in KINDS else ""
             print(f"| {source.name} | {kind} | {used} | {metrics['psnr']:.2f} | {error:.3f} |", flush=True)
 
 

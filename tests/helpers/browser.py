@@ -35,8 +35,8 @@ def find_browser() -> str | None:
 class Page:
     """An open page, which is asked by the protocol of the browser's own tools."""
 
-    def __init__(self, connection: Any) -> None:
-        self._connection, self._count = connection, 0
+    def __init__(self, connection: Any, browser: str) -> None:
+        self._connection, self._browser, self._count = connection, browser, 0
         self.errors: list[str] = []
         for domain in ("Page", "Runtime", "Network"):
             self.ask(f"{domain}.enable")
@@ -84,6 +84,15 @@ class Page:
             assert time.monotonic() < end, found
             time.sleep(0.1)
 
+    def processor_seconds(self) -> float:
+        """What the browser's processes have taken together until now."""
+        from websockets.sync.client import connect
+
+        with connect(self._browser, max_size=None, compression=None) as connection:
+            connection.send(json.dumps({"id": 1, "method": "SystemInfo.getProcessInfo"}))
+            found = json.loads(connection.recv(timeout=PATIENCE))
+        return sum(process["cpuTime"] for process in found["result"]["processInfo"])
+
     def picture(self, code: str) -> np.ndarray:
         """(H, W, 3) in [0, 1] of a canvas, or of the promise of one."""
         return self.decoded(self.value(f"(async () => (await ({code})).toDataURL('image/png'))()").split(",")[1])
@@ -114,13 +123,17 @@ def browser_page() -> Iterator[Page]:
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         try:
             port = _port(Path(profile) / "DevToolsActivePort", process)
-            with urllib.request.urlopen(f"http://127.0.0.1:{port}/json/list", timeout=PATIENCE) as answer:
-                pages = [page for page in json.load(answer) if page["type"] == "page"]
+            pages = [page for page in _answer(port, "list") if page["type"] == "page"]
             with connect(pages[0]["webSocketDebuggerUrl"], max_size=None, compression=None) as connection:
-                yield Page(connection)
+                yield Page(connection, _answer(port, "version")["webSocketDebuggerUrl"])
         finally:
             process.terminate()
             process.wait(PATIENCE)
+
+
+def _answer(port: int, question: str) -> Any:
+    with urllib.request.urlopen(f"http://127.0.0.1:{port}/json/{question}", timeout=PATIENCE) as answer:
+        return json.load(answer)
 
 
 def _port(file: Path, process: "subprocess.Popen[bytes]") -> int:

@@ -88,11 +88,19 @@ def test_what_no_photo_shows_takes_the_colour_of_what_is_next_to_it(scene: SCENE
 
 def test_sheets_that_decimation_crosses_are_apart_again(scene: SCENE) -> None:
     mesh, views = scene
-    vertices = torch.cat([mesh.vertices, 0.98 * mesh.vertices])
+    vertices = torch.cat([mesh.vertices, 0.96 * mesh.vertices])
     faces = torch.cat([mesh.faces, mesh.faces.flip(1) + len(mesh.vertices)])
     assert count_self_intersections(*decimated(vertices, faces, FACES)) > 0
     light = texture_object(MeshFile(vertices, faces), views, size=SIZE, faces=FACES)
     assert count_self_intersections(light.vertices.detach(), light.faces) == 0
+
+
+def test_folds_that_hold_up_the_shape_stay(scene: SCENE) -> None:
+    """Two spheres in one, so near that untangling would ruin both."""
+    mesh, views = scene
+    vertices = torch.cat([mesh.vertices, 0.98 * mesh.vertices])
+    faces = torch.cat([mesh.faces, mesh.faces.flip(1) + len(mesh.vertices)])
+    assert quality(texture_object(MeshFile(vertices, faces), views, size=SIZE, faces=FACES), views) > 24
 
 
 def test_exposures_are_not_part_of_the_result(scene: SCENE, light: TexturedMesh) -> None:

@@ -289,22 +289,43 @@ def test_a_soft_picture_that_is_refined_ends_as_one_that_is_drawn_at_once(tmp_pa
     assert torch.equal(found[0], found[-1])
     small, *parts = (decibels(each, found[0]) for each in found[1:-1])
     assert small < min(parts)
-    shares = f"""sceneViewer.then(async v => {{
-        const shares = [], refine = v.painter.refine.bind(v.painter);
-        v.painter.refine = (camera, share, fresh) => {{
+    shown = f"""sceneViewer.then(async v => {{
+        const {{ painter }} = v, steps = [], draw = painter.draw.bind(painter), refine = painter.refine.bind(painter);
+        painter.draw = (camera, mode, how) => {{ steps.push(how.scale); draw(camera, mode, how); }};
+        painter.refine = (camera, share, fresh) => {{
             const whole = refine(camera, share, fresh);
-            shares.push([fresh, whole]);
+            steps.push([fresh, whole]);
             return whole;
         }};
-        [v.moved, v.pace.soft] = [0, 0.3];
+        [v.moved, v.pace.soft] = [0, SCALE];
         v.step(performance.now());
         await {STILL};
-        return shares;
+        [painter.draw, painter.refine] = [draw, refine];
+        return steps;
     }})"""
-    steps = page.value(shares)
-    assert [fresh for fresh, _ in steps] == [True] + [False] * (len(steps) - 1)
-    assert [whole for _, whole in steps] == [False] * (len(steps) - 1) + [True]
-    assert len(steps) > 2
+    for moving, coarse in ((0.3, 0.5), (0.7, 0.7)):
+        first, *steps = page.value(shown.replace("SCALE", str(moving)))
+        assert first == coarse  # of its size along each side, before any part of the whole one
+        assert [fresh for fresh, _ in steps] == [True] + [False] * (len(steps) - 1)
+        assert [whole for _, whole in steps] == [False] * (len(steps) - 1) + [True]
+        assert len(steps) > 1
+    assert page.value(shown.replace("SCALE", "1")) == [[True, True]]
+
+
+def test_soft_layers_are_added_up_in_as_many_bits_as_there_are(tmp_path, page, capture):
+    """32 in software, where 16 take twice the time; fewer where a device has no more."""
+    soup = make_soup()
+    expected, path = soup.render(camera_of(capture, 1)).color[0], written(tmp_path, soup, capture)
+    for missing, held, least in (("", "RGBA32F", 40), ("EXT_float_blend", "RGBA16F", 40), ("EXT_color", "RGBA8", 35)):
+        source = f"""const extension = WebGL2RenderingContext.prototype.getExtension;
+            WebGL2RenderingContext.prototype.getExtension = function (name) {{
+                return "{missing}" && name.startsWith("{missing}") ? null : extension.call(this, name);
+            }}"""
+        added = page.ask("Page.addScriptToEvaluateOnNewDocument", source=source)
+        page.open(path)
+        page.ask("Page.removeScriptToEvaluateOnNewDocument", **added)
+        assert page.value(f"sceneViewer.then(v => v.painter.soft.whole.format === v.gl.{held})")
+        assert decibels(picture(page, 1, "soft"), expected) > least
 
 
 def test_an_opaque_picture_of_a_moving_camera_is_the_same_but_for_its_edges(tmp_path, page, capture):

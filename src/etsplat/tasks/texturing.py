@@ -3,13 +3,15 @@
 The mesh is decimated, untangled and cut into charts. The texture begins with the colours of the full mesh, small, and
 is fitted with the antialiased z-buffer, the picture that a viewer draws; twice it is enlarged, so that where photos
 show less than its texels hold it stays smooth. The vertices follow, slowly, for the silhouettes that decimation moved,
-and are untangled once more. Texels that no photo shows take the colour of the nearest place on the surface that one
-does; those between charts that of the nearest texel of a chart, so that coarser levels do not bleed.
+and are untangled once more. Where pictures get worse by untangling, it is left. Texels that no photo shows take the
+colour of the nearest place on the surface that one does; those between charts that of the nearest texel of a chart, so
+that coarser levels do not bleed.
 """
 
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -18,7 +20,7 @@ from scipy.ndimage import distance_transform_edt
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from etsplat.data.dataset import Dataset
+from etsplat.data.dataset import Dataset, middles_of
 from etsplat.geometry.decimation import decimated, load_simplifier
 from etsplat.geometry.distance import closest_places, closest_points
 from etsplat.geometry.topology import MeshTopology
@@ -26,14 +28,16 @@ from etsplat.geometry.untangle import untangle
 from etsplat.geometry.unwrap import load_xatlas, texel_points, unwrapped
 from etsplat.io.mesh_files import MeshFile
 from etsplat.model.textured_mesh import TexturedMesh
+from etsplat.model.triangle_mesh import TriangleMesh
 from etsplat.ops.texture import sample_texture
 from etsplat.optim.exposure import Exposure
+from etsplat.optim.gauge import Gauge
 from etsplat.optim.known_exposure import KnownExposure
 from etsplat.optim.loop import Event, StepEvent
 from etsplat.optim.objective import Objective
 from etsplat.optim.schedules import Schedule, exponential_decay
 from etsplat.optim.terms.photometric import Photometric
-from etsplat.optim.trainer import Trainer
+from etsplat.optim.trainer import GUARD_SIDE, GUARD_VIEWS, Trainer
 
 EPOCHS = (4, 3, 3)
 """How often every photo is seen by textures of a quarter and half of the size, and of the size itself."""
@@ -42,11 +46,18 @@ VERTEX_RATE, VERTEX_FINAL = 3e-5, 0.1
 """Adam's rate of vertices, where the object has radius 1, and what is left of it at the end of the last stage. At ten
 times the rate faces cut through others by the hundred (research/results.md)."""
 
+REACHES, WORSE = (math.inf, 0.5), 0.02
+"""How far untangling may move a vertex, in lengths of its longest edge: the first by which pictures of training views
+get no worse than by this part of their loss. Where none does, folds hold up the shape, as of thin parts after a short
+run."""
+
 TEXTURE_RATES, TEXTURE_FINAL = (2e-2, 1e-2, 1e-2), 0.2
 """Adam's rate of texels in each stage, and what is left of it at the stage's end."""
 
 SHOWN = 1e-4
 """Photos show a texel whose second moment is at least this part of the median of those that they do."""
+
+Surface = TypeVar("Surface", TriangleMesh, TexturedMesh)
 
 Tell = Callable[[str, int, int], None]
 """Called with a phase, steps done and steps in all."""
@@ -89,9 +100,15 @@ def texture_object(
         InputError: a package is missing; the mesh does not stay whole with so few faces.
     """
     tell("Simplifying", 0, 0)
+    device = device or torch.device("cpu")
+    exposure = KnownExposure(exposures) if exposures else None
+    if exposure is not None:
+        exposure.start(views.train, 1, mesh.vertices.to(device))
+    gauge = Gauge(views, middles_of(views.train, min(len(views.train), GUARD_VIEWS)), GUARD_SIDE, device)
     vertices, triangles = decimated(mesh.vertices, mesh.faces, faces)
-    topology = MeshTopology.from_faces(triangles, len(vertices))
-    vertices = _untangled(vertices, topology)
+    colors = colors_at(mesh, vertices[triangles].mean(dim=1))
+    plain = TriangleMesh.from_mesh(vertices, triangles, colors=colors, opacity=None, sigma=None).to(device)
+    vertices = _untangled(plain, gauge, exposure).vertices.detach().cpu()
     tell("Unwrapping", 0, 0)
     uvs = unwrapped(vertices, triangles, size)
     side = size >> (len(EPOCHS) - 1)
@@ -99,15 +116,13 @@ def texture_object(
     texture = vertices.new_zeros(side, side, 3)
     texture[covered] = colors_at(mesh, points)
     texture = spread(texture, covered)
-    model = TexturedMesh.from_mesh(vertices, triangles, texture, uvs).to(device or torch.device("cpu"))
+    model = TexturedMesh.from_mesh(vertices, triangles, texture, uvs).to(device)
     total, done = sum(EPOCHS) * len(views.train), 0
     for stage, epochs in enumerate(EPOCHS):
         if stage:
             model = _with_texture(model, _enlarged(model.texture.detach()))
         steps = epochs * len(views.train)
-        trainer = _make_trainer(
-            model, views, stage, done, steps, total, KnownExposure(exposures) if exposures else None, seed
-        )
+        trainer = _make_trainer(model, views, stage, done, steps, total, exposure, seed)
 
         def hear(event: Event, before: int = done) -> None:
             if isinstance(event, StepEvent):
@@ -116,8 +131,7 @@ def texture_object(
         trainer.fit(steps, callbacks=[hear], log_every=10)
         done += steps
         model = _completed(model, trainer.adam.second_moments["texture"].amax(dim=-1).cpu())
-    model = model.to(torch.device("cpu"))
-    return replace(model, vertices=_untangled(model.vertices.detach(), topology)).learnable()
+    return _untangled(model.to(device), gauge, exposure).to(torch.device("cpu"))
 
 
 @torch.no_grad()
@@ -135,7 +149,9 @@ def coarser(mesh: TexturedMesh, faces: int, size: int) -> TexturedMesh:
     """
     fine, triangles = mesh.surface()
     vertices, light = decimated(fine, triangles, faces)
-    vertices = _untangled(vertices, MeshTopology.from_faces(light, len(vertices)))
+    topology = MeshTopology.from_faces(light, len(vertices))
+    if topology.is_closed():
+        vertices, _ = untangle(vertices, topology, reach=REACHES[-1])
     uvs = unwrapped(vertices, light, size)
     covered, points, _ = texel_points(vertices, light, uvs, size)
     face, weights = closest_places(points, fine, triangles)
@@ -146,9 +162,22 @@ def coarser(mesh: TexturedMesh, faces: int, size: int) -> TexturedMesh:
     return TexturedMesh.from_mesh(vertices, light, spread(texture, covered), uvs)
 
 
-def _untangled(vertices: Float[Tensor, "V 3"], topology: MeshTopology) -> Float[Tensor, "V 3"]:
-    """Without faces that cut through others, as far as that goes, where there is an inside."""
-    return untangle(vertices, topology)[0] if topology.is_closed() else vertices
+def _untangled(model: Surface, gauge: Gauge, exposure: Exposure | None) -> Surface:
+    """Without faces that cut through others, as far as pictures stay as good by it, where there is an inside."""
+    if not model.topology.is_closed():
+        return model
+    objective, vertices = Objective(Photometric()), model.vertices.detach()
+    limit: float | None = None
+    for reach in REACHES:
+        moved = untangle(vertices, model.topology, reach=reach)[0]
+        if torch.equal(moved, vertices):
+            break
+        if limit is None:
+            limit = (1 + WORSE) * gauge.measure(model, objective, exposure).loss
+        found = replace(model, vertices=moved).learnable()
+        if gauge.measure(found, objective, exposure).loss <= limit:
+            return found
+    return model
 
 
 def _make_trainer(

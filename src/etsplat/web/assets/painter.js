@@ -38,6 +38,17 @@ function placesTexture(gl, corners, opacities, sigma) {
     return texture;
 }
 
+// What soft layers are added up in. Many faint ones would be lost in 8 bits, so it is these only where a device has no more. In
+// software 32 bits take half the time of 16, which SwiftShader converts to 32 and back at every layer.
+function blendedFormat(gl) {
+    const info = gl.getExtension("WEBGL_debug_renderer_info");
+    const slow16 = info && /SwiftShader/.test(gl.getParameter(info.UNMASKED_RENDERER_WEBGL));
+    const float = gl.getExtension("EXT_color_buffer_float");
+    const wide = ["EXT_float_blend", "OES_texture_float_linear"].every((name) => gl.getExtension(name));
+    if (slow16 && float && wide) return gl.RGBA32F;
+    return float || gl.getExtension("EXT_color_buffer_half_float") ? gl.RGBA16F : gl.RGBA8;
+}
+
 // Where pictures are drawn before they are shown; made anew when their size changes. `samples` of a pixel; 0 for one
 // without a depth buffer, 1 for one with it.
 class Target {
@@ -110,11 +121,9 @@ class Painter {
     // `soup` and `mesh` (or null) are of `readCompact`.
     constructor(gl, soup, mesh) {
         [this.gl, this.soup, this.look] = [gl, soup, soup.look];
-        // Many faint layers add up: 8 bits would lose them where a device has no more.
-        const exact = gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float");
         const kernel = `#version 300 es\n#define KERNEL ${KERNEL_IDS[this.look.kernel]}\n#define SDF ${Number(this.look.distance === "sdf")}`;
         const defined = (source) => source.replace("#version 300 es", kernel);
-        const [whole, small] = [0, 1].map(() => new Target(gl, exact ? gl.RGBA16F : gl.RGBA8, 0));
+        const [whole, small] = [0, 1].map(() => new Target(gl, blendedFormat(gl), 0));
         this.soft = { ...compileProgram(gl, defined(SOFT_VERTEX), defined(SOFT_FRAGMENT)), whole, small };
         this.opaque = {
             ...compileProgram(gl, OPAQUE_VERTEX, OPAQUE_FRAGMENT),

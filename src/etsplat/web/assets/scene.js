@@ -4,6 +4,7 @@
 const STILL_AFTER = 250; // milliseconds after the last motion
 const SLOW = 45, FAST = 24; // milliseconds of a frame: above and below, pictures of a moving camera get smaller and larger
 const PART = 120, LEAST = 0.04; // milliseconds that a part of a soft picture may take, and how much of it that is at least
+const COARSE = 0.5; // of its size along each side: the first soft picture of a camera that stands, if it was not larger in motion
 const SMALLEST = 0.2, FIRST = { soft: 0.5, opaque: 1 }; // of their sizes, along each side
 const EARLY = 1 << 22; // characters of base64, a multiple of four: as much of a scene is shown before the rest is read
 
@@ -78,8 +79,8 @@ class SceneViewer {
         this.change();
     }
 
-    // One frame: small while the camera moves, as fast as the last ones were drawn; whole when it stands, a soft one a part
-    // after the other.
+    // One frame: small while the camera moves, as fast as the last ones were drawn; whole when it stands, a soft one first
+    // coarse, then a part after the other.
     step(now) {
         this.frame = 0;
         if (this.gl.isContextLost()) return; // `restore` goes on
@@ -100,26 +101,28 @@ class SceneViewer {
         if (moving || unfinished) this.frame = requestAnimationFrame((later) => this.step(later));
     }
 
-    // The small picture again, in the order that has come, or the next part of the whole one; returns whether it is whole.
+    // A coarse picture in the order that has come, or the next part of the whole one; returns whether it is whole.
     refine() {
         const { gl, painter, camera, pace: { soft } } = this;
-        if (!this.share && soft < 1) {
-            this.share = Math.max(LEAST, soft * soft); // so many pixels took the time of a frame
-            [this.fresh, this.fence] = [true, null];
-            painter.draw(camera, "soft", { scale: soft, still: false });
-            return false;
-        }
-        if (this.fence) { // frames come before the device is done with the last part
+        const first = !this.share;
+        if (this.fence && !first) { // frames come before the device is done with what was asked of it last
             if (gl.getSyncParameter(this.fence, gl.SYNC_STATUS) !== gl.SIGNALED) return false;
-            gl.deleteSync(this.fence);
             const took = performance.now() - this.begun;
-            this.share = Math.max(LEAST, this.share * Math.min(2, Math.max(0.5, PART / took)));
+            this.share = Math.min(1, Math.max(LEAST, this.share * Math.min(2, Math.max(0.5, PART / took))));
         }
+        gl.deleteSync(this.fence);
         this.begun = performance.now();
-        const whole = painter.refine(camera, this.share || 1, this.fresh || !this.share);
-        this.fresh = false;
+        let whole = false;
+        if (first && soft < 1) {
+            const scale = Math.max(COARSE, soft);
+            [this.share, this.fresh] = [scale * scale, true]; // it has so many of the whole one's pixels
+            painter.draw(camera, "soft", { scale, still: false });
+        } else {
+            whole = painter.refine(camera, this.share || 1, this.fresh || first);
+            this.fresh = false;
+        }
+        this.fence = whole ? null : gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
         if (whole) this.share = 0;
-        else this.fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
         return whole;
     }
 
