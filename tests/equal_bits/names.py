@@ -157,11 +157,13 @@ FILES = Names({})
 CLOCKS = {"progress": 0}
 """Tensors with an element that is a time: its index. By the names of either tree."""
 
+_HELD = "meshes are untangled once more at 0.98 of a run, and from there on their vertices stay"
 _SPACED = "edits of scenes are thirty iterations, or a tenth of a short run, apart, and begin after two of these"
 
 CHANGED: dict[str, str] = {
     "owl-batch": "each view of a step is differentiated by itself; their gradients are added in the order of the "
     "views; rates are multiplied by the square root of the batch",
+    **dict.fromkeys(("owl-best", "owl-demo", "mesh-quick"), _HELD),
     **{
         f"scene-{name}": _SPACED
         for name in ("elastic", "bilateral", "single-sided", "not-frozen", "opaque", "sphere", "no-sky", "random")

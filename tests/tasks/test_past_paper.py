@@ -5,17 +5,20 @@ from pathlib import Path
 import pytest
 import torch
 
+from etsplat.data.demo_object import demo_object
+from etsplat.data.photograph import photograph
 from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.intersections import count_self_intersections
 from etsplat.geometry.topology import MeshTopology
 from etsplat.geometry.untangle import untangle
 from etsplat.io.mesh_files import MeshFile
 from etsplat.io.run_directory import RunDirectory
+from etsplat.model.triangle_mesh import TriangleMesh
 from etsplat.ops.adam import Adam
 from etsplat.optim.loop import StepEvent
 from etsplat.optim.schedules import coarse_level, evenly, regularization_weight
 from etsplat.optim.vertex_updates import laplacian_solver, uniform_step
-from etsplat.tasks.reconstruct import reconstruct
+from etsplat.tasks.reconstruct import make_trainer, reconstruct
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 from helpers.meshes import bumpy_sphere
 
@@ -54,8 +57,12 @@ def test_untangling_moves_no_farther_than_it_must(monkeypatch: pytest.MonkeyPatc
     assert count_self_intersections(untangled, faces) == 0
 
 
-def test_folds_out_of_reach_stay() -> None:
-    """A cap pushed through the far side stays where it is, as a whole, while a stray vertex elsewhere is put right."""
+def test_folds_out_of_reach_stay(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A cap pushed through the far side stays where it is, as a whole, while a stray vertex elsewhere is put right.
+
+    If it is too thick to be turned right: else it and what it went through change places.
+    """
+    monkeypatch.setattr("etsplat.geometry.inside_out._THICK", 0.0)
     vertices, faces = icosphere(4)
     vertices = vertices.clone()
     topology = MeshTopology.from_faces(faces, len(vertices))
@@ -119,6 +126,20 @@ def test_schedules_past_the_paper() -> None:
     assert regularization_weight(55, 100, 10, final=0.2) == pytest.approx(0.6)
     assert evenly(100, 4, 0.6) == [70, 80, 90, 100]
     assert evenly(100, 0, 0.6) == []
+
+
+@pytest.mark.parametrize("untanglings", [0, 1])
+def test_vertices_of_what_is_untangled_stay_at_the_end(untanglings: int) -> None:
+    """The last fiftieth of a run changes colours alone, so that nothing folds again."""
+    views = photograph(demo_object(), 16, 16, elevations=(0.0,), azimuths=3, supersampling=1)
+    mesh = TriangleMesh.from_mesh(*icosphere(2), colors=0.7, opacity=0.98, sigma=0.25)
+    config = SHORT.changed({"iterations": 50, "refinement.subdivisions": 0, "refinement.untanglings": untanglings})
+    trainer = make_trainer(mesh, views, config)
+    trainer.fit(49)
+    vertices, colors = mesh.vertices.detach().clone(), mesh.colors.detach().clone()
+    trainer.fit(50)
+    assert torch.equal(mesh.vertices, vertices) == (untanglings > 0)
+    assert not torch.equal(mesh.colors, colors)
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from etsplat.geometry.topology import MeshTopology
+from etsplat.geometry.topology import MeshTopology, connected
 
 _TURN = torch.linalg.qr(torch.tensor([[0.83, -0.31, 0.47], [0.29, 0.91, -0.17], [-0.41, 0.23, 0.87]]).double()).Q
 """Some rotation: rays are cast along its first axis, since meshes often have edges in planes of the coordinate axes."""
@@ -35,7 +35,7 @@ def find_piercings(vertices: Float[Tensor, "V 3"], topology: MeshTopology, marke
         topology: of the mesh, on the CPU.
         marked: (F,) faces that intersect others, as of `intersecting_faces`.
     """
-    first, second = _overlapping_boxes(vertices[topology.faces], marked.nonzero()[:, 0])
+    first, second = overlapping_boxes(vertices[topology.faces], marked.nonzero()[:, 0])
     edges = torch.cat([topology.face_edges[first], topology.face_edges[second]]).reshape(-1)
     faces = torch.cat([second, first]).repeat_interleave(3)
     both = torch.unique(edges * topology.num_faces + faces)
@@ -58,7 +58,8 @@ def outer_windings(
     Two oriented sheets that cross part space into four: outside of both, with winding number k, inside of one, with
     k + 1, and inside of both, with k + 2. At k = 0 two parts of a solid overlap; at k = -1 one is thinner than nothing:
     its front has gone behind its back. Found by counting faces along a ray, so that it depends on the whole surface
-    and not on how it looks from here. The edges must be of two faces; others count as if they went straight on.
+    and not on how it looks from here. The edges must be of two faces; others count as if they went straight on. An open
+    mesh counts as closed by cones over its borders.
 
     Args:
         vertices: (V, 3) float64 on the CPU.
@@ -75,15 +76,24 @@ def outer_windings(
     inward = normals @ _TURN[:, 0] < 0
     in_edge = torch.where(convex, inward[first] & inward[last], inward[first] | inward[last])
     own = torch.stack([found.faces, first, last], dim=1)
-    return _crossings(points, (vertices @ _TURN)[topology.faces], own) - inward[found.faces].long() - in_edge.long()
+    return _crossings(points, _closed(vertices @ _TURN, topology), own) - inward[found.faces].long() - in_edge.long()
 
 
-def _volume(a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> Float[Tensor, " P"]:
-    """Six times the signed volume of tetrahedra."""
-    return ((b - a) * torch.linalg.cross(c - a, d - a)).sum(dim=1)
+def winding_numbers(
+    points: Float[Tensor, "P 3"], vertices: Float[Tensor, "V 3"], topology: MeshTopology
+) -> Int[Tensor, " P"]:
+    """How often a mesh winds around points that do not lie on it; an open one with cones over its borders.
+
+    Args:
+        points: (P, 3) float64 on the CPU.
+        vertices: (V, 3) float64 on the CPU.
+        topology: of the mesh, on the CPU.
+    """
+    none = torch.full((len(points), 1), -1)
+    return _crossings(points @ _TURN, _closed(vertices @ _TURN, topology), none)
 
 
-def _overlapping_boxes(
+def overlapping_boxes(
     corners: Float[Tensor, "F 3 3"], chosen: Int[Tensor, " K"]
 ) -> tuple[Int[Tensor, " N"], Int[Tensor, " N"]]:
     """Pairs of the chosen faces whose boxes overlap, each once."""
@@ -95,6 +105,26 @@ def _overlapping_boxes(
     first, second = _ranges(begin, torch.maximum(begin, end))
     overlap = ((low[first] <= high[second]) & (low[second] <= high[first])).all(dim=1)
     return chosen[first[overlap]], chosen[second[overlap]]
+
+
+def _closed(vertices: Float[Tensor, "V 3"], topology: MeshTopology) -> Float[Tensor, "G 3 3"]:
+    """The corners of all faces, and behind them those of a cone over each border, with its tip in the middle of it."""
+    corners = vertices[topology.faces]
+    alone = topology.edge_face_counts == 1
+    if not bool(alone.any()):
+        return corners
+    at_border = alone[topology.face_edges]
+    tail, head = topology.faces[at_border].long(), topology.faces.roll(-1, dims=1)[at_border].long()
+    _, loop = connected(torch.stack([tail, head], dim=1), len(vertices))
+    ends, own = torch.cat([tail, head]), torch.cat([loop[tail], loop[head]])
+    sums = torch.zeros_like(vertices).index_add_(0, own, vertices[ends])
+    tips = (sums / own.bincount(minlength=len(vertices)).clamp(min=1)[:, None])[loop[tail]]
+    return torch.cat([corners, torch.stack([vertices[head], vertices[tail], tips], dim=1)])
+
+
+def _volume(a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> Float[Tensor, " P"]:
+    """Six times the signed volume of tetrahedra."""
+    return ((b - a) * torch.linalg.cross(c - a, d - a)).sum(dim=1)
 
 
 def _crossings(

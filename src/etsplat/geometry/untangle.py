@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from etsplat.geometry.inside_out import inside_out, turned_out
 from etsplat.geometry.intersections import intersecting_faces
 from etsplat.geometry.separation import separated
 from etsplat.geometry.topology import MeshTopology
@@ -45,14 +46,16 @@ def untangle(
 ) -> tuple[Float[Tensor, "V 3"], int]:
     """Moves the vertices of faces that cut through others until none does, as little as possible.
 
-    1. In rounds, sheets that cross are pushed apart (`separation.separated`): most cross by a small part of an edge, so
+    1. Thin parts that are inside out are turned right (`inside_out`): the surface stays where it is. What follows is
+       done with that, and where faces still intersect without it too; the result with fewer of them is taken.
+    2. In rounds, sheets that cross are pushed apart (`separation.separated`): most cross by a small part of an edge, so
        that nobody sees it. Every few rounds the corners of what still intersects are smoothed a little.
-    2. What that leaves is smoothed in rounds: the corners of intersecting faces, with a ring of neighbours for every
+    3. What that leaves is smoothed in rounds: the corners of intersecting faces, with a ring of neighbours for every
        eighth round already done, so that what resists is smoothed more widely, move to the mean of their neighbours in
        damped sweeps.
-    3. What moved goes back towards its old place, as far as that makes no face intersect anew: folds end where they
+    4. What moved goes back towards its old place, as far as that makes no face intersect anew: folds end where they
        touch instead of flat.
-    4. Where a vertex still ends too far away, all that moved together with it returns to its old place, intersections
+    5. Where a vertex still ends too far away, all that moved together with it returns to its old place, intersections
        included: folds so large hold up the shape, as where a sphere stands for an object with holes.
 
     All other vertices stay where they are. Boundary vertices may shrink inwards. Computed on the CPU.
@@ -60,17 +63,34 @@ def untangle(
     Args:
         vertices: (V, 3) finite.
         topology: of the mesh.
-        rounds: most looks for intersections in step 2.
-        reach: how far a vertex may go, in lengths of its longest edge, or of two mean edges of the mesh if that is
-            more: where it is folded its own are short.
+        rounds: most looks for intersections in step 3.
+        reach: how far a vertex may go after step 1, in lengths of its longest edge, or of two mean edges of the mesh if
+            that is more: where it is folded its own are short.
 
     Returns:
         Moved vertices, and how many faces still intersect.
     """
-    original, faces = vertices.detach().cpu(), topology.faces.cpu()
-    moved = original.clone()
+    original, topology = vertices.detach().cpu(), topology.to(torch.device("cpu"))
+    marked = intersecting_faces(original, topology.faces)
+    wrong = inside_out(original.double(), topology, marked)
+    turned = turned_out(original.double(), topology, wrong).to(original)
+    starts = [original] if torch.equal(turned, original) else [turned, original]
+    found, left = original, math.inf
+    for start in starts:
+        moved, still = _apart(start, topology, rounds, reach)
+        if still < left:
+            found, left = moved, still
+        if left == 0:
+            break
+    return found.to(vertices.device), int(left)
+
+
+def _apart(
+    original: Float[Tensor, "V 3"], topology: MeshTopology, rounds: int, reach: float
+) -> tuple[Float[Tensor, "V 3"], int]:
+    """Steps 2 to 5 of `untangle`."""
+    moved, faces = original.clone(), topology.faces
     marked = intersecting_faces(moved, faces)
-    topology = topology.to(torch.device("cpu"))
     for done in range(1, _PUSHES + 1):
         if not 0 < float(marked.float().mean()) <= _TANGLED:
             break
@@ -88,7 +108,7 @@ def untangle(
     if bool(lost.any()):
         moved[lost] = original[lost]
         marked = intersecting_faces(moved, faces)
-    return moved.to(vertices.device), int(marked.sum())
+    return moved, int(marked.sum())
 
 
 def _returned(

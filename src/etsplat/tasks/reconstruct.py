@@ -59,6 +59,10 @@ from etsplat.tasks.texturing import check_installed
 DEPTHS_NEAR, DEPTHS_FAR = 0.02, 0.15
 """When depth maps are compared with the mesh, as a fraction of a run that starts near the surface, or far from it."""
 
+HELD = 0.98
+"""At this fraction of a run meshes are untangled too, and then vertices stay, so that nothing folds again. Whether that
+spoils pictures is judged when colours have settled."""
+
 
 @dataclass(frozen=True)
 class ReconstructResult(Result):
@@ -302,6 +306,7 @@ def make_trainer(
         max_faces=config.max_faces,
     )
     untanglings = evenly(length, refinement.untanglings, refinement.last)
+    untanglings += [_held_from(config)] if untanglings else []
     smoothing = config.optimizer.large_steps_weight if config.optimizer.vertex_update == "large-steps" else None
     return Trainer(
         mesh,
@@ -326,11 +331,19 @@ def make_trainer(
     )
 
 
+def _held_from(config: ReconstructConfig) -> int:
+    return max(1, round(HELD * config.iterations))
+
+
 def _schedule(config: ReconstructConfig) -> Schedule:
     length, rates, pictures = config.iterations, config.optimizer, config.pictures
     annealed = config.soft and rates.sigma_final > 0
 
+    held_from = _held_from(config) if config.refinement.untanglings else length
+
     def vertices(iteration: int) -> float:
+        if iteration > held_from:
+            return 0.0
         return rates.lr_vertices * exponential_decay(iteration, length, rates.lr_vertices_final)
 
     def log_sigma(iteration: int) -> float:
