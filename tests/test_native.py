@@ -121,7 +121,7 @@ def test_a_group_of_arguments_keeps_its_tensors():
 
 def test_every_path_draws_the_same_without_torch() -> None:
     """By the program that also tries modules of other machines, under emulators."""
-    program = Path(__file__).parent / "native" / "without_torch.py"
+    program = Path(__file__).parent / "helpers" / "without_torch.py"
     shown = subprocess.run([sys.executable, str(program)], capture_output=True, text=True, check=True).stdout
     apart = dict(re.findall(r"^(\w+): differs by (\S+) of the largest value$", shown, re.MULTILINE))
     assert list(apart) == _native.available_instruction_sets()

@@ -1,6 +1,6 @@
 """Draws pictures and their gradients by each path of the native module, without torch, which is slow under emulators.
 
-    python3 tests/native/without_torch.py [FOLDER]      the module of an unpacked wheel, not the installed one
+    python3 tests/helpers/without_torch.py [FOLDER]      the module of an unpacked wheel, not the installed one
 
 It prints SHA-256 of what the plain path gives, and by how much other paths differ from it. Where tensors are asked for,
 it gives what the module looks at, over memory of its own.
