@@ -19,6 +19,7 @@ struct AdamGroup {
     float* first;
     float* second;
     int64_t size;
+    float decay;  // times the parameter is added to its gradient
     AdamCoefficients<float> coefficients;
 };
 
@@ -28,8 +29,13 @@ void adam_range(const AdamGroup& group, int64_t begin, int64_t end) {
     float* __restrict first = group.first;
     float* __restrict second = group.second;
     const AdamCoefficients<float> coefficients = group.coefficients;
-    for (int64_t i = begin; i < end; ++i) {
-        adam_update(parameter[i], first[i], second[i], gradient[i], coefficients);
+    const float decay = group.decay;
+    if (decay == 0.0f) {
+        for (int64_t i = begin; i < end; ++i)
+            adam_update(parameter[i], first[i], second[i], gradient[i], coefficients);
+    } else {
+        for (int64_t i = begin; i < end; ++i)
+            adam_update(parameter[i], first[i], second[i], gradient[i] + decay * parameter[i], coefficients);
     }
 }
 
@@ -53,12 +59,12 @@ void adam_step(const std::vector<AdamGroup>& groups) {
 }  // namespace
 
 void bind_adam(nb::module_& m) {
-    // One tensor of each kind and one rate per parameter; `step` counts from 1.
+    // One tensor of each kind, one rate and one decay per parameter; `step` counts from 1.
     def_function(
         m, "adam_step",
         [](const std::vector<Array<float>>& parameters, const std::vector<Array<const float>>& gradients,
            const std::vector<Array<float>>& firsts, const std::vector<Array<float>>& seconds,
-           const std::vector<double>& learning_rates, double beta1, double beta2, double eps, int64_t step) {
+           const std::vector<double>& learning_rates, const std::vector<double>& decays, double beta1, double beta2, double eps, int64_t step) {
             const double first_correction = 1.0 - std::pow(beta1, static_cast<double>(step));
             const double second_correction = std::sqrt(1.0 - std::pow(beta2, static_cast<double>(step)));
             std::vector<AdamGroup> groups;
@@ -71,11 +77,11 @@ void bind_adam(nb::module_& m) {
                 k.second_correction = static_cast<float>(second_correction);
                 k.eps = static_cast<float>(eps);
                 groups.push_back({parameters[i].data(), gradients.at(i).data(), firsts.at(i).data(),
-                                  seconds.at(i).data(), parameters[i].count(), k});
+                                  seconds.at(i).data(), parameters[i].count(), static_cast<float>(decays.at(i)), k});
             }
             adam_step(groups);
         },
-        "parameters", "gradients", "firsts", "seconds", "learning_rates", "beta1", "beta2", "eps", "step");
+        "parameters", "gradients", "firsts", "seconds", "learning_rates", "decays", "beta1", "beta2", "eps", "step");
 }
 
 }  // namespace etsplat

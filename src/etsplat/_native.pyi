@@ -18,6 +18,7 @@ def adam_step(
     firsts: Sequence[torch.Tensor],
     seconds: Sequence[torch.Tensor],
     learning_rates: Sequence[float],
+    decays: Sequence[float],
     beta1: float,
     beta2: float,
     eps: float,

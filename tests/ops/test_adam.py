@@ -57,6 +57,33 @@ def test_first_step_moves_by_the_learning_rate(engine):
 
 
 @pytest.mark.sanitize
+def test_a_decay_adds_a_multiple_of_the_parameter_to_its_gradient(engine, rng):
+    """To the bit, over several steps; other parameters have none."""
+    ours = {name: p.detach().to(device_of(engine)).requires_grad_() for name, p in parameters(rng).items()}
+    theirs = copies(ours)
+    adam, expected = Adam(ours, RATES), Adam(theirs, RATES)
+    for _ in range(3):
+        set_gradients(rng, ours, theirs)
+        for name in ("colors", "sigma"):
+            theirs[name].grad = theirs[name].grad + 0.3 * theirs[name].detach()
+        on(engine, adam.step, {"colors": 0.3, "sigma": 0.3})
+        on(engine, expected.step)
+    assert all(torch.equal(ours[name], theirs[name]) for name in SHAPES)
+
+
+def test_a_decay_of_no_parameter_is_refused(rng):
+    """Before anything is updated."""
+    ours = parameters(rng)
+    set_gradients(rng, ours)
+    adam = Adam(ours, RATES)
+    with pytest.raises(
+        ValueError, match=r"^decays must be of \['colors', 'empty', 'sigma', 'vertices'\], got \['colours'\]"
+    ):
+        adam.step({"colours": 0.1})
+    assert adam.step_count == 0
+
+
+@pytest.mark.sanitize
 def test_same_bits_for_any_number_of_threads(rng):
     """Elements are independent of one another and of the threads."""
     start = parameters(rng)
