@@ -95,7 +95,7 @@ def test_lists_of_tensors_are_read_one_by_one():
     parameters = [torch.ones(3), torch.ones(2, 5), torch.ones(())]
     zeros = [[torch.zeros_like(parameter) for parameter in parameters] for _ in range(2)]
     gradients = [torch.ones_like(parameter) for parameter in parameters]
-    rest = {"learning_rates": [0.5] * 3, "beta1": 0.9, "beta2": 0.99, "eps": 0.0, "step": 1}
+    rest = {"learning_rates": [0.5] * 3, "decays": [0.0] * 3, "beta1": 0.9, "beta2": 0.99, "eps": 0.0, "step": 1}
     state = {"firsts": zeros[0], "seconds": zeros[1], "paces": [None] * 3}
     _native.adam_step(parameters=parameters, gradients=gradients, **state, **rest)
     for parameter in parameters:

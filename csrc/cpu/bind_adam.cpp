@@ -21,6 +21,7 @@ struct AdamGroup {
     float* second;
     const float* paces;  // of rows, or null
     int64_t size, width;  // elements, and those of a row
+    float decay;  // times the parameter is added to its gradient
     AdamCoefficients<float> coefficients;
 
     // Elements of a piece: whole rows.
@@ -33,8 +34,13 @@ void adam_range(const AdamGroup& group, int64_t begin, int64_t end) {
     float* __restrict first = group.first;
     float* __restrict second = group.second;
     const AdamCoefficients<float> coefficients = group.coefficients;
-    for (int64_t i = begin; i < end; ++i) {
-        adam_update(parameter[i], first[i], second[i], gradient[i], coefficients);
+    const float decay = group.decay;
+    if (decay == 0.0f) {
+        for (int64_t i = begin; i < end; ++i)
+            adam_update(parameter[i], first[i], second[i], gradient[i], coefficients);
+    } else {
+        for (int64_t i = begin; i < end; ++i)
+            adam_update(parameter[i], first[i], second[i], gradient[i] + decay * parameter[i], coefficients);
     }
 }
 
@@ -62,7 +68,9 @@ void paced_range(const AdamGroup& group, int64_t begin, int64_t end) {
         for (int64_t i = 0; i < count; ++i) {
             AdamCoefficients<float> own = coefficients;
             own.step_size = sizes[i];
-            adam_update(parameter[begin + i], first[begin + i], second[begin + i], gradient[begin + i], own);
+            const int64_t k = begin + i;
+            const float whole = group.decay == 0.0f ? gradient[k] : gradient[k] + group.decay * parameter[k];
+            adam_update(parameter[k], first[k], second[k], whole, own);
         }
         begin += count;
     }
@@ -88,13 +96,13 @@ void adam_step(const std::vector<AdamGroup>& groups) {
 }  // namespace
 
 void bind_adam(nb::module_& m) {
-    // One tensor of each kind and one rate per parameter, and its rows' paces or None; `step` counts from 1.
+    // One tensor of each kind, one rate and one decay per parameter, and its rows' paces or None; `step` counts from 1.
     def_function(
         m, "adam_step",
         [](const std::vector<Array<float>>& parameters, const std::vector<Array<const float>>& gradients,
            const std::vector<Array<float>>& firsts, const std::vector<Array<float>>& seconds,
-           const std::vector<OptionalArray<const float, 1>>& paces, const std::vector<double>& learning_rates, double beta1,
-           double beta2, double eps, int64_t step) {
+           const std::vector<OptionalArray<const float, 1>>& paces, const std::vector<double>& learning_rates,
+           const std::vector<double>& decays, double beta1, double beta2, double eps, int64_t step) {
             const double first_correction = 1.0 - std::pow(beta1, static_cast<double>(step));
             const double second_correction = std::sqrt(1.0 - std::pow(beta2, static_cast<double>(step)));
             std::vector<AdamGroup> groups;
@@ -108,11 +116,13 @@ void bind_adam(nb::module_& m) {
                 k.eps = static_cast<float>(eps);
                 const int64_t size = parameters[i].count(), rows = paces.at(i) ? paces[i]->size(0) : 0;
                 groups.push_back({parameters[i].data(), gradients.at(i).data(), firsts.at(i).data(), seconds.at(i).data(),
-                                  data_or_null(paces[i]), size, rows ? size / rows : 1, k});
+                                  data_or_null(paces[i]), size, rows ? size / rows : 1, static_cast<float>(decays.at(i)),
+                                  k});
             }
             adam_step(groups);
         },
-        "parameters", "gradients", "firsts", "seconds", "paces", "learning_rates", "beta1", "beta2", "eps", "step");
+        "parameters", "gradients", "firsts", "seconds", "paces", "learning_rates", "decays", "beta1", "beta2", "eps",
+        "step");
 }
 
 }  // namespace etsplat

@@ -5,9 +5,9 @@
 #include <cstdint>
 #include <cstdlib>
 #include <cstring>
-#include <new>
 #include <utility>
 
+#include "huge_pages.h"
 #include "parallel.h"
 
 namespace etsplat {
@@ -24,7 +24,7 @@ public:
         if (n > capacity_) {
             release();
             const int64_t wanted = n + n / 8;
-            data_ = static_cast<T*>(::operator new(static_cast<size_t>(wanted) * sizeof(T) + 64, std::align_val_t{64}));
+            data_ = static_cast<T*>(acquire_block(block_size(wanted)));
             capacity_ = wanted;
         }
         size_ = n;
@@ -47,8 +47,9 @@ public:
     }
 
 private:
+    static size_t block_size(int64_t n) { return static_cast<size_t>(n) * sizeof(T) + 64; }
     void release() {
-        if (data_) ::operator delete(data_, std::align_val_t{64});
+        if (data_) release_block(data_, block_size(capacity_));
         data_ = nullptr;
         capacity_ = 0;
     }

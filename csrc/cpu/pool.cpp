@@ -3,15 +3,14 @@
 #include <iterator>
 #include <map>
 #include <mutex>
-#include <new>
 #include <unordered_map>
 
 #include "forking.h"
+#include "huge_pages.h"
 
 namespace etsplat {
 namespace {
 
-constexpr std::size_t kAlignment = 64;
 constexpr std::size_t kMostIdleBytes = std::size_t{256} << 20;
 
 std::mutex mutex;
@@ -40,7 +39,7 @@ float* pool_acquire(std::size_t count) {
         p.idle_bytes -= count * sizeof(float);
         return block;
     }
-    auto* block = static_cast<float*>(::operator new(count * sizeof(float), std::align_val_t{kAlignment}));
+    auto* block = static_cast<float*>(acquire_block(count * sizeof(float)));
     p.size[block] = count;
     return block;
 }
@@ -53,9 +52,10 @@ void pool_release(float* block) noexcept {
     p.idle_bytes += count * sizeof(float);
     while (p.idle_bytes > kMostIdleBytes) {  // the largest goes first
         const auto largest = std::prev(p.idle.end());
-        p.idle_bytes -= largest->first * sizeof(float);
+        const std::size_t bytes = largest->first * sizeof(float);
+        p.idle_bytes -= bytes;
         p.size.erase(largest->second);
-        ::operator delete(largest->second, std::align_val_t{kAlignment});
+        release_block(largest->second, bytes);
         p.idle.erase(largest);
     }
 }

@@ -19,6 +19,7 @@ def adam_step(
     seconds: Sequence[torch.Tensor],
     paces: Sequence[torch.Tensor | None],
     learning_rates: Sequence[float],
+    decays: Sequence[float],
     beta1: float,
     beta2: float,
     eps: float,

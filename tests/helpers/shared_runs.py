@@ -3,7 +3,7 @@
 import math
 import os
 import signal
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -204,10 +204,11 @@ def gradients_of_steps(kind: str, batch: int, steps: int) -> list[dict[str, byte
     trainer, found = trainer_of(kind, batch), list[dict[str, bytes]]()
     make_step = trainer.adam.step
 
-    def step() -> None:
+    def step(decays: Mapping[str, float] | None = None) -> None:
         gradients = {name: parameter.grad for name, parameter in trainer.adam.parameters.items()}
         found.append({name: t.contiguous().numpy().tobytes() for name, t in gradients.items() if t is not None})
-        make_step()
+        found[-1]["decays"] = repr(decays).encode()
+        make_step(decays)
 
     trainer.adam.step = step
     for iteration in range(1, steps + 1):

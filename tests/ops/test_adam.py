@@ -71,6 +71,24 @@ def test_rows_move_at_their_own_pace(engine, rng, shape):
     assert all(torch.equal(*pair) for pair in zip(moments, expected, strict=True))
 
 
+@pytest.mark.sanitize
+def test_rows_with_paces_decay_as_others_do(engine, rng):
+    """A step of both goes as far as one of the decay alone, times the factor of the row."""
+    start, gradient = (torch.randn((500, 3, 3), generator=rng).to(dtype_of(engine)) for _ in range(2))
+    paces, moved = 10 ** torch.rand(500, generator=rng).to(start), []
+    for factors in (paces, None):
+        parameter = start.to(device_of(engine), copy=True).requires_grad_()
+        adam = Adam({"p": parameter}, {"p": 0.01})
+        if factors is not None:
+            adam.paces["p"] = factors.to(parameter)
+        parameter.grad = gradient.to(parameter)
+        on(engine, adam.step, {"p": 3.0})
+        moved.append(parameter.detach().cpu() - start)
+    torch.testing.assert_close(moved[0], paces[:, None, None] * moved[1], rtol=1e-5, atol=1e-5)
+    against = torch.where(gradient + 3.0 * start > 0, -0.01, 0.01).to(start)
+    torch.testing.assert_close(moved[1], against, rtol=1e-4, atol=1e-6)
+
+
 def test_paces_must_fit_and_go_with_the_rows_that_they_were_for(rng):
     """Nothing is updated where they do not fit; a parameter of another length has none."""
     parameter = torch.zeros(4, 3, requires_grad=True)
@@ -94,6 +112,33 @@ def test_first_step_moves_by_the_learning_rate(engine):
     parameter.grad = torch.tensor([1e-6, -3.0, 0.0, 1e4, -1e-3]).to(parameter)
     on(engine, Adam({"p": parameter}, {"p": 0.25}).step)
     torch.testing.assert_close(parameter.detach().cpu(), torch.tensor([-0.25, 0.25, 0.0, -0.25, 0.25]))
+
+
+@pytest.mark.sanitize
+def test_a_decay_adds_a_multiple_of_the_parameter_to_its_gradient(engine, rng):
+    """To the bit, over several steps; other parameters have none."""
+    ours = {name: p.detach().to(device_of(engine)).requires_grad_() for name, p in parameters(rng).items()}
+    theirs = copies(ours)
+    adam, expected = Adam(ours, RATES), Adam(theirs, RATES)
+    for _ in range(3):
+        set_gradients(rng, ours, theirs)
+        for name in ("colors", "sigma"):
+            theirs[name].grad = theirs[name].grad + 0.3 * theirs[name].detach()
+        on(engine, adam.step, {"colors": 0.3, "sigma": 0.3})
+        on(engine, expected.step)
+    assert all(torch.equal(ours[name], theirs[name]) for name in SHAPES)
+
+
+def test_a_decay_of_no_parameter_is_refused(rng):
+    """Before anything is updated."""
+    ours = parameters(rng)
+    set_gradients(rng, ours)
+    adam = Adam(ours, RATES)
+    with pytest.raises(
+        ValueError, match=r"^decays must be of \['colors', 'empty', 'sigma', 'vertices'\], got \['colours'\]"
+    ):
+        adam.step({"colours": 0.1})
+    assert adam.step_count == 0
 
 
 @pytest.mark.sanitize

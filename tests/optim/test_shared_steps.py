@@ -89,7 +89,7 @@ def test_what_travels_adds_up_to_the_gradients_of_one_process(
         return
     assert all({"colors", "center", "degree"} <= names for names in sent)
     of_parameters = [{"gradient.0.sh_rest", "gradient.0.sh_dc"} & names for names in sent]
-    last = {"soup": set(), "normals": {"gradient.0.sh_rest"}}.get(kind, {"gradient.0.sh_rest", "gradient.0.sh_dc"})
+    last = {"gradient.0.sh_dc"} if kind == "inseparable" else set[str]()
     assert of_parameters == 4 * [*(batch - 1) * [set()], last]
 
 

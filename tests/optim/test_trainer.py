@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
+import etsplat
 from etsplat.core.errors import InputError
 from etsplat.data.dataset import Dataset
 from etsplat.data.demo_object import demo_object
@@ -26,7 +27,7 @@ from etsplat.optim.schedules import Schedule, face_budgets
 from etsplat.optim.strategies import DensifyAndPrune, Fixed, Strategy, SubdivideAndUntangle
 from etsplat.optim.terms.mesh import EdgeLength, Laplacian, SmoothNormals, Softness
 from etsplat.optim.terms.photometric import Photometric
-from etsplat.optim.terms.soup import DepthNormals, Opacity
+from etsplat.optim.terms.soup import DepthNormals, Harmonics, Opacity
 from etsplat.optim.trainer import Trainer
 
 
@@ -144,6 +145,28 @@ def test_a_folder_becomes_a_run_to_go_on_with(object_views: Dataset, tmp_path: P
             other.fit(30, run=tmp_path / "run")
     with writing_run(tmp_path / "run", pytest.fail), pytest.raises(InputError, match="is writing this run"):
         combination("mesh", object_views).fit(30, run=tmp_path / "run")
+
+
+@pytest.mark.parametrize("weight", [0.1, 1.7])
+@pytest.mark.parametrize("chosen", ["cpu", "reference"])
+def test_adam_adds_the_gradient_of_harmonics_with_the_bits_of_autograd(
+    object_views: Dataset, chosen: str, weight: float
+) -> None:
+    """A run ends with the parameters of one whose term is differentiated, and has its losses."""
+
+    class Differentiated(Harmonics):
+        squares = None
+
+    found = []
+    for kind in (Harmonics, Differentiated):
+        objective = Objective(Photometric(0.2), [Opacity(0.005), kind(weight)], scale=lambda iteration: 0.9**iteration)
+        with etsplat.engine(chosen):
+            trainer = Trainer(a_soup(), object_views, objective, seed=3)
+            found.append((losses_of(trainer, 5), trainer.model.state()))
+    (losses, ours), (expected, theirs) = found
+    assert losses == expected
+    assert ours["sh_rest"].abs().max() > 0
+    assert all(torch.equal(ours[name], theirs[name]) for name in theirs)
 
 
 def test_a_step_of_two_views_is_the_mean_of_their_gradients(object_views: Dataset) -> None:

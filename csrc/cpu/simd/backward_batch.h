@@ -27,9 +27,11 @@ struct BackwardBatch {
     uint16_t visible[kPairs + kTogether];  // lanes within the extent, with enough alpha
 };
 
-// Takes entries from `next` on that the forward pass drew, and returns where the next batch begins.
+// Takes entries from `next` on that the forward pass drew, and returns where the next batch begins. Their slots, which lie
+// anywhere in memory, are on their way while kernels are evaluated.
 ETSPLAT_FN int collect(const RasterPass& pass, const TileFrame& frame, int next, int end, BackwardBatch& batch) {
     constexpr int kAhead = 8;
+    const int stride = pass.slot_layout.stride();
     batch.pairs.clear();
     batch.count = 0;
     while (next < end && batch.count < kBatch && batch.pairs.count < BackwardBatch::kEnough) {
@@ -42,6 +44,7 @@ ETSPLAT_FN int collect(const RasterPass& pass, const TileFrame& frame, int next,
         if (blocks == 0) continue;
         const int i = batch.count++;
         batch.entries[i] = entry;
+        for (int line = 0; line < stride; line += 16) prefetch(pass.slots + int64_t{entry.slot} * stride + line);
         batch.begin[i] = batch.pairs.count;
         batch.forms[i].prepare(pass.records[entry.triangle], frame);
         batch.pairs.append(i, blocks);

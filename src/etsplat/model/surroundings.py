@@ -100,7 +100,8 @@ class Surroundings:
     @torch.no_grad()
     def outermost(self, vertices: Float[Tensor, "N 3 3"]) -> Bool[Tensor, " N"]:
         """Which triangles are on the sphere or beyond."""
-        return (vertices.mean(dim=1) - self.middle).norm(dim=1) > _INSIDE * self.radius
+        a, b, c = vertices.unbind(dim=1)  # their mean over that axis takes three times as long, for the same bits
+        return ((a + b + c) / 3 - self.middle).norm(dim=1) > _INSIDE * self.radius
 
     @torch.no_grad()
     def facing_outwards(self, vertices: Float[Tensor, "N 3 3"]) -> Bool[Tensor, " N"]:

@@ -81,13 +81,20 @@ class Adam:
         self.paces: dict[str, Tensor] = {}
 
     @torch.no_grad()
-    def step(self) -> None:
+    def step(self, decays: Mapping[str, float] | None = None) -> None:
         """Update every parameter from its gradient.
 
+        Args:
+            decays: By name of a parameter, how many times the parameter itself is added to its gradient: 2 c for a
+                term c |p|^2 of what is minimised, whose gradient then takes no memory of its own.
+
         Raises:
-            ValueError: A parameter without gradient or without a place for each element, or paces that do not fit it;
-                nothing is updated then.
+            ValueError: A parameter without gradient or without a place for each element, paces that do not fit it, or a
+                decay of none that there is; nothing is updated then.
         """
+        decays = decays or {}
+        if not decays.keys() <= self.parameters.keys():
+            raise ValueError(f"decays must be of {sorted(self.parameters)}, got {sorted(decays)}")
         together: dict[Engine, list[str]] = {}
         for name, parameter in self.parameters.items():
             check_written(f"parameters[{name}]", parameter)  # `data` may have been set since
@@ -98,7 +105,8 @@ class Adam:
         self.step_count += 1
         for engine, names in together.items():
             groups, rates = groups_of[engine], [self.learning_rates[name] for name in names]
-            engine.adam_step(groups, rates, self.betas, self.eps, self.step_count)
+            added = [decays.get(name, 0.0) for name in names]
+            engine.adam_step(groups, rates, added, self.betas, self.eps, self.step_count)
             self._store(names, groups)
 
     def rates(self, names: Sequence[str]) -> list[float]:

@@ -81,6 +81,8 @@ class Term(ABC):
         power: of the value.
         looks_at: what it looks at, if that is parameters alone, or colours of pictures alone: workers of a run then
             need not send each other what they can compute for themselves. None for more, or where nobody says.
+        squares: name of the parameter of whose rows it is the mean sum of squares: its gradient is a multiple of that
+            parameter, which the optimizer can add by itself. None for any other term.
 
     Example:
         >>> class Centred(etsplat.Term):
@@ -94,6 +96,7 @@ class Term(ABC):
     outputs: tuple[str, ...] = ()
     power: Literal[1, -1, -2] = 1
     looks_at: ClassVar[Literal["parameters", "colors"] | None] = None
+    squares: ClassVar[str | None] = None
 
     def __init__(self, weight: Scheduled = 1.0) -> None:
         self.weight = weight
@@ -164,6 +167,7 @@ class Objective:
         views: int = 1,
         whole: bool = True,
         apart: bool = False,
+        decayed: bool = False,
     ) -> Float[Tensor, ""]:
         """The part of a step's objective that belongs to one of its views.
 
@@ -174,6 +178,7 @@ class Objective:
             views: how many the step has.
             whole: whether terms that depend on the parameters alone belong to this view.
             apart: whether those count with their values alone, and `of_parameters` has their gradients.
+            decayed: whether sums of squares count with their values alone, and `decays` has their gradients.
         """
         first = self.photometric(drawing)
         if views > 1:
@@ -183,7 +188,8 @@ class Objective:
         summands = []
         for term, weight in zip(self.terms, weights, strict=True):
             if weight and (whole or term.outputs):
-                with torch.set_grad_enabled(torch.is_grad_enabled() and not (apart and not term.outputs)):
+                elsewhere = (apart and not term.outputs) or (decayed and term.squares is not None)
+                with torch.set_grad_enabled(torch.is_grad_enabled() and not elsewhere):
                     value = term(drawing)
                 summands.append(Summand(weight / views if term.outputs else weight, value, term.power))
         return weighted_sum(first, summands, scale)
@@ -196,16 +202,37 @@ class Objective:
         counting = [term for term, weight in zip(self.terms, weights, strict=True) if weight]
         return self.photometric.looks_at == "colors" and all(term.looks_at == "parameters" for term in counting)
 
-    def of_parameters(self, model: Any, weights: Sequence[float], scale: float) -> Float[Tensor, ""] | None:
-        """The part of a step's objective that depends on the parameters alone; None where nothing does.
+    def decays(self, model: Any, weights: Sequence[float], scale: float) -> dict[str, float]:
+        """By name of a parameter, how many times it is the gradient of the terms that are sums of its squares.
 
         Args:
             model: as it is now.
             weights: of the terms, as of `weights`.
             scale: of them all.
         """
+        found: dict[str, float] = {}
+        for term, weight in zip(self.terms, weights, strict=True):
+            if term.squares is not None and weight and scale:
+                parameter = model.parameters()[term.squares]
+                one = torch.ones((), dtype=parameter.dtype)  # rounded as autograd rounds it
+                share = float(one * scale * weight / len(parameter) * 2)
+                found[term.squares] = found.get(term.squares, 0.0) + share
+        return found
+
+    def of_parameters(
+        self, model: Any, weights: Sequence[float], scale: float, *, decayed: bool = False
+    ) -> Float[Tensor, ""] | None:
+        """The part of a step's objective that depends on the parameters alone; None where nothing does.
+
+        Args:
+            model: as it is now.
+            weights: of the terms, as of `weights`.
+            scale: of them all.
+            decayed: whether sums of squares are left out, as `decays` has their gradients.
+        """
         counting = zip(self.terms, weights, strict=True)
-        alone = [(term, weight) for term, weight in counting if weight and not term.outputs]
+        here = [(term, weight) for term, weight in counting if not (decayed and term.squares)]
+        alone = [(term, weight) for term, weight in here if weight and not term.outputs]
         if not alone or scale == 0.0:
             return None
         drawing: Any = OfParameters(model)

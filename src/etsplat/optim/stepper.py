@@ -167,23 +167,25 @@ class Stepper(Generic[M]):
         self.arrive(iteration)
         chosen = self._choose()
         weights, scale = self._objective.weights(iteration), at(self._objective.scale, iteration)
-        moving = self._cameras.moving(iteration)
+        moving, decayed = self._cameras.moving(iteration), self._update is None
 
         def gradients(places: range) -> tuple[Tensor, list[Rasterization]]:
             some = (chosen[place] for place in places)
             views = ((self._loader.view(c.view), c.background.to(self._device)) for c in some)
             separate = apart is not None and apart.of_parameters is not None
-            return self._gradients(views, weights, scale, moving=moving, first=places.start, separate=separate)
+            options = {"moving": moving, "first": places.start, "separate": separate, "decayed": decayed}
+            return self._gradients(views, weights, scale, **options)
 
         group, apart = workers(), None
         if group.count > 1 and self._model.COLORED is not None:
             separable = self._objective.separable(weights)
-            apart = Apart(self._model.COLORED, partial(self._of_parameters, weights, scale) if separable else None)
+            alone = partial(self._of_parameters, weights, scale, decayed=decayed)
+            apart = Apart(self._model.COLORED, alone if separable else None)
         indices, optimizers = [c.view for c in chosen], [self.adam, self._exposure.adam]
         loss, seen = shared_gradients(group, indices, gradients, optimizers, self._strategy.outputs, apart)
         self.adam.learning_rates = self._rates(iteration)
         if self._update is None:
-            self.adam.step()
+            self.adam.step(self._objective.decays(self._model, weights, scale))
         else:
             self._update(self.adam, self._model)
         if self._exposure.learned:
@@ -252,10 +254,12 @@ class Stepper(Generic[M]):
         moving: bool,
         first: int = 0,
         separate: bool = False,
+        decayed: bool = False,
     ) -> tuple[Tensor, list[Rasterization]]:
         """Those of the objective, one view after the other, from place `first` on; its value, and what was seen.
 
-        Where `separate`, terms that depend on the parameters alone have their gradients in `_of_parameters`.
+        Where `separate`, terms that depend on the parameters alone have their gradients in `_of_parameters`; where
+        `decayed`, Adam adds those of sums of squares.
         """
         outputs = (*self._objective.outputs(weights), *self._strategy.outputs)
         losses, seen, exposure = [], [], self._exposure
@@ -269,7 +273,9 @@ class Stepper(Generic[M]):
                 self._model, view.camera, view.photo, view.mask, background, shot, index=view.index, depth=view.depth
             )
             whole = number == self._batch
-            loss = self._objective(drawing, weights, scale, views=self._batch, whole=whole, apart=separate)
+            loss = self._objective(
+                drawing, weights, scale, views=self._batch, whole=whole, apart=separate, decayed=decayed
+            )
             if exposure.learned:
                 loss = loss + exposure.penalty(view) / self._batch
             if not losses:
@@ -281,8 +287,8 @@ class Stepper(Generic[M]):
             seen.append(rendering)
         return sum(losses[1:], start=losses[0]), seen
 
-    def _of_parameters(self, weights: Sequence[float], scale: float) -> None:
-        value = self._objective.of_parameters(self._model, weights, scale)
+    def _of_parameters(self, weights: Sequence[float], scale: float, *, decayed: bool) -> None:
+        value = self._objective.of_parameters(self._model, weights, scale, decayed=decayed)
         if value is not None:
             value.backward()
 

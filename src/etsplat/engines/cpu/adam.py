@@ -9,6 +9,7 @@ from etsplat.engines.reference.steps import AdamGroup
 def adam_step(
     groups: Sequence[AdamGroup],
     learning_rates: Sequence[float],
+    decays: Sequence[float],
     betas: tuple[float, float],
     eps: float,
     step_count: int,
@@ -22,6 +23,7 @@ def adam_step(
         seconds=seconds,
         paces=paces,
         learning_rates=learning_rates,
+        decays=decays,
         beta1=betas[0],
         beta2=betas[1],
         eps=eps,

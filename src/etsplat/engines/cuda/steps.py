@@ -12,7 +12,7 @@ from etsplat.engines.cuda.capacity import overflow_flag, repair_overflow
 from etsplat.engines.cuda.launch import backend, blocks, launch, launch_each, upload
 from etsplat.engines.cuda.program import Program
 from etsplat.engines.cuda.structs import constant, struct_class
-from etsplat.engines.reference.steps import AdamGroup, step_rates
+from etsplat.engines.reference.steps import AdamGroup, decayed, step_rates
 
 _ADAM = Program("adam.cu", contract=False)
 _STATISTICS = Program("soup_statistics.cu", contract=False)
@@ -23,11 +23,13 @@ _ADAM_THREADS, _ADAM_ELEMENTS = (constant("cuda/adam.cu", name) for name in ("kT
 def adam_step(
     groups: Sequence[AdamGroup],
     learning_rates: Sequence[float],
+    decays: Sequence[float],
     betas: tuple[float, float],
     eps: float,
     step_count: int,
 ) -> None:
     """See `Engine.adam_step`."""
+    groups = [decayed(group, decay) for group, decay in zip(groups, decays, strict=True)]
     rates = upload(step_rates(learning_rates, betas, step_count), groups[0][0].device)
     CudaQueuedSteps.adam_step(groups, rates, betas, eps, None)
 

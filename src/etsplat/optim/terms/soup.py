@@ -86,6 +86,7 @@ class Harmonics(Term):
 
     name = "harmonics"
     looks_at = "parameters"
+    squares = "sh_rest"
 
     def __call__(self, drawing: Drawing) -> Float[Tensor, ""]:
         """Of the soup."""
