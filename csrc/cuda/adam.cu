@@ -37,8 +37,13 @@ extern "C" __global__ void adam_step(AdamParameters parameters, int count, const
     float *value = parameters.values[p], *first = parameters.firsts[p], *second = parameters.seconds[p];
     const float* gradient = parameters.gradients[p];
     const long long begin = block * kElements, left = parameters.sizes[p] - begin;
-    const int width = parameters.widths[p], within = static_cast<int>(begin % width);  // place in its row where the block begins
-    if (pace) pace += begin / width;
+    const int width = parameters.widths[p];
+    int within = 0;  // of a row with a pace: the place where the block begins
+    if (pace) {
+        const long long row = begin / width;
+        within = static_cast<int>(begin - row * width);
+        pace += row;
+    }
     for (int i = threadIdx.x; i < kElements; i += kThreads) {
         if (i >= left) break;
         if (pace) k.step_size = step_size * pace[static_cast<unsigned>(within + i) / static_cast<unsigned>(width)];
