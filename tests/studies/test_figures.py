@@ -13,7 +13,7 @@ from etsplat.tasks.train import train
 from etsplat.tasks.train_config import TrainConfig
 from helpers.captures import write_colmap
 from studies.drawings.dead_zone import pull, remaining_distance
-from studies.drawings.growth import TILE, save_growth, watch_growth
+from studies.drawings.growth import SCENE_SIZE, TILE, save_growth, watch_growth, watch_scene
 from studies.drawings.kernels import FIGURES, draw_edges
 from studies.drawings.teaser import draw_teaser
 from studies.figures import Figures
@@ -41,7 +41,7 @@ def test_the_growing_object_is_watched_from_all_around(tmp_path: Path) -> None:
     frames = watch_growth(tiny, 4)
     assert [frame.iteration for frame in frames] == [0, 1, 4, 9]
     assert float(frames[0].splatted.std(dim=2).max()) < 1e-3 < float(frames[-1].splatted.std(dim=2).max())
-    assert all(float(frame.shape.std()) > 0.02 for frame in frames)
+    assert all(float(frame.beside.std()) > 0.02 for frame in frames)
     save_growth(tmp_path / "owl.webp", frames)
     with Image.open(tmp_path / "owl.webp") as film:
         assert getattr(film, "n_frames", 1) == 4
@@ -49,6 +49,18 @@ def test_the_growing_object_is_watched_from_all_around(tmp_path: Path) -> None:
         film.seek(3)
         film.load()
         assert film.info["duration"] > 1000
+
+
+def test_the_growing_scene_comes_closer_to_what_a_camera_sees_there(tmp_path: Path) -> None:
+    """Of each frame, whose camera is another: the photo beside it is what a right scene would look like."""
+    frames = watch_scene(TrainConfig.tiny().changed({"iterations": 40}), 3)
+    assert [frame.iteration for frame in frames] == [0, 10, 40]
+    first, last = (float((frame.splatted - frame.beside).square().mean()) for frame in (frames[0], frames[-1]))
+    assert last < 0.7 * first
+    assert float((frames[0].beside - frames[-1].beside).abs().mean()) > 0.02
+    save_growth(tmp_path / "scene.webp", frames)
+    with Image.open(tmp_path / "scene.webp") as film:
+        assert film.size == (2 * SCENE_SIZE[0], SCENE_SIZE[1])
 
 
 def test_every_kernel_pulls_an_overlapping_triangle_back() -> None:
