@@ -85,8 +85,8 @@ class Adam:
         """Update every parameter from its gradient.
 
         Args:
-            decays: By name of a parameter, how many times the parameter itself is added to its gradient: 2 c for a
-                term c |p|^2 of what is minimised, whose gradient then takes no memory of its own.
+            decays: By name of a parameter, how many times the parameter itself is added to its gradient: 2 c where c
+                times the sum of its squares is minimised, whose gradient then takes no memory of its own.
 
         Raises:
             ValueError: A parameter without gradient or without a place for each element, paces that do not fit it, or a
