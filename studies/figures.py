@@ -12,6 +12,8 @@ from studies.study import Study
 
 Name = Literal["kernels", "edges", "soft-triangle", "axes", "dead-zone", "growth", "scene-growth", "teaser"]
 
+_MOVING = ("growth", "scene-growth")
+
 
 @dataclass(frozen=True, kw_only=True)
 class Figures(Study):
@@ -43,7 +45,7 @@ class Figures(Study):
         from etsplat.io.atomic import atomic_write
         from etsplat.io.paths import kind_of
 
-        kinds = (".webp",) if self.name in ("growth", "scene-growth") else (".png", ".pdf", ".svg")
+        kinds = (".webp",) if self.name in _MOVING else (".png", ".pdf", ".svg")
         path = self.out or Path(f"{self.name}{kinds[0]}")
         if kind_of(path) not in kinds:
             raise InputError(f"{path}: unknown kind of picture; end the name in {' or '.join(kinds)}")
@@ -59,7 +61,7 @@ class Figures(Study):
         from studies.drawings.kernels import FIGURES
         from studies.drawings.teaser import draw_teaser
 
-        if self.name in ("growth", "scene-growth"):
+        if self.name in _MOVING:
             save_growth(path, watch_growth() if self.name == "growth" else watch_scene())
             return
         figure = draw_teaser(self.runs) if self.name == "teaser" else FIGURES[self.name]()

@@ -28,36 +28,32 @@ struct AdamGroup {
     int64_t piece() const { return paces ? std::max(width, kPiece / width * width) : kPiece; }
 };
 
-void adam_range(const AdamGroup& group, int64_t begin, int64_t end) {
-    float* __restrict parameter = group.parameter;
-    const float* __restrict gradient = group.gradient;
-    float* __restrict first = group.first;
-    float* __restrict second = group.second;
-    const AdamCoefficients<float> coefficients = group.coefficients;
+// Elements [begin, begin + count); size(i) is how far the i-th of these goes.
+template <class Size>
+void update(const AdamGroup& group, int64_t begin, int64_t count, const Size& size) {
+    float* __restrict parameter = group.parameter + begin;
+    const float* __restrict gradient = group.gradient + begin;
+    float* __restrict first = group.first + begin;
+    float* __restrict second = group.second + begin;
+    AdamCoefficients<float> own = group.coefficients;
     const float decay = group.decay;
-    if (decay == 0.0f) {
-        for (int64_t i = begin; i < end; ++i)
-            adam_update(parameter[i], first[i], second[i], gradient[i], coefficients);
-    } else {
-        for (int64_t i = begin; i < end; ++i)
-            adam_update(parameter[i], first[i], second[i], gradient[i] + decay * parameter[i], coefficients);
+    for (int64_t i = 0; i < count; ++i) {
+        own.step_size = size(i);
+        const float whole = decay == 0.0f ? gradient[i] : gradient[i] + decay * parameter[i];
+        adam_update(parameter[i], first[i], second[i], whole, own);
     }
 }
 
 // The same where rows have paces; `begin` is that of a row.
-void paced_range(const AdamGroup& group, int64_t begin, int64_t end) {
-    float* __restrict parameter = group.parameter;
-    const float* __restrict gradient = group.gradient;
-    float* __restrict first = group.first;
-    float* __restrict second = group.second;
-    const AdamCoefficients<float> coefficients = group.coefficients;
-    float sizes[kTogether];
+void update_paced(const AdamGroup& group, int64_t begin, int64_t end) {
+    const float usual = group.coefficients.step_size;
     const float* pace = group.paces + begin / group.width;
+    float sizes[kTogether];
     for (int64_t left = group.width; begin < end;) {  // of the row at hand
         const int64_t count = std::min(kTogether, end - begin);
         for (int64_t filled = 0; filled < count;) {
             const int64_t same = std::min(left, count - filled);
-            std::fill_n(sizes + filled, same, coefficients.step_size * *pace);
+            std::fill_n(sizes + filled, same, usual * *pace);
             filled += same;
             left -= same;
             if (left == 0) {
@@ -65,13 +61,7 @@ void paced_range(const AdamGroup& group, int64_t begin, int64_t end) {
                 ++pace;
             }
         }
-        for (int64_t i = 0; i < count; ++i) {
-            AdamCoefficients<float> own = coefficients;
-            own.step_size = sizes[i];
-            const int64_t k = begin + i;
-            const float whole = group.decay == 0.0f ? gradient[k] : gradient[k] + group.decay * parameter[k];
-            adam_update(parameter[k], first[k], second[k], whole, own);
-        }
+        update(group, begin, count, [&](int64_t i) { return sizes[i]; });
         begin += count;
     }
 }
@@ -88,7 +78,9 @@ void adam_step(const std::vector<AdamGroup>& groups) {
     parallel_for(static_cast<int64_t>(pieces.size()), 1, [&](int64_t begin, int64_t end) {
         for (int64_t i = begin; i < end; ++i) {
             const auto& [group, first] = pieces[i];
-            (group->paces ? paced_range : adam_range)(*group, first, std::min(first + group->piece(), group->size));
+            const int64_t last = std::min(first + group->piece(), group->size);
+            if (group->paces) update_paced(*group, first, last);
+            else update(*group, first, last - first, [&](int64_t) { return group->coefficients.step_size; });
         }
     });
 }

@@ -18,6 +18,7 @@ from etsplat.tasks.train_memory import (
     PASSING,
     PLANNED,
     STATISTICS,
+    bytes_around,
     bytes_of_values,
     bytes_per_triangle,
     check_memory,
@@ -63,8 +64,8 @@ def test_memory_is_linear_in_triangles_and_photos(capture: Dataset) -> None:
 
 def test_triangles_around_a_run_count_and_more_where_they_are_recolored(capture: Dataset) -> None:
     """Their values, corners in the frame of the run, what comes and goes; of plain colours that learn five copies."""
-    alone, among = memory_of(capture, SHORT, 600, CPU), memory_of(capture, SHORT, 600, CPU, 1000)
-    recolored = memory_of(capture, SHORT, 600, CPU, 1000, recolors=True)
+    others = (0, bytes_around(1000, 1), bytes_around(1000, 1, recolored=True))
+    alone, among, recolored = (memory_of(capture, SHORT, 600, CPU, around) for around in others)
     assert among.total - alone.total == 1000 * (bytes_of_values(1) + 36 + PASSING)
     assert recolored.total - among.total == 1000 * 5 * 12
 

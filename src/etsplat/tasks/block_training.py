@@ -32,7 +32,7 @@ from etsplat.tasks.scoring import Scorer
 from etsplat.tasks.soup_trainer import background_of
 from etsplat.tasks.train_checks import triangle_limit
 from etsplat.tasks.train_config import TrainConfig
-from etsplat.tasks.train_memory import bytes_of_values, check_memory, in_words, memory_of
+from etsplat.tasks.train_memory import bytes_around, bytes_of_values, check_memory, in_words, memory_of
 
 FOLDER, COARSE, SKY = "blocks", "coarse", "sky"
 """In the run's folder: the runs of the blocks, and those of the coarse soup and of the sky among them."""
@@ -254,12 +254,15 @@ def _check(
     asset: bool,
 ) -> list[str]:
     """What the owner of the runs should know. Raises InputError where there is too little memory for one of them."""
-    needed = [check_memory(part, each, each.max_triangles, device, coarse.max_triangles) for part in parts]
+    degree = each.drawing.sh_degree
+    beside = bytes_around(coarse.max_triangles, degree)
+    needed = [check_memory(part, each, each.max_triangles, device, beside) for part in parts]
     most, all_blocks = max(needed, key=lambda memory: memory.total), len(parts) * each.max_triangles
-    result = 2 * all_blocks * bytes_of_values(each.drawing.sh_degree)
+    result = 2 * all_blocks * bytes_of_values(degree)
     if coarse.sky != "none":
         last = _of_sky(each, coarse)
-        sky = memory_of(thin, last, last.max_triangles, device, all_blocks, recolors=True)
+        ground = bytes_around(all_blocks, degree, recolored=True)
+        sky = memory_of(thin, last, last.max_triangles, device, ground)
         result = max(result, sky.total - sky.kept)  # its photos are streamed, or there already
     if result > (free := available_memory()):
         raise InputError(

@@ -34,6 +34,7 @@ from etsplat.tasks.soup_trainer import background_of, start_trainer
 from etsplat.tasks.sources import SoupRun, load_scene, with_cloud
 from etsplat.tasks.train_checks import check_train, doubtful_scale, triangle_limit
 from etsplat.tasks.train_config import TrainConfig
+from etsplat.tasks.train_memory import bytes_around
 
 Onlooker = Callable[[Dataset, int, Callable[[], TriangleSoup]], None]
 """Called with the capture, in its own units; iterations done; and what gives a copy of the soup as it is now, in these
@@ -157,8 +158,9 @@ def _fit(
     frame = own.frame if part is None else part.frame
     capture = own.renormalized(frame.center, frame.radius) if config.normalize else own
     iterations = limited_iterations(config.iterations, config.schedule.max_epochs, len(own.train), config.batch)
-    around, recolors = (0, False) if part is None else (len(part.rest), part.recolors)
-    for note in (*own.notes, *check_train(own, config, iterations, job.device, around, recolors=recolors)):
+    degree = config.drawing.sh_degree
+    around = 0 if part is None else bytes_around(len(part.rest), degree, recolored=part.recolors)
+    for note in (*own.notes, *check_train(own, config, iterations, job.device, around)):
         job.announce(NoteEvent(note))
     hashes = {"fingerprint": own.fingerprint(), **({} if part is None else {"part": part.digest()})}
     job.identify(hashes, paths, iterations)

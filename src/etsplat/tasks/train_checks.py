@@ -12,13 +12,7 @@ USUAL_EXTENT = (0.5, 50.0)
 
 
 def check_train(
-    capture: Dataset,
-    config: TrainConfig,
-    iterations: int,
-    device: torch.device,
-    around: int = 0,
-    *,
-    recolors: bool = False,
+    capture: Dataset, config: TrainConfig, iterations: int, device: torch.device, around: int = 0
 ) -> list[str]:
     """Refuses what cannot work; returns what the owner of a run of so many iterations should know.
 
@@ -27,12 +21,11 @@ def check_train(
         config: settings.
         iterations: of the run.
         device: where it runs.
-        around: triangles that are drawn as well and stay where they are.
-        recolors: their plain colours learn.
+        around: bytes of triangles that are drawn as well (`bytes_around`).
     """
     if not capture.train:
         raise InputError("capture: has no view to train on; name some in its split")
-    needed = check_memory(capture, config, triangle_limit(capture, config), device, around, recolors=recolors)
+    needed = check_memory(capture, config, triangle_limit(capture, config), device, around)
     aside = f", {len(capture.watched)} to watch the run" if capture.watched else ""
     views = f"{len(capture.train)} photos to train on{aside}, {len(capture.test)} to test"
     notes = [f"{views}; {needed}"]

@@ -51,7 +51,7 @@ class TrainMemory:
         photos: how many there are.
         kept: of all photos that stay.
         pictures: of the pictures of a step.
-        around: of triangles that are drawn in them and do not learn.
+        around: of triangles that are drawn in them and stay where they are.
         pooled: what is kept for the next step, and of libraries.
     """
 
@@ -96,15 +96,13 @@ def bytes_of_values(sh_degree: int) -> int:
     return 4 * (9 + 1 + 1 + 3 * (sh_degree + 1) ** 2)
 
 
-def memory_of(
-    capture: Dataset,
-    config: TrainConfig,
-    most: int,
-    device: torch.device,
-    around: int = 0,
-    *,
-    recolors: bool = False,
-) -> TrainMemory:
+def bytes_around(triangles: int, sh_degree: int, *, recolored: bool = False) -> int:
+    """Bytes of triangles that are drawn as well and stay where they are; `recolored` if their plain colours learn."""
+    corners = 36  # once more, in the frame of the run
+    return triangles * (bytes_of_values(sh_degree) + corners + PASSING + (RECOLORED if recolored else 0))
+
+
+def memory_of(capture: Dataset, config: TrainConfig, most: int, device: torch.device, around: int = 0) -> TrainMemory:
     """What a run may come to need.
 
     Args:
@@ -112,8 +110,7 @@ def memory_of(
         config: settings.
         most: triangles that there may be.
         device: where it runs.
-        around: triangles that are drawn as well and stay where they are.
-        recolors: their plain colours learn.
+        around: as of `bytes_around`.
     """
     pixels = max(width * height for width, height in capture.images.sizes)
     points = config.start.points if capture.exact_points is None else len(capture.exact_points)
@@ -124,19 +121,11 @@ def memory_of(
     on_cpu = device.type == "cpu"
     pooled = LIBRARIES + (min(POOLED, triangles * each // 4) if on_cpu else 0)
     each = each if on_cpu else max(each, ON_DEVICES)
-    corners = 36  # once more, in the frame of the run
-    beside = bytes_of_values(config.drawing.sh_degree) + corners + PASSING + (RECOLORED if recolors else 0)
-    return TrainMemory(triangles, each, len(capture), kept, pixels * BYTES_PER_PIXEL, around * beside, pooled)
+    return TrainMemory(triangles, each, len(capture), kept, pixels * BYTES_PER_PIXEL, around, pooled)
 
 
 def check_memory(
-    capture: Dataset,
-    config: TrainConfig,
-    most: int,
-    device: torch.device,
-    around: int = 0,
-    *,
-    recolors: bool = False,
+    capture: Dataset, config: TrainConfig, most: int, device: torch.device, around: int = 0
 ) -> TrainMemory:
     """What a run may come to need, where that is there.
 
@@ -146,12 +135,11 @@ def check_memory(
         most: as there.
         device: as there.
         around: as there.
-        recolors: as there.
 
     Raises:
         InputError: it is not; the message says what would fit.
     """
-    needed = memory_of(capture, config, most, device, around, recolors=recolors)
+    needed = memory_of(capture, config, most, device, around)
     if device.type == "cuda":
         free, there = torch.cuda.mem_get_info(device)[0], 0
     else:
