@@ -1,7 +1,8 @@
 // Memory for images that comes back when the last tensor that uses it dies.
 //
 // A large tensor made by malloc is new to the process: its first write costs a page fault every 4 KiB, together more
-// than some kernels. A step of training asks for the same sizes again and again, so their blocks are kept.
+// than some kernels. A step of training asks for nearly the same sizes again and again, so their blocks are kept, and
+// those that nobody has asked for lately are not.
 #pragma once
 
 #include <cstddef>

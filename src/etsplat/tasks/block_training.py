@@ -143,16 +143,16 @@ def train_blocks(
     with job.writing():
         done = _run(job, COARSE, coarse, thin.halved(), None, fit)
         runs, whole = [done.giving(done.soup)], _whole(own, done.soup, job.run.path / FOLDER / COARSE)
-        soup, soups = whole.soup, dict[int, TriangleSoup]()
+        soup = whole.soup
         soup.save(job.run.soup_path)  # so that `etsplat view` has something to follow
         for block, capture in enumerate(parts):
             job.announce(NoteEvent(f"block {grid.name(block)}, {block + 1} of {len(grid)}: {_about(capture)}"))
             done = _run(job, grid.name(block), each, capture, _part(own, grid, block, whole), fit)
-            soups[block] = done.soup.kept((_owners(own, grid, done.soup) == block) & ~whole.on_sky(done.soup))
-            runs.append(done.giving(soups[block]))
-            soup = _merged(own, grid, whole, soups)
+            its_own = done.soup.kept((_owners(own, grid, done.soup) == block) & ~whole.on_sky(done.soup))
+            runs.append(done.giving(its_own))
+            soup = _joined([soup.kept((_owners(own, grid, soup) != block) | whole.on_sky(soup)), its_own], whole)
             soup.save(job.run.soup_path)
-        soups.clear()  # all of it is in the soup, and then in its two parts; the last run needs the room
+            del done, its_own  # the next run needs the room
         on_sky = whole.on_sky(soup)
         ground, sky = soup.kept(~on_sky), soup.kept(on_sky)
         del soup
@@ -162,13 +162,6 @@ def train_blocks(
         soup = _joined([ground, sky], whole)
         soup.save(job.run.soup_path)
         return soup, _conclude(job, own, soup, runs, config)
-
-
-def _merged(own: Dataset, grid: Grid, whole: _Whole, soups: dict[int, TriangleSoup]) -> TriangleSoup:
-    """The blocks that are done, and of the coarse soup what lies in the others, and the sky."""
-    missing = torch.tensor([block not in soups for block in range(len(grid))])
-    rest = whole.soup.kept(missing[_owners(own, grid, whole.soup)] | whole.on_sky(whole.soup))
-    return _joined([rest, *(soups[block] for block in sorted(soups))], whole)
 
 
 def _joined(soups: Sequence[TriangleSoup], whole: _Whole) -> TriangleSoup:
