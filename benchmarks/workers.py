@@ -16,6 +16,10 @@ coefficients, have as many cores as a worker has, all else one. A step has a bro
 small numbers, one for each view of a worker and one more. One process neither packs nor unpacks. Messages, all but the
 last of each worker, travel while its next view is drawn: of their time so much is taken off again as drawing takes.
 
+Last it answers when one worker for each of a machine's nodes of memory (NUMA) is better than one process on all cores:
+by how many times memory of other nodes would have to slow drawing down there, for both to take as long. Messages
+between workers cost their packing alone, which is in favour of workers.
+
 With --check steps are made by one process and by two, and the processor's time of a step, and the bytes, are compared
 with what the model says of them. What sending while the next view is drawn gives is seen by the clock, on a network as
 slow as one says, of which both directions go through the same loopback (Linux):
@@ -56,6 +60,9 @@ STEPS, ROUNDS = 4, 15
 WORKERS = (1, 2, 4, 8, 16, 32, 64)
 NETWORKS = (1, 10, 100)
 """Gbit/s."""
+
+NODES = ((2, 2), (2, 8), (4, 4), (4, 16))
+"""Of memory on one machine, and views of a step, of a question that is asked of the model."""
 
 LATENCY = 50e-6
 """Seconds of a hop of a message, a stated number as the networks' are."""
@@ -117,7 +124,8 @@ def message_of(trainer: Trainer[Any], iteration: int) -> Tensor:
     """What a view of a step sends: that of a step of two views, in which only the first is drawn."""
     recorder, honest, stepper = Recorder(), shared_steps.owners, trainer._stepper
     weights = stepper._objective.weights(iteration)
-    apart = shared_steps.Apart(trainer.model.COLORED, partial(stepper._of_parameters, weights, 1.0))
+    alone = partial(stepper._of_parameters, weights, 1.0, decayed=True)
+    apart = shared_steps.Apart(trainer.model.COLORED, alone)
     shared_steps.owners = lambda views, count: [0, 1]
     try:
         draw = drawing(trainer, iteration)
@@ -132,12 +140,14 @@ def drawing(trainer: Trainer[Any], iteration: int) -> shared_steps.Gradients:
     stepper = trainer._stepper
     chosen, weights = stepper._choose()[0], stepper._objective.weights(iteration)
     views = [(stepper._loader.view(chosen.view), chosen.background)]
-    return lambda places: stepper._gradients(views, weights, 1.0, moving=False, first=places.start, separate=True)
+    options = {"moving": False, "separate": True, "decayed": True}
+    return lambda places: stepper._gradients(views, weights, 1.0, first=places.start, **options)
 
 
 def measure(trainer: Trainer[Any], config: TrainConfig) -> dict[str, float]:
     """Seconds of a core and bytes, each of one view; those of parameters and Adam of a step."""
     iteration, model, stepper = config.iterations, trainer.model, trainer._stepper
+    weights = stepper._objective.weights(iteration)
     stepper.arrive(iteration)
     messages = [message_of(trainer, iteration) for _ in range(4)]
     tensors = shared_steps.unpack(messages[0])
@@ -158,13 +168,14 @@ def measure(trainer: Trainer[Any], config: TrainConfig) -> dict[str, float]:
         "pack": seconds(lambda: shared_steps.pack(tensors), 5),
         "unpack": seconds(lambda: shared_steps.unpack(messages[0]), 5),
         "add": seconds(lambda: [total.add_(each) for total, each in zip(sums, gradients, strict=True)], 5),
-        "parameters": seconds(partial(stepper._of_parameters, stepper._objective.weights(iteration), 1.0), 5),
+        "parameters": seconds(partial(stepper._of_parameters, weights, 1.0, decayed=True), 5),
         "bytes": sum(map(len, messages)) / len(messages),
         "shown": float(tensors["seen.statistics.visible"].float().mean()),
     }
     for parameter in trainer.adam.parameters.values():
         parameter.grad = torch.zeros_like(parameter)
-    return {**cost, "adam": seconds(trainer.adam.step, 5)}
+    step = partial(trainer.adam.step, stepper._objective.decays(model, weights, 1.0))
+    return {**cost, "adam": seconds(step, 5)}
 
 
 def computed(found: Mapping[str, float], views: int, workers: int, cores: int) -> float:
@@ -185,6 +196,13 @@ def modelled(
     sending = traffic.received * found["bytes"] * 8 / (gigabits * 1e9) + traffic.calls * traffic.hops * LATENCY
     whole, drawn = computed(found, views, workers, cores) + sending, share * found["view"] / cores
     return whole if late else whole - min(sending, drawn) * (share - 1) / share
+
+
+def break_even(found: Mapping[str, float], views: int, nodes: int, cores: int) -> float:
+    """How much slower one process on all nodes must draw, for a worker on the cores of each node to be as fast."""
+    apart = computed(found, views, nodes, cores)
+    whole = computed(found, views, 1, nodes * cores)
+    return 1 + (apart - whole) * nodes * cores / (views * found["view"])
 
 
 def steps_of(rank: int, count: int, arguments: argparse.Namespace, place: str, pipe: Any) -> None:
@@ -298,6 +316,12 @@ def main() -> None:
             views, about = each * workers, (found, each * workers, workers, arguments.cores)
             rates = [[views / modelled(*about, speed, late=late) for late in (False, True)] for speed in NETWORKS]
             print(f"| {workers} | " + " | ".join(f"{one:.1f} ({other:.1f})" for one, other in rates) + " |")
+    print("\nModel: how many times slower one process on all nodes must draw, for one worker on each to be as fast\n")
+    print("| cores of a node | " + " | ".join(f"{nodes} nodes, {views} views" for nodes, views in NODES) + " |")
+    print("| --: |" + " --: |" * len(NODES))
+    for cores in (4, 8, 16, 32, 64):
+        times = [break_even(found, views, nodes, cores) for nodes, views in NODES]
+        print(f"| {cores} | " + " | ".join(f"{each:.2f}" for each in times) + " |")
 
 
 if __name__ == "__main__":

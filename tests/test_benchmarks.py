@@ -1,5 +1,6 @@
 """The numbers that the benchmarks report mean what they say."""
 
+import argparse
 import json
 import os
 import subprocess
@@ -23,11 +24,13 @@ from benchmarks import (
     rasterizer,
     scenes,
     tables,
+    workers,
 )
 from benchmarks.measure import native_state
 from etsplat import _native, rasterize
 from etsplat.core.cameras import Cameras
 from etsplat.data.demo_scene import demo_scene
+from etsplat.engines.threads import one_torch_thread
 from etsplat.tasks.train_config import TrainConfig
 from helpers.captures import small_demo_scene
 from helpers.scenes import mesh
@@ -222,3 +225,16 @@ def test_opaque_meshes_are_compared_from_the_same_soup(tmp_path):
     assert kept == {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.safetensors")}
     assert torch.equal(first.vertices, again.vertices)
     assert torch.equal(first.colors, again.colors)
+
+
+def test_workers_are_as_fast_as_one_process_that_draws_so_much_slower():
+    """What a run on several nodes of memory is asked by; every part of a step is measured on a real one."""
+    arguments = argparse.Namespace(scene=None, triangles=300, width=32, views=2)
+    with one_torch_thread():
+        found = workers.measure(*workers.start(arguments))
+    assert all(value > 0 for value in found.values()), found
+    for nodes, views, cores in ((2, 2, 8), (4, 16, 4)):
+        slower = workers.break_even(found, views, nodes, cores)
+        slowed = {**found, "view": slower * found["view"]}
+        apart = workers.computed(found, views, nodes, cores)
+        assert workers.computed(slowed, views, 1, nodes * cores) == pytest.approx(apart)
