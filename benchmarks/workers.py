@@ -144,6 +144,12 @@ def drawing(trainer: Trainer[Any], iteration: int) -> shared_steps.Gradients:
     return lambda places: stepper._gradients(views, weights, 1.0, first=places.start, **options)
 
 
+def drawn(trainer: Trainer[Any], iteration: int) -> None:
+    """The next view, and its gradients up to the colours of triangles."""
+    with EndAtColors(*(getattr(trainer.model, name) for name in trainer.model.COLORED)):
+        drawing(trainer, iteration)(range(1))
+
+
 def measure(trainer: Trainer[Any], config: TrainConfig) -> dict[str, float]:
     """Seconds of a core and bytes, each of one view; those of parameters and Adam of a step."""
     iteration, model, stepper = config.iterations, trainer.model, trainer._stepper
@@ -156,14 +162,8 @@ def measure(trainer: Trainer[Any], config: TrainConfig) -> dict[str, float]:
     by_colors = partial(colors_backward, tensors["colors"][None], *colored, tensors["center"], int(tensors["degree"]))
     more = [torch.zeros_like(tensor) for tensor in by_colors()]
     sums, gradients = [*sums, *more], [*gradients, *by_colors()]
-    draw = drawing(trainer, iteration)
-
-    def view() -> None:
-        with EndAtColors(*colored):
-            draw(range(1))
-
     cost = {
-        "view": seconds(view, 4),
+        "view": seconds(partial(drawn, trainer, iteration), 4),
         "colors": seconds(by_colors, 5),
         "pack": seconds(lambda: shared_steps.pack(tensors), 5),
         "unpack": seconds(lambda: shared_steps.unpack(messages[0]), 5),
@@ -292,10 +292,16 @@ def main() -> None:
     parser.add_argument("--cores", type=int, default=8, help="of each worker, in the model")
     parser.add_argument("--check", action="store_true", help="compare with one process and two")
     parser.add_argument("--views", type=int, default=2, help="of a step of a check")
+    parser.add_argument("--draw", type=int, metavar="VIEWS", help="only draw, for tools that count")
     arguments = parser.parse_args()
     set_num_threads(1)
     trainer, config = start(arguments)
     with one_torch_thread():
+        if arguments.draw is not None:
+            trainer._stepper.arrive(config.iterations)
+            for _ in range(arguments.draw):
+                drawn(trainer, config.iterations)
+            return
         found = measure(trainer, config)
     print(description())
     count, (width, height) = trainer.count, trainer._dataset.images.sizes[0]
