@@ -132,6 +132,16 @@ def cuda_device(cuda_engine: str) -> torch.device:
 
 
 @pytest.fixture
+def looks_like_a_class() -> object:
+    """As `list[int]` does on Python 3.10: `isinstance` takes it for a type, and `issubclass` refuses it."""
+
+    class Alias:
+        __class__ = property(lambda self: type)
+
+    return Alias()
+
+
+@pytest.fixture
 def rng() -> torch.Generator:
     """A generator that starts alike in every test."""
     return torch.Generator().manual_seed(20261121)
