@@ -150,7 +150,7 @@ def rng() -> torch.Generator:
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
     """Folder of the real input, or a skip that says where it is looked for."""
-    path = REPOSITORY.parent / "shared" / "data"
-    if not path.is_dir():
-        pytest.skip("real input ../shared/data is not there")
-    return path
+    for path in (REPOSITORY / "data", REPOSITORY.parent / "shared" / "data"):
+        if all((path / name).is_dir() for name in ("famous", "objects", "scenes")):
+            return path
+    pytest.skip("real input is not there: data/ with famous, objects and scenes")
