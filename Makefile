@@ -20,7 +20,7 @@ SANITIZED := build/sanitize/.stamp
 NATIVE := CMakeLists.txt $(shell find csrc)
 
 .PHONY: help setup demo test lint docs format stubs bench equal-bits fuzz fuzz-short sanitize races soak lock audit \
-	ptx check-neon wheel check-wheel check-sdist wheels clean
+	ptx check-neon wheel check-wheel check-sdist check-dockerfile wheels clean
 
 help:
 	@echo "make setup        create .venv and build the package into it"
@@ -40,6 +40,7 @@ help:
 	@echo "make check-neon   run the rasterizer's NEON path under QEMU (AArch64 cross compiler)"
 	@echo "make check-wheel  build the wheel, install it into an empty environment, run a tiny demo; WHEEL=FILE for another, TORCH=2.6.0"
 	@echo "make check-sdist  the same from the source distribution"
+	@echo "make check-dockerfile  run the Dockerfile in chroots, as root, where debootstrap is; IMAGE='EXTRAS=cuda,sfm' for other arguments"
 	@echo "make wheels       wheels of every platform by Zig's compilers, under dist/wheels (Python 3.12 or newer); WHEELS='macos-arm64' for one"
 	@echo "make clean        remove .venv, build, dist and caches"
 
@@ -230,6 +231,11 @@ check-sdist: $(TOOLS)
 	cd build/sdist-check && venv/bin/etsplat demo --out demo --preset tiny
 	test -s build/sdist-check/demo/report.html
 	rm -rf build/sdist-check
+
+# Every line of the Dockerfile where there is no Docker, and what the image is for (release/dockerfile.py).
+IMAGE ?=
+check-dockerfile:
+	$(PYTHON) release/dockerfile.py build/image $(IMAGE)
 
 # They hold nanobind, so they need no other compiler's exceptions to be theirs; in an environment of its own, without torch.
 WHEELS ?=

@@ -1,6 +1,6 @@
 """Depth maps and dense clouds, right and wrong ones, in runs of objects whose surface is known.
 
-python -m benchmarks.depth_maps ../shared/data/objects/mug ... --work runs/depths --iterations 500
+python -m benchmarks.depth_maps data/objects/mug ... --work runs/depths --iterations 500
 
 Maps are drawn from the true surface by the z-buffer and written beside links to the photos, or a cloud of points of it;
 then the command line is run as a user would, and test views are compared with the true depth.

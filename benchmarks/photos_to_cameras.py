@@ -2,7 +2,7 @@
 
 python -m benchmarks.photos_to_cameras kitchen25 --inputs plain phones video --mappers incremental global
 
-Scenes are those of `../shared/data/scenes`. Their cameras are what is compared with, after a similarity: places in
+Scenes are those of `data/scenes`. Their cameras are what is compared with, after a similarity: places in
 parts of the root mean square distance of the cameras from their middle, angles in degrees.
 
 plain   the photos in one folder

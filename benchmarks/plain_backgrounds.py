@@ -2,9 +2,9 @@
 
 python -m benchmarks.plain_backgrounds
 
-Every fourth training view of the objects in `../shared/data/objects` before five backgrounds, with noise, as JPEG of
+Every fourth training view of the objects in `data/objects` before five backgrounds, with noise, as JPEG of
 quality 92: intersection over union with their alpha, mean and smallest. And of every third photo, at most twelve, of
-each scene in `../shared/data/scenes`: how many are refused. All should be but those of lego, which is before white.
+each scene in `data/scenes`: how many are refused. All should be but those of lego, which is before white.
 """
 
 import io

@@ -1,7 +1,7 @@
 """What refining cameras does to runs whose poses are right, or wrong on purpose: a table for research/results.md.
 
-python -m benchmarks.poor_poses ../shared/data/scenes/fox --work runs/poses
-python -m benchmarks.poor_poses ../shared/data/objects/mug --task reconstruct --triangles 3000 --work runs/poses
+python -m benchmarks.poor_poses data/scenes/fox --work runs/poses
+python -m benchmarks.poor_poses data/objects/mug --task reconstruct --triangles 3000 --work runs/poses
 
 Every camera, those of test photos too, is turned by 0.5 degrees about a random axis and shifted by 1 % of its distance
 in a random direction. Poses are compared with the right ones after the similarity that fits the centres best; test

@@ -1,4 +1,4 @@
-"""The throw-away prototype of ../shared/prototypes as a yardstick, where that folder is there."""
+"""The throw-away prototype of the rasterizer as a yardstick, where it lies beside the checkout; it is not published."""
 
 import os
 import re
@@ -25,7 +25,7 @@ class Prototype:
     def _build(self) -> str:
         compiler = os.environ.get("CXX") or shutil.which("g++") or shutil.which("c++")
         if not SOURCE.exists():
-            return "../shared/prototypes/cpu_splat.cpp is not there"
+            return f"{SOURCE.name} is not there"
         if compiler is None:
             return "no C++ compiler"
         BUILD.mkdir(parents=True, exist_ok=True)

@@ -3,7 +3,7 @@
 python -m benchmarks.rasterizer                              every scene, one thread and all
 python -m benchmarks.rasterizer --scene sphere6 --instruction-set all --repeats 10
 
-Spheres are compared with the prototype in ../shared/prototypes, where that is there: it is built into build/bench and
+Spheres are compared with the prototype (`prototype.py`), where that is there: it is built into build/bench and
 run in turn with the engine, so that both see the same moods of the machine. A turn is three timed repetitions of each.
 Scenes with colours at the vertices ("sphere6-vertex") are compared with themselves under constant colours, in turn too,
 and those with a kernel that is registered from Python ("sphere6-registered") with themselves under the built-in one.

@@ -86,7 +86,7 @@ def load(name: str) -> Scene:
 
 
 def displaced_sphere(level: int) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """A bumpy icosphere, 20 * 4^level faces; formula and camera of ../shared/prototypes/cpu_splat.cpp."""
+    """A bumpy icosphere, 20 * 4^level faces; formula and camera of the prototype."""
     vertices, faces = icosphere(level)
     # turned so that a pole goes to (0, 1, golden ratio) and a neighbour of it to (0, -1, golden ratio)
     golden = (1 + math.sqrt(5)) / 2

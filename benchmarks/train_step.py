@@ -1,6 +1,6 @@
 """Milliseconds of a training step of novel-view synthesis, the rasterizer's share, and that of each other part.
 
-python -m benchmarks.train_step ../shared/data/scenes/kitchen25 --triangles 100000 --width 800
+python -m benchmarks.train_step data/scenes/kitchen25 --triangles 100000 --width 800
 """
 
 import argparse

@@ -1,7 +1,7 @@
 """What a step of several workers sends, and a model of how long it takes on networks of a stated speed.
 
 python -m benchmarks.workers --triangles 50000 --width 640
-python -m benchmarks.workers ../shared/data/scenes/kitchen25 --triangles 100000 --width 800 --cores 16
+python -m benchmarks.workers data/scenes/kitchen25 --triangles 100000 --width 800 --cores 16
 
     python -m benchmarks.workers --check --triangles 20000 --width 320
 

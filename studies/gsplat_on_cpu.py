@@ -1,7 +1,7 @@
 r"""`python -m studies.nvs` with the peers 3dgs and 2dgs where there is no GPU: small pictures, a second or so a step.
 
     python -m studies.gsplat_on_cpu --methods elastic 3dgs 2dgs --set width=80,iterations=1000 \
-        --scenes ../shared/data/scenes/fox:indoor --out runs/peers
+        --scenes data/scenes/fox:indoor --out runs/peers
 
 What runs is gsplat 1.5.3 itself, its densification included, but for what it compiles for a GPU: projection and
 harmonics are replaced by its own PyTorch twins, the compositing by the functions below (equations of 3DGS and 2DGS,

@@ -73,6 +73,16 @@ def test_nothing_local_is_committed() -> None:
     assert [name for name in found if name != "tests/test_packaging.py"] == []
 
 
+def test_no_reader_is_sent_to_a_folder_that_only_its_authors_have() -> None:
+    """Pages, sources and what programs say of themselves name real input as research/README.md does: data/NAME."""
+    folders = ("docs", "research", "studies", "benchmarks", "examples", "src", "release", ".github")
+    pages = [*REPOSITORY.glob("*.*"), *(path for name in folders for path in (REPOSITORY / name).rglob("*"))]
+    texts = [path for path in pages if path.suffix in (".md", ".py", ".ipynb", ".toml", ".yml", ".yaml", ".sh")]
+    assert len(texts) > 300
+    named = re.compile(r"\.\./shared|shared/(?:data|prototypes|spec)")
+    assert [str(path) for path in texts if named.search(path.read_text(encoding="utf-8"))] == []
+
+
 @pytest.mark.parametrize(
     "page", sorted(REPOSITORY.glob("*.md")) + sorted(REPOSITORY.glob("[drs]*/*.md")), ids=lambda page: page.name
 )

@@ -1,4 +1,4 @@
-"""What makes wheels of other platforms (`make wheels`), as far as it can be tested without their compilers."""
+"""What makes wheels of other platforms and runs the Dockerfile, as far as can be tested without compilers and root."""
 
 import os
 import shutil
@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from release import wheels
+from release import dockerfile, wheels
 
 LINUX = wheels.PLATFORMS["linux-x64"]
 NAME = "etsplat-0.1.0-cp312-abi3-manylinux_2_24_x86_64.whl"
@@ -79,3 +79,61 @@ def test_headers_of_python_are_of_the_compilers_machine(tmp_path: Path) -> None:
     command = ["c++", "-std=c++17", "-fsyntax-only", f"-I{wheels.headers(tmp_path / 'include')}", str(source)]
     compiled = subprocess.run(command, capture_output=True, text=True, check=False)
     assert compiled.returncode == 0, compiled.stderr
+
+
+def a_stage(root: Path, monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, dockerfile.Stage, list[str]]]:
+    """Stages begin in empty folders, and what they would run is noted."""
+    ran: list[tuple[str, dockerfile.Stage, list[str]]] = []
+    (root / "base").mkdir()
+    monkeypatch.setattr(dockerfile, "base", lambda image, folder: root / "base")
+    monkeypatch.setattr(
+        dockerfile.Stage, "run", lambda stage, command, binds: ran.append((stage.root.name, stage, list(command)))
+    )
+    return ran
+
+
+def test_the_dockerfile_is_understood(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All of it: what is copied where, what runs in which stage and shell, and as whom its entry point does."""
+    ran = a_stage(tmp_path, monkeypatch)
+    text = (dockerfile.ROOT / "Dockerfile").read_text(encoding="utf-8")
+    made = text.replace("RUN python -m pip wheel", "WORKDIR /wheels\nCOPY LICENSE .\nRUN python -m pip wheel")
+    build, image = dockerfile.build(made, tmp_path, {"EXTRAS": "cuda"}, {})
+    assert (image.user, image.folder, image.entry, image.command) == (1000, "/data", ["etsplat"], ["--help"])
+    assert image.variables == {"EXTRAS": "cuda"}  # TORCH_INDEX has no value unless it is given one
+    assert [name for name, _, _ in ran] == ["build", "build", "image"]
+    assert [command[0] for _, _, command in ran] == ["/bin/bash", "/bin/bash", "/bin/sh"]
+    assert ran[2][2][2].endswith("&& useradd --create-home --uid 1000 etsplat")
+    assert "\\" not in ran[2][2][2]
+    assert (build.root / "source" / "src" / "etsplat" / "__init__.py").is_file()
+    assert not (build.root / "source" / "tests").exists()
+    assert {path.name for path in (image.root / "wheels").iterdir()} == {"LICENSE", "constraints.txt"}
+
+
+@pytest.mark.parametrize(
+    ("text", "given", "problem"),
+    [
+        ("FROM a\nVOLUME /data", {}, "VOLUME: this instruction"),
+        ("FROM a\nARG B=1", {"C": "2"}, "no ARG C"),
+        ("FROM a\nCOPY tests /tests", {}, "lets no such file through"),
+    ],
+)
+def test_what_the_dockerfile_cannot_have_here_is_refused(
+    text: str, given: dict[str, str], problem: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    a_stage(tmp_path, monkeypatch)
+    with pytest.raises(SystemExit, match=problem):
+        dockerfile.build(text, tmp_path, given, {})
+
+
+def test_an_image_that_nothing_stands_in_for_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(SystemExit, match="nothing stands in"):
+        dockerfile.base("node:22", tmp_path)
+
+
+def test_what_dockerignore_leaves_out_is_not_copied(tmp_path: Path) -> None:
+    """The last rule that names a file, or a folder around it, decides."""
+    (tmp_path / ".dockerignore").write_text("*\n!src\n!a.txt\n**/__pycache__\n**/*.so\n")
+    for name in ("a.txt", "b.txt", "src/c.py", "src/d/e.so", "src/d/__pycache__/f.pyc", "tests/g.py", "src/d.so.py"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    assert dockerfile.context(tmp_path) == ["a.txt", "src/c.py", "src/d.so.py"]

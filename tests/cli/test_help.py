@@ -5,13 +5,16 @@ import subprocess
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
+from types import SimpleNamespace
+from typing import TypeGuard, cast
 
 import docstring_parser
 import pytest
+import tyro
 
 from etsplat.cli.command import Command
 from etsplat.cli.doctor import Doctor
-from etsplat.cli.parse import COMMANDS, Group, parse
+from etsplat.cli.parse import COMMANDS, Group, _struct, parse
 from etsplat.tasks.export_config import ExportConfig
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.render_config import RenderConfig
@@ -85,6 +88,38 @@ def _commands(entries: Mapping[str, type[Command] | Group]) -> Iterator[type[Com
             yield from _commands(entry.commands)
         else:
             yield entry
+
+
+def test_help_says_what_must_be_given_and_nothing_else(capsys: pytest.CaptureFixture[str]) -> None:
+    """A command among others is required unless one is the default; no default is an empty word."""
+    groups = {(): Group("All.", COMMANDS)} | {(name,): group for name, group in COMMANDS.items() if _is_group(group)}
+    for words, group in groups.items():
+        text = _help_of(words, capsys)
+        assert ("(required)" in text) == (group.default is None)
+        assert (f"(default: {group.default})" in text) == (group.default is not None)
+        for name, entry in group.commands.items():
+            assert "(default: )" not in _help_of([*words, name], capsys)
+            if not _is_group(entry):
+                assert "(default: )" not in _help_of([*words, name, "--help-all"], capsys)
+    assert "(default: object)" in _help_of(["demo"], capsys)
+    assert "(required, one or more)" in _help_of(["sweep", "train"], capsys)
+
+
+def _is_group(entry: object) -> TypeGuard[Group]:
+    return isinstance(entry, Group)
+
+
+def _help_of(words: Sequence[str], capsys: pytest.CaptureFixture[str]) -> str:
+    """In one line, without frames."""
+    with pytest.raises(SystemExit):
+        parse([*words, "--help"])
+    return " ".join(capsys.readouterr().out.replace("│", " ").split())
+
+
+def test_an_alias_of_a_type_is_no_command(looks_like_a_class: object) -> None:
+    """Nor does tyro's question for it end in an error: options of several numbers have such a type."""
+    info = SimpleNamespace(type=looks_like_a_class)
+    assert _struct(cast(tyro.constructors.StructTypeInfo, info), brief=False) is None
 
 
 def test_help_of_a_command_teaches(etsplat: Run) -> None:

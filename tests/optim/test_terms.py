@@ -281,6 +281,14 @@ def test_every_weight_among_the_settings_is_that_of_a_term() -> None:
     assert weights - {"lambda_dssim"} == {f"lambda_{name}" for name in named_terms()}
 
 
+def test_an_alias_of_a_type_in_a_module_of_terms_is_no_term(
+    monkeypatch: pytest.MonkeyPatch, looks_like_a_class: object
+) -> None:
+    known = named_terms()
+    monkeypatch.setattr("etsplat.optim.terms.soup.Spared", looks_like_a_class)
+    assert named_terms() == known
+
+
 def a_depth_drawing(depth: Tensor, said: Tensor, alpha: float = 1.0) -> Drawing:
     color = torch.zeros(1, *depth.shape, 3)
     rendering = Rasterization(color, torch.full((1, *depth.shape, 1), alpha), depth=depth[None, ..., None])

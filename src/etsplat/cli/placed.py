@@ -30,7 +30,7 @@ class Placed(Command):
     """Run on a cluster, whose machines see the same folders:
     auto or ADDRESS: of Ray (extra "cluster"); slurm: by submitit (extra "slurm").
     None for this machine."""
-    slurm: tuple[str, ...] = ()
+    slurm: Annotated[tuple[str, ...], tyro.conf.arg(help_behavior_hint="(default: none)")] = ()
     """With --cluster slurm: submitit's parameters, such as timeout_min=240 slurm_partition=cpu."""
 
     def where(self) -> Where:

@@ -33,7 +33,11 @@ class ManyRuns(Placed):
     PRESET: ClassVar[dict[str, str]]
     """What the settings start from, where nobody says otherwise."""
 
-    sources: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="INPUT ...")]
+    sources: Annotated[
+        tuple[str, ...],
+        tyro.conf.Positional,
+        tyro.conf.arg(metavar="INPUT ...", help_behavior_hint="(required, one or more)"),
+    ]
     """What `etsplat reconstruct` or `etsplat train` takes, or what the demo shows: demo:owl, demo:scene."""
     out: Path
     """Folder for the runs, tables and the page; what was interrupted goes on where it was."""
