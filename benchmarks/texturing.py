@@ -5,6 +5,7 @@
     python -m benchmarks.texturing RUNS --stored
 
 Seconds are of the processor, all threads together: the same beside other jobs, and about what one core would take.
+Faces that cut through others are counted.
 
 With --lods the coarser levels that `etsplat export RUN --texture N --lods N` has written: PSNR of the test views, at
 their size, and halved as often as the level says, where that of the first level stands beside it. With --stored one
@@ -23,6 +24,7 @@ import torch
 from etsplat import Scorer, TexturedMesh, TriangleMesh, texture_mesh
 from etsplat.data.dataset import Dataset
 from etsplat.data.pictures import as_float
+from etsplat.geometry.intersections import count_self_intersections
 from etsplat.geometry.topology import MeshTopology
 from etsplat.metrics.image import psnr
 from etsplat.tasks.export_mesh import open_reconstruction
@@ -47,7 +49,7 @@ def main() -> None:
         for run in options.runs:
             measure_levels(run, options.lods)
         return
-    print("run | full: faces, PSNR, IoU | textured: faces, PSNR, IoU, sound | MB | processor seconds")
+    print("run | full: faces, PSNR, IoU, cutting | textured: faces, PSNR, IoU, cutting, sound | MB | processor seconds")
     for run in options.runs:
         measure(run, options.texture, options.faces, options.keep)
 
@@ -77,7 +79,8 @@ def measure(run: Path, size: int, faces: int, keep: Path | None) -> None:
     rows = []
     for model in (full, replace(read, vertices=views.normalization.apply(read.vertices.detach()))):
         found = scorer.opaque(model, views.test)
-        rows.append(f"{model.count} {found['psnr_mesh']:.2f} {found['silhouette_iou']:.4f}")
+        cutting = count_self_intersections(*model.surface())
+        rows.append(f"{model.count} {found['psnr_mesh']:.2f} {found['silhouette_iou']:.4f} {cutting}")
     print(f"{run.name} | {rows[0]} | {rows[1]} {sound} | {size_mb:.2f} | {end - before:.0f} {seconds}", flush=True)
 
 

@@ -14,6 +14,7 @@ from etsplat.geometry.topology import MeshTopology
 from etsplat.geometry.unwrap import texel_points
 from etsplat.io.mesh_files import MeshFile
 from etsplat.model.textured_mesh import TexturedMesh
+from etsplat.optim.strategies import Fixed
 from etsplat.tasks import texturing
 from etsplat.tasks.scoring import Scorer
 from etsplat.tasks.texturing import coarser, texture_object
@@ -101,6 +102,36 @@ def test_folds_that_hold_up_the_shape_stay(scene: SCENE) -> None:
     vertices = torch.cat([mesh.vertices, 0.98 * mesh.vertices])
     faces = torch.cat([mesh.faces, mesh.faces.flip(1) + len(mesh.vertices)])
     assert quality(texture_object(MeshFile(vertices, faces), views, size=SIZE, faces=FACES), views) > 24
+
+
+def test_vertices_make_no_folds_on_the_way(scene: SCENE, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A sphere that is to shrink, with another one within, through which its vertices would go."""
+    mesh, views = scene
+    vertices = torch.cat([1.1 * mesh.vertices, 1.02 * mesh.vertices])
+    faces = torch.cat([mesh.faces, mesh.faces.flip(1) + len(mesh.vertices)])
+    monkeypatch.setattr(texturing, "LEAST_RATE", 3e-3)
+    monkeypatch.setattr(texturing, "_untangled", lambda model, *_: model)
+
+    def folds() -> int:
+        light = texture_object(MeshFile(vertices, faces), views, size=SIZE, faces=len(faces))
+        return count_self_intersections(light.vertices.detach(), light.faces)
+
+    assert folds() == 0
+    monkeypatch.setattr(texturing, "NoNewFolds", lambda *_: Fixed())
+    assert folds() > 0
+
+
+def test_the_outline_that_decimation_lost_comes_back_the_faster_the_more_it_is(
+    scene: SCENE, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a rough sphere, whose decimation is another rough sphere."""
+    mesh, views = scene
+    noise = torch.randn((len(mesh.vertices), 1), generator=torch.Generator().manual_seed(0))
+    rough = replace(mesh, vertices=mesh.vertices * (1 + 0.03 * noise))
+    adaptive = texture_object(rough, views, size=SIZE, faces=FACES)
+    monkeypatch.setattr(texturing, "PULL", 0.0)
+    slow = texture_object(rough, views, size=SIZE, faces=FACES)
+    assert quality(adaptive, views) > quality(slow, views) + 1
 
 
 def test_exposures_are_not_part_of_the_result(scene: SCENE, light: TexturedMesh) -> None:

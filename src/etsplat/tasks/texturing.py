@@ -2,20 +2,20 @@
 
 The mesh is decimated, untangled and cut into charts. The texture begins with the colours of the full mesh, small, and
 is fitted with the antialiased z-buffer, the picture that a viewer draws; twice it is enlarged, so that where photos
-show less than its texels hold it stays smooth. The vertices follow, slowly, for the silhouettes that decimation moved,
-and are untangled once more. Where pictures get worse by untangling, it is left. Texels that no photo shows take the
-colour of the nearest place on the surface that one does; those between charts that of the nearest texel of a chart, so
-that coarser levels do not bleed.
+show less than its texels hold it stays smooth. The vertices follow, for the silhouettes that decimation moved, but make
+no new folds, and are untangled once more. Where pictures get worse by untangling, it is left. Texels that no photo
+shows take the colour of the nearest place on the surface that one does; those between charts that of the nearest texel
+of a chart, so that coarser levels do not bleed.
 """
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int64
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial import KDTree
 from torch import Tensor
@@ -23,6 +23,7 @@ from torch import Tensor
 from etsplat.data.dataset import Dataset, middles_of
 from etsplat.geometry.decimation import decimated, load_simplifier
 from etsplat.geometry.distance import closest_places, closest_points
+from etsplat.geometry.held_back import around_folds
 from etsplat.geometry.topology import MeshTopology
 from etsplat.geometry.untangle import untangle
 from etsplat.geometry.unwrap import load_xatlas, texel_points, unwrapped
@@ -34,6 +35,7 @@ from etsplat.optim.exposure import Exposure
 from etsplat.optim.gauge import Gauge
 from etsplat.optim.known_exposure import KnownExposure
 from etsplat.optim.loop import Event, StepEvent
+from etsplat.optim.new_folds import NoNewFolds
 from etsplat.optim.objective import Objective
 from etsplat.optim.schedules import Schedule, exponential_decay
 from etsplat.optim.terms.photometric import Photometric
@@ -42,9 +44,14 @@ from etsplat.optim.trainer import GUARD_SIDE, GUARD_VIEWS, Trainer
 EPOCHS = (4, 3, 3)
 """How often every photo is seen by textures of a quarter and half of the size, and of the size itself."""
 
-VERTEX_RATE, VERTEX_FINAL = 3e-5, 0.1
-"""Adam's rate of vertices, where the object has radius 1, and what is left of it at the end of the last stage. At ten
-times the rate faces cut through others by the hundred (research/results.md)."""
+PULL, LEAST_RATE, VERTEX_FINAL = 0.12, 3e-5, 0.1
+"""Adam's rate of vertices: this part of how far decimation moved the surface, median over the full mesh's vertices; the
+least, where the object has radius 1; and what is left of it at the end of the last stage. Rough meshes lose their
+outline to decimation, which fast vertices bring back; of smooth ones they would follow the photos' noise."""
+
+LOOK_EVERY, FASTEST = 25, 5e-3
+"""Steps after which vertices of new folds go back; and the highest rate, in mean edges: by then they moved by an eighth
+of one at most, so that no face goes through another unseen."""
 
 REACHES, WORSE = (math.inf, 0.5), 0.02
 """How far untangling may move a vertex, in lengths of its longest edge: the first by which pictures of training views
@@ -110,27 +117,10 @@ def texture_object(
     plain = TriangleMesh.from_mesh(vertices, triangles, colors=colors, opacity=None, sigma=None).to(device)
     vertices = _untangled(plain, gauge, exposure).vertices.detach().cpu()
     tell("Unwrapping", 0, 0)
-    uvs = unwrapped(vertices, triangles, size)
-    side = size >> (len(EPOCHS) - 1)
-    covered, points, _ = texel_points(vertices, triangles, uvs, side)
-    texture = vertices.new_zeros(side, side, 3)
-    texture[covered] = colors_at(mesh, points)
-    texture = spread(texture, covered)
-    model = TexturedMesh.from_mesh(vertices, triangles, texture, uvs).to(device)
-    total, done = sum(EPOCHS) * len(views.train), 0
-    for stage, epochs in enumerate(EPOCHS):
-        if stage:
-            model = _with_texture(model, _enlarged(model.texture.detach()))
-        steps = epochs * len(views.train)
-        trainer = _make_trainer(model, views, stage, done, steps, total, exposure, seed)
-
-        def hear(event: Event, before: int = done) -> None:
-            if isinstance(event, StepEvent):
-                tell("Fitting the texture", before + event.iteration, total)
-
-        trainer.fit(steps, callbacks=[hear], log_every=10)
-        done += steps
-        model = _completed(model, trainer.adam.second_moments["texture"].amax(dim=-1).cpu())
+    model = _unwrapped(mesh, vertices, triangles, size).to(device)
+    model = _Fit(views, exposure, seed, _rate(mesh, vertices, triangles), around_folds(vertices, triangles)).fitted(
+        model, tell
+    )
     return _untangled(model.to(device), gauge, exposure).to(torch.device("cpu"))
 
 
@@ -180,28 +170,80 @@ def _untangled(model: Surface, gauge: Gauge, exposure: Exposure | None) -> Surfa
     return model
 
 
-def _make_trainer(
-    model: TexturedMesh,
-    views: Dataset,
-    stage: int,
-    done: int,
-    steps: int,
-    total: int,
-    exposure: Exposure | None,
-    seed: int,
-) -> Trainer[TexturedMesh]:
-    """Of one stage, `done` of whose `total` steps are made."""
+def _unwrapped(mesh: MeshFile, vertices: Float[Tensor, "V 3"], faces: Int64[Tensor, "F 3"], size: int) -> TexturedMesh:
+    """A light mesh in the colours of the full one, under a texture of the first stage."""
+    uvs = unwrapped(vertices, faces, size)
+    side = size >> (len(EPOCHS) - 1)
+    covered, points, _ = texel_points(vertices, faces, uvs, side)
+    texture = vertices.new_zeros(side, side, 3)
+    texture[covered] = colors_at(mesh, points)
+    return TexturedMesh.from_mesh(vertices, faces, spread(texture, covered), uvs)
 
-    def vertices(iteration: int) -> float:
-        return VERTEX_RATE * exponential_decay(done + iteration, total, VERTEX_FINAL)
 
-    def texture(iteration: int) -> float:
-        return TEXTURE_RATES[stage] * exponential_decay(iteration, steps, TEXTURE_FINAL)
+def _rate(mesh: MeshFile, vertices: Float[Tensor, "V 3"], faces: Int64[Tensor, "F 3"]) -> float:
+    """That of a light mesh's vertices at the start."""
+    moved = closest_points(mesh.vertices, vertices, faces)[0].sqrt().median()
+    edge = (vertices[faces] - vertices[faces.roll(1, dims=1)]).norm(dim=-1).mean()
+    return max(LEAST_RATE, min(PULL * float(moved), FASTEST * float(edge)))
 
-    rates = {"vertices": vertices, "texture": texture}
-    return Trainer(
-        model, views, Objective(Photometric()), schedule=Schedule(rates), exposure=exposure, seed=seed + stage
-    )
+
+@dataclass(frozen=True)
+class _Fit:
+    """What the stages of a fit have in common.
+
+    Attributes:
+        views: photos, those in `train` are fitted to.
+        exposure: of those; None where they were exposed alike.
+        seed: of the first stage.
+        rate: of the vertices at the start.
+        spared: (F,) faces that may cut through others.
+    """
+
+    views: Dataset
+    exposure: Exposure | None
+    seed: int
+    rate: float
+    spared: Bool[Tensor, " F"]
+
+    def fitted(self, model: TexturedMesh, tell: Tell) -> TexturedMesh:
+        """A model after all stages, with the texture of the first one to start from."""
+        for stage in range(len(EPOCHS)):
+            if stage:
+                model = _with_texture(model, _enlarged(model.texture.detach()))
+            trainer, done = self._trainer(model, stage), self._steps(stage)
+
+            def hear(event: Event, done: int = done) -> None:
+                if isinstance(event, StepEvent):
+                    tell("Fitting the texture", done + event.iteration, self._steps(len(EPOCHS)))
+
+            trainer.fit(self._steps(stage + 1) - done, callbacks=[hear], log_every=10)
+            model = _completed(model, trainer.adam.second_moments["texture"].amax(dim=-1).cpu())
+        return model
+
+    def _steps(self, stage: int) -> int:
+        """How many are made before a stage; those of all of them before the one after the last."""
+        return sum(EPOCHS[:stage]) * len(self.views.train)
+
+    def _trainer(self, model: TexturedMesh, stage: int) -> Trainer[TexturedMesh]:
+        """Of one stage."""
+        done, total = self._steps(stage), self._steps(len(EPOCHS))
+        last = self._steps(stage + 1) - done
+
+        def vertices(iteration: int) -> float:
+            return self.rate * exponential_decay(done + iteration, total, VERTEX_FINAL)
+
+        def texture(iteration: int) -> float:
+            return TEXTURE_RATES[stage] * exponential_decay(iteration, last, TEXTURE_FINAL)
+
+        return Trainer(
+            model,
+            self.views,
+            Objective(Photometric()),
+            NoNewFolds(self.spared, LOOK_EVERY, last),
+            schedule=Schedule({"vertices": vertices, "texture": texture}),
+            exposure=self.exposure,
+            seed=self.seed + stage,
+        )
 
 
 def _completed(model: TexturedMesh, moments: Float[Tensor, "H W"]) -> TexturedMesh:
