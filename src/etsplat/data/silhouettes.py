@@ -88,7 +88,8 @@ class Silhouette:
         pixel = camera @ self.K.T / torch.where(front, z, 1.0)[:, None]
         place = 2 * pixel[:, :2] / torch.tensor([width, height]) - 1
         found = grid_sample(self.distance, place[None, None], padding_mode="border", align_corners=False)
-        return found[0, 0, 0], z / self.K[0, 0], front & (self.whole | (place.abs() < 1).all(dim=1))
+        judged = front if self.whole else front & (place.abs() < 1).all(dim=1)
+        return found[0, 0, 0], z / self.K[0, 0], judged
 
     def rays(self, count: int) -> tuple[Float[Tensor, "3"], Float[Tensor, "R 3"]]:
         """The camera's centre, and unit directions of so many pixels of the object, evenly spread over its rows."""
