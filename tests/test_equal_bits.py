@@ -82,6 +82,13 @@ def test_one_bit_of_a_loss_or_of_a_nested_score_is_found(runs):
     assert second.startswith("metrics.json: test_views[0]: psnr: 0.333")
 
 
+@pytest.mark.parametrize(("change", "found"), [(1e-15, False), (1e-9, True)])
+def test_numbers_that_are_rounded_differ_only_by_more_than_that(runs, change, found):
+    for score, run in zip((0.75, 0.75 + change), runs, strict=True):
+        (run / "metrics.json").write_text(json.dumps({**METRICS, "ssim": score}))
+    assert ("history" in differing(runs)) is found
+
+
 def test_one_byte_of_a_mesh_file_is_found(runs):
     (runs[1] / "mesh.obj").write_text("v 0 0 2\n")
     assert differing(runs)["parameters"] == [

@@ -1,7 +1,6 @@
 #include "bvh.h"
 
 #include <limits>
-#include <numeric>
 #include <utility>
 
 namespace etsplat {
@@ -12,7 +11,9 @@ constexpr Box nothing{{infinity, infinity, infinity}, {-infinity, -infinity, -in
 
 Box join(const Box& a, const Box& b) { return {min(a.low, b.low), max(a.high, b.high)}; }
 
-double component(Vec3 v, int axis) { return axis == 0 ? v.x : axis == 1 ? v.y : v.z; }
+Box bounds(const Triangle& t) {
+    return {min(min(t.corner[0], t.corner[1]), t.corner[2]), max(max(t.corner[0], t.corner[1]), t.corner[2])};
+}
 
 double segment_squared_distance(Vec3 a, Vec3 b, Vec3 p) {
     const Vec3 along = b - a, offset = p - a;
@@ -23,10 +24,6 @@ double segment_squared_distance(Vec3 a, Vec3 b, Vec3 p) {
 }
 
 }  // namespace
-
-Box bounds(const Triangle& t) {
-    return {min(min(t.corner[0], t.corner[1]), t.corner[2]), max(max(t.corner[0], t.corner[1]), t.corner[2])};
-}
 
 double squared_distance(const Triangle& t, Vec3 p) {
     const auto& [a, b, c] = t.corner;
@@ -46,38 +43,51 @@ double squared_distance(const Triangle& t, Vec3 p) {
                      segment_squared_distance(c, a, p)});
 }
 
-Bvh::Bvh(const double* vertices, const int64_t* faces, int64_t num_faces) : faces_(num_faces) {
+Bvh::Bvh(const double* vertices, const int64_t* faces, int64_t num_faces) {
     std::vector<Box> boxes(num_faces);
-    for (int64_t f = 0; f < num_faces; ++f) boxes[f] = bounds(triangle(vertices, faces + 3 * f));
-    std::iota(faces_.begin(), faces_.end(), int64_t{0});
+    std::vector<Centered> order(num_faces);
+    for (int64_t f = 0; f < num_faces; ++f) {
+        boxes[f] = bounds(triangle(vertices, faces + 3 * f));
+        order[f] = {boxes[f].low + boxes[f].high, f};
+    }
     nodes_.reserve(num_faces);
-    build(0, num_faces, boxes);
+    build(0, num_faces, order, boxes);
     triangles_.reserve(num_faces);
-    for (const int64_t f : faces_) triangles_.push_back(triangle(vertices, faces + 3 * f));
+    boxes_.reserve(num_faces);
+    faces_.reserve(num_faces);
+    for (const Centered& at : order) {
+        triangles_.push_back(triangle(vertices, faces + 3 * at.face));
+        boxes_.push_back(boxes[at.face]);
+        faces_.push_back(at.face);
+    }
 }
 
-int32_t Bvh::build(int64_t begin, int64_t end, const std::vector<Box>& boxes) {
-    const auto twice_center = [&](int64_t face) { return boxes[face].low + boxes[face].high; };
+int32_t Bvh::build(int64_t begin, int64_t end, std::vector<Centered>& order, const std::vector<Box>& boxes) {
     const int32_t index = static_cast<int32_t>(nodes_.size());
-    Box box = nothing, centers = nothing;
-    for (int64_t slot = begin; slot < end; ++slot) {
-        const Vec3 center = twice_center(faces_[slot]);
-        box = join(box, boxes[faces_[slot]]);
-        centers = join(centers, {center, center});
+    nodes_.push_back({nothing, static_cast<int32_t>(begin), static_cast<int32_t>(end), 0});
+    if (end - begin <= leaf_size) {
+        for (int64_t slot = begin; slot < end; ++slot) nodes_[index].box = join(nodes_[index].box, boxes[order[slot].face]);
+        leaves_.push_back(index);
+        return index;
     }
-    nodes_.push_back({box, static_cast<int32_t>(begin), static_cast<int32_t>(end), 0});
-    if (end - begin <= leaf_size) return index;
-
+    Box centers = nothing;
+    for (int64_t slot = begin; slot < end; ++slot) {
+        centers = join(centers, {order[slot].twice_center, order[slot].twice_center});
+    }
     const Vec3 extent = centers.high - centers.low;
-    const int axis = extent.x >= extent.y && extent.x >= extent.z ? 0 : extent.y >= extent.z ? 1 : 2;
+    double Vec3::*const axis = extent.x >= extent.y && extent.x >= extent.z ? &Vec3::x
+                               : extent.y >= extent.z                       ? &Vec3::y
+                                                                            : &Vec3::z;
     const int64_t middle = begin + (end - begin) / 2;
-    std::nth_element(faces_.begin() + begin, faces_.begin() + middle, faces_.begin() + end,
-                     [&](int64_t a, int64_t b) {
-                         return std::pair(component(twice_center(a), axis), a) <
-                                std::pair(component(twice_center(b), axis), b);
+    std::nth_element(order.begin() + begin, order.begin() + middle, order.begin() + end,
+                     [axis](const Centered& a, const Centered& b) {
+                         const double first = a.twice_center.*axis, second = b.twice_center.*axis;
+                         return first != second ? first < second : a.face < b.face;
                      });
-    build(begin, middle, boxes);
-    nodes_[index].right = build(middle, end, boxes);
+    build(begin, middle, order, boxes);
+    const int32_t right = build(middle, end, order, boxes);
+    nodes_[index].right = right;
+    nodes_[index].box = join(nodes_[index + 1].box, nodes_[right].box);
     return index;
 }
 
@@ -99,7 +109,7 @@ Bvh::Nearest Bvh::nearest(Vec3 p) const {
             continue;
         }
         for (int32_t slot = node.begin; slot < node.end; ++slot) {
-            if (bounds(triangles_[slot]).squared_distance(p) > best.squared_distance) continue;
+            if (boxes_[slot].squared_distance(p) > best.squared_distance) continue;
             const Nearest found{squared_distance(triangles_[slot], p), faces_[slot]};
             if (std::pair(found.squared_distance, found.face) < std::pair(best.squared_distance, best.face)) {
                 best = found;

@@ -2,10 +2,11 @@
 //
 // A binary tree of axis-aligned boxes, split at the median centre along the longest axis of the centres' box, so that
 // its depth is logarithmic for any input. Nodes lie in depth-first order (the left child follows its parent); the
-// triangles are copied in leaf order, so that a leaf reads one run of memory. Building is serial, O(F log F); queries
-// change nothing and may run from any number of threads.
+// triangles and their boxes are copied in leaf order, so that a leaf reads one run of memory. Building is serial,
+// O(F log F); queries change nothing and may run from any number of threads.
 #pragma once
 
+#include <algorithm>
 #include <vector>
 
 #include "vec3.h"
@@ -24,8 +25,6 @@ struct Box {
         return dot(outside, outside);
     }
 };
-
-Box bounds(const Triangle& t);
 
 // The squared distance from p to the triangle, any degenerate one (a segment, a point) included.
 double squared_distance(const Triangle& t, Vec3 p);
@@ -47,11 +46,18 @@ public:
     const std::vector<Triangle>& triangles() const { return triangles_; }
     const std::vector<int64_t>& faces() const { return faces_; }
 
-    // Calls visit(slot) for every slot > after whose leaf's box meets `box`.
+    // Leaves, which are runs of slots one behind the other.
+    int64_t leaves() const { return static_cast<int64_t>(leaves_.size()); }
+
+    // Calls visit(slot, other) for all slots < other whose boxes meet, and of which the first is in that leaf.
     template <class Visit>
-    void overlapping(const Box& box, int64_t after, Visit&& visit) const;
+    void meeting(int64_t leaf, Visit&& visit) const;
 
 private:
+    struct Centered {
+        Vec3 twice_center;  // of a face's box
+        int64_t face;
+    };
     struct Node {
         Box box;
         int32_t begin, end;  // its slots
@@ -60,28 +66,37 @@ private:
     static constexpr int leaf_size = 8;
     static constexpr int max_depth = 64;  // halving 2^31 slots takes 31
 
-    int32_t build(int64_t begin, int64_t end, const std::vector<Box>& boxes);
+    int32_t build(int64_t begin, int64_t end, std::vector<Centered>& order, const std::vector<Box>& boxes);
 
     std::vector<Node> nodes_;
+    std::vector<int32_t> leaves_;  // indices of nodes
     std::vector<Triangle> triangles_;
+    std::vector<Box> boxes_;
     std::vector<int64_t> faces_;
 };
 
 template <class Visit>
-void Bvh::overlapping(const Box& box, int64_t after, Visit&& visit) const {
+void Bvh::meeting(int64_t leaf, Visit&& visit) const {
+    const Node& here = nodes_[leaves_[leaf]];
     int32_t stack[max_depth];
     int depth = 0;
     stack[depth++] = 0;
     while (depth > 0) {
         const int32_t index = stack[--depth];
         const Node& node = nodes_[index];
-        if (node.end <= after + 1 || !node.box.overlaps(box)) continue;
+        if (node.end <= here.begin + 1 || !node.box.overlaps(here.box)) continue;
         if (node.right) {
             stack[depth++] = node.right;
             stack[depth++] = index + 1;
             continue;
         }
-        for (int64_t slot = std::max<int64_t>(node.begin, after + 1); slot < node.end; ++slot) visit(slot);
+        for (int32_t slot = here.begin; slot < here.end; ++slot) {
+            const Box& box = boxes_[slot];
+            if (!node.box.overlaps(box)) continue;
+            for (int32_t other = std::max(node.begin, slot + 1); other < node.end; ++other) {
+                if (box.overlaps(boxes_[other])) visit(slot, other);
+            }
+        }
     }
 }
 

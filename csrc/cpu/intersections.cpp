@@ -1,5 +1,5 @@
-// Every face asks the hierarchy for the faces behind it (in leaf order) whose box meets its own, so that each pair is
-// tested once. Marks are only ever set, so the result does not depend on the order in which threads set them.
+// Every leaf of the hierarchy asks it for the faces behind its own (in leaf order) whose boxes meet one of those, so that
+// each pair is tested once. Marks are only ever set, so the result does not depend on the order in which threads set them.
 #include "intersections.h"
 
 #include <atomic>
@@ -88,14 +88,12 @@ void mark_intersecting_faces(const double* vertices, const int64_t* faces, int64
     parallel_for(num_faces, 1024, [&](int64_t begin, int64_t end) {
         for (int64_t slot = begin; slot < end; ++slot) no_interior[slot] = collinear(triangles[slot]);
     });
-    parallel_for(num_faces, 256, [&](int64_t begin, int64_t end) {
-        for (int64_t slot = begin; slot < end; ++slot) {
-            if (no_interior[slot]) continue;
-            const Box box = bounds(triangles[slot]);
-            bvh.overlapping(box, slot, [&](int64_t other) {
+    parallel_for(bvh.leaves(), 32, [&](int64_t begin, int64_t end) {
+        for (int64_t leaf = begin; leaf < end; ++leaf) {
+            bvh.meeting(leaf, [&](int32_t slot, int32_t other) {
                 const bool known = marks[slot].load(std::memory_order_relaxed) &&
                                    marks[other].load(std::memory_order_relaxed);
-                if (known || no_interior[other] || !box.overlaps(bounds(triangles[other]))) return;
+                if (known || no_interior[slot] || no_interior[other]) return;
                 if (interiors_meet(triangles[slot], triangles[other])) {
                     marks[slot].store(true, std::memory_order_relaxed);
                     marks[other].store(true, std::memory_order_relaxed);

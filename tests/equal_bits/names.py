@@ -118,12 +118,14 @@ class Names:
         gone: names that BASE alone has.
         added: names that this tree alone has.
         ignored: names of either tree whose values depend on the clock or on versions.
+        rounded: names of numbers that are compared to twelve digits: float64 sums in another order.
     """
 
     renamed: dict[str, str]
     gone: frozenset[str] = frozenset()
     added: frozenset[str] = frozenset()
     ignored: frozenset[str] = frozenset()
+    rounded: frozenset[str] = frozenset()
 
     def here(self, name: str) -> str:
         """What BASE's name is in this tree."""
@@ -147,6 +149,8 @@ METRICS = Names(
     )
     | {"psnr_affine", "exposure_learned", "exposure_explained", "flip", "flip_mesh", "flip_opaque", "flip_asset"},
     ignored=frozenset({"seconds", "seconds_per_iteration", "versions"}),
+    # The window of SSIM is summed from its middle outwards.
+    rounded=frozenset({"ssim", "ssim_interior", "ssim_mesh", "ssim_opaque", "ssim_asset"}),
 )
 """Of metrics.json."""
 HISTORY = Names({}, ignored=frozenset({"seconds"}))

@@ -149,6 +149,7 @@ def test_a_mesh_that_went_to_infinity_is_neither_untangled_nor_divided(number: f
     for iteration in (4, 8):
         with pytest.raises(DivergedError, match=f"not finite at iteration {iteration}"):
             strategy.edit(iteration)
+    assert not strategy.edit(5)  # there is nothing to do, so nobody looks
 
 
 def test_a_soup_is_edited_between_its_first_and_its_last_time(rng: torch.Generator) -> None:

@@ -94,6 +94,7 @@ def outside_hull(dataset: Dataset) -> Distance:
 
     def outside(points: Tensor) -> Tensor:
         depth, judges = torch.full((len(points),), torch.inf), torch.zeros(len(points))
+        points = points.T.contiguous().T
         for view in views:
             found, unit, judged = view.depth(points)
             depth = torch.where(judged, torch.minimum(depth, (found + rough) * unit), depth)

@@ -145,6 +145,8 @@ class SubdivideAndUntangle(Strategy):
 
     def edit(self, iteration: int) -> bool:
         """Removes lids, untangles, then divides. Raises DivergedError where faces have no finite area."""
+        if self.next_edit(iteration) != iteration:
+            return False
         mesh: TriangleMesh = self.model
         if not bool(face_areas(*mesh.surface()).isfinite().all()):
             raise DivergedError(f"the areas of faces are not finite at iteration {iteration}; lower the learning rates")

@@ -231,17 +231,18 @@ class Trainer(Generic[M]):
 
     def _edit(self, iteration: int) -> int:
         before = self.count
-        if self.guard is not None and self.strategy.next_edit(iteration) == iteration:
-            self.strategy.undone = self.guard.undone.count(iteration)
+        guard = self.guard if self.strategy.next_edit(iteration) == iteration else None
+        if guard is not None:
+            self.strategy.undone = guard.undone.count(iteration)
             if self.strategy.undone == self.strategy.attempts(iteration):
                 return 0
             loss, following = self._loss(), self.strategy.next_edit(iteration + 1)
-            self.guard.hold(self.progress, following, loss, self._state())
+            guard.hold(self.progress, following, loss, self._state())
         if self.strategy.edit(iteration):
             self._set_paces()
             self.edited()
-        elif self.guard is not None:
-            self.guard.release_if_same(self._state())
+        elif guard is not None:
+            guard.release_if_same(self._state())
         return self.count - before
 
     def review(self, progress: Progress) -> Return | None:
