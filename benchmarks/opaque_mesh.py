@@ -18,7 +18,7 @@ import torch
 from etsplat.data.dataset import Dataset
 from etsplat.model.triangle_mesh import TriangleMesh
 from etsplat.optim.schedules import limited_iterations
-from etsplat.tasks.opaque import mesh_steps, start_mesh, towards_opaque
+from etsplat.tasks.opaque import finished_mesh, mesh_steps, start_mesh, towards_opaque
 from etsplat.tasks.scoring import Scorer
 from etsplat.tasks.soup_trainer import background_of, start_trainer
 from etsplat.tasks.sources import kept_aside, load_scene
@@ -35,7 +35,7 @@ def fitted(capture: Dataset, config: TrainConfig, kept: Path) -> tuple[TriangleM
     trainer = start_mesh(soup, before.exposure, capture, config)
     began = time.process_time()
     trainer.fit(mesh_steps(config))
-    return trainer.outcome().model, time.process_time() - began
+    return finished_mesh(trainer.outcome().model, capture), time.process_time() - began
 
 
 def main() -> None:

@@ -58,6 +58,22 @@ def test_colours_are_those_of_the_photos_there_and_next_to_it(capture: Dataset) 
     red = replace(capture, images=Red())  # type: ignore[arg-type]
     colors = Surroundings.of(red).soup(red, 0).display_colors()
     torch.testing.assert_close(colors, torch.tensor([[1.0, 0, 0]]).expand_as(colors), rtol=0, atol=1e-3)
+    colors = Surroundings.of(red).backdrop(red)[1]
+    torch.testing.assert_close(colors, torch.tensor([1.0, 0, 0]).expand_as(colors), rtol=0, atol=1e-3)
+
+
+def test_a_backdrop_is_closed_behind_the_sphere(capture: Dataset) -> None:
+    """Every edge belongs to two triangles; what is halved stays at it, and the sphere is not."""
+    surroundings = Surroundings.of(capture)
+    corners = surroundings.backdrop(capture)[0]
+    edges = torch.cat([corners, corners.roll(-1, dims=1)], dim=-1).reshape(-1, 2, 3)
+    count = edges.mean(dim=1).unique(dim=0, return_counts=True)[1]
+    assert count.unique().tolist() == [2]
+    assert bool(surroundings.at_backdrop(edges.mean(dim=1)).all())
+    assert bool(surroundings.at_backdrop(corners.reshape(-1, 3)).all())
+    sphere = surroundings.soup(capture, 0)
+    assert not bool(surroundings.at_backdrop(sphere.vertices.detach().reshape(-1, 3)).any())
+    assert bool(surroundings.outermost(corners).all())
 
 
 def test_a_note_tells_the_sphere_to_the_last_bit(capture: Dataset) -> None:

@@ -10,11 +10,11 @@ from typing import ClassVar
 
 import torch
 from jaxtyping import Bool, Float
-from scipy.spatial import KDTree
 from torch import Tensor
 
 from etsplat.data.dataset import Dataset
 from etsplat.data.pictures import as_float
+from etsplat.geometry.blending import blended
 from etsplat.geometry.icosphere import icosphere
 from etsplat.model.triangle_soup import TriangleSoup
 
@@ -28,9 +28,12 @@ OPACITY, SIGMA = 0.5, 0.4
 REACH = 1.5
 """Radius of the sphere, relative to the distance within which nearly all points lie."""
 
+BACKDROP = 2.0
+"""Radius of the backdrop of an opaque mesh, relative to that of the sphere."""
+
 _NEARLY_ALL = 0.98
 _INSIDE = 0.9
-_BLENDED = 8
+_FLAT = 0.95  # triangles of so many corners lie that near to the sphere through these, with their halves
 
 
 @dataclass(frozen=True)
@@ -92,10 +95,24 @@ class Surroundings:
         """
         directions, faces = icosphere(LEVEL)
         corners = self.middle + self.radius * directions[faces]
-        colors, seen = _photographed(dataset, corners.mean(dim=1))
-        if bool(seen.any()) and not bool(seen.all()):
-            colors[~seen] = _blended(directions[faces].mean(dim=1), colors, seen)
+        colors = _photographed_or_blended(dataset, corners.mean(dim=1), directions[faces].mean(dim=1))
         return TriangleSoup.from_triangles(corners, colors, opacity=OPACITY, sigma=SIGMA, sh_degree=sh_degree)
+
+    def backdrop(self, dataset: Dataset) -> tuple[Float[Tensor, "N 3 3"], Float[Tensor, "N 3 3"]]:
+        """What is to be seen through gaps between opaque triangles: a closed sphere behind that of the soup.
+
+        Returns:
+            Corners of its triangles, and the colours of these: those of the photos where the sphere of the soup is, and
+            blended where no photo looks, as there.
+        """
+        directions, faces = icosphere(LEVEL)
+        colors = _photographed_or_blended(dataset, self.middle + self.radius * directions, directions)
+        return (self.middle + BACKDROP * self.radius * directions)[faces], colors[faces]
+
+    @torch.no_grad()
+    def at_backdrop(self, positions: Float[Tensor, "N 3"]) -> Bool[Tensor, " N"]:
+        """Which positions are on the backdrop, on edges between its corners, or beyond."""
+        return (positions - self.middle.to(positions)).norm(dim=1) > _FLAT * BACKDROP * self.radius
 
     @torch.no_grad()
     def outermost(self, vertices: Float[Tensor, "N 3 3"]) -> Bool[Tensor, " N"]:
@@ -111,14 +128,14 @@ class Surroundings:
         return (across * (vertices.mean(dim=1) - self.middle.to(vertices))).sum(dim=1) > 0
 
 
-def _blended(
-    towards: Float[Tensor, "N 3"], colors: Float[Tensor, "N 3"], seen: Bool[Tensor, " N"]
-) -> Float[Tensor, "M 3"]:
-    """Colours of the M that are not seen: a mean of the nearest that are, by the reciprocal of their distance."""
-    found = KDTree(towards[seen].numpy()).query(towards[~seen].numpy(), k=min(_BLENDED, int(seen.sum())))
-    distance, nearest = (torch.from_numpy(array).reshape(int((~seen).sum()), -1) for array in found)
-    weight = 1 / distance.float().clamp_min(1e-6)
-    return (weight[..., None] * colors[seen][nearest]).sum(dim=1) / weight.sum(dim=1, keepdim=True)
+def _photographed_or_blended(
+    dataset: Dataset, positions: Float[Tensor, "N 3"], directions: Float[Tensor, "N 3"]
+) -> Float[Tensor, "N 3"]:
+    """Mean colours of the photos at positions; where no photo shows one, of those in the nearest directions."""
+    colors, seen = _photographed(dataset, positions)
+    if bool(seen.any()) and not bool(seen.all()):
+        colors[~seen] = blended(directions[~seen], directions[seen], colors[seen])
+    return colors
 
 
 def _photographed(dataset: Dataset, positions: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, "N 3"], Bool[Tensor, " N"]]:

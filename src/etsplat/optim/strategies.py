@@ -204,20 +204,28 @@ class SubdivideAndUntangle(Strategy):
 
 
 class HalveWhereWrong(Strategy):
-    """Removes those of a mesh's separate triangles, at given times, that are in the way, and halves the most wrong.
+    """Removes those of a mesh's separate triangles, at given times, that are in the way, and halves others.
 
-    Each corner is a vertex of its own, before and after: halves that shared the new corner would keep its colour and
-    place in common, and fit photos worse (research/ablations.md).
+    Halved are the most wrong, as many as photos of that size carry, whatever the halves may learn, and besides them
+    those that photos agree to halve. Each corner is a vertex of its own, before and after: halves that shared the new
+    corner would keep its colour and place in common, and fit photos worse (research/ablations.md).
     """
 
-    def __init__(self, budgets: Mapping[int, int], errors: Callable[[TriangleMesh], FaceErrors]) -> None:
+    def __init__(
+        self,
+        budgets: Mapping[int, int],
+        errors: Callable[[TriangleMesh], FaceErrors],
+        most_wrong: Mapping[int, int],
+    ) -> None:
         """Takes the times.
 
         Args:
             budgets: by iteration, how many triangles there may be after it (`optim.schedules.face_budgets`).
             errors: what pictures say of each triangle.
+            most_wrong: by iteration, how many of the most wrong are halved, beside as many as were removed; none of
+                those that photos do not agree to halve in an iteration that is not named.
         """
-        self._budgets, self._errors = dict(budgets), errors
+        self._budgets, self._errors, self._most_wrong = dict(budgets), errors, dict(most_wrong)
 
     def next_edit(self, iteration: int) -> int:
         """The next of the given times."""
@@ -229,22 +237,30 @@ class HalveWhereWrong(Strategy):
             return False
         mesh: TriangleMesh = self.model
         errors = self._errors(mesh)
-        kept, wrong = ~errors.in_the_way, errors.wrong
-        removes = bool(kept.any()) and not bool(kept.all())
-        if removes:
+        kept = ~errors.in_the_way
+        removed = int(errors.in_the_way.sum()) if bool(kept.any()) else 0
+        if removed:
             self._carry_out(RowPlan.keeping(kept.repeat_interleave(3).to(mesh.vertices.device)))
-            wrong = wrong[kept]
-        most = min(self._budgets[iteration] - mesh.count, int((wrong > 0).sum()))
-        if most > 0:
-            chosen = wrong.topk(most).indices
+            errors = FaceErrors(errors.wrong[kept], errors.in_the_way[kept], errors.gained[kept])
+        wanted = self._most_wrong[iteration] + removed if iteration in self._most_wrong else 0
+        chosen = _to_halve(errors, wanted)[: max(self._budgets[iteration] - mesh.count, 0)]
+        if len(chosen):
             self._carry_out(halves_plan(mesh.vertices.detach(), mesh.colors.detach(), chosen))
-        return removes or most > 0
+        return removed > 0 or len(chosen) > 0
 
     def _carry_out(self, plan: RowPlan) -> None:
         """Rows are corners, three of each triangle after the other."""
         parameters, _ = apply_rows(plan, self.adam, {})
         faces = torch.arange(len(plan.source), device=plan.source.device).reshape(-1, 3)
         self.model.load_state({**parameters, "faces": faces})
+
+
+def _to_halve(errors: FaceErrors, most_wrong: int) -> Tensor:
+    """(K,) the most wrong triangles, then those that photos agree to halve, those first by which most is gained."""
+    first = errors.wrong.topk(min(most_wrong, int((errors.wrong > 0).sum()))).indices
+    gained = errors.gained.clone()
+    gained[first] = 0.0
+    return torch.cat([first, gained.topk(int((gained > 0).sum())).indices])
 
 
 @dataclass

@@ -4,12 +4,15 @@ Most triangles of a soft soup are half transparent, and it is sorted by centroid
 mesh is made in two steps. A soup becomes opaque while it is trained (`--finish opaque`), which puts its triangles where
 the surfaces are. Then each of its corners gets a colour of its own, the same from every side, and corners and colours
 are fitted by the z-buffer with antialiased edges (`ops/antialias.py`): the very picture that a viewer draws. Triangles
-in the way of what photos show are removed, and others halved where pictures are most wrong. What no training photo
-shows stays: other views do. What was tried besides is in research/ablations.md.
+in the way of what photos show are removed, and others halved where pictures are most wrong, or where photos agree. What
+no training photo shows stays, in the colours of what is around it: other views do. Behind all of them is a closed
+backdrop, since other views look through gaps that no training photo shows. What was tried besides is in
+research/ablations.md.
 """
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import pairwise
 
 import torch
 from jaxtyping import Float
@@ -17,8 +20,11 @@ from torch import Tensor
 
 from etsplat.data.dataset import Dataset
 from etsplat.data.shown_width import ShownWidths
+from etsplat.geometry.blending import blended
+from etsplat.model.surroundings import Surroundings
 from etsplat.model.triangle_mesh import TriangleMesh
 from etsplat.model.triangle_soup import TriangleSoup
+from etsplat.ops.rasterize_opaque import rasterize_opaque
 from etsplat.optim.exposure import Exposure
 from etsplat.optim.objective import Objective
 from etsplat.optim.picture_errors import PictureErrors
@@ -29,6 +35,7 @@ from etsplat.optim.trainer import Trainer
 from etsplat.tasks.running import Job
 from etsplat.tasks.settings import get
 from etsplat.tasks.soup_trainer import background_of, shown_across, start_trainer
+from etsplat.tasks.sources import training_cameras
 from etsplat.tasks.train_checks import triangle_limit
 from etsplat.tasks.train_config import TrainConfig
 
@@ -73,23 +80,48 @@ def fit_opaque_mesh(
         _take_over(trainer.exposure, exposure)
         soup = job.fit_stage(trainer, shorter.iterations, "soup", "Making opaque triangles").finished()
     trainer = start_mesh(soup, exposure, capture, config)
-    return job.fit_stage(trainer, mesh_steps(config), "mesh", "Fitting the opaque mesh")
+    return finished_mesh(job.fit_stage(trainer, mesh_steps(config), "mesh", "Fitting the opaque mesh"), capture)
 
 
 def start_mesh(soup: TriangleSoup, exposure: Exposure, capture: Dataset, config: TrainConfig) -> Trainer[TriangleMesh]:
     """The start of the mesh of an opaque soup; arguments are those of `fit_opaque_mesh`."""
+    around = Surroundings.of(capture) if config.sky == "sphere" else None
     trainer = make_opaque_trainer(
-        opaque_mesh(soup),
+        opaque_mesh(soup, None if around is None else around.backdrop(capture)),
         capture,
         iterations=mesh_steps(config),
         unit=shown_across(soup, capture),
-        max_faces=triangle_limit(capture, config),
+        carried=triangle_limit(capture, config),
+        max_faces=config.max_triangles,
+        around=around,
         background=background_of(config),
         batch=config.batch,
         seed=config.seed,
     )
     _take_over(trainer.exposure, exposure)
     return trainer
+
+
+@torch.no_grad()
+def finished_mesh(mesh: TriangleMesh, capture: Dataset) -> TriangleMesh:
+    """Gives what no training photo shows the colours of what is nearest and shown; a view may show it that is none.
+
+    Args:
+        mesh: of separate triangles; changed in place. Its backdrop is coloured as others are.
+        capture: what it was fitted to.
+    """
+    shown = torch.zeros(mesh.count, dtype=torch.bool, device=mesh.vertices.device)
+    for camera in training_cameras(capture):
+        nearest = rasterize_opaque(mesh.vertices, cameras=camera.to(shown.device), faces=mesh.faces).triangle
+        assert nearest is not None
+        shown[nearest[nearest >= 0].long()] = True
+    if bool(shown.any()) and not bool(shown.all()):
+        corners, colors = (values.detach().cpu().reshape(-1, 3, 3) for values in (mesh.vertices, mesh.colors))
+        shown = shown.cpu()
+        guessed = blended(corners[~shown].flatten(0, 1), corners[shown].mean(dim=1), colors[shown].mean(dim=1))
+        colors[~shown] = guessed.reshape(-1, 3, 3)
+        mesh.colors.copy_(colors.reshape(-1, 3))
+    return mesh
 
 
 def mesh_steps(config: TrainConfig) -> int:
@@ -137,11 +169,21 @@ def towards_opaque(capture: Dataset, config: TrainConfig) -> TrainConfig:
     )
 
 
-def opaque_mesh(soup: TriangleSoup) -> TriangleMesh:
-    """The triangles of a soup that are drawn opaque, each corner a vertex of its own, in colours for all directions."""
+def opaque_mesh(
+    soup: TriangleSoup, backdrop: tuple[Float[Tensor, "K 3 3"], Float[Tensor, "K 3 3"]] | None = None
+) -> TriangleMesh:
+    """The triangles of a soup that are drawn opaque, each corner a vertex of its own, in colours for all directions.
+
+    Args:
+        soup: where the mesh begins.
+        backdrop: corners of more triangles and the colours of these (`Surroundings.backdrop`); None for no more.
+    """
     kept = soup.seen_opaque
     vertices = soup.vertices.detach()[kept].reshape(-1, 3)
     colors = soup.display_colors()[kept].repeat_interleave(3, dim=0)
+    if backdrop is not None:
+        more = [values.reshape(-1, 3).to(vertices) for values in backdrop]
+        vertices, colors = torch.cat([vertices, more[0]]), torch.cat([colors, more[1]])
     faces = torch.arange(len(vertices), device=vertices.device).reshape(-1, 3)
     return TriangleMesh.from_mesh(vertices, faces, colors=colors, opacity=None, sigma=None, vertex_colored=True)
 
@@ -152,8 +194,10 @@ def make_opaque_trainer(
     *,
     iterations: int,
     unit: float,
+    carried: int,
     max_faces: int,
     background: tuple[float, float, float],
+    around: Surroundings | None = None,
     batch: int = 1,
     seed: int = 0,
 ) -> Trainer[TriangleMesh]:
@@ -164,45 +208,47 @@ def make_opaque_trainer(
         capture: what it is fitted to.
         iterations: steps.
         unit: what the rate of corners is a fraction of, where photos show as much across as at the capture's points.
-        max_faces: most faces that there may be.
+        carried: most faces that there may be by halving those that are most wrong.
+        max_faces: most that there may be where photos agree to halve others.
         background: behind the pictures.
+        around: whose backdrop is among the faces; None where none is.
         batch: views of each step.
         seed: of the order of the views.
     """
-    budgets = face_budgets(
-        iterations,
-        steps=HALVINGS,
-        first=FIRST_HALVING,
-        last=LAST_HALVING,
-        start_faces=mesh.count,
-        max_faces=max_faces,
-    )
+    times = {"steps": HALVINGS, "first": FIRST_HALVING, "last": LAST_HALVING, "start_faces": mesh.count}
+    budgets = face_budgets(iterations, max_faces=max_faces, **times)
+    grown = face_budgets(iterations, max_faces=carried, **times)
+    more = (after - before for before, after in pairwise([mesh.count, *grown.values()]))
+    most_wrong = dict(zip(grown, more, strict=True))
     exposure = Exposure(NEVER)
-    errors = PictureErrors(capture, JUDGES, mesh.vertices.device, torch.tensor(background), exposure)
+    errors = PictureErrors(capture, JUDGES, mesh.vertices.device, torch.tensor(background), exposure, around)
     return Trainer(
         mesh,
         capture,
         Objective(Photometric(DSSIM, pixel="rms")),
-        HalveWhereWrong(budgets, errors),
+        HalveWhereWrong(budgets, errors, most_wrong),
         schedule=Schedule({"vertices": _corners(iterations, unit), "colors": _colors(iterations)}),
         batch=batch,
         background=background,
         exposure=exposure,
-        paces={"vertices": corner_paces(capture, unit)},
+        paces={"vertices": corner_paces(capture, unit, around)},
         seed=seed,
     )
 
 
-def corner_paces(capture: Dataset, unit: float) -> Callable[[Float[Tensor, "N3 3"]], Float[Tensor, " N3"]]:
+def corner_paces(
+    capture: Dataset, unit: float, around: Surroundings | None
+) -> Callable[[Float[Tensor, "N3 3"]], Float[Tensor, " N3"]]:
     """How much faster than at that unit the corners of separate triangles move: as fast on screen near and far.
 
-    Those of a triangle that no photo shows move at the usual rate.
+    Those of a triangle that no photo shows move at the usual rate, and those of the backdrop not at all: it is closed.
     """
     shown = ShownWidths(capture)
 
     def paces(corners: Float[Tensor, "N3 3"]) -> Float[Tensor, " N3"]:
         relative = shown(corners.reshape(-1, 3, 3).mean(dim=1)) / unit
-        return relative.nan_to_num(1.0, posinf=1.0).clamp(SLOWEST, FASTEST).repeat_interleave(3)
+        moving = relative.nan_to_num(1.0, posinf=1.0).clamp(SLOWEST, FASTEST).repeat_interleave(3)
+        return moving if around is None else moving.masked_fill(around.at_backdrop(corners), 0.0)
 
     return paces
 
