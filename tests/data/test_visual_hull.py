@@ -2,34 +2,28 @@ from dataclasses import replace
 
 import pytest
 import torch
-import trimesh
 
 from etsplat.data.demo_object import demo_object
 from etsplat.data.photograph import photograph
 from etsplat.data.pictures import StoredPictures
 from etsplat.data.visual_hull import visual_hull
 from etsplat.geometry.distance import closest_points
-from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.parts import genera
 from etsplat.geometry.topology import MeshTopology
-from etsplat.io.mesh_files import MeshFile
+from helpers.meshes import ring_and_ball
 
 
 @pytest.fixture(scope="module")
-def ring_and_ball():
-    """A torus with a ball beside it: two parts, one hole; in the unit ball around the origin."""
-    ring = trimesh.creation.torus(0.5, 0.12, major_sections=48, minor_sections=24)
-    v, f = icosphere(3)
-    w = torch.from_numpy(ring.vertices.copy()).float()
-    vertices = torch.cat([w, 0.15 * v + torch.tensor([0.0, 0.0, 0.6])])
-    faces = torch.cat([torch.from_numpy(ring.faces.copy()).long(), f + len(w)])
-    views = photograph(MeshFile(vertices, faces), 160, 160, supersampling=2)
-    return views.normalization.apply(vertices), faces, views
+def object_and_views():
+    """Two parts, one hole; in the unit ball around the origin."""
+    mesh = ring_and_ball(0.12)
+    views = photograph(mesh, 160, 160, supersampling=2)
+    return views.normalization.apply(mesh.vertices), mesh.faces, views
 
 
-def test_the_hull_has_the_holes_and_parts_of_the_object(ring_and_ball):
+def test_the_hull_has_the_holes_and_parts_of_the_object(object_and_views):
     """A convex section all around: the hull is the object up to a cell; closed, oriented outwards, as fine as asked."""
-    vertices, faces, views = ring_and_ball
+    vertices, faces, views = object_and_views
     found, triangles = visual_hull(views, 4000)
     topology = MeshTopology.from_faces(triangles, len(found))
     assert topology.is_closed()
@@ -42,9 +36,13 @@ def test_the_hull_has_the_holes_and_parts_of_the_object(ring_and_ball):
     assert float(closest_points(found, vertices, faces)[0].max()) < 0.05
 
 
-def test_what_one_mask_excludes_is_outside(ring_and_ball):
-    """One mask loses the upper half of its picture: no vertex is seen there, but for a cell's width."""
-    _, _, views = ring_and_ball
+def test_what_one_mask_of_few_excludes_is_outside(object_and_views):
+    """One mask loses the upper half of its picture: no vertex is seen there, but for a cell's width.
+
+    Of five views nobody can say which is wrong; of more, it would be outvoted.
+    """
+    _, _, views = object_and_views
+    views = replace(views, train=views.train[:20:4])
     first = views.train[0]
     images = [image.clone() for image in views.images]
     half = len(images[first]) // 2
@@ -57,10 +55,11 @@ def test_what_one_mask_excludes_is_outside(ring_and_ball):
     assert float(rows.min()) > half - 3
 
 
-def test_silhouettes_without_a_common_point_leave_nothing(ring_and_ball):
-    _, _, views = ring_and_ball
+def test_silhouettes_without_a_common_point_leave_nothing(object_and_views):
+    _, _, views = object_and_views
     images = [image.clone() for image in views.images]
-    images[views.train[0]][:] = 0
+    for index in views.train[:3]:
+        images[index][:] = 0
     vertices, triangles = visual_hull(replace(views, images=StoredPictures(images)), 4000)
     assert vertices.shape == (0, 3)
     assert triangles.shape == (0, 3)

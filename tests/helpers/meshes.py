@@ -3,10 +3,12 @@
 from pathlib import Path
 
 import torch
+import trimesh
 from torch import Tensor
 
 from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.measures import bounding_ball
+from etsplat.io.mesh_files import MeshFile
 
 TETRAHEDRON_FACES = torch.tensor([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
 TETRAHEDRON = torch.tensor([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]), TETRAHEDRON_FACES.flip(1)
@@ -51,3 +53,12 @@ def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
     normal = torch.linalg.cross(b - a, c - a)
     total = torch.zeros_like(vertices).index_add(0, faces.reshape(-1), normal.repeat_interleave(3, dim=0))
     return torch.nn.functional.normalize(total, dim=1)
+
+
+def ring_and_ball(thickness: float) -> MeshFile:
+    """A torus around the z axis, as thick as that, with a ball above its hole: two parts, one hole."""
+    ring = trimesh.creation.torus(0.5, thickness, major_sections=48, minor_sections=24)
+    v, f = icosphere(3)
+    w = torch.from_numpy(ring.vertices.copy()).float()
+    vertices = torch.cat([w, 0.15 * v + torch.tensor([0.0, 0.0, 0.6])])
+    return MeshFile(vertices, torch.cat([torch.from_numpy(ring.faces.copy()).long(), f + len(w)]))

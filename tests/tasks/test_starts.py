@@ -11,7 +11,7 @@ import trimesh
 from etsplat.core.errors import InputError
 from etsplat.data.dataset import Dataset
 from etsplat.data.photograph import photograph
-from etsplat.data.pictures import StoredPictures
+from etsplat.data.pictures import Box, StoredPictures, cropped
 from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.parts import genera
 from etsplat.io.mesh_files import MeshFile
@@ -28,7 +28,7 @@ def pebble() -> MeshFile:
 
 
 def test_photos_start_from_the_hull_if_most_show_the_object_as_a_whole() -> None:
-    """Those without transparency, or cut off by their frames, start from the sphere."""
+    """Those without transparency, and those of whose silhouettes no hull explains half, start from the sphere."""
     ball = MeshFile(*icosphere(2))
     views = photograph(ball, 48, 48, supersampling=1)
     config = ReconstructConfig.quick()
@@ -45,6 +45,16 @@ def test_photos_start_from_the_hull_if_most_show_the_object_as_a_whole() -> None
     assert start(replace(views, images=StoredPictures(cut))) == "sphere"
     asked = ReconstructConfig.quick().changed({"start.shape": "sphere"})
     assert start_shape(asked, views) == "sphere"
+
+
+def test_photos_that_together_show_all_of_an_object_start_from_the_hull() -> None:
+    """Each is cut off at a side, and other photos show what it lacks; from the sphere that would stay where it is."""
+    whole = photograph(MeshFile(*icosphere(2)), 48, 48, supersampling=1)
+    boxes = [(Box(14, 0, 48, 48), Box(0, 0, 34, 48))[index % 2] for index in range(len(whole))]
+    Ks = whole.Ks.clone()
+    Ks[:, 0, 2] -= torch.tensor([float(box.left) for box in boxes])
+    views = replace(whole, Ks=Ks, images=cropped(whole.images, boxes))
+    assert start_shape(ReconstructConfig.quick(), views) == "hull"
 
 
 def test_settings_of_one_start_are_taken_where_it_is_chosen_as_the_run_begins(tmp_path: Path) -> None:

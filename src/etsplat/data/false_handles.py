@@ -47,7 +47,7 @@ def without_false_handles(
     photos = photos_of(dataset)
     if len(photos) < 2:
         return vertices, faces
-    most = _wrong(photos, vertices, faces) + torch.tensor([_LOST, _ADDED])
+    most = silhouette_errors(photos, vertices, faces) + torch.tensor([_LOST, _ADDED])
     for level in _LEVELS:
         while (simpler := _simpler(photos, vertices, faces, level, most)) is not None:
             vertices, faces = simpler
@@ -73,7 +73,7 @@ def _simpler(
         after = genera(found[1], len(found[0]))
         if sum(after) >= sum(before) or len(after) != len(before):
             continue
-        if bool((_wrong(photos, *found) <= most).all()):
+        if bool((silhouette_errors(photos, *found) <= most).all()):
             return found
     return None
 
@@ -99,7 +99,7 @@ def _regions(faces: Tensor, low: Bool[Tensor, " F"]) -> list[Bool[Tensor, " F"]]
     return found
 
 
-def _wrong(photos: list[Photo], vertices: Tensor, faces: Tensor) -> Float[Tensor, "B 2"]:
+def silhouette_errors(photos: list[Photo], vertices: Tensor, faces: Tensor) -> Float[Tensor, "B 2"]:
     """Of each view, the pixels that the surface should cover and does not, and the reverse, per silhouette."""
     found = []
     for photo in photos:

@@ -4,6 +4,8 @@ The visual hull (Laurentini 1994) is the set of points that fall inside the silh
 object.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import distance_transform_edt
@@ -12,8 +14,9 @@ from torch import Tensor
 from etsplat.core.cameras import camera_centers
 from etsplat.core.errors import InputError
 from etsplat.data.camera_coverage import axes_meeting_point
+from etsplat.data.carving import Carving
 from etsplat.data.dataset import Dataset
-from etsplat.data.silhouettes import silhouette, touches_border
+from etsplat.data.silhouettes import Silhouette, reach_of, silhouette, touches_border
 
 _CELLS = 48
 """Grid cells per side, at each of the levels."""
@@ -21,11 +24,24 @@ _CELLS = 48
 _LEVELS = 3
 """Each level divides the box of what the one before has left."""
 
-_View = tuple[np.ndarray, np.ndarray, np.ndarray]
-"""World to camera (4, 4) and K (3, 3), for the shrunk silhouette (h, w): each pixel's distance to it, 0 inside."""
-
 _MASK_WIDTH = 200
 """Silhouettes are shrunk to about this many pixels across (a pixel counts as inside if any part of it was)."""
+
+
+class _View(NamedTuple):
+    """A shrunk silhouette with its camera.
+
+    Attributes:
+        viewmat: (4, 4) world to camera.
+        K: (3, 3), for the shrunk picture.
+        outside: (h, w) each pixel's distance to the silhouette, 0 inside.
+        whole: whether it keeps off the border.
+    """
+
+    viewmat: np.ndarray
+    K: np.ndarray
+    outside: np.ndarray
+    whole: bool
 
 
 def bounding_sphere(dataset: Dataset) -> tuple[Float[Tensor, "3"], float]:
@@ -34,7 +50,7 @@ def bounding_sphere(dataset: Dataset) -> tuple[Float[Tensor, "3"], float]:
     The hull is carved from a grid between the cameras with the masks of the training views. A view whose silhouette
     keeps off the image border shows the whole object, so it also excludes what its image does not show; where the
     silhouette is cut by the border, nothing is known outside the image. A point of the hull is judged by at least
-    half of the views.
+    half of the views. Rough masks are believed as far as they predict each other (`Carving`).
 
     Args:
         dataset: photos with alpha, in any frame.
@@ -64,20 +80,30 @@ def bounding_sphere(dataset: Dataset) -> tuple[Float[Tensor, "3"], float]:
         raise InputError(
             f"view {names[depth.argmin()]}: looks away from where the others look; an object needs views around it"
         )
-    outside = [np.asarray(distance_transform_edt(~mask)) for mask in inside]
+    carving = _carving(dataset, center.float())
+    outside = [
+        (np.asarray(distance_transform_edt(~mask)) - carving.grown / step).clip(min=0)
+        for mask, step in zip(inside, steps, strict=True)
+    ]
     Ks = dataset.Ks[dataset.train].float().double().numpy()
     Ks[:, :2] /= steps[:, None, None]
-    views = list(zip(viewmats, Ks, outside, strict=True))
+    whole = [not touches_border(mask) for mask in inside]
+    views = [_View(*each) for each in zip(viewmats, Ks, outside, whole, strict=True)]
     eyes = camera_centers(rounded).double().numpy()
-    kept, cell = _carve(views, meeting, np.linalg.norm(eyes - meeting, axis=1).max())
-    within = _keeps(views, eyes, 0.0)
+    kept, cell = _carve(views, meeting, np.linalg.norm(eyes - meeting, axis=1).max(), carving.outvoted)
+    within = _keeps(views, eyes, 0.0, carving.outvoted)
     if within.any():
         raise InputError(f"view {names[within.argmax()]}: its camera is inside the object; remove that view")
     radius = float(np.linalg.norm(kept - meeting, axis=1).max()) + cell * 3**0.5 / 2
     return center.float(), radius
 
 
-def _carve(views: list[_View], center: np.ndarray, reach: float) -> tuple[np.ndarray, float]:
+def _carving(dataset: Dataset, center: Tensor) -> Carving:
+    views = [Silhouette(dataset, index) for index in dataset.train]
+    return Carving.of(views, center, reach_of(views, center))
+
+
+def _carve(views: list[_View], center: np.ndarray, reach: float, outvoted: int) -> tuple[np.ndarray, float]:
     """Centres (N, 3) and side of the cubes that are left of the box `center` +- `reach`."""
     lower, upper = center - reach, center + reach
     kept, cell = center[None], reach
@@ -85,7 +111,7 @@ def _carve(views: list[_View], center: np.ndarray, reach: float) -> tuple[np.nda
         cell = float((upper - lower).max()) / _CELLS
         axes = [np.arange(lower[k] + cell / 2, upper[k], cell) for k in range(3)]
         points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-        kept = points[_keeps(views, points, cell)]
+        kept = points[_keeps(views, points, cell, outvoted)]
         if len(kept) == 0:
             raise InputError(
                 "masks: the silhouettes have no point in common; check that masks are white inside the object and that"
@@ -121,14 +147,14 @@ def _any_of(mask: np.ndarray, step: int) -> np.ndarray:
     return np.logical_or.reduceat(np.logical_or.reduceat(mask, rows), columns, axis=1)
 
 
-def _keeps(views: list[_View], points: np.ndarray, cell: float) -> np.ndarray:
+def _keeps(views: list[_View], points: np.ndarray, cell: float, outvoted: int) -> np.ndarray:
     """(N,) whether the cube of side `cell` about each point may reach into the silhouettes of all that judge it.
 
-    In numpy: for thousands of small steps torch's threads are in the way.
+    All but so many that are outvoted. In numpy: for thousands of small steps torch's threads are in the way.
     """
     alive = np.arange(len(points))
-    judged = np.zeros(len(points), dtype=np.int32)
-    for viewmat, K, outside in views:
+    judged, missed = np.zeros(len(points), dtype=np.int32), np.zeros(len(points), dtype=np.int32)
+    for viewmat, K, outside, whole in views:
         camera = points[alive] @ viewmat[:3, :3].T + viewmat[:3, 3]
         z = camera[:, 2]
         front = z > 0
@@ -137,11 +163,11 @@ def _keeps(views: list[_View], points: np.ndarray, cell: float) -> np.ndarray:
         column, row = pixel[framed].astype(np.int64).T
         # Half the cube's diagonal on the screen, and half a pixel's.
         reach = K[0, 0] * 0.87 * cell / z[framed] + 0.71
-        whole = not touches_border(outside == 0)
         keep = np.full(len(alive), not whole)
         keep[framed] = outside[row, column] <= reach
         judged[alive] += framed | whole
-        alive = alive[keep]
+        missed[alive] += ~keep
+        alive = alive[missed[alive] <= outvoted]
     kept = np.zeros(len(points), dtype=bool)
     kept[alive] = 2 * judged[alive] >= len(views)
     return kept

@@ -9,6 +9,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, UInt8
@@ -265,6 +266,32 @@ class LazyPictures(Pictures):
             return self._kept[index]
 
 
+class Box(NamedTuple):
+    """A part of a picture: its first column and row, and those after its last."""
+
+    left: int
+    upper: int
+    right: int
+    lower: int
+
+
+def cropped(pictures: Pictures, boxes: Sequence[Box]) -> LazyPictures:
+    """Of each photo, its mask and its depths what is in a box."""
+    sizes = [(box.right - box.left, box.lower - box.upper) for box in boxes]
+
+    def make(index: int) -> Picture:
+        picture, box = pictures.picture(index), boxes[index]
+        rows, columns = slice(box.upper, box.lower), slice(box.left, box.right)
+        mask = None if picture.mask is None else picture.mask[rows, columns].contiguous()
+        depth = None if picture.depth is None else picture.depth[rows, columns].contiguous()
+        return Picture(picture.pixels[rows, columns].contiguous(), mask, depth)
+
+    def fingerprint() -> bytes:
+        return hashlib.sha256(pictures.fingerprint() + repr(boxes).encode()).digest()
+
+    return LazyPictures(make, sizes, _bytes_of(pictures, sizes), fingerprint, with_depth=pictures.with_depth)
+
+
 def halved(pictures: Pictures) -> LazyPictures:
     """Photos and masks at half the size, each pixel the mean of those it replaces; odd sizes are rounded down.
 
@@ -278,9 +305,13 @@ def halved(pictures: Pictures) -> LazyPictures:
         depth = None if picture.depth is None else resize_depth(picture.depth, width, height)
         return Picture(_area_mean(picture.pixels, width, height), mask, depth)
 
+    return LazyPictures(make, sizes, _bytes_of(pictures, sizes), pictures.fingerprint, with_depth=pictures.with_depth)
+
+
+def _bytes_of(pictures: Pictures, sizes: Sequence[tuple[int, int]]) -> list[int]:
+    """What photos of other sizes take."""
     per_pixel = math.ceil(pictures.total_bytes / sum(width * height for width, height in pictures.sizes))
-    sizes_in_bytes = [per_pixel * width * height for width, height in sizes]
-    return LazyPictures(make, sizes, sizes_in_bytes, pictures.fingerprint, with_depth=pictures.with_depth)
+    return [per_pixel * width * height for width, height in sizes]
 
 
 def _area_mean(image: Pixels, width: int, height: int) -> Pixels:

@@ -39,12 +39,6 @@ _ALONE = 4.0
 _KEPT = 0.75
 """So many of the views are kept at least."""
 
-_ROUGH = 0.02
-"""The part of the object's pixels that masks may lose where they are rough."""
-
-_EXACT = 1.0
-"""Pixels, up to which masks are taken to be exact."""
-
 
 def silhouette(photo: Pixels) -> Bool[np.ndarray, "H W"]:
     """Where a photo shows the object: alpha from 0.5 on; everywhere without alpha."""
@@ -99,9 +93,13 @@ class Silhouette:
         inside = np.flatnonzero(self.inside)
         chosen = inside[np.linspace(0, len(inside) - 1, min(count, len(inside))).round().astype(np.int64)]
         row, column = np.unravel_index(chosen, self.inside.shape)
+        return camera_centers(self.viewmat[None])[0], self.directions(row, column)
+
+    def directions(self, row: np.ndarray, column: np.ndarray) -> Float[Tensor, "R 3"]:
+        """Unit vectors from the camera's centre through the centres of pixels."""
         pixel = torch.from_numpy(np.stack([column + 0.5, row + 0.5, np.ones(len(row))], axis=1)).float()
         direction = torch.linalg.solve(self.K, pixel.T).T @ self.viewmat[:3, :3]
-        return camera_centers(self.viewmat[None])[0], torch.nn.functional.normalize(direction, dim=1)
+        return torch.nn.functional.normalize(direction, dim=1)
 
     @property
     def far(self) -> float:
@@ -131,21 +129,17 @@ class Evidence:
         starts = torch.cat([start.expand_as(along) for start, along in lines])
         along = torch.cat([along for _, along in lines])
         view = torch.arange(len(views)).repeat_interleave(torch.tensor([len(along) for _, along in lines]))
-        nearest = ((center - starts) * along).sum(dim=1)
-        aside = (starts + nearest[:, None] * along - center).norm(dim=1)
-        half = (radius**2 - aside**2).clamp_min((0.1 * radius) ** 2).sqrt()
+        nearest, half = within_ball(starts, along, center, radius)
         chunks = zip(*(x.split(_CHUNK) for x in (starts, along, nearest, half)), strict=True)
         depth = torch.cat([_best_along(views, *chunk) for chunk in chunks])
         return Evidence(view, depth, depth < -torch.tensor([view.far for view in views]))
 
-    def rough(self) -> float:
-        """By how many pixels silhouettes must grow until they explain each other, contradictions left out.
 
-        0 where they are exact.
-        """
-        lost = (-self.depth.amin(dim=1)).clamp_min(0)[~self.excluded.any(dim=1)]
-        rough = float(lost.quantile(1 - _ROUGH)) if len(lost) else 0.0
-        return rough if rough > _EXACT else 0.0
+def within_ball(start: Tensor, along: Tensor, center: Tensor, radius: float) -> tuple[Tensor, Tensor]:
+    """(R,) where lines of sight are in the middle of a ball, and (R,) how far they are within it on either side."""
+    middle = ((center - start) * along).sum(dim=1)
+    aside = (start + middle[:, None] * along - center).norm(dim=1)
+    return middle, (radius**2 - aside**2).clamp_min((0.1 * radius) ** 2).sqrt()
 
 
 def _best_along(views: Sequence[Silhouette], starts: Tensor, along: Tensor, middle: Tensor, half: Tensor) -> Tensor:
@@ -189,7 +183,7 @@ def contradicting(dataset: Dataset) -> list[int]:
         return []
     while len(left) >= max(_FEWEST, _KEPT * len(dataset.train) + 1):
         views = [silhouettes[index] for index in left]
-        guilt = _guilt(views, Evidence.of(views, center.float(), _reach(views, center.float())))
+        guilt = _guilt(views, Evidence.of(views, center.float(), reach_of(views, center.float())))
         if float(guilt.max()) < 1:
             break
         wrong.append(left.pop(int(guilt.argmax())))
@@ -209,7 +203,7 @@ def _guilt(views: Sequence[Silhouette], evidence: Evidence) -> Float[Tensor, " N
     return torch.where(alone, guilt, 0.0).amax(dim=0)
 
 
-def _reach(views: Sequence[Silhouette], center: Tensor) -> float:
+def reach_of(views: Sequence[Silhouette], center: Tensor) -> float:
     """Radius of a ball about the point that holds the object, by what most views show."""
     radii = []
     for view in views:

@@ -11,9 +11,10 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
+from etsplat.data.carving import Carving
 from etsplat.data.dataset import Dataset
 from etsplat.data.meshing import dual_contour
-from etsplat.data.silhouettes import Evidence, Silhouette
+from etsplat.data.silhouettes import Silhouette
 from etsplat.geometry.manifold import taken_apart
 from etsplat.geometry.parts import face_parts
 
@@ -84,22 +85,17 @@ def visual_hull(
 def outside_hull(dataset: Dataset) -> Distance:
     """How far points are outside the visual hull: a function of them, in units of the scene, negative inside.
 
-    Where masks are rough and lose what others show, silhouettes are taken to be larger by so many pixels.
+    Where masks are rough or bitten they are believed as far as they predict each other (`Carving`).
 
     Args:
         dataset: as in `visual_hull`.
     """
     views = [Silhouette(dataset, index) for index in dataset.train]
-    rough = Evidence.of(views, torch.zeros(3), 1.0).rough()
+    carving = Carving.of(views, torch.zeros(3), 1.0)
 
     def outside(points: Tensor) -> Tensor:
-        depth, judges = torch.full((len(points),), torch.inf), torch.zeros(len(points))
-        points = points.T.contiguous().T
-        for view in views:
-            found, unit, judged = view.depth(points)
-            depth = torch.where(judged, torch.minimum(depth, (found + rough) * unit), depth)
-            judges += judged
-        return torch.where(2 * judges >= len(views), -depth, 1.0)
+        depth = carving.depth(views, points)
+        return torch.where(depth.isneginf(), 1.0, -depth)
 
     return outside
 

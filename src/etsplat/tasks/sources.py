@@ -19,6 +19,7 @@ from etsplat.data.dataset import Dataset
 from etsplat.data.demo_object import demo_object
 from etsplat.data.demo_scene import HEIGHT, WIDTH, demo_scene
 from etsplat.data.dense_cloud import dense_start
+from etsplat.data.frame_gaps import without_frame_gaps
 from etsplat.data.hull import bounding_sphere
 from etsplat.data.load import load_dataset
 from etsplat.data.photograph import normalize_mesh, photograph
@@ -56,7 +57,8 @@ def load_source(
 ) -> tuple[MeshFile | Dataset, Sequence[str]]:
     """Reads a mesh file or a scene folder, or makes the demo's object; objects are passed through.
 
-    Of a folder, training views are left out whose masks contradict the others'.
+    Of a folder, training views are left out whose masks contradict the others', and photos are cropped where their mask
+    ends just before the frame that cuts the object off.
 
     Args:
         source: what to read.
@@ -95,14 +97,19 @@ def load_source(
 
 
 def _agreeing(scene: Dataset) -> tuple[Dataset, list[str]]:
-    """Without training views whose masks contradict the others', and a note that names them."""
+    """Without training views whose masks contradict the others', nor gaps at frames; and notes that name the photos."""
+    scene, cropped = without_frame_gaps(scene)
+    notes = []
+    if cropped:
+        names = ", ".join(scene.names[index] for index in cropped)
+        notes.append(f"cropped, since a mask ends along the frame just before it: {names}")
     wrong = contradicting(scene)
-    if not wrong:
-        return scene, []
-    names = ", ".join(scene.names[index] for index in sorted(wrong))
-    contradict = "its mask contradicts" if len(wrong) == 1 else "their masks contradict"
-    note = f"left out, since {contradict} the others: {names}"
-    return replace(scene, train=[index for index in scene.train if index not in wrong]), [note]
+    if wrong:
+        names = ", ".join(scene.names[index] for index in sorted(wrong))
+        contradict = "its mask contradicts" if len(wrong) == 1 else "their masks contradict"
+        notes.append(f"left out, since {contradict} the others: {names}")
+        scene = replace(scene, train=[index for index in scene.train if index not in wrong])
+    return scene, notes
 
 
 def load_scene(

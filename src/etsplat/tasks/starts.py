@@ -8,8 +8,9 @@ import torch
 from torch import Tensor
 
 from etsplat.core.errors import InputError
+from etsplat.data.agreement import photos_of
 from etsplat.data.dataset import Dataset
-from etsplat.data.false_handles import without_false_handles
+from etsplat.data.false_handles import silhouette_errors, without_false_handles
 from etsplat.data.hollows import open_hollows
 from etsplat.data.lids import without_lids
 from etsplat.data.silhouettes import silhouette, touches_border
@@ -21,6 +22,12 @@ from etsplat.io.mesh_files import MeshFile, load_mesh, weld_vertices
 from etsplat.model.triangle_mesh import MeshAppearance, TriangleMesh
 from etsplat.tasks.judgement import Start
 from etsplat.tasks.reconstruct_config import ReconstructConfig
+
+_FACES = 4000
+"""Of the hull that is asked what it explains."""
+
+_LOST = 0.05
+"""The part of silhouettes that it may leave uncovered, in the mean: less than a limb."""
 
 
 class Started(NamedTuple):
@@ -53,8 +60,20 @@ def start_shape(config: ReconstructConfig, views: Dataset) -> Literal["sphere", 
     """
     if config.start.shape != "auto":
         return config.start.shape
-    whole = [not touches_border(silhouette(views.images[index])) for index in views.train] if views.has_masks else []
-    return "hull" if 2 * sum(whole) > len(views.train) else "sphere"
+    if not views.has_masks:
+        return "sphere"
+    whole = [not touches_border(silhouette(views.images[index])) for index in views.train]
+    return "hull" if 2 * sum(whole) > len(views.train) or _explained(views, config.start.radius) else "sphere"
+
+
+@torch.no_grad()
+def _explained(views: Dataset, radius: float) -> bool:
+    """Whether the hull covers what photos show, though most of them cut it off."""
+    surface = visual_hull(views, _FACES, radius=radius)
+    if len(surface[1]) == 0:
+        return False
+    lost, _ = silhouette_errors(photos_of(views), *surface).unbind(dim=1)
+    return float(lost.mean()) <= _LOST
 
 
 def make_start(

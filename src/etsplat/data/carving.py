@@ -1,0 +1,179 @@
+"""How far silhouettes are believed where they are intersected: masks that somebody brings are rough, or bitten.
+
+A rule for the visual hull is as good as it predicts the mask of a view that it has not seen (leave-one-out). That is
+measured at pixels near the outlines, where what is lost counts as much as what is too much, and the best rule is taken.
+Exact masks are intersected as they are: then nothing else predicts as well.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int64
+from torch import Tensor
+
+from etsplat.core.cameras import camera_centers
+from etsplat.data.silhouettes import Silhouette, within_ball
+
+_RAYS, _LEAST_RAYS = 1024, 8
+"""Pixels that are asked for on each side of the outlines, in all views together, and of each at least."""
+
+_BAND, _LEAST_BAND = 0.04, 6.0
+"""They are nearer to the outline than this fraction of the silhouette's size, or than so many pixels."""
+
+_SAMPLES, _FINER = 96, (9, 9)
+"""Points along the line of sight of each, and then around the best of these."""
+
+_CHUNK = 1 << 10
+"""Lines of sight that are looked along together."""
+
+_MOST = 2
+"""So many views may be outvoted at a point, at most."""
+
+_CLEARLY = 0.9
+"""A rule with more of them errs at most so many times as often as one with fewer."""
+
+_EXACT = 0.5
+"""Pixels up to which masks are taken to be exact: that is how well a pixel's edge is known."""
+
+_FEWEST = 6
+"""With fewer views nobody can say whose mask is wrong."""
+
+
+@dataclass(frozen=True)
+class Carving:
+    """The rule by which silhouettes are intersected.
+
+    Attributes:
+        outvoted: so many views may say of a point of the hull that it is outside.
+        grown: pixels by which silhouettes are taken to be larger.
+    """
+
+    outvoted: int = 0
+    grown: float = 0.0
+
+    @classmethod
+    def of(cls, views: Sequence[Silhouette], center: Float[Tensor, "3"], radius: float) -> "Carving":
+        """The rule that predicts the masks of these views best, for an object in a ball."""
+        if len(views) < _FEWEST:
+            return cls()
+        lines = _Lines.near_outlines(views, max(_LEAST_RAYS, _RAYS // len(views)))
+        depths = torch.cat([_deepest(views, some, center, radius) for some in lines.split(_CHUNK)])
+        shown, limit = lines.shown, max(view.far for view in views)
+        best, least = cls(), torch.inf
+        for outvoted, depth in enumerate(depths.T):
+            grown, wrong = _best_growth(depth, shown, limit)
+            if wrong < _CLEARLY * least:
+                best, least = cls(outvoted, grown if grown > _EXACT else 0.0), wrong
+        return best
+
+    def depth(self, views: Sequence[Silhouette], points: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:
+        """How deep points are in the hull, in units of the scene; -inf where less than half of the views judge."""
+        lowest, judges = Lowest(self.outvoted + 1, len(points)), torch.zeros(len(points))
+        points = points.T.contiguous().T
+        for view in views:
+            found, unit, judged = view.depth(points)
+            lowest.add(torch.where(judged, (found + self.grown) * unit, torch.inf))
+            judges += judged
+        return torch.where(2 * judges >= len(views), lowest.values[-1], -torch.inf)
+
+
+class Lowest:
+    """The lowest so many of the numbers that were added at each of N places.
+
+    Attributes:
+        values: (N,) each, ascending; infinite as long as fewer were added.
+    """
+
+    def __init__(self, count: int, *shape: int) -> None:
+        self.values = [torch.full(shape, torch.inf) for _ in range(count)]
+
+    def add(self, number: Tensor) -> None:
+        """Another one at each place."""
+        for place, value in enumerate(self.values):
+            self.values[place], number = torch.minimum(value, number), torch.maximum(value, number)
+
+
+class _Lines(NamedTuple):
+    """Lines of sight through pixels near outlines.
+
+    Attributes:
+        view: (R,) the view that is asked about each, and so does not judge it.
+        start: (R, 3).
+        along: (R, 3) unit vectors.
+        shown: (R,) whether the pixel shows the object.
+    """
+
+    view: Int64[Tensor, " R"]
+    start: Float[Tensor, "R 3"]
+    along: Float[Tensor, "R 3"]
+    shown: Bool[Tensor, " R"]
+
+    @classmethod
+    def near_outlines(cls, views: Sequence[Silhouette], count: int) -> "_Lines":
+        """So many on each side of each outline, evenly spread over rows, where there are so many."""
+        each = []
+        for number, view in enumerate(views):
+            distance = view.distance[0, 0].numpy()
+            near = np.abs(distance) < max(_LEAST_BAND, _BAND * float(view.inside.sum()) ** 0.5)
+            inside, beyond = (_spread(side, count) for side in (near & view.inside, near & ~view.inside))
+            row, column = np.unravel_index(np.concatenate([inside, beyond]), distance.shape)
+            start = camera_centers(view.viewmat[None]).expand(len(row), 3)
+            shown = torch.arange(len(row)) < len(inside)
+            each.append(cls(torch.full((len(row),), number), start, view.directions(row, column), shown))
+        return cls(*(torch.cat(parts) for parts in zip(*each, strict=True)))
+
+    def split(self, size: int) -> Iterator["_Lines"]:
+        return (_Lines(*parts) for parts in zip(*(part.split(size) for part in self), strict=True))
+
+
+def _spread(some: Bool[np.ndarray, "H W"], count: int) -> np.ndarray:
+    place = np.flatnonzero(some)
+    return place[np.linspace(0, len(place) - 1, min(count, len(place))).round().astype(np.int64)]
+
+
+def _deepest(views: Sequence[Silhouette], lines: _Lines, center: Tensor, radius: float) -> Float[Tensor, "R K"]:
+    """How deep the deepest point on each line is, in pixels, by each number of views that are outvoted."""
+    middle, half = within_ball(lines.start, lines.along, center, radius)
+    each, every = [], torch.arange(len(half))
+    t, found = _look(views, lines, middle, half, _SAMPLES)
+    for outvoted in range(_MOST + 1):
+        best, place = found[outvoted].max(dim=1)
+        around, reach = t[every, place], half * 2 / (_SAMPLES - 1)
+        for samples in _FINER:
+            finer, depths = _look(views, lines, around, reach, samples)
+            value, place = depths[outvoted].max(dim=1)
+            best = torch.maximum(best, value)
+            around, reach = finer[every, place], reach * 2 / (samples - 1)
+        each.append(best)
+    return torch.stack(each, dim=1)
+
+
+def _look(
+    views: Sequence[Silhouette], lines: _Lines, middle: Tensor, half: Tensor, samples: int
+) -> tuple[Float[Tensor, "R S"], list[Float[Tensor, "R S"]]]:
+    """Places along each line, and how deep the points there are by each number of views that are outvoted."""
+    t = middle[:, None] + half[:, None] * torch.linspace(-1, 1, samples)
+    rows = zip(lines.start.T, lines.along.T, strict=True)
+    points = torch.stack([(a[:, None] + t * b[:, None]).view(-1) for a, b in rows]).T
+    lowest, judges = Lowest(_MOST + 1, *t.shape), torch.zeros(t.shape)
+    for number, view in enumerate(views):
+        found, _, judged = (x.reshape(t.shape) for x in view.depth(points))
+        judged = judged & (lines.view != number)[:, None]
+        lowest.add(torch.where(judged, found, torch.inf))
+        judges += judged
+    return t, [torch.where(2 * judges >= len(views) - 1, depth, -torch.inf) for depth in lowest.values]
+
+
+def _best_growth(depth: Float[Tensor, " R"], shown: Bool[Tensor, " R"], limit: float) -> tuple[float, float]:
+    """Pixels, up to `limit`, by which silhouettes must grow to predict masks best, and the share of wrong pixels."""
+    needed, order = (-depth).clamp_min(0).sort(stable=True)
+    gained = torch.where(shown[order], 1, -1).cumsum(dim=0)
+    last = torch.cat([needed[1:] > needed[:-1], torch.tensor([True])]) & (needed <= limit)
+    choices = last.nonzero()[:, 0]
+    if len(choices) == 0:
+        return 0.0, 1.0
+    best = choices[gained[choices].argmax()]
+    return float(needed[best]), float((shown.sum() - gained[best]) / len(shown))
