@@ -203,7 +203,8 @@ class TrainConfig(Settings):
     """Densification stops here, or earlier where photos are few or small."""
     pixels_per_triangle: Annotated[float | None, Range(0.01), Rare] = 75.0
     """Densification stops where there is a triangle for so many pixels of the training photos.
-    More learn the photos by heart, and other views fall apart; None for `max_triangles` whatever the photos."""
+    More learn the photos by heart, and other views fall apart; None for `max_triangles` whatever the photos.
+    The opaque mesh has more where photos agree on them."""
     normalize: Annotated[bool, Rare] = True
     """Train in the frame where the cameras are centred and the scene has extent 1. Results are in the scene's units."""
     background: Annotated[Literal["black", "white", "random"], Rare] = "black"
