@@ -1,4 +1,6 @@
-// Bands of rows run in parallel (simd/photometric.h); their sums are added in order.
+// Each thread takes rows in one sweep (simd/photometric.h), as many as leave something for the others: twenty more are
+// read around them. Sums are of bands of rows, however they are shared out, and added in order.
+#include <algorithm>
 #include <vector>
 
 #include "bindings.h"
@@ -12,15 +14,18 @@ namespace etsplat {
 namespace {
 
 PhotometricSums photometric(const PhotometricPass& pass, int64_t views) {
-    const int64_t bands = (pass.height + kBandRows - 1) / kBandRows;
-    std::vector<PhotometricSums> sums(static_cast<size_t>(views * bands));
-    const PhotometricKernels::Band run = active_photometric_kernels().band;
-    parallel_for(views * bands, 1, [&](int64_t begin, int64_t end) {
+    const int64_t bands = (pass.height + kBandRows - 1) / kBandRows;  // of a view
+    const int64_t together = std::min(bands, (views * bands + num_threads() - 1) / num_threads());
+    const int64_t sweeps = (bands + together - 1) / together;
+    std::vector<PhotometricSums> sums(static_cast<size_t>(views * bands), {0.0, 0.0});
+    const PhotometricKernels::Sweep run = active_photometric_kernels().sweep;
+    parallel_for(views * sweeps, 1, [&](int64_t begin, int64_t end) {
         thread_local Buffer<float> scratch;
         scratch.resize(photometric_scratch_size(pass.width));
         for (int64_t piece = begin; piece < end; ++piece) {
-            const int64_t first = piece % bands * kBandRows, last = std::min(first + kBandRows, pass.height);
-            sums[static_cast<size_t>(piece)] = run(pass, piece / bands, first, last, scratch.data());
+            const int64_t view = piece / sweeps, band = piece % sweeps * together;
+            const int64_t last = std::min((band + together) * kBandRows, pass.height);
+            run(pass, view, band * kBandRows, last, scratch.data(), sums.data() + view * bands + band);
         }
     });
     PhotometricSums total{0.0, 0.0};

@@ -8,7 +8,7 @@
 
 namespace etsplat {
 
-constexpr int64_t kBandRows = 32;  // rows of an image that a thread takes at a time
+constexpr int64_t kBandRows = 32;  // rows of an image whose values are summed together
 
 struct PhotometricPass {
     const float* color;   // (B, H, W, 3)
@@ -28,8 +28,10 @@ struct PhotometricSums {
 };
 
 struct PhotometricKernels {
-    using Band = PhotometricSums (*)(const PhotometricPass&, int64_t view, int64_t first, int64_t last, float* scratch);
-    Band band;
+    // Rows first .. last - 1 in one sweep; `sums`, zeros at first, are those of each kBandRows of them.
+    using Sweep = void (*)(const PhotometricPass&, int64_t view, int64_t first, int64_t last, float* scratch,
+                           PhotometricSums* sums);
+    Sweep sweep;
 };
 
 // floats

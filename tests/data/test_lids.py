@@ -65,12 +65,12 @@ def test_differences_are_of_the_pixels_that_show_a_face() -> None:
     colors = shade_faces(vertices, faces)
     photo = photos_of(views)[0]
     hit = first_hits(photo, vertices, faces)[1]
-    sums = differences(photo, hit, hit, colors)
+    sums = differences(photo, hit, [hit], colors)
     seen = hit[(hit >= 0) & (photo.pixels[0, 3] > 0.95)].unique()
     assert torch.equal(sums[:, 0].nonzero()[:, 0], seen)
     pairs = MeshTopology.from_faces(faces, len(vertices)).face_pairs.long()
     assert per_pixel(sums, pairs)[seen, 0].median() < 0.01  # its own colours, but for the brim
-    wrong = per_pixel(differences(photo, hit, hit, (colors - 0.2).clamp_min(0)), pairs)[seen, 0]
+    wrong = per_pixel(differences(photo, hit, [hit], (colors - 0.2).clamp_min(0)), pairs)[seen, 0]
     assert wrong.median() == pytest.approx(0.2, abs=0.02)
 
 

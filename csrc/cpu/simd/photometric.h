@@ -1,8 +1,8 @@
-// L1 (or squared) difference and SSIM of a band of rows, with the gradient, in one sweep over the rows.
+// L1 (or squared) difference and SSIM of some rows, with the gradient, in one sweep over the rows.
 //
 // The 11 x 11 window is separable: a row is blurred along x when it arrives and kept in a ring of 11 rows; the blur along
 // y reads the ring. The gradient needs a second blur, of three derivative maps, which follows five rows behind through
-// rings of its own. So a band touches its rows and ten above and below, and its working set (about 120 KiB per 100 pixels
+// rings of its own. So a sweep touches its rows and ten above and below, and its working set (about 120 KiB per 100 pixels
 // of width) stays in the second-level cache. Rows and columns outside the image are zero, as in 3DGS.
 #pragma once
 
@@ -125,22 +125,22 @@ void mask_row(const PhotometricPass& pass, int64_t at, float* gradient) {
 }
 
 // Without SSIM: one row at a time.
-double pixel_band(const PhotometricPass& pass, int64_t view, int64_t first, int64_t last, float* scratch) {
+void pixel_sweep(const PhotometricPass& pass, int64_t view, int64_t first, int64_t last, float* scratch,
+                 PhotometricSums* sums) {
     const int64_t n = 3 * pass.width;
     float *masked = scratch, *y = scratch + n;
-    double sum = 0.0;
     for (int64_t row = first; row < last; ++row) {
         const int64_t at = (view * pass.height + row) * pass.width;
         load_target(pass, view, at, y);
         if (pass.mask) load_masked(pass, at, y, masked);
         float* gradient = pass.gradient ? pass.gradient + 3 * at : nullptr;
-        sum += pixel_row(pass, pass.mask ? masked : pass.color + 3 * at, y, gradient, n);
+        const float* x = pass.mask ? masked : pass.color + 3 * at;
+        sums[(row - first) / kBandRows].pixel += pixel_row(pass, x, y, gradient, n);
         if (gradient) mask_row(pass, at, gradient);
     }
-    return sum;
 }
 
-// The rows that a band keeps around the one at hand. Rows of x, y, their products and the maps have zeros on both sides.
+// The rows that a sweep keeps around the one at hand. Rows of x, y, their products and the maps have zeros on both sides.
 struct Rows {
     Rows(float* scratch, int64_t n)
         : memory(scratch), padded(n + 2 * kPad),
@@ -200,19 +200,18 @@ void add_slopes(const PhotometricPass& pass, Rows& rows, int64_t row, int64_t at
     mask_row(pass, at, gradient);
 }
 
-PhotometricSums photometric_band(const PhotometricPass& pass, int64_t view, int64_t first, int64_t last,
-                                 float* scratch) {
-    if (pass.ssim_weight == 0.0f) return {pixel_band(pass, view, first, last, scratch), 0.0};
+void photometric_sweep(const PhotometricPass& pass, int64_t view, int64_t first, int64_t last, float* scratch,
+                       PhotometricSums* sums) {
+    if (pass.ssim_weight == 0.0f) return pixel_sweep(pass, view, first, last, scratch, sums);
     const int64_t n = 3 * pass.width, image = view * pass.height;
     std::memset(scratch, 0, static_cast<size_t>(photometric_scratch_size(pass.width)) * sizeof(float));
     Rows rows(scratch, n);
-    PhotometricSums sums{0.0, 0.0};
     const int64_t reach = pass.gradient ? 2 * kReach : kReach;
     for (int64_t row = first - reach; row < last + reach; ++row) {
         load_row(pass, view, row, rows.x(row), rows.y(row));
         if (row >= first && row < last) {
             float* gradient = pass.gradient ? pass.gradient + (image + row) * n : nullptr;
-            sums.pixel += pixel_row(pass, rows.x(row), rows.y(row), gradient, n);
+            sums[(row - first) / kBandRows].pixel += pixel_row(pass, rows.x(row), rows.y(row), gradient, n);
         }
         blur_moments(rows, row, n);
 
@@ -222,7 +221,8 @@ PhotometricSums photometric_band(const PhotometricPass& pass, int64_t view, int6
             for (int k = 0; k < 4; ++k) rows.moments[k].blur(centre, rows.blurred[k]);
             similarity_row(rows.blurred, rows.similarity, rows.map[0], rows.map[1], rows.map[2], n);
             if (centre >= first && centre < last) {
-                sums.ssim += lane_sum(n, [similarity = rows.similarity](int64_t i) { return similarity[i]; });
+                double& sum = sums[(centre - first) / kBandRows].ssim;
+                sum += lane_sum(n, [similarity = rows.similarity](int64_t i) { return similarity[i]; });
             }
         } else {
             for (float* map : rows.map) std::fill_n(map, n, 0.0f);
@@ -233,7 +233,6 @@ PhotometricSums photometric_band(const PhotometricPass& pass, int64_t view, int6
         const int64_t done = centre - kReach;
         if (done >= first) add_slopes(pass, rows, done, (image + done) * pass.width, n);
     }
-    return sums;
 }
 
 }  // namespace

@@ -5,6 +5,6 @@
 
 namespace etsplat::ETSPLAT_SIMD {
 
-PhotometricKernels photometric_kernels() { return {photometric_band}; }
+PhotometricKernels photometric_kernels() { return {photometric_sweep}; }
 
 }  // namespace etsplat::ETSPLAT_SIMD

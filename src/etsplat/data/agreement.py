@@ -4,7 +4,7 @@ That is the normalised cross-correlation of patches, so exposure does not matter
 is known.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -163,7 +163,7 @@ def contradicted(
     edges = topology.edges.long()
     hits = [first_hits(photo, vertices, faces) for photo in photos]
     score = surface_agreement(photos, hits, vertices, faces, edges)
-    sums = torch.stack([differences(photo, hit, hit, colors) for photo, (_, hit) in zip(photos, hits, strict=True)])
+    sums = torch.stack([differences(photo, hit, [hit], colors) for photo, (_, hit) in zip(photos, hits, strict=True)])
     wrong = per_pixel(sums.sum(dim=0), topology.face_pairs.long())[:, 0]
     usual = wrong[wrong > 0].median() if bool((wrong > 0).any()) else wrong.new_zeros(())
     return contradicted_share(score, vertices, faces, edges, wrong > torch.maximum(_UNUSUAL * usual, usual + _WRONG))
@@ -192,19 +192,21 @@ def contradicted_share(
 
 
 def differences(
-    photo: Photo, seen: Int64[Tensor, "H W"], shown: Int64[Tensor, "H W"], colors: Float[Tensor, "F 3"]
-) -> Float[Tensor, "F 2"]:
-    """Of each face, at how many pixels a photo of the object sees it, and the sum there of mean absolute differences.
+    photo: Photo, seen: Int64[Tensor, "H W"], shown: Sequence[Int64[Tensor, "H W"]], colors: Float[Tensor, "F 3"]
+) -> Float[Tensor, "F K"]:
+    """Of each face, at how many pixels a photo of the object sees it, and the sums there of mean absolute differences.
 
     Args:
         photo: one of `photos_of`.
         seen: (H, W) the face at each pixel, -1 where there is none.
-        shown: (H, W) the face whose colour is compared there.
+        shown: (H, W) the face whose colour is compared there: a column for each.
         colors: (F, 3) in [0, 1].
     """
-    at = (seen >= 0) & (photo.pixels[0, 3] > 0.95)
-    error = (photo.pixels[0, :3, at].T - colors[shown[at]]).abs().mean(dim=1)
-    return torch.zeros(len(colors), 2).index_add(0, seen[at], torch.stack([torch.ones_like(error), error], dim=1))
+    at = ((seen >= 0) & (photo.pixels[0, 3] > 0.95)).view(-1).nonzero()[:, 0]
+    face, pixels = seen.view(-1)[at], photo.pixels[0, :3].flatten(1)[:, at].T
+    errors = [(pixels - colors[faces.reshape(-1)[at]]).abs().mean(dim=1) for faces in shown]
+    columns = [torch.zeros(len(colors)).index_add(0, face, each) for each in (torch.ones(len(at)), *errors)]
+    return torch.stack(columns, dim=1)
 
 
 def per_pixel(sums: Float[Tensor, "F K"], pairs: Int64[Tensor, "P 2"]) -> Float[Tensor, "F K-1"]:

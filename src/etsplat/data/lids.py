@@ -97,7 +97,7 @@ def _wrong(photo: Photo, vertices: Tensor, faces: Tensor, colors: Tensor) -> Flo
     The first is that of the face, the second of the nearest face behind it that turns its back to the camera: on a
     closed surface that is where the line of sight leaves the matter that it enters here.
     """
-    corners = vertices[faces]
+    corners = vertices.index_select(0, faces.reshape(-1)).view(-1, 3, 3)
     normals = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     turned = ((corners[:, 0] - photo.center) * normals).sum(dim=1) > 0
     backs = turned.nonzero()[:, 0]
@@ -105,7 +105,7 @@ def _wrong(photo: Photo, vertices: Tensor, faces: Tensor, colors: Tensor) -> Flo
     entered = (front >= 0) & ~turned[front.clamp_min(0)] & (behind >= 0)
     front = torch.where(entered, front, -1)
     left = torch.where(entered, backs[behind.clamp_min(0)], -1) if len(backs) else front
-    return torch.cat([differences(photo, front, front, colors), differences(photo, front, left, colors)[:, 1:]], dim=1)
+    return differences(photo, front, [front, left], colors)
 
 
 def _patches(wrong: Float[Tensor, "F 3"], area: Float[Tensor, " F"], pairs: Int64[Tensor, "P 2"]) -> Bool[Tensor, " F"]:
