@@ -104,10 +104,10 @@ def start_mesh(soup: TriangleSoup, exposure: Exposure, capture: Dataset, config:
 
 @torch.no_grad()
 def finished_mesh(mesh: TriangleMesh, capture: Dataset) -> TriangleMesh:
-    """Gives what no training photo shows the colours of what is nearest and shown; a view may show it that is none.
+    """Gives triangles that no training photo shows the colours of the nearest that one shows: other views show them.
 
     Args:
-        mesh: of separate triangles; changed in place. Its backdrop is coloured as others are.
+        mesh: of separate triangles; changed in place, its backdrop like the rest.
         capture: what it was fitted to.
     """
     shown = torch.zeros(mesh.count, dtype=torch.bool, device=mesh.vertices.device)

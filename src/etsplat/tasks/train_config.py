@@ -216,7 +216,7 @@ class TrainConfig(Settings):
     """opaque: triangles are made opaque, then sharp, for engines without transparency."""
     asset: bool = True
     """Make an opaque mesh of the scene beside the soup, which looks right in every mesh viewer and game engine.
-    It takes a third to a half as long again as the soup; with finish opaque less."""
+    It takes a third to two thirds as long again as the soup; with finish opaque less."""
     watch: Annotated[int | None, Range(0), Rare] = None
     """One in so many training photos is kept from training, to watch the run by; 0 keeps none.
     None keeps one in 16 where there are at least 24.
