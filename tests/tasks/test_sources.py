@@ -147,3 +147,20 @@ def test_photos_whose_masks_contradict_the_others_are_left_out_and_named(tmp_pat
     assert wrong not in names
     assert len(names) == len(views.train) - 1
     assert notes == [f"left out, since its mask contradicts the others: {wrong}"]
+
+
+def test_photos_whose_mask_ends_just_before_the_frame_are_cropped_and_named(tmp_path):
+    """All lack what is left of a column, and their masks one pixel more."""
+    views = photograph(demo_object(), 64, 64, supersampling=2)
+    images = [image[:, 22:].clone() for image in views.images]
+    for image in images:
+        image[:, 0] = 0
+    spoilt = replace(views, images=StoredPictures(images))
+    camera = {"fl_x": float(views.Ks[0, 0, 0]), "cx": 10, "cy": 32, "w": 42, "h": 64}
+    write_views(tmp_path, spoilt, views.train, "transforms_train.json", **camera)
+    write_views(tmp_path, spoilt, views.test, "transforms_test.json", **camera)
+    scene, notes = load_source(tmp_path, ReconstructConfig.tiny())
+    cropped = [name for name, size in zip(scene.names, scene.images.sizes, strict=True) if size == (41, 64)]
+    assert len(cropped) > len(scene) / 2
+    assert notes[0] == f"cropped, since a mask ends along the frame just before it: {', '.join(cropped)}"
+    assert all(float(scene.Ks[scene.names.index(name), 0, 2]) == 9 for name in cropped)

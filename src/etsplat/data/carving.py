@@ -32,8 +32,8 @@ _CHUNK = 1 << 10
 _MOST = 2
 """So many views may be outvoted at a point, at most."""
 
-_CLEARLY = 0.9
-"""A rule with more of them errs at most so many times as often as one with fewer."""
+_CLEARLY, _SURELY = 0.9, 0.005
+"""A rule with more of them errs at most so many times as often as one with fewer, and at so much less of the pixels."""
 
 _EXACT = 0.5
 """Pixels up to which masks are taken to be exact: that is how well a pixel's edge is known."""
@@ -65,7 +65,7 @@ class Carving:
         best, least = cls(), torch.inf
         for outvoted, depth in enumerate(depths.T):
             grown, wrong = _best_growth(depth, shown, limit)
-            if wrong < _CLEARLY * least:
+            if wrong < min(_CLEARLY * least, least - _SURELY):
                 best, least = cls(outvoted, grown if grown > _EXACT else 0.0), wrong
         return best
 
