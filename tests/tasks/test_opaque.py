@@ -23,11 +23,13 @@ from etsplat.model.soup_appearance import SoupAppearance
 from etsplat.model.surroundings import Surroundings
 from etsplat.model.triangle_mesh import TriangleMesh
 from etsplat.model.triangle_soup import FOCAL_NOTE, TriangleSoup
+from etsplat.optim.exposure import Exposure
 from etsplat.optim.loop import DivergedError, Event, StageEvent
+from etsplat.optim.schedules import NEVER
 from etsplat.tasks import train as tasks_train
 from etsplat.tasks.export_config import ExportConfig
 from etsplat.tasks.export_soup import export_soup
-from etsplat.tasks.opaque import finished_mesh, make_opaque_trainer, opaque_mesh
+from etsplat.tasks.opaque import finished_mesh, make_opaque_trainer, opaque_mesh, start_mesh
 from etsplat.tasks.render_config import RenderConfig
 from etsplat.tasks.render_soup import draw, drawn_soup
 from etsplat.tasks.scoring import evaluate_run
@@ -143,6 +145,15 @@ def test_no_view_looks_through_a_mesh_with_a_backdrop(capture: Dataset) -> None:
         seen = mesh.render(camera).triangle
         assert seen is not None
         assert int((seen < 0).sum()) <= 2  # a halved edge is one of floats beside a whole one
+
+
+@pytest.mark.parametrize("sky", ["sphere", "dome", "none"])
+def test_runs_with_a_sky_have_a_backdrop(sky: str, capture: Dataset) -> None:
+    own = capture.normalized()
+    trainer = start_mesh(grey_soup(own, 300), Exposure(NEVER), own, CONFIG.changed({"sky": sky}))
+    seen = trainer.model.render(own.cameras[0]).triangle
+    assert seen is not None
+    assert bool((seen < 0).any()) == (sky == "none")
 
 
 def test_what_no_photo_shows_gets_the_colours_of_what_is_near(capture: Dataset) -> None:

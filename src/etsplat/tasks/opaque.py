@@ -34,7 +34,7 @@ from etsplat.optim.terms.photometric import Photometric
 from etsplat.optim.trainer import Trainer
 from etsplat.tasks.running import Job
 from etsplat.tasks.settings import get
-from etsplat.tasks.soup_trainer import background_of, shown_across, start_trainer
+from etsplat.tasks.soup_trainer import background_of, shown_across, start_trainer, surroundings_of_run
 from etsplat.tasks.sources import training_cameras
 from etsplat.tasks.train_checks import triangle_limit
 from etsplat.tasks.train_config import TrainConfig
@@ -85,7 +85,7 @@ def fit_opaque_mesh(
 
 def start_mesh(soup: TriangleSoup, exposure: Exposure, capture: Dataset, config: TrainConfig) -> Trainer[TriangleMesh]:
     """The start of the mesh of an opaque soup; arguments are those of `fit_opaque_mesh`."""
-    around = Surroundings.of(capture) if config.sky == "sphere" else None
+    around = surroundings_of_run(capture, config)
     trainer = make_opaque_trainer(
         opaque_mesh(soup, None if around is None else around.backdrop(capture)),
         capture,

@@ -181,6 +181,15 @@ def vertex_unit(soup: TriangleSoup, capture: Dataset, config: TrainConfig) -> fl
     return 1.0 if config.optimizer.lr_vertices_unit == "frame" else shown_across(soup, capture)
 
 
+def surroundings_of_run(capture: Dataset, config: TrainConfig) -> Surroundings | None:
+    """Where the sky of a run is, in units of the scene; None where there is none, or nobody can tell."""
+    if config.sky == "sphere":
+        return Surroundings.of(capture)
+    if config.sky == "dome" and capture.points is not None:  # of random points some are beyond it
+        return Surroundings.dome(capture.points)
+    return None
+
+
 def shown_across(soup: TriangleSoup, capture: Dataset) -> float:
     """What photos show across at the capture's points, or at the triangles, in units of the frame."""
     points = soup.vertices.detach().mean(dim=1).cpu() if capture.points is None else capture.points

@@ -30,7 +30,7 @@ from etsplat.tasks.refined_cameras import kept_aside
 from etsplat.tasks.running import Job, Result, path_of
 from etsplat.tasks.scene_part import ScenePart, keep_colors
 from etsplat.tasks.scoring import Scorer
-from etsplat.tasks.soup_trainer import background_of, start_trainer
+from etsplat.tasks.soup_trainer import background_of, start_trainer, surroundings_of_run
 from etsplat.tasks.sources import SoupRun, load_scene, with_cloud
 from etsplat.tasks.train_checks import check_train, doubtful_scale, triangle_limit
 from etsplat.tasks.train_config import TrainConfig
@@ -264,11 +264,7 @@ def _in_own_units(soup: TriangleSoup, iteration: int, capture: Dataset, config: 
 
 def _sky_note(capture: Dataset, config: TrainConfig) -> str:
     """For those who use the soup: where its sky is, in the capture's own units."""
-    if config.sky == "sphere":
-        sky = Surroundings.of(capture)
-    elif config.sky == "dome" and capture.points is not None:
-        sky = Surroundings.dome(capture.points)
-    else:  # among random points, some of which are beyond it, nobody can tell a dome
+    if (sky := surroundings_of_run(capture, config)) is None:
         return "none"
     own = capture.normalization
     return Surroundings(own.invert(sky.middle.double()), sky.radius * own.radius).note
