@@ -1,7 +1,7 @@
 """Processor time of a step of shape reconstruction, with what is done between steps; or of a whole run.
 
-python -m benchmarks.reconstruct_step ../shared/data/objects/mug --init runs/mug/mesh.ply
-python -m benchmarks.reconstruct_step ../shared/data/objects/mug/mesh.obj --whole runs/mug
+python -m benchmarks.reconstruct_step data/objects/mug --init runs/mug/mesh.ply
+python -m benchmarks.reconstruct_step data/objects/mug/mesh.obj --whole runs/mug
 """
 
 import argparse
