@@ -73,8 +73,8 @@ class Start:
 
     shape: Literal["auto", "sphere", "hull"] = "auto"
     """A sphere around the object; or the visual hull of its masks, which has the holes and parts that they show.
-    auto: the hull where photos show the object as a whole, as those of a mesh do, or where together they show all of
-    it; the sphere where a hull of photos that cut it off does not cover what they show, or there are no masks."""
+    auto: the hull where photos show the object as a whole, as those of a mesh do, or together show all of it;
+    the sphere where a hull of photos that cut it off does not cover what they show, or there are no masks."""
     level: Annotated[int, Range(0, 9), _SPHERE] = 4
     """The sphere has 20 * 4^level faces."""
     radius: Annotated[float, Range(1e-6, 1e6)] = 1.05
