@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from etsplat.core.cameras import camera_centers
-from etsplat.data.silhouettes import Silhouette, within_ball
+from etsplat.data.silhouettes import Silhouette, points_along, within_ball
 
 _RAYS, _LEAST_RAYS = 1024, 8
 """Pixels that are asked for on each side of the outlines, in all views together, and of each at least."""
@@ -156,8 +156,7 @@ def _look(
 ) -> tuple[Float[Tensor, "R S"], list[Float[Tensor, "R S"]]]:
     """Places along each line, and how deep the points there are by each number of views that are outvoted."""
     t = middle[:, None] + half[:, None] * torch.linspace(-1, 1, samples)
-    rows = zip(lines.start.T, lines.along.T, strict=True)
-    points = torch.stack([(a[:, None] + t * b[:, None]).view(-1) for a, b in rows]).T
+    points = points_along(lines.start, lines.along, t)
     lowest, judges = Lowest(_MOST + 1, *t.shape), torch.zeros(t.shape)
     for number, view in enumerate(views):
         found, _, judged = (x.reshape(t.shape) for x in view.depth(points))

@@ -142,6 +142,13 @@ def within_ball(start: Tensor, along: Tensor, center: Tensor, radius: float) -> 
     return middle, (radius**2 - aside**2).clamp_min((0.1 * radius) ** 2).sqrt()
 
 
+def points_along(
+    start: Float[Tensor, "R 3"], along: Float[Tensor, "R 3"], t: Float[Tensor, "R S"]
+) -> Float[Tensor, "RS 3"]:
+    """Points on lines of sight at S distances on each, as `Silhouette.depth` takes them fastest."""
+    return torch.stack([(a[:, None] + t * b[:, None]).view(-1) for a, b in zip(start.T, along.T, strict=True)]).T
+
+
 def _best_along(views: Sequence[Silhouette], starts: Tensor, along: Tensor, middle: Tensor, half: Tensor) -> Tensor:
     """(R, N) depths of the point on each line that the fewest exclude, within `half` of its `middle`."""
     every = torch.arange(len(starts))
@@ -149,7 +156,7 @@ def _best_along(views: Sequence[Silhouette], starts: Tensor, along: Tensor, midd
     for samples in (_SAMPLES, *_FINER):
         offsets = torch.linspace(-1, 1, samples)
         t = middle[:, None] + half[:, None] * offsets
-        points = torch.stack([(a[:, None] + t * b[:, None]).view(-1) for a, b in zip(starts.T, along.T, strict=True)]).T
+        points = points_along(starts, along, t)
         depths = torch.empty(len(views), len(starts), samples)
         cost = torch.zeros(len(starts), samples)
         for depth, view in zip(depths, views, strict=True):
