@@ -20,7 +20,7 @@ SANITIZED := build/sanitize/.stamp
 NATIVE := CMakeLists.txt $(shell find csrc)
 
 .PHONY: help setup demo test lint docs format stubs bench equal-bits fuzz fuzz-short sanitize races soak lock audit \
-	ptx check-neon wheel check-wheel check-sdist check-dockerfile wheels clean
+	ptx prove check-neon wheel check-wheel check-sdist check-dockerfile wheels clean
 
 help:
 	@echo "make setup        create .venv and build the package into it"
@@ -35,6 +35,7 @@ help:
 	@echo "make fuzz         a million changed files and 100,000 odd calls; FUZZ='--targets mesh*' for some; fuzz-short for a minute"
 	@echo "make races        threads, forks and GPU kernels under ThreadSanitizer (GCC, Linux); RACES=300 for so many seconds"
 	@echo "make ptx          tests of the GPU engine on the CPU, on what NVRTC compiles; PTX=compute_75 for one architecture"
+	@echo "make prove        prove that plain GPU kernels have no races, by their PTX (needs a network, once)"
 	@echo "make soak         kill runs, fill their disk, move their clock; SOAK=100 for so many of each (Linux)"
 	@echo "make lock         requirements.lock: the newest versions that fit, with hashes; make audit: known holes in them"
 	@echo "make check-neon   run the rasterizer's NEON path under QEMU (AArch64 cross compiler)"
@@ -176,6 +177,11 @@ PTX ?= compute_75 compute_90
 PTX_TESTS ?= tests
 ptx: setup
 	for architecture in $(PTX); do $(PY) -m pytest -n auto --ptx $$architecture $(PTX_TESTS) $(PYTEST_ARGS) || exit 1; done
+
+# What no order of threads can make race, by the PTX alone (tests/proofs.py). sentryward comes from the group `proofs`.
+prove: setup
+	$(PIP) --group proofs
+	PYTHONPATH=tests $(PY) -m tests.proofs
 
 # The NEON path under an emulator, where there is no ARM machine (Debian: g++-aarch64-linux-gnu qemu-user).
 check-neon:

@@ -100,15 +100,20 @@ def kernels(program: Program, architecture: str) -> list[Kernel]:
         path.write_bytes(compile_without_cache(program, architecture))
         resources = _RESOURCES.findall(_run("cuobjdump", "-res-usage", str(path)))
         code = dict(_sections(_run("nvdisasm", "-c", str(path))))
-    threads = {name: int(count) for count, name in _BOUNDS.findall(program.source)}
     result = []
     for name, registers, stack, shared, _ in resources:
         lines = _LINE.findall(code[name])
         instructions = [text for _, text in lines if text and "NOP" not in text]
         local = sum(bool(re.search(r"\b(LDL|STL)\b", text)) for text in instructions)
         numbers = (int(registers), int(shared), int(stack), len(instructions), pair_instructions(lines), local)
-        result.append(Kernel(program, name, architecture, threads.get(name, block_size(program)), *numbers))
+        result.append(Kernel(program, name, architecture, kernel_threads(program, name), *numbers))
     return result
+
+
+def kernel_threads(program: Program, name: str) -> int:
+    """Threads of a block of one of the program's kernels."""
+    bounds = {name: int(count) for count, name in _BOUNDS.findall(program.source)}
+    return bounds.get(name, block_size(program))
 
 
 def pair_instructions(lines: list[tuple[str, str]]) -> int:

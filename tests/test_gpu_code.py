@@ -9,6 +9,7 @@ import pytest
 from benchmarks import gpu_code, gpu_floors
 from benchmarks.gpu_code import Kernel
 from etsplat.engines.cuda.program import Program, source_root
+from tests import proofs
 
 LISTING = """
 .text.drawn:
@@ -67,3 +68,11 @@ def test_the_page_has_every_kernel_and_the_counts_of_the_floors():
     assert pairs.keys() == set(names)
     assert pairs["raster_forward"] == str(gpu_floors.FORWARD_PAIR_INSTRUCTIONS)
     assert pairs["raster_backward"] == str(gpu_floors.BACKWARD_PAIR_INSTRUCTIONS)
+
+
+def test_the_page_names_the_kernels_that_are_proved():
+    """Those that `make prove` expects, and no others."""
+    page = (Path(__file__).parent.parent / "docs" / "gpu_kernels.md").read_text(encoding="utf-8")
+    for head, names in (("whatever the data", proofs.PROVED), ("Along one way", proofs.ONE_PATH)):
+        item = next(item for item in page.split("\n- ") if head in item[:60])
+        assert set(re.findall(r"\w+_\w+|fill", item.split(":", 1)[1])) == names
