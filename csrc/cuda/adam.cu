@@ -19,11 +19,11 @@ struct AdamParameters {
     int widths[kMaxParameters];  // elements of a row
 };
 
-// step_sizes: for each parameter learning rate / (1 - beta1^t); second_correction: sqrt(1 - beta2^t). Where `halted` is
-// given and not 0, nothing is updated.
+// step_sizes: for each parameter learning rate / (1 - beta1^t); second_correction: sqrt(1 - beta2^t); decays: how many times
+// each is added to its gradient, or null. Where `halted` is given and not 0, nothing is updated.
 extern "C" __global__ void adam_step(AdamParameters parameters, int count, const float* step_sizes,
-                                     const float* second_correction, float first_weight, float second_decay,
-                                     float second_weight, float eps, const int* halted) {
+                                     const float* second_correction, const float* decays, float first_weight,
+                                     float second_decay, float second_weight, float eps, const int* halted) {
     if (halted && *halted) return;
     long long block = blockIdx.x;
     int p = 0;
@@ -33,7 +33,7 @@ extern "C" __global__ void adam_step(AdamParameters parameters, int count, const
         block -= blocks;
     }
     AdamCoefficients<float> k{first_weight, second_decay, second_weight, step_sizes[p], *second_correction, eps};
-    const float step_size = k.step_size, *pace = parameters.paces[p];
+    const float step_size = k.step_size, decay = decays ? decays[p] : 0.0f, *pace = parameters.paces[p];
     float *value = parameters.values[p], *first = parameters.firsts[p], *second = parameters.seconds[p];
     const float* gradient = parameters.gradients[p];
     const long long begin = block * kElements, left = parameters.sizes[p] - begin;
@@ -47,6 +47,8 @@ extern "C" __global__ void adam_step(AdamParameters parameters, int count, const
     for (int i = threadIdx.x; i < kElements; i += kThreads) {
         if (i >= left) break;
         if (pace) k.step_size = step_size * pace[static_cast<unsigned>(within + i) / static_cast<unsigned>(width)];
-        adam_update(value[begin + i], first[begin + i], second[begin + i], gradient[begin + i], k);
+        float whole = gradient[begin + i];
+        if (decay != 0.0f) whole += decay * value[begin + i];
+        adam_update(value[begin + i], first[begin + i], second[begin + i], whole, k);
     }
 }

@@ -79,7 +79,8 @@ def test_weighted_sum_is_that_of_pytorch(cuda_device, scale, rounds):
 
 
 def test_adam_takes_the_steps_of_the_cpu_engine(cuda_device, rng):
-    """Ten parameters, one empty, one not contiguous, two with paces; rates that change: equal after five steps."""
+    """Ten parameters, one empty, one not contiguous, two with paces, three that decay, in both launches; rates that
+    change: equal after five steps."""
     shapes = [(1200, 3), (), (0, 3), (7,), (1024,), (2, 2), (3,), (5, 1), (1025,), (40, 30)]
     start = {f"p{i}": torch.randn(shape, generator=rng) for i, shape in enumerate(shapes)}
     start["p9"] = start["p9"].T
@@ -93,25 +94,28 @@ def test_adam_takes_the_steps_of_the_cpu_engine(cuda_device, rng):
             for name, p in parameters.items():
                 p.grad = step[name].to(device)
             adam.learning_rates["p0"] *= 0.5
-            on(engine, adam.step)
+            on(engine, adam.step, {"p0": 0.3, "p4": 1.7, "p9": 0.7})
         ends.append([*parameters.values(), *adam.first_moments.values(), *adam.second_moments.values()])
     for actual, expected in zip(*ends, strict=True):
         same_bits(actual.detach(), expected.detach())
 
 
 def test_a_halted_adam_changes_nothing(cuda_device):
-    """With the flag set, parameters and moments stay; without, they move."""
+    """With the flag set, parameters and moments stay; without, they move, as the decay wants."""
     parameter = torch.ones(10, requires_grad=True, device=cuda_device)
     adam = Adam({"p": parameter}, {"p": 0.1})
     parameter.grad = torch.ones_like(parameter)
     rates = torch.tensor([0.1, 1.0], device=cuda_device)
     halted = torch.ones((), dtype=torch.int32, device=cuda_device)
     with etsplat.engine("cuda"):
-        adam.step_on_device(rates, halted)
+        decays = torch.tensor([-3.0], device=cuda_device)
+        adam.step_on_device(rates, halted, decays)
         assert bool((parameter == 1).all())
         assert not adam.second_moments["p"].any()
-        adam.step_on_device(rates, halted.zero_())
-    assert bool((parameter < 1).all())
+        adam.step_on_device(rates, halted.zero_(), decays)
+        assert bool((parameter > 1).all())
+        adam.step_on_device(rates, halted)
+        torch.testing.assert_close(adam.first_moments["p"], torch.full_like(parameter, -0.9 * 0.2 + 0.1))
 
 
 @pytest.mark.parametrize(("degree", "channels", "bases"), [(0, 3, 1), (1, 3, 16), (2, 5, 9), (3, 3, 16), (3, 4, 16)])

@@ -148,9 +148,8 @@ def test_a_folder_becomes_a_run_to_go_on_with(object_views: Dataset, tmp_path: P
 
 
 @pytest.mark.parametrize("weight", [0.1, 1.7])
-@pytest.mark.parametrize("chosen", ["cpu", "reference"])
 def test_adam_adds_the_gradient_of_harmonics_with_the_bits_of_autograd(
-    object_views: Dataset, chosen: str, weight: float
+    object_views: Dataset, engine: str, weight: float
 ) -> None:
     """A run ends with the parameters of one whose term is differentiated, and has its losses."""
 
@@ -160,7 +159,7 @@ def test_adam_adds_the_gradient_of_harmonics_with_the_bits_of_autograd(
     found = []
     for kind in (Harmonics, Differentiated):
         objective = Objective(Photometric(0.2), [Opacity(0.005), kind(weight)], scale=lambda iteration: 0.9**iteration)
-        with etsplat.engine(chosen):
+        with etsplat.engine(engine):
             trainer = Trainer(a_soup(), object_views, objective, seed=3)
             found.append((losses_of(trainer, 5), trainer.model.state()))
     (losses, ours), (expected, theirs) = found

@@ -171,16 +171,17 @@ class Adam:
         self.paces = {name: _dense_copy(paces) for name, paces in state["paces"].items()}
 
     @torch.no_grad()
-    def step_on_device(self, rates: Tensor, halted: Tensor) -> None:
+    def step_on_device(self, rates: Tensor, halted: Tensor, decays: Tensor | None = None) -> None:
         """A step as part of a queued one; it leaves `step_count` to the caller.
 
         Args:
             rates: (P + 1,) float32 in device memory, of `rates`.
             halted: () int32 in device memory: nothing is updated where it is not 0.
+            decays: (P,) float32 in device memory, as those of `step`.
         """
         names = list(self.parameters)
         groups = self._groups(names)
-        queued_steps(groups[0][0]).adam_step(groups, rates, self.betas, self.eps, halted)
+        queued_steps(groups[0][0]).adam_step(groups, rates, decays, self.betas, self.eps, halted)
         self._store(names, groups)
 
     def _groups(self, names: Sequence[str]) -> list[AdamGroup]:

@@ -96,6 +96,7 @@ class Stepper(Generic[M]):
                 appearance=len(model.appearance.numbers),
                 values=len(schedule.values),
                 rates=len(parameters) + 1,
+                decays=len(parameters),
                 exposure=2,
                 cameras=cameras.row,
             )
@@ -202,14 +203,17 @@ class Stepper(Generic[M]):
         uploads = [self._loader.upload(each.view, number) for number, each in enumerate(chosen)]
         self.adam.learning_rates = self._rates(iteration)
         self.adam.step_count += 1
+        weights, scale = self._objective.weights(iteration), at(self._objective.scale, iteration)
+        decays = self._objective.decays(self._model, weights, scale)
         row = self._row.pack(
             places=[number for _, place in found for number in place],
             backgrounds=torch.cat([c.background for c in chosen]).flatten().tolist(),
             epochs=[c.epoch_starts for c in chosen],
-            scale=[at(self._objective.scale, iteration)],
+            scale=[scale],
             appearance=self._appearance(iteration).numbers,
             values=list(self._values(iteration).values()),
             rates=self.adam.rates(list(self.adam.parameters)),
+            decays=[decays.get(name, 0.0) for name in self.adam.parameters],
             exposure=self._exposure.queued_rates(iteration),
             cameras=self._cameras.queued_rates(iteration),
         )
@@ -231,12 +235,12 @@ class Stepper(Generic[M]):
             (self._loader.look_up(kind, place), background[None])
             for kind, place, background in zip(kinds, places, backgrounds, strict=True)
         )
-        loss, self._seen = self._gradients(views, weights, fields["scale"][0], moving=moving)
+        loss, self._seen = self._gradients(views, weights, fields["scale"][0], moving=moving, decayed=True)
         return loss
 
     def _commit(self, row: Tensor, halted: Tensor) -> None:
         fields = self._row.unpack(row)
-        self.adam.step_on_device(fields["rates"], halted)
+        self.adam.step_on_device(fields["rates"], halted, fields["decays"])
         if self._exposure.learned:
             self._exposure.step_on_device(fields["exposure"], halted)
         if self._phase[-1]:

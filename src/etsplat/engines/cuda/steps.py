@@ -12,7 +12,7 @@ from etsplat.engines.cuda.capacity import overflow_flag, repair_overflow
 from etsplat.engines.cuda.launch import backend, blocks, launch, launch_each, upload
 from etsplat.engines.cuda.program import Program
 from etsplat.engines.cuda.structs import constant, struct_class
-from etsplat.engines.reference.steps import AdamGroup, decayed, step_rates
+from etsplat.engines.reference.steps import AdamGroup, step_rates
 
 _ADAM = Program("adam.cu", contract=False)
 _STATISTICS = Program("soup_statistics.cu", contract=False)
@@ -29,9 +29,9 @@ def adam_step(
     step_count: int,
 ) -> None:
     """See `Engine.adam_step`."""
-    groups = [decayed(group, decay) for group, decay in zip(groups, decays, strict=True)]
-    rates = upload(step_rates(learning_rates, betas, step_count), groups[0][0].device)
-    CudaQueuedSteps.adam_step(groups, rates, betas, eps, None)
+    rates = step_rates(learning_rates, betas, step_count)
+    numbers = upload([*rates, *decays], groups[0][0].device)
+    CudaQueuedSteps.adam_step(groups, numbers[: len(rates)], numbers[len(rates) :], betas, eps, None)
 
 
 def update_statistics(
@@ -109,11 +109,15 @@ class CudaQueuedSteps:
     def adam_step(
         groups: Sequence[AdamGroup],
         rates: Tensor,
+        decays: Tensor | None,
         betas: tuple[float, float],
         eps: float,
         halted: Tensor | None,
     ) -> None:
-        """As `Engine.adam_step`, with `Adam.rates` (P + 1,) float32 in device memory; None never halts."""
+        """As `Engine.adam_step`, with `Adam.rates` (P + 1,) and decays (P,) float32 in device memory.
+
+        Without decays there are none, and without `halted` it never halts.
+        """
         first_beta, second_beta = betas
         constants = 1 - first_beta, second_beta, 1 - second_beta, eps
         table_class = struct_class("cuda/adam.cu", "AdamParameters")
@@ -124,5 +128,6 @@ class CudaQueuedSteps:
             widths = [max(1, math.prod(group[0].shape[1:])) for group in chosen]
             table = table_class(*map(list, zip(*chosen, strict=True)), sizes, widths)
             grid = sum(blocks(size, _ADAM_ELEMENTS) for size in sizes)
-            arguments = (table, len(chosen), rates[first:], rates[len(groups) :], *constants, halted)
+            numbers = rates[first:], rates[len(groups) :], None if decays is None else decays[first:]
+            arguments = (table, len(chosen), *numbers, *constants, halted)
             launch(_ADAM, "adam_step", grid, _ADAM_THREADS, arguments)

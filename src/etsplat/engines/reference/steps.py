@@ -19,12 +19,6 @@ def step_rates(learning_rates: Sequence[float], betas: tuple[float, float], step
     return [*(rate / first for rate in learning_rates), second**0.5]
 
 
-def decayed(group: AdamGroup, decay: float) -> AdamGroup:
-    """With so many times the parameter added to its gradient."""
-    parameter, gradient, first, second, paces = group
-    return group if decay == 0.0 else (parameter, gradient + decay * parameter, first, second, paces)
-
-
 def adam_step(
     groups: Sequence[AdamGroup],
     learning_rates: Sequence[float],
@@ -35,8 +29,11 @@ def adam_step(
 ) -> None:
     """Update the parameters and their moments in place; see `etsplat.ops.adam`."""
     beta1, beta2 = betas
-    groups = [decayed(group, decay) for group, decay in zip(groups, decays, strict=True)]
-    for (parameter, gradient, first, second, paces), learning_rate in zip(groups, learning_rates, strict=True):
+    for (parameter, gradient, first, second, paces), learning_rate, decay in zip(
+        groups, learning_rates, decays, strict=True
+    ):
+        if decay != 0.0:
+            gradient = gradient + decay * parameter
         first += (1 - beta1) * (gradient - first)
         second.mul_(beta2).add_((1 - beta2) * gradient * gradient)
         root = second.sqrt() / (1 - beta2**step_count) ** 0.5
