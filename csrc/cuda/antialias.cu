@@ -4,7 +4,9 @@
 // and takes what their silhouettes give it, so that nothing is scattered. Backward: each pixel gathers its cotangent in
 // the same way; then cotangents go to colours and corners, many pixels to a place, as fixed-point sums (fixed_sums.h):
 // the same bits in every run. Each pair is evaluated by both its pixels, and few pairs have anything between them: some 50
-// bytes a pixel bound the forward; atomics in L2, 3 a pixel for colours, bound the backward.
+// bytes a pixel bound the forward; atomics in L2, 3 a pixel for colours, bound the backward. The background has few numbers for
+// many pixels: it is summed by blocks.
+#include "cuda/block_sum.h"
 #include "cuda/shading.h"
 #include "math/texture.h"
 
@@ -77,7 +79,7 @@ extern "C" __global__ void shade_measure(ShadedView view, const float* grad_shad
     const long long p = thread_index();
     Collector<true> into(targets);
     if (p < pixel_count(view)) collect_shaded(view, p, grad_shaded + p * view.channels, into);
-    for (int i = 0; i < 3; ++i) record_largest(into.magnitudes[i], targets.largest + i);
+    for (int i = 0; i < kTargets; ++i) record_largest(into.magnitudes[i], targets.largest + i);
 }
 
 extern "C" __global__ void shade_scatter(ShadedView view, const float* grad_shaded, Targets targets) {
@@ -220,7 +222,7 @@ extern "C" __global__ void antialias_measure(Scene scene, const float* shaded, c
     const long long p = thread_index();
     Collector<true> into(targets);
     if (p < pixel_count(scene.view.shaded)) collect(scene, p, shaded, grad_image, grad_shaded, into);
-    for (int i = 0; i < 3; ++i) record_largest(into.magnitudes[i], targets.largest + i);
+    for (int i = 0; i < kTargets; ++i) record_largest(into.magnitudes[i], targets.largest + i);
 }
 
 extern "C" __global__ void antialias_scatter(Scene scene, const float* shaded, const float* grad_image,
@@ -235,4 +237,28 @@ extern "C" __global__ void antialias_finish(const FixedSum* sums, const unsigned
                                             float* gradient) {
     const long long i = thread_index();
     if (i < count) gradient[i] += from_fixed(sums[i], *largest);
+}
+
+// The pixels of a block that show no triangle: a row of sums (channels) for each block.
+extern "C" __global__ void background_sums(ShadedView view, const float* grad_shaded, double* sums) {
+    __shared__ double scratch[kThreads / kWarp];
+    const long long p = thread_index();
+    const bool behind = p < pixel_count(view) && view.triangle[p] < 0;
+    double* row = sums + static_cast<long long>(blockIdx.x) * view.channels;
+    if (!__syncthreads_or(behind)) {
+        for (int c = threadIdx.x; c < view.channels; c += kThreads) row[c] = 0.0;
+        return;
+    }
+    for (int c = 0; c < view.channels; ++c) {
+        const double sum = block_sum<kThreads>(behind ? grad_shaded[p * view.channels + c] : 0.0, scratch);
+        if (threadIdx.x == 0) row[c] = sum;
+    }
+}
+
+// A block for each channel.
+extern "C" __global__ void background_gradient(const double* sums, long long rows, int channels, float* gradient) {
+    __shared__ double scratch[kThreads / kWarp];
+    const int channel = blockIdx.x;
+    const double sum = sum_of_array<kThreads>(sums + channel, rows, channels, scratch);
+    if (threadIdx.x == 0) gradient[channel] = static_cast<float>(sum);
 }

@@ -76,21 +76,22 @@ __device__ __forceinline__ ViewInverse<double> inverse_of(const ShadedView& view
     return view_inverse(corner);
 }
 
-// Where gradients go, null if nobody wants them; `largest` has a number for each of the three.
+// Where gradients go, null if nobody wants them; `largest` has a number for each of the two.
 struct Targets {
-    FixedSum *vertices, *colors, *background;
+    FixedSum *vertices, *colors;
     unsigned* largest;
 };
+constexpr int kTargets = 2;
 
 // Adds (or, if Measure, looks at) what one pixel gives to the targets.
 template <bool Measure>
 struct Collector {
     const Targets& targets;
-    float magnitudes[3] = {};
-    double scales[3] = {};
+    float magnitudes[kTargets] = {};
+    double scales[kTargets] = {};
 
     __device__ explicit Collector(const Targets& t) : targets(t) {
-        for (int i = 0; i < 3 && !Measure; ++i) scales[i] = fixed_scale(t.largest[i]);
+        for (int i = 0; i < kTargets && !Measure; ++i) scales[i] = fixed_scale(t.largest[i]);
     }
     __device__ void add(int target, FixedSum* sums, long long index, double value) {
         if (Measure) {
@@ -105,9 +106,6 @@ struct Collector {
     }
     __device__ void color(long long index, double value) {
         if (targets.colors) add(1, targets.colors, index, value);
-    }
-    __device__ void background(int channel, double value) {
-        if (targets.background) add(2, targets.background, channel, value);
     }
 };
 
@@ -132,16 +130,15 @@ __device__ void collect_interpolated(const ShadedView& view, long long p, const 
     }
 }
 
-// What the colour of pixel p, with the cotangents g, gives; colours of pixels themselves are none of the targets.
+// What the colour of pixel p, with the cotangents g, gives; colours of pixels themselves and of the background are none of the
+// targets.
 template <class Into>
 __device__ void collect_shaded(const ShadedView& view, long long p, const float* g, Into& into) {
     const long long face = view.triangle[p];
     const bool interpolated = has_colors_of(view, ColorsOf::kVertices) || has_colors_of(view, ColorsOf::kCorners);
-    if (face >= 0 && interpolated) return collect_interpolated(view, p, g, into);
-    for (int c = 0; c < view.channels; ++c) {
-        if (face < 0) into.background(c, g[c]);
-        else into.color(face * view.channels + c, g[c]);
-    }
+    if (face < 0) return;
+    if (interpolated) return collect_interpolated(view, p, g, into);
+    for (int c = 0; c < view.channels; ++c) into.color(face * view.channels + c, g[c]);
 }
 
 }  // namespace etsplat

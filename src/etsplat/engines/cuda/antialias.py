@@ -9,7 +9,7 @@ from torch import Tensor
 from etsplat import _native
 from etsplat.core.validation import dense
 from etsplat.engines.cuda.capacity import check_summed
-from etsplat.engines.cuda.launch import launch_each
+from etsplat.engines.cuda.launch import BLOCK, blocks, launch, launch_each
 from etsplat.engines.cuda.program import Program
 from etsplat.engines.cuda.structs import Struct, struct_class
 from etsplat.engines.native.operation import differentiable
@@ -56,7 +56,9 @@ def _backward(kept: Any, needed: Any, grad_image: Tensor) -> list[Tensor | None]
     for b in range(len(shaded)):
         scene, pixels = _scene(b, *problem), shaded[b].shape[0] * shaded[b].shape[1]
         launch_each(_PROGRAM, "antialias_unblend", pixels, (scene, grad_image[b], grad_shaded))
-        parts = [grads[0], grads[1], None if grads[2] is None else grads[2][b]]
+        parts = grads[:2]
+        if grads[2] is not None:
+            _sum_background(scene.view.shaded, pixels, grad_shaded, grads[2][b])
         if of_pixels and grads[1] is not None:
             launch_each(_PROGRAM, "shade_pixels", pixels, (scene.view.shaded, grad_shaded, grads[1][b]))
             parts[1] = None
@@ -65,9 +67,9 @@ def _backward(kept: Any, needed: Any, grad_image: Tensor) -> list[Tensor | None]
 
 
 def _add_sums(kernels: str, pixels: int, arguments: tuple[Any, ...], parts: list[Tensor | None]) -> None:
-    """Adds what the pixels of a view give to gradients by vertices, colours and a background, but to those of None."""
+    """Adds what the pixels of a view give to gradients by vertices and colours, but to those of None."""
     sums = [None if g is None else torch.zeros(g.shape, dtype=torch.int64, device=g.device) for g in parts]
-    largest = torch.zeros(3, dtype=torch.int32, device=arguments[-1].device)
+    largest = torch.zeros(len(parts), dtype=torch.int32, device=arguments[-1].device)
     arguments = (*arguments, struct_class(_SHADING, "Targets")(*sums, largest))
     launch_each(_PROGRAM, f"{kernels}_measure", pixels, arguments)
     launch_each(_PROGRAM, f"{kernels}_scatter", pixels, arguments)
@@ -75,6 +77,14 @@ def _add_sums(kernels: str, pixels: int, arguments: tuple[Any, ...], parts: list
         if total is not None and gradient is not None:
             count = gradient.numel()
             launch_each(_PROGRAM, "antialias_finish", count, (total, largest[i:], ctypes.c_int64(count), gradient))
+
+
+def _sum_background(view: Struct, pixels: int, grad_shaded: Tensor, gradient: Tensor) -> None:
+    """The gradient of one view's background."""
+    rows, channels = blocks(pixels, BLOCK), len(gradient)
+    sums = torch.empty((rows, channels), dtype=torch.float64, device=gradient.device)
+    launch_each(_PROGRAM, "background_sums", pixels, (view, grad_shaded, sums))
+    launch(_PROGRAM, "background_gradient", channels, BLOCK, (sums, ctypes.c_int64(rows), channels, gradient))
 
 
 def _scene(b: int, points: Tensor, silhouettes: Tensor, *given: Any) -> Struct:
@@ -125,7 +135,7 @@ def _interpolate_backward(kept: Any, needed: Any, grad_image: Tensor) -> list[Te
     grads = [torch.zeros_like(tensor) if wanted else None for tensor, wanted in zip(kept[:2], needed, strict=False)]
     pixels = grad_image.shape[1] * grad_image.shape[2]
     for b in range(len(grad_image)):
-        _add_sums("shade", pixels, (_shaded(b, *kept), grad_image[b]), [*grads, None])
+        _add_sums("shade", pixels, (_shaded(b, *kept), grad_image[b]), grads)
     return grads
 
 
