@@ -224,6 +224,22 @@ def test_lids_that_are_undone_come_back_and_the_untangling_without_them_is_made(
     assert_equal(*runs)
 
 
+def test_pictures_are_drawn_once_of_each_state(views: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[int] = []
+    measure = Gauge.measure
+
+    def counted(gauge: Gauge, model: TriangleMesh, *others: Any) -> Any:
+        seen.append(hash(tuple(tensor.numpy().tobytes() for tensor in model.state().values())))
+        return measure(gauge, model, *others)
+
+    monkeypatch.setattr(Gauge, "measure", counted)
+    run = trainer(views, 30, 35, steps=100)  # each edit is judged where the next is made
+    run.fit(LENGTH)
+    assert run.guard is not None
+    assert run.guard.undone == [30, 35]
+    assert len(seen) == len(set(seen)) == 7  # at 10, 30, 35, where 30 is undone, 35, 40, where 35 is, 40 and 60
+
+
 def test_a_guard_that_tolerates_more_lets_it_stay(views: Dataset) -> None:
     run = trainer(views, 20)
     run.guard = Guard(tolerance=1e9, steps=8)

@@ -143,6 +143,7 @@ class Trainer(Generic[M]):
         judges = middles_of(dataset.train, min(len(dataset.train), GUARD_VIEWS))
         placed = self.cameras.placed
         self._judging = Gauge(dataset, judges, GUARD_SIDE, self._device, behind, placed=placed)
+        self._known_loss: float | None = None
         kept = None
         if dataset.watched:
             kept = Gauge(dataset, dataset.watched, WATCH_SIDE, self._device, behind, placed=placed)
@@ -215,6 +216,7 @@ class Trainer(Generic[M]):
         judged = NEVER if self.guard is None else self.guard.due
         measured = self.exposure.next_measurement(first), self.depths.next_measurement(first)
         stops = self.strategy.next_edit(first), judged, *measured
+        self._known_loss = None
         losses = self._stepper.advance(first, last, stops)
         if self.onlooker is not None:
             self.onlooker(first + len(losses) - 1)
@@ -224,6 +226,7 @@ class Trainer(Generic[M]):
         """Edits if it is time to; returns by how many triangles the model grew."""
         if iteration == self.exposure.measured_at:
             self._stepper.measure_exposure()
+            self._known_loss = None
         if iteration == self.depths.measured_at:
             self._stepper.measure_depths(self.depths)
         self._edited_after = iteration
@@ -238,7 +241,8 @@ class Trainer(Generic[M]):
                 return 0
             loss, following = self._loss(), self.strategy.next_edit(iteration + 1)
             guard.hold(self.progress, following, loss, self._state())
-        if self.strategy.edit(iteration):
+        edited, self._known_loss = self.strategy.edit(iteration), None  # it may change tensors in place
+        if edited:
             self._set_paces()
             self.edited()
         elif guard is not None:
@@ -254,6 +258,7 @@ class Trainer(Generic[M]):
         if undone is not None or not self.cameras.wanted or self._edited_after != progress.iteration:
             return undone
         event = self.trial.review(self.model, progress, self._state_of_run, self._go_back)
+        self._known_loss = None
         if event is not None and event.refined is None and self.guard is not None:
             self.guard.held = None  # an edit before it stays: what is held of it knows nothing of refined cameras
         return event
@@ -267,6 +272,7 @@ class Trainer(Generic[M]):
             return None
         undone = UndoEvent(held.iteration, progress.iteration, held.loss, loss)
         self._load(held.state, held.iteration)
+        self._known_loss = held.loss
         progress.iteration, (progress.loss_sum, progress.loss_count) = held.iteration, held.losses
         self._edit(held.iteration)
         return self._review_edit(progress) or undone
@@ -278,6 +284,7 @@ class Trainer(Generic[M]):
     def edited(self) -> None:
         """To be called when tensors of the model were replaced."""
         self._stepper.restart()
+        self._known_loss = None
 
     def evaluate(self) -> dict[str, float]:
         """Cheap metrics of the present state, which is kept if the watched photos speak for it."""
@@ -370,8 +377,10 @@ class Trainer(Generic[M]):
         return getattr(self.model.appearance, "kernel", None)
 
     def _loss(self) -> float:
-        """By which edits are judged."""
-        return self._judging.measure(self.model, self._objective, self.exposure).loss
+        """By which edits are judged; measured once of each state."""
+        if self._known_loss is None:
+            self._known_loss = self._judging.measure(self.model, self._objective, self.exposure).loss
+        return self._known_loss
 
     def _hash(self) -> str:
         kinds = [type(part).__name__ for part in (self.model, self.strategy, *self._objective.terms)]
