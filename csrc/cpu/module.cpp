@@ -16,6 +16,7 @@ void bind_constants(nb::module_& m);
 void bind_geometry(nb::module_& m);
 void bind_mesh_energies(nb::module_& m);
 void bind_normals(nb::module_& m);
+void bind_photo_agreement(nb::module_& m);
 void bind_photometric(nb::module_& m);
 void bind_rasterize(nb::module_& m);
 void bind_rasterize_opaque(nb::module_& m);
@@ -63,6 +64,7 @@ NB_MODULE(_native, m) {
     bind_geometry(m);
     bind_mesh_energies(m);
     bind_normals(m);
+    bind_photo_agreement(m);
     bind_photometric(m);
     bind_rasterize(m);
     bind_rasterize_opaque(m);

@@ -157,6 +157,25 @@ def normal_agreement(
     by_normals: torch.Tensor | None,
     by_depth: torch.Tensor | None,
 ) -> float: ...
+def photo_agreement(
+    *,
+    pixels: Sequence[torch.Tensor],
+    masks: Sequence[torch.Tensor],
+    viewmats: torch.Tensor,
+    Ks: torch.Tensor,
+    centers: torch.Tensor,
+    points: torch.Tensor,
+    normals: torch.Tensor,
+    seen: torch.Tensor,
+    patch: int,
+    asked: int,
+    slant: float,
+    flat: float,
+    whole: float,
+    fewest: int,
+    pixel: float,
+    result: torch.Tensor,
+) -> None: ...
 def photometric(
     *,
     color: torch.Tensor,

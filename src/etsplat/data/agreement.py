@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 from torch.nn.functional import grid_sample, max_pool2d, normalize
 
+from etsplat import _native
 from etsplat.core.cameras import camera_centers
 from etsplat.data.dataset import Dataset
 from etsplat.data.pictures import as_float
@@ -33,6 +34,9 @@ _SLANT = 0.2
 
 _FLAT = 0.01
 """Standard deviation of colours below which a patch shows nothing to compare."""
+
+_WHOLE = 0.7
+"""Share of a patch that must lie on the object for more."""
 
 _SMOOTH = 3
 """Rounds in which normals are averaged with their neighbours'."""
@@ -85,7 +89,7 @@ def photos_of(dataset: Dataset) -> list[Photo]:
     """Of the training views, as `reduced` makes them."""
     dataset = reduced(dataset)
     viewmats, Ks = dataset.viewmats[dataset.train].float(), dataset.Ks[dataset.train].float()
-    pixels = [as_float(dataset.images[index]).permute(2, 0, 1)[None] for index in dataset.train]
+    pixels = [as_float(dataset.images[index]).permute(2, 0, 1)[None].contiguous() for index in dataset.train]
     return [Photo(*each) for each in zip(pixels, viewmats, Ks, camera_centers(viewmats), strict=True)]
 
 
@@ -240,38 +244,26 @@ def agreement(
     fewest: int,
 ) -> Float[Tensor, " N"]:
     """Mean of the upper half of the correlations between the photos that see each point; NaN if too few do."""
-    directions = normalize(torch.stack([photo.center for photo in photos])[:, None] - points, dim=2)
-    square = torch.where(seen, (directions * normals).sum(dim=2), -1.0)
-    cosine, asked = square.topk(min(_ASKED, len(photos)), dim=0)
-    patch = _patches(points, normals, pixel)
-    colors = torch.zeros(len(points), len(asked), patch.shape[1], 3)
-    valid = torch.zeros(*colors.shape[:3])
-    for index, photo in enumerate(photos):
-        rank, who = ((asked == index) & (cosine > _SLANT)).nonzero(as_tuple=True)
-        place = photo.project(patch[who])[0]
-        colors[who, rank] = photo.look_up(photo.pixels[:, :3], place).permute(1, 2, 0)
-        valid[who, rank] = photo.look_up(masks[index], place, "nearest")[0]
-    mean = (colors * valid[..., None]).sum(dim=2) / valid.sum(dim=2).clamp_min(1)[..., None]
-    colors = (colors - mean[:, :, None]) * valid[..., None]
-    length = colors.square().sum(dim=(2, 3)).sqrt()
-    shows = (valid.mean(dim=2) > 0.7) & (length > _FLAT * (3 * patch.shape[1]) ** 0.5)
-    unit = (colors / length.clamp_min(1e-6)[..., None, None]).flatten(2)
-    first, second = torch.triu_indices(len(asked), len(asked), 1)
-    both = shows[:, first] & shows[:, second]
-    ranked = torch.where(both, (unit @ unit.mT)[:, first, second], -torch.inf).sort(dim=1, descending=True).values
-    half = (both.sum(dim=1) + 1) // 2
-    kept = torch.where(torch.arange(ranked.shape[1]) < half[:, None], ranked, 0.0).sum(dim=1)
-    return torch.where(shows.sum(dim=1) >= fewest, kept / half, torch.nan)
-
-
-def _patches(points: Tensor, normals: Tensor, pixel: float) -> Tensor:
-    """(N, P, 3) grids of points across the normals, a pixel apart."""
-    across = torch.where(normals[:, :1].abs() < 0.7, torch.tensor([1.0, 0.0, 0.0]), torch.tensor([0.0, 1.0, 0.0]))
-    u = normalize(torch.linalg.cross(normals, across), dim=1)
-    v = torch.linalg.cross(normals, u)
-    steps = pixel * (torch.arange(_PATCH) - (_PATCH - 1) / 2)
-    y, x = torch.meshgrid(steps, steps, indexing="ij")
-    return points[:, None] + x.reshape(-1, 1) * u[:, None] + y.reshape(-1, 1) * v[:, None]
+    found = torch.empty(len(points))
+    _native.photo_agreement(
+        pixels=[photo.pixels for photo in photos],
+        masks=masks,
+        viewmats=torch.stack([photo.viewmat for photo in photos]),
+        Ks=torch.stack([photo.K for photo in photos]),
+        centers=torch.stack([photo.center for photo in photos]),
+        points=points.contiguous(),
+        normals=normals.contiguous(),
+        seen=seen.contiguous(),
+        patch=_PATCH,
+        asked=_ASKED,
+        slant=_SLANT,
+        flat=_FLAT,
+        whole=_WHOLE,
+        fewest=fewest,
+        pixel=pixel,
+        result=found,
+    )
+    return found
 
 
 def averaged(normals: Float[Tensor, "V 3"], edges: Int64[Tensor, "E 2"], rounds: int) -> Float[Tensor, "V 3"]:

@@ -59,6 +59,9 @@ _SMOOTH_UNSEEN = 100
 _PASSES = 3
 """Looks at all lids: the second sees walls where the first tore."""
 
+_CHUNK = 1 << 16
+"""Points at which photos are asked together."""
+
 _LONGEST = 2.5
 """Edges longer than this times the mean of the hull's are divided."""
 
@@ -131,10 +134,14 @@ def _push(photos: list[Photo], outside: Distance, vertices: Tensor, faces: Tenso
     lids = [((hit >= 0) & (lid[faces].sum(dim=1) >= 2)[hit.clamp_min(0)]).float()[None, None] for _, hit in hits]
     free = _within(outside, vertices[own], inward, depths)
     found = torch.full(free.shape, torch.nan)
-    for number, depth in enumerate(depths):
-        within = free[:, number]
-        points = vertices[own][within] + depth * inward[within]
-        found[within, number] = _agreement_behind(photos, lids, points, -inward[within], pixel)
+    who, which = free.nonzero(as_tuple=True)
+    chunks = zip(who.split(_CHUNK), which.split(_CHUNK), strict=True)
+    found[free] = torch.cat(
+        [
+            _agreement_behind(photos, lids, vertices[own[v]] + depths[d, None] * inward[v], -inward[v], pixel)
+            for v, d in chunks
+        ]
+    )
     cost = torch.where(found.isnan(), _UNKNOWN, 1 - found.clamp(0, 1)).masked_fill(~free, torch.inf)
     depth = _depths(cost, links)
     edge = float((vertices[edges[:, 0]] - vertices[edges[:, 1]]).norm(dim=1).mean())

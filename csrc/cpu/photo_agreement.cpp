@@ -1,0 +1,178 @@
+#include "photo_agreement.h"
+
+#include <algorithm>
+#include <cmath>
+#include <functional>
+#include <limits>
+#include <vector>
+
+#include "math/vector3.h"
+#include "parallel.h"
+
+namespace etsplat {
+namespace {
+
+using Vec = Vector3<float>;
+
+constexpr int32_t kLanes = 16;  // floats that are summed side by side; patches are padded to it
+
+Vec vec(const float* values) { return {values[0], values[1], values[2]}; }
+
+Vec normalized(Vec a) { return (1.0f / std::max(std::sqrt(dot(a, a)), 1e-12f)) * a; }
+
+float dot_of_patches(const float* a, const float* b, int32_t size) {
+    float lanes[kLanes] = {};
+    for (int32_t i = 0; i < size; i += kLanes) {
+        for (int32_t k = 0; k < kLanes; ++k) lanes[k] += a[i + k] * b[i + k];
+    }
+    for (int32_t half = kLanes / 2; half > 0; half /= 2) {
+        for (int32_t k = 0; k < half; ++k) lanes[k] += lanes[k + half];
+    }
+    return lanes[0];
+}
+
+// A point before the division by its depth, which is the third; of a direction with `where` 0.
+Vec projected(const AskedPhoto& photo, Vec point, float where) {
+    const float *m = photo.viewmat, *K = photo.K;
+    const Vec camera = {dot(vec(m), point) + where * m[3], dot(vec(m + 4), point) + where * m[7],
+                        dot(vec(m + 8), point) + where * m[11]};
+    return {dot(vec(K), camera), dot(vec(K + 3), camera), camera.z};
+}
+
+// Without calls, which std::floor and std::nearbyint are where processors before SSE 4.1 are to run this. For |x| < 2^22.
+int32_t lower(float x) {
+    const auto towards_zero = static_cast<int32_t>(x);
+    return towards_zero - (static_cast<float>(towards_zero) > x);
+}
+int32_t nearest(float x) { return static_cast<int32_t>((x + 12582912.0f) - 12582912.0f); }  // 1.5 x 2^23
+
+// The colour at a place, 0 beyond the picture, and whether the nearest pixel counts.
+void look_up(const AskedPhoto& photo, float x, float y, float out[4]) {
+    const int32_t width = photo.width, height = photo.height;
+    out[0] = out[1] = out[2] = out[3] = 0.0f;
+    if (!(x > -1.0f && x < static_cast<float>(width) && y > -1.0f && y < static_cast<float>(height))) return;
+    const int32_t left = lower(x), top = lower(y);
+    const float right = x - static_cast<float>(left), below = y - static_cast<float>(top);
+    const int64_t plane = static_cast<int64_t>(width) * height;
+    const auto add = [&](int32_t column, int32_t row, float weight) {
+        if (column < 0 || column >= width || row < 0 || row >= height) return;
+        const float* pixel = photo.pixels + static_cast<int64_t>(row) * width + column;
+        for (int32_t c = 0; c < 3; ++c) out[c] += weight * pixel[c * plane];
+    };
+    add(left, top, (1.0f - right) * (1.0f - below));
+    add(left + 1, top, right * (1.0f - below));
+    add(left, top + 1, (1.0f - right) * below);
+    add(left + 1, top + 1, right * below);
+    const int32_t column = nearest(x), row = nearest(y);
+    if (column < 0 || column >= width || row < 0 || row >= height) return;
+    out[3] = photo.mask[static_cast<int64_t>(row) * width + column];
+}
+
+class Agreement {
+public:
+    Agreement(const std::vector<AskedPhoto>& photos, const AgreementRules& rules)
+        : photos_(photos),
+          rules_(rules),
+          count_(rules.patch * rules.patch),
+          size_((4 * count_ + kLanes - 1) / kLanes * kLanes),
+          patches_(static_cast<size_t>(rules.asked) * size_) {}
+
+    float at(Vec point, Vec normal, const bool* seen, int64_t stride) {
+        choose(point, normal, seen, stride);
+        int32_t shown = 0;
+        for (const Choice& choice : choices_) {
+            shown += look(photos_[choice.photo], point, normal, patches_.data() + shown * size_);
+        }
+        if (shown < rules_.fewest) return std::numeric_limits<float>::quiet_NaN();
+        correlations_.clear();
+        for (int32_t i = 0; i < shown; ++i) {
+            for (int32_t j = i + 1; j < shown; ++j) {
+                correlations_.push_back(dot_of_patches(patch(i), patch(j), size_));
+            }
+        }
+        const size_t half = (correlations_.size() + 1) / 2;
+        std::sort(correlations_.begin(), correlations_.end(), std::greater<float>());
+        float sum = 0.0f;
+        for (size_t k = 0; k < half; ++k) sum += correlations_[k];
+        return sum / static_cast<float>(half);
+    }
+
+private:
+    struct Choice {
+        float cosine;
+        size_t photo;
+    };
+
+    const float* patch(int32_t number) const { return patches_.data() + number * size_; }
+
+    // The photos that see a point most squarely; of equal ones the first.
+    void choose(Vec point, Vec normal, const bool* seen, int64_t stride) {
+        choices_.clear();
+        for (size_t photo = 0; photo < photos_.size(); ++photo) {
+            if (!seen[photo * stride]) continue;
+            const float cosine = dot(normalized(vec(photos_[photo].center) - point), normal);
+            if (cosine > rules_.slant) choices_.push_back({cosine, photo});
+        }
+        std::stable_sort(choices_.begin(), choices_.end(),
+                         [](const Choice& a, const Choice& b) { return a.cosine > b.cosine; });
+        if (static_cast<int32_t>(choices_.size()) > rules_.asked) choices_.resize(rules_.asked);
+    }
+
+    // What a photo shows around a point, its mean taken away and of length 1; whether that can be compared.
+    bool look(const AskedPhoto& photo, Vec point, Vec normal, float* out) const {
+        const Vec across = std::abs(normal.x) < 0.7f ? Vec{1.0f, 0.0f, 0.0f} : Vec{0.0f, 1.0f, 0.0f};
+        const Vec u = normalized(cross(normal, across)), v = cross(normal, u);
+        const Vec middle = projected(photo, point, 1.0f);
+        const Vec du = projected(photo, u, 0.0f), dv = projected(photo, v, 0.0f);
+        const float first = -0.5f * static_cast<float>(rules_.patch - 1);
+        float sum[4] = {};
+        for (int32_t row = 0; row < rules_.patch; ++row) {
+            const Vec start = middle + rules_.pixel * (first + static_cast<float>(row)) * dv;
+            for (int32_t column = 0; column < rules_.patch; ++column) {
+                const Vec h = start + rules_.pixel * (first + static_cast<float>(column)) * du;
+                float* pixel = out + 4 * (row * rules_.patch + column);
+                if (h.z > 0.0f) {
+                    look_up(photo, h.x / h.z - 0.5f, h.y / h.z - 0.5f, pixel);
+                } else {
+                    std::fill(pixel, pixel + 4, 0.0f);
+                }
+                for (int32_t c = 0; c < 3; ++c) sum[c] += pixel[3] * pixel[c];
+                sum[3] += pixel[3];
+            }
+        }
+        const float counted = sum[3];
+        if (!(counted > rules_.whole * static_cast<float>(count_))) return false;
+        for (float& mean : sum) mean /= std::max(counted, 1.0f);
+        for (int32_t i = 0; i < count_; ++i) {
+            float* pixel = out + 4 * i;
+            for (int32_t c = 0; c < 3; ++c) pixel[c] = pixel[3] * (pixel[c] - sum[c]);
+            pixel[3] = 0.0f;
+        }
+        std::fill(out + 4 * count_, out + size_, 0.0f);
+        const float length = std::sqrt(dot_of_patches(out, out, size_));
+        if (!(length > rules_.flat * std::sqrt(3.0f * static_cast<float>(count_)))) return false;
+        for (int32_t i = 0; i < size_; ++i) out[i] /= std::max(length, 1e-6f);
+        return true;
+    }
+
+    const std::vector<AskedPhoto>& photos_;
+    const AgreementRules& rules_;
+    int32_t count_, size_;  // pixels and floats of a patch
+    std::vector<float> patches_;
+    std::vector<Choice> choices_;
+    std::vector<float> correlations_;
+};
+
+}  // namespace
+
+void photo_agreement(const std::vector<AskedPhoto>& photos, const AgreementRules& rules, const float* points,
+                     const float* normals, const bool* seen, int64_t N, float* result) {
+    parallel_for(N, 64, [&](int64_t begin, int64_t end) {
+        Agreement agreement(photos, rules);
+        for (int64_t n = begin; n < end; ++n) {
+            result[n] = agreement.at(vec(points + 3 * n), vec(normals + 3 * n), seen + n, N);
+        }
+    });
+}
+
+}  // namespace etsplat
