@@ -24,6 +24,16 @@ void bind_photo_agreement(nb::module_& m) {
         },
         "pixels", "masks", "viewmats", "Ks", "centers", "points", "normals", "seen", "patch", "asked", "slant", "flat",
         "whole", "fewest", "pixel", "result");
+    // pixels (1, 4, H, W), seen and each of shown (H, W), colors (F, 3), sums (F, 1 + shown).
+    def_function(
+        m, "add_differences",
+        [](Array<const float, 4> pixels, float opaque, Array<const int64_t, 2> seen,
+           const std::vector<Array<const int64_t, 2>>& shown, Array<const float, 2> colors, Array<float, 2> sums) {
+            std::vector<const int64_t*> faces;
+            for (const auto& each : shown) faces.push_back(each.data());
+            add_differences(pixels.data(), seen.count(), opaque, seen.data(), faces, colors.data(), sums.data());
+        },
+        "pixels", "opaque", "seen", "shown", "colors", "sums");
 }
 
 }  // namespace etsplat

@@ -4,19 +4,31 @@
 namespace etsplat {
 
 void bind_rasterize_opaque(nb::module_& m) {
-    // Of one view: vertices (V, 3), faces (F, 3), viewmat (4, 4), K (3, 3); triangle (H, W), barycentrics (H, W, 3), depth
-    // (H, W).
+    // Of one view: vertices (V, 3), faces (F, 3), viewmat (4, 4), K (3, 3); triangle (H, W), barycentrics (H, W, 3) or None,
+    // depth (H, W).
     def_function(
         m, "rasterize_opaque",
         [](Array<const float, 2> vertices, Array<const int32_t, 2> faces, Array<const float, 2> viewmat,
-           Array<const float, 2> K, float near_plane, Array<int32_t, 2> triangle, Array<float, 3> barycentrics,
+           Array<const float, 2> K, float near_plane, Array<int32_t, 2> triangle, OptionalArray<float, 3> barycentrics,
            Array<float, 2> depth) {
             const OpaqueMesh mesh{vertices.data(), faces.data(), vertices.size(0), faces.size(0)};
             const OpaqueCamera camera{viewmat.data(), K.data(), near_plane, static_cast<int32_t>(triangle.size(1)),
                                     static_cast<int32_t>(triangle.size(0))};
-            rasterize_opaque(mesh, camera, triangle.data(), barycentrics.data(), depth.data());
+            rasterize_opaque(mesh, camera, triangle.data(), data_or_null(barycentrics), depth.data());
         },
         "vertices", "faces", "viewmat", "K", "near_plane", "triangle", "barycentrics", "depth");
+    // As above; turned (F,), entered and left (H, W).
+    def_function(
+        m, "enter_and_leave",
+        [](Array<const float, 2> vertices, Array<const int32_t, 2> faces, Array<const float, 2> viewmat,
+           Array<const float, 2> K, float near_plane, Array<const bool, 1> turned, Array<int64_t, 2> entered,
+           Array<int64_t, 2> left) {
+            const OpaqueMesh mesh{vertices.data(), faces.data(), vertices.size(0), faces.size(0)};
+            const OpaqueCamera camera{viewmat.data(), K.data(), near_plane, static_cast<int32_t>(entered.size(1)),
+                                    static_cast<int32_t>(entered.size(0))};
+            enter_and_leave(mesh, camera, turned.data(), entered.data(), left.data());
+        },
+        "vertices", "faces", "viewmat", "K", "near_plane", "turned", "entered", "left");
     // As above; colors (F, C) or (V, C), image (H, W, C + 1).
     def_function(
         m, "render_opaque",

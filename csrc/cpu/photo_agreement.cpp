@@ -175,4 +175,20 @@ void photo_agreement(const std::vector<AskedPhoto>& photos, const AgreementRules
     });
 }
 
+void add_differences(const float* pixels, int64_t size, float opaque, const int64_t* seen,
+                     const std::vector<const int64_t*>& shown, const float* colors, float* sums) {
+    const auto columns = static_cast<int64_t>(shown.size()) + 1;
+    for (int64_t i = 0; i < size; ++i) {
+        if (seen[i] < 0 || !(pixels[3 * size + i] > opaque)) continue;
+        float* sum = sums + seen[i] * columns;
+        sum[0] += 1.0f;
+        for (int64_t k = 1; k < columns; ++k) {
+            const float* color = colors + 3 * shown[k - 1][i];
+            float error = 0.0f;
+            for (int64_t c = 0; c < 3; ++c) error += std::abs(pixels[c * size + i] - color[c]);
+            sum[k] += error / 3.0f;
+        }
+    }
+}
+
 }  // namespace etsplat

@@ -1,4 +1,4 @@
-// How far photos agree on what they show at points of a surface (src/etsplat/data/agreement.py says what for).
+// How far photos agree on what they show at points of a surface, and how far its colours differ from it (src/etsplat/data/agreement.py says what for).
 #pragma once
 
 #include <cstdint>
@@ -29,5 +29,10 @@ struct AgreementRules {
 // points and normals (N, 3), seen (photos, N).
 void photo_agreement(const std::vector<AskedPhoto>& photos, const AgreementRules& rules, const float* points,
                      const float* normals, const bool* seen, int64_t N, float* result);
+
+// For each pixel of a photo (4, size) with an alpha above `opaque` at which a face is seen: 1 is added to the first of the face's
+// sums (faces, 1 + shown), and the mean difference of its colour from that of each face that is shown there to the others.
+void add_differences(const float* pixels, int64_t size, float opaque, const int64_t* seen,
+                     const std::vector<const int64_t*>& shown, const float* colors, float* sums);
 
 }  // namespace etsplat

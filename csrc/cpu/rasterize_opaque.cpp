@@ -159,27 +159,35 @@ void draw(const Screen& screen, int32_t index, TileBuffer& tile) {
     }
 }
 
-template <class Resolve>
-void for_each_tile(const Screen& screen, const Resolve& resolve) {
+// Draws each triangle into the buffer `layer` names, one of so many, and hands these to `resolve`.
+template <int Layers, class Layer, class Resolve>
+void for_each_tile(const Screen& screen, const Layer& layer, const Resolve& resolve) {
     int32_t row_begin = 0;
     for (const int32_t row_end : strip_ends(screen)) {
         const Bins bins = bin_strip(screen, row_begin, row_end);
         const int64_t tiles = static_cast<int64_t>(row_end - row_begin) * screen.tiles_x;
         parallel_for(tiles, 1, [&](int64_t begin, int64_t end) {
-            thread_local TileBuffer buffer;
+            thread_local TileBuffer buffers[Layers];
             for (int64_t tile = begin; tile < end; ++tile) {
-                buffer.reset(screen, static_cast<int32_t>(tile % screen.tiles_x),
-                             row_begin + static_cast<int32_t>(tile / screen.tiles_x));
+                for (TileBuffer& buffer : buffers) {
+                    buffer.reset(screen, static_cast<int32_t>(tile % screen.tiles_x),
+                                 row_begin + static_cast<int32_t>(tile / screen.tiles_x));
+                }
                 const int64_t last = bins.begin[tile + 1];
                 for (int64_t i = bins.begin[tile]; i < last; ++i) {
                     if (i + kAhead < last) prefetch_all(screen.triangles[bins.triangles[i + kAhead]]);
-                    draw(screen, bins.triangles[i], buffer);
+                    draw(screen, bins.triangles[i], buffers[layer(bins.triangles[i])]);
                 }
-                resolve(buffer);
+                resolve(buffers);
             }
         });
         row_begin = row_end;
     }
+}
+
+template <class Resolve>
+void for_each_tile(const Screen& screen, const Resolve& resolve) {
+    for_each_tile<1>(screen, [](int32_t) { return 0; }, [&](const TileBuffer* tile) { resolve(*tile); });
 }
 
 void barycentrics_at(const OpaqueMesh& mesh, const Screen& screen, int32_t face, int32_t x, int32_t y, float out[3]) {
@@ -235,11 +243,13 @@ void rasterize_opaque(const OpaqueMesh& mesh, const OpaqueCamera& camera, int32_
             int32_t known = -1;  // whose corners are at hand
             OpaqueVertex v[3] = {};
             for (int32_t x = tile.x0; x < tile.x1; ++x) {
-                look_ahead(mesh, screen, owners + x, tile.x1 - x);
                 const int32_t face = owners[x];
-                float* b = barycentrics + 3 * (row + x);
                 triangle[row + x] = face;
-                depth[row + x] = b[0] = b[1] = b[2] = 0.0f;
+                depth[row + x] = face < 0 ? 0.0f : 1.0f / tile.inverse_depth[place + x];
+                if (!barycentrics) continue;
+                look_ahead(mesh, screen, owners + x, tile.x1 - x);
+                float* b = barycentrics + 3 * (row + x);
+                b[0] = b[1] = b[2] = 0.0f;
                 if (face < 0) continue;
                 if (face != known) {
                     known = face;
@@ -247,7 +257,26 @@ void rasterize_opaque(const OpaqueMesh& mesh, const OpaqueCamera& camera, int32_
                     for (int i = 0; i < 3; ++i) v[i] = screen.vertices[k[i]];
                 }
                 opaque_barycentrics(v, x, y, b);
-                depth[row + x] = 1.0f / tile.inverse_depth[place + x];
+            }
+        }
+    });
+}
+
+void enter_and_leave(const OpaqueMesh& mesh, const OpaqueCamera& camera, const bool* turned, int64_t* entered,
+                     int64_t* left) {
+    const Screen screen(mesh, camera, 1, false);
+    const auto layer = [&](int32_t face) { return turned[face] ? 1 : 0; };
+    for_each_tile<2>(screen, layer, [&](const TileBuffer* tiles) {
+        const TileBuffer &facing = tiles[0], &back = tiles[1];
+        for (int32_t y = facing.y0; y < facing.y1; ++y) {
+            for (int32_t x = facing.x0; x < facing.x1; ++x) {
+                const int64_t from = static_cast<int64_t>(y - facing.y0) * facing.stride + (x - facing.x0);
+                const int32_t enters = facing.triangle[from], leaves = back.triangle[from];
+                const float near = facing.inverse_depth[from], far = back.inverse_depth[from];
+                const bool both = enters >= 0 && leaves >= 0 && (near > far || (near == far && enters < leaves));
+                const int64_t to = static_cast<int64_t>(y) * screen.width + x;
+                entered[to] = both ? enters : -1;
+                left[to] = both ? leaves : -1;
             }
         }
     });

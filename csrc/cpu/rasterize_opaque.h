@@ -25,9 +25,15 @@ struct OpaqueColors {
     int32_t channels;
 };
 
-// The nearest triangle of every pixel centre (-1: none), its perspective-correct barycentrics and its depth.
+// The nearest triangle of every pixel centre (-1: none), its perspective-correct barycentrics, unless that is null, and its
+// depth.
 void rasterize_opaque(const OpaqueMesh& mesh, const OpaqueCamera& camera, int32_t* triangle, float* barycentrics,
                       float* depth);
+
+// Where lines of sight through pixel centres meet a triangle first that does not turn its back, the triangle, and the nearest
+// that does, which lies behind it; -1 where either is missing. turned (num_faces,) says which do.
+void enter_and_leave(const OpaqueMesh& mesh, const OpaqueCamera& camera, const bool* turned, int64_t* entered,
+                     int64_t* left);
 
 // Mean over supersampling^2 samples a pixel: premultiplied colour and coverage, (height, width, channels + 1).
 void render_opaque(const OpaqueMesh& mesh, const OpaqueCamera& camera, const OpaqueColors& colors,

@@ -176,6 +176,15 @@ def photo_agreement(
     pixel: float,
     result: torch.Tensor,
 ) -> None: ...
+def add_differences(
+    *,
+    pixels: torch.Tensor,
+    opaque: float,
+    seen: torch.Tensor,
+    shown: Sequence[torch.Tensor],
+    colors: torch.Tensor,
+    sums: torch.Tensor,
+) -> None: ...
 def photometric(
     *,
     color: torch.Tensor,
@@ -287,8 +296,19 @@ def rasterize_opaque(
     K: torch.Tensor,
     near_plane: float,
     triangle: torch.Tensor,
-    barycentrics: torch.Tensor,
+    barycentrics: torch.Tensor | None,
     depth: torch.Tensor,
+) -> None: ...
+def enter_and_leave(
+    *,
+    vertices: torch.Tensor,
+    faces: torch.Tensor,
+    viewmat: torch.Tensor,
+    K: torch.Tensor,
+    near_plane: float,
+    turned: torch.Tensor,
+    entered: torch.Tensor,
+    left: torch.Tensor,
 ) -> None: ...
 def render_opaque(
     *,

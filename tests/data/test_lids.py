@@ -3,6 +3,8 @@
 import pytest
 import torch
 
+from etsplat import _native
+from etsplat.core.cameras import Cameras
 from etsplat.data.agreement import differences, first_hits, per_pixel, photos_of
 from etsplat.data.dataset import Dataset
 from etsplat.data.lids import _without_gaps, lids, without_lids
@@ -10,6 +12,7 @@ from etsplat.data.photograph import photograph, shade_faces
 from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.topology import MeshTopology
 from etsplat.io.mesh_files import MeshFile
+from etsplat.ops.rasterize_opaque import rasterize_opaque
 from helpers.painting import mean_colors
 
 BRIM = -0.4
@@ -84,3 +87,40 @@ def test_a_gap_in_a_lid_belongs_to_it_and_what_is_beside_it_does_not() -> None:
     assert gap[inner].sum() > 20
     assert whole[inner].all()
     assert whole[~cap].float().mean() < 0.005  # at the ends of the gap
+
+
+def test_lines_of_sight_enter_and_leave_as_two_drawings_say() -> None:
+    generator = torch.Generator().manual_seed(0)
+    vertices, faces = icosphere(3)
+    vertices = vertices * (0.7 + 0.6 * torch.rand(len(vertices), 1, generator=generator))  # spikes, so several layers
+    faces = faces[len(faces) // 4 :]  # so that backs are seen
+    colors = torch.rand(len(faces), 3, generator=generator)
+    backs_seen = 0
+    for photo in photos_of(photograph(MeshFile(vertices, faces), 70, 60, elevations=(20.0,), azimuths=4)):
+        corners = vertices[faces]
+        normals = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        turned = ((corners[:, 0] - photo.center) * normals).sum(dim=1) > 0
+        camera = Cameras(photo.viewmat[None], photo.K[None], 70, 60)
+        front = rasterize_opaque(vertices, faces=faces, cameras=camera)
+        assert front.triangle is not None
+        assert front.depth is not None
+        assert torch.equal(first_hits(photo, vertices, faces)[1], front.triangle[0].long())
+        assert torch.equal(first_hits(photo, vertices, faces)[0], front.depth[0, ..., 0])
+        nearest = front.triangle[0].long()
+        backs = rasterize_opaque(vertices, faces=faces[turned], cameras=camera).triangle
+        assert backs is not None
+        behind = backs[0].long()
+        both = (nearest >= 0) & ~turned[nearest.clamp_min(0)] & (behind >= 0)
+        entered, left = torch.empty_like(nearest), torch.empty_like(nearest)
+        _native.enter_and_leave(**photo.drawing(vertices, faces), turned=turned, entered=entered, left=left)
+        assert both.sum() > 300
+        backs_seen += int((turned[nearest.clamp_min(0)] & (nearest >= 0)).sum())
+        assert torch.equal(entered, torch.where(both, nearest, -1))
+        assert torch.equal(left, torch.where(both, turned.nonzero()[:, 0][behind.clamp_min(0)], -1))
+
+        at = (entered >= 0) & (photo.pixels[0, 3] > 0.95)
+        errors = [(photo.pixels[0, :3, at].T - colors[shown[at]]).abs().mean(dim=1) for shown in (entered, left)]
+        columns = torch.stack([torch.ones(len(errors[0])), *errors], dim=1)
+        expected = torch.zeros(len(faces), 3).index_add(0, entered[at], columns)
+        torch.testing.assert_close(differences(photo, entered, [entered, left], colors), expected)
+    assert backs_seen > 5

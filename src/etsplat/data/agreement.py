@@ -6,6 +6,7 @@ is known.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int64
@@ -18,10 +19,12 @@ from etsplat.data.dataset import Dataset
 from etsplat.data.pictures import as_float
 from etsplat.geometry.measures import face_areas, vertex_normals
 from etsplat.geometry.topology import MeshTopology, connected
-from etsplat.ops.rasterize_opaque import rasterize_opaque
 
 _WIDEST = 320
 """Photos are halved until none is wider: agreement asks for texture, not for detail."""
+
+_NEAR_PLANE = 0.01
+"""Of cameras around an object in the unit ball, which none is in."""
 
 _PATCH = 7
 """Pixels across the patches that are compared."""
@@ -73,6 +76,11 @@ class Photo:
         place = 2 * pixel / torch.tensor([[width], [height]]) - 1
         return torch.where(z > 0, place, 2.0).T.reshape(*points.shape[:-1], 2), z.view(points.shape[:-1])
 
+    def drawing(self, vertices: Tensor, faces: Tensor) -> dict[str, Any]:
+        """Arguments of native calls that draw a surface as it sees it."""
+        camera = {"viewmat": self.viewmat, "K": self.K, "near_plane": _NEAR_PLANE}
+        return {"vertices": vertices.detach().contiguous(), "faces": faces.to(torch.int32).contiguous(), **camera}
+
     def look_up(self, planes: Tensor, places: Tensor, mode: str = "bilinear") -> Tensor:
         """(C, N, M) values of (1, C, H, W) planes at (N, M, 2) places; 0 outside."""
         return grid_sample(planes, places[None], mode=mode, align_corners=False)[0]
@@ -116,14 +124,10 @@ def pixel_size(photos: list[Photo]) -> float:
 
 def first_hits(photo: Photo, vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
     """(H, W) depth of the surface at each pixel, 0 where there is none, and (H, W) its face, else -1."""
-    height, width = photo.pixels.shape[2:]
-    drawn = rasterize_opaque(
-        vertices, faces=faces, viewmats=photo.viewmat[None], Ks=photo.K[None], width=width, height=height
-    )
-    assert drawn.triangle is not None
-    assert drawn.depth is not None
-    triangle = drawn.triangle[0].long()
-    return torch.where(triangle >= 0, drawn.depth[0, ..., 0], 0.0), triangle
+    size = photo.pixels.shape[2:]
+    triangle, depth = torch.empty(size, dtype=torch.int32), torch.empty(size)
+    _native.rasterize_opaque(**photo.drawing(vertices, faces), triangle=triangle, barycentrics=None, depth=depth)
+    return depth, triangle.long()
 
 
 def surface_agreement(
@@ -206,11 +210,11 @@ def differences(
         shown: (H, W) the face whose colour is compared there: a column for each.
         colors: (F, 3) in [0, 1].
     """
-    at = ((seen >= 0) & (photo.pixels[0, 3] > 0.95)).view(-1).nonzero()[:, 0]
-    face, pixels = seen.view(-1)[at], photo.pixels[0, :3].flatten(1)[:, at].T
-    errors = [(pixels - colors[faces.reshape(-1)[at]]).abs().mean(dim=1) for faces in shown]
-    columns = [torch.zeros(len(colors)).index_add(0, face, each) for each in (torch.ones(len(at)), *errors)]
-    return torch.stack(columns, dim=1)
+    sums = torch.zeros(len(colors), 1 + len(shown))
+    _native.add_differences(
+        pixels=photo.pixels, opaque=0.95, seen=seen, shown=shown, colors=colors.detach().contiguous(), sums=sums
+    )
+    return sums
 
 
 def per_pixel(sums: Float[Tensor, "F K"], pairs: Int64[Tensor, "P 2"]) -> Float[Tensor, "F K-1"]:

@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
+from etsplat import _native
 from etsplat.data.agreement import Photo, differences, first_hits, per_pixel, photos_of
 from etsplat.data.dataset import Dataset
 from etsplat.geometry.discs import cut_open
@@ -70,9 +71,11 @@ def without_lids(
 def _lids(photos: list[Photo]) -> Lids:
     @torch.no_grad()
     def marked(vertices: Tensor, faces: Tensor, colors: Tensor) -> Tensor:
-        wrong = torch.zeros(len(faces), 3)
+        corners = vertices.index_select(0, faces.reshape(-1)).view(-1, 3, 3)
+        normals = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        wrong, drawn = torch.zeros(len(faces), 3), faces.to(torch.int32)
         for photo in photos:
-            wrong += _wrong(photo, vertices, faces, colors)
+            wrong += _wrong(photo, vertices, drawn, corners[:, 0], normals, colors)
         pairs = MeshTopology.from_faces(faces, len(vertices)).face_pairs.long()
         found = _patches(wrong, face_areas(vertices, faces), pairs)
         return _without_gaps(found, faces) if bool(found.any()) else found
@@ -91,21 +94,27 @@ def _shown(photos: list[Photo], vertices: Tensor, faces: Tensor) -> Float[Tensor
     return sums[:, 1:] / sums[:, :1].clamp_min(1)
 
 
-def _wrong(photo: Photo, vertices: Tensor, faces: Tensor, colors: Tensor) -> Float[Tensor, "F 3"]:
+def _wrong(
+    photo: Photo, vertices: Tensor, faces: Tensor, corners: Tensor, normals: Tensor, colors: Tensor
+) -> Float[Tensor, "F 3"]:
     """Of each face, the pixels at which a photo sees it, and the sums there of two differences.
 
     The first is that of the face, the second of the nearest face behind it that turns its back to the camera: on a
     closed surface that is where the line of sight leaves the matter that it enters here.
+
+    Args:
+        photo: which looks.
+        vertices: (V, 3).
+        faces: (F, 3).
+        corners: (F, 3) a point of each face.
+        normals: (F, 3), of any length.
+        colors: (F, 3).
     """
-    corners = vertices.index_select(0, faces.reshape(-1)).view(-1, 3, 3)
-    normals = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    turned = ((corners[:, 0] - photo.center) * normals).sum(dim=1) > 0
-    backs = turned.nonzero()[:, 0]
-    front, behind = first_hits(photo, vertices, faces)[1], first_hits(photo, vertices, faces[turned])[1]
-    entered = (front >= 0) & ~turned[front.clamp_min(0)] & (behind >= 0)
-    front = torch.where(entered, front, -1)
-    left = torch.where(entered, backs[behind.clamp_min(0)], -1) if len(backs) else front
-    return differences(photo, front, [front, left], colors)
+    size = photo.pixels.shape[2:]
+    entered, left = torch.empty(size, dtype=torch.int64), torch.empty(size, dtype=torch.int64)
+    turned = ((corners - photo.center) * normals).sum(dim=1) > 0
+    _native.enter_and_leave(**photo.drawing(vertices, faces), turned=turned, entered=entered, left=left)
+    return differences(photo, entered, [entered, left], colors)
 
 
 def _patches(wrong: Float[Tensor, "F 3"], area: Float[Tensor, " F"], pairs: Int64[Tensor, "P 2"]) -> Bool[Tensor, " F"]:
