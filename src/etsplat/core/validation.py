@@ -84,8 +84,11 @@ def check_memory(name: str, tensor: Tensor) -> None:
         raise ValueError(f"{name} must have memory of its own, got a ZeroTensor: pass {name}.clone()")
     if tensor.numel() == 0:
         return
-    last = tensor.storage_offset() + sum((n - 1) * step for n, step in zip(tensor.shape, tensor.stride(), strict=True))
-    needed, held = (last + 1) * tensor.element_size(), tensor.untyped_storage().nbytes()
+    if tensor.is_contiguous():  # as most are, and steps check dozens
+        spanned = tensor.numel()
+    else:
+        spanned = 1 + sum((n - 1) * step for n, step in zip(tensor.shape, tensor.stride(), strict=True))
+    needed, held = (tensor.storage_offset() + spanned) * tensor.element_size(), tensor.untyped_storage().nbytes()
     if held < needed:
         raise ValueError(f"{name} must have memory of its own: it needs {needed} bytes, and its storage holds {held}")
 
