@@ -59,6 +59,9 @@ _SMOOTH_UNSEEN = 100
 _PASSES = 3
 """Looks at all lids: the second sees walls where the first tore."""
 
+_AT_ONCE = 8
+"""Depths at which it is asked together whether they are still inside."""
+
 _CHUNK = 1 << 16
 """Points at which photos are asked together."""
 
@@ -191,10 +194,19 @@ def _agreement_behind(photos: list[Photo], lids: list[Tensor], points: Tensor, n
 
 def _within(outside: Distance, points: Tensor, inward: Tensor, depths: Tensor) -> Bool[Tensor, "N D"]:
     """Which depths lie before the way inwards comes within a step of the hull's other side."""
-    beyond = torch.stack([outside(points + depth * inward) > -depths[1] for depth in depths[2:]], dim=1)
-    free = beyond.int().cumsum(dim=1) == 0
-    # A lid itself, and the way to the first depth well inside of it, are always free.
-    return torch.cat([torch.ones(len(points), 2, dtype=torch.bool), free], dim=1)
+    free = torch.zeros(len(points), len(depths), dtype=torch.bool)
+    free[:, :2] = True  # a lid itself, and the way to the first depth well inside of it
+    going = torch.arange(len(points))
+    for column in range(2, len(depths), _AT_ONCE):
+        if len(going) == 0:
+            break
+        some = depths[column : column + _AT_ONCE]
+        asked = points[going, None] + some[:, None] * inward[going, None]
+        inside = outside(asked.reshape(-1, 3)).view(asked.shape[:2]) <= -depths[1]
+        on = inside.int().cumprod(dim=1).bool()
+        free[going, column : column + _AT_ONCE] = on
+        going = going[on[:, -1]]
+    return free
 
 
 def _depths(cost: Float[Tensor, "N D"], edges: Int64[Tensor, "E 2"]) -> Int64[Tensor, " N"]:
@@ -209,11 +221,12 @@ def _depths(cost: Float[Tensor, "N D"], edges: Int64[Tensor, "E 2"]) -> Int64[Te
     for _ in range(_ROUNDS):
         sent = belief()[source] - message[back]
         least = sent.amin(dim=1, keepdim=True)
+        rows = sent.T.contiguous()  # a depth in each, in one piece of memory
         for order in (range(1, cost.shape[1]), range(cost.shape[1] - 2, -1, -1)):
             for k in order:
                 behind = k - 1 if order.step > 0 else k + 1
-                torch.minimum(sent[:, k], sent[:, behind] + _BEND, out=sent[:, k])
-        sent = torch.minimum(sent, least + _TEAR)
+                torch.minimum(rows[k], rows[behind] + _BEND, out=rows[k])
+        sent = torch.minimum(rows.T, least + _TEAR).contiguous()
         message = (message + sent - sent.amin(dim=1, keepdim=True)) / 2
     return belief().argmin(dim=1)
 
