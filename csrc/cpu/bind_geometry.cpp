@@ -1,5 +1,8 @@
+#include <nanobind/ndarray.h>
+
 #include "bindings.h"
 #include "bvh.h"
+#include "crossings.h"
 #include "intersections.h"
 #include "parallel.h"
 #include "subdivision.h"
@@ -32,14 +35,51 @@ void bind_geometry(nb::module_& m) {
             });
         },
         "points", "vertices", "faces", "squared_distances", "closest");
-    // vertices (V, 3), faces (F, 3), intersecting (F,).
+    // vertices (V, 3), faces (F, 3) with F > 0.
+    nb::class_<Bvh>(m, "FaceTree");
+    def_function(
+        m, "face_tree",
+        [](Array<const double, 2> vertices, Array<const int64_t, 2> faces) {
+            return Bvh(vertices.data(), faces.data(), faces.size(0));
+        },
+        "vertices", "faces");
+    def_function(
+        m, "move_face_tree",
+        [](Bvh& tree, Array<const double, 2> vertices, Array<const int64_t, 2> faces) {
+            tree.move(vertices.data(), faces.data());
+        },
+        "tree", "vertices", "faces");
+    // again and intersecting (F,).
     def_function(
         m, "mark_intersecting_faces",
-        [](Array<const double, 2> vertices, Array<const int64_t, 2> faces, Array<bool, 1> intersecting) {
-            mark_intersecting_faces(vertices.data(), faces.data(), faces.size(0),
+        [](const Bvh& tree, OptionalArray<const bool, 1> again, Array<bool, 1> intersecting) {
+            mark_intersecting_faces(tree, reinterpret_cast<const uint8_t*>(data_or_null(again)),
                                     reinterpret_cast<uint8_t*>(intersecting.data()));
         },
-        "vertices", "faces", "intersecting");
+        "tree", "again", "intersecting");
+    // (N, 2) pairs of faces.
+    m.def(
+        "overlapping_boxes",
+        [](const Bvh& tree) {
+            std::vector<int64_t>* pairs;
+            {
+                nb::gil_scoped_release release;
+                pairs = new std::vector<int64_t>(overlapping_boxes(tree));
+            }
+            nb::capsule owner(pairs, [](void* p) noexcept { delete static_cast<std::vector<int64_t>*>(p); });
+            return nb::ndarray<nb::numpy, int64_t, nb::ndim<2>>(pairs->data(), {pairs->size() / 2, 2}, owner);
+        },
+        nb::kw_only(), nb::arg("tree"),
+        nb::sig("def overlapping_boxes(*, tree: FaceTree) -> numpy.typing.NDArray[numpy.int64]"));
+    // points (P, 3), own (P, K), corners (F, 9) with F > 0; counts (P,).
+    def_function(
+        m, "count_crossings",
+        [](Array<const double, 2> points, Array<const int64_t, 2> own, Array<const double, 2> corners,
+           Array<int64_t, 1> counts) {
+            count_crossings(points.data(), own.data(), points.size(0), own.size(1), corners.data(), corners.size(0),
+                            counts.data());
+        },
+        "points", "own", "corners", "counts");
 }
 
 }  // namespace etsplat

@@ -91,6 +91,28 @@ int32_t Bvh::build(int64_t begin, int64_t end, std::vector<Centered>& order, con
     return index;
 }
 
+void Bvh::move(const double* vertices, const int64_t* faces) {
+    for (size_t slot = 0; slot < faces_.size(); ++slot) {
+        triangles_[slot] = triangle(vertices, faces + 3 * faces_[slot]);
+        boxes_[slot] = bounds(triangles_[slot]);
+    }
+    for (int64_t index = static_cast<int64_t>(nodes_.size()) - 1; index >= 0; --index) {  // children lie behind parents
+        Node& node = nodes_[index];
+        node.box = node.right ? join(nodes_[index + 1].box, nodes_[node.right].box) : nothing;
+        for (int32_t slot = node.begin; !node.right && slot < node.end; ++slot) node.box = join(node.box, boxes_[slot]);
+    }
+}
+
+Bvh::Chosen Bvh::choose(const uint8_t* faces) const {
+    Chosen found{std::vector<uint8_t>(faces_.size()), {0}};
+    found.before.reserve(faces_.size() + 1);
+    for (size_t slot = 0; slot < faces_.size(); ++slot) {
+        found.chosen[slot] = !faces || faces[faces_[slot]];
+        found.before.push_back(found.before.back() + found.chosen[slot]);
+    }
+    return found;
+}
+
 Bvh::Nearest Bvh::nearest(Vec3 p) const {
     std::pair<double, int32_t> stack[max_depth];
     int depth = 0;

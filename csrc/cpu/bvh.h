@@ -7,6 +7,7 @@
 #pragma once
 
 #include <algorithm>
+#include <cstdint>
 #include <vector>
 
 #include "vec3.h"
@@ -39,6 +40,9 @@ public:
     // vertices: rows of 3; faces: rows of 3, num_faces >= 1. All coordinates finite.
     Bvh(const double* vertices, const int64_t* faces, int64_t num_faces);
 
+    // Moves the same faces to where their vertices are now. The tree stays as it is, and is the worse the farther they moved.
+    void move(const double* vertices, const int64_t* faces);
+
     // The face nearest to p; of faces at the same computed distance the one with the smallest index.
     Nearest nearest(Vec3 p) const;
 
@@ -49,9 +53,23 @@ public:
     // Leaves, which are runs of slots one behind the other.
     int64_t leaves() const { return static_cast<int64_t>(leaves_.size()); }
 
-    // Calls visit(slot, other) for all slots < other whose boxes meet, and of which the first is in that leaf.
+    // Some of the slots.
+    struct Chosen {
+        std::vector<uint8_t> chosen;  // of each slot
+        std::vector<int32_t> before;  // how many of those before each slot are chosen, and of all
+        bool all(int32_t begin, int32_t end) const { return before[end] - before[begin] == end - begin; }
+    };
+    // Those of which faces[f] is not 0; all if `faces` is null.
+    Chosen choose(const uint8_t* faces) const;
+
+    // Calls visit(slot, other) for chosen slots of that leaf and all others whose boxes meet theirs; over all leaves that
+    // is every such pair of which one at least is chosen, once.
     template <class Visit>
-    void meeting(int64_t leaf, Visit&& visit) const;
+    void meeting(int64_t leaf, const Chosen& chosen, Visit&& visit) const;
+
+    // Calls visit(slot) for every slot whose box meets that one.
+    template <class Visit>
+    void touching(const Box& box, Visit&& visit) const;
 
 private:
     struct Centered {
@@ -76,15 +94,17 @@ private:
 };
 
 template <class Visit>
-void Bvh::meeting(int64_t leaf, Visit&& visit) const {
+void Bvh::meeting(int64_t leaf, const Chosen& chosen, Visit&& visit) const {
     const Node& here = nodes_[leaves_[leaf]];
+    if (chosen.before[here.begin] == chosen.before[here.end]) return;
     int32_t stack[max_depth];
     int depth = 0;
     stack[depth++] = 0;
     while (depth > 0) {
         const int32_t index = stack[--depth];
         const Node& node = nodes_[index];
-        if (node.end <= here.begin + 1 || !node.box.overlaps(here.box)) continue;
+        if (!node.box.overlaps(here.box)) continue;
+        if (node.end <= here.begin && chosen.all(node.begin, node.end)) continue;  // those ask for these
         if (node.right) {
             stack[depth++] = node.right;
             stack[depth++] = index + 1;
@@ -92,10 +112,31 @@ void Bvh::meeting(int64_t leaf, Visit&& visit) const {
         }
         for (int32_t slot = here.begin; slot < here.end; ++slot) {
             const Box& box = boxes_[slot];
-            if (!node.box.overlaps(box)) continue;
-            for (int32_t other = std::max(node.begin, slot + 1); other < node.end; ++other) {
+            if (!chosen.chosen[slot] || !node.box.overlaps(box)) continue;
+            for (int32_t other = node.begin; other < node.end; ++other) {
+                if (other == slot || (other < slot && chosen.chosen[other])) continue;
                 if (box.overlaps(boxes_[other])) visit(slot, other);
             }
+        }
+    }
+}
+
+template <class Visit>
+void Bvh::touching(const Box& box, Visit&& visit) const {
+    int32_t stack[max_depth];
+    int depth = 0;
+    stack[depth++] = 0;
+    while (depth > 0) {
+        const int32_t index = stack[--depth];
+        const Node& node = nodes_[index];
+        if (!node.box.overlaps(box)) continue;
+        if (node.right) {
+            stack[depth++] = node.right;
+            stack[depth++] = index + 1;
+            continue;
+        }
+        for (int32_t slot = node.begin; slot < node.end; ++slot) {
+            if (boxes_[slot].overlaps(box)) visit(slot);
         }
     }
 }

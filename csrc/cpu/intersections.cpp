@@ -1,12 +1,11 @@
-// Every leaf of the hierarchy asks it for the faces behind its own (in leaf order) whose boxes meet one of those, so that
-// each pair is tested once. Marks are only ever set, so the result does not depend on the order in which threads set them.
+// Every leaf of the hierarchy asks it for the faces whose boxes meet those of its own, so that each pair is tested once.
+// Marks are only ever set, so the result does not depend on the order in which threads set them.
 #include "intersections.h"
 
 #include <atomic>
 #include <cmath>
 #include <memory>
 
-#include "bvh.h"
 #include "parallel.h"
 #include "predicates.h"
 
@@ -80,9 +79,10 @@ bool interiors_meet(const Triangle& s, const Triangle& t) {
 
 }  // namespace
 
-void mark_intersecting_faces(const double* vertices, const int64_t* faces, int64_t num_faces, uint8_t* intersecting) {
-    const Bvh bvh(vertices, faces, num_faces);
+void mark_intersecting_faces(const Bvh& bvh, const uint8_t* again, uint8_t* intersecting) {
+    const Bvh::Chosen chosen = bvh.choose(again);
     const auto& triangles = bvh.triangles();
+    const auto num_faces = static_cast<int64_t>(triangles.size());
     const auto marks = std::make_unique<std::atomic<bool>[]>(num_faces);
     const auto no_interior = std::make_unique<bool[]>(num_faces);
     parallel_for(num_faces, 1024, [&](int64_t begin, int64_t end) {
@@ -90,7 +90,7 @@ void mark_intersecting_faces(const double* vertices, const int64_t* faces, int64
     });
     parallel_for(bvh.leaves(), 32, [&](int64_t begin, int64_t end) {
         for (int64_t leaf = begin; leaf < end; ++leaf) {
-            bvh.meeting(leaf, [&](int32_t slot, int32_t other) {
+            bvh.meeting(leaf, chosen, [&](int32_t slot, int32_t other) {
                 const bool known = marks[slot].load(std::memory_order_relaxed) &&
                                    marks[other].load(std::memory_order_relaxed);
                 if (known || no_interior[slot] || no_interior[other]) return;
@@ -102,6 +102,28 @@ void mark_intersecting_faces(const double* vertices, const int64_t* faces, int64
         }
     });
     for (int64_t slot = 0; slot < num_faces; ++slot) intersecting[bvh.faces()[slot]] = marks[slot].load();
+}
+
+std::vector<int64_t> overlapping_boxes(const Bvh& bvh) {
+    const Bvh::Chosen all = bvh.choose(nullptr);
+    std::vector<std::vector<int64_t>> found(bvh.leaves());
+    parallel_for(bvh.leaves(), 32, [&](int64_t begin, int64_t end) {
+        for (int64_t leaf = begin; leaf < end; ++leaf) {
+            bvh.meeting(leaf, all, [&](int32_t slot, int32_t other) {
+                found[leaf].push_back(bvh.faces()[slot]);
+                found[leaf].push_back(bvh.faces()[other]);
+            });
+        }
+    });
+    std::vector<int64_t> pairs;
+    size_t count = 0;
+    for (const std::vector<int64_t>& own : found) count += own.size();
+    pairs.reserve(count);
+    for (std::vector<int64_t>& own : found) {
+        pairs.insert(pairs.end(), own.begin(), own.end());
+        std::vector<int64_t>().swap(own);
+    }
+    return pairs;
 }
 
 }  // namespace etsplat

@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from etsplat.geometry.intersections import intersecting_faces
+from etsplat.geometry.intersections import IntersectionSearch, intersecting_faces
 
 _LOOKS = 20
 """Looks for intersections, after which all vertices go back."""
@@ -34,9 +34,9 @@ def held_back(
         faces: (F, 3).
         spared: (F,) faces that may cut through others; what they alone cut through may not be put right.
     """
-    found, back = moved.clone(), (moved == before).all(dim=1)
+    found, back, search = moved.clone(), (moved == before).all(dim=1), IntersectionSearch(faces)
     for _ in range(_LOOKS):
-        cutting = intersecting_faces(found, faces) & ~spared
+        cutting = search(found) & ~spared
         corners = torch.zeros_like(back)
         corners[faces[cutting].reshape(-1).long()] = True
         if not bool((corners & ~back).any()):

@@ -24,11 +24,47 @@ def intersecting_faces(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]
     Raises:
         ValueError: a shape is wrong, a coordinate is not finite, or an index is out of range.
     """
-    vertices, faces = native_mesh(vertices, faces)
-    marks = torch.zeros(len(faces), dtype=torch.bool)
-    if len(faces):
-        _native.mark_intersecting_faces(vertices=vertices, faces=faces, intersecting=marks)
-    return marks
+    return IntersectionSearch(faces)(vertices)
+
+
+class IntersectionSearch:
+    """As `intersecting_faces`, again and again of a mesh that changes here and there.
+
+    Compared with others are the faces that moved since it looked last, and those that were marked then: two of the
+    others neither met then nor do now.
+    """
+
+    def __init__(self, faces: Int[Tensor, "F 3"]) -> None:
+        """Nothing has been seen yet.
+
+        Args:
+            faces: (F, 3).
+        """
+        self._faces = faces
+        self._seen: tuple[_native.FaceTree, Float[Tensor, "V 3"], Bool[Tensor, " F"]] | None = None
+
+    def __call__(self, vertices: Float[Tensor, "V 3"]) -> Bool[Tensor, " F"]:
+        """Marks the faces that cut through others.
+
+        Args:
+            vertices: (V, 3) finite, of the same number each time.
+
+        Raises:
+            ValueError: a shape is wrong, a coordinate is not finite, or an index is out of range.
+        """
+        now, faces = native_mesh(vertices, self._faces)
+        marks, again = torch.zeros(len(faces), dtype=torch.bool), None
+        if len(faces) == 0:
+            return marks
+        if self._seen is None:
+            tree = _native.face_tree(vertices=now, faces=faces)
+        else:
+            tree, before, marked = self._seen
+            again = marked | (now != before).any(dim=1)[faces].any(dim=1)
+            _native.move_face_tree(tree=tree, vertices=now, faces=faces)
+        _native.mark_intersecting_faces(tree=tree, again=again, intersecting=marks)
+        self._seen = tree, now.clone(), marks.clone()
+        return marks
 
 
 def count_self_intersections(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> int:

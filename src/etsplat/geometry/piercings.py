@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from etsplat import _native
 from etsplat.geometry.topology import MeshTopology, connected
 
 _TURN = torch.linalg.qr(torch.tensor([[0.83, -0.31, 0.47], [0.29, 0.91, -0.17], [-0.41, 0.23, 0.87]]).double()).Q
@@ -38,6 +39,8 @@ def find_piercings(vertices: Float[Tensor, "V 3"], topology: MeshTopology, marke
     first, second = overlapping_boxes(vertices[topology.faces], marked.nonzero()[:, 0])
     edges = torch.cat([topology.face_edges[first], topology.face_edges[second]]).reshape(-1)
     faces = torch.cat([second, first]).repeat_interleave(3)
+    near = _near(vertices[topology.edges], vertices[topology.faces], edges, faces)
+    edges, faces = edges[near], faces[near]
     both = torch.unique(edges * topology.num_faces + faces)
     edges, faces = both // max(topology.num_faces, 1), both % max(topology.num_faces, 1)
     ends, corners = topology.edges[edges], topology.faces[faces]
@@ -96,15 +99,18 @@ def winding_numbers(
 def overlapping_boxes(
     corners: Float[Tensor, "F 3 3"], chosen: Int[Tensor, " K"]
 ) -> tuple[Int[Tensor, " N"], Int[Tensor, " N"]]:
-    """Pairs of the chosen faces whose boxes overlap, each once."""
-    low, high = corners[chosen].amin(dim=1), corners[chosen].amax(dim=1)
-    order = torch.sort(low[:, 0], stable=True).indices
-    chosen, low, high = chosen[order], low[order], high[order]
-    begin = torch.arange(1, len(chosen) + 1)
-    end = torch.searchsorted(low[:, 0].contiguous(), high[:, 0].contiguous(), right=True)
-    first, second = _ranges(begin, torch.maximum(begin, end))
-    overlap = ((low[first] <= high[second]) & (low[second] <= high[first])).all(dim=1)
-    return chosen[first[overlap]], chosen[second[overlap]]
+    """Pairs of the chosen faces whose boxes overlap, each once, in an order that depends on these faces alone.
+
+    Args:
+        corners: float64 on the CPU, finite.
+        chosen: rows of them.
+    """
+    if len(chosen) == 0:
+        return chosen, chosen
+    faces = torch.arange(3 * len(chosen)).reshape(-1, 3)
+    tree = _native.face_tree(vertices=corners[chosen].reshape(-1, 3), faces=faces)
+    first, second = torch.from_numpy(_native.overlapping_boxes(tree=tree)).unbind(1)
+    return chosen[first], chosen[second]
 
 
 def _closed(vertices: Float[Tensor, "V 3"], topology: MeshTopology) -> Float[Tensor, "G 3 3"]:
@@ -122,6 +128,15 @@ def _closed(vertices: Float[Tensor, "V 3"], topology: MeshTopology) -> Float[Ten
     return torch.cat([corners, torch.stack([vertices[head], vertices[tail], tips], dim=1)])
 
 
+def _near(
+    ends: Float[Tensor, "E 2 3"], corners: Float[Tensor, "F 3 3"], edges: Int[Tensor, " N"], faces: Int[Tensor, " N"]
+) -> Bool[Tensor, " N"]:
+    """Whether the boxes of edges and of faces overlap."""
+    low = ends.amin(dim=1)[edges] <= corners.amax(dim=1)[faces]
+    high = ends.amax(dim=1)[edges] >= corners.amin(dim=1)[faces]
+    return (low & high).all(dim=1)
+
+
 def _volume(a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> Float[Tensor, " P"]:
     """Six times the signed volume of tetrahedra."""
     return ((b - a) * torch.linalg.cross(c - a, d - a)).sum(dim=1)
@@ -131,38 +146,9 @@ def _crossings(
     points: Float[Tensor, "P 3"], corners: Float[Tensor, "F 3 3"], own: Int[Tensor, "P K"]
 ) -> Int[Tensor, " P"]:
     """How many faces a ray along +x leaves through less those it enters through, but for each point's own faces."""
-    low, high = corners.amin(dim=1), corners.amax(dim=1)
-    width = high[:, 1] - low[:, 1]
     counts = torch.zeros(len(points), dtype=torch.int64)
-    octave = torch.log2(width.clamp(min=1e-30)).floor()
-    for size in torch.unique(octave[width > 0]):  # faces of like width together: a wide one would widen every search
-        some = ((octave == size) & (width > 0)).nonzero()[:, 0]
-        some = some[torch.sort(low[some, 1], stable=True).indices]
-        keys = low[some, 1].contiguous()
-        begin = torch.searchsorted(keys, points[:, 1] - width[some].max())
-        end = torch.searchsorted(keys, points[:, 1].contiguous(), right=True)
-        point, place = _ranges(begin, torch.maximum(begin, end))
-        face, at = some[place], points[point]
-        near = (high[face, 1:] >= at[:, 1:]).all(dim=1) & (low[face, 2] <= at[:, 2]) & (high[face, 0] >= at[:, 0])
-        near &= (own[point] != face[:, None]).all(dim=1)
-        point, face, at = point[near], face[near], at[near]
-        a, b, c = (corners[face] - at[:, None]).unbind(1)
-        weights = torch.stack([_span(b, c), _span(c, a), _span(a, b)], dim=1)
-        total = weights.sum(dim=1)
-        inside = (weights > 0).all(dim=1) | (weights < 0).all(dim=1)
-        ahead = (weights * torch.stack([a[:, 0], b[:, 0], c[:, 0]], dim=1)).sum(dim=1) * total > 0
-        hit = inside & ahead
-        counts.index_add_(0, point[hit], total[hit].sign().long())
+    if len(points) and len(corners):
+        _native.count_crossings(
+            points=points.contiguous(), own=own.contiguous(), corners=corners.reshape(-1, 9), counts=counts
+        )
     return counts
-
-
-def _span(a: Tensor, b: Tensor) -> Float[Tensor, " N"]:
-    """Twice the signed area that a and b span, seen along x."""
-    return a[:, 1] * b[:, 2] - a[:, 2] * b[:, 1]
-
-
-def _ranges(begin: Int[Tensor, " N"], end: Int[Tensor, " N"]) -> tuple[Int[Tensor, " M"], Int[Tensor, " M"]]:
-    """All (i, j) with begin[i] <= j < end[i]."""
-    counts = end - begin
-    rows = torch.repeat_interleave(torch.arange(len(begin)), counts)
-    return rows, torch.arange(len(rows)) + torch.repeat_interleave(begin - counts.cumsum(0) + counts, counts)

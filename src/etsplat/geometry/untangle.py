@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from etsplat.geometry.inside_out import inside_out, turned_out
-from etsplat.geometry.intersections import intersecting_faces
+from etsplat.geometry.intersections import IntersectionSearch
 from etsplat.geometry.separation import separated
 from etsplat.geometry.topology import MeshTopology
 
@@ -71,13 +71,14 @@ def untangle(
         Moved vertices, and how many faces still intersect.
     """
     original, topology = vertices.detach().cpu(), topology.to(torch.device("cpu"))
-    marked = intersecting_faces(original, topology.faces)
+    search = IntersectionSearch(topology.faces)
+    marked = search(original)
     wrong = inside_out(original.double(), topology, marked)
     turned = turned_out(original.double(), topology, wrong).to(original)
     starts = [original] if torch.equal(turned, original) else [turned, original]
     found, left = original, math.inf
     for start in starts:
-        moved, still = _apart(start, topology, rounds, reach)
+        moved, still = _apart(start, topology, search, rounds, reach)
         if still < left:
             found, left = moved, still
         if left == 0:
@@ -86,33 +87,37 @@ def untangle(
 
 
 def _apart(
-    original: Float[Tensor, "V 3"], topology: MeshTopology, rounds: int, reach: float
+    original: Float[Tensor, "V 3"], topology: MeshTopology, search: IntersectionSearch, rounds: int, reach: float
 ) -> tuple[Float[Tensor, "V 3"], int]:
     """Steps 2 to 5 of `untangle`."""
-    moved, faces = original.clone(), topology.faces
-    marked = intersecting_faces(moved, faces)
+    moved = original.clone()
+    marked = search(moved)
     for done in range(1, _PUSHES + 1):
         if not 0 < float(marked.float().mean()) <= _TANGLED:
             break
         moved = separated(moved.double(), topology, marked).to(original)
         if done % _SETTLE == 0:
             _smooth(moved, topology, _region(marked, topology, rings=0), sweeps=1, step=0.5 * _STEP)
-        marked = intersecting_faces(moved, faces)
+        marked = search(moved)
     for done in range(rounds):
         if not bool(marked.any()):
             break
         _smooth(moved, topology, _region(marked, topology, rings=done // _WIDEN))
-        marked = intersecting_faces(moved, faces)
-    moved = _returned(moved, original, topology, marked)
+        marked = search(moved)
+    moved = _returned(moved, original, topology, search, marked)
     lost = _too_far(moved, original, topology, reach)
     if bool(lost.any()):
         moved[lost] = original[lost]
-        marked = intersecting_faces(moved, faces)
+        marked = search(moved)
     return moved, int(marked.sum())
 
 
 def _returned(
-    vertices: Float[Tensor, "V 3"], original: Float[Tensor, "V 3"], topology: MeshTopology, marked: Bool[Tensor, " F"]
+    vertices: Float[Tensor, "V 3"],
+    original: Float[Tensor, "V 3"],
+    topology: MeshTopology,
+    search: IntersectionSearch,
+    marked: Bool[Tensor, " F"],
 ) -> Float[Tensor, "V 3"]:
     """The vertices brought back towards `original` as far as no faces intersect but those that are marked."""
     still = (vertices == original).all(dim=1)
@@ -124,7 +129,7 @@ def _returned(
         held = still
         for _ in range(_HOLDS):
             trial = vertices.lerp(original, torch.where(held, way, aim)[:, None])
-            new = intersecting_faces(trial, topology.faces.cpu()) & ~marked
+            new = search(trial) & ~marked
             if not bool(new.any()):
                 break
             corners = _region(new, topology, rings=0)
