@@ -1,12 +1,14 @@
 // How it is scheduled. Samples are independent but for the gradient of the texels, where many of them meet. There, (1)
 // each level is cut into tiles of texels, and chunks of samples count in parallel which tiles they touch, one nearly
 // always; (2) the chunks write their samples' numbers into lists of the tiles, so that these have the order of the samples;
-// (3) tiles, or parts of a long list, add up their samples in double precision, each in memory of its own, in parallel; (4)
-// parts are added in their order; (5) levels hand their gradients on to the next finer one. What is added in which order
-// depends on the samples alone. Samples whose cotangent is 0 are left out.
+// (3) level by level, the coarsest first, tiles, or parts of a long list, add up their samples in double precision, each in
+// memory of its own, in parallel; (4) parts are added in their order; (5) as a tile is written, what its texels hand on to
+// those of the level before is added. What is added in which order depends on the samples alone. Samples whose cotangent
+// is 0 are left out.
 #include "texture.h"
 
 #include <algorithm>
+#include <cstdint>
 #include <vector>
 
 #include "parallel.h"
@@ -50,11 +52,17 @@ public:
             tiles += static_cast<int64_t>(columns) * ((height + kTile - 1) / kTile);
         }
         tiles_ = tiles;
+        written_.assign(tiles, 0);
     }
 
     void run() {
         list_samples();
-        const std::vector<Job> jobs = find_jobs();
+        for (int level = texture_.levels - 1; level >= 0; --level) add_up_level(level);
+    }
+
+private:
+    void add_up_level(int level) {
+        const std::vector<Job> jobs = find_jobs(level);
         std::vector<std::vector<double>> parts(jobs.size());
         parallel_for(static_cast<int64_t>(jobs.size()), 1, [&](int64_t begin, int64_t end) {
             std::vector<double> sums;
@@ -74,7 +82,6 @@ public:
         }
     }
 
-private:
     // Calls visit(tile) for every tile that a sample adds to.
     template <class Visit>
     void for_each_tile(int64_t n, const Visit& visit) const {
@@ -121,20 +128,18 @@ private:
         for_each_chunk([this](int64_t& at, int64_t n) { listed_[at++] = static_cast<int32_t>(n); });
     }
 
-    // In the order of tiles; every tile has one at least, which writes zeros where nothing was added.
-    std::vector<Job> find_jobs() const {
+    // In the order of tiles; every tile has one at least, since it is written even where nothing was added.
+    std::vector<Job> find_jobs(int level) const {
         std::vector<Job> jobs;
-        for (int level = 0; level < texture_.levels; ++level) {
-            const int64_t last = level + 1 < texture_.levels ? levels_[level + 1].first_tile : tiles_;
-            for (int64_t tile = levels_[level].first_tile; tile < last; ++tile) {
-                const bool whole = starts_[tile + 1] - starts_[tile] <= kPart;
-                int64_t begin = starts_[tile];
-                do {
-                    const int64_t end = std::min(begin + kPart, starts_[tile + 1]);
-                    jobs.push_back({level, tile, begin, end, whole});
-                    begin = end;
-                } while (begin < starts_[tile + 1]);
-            }
+        const int64_t last = level + 1 < texture_.levels ? levels_[level + 1].first_tile : tiles_;
+        for (int64_t tile = levels_[level].first_tile; tile < last; ++tile) {
+            const bool whole = starts_[tile + 1] - starts_[tile] <= kPart;
+            int64_t begin = starts_[tile];
+            do {
+                const int64_t end = std::min(begin + kPart, starts_[tile + 1]);
+                jobs.push_back({level, tile, begin, end, whole});
+                begin = end;
+            } while (begin < starts_[tile + 1]);
         }
         return jobs;
     }
@@ -163,19 +168,40 @@ private:
         }
     }
 
-    // Of a whole tile; no sums are zeros.
-    void write(const Job& job, const std::vector<double>& sums) const {
+    // Of a whole tile; no sums are zeros. The next coarser level, whose texels are means of four, is written already.
+    void write(const Job& job, const std::vector<double>& sums) {
         const LevelTiles& level = levels_[job.level];
         const int64_t index = job.tile - level.first_tile, channels = texture_.channels;
-        const int64_t left = index % level.columns * kTile, top = index / level.columns * kTile;
-        const int64_t columns = std::min<int64_t>(kTile, level.width - left) * channels;
+        const int64_t column = index % level.columns, line = index / level.columns;
+        const int64_t left = column * kTile, top = line * kTile;
+        const int64_t columns = std::min<int64_t>(kTile, level.width - left);
         const int64_t rows = std::min<int64_t>(kTile, level.height - top);
-        float* texels = level_of(texture_, base_, coarser_, job.level);
+        const float* coarser = coarser_row(job.level, left, top, line / 2, column / 2);
+        float* texels = level_of(texture_, base_, coarser_, job.level) + (top * level.width + left) * channels;
+        written_[job.tile] = !sums.empty() || coarser;
+        std::vector<float> handed(coarser ? columns * channels : 0);
         for (int64_t y = 0; y < rows; ++y) {
-            float* to = texels + ((top + y) * level.width + left) * channels;
-            const double* from = sums.data() + y * kTile * channels;
-            for (int64_t i = 0; i < columns; ++i) to[i] = sums.empty() ? 0.0f : static_cast<float>(from[i]);
+            float* to = texels + y * level.width * channels;
+            if (sums.empty()) std::fill_n(to, columns * channels, 0.0f);
+            else std::copy_n(sums.data() + y * kTile * channels, columns * channels, to);
+            if (!coarser) continue;
+            if (y % 2 == 0) {
+                const float* from = coarser + y / 2 * (level.width / 2) * channels;
+                for (int64_t x = 0; x < columns; ++x) {
+                    for (int64_t c = 0; c < channels; ++c) handed[x * channels + c] = 0.25f * from[x / 2 * channels + c];
+                }
+            }
+            for (int64_t i = 0; i < columns * channels; ++i) to[i] += handed[i];
         }
+    }
+
+    // The gradient of the coarser texels in front of a tile's first; null where they have none.
+    const float* coarser_row(int level, int64_t left, int64_t top, int64_t line, int64_t column) const {
+        if (level + 1 == texture_.levels) return nullptr;
+        const LevelTiles& coarser = levels_[level + 1];
+        if (!written_[coarser.first_tile + line * coarser.columns + column]) return nullptr;
+        return level_of(texture_, base_, coarser_, level + 1) +
+               (top / 2 * coarser.width + left / 2) * texture_.channels;
     }
 
     const Texture& texture_;
@@ -186,6 +212,7 @@ private:
     int64_t tiles_;
     std::vector<int64_t> starts_;  // (tiles + 1): where the list of each tile begins
     std::vector<int32_t> listed_;  // samples
+    std::vector<uint8_t> written_;  // of each tile, whether it has more than zeros
 };
 
 }  // namespace
@@ -233,21 +260,6 @@ void sample_texture_by_uv(const Texture& texture, const TextureSamples& samples,
 void sample_texture_by_texels(const Texture& texture, const TextureSamples& samples, const float* grad_values,
                               float* grad_base, float* grad_coarser) {
     TexelGradient(texture, samples, grad_values, grad_base, grad_coarser).run();
-    const int channels = texture.channels;
-    for (int level = texture.levels - 1; level > 0; --level) {
-        const int64_t width = texture.width >> level, height = texture.height >> level;
-        const float* from = level_of(texture, grad_base, grad_coarser, level);
-        float* to = level_of(texture, grad_base, grad_coarser, level - 1);
-        parallel_for(2 * height, 16, [&](int64_t begin, int64_t end) {
-            for (int64_t y = begin; y < end; ++y) {
-                const float* row = from + y / 2 * width * channels;
-                float* into = to + y * 2 * width * channels;
-                for (int64_t x = 0; x < 2 * width; ++x) {
-                    for (int c = 0; c < channels; ++c) into[x * channels + c] += 0.25f * row[x / 2 * channels + c];
-                }
-            }
-        });
-    }
 }
 
 }  // namespace etsplat
