@@ -209,6 +209,21 @@ def test_a_run_starts_from_a_dense_cloud(tmp_path):
         etsplat.train(tmp_path, tmp_path / "other", config, init_points=tmp_path / "bad.ply")
 
 
+def test_a_dense_cloud_is_no_sparser_a_start_than_the_points_it_replaces(tmp_path):
+    """Small photos allow few triangles, and their capture has more points than that, all of which would start."""
+    ball = write_ball(tmp_path)
+    assert ball.exact_points is not None
+    table = np.ascontiguousarray(ball.exact_points.numpy()).view([(axis, np.float64) for axis in "xyz"])[:, 0]
+    (tmp_path / "dense.ply").write_bytes(encode_ply({"vertex": table}))
+    own = ball.exact_points[:120]
+    scene = replace(load_dataset(tmp_path), exact_points=own, point_colors=torch.zeros(len(own), 3))
+    with pytest.raises(InputError, match="align them first"):  # of so few nothing can start
+        with_cloud(replace(scene, exact_points=None, point_colors=None), tmp_path / "dense.ply", 60)
+    started, _ = with_cloud(scene, tmp_path / "dense.ply", 60)
+    assert started.exact_points is not None
+    assert 100 <= len(started.exact_points) <= 120
+
+
 def test_a_cloud_is_in_the_world_where_the_scene_says_how_it_lies_there(tmp_path):
     """As laser scans are, whose coordinates are those of maps."""
     ball = write_ball(tmp_path)

@@ -163,7 +163,7 @@ def with_cloud(
     Args:
         scene: in its own units.
         path: of the cloud, in the same units; in the world's, where a georeference says how the scene lies in that.
-        most: triangles that there may be; half as many points are taken at most.
+        most: triangles that there may be; half as many points are taken, or as many as the scene has of its own.
         progress: called with (photos compared, photos in all).
 
     Raises:
@@ -173,7 +173,8 @@ def with_cloud(
     if scene.georeference is not None:
         far = scene.georeference
         points = (points - torch.tensor(far.offset, dtype=torch.float64)) / far.scale
-    found = dense_start(points, colors, scene, max(1, most // 2), progress)
+    replaced = 0 if scene.exact_points is None else len(scene.exact_points)
+    found = dense_start(points, colors, scene, max(1, most // 2, replaced), progress)
     if len(found.positions) < FEWEST_POINTS:
         raise InputError(
             f"points {path}: {found.note}; they must be in the frame and units of the photos' poses: align them first"
