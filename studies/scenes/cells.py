@@ -8,7 +8,7 @@ from typing import Any
 
 from etsplat.core.errors import InputError
 from etsplat.io.run_directory import RunDirectory
-from etsplat.tasks.sources import DEMO_SCENE
+from etsplat.tasks.demos import DEMO_SCENE
 from etsplat.tasks.train_config import SCENE_TYPES, TrainConfig
 from studies.grid.cells import Cell
 from studies.peers.settings import PEERS, Peer, PeerConfig, load_gsplat, peer_config

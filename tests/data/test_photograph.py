@@ -98,6 +98,8 @@ def test_a_mesh_at_one_point_and_impossible_views_are_refused(sphere):
         photograph(sphere, 16, 16, elevations=(90.0,))
     with pytest.raises(ValueError, match="width"):
         photograph(sphere, 16, 32)
+    with pytest.raises(ValueError, match=r"mesh must be a MeshFile, got str: etsplat\.load_mesh reads one"):
+        photograph("ball.obj", 16, 16)
 
 
 def test_the_shared_koala_stands_upright_in_its_front_view(shared_data):

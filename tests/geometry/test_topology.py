@@ -45,6 +45,12 @@ def test_tables_agree_with_a_plain_search(mesh):
         assert neighbors.tolist() == sorted({a + b - v for a, b in edges if v in (a, b)})
 
 
+@pytest.mark.parametrize("level", [-1, 13, 2.0, True])
+def test_a_sphere_that_no_memory_holds_is_refused(level):
+    with pytest.raises(ValueError, match=f"level must be an integer from 0 to 12, got {level}"):
+        icosphere(level)
+
+
 @pytest.mark.parametrize("level", range(5))
 def test_icosphere_is_a_closed_oriented_sphere(level):
     """Every level has the right counts, unit vertices, Euler characteristic 2, and normals that point outwards."""
@@ -137,9 +143,3 @@ def test_bad_faces_are_named(faces, message):
     """Wrong indices, repeated vertices, shapes and dtypes raise one line that says which and what is wanted."""
     with pytest.raises(ValueError, match=message):
         MeshTopology.from_faces(faces, 4)
-
-
-def test_negative_level_is_refused():
-    """A sphere cannot be subdivided a negative number of times."""
-    with pytest.raises(ValueError, match="level must be at least 0, got -1"):
-        icosphere(-1)

@@ -60,6 +60,12 @@ def test_wrong_shapes_name_the_argument(tmp_path, shape):
         save_image(tmp_path / "a.png", torch.zeros(shape))
 
 
+def test_pixels_of_8_bits_are_refused(tmp_path):
+    """As values in [0, 1] they would be white."""
+    with pytest.raises(ValueError, match=r"image must be of floating-point numbers, got torch\.uint8"):
+        save_image(tmp_path / "a.png", torch.full((4, 4, 3), 200, dtype=torch.uint8))
+
+
 def test_grey_palette_and_16_bit_files_become_rgb(tmp_path):
     grey = np.arange(12, dtype=np.uint8).reshape(3, 4) * 20
     Image.fromarray(grey).save(tmp_path / "grey.png")

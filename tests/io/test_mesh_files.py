@@ -361,6 +361,8 @@ def test_save_mesh_names_the_wrong_argument(tmp_path, ball):
         save_mesh(tmp_path / "a.ply", vertices[:5], faces)
     with pytest.raises(ValueError, match="face_colors: expected shape"):
         save_mesh(tmp_path / "a.ply", vertices, faces, colors[:-1])
+    with pytest.raises(ValueError, match="faces: expected whole numbers"):
+        save_mesh(tmp_path / "a.ply", vertices, faces.float())
     with pytest.raises(ValueError, match="path: expected one of the suffixes"):
         save_mesh(tmp_path / "a.xyz", vertices, faces)
     assert list(tmp_path.iterdir()) == []

@@ -65,3 +65,21 @@ def test_harmonics_of_other_colours_are_refused(given: dict[str, object]) -> Non
     arguments = {"colors": 0.5, "opacity": 0.9, "sigma": 0.1, "harmonics": 1, **given}
     with pytest.raises(ValueError, match="harmonics must be 0"):
         TriangleMesh.from_mesh(VERTICES, FACES, **arguments)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"colors": torch.rand(3, 3)}, r"colors must have shape \(F, 3\)"),
+        ({"colors": torch.rand(len(FACES), 3), "vertex_colored": True}, r"colors must have shape \(V, 3\)"),
+        ({"colors": 200.0}, "colors must be from 0 to 1, got 200"),
+        ({"opacity": 1.0}, "opacity must be between 0 and 1, got 1"),
+        ({"sigma": 0.0}, "sigma must be positive and finite, got 0"),
+        ({"sigma": float("nan")}, "sigma must be positive and finite, got nan"),
+        ({"sigma": None}, "opacity and sigma must be given together, or both be None"),
+    ],
+)
+def test_a_mesh_that_could_not_be_drawn_is_refused_where_it_is_made(given: dict[str, object], message: str) -> None:
+    arguments = {"colors": 0.5, "opacity": 0.9, "sigma": 0.1, **given}
+    with pytest.raises(ValueError, match=message):
+        TriangleMesh.from_mesh(VERTICES, FACES, **arguments)  # type: ignore[arg-type]

@@ -224,6 +224,10 @@ def test_missing_gradients_and_wrong_names_are_errors(rng):
     ours = parameters(rng)
     with pytest.raises(ValueError, match="learning_rates"):
         Adam(ours, {"vertices": 0.1})
+    with pytest.raises(ValueError, match=r"learning_rates must name .* got 0\.1"):
+        Adam(ours, 0.1)
+    with pytest.raises(ValueError, match="parameters must be tensors by name, got list"):
+        Adam(list(ours.values()), RATES)
     with pytest.raises(ValueError, match="betas"):
         Adam(ours, RATES, betas=(0.9, 1.0))
     adam = Adam(ours, RATES)

@@ -97,7 +97,10 @@ def test_default_engine_follows_dtype():
 
 ONE_CAMERA = Cameras(torch.eye(4)[None], torch.eye(3)[None], 4, 4)
 BAD_ARGUMENTS = {
-    "vertices without faces": ({"vertices": torch.zeros(5, 3)}, r"vertices must have shape \(N, 3, 3\), got \(5, 3\)"),
+    "vertices without faces": (
+        {"vertices": torch.zeros(5, 3)},
+        r"vertices must have shape \(N, 3, 3\) where faces is None, got \(5, 3\): pass faces= too",
+    ),
     "vertices with faces": ({"faces": torch.zeros(5, 3, dtype=torch.int64)}, r"vertices must have shape \(V, 3\)"),
     "number of colors": ({"face_colors": torch.zeros(4, 3)}, r"colors must have shape .* with B=2, N=5, got \(4, 3\)"),
     "views of colors": ({"face_colors": torch.zeros(3, 5, 3)}, "colors must have shape"),
@@ -123,6 +126,11 @@ BAD_ARGUMENTS = {
     "vertex colors": ({"face_colors": None, "vertex_colors": torch.ones(15, 3)}, "vertex_colors need faces"),
     "numpy": ({"vertices": np.zeros((5, 3, 3))}, r"vertices must be .* got ndarray: pass torch.from_numpy\(vertices\)"),
     "sigma list": ({"sigma": [0.5] * 5}, r"sigma must be .* got list: pass torch.tensor\(sigma\)"),
+    "cameras by hand": (
+        {"cameras": (np.eye(4), np.eye(3)), "viewmats": None, "Ks": None, "width": None, "height": None},
+        r"cameras must be Cameras, got tuple: make them by etsplat\.Cameras\(viewmats, Ks, width, height\)",
+    ),
+    "whole numbers": ({"vertices": torch.zeros(5, 3, 3, dtype=torch.int32)}, "vertices must be of floating-point"),
     "two kinds of cameras": ({"cameras": ONE_CAMERA}, "either cameras, or all of viewmats, Ks, width and height"),
     "cameras missing": ({"viewmats": None}, "either cameras, or all of viewmats, Ks, width and height must be given"),
     "width": ({"width": 0}, "width must be a positive integer, got 0"),
@@ -169,7 +177,7 @@ def test_bad_faces_are_refused_even_without_validation(engine, faces, message, s
 def test_engines_refuse_what_they_cannot_compute(scene):
     with pytest.raises(ValueError, match=r"engine cpu computes in float32, got torch\.float64"):
         on("cpu", rasterize, **prepare(scene, "reference"))
-    with pytest.raises(ValueError, match=r"float32 or float64, got torch\.float16"):
+    with pytest.raises(ValueError, match=r"vertices must be float32 or float64, got torch\.float16"):
         rasterize(**prepare(scene, "reference", torch.float16))
 
 

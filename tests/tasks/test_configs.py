@@ -11,6 +11,7 @@ from typing import Any, get_args
 
 import pytest
 
+import etsplat
 from etsplat.core.errors import InputError
 from etsplat.io.run_directory import FORMAT
 from etsplat.tasks.export_config import ExportConfig
@@ -289,3 +290,11 @@ def test_changes_are_written_as_a_list() -> None:
     for wrong, message in (("iterations=2.5", "whole number"), ("normalize=maybe", "true or false"), ("seed", "NAME=")):
         with pytest.raises(InputError, match=message):
             TRAIN.changed(TRAIN.read_changes(wrong))
+
+
+@pytest.mark.parametrize(("task", "kind"), [(etsplat.train, "TrainConfig"), (etsplat.reconstruct, "ReconstructConfig")])
+def test_settings_of_another_kind_are_refused(task: Callable[..., object], kind: str, tmp_path: Path) -> None:
+    for wrong in ("quick", {"iterations": 5}):
+        got = type(wrong).__name__
+        with pytest.raises(ValueError, match=rf"config must be a {kind}, got {got}: etsplat\.{kind}\.of\(PRESET\)"):
+            task("demo:scene", tmp_path, wrong)

@@ -36,6 +36,10 @@ def run_command(parse: Callable[[Sequence[str]], Command], arguments: Sequence[s
         sys.exit(FAILED)
     except KeyboardInterrupt:
         fail("interrupted", INTERRUPTED)
+    except ModuleNotFoundError as error:  # of an extra it is an InputError
+        if "--debug" in arguments or error.name is None or error.name.partition(".")[0] == "etsplat":
+            raise
+        fail(f"the module {error.name} is not installed: install etsplat anew, without pip's --no-deps", FAILED)
     except (MemoryError, RuntimeError) as error:
         full = isinstance(error, MemoryError) or re.search(r"can't allocate memory|out of memory", str(error))
         if "--debug" in arguments or not full:

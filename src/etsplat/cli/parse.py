@@ -128,10 +128,11 @@ def _listed(group: Group) -> tuple[Any, Any]:
 
 def _offered(setting: Setting) -> Any:
     """A type that tyro reads as one of the words that there are by now; of files, which the setting itself checks."""
-    words: Any = Literal[setting.choices]  # pyright: ignore[reportInvalidTypeForm]
     if setting.suffix:
-        words = Annotated[str, tyro.conf.arg(metavar=f"{{{','.join(setting.choices)},FILE{setting.suffix}}}")]
-    return words | None if setting.optional else words
+        words: Any = Annotated[str, tyro.conf.arg(metavar=f"{{{','.join(setting.choices)},FILE{setting.suffix}}}")]
+        return words | None if setting.optional else words
+    # None as one of them: of a union tyro's errors would list the words in another order each time.
+    return Literal[(*setting.choices, *([None] if setting.optional else []))]  # pyright: ignore[reportInvalidTypeForm]
 
 
 def _registry(*, brief: bool) -> tyro.constructors.ConstructorRegistry:

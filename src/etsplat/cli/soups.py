@@ -43,9 +43,9 @@ PURPOSES = {
     "safetensors": "For etsplat.",
 }
 if TYPE_CHECKING:
-    Kind = str
+    Kind = str | None
 else:
-    Kind = Literal[tuple(PURPOSES)]
+    Kind = Literal[(*PURPOSES, None)]  # within: of a union tyro's errors would list them in another order each time
 _FORMAT = "\n".join(
     ["Kind of file; by default what --out ends in, or glb.", *(f"{kind}: {use}" for kind, use in PURPOSES.items())]
 )
@@ -201,7 +201,7 @@ class Export(Command):
     run_dir: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(name="dir")]
     """A run of `etsplat train` or `etsplat reconstruct`;
     or a file: .safetensors, .etz, .pt of Triangle Splatting, Gaussian .ply, or a mesh."""
-    format: Annotated[Kind | None, tyro.conf.arg(help=_FORMAT)] = None
+    format: Annotated[Kind, tyro.conf.arg(help=_FORMAT)] = None
     out: Path | None = None
     """The file to write; by default soup.FORMAT in the run's folder;
     of a reconstruction textured.FORMAT, or light.FORMAT with --faces alone."""

@@ -101,6 +101,11 @@ def camera_centers(viewmats: Float[Tensor, "B 4 4"]) -> Float[Tensor, "B 3"]:
     return -torch.einsum("bji,bj->bi", viewmats[:, :3, :3], viewmats[:, :3, 3])
 
 
+def _made(cameras: object) -> str:
+    """What is no `Cameras`, and how these are made."""
+    return f"{type(cameras).__name__}: make them by etsplat.Cameras(viewmats, Ks, width, height)"
+
+
 def view_arguments(
     cameras: Cameras | None,
     viewmats: Float[Tensor, "B 4 4"] | None,
@@ -118,7 +123,7 @@ def view_arguments(
             raise ValueError("either cameras, or all of viewmats, Ks, width and height must be given")
         return viewmats, Ks, width, height
     if not isinstance(cameras, Cameras):
-        raise ValueError(f"cameras must be Cameras, got {type(cameras).__name__}: pass them as cameras=")
+        raise ValueError(f"cameras must be Cameras, got {_made(cameras)}")
     if any(given is not None for given in (viewmats, Ks, width, height)):
         raise ValueError("either cameras, or all of viewmats, Ks, width and height must be given, not some of both")
     return cameras.viewmats, cameras.Ks, cameras.width, cameras.height

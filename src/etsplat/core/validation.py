@@ -202,6 +202,12 @@ def check_floating(name: str, tensor: Tensor) -> None:
         raise ValueError(f"{name} must be of floating-point numbers, got {tensor.dtype}")
 
 
+def check_open_unit(name: str, value: float) -> None:
+    """Raise ValueError unless ``value`` is between 0 and 1, as what passes through a sigmoid."""
+    if not 0 < value < 1:
+        raise ValueError(f"{name} must be between 0 and 1, got {value:g}")
+
+
 def check_written(name: str, tensor: Tensor) -> None:
     """`check_memory`, and ValueError where several elements share one place, of which only one could be kept."""
     check_memory(name, tensor)

@@ -13,7 +13,7 @@ from etsplat.data.frames import LARGEST, Listing, MasksAs, Wanted, posed
 from etsplat.data.georeferencing import near_origin
 from etsplat.data.pictures import LazyPictures
 from etsplat.io.paths import kind_of, path_remedy
-from etsplat.io.photos import PHOTO_SUFFIXES
+from etsplat.io.photos import PHOTO_SUFFIXES, picture_remedy
 from etsplat.io.run_directory import is_run
 
 
@@ -103,7 +103,7 @@ def load_dataset(
     path = Path(path)
     if not path.is_dir():
         wrong = "is a file; name the scene's folder" if path.is_file() else f"no such folder; {path_remedy(path)}"
-        raise InputError(f"scene {path}: {wrong}")
+        raise InputError(f"scene {path}: {picture_remedy(path) or wrong}")
     if images is not None and not (path / images).is_dir():
         raise InputError(f"scene {path}: no folder {images} in it; choose another or leave it out")
     folder = depths if isinstance(depths, bool) else Path(depths)

@@ -43,6 +43,7 @@ def normalize_mesh(mesh: MeshFile) -> tuple[MeshFile, Normalization]:
     """Move the bounding box's centre to the origin and scale the farthest vertex to radius 1.
 
     Raises:
+        ValueError: it is no `MeshFile`.
         InputError: all vertices coincide.
 
     Example:
@@ -50,6 +51,8 @@ def normalize_mesh(mesh: MeshFile) -> tuple[MeshFile, Normalization]:
         >>> round(float(owl.vertices.norm(dim=1).max()), 4)
         1.0
     """
+    if not isinstance(mesh, MeshFile):
+        raise ValueError(f"mesh must be a MeshFile, got {type(mesh).__name__}: etsplat.load_mesh reads one")
     center, radius = bounding_ball(mesh.vertices)
     if radius <= 0:
         raise InputError("mesh: all vertices are at one point; there is nothing to photograph")

@@ -6,29 +6,32 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from etsplat.core.validation import check_count
 from etsplat.geometry.topology import MeshTopology
+
+MAX_LEVEL = 12
+"""336 million faces; each level more takes four times the memory, some 30 GB here."""
 
 
 def icosphere(level: int) -> tuple[Float[Tensor, "V 3"], Int[Tensor, "F 3"]]:
     """Subdivides an icosahedron 1 -> 4 and projects onto the unit sphere, `level` times.
 
     Args:
-        level: number of subdivisions, at least 0. The paper starts from level 4 (2,562 vertices, 5,120 faces).
+        level: number of subdivisions, 0 to 12. The paper starts from level 4 (2,562 vertices, 5,120 faces).
 
     Returns:
         Vertices (V, 3) float32 of length 1 and faces (F, 3) int64, counter-clockwise seen from outside, with
         F = 20 * 4^level and V = F / 2 + 2. Closed, Euler characteristic 2.
 
     Raises:
-        ValueError: `level` is negative.
+        ValueError: `level` is no such number.
 
     Example:
         >>> vertices, faces = etsplat.icosphere(4)
         >>> vertices.shape, faces.shape
         (torch.Size([2562, 3]), torch.Size([5120, 3]))
     """
-    if level < 0:
-        raise ValueError(f"level must be at least 0, got {level}")
+    check_count("level", level, least=0, most=MAX_LEVEL)
     vertices, faces = _icosahedron()
     for _ in range(level):
         topology = MeshTopology.from_faces(faces, len(vertices))

@@ -383,6 +383,8 @@ def _check_arguments(vertices: Tensor, faces: Tensor, face_colors: Tensor | None
             raise ValueError(f"{name}: expected shape {wanted}, got {tuple(values.shape)}")
         if not bool(torch.isfinite(values).all()):
             raise ValueError(f"{name}: expected finite values, got NaN or Inf")
+    if faces.is_floating_point():
+        raise ValueError(f"faces: expected whole numbers, got {faces.dtype}")
     if len(faces) == 0 or int(faces.min()) < 0 or int(faces.max()) >= len(vertices):
         raise ValueError(f"faces: expected indices in [0, {len(vertices)}), and at least one face")
 

@@ -13,7 +13,8 @@ from etsplat.io.paths import kind_of
 
 HEIC_SUFFIXES = (".heic", ".heif")
 PHOTO_SUFFIXES = (*IMAGE_SUFFIXES, *HEIC_SUFFIXES)
-"""File name endings, lower case, of photos."""
+VIDEO_SUFFIXES = (".avi", ".m4v", ".mkv", ".mov", ".mp4", ".webm")
+"""File name endings, lower case."""
 
 _QUALITY = 95
 
@@ -81,3 +82,14 @@ def write_upright(path: Path | str, target: Path) -> None:
     kind = "PNG" if kind_of(target) == ".png" else "JPEG"
     with atomic_write(target) as temporary:
         pixels.save(temporary, kind, quality=_QUALITY, subsampling=0, exif=exif)  # PNG ignores the first two
+
+
+def picture_remedy(path: Path) -> str:
+    """The end of the error for a photo or a video that stands where a capture belongs, or ""."""
+    if not path.is_file():
+        return ""
+    if kind_of(path) in PHOTO_SUFFIXES:
+        return "is one photo; name the folder that has all of them and their cameras"
+    if kind_of(path) in VIDEO_SUFFIXES:
+        return f"is a video; make a scene of it: etsplat data sfm {path} --out SCENE"
+    return ""

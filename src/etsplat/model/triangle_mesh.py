@@ -13,7 +13,7 @@ from torch import Tensor
 from etsplat.core.cameras import Cameras
 from etsplat.core.harmonics import SH_CONSTANT
 from etsplat.core.rasterization import Rasterization
-from etsplat.core.validation import check_memory, check_shape
+from etsplat.core.validation import check_open_unit, check_shape
 from etsplat.data.dataset import Normalization
 from etsplat.geometry.topology import MeshTopology
 from etsplat.io.mesh_files import MeshFile, load_mesh, save_mesh, weld_vertices
@@ -124,16 +124,17 @@ class TriangleMesh(Model):
             harmonics: degree, 0 to 3, up to which colours depend on the direction; of soft triangles with face colours.
 
         Raises:
-            ValueError: wrong shapes or dtypes; harmonics of opaque triangles or of colours of vertices.
+            ValueError: wrong shapes or dtypes; numbers out of their range; opacity or sigma alone; harmonics of opaque
+                triangles or of colours of vertices.
         """
-        check_shape("vertices", vertices, ("V", 3))
-        check_shape("faces", faces, ("F", 3))
-        if isinstance(colors, Tensor):
-            check_memory("colors", colors)
+        sizes: dict[str, int] = {}
+        check_shape("vertices", vertices, ("V", 3), sizes=sizes)
+        check_shape("faces", faces, ("F", 3), sizes=sizes)
+        letter = "V" if vertex_colored else "F"
+        start = torch.full((sizes[letter], 3), _grey(colors)) if isinstance(colors, float | int) else colors
+        check_shape("colors", start, (letter, 3), sizes=sizes)
         vertices = vertices.detach().clone()
-        count = len(vertices) if vertex_colored else len(faces)
-        start = colors if isinstance(colors, Tensor) else torch.full((count, 3), colors)
-        soft = opacity is not None and sigma is not None
+        soft = _is_soft(opacity, sigma)
         if harmonics and (vertex_colored or not soft):
             raise ValueError("harmonics must be 0 where triangles are opaque or colours belong to vertices")
         rest = vertices.new_zeros(len(faces), (harmonics + 1) ** 2 - 1, 3) if harmonics else None
@@ -333,3 +334,22 @@ class TriangleMesh(Model):
     def named(self, colors: Tensor) -> dict[str, Any]:
         """Colours of this mesh as an argument: {"face_colors": colors} or {"vertex_colors": colors}."""
         return {"vertex_colors" if self.vertex_colored else "face_colors": colors}
+
+
+def _grey(value: float) -> float:
+    """One value for all colours, if it is one."""
+    if not 0 <= value <= 1:
+        raise ValueError(f"colors must be from 0 to 1, got {value:g}")
+    return value
+
+
+def _is_soft(opacity: float | None, sigma: float | None) -> bool:
+    """Whether triangles are soft; ValueError where that cannot be told, or the numbers are out of range."""
+    if (opacity is None) != (sigma is None):
+        raise ValueError("opacity and sigma must be given together, or both be None")
+    if opacity is None or sigma is None:
+        return False
+    check_open_unit("opacity", opacity)
+    if not 0 < sigma < math.inf:
+        raise ValueError(f"sigma must be positive and finite, got {sigma:g}")
+    return True

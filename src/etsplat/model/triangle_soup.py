@@ -1,5 +1,6 @@
 """The learnable triangle soup of novel-view synthesis."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -14,7 +15,7 @@ from etsplat.core.cameras import Cameras
 from etsplat.core.errors import InputError
 from etsplat.core.harmonics import MAX_DEGREE, SH_CONSTANT
 from etsplat.core.rasterization import SOUP_SIGMA_FLOOR, Rasterization, joined
-from etsplat.core.validation import check_shape
+from etsplat.core.validation import check_open_unit, check_shape
 from etsplat.io.kernel_files import adopt_kernel, kernel_tensors
 from etsplat.io.paths import kind_of
 from etsplat.io.tensors import read_tensors, save_tensors
@@ -131,9 +132,15 @@ class TriangleSoup(Model):
             opacity: of every triangle, in (0, 1).
             sigma: softness of every triangle, above 0.01.
             sh_degree: of the colours, 0 to 3.
+
+        Raises:
+            ValueError: wrong shapes, or numbers out of their range.
         """
         check_shape("vertices", vertices, ("N", 3, 3))
         check_shape("colors", colors, (N := len(vertices), 3))
+        check_open_unit("opacity", opacity)
+        if not SOUP_SIGMA_FLOOR < sigma < math.inf:
+            raise ValueError(f"sigma must be above {SOUP_SIGMA_FLOOR} and finite, got {sigma:g}")
         logit = torch.logit(torch.tensor(opacity, dtype=torch.float64)).to(vertices)
         raw = torch.tensor(sigma - SOUP_SIGMA_FLOOR, dtype=torch.float64).log().to(vertices)
         return cls(

@@ -63,8 +63,11 @@ class Adam:
             ValueError: Names that do not match, a number out of its range, or a parameter that is no tensor with
                 a place in memory for each element.
         """
-        if set(parameters) != set(learning_rates):
-            raise ValueError(f"learning_rates must name {sorted(parameters)}, got {sorted(learning_rates)}")
+        if not isinstance(parameters, Mapping):
+            raise ValueError(f"parameters must be tensors by name, got {type(parameters).__name__}")
+        if not isinstance(learning_rates, Mapping) or set(parameters) != set(learning_rates):
+            got = sorted(learning_rates) if isinstance(learning_rates, Mapping) else learning_rates
+            raise ValueError(f"learning_rates must name {sorted(parameters)}, got {got}")
         if not all(0 <= beta < 1 for beta in betas):
             raise ValueError(f"betas must be in [0, 1), got {betas}")
         if eps < 0:

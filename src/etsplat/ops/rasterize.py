@@ -27,6 +27,7 @@ from etsplat.core.validation import (
     check_device,
     check_finite,
     check_flags,
+    check_floating,
     check_indices,
     check_intrinsics,
     check_like,
@@ -132,7 +133,7 @@ def rasterize(
         cutoffs=cutoffs,
     )
     _check_settings(settings)
-    check_shape("vertices", vertices, ("N", 3, 3) if faces is None else ("V", 3))
+    _check_vertices(vertices, faces)
     if not isinstance(sigma, Tensor) and isinstance(sigma, float | int | np.number):
         sigma = torch.full((), float(sigma), dtype=vertices.dtype, device=vertices.device)
     tensors = RasterizeTensors(
@@ -174,6 +175,17 @@ def one_kind_of_colors(
     if vertex_colors is not None and faces is None:
         raise ValueError("vertex_colors need faces; separate triangles have corner_colors (N, 3, C)")
     return given[0]
+
+
+def _check_vertices(vertices: Tensor, faces: Tensor | None) -> None:
+    """Before the others, which are compared with them."""
+    if faces is None and isinstance(vertices, Tensor) and vertices.ndim == 2:
+        got = tuple(vertices.shape)
+        raise ValueError(f"vertices must have shape (N, 3, 3) where faces is None, got {got}: pass faces= too")
+    check_shape("vertices", vertices, ("N", 3, 3) if faces is None else ("V", 3))
+    check_floating("vertices", vertices)
+    if vertices.dtype not in (torch.float32, torch.float64):
+        raise ValueError(f"vertices must be float32 or float64, got {vertices.dtype}")
 
 
 def _check_settings(settings: RasterizeSettings) -> None:

@@ -8,8 +8,9 @@ from etsplat.io.opaque_files import load_opaque
 from etsplat.io.run_directory import RunDirectory
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.report.data import Run
+from etsplat.tasks.demos import DEMO_SCENE
 from etsplat.tasks.scene_page import scene_of
-from etsplat.tasks.sources import DEMO_SCENE, SoupRun, open_run
+from etsplat.tasks.sources import SoupRun, open_run
 from etsplat.web.pages import asset, filled, render_scene
 
 MOST_TRIANGLES = 100_000

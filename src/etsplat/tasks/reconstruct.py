@@ -50,7 +50,7 @@ from etsplat.tasks.judgement import (
     spread,
 )
 from etsplat.tasks.reconstruct_config import ReconstructConfig
-from etsplat.tasks.running import Job, Result, path_of, terms_of
+from etsplat.tasks.running import Job, Result, path_of, settings_for, terms_of
 from etsplat.tasks.scoring import Scorer, load_lpips
 from etsplat.tasks.sources import Source, fingerprint, load_source, make_subject
 from etsplat.tasks.starts import Started, load_start, make_start, nearby
@@ -140,7 +140,7 @@ def reconstruct(
         >>> result.mesh.vertices.shape[1], sorted(path.name for path in result.path.glob("mesh.*"))
         (3, ['mesh.glb', 'mesh.obj', 'mesh.ply'])
     """
-    config = config or ReconstructConfig()
+    config = settings_for(config, ReconstructConfig)
     job = Job(config, out, callbacks, resume=resume, overwrite=overwrite)
     for name, given in (("depths", depths), ("depth_unit", depth_unit)):
         if given is not None and not config.soft:

@@ -111,6 +111,18 @@ class Result:
         return result_html(self.path, self.metrics, self.OPAQUE)
 
 
+def settings_for(config: C | None, kind: type[C]) -> C:
+    """The settings that a task is to run with: its defaults where there are none.
+
+    Raises:
+        ValueError: they are of another kind.
+    """
+    if config is not None and not isinstance(config, kind):
+        name = kind.__name__
+        raise ValueError(f"config must be a {name}, got {type(config).__name__}: etsplat.{name}.of(PRESET) makes one")
+    return config or kind()
+
+
 class Job(Generic[C]):
     """A run of a task, from its settings to its metrics: what all tasks do around their trainers.
 

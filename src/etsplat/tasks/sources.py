@@ -28,20 +28,19 @@ from etsplat.engines.choice import resolve_device
 from etsplat.io.mesh_files import MeshFile, load_mesh
 from etsplat.io.opaque_files import load_opaque
 from etsplat.io.paths import path_remedy
+from etsplat.io.photos import picture_remedy
 from etsplat.io.point_clouds import load_cloud
 from etsplat.io.run_directory import RunDirectory, is_run
 from etsplat.model.solid_soup import SolidSoup
 from etsplat.model.soup_import import open_soup
 from etsplat.model.triangle_soup import TriangleSoup
+from etsplat.tasks.demos import DEMO_OBJECT, DEMO_SCENE, check_demo
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.refined_cameras import alignment_starts, kept_aside, refined_capture
 from etsplat.tasks.settings import Settings, settings_of
 from etsplat.tasks.train_config import TrainConfig
 
 Source = str | Path | MeshFile | Dataset
-
-DEMO_OBJECT, DEMO_SCENE = "demo:owl", "demo:scene"
-"""Name what is built in code."""
 
 FEWEST_POINTS = 100
 """Of a dense cloud that photos speak for."""
@@ -81,6 +80,7 @@ def load_source(
         return source, source.notes
     if isinstance(source, Dataset):
         return source, []
+    check_demo(source, "reconstruct")
     if str(source) == DEMO_OBJECT:
         return demo_object(), []
     path = Path(source)
@@ -90,6 +90,8 @@ def load_source(
         )
         scene, notes = _agreeing(loaded)
         return scene.renormalized(*bounding_sphere(scene)), [*scene.notes, *notes]
+    if remedy := picture_remedy(path):
+        raise InputError(f"{path}: {remedy}")
     if path.is_file():
         mesh = load_mesh(path)
         return mesh, mesh.notes
@@ -139,6 +141,7 @@ def load_scene(
     """
     if isinstance(source, Dataset):
         return source
+    check_demo(source, "train")
     if str(source) == DEMO_SCENE:
         width = min(WIDTH, width or WIDTH)
         return demo_scene(width, max(1, round(HEIGHT * width / WIDTH)), progress=progress)

@@ -27,7 +27,7 @@ from etsplat.tasks.export_config import ExportConfig
 from etsplat.tasks.export_soup import export_soup
 from etsplat.tasks.opaque import fit_opaque_mesh
 from etsplat.tasks.refined_cameras import kept_aside
-from etsplat.tasks.running import Job, Result, path_of
+from etsplat.tasks.running import Job, Result, path_of, settings_for
 from etsplat.tasks.scene_part import ScenePart, keep_colors
 from etsplat.tasks.scoring import Scorer
 from etsplat.tasks.soup_trainer import background_of, start_trainer, surroundings_of_run
@@ -118,7 +118,7 @@ def train(
         >>> result.metrics["triangles"] > 0
         True
     """
-    config = config or TrainConfig()
+    config = settings_for(config, TrainConfig)
     if blocks is not None:
         check_blocks(blocks, config, watched=onlooker is not None)
     job = Job(config, out, callbacks, resume=resume, overwrite=overwrite)

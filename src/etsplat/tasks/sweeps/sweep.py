@@ -11,11 +11,9 @@ from typing import Any, Generic
 
 from etsplat.core.errors import InputError
 from etsplat.io.paths import path_remedy
+from etsplat.tasks import demos
 from etsplat.tasks.settings import AnySettings, did_you_mean, settings_of
 from etsplat.tasks.sweeps.cells import Cell
-
-DEMOS = {"demo:owl": "reconstruct", "demo:scene": "train"}
-"""Inputs that are built in code, and the task that takes them."""
 
 _LONGEST = 120
 """Of the name of a folder; what is longer is cut, and has a hash instead."""
@@ -122,12 +120,11 @@ def read_inputs(sources: Sequence[str], task: str) -> dict[str, Path]:
     """
     found: dict[str, Path] = {}
     for source in sources:
-        if source in DEMOS and DEMOS[source] != task:
-            raise InputError(f"{source}: is for `etsplat {DEMOS[source]}`; name another input")
+        demos.check_demo(source, task)
         path = Path(source)
-        if source not in DEMOS and not path.exists():
+        if source not in demos.TASKS and not path.exists():
             raise InputError(f"{source}: no such file or folder; {path_remedy(path)}")
-        name = source.partition(":")[2] if source in DEMOS else path.resolve().stem
+        name = source.partition(":")[2] if source in demos.TASKS else path.resolve().stem
         if name in found:
             raise InputError(f"{source}: another input is named {name} too; rename one of them")
         found[name] = path
