@@ -130,7 +130,8 @@ def plain_hull(views: Dataset, config: ReconstructConfig) -> tuple[Tensor, Tenso
     """
     if not views.has_masks:
         raise InputError("start.shape: hull needs masks or transparent pictures; give masks, or start from a sphere")
-    vertices, faces = visual_hull(views, round(config.start.hull_faces * config.max_faces), radius=config.start.radius)
+    wanted = min(config.start.hull_faces, max(1, config.max_faces // 2))
+    vertices, faces = visual_hull(views, wanted, radius=config.start.radius)
     if len(faces) == 0:
         raise InputError(
             "start.shape: the masks have no point in common, so there is no hull; check that masks are white inside the"
