@@ -81,8 +81,8 @@ def fitting(capture: Dataset, engine: str, device: torch.device = CPU, config: T
     ids=["plain", "finish", "paper", "single-sided", "batch"],
 )
 def test_steps_are_those_of_the_cpu_engine(cuda_device: torch.device, capture: Dataset, settings: Any) -> None:
-    """Three steps: the same losses, and statistics and parameters to rounding but for a few triangles, where Adam
-    divided small gradients by small ones; then a densification and three more."""
+    """Three steps: the same losses, and statistics to rounding but for a few triangles, and parameters but for
+    one, where Adam divided small gradients by small ones; then a densification and three more."""
     config = CONFIG.changed(settings)
     on_device, on_cpu = fitting(capture, "cuda", cuda_device, config), fitting(capture, "cpu", CPU, config)
     before = on_cpu.model.count
@@ -93,7 +93,7 @@ def test_steps_are_those_of_the_cpu_engine(cuda_device: torch.device, capture: D
         assert float((difference > 1e-4 + 1e-3 * tensor.abs()).float().mean()) < 0.05, name
     for name, parameter in on_cpu.model.parameters().items():
         difference = (on_device.model.parameters()[name].cpu() - parameter).detach().abs()
-        assert float((difference > 1e-4).float().mean()) < 0.01, name
+        assert int((difference > 1e-4).reshape(len(difference), -1).any(dim=1).sum()) <= 1, name  # of 27
     assert on_device.refine(3) == on_cpu.refine(3) > 0
     losses, expected = ([loss for i in (4, 5, 6) for loss in p.advance(i, i)] for p in (on_device, on_cpu))
     assert losses == pytest.approx(expected, rel=1e-3)
