@@ -42,7 +42,7 @@ def test_without_pycolmap_the_extra_is_named(tmp_path, monkeypatch):
 
 def test_folders_that_cannot_be_used_are_input_errors(tmp_path):
     pytest.importorskip("pycolmap")
-    with pytest.raises(InputError, match="no such folder"):
+    with pytest.raises(InputError, match="no such file or folder"):
         find_cameras(tmp_path / "absent", tmp_path / "scene")
     write_photo(tmp_path / "photos" / "a.jpg", 16, 12)
     with pytest.raises(InputError, match="1 JPEG, PNG or HEIC files"):
