@@ -50,7 +50,7 @@ def test_folders_that_cannot_be_used_are_input_errors(tmp_path):
     for name in "bc":
         write_photo(tmp_path / "photos" / f"{name}.jpg", 16, 12)
     for photos, out in (("photos", "photos/a.jpg/scene"), ("photos/a.jpg", "scene")):
-        with pytest.raises(InputError, match=r"is a file|a file is in the way"):
+        with pytest.raises(InputError, match=r"is one photo; name the folder|a file is in the way"):
             find_cameras(tmp_path / photos, tmp_path / out)
     with pytest.raises(InputError, match=r"scene .*/photoz: no such folder; did you mean .*/photos\?"):
         undistort_scene(tmp_path / "photoz", tmp_path / "scene")
