@@ -21,6 +21,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from etsplat.data.dataset import Dataset, middles_of
+from etsplat.engines.threads import num_threads
 from etsplat.geometry.decimation import decimated, load_simplifier
 from etsplat.geometry.distance import closest_places, closest_points
 from etsplat.geometry.held_back import around_folds
@@ -258,7 +259,7 @@ def _completed(model: TexturedMesh, moments: Float[Tensor, "H W"]) -> TexturedMe
     if bool((moments > 0).any()):
         shown = moments > SHOWN * moments[moments > 0].median()
         if not bool(shown.all()):
-            _, nearest = KDTree(points[shown].numpy()).query(points[~shown].numpy())
+            _, nearest = KDTree(points[shown].numpy()).query(points[~shown].numpy(), workers=num_threads())
             colors[~shown] = colors[shown][torch.from_numpy(np.asarray(nearest))]
     texture[covered] = colors
     return _with_texture(model, spread(texture, covered))
