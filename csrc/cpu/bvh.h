@@ -86,6 +86,10 @@ private:
 
     int32_t build(int64_t begin, int64_t end, std::vector<Centered>& order, const std::vector<Box>& boxes);
 
+    // Calls visit(leaf) for every leaf that, as all above it, is asked for.
+    template <class Asked, class Visit>
+    void descend(Asked&& asked, Visit&& visit) const;
+
     std::vector<Node> nodes_;
     std::vector<int32_t> leaves_;  // indices of nodes
     std::vector<Triangle> triangles_;
@@ -93,23 +97,33 @@ private:
     std::vector<int64_t> faces_;
 };
 
-template <class Visit>
-void Bvh::meeting(int64_t leaf, const Chosen& chosen, Visit&& visit) const {
-    const Node& here = nodes_[leaves_[leaf]];
-    if (chosen.before[here.begin] == chosen.before[here.end]) return;
+template <class Asked, class Visit>
+void Bvh::descend(Asked&& asked, Visit&& visit) const {
     int32_t stack[max_depth];
     int depth = 0;
     stack[depth++] = 0;
     while (depth > 0) {
         const int32_t index = stack[--depth];
         const Node& node = nodes_[index];
-        if (!node.box.overlaps(here.box)) continue;
-        if (node.end <= here.begin && chosen.all(node.begin, node.end)) continue;  // those ask for these
+        if (!asked(node)) continue;
         if (node.right) {
             stack[depth++] = node.right;
             stack[depth++] = index + 1;
-            continue;
+        } else {
+            visit(node);
         }
+    }
+}
+
+template <class Visit>
+void Bvh::meeting(int64_t leaf, const Chosen& chosen, Visit&& visit) const {
+    const Node& here = nodes_[leaves_[leaf]];
+    if (chosen.before[here.begin] == chosen.before[here.end]) return;
+    const auto asked = [&](const Node& node) {
+        if (node.end <= here.begin && chosen.all(node.begin, node.end)) return false;  // those ask for these
+        return node.box.overlaps(here.box);
+    };
+    descend(asked, [&](const Node& node) {
         for (int32_t slot = here.begin; slot < here.end; ++slot) {
             const Box& box = boxes_[slot];
             if (!chosen.chosen[slot] || !node.box.overlaps(box)) continue;
@@ -118,27 +132,16 @@ void Bvh::meeting(int64_t leaf, const Chosen& chosen, Visit&& visit) const {
                 if (box.overlaps(boxes_[other])) visit(slot, other);
             }
         }
-    }
+    });
 }
 
 template <class Visit>
 void Bvh::touching(const Box& box, Visit&& visit) const {
-    int32_t stack[max_depth];
-    int depth = 0;
-    stack[depth++] = 0;
-    while (depth > 0) {
-        const int32_t index = stack[--depth];
-        const Node& node = nodes_[index];
-        if (!node.box.overlaps(box)) continue;
-        if (node.right) {
-            stack[depth++] = node.right;
-            stack[depth++] = index + 1;
-            continue;
-        }
-        for (int32_t slot = node.begin; slot < node.end; ++slot) {
+    descend([&](const Node& node) { return node.box.overlaps(box); }, [&](const Node& leaf) {
+        for (int32_t slot = leaf.begin; slot < leaf.end; ++slot) {
             if (boxes_[slot].overlaps(box)) visit(slot);
         }
-    }
+    });
 }
 
 }  // namespace etsplat
