@@ -2,7 +2,7 @@
 // parallel; (2) pixels are shaded in parallel (shading.cpp); (3) bands of rows look for pairs of neighbouring pixels with a
 // silhouette between them, in parallel, each into a list of its own (36 bytes a blend, a few per silhouette pixel); (4) the
 // lists are carried out in their order, on one thread: there are as many blends as silhouette pixels, a hundredth of the
-// image.
+// image where a mesh is welded, up to half of it where triangles are separate.
 //
 // Backward: blends hand their pixels' cotangents on, and move their edge's ends, on one thread; then comes that of shading.
 // Nothing depends on which thread runs what.
@@ -29,15 +29,11 @@ void prefetch_ends(const Blend& blend, const float* vertices, const float* gradi
 }
 
 // Cotangents of the shaded pixels, and what the silhouettes' ends get from the weights.
-void blend_backward(const AntialiasState& state, const ShadeInput& in, const AntialiasGradients& out) {
+void blend_backward(const std::vector<Blend>& blends, const ShadeInput& in, const AntialiasGradients& out) {
     const int32_t channels = in.channels;
-    const int64_t size = static_cast<int64_t>(in.camera.width) * in.camera.height * channels;
-    parallel_for(size, 1 << 16, [&](int64_t begin, int64_t end) {
-        std::copy(out.color + begin, out.color + end, out.grad_shaded + begin);
-    });
     const PinholeCamera camera = pinhole(in.camera);
-    const Blend* last = state.blends.data() + state.blends.size();
-    for (const Blend& blend : state.blends) {
+    const Blend* last = blends.data() + blends.size();
+    for (const Blend& blend : blends) {
         if (out.into.vertices && last - &blend > kAhead) {
             prefetch_ends((&blend)[kAhead], in.mesh.vertices, out.into.vertices);
         }
@@ -65,6 +61,11 @@ void blend_backward(const AntialiasState& state, const ShadeInput& in, const Ant
     }
 }
 
+void copy_image(const ShadeInput& in, const float* from, float* to) {
+    const int64_t size = static_cast<int64_t>(in.camera.width) * in.camera.height * in.channels;
+    parallel_for(size, 1 << 16, [&](int64_t begin, int64_t end) { std::copy(from + begin, from + end, to + begin); });
+}
+
 }  // namespace
 
 std::shared_ptr<AntialiasState> antialias_forward(const AntialiasInput& input, float* shaded, float* color) {
@@ -72,18 +73,20 @@ std::shared_ptr<AntialiasState> antialias_forward(const AntialiasInput& input, f
     const ShadeInput& in = input.shading;
     shade(in, shaded);
     state->blends = find_blends(input);
+    copy_image(in, shaded, color);
     const int32_t channels = in.channels;
-    const int64_t size = static_cast<int64_t>(in.camera.width) * in.camera.height * channels;
-    parallel_for(size, 1 << 16, [&](int64_t begin, int64_t end) { std::copy(shaded + begin, shaded + end, color + begin); });
-    for (const Blend& blend : state->blends) {
-        const int64_t to = static_cast<int64_t>(blend.to) * channels, from = static_cast<int64_t>(blend.from) * channels;
-        for (int32_t c = 0; c < channels; ++c) color[to + c] += blend.weight * (shaded[from + c] - shaded[to + c]);
+    for (const std::vector<Blend>& list : state->blends) {
+        for (const Blend& blend : list) {
+            const int64_t to = static_cast<int64_t>(blend.to) * channels, from = static_cast<int64_t>(blend.from) * channels;
+            for (int32_t c = 0; c < channels; ++c) color[to + c] += blend.weight * (shaded[from + c] - shaded[to + c]);
+        }
     }
     return state;
 }
 
 void antialias_backward(const AntialiasState& state, const AntialiasInput& input, const AntialiasGradients& gradients) {
-    blend_backward(state, input.shading, gradients);
+    copy_image(input.shading, gradients.color, gradients.grad_shaded);
+    for (const std::vector<Blend>& list : state.blends) blend_backward(list, input.shading, gradients);
     shade_backward(input.shading, gradients.grad_shaded, gradients.into);
 }
 

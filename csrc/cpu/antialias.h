@@ -25,11 +25,12 @@ struct Blend {
     float derivative[2][2];  // of the weight by the ends' screen x, y
 };
 
-// Every silhouette of the nearer triangle between two neighbouring pixels that see different ones, row by row.
-std::vector<Blend> find_blends(const AntialiasInput& input);
+// Every silhouette of the nearer triangle between two neighbouring pixels that see different ones, row by row, in lists
+// that follow each other.
+std::vector<std::vector<Blend>> find_blends(const AntialiasInput& input);
 
 struct AntialiasState {
-    std::vector<Blend> blends;
+    std::vector<std::vector<Blend>> blends;
 };
 
 struct AntialiasGradients {

@@ -61,56 +61,83 @@ std::vector<uint8_t> find_silhouettes(const AntialiasInput& in, const Scratch<Po
     return bits;
 }
 
-// Looks for a silhouette of the nearer triangle between two neighbouring pixels that see different ones.
+// The numbers of the two edges of a triangle that a line meets, the smaller first, by which corners lie at its one side (bit
+// k: corner k). Edge k leads from corner k to k + 1. Where all lie at one side, any two.
+constexpr uint8_t kMet[8][2] = {{0, 1}, {0, 2}, {0, 1}, {1, 2}, {1, 2}, {0, 1}, {0, 2}, {0, 1}};
+
+constexpr uint8_t kNext[4] = {0, 1, 2, 0};  // corners, in a circle
+
+// Looks for a silhouette of the nearer triangle between two neighbouring pixels that see different ones. A processor cannot
+// guess what is found, so that both edges in question are computed, and one is chosen at the end, without branches.
 class PairSearch {
 public:
     PairSearch(const AntialiasInput& in, const Scratch<Point>& points, const std::vector<uint8_t>& silhouettes)
-        : in_(in.shading), depth_(in.depth), points_(points), silhouettes_(silhouettes) {}
+        : in_(in.shading), depth_(in.depth), points_(points), silhouettes_(silhouettes), step_{1, in.shading.camera.width} {}
 
-    // The pair is the pixel (x, y) and its neighbour at the right (axis 0) or below (axis 1).
-    void visit(int32_t x, int32_t y, int axis, std::vector<Blend>& blends) const {
-        const int32_t first = y * in_.camera.width + x, second = axis == 0 ? first + 1 : first + in_.camera.width;
-        const int32_t face[2] = {in_.triangle[first], in_.triangle[second]};
-        if (face[0] == face[1]) return;
-        const bool forward = face[1] < 0 || (face[0] >= 0 && depth_[first] <= depth_[second]);
-        const int32_t nearer = face[forward ? 0 : 1];
-        const int silhouettes = silhouettes_[nearer];
-        if (silhouettes == 0) return;
-        const int32_t* corner = in_.mesh.faces + 3 * static_cast<int64_t>(nearer);
-        const double along = (axis == 0 ? x : y) + (forward ? 0.5 : 1.5), across = (axis == 0 ? y : x) + 0.5;
-        for (int k = 0; k < 3; ++k) {
-            if (!(silhouettes >> k & 1)) continue;
-            const int32_t ends[2] = {corner[k], corner[(k + 1) % 3]};
-            if (add(ends, axis, along, across, forward, first, second, blends)) return;
+    // The pairs of row y that see different triangles, in their order: 2 x + axis for the pixel (x, y) and its neighbour at
+    // the right (axis 0) or below (axis 1). Returns how many.
+    int32_t different(int32_t y, int32_t* pairs) const {
+        const int32_t width = in_.camera.width;
+        const int32_t* here = in_.triangle + static_cast<int64_t>(y) * width;
+        const int32_t* below = y + 1 < in_.camera.height ? here + width : here;
+        int32_t count = 0;
+        for (int32_t x = 0; x < width; ++x) {
+            pairs[count] = 2 * x;
+            count += here[x] != here[x + 1 < width ? x + 1 : x];
+            pairs[count] = 2 * x + 1;
+            count += here[x] != below[x];
         }
+        return count;
+    }
+
+    // Writes the blend of such a pair, if there is one, and returns how many.
+    int blend(int32_t x, int32_t y, int axis, Blend* blend) const {
+        const int other = 1 - axis;
+        const int32_t first = y * in_.camera.width + x, pixels[2] = {first, first + step_[axis]};
+        const int32_t face[2] = {in_.triangle[pixels[0]], in_.triangle[pixels[1]]};
+        const bool forward = (face[1] < 0) | ((face[0] >= 0) & (depth_[pixels[0]] <= depth_[pixels[1]]));
+        const int32_t nearer = forward ? face[0] : face[1];
+        const int silhouettes = silhouettes_[nearer];
+        if (silhouettes == 0) return 0;  // of a welded mesh nearly always, of separate triangles never
+        const int32_t* corner = in_.mesh.faces + 3 * static_cast<int64_t>(nearer);
+        const int32_t at[2] = {x, y};
+        const double along = at[axis] + (1.5 - forward), across = at[other] + 0.5;
+        int side = 0;
+        for (int k = 0; k < 3; ++k) side |= (points_[corner[k]].at[other] <= across) << k;
+        const auto [met, then] = kMet[side];
+        const EdgeCrossing crossings[2] = {crossing_of(corner, met, axis, along, across, forward),
+                                           crossing_of(corner, then, axis, along, across, forward)};
+        const bool meets = (side != 0) & (side != 7);
+        const bool one = crossings[0].between & ((silhouettes >> met & 1) != 0);
+        const bool two = crossings[1].between & ((silhouettes >> then & 1) != 0);
+        const SilhouetteBlend found = blend_of(crossings[!one], forward);
+        const int edge = one ? met : then;
+        blend->to = pixels[found.into_second];
+        blend->from = pixels[!found.into_second];
+        blend->weight = found.weight;
+        for (int end = 0; end < 2; ++end) {
+            blend->vertex[end] = corner[kNext[edge + end]];
+            blend->derivative[end][axis] = found.by_along[end];
+            blend->derivative[end][other] = found.by_across[end];
+        }
+        return meets & (one | two);
     }
 
 private:
-    bool add(const int32_t* ends, int axis, double along, double across, bool forward, int32_t first, int32_t second,
-             std::vector<Blend>& blends) const {
-        SilhouetteBlend found;
-        if (!silhouette_blend(points_[ends[0]].at, points_[ends[1]].at, axis, along, across, forward, found)) return false;
-        Blend blend;
-        blend.to = found.into_second ? second : first;
-        blend.from = found.into_second ? first : second;
-        blend.weight = found.weight;
-        for (int end = 0; end < 2; ++end) {
-            blend.vertex[end] = ends[end];
-            for (int i = 0; i < 2; ++i) blend.derivative[end][i] = found.derivative[end][i];
-        }
-        blends.push_back(blend);
-        return true;
+    EdgeCrossing crossing_of(const int32_t* corner, int edge, int axis, double along, double across, bool forward) const {
+        return edge_crossing(points_[corner[edge]].at, points_[corner[kNext[edge + 1]]].at, axis, along, across, forward);
     }
 
     const ShadeInput& in_;
     const float* depth_;
     const Scratch<Point>& points_;
     const std::vector<uint8_t>& silhouettes_;
+    const int32_t step_[2];  // to the neighbour
 };
 
 }  // namespace
 
-std::vector<Blend> find_blends(const AntialiasInput& in) {
+std::vector<std::vector<Blend>> find_blends(const AntialiasInput& in) {
     Scratch<Point> points(in.shading.mesh.num_vertices);
     project_vertices(in.shading, points);
     const std::vector<uint8_t> silhouettes = find_silhouettes(in, points);
@@ -118,19 +145,19 @@ std::vector<Blend> find_blends(const AntialiasInput& in) {
     const int32_t width = in.shading.camera.width, height = in.shading.camera.height, bands = (height + kRows - 1) / kRows;
     std::vector<std::vector<Blend>> lists(bands);
     parallel_for(bands, 1, [&](int64_t begin, int64_t end) {
+        Scratch<Blend> found(2 * int64_t{width} + 1);  // of a row, and one that is none
+        Scratch<int32_t> pairs(2 * int64_t{width} + 1);
         for (int64_t band = begin; band < end; ++band) {
             const auto top = static_cast<int32_t>(band) * kRows;
             for (int32_t y = top; y < std::min(top + kRows, height); ++y) {
-                for (int32_t x = 0; x < width; ++x) {
-                    if (x + 1 < width) search.visit(x, y, 0, lists[band]);
-                    if (y + 1 < height) search.visit(x, y, 1, lists[band]);
-                }
+                const int32_t count = search.different(y, pairs.data());
+                Blend* next = found.data();
+                for (int32_t i = 0; i < count; ++i) next += search.blend(pairs[i] / 2, y, pairs[i] % 2, next);
+                lists[band].insert(lists[band].end(), found.data(), next);
             }
         }
     });
-    std::vector<Blend> blends;
-    for (const std::vector<Blend>& list : lists) blends.insert(blends.end(), list.begin(), list.end());
-    return blends;
+    return lists;
 }
 
 }  // namespace etsplat

@@ -22,6 +22,7 @@ struct Path {
     TriangleKernels triangles;
     PhotometricKernels photometric;
     NormalsKernels normals;
+    OpaqueKernels opaque;
 };
 
 #if defined(ETSPLAT_X86)
@@ -71,7 +72,8 @@ bool has_avx512() {
 
 #define ETSPLAT_PATH(name)                                                                                          \
     Path {                                                                                                          \
-        #name, name::raster_kernels(), name::triangle_kernels(), name::photometric_kernels(), name::normals_kernels() \
+        #name,                    name::raster_kernels(),   name::triangle_kernels(), name::photometric_kernels(),  \
+        name::normals_kernels(), name::opaque_kernels()                                                             \
     }
 
 const std::vector<Path>& paths() {
@@ -129,5 +131,7 @@ const TriangleKernels& active_triangle_kernels() { return active().triangles; }
 const PhotometricKernels& active_photometric_kernels() { return active().photometric; }
 
 const NormalsKernels& active_normals_kernels() { return active().normals; }
+
+const OpaqueKernels& active_opaque_kernels() { return active().opaque; }
 
 }  // namespace etsplat

@@ -5,6 +5,7 @@
 #include <vector>
 
 #include "normals_pass.h"
+#include "opaque_pass.h"
 #include "photometric_pass.h"
 #include "raster_pass.h"
 #include "triangle_pass.h"
@@ -19,5 +20,6 @@ const RasterKernels& active_raster_kernels();
 const TriangleKernels& active_triangle_kernels();
 const PhotometricKernels& active_photometric_kernels();
 const NormalsKernels& active_normals_kernels();
+const OpaqueKernels& active_opaque_kernels();
 
 }  // namespace etsplat

@@ -9,7 +9,9 @@
 #include <utility>
 #include <vector>
 
+#include "instruction_set.h"
 #include "math/opaque_triangle.h"
+#include "opaque_pass.h"
 #include "parallel.h"
 #include "prefetch.h"
 #include "scratch.h"
@@ -19,16 +21,18 @@ namespace {
 
 constexpr int kTileSamples = 64;
 constexpr int64_t kStripEntries = 8'000'000;  // (tile, triangle) pairs in memory at a time
-constexpr int32_t kAhead = 8;  // triangles of a tile, and pixels of a row: what they read lies anywhere in memory
+constexpr int32_t kAhead = 8;                 // pixels of a row: what they read lies anywhere in memory
 
 struct Screen {
     Scratch<OpaqueVertex> vertices;
-    Scratch<OpaqueTriangle> triangles;
-    int32_t width, height;  // in samples
+    Scratch<OpaqueBounds> bounds;       // empty where a triangle draws nothing
+    Scratch<OpaqueTriangle> triangles;  // set up where bounds are not empty
+    int32_t width, height;              // in samples
     int32_t tile, tiles_x, tiles_y;
 
     Screen(const OpaqueMesh& mesh, const OpaqueCamera& camera, int32_t samples, bool cull_backfaces)
         : vertices(mesh.num_vertices),
+          bounds(mesh.num_faces),
           triangles(mesh.num_faces),
           width(camera.width * samples),
           height(camera.height * samples),
@@ -44,7 +48,8 @@ struct Screen {
             for (int64_t f = begin; f < end; ++f) {
                 const int32_t* k = mesh.faces + 3 * f;
                 const OpaqueVertex v[3] = {vertices[k[0]], vertices[k[1]], vertices[k[2]]};
-                triangles[f] = set_up_opaque(v, width, height, cull_backfaces);
+                bounds[f] = opaque_bounds(v, width, height);
+                if (!set_up_opaque(v, bounds[f], cull_backfaces, triangles[f])) bounds[f] = {0, 0, 0, 0};
             }
         });
     }
@@ -53,8 +58,8 @@ struct Screen {
 // Ends of strips of tile rows that hold at most kStripEntries pairs each, or are one row high.
 std::vector<int32_t> strip_ends(const Screen& screen) {
     std::vector<int64_t> change(screen.tiles_y + 1, 0);
-    for (const OpaqueTriangle& t : screen.triangles) {
-        if (!t.draws()) continue;
+    for (const OpaqueBounds& t : screen.bounds) {
+        if (t.empty()) continue;
         const int64_t columns = (t.x_end - 1) / screen.tile - t.x_begin / screen.tile + 1;
         change[t.y_begin / screen.tile] += columns;
         change[(t.y_end - 1) / screen.tile + 1] -= columns;
@@ -73,41 +78,44 @@ std::vector<int32_t> strip_ends(const Screen& screen) {
     return ends;
 }
 
+// A bin for each layer of each tile of a strip, tile after tile.
 struct Bins {
-    std::vector<int64_t> begin;      // (tiles of the strip + 1)
-    std::vector<int32_t> triangles;  // ascending within a tile
+    std::vector<int64_t> begin;      // (bins + 1)
+    std::vector<int32_t> triangles;  // ascending within a bin
 };
 
-Bins bin_strip(const Screen& screen, int32_t row_begin, int32_t row_end) {
-    const int64_t n = screen.triangles.size();
-    const int64_t tiles = static_cast<int64_t>(row_end - row_begin) * screen.tiles_x;
+template <int Layers, class Layer>
+Bins bin_strip(const Screen& screen, const Layer& layer, int32_t row_begin, int32_t row_end) {
+    const int64_t n = screen.bounds.size();
+    const int64_t count = static_cast<int64_t>(row_end - row_begin) * screen.tiles_x * Layers;
     const int64_t chunk = std::max<int64_t>(4096, (n + 31) / 32), chunks = (n + chunk - 1) / chunk;
-    std::vector<int64_t> places(chunks * tiles, 0);  // counts first, then the place of the chunk's next entry
+    std::vector<int64_t> places(chunks * count, 0);  // counts first, then the place of the chunk's next entry
 
     const auto for_each_pair = [&](int64_t c, auto&& visit) {
         for (int64_t f = c * chunk; f < std::min(n, (c + 1) * chunk); ++f) {
-            const OpaqueTriangle& t = screen.triangles[f];
-            if (!t.draws()) continue;
+            const OpaqueBounds& t = screen.bounds[f];
+            if (t.empty()) continue;
             const int32_t y0 = std::max(t.y_begin / screen.tile, row_begin);
             const int32_t y1 = std::min((t.y_end - 1) / screen.tile + 1, row_end);
             for (int32_t y = y0; y < y1; ++y) {
                 for (int32_t x = t.x_begin / screen.tile; x <= (t.x_end - 1) / screen.tile; ++x) {
-                    visit(f, places[c * tiles + static_cast<int64_t>(y - row_begin) * screen.tiles_x + x]);
+                    const int64_t tile = static_cast<int64_t>(y - row_begin) * screen.tiles_x + x;
+                    visit(f, places[c * count + tile * Layers + layer(static_cast<int32_t>(f))]);
                 }
             }
         }
     };
     parallel_for(chunks, 1, [&](int64_t begin, int64_t end) {
-        for (int64_t c = begin; c < end; ++c) for_each_pair(c, [](int64_t, int64_t& count) { ++count; });
+        for (int64_t c = begin; c < end; ++c) for_each_pair(c, [](int64_t, int64_t& entries) { ++entries; });
     });
     Bins bins;
-    bins.begin.resize(tiles + 1);
+    bins.begin.resize(count + 1);
     int64_t total = 0;
-    for (int64_t tile = 0; tile < tiles; ++tile) {
-        bins.begin[tile] = total;
-        for (int64_t c = 0; c < chunks; ++c) total += std::exchange(places[c * tiles + tile], total);
+    for (int64_t bin = 0; bin < count; ++bin) {
+        bins.begin[bin] = total;
+        for (int64_t c = 0; c < chunks; ++c) total += std::exchange(places[c * count + bin], total);
     }
-    bins.begin[tiles] = total;
+    bins.begin[count] = total;
     bins.triangles.resize(total);
     parallel_for(chunks, 1, [&](int64_t begin, int64_t end) {
         for (int64_t c = begin; c < end; ++c) {
@@ -117,66 +125,41 @@ Bins bin_strip(const Screen& screen, int32_t row_begin, int32_t row_end) {
     return bins;
 }
 
-struct TileBuffer {
-    int32_t x0, y0, x1, y1;  // samples of the tile, clipped to the screen
-    int32_t stride;
-    std::vector<float> inverse_depth;
-    std::vector<int32_t> triangle;
+struct TileBuffer : OpaqueTile {
+    std::vector<float> depths;
+    std::vector<int32_t> owners;
 
     void reset(const Screen& screen, int32_t tile_x, int32_t tile_y) {
         x0 = tile_x * screen.tile;
         y0 = tile_y * screen.tile;
         x1 = std::min(x0 + screen.tile, screen.width);
         y1 = std::min(y0 + screen.tile, screen.height);
+        width = screen.width;
         stride = screen.tile;
-        inverse_depth.assign(static_cast<size_t>(stride) * stride, 0.0f);
-        triangle.assign(static_cast<size_t>(stride) * stride, -1);
+        const size_t size = static_cast<size_t>(stride) * stride + kMostAtATime - 1;
+        depths.assign(size, 0.0f);
+        owners.assign(size, -1);
+        inverse_depth = depths.data();
+        triangle = owners.data();
     }
 };
-
-// Triangles come in ascending index: a strict comparison lets the smaller index win a tie.
-void draw(const Screen& screen, int32_t index, TileBuffer& tile) {
-    const OpaqueTriangle t = screen.triangles[index];  // a copy, which no store can alias
-    const auto slope = static_cast<float>(t.inverse_depth_dx);
-    const int32_t y_end = std::min(t.y_end, tile.y1);
-    for (int32_t y = std::max(t.y_begin, tile.y0); y < y_end; ++y) {
-        int32_t begin, end;
-        t.span(y, screen.width, begin, end);
-        begin = std::max(begin, tile.x0);
-        end = std::min(end, tile.x1);
-        if (begin >= end) continue;
-        const float row = t.row_inverse_depth(y);
-        const int64_t place = static_cast<int64_t>(y - tile.y0) * tile.stride + (begin - tile.x0);
-        float* depths = tile.inverse_depth.data() + place;
-        int32_t* owners = tile.triangle.data() + place;
-        const int32_t count = end - begin, offset = begin - t.x_begin;
-        for (int32_t i = 0; i < count; ++i) {
-            const float w = t.inverse_depth_at(row, slope, offset + i);
-            const bool nearer = w > depths[i];
-            depths[i] = nearer ? w : depths[i];
-            owners[i] = nearer ? index : owners[i];
-        }
-    }
-}
 
 // Draws each triangle into the buffer `layer` names, one of so many, and hands these to `resolve`.
 template <int Layers, class Layer, class Resolve>
 void for_each_tile(const Screen& screen, const Layer& layer, const Resolve& resolve) {
+    const OpaqueKernels& kernels = active_opaque_kernels();
     int32_t row_begin = 0;
     for (const int32_t row_end : strip_ends(screen)) {
-        const Bins bins = bin_strip(screen, row_begin, row_end);
+        const Bins bins = bin_strip<Layers>(screen, layer, row_begin, row_end);
         const int64_t tiles = static_cast<int64_t>(row_end - row_begin) * screen.tiles_x;
         parallel_for(tiles, 1, [&](int64_t begin, int64_t end) {
             thread_local TileBuffer buffers[Layers];
             for (int64_t tile = begin; tile < end; ++tile) {
-                for (TileBuffer& buffer : buffers) {
-                    buffer.reset(screen, static_cast<int32_t>(tile % screen.tiles_x),
-                                 row_begin + static_cast<int32_t>(tile / screen.tiles_x));
-                }
-                const int64_t last = bins.begin[tile + 1];
-                for (int64_t i = bins.begin[tile]; i < last; ++i) {
-                    if (i + kAhead < last) prefetch_all(screen.triangles[bins.triangles[i + kAhead]]);
-                    draw(screen, bins.triangles[i], buffers[layer(bins.triangles[i])]);
+                for (int k = 0; k < Layers; ++k) {
+                    buffers[k].reset(screen, static_cast<int32_t>(tile % screen.tiles_x),
+                                     row_begin + static_cast<int32_t>(tile / screen.tiles_x));
+                    const int64_t first = bins.begin[tile * Layers + k], next = bins.begin[tile * Layers + k + 1];
+                    kernels.draw(screen.triangles.begin(), bins.triangles.data() + first, next - first, buffers[k]);
                 }
                 resolve(buffers);
             }
@@ -239,7 +222,7 @@ void rasterize_opaque(const OpaqueMesh& mesh, const OpaqueCamera& camera, int32_
         for (int32_t y = tile.y0; y < tile.y1; ++y) {
             const int64_t place = static_cast<int64_t>(y - tile.y0) * tile.stride - tile.x0;
             const int64_t row = static_cast<int64_t>(y) * screen.width;
-            const int32_t* owners = tile.triangle.data() + place;
+            const int32_t* owners = tile.triangle + place;
             int32_t known = -1;  // whose corners are at hand
             OpaqueVertex v[3] = {};
             for (int32_t x = tile.x0; x < tile.x1; ++x) {

@@ -180,7 +180,7 @@ extern "C" __global__ void antialias_unblend(Scene scene, const float* grad_imag
 
 // The weight of a pair's blend moves the ends of its silhouette.
 template <class Into>
-__device__ void collect_silhouette(const Scene& scene, const PairBlend& pair, const float* shaded,
+__device__ void collect_silhouette(const Scene& scene, const PairBlend& pair, int axis, const float* shaded,
                                    const float* grad_image, Into& into) {
     const int channels = scene.view.shaded.channels;
     double by_weight = 0.0;
@@ -196,8 +196,9 @@ __device__ void collect_silhouette(const Scene& scene, const PairBlend& pair, co
         double seen[3], grad_seen[3] = {0.0, 0.0, 0.0}, grad_world[3], x, y;
         to_camera(camera, world, seen);
         project(camera, seen, x, y);
-        project_backward(camera, seen, x, y, by_weight * pair.blend.derivative[end][0],
-                         by_weight * pair.blend.derivative[end][1], grad_seen);
+        const float by_along = pair.blend.by_along[end], by_across = pair.blend.by_across[end];
+        project_backward(camera, seen, x, y, by_weight * (axis == 0 ? by_along : by_across),
+                         by_weight * (axis == 0 ? by_across : by_along), grad_seen);
         to_world_gradient(camera, grad_seen, grad_world);
         into.vertex(pair.ends[end], grad_world);
     }
@@ -211,7 +212,7 @@ __device__ void collect(const Scene& scene, long long p, const float* shaded, co
         const int x = static_cast<int>(p % view.width), y = static_cast<int>(p / view.width);
         PairBlend pair;
         for (int axis = 0; axis < 2; ++axis) {
-            if (find_pair(scene, x, y, axis, pair)) collect_silhouette(scene, pair, shaded, grad_image, into);
+            if (find_pair(scene, x, y, axis, pair)) collect_silhouette(scene, pair, axis, shaded, grad_image, into);
         }
     }
     collect_shaded(view, p, grad_shaded + p * view.channels, into);

@@ -40,11 +40,13 @@ __device__ bool load_corners(const OpaqueView& view, long long face, OpaqueVerte
     return true;
 }
 
+// Its bounds are empty where it draws nothing.
 __device__ OpaqueTriangle load_triangle(const OpaqueView& view, long long face) {
     OpaqueVertex corners[3];
     OpaqueTriangle t;
-    t.x_begin = t.x_end = t.y_begin = t.y_end = 0;
-    if (load_corners(view, face, corners)) t = set_up_opaque(corners, view.width, view.height, view.cull_backfaces != 0);
+    const bool draws = load_corners(view, face, corners) &&
+                       set_up_opaque(corners, opaque_bounds(corners, view.width, view.height), view.cull_backfaces != 0, t);
+    if (!draws) t.bounds = {0, 0, 0, 0};
     return t;
 }
 
@@ -54,9 +56,9 @@ __device__ int face_of(Sample sample) { return static_cast<int>(~static_cast<uns
 extern "C" __global__ void opaque_rows(OpaqueView view, int* rows) {
     const long long f = static_cast<long long>(blockIdx.x) * kThreads + threadIdx.x;
     if (f >= view.num_faces) return;
-    const OpaqueTriangle t = load_triangle(view, f);
-    rows[2 * f] = t.draws() ? t.y_begin : 0;
-    rows[2 * f + 1] = t.draws() ? t.y_end : 0;
+    const OpaqueBounds bounds = load_triangle(view, f).bounds;
+    rows[2 * f] = bounds.y_begin;
+    rows[2 * f + 1] = bounds.y_end;
 }
 
 // Rows [begin, end) of a triangle, every `stride`-th column from `offset` on, into a buffer that starts at row `top`.
@@ -70,7 +72,7 @@ __device__ void draw(const OpaqueTriangle& t, long long face, int begin, int end
         const float row = t.row_inverse_depth(y);
         Sample* line = buffer + static_cast<long long>(y - top) * width;
         for (int x = left + offset; x < right; x += stride) {
-            const float w = t.inverse_depth_at(row, slope, x - t.x_begin);
+            const float w = t.inverse_depth_at(row, slope, x - t.bounds.x_begin);
             if (!(w > 0.0f)) continue;
             const Sample sample = static_cast<Sample>(__float_as_uint(w)) << 32 | complement;
             if (sample > load_relaxed(line + x)) atomicMax(line + x, sample);
@@ -89,7 +91,7 @@ extern "C" __global__ void opaque_draw(OpaqueView view, const int* rows, int top
         end = rows[2 * f + 1] > bottom ? bottom : rows[2 * f + 1];
     }
     if (begin < end) t = load_triangle(view, f);
-    const bool small = begin < end && (end - begin) * static_cast<long long>(t.x_end - t.x_begin) <= kSmall;
+    const bool small = begin < end && (end - begin) * static_cast<long long>(t.bounds.x_end - t.bounds.x_begin) <= kSmall;
     if (small) draw(t, f, begin, end, 0, 1, view.width, top, buffer);
     unsigned large = __ballot_sync(kAllLanes, begin < end && !small);
     OpaqueTriangle* common = shared + warp_index();

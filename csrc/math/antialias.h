@@ -42,32 +42,54 @@ ETSPLAT_FN double side_of(const double* a, const double* b, const double* p) {
 
 // What a silhouette does between a pixel and its neighbour at the right (axis 0) or below (axis 1).
 struct SilhouetteBlend {
-    bool into_second;        // the second pixel gets weight (colour of the first - its own), or the other way round
+    bool into_second;  // the second pixel gets weight (colour of the first - its own), or the other way round
     float weight;
-    float derivative[2][2];  // of the weight by the screen x, y of the silhouette's ends
+    float by_along[2], by_across[2];  // its derivative by where the silhouette's ends are along the axis, and across it
 };
 
-// For the silhouette from a to b of the nearer triangle, which the first pixel sees if `forward`. `along` is where the
-// nearer triangle's pixel has its centre, along the axis, `across` where both have it across. False if it does nothing.
+// The edge from a to b of the nearer triangle, which the first pixel sees if `forward`, beside the line between the centres
+// of two pixels. `along` is where the nearer triangle's pixel has its centre, along the axis, `across` where both have it
+// across.
+struct EdgeCrossing {
+    Crossing<double> at;
+    double reach;  // from the nearer triangle's pixel
+    bool between;  // it is steep enough, and crosses between the centres, if its ends lie on both sides of the line
+};
+
+ETSPLAT_FN EdgeCrossing edge_crossing(const double* a, const double* b, int axis, double along, double across,
+                                      bool forward) {
+    const int other = 1 - axis;
+    EdgeCrossing e;
+    e.at = crossing(a[axis], a[other], b[axis], b[other], across);
+    e.reach = (2.0 * forward - 1.0) * (e.at.position - along);
+    e.between = (e.at.slope <= 1.0) & (e.at.slope >= -1.0) & (e.reach >= 0.0) & (e.reach <= 1.0);
+    return e;
+}
+
+// What an edge that crosses between the centres does.
+ETSPLAT_FN SilhouetteBlend blend_of(const EdgeCrossing& e, bool forward) {
+    const bool overruns = e.reach > 0.5;  // into the other pixel's half
+    SilhouetteBlend blend;
+    blend.into_second = overruns == forward;
+    blend.weight = static_cast<float>((2.0 * overruns - 1.0) * (e.reach - 0.5));
+    const double sign = 2.0 * blend.into_second - 1.0;
+    double derivative[4];
+    crossing_derivative(e.at, derivative);
+    for (int end = 0; end < 2; ++end) {
+        blend.by_along[end] = static_cast<float>(sign * derivative[2 * end]);
+        blend.by_across[end] = static_cast<float>(sign * derivative[2 * end + 1]);
+    }
+    return blend;
+}
+
+// For the silhouette from a to b, with the arguments of `edge_crossing`. False if it does nothing.
 ETSPLAT_FN bool silhouette_blend(const double* a, const double* b, int axis, double along, double across, bool forward,
                                  SilhouetteBlend& blend) {
     const int other = 1 - axis;
     if ((a[other] <= across) == (b[other] <= across)) return false;
-    const Crossing<double> c = crossing(a[axis], a[other], b[axis], b[other], across);
-    const double reach = forward ? c.position - along : along - c.position;  // from the nearer triangle's pixel
-    if (!(c.slope <= 1.0 && c.slope >= -1.0 && reach >= 0.0 && reach <= 1.0)) return false;
-    const bool overruns = reach > 0.5;  // into the other pixel's half
-    const double sign = overruns == forward ? 1.0 : -1.0;
-    double derivative[4];
-    crossing_derivative(c, derivative);
-    blend.into_second = overruns == forward;
-    blend.weight = static_cast<float>(overruns ? reach - 0.5 : 0.5 - reach);
-    for (int end = 0; end < 2; ++end) {
-        const float by_along = static_cast<float>(sign * derivative[2 * end]);
-        const float by_across = static_cast<float>(sign * derivative[2 * end + 1]);
-        blend.derivative[end][0] = axis == 0 ? by_along : by_across;
-        blend.derivative[end][1] = axis == 0 ? by_across : by_along;
-    }
+    const EdgeCrossing e = edge_crossing(a, b, axis, along, across, forward);
+    if (!e.between) return false;
+    blend = blend_of(e, forward);
     return true;
 }
 

@@ -34,25 +34,54 @@ ETSPLAT_FN OpaqueVertex project_opaque(const float* viewmat, const float* K, flo
     return v;
 }
 
-// First sample at or after a coordinate, clamped to [0, size].
-ETSPLAT_FN int first_sample(double coordinate, int size) {
+// A coordinate relative to the middle of the first sample, clamped to [0, size].
+ETSPLAT_FN double from_first_sample(double coordinate, int size) {
     double at = coordinate - 0.5;
     at = at < 0.0 ? 0.0 : at;
-    at = static_cast<double>(size) < at ? static_cast<double>(size) : at;
+    return static_cast<double>(size) < at ? static_cast<double>(size) : at;
+}
+
+// The first sample at or after that.
+ETSPLAT_FN int next_sample(double at) {
     const int truncated = static_cast<int>(at);
     return truncated + (at > truncated ? 1 : 0);
+}
+
+ETSPLAT_FN int first_sample(double coordinate, int size) { return next_sample(from_first_sample(coordinate, size)); }
+
+// Samples that may be in a triangle: none where it cannot be drawn, as it has a vertex behind the near plane or not finite.
+struct OpaqueBounds {
+    int x_begin, x_end, y_begin, y_end;
+
+    ETSPLAT_FN bool empty() const { return x_begin >= x_end || y_begin >= y_end; }
+};
+
+ETSPLAT_FN OpaqueBounds opaque_bounds(const OpaqueVertex* v, int width, int height) {
+    if (!is_finite(v[0].inverse_depth + v[1].inverse_depth + v[2].inverse_depth)) return {0, 0, 0, 0};
+    double low[2] = {v[0].x, v[0].y}, high[2] = {v[0].x, v[0].y};
+    for (int k = 1; k < 3; ++k) {
+        low[0] = v[k].x < low[0] ? v[k].x : low[0];
+        high[0] = v[k].x > high[0] ? v[k].x : high[0];
+        low[1] = v[k].y < low[1] ? v[k].y : low[1];
+        high[1] = v[k].y > high[1] ? v[k].y : high[1];
+    }
+    return {first_sample(low[0], width), first_sample(high[0], width), first_sample(low[1], height),
+            first_sample(high[1], height)};
 }
 
 struct OpaqueEdge {
     double x, y, slope, x_low, x_high;
 
-    // Column of the first sample on the right side of the edge, clamped to [0, width].
-    ETSPLAT_FN int first_right(double sample_y, int width) const {
+    // Where a row meets it, relative to the middle of the first column, clamped to [0, width].
+    ETSPLAT_FN double clamped(double sample_y, int width) const {
         double at = x + (sample_y - y) * slope;
         at = at > x_low ? at : x_low;  // the edge's own range, so that both neighbours clamp alike (also a NaN)
         at = at < x_high ? at : x_high;
-        return first_sample(at, width);
+        return from_first_sample(at, width);
     }
+
+    // Column of the first sample on the right side of the edge.
+    ETSPLAT_FN int first_right(double sample_y, int width) const { return next_sample(clamped(sample_y, width)); }
 };
 
 ETSPLAT_FN OpaqueEdge opaque_edge(const OpaqueVertex& upper, const OpaqueVertex& lower) {
@@ -64,9 +93,7 @@ struct OpaqueTriangle {
     OpaqueEdge whole, upper, lower;  // from the top vertex to the bottom one, top to middle, middle to bottom
     double inverse_depth, inverse_depth_dx, inverse_depth_dy;  // plane, at the top vertex
     float inverse_depth_min, inverse_depth_max;
-    int x_begin, x_end, y_begin, y_end;  // samples; empty where the triangle draws nothing
-
-    ETSPLAT_FN bool draws() const { return x_begin < x_end && y_begin < y_end; }
+    OpaqueBounds bounds;
 
     // Columns [begin, end) that it covers on row y.
     ETSPLAT_FN void span(int y, int width, int& begin, int& end) const {
@@ -77,13 +104,13 @@ struct OpaqueTriangle {
         end = a < b ? b : a;
     }
 
-    // Inverse depth of row y at column x_begin.
+    // Inverse depth of row y at the first column of the bounds.
     ETSPLAT_FN float row_inverse_depth(int y) const {
         return static_cast<float>(inverse_depth + inverse_depth_dy * (y + 0.5 - whole.y) +
-                                  inverse_depth_dx * (x_begin + 0.5 - whole.x));
+                                  inverse_depth_dx * (bounds.x_begin + 0.5 - whole.x));
     }
 
-    // Inverse depth `column` samples right of x_begin, on a row that starts with `row`: the same number whoever asks.
+    // Inverse depth `column` samples right of that, on a row that starts with `row`: the same number whoever asks.
     ETSPLAT_FN float inverse_depth_at(float row, float slope, int column) const {
         float w = row + slope * static_cast<float>(column);
         w = w < inverse_depth_min ? inverse_depth_min : w;  // slivers must not extrapolate
@@ -91,14 +118,15 @@ struct OpaqueTriangle {
     }
 };
 
-// Empty if it cannot be drawn: a vertex behind the near plane or not finite, no area, facing away.
-ETSPLAT_FN OpaqueTriangle set_up_opaque(const OpaqueVertex* in, int width, int height, bool cull_backfaces) {
-    OpaqueTriangle t;
-    t.x_begin = t.x_end = t.y_begin = t.y_end = 0;
+// False if it draws nothing: no sample in its bounds, no area, facing away.
+ETSPLAT_FN bool set_up_opaque(const OpaqueVertex* in, const OpaqueBounds& bounds, bool cull_backfaces, OpaqueTriangle& t) {
+    if (bounds.empty()) return false;
+    if (cull_backfaces) {
+        const double facing = (in[1].x - in[0].x) * (in[2].y - in[0].y) - (in[2].x - in[0].x) * (in[1].y - in[0].y);
+        if (!(facing < 0.0)) return false;  // y points down: counter-clockwise is negative
+    }
     OpaqueVertex v[3] = {in[0], in[1], in[2]};
-    const double facing = (v[1].x - v[0].x) * (v[2].y - v[0].y) - (v[2].x - v[0].x) * (v[1].y - v[0].y);
-    if (cull_backfaces && !(facing < 0.0)) return t;  // y points down: counter-clockwise is negative
-    for (int i = 0; i < 3; ++i) {                     // by y, then x: pairs 01, 12, 01
+    for (int i = 0; i < 3; ++i) {  // by y, then x: pairs 01, 12, 01
         OpaqueVertex &a = v[i % 2], &b = v[i % 2 + 1];
         if (b.y < a.y || (b.y == a.y && b.x < a.x)) {
             const OpaqueVertex swapped = a;
@@ -113,7 +141,7 @@ ETSPLAT_FN OpaqueTriangle set_up_opaque(const OpaqueVertex* in, int width, int h
     t.inverse_depth = v[0].inverse_depth;
     t.inverse_depth_dx = (w1 * y2 - w2 * y1) / area;
     t.inverse_depth_dy = (x1 * w2 - x2 * w1) / area;
-    if (!is_finite(t.inverse_depth_dx) || !is_finite(t.inverse_depth_dy)) return t;
+    if (!is_finite(t.inverse_depth_dx) || !is_finite(t.inverse_depth_dy)) return false;
 
     double low = v[0].inverse_depth, high = v[0].inverse_depth;
     for (int k = 1; k < 3; ++k) {
@@ -125,11 +153,8 @@ ETSPLAT_FN OpaqueTriangle set_up_opaque(const OpaqueVertex* in, int width, int h
     t.whole = opaque_edge(v[0], v[2]);
     t.upper = opaque_edge(v[0], v[1]);
     t.lower = opaque_edge(v[1], v[2]);
-    t.y_begin = first_sample(v[0].y, height);
-    t.y_end = first_sample(v[2].y, height);
-    t.x_begin = first_sample(v[1].x < t.whole.x_low ? v[1].x : t.whole.x_low, width);
-    t.x_end = first_sample(v[1].x > t.whole.x_high ? v[1].x : t.whole.x_high, width);
-    return t;
+    t.bounds = bounds;
+    return true;
 }
 
 // Perspective-correct barycentrics b_k = (a_k / z_k) / sum_j (a_j / z_j), a clamped at 0, of the sample at column x and

@@ -3,6 +3,7 @@ import math
 import pytest
 import torch
 
+from etsplat import _native
 from etsplat.core.cameras import Cameras, intrinsics, look_at
 from etsplat.engines.threads import num_threads, set_num_threads
 from etsplat.geometry.icosphere import icosphere
@@ -215,6 +216,28 @@ def test_same_bits_for_any_number_of_threads(rng):
         seen = rasterize_opaque(corners, cameras=Cameras(IDENTITY, flat_camera(), 301, 203))
         results.append((image, seen.triangle, seen.barycentrics, seen.depth))
     set_num_threads(before)
+    for result in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(result, results[0], strict=True))
+
+
+@pytest.mark.sanitize
+def test_same_bits_on_every_instruction_set(rng):
+    """Rows are found many at once, and samples side by side, as many as registers hold: of one sample to large ones."""
+    corners = torch.cat([soup(rng, 300, spread) for spread in (3.0, 30.0, 300.0)])
+    size = torch.rand((len(corners), 1, 1), generator=rng)
+    corners[:, 1:, :2] = corners[:, :1, :2].lerp(corners[:, 1:, :2], size)
+    colors = torch.rand((len(corners), 3), generator=rng)
+    cameras, results = Cameras(IDENTITY, flat_camera(), 301, 203), []
+    before = _native.instruction_set()
+    try:
+        for name in _native.available_instruction_sets():
+            _native.set_instruction_set(name)
+            image = render_opaque(corners, cameras=cameras, face_colors=colors, supersampling=3).rgba
+            seen = rasterize_opaque(corners, cameras=cameras)
+            results.append((image, seen.triangle, seen.barycentrics, seen.depth))
+    finally:
+        _native.set_instruction_set(before)
+    assert int((results[0][1] >= 0).sum()) > 1000
     for result in results[1:]:
         assert all(torch.equal(a, b) for a, b in zip(result, results[0], strict=True))
 

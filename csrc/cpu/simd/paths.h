@@ -2,6 +2,7 @@
 #pragma once
 
 #include "cpu/normals_pass.h"
+#include "cpu/opaque_pass.h"
 #include "cpu/photometric_pass.h"
 #include "cpu/raster_pass.h"
 #include "cpu/triangle_pass.h"
@@ -14,6 +15,7 @@ namespace etsplat {
     TriangleKernels triangle_kernels();       \
     PhotometricKernels photometric_kernels(); \
     NormalsKernels normals_kernels();         \
+    OpaqueKernels opaque_kernels();           \
     }
 ETSPLAT_DECLARE_PATH(plain)
 ETSPLAT_DECLARE_PATH(avx2)
