@@ -39,7 +39,7 @@ from etsplat.tasks.sources import training_cameras
 from etsplat.tasks.train_checks import triangle_limit
 from etsplat.tasks.train_config import TrainConfig
 
-SOUP_SHARE, SOUP_TRIANGLES, MESH_SHARE = 0.3, 0.5, 0.4
+SOUP_SHARE, SOUP_TRIANGLES, MESH_SHARE = 0.3, 0.5, 1 / 3
 """Of the soup that becomes opaque, where the run's own is soft: its steps and its triangles, as parts of a run's. The
 others come where the mesh is wrong. And steps of the mesh (research/ablations.md)."""
 
@@ -52,7 +52,7 @@ SLOWEST, FASTEST = 0.1, 30.0
 COLOR_RATE, SETTLING_FROM, SETTLED = 5e-3, 0.7, 0.1
 """Adam's rate of colours; from this part of the steps on it falls, to this part of itself."""
 
-HALVINGS, FIRST_HALVING, LAST_HALVING = 5, 0.15, 0.65
+HALVINGS, FIRST_HALVING, LAST_HALVING = 8, 0.15, 0.65
 """How often triangles are halved, and when, as fractions of the steps."""
 
 DSSIM = 0.2
