@@ -39,8 +39,7 @@ void update(const AdamGroup& group, int64_t begin, int64_t count, const Size& si
     const float decay = group.decay;
     for (int64_t i = 0; i < count; ++i) {
         own.step_size = size(i);
-        const float whole = decay == 0.0f ? gradient[i] : gradient[i] + decay * parameter[i];
-        adam_update(parameter[i], first[i], second[i], whole, own);
+        adam_update(parameter[i], first[i], second[i], gradient[i], decay, own);
     }
 }
 

@@ -47,8 +47,6 @@ extern "C" __global__ void adam_step(AdamParameters parameters, int count, const
     for (int i = threadIdx.x; i < kElements; i += kThreads) {
         if (i >= left) break;
         if (pace) k.step_size = step_size * pace[static_cast<unsigned>(within + i) / static_cast<unsigned>(width)];
-        float whole = gradient[begin + i];
-        if (decay != 0.0f) whole += decay * value[begin + i];
-        adam_update(value[begin + i], first[begin + i], second[begin + i], whole, k);
+        adam_update(value[begin + i], first[begin + i], second[begin + i], gradient[begin + i], decay, k);
     }
 }

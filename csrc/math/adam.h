@@ -1,4 +1,5 @@
-// One element of an Adam step (Kingma and Ba 2015, algorithm 1), rounded as torch.optim.Adam rounds it.
+// One element of an Adam step (Kingma and Ba 2015, algorithm 1), rounded as torch.optim.Adam rounds it, also where contraction
+// is on.
 #pragma once
 
 #include "portable.h"
@@ -15,11 +16,18 @@ struct AdamCoefficients {
     T eps;
 };
 
+// Adds the parameter `decay` times to its gradient. All is read before anything is written: nobody knows where references
+// lead, so that a load behind a store waits for it.
 template <class T>
-ETSPLAT_FN void adam_update(T& parameter, T& first, T& second, T gradient, const AdamCoefficients<T>& k) {
-    first = first + k.first_weight * (gradient - first);
-    second = second * k.second_decay + k.second_weight * gradient * gradient;
-    parameter = parameter - k.step_size * (first / (vsqrt(second) / k.second_correction + k.eps));
+ETSPLAT_FN void adam_update(T& parameter, T& first, T& second, T gradient, T decay, const AdamCoefficients<T>& k) {
+    T p = parameter, m = first, v = second;
+    if (decay != T(0)) gradient = gradient + vproduct(decay, p);
+    m = m + vproduct(k.first_weight, gradient - m);
+    v = vproduct(v, k.second_decay) + vproduct(k.second_weight * gradient, gradient);
+    p = p - vproduct(k.step_size, m / (vsqrt(v) / k.second_correction + k.eps));
+    parameter = p;
+    first = m;
+    second = v;
 }
 
 }  // namespace etsplat
