@@ -35,16 +35,22 @@ struct StagedRows {
             __syncthreads();
         }
     }
-    // What is beyond Width is 0.
+    // The j-th of the thread's numbers, Stride in all, when the block has met; what is beyond Width is 0.
+    struct Number {
+        bool used;
+        long long at;  // in the whole array
+        float value;
+    };
+    __device__ Number number(int j) const {
+        const unsigned i = j * kThreads + threadIdx.x, row = i / Stride, column = i % Stride;
+        return {i < count * Stride, first * Stride + i, column < Width ? shared[row * kPitch + column] : 0.0f};
+    }
     __device__ void store(float* to) const {
         if constexpr (Stride > 0) {
-            float* block = to + first * Stride;
             __syncthreads();
 #pragma unroll(kUnroll)
-            for (int j = 0; j < Stride; ++j) {
-                const unsigned i = j * kThreads + threadIdx.x, row = i / Stride, column = i % Stride;
-                if (i < count * Stride) block[i] = column < Width ? shared[row * kPitch + column] : 0.0f;
-            }
+            for (int j = 0; j < Stride; ++j)
+                if (const Number each = number(j); each.used) to[each.at] = each.value;
         }
     }
 };

@@ -1,5 +1,7 @@
 """Operations of the GPU engine against the CPU engine, by the shim and, where there is one, on a GPU."""
 
+from contextlib import nullcontext
+
 import pytest
 import torch
 
@@ -12,6 +14,7 @@ from etsplat.ops.antialias import rasterize_antialiased
 from etsplat.ops.mesh_energies import mesh_energies
 from etsplat.ops.photometric import photometric_loss
 from etsplat.ops.rasterize_opaque import rasterize_opaque, render_opaque
+from etsplat.ops.soup_colors import EndAtColors, soup_colors
 from etsplat.ops.spherical_harmonics import spherical_harmonics
 from etsplat.ops.weighted_sum import Term, weighted_sum
 from helpers.engines import on
@@ -116,6 +119,54 @@ def test_a_halted_adam_changes_nothing(cuda_device):
         assert bool((parameter > 1).all())
         adam.step_on_device(rates, halted)
         torch.testing.assert_close(adam.first_moments["p"], torch.full_like(parameter, -0.9 * 0.2 + 0.1))
+
+
+@pytest.mark.parametrize(("degree", "bases"), [(0, 0), (0, 15), (1, 3), (2, 15), (3, 15), (3, 20)])
+@pytest.mark.parametrize("decays", [True, False])
+def test_a_step_of_coefficients_is_that_of_their_gradient(cuda_device, rng, degree, bases, decays):
+    """The same bits where gradients end at colours. Halted, nothing changes."""
+    found, expected = (steps_of_colors(cuda_device, rng, degree, bases, ends, decays) for ends in (True, False))
+    assert found[0] == [False] * 4  # coefficients have no gradient
+    same_bits(found[1], expected[1])
+    same_bits(found[2], expected[1])
+
+
+@pytest.mark.parametrize("case", ["gradient", "paces", "strides"])
+def test_coefficients_that_cannot_be_stepped_with_their_gradient_are_stepped_after_it(cuda_device, rng, case):
+    """Another term gives them one, they have paces, or they do not lie in order: the same bits as always."""
+    found, expected = (steps_of_colors(cuda_device, rng, 2, 8, ends, True, case) for ends in (True, False))
+    assert found[0] == [True] * 4
+    same_bits(found[1], expected[1])
+
+
+def steps_of_colors(device, rng, degree, bases, ends, decays, case=""):
+    """Four steps of two views that see two of three blocks, the last halted: whether coefficients had a gradient at the
+    end of each; parameters and moments after the third, and after the fourth."""
+    rng.manual_seed(3)
+    start = {"vertices": torch.randn((150, 3, 3), generator=rng), "dc": torch.randn((150, 1, 3), generator=rng)}
+    start["rest"] = 0.3 * torch.randn((150, bases, 3), generator=rng)
+    centers, cotangents = 4 * torch.randn((2, 3), generator=rng), torch.randn((3, 2, 150, 3), generator=rng)
+    cotangents[:, :, 64:128] = 0
+    numbers = torch.tensor([0.1, 0.2, 0.3, 0.7, 0.0, 0.2, 1.3], device=device)
+    parameters = {name: tensor.to(device, copy=True) for name, tensor in start.items()}
+    if case == "strides":
+        parameters["rest"] = parameters["rest"].transpose(1, 2).contiguous().transpose(1, 2)
+    adam = Adam({name: tensor.requires_grad_() for name, tensor in parameters.items()}, dict.fromkeys(start, 0.1))
+    if case == "paces":
+        adam.paces = {"rest": torch.linspace(0.1, 9.0, 150).to(device)}
+    had, states, halted = [], [], torch.zeros((), dtype=torch.int32, device=device)
+    for step in range(4):
+        adam.zero_grad()
+        with etsplat.engine("cuda"):
+            with EndAtColors(*parameters.values()) if ends else nullcontext() as ending:
+                colors = soup_colors(*parameters.values(), centers.to(device), degree)
+            loss = (colors * cotangents[step % 3].to(device)).sum()
+            (loss + parameters["rest"].square().sum() if case == "gradient" else loss).backward()
+            adam.step_on_device(numbers[:4], halted.fill_(step == 3), numbers[4:] if decays else None, ending)
+        had.append(parameters["rest"].grad is not None)
+        state = [*parameters.values(), *adam.first_moments.values(), *adam.second_moments.values()]
+        states.append(torch.cat([tensor.detach().cpu().flatten() for tensor in state]))
+    return had, *states[2:]
 
 
 @pytest.mark.parametrize(("degree", "channels", "bases"), [(0, 3, 1), (1, 3, 16), (2, 5, 9), (3, 3, 16), (3, 4, 16)])

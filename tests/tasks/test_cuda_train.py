@@ -14,6 +14,10 @@ from etsplat.data.demo_scene import demo_scene
 from etsplat.data.pictures import StoredPictures
 from etsplat.engines.cuda.steps import Repeated
 from etsplat.model.soup_init import StartPoints, start_soup
+from etsplat.model.triangle_soup import TriangleSoup
+from etsplat.optim.objective import Custom, Drawing, Objective
+from etsplat.optim.terms.photometric import Photometric
+from etsplat.optim.trainer import Trainer
 from etsplat.tasks.soup_trainer import make_trainer
 from etsplat.tasks.train import train
 from etsplat.tasks.train_config import TrainConfig
@@ -154,6 +158,49 @@ PAPER = {
     "loss.lambda_size": 1e-6,
     "loss.regularize_from": 0,
 }
+
+
+@pytest.mark.parametrize(
+    ("settings", "kernel"),
+    [({}, "soup_adam"), (PAPER, "soup_adam"), ({"batch": 2}, "soup_backward")],
+    ids=["quick", "paper", "batch"],
+)
+def test_coefficients_are_stepped_with_their_gradient(
+    simt: Simt, capture: Dataset, monkeypatch: pytest.MonkeyPatch, settings: Any, kernel: str
+) -> None:
+    """In steps of one view, with the bits of steps that make it first, over a densification and a higher degree."""
+    runs = []
+    for colored in (TriangleSoup.COLORED, None):
+        monkeypatch.setattr(TriangleSoup, "COLORED", colored)
+        simt.launches.clear()
+        problem = fitting(capture, "cuda", config=CONFIG.changed(settings))
+        runs.append((problem, problem.run(6), {"soup_adam", "soup_backward"} & set(simt.launches)))
+    (first, losses, kernels), (second, expected, others) = runs
+    assert kernels == {kernel}
+    assert others == {"soup_backward"}
+    assert losses == expected
+    same_bits(first, second)
+
+
+def test_a_term_may_draw_the_view_again(
+    cuda_device: torch.device, capture: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Colours are made twice then, and the gradients of all of them arrive."""
+
+    def again(drawing: Drawing) -> torch.Tensor:
+        return drawing.model.render(drawing.camera, backgrounds=drawing.background).color.square().mean()
+
+    def trainer() -> Trainer[TriangleSoup]:
+        soup = fitting(capture, "cuda", cuda_device).model
+        return Trainer(soup, capture, Objective(Photometric(0.2), [Custom(again, 0.5)]), seed=3)
+
+    problem = OnEngine("cuda", trainer)
+    losses = problem.run(4)
+    monkeypatch.setattr(TriangleSoup, "COLORED", None)
+    expected = OnEngine("cuda", trainer)
+    assert losses == pytest.approx(expected.run(4), rel=1e-5)
+    for name, tensor in problem.model.parameters().items():
+        torch.testing.assert_close(tensor, expected.model.parameters()[name], rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.parametrize(("settings", "own", "kernels"), [({}, 25, 18), (PAPER, 37, 34)], ids=["quick", "paper"])

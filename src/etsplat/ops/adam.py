@@ -14,6 +14,7 @@ from etsplat.core.validation import check_like, check_shape, check_written, dens
 from etsplat.engines.choice import engine_for, queued_steps
 from etsplat.engines.engine import Engine
 from etsplat.engines.reference.steps import AdamGroup, step_rates
+from etsplat.ops.soup_colors import EndAtColors, colors_backward
 
 
 class Adam:
@@ -101,16 +102,14 @@ class Adam:
         together: dict[Engine, list[str]] = {}
         for name, parameter in self.parameters.items():
             check_written(f"parameters[{name}]", parameter)  # `data` may have been set since
-            if parameter.grad is None:
-                raise ValueError(f"parameter {name} has no gradient: call backward() before step()")
             together.setdefault(engine_for(parameter), []).append(name)
-        groups_of = {engine: self._groups(names) for engine, names in together.items()}
+        groups_of = {engine: {name: self._group(name) for name in names} for engine, names in together.items()}
         self.step_count += 1
         for engine, names in together.items():
             groups, rates = groups_of[engine], [self.learning_rates[name] for name in names]
             added = [decays.get(name, 0.0) for name in names]
-            engine.adam_step(groups, rates, added, self.betas, self.eps, self.step_count)
-            self._store(names, groups)
+            engine.adam_step(list(groups.values()), rates, added, self.betas, self.eps, self.step_count)
+            self._store(groups)
 
     def rates(self, names: Sequence[str]) -> list[float]:
         """What step t = `step_count` needs: lr / (1 - b1^t) of each named parameter, then sqrt(1 - b2^t)."""
@@ -174,40 +173,66 @@ class Adam:
         self.paces = {name: _dense_copy(paces) for name, paces in state["paces"].items()}
 
     @torch.no_grad()
-    def step_on_device(self, rates: Tensor, halted: Tensor, decays: Tensor | None = None) -> None:
+    def step_on_device(
+        self, rates: Tensor, halted: Tensor, decays: Tensor | None = None, ending: EndAtColors | None = None
+    ) -> None:
         """A step as part of a queued one; it leaves `step_count` to the caller.
 
         Args:
             rates: (P + 1,) float32 in device memory, of `rates`.
             halted: () int32 in device memory: nothing is updated where it is not 0.
             decays: (P,) float32 in device memory, as those of `step`.
+            ending: Where gradients ended at colours of three of the parameters, from which they are carried on.
         """
-        names = list(self.parameters)
-        groups = self._groups(names)
-        queued_steps(groups[0][0]).adam_step(groups, rates, decays, self.betas, self.eps, halted)
-        self._store(names, groups)
+        engine, updated = queued_steps(rates), None
+        if ending is not None:
+            updated = self._carry_on(ending, rates, halted, decays)
+        groups = {name: self._group(name) for name in self.parameters if name != updated}
+        nothing = rates[:0]
+        no_group = nothing, nothing, nothing, nothing, None
+        in_order = [groups.get(name, no_group) for name in self.parameters]
+        engine.adam_step(in_order, rates, decays, self.betas, self.eps, halted)
+        self._store(groups)
 
-    def _groups(self, names: Sequence[str]) -> list[AdamGroup]:
-        """Value, gradient and moments of each parameter, contiguous."""
-        groups = []
-        for name in names:
-            parameter = self.parameters[name]
-            assert parameter.grad is not None
-            first, second = self.first_moments[name], self.second_moments[name]
-            if not parameter.shape == parameter.grad.shape == first.shape == second.shape:
-                was, got = tuple(first.shape), tuple(parameter.shape)
-                raise ValueError(f"parameter {name}, its gradient and moments must have one shape, {was}, got {got}")
-            paces = self.paces.get(name)
-            if paces is not None:
-                check_shape(f"paces of {name}", paces, (len(parameter),))
-                check_like(f"paces of {name}", paces, name, parameter)
-                paces = dense(paces, f"paces of {name}")
-            gradient = dense(parameter.grad, f"gradient of {name}")
-            groups.append((dense(parameter, name), gradient, first, second, paces))
-        return groups
+    def _carry_on(self, ending: EndAtColors, rates: Tensor, halted: Tensor, decays: Tensor | None) -> str | None:
+        """From colours to the parameters; the name of the one that was updated on the way, without a gradient."""
+        if ending.colors is None or ending.colors.grad is None:
+            return None
+        rest, updated, engine = ending.of[-1], None, queued_steps(rates)
+        place, name = next((i, name) for i, (name, p) in enumerate(self.parameters.items()) if p is rest)
+        gradient = ending.colors.grad, ending.colors.detach()
+        colored = ending.of, ending.centers, ending.degree
+        if rest.grad is None and name not in self.paces and rest.is_contiguous():
+            moments = self.first_moments[name], self.second_moments[name]
+            decay = None if decays is None else decays[place : place + 1]
+            numbers = rates[place : place + 1], rates[-1:], decay
+            found = engine.colors_adam(*gradient, *colored, moments, numbers, self.betas, self.eps, halted)
+            torch.autograd.graph.increment_version(rest)
+            updated = name
+        else:
+            found = colors_backward(gradient[0], *ending.of, *colored[1:])
+        for parameter, by_colors in zip(ending.of, found, strict=False):
+            parameter.grad = by_colors if parameter.grad is None else parameter.grad + by_colors
+        return updated
 
-    def _store(self, names: Sequence[str], groups: Sequence[AdamGroup]) -> None:
-        for name, (value, *_) in zip(names, groups, strict=True):
+    def _group(self, name: str) -> AdamGroup:
+        """Value, gradient and moments of a parameter, contiguous."""
+        parameter = self.parameters[name]
+        if parameter.grad is None:
+            raise ValueError(f"parameter {name} has no gradient: call backward() before step()")
+        first, second = self.first_moments[name], self.second_moments[name]
+        if not parameter.shape == parameter.grad.shape == first.shape == second.shape:
+            was, got = tuple(first.shape), tuple(parameter.shape)
+            raise ValueError(f"parameter {name}, its gradient and moments must have one shape, {was}, got {got}")
+        paces = self.paces.get(name)
+        if paces is not None:
+            check_shape(f"paces of {name}", paces, (len(parameter),))
+            check_like(f"paces of {name}", paces, name, parameter)
+            paces = dense(paces, f"paces of {name}")
+        return dense(parameter, name), dense(parameter.grad, f"gradient of {name}"), first, second, paces
+
+    def _store(self, groups: Mapping[str, AdamGroup]) -> None:
+        for name, (value, *_) in groups.items():
             parameter = self.parameters[name]
             if value.data_ptr() == parameter.data_ptr():
                 torch.autograd.graph.increment_version(parameter)  # so that a stale graph fails loudly in backward

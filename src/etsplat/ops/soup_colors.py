@@ -53,22 +53,25 @@ def soup_colors(
 
 
 class EndAtColors:
-    """Within the block gradients end at the colours that `soup_colors` makes of these tensors, once.
+    """Within the block gradients end at the colours that `soup_colors` makes of these tensors, the first time.
 
     So whoever gets the gradient of a view's colours, three numbers for each triangle, can carry it on to the
     coefficients, which are up to 48, in another place (`colors_backward`).
 
     Attributes:
+        of: the tensors: corners, and the coefficients of the constant band and of the others.
         colors: (B, N, 3) leaf, which gets the gradient; None before it was made.
+        again: whether colours were made of them once more, whose gradients went on.
         centers: (B, 3) positions of the cameras.
         degree: of the harmonics.
     """
 
     def __init__(self, vertices: Tensor, sh_dc: Tensor, sh_rest: Tensor) -> None:
         """Takes the tensors, which are recognised by being the same objects."""
-        self._of = (vertices, sh_dc, sh_rest)
+        self.of = (vertices, sh_dc, sh_rest)
         self.colors: Tensor | None = None
-        self.centers, self.degree = vertices.new_zeros((0, 3)), 0
+        self.again = False
+        self.centers, self.degree = vertices.new_empty((0, 3)), 0
 
     def __enter__(self) -> "EndAtColors":
         self._token: Token[EndAtColors | None] = _ending.set(self)
@@ -78,15 +81,12 @@ class EndAtColors:
         _ending.reset(self._token)
 
     def taken(self, colors: Tensor, of: tuple[Tensor, ...], centers: Tensor, degree: int) -> Tensor:
-        """A leaf in the place of colours of the tensors; others are given back.
-
-        Raises:
-            RuntimeError: It is the second time.
-        """
-        if not colors.requires_grad or any(one is not other for one, other in zip(of, self._of, strict=True)):
+        """A leaf in the place of the first colours of the tensors; others are given back."""
+        if not colors.requires_grad or any(one is not other for one, other in zip(of, self.of, strict=True)):
             return colors
         if self.colors is not None:
-            raise RuntimeError("colours of one view were made twice")
+            self.again = True
+            return colors
         self.colors, self.centers, self.degree = colors.detach().requires_grad_(), centers.detach(), degree
         return self.colors
 

@@ -197,6 +197,8 @@ def _colors(ending: EndAtColors | None) -> dict[str, Tensor]:
         return {}
     if ending.colors is None or ending.colors.grad is None:
         raise RuntimeError("a model with COLORED drew a view without soup_colors")
+    if ending.again:
+        raise RuntimeError("colours of one view were made twice")
     return {_COLORS: ending.colors.grad[0], _CENTER: ending.centers, _DEGREE: torch.tensor(ending.degree)}
 
 

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Hashable, Iterable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from itertools import takewhile
@@ -18,6 +19,7 @@ from etsplat.data.loader import View, ViewLoader
 from etsplat.engines.choice import engine_for
 from etsplat.model.model import Model
 from etsplat.ops.adam import Adam
+from etsplat.ops.soup_colors import EndAtColors
 from etsplat.optim.camera_refinement import CameraRefinement
 from etsplat.optim.depth_trust import DepthTrust
 from etsplat.optim.exposure import Exposure
@@ -86,6 +88,7 @@ class Stepper(Generic[M]):
         self.queue: StepQueue | None = None
         self._phase: tuple[Any, ...] = ()
         self._seen: list[Rasterization] = []  # by the step that is being captured
+        self._ended: EndAtColors | None = None  # where its gradients did, if before the coefficients
         queues = engine_for(next(iter(parameters.values()))).queues_steps
         if queues and update is None and not model.appearance.needs_host and workers().count == 1:
             self._row = RowLayout(
@@ -235,19 +238,27 @@ class Stepper(Generic[M]):
             (self._loader.look_up(kind, place), background[None])
             for kind, place, background in zip(kinds, places, backgrounds, strict=True)
         )
-        loss, self._seen = self._gradients(views, weights, fields["scale"][0], moving=moving, decayed=True)
+        with self._ending() as self._ended:
+            loss, self._seen = self._gradients(views, weights, fields["scale"][0], moving=moving, decayed=True)
         return loss
+
+    def _ending(self) -> AbstractContextManager[EndAtColors | None]:
+        """Adam carries gradients on from colours, where they are those of one view."""
+        names = self._model.COLORED
+        if names is None or self._batch > 1:
+            return nullcontext()
+        return EndAtColors(*(self.adam.parameters[name] for name in names))
 
     def _commit(self, row: Tensor, halted: Tensor) -> None:
         fields = self._row.unpack(row)
-        self.adam.step_on_device(fields["rates"], halted, fields["decays"])
+        self.adam.step_on_device(fields["rates"], halted, fields["decays"], self._ended)
         if self._exposure.learned:
             self._exposure.step_on_device(fields["exposure"], halted)
         if self._phase[-1]:
             self._cameras.step_on_device(fields["cameras"], halted)
         for rendering, epoch_starts in zip(self._seen, fields["epochs"].split(1), strict=True):
             self._strategy.observe_on_device(rendering, epoch_starts, halted)
-        self._seen = []
+        self._seen, self._ended = [], None
 
     def _gradients(
         self,

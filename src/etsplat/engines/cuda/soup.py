@@ -10,7 +10,7 @@ from etsplat.core.cameras import Cameras
 from etsplat.core.validation import dense
 from etsplat.engines.cuda.launch import launch_each, upload
 from etsplat.engines.cuda.program import Program
-from etsplat.engines.cuda.structs import constant
+from etsplat.engines.cuda.structs import constant, struct_class
 from etsplat.engines.native.operation import differentiable
 
 _ACTIVATION = Program("soup_activation.cu")
@@ -85,6 +85,42 @@ def _colors_backward(kept: Any, _needed: Any, grad_colors: Tensor) -> list[Tenso
     degree, dc, vertices, rest, *others = kept
     grads = [torch.empty_like(tensor) for tensor in (vertices, dc, rest)]
     _on_triangles(degree, rest, "soup_backward", vertices, rest, *others, grad_colors, *grads)
+    return grads
+
+
+def colors_adam(
+    grad_colors: Tensor,
+    colors: Tensor,
+    of: tuple[Tensor, Tensor, Tensor],
+    centers: Tensor,
+    degree: int,
+    moments: tuple[Tensor, Tensor],
+    numbers: tuple[Tensor, Tensor, Tensor | None],
+    betas: tuple[float, float],
+    eps: float,
+    halted: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """The gradients of `soup_colors` by its first two arguments, and a step of Adam on the third, without its gradient.
+
+    Args:
+        grad_colors: (B, N, 3), like the colours.
+        colors: that it gave.
+        of: its first three arguments; the third, which is contiguous, is updated.
+        centers: its fourth.
+        degree: its last.
+        moments: both of the third.
+        numbers: its step size, the correction of the second moment and its decay or None, all (1,) in device memory.
+        betas: of Adam.
+        eps: of Adam.
+        halted: () int32 in device memory: nothing is updated, and the gradients are anything, where it is not 0.
+    """
+    grad_colors, vertices, dc, centers = (dense(tensor) for tensor in (grad_colors, *of[:2], centers))
+    rest, (first_beta, second_beta) = of[2], betas
+    grads = torch.empty_like(vertices), torch.empty_like(dc)
+    constants = 1 - first_beta, second_beta, 1 - second_beta, eps
+    step = struct_class("cuda/soup_colors.cu", "RestStep")(*moments, *numbers, *constants, halted)
+    sizes = ctypes.c_int64(len(vertices)), len(centers)
+    _on_triangles(degree, rest, "soup_adam", vertices, rest, centers, *sizes, colors, grad_colors, *grads, step)
     return grads
 
 

@@ -11,6 +11,7 @@ from etsplat.core.rasterization import TriangleStatistics
 from etsplat.engines.cuda.capacity import overflow_flag, repair_overflow
 from etsplat.engines.cuda.launch import backend, blocks, launch, launch_each, upload
 from etsplat.engines.cuda.program import Program
+from etsplat.engines.cuda.soup import colors_adam
 from etsplat.engines.cuda.structs import constant, struct_class
 from etsplat.engines.reference.steps import AdamGroup, step_rates
 
@@ -87,6 +88,7 @@ class CudaQueuedSteps:
     """
 
     update_statistics = staticmethod(update_statistics)
+    colors_adam = staticmethod(colors_adam)
     repeated = Repeated
     """What queues the work of a function each time it is called, by and by without calling the function."""
 
