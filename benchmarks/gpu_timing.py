@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from benchmarks.gpu_floors import Work
 from benchmarks.gpu_scenes import GpuScene
@@ -94,23 +95,46 @@ def count(scene: GpuScene) -> Work:
     """The work of one step."""
     out = scene.render()
     out.color.backward(scene.cotangent)
-    render: CudaRender = out.color.grad_fn.constants[0]  # type: ignore[union-attr]
-    slots = int(render.zeros[2 + 2 * -(-len(scene.opacities) // 1024)].item())
-    hits = render.state.bytes("hits", slots)
-    bits = sum(((hits >> bit) & 1).sum(dtype=torch.int64) for bit in range(8))
+    return work_of(scene, out.color.grad_fn.constants[0])  # type: ignore[union-attr]
+
+
+def work_of(scene: GpuScene, render: CudaRender) -> Work:
+    """The work of a render and its backward pass, from its buffers."""
+    hits = hits_of(render)
     visible = render.state.bytes("spans", 8 * len(scene.opacities)).view(torch.int32).view(-1, 2)[:, 1] != 0
     batch, height, width, channels = scene.cotangent.shape
     return Work(
         triangles=len(scene.opacities),
         visible=int(visible.sum()),
         vertices=0 if scene.faces is None else len(scene.vertices),
-        slots=slots,
+        slots=len(hits),
         hit_slots=int((hits != 0).sum()),
-        hit_pairs=int(bits),
+        hit_pairs=int(pairs_of(hits).sum()),
         pixels=batch * height * width,
         tiles=batch * -(-height // _native.TILE) * -(-width // _native.TILE),
         channels=channels,
     )
+
+
+def hits_of(render: CudaRender) -> Tensor:
+    """(slots,) uint8: a bit for each sub-tile in which the slot draws something."""
+    return render.state.bytes("hits", int(render.zeros[_counters(render)]))
+
+
+def pairs_of(hits: Tensor) -> Tensor:
+    """How many bits there are."""
+    return torch.stack([(hits >> bit) & 1 for bit in range(8)]).sum(dim=0, dtype=torch.int64)
+
+
+def ranges_of(render: CudaRender) -> Tensor:
+    """(tiles, 2): where the slots of each tile begin and end, among the sorted ones."""
+    begin = _counters(render) + 2
+    return render.zeros[begin : begin + 2 * render.tile_count].view(-1, 2).long()
+
+
+def _counters(render: CudaRender) -> int:
+    """Where the number of slots is, among what was zero at first (`CudaRender`)."""
+    return 2 + 2 * -(-render.projected // 1024)
 
 
 class _Nothing:

@@ -16,6 +16,7 @@ from benchmarks import (
     floaters,
     gpu,
     gpu_floors,
+    gpu_forms,
     gpu_reconstruct,
     gpu_scenes,
     gpu_timing,
@@ -30,6 +31,7 @@ from benchmarks.measure import native_state
 from etsplat import _native, rasterize
 from etsplat.core.cameras import Cameras
 from etsplat.data.demo_scene import demo_scene
+from etsplat.engines.cuda.program import Program
 from etsplat.engines.threads import one_torch_thread
 from etsplat.tasks.train_config import TrainConfig
 from helpers.captures import small_demo_scene
@@ -127,6 +129,16 @@ def test_work_of_the_gpu_engine_is_counted_by_the_shim():
     assert work.slots >= work.hit_slots > 0
     assert 8 * work.hit_slots >= work.hit_pairs >= work.hit_slots
     assert all(floor.ms > 0 for floor in gpu_floors.floors(work, gpu_floors.PEAKS["H100"]))
+
+
+def test_work_of_tiles_adds_up_and_their_other_loop_exchanges_nothing():
+    """What `gpu_forms` counts by tiles, against the counts of the whole picture; and the loop that it compiles."""
+    work, tiles = gpu_forms.counted(gpu_scenes.load("sphere1", "cpu"))
+    assert len(tiles.slots) == work.tiles
+    assert int(tiles.slots.sum()) == work.hit_slots
+    assert int(tiles.pairs.sum()) == work.hit_pairs
+    kept, changed = (kind("raster_backward.cu").source for kind in (Program, gpu_forms.InRegisters))
+    assert kept.count("sum_sixteen(") == changed.count("sum_sixteen(") + 1
 
 
 def test_host_time_is_measured_without_kernels():
