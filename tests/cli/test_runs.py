@@ -9,12 +9,14 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
+import torch
 
 from etsplat.cli.command import Command, resume_line
 from etsplat.cli.doctor import Doctor
 from etsplat.cli.parse import parse
 from etsplat.core.errors import InputError
 from tests.helpers.commands import PROGRAM, Run, assert_one_line_error, in_own_process
+from tests.helpers.torch_threads import COUNTS, on_each_count
 
 
 def test_memory_that_torch_does_not_get_is_no_traceback(etsplat: Run, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -155,3 +157,16 @@ def test_resume_line_keeps_the_options() -> None:
     """The suggested command quotes what needs it, says --resume once, and never --overwrite."""
     line = resume_line(["demo", "--out", "my run", "--overwrite", "--resume"])
     assert line == "etsplat demo --out 'my run' --resume"
+
+
+def test_commands_have_torch_compute_on_one_thread(etsplat: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On how many it would depend the last bits of files; afterwards there are as many as before."""
+    seen: list[int] = []
+
+    def run(command: Command, arguments: Sequence[str]) -> int:
+        seen.append(torch.get_num_threads())
+        return 0
+
+    monkeypatch.setattr(Doctor, "run", run)
+    on_each_count(lambda: etsplat("doctor"))
+    assert seen == [1] * len(COUNTS)

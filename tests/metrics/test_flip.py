@@ -4,6 +4,7 @@ import torch
 from torch import Tensor
 
 from etsplat.metrics.flip import flip
+from helpers.torch_threads import on_each_count
 
 
 def picture(index: int, height: int, width: int) -> np.ndarray:
@@ -77,3 +78,9 @@ def test_bad_arguments_are_named():
         flip(image[:0], image[:0])
     with pytest.raises(ValueError, match="pixels_per_degree: expected a positive number, got 0"):
         flip(image, image, pixels_per_degree=0.0)
+
+
+def test_equal_bits_on_any_number_of_torchs_threads(rng):
+    """Of pictures large enough that torch shares their sums and powers out."""
+    image, truth = (torch.rand(401, 403, 3, generator=rng) for _ in range(2))
+    assert len(set(on_each_count(lambda: float(flip(image, truth))))) == 1

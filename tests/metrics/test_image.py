@@ -11,6 +11,7 @@ from scipy.ndimage import correlate
 from etsplat.core.errors import InputError
 from etsplat.metrics import image as image_metrics
 from etsplat.metrics.image import Lpips, colors_fitted, find_lpips_weights, psnr, silhouette_iou, ssim
+from helpers.torch_threads import on_each_count
 
 
 @pytest.fixture
@@ -231,3 +232,10 @@ def test_lpips_refuses_images_too_small_for_its_five_stages(weights):
 def test_silhouettes_of_other_shapes_are_refused():
     with pytest.raises(ValueError, match=r"truth must have the coverage's shape \(5, 6\), got \(5, 1\)"):
         silhouette_iou(torch.rand(5, 6), torch.rand(5, 1))
+
+
+def test_equal_bits_on_any_number_of_torchs_threads(rng):
+    """Of pictures large enough that torch shares their sums out."""
+    image, truth = (torch.rand(401, 403, 3, generator=rng) for _ in range(2))
+    found = on_each_count(lambda: (psnr(image, truth), ssim(image, truth), ssim(image, truth, interior=True)))
+    assert len(set(found)) == 1

@@ -7,6 +7,7 @@ import torch
 
 import etsplat
 from etsplat.optim.camera_motion import DAMPING, common_motions, distance_shown, moved, unit_motions, zoomed
+from helpers.torch_threads import on_each_count
 
 CAMERAS = etsplat.orbit_cameras(100, 80, elevations=(10.0, 40.0), azimuths=3).to(dtype=torch.float64)
 
@@ -98,3 +99,10 @@ def test_what_moves_all_cameras_alike_is_in_the_basis() -> None:
     assert float((together - basis @ (basis.T @ together)).norm() / together.norm()) < 1e-3
     alone = torch.cat([learned[0], torch.zeros(30, dtype=torch.float64)])
     assert float((alone - basis @ (basis.T @ alone)).norm() / alone.norm()) > 0.5
+
+
+def test_the_basis_has_equal_bits_on_any_number_of_torchs_threads() -> None:
+    cameras = etsplat.orbit_cameras(100, 80, elevations=(10.0, 40.0), azimuths=20).to(dtype=torch.float64)
+    units = torch.stack([unit_motions(points(), cameras[i]) for i in range(len(cameras))])
+    first, *others = on_each_count(lambda: common_motions(cameras.viewmats, units))
+    assert all(torch.equal(first, other) for other in others)

@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
 
 from etsplat.core.errors import InputError
 from etsplat.data.dataset import Dataset
@@ -19,6 +20,7 @@ from etsplat.tasks.export_mesh import texture_mesh
 from etsplat.tasks.reconstruct import reconstruct
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 from helpers.reconstructions import KilledError
+from helpers.torch_threads import on_each_count
 
 pytest.importorskip("xatlas")
 pytest.importorskip("fast_simplification")
@@ -112,3 +114,25 @@ def test_what_cannot_be_made_is_refused_before_the_run(
     with pytest.raises(InputError, match="need xatlas"):
         reconstruct(ball, tmp_path / "run", TEXTURED)
     assert not (tmp_path / "run").exists()
+
+
+def test_the_texture_has_equal_bits_on_any_number_of_torchs_threads(ball: Path, tmp_path: Path) -> None:
+    """Every byte of the file."""
+    run = reconstruct(ball, tmp_path / "run", SHORT).path
+
+    def written() -> bytes:
+        texture_mesh(run, size=512, faces=200).save(tmp_path / "light.glb")
+        return (tmp_path / "light.glb").read_bytes()
+
+    assert len(set(on_each_count(written))) == 1
+
+
+def test_runs_have_torch_compute_on_one_thread(ball: Path, tmp_path: Path) -> None:
+    """Also between their loops."""
+    seen: set[int] = set()
+
+    def hear(event: Event) -> None:
+        seen.add(torch.get_num_threads())
+
+    on_each_count(lambda: reconstruct(ball, tmp_path / "run", TEXTURED, callbacks=[hear], overwrite=True))
+    assert seen == {1}

@@ -30,7 +30,11 @@ def run_command(parse: Callable[[Sequence[str]], Command], arguments: Sequence[s
     """
     before = signal.signal(signal.SIGTERM, _interrupt)
     try:
-        sys.exit(parse(arguments).run(arguments))
+        command = parse(arguments)
+        from etsplat.engines.threads import one_torch_thread  # imports torch, which `--help` does without
+
+        with one_torch_thread():
+            sys.exit(command.run(arguments))
     except BrokenPipeError:  # `etsplat --help | head`: nobody reads on
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(FAILED)

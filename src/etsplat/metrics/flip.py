@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from etsplat.core.precision import as_given
 from etsplat.core.validation import check_device, check_floating, check_memory
+from etsplat.engines.threads import all_torch_threads, one_torch_thread
 
 PIXELS_PER_DEGREE = 67.0
 """Of a display 0.7 m away that is 3840 pixels and 0.7 m wide: the paper's default."""
@@ -36,6 +37,7 @@ _FEATURE_WIDTH, _FEATURE_POWER = 0.082, 0.5
 """Width of what counts as an edge or a point, in degrees, and q_f."""
 
 
+@one_torch_thread()
 @as_given
 def flip(
     image: Float[Tensor, "H W 3"], truth: Float[Tensor, "H W 3"], *, pixels_per_degree: float = PIXELS_PER_DEGREE
@@ -157,9 +159,10 @@ def _separable(
 ) -> Float[Tensor, "B H W"]:
     """Filtered along rows and columns; beyond the border there is the pixel at it."""
     radius = len(across) // 2
-    wide = nn.functional.pad(planes[:, None], (radius,) * 4, mode="replicate")
-    wide = nn.functional.conv2d(wide, across.view(1, 1, 1, -1))
-    return nn.functional.conv2d(wide, down.view(1, 1, -1, 1))[:, 0]
+    with all_torch_threads():
+        wide = nn.functional.pad(planes[:, None], (radius,) * 4, mode="replicate")
+        wide = nn.functional.conv2d(wide, across.view(1, 1, 1, -1))
+        return nn.functional.conv2d(wide, down.view(1, 1, -1, 1))[:, 0]
 
 
 def _offsets(radius: int, like: Tensor) -> Float[Tensor, " K"]:

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 
 from etsplat.core.errors import InputError
 from etsplat.core.validation import check_device, check_memory
+from etsplat.engines.threads import all_torch_threads, one_torch_thread
 from etsplat.io.paths import kind_of
 from etsplat.io.tensors import read_state_dict
 
@@ -40,6 +41,7 @@ _WEIGHTS = {
 """Where the weights of LPIPS come from, by the names that torch's cache has for them; SHA-256 of each."""
 
 
+@one_torch_thread()
 def psnr(image: Float[Tensor, "H W C"], truth: Float[Tensor, "H W C"]) -> float:
     """Peak signal-to-noise ratio in dB, -10 log10 mean((image - truth)^2), peak 1, in float (no rounding to 8 bits).
 
@@ -58,6 +60,7 @@ def psnr(image: Float[Tensor, "H W C"], truth: Float[Tensor, "H W C"]) -> float:
     return math.inf if error == 0 else -10 * math.log10(error)
 
 
+@one_torch_thread()
 def colors_fitted(
     image: Float[Tensor, "H W 3"],
     truth: Float[Tensor, "H W 3"],
@@ -118,6 +121,7 @@ def silhouette_iou(coverage: Float[Tensor, "H W"], truth: Float[Tensor, "H W"]) 
     return int((ours & theirs).sum()) / union if union else 1.0
 
 
+@one_torch_thread()
 def ssim(image: Float[Tensor, "H W C"], truth: Float[Tensor, "H W C"], *, interior: bool = False) -> float:
     """Structural similarity (Wang et al. 2004): 11x11 Gaussian window of sigma 1.5, C1 = 0.01^2, C2 = 0.03^2, peak 1.
 
@@ -219,6 +223,7 @@ class Lpips(nn.Module):
         return lpips
 
     @torch.no_grad()
+    @one_torch_thread()
     def forward(self, image: Float[Tensor, "H W 3"], truth: Float[Tensor, "H W 3"], *, rescale: bool = True) -> Tensor:
         """The distance, a scalar tensor; 0 for equal images.
 
@@ -241,7 +246,8 @@ class Lpips(nn.Module):
         scale = pair.new_tensor([0.458, 0.448, 0.450]).view(3, 1, 1)
         features, total = (pair - shift) / scale, pair.new_zeros(())
         for index, layer in enumerate(self.features):
-            features = layer(features)
+            with all_torch_threads():
+                features = layer(features)
             if index in _TAPS:
                 unit = features / (features.square().sum(dim=1, keepdim=True).sqrt() + 1e-10)
                 weigh = self.get_submodule(f"lin{_TAPS.index(index)}.model")
@@ -308,8 +314,10 @@ def _blur(planes: Float[Tensor, "M C H W"], padding: int) -> Float[Tensor, "M C 
     offsets = torch.arange(WINDOW, dtype=planes.dtype) - WINDOW // 2
     window = torch.exp(-(offsets**2) / (2 * _SIGMA**2))
     weights = (window / window.sum()).tolist()
-    blurred = [_weighted(_weighted(plane, weights, 0, padding), weights, 1, padding) for plane in planes.flatten(0, 1)]
-    return torch.stack(blurred).unflatten(0, planes.shape[:2])
+    with all_torch_threads():
+        flat = planes.flatten(0, 1)
+        blurred = [_weighted(_weighted(plane, weights, 0, padding), weights, 1, padding) for plane in flat]
+        return torch.stack(blurred).unflatten(0, planes.shape[:2])
 
 
 def _weighted(plane: Float[Tensor, "H W"], weights: Sequence[float], dim: int, padding: int) -> Float[Tensor, "H2 W2"]:

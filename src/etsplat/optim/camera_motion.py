@@ -17,6 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from etsplat.core.cameras import Cameras
+from etsplat.engines.threads import one_torch_thread
 
 DAMPING = 1.0
 """Of the diagonal that is added: with less, directions in which pictures hardly move drift (research/results.md)."""
@@ -100,6 +101,7 @@ def _in_frame(points: Float[Tensor, "N 3"], camera: Cameras) -> Float[Tensor, "M
 
 
 @torch.no_grad()
+@one_torch_thread()
 def common_motions(viewmats: Float[Tensor, "P 4 4"], units: Float[Tensor, "P 6 6"]) -> Float[Tensor, "6P k"]:
     """What moves, turns or scales all cameras together, which no photo shows: an orthonormal basis, k at most 7.
 

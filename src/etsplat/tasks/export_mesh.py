@@ -12,6 +12,7 @@ from torch import Tensor
 from etsplat.core.errors import InputError
 from etsplat.data.dataset import Dataset
 from etsplat.engines.choice import resolve_device
+from etsplat.engines.threads import one_torch_thread
 from etsplat.geometry.decimation import decimated
 from etsplat.io.georeference import GEOREFERENCE_FILE, Georeference
 from etsplat.io.mesh_files import MeshFile, load_mesh, save_mesh
@@ -132,6 +133,7 @@ def _exposures(run: RunDirectory, views: Dataset) -> dict[int, Float[Tensor, "3 
     return {view: torch.tensor(matrices[name]) for view in views.train if (name := views.names[view]) in matrices}
 
 
+@one_torch_thread()
 def texture_mesh(
     run: Path | str,
     *,

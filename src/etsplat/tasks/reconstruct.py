@@ -13,6 +13,7 @@ from etsplat.data.agreement import contradicted, unseen_vertices
 from etsplat.data.dataset import Dataset
 from etsplat.data.lids import lids
 from etsplat.engines.choice import engine
+from etsplat.engines.threads import one_torch_thread
 from etsplat.geometry.parts import Shape, genera, shape_of
 from etsplat.io.mesh_files import MeshFile
 from etsplat.model.triangle_mesh import TriangleMesh
@@ -93,6 +94,7 @@ class ReconstructResult(Result):
 
 
 @together()
+@one_torch_thread()
 def reconstruct(
     source: Source,
     out: str | Path,
@@ -108,9 +110,9 @@ def reconstruct(
 ) -> ReconstructResult:
     """Deforms a sphere, or the visual hull, into the object that the source shows.
 
-    A run ends with the same bits on the same machine, torch and number of threads, also if it was killed and resumed
-    any number of times, or made by several workers of torchrun (docs/distributed.md), which all call this. Ctrl-C
-    leaves a checkpoint of the last whole iteration.
+    A run ends with the same bits on the same machine and version of torch, on any number of threads, also if it was
+    killed and resumed any number of times, or made by several workers of torchrun (docs/distributed.md), which all call
+    this. Ctrl-C leaves a checkpoint of the last whole iteration.
 
     Args:
         source: a mesh file or `MeshFile`, which is photographed from 40 sides; "demo:owl", an object built in code; a

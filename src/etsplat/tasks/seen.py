@@ -11,6 +11,7 @@ from etsplat.core.cameras import Cameras
 from etsplat.core.rasterization import Rasterization
 from etsplat.data.loader import View
 from etsplat.data.pictures import as_float
+from etsplat.engines.threads import all_torch_threads
 from etsplat.io.images import over_background
 from etsplat.metrics.image import colors_fitted
 from etsplat.model.model import Model
@@ -75,7 +76,8 @@ class Seen:
     @cached_property
     def covered(self) -> Float[Tensor, "H W 4"]:
         """(H, W, 4) as a mesh viewer draws it, premultiplied."""
-        return self._model.render_opaque(self._view.camera, supersampling=self._supersampling)[0]
+        with all_torch_threads():
+            return self._model.render_opaque(self._view.camera, supersampling=self._supersampling)[0]
 
     @property
     def opaque(self) -> Float[Tensor, "H W 3"]:

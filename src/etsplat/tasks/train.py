@@ -11,6 +11,7 @@ import torch
 from etsplat.core.workers import together, workers
 from etsplat.data.dataset import Dataset
 from etsplat.engines.choice import engine, engine_for
+from etsplat.engines.threads import one_torch_thread
 from etsplat.io.mesh_files import MeshFile
 from etsplat.io.opaque_files import save_opaque
 from etsplat.io.run_directory import RunDirectory
@@ -65,6 +66,7 @@ class TrainResult(Result):
 
 
 @together()
+@one_torch_thread()
 def train(
     source: str | Path | Dataset,
     out: str | Path,
@@ -83,9 +85,9 @@ def train(
 ) -> TrainResult:
     """Fits a triangle soup to the photos of a scene, and makes an opaque mesh beside it if that is asked for.
 
-    A run ends with the same bits on the same machine, torch and number of threads, also if it was killed and resumed
-    any number of times, or made by several workers of torchrun (docs/distributed.md), which all call this. Ctrl-C
-    leaves a checkpoint of the last whole iteration.
+    A run ends with the same bits on the same machine and version of torch, on any number of threads, also if it was
+    killed and resumed any number of times, or made by several workers of torchrun (docs/distributed.md), which all call
+    this. Ctrl-C leaves a checkpoint of the last whole iteration.
 
     Args:
         source: a folder with posed photos (of the programs in `docs/captures.md`), a `Dataset` in its own units, or
