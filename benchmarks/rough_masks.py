@@ -220,7 +220,7 @@ def row(name: str, source: Path, kind: str, truth: MeshFile, clean: Dataset | No
     try:
         loaded, _ = load_source(source, config)
         views, _ = make_subject(loaded, config, lambda *_: None, torch.device("cpu"))
-        vertices, faces = plain_hull(views, config)
+        vertices, faces = plain_hull(views, config)[:2]
     except InputError as error:
         return f"{head} {error} |", None
     seconds, frame = time.process_time() - begun, views.normalization

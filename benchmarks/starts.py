@@ -3,7 +3,8 @@
     python -m benchmarks.starts FOLDERS [--objects NAMES]
 
 Inputs are those of `python -m studies.gallery`, with a known surface. Of each of the three its holes, and the exact
-Chamfer distance x 1e-3 of 20,000 samples; photos, faces and frame are those of preset quick. With CPU seconds.
+Chamfer distance x 1e-3 of 20,000 samples; photos, faces and frame are those of preset quick. With CPU seconds; of the
+hull also what it leaves uncovered of the silhouettes, and the parts and holes of a finer one if it has others.
 """
 
 import argparse
@@ -13,6 +14,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from etsplat.data.dataset import Dataset
 from etsplat.data.false_handles import without_false_handles
 from etsplat.data.hollows import open_hollows
 from etsplat.geometry.parts import genera
@@ -20,7 +22,7 @@ from etsplat.io.mesh_files import load_mesh
 from etsplat.metrics.geometry import chamfer_exact, exact_squared_distances, sample_pair
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.sources import load_source, make_subject
-from etsplat.tasks.starts import plain_hull
+from etsplat.tasks.starts import Hull, finer_shape, plain_hull
 from studies.objects.subjects import Subject, find_subjects
 
 SAMPLES = 20_000
@@ -33,20 +35,27 @@ def rows(subject: Subject) -> list[str]:
     config = ReconstructConfig.quick()
     views, _ = make_subject(load_source(subject.source, config)[0], config, lambda *_: None, torch.device("cpu"))
     truth = load_mesh(subject.surface)
-    found, surface, begun = [], (torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.int64)), time.process_time()
+    found, begun = [], time.process_time()
+    hull = plain_hull(views, config)
+    surface = hull.vertices, hull.faces
     for name in ("hull", "without false handles", "opened"):
-        if name == "hull":
-            surface = plain_hull(views, config)
+        if name == "without false handles":
+            surface = without_false_handles(views, *surface)
         elif name == "opened":
             surface = open_hollows(views, *surface)[:2]
-        else:
-            surface = without_false_handles(views, *surface)
         seconds = time.process_time() - begun
         score = distance(surface, views.normalization.apply(truth.vertices), truth.faces)
         holes = ", ".join(str(count) for count in genera(surface[1], len(surface[0])))
-        found.append(f"| {subject.name} | {name} | {len(surface[1]):,} | {holes} | {1e3 * score:.3f} | {seconds:.1f} |")
+        covers = _uncovered(hull, views, config) if name == "hull" else ""
+        row = (subject.name, name, f"{len(surface[1]):,}", holes, covers, f"{1e3 * score:.3f}", f"{seconds:.1f}")
+        found.append(f"| {' | '.join(row)} |")
         begun = time.process_time()
     return found
+
+
+def _uncovered(hull: Hull, views: Dataset, config: ReconstructConfig) -> str:
+    finer = finer_shape(hull, views, config.start.radius)
+    return f"{100 * hull.uncovered:.3f}" + (f"; finer: {finer.parts}, {finer.holes}" if finer else "")
 
 
 def distance(surface: tuple[Tensor, Tensor], vertices: Tensor, faces: Tensor) -> float:
@@ -59,7 +68,8 @@ def main() -> None:
     parser.add_argument("inputs", nargs="+", type=Path)
     parser.add_argument("--objects", nargs="*", default=())
     options = parser.parse_args()
-    print("| object | start | faces | holes of each part | Chamfer | CPU s |\n|---|---|---|---|---|---|", flush=True)
+    titles = ("object", "start", "faces", "holes of each part", "uncovered, %", "Chamfer", "CPU s")
+    print(f"| {' | '.join(titles)} |\n|{'---|' * len(titles)}", flush=True)
     with torch.no_grad():
         for subject in find_subjects(options.inputs, options.objects):
             print("\n".join(rows(subject)), flush=True)

@@ -73,7 +73,7 @@ def _carve(subject: Subject, config: ReconstructConfig, path: Path) -> dict[str,
     found: dict[str, Any] = {"problem": None, "silhouette_iou": None, "up": None if up is None else up.tolist()}
     started = time.perf_counter()
     try:
-        vertices, faces = plain_hull(views, config)
+        vertices, faces = plain_hull(views, config)[:2]
     except InputError as error:
         return {**found, "problem": str(error), "seconds": time.perf_counter() - started}
     found["seconds"] = time.perf_counter() - started

@@ -7,12 +7,13 @@ import pytest
 import torch
 
 from etsplat.data.agreement import contradicted
+from etsplat.data.closed_hollows import closed_hollows
 from etsplat.data.hollows import _where_agreed, _without_unseen, open_hollows
 from etsplat.data.visual_hull import visual_hull
 from etsplat.geometry.distance import closest_points
 from etsplat.geometry.measures import face_areas
 from etsplat.geometry.topology import MeshTopology
-from etsplat.tasks.judgement import CONTRADICTED
+from etsplat.tasks.judgement import CLOSED, CONTRADICTED
 from helpers.painting import mean_colors, painted_pictures
 
 
@@ -139,6 +140,14 @@ def test_what_photos_contradict_is_measured(bowl):
     vase = open_hollows(views, *visual_hull(views, 1600))
     assert vase.contradicted > CONTRADICTED
     assert contradicted_of(views, vase.vertices, vase.faces) == pytest.approx(vase.contradicted, abs=0.01)
+
+
+def test_how_much_of_a_hollow_is_closed_is_measured(bowl):
+    truth, faces, views, hull, opened = bowl
+    closed = closed_hollows(views, (truth, faces), hull)
+    assert closed > 5 * CLOSED
+    assert closed_hollows(views, (truth, faces), (opened.vertices, opened.faces)) < closed / 5
+    assert closed_hollows(views, (truth, faces), (truth, faces)) == 0
 
 
 def test_where_there_is_no_texture_nothing_moves():

@@ -48,10 +48,13 @@ def judged(
     untangled: bool = True,
     shown: bool = True,
     contradicted: float = 0.0,
+    cut_off: float = 0.0,
+    closed: float = 0.0,
 ) -> Judgement:
     wanted = Expected(expected, None if expected.unclear else "input mesh", shown)
-    said = {"begun": begun, "preset": preset, "untangled": untangled, "contradicted": contradicted}
-    return judge("test", scores, intersecting, found, wanted, **said)
+    shares = {"contradicted": contradicted, "cut_off": cut_off, "closed": closed}
+    run = {"begun": begun, "preset": preset, "untangled": untangled}
+    return judge("test", scores, intersecting, found, wanted, **shares, **run)
 
 
 def test_a_patch_that_photos_contradict_is_told():
@@ -60,6 +63,22 @@ def test_a_patch_that_photos_contradict_is_told():
     assert verdict == (
         "poor: photos contradict each other on 2.8 % of its surface, where a hollow may be closed: "
         "try more photos that look into it, or depth maps"
+    )
+
+
+def test_where_no_photo_says_how_an_object_goes_on_is_told():
+    assert judged(cut_off=0.004).verdict.startswith("good")
+    assert judged(cut_off=0.016).verdict == (
+        "poor: the frame cuts the object off on 1.6 % of the visual hull's surface, where nothing says how it goes on: "
+        "try photos that show all of it"
+    )
+
+
+def test_a_hollow_of_the_input_mesh_that_is_closed_is_told():
+    assert judged(closed=0.004).verdict.startswith("good")
+    assert judged(closed=0.023).verdict == (
+        "poor: on 2.3 % of what photos show the result lies far in front of the input mesh, so a hollow is closed: "
+        "try --init-mesh with a mesh that has it, or a texture for photos to agree on"
     )
 
 

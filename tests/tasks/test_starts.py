@@ -13,12 +13,13 @@ from etsplat.data.dataset import Dataset
 from etsplat.data.photograph import photograph
 from etsplat.data.pictures import Box, StoredPictures, cropped
 from etsplat.geometry.icosphere import icosphere
-from etsplat.geometry.parts import genera
+from etsplat.geometry.parts import Shape, genera, shape_of
 from etsplat.io.mesh_files import MeshFile
 from etsplat.optim.loop import Event, NoteEvent
+from etsplat.tasks.judgement import expect_hull
 from etsplat.tasks.reconstruct import reconstruct
 from etsplat.tasks.reconstruct_config import ReconstructConfig
-from etsplat.tasks.starts import start_shape
+from etsplat.tasks.starts import Hull, finer_shape, plain_hull, start_shape
 from helpers.reconstructions import SHORT, KilledError, kill_at, pebble_mesh, untimed
 
 
@@ -55,6 +56,57 @@ def test_photos_that_together_show_all_of_an_object_start_from_the_hull() -> Non
     Ks[:, 0, 2] -= torch.tensor([float(box.left) for box in boxes])
     views = replace(whole, Ks=Ks, images=cropped(whole.images, boxes))
     assert start_shape(ReconstructConfig.quick(), views) == "hull"
+
+
+def hull_shape(hull: Hull) -> Shape:
+    return shape_of(hull.vertices, hull.faces)
+
+
+def ring_of(thickness: float) -> MeshFile:
+    ring = trimesh.creation.torus(1.0, thickness, major_sections=64, minor_sections=12)
+    return MeshFile(torch.from_numpy(ring.vertices.copy()).float(), torch.from_numpy(ring.faces.copy()).long())
+
+
+def test_long_runs_start_from_the_hull_of_short_ones() -> None:
+    """A finer one is opened worse, and costs more; it has its faces later."""
+    views = photograph(MeshFile(*icosphere(3)), 96, 96, supersampling=1)
+    best, quick = (plain_hull(views, ReconstructConfig.of(preset)) for preset in ("best", "quick"))
+    assert torch.equal(best.vertices, quick.vertices)
+    assert torch.equal(best.faces, quick.faces)
+    assert len(best.faces) < 15_000
+
+
+def test_a_hull_that_lacks_thin_parts_is_known_by_what_it_leaves_uncovered() -> None:
+    """A thin ring, of which a coarse grid has pieces: the verdict compares no parts and holes, and says what to try."""
+    views = photograph(ring_of(0.03), 128, 128, supersampling=2)
+    config = ReconstructConfig.quick()
+    torn, whole = (plain_hull(views, config.changed({"start.hull_faces": faces})) for faces in (1000, 3000))
+    assert hull_shape(torn).parts == 24
+    assert torn.uncovered > 0.0005
+    finer = finer_shape(torn, views, config.start.radius)
+    assert finer == Shape(1, 1)
+    expected = expect_hull(hull_shape(torn), finer, 2 * torn.wanted)
+    assert expected.of is None
+    assert expected.shape.unclear == (
+        "a finer visual hull has 1 part and 1 hole: try --start.hull-faces 2000 --max-faces 4000"
+    )
+    assert hull_shape(whole) == Shape(1, 1)
+    assert whole.uncovered < 0.0005
+    assert finer_shape(whole, views, config.start.radius) is None
+
+
+def test_what_masks_lack_is_no_matter_of_how_fine_a_hull_is() -> None:
+    """They lack it on any grid: here one in four has lost half of the object, and is outvoted by none."""
+    whole = photograph(MeshFile(*icosphere(3)), 96, 96, supersampling=1)
+    images = list(whole.images)
+    for index in whole.train[::4]:
+        images[index] = images[index].clone()
+        images[index][:, 48:] = 0
+    views = replace(whole, images=StoredPictures(images))
+    config = ReconstructConfig.quick().changed({"start.hull_faces": 3000})
+    found = plain_hull(views, config)
+    assert found.uncovered > 0.05
+    assert finer_shape(found, views, config.start.radius) is None
 
 
 def test_settings_of_one_start_are_taken_where_it_is_chosen_as_the_run_begins(tmp_path: Path) -> None:

@@ -71,13 +71,20 @@ class Carving:
 
     def depth(self, views: Sequence[Silhouette], points: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:
         """How deep points are in the hull, in units of the scene; -inf where less than half of the views judge."""
+        lowest, judges = self.judged(views, points)
+        return torch.where(2 * judges >= len(views), lowest, -torch.inf)
+
+    def judged(
+        self, views: Sequence[Silhouette], points: Float[Tensor, "N 3"]
+    ) -> tuple[Float[Tensor, " N"], Float[Tensor, " N"]]:
+        """How deep points are by those views that judge, infinite where none does; and how many these are."""
         lowest, judges = Lowest(self.outvoted + 1, len(points)), torch.zeros(len(points))
         points = points.T.contiguous().T
         for view in views:
             found, unit, judged = view.depth(points)
             lowest.add(torch.where(judged, (found + self.grown) * unit, torch.inf))
             judges += judged
-        return torch.where(2 * judges >= len(views), lowest.values[-1], -torch.inf)
+        return lowest.values[-1], judges
 
 
 class Lowest:

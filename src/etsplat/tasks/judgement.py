@@ -25,6 +25,12 @@ GOOD_INTERSECTING = 1.0
 CONTRADICTED = 0.005
 """Share of the surface that photos contradict in one patch, which good results have at most."""
 
+CLOSED = 0.005
+"""Share of what photos see of an input mesh that lies far behind the result, of good results at most."""
+
+CUT_OFF = 0.005
+"""Share of the visual hull's surface where the frame cuts it off, which good results have at most."""
+
 TRAINING_VIEWS = 16
 """So many training views, evenly spaced, are looked at where there are no test views."""
 
@@ -121,8 +127,12 @@ def expect_photos(photos: Dataset, found: Shape, radius: float) -> Expected:
     return expect_hull(shape)
 
 
-def expect_hull(shape: Shape) -> Expected:
-    """What a result should look like whose visual hull has this shape."""
+def expect_hull(shape: Shape, finer: Shape | None = None, finer_faces: int = 0) -> Expected:
+    """What a result should look like whose visual hull has this shape; unclear where a `finer` one has another."""
+    if finer is not None:
+        has = finer.unclear or f"has {_counted(finer)}"
+        remedy = f"try --start.hull-faces {finer_faces} --max-faces {2 * finer_faces}"
+        return Expected.unclear(f"a finer visual hull {has}: {remedy}")
     return Expected.unclear(f"the visual hull {shape.unclear}") if shape.unclear else Expected(shape, "visual hull")
 
 
@@ -140,6 +150,8 @@ def judge(
     expected: Expected,
     *,
     contradicted: float,
+    cut_off: float,
+    closed: float,
     begun: Start,
     preset: str,
     untangled: bool,
@@ -153,6 +165,8 @@ def judge(
         found: what the result looks like.
         expected: what it should look like.
         contradicted: the largest patch that photos contradict, as a fraction of the surface.
+        cut_off: where the visual hull ends because photos do, as a fraction of its surface.
+        closed: where the result fills a hollow of the input mesh, as a fraction of what photos see of it.
         begun: what the run started from; with the rest it decides what to try next.
         preset: of the run.
         untangled: whether faces that cut through others were smoothed away.
@@ -176,6 +190,16 @@ def judge(
         poor.append(
             f"photos contradict each other on {100 * contradicted:.1f} % of its surface, where a hollow may be closed: "
             "try more photos that look into it, or depth maps"
+        )
+    if cut_off > CUT_OFF:
+        poor.append(
+            f"the frame cuts the object off on {100 * cut_off:.1f} % of the visual hull's surface, where nothing says "
+            "how it goes on: try photos that show all of it"
+        )
+    if closed > CLOSED:
+        poor.append(
+            f"on {100 * closed:.1f} % of what photos show the result lies far in front of the input mesh, so a "
+            "hollow is closed: try --init-mesh with a mesh that has it, or a texture for photos to agree on"
         )
     return Judgement(
         views=views,

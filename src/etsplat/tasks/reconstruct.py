@@ -10,6 +10,8 @@ from typing import Any
 from etsplat.core.errors import InputError
 from etsplat.core.workers import together
 from etsplat.data.agreement import contradicted, unseen_vertices
+from etsplat.data.closed_hollows import closed_hollows
+from etsplat.data.cut_off import cut_off
 from etsplat.data.dataset import Dataset
 from etsplat.data.lids import lids
 from etsplat.engines.choice import engine
@@ -54,7 +56,7 @@ from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.running import Job, Result, path_of, settings_for, terms_of
 from etsplat.tasks.scoring import Scorer, load_lpips
 from etsplat.tasks.sources import Source, fingerprint, load_source, make_subject
-from etsplat.tasks.starts import Started, load_start, make_start, nearby
+from etsplat.tasks.starts import Started, finer_shape, load_start, make_start, nearby
 from etsplat.tasks.texturing import check_installed
 
 DEPTHS_NEAR, DEPTHS_FAR = 0.02, 0.15
@@ -174,7 +176,7 @@ def reconstruct(
             lpips=load_lpips(config.output.lpips_weights, job.device),
         )
         started = make_start(start, views, config, job.device)
-        mesh, begun, _ = started
+        mesh, begun = started.mesh, started.kind
         judging = partial(_judge, scorer, views, truth, config, started, shape_of(*mesh.surface()))
         if begun == "hull":
             holes = f"holes in each part: {genera(mesh.faces.cpu(), len(mesh.vertices))}"
@@ -253,11 +255,11 @@ def _judge(
         scores: of it.
     """
     found = shape_of(*mesh.surface())
-    doubtful = started.contradicted > CONTRADICTED
+    doubtful, hull = started.contradicted > CONTRADICTED, started.hull
     if truth is not None:
         expected = expect_mesh(truth, views, found, config.start.radius)
-    elif started.kind == "hull":
-        expected = expect_hull(start)
+    elif hull is not None:
+        expected = expect_hull(start, finer_shape(hull, views, config.start.radius), 2 * hull.wanted)
     else:
         expected = expect_photos(views, found, config.start.radius)
     return judge(
@@ -267,6 +269,8 @@ def _judge(
         found,
         expected,
         contradicted=contradicted(views, *mesh.surface(), mesh.display_face_colors.cpu()) if doubtful else 0.0,
+        cut_off=0.0 if hull is None else cut_off(views, hull.vertices, hull.faces),
+        closed=0.0 if truth is None else closed_hollows(views, (truth.vertices, truth.faces), mesh.surface()),
         begun=started.kind,
         preset=config.preset,
         untangled=config.refinement.untanglings > 0,

@@ -6,9 +6,10 @@ from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import max_pool2d
 
 from etsplat.core.errors import InputError
-from etsplat.data.agreement import photos_of
+from etsplat.data.agreement import Photo, first_hits, photos_of
 from etsplat.data.dataset import Dataset
 from etsplat.data.false_handles import silhouette_errors, without_false_handles
 from etsplat.data.hollows import open_hollows
@@ -16,6 +17,7 @@ from etsplat.data.lids import without_lids
 from etsplat.data.silhouettes import silhouette, touches_border
 from etsplat.data.visual_hull import visual_hull
 from etsplat.geometry.icosphere import icosphere
+from etsplat.geometry.parts import Shape, shape_of
 from etsplat.geometry.topology import MeshTopology
 from etsplat.geometry.untangle import untangle
 from etsplat.io.mesh_files import MeshFile, load_mesh, weld_vertices
@@ -29,6 +31,26 @@ _FACES = 4000
 _LOST = 0.05
 """The part of silhouettes that it may leave uncovered, in the mean: less than a limb."""
 
+_UNCOVERED, _LESS = 0.0005, 0.9
+"""A hull that leaves more of the silhouettes uncovered lacks thin parts if a finer one leaves at most so many times as
+much: what rough masks leave does not depend on how fine it is."""
+
+
+class Hull(NamedTuple):
+    """The visual hull, before false handles go and hollows are opened.
+
+    Attributes:
+        vertices: (V, 3), in the unit frame.
+        faces: (F, 3).
+        wanted: about how many faces it should have.
+        uncovered: the part of silhouettes that is more than a pixel beside what it covers, in the mean.
+    """
+
+    vertices: Tensor
+    faces: Tensor
+    wanted: int
+    uncovered: float
+
 
 class Started(NamedTuple):
     """What a run starts from.
@@ -37,11 +59,13 @@ class Started(NamedTuple):
         mesh: in the unit frame.
         kind: where it comes from.
         contradicted: the largest patch of a hull that photos contradict, as a fraction of its area; 0 otherwise.
+        hull: that it was, before it was mended; None for another kind.
     """
 
     mesh: TriangleMesh
     kind: Start
     contradicted: float
+    hull: Hull | None = None
 
 
 def load_start(start: str | Path | MeshFile | None) -> MeshFile | None:
@@ -76,6 +100,23 @@ def _explained(views: Dataset, radius: float) -> bool:
     return float(lost.mean()) <= _LOST
 
 
+def _carved(views: Dataset, faces: int, radius: float) -> Hull:
+    """A hull of about so many faces; where the silhouettes have no point in common it has none, and covers nothing."""
+    surface = visual_hull(views, faces, radius=radius)
+    return Hull(*surface, faces, _uncovered(photos_of(views), *surface) if len(surface[1]) else 1.0)
+
+
+def _uncovered(photos: list[Photo], vertices: Tensor, faces: Tensor) -> float:
+    """The part of silhouettes that is more than a pixel beside what a surface covers, in the mean."""
+    found = []
+    for photo in photos:
+        covered = (first_hits(photo, vertices, faces)[1] >= 0).float()
+        near = max_pool2d(covered[None, None], 3, stride=1, padding=1)[0, 0]
+        alpha = photo.pixels[0, 3]
+        found.append(float((alpha > 0.95)[near == 0].sum() / (alpha > 0.5).sum().clamp_min(1)))
+    return sum(found) / max(1, len(found))
+
+
 def make_start(
     start: MeshFile | None, views: Dataset, config: ReconstructConfig, device: torch.device | None = None
 ) -> Started:
@@ -92,10 +133,11 @@ def make_start(
     """
     colors: Tensor | float = config.start.color
     kind: Start = start_shape(config, views) if start is None else "mesh"
-    contradicted = 0.0
+    contradicted, hull = 0.0, None
     if kind == "hull":
-        hull = without_lids(views, *without_false_handles(views, *plain_hull(views, config)))
-        vertices, faces, _, contradicted = open_hollows(views, *hull)
+        hull = plain_hull(views, config)
+        mended = without_lids(views, *without_false_handles(views, hull.vertices, hull.faces))
+        vertices, faces, _, contradicted = open_hollows(views, *mended)
         vertices = untangle(vertices, MeshTopology.from_faces(faces, len(vertices)))[0]
     elif start is None:
         vertices, faces = icosphere(config.start.level)
@@ -115,15 +157,16 @@ def make_start(
         appearance=MeshAppearance(kernel, config.drawing.distance, config.drawing.backend),
         harmonics=config.drawing.harmonics,
     )
-    return Started(mesh, kind, contradicted)
+    return Started(mesh, kind, contradicted, hull)
 
 
-def plain_hull(views: Dataset, config: ReconstructConfig) -> tuple[Tensor, Tensor]:
-    """The visual hull, before false handles go and hollows are opened: (V, 3) and (F, 3), in the unit frame.
+@torch.no_grad()
+def plain_hull(views: Dataset, config: ReconstructConfig) -> Hull:
+    """The visual hull, with at most half of a run's faces.
 
     Args:
         views: of the unit frame.
-        config: how many faces are wanted.
+        config: how many faces are wanted, and how many there may be.
 
     Raises:
         InputError: the views have no masks, or masks that exclude everything.
@@ -131,13 +174,30 @@ def plain_hull(views: Dataset, config: ReconstructConfig) -> tuple[Tensor, Tenso
     if not views.has_masks:
         raise InputError("start.shape: hull needs masks or transparent pictures; give masks, or start from a sphere")
     wanted = min(config.start.hull_faces, max(1, config.max_faces // 2))
-    vertices, faces = visual_hull(views, wanted, radius=config.start.radius)
-    if len(faces) == 0:
+    hull = _carved(views, wanted, config.start.radius)
+    if len(hull.faces) == 0:
         raise InputError(
             "start.shape: the masks have no point in common, so there is no hull; check that masks are white inside the"
             " object and that poses and images belong together"
         )
-    return vertices, faces
+    return hull
+
+
+@torch.no_grad()
+def finer_shape(hull: Hull, views: Dataset, radius: float) -> Shape | None:
+    """Parts and holes of a finer hull, if it covers what this one does not, and has others.
+
+    Args:
+        hull: from `plain_hull`.
+        views: of which it is.
+        radius: as `visual_hull` takes it.
+    """
+    if hull.uncovered <= _UNCOVERED:
+        return None
+    finer = _carved(views, 2 * hull.wanted, radius)
+    shape = shape_of(finer.vertices, finer.faces)
+    covers = finer.uncovered <= _LESS * hull.uncovered
+    return shape if covers and shape != shape_of(hull.vertices, hull.faces) else None
 
 
 def nearby(config: ReconstructConfig) -> ReconstructConfig:
