@@ -20,7 +20,10 @@ _PRODUCTS = (0, 1, 2, 4, 5, 8)
 _SQUARE = (0, 1, 2, 1, 3, 4, 2, 4, 5)
 """Which of the nine products of barycentrics are kept, and where each of the nine is among them."""
 
-_TOGETHER = 1 << 15
+_SIZES = (0, 3, 5)
+"""Which of them are squares, above 0 where there is a pixel."""
+
+_TOGETHER = 1 << 12
 
 
 class HalvingGains:
@@ -66,7 +69,11 @@ class HalvingGains:
     def gains(self) -> Float[Tensor, " F"]:
         """By how much less the sum of squared differences of photos left out is for the halves, float64."""
         sums = self._sums.reshape(_PARTS, self._count, 2, -1)
-        return torch.cat([_gains(some.double()) for some in sums.split(_TOGETHER, dim=1)])
+        in_parts = (sums[..., _SIZES].sum(dim=(2, 3)) > 0).sum(dim=0)
+        asked = (in_parts > 1).nonzero()[:, 0]  # what a single part shows, nobody else says anything of
+        gained = torch.zeros(self._count, dtype=torch.float64)
+        gained[asked] = torch.cat([_gains(sums[:, some].double()) for some in asked.split(_TOGETHER)])
+        return gained
 
 
 def _gains(sums: Float[Tensor, "R F 2 15"]) -> Float[Tensor, " F"]:
