@@ -32,18 +32,6 @@ SMALLEST: dict[str, tuple[list[str], str]] = {
 """By example: what makes it small, and the picture that it then writes."""
 
 
-GIVEN = """
-import torch, etsplat
-owl, _ = etsplat.normalize_mesh(etsplat.demo_object())
-vertices, faces = owl.vertices.requires_grad_(), owl.faces
-colors, opacities = torch.ones(len(faces), 3), torch.ones(len(faces))
-width, height = 32, 32
-around = etsplat.orbit_cameras(width, height, elevations=(0.0,), azimuths=2)
-viewmats, Ks, photographs = around.viewmats, around.Ks, torch.zeros(2, height, width, 3)
-"""
-"""What README.md leaves to its readers."""
-
-
 def run(program: list[str], folder: Path) -> str:
     environment = {**os.environ, "MPLBACKEND": "Agg"}
     command = [sys.executable, *program]
@@ -110,10 +98,25 @@ def test_the_trainer_of_the_documents_runs(tmp_path: Path) -> None:
 
 
 def test_the_call_of_the_readme_runs(tmp_path: Path) -> None:
-    """With what it leaves to the reader put before it."""
+    """As it stands: it leaves nothing to its readers."""
     code = code_of("README.md", "etsplat.rasterize(")
-    printed = run(["-c", f"{GIVEN}\n{code}\nprint(float(vertices.grad.abs().sum()))"], tmp_path)
+    printed = run(["-c", f"{code}\nprint(float(vertices.grad.abs().sum()))"], tmp_path)
     assert float(printed) > 0
+
+
+def test_the_pieces_of_ones_own_of_the_documents_run(tmp_path: Path) -> None:
+    """docs/extending.md: a kernel, on the command line too; a loss; a strategy that takes away two tenths."""
+    page = "docs/extending.md"
+    kernel = code_of(page, "register_kernel(")
+    (tmp_path / "plateau.py").write_text(kernel)
+    shorter = code_of(page, '"method"').replace('{"method"', '{"iterations": 4, "method"')
+    run(["-c", kernel + shorter], tmp_path)
+    (command,) = re.findall("^    etsplat (.* --kernel-file .*)$", (ROOT / page).read_text(encoding="utf-8"), re.M)
+    run(["-m", "etsplat", *command.split(), "--iterations", "4", "--overwrite"], tmp_path)
+    assert (tmp_path / "runs" / "plateau" / "mesh.glb").is_file()
+    loss = code_of(page, "Custom(").replace("fit(100", "fit(4")
+    printed = run(["-c", loss + code_of(page, "class Thin") + "print(soup.count)"], tmp_path)
+    assert printed.splitlines()[-1] == "1620"
 
 
 def test_the_notebook_runs(tmp_path: Path) -> None:
