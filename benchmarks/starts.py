@@ -1,8 +1,8 @@
-"""What runs start from: the visual hull, that without false handles, and that with its hollows open.
+"""What runs start from: the visual hull, without false handles, with its hollows open, and with its plain sides flat.
 
     python -m benchmarks.starts FOLDERS [--objects NAMES]
 
-Inputs are those of `python -m studies.gallery`, with a known surface. Of each of the three its holes, and the exact
+Inputs are those of `python -m studies.gallery`, with a known surface. Of each of the four its holes, and the exact
 Chamfer distance x 1e-3 of 20,000 samples; photos, faces and frame are those of preset quick. With CPU seconds; of the
 hull also what it leaves uncovered of the silhouettes, and the parts and holes of a finer one if it has others.
 """
@@ -17,6 +17,7 @@ from torch import Tensor
 from etsplat.data.dataset import Dataset
 from etsplat.data.false_handles import without_false_handles
 from etsplat.data.hollows import open_hollows
+from etsplat.data.plain_sides import with_flat_sides
 from etsplat.geometry.parts import genera
 from etsplat.io.mesh_files import load_mesh
 from etsplat.metrics.geometry import chamfer_exact, exact_squared_distances, sample_pair
@@ -29,7 +30,7 @@ SAMPLES = 20_000
 
 
 def rows(subject: Subject) -> list[str]:
-    """One of the table for each of the three."""
+    """One of the table for each of the four."""
     if subject.surface is None:
         raise SystemExit(f"{subject.name}: its surface is not known")
     config = ReconstructConfig.quick()
@@ -38,11 +39,13 @@ def rows(subject: Subject) -> list[str]:
     found, begun = [], time.process_time()
     hull = plain_hull(views, config)
     surface = hull.vertices, hull.faces
-    for name in ("hull", "without false handles", "opened"):
+    for name in ("hull", "without false handles", "opened", "flat"):
         if name == "without false handles":
             surface = without_false_handles(views, *surface)
         elif name == "opened":
             surface = open_hollows(views, *surface)[:2]
+        elif name == "flat":
+            surface = with_flat_sides(views, *surface), surface[1]
         seconds = time.process_time() - begun
         score = distance(surface, views.normalization.apply(truth.vertices), truth.faces)
         holes = ", ".join(str(count) for count in genera(surface[1], len(surface[0])))

@@ -24,6 +24,10 @@ class Grid:
         """Distance from the z axis."""
         return np.hypot(self.x, self.y)
 
+    def pillar(self, x: float, y: float) -> Field:
+        """Distance from a line along the z axis."""
+        return np.hypot(self.x - x, self.y - y)
+
     def ball(self, center: Point, radius: float) -> Field:
         """Round."""
         return np.sqrt(sum(place**2 for place in self._from(center))) - radius
@@ -184,10 +188,72 @@ def shelf(g: Grid) -> Field:
     return case
 
 
+def cottage(g: Grid) -> Field:
+    """Flat sides: walls with recessed windows behind bars, a roof that stands over them, a chimney with a flue."""
+    slope = 0.6 * np.abs(g.y) + 0.8 * g.z
+    attic = np.maximum(np.maximum(slope - 0.42, np.abs(g.x) - 0.58), -0.1 - g.z)
+    roof = np.maximum(np.maximum(np.abs(slope - 0.45) - 0.04, np.abs(g.x) - 0.68), np.abs(g.y) - 0.56)
+    solid = union(g.block((0, 0, -0.3), (0.58, 0.44, 0.42), 0), attic, g.block((0, 0, -0.72), (0.62, 0.48, 0.06), 0))
+    for x in (-0.3, 0.3):
+        for side in (-1, 1):
+            pane = np.maximum(g.block((x, 0.44 * side, -0.2), (0.15, 0.06, 0.13), 0), -np.abs(g.x - x) + 0.02)
+            solid = np.maximum(solid, -np.maximum(pane, -np.abs(g.z + 0.2) + 0.02))
+    solid = np.maximum(solid, -g.block((0.58, 0, -0.4), (0.05, 0.12, 0.26), 0))
+    flue = g.block((-0.4, 0.12, 0.9), (0.045, 0.045, 0.2), 0)
+    return union(solid, roof, np.maximum(g.block((-0.4, 0.12, 0.6), (0.09, 0.09, 0.26), 0), -flue))
+
+
+def tree(g: Grid) -> Field:
+    """A trunk with roots, whose limbs fork three times and end in tips of a fiftieth."""
+    rng, parts = np.random.default_rng(5), []
+
+    def limb(a: np.ndarray, way: np.ndarray, length: float, radius: float, forks: int) -> None:
+        b = a + length * way
+        parts.append(g.rod(a, b, radius))
+        turn = math.tau * rng.random()
+        sides = np.linalg.qr(np.column_stack([way, rng.normal(size=(3, 2))]))[0][:, 1:]
+        for number in range(3 if forks == 3 else 2 * (forks > 0)):
+            angle = turn + math.tau * number / (3 if forks == 3 else 2)
+            out = way + 0.75 * sides @ np.array([math.cos(angle), math.sin(angle)]) + np.array([0, 0, 0.15])
+            limb(b, out / np.linalg.norm(out), 0.72 * length, 0.62 * radius, forks - 1)
+
+    limb(np.array([0, 0, -0.75]), np.array([0, 0, 1.0]), 0.55, 0.12, 3)
+    for angle in math.tau * np.arange(6) / 6:
+        tip = np.array([0.4 * math.cos(angle), 0.4 * math.sin(angle), -0.8])
+        parts.append(g.rod((0, 0, -0.6), tip, 0.05))
+    return union(*parts)
+
+
+def violin(g: Grid) -> Field:
+    """A flat body with a waist, a board that floats over it, a thin neck, a bridge, pegs."""
+    lobes = union(g.pillar(0.3, 0) - 0.27, g.pillar(-0.18, 0) - 0.21, g.block((0.06, 0, 0), (0.25, 0.16, 2), 0))
+    board = g.block((-0.42, 0, 0.12), (0.36, 0.045, 0.015))
+    neck = union(g.rod((-0.3, 0, 0.05), (-0.8, 0, 0.09), 0.035), g.ball((-0.86, 0, 0.05), 0.07))
+    pegs = [g.rod((x, -0.13, 0.07), (x, 0.13, 0.07), 0.018) for x in (-0.8, -0.72)]
+    tail = union(g.block((0.42, 0, 0.11), (0.12, 0.04, 0.015)), g.rod((0.56, 0, 0), (0.53, 0, 0.11), 0.02))
+    return union(
+        np.maximum(lobes, np.abs(g.z) - 0.06), board, neck, *pegs, tail, g.block((0.17, 0, 0.1), (0.012, 0.09, 0.06))
+    )
+
+
+def well(g: Grid) -> Field:
+    """A round wall around a shaft, two posts, a roof over it, a bar from which a bucket hangs."""
+    wall = np.maximum(np.maximum(np.abs(g.around - 0.36) - 0.06, -0.8 - g.z), g.z + 0.3)
+    roof = np.maximum(
+        np.maximum(np.abs(0.5 * np.abs(g.y) + 0.87 * g.z - 0.7) - 0.03, np.abs(g.x) - 0.55), np.abs(g.y) - 0.42
+    )
+    posts = [g.block((0.4 * side, 0, 0.05), (0.045, 0.045, 0.75), 0) for side in (-1, 1)]
+    bar = union(g.rod((-0.4, 0, 0.15), (0.55, 0, 0.15), 0.03), g.rod((0.55, 0, 0.15), (0.55, 0, 0.0), 0.025))
+    bucket = np.maximum(np.maximum(np.abs(np.hypot(g.x, g.y) - 0.11) - 0.025, np.abs(g.z + 0.2) - 0.1), -0.3 - g.z)
+    bail = union(g.rod((0, 0, 0.15), (0, 0, -0.1), 0.015), g.rod((-0.12, 0, -0.12), (0.12, 0, -0.12), 0.02))
+    return union(wall, g.disc(-0.8, 0.6, 0.05), roof, *posts, bar, bucket, bail, g.disc(-0.29, 0.12, 0.03))
+
+
 SHAPES: dict[str, Callable[[Grid], Field]] = {
     shape.__name__: shape
     for shape in (
         *(chair, chain, bowl, vase, plant, gear, cage, plate, figures),
         *(teapot, comb, clasp, basket, shelf),
+        *(cottage, tree, violin, well),
     )
 }

@@ -14,6 +14,7 @@ from etsplat.data.dataset import Dataset
 from etsplat.data.false_handles import silhouette_errors, without_false_handles
 from etsplat.data.hollows import open_hollows
 from etsplat.data.lids import without_lids
+from etsplat.data.plain_sides import with_flat_sides
 from etsplat.data.silhouettes import silhouette, touches_border
 from etsplat.data.visual_hull import visual_hull
 from etsplat.geometry.icosphere import icosphere
@@ -138,6 +139,7 @@ def make_start(
         hull = plain_hull(views, config)
         mended = without_lids(views, *without_false_handles(views, hull.vertices, hull.faces))
         vertices, faces, _, contradicted = open_hollows(views, *mended)
+        vertices = with_flat_sides(views, vertices, faces)
         vertices = untangle(vertices, MeshTopology.from_faces(faces, len(vertices)))[0]
     elif start is None:
         vertices, faces = icosphere(config.start.level)

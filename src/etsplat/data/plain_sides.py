@@ -1,0 +1,197 @@
+"""Plain sides of a hull: over a flat side it stands like a tent, and where photos show one colour nothing says so.
+
+The silhouettes need the side's edges alone: each line of sight that touches the tent touches an edge too, where the
+hull is sharper. So of the vertices that silhouettes need, the sharpest stay; the others, where photos that see them
+show nothing to compare, are drawn to the smallest surface between those that stay, and inwards only.
+"""
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int64
+from scipy.sparse import csr_array, diags_array
+from scipy.sparse.linalg import splu
+from torch import Tensor
+
+from etsplat.data.agreement import (
+    Photo,
+    first_hits,
+    photos_of,
+    pixel_size,
+    reduced,
+    seen_by,
+    surface_agreement,
+)
+from etsplat.data.dataset import Dataset
+from etsplat.data.silhouettes import Silhouette
+from etsplat.geometry.measures import vertex_normals
+from etsplat.geometry.topology import MeshTopology, connected
+
+_OUTLINE = 1.5
+"""Pixels from the outline, within which a vertex touches it."""
+
+_ALIKE = 0.5
+"""Cosine of the angle between outlines that run along each other."""
+
+_ROUND = 3
+"""Rounds in which places are averaged with their neighbours', to see where the hull is sharp."""
+
+_BESIDE, _AGREED = 2, 0.75
+"""So many neighbours away patches may show a side's edge, at which photos agree if the hull is the surface there."""
+
+_REACH = 0.75
+"""Mean lengths of edges, to which a vertex holds an outline on either side."""
+
+_LEAST = 0.02
+"""Share of the vertices that plain sides have at least: for less a hull is better left as it is."""
+
+_SOLVES = 8
+"""Rounds in which vertices are found that have to stay after all."""
+
+
+@torch.no_grad()
+def with_flat_sides(
+    dataset: Dataset, vertices: Float[Tensor, "V 3"], faces: Int64[Tensor, "F 3"]
+) -> Float[Tensor, "V 3"]:
+    """Where the vertices of a hull belong, whose plain sides are flat.
+
+    Args:
+        dataset: photos with alpha around an object in the unit ball.
+        vertices: (V, 3) of the hull.
+        faces: (F, 3) of it.
+    """
+    dataset = reduced(dataset)
+    photos = photos_of(dataset)
+    if len(photos) < 2 or len(vertices) == 0:
+        return vertices
+    topology = MeshTopology.from_faces(faces, len(vertices))
+    edges = topology.edges.long()
+    free = _plain(photos, vertices, faces, edges)
+    free[edges[topology.edge_face_counts == 1].reshape(-1)] = False  # borders, where lids were
+    if float(free.float().mean()) < _LEAST:
+        return vertices
+    normals = vertex_normals(vertices, faces)
+    views = [Silhouette(dataset, index) for index in dataset.train]
+    free &= ~_needed(photos, views, vertices, normals, edges, free)
+    free = _held(free, edges)
+    return _drawn_flat(photos, vertices, faces, edges, normals, free)
+
+
+def _plain(photos: list[Photo], vertices: Tensor, faces: Tensor, edges: Tensor) -> Bool[Tensor, " V"]:
+    """Where photos show nothing to compare, though two at least see it, and beside that where they do not agree."""
+    pixel = pixel_size(photos)
+    hits = [first_hits(photo, vertices, faces) for photo in photos]
+    score = surface_agreement(photos, hits, vertices, faces, edges)
+    plain = score.isnan() & (seen_by(photos, hits, vertices, pixel).sum(dim=0) >= 2)
+    source, target = torch.cat([edges, edges.flip(1)]).T
+    for _ in range(_BESIDE):
+        beside = torch.zeros(len(plain)).index_add(0, target, plain[source].float()) > 0
+        plain = plain | (beside & (score < _AGREED))
+    return plain
+
+
+def _needed(
+    photos: list[Photo], views: list[Silhouette], vertices: Tensor, normals: Tensor, edges: Tensor, free: Tensor
+) -> Bool[Tensor, " V"]:
+    """The vertices that outlines need, the sharpest first, and those that touch none."""
+    length = float((vertices[edges[:, 0]] - vertices[edges[:, 1]]).norm(dim=1).mean())
+    outlines = [_Outline(photo, view, vertices) for photo, view in zip(photos, views, strict=True)]
+    sharpness = ((vertices - _between(vertices, edges, _ROUND)) * normals).sum(dim=1)
+    order = torch.argsort(torch.where(free, sharpness, torch.inf), descending=True, stable=True).tolist()
+    reach = _REACH * length / pixel_size(photos)
+    fixed, needed = (~free).tolist(), ~torch.stack([outline.touched for outline in outlines]).any(dim=0)
+    touching = [[] for _ in range(len(vertices))]
+    for number, outline in enumerate(outlines):
+        for vertex in outline.touched.nonzero()[:, 0].tolist():
+            touching[vertex].append(number)
+    for vertex in order:
+        at = touching[vertex]
+        if fixed[vertex] or any(outlines[number].bare(vertex) for number in at):
+            needed[vertex] = True
+            for number in at:
+                outlines[number].cover(vertex, reach)
+    return needed
+
+
+class _Outline:
+    """Where a view's outline is held by vertices."""
+
+    def __init__(self, photo: Photo, view: Silhouette, vertices: Tensor) -> None:
+        places, _ = photo.project(vertices)
+        height, width = view.inside.shape
+        self.touched = photo.look_up(view.distance, places[None])[0, 0].abs() <= _OUTLINE
+        self._at = ((places + 1) / 2 * torch.tensor([width, height])).numpy()
+        self._outline = view.inside & (view.distance[0, 0].numpy() < 1)
+        self._bare = self._outline.copy()
+        slope = torch.stack(torch.gradient(view.distance[0, 0]))
+        self._across = torch.nn.functional.normalize(slope, dim=0).numpy()
+
+    def _around(self, vertex: int, reach: float) -> tuple[tuple[slice, slice], np.ndarray]:
+        """A window of pixels, and which of them are near the vertex and run along the outline there."""
+        x, y = self._at[vertex]
+        height, width = self._bare.shape
+        rows = slice(max(0, int(y - reach)), min(height, int(y + reach) + 1))
+        columns = slice(max(0, int(x - reach)), min(width, int(x + reach) + 1))
+        row, column = min(max(int(y), 0), height - 1), min(max(int(x), 0), width - 1)
+        along = np.tensordot(self._across[:, row, column], self._across[:, rows, columns], 1) > _ALIKE
+        i, j = np.ogrid[rows, columns]
+        return (rows, columns), along & ((i + 0.5 - y) ** 2 + (j + 0.5 - x) ** 2 <= reach**2)
+
+    def bare(self, vertex: int) -> bool:
+        """Whether no vertex that stays holds the outline here."""
+        window, near = self._around(vertex, _OUTLINE)
+        outline = self._outline[window] & near
+        return bool(2 * (self._bare[window] & outline).sum() > outline.sum())
+
+    def cover(self, vertex: int, reach: float) -> None:
+        """The vertex stays."""
+        window, near = self._around(vertex, reach)
+        self._bare[window] &= ~near
+
+
+def _held(free: Bool[Tensor, " V"], edges: Int64[Tensor, "E 2"]) -> Bool[Tensor, " V"]:
+    """The free vertices of parts of which some vertex stays: others would shrink to a point."""
+    count, part = connected(edges, len(free))
+    return free & (torch.zeros(count).index_add(0, part, (~free).float()) > 0)[part]
+
+
+def _drawn_flat(
+    photos: list[Photo], vertices: Tensor, faces: Tensor, edges: Tensor, normals: Tensor, free: Tensor
+) -> Float[Tensor, "V 3"]:
+    """The smallest surface with free vertices, but for those that would move outwards or that silhouettes miss."""
+    seen = [first_hits(photo, vertices, faces)[1] for photo in photos]
+    free, moved = free.clone(), vertices
+    for _ in range(_SOLVES):
+        if not bool(free.any()):
+            return vertices
+        moved = _tight(vertices, edges, free)
+        stay = free & (((moved - vertices) * normals).sum(dim=1) > 0)
+        for photo, before in zip(photos, seen, strict=True):
+            missed = (before >= 0) & (first_hits(photo, moved, faces)[1] < 0) & (photo.pixels[0, 3] > 0.95)
+            stay[faces[before[missed]].reshape(-1)] = True
+        stay &= free
+        if not bool(stay.any()):
+            break
+        free &= ~stay
+    return moved
+
+
+def _tight(vertices: Tensor, edges: Int64[Tensor, "E 2"], free: Bool[Tensor, " V"]) -> Float[Tensor, "V 3"]:
+    """Each free vertex in the mean of its neighbours, the others where they are."""
+    own = free.nonzero()[:, 0].numpy()
+    source, target = torch.cat([edges, edges.flip(1)]).T.numpy()
+    links = csr_array((np.ones(len(source)), (source, target)), shape=(len(free), len(free)))
+    laplacian = (diags_array(links.sum(axis=1)) - links).tocsr()[own]
+    places = vertices.double().numpy().copy()
+    held = places.copy()
+    held[own] = 0
+    places[own] = splu(laplacian[:, own].tocsc()).solve(-(laplacian @ held))
+    return torch.from_numpy(places).to(vertices)
+
+
+def _between(vertices: Tensor, edges: Tensor, rounds: int) -> Float[Tensor, "V 3"]:
+    """Places averaged with their neighbours' so many times."""
+    source, target = torch.cat([edges, edges.flip(1)]).T
+    count = 1 + target.bincount(minlength=len(vertices))[:, None]
+    for _ in range(rounds):
+        vertices = vertices.index_add(0, target, vertices[source]) / count
+    return vertices
