@@ -182,6 +182,19 @@ def test_a_hollow_is_not_much_deeper_than_it_is_wide():
         assert bool((found > 0).any()) is opens
 
 
+def test_a_shaft_in_a_wide_hollow_goes_hardly_deeper_than_the_hollow() -> None:
+    side = 12
+    depth = torch.full((side, side), 5)
+    depth[4:8, 4:8] = 9
+    hollow = depth.flatten().clone()
+    depth[5, 5:7] = 20
+    agreed = torch.full((side * side, 40), 0.9)
+    assert torch.equal(_where_agreed(hollow, agreed, grid_links(side), 1.0), hollow)
+    without = _where_agreed(depth.flatten(), agreed, grid_links(side), 1.0)
+    assert torch.equal(without.clamp_max(9), hollow)
+    assert 9 <= int(without.max()) <= 12
+
+
 def test_what_photos_would_not_see_goes_no_deeper_than_what_is_beside_it():
     """A line of five vertices of a lid, the ends of which have a neighbour beside it."""
     links = torch.tensor([[0, 1], [1, 2], [2, 3], [3, 4]])

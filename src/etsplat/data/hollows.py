@@ -247,7 +247,18 @@ def _where_agreed(depth: Tensor, found: Tensor, edges: Tensor, edge: float) -> T
     deepest = torch.zeros(count).scatter_reduce(0, lid, depth.float(), "amax")
     opened = (size >= _FEWEST) & (2 * asked >= size) & (agreement >= _AGREED)
     opened &= deepest <= _SLENDER * edge * size.sqrt()
-    return torch.where(deep & opened[lid], depth, 0)
+    return _without_shafts(torch.where(deep & opened[lid], depth, 0), edges, edge)
+
+
+def _without_shafts(depth: Int64[Tensor, " N"], edges: Int64[Tensor, "E 2"], edge: float) -> Int64[Tensor, " N"]:
+    """The depths, where what is deeper than any level is no deeper below it than the same limit allows."""
+    for level in range(int(depth.max()), 1, -1):
+        deep = depth >= level
+        count, shaft = connected(edges[deep[edges].all(dim=1)], len(depth))
+        width = edge * torch.zeros(count).index_add(0, shaft, deep.float()).sqrt()
+        deepest = torch.zeros(count).scatter_reduce(0, shaft, depth.float(), "amax")
+        depth = torch.where(deep & (deepest - level > _SLENDER * width)[shaft], level, depth)
+    return depth
 
 
 def _without_unseen(way: Tensor, seen: Bool[Tensor, "B N"], neighbours: Tensor, edges: Tensor) -> Tensor:
