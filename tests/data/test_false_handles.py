@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import torch
 
+from etsplat.data.agreement import photos_of
 from etsplat.data.dataset import Dataset
-from etsplat.data.false_handles import without_false_handles
+from etsplat.data.false_handles import _BLOCKED, _cut, silhouette_errors, without_false_handles
 from etsplat.data.meshing import SignedDistance, dual_contour
 from etsplat.data.pictures import StoredPictures
 from etsplat.geometry.distance import closest_points
@@ -89,6 +90,25 @@ def test_a_handle_that_silhouettes_need_stays_whatever_photos_say() -> None:
     noisy = replace(views, images=StoredPictures(images))
     vertices, faces = without_false_handles(noisy, *truth)
     assert genera(faces, len(vertices)) == [1]
+
+
+def bridged(places: np.ndarray) -> np.ndarray:
+    """The bowl with a bridge over the corner at its bottom, as thin as the grid."""
+    x, y, z = places.T
+    aside = np.hypot((x - y - 0.48) / 2**0.5, z)
+    return np.minimum(bowl(places), np.maximum(aside - 0.06, np.abs(x - 0.43) - 0.2))
+
+
+@pytest.mark.parametrize(("shown", "holes"), [(bowl, 0), (bridged, 1)])
+def test_a_thin_bridge_is_cut_unless_photos_show_it(shown: SignedDistance, holes: int) -> None:
+    _, views = photographed(shown)
+    photos, (vertices, faces) = photos_of(views), placed(bridged, views)
+    assert genera(faces, len(vertices)) == [1]
+    most = silhouette_errors(photos, vertices, faces) + torch.tensor([0, _BLOCKED])
+    found = _cut(photos, vertices, faces, most)
+    vertices, faces = (vertices, faces) if found is None else found
+    assert genera(faces, len(vertices)) == [holes]
+    assert bool((silhouette_errors(photos, vertices, faces) <= most).all())
 
 
 def test_a_surface_without_handles_is_left_alone() -> None:

@@ -4,6 +4,10 @@ Where several silhouettes cut into a hollow from several sides, what they leave 
 arches. Photos contradict each other on all of their surface, and no silhouette needs them. So a region that photos
 contradict and that is no disc is replaced by discs, as long as all silhouettes stay as they are, nearly: a true handle
 would leave a gap in some, and a true hole that is closed would block the light in some.
+
+A bridge between two feet that nearly touch is no such region, and one with the feet is what silhouettes need. So then
+the shortest loops that bound no disc are looked at: what is as thin as a few edges, or a hole as narrow, is cut there
+and closed by two discs, if photos contradict each other along the loop and no silhouette needs it.
 """
 
 import torch
@@ -14,6 +18,7 @@ from etsplat.data.agreement import Photo, first_hits, photos_of, surface_agreeme
 from etsplat.data.dataset import Dataset
 from etsplat.data.visual_hull import without_specks
 from etsplat.geometry.discs import with_discs
+from etsplat.geometry.loops import short_loops
 from etsplat.geometry.parts import genera
 from etsplat.geometry.topology import MeshTopology, connected
 
@@ -26,6 +31,13 @@ _FEWEST = 8
 _LOST, _ADDED = 0.001, 0.01
 """So much of a silhouette, in any view, may be uncovered, and so much beside it covered. A crossbar is little of it,
 what is seen through a hole in the view that shows it best is more."""
+
+_THIN = 8
+"""Edges of a loop at most: whether a thicker handle is there photos can tell by its whole surface."""
+
+_BLOCKED = 0.001
+"""So much beside a silhouette may be covered where a loop is cut, and no pixel of it uncovered: the gap that a cut
+leaves in a spoke is narrow."""
 
 
 @torch.no_grad()
@@ -51,7 +63,39 @@ def without_false_handles(
     for level in _LEVELS:
         while (simpler := _simpler(photos, vertices, faces, level, most)) is not None:
             vertices, faces = simpler
+    most = silhouette_errors(photos, vertices, faces) + torch.tensor([0, _BLOCKED])
+    while (simpler := _cut(photos, vertices, faces, most)) is not None:
+        vertices, faces = simpler
     return vertices, faces
+
+
+def _cut(photos: list[Photo], vertices: Tensor, faces: Tensor, most: Tensor) -> tuple[Tensor, Tensor] | None:
+    """The surface cut along a short loop, with a smaller genus, if there is one: the shortest is tried first."""
+    before = genera(faces, len(vertices))
+    if not any(before):
+        return None
+    score = _agreement(photos, vertices, faces)
+    tried = torch.zeros(len(vertices), dtype=torch.bool)
+    for loop in short_loops(vertices, faces):
+        if len(loop) > _THIN or 2 * int(tried[loop].sum()) > len(loop):
+            continue
+        band = torch.isin(faces, torch.tensor(loop)).any(dim=1)
+        tried[faces[band]] = True
+        if not float(score[faces[band].unique()].nanmean()) < _LEVELS[-1]:
+            continue
+        found = without_specks(*with_discs(vertices, faces, band))
+        after = genera(found[1], len(found[0]))
+        if sum(after) >= sum(before) or len(after) != len(before):
+            continue
+        if all(bool((silhouette_errors([p], *found) <= limit).all()) for p, limit in zip(photos, most, strict=True)):
+            return found
+    return None
+
+
+def _agreement(photos: list[Photo], vertices: Tensor, faces: Tensor) -> Float[Tensor, " V"]:
+    """How far photos agree at the vertices; NaN where it is not known."""
+    edges = MeshTopology.from_faces(faces, len(vertices)).edges.long()
+    return surface_agreement(photos, [first_hits(photo, vertices, faces) for photo in photos], vertices, faces, edges)
 
 
 def _simpler(
@@ -61,9 +105,7 @@ def _simpler(
     before = genera(faces, len(vertices))
     if not any(before):
         return None
-    edges = MeshTopology.from_faces(faces, len(vertices)).edges.long()
-    hits = [first_hits(photo, vertices, faces) for photo in photos]
-    score = surface_agreement(photos, hits, vertices, faces, edges)
+    score = _agreement(photos, vertices, faces)
     low, unseen = score < level, score.isnan()
     # Of most posts photos see one side. With the other they are handles, but what is not seen may join several.
     regions = _regions(faces, low[faces].all(dim=1))
