@@ -29,6 +29,7 @@ class Timings:
     stages: dict[str, list[float]] = field(default_factory=lambda: {name: [] for name in STAGES})
     parallel: list[float] = field(default_factory=list)  # inside parallel_for, in the stages
     all_parallel: list[float] = field(default_factory=list)  # ... in all of the call
+    processor: list[float] = field(default_factory=list)  # of all threads
 
     @property
     def total(self) -> list[float]:
@@ -40,12 +41,13 @@ def repetition(scene: Scene, timings: Timings) -> None:
     """A training step's rendering, from tensors to gradients."""
     for leaf in scene.leaves:
         leaf.grad = None
-    before = _native.parallel_seconds()
+    before, processor = _native.parallel_seconds(), time.process_time()
     start = time.perf_counter()
     out = scene.render()
     middle = time.perf_counter()
     out.color.backward(scene.cotangent)
     end = time.perf_counter()
+    timings.processor.append(1e3 * (time.process_time() - processor))
     timings.forward.append(1e3 * (middle - start))
     timings.backward.append(1e3 * (end - middle))
     timings.all_parallel.append(1e3 * (_native.parallel_seconds() - before))
@@ -122,6 +124,7 @@ def measure(
         ours.backward += turn.backward
         ours.parallel += turn.parallel
         ours.all_parallel += turn.all_parallel
+        ours.processor += turn.processor
         for name in STAGES:
             ours.stages[name] += turn.stages[name]
     entry: dict[str, Any] = {
@@ -130,6 +133,7 @@ def measure(
         "instruction_set": instruction_set,
         "threads": threads,
         "milliseconds": summary(ours.total),
+        "processor": summary(ours.processor),
         "forward": summary(ours.forward),
         "backward": summary(ours.backward),
         "stages": {name: summary(values) for name, values in ours.stages.items()},
@@ -167,11 +171,13 @@ def derive(entry: dict[str, Any], timings: Timings, counts: dict[str, int], work
     entry["counts"] = counts
     entry["kernel_nanoseconds"] = {"value": kernel.value, "gradient": kernel.gradient}
     entry["outside_stages"] = statistics.median(t - n for n, t in zip(native, timings.total, strict=True))
+    # On a busy machine a whole call of one thread is interrupted, what lies outside of parallel_for hardly ever.
+    whole = [entry["processor"]["median"]] * len(native) if entry["threads"] == 1 else timings.total
     entry["serial"] = {
-        "stages": statistics.median(
-            (n - p) / t for n, p, t in zip(native, timings.parallel, timings.total, strict=True)
+        "stages": statistics.median((n - p) / t for n, p, t in zip(native, timings.parallel, whole, strict=True)),
+        "all": statistics.median(
+            (t - p) / w for t, p, w in zip(timings.total, timings.all_parallel, whole, strict=True)
         ),
-        "all": statistics.median((t - p) / t for p, t in zip(timings.all_parallel, timings.total, strict=True)),
     }
     useful = max(1, counts["useful"])
     entry["nanoseconds_per_useful_pair"] = 1e6 * entry["milliseconds"]["median"] / useful

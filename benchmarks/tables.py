@@ -56,13 +56,14 @@ def times(entries: list[dict[str, Any]]) -> Table:
                 f"{ms['median']:.1f}",
                 f"{ms['low']:.1f}-{ms['high']:.1f}",
                 f"{ms['best']:.1f}",
+                f"{e['processor']['median']:.1f}" if "processor" in e else "",
                 e["yardstick"]["name"] if ratio else "",
                 f"{e['yardstick']['median']:.1f}" if ratio else "",
                 f"{ratio['median']:.2f}" if ratio else "",
                 f"{ratio['low']:.2f}-{ratio['high']:.2f}" if ratio else "",
             ]
         )
-    columns = ["scene", "instructions", "threads", "ms", "quartiles", "best", "in turn with", "its ms"]
+    columns = ["scene", "instructions", "threads", "ms", "quartiles", "best", "processor", "in turn with", "its ms"]
     columns += ["ratio", "of each turn"]
     return Table("Forward + backward through the public API, and what ran in turn with it", columns, rows)
 

@@ -110,6 +110,7 @@ def test_the_benchmark_writes_its_results_and_the_document_takes_them(tmp_path, 
     assert entry["triangles"] == 100
     assert entry["counts"]["useful"] > 0
     assert entry["nanoseconds_per_useful_pair"] > 0
+    assert 0 < entry["processor"]["median"] <= 1.1 * entry["milliseconds"]["high"]
     document.write_text(f"before\n{tables.BEGIN}\nold\n{tables.END}\nafter\n")
     monkeypatch.setattr("sys.argv", ["tables", str(result), "--into", str(document)])
     tables.main()
