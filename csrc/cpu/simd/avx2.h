@@ -52,20 +52,28 @@ ETSPLAT_FN Register r_scale(Register a, Register shifted) {
         _mm256_add_epi32(_mm256_castps_si256(a), _mm256_slli_epi32(_mm256_castps_si256(shifted), 23)));
 }
 
-// out[k] lane i = table[index of lane i + k]
-ETSPLAT_FN void r_lookup4(const float* table, Register index, Register out[4]) {
-    alignas(32) int at[8];
-    _mm256_store_si256(reinterpret_cast<__m256i*>(at), _mm256_cvttps_epi32(index));
-    Register quads[4];  // quads[j]: of lanes j and 4 + j
-    for (int j = 0; j < 4; ++j)
-        quads[j] = _mm256_insertf128_ps(_mm256_castps128_ps256(_mm_loadu_ps(table + at[j])), _mm_loadu_ps(table + at[4 + j]), 1);
+// Four floats in each half.
+ETSPLAT_FN Register r_load_quads(const float* low, const float* high) {
+    return _mm256_insertf128_ps(_mm256_castps128_ps256(_mm_loadu_ps(low)), _mm_loadu_ps(high), 1);
+}
+// In each half: columns[k] lane i = quads[i] lane k
+ETSPLAT_FN void r_transpose_quads(const Register quads[4], Register columns[4]) {
     for (int half = 0; half < 2; ++half) {
         const Register a = half ? _mm256_unpackhi_ps(quads[0], quads[1]) : _mm256_unpacklo_ps(quads[0], quads[1]);
         const Register b = half ? _mm256_unpackhi_ps(quads[2], quads[3]) : _mm256_unpacklo_ps(quads[2], quads[3]);
         const __m256d low = _mm256_castps_pd(a), high = _mm256_castps_pd(b);
-        out[2 * half] = _mm256_castpd_ps(_mm256_unpacklo_pd(low, high));
-        out[2 * half + 1] = _mm256_castpd_ps(_mm256_unpackhi_pd(low, high));
+        columns[2 * half] = _mm256_castpd_ps(_mm256_unpacklo_pd(low, high));
+        columns[2 * half + 1] = _mm256_castpd_ps(_mm256_unpackhi_pd(low, high));
     }
+}
+
+// out[k] lane i = table[index of lane i + k]
+ETSPLAT_FN void r_lookup4(const float* table, Register index, Register out[4]) {
+    alignas(32) int at[8];
+    _mm256_store_si256(reinterpret_cast<__m256i*>(at), _mm256_cvttps_epi32(index));
+    Register quads[4];
+    for (int j = 0; j < 4; ++j) quads[j] = r_load_quads(table + at[j], table + at[4 + j]);
+    r_transpose_quads(quads, out);
 }
 
 // Sums of the lanes of eight vectors, in order.
@@ -74,6 +82,43 @@ ETSPLAT_FN Register r_column_sums(const Register v[8]) {
     const Register quad0 = _mm256_hadd_ps(_mm256_hadd_ps(v[0], v[1]), _mm256_hadd_ps(v[2], v[3]));
     const Register quad1 = _mm256_hadd_ps(_mm256_hadd_ps(v[4], v[5]), _mm256_hadd_ps(v[6], v[7]));
     return _mm256_add_ps(_mm256_permute2f128_ps(quad0, quad1, 0x20), _mm256_permute2f128_ps(quad0, quad1, 0x31));
+}
+
+// rows[i] lane j = columns[j] lane i
+ETSPLAT_FN void r_transpose(const Register columns[8], Register rows[8]) {
+    Register left[4], right[4];  // left[i], half p: lane 4 p + i of columns 0 .. 3; right: of the others
+    r_transpose_quads(columns, left);
+    r_transpose_quads(columns + 4, right);
+    for (int i = 0; i < 4; ++i) {
+        rows[i] = _mm256_permute2f128_ps(left[i], right[i], 0x20);
+        rows[4 + i] = _mm256_permute2f128_ps(left[i], right[i], 0x31);
+    }
+}
+
+// Eight lanes, the second four `apart` floats behind the first.
+ETSPLAT_FN void r_load_apart(const float* in, int apart, Register& out) { out = r_load_quads(in, in + apart); }
+
+// Eight pixels of three channels to one register per channel, and back. Each half has four pixels:
+// a = x0 y0 z0 x1, b = y1 z1 x2 y2, c = z2 x3 y3 z3.
+ETSPLAT_FN void r_deinterleave3(const float* in, Register out[3]) {
+    const Register a = r_load_quads(in, in + 12), b = r_load_quads(in + 4, in + 16), c = r_load_quads(in + 8, in + 20);
+    const Register first_yz = _mm256_shuffle_ps(a, b, _MM_SHUFFLE(1, 0, 2, 1));
+    const Register last_xy = _mm256_shuffle_ps(b, c, _MM_SHUFFLE(2, 1, 3, 2));
+    out[0] = _mm256_shuffle_ps(a, last_xy, _MM_SHUFFLE(2, 0, 3, 0));
+    out[1] = _mm256_shuffle_ps(first_yz, last_xy, _MM_SHUFFLE(3, 1, 2, 0));
+    out[2] = _mm256_shuffle_ps(first_yz, c, _MM_SHUFFLE(3, 0, 3, 1));
+}
+ETSPLAT_FN void r_interleave3(const Register in[3], float* out) {
+    const Register even_xy = _mm256_shuffle_ps(in[0], in[1], _MM_SHUFFLE(2, 0, 2, 0));
+    const Register odd_yz = _mm256_shuffle_ps(in[1], in[2], _MM_SHUFFLE(3, 1, 3, 1));
+    const Register even_z_odd_x = _mm256_shuffle_ps(in[2], in[0], _MM_SHUFFLE(3, 1, 2, 0));
+    const Register abc[3] = {_mm256_shuffle_ps(even_xy, even_z_odd_x, _MM_SHUFFLE(2, 0, 2, 0)),
+                             _mm256_shuffle_ps(odd_yz, even_xy, _MM_SHUFFLE(3, 1, 2, 0)),
+                             _mm256_shuffle_ps(even_z_odd_x, odd_yz, _MM_SHUFFLE(3, 1, 3, 1))};
+    for (int k = 0; k < 3; ++k) {
+        _mm_storeu_ps(out + 4 * k, _mm256_castps256_ps128(abc[k]));
+        _mm_storeu_ps(out + 12 + 4 * k, _mm256_extractf128_ps(abc[k], 1));
+    }
 }
 
 }  // namespace etsplat::avx2

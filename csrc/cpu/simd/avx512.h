@@ -112,6 +112,14 @@ ETSPLAT_FN void r_transpose(const Register columns[16], Register rows[16]) {
     }
 }
 
+// Sixteen lanes, each four `apart` floats behind those before.
+ETSPLAT_FN void r_load_apart(const float* in, int apart, Register& out) {
+    out = _mm512_castps128_ps512(_mm_loadu_ps(in));
+    out = _mm512_insertf32x4(out, _mm_loadu_ps(in + apart), 1);
+    out = _mm512_insertf32x4(out, _mm_loadu_ps(in + 2 * apart), 2);
+    out = _mm512_insertf32x4(out, _mm_loadu_ps(in + 3 * apart), 3);
+}
+
 // Sixteen pixels of three channels to one register per channel, and back.
 ETSPLAT_FN void r_deinterleave3(const float* in, Register out[3]) {
     const Register a = _mm512_loadu_ps(in), b = _mm512_loadu_ps(in + 16), c = _mm512_loadu_ps(in + 32);

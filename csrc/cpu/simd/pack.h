@@ -6,6 +6,8 @@
 // wide instruction set can be linked into a narrow one. For the same reason these headers use no std:: templates.
 #pragma once
 
+#include <string.h>
+
 #include "cpu/prefetch.h"
 #include "math/portable.h"
 
@@ -252,14 +254,21 @@ ETSPLAT_FN void column_sums(const Vec v[kLanes], float* out) {
     for (int i = 0; i < kLanes; i += kLanesPerRegister) r_store(out + i, r_column_sums(sums + i));
 }
 
+// Whether an instruction set moves lanes between wide registers: r_transpose, r_load_apart, r_deinterleave3, r_interleave3.
+constexpr bool kMovesLanes = kLanesPerRegister > 4;
+
 // out[16 i + j] = lane i of v[j]
 template <class R = Register>
 ETSPLAT_FN void store_transposed(const Vec v[kLanes], float* out) {
-    if constexpr (kRegisters == 1) {
-        R columns[kLanes], rows[kLanes];
-        for (int i = 0; i < kLanes; ++i) columns[i] = v[i].r[0];
-        r_transpose(columns, rows);
-        for (int i = 0; i < kLanes; ++i) r_store(out + kLanes * i, rows[i]);
+    if constexpr (kMovesLanes) {
+        for (int first = 0; first < kLanes; first += kLanesPerRegister)
+            for (int part = 0; part < kRegisters; ++part) {
+                R columns[kLanesPerRegister], rows[kLanesPerRegister];
+                for (int i = 0; i < kLanesPerRegister; ++i) columns[i] = v[first + i].r[part];
+                r_transpose(columns, rows);
+                for (int i = 0; i < kLanesPerRegister; ++i)
+                    r_store(out + kLanes * (part * kLanesPerRegister + i) + first, rows[i]);
+            }
     } else {
         float lanes[kLanes];
         for (int j = 0; j < kLanes; ++j) {
@@ -269,13 +278,33 @@ ETSPLAT_FN void store_transposed(const Vec v[kLanes], float* out) {
     }
 }
 
+// Each four lanes from `apart` floats behind those before: what was written four at a time is not there yet for a wider load.
+template <class R = Register>
+ETSPLAT_FN Vec load_apart(const float* in, int apart) {
+    if constexpr (kMovesLanes) {
+        Vec v;
+        for (int i = 0; i < kRegisters; ++i) {
+            R lanes;
+            r_load_apart(in + i * kLanesPerRegister / 4 * apart, apart, lanes);
+            v.r[i] = lanes;
+        }
+        return v;
+    } else {
+        float lanes[kLanes];
+        for (int quad = 0; quad < 4; ++quad) memcpy(lanes + 4 * quad, in + quad * apart, 16);
+        return Vec::load(lanes);
+    }
+}
+
 // Sixteen pixels of three channels to one vector per channel, and back.
 template <class R = Register>
 ETSPLAT_FN void deinterleave3(const float* in, Vec out[3]) {
-    if constexpr (kRegisters == 1) {
-        R registers[3];
-        r_deinterleave3(in, registers);
-        for (int c = 0; c < 3; ++c) out[c].r[0] = registers[c];
+    if constexpr (kMovesLanes) {
+        for (int part = 0; part < kRegisters; ++part) {
+            R registers[3];
+            r_deinterleave3(in + 3 * kLanesPerRegister * part, registers);
+            for (int c = 0; c < 3; ++c) out[c].r[part] = registers[c];
+        }
     } else {
         float planes[3][kLanes];
         for (int i = 0; i < kLanes; ++i)
@@ -285,9 +314,11 @@ ETSPLAT_FN void deinterleave3(const float* in, Vec out[3]) {
 }
 template <class R = Register>
 ETSPLAT_FN void interleave3(const Vec in[3], float* out) {
-    if constexpr (kRegisters == 1) {
-        const R registers[3] = {in[0].r[0], in[1].r[0], in[2].r[0]};
-        r_interleave3(registers, out);
+    if constexpr (kMovesLanes) {
+        for (int part = 0; part < kRegisters; ++part) {
+            const R registers[3] = {in[0].r[part], in[1].r[part], in[2].r[part]};
+            r_interleave3(registers, out + 3 * kLanesPerRegister * part);
+        }
     } else {
         float planes[3][kLanes];
         for (int c = 0; c < 3; ++c) in[c].store(planes[c]);

@@ -58,12 +58,7 @@ ETSPLAT_FN void store_row(float* plane, int row, Vec values) {
     float* out = plane + row / 4 * 64 + row % 4 * 4;
     for (int column = 0; column < 4; ++column) memcpy(out + 16 * column, lanes + 4 * column, 16);
 }
-ETSPLAT_FN Vec load_row(const float* plane, int row) {
-    float lanes[16];
-    const float* in = plane + row / 4 * 64 + row % 4 * 4;
-    for (int column = 0; column < 4; ++column) memcpy(lanes + 4 * column, in + 16 * column, 16);
-    return Vec::load(lanes);
-}
+ETSPLAT_FN Vec load_row(const float* plane, int row) { return load_apart(plane + row / 4 * 64 + row % 4 * 4, 16); }
 
 // The three forms g_k . (p - q) of a triangle over one tile.
 struct TriangleForms {
