@@ -38,9 +38,9 @@ def fitted(capture: Dataset, config: TrainConfig, kept: Path) -> tuple[TriangleM
     return finished_mesh(trainer.outcome().model, capture), time.process_time() - began
 
 
-def main() -> None:
-    """One capture."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def start(description: str | None) -> tuple[Dataset, TrainConfig, Path]:
+    """What the command line names: a capture, the settings of its run, and the folder where its soup is kept."""
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scene", type=Path)
     parser.add_argument("--scene-type", default="outdoor")
     parser.add_argument("--width", type=int, default=400)
@@ -53,8 +53,13 @@ def main() -> None:
     own = kept_aside(load_scene(given.scene, config.width, None, None), config.watch, config.refine_cameras)
     capture = own.renormalized(own.frame.center, own.frame.radius)
     steps = limited_iterations(config.iterations, config.schedule.max_epochs, len(own.train), config.batch)
-    config = config.changed({"iterations": steps})
     kept = given.soups / f"{given.scene.name}-{given.width}-{given.max_triangles}"
+    return capture, config.changed({"iterations": steps}), kept
+
+
+def main() -> None:
+    """One capture."""
+    capture, config, kept = start(__doc__)
     mesh, seconds = fitted(capture, config, kept)
     scorer = Scorer(capture, torch.device("cpu"), background=background_of(config))
     (kept / "test").mkdir(exist_ok=True)

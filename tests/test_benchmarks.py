@@ -21,6 +21,7 @@ from benchmarks import (
     gpu_scenes,
     gpu_timing,
     gpu_train,
+    opaque_errors,
     opaque_mesh,
     rasterizer,
     scenes,
@@ -30,9 +31,12 @@ from benchmarks import (
 from benchmarks.measure import native_state
 from etsplat import _native, rasterize
 from etsplat.core.cameras import Cameras
+from etsplat.data.agreement import Photo
 from etsplat.data.demo_scene import demo_scene
 from etsplat.engines.cuda.program import Program
 from etsplat.engines.threads import one_torch_thread
+from etsplat.model.triangle_mesh import TriangleMesh
+from etsplat.ops.rasterize_opaque import rasterize_opaque
 from etsplat.tasks.train_config import TrainConfig
 from helpers.captures import small_demo_scene
 from helpers.scenes import mesh
@@ -238,6 +242,28 @@ def test_opaque_meshes_are_compared_from_the_same_soup(tmp_path):
     assert kept == {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.safetensors")}
     assert torch.equal(first.vertices, again.vertices)
     assert torch.equal(first.colors, again.colors)
+
+
+def test_photos_are_asked_of_points_that_they_show():
+    """A wall, and a triangle that hides its left from one of two cameras: there the other's colour alone counts."""
+    corners = [[-9.0, -9, 3], [9, -9, 3], [0, 20, 3], [-0.9, -0.5, 1], [-0.1, -0.5, 1], [-0.5, 0.7, 1]]
+    wall = TriangleMesh.from_mesh(
+        torch.tensor(corners), torch.arange(6).view(2, 3), colors=0.5, opacity=None, sigma=None
+    )
+    beside = torch.eye(4)
+    beside[0, 3] = -1.0
+    photos = []
+    for value, viewmat in ((0.2, torch.eye(4)), (0.6, beside)):
+        camera = Cameras(viewmat[None], torch.tensor([[[20.0, 0, 20], [0, 20, 20], [0, 0, 1]]]), 40, 40)
+        pixels = torch.cat([torch.full((1, 3, 40, 40), value), torch.ones(1, 1, 40, 40)], dim=1)
+        drawn = rasterize_opaque(wall.vertices.detach(), faces=wall.faces, cameras=camera)
+        photos.append((Photo(pixels, viewmat, camera.Ks[0], camera.centers[0]), drawn))
+    assert opaque_errors.photos_showing(wall, [drawn for _, drawn in photos]).tolist() == [2, 1, -1]
+    points = torch.tensor([[-1.5, 0.0, 3.0], [1.5, 0.0, 3.0], [0.0, 0.0, -3.0]])
+    count, mean, variance = opaque_errors.colors_in(photos, points)
+    assert count.tolist() == [1, 2, 0]
+    assert torch.allclose(mean[:2, 0], torch.tensor([0.6, 0.4]))
+    assert torch.allclose(variance[1], torch.tensor(0.08))
 
 
 def test_workers_are_as_fast_as_one_process_that_draws_so_much_slower():
