@@ -2,9 +2,10 @@
 
 import torch
 
-from etsplat.geometry.films import film
+from etsplat.geometry.films import film, tight_film
 from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.measures import enclosed_volume
+from etsplat.geometry.topology import MeshTopology
 
 
 def test_a_slit_in_a_ball_closes() -> None:
@@ -21,3 +22,11 @@ def test_a_slit_in_a_ball_closes() -> None:
 def test_where_nothing_is_free_nothing_moves() -> None:
     vertices, faces = icosphere(1)
     assert torch.equal(film(vertices, faces, torch.zeros(len(vertices), dtype=torch.bool)), vertices)
+
+
+def test_a_tight_film_is_where_sweeps_end() -> None:
+    vertices, faces = icosphere(3)
+    free = (vertices[:, 1] > 0.8) & (vertices[:, 0].abs() < 0.3)
+    tight = tight_film(vertices, MeshTopology.from_faces(faces, len(vertices)).edges.long(), free)
+    assert (tight[free] - vertices[free]).norm(dim=1).max() > 0.05
+    torch.testing.assert_close(tight, film(vertices, faces, free), rtol=0, atol=1e-5)

@@ -8,8 +8,6 @@ show nothing to compare, are drawn to the smallest surface between those that st
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int64
-from scipy.sparse import csr_array, diags_array
-from scipy.sparse.linalg import splu
 from torch import Tensor
 
 from etsplat.data.agreement import (
@@ -23,6 +21,7 @@ from etsplat.data.agreement import (
 )
 from etsplat.data.dataset import Dataset
 from etsplat.data.silhouettes import Silhouette
+from etsplat.geometry.films import tight_film
 from etsplat.geometry.measures import vertex_normals
 from etsplat.geometry.topology import MeshTopology, connected
 
@@ -65,7 +64,8 @@ def with_flat_sides(
         return vertices
     topology = MeshTopology.from_faces(faces, len(vertices))
     edges = topology.edges.long()
-    free = _plain(photos, vertices, faces, edges)
+    hits = [first_hits(photo, vertices, faces) for photo in photos]
+    free = _plain(photos, hits, vertices, faces, edges)
     free[edges[topology.edge_face_counts == 1].reshape(-1)] = False  # borders, where lids were
     if float(free.float().mean()) < _LEAST:
         return vertices
@@ -73,13 +73,14 @@ def with_flat_sides(
     views = [Silhouette(dataset, index) for index in dataset.train]
     free &= ~_needed(photos, views, vertices, normals, edges, free)
     free = _held(free, edges)
-    return _drawn_flat(photos, vertices, faces, edges, normals, free)
+    return _drawn_flat(photos, [face for _, face in hits], vertices, faces, edges, normals, free)
 
 
-def _plain(photos: list[Photo], vertices: Tensor, faces: Tensor, edges: Tensor) -> Bool[Tensor, " V"]:
+def _plain(
+    photos: list[Photo], hits: list[tuple[Tensor, Tensor]], vertices: Tensor, faces: Tensor, edges: Tensor
+) -> Bool[Tensor, " V"]:
     """Where photos show nothing to compare, though two at least see it, and beside that where they do not agree."""
     pixel = pixel_size(photos)
-    hits = [first_hits(photo, vertices, faces) for photo in photos]
     score = surface_agreement(photos, hits, vertices, faces, edges)
     plain = score.isnan() & (seen_by(photos, hits, vertices, pixel).sum(dim=0) >= 2)
     source, target = torch.cat([edges, edges.flip(1)]).T
@@ -155,15 +156,20 @@ def _held(free: Bool[Tensor, " V"], edges: Int64[Tensor, "E 2"]) -> Bool[Tensor,
 
 
 def _drawn_flat(
-    photos: list[Photo], vertices: Tensor, faces: Tensor, edges: Tensor, normals: Tensor, free: Tensor
+    photos: list[Photo],
+    seen: list[Tensor],
+    vertices: Tensor,
+    faces: Tensor,
+    edges: Tensor,
+    normals: Tensor,
+    free: Tensor,
 ) -> Float[Tensor, "V 3"]:
     """The smallest surface with free vertices, but for those that would move outwards or that silhouettes miss."""
-    seen = [first_hits(photo, vertices, faces)[1] for photo in photos]
     free, moved = free.clone(), vertices
     for _ in range(_SOLVES):
         if not bool(free.any()):
             return vertices
-        moved = _tight(vertices, edges, free)
+        moved = tight_film(vertices, edges, free)
         stay = free & (((moved - vertices) * normals).sum(dim=1) > 0)
         for photo, before in zip(photos, seen, strict=True):
             missed = (before >= 0) & (first_hits(photo, moved, faces)[1] < 0) & (photo.pixels[0, 3] > 0.95)
@@ -173,19 +179,6 @@ def _drawn_flat(
             break
         free &= ~stay
     return moved
-
-
-def _tight(vertices: Tensor, edges: Int64[Tensor, "E 2"], free: Bool[Tensor, " V"]) -> Float[Tensor, "V 3"]:
-    """Each free vertex in the mean of its neighbours, the others where they are."""
-    own = free.nonzero()[:, 0].numpy()
-    source, target = torch.cat([edges, edges.flip(1)]).T.numpy()
-    links = csr_array((np.ones(len(source)), (source, target)), shape=(len(free), len(free)))
-    laplacian = (diags_array(links.sum(axis=1)) - links).tocsr()[own]
-    places = vertices.double().numpy().copy()
-    held = places.copy()
-    held[own] = 0
-    places[own] = splu(laplacian[:, own].tocsc()).solve(-(laplacian @ held))
-    return torch.from_numpy(places).to(vertices)
 
 
 def _between(vertices: Tensor, edges: Tensor, rounds: int) -> Float[Tensor, "V 3"]:

@@ -1,7 +1,10 @@
 """A film of soap: the part of a surface of which nothing is known, as small as what is around it lets it be."""
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int64
+from scipy.sparse import csr_array, diags_array
+from scipy.sparse.linalg import splu
 from torch import Tensor
 
 from etsplat.geometry.topology import MeshTopology
@@ -29,3 +32,24 @@ def film(vertices: Float[Tensor, "V 3"], faces: Int64[Tensor, "F 3"], free: Bool
     for _ in range(_SWEEPS if len(own) else 0):
         places[own] = places.new_zeros((len(own), 3)).index_add(0, target, places[source]) / counts
     return places
+
+
+def tight_film(
+    vertices: Float[Tensor, "V 3"], edges: Int64[Tensor, "E 2"], free: Bool[Tensor, " V"]
+) -> Float[Tensor, "V 3"]:
+    """Where a film comes to rest, whose sweeps in areas many edges wide would take thousands: one sparse solution.
+
+    Args:
+        vertices: (V, 3).
+        edges: (E, 2) between them.
+        free: (V,) which move, some at least; some vertex of each part is held.
+    """
+    own = free.nonzero()[:, 0].numpy()
+    source, target = torch.cat([edges, edges.flip(1)]).T.numpy()
+    links = csr_array((np.ones(len(source)), (source, target)), shape=(len(free), len(free)))
+    laplacian = (diags_array(links.sum(axis=1)) - links).tocsr()[own]
+    places = vertices.double().numpy().copy()
+    held = places.copy()
+    held[own] = 0
+    places[own] = splu(laplacian[:, own].tocsc()).solve(-(laplacian @ held))
+    return torch.from_numpy(places).to(vertices)
