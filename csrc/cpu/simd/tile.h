@@ -1,7 +1,12 @@
 // Geometry of a tile in lanes: which pixels a block holds, and which blocks a triangle can touch.
 #pragma once
 
+#include <stdint.h>
 #include <string.h>
+
+#if defined(_MSC_VER) && !defined(__clang__)
+#include <intrin.h>
+#endif
 
 #include "cpu/raster_pass.h"
 #include "math/interpolation.h"
@@ -41,8 +46,8 @@ struct TileFrame {
         return bits;
     }
     // Index of the first pixel of a block row in an image of the given width
-    ETSPLAT_FN long pixel(int block, int row, int width) const {
-        return static_cast<long>(y0 + block / 4 * 4 + row) * width + x0 + block % 4 * 4;
+    ETSPLAT_FN int64_t pixel(int block, int row, int width) const {
+        return static_cast<int64_t>(y0 + block / 4 * 4 + row) * width + x0 + block % 4 * 4;
     }
     ETSPLAT_FN int row_count(int block) const { return clamp4(rows - block / 4 * 4); }
     ETSPLAT_FN int column_count(int block) const { return clamp4(columns - block % 4 * 4); }

@@ -34,7 +34,7 @@ ETSPLAT_FN void load_block(const RasterPass& pass, BackwardTile& tile, const Til
         for (int c = 0; c < channels; ++c) Vec(0.0f).store(tile.grad_color + (c * kBlocks + block) * 16);
     }
     for (int row = 0; row < frame.row_count(block); ++row) {
-        const long pixel = frame.pixel(block, row, pass.width);
+        const int64_t pixel = frame.pixel(block, row, pass.width);
         const float* color = pass.color + pixel * channels;
         const float* grad = pass.grad_color + pixel * channels;
         for (int i = 0; i < columns; ++i) remaining[4 * row + i] = 0.0f;
@@ -54,7 +54,7 @@ ETSPLAT_FN void load_block(const RasterPass& pass, BackwardTile& tile, const Til
 // Whole tiles of the fast pass, a row of pixels at a time.
 ETSPLAT_FN void load_rows(const RasterPass& pass, BackwardTile& tile, const TileFrame& frame) {
     for (int row = 0; row < kTile; ++row) {
-        const long pixel = static_cast<long>(frame.y0 + row) * pass.width + frame.x0;
+        const int64_t pixel = static_cast<int64_t>(frame.y0 + row) * pass.width + frame.x0;
         Vec color[3], grad[3];
         deinterleave3(pass.color + 3 * pixel, color);
         deinterleave3(pass.grad_color + 3 * pixel, grad);
@@ -73,7 +73,7 @@ ETSPLAT_FN void load_distortion(const RasterPass& pass, BackwardTile& tile, cons
     Vec(0.0f).store(tile.grad_distortion[block]);
     const int columns = frame.column_count(block);
     for (int row = 0; row < frame.row_count(block); ++row) {
-        const long pixel = frame.pixel(block, row, pass.width);
+        const int64_t pixel = frame.pixel(block, row, pass.width);
         for (int i = 0; i < columns; ++i) {
             const int lane = 4 * row + i;
             tile.grad_distortion[block][lane] = pass.grad_distortion[pixel + i];
@@ -116,7 +116,7 @@ ETSPLAT_FN void background_gradient(const RasterPass& pass, const BackwardTile& 
     for (int c = 0; c < channels; ++c) out[c] = 0.0f;
     for (int block = 0; block < kBlocks; ++block)
         for (int row = 0; row < frame.row_count(block); ++row) {
-            const long pixel = frame.pixel(block, row, pass.width);
+            const int64_t pixel = frame.pixel(block, row, pass.width);
             for (int i = 0; i < frame.column_count(block); ++i)
                 for (int c = 0; c < channels; ++c)
                     out[c] += (1.0f - pass.alpha[pixel + i]) * tile.channel(c, block)[4 * row + i];

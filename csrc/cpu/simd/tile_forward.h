@@ -178,7 +178,7 @@ ETSPLAT_FN void finish_rows(const RasterPass& pass, ForwardTile& tile, const Til
     Vec background[3];
     for (int c = 0; c < 3; ++c) background[c] = Vec(pass.background ? pass.background[c] : 0.0f);
     for (int row = 0; row < kTile; ++row) {
-        const long pixel = static_cast<long>(frame.y0 + row) * pass.width + frame.x0;
+        const int64_t pixel = static_cast<int64_t>(frame.y0 + row) * pass.width + frame.x0;
         const Vec t = load_row(tile.transmittance[0], row);
         Vec color[3];
         for (int c = 0; c < 3; ++c) color[c] = vfma(t, background[c], load_row(tile.channel(c, 0), row));
@@ -192,7 +192,7 @@ ETSPLAT_FN void finish(const RasterPass& pass, ForwardTile& tile, const TileFram
     for (int block = 0; block < kBlocks; ++block) {
         const int columns = frame.column_count(block);
         for (int row = 0; row < frame.row_count(block); ++row) {
-            const long pixel = frame.pixel(block, row, pass.width);
+            const int64_t pixel = frame.pixel(block, row, pass.width);
             const float* t = tile.transmittance[block] + 4 * row;
             float* out = pass.color + pixel * channels;
             for (int c = 0; c < channels; ++c) {
