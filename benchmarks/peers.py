@@ -208,7 +208,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             raise SystemExit(f"{name} drew another picture: {apart:.3f} apart")
         cells = (
             f"{len(given.faces):,}",
-            f"{options.size}²",
+            f"{options.size} x {options.size}",
             options.threads,
             f"{1000 * processor:,.0f}",
             f"{ratio:,.1f}",

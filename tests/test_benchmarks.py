@@ -3,6 +3,7 @@
 import argparse
 import json
 import os
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -23,6 +24,7 @@ from benchmarks import (
     gpu_train,
     opaque_errors,
     opaque_mesh,
+    peers,
     rasterizer,
     scenes,
     tables,
@@ -277,3 +279,26 @@ def test_workers_are_as_fast_as_one_process_that_draws_so_much_slower():
         slowed = {**found, "view": slower * found["view"]}
         apart = workers.computed(found, views, nodes, cores)
         assert workers.computed(slowed, views, 1, nodes * cores) == pytest.approx(apart)
+
+
+def test_peers_draw_the_scene_of_the_rasterizers_own_benchmark(capsys):
+    """With the camera that other renderers are given, at any size; what draws another picture is no peer."""
+    given = peers.subject(2, scenes.SIZE)
+    vertices = given.vertices.clone().requires_grad_()
+    picture, scene = peers.ours(given, 1)(vertices), scenes.load("sphere2")
+    assert torch.equal(picture, scene.render().color[0].detach())
+    assert vertices.grad is not None
+    peers.main(["--peers", "--level", "1", "--size", "32", "--turns", "1", "--warm", "0"])
+    assert re.search(
+        r"^\| etsplat \| 80 \| 32 x 32 \| 1 \| \d+ \| 1\.0 \| \d+ \| 0\.0000 \|$", capsys.readouterr().out, re.M
+    )
+
+
+def test_peers_that_draw_another_picture_are_refused(monkeypatch):
+    def grey(vertices):
+        vertices.sum().backward()
+        return torch.full((32, 32, 3), 0.5)
+
+    monkeypatch.setitem(peers.PEERS, "mitsuba", lambda given, threads: grey)
+    with pytest.raises(SystemExit, match="mitsuba drew another picture"):
+        peers.main(["--peers", "mitsuba", "--level", "1", "--size", "32", "--turns", "1", "--warm", "0"])

@@ -18,12 +18,17 @@ REPOSITORY = Path(__file__).resolve().parent.parent
 
 
 def test_version_is_the_same_everywhere() -> None:
-    """pyproject.toml, the installed package and the newest heading of CHANGELOG.md name one version."""
-    project = re.search(r'^version = "(.+)"$', (REPOSITORY / "pyproject.toml").read_text(), re.MULTILINE)
-    changelog = re.search(r"^## (\S+)", (REPOSITORY / "CHANGELOG.md").read_text(), re.MULTILINE)
-    assert project
-    assert changelog
-    assert version("etsplat") == project[1] == changelog[1]
+    """In pyproject.toml, the installed package, the newest heading of CHANGELOG.md, and what is cited."""
+    places = {
+        "pyproject.toml": r'^version = "(.+)"$',
+        "CHANGELOG.md": r"^## (\S+)",
+        "CITATION.cff": r"^version: (.+)$",
+        "README.md": r"^  version = {(.+)},$",
+    }
+    for name, pattern in places.items():
+        found = re.search(pattern, (REPOSITORY / name).read_text(encoding="utf-8"), re.MULTILINE)
+        assert found, name
+        assert found[1] == version("etsplat"), name
 
 
 def test_layers_hold() -> None:

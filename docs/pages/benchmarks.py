@@ -53,6 +53,9 @@ def tables(results: str) -> Mapping[str, Rows]:
     scenes = {name: (_beside(results, name, "ours"), _better(results, name)) for name in _CAPTURES}
     decibels = {name: [f"{number} dB" for number, _ in pair] for name, pair in scenes.items()}
     columns = ("PSNR", "SSIM", "primitives", _SECONDS)
+    speed = {
+        name: [_step(results, name, *of) for of in _STEPS] for name in ("etsplat", "Mitsuba 3.9.1", "PyTorch3D 0.7.9")
+    }
     return {
         "measured": [
             ("measured", "etsplat:", "others:", "`python -m`"),
@@ -66,6 +69,12 @@ def tables(results: str) -> Mapping[str, Rows]:
             *(
                 (label, decibels[name][0], f"{decibels[name][1]} OpenSplat 1.1.5", "`studies.opensplat`")
                 for name, label in (("banana", "banana, 200 pixels, equal seconds"), ("lund", "lund, the same"))
+            ),
+            (
+                "forward and backward, 82,000 triangles, one thread",
+                f"{speed['etsplat'][0]} ms",
+                f"{speed['Mitsuba 3.9.1'][0]} ms Mitsuba 3.9.1",
+                "`benchmarks.peers`",
             ),
         ],
         "objects": [
@@ -87,6 +96,10 @@ def tables(results: str) -> Mapping[str, Rows]:
             ("kernel", "PSNR:", "SSIM:"),
             *((name, kernel("PSNR", part), kernel("SSIM", part)) for part, name in enumerate(_KERNELS)),
         ],
+        "speed": [
+            ("renderer", *(f"{triangles} triangles, {pixels}:" for triangles, pixels in _STEPS)),
+            *((name, *milliseconds) for name, milliseconds in speed.items()),
+        ],
     }
 
 
@@ -94,12 +107,19 @@ _CHAMFER, _SECONDS = "Chamfer distance x 1000", "seconds, one thread"
 _CAPTURES = ("banana", "family", "kitchen25", "lund")
 _PEERS = {"elastic": "elastic triangles", "3dgs": "3D Gaussians", "2dgs": "2D Gaussians"}
 _KERNELS = ("elastic", "bilateral", "single-sided")
+_STEPS = (("81,920", "1024 x 1024"), ("5,120", "256 x 256"))
 
 
 def _beside(results: str, capture: str, method: str) -> tuple[str, str]:
     """PSNR and seconds of a run beside OpenSplat, or of OpenSplat."""
     cell = partial(value, results, "OpenSplat on the CPU", [capture, method])
     return cell("PSNR"), cell("processor seconds")
+
+
+def _step(results: str, renderer: str, triangles: str, pixels: str) -> str:
+    """Processor milliseconds of forward and backward."""
+    section = "Other differentiable renderers on the CPU"
+    return value(results, section, [renderer, triangles, pixels], "processor ms")
 
 
 def _better(results: str, capture: str) -> tuple[str, str]:

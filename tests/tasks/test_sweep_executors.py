@@ -1,9 +1,11 @@
 """Three executors, one interface: runs that are lost in the middle end as if nothing had happened."""
 
 import os
+import re
 import socket
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -137,6 +139,25 @@ def test_a_ray_cluster_that_is_not_there_is_named_at_once() -> None:
         port = server.getsockname()[1]
     with pytest.raises(InputError, match=f"cluster 127.0.0.1:{port}: nobody answers there"):
         Where(cluster=f"127.0.0.1:{port}").executor(1)
+
+
+@pytest.mark.parametrize(
+    ("address", "error", "said"),
+    [
+        ("auto", ConnectionError("Please specify `--address`."), "auto: no Ray runs on this machine; start one"),
+        ("auto", RuntimeError("Versions differ:\n 1 and 2."), "auto: Versions differ: 1 and 2; start one"),
+        ("ray", ValueError("no such address"), "ray: no such address; start one with `ray start --head`, or name"),
+    ],
+)
+def test_what_ray_says_is_told_but_for_options_that_are_not_ours(
+    monkeypatch: pytest.MonkeyPatch, address: str, error: Exception, said: str
+) -> None:
+    def init(**_: object) -> None:
+        raise error
+
+    monkeypatch.setitem(sys.modules, "ray", SimpleNamespace(is_initialized=lambda: False, init=init))
+    with pytest.raises(InputError, match=re.escape(said)):
+        Where(cluster=address).executor(1)
 
 
 def test_ray_that_is_missing_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

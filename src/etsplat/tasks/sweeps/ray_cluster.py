@@ -11,6 +11,7 @@ from etsplat.tasks.sweeps.executors import Executor, LostError
 from etsplat.tasks.sweeps.work import Work, perform
 
 _CANCELLED_SECONDS, _REACH_SECONDS = 60.0, 10.0
+_REMEDY = "start one with `ray start --head`, or name another: HOST:PORT"
 
 
 class RayExecutor(Executor):
@@ -37,8 +38,7 @@ class RayExecutor(Executor):
             try:
                 ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
             except (ConnectionError, ValueError, RuntimeError) as error:
-                text = " ".join(str(error).split())
-                raise InputError(f"cluster {address}: {text}; start one with `ray start --head`") from error
+                raise InputError(f"cluster {address}: {_said(error, address)}; {_REMEDY}") from error
         # Retries are those of `run_cells`. A process makes one run, so that none inherits another's memory.
         self._perform = ray.remote(num_cpus=cores, max_retries=0, max_calls=1)(perform)
         self._tasks: list[Any] = []
@@ -62,6 +62,13 @@ class RayExecutor(Executor):
             self._ray.shutdown()
 
 
+def _said(error: Exception, address: str) -> str:
+    """What Ray says, but where it asks for an option of its own programs."""
+    if isinstance(error, ConnectionError) and address == "auto":
+        return "no Ray runs on this machine"
+    return " ".join(str(error).split()).removesuffix(".")
+
+
 def _reach(address: str) -> None:
     """Raises InputError where nobody listens at HOST:PORT, for which Ray itself would wait for many minutes."""
     host, colon, port = address.rpartition("://")[2].rpartition(":")
@@ -70,9 +77,7 @@ def _reach(address: str) -> None:
     try:
         socket.create_connection((host.strip("[]"), int(port)), timeout=_REACH_SECONDS).close()
     except (OSError, OverflowError) as error:
-        raise InputError(
-            f"cluster {address}: nobody answers there ({error}); start one with `ray start --head`"
-        ) from error
+        raise InputError(f"cluster {address}: nobody answers there ({error}); {_REMEDY}") from error
 
 
 class _Task:
