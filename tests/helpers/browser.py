@@ -84,6 +84,39 @@ class Page:
             assert time.monotonic() < end, found
             time.sleep(0.1)
 
+    def box(self, selector: str) -> tuple[float, float, float, float]:
+        """Left, top, width and height of an element in the window."""
+        found = f"(({{ x, y, width, height }}) => [x, y, width, height])({_element(selector)}.getBoundingClientRect())"
+        left, top, width, height = self.value(found)
+        return left, top, width, height
+
+    def click(self, selector: str) -> None:
+        """Presses the mouse on the middle of an element, which must be seen there."""
+        left, top, width, height = self.box(selector)
+        x, y = left + width / 2, top + height / 2
+        assert self.value(f"{_element(selector)}.contains(document.elementFromPoint({x}, {y}))"), (
+            f"{selector} is covered"
+        )
+        for kind in ("mousePressed", "mouseReleased"):
+            self.ask("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
+
+    def drag(self, selector: str, dx: float, dy: float) -> None:
+        """Moves the pressed mouse from the middle of an element."""
+        left, top, width, height = self.box(selector)
+        x, y = left + width / 2, top + height / 2
+        for kind, at in (
+            ("mousePressed", (x, y)),
+            ("mouseMoved", (x + dx, y + dy)),
+            ("mouseReleased", (x + dx, y + dy)),
+        ):
+            place = {"x": at[0], "y": at[1]}
+            self.ask("Input.dispatchMouseEvent", type=kind, **place, button="left", buttons=1, clickCount=1)
+
+    def press(self, key: str, code: int = 0) -> None:
+        """A key, of what has the focus; `code` where it is none of a character."""
+        for kind in ("keyDown", "keyUp"):
+            self.ask("Input.dispatchKeyEvent", type=kind, key=key, code=key, windowsVirtualKeyCode=code)
+
     def processor_seconds(self) -> float:
         """What the browser's processes have taken together until now."""
         from websockets.sync.client import connect
@@ -104,6 +137,10 @@ class Page:
     def decoded(self, text: str) -> np.ndarray:
         """(H, W, 3) in [0, 1] of a picture file in base64."""
         return np.asarray(Image.open(io.BytesIO(base64.b64decode(text))).convert("RGB")) / 255
+
+
+def _element(selector: str) -> str:
+    return f"document.querySelector({json.dumps(selector)})"
 
 
 @contextmanager

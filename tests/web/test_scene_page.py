@@ -9,78 +9,16 @@ import pytest
 import torch
 
 import etsplat
-from etsplat.data.load import load_dataset
 from etsplat.io.mesh_files import MeshFile
 from etsplat.io.run_directory import RunDirectory
-from etsplat.model.soup_appearance import SoupAppearance
 from etsplat.model.soup_import import open_soup
-from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.report import write_report
 from etsplat.tasks.export_config import ExportConfig
 from etsplat.tasks.export_soup import export_soup
 from etsplat.tasks.sources import SoupRun
 from etsplat.web.pages import SCENE_SCRIPTS, SHARED_SCRIPTS, asset
-from helpers.browser import browser_page, find_browser
-from helpers.captures import write_transforms
 from helpers.finished_runs import write_run, write_soup_run
-
-SIZE = (400, 300)
-STILL = """new Promise((done) => {
-    const look = () => { if (v.frame || v.sorting || !v.sorted) setTimeout(look, 50); else done(true); };
-    look();
-})"""
-
-
-@pytest.fixture(scope="module")
-def page():
-    if find_browser() is None:
-        pytest.skip("there is no Chromium")
-    pytest.importorskip("websockets")
-    with browser_page() as opened:
-        yield opened
-
-
-def make_soup(count=150, **appearance):
-    """Triangles around the origin, with colours that depend on the direction, before a large one and a far one."""
-    rng = torch.Generator().manual_seed(5)
-    corners = torch.randn(count, 1, 3, generator=rng) * 0.6 + torch.randn(count, 3, 3, generator=rng) * 0.25
-    corners[0], corners[1] = 4 * corners[0], 20 * corners[1]
-    made = TriangleSoup.from_triangles(
-        corners, torch.rand(count, 3, generator=rng), opacity=0.5, sigma=0.5, sh_degree=3
-    )
-    state = made.state()
-    state["opacity_logits"] = torch.randn(count, generator=rng) * 2 + 1
-    state["sigma_raw"] = torch.randn(count, generator=rng) * 0.8 - 1
-    state["sh_rest"] = torch.randn(count, 15, 3, generator=rng) * 0.1
-    return TriangleSoup(**state, appearance=SoupAppearance(**appearance))
-
-
-@pytest.fixture
-def capture(tmp_path):
-    """Eight cameras around the origin, of an odd lens."""
-    write_transforms(tmp_path / "scene", 8, cx=8.5, cy=5.5, fl_y=15.0)
-    return load_dataset(tmp_path / "scene", preload=False)
-
-
-def written(tmp_path, soup, capture=None, opaque=None, **config):
-    path = tmp_path / "a <b> scene.html"
-    run = SoupRun(path.with_suffix(".safetensors"), soup, capture, opaque)
-    export_soup(run, path, ExportConfig(**config))
-    return path
-
-
-def picture(page, photo, mode):
-    drawn = f"v.picture({{photo: {photo}, mode: '{mode}', width: {SIZE[0]}, height: {SIZE[1]}}})"
-    return torch.from_numpy(page.picture(f"sceneViewer.then(v => {drawn})")).float()
-
-
-def decibels(a, b):
-    return float(-10 * (a.clamp(0, 1) - b.clamp(0, 1)).square().mean().log10())
-
-
-def camera_of(capture, index):
-    camera = capture.cameras[index]
-    return camera.scaled(SIZE[0] / camera.width)
+from helpers.scene_pages import SIZE, STILL, camera_of, decibels, make_soup, picture, written
 
 
 def test_a_page_needs_no_network_and_no_other_file(tmp_path, capture):
