@@ -40,7 +40,7 @@ EARLY = """new Promise((done) => {
     look();
 })"""
 WHOLE = """sceneViewer.then((v) => new Promise((done) => {
-    const look = () => { if (v.frame || v.sorting || !v.sorted) setTimeout(look, 50); else done(true); };
+    const look = () => { if (v.busy) setTimeout(look, 50); else done(true); };
     look();
 }))"""
 READING, DRAWING, FINDING = "to read alone", "a picture of the viewer, 960 x 540", ".etz, read"

@@ -2,10 +2,10 @@
 
     python -m benchmarks.sending runs/fox runs/bonsai
 
-A table in Markdown for each run. Pictures of the browser (Chromium, WebGL in software) are compared with ours from the
-exact soup and mesh, 400 pixels wide at the first test view; frames are 1280 x 720 from the camera that a page begins
-at, the best of four, with the pixels read back; and beside them the mean of the processor's seconds, of all of the
-browser's processes, which other jobs do not lengthen.
+A table in Markdown for each run. Pictures of the browser (Chromium, WebGL and WebGPU in software) are compared with
+ours from the exact soup and mesh, 400 pixels wide at the first test view. Frames are by WebGL, 1280 x 720 from the
+camera that a page begins at, the best of four, with the pixels read back; and beside them the mean of the processor's
+seconds, of all of the browser's processes, which other jobs do not lengthen.
 """
 
 import json
@@ -28,17 +28,18 @@ from etsplat.tasks.export_config import ExportConfig
 from etsplat.tasks.export_soup import export_soup
 from etsplat.tasks.scoring import Scorer
 from etsplat.tasks.sources import SoupRun, open_run
-from tests.helpers.browser import Page, browser_page
+from tests.helpers.browser import WEBGPU, Page, browser_page
 
 FRAME = """sceneViewer.then((v) => {
     [v.canvas.width, v.canvas.height] = [1280, 720];
     const begin = performance.now();
     v.painter.draw(v.camera, "MODE", OPTIONS);
-    v.gl.readPixels(0, 0, 1, 1, v.gl.RGBA, v.gl.UNSIGNED_BYTE, new Uint8Array(4));
+    const { gl } = v.device;
+    gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));
     return performance.now() - begin;
 })"""
 STILL = """sceneViewer.then((v) => new Promise((done) => {
-    const look = () => { if (v.frame || v.sorting || !v.sorted) setTimeout(look, 50); else done(true); };
+    const look = () => { if (v.busy) setTimeout(look, 50); else done(true); };
     look();
 }))"""
 REFINE = """sceneViewer.then(async (v) => {
@@ -48,8 +49,9 @@ REFINE = """sceneViewer.then(async (v) => {
     painter.refine = (...given) => { times.push(performance.now()); return refine(...given); };
     v.change();
     v.moved = 0;
-    while (v.frame || v.sorting) await new Promise((done) => setTimeout(done, 5));
-    v.gl.readPixels(0, 0, 1, 1, v.gl.RGBA, v.gl.UNSIGNED_BYTE, new Uint8Array(4));
+    while (v.busy) await new Promise((done) => setTimeout(done, 5));
+    const { gl } = v.device;
+    gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));
     times.push(performance.now());
     [painter.draw, painter.refine] = [draw, refine];
     return times.slice(1);
@@ -63,7 +65,7 @@ COARSE = """sceneViewer.then(async (v) => {
 })"""
 SORT = """sceneViewer.then(async (v) => {
     const begin = performance.now();
-    await v.sorter.sort(v.request());
+    await v.painter.sorter.sort(v.request());
     return performance.now() - begin;
 })"""
 
@@ -116,22 +118,29 @@ def cut(compact: Path, part: Path, share: float) -> int:
     return count
 
 
+def compared(run: SoupRun, html: Path, page: Page, query: str) -> list[tuple[str, str]]:
+    """How near its pictures are to ours, by WebGL or by what the query asks for."""
+    page.open(html, query=query)
+    page.value(STILL)
+    name, rows = page.value("sceneViewer.then(v => v.device.name)"), []
+    photo, camera = _first_test_view(run, 400)
+    for mode, ours in _ours(run, camera).items():
+        wanted: dict[str, Any] = {"photo": photo, "mode": mode, "width": camera.width, "height": camera.height}
+        shown = torch.from_numpy(page.picture(f"sceneViewer.then(v => v.picture({wanted}))")).float()
+        rows.append((f"{mode} by {name}, against ours", f"{decibels(shown, ours):.1f} dB"))
+    return rows
+
+
 def drawn(run: SoupRun, html: Path, page: Page) -> list[tuple[str, str]]:
     """What the browser makes of the page."""
-    capture = run.needed_capture()
-    photo = capture.test[0]
-    camera = capture.cameras[photo]
-    camera = camera.scaled(400 / camera.width)
     begin = time.perf_counter()
     page.open(html)
     page.value(STILL)
     rows = [("until the first whole picture", f"{time.perf_counter() - begin:.1f} s")]
-    place = sorted([*capture.train, *capture.test, *capture.watched]).index(photo)
-    for mode, ours in _ours(run, camera).items():
-        wanted: dict[str, Any] = {"photo": place, "mode": mode, "width": camera.width, "height": camera.height}
-        shown = torch.from_numpy(page.picture(f"sceneViewer.then(v => v.picture({wanted}))")).float()
-        rows.append((f"{mode}, against ours", f"{decibels(shown, ours):.1f} dB"))
-    camera = camera.scaled(1280 / camera.width)
+    rows += compared(run, html, page, "")
+    with browser_page(*WEBGPU) as another:
+        rows += compared(run, html, another, "?draw=webgpu")
+    place, camera = _first_test_view(run, 1280)
     wanted = {"photo": place, "mode": "soft", "width": camera.width, "height": camera.height}
     shown = torch.from_numpy(page.picture(COARSE.replace("WANTED", json.dumps(wanted)))).float()
     against = decibels(shown, _ours(run, camera)["soft"])
@@ -159,6 +168,15 @@ def drawn(run: SoupRun, html: Path, page: Page) -> list[tuple[str, str]]:
     rows.append(("soft, from standing still to the whole picture, 1280 x 720", f"{took}; processor {seconds:.2f} s"))
     rows.append(("to sort and colour", f"{min(page.value(SORT) for _ in range(4)):.0f} ms"))
     return rows
+
+
+def _first_test_view(run: SoupRun, width: int) -> tuple[int, Cameras]:
+    """Its place in the page's list of photos, and its camera, so wide."""
+    capture = run.needed_capture()
+    photo = capture.test[0]
+    camera = capture.cameras[photo]
+    place = sorted([*capture.train, *capture.test, *capture.watched]).index(photo)
+    return place, camera.scaled(width / camera.width)
 
 
 def _ours(run: SoupRun, camera: Cameras) -> dict[str, Tensor]:

@@ -12,7 +12,7 @@ import pytest
 
 from etsplat import _native
 from etsplat.engines.cuda.program import source_root
-from etsplat.web.pages import SCENE_SCRIPTS, SHARED_SCRIPTS
+from etsplat.web.pages import SCENE_SCRIPTS, SHADERS, SHARED_SCRIPTS, SORT_SHADERS
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 
@@ -50,8 +50,11 @@ def test_report_assets_are_installed() -> None:
     """The pages of reports and scenes, styles and scripts come with the package, and so does the typing marker."""
     for name in ("page.html", "page.css", "page.js", "viewer.js", "scene.html"):
         assert (files("etsplat.report") / "assets" / name).is_file()
-    for name in ("scene_page.html", "scene.html", "base.css", "scene.css", *SHARED_SCRIPTS, *SCENE_SCRIPTS):
+    shaders = [f"{name}.wgsl" for name in SHADERS]
+    for name in ("scene_page.html", "scene.html", "base.css", "scene.css", *SHARED_SCRIPTS, *SCENE_SCRIPTS, *shaders):
         assert (files("etsplat.web") / "assets" / name).is_file()
+    for name in SORT_SHADERS:
+        assert (files("etsplat.engines.webgpu") / "shaders" / f"{name}.wgsl").is_file()
     assert (files("etsplat") / "py.typed").is_file()
 
 

@@ -23,6 +23,9 @@ FLAGS = (
     *("--no-first-run", "--disable-extensions", "--disable-background-networking", "--disable-dev-shm-usage"),
     *("--hide-scrollbars", "--remote-debugging-port=0"),
 )
+WEBGPU = ("--enable-unsafe-webgpu", "--enable-features=Vulkan", "--use-vulkan=swiftshader")
+"""Flags for WebGPU in software: its canvases stay empty where the browser's own pictures are not made by Vulkan too."""
+
 PATIENCE = 120.0
 """Seconds for any answer."""
 
@@ -57,13 +60,33 @@ class Page:
                 assert "error" not in said, said
                 return said["result"]
 
-    def open(self, path: Path, width: int = 1280, height: int = 720, *, phone: bool = False) -> None:
-        """Opens a file in a window of so many pixels."""
+    def open(
+        self,
+        path: Path,
+        width: int = 1280,
+        height: int = 720,
+        *,
+        phone: bool = False,
+        query: str = "",
+        before: str = "",
+    ) -> None:
+        """Opens a file in a window of so many pixels.
+
+        Args:
+            path: of the file.
+            width: of the window.
+            height: of the window.
+            phone: whether it is one, with two pixels for each along each side.
+            query: what stands behind the file's name in the address.
+            before: a script that runs before those of the page.
+        """
         scale = 2 if phone else 1
         self.ask(
             "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=scale, mobile=phone
         )
-        self.visit(path.resolve().as_uri())
+        added = self.ask("Page.addScriptToEvaluateOnNewDocument", source=before)
+        self.visit(path.resolve().as_uri() + query)
+        self.ask("Page.removeScriptToEvaluateOnNewDocument", **added)
 
     def visit(self, address: str) -> None:
         """Goes to an address, and waits until what is there has come."""
@@ -144,8 +167,8 @@ def _element(selector: str) -> str:
 
 
 @contextmanager
-def browser_page() -> Iterator[Page]:
-    """A page of a browser of its own.
+def browser_page(*flags: str) -> Iterator[Page]:
+    """A page of a browser of its own, with these flags besides the usual ones.
 
     Raises:
         AssertionError: there is no browser.
@@ -156,7 +179,7 @@ def browser_page() -> Iterator[Page]:
     assert program is not None
     with TemporaryDirectory(ignore_cleanup_errors=True) as profile:
         root = ["--no-sandbox"] if hasattr(os, "geteuid") and os.geteuid() == 0 else []
-        command = [program, *FLAGS, *root, f"--user-data-dir={profile}", "about:blank"]
+        command = [program, *FLAGS, *flags, *root, f"--user-data-dir={profile}", "about:blank"]
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         try:
             port = _port(Path(profile) / "DevToolsActivePort", process)

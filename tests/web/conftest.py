@@ -8,11 +8,17 @@ from helpers.captures import write_transforms
 
 
 @pytest.fixture(scope="module")
-def page():
+def flags():
+    """Of the browser; a module may have its own."""
+    return ()
+
+
+@pytest.fixture(scope="module")
+def page(flags):
     if find_browser() is None:
         pytest.skip("there is no Chromium")
     pytest.importorskip("websockets")
-    with browser_page() as opened:
+    with browser_page(*flags) as opened:
         yield opened
 
 

@@ -8,8 +8,6 @@ from html.parser import HTMLParser
 import pytest
 import torch
 
-import etsplat
-from etsplat.io.mesh_files import MeshFile
 from etsplat.io.run_directory import RunDirectory
 from etsplat.model.soup_import import open_soup
 from etsplat.report import write_report
@@ -18,7 +16,20 @@ from etsplat.tasks.export_soup import export_soup
 from etsplat.tasks.sources import SoupRun
 from etsplat.web.pages import SCENE_SCRIPTS, SHARED_SCRIPTS, asset
 from helpers.finished_runs import write_run, write_soup_run
-from helpers.scene_pages import SIZE, STILL, camera_of, decibels, make_soup, picture, written
+from helpers.scene_pages import (
+    SIZE,
+    STILL,
+    camera_of,
+    decibels,
+    expect_that_refining_ends_as_drawing_at_once,
+    make_soup,
+    mesh_of_a_ball,
+    opaque_of,
+    picture,
+    soft_of,
+    with_a_small_beginning,
+    written,
+)
 
 
 def test_a_page_needs_no_network_and_no_other_file(tmp_path, capture):
@@ -65,20 +76,17 @@ def test_a_browser_draws_what_the_rasterizer_draws(tmp_path, page, capture, appe
     page.open(written(tmp_path, soup, capture))
     for photo in (1, 6):
         camera = camera_of(capture, photo)
-        behind = torch.tensor([soup.appearance.background])
-        soft = soup.render(camera, backgrounds=behind).color[0]
+        soft = soft_of(soup, camera)
         assert float(soft.std()) > 0.1
         assert decibels(picture(page, photo, "soft"), soft) > 40
-        rgba = soup.render_opaque(camera)[0]
-        assert decibels(picture(page, photo, "opaque"), rgba[..., :3] + (1 - rgba[..., 3:]) * behind) > 35
+        assert decibels(picture(page, photo, "opaque"), opaque_of(soup, camera, soup.appearance.background)) > 35
     assert page.errors == []
 
 
 def test_a_browser_draws_the_opaque_mesh(tmp_path, page, capture):
     """With colours at its corners, where the run has one; without the sky if that is left out."""
     soup = make_soup()
-    vertices, faces = etsplat.icosphere(2)
-    mesh = MeshFile(vertices.float(), faces, vertex_colors=vertices.float() * 0.5 + 0.5)
+    mesh = mesh_of_a_ball()
     page.open(written(tmp_path, soup, capture, mesh))
     run = SoupRun(tmp_path, soup, capture, mesh)
     assert run.solid is not None
@@ -139,17 +147,13 @@ def test_a_browser_without_workers_sorts_all_the_same(tmp_path, page, capture):
         "Worker = class { constructor() { throw new Error(); } }",
         "URL.createObjectURL = () => 'blob:none'",
     ):
-        added = page.ask("Page.addScriptToEvaluateOnNewDocument", source=source)
-        page.open(path)
-        page.ask("Page.removeScriptToEvaluateOnNewDocument", **added)
+        page.open(path, before=source)
         assert decibels(picture(page, 2, "soft"), soup.render(camera_of(capture, 2)).color[0]) > 40
 
 
 def test_a_browser_without_webgl_says_so(tmp_path, page):
     source = "HTMLCanvasElement.prototype.getContext = () => null"
-    added = page.ask("Page.addScriptToEvaluateOnNewDocument", source=source)
-    page.open(written(tmp_path, make_soup(5)))
-    page.ask("Page.removeScriptToEvaluateOnNewDocument", **added)
+    page.open(written(tmp_path, make_soup(5)), before=source)
     assert page.value("sceneViewer.then(v => v === null)")
     assert "has no WebGL 2" in page.value("document.body.textContent")
 
@@ -178,13 +182,11 @@ def test_the_report_of_a_soup_shows_its_scene(tmp_path, page):
 
 def test_pictures_come_back_where_the_device_took_what_it_held(tmp_path, page, capture):
     """As phones do with pages in the background."""
-    soup, (vertices, faces) = make_soup(), etsplat.icosphere(2)
-    mesh = MeshFile(vertices.float(), faces, vertex_colors=vertices.float() * 0.5 + 0.5)
-    page.open(written(tmp_path, soup, capture, mesh))
+    page.open(written(tmp_path, make_soup(), capture, mesh_of_a_ball()))
     before = [picture(page, 2, mode) for mode in ("soft", "opaque")]
-    page.value("sceneViewer.then(v => (window.taken = v.gl.getExtension('WEBGL_lose_context')).loseContext())")
+    page.value("sceneViewer.then(v => (window.taken = v.device.gl.getExtension('WEBGL_lose_context')).loseContext())")
     page.value("sceneViewer.then(v => { v.stand(1); return new Promise(done => setTimeout(done, 300)); })")
-    assert page.value("sceneViewer.then(v => v.gl.isContextLost())")
+    assert page.value("sceneViewer.then(v => v.device.lost)")
     page.value("taken.restoreContext()")
     page.value("new Promise(done => setTimeout(done, 300))")
     page.value(f"sceneViewer.then(v => {STILL})")
@@ -211,22 +213,7 @@ def test_a_part_of_a_scene_is_drawn_larger(tmp_path, page, capture):
 def test_a_soft_picture_that_is_refined_ends_as_one_that_is_drawn_at_once(tmp_path, page, capture):
     """Part by part over a small one, each nearer to it than the small one; then nothing is drawn any more."""
     page.open(written(tmp_path, make_soup(), capture), 160, 120)
-    page.value(f"sceneViewer.then(v => {STILL})")
-    drawn = """sceneViewer.then(v => {
-        const pictures = [], { painter, camera, canvas } = v, take = () => pictures.push(canvas.toDataURL());
-        painter.draw(camera, "soft"); take();
-        painter.draw(camera, "soft", { scale: 0.1, still: false }); take();
-        for (let whole = false, fresh = true; !whole; fresh = false) {
-            whole = painter.refine(camera, 0.3, fresh);
-            take();
-        }
-        return pictures;
-    })"""
-    found = [torch.from_numpy(page.decoded(each.split(",")[1])).float() for each in page.value(drawn)]
-    assert len(found) == 2 + 4
-    assert torch.equal(found[0], found[-1])
-    small, *parts = (decibels(each, found[0]) for each in found[1:-1])
-    assert small < min(parts)
+    expect_that_refining_ends_as_drawing_at_once(page)
     shown = f"""sceneViewer.then(async v => {{
         const {{ painter }} = v, steps = [], draw = painter.draw.bind(painter), refine = painter.refine.bind(painter);
         painter.draw = (camera, mode, how) => {{ steps.push(how.scale); draw(camera, mode, how); }};
@@ -259,10 +246,8 @@ def test_soft_layers_are_added_up_in_as_many_bits_as_there_are(tmp_path, page, c
             WebGL2RenderingContext.prototype.getExtension = function (name) {{
                 return "{missing}" && name.startsWith("{missing}") ? null : extension.call(this, name);
             }}"""
-        added = page.ask("Page.addScriptToEvaluateOnNewDocument", source=source)
-        page.open(path)
-        page.ask("Page.removeScriptToEvaluateOnNewDocument", **added)
-        assert page.value(f"sceneViewer.then(v => v.painter.soft.whole.format === v.gl.{held})")
+        page.open(path, before=source)
+        assert page.value(f"sceneViewer.then(v => v.painter.targets.whole.format === v.device.gl.{held})")
         assert decibels(picture(page, 1, "soft"), expected) > least
 
 
@@ -288,11 +273,7 @@ def test_a_large_scene_is_shown_before_all_of_it_is_read(tmp_path, page, capture
     page.open(file)
     expected = picture(page, 2, "soft")
     assert page.value("document.getElementById('scene').dataset.early ?? null") is None
-    text, constant = file.read_text(encoding="utf-8"), "const EARLY = 1 << 22;"
-    assert constant in text
-    soup = re.search(r'id="scene-soup">([^<]*)<', text)
-    assert soup is not None
-    file.write_text(text.replace(constant, f"const EARLY = {len(soup[1]) // 2 & ~3};"), encoding="utf-8")
+    with_a_small_beginning(file)
     page.open(file)
     assert page.value("sceneViewer.then(v => [v.root.dataset.early, v.soup.count])") == ["4096", 9000]
     assert torch.equal(picture(page, 2, "soft"), expected)

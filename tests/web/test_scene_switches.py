@@ -10,14 +10,15 @@ from etsplat.model.soup_import import open_soup
 from etsplat.tasks.export_config import ExportConfig
 from etsplat.tasks.export_soup import export_soup
 from etsplat.tasks.sources import SoupRun
-from helpers.scene_pages import STILL, camera_of, decibels, make_soup, written
+from helpers.scene_pages import STILL, camera_of, decibels, make_soup, opaque_of, soft_of, written
 
+BACKGROUND = (0.2, 0.4, 0.6)
 DOWN = ("ArrowDown", 40)
 
 
 @pytest.fixture
 def soup():
-    return make_soup(300, background=(0.2, 0.4, 0.6))
+    return make_soup(300, background=BACKGROUND)
 
 
 @pytest.fixture
@@ -39,15 +40,6 @@ def shown(tmp_path, page, soup, capture):
     assert page.errors == []
 
 
-def soft(soup, camera):
-    return soup.render(camera, backgrounds=torch.tensor([soup.appearance.background])).color[0]
-
-
-def opaque(soup, camera):
-    rgba = soup.render_opaque(camera)[0]
-    return rgba[..., :3] + (1 - rgba[..., 3:]) * torch.tensor([soup.appearance.background])
-
-
 def pressed(page, group):
     chosen = f"document.querySelectorAll('[data-switch={group}] [aria-pressed=true]')"
     return page.value(f"[...{chosen}].map(button => button.value)")
@@ -56,13 +48,13 @@ def pressed(page, group):
 def test_soft_and_opaque(page, shown, soup, capture):
     camera = camera_of(capture, page.value("sceneViewer.then(v => v.photo)"))
     assert pressed(page, "mode") == ["soft"]
-    assert decibels(shown(), soft(soup, camera)) > 40
+    assert decibels(shown(), soft_of(soup, camera)) > 40
     page.click("[data-switch=mode] [value=opaque]")
     assert pressed(page, "mode") == ["opaque"]
-    assert decibels(shown(), opaque(soup, camera)) > 35
-    assert decibels(shown(), soft(soup, camera)) < 30
+    assert decibels(shown(), opaque_of(soup, camera, BACKGROUND)) > 35
+    assert decibels(shown(), soft_of(soup, camera)) < 30
     page.click("[data-switch=mode] [value=soft]")
-    assert decibels(shown(), soft(soup, camera)) > 40
+    assert decibels(shown(), soft_of(soup, camera)) > 40
 
 
 def test_photos_by_list_and_by_steps(page, shown, soup, capture):
@@ -73,7 +65,7 @@ def test_photos_by_list_and_by_steps(page, shown, soup, capture):
         assert page.value("document.querySelector('[data-list=photos]').value") == str(photo)
         name = "document.querySelector('[data-list=photos]').selectedOptions[0].textContent"
         assert page.value(name) == capture.names[photo]
-        assert decibels(shown(), soft(soup, camera_of(capture, photo))) > 40
+        assert decibels(shown(), soft_of(soup, camera_of(capture, photo))) > 40
 
     expect(first)
     page.click("[data-step='1']")
@@ -87,12 +79,12 @@ def test_photos_by_list_and_by_steps(page, shown, soup, capture):
     page.press(*DOWN)
     expect(1)
     page.drag("canvas", 60, 20)
-    assert decibels(shown(), soft(soup, camera_of(capture, 1))) < 30
+    assert decibels(shown(), soft_of(soup, camera_of(capture, 1))) < 30
     page.press("0", 48)  # the drag gave the canvas the focus
     expect(1)
 
 
-@pytest.mark.parametrize("soup", [make_soup(9000, background=(0.2, 0.4, 0.6))], ids=["several chunks"])
+@pytest.mark.parametrize("soup", [make_soup(9000, background=BACKGROUND)], ids=["several chunks"])
 def test_a_fraction(tmp_path, page, shown, soup, capture):
     """As a file cut off there is drawn."""
     export_soup(SoupRun(tmp_path, soup, capture, None), tmp_path / "soup.etz", ExportConfig())
@@ -107,24 +99,33 @@ def test_a_fraction(tmp_path, page, shown, soup, capture):
         (tmp_path / "part.etz").write_bytes(data[: begin + sum(sizes[:chunks])])
         part = open_soup(tmp_path / "part.etz")
         assert len(part) == count
-        assert decibels(shown(), soft(part, camera)) > 40
-    assert decibels(shown(), soft(soup, camera)) < 35
+        assert decibels(shown(), soft_of(part, camera)) > 40
+    assert decibels(shown(), soft_of(soup, camera)) < 35
+    page.click("[data-switch=mode] [value=opaque]")
+    assert (
+        decibels(shown(), opaque_of(part, camera, BACKGROUND))
+        > 35
+        > decibels(shown(), opaque_of(soup, camera, BACKGROUND))
+    )
+    page.click("[data-switch=mode] [value=soft]")
+    page.value("document.querySelector('[data-list=fraction]').focus()")
     page.press("Home", 36)
-    assert decibels(shown(), soft(soup, camera)) > 40
+    assert decibels(shown(), soft_of(soup, camera)) > 40
 
 
 @pytest.mark.parametrize("mode", ["soft", "opaque"])
 def test_half_size(page, shown, soup, capture, mode):
     """Half as many pixels along each side, made as large as the others by the browser."""
     camera = camera_of(capture, page.value("sceneViewer.then(v => v.photo)"))
-    draw = {"soft": soft, "opaque": opaque}[mode]
     page.click(f"[data-switch=mode] [value={mode}]")
     whole = shown()
     page.value("document.querySelector('[data-list=resolution]').focus()")
     page.press(*DOWN)
     half = shown()
     assert page.value("sceneViewer.then(v => [v.canvas.width, v.canvas.height])") == [200, 150]
-    small = draw(soup, camera.scaled(0.5)).movedim(-1, 0)[None]
+    smaller = camera.scaled(0.5)
+    drawn = soft_of(soup, smaller) if mode == "soft" else opaque_of(soup, smaller, BACKGROUND)
+    small = drawn.movedim(-1, 0)[None]
     enlarged = functional.interpolate(small, size=(300, 400), mode="bilinear")[0].movedim(0, -1)
     assert decibels(half, enlarged) > decibels(half, whole) + 3
     page.press("ArrowUp", 38)

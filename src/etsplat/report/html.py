@@ -20,7 +20,7 @@ from etsplat.report.curves import curves_of, draw_svg, plot_convergence, short_n
 from etsplat.report.data import Run, read_run
 from etsplat.report.scene import own_asset, scene_section
 from etsplat.tasks.settings import flatten
-from etsplat.web.pages import SCENE_SCRIPTS, SHARED_SCRIPTS, asset, filled, in_base64, scripts
+from etsplat.web.pages import SHARED_SCRIPTS, asset, filled, in_base64, scene_script, scripts
 
 MAX_VIEWS = 12
 MAX_PICTURE = 800
@@ -64,7 +64,7 @@ def render_page(run: Run) -> str:
     versions = ", ".join(f"{name} {number}" for name, number in run.metrics["versions"].items())
     scene = "" if run.task != "train" else scene_section(run)
     said = {name: v if isinstance(v, str) else json.dumps(v) for name, v in flatten(run.config).items()}
-    viewer = own_asset("viewer.js") if run.mesh is not None else scripts(*SCENE_SCRIPTS) if scene else ""
+    viewer = own_asset("viewer.js") if run.mesh is not None else scene_script() if scene else ""
     return filled(
         own_asset("page.html"),
         version=version("etsplat"),

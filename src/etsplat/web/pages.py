@@ -13,8 +13,17 @@ from typing import Any
 SHARED_SCRIPTS = ("gl.js", "camera.js", "switches.js")
 """What every viewer needs, in the order in which it is read."""
 
-SCENE_SCRIPTS = ("compact.js", "sorter.js", "shaders.js", "painter.js", "scene.js")
+SCENE_SCRIPTS = (
+    *("compact.js", "sorter.js", "painter.js", "gl_shaders.js", "gl_painter.js"),
+    *("gpu_device.js", "gpu_painter.js", "scene.js"),
+)
 """What the viewer of a scene needs beside it."""
+
+SHADERS = ("view", "order", "soft", "opaque", "resolve")
+"""By which it draws where a browser has WebGPU."""
+
+SORT_SHADERS = ("common", "block_scan", "sort", "scan")
+"""By which it puts triangles into order there, as the engine "webgpu" does."""
 
 
 @dataclass(frozen=True)
@@ -49,6 +58,14 @@ def scripts(*names: str) -> str:
     return "\n".join(asset(name) for name in names)
 
 
+def scene_script() -> str:
+    """The viewer of a scene, which needs the shared scripts before it."""
+    shaders = {name: asset(f"{name}.wgsl") for name in SHADERS}
+    engine = files("etsplat.engines.webgpu") / "shaders"
+    shaders |= {name: (engine / f"{name}.wgsl").read_text(encoding="utf-8") for name in SORT_SHADERS}
+    return f"const SHADERS = {json.dumps(shaders)};\n" + scripts(*SCENE_SCRIPTS)
+
+
 def in_base64(content: bytes) -> str:
     """Bytes as ASCII."""
     return base64.b64encode(content).decode("ascii")
@@ -75,5 +92,5 @@ def render_scene_page(scene: ScenePage) -> str:
         title=escape(scene.title),
         style="\n".join(asset(name) for name in ("base.css", "scene.css")),
         scene=render_scene(scene),
-        script=scripts(*SHARED_SCRIPTS, *SCENE_SCRIPTS),
+        script="\n".join([scripts(*SHARED_SCRIPTS), scene_script()]),
     )

@@ -61,7 +61,8 @@ function readSoft(planes, header, soup, first) {
 }
 
 // {count, corners, opacities, sigma, harmonics, bases} of soft triangles, {count, corners, colors} of opaque ones, both with
-// `look`, how they are drawn, `ends`, the lengths of the prefixes that draw, and `enlarged`, how much larger in each of them.
+// `look`, how they are drawn, `whole`, how many there are if nothing is cut off, `ends`, the lengths of the prefixes that draw,
+// and `enlarged`, how much larger in each of them.
 async function readCompact(buffer) {
     const view = new DataView(buffer);
     const [magic, version, length] = [0, 4, 8].map((at) => view.getUint32(at, true));
@@ -75,7 +76,8 @@ async function readCompact(buffer) {
         count += rows;
     }
     const { appearance: look, enlarged = [] } = header;
-    const soup = { count, bases, look, enlarged, corners: new Float32Array(9 * count), ends: [] };
+    const whole = header.chunks.reduce((sum, [rows]) => sum + rows, 0);
+    const soup = { count, whole, bases, look, enlarged, corners: new Float32Array(9 * count), ends: [] };
     if (bases) {
         [soup.opacities, soup.sigma] = [new Float32Array(count), new Float32Array(count)];
         soup.harmonics = new Float32Array(3 * bases * count);

@@ -9,15 +9,13 @@ const SMALLEST = 0.2, FIRST = { soft: 0.5, opaque: 1 }; // of their sizes, along
 const EARLY = 1 << 22; // characters of base64, a multiple of four: as much of a scene is shown before the rest is read
 
 class SceneViewer {
-    constructor(root, scene, soup, mesh) {
-        [this.root, this.scene] = [root, scene];
+    constructor(root, scene, device, soup, mesh) {
+        [this.root, this.scene, this.device] = [root, scene, device];
         this.canvas = root.querySelector("canvas");
-        this.gl = context(this.canvas, { antialias: false, alpha: false });
         this.hold(soup, mesh);
-        this.canvas.addEventListener("webglcontextlost", (event) => event.preventDefault()); // so that it comes back
-        this.canvas.addEventListener("webglcontextrestored", () => this.restore());
+        device.returned = () => this.restore();
         this.options = { mode: "soft", fraction: 1, resolution: 1 };
-        [this.moved, this.pace, this.before, this.frame, this.share, this.fence] = [0, { ...FIRST }, 0, 0, 0, null];
+        [this.moved, this.pace, this.before, this.frame, this.share] = [0, { ...FIRST }, 0, 0, 0];
         const first = scene.cameras[scene.start];
         const up = scene.up || first.rows[1].map((value) => -value);
         const target = along(first.eye, first.rows[2], Math.max(dot(along(scene.focus, first.eye, -1), first.rows[2]), 0.05 * scene.radius));
@@ -31,11 +29,8 @@ class SceneViewer {
     // Shows these triangles from now on.
     hold(soup, mesh) {
         this.painter?.free();
-        this.sorter?.end();
-        [this.soup, this.mesh, this.sorting, this.sorted] = [soup, mesh, false, ""];
-        this.painter = new Painter(this.gl, soup, mesh);
-        const degree = Math.round(Math.sqrt(soup.bases)) - 1;
-        this.sorter = new Sorter(soup, Math.min(degree, soup.look.sh_degree ?? 3));
+        [this.soup, this.mesh] = [soup, mesh];
+        this.painter = this.device.painter(soup, mesh, () => this.wake());
     }
 
     // Goes to a photo's camera.
@@ -52,7 +47,11 @@ class SceneViewer {
 
     change() {
         this.moved = performance.now();
-        if (!this.frame) this.frame = requestAnimationFrame((now) => this.step(now));
+        this.wake();
+    }
+
+    wake() {
+        this.frame ||= requestAnimationFrame((now) => this.step(now));
     }
 
     get amount() {
@@ -61,8 +60,8 @@ class SceneViewer {
         return Math.min(count, ends.find((end) => end >= asked) ?? count);
     }
 
-    request() {
-        const { eye, forward } = this.camera;
+    // The order in which soft triangles are wanted.
+    request({ eye, forward } = this.camera) {
         return { eye: [...eye], forward: [...forward], near: this.soup.look.near_plane, amount: this.amount };
     }
 
@@ -72,10 +71,9 @@ class SceneViewer {
         if (this.canvas.width !== sides[0] || this.canvas.height !== sides[1]) [this.canvas.width, this.canvas.height] = sides;
     }
 
-    // A device takes what it holds from pages that are not looked at for long: all of it is made anew.
+    // The device has lost all that it held.
     restore() {
-        this.painter = new Painter(this.gl, this.soup, this.mesh);
-        this.sorted = "";
+        this.hold(this.soup, this.mesh);
         this.change();
     }
 
@@ -83,34 +81,33 @@ class SceneViewer {
     // coarse, then a part after the other.
     step(now) {
         this.frame = 0;
-        if (this.gl.isContextLost()) return; // `restore` goes on
+        if (this.device.lost) return; // `restore` goes on
         this.resize();
         const moving = performance.now() - this.moved < STILL_AFTER;
-        const { pace, options: { mode } } = this;
+        const { pace, painter, options: { mode } } = this;
         const took = this.before ? now - this.before : 0;
         if (moving && took > SLOW) pace[mode] = Math.max(SMALLEST, pace[mode] * 0.9);
         if (moving && took && took < FAST) pace[mode] = Math.min(1, pace[mode] * 1.03);
-        const refining = mode === "soft" && !moving && !this.sorting;
+        const ordered = (mode === "opaque" && this.mesh) || painter.order(this.request());
+        const refining = mode === "soft" && !moving && ordered;
         if (!refining) {
             this.share = 0;
-            this.painter.draw(this.camera, mode, { scale: pace[mode], still: !moving && mode === "opaque" });
+            painter.draw(this.camera, mode, { scale: pace[mode], still: !moving && mode === "opaque" });
         }
         const unfinished = refining && !this.refine();
         this.before = moving || unfinished ? now : 0;
-        this.sortSoon();
-        if (moving || unfinished) this.frame = requestAnimationFrame((later) => this.step(later));
+        if (moving || unfinished) this.wake();
     }
 
     // A coarse picture in the order that has come, or the next part of the whole one; returns whether it is whole.
     refine() {
-        const { gl, painter, camera, pace: { soft } } = this;
+        const { painter, camera, pace: { soft } } = this;
         const first = !this.share;
-        if (this.fence && !first) { // frames come before the device is done with what was asked of it last
-            if (gl.getSyncParameter(this.fence, gl.SYNC_STATUS) !== gl.SIGNALED) return false;
+        if (!first) { // frames come before the device is done with what was asked of it last
+            if (!painter.done) return false;
             const took = performance.now() - this.begun;
             this.share = Math.min(1, Math.max(LEAST, this.share * Math.min(2, Math.max(0.5, PART / took))));
         }
-        gl.deleteSync(this.fence);
         this.begun = performance.now();
         let whole = false;
         if (first && soft < 1) {
@@ -121,34 +118,22 @@ class SceneViewer {
             whole = painter.refine(camera, this.share || 1, this.fresh || first);
             this.fresh = false;
         }
-        this.fence = whole ? null : gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
         if (whole) this.share = 0;
+        else painter.mark();
         return whole;
     }
 
-    // Asks for the order from here, unless that is under way: then anew when it has come.
-    sortSoon() {
-        const wanted = JSON.stringify(this.request());
-        const needless = this.options.mode === "opaque" && this.painter.mesh;
-        if (needless || this.sorting || wanted === this.sorted) return;
-        this.sorting = true;
-        const { sorter } = this;
-        sorter.sort(this.request()).then((found) => {
-            if (sorter !== this.sorter) return; // of fewer triangles
-            [this.sorting, this.sorted] = [false, wanted];
-            this.painter.take(found);
-            this.share = 0;
-            if (!this.frame) this.frame = requestAnimationFrame((now) => this.step(now));
-        });
+    // For scripts: whether what is shown is going to change by itself.
+    get busy() {
+        return Boolean(this.frame || this.painter.wanted);
     }
 
     // For scripts: the canvas with a photo's picture of so many pixels, when it is drawn; until the camera moves.
     async picture({ photo, mode, width, height }) {
         const camera = new Camera(this.camera.home, this.scene.radius);
         camera.stand(this.scene.cameras[photo], this.scene.focus);
-        const { eye, forward } = camera;
-        this.painter.take(await this.sorter.sort({ ...this.request(), eye, forward }));
-        [this.sorted, this.share] = ["", 0];
+        while (!this.painter.order(this.request(camera))) await this.painter.asked;
+        this.share = 0;
         [this.canvas.width, this.canvas.height] = [width, height];
         this.painter.draw(camera, mode);
         return this.canvas;
@@ -193,6 +178,16 @@ function listenToSwitches(root, viewer) {
     });
 }
 
+// WebGPU where it is of hardware and has room for the scene, WebGL 2 elsewhere; ?draw=webgl or ?draw=webgpu in the address asks
+// for one of them, also in software.
+async function openDevice(canvas, soup) {
+    const asked = new URLSearchParams(location.search).get("draw");
+    if (asked === "webgl") return new GlDevice(canvas);
+    const device = await GpuDevice.open(canvas, soup, asked === "webgpu").catch((error) => console.warn(error));
+    if (!device && asked === "webgpu") throw new Error("this browser has no WebGPU that can show it");
+    return device || new GlDevice(canvas);
+}
+
 // Shows the scene that the page holds, if it holds one; returns its viewer.
 async function showScene() {
     const root = document.getElementById("scene");
@@ -203,7 +198,9 @@ async function showScene() {
         const read = (name, most) => (text(name) ? readCompact(bytesOf(text(name).slice(0, most))) : null);
         const scene = JSON.parse(part("data").textContent);
         const some = text("soup").length > EARLY ? EARLY : undefined;
-        const viewer = new SceneViewer(root, scene, await read("soup", some), await read("mesh", some));
+        const [soup, mesh] = [await read("soup", some), await read("mesh", some)];
+        const viewer = new SceneViewer(root, scene, await openDevice(root.querySelector("canvas"), soup), soup, mesh);
+        root.querySelector("[data-device]").textContent = viewer.device.name;
         listenToSwitches(root, viewer);
         if (some) {
             root.dataset.early = viewer.soup.count;

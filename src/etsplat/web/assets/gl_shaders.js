@@ -12,14 +12,16 @@ ivec2 texel(highp sampler2D texture, int index) {
 }
 vec4 place(int index) { return texelFetch(places, texel(places, index), 0); }
 vec4 paint(int index) { return texelFetch(colors, texel(colors, index), 0); }
+uniform float enlarged; // about the middle, where others are left out
 const vec4 NOWHERE = vec4(2.0, 2.0, 2.0, 1.0);
-${CAMERA_UNIFORMS}`;
+${CAMERA_UNIFORMS}
+vec3 larger(vec4 corner, vec3 middle) { return seen(corner.xyz + (enlarged - 1.0) * (corner.xyz - middle)); }`;
 
 // A soft triangle is drawn as {x <= X}, itself made X times as large about its centre q, X the end of what is visible of it.
 // The forms f_k, of which x is the largest, are affine on the image: X (1 - w_k) at corner k, X at the two others
 // (docs/method.md, csrc/math/triangle.h). What is left out, and when, is in docs/conventions.md.
 const SOFT_VERTEX = `${TRIANGLE_DATA}
-uniform float cullLarge, cullSmall, enlarged;
+uniform float cullLarge, cullSmall;
 out vec3 forms;
 flat out vec4 color;
 flat out vec2 curve;
@@ -42,9 +44,7 @@ void main() {
     int triangle = gl_VertexID / 3, corner = gl_VertexID % 3;
     vec4 a = place(3 * triangle), b = place(3 * triangle + 1), c = place(3 * triangle + 2);
     vec3 middle = (a.xyz + b.xyz + c.xyz) / 3.0;
-    vec3 p0 = seen(a.xyz + (enlarged - 1.0) * (a.xyz - middle));
-    vec3 p1 = seen(b.xyz + (enlarged - 1.0) * (b.xyz - middle));
-    vec3 p2 = seen(c.xyz + (enlarged - 1.0) * (c.xyz - middle));
+    vec3 p0 = larger(a, middle), p1 = larger(b, middle), p2 = larger(c, middle);
     float opacity = a.w, sigma = max(b.w, 1e-6);
     gl_Position = NOWHERE;
     forms = vec3(0.0);
@@ -111,7 +111,8 @@ out vec3 color;
 void main() {
     int triangle = gl_VertexID / 3, corner = gl_VertexID % 3;
     vec4 a = place(3 * triangle), b = place(3 * triangle + 1), c = place(3 * triangle + 2);
-    vec3 p0 = seen(a.xyz), p1 = seen(b.xyz), p2 = seen(c.xyz);
+    vec3 middle = (a.xyz + b.xyz + c.xyz) / 3.0;
+    vec3 p0 = larger(a, middle), p1 = larger(b, middle), p2 = larger(c, middle);
     vec3 mine = corner == 0 ? p0 : corner == 1 ? p1 : p2;
     color = paint(perTriangle == 1 ? triangle : gl_VertexID).rgb;
     bool shown = min(p0.z, min(p1.z, p2.z)) > near && a.w >= 0.5;
