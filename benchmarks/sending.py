@@ -4,8 +4,9 @@
 
 A table in Markdown for each run. Pictures of the browser (Chromium, WebGL and WebGPU in software) are compared with
 ours from the exact soup and mesh, 400 pixels wide at the first test view. Frames are by WebGL, 1280 x 720 from the
-camera that a page begins at, the best of four, with the pixels read back; and beside them the mean of the processor's
-seconds, of all of the browser's processes, which other jobs do not lengthen.
+camera that a page begins at, the best of four, with the pixels read back, and those of a camera that turns as they
+are shown in the window; and beside them the mean of the processor's seconds, of all of the browser's processes, which
+other jobs do not lengthen.
 """
 
 import json
@@ -63,6 +64,20 @@ COARSE = """sceneViewer.then(async (v) => {
     v.painter.draw(camera, "soft", { scale: 0.5, still: false });
     return v.canvas;
 })"""
+TURN = """sceneViewer.then((v) => new Promise((done) => {
+    const { painter } = v, draw = painter.draw.bind(painter), begin = performance.now();
+    let frames = 0;
+    v.set("mode", "opaque");
+    painter.draw = (camera, mode) => { ++frames; draw(camera, mode, { still: false }); };
+    const turn = () => {
+        v.camera.turn(0.01, 0);
+        v.change();
+        if (performance.now() - begin < 4000) { requestAnimationFrame(turn); return; }
+        painter.draw = draw;
+        done([frames, (performance.now() - begin) / 1000]);
+    };
+    turn();
+}))"""
 SORT = """sceneViewer.then(async (v) => {
     const begin = performance.now();
     await v.painter.sorter.sort(v.request());
@@ -166,6 +181,13 @@ def drawn(run: SoupRun, html: Path, page: Page) -> list[tuple[str, str]]:
     longest = max(later - earlier for earlier, later in pairwise(times))
     took = f"{times[-1] - times[0]:.0f} ms in {len(times) - 1} frames, the longest {longest:.0f} ms"
     rows.append(("soft, from standing still to the whole picture, 1280 x 720", f"{took}; processor {seconds:.2f} s"))
+    page.open(html, 1280, 720 + _around(page))
+    page.value(STILL)
+    before = page.processor_seconds()
+    frames, seconds = page.value(TURN)
+    each = (page.processor_seconds() - before) / frames
+    took = f"{frames / seconds:.3g} frames/s; processor {each:.3f} s a frame"
+    rows.append(("opaque, turned for four seconds in a window that shows 1280 x 720", took))
     rows.append(("to sort and colour", f"{min(page.value(SORT) for _ in range(4)):.0f} ms"))
     return rows
 
@@ -185,6 +207,11 @@ def _ours(run: SoupRun, camera: Cameras) -> dict[str, Tensor]:
     rgba = shown.render_opaque(camera)[0]
     opaque = rgba[..., :3] + (1 - rgba[..., 3:]) * behind
     return {"soft": run.soup.render(camera, backgrounds=behind).color[0], "opaque": opaque}
+
+
+def _around(page: Page) -> int:
+    """Height of what the page has beside the picture."""
+    return round(page.value("innerHeight - document.querySelector('canvas').clientHeight"))
 
 
 def _size(path: Path) -> str:

@@ -1,31 +1,31 @@
 // Draws a scene by WebGL 2; the order of soft triangles comes from a worker.
 "use strict";
 
-const TEXTURE_WIDTH = 3072; // a multiple of three, so that a triangle's texels lie in one row
-
-function dataTexture(gl, format, texels) {
+// For so many triangles of `texels` each.
+function dataTexture(gl, format, count, texels) {
     const texture = gl.createTexture();
-    const height = Math.max(1, Math.ceil(texels / TEXTURE_WIDTH));
+    const height = Math.max(1, Math.ceil(count / TRIANGLES_A_ROW));
     if (height > gl.getParameter(gl.MAX_TEXTURE_SIZE)) throw new Error("this device cannot hold so many triangles");
     gl.bindTexture(gl.TEXTURE_2D, texture);
-    gl.texStorage2D(gl.TEXTURE_2D, 1, format, TEXTURE_WIDTH, height);
+    gl.texStorage2D(gl.TEXTURE_2D, 1, format, texels * TRIANGLES_A_ROW, height);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
     return texture;
 }
 
-// Writes `array`, `width` numbers a texel, from the first texel on.
-function fillTexture(gl, texture, layout, type, array, width) {
+// Writes RGBA, from the first texel on.
+function fillTexture(gl, texture, type, array, texels) {
     gl.bindTexture(gl.TEXTURE_2D, texture);
-    const rows = Math.floor(array.length / (width * TEXTURE_WIDTH));
-    const whole = rows * width * TEXTURE_WIDTH, rest = (array.length - whole) / width;
-    if (rows) gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, TEXTURE_WIDTH, rows, layout, type, array.subarray(0, whole));
-    if (rest) gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, rows, rest, 1, layout, type, array.subarray(whole));
+    const width = texels * TRIANGLES_A_ROW, rows = Math.floor(array.length / (4 * width));
+    const whole = 4 * rows * width, rest = (array.length - whole) / 4;
+    if (rows) gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, width, rows, gl.RGBA, type, array.subarray(0, whole));
+    if (rest) gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, rows, rest, 1, gl.RGBA, type, array.subarray(whole));
 }
 
-function filledTexture(gl, format, layout, type, array, width) {
-    const texture = dataTexture(gl, format, array.length / width);
-    fillTexture(gl, texture, layout, type, array, width);
+// With three texels a triangle.
+function cornerTexture(gl, format, type, array) {
+    const texture = dataTexture(gl, format, array.length / 12, 3);
+    fillTexture(gl, texture, type, array, 3);
     return texture;
 }
 
@@ -38,6 +38,12 @@ function blendedFormat(gl) {
     const wide = ["EXT_float_blend", "OES_texture_float_linear"].every((name) => gl.getExtension(name));
     if (slow16 && float && wide) return gl.RGBA32F;
     return float || gl.getExtension("EXT_color_buffer_half_float") ? gl.RGBA16F : gl.RGBA8;
+}
+
+// A source with constants.
+function defined(source, constants) {
+    const lines = Object.entries(constants).map(([name, value]) => `#define ${name} ${value}`);
+    return source.replace("#version 300 es", ["#version 300 es", ...lines].join("\n"));
 }
 
 // A target; made anew when its size changes. `samples` of a pixel; 0 for one without a depth buffer, 1 for one with it.
@@ -107,22 +113,43 @@ class GlTarget {
     }
 }
 
+// The canvas as a target, for opaque pictures: what is seen of it is the background where nothing is drawn.
+class GlCanvas {
+    constructor(gl, background) {
+        [this.gl, this.background] = [gl, background];
+    }
+
+    begin(width, height) {
+        const { gl } = this;
+        [this.width, this.height] = [width, height];
+        gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+        gl.viewport(0, 0, width, height);
+        gl.clearColor(...this.background, 1);
+        gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
+    }
+
+    // It needs not be shown.
+    end() {
+        return null;
+    }
+}
+
 class GlPainter extends Painter {
     constructor(gl, soup, mesh, arrived) {
         const [whole, small] = [0, 1].map(() => new GlTarget(gl, blendedFormat(gl), 0));
         const [still, moving] = [4, 1].map((samples) => new GlTarget(gl, gl.RGBA8, samples));
-        super(gl.canvas, soup, mesh, { whole, small, still, moving });
+        super(gl.canvas, soup, mesh, { whole, small, still, moving, canvas: new GlCanvas(gl, soup.look.background || [0, 0, 0]) });
         [this.gl, this.arrived, this.fence] = [gl, arrived, null];
-        const kernel = `#version 300 es\n#define KERNEL ${KERNEL_IDS[this.look.kernel]}\n#define SDF ${Number(this.look.distance === "sdf")}`;
-        const defined = (source) => source.replace("#version 300 es", kernel);
-        this.soft = compileProgram(gl, defined(SOFT_VERTEX), defined(SOFT_FRAGMENT));
+        const kernel = { KERNEL: KERNEL_IDS[this.look.kernel], SDF: Number(this.look.distance === "sdf") };
+        this.soft = compileProgram(gl, defined(SOFT_VERTEX, kernel), defined(SOFT_FRAGMENT, kernel));
         this.opaque = compileProgram(gl, OPAQUE_VERTEX, OPAQUE_FRAGMENT);
-        this.resolve = compileProgram(gl, RESOLVE_VERTEX, RESOLVE_FRAGMENT);
-        const places = (...of) => filledTexture(gl, gl.RGBA32F, gl.RGBA, gl.FLOAT, packedPlaces(...of), 4);
-        this.triangles = { places: places(soup.corners, soup.opacities, soup.sigma), colors: dataTexture(gl, gl.RGBA16F, soup.count) };
+        const resolve = (SAMPLES, UNFINISHED) => compileProgram(gl, RESOLVE_VERTEX, defined(RESOLVE_FRAGMENT, { SAMPLES, UNFINISHED }));
+        this.resolve = { plain: resolve(1, 0), unfinished: resolve(1, 1), sampled: resolve(STILL_SAMPLES, 0) };
+        const places = (...of) => cornerTexture(gl, gl.RGBA32F, gl.FLOAT, packedPlaces(...of));
+        this.triangles = { places: places(soup.corners, soup.opacities, soup.sigma), colors: dataTexture(gl, gl.RGBA16F, soup.count, 1) };
         this.solid = mesh && {
             count: mesh.count, places: places(mesh.corners),
-            colors: filledTexture(gl, gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE, packedColors(mesh.colors), 4),
+            colors: cornerTexture(gl, gl.RGBA8, gl.UNSIGNED_BYTE, packedColors(mesh.colors)),
         };
         this.elements = gl.createBuffer();
         this.sorter = new Sorter(soup, Painter.degreeOf(soup));
@@ -157,7 +184,7 @@ class GlPainter extends Painter {
     take({ elements, colors }) {
         const { gl } = this;
         this.ordered(colors.length / 4, elements.length / 3);
-        fillTexture(gl, this.triangles.colors, gl.RGBA, gl.FLOAT, colors, 4);
+        fillTexture(gl, this.triangles.colors, gl.FLOAT, colors, 1);
         gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, this.elements);
         gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, elements, gl.DYNAMIC_DRAW);
     }
@@ -214,13 +241,12 @@ class GlPainter extends Painter {
 
     // A texture of `samples` times the canvas's size along each side, or of another one, over the texture `below` and the background.
     show(texture, samples, below = null) {
-        const { gl, resolve, canvas: { width, height } } = this;
+        const { gl, canvas: { width, height } } = this;
+        const resolve = this.resolve[below ? "unfinished" : samples > 1 ? "sampled" : "plain"];
         gl.viewport(0, 0, width, height);
-        this.use(resolve, [["drawn", texture], ["below", below ?? texture]]);
-        gl.uniform1i(resolve.at.unfinished, below ? 1 : 0);
+        this.use(resolve, [["drawn", texture], ...(below ? [["below", below]] : [])]);
         gl.uniform3fv(resolve.at.background, this.look.background || [0, 0, 0]);
         gl.uniform2f(resolve.at.size, width, height);
-        gl.uniform1i(resolve.at.samples, samples);
         gl.drawArrays(gl.TRIANGLES, 0, 3);
     }
 }

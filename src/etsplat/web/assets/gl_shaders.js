@@ -1,17 +1,16 @@
 // Triangles by their number alone: corners, opacity and softness are in a texture, and an element names a corner.
 "use strict";
 
+const TRIANGLES_A_ROW = 1024; // of a texture; a power of two
+
 const TRIANGLE_DATA = `#version 300 es
 precision highp float;
 precision highp int;
 uniform highp sampler2D places;  // three texels a triangle: corner and opacity, corner and softness, corner
-uniform highp sampler2D colors;
-ivec2 texel(highp sampler2D texture, int index) {
-    int width = textureSize(texture, 0).x;
-    return ivec2(index % width, index / width);
-}
-vec4 place(int index) { return texelFetch(places, texel(places, index), 0); }
-vec4 paint(int index) { return texelFetch(colors, texel(colors, index), 0); }
+uniform highp sampler2D colors;  // one or three texels
+// Of a triangle, its column and row among the others; by shifts, since divisions take long in software.
+ivec2 cell(int triangle) { return ivec2(triangle & ${TRIANGLES_A_ROW - 1}, triangle >> ${Math.log2(TRIANGLES_A_ROW)}); }
+vec4 place(ivec2 cell, int corner) { return texelFetch(places, ivec2(3 * cell.x + corner, cell.y), 0); }
 uniform float enlarged; // about the middle, where others are left out
 const vec4 NOWHERE = vec4(2.0, 2.0, 2.0, 1.0);
 ${CAMERA_UNIFORMS}
@@ -41,14 +40,15 @@ float support(float ratio, float sigma) {
 }
 
 void main() {
-    int triangle = gl_VertexID / 3, corner = gl_VertexID % 3;
-    vec4 a = place(3 * triangle), b = place(3 * triangle + 1), c = place(3 * triangle + 2);
+    int triangle = gl_VertexID / 3, corner = gl_VertexID - 3 * triangle;
+    ivec2 at = cell(triangle);
+    vec4 a = place(at, 0), b = place(at, 1), c = place(at, 2);
     vec3 middle = (a.xyz + b.xyz + c.xyz) / 3.0;
     vec3 p0 = larger(a, middle), p1 = larger(b, middle), p2 = larger(c, middle);
     float opacity = a.w, sigma = max(b.w, 1e-6);
     gl_Position = NOWHERE;
     forms = vec3(0.0);
-    color = vec4(paint(triangle).rgb, opacity);
+    color = vec4(texelFetch(colors, at, 0).rgb, opacity);
     curve = vec2(0.0);
     float ratio = opacity / ALPHA_MIN;
     if (min(p0.z, min(p1.z, p2.z)) <= near || ratio < 1.0) return;
@@ -109,12 +109,13 @@ const OPAQUE_VERTEX = `${TRIANGLE_DATA}
 uniform int perTriangle;
 out vec3 color;
 void main() {
-    int triangle = gl_VertexID / 3, corner = gl_VertexID % 3;
-    vec4 a = place(3 * triangle), b = place(3 * triangle + 1), c = place(3 * triangle + 2);
+    int triangle = gl_VertexID / 3, corner = gl_VertexID - 3 * triangle;
+    ivec2 at = cell(triangle);
+    vec4 a = place(at, 0), b = place(at, 1), c = place(at, 2);
     vec3 middle = (a.xyz + b.xyz + c.xyz) / 3.0;
     vec3 p0 = larger(a, middle), p1 = larger(b, middle), p2 = larger(c, middle);
     vec3 mine = corner == 0 ? p0 : corner == 1 ? p1 : p2;
-    color = paint(perTriangle == 1 ? triangle : gl_VertexID).rgb;
+    color = texelFetch(colors, perTriangle == 3 ? ivec2(3 * at.x + corner, at.y) : at, 0).rgb;
     bool shown = min(p0.z, min(p1.z, p2.z)) > near && a.w >= 0.5;
     gl_Position = shown ? clipped(mine) : NOWHERE;
 }`;
@@ -125,8 +126,8 @@ in vec3 color;
 out vec4 pixel;
 void main() { pixel = vec4(color, 1.0); }`;
 
-// One triangle over everything: what was drawn at `samples` times the size, or at a smaller one, over the background; over
-// another picture where it is `unfinished`.
+// One triangle over everything: what was drawn at SAMPLES times the size, or at a smaller one, over the background; over
+// another picture where it is UNFINISHED. Each kind is a program of its own, which takes two thirds of the time in software.
 const RESOLVE_VERTEX = `#version 300 es
 void main() {
     gl_Position = vec4(gl_VertexID == 1 ? 3.0 : -1.0, gl_VertexID == 2 ? 3.0 : -1.0, 0.0, 1.0);
@@ -135,25 +136,23 @@ void main() {
 const RESOLVE_FRAGMENT = `#version 300 es
 precision highp float;
 uniform highp sampler2D drawn, below;
-uniform bool unfinished;
 uniform vec3 background;
 uniform vec2 size;
-uniform int samples;
 out vec4 pixel;
 void main() {
+#if SAMPLES > 1
     vec4 sum = vec4(0.0);
-    if (samples > 1) {
-        ivec2 first = samples * ivec2(gl_FragCoord.xy);
-        for (int y = 0; y < samples; ++y)
-            for (int x = 0; x < samples; ++x) sum += texelFetch(drawn, first + ivec2(x, y), 0);
-        sum /= float(samples * samples);
-    } else {
-        sum = texture(drawn, gl_FragCoord.xy / size);
-    }
+    ivec2 first = SAMPLES * ivec2(gl_FragCoord.xy);
+    for (int y = 0; y < SAMPLES; ++y)
+        for (int x = 0; x < SAMPLES; ++x) sum += texelFetch(drawn, first + ivec2(x, y), 0);
+    sum /= float(SAMPLES * SAMPLES);
+#else
+    vec4 sum = texture(drawn, gl_FragCoord.xy / size);
+#endif
     vec3 behind = background;
-    if (unfinished) {
-        vec4 coarse = texture(below, gl_FragCoord.xy / size);
-        behind = coarse.rgb + (1.0 - coarse.a) * background;
-    }
+#if UNFINISHED
+    vec4 coarse = texture(below, gl_FragCoord.xy / size);
+    behind = coarse.rgb + (1.0 - coarse.a) * background;
+#endif
     pixel = vec4(sum.rgb + (1.0 - sum.a) * behind, 1.0);
 }`;

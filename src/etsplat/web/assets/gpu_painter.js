@@ -54,7 +54,7 @@ class GpuPainter extends Painter {
         const { device } = gpu;
         const [whole, small] = [0, 1].map(() => new GpuTarget(device, SOFT_FORMAT, 0));
         const [still, moving] = [4, 1].map((samples) => new GpuTarget(device, OPAQUE_FORMAT, samples));
-        super(gpu.canvas, soup, mesh, { whole, small, still, moving });
+        super(gpu.canvas, soup, mesh, { whole, small, still, moving, canvas: moving });
         [this.gpu, this.marked] = [gpu, null];
         const [view, sorting, resolving] = [96, 32 / SORT_DIGIT * UNIFORM_SLICE, 32].map((size) => gpu.uniform(size));
         const pair = () => [4 * soup.count, 4 * soup.count].map((size) => gpu.storage(size));

@@ -6,7 +6,7 @@
 //   show(texture, samples, below)      a picture in the canvas
 //   mark(), done                       a mark in the device's work, and whether it has come so far
 // and with targets, where pictures are drawn before they are shown: begin(width, height) empties one, resume() goes on with
-// what was drawn, end() is the texture of that.
+// what was drawn, end() is the texture of that, or null where it is seen already.
 "use strict";
 
 const KERNEL_IDS = { single_sided: 0, bilateral: 1, elastic: 2, hard: 3 };
@@ -32,7 +32,7 @@ function packedColors(colors) {
 }
 
 class Painter {
-    // `soup` and `mesh` (or null) are of `readCompact`; targets are {whole, small, still, moving}.
+    // `soup` and `mesh` (or null) are of `readCompact`; targets are {whole, small} of soft pictures, {still, moving, canvas} of opaque ones.
     constructor(canvas, soup, mesh, targets) {
         [this.canvas, this.soup, this.mesh, this.look, this.targets] = [canvas, soup, mesh, soup.look, targets];
         [this.amount, this.shown, this.drawn, this.enlarged] = [0, 0, 0, 1];
@@ -75,10 +75,11 @@ class Painter {
         if (mode === "soft" && still) { this.refine(camera, 1, true); return; }
         const samples = still ? STILL_SAMPLES : 1;
         const sides = [width, height].map((side) => Math.max(1, Math.round((still ? samples : scale) * side)));
-        const target = mode === "soft" ? targets.small : still ? targets.still : targets.moving;
+        const target = mode === "soft" ? targets.small : still ? targets.still : scale < 1 ? targets.moving : targets.canvas;
         target.begin(...sides);
         if (mode === "soft") this.drawSoft(camera, target, 0, this.shown);
         else this.drawOpaque(camera, target);
-        this.show(target.end(), samples);
+        const drawn = target.end();
+        if (drawn) this.show(drawn, samples);
     }
 }
