@@ -50,9 +50,10 @@ def judged(
     contradicted: float = 0.0,
     cut_off: float = 0.0,
     closed: float = 0.0,
+    plain: float = 0.0,
 ) -> Judgement:
     wanted = Expected(expected, None if expected.unclear else "input mesh", shown)
-    shares = {"contradicted": contradicted, "cut_off": cut_off, "closed": closed}
+    shares = {"contradicted": contradicted, "cut_off": cut_off, "closed": closed, "plain": plain}
     run = {"begun": begun, "preset": preset, "untangled": untangled}
     return judge("test", scores, intersecting, found, wanted, **shares, **run)
 
@@ -64,6 +65,17 @@ def test_a_patch_that_photos_contradict_is_told():
         "poor: photos contradict each other on 2.8 % of its surface, where a hollow may be closed: "
         "try more photos that look into it, or depth maps"
     )
+
+
+def test_a_plain_piece_is_told_where_nothing_else_is_wrong():
+    assert "hollow" not in judged(plain=0.04).verdict
+    verdict = judged(plain=0.139).verdict
+    assert verdict.startswith("good")
+    assert verdict.endswith(
+        "; hollows were not compared: 13.9 % of its surface is one plain piece, where photos do not tell a side from a"
+        " lid over a hollow: look at it"
+    )
+    assert "plain piece" not in judged(plain=0.139, contradicted=0.028).verdict
 
 
 def test_where_no_photo_says_how_an_object_goes_on_is_told():

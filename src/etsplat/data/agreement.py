@@ -41,6 +41,9 @@ _FLAT = 0.01
 _WHOLE = 0.7
 """Share of a patch that must lie on the object for more."""
 
+_COMPARED = 3
+"""Photos that see a vertex of a surface, from which on they are compared there."""
+
 _SMOOTH = 3
 """Rounds in which normals are averaged with their neighbours'."""
 
@@ -146,7 +149,7 @@ def surface_agreement(
     masks = [(photo.pixels[:, 3:] >= 0.95).float() for photo in photos]
     normals = averaged(vertex_normals(vertices, faces), edges, _SMOOTH)
     seen = seen_by(photos, hits, vertices, pixel)
-    return _ring_mean(agreement(photos, masks, vertices, normals, seen, pixel, fewest=3), edges)
+    return _ring_mean(agreement(photos, masks, vertices, normals, seen, pixel, fewest=_COMPARED), edges)
 
 
 @torch.no_grad()
@@ -177,6 +180,27 @@ def contradicted(
     return contradicted_share(score, vertices, faces, edges, wrong > torch.maximum(_UNUSUAL * usual, usual + _WRONG))
 
 
+@torch.no_grad()
+def plain_share(dataset: Dataset, vertices: Float[Tensor, "V 3"], faces: Int64[Tensor, "F 3"]) -> float:
+    """The largest patch that photos see and on which they show nothing to compare, as a fraction of a surface's area.
+
+    What lies there outlines alone say, and no outline shows a hollow. 0 where there are no photos.
+
+    Args:
+        dataset: photos with alpha around it.
+        vertices: (V, 3).
+        faces: (F, 3).
+    """
+    photos = photos_of(dataset)
+    if len(photos) < 2 or len(vertices) == 0:
+        return 0.0
+    edges = MeshTopology.from_faces(faces, len(vertices)).edges.long()
+    hits = [first_hits(photo, vertices, faces) for photo in photos]
+    seen = seen_by(photos, hits, vertices, pixel_size(photos)).sum(dim=0) >= _COMPARED
+    plain = seen & surface_agreement(photos, hits, vertices, faces, edges).isnan()
+    return _largest_patch(plain, vertices, faces, edges)
+
+
 def contradicted_share(
     score: Float[Tensor, " V"], vertices: Tensor, faces: Tensor, edges: Tensor, wrong: Bool[Tensor, " F"] | None = None
 ) -> float:
@@ -189,12 +213,18 @@ def contradicted_share(
         edges: (E, 2).
         wrong: (F,) only these faces count; None for all.
     """
-    low = score < _CONTRADICTED
-    count, patch = connected(edges[low[edges].all(dim=1)], len(vertices))
+    return _largest_patch(score < _CONTRADICTED, vertices, faces, edges, wrong)
+
+
+def _largest_patch(
+    some: Bool[Tensor, " V"], vertices: Tensor, faces: Tensor, edges: Tensor, only: Bool[Tensor, " F"] | None = None
+) -> float:
+    """Of the connected patches of some vertices the largest, as a fraction of the area; `only` of these faces."""
+    count, patch = connected(edges[some[edges].all(dim=1)], len(vertices))
     area = face_areas(vertices, faces)
-    within = low[faces].all(dim=1)
-    if wrong is not None:
-        within &= wrong
+    within = some[faces].all(dim=1)
+    if only is not None:
+        within &= only
     patches = torch.zeros(count).index_add(0, patch[faces[within, 0]], area[within])
     return float(patches.amax() / area.sum())
 

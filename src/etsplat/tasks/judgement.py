@@ -28,6 +28,9 @@ CONTRADICTED = 0.005
 CLOSED = 0.005
 """Share of what photos see of an input mesh that lies far behind the result, of good results at most."""
 
+PLAIN = 0.05
+"""Share of the surface in one patch on which photos show nothing to compare: from there on the verdict says so."""
+
 CUT_OFF = 0.005
 """Share of the visual hull's surface where the frame cuts it off, which good results have at most."""
 
@@ -152,6 +155,7 @@ def judge(
     contradicted: float,
     cut_off: float,
     closed: float,
+    plain: float,
     begun: Start,
     preset: str,
     untangled: bool,
@@ -167,6 +171,8 @@ def judge(
         contradicted: the largest patch that photos contradict, as a fraction of the surface.
         cut_off: where the visual hull ends because photos do, as a fraction of its surface.
         closed: where the result fills a hollow of the input mesh, as a fraction of what photos see of it.
+        plain: the largest patch on which photos show nothing to compare, as a fraction of the surface; 0 where hollows
+            are compared with those of the input mesh.
         begun: what the run started from; with the rest it decides what to try next.
         preset: of the run.
         untangled: whether faces that cut through others were smoothed away.
@@ -201,6 +207,12 @@ def judge(
             f"on {100 * closed:.1f} % of what photos show the result lies far in front of the input mesh, so a "
             "hollow is closed: try --init-mesh with a mesh that has it, or a texture for photos to agree on"
         )
+    praise = _praise(views, scores, intersecting_percent, found, expected)
+    if plain > PLAIN:
+        praise += (
+            f"; hollows were not compared: {100 * plain:.1f} % of its surface is one plain piece, where photos do not "
+            "tell a side from a lid over a hollow: look at it"
+        )
     return Judgement(
         views=views,
         silhouette_iou=iou,
@@ -211,7 +223,7 @@ def judge(
         expected_parts=expected.shape.parts,
         expected_holes=expected.shape.holes,
         expected_of=expected.of,
-        verdict=f"poor: {'; '.join(poor)}" if poor else _praise(views, scores, intersecting_percent, found, expected),
+        verdict=f"poor: {'; '.join(poor)}" if poor else praise,
     )
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from etsplat.core.errors import InputError
 from etsplat.core.workers import together
-from etsplat.data.agreement import contradicted, unseen_vertices
+from etsplat.data.agreement import contradicted, plain_share, unseen_vertices
 from etsplat.data.closed_hollows import closed_hollows
 from etsplat.data.cut_off import cut_off
 from etsplat.data.dataset import Dataset
@@ -271,6 +271,7 @@ def _judge(
         contradicted=contradicted(views, *mesh.surface(), mesh.display_face_colors.cpu()) if doubtful else 0.0,
         cut_off=0.0 if hull is None else cut_off(views, hull.vertices, hull.faces),
         closed=0.0 if truth is None else closed_hollows(views, (truth.vertices, truth.faces), mesh.surface()),
+        plain=plain_share(views, *mesh.surface()) if truth is None and views.has_masks else 0.0,
         begun=started.kind,
         preset=config.preset,
         untangled=config.refinement.untanglings > 0,
