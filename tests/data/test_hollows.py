@@ -3,16 +3,20 @@
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
-from etsplat.data.agreement import contradicted
+from etsplat.data.agreement import contradicted, first_hits, photos_of, plain_share
 from etsplat.data.closed_hollows import closed_hollows
-from etsplat.data.hollows import _where_agreed, _without_unseen, open_hollows
+from etsplat.data.hollows import _mistaken, _where_agreed, _without_unseen, open_hollows
+from etsplat.data.meshing import dual_contour
+from etsplat.data.photograph import photograph
 from etsplat.data.visual_hull import visual_hull
 from etsplat.geometry.distance import closest_points
 from etsplat.geometry.measures import face_areas
 from etsplat.geometry.topology import MeshTopology
+from etsplat.io.mesh_files import MeshFile
 from etsplat.tasks.judgement import CLOSED, CONTRADICTED
 from helpers.painting import mean_colors, painted_pictures
 
@@ -150,10 +154,45 @@ def test_how_much_of_a_hollow_is_closed_is_measured(bowl):
     assert closed_hollows(views, (truth, faces), (truth, faces)) == 0
 
 
-def test_where_there_is_no_texture_nothing_moves():
+def test_where_there_is_no_texture_nothing_moves(bowl):
+    """And that nothing there is compared is known, since nobody would notice that a hollow is closed."""
     _, _, views = pictures_of(BOWL, painted=False)
     hull, triangles = visual_hull(views, 400)
     assert open_hollows(views, hull, triangles).moved == 0
+    assert plain_share(views, hull, triangles) > 0.8
+    _, _, views, painted, _ = bowl
+    assert plain_share(views, *painted) < 0.01
+
+
+def cage(places: np.ndarray) -> np.ndarray:
+    """The edges of a cube, as bars."""
+    x, y, z = np.abs(places).T
+    bars = [np.maximum(np.hypot(a - 0.7, b - 0.7) - 0.1, c - 0.7) for a, b, c in ((x, y, z), (y, z, x), (z, x, y))]
+    return np.minimum.reduce(bars)
+
+
+def test_plain_bars_on_which_photos_agree_nowhere_stay():
+    """Their shading correlates by chance at some depth, which nobody would see."""
+    vertices, faces = dual_contour(cage, (-1.25, -1.25, -1.25), 0.05, (50, 50, 50))
+    views = photograph(MeshFile(torch.from_numpy(vertices).float(), torch.from_numpy(faces)), 160, 160, supersampling=2)
+    hull = visual_hull(views, 1600)
+    found, _, moved, _ = open_hollows(views, *hull)
+    assert moved == 0
+    assert torch.equal(found, hull[0])
+
+
+@pytest.mark.parametrize(("inwards", "mistaken"), [(False, False), (True, True)])
+def test_what_silhouettes_need_is_no_lid(bowl, inwards, mistaken):
+    """The upper end of a bowl's wall, where it is and pushed down, which uncovers a few pixels of each silhouette."""
+    truth, faces, views, *_ = bowl
+    photos = photos_of(views)
+    hits = [first_hits(photo, truth, faces) for photo in photos]
+    edges = MeshTopology.from_faces(faces, len(truth)).edges.long()
+    height = views.normalization.invert(truth)[:, 1]
+    rim = height > 0.39
+    moved = truth.clone()
+    moved[rim, 1] -= 0.06 * float(inwards)
+    assert bool(_mistaken(photos, hits, moved, faces, rim, edges).any()) is mistaken
 
 
 def test_it_repeats_to_the_bit(bowl):

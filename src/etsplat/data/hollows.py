@@ -38,6 +38,13 @@ _DEEPEST = 1.5
 _AGREED = 0.75
 """Correlation of photos that show one surface; those of different ones have about 0.3."""
 
+_CONFIRMED = 0.5
+"""Mean correlation on a hollow as photos see it once it is open, at least: its walls are seen at a slant."""
+
+_LOST = 10.0
+"""The correlation counts so much less, times the share of a lid's pixels at which silhouettes show what is gone once it
+is open: a few along its border, many where a wall is pushed in."""
+
 _UNKNOWN = 0.6
 """Cost of a depth where nobody can be asked; elsewhere it is 1 - agreement."""
 
@@ -154,6 +161,10 @@ def _push(photos: list[Photo], outside: Distance, vertices: Tensor, faces: Tenso
     seen = seen_by(photos, [first_hits(photo, moved, faces) for photo in photos], moved[own], pixel)
     way = _without_unseen(way, seen, edges.flatten().bincount(minlength=len(vertices))[own], links)
     moved[own] = vertices[own] + way[:, None] * inward
+    deep = torch.zeros(len(vertices), dtype=torch.bool)
+    deep[own] = way > depths[1]
+    way = way.masked_fill(_mistaken(photos, hits, moved, faces, deep, edges)[own], 0.0)
+    moved[own] = vertices[own] + way[:, None] * inward
     return moved, int((way > depths[1]).sum()), share
 
 
@@ -248,6 +259,42 @@ def _where_agreed(depth: Tensor, found: Tensor, edges: Tensor, edge: float) -> T
     opened = (size >= _FEWEST) & (2 * asked >= size) & (agreement >= _AGREED)
     opened &= deepest <= _SLENDER * edge * size.sqrt()
     return _without_shafts(torch.where(deep & opened[lid], depth, 0), edges, edge)
+
+
+def _mistaken(
+    photos: list[Photo],
+    before: list[tuple[Tensor, Tensor]],
+    moved: Float[Tensor, "V 3"],
+    faces: Int64[Tensor, "F 3"],
+    deep: Bool[Tensor, " V"],
+    edges: Int64[Tensor, "E 2"],
+) -> Bool[Tensor, " V"]:
+    """Moved vertices of what is no lid: once it is open photos do not agree, or silhouettes show what is gone.
+
+    Where little is textured photos agree by chance at some depth, seen through a lid that is none: a plain wall, behind
+    which nobody would see what agreed.
+
+    Args:
+        photos: which look.
+        before: first hits of each, when nothing had moved.
+        moved: (V, 3).
+        faces: (F, 3).
+        deep: (V,) which have.
+        edges: (E, 2).
+    """
+    after = [first_hits(photo, moved, faces) for photo in photos]
+    shown = surface_agreement(photos, after, moved, faces, edges)
+    count, lid = connected(edges[deep[edges].all(dim=1)], len(deep))
+    known = deep & ~shown.isnan()
+    asked = torch.zeros(count).index_add(0, lid, known.float())
+    agreement = torch.zeros(count).index_add(0, lid, torch.where(known, shown, 0.0)) / asked.clamp_min(1)
+    own = torch.where(deep, lid, -1)[faces].amax(dim=1)
+    seen, lost = torch.zeros(count), torch.zeros(count)
+    for photo, (_, was), (_, hit) in zip(photos, before, after, strict=True):
+        of = torch.where(was >= 0, own[was.clamp_min(0)], -1)
+        seen += of[of >= 0].bincount(minlength=count)
+        lost += of[(of >= 0) & (hit < 0) & (photo.pixels[0, 3] > 0.95)].bincount(minlength=count)
+    return deep & (agreement - _LOST * lost / seen.clamp_min(1) < _CONFIRMED)[lid]
 
 
 def _without_shafts(depth: Int64[Tensor, " N"], edges: Int64[Tensor, "E 2"], edge: float) -> Int64[Tensor, " N"]:
