@@ -99,6 +99,12 @@ void copy_indices(const T* values, int64_t count, int32_t* copies) {
 template void copy_indices(const int32_t*, int64_t, int32_t*);
 template void copy_indices(const int64_t*, int64_t, int32_t*);
 
+bool are_intrinsics(const float* Ks, int64_t count) {
+    for (const float* K = Ks; K < Ks + 9 * count; K += 9)
+        if (K[1] != 0.0f || K[3] != 0.0f || K[6] != 0.0f || K[7] != 0.0f || K[8] != 1.0f) return false;
+    return true;
+}
+
 void zero_floats(float* values, int64_t count) {
     parallel_for(count, kChunk, [values](int64_t begin, int64_t end) { std::fill(values + begin, values + end, 0.0f); });
 }

@@ -19,6 +19,7 @@ template <class T>
 void copy_indices(const T* values, int64_t count, int32_t* copies);  // that fit
 
 void zero_floats(float* values, int64_t count);
+bool are_intrinsics(const float* Ks, int64_t count);  // of pinhole cameras without skew
 
 // sums (rows, channels): row g is the sum of those rows i of values (count, channels) whose indices[i] is g, from the first
 // to the last. Indices are from 0 to rows - 1.

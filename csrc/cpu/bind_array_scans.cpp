@@ -17,16 +17,9 @@ void bind_array_scans(nb::module_& m) {
                                               : indices_below(values.data<const int32_t>(), values.count(), bound);
         },
         "values", "bound");
-    // copies, of as many indices as `values`.
+    // Whether all of Ks (B, 3, 3) are [[fx, 0, cx], [0, fy, cy], [0, 0, 1]].
     def_function(
-        m, "copy_indices",
-        [](EitherArray<const int32_t, const int64_t> values, Array<int32_t> copies) {
-            if (values.is<const int64_t>())
-                copy_indices(values.data<const int64_t>(), values.count(), copies.data());
-            else
-                copy_indices(values.data<const int32_t>(), values.count(), copies.data());
-        },
-        "values", "copies");
+        m, "are_intrinsics", [](Array<const float, 3> Ks) { return are_intrinsics(Ks.data(), Ks.size(0)); }, "Ks");
     // values (..., C), an index from 0 to rows - 1 for each of its rows, sums (rows, C).
     def_function(
         m, "sum_by_index",
@@ -34,7 +27,6 @@ void bind_array_scans(nb::module_& m) {
             sum_by_index(values.data(), indices.data(), indices.count(), sums.size(0), sums.size(1), sums.data());
         },
         "values", "indices", "sums");
-    def_function(m, "zero_floats", [](Array<float> values) { zero_floats(values.data(), values.count()); }, "values");
 }
 
 }  // namespace etsplat

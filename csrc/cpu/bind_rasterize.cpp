@@ -1,9 +1,7 @@
-#include <nanobind/ndarray.h>
 #include <nanobind/stl/shared_ptr.h>
 
 #include "bindings.h"
 #include "instruction_set.h"
-#include "pool.h"
 #include "raster.h"
 #include "raster_diagnostics.h"
 
@@ -105,7 +103,6 @@ void bind_diagnostics(nb::module_& m) {
     m.def("instruction_set", &instruction_set);
     m.def("set_instruction_set", &set_instruction_set, nb::arg("name"));
     m.def("kernel_names", &kernel_names);
-    m.def("pool_idle_bytes", &pool_idle_bytes);
     nb::class_<TileCounts>(m, "TileCounts")
         .def_ro("pairs", &TileCounts::pairs)
         .def_ro("forward_vectors", &TileCounts::forward_vectors)
@@ -122,14 +119,6 @@ void bind_diagnostics(nb::module_& m) {
 }  // namespace
 
 void bind_rasterize(nb::module_& m) {
-    m.def(
-        "pooled_floats",
-        [](size_t count) {
-            float* block = pool_acquire(count);
-            nb::capsule owner(block, [](void* p) noexcept { pool_release(static_cast<float*>(p)); });
-            return nb::ndarray<nb::numpy, float, nb::ndim<1>>(block, {count}, owner);
-        },
-        nb::arg("count"), nb::sig("def pooled_floats(count: int) -> numpy.typing.NDArray[numpy.float32]"));
     nb::class_<RasterState>(m, "RasterState")
         .def_prop_ro("bytes", &RasterState::bytes)
         .def_prop_ro("num_pairs", [](const RasterState& state) { return state.num_slots; })

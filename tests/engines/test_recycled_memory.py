@@ -1,13 +1,14 @@
 """Blocks of the pool (csrc/cpu/pool.h): who gets which again, and which go."""
 
 from etsplat import _native
+from etsplat.engines.native.pool import empty_image
 
 LARGE = 25 << 20  # floats, of 100 MiB; none is written, so none takes memory
 
 
 def used(count: int) -> int:
     """Where a block is that is taken and given back."""
-    return _native.pooled_floats(count=count).ctypes.data
+    return empty_image(count).data_ptr()
 
 
 def test_a_block_that_is_used_stays_however_many_others_are_left_behind():
@@ -34,6 +35,6 @@ def test_a_block_serves_who_needs_a_little_less():
     assert used(count - count // 10) == first
     assert used(count) == first
     assert used(count // 2) != first
-    held = _native.pooled_floats(count=count)
+    held = empty_image(count)
     assert held.shape == (count,)
-    assert held.ctypes.data == first
+    assert held.data_ptr() == first

@@ -40,7 +40,7 @@ def stand_in() -> types.ModuleType:
     torch: Any = types.ModuleType("torch")
     for name in ("float32", "float64", "int32", "int64", "uint8", "bool"):
         setattr(torch, name, object())
-    torch.Tensor = Tensor
+    torch.Tensor, torch.from_dlpack = Tensor, None  # memory of the module is not asked for
     return torch
 
 

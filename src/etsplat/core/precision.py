@@ -2,7 +2,6 @@
 
 import sys
 from collections.abc import Callable
-from contextlib import ExitStack
 from functools import cache, wraps
 from typing import ParamSpec, TypeVar, cast
 
@@ -20,10 +19,9 @@ def as_given(function: Callable[Arguments, Result]) -> Callable[Arguments, Resul
 
     @wraps(function)
     def called(*arguments: Arguments.args, **named: Arguments.kwargs) -> Result:
-        active = [device for device in ("cpu", "cuda") if torch.is_autocast_enabled(device)]
-        with ExitStack() as stack:
-            for device in active:
-                stack.enter_context(torch.autocast(device, enabled=False))
+        if not (torch.is_autocast_enabled("cpu") or torch.is_autocast_enabled("cuda")):
+            return function(*arguments, **named)
+        with torch.autocast("cpu", enabled=False), torch.autocast("cuda", enabled=False):
             return function(*arguments, **named)
 
     uncompiled = cache(lambda: cast(Callable[Arguments, Result], torch.compiler.disable(called)))

@@ -48,8 +48,7 @@ OUTPUTS = ("color", "alpha", "depth", "median_depth", "normal", "distortion", "s
 DEPTHS = ("plane", "centroid")
 
 
-@dataclass(frozen=True)
-class RasterizeSettings:
+class RasterizeSettings(NamedTuple):
     """The arguments of ``etsplat.rasterize`` that are not tensors; see there."""
 
     width: int

@@ -30,7 +30,7 @@ def check_shape(name: str, tensor: Tensor, *shapes: Shape, sizes: dict[str, int]
     if not isinstance(tensor, Tensor):
         got = f"{type(tensor).__name__}{_remedy(name, tensor)}"
         raise ValueError(f"{name} must be a tensor of shape {_written(shapes)}, got {got}")
-    _check_native(name, tensor)
+    check_native(name, tensor)
     for shape in shapes:
         if len(shape) != tensor.ndim:
             continue
@@ -60,7 +60,7 @@ def dense(tensor: Tensor, name: str = "gradient") -> Tensor:
     Raises:
         ValueError: It has no memory, or is within a transform of torch.func; the message says ``name``.
     """
-    _check_native(name, tensor)
+    check_native(name, tensor)
     return tensor.detach().resolve_conj().resolve_neg().contiguous()
 
 
@@ -76,15 +76,16 @@ def check_memory(name: str, tensor: Tensor) -> None:
         raise ValueError(f"{name} must be a dense tensor, got {kind}")
     if tensor.is_quantized or tensor.is_complex():
         raise ValueError(f"{name} must be a tensor of plain numbers, got {tensor.dtype}")
-    if _is_transformed(tensor):  # torch sees through
-        return
-    if tensor.is_meta:
-        raise ValueError(f"{name} must be in memory, got a tensor on {tensor.device}")
-    if tensor._is_zerotensor():
-        raise ValueError(f"{name} must have memory of its own, got a ZeroTensor: pass {name}.clone()")
-    if tensor.numel() == 0:
-        return
-    if tensor.is_contiguous():  # as most are, and steps check dozens
+    if _address(tensor) == 0:  # few have none, and steps check dozens
+        if _is_transformed(tensor):  # torch sees through
+            return
+        if tensor.is_meta:
+            raise ValueError(f"{name} must be in memory, got a tensor on {tensor.device}")
+        if tensor._is_zerotensor():
+            raise ValueError(f"{name} must have memory of its own, got a ZeroTensor: pass {name}.clone()")
+        if tensor.numel() == 0:
+            return
+    if tensor.is_contiguous():  # as most are
         spanned = tensor.numel()
     else:
         spanned = 1 + sum((n - 1) * step for n, step in zip(tensor.shape, tensor.stride(), strict=True))
@@ -93,14 +94,22 @@ def check_memory(name: str, tensor: Tensor) -> None:
         raise ValueError(f"{name} must have memory of its own: it needs {needed} bytes, and its storage holds {held}")
 
 
-def _check_native(name: str, tensor: Tensor) -> None:
+def check_native(name: str, tensor: Tensor) -> None:
     """`check_memory`, and ValueError within a transform of torch.func."""
-    if isinstance(tensor, Tensor) and _is_transformed(tensor):
+    if isinstance(tensor, Tensor) and _address(tensor) == 0 and _is_transformed(tensor):
         raise ValueError(
             f"{name} must be a plain tensor, got one within a transform of torch.func, which native code cannot see "
             "through: take torch.autograd.grad for gradients, and several cameras in one call in the place of vmap"
         )
     check_memory(name, tensor)
+
+
+def _address(tensor: Tensor) -> int:
+    """Where its first number lies; 0 if it has no numbers, or no memory of its own."""
+    try:
+        return tensor.data_ptr()
+    except RuntimeError:  # sparse, and within a transform
+        return 0
 
 
 def _is_transformed(tensor: Tensor) -> bool:
@@ -178,7 +187,11 @@ def _is_plain(tensor: Tensor) -> bool:
 
 def check_intrinsics(name: str, Ks: Tensor) -> None:
     """Raise ValueError unless every matrix of ``Ks`` (B, 3, 3) is a pinhole camera without skew."""
-    if any((k[0][1], k[1][0], *k[2]) != (0, 0, 0, 0, 1) for k in Ks.tolist()):
+    if _is_plain(Ks) and Ks.dtype == torch.float32:
+        pinholes = _native.are_intrinsics(Ks=Ks)
+    else:
+        pinholes = all((k[0][1], k[1][0], *k[2]) == (0, 0, 0, 0, 1) for k in Ks.tolist())
+    if not pinholes:
         raise ValueError(f"{name} must have the form [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]; skew is not supported")
 
 

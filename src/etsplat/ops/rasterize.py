@@ -38,6 +38,17 @@ from etsplat.engines.choice import engine_for
 
 COLORS = ("face_colors", "vertex_colors", "corner_colors")
 OPTIONAL = (*COLORS, "backgrounds")
+_SEPARATE, _SHARED = ("N", 3, 3), ("V", 3)
+_SHAPES: dict[str, tuple[Shape, ...]] = {
+    "opacities": (("N",),),
+    "sigma": ((), ("N",)),
+    "viewmats": (("B", 4, 4),),
+    "Ks": (("B", 3, 3),),
+    "face_colors": (("N", "C"), ("B", "N", "C")),
+    "vertex_colors": (("V", "C"),),
+    "corner_colors": (("N", 3, "C"),),
+    "backgrounds": (("B", "C"),),
+}
 LARGEST_COLOR = 1e30  # beyond, the gradients of the triangles around overflow
 
 
@@ -182,7 +193,7 @@ def _check_vertices(vertices: Tensor, faces: Tensor | None) -> None:
     if faces is None and isinstance(vertices, Tensor) and vertices.ndim == 2:
         got = tuple(vertices.shape)
         raise ValueError(f"vertices must have shape (N, 3, 3) where faces is None, got {got}: pass faces= too")
-    check_shape("vertices", vertices, ("N", 3, 3) if faces is None else ("V", 3))
+    check_shape("vertices", vertices, _SEPARATE if faces is None else _SHARED)
     check_floating("vertices", vertices)
     if vertices.dtype not in (torch.float32, torch.float64):
         raise ValueError(f"vertices must be float32 or float64, got {vertices.dtype}")
@@ -222,21 +233,12 @@ def _check_tensors(given: dict[str, Tensor], faces: Tensor | None, look: bool) -
     sizes: dict[str, int] = {}
     if faces is not None:
         check_shape("faces", faces, ("N", 3), sizes=sizes)
-    shapes: dict[str, list[Shape]] = {
-        "vertices": [("N", 3, 3)] if faces is None else [("V", 3)],
-        "opacities": [("N",)],
-        "sigma": [(), ("N",)],
-        "viewmats": [("B", 4, 4)],
-        "Ks": [("B", 3, 3)],
-        "face_colors": [("N", "C"), ("B", "N", "C")],
-        "vertex_colors": [("V", "C")],
-        "corner_colors": [("N", 3, "C")],
-        "backgrounds": [("B", "C")],
-    }
-    for name, alternatives in shapes.items():
-        if name in given:
-            check_shape(name, given[name], *alternatives, sizes=sizes)
-            check_like(name, given[name], "vertices", given["vertices"])
+    for name, tensor in given.items():
+        if name == "vertices":
+            check_shape(name, tensor, _SEPARATE if faces is None else _SHARED, sizes=sizes)
+        else:
+            check_shape(name, tensor, *_SHAPES[name], sizes=sizes)
+            check_like(name, tensor, "vertices", given["vertices"])
     if sizes["B"] < 1:
         raise ValueError("viewmats must hold at least one camera, got 0")
     if sizes["C"] < 1:

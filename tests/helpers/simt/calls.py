@@ -2,15 +2,19 @@
 
 from collections.abc import Callable
 from typing import Any
+from unittest.mock import patch
 
 import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
+from etsplat import _native
+
 WAITING = ("_local_scalar_dense", "nonzero", "masked_select", "unique", "_unique2", "bincount", "equal")
 
 
+_MAKING = ("empty_floats", "zero_floats", "copied_indices")
 _VIEWS = ("view", "_unsafe_view", "slice", "select", "expand", "unsqueeze", "squeeze", "permute", "transpose", "t")
 _VIEWS += ("detach", "as_strided", "alias", "split", "split_with_sizes", "unbind", "diagonal")
 
@@ -45,6 +49,26 @@ class Recording(TorchDispatchMode):
     def __init__(self) -> None:
         super().__init__()
         self.steps: list[Callable[[], None]] = []
+        self.native: list[Tensor] = []
+        making = {name: self._keeping(getattr(_native, name)) for name in _MAKING}
+        self.patched = patch.multiple(_native, **making)
+
+    def __enter__(self) -> Any:
+        self.patched.start()
+        return super().__enter__()
+
+    def __exit__(self, *raised: Any) -> None:
+        self.patched.stop()
+        super().__exit__(*raised)
+
+    def _keeping(self, make: Callable[..., Tensor]) -> Callable[..., Tensor]:
+        """Of what native code allocates for the CPU, which stands for a device here, torch tells nothing."""
+
+        def made(**named: Any) -> Tensor:
+            self.native.append(make(**named))
+            return self.native[-1]
+
+        return made
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         name, kwargs = str(func).split(".")[1], kwargs or {}

@@ -41,7 +41,7 @@ class CpuRender:
         self.states = _native.raster_forward(
             batch=_batch(inputs, outputs.images, plan),
             keep_for_backward=keep,
-            median_triangle=outputs.median_triangle if plan.settings.wants("median_depth") else None,
+            median_triangle=outputs.median_triangle,
             max_weight=statistics and statistics.max_weight,
             screen_size=statistics and statistics.screen_size,
             inradius=statistics and statistics.inradius,
@@ -106,7 +106,7 @@ def _batch(inputs: Inputs, images: Images, plan: Plan) -> _native.RasterBatch:
         centroid_depth=settings.depth_of == "centroid",
         color=images.color,
         alpha=images.alpha,
-        distortion=images.distortion if settings.wants("distortion") else None,
+        distortion=images.distortion,
         distortion_totals=images.distortion_totals,
     )
 

@@ -8,11 +8,11 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from etsplat.core.validation import dense
+from etsplat.core.validation import check_native, dense
 
 
 def differentiable(forward: Callable[..., Any], backward: Callable[..., Any]) -> Callable[..., Any]:
-    """A method of engines from native code in both directions, which gets dense tensors, detached from autograd.
+    """A method of engines from native code in both directions, which gets dense tensors and is outside of autograd.
 
     Args:
         forward: (keep, *arguments) -> (result, kept): a tensor or a tuple of them, and a tuple of whatever ``backward``
@@ -26,7 +26,7 @@ def differentiable(forward: Callable[..., Any], backward: Callable[..., Any]) ->
 class _Native(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, forward: Callable[..., Any], backward: Callable[..., Any], *arguments: Any) -> Any:
-        given = (dense(argument) if isinstance(argument, Tensor) else argument for argument in arguments)
+        given = [_checked(argument) if isinstance(argument, Tensor) else argument for argument in arguments]
         result, kept = forward(any(ctx.needs_input_grad), *given)
         ctx.save_for_backward(*(item if isinstance(item, Tensor) else None for item in kept))
         ctx.constants = [None if isinstance(item, Tensor) else item for item in kept]
@@ -35,13 +35,26 @@ class _Native(torch.autograd.Function):
         return result
 
     @staticmethod
-    @once_differentiable
     def backward(ctx: Any, *cotangents: Tensor | None) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        saved = zip(ctx.saved_tensors, ctx.constants, strict=True)
-        kept = [constant if tensor is None else _dense(tensor) for tensor, constant in saved]
-        needed = ctx.needs_input_grad[2:]
-        gradients = ctx.gradients(kept, needed, *(None if given is None else dense(given) for given in cotangents))
-        return None, None, *gradients, *(None,) * (len(needed) - len(gradients))
+        # Only where gradients are to have gradients does autograd follow what is done here.
+        return (_once if torch.is_grad_enabled() else _backward)(ctx, *cotangents)
+
+
+def _backward(ctx: Any, *cotangents: Tensor | None) -> tuple[Tensor | None, ...]:
+    saved = zip(ctx.saved_tensors, ctx.constants, strict=True)
+    kept = [constant if tensor is None else _dense(tensor) for tensor, constant in saved]
+    needed = ctx.needs_input_grad[2:]
+    gradients = ctx.gradients(kept, needed, *[None if given is None else _checked(given) for given in cotangents])
+    return None, None, *gradients, *(None,) * (len(needed) - len(gradients))
+
+
+_once = once_differentiable(_backward)
+
+
+def _checked(tensor: Tensor) -> Tensor:
+    """As native code reads it, or ValueError."""
+    check_native("gradient", tensor)
+    return _dense(tensor)
 
 
 def _dense(tensor: Tensor) -> Tensor:

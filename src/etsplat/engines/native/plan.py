@@ -81,12 +81,12 @@ class Images(NamedTuple):
 
     color: Tensor
     alpha: Tensor
-    distortion: Tensor  # empty unless asked for
+    distortion: Tensor | None
     distortion_totals: Tensor | None
 
 
 class Outputs:
-    """Uninitialised output images of a batch; native code writes every element."""
+    """Uninitialised output images of a batch, None where not asked for; native code writes every element."""
 
     def __init__(self, plan: Plan, inputs: Inputs) -> None:
         settings, near = plan.settings, inputs.vertices
@@ -94,11 +94,12 @@ class Outputs:
         self.images = Images(
             color=empty(near, *image, sum(inputs.channels)),
             alpha=empty(near, *image, 1),
-            distortion=empty(near, *image, 1) if settings.wants("distortion") else empty(near, 0),
+            distortion=empty(near, *image, 1) if settings.wants("distortion") else None,
             distortion_totals=empty(near, *image, 2) if settings.wants("distortion") else None,
         )
-        median_shape = image if settings.wants("median_depth") else (0,)
-        self.median_triangle = torch.empty(median_shape, dtype=torch.int32, device=near.device)
+        self.median_triangle = None
+        if settings.wants("median_depth"):
+            self.median_triangle = torch.empty(image, dtype=torch.int32, device=near.device)
         self.statistics = None
         if settings.wants("statistics"):
             values = torch.empty(3, plan.views, plan.geometry.count, device=near.device)

@@ -1,13 +1,9 @@
 """Tensors from recycled memory."""
 
-import math
-
 import torch
 from torch import Tensor
 
 from etsplat import _native
-
-_SMALLEST = 1 << 16  # floats; below, the allocator of the C library recycles by itself
 
 
 def empty_image(*shape: int) -> Tensor:
@@ -16,10 +12,7 @@ def empty_image(*shape: int) -> Tensor:
     Memory new to the process costs a page fault every 4 KiB at its first write, for an image of a million pixels as
     much as rendering it. Blocks return to the pool (csrc/cpu/pool.h) when their last tensor is freed.
     """
-    count = math.prod(shape)
-    if count < _SMALLEST:
-        return torch.empty(shape)
-    return torch.from_numpy(_native.pooled_floats(count=count)).view(shape)
+    return _native.empty_floats(shape=shape)
 
 
 def empty(like: Tensor, *shape: int) -> Tensor:
@@ -29,15 +22,11 @@ def empty(like: Tensor, *shape: int) -> Tensor:
 
 def zeros_image(*shape: int) -> Tensor:
     """Like ``empty_image``, zeroed by the engine's threads."""
-    zeros = empty_image(*shape)
-    _native.zero_floats(values=zeros)
-    return zeros
+    return _native.zero_floats(shape=shape)
 
 
 def copied_indices(indices: Tensor) -> Tensor:
     """A contiguous int32 copy of a dense int32 or int64 tensor, whose values fit."""
     if not indices.is_cpu:
         return indices.to(torch.int32, copy=True)
-    copies = empty_image(*indices.shape).view(torch.int32)
-    _native.copy_indices(values=indices, copies=copies)
-    return copies
+    return _native.copied_indices(values=indices)

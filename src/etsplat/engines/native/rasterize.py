@@ -28,13 +28,11 @@ def rasterize_native(
     plan = Plan(render, settings, geometry, len(tensors.viewmats))
     color, alpha, distortion, median_triangle = _rasterize(plan, *first)
     if rest:
-        plain = replace(settings, outputs=settings.outputs - {"statistics", "distortion", "median_depth"})
+        plain = settings._replace(outputs=settings.outputs - {"statistics", "distortion", "median_depth"})
         others = replace(plan, settings=plain)
         color = torch.cat([color, *(_rasterize(others, *part)[0] for part in rest)], dim=-1)
-    result = Rasterization(color=color, alpha=alpha, statistics=plan.statistics)
-    if settings.wants("distortion"):
-        result.distortion = distortion
-    if settings.wants("median_depth"):
+    result = Rasterization(color=color, alpha=alpha, distortion=distortion, statistics=plan.statistics)
+    if median_triangle is not None:
         result.median_depth = median_depth(median_triangle, channels, tensors, engine)
     channels.split(result)
     return result
@@ -60,8 +58,8 @@ def _parts(inputs: Inputs, most: int | None) -> list[Inputs]:
     return parts
 
 
-def _forward(keep: bool, plan: Plan, *given: Tensor) -> tuple[tuple[Tensor, ...], Any]:
-    """(colour of all channels, alpha, distortion, median triangle); the latter two are empty unless asked for."""
+def _forward(keep: bool, plan: Plan, *given: Tensor) -> tuple[tuple[Tensor | None, ...], Any]:
+    """(colour of all channels, alpha, distortion, median triangle); the latter two are None unless asked for."""
     inputs = Inputs(*given)
     outputs = Outputs(plan, inputs)
     render = plan.render(plan, inputs, outputs, keep)

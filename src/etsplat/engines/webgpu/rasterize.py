@@ -44,6 +44,7 @@ class WebGpuRender:
 
     def __init__(self, plan: Plan, inputs: Inputs, outputs: Outputs, keep: bool) -> None:
         _check(plan)
+        inputs = Inputs(*(None if tensor is None else tensor.detach() for tensor in inputs))  # numpy wants them so
         device = gpu()
         with device.lock:
             for view in range(plan.views):
@@ -164,7 +165,7 @@ class _View:
         numbers = torch.from_numpy(words[..., :-1].copy().view(np.float32))
         outputs.images.color[self.view] = numbers[..., :-1]
         outputs.images.alpha[self.view] = numbers[..., -1:]
-        if self.settings.wants("median_depth"):
+        if outputs.median_triangle is not None:
             outputs.median_triangle[self.view] = torch.from_numpy(words[..., -1].astype(np.int32))
         if outputs.statistics is not None:
             self._read_statistics(outputs.statistics)
