@@ -3,10 +3,13 @@
 #include <algorithm>
 #include <bit>
 #include <limits>
+#include <memory>
 #include <type_traits>
+#include <utility>
 #include <vector>
 
 #include "parallel.h"
+#include "pool.h"
 
 namespace etsplat {
 namespace {
@@ -28,28 +31,32 @@ std::vector<Part> chunkwise(int64_t count, F&& scan) {
 // Bits of a float to an integer of the same order, and back.
 int32_t in_order(int32_t bits) { return bits ^ ((bits >> 31) & kMagnitude); }
 
-// Adds row i of `values` to row indices[i] of `sums` where that is from `low` to `high` - 1. Channels: 0 if not known here.
-template <int Channels>
-void sum_range(const float* values, const int32_t* indices, int64_t count, int64_t low, int64_t high, int64_t channels,
-               float* sums) {
+// Adds rows of `values` to those of `sums` that they belong to: `count` of them, in the order of place(0), place(1), ...
+// Channels: 0 if not known here.
+template <int Channels, class Place>
+void add_rows(const float* values, const int32_t* indices, int64_t count, int64_t channels, float* sums, Place place) {
     if constexpr (Channels > 0) channels = Channels;
-    constexpr int64_t kBlock = 1024;
-    int32_t own[kBlock];  // places in the block
-    const auto lowest = static_cast<uint32_t>(low), size = static_cast<uint32_t>(high - low);
-    for (int64_t begin = 0; begin < count; begin += kBlock) {
-        const int32_t* index = indices + begin;
-        const auto places = static_cast<int32_t>(std::min(kBlock, count - begin));
-        int found = 0;
-        for (int32_t i = 0; i < places; ++i) {
-            own[found] = i;
-            found += static_cast<uint32_t>(index[i]) - lowest < size ? 1 : 0;
-        }
-        for (int k = 0; k < found; ++k) {
-            const float* row = values + (begin + own[k]) * channels;
-            float* sum = sums + index[own[k]] * channels;
-            for (int64_t c = 0; c < channels; ++c) sum[c] += row[c];
-        }
+    for (int64_t k = 0; k < count; ++k) {
+        const int64_t i = place(k);
+        const float* row = values + i * channels;
+        float* sum = sums + indices[i] * channels;
+        for (int64_t c = 0; c < channels; ++c) sum[c] += row[c];
     }
+}
+
+template <class Place>
+void add_rows(const float* values, const int32_t* indices, int64_t count, int64_t channels, float* sums, Place place) {
+    if (channels == 3) return add_rows<3>(values, indices, count, channels, sums, place);
+    add_rows<0>(values, indices, count, channels, sums, place);
+}
+
+// Lists the places of a chunk of indices by their ranges, each of 2^shift rows: those of range r from ends[r - 1] to ends[r].
+void list_by_range(const int32_t* indices, int64_t count, int shift, int64_t ranges, int32_t* ends, uint16_t* places) {
+    std::fill(ends, ends + ranges, 0);
+    for (int64_t i = 0; i < count; ++i) ++ends[indices[i] >> shift];
+    int32_t total = 0;
+    for (int64_t r = 0; r < ranges; ++r) ends[r] = std::exchange(total, total + ends[r]);
+    for (int64_t i = 0; i < count; ++i) places[ends[indices[i] >> shift]++] = static_cast<uint16_t>(i);
 }
 
 }  // namespace
@@ -109,17 +116,35 @@ void zero_floats(float* values, int64_t count) {
     parallel_for(count, kChunk, [values](int64_t begin, int64_t end) { std::fill(values + begin, values + end, 0.0f); });
 }
 
-// Each range of rows belongs to one thread, which looks through all indices for those of its own. For the corners of 82,000
-// faces that takes 0.5 ms on one thread, where grouping them by row and gathering takes 1.1.
+// One thread goes from the first row to the last. Several first list for each chunk of rows which belong to which range of
+// sums, then each adds to ranges of its own, chunk by chunk: the same order for every sum.
 void sum_by_index(const float* values, const int32_t* indices, int64_t count, int64_t rows, int64_t channels, float* sums) {
-    constexpr int64_t kFewest = 1 << 13;  // indices for each range
-    const int64_t ranges = std::clamp<int64_t>(count / kFewest, 1, num_threads());
-    const int64_t size = (rows + ranges - 1) / ranges;
+    constexpr int64_t kListed = int64_t{1} << 13;  // rows of a chunk
+    if (num_threads() == 1 || count < 2 * kListed) {
+        std::fill(sums, sums + rows * channels, 0.0f);
+        return add_rows(values, indices, count, channels, sums, [](int64_t k) { return k; });
+    }
+    int shift = 0;
+    while ((rows >> shift) >= 4 * num_threads()) ++shift;
+    const int64_t ranges = (rows >> shift) + 1, chunks = (count + kListed - 1) / kListed;
+    std::vector<int32_t> ends(static_cast<size_t>(chunks * ranges));
+    const std::unique_ptr<float, void (*)(float*)> block(pool_acquire(static_cast<size_t>(count + 1) / 2), pool_release);
+    auto* const places = reinterpret_cast<uint16_t*>(block.get());
+    parallel_for(chunks, 1, [&](int64_t first, int64_t last) {
+        for (int64_t c = first, at = c * kListed; c < last; ++c, at += kListed)
+            list_by_range(indices + at, std::min(kListed, count - at), shift, ranges, ends.data() + c * ranges, places + at);
+    });
     parallel_for(ranges, 1, [&](int64_t first, int64_t last) {
-        const int64_t low = std::min(rows, first * size), high = std::min(rows, last * size);
-        std::fill(sums + low * channels, sums + high * channels, 0.0f);
-        if (channels == 3) return sum_range<3>(values, indices, count, low, high, channels, sums);
-        sum_range<0>(values, indices, count, low, high, channels, sums);
+        for (int64_t r = first; r < last; ++r) {
+            std::fill(sums + (r << shift) * channels, sums + std::min(rows, (r + 1) << shift) * channels, 0.0f);
+            for (int64_t c = 0, at = 0; c < chunks; ++c, at += kListed) {
+                const int32_t* end = ends.data() + c * ranges + r;
+                const int32_t begin = r > 0 ? end[-1] : 0;
+                const uint16_t* listed = places + at + begin;
+                add_rows(values + at * channels, indices + at, *end - begin, channels, sums,
+                         [listed](int64_t k) { return int64_t{listed[k]}; });
+            }
+        }
     });
 }
 

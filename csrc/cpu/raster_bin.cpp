@@ -15,7 +15,10 @@
 namespace etsplat {
 namespace {
 
-int chunk_count(int64_t n) { return static_cast<int>(std::clamp<int64_t>(n / 8192, 1, 4 * num_threads())); }
+// For so many items to be counted in so many bins: what each chunk adds is its own bins, to be cleared and scanned.
+int chunk_count(int64_t items, int bins) {
+    return static_cast<int>(std::clamp<int64_t>(items / std::max(bins, 1024), 1, 4 * num_threads()));
+}
 
 struct Chunks {
     int64_t n;
@@ -104,12 +107,12 @@ ChunkTotals number_slots(RasterState& state, const TriangleKernels& kernels) {
 void sort_by_depth(RasterState& state, const ChunkTotals& total) {
     const int64_t n = total.triangles;
     if (n < 2) return;
-    const Chunks chunks{n, chunk_count(n)};
     const uint32_t low = total.lowest_key, range = total.highest_key - low;
     int bits = 0;
     while (bits < 32 && (range >> bits) != 0) ++bits;
     if (bits == 0) return;
     const int passes = (bits + 10) / 11, digit = (bits + passes - 1) / passes, bins = 1 << digit;
+    const Chunks chunks{n, chunk_count(n, bins)};
     state.keys_swap.resize(n);
     state.order_swap.resize(n);
     state.histogram.resize(int64_t{chunks.count} * bins);
@@ -160,7 +163,7 @@ void prefetch_coming(const RasterState& state, int64_t r, int64_t end) {
 void sort_by_tile(RasterState& state, int64_t n) {
     const int tiles = state.pass.tiles_x * state.pass.tiles_y;
     const int bins = tiles + state.pass.tiles_x + 1;  // a pattern may reach past the last tile, with nothing there
-    const Chunks chunks{n, chunk_count(n)};
+    const Chunks chunks{n, std::min(chunk_count(state.num_slots, bins), static_cast<int>(std::max<int64_t>(n, 1)))};
     state.histogram.resize(int64_t{chunks.count} * bins);
     state.tile_begin.resize(bins + 1);
     // behind the entries each chunk has a cache line for what is not taken
