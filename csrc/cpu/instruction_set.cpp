@@ -23,6 +23,7 @@ struct Path {
     PhotometricKernels photometric;
     NormalsKernels normals;
     OpaqueKernels opaque;
+    ColorsKernels colors;
 };
 
 #if defined(ETSPLAT_X86)
@@ -73,7 +74,7 @@ bool has_avx512() {
 #define ETSPLAT_PATH(name)                                                                                          \
     Path {                                                                                                          \
         #name,                    name::raster_kernels(),   name::triangle_kernels(), name::photometric_kernels(),  \
-        name::normals_kernels(), name::opaque_kernels()                                                             \
+        name::normals_kernels(), name::opaque_kernels(),    name::colors_kernels()                                  \
     }
 
 const std::vector<Path>& paths() {
@@ -133,5 +134,7 @@ const PhotometricKernels& active_photometric_kernels() { return active().photome
 const NormalsKernels& active_normals_kernels() { return active().normals; }
 
 const OpaqueKernels& active_opaque_kernels() { return active().opaque; }
+
+const ColorsKernels& active_colors_kernels() { return active().colors; }
 
 }  // namespace etsplat

@@ -4,6 +4,7 @@
 #include <string>
 #include <vector>
 
+#include "colors_pass.h"
 #include "normals_pass.h"
 #include "opaque_pass.h"
 #include "photometric_pass.h"
@@ -21,5 +22,6 @@ const TriangleKernels& active_triangle_kernels();
 const PhotometricKernels& active_photometric_kernels();
 const NormalsKernels& active_normals_kernels();
 const OpaqueKernels& active_opaque_kernels();
+const ColorsKernels& active_colors_kernels();
 
 }  // namespace etsplat

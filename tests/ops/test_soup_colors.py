@@ -1,6 +1,7 @@
 import pytest
 import torch
 
+from etsplat import _native
 from etsplat.ops.soup_colors import soup_colors
 from etsplat.ops.spherical_harmonics import spherical_harmonics
 from helpers.engines import on
@@ -35,6 +36,30 @@ def test_every_engine_agrees_with_the_float64_reference(engine, rng, degree):
     for grad, exact_grad in zip(grads, exact_grads, strict=True):
         scale = float(exact_grad.abs().max())
         torch.testing.assert_close(grad.double()[~clamp], exact_grad[~clamp], rtol=1e-4, atol=1e-6 * scale)
+
+
+@pytest.mark.sanitize
+@pytest.mark.parametrize("instruction_set", _native.available_instruction_sets())
+@pytest.mark.parametrize(("degree", "bases"), [(0, 0), (0, 15), (1, 3), (1, 15), (2, 8), (3, 15)])
+def test_a_triangle_has_the_same_bits_alone_as_among_others(rng, instruction_set, degree, bases):
+    """Sixteen are in the lanes of a vector, the last of these many are not; some no view sees, one has no direction."""
+    vertices, dc, rest, centers = problem(rng, 37, 2, bases)
+    vertices[4] = centers[0]
+    cotangent = torch.randn((2, 37, 3), generator=rng)
+    cotangent[0, ::3] = 0
+    cotangent[:, 5:9] = 0
+    cotangent[1, 10] = torch.nan
+    before = _native.instruction_set()
+    _native.set_instruction_set(instruction_set)
+    try:
+        colors, grads = gradients((vertices, dc, rest, centers), degree, cotangent, "cpu")
+        each = [(vertices[i : i + 1], dc[i : i + 1], rest[i : i + 1], centers) for i in range(37)]
+        alone = [gradients(one, degree, cotangent[:, i : i + 1], "cpu") for i, one in enumerate(each)]
+    finally:
+        _native.set_instruction_set(before)
+    torch.testing.assert_close(colors, torch.cat([one[0] for one in alone], dim=1), rtol=0, atol=0)
+    for grad, parts in zip(grads, zip(*(one[1] for one in alone), strict=True), strict=True):
+        torch.testing.assert_close(grad, torch.cat(parts), rtol=0, atol=0, equal_nan=True)
 
 
 def test_direction_is_from_the_camera_to_the_centroid(engine, rng):

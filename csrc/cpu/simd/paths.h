@@ -1,6 +1,7 @@
 // What the files *_kernels.cpp define, each compiled once for every instruction set.
 #pragma once
 
+#include "cpu/colors_pass.h"
 #include "cpu/normals_pass.h"
 #include "cpu/opaque_pass.h"
 #include "cpu/photometric_pass.h"
@@ -14,6 +15,7 @@ namespace etsplat {
     RasterKernels raster_kernels();           \
     TriangleKernels triangle_kernels();       \
     PhotometricKernels photometric_kernels(); \
+    ColorsKernels colors_kernels();           \
     NormalsKernels normals_kernels();         \
     OpaqueKernels opaque_kernels();           \
     }
