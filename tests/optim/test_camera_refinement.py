@@ -241,7 +241,7 @@ def test_cameras_move_alike_on_every_engine(engine: str, scene: Dataset) -> None
     for trainer in (ours, reference):
         trainer.run(3)
     for name in ("poses", "lenses"):
-        values, wanted = (each.trainer.cameras.adam.parameters[name].detach() for each in (ours, reference))
+        values, wanted = (each.trainer.cameras.learned[name].detach() for each in (ours, reference))
         assert float(wanted.abs().max()) > 1e-4
         assert float((values.cpu() - wanted).abs().median()) < 1e-5
 
@@ -261,7 +261,7 @@ def test_a_step_that_does_not_count_moves_no_camera(simt: object, scene: Dataset
     trainer.run(3)
     cameras = trainer.trainer.cameras
     before = {name: tensor.clone() for name, tensor in cameras.state().items()}
-    for parameter in cameras.adam.parameters.values():
+    for parameter in cameras.learned.values():
         parameter.grad = torch.ones_like(parameter)
     with etsplat.engine("cuda"):
         cameras.step_on_device(torch.tensor([0.1, 0.1, 1.0]), torch.tensor(1, dtype=torch.int32))

@@ -8,7 +8,7 @@ camera sees at x it sees at Q(w) (x - s) afterwards, where Q(w) is Cayley's rota
 about the axis w by 2 atan(|w| / 2): by |w| where that is small, and smooth at zero.
 
 Turning to the left and shifting to the left look nearly alike, so motions are not learned as they are. With the 6 x 6
-matrix H = mean J^T J of how pixels move, in units of the picture's longer side, a motion is (H + diag H)^-1/2 v:
+matrix H = mean J^T J of how pixels move, in units of the picture's longer side, a motion is (H + d diag H)^-1/2 v:
 all directions of v are worth about the same, and |v| is how far the picture moves (Park et al. 2023, CamP).
 """
 
@@ -19,8 +19,8 @@ from torch import Tensor
 from etsplat.core.cameras import Cameras
 from etsplat.engines.threads import one_torch_thread
 
-DAMPING = 1.0
-"""Of the diagonal that is added: with less, directions in which pictures hardly move drift (research/results.md)."""
+DAMPING = 0.3
+"""d: with less, directions in which pictures hardly move drift, with more they stay (research/results.md)."""
 
 NEAREST = 0.1
 """Points nearer than this part of the median depth count as if they were there: what floats before a lens says little

@@ -1,8 +1,9 @@
 """Where each photo was taken from, corrected beside the model: a small motion of every camera, and lenses of photos.
 
 Poses of structure from motion are off by a pixel, those of a phone by a degree. A motion (optim/camera_motion.py) of
-each training photo is learned by an Adam of its own while the model takes shape. What moves all cameras together is
-taken out after every step: the model stays where it is, and so does what the cameras of test photos mean.
+each training photo is learned by steps of its own (optim/visit_steps.py) while the model takes shape. What moves all
+cameras together is taken out after every step: the model stays where it is, and so does what the cameras of test photos
+mean.
 
 Photos that are kept aside have poses that are as wrong. They are aligned to the model (`optim/camera_alignment.py`),
 which does not learn of them; whether refined poses stay, they decide (`optim/camera_trial.py`).
@@ -23,6 +24,7 @@ from etsplat.data.loader import View
 from etsplat.ops.adam import Adam
 from etsplat.optim.camera_motion import common_motions, moved, unit_motions, zoomed
 from etsplat.optim.schedules import NEVER, Scheduled, at, exponential_decay
+from etsplat.optim.visit_steps import VisitSteps
 
 Choice = Literal["off", "poses", "all"]
 
@@ -39,15 +41,15 @@ SEEN = 5
 
 
 class CameraRefinement:
-    """The motions of a run's cameras, with their optimizer. A trainer has one, or none.
+    """The motions of a run's cameras, with their optimizers. A trainer has one, or none.
 
     Attributes:
         begin: iteration after which cameras may move.
         judged: iteration after which photos that are kept aside judge it.
         end: the last iteration that moves cameras.
         active: whether refined cameras are in use.
-        adam: the optimizer of "poses", (P, 6), of all training views and those kept aside, of which only the former
-            move; and, if they are learned, of "lenses", (C, 3), of photos that had the same intrinsics.
+        learned: "poses", (P, 6), of all training views and those kept aside, of which only the former move; and, if
+            they are learned, "lenses", (C, 3), of photos that had the same intrinsics.
 
     Example:
         >>> cameras = etsplat.CameraRefinement.of("poses", iterations=3000, epoch=40)
@@ -57,7 +59,7 @@ class CameraRefinement:
         False
     """
 
-    adam: Adam
+    learned: dict[str, Tensor]
 
     @staticmethod
     def of(choice: Choice, iterations: int, epoch: float) -> "CameraRefinement":
@@ -97,7 +99,6 @@ class CameraRefinement:
         """
         self.begin, self.judged, self.end, self.active = begin, judged, end, False
         self._rate, self._lenses = rate, lenses
-        self._names = ("poses", "lenses") if lenses else ("poses",)
 
     @property
     def wanted(self) -> bool:
@@ -125,8 +126,7 @@ class CameraRefinement:
         self._rows = rows.to(like.device)
         self._restart({"poses": torch.zeros(len(self._views), 6), "lenses": torch.zeros(len(kinds), 3)})
         self._use_units(torch.eye(6, dtype=torch.float64).expand(len(self._views), 6, 6))
-        # Adam divides by the root of a mean over all steps, of which those with other photos count as zero.
-        self._visits = (batch / max(1, self._moving)) ** 0.5
+        self._slower = (batch / max(1, self._moving)) ** 0.5
 
     def activate(self, vertices: Float[Tensor, "V 3"]) -> None:
         """From now on cameras are refined, from where they were given.
@@ -135,7 +135,7 @@ class CameraRefinement:
             vertices: of the model as it is now: they say how far away is what a camera shows.
         """
         self.active = True
-        self._restart({name: torch.zeros_like(values) for name, values in self.adam.parameters.items()})
+        self._restart({name: torch.zeros_like(values) for name, values in self.learned.items()})
         cameras = self._dataset.cameras
         self._use_units(torch.stack([unit_motions(vertices, cameras[view]) for view in self._views]))
 
@@ -160,7 +160,7 @@ class CameraRefinement:
         motion = self._units.index_select(0, pose)[0] @ self.poses.index_select(0, pose)[0]
         camera = moved(view.camera, motion if learning else motion.detach())
         if self._lenses:
-            numbers = self.adam.parameters["lenses"].index_select(0, lens)[0]
+            numbers = self.learned["lenses"].index_select(0, lens)[0]
             camera = zoomed(camera, numbers if learning else numbers.detach())
         return replace(view, camera=camera)
 
@@ -169,7 +169,7 @@ class CameraRefinement:
         if not (self.active and self._lenses):
             return view
         lens = self._rows.index_select(0, view.index)[0, 1:]
-        return replace(view, camera=zoomed(view.camera, self.adam.parameters["lenses"].detach()[lens][0]))
+        return replace(view, camera=zoomed(view.camera, self.learned["lenses"].detach()[lens][0]))
 
     @torch.no_grad()
     def align(self, motions: Mapping[int, Float[Tensor, "6"]]) -> None:
@@ -178,34 +178,46 @@ class CameraRefinement:
             row = int(self._rows[view, 0])
             self.poses[row] = torch.linalg.solve(self._units[row].double(), motion.double().to(self._units.device))
 
+    def zero_grad(self) -> None:
+        """Drops all gradients."""
+        for values in self.learned.values():
+            values.grad = None
+
     def step(self, iteration: int) -> None:
-        """Adam's, from the gradients; then what moves all cameras alike is taken out."""
-        self._set_rates(iteration)
-        self.adam.step()
+        """From the gradients; then what moves all cameras alike is taken out."""
+        self._steps.step(at(self._rate, iteration))
+        if self._adam is not None:
+            self._adam.learning_rates["lenses"] = self._lens_rate(iteration)
+            self._adam.step()
         self._fix_gauge(None)
 
     @property
     def row(self) -> int:
         """How many numbers a queued step needs."""
-        return len(self._names) + 1
+        return 3 if self._lenses else 1
 
     def queued_rates(self, iteration: int) -> list[float]:
         """What a queued step needs, `row` numbers; zeros where no camera moves. Counts the step."""
         if not self.moving(iteration):
             return [0.0] * self.row
-        self._set_rates(iteration)
-        self.adam.step_count += 1
-        return self.adam.rates(self._names)
+        rates = [at(self._rate, iteration)]
+        if self._adam is not None:
+            self._adam.learning_rates["lenses"] = self._lens_rate(iteration)
+            self._adam.step_count += 1
+            rates += self._adam.rates(["lenses"])
+        return rates
 
     def step_on_device(self, rates: Float[Tensor, " R"], halted: Tensor) -> None:
         """As `step`, from `queued_rates` in device memory; changes nothing where () `halted` is not 0."""
-        self.adam.step_on_device(rates, halted)
+        self._steps.step(rates[0], halted)
+        if self._adam is not None:
+            self._adam.step_on_device(rates[1:], halted)
         self._fix_gauge(halted)
 
     @property
     def poses(self) -> Float[Tensor, "P 6"]:
         """What is learned of each camera's pose; as long as its picture moves, in parts of its longer side."""
-        return self.adam.parameters["poses"]
+        return self.learned["poses"]
 
     @torch.no_grad()
     def refined(self, dataset: Dataset) -> Dataset:
@@ -218,7 +230,7 @@ class CameraRefinement:
             motion = (self._units[pose].double() @ self.poses[pose].double()).cpu()
             camera = Cameras(viewmats[view][None], Ks[view][None], *dataset.images.sizes[view])
             if self._lenses:
-                camera = zoomed(camera, self.adam.parameters["lenses"][lens].double().cpu())
+                camera = zoomed(camera, self.learned["lenses"][lens].double().cpu())
             camera = moved(camera, motion)
             viewmats[view], Ks[view] = camera.viewmats[0], camera.Ks[0]
         return replace(dataset, viewmats=viewmats, Ks=Ks)
@@ -227,14 +239,12 @@ class CameraRefinement:
         """Everything that the rest of the run depends on, by name, for a checkpoint."""
         if not self.active:
             return {}
-        moments = {
-            f"{kind}.{name}": tensor
-            for kind, tensors in (("first", self.adam.first_moments), ("second", self.adam.second_moments))
-            for name, tensor in tensors.items()
-        }
-        learned = {name: parameter.detach() for name, parameter in self.adam.parameters.items()}
-        count = torch.tensor(self.adam.step_count)
-        return {**learned, **moments, "units": self._exact_units, "step_count": count}
+        state = {name: values.detach() for name, values in self.learned.items()}
+        if self._adam is not None:
+            moments = self._adam.first_moments, self._adam.second_moments
+            state |= {"first.lenses": moments[0]["lenses"], "second.lenses": moments[1]["lenses"]}
+            state["step_count"] = torch.tensor(self._adam.step_count)
+        return {**state, **self._steps.state(), "units": self._exact_units}
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
         """Continues where `state` was taken."""
@@ -243,14 +253,17 @@ class CameraRefinement:
             return
         self._use_units(state["units"].cpu())
         self._restart(state)
-        for name, parameter in self.adam.parameters.items():
-            first, second = (state[f"{kind}.{name}"].to(**self._place).clone() for kind in ("first", "second"))
-            self.adam.replace(name, parameter, first, second)
-        self.adam.step_count = int(state["step_count"])
+        self._steps.load_state(state)
+        if self._adam is not None:
+            first, second = (state[f"{kind}.lenses"].to(**self._place).clone() for kind in ("first", "second"))
+            self._adam.replace("lenses", self.learned["lenses"], first, second)
+            self._adam.step_count = int(state["step_count"])
 
     def _restart(self, values: Mapping[str, Tensor]) -> None:
-        learned = {name: values[name].detach().to(**self._place).clone().requires_grad_(True) for name in self._names}
-        self.adam = Adam(learned, dict.fromkeys(learned, 0.0))
+        names = ("poses", "lenses") if self._lenses else ("poses",)
+        self.learned = {name: values[name].detach().to(**self._place).clone().requires_grad_(True) for name in names}
+        self._steps = VisitSteps(self.poses)
+        self._adam = Adam({"lenses": self.learned["lenses"]}, {"lenses": 0.0}) if self._lenses else None
 
     def _use_units(self, units: Float[Tensor, "P 6 6"]) -> None:
         self._exact_units = units
@@ -259,9 +272,8 @@ class CameraRefinement:
         basis = common_motions(self._dataset.viewmats[self._views[trained]], units[trained])
         self._common = basis.to(**self._place)
 
-    def _set_rates(self, iteration: int) -> None:
-        rate = at(self._rate, iteration)
-        self.adam.learning_rates = dict.fromkeys(self._names, rate * self._visits)
+    def _lens_rate(self, iteration: int) -> float:
+        return at(self._rate, iteration) * self._slower
 
     @torch.no_grad()
     def _fix_gauge(self, halted: Tensor | None) -> None:

@@ -296,7 +296,7 @@ class Stepper(Generic[M]):
             if not losses:
                 self.adam.zero_grad()
                 exposure.adam.zero_grad()
-                self._cameras.adam.zero_grad()
+                self._cameras.zero_grad()
             loss.backward()
             losses.append(loss.detach())
             seen.append(rendering)

@@ -312,7 +312,7 @@ class Trainer(Generic[M]):
 
     def first_not_finite(self) -> str | None:
         """The name of a parameter that holds NaN or infinity, or None."""
-        cameras = {f"cameras.{name}": learned for name, learned in self.cameras.adam.parameters.items()}
+        cameras = {f"cameras.{name}": learned for name, learned in self.cameras.learned.items()}
         return first_not_finite({**self.model.parameters(), "exposure": self.exposure.values, **cameras})
 
     def state(self) -> dict[str, Tensor]:
