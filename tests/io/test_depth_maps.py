@@ -1,3 +1,7 @@
+import gc
+import time
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 import torch
@@ -63,6 +67,25 @@ def test_what_is_no_depth_map_is_refused_with_what_to_do(tmp_path):
     pytest.importorskip("OpenEXR")
     with pytest.raises(InputError, match="no EXR that can be read"):
         load_depth(tmp_path / "cut.exr")
+
+
+def test_threads_that_take_turns_at_any_time_read_the_same(tmp_path):
+    """Here at each collection of garbage, of which headers are full: CPython 3.11 called good files damaged."""
+    np.save(tmp_path / "a.npy", DEPTH)
+    before = gc.get_threshold()
+
+    def take_turns(*_: object) -> None:
+        time.sleep(0)
+
+    gc.callbacks.append(take_turns)
+    gc.set_threshold(20, 1000, 1000)
+    try:
+        with ThreadPoolExecutor(4) as pool:
+            maps = list(pool.map(load_depth, [tmp_path / "a.npy"] * 60))
+    finally:
+        gc.set_threshold(*before)
+        gc.callbacks.remove(take_turns)
+    assert all(torch.equal(found, KNOWN) for found in maps)
 
 
 @pytest.mark.parametrize("size", [(5, 4), (10, 8), (7, 3), (40, 32)])
