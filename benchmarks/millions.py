@@ -39,10 +39,7 @@ EARLY = """new Promise((done) => {
     const look = () => (document.getElementById("scene").dataset.early ? done(true) : setTimeout(look, 20));
     look();
 })"""
-WHOLE = """sceneViewer.then((v) => new Promise((done) => {
-    const look = () => { if (v.busy) setTimeout(look, 50); else done(true); };
-    look();
-}))"""
+WHOLE = "sceneViewer.then((v) => v.settled())"
 READING, DRAWING, FINDING = "to read alone", "a picture of the viewer, 960 x 540", ".etz, read"
 
 

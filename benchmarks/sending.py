@@ -39,10 +39,7 @@ FRAME = """sceneViewer.then((v) => {
     gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));
     return performance.now() - begin;
 })"""
-STILL = """sceneViewer.then((v) => new Promise((done) => {
-    const look = () => { if (v.busy) setTimeout(look, 50); else done(true); };
-    look();
-}))"""
+SETTLED = "sceneViewer.then((v) => v.settled())"
 REFINE = """sceneViewer.then(async (v) => {
     const { painter } = v, times = [performance.now()];
     const [draw, refine] = [painter.draw.bind(painter), painter.refine.bind(painter)];
@@ -50,7 +47,7 @@ REFINE = """sceneViewer.then(async (v) => {
     painter.refine = (...given) => { times.push(performance.now()); return refine(...given); };
     v.change();
     v.moved = 0;
-    while (v.busy) await new Promise((done) => setTimeout(done, 5));
+    await v.settled();
     const { gl } = v.device;
     gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));
     times.push(performance.now());
@@ -136,7 +133,7 @@ def cut(compact: Path, part: Path, share: float) -> int:
 def compared(run: SoupRun, html: Path, page: Page, query: str) -> list[tuple[str, str]]:
     """How near its pictures are to ours, by WebGL or by what the query asks for."""
     page.open(html, query=query)
-    page.value(STILL)
+    page.value(SETTLED)
     name, rows = page.value("sceneViewer.then(v => v.device.name)"), []
     photo, camera = _first_test_view(run, 400)
     for mode, ours in _ours(run, camera).items():
@@ -150,7 +147,7 @@ def drawn(run: SoupRun, html: Path, page: Page) -> list[tuple[str, str]]:
     """What the browser makes of the page."""
     begin = time.perf_counter()
     page.open(html)
-    page.value(STILL)
+    page.value(SETTLED)
     rows = [("until the first whole picture", f"{time.perf_counter() - begin:.1f} s")]
     rows += compared(run, html, page, "")
     with browser_page(*WEBGPU) as another:
@@ -161,7 +158,7 @@ def drawn(run: SoupRun, html: Path, page: Page) -> list[tuple[str, str]]:
     against = decibels(shown, _ours(run, camera)["soft"])
     rows.append((f"the first soft picture of a camera that stands, {camera.width} pixels wide", f"{against:.1f} dB"))
     page.open(html)
-    page.value(STILL)
+    page.value(SETTLED)
     for name, mode, options in (
         ("opaque, moving", "opaque", "{still: false}"),
         ("opaque, standing", "opaque", "{}"),
@@ -182,7 +179,7 @@ def drawn(run: SoupRun, html: Path, page: Page) -> list[tuple[str, str]]:
     took = f"{times[-1] - times[0]:.0f} ms in {len(times) - 1} frames, the longest {longest:.0f} ms"
     rows.append(("soft, from standing still to the whole picture, 1280 x 720", f"{took}; processor {seconds:.2f} s"))
     page.open(html, 1280, 720 + _around(page))
-    page.value(STILL)
+    page.value(SETTLED)
     before = page.processor_seconds()
     frames, seconds = page.value(TURN)
     each = (page.processor_seconds() - before) / frames

@@ -13,10 +13,6 @@ from etsplat.tasks.export_soup import export_soup
 from etsplat.tasks.sources import SoupRun
 
 SIZE = (400, 300)
-STILL = """new Promise((done) => {
-    const look = () => { if (v.busy) setTimeout(look, 50); else done(true); };
-    look();
-})"""
 
 
 def make_soup(count=150, **appearance):
@@ -68,7 +64,7 @@ def opaque_of(shown, camera, background=(0.0, 0.0, 0.0)):
 
 def expect_that_refining_ends_as_drawing_at_once(page):
     """Part by part over a small picture, each nearer to the whole one than the small one."""
-    page.value(f"sceneViewer.then(v => {STILL})")
+    page.value("sceneViewer.then(v => v.settled())")
     drawn = """sceneViewer.then(v => {
         const pictures = [], { painter, camera, canvas } = v, take = () => pictures.push(canvas.toDataURL());
         painter.draw(camera, "soft"); take();

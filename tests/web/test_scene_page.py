@@ -18,7 +18,6 @@ from etsplat.web.pages import SCENE_SCRIPTS, SHARED_SCRIPTS, asset
 from helpers.finished_runs import write_run, write_soup_run
 from helpers.scene_pages import (
     SIZE,
-    STILL,
     camera_of,
     decibels,
     expect_that_refining_ends_as_drawing_at_once,
@@ -99,7 +98,7 @@ def test_a_browser_draws_the_opaque_mesh(tmp_path, page, capture):
 def test_a_scene_can_be_looked_around_in(tmp_path, page, capture):
     """Dragging turns about what is looked at, keys move, the list goes to photos, help can be read."""
     page.open(written(tmp_path, make_soup(), capture), 400, 300)
-    page.value(f"sceneViewer.then(v => {STILL})")
+    page.value("sceneViewer.then(v => v.settled())")
 
     def state():
         return page.value("sceneViewer.then(v => [v.camera.eye, v.camera.target, v.camera.forward, v.camera.right])")
@@ -189,7 +188,7 @@ def test_pictures_come_back_where_the_device_took_what_it_held(tmp_path, page, c
     assert page.value("sceneViewer.then(v => v.device.lost)")
     page.value("taken.restoreContext()")
     page.value("new Promise(done => setTimeout(done, 300))")
-    page.value(f"sceneViewer.then(v => {STILL})")
+    page.value("sceneViewer.then(v => v.settled())")
     for mode, expected in zip(("soft", "opaque"), before, strict=True):
         assert torch.equal(picture(page, 2, mode), expected)
     assert page.errors == []
@@ -214,20 +213,20 @@ def test_a_soft_picture_that_is_refined_ends_as_one_that_is_drawn_at_once(tmp_pa
     """Part by part over a small one, each nearer to it than the small one; then nothing is drawn any more."""
     page.open(written(tmp_path, make_soup(), capture), 160, 120)
     expect_that_refining_ends_as_drawing_at_once(page)
-    shown = f"""sceneViewer.then(async v => {{
-        const {{ painter }} = v, steps = [], draw = painter.draw.bind(painter), refine = painter.refine.bind(painter);
-        painter.draw = (camera, mode, how) => {{ steps.push(how.scale); draw(camera, mode, how); }};
-        painter.refine = (camera, share, fresh) => {{
+    shown = """sceneViewer.then(async v => {
+        const { painter } = v, steps = [], draw = painter.draw.bind(painter), refine = painter.refine.bind(painter);
+        painter.draw = (camera, mode, how) => { steps.push(how.scale); draw(camera, mode, how); };
+        painter.refine = (camera, share, fresh) => {
             const whole = refine(camera, share, fresh);
             steps.push([fresh, whole]);
             return whole;
-        }};
+        };
         [v.moved, v.pace.soft] = [0, SCALE];
         v.step(performance.now());
-        await {STILL};
+        await v.settled();
         [painter.draw, painter.refine] = [draw, refine];
         return steps;
-    }})"""
+    })"""
     for moving, coarse in ((0.3, 0.5), (0.7, 0.7)):
         first, *steps = page.value(shown.replace("SCALE", str(moving)))
         assert first == coarse  # of its size along each side, before any part of the whole one

@@ -10,7 +10,7 @@ from etsplat.model.soup_import import open_soup
 from etsplat.tasks.export_config import ExportConfig
 from etsplat.tasks.export_soup import export_soup
 from etsplat.tasks.sources import SoupRun
-from helpers.scene_pages import STILL, camera_of, decibels, make_soup, opaque_of, soft_of, written
+from helpers.scene_pages import camera_of, decibels, make_soup, opaque_of, soft_of, written
 
 BACKGROUND = (0.2, 0.4, 0.6)
 DOWN = ("ArrowDown", 40)
@@ -31,7 +31,7 @@ def shown(tmp_path, page, soup, capture):
     page.value("sceneViewer")  # switches answer from here on
 
     def canvas():
-        page.value(f"sceneViewer.then(v => {STILL})")
+        page.value("sceneViewer.then(v => v.settled())")
         left, top, width, height = (round(side) for side in page.box("canvas"))
         assert (width, height) == (400, 300)
         return torch.from_numpy(page.screenshot()).float()[top : top + height, left : left + width]
@@ -169,7 +169,7 @@ def test_help_and_theme(page, shown):
 def test_a_phone_has_room_for_every_switch_and_fingers_move_the_scene(tmp_path, page, soup, capture, width, height):
     """Upright and lying: nothing is cut off or covered; a finger turns, two go nearer."""
     page.open(written(tmp_path, soup, capture), width, height, phone=True)
-    page.value(f"sceneViewer.then(v => {STILL})")
+    page.value("sceneViewer.then(v => v.settled())")
     assert page.value("document.documentElement.scrollWidth <= innerWidth && document.body.scrollHeight <= innerHeight")
     assert page.box("canvas")[3] > height / 2
     found = "[...document.querySelectorAll('button, select')].filter(part => part.checkVisibility())"

@@ -14,7 +14,6 @@ from etsplat.web.pages import asset
 from helpers.browser import WEBGPU
 from helpers.scene_pages import (
     SIZE,
-    STILL,
     camera_of,
     decibels,
     expect_that_refining_ends_as_drawing_at_once,
@@ -96,7 +95,7 @@ def test_every_frame_has_its_own_order(tmp_path, page, capture):
     made = make_soup(5000)
     soup = replace(made, vertices=torch.cat([made.vertices[:2500]] * 2))
     open_by_webgpu(page, written(tmp_path, soup, capture), 64, 48)
-    page.value(f"sceneViewer.then(v => {STILL})")
+    page.value("sceneViewer.then(v => v.settled())")
     export_soup(SoupRun(tmp_path, soup, capture, None), tmp_path / "soup.etz", ExportConfig())
     in_file = open_soup(tmp_path / "soup.etz")
     drawn = """sceneViewer.then(v => [5, 2, 7].map(photo => {
@@ -116,7 +115,7 @@ def test_every_frame_has_its_own_order(tmp_path, page, capture):
 def test_a_soft_picture_is_refined_by_webgpu_too(tmp_path, page, capture):
     open_by_webgpu(page, written(tmp_path, make_soup(), capture), 160, 120)
     expect_that_refining_ends_as_drawing_at_once(page)
-    page.value(f"sceneViewer.then(v => {STILL})")
+    page.value("sceneViewer.then(v => v.settled())")
     assert page.errors == []
 
 
@@ -129,7 +128,7 @@ def test_pictures_come_back_where_webgpu_lost_its_device(tmp_path, page, capture
         v.device.device.destroy();
         v.stand(1);
     }))""")
-    page.value(f"sceneViewer.then(v => {STILL})")
+    page.value("sceneViewer.then(v => v.settled())")
     for mode, expected in zip(("soft", "opaque"), before, strict=True):
         assert torch.equal(picture(page, 2, mode), expected)
     assert page.errors == []

@@ -123,9 +123,9 @@ class SceneViewer {
         return whole;
     }
 
-    // For scripts: whether what is shown is going to change by itself.
-    get busy() {
-        return Boolean(this.frame || this.painter.wanted);
+    // For scripts: done when what is shown is not going to change by itself any more.
+    async settled() {
+        while (this.frame || this.painter.wanted) await new Promise((done) => setTimeout(done, 5));
     }
 
     // For scripts: the canvas with a photo's picture of so many pixels, when it is drawn; until the camera moves.
