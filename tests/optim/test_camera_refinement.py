@@ -11,12 +11,14 @@ from torch import Tensor
 
 import etsplat
 from etsplat.core.cameras import Cameras
+from etsplat.core.errors import InputError
 from etsplat.data.dataset import Dataset
 from etsplat.data.demo_scene import demo_scene
 from etsplat.data.photograph import photograph
 from etsplat.geometry.icosphere import icosphere
 from etsplat.io.mesh_files import MeshFile
 from etsplat.io.run_directory import RunDirectory
+from etsplat.io.tensors import read_tensors, save_tensors
 from etsplat.model.soup_init import StartPoints, start_soup
 from etsplat.model.triangle_mesh import TriangleMesh
 from etsplat.optim.camera_event import CamerasEvent
@@ -204,6 +206,18 @@ def test_a_resumed_run_ends_with_the_same_bits(
     forgotten = range(0) if resumed.cameras.active else range(11, 35)
     logged = [number for number in range(1, BRIEF + 1) if number not in forgotten]
     assert [line["iteration"] for line in run.read_history()] == logged
+
+
+def test_a_checkpoint_of_a_version_before_is_refused(right: Dataset, tmp_path: Path) -> None:
+    """Versions before moved cameras by Adam, whose checkpoints have no clock of each camera."""
+    first, resumed = (true_shape(turned(right, ball().vertices), briefly()) for _ in range(2))
+    first.fit(BRIEF, run=tmp_path)
+    path = tmp_path / "checkpoints" / "step_000060.safetensors"
+    tensors, metadata = read_tensors(path)
+    del tensors["cameras.squares"]
+    save_tensors(path, tensors, metadata)
+    with pytest.raises(InputError, match=r"step_000060\.safetensors: another .* lacks `squares`; .*--overwrite"):
+        resumed.fit(BRIEF + 10, run=tmp_path)
 
 
 def test_photos_must_be_kept_aside(right: Dataset) -> None:

@@ -8,10 +8,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from etsplat.core.errors import InputError
 from etsplat.core.workers import about_this, workers
 from etsplat.io.run_directory import RunDirectory
 from etsplat.optim.camera_event import CamerasEvent
-from etsplat.optim.checkpoints import checkpoint_path, load_latest_checkpoint, save_checkpoint
+from etsplat.optim.checkpoints import Checkpoint, checkpoint_path, load_latest_checkpoint, save_checkpoint
 from etsplat.optim.loop import Callback, Event, LoopSettings, Problem, Progress, StepEvent, UndoEvent, optimize
 
 
@@ -35,16 +36,13 @@ def drive(
 
     Raises:
         DivergedError: a loss or parameter is not finite.
-        InputError: the checkpoint is damaged or of another run; the disk is full.
+        InputError: the checkpoint is damaged, of another run or another version; the disk is full.
     """
     group = workers()
     if run is not None:
         checkpoint = group.from_first(lambda: load_latest_checkpoint(run.checkpoints, run_hash))
         if checkpoint is not None:
-            problem.load_state(checkpoint.tensors, checkpoint.iteration)
-            progress.iteration = checkpoint.iteration
-            progress.seconds, progress.loss_sum, loss_count = checkpoint.tensors["progress"].tolist()
-            progress.loss_count = int(loss_count)
+            _go_on(problem, progress, checkpoint)
         del checkpoint  # or its tensors would stay beside those that edits make of them
         if group.leads:
             run.truncate_history(progress.iteration)
@@ -63,6 +61,19 @@ def drive(
             _check_same(problem, {"iteration": event.iteration})
         for callback in told:
             callback(event)
+
+
+def _go_on(problem: Problem, progress: Progress, checkpoint: Checkpoint) -> None:
+    """Where a checkpoint was taken. InputError where it lacks something: versions before knew no such part."""
+    try:
+        problem.load_state(checkpoint.tensors, checkpoint.iteration)
+        progress.seconds, progress.loss_sum, loss_count = checkpoint.tensors["progress"].tolist()
+    except KeyError as error:
+        raise InputError(
+            f"{checkpoint.path}: another version of etsplat wrote it, it lacks `{error.args[0]}`; finish the run with "
+            "that version, or start it again, with --overwrite or in another folder"
+        ) from error
+    progress.iteration, progress.loss_count = checkpoint.iteration, int(loss_count)
 
 
 def _check_same(problem: Problem, about: Mapping[str, object]) -> None:
