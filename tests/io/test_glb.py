@@ -100,7 +100,7 @@ def test_names_of_any_file_are_in_json_that_can_be_read(tmp_path: Path, name: by
         (b'"max":[0.', b'"max":[3.'),
         (b'"target":34962', b'"target":34963'),
         (b'"KHR_materials_unlit"]', b'"KHR_materials_other"]'),
-        (b'"componentType":5125', b'"componentType":5126'),
+        (b'"componentType":5123', b'"componentType":5126'),
         (b'"byteOffset":0', b'"byteOffset":4'),
     ],
 )

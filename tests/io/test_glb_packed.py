@@ -94,7 +94,8 @@ def test_compressed_is_the_same_surface_as_quantised(tmp_path: Path) -> None:
     for compress in ("none", "quantize", "meshopt"):
         save_mesh(tmp_path / f"{compress}.glb", *icosphere(4), vertex_colors=torch.rand(2562, 3), compress=compress)
     sizes = [(tmp_path / f"{name}.glb").stat().st_size for name in ("none", "quantize", "meshopt")]
-    assert sizes[2] < 0.8 * sizes[1] < 0.5 * sizes[0]
+    assert sizes[2] < 0.8 * sizes[1]
+    assert sizes[1] < 0.75 * sizes[0]
     one, other = (load_mesh(tmp_path / f"{name}.glb") for name in ("quantize", "meshopt"))
     corners = [
         {tuple(sorted(map(tuple, face))) for face in mesh.vertices[mesh.faces].tolist()} for mesh in (one, other)

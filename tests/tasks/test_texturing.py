@@ -178,3 +178,24 @@ def test_colours_of_a_coarser_level_are_those_of_the_place(light: TexturedMesh) 
     error = (far.texture.detach()[covered] - (0.5 + 0.4 * points)).abs()
     assert float(error.median()) < 0.02
     assert float(error.max()) < 0.15
+
+
+@pytest.mark.parametrize("shape", [(64, 64), (52, 37), (1, 9)])
+def test_one_texel_colours_all_that_is_between_charts(shape: tuple[int, int], rng: torch.Generator) -> None:
+    known = torch.zeros(shape, dtype=torch.bool)
+    known[0, 3] = True
+    one = torch.rand(3, generator=rng)
+    assert torch.equal(texturing.spread(known[..., None] * one, known), one.expand(*shape, 3))
+
+
+def test_no_coarser_level_of_a_chart_has_the_colours_of_another(rng: torch.Generator) -> None:
+    """A block of any level that holds a part of one chart has its colours alone; texels beside a chart, the nearest."""
+    known = torch.zeros(64, 64, dtype=torch.bool)
+    known[5:60, 3:6] = known[8:40, 34:60] = True
+    texture = known[..., None] * torch.rand((64, 64, 3), generator=rng)
+    texture[:, :32, 2], texture[:, 32:, 2] = 0, known[:, 32:].float()
+    filled = texturing.spread(texture, known)
+    assert torch.equal(filled[known], texture[known])
+    assert torch.equal(filled[40, 35:59], texture[39, 35:59])
+    assert set(filled[:, :32, 2].flatten().tolist()) == {0.0}
+    assert set(filled[:, 32:, 2].flatten().tolist()) == {1.0}

@@ -4,8 +4,8 @@ The mesh is decimated, untangled and cut into charts. The texture begins with th
 is fitted with the antialiased z-buffer, the picture that a viewer draws; twice it is enlarged, so that where photos
 show less than its texels hold it stays smooth. The vertices follow, for the silhouettes that decimation moved, but make
 no new folds, and are untangled once more. Where pictures get worse by untangling, it is left. Texels that no photo
-shows take the colour of the nearest place on the surface that one does; those between charts that of the nearest texel
-of a chart, so that coarser levels do not bleed.
+shows take the colour of the nearest place on the surface that one does; those between charts that of charts beside
+them, so that coarser levels do not bleed.
 """
 
 import math
@@ -61,6 +61,9 @@ run."""
 
 TEXTURE_RATES, TEXTURE_FINAL = (2e-2, 1e-2, 1e-2), 0.2
 """Adam's rate of texels in each stage, and what is left of it at the stage's end."""
+
+RIM = 1.5
+"""Texels around a chart: bilinear filters at a chart's edge read its neighbours along both axes."""
 
 SHOWN = 1e-4
 """Photos show a texel whose second moment is at least this part of the median of those that they do."""
@@ -265,11 +268,31 @@ def _completed(model: TexturedMesh, moments: Float[Tensor, "H W"]) -> TexturedMe
     return _with_texture(model, spread(texture, covered))
 
 
-def spread(texture: Float[Tensor, "H W 3"], known: Bool[Tensor, "H W"]) -> Float[Tensor, "H W 3"]:
-    """Every other texel takes the colour of the nearest known one."""
-    nearest = distance_transform_edt(~known.numpy(), return_distances=False, return_indices=True)
+def spread(texture: Float[Tensor, "H W C"], known: Bool[Tensor, "H W"]) -> Float[Tensor, "H W C"]:
+    """Every other texel takes the colour of the nearest known one if that is near, where filters at a rim read it.
+
+    Farther away it takes the mean of what is known in the smallest block of a coarser level that it is in: no level has
+    another colour by it, and large blocks of one colour hardly count in a file.
+    """
+    found = distance_transform_edt(~known.numpy(), return_indices=True)
+    assert found is not None
+    away, nearest = found
     rows, columns = torch.from_numpy(np.asarray(nearest)).long()
-    return texture[rows, columns]
+    near = torch.from_numpy(away <= RIM)[..., None]
+    return torch.where(near, texture[rows, columns], _block_means(texture, known[..., None].to(texture)))
+
+
+def _block_means(texture: Float[Tensor, "H W C"], weights: Float[Tensor, "H W 1"]) -> Float[Tensor, "H W C"]:
+    """The weighted mean of each texel, or of the smallest block around it that has a weight; of any H and W."""
+    height, width = weights.shape[:2]
+    if bool((weights > 0).all()) or height == width == 1:
+        return texture
+    both = torch.cat([texture * weights, weights], dim=-1).permute(2, 0, 1)
+    sums = torch.nn.functional.pad(both, (0, width % 2, 0, height % 2)).unfold(1, 2, 2).unfold(2, 2, 2).sum(dim=(3, 4))
+    means = (sums[:-1] / sums[-1:].clamp_min(1.0)).permute(1, 2, 0)
+    coarser = _block_means(means, sums[-1:].permute(1, 2, 0))
+    doubled = coarser.repeat_interleave(2, dim=0).repeat_interleave(2, dim=1)[:height, :width]
+    return torch.where(weights > 0, texture, doubled)
 
 
 def _enlarged(texture: Float[Tensor, "H W 3"]) -> Float[Tensor, "2H 2W 3"]:

@@ -71,7 +71,7 @@ class Arrays:
 
     def indices(self, faces: np.ndarray, vertices: int) -> int:
         """Append the corners of triangles; the number of their accessor."""
-        short = self.quantized and vertices <= _STEPS
+        short = vertices <= _STEPS
         corners = faces.astype("<u2" if short else "<u4").reshape(-1)
         if self.compress == "meshopt":
             view = self._packed(*meshopt.encoded_indices(corners, vertices), target=_INDICES)
