@@ -13,7 +13,7 @@ from etsplat.data.load import load_dataset
 from etsplat.io.georeference import Georeference
 from etsplat.io.ply_tables import encode_ply
 from etsplat.optim.loop import NoteEvent
-from etsplat.tasks.depths import trusted_depths, unit_of_maps, wanted_depths
+from etsplat.tasks.depths import trusted_depths, unit_of_maps, wanted_depths, with_shown_points
 from etsplat.tasks.sources import with_cloud
 from helpers.depths import ball_with_depths
 
@@ -124,10 +124,11 @@ def test_maps_in_a_wrong_unit_are_used_as_depths_where_it_is_found():
     assert (right.kind, right.unit) == ("l1", 1)
 
 
-def test_a_resumed_run_ends_with_the_same_bits(tmp_path):
-    """Stopped after the maps were compared with the soup, and before."""
+@pytest.mark.parametrize("setting", ["pearson", "auto"])
+def test_a_resumed_run_ends_with_the_same_bits(tmp_path, setting):
+    """Stopped after the maps were compared with the soup, and before; or where it began at what they show."""
     write_ball(tmp_path / "scene")
-    config = TRAIN.changed({"loss.depth": "pearson", "loss.depth_from": 15_000, "output.checkpoint_every": 10})
+    config = TRAIN.changed({"loss.depth": setting, "loss.depth_from": 15_000, "output.checkpoint_every": 10})
 
     class StopError(Exception):
         pass
@@ -147,6 +148,26 @@ def test_a_resumed_run_ends_with_the_same_bits(tmp_path):
         again = etsplat.train(tmp_path / "scene", out, config, callbacks=[lambda event: None], resume=True)
         assert torch.equal(again.soup.vertices, whole.soup.vertices)
         assert again.metrics["depth_used"] == whole.metrics["depth_used"]
+
+
+def test_a_capture_without_points_begins_at_what_right_maps_show():
+    """On the surface, in colours of the photos, whatever the unit; random points stay where maps are wrong."""
+    for scale in (1, 1000):
+        ball = replace(ball_with_depths(change=lambda depth, view, scale=scale: scale * depth), exact_points=None)
+        given, told = ball_with_depths().exact_points, []
+        trust = trusted_depths(replace(ball, exact_points=given if scale > 1 else None), "auto", 10, told.append)
+        found = with_shown_points(ball, trust, 600, told.append)
+        assert found.exact_points is not None
+        assert found.point_colors is not None
+        assert 150 < len(found.exact_points) <= 300
+        assert (found.exact_points.norm(dim=1) - 1).abs().median() < 0.01
+        assert "depth maps: starting from" in str(told[-1])
+        assert with_shown_points(ball, trust, 2, told.append) is ball
+    wrong = replace(ball_with_depths(change=garbage), exact_points=None)
+    assert with_shown_points(wrong, trusted_depths(wrong, "auto", 10, told.append), 600, told.append) is wrong
+    assert with_shown_points(ball, None, 600, told.append) is ball
+    pointed = ball_with_depths()
+    assert with_shown_points(pointed, trusted_depths(pointed, "auto", 10, told.append), 600, told.append) is pointed
 
 
 def test_a_mesh_uses_right_maps_and_wrong_ones_change_no_bit(tmp_path):

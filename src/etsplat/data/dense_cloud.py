@@ -32,6 +32,9 @@ CELLS, IN_CELL, BEHIND = 96, 8, 1.02
 """A point is hidden behind others in the same field that are nearer by this factor; there are so many fields along the
 width, or fewer, so that points are as many in each."""
 
+FEWEST_POINTS = 100
+"""What photos speak for is no start where there are fewer."""
+
 COMPARED = 1_000_000
 """Larger clouds are thinned to so many points before they are compared with the photos. Fewer would hide too little."""
 

@@ -40,7 +40,7 @@ def maps_on_maps(dataset: Dataset, views: Sequence[int], unit: float = 1.0) -> d
         views: indices.
         unit: all maps are multiplied by this first.
     """
-    shown = {view: _surface(dataset, view, unit) for view in views}
+    shown = {view: shown_by_map(dataset, view, unit) for view in views}
     forward, centers = dataset.viewmats[list(views), 2, :3], dataset.centers[list(views)]
     reach = (centers - centers.mean(dim=0)).norm(dim=1).max().clamp_min(1e-12)
     apart = torch.cdist(centers, centers) / reach + torch.cdist(forward, forward)
@@ -52,11 +52,18 @@ def maps_on_maps(dataset: Dataset, views: Sequence[int], unit: float = 1.0) -> d
     }
 
 
-def _surface(dataset: Dataset, view: int, unit: float) -> Float[Tensor, "P 3"]:
-    """What a depth map shows, at some of its pixels; float64, in the frame."""
+def shown_by_map(dataset: Dataset, view: int, unit: float = 1.0, samples: int = SAMPLES) -> Float[Tensor, "P 3"]:
+    """What a depth map shows, at some of its pixels; float64, in the frame.
+
+    Args:
+        dataset: with a depth map of the view.
+        view: its index.
+        unit: the map is multiplied by this first.
+        samples: about so many pixels along the width, twice as many at most.
+    """
     said, viewmat, K = dataset.images.depth(view), dataset.viewmats[view], dataset.Ks[view]
     assert said is not None
-    step = max(1, said.shape[1] // SAMPLES)
+    step = max(1, said.shape[1] // samples)
     depth = said[::step, ::step].double() * unit / dataset.normalization.radius
     rows, columns = depth.nonzero().unbind(dim=1)
     depth = depth[rows, columns]

@@ -74,6 +74,11 @@ class DepthTrust:
         """How many maps are believed."""
         return int(self._used.sum()) if self.kind else 0
 
+    @property
+    def believed_maps(self) -> list[int]:
+        """Views whose maps are believed."""
+        return [view for view in self._maps if self.kind and self._used[view]]
+
     def start(self, like: Tensor) -> None:
         """Goes to the device and precision of a tensor of the model."""
         self._used = self._used.to(like)

@@ -2,14 +2,17 @@
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
+import torch
 from scipy.optimize import minimize_scalar
 
 from etsplat.core.errors import InputError
 from etsplat.data.dataset import Dataset
-from etsplat.data.depth_points import maps_on_maps, points_on_maps
+from etsplat.data.dense_cloud import COMPARED, FEWEST_POINTS, dense_start
+from etsplat.data.depth_points import maps_on_maps, points_on_maps, shown_by_map
 from etsplat.data.frames import LARGEST
 from etsplat.metrics.depth import FEWEST, explained_as_they_are
 from etsplat.optim.depth_trust import NEEDED, DepthTrust
@@ -79,6 +82,30 @@ def trusted_depths(
     if early.judge(maps_on_maps(capture, maps), "what the maps of other photos show", only="l1"):
         return early
     return DepthTrust(maps, setting, compared_at, tell, unit_near)
+
+
+def with_shown_points(
+    capture: Dataset, trust: DepthTrust | None, most: int, announce: Callable[[Event], None]
+) -> Dataset:
+    """A capture without points, with those that its depth maps show, where they are believed before the run.
+
+    Triangles that begin at random places are a fog for half of a short run, whose depths no map can correct.
+
+    Args:
+        capture: in the frame that is trained in.
+        trust: from `trusted_depths`.
+        most: triangles that there may be; half as many points are taken.
+        announce: told of what is found.
+    """
+    if capture.exact_points is not None or trust is None or trust.kind != "l1":
+        return capture
+    samples = max(1, math.isqrt(COMPARED // trust.photos))
+    shown = torch.cat([shown_by_map(capture, view, trust.unit, samples) for view in trust.believed_maps])
+    found = dense_start(shown, None, capture, max(1, most // 2))
+    if len(found.positions) < FEWEST_POINTS:
+        return capture
+    announce(NoteEvent(f"depth maps: {found.note}"))
+    return replace(capture, exact_points=found.positions, point_colors=found.colors)
 
 
 def unit_of_maps(capture: Dataset, maps: Sequence[int], near: float) -> float | None:

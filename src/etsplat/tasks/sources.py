@@ -18,7 +18,7 @@ from etsplat.core.errors import InputError
 from etsplat.data.dataset import Dataset
 from etsplat.data.demo_object import demo_object
 from etsplat.data.demo_scene import HEIGHT, WIDTH, demo_scene
-from etsplat.data.dense_cloud import dense_start
+from etsplat.data.dense_cloud import FEWEST_POINTS, dense_start
 from etsplat.data.frame_gaps import without_frame_gaps
 from etsplat.data.hull import bounding_sphere
 from etsplat.data.load import load_dataset
@@ -41,9 +41,6 @@ from etsplat.tasks.settings import Settings, settings_of
 from etsplat.tasks.train_config import TrainConfig
 
 Source = str | Path | MeshFile | Dataset
-
-FEWEST_POINTS = 100
-"""Of a dense cloud that photos speak for."""
 
 
 def load_source(

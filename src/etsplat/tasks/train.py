@@ -23,7 +23,7 @@ from etsplat.optim.loop import Callback, CheckpointEvent, DivergedError, Event, 
 from etsplat.optim.schedules import limited_iterations
 from etsplat.tasks.block_training import check_blocks, shape_of, train_blocks
 from etsplat.tasks.camera_results import conclude_cameras
-from etsplat.tasks.depths import trusted_depths, wanted_depths
+from etsplat.tasks.depths import trusted_depths, wanted_depths, with_shown_points
 from etsplat.tasks.export_config import ExportConfig
 from etsplat.tasks.export_soup import export_soup
 from etsplat.tasks.opaque import fit_opaque_mesh
@@ -174,7 +174,10 @@ def _fit(
         scorer = Scorer(capture, job.device, background=background_of(config))
         loss, first = config.loss, config.at(config.loss.depth_from)
         trust = trusted_depths(capture, loss.depth if loss.lambda_depth else "off", first, job.announce)
-        trainer = start_trainer(capture, config, scorer.cheap, job.device, trust, part)
+        start = capture
+        if part is None:
+            start = with_shown_points(capture, trust, triangle_limit(own, config), job.announce)
+        trainer = start_trainer(start, config, scorer.cheap, job.device, trust, part)
 
         def look(iteration: int) -> None:
             if onlooker is not None and workers().leads:

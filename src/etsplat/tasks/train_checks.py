@@ -38,7 +38,8 @@ def check_train(
     if capture.images.streamed:
         notes.append("the photos do not fit into memory: they are decoded anew whenever they are needed")
     if capture.exact_points is None:
-        notes.append(f"no points in the capture: starting from {config.start.points:,} random ones")
+        unless = " unless its depth maps agree" if capture.images.with_depth and config.loss.depth != "off" else ""
+        notes.append(f"no points in the capture: starting from {config.start.points:,} random ones{unless}")
     if doubt := doubtful_scale(capture, config):
         notes.append(doubt)
     return notes
