@@ -31,6 +31,15 @@ def ball(size: float = 1.0, x: float = 0.0) -> MeshFile:
     return MeshFile(size * vertices + torch.tensor([x, 0.0, 0.0]), faces)
 
 
+def bent_rod() -> MeshFile:
+    """Around a ring, and a little farther."""
+    mesh = trimesh.creation.cylinder(0.3, 1.0, sections=16).subdivide_to_size(0.25)
+    x, y, along = torch.from_numpy(mesh.vertices.copy()).float().unbind(1)
+    angle = 2.1 * torch.pi * along
+    places = torch.stack([(1 + x) * angle.cos(), (1 + x) * angle.sin(), y], dim=1)
+    return MeshFile(places, torch.from_numpy(mesh.faces.copy()).long())
+
+
 def joined(*meshes: MeshFile) -> MeshFile:
     offsets = torch.tensor([0, *(len(mesh.vertices) for mesh in meshes)]).cumsum(0)
     faces = [mesh.faces + offset for mesh, offset in zip(meshes, offsets, strict=False)]
@@ -123,7 +132,9 @@ def test_a_hull_with_other_holes_has_other_remedies():
 
 def test_holes_that_no_silhouette_shows_are_not_held_against_a_result():
     found = judged(expected=Shape(1, 12), shown=False)
-    assert found.verdict.endswith("1 part and 0 holes, as silhouettes of the input mesh show it")
+    assert found.verdict.endswith(
+        "1 part and 0 holes, as silhouettes of the input mesh show it, which has 1 part and 12 holes"
+    )
     assert found.expected_holes == 12
 
 
@@ -180,6 +191,22 @@ def test_silhouettes_tell_whether_a_ring_is_a_ring():
     assert expect_photos(photos, BALL, 1.05) == Expected(RING, "visual hull")
     assert expect_mesh(ring(), photos, BALL, 1.05).shown
     assert not expect_mesh(ring(), photograph(ball(), 48, 48, supersampling=1), BALL, 1.05).shown
+
+
+def test_holes_that_the_input_mesh_has_not_are_wrong_though_the_hull_has_them_too():
+    """A hull may have a hole that is none of the object's, and so excuses none of a result's."""
+    expected = expect_mesh(ball(), photograph(ring(), 96, 96, supersampling=1), RING, 1.05)
+    assert expected == Expected(BALL, "input mesh")
+
+
+def test_a_mesh_that_cuts_through_itself_has_not_the_holes_that_are_seen():
+    """The ends of a bent rod in each other: a ring to look at, without a hole as a surface."""
+    photos = photograph(bent_rod(), 96, 96, supersampling=1)
+    assert expect_mesh(bent_rod(), photos, BALL, 1.05) == Expected(BALL, "input mesh")
+    assert expect_mesh(bent_rod(), photos, RING, 1.05).shape.unclear == (
+        "the input mesh cuts through itself: its own surface has 1 part and 0 holes, the result, as silhouettes show"
+        " it, 1 part and 1 hole"
+    )
 
 
 def test_views_are_spread_evenly():

@@ -98,19 +98,39 @@ class Judgement:
 
 
 def expect_mesh(truth: MeshFile, photos: Dataset, found: Shape, radius: float) -> Expected:
-    """What a result for an input mesh should look like. Where `found` is something else, its `photos` are asked too."""
+    """What a result for an input mesh should look like. Where `found` is something else, its `photos` are asked too.
+
+    They may excuse what a result lacks, since no silhouette shows a tunnel that nobody can look through. Holes and
+    parts that the mesh has not are wrong whatever a hull has, unless the mesh cuts through itself: then what is seen
+    of it need not have its parts and holes.
+    """
     shape = true_shape(truth)
     if shape.unclear:
         return Expected.unclear(f"the input mesh {shape.unclear}")
-    shown = shape == found or expect_photos(photos, found, radius).shape != found
-    return Expected(shape, "input mesh", shown)
+    if shape == found or expect_photos(photos, found, radius).shape != found:
+        return Expected(shape, "input mesh")
+    if _lacks(found, shape):
+        return Expected(shape, "input mesh", shown=False)
+    if _cuts_itself(weld_vertices(truth)):
+        own = f"its own surface has {_counted(shape)}, the result, as silhouettes show it, {_counted(found)}"
+        return Expected.unclear(f"the input mesh cuts through itself: {own}")
+    return Expected(shape, "input mesh")
+
+
+def _lacks(found: Shape, wanted: Shape) -> bool:
+    """Whether nothing is too much in what was found."""
+    return (found.parts or 0) <= (wanted.parts or 0) and (found.holes or 0) <= (wanted.holes or 0)
+
+
+def _cuts_itself(welded: MeshFile) -> bool:
+    return bool(intersecting_faces(welded.vertices, welded.faces).any())
 
 
 def true_shape(truth: MeshFile) -> Shape:
     """The parts and holes of a mesh that is the truth; unclear also where its parts cut through each other."""
     welded = weld_vertices(truth)
     shape = shape_of(welded.vertices, welded.faces)
-    if shape.parts not in (None, 1) and bool(intersecting_faces(welded.vertices, welded.faces).any()):
+    if shape.parts not in (None, 1) and _cuts_itself(welded):
         return Shape(None, None, "has parts that cut through each other")
     return shape
 
@@ -241,7 +261,8 @@ def _praise(
     if found.unclear or expected.shape.unclear:
         reason = f"the result {found.unclear}" if found.unclear else expected.shape.unclear
         return f"good on {views} views: {', '.join(said)}; parts and holes were not compared: {reason}"
-    same = f"as the {expected.of}" if expected.shown else f"as silhouettes of the {expected.of} show it"
+    unseen = f"as silhouettes of the {expected.of} show it, which has {_counted(expected.shape)}"
+    same = f"as the {expected.of}" if expected.shown else unseen
     return f"good on {views} views: {', '.join(said)}; {_counted(found)}, {same}"
 
 
