@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from etsplat.core.cameras import camera_centers
 from etsplat.data.agreement import photos_of
 from etsplat.data.dataset import Dataset
 from etsplat.data.false_handles import _BLOCKED, _cut, silhouette_errors, without_false_handles
@@ -109,6 +110,17 @@ def test_a_thin_bridge_is_cut_unless_photos_show_it(shown: SignedDistance, holes
     vertices, faces = (vertices, faces) if found is None else found
     assert genera(faces, len(vertices)) == [holes]
     assert bool((silhouette_errors(photos, vertices, faces) <= most).all())
+
+
+def test_a_thin_bridge_is_cut_where_no_photo_sees_it() -> None:
+    """Its own photos show that it is there, but those from below, which do not look in, say nothing of it."""
+    _, views = photographed(bridged)
+    below = [index for index in views.train if float(camera_centers(views.viewmats[index][None])[0, 1]) < -0.5]
+    assert len(below) >= 3
+    photos, (vertices, faces) = photos_of(replace(views, train=below)), placed(bridged, views)
+    found = _cut(photos, vertices, faces, silhouette_errors(photos, vertices, faces) + torch.tensor([0, _BLOCKED]))
+    assert found is not None
+    assert genera(found[1], len(found[0])) == [0]
 
 
 def test_a_surface_without_handles_is_left_alone() -> None:

@@ -79,7 +79,7 @@ def test_a_patch_that_photos_contradict_is_told():
 def test_a_plain_piece_is_told_where_nothing_else_is_wrong():
     assert "hollow" not in judged(plain=0.04).verdict
     verdict = judged(plain=0.139).verdict
-    assert verdict.startswith("good")
+    assert verdict.startswith("good in silhouettes alone, which show no hollow, on test views: silhouette IoU 0.990, ")
     assert verdict.endswith(
         "; hollows were not compared: 13.9 % of its surface is one plain piece, where photos do not tell a side from a"
         " lid over a hollow: look at it"

@@ -41,7 +41,7 @@ _FLAT = 0.01
 _WHOLE = 0.7
 """Share of a patch that must lie on the object for more."""
 
-_COMPARED = 3
+COMPARED = 3
 """Photos that see a vertex of a surface, from which on they are compared there."""
 
 _SMOOTH = 3
@@ -149,7 +149,7 @@ def surface_agreement(
     masks = [(photo.pixels[:, 3:] >= 0.95).float() for photo in photos]
     normals = averaged(vertex_normals(vertices, faces), edges, _SMOOTH)
     seen = seen_by(photos, hits, vertices, pixel)
-    return _ring_mean(agreement(photos, masks, vertices, normals, seen, pixel, fewest=_COMPARED), edges)
+    return _ring_mean(agreement(photos, masks, vertices, normals, seen, pixel, fewest=COMPARED), edges)
 
 
 @torch.no_grad()
@@ -196,7 +196,7 @@ def plain_share(dataset: Dataset, vertices: Float[Tensor, "V 3"], faces: Int64[T
         return 0.0
     edges = MeshTopology.from_faces(faces, len(vertices)).edges.long()
     hits = [first_hits(photo, vertices, faces) for photo in photos]
-    seen = seen_by(photos, hits, vertices, pixel_size(photos)).sum(dim=0) >= _COMPARED
+    seen = seen_by(photos, hits, vertices, pixel_size(photos)).sum(dim=0) >= COMPARED
     plain = seen & surface_agreement(photos, hits, vertices, faces, edges).isnan()
     return _largest_patch(plain, vertices, faces, edges)
 

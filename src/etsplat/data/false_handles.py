@@ -7,14 +7,15 @@ would leave a gap in some, and a true hole that is closed would block the light 
 
 A bridge between two feet that nearly touch is no such region, and one with the feet is what silhouettes need. So then
 the shortest loops that bound no disc are looked at: what is as thin as a few edges, or a hole as narrow, is cut there
-and closed by two discs, if photos contradict each other along the loop and no silhouette needs it.
+and closed by two discs, if photos contradict each other along the loop, or too few see it to say, and no silhouette
+needs it.
 """
 
 import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from etsplat.data.agreement import Photo, first_hits, photos_of, surface_agreement
+from etsplat.data.agreement import COMPARED, Photo, first_hits, photos_of, pixel_size, seen_by, surface_agreement
 from etsplat.data.dataset import Dataset
 from etsplat.data.visual_hull import without_specks
 from etsplat.geometry.discs import with_discs
@@ -74,14 +75,15 @@ def _cut(photos: list[Photo], vertices: Tensor, faces: Tensor, most: Tensor) -> 
     before = genera(faces, len(vertices))
     if not any(before):
         return None
-    score = _agreement(photos, vertices, faces)
+    score, hidden = _agreement(photos, vertices, faces)
     tried = torch.zeros(len(vertices), dtype=torch.bool)
     for loop in short_loops(vertices, faces):
         if len(loop) > _THIN or 2 * int(tried[loop].sum()) > len(loop):
             continue
         band = torch.isin(faces, torch.tensor(loop)).any(dim=1)
         tried[faces[band]] = True
-        if not float(score[faces[band].unique()].nanmean()) < _LEVELS[-1]:
+        around = faces[band].unique()
+        if not (float(hidden[around].float().mean()) > 0.5 or float(score[around].nanmean()) < _LEVELS[-1]):
             continue
         found = without_specks(*with_discs(vertices, faces, band))
         after = genera(found[1], len(found[0]))
@@ -92,10 +94,12 @@ def _cut(photos: list[Photo], vertices: Tensor, faces: Tensor, most: Tensor) -> 
     return None
 
 
-def _agreement(photos: list[Photo], vertices: Tensor, faces: Tensor) -> Float[Tensor, " V"]:
-    """How far photos agree at the vertices; NaN where it is not known."""
+def _agreement(photos: list[Photo], vertices: Tensor, faces: Tensor) -> tuple[Float[Tensor, " V"], Bool[Tensor, " V"]]:
+    """How far photos agree at the vertices, NaN where it is not known; and which of them too few see."""
     edges = MeshTopology.from_faces(faces, len(vertices)).edges.long()
-    return surface_agreement(photos, [first_hits(photo, vertices, faces) for photo in photos], vertices, faces, edges)
+    hits = [first_hits(photo, vertices, faces) for photo in photos]
+    seen = seen_by(photos, hits, vertices, pixel_size(photos)).sum(dim=0)
+    return surface_agreement(photos, hits, vertices, faces, edges), seen < COMPARED
 
 
 def _simpler(
@@ -105,7 +109,7 @@ def _simpler(
     before = genera(faces, len(vertices))
     if not any(before):
         return None
-    score = _agreement(photos, vertices, faces)
+    score, _ = _agreement(photos, vertices, faces)
     low, unseen = score < level, score.isnan()
     # Of most posts photos see one side. With the other they are handles, but what is not seen may join several.
     regions = _regions(faces, low[faces].all(dim=1))

@@ -27,8 +27,8 @@ _FIRST_CELLS, _MOST_CELLS = 48, 160
 _TRIES = 3
 """Grids that are tried, to come near the number of faces that is wanted."""
 
-_NEAR = 0.15
-"""How near, as a fraction of it."""
+NEAR = 0.15
+"""How near, as a fraction of it, unless the object is too thin for any grid."""
 
 _SPECK = 0.02
 """Parts with fewer faces than this fraction of the largest are dropped: dents of rough masks leave them."""
@@ -74,7 +74,7 @@ def visual_hull(
         corner = -0.5 * cell * cells
         lower, counts = (corner, corner, corner), (cells, cells, cells)
         vertices, triangles = dual_contour(distance, lower, cell, counts, bisections=_BISECTIONS)
-        if len(triangles) == 0 or abs(len(triangles) - faces) <= _NEAR * faces:
+        if len(triangles) == 0 or abs(len(triangles) - faces) <= NEAR * faces:
             break
         wanted = round(cells * (faces / len(triangles)) ** 0.5)
         if cells == (cells := min(max(wanted, _FIRST_CELLS // 2), _MOST_CELLS)):

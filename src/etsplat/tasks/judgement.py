@@ -78,7 +78,8 @@ class Judgement:
         expected_parts: what it should have; None, as `expected_holes`, where that is not known.
         expected_holes: what it should have.
         expected_of: "input mesh" or "visual hull"; None where neither tells.
-        verdict: a sentence that begins with "good" or "poor"; of a poor result it says what is wrong and what to try.
+        verdict: a sentence that begins with "good" or "poor"; of a poor result it says what is wrong and what to try,
+            of a good one of photos first that it is so "in silhouettes alone", where a large piece is plain.
     """
 
     views: Views
@@ -227,11 +228,11 @@ def judge(
             f"on {100 * closed:.1f} % of what photos show the result lies far in front of the input mesh, so a "
             "hollow is closed: try --init-mesh with a mesh that has it, or a texture for photos to agree on"
         )
-    praise = _praise(views, scores, intersecting_percent, found, expected)
+    praise = f"on {views} views: {_praise(scores, intersecting_percent, found, expected)}"
     if plain > PLAIN:
-        praise += (
-            f"; hollows were not compared: {100 * plain:.1f} % of its surface is one plain piece, where photos do not "
-            "tell a side from a lid over a hollow: look at it"
+        praise = (
+            f"in silhouettes alone, which show no hollow, {praise}; hollows were not compared: {100 * plain:.1f} % of "
+            "its surface is one plain piece, where photos do not tell a side from a lid over a hollow: look at it"
         )
     return Judgement(
         views=views,
@@ -243,7 +244,7 @@ def judge(
         expected_parts=expected.shape.parts,
         expected_holes=expected.shape.holes,
         expected_of=expected.of,
-        verdict=f"poor: {'; '.join(poor)}" if poor else praise,
+        verdict=f"poor: {'; '.join(poor)}" if poor else f"good {praise}",
     )
 
 
@@ -252,18 +253,16 @@ def _differ(found: Shape, expected: Shape) -> bool:
     return clear and (found.parts, found.holes) != (expected.parts, expected.holes)
 
 
-def _praise(
-    views: Views, scores: Mapping[str, float | None], intersecting_percent: float, found: Shape, expected: Expected
-) -> str:
+def _praise(scores: Mapping[str, float | None], intersecting_percent: float, found: Shape, expected: Expected) -> str:
     seen = (("silhouette IoU {:.3f}", scores["silhouette_iou"]), ("PSNR of the mesh {:.2f} dB", scores["psnr_mesh"]))
     said = [form.format(value) for form, value in seen if value is not None]
     said.append(f"{intersecting_percent:.1f} % of the faces cut through others")
     if found.unclear or expected.shape.unclear:
         reason = f"the result {found.unclear}" if found.unclear else expected.shape.unclear
-        return f"good on {views} views: {', '.join(said)}; parts and holes were not compared: {reason}"
+        return f"{', '.join(said)}; parts and holes were not compared: {reason}"
     unseen = f"as silhouettes of the {expected.of} show it, which has {_counted(expected.shape)}"
     same = f"as the {expected.of}" if expected.shown else unseen
-    return f"good on {views} views: {', '.join(said)}; {_counted(found)}, {same}"
+    return f"{', '.join(said)}; {_counted(found)}, {same}"
 
 
 def _counted(shape: Shape) -> str:

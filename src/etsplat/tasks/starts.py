@@ -16,7 +16,7 @@ from etsplat.data.hollows import open_hollows
 from etsplat.data.lids import without_lids
 from etsplat.data.plain_sides import with_flat_sides
 from etsplat.data.silhouettes import silhouette, touches_border
-from etsplat.data.visual_hull import visual_hull
+from etsplat.data.visual_hull import NEAR, visual_hull
 from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.parts import Shape, shape_of
 from etsplat.geometry.topology import MeshTopology
@@ -164,7 +164,7 @@ def make_start(
 
 @torch.no_grad()
 def plain_hull(views: Dataset, config: ReconstructConfig) -> Hull:
-    """The visual hull, with at most half of a run's faces.
+    """The visual hull, with at most half of a run's faces, or finer where thin parts of that one are broken.
 
     Args:
         views: of the unit frame.
@@ -175,14 +175,28 @@ def plain_hull(views: Dataset, config: ReconstructConfig) -> Hull:
     """
     if not views.has_masks:
         raise InputError("start.shape: hull needs masks or transparent pictures; give masks, or start from a sphere")
-    wanted = min(config.start.hull_faces, max(1, config.max_faces // 2))
-    hull = _carved(views, wanted, config.start.radius)
+    wanted, radius = min(config.start.hull_faces, max(1, config.max_faces // 2)), config.start.radius
+    hull = _carved(views, wanted, radius)
     if len(hull.faces) == 0:
         raise InputError(
             "start.shape: the masks have no point in common, so there is no hull; check that masks are white inside the"
             " object and that poses and images belong together"
         )
+    most = round(config.max_faces / (1 + NEAR))
+    while hull.uncovered > _UNCOVERED and (more := min(2 * hull.wanted, most)) > hull.wanted:
+        finer = _carved(views, more, radius)
+        if len(finer.faces) > config.max_faces or not _mends(finer, hull):
+            break
+        hull = finer
     return hull
+
+
+def _mends(finer: Hull, hull: Hull) -> bool:
+    """Whether a finer hull covers more, and has fewer parts, or more holes: thin parts of the other one are broken."""
+    whole, broken = (shape_of(each.vertices, each.faces) for each in (finer, hull))
+    if finer.uncovered > _LESS * hull.uncovered or whole.parts is None or broken.parts is None:
+        return False
+    return whole.parts < broken.parts or (whole.parts == broken.parts and (whole.holes or 0) > (broken.holes or 0))
 
 
 @torch.no_grad()
