@@ -84,6 +84,23 @@ std::shared_ptr<AntialiasState> antialias_forward(const AntialiasInput& input, f
     return state;
 }
 
+void antialias_behind(const AntialiasInput& nearest, const AntialiasInput& behind, const float* shaded, float* shaded_behind,
+                      float* color) {
+    const ShadeInput& in = behind.shading;
+    shade(in, shaded_behind);
+    copy_image(in, shaded_behind, color);
+    const int32_t channels = in.channels;
+    const int32_t* seen = nearest.shading.triangle;
+    for (const std::vector<Blend>& list : find_blends_behind(nearest, behind)) {
+        for (const Blend& blend : list) {
+            const bool both = opaque_part(seen[blend.to]) == opaque_part(seen[blend.from]);
+            const int64_t to = static_cast<int64_t>(blend.to) * channels, from = static_cast<int64_t>(blend.from) * channels;
+            const float* other = (both ? shaded_behind : shaded) + from;
+            for (int32_t c = 0; c < channels; ++c) color[to + c] += blend.weight * (other[c] - shaded_behind[to + c]);
+        }
+    }
+}
+
 void antialias_backward(const AntialiasState& state, const AntialiasInput& input, const AntialiasGradients& gradients) {
     copy_image(input.shading, gradients.color, gradients.grad_shaded);
     for (const std::vector<Blend>& list : state.blends) blend_backward(list, input.shading, gradients);

@@ -29,6 +29,10 @@ struct Blend {
 // that follow each other.
 std::vector<std::vector<Blend>> find_blends(const AntialiasInput& input);
 
+// Of the pictures without a part of the triangles each, the blends into the pixels in which one of these is the nearest
+// (`rasterize_behind`). `from` has the colour of what is behind where it is of that part, too, else that of the nearest.
+std::vector<std::vector<Blend>> find_blends_behind(const AntialiasInput& nearest, const AntialiasInput& behind);
+
 struct AntialiasState {
     std::vector<std::vector<Blend>> blends;
 };
@@ -42,6 +46,11 @@ struct AntialiasGradients {
 
 // Fills `shaded` (before antialiasing) and `color` (after).
 std::shared_ptr<AntialiasState> antialias_forward(const AntialiasInput& input, float* shaded, float* color);
+
+// What pixels show without the part of the triangles that the nearest one belongs to; where there is none, what is behind
+// all. `shaded` are the colours of the nearest triangles, before antialiasing. The mesh has no shared edges.
+void antialias_behind(const AntialiasInput& nearest, const AntialiasInput& behind, const float* shaded, float* shaded_behind,
+                      float* color);
 
 // `input` is that of the forward pass, wherever it lies now.
 void antialias_backward(const AntialiasState& state, const AntialiasInput& input, const AntialiasGradients& gradients);

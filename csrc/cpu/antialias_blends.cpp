@@ -67,36 +67,33 @@ constexpr uint8_t kMet[8][2] = {{0, 1}, {0, 2}, {0, 1}, {1, 2}, {1, 2}, {0, 1}, 
 
 constexpr uint8_t kNext[4] = {0, 1, 2, 0};  // corners, in a circle
 
+// What two neighbouring pixels see.
+struct PixelPair {
+    int32_t pixel[2], face[2];
+    float depth[2];
+};
+
 // Looks for a silhouette of the nearer triangle between two neighbouring pixels that see different ones. A processor cannot
 // guess what is found, so that both edges in question are computed, and one is chosen at the end, without branches.
 class PairSearch {
 public:
-    PairSearch(const AntialiasInput& in, const Scratch<Point>& points, const std::vector<uint8_t>& silhouettes)
-        : in_(in.shading), depth_(in.depth), points_(points), silhouettes_(silhouettes), step_{1, in.shading.camera.width} {}
+    explicit PairSearch(const AntialiasInput& in)
+        : in_(in.shading), points_(in.shading.mesh.num_vertices), step_{1, in.shading.camera.width} {
+        project_vertices(in_, points_);
+        silhouettes_ = find_silhouettes(in, points_);
+    }
 
-    // The pairs of row y that see different triangles, in their order: 2 x + axis for the pixel (x, y) and its neighbour at
-    // the right (axis 0) or below (axis 1). Returns how many.
-    int32_t different(int32_t y, int32_t* pairs) const {
-        const int32_t width = in_.camera.width;
-        const int32_t* here = in_.triangle + static_cast<int64_t>(y) * width;
-        const int32_t* below = y + 1 < in_.camera.height ? here + width : here;
-        int32_t count = 0;
-        for (int32_t x = 0; x < width; ++x) {
-            pairs[count] = 2 * x;
-            count += here[x] != here[x + 1 < width ? x + 1 : x];
-            pairs[count] = 2 * x + 1;
-            count += here[x] != below[x];
-        }
-        return count;
+    // The pixel (x, y) and its neighbour at the right (axis 0) or below (axis 1); of what both see, the pixels alone.
+    PixelPair pair(int32_t x, int32_t y, int axis) const {
+        const int32_t first = y * in_.camera.width + x;
+        return {{first, first + step_[axis]}, {-1, -1}, {0.0f, 0.0f}};
     }
 
     // Writes the blend of such a pair, if there is one, and returns how many.
-    int blend(int32_t x, int32_t y, int axis, Blend* blend) const {
+    int blend(int32_t x, int32_t y, int axis, const PixelPair& seen, Blend* blend) const {
         const int other = 1 - axis;
-        const int32_t first = y * in_.camera.width + x, pixels[2] = {first, first + step_[axis]};
-        const int32_t face[2] = {in_.triangle[pixels[0]], in_.triangle[pixels[1]]};
-        const bool forward = (face[1] < 0) | ((face[0] >= 0) & (depth_[pixels[0]] <= depth_[pixels[1]]));
-        const int32_t nearer = forward ? face[0] : face[1];
+        const bool forward = (seen.face[1] < 0) | ((seen.face[0] >= 0) & (seen.depth[0] <= seen.depth[1]));
+        const int32_t nearer = forward ? seen.face[0] : seen.face[1];
         const int silhouettes = silhouettes_[nearer];
         if (silhouettes == 0) return 0;  // of a welded mesh nearly always, of separate triangles never
         const int32_t* corner = in_.mesh.faces + 3 * static_cast<int64_t>(nearer);
@@ -112,8 +109,8 @@ public:
         const bool two = crossings[1].between & ((silhouettes >> then & 1) != 0);
         const SilhouetteBlend found = blend_of(crossings[!one], forward);
         const int edge = one ? met : then;
-        blend->to = pixels[found.into_second];
-        blend->from = pixels[!found.into_second];
+        blend->to = seen.pixel[found.into_second];
+        blend->from = seen.pixel[!found.into_second];
         blend->weight = found.weight;
         for (int end = 0; end < 2; ++end) {
             blend->vertex[end] = corner[kNext[edge + end]];
@@ -129,35 +126,90 @@ private:
     }
 
     const ShadeInput& in_;
-    const float* depth_;
-    const Scratch<Point>& points_;
-    const std::vector<uint8_t>& silhouettes_;
+    Scratch<Point> points_;
+    std::vector<uint8_t> silhouettes_;
     const int32_t step_[2];  // to the neighbour
 };
+
+// The pairs of row y that see different triangles, in their order: 2 x + axis for the pixel (x, y) and its neighbour at the
+// right (axis 0) or below (axis 1). Returns how many.
+int32_t different(const int32_t* triangle, const OpaqueCamera& camera, int32_t y, int32_t* pairs) {
+    const int32_t width = camera.width;
+    const int32_t* here = triangle + static_cast<int64_t>(y) * width;
+    const int32_t* below = y + 1 < camera.height ? here + width : here;
+    int32_t count = 0;
+    for (int32_t x = 0; x < width; ++x) {
+        pairs[count] = 2 * x;
+        count += here[x] != here[x + 1 < width ? x + 1 : x];
+        pairs[count] = 2 * x + 1;
+        count += here[x] != below[x];
+    }
+    return count;
+}
+
+// Calls row(y, list) for every row of an image, with the list of its band: bands are looked through side by side.
+template <class Item, class Row>
+std::vector<std::vector<Item>> in_bands(int32_t height, const Row& row) {
+    const int32_t bands = (height + kRows - 1) / kRows;
+    std::vector<std::vector<Item>> lists(bands);
+    parallel_for(bands, 1, [&](int64_t begin, int64_t end) {
+        for (int64_t band = begin; band < end; ++band) {
+            const auto top = static_cast<int32_t>(band) * kRows;
+            for (int32_t y = top; y < std::min(top + kRows, height); ++y) row(y, lists[band]);
+        }
+    });
+    return lists;
+}
 
 }  // namespace
 
 std::vector<std::vector<Blend>> find_blends(const AntialiasInput& in) {
-    Scratch<Point> points(in.shading.mesh.num_vertices);
-    project_vertices(in.shading, points);
-    const std::vector<uint8_t> silhouettes = find_silhouettes(in, points);
-    const PairSearch search(in, points, silhouettes);
-    const int32_t width = in.shading.camera.width, height = in.shading.camera.height, bands = (height + kRows - 1) / kRows;
-    std::vector<std::vector<Blend>> lists(bands);
-    parallel_for(bands, 1, [&](int64_t begin, int64_t end) {
-        Scratch<Blend> found(2 * int64_t{width} + 1);  // of a row, and one that is none
-        Scratch<int32_t> pairs(2 * int64_t{width} + 1);
-        for (int64_t band = begin; band < end; ++band) {
-            const auto top = static_cast<int32_t>(band) * kRows;
-            for (int32_t y = top; y < std::min(top + kRows, height); ++y) {
-                const int32_t count = search.different(y, pairs.data());
-                Blend* next = found.data();
-                for (int32_t i = 0; i < count; ++i) next += search.blend(pairs[i] / 2, y, pairs[i] % 2, next);
-                lists[band].insert(lists[band].end(), found.data(), next);
+    const PairSearch search(in);
+    const OpaqueCamera& camera = in.shading.camera;
+    return in_bands<Blend>(camera.height, [&](int32_t y, std::vector<Blend>& list) {
+        Scratch<Blend> found(2 * int64_t{camera.width} + 1);  // of a row, and one that is none
+        Scratch<int32_t> pairs(2 * int64_t{camera.width} + 1);
+        const int32_t count = different(in.shading.triangle, camera, y, pairs.data());
+        Blend* next = found.data();
+        for (int32_t i = 0; i < count; ++i) {
+            const int32_t x = pairs[i] / 2, axis = pairs[i] % 2;
+            PixelPair seen = search.pair(x, y, axis);
+            for (int k = 0; k < 2; ++k) {
+                seen.face[k] = in.shading.triangle[seen.pixel[k]];
+                seen.depth[k] = in.depth[seen.pixel[k]];
+            }
+            next += search.blend(x, y, axis, seen, next);
+        }
+        list.insert(list.end(), found.data(), next);
+    });
+}
+
+std::vector<std::vector<Blend>> find_blends_behind(const AntialiasInput& in, const AntialiasInput& behind) {
+    const PairSearch search(in);
+    const OpaqueCamera& camera = in.shading.camera;
+    return in_bands<Blend>(camera.height, [&](int32_t y, std::vector<Blend>& list) {
+        Scratch<Blend> found(4 * int64_t{camera.width} + 1);
+        Blend* next = found.data();
+        for (int32_t i = 0; i < 2 * camera.width; ++i) {
+            const int32_t x = i / 2, axis = i % 2;
+            if (axis == 0 ? x + 1 == camera.width : y + 1 == camera.height) continue;
+            PixelPair seen = search.pair(x, y, axis);
+            const int parts[2] = {opaque_part(in.shading.triangle[seen.pixel[0]]),
+                                  opaque_part(in.shading.triangle[seen.pixel[1]])};
+            for (int of = 0; of < (parts[0] == parts[1] ? 1 : 2); ++of) {  // the picture without that pixel's part
+                if (parts[of] < 0) continue;
+                for (int k = 0; k < 2; ++k) {
+                    const AntialiasInput& shown = parts[k] == parts[of] ? behind : in;
+                    seen.face[k] = shown.shading.triangle[seen.pixel[k]];
+                    seen.depth[k] = shown.depth[seen.pixel[k]];
+                }
+                if (seen.face[0] == seen.face[1]) continue;
+                const int blends = search.blend(x, y, axis, seen, next);
+                next += blends & (opaque_part(in.shading.triangle[next->to]) == parts[of]);
             }
         }
+        list.insert(list.end(), found.data(), next);
     });
-    return lists;
 }
 
 }  // namespace etsplat

@@ -102,6 +102,15 @@ void bind_antialias(nb::module_& m) {
             return states;
         },
         "views", "silhouettes", "shaded", "color");
+    // The same of two views, of what `rasterize_behind` found: the picture, and what it shows without parts of the mesh.
+    def_function(
+        m, "antialias_behind",
+        [](const ShadedViews& views, const Silhouettes& silhouettes, Array<float, 4> shaded, Array<float, 4> color) {
+            const AntialiasInput nearest = silhouettes.view(views, 0), behind = silhouettes.view(views, 1);
+            antialias_forward(nearest, shaded.row(0), color.row(0));
+            antialias_behind(nearest, behind, shaded.row(0), shaded.row(1), color.row(1));
+        },
+        "views", "silhouettes", "shaded", "color");
     // grad_color (B, H, W, C); shaded as above; scratch (H, W, C); then what is added to: by vertices (V, 3), colours,
     // backgrounds (B, C).
     def_function(

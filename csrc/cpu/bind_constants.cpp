@@ -4,6 +4,7 @@
 #include "math/spherical_harmonics.h"
 #include "math/tiles.h"
 #include "math/triangle.h"
+#include "rasterize_opaque.h"
 
 namespace etsplat {
 
@@ -14,6 +15,7 @@ void bind_constants(nb::module_& m) {
     m.attr("CAMERA_GRADIENTS") = kCameraGradients;
     m.attr("MOST_GPU_CHANNELS") = kMostGpuChannels;
     m.attr("MAX_SH_DEGREE") = kMaxShDegree;
+    m.attr("OPAQUE_PARTS") = kOpaqueParts;
     nb::enum_<DistortionDepth>(m, "DistortionDepth", nb::is_arithmetic())
         .value("NONE", DistortionDepth::kNone)
         .value("PLANE", DistortionDepth::kPlane)

@@ -14,7 +14,20 @@ void bind_rasterize_opaque(nb::module_& m) {
             const OpaqueMesh mesh{vertices.data(), faces.data(), vertices.size(0), faces.size(0)};
             const OpaqueCamera camera{viewmat.data(), K.data(), near_plane, static_cast<int32_t>(triangle.size(1)),
                                     static_cast<int32_t>(triangle.size(0))};
-            rasterize_opaque(mesh, camera, triangle.data(), data_or_null(barycentrics), depth.data());
+            rasterize_opaque(mesh, camera, {triangle.data(), data_or_null(barycentrics), depth.data()});
+        },
+        "vertices", "faces", "viewmat", "K", "near_plane", "triangle", "barycentrics", "depth");
+    // As above, of the nearest triangles and of those behind: triangle (2, H, W), barycentrics (2, H, W, 3), depth (2, H, W).
+    def_function(
+        m, "rasterize_behind",
+        [](Array<const float, 2> vertices, Array<const int32_t, 2> faces, Array<const float, 2> viewmat,
+           Array<const float, 2> K, float near_plane, Array<int32_t, 3> triangle, Array<float, 4> barycentrics,
+           Array<float, 3> depth) {
+            const OpaqueMesh mesh{vertices.data(), faces.data(), vertices.size(0), faces.size(0)};
+            const OpaqueCamera camera{viewmat.data(), K.data(), near_plane, static_cast<int32_t>(triangle.size(2)),
+                                    static_cast<int32_t>(triangle.size(1))};
+            rasterize_behind(mesh, camera, {triangle.row(0), barycentrics.row(0), depth.row(0)},
+                             {triangle.row(1), barycentrics.row(1), depth.row(1)});
         },
         "vertices", "faces", "viewmat", "K", "near_plane", "triangle", "barycentrics", "depth");
     // As above; turned (F,), entered and left (H, W).

@@ -14,6 +14,7 @@ void bind_antialias(nb::module_& m);
 void bind_array_scans(nb::module_& m);
 void bind_constants(nb::module_& m);
 void bind_geometry(nb::module_& m);
+void bind_halving_sums(nb::module_& m);
 void bind_mesh_energies(nb::module_& m);
 void bind_normals(nb::module_& m);
 void bind_photo_agreement(nb::module_& m);
@@ -63,6 +64,7 @@ NB_MODULE(_native, m) {
     bind_array_scans(m);
     bind_constants(m);
     bind_geometry(m);
+    bind_halving_sums(m);
     bind_mesh_energies(m);
     bind_normals(m);
     bind_photo_agreement(m);

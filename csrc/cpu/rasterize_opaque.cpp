@@ -189,6 +189,48 @@ void look_ahead(const OpaqueMesh& mesh, const Screen& screen, const int32_t* her
     }
 }
 
+// What a tile shows to its place in the images.
+void write_tile(const OpaqueMesh& mesh, const Screen& screen, const TileBuffer& tile, const OpaqueImages& to) {
+    for (int32_t y = tile.y0; y < tile.y1; ++y) {
+        const int64_t place = static_cast<int64_t>(y - tile.y0) * tile.stride - tile.x0;
+        const int64_t row = static_cast<int64_t>(y) * screen.width;
+        const int32_t* owners = tile.triangle + place;
+        int32_t known = -1;  // whose corners are at hand
+        OpaqueVertex v[3] = {};
+        for (int32_t x = tile.x0; x < tile.x1; ++x) {
+            const int32_t face = owners[x];
+            to.triangle[row + x] = face;
+            to.depth[row + x] = face < 0 ? 0.0f : 1.0f / tile.inverse_depth[place + x];
+            if (!to.barycentrics) continue;
+            look_ahead(mesh, screen, owners + x, tile.x1 - x);
+            float* b = to.barycentrics + 3 * (row + x);
+            b[0] = b[1] = b[2] = 0.0f;
+            if (face < 0) continue;
+            if (face != known) {
+                known = face;
+                const int32_t* k = mesh.faces + 3 * static_cast<int64_t>(face);
+                for (int i = 0; i < 3; ++i) v[i] = screen.vertices[k[i]];
+            }
+            opaque_barycentrics(v, x, y, b);
+        }
+    }
+}
+
+// Swaps two layers that follow each other where the second is nearer. Of equally near triangles the smaller index is.
+void bring_nearer(TileBuffer* layers, int second) {
+    TileBuffer &a = layers[second - 1], &b = layers[second];
+    const int64_t size = static_cast<int64_t>(a.y1 - a.y0) * a.stride;
+    for (int64_t i = 0; i < size; ++i) {
+        const float near = a.inverse_depth[i], other = b.inverse_depth[i];
+        const int32_t here = a.triangle[i], there = b.triangle[i];
+        const bool swaps = (other > near) | ((other == near) & (there < here));
+        a.inverse_depth[i] = swaps ? other : near;
+        b.inverse_depth[i] = swaps ? near : other;
+        a.triangle[i] = swaps ? there : here;
+        b.triangle[i] = swaps ? here : there;
+    }
+}
+
 // Adds a sample's colour to `sum` (channels).
 struct Shader {
     const OpaqueMesh& mesh;
@@ -215,33 +257,19 @@ struct Shader {
 
 }  // namespace
 
-void rasterize_opaque(const OpaqueMesh& mesh, const OpaqueCamera& camera, int32_t* triangle, float* barycentrics,
-                      float* depth) {
+void rasterize_opaque(const OpaqueMesh& mesh, const OpaqueCamera& camera, const OpaqueImages& nearest) {
     const Screen screen(mesh, camera, 1, false);
-    for_each_tile(screen, [&](const TileBuffer& tile) {
-        for (int32_t y = tile.y0; y < tile.y1; ++y) {
-            const int64_t place = static_cast<int64_t>(y - tile.y0) * tile.stride - tile.x0;
-            const int64_t row = static_cast<int64_t>(y) * screen.width;
-            const int32_t* owners = tile.triangle + place;
-            int32_t known = -1;  // whose corners are at hand
-            OpaqueVertex v[3] = {};
-            for (int32_t x = tile.x0; x < tile.x1; ++x) {
-                const int32_t face = owners[x];
-                triangle[row + x] = face;
-                depth[row + x] = face < 0 ? 0.0f : 1.0f / tile.inverse_depth[place + x];
-                if (!barycentrics) continue;
-                look_ahead(mesh, screen, owners + x, tile.x1 - x);
-                float* b = barycentrics + 3 * (row + x);
-                b[0] = b[1] = b[2] = 0.0f;
-                if (face < 0) continue;
-                if (face != known) {
-                    known = face;
-                    const int32_t* k = mesh.faces + 3 * static_cast<int64_t>(face);
-                    for (int i = 0; i < 3; ++i) v[i] = screen.vertices[k[i]];
-                }
-                opaque_barycentrics(v, x, y, b);
-            }
-        }
+    for_each_tile(screen, [&](const TileBuffer& tile) { write_tile(mesh, screen, tile, nearest); });
+}
+
+void rasterize_behind(const OpaqueMesh& mesh, const OpaqueCamera& camera, const OpaqueImages& nearest,
+                      const OpaqueImages& behind) {
+    const Screen screen(mesh, camera, 1, false);
+    for_each_tile<kOpaqueParts>(screen, opaque_part, [&](TileBuffer* parts) {
+        for (int last = kOpaqueParts - 1; last > 0; --last) bring_nearer(parts, last);  // the nearest to the first
+        for (int last = kOpaqueParts - 1; last > 1; --last) bring_nearer(parts, last);  // the next to the second
+        write_tile(mesh, screen, parts[0], nearest);
+        write_tile(mesh, screen, parts[1], behind);
     });
 }
 

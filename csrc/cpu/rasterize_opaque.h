@@ -25,10 +25,24 @@ struct OpaqueColors {
     int32_t channels;
 };
 
-// The nearest triangle of every pixel centre (-1: none), its perspective-correct barycentrics, unless that is null, and its
-// depth.
-void rasterize_opaque(const OpaqueMesh& mesh, const OpaqueCamera& camera, int32_t* triangle, float* barycentrics,
-                      float* depth);
+// What is seen at every pixel centre, (height, width, ...).
+struct OpaqueImages {
+    int32_t* triangle;    // -1: none
+    float* barycentrics;  // 3 of it, perspective-correct; or null
+    float* depth;
+};
+
+// The nearest triangle.
+void rasterize_opaque(const OpaqueMesh& mesh, const OpaqueCamera& camera, const OpaqueImages& nearest);
+
+constexpr int kOpaqueParts = 3;
+
+// Of that, or of none (-1).
+inline int opaque_part(int32_t face) { return face < 0 ? -1 : face % kOpaqueParts; }
+
+// The nearest triangle, and the nearest of the other parts, where triangles are dealt into parts.
+void rasterize_behind(const OpaqueMesh& mesh, const OpaqueCamera& camera, const OpaqueImages& nearest,
+                      const OpaqueImages& behind);
 
 // Where lines of sight through pixel centres meet a triangle first that does not turn its back, the triangle, and the nearest
 // that does, which lies behind it; -1 where either is missing. turned (num_faces,) says which do.

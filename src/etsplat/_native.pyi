@@ -70,6 +70,9 @@ def texture_detail(*, views: ShadedViews, depth: torch.Tensor, width: int, heigh
 def antialias_forward(
     *, views: ShadedViews, silhouettes: Silhouettes, shaded: torch.Tensor, color: torch.Tensor
 ) -> list[AntialiasState]: ...
+def antialias_behind(
+    *, views: ShadedViews, silhouettes: Silhouettes, shaded: torch.Tensor, color: torch.Tensor
+) -> None: ...
 def antialias_backward(
     *,
     states: Sequence[AntialiasState],
@@ -106,6 +109,8 @@ MOST_GPU_CHANNELS: int = 16
 
 MAX_SH_DEGREE: int = 3
 
+OPAQUE_PARTS: int = 3
+
 class DistortionDepth(enum.IntEnum):
     NONE = 0
 
@@ -141,6 +146,15 @@ def mark_intersecting_faces(*, tree: FaceTree, again: torch.Tensor | None, inter
 def overlapping_boxes(*, tree: FaceTree) -> numpy.typing.NDArray[numpy.int64]: ...
 def count_crossings(
     *, points: torch.Tensor, own: torch.Tensor, corners: torch.Tensor, counts: torch.Tensor
+) -> None: ...
+def add_halving_sums(
+    *,
+    face: torch.Tensor,
+    barycentrics: torch.Tensor,
+    lacking: torch.Tensor,
+    counted: torch.Tensor,
+    longest: torch.Tensor,
+    sums: torch.Tensor,
 ) -> None: ...
 def mesh_energies(
     *,
@@ -308,6 +322,17 @@ def rasterize_opaque(
     near_plane: float,
     triangle: torch.Tensor,
     barycentrics: torch.Tensor | None,
+    depth: torch.Tensor,
+) -> None: ...
+def rasterize_behind(
+    *,
+    vertices: torch.Tensor,
+    faces: torch.Tensor,
+    viewmat: torch.Tensor,
+    K: torch.Tensor,
+    near_plane: float,
+    triangle: torch.Tensor,
+    barycentrics: torch.Tensor,
     depth: torch.Tensor,
 ) -> None: ...
 def enter_and_leave(

@@ -33,12 +33,14 @@ class Engine:
         name: by which it is chosen: `with etsplat.engine(name)`.
         device: type of the devices on which it is chosen by itself, for float32; None if it never is.
         differentiates: whether it has the gradients of the rasterizer, so that one can train on it.
+        rasterize_behind: what is nearest and what is behind it (`model/behind.py`) at once; None where each is drawn.
         queued: how steps are queued on it, as `engines/cuda/steps.py` does; None where each step returns to the host.
     """
 
     name: str = "reference"
     device: str | None = None
     differentiates: bool = True
+    rasterize_behind: Any = None
     queued: Any = None
 
     @property

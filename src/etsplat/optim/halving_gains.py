@@ -10,15 +10,19 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from etsplat import _native
+from etsplat.core.validation import dense
+
 _PARTS = 4
 """Of the photos, each left out once."""
 
 _RIDGE = 1.0
 """Corrections keep to none, and those of halves to that of the whole, as if so many pixels at each corner said so."""
 
-_PRODUCTS = (0, 1, 2, 4, 5, 8)
 _SQUARE = (0, 1, 2, 1, 3, 4, 2, 4, 5)
-"""Which of the nine products of barycentrics are kept, and where each of the nine is among them."""
+"""Where each of the nine products of barycentrics is among the six that are kept."""
+
+_PRODUCTS = 6
 
 _SIZES = (0, 3, 5)
 """Which of them are squares, above 0 where there is a pixel."""
@@ -38,7 +42,7 @@ class HalvingGains:
         self._count = len(corners)
         corners = corners.detach().cpu()
         self._longest = (corners.roll(-1, dims=1) - corners).norm(dim=2).argmax(dim=1)
-        self._sums = torch.zeros(_PARTS * self._count * 2, len(_PRODUCTS) + 9)
+        self._sums = torch.zeros(_PARTS, self._count, 2, _PRODUCTS + 9)
 
     def add(
         self,
@@ -57,28 +61,22 @@ class HalvingGains:
             lacking: photo minus picture.
             counted: how much a pixel counts, from 0 to 1.
         """
-        on = face >= 0
-        face, b, lacking, counted = face[on], barycentrics[on], lacking[on], counted[on, None]
-        start = self._longest[face][:, None]
-        in_second = (b.gather(1, (start + 1) % 3) > b.gather(1, start))[:, 0]
-        row = ((photo % _PARTS) * self._count + face) * 2 + in_second
-        products = (b[:, :, None] * b[:, None, :]).flatten(1)[:, _PRODUCTS]
-        pulls = (b[:, :, None] * lacking[:, None, :]).flatten(1)
-        self._sums.index_add_(0, row, counted * torch.cat([products, pulls], dim=1))
+        pixels = {"face": face, "barycentrics": barycentrics, "lacking": lacking, "counted": counted}
+        given = {name: dense(values) for name, values in pixels.items()}
+        _native.add_halving_sums(**given, longest=self._longest, sums=self._sums[photo % _PARTS])
 
     def gains(self) -> Float[Tensor, " F"]:
         """By how much less the sum of squared differences of photos left out is for the halves, float64."""
-        sums = self._sums.reshape(_PARTS, self._count, 2, -1)
-        in_parts = (sums[..., _SIZES].sum(dim=(2, 3)) > 0).sum(dim=0)
+        in_parts = (self._sums[..., _SIZES].sum(dim=(2, 3)) > 0).sum(dim=0)
         asked = (in_parts > 1).nonzero()[:, 0]  # what a single part shows, nobody else says anything of
         gained = torch.zeros(self._count, dtype=torch.float64)
-        gained[asked] = torch.cat([_gains(sums[:, some].double()) for some in asked.split(_TOGETHER)])
+        gained[asked] = torch.cat([_gains(self._sums[:, some].double()) for some in asked.split(_TOGETHER)])
         return gained
 
 
 def _gains(sums: Float[Tensor, "R F 2 15"]) -> Float[Tensor, " F"]:
     squares = sums[..., _SQUARE].unflatten(-1, (3, 3))
-    pulls = sums[..., len(_PRODUCTS) :].unflatten(-1, (3, 3))
+    pulls = sums[..., _PRODUCTS:].unflatten(-1, (3, 3))
     ridge = _RIDGE * torch.eye(3, dtype=sums.dtype)
     known_squares, known_pulls = squares.sum(dim=0) - squares, pulls.sum(dim=0) - pulls
     whole = torch.linalg.solve(known_squares.sum(dim=2) + ridge, known_pulls.sum(dim=2))[:, :, None]

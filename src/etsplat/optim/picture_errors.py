@@ -1,29 +1,27 @@
 """Where the pictures of an opaque mesh are wrong: what each face has to answer for, and which are in the way.
 
-A face is in the way if photos are explained better by what is behind it. That is drawn without a third of the faces at
-a time, and compared in the pixels in which one of these was the nearest. All is looked at at half the size, which is
-less than a third of the work, and where a face that is right but for its outline is hardly blamed for that. Of the same
-pictures it is asked which faces photos agree to halve (`optim/halving_gains.py`).
+A face is in the way if photos are explained better by what is behind it (`model/behind.py`), in the pixels in which it
+is the nearest. All is looked at at half the size, which is less work, and where a face that is right but for its
+outline is hardly blamed for that. Of the same pictures it is asked which faces photos agree to halve
+(`optim/halving_gains.py`).
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from etsplat.core.rasterization import Rasterization
 from etsplat.data.dataset import Dataset, middles_of
 from etsplat.data.loader import View, ViewLoader
 from etsplat.data.pictures import as_float
-from etsplat.geometry.topology import MeshTopology
 from etsplat.io.images import over_background
+from etsplat.model.behind import render_with_behind
 from etsplat.model.surroundings import Surroundings
 from etsplat.model.triangle_mesh import TriangleMesh
 from etsplat.optim.exposure import Exposure
 from etsplat.optim.halving_gains import HalvingGains
-
-_PARTS = 3
-"""What is behind faces is drawn without every third one; without more at a time it would lack faces, too."""
 
 _PHOTOS = 2
 """A single photo may be explained better by many a wrong depth: so many have to show a face that is in the way."""
@@ -45,20 +43,6 @@ class FaceErrors:
     wrong: Float[Tensor, " F"]
     in_the_way: Bool[Tensor, " F"]
     gained: Float[Tensor, " F"]
-
-
-@dataclass(frozen=True)
-class _Compared:
-    """Of each pixel of a view: which face is the nearest, -1 where there is none, where in it, and what it lacks."""
-
-    face: Int[Tensor, " P"]
-    barycentrics: Float[Tensor, "P 3"]
-    lacking: Float[Tensor, "P 3"]
-    counted: Float[Tensor, " P"]
-
-    @property
-    def wrong(self) -> Float[Tensor, " P"]:
-        return self.counted * self.lacking.square().sum(dim=-1)
 
 
 class PictureErrors:
@@ -95,45 +79,40 @@ class PictureErrors:
         photos = torch.zeros(mesh.count, dtype=torch.int64)
         corners = mesh.vertices[mesh.faces]
         gains = HalvingGains(corners)
-        part = torch.arange(mesh.count) % _PARTS
-        others = [_of(mesh, (part != taken).to(corners.device)) for taken in range(_PARTS)]
         self._loader.expect(self._views)
         for number, index in enumerate(self._views):
             view = self._loader.view(index)
-            now = self._compared(mesh, view)
-            face, error = now.face, now.wrong
+            nearest, behind = render_with_behind(mesh, view.camera, self._background[None])
+            assert nearest.triangle is not None
+            assert nearest.barycentrics is not None
+            face, barycentrics = nearest.triangle.flatten().long().cpu(), nearest.barycentrics.reshape(-1, 3).cpu()
+            counted = self._counted(view)
+            lacking = self._lacking(nearest, view)
+            error, error_behind = (
+                counted * lacks.square().sum(dim=-1) for lacks in (lacking, self._lacking(behind, view))
+            )
             _add(wrong, face, error)
-            gains.add(number, face, now.barycentrics, now.lacking, now.counted)
-            for taken, rest in enumerate(others):
-                chosen = (face >= 0) & (part[face.clamp(min=0)] == taken)
-                _add(without, torch.where(chosen, face, -1), self._compared(rest, view).wrong - error)
+            _add(without, face, error_behind - error)
+            gains.add(number, face, barycentrics, lacking, counted)
             photos += torch.bincount(face[face >= 0], minlength=mesh.count) > 0
         in_the_way = (photos >= _PHOTOS) & (without < 0)
         if self._around is not None:
             in_the_way &= ~self._around.at_backdrop(corners.flatten(0, 1)).reshape(-1, 3).all(dim=1).cpu()
         return FaceErrors(wrong, in_the_way, gains.gains())
 
-    def _compared(self, mesh: TriangleMesh, view: View) -> _Compared:
-        background = self._background[None]
-        seen = mesh.render(view.camera, backgrounds=background)
-        shot = self._exposure.applied(seen, view, background) if self._exposure.learned else seen
+    def _counted(self, view: View) -> Float[Tensor, " P"]:
+        """How much each pixel counts."""
+        return (
+            torch.ones(view.photo[0, ..., 0].numel()) if view.mask is None else as_float(view.mask[0]).flatten().cpu()
+        )
+
+    def _lacking(self, seen: Rasterization, view: View) -> Float[Tensor, "P 3"]:
+        """Photo minus picture."""
+        shot = self._exposure.applied(seen, view, self._background[None]) if self._exposure.learned else seen
         photo = as_float(view.photo[0])
         if photo.shape[-1] == 4:
             photo = over_background(photo, self._background)
-        counted = torch.ones_like(photo[..., 0]) if view.mask is None else as_float(view.mask[0])
-        assert seen.triangle is not None
-        assert seen.barycentrics is not None
-        return _Compared(
-            seen.triangle[0].flatten().long().cpu(),
-            seen.barycentrics[0].reshape(-1, 3).cpu(),
-            (photo - shot.color[0]).reshape(-1, 3).cpu(),
-            counted.flatten().cpu(),
-        )
-
-
-def _of(mesh: TriangleMesh, kept: Bool[Tensor, " F"]) -> TriangleMesh:
-    """The same mesh with some of its faces."""
-    return replace(mesh, topology=MeshTopology.from_faces(mesh.faces[kept], len(mesh.vertices)))
+        return (photo - shot.color[0]).reshape(-1, 3).cpu()
 
 
 def _add(sums: Float[Tensor, " F"], face: Int[Tensor, " P"], values: Float[Tensor, " P"]) -> None:

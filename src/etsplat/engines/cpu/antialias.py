@@ -2,9 +2,11 @@
 
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from etsplat import _native
+from etsplat.core.cameras import Cameras
 from etsplat.core.connectivity import MeshConnectivity
 from etsplat.core.validation import dense
 from etsplat.engines.native.operation import differentiable
@@ -125,6 +127,50 @@ def texture_detail(
     lod = empty_image(*triangle.shape)
     _native.texture_detail(views=_corners(*given), depth=dense(depth), width=width, height=height, lod=lod)
     return lod
+
+
+def rasterize_behind(
+    vertices: Tensor,
+    colors: Tensor,
+    background: Tensor,
+    cameras: Cameras,
+    near_plane: float,
+    connectivity: MeshConnectivity,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Colours, triangles, barycentrics and depths (2, H, W, ...): of the nearest triangles and of those behind."""
+    vertices, colors = dense(vertices.detach()), dense(colors.detach())
+    backgrounds, viewmats, Ks = (
+        dense(tensor.expand(2, *tensor.shape[1:])) for tensor in (background, cameras.viewmats, cameras.Ks)
+    )
+    shape = 2, cameras.height, cameras.width
+    triangle = torch.empty(shape, dtype=torch.int32)
+    barycentrics, depth = empty_image(*shape, 3), empty_image(*shape)
+    _native.rasterize_behind(
+        vertices=vertices,
+        faces=connectivity.faces,
+        viewmat=viewmats[0],
+        K=Ks[0],
+        near_plane=near_plane,
+        triangle=triangle,
+        barycentrics=barycentrics,
+        depth=depth,
+    )
+    shaded, image = empty_image(*shape, colors.shape[1]), empty_image(*shape, colors.shape[1])
+    drawn, silhouettes = _problem(
+        vertices,
+        colors,
+        backgrounds,
+        viewmats,
+        Ks,
+        triangle,
+        barycentrics,
+        depth,
+        near_plane,
+        "vertices",
+        connectivity,
+    )
+    _native.antialias_behind(views=drawn, silhouettes=silhouettes, shaded=shaded, color=image)
+    return image, triangle, barycentrics, depth
 
 
 antialias = differentiable(_forward, _backward)

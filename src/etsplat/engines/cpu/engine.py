@@ -4,7 +4,7 @@ from contextlib import AbstractContextManager
 
 from etsplat import _native
 from etsplat.engines.cpu.adam import adam_step
-from etsplat.engines.cpu.antialias import antialias, interpolate, texture_detail
+from etsplat.engines.cpu.antialias import antialias, interpolate, rasterize_behind, texture_detail
 from etsplat.engines.cpu.losses import mean_area, mesh_energies, normal_consistency, photometric_loss
 from etsplat.engines.cpu.rasterize import CpuRender
 from etsplat.engines.cpu.rasterize_opaque import rasterize_opaque, render_opaque
@@ -38,6 +38,7 @@ class CpuEngine(NativeEngine):
     mesh_energies = staticmethod(mesh_energies)
     normal_consistency = staticmethod(normal_consistency)
     photometric_loss = staticmethod(photometric_loss)
+    rasterize_behind = staticmethod(rasterize_behind)
     rasterize_opaque = staticmethod(rasterize_opaque)
     render_opaque = staticmethod(render_opaque)
     sample_texture = staticmethod(sample_texture)
