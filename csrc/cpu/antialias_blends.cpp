@@ -204,8 +204,8 @@ std::vector<std::vector<Blend>> find_blends_behind(const AntialiasInput& in, con
                     seen.depth[k] = shown.depth[seen.pixel[k]];
                 }
                 if (seen.face[0] == seen.face[1]) continue;
-                const int blends = search.blend(x, y, axis, seen, next);
-                next += blends & (opaque_part(in.shading.triangle[next->to]) == parts[of]);
+                if (search.blend(x, y, axis, seen, next) == 0) continue;
+                next += opaque_part(in.shading.triangle[next->to]) == parts[of];
             }
         }
         list.insert(list.end(), found.data(), next);
