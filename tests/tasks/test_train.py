@@ -18,9 +18,10 @@ from etsplat.optim.loop import CheckpointEvent, DivergedError, NoteEvent, Refine
 from etsplat.optim.schedules import at
 from etsplat.optim.strategies import DensifyAndPrune
 from etsplat.optim.trainer import Trainer
+from etsplat.tasks.pixel_limits import triangle_limit
 from etsplat.tasks.soup_trainer import start_trainer
 from etsplat.tasks.train import TrainResult, train
-from etsplat.tasks.train_checks import check_train, triangle_limit
+from etsplat.tasks.train_checks import check_train
 from etsplat.tasks.train_config import TrainConfig
 from helpers.captures import small_demo_scene
 

@@ -106,17 +106,21 @@ def photos_of(dataset: Dataset) -> list[Photo]:
 
 def unseen_vertices(dataset: Dataset) -> Callable[[Tensor, Tensor], Bool[Tensor, " V"]]:
     """Of a surface (V, 3), (F, 3), on the CPU, the vertices that no training view sees, as a function of it."""
-    dataset = reduced(dataset)
-    viewmats, Ks = dataset.viewmats[dataset.train].float(), dataset.Ks[dataset.train].float()
-    sizes = [dataset.images.sizes[index] for index in dataset.train]
-    blank = [torch.zeros(1).expand(1, 4, height, width) for width, height in sizes]
-    photos = [Photo(*each) for each in zip(blank, viewmats, Ks, camera_centers(viewmats), strict=True)]
+    photos = blank_photos(reduced(dataset))
 
     def unseen(vertices: Tensor, faces: Tensor) -> Tensor:
         hits = [first_hits(photo, vertices, faces) for photo in photos]
         return ~seen_by(photos, hits, vertices, pixel_size(photos)).any(dim=0)
 
     return unseen
+
+
+def blank_photos(dataset: Dataset) -> list[Photo]:
+    """The training views as cameras alone, which show nothing."""
+    viewmats, Ks = dataset.viewmats[dataset.train].float(), dataset.Ks[dataset.train].float()
+    sizes = [dataset.images.sizes[index] for index in dataset.train]
+    blank = [torch.zeros(1).expand(1, 4, height, width) for width, height in sizes]
+    return [Photo(*each) for each in zip(blank, viewmats, Ks, camera_centers(viewmats), strict=True)]
 
 
 def pixel_size(photos: list[Photo]) -> float:

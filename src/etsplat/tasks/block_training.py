@@ -26,11 +26,11 @@ from etsplat.model.surroundings import Surroundings
 from etsplat.model.triangle_soup import FOCAL_NOTE, TriangleSoup
 from etsplat.optim.loop import DivergedError, Event, NoteEvent, Progress, StageEvent, StepEvent
 from etsplat.optim.schedules import limited_iterations
+from etsplat.tasks.pixel_limits import triangle_limit
 from etsplat.tasks.running import Job
 from etsplat.tasks.scene_part import ScenePart, in_frame, recolored
 from etsplat.tasks.scoring import Scorer
 from etsplat.tasks.soup_trainer import background_of
-from etsplat.tasks.train_checks import triangle_limit
 from etsplat.tasks.train_config import TrainConfig
 from etsplat.tasks.train_memory import bytes_around, bytes_of_values, check_memory, in_words, memory_of
 

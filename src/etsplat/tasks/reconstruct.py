@@ -52,6 +52,7 @@ from etsplat.tasks.judgement import (
     judge,
     spread,
 )
+from etsplat.tasks.pixel_limits import within_pixels
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.running import Job, Result, path_of, settings_for, terms_of
 from etsplat.tasks.scoring import Scorer, load_lpips
@@ -183,6 +184,7 @@ def reconstruct(
             form = holes if mesh.topology.is_closed() else "open where photos look onto the inner side of its surface"
             job.announce(NoteEvent(f"start: the visual hull, {mesh.count:,} faces; {form}"))
             config = nearby(config)
+        config = _fitting(config, views, mesh, job)
         trust = _trusted_depths(views, config, begun, job)
         trainer = make_trainer(mesh, views, config, scorer.cheap, trust, near=begun == "hull")
         with job.writing():  # what only the first of several workers does goes through `job.first`
@@ -203,6 +205,15 @@ def reconstruct(
             metrics = job.finish(trainer.progress, {**found, "judgement": judgement.to_dict()}, mesh.vertices)
             job.first(lambda: job.run.conclude(judgement.verdict))
     return ReconstructResult(job.run.path, metrics, mesh.to_file(frame))
+
+
+def _fitting(config: ReconstructConfig, views: Dataset, start: TriangleMesh, job: Job) -> ReconstructConfig:
+    """With no more faces and iterations than photos have pixels for; the run's length is that from here on."""
+    config, about = within_pixels(config, views, start)
+    if about is not None:
+        job.announce(NoteEvent(about))
+        job.shorten(config.iterations)
+    return config
 
 
 def _trusted_depths(views: Dataset, config: ReconstructConfig, begun: Start, job: Job) -> DepthTrust | None:

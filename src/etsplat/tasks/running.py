@@ -5,7 +5,7 @@ import hashlib
 import json
 import platform
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar
@@ -183,6 +183,11 @@ class Job(Generic[C]):
         workers().agree({**about_this(), **about, **flattened(self._record["config"])})
         if self.place.resume:
             self.first(lambda: RunDirectory.resume(self.place.path, self._record))
+
+    def shorten(self, iterations: int) -> None:
+        """Ends the run after so many iterations, which what it starts from says of it; before `writing`."""
+        self.config = replace(self.config, iterations=iterations)
+        self._record["iterations"] = iterations
 
     def measured(self) -> dict[str, Any] | None:
         """metrics.json of a run that goes on after it was done, once it is identified; None of others."""

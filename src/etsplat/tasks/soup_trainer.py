@@ -24,9 +24,9 @@ from etsplat.optim.strategies import DensifyAndPrune
 from etsplat.optim.terms.photometric import Photometric
 from etsplat.optim.terms.soup import Spared
 from etsplat.optim.trainer import Trainer
+from etsplat.tasks.pixel_limits import triangle_limit
 from etsplat.tasks.running import terms_of
 from etsplat.tasks.scene_part import ScenePart, in_frame, sphere_in_frame
-from etsplat.tasks.train_checks import triangle_limit
 from etsplat.tasks.train_config import TrainConfig
 
 LARGE_SPAN = 300.0

@@ -4,6 +4,7 @@ import torch
 
 from etsplat.core.errors import InputError
 from etsplat.data.dataset import Dataset
+from etsplat.tasks.pixel_limits import triangle_limit
 from etsplat.tasks.train_config import TrainConfig
 from etsplat.tasks.train_memory import check_memory
 
@@ -43,14 +44,6 @@ def check_train(
     if doubt := doubtful_scale(capture, config):
         notes.append(doubt)
     return notes
-
-
-def triangle_limit(capture: Dataset, config: TrainConfig) -> int:
-    """How many triangles there may be: `max_triangles`, or fewer where the training photos have few pixels."""
-    if config.pixels_per_triangle is None:
-        return config.max_triangles
-    pixels = sum(width * height for width, height in (capture.images.sizes[index] for index in capture.train))
-    return min(config.max_triangles, max(1, int(pixels / config.pixels_per_triangle)))
 
 
 def doubtful_scale(capture: Dataset, config: TrainConfig) -> str | None:

@@ -1,0 +1,48 @@
+"""How many triangles the pixels of photos carry: more learn noise by heart."""
+
+from dataclasses import replace
+
+from etsplat.data.dataset import Dataset
+from etsplat.data.surface_pixels import surface_pixels
+from etsplat.model.triangle_mesh import TriangleMesh
+from etsplat.tasks.reconstruct_config import ReconstructConfig
+from etsplat.tasks.train_config import TrainConfig
+
+
+def triangle_limit(capture: Dataset, config: TrainConfig) -> int:
+    """How many triangles there may be: `max_triangles`, or fewer where the training photos have few pixels."""
+    pixels = sum(width * height for width, height in (capture.images.sizes[index] for index in capture.train))
+    return _carried(pixels, config.pixels_per_triangle, config.max_triangles)
+
+
+def within_pixels(
+    config: ReconstructConfig, views: Dataset, start: TriangleMesh
+) -> tuple[ReconstructConfig, str | None]:
+    """The settings with no more faces than photos have pixels for, and with so much fewer iterations.
+
+    Args:
+        config: as asked for.
+        views: of which the run is.
+        start: what it starts from, whose faces stay.
+
+    Returns:
+        What the run is made with; and a sentence about it, or None if it is what was asked for.
+    """
+    if config.pixels_per_face is None:
+        return config, None
+    vertices, corners = start.surface()
+    pixels = surface_pixels(views, vertices, corners)
+    faces = max(start.count, _carried(pixels, config.pixels_per_face, config.max_faces))
+    if faces >= config.max_faces:
+        return config, None
+    iterations = max(1, round(config.iterations * faces / config.max_faces))
+    about = (
+        f"few pixels: at most {faces:,} faces, not {config.max_faces:,}, and in proportion {iterations:,} iterations, "
+        f"not {config.iterations:,} (pixels_per_face {config.pixels_per_face:g})"
+    )
+    return replace(config, max_faces=faces, iterations=iterations), about
+
+
+def _carried(pixels: float, each: float | None, most: int) -> int:
+    """So many triangles, with so many pixels for each, or any number of pixels for None."""
+    return most if each is None else min(most, max(1, int(pixels / each)))
