@@ -46,26 +46,35 @@ int32_t lower(float x) {
 }
 int32_t nearest(float x) { return static_cast<int32_t>((x + 12582912.0f) - 12582912.0f); }  // 1.5 x 2^23
 
-// The colour at a place, 0 beyond the picture, and whether the nearest pixel counts.
-void look_up(const AskedPhoto& photo, float x, float y, float out[4]) {
-    const int32_t width = photo.width, height = photo.height;
-    out[0] = out[1] = out[2] = out[3] = 0.0f;
-    if (!(x > -1.0f && x < static_cast<float>(width) && y > -1.0f && y < static_cast<float>(height))) return;
-    const int32_t left = lower(x), top = lower(y);
-    const float right = x - static_cast<float>(left), below = y - static_cast<float>(top);
-    const int64_t plane = static_cast<int64_t>(width) * height;
-    const auto add = [&](int32_t column, int32_t row, float weight) {
-        if (column < 0 || column >= width || row < 0 || row >= height) return;
-        const float* pixel = photo.pixels + static_cast<int64_t>(row) * width + column;
-        for (int32_t c = 0; c < 3; ++c) out[c] += weight * pixel[c * plane];
-    };
-    add(left, top, (1.0f - right) * (1.0f - below));
-    add(left + 1, top, right * (1.0f - below));
-    add(left, top + 1, (1.0f - right) * below);
-    add(left + 1, top + 1, right * below);
+// Whether the pixel nearest to a place counts; 0 beyond the picture.
+float counts(const AskedPhoto& photo, float x, float y) {
     const int32_t column = nearest(x), row = nearest(y);
-    if (column < 0 || column >= width || row < 0 || row >= height) return;
-    out[3] = photo.mask[static_cast<int64_t>(row) * width + column];
+    if (column < 0 || column >= photo.width || row < 0 || row >= photo.height) return 0.0f;
+    return photo.mask[static_cast<int64_t>(row) * photo.width + column];
+}
+
+// The colour at a place less than a pixel beyond the picture at most, where there is black.
+void look_up(const AskedPhoto& photo, float x, float y, float out[3]) {
+    const int32_t width = photo.width, height = photo.height, left = lower(x), top = lower(y);
+    const float right = x - static_cast<float>(left), below = y - static_cast<float>(top);
+    const float weights[4] = {(1.0f - right) * (1.0f - below), right * (1.0f - below), (1.0f - right) * below,
+                              right * below};
+    const int64_t plane = static_cast<int64_t>(width) * height;
+    if (left >= 0 && left + 1 < width && top >= 0 && top + 1 < height) {
+        const float* pixel = photo.pixels + static_cast<int64_t>(top) * width + left;
+        for (int32_t c = 0; c < 3; ++c, pixel += plane) {
+            out[c] = weights[0] * pixel[0] + weights[1] * pixel[1] + weights[2] * pixel[width] +
+                     weights[3] * pixel[width + 1];
+        }
+        return;
+    }
+    out[0] = out[1] = out[2] = 0.0f;
+    for (int32_t k = 0; k < 4; ++k) {
+        const int32_t column = left + k % 2, row = top + k / 2;
+        if (column < 0 || column >= width || row < 0 || row >= height) continue;
+        const float* pixel = photo.pixels + static_cast<int64_t>(row) * width + column;
+        for (int32_t c = 0; c < 3; ++c) out[c] += weights[k] * pixel[c * plane];
+    }
 }
 
 class Agreement {
@@ -75,7 +84,18 @@ public:
           rules_(rules),
           count_(rules.patch * rules.patch),
           size_((4 * count_ + kLanes - 1) / kLanes * kLanes),
-          patches_(static_cast<size_t>(rules.asked) * size_) {}
+          patches_(static_cast<size_t>(rules.asked) * size_),
+          along_(static_cast<size_t>(size_) / 4),
+          down_(along_.size()),
+          x_(along_.size()),
+          y_(along_.size()),
+          mask_(along_.size()) {
+        const float first = -0.5f * static_cast<float>(rules.patch - 1);
+        for (int32_t i = 0; i < count_; ++i) {
+            along_[i] = rules.pixel * (first + static_cast<float>(i % rules.patch));
+            down_[i] = rules.pixel * (first + static_cast<float>(i / rules.patch));
+        }
+    }
 
     float at(Vec point, Vec normal, const bool* seen, int64_t stride) {
         choose(point, normal, seen, stride);
@@ -119,33 +139,22 @@ private:
     }
 
     // What a photo shows around a point, its mean taken away and of length 1; whether that can be compared.
-    bool look(const AskedPhoto& photo, Vec point, Vec normal, float* out) const {
-        const Vec across = std::abs(normal.x) < 0.7f ? Vec{1.0f, 0.0f, 0.0f} : Vec{0.0f, 1.0f, 0.0f};
-        const Vec u = normalized(cross(normal, across)), v = cross(normal, u);
-        const Vec middle = projected(photo, point, 1.0f);
-        const Vec du = projected(photo, u, 0.0f), dv = projected(photo, v, 0.0f);
-        const float first = -0.5f * static_cast<float>(rules_.patch - 1);
-        float sum[4] = {};
-        for (int32_t row = 0; row < rules_.patch; ++row) {
-            const Vec start = middle + rules_.pixel * (first + static_cast<float>(row)) * dv;
-            for (int32_t column = 0; column < rules_.patch; ++column) {
-                const Vec h = start + rules_.pixel * (first + static_cast<float>(column)) * du;
-                float* pixel = out + 4 * (row * rules_.patch + column);
-                if (h.z > 0.0f) {
-                    look_up(photo, h.x / h.z - 0.5f, h.y / h.z - 0.5f, pixel);
-                } else {
-                    std::fill(pixel, pixel + 4, 0.0f);
-                }
-                for (int32_t c = 0; c < 3; ++c) sum[c] += pixel[3] * pixel[c];
-                sum[3] += pixel[3];
-            }
-        }
-        const float counted = sum[3];
+    bool look(const AskedPhoto& photo, Vec point, Vec normal, float* out) {
+        place(photo, point, normal);
+        float counted = 0.0f;
+        for (int32_t i = 0; i < count_; ++i) counted += mask_[i] = counts(photo, x_[i], y_[i]);
         if (!(counted > rules_.whole * static_cast<float>(count_))) return false;
-        for (float& mean : sum) mean /= std::max(counted, 1.0f);
+        float mean[3] = {};
+        for (int32_t i = 0; i < count_; ++i) {
+            if (mask_[i] == 0.0f) continue;
+            float* pixel = out + 4 * i;
+            look_up(photo, x_[i], y_[i], pixel);
+            for (int32_t c = 0; c < 3; ++c) mean[c] += mask_[i] * pixel[c];
+        }
+        for (float& sum : mean) sum /= std::max(counted, 1.0f);
         for (int32_t i = 0; i < count_; ++i) {
             float* pixel = out + 4 * i;
-            for (int32_t c = 0; c < 3; ++c) pixel[c] = pixel[3] * (pixel[c] - sum[c]);
+            for (int32_t c = 0; c < 3; ++c) pixel[c] = mask_[i] == 0.0f ? 0.0f : mask_[i] * (pixel[c] - mean[c]);
             pixel[3] = 0.0f;
         }
         std::fill(out + 4 * count_, out + size_, 0.0f);
@@ -155,10 +164,31 @@ private:
         return true;
     }
 
+    // Where a photo shows the pixels of the patch around a point; what it does not show is put beside its corner.
+    void place(const AskedPhoto& photo, Vec point, Vec normal) {
+        const Vec across = std::abs(normal.x) < 0.7f ? Vec{1.0f, 0.0f, 0.0f} : Vec{0.0f, 1.0f, 0.0f};
+        const Vec u = normalized(cross(normal, across)), v = cross(normal, u);
+        const Vec middle = projected(photo, point, 1.0f);
+        const Vec du = projected(photo, u, 0.0f), dv = projected(photo, v, 0.0f);
+        const auto width = static_cast<float>(photo.width), height = static_cast<float>(photo.height);
+        const float *along = along_.data(), *down = down_.data();
+        float *xs = x_.data(), *ys = y_.data();
+        for (size_t i = 0; i < x_.size(); ++i) {
+            const float z = middle.z + down[i] * dv.z + along[i] * du.z;
+            const float x = (middle.x + down[i] * dv.x + along[i] * du.x) / z - 0.5f;
+            const float y = (middle.y + down[i] * dv.y + along[i] * du.y) / z - 0.5f;
+            const bool shown = (z > 0.0f) & (x > -1.0f) & (x < width) & (y > -1.0f) & (y < height);
+            xs[i] = shown ? x : -2.0f;
+            ys[i] = shown ? y : -2.0f;
+        }
+    }
+
     const std::vector<AskedPhoto>& photos_;
     const AgreementRules& rules_;
     int32_t count_, size_;  // pixels and floats of a patch
     std::vector<float> patches_;
+    // Of each pixel of a patch: how far from its middle, where a photo shows it, and whether it counts there.
+    std::vector<float> along_, down_, x_, y_, mask_;
     std::vector<Choice> choices_;
     std::vector<float> correlations_;
 };

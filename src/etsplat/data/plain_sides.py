@@ -97,19 +97,18 @@ def _needed(
     length = float((vertices[edges[:, 0]] - vertices[edges[:, 1]]).norm(dim=1).mean())
     outlines = [_Outline(photo, view, vertices) for photo, view in zip(photos, views, strict=True)]
     sharpness = ((vertices - _between(vertices, edges, _ROUND)) * normals).sum(dim=1)
-    order = torch.argsort(torch.where(free, sharpness, torch.inf), descending=True, stable=True).tolist()
     reach = _REACH * length / pixel_size(photos)
-    fixed, needed = (~free).tolist(), ~torch.stack([outline.touched for outline in outlines]).any(dim=0)
-    touching = [[] for _ in range(len(vertices))]
-    for number, outline in enumerate(outlines):
-        for vertex in outline.touched.nonzero()[:, 0].tolist():
-            touching[vertex].append(number)
-    for vertex in order:
-        at = touching[vertex]
-        if fixed[vertex] or any(outlines[number].bare(vertex) for number in at):
+    touched = torch.stack([outline.touched for outline in outlines])
+    for outline in outlines:
+        outline.cover((outline.touched & ~free).nonzero()[:, 0].numpy(), reach)
+    needed = ~free | ~touched.any(dim=0)
+    asked = (free & ~needed).nonzero()[:, 0]
+    for vertex in asked[torch.argsort(sharpness[asked], descending=True, stable=True)].tolist():
+        at = [outlines[number] for number in touched[:, vertex].nonzero()[:, 0].tolist()]
+        if any(outline.bare(vertex) for outline in at):
             needed[vertex] = True
-            for number in at:
-                outlines[number].cover(vertex, reach)
+            for outline in at:
+                outline.cover(np.array([vertex]), reach)
     return needed
 
 
@@ -126,27 +125,30 @@ class _Outline:
         slope = torch.stack(torch.gradient(view.distance[0, 0]))
         self._across = torch.nn.functional.normalize(slope, dim=0).numpy()
 
-    def _around(self, vertex: int, reach: float) -> tuple[tuple[slice, slice], np.ndarray]:
-        """A window of pixels, and which of them are near the vertex and run along the outline there."""
-        x, y = self._at[vertex]
+    def _near(self, vertices: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
+        """Rows and columns of the pixels that are near some vertices and run along the outline as it does there."""
+        x, y = self._at[vertices].astype(np.float64).T
         height, width = self._bare.shape
-        rows = slice(max(0, int(y - reach)), min(height, int(y + reach) + 1))
-        columns = slice(max(0, int(x - reach)), min(width, int(x + reach) + 1))
-        row, column = min(max(int(y), 0), height - 1), min(max(int(x), 0), width - 1)
-        along = np.tensordot(self._across[:, row, column], self._across[:, rows, columns], 1) > _ALIKE
-        i, j = np.ogrid[rows, columns]
-        return (rows, columns), along & ((i + 0.5 - y) ** 2 + (j + 0.5 - x) ** 2 <= reach**2)
+        span = np.arange(int(2 * reach) + 2)
+        rows, columns = (np.floor(at - reach).astype(np.int64)[:, None] + span for at in (y, x))
+        down, right = rows + 0.5 - y[:, None], columns + 0.5 - x[:, None]
+        near = down[:, :, None] ** 2 + right[:, None] ** 2 <= reach**2
+        near &= ((rows >= 0) & (rows < height))[:, :, None] & ((columns >= 0) & (columns < width))[:, None]
+        vertex, a, b = near.nonzero()
+        row, column = rows[vertex, a], columns[vertex, b]
+        here = [np.clip(at.astype(np.int64), 0, size - 1)[vertex] for at, size in ((y, height), (x, width))]
+        alike = sum(slope[row, column] * slope[here[0], here[1]] for slope in self._across) > _ALIKE
+        return row[alike], column[alike]
 
     def bare(self, vertex: int) -> bool:
         """Whether no vertex that stays holds the outline here."""
-        window, near = self._around(vertex, _OUTLINE)
-        outline = self._outline[window] & near
-        return bool(2 * (self._bare[window] & outline).sum() > outline.sum())
+        near = self._near(np.array([vertex]), _OUTLINE)
+        outline = self._outline[near]
+        return bool(2 * (self._bare[near] & outline).sum() > outline.sum())
 
-    def cover(self, vertex: int, reach: float) -> None:
-        """The vertex stays."""
-        window, near = self._around(vertex, reach)
-        self._bare[window] &= ~near
+    def cover(self, vertices: np.ndarray, reach: float) -> None:
+        """These stay."""
+        self._bare[self._near(vertices, reach)] = False
 
 
 def _held(free: Bool[Tensor, " V"], edges: Int64[Tensor, "E 2"]) -> Bool[Tensor, " V"]:
