@@ -146,11 +146,13 @@ def _comparison(view: TestView, kind: str) -> str:
 
 
 def _picture(path: Path) -> str:
-    image = load_rgb(path)
-    image.thumbnail((MAX_PICTURE, MAX_PICTURE), Image.Resampling.LANCZOS)
-    buffer = io.BytesIO()
-    image.save(buffer, "PNG", optimize=True)
-    return "data:image/png;base64," + in_base64(buffer.getvalue())
+    image, encoded = load_rgb(path), path.read_bytes()
+    if max(image.size) > MAX_PICTURE:
+        image.thumbnail((MAX_PICTURE, MAX_PICTURE), Image.Resampling.LANCZOS)
+        buffer = io.BytesIO()
+        image.save(buffer, "PNG")
+        encoded = buffer.getvalue()
+    return "data:image/png;base64," + in_base64(encoded)
 
 
 def _curves_section(run: Run) -> str:
