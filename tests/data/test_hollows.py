@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from etsplat.data.agreement import contradicted, first_hits, photos_of, plain_share
+from etsplat.data.agreement import contradicted, first_hits, looked_at, photos_of, plain_share
 from etsplat.data.closed_hollows import closed_hollows
 from etsplat.data.hollows import _mistaken, _where_agreed, _without_unseen, open_hollows
 from etsplat.data.meshing import dual_contour
@@ -87,7 +87,7 @@ def bowl():
 
 
 def contradicted_of(views, vertices, faces):
-    return contradicted(views, vertices, faces, mean_colors(views, vertices, faces))
+    return contradicted(looked_at(views, vertices, faces), mean_colors(views, vertices, faces))
 
 
 def inner(views, vertices):
@@ -159,9 +159,9 @@ def test_where_there_is_no_texture_nothing_moves(bowl):
     _, _, views = pictures_of(BOWL, painted=False)
     hull, triangles = visual_hull(views, 400)
     assert open_hollows(views, hull, triangles).moved == 0
-    assert plain_share(views, hull, triangles) > 0.8
+    assert plain_share(looked_at(views, hull, triangles)) > 0.8
     _, _, views, painted, _ = bowl
-    assert plain_share(views, *painted) < 0.01
+    assert plain_share(looked_at(views, *painted)) < 0.01
 
 
 def cage(places: np.ndarray) -> np.ndarray:

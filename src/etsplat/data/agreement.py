@@ -6,7 +6,7 @@ is known.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int64
@@ -156,53 +156,79 @@ def surface_agreement(
     return _ring_mean(agreement(photos, masks, vertices, normals, seen, pixel, fewest=COMPARED), edges)
 
 
+class Looked(NamedTuple):
+    """A surface as photos see it, for what is asked of it.
+
+    Attributes:
+        photos: all that look.
+        vertices: (V, 3).
+        faces: (F, 3).
+        topology: of them.
+        hits: of each photo, from `first_hits`.
+        score: (V,) from `surface_agreement`.
+    """
+
+    photos: list[Photo]
+    vertices: Tensor
+    faces: Tensor
+    topology: MeshTopology
+    hits: list[tuple[Tensor, Tensor]]
+    score: Tensor
+
+
 @torch.no_grad()
-def contradicted(
-    dataset: Dataset, vertices: Float[Tensor, "V 3"], faces: Int64[Tensor, "F 3"], colors: Float[Tensor, "F 3"]
-) -> float:
-    """As `contradicted_share`, of a surface whose colours were fitted to the photos of a dataset.
+def looked_at(dataset: Dataset, vertices: Float[Tensor, "V 3"], faces: Int64[Tensor, "F 3"]) -> Looked | None:
+    """What photos see of a surface; None where there are not two photos, or nothing to see.
+
+    Args:
+        dataset: photos with alpha around it.
+        vertices: (V, 3).
+        faces: (F, 3).
+    """
+    photos = photos_of(dataset)
+    if len(photos) < 2 or len(vertices) == 0:
+        return None
+    topology = MeshTopology.from_faces(faces, len(vertices))
+    hits = [first_hits(photo, vertices, faces) for photo in photos]
+    score = surface_agreement(photos, hits, vertices, faces, topology.edges.long())
+    return Looked(photos, vertices, faces, topology, hits, score)
+
+
+@torch.no_grad()
+def contradicted(looked: Looked | None, colors: Float[Tensor, "F 3"]) -> float:
+    """As `contradicted_share`, of a surface whose colours were fitted to the photos.
 
     Where the photos do not correlate and yet the colours explain them, what they show there is noise: a plain surface
     is no lid. 0 where there are no photos.
 
     Args:
-        dataset: photos with alpha around it.
-        vertices: (V, 3).
-        faces: (F, 3).
+        looked: from `looked_at`.
         colors: (F, 3) in [0, 1].
     """
-    photos = photos_of(dataset)
-    if len(photos) < 2 or len(vertices) == 0:
+    if looked is None:
         return 0.0
-    topology = MeshTopology.from_faces(faces, len(vertices))
-    edges = topology.edges.long()
-    hits = [first_hits(photo, vertices, faces) for photo in photos]
-    score = surface_agreement(photos, hits, vertices, faces, edges)
+    photos, vertices, faces, topology, hits, score = looked
     sums = torch.stack([differences(photo, hit, [hit], colors) for photo, (_, hit) in zip(photos, hits, strict=True)])
     wrong = per_pixel(sums.sum(dim=0), topology.face_pairs.long())[:, 0]
     usual = wrong[wrong > 0].median() if bool((wrong > 0).any()) else wrong.new_zeros(())
-    return contradicted_share(score, vertices, faces, edges, wrong > torch.maximum(_UNUSUAL * usual, usual + _WRONG))
+    unlike = wrong > torch.maximum(_UNUSUAL * usual, usual + _WRONG)
+    return contradicted_share(score, vertices, faces, topology.edges.long(), unlike)
 
 
 @torch.no_grad()
-def plain_share(dataset: Dataset, vertices: Float[Tensor, "V 3"], faces: Int64[Tensor, "F 3"]) -> float:
+def plain_share(looked: Looked | None) -> float:
     """The largest patch that photos see and on which they show nothing to compare, as a fraction of a surface's area.
 
     What lies there outlines alone say, and no outline shows a hollow. 0 where there are no photos.
 
     Args:
-        dataset: photos with alpha around it.
-        vertices: (V, 3).
-        faces: (F, 3).
+        looked: from `looked_at`.
     """
-    photos = photos_of(dataset)
-    if len(photos) < 2 or len(vertices) == 0:
+    if looked is None:
         return 0.0
-    edges = MeshTopology.from_faces(faces, len(vertices)).edges.long()
-    hits = [first_hits(photo, vertices, faces) for photo in photos]
+    photos, vertices, faces, topology, hits, score = looked
     seen = seen_by(photos, hits, vertices, pixel_size(photos)).sum(dim=0) >= COMPARED
-    plain = seen & surface_agreement(photos, hits, vertices, faces, edges).isnan()
-    return _largest_patch(plain, vertices, faces, edges)
+    return _largest_patch(seen & score.isnan(), vertices, faces, topology.edges.long())
 
 
 def contradicted_share(

@@ -9,7 +9,7 @@ from typing import Any
 
 from etsplat.core.errors import InputError
 from etsplat.core.workers import together
-from etsplat.data.agreement import contradicted, plain_share, unseen_vertices
+from etsplat.data.agreement import contradicted, looked_at, plain_share, unseen_vertices
 from etsplat.data.closed_hollows import closed_hollows
 from etsplat.data.cut_off import cut_off
 from etsplat.data.dataset import Dataset
@@ -267,6 +267,8 @@ def _judge(
     """
     found = shape_of(*mesh.surface())
     doubtful, hull = started.contradicted > CONTRADICTED, started.hull
+    may_be_plain = truth is None and views.has_masks
+    looked = looked_at(views, *mesh.surface()) if doubtful or may_be_plain else None
     if truth is not None:
         expected = expect_mesh(truth, views, found, config.start.radius)
     elif hull is not None:
@@ -279,10 +281,10 @@ def _judge(
         100 * scores["self_intersections"] / mesh.count,
         found,
         expected,
-        contradicted=contradicted(views, *mesh.surface(), mesh.display_face_colors.cpu()) if doubtful else 0.0,
+        contradicted=contradicted(looked, mesh.display_face_colors.cpu()) if doubtful else 0.0,
         cut_off=0.0 if hull is None else cut_off(views, hull.vertices, hull.faces),
         closed=0.0 if truth is None else closed_hollows(views, (truth.vertices, truth.faces), mesh.surface()),
-        plain=plain_share(views, *mesh.surface()) if truth is None and views.has_masks else 0.0,
+        plain=plain_share(looked) if may_be_plain else 0.0,
         begun=started.kind,
         preset=config.preset,
         untangled=config.refinement.untanglings > 0,
