@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 
 import pytest
@@ -26,6 +27,7 @@ from benchmarks import (
     opaque_mesh,
     peers,
     rasterizer,
+    reconstruct_stages,
     scenes,
     tables,
     workers,
@@ -302,3 +304,15 @@ def test_peers_that_draw_another_picture_are_refused(monkeypatch):
     monkeypatch.setitem(peers.PEERS, "mitsuba", lambda given, threads: grey)
     with pytest.raises(SystemExit, match="mitsuba drew another picture"):
         peers.main(["--peers", "mitsuba", "--level", "1", "--size", "32", "--turns", "1", "--warm", "0"])
+
+
+def test_stages_of_a_run_exist_and_each_second_is_counted_once(monkeypatch):
+    for name in chain.from_iterable(reconstruct_stages.STAGES.values()):
+        owner, attribute = reconstruct_stages.place_of(name)
+        assert callable(getattr(owner, attribute)), name
+    now = iter([0.0, 1.0, 3.0, 7.0])
+    monkeypatch.setattr("time.process_time", lambda: next(now))
+    clock = reconstruct_stages.StageClock()
+    clock.timed("steps", clock.timed("guard", lambda: None))()
+    assert clock.seconds["steps"] == 5.0
+    assert clock.seconds["guard"] == 2.0
