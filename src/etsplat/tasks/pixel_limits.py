@@ -8,6 +8,9 @@ from etsplat.model.triangle_mesh import TriangleMesh
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.train_config import TrainConfig
 
+_FEWEST = 5000
+"""Iterations that are left of a run that had more: shapes and outlines need them however few the faces are."""
+
 
 def triangle_limit(capture: Dataset, config: TrainConfig) -> int:
     """How many triangles there may be: `max_triangles`, or fewer where the training photos have few pixels."""
@@ -18,7 +21,7 @@ def triangle_limit(capture: Dataset, config: TrainConfig) -> int:
 def within_pixels(
     config: ReconstructConfig, views: Dataset, start: TriangleMesh
 ) -> tuple[ReconstructConfig, str | None]:
-    """The settings with no more faces than photos have pixels for, and with so much fewer iterations.
+    """The settings with no more faces than photos have pixels for, and of long runs with fewer iterations.
 
     Args:
         config: as asked for.
@@ -35,11 +38,11 @@ def within_pixels(
     faces = max(start.count, _carried(pixels, config.pixels_per_face, config.max_faces))
     if faces >= config.max_faces:
         return config, None
-    iterations = max(1, round(config.iterations * faces / config.max_faces))
-    about = (
-        f"few pixels: at most {faces:,} faces, not {config.max_faces:,}, and in proportion {iterations:,} iterations, "
-        f"not {config.iterations:,} (pixels_per_face {config.pixels_per_face:g})"
-    )
+    shorter = max(_FEWEST, round(config.iterations * faces / config.max_faces))
+    iterations = min(config.iterations, shorter)
+    steps = f", and {iterations:,} iterations, not {config.iterations:,}" if iterations < config.iterations else ""
+    setting = f"pixels_per_face {config.pixels_per_face:g}"
+    about = f"few pixels: at most {faces:,} faces, not {config.max_faces:,}{steps} ({setting})"
     return replace(config, max_faces=faces, iterations=iterations), about
 
 

@@ -214,14 +214,14 @@ class ReconstructConfig(Settings):
     or the name of one of your own, with --kernel-file.
     Opaque triangles with antialiased silhouettes: raster-face or raster-vertex (a colour per face or per vertex)."""
     iterations: Annotated[int, Range(1)] = 30_000
-    """Optimization steps; in proportion fewer where photos carry fewer faces (`pixels_per_face`)."""
+    """Optimization steps; of more than 5,000, fewer where photos carry fewer faces (`pixels_per_face`)."""
     resolution: Annotated[int, Range(1, 8192)] = 1024
     """Side of the pictures taken of a mesh, in pixels; wider images of a scene are scaled down to this width."""
     max_faces: Annotated[int, Range(1)] = 100_000
     """Subdivision stops here, or earlier where photos are small."""
     pixels_per_face: Annotated[float | None, Range(0.01), Rare] = 3.5
     """Subdivision stops where there is a face for so many pixels of the surface, as the photos show it largest.
-    Smaller faces learn noise. None for `max_faces` and all iterations whatever the photos."""
+    Smaller ones learn noise. Iterations beyond 5,000 are in proportion fewer. None for all of both in any case."""
     texture: Annotated[int | None, TEXELS] = None
     """Make a light mesh too, textured.glb: few faces under a texture with so many texels along each side, say 2048.
     It is what `etsplat export --texture` makes of a run. Needs pip install 'etsplat[texture]'."""
