@@ -33,7 +33,7 @@ RATE, FINAL = 0.02, 0.02
 of how often each is seen while cameras move; and what is left of that at the end. Lenses, which every step shows, move
 no faster than the root of the number of photos times that in an epoch."""
 
-BEGIN, JUDGED, END = 0.1, 0.3, 0.7
+BEGIN, JUDGED, END = 0.05, 0.3, 0.9
 """When cameras begin to move, when it is judged whether that does good, and when they rest again; parts of a run."""
 
 SEEN = 5
