@@ -110,3 +110,13 @@ def test_arguments_out_of_range_are_refused_by_name(odd, text):
     both = {"vertices": points, "faces": faces, "true_vertices": points, "true_faces": faces, "samples": 20}
     with pytest.raises(ValueError, match=text):
         geometry_metrics(**{**both, **odd})
+
+
+def test_a_true_surface_of_an_earlier_pair_is_not_sampled_again() -> None:
+    vertices, faces = icosphere(2)
+    first, truth = sample_pair(vertices, faces, 1.1 * vertices, faces, 500)
+    again, same = sample_pair(0.9 * vertices, faces, 1.1 * vertices, faces, 500, truth=truth)
+    alone = sample_pair(0.9 * vertices, faces, 1.1 * vertices, faces, 500)
+    assert same is truth
+    assert not torch.equal(first.points, again.points)
+    assert chamfer(again, same) == chamfer(*alone)

@@ -7,6 +7,7 @@ Chamfer distances squared and summed over both directions; multiply by 1000 to c
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -64,6 +65,11 @@ class Surface:
     faces: Int[Tensor, "F 3"]
     points: Float[Tensor, "N 3"]
 
+    @cached_property
+    def tree(self) -> KDTree:
+        """Of the points."""
+        return KDTree(self.points.numpy())
+
 
 def sample_pair(
     vertices: Float[Tensor, "V 3"],
@@ -72,8 +78,18 @@ def sample_pair(
     true_faces: Int[Tensor, "Ft 3"],
     samples: int = SAMPLES,
     seed: int = 0,
+    truth: Surface | None = None,
 ) -> tuple[Surface, Surface]:
     """Both surfaces, reconstructed and true, in the true one's normalisation, with independent samples.
+
+    Args:
+        vertices: (V, 3) reconstructed.
+        faces: (F, 3).
+        true_vertices: (Vt, 3).
+        true_faces: (Ft, 3).
+        samples: points drawn from each surface.
+        seed: of the samples.
+        truth: the true surface of an earlier pair with all else alike, which is then not sampled again.
 
     Raises:
         ValueError: a mesh has no area or is not finite, or an argument has a wrong shape, dtype or range.
@@ -88,12 +104,12 @@ def sample_pair(
     check_count("samples", samples, most=MAX_SAMPLES)
     check_count("seed", seed, least=0)
     center, radius = bounding_ball(true_vertices)
-    surfaces = []
-    for side, (points, triangles) in enumerate([(vertices, faces), (true_vertices, true_faces)]):
-        normalized = (points.detach().cpu().double() - center.cpu()) / radius
-        triangles = dense(triangles).cpu()
-        surfaces.append(Surface(normalized, triangles, sample_surface(normalized, triangles, samples, (seed, side))[0]))
-    return surfaces[0], surfaces[1]
+
+    def sampled(points: Tensor, triangles: Tensor, side: int) -> Surface:
+        normalized, triangles = (points.detach().cpu().double() - center.cpu()) / radius, dense(triangles).cpu()
+        return Surface(normalized, triangles, sample_surface(normalized, triangles, samples, (seed, side))[0])
+
+    return sampled(vertices, faces, 0), truth or sampled(true_vertices, true_faces, 1)
 
 
 def chamfer(surface: Surface, truth: Surface, queries: int | None = None) -> float:
@@ -105,8 +121,8 @@ def chamfer(surface: Surface, truth: Surface, queries: int | None = None) -> flo
         queries: look from this many samples of each side only (still at all of the other side): an estimate of the
             same number in less time, which matters for surfaces that are far apart, where a k-d tree prunes little.
     """
-    to_truth, _ = KDTree(truth.points.numpy()).query(surface.points[:queries].numpy(), workers=-1)
-    to_surface, _ = KDTree(surface.points.numpy()).query(truth.points[:queries].numpy(), workers=-1)
+    to_truth, _ = truth.tree.query(surface.points[:queries].numpy(), workers=-1)
+    to_surface, _ = surface.tree.query(truth.points[:queries].numpy(), workers=-1)
     return float(np.mean(to_truth**2) + np.mean(to_surface**2))
 
 

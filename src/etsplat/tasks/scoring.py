@@ -27,7 +27,7 @@ from etsplat.io.atomic import write_error
 from etsplat.io.images import save_image, to_8_bit
 from etsplat.io.mesh_files import MeshFile
 from etsplat.metrics.flip import flip
-from etsplat.metrics.geometry import SAMPLES, chamfer, geometry_metrics, sample_pair
+from etsplat.metrics.geometry import SAMPLES, Surface, chamfer, geometry_metrics, sample_pair
 from etsplat.metrics.image import WINDOW, Lpips, find_lpips_weights, psnr, silhouette_iou, ssim
 from etsplat.model.model import Model
 from etsplat.model.triangle_mesh import TriangleMesh
@@ -97,6 +97,7 @@ class Scorer:
         self._dataset, self._views, self._device = dataset, ViewLoader(dataset, device), device
         self._background = torch.tensor(background, device=device)
         self._truth, self._samples, self._supersampling = truth, samples, supersampling
+        self._true_surface: Surface | None = None  # with samples, once they are drawn
         sides = [min(camera.width, camera.height) for camera in (dataset.cameras[index] for index in dataset.test)]
         too_small = min(sides, default=SMALLEST) < SMALLEST
         self._lpips, self.lpips_reason = (None, "the images are smaller than 16 pixels") if too_small else lpips
@@ -112,7 +113,9 @@ class Scorer:
             seen = [self.see(model, index) for index in self._dataset.test]
             scores["psnr"] = sum(psnr(view.counting(view.splatted), view.photo) for view in seen) / len(seen)
         if self._truth is not None:
-            pair = sample_pair(*model.surface(), self._truth.vertices, self._truth.faces, self._samples)
+            truth = self._truth.vertices, self._truth.faces
+            pair = sample_pair(*model.surface(), *truth, self._samples, truth=self._true_surface)
+            self._true_surface = pair[1]
             scores["chamfer"] = chamfer(*pair, queries=self._samples // 10)
         return scores
 
