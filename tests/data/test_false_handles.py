@@ -9,7 +9,7 @@ import torch
 from etsplat.core.cameras import camera_centers
 from etsplat.data.agreement import photos_of
 from etsplat.data.dataset import Dataset
-from etsplat.data.false_handles import _BLOCKED, _cut, silhouette_errors, without_false_handles
+from etsplat.data.false_handles import _BLOCKED, _agreement, _cut, silhouette_errors, without_false_handles
 from etsplat.data.meshing import SignedDistance, dual_contour
 from etsplat.data.pictures import StoredPictures
 from etsplat.geometry.distance import closest_points
@@ -106,7 +106,7 @@ def test_a_thin_bridge_is_cut_unless_photos_show_it(shown: SignedDistance, holes
     photos, (vertices, faces) = photos_of(views), placed(bridged, views)
     assert genera(faces, len(vertices)) == [1]
     most = silhouette_errors(photos, vertices, faces) + torch.tensor([0, _BLOCKED])
-    found = _cut(photos, vertices, faces, most)
+    found = _cut(photos, vertices, faces, _agreement(photos, vertices, faces), most)
     vertices, faces = (vertices, faces) if found is None else found
     assert genera(faces, len(vertices)) == [holes]
     assert bool((silhouette_errors(photos, vertices, faces) <= most).all())
@@ -118,7 +118,8 @@ def test_a_thin_bridge_is_cut_where_no_photo_sees_it() -> None:
     below = [index for index in views.train if float(camera_centers(views.viewmats[index][None])[0, 1]) < -0.5]
     assert len(below) >= 3
     photos, (vertices, faces) = photos_of(replace(views, train=below)), placed(bridged, views)
-    found = _cut(photos, vertices, faces, silhouette_errors(photos, vertices, faces) + torch.tensor([0, _BLOCKED]))
+    most = silhouette_errors(photos, vertices, faces) + torch.tensor([0, _BLOCKED])
+    found = _cut(photos, vertices, faces, _agreement(photos, vertices, faces), most)
     assert found is not None
     assert genera(found[1], len(found[0])) == [0]
 

@@ -61,21 +61,35 @@ def without_false_handles(
     if len(photos) < 2:
         return vertices, faces
     most = silhouette_errors(photos, vertices, faces) + torch.tensor([_LOST, _ADDED])
+    agreed = _agreement(photos, vertices, faces)
     for level in _LEVELS:
-        while (simpler := _simpler(photos, vertices, faces, level, most)) is not None:
+        while (simpler := _simpler(photos, vertices, faces, agreed, level, most)) is not None:
             vertices, faces = simpler
+            if not any(genera(faces, len(vertices))):
+                return vertices, faces
+            agreed = _agreement(photos, vertices, faces)
     most = silhouette_errors(photos, vertices, faces) + torch.tensor([0, _BLOCKED])
-    while (simpler := _cut(photos, vertices, faces, most)) is not None:
+    while (simpler := _cut(photos, vertices, faces, agreed, most)) is not None:
         vertices, faces = simpler
+        if not any(genera(faces, len(vertices))):
+            break
+        agreed = _agreement(photos, vertices, faces)
     return vertices, faces
 
 
-def _cut(photos: list[Photo], vertices: Tensor, faces: Tensor, most: Tensor) -> tuple[Tensor, Tensor] | None:
-    """The surface cut along a short loop, with a smaller genus, if there is one: the shortest is tried first."""
-    before = genera(faces, len(vertices))
-    if not any(before):
-        return None
-    score, hidden = _agreement(photos, vertices, faces)
+def _cut(
+    photos: list[Photo], vertices: Tensor, faces: Tensor, agreed: tuple[Tensor, Tensor], most: Tensor
+) -> tuple[Tensor, Tensor] | None:
+    """The surface cut along a short loop, with a smaller genus, if there is one: the shortest is tried first.
+
+    Args:
+        photos: all that look.
+        vertices: (V, 3).
+        faces: (F, 3), with a handle.
+        agreed: from `_agreement`.
+        most: (B, 2) errors of silhouettes that are allowed.
+    """
+    before, (score, hidden) = genera(faces, len(vertices)), agreed
     tried = torch.zeros(len(vertices), dtype=torch.bool)
     for loop in short_loops(vertices, faces):
         if len(loop) > _THIN or 2 * int(tried[loop].sum()) > len(loop):
@@ -103,13 +117,10 @@ def _agreement(photos: list[Photo], vertices: Tensor, faces: Tensor) -> tuple[Fl
 
 
 def _simpler(
-    photos: list[Photo], vertices: Tensor, faces: Tensor, level: float, most: Tensor
+    photos: list[Photo], vertices: Tensor, faces: Tensor, agreed: tuple[Tensor, Tensor], level: float, most: Tensor
 ) -> tuple[Tensor, Tensor] | None:
-    """The surface with a smaller genus, if there is one: the largest region is tried first."""
-    before = genera(faces, len(vertices))
-    if not any(before):
-        return None
-    score, _ = _agreement(photos, vertices, faces)
+    """The surface with a smaller genus, if there is one: the largest region is tried first. Arguments as of `_cut`."""
+    before, (score, _) = genera(faces, len(vertices)), agreed
     low, unseen = score < level, score.isnan()
     # Of most posts photos see one side. With the other they are handles, but what is not seen may join several.
     regions = _regions(faces, low[faces].all(dim=1))

@@ -62,16 +62,21 @@ def _loops_through(root: int, topology: MeshTopology, edges: Tensor, length: Ten
     way, before = torch.from_numpy(way), torch.from_numpy(before).long()
     free = ((before[a] != b) & (before[b] != a) & (way[a] + way[b]).isfinite()).nonzero()[:, 0]
     around = (way[a] + way[b] + length)[free]
-    # Two faces may share two edges of a closed mesh: the one with the longer way joins them.
     order = free[torch.argsort(around, stable=True)]
-    pairs = topology.face_pairs[order].tolist()
-    joins = {(first, second): edge for (first, second), edge in zip(pairs, order.tolist(), strict=True)}
-    first, second = np.array(list(joins)).T
-    cost = 1 + around.max() - (way[a] + way[b] + length)[list(joins.values())]
+    # Two faces may share two edges of a closed mesh: the one with the longer way joins them.
+    pairs = topology.face_pairs[order].long().numpy()
+    keys, earliest, which = np.unique(pairs[:, 0] * F + pairs[:, 1], return_index=True, return_inverse=True)
+    latest = np.empty_like(earliest)
+    latest[which] = np.arange(len(order))
+    longest = order[torch.from_numpy(latest)]
+    first, second = pairs[np.sort(earliest)].T
+    cost = 1 + around.max() - (way[a] + way[b] + length)[longest[torch.from_numpy(np.argsort(earliest))]]
     tree = minimum_spanning_tree(csr_array((cost.numpy(), (first, second)), shape=(F, F)))
-    joined = {joins[first, second] for first, second in np.stack(tree.nonzero(), axis=1).tolist()}
-    left = [edge for edge in free.tolist() if edge not in joined]
-    return [_closed(int(edges[edge, 0]), int(edges[edge, 1]), before) for edge in left]
+    row, column = tree.nonzero()
+    left = torch.zeros(len(edges), dtype=torch.bool)
+    left[free] = True
+    left[longest[np.searchsorted(keys, row.astype(np.int64) * F + column)]] = False
+    return [_closed(a, b, before) for a, b in edges[left].tolist()]
 
 
 def _closed(a: int, b: int, before: Tensor) -> list[int]:
