@@ -182,19 +182,18 @@ def plain_hull(views: Dataset, config: ReconstructConfig) -> Hull:
             "start.shape: the masks have no point in common, so there is no hull; check that masks are white inside the"
             " object and that poses and images belong together"
         )
-    most = round(config.max_faces / (1 + NEAR))
-    while hull.uncovered > _UNCOVERED and (more := min(2 * hull.wanted, most)) > hull.wanted:
-        finer = _carved(views, more, radius)
-        if len(finer.faces) > config.max_faces or not _mends(finer, hull):
-            break
-        hull = finer
-    return hull
+    finer, most = hull, round(config.max_faces / (1 + NEAR))
+    while finer.uncovered > _UNCOVERED and (more := min(2 * finer.wanted, most)) > finer.wanted:
+        coarse, finer = finer, _carved(views, more, radius)
+        if len(finer.faces) > config.max_faces or finer.uncovered > _LESS * coarse.uncovered:
+            return hull
+    return finer if _mends(finer, hull) else hull
 
 
 def _mends(finer: Hull, hull: Hull) -> bool:
-    """Whether a finer hull covers more, and has fewer parts, or more holes: thin parts of the other one are broken."""
+    """Whether a finer hull covers all, and has fewer parts, or more holes: thin parts of the other one are broken."""
     whole, broken = (shape_of(each.vertices, each.faces) for each in (finer, hull))
-    if finer.uncovered > _LESS * hull.uncovered or whole.parts is None or broken.parts is None:
+    if finer.uncovered > _UNCOVERED or whole.parts is None or broken.parts is None:
         return False
     return whole.parts < broken.parts or (whole.parts == broken.parts and (whole.holes or 0) > (broken.holes or 0))
 
