@@ -81,7 +81,7 @@ class Start:
     """Radius of the sphere, in which the hull lies too, as a multiple of the radius of a sphere around the object."""
     hull_faces: Annotated[int, Range(100, 10**7), _HULL] = 12_500
     """About how many faces the hull has, and no more than half of `max_faces`;
-    up to all of them where thin parts of the object would be broken. Other runs have more faces later:
+    up to twice as many where thin parts of the object would be broken. Other runs have more faces later:
     where a hull is finer than photos tell depths, its hollows are opened worse."""
     near: Annotated[float, Range(1e-6, 1), _HULL] = 0.3
     """A hull is near the surface already: the rate of vertices is multiplied by this."""

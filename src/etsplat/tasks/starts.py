@@ -164,7 +164,7 @@ def make_start(
 
 @torch.no_grad()
 def plain_hull(views: Dataset, config: ReconstructConfig) -> Hull:
-    """The visual hull, with at most half of a run's faces, or finer where thin parts of that one are broken.
+    """The visual hull, with at most half of a run's faces, or twice as fine where thin parts of that one are broken.
 
     Args:
         views: of the unit frame.
@@ -182,12 +182,11 @@ def plain_hull(views: Dataset, config: ReconstructConfig) -> Hull:
             "start.shape: the masks have no point in common, so there is no hull; check that masks are white inside the"
             " object and that poses and images belong together"
         )
-    finer, most = hull, round(config.max_faces / (1 + NEAR))
-    while finer.uncovered > _UNCOVERED and (more := min(2 * finer.wanted, most)) > finer.wanted:
-        coarse, finer = finer, _carved(views, more, radius)
-        if len(finer.faces) > config.max_faces or finer.uncovered > _LESS * coarse.uncovered:
-            return hull
-    return finer if _mends(finer, hull) else hull
+    more = min(2 * wanted, round(config.max_faces / (1 + NEAR)))
+    if hull.uncovered <= _UNCOVERED or more <= wanted:
+        return hull
+    finer = _carved(views, more, radius)
+    return finer if len(finer.faces) <= config.max_faces and _mends(finer, hull) else hull
 
 
 def _mends(finer: Hull, hull: Hull) -> bool:
