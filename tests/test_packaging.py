@@ -109,11 +109,14 @@ def test_links_lead_somewhere(page: Path) -> None:
 @pytest.mark.parametrize("threads", [1, 2, 5])
 def test_thread_count_can_be_set(threads: int) -> None:
     """The native pool takes any number of threads, and 0 goes back to the default."""
+    before = _native.num_threads()
+    _native.set_num_threads(0)
     default = _native.num_threads()
     _native.set_num_threads(threads)
     assert _native.num_threads() == threads
     _native.set_num_threads(0)
     assert _native.num_threads() == default
+    _native.set_num_threads(before)
 
 
 def test_thread_count_from_the_environment() -> None:
