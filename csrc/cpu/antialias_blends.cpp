@@ -148,10 +148,10 @@ int32_t different(const int32_t* triangle, const OpaqueCamera& camera, int32_t y
 }
 
 // Calls row(y, list) for every row of an image, with the list of its band: bands are looked through side by side.
-template <class Item, class Row>
-std::vector<std::vector<Item>> in_bands(int32_t height, const Row& row) {
+template <class Row>
+std::vector<std::vector<Blend>> in_bands(int32_t height, const Row& row) {
     const int32_t bands = (height + kRows - 1) / kRows;
-    std::vector<std::vector<Item>> lists(bands);
+    std::vector<std::vector<Blend>> lists(bands);
     parallel_for(bands, 1, [&](int64_t begin, int64_t end) {
         for (int64_t band = begin; band < end; ++band) {
             const auto top = static_cast<int32_t>(band) * kRows;
@@ -166,7 +166,7 @@ std::vector<std::vector<Item>> in_bands(int32_t height, const Row& row) {
 std::vector<std::vector<Blend>> find_blends(const AntialiasInput& in) {
     const PairSearch search(in);
     const OpaqueCamera& camera = in.shading.camera;
-    return in_bands<Blend>(camera.height, [&](int32_t y, std::vector<Blend>& list) {
+    return in_bands(camera.height, [&](int32_t y, std::vector<Blend>& list) {
         Scratch<Blend> found(2 * int64_t{camera.width} + 1);  // of a row, and one that is none
         Scratch<int32_t> pairs(2 * int64_t{camera.width} + 1);
         const int32_t count = different(in.shading.triangle, camera, y, pairs.data());
@@ -187,7 +187,7 @@ std::vector<std::vector<Blend>> find_blends(const AntialiasInput& in) {
 std::vector<std::vector<Blend>> find_blends_behind(const AntialiasInput& in, const AntialiasInput& behind) {
     const PairSearch search(in);
     const OpaqueCamera& camera = in.shading.camera;
-    return in_bands<Blend>(camera.height, [&](int32_t y, std::vector<Blend>& list) {
+    return in_bands(camera.height, [&](int32_t y, std::vector<Blend>& list) {
         Scratch<Blend> found(4 * int64_t{camera.width} + 1);
         Blend* next = found.data();
         for (int32_t i = 0; i < 2 * camera.width; ++i) {

@@ -2,6 +2,18 @@
 #include "rasterize_opaque.h"
 
 namespace etsplat {
+namespace {
+
+OpaqueMesh mesh_of(const Array<const float, 2>& vertices, const Array<const int32_t, 2>& faces) {
+    return {vertices.data(), faces.data(), vertices.size(0), faces.size(0)};
+}
+
+OpaqueCamera camera_of(const Array<const float, 2>& viewmat, const Array<const float, 2>& K, float near_plane, int64_t height,
+                       int64_t width) {
+    return {viewmat.data(), K.data(), near_plane, static_cast<int32_t>(width), static_cast<int32_t>(height)};
+}
+
+}  // namespace
 
 void bind_rasterize_opaque(nb::module_& m) {
     // Of one view: vertices (V, 3), faces (F, 3), viewmat (4, 4), K (3, 3); triangle (H, W), barycentrics (H, W, 3) or None,
@@ -11,9 +23,8 @@ void bind_rasterize_opaque(nb::module_& m) {
         [](Array<const float, 2> vertices, Array<const int32_t, 2> faces, Array<const float, 2> viewmat,
            Array<const float, 2> K, float near_plane, Array<int32_t, 2> triangle, OptionalArray<float, 3> barycentrics,
            Array<float, 2> depth) {
-            const OpaqueMesh mesh{vertices.data(), faces.data(), vertices.size(0), faces.size(0)};
-            const OpaqueCamera camera{viewmat.data(), K.data(), near_plane, static_cast<int32_t>(triangle.size(1)),
-                                    static_cast<int32_t>(triangle.size(0))};
+            const OpaqueMesh mesh = mesh_of(vertices, faces);
+            const OpaqueCamera camera = camera_of(viewmat, K, near_plane, triangle.size(0), triangle.size(1));
             rasterize_opaque(mesh, camera, {triangle.data(), data_or_null(barycentrics), depth.data()});
         },
         "vertices", "faces", "viewmat", "K", "near_plane", "triangle", "barycentrics", "depth");
@@ -23,9 +34,8 @@ void bind_rasterize_opaque(nb::module_& m) {
         [](Array<const float, 2> vertices, Array<const int32_t, 2> faces, Array<const float, 2> viewmat,
            Array<const float, 2> K, float near_plane, Array<int32_t, 3> triangle, Array<float, 4> barycentrics,
            Array<float, 3> depth) {
-            const OpaqueMesh mesh{vertices.data(), faces.data(), vertices.size(0), faces.size(0)};
-            const OpaqueCamera camera{viewmat.data(), K.data(), near_plane, static_cast<int32_t>(triangle.size(2)),
-                                    static_cast<int32_t>(triangle.size(1))};
+            const OpaqueMesh mesh = mesh_of(vertices, faces);
+            const OpaqueCamera camera = camera_of(viewmat, K, near_plane, triangle.size(1), triangle.size(2));
             rasterize_behind(mesh, camera, {triangle.row(0), barycentrics.row(0), depth.row(0)},
                              {triangle.row(1), barycentrics.row(1), depth.row(1)});
         },
@@ -36,9 +46,8 @@ void bind_rasterize_opaque(nb::module_& m) {
         [](Array<const float, 2> vertices, Array<const int32_t, 2> faces, Array<const float, 2> viewmat,
            Array<const float, 2> K, float near_plane, Array<const bool, 1> turned, Array<int64_t, 2> entered,
            Array<int64_t, 2> left) {
-            const OpaqueMesh mesh{vertices.data(), faces.data(), vertices.size(0), faces.size(0)};
-            const OpaqueCamera camera{viewmat.data(), K.data(), near_plane, static_cast<int32_t>(entered.size(1)),
-                                    static_cast<int32_t>(entered.size(0))};
+            const OpaqueMesh mesh = mesh_of(vertices, faces);
+            const OpaqueCamera camera = camera_of(viewmat, K, near_plane, entered.size(0), entered.size(1));
             enter_and_leave(mesh, camera, turned.data(), entered.data(), left.data());
         },
         "vertices", "faces", "viewmat", "K", "near_plane", "turned", "entered", "left");
@@ -48,9 +57,8 @@ void bind_rasterize_opaque(nb::module_& m) {
         [](Array<const float, 2> vertices, Array<const int32_t, 2> faces, Array<const float, 2> viewmat,
            Array<const float, 2> K, float near_plane, Array<const float, 2> colors, bool per_face,
            int32_t supersampling, bool cull_backfaces, Array<float, 3> image) {
-            const OpaqueMesh mesh{vertices.data(), faces.data(), vertices.size(0), faces.size(0)};
-            const OpaqueCamera camera{viewmat.data(), K.data(), near_plane, static_cast<int32_t>(image.size(1)),
-                                    static_cast<int32_t>(image.size(0))};
+            const OpaqueMesh mesh = mesh_of(vertices, faces);
+            const OpaqueCamera camera = camera_of(viewmat, K, near_plane, image.size(0), image.size(1));
             const OpaqueColors shown{per_face ? colors.data() : nullptr, per_face ? nullptr : colors.data(),
                                    static_cast<int32_t>(colors.size(1))};
             render_opaque(mesh, camera, shown, supersampling, cull_backfaces, image.data());
