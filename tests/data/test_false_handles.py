@@ -9,7 +9,16 @@ import torch
 from etsplat.core.cameras import camera_centers
 from etsplat.data.agreement import photos_of
 from etsplat.data.dataset import Dataset
-from etsplat.data.false_handles import _BLOCKED, _agreement, _cut, silhouette_errors, without_false_handles
+from etsplat.data.false_handles import (
+    _ADDED,
+    _BLOCKED,
+    _LOST,
+    _agreement,
+    _cut,
+    _simpler,
+    silhouette_errors,
+    without_false_handles,
+)
 from etsplat.data.meshing import SignedDistance, dual_contour
 from etsplat.data.pictures import StoredPictures
 from etsplat.geometry.distance import closest_points
@@ -40,14 +49,21 @@ def handled(places: np.ndarray) -> np.ndarray:
     return np.minimum(bowl(places), np.maximum(np.hypot(np.hypot(x - 0.75, y) - 0.25, z) - 0.07, 0.62 - x))
 
 
-def surface(shape: SignedDistance) -> Surface:
-    vertices, faces = dual_contour(shape, (-1.2, -1.2, -1.2), 0.08, (30, 30, 30))
+def ringed(places: np.ndarray) -> np.ndarray:
+    """The same with a small ring at its side, whose hole is under a hundredth of every silhouette."""
+    x, y, z = places.T
+    return np.minimum(bowl(places), np.maximum(np.hypot(np.hypot(x - 0.74, y) - 0.13, z) - 0.05, 0.62 - x))
+
+
+def surface(shape: SignedDistance, step: float = 0.08) -> Surface:
+    count = round(2.4 / step)
+    vertices, faces = dual_contour(shape, (-1.2, -1.2, -1.2), step, (count, count, count))
     return torch.from_numpy(vertices).float(), torch.from_numpy(faces)
 
 
-def photographed(shape: SignedDistance) -> tuple[Surface, Dataset]:
+def photographed(shape: SignedDistance, step: float = 0.08) -> tuple[Surface, Dataset]:
     """A surface in the frame of its views, and these."""
-    vertices, faces, views = painted_pictures(*surface(shape))
+    vertices, faces, views = painted_pictures(*surface(shape, step))
     return (vertices, faces), views
 
 
@@ -91,6 +107,17 @@ def test_a_handle_that_silhouettes_need_stays_whatever_photos_say() -> None:
     noisy = replace(views, images=StoredPictures(images))
     vertices, faces = without_false_handles(noisy, *truth)
     assert genera(faces, len(vertices)) == [1]
+
+
+def test_a_small_hole_that_light_comes_through_stays_whatever_photos_say() -> None:
+    """Skull, which lost both of its holes by preset best: closed, a hole covers 0.7 % beside a silhouette."""
+    truth, views = photographed(ringed, 0.04)
+    photos = photos_of(views)
+    middle, rim = views.normalization.apply(torch.tensor([[0.74, 0, 0], [0.87, 0, 0]]))
+    score = ((truth[0] - middle)[:, :2].norm(dim=1) > (rim - middle).norm()).float()
+    seen = torch.zeros(len(score), dtype=torch.bool)
+    most = silhouette_errors(photos, *truth) + torch.tensor([_LOST, _ADDED])
+    assert _simpler(photos, *truth, (score, seen), 0.5, most) is None
 
 
 def bridged(places: np.ndarray) -> np.ndarray:

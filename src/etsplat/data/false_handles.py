@@ -12,7 +12,9 @@ needs it.
 """
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int64
+from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from etsplat.data.agreement import COMPARED, Photo, first_hits, photos_of, pixel_size, seen_by, surface_agreement
@@ -30,8 +32,11 @@ _FEWEST = 8
 """Faces of a region that is looked at."""
 
 _LOST, _ADDED = 0.001, 0.01
-"""So much of a silhouette, in any view, may be uncovered, and so much beside it covered. A crossbar is little of it,
-what is seen through a hole in the view that shows it best is more."""
+"""So much of a silhouette, in any view, may be uncovered, and so much beside it covered: a crossbar is little of it."""
+
+_DEEP = 0.9
+"""Of a mean edge, how deep what is covered beside a silhouette may be: discs overhang by less, and what is seen through
+a hole in the view that shows it best is deeper, however little of a large silhouette it is."""
 
 _THIN = 8
 """Edges of a loop at most: whether a thicker handle is there photos can tell by its whole surface."""
@@ -130,9 +135,21 @@ def _simpler(
         after = genera(found[1], len(found[0]))
         if sum(after) >= sum(before) or len(after) != len(before):
             continue
-        if bool((silhouette_errors(photos, *found) <= most).all()):
+        if bool((silhouette_errors(photos, *found) <= most).all()) and not _closes(photos, (vertices, faces), found):
             return found
     return None
+
+
+def _closes(photos: list[Photo], before: tuple[Tensor, Tensor], after: tuple[Tensor, Tensor]) -> bool:
+    """Whether a replacement (V2, 3), (F2, 3) covers, beside a silhouette, more than slivers that were open before."""
+    ends = before[0][MeshTopology.from_faces(before[1], len(before[0])).edges.long()]
+    most = _DEEP * float((ends[:, 0] - ends[:, 1]).norm(dim=1).mean()) / pixel_size(photos)
+    for photo in photos:
+        was, covered = (first_hits(photo, *surface)[1] >= 0 for surface in (before, after))
+        beside = covered & ~was & (photo.pixels[0, 3] < 0.05)
+        if bool(beside.any()) and float(distance_transform_edt(F.pad(beside, (1, 1, 1, 1)).numpy()).max()) > most:
+            return True
+    return False
 
 
 def _regions(faces: Tensor, low: Bool[Tensor, " F"]) -> list[Bool[Tensor, " F"]]:
