@@ -3,6 +3,7 @@
 #include "bindings.h"
 #include "bvh.h"
 #include "crossings.h"
+#include "flips.h"
 #include "intersections.h"
 #include "parallel.h"
 #include "subdivision.h"
@@ -20,6 +21,16 @@ void bind_geometry(nb::module_& m) {
                                split_edge.data(), order.count(), max_new_faces);
         },
         "order", "longest_edge", "edge_face_offsets", "edge_faces", "split_edge", "max_new_faces");
+    // vertices (V, 3); edges and edge_faces (E, 2), face_edges and faces (F, 3), valences (V,), which are kept up.
+    def_function(
+        m, "flip_edges",
+        [](Array<const double, 2> vertices, Array<int64_t, 2> edges, Array<int64_t, 2> edge_faces,
+           Array<int64_t, 2> face_edges, Array<int64_t, 2> faces, Array<int64_t, 1> valences, double least_cosine,
+           int rounds) {
+            const EdgesOfMesh mesh{edges.data(), edge_faces.data(), face_edges.data(), faces.data(), valences.data()};
+            return flip_edges(vertices.data(), mesh, edges.size(0), least_cosine, rounds);
+        },
+        "vertices", "edges", "edge_faces", "face_edges", "faces", "valences", "least_cosine", "rounds");
     // points (N, 3), vertices (V, 3), faces (F, 3) with F > 0; squared_distances and closest (N,).
     def_function(
         m, "closest_faces",

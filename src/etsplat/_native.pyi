@@ -128,6 +128,17 @@ def select_edge_splits(
     split_edge: torch.Tensor,
     max_new_faces: int,
 ) -> None: ...
+def flip_edges(
+    *,
+    vertices: torch.Tensor,
+    edges: torch.Tensor,
+    edge_faces: torch.Tensor,
+    face_edges: torch.Tensor,
+    faces: torch.Tensor,
+    valences: torch.Tensor,
+    least_cosine: float,
+    rounds: int,
+) -> int: ...
 def closest_faces(
     *,
     points: torch.Tensor,

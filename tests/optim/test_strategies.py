@@ -7,6 +7,7 @@ import torch
 
 from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.intersections import count_self_intersections
+from etsplat.geometry.measures import face_areas
 from etsplat.model.triangle_mesh import TriangleMesh
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.ops.adam import Adam
@@ -48,6 +49,27 @@ def test_a_fixed_model_is_never_edited() -> None:
     started(strategy, a_mesh())
     assert strategy.next_edit(1) == NEVER
     assert not strategy.edit(1)
+
+
+def test_edges_are_flipped_after_a_subdivision_where_that_is_asked_for() -> None:
+    """What was longest is cut in two, and no face is as slender as without; vertices, rows and moments are the same."""
+    worst, made = [], []
+    for flips in (False, True):
+        strategy, mesh = SubdivideAndUntangle({3: 480}, flips=flips), a_mesh()
+        with torch.no_grad():
+            mesh.vertices[:, 0] *= 3
+        adam = started(strategy, mesh)
+        adam.first_moments["colors"].copy_(torch.arange(320.0)[:, None].expand(320, 3))
+        assert strategy.edit(3)
+        corners = mesh.vertices.detach()[mesh.faces]
+        areas, edges = face_areas(*mesh.surface()), (corners - corners.roll(1, dims=1)).norm(dim=2)
+        worst.append(float((edges.amax(1).square() / areas).mean()))
+        made.append((mesh.vertices.detach(), adam.first_moments["colors"]))
+        assert mesh.count == 480
+        assert mesh.topology.is_manifold()
+        assert mesh.topology.is_closed()
+    assert worst[1] < 0.95 * worst[0]
+    assert all(torch.equal(*both) for both in zip(*made, strict=True))
 
 
 def test_what_no_picture_shows_becomes_a_film_where_meshes_are_untangled() -> None:

@@ -10,8 +10,10 @@ from torch import Tensor
 from etsplat.core.rasterization import Rasterization
 from etsplat.geometry.discs import cut_open
 from etsplat.geometry.films import film
+from etsplat.geometry.flips import flipped
 from etsplat.geometry.measures import face_areas
 from etsplat.geometry.subdivision import longest_edge_plan
+from etsplat.geometry.topology import MeshTopology
 from etsplat.geometry.untangle import untangle
 from etsplat.model.triangle_mesh import TriangleMesh
 from etsplat.model.triangle_soup import TriangleSoup
@@ -113,6 +115,7 @@ class SubdivideAndUntangle(Strategy):
         budgets: Mapping[int, int],
         untangle_after: Collection[int] = (),
         *,
+        flips: bool = False,
         reach: float = _SHORT,
         unseen: Callable[[Tensor, Tensor], Tensor] | None = None,
         lids: Callable[[Tensor, Tensor, Tensor], Tensor] | None = None,
@@ -122,6 +125,7 @@ class SubdivideAndUntangle(Strategy):
         Args:
             budgets: by iteration, how many faces there may be after it (`optim.schedules.face_budgets`).
             untangle_after: iterations after which faces that cut through others are put right.
+            flips: whether edges are flipped where that makes faces less slender, after each subdivision.
             reach: folds in which a vertex would have to move farther stay (`geometry.untangle`). If it is more than a
                 half, and that spoils the pictures, a half is tried.
             unseen: of vertices and faces, on the CPU, which vertices no picture shows. Before each untangling they
@@ -131,7 +135,7 @@ class SubdivideAndUntangle(Strategy):
         """
         self._budgets, self._untangle_after, self._unseen = dict(budgets), set(untangle_after), unseen
         self._reaches = (reach, _SHORT) if reach > _SHORT else (reach,)
-        self._lids = lids
+        self._flips, self._lids = flips, lids
         self._found: dict[int, Tensor | None] = {}
 
     def next_edit(self, iteration: int) -> int:
@@ -144,7 +148,7 @@ class SubdivideAndUntangle(Strategy):
         return ways + (self._lids_at(iteration) is not None)
 
     def edit(self, iteration: int) -> bool:
-        """Removes lids, untangles, then divides. Raises DivergedError where faces have no finite area."""
+        """Removes lids, untangles, then divides and flips. Raises DivergedError where faces have no finite area."""
         if self.next_edit(iteration) != iteration:
             return False
         mesh: TriangleMesh = self.model
@@ -162,7 +166,10 @@ class SubdivideAndUntangle(Strategy):
         vertices, topology = mesh.vertices.detach().cpu(), mesh.topology.to(torch.device("cpu"))
         plan = longest_edge_plan(vertices, topology, face_areas(vertices, topology.faces), self._budgets[iteration])
         carried = apply_subdivision(plan, self.adam, per_vertex=mesh.vertex_parameters, per_face=mesh.face_parameters)
-        mesh.load_state({**carried, "faces": plan.faces})
+        faces, vertices = plan.faces, carried["vertices"].detach().cpu()
+        if self._flips:
+            faces = flipped(vertices, MeshTopology.from_faces(faces, len(vertices)))
+        mesh.load_state({**carried, "faces": faces})
         return True
 
     def finish(self, model: TriangleMesh) -> None:

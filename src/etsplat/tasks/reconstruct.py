@@ -335,6 +335,7 @@ def make_trainer(
         SubdivideAndUntangle(
             budgets,
             untanglings,
+            flips=refinement.flips,
             reach=refinement.reach,
             unseen=unseen_vertices(views) if near else None,
             lids=lids(views) if near else None,

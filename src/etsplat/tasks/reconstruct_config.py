@@ -158,6 +158,8 @@ class Refinement:
     """Last subdivision, as a fraction of the iterations."""
     subdivisions: Annotated[int, Range(0, 10_000)] = 30
     """Number of subdivisions between these two; each adds the same fraction of faces, up to `max_faces`."""
+    flips: Annotated[bool, _SUBDIVIDED] = True
+    """After each subdivision edges are flipped to the other diagonal where that makes faces less slender."""
     untanglings: Annotated[int, Range(0, 10_000)] = 6
     """How often faces that cut through others are pushed apart, from the last subdivision to the last step.
     If ever, then once more at 98 % of the run, and from there on vertices stay."""
@@ -323,6 +325,7 @@ _PAPER: dict[str, Any] = {
     "pictures.coarse_until": 0.5,
     "regularization.final": 0.0,
     "regularization.depth": "off",
+    "refinement.flips": False,
     "refinement.untanglings": 0,
     "refinement.guard": 0.0,
 }
