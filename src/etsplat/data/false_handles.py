@@ -11,8 +11,8 @@ and closed by two discs, if photos contradict each other along the loop, or too 
 needs it.
 """
 
+import numpy as np
 import torch
-import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int64
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
@@ -147,7 +147,8 @@ def _closes(photos: list[Photo], before: tuple[Tensor, Tensor], after: tuple[Ten
     for photo in photos:
         was, covered = (first_hits(photo, *surface)[1] >= 0 for surface in (before, after))
         beside = covered & ~was & (photo.pixels[0, 3] < 0.05)
-        if bool(beside.any()) and float(distance_transform_edt(F.pad(beside, (1, 1, 1, 1)).numpy()).max()) > most:
+        depth = np.asarray(distance_transform_edt(np.pad(beside.numpy(), 1)))  # what is out of the frame is not beside
+        if depth.max() > most:
             return True
     return False
 
