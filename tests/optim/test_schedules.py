@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from etsplat.optim.schedules import exponential_decay, face_budgets, regularization_weight
+from etsplat.optim.schedules import exponential_decay, face_budgets, late_decay, regularization_weight
 from etsplat.optim.view_sampler import ViewSampler
 
 
@@ -31,6 +31,17 @@ def test_learning_rates_fall_exponentially() -> None:
     factors = [exponential_decay(t, 101, 0.01) for t in (1, 51, 101)]
     assert factors == pytest.approx([1.0, 0.1, 0.01])
     assert exponential_decay(1, 1, 0.01) == 1.0
+
+
+def test_a_late_fall_travels_half_as_far_again_and_ends_as_low() -> None:
+    """Above the exponential for two thirds of a run, below it from there on, and the same at both ends."""
+    late, early = ([fall(t, 1001, 0.02) for t in range(1, 1002)] for fall in (late_decay, exponential_decay))
+    assert (late[0], late[-1]) == pytest.approx((1.0, 0.02))
+    assert sum(late) / sum(early) == pytest.approx(1.5, abs=0.1)
+    assert late[250] > 1.5 * early[250]
+    assert late[900] < early[900]
+    assert sorted(late, reverse=True) == late
+    assert late_decay(1, 1, 0.02) == 1.0
 
 
 def test_every_epoch_shows_each_view_once_in_a_new_order() -> None:

@@ -128,6 +128,19 @@ def test_schedules_past_the_paper() -> None:
     assert evenly(100, 0, 0.6) == []
 
 
+@pytest.mark.parametrize("near", [False, True])
+def test_the_rate_of_vertices_falls_late_near_the_surface_alone(near: bool) -> None:
+    """Only of a start from a hull is it known what a late fall does; halfway it is higher."""
+    views = photograph(demo_object(), 16, 16, elevations=(0.0,), azimuths=3, supersampling=1)
+    mesh = TriangleMesh.from_mesh(*icosphere(2), colors=0.7, opacity=0.98, sigma=0.25)
+    late = {"start.shape": "hull", "start.near_fall": "late", "optimizer.lr_vertices_final": 0.04}
+    config = SHORT.changed({"iterations": 11, "refinement.subdivisions": 0, **late})
+    trainer = make_trainer(mesh, views, config, near=near)
+    trainer.fit(6)
+    halfway = 0.04 + 0.96 / 4 if near else 0.04**0.5
+    assert trainer.adam.learning_rates["vertices"] == pytest.approx(halfway * config.optimizer.lr_vertices)
+
+
 @pytest.mark.parametrize("untanglings", [0, 1])
 def test_vertices_of_what_is_untangled_stay_at_the_end(untanglings: int) -> None:
     """The last fiftieth of a run changes colours alone, so that nothing folds again."""

@@ -32,6 +32,7 @@ from etsplat.optim.schedules import (
     evenly,
     exponential_decay,
     face_budgets,
+    late_decay,
     regularization_weight,
 )
 from etsplat.optim.strategies import SubdivideAndUntangle
@@ -340,7 +341,7 @@ def make_trainer(
             unseen=unseen_vertices(views) if near else None,
             lids=lids(views) if near else None,
         ),
-        schedule=_schedule(config),
+        schedule=_schedule(config, near=near),
         batch=config.batch,
         exposure=Exposure.of(config.exposure, length, len(views.train) / config.batch),
         depths=depths,
@@ -356,20 +357,21 @@ def _held_from(config: ReconstructConfig) -> int:
     return max(1, round(HELD * config.iterations))
 
 
-def _schedule(config: ReconstructConfig) -> Schedule:
+def _schedule(config: ReconstructConfig, *, near: bool) -> Schedule:
     length, rates, pictures = config.iterations, config.optimizer, config.pictures
     annealed = config.soft and rates.sigma_final > 0
 
     held_from = _held_from(config) if config.refinement.untanglings else length
+    fall = late_decay if near and config.start.near_fall == "late" else exponential_decay
 
     def vertices(iteration: int) -> float:
         if iteration > held_from:
             return 0.0
-        return rates.lr_vertices * exponential_decay(iteration, length, rates.lr_vertices_final)
+        return rates.lr_vertices * fall(iteration, length, rates.lr_vertices_final)
 
     def log_sigma(iteration: int) -> float:
-        fall = exponential_decay(iteration, length, rates.sigma_final / config.start.sigma)
-        return math.log(config.start.sigma * fall)
+        softer = exponential_decay(iteration, length, rates.sigma_final / config.start.sigma)
+        return math.log(config.start.sigma * softer)
 
     return Schedule(
         rates={
