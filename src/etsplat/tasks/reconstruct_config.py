@@ -282,7 +282,7 @@ class ReconstructConfig(Settings):
 
     @classmethod
     def demo(cls) -> "ReconstructConfig":
-        """For `etsplat demo object`."""
+        """For `etsplat demo object`: quick with half of the steps, for those who wait."""
         return cls.of("demo")
 
     @classmethod
@@ -362,7 +362,7 @@ _PRESETS: dict[str, dict[str, Any]] = {
         "output.checkpoint_every": 1000,
     },
     "quick": _QUICK,
-    "demo": _QUICK,
+    "demo": {**_QUICK, "iterations": 2500},
     "tiny": {
         **_PAPER,
         **_QUICK,
