@@ -86,7 +86,7 @@ def test_presets_of_reconstruct_are_what_they_were(preset: str) -> None:
     """Every setting of then has a name now; what has come since has no effect unless it is asked for or needed."""
     config = flatten(ReconstructConfig.of(preset).to_dict())
     since = {"start.hull_faces": 12_500, "start.near": 0.3, "start.near_edge": 0.02, "start.near_reach": 2.0}
-    since["start.near_fall"] = "late" if preset in ("quick", "demo") else "exponential"
+    since["start.near_fall"] = "exponential" if preset in ("paper", "study", "tiny") else "late"
     since["refinement.reach"] = 0.5
     since |= {"drawing.harmonics": 0, "optimizer.lr_harmonics": 5e-4}
     since["start.shape"] = "sphere" if preset in ("paper", "study", "tiny") else "auto"

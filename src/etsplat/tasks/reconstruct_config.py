@@ -85,7 +85,7 @@ class Start:
     where a hull is finer than photos tell depths, its hollows are opened worse."""
     near: Annotated[float, Range(1e-6, 1), _HULL] = 0.3
     """A hull is near the surface already: the rate of vertices is multiplied by this."""
-    near_fall: Annotated[Literal["exponential", "late"], _HULL] = "exponential"
+    near_fall: Annotated[Literal["exponential", "late"], _HULL] = "late"
     """How that rate falls: as it does elsewhere; or late, which stays high for longer and ends as low.
     Hollows, which travel far, are then opened deeper in as many steps."""
     near_edge: Annotated[float, Range(0, 1), _HULL] = 0.02
@@ -324,6 +324,7 @@ _PAPER: dict[str, Any] = {
     "exposure": "off",
     "pixels_per_face": None,
     "start.shape": "sphere",
+    "start.near_fall": "exponential",
     "pictures.coarse_levels": 0,
     "pictures.coarse_until": 0.5,
     "regularization.final": 0.0,
@@ -337,7 +338,6 @@ _QUICK: dict[str, Any] = {
     "resolution": 448,
     "iterations": 5000,
     "max_faces": 25_000,
-    "start.near_fall": "late",
     "optimizer.lr_vertices": 1e-2,
     "optimizer.lr_sigma": 3e-4,
     "regularization.hold": 50,
@@ -355,7 +355,6 @@ _PRESETS: dict[str, dict[str, Any]] = {
         "resolution": 640,
         "iterations": 6000,
         "max_faces": 40_000,
-        "start.near_fall": "exponential",
         "optimizer.lr_vertices": 8e-3,
         "regularization.hold": 100,
         "refinement.subdivisions": 15,
@@ -373,7 +372,6 @@ _PRESETS: dict[str, dict[str, Any]] = {
         "start.level": 2,
         "start.opacity": 0.9,
         "start.sigma": 0.5,
-        "start.near_fall": "exponential",
         "optimizer.lr_vertices": 2e-2,
         "optimizer.lr_vertices_final": 0.05,
         "optimizer.lr_colors": 2e-2,
