@@ -22,6 +22,7 @@ from etsplat.data.dataset import Dataset
 from etsplat.data.visual_hull import without_specks
 from etsplat.geometry.discs import with_discs
 from etsplat.geometry.loops import short_loops
+from etsplat.geometry.measures import mean_edge
 from etsplat.geometry.parts import genera
 from etsplat.geometry.topology import MeshTopology, connected
 
@@ -37,6 +38,9 @@ _LOST, _ADDED = 0.001, 0.01
 _DEEP = 0.9
 """Of a mean edge, how deep what is covered beside a silhouette may be: discs overhang by less, and what is seen through
 a hole in the view that shows it best is deeper, however little of a large silhouette it is."""
+
+_BESIDE = 0.05
+"""Alpha of what is certainly beside a silhouette."""
 
 _THIN = 8
 """Edges of a loop at most: whether a thicker handle is there photos can tell by its whole surface."""
@@ -127,6 +131,8 @@ def _simpler(
     """The surface with a smaller genus, if there is one: the largest region is tried first. Arguments as of `_cut`."""
     before, (score, _) = genera(faces, len(vertices)), agreed
     low, unseen = score < level, score.isnan()
+    edges = MeshTopology.from_faces(faces, len(vertices)).edges.long()
+    was, deep = None, _DEEP * mean_edge(vertices, edges) / pixel_size(photos)
     # Of most posts photos see one side. With the other they are handles, but what is not seen may join several.
     regions = _regions(faces, low[faces].all(dim=1))
     hidden = _regions(faces, (low | unseen)[faces].all(dim=1))
@@ -135,20 +141,20 @@ def _simpler(
         after = genera(found[1], len(found[0]))
         if sum(after) >= sum(before) or len(after) != len(before):
             continue
-        if bool((silhouette_errors(photos, *found) <= most).all()) and not _closes(photos, (vertices, faces), found):
-            return found
+        covered = _covered(photos, *found)
+        if bool((_errors(photos, covered) <= most).all()):
+            was = was or _covered(photos, vertices, faces)
+            if not _closes(photos, was, covered, deep):
+                return found
     return None
 
 
-def _closes(photos: list[Photo], before: tuple[Tensor, Tensor], after: tuple[Tensor, Tensor]) -> bool:
-    """Whether a replacement (V2, 3), (F2, 3) covers, beside a silhouette, more than slivers that were open before."""
-    ends = before[0][MeshTopology.from_faces(before[1], len(before[0])).edges.long()]
-    most = _DEEP * float((ends[:, 0] - ends[:, 1]).norm(dim=1).mean()) / pixel_size(photos)
-    for photo in photos:
-        was, covered = (first_hits(photo, *surface)[1] >= 0 for surface in (before, after))
-        beside = covered & ~was & (photo.pixels[0, 3] < 0.05)
+def _closes(photos: list[Photo], was: list[Tensor], covered: list[Tensor], deep: float) -> bool:
+    """Whether more than slivers, so many pixels deep, are covered beside a silhouette that were open before."""
+    for photo, before, after in zip(photos, was, covered, strict=True):
+        beside = after & ~before & (photo.pixels[0, 3] < _BESIDE)
         depth = np.asarray(distance_transform_edt(np.pad(beside.numpy(), 1)))  # what is out of the frame is not beside
-        if depth.max() > most:
+        if depth.max() > deep:
             return True
     return False
 
@@ -176,9 +182,19 @@ def _regions(faces: Tensor, low: Bool[Tensor, " F"]) -> list[Bool[Tensor, " F"]]
 
 def silhouette_errors(photos: list[Photo], vertices: Tensor, faces: Tensor) -> Float[Tensor, "B 2"]:
     """Of each view, the pixels that the surface should cover and does not, and the reverse, per silhouette."""
+    return _errors(photos, _covered(photos, vertices, faces))
+
+
+def _covered(photos: list[Photo], vertices: Tensor, faces: Tensor) -> list[Bool[Tensor, "H W"]]:
+    """Of each view, the pixels that a surface covers."""
+    return [first_hits(photo, vertices, faces)[1] >= 0 for photo in photos]
+
+
+def _errors(photos: list[Photo], covered: list[Tensor]) -> Float[Tensor, "B 2"]:
+    """As `silhouette_errors`, of what `_covered` found."""
     found = []
-    for photo in photos:
-        alpha, covered = photo.pixels[0, 3], first_hits(photo, vertices, faces)[1] >= 0
-        lost, added = ~covered & (alpha > 0.95), covered & (alpha < 0.05)
+    for photo, drawn in zip(photos, covered, strict=True):
+        alpha = photo.pixels[0, 3]
+        lost, added = ~drawn & (alpha > 0.95), drawn & (alpha < _BESIDE)
         found.append(torch.stack([lost.sum(), added.sum()]) / (alpha > 0.5).sum())
     return torch.stack(found)

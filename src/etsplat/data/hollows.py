@@ -25,7 +25,7 @@ from etsplat.data.agreement import (
 )
 from etsplat.data.dataset import Dataset
 from etsplat.data.visual_hull import Distance, outside_hull
-from etsplat.geometry.measures import vertex_normals
+from etsplat.geometry.measures import mean_edge, vertex_normals
 from etsplat.geometry.subdivision import longest_edge_plan
 from etsplat.geometry.topology import MeshTopology, connected
 
@@ -154,7 +154,7 @@ def _push(photos: list[Photo], outside: Distance, vertices: Tensor, faces: Tenso
     )
     cost = torch.where(found.isnan(), _UNKNOWN, 1 - found.clamp(0, 1)).masked_fill(~free, torch.inf)
     depth = _depths(cost, links)
-    edge = float((vertices[edges[:, 0]] - vertices[edges[:, 1]]).norm(dim=1).mean())
+    edge = mean_edge(vertices, edges)
     depth = _where_agreed(depth, found, links, edge / float(depths[1]))
     way, moved = depths[depth], vertices.clone()
     moved[own] += way[:, None] * inward

@@ -22,7 +22,7 @@ from etsplat.data.agreement import (
 from etsplat.data.dataset import Dataset
 from etsplat.data.silhouettes import Silhouette
 from etsplat.geometry.films import tight_film
-from etsplat.geometry.measures import vertex_normals
+from etsplat.geometry.measures import mean_edge, vertex_normals
 from etsplat.geometry.topology import MeshTopology, connected
 
 _OUTLINE = 1.5
@@ -94,7 +94,7 @@ def _needed(
     photos: list[Photo], views: list[Silhouette], vertices: Tensor, normals: Tensor, edges: Tensor, free: Tensor
 ) -> Bool[Tensor, " V"]:
     """The vertices that outlines need, the sharpest first, and those that touch none."""
-    length = float((vertices[edges[:, 0]] - vertices[edges[:, 1]]).norm(dim=1).mean())
+    length = mean_edge(vertices, edges)
     outlines = [_Outline(photo, view, vertices) for photo, view in zip(photos, views, strict=True)]
     sharpness = ((vertices - _between(vertices, edges, _ROUND)) * normals).sum(dim=1)
     reach = _REACH * length / pixel_size(photos)

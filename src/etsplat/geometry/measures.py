@@ -23,6 +23,11 @@ def vertex_normals(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) ->
     return torch.nn.functional.normalize(total, dim=1)
 
 
+def mean_edge(vertices: Float[Tensor, "V 3"], edges: Int[Tensor, "E 2"]) -> float:
+    """The mean length of edges, in the units of the vertices."""
+    return float((vertices[edges[:, 0]] - vertices[edges[:, 1]]).norm(dim=1).mean())
+
+
 def enclosed_volume(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> float:
     """The volume inside a closed oriented mesh, positive if its normals point outwards: sum of a . (b x c) / 6."""
     corners = vertices[faces].double()

@@ -166,8 +166,9 @@ class SubdivideAndUntangle(Strategy):
         vertices, topology = mesh.vertices.detach().cpu(), mesh.topology.to(torch.device("cpu"))
         plan = longest_edge_plan(vertices, topology, face_areas(vertices, topology.faces), self._budgets[iteration])
         carried = apply_subdivision(plan, self.adam, per_vertex=mesh.vertex_parameters, per_face=mesh.face_parameters)
-        faces, vertices = plan.faces, carried["vertices"].detach().cpu()
+        faces = plan.faces
         if self._flips:
+            vertices = carried["vertices"].detach().cpu()
             faces = flipped(vertices, MeshTopology.from_faces(faces, len(vertices)))
         mesh.load_state({**carried, "faces": faces})
         return True
