@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Sequence
 from functools import reduce
+from itertools import pairwise
 
 import numpy as np
 
@@ -249,11 +250,97 @@ def well(g: Grid) -> Field:
     return union(wall, g.disc(-0.8, 0.6, 0.05), roof, *posts, bar, bucket, bail, g.disc(-0.29, 0.12, 0.03))
 
 
+def bucket(g: Grid) -> Field:
+    """A wall that widens, open above, and a bail that stands upright."""
+    wall = np.maximum(0.95 * np.abs(g.around - (0.45 + 0.15 * g.z)) - 0.03, np.abs(g.z + 0.25) - 0.5)
+    bail = np.maximum(g.ring((0, 0, 0.15), 0.52, 0.025, 1), 0.15 - g.z)
+    return union(wall, g.disc(-0.75, 0.36, 0.04), bail)
+
+
+def glasses(g: Grid) -> Field:
+    """Two rims, a bridge, and temples that bend down at their ends: nothing is thicker than a twentieth."""
+    parts = [g.rod((-0.09, 0, 0.05), (0.09, 0, 0.05), 0.025)]
+    for side in (-1, 1):
+        hinge, ear = (0.75 * side, 0, 0.08), (0.72 * side, 0.95, 0.08)
+        parts += [g.ring((0.4 * side, 0, 0), 0.32, 0.035, 1), g.rod((0.68 * side, 0, 0.08), hinge, 0.03)]
+        parts += [g.rod(hinge, ear, 0.024), g.rod(ear, (0.7 * side, 1.05, -0.15), 0.024)]
+    return union(*parts)
+
+
+def lantern(g: Grid) -> Field:
+    """Six posts between a base and a roof, a candle among them, and a ring on top: six holes."""
+    angles = math.tau * np.arange(6) / 6
+    posts = [
+        g.rod((0.45 * x, 0.45 * y, -0.65), (0.45 * x, 0.45 * y, 0.45), 0.035)
+        for x, y in zip(np.cos(angles), np.sin(angles), strict=True)
+    ]
+    roof = np.maximum(0.8 * (g.around - 0.55 + 1.3 * (g.z - 0.45)), 0.42 - g.z)
+    candle = g.rod((0, 0, -0.6), (0, 0, -0.15), 0.13)
+    return union(g.disc(-0.68, 0.55, 0.06), roof, candle, g.ring((0, 0, 0.94), 0.12, 0.03, 1), *posts)
+
+
+def pretzel(g: Grid) -> Field:
+    """A rope whose ends cross above each other and run back into it: three holes."""
+    x = (0, 0.4, 0.7, 0.82, 0.7, 0.4, 0.12, -0.15, -0.33, -0.42)
+    z = (-0.56, -0.6, -0.38, 0.02, 0.4, 0.52, 0.3, -0.05, -0.32, -0.56)
+    y = (0, 0, 0, 0, 0, 0.06, 0.09, 0.09, 0.04, 0)
+    halves = [[np.array((side * a, side * b, c)) for a, b, c in zip(x, y, z, strict=True)] for side in (-1, 1)]
+    return union(*(g.rod(a, b, 0.1) for path in halves for a, b in pairwise(path)))
+
+
+def book(g: Grid) -> Field:
+    """Open, upright: two covers at an angle, with three leaves between that touch at the spine alone."""
+    pages = []
+    for angle, length in ((20, 0.8), (58, 0.72), (90, 0.72), (122, 0.72), (160, 0.8)):
+        way = np.array([math.cos(math.radians(angle)), math.sin(math.radians(angle))])
+        along, across = way[0] * g.x + way[1] * (g.y + 0.4), way[0] * (g.y + 0.4) - way[1] * g.x
+        half = 0.03 if length == 0.8 else 0.018
+        pages.append(
+            np.maximum(
+                np.maximum(np.abs(across) - half, np.abs(along - length / 2) - length / 2), np.abs(g.z) - length * 0.8
+            )
+        )
+    return union(*pages)
+
+
+def can(g: Grid) -> Field:
+    """For watering: half open above, a long spout that ends in a ball, a handle behind, another over the top."""
+    wall = np.maximum(np.abs(g.around - 0.4) - 0.03, np.abs(g.z + 0.3) - 0.4)
+    lid = np.maximum(g.disc(0.1, 0.42, 0.03), 0.05 - g.x)
+    spout = union(g.rod((0.38, 0, -0.5), (0.9, 0, 0.25), 0.06), g.rod((0.88, 0, 0.22), (0.93, 0, 0.3), 0.13))
+    handle, top = g.ring((-0.4, 0, -0.28), 0.3, 0.035, 1), g.ring((0, 0, 0.1), 0.38, 0.035, 1)
+    outside = np.maximum(g.around - 0.41, np.abs(g.z + 0.3) - 0.39)
+    return union(wall, lid, g.disc(-0.7, 0.42, 0.04), *(np.maximum(part, -outside) for part in (spout, handle, top)))
+
+
+def rings(g: Grid) -> Field:
+    """Four parts one above another that do not touch, the gaps as narrow as a twentieth."""
+    return union(
+        *(g.ring((0, 0, z), radius, 0.13) for z, radius in ((-0.5, 0.68), (-0.19, 0.56), (0.12, 0.44), (0.43, 0.32)))
+    )
+
+
+def bottle(g: Grid) -> Field:
+    """A wide belly behind a long narrow neck, hollow, with a handle between them."""
+    radius = 0.14 + 0.32 / (1 + np.exp(14 * (g.z - 0.1)))
+    wall = np.maximum(0.6 * np.abs(g.around - radius) - 0.025, np.abs(g.z) - 0.85)
+    handle = np.maximum(g.ring((0.3, 0, 0.25), 0.28, 0.035, 1), -0.6 * (g.around - radius))
+    return union(wall, g.disc(-0.83, 0.47, 0.05), handle)
+
+
+def helix(g: Grid) -> Field:
+    """A spring: a thin wire of five turns whose coils do not touch, with a plate at each end."""
+    turns = np.linspace(0, 5 * math.tau, 160)
+    path = np.stack([0.5 * np.cos(turns), 0.5 * np.sin(turns), np.linspace(-0.7, 0.7, len(turns))], axis=1)
+    return union(g.disc(-0.75, 0.62, 0.05), g.disc(0.75, 0.62, 0.05), *(g.rod(a, b, 0.045) for a, b in pairwise(path)))
+
+
 SHAPES: dict[str, Callable[[Grid], Field]] = {
     shape.__name__: shape
     for shape in (
         *(chair, chain, bowl, vase, plant, gear, cage, plate, figures),
         *(teapot, comb, clasp, basket, shelf),
         *(cottage, tree, violin, well),
+        *(bucket, glasses, lantern, pretzel, book, can, rings, bottle, helix),
     )
 }
