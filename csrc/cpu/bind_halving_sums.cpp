@@ -13,6 +13,13 @@ void bind_halving_sums(nb::module_& m) {
             add_halving_sums(pixels, longest.data(), sums.data());
         },
         "face", "barycentrics", "lacking", "counted", "longest", "sums");
+    // Of R parts of the photos: sums (R, F, 2, 15), gains (F,).
+    def_function(
+        m, "halving_gains",
+        [](Array<const float, 4> sums, Array<double, 1> gains) {
+            halving_gains(sums.data(), sums.size(0), sums.size(1), gains.data());
+        },
+        "sums", "gains");
 }
 
 }  // namespace etsplat

@@ -20,4 +20,9 @@ struct HalvingPixels {
 // at whose middle a face is halved.
 void add_halving_sums(const HalvingPixels& pixels, const int64_t* longest, float* sums);
 
+// By how much the sum of squared differences of each part of the photos is less for the halves of a face, added up, where both
+// halves and whole are corrected by all other parts: sums (parts, faces, 2, kHalvingSums), gains (faces). 0 where fewer than
+// two parts show a face: what a single one shows, nobody else says anything of.
+void halving_gains(const float* sums, int64_t parts, int64_t faces, double* gains);
+
 }  // namespace etsplat

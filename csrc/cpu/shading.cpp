@@ -9,11 +9,13 @@
 
 #include "math/texture.h"
 #include "parallel.h"
+#include "prefetch.h"
 
 namespace etsplat {
 namespace {
 
-constexpr int kBands = 8;  // in the backward pass
+constexpr int kBands = 8;      // in the backward pass
+constexpr size_t kAhead = 16;  // faces of a band
 
 // The camera's centre in world space.
 struct Center {
@@ -49,69 +51,68 @@ void for_each_run(const int32_t* triangle, int32_t width, int64_t y, const Visit
     }
 }
 
-// Sums of some of many rows: those that are asked for, 0 at first. A large mesh shows few of its faces in a band.
-class SparseRows {
+// Cotangents of what one band of rows shows: of each of its faces, in the order in which they come.
+struct BandSums {
+    std::vector<int32_t> faces;
+    std::vector<float> sums;  // of each: of its colour (channels), or those of `Weights` (channels, Weights::kCount)
+    std::vector<float> moved; // (3, 3) of its corners' places
+    std::vector<double> background;
+};
+
+// Where a thread finds the sums of a face: -1 throughout between bands, so that no band has to fill them.
+class Places {
 public:
-    explicit SparseRows(int32_t width) : width_(width) {}
+    // The table of this thread, for as long as it gathers a band.
+    Places(int64_t faces, BandSums& sums) : table_(of_this_thread(faces)), sums_(sums) {}
+    ~Places() {
+        for (const int32_t face : sums_.faces) table_[face] = -1;
+    }
+    Places(const Places&) = delete;
+    Places& operator=(const Places&) = delete;
 
-    // Where the sums of a row begin. `places` has -1 for each row, at first.
-    int64_t place(int64_t row, std::vector<int32_t>& places) {
-        int32_t& found = places[row];
+    // Where the sums of a face begin, so many of them, 0 at first.
+    float* find(int64_t face, int32_t count) {
+        int32_t& found = table_[face];
         if (found < 0) {
-            rows_.push_back(row);
-            sums_.resize(sums_.size() + width_, 0.0f);
-            found = static_cast<int32_t>(rows_.size()) - 1;
+            found = static_cast<int32_t>(sums_.faces.size());
+            sums_.faces.push_back(static_cast<int32_t>(face));
+            sums_.sums.resize(sums_.sums.size() + count, 0.0f);
         }
-        return static_cast<int64_t>(found) * width_;
-    }
-    float* at(int64_t place) { return sums_.data() + place; }
-
-    void forget(std::vector<int32_t>& places) const {
-        for (const int64_t row : rows_) places[row] = -1;
-    }
-
-    // Columns [begin, begin + columns) of all sums to as wide rows.
-    void add_to(float* out, int32_t begin, int32_t columns) const {
-        const float* from = sums_.data() + begin;
-        for (const int64_t row : rows_) {
-            for (int32_t i = 0; i < columns; ++i) out[row * columns + i] += from[i];
-            from += width_;
-        }
+        return sums_.sums.data() + static_cast<int64_t>(found) * count;
     }
 
 private:
-    int32_t width_;
-    std::vector<int64_t> rows_;
-    std::vector<float> sums_;
-};
-
-// Where a thread looks places up: -1 throughout between bands, so that no band has to fill them.
-struct Places {
-    std::vector<int32_t> colors, vertices;
-
-    static Places& of_this_thread(int64_t colors, int64_t vertices) {
-        thread_local Places places;
-        if (static_cast<int64_t>(places.colors.size()) < colors) places.colors.resize(colors, -1);
-        if (static_cast<int64_t>(places.vertices.size()) < vertices) places.vertices.resize(vertices, -1);
-        return places;
+    static std::vector<int32_t>& of_this_thread(int64_t faces) {
+        thread_local std::vector<int32_t> table;
+        if (static_cast<int64_t>(table.size()) < faces) table.resize(faces, -1);
+        return table;
     }
+
+    std::vector<int32_t>& table_;
+    BandSums& sums_;
 };
 
-// Cotangents of one band of rows. Those of a vertex' colour and of its place are one row, if both are asked for.
-struct BandSums {
-    SparseRows colors, vertices;
-    std::vector<double> background;
+// What the cotangents of a face's pixels are multiplied by before they are added up: its barycentrics and their products.
+//
+// With cotangents G_c of a pixel's channels, a corner gets b_k G_c, and its place -b_m u, u = V^-T (g - sum_j b_j g_j) with
+// g_k = sum_c G_c C_kc (`interpolation_derivative`). Of all pixels together that is -V^-T S_m with
+//
+//     S_mk = sum_c (D_kc sum b_m G_c - sum_j D_jc sum b_m b_j G_c),   D_k = C_k - C_0,
+//
+// as barycentrics add up to 1: nothing of a face but its pixels' barycentrics has to be looked at pixel by pixel.
+struct Weights {
+    static constexpr int kCount = 8;  // two of them 0, to be added side by side
 
-    // Leaves the tables of its thread as they were.
-    struct Gathering {
-        const BandSums& sums;
-        Places& places;
+    float of[kCount];
 
-        ~Gathering() {
-            sums.colors.forget(places.colors);
-            sums.vertices.forget(places.vertices);
-        }
-    };
+    explicit Weights(const float* b)
+        : of{b[0], b[1], b[2], b[0] * b[1], b[0] * b[2], b[1] * b[2], 0.0f, 0.0f} {}
+
+    // Of the products of two corners, by the sums of a channel.
+    static double product(const float* sums, int i, int j) {
+        if (i != j) return sums[2 + i + j];
+        return static_cast<double>(sums[i]) - sums[2 + i + (i + 1) % 3] - sums[2 + i + (i + 2) % 3];
+    }
 };
 
 // Pictures have three channels nearly always: the compiler unrolls loops over so many.
@@ -126,38 +127,40 @@ class ShadeBackward {
 public:
     ShadeBackward(const ShadeInput& in, Channels channels, const float* grad_shaded, const ShadeGradients& out)
         : in_(in), grad_shaded_(grad_shaded), out_(out), center_(in.camera), channels_(channels) {
-        const int64_t faces = in.mesh.num_faces, vertices = in.mesh.num_vertices;
         interpolates_ = in.colors_of == ColorsOf::kVertices || in.colors_of == ColorsOf::kCorners;
         moves_ = out.vertices && interpolates_;
-        together_ = moves_ && out.colors && in.colors_of == ColorsOf::kVertices;
-        moved_rows_ = moves_ && !together_ ? vertices : 0;
-        colored_rows_ = 0;
-        if (!out.colors) return;
-        if (in.colors_of == ColorsOf::kFaces) colored_rows_ = faces;
-        if (in.colors_of == ColorsOf::kVertices) colored_rows_ = vertices;
-        if (in.colors_of == ColorsOf::kCorners) colored_rows_ = 3 * faces;
     }
 
-    BandSums nothing() const {
-        return {SparseRows(channels_ + (together_ ? 3 : 0)), SparseRows(3), std::vector<double>(channels_, 0.0)};
-    }
-
-    void gather(int band, BandSums& sums) const {
-        Places& places = Places::of_this_thread(colored_rows_, moved_rows_);
-        const BandSums::Gathering gathering{sums, places};
-        const int32_t width = in_.camera.width, height = in_.camera.height;
-        for (int32_t y = height * band / kBands; y < height * (band + 1) / kBands; ++y) {
-            for_each_run(in_.triangle, width, y, [&](int32_t face, int64_t begin, int64_t end) {
-                run(face, begin, end, sums, places);
-            });
+    BandSums gather(int band) const {
+        BandSums sums;
+        sums.background.assign(channels_, 0.0);
+        {
+            Places places(in_.mesh.num_faces, sums);
+            const int32_t width = in_.camera.width, height = in_.camera.height;
+            for (int32_t y = height * band / kBands; y < height * (band + 1) / kBands; ++y) {
+                for_each_run(in_.triangle, width, y, [&](int32_t face, int64_t begin, int64_t end) {
+                    run(face, begin, end, sums, places);
+                });
+            }
         }
+        if (moves_) move(sums);
+        return sums;
     }
 
     void add_up(const std::vector<BandSums>& bands) const {
         for (const BandSums& band : bands) {
-            if (out_.colors) band.colors.add_to(out_.colors, 0, channels_);
-            if (together_) band.colors.add_to(out_.vertices, channels_, 3);
-            else if (moves_) band.vertices.add_to(out_.vertices, 0, 3);
+            const float *sums = band.sums.data(), *moved = band.moved.data();
+            for (const int64_t face : band.faces) {
+                if (!interpolates_) add(sums, channels_, out_.colors + face * channels_);
+                for (int i = 0; i < 3 && interpolates_; ++i) {
+                    float* color = out_.colors ? out_.colors + in_.corner_color(face, i) : nullptr;
+                    for (int32_t c = 0; c < channels_ && color; ++c) color[c] += sums[c * Weights::kCount + i];
+                    const int64_t vertex = in_.mesh.faces[3 * face + i];
+                    if (moves_) add(moved + 3 * i, std::integral_constant<int32_t, 3>{}, out_.vertices + 3 * vertex);
+                }
+                sums += sums_of_face();
+                moved += 9;
+            }
         }
         if (!out_.background) return;
         for (int32_t c = 0; c < channels_; ++c) {
@@ -168,63 +171,78 @@ public:
     }
 
 private:
+    template <class Count>
+    static void add(const float* from, Count count, float* to) {
+        for (int32_t i = 0; i < count; ++i) to[i] += from[i];
+    }
+
     // Pixels [begin, end) of a row see the same face, or none.
     void run(int32_t face, int64_t begin, int64_t end, BandSums& sums, Places& places) const {
-        if (face >= 0 && interpolates_) return interpolated(face, begin, end, sums, places);
-        if (face >= 0 && !out_.colors) return;
-        const int64_t size = (end - begin) * channels_;
-        const float* grad = grad_shaded_ + begin * channels_;
-        if (face >= 0 && in_.colors_of == ColorsOf::kPixels) {
-            for (int64_t i = 0; i < size; ++i) out_.colors[begin * channels_ + i] += grad[i];
-            return;
+        if (face < 0) {
+            for (int64_t p = begin; p < end; ++p) {
+                for (int32_t c = 0; c < channels_; ++c) sums.background[c] += grad_shaded_[p * channels_ + c];
+            }
+        } else if (in_.colors_of == ColorsOf::kPixels) {
+            if (out_.colors) add(grad_shaded_ + begin * channels_, (end - begin) * channels_, out_.colors + begin * channels_);
+        } else if (interpolates_ && (out_.colors || moves_)) {
+            interpolated(begin, end, places.find(face, sums_of_face()));
+        } else if (out_.colors) {
+            float* into = places.find(face, channels_);
+            for (int64_t p = begin; p < end; ++p) add(grad_shaded_ + p * channels_, channels_, into);
         }
-        float* into = face < 0 ? nullptr : sums.colors.at(sums.colors.place(face, places.colors));
+    }
+
+    int32_t sums_of_face() const { return interpolates_ ? channels_ * Weights::kCount : int32_t{channels_}; }
+
+    void interpolated(int64_t begin, int64_t end, float* sums) const {
         for (int64_t p = begin; p < end; ++p) {
-            const float* g = grad_shaded_ + p * channels_;
+            const Weights weights(in_.barycentrics + 3 * p);
             for (int32_t c = 0; c < channels_; ++c) {
-                if (face < 0) sums.background[c] += g[c];
-                else into[c] += g[c];
+                const float g = grad_shaded_[p * channels_ + c];
+                for (int i = 0; i < Weights::kCount; ++i) sums[c * Weights::kCount + i] += weights.of[i] * g;
             }
         }
     }
 
-    void interpolated(int64_t face, int64_t begin, int64_t end, BandSums& sums, Places& places) const {
-        const float* color[3];
-        int64_t into[3] = {0, 0, 0};
-        float* summed[3];
+    // Asks for what `move` reads of a face: its corners lie anywhere in memory.
+    void look_ahead(int64_t face) const {
+        const int32_t* corners = in_.mesh.faces + 3 * face;
         for (int i = 0; i < 3; ++i) {
-            const int64_t from = in_.corner_color(face, i);
-            color[i] = in_.colors + from;
-            if (out_.colors) into[i] = sums.colors.place(from / channels_, places.colors);
-        }
-        for (int i = 0; i < 3; ++i) summed[i] = sums.colors.at(into[i]);
-        ViewInverse<double> inverse;
-        if (moves_) inverse = center_.inverse(in_.mesh, face);
-        Vector3<double> moved[3] = {};
-        for (int64_t p = begin; p < end; ++p) {
-            const float* g = grad_shaded_ + p * channels_;
-            double b[3], cotangent[3] = {0.0, 0.0, 0.0};
-            for (int i = 0; i < 3; ++i) {
-                b[i] = in_.barycentrics[3 * p + i];
-                for (int32_t c = 0; c < channels_; ++c) {
-                    if (out_.colors) summed[i][c] += static_cast<float>(b[i]) * g[c];
-                    cotangent[i] += static_cast<double>(g[c]) * color[i][c];
-                }
-            }
-            if (!moves_) continue;
-            const Vector3<double> u = interpolation_derivative(inverse, b, cotangent);
-            for (int i = 0; i < 3; ++i) moved[i] = moved[i] - b[i] * u;
-        }
-        for (int i = 0; moves_ && i < 3; ++i) {
-            float* into_vertex = together_ ? summed[i] + channels_ : moved_sums(face, i, sums, places);
-            into_vertex[0] += static_cast<float>(moved[i].x);
-            into_vertex[1] += static_cast<float>(moved[i].y);
-            into_vertex[2] += static_cast<float>(moved[i].z);
+            prefetch(in_.mesh.vertices + 3 * static_cast<int64_t>(corners[i]));
+            prefetch(in_.colors + in_.corner_color(face, i));
         }
     }
 
-    float* moved_sums(int64_t face, int corner, BandSums& sums, Places& places) const {
-        return sums.vertices.at(sums.vertices.place(in_.mesh.faces[3 * face + corner], places.vertices));
+    // From sums to cotangents of places.
+    void move(BandSums& band) const {
+        band.moved.resize(9 * band.faces.size());
+        const float* sums = band.sums.data();
+        float* moved = band.moved.data();
+        for (size_t number = 0; number < band.faces.size(); ++number) {
+            if (number + kAhead < band.faces.size()) look_ahead(band.faces[number + kAhead]);
+            const int64_t face = band.faces[number];
+            const ViewInverse<double> inverse = center_.inverse(in_.mesh, face);
+            const float* color[3];
+            for (int i = 0; i < 3; ++i) color[i] = in_.colors + in_.corner_color(face, i);
+            for (int m = 0; m < 3; ++m) {
+                double pull[3] = {0.0, 0.0, 0.0}, mean = 0.0;
+                for (int32_t c = 0; c < channels_; ++c) {
+                    const float* of = sums + c * Weights::kCount;
+                    for (int k = 1; k < 3; ++k) {
+                        const double beside = static_cast<double>(color[k][c]) - color[0][c];
+                        pull[k] += beside * of[m];
+                        mean += beside * Weights::product(of, m, k);
+                    }
+                }
+                const Vector3<double> u = (pull[0] - mean) * inverse.row[0] + (pull[1] - mean) * inverse.row[1] +
+                                          (pull[2] - mean) * inverse.row[2];
+                moved[3 * m] = static_cast<float>(-u.x);
+                moved[3 * m + 1] = static_cast<float>(-u.y);
+                moved[3 * m + 2] = static_cast<float>(-u.z);
+            }
+            sums += sums_of_face();
+            moved += 9;
+        }
     }
 
     const ShadeInput& in_;
@@ -232,8 +250,7 @@ private:
     const ShadeGradients& out_;
     Center center_;
     Channels channels_;
-    int64_t colored_rows_, moved_rows_;
-    bool interpolates_, moves_, together_;
+    bool interpolates_, moves_;
 };
 
 template <class Channels>
@@ -270,9 +287,9 @@ void shade(const ShadeInput& in, float* shaded) {
 void shade_backward(const ShadeInput& input, const float* grad_shaded, const ShadeGradients& gradients) {
     with_channels(input.channels, [&](auto channels) {
         const ShadeBackward shading(input, channels, grad_shaded, gradients);
-        std::vector<BandSums> bands(kBands, shading.nothing());
+        std::vector<BandSums> bands(kBands);
         parallel_for(kBands, 1, [&](int64_t begin, int64_t end) {
-            for (int64_t band = begin; band < end; ++band) shading.gather(static_cast<int>(band), bands[band]);
+            for (int64_t band = begin; band < end; ++band) bands[band] = shading.gather(static_cast<int>(band));
         });
         shading.add_up(bands);
     });

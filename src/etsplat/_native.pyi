@@ -167,6 +167,7 @@ def add_halving_sums(
     longest: torch.Tensor,
     sums: torch.Tensor,
 ) -> None: ...
+def halving_gains(*, sums: torch.Tensor, gains: torch.Tensor) -> None: ...
 def mesh_energies(
     *,
     vertices: torch.Tensor,

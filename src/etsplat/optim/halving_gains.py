@@ -16,18 +16,8 @@ from etsplat.core.validation import dense
 _PARTS = 4
 """Of the photos, each left out once."""
 
-_RIDGE = 1.0
-"""Corrections keep to none, and those of halves to that of the whole, as if so many pixels at each corner said so."""
-
-_SQUARE = (0, 1, 2, 1, 3, 4, 2, 4, 5)
-"""Where each of the nine products of barycentrics is among the six that are kept."""
-
-_PRODUCTS = 6
-
-_SIZES = (0, 3, 5)
-"""Which of them are squares, above 0 where there is a pixel."""
-
-_TOGETHER = 1 << 12
+_SUMS = 15
+"""Six products of barycentrics, nine of these and what a pixel lacks (csrc/cpu/halving_sums.h)."""
 
 
 class HalvingGains:
@@ -42,7 +32,7 @@ class HalvingGains:
         self._count = len(corners)
         corners = corners.detach().cpu()
         self._longest = (corners.roll(-1, dims=1) - corners).norm(dim=2).argmax(dim=1)
-        self._sums = torch.zeros(_PARTS, self._count, 2, _PRODUCTS + 9)
+        self._sums = torch.zeros(_PARTS, self._count, 2, _SUMS)
 
     def add(
         self,
@@ -67,26 +57,6 @@ class HalvingGains:
 
     def gains(self) -> Float[Tensor, " F"]:
         """By how much less the sum of squared differences of photos left out is for the halves, float64."""
-        in_parts = (self._sums[..., _SIZES].sum(dim=(2, 3)) > 0).sum(dim=0)
-        asked = (in_parts > 1).nonzero()[:, 0]  # what a single part shows, nobody else says anything of
-        gained = torch.zeros(self._count, dtype=torch.float64)
-        gained[asked] = torch.cat([_gains(self._sums[:, some].double()) for some in asked.split(_TOGETHER)])
+        gained = torch.empty(self._count, dtype=torch.float64)
+        _native.halving_gains(sums=self._sums, gains=gained)
         return gained
-
-
-def _gains(sums: Float[Tensor, "R F 2 15"]) -> Float[Tensor, " F"]:
-    squares = sums[..., _SQUARE].unflatten(-1, (3, 3))
-    pulls = sums[..., _PRODUCTS:].unflatten(-1, (3, 3))
-    ridge = _RIDGE * torch.eye(3, dtype=sums.dtype)
-    known_squares, known_pulls = squares.sum(dim=0) - squares, pulls.sum(dim=0) - pulls
-    whole = torch.linalg.solve(known_squares.sum(dim=2) + ridge, known_pulls.sum(dim=2))[:, :, None]
-    halves = whole + torch.linalg.solve(known_squares + ridge, known_pulls - known_squares @ whole)
-    gained = _square_sums(whole, squares, pulls) - _square_sums(halves, squares, pulls)
-    return gained.sum(dim=(0, 2))
-
-
-def _square_sums(
-    corrections: Float[Tensor, "R F #2 3 3"], squares: Float[Tensor, "R F 2 3 3"], pulls: Float[Tensor, "R F 2 3 3"]
-) -> Float[Tensor, "R F 2"]:
-    """Of what corrections leave, but for a part that is the same for all of them."""
-    return (corrections * (squares @ corrections - 2 * pulls)).sum(dim=(-1, -2))
