@@ -221,6 +221,20 @@ def test_a_hollow_is_not_much_deeper_than_it_is_wide():
         assert bool((found > 0).any()) is opens
 
 
+@pytest.mark.parametrize(
+    ("side", "on_the_lid", "behind", "opened"),
+    [(12, 0.25, 0.6, True), (12, 0.5, 0.6, False), (12, 0.25, 0.5, False), (6, 0.25, 0.6, False), (6, 0.25, 0.8, True)],
+)
+def test_photos_agree_behind_a_lid_well_or_much_better_than_on_it(
+    side: int, on_the_lid: float, behind: float, opened: bool
+) -> None:
+    """Much better is enough for wide lids alone: on a few vertices photos agree by chance."""
+    found = torch.full((side * side, 10), 0.3)
+    found[:, 0], found[:, 5] = on_the_lid, behind
+    depth = torch.full((side * side,), 5)
+    assert torch.equal(_where_agreed(depth, found, grid_links(side), 1.0) > 1, torch.full((side * side,), opened))
+
+
 def test_a_shaft_in_a_wide_hollow_goes_hardly_deeper_than_the_hollow() -> None:
     side = 12
     depth = torch.full((side, side), 5)

@@ -38,6 +38,10 @@ _DEEPEST = 1.5
 _AGREED = 0.75
 """Correlation of photos that show one surface; those of different ones have about 0.3."""
 
+_PARTLY, _BETTER, _WIDE = 0.55, 0.3, 64
+"""Or so much, if that is by so much more than on the lid, and on so many vertices that it is no chance: of a deep
+hollow with dark walls little is seen before it is open."""
+
 _CONFIRMED = 0.5
 """Mean correlation on a hollow as photos see it once it is open, at least: its walls are seen at a slant."""
 
@@ -252,13 +256,19 @@ def _where_agreed(depth: Tensor, found: Tensor, edges: Tensor, edge: float) -> T
     deep = depth > 1
     count, lid = connected(edges[deep[edges].all(dim=1)], len(depth))
     size = torch.zeros(count).index_add(0, lid, deep.float())
-    known = ~at.isnan()
-    asked = torch.zeros(count).index_add(0, lid, known.float())
-    agreement = torch.zeros(count).index_add(0, lid, at.nan_to_num()) / asked.clamp_min(1)
+    agreement, asked = _means(at, lid, count)
+    closed, _ = _means(found[:, 0], lid, count)
     deepest = torch.zeros(count).scatter_reduce(0, lid, depth.float(), "amax")
-    opened = (size >= _FEWEST) & (2 * asked >= size) & (agreement >= _AGREED)
+    partly = (size >= _WIDE) & (agreement >= _PARTLY) & (agreement - closed >= _BETTER)
+    opened = (size >= _FEWEST) & (2 * asked >= size) & ((agreement >= _AGREED) | partly)
     opened &= deepest <= _SLENDER * edge * size.sqrt()
     return _without_shafts(torch.where(deep & opened[lid], depth, 0), edges, edge)
+
+
+def _means(values: Float[Tensor, " N"], group: Int64[Tensor, " N"], count: int) -> tuple[Tensor, Tensor]:
+    """(count,) means of what is known of each group, and how many of it are."""
+    known = torch.zeros(count).index_add(0, group, (~values.isnan()).float())
+    return torch.zeros(count).index_add(0, group, values.nan_to_num()) / known.clamp_min(1), known
 
 
 def _mistaken(
@@ -285,9 +295,7 @@ def _mistaken(
     after = [first_hits(photo, moved, faces) for photo in photos]
     shown = surface_agreement(photos, after, moved, faces, edges)
     count, lid = connected(edges[deep[edges].all(dim=1)], len(deep))
-    known = deep & ~shown.isnan()
-    asked = torch.zeros(count).index_add(0, lid, known.float())
-    agreement = torch.zeros(count).index_add(0, lid, torch.where(known, shown, 0.0)) / asked.clamp_min(1)
+    agreement, _ = _means(torch.where(deep, shown, torch.nan), lid, count)
     own = torch.where(deep, lid, -1)[faces].amax(dim=1)
     seen, lost = torch.zeros(count), torch.zeros(count)
     for photo, (_, was), (_, hit) in zip(photos, before, after, strict=True):
