@@ -35,6 +35,12 @@ def test_points_that_training_photos_do_not_show_do_not_count() -> None:
     assert shown_width(views, points[1:2]) is None
 
 
+def test_what_many_photos_show_counts_no_more_than_what_one_does() -> None:
+    """Ten points in the middle, in all three photos, and fifteen far behind it, in one."""
+    points = torch.cat([torch.zeros(10, 3), torch.tensor([[-60.0, 0.0, 0.0]]).expand(15, 3)])
+    assert shown_width(capture(80, 40, 3.0), points) == pytest.approx(2 * 63 * 3**-0.5 * 2, rel=1e-3)
+
+
 def test_widths_of_points_are_those_of_the_photos_that_show_them() -> None:
     """Of the origin that of every photo; elsewhere their harmonic mean; none of what none shows."""
     views = capture(80, 40, 3.0)

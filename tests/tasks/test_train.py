@@ -64,7 +64,7 @@ def test_a_soup_is_fitted(run: tuple[TrainResult, list[object]]) -> None:
     psnrs = [line["psnr"] for line in history if "psnr" in line]
     assert run[0].metrics["psnr"] == pytest.approx(psnrs[-1])
     assert psnrs[-1] > psnrs[0]
-    assert psnrs[-1] > 14
+    assert psnrs[-1] > 13.5
     assert history[-1]["loss"] < 0.85 * history[0]["loss"]
 
 

@@ -6,15 +6,17 @@ from torch import Tensor
 
 from etsplat.data.dataset import Dataset, middles_of
 
-_POINTS, _VIEWS = 10_000, 64
-"""So many of the points are looked at at most, and in so many of the views."""
+_POINTS = 10_000
+"""So many of the points are looked at at most."""
 
 _OFTEN = 24
-"""Views for what is asked again and again."""
+"""Views that are asked, of many."""
 
 
 def shown_width(capture: Dataset, points: Float[Tensor, "P 3"]) -> float | None:
     """The longer side of what photos show at the points that are in them, in units of the capture's frame: the median.
+
+    Each point counts once: what is near is in many photos, and may be a small part of what is to be drawn.
 
     Args:
         capture: photos with cameras; those of its training views count.
@@ -23,16 +25,8 @@ def shown_width(capture: Dataset, points: Float[Tensor, "P 3"]) -> float | None:
     Returns:
         None where no training view sees a point.
     """
-    points = points.double()[:: max(1, len(points) // _POINTS)]
-    widths = []
-    for index in middles_of(capture.train, min(_VIEWS, len(capture.train))):
-        (width, height), K, viewmat = capture.images.sizes[index], capture.Ks[index], capture.viewmats[index]
-        camera = points @ viewmat[:3, :3].T + viewmat[:3, 3]
-        camera = camera[camera[:, 2] > 0]
-        pixel = camera @ K.T / camera[:, 2:]
-        seen = ((pixel[:, :2] >= 0) & (pixel[:, :2] < torch.tensor([width, height]))).all(dim=1)
-        widths.append(camera[seen, 2] * max(width, height) / K[0, 0])
-    found = torch.cat([torch.empty(0, dtype=torch.float64), *widths])
+    found = ShownWidths(capture)(points.double()[:: max(1, len(points) // _POINTS)])
+    found = found[found.isfinite()]
     return float(found.median()) if len(found) else None
 
 
