@@ -290,16 +290,13 @@ def pretzel(g: Grid) -> Field:
 
 def book(g: Grid) -> Field:
     """Open, upright: two covers at an angle, with three leaves between that touch at the spine alone."""
+    cover, leaf = (0.8, 0.03), (0.72, 0.018)  # how long, and half how thick
     pages = []
-    for angle, length in ((20, 0.8), (58, 0.72), (90, 0.72), (122, 0.72), (160, 0.8)):
-        way = np.array([math.cos(math.radians(angle)), math.sin(math.radians(angle))])
-        along, across = way[0] * g.x + way[1] * (g.y + 0.4), way[0] * (g.y + 0.4) - way[1] * g.x
-        half = 0.03 if length == 0.8 else 0.018
-        pages.append(
-            np.maximum(
-                np.maximum(np.abs(across) - half, np.abs(along - length / 2) - length / 2), np.abs(g.z) - length * 0.8
-            )
-        )
+    for angle, (length, half) in ((20, cover), (58, leaf), (90, leaf), (122, leaf), (160, cover)):
+        x, y = math.cos(math.radians(angle)), math.sin(math.radians(angle))
+        along, across = x * g.x + y * (g.y + 0.4), x * (g.y + 0.4) - y * g.x
+        side = np.maximum(np.abs(across) - half, np.abs(along - length / 2) - length / 2)
+        pages.append(np.maximum(side, np.abs(g.z) - length * 0.8))
     return union(*pages)
 
 

@@ -47,7 +47,8 @@ def capture() -> Dataset:
 @pytest.fixture(scope="module")
 def run(capture: Dataset, tmp_path_factory: pytest.TempPathFactory) -> tuple[TrainResult, list[object]]:
     events: list[object] = []
-    return train(capture, tmp_path_factory.mktemp("soup") / "run", TINY, callbacks=[events.append]), events
+    config = TINY.changed({"iterations": 200})  # after 120 what a seed changes is as much as what the last of them gain
+    return train(capture, tmp_path_factory.mktemp("soup") / "run", config, callbacks=[events.append]), events
 
 
 def stop_at(iteration: int) -> Callable[[object], None]:
@@ -64,7 +65,7 @@ def test_a_soup_is_fitted(run: tuple[TrainResult, list[object]]) -> None:
     psnrs = [line["psnr"] for line in history if "psnr" in line]
     assert run[0].metrics["psnr"] == pytest.approx(psnrs[-1])
     assert psnrs[-1] > psnrs[0]
-    assert psnrs[-1] > 13.5
+    assert psnrs[-1] > 14.4  # seeds 0 to 3 end at 14.6 to 15.0
     assert history[-1]["loss"] < 0.85 * history[0]["loss"]
 
 
