@@ -87,6 +87,7 @@ def test_presets_of_reconstruct_are_what_they_were(preset: str) -> None:
     config = flatten(ReconstructConfig.of(preset).to_dict())
     since = {"start.hull_faces": 12_500, "start.near": 0.3, "start.near_edge": 0.02, "start.near_reach": 2.0}
     since["start.near_fall"] = "exponential" if preset in ("paper", "study", "tiny") else "late"
+    since["start.near_iterations"] = 2500 if preset == "quick" else None
     since["refinement.reach"] = 0.5
     since |= {"drawing.harmonics": 0, "optimizer.lr_harmonics": 5e-4}
     since["start.shape"] = "sphere" if preset in ("paper", "study", "tiny") else "auto"

@@ -10,16 +10,19 @@ import trimesh
 
 from etsplat.core.errors import InputError
 from etsplat.data.dataset import Dataset
+from etsplat.data.hollows import Opened
 from etsplat.data.photograph import photograph
 from etsplat.data.pictures import Box, StoredPictures, cropped
 from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.parts import Shape, genera, shape_of
 from etsplat.io.mesh_files import MeshFile
+from etsplat.io.run_directory import RunDirectory
+from etsplat.model.triangle_mesh import TriangleMesh
 from etsplat.optim.loop import Event, NoteEvent
-from etsplat.tasks.judgement import expect_hull
+from etsplat.tasks.judgement import CONTRADICTED, expect_hull
 from etsplat.tasks.reconstruct import reconstruct
 from etsplat.tasks.reconstruct_config import ReconstructConfig
-from etsplat.tasks.starts import Hull, finer_shape, plain_hull, start_shape
+from etsplat.tasks.starts import Hull, Started, finer_shape, plain_hull, start_shape, within_need
 from helpers.reconstructions import SHORT, KilledError, kill_at, pebble_mesh, untimed
 
 
@@ -60,6 +63,13 @@ def test_photos_that_together_show_all_of_an_object_start_from_the_hull() -> Non
 
 def hull_shape(hull: Hull) -> Shape:
     return shape_of(hull.vertices, hull.faces)
+
+
+def painted_ball() -> MeshFile:
+    """A ball in stripes, on which photos agree."""
+    vertices, faces = icosphere(4)
+    colors = 0.5 + 0.5 * torch.sin(torch.tensor([11.0, 17.0, 23.0]) * vertices[faces].mean(dim=1))
+    return MeshFile(vertices, faces, face_colors=colors)
 
 
 def ring_of(thickness: float) -> MeshFile:
@@ -119,6 +129,39 @@ def test_settings_of_one_start_are_taken_where_it_is_chosen_as_the_run_begins(tm
     reconstruct(views, tmp_path, config)
     told = json.loads((tmp_path / "config.json").read_text())["config"]["start"]
     assert (told["shape"], told["level"], told["near"]) == ("auto", 1, 0.5)
+
+
+def test_a_hull_that_is_near_all_over_takes_the_fewer_iterations() -> None:
+    """Neither one with hollows, nor one that photos contradict, nor a length that was asked for."""
+    quick, (vertices, faces) = ReconstructConfig.quick(), icosphere(1)
+    mesh = TriangleMesh.from_mesh(vertices, faces, colors=0.5, opacity=0.98, sigma=0.25)
+    opened = Opened(vertices, faces, 0, CONTRADICTED, 0.05, 0.5)
+    near = Started(mesh, "hull", opened)
+    config, about = within_need(quick, near)
+    assert config == quick.changed({"iterations": 2500})
+    assert about is not None
+    assert "2,500 iterations, not 5,000" in about
+    others = [opened._replace(**{name: value}) for name, value in (("doubtful", 0.051), ("agreed", 0.49))]
+    for other in (*others, opened._replace(contradicted=0.006), None):
+        assert within_need(quick, Started(mesh, "hull", other)) == (quick, None)
+    for asked in ({"iterations": 4999}, {"iterations": 5001}, {"start.near_iterations": None}):
+        assert within_need(quick.changed(asked), near)[1] is None
+    for unasked in (ReconstructConfig.best(), ReconstructConfig.demo(), ReconstructConfig.paper()):
+        assert within_need(unasked, near) == (unasked, None)
+
+
+def test_a_run_that_needs_fewer_iterations_is_shorter_and_says_why(tmp_path: Path) -> None:
+    """In a note and in config.json; killed and resumed it has the same bits."""
+    views = photograph(painted_ball(), 64, 64, supersampling=1)
+    config = ReconstructConfig.tiny().changed({"start.shape": "hull", "start.near_iterations": 20})
+    events = list[Event]()
+    whole = reconstruct(views, tmp_path / "whole", config, callbacks=[events.append])
+    assert whole.metrics["iterations"] == RunDirectory(whole.path).read_config()["iterations"] == 20
+    assert any(isinstance(each, NoteEvent) and "20 iterations, not 300" in each.text for each in events)
+    with pytest.raises(KilledError):
+        reconstruct(views, tmp_path / "killed", config, callbacks=[kill_at(10)])
+    resumed = reconstruct(views, tmp_path / "killed", config, resume=True)
+    assert untimed(resumed.path) == untimed(whole.path)
 
 
 def test_a_given_mesh_is_the_start(pebble: MeshFile, tmp_path: Path) -> None:

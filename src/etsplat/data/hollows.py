@@ -91,12 +91,34 @@ class Opened(NamedTuple):
         faces: (F2, 3), at most half as many again as before.
         moved: how many vertices moved.
         contradicted: the largest patch that photos contradicted when they were last asked (`contradicted_share`).
+        doubtful: the part of the vertices that moved, or that no two photos saw then.
+        agreed: the part of the vertices on which photos agreed then.
     """
 
     vertices: Float[Tensor, "V2 3"]
     faces: Int64[Tensor, "F2 3"]
     moved: int
     contradicted: float
+    doubtful: float
+    agreed: float
+
+
+class _Look(NamedTuple):
+    """One look at all lids: where vertices are then, how many moved, and what photos said of the surface before.
+
+    Attributes:
+        vertices: (V, 3).
+        moved: how many.
+        contradicted: the largest patch (`contradicted_share`).
+        unseen: the part of the vertices that no two photos see.
+        agreed: the part on which photos agree.
+    """
+
+    vertices: Float[Tensor, "V 3"]
+    moved: int
+    contradicted: float
+    unseen: float
+    agreed: float
 
 
 @torch.no_grad()
@@ -115,30 +137,35 @@ def open_hollows(dataset: Dataset, vertices: Float[Tensor, "V 3"], faces: Int64[
     dataset = reduced(dataset)
     photos = photos_of(dataset)
     if len(photos) < 2 or len(vertices) == 0:
-        return Opened(vertices, faces, 0, 0.0)
+        return Opened(vertices, faces, 0, 0.0, 1.0, 0.0)
     edge, most = float(_edge_lengths(vertices, faces).mean()), len(faces) * 3 // 2
-    outside, total, share = outside_hull(dataset), 0, 0.0
+    outside, total, look = outside_hull(dataset), 0, _Look(vertices, 0, 0.0, 1.0, 0.0)
     for _ in range(_PASSES):
-        vertices, moved, share = _push(photos, outside, vertices, faces)
-        if moved == 0:
+        look = _push(photos, outside, vertices, faces)
+        if look.moved == 0:
             break
-        total += moved
-        vertices, faces = _divided(vertices, faces, _LONGEST * edge, most)
-    return Opened(vertices, faces, total, share)
+        total += look.moved
+        vertices, faces = _divided(look.vertices, faces, _LONGEST * edge, most)
+    doubtful = min(1.0, total / len(vertices) + look.unseen)
+    return Opened(vertices, faces, total, look.contradicted, doubtful, look.agreed)
 
 
-def _push(photos: list[Photo], outside: Distance, vertices: Tensor, faces: Tensor) -> tuple[Tensor, int, float]:
-    """Moved vertices, how many, and what photos contradict before: one look at all lids."""
+def _push(photos: list[Photo], outside: Distance, vertices: Tensor, faces: Tensor) -> _Look:
+    """One look at all lids."""
     edges = MeshTopology.from_faces(faces, len(vertices)).edges.long()
     pixel = pixel_size(photos)
     hits = [first_hits(photo, vertices, faces) for photo in photos]
 
     score = surface_agreement(photos, hits, vertices, faces, edges)
-    share = contradicted_share(score, vertices, faces, edges)
     lid = score < _AGREED
+    said = (
+        contradicted_share(score, vertices, faces, edges),
+        float(score.isnan().float().mean()),
+        float((score >= _AGREED).float().mean()),
+    )
     own = lid.nonzero()[:, 0]
     if len(own) < _FEWEST:
-        return vertices, 0, share
+        return _Look(vertices, 0, *said)
     number = torch.full((len(vertices),), -1)
     number[own] = torch.arange(len(own))
     links = number[edges[lid[edges].all(dim=1)]]
@@ -169,7 +196,7 @@ def _push(photos: list[Photo], outside: Distance, vertices: Tensor, faces: Tenso
     deep[own] = way > depths[1]
     way = way.masked_fill(_mistaken(photos, hits, moved, faces, deep, edges)[own], 0.0)
     moved[own] = vertices[own] + way[:, None] * inward
-    return moved, int((way > depths[1]).sum()), share
+    return _Look(moved, int((way > depths[1]).sum()), *said)
 
 
 def _divided(vertices: Tensor, faces: Tensor, longest: float, most: int) -> tuple[Tensor, Tensor]:

@@ -58,7 +58,7 @@ from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.running import Job, Result, path_of, settings_for, terms_of
 from etsplat.tasks.scoring import Scorer, load_lpips
 from etsplat.tasks.sources import Source, fingerprint, load_source, make_subject
-from etsplat.tasks.starts import Started, finer_shape, load_start, make_start, nearby
+from etsplat.tasks.starts import Started, finer_shape, load_start, make_start, nearby, within_need
 from etsplat.tasks.texturing import check_installed
 
 DEPTHS_NEAR, DEPTHS_FAR = 0.02, 0.15
@@ -185,7 +185,8 @@ def reconstruct(
             form = holes if mesh.topology.is_closed() else "open where photos look onto the inner side of its surface"
             job.announce(NoteEvent(f"start: the visual hull, {mesh.count:,} faces; {form}"))
             config = nearby(config)
-        config = _fitting(config, views, mesh, job)
+        config = _told(job, *within_need(config, started))
+        config = _told(job, *within_pixels(config, views, mesh))
         trust = _trusted_depths(views, config, begun, job)
         trainer = make_trainer(mesh, views, config, scorer.cheap, trust, near=begun == "hull")
         with job.writing():  # what only the first of several workers does goes through `job.first`
@@ -208,9 +209,8 @@ def reconstruct(
     return ReconstructResult(job.run.path, metrics, mesh.to_file(frame))
 
 
-def _fitting(config: ReconstructConfig, views: Dataset, start: TriangleMesh, job: Job) -> ReconstructConfig:
-    """With no more faces and iterations than photos have pixels for; the run's length is that from here on."""
-    config, about = within_pixels(config, views, start)
+def _told(job: Job, config: ReconstructConfig, about: str | None) -> ReconstructConfig:
+    """Settings that a run is made with, and says so; its length is theirs from here on."""
     if about is not None:
         job.announce(NoteEvent(about))
         job.shorten(config.iterations)

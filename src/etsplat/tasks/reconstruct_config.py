@@ -88,6 +88,9 @@ class Start:
     near_fall: Annotated[Literal["exponential", "late"], _HULL] = "late"
     """How that rate falls: as it does elsewhere; or late, which stays high for longer and ends as low.
     Hollows, which travel far, are then opened deeper in as many steps."""
+    near_iterations: Annotated[int | None, Range(1), _HULL] = None
+    """A run of the preset's own length ends after so many iterations where the hull is near the surface all over:
+    hardly a hollow was to be opened, and photos see nearly all of it and agree there. None for all of them."""
     near_edge: Annotated[float, Range(0, 1), _HULL] = 0.02
     """And the weight of edges by this: pulled tight they fill hollows."""
     near_reach: Annotated[float, Range(0), _HULL] = 2.0
@@ -360,7 +363,7 @@ _PRESETS: dict[str, dict[str, Any]] = {
         "refinement.subdivisions": 15,
         "output.checkpoint_every": 1000,
     },
-    "quick": _QUICK,
+    "quick": {**_QUICK, "start.near_iterations": 2500},
     "demo": {**_QUICK, "iterations": 2500},
     "tiny": {
         **_PAPER,

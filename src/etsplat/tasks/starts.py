@@ -12,7 +12,7 @@ from etsplat.core.errors import InputError
 from etsplat.data.agreement import Photo, first_hits, photos_of
 from etsplat.data.dataset import Dataset
 from etsplat.data.false_handles import silhouette_errors, without_false_handles
-from etsplat.data.hollows import open_hollows
+from etsplat.data.hollows import Opened, open_hollows
 from etsplat.data.lids import without_lids
 from etsplat.data.plain_sides import with_flat_sides
 from etsplat.data.silhouettes import silhouette, touches_border
@@ -23,7 +23,7 @@ from etsplat.geometry.topology import MeshTopology
 from etsplat.geometry.untangle import untangle
 from etsplat.io.mesh_files import MeshFile, load_mesh, weld_vertices
 from etsplat.model.triangle_mesh import MeshAppearance, TriangleMesh
-from etsplat.tasks.judgement import Start
+from etsplat.tasks.judgement import CONTRADICTED, Start
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 
 _FACES = 4000
@@ -31,6 +31,10 @@ _FACES = 4000
 
 _LOST = 0.05
 """The part of silhouettes that it may leave uncovered, in the mean: less than a limb."""
+
+_DOUBTFUL, _AGREED = 0.05, 0.5
+"""A hull is near the surface all over if no larger part of its vertices was moved or is not seen by two photos:
+hollows, which travel on to the end of a run; and if photos agree on so many, which they hardly do on thin parts."""
 
 _UNCOVERED, _LESS = 0.0005, 0.9
 """A hull that leaves more of the silhouettes uncovered lacks thin parts if a finer one leaves at most so many times as
@@ -59,14 +63,19 @@ class Started(NamedTuple):
     Attributes:
         mesh: in the unit frame.
         kind: where it comes from.
-        contradicted: the largest patch of a hull that photos contradict, as a fraction of its area; 0 otherwise.
+        opened: the hull with its hollows open, and what photos say of it; None for another kind.
         hull: that it was, before it was mended; None for another kind.
     """
 
     mesh: TriangleMesh
     kind: Start
-    contradicted: float
+    opened: Opened | None = None
     hull: Hull | None = None
+
+    @property
+    def contradicted(self) -> float:
+        """The largest patch of a hull that photos contradict, as a fraction of its area; 0 for another kind."""
+        return 0.0 if self.opened is None else self.opened.contradicted
 
 
 def load_start(start: str | Path | MeshFile | None) -> MeshFile | None:
@@ -134,12 +143,13 @@ def make_start(
     """
     colors: Tensor | float = config.start.color
     kind: Start = start_shape(config, views) if start is None else "mesh"
-    contradicted, hull = 0.0, None
+    opened, hull = None, None
     if kind == "hull":
         hull = plain_hull(views, config)
         mended = without_lids(views, *without_false_handles(views, hull.vertices, hull.faces))
-        vertices, faces, _, contradicted = open_hollows(views, *mended)
-        vertices = with_flat_sides(views, vertices, faces)
+        opened = open_hollows(views, *mended)
+        faces = opened.faces
+        vertices = with_flat_sides(views, opened.vertices, faces)
         vertices = untangle(vertices, MeshTopology.from_faces(faces, len(vertices)))[0]
     elif start is None:
         vertices, faces = icosphere(config.start.level)
@@ -159,7 +169,7 @@ def make_start(
         appearance=MeshAppearance(kernel, config.drawing.distance, config.drawing.backend),
         harmonics=config.drawing.harmonics,
     )
-    return Started(mesh, kind, contradicted, hull)
+    return Started(mesh, kind, opened, hull)
 
 
 @torch.no_grad()
@@ -223,3 +233,27 @@ def nearby(config: ReconstructConfig) -> ReconstructConfig:
         regularization=replace(weights, lambda_edge=start.near_edge * weights.lambda_edge),
         refinement=replace(edits, reach=start.near_reach) if edits.untanglings else edits,
     )
+
+
+def within_need(config: ReconstructConfig, started: Started) -> tuple[ReconstructConfig, str | None]:
+    """The settings with `start.near_iterations` where a hull is near the surface all over.
+
+    Args:
+        config: as asked for. A length that is not its preset's own stays.
+        started: from `make_start`.
+
+    Returns:
+        What the run is made with; and a sentence about it, or None if it is what was asked for.
+    """
+    enough, own = config.start.near_iterations, ReconstructConfig.of(config.preset).iterations
+    if enough is None or config.iterations != own or own <= enough or not _near(started.opened):
+        return config, None
+    about = f"the hull is near the surface all over: {enough:,} iterations, not {own:,} (start.near_iterations)"
+    return replace(config, iterations=enough), about
+
+
+def _near(opened: Opened | None) -> bool:
+    """Whether a hull is near the surface all over, as far as photos tell."""
+    if opened is None:
+        return False
+    return opened.doubtful <= _DOUBTFUL and opened.agreed >= _AGREED and opened.contradicted <= CONTRADICTED
