@@ -116,13 +116,17 @@ void zero_floats(float* values, int64_t count) {
     parallel_for(count, kChunk, [values](int64_t begin, int64_t end) { std::fill(values + begin, values + end, 0.0f); });
 }
 
-// One thread goes from the first row to the last. Several first list for each chunk of rows which belong to which range of
-// sums, then each adds to ranges of its own, chunk by chunk: the same order for every sum.
+void add_by_index(const float* values, const int32_t* indices, int64_t count, int64_t channels, float* sums) {
+    add_rows(values, indices, count, channels, sums, [](int64_t k) { return k; });
+}
+
+// One thread goes from the first row to the last. Many first list for each chunk of rows which belong to which range of
+// sums, then each adds to ranges of its own, chunk by chunk: the same order for every sum. That is four times the work.
 void sum_by_index(const float* values, const int32_t* indices, int64_t count, int64_t rows, int64_t channels, float* sums) {
     constexpr int64_t kListed = int64_t{1} << 13;  // rows of a chunk
-    if (num_threads() == 1 || count < 2 * kListed) {
+    if (num_threads() <= 4 || count < 2 * kListed) {
         std::fill(sums, sums + rows * channels, 0.0f);
-        return add_rows(values, indices, count, channels, sums, [](int64_t k) { return k; });
+        return add_by_index(values, indices, count, channels, sums);
     }
     int shift = 0;
     while ((rows >> shift) >= 4 * num_threads()) ++shift;
@@ -144,6 +148,18 @@ void sum_by_index(const float* values, const int32_t* indices, int64_t count, in
                 add_rows(values + at * channels, indices + at, *end - begin, channels, sums,
                          [listed](int64_t k) { return int64_t{listed[k]}; });
             }
+        }
+    });
+}
+
+void gather_rows(const float* values, const int32_t* indices, int64_t count, int64_t channels, float* rows) {
+    parallel_for(count, kChunk, [=](int64_t begin, int64_t end) {
+        for (int64_t i = begin; i < end; ++i) {
+            const float* value = values + indices[i] * channels;
+            if (channels == 3)
+                std::copy(value, value + 3, rows + 3 * i);
+            else
+                std::copy(value, value + channels, rows + channels * i);
         }
     });
 }

@@ -24,5 +24,10 @@ bool are_intrinsics(const float* Ks, int64_t count);  // of pinhole cameras with
 // sums (rows, channels): row g is the sum of those rows i of values (count, channels) whose indices[i] is g, from the first
 // to the last. Indices are from 0 to rows - 1.
 void sum_by_index(const float* values, const int32_t* indices, int64_t count, int64_t rows, int64_t channels, float* sums);
+// The same on the calling thread alone, added to what is in sums already.
+void add_by_index(const float* values, const int32_t* indices, int64_t count, int64_t channels, float* sums);
+
+// Row i of rows (count, channels) is that row of values which indices[i] says.
+void gather_rows(const float* values, const int32_t* indices, int64_t count, int64_t channels, float* rows);
 
 }  // namespace etsplat

@@ -27,6 +27,13 @@ void bind_array_scans(nb::module_& m) {
             sum_by_index(values.data(), indices.data(), indices.count(), sums.size(0), sums.size(1), sums.data());
         },
         "values", "indices", "sums");
+    // values (V, C), an index from 0 to V - 1 for each row of rows (..., C).
+    def_function(
+        m, "gather_rows",
+        [](Array<const float, 2> values, Array<const int32_t> indices, Array<float> rows) {
+            gather_rows(values.data(), indices.data(), indices.count(), values.size(1), rows.data());
+        },
+        "values", "indices", "rows");
 }
 
 }  // namespace etsplat

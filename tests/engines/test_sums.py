@@ -1,4 +1,4 @@
-"""Sums by index of the CPU engine."""
+"""Sums and copies by index of the CPU engine."""
 
 import numpy as np
 import pytest
@@ -25,6 +25,17 @@ def test_rows_are_added_in_their_order_for_any_number_of_threads(count, rows, ch
         _native.sum_by_index(values=values, indices=indices, sums=sums)
         assert np.array_equal(sums.numpy(), expected)
     set_num_threads(before)
+
+
+@pytest.mark.sanitize
+@pytest.mark.parametrize("channels", [1, 3, 5])
+@pytest.mark.parametrize("shape", [(0, 3), (7, 3), (30_000, 3)])
+def test_rows_are_gathered(channels, shape, rng):
+    values = torch.randn(9_000, channels, generator=rng)
+    indices = torch.randint(len(values), shape, generator=rng, dtype=torch.int32)
+    rows = torch.full((*shape, channels), torch.nan)
+    _native.gather_rows(values=values, indices=indices, rows=rows)
+    assert torch.equal(rows, values[indices.long()])
 
 
 @pytest.mark.sanitize

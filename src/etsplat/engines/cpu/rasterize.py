@@ -15,8 +15,10 @@ from etsplat.engines.native.pool import empty_image, zeros_image
 def _gather(_keep: bool, values: Tensor, _faces: Tensor, geometry: Geometry) -> tuple[Tensor, Any]:
     """(V, C) -> (N, 3, C). Autograd's own backward of the indexing takes longer than rasterizing."""
     assert geometry.faces is not None
-    # values[faces] takes five times as long
-    return values.index_select(0, geometry.faces.view(-1)).view(-1, 3, values.shape[1]), (geometry, values.shape)
+    # threads of torch that have gathered would spin for the next milliseconds, where those of the engine are to project
+    corners = empty_image(*geometry.faces.shape, values.shape[1])
+    _native.gather_rows(values=values, indices=geometry.faces, rows=corners)
+    return corners, (geometry, values.shape)
 
 
 def _scatter(kept: Any, _needed: Any, grad_corners: Tensor) -> tuple[Tensor]:
