@@ -28,17 +28,17 @@ struct BackwardBatch {
 };
 
 // Takes entries from `next` on that the forward pass drew, and returns where the next batch begins. Their slots, which lie
-// anywhere in memory, are on their way while kernels are evaluated.
-ETSPLAT_FN int collect(const RasterPass& pass, const TileFrame& frame, int next, int end, BackwardBatch& batch) {
-    constexpr int kAhead = 8;
-    const int stride = pass.slot_layout.stride();
+// anywhere in memory, are on their way while kernels are evaluated. Behind `end` those of the next tile are asked for.
+ETSPLAT_FN int collect(const RasterPass& pass, const TileFrame& frame, int next, int end, int next_tile, BackwardBatch& batch) {
+    constexpr int kAhead = 16;
+    const int last = entry_count(pass) - 1, stride = pass.slot_layout.stride();
     batch.pairs.clear();
     batch.count = 0;
     while (next < end && batch.count < kBatch && batch.pairs.count < BackwardBatch::kEnough) {
-        const TileEntry& coming = pass.entries[next + kAhead < end ? next + kAhead : end - 1];
-        prefetch(pass.records + coming.triangle);
+        const int ahead = next + kAhead < end ? next + kAhead : next + kAhead - end + next_tile;
+        const TileEntry& coming = pass.entries[ahead < last ? ahead : last];
+        prefetch_triangle(pass, coming.triangle);
         prefetch(pass.hits + coming.slot);
-        prefetch_colors(pass, coming.triangle);
         const TileEntry entry = pass.entries[next++];
         const unsigned blocks = pass.hits[entry.slot];
         if (blocks == 0) continue;

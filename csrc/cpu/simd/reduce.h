@@ -8,25 +8,27 @@
 
 namespace etsplat::ETSPLAT_SIMD {
 
-// Sums the touched slots of each triangle into rows (16, stride); returns the lanes that have any.
+// Sums the touched slots of each triangle into rows (16, stride), in order, from -0 on, which changes no number; returns the
+// lanes that have any.
 ETSPLAT_FN unsigned sum_slots(const RasterPass& pass, const TrianglePass& triangles, const LaneRange& range, float* rows) {
+    constexpr int kAhead = 32;
     const int stride = pass.slot_layout.stride();
+    const int32_t* begin = triangles.slot_begin + range.first;
     unsigned any = 0;
     for (int i = 0; i < range.count; ++i) {
-        float* row = rows + i * stride;
-        const int32_t* begin = triangles.slot_begin + range.first + i;
-        for (int32_t s = begin[0]; s < begin[1]; ++s) {
-            if (!pass.touched[s]) continue;
-            const float* slot = pass.slots + int64_t{s} * stride;
-            const bool first = (any >> i & 1) == 0;
-            for (int j = 0; j < stride; j += kLanes)
-                (first ? Vec::load(slot + j) : Vec::load(row + j) + Vec::load(slot + j)).store(row + j);
-            any |= 1u << i;
+        for (int j = 0; j < stride; j += kLanes) {
+            Vec sum(-0.0f);
+            for (int32_t s = begin[i]; s < begin[i + 1]; ++s) {
+                const float* slot = pass.slots + int64_t{s} * stride + j;
+                prefetch(slot + kAhead * kLanes);
+                if (!pass.touched[s]) continue;
+                sum = sum + Vec::load(slot);
+                any |= 1u << i;
+            }
+            sum.store(rows + i * stride + j);
         }
     }
-    if (any != 0)
-        for (int i = 0; i < kLanes; ++i)
-            if ((any >> i & 1) == 0) memset(rows + i * stride, 0, sizeof(float) * static_cast<size_t>(stride));
+    for (int i = range.count; i < kLanes; ++i) memset(rows + i * stride, 0, sizeof(float) * static_cast<size_t>(stride));
     return any;
 }
 

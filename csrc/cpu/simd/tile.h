@@ -115,6 +115,15 @@ ETSPLAT_FN void prefetch_colors(const RasterPass& pass, int32_t triangle) {
     }
 }
 
+// All that a tile reads of a triangle.
+ETSPLAT_FN void prefetch_triangle(const RasterPass& pass, int32_t triangle) {
+    prefetch(pass.records + triangle);
+    prefetch_colors(pass, triangle);
+}
+
+// Entries of all tiles: behind those of a tile come those of the next, which mostly the same thread draws.
+ETSPLAT_FN int entry_count(const RasterPass& pass) { return pass.tile_begin[pass.tiles_x * pass.tiles_y]; }
+
 ETSPLAT_FN float first_inverse_depth(const RasterPass& pass, int tile) {
     const int first = pass.tile_begin[tile];
     if (!pass.want_distortion || first == pass.tile_begin[tile + 1]) return 0.0f;

@@ -319,7 +319,7 @@ void backward_tile(const RasterPass& pass, int index, float* scratch) {
     BackwardBatch batch;
     const int end = pass.tile_done[index];
     for (int next = pass.tile_begin[index]; next < end;) {
-        next = collect(pass, frame, next, end, batch);
+        next = collect(pass, frame, next, end, pass.tile_begin[index + 1], batch);
         evaluate<Kernel>(pass, batch);
         for (int i = 0; i < batch.count; ++i) differentiate<kShape>(pass, tile, batch, i);
     }

@@ -103,11 +103,8 @@ struct Batch {
 ETSPLAT_FN void prepare(const RasterPass& pass, const TileFrame& frame, unsigned alive_blocks, const TileEntry* entries,
                         int count, int ahead, Batch& batch) {
     batch.pairs.clear();
-    // the records of the next batch are on their way while this one is drawn
-    for (int i = count; i < ahead; ++i) {
-        prefetch(pass.records + entries[i].triangle);
-        prefetch_colors(pass, entries[i].triangle);
-    }
+    // the records of the next batch, maybe of the next tile, are on their way while this one is drawn
+    for (int i = count; i < ahead; ++i) prefetch_triangle(pass, entries[i].triangle);
     for (int i = 0; i < count; ++i) {
         const TriangleRecord& record = pass.records[entries[i].triangle];
         batch.entries[i] = entries[i];
@@ -223,13 +220,13 @@ void forward_tile(const RasterPass& pass, int index, float* scratch) {
     if constexpr (kGeneral) tile.first_inverse_z = first_inverse_depth(pass, index);
     begin(tile, frame, pass.channels(), kGeneral);
     Batch batch;
-    const int end = pass.tile_begin[index + 1];
+    const int end = pass.tile_begin[index + 1], all = entry_count(pass);
     int next = pass.tile_begin[index];
     while (next < end) {
         const unsigned alive_blocks = tile.alive_blocks();
         if (alive_blocks == 0) break;
         const int count = end - next < kBatch ? end - next : kBatch;
-        const int ahead = end - next < 2 * kBatch ? end - next : 2 * kBatch;
+        const int ahead = all - next < count + kBatch ? all - next : count + kBatch;
         prepare(pass, frame, alive_blocks, pass.entries + next, count, ahead, batch);
         evaluate<Kernel>(pass, batch);
         for (int p = 0; p < batch.pairs.count; ++p) draw<kShape>(pass, tile, batch, p);

@@ -33,8 +33,17 @@ struct LaneRange {
 
 alignas(64) constexpr float kLaneNumber[kLanes] = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
 
+// Vertices lie anywhere in memory: asks for those of the triangles that follow the next group.
+ETSPLAT_FN void prefetch_corners(const TrianglePass& triangles, const LaneRange& range) {
+    const int64_t first = range.first + 2 * kLanes;
+    if (!triangles.faces || first + kLanes > triangles.count) return;
+    for (const int32_t* corner = triangles.faces + 3 * first; corner < triangles.faces + 3 * (first + kLanes); ++corner)
+        prefetch(triangles.vertices + int64_t{3} * *corner);
+}
+
 // World positions of the corners, (3, 3).
 ETSPLAT_FN void load_corners(const TrianglePass& triangles, const LaneRange& range, Vec world[9]) {
+    prefetch_corners(triangles, range);
     alignas(64) float lanes[9][kLanes];
     for (int i = 0; i < kLanes; ++i) {
         const int64_t triangle = range.first + (i < range.count ? i : 0);
