@@ -38,7 +38,7 @@ CXX=${CXX:-c++}
 build=build/native-$target
 mkdir -p "$build"
 
-avx512="-mavx512f -mavx512dq -mavx512bw -mavx512vl -mavx2 -mfma -mprefer-vector-width=512"
+avx512="-mavx512f -mavx512dq -mavx512bw -mavx512vl -mavx2 -mfma -mprefer-vector-width=512 -mtune=icelake-server"
 case $machine in
     x86_64) define=-DETSPLAT_X86=1 paths=("plain:" "avx2:-mavx2 -mfma" "avx512:$avx512") ;;
     aarch64 | arm64) define=-DETSPLAT_ARM64=1 paths=("plain:" "neon:") ;;
