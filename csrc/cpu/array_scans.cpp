@@ -10,6 +10,7 @@
 
 #include "parallel.h"
 #include "pool.h"
+#include "prefetch.h"
 
 namespace etsplat {
 namespace {
@@ -36,7 +37,9 @@ int32_t in_order(int32_t bits) { return bits ^ ((bits >> 31) & kMagnitude); }
 template <int Channels, class Place>
 void add_rows(const float* values, const int32_t* indices, int64_t count, int64_t channels, float* sums, Place place) {
     if constexpr (Channels > 0) channels = Channels;
+    constexpr int64_t kAhead = 24;
     for (int64_t k = 0; k < count; ++k) {
+        prefetch(sums + indices[place(k + kAhead < count ? k + kAhead : k)] * channels);
         const int64_t i = place(k);
         const float* row = values + i * channels;
         float* sum = sums + indices[i] * channels;

@@ -170,7 +170,6 @@ std::shared_ptr<RasterState> raster_forward(const RasterCall& call) {
     pass.entries = state->entries.data();
     if (call.keep_for_backward) {
         state->hits.resize(state->num_slots);
-        state->hits.fill_zero();
         pass.hits = state->hits.data();
         state->tile_done.resize(int64_t{pass.tiles_x} * pass.tiles_y);
         pass.tile_done = state->tile_done.data();

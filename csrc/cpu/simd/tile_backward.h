@@ -260,12 +260,11 @@ ETSPLAT_FN void differentiate(const RasterPass& pass, BackwardTile& tile, const 
         const Vec transmittance = Vec::load(tile.transmittance[block]);
         const unsigned alive = tile.alive[block];
         const VecMask mask = VecMask::from_bits(alive & batch.visible[pair]);
-        Vec w = alpha * transmittance;
-        const VecMask stop = mask & (transmittance - w < transmittance_min);
+        const Vec all = alpha * transmittance, rest = transmittance - all;
+        const VecMask stop = mask & (rest < transmittance_min), drawn = mask & (rest >= transmittance_min);
         tile.alive[block] = static_cast<uint16_t>(alive & ~stop.bits());
-        const VecMask drawn = and_not(mask, stop);
-        w = keep(drawn, w);
-        (transmittance - w).store(tile.transmittance[block]);
+        const Vec w = keep(drawn, all);
+        vselect(drawn, rest, transmittance).store(tile.transmittance[block]);
 
         // cotangent of the blend weight, and what else comes of colours
         Vec cotangent(0.0f), grad_form[3] = {cotangent, cotangent, cotangent};

@@ -152,10 +152,11 @@ ETSPLAT_FN void draw(const RasterPass& pass, ForwardTile& tile, Batch& batch, in
     const Vec transmittance = Vec::load(tile.transmittance[block]);
     const unsigned alive = tile.alive[block];
     const VecMask mask = VecMask::from_bits(alive & batch.visible[pair]);
-    Vec w = alpha * transmittance;
-    const VecMask stop = mask & (transmittance - w < Vec(pass.transmittance_min));
-    w = keep(and_not(mask, stop), w);
-    (transmittance - w).store(tile.transmittance[block]);
+    const Vec all = alpha * transmittance, rest = transmittance - all, transmittance_min(pass.transmittance_min);
+    // two comparisons, so that the next triangle need not wait for masks that become bits and masks again
+    const VecMask stop = mask & (rest < transmittance_min), drawn = mask & (rest >= transmittance_min);
+    const Vec w = keep(drawn, all);
+    vselect(drawn, rest, transmittance).store(tile.transmittance[block]);
     tile.alive[block] = static_cast<uint16_t>(alive & ~stop.bits());
     batch.hits[i] |= any_bit(mask.bits()) << block;
     for (int c = 0; c < flat; ++c) {
