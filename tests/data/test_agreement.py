@@ -7,11 +7,20 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample, normalize
 
-from etsplat.data.agreement import Photo, agreement, photos_of, pixel_size, unseen_vertices
+from etsplat.data.agreement import (
+    Photo,
+    agreement,
+    contradicted,
+    looked_at,
+    photos_of,
+    pixel_size,
+    unseen_vertices,
+)
 from etsplat.data.photograph import photograph
 from etsplat.engines.threads import num_threads, set_num_threads
 from etsplat.geometry.icosphere import icosphere
 from etsplat.io.mesh_files import MeshFile
+from helpers.painting import mean_colors, painted_pictures
 
 
 def test_of_a_ball_all_is_seen_and_of_a_deep_pit_in_it_the_bottom_is_not() -> None:
@@ -116,3 +125,17 @@ def test_no_more_photos_than_twelve_are_asked() -> None:
     )
     assert torch.isclose(every, best, equal_nan=True).float().mean() > 0.9  # but for equal cosines
     assert (~every.isnan()).sum() > 100
+
+
+@pytest.mark.parametrize(("shift", "counted"), [(0.01, False), (0.018, True)])
+def test_what_colours_explain_is_not_contradicted(shift: float, counted: bool) -> None:
+    """Nowhere on a plain ball do photos correlate; colours are a little wrong, on its cap by so much more."""
+    vertices, faces, views = painted_pictures(*icosphere(3), painted=False)
+    looked = looked_at(views, vertices, faces)
+    assert looked is not None
+    colors = mean_colors(views, vertices, faces) + 0.002
+    cap = vertices[faces].mean(dim=1)[:, 1] > 0.5
+    colors[cap] += shift
+    found = contradicted(looked._replace(score=torch.zeros(len(vertices))), colors)
+    assert (found > 0.1) is counted
+    assert found < 0.4
