@@ -12,15 +12,18 @@
 namespace etsplat::scene {
 
 inline constexpr int kWidth = 75, kHeight = 50, kTriangles = 200;  // partial tiles on two sides
-inline constexpr int kMostCorner = 3;
+inline constexpr int kMostCorner = 3, kMany = 2500;
 
-// Channels of each kind, and whether everything else is wanted too: one for each Shape of the tile loops.
+// Channels of each kind, and whether everything else is wanted too: one for each Shape of the tile loops. And many triangles
+// on the vertices of those few, in three chunks, whose gradients are added up while others are still to come.
 struct Pass {
     const char* name;
     int flat, corner;
-    bool everything;
+    bool everything, shared;
+    constexpr int triangles() const { return shared ? kMany : kTriangles; }
 };
-inline constexpr Pass kPasses[] = {{"flat", 3, 0, false}, {"corner", 0, 3, false}, {"general", 3, 2, true}};
+inline constexpr Pass kPasses[] = {
+    {"flat", 3, 0, false, false}, {"corner", 0, 3, false, false}, {"general", 3, 2, true, false}, {"shared", 3, 0, false, true}};
 
 // G = exp(-x / sigma) as a table (math/kernel_table.h), for the kernel "Tabulated".
 inline std::vector<float> exponential_table() {
@@ -65,6 +68,7 @@ struct Scene {
     std::vector<float> viewmat{1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 4, 0, 0, 0, 1};
     std::vector<float> K{60, 0, 37.3f, 0, 55, 25.2f, 0, 0, 1};
     std::vector<float> grad_color, grad_alpha, grad_distortion;
+    std::vector<int32_t> faces;
 
     Scene() {
         std::mt19937 random(1);
@@ -84,6 +88,11 @@ struct Scene {
         fill(grad_color, 5 * kWidth * kHeight, -1, 1);
         fill(grad_alpha, kWidth * kHeight, -1, 1);
         fill(grad_distortion, kWidth * kHeight, -1, 1);
+        for (int i = 0; i < 3 * kMany; ++i) faces.push_back(i % (3 * kTriangles));
+        for (std::vector<float>* each : {&flat, &opacities, &sigmas}) {
+            const size_t few = each->size();
+            for (size_t i = few; i < few / kTriangles * kMany; ++i) each->push_back((*each)[i - few]);
+        }
     }
 };
 
@@ -93,20 +102,21 @@ struct Result {
 };
 
 inline Result render(Scene& scene, int kernel, int distance, const Pass& pass) {
-    const int channels = pass.flat + pass.corner, pixels = kWidth * kHeight;
+    const int channels = pass.flat + pass.corner, pixels = kWidth * kHeight, triangles = pass.triangles();
     Result r;
     const auto make = [](std::vector<float>& v, int n) { v.assign(static_cast<size_t>(n), 0.0f); };
-    make(r.color, channels * pixels), make(r.alpha, pixels), make(r.distortion, pixels), make(r.weights, kTriangles);
-    make(r.vertices, 9 * kTriangles), make(r.flat, pass.flat * kTriangles);
-    make(r.corner, 3 * pass.corner * kTriangles);
-    make(r.opacities, kTriangles), make(r.sigmas, kTriangles), make(r.background, channels), make(r.viewmat, 16), make(r.K, 9);
+    make(r.color, channels * pixels), make(r.alpha, pixels), make(r.distortion, pixels), make(r.weights, triangles);
+    make(r.vertices, 9 * kTriangles), make(r.flat, pass.flat * triangles);
+    make(r.corner, 3 * pass.corner * triangles);
+    make(r.opacities, triangles), make(r.sigmas, triangles), make(r.background, channels), make(r.viewmat, 16), make(r.K, 9);
     std::vector<float> totals(static_cast<size_t>(2 * pixels)), sizes(kTriangles), inradii(kTriangles);
     std::vector<int32_t> median(static_cast<size_t>(pixels));
     std::vector<uint8_t> visible(kTriangles);
 
     RasterCall call;
     call.vertices = scene.vertices.data();
-    call.num_triangles = kTriangles;
+    if (pass.shared) call.faces = scene.faces.data();
+    call.num_triangles = triangles;
     call.num_vertices = 3 * kTriangles;
     call.flat_colors = scene.flat.data();
     call.flat_channels = pass.flat;
