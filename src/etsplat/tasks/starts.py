@@ -36,6 +36,9 @@ _DOUBTFUL, _AGREED = 0.05, 0.5
 """A hull is near the surface all over if no larger part of its vertices was moved or is not seen by two photos:
 hollows, which travel on to the end of a run; and if photos agree on so many, which they hardly do on thin parts."""
 
+_CALM = 1 / 3
+"""Of the rate of vertices, where a hull is near the surface all over: larger steps leave it for what noise says."""
+
 _UNCOVERED, _LESS = 0.0005, 0.9
 """A hull that leaves more of the silhouettes uncovered lacks thin parts if a finer one leaves at most so many times as
 much: what rough masks leave does not depend on how fine it is."""
@@ -236,7 +239,7 @@ def nearby(config: ReconstructConfig) -> ReconstructConfig:
 
 
 def within_need(config: ReconstructConfig, started: Started) -> tuple[ReconstructConfig, str | None]:
-    """The settings with `start.near_iterations` where a hull is near the surface all over.
+    """The settings with `start.near_iterations`, and slower vertices, where a hull is near the surface all over.
 
     Args:
         config: as asked for. A length that is not its preset's own stays.
@@ -249,7 +252,8 @@ def within_need(config: ReconstructConfig, started: Started) -> tuple[Reconstruc
     if enough is None or config.iterations != own or own <= enough or not _near(started.opened):
         return config, None
     about = f"the hull is near the surface all over: {enough:,} iterations, not {own:,} (start.near_iterations)"
-    return replace(config, iterations=enough), about
+    calmer = replace(config.optimizer, lr_vertices=_CALM * config.optimizer.lr_vertices)
+    return replace(config, iterations=enough, optimizer=calmer), about
 
 
 def _near(opened: Opened | None) -> bool:
