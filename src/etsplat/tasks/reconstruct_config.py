@@ -90,8 +90,8 @@ class Start:
     Hollows, which travel far, are then opened deeper in as many steps."""
     near_iterations: Annotated[int | None, Range(1), _HULL] = None
     """A run of the preset's own length ends after so many iterations where the hull is near the surface all over:
-    hardly a hollow was to be opened, and photos see nearly all of it and agree there. Vertices then move at a third
-    of the rate, too. None for all of them, at the whole rate."""
+    hardly a hollow was to be opened, and photos see nearly all of it and agree there.
+    Vertices then move at a third of the rate, too. None for all iterations, at the whole rate."""
     near_edge: Annotated[float, Range(0, 1), _HULL] = 0.02
     """And the weight of edges by this: pulled tight they fill hollows."""
     near_reach: Annotated[float, Range(0), _HULL] = 2.0
