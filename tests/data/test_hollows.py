@@ -196,9 +196,7 @@ def test_what_silhouettes_need_is_no_lid(bowl, inwards, mistaken):
     rim = height > 0.39
     moved = truth.clone()
     moved[rim, 1] -= 0.06 * float(inwards)
-    wanted = torch.full((len(truth),), 0.5)
-    assert bool(_mistaken(photos, hits, moved, faces, rim, edges, wanted).any()) is mistaken
-    assert bool(_mistaken(photos, hits, moved, faces, rim, edges, wanted + 0.5).any())
+    assert bool(_mistaken(photos, hits, moved, faces, rim, edges).any()) is mistaken
 
 
 def test_it_repeats_to_the_bit(bowl):
@@ -222,28 +220,23 @@ def test_a_hollow_is_not_much_deeper_than_it_is_wide():
     """Photos that agree far below a small lid show something else: its bottom would be out of sight."""
     side, agreed = 6, torch.full((36, 40), 0.9)
     for depth, opens in ((8, True), (11, True), (13, False), (39, False)):
-        found, _ = _where_agreed(torch.full((36,), depth), agreed, grid_links(side), 1.0)
+        found = _where_agreed(torch.full((36,), depth), agreed, grid_links(side), 1.0)
         assert bool((found > 0).all()) is opens
         assert bool((found > 0).any()) is opens
 
 
 @pytest.mark.parametrize(
-    ("side", "on_the_lid", "behind", "opened", "least"),
-    [
-        *((12, 0.4, 0.8, True, 0.5), (6, 0.4, 0.8, True, 0.5)),
-        *((12, 0.4, 0.45, True, 0.6), (12, 0.1, 0.45, True, 0.5)),
-        *((12, 0.1, 0.35, False, 0.5), (6, 0.1, 0.7, False, 0.5)),
-    ],
+    ("side", "on_the_lid", "behind", "opened"),
+    [(12, 0.25, 0.6, True), (12, 0.5, 0.6, False), (12, 0.25, 0.5, False), (6, 0.25, 0.6, False), (6, 0.25, 0.8, True)],
 )
-def test_photos_agree_behind_a_lid_well_or_partly(
-    side: int, on_the_lid: float, behind: float, opened: bool, least: float
+def test_photos_agree_behind_a_lid_well_or_much_better_than_on_it(
+    side: int, on_the_lid: float, behind: float, opened: bool
 ) -> None:
-    """Partly is enough for wide lids alone, if they then agree more than on the lid: few vertices agree by chance."""
+    """Much better is enough for wide lids alone: on a few vertices photos agree by chance."""
     found = torch.full((side * side, 10), 0.3)
     found[:, 0], found[:, 5] = on_the_lid, behind
-    depth, wanted = _where_agreed(torch.full((side * side,), 5), found, grid_links(side), 1.0)
-    assert torch.equal(depth > 1, torch.full((side * side,), opened))
-    torch.testing.assert_close(wanted, torch.full((side * side,), least))
+    depth = torch.full((side * side,), 5)
+    assert torch.equal(_where_agreed(depth, found, grid_links(side), 1.0) > 1, torch.full((side * side,), opened))
 
 
 def test_a_shaft_in_a_wide_hollow_goes_hardly_deeper_than_the_hollow() -> None:
@@ -253,8 +246,8 @@ def test_a_shaft_in_a_wide_hollow_goes_hardly_deeper_than_the_hollow() -> None:
     hollow = depth.flatten().clone()
     depth[5, 5:7] = 20
     agreed = torch.full((side * side, 40), 0.9)
-    assert torch.equal(_where_agreed(hollow, agreed, grid_links(side), 1.0)[0], hollow)
-    without, _ = _where_agreed(depth.flatten(), agreed, grid_links(side), 1.0)
+    assert torch.equal(_where_agreed(hollow, agreed, grid_links(side), 1.0), hollow)
+    without = _where_agreed(depth.flatten(), agreed, grid_links(side), 1.0)
     assert torch.equal(without.clamp_max(9), hollow)
     assert 9 <= int(without.max()) <= 12
 

@@ -38,9 +38,9 @@ _DEEPEST = 1.5
 _AGREED = 0.75
 """Correlation of photos that show one surface; those of different ones have about 0.3."""
 
-_PARTLY, _WIDE, _BETTER = 0.4, 40, 0.2
-"""Or so much, on so many vertices that it is no chance, if they agree by so much more once it is open than on the lid:
-of a deep hollow with dark walls little is seen before."""
+_PARTLY, _BETTER, _WIDE = 0.55, 0.3, 64
+"""Or so much, if that is by so much more than on the lid, and on so many vertices that it is no chance: of a deep
+hollow with dark walls little is seen before it is open."""
 
 _CONFIRMED = 0.5
 """Mean correlation on a hollow as photos see it once it is open, at least: its walls are seen at a slant."""
@@ -186,7 +186,7 @@ def _push(photos: list[Photo], outside: Distance, vertices: Tensor, faces: Tenso
     cost = torch.where(found.isnan(), _UNKNOWN, 1 - found.clamp(0, 1)).masked_fill(~free, torch.inf)
     depth = _depths(cost, links)
     edge = mean_edge(vertices, edges)
-    depth, least = _where_agreed(depth, found, links, edge / float(depths[1]))
+    depth = _where_agreed(depth, found, links, edge / float(depths[1]))
     way, moved = depths[depth], vertices.clone()
     moved[own] += way[:, None] * inward
     seen = seen_by(photos, [first_hits(photo, moved, faces) for photo in photos], moved[own], pixel)
@@ -194,8 +194,7 @@ def _push(photos: list[Photo], outside: Distance, vertices: Tensor, faces: Tenso
     moved[own] = vertices[own] + way[:, None] * inward
     deep = torch.zeros(len(vertices), dtype=torch.bool)
     deep[own] = way > depths[1]
-    wanted = torch.zeros(len(vertices)).index_put((own,), least)
-    way = way.masked_fill(_mistaken(photos, hits, moved, faces, deep, edges, wanted)[own], 0.0)
+    way = way.masked_fill(_mistaken(photos, hits, moved, faces, deep, edges)[own], 0.0)
     moved[own] = vertices[own] + way[:, None] * inward
     return _Look(moved, int((way > depths[1]).sum()), *said)
 
@@ -274,12 +273,8 @@ def _depths(cost: Float[Tensor, "N D"], edges: Int64[Tensor, "E 2"]) -> Int64[Te
     return belief().argmin(dim=1)
 
 
-def _where_agreed(
-    depth: Tensor, found: Tensor, edges: Tensor, edge: float
-) -> tuple[Int64[Tensor, " N"], Float[Tensor, " N"]]:
-    """The depths, 0 for lids under which photos do not agree, and for those that hardly move; and what confirms them.
-
-    That is how far photos must agree once the lid is open, mean over it.
+def _where_agreed(depth: Tensor, found: Tensor, edges: Tensor, edge: float) -> Tensor:
+    """The depths, 0 for lids under which photos agree no more than on a lid, and for those that hardly move.
 
     Hollows much deeper than wide are no hollows: no two photos could see their bottom. The length of an edge, by which
     widths are known, is given in depths.
@@ -291,11 +286,10 @@ def _where_agreed(
     agreement, asked = _means(at, lid, count)
     closed, _ = _means(found[:, 0], lid, count)
     deepest = torch.zeros(count).scatter_reduce(0, lid, depth.float(), "amax")
-    partly = (size >= _WIDE) & (agreement >= _PARTLY) & (agreement < _AGREED)
+    partly = (size >= _WIDE) & (agreement >= _PARTLY) & (agreement - closed >= _BETTER)
     opened = (size >= _FEWEST) & (2 * asked >= size) & ((agreement >= _AGREED) | partly)
     opened &= deepest <= _SLENDER * edge * size.sqrt()
-    least = torch.where(partly, closed + _BETTER, 0.0).clamp_min(_CONFIRMED)
-    return _without_shafts(torch.where(deep & opened[lid], depth, 0), edges, edge), least[lid]
+    return _without_shafts(torch.where(deep & opened[lid], depth, 0), edges, edge)
 
 
 def _means(values: Float[Tensor, " N"], group: Int64[Tensor, " N"], count: int) -> tuple[Tensor, Tensor]:
@@ -311,7 +305,6 @@ def _mistaken(
     faces: Int64[Tensor, "F 3"],
     deep: Bool[Tensor, " V"],
     edges: Int64[Tensor, "E 2"],
-    wanted: Float[Tensor, " V"],
 ) -> Bool[Tensor, " V"]:
     """Moved vertices of what is no lid: once it is open photos do not agree, or silhouettes show what is gone.
 
@@ -325,7 +318,6 @@ def _mistaken(
         faces: (F, 3).
         deep: (V,) which have.
         edges: (E, 2).
-        wanted: (V,) how far photos must agree, mean over a lid.
     """
     after = [first_hits(photo, moved, faces) for photo in photos]
     shown = surface_agreement(photos, after, moved, faces, edges)
@@ -337,7 +329,7 @@ def _mistaken(
         of = torch.where(was >= 0, own[was.clamp_min(0)], -1)
         seen += of[of >= 0].bincount(minlength=count)
         lost += of[(of >= 0) & (hit < 0) & (photo.pixels[0, 3] > 0.95)].bincount(minlength=count)
-    return deep & ((agreement - _LOST * lost / seen.clamp_min(1))[lid] < wanted)
+    return deep & (agreement - _LOST * lost / seen.clamp_min(1) < _CONFIRMED)[lid]
 
 
 def _without_shafts(depth: Int64[Tensor, " N"], edges: Int64[Tensor, "E 2"], edge: float) -> Int64[Tensor, " N"]:
