@@ -109,9 +109,10 @@ inline Result render(Scene& scene, int kernel, int distance, const Pass& pass) {
     make(r.vertices, 9 * kTriangles), make(r.flat, pass.flat * triangles);
     make(r.corner, 3 * pass.corner * triangles);
     make(r.opacities, triangles), make(r.sigmas, triangles), make(r.background, channels), make(r.viewmat, 16), make(r.K, 9);
-    std::vector<float> totals(static_cast<size_t>(2 * pixels)), sizes(kTriangles), inradii(kTriangles);
+    std::vector<float> totals(static_cast<size_t>(2 * pixels)), sizes, inradii;
+    make(sizes, triangles), make(inradii, triangles);
     std::vector<int32_t> median(static_cast<size_t>(pixels));
-    std::vector<uint8_t> visible(kTriangles);
+    std::vector<uint8_t> visible(static_cast<size_t>(triangles));
 
     RasterCall call;
     call.vertices = scene.vertices.data();

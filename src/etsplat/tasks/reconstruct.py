@@ -210,7 +210,7 @@ def reconstruct(
 
 
 def _told(job: Job, config: ReconstructConfig, about: str | None) -> ReconstructConfig:
-    """Settings that a run is made with, and says so; its length is theirs from here on."""
+    """These settings; if there is something to say of them, the run says it, and has their length from here on."""
     if about is not None:
         job.announce(NoteEvent(about))
         job.shorten(config.iterations)
