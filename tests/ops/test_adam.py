@@ -72,6 +72,30 @@ def test_rows_move_at_their_own_pace(engine, rng, shape):
 
 
 @pytest.mark.sanitize
+def test_calmed_rows_with_small_gradients_move_little(engine, rng):
+    """As far as others, times r^2 / (r^2 + (mean r)^2) of the moments before the step; without any, not at all."""
+    size = torch.tensor([1.0, 0.1, 0.0]).repeat(100)[:, None]
+    gradients = [size * torch.randn((300, 3), generator=rng) for _ in range(2)]
+    moved, roots = [], []
+    for calmed in (True, False):
+        parameter = torch.zeros(300, 3, dtype=dtype_of(engine), device=device_of(engine)).requires_grad_()
+        adam = Adam({"p": parameter}, {"p": 0.01})
+        for step, gradient in enumerate(gradients):
+            adam.calmed = frozenset({"p"}) if calmed else frozenset()
+            parameter.grad = gradient.to(parameter)
+            before = parameter.detach().cpu().clone()
+            roots.append(adam.second_moments["p"].cpu().sum(dim=1).sqrt())
+            on(engine, adam.step)
+            moved.append((step, calmed, parameter.detach().cpu() - before))
+    steps = {(step, calmed): by for step, calmed, by in moved}
+    assert torch.equal(steps[0, True], torch.zeros_like(steps[0, True]))
+    root = roots[1]
+    expected = (root**2 / (root**2 + root.mean() ** 2))[:, None] * steps[1, False]
+    torch.testing.assert_close(steps[1, True], expected, rtol=1e-4, atol=1e-7)
+    assert bool((steps[1, True][2::3] == 0).all())
+
+
+@pytest.mark.sanitize
 def test_rows_with_paces_decay_as_others_do(engine, rng):
     """A step of both goes as far as one of the decay alone, times the factor of the row."""
     start, gradient = (torch.randn((500, 3, 3), generator=rng).to(dtype_of(engine)) for _ in range(2))

@@ -5,7 +5,8 @@ import math
 import pytest
 import torch
 
-from etsplat.optim.schedules import exponential_decay, face_budgets, late_decay, regularization_weight
+from etsplat.ops.adam import Adam
+from etsplat.optim.schedules import begun_anew, exponential_decay, face_budgets, late_decay, regularization_weight
 from etsplat.optim.view_sampler import ViewSampler
 
 
@@ -42,6 +43,25 @@ def test_a_late_fall_travels_half_as_far_again_and_ends_as_low() -> None:
     assert late[900] < early[900]
     assert sorted(late, reverse=True) == late
     assert late_decay(1, 1, 0.02) == 1.0
+
+
+def test_steps_with_moments_begun_anew_are_those_of_a_new_run() -> None:
+    """Adam corrects moments for the steps since the start of a run; the factor on the rate makes up for it."""
+    gradients = [torch.tensor([1.0, -3.0]), torch.tensor([0.5, 2.0]), torch.tensor([-1.0, 0.1])]
+    moved = []
+    for before in (0, 5):
+        place = torch.zeros(2, dtype=torch.float64, requires_grad=True)
+        adam = Adam({"p": place}, {"p": 0.0})
+        for _ in range(before):
+            place.grad = torch.ones_like(place)
+            adam.step()
+        adam.forget("p")
+        for number, gradient in enumerate(gradients, start=before + 1):
+            place.grad = gradient.double()
+            adam.learning_rates["p"] = 0.1 * begun_anew(number, before + 1, adam.betas)
+            adam.step()
+        moved.append(place.detach())
+    torch.testing.assert_close(*moved)
 
 
 def test_every_epoch_shows_each_view_once_in_a_new_order() -> None:

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from etsplat.data.dataset import Dataset
 from etsplat.data.demo_object import demo_object
 from etsplat.data.photograph import photograph
 from etsplat.geometry.icosphere import icosphere
@@ -25,6 +26,13 @@ from helpers.meshes import bumpy_sphere
 SHORT = ReconstructConfig.tiny().changed(
     {"iterations": 40, "output.checkpoint_every": 10, "refinement.subdivisions": 3, "output.chamfer_samples": 2000}
 )
+
+
+def _small_ball(harmonics: int = 0) -> tuple[TriangleMesh, Dataset]:
+    """A start of 320 faces, and photos of the demo's object."""
+    views = photograph(demo_object(), 32, 32, elevations=(0.0,), azimuths=3, supersampling=1)
+    mesh = TriangleMesh.from_mesh(*icosphere(2), colors=0.7, opacity=0.98, sigma=0.25, harmonics=harmonics)
+    return mesh, views
 
 
 def test_untangling_leaves_no_intersection_and_the_rest_in_place() -> None:
@@ -141,6 +149,52 @@ def test_the_rate_of_vertices_falls_late_near_the_surface_alone(near: bool) -> N
     assert trainer.adam.learning_rates["vertices"] == pytest.approx(halfway * config.optimizer.lr_vertices)
 
 
+def test_a_mesh_is_opaque_at_last_and_its_outline_comes_nearer() -> None:
+    """A ball 4 % too small, 8 % by what it covers, grows as photos say; softness and opacities rest."""
+    vertices, faces = icosphere(3)
+    views = photograph(MeshFile(vertices, faces), 64, 64, elevations=(-40.0, 0.0, 40.0), azimuths=5)
+    mesh = TriangleMesh.from_mesh(0.96 * vertices, faces, colors=0.75, opacity=0.98, sigma=0.25)
+    changes = {"iterations": 400, "drawing.opaque_from": 0.05, "optimizer.lr_opaque": 3e-3}
+    still = {"optimizer.lr_vertices": 0.0, "refinement.subdivisions": 0}
+    still |= {"regularization.lambda_edge": 0.0, "regularization.lambda_laplacian": 0.05}
+    trainer = make_trainer(mesh, views, SHORT.changed({**changes, **still}))
+    trainer.fit(20)
+    assert mesh.appearance.kernel == "elastic"
+    assert mesh.log_sigma is not None
+    assert mesh.opacity_logits is not None
+    sigma, opacities = mesh.log_sigma.detach().clone(), mesh.opacity_logits.detach().clone()
+    trainer.fit(400)
+    assert mesh.appearance.kernel is None
+    assert torch.equal(mesh.log_sigma, sigma)
+    assert torch.equal(mesh.opacity_logits, opacities)
+    for index in views.train:
+        wanted = float(views.images[index][..., 3].float().sum())
+        assert float(mesh.render_opaque(views.cameras[index])[..., 3].sum()) == pytest.approx(wanted, rel=0.03)
+
+
+def test_a_mesh_with_harmonics_stays_soft() -> None:
+    """Opaque triangles have no colours that depend on the direction."""
+    presets = ReconstructConfig.quick().changed({"drawing.harmonics": 2, "iterations": 10})
+    assert presets.drawing.opaque_from < 1
+    mesh, views = _small_ball(harmonics=2)
+    make_trainer(mesh, views, presets).fit(10)
+    assert mesh.appearance.kernel == "elastic"
+
+
+def test_edits_are_judged_before_triangles_become_opaque() -> None:
+    """Losses of soft and of opaque pictures say nothing of each other."""
+    guarded = {"drawing.opaque_from": 0.5, "refinement.untanglings": 2, "refinement.guard": 0.02}
+    mesh, views = _small_ball()
+    trainer = make_trainer(mesh, views, SHORT.changed({**guarded, "iterations": 40, "refinement.last": 0.2}))
+    edits, guard = sorted({*trainer.strategy._budgets, *trainer.strategy._untangle_after}), trainer.guard
+    assert guard is not None
+    last = max(each for each in edits if each < 20)
+    trainer.fit(last)
+    assert guard.held is None or guard.due <= 20
+    assert trainer._stepper.alike_until(last) == 20
+    assert trainer._stepper.alike_until(21) > 40
+
+
 @pytest.mark.parametrize("untanglings", [0, 1])
 def test_vertices_of_what_is_untangled_stay_at_the_end(untanglings: int) -> None:
     """The last fiftieth of a run changes colours alone, so that nothing folds again."""
@@ -170,6 +224,8 @@ def test_vertices_of_what_is_untangled_stay_at_the_end(untanglings: int) -> None
             "optimizer.sigma_final": 0.05,
         },
         {"optimizer.vertex_update": "uniform", "drawing.colors": "vertex"},
+        {"drawing.opaque_from": 0.5, "refinement.untanglings": 3, "refinement.guard": 0.02},
+        {"drawing.opaque_from": 0.9},
     ],
 )
 def test_settings_run_and_resume_to_the_same_bits(tmp_path: Path, settings: dict[str, object]) -> None:

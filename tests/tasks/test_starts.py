@@ -139,7 +139,8 @@ def test_a_hull_that_is_near_all_over_takes_the_fewer_iterations() -> None:
     near = Started(mesh, "hull", opened)
     config, about = within_need(quick, near)
     slower = 1 / 3 * quick.optimizer.lr_vertices
-    assert config == quick.changed({"iterations": 2500, "optimizer.lr_vertices": slower})
+    changes = {"iterations": 2500, "optimizer.lr_vertices": slower, "drawing.opaque_from": 0.7}
+    assert config == quick.changed(changes)
     assert about is not None
     assert "2,500 iterations, not 5,000" in about
     others = [opened._replace(**{name: value}) for name, value in (("doubtful", 0.051), ("agreed", 0.49))]
@@ -147,8 +148,10 @@ def test_a_hull_that_is_near_all_over_takes_the_fewer_iterations() -> None:
         assert within_need(quick, Started(mesh, "hull", other)) == (quick, None)
     for asked in ({"iterations": 4999}, {"iterations": 5001}, {"start.near_iterations": None}):
         assert within_need(quick.changed(asked), near)[1] is None
-    for unasked in (ReconstructConfig.best(), ReconstructConfig.demo(), ReconstructConfig.paper()):
-        assert within_need(unasked, near) == (unasked, None)
+    for unasked in (ReconstructConfig.best(), ReconstructConfig.demo()):
+        assert within_need(unasked, near) == (unasked.changed({"drawing.opaque_from": 0.7}), None)
+    for kept in (ReconstructConfig.paper(), ReconstructConfig.best().changed({"drawing.opaque_from": 0.5})):
+        assert within_need(kept, near) == (kept, None)
 
 
 def test_a_run_that_needs_fewer_iterations_is_shorter_and_says_why(tmp_path: Path) -> None:

@@ -34,6 +34,9 @@ class Adam:
         step_count: t, the number of steps taken.
         paces: By name of a parameter, (rows,) factors of its rate, one for each row. Change them freely between steps;
             those of a parameter are gone when another number of rows takes its place.
+        calmed: Names of parameters whose rows move less where their gradients are small beside the others': the rate of
+            a row is multiplied by r^2 / (r^2 + (mean r)^2), r^2 the sum of v over the row. Adam by itself moves all
+            alike, also where there is hardly a gradient.
 
     Example:
         >>> place = torch.tensor([1.0, 2.0], requires_grad=True)
@@ -83,6 +86,7 @@ class Adam:
         self.first_moments = {name: _zeros(parameter) for name, parameter in self.parameters.items()}
         self.second_moments = {name: _zeros(parameter) for name, parameter in self.parameters.items()}
         self.paces: dict[str, Tensor] = {}
+        self.calmed: frozenset[str] = frozenset()
 
     @torch.no_grad()
     def step(self, decays: Mapping[str, float] | None = None) -> None:
@@ -119,6 +123,12 @@ class Adam:
         """Drop all gradients."""
         for parameter in self.parameters.values():
             parameter.grad = None
+
+    @torch.no_grad()
+    def forget(self, name: str) -> None:
+        """Set the moments of a parameter to 0."""
+        self.first_moments[name].zero_()
+        self.second_moments[name].zero_()
 
     def replace(self, name: str, parameter: Tensor, first: Tensor, second: Tensor) -> None:
         """Put another tensor, with its moments, in the place of a parameter (structural edits only).
@@ -229,6 +239,9 @@ class Adam:
             check_shape(f"paces of {name}", paces, (len(parameter),))
             check_like(f"paces of {name}", paces, name, parameter)
             paces = dense(paces, f"paces of {name}")
+        if name in self.calmed:
+            calm = _calm(second)
+            paces = calm if paces is None else calm * paces
         return dense(parameter, name), dense(parameter.grad, f"gradient of {name}"), first, second, paces
 
     def _store(self, groups: Mapping[str, AdamGroup]) -> None:
@@ -238,6 +251,12 @@ class Adam:
                 torch.autograd.graph.increment_version(parameter)  # so that a stale graph fails loudly in backward
             else:
                 parameter.copy_(value)
+
+
+def _calm(second: Tensor) -> Tensor:
+    """(rows,) by how much each row moves less than by itself; 0 for all where there are no gradients yet."""
+    squared = second.flatten(1).sum(dim=1)
+    return squared / (squared + squared.sqrt().mean().square()).clamp_min(torch.finfo(second.dtype).tiny)
 
 
 def _zeros(parameter: Tensor) -> Tensor:

@@ -31,6 +31,8 @@ class Schedule:
         values: parameters of one number that are set instead of learned, by name.
         appearance: how the model is drawn, by iteration (0 is the start); None for what the model says.
         halvings: how often the photos are halved, by iteration.
+        calm_from: by name of a parameter, the iteration from which on it is one of `Adam.calmed`. What Adam knows of
+            its gradients begins anew there, as they are then of another kind.
 
     Example:
         >>> falling = etsplat.Schedule({"vertices": lambda k: 1e-2 * etsplat.exponential_decay(k, 1000, 0.1)})
@@ -42,6 +44,22 @@ class Schedule:
     values: Mapping[str, Scheduled] = field(default_factory=dict)
     appearance: Callable[[int], Any] | None = None
     halvings: Callable[[int], int] = _never
+    calm_from: Mapping[str, int] = field(default_factory=dict)
+
+
+def begun_anew(iteration: int, first: int, betas: tuple[float, float]) -> float:
+    """Factor on a rate that lets Adam's steps be those of a run that began at iteration `first`, with moments of 0.
+
+    Args:
+        iteration: 1 or more, and no less than `first`.
+        first: the iteration of the first step with the new moments.
+        betas: of Adam.
+    """
+
+    def correction(steps: int) -> float:
+        return math.sqrt(1 - betas[1] ** steps) / (1 - betas[0] ** steps)
+
+    return correction(iteration - first + 1) / correction(iteration)
 
 
 def regularization_weight(iteration: int, iterations: int, hold: int, final: float = 0.0) -> float:

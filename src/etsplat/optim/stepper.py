@@ -24,7 +24,7 @@ from etsplat.optim.camera_refinement import CameraRefinement
 from etsplat.optim.depth_trust import DepthTrust
 from etsplat.optim.exposure import Exposure
 from etsplat.optim.objective import Drawing, Objective
-from etsplat.optim.schedules import Schedule, at
+from etsplat.optim.schedules import NEVER, Schedule, at, begun_anew
 from etsplat.optim.shared_steps import Apart, owners, shared_gradients
 from etsplat.optim.step_queue import MAX_STEPS, QueuedStep, RowLayout, StepQueue
 from etsplat.optim.strategies import Strategy
@@ -122,6 +122,7 @@ class Stepper(Generic[M]):
         if phase != self._phase:
             self._phase = phase
             self.arrive(first)
+            self._calm(first)
             self.queue.restart()
         most = max(1, READ_AHEAD // self._batch) if self._loader.streamed else MAX_STEPS
         steps = range(first, min(last, first + most - 1, *stops) + 1)
@@ -153,6 +154,10 @@ class Stepper(Generic[M]):
         halvings = self._schedule.halvings(max(1, iteration))
         return self._appearance(iteration), halvings, values, self._cameras.stage(iteration)
 
+    def alike_until(self, iteration: int) -> int:
+        """The last iteration, from this one on, before steps are of another kind; NEVER if they stay as they are."""
+        return min((first - 1 for first in self._schedule.calm_from.values() if first > iteration), default=NEVER)
+
     def measure_exposure(self) -> None:
         """Measures whether the photos that are fitted to were exposed unlike each other."""
         behind = torch.zeros(1, 3) if self._background is None else self._background
@@ -169,6 +174,8 @@ class Stepper(Generic[M]):
 
     def _step(self, iteration: int) -> float:
         self.arrive(iteration)
+        self._calm(iteration)
+        self.adam.learning_rates = self._rates(iteration)
         chosen = self._choose()
         weights, scale = self._objective.weights(iteration), at(self._objective.scale, iteration)
         moving, decayed = self._cameras.moving(iteration), self._update is None
@@ -187,7 +194,6 @@ class Stepper(Generic[M]):
             apart = Apart(self._model.COLORED, alone if separable else None)
         indices, optimizers = [c.view for c in chosen], [self.adam, self._exposure.adam]
         loss, seen = shared_gradients(group, indices, gradients, optimizers, self._strategy.outputs, apart)
-        self.adam.learning_rates = self._rates(iteration)
         if self._update is None:
             self.adam.step(self._objective.decays(self._model, weights, scale))
         else:
@@ -230,7 +236,7 @@ class Stepper(Generic[M]):
     def _queued_gradients(self, row: Tensor, kinds: Hashable) -> Tensor:
         assert isinstance(kinds, tuple)
         fields = self._row.unpack(row)
-        _, structure, weights, moving = self._phase
+        _, structure, weights, _, moving = self._phase
         self._model.appearance = structure.on_device(fields["appearance"])
         self._set(dict(zip(self._schedule.values, fields["values"].unbind(), strict=True)))
         places, backgrounds = fields["places"].split(2), fields["backgrounds"].split(3)
@@ -298,9 +304,16 @@ class Stepper(Generic[M]):
                 exposure.adam.zero_grad()
                 self._cameras.zero_grad()
             loss.backward()
+            self._complete_gradients()
             losses.append(loss.detach())
             seen.append(rendering)
         return sum(losses[1:], start=losses[0]), seen
+
+    def _complete_gradients(self) -> None:
+        """Of what rests, and pictures do not depend on, as opaque ones do not on opacities, they are 0."""
+        for name, parameter in self.adam.parameters.items():
+            if parameter.grad is None and self.adam.learning_rates[name] == 0.0:
+                parameter.grad = torch.zeros_like(parameter)
 
     def _of_parameters(self, weights: Sequence[float], scale: float, *, decayed: bool) -> None:
         value = self._objective.of_parameters(self._model, weights, scale, decayed=decayed)
@@ -324,15 +337,28 @@ class Stepper(Generic[M]):
         whose = [owner for step in steps for owner in owners(step, group.count)]
         return [view for view, owner in zip(views, whose, strict=True) if owner == group.rank]
 
+    def _calm(self, iteration: int) -> None:
+        """To be called before a step."""
+        starts = self._schedule.calm_from
+        self.adam.calmed = frozenset(name for name, first in starts.items() if iteration >= first)
+        for name, first in starts.items():
+            if iteration == first:
+                self.adam.forget(name)
+
     def _phase_at(self, iteration: int) -> tuple[Any, ...]:
         """What changes seldom: how often photos are halved, how the model is drawn, weights, whether cameras move."""
         look, moving = self._appearance(iteration).structure, self._cameras.moving(iteration)
-        return self._schedule.halvings(iteration), look, self._objective.weights(iteration), moving
+        calmed = tuple(iteration >= first for first in self._schedule.calm_from.values())
+        return self._schedule.halvings(iteration), look, self._objective.weights(iteration), calmed, moving
 
     def _rates(self, iteration: int) -> dict[str, float]:
         """Times the square root of the batch: by that the gradients of so many views have less noise."""
         longer = math.sqrt(self._batch)
-        return {name: longer * at(self._schedule.rates[name], iteration) for name in self._model.parameters()}
+        rates = {name: longer * at(self._schedule.rates[name], iteration) for name in self._model.parameters()}
+        for name, first in self._schedule.calm_from.items():
+            if iteration >= first:
+                rates[name] *= begun_anew(iteration, first, self.adam.betas)
+        return rates
 
     def _values(self, iteration: int) -> dict[str, float]:
         return {name: at(value, iteration) for name, value in self._schedule.values.items()}

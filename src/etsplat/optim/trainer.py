@@ -239,7 +239,8 @@ class Trainer(Generic[M]):
             self.strategy.undone = guard.undone.count(iteration)
             if self.strategy.undone == self.strategy.attempts(iteration):
                 return 0
-            loss, following = self._loss(), self.strategy.next_edit(iteration + 1)
+            following = min(self.strategy.next_edit(iteration + 1), self._stepper.alike_until(iteration))
+            loss = self._loss()
             guard.hold(self.progress, following, loss, self._state())
         edited, self._known_loss = self.strategy.edit(iteration), None  # it may change tensors in place
         if edited:

@@ -1,6 +1,5 @@
 """Shape reconstruction (paper section 3.3): posed images of an object in, a run directory with its mesh out."""
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -26,15 +25,7 @@ from etsplat.optim.exposure import Exposure
 from etsplat.optim.guard import Guard
 from etsplat.optim.loop import Callback, NoteEvent, StageEvent
 from etsplat.optim.objective import Objective
-from etsplat.optim.schedules import (
-    Schedule,
-    coarse_level,
-    evenly,
-    exponential_decay,
-    face_budgets,
-    late_decay,
-    regularization_weight,
-)
+from etsplat.optim.schedules import evenly, face_budgets, regularization_weight
 from etsplat.optim.strategies import SubdivideAndUntangle
 from etsplat.optim.terms.photometric import Photometric
 from etsplat.optim.trainer import Trainer
@@ -55,6 +46,7 @@ from etsplat.tasks.judgement import (
 )
 from etsplat.tasks.pixel_limits import within_pixels
 from etsplat.tasks.reconstruct_config import ReconstructConfig
+from etsplat.tasks.reconstruct_schedule import held_from, make_schedule, soft_until, while_soft
 from etsplat.tasks.running import Job, Result, path_of, settings_for, terms_of
 from etsplat.tasks.scoring import Scorer, load_lpips
 from etsplat.tasks.sources import Source, fingerprint, load_source, make_subject
@@ -63,10 +55,6 @@ from etsplat.tasks.texturing import check_installed
 
 DEPTHS_NEAR, DEPTHS_FAR = 0.02, 0.15
 """When depth maps are compared with the mesh, as a fraction of a run that starts near the surface, or far from it."""
-
-HELD = 0.98
-"""At this fraction of a run meshes are untangled too, and then vertices stay, so that nothing folds again. Whether that
-spoils pictures is judged when colours have settled."""
 
 
 @dataclass(frozen=True)
@@ -315,6 +303,7 @@ def make_trainer(
     terms = terms_of(
         regularization,
         leaving=[*([] if config.soft else ["sigma"]), *(["depth"] if depths is None else [])],
+        scheduled={"depth": partial(while_soft, last=soft_until(config))},
         arguments={"edge": {"power": regularization.edge_power}, "depth": {"trust": depths}},
     )
     gamma = partial(regularization_weight, iterations=length, hold=regularization.hold, final=regularization.final)
@@ -327,7 +316,7 @@ def make_trainer(
         max_faces=config.max_faces,
     )
     untanglings = evenly(length, refinement.untanglings, refinement.last)
-    untanglings += [_held_from(config)] if untanglings else []
+    untanglings += [held_from(config)] if untanglings else []
     smoothing = config.optimizer.large_steps_weight if config.optimizer.vertex_update == "large-steps" else None
     return Trainer(
         mesh,
@@ -341,7 +330,7 @@ def make_trainer(
             unseen=unseen_vertices(views) if near else None,
             lids=lids(views) if near else None,
         ),
-        schedule=_schedule(config, near=near),
+        schedule=make_schedule(config, mesh.appearance, near=near),
         batch=config.batch,
         exposure=Exposure.of(config.exposure, length, len(views.train) / config.batch),
         depths=depths,
@@ -350,37 +339,4 @@ def make_trainer(
         evaluate=evaluate,
         guard=Guard(tolerance=refinement.guard, until=length) if refinement.guard else None,
         seed=config.seed,
-    )
-
-
-def _held_from(config: ReconstructConfig) -> int:
-    return max(1, round(HELD * config.iterations))
-
-
-def _schedule(config: ReconstructConfig, *, near: bool) -> Schedule:
-    length, rates, pictures = config.iterations, config.optimizer, config.pictures
-    annealed = config.soft and rates.sigma_final > 0
-
-    held_from = _held_from(config) if config.refinement.untanglings else length
-    fall = late_decay if near and config.start.near_fall == "late" else exponential_decay
-
-    def vertices(iteration: int) -> float:
-        if iteration > held_from:
-            return 0.0
-        return rates.lr_vertices * fall(iteration, length, rates.lr_vertices_final)
-
-    def log_sigma(iteration: int) -> float:
-        softer = exponential_decay(iteration, length, rates.sigma_final / config.start.sigma)
-        return math.log(config.start.sigma * softer)
-
-    return Schedule(
-        rates={
-            "vertices": vertices,
-            "colors": rates.lr_colors,
-            "opacity_logits": rates.lr_opacities,
-            "log_sigma": 0.0 if annealed else rates.lr_sigma,
-            "harmonics": rates.lr_harmonics,
-        },
-        values={"log_sigma": log_sigma} if annealed else {},
-        halvings=partial(coarse_level, iterations=length, levels=pictures.coarse_levels, until=pictures.coarse_until),
     )

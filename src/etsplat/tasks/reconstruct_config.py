@@ -34,6 +34,11 @@ _EDGES = Only("with lambda_edge", lambda config: config.regularization.lambda_ed
 _FACE_COLORED = Only(
     "with soft triangles that have a colour for each face", lambda config: config.soft and not config.vertex_colored
 )
+_STAYING = Only("with soft triangles and harmonics 0", lambda config: config.soft and not config.drawing.harmonics)
+_OPAQUE = Only(
+    "with drawing.opaque_from below 1, soft triangles and harmonics 0",
+    lambda config: config.soft and not config.drawing.harmonics and config.drawing.opaque_from < 1,
+)
 _HARMONICS = Only("with harmonics", lambda config: config.drawing.harmonics > 0)
 _UNTANGLED = Only("with untanglings", lambda config: config.refinement.untanglings > 0)
 _SUBDIVIDED = Only("with subdivisions", lambda config: config.refinement.subdivisions > 0)
@@ -63,6 +68,10 @@ class Drawing:
     harmonics: Annotated[int, Range(0, 3), _FACE_COLORED] = 0
     """Degree of the harmonics by which colours of faces depend on the direction, as gloss does; 0 for none.
     Meshes that are written carry each face's mean over the directions in front of it."""
+    opaque_from: Annotated[float, Range(0, 1), _STAYING] = 0.9
+    """From this fraction of a run on soft triangles with `harmonics` 0 are drawn as a viewer draws a mesh:
+    opaque, with antialiased silhouettes, which place outlines nearer to those of the photos. 1 for never.
+    Where the hull that a run starts from is near the surface all over, from 0.7 on if that is less."""
     backend: Literal["etsplat", "nvdiffrast"] = "etsplat"
     """Whose rasterizer the raster methods use; nvdiffrast must be installed and wants a CUDA device."""
 
@@ -116,6 +125,9 @@ class Optimizer:
     """Adam learning rate of positions, in units of the object's radius."""
     lr_vertices_final: Annotated[float, Range(1e-6)] = 0.02
     """Ratio of that rate's last value to its first; it falls exponentially."""
+    lr_opaque: Annotated[float, Range(0), _OPAQUE] = 6e-5
+    """Adam learning rate of positions where triangles are drawn opaque (`drawing.opaque_from`).
+    Vertices that are never at an outline move less."""
     lr_colors: Annotated[float, Range(0)] = 1e-2
     """Adam learning rate of colours."""
     lr_harmonics: Annotated[float, Range(0), _HARMONICS] = 5e-4
@@ -331,6 +343,7 @@ _PAPER: dict[str, Any] = {
     "start.near_fall": "exponential",
     "pictures.coarse_levels": 0,
     "pictures.coarse_until": 0.5,
+    "drawing.opaque_from": 1.0,
     "regularization.final": 0.0,
     "regularization.depth": "off",
     "refinement.flips": False,
@@ -343,6 +356,7 @@ _QUICK: dict[str, Any] = {
     "iterations": 5000,
     "max_faces": 25_000,
     "optimizer.lr_vertices": 1e-2,
+    "optimizer.lr_opaque": 3e-4,
     "optimizer.lr_sigma": 3e-4,
     "regularization.hold": 50,
     "refinement.subdivisions": 10,

@@ -39,6 +39,10 @@ hollows, which travel on to the end of a run; and if photos agree on so many, wh
 _CALM = 1 / 3
 """Of the rate of vertices, where a hull is near the surface all over: larger steps leave it for what noise says."""
 
+_OPAQUE_FROM = 0.7
+"""From this fraction of a run on triangles are opaque, where a hull is near the surface all over: what is left to do is
+at outlines. Hollows are opened while triangles are soft."""
+
 _UNCOVERED, _LESS = 0.0005, 0.9
 """A hull that leaves more of the silhouettes uncovered lacks thin parts if a finer one leaves at most so many times as
 much: what rough masks leave does not depend on how fine it is."""
@@ -239,17 +243,24 @@ def nearby(config: ReconstructConfig) -> ReconstructConfig:
 
 
 def within_need(config: ReconstructConfig, started: Started) -> tuple[ReconstructConfig, str | None]:
-    """The settings with `start.near_iterations`, and slower vertices, where a hull is near the surface all over.
+    """The settings for a hull that is near the surface all over: triangles are opaque sooner.
+
+    With `start.near_iterations` there are also fewer iterations, and vertices are slower.
 
     Args:
         config: as asked for. A length that is not its preset's own stays.
         started: from `make_start`.
 
     Returns:
-        What the run is made with; and a sentence about it, or None if it is what was asked for.
+        What the run is made with; and a sentence about its length, or None if that is what was asked for.
     """
+    if not _near(started.opened):
+        return config, None
+    if config.drawing.opaque_from < 1:
+        sooner = min(config.drawing.opaque_from, _OPAQUE_FROM)
+        config = replace(config, drawing=replace(config.drawing, opaque_from=sooner))
     enough, own = config.start.near_iterations, ReconstructConfig.of(config.preset).iterations
-    if enough is None or config.iterations != own or own <= enough or not _near(started.opened):
+    if enough is None or config.iterations != own or own <= enough:
         return config, None
     less = f"{enough:,} iterations, not {own:,}, and vertices at a third of their rate"
     about = f"the hull is near the surface all over: {less} (start.near_iterations)"
