@@ -63,6 +63,7 @@ def fitting(views: Dataset, engine: str, config: ReconstructConfig = CONFIG, dev
             "refinement.untanglings": 2,
         },
         {"optimizer.vertex_update": "large-steps"},
+        {"drawing.opaque_from": 0.5},
     ],
     ids=lambda settings: next(iter(settings.values())),
 )
@@ -93,7 +94,9 @@ def test_steps_queued_together_are_the_steps_one_by_one(cuda_device: torch.devic
 
 def test_replayed_steps_are_those_that_are_called(cuda_device: torch.device, views: Dataset, monkeypatch) -> None:
     """The same bits with graphs and without: all that changes from step to step is in device memory."""
-    config = CONFIG.changed({**UNREFINED, "iterations": 9, "optimizer.sigma_final": 0.2, "batch": 2})
+    config = CONFIG.changed(
+        {**UNREFINED, "iterations": 9, "optimizer.sigma_final": 0.2, "batch": 2, "drawing.opaque_from": 0.6}
+    )
     replayed, called = (fitting(views, "cuda", config, cuda_device) for _ in range(2))
     losses = replayed.run(9)
     monkeypatch.setattr(Repeated, "__call__", lambda self: self._body())

@@ -176,13 +176,30 @@ def test_a_mesh_uses_right_maps_and_wrong_ones_change_no_bit(tmp_path):
     for kind, change in (("right", lambda depth, view: depth), ("wrong", garbage)):
         write_ball(tmp_path / kind, change=change)
         for setting in ("auto", "off"):
-            config = etsplat.ReconstructConfig.tiny().changed({"iterations": 20, "regularization.depth": setting})
+            config = etsplat.ReconstructConfig.tiny().changed(
+                {"iterations": 20, "regularization.depth": setting, "drawing.opaque_from": 0.8}
+            )
             out = tmp_path / f"{kind}_{setting}"
             result = etsplat.reconstruct(tmp_path / kind, out, config, callbacks=[lambda event: None])
             meshes[kind, setting], used[kind, setting] = result.mesh.vertices, result.metrics.get("depth_used")
     assert used == {("right", "auto"): "l1", ("right", "off"): None, ("wrong", "auto"): None, ("wrong", "off"): None}
     assert torch.equal(meshes["wrong", "auto"], meshes["wrong", "off"])
     assert not torch.equal(meshes["right", "auto"], meshes["right", "off"])
+
+
+@pytest.mark.parametrize(("opaque_from", "used"), [(0.8, "l1"), (1.0, None)])
+def test_maps_are_not_blamed_for_what_opaque_pictures_are_worth(tmp_path, monkeypatch, opaque_from, used):
+    """Photos kept aside fall where triangles become opaque: maps are dropped only if they did so while soft."""
+
+    def falling(_watch, _model, iteration):
+        return {"watched_loss": 0.1, "watched_psnr": 30.0 if iteration <= 16 else 20.0}
+
+    monkeypatch.setattr("etsplat.optim.watch.Watch.observe", falling)
+    write_ball(tmp_path / "ball")
+    changes = {"iterations": 20, "regularization.depth": "auto", "watch": 4, "output.evaluate_every": 2}
+    config = etsplat.ReconstructConfig.tiny().changed({**changes, "drawing.opaque_from": opaque_from})
+    result = etsplat.reconstruct(tmp_path / "ball", tmp_path / "run", config, callbacks=[lambda event: None])
+    assert result.metrics["depth_used"] == used
 
 
 def test_opaque_triangles_say_that_they_leave_maps_out(tmp_path):

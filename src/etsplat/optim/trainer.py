@@ -291,7 +291,7 @@ class Trainer(Generic[M]):
         """Cheap metrics of the present state, which is kept if the watched photos speak for it."""
         metrics = self._evaluate(self.model) if self._evaluate and workers().leads else {}
         watched = self._watch.observe(self.model, self.progress.iteration) if self._watch else {}
-        if watched:
+        if watched and self.progress.iteration <= self._stepper.alike_until(0):  # what opaque ones say is another thing
             self.depths.observe(watched["watched_psnr"])
         return metrics | watched
 

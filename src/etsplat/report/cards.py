@@ -18,12 +18,12 @@ class Metric:
 
 
 _PSNR = (
-    "The splatted triangles against the photographs of the test views, which training never saw; mean over views, in "
-    "float, over black. Higher is better."
+    "The triangles, as the run drew them at last, against the photographs of the test views, which training never saw; "
+    "mean over views, in float, over black. Higher is better."
 )
 _PSNR_MESH = (
-    "The same with the exported mesh drawn as opaque triangles: what a mesh viewer shows. Close to the PSNR of the "
-    "splats means that nothing depends on their softness."
+    "The same with the exported mesh drawn as opaque triangles, many samples a pixel: what a mesh viewer shows. Where "
+    "it is far below the other, pictures depend on the softness of triangles."
 )
 _TEXTURED = (
     "The test views of textured.glb, a light mesh under a texture that was fitted to the training photos, with 4 × 4 "
