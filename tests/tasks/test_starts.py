@@ -139,7 +139,7 @@ def test_a_hull_that_is_near_all_over_takes_the_fewer_iterations() -> None:
     near = Started(mesh, "hull", opened)
     config, about = within_need(quick, near)
     slower = 1 / 3 * quick.optimizer.lr_vertices
-    changes = {"iterations": 2500, "optimizer.lr_vertices": slower, "drawing.opaque_from": 0.7}
+    changes = {"iterations": 2500, "optimizer.lr_vertices": slower, "drawing.opaque_from": 0.8}
     assert config == quick.changed(changes)
     assert about is not None
     assert "2,500 iterations, not 5,000" in about
@@ -149,7 +149,7 @@ def test_a_hull_that_is_near_all_over_takes_the_fewer_iterations() -> None:
     for asked in ({"iterations": 4999}, {"iterations": 5001}, {"start.near_iterations": None}):
         assert within_need(quick.changed(asked), near)[1] is None
     for unasked in (ReconstructConfig.best(), ReconstructConfig.demo()):
-        assert within_need(unasked, near) == (unasked.changed({"drawing.opaque_from": 0.7}), None)
+        assert within_need(unasked, near) == (unasked.changed({"drawing.opaque_from": 0.8}), None)
     for kept in (ReconstructConfig.paper(), ReconstructConfig.best().changed({"drawing.opaque_from": 0.5})):
         assert within_need(kept, near) == (kept, None)
 

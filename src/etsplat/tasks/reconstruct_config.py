@@ -71,7 +71,7 @@ class Drawing:
     opaque_from: Annotated[float, Range(0, 1), _STAYING] = 0.9
     """From this fraction of a run on soft triangles with `harmonics` 0 are drawn as a viewer draws a mesh:
     opaque, with antialiased silhouettes, which place outlines nearer to those of the photos. 1 for never.
-    Where the hull that a run starts from is near the surface all over, from 0.7 on if that is less."""
+    Where the hull that a run starts from is near the surface all over, from 0.8 on if that is less."""
     backend: Literal["etsplat", "nvdiffrast"] = "etsplat"
     """Whose rasterizer the raster methods use; nvdiffrast must be installed and wants a CUDA device."""
 

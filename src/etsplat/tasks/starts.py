@@ -39,7 +39,7 @@ hollows, which travel on to the end of a run; and if photos agree on so many, wh
 _CALM = 1 / 3
 """Of the rate of vertices, where a hull is near the surface all over: larger steps leave it for what noise says."""
 
-_OPAQUE_FROM = 0.7
+_OPAQUE_FROM = 0.8
 """From this fraction of a run on triangles are opaque, where a hull is near the surface all over: what is left to do is
 at outlines. Hollows are opened while triangles are soft."""
 
