@@ -49,8 +49,11 @@ def etsplat(monkeypatch, capfd, *arguments) -> tuple[int, str]:
     return int(ended.value.code or 0), " ".join((output.out + output.err).split())
 
 
-def test_a_mesh_is_fitted_and_goes_on_without_the_file(monkeypatch, capfd, tmp_path):
-    status, said = etsplat(monkeypatch, capfd, *OBJECT, "--iterations", "30", "--kernel-file", "plateau.py")
+@pytest.mark.parametrize("opaque_from", ["1.0", "0.5"])
+def test_a_mesh_is_fitted_and_goes_on_without_the_file(monkeypatch, capfd, tmp_path, opaque_from):
+    """Also from a checkpoint of the last steps, which draw the mesh opaque."""
+    command = (*OBJECT, "--iterations", "30", "--drawing.opaque-from", opaque_from)
+    status, said = etsplat(monkeypatch, capfd, *command, "--kernel-file", "plateau.py")
     assert status == 0, said
     (tmp_path / "was_run").unlink()
     table = table_of("plateau")
@@ -60,7 +63,7 @@ def test_a_mesh_is_fitted_and_goes_on_without_the_file(monkeypatch, capfd, tmp_p
     checkpoint = max((tmp_path / "run" / "checkpoints").glob("*.safetensors"))
     assert "kernel.values" in read_tensors(checkpoint)[0]
     forget()
-    status, said = etsplat(monkeypatch, capfd, *OBJECT, "--iterations", "30", "--resume")
+    status, said = etsplat(monkeypatch, capfd, *command, "--resume")
     assert status == 0, said
     assert table_of("plateau") == table
     assert not (tmp_path / "was_run").exists()

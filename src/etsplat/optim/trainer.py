@@ -122,6 +122,7 @@ class Trainer(Generic[M]):
         self._paces = dict(paces or {})
         generator = seed if isinstance(seed, torch.Generator) else torch.Generator().manual_seed(seed)
         self._began = generator.get_state()
+        self._kernel = getattr(model.appearance, "kernel", None)  # of what is soft at first; None for other models
         behind = None if background is None else torch.tensor(background)[None]
         self._stepper = Stepper(
             model,
@@ -371,11 +372,6 @@ class Trainer(Generic[M]):
         self.cameras.load_state(_part(state, "cameras"))
         self._stepper.arrive(iteration)
         self.edited()
-
-    @property
-    def _kernel(self) -> str | None:
-        """What the model is drawn with; None for models that are drawn otherwise."""
-        return getattr(self.model.appearance, "kernel", None)
 
     def _loss(self) -> float:
         """By which edits are judged; measured once of each state."""
