@@ -51,7 +51,7 @@ _CONTRADICTED = 0.4
 """Correlation below which photos show different things, as on a lid over a hollow; gloss seldom goes so low."""
 
 
-_WRONG, _UNUSUAL = 0.015, 1.5
+_WRONG, _UNUSUAL = 0.01, 1.3
 """Mean difference of colours from which photos are said to show something else than a face does, and so many times
 what it is on half of the surface: coarse faces do not show all of a texture."""
 
