@@ -30,7 +30,7 @@ SHORT = ReconstructConfig.tiny().changed(
 
 def _small_ball(harmonics: int = 0) -> tuple[TriangleMesh, Dataset]:
     """A start of 320 faces, and photos of the demo's object."""
-    views = photograph(demo_object(), 32, 32, elevations=(0.0,), azimuths=3, supersampling=1)
+    views = photograph(demo_object(), 16, 16, elevations=(0.0,), azimuths=3, supersampling=1)
     mesh = TriangleMesh.from_mesh(*icosphere(2), colors=0.7, opacity=0.98, sigma=0.25, harmonics=harmonics)
     return mesh, views
 
@@ -139,8 +139,7 @@ def test_schedules_past_the_paper() -> None:
 @pytest.mark.parametrize("near", [False, True])
 def test_the_rate_of_vertices_falls_late_near_the_surface_alone(near: bool) -> None:
     """Only of a start from a hull is it known what a late fall does; halfway it is higher."""
-    views = photograph(demo_object(), 16, 16, elevations=(0.0,), azimuths=3, supersampling=1)
-    mesh = TriangleMesh.from_mesh(*icosphere(2), colors=0.7, opacity=0.98, sigma=0.25)
+    mesh, views = _small_ball()
     late = {"start.shape": "hull", "start.near_fall": "late", "optimizer.lr_vertices_final": 0.04}
     config = SHORT.changed({"iterations": 11, "refinement.subdivisions": 0, **late})
     trainer = make_trainer(mesh, views, config, near=near)
@@ -198,8 +197,7 @@ def test_edits_are_judged_before_triangles_become_opaque() -> None:
 @pytest.mark.parametrize("untanglings", [0, 1])
 def test_vertices_of_what_is_untangled_stay_at_the_end(untanglings: int) -> None:
     """The last fiftieth of a run changes colours alone, so that nothing folds again."""
-    views = photograph(demo_object(), 16, 16, elevations=(0.0,), azimuths=3, supersampling=1)
-    mesh = TriangleMesh.from_mesh(*icosphere(2), colors=0.7, opacity=0.98, sigma=0.25)
+    mesh, views = _small_ball()
     config = SHORT.changed({"iterations": 50, "refinement.subdivisions": 0, "refinement.untanglings": untanglings})
     trainer = make_trainer(mesh, views, config)
     trainer.fit(49)

@@ -34,10 +34,10 @@ _EDGES = Only("with lambda_edge", lambda config: config.regularization.lambda_ed
 _FACE_COLORED = Only(
     "with soft triangles that have a colour for each face", lambda config: config.soft and not config.vertex_colored
 )
-_STAYING = Only("with soft triangles and harmonics 0", lambda config: config.soft and not config.drawing.harmonics)
+_PLAIN = Only("with soft triangles and harmonics 0", lambda config: config.may_end_opaque)
 _OPAQUE = Only(
     "with drawing.opaque_from below 1, soft triangles and harmonics 0",
-    lambda config: config.soft and not config.drawing.harmonics and config.drawing.opaque_from < 1,
+    lambda config: config.may_end_opaque and config.drawing.opaque_from < 1,
 )
 _HARMONICS = Only("with harmonics", lambda config: config.drawing.harmonics > 0)
 _UNTANGLED = Only("with untanglings", lambda config: config.refinement.untanglings > 0)
@@ -68,7 +68,7 @@ class Drawing:
     harmonics: Annotated[int, Range(0, 3), _FACE_COLORED] = 0
     """Degree of the harmonics by which colours of faces depend on the direction, as gloss does; 0 for none.
     Meshes that are written carry each face's mean over the directions in front of it."""
-    opaque_from: Annotated[float, Range(0, 1), _STAYING] = 0.9
+    opaque_from: Annotated[float, Range(0, 1), _PLAIN] = 0.9
     """From this fraction of a run on soft triangles with `harmonics` 0 are drawn as a viewer draws a mesh:
     opaque, with antialiased silhouettes, which place outlines nearer to those of the photos. 1 for never.
     Where the hull that a run starts from is near the surface all over, from 0.8 on if that is less."""
@@ -310,6 +310,11 @@ class ReconstructConfig(Settings):
     def soft(self) -> bool:
         """Whether triangles are soft."""
         return not self.method.startswith("raster-")
+
+    @property
+    def may_end_opaque(self) -> bool:
+        """Whether triangles are soft and may become opaque, which have no colours that depend on the direction."""
+        return self.soft and not self.drawing.harmonics
 
     @property
     def vertex_colored(self) -> bool:

@@ -14,7 +14,7 @@ HELD = 0.98
 spoils pictures is judged when colours have settled."""
 
 _OPAQUE_FALL = 0.05
-"""The rate of vertices at the last iteration, where the mesh is drawn opaque, as a part of the first of these."""
+"""What rates of vertices and colours fall to over the iterations that draw the mesh opaque."""
 
 
 def held_from(config: ReconstructConfig) -> int:
@@ -23,12 +23,9 @@ def held_from(config: ReconstructConfig) -> int:
 
 
 def soft_until(config: ReconstructConfig) -> int:
-    """The last iteration whose pictures are of soft triangles, if that comes before the last of the run, or NEVER.
-
-    Opaque triangles have no colours that depend on the direction, so a mesh with these stays soft.
-    """
+    """The last iteration whose pictures are of soft triangles, if that comes before the last of the run, or NEVER."""
     last = round(config.drawing.opaque_from * config.iterations)
-    return last if config.soft and not config.drawing.harmonics and last < config.iterations else NEVER
+    return last if config.may_end_opaque and last < config.iterations else NEVER
 
 
 def while_soft(weight: float, last: int) -> Callable[[int], float]:
@@ -53,16 +50,15 @@ def make_schedule(config: ReconstructConfig, appearance: MeshAppearance, *, near
     held = held_from(config) if config.refinement.untanglings else length
     fall = late_decay if near and config.start.near_fall == "late" else exponential_decay
 
+    def at_last(iteration: int) -> float:
+        return late_decay(iteration - soft, length - soft, _OPAQUE_FALL) if iteration > soft else 1.0
+
     def vertices(iteration: int) -> float:
         if iteration > held:
             return 0.0
         if iteration > soft:
-            return rates.lr_opaque * late_decay(iteration - soft, length - soft, _OPAQUE_FALL)
+            return rates.lr_opaque * at_last(iteration)
         return rates.lr_vertices * fall(iteration, length, rates.lr_vertices_final)
-
-    def colors(iteration: int) -> float:
-        late = late_decay(iteration - soft, length - soft, _OPAQUE_FALL) if iteration > soft else 1.0
-        return rates.lr_colors * late
 
     def log_sigma(iteration: int) -> float:
         softer = exponential_decay(iteration, length, rates.sigma_final / config.start.sigma)
@@ -72,7 +68,7 @@ def make_schedule(config: ReconstructConfig, appearance: MeshAppearance, *, near
     return Schedule(
         rates={
             "vertices": vertices,
-            "colors": colors,
+            "colors": lambda iteration: rates.lr_colors * at_last(iteration),
             "opacity_logits": while_soft(rates.lr_opacities, soft),
             "log_sigma": 0.0 if annealed else while_soft(rates.lr_sigma, soft),
             "harmonics": rates.lr_harmonics,
