@@ -8,6 +8,7 @@ import torch
 from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.intersections import count_self_intersections
 from etsplat.geometry.measures import face_areas
+from etsplat.geometry.topology import MeshTopology
 from etsplat.model.triangle_mesh import TriangleMesh
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.ops.adam import Adam
@@ -89,6 +90,27 @@ def test_what_no_picture_shows_becomes_a_film_where_meshes_are_untangled() -> No
         meshes.append(mesh.vertices.detach())
     assert torch.equal(meshes[0], before)
     assert meshes[1][hidden, 1].std() < before[hidden, 1].std() / 2
+
+
+def test_vertices_go_to_outlines_once_in_place() -> None:
+    """After that iteration and no other; what is to be told from outlines is asked of the mesh as it is."""
+    asked = []
+
+    def doubled(vertices: torch.Tensor, topology: MeshTopology) -> torch.Tensor:
+        asked.append((vertices.clone(), topology.num_faces))
+        return 2 * vertices
+
+    strategy, mesh = SubdivideAndUntangle({3: 400}, [9], outlines=doubled, outlines_after=7), a_mesh()
+    started(strategy, mesh)
+    before = mesh.vertices.detach().clone()
+    assert [strategy.next_edit(i) for i in (3, 4, 8, 10)] == [3, 7, 9, NEVER]
+    assert strategy.attempts(7) == 1
+    assert not strategy.edit(6)
+    assert not strategy.edit(7)
+    assert torch.equal(mesh.vertices, 2 * before)
+    assert len(asked) == 1
+    assert torch.equal(asked[0][0], before)
+    assert asked[0][1] == mesh.count
 
 
 def test_lids_are_removed_at_each_edit_but_the_last_with_all_that_belongs_to_them() -> None:

@@ -99,6 +99,7 @@ def test_presets_of_reconstruct_are_what_they_were(preset: str) -> None:
     since["regularization.depth"] = "off" if preset in ("paper", "study", "tiny") else "auto"
     since["regularization.lambda_depth"] = 0.5
     since["refinement.guard"] = 0.0 if preset in ("paper", "study", "tiny") else 0.02
+    since["refinement.outlines"] = preset not in ("paper", "study", "tiny")
     since["refinement.flips"] = preset not in ("paper", "study", "tiny")
     since["pixels_per_face"] = None if preset in ("paper", "study", "tiny") else 3.5
     expected = {**before.RECONSTRUCT_PAPER, **before.RECONSTRUCT_CHANGES[preset]}

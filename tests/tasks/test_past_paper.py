@@ -17,10 +17,11 @@ from etsplat.io.run_directory import RunDirectory
 from etsplat.model.triangle_mesh import TriangleMesh
 from etsplat.ops.adam import Adam
 from etsplat.optim.loop import StepEvent
-from etsplat.optim.schedules import coarse_level, evenly, regularization_weight
+from etsplat.optim.schedules import NEVER, coarse_level, evenly, regularization_weight
 from etsplat.optim.vertex_updates import laplacian_solver, uniform_step
 from etsplat.tasks.reconstruct import make_trainer, reconstruct
 from etsplat.tasks.reconstruct_config import ReconstructConfig
+from etsplat.tasks.reconstruct_schedule import outlines_after
 from helpers.meshes import bumpy_sphere
 
 SHORT = ReconstructConfig.tiny().changed(
@@ -180,6 +181,23 @@ def test_a_mesh_with_harmonics_stays_soft() -> None:
     assert mesh.appearance.kernel == "elastic"
 
 
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({}, 95),
+        ({"method": "raster-face"}, NEVER),
+        ({"drawing.opaque_from": 0.5}, 75),
+        ({"drawing.opaque_from": 1.0}, NEVER),
+        ({"drawing.harmonics": 2}, NEVER),
+        ({"refine_cameras": "poses"}, NEVER),
+        ({"refinement.outlines": False}, NEVER),
+    ],
+)
+def test_outlines_are_asked_while_triangles_are_opaque(changes, expected) -> None:
+    """Soft pictures have theirs elsewhere, and cameras that are refined are not those of the photos."""
+    assert outlines_after(ReconstructConfig.quick().changed({"iterations": 100, **changes})) == expected
+
+
 def test_edits_are_judged_before_triangles_become_opaque() -> None:
     """Losses of soft and of opaque pictures say nothing of each other."""
     guarded = {"drawing.opaque_from": 0.5, "refinement.untanglings": 2, "refinement.guard": 0.02}
@@ -224,6 +242,7 @@ def test_vertices_of_what_is_untangled_stay_at_the_end(untanglings: int) -> None
         {"optimizer.vertex_update": "uniform", "drawing.colors": "vertex"},
         {"drawing.opaque_from": 0.5, "refinement.untanglings": 3, "refinement.guard": 0.02},
         {"drawing.opaque_from": 0.9},
+        {"drawing.opaque_from": 0.4, "refinement.outlines": True, "refinement.guard": 0.02},
     ],
 )
 def test_settings_run_and_resume_to_the_same_bits(tmp_path: Path, settings: dict[str, object]) -> None:

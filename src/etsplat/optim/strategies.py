@@ -119,6 +119,8 @@ class SubdivideAndUntangle(Strategy):
         reach: float = _SHORT,
         unseen: Callable[[Tensor, Tensor], Tensor] | None = None,
         lids: Callable[[Tensor, Tensor, Tensor], Tensor] | None = None,
+        outlines: Callable[[Tensor, MeshTopology], Tensor] | None = None,
+        outlines_after: int = NEVER,
     ) -> None:
         """Takes the times.
 
@@ -132,15 +134,19 @@ class SubdivideAndUntangle(Strategy):
                 become a film (`geometry.films`): regularizers alone leave slits in what nobody sees, and deepen them.
             lids: of vertices, faces and their colours, on the CPU, which faces pictures look through. They are removed
                 at each edit but the last, before what else it does, or stay where that spoils the pictures.
+            outlines: of vertices and how they hang together, on the CPU, where outlines say that vertices belong.
+            outlines_after: the iteration after which they are brought there.
         """
         self._budgets, self._untangle_after, self._unseen = dict(budgets), set(untangle_after), unseen
+        self._outlines, self._outlines_after = outlines, NEVER if outlines is None else outlines_after
         self._reaches = (reach, _SHORT) if reach > _SHORT else (reach,)
         self._flips, self._lids = flips, lids
         self._found: dict[int, Tensor | None] = {}
 
     def next_edit(self, iteration: int) -> int:
         """The next of the given times."""
-        return min((i for i in (*self._budgets, *self._untangle_after) if i >= iteration), default=NEVER)
+        times = (*self._budgets, *self._untangle_after, self._outlines_after)
+        return min((i for i in times if i >= iteration), default=NEVER)
 
     def attempts(self, iteration: int) -> int:
         """Untangling has one for each reach; the first of all removes lids, if there are any."""
@@ -148,7 +154,7 @@ class SubdivideAndUntangle(Strategy):
         return ways + (self._lids_at(iteration) is not None)
 
     def edit(self, iteration: int) -> bool:
-        """Removes lids, untangles, then divides and flips. Raises DivergedError where faces have no finite area."""
+        """Removes lids, goes by outlines, untangles, divides, flips. Raises DivergedError where areas are infinite."""
         if self.next_edit(iteration) != iteration:
             return False
         mesh: TriangleMesh = self.model
@@ -158,6 +164,9 @@ class SubdivideAndUntangle(Strategy):
         opened = lid is not None and self.undone == 0
         if lid is not None and opened:
             self._remove(lid)
+        if self._outlines is not None and iteration == self._outlines_after:
+            topology = mesh.topology.to(torch.device("cpu"))
+            mesh.vertices.detach().copy_(self._outlines(mesh.vertices.detach().cpu(), topology))
         if iteration in self._untangle_after:
             self._untangle(mesh, self.undone - (lid is not None and not opened))
         self._found.clear()

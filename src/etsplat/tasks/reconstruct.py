@@ -13,6 +13,7 @@ from etsplat.data.closed_hollows import closed_hollows
 from etsplat.data.cut_off import cut_off
 from etsplat.data.dataset import Dataset
 from etsplat.data.lids import lids
+from etsplat.data.outlines import outlines
 from etsplat.engines.choice import engine
 from etsplat.engines.threads import one_torch_thread
 from etsplat.geometry.parts import Shape, genera, shape_of
@@ -46,7 +47,7 @@ from etsplat.tasks.judgement import (
 )
 from etsplat.tasks.pixel_limits import within_pixels
 from etsplat.tasks.reconstruct_config import ReconstructConfig
-from etsplat.tasks.reconstruct_schedule import held_from, make_schedule, soft_until, while_soft
+from etsplat.tasks.reconstruct_schedule import held_from, make_schedule, outlines_after, soft_until, while_soft
 from etsplat.tasks.running import Job, Result, path_of, settings_for, terms_of
 from etsplat.tasks.scoring import Scorer, load_lpips
 from etsplat.tasks.sources import Source, fingerprint, load_source, make_subject
@@ -329,6 +330,8 @@ def make_trainer(
             reach=refinement.reach,
             unseen=unseen_vertices(views) if near else None,
             lids=lids(views) if near else None,
+            outlines=outlines(views),
+            outlines_after=outlines_after(config),
         ),
         schedule=make_schedule(config, mesh.appearance, near=near),
         batch=config.batch,

@@ -39,6 +39,10 @@ _OPAQUE = Only(
     "with drawing.opaque_from below 1, soft triangles and harmonics 0",
     lambda config: config.may_end_opaque and config.drawing.opaque_from < 1,
 )
+_OUTLINED = Only(
+    "with drawing.opaque_from below 1, soft triangles, harmonics 0 and refine_cameras off",
+    lambda config: _OPAQUE.holds(config) and config.refine_cameras == "off",
+)
 _HARMONICS = Only("with harmonics", lambda config: config.drawing.harmonics > 0)
 _UNTANGLED = Only("with untanglings", lambda config: config.refinement.untanglings > 0)
 _SUBDIVIDED = Only("with subdivisions", lambda config: config.refinement.subdivisions > 0)
@@ -185,6 +189,9 @@ class Refinement:
     reach: Annotated[float, Range(0), _UNTANGLED] = 0.5
     """Folds stay in which a vertex would have to move farther than so many lengths of its edges.
     They may hold up the shape. If it is more than a half, and that spoils the photos, a half is tried (`guard`)."""
+    outlines: Annotated[bool, _OUTLINED] = True
+    """Once triangles are opaque, vertices are brought to where the masks of all photos have their outlines.
+    That is by least squares, to a small fraction of a pixel."""
     guard: Annotated[float, Range(0)] = 0.02
     """A subdivision or untangling is undone where 100 steps later training photos are explained worse;
     that is where their loss, at a small size, is higher by more than this part; 0 lets all of them stay."""
@@ -354,6 +361,7 @@ _PAPER: dict[str, Any] = {
     "refinement.flips": False,
     "refinement.untanglings": 0,
     "refinement.guard": 0.0,
+    "refinement.outlines": False,
 }
 # A fifth of the budget.
 _QUICK: dict[str, Any] = {

@@ -13,6 +13,9 @@ HELD = 0.98
 """At this fraction of a run meshes are untangled too, and then vertices stay, so that nothing folds again. Whether that
 spoils pictures is judged when colours have settled."""
 
+_OUTLINES = 0.5
+"""Of the iterations that draw the mesh opaque, those behind which it is brought to the photos' outlines."""
+
 _OPAQUE_FALL = 0.05
 """What rates of vertices and colours fall to over the iterations that draw the mesh opaque."""
 
@@ -26,6 +29,17 @@ def soft_until(config: ReconstructConfig) -> int:
     """The last iteration whose pictures are of soft triangles, if that comes before the last of the run, or NEVER."""
     last = round(config.drawing.opaque_from * config.iterations)
     return last if config.may_end_opaque and last < config.iterations else NEVER
+
+
+def outlines_after(config: ReconstructConfig) -> int:
+    """The iteration after which vertices are brought to where masks have their outlines, or NEVER.
+
+    Soft pictures have theirs elsewhere; and where cameras are refined, those of the photos are not yet right.
+    """
+    soft = soft_until(config)
+    if not config.refinement.outlines or soft == NEVER or config.refine_cameras != "off":
+        return NEVER
+    return soft + round(_OUTLINES * (config.iterations - soft))
 
 
 def while_soft(weight: float, last: int) -> Callable[[int], float]:

@@ -1,0 +1,185 @@
+"""Where vertices belong, by where masks have their outlines, to a small fraction of a pixel.
+
+A mask says where its outline is: along a line across it alpha adds up to how far the object reaches. Each point of a
+surface's outline, in each photo, so says how far the two vertices beside it are to move along their normals: a linear
+equation. There are several for each vertex, and least squares takes all of them at once, where a step of the optimizer
+sees one photo, and is done at a quarter of a pixel, inside, where the noise of its steps is as large as what they mend.
+"""
+
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int64
+from scipy.sparse import coo_array, csc_array, diags_array, identity
+from scipy.sparse.linalg import splu
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from etsplat.core.cameras import camera_centers
+from etsplat.data.agreement import Photo, first_hits
+from etsplat.data.dataset import Dataset
+from etsplat.data.pictures import as_float
+from etsplat.geometry.measures import vertex_normals
+from etsplat.geometry.topology import MeshTopology
+
+_ROUNDS = 3
+"""Times that outlines are measured, each with what the one before has moved."""
+
+_ALONG = (1 / 6, 1 / 2, 5 / 6)
+"""Where on an edge outlines are measured."""
+
+_REACH, _STEP = 2.0, 0.25
+"""Pixels on either side of an outline that are looked at, and between two looks."""
+
+_FULL, _EMPTY = 0.9, 0.1
+"""Alpha at either end of the line across a mask's outline; otherwise there is no outline, or another one beside it."""
+
+_BESIDE = 1.0
+"""Pixels to either side, where the surface has to be seen, and nothing behind it."""
+
+_ACROSS = 0.6
+"""Sine of the angle to the line of sight, below which a normal hardly moves an outline."""
+
+_DOUBTED = 0.5
+"""Pixels from which on an outline is trusted less than half: Cauchy's weights."""
+
+_SMOOTH, _STILL = 1.0, 1.0
+"""Weights, beside that of a measured pixel, of the differences of how far neighbours move, and of how far all do."""
+
+Outlines = Callable[[Float[Tensor, "V 3"], MeshTopology], Float[Tensor, "V 3"]]
+"""Of vertices and how they hang together, on the CPU, where they belong."""
+
+
+class _Measured(NamedTuple):
+    """What photos say of outlines: M equations shares[m] . moved[ends[m]] = pixels[m], moved along normals.
+
+    Attributes:
+        ends: (M, 2) the vertices on either side.
+        shares: (M, 2) pixels for each unit that these move.
+        pixels: (M,) how far outside of the surface's outline that of the mask is.
+    """
+
+    ends: Int64[Tensor, "M 2"]
+    shares: Float[Tensor, "M 2"]
+    pixels: Float[Tensor, " M"]
+
+
+def outlines(dataset: Dataset) -> Outlines:
+    """Where vertices of a surface belong by the masks of the training views, as a function of it.
+
+    What no outline shows goes along with what is beside it. Without masks, all stay.
+
+    Args:
+        dataset: photos with alpha around an object in the unit ball.
+    """
+
+    @torch.no_grad()
+    def fitted(vertices: Tensor, topology: MeshTopology) -> Tensor:
+        for _ in range(_ROUNDS):
+            normals = vertex_normals(vertices, topology.faces)
+            found = [_measured(photo, vertices, normals, topology) for photo in _with_masks(dataset)]
+            whole = _Measured(*(torch.cat(each) for each in zip(*found, strict=True))) if found else None
+            if whole is None or len(whole.pixels) == 0:
+                return vertices
+            vertices = vertices + _moved(whole, topology)[:, None].to(vertices) * normals
+        return vertices
+
+    return fitted
+
+
+def _with_masks(dataset: Dataset) -> Iterator[Photo]:
+    """Photos of the training views as they are, one after the other; alpha is not a number where it does not count."""
+    for index in dataset.train:
+        picture = dataset.images.picture(index)
+        if picture.pixels.shape[-1] < 4:
+            continue
+        alpha = as_float(picture.pixels[..., 3])
+        if picture.mask is not None:
+            alpha = torch.where(picture.mask >= 128, alpha, torch.nan)
+        viewmat, K = dataset.viewmats[index].float(), dataset.Ks[index].float()
+        yield Photo(alpha[None, None].contiguous(), viewmat, K, camera_centers(viewmat[None])[0])
+
+
+def _measured(photo: Photo, vertices: Tensor, normals: Tensor, topology: MeshTopology) -> _Measured:
+    """Of one photo, whose pixels are alpha alone."""
+    edges = _outline_edges(photo, vertices, topology)
+    along = torch.tensor(_ALONG, dtype=vertices.dtype)
+    weights = torch.stack([1 - along, along], dim=1).repeat(len(edges), 1)
+    ends = edges.repeat_interleave(len(along), dim=0)
+    place, across, pixels_per_unit, z = _projected(photo, vertices, normals, ends, weights)
+    seen = _at_rim(photo, vertices, topology.faces, place, across, z)
+    seen &= pixels_per_unit > _ACROSS * photo.K[0, 0] / z
+    offsets = torch.arange(-_REACH + 0.5 * _STEP, _REACH, _STEP)
+    height, width = photo.pixels.shape[2:]
+    points = place[:, None] + offsets[:, None] * across[:, None]
+    alpha = photo.look_up(photo.pixels, 2 * points / torch.tensor([width, height]) - 1)[0]
+    seen &= (alpha[:, 0] > _FULL) & (alpha[:, -1] < _EMPTY)
+    pixels = _STEP * alpha.sum(dim=1) - _REACH
+    seen &= pixels.isfinite()
+    return _Measured(ends[seen], (weights * pixels_per_unit[:, None])[seen], pixels[seen])
+
+
+def _outline_edges(photo: Photo, vertices: Tensor, topology: MeshTopology) -> Int64[Tensor, "N 2"]:
+    """Between a face that looks at the camera and one that does not."""
+    a, b, c = vertices[topology.faces].unbind(1)
+    facing = ((a - photo.center) * torch.linalg.cross(b - a, c - a)).sum(dim=1) < 0
+    inner = topology.edge_face_counts == 2
+    starts = topology.edge_face_offsets[:-1][inner]
+    turns = facing[topology.edge_faces[starts]] != facing[topology.edge_faces[starts + 1]]
+    return topology.edges[inner][turns].long()
+
+
+def _projected(
+    photo: Photo, vertices: Tensor, normals: Tensor, ends: Tensor, weights: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Of points on edges: (N, 2) pixels, (N, 2) which way is out, (N,) pixels for a unit along normals, (N,) depths."""
+    rotation, focal = photo.viewmat[:3, :3], torch.stack([photo.K[0, 0], photo.K[1, 1]])
+    corners = vertices[ends] @ rotation.T + photo.viewmat[:3, 3]
+    point = (weights[:, :, None] * corners).sum(dim=1)
+    normal = normalize((weights[:, :, None] * normals[ends]).sum(dim=1), dim=1) @ rotation.T
+    z = point[:, 2]
+    place = focal * point[:, :2] / z[:, None] + photo.K[:2, 2]
+    moved = focal * (normal[:, :2] - point[:, :2] / z[:, None] * normal[:, 2:]) / z[:, None]
+    first, second = (focal * corners[:, end, :2] / corners[:, end, 2:] for end in range(2))
+    right, down = normalize(second - first, dim=1).unbind(dim=1)
+    across = torch.stack([down, -right], dim=1)
+    speed = (across * moved).sum(dim=1)
+    return place, across * torch.where(speed < 0, -1.0, 1.0)[:, None], speed.abs(), z
+
+
+def _at_rim(photo: Photo, vertices: Tensor, faces: Tensor, place: Tensor, across: Tensor, z: Tensor) -> Tensor:
+    """(N,) whether the surface is seen on one side of a point, at its depth, and nothing on the other."""
+    depth, face = first_hits(photo, vertices, faces)
+    height, width = depth.shape
+    size = torch.tensor([width, height])
+    within, beyond = ((place + side * _BESIDE * across).floor().long() for side in (-1, 1))
+    margin = round(_REACH)
+    inside = ((within >= margin) & (within < size - margin)).all(dim=1) & (z > 0)
+    within, beyond = (torch.minimum(each.clamp_min(0), size - 1) for each in (within, beyond))
+    # By so much depths differ that far within the outline of a ball as large as the object; what differs by more is
+    # another part, in front or behind.
+    same = (depth[within[:, 1], within[:, 0]] - z).abs() < (4 * _BESIDE * z / photo.K[0, 0]).sqrt()
+    covered = face[within[:, 1], within[:, 0]] >= 0
+    return inside & covered & same & (face[beyond[:, 1], beyond[:, 0]] < 0)
+
+
+def _moved(found: _Measured, topology: MeshTopology) -> Float[Tensor, " V"]:
+    """How far each vertex moves along its normal, in units of the scene, float64."""
+    V, M = topology.num_vertices, len(found.pixels)
+    unit = 1 / float(found.shares.sum(dim=1).median())  # so that unknowns are pixels, as weights are
+    rows = np.arange(M).repeat(2)
+    shares = (unit * found.shares.double()).reshape(-1).numpy()
+    matrix = coo_array((shares, (rows, found.ends.reshape(-1).numpy())), shape=(M, V)).tocsr()
+    first, second = topology.edges.numpy().T
+    numbers, ones = np.arange(len(first)), np.ones(len(first))
+    differences = coo_array(
+        (np.r_[ones, -ones], (np.r_[numbers, numbers], np.r_[first, second])), shape=(len(first), V)
+    ).tocsr()
+    pixels = found.pixels.double().numpy()
+    trusted = 1 / (1 + (pixels / _DOUBTED) ** 2)
+    normal = matrix.T @ diags_array(trusted) @ matrix
+    normal = csc_array(normal + _SMOOTH * (differences.T @ differences) + _STILL * identity(V))
+    factors = splu(normal, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    return torch.from_numpy(unit * factors.solve(matrix.T @ (trusted * pixels)))
