@@ -52,14 +52,29 @@ def test_vertices_end_within_a_small_part_of_a_pixel(egg) -> None:
     vertices, topology = off(egg)
     fitted = outlines(egg[2])(vertices, topology)
     before, after = distances(vertices, egg), distances(fitted, egg)
-    assert float(before.square().mean().sqrt()) > 0.4 * PIXEL
-    assert float(after.square().mean().sqrt()) < 0.12 * PIXEL
+    assert float(before.median()) > 0.4 * PIXEL
+    assert float(after.median()) < 0.12 * PIXEL
+    assert float(after.square().mean().sqrt()) < 0.22 * PIXEL  # dents are at no outline
 
 
 def test_masks_of_whole_pixels_will_do(egg) -> None:
     vertices, topology = off(egg)
     views = with_alpha(egg[2], lambda _, alpha: (alpha >= 0.5).float())
-    assert float(distances(outlines(views)(vertices, topology), egg).square().mean().sqrt()) < 0.2 * PIXEL
+    assert float(distances(outlines(views)(vertices, topology), egg).median()) < 0.2 * PIXEL
+
+
+def test_masks_that_are_rough_say_nothing(egg) -> None:
+    """Each by a pixel and a half, in any direction."""
+    vertices, topology = off(egg)
+    rng = torch.Generator().manual_seed(1)
+    waves = torch.nn.functional.interpolate(torch.randn(40, 2, 12, 12, generator=rng), (96, 96), mode="bicubic")
+    grid = torch.stack(torch.meshgrid(torch.arange(96.0), torch.arange(96.0), indexing="xy"), dim=-1) + 0.5
+
+    def moved(index: int, alpha: torch.Tensor) -> torch.Tensor:
+        places = (grid + 1.5 * waves[index].permute(1, 2, 0)) / 48 - 1
+        return torch.nn.functional.grid_sample(alpha[None, None], places[None], align_corners=False)[0, 0]
+
+    assert torch.equal(outlines(with_alpha(egg[2], moved))(vertices, topology), vertices)
 
 
 def test_a_photo_whose_mask_is_wrong_is_outvoted(egg) -> None:
@@ -67,7 +82,7 @@ def test_a_photo_whose_mask_is_wrong_is_outvoted(egg) -> None:
     vertices, topology = off(egg)
     right = outlines(egg[2])(vertices, topology)
     wrong = with_alpha(egg[2], lambda index, alpha: alpha.roll(2, dims=1) if index == egg[2].train[3] else alpha)
-    assert float((outlines(wrong)(vertices, topology) - right).norm(dim=1).max()) < 0.35 * PIXEL
+    assert float((outlines(wrong)(vertices, topology) - right).norm(dim=1).max()) < 0.5 * PIXEL
 
 
 @pytest.mark.parametrize("shown", ["all", "nothing", "without alpha"])
@@ -87,8 +102,8 @@ def test_pixels_that_do_not_count_say_nothing(egg) -> None:
     counted = [(~left).to(torch.uint8) * 255] * len(views)
     ignored = replace(shifted, images=StoredPictures(list(shifted.images), masks=counted))
     vertices, topology = off(egg)
-    errors = [distances(outlines(each)(vertices, topology), egg).square().mean().sqrt() for each in (shifted, ignored)]
-    assert float(errors[1]) < 0.15 * PIXEL < 0.2 * PIXEL < float(errors[0])
+    errors = [distances(outlines(each)(vertices, topology), egg).median() for each in (shifted, ignored)]
+    assert float(errors[1]) < 0.15 * PIXEL < 0.25 * PIXEL < float(errors[0])
 
 
 def test_what_no_outline_shows_stays_where_it_is(egg) -> None:

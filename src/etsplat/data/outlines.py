@@ -15,7 +15,7 @@ from jaxtyping import Float, Int64
 from scipy.sparse import coo_array, csc_array, diags_array, identity
 from scipy.sparse.linalg import splu
 from torch import Tensor
-from torch.nn.functional import normalize
+from torch.nn.functional import avg_pool2d, normalize
 
 from etsplat.core.cameras import camera_centers
 from etsplat.data.agreement import Photo, first_hits
@@ -24,7 +24,7 @@ from etsplat.data.pictures import as_float
 from etsplat.geometry.measures import vertex_normals
 from etsplat.geometry.topology import MeshTopology
 
-_ROUNDS = 3
+_ROUNDS = 2
 """Times that outlines are measured, each with what the one before has moved."""
 
 _ALONG = (1 / 6, 1 / 2, 5 / 6)
@@ -32,6 +32,9 @@ _ALONG = (1 / 6, 1 / 2, 5 / 6)
 
 _REACH, _STEP = 2.0, 0.25
 """Pixels on either side of an outline that are looked at, and between two looks."""
+
+_FINER = 2
+"""Samples along either side of a pixel, by which the surface's own outline is drawn."""
 
 _FULL, _EMPTY = 0.9, 0.1
 """Alpha at either end of the line across a mask's outline; otherwise there is no outline, or another one beside it."""
@@ -45,7 +48,11 @@ _ACROSS = 0.6
 _DOUBTED = 0.5
 """Pixels from which on an outline is trusted less than half: Cauchy's weights."""
 
-_SMOOTH, _STILL = 1.0, 1.0
+_ROUGH, _DEVIATION = 0.3, 1.48
+"""Pixels that masks may disagree by, as the standard deviation of what is left over: rougher ones say less than the
+steps have found. And that deviation as a multiple of the median of what is left over."""
+
+_SMOOTH, _STILL = 0.3, 0.3
 """Weights, beside that of a measured pixel, of the differences of how far neighbours move, and of how far all do."""
 
 Outlines = Callable[[Float[Tensor, "V 3"], MeshTopology], Float[Tensor, "V 3"]]
@@ -109,16 +116,28 @@ def _measured(photo: Photo, vertices: Tensor, normals: Tensor, topology: MeshTop
     weights = torch.stack([1 - along, along], dim=1).repeat(len(edges), 1)
     ends = edges.repeat_interleave(len(along), dim=0)
     place, across, pixels_per_unit, z = _projected(photo, vertices, normals, ends, weights)
-    seen = _at_rim(photo, vertices, topology.faces, place, across, z)
+    depth, covered = _drawn(photo, vertices, topology.faces)
+    seen = _at_rim(depth, place, across, z, photo)
     seen &= pixels_per_unit > _ACROSS * photo.K[0, 0] / z
     offsets = torch.arange(-_REACH + 0.5 * _STEP, _REACH, _STEP)
     height, width = photo.pixels.shape[2:]
     points = place[:, None] + offsets[:, None] * across[:, None]
-    alpha = photo.look_up(photo.pixels, 2 * points / torch.tensor([width, height]) - 1)[0]
-    seen &= (alpha[:, 0] > _FULL) & (alpha[:, -1] < _EMPTY)
-    pixels = _STEP * alpha.sum(dim=1) - _REACH
+    points = 2 * points / torch.tensor([width, height]) - 1
+    alpha, own = (photo.look_up(plane, points)[0] for plane in (photo.pixels, covered))
+    for profile in (alpha, own):
+        seen &= (profile[:, 0] > _FULL) & (profile[:, -1] < _EMPTY)
+    pixels = _STEP * (alpha - own).sum(dim=1)
     seen &= pixels.isfinite()
     return _Measured(ends[seen], (weights * pixels_per_unit[:, None])[seen], pixels[seen])
+
+
+def _drawn(photo: Photo, vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
+    """(H, W) depth of the surface in a photo, 0 where there is none, and (1, 1, H, W) how much of a pixel it covers."""
+    height, width = photo.pixels.shape[2:]
+    fine = torch.zeros(1).expand(1, 1, _FINER * height, _FINER * width)
+    scale = torch.tensor([_FINER, _FINER, 1.0])[:, None]
+    depth, face = first_hits(Photo(fine, photo.viewmat, scale * photo.K, photo.center), vertices, faces)
+    return depth[_FINER // 2 :: _FINER, _FINER // 2 :: _FINER], avg_pool2d((face >= 0).float()[None, None], _FINER)
 
 
 def _outline_edges(photo: Photo, vertices: Tensor, topology: MeshTopology) -> Int64[Tensor, "N 2"]:
@@ -149,9 +168,8 @@ def _projected(
     return place, across * torch.where(speed < 0, -1.0, 1.0)[:, None], speed.abs(), z
 
 
-def _at_rim(photo: Photo, vertices: Tensor, faces: Tensor, place: Tensor, across: Tensor, z: Tensor) -> Tensor:
+def _at_rim(depth: Tensor, place: Tensor, across: Tensor, z: Tensor, photo: Photo) -> Tensor:
     """(N,) whether the surface is seen on one side of a point, at its depth, and nothing on the other."""
-    depth, face = first_hits(photo, vertices, faces)
     height, width = depth.shape
     size = torch.tensor([width, height])
     within, beyond = ((place + side * _BESIDE * across).floor().long() for side in (-1, 1))
@@ -160,9 +178,9 @@ def _at_rim(photo: Photo, vertices: Tensor, faces: Tensor, place: Tensor, across
     within, beyond = (torch.minimum(each.clamp_min(0), size - 1) for each in (within, beyond))
     # By so much depths differ that far within the outline of a ball as large as the object; what differs by more is
     # another part, in front or behind.
-    same = (depth[within[:, 1], within[:, 0]] - z).abs() < (4 * _BESIDE * z / photo.K[0, 0]).sqrt()
-    covered = face[within[:, 1], within[:, 0]] >= 0
-    return inside & covered & same & (face[beyond[:, 1], beyond[:, 0]] < 0)
+    hit = depth[within[:, 1], within[:, 0]]
+    same = (hit - z).abs() < (4 * _BESIDE * z / photo.K[0, 0]).sqrt()
+    return inside & (hit > 0) & same & (depth[beyond[:, 1], beyond[:, 0]] == 0)
 
 
 def _moved(found: _Measured, topology: MeshTopology) -> Float[Tensor, " V"]:
@@ -182,4 +200,6 @@ def _moved(found: _Measured, topology: MeshTopology) -> Float[Tensor, " V"]:
     normal = matrix.T @ diags_array(trusted) @ matrix
     normal = csc_array(normal + _SMOOTH * (differences.T @ differences) + _STILL * identity(V))
     factors = splu(normal, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-    return torch.from_numpy(unit * factors.solve(matrix.T @ (trusted * pixels)))
+    moved = factors.solve(matrix.T @ (trusted * pixels))
+    noise = _DEVIATION * np.median(np.abs(pixels - matrix @ moved))
+    return torch.from_numpy(unit * moved * (noise <= _ROUGH))
