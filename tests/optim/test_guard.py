@@ -117,6 +117,7 @@ def test_what_spoils_is_undone_as_if_it_had_never_been(views: Dataset, tmp_path:
     assert [(event.iteration, event.judged) for event in undone] == [(20, min(20 + steps, 40)), (LENGTH, LENGTH)]
     assert all(event.loss_after > 1.02 * event.loss_before for event in undone)
     assert "20: the edit of the triangles is undone" in str(undone[0])
+    assert str(undone[0]).endswith("than before; the run goes on without")
     assert [event.iteration for event in events if isinstance(event, RefineEvent)] == [10, 40]
     assert_equal(plain, run)
     assert run.guard is not None
@@ -149,11 +150,13 @@ def test_what_spoils_is_tried_again_milder_and_resumes_there(views: Dataset, tmp
     class Mild(Milder):
         undone = 1
 
+    events: list[Any] = []
     whole, mild = trainer(views, 20, kind=Milder), trainer(views, 20, kind=Mild, guarded=False)
-    whole.fit(LENGTH, log_every=5)
+    whole.fit(LENGTH, callbacks=[events.append], log_every=5)
     mild.fit(LENGTH, log_every=5)
     assert whole.guard is not None
     assert whole.guard.undone == [20]
+    assert [str(event).split("; ")[-1] for event in events if isinstance(event, UndoEvent)] == ["a milder one is tried"]
     assert_equal(mild, whole)
 
     run = RunDirectory.create(tmp_path / "run", {"task": "train"})

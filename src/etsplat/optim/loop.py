@@ -175,6 +175,7 @@ class UndoEvent:
         judged: how many were done.
         loss_before: photometric loss of the training views before the edit.
         loss_after: the same when it was judged.
+        milder: whether another edit is made in its place, which changes less.
 
     Example:
         >>> event = etsplat.UndoEvent(iteration=300, judged=340, loss_before=0.020, loss_after=0.025)
@@ -186,12 +187,14 @@ class UndoEvent:
     judged: int
     loss_before: float
     loss_after: float
+    milder: bool = False
 
     def __str__(self) -> str:
         rise = 100 * (self.loss_after / self.loss_before - 1) if self.loss_before else math.inf
         return (
             f"iteration {self.iteration:,}: the edit of the triangles is undone: {self.judged - self.iteration} "
-            f"steps after it the loss of the training photos was {rise:.1f} % higher than before"
+            f"steps after it the loss of the training photos was {rise:.1f} % higher than before; "
+            f"{'a milder one is tried' if self.milder else 'the run goes on without'}"
         )
 
 

@@ -272,10 +272,12 @@ class Trainer(Generic[M]):
         held = self.guard.judge(loss)
         if held is None:
             return None
-        undone = UndoEvent(held.iteration, progress.iteration, held.loss, loss)
+        judged = progress.iteration
         self._load(held.state, held.iteration)
         self._known_loss = held.loss
         progress.iteration, (progress.loss_sum, progress.loss_count) = held.iteration, held.losses
+        left = self.guard.undone.count(held.iteration) < self.strategy.attempts(held.iteration)
+        undone = UndoEvent(held.iteration, judged, held.loss, loss, milder=left)
         self._edit(held.iteration)
         return self._review_edit(progress) or undone
 
