@@ -139,18 +139,19 @@ def test_a_hull_that_is_near_all_over_takes_the_fewer_iterations() -> None:
     near = Started(mesh, "hull", opened)
     config, about = within_need(quick, near)
     slower = 1 / 3 * quick.optimizer.lr_vertices
-    changes = {"iterations": 2500, "optimizer.lr_vertices": slower, "drawing.opaque_from": 0.8}
+    changes = {"iterations": 2000, "optimizer.lr_vertices": slower, "drawing.opaque_from": 0.8}
     assert config == quick.changed(changes)
     assert about is not None
-    assert "2,500 iterations, not 5,000" in about
+    assert "2,000 iterations, not 5,000" in about
     others = [opened._replace(**{name: value}) for name, value in (("doubtful", 0.051), ("agreed", 0.49))]
     for other in (*others, opened._replace(contradicted=0.006), None):
         assert within_need(quick, Started(mesh, "hull", other)) == (quick, None)
     for asked in ({"iterations": 4999}, {"iterations": 5001}, {"start.near_iterations": None}):
         assert within_need(quick.changed(asked), near)[1] is None
-    for unasked in (ReconstructConfig.best(), ReconstructConfig.demo()):
-        assert within_need(unasked, near) == (unasked.changed({"drawing.opaque_from": 0.8}), None)
-    for kept in (ReconstructConfig.paper(), ReconstructConfig.best().changed({"drawing.opaque_from": 0.5})):
+    best, demo = ReconstructConfig.best(), ReconstructConfig.demo()
+    assert within_need(best, near)[0].iterations == 15_000
+    assert within_need(demo, near) == (demo.changed({"drawing.opaque_from": 0.8}), None)
+    for kept in (ReconstructConfig.paper(), demo.changed({"drawing.opaque_from": 0.5})):
         assert within_need(kept, near) == (kept, None)
 
 

@@ -1,9 +1,10 @@
 """Where vertices belong, by where masks have their outlines, to a small fraction of a pixel.
 
-A mask says where its outline is: along a line across it alpha adds up to how far the object reaches. Each point of a
-surface's outline, in each photo, so says how far the two vertices beside it are to move along their normals: a linear
-equation. There are several for each vertex, and least squares takes all of them at once, where a step of the optimizer
-sees one photo, and is done at a quarter of a pixel, inside, where the noise of its steps is as large as what they mend.
+A mask says where its outline is: along a line across it alpha adds up to how far the object reaches, and what the
+surface covers to how far that does. Each point of a surface's outline, in each photo, so says how far the two vertices
+beside it are to move along their normals: a linear equation. There are several for each vertex, and least squares takes
+all of them at once. A step of the optimizer sees one photo, and is done a quarter of a pixel inside, where what its
+noise moves is as large as what it mends.
 """
 
 from collections.abc import Callable, Iterator
