@@ -101,7 +101,7 @@ class Start:
     near_fall: Annotated[Literal["exponential", "late"], _HULL] = "late"
     """How that rate falls: as it does elsewhere; or late, which stays high for longer and ends as low.
     Hollows, which travel far, are then opened deeper in as many steps."""
-    near_iterations: Annotated[int | None, Range(1), _HULL] = 15_000
+    near_iterations: Annotated[int | None, Range(1), _HULL] = None
     """A run of the preset's own length ends after so many iterations where the hull is near the surface all over:
     hardly a hollow was to be opened, and photos see nearly all of it and agree there.
     Vertices then move at a third of the rate, too. None for all iterations, at the whole rate."""
@@ -353,7 +353,6 @@ _PAPER: dict[str, Any] = {
     "pixels_per_face": None,
     "start.shape": "sphere",
     "start.near_fall": "exponential",
-    "start.near_iterations": None,
     "pictures.coarse_levels": 0,
     "pictures.coarse_until": 0.5,
     "drawing.opaque_from": 1.0,
@@ -393,7 +392,7 @@ _PRESETS: dict[str, dict[str, Any]] = {
         "output.checkpoint_every": 1000,
     },
     "quick": {**_QUICK, "start.near_iterations": 2000},
-    "demo": {**_QUICK, "iterations": 2500, "start.near_iterations": None},
+    "demo": {**_QUICK, "iterations": 2500},
     "tiny": {
         **_PAPER,
         **_QUICK,
