@@ -68,6 +68,12 @@ class Photo:
     K: Tensor
     center: Tensor
 
+    @staticmethod
+    def of(dataset: Dataset, index: int, pixels: Tensor) -> "Photo":
+        """Pixels as a view of a data set sees them."""
+        viewmat, K = dataset.viewmats[index].float(), dataset.Ks[index].float()
+        return Photo(pixels, viewmat, K, camera_centers(viewmat[None])[0])
+
     def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """(..., 2) places as `grid_sample` has them, and (...) depths, of (..., 3) points."""
         # Each coordinate in a row of memory: products of (N, 3) with a matrix take ten times as long.
@@ -99,9 +105,8 @@ def reduced(dataset: Dataset) -> Dataset:
 def photos_of(dataset: Dataset) -> list[Photo]:
     """Of the training views, as `reduced` makes them."""
     dataset = reduced(dataset)
-    viewmats, Ks = dataset.viewmats[dataset.train].float(), dataset.Ks[dataset.train].float()
-    pixels = [as_float(dataset.images[index]).permute(2, 0, 1)[None].contiguous() for index in dataset.train]
-    return [Photo(*each) for each in zip(pixels, viewmats, Ks, camera_centers(viewmats), strict=True)]
+    pixels = (as_float(dataset.images[index]).permute(2, 0, 1)[None].contiguous() for index in dataset.train)
+    return [Photo.of(dataset, *each) for each in zip(dataset.train, pixels, strict=True)]
 
 
 def unseen_vertices(dataset: Dataset) -> Callable[[Tensor, Tensor], Bool[Tensor, " V"]]:
@@ -117,10 +122,9 @@ def unseen_vertices(dataset: Dataset) -> Callable[[Tensor, Tensor], Bool[Tensor,
 
 def blank_photos(dataset: Dataset) -> list[Photo]:
     """The training views as cameras alone, which show nothing."""
-    viewmats, Ks = dataset.viewmats[dataset.train].float(), dataset.Ks[dataset.train].float()
-    sizes = [dataset.images.sizes[index] for index in dataset.train]
-    blank = [torch.zeros(1).expand(1, 4, height, width) for width, height in sizes]
-    return [Photo(*each) for each in zip(blank, viewmats, Ks, camera_centers(viewmats), strict=True)]
+    sizes = (dataset.images.sizes[index] for index in dataset.train)
+    blank = (torch.zeros(1).expand(1, 4, height, width) for width, height in sizes)
+    return [Photo.of(dataset, *each) for each in zip(dataset.train, blank, strict=True)]
 
 
 def pixel_size(photos: list[Photo]) -> float:

@@ -8,20 +8,20 @@ noise moves is as large as what it mends.
 """
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int64
 from scipy.sparse import coo_array, csc_array, diags_array, identity
-from scipy.sparse.linalg import splu
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, normalize
 
-from etsplat.core.cameras import camera_centers
 from etsplat.data.agreement import Photo, first_hits
 from etsplat.data.dataset import Dataset
 from etsplat.data.pictures import as_float
+from etsplat.geometry.laplacians import laplacian, solver
 from etsplat.geometry.measures import vertex_normals
 from etsplat.geometry.topology import MeshTopology
 
@@ -60,6 +60,51 @@ Outlines = Callable[[Float[Tensor, "V 3"], MeshTopology], Float[Tensor, "V 3"]]
 """Of vertices and how they hang together, on the CPU, where they belong."""
 
 
+class _Surface(NamedTuple):
+    """A surface, and what of it does not depend on the photo.
+
+    Attributes:
+        vertices: (V, 3).
+        normals: (V, 3).
+        faces: (F, 3).
+        across: (F, 3) their normals, twice their areas long.
+        edges: (E, 2) between two faces.
+        sides: (E, 2) these faces.
+    """
+
+    vertices: Float[Tensor, "V 3"]
+    normals: Float[Tensor, "V 3"]
+    faces: Int64[Tensor, "F 3"]
+    across: Float[Tensor, "F 3"]
+    edges: Int64[Tensor, "E 2"]
+    sides: Int64[Tensor, "E 2"]
+
+    @staticmethod
+    def of(vertices: Tensor, topology: MeshTopology) -> "_Surface":
+        faces = topology.faces
+        a, b, c = vertices[faces].unbind(1)
+        inner = topology.edge_face_counts == 2
+        sides = topology.edge_faces[topology.edge_face_offsets[:-1][inner, None] + torch.arange(2)]
+        normals = vertex_normals(vertices, faces)
+        return _Surface(vertices, normals, faces, torch.linalg.cross(b - a, c - a), topology.edges[inner], sides)
+
+
+class _Points(NamedTuple):
+    """Points on edges, as a photo has them.
+
+    Attributes:
+        place: (N, 2) pixels.
+        out: (N, 2) which way is out, across the edge.
+        speed: (N,) pixels for each unit that the edge moves along normals.
+        depth: (N,).
+    """
+
+    place: Float[Tensor, "N 2"]
+    out: Float[Tensor, "N 2"]
+    speed: Float[Tensor, " N"]
+    depth: Float[Tensor, " N"]
+
+
 class _Measured(NamedTuple):
     """What photos say of outlines: M equations shares[m] . moved[ends[m]] = pixels[m], moved along normals.
 
@@ -86,19 +131,19 @@ def outlines(dataset: Dataset) -> Outlines:
     @torch.no_grad()
     def fitted(vertices: Tensor, topology: MeshTopology) -> Tensor:
         for _ in range(_ROUNDS):
-            normals = vertex_normals(vertices, topology.faces)
-            found = [_measured(photo, vertices, normals, topology) for photo in _with_masks(dataset)]
+            surface = _Surface.of(vertices, topology)
+            found = [_measured(photo, surface) for photo in _with_masks(dataset)]
             whole = _Measured(*(torch.cat(each) for each in zip(*found, strict=True))) if found else None
             if whole is None or len(whole.pixels) == 0:
                 return vertices
-            vertices = vertices + _moved(whole, topology)[:, None].to(vertices) * normals
+            vertices = vertices + _moved(whole, topology)[:, None].to(vertices) * surface.normals
         return vertices
 
     return fitted
 
 
 def _with_masks(dataset: Dataset) -> Iterator[Photo]:
-    """Photos of the training views as they are, one after the other; alpha is not a number where it does not count."""
+    """Alpha of the training views, one after the other; it is not a number where pixels do not count."""
     for index in dataset.train:
         picture = dataset.images.picture(index)
         if picture.pixels.shape[-1] < 4:
@@ -106,59 +151,53 @@ def _with_masks(dataset: Dataset) -> Iterator[Photo]:
         alpha = as_float(picture.pixels[..., 3])
         if picture.mask is not None:
             alpha = torch.where(picture.mask >= 128, alpha, torch.nan)
-        viewmat, K = dataset.viewmats[index].float(), dataset.Ks[index].float()
-        yield Photo(alpha[None, None].contiguous(), viewmat, K, camera_centers(viewmat[None])[0])
+        yield Photo.of(dataset, index, alpha[None, None].contiguous())
 
 
-def _measured(photo: Photo, vertices: Tensor, normals: Tensor, topology: MeshTopology) -> _Measured:
+def _measured(photo: Photo, surface: _Surface) -> _Measured:
     """Of one photo, whose pixels are alpha alone."""
-    edges = _outline_edges(photo, vertices, topology)
-    along = torch.tensor(_ALONG, dtype=vertices.dtype)
+    edges = _outline_edges(photo, surface)
+    along = torch.tensor(_ALONG, dtype=surface.vertices.dtype)
     weights = torch.stack([1 - along, along], dim=1).repeat(len(edges), 1)
     ends = edges.repeat_interleave(len(along), dim=0)
-    place, across, pixels_per_unit, z = _projected(photo, vertices, normals, ends, weights)
-    depth, covered = _drawn(photo, vertices, topology.faces)
-    seen = _at_rim(depth, place, across, z, photo)
-    seen &= pixels_per_unit > _ACROSS * photo.K[0, 0] / z
+    points, focal = _projected(photo, surface, ends, weights), photo.K[0, 0]
+    depth, covered = _drawn(photo, surface)
+    seen = _at_rim(depth, points, focal) & (points.speed > _ACROSS * focal / points.depth)
     offsets = torch.arange(-_REACH + 0.5 * _STEP, _REACH, _STEP)
     height, width = photo.pixels.shape[2:]
-    points = place[:, None] + offsets[:, None] * across[:, None]
-    points = 2 * points / torch.tensor([width, height]) - 1
-    alpha, own = (photo.look_up(plane, points)[0] for plane in (photo.pixels, covered))
+    line = points.place[:, None] + offsets[:, None] * points.out[:, None]
+    line = 2 * line / torch.tensor([width, height]) - 1
+    alpha, own = (photo.look_up(plane, line)[0] for plane in (photo.pixels, covered))
     for profile in (alpha, own):
         seen &= (profile[:, 0] > _FULL) & (profile[:, -1] < _EMPTY)
     pixels = _STEP * (alpha - own).sum(dim=1)
     seen &= pixels.isfinite()
-    return _Measured(ends[seen], (weights * pixels_per_unit[:, None])[seen], pixels[seen])
+    return _Measured(ends[seen], (weights * points.speed[:, None])[seen], pixels[seen])
 
 
-def _drawn(photo: Photo, vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
+def _drawn(photo: Photo, surface: _Surface) -> tuple[Tensor, Tensor]:
     """(H, W) depth of the surface in a photo, 0 where there is none, and (1, 1, H, W) how much of a pixel it covers."""
     height, width = photo.pixels.shape[2:]
     fine = torch.zeros(1).expand(1, 1, _FINER * height, _FINER * width)
-    scale = torch.tensor([_FINER, _FINER, 1.0])[:, None]
-    depth, face = first_hits(Photo(fine, photo.viewmat, scale * photo.K, photo.center), vertices, faces)
-    return depth[_FINER // 2 :: _FINER, _FINER // 2 :: _FINER], avg_pool2d((face >= 0).float()[None, None], _FINER)
+    K = torch.tensor([_FINER, _FINER, 1.0])[:, None] * photo.K
+    depth, _ = first_hits(replace(photo, pixels=fine, K=K), surface.vertices, surface.faces)
+    return depth[_FINER // 2 :: _FINER, _FINER // 2 :: _FINER], avg_pool2d((depth > 0).float()[None, None], _FINER)
 
 
-def _outline_edges(photo: Photo, vertices: Tensor, topology: MeshTopology) -> Int64[Tensor, "N 2"]:
+def _outline_edges(photo: Photo, surface: _Surface) -> Int64[Tensor, "N 2"]:
     """Between a face that looks at the camera and one that does not."""
-    a, b, c = vertices[topology.faces].unbind(1)
-    facing = ((a - photo.center) * torch.linalg.cross(b - a, c - a)).sum(dim=1) < 0
-    inner = topology.edge_face_counts == 2
-    starts = topology.edge_face_offsets[:-1][inner]
-    turns = facing[topology.edge_faces[starts]] != facing[topology.edge_faces[starts + 1]]
-    return topology.edges[inner][turns].long()
+    corner = surface.vertices[surface.faces[:, 0]]
+    facing = ((corner - photo.center) * surface.across).sum(dim=1) < 0
+    one, other = facing[surface.sides].unbind(dim=1)
+    return surface.edges[one != other]
 
 
-def _projected(
-    photo: Photo, vertices: Tensor, normals: Tensor, ends: Tensor, weights: Tensor
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Of points on edges: (N, 2) pixels, (N, 2) which way is out, (N,) pixels for a unit along normals, (N,) depths."""
+def _projected(photo: Photo, surface: _Surface, ends: Tensor, weights: Tensor) -> _Points:
+    """(N, 2) ends of edges with their weights, as a photo has the points between."""
     rotation, focal = photo.viewmat[:3, :3], torch.stack([photo.K[0, 0], photo.K[1, 1]])
-    corners = vertices[ends] @ rotation.T + photo.viewmat[:3, 3]
+    corners = surface.vertices[ends] @ rotation.T + photo.viewmat[:3, 3]
     point = (weights[:, :, None] * corners).sum(dim=1)
-    normal = normalize((weights[:, :, None] * normals[ends]).sum(dim=1), dim=1) @ rotation.T
+    normal = normalize((weights[:, :, None] * surface.normals[ends]).sum(dim=1), dim=1) @ rotation.T
     z = point[:, 2]
     place = focal * point[:, :2] / z[:, None] + photo.K[:2, 2]
     moved = focal * (normal[:, :2] - point[:, :2] / z[:, None] * normal[:, 2:]) / z[:, None]
@@ -166,41 +205,34 @@ def _projected(
     right, down = normalize(second - first, dim=1).unbind(dim=1)
     across = torch.stack([down, -right], dim=1)
     speed = (across * moved).sum(dim=1)
-    return place, across * torch.where(speed < 0, -1.0, 1.0)[:, None], speed.abs(), z
+    return _Points(place, across * torch.where(speed < 0, -1.0, 1.0)[:, None], speed.abs(), z)
 
 
-def _at_rim(depth: Tensor, place: Tensor, across: Tensor, z: Tensor, photo: Photo) -> Tensor:
+def _at_rim(depth: Tensor, points: _Points, focal: Tensor) -> Tensor:
     """(N,) whether the surface is seen on one side of a point, at its depth, and nothing on the other."""
     height, width = depth.shape
     size = torch.tensor([width, height])
-    within, beyond = ((place + side * _BESIDE * across).floor().long() for side in (-1, 1))
+    within, beyond = ((points.place + side * _BESIDE * points.out).floor().long() for side in (-1, 1))
     margin = round(_REACH)
-    inside = ((within >= margin) & (within < size - margin)).all(dim=1) & (z > 0)
+    inside = ((within >= margin) & (within < size - margin)).all(dim=1) & (points.depth > 0)
     within, beyond = (torch.minimum(each.clamp_min(0), size - 1) for each in (within, beyond))
     # By so much depths differ that far within the outline of a ball as large as the object; what differs by more is
     # another part, in front or behind.
     hit = depth[within[:, 1], within[:, 0]]
-    same = (hit - z).abs() < (4 * _BESIDE * z / photo.K[0, 0]).sqrt()
+    same = (hit - points.depth).abs() < (4 * _BESIDE * points.depth / focal).sqrt()
     return inside & (hit > 0) & same & (depth[beyond[:, 1], beyond[:, 0]] == 0)
 
 
 def _moved(found: _Measured, topology: MeshTopology) -> Float[Tensor, " V"]:
-    """How far each vertex moves along its normal, in units of the scene, float64."""
+    """How far each vertex moves along its normal, in units of the scene, float64; nowhere where masks are rough."""
     V, M = topology.num_vertices, len(found.pixels)
     unit = 1 / float(found.shares.sum(dim=1).median())  # so that unknowns are pixels, as weights are
-    rows = np.arange(M).repeat(2)
-    shares = (unit * found.shares.double()).reshape(-1).numpy()
+    shares, rows = (unit * found.shares.double()).reshape(-1).numpy(), np.arange(M).repeat(2)
     matrix = coo_array((shares, (rows, found.ends.reshape(-1).numpy())), shape=(M, V)).tocsr()
-    first, second = topology.edges.numpy().T
-    numbers, ones = np.arange(len(first)), np.ones(len(first))
-    differences = coo_array(
-        (np.r_[ones, -ones], (np.r_[numbers, numbers], np.r_[first, second])), shape=(len(first), V)
-    ).tocsr()
     pixels = found.pixels.double().numpy()
     trusted = 1 / (1 + (pixels / _DOUBTED) ** 2)
     normal = matrix.T @ diags_array(trusted) @ matrix
-    normal = csc_array(normal + _SMOOTH * (differences.T @ differences) + _STILL * identity(V))
-    factors = splu(normal, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-    moved = factors.solve(matrix.T @ (trusted * pixels))
+    normal = normal + _SMOOTH * laplacian(topology.edges, V) + _STILL * identity(V)
+    moved = solver(csc_array(normal))(matrix.T @ (trusted * pixels))
     noise = _DEVIATION * np.median(np.abs(pixels - matrix @ moved))
     return torch.from_numpy(unit * moved * (noise <= _ROUGH))

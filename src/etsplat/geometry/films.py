@@ -1,12 +1,11 @@
 """A film of soap: the part of a surface of which nothing is known, as small as what is around it lets it be."""
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int64
-from scipy.sparse import csr_array, diags_array
 from scipy.sparse.linalg import splu
 from torch import Tensor
 
+from etsplat.geometry.laplacians import laplacian
 from etsplat.geometry.topology import MeshTopology
 
 _SWEEPS = 200
@@ -45,11 +44,9 @@ def tight_film(
         free: (V,) which move, some at least; some vertex of each part is held.
     """
     own = free.nonzero()[:, 0].numpy()
-    source, target = torch.cat([edges, edges.flip(1)]).T.numpy()
-    links = csr_array((np.ones(len(source)), (source, target)), shape=(len(free), len(free)))
-    laplacian = (diags_array(links.sum(axis=1)) - links).tocsr()[own]
+    rows = laplacian(edges, len(free))[own]
     places = vertices.double().numpy().copy()
     held = places.copy()
     held[own] = 0
-    places[own] = splu(laplacian[:, own].tocsc()).solve(-(laplacian @ held))
+    places[own] = splu(rows[:, own].tocsc()).solve(-(rows @ held))
     return torch.from_numpy(places).to(vertices)

@@ -154,7 +154,10 @@ class SubdivideAndUntangle(Strategy):
         return ways + (self._lids_at(iteration) is not None)
 
     def edit(self, iteration: int) -> bool:
-        """Removes lids, goes by outlines, untangles, divides, flips. Raises DivergedError where areas are infinite."""
+        """Removes lids, goes by outlines, untangles, divides and flips.
+
+        Raises DivergedError where faces have no finite area.
+        """
         if self.next_edit(iteration) != iteration:
             return False
         mesh: TriangleMesh = self.model

@@ -8,13 +8,12 @@ v as M^-1 again. No u is stored: v moves by M^-1 times u's step.
 
 from collections.abc import Callable
 
-import numpy as np
 import torch
 from jaxtyping import Float
-from scipy.sparse import coo_array, csc_array, identity
-from scipy.sparse.linalg import splu
+from scipy.sparse import csc_array, identity
 from torch import Tensor
 
+from etsplat.geometry.laplacians import laplacian, solver
 from etsplat.geometry.topology import MeshTopology
 from etsplat.model.triangle_mesh import TriangleMesh
 from etsplat.ops.adam import Adam
@@ -24,16 +23,11 @@ Solve = Callable[[Float[Tensor, "V 3"]], Float[Tensor, "V 3"]]
 
 def laplacian_solver(topology: MeshTopology, weight: float) -> Solve:
     """X -> (I + weight L)^-1 x, factorised once; float64 inside."""
-    first, second = topology.edges.cpu().numpy().T
     V = topology.num_vertices
-    ones = np.ones(len(first))
-    adjacency = coo_array((np.tile(ones, 2), (np.r_[first, second], np.r_[second, first])), shape=(V, V))
-    degrees = coo_array((adjacency.sum(axis=1), (np.arange(V), np.arange(V))), shape=(V, V))
-    matrix = csc_array(identity(V) + weight * (degrees - adjacency))
-    factors = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    solution = solver(csc_array(identity(V) + weight * laplacian(topology.edges, V)))
 
     def solve(x: Tensor) -> Tensor:
-        return torch.from_numpy(factors.solve(x.detach().cpu().double().numpy())).to(x)
+        return torch.from_numpy(solution(x.detach().cpu().double().numpy())).to(x)
 
     return solve
 
