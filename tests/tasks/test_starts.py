@@ -148,10 +148,13 @@ def test_a_hull_that_is_near_all_over_takes_the_fewer_iterations() -> None:
         assert within_need(quick, Started(mesh, "hull", other)) == (quick, None)
     for asked in ({"iterations": 4999}, {"iterations": 5001}, {"start.near_iterations": None}):
         assert within_need(quick.changed(asked), near)[1] is None
-    for unasked in (ReconstructConfig.best(), ReconstructConfig.demo()):
-        assert within_need(unasked, near) == (unasked.changed({"drawing.opaque_from": 0.8}), None)
-    for kept in (ReconstructConfig.paper(), ReconstructConfig.best().changed({"drawing.opaque_from": 0.5})):
-        assert within_need(kept, near) == (kept, None)
+    best, sooner = ReconstructConfig.best(), {"drawing.opaque_from": 0.8}
+    assert within_need(best, near)[0] == best.changed({"iterations": 8000, **sooner})
+    for unasked in (best.changed({"start.near_iterations": None}), ReconstructConfig.demo()):
+        assert within_need(unasked, near) == (unasked.changed(sooner), None)
+    kept = ReconstructConfig.paper()
+    assert within_need(kept, near) == (kept, None)
+    assert within_need(best.changed({"drawing.opaque_from": 0.5}), near)[0].drawing.opaque_from == 0.5
 
 
 def test_a_run_that_needs_fewer_iterations_is_shorter_and_says_why(tmp_path: Path) -> None:

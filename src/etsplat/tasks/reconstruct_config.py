@@ -101,10 +101,12 @@ class Start:
     near_fall: Annotated[Literal["exponential", "late"], _HULL] = "late"
     """How that rate falls: as it does elsewhere; or late, which stays high for longer and ends as low.
     Hollows, which travel far, are then opened deeper in as many steps."""
-    near_iterations: Annotated[int | None, Range(1), _HULL] = None
-    """A run of the preset's own length ends after so many iterations where the hull is near the surface all over:
+    near_iterations: Annotated[int | None, Range(1), _HULL] = 8000
+    """A run of the preset's own length has so many iterations at most where the hull is near the surface all over:
     hardly a hollow was to be opened, and photos see nearly all of it and agree there.
-    Vertices then move at a third of the rate, too. None for all iterations, at the whole rate."""
+    None for all iterations, at the whole rate."""
+    near_rate: Annotated[float, Range(1e-6, 1), _HULL] = 1.0
+    """In these iterations the rate of vertices is multiplied by this, too."""
     near_edge: Annotated[float, Range(0, 1), _HULL] = 0.02
     """And the weight of edges by this: pulled tight they fill hollows."""
     near_reach: Annotated[float, Range(0), _HULL] = 2.0
@@ -353,6 +355,7 @@ _PAPER: dict[str, Any] = {
     "pixels_per_face": None,
     "start.shape": "sphere",
     "start.near_fall": "exponential",
+    "start.near_iterations": None,
     "pictures.coarse_levels": 0,
     "pictures.coarse_until": 0.5,
     "drawing.opaque_from": 1.0,
@@ -391,7 +394,7 @@ _PRESETS: dict[str, dict[str, Any]] = {
         "refinement.subdivisions": 15,
         "output.checkpoint_every": 1000,
     },
-    "quick": {**_QUICK, "start.near_iterations": 2000},
+    "quick": {**_QUICK, "start.near_iterations": 2000, "start.near_rate": 1 / 3},
     "demo": {**_QUICK, "iterations": 2500},
     "tiny": {
         **_PAPER,

@@ -36,9 +36,6 @@ _DOUBTFUL, _AGREED = 0.05, 0.5
 """A hull is near the surface all over if no larger part of its vertices was moved or is not seen by two photos:
 hollows, which travel on to the end of a run; and if photos agree on so many, which they hardly do on thin parts."""
 
-_CALM = 1 / 3
-"""Of the rate of vertices, where a hull is near the surface all over: larger steps leave it for what noise says."""
-
 _OPAQUE_FROM = 0.8
 """From this fraction of a run on triangles are opaque, where a hull is near the surface all over: what is left to do is
 at outlines. Hollows are opened while triangles are soft."""
@@ -245,7 +242,7 @@ def nearby(config: ReconstructConfig) -> ReconstructConfig:
 def within_need(config: ReconstructConfig, started: Started) -> tuple[ReconstructConfig, str | None]:
     """The settings for a hull that is near the surface all over: triangles are opaque sooner.
 
-    With `start.near_iterations` there are also fewer iterations, and vertices are slower.
+    With `start.near_iterations` there are also fewer iterations: noise goes on making dents as long as a run lasts.
 
     Args:
         config: as asked for. A length that is not its preset's own stays.
@@ -262,9 +259,8 @@ def within_need(config: ReconstructConfig, started: Started) -> tuple[Reconstruc
     enough, own = config.start.near_iterations, ReconstructConfig.of(config.preset).iterations
     if enough is None or config.iterations != own or own <= enough:
         return config, None
-    less = f"{enough:,} iterations, not {own:,}, and vertices at a third of their rate"
-    about = f"the hull is near the surface all over: {less} (start.near_iterations)"
-    calmer = replace(config.optimizer, lr_vertices=_CALM * config.optimizer.lr_vertices)
+    about = f"the hull is near the surface all over: {enough:,} iterations, not {own:,} (start.near_iterations)"
+    calmer = replace(config.optimizer, lr_vertices=config.start.near_rate * config.optimizer.lr_vertices)
     return replace(config, iterations=enough, optimizer=calmer), about
 
 
