@@ -42,6 +42,9 @@ class Start:
 
     points: Annotated[int, Range(1, 10**8)] = 100_000
     """So many random triangles to start from where the capture has no points."""
+    dense: bool = True
+    """Triangles start at places that photos agree on, too, where the capture has points and photos agree on many;
+    up to half of the triangles that there may be."""
     scale: Annotated[float, Range(1e-6)] = 2.23
     """Size of a triangle at the start, relative to the distance to its neighbours."""
     limit: Annotated[float | None, Range(0)] = 0.4
@@ -309,6 +312,7 @@ _PAPER: dict[str, Any] = {
     "sky": "dome",
     "drawing.near_plane": 0.2,
     "drawing.cull_small": True,
+    "start.dense": False,
     "start.limit": None,
     "schedule.max_epochs": None,
     "optimizer.lr_vertices": 0.0018,
@@ -336,6 +340,7 @@ _TINY: dict[str, Any] = {
     "max_triangles": 2000,
     "sky": "dome",
     "drawing.sh_degree": 1,
+    "start.dense": False,
     "start.points": 1000,
     "output.log_every": 20,
     "output.evaluate_every": 100,

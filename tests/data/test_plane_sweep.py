@@ -1,0 +1,118 @@
+"""Depths that photos agree on, of a wall whose depths are known."""
+
+import math
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from etsplat.data.dataset import Dataset
+from etsplat.data.pictures import StoredPictures
+from etsplat.data.plane_sweep import swept_points
+from etsplat.optim.loop import Event, NoteEvent
+from etsplat.tasks.dense_starts import LEAST_SHARE, with_swept_points
+
+W, H = 96, 64
+NORMAL, OFFSET = torch.tensor([0.2, -0.1, 1.0], dtype=torch.float64), 4.0
+"""The wall: where NORMAL x = OFFSET."""
+
+
+def painted(points: Float[Tensor, "*N 3"]) -> Float[Tensor, "*N 3"]:
+    """Waves of many lengths, a colour for each place of the wall."""
+    generator = torch.Generator().manual_seed(3)
+    waves = 8 * torch.randn((24, 2), generator=generator, dtype=torch.float64)
+    phases = 2 * math.pi * torch.rand((24, 3), generator=generator, dtype=torch.float64)
+    angles = (points[..., :2] @ waves.T)[..., None] + phases
+    return (0.5 + 0.5 * angles.sin().mean(dim=-2) * 2).clamp(0.0, 1.0)
+
+
+def wall(count: int = 5, *, alike: bool = True) -> Dataset:
+    """Photos of the wall from places side by side, with some points on it; or of nothing that is in two of them."""
+    K = torch.tensor([[100.0, 0.0, W / 2], [0.0, 100.0, H / 2], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    rows, columns = torch.meshgrid(torch.arange(H) + 0.5, torch.arange(W) + 0.5, indexing="ij")
+    rays = torch.stack([columns, rows, torch.ones_like(rows)], dim=-1).double() @ torch.linalg.inv(K).T
+    poses, photos, generator = [], [], torch.Generator().manual_seed(0)
+    for number in range(count):
+        center = torch.tensor([0.4 * (number - count // 2), 0.1 * (number % 2), 0.0], dtype=torch.float64)
+        depths = (OFFSET - NORMAL @ center) / (rays @ NORMAL)
+        colors = painted(center + rays * depths[..., None])
+        photo = colors if alike else torch.rand((H, W, 3), generator=generator)
+        photos.append((255 * photo).round().to(torch.uint8))
+        pose = torch.eye(4, dtype=torch.float64)
+        pose[:3, 3] = -center
+        poses.append(pose)
+    across = 1.5 * (2 * torch.rand((300, 2), generator=generator, dtype=torch.float64) - 1)
+    points = torch.cat([across, ((OFFSET - across @ NORMAL[:2]) / NORMAL[2])[:, None]], dim=1)
+    return Dataset(
+        viewmats=torch.stack(poses),
+        Ks=K.repeat(count, 1, 1),
+        images=StoredPictures(photos),
+        names=[f"{number}" for number in range(count)],
+        train=list(range(count)),
+        test=[],
+        exact_points=points,
+        point_colors=painted(points).float(),
+    )
+
+
+def nothing(_: int, __: int) -> None:
+    pass
+
+
+def test_points_lie_on_the_wall() -> None:
+    """Where three photos see it: a hundredth of the depth off at most, much less in the median, in its colours."""
+    swept = swept_points(wall(7))
+    off = (swept.positions @ NORMAL - OFFSET).abs() / NORMAL.norm()
+    assert swept.share > 0.3
+    assert float(off.median()) < 0.003 * OFFSET
+    assert float(off.quantile(0.99)) < 0.015 * OFFSET
+    assert float((swept.colors - painted(swept.positions)).abs().mean()) < 0.02
+
+
+def test_photos_of_different_things_agree_on_nothing() -> None:
+    """Not even by chance; then the capture keeps its own points, and the run says why."""
+    capture = wall(alike=False)
+    assert swept_points(capture).share < LEAST_SHARE / 10
+    events = list[Event]()
+    assert with_swept_points(capture, 4000, events.append, nothing) is capture
+    assert any(isinstance(each, NoteEvent) and "agree on 0 %" in each.text for each in events)
+
+
+def test_what_masks_exclude_or_is_transparent_gets_no_points() -> None:
+    """The left half by alpha, the upper one by a mask."""
+    capture = wall()
+    masks = [torch.full((H, W), 255, dtype=torch.uint8) for _ in capture.train]
+    photos = []
+    for photo, mask in zip(capture.images, masks, strict=True):
+        alpha = torch.full((H, W, 1), 255, dtype=torch.uint8)
+        alpha[:, : W // 2] = 0
+        mask[: H // 2] = 0
+        photos.append(torch.cat([torch.where(alpha > 0, photo, 0), alpha], dim=-1).to(torch.uint8))
+    masked = replace(capture, images=StoredPictures(photos, masks))
+    swept, whole = swept_points(masked), swept_points(capture)
+    assert 0 < len(swept.positions) < len(whole.positions) / 3
+    middle = capture.viewmats[2, :3, 3]  # of the leftmost camera's frame the right half alone is left
+    assert float((swept.positions + middle)[:, 1].quantile(0.05)) > -0.3
+
+
+def test_a_start_is_spread_evenly_and_no_larger_than_asked() -> None:
+    """Half of the triangles that there may be, or as many as the capture has points."""
+    events = list[Event]()
+    dense = with_swept_points(wall(), 4000, events.append, nothing)
+    assert dense.exact_points is not None
+    assert 1000 < len(dense.exact_points) <= 2000
+    fewer = with_swept_points(wall(), 400, events.append, nothing)
+    assert fewer.exact_points is not None
+    assert 200 < len(fewer.exact_points) <= 300
+    assert any(isinstance(each, NoteEvent) and "starting from" in each.text for each in events)
+
+
+def test_without_points_nothing_is_swept() -> None:
+    """Nobody says how far away things are."""
+    capture = replace(wall(), exact_points=None, point_colors=None)
+    assert with_swept_points(capture, 4000, nothing_told, nothing) is capture
+
+
+def nothing_told(event: Event) -> None:
+    raise AssertionError(event)
