@@ -105,7 +105,7 @@ class Start:
     """A run of the preset's own length has so many iterations at most where the hull is near the surface all over:
     hardly a hollow was to be opened, and photos see nearly all of it and agree there.
     None for all iterations, at the whole rate."""
-    near_rate: Annotated[float, Range(1e-6, 1), _HULL] = 1.0
+    near_rate: Annotated[float, Range(1e-6, 1), _HULL] = 0.7
     """In these iterations the rate of vertices is multiplied by this, too."""
     near_edge: Annotated[float, Range(0, 1), _HULL] = 0.02
     """And the weight of edges by this: pulled tight they fill hollows."""
@@ -356,6 +356,7 @@ _PAPER: dict[str, Any] = {
     "start.shape": "sphere",
     "start.near_fall": "exponential",
     "start.near_iterations": None,
+    "start.near_rate": 1.0,
     "pictures.coarse_levels": 0,
     "pictures.coarse_until": 0.5,
     "drawing.opaque_from": 1.0,

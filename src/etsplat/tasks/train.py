@@ -179,7 +179,8 @@ def _fit(
         start = capture
         if part is None:
             start = with_shown_points(capture, trust, triangle_limit(own, config), job.announce)
-            if config.start.dense and own.exact_points is not None and paths["init_points"] is None:
+            wanted = config.start.dense and config.finish == "none" and paths["init_points"] is None
+            if wanted and own.exact_points is not None:
                 start = with_swept_points(start, triangle_limit(own, config), job.announce, job.prepared)
         trainer = start_trainer(start, config, scorer.cheap, job.device, trust, part)
 
@@ -210,8 +211,7 @@ def _fit(
             job.first(lambda: result.save(job.run.soup_path))
             keep_colors(soup, job.run.path)
             opaque, about_opaque = None, {}
-            placed = replace(capture, exact_points=start.exact_points, point_colors=start.point_colors)
-            if config.asset and (mesh := _opaque_mesh(job, soup, trainer.exposure, placed, config)) is not None:
+            if config.asset and (mesh := _opaque_mesh(job, soup, trainer.exposure, capture, config)) is not None:
                 about_opaque = job.first(partial(scorer.asset, mesh, job.run.test))
                 opaque = mesh.to_file(capture.normalization)
                 job.first(partial(_write_opaque, SoupRun(job.run.path, result, own, opaque), job.run, opaque))
