@@ -10,6 +10,7 @@ from torch import Tensor
 from etsplat.data.dataset import Dataset
 from etsplat.data.pictures import StoredPictures
 from etsplat.data.plane_sweep import swept_points
+from etsplat.engines.threads import num_threads, set_num_threads
 from etsplat.optim.loop import Event, NoteEvent
 from etsplat.tasks.dense_starts import LEAST_SHARE, with_swept_points
 
@@ -68,6 +69,19 @@ def test_points_lie_on_the_wall() -> None:
     assert float(off.median()) < 0.003 * OFFSET
     assert float(off.quantile(0.99)) < 0.015 * OFFSET
     assert float((swept.colors - painted(swept.positions)).abs().mean()) < 0.02
+
+
+def test_bits_do_not_depend_on_threads() -> None:
+    """Nor on those of torch."""
+    before, ours, found = torch.get_num_threads(), num_threads(), []
+    for threads in (1, 3):
+        torch.set_num_threads(threads)
+        set_num_threads(threads)
+        found.append(swept_points(wall()))
+    torch.set_num_threads(before)
+    set_num_threads(ours)
+    assert torch.equal(found[0].positions, found[1].positions)
+    assert torch.equal(found[0].colors, found[1].colors)
 
 
 def test_photos_of_different_things_agree_on_nothing() -> None:

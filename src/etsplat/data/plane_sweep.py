@@ -7,6 +7,7 @@ elsewhere, and if other photos found the same place.
 
 import math
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import torch
@@ -16,6 +17,7 @@ from torch.nn.functional import grid_sample, interpolate, normalize
 
 from etsplat.data.dataset import Dataset
 from etsplat.data.pictures import as_float
+from etsplat.engines.threads import num_threads, one_torch_thread
 
 SIDE = 200
 """Longer side of the photos that are compared, in pixels: depths of larger ones are finer than triangles at the start
@@ -23,6 +25,9 @@ need to be."""
 
 PHOTOS = 64
 """So many photos at most are compared; of more, every second, third, ... one."""
+
+SIDE_BY_SIDE = 4
+"""So many photos at most are swept at a time, each by one thread; a third of a gigabyte each."""
 
 NEIGHBOURS, AGREEING = 4, 2
 """Neighbours of a photo, and how many of them, the best ones, a depth is judged by: others may not see the place."""
@@ -120,12 +125,17 @@ def swept_points(capture: Dataset, progress: Callable[[int, int], None] | None =
     framed = [photo.framed(*photo.projected(points)) for photo in photos]
     some = slice(None, None, math.ceil(len(points) / ASKED))
     beside = _neighbours(photos, points[some], [inside[some] for inside in framed])
+
+    def swept(number: int) -> Float[Tensor, "h w"]:
+        photo, near = photos[number], [photos[other] for other in beside[number]]
+        return _depths(photo, near, photo.projected(points[framed[number]])[1])
+
     depths = []
-    for number, photo in enumerate(photos):
-        near = [photos[other] for other in beside[number]]
-        depths.append(_depths(photo, near, photo.projected(points[framed[number]])[1]))
-        if progress is not None:
-            progress(number + 1, len(photos))
+    with one_torch_thread(), ThreadPoolExecutor(min(num_threads(), SIDE_BY_SIDE)) as pool:
+        for found in pool.map(swept, range(len(photos))):
+            depths.append(found)
+            if progress is not None:
+                progress(len(depths), len(photos))
     positions, colors = [], []
     for number, (photo, found) in enumerate(zip(photos, depths, strict=True)):
         places = photo.places(found)
@@ -212,13 +222,11 @@ def _correlation(photo: _Photo, other: _Photo, inverse: Float[Tensor, " D"]) -> 
     h, w = other.grey.shape
     whole = torch.tensor([[2 / w, 0.0, -1.0], [0.0, 2 / h, -1.0], [0.0, 0.0, 1.0]], dtype=torch.float64) @ other.K
     turn = other.rotation @ photo.rotation.T
-    shift = (whole @ (other.shift - turn @ photo.shift)).float()
-    ahead = (photo.rays @ (whole @ turn).T).float()
-    seen = ahead + shift * inverse[:, None, None, None]
-    places = seen[..., :2] / seen[..., 2:].clamp_min(1e-6)  # from -1 to 1 across the photo
+    start = (whole @ (other.shift - turn @ photo.shift)).float()
+    seen = (photo.rays @ (whole @ turn).T).float() + start * inverse[:, None, None, None]
+    places = seen[..., :2] / seen[..., 2:].clamp_min(1e-6)  # from -1 to 1 across the other
     outside = ~((places.abs() < 1).all(dim=-1) & (seen[..., 2] > 0))
-    images = other.grey.expand(len(inverse), 1, -1, -1)
-    warped = grid_sample(images, places, align_corners=False)
+    warped = grid_sample(other.grey.expand(len(inverse), 1, -1, -1), places, align_corners=False)
     grey = photo.grey[None, None]
     mean, variance = _spread(grey)
     there, varies = _spread(warped)
