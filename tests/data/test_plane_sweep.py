@@ -122,6 +122,22 @@ def test_a_start_is_spread_evenly_and_no_larger_than_asked() -> None:
     assert any(isinstance(each, NoteEvent) and "starting from" in each.text for each in events)
 
 
+def test_points_without_colors_get_those_of_the_photos() -> None:
+    """As a dense cloud without any does."""
+    dense = with_swept_points(replace(wall(), point_colors=None), 4000, list[Event]().append, nothing)
+    assert dense.exact_points is not None
+    assert dense.point_colors is not None
+    assert float((dense.point_colors - painted(dense.exact_points)).abs().mean()) < 0.05
+
+
+def test_a_photo_from_beyond_the_nearest_plane_is_no_obstacle() -> None:
+    """What is nearest lies behind its camera, where it has no place in its photo."""
+    capture = wall(6)
+    ahead = capture.viewmats.clone()
+    ahead[5, :3, 3] = torch.tensor([0.0, 0.0, -3.7], dtype=torch.float64)
+    assert swept_points(replace(capture, viewmats=ahead)).share > 0.15
+
+
 def test_without_points_nothing_is_swept() -> None:
     """Nobody says how far away things are."""
     capture = replace(wall(), exact_points=None, point_colors=None)

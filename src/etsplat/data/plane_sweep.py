@@ -213,8 +213,12 @@ def _planes(photo: _Photo, others: Sequence[_Photo], near: float, far: float) ->
     h, w = photo.grey.shape
     ray = photo.rays[h // 2, w // 2]
     ends = torch.stack([(ray * depth - photo.shift) @ photo.rotation for depth in (near, far)])
-    moves = [float((pixels[0] - pixels[1]).norm()) for pixels, _ in (other.projected(ends) for other in others)]
-    return min(max(PLANES[0], *(math.ceil(move) for move in moves)), PLANES[1])
+    widest = 0.0
+    for other in others:
+        pixels, depths = other.projected(ends)
+        move = float((pixels[0] - pixels[1]).norm())
+        widest = max(widest, move if bool((depths > 0).all()) else PLANES[1])
+    return math.ceil(min(max(PLANES[0], widest), PLANES[1]))
 
 
 def _correlation(photo: _Photo, other: _Photo, inverse: Float[Tensor, " D"]) -> Float[Tensor, "D h w"]:

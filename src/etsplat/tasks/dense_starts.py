@@ -28,7 +28,7 @@ def with_swept_points(
         announce: told of what is found.
         progress: called with (photos compared, photos in all).
     """
-    if capture.exact_points is None or capture.point_colors is None:
+    if capture.exact_points is None:
         return capture
     swept = swept_points(capture, progress)
     agreed = f"photos agree on {100 * swept.share:.0f} % of their pixels"
@@ -36,7 +36,8 @@ def with_swept_points(
         announce(NoteEvent(f"start: {agreed} alone, so that triangles start at the capture's points"))
         return capture
     positions = torch.cat([capture.exact_points, swept.positions])
-    colors = torch.cat([capture.point_colors, swept.colors])
+    own = capture.point_colors
+    colors = None if own is None else torch.cat([own, swept.colors])
     found = dense_start(positions, colors, capture, max(1, most // 2, len(capture.exact_points)))
     announce(NoteEvent(f"start: {agreed}; {found.note}"))
     return replace(capture, exact_points=found.positions, point_colors=found.colors)
