@@ -110,24 +110,18 @@ def test_what_masks_exclude_or_is_transparent_gets_no_points() -> None:
     assert float((swept.positions + middle)[:, 1].quantile(0.05)) > -0.3
 
 
-def test_a_start_is_spread_evenly_and_no_larger_than_asked() -> None:
-    """Half of the triangles that there may be, or as many as the capture has points."""
-    events = list[Event]()
-    dense = with_swept_points(wall(), 4000, events.append, nothing)
-    assert dense.exact_points is not None
-    assert 1000 < len(dense.exact_points) <= 2000
-    fewer = with_swept_points(wall(), 400, events.append, nothing)
-    assert fewer.exact_points is not None
-    assert 200 < len(fewer.exact_points) <= 300
-    assert any(isinstance(each, NoteEvent) and "starting from" in each.text for each in events)
-
-
-def test_points_without_colors_get_those_of_the_photos() -> None:
-    """As a dense cloud without any does."""
-    dense = with_swept_points(replace(wall(), point_colors=None), 4000, list[Event]().append, nothing)
+def test_what_is_found_joins_the_points_of_the_capture() -> None:
+    """Up to half of the triangles that there may be; a capture with as many points keeps its own."""
+    events, capture = list[Event](), wall()
+    dense = with_swept_points(capture, 4000, events.append, nothing)
+    assert capture.exact_points is not None
     assert dense.exact_points is not None
     assert dense.point_colors is not None
-    assert float((dense.point_colors - painted(dense.exact_points)).abs().mean()) < 0.05
+    assert torch.equal(dense.exact_points[:300], capture.exact_points)
+    assert 1000 < len(dense.exact_points) == len(dense.point_colors) <= 2000
+    assert any(isinstance(each, NoteEvent) and "join the capture's 300 points" in each.text for each in events)
+    assert with_swept_points(capture, 600, nothing_told, nothing) is capture
+    assert with_swept_points(replace(capture, point_colors=None), 4000, events.append, nothing).point_colors is None
 
 
 def test_a_photo_from_beyond_the_nearest_plane_is_no_obstacle() -> None:
