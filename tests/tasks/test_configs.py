@@ -88,7 +88,7 @@ def test_presets_of_reconstruct_are_what_they_were(preset: str) -> None:
     since = {"start.hull_faces": 12_500, "start.near": 0.3, "start.near_edge": 0.02, "start.near_reach": 2.0}
     since["start.near_fall"] = "exponential" if preset in ("paper", "study", "tiny") else "late"
     since["start.near_iterations"] = 2000 if preset == "quick" else 8000 if preset in ("best", "demo") else None
-    since["start.near_rate"] = 1 / 3 if preset == "quick" else 0.7 if preset in ("best", "demo") else 1.0
+    since["start.near_rate"] = 1 / 3 if preset == "quick" else 0.7
     since["drawing.opaque_from"] = 1.0 if preset in ("paper", "study", "tiny") else 0.9
     since["optimizer.lr_opaque"] = 6e-5 if preset in ("best", "paper") else 3e-4
     since["refinement.reach"] = 0.5

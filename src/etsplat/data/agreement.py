@@ -95,9 +95,9 @@ class Photo:
         return grid_sample(planes, places[None], mode=mode, align_corners=False)[0]
 
 
-def reduced(dataset: Dataset) -> Dataset:
-    """Halved until no training view is wider than agreement asks for."""
-    while dataset.train and max(dataset.images.sizes[index][0] for index in dataset.train) > _WIDEST:
+def reduced(dataset: Dataset, widest: int = _WIDEST) -> Dataset:
+    """Halved until no training view is wider, by default than agreement of surfaces asks for."""
+    while dataset.train and max(dataset.images.sizes[index][0] for index in dataset.train) > widest:
         dataset = dataset.halved()
     return dataset
 

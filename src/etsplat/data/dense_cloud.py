@@ -12,8 +12,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from etsplat.data.dataset import Dataset
-from etsplat.data.depth_points import project
-from etsplat.data.pictures import as_float
+from etsplat.data.depth_points import framed, project
+from etsplat.data.pictures import as_float, unpremultiplied
 
 SEEN_BY, AGREEING = 2, 0.5
 """So many photos must see a point, and this part of them in its colour."""
@@ -186,19 +186,17 @@ def _cubes(points: Float[Tensor, "P 3"], low: Float[Tensor, "3"], side: float) -
 
 def _look(dataset: Dataset, view: int, points: Float[Tensor, "P 3"], hiding: Bool[Tensor, " P"]) -> _Seen:
     """What a photo says of every point, where those that are `hiding` hide others."""
-    picture, (width, height) = dataset.images.picture(view), dataset.images.sizes[view]
+    picture, (width, _) = dataset.images.picture(view), dataset.images.sizes[view]
     depth, column, row = project(dataset, view, points)
-    framed = (depth > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    column = torch.where(framed, column, 0).long()
-    row = torch.where(framed, row, 0).long()
-    cells = min(CELLS, max(1, int((int((framed & hiding).sum()) / IN_CELL) ** 0.5)))
+    inside = framed(dataset, view, depth, column, row)
+    column = torch.where(inside, column, 0).long()
+    row = torch.where(inside, row, 0).long()
+    cells = min(CELLS, max(1, int((int((inside & hiding).sum()) / IN_CELL) ** 0.5)))
     cell = (row * cells // width) * cells + column * cells // width
     nearest = torch.full((int(cell.max()) + 1,), torch.inf, dtype=depth.dtype)
-    nearest = nearest.scatter_reduce(0, cell[framed & hiding], depth[framed & hiding], "amin")
-    pixels = as_float(picture.pixels)[row, column]
-    opaque = pixels[:, 3] > 0.5 if pixels.shape[1] == 4 else torch.ones_like(framed)
-    colors = pixels[:, :3] / pixels[:, 3:].clamp_min(1e-3) if pixels.shape[1] == 4 else pixels
+    nearest = nearest.scatter_reduce(0, cell[inside & hiding], depth[inside & hiding], "amin")
+    colors, opaque = unpremultiplied(as_float(picture.pixels)[row, column])
     if picture.mask is not None:
-        framed = framed & (picture.mask[row, column] > 127)
-    seen = framed & opaque & (depth <= BEHIND * nearest[cell])
-    return _Seen(framed, framed & ~opaque, seen, colors)
+        inside = inside & (picture.mask[row, column] > 127)
+    seen = inside & opaque & (depth <= BEHIND * nearest[cell])
+    return _Seen(inside, inside & ~opaque, seen, colors)

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from etsplat.data.dataset import Dataset
@@ -61,15 +61,13 @@ def shown_by_map(dataset: Dataset, view: int, unit: float = 1.0, samples: int = 
         unit: the map is multiplied by this first.
         samples: about so many pixels along the width, twice as many at most.
     """
-    said, viewmat, K = dataset.images.depth(view), dataset.viewmats[view], dataset.Ks[view]
+    said = dataset.images.depth(view)
     assert said is not None
     step = max(1, said.shape[1] // samples)
     depth = said[::step, ::step].double() * unit / dataset.normalization.radius
     rows, columns = depth.nonzero().unbind(dim=1)
     depth = depth[rows, columns]
-    across = (columns * step + 0.5 - K[0, 2]) / K[0, 0] * depth
-    down = (rows * step + 0.5 - K[1, 2]) / K[1, 1] * depth
-    return (torch.stack([across, down, depth], dim=1) - viewmat[:3, 3]) @ viewmat[:3, :3]
+    return unproject(dataset, view, depth, columns * step + 0.5, rows * step + 0.5)
 
 
 def _seen(dataset: Dataset, view: int, points: Float[Tensor, "P 3"], unit: float = 1.0) -> Pairs:
@@ -77,8 +75,8 @@ def _seen(dataset: Dataset, view: int, points: Float[Tensor, "P 3"], unit: float
     said = dataset.images.depth(view)
     assert said is not None
     depth, column, row = project(dataset, view, points)
-    width, height = dataset.images.sizes[view]
-    inside = (depth > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    width, _ = dataset.images.sizes[view]
+    inside = framed(dataset, view, depth, column, row)
     depth, column, row = depth[inside], column[inside].long(), row[inside].long()
     cells = min(CELLS, max(1, int((len(depth) / IN_CELL) ** 0.5)))
     cell = (row * cells // width) * cells + column * cells // width
@@ -102,3 +100,37 @@ def project(
     viewmat, K = dataset.viewmats[view], dataset.Ks[view]
     across, down, depth = (points @ viewmat[:3, :3].T + viewmat[:3, 3]).unbind(dim=1)
     return depth, K[0, 0] * across / depth + K[0, 2], K[1, 1] * down / depth + K[1, 2]
+
+
+def unproject(
+    dataset: Dataset, view: int, depth: Float[Tensor, " P"], column: Float[Tensor, " P"], row: Float[Tensor, " P"]
+) -> Float[Tensor, "P 3"]:
+    """Points in the data set's frame, float64: what `project` takes.
+
+    Args:
+        dataset: whose view it is.
+        view: its index.
+        depth: (P,) float64.
+        column: (P,) of the pixels of the photo, whose middles are at halves.
+        row: (P,).
+    """
+    viewmat, K = dataset.viewmats[view], dataset.Ks[view]
+    across = (column - K[0, 2]) / K[0, 0] * depth
+    down = (row - K[1, 2]) / K[1, 1] * depth
+    return (torch.stack([across, down, depth], dim=1) - viewmat[:3, 3]) @ viewmat[:3, :3]
+
+
+def framed(
+    dataset: Dataset, view: int, depth: Float[Tensor, " P"], column: Float[Tensor, " P"], row: Float[Tensor, " P"]
+) -> Bool[Tensor, " P"]:
+    """Whether what `project` gives is in the frame of the photo.
+
+    Args:
+        dataset: whose view it is.
+        view: its index.
+        depth: (P,) of `project`.
+        column: (P,).
+        row: (P,).
+    """
+    width, height = dataset.images.sizes[view]
+    return (depth > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)

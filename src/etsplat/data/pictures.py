@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from etsplat.core.workers import workers
@@ -26,6 +26,13 @@ Pixels = UInt8[Tensor, "H W C"] | Float[Tensor, "H W 4"]
 def as_float(pixels: Pixels) -> Float[Tensor, "H W C"]:
     """Pixels in [0, 1]."""
     return pixels.float() / 255 if pixels.dtype == torch.uint8 else pixels
+
+
+def unpremultiplied(pixels: Float[Tensor, "*N C"]) -> tuple[Float[Tensor, "*N 3"], Bool[Tensor, "*N"]]:
+    """Colours of pixels in [0, 1] as they are where nothing shines through, and which are more than half opaque."""
+    if pixels.shape[-1] == 3:
+        return pixels, torch.ones(pixels.shape[:-1], dtype=torch.bool)
+    return pixels[..., :3] / pixels[..., 3:].clamp_min(1e-3), pixels[..., 3] > 0.5
 
 
 @dataclass(frozen=True)

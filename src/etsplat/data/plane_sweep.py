@@ -13,15 +13,16 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import grid_sample, interpolate, normalize
+from torch.nn.functional import grid_sample, normalize
 
+from etsplat.data.agreement import reduced
 from etsplat.data.dataset import Dataset
-from etsplat.data.pictures import as_float
+from etsplat.data.depth_points import framed, project, unproject
+from etsplat.data.pictures import as_float, unpremultiplied
 from etsplat.engines.threads import num_threads, one_torch_thread
 
-SIDE = 200
-"""Longer side of the photos that are compared, in pixels: depths of larger ones are finer than triangles at the start
-need to be."""
+WIDEST = 200
+"""Photos are halved until none is wider: depths of larger ones are finer than triangles at the start need to be."""
 
 PHOTOS = 64
 """So many photos at most are compared; of more, every second, third, ... one."""
@@ -74,41 +75,47 @@ class Swept:
 
 @dataclass(frozen=True)
 class _Photo:
-    """A small photo and its camera: x_camera = rotation x + shift.
+    """A small photo, as view `index` of a data set of such.
 
     Attributes:
-        colors: (3, h, w).
+        colors: (h, w, 3).
         grey: (h, w).
         counts: (h, w), where it shows something that is not masked.
-        rays: (h, w, 3) float64 through the middles of the pixels, 1 deep, in the camera's axes.
+        center: (3,) float64 of the camera.
+        rays: (h, w, 3) float64 from there through the middles of the pixels, to depth 1.
     """
 
-    colors: Float[Tensor, "3 h w"]
+    dataset: Dataset
+    index: int
+    colors: Float[Tensor, "h w 3"]
     grey: Float[Tensor, "h w"]
     counts: Bool[Tensor, "h w"]
-    K: Float[Tensor, "3 3"]
-    rotation: Float[Tensor, "3 3"]
-    shift: Float[Tensor, "3"]
+    center: Float[Tensor, "3"]
     rays: Float[Tensor, "h w 3"]
 
-    @property
-    def center(self) -> Float[Tensor, "3"]:
-        return -self.rotation.T @ self.shift
+    @staticmethod
+    def of(dataset: Dataset, index: int) -> "_Photo":
+        picture, (width, height) = dataset.images.picture(index), dataset.images.sizes[index]
+        colors, counts = unpremultiplied(as_float(picture.pixels))
+        if picture.mask is not None:
+            counts = counts & (picture.mask > 127)
+        row, column = (torch.cartesian_prod(torch.arange(height), torch.arange(width)) + 0.5).unbind(dim=1)
+        center, one = dataset.centers[index], torch.ones(height * width, dtype=torch.float64)
+        rays = unproject(dataset, index, one, column, row) - center
+        return _Photo(dataset, index, colors, colors.mean(dim=2), counts, center, rays.view(height, width, 3))
 
-    def projected(self, points: Float[Tensor, "P 3"]) -> tuple[Float[Tensor, "P 2"], Float[Tensor, " P"]]:
-        """Pixels, and depths; pixels mean nothing where depths are not positive."""
-        seen = points @ self.rotation.T + self.shift
-        depths = seen[:, 2]
-        return (seen @ self.K.T)[:, :2] / depths[:, None], depths
+    def located(self, points: Float[Tensor, "P 3"]) -> tuple[Tensor, Tensor, Tensor]:
+        """(P,) depths of points, columns and rows of their pixels."""
+        return project(self.dataset, self.index, points)
 
-    def framed(self, pixels: Float[Tensor, "P 2"], depths: Float[Tensor, " P"]) -> Bool[Tensor, " P"]:
-        size = torch.tensor([self.grey.shape[1], self.grey.shape[0]])
-        return (depths > 0) & ((pixels >= 0) & (pixels < size)).all(dim=1)
+    def frames(self, located: tuple[Tensor, Tensor, Tensor]) -> Bool[Tensor, " P"]:
+        """Whether they are in the photo."""
+        return framed(self.dataset, self.index, *located)
 
     def places(self, depths: Float[Tensor, "h w"]) -> Float[Tensor, "P 3"]:
         """Of the pixels with a depth, in rows."""
         known = depths > 0
-        return (self.rays[known] * depths[known, None].double() - self.shift) @ self.rotation
+        return self.center + self.rays[known] * depths[known, None]
 
 
 def swept_points(capture: Dataset, progress: Callable[[int, int], None] | None = None) -> Swept:
@@ -119,16 +126,17 @@ def swept_points(capture: Dataset, progress: Callable[[int, int], None] | None =
         progress: called with (photos compared, photos in all).
     """
     assert capture.exact_points is not None
-    every = math.ceil(len(capture.train) / PHOTOS)
-    photos = [_small(capture, view) for view in capture.train[::every]]
-    points = capture.exact_points
-    framed = [photo.framed(*photo.projected(points)) for photo in photos]
-    some = slice(None, None, math.ceil(len(points) / ASKED))
-    beside = _neighbours(photos, points[some], [inside[some] for inside in framed])
+    some = capture.train[:: math.ceil(len(capture.train) / PHOTOS)]
+    small = reduced(capture.of_views(some), WIDEST)
+    photos, points = [_Photo.of(small, index) for index in small.train], capture.exact_points
+    located = [photo.located(points) for photo in photos]
+    inside = [photo.frames(each) for photo, each in zip(photos, located, strict=True)]
+    asked = slice(None, None, math.ceil(len(points) / ASKED))
+    beside = _neighbours(photos, points[asked], [each[asked] for each in inside])
 
     def swept(number: int) -> Float[Tensor, "h w"]:
-        photo, near = photos[number], [photos[other] for other in beside[number]]
-        return _depths(photo, near, photo.projected(points[framed[number]])[1])
+        near = [photos[other] for other in beside[number]]
+        return _depths(photos[number], near, located[number][0][inside[number]])
 
     depths = []
     with one_torch_thread(), ThreadPoolExecutor(min(num_threads(), SIDE_BY_SIDE)) as pool:
@@ -142,28 +150,10 @@ def swept_points(capture: Dataset, progress: Callable[[int, int], None] | None =
         others = [pair for other, pair in enumerate(zip(photos, depths, strict=True)) if other != number]
         agreed = _found_by(places, others) >= SEEN_BY
         positions.append(places[agreed])
-        colors.append(photo.colors.permute(1, 2, 0)[found > 0][agreed])
+        colors.append(photo.colors[found > 0][agreed])
     compared = sum(int(photo.counts.sum()) for photo in photos)
     count = sum(len(each) for each in positions)
     return Swept(torch.cat(positions), torch.cat(colors), count / max(compared, 1))
-
-
-def _small(capture: Dataset, view: int) -> _Photo:
-    picture, (width, height) = capture.images.picture(view), capture.images.sizes[view]
-    pixels = as_float(picture.pixels).permute(2, 0, 1)
-    alpha = pixels[3:] if len(pixels) == 4 else torch.ones_like(pixels[:1])
-    counts = alpha if picture.mask is None else alpha * (picture.mask > 127)
-    scale = min(1.0, SIDE / max(width, height))
-    h, w = max(1, round(height * scale)), max(1, round(width * scale))
-    small = interpolate(torch.cat([pixels[:3], alpha, counts])[None], size=(h, w), mode="area")[0]
-    colors = (small[:3] / small[3:4].clamp_min(1e-3)).clamp(0.0, 1.0)
-    K = capture.Ks[view].double() * torch.tensor([[w / width], [h / height], [1.0]], dtype=torch.float64)
-    rows, columns = torch.meshgrid(
-        torch.arange(h, dtype=torch.float64) + 0.5, torch.arange(w, dtype=torch.float64) + 0.5, indexing="ij"
-    )
-    rays = torch.stack([columns, rows, torch.ones_like(rows)], dim=-1) @ torch.linalg.inv(K).T
-    pose = capture.viewmats[view].double()
-    return _Photo(colors, colors.mean(dim=0), small[4] > 0.5, K, pose[:3, :3], pose[:3, 3], rays)
 
 
 def _neighbours(
@@ -211,23 +201,22 @@ def _depths(photo: _Photo, others: Sequence[_Photo], known: Float[Tensor, " K"])
 def _planes(photo: _Photo, others: Sequence[_Photo], near: float, far: float) -> int:
     """So many that the middle of the photo moves by a pixel in the widest of the others between two."""
     h, w = photo.grey.shape
-    ray = photo.rays[h // 2, w // 2]
-    ends = torch.stack([(ray * depth - photo.shift) @ photo.rotation for depth in (near, far)])
+    ends = photo.center + photo.rays[h // 2, w // 2] * torch.tensor([[near], [far]])
     widest = 0.0
     for other in others:
-        pixels, depths = other.projected(ends)
-        move = float((pixels[0] - pixels[1]).norm())
-        widest = max(widest, move if bool((depths > 0).all()) else PLANES[1])
+        depth, column, row = other.located(ends)
+        move = math.hypot(float(column[0] - column[1]), float(row[0] - row[1]))
+        widest = max(widest, move if bool((depth > 0).all()) else PLANES[1])
     return math.ceil(min(max(PLANES[0], widest), PLANES[1]))
 
 
 def _correlation(photo: _Photo, other: _Photo, inverse: Float[Tensor, " D"]) -> Float[Tensor, "D h w"]:
     """Of the windows of a photo with those of another as each of the planes has it; -1 where that shows nothing."""
     h, w = other.grey.shape
-    whole = torch.tensor([[2 / w, 0.0, -1.0], [0.0, 2 / h, -1.0], [0.0, 0.0, 1.0]], dtype=torch.float64) @ other.K
-    turn = other.rotation @ photo.rotation.T
-    start = (whole @ (other.shift - turn @ photo.shift)).float()
-    seen = (photo.rays @ (whole @ turn).T).float() + start * inverse[:, None, None, None]
+    whole = torch.tensor([[2 / w, 0.0, -1.0], [0.0, 2 / h, -1.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    matrix = whole @ other.dataset.Ks[other.index] @ other.dataset.viewmats[other.index, :3]
+    along, start = photo.rays @ matrix[:, :3].T, matrix[:, :3] @ photo.center + matrix[:, 3]
+    seen = along.float() + start.float() * inverse[:, None, None, None]
     places = seen[..., :2] / seen[..., 2:].clamp_min(1e-6)  # from -1 to 1 across the other
     outside = ~((places.abs() < 1).all(dim=-1) & (seen[..., 2] > 0))
     warped = grid_sample(other.grey.expand(len(inverse), 1, -1, -1), places, align_corners=False)
@@ -265,9 +254,9 @@ def _found_by(
     """In how many other photos each place was found."""
     count = torch.zeros(len(places))
     for photo, depths in others:
-        pixels, expected = photo.projected(places)
-        framed = photo.framed(pixels, expected)
-        column, row = torch.where(framed[:, None], pixels, 0.0).long().unbind(dim=1)
+        expected, column, row = located = photo.located(places)
+        inside = photo.frames(located)
+        column, row = (torch.where(inside, each, 0.0).long() for each in (column, row))
         there = depths[row, column]
-        count += framed & (there > 0) & ((there - expected).abs() < SAME * expected)
+        count += inside & (there > 0) & ((there - expected).abs() < SAME * expected)
     return count

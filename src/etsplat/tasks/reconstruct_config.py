@@ -356,7 +356,6 @@ _PAPER: dict[str, Any] = {
     "start.shape": "sphere",
     "start.near_fall": "exponential",
     "start.near_iterations": None,
-    "start.near_rate": 1.0,
     "pictures.coarse_levels": 0,
     "pictures.coarse_until": 0.5,
     "drawing.opaque_from": 1.0,

@@ -259,7 +259,8 @@ def within_need(config: ReconstructConfig, started: Started) -> tuple[Reconstruc
     enough, own = config.start.near_iterations, ReconstructConfig.of(config.preset).iterations
     if enough is None or config.iterations != own or own <= enough:
         return config, None
-    about = f"the hull is near the surface all over: {enough:,} iterations, not {own:,} (start.near_iterations)"
+    less = f"{enough:,} iterations, not {own:,}, and vertices at {config.start.near_rate:.2g} of their rate"
+    about = f"the hull is near the surface all over: {less} (start.near_iterations)"
     calmer = replace(config.optimizer, lr_vertices=config.start.near_rate * config.optimizer.lr_vertices)
     return replace(config, iterations=enough, optimizer=calmer), about
 

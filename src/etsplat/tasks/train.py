@@ -178,10 +178,10 @@ def _fit(
         trust = trusted_depths(capture, loss.depth if loss.lambda_depth else "off", first, job.announce)
         start = capture
         if part is None:
-            start = with_shown_points(capture, trust, triangle_limit(own, config), job.announce)
-            wanted = config.start.dense and config.finish == "none" and paths["init_points"] is None
-            if wanted and own.exact_points is not None:
-                start = with_swept_points(start, triangle_limit(own, config), job.announce, job.prepared)
+            most = triangle_limit(own, config)
+            start = with_shown_points(capture, trust, most, job.announce)
+            if start is capture and config.start.dense and config.finish == "none" and paths["init_points"] is None:
+                start = with_swept_points(capture, most, job.announce, job.prepared)
         trainer = start_trainer(start, config, scorer.cheap, job.device, trust, part)
 
         def look(iteration: int) -> None:

@@ -43,8 +43,9 @@ class Start:
     points: Annotated[int, Range(1, 10**8)] = 100_000
     """So many random triangles to start from where the capture has no points."""
     dense: bool = True
-    """Triangles start at places that photos agree on, too, where the capture has points, but fewer than half of
-    the triangles that there may be, and photos agree on many. Those that become opaque (finish, asset) do without."""
+    """Triangles start at places that photos agree on, too, where photos agree on many places:
+    the capture's points are filled up to half of the triangles that there may be.
+    Not where the capture has no points, nor for triangles that become opaque (finish, asset)."""
     scale: Annotated[float, Range(1e-6)] = 2.23
     """Size of a triangle at the start, relative to the distance to its neighbours."""
     limit: Annotated[float | None, Range(0)] = 0.4
