@@ -123,6 +123,7 @@ def test_presets_of_train_are_what_they_were(preset: str, scene: str) -> None:
     since["loss.lambda_harmonics"] = 0.0 if off else 2.0
     since["asset"] = preset not in ("paper", "tiny")
     since["start.dense"] = preset not in ("paper", "tiny")
+    since["start.nearest"] = 0.0 if preset in ("paper", "tiny") else 0.75
     since["refine_cameras"] = "off"
     if not off:  # 0.0015, and 0.0004 of objects, in the unit of the frame
         since["optimizer.lr_vertices"] = 0.0006

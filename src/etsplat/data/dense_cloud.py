@@ -150,6 +150,23 @@ def dense_start(
     return DenseStart(kept, shown, f"starting from {len(kept):,} of {total:,} points{why}")
 
 
+def seen_in_other_colors(
+    points: Float[Tensor, "P 3"], colors: Float[Tensor, "P 3"] | None, dataset: Dataset
+) -> Bool[Tensor, " P"]:
+    """Which points training photos see in different colours, so that nothing is there. None of them hides others.
+
+    Args:
+        points: (P, 3) float64, in the frame of the data set.
+        colors: (P, 3) in [0, 1] of the points themselves, if they have any.
+        dataset: photos.
+    """
+    votes, hiding = _Votes.nothing(len(points)), torch.zeros(len(points), dtype=torch.bool)
+    for view in dataset.train:
+        if bool(framed(dataset, view, *project(dataset, view, points)).any()):
+            votes.add(_look(dataset, view, points, hiding), colors)
+    return votes.against(SEEN_BY)[_COLOR]
+
+
 def thinned(
     points: Float[Tensor, "P 3"], colors: Float[Tensor, "P 3"] | None, most: int
 ) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 3"] | None]:

@@ -10,6 +10,7 @@ import torch
 
 from etsplat.core.workers import together, workers
 from etsplat.data.dataset import Dataset
+from etsplat.data.stray_points import without_strays
 from etsplat.engines.choice import engine, engine_for
 from etsplat.engines.threads import one_torch_thread
 from etsplat.io.mesh_files import MeshFile
@@ -132,7 +133,9 @@ def train(
         source, config.width, images, masks, job.prepared, depths=maps, depth_unit=depth_unit, memory=memory
     )
     own = kept_aside(own, config.watch, config.refine_cameras)
-    if init_points is not None:
+    if init_points is None:
+        own = without_strays(own, config.start.nearest)
+    else:
         own, note = with_cloud(own, init_points, triangle_limit(own, config), job.prepared)
         job.announce(NoteEvent(note))
     folders = {"masks": path_of(masks), "depths": path_of(depths), "init_points": path_of(init_points)}

@@ -46,6 +46,9 @@ class Start:
     """Triangles start at places that photos agree on, too, where photos agree on many places:
     the capture's points are filled up to half of the triangles that there may be.
     Not where the capture has no points, nor for triangles that become opaque (finish, asset)."""
+    nearest: Annotated[float, Range(0, 1)] = 0.75
+    """Points before everything else that photos see in different colours are left out, for veils grow from them.
+    Before everything: nearer to a photo than this times where all points but a hundredth begin; 0 keeps all."""
     scale: Annotated[float, Range(1e-6)] = 2.23
     """Size of a triangle at the start, relative to the distance to its neighbours."""
     limit: Annotated[float | None, Range(0)] = 0.4
@@ -314,6 +317,7 @@ _PAPER: dict[str, Any] = {
     "drawing.near_plane": 0.2,
     "drawing.cull_small": True,
     "start.dense": False,
+    "start.nearest": 0.0,
     "start.limit": None,
     "schedule.max_epochs": None,
     "optimizer.lr_vertices": 0.0018,
@@ -342,6 +346,7 @@ _TINY: dict[str, Any] = {
     "sky": "dome",
     "drawing.sh_degree": 1,
     "start.dense": False,
+    "start.nearest": 0.0,
     "start.points": 1000,
     "output.log_every": 20,
     "output.evaluate_every": 100,

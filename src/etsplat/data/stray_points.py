@@ -1,0 +1,60 @@
+"""Points of structure from motion that hang before everything else: no start for a triangle.
+
+A triangle that begins just before a camera grows to a veil over the whole photo. It takes what light differs from photo
+to photo, and hangs over the views that no photo tells it of.
+"""
+
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from etsplat.data.dataset import Dataset
+from etsplat.data.dense_cloud import seen_in_other_colors
+from etsplat.data.depth_points import framed, project
+
+BEGINS_WITH = 0.01
+"""What a capture shows begins where this part of its points is nearer to the nearest photo."""
+
+
+def without_strays(capture: Dataset, nearest: float) -> Dataset:
+    """A capture without the points that hang before it and that photos see in different colours; a note says how many.
+
+    Args:
+        capture: photos and points.
+        nearest: how near points may be to the nearest training photo that they are in, as a part of where the capture
+            begins; nearer ones are asked for their colours. 0 leaves all.
+    """
+    points, colors = capture.exact_points, capture.point_colors
+    if points is None or nearest == 0 or not capture.train:
+        return capture
+    depth = _nearest_depth(capture, points)
+    shown = depth[depth.isfinite()].sort().values
+    if not len(shown):
+        return capture
+    asked = (depth < nearest * shown[int(BEGINS_WITH * len(shown))]).nonzero()[:, 0]
+    if not len(asked):
+        return capture
+    stray = seen_in_other_colors(points[asked], None if colors is None else colors[asked], capture)
+    kept = torch.ones(len(points), dtype=torch.bool)
+    kept[asked[stray]] = False
+    if bool(kept.all()):
+        return capture
+    note = f"start: {int((~kept).sum()):,} points hang before all others in no colour that photos agree on; without them"
+    return replace(
+        capture,
+        exact_points=points[kept],
+        point_colors=None if colors is None else colors[kept],
+        notes=(*capture.notes, note),
+    )
+
+
+def _nearest_depth(capture: Dataset, points: Float[Tensor, "P 3"]) -> Float[Tensor, " P"]:
+    """In front of the nearest training photo that shows each point; inf where none does."""
+    nearest = torch.full((len(points),), torch.inf, dtype=points.dtype)
+    for view in capture.train:
+        depth, column, row = project(capture, view, points)
+        inside = framed(capture, view, depth, column, row)
+        nearest = torch.where(inside, torch.minimum(nearest, depth), nearest)
+    return nearest
