@@ -41,7 +41,8 @@ def without_strays(capture: Dataset, nearest: float) -> Dataset:
     kept[asked[stray]] = False
     if bool(kept.all()):
         return capture
-    note = f"start: {int((~kept).sum()):,} points hang before all others in no colour that photos agree on; without them"
+    gone = int((~kept).sum())
+    note = f"start: {gone:,} points hang before all others in no colour that photos agree on; without them"
     return replace(
         capture,
         exact_points=points[kept],
