@@ -111,7 +111,7 @@ def test_what_masks_exclude_or_is_transparent_gets_no_points() -> None:
 
 
 def test_what_is_found_joins_the_points_of_the_capture() -> None:
-    """Up to half of the triangles that there may be; a capture with as many points keeps its own."""
+    """Up to half of the triangles that there may be, or to as many as the capture has, two thirds of which stay."""
     events, capture = list[Event](), wall()
     dense = with_swept_points(capture, 4000, events.append, nothing)
     assert capture.exact_points is not None
@@ -119,8 +119,11 @@ def test_what_is_found_joins_the_points_of_the_capture() -> None:
     assert dense.point_colors is not None
     assert torch.equal(dense.exact_points[:300], capture.exact_points)
     assert 1000 < len(dense.exact_points) == len(dense.point_colors) <= 2000
-    assert any(isinstance(each, NoteEvent) and "join the capture's 300 points" in each.text for each in events)
-    assert with_swept_points(capture, 600, nothing_told, nothing) is capture
+    assert any(isinstance(each, NoteEvent) and "join 300 of its 300 points" in each.text for each in events)
+    full = with_swept_points(capture, 600, events.append, nothing)
+    assert full.exact_points is not None
+    assert 200 < len(full.exact_points) <= 300
+    assert any(isinstance(each, NoteEvent) and "of its 300 points" in each.text for each in events[-1:])
     assert with_swept_points(replace(capture, point_colors=None), 4000, events.append, nothing).point_colors is None
 
 

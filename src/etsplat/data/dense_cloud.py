@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from etsplat.data.cubes import thinned
 from etsplat.data.dataset import Dataset
 from etsplat.data.depth_points import framed, project
 from etsplat.data.pictures import as_float, unpremultiplied
@@ -165,40 +166,6 @@ def seen_in_other_colors(
         if bool(framed(dataset, view, *project(dataset, view, points)).any()):
             votes.add(_look(dataset, view, points, hiding), colors)
     return votes.against(SEEN_BY)[_COLOR]
-
-
-def thinned(
-    points: Float[Tensor, "P 3"], colors: Float[Tensor, "P 3"] | None, most: int
-) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 3"] | None]:
-    """At most so many points: the means of those in each cube of the smallest grid that has no more cubes than that.
-
-    Cubes are sized by halving an interval, to 2 %.
-    """
-    if len(points) <= most:
-        return points, colors
-    low = points.amin(dim=0)
-    side = float((points.amax(dim=0) - low).max())
-    least, largest = side / 2**20, max(side, 1e-300)
-    while largest > 1.02 * least:
-        middle = (least * largest) ** 0.5
-        if len(_cubes(points, low, middle)[0]) > most:
-            least = middle
-        else:
-            largest = middle
-    _, cube = _cubes(points, low, largest)
-    number = int(cube.max()) + 1
-    sizes = torch.bincount(cube, minlength=number)[:, None]
-    means = torch.zeros((number, 3), dtype=points.dtype).index_add_(0, cube, points) / sizes
-    if colors is None:
-        return means, None
-    return means, torch.zeros((number, 3), dtype=colors.dtype).index_add_(0, cube, colors) / sizes
-
-
-def _cubes(points: Float[Tensor, "P 3"], low: Float[Tensor, "3"], side: float) -> tuple[Tensor, Tensor]:
-    """The cubes of a grid that hold points, and of each point which it is in."""
-    places = ((points - low) / side).long()
-    x, y, z = places.unbind(dim=1)
-    return torch.unique((x << 42) | (y << 21) | z, return_inverse=True)
 
 
 def _look(dataset: Dataset, view: int, points: Float[Tensor, "P 3"], hiding: Bool[Tensor, " P"]) -> _Seen:

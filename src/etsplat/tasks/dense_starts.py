@@ -5,40 +5,49 @@ from dataclasses import replace
 
 import torch
 
+from etsplat.data.cubes import seen_sizes, thinned
 from etsplat.data.dataset import Dataset
-from etsplat.data.dense_cloud import dense_start
+from etsplat.data.dense_cloud import COMPARED, dense_start
 from etsplat.data.plane_sweep import swept_points
 from etsplat.optim.loop import Event, NoteEvent
 
 LEAST_SHARE = 0.1
 """Photos that agree on a smaller part of their pixels do so by chance (0.01 of `lund`, and 0.4 to 0.6 of others)."""
 
+OWN = 2 / 3
+"""Part of the triangles at the start that begin at the capture's points, if it has so many: they are dense where there
+is detail."""
+
 
 def with_swept_points(
     capture: Dataset, most: int, announce: Callable[[Event], None], progress: Callable[[int, int], None]
 ) -> Dataset:
-    """A capture of few points with what its training photos agree on besides, as evenly as they may be.
+    """A capture that starts at what its training photos agree on, too, as evenly as photos show it.
 
     Structure from motion keeps corners and edges, many at one place and none at another. Triangles that begin at all of
-    what photos show need not grow there from afar. Its points stay: they are dense where there is detail.
+    what photos show need not grow there from afar. Where points are many they are thinned to cubes that look about as
+    large from the nearest camera, and what is swept takes the cubes in which there are none.
 
     Args:
         capture: in the frame that is trained in.
-        most: triangles that there may be; there are half as many points then, if the capture has no more of its own.
+        most: triangles that there may be; there are half as many points then, or as many as the capture has, if more.
         announce: told of what is found.
         progress: called with (photos compared, photos in all).
     """
-    if capture.exact_points is None or (room := most // 2 - len(capture.exact_points)) <= 0:
+    points, colors = capture.exact_points, capture.point_colors
+    if points is None:
         return capture
     swept = swept_points(capture, progress)
     agreed = f"photos agree on {100 * swept.share:.0f} % of their pixels"
-    if swept.share < LEAST_SHARE:
+    found = dense_start(swept.positions, swept.colors, capture, COMPARED) if swept.share >= LEAST_SHARE else None
+    if found is None or not len(found.positions):
         announce(NoteEvent(f"start: {agreed} alone, so that triangles start at the capture's points"))
         return capture
-    found = dense_start(swept.positions, swept.colors, capture, room)
-    joined = f"{len(found.positions):,} of these places join the capture's {len(capture.exact_points):,} points"
+    count = max(most // 2, len(points))
+    kept, kept_colors = thinned(points, colors, int(OWN * count), seen_sizes(points, capture))
+    sizes, taken = seen_sizes(found.positions, capture), (kept, seen_sizes(kept, capture))
+    added, added_colors = thinned(found.positions, found.colors, count - len(kept), sizes, taken)
+    joined = f"{len(added):,} of these places join {len(kept):,} of its {len(points):,} points"
     announce(NoteEvent(f"start: {agreed}; {joined}"))
-    positions, colors = torch.cat([capture.exact_points, found.positions]), None
-    if capture.point_colors is not None:
-        colors = torch.cat([capture.point_colors, found.colors])
-    return replace(capture, exact_points=positions, point_colors=colors)
+    both = None if kept_colors is None or added_colors is None else torch.cat([kept_colors, added_colors])
+    return replace(capture, exact_points=torch.cat([kept, added]), point_colors=both)
