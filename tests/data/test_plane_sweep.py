@@ -119,11 +119,11 @@ def test_what_is_found_joins_the_points_of_the_capture() -> None:
     assert dense.point_colors is not None
     assert torch.equal(dense.exact_points[:300], capture.exact_points)
     assert 1000 < len(dense.exact_points) == len(dense.point_colors) <= 2000
-    assert any(isinstance(each, NoteEvent) and "join 300 of its 300 points" in each.text for each in events)
+    assert any(isinstance(each, NoteEvent) and "join 300 of the capture's 300 points" in each.text for each in events)
     full = with_swept_points(capture, 600, events.append, nothing)
     assert full.exact_points is not None
     assert 200 < len(full.exact_points) <= 300
-    assert any(isinstance(each, NoteEvent) and "of its 300 points" in each.text for each in events[-1:])
+    assert any(isinstance(each, NoteEvent) and "of the capture's 300 points" in each.text for each in events[-1:])
     assert with_swept_points(replace(capture, point_colors=None), 4000, events.append, nothing).point_colors is None
 
 

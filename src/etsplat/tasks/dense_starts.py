@@ -47,7 +47,7 @@ def with_swept_points(
     kept, kept_colors = thinned(points, colors, int(OWN * count), seen_sizes(points, capture))
     sizes, taken = seen_sizes(found.positions, capture), (kept, seen_sizes(kept, capture))
     added, added_colors = thinned(found.positions, found.colors, count - len(kept), sizes, taken)
-    joined = f"{len(added):,} of these places join {len(kept):,} of its {len(points):,} points"
+    joined = f"{len(added):,} of these places join {len(kept):,} of the capture's {len(points):,} points"
     announce(NoteEvent(f"start: {agreed}; {joined}"))
     both = None if kept_colors is None or added_colors is None else torch.cat([kept_colors, added_colors])
     return replace(capture, exact_points=torch.cat([kept, added]), point_colors=both)
