@@ -124,7 +124,15 @@ def test_what_is_found_joins_the_points_of_the_capture() -> None:
     assert full.exact_points is not None
     assert 200 < len(full.exact_points) <= 300
     assert any(isinstance(each, NoteEvent) and "of the capture's 300 points" in each.text for each in events[-1:])
-    assert with_swept_points(replace(capture, point_colors=None), 4000, events.append, nothing).point_colors is None
+
+
+def test_what_is_found_has_its_colours_beside_points_without() -> None:
+    """Those are grey, as they are where nothing is found."""
+    dense = with_swept_points(replace(wall(), point_colors=None), 4000, list[Event]().append, nothing)
+    assert dense.exact_points is not None
+    assert dense.point_colors is not None
+    assert (dense.point_colors[:300] == 0.5).all()
+    assert float((dense.point_colors[300:] - painted(dense.exact_points[300:])).abs().mean()) < 0.05
 
 
 def test_a_photo_from_beyond_the_nearest_plane_is_no_obstacle() -> None:

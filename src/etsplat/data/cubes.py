@@ -40,26 +40,25 @@ def thinned(
     low, steps = everything.amin(dim=0), steps - steps.min()
     extent, bits = float((everything.amax(dim=0) - low).max()), (63 - int(steps.max()).bit_length()) // 3
 
-    def free(side: float) -> tuple[Tensor, Tensor]:
+    def free(side: float) -> tuple[Tensor, Tensor, int]:
         cube = _cubes(everything - low, side, steps, bits)
         left = ~torch.isin(cube[: len(points)], cube[len(points) :])
-        return left, torch.unique(cube[: len(points)][left], return_inverse=True)[1]
+        cubes, number = torch.unique(cube[: len(points)][left], return_inverse=True)
+        return left, number, len(cubes)
 
     least, largest = extent / 2 ** (bits - 1), max(extent, 1e-300)
     while largest > 1.02 * least:
         middle = (least * largest) ** 0.5
-        _, cube = free(middle)
-        if len(cube) and int(cube.max()) >= most:
+        if free(middle)[2] > most:
             least = middle
         else:
             largest = middle
-    left, cube = free(largest)
-    number = int(cube.max()) + 1 if len(cube) else 0
-    held = torch.bincount(cube, minlength=number)[:, None]
-    means = torch.zeros((number, 3), dtype=points.dtype).index_add_(0, cube, points[left]) / held
+    left, number, count = free(largest)
+    held = torch.bincount(number, minlength=count)[:, None]
+    means = torch.zeros((count, 3), dtype=points.dtype).index_add_(0, number, points[left]) / held
     if colors is None:
         return means, None
-    return means, torch.zeros((number, 3), dtype=colors.dtype).index_add_(0, cube, colors[left]) / held
+    return means, torch.zeros((count, 3), dtype=colors.dtype).index_add_(0, number, colors[left]) / held
 
 
 def seen_sizes(points: Float[Tensor, "P 3"], capture: Dataset) -> Int[Tensor, " P"]:

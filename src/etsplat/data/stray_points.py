@@ -27,22 +27,17 @@ def without_strays(capture: Dataset, nearest: float) -> Dataset:
             begins; nearer ones are asked for their colours. 0 leaves all.
     """
     points, colors = capture.exact_points, capture.point_colors
-    if points is None or nearest == 0 or not capture.train:
+    if points is None or nearest == 0:
         return capture
     depth = _nearest_depth(capture, points)
-    shown = depth[depth.isfinite()].sort().values
-    if not len(shown):
+    begins = depth.sort().values[int(BEGINS_WITH * int(depth.isfinite().sum()))]
+    asked = (depth < nearest * begins).nonzero()[:, 0]
+    stray = asked[seen_in_other_colors(points[asked], None if colors is None else colors[asked], capture)]
+    if not len(stray):
         return capture
-    asked = (depth < nearest * shown[int(BEGINS_WITH * len(shown))]).nonzero()[:, 0]
-    if not len(asked):
-        return capture
-    stray = seen_in_other_colors(points[asked], None if colors is None else colors[asked], capture)
     kept = torch.ones(len(points), dtype=torch.bool)
-    kept[asked[stray]] = False
-    if bool(kept.all()):
-        return capture
-    gone = int((~kept).sum())
-    note = f"start: {gone:,} points hang before all others in no colour that photos agree on; without them"
+    kept[stray] = False
+    note = f"start: {len(stray):,} points hang before all others in no colour that photos agree on; without them"
     return replace(
         capture,
         exact_points=points[kept],

@@ -34,9 +34,10 @@ def with_swept_points(
         announce: told of what is found.
         progress: called with (photos compared, photos in all).
     """
-    points, colors = capture.exact_points, capture.point_colors
+    points = capture.exact_points
     if points is None:
         return capture
+    colors = torch.full(points.shape, 0.5) if capture.point_colors is None else capture.point_colors
     swept = swept_points(capture, progress)
     agreed = f"photos agree on {100 * swept.share:.0f} % of their pixels"
     found = dense_start(swept.positions, swept.colors, capture, COMPARED) if swept.share >= LEAST_SHARE else None
@@ -49,5 +50,7 @@ def with_swept_points(
     added, added_colors = thinned(found.positions, found.colors, count - len(kept), sizes, taken)
     joined = f"{len(added):,} of these places join {len(kept):,} of the capture's {len(points):,} points"
     announce(NoteEvent(f"start: {agreed}; {joined}"))
-    both = None if kept_colors is None or added_colors is None else torch.cat([kept_colors, added_colors])
+    assert kept_colors is not None
+    assert added_colors is not None
+    both = torch.cat([kept_colors, added_colors])
     return replace(capture, exact_points=torch.cat([kept, added]), point_colors=both)

@@ -44,7 +44,7 @@ class Start:
     """So many random triangles to start from where the capture has no points."""
     dense: bool = True
     """Triangles start at places that photos agree on, too, where photos agree on many places:
-    the capture's points are filled up to half of the triangles that there may be.
+    in a third of the start or more, which is half of the triangles that there may be or as many as there are points.
     Not where the capture has no points, nor for triangles that become opaque (finish, asset)."""
     nearest: Annotated[float, Range(0, 1)] = 0.75
     """Points before everything else that photos see in different colours are left out, for veils grow from them.
