@@ -4,9 +4,10 @@
 # reconstruction and one soup; prints a short table last. A step that fails does not stop the others.
 #
 #   benchmarks/gpu_run.sh              all steps, in the order of what they tell
-#   benchmarks/gpu_run.sh test bench   some of: build doctor test bench sanitize reconstruct train
+#   benchmarks/gpu_run.sh test bench   some of: build doctor first sphere test bench profile sanitize reconstruct train
 #
-# For a device of which there are ten minutes: `build doctor first sphere`, some three of them the build; then `bench`.
+# For a device of which there are ten minutes: `build doctor first sphere`, some three of them the build unless WHEELS has
+# the package; then `test bench`.
 #   doctor     what is seen: driver, torch, NVRTC. If this fails, nothing else can work.
 #   first      tests of launches, sorting and the rasterizer, which say which kernel is wrong where one is
 #   sphere     one scene: compare "measured" with the floors beside it (docs/gpu_kernels.md has those of other devices), and
@@ -14,7 +15,9 @@
 # Send back $OUT/report.tar.gz, whatever failed: logs, results, and what the device is.
 #
 #   PYTHON=python3.12    the interpreter that has torch
-#   WHEELS=folder        wheels of packages that it lacks (nanobind-backend, tyro, trimesh, hypothesis, ...)
+#   WHEELS=folder        wheels of packages that it lacks (nanobind-backend, tyro, trimesh, hypothesis, ...); with one of
+#                        etsplat itself nothing is built
+#   JOBS=8               tests side by side, where there is pytest-xdist
 #   OUT=build/gpu        logs; results go to benchmarks/results
 set -uo pipefail
 cd "$(dirname "$0")/.."
@@ -25,7 +28,7 @@ SITE=$PWD/build/gpu/site
 mkdir -p "$OUT" "$SITE"
 export PYTHONPATH=$SITE PYTHONUNBUFFERED=1 ETSPLAT_CACHE_DIR=$PWD/build/gpu/kernels
 steps=("$@")
-[ $# -gt 0 ] || steps=(build doctor test bench sanitize reconstruct train)
+[ $# -gt 0 ] || steps=(build doctor test bench profile sanitize reconstruct train)
 summary=()
 "$PYTHON" -c 'import sys, torch; sys.exit(not torch.cuda.is_available())' || { echo "no GPU that torch can use" >&2; exit 1; }
 
@@ -40,15 +43,17 @@ step() { # name, seconds, command...
 }
 
 pip_target=("$PYTHON" -m pip --disable-pip-version-check install --quiet --no-index --no-deps --upgrade --target "$SITE")
-pytest_cuda=("$PYTHON" -m pytest -p no:cacheprovider)
+pytest_cuda=("$PYTHON" -m pytest -p no:cacheprovider --gpu)
+! "$PYTHON" -c 'import xdist' 2>/dev/null || pytest_cuda+=(--numprocesses "${JOBS:-8}")
 
 build() {
     [ -z "${WHEELS:-}" ] || step wheels 120 "${pip_target[@]}" "$WHEELS"/*.whl || return
+    ! compgen -G "${WHEELS:-/nowhere}/etsplat-*.whl" >/dev/null || return 0
     step build 420 "${pip_target[@]}" --no-build-isolation .
 }
 
-first() { step first 240 "${pytest_cuda[@]}" -m cuda tests/engines tests/ops/test_rasterize_engines.py; }
-run_tests() { step tests 540 "${pytest_cuda[@]}" -m cuda tests; }
+first() { step first 240 "${pytest_cuda[@]}" tests/engines tests/ops/test_rasterize_engines.py; }
+run_tests() { step tests 540 "${pytest_cuda[@]}" tests; }
 
 # Small scenes: memcheck makes a kernel some fifty times slower, racecheck more.
 sanitize() {
@@ -59,13 +64,31 @@ sanitize() {
     fi
     for tool in memcheck racecheck; do
         step "$tool" 540 compute-sanitizer --tool "$tool" --error-exitcode 1 "${pytest_cuda[@]}" \
-            -m "cuda and sanitize" tests/engines tests/ops/test_rasterize_engines.py tests/ops/test_cuda_ops.py \
-            tests/ops/test_soup_activation.py tests/ops/test_triangle_channels.py tests/ops/test_normal_consistency.py
+            -m sanitize tests/engines tests/ops
     done
 }
 
 bench() { step bench 540 "$PYTHON" -m benchmarks.gpu; }
 sphere() { step sphere 180 "$PYTHON" -m benchmarks.gpu --scene sphere6; }
+
+# Why a kernel takes what it takes, by the hardware's counters; clocks are left as they are.
+profile() {
+    local scene
+    if ! command -v ncu >/dev/null; then
+        summary+=("ncu (Nsight Compute) is not installed")
+        return
+    fi
+    for scene in sphere6 soup4m; do
+        step "profile_$scene" 180 ncu --clock-control none --kernel-name 'regex:^(raster|radix|soup)_' --launch-skip 30 \
+            --launch-count 15 --section SpeedOfLight --section Occupancy --section WarpStateStats --section SchedulerStats \
+            --section MemoryWorkloadAnalysis --section InstructionStats "$PYTHON" -c "
+from benchmarks import gpu_scenes, gpu_timing
+scene = gpu_scenes.load('$scene', 'cuda')
+for _ in range(4):
+    gpu_timing.step(scene)
+"
+    done
+}
 
 etsplat=("$PYTHON" -c 'import sys; from etsplat.cli import main; sys.exit(main())')
 doctor() { step doctor 120 "${etsplat[@]}" doctor; }
@@ -80,11 +103,12 @@ for name in "${steps[@]}"; do
         first) first ;;
         sphere) sphere ;;
         test) run_tests ;;
+        profile) profile ;;
         sanitize) sanitize ;;
         bench) bench ;;
         reconstruct) reconstruct ;;
         train) train ;;
-        *) echo "no step $name: choose from build doctor first sphere test bench sanitize reconstruct train" >&2; exit 2 ;;
+        *) echo "no step $name: choose from build doctor first sphere test bench profile sanitize reconstruct train" >&2; exit 2 ;;
     esac
 done
 

@@ -4,6 +4,7 @@ import os
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -30,6 +31,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         metavar="ARCHITECTURE",
         help="run kernels as NVRTC compiles them, for compute_75 or newer; other tests not at all",
     )
+    parser.addoption("--gpu", action="store_true", help="run the tests whose kernels run on a GPU; others not at all")
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -47,15 +49,31 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    if config.getoption("--ptx") or watched():
-        chosen = [item for item in items if isinstance(item, pytest.Function) and _runs_kernels(item)]
-        config.hook.pytest_deselected(items=[item for item in items if item not in chosen])
-        items[:] = chosen
+    if config.getoption("--gpu"):
+        wanted = _runs_on_a_gpu
+    elif config.getoption("--ptx") or watched():
+        wanted = _runs_kernels
+    else:
+        return
+    chosen = [item for item in items if isinstance(item, pytest.Function) and wanted(item)]
+    config.hook.pytest_deselected(items=[item for item in items if item not in chosen])
+    items[:] = chosen
+
+
+def _runs_on_a_gpu(test: pytest.Function) -> bool:
+    """Whether its kernels run on a GPU where there is one."""
+    parameters = _parameters(test)
+    by_engine = any(parameters.get(name) == "cuda" for name in ("engine", "native"))
+    return by_engine or test.get_closest_marker("cuda") is not None
+
+
+def _parameters(test: pytest.Function) -> dict[str, Any]:
+    return test.callspec.params if hasattr(test, "callspec") else {}
 
 
 def _runs_kernels(test: pytest.Function) -> bool:
     """Whether it takes a fixture by which CUDA kernels may run on the CPU."""
-    parameters = test.callspec.params if hasattr(test, "callspec") else {}
+    parameters = _parameters(test)
     others = {"reference", "cpu", "device"}
     if any(parameters.get(name) in others for name in ("engine", "native", "cuda_engine")):
         return False

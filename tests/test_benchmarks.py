@@ -166,8 +166,8 @@ def test_a_training_step_is_timed(simt, preset):
     """With the losses of the preset; the statistics of every step are among its kernels."""
     result = gpu_train.step_milliseconds(torch.device("cpu"), preset, size=(24, 16), triangles=40, steps=2)
     assert result["milliseconds"] > 0
-    assert simt.launches.count("soup_statistics") == 4
-    assert simt.launches.count("normal_backward") == (4 if preset == "paper" else 0)
+    assert simt.launches.count("soup_statistics") == 8
+    assert simt.launches.count("normal_backward") == (8 if preset == "paper" else 0)
 
 
 def test_the_benchmark_says_that_there_is_no_gpu(monkeypatch):

@@ -19,8 +19,8 @@ def on(engine: str | None, function: Callable[..., Any], *arguments: Any, **name
     """Calls the function on an engine: tensors go to its device, results come back, gradients with them."""
     there = device_of(engine)
     with etsplat.engine(engine):
-        result = function(*_moved(arguments, there), **_moved(named, there))
-    return _moved(result, "cpu")
+        result = function(*moved(arguments, there), **moved(named, there))
+    return moved(result, "cpu")
 
 
 class Noted(CpuEngine):
@@ -45,6 +45,11 @@ def noted_engine(monkeypatch: pytest.MonkeyPatch) -> Noted:
     return noted
 
 
+def looking(engine: str) -> dict[str, bool]:
+    """What makes `rasterize` look at values, as it does by itself where they are on the CPU."""
+    return {"validate": True} if device_of(engine) == "cuda" else {}
+
+
 def device_of(engine: str | None) -> str:
     return device_type() if engine == "cuda" else "cpu"
 
@@ -53,16 +58,16 @@ def dtype_of(engine: str) -> torch.dtype:
     return torch.float64 if engine == "reference" else torch.float32
 
 
-def _moved(value: Any, device: str) -> Any:
+def moved(value: Any, device: str) -> Any:
     """The tensors in it on the device: also those in tuples, lists, dictionaries and dataclasses."""
     if isinstance(value, Tensor):
         return value.to(device)
     if isinstance(value, dict):
-        return {name: _moved(item, device) for name, item in value.items()}
+        return {name: moved(item, device) for name, item in value.items()}
     if isinstance(value, tuple) and hasattr(value, "_fields"):
-        return type(value)(*(_moved(item, device) for item in value))
+        return type(value)(*(moved(item, device) for item in value))
     if isinstance(value, list | tuple):
-        return type(value)(_moved(item, device) for item in value)
+        return type(value)(moved(item, device) for item in value)
     if is_dataclass(value) and not isinstance(value, type):
-        return type(value)(**{field.name: _moved(getattr(value, field.name), device) for field in fields(value)})
+        return type(value)(**{field.name: moved(getattr(value, field.name), device) for field in fields(value)})
     return value

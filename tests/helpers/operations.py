@@ -22,7 +22,7 @@ from etsplat.ops.texture import sample_texture
 from etsplat.ops.triangle_area import mean_area
 from etsplat.ops.triangle_channels import triangle_channels
 from etsplat.ops.weighted_sum import Term, weighted_sum
-from helpers.engines import dtype_of, on
+from helpers.engines import device_of, dtype_of, on
 from helpers.scenes import DIFFERENTIABLE, EVERYTHING, NO_CUTOFFS, Scene, cameras, mesh, soup
 
 Run = Callable[..., list[Tensor]]
@@ -197,12 +197,12 @@ def _mesh_render(rng: torch.Generator, engine: str) -> Case:
     scene = mesh(rng)
     drawn = TriangleMesh.from_mesh(
         scene["vertices"], scene["faces"], colors=scene["face_colors"], opacity=0.8, sigma=0.5
-    )
+    ).to(torch.device(device_of(engine)))
 
     def draw(cameras: Cameras, **parameters: Tensor) -> Tensor:
         return replace(drawn, **parameters).render(cameras).color
 
-    leaves = {name: parameter.detach() for name, parameter in drawn.parameters().items()}
+    leaves = {name: parameter.detach().cpu() for name, parameter in drawn.parameters().items()}
     return case(engine, leaves, draw, cameras=Cameras(**cameras(48, 40)))
 
 

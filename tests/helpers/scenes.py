@@ -9,7 +9,7 @@ import etsplat
 from etsplat import Cutoffs, Rasterization, intrinsics, look_at
 from etsplat.core.rasterization import OUTPUTS
 from etsplat.geometry.icosphere import icosphere
-from helpers.engines import device_of, dtype_of
+from helpers.engines import device_of, dtype_of, moved
 
 NO_CUTOFFS = Cutoffs(alpha_min=0.0, alpha_max=1.0, x_max=float("inf"), transmittance_min=0.0)
 IMAGES = ("color", "alpha", "depth", "median_depth", "normal", "distortion")
@@ -127,15 +127,16 @@ def prepare(scene: Scene, engine: str, dtype: torch.dtype | None = None, require
 
 
 def render(scene: Scene, engine: str, **options: Any) -> Rasterization:
+    """The pictures, on the CPU."""
     arguments = {**prepare(scene, engine), **options}
     with etsplat.engine(engine):
-        return etsplat.rasterize(**arguments)
+        return moved(etsplat.rasterize(**arguments), "cpu")
 
 
 def gradients(
     scene: Scene, engine: str, cotangents: dict[str, Tensor], dtype: torch.dtype | None = None, **options: Any
 ) -> tuple[Rasterization, dict[str, Tensor]]:
-    """Run forward and backward; ``cotangents`` are dL/d(image) by the image's name."""
+    """Run forward and backward; ``cotangents`` are dL/d(image) by the image's name. What comes out is on the CPU."""
     prepared = prepare(scene, engine, dtype, requires_grad=True)
     with etsplat.engine(engine):
         out = etsplat.rasterize(**{**prepared, **options})
@@ -145,4 +146,5 @@ def gradients(
     assert isinstance(loss, Tensor)
     loss.backward()
     leaves = {name: prepared[name] for name in DIFFERENTIABLE if isinstance(prepared.get(name), Tensor)}
-    return out, {name: torch.zeros_like(t) if t.grad is None else t.grad for name, t in leaves.items()}
+    grads = {name: torch.zeros_like(t) if t.grad is None else t.grad for name, t in leaves.items()}
+    return moved(out, "cpu"), moved(grads, "cpu")

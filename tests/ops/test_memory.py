@@ -18,7 +18,7 @@ from etsplat.core.cameras import MAX_SIDE, Cameras
 from etsplat.engines.native.pool import empty_image
 from etsplat.ops.adam import Adam
 from etsplat.ops.rasterize_opaque import render_opaque
-from helpers.engines import on
+from helpers.engines import looking, on
 from helpers.operations import CASES, Case, Run, loss
 from helpers.scenes import mesh, soup
 
@@ -301,7 +301,7 @@ class TestOddArguments:
             scene = {key: value.double() if isinstance(value, Tensor) else value for key, value in scene.items()}
         scene[name][0, 0] = 1e38
         with pytest.raises(ValueError, match=rf"{name} must be from -1e\+30 to 1e\+30, got 1 values beyond"):
-            on(engine, rasterize, **scene)
+            on(engine, rasterize, **scene, **looking(engine))
 
     @pytest.mark.parametrize("kind", ["face_colors", "vertex_colors"])
     def test_so_are_those_of_antialiased_pictures(self, engine, kind, rng):
@@ -314,7 +314,7 @@ class TestOddArguments:
                 grown = {key: leaf.requires_grad_() for key, leaf in grown.items()}
                 if value != 1e30:
                     with pytest.raises(ValueError, match=rf"{name} must be (finite|from -1e\+30)"):
-                        run(**grown)
+                        run(**grown, **looking(engine))
                     continue
                 run(**grown)[0].sum().backward()
                 assert all(leaf.grad is not None and leaf.grad.isfinite().all() for leaf in grown.values())

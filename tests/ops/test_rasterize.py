@@ -8,7 +8,7 @@ import etsplat
 from etsplat import Cutoffs, rasterize
 from etsplat.core.cameras import Cameras
 from etsplat.engines.choice import engine_for
-from helpers.engines import dtype_of, on
+from helpers.engines import device_of, dtype_of, looking, moved, on
 from helpers.scenes import EVERYTHING, IMAGES, accuracy, mesh, prepare, render, soup
 
 
@@ -154,8 +154,10 @@ def test_bad_arguments_are_refused_by_name(engine, case, scene):
         name: value.to(dtype_of(engine)) if isinstance(value, torch.Tensor) and value.dtype == torch.float32 else value
         for name, value in bad.items()
     }
+    if case != "device":
+        converted = moved(converted, device_of(engine))
     with etsplat.engine(engine), pytest.raises(ValueError, match=message):
-        rasterize(**{**prepare(scene, engine), **converted})
+        rasterize(**{**prepare(scene, engine), **converted, **looking(engine)})
 
 
 @pytest.mark.parametrize(
@@ -163,15 +165,22 @@ def test_bad_arguments_are_refused_by_name(engine, case, scene):
     [
         (torch.full((5, 3), 15), "faces must be indices from 0 to 14, got indices from 15 to 15"),
         (torch.full((5, 3), -1), "faces must be indices from 0 to 14, got indices from -1 to -1"),
-        (torch.zeros(5, 3), "faces must be int32 or int64, got torch.float32"),
     ],
 )
 def test_bad_faces_are_refused_even_without_validation(engine, faces, message, scene):
-    """An index out of range would crash a native engine."""
+    """An index out of range would crash the native engine; that of GPUs leaves the triangle out."""
     prepared = prepare(scene, engine)
     prepared["vertices"] = prepared["vertices"].reshape(15, 3)
     with pytest.raises(ValueError, match=message):
-        on(engine, rasterize, **prepared, faces=faces, validate=False)
+        on(engine, rasterize, **prepared, faces=faces, **{"validate": False, **looking(engine)})
+
+
+def test_faces_of_another_type_are_refused_wherever_they_are(engine, scene):
+    """Kernels would take their bits for integers."""
+    prepared = prepare(scene, engine)
+    prepared["vertices"] = prepared["vertices"].reshape(15, 3)
+    with pytest.raises(ValueError, match=r"faces must be int32 or int64, got torch\.float32"):
+        on(engine, rasterize, **prepared, faces=torch.zeros(5, 3), validate=False)
 
 
 def test_engines_refuse_what_they_cannot_compute(scene):

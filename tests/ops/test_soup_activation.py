@@ -41,7 +41,7 @@ def test_native_engines_agree_with_the_float64_reference(rng, cuda_device, limit
         seen = camera().to(torch.device(device), dtype=dtype) if culling else None
         sizes = {"smallest": 1.0, "largest": 20.0}
         drawn = torch.stack(on(engine, soup_activation, vertices.to(device, dtype), *leaves, given, seen, **sizes))
-        (drawn * cotangents.to(device, dtype)).sum().backward()
+        (drawn * cotangents.to(drawn)).sum().backward()
         results.append([tensor.detach().cpu().double() for tensor in (drawn, *(leaf.grad for leaf in leaves))])
     exact, on_cpu, on_device = results
     assert (exact[0][0] == 0).float().mean() > 0.2 if culling else bool((exact[0][0] > 0).all())

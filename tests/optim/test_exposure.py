@@ -31,6 +31,7 @@ from etsplat.optim.strategies import DensifyAndPrune
 from etsplat.optim.terms.photometric import Photometric
 from etsplat.optim.terms.soup import Opacity
 from etsplat.optim.trainer import Trainer
+from helpers.engines import device_of
 from helpers.trainers import OnEngine, same_bits
 
 GAIN = 0.12
@@ -217,7 +218,7 @@ def on_engine(scene: Dataset, engine: str, batch: int = 1, choice: Any = "auto")
     points = scene.points[::150]
     rng = torch.Generator().manual_seed(3)
     start = StartPoints(points, torch.full_like(points, 0.5))
-    soup = start_soup(start, rng, scale=2.0, opacity=0.4, sigma=1.0, sh_degree=1)
+    soup = start_soup(start, rng, scale=2.0, opacity=0.4, sigma=1.0, sh_degree=1).to(torch.device(device_of(engine)))
     objective = Objective(Photometric(0.2), [Opacity(0.005)])
     strategy = DensifyAndPrune(begin=3, every=4, max_triangles=300)
     exposure = Exposure.of(choice, 20, 0)
@@ -230,7 +231,7 @@ def test_it_is_learned_alike_on_every_engine(engine: str, scene: Dataset) -> Non
     for trainer in (ours, reference):
         trainer.run(4)
     found, expected = ours.trainer.exposure, reference.trainer.exposure
-    values, wanted = (each.values.detach() for each in (found, expected))
+    values, wanted = (each.values.detach().cpu() for each in (found, expected))
     assert float(wanted.abs().max()) > 0.005
     # Signs of gradients near zero differ, and Adam takes a whole step for each.
     assert float(((values - wanted).abs() < 1e-4).double().mean()) > 0.9

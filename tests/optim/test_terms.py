@@ -24,7 +24,7 @@ from etsplat.optim.terms.photometric import Photometric
 from etsplat.optim.terms.soup import DepthNormals, Distortion, Harmonics, Opacity, Size
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.train_config import TrainConfig
-from helpers.engines import on
+from helpers.engines import device_of, on
 
 # Two faces that share the edge (0, 2) of a folded unit square.
 VERTICES = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.5], [1.0, 1.0, 0.0], [0.0, 1.0, 0.25]]
@@ -183,19 +183,19 @@ def test_parameters_start_where_they_are_told_to() -> None:
 SIZE = 40
 
 
-def a_soups_drawing(rng: torch.Generator, outputs: tuple[str, ...]) -> tuple[Cameras, Drawing]:
+def a_soups_drawing(rng: torch.Generator, outputs: tuple[str, ...], device: str = "cpu") -> tuple[Cameras, Drawing]:
     soup = TriangleSoup.from_triangles(
         0.8 * torch.randn((30, 3, 3), generator=rng),
         torch.rand((30, 3), generator=rng),
         opacity=0.6,
         sigma=0.5,
         sh_degree=0,
-    )
+    ).to(torch.device(device))
     viewmats = look_at(torch.tensor([[0.6, 0.4, 3.0]]), torch.zeros(3), torch.tensor([0.0, 1, 0]))
-    camera = Cameras(viewmats, intrinsics(45, SIZE, SIZE)[None], SIZE, SIZE)
-    photo = (255 * torch.rand((1, SIZE, SIZE, 3), generator=rng)).to(torch.uint8)
+    camera = Cameras(viewmats, intrinsics(45, SIZE, SIZE)[None], SIZE, SIZE).to(torch.device(device))
+    photo = (255 * torch.rand((1, SIZE, SIZE, 3), generator=rng)).to(device, torch.uint8)
     rendering = soup.render(camera, outputs=outputs, depth_of="centroid")
-    return camera, Drawing(soup, camera, photo, None, torch.zeros(1, 3), rendering)
+    return camera, Drawing(soup, camera, photo, None, torch.zeros(1, 3, device=device), rendering)
 
 
 @pytest.mark.sanitize
@@ -236,7 +236,7 @@ def test_every_term_of_a_soup_adds_with_its_weight(rng: torch.Generator, engine:
         "distortion": (Distortion, 2.0),
     }
     with etsplat.engine(engine):
-        _, drawing = a_soups_drawing(rng, ("color", "normal", "median_depth", "distortion"))
+        _, drawing = a_soups_drawing(rng, ("color", "normal", "median_depth", "distortion"), device_of(engine))
 
         def objective(*terms: Term) -> float:
             whole = Objective(Photometric(0.2), terms)

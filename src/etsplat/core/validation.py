@@ -136,10 +136,15 @@ def check_device(name: str, tensor: Tensor, other_name: str, other: Tensor) -> N
         raise ValueError(f"{name} must be on {other.device} like {other_name}, got {tensor.device}")
 
 
-def check_indices(name: str, indices: Tensor, count: int) -> None:
-    """Raise ValueError unless ``indices`` are int32 or int64, from 0 to ``count`` - 1."""
+def check_integers(name: str, indices: Tensor) -> None:
+    """Raise ValueError unless ``indices`` are int32 or int64, whatever their values."""
     if indices.dtype not in (torch.int32, torch.int64):
         raise ValueError(f"{name} must be int32 or int64, got {indices.dtype}")
+
+
+def check_indices(name: str, indices: Tensor, count: int) -> None:
+    """Raise ValueError unless ``indices`` are int32 or int64, from 0 to ``count`` - 1."""
+    check_integers(name, indices)
     if indices.numel() == 0 or (_is_plain(indices) and _native.indices_below(values=indices, bound=count)):
         return
     low, high = (int(value) for value in torch.aminmax(indices))

@@ -29,6 +29,7 @@ from etsplat.core.validation import (
     check_flags,
     check_floating,
     check_indices,
+    check_integers,
     check_intrinsics,
     check_like,
     check_positive,
@@ -245,6 +246,7 @@ def _check_tensors(given: dict[str, Tensor], faces: Tensor | None, look: bool) -
         raise ValueError(f"{colors} must have at least one channel, got 0")
     if faces is not None:
         check_device("faces", faces, "vertices", given["vertices"])
+        check_integers("faces", faces)
         if look or faces.is_cpu:
             check_indices("faces", faces, sizes["V"])
 

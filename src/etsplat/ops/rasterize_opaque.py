@@ -16,6 +16,7 @@ from etsplat.core.validation import (
     check_device,
     check_flags,
     check_indices,
+    check_integers,
     check_intrinsics,
     check_like,
     check_shape,
@@ -161,6 +162,7 @@ def _check_mesh(vertices: Tensor, faces: Tensor | None) -> tuple[Tensor, Tensor]
         return points, _separate(points)
     check_shape("vertices", vertices, ("V", 3))
     check_shape("faces", faces, ("F", 3))
+    check_integers("faces", faces)
     if faces.is_cpu:  # reading them would wait for a GPU, which leaves out what is out of range
         check_indices("faces", faces, len(vertices))
     check_device("faces", faces, "vertices", vertices)
