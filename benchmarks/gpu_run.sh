@@ -80,7 +80,7 @@ profile() {
     fi
     for scene in sphere6 soup4m; do
         step "profile_$scene" 180 ncu --clock-control none --kernel-name 'regex:^(raster|radix|soup)_' --launch-skip 30 \
-            --launch-count 15 --section SpeedOfLight --section Occupancy --section WarpStateStats --section SchedulerStats \
+            --launch-count 16 --section SpeedOfLight --section Occupancy --section WarpStateStats --section SchedulerStats \
             --section MemoryWorkloadAnalysis --section InstructionStats "$PYTHON" -c "
 from benchmarks import gpu_scenes, gpu_timing
 scene = gpu_scenes.load('$scene', 'cuda')
