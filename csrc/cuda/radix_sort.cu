@@ -16,6 +16,7 @@ constexpr int kSortWarps = kSortBlock / kWarp;
 constexpr int kSortItems = 8;
 constexpr int kSortTile = kSortBlock * kSortItems;
 constexpr int kMostPasses = 4;
+constexpr int kAhead = 8;  // blocks that the look-back looks at together
 constexpr unsigned kSortAggregate = 1u << 30, kSortPrefix = 2u << 30, kSortValue = kSortAggregate - 1;
 
 __device__ __forceinline__ unsigned digit_of(unsigned key, int shift, int bits) { return key >> shift & ((1u << bits) - 1); }
@@ -26,15 +27,14 @@ __device__ __forceinline__ unsigned place_of(int i) {
     return static_cast<unsigned>((warp_index() * kSortItems + i) * kWarp + lane_index());
 }
 
-// This lane's keys, and how many equal digits come before each in its warp; `counts` (kDigits) of the warp start at 0 and
-// end as how many there are of each. All lanes call it.
-__device__ __forceinline__ void rank_in_warp(const unsigned* keys, unsigned here, int shift, int bits, unsigned* counts,
-                                             unsigned* key, unsigned* rank) {
+// How many equal digits come before each of this lane's keys in its warp; `counts` (kDigits) of the warp start at 0 and end
+// as how many there are of each. All lanes call it.
+__device__ __forceinline__ void rank_in_warp(const unsigned* key, unsigned here, int shift, int bits, unsigned* counts,
+                                             unsigned* rank) {
     const int lane = lane_index();
+#pragma unroll
     for (int i = 0; i < kSortItems; ++i) {
-        const unsigned at = place_of(i);
-        const bool inside = at < here;
-        key[i] = inside ? keys[at] : 0;
+        const bool inside = place_of(i) < here;
         const unsigned digit = inside ? digit_of(key[i], shift, bits) : kDigits;
         const unsigned equal = __match_any_sync(kAllLanes, digit);
         const int leader = __ffs(static_cast<int>(equal)) - 1;
@@ -48,15 +48,21 @@ __device__ __forceinline__ void rank_in_warp(const unsigned* keys, unsigned here
     }
 }
 
-// The decoupled look-back: how many pairs with this digit the blocks before `block` have, once they have said so.
+// The decoupled look-back: how many pairs with this digit the blocks before `block` have, once they have said so. Several
+// words are on their way together: blocks that start together each look back over all others, a latency after the other.
 __device__ __forceinline__ unsigned pairs_before(volatile unsigned* words, int block, int digit) {
     unsigned before = 0;
     for (int other = block - 1; other >= 0;) {
-        const unsigned word = words[other * kDigits + digit];
-        if (word >> 30 == 0) continue;
-        before += word & kSortValue;
-        if (word >> 30 == 2) break;
-        --other;
+        unsigned word[kAhead];
+#pragma unroll
+        for (int i = 0; i < kAhead; ++i) word[i] = other >= i ? words[(other - i) * kDigits + digit] : kSortPrefix;
+#pragma unroll
+        for (int i = 0; i < kAhead; ++i) {
+            if (word[i] >> 30 == 0) break;  // not yet: from here again
+            before += word[i] & kSortValue;
+            if (word[i] >> 30 == 2) return before;
+            --other;
+        }
     }
     return before;
 }
@@ -97,8 +103,15 @@ extern "C" __global__ void __launch_bounds__(256) radix_pass(const unsigned* key
     if (begin >= total) return;
     const unsigned here = total - begin < kSortTile ? total - begin : kSortTile;
 
-    unsigned key[kSortItems], rank[kSortItems];
-    rank_in_warp(keys_in + begin, here, shift, bits, warp_counts[warp], key, rank);
+    // All at once, before anything that waits.
+    unsigned key[kSortItems], value[kSortItems], rank[kSortItems];
+#pragma unroll
+    for (int i = 0; i < kSortItems; ++i) {
+        const unsigned at = place_of(i);
+        key[i] = at < here ? keys_in[begin + at] : 0;
+        value[i] = at < here && values_in ? values_in[begin + at] : begin + at;
+    }
+    rank_in_warp(key, here, shift, bits, warp_counts[warp], rank);
     __syncthreads();
 
     // A thread per digit: its pairs in this block, then in the blocks before, then those of smaller digits.
@@ -128,13 +141,13 @@ extern "C" __global__ void __launch_bounds__(256) radix_pass(const unsigned* key
     digit_target[t] = target + before_block - smaller_here;
     __syncthreads();
 
+#pragma unroll
     for (int i = 0; i < kSortItems; ++i) {
-        const unsigned at = place_of(i);
-        if (at >= here) continue;
+        if (place_of(i) >= here) continue;
         const unsigned digit = digit_of(key[i], shift, bits);
         const unsigned place = digit_begin[digit] + warp_counts[warp][digit] + rank[i];
         tile_keys[place] = key[i];
-        tile_values[place] = values_in ? values_in[begin + at] : begin + at;
+        tile_values[place] = value[i];
     }
     __syncthreads();
     for (unsigned place = t; place < here; place += kSortBlock) {

@@ -152,7 +152,7 @@ __device__ __forceinline__ float sum_sixteen(const float* values) {
 }
 
 // Sum over the tile's pixels of T_N g.
-__device__ __forceinline__ void background_gradient(const RasterPass& pass, const BackwardPixel& p, bool inside,
+__device__ __forceinline__ void background_gradient(const RasterPass& pass, int tile, const BackwardPixel& p, bool inside,
                                                     float (*part)[kChannels]) {
     const float rest = inside ? 1.0f - p.total_weight : 0.0f;
     for (int c = 0; c < kChannels; ++c) {
@@ -163,7 +163,7 @@ __device__ __forceinline__ void background_gradient(const RasterPass& pass, cons
     if (threadIdx.x < kChannels) {
         float sum = 0.0f;
         for (int w = 0; w < kWarps; ++w) sum += part[w][threadIdx.x];
-        pass.tile_background[static_cast<long long>(blockIdx.x) * kChannels + threadIdx.x] = sum;
+        pass.tile_background[static_cast<long long>(tile) * kChannels + threadIdx.x] = sum;
     }
 }
 
@@ -176,12 +176,12 @@ extern "C" __global__ void __launch_bounds__(256) raster_backward(const __grid_c
     __shared__ float warp_sums[kWarps][kSub][kStride];
     __shared__ float background_part[kWarps][kChannels];
     __shared__ unsigned listed_slot[kTileThreads], listed_hits[kTileThreads], counts[kWarps];
-    const int t = threadIdx.x, warp = warp_index(), lane = lane_index();
-    const Pixel pixel(pass, blockIdx.x);
-    const int begin = pass.tile_ranges[2 * blockIdx.x], end = pass.tile_done[blockIdx.x];
+    const int t = threadIdx.x, warp = warp_index(), lane = lane_index(), tile = tile_of_block(pass);
+    const Pixel pixel(pass, tile);
+    const int begin = pass.tile_ranges[2 * tile], end = pass.tile_done[tile];
     const float first_inverse_z = first_inverse_depth(pass, begin, end);
     BackwardPixel p = load_pixel(pass, pixel);
-    if (pass.tile_background) background_gradient(pass, p, pixel.inside, background_part);
+    if (pass.tile_background) background_gradient(pass, tile, p, pixel.inside, background_part);
     for (int base = begin; base < end; base += kTileThreads) {
         unsigned slot = 0, hits = 0;
         if (base + t < end) {

@@ -84,9 +84,9 @@ extern "C" __global__ void __launch_bounds__(256) raster_forward(const __grid_co
     __shared__ Staged staged[kForwardBatch];
     __shared__ unsigned char touched[kForwardBatch];
     __shared__ unsigned hit_words[kWarps][kChunks];
-    const int t = threadIdx.x, warp = warp_index(), lane = lane_index();
-    const Pixel pixel(pass, blockIdx.x);
-    const int begin = pass.tile_ranges[2 * blockIdx.x], end = pass.tile_ranges[2 * blockIdx.x + 1];
+    const int t = threadIdx.x, warp = warp_index(), lane = lane_index(), tile = tile_of_block(pass);
+    const Pixel pixel(pass, tile);
+    const int begin = pass.tile_ranges[2 * tile], end = pass.tile_ranges[2 * tile + 1];
     const float first_inverse_z = first_inverse_depth(pass, begin, end);
     ForwardPixel p;
     p.alive = pixel.inside;
@@ -130,6 +130,6 @@ extern "C" __global__ void __launch_bounds__(256) raster_forward(const __grid_co
         }
         next += count;
     }
-    if (t == 0) pass.tile_done[blockIdx.x] = next;
+    if (t == 0) pass.tile_done[tile] = next;
     write_pixel(pass, pixel, p);
 }

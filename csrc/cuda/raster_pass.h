@@ -29,7 +29,8 @@ struct RasterPass {
     unsigned char* hits;
     // Slots by tile, front to back, with the range of each tile and the end of what its pixels looked at.
     const unsigned *sorted_tiles, *sorted_slots;
-    int *tile_ranges, *tile_done;
+    // `tile_order` is the tiles as blocks take them.
+    int *tile_ranges, *tile_done, *tile_order;
     // Device-side numbers: slots wanted, slots there are; look-back words and ticket of the scan. `overflow` outlives a call.
     long long *wanted, *overflow;
     unsigned *slots, *scan_ticket;
@@ -45,8 +46,11 @@ struct RasterPass {
     double *sigma_sums, *camera_sums;
 };
 
-// A triangle's tiles as a word: up to kPatternSide rows and columns as a bit pattern (row-major, from tile `first`), or
+// A triangle's tiles, from tile `first` on, as a word: up to kPatternSide rows and columns as a bit pattern (row-major), or
 // their number with kMany set, where the box is larger and has to be searched.
+struct alignas(8) Span {
+    unsigned first, word;
+};
 constexpr int kPatternSide = 4;
 constexpr unsigned kMany = 0x80000000u;
 __device__ __forceinline__ unsigned span_count(unsigned word) { return word & kMany ? word & ~kMany : __popc(word); }

@@ -5,6 +5,8 @@
 //   raster_emit     a thread per kEmitItems ranks of the depth order: numbers the slots with a decoupled look-back
 //                   (Merrill and Garland 2016) and writes them, in drawing order, so that a triangle's slots lie together
 //   raster_ranges   a thread per slot, after they were sorted by tile: where each tile begins and ends
+//   raster_order    a block per view: its tiles by their number of slots, the largest first, so that none of these is begun
+//                   when all others are done
 #include "cuda/raster_pass.h"
 
 namespace etsplat {
@@ -12,6 +14,8 @@ namespace etsplat {
 constexpr int kProjectBlock = 128;
 constexpr int kEmitBlock = 256;
 constexpr int kEmitItems = 4;
+constexpr int kOrderBlock = 1024;
+constexpr int kSizes = 64;  // of tiles, two for each power of two
 
 __device__ __forceinline__ bool all_finite(const float* values, int count) {
     float differences = 0.0f;  // value - value: NaN for Inf and NaN
@@ -146,8 +150,7 @@ extern "C" __global__ void __launch_bounds__(128) raster_project(const __grid_co
         if (lane_index() == lane) word = found == 0 ? 0 : kMany | found;
     }
     if (!inside) return;
-    pass.spans[2 * m] = static_cast<unsigned>(first);
-    pass.spans[2 * m + 1] = word;
+    reinterpret_cast<Span*>(pass.spans)[m] = {static_cast<unsigned>(first), word};
     pass.depth_keys[m] = word != 0 ? __float_as_uint(p.depth) : 0x7fffffffu;  // what is nowhere goes last
     if (pass.visible) {
         pass.visible[m] = visible;
@@ -199,12 +202,18 @@ extern "C" __global__ void __launch_bounds__(256) raster_emit(const __grid_const
     if (threadIdx.x == 0) ticket = static_cast<int>(atomicAdd(pass.scan_ticket, 1u));  // blocks start in this order
     __syncthreads();
     const int block = ticket, count = pass.views * pass.triangles;
-    int m[kEmitItems];
+    int m[kEmitItems], first[kEmitItems];
     unsigned word[kEmitItems], mine = 0;
+#pragma unroll
     for (int i = 0; i < kEmitItems; ++i) {
         const int rank = (block * kEmitBlock + static_cast<int>(threadIdx.x)) * kEmitItems + i;
         m[i] = rank < count ? static_cast<int>(pass.order[rank]) : -1;
-        word[i] = rank < count ? pass.spans[2 * m[i] + 1] : 0;
+    }
+#pragma unroll
+    for (int i = 0; i < kEmitItems; ++i) {  // all on their way together: they lie anywhere
+        const Span span = m[i] >= 0 ? reinterpret_cast<const Span*>(pass.spans)[m[i]] : Span{0, 0};
+        first[i] = static_cast<int>(span.first);
+        word[i] = span.word;
         mine += span_count(word[i]);
     }
     const unsigned scanned = warp_inclusive_scan(mine);
@@ -235,11 +244,10 @@ extern "C" __global__ void __launch_bounds__(256) raster_emit(const __grid_const
             pass.slot_begin[m[i]] =
                 slot < static_cast<unsigned>(pass.capacity) ? static_cast<unsigned>(slot) : static_cast<unsigned>(pass.capacity);
         if (!many && word[i] != 0) {
-            const int first = static_cast<int>(pass.spans[2 * m[i]]);
             unsigned long long at = slot;
             for (unsigned bits = word[i]; bits != 0; bits &= bits - 1) {
                 const int bit = __ffs(static_cast<int>(bits)) - 1;
-                write_slot(pass, at++, first + bit / kPatternSide * pass.tiles_x + bit % kPatternSide, m[i]);
+                write_slot(pass, at++, first[i] + bit / kPatternSide * pass.tiles_x + bit % kPatternSide, m[i]);
             }
         }
         for (unsigned lanes = __ballot_sync(kAllLanes, many); lanes != 0; lanes &= lanes - 1) {
@@ -259,4 +267,40 @@ extern "C" __global__ void raster_ranges(const __grid_constant__ RasterPass pass
     const unsigned tile = pass.sorted_tiles[i];
     if (i == 0 || pass.sorted_tiles[i - 1] != tile) pass.tile_ranges[2 * tile] = static_cast<int>(i);
     if (i + 1 == count || pass.sorted_tiles[i + 1] != tile) pass.tile_ranges[2 * tile + 1] = static_cast<int>(i) + 1;
+}
+
+namespace etsplat {
+
+// Of a tile with so many slots: 0 for the largest, kSizes - 1 for none.
+__device__ __forceinline__ int size_class(int slots) {
+    if (slots <= 0) return kSizes - 1;
+    const int power = 31 - __clz(slots), upper = power > 0 ? slots >> (power - 1) & 1 : 0;
+    return kSizes - 2 - (2 * power + upper);
+}
+
+}  // namespace etsplat
+
+extern "C" __global__ void __launch_bounds__(1024) raster_order(const __grid_constant__ RasterPass pass) {
+    __shared__ unsigned begin[kSizes];
+    const int t = threadIdx.x, tiles = pass.tiles_x * pass.tiles_y, base = static_cast<int>(blockIdx.x) * tiles;
+    if (t < kSizes) begin[t] = 0;
+    __syncthreads();
+    for (int i = t; i < tiles; i += kOrderBlock) {
+        const int* range = pass.tile_ranges + 2 * (base + i);
+        atomicAdd(&begin[size_class(range[1] - range[0])], 1u);
+    }
+    __syncthreads();
+    if (warp_index() == 0) {
+        unsigned before = 0;
+        for (int first = 0; first < kSizes; first += kWarp) {
+            const unsigned here = begin[first + t], scanned = warp_inclusive_scan(here);
+            begin[first + t] = before + scanned - here;
+            before += __shfl_sync(kAllLanes, scanned, kWarp - 1);
+        }
+    }
+    __syncthreads();
+    for (int i = t; i < tiles; i += kOrderBlock) {
+        const int* range = pass.tile_ranges + 2 * (base + i);
+        pass.tile_order[base + atomicAdd(&begin[size_class(range[1] - range[0])], 1u)] = base + i;
+    }
 }

@@ -75,6 +75,11 @@ __device__ __forceinline__ unsigned sub_tiles(const TriangleRecord& r, int x0, i
     return bits;
 }
 
+// The tile of this block.
+__device__ __forceinline__ int tile_of_block(const RasterPass& pass) {
+    return pass.tile_order ? pass.tile_order[blockIdx.x] : static_cast<int>(blockIdx.x);
+}
+
 // The pixel of this thread.
 struct Pixel {
     int view, x0, y0;     // first pixel of the tile

@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 
+import pytest
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -14,6 +15,7 @@ from etsplat.engines.threads import num_threads, set_num_threads
 from etsplat.optim.loop import Event, NoteEvent
 from etsplat.tasks.dense_starts import LEAST_SHARE, with_swept_points
 
+CPU = torch.device("cpu")
 W, H = 96, 64
 NORMAL, OFFSET = torch.tensor([0.2, -0.1, 1.0], dtype=torch.float64), 4.0
 """The wall: where NORMAL x = OFFSET."""
@@ -63,7 +65,7 @@ def nothing(_: int, __: int) -> None:
 
 def test_points_lie_on_the_wall() -> None:
     """Where three photos see it: a hundredth of the depth off at most, much less in the median, in its colours."""
-    swept = swept_points(wall(7))
+    swept = swept_points(wall(7), CPU)
     off = (swept.positions @ NORMAL - OFFSET).abs() / NORMAL.norm()
     assert swept.share > 0.3
     assert float(off.median()) < 0.003 * OFFSET
@@ -77,19 +79,31 @@ def test_bits_do_not_depend_on_threads() -> None:
     for threads in (1, 3):
         torch.set_num_threads(threads)
         set_num_threads(threads)
-        found.append(swept_points(wall()))
+        found.append(swept_points(wall(), CPU))
     torch.set_num_threads(before)
     set_num_threads(ours)
     assert torch.equal(found[0].positions, found[1].positions)
     assert torch.equal(found[0].colors, found[1].colors)
 
 
+@pytest.mark.cuda
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
+def test_a_gpu_finds_the_same_places() -> None:
+    """But where one more or one less just counts; on the CPU's tensors, the same bits each time."""
+    found, again, here = (swept_points(wall(), torch.device(device)) for device in ("cuda", "cuda", "cpu"))
+    assert found.positions.is_cpu
+    assert torch.equal(found.positions, again.positions)
+    assert abs(found.share - here.share) < 0.01 * here.share
+    nearest = torch.cdist(found.positions, here.positions).amin(dim=1)
+    assert float(nearest.quantile(0.95)) < 1e-4 * OFFSET
+
+
 def test_photos_of_different_things_agree_on_nothing() -> None:
     """Not even by chance; then the capture keeps its own points, and the run says why."""
     capture = wall(alike=False)
-    assert swept_points(capture).share < LEAST_SHARE / 10
+    assert swept_points(capture, CPU).share < LEAST_SHARE / 10
     events = list[Event]()
-    assert with_swept_points(capture, 4000, events.append, nothing) is capture
+    assert with_swept_points(capture, 4000, CPU, events.append, nothing) is capture
     assert any(isinstance(each, NoteEvent) and "agree on 0 %" in each.text for each in events)
 
 
@@ -104,7 +118,7 @@ def test_what_masks_exclude_or_is_transparent_gets_no_points() -> None:
         mask[: H // 2] = 0
         photos.append(torch.cat([torch.where(alpha > 0, photo, 0), alpha], dim=-1).to(torch.uint8))
     masked = replace(capture, images=StoredPictures(photos, masks))
-    swept, whole = swept_points(masked), swept_points(capture)
+    swept, whole = swept_points(masked, CPU), swept_points(capture, CPU)
     assert 0 < len(swept.positions) < len(whole.positions) / 3
     middle = capture.viewmats[2, :3, 3]  # of the leftmost camera's frame the right half alone is left
     assert float((swept.positions + middle)[:, 1].quantile(0.05)) > -0.3
@@ -113,14 +127,14 @@ def test_what_masks_exclude_or_is_transparent_gets_no_points() -> None:
 def test_what_is_found_joins_the_points_of_the_capture() -> None:
     """Up to half of the triangles that there may be, or to as many as the capture has, two thirds of which stay."""
     events, capture = list[Event](), wall()
-    dense = with_swept_points(capture, 4000, events.append, nothing)
+    dense = with_swept_points(capture, 4000, CPU, events.append, nothing)
     assert capture.exact_points is not None
     assert dense.exact_points is not None
     assert dense.point_colors is not None
     assert torch.equal(dense.exact_points[:300], capture.exact_points)
     assert 1000 < len(dense.exact_points) == len(dense.point_colors) <= 2000
     assert any(isinstance(each, NoteEvent) and "join 300 of the capture's 300 points" in each.text for each in events)
-    full = with_swept_points(capture, 600, events.append, nothing)
+    full = with_swept_points(capture, 600, CPU, events.append, nothing)
     assert full.exact_points is not None
     assert 200 < len(full.exact_points) <= 300
     assert any(isinstance(each, NoteEvent) and "of the capture's 300 points" in each.text for each in events[-1:])
@@ -128,7 +142,7 @@ def test_what_is_found_joins_the_points_of_the_capture() -> None:
 
 def test_what_is_found_has_its_colours_beside_points_without() -> None:
     """Those are grey, as they are where nothing is found."""
-    dense = with_swept_points(replace(wall(), point_colors=None), 4000, list[Event]().append, nothing)
+    dense = with_swept_points(replace(wall(), point_colors=None), 4000, CPU, list[Event]().append, nothing)
     assert dense.exact_points is not None
     assert dense.point_colors is not None
     assert (dense.point_colors[:300] == 0.5).all()
@@ -140,13 +154,13 @@ def test_a_photo_from_beyond_the_nearest_plane_is_no_obstacle() -> None:
     capture = wall(6)
     ahead = capture.viewmats.clone()
     ahead[5, :3, 3] = torch.tensor([0.0, 0.0, -3.7], dtype=torch.float64)
-    assert swept_points(replace(capture, viewmats=ahead)).share > 0.15
+    assert swept_points(replace(capture, viewmats=ahead), CPU).share > 0.15
 
 
 def test_without_points_nothing_is_swept() -> None:
     """Nobody says how far away things are."""
     capture = replace(wall(), exact_points=None, point_colors=None)
-    assert with_swept_points(capture, 4000, nothing_told, nothing) is capture
+    assert with_swept_points(capture, 4000, CPU, nothing_told, nothing) is capture
 
 
 def nothing_told(event: Event) -> None:

@@ -6,6 +6,7 @@ import torch
 import etsplat
 from etsplat import rasterize
 from etsplat.engines.cuda import capacity
+from etsplat.engines.cuda import rasterize as rasterize_launches
 from etsplat.engines.cuda.launch import use_backend
 from helpers.agreement import compare
 from helpers.engines import device_of
@@ -29,6 +30,19 @@ def test_triangles_over_many_tiles(cuda_engine, distance, rng):
     """Boxes of more than 4x4 tiles, more slots than a thread adds up alone, sizes that no tile divides."""
     scene = soup(rng, 25, width=150, height=133, size=6.0, views=1)
     compare(scene, cuda_engine, rng, images=("color",), distance=distance)
+
+
+@pytest.mark.sanitize
+def test_the_order_of_tiles_changes_nothing(cuda_engine, rng, monkeypatch):
+    """The fullest tiles first, in two views; some tiles are empty."""
+    scene = soup(rng, 120, width=150, height=133, size=1.0)
+    cotangents = {"color": torch.randn(2, 133, 150, 3, generator=rng)}
+    (out, grads), (ordered, ordered_grads) = (
+        (monkeypatch.setattr(rasterize_launches, "_AT_ONCE", most), gradients(scene, cuda_engine, cotangents))[1]
+        for most in (1 << 30, 0)
+    )
+    assert torch.equal(ordered.color, out.color)
+    assert all(torch.equal(ordered_grads[name], grads[name]) for name in grads)
 
 
 @pytest.mark.sanitize

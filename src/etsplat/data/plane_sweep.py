@@ -8,7 +8,7 @@ elsewhere, and if other photos found the same place.
 import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -104,6 +104,11 @@ class _Photo:
         rays = unproject(dataset, index, one, column, row) - center
         return _Photo(dataset, index, colors, colors.mean(dim=2), counts, center, rays.view(height, width, 3))
 
+    def to(self, device: torch.device) -> "_Photo":
+        """For `_depths`, which compares there; cameras stay where they are."""
+        moved = {name: getattr(self, name).to(device) for name in ("grey", "counts", "rays")}
+        return replace(self, **moved)
+
     def located(self, points: Float[Tensor, "P 3"]) -> tuple[Tensor, Tensor, Tensor]:
         """(P,) depths of points, columns and rows of their pixels."""
         return project(self.dataset, self.index, points)
@@ -118,11 +123,12 @@ class _Photo:
         return self.center + self.rays[known] * depths[known, None]
 
 
-def swept_points(capture: Dataset, progress: Callable[[int, int], None] | None = None) -> Swept:
+def swept_points(capture: Dataset, device: torch.device, progress: Callable[[int, int], None] | None = None) -> Swept:
     """The points that the training photos agree on.
 
     Args:
         capture: photos, with points that say how far away things are.
+        device: where photos are compared; results are on the CPU.
         progress: called with (photos compared, photos in all).
     """
     assert capture.exact_points is not None
@@ -133,10 +139,11 @@ def swept_points(capture: Dataset, progress: Callable[[int, int], None] | None =
     inside = [photo.frames(each) for photo, each in zip(photos, located, strict=True)]
     asked = slice(None, None, math.ceil(len(points) / ASKED))
     beside = _neighbours(photos, points[asked], [each[asked] for each in inside])
+    there = [photo.to(device) for photo in photos]
 
     def swept(number: int) -> Float[Tensor, "h w"]:
-        near = [photos[other] for other in beside[number]]
-        return _depths(photos[number], near, located[number][0][inside[number]])
+        near = [there[other] for other in beside[number]]
+        return _depths(there[number], near, located[number][0][inside[number]]).cpu()
 
     depths = []
     with one_torch_thread(), ThreadPoolExecutor(min(num_threads(), SIDE_BY_SIDE)) as pool:
@@ -183,11 +190,12 @@ def _depths(photo: _Photo, others: Sequence[_Photo], known: Float[Tensor, " K"])
     ordered = known.sort().values
     near = NEARER * float(ordered[len(ordered) // 100])
     far = FARTHER * float(ordered[-1 - len(ordered) // 100])
-    inverse = torch.linspace(1 / near, 1 / far, _planes(photo, others, near, far))
+    device = photo.grey.device
+    inverse = torch.linspace(1 / near, 1 / far, _planes(photo, others, near, far), device=device)
     correlations = torch.stack([_correlation(photo, other, inverse) for other in others])
     judged = correlations.topk(AGREEING, dim=0).values.mean(dim=0)
     best, plane = judged.max(dim=0)
-    number = torch.arange(len(inverse))[:, None, None]
+    number = torch.arange(len(inverse), device=device)[:, None, None]
     elsewhere = judged.masked_fill((number - plane).abs() <= BESIDE, -1.0).amax(dim=0)
     within = plane.clamp(1, len(inverse) - 2)
     before, at, after = (judged.gather(0, (within + step)[None])[0] for step in (-1, 0, 1))
@@ -201,7 +209,7 @@ def _depths(photo: _Photo, others: Sequence[_Photo], known: Float[Tensor, " K"])
 def _planes(photo: _Photo, others: Sequence[_Photo], near: float, far: float) -> int:
     """So many that the middle of the photo moves by a pixel in the widest of the others between two."""
     h, w = photo.grey.shape
-    ends = photo.center + photo.rays[h // 2, w // 2] * torch.tensor([[near], [far]])
+    ends = photo.center + photo.rays[h // 2, w // 2].cpu() * torch.tensor([[near], [far]])
     widest = 0.0
     for other in others:
         depth, column, row = other.located(ends)
@@ -215,8 +223,9 @@ def _correlation(photo: _Photo, other: _Photo, inverse: Float[Tensor, " D"]) -> 
     h, w = other.grey.shape
     whole = torch.tensor([[2 / w, 0.0, -1.0], [0.0, 2 / h, -1.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
     matrix = whole @ other.dataset.Ks[other.index] @ other.dataset.viewmats[other.index, :3]
-    along, start = photo.rays @ matrix[:, :3].T, matrix[:, :3] @ photo.center + matrix[:, 3]
-    seen = along.float() + start.float() * inverse[:, None, None, None]
+    start = (matrix[:, :3] @ photo.center + matrix[:, 3]).float().to(inverse.device)
+    along = photo.rays @ matrix[:, :3].T.to(inverse.device)
+    seen = along.float() + start * inverse[:, None, None, None]
     places = seen[..., :2] / seen[..., 2:].clamp_min(1e-6)  # from -1 to 1 across the other
     outside = ~((places.abs() < 1).all(dim=-1) & (seen[..., 2] > 0))
     warped = grid_sample(other.grey.expand(len(inverse), 1, -1, -1), places, align_corners=False)
@@ -242,7 +251,7 @@ def _windows(images: Float[Tensor, "D 1 h w"]) -> Float[Tensor, "D 1 h w"]:
             left, right = (0, size - step), (step, size - step)
             sums.narrow(axis, *left).add_(images.narrow(axis, *right))
             sums.narrow(axis, *right).add_(images.narrow(axis, *left))
-        place = torch.arange(size)
+        place = torch.arange(size, device=images.device)
         counts = 1 + place.clamp_max(half) + (size - 1 - place).clamp_max(half)
         images = sums / counts.view(-1, *[1] * (-1 - axis))
     return images

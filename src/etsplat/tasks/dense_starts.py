@@ -20,7 +20,11 @@ is detail."""
 
 
 def with_swept_points(
-    capture: Dataset, most: int, announce: Callable[[Event], None], progress: Callable[[int, int], None]
+    capture: Dataset,
+    most: int,
+    device: torch.device,
+    announce: Callable[[Event], None],
+    progress: Callable[[int, int], None],
 ) -> Dataset:
     """A capture that starts at what its training photos agree on, too, as evenly as photos show it.
 
@@ -31,6 +35,7 @@ def with_swept_points(
     Args:
         capture: in the frame that is trained in.
         most: triangles that there may be; there are half as many points then, or as many as the capture has, if more.
+        device: where photos are compared.
         announce: told of what is found.
         progress: called with (photos compared, photos in all).
     """
@@ -38,7 +43,7 @@ def with_swept_points(
     if points is None:
         return capture
     colors = torch.full(points.shape, 0.5) if capture.point_colors is None else capture.point_colors
-    swept = swept_points(capture, progress)
+    swept = swept_points(capture, device, progress)
     agreed = f"photos agree on {100 * swept.share:.0f} % of their pixels"
     found = dense_start(swept.positions, swept.colors, capture, COMPARED) if swept.share >= LEAST_SHARE else None
     if found is None or not len(found.positions):

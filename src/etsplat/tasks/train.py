@@ -184,7 +184,7 @@ def _fit(
             most = triangle_limit(own, config)
             start = with_shown_points(capture, trust, most, job.announce)
             if start is capture and config.start.dense and config.finish == "none" and paths["init_points"] is None:
-                start = with_swept_points(capture, most, job.announce, job.prepared)
+                start = with_swept_points(capture, most, job.device, job.announce, job.prepared)
         trainer = start_trainer(start, config, scorer.cheap, job.device, trust, part)
 
         def look(iteration: int) -> None:

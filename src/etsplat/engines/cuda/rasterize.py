@@ -32,6 +32,8 @@ from etsplat.engines.native.plan import (
 _TILE_THREADS = _native.TILE**2
 _PROJECT_BLOCK = constant("cuda/raster_project.cu", "kProjectBlock")
 _EMIT_BLOCK, _EMIT_ITEMS = (constant("cuda/raster_project.cu", name) for name in ("kEmitBlock", "kEmitItems"))
+_ORDER_BLOCK = constant("cuda/raster_project.cu", "kOrderBlock")
+_AT_ONCE = 512  # tiles that the largest GPUs draw side by side: in which order does not matter then
 _REDUCE_BLOCK = constant("cuda/raster_reduce.cu", "kReduceBlock")
 _PROJECT = Program("raster_project.cu")
 _Depth = _native.DistortionDepth
@@ -108,6 +110,7 @@ class CudaRender:
             sorted_slots=4 * capacity,
             hits=capacity if self.keep else 0,
             tile_done=4 * tiles,
+            tile_order=4 * tiles if tiles > _AT_ONCE else 0,
         )
         per_triangle = dict.fromkeys(("depth_keys", "depth_keys_2", "order", "order_2"), 4 * m)
         per_pair = dict.fromkeys(("slot_tile", "slot_tile_2", "sorted_slots_2"), 4 * capacity)
@@ -130,6 +133,8 @@ class CudaRender:
         keys = (temporary["slot_tile"], temporary["slot_tile_2"])
         a.sorted_tiles, a.sorted_slots = self.by_tile.run(keys, slots, ctypes.c_void_p(a.slots), self.tile_zeros)
         launch_each(_PROJECT, "raster_ranges", capacity, [a])
+        if self.tile_count > _AT_ONCE:
+            launch(_PROJECT, "raster_order", self.plan.views, _ORDER_BLOCK, [a])
         settings = self.plan.settings
         defines = self._defines(self.distortion, settings.wants("median_depth"), settings.wants("statistics"))
         program = Program("raster_forward.cu", defines, flush=True)
