@@ -85,6 +85,7 @@ def floors(work: Work, peaks: Peaks) -> list[Floor]:
         ("radix_pass", depth_passes + tile_passes, 16 * (depth_passes * w.triangles + tile_passes * w.slots), 0),
         ("raster_emit", 1, 16 * w.triangles + 9 * w.slots, 0),
         ("raster_ranges", 1, 4 * w.slots + 8 * w.tiles, 0),
+        ("raster_order", 1, 12 * w.tiles, 0),
         ("raster_forward", 1, 9 * w.slots + w.visible * (record + color) + w.pixels * (color + 4),
          w.hit_pairs * FORWARD_PAIR_INSTRUCTIONS + w.slots * FORWARD_SLOT_INSTRUCTIONS),
         ("raster_backward", 1, 9 * w.slots + w.visible * (record + color) + w.hit_slots * stride

@@ -1,6 +1,7 @@
 """The backend for GPUs on a driver without one (helpers/simt/driver.py): its launches, captures and errors."""
 
 import ctypes
+import gc
 import threading
 from collections.abc import Iterator
 
@@ -141,6 +142,28 @@ def test_kernels_are_not_loaded_in_a_capture(backend: Device, driver: Driver) ->
     with pytest.raises(RuntimeError, match="CUDA_ERROR_STREAM_CAPTURE_UNSUPPORTED"):
         backend.capture(lambda: add(torch.zeros(1)), None)
     assert not backend.capturing
+
+
+@pytest.mark.parametrize("collecting", [True, False])
+def test_no_garbage_is_collected_in_a_capture(backend: Device, collecting: bool) -> None:
+    """A graph among it would be destroyed, which makes the capture invalid: an H100 refused one in hundreds. Behind it
+    all is as before, also behind an error."""
+    seen: list[bool] = []
+
+    def body() -> None:
+        seen.append(gc.isenabled())
+        add(torch.zeros(1))
+
+    before = gc.isenabled()
+    try:
+        (gc.enable if collecting else gc.disable)()
+        backend.warm_up(body)
+        backend.capture(body, None)
+        with pytest.raises(ZeroDivisionError):
+            backend.capture(lambda: [1 // 0], None)
+        assert (seen, gc.isenabled()) == ([collecting, False], collecting)
+    finally:
+        (gc.enable if before else gc.disable)()
 
 
 def test_an_error_within_a_capture_is_the_one_that_is_seen(

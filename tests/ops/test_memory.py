@@ -18,7 +18,7 @@ from etsplat.core.cameras import MAX_SIDE, Cameras
 from etsplat.engines.native.pool import empty_image
 from etsplat.ops.adam import Adam
 from etsplat.ops.rasterize_opaque import render_opaque
-from helpers.engines import looking, on
+from helpers.engines import device_of, looking, on
 from helpers.operations import CASES, Case, Run, loss
 from helpers.scenes import mesh, soup
 
@@ -227,7 +227,8 @@ class TestOddArguments:
     def test_opaque_pictures_count_signs_and_refuse_freed_memory(self, engine, rng):
         scene = mesh(rng)
         dtype = torch.float64 if engine == "reference" else torch.float32
-        points, *view = (scene[key].to(dtype) for key in ("vertices", "viewmats", "Ks"))
+        device = device_of(engine)
+        points, *view = (scene[key].to(device, dtype) for key in ("vertices", "viewmats", "Ks"))
         options = {"faces": scene["faces"]}
         size, colors = (scene["width"], scene["height"]), scene["face_colors"].to(dtype)
         for draw in (

@@ -1,6 +1,7 @@
 """The backend that runs kernels on NVIDIA GPUs, by the driver's own interface (cuda-bindings)."""
 
 import ctypes
+import gc
 import importlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -104,7 +105,7 @@ class Device:
 
     def _captured(self, body: Callable[[], None], pool: Any) -> torch.cuda.CUDAGraph:
         graph = torch.cuda.CUDAGraph()
-        with self._capture_stream():
+        with self._capture_stream(), _no_collection():
             # Threads that bring photos may allocate meanwhile.
             graph.capture_begin(pool=pool, capture_error_mode="thread_local")
             try:
@@ -156,6 +157,18 @@ class Device:
         if status != self._driver.CUresult.CUDA_SUCCESS:
             raise _failure(status, str(what))
         return value
+
+
+@contextmanager
+def _no_collection() -> Iterator[None]:
+    """Within, garbage stays: to destroy a graph that is among it would make a capture of this thread invalid."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
 
 
 def _failure(status: Any, what: str) -> RuntimeError:
