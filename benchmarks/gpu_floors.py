@@ -61,13 +61,14 @@ class Floor:
 
 
 # Warp instructions in the machine code of FLAT=3, elastic, sm_90 (NVRTC 13.5, nvdisasm); sm_89 differs by 2 at most. Of
-# pairs by `python -m benchmarks.gpu_code`; those of slots are the rest of a batch, spread over them.
-PROJECT_INSTRUCTIONS = 1500  # per 32 triangles of up to four tiles
+# pairs by `python -m benchmarks.gpu_code`; those of slots are the rest of a batch, spread over them. Of triangles by the
+# hardware's counters (`benchmarks/gpu_run.sh profile`, H100): the least of two scenes.
+PROJECT_INSTRUCTIONS = 890  # per 32 triangles
 FORWARD_PAIR_INSTRUCTIONS = 66  # per (slot, sub-tile) pair
 FORWARD_SLOT_INSTRUCTIONS = 22  # staging, the test of eight sub-tiles, eight warps looking for theirs
 BACKWARD_PAIR_INSTRUCTIONS = 211  # per pair, 16 shuffles among them
 BACKWARD_SLOT_INSTRUCTIONS = 45  # staging, adding the warps' sums, compaction
-REDUCE_INSTRUCTIONS = 940  # per 32 triangles of up to five slots, none of which needs a slow path of a quotient or root
+REDUCE_INSTRUCTIONS = 750  # per 32 triangles
 
 
 def floors(work: Work, peaks: Peaks) -> list[Floor]:

@@ -2,7 +2,7 @@
 
 python -m benchmarks.gpu_page docs/gpu_kernels.md benchmarks/results/gpu_2026-11-27_COMMIT.json
 
-takes what `python -m benchmarks.gpu` wrote on an H100, needs no GPU itself, and puts its tables between the lines
+takes what `python -m benchmarks.gpu` wrote on an H200, needs no GPU itself, and puts its tables between the lines
 `<!-- results -->` and `<!-- end of results -->`. It needs what benchmarks.gpu_code needs.
 """
 
@@ -17,8 +17,8 @@ from benchmarks.gpu_programs import PROGRAMS
 from benchmarks.tables import BEGIN, END, Table
 from etsplat.engines.cuda.compile import import_nvrtc, nvrtc_version
 
-DEVICES = {"H100": "sm_90", "RTX 4090": "sm_89"}
-MEASURED = "H100"
+DEVICES = {"H200": "sm_90", "RTX 4090": "sm_89"}
+MEASURED = "H200"
 # By `python -m benchmarks.gpu --count`, minutes by the shim; what is visible of the soup to 0.2 %, from its bytes.
 WORK = {
     "sphere6": Work(81_920, 81_920, 40_962, 184_873, 171_851, 389_227, 1024 * 1024, 64 * 64, 3),
