@@ -61,8 +61,8 @@ class Floor:
 
 
 # Warp instructions in the machine code of FLAT=3, elastic, sm_90 (NVRTC 13.5, nvdisasm); sm_89 differs by 2 at most. Of
-# pairs by `python -m benchmarks.gpu_code`; those of slots are the rest of a batch, spread over them. Of triangles by the
-# hardware's counters (`benchmarks/gpu_run.sh profile`, H100): the least of two scenes.
+# pairs by `python -m benchmarks.gpu_code`; those of slots are the rest of a batch, spread over them. Of triangles by
+# the hardware's counters (`benchmarks/gpu_run.sh profile`, H100): the least of two scenes.
 PROJECT_INSTRUCTIONS = 890  # per 32 triangles
 FORWARD_PAIR_INSTRUCTIONS = 66  # per (slot, sub-tile) pair
 FORWARD_SLOT_INSTRUCTIONS = 22  # staging, the test of eight sub-tiles, eight warps looking for theirs

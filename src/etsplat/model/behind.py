@@ -5,6 +5,7 @@ that the pixel's nearest triangle belongs to; where no triangle is, it is the ba
 """
 
 from dataclasses import replace
+from functools import cached_property
 
 import torch
 from jaxtyping import Float
@@ -24,46 +25,51 @@ _NEAR_PLANE = 0.01
 """That of `rasterize_antialiased`."""
 
 
-@torch.no_grad()
-def render_with_behind(
-    mesh: TriangleMesh, cameras: Cameras, backgrounds: Float[Tensor, "1 3"]
-) -> tuple[Rasterization, Rasterization]:
-    """A picture of separate opaque triangles with colours of corners, and what is behind them, without gradients.
+class WithBehind:
+    """Draws separate opaque triangles with colours of corners, and what is behind them, without gradients."""
 
-    Args:
-        mesh: whose faces share no edges.
-        cameras: a single one.
-        backgrounds: (1, 3).
+    def __init__(self, mesh: TriangleMesh) -> None:
+        """Takes a mesh whose faces share no edges, and which does not change meanwhile."""
+        assert mesh.vertex_colored
+        assert len(mesh.topology.connectivity.face_pairs) == 0, "an edge would be a silhouette without the other face"
+        self._mesh = mesh
 
-    Returns:
-        The picture as `TriangleMesh.render` gives it, and colour and alpha of what is behind.
-    """
-    connectivity = mesh.topology.connectivity
-    assert mesh.vertex_colored
-    assert len(connectivity.face_pairs) == 0, "an edge would be a silhouette without the other face"
-    together = engine_for(mesh.vertices).rasterize_behind
-    if together is None:
-        return by_parts(mesh, cameras, backgrounds)
-    found = together(mesh.vertices, mesh.colors, backgrounds, cameras, _NEAR_PLANE, connectivity)
-    color, triangle, barycentrics, depth = (images.split(1) for images in found)
-    alpha = [(shown >= 0).to(mesh.vertices.dtype)[..., None] for shown in triangle]
-    nearest = Rasterization(color[0], alpha[0], depth[0][..., None], triangle=triangle[0], barycentrics=barycentrics[0])
-    return nearest, Rasterization(color[1], alpha[1])
+    @torch.no_grad()
+    def render(self, cameras: Cameras, backgrounds: Float[Tensor, "1 3"]) -> tuple[Rasterization, Rasterization]:
+        """A picture as `TriangleMesh.render` gives it, and colour and alpha of what is behind.
 
+        Args:
+            cameras: a single one.
+            backgrounds: (1, 3).
+        """
+        mesh = self._mesh
+        together = engine_for(mesh.vertices).rasterize_behind
+        if together is None:
+            return self.by_parts(cameras, backgrounds)
+        found = together(mesh.vertices, mesh.colors, backgrounds, cameras, _NEAR_PLANE, mesh.topology.connectivity)
+        color, triangle, barycentrics, depth = (images.split(1) for images in found)
+        alpha = [(shown >= 0).to(mesh.vertices.dtype)[..., None] for shown in triangle]
+        seen = {"triangle": triangle[0], "barycentrics": barycentrics[0]}
+        nearest = Rasterization(color[0], alpha[0], depth[0][..., None], **seen)
+        return nearest, Rasterization(color[1], alpha[1])
 
-def by_parts(
-    mesh: TriangleMesh, cameras: Cameras, backgrounds: Float[Tensor, "1 3"]
-) -> tuple[Rasterization, Rasterization]:
-    """The same by one picture more of what each part leaves."""
-    nearest = mesh.render(cameras, backgrounds=backgrounds)
-    assert nearest.triangle is not None
-    part = torch.where(nearest.triangle < 0, -1, nearest.triangle % PARTS)[..., None]
-    color, alpha = backgrounds[:, None, None].expand_as(nearest.color), torch.zeros_like(nearest.alpha)
-    number = torch.arange(mesh.count, device=mesh.vertices.device)
-    for left_out in range(PARTS):
-        kept = mesh.faces[number % PARTS != left_out]
-        rest = replace(mesh, topology=MeshTopology.from_faces(kept, len(mesh.vertices)))
-        seen = rest.render(cameras, backgrounds=backgrounds)
-        color = torch.where(part == left_out, seen.color, color)
-        alpha = torch.where(part == left_out, seen.alpha, alpha)
-    return nearest, Rasterization(color, alpha)
+    @torch.no_grad()
+    def by_parts(self, cameras: Cameras, backgrounds: Float[Tensor, "1 3"]) -> tuple[Rasterization, Rasterization]:
+        """The same by one picture more of what each part leaves."""
+        nearest = self._mesh.render(cameras, backgrounds=backgrounds)
+        assert nearest.triangle is not None
+        part = torch.where(nearest.triangle < 0, -1, nearest.triangle % PARTS)[..., None]
+        color, alpha = backgrounds[:, None, None].expand_as(nearest.color), torch.zeros_like(nearest.alpha)
+        for left_out, rest in enumerate(self._rests):
+            seen = rest.render(cameras, backgrounds=backgrounds)
+            color = torch.where(part == left_out, seen.color, color)
+            alpha = torch.where(part == left_out, seen.alpha, alpha)
+        return nearest, Rasterization(color, alpha)
+
+    @cached_property
+    def _rests(self) -> list[TriangleMesh]:
+        """What each part leaves: once for all pictures, as how faces hang together is found out on the CPU."""
+        faces, count = self._mesh.faces, len(self._mesh.vertices)
+        part = torch.arange(len(faces), device=faces.device) % PARTS
+        topologies = (MeshTopology.from_faces(faces[part != left_out], count) for left_out in range(PARTS))
+        return [replace(self._mesh, topology=topology) for topology in topologies]

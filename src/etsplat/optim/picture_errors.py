@@ -17,7 +17,7 @@ from etsplat.data.dataset import Dataset, middles_of
 from etsplat.data.loader import View, ViewLoader
 from etsplat.data.pictures import as_float
 from etsplat.io.images import over_background
-from etsplat.model.behind import render_with_behind
+from etsplat.model.behind import WithBehind
 from etsplat.model.surroundings import Surroundings
 from etsplat.model.triangle_mesh import TriangleMesh
 from etsplat.optim.exposure import Exposure
@@ -78,11 +78,11 @@ class PictureErrors:
         wrong, without = (torch.zeros(mesh.count, dtype=torch.float64) for _ in range(2))
         photos = torch.zeros(mesh.count, dtype=torch.int64)
         corners = mesh.vertices[mesh.faces]
-        gains = HalvingGains(corners)
+        gains, drawn = HalvingGains(corners), WithBehind(mesh)
         self._loader.expect(self._views)
         for number, index in enumerate(self._views):
             view = self._loader.view(index)
-            nearest, behind = render_with_behind(mesh, view.camera, self._background[None])
+            nearest, behind = drawn.render(view.camera, self._background[None])
             assert nearest.triangle is not None
             assert nearest.barycentrics is not None
             face, barycentrics = nearest.triangle.flatten().long().cpu(), nearest.barycentrics.reshape(-1, 3).cpu()
