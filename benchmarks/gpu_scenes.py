@@ -1,6 +1,7 @@
 """The scenes that the GPU engine is measured on: those of benchmarks.scenes, and a soup of four million triangles."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -17,7 +18,10 @@ SOUP_COUNT = 4_000_000
 
 @dataclass
 class GpuScene:
-    """Leaves on the device, one camera, the gradient that reaches the image; with ``sh``, view-dependent colours."""
+    """Leaves on the device, one camera, the gradient that reaches the image; with ``sh``, view-dependent colours.
+
+    ``options`` are further arguments of `etsplat.rasterize`.
+    """
 
     name: str
     vertices: Tensor
@@ -30,6 +34,7 @@ class GpuScene:
     viewmats: Tensor
     Ks: Tensor
     cotangent: Tensor
+    options: dict[str, Any] = field(default_factory=dict)
 
     @property
     def leaves(self) -> list[Tensor]:
@@ -58,6 +63,7 @@ class GpuScene:
                 height=height,
                 faces=self.faces,
                 validate=False,
+                **self.options,
             )
 
 

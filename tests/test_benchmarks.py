@@ -9,16 +9,19 @@ import sys
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
 
+import etsplat
 from benchmarks import (
     determinism,
     floaters,
     gpu,
     gpu_floors,
     gpu_forms,
+    gpu_peer,
     gpu_reconstruct,
     gpu_scenes,
     gpu_timing,
@@ -38,6 +41,7 @@ from etsplat.core.cameras import Cameras
 from etsplat.data.agreement import Photo
 from etsplat.data.demo_scene import demo_scene
 from etsplat.engines.cuda.program import Program
+from etsplat.engines.reference.rasterize import to_screen
 from etsplat.engines.threads import one_torch_thread
 from etsplat.model.triangle_mesh import TriangleMesh
 from etsplat.ops.rasterize_opaque import rasterize_opaque
@@ -168,6 +172,47 @@ def test_a_training_step_is_timed(simt, preset):
     assert result["milliseconds"] > 0
     assert simt.launches.count("soup_statistics") == 8
     assert simt.launches.count("normal_backward") == (8 if preset == "paper" else 0)
+
+
+def test_the_peer_on_gpus_sees_the_scene_from_the_same_camera():
+    """Corners of a scene by its matrices, for rows, and by ours: in its pixels the middle of the first one is 0."""
+    scene = gpu_peer.separate("sphere2", "cpu")
+    _, full, tan_x, _ = gpu_peer.matrices(scene.viewmats[0], scene.Ks[0], 1024, 1024)
+    corners = scene.vertices.detach()
+    clip = torch.cat([corners, torch.ones_like(corners[..., :1])], dim=-1) @ full
+    theirs = ((clip[..., :2] / clip[..., 3:] + 1) * 1024 - 1) / 2
+    ours, _ = to_screen(corners, scene.viewmats[0], scene.Ks[0])
+    torch.testing.assert_close(theirs + 0.5, ours, rtol=0, atol=1e-3)
+    assert tan_x == pytest.approx(512 / float(scene.Ks[0, 0, 0]))
+
+
+def test_the_peer_on_gpus_gets_what_is_drawn(simt, monkeypatch):
+    """Each triangle with corners and a softness of its own, in its layout; a stand-in draws by our rasterizer."""
+    scene = gpu_peer.separate("sphere1", "cpu")
+    scene.cotangent = scene.cotangent[:, :32, :32].contiguous()
+    scene.Ks = scene.Ks / 32 + torch.diag(torch.tensor([0.0, 0.0, 31 / 32]))
+
+    class Rasterizer:
+        def __init__(self, settings):
+            assert (settings["image_width"], settings["image_height"]) == (32, 32)
+
+        def __call__(self, triangles_points, opacities, sigma, colors_precomp, number_of_points, **_):
+            given = {"opacities": opacities[:, 0], "sigma": sigma[:, 0], "face_colors": colors_precomp}
+            views = {"viewmats": scene.viewmats, "Ks": scene.Ks, "width": 32, "height": 32}
+            with etsplat.engine("cuda"):
+                out = rasterize(triangles_points.view(-1, 3, 3), **given, **views, **gpu_peer.THEIRS)
+            return out.color[0].permute(2, 0, 1), torch.ones(number_of_points, dtype=torch.int32)
+
+    package = SimpleNamespace(TriangleRasterizationSettings=dict, TriangleRasterizer=Rasterizer)
+    monkeypatch.setitem(sys.modules, "diff_triangle_rasterization", package)
+    peer = gpu_peer.Peer(scene)
+    picture, drawn = peer.picture()
+    assert torch.equal(picture, scene.render().color[0])
+    assert drawn.all()
+    gpu_timing.step(scene)
+    peer.step()
+    theirs = peer._given["triangles_points"].grad
+    torch.testing.assert_close(theirs.view(-1, 3, 3), scene.vertices.grad, rtol=0, atol=0)
 
 
 def test_the_benchmark_says_that_there_is_no_gpu(monkeypatch):
