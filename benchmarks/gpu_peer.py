@@ -44,8 +44,7 @@ def separate(name: str, device: str) -> GpuScene:
 def matrices(viewmat: Tensor, K: Tensor, width: int, height: int) -> tuple[Tensor, Tensor, float, float]:
     """World to view and world to clip space as it wants them, for rows; tangents of half the fields of view."""
     fx, fy = float(K[0, 0]), float(K[1, 1])
-    assert abs(float(K[0, 2]) - width / 2) < 1e-6, "it has the principal point in the middle"
-    assert abs(float(K[1, 2]) - height / 2) < 1e-6, "it has the principal point in the middle"
+    assert K[:2, 2].tolist() == [width / 2, height / 2], "it has the principal point in the middle"
     tan_x, tan_y = width / (2 * fx), height / (2 * fy)
     clip = torch.zeros(4, 4, dtype=torch.float64)
     clip[0, 0], clip[1, 1], clip[3, 2] = 1 / tan_x, 1 / tan_y, 1.0

@@ -53,6 +53,7 @@ struct alignas(8) Span {
 };
 constexpr int kPatternSide = 4;
 constexpr unsigned kMany = 0x80000000u;
+__device__ __forceinline__ Span& span_of(const RasterPass& pass, int m) { return reinterpret_cast<Span*>(pass.spans)[m]; }
 __device__ __forceinline__ unsigned span_count(unsigned word) { return word & kMany ? word & ~kMany : __popc(word); }
 
 __device__ __forceinline__ TriangleRecord load_record(const RasterPass& pass, int m) {

@@ -150,7 +150,7 @@ extern "C" __global__ void __launch_bounds__(128) raster_project(const __grid_co
         if (lane_index() == lane) word = found == 0 ? 0 : kMany | found;
     }
     if (!inside) return;
-    reinterpret_cast<Span*>(pass.spans)[m] = {static_cast<unsigned>(first), word};
+    span_of(pass, m) = {static_cast<unsigned>(first), word};
     pass.depth_keys[m] = word != 0 ? __float_as_uint(p.depth) : 0x7fffffffu;  // what is nowhere goes last
     if (pass.visible) {
         pass.visible[m] = visible;
@@ -211,7 +211,7 @@ extern "C" __global__ void __launch_bounds__(256) raster_emit(const __grid_const
     }
 #pragma unroll
     for (int i = 0; i < kEmitItems; ++i) {  // all on their way together: they lie anywhere
-        const Span span = m[i] >= 0 ? reinterpret_cast<const Span*>(pass.spans)[m[i]] : Span{0, 0};
+        const Span span = m[i] >= 0 ? span_of(pass, m[i]) : Span{0, 0};
         first[i] = static_cast<int>(span.first);
         word[i] = span.word;
         mine += span_count(word[i]);

@@ -30,7 +30,7 @@ __device__ __forceinline__ void add_slot(const RasterPass& pass, unsigned slot, 
 __device__ __forceinline__ void sum_slots(const RasterPass& pass, int m, bool inside, float (&sums)[kStride]) {
     for (int j = 0; j < kStride; ++j) sums[j] = 0.0f;
     const unsigned limit = *pass.slots;
-    const unsigned begin = inside ? pass.slot_begin[m] : 0, count = inside ? span_count(pass.spans[2 * m + 1]) : 0;
+    const unsigned begin = inside ? pass.slot_begin[m] : 0, count = inside ? span_count(span_of(pass, m).word) : 0;
     const unsigned end = begin + count < limit ? begin + count : limit;
     const bool many = end > begin && end - begin > kManySlots;
     if (!many)
@@ -92,7 +92,7 @@ extern "C" __global__ void __launch_bounds__(128) raster_reduce(const __grid_con
     const long long m = static_cast<long long>(view) * pass.triangles + triangle;
     const long long block = static_cast<long long>(view) * gridDim.x + blockIdx.x;
     const bool inside = triangle < pass.triangles, first = view == 0;
-    const bool drawn = inside && span_count(pass.spans[2 * m + 1]) > 0;
+    const bool drawn = inside && span_count(span_of(pass, m).word) > 0;
     float sums[kStride];
     sum_slots(pass, static_cast<int>(inside ? m : 0), inside, sums);
     if (inside) store_attributes(pass, triangle, m, first, sums);

@@ -89,7 +89,7 @@ def test_bits_do_not_depend_on_threads() -> None:
 @pytest.mark.cuda
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
 def test_a_gpu_finds_the_same_places() -> None:
-    """But where one more or one less just counts; on the CPU's tensors, the same bits each time."""
+    """But for a few that just count or just do not; with the same bits each time, as tensors of the CPU."""
     found, again, here = (swept_points(wall(), torch.device(device)) for device in ("cuda", "cuda", "cpu"))
     assert found.positions.is_cpu
     assert torch.equal(found.positions, again.positions)

@@ -167,9 +167,9 @@ def test_adam_adds_the_gradient_of_harmonics_with_the_bits_of_autograd(
     (losses, ours), (expected, theirs) = found
     assert ours["sh_rest"].abs().max() > 0
     assert losses == expected
-    bits = {"rtol": 1e-4, "atol": 1e-6} if device_of(engine) == "cuda" else {"rtol": 0, "atol": 0}
+    tolerance = {"rtol": 1e-4, "atol": 1e-6} if device_of(engine) == "cuda" else {"rtol": 0, "atol": 0}
     for name in theirs:
-        torch.testing.assert_close(ours[name], theirs[name], **bits, msg=lambda text, name=name: f"{name}: {text}")
+        torch.testing.assert_close(ours[name], theirs[name], **tolerance, msg=lambda text, name=name: f"{name}: {text}")
 
 
 def test_a_step_of_two_views_is_the_mean_of_their_gradients(object_views: Dataset) -> None:
