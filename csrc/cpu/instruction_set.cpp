@@ -24,6 +24,7 @@ struct Path {
     NormalsKernels normals;
     OpaqueKernels opaque;
     ColorsKernels colors;
+    PlaneSweepKernels plane_sweep;
 };
 
 #if defined(ETSPLAT_X86)
@@ -71,10 +72,10 @@ bool has_avx512() {
 }
 #endif
 
-#define ETSPLAT_PATH(name)                                                                                          \
-    Path {                                                                                                          \
-        #name,                    name::raster_kernels(),   name::triangle_kernels(), name::photometric_kernels(),  \
-        name::normals_kernels(), name::opaque_kernels(),    name::colors_kernels()                                  \
+#define ETSPLAT_PATH(name)                                                                                         \
+    Path {                                                                                                         \
+        #name,                   name::raster_kernels(), name::triangle_kernels(), name::photometric_kernels(),    \
+        name::normals_kernels(), name::opaque_kernels(), name::colors_kernels(),   name::plane_sweep_kernels()     \
     }
 
 const std::vector<Path>& paths() {
@@ -136,5 +137,7 @@ const NormalsKernels& active_normals_kernels() { return active().normals; }
 const OpaqueKernels& active_opaque_kernels() { return active().opaque; }
 
 const ColorsKernels& active_colors_kernels() { return active().colors; }
+
+const PlaneSweepKernels& active_plane_sweep_kernels() { return active().plane_sweep; }
 
 }  // namespace etsplat

@@ -8,6 +8,7 @@
 #include "normals_pass.h"
 #include "opaque_pass.h"
 #include "photometric_pass.h"
+#include "plane_sweep_pass.h"
 #include "raster_pass.h"
 #include "triangle_pass.h"
 
@@ -23,5 +24,6 @@ const PhotometricKernels& active_photometric_kernels();
 const NormalsKernels& active_normals_kernels();
 const OpaqueKernels& active_opaque_kernels();
 const ColorsKernels& active_colors_kernels();
+const PlaneSweepKernels& active_plane_sweep_kernels();
 
 }  // namespace etsplat

@@ -19,6 +19,7 @@ void bind_mesh_energies(nb::module_& m);
 void bind_normals(nb::module_& m);
 void bind_photo_agreement(nb::module_& m);
 void bind_photometric(nb::module_& m);
+void bind_plane_sweep(nb::module_& m);
 void bind_pool(nb::module_& m);
 void bind_rasterize(nb::module_& m);
 void bind_rasterize_opaque(nb::module_& m);
@@ -69,6 +70,7 @@ NB_MODULE(_native, m) {
     bind_normals(m);
     bind_photo_agreement(m);
     bind_photometric(m);
+    bind_plane_sweep(m);
     bind_pool(m);
     bind_rasterize(m);
     bind_rasterize_opaque(m);

@@ -231,6 +231,22 @@ def photometric(
     squared: bool,
     dssim_weight: float,
 ) -> float: ...
+def plane_sweep(
+    *,
+    grey: torch.Tensor,
+    mean: torch.Tensor,
+    variance: torch.Tensor,
+    neighbours: Sequence[torch.Tensor],
+    rays: torch.Tensor,
+    starts: torch.Tensor,
+    inverse: torch.Tensor,
+    window: int,
+    agreeing: int,
+    beside: int,
+    place: torch.Tensor,
+    best: torch.Tensor,
+    elsewhere: torch.Tensor,
+) -> None: ...
 def pool_idle_bytes() -> int: ...
 def empty_floats(*, shape: Sequence[int]) -> torch.Tensor: ...
 def zero_floats(*, shape: Sequence[int]) -> torch.Tensor: ...

@@ -5,6 +5,7 @@
 #include "cpu/normals_pass.h"
 #include "cpu/opaque_pass.h"
 #include "cpu/photometric_pass.h"
+#include "cpu/plane_sweep_pass.h"
 #include "cpu/raster_pass.h"
 #include "cpu/triangle_pass.h"
 
@@ -18,6 +19,7 @@ namespace etsplat {
     ColorsKernels colors_kernels();           \
     NormalsKernels normals_kernels();         \
     OpaqueKernels opaque_kernels();           \
+    PlaneSweepKernels plane_sweep_kernels();  \
     }
 ETSPLAT_DECLARE_PATH(plain)
 ETSPLAT_DECLARE_PATH(avx2)

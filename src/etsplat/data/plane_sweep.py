@@ -13,12 +13,13 @@ from dataclasses import dataclass, replace
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import grid_sample, normalize
+from torch.nn.functional import normalize
 
 from etsplat.data.agreement import reduced
 from etsplat.data.dataset import Dataset
-from etsplat.data.depth_points import framed, project, unproject
+from etsplat.data.depth_points import framed, project
 from etsplat.data.pictures import as_float, unpremultiplied
+from etsplat.data.plane_matches import AGREEING, Neighbour, best_matches, spread
 from etsplat.engines.threads import num_threads, one_torch_thread
 
 WIDEST = 200
@@ -27,11 +28,8 @@ WIDEST = 200
 PHOTOS = 64
 """So many photos at most are compared; of more, every second, third, ... one."""
 
-SIDE_BY_SIDE = 4
-"""So many photos at most are swept at a time, each by one thread; a third of a gigabyte each."""
-
-NEIGHBOURS, AGREEING = 4, 2
-"""Neighbours of a photo, and how many of them, the best ones, a depth is judged by: others may not see the place."""
+NEIGHBOURS = 4
+"""Photos that a photo is compared with."""
 
 ANGLE, NARROWER, WIDER = 8.0, 5.0, 10.0
 """Degrees between the rays of two photos to what both show, in the median, that suit best; and how fast a pair suits
@@ -44,15 +42,9 @@ PLANES, NEARER, FARTHER = (32, 160), 0.8, 1.3
 """Fewest and most planes: the widest neighbour moves by a pixel between two. They lie between what the nearest and the
 farthest hundredth of the points are, times these factors."""
 
-WINDOW = 5
-"""Side of the windows that are correlated, in pixels."""
-
 CORRELATED, CLEARLY, CONTRAST = 0.6, 0.03, 0.01
 """What the correlation must be, by how much more than at planes that are not beside the best one, and the standard
 deviation of grey values in a window."""
-
-BESIDE = 3
-"""Planes that far from the best one are beside it."""
 
 SAME, SEEN_BY = 0.015, 2
 """Depths in other photos are the same up to this part of them; in so many others a place must have been found."""
@@ -82,7 +74,7 @@ class _Photo:
         grey: (h, w).
         counts: (h, w), where it shows something that is not masked.
         center: (3,) float64 of the camera.
-        rays: (h, w, 3) float64 from there through the middles of the pixels, to depth 1.
+        rays: (3, 3) float64 from a place (x, y, 1) in pixels to the ray from there through it, to depth 1.
     """
 
     dataset: Dataset
@@ -91,23 +83,26 @@ class _Photo:
     grey: Float[Tensor, "h w"]
     counts: Bool[Tensor, "h w"]
     center: Float[Tensor, "3"]
-    rays: Float[Tensor, "h w 3"]
+    rays: Float[Tensor, "3 3"]
 
     @staticmethod
     def of(dataset: Dataset, index: int) -> "_Photo":
-        picture, (width, height) = dataset.images.picture(index), dataset.images.sizes[index]
+        picture = dataset.images.picture(index)
         colors, counts = unpremultiplied(as_float(picture.pixels))
         if picture.mask is not None:
             counts = counts & (picture.mask > 127)
-        row, column = (torch.cartesian_prod(torch.arange(height), torch.arange(width)) + 0.5).unbind(dim=1)
-        center, one = dataset.centers[index], torch.ones(height * width, dtype=torch.float64)
-        rays = unproject(dataset, index, one, column, row) - center
-        return _Photo(dataset, index, colors, colors.mean(dim=2), counts, center, rays.view(height, width, 3))
+        rays = dataset.viewmats[index, :3, :3].T @ torch.linalg.inv(dataset.Ks[index])
+        return _Photo(dataset, index, colors, colors.mean(dim=2), counts, dataset.centers[index], rays)
 
     def to(self, device: torch.device) -> "_Photo":
         """For `_depths`, which compares there; cameras stay where they are."""
-        moved = {name: getattr(self, name).to(device) for name in ("grey", "counts", "rays")}
-        return replace(self, **moved)
+        return replace(self, grey=self.grey.to(device), counts=self.counts.to(device))
+
+    def beside(self, other: "_Photo") -> Neighbour:
+        """Another photo, to compare this one with."""
+        matrix = other.dataset.Ks[other.index] @ other.dataset.viewmats[other.index, :3]
+        rays, start = matrix[:, :3] @ self.rays, matrix[:, :3] @ self.center + matrix[:, 3]
+        return Neighbour(other.grey, rays.to(other.grey.device), start.to(other.grey.device))
 
     def located(self, points: Float[Tensor, "P 3"]) -> tuple[Tensor, Tensor, Tensor]:
         """(P,) depths of points, columns and rows of their pixels."""
@@ -120,7 +115,9 @@ class _Photo:
     def places(self, depths: Float[Tensor, "h w"]) -> Float[Tensor, "P 3"]:
         """Of the pixels with a depth, in rows."""
         known = depths > 0
-        return self.center + self.rays[known] * depths[known, None]
+        row, column = known.nonzero().T.double() + 0.5
+        rays = self.rays @ torch.stack([column, row, torch.ones_like(row)])
+        return self.center + rays.T * depths[known, None]
 
 
 def swept_points(capture: Dataset, device: torch.device, progress: Callable[[int, int], None] | None = None) -> Swept:
@@ -141,23 +138,16 @@ def swept_points(capture: Dataset, device: torch.device, progress: Callable[[int
     beside = _neighbours(photos, points[asked], [each[asked] for each in inside])
     there = [photo.to(device) for photo in photos]
 
-    def swept(number: int) -> Float[Tensor, "h w"]:
-        near = [there[other] for other in beside[number]]
-        return _depths(there[number], near, located[number][0][inside[number]]).cpu()
-
-    depths = []
-    with one_torch_thread(), ThreadPoolExecutor(min(num_threads(), SIDE_BY_SIDE)) as pool:
-        for found in pool.map(swept, range(len(photos))):
-            depths.append(found)
+    depths = list[Tensor]()
+    with one_torch_thread(), ThreadPoolExecutor(num_threads()) as pool:
+        for number, others in enumerate(beside):
+            near, known = [there[other] for other in others], located[number][0][inside[number]]
+            depths.append(_depths(there[number], near, known).cpu())
             if progress is not None:
                 progress(len(depths), len(photos))
-    positions, colors = [], []
-    for number, (photo, found) in enumerate(zip(photos, depths, strict=True)):
-        places = photo.places(found)
-        others = [pair for other, pair in enumerate(zip(photos, depths, strict=True)) if other != number]
-        agreed = _found_by(places, others) >= SEEN_BY
-        positions.append(places[agreed])
-        colors.append(photo.colors[found > 0][agreed])
+        agreed = list(pool.map(lambda number: _agreed(photos, depths, number, beside[number]), range(len(photos))))
+    positions = [photo.places(found)[kept] for photo, found, kept in zip(photos, depths, agreed, strict=True)]
+    colors = [photo.colors[found > 0][kept] for photo, found, kept in zip(photos, depths, agreed, strict=True)]
     compared = sum(int(photo.counts.sum()) for photo in photos)
     count = sum(len(each) for each in positions)
     return Swept(torch.cat(positions), torch.cat(colors), count / max(compared, 1))
@@ -190,26 +180,20 @@ def _depths(photo: _Photo, others: Sequence[_Photo], known: Float[Tensor, " K"])
     ordered = known.sort().values
     near = NEARER * float(ordered[len(ordered) // 100])
     far = FARTHER * float(ordered[-1 - len(ordered) // 100])
-    device = photo.grey.device
-    inverse = torch.linspace(1 / near, 1 / far, _planes(photo, others, near, far), device=device)
-    correlations = torch.stack([_correlation(photo, other, inverse) for other in others])
-    judged = correlations.topk(AGREEING, dim=0).values.mean(dim=0)
-    best, plane = judged.max(dim=0)
-    number = torch.arange(len(inverse), device=device)[:, None, None]
-    elsewhere = judged.masked_fill((number - plane).abs() <= BESIDE, -1.0).amax(dim=0)
-    within = plane.clamp(1, len(inverse) - 2)
-    before, at, after = (judged.gather(0, (within + step)[None])[0] for step in (-1, 0, 1))
-    between = ((before - after) / (2 * (before - 2 * at + after)).clamp_max(-1e-6)).clamp(-0.5, 0.5)
-    found = 1 / (inverse[within] + between * (inverse[1] - inverse[0]))
-    contrast = _spread(photo.grey[None, None])[1][0, 0].sqrt()
-    clear = (best > CORRELATED) & (best - elsewhere > CLEARLY) & (contrast > CONTRAST) & (plane == within)
-    return torch.where(clear & photo.counts, found, 0.0)
+    planes = _planes(photo, others, near, far)
+    inverse = torch.linspace(1 / near, 1 / far, planes, device=photo.grey.device)
+    found = best_matches(photo.grey, [photo.beside(other) for other in others], inverse)
+    contrast = spread(photo.grey[None])[1][0].sqrt()
+    clear = (found.best > CORRELATED) & (found.best - found.elsewhere > CLEARLY) & (contrast > CONTRAST)
+    depths = 1 / (inverse[0] + found.place * (inverse[1] - inverse[0]))
+    return torch.where(clear & (found.place >= 0) & photo.counts, depths, 0.0)
 
 
 def _planes(photo: _Photo, others: Sequence[_Photo], near: float, far: float) -> int:
     """So many that the middle of the photo moves by a pixel in the widest of the others between two."""
     h, w = photo.grey.shape
-    ends = photo.center + photo.rays[h // 2, w // 2].cpu() * torch.tensor([[near], [far]])
+    middle = photo.rays @ torch.tensor([w // 2 + 0.5, h // 2 + 0.5, 1.0], dtype=torch.float64)
+    ends = photo.center + middle * torch.tensor([[near], [far]])
     widest = 0.0
     for other in others:
         depth, column, row = other.located(ends)
@@ -218,54 +202,30 @@ def _planes(photo: _Photo, others: Sequence[_Photo], near: float, far: float) ->
     return math.ceil(min(max(PLANES[0], widest), PLANES[1]))
 
 
-def _correlation(photo: _Photo, other: _Photo, inverse: Float[Tensor, " D"]) -> Float[Tensor, "D h w"]:
-    """Of the windows of a photo with those of another as each of the planes has it; -1 where that shows nothing."""
-    h, w = other.grey.shape
-    whole = torch.tensor([[2 / w, 0.0, -1.0], [0.0, 2 / h, -1.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
-    matrix = whole @ other.dataset.Ks[other.index] @ other.dataset.viewmats[other.index, :3]
-    start = (matrix[:, :3] @ photo.center + matrix[:, 3]).float().to(inverse.device)
-    along = photo.rays @ matrix[:, :3].T.to(inverse.device)
-    seen = along.float() + start * inverse[:, None, None, None]
-    places = seen[..., :2] / seen[..., 2:].clamp_min(1e-6)  # from -1 to 1 across the other
-    outside = ~((places.abs() < 1).all(dim=-1) & (seen[..., 2] > 0))
-    warped = grid_sample(other.grey.expand(len(inverse), 1, -1, -1), places, align_corners=False)
-    grey = photo.grey[None, None]
-    mean, variance = _spread(grey)
-    there, varies = _spread(warped)
-    together = _windows(warped * grey) - mean * there
-    return (together / (variance * varies).sqrt())[:, 0].masked_fill(outside, -1.0)
+def _agreed(
+    photos: Sequence[_Photo], depths: Sequence[Float[Tensor, "h w"]], number: int, first: Sequence[int]
+) -> Bool[Tensor, " P"]:
+    """Whether other photos found the places that one has a depth of, in `SEEN_BY` of them.
+
+    Args:
+        photos: all.
+        depths: of each.
+        number: whose places they are.
+        first: photos that are asked first, for what they agree to is not asked again.
+    """
+    places = photos[number].places(depths[number])
+    count, doubtful = torch.zeros(len(places), dtype=torch.int32), torch.arange(len(places))
+    for other in (*first, *(each for each in range(len(photos)) if each not in (number, *first))):
+        found = _found(photos[other], depths[other], places[doubtful])
+        count[doubtful] += found
+        doubtful = doubtful[count[doubtful] < SEEN_BY]
+    return count >= SEEN_BY
 
 
-def _spread(images: Float[Tensor, "D 1 h w"]) -> tuple[Float[Tensor, "D 1 h w"], Float[Tensor, "D 1 h w"]]:
-    """Mean and variance in the window around each pixel."""
-    mean = _windows(images)
-    return mean, (_windows(images.square()) - mean.square()).clamp_min(1e-6)
-
-
-def _windows(images: Float[Tensor, "D 1 h w"]) -> Float[Tensor, "D 1 h w"]:
-    """Means of the windows around each pixel, of what of them is in the image."""
-    half = WINDOW // 2  # sums of shifted images take a seventh of the time of torch's pooling
-    for axis in (-1, -2):
-        size, sums = images.shape[axis], images.clone()
-        for step in range(1, min(half, size - 1) + 1):
-            left, right = (0, size - step), (step, size - step)
-            sums.narrow(axis, *left).add_(images.narrow(axis, *right))
-            sums.narrow(axis, *right).add_(images.narrow(axis, *left))
-        place = torch.arange(size, device=images.device)
-        counts = 1 + place.clamp_max(half) + (size - 1 - place).clamp_max(half)
-        images = sums / counts.view(-1, *[1] * (-1 - axis))
-    return images
-
-
-def _found_by(
-    places: Float[Tensor, "P 3"], others: Sequence[tuple[_Photo, Float[Tensor, "h w"]]]
-) -> Float[Tensor, " P"]:
-    """In how many other photos each place was found."""
-    count = torch.zeros(len(places))
-    for photo, depths in others:
-        expected, column, row = located = photo.located(places)
-        inside = photo.frames(located)
-        column, row = (torch.where(inside, each, 0.0).long() for each in (column, row))
-        there = depths[row, column]
-        count += inside & (there > 0) & ((there - expected).abs() < SAME * expected)
-    return count
+def _found(photo: _Photo, depths: Float[Tensor, "h w"], places: Float[Tensor, "P 3"]) -> Bool[Tensor, " P"]:
+    """Whether a photo found the same places."""
+    expected, column, row = located = photo.located(places)
+    inside = photo.frames(located)
+    column, row = (torch.where(inside, each, 0.0).long() for each in (column, row))
+    there = depths[row, column]
+    return inside & (there > 0) & ((there - expected).abs() < SAME * expected)
