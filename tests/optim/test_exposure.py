@@ -284,6 +284,40 @@ def test_photos_are_measured_when_each_was_seen(iterations: int, epoch: float, a
     assert Exposure.of("auto", 40, 32).next_measurement(1) > 40
 
 
+@pytest.mark.parametrize(
+    ("explained", "learned"),
+    [([0.3], True), ([0.05], False), ([0.15, 0.12], True), ([0.15, 0.3], True), ([0.15, 0.08], False)],
+)
+def test_what_is_in_doubt_is_measured_again(
+    monkeypatch: pytest.MonkeyPatch, views: Dataset, explained: list[float], learned: bool
+) -> None:
+    """After as many steps more; a checkpoint between the two forgets nothing."""
+    trainer = true_shape(views, exposure := Exposure.of("auto", 100, 1))
+    answers = iter(explained)
+    monkeypatch.setattr(
+        "etsplat.optim.exposure.explained_error", lambda *_: (next(answers), torch.zeros(len(views.train), 3))
+    )
+    measured = list[int]()
+    for iteration in range(1, 31):
+        if exposure.next_measurement(iteration) == iteration:
+            measured.append(iteration)
+        trainer.refine(iteration)
+        if iteration == 15:
+            exposure.load_state(exposure.state())
+    assert measured == [10, 20][: len(explained)]
+    assert exposure.learned is learned
+    assert exposure.explained == explained[-1]
+
+
+def test_in_a_short_run_the_first_answer_counts(monkeypatch: pytest.MonkeyPatch, views: Dataset) -> None:
+    """Where there is no time for another."""
+    trainer = true_shape(views, exposure := Exposure.of("auto", 20, 2))
+    assert exposure.again_at <= exposure.measured_at == 10
+    monkeypatch.setattr("etsplat.optim.exposure.explained_error", lambda *_: (0.15, torch.zeros(len(views.train), 3)))
+    trainer.refine(10)
+    assert exposure.learned
+
+
 def test_a_step_that_does_not_count_changes_nothing(simt: object, scene: Dataset) -> None:
     """Neither the numbers nor their means."""
     trainer = on_engine(scene, "cuda", choice="on")

@@ -33,8 +33,9 @@ RATE, FINAL = 0.03, 0.02
 WEIGHT = 0.001
 """Of g^2 + |D|^2, mean over the photos of a step, in the objective."""
 
-NEEDED = 0.1
-"""Exposures are learned where they explain more than this part of the squared error."""
+NEEDED, SURE = 0.1, 0.2
+"""Exposures are learned where they explain more than this part of the squared error. Up to the second, of photos that
+were exposed alike, that may be what the model does not have yet, so that it is measured again after as many steps."""
 
 MEASURED_AT, EPOCHS = 0.1, 5
 """When it is measured whether photos need it, as a fraction of a run; and how often each must have been seen by then,
@@ -50,8 +51,9 @@ class Exposure:
 
     Attributes:
         measured_at: iteration after which it is measured whether photos need it.
+        again_at: iteration after which that is measured again if the answer was in doubt.
         learned: whether it is, by now.
-        explained: the part of the squared error that exposures explained when it was measured; None before.
+        explained: the part of the squared error that exposures explained when it was measured last; None before.
         adam: the optimizer of "values", (P, 10): of each photo g, then D by rows.
 
     Example:
@@ -72,23 +74,34 @@ class Exposure:
             epoch: how many iterations show every photo once.
         """
         early = max(1, round(MEASURED_AT * iterations), round(EPOCHS * epoch))
-        measured = {"auto": early, "on": min(early, max(1, iterations // 2)), "off": NEVER}
+        half = max(1, iterations // 2)
+        measured = {"auto": early, "on": min(early, half), "off": NEVER}[choice]
+        again = min(2 * early, half) if choice == "auto" else 0
         needed = -math.inf if choice == "on" else NEEDED
-        return Exposure(measured[choice], needed=needed, rate=partial(_falling, iterations=iterations))
+        rate = partial(_falling, iterations=iterations)
+        return Exposure(measured, again_at=again, needed=needed, rate=rate)
 
     def __init__(
-        self, measured_at: int, *, needed: float = NEEDED, rate: Scheduled = RATE, weight: float = WEIGHT
+        self,
+        measured_at: int,
+        *,
+        again_at: int = 0,
+        needed: float = NEEDED,
+        rate: Scheduled = RATE,
+        weight: float = WEIGHT,
     ) -> None:
         """Takes when and how fast it is learned.
 
         Args:
             measured_at: iteration after which photos are measured; `NEVER` for photos that are taken as they are.
+            again_at: iteration after which they are measured again where exposures explain no more than `SURE`; none
+                that is later than the first for an answer at once.
             needed: learned from then on if it explains more than this part of the squared error. It starts from what
                 was measured.
             rate: how far a number of a photo moves each time that the photo is seen.
             weight: of what holds the numbers near zero.
         """
-        self.measured_at, self.learned = measured_at, False
+        self.measured_at, self.again_at, self.learned = measured_at, again_at, False
         self.explained: float | None = None
         self._needed, self._rate, self._weight = needed, rate, weight
 
@@ -161,13 +174,16 @@ class Exposure:
     def measure(self, model: Model, views: Sequence[View], background: Float[Tensor, "1 3"]) -> None:
         """Measures whether photos need it, and learns from now on if they do. Changes nothing else.
 
+        Where exposures explain hardly more than is needed, that is said by the next measurement.
+
         Args:
             model: as it is now.
             views: of all photos, in their order.
             background: behind photos without transparency.
         """
+        first = self.explained is None and self.again_at > self.measured_at
         self.explained, gains = explained_error(model, views, background)
-        self.learned = self.explained > self._needed
+        self.learned = self.explained > (max(SURE, self._needed) if first else self._needed)
         if self.learned:
             overall = gains.mean(dim=1)
             offsets = torch.diag_embed((gains - overall[:, None]).exp() - 1)
@@ -177,7 +193,9 @@ class Exposure:
 
     def next_measurement(self, iteration: int) -> int:
         """The iteration, this one or later, after whose step photos are measured."""
-        return NEVER if self.measured_at < iteration else self.measured_at
+        doubtful = self.explained is not None and self._needed < self.explained <= SURE and not self.learned
+        times = (self.measured_at, self.again_at) if doubtful else (self.measured_at,)
+        return min((time for time in times if time >= iteration), default=NEVER)
 
     def state(self) -> dict[str, Tensor]:
         """Everything that the rest of the run depends on, by name, for a checkpoint."""

@@ -225,7 +225,7 @@ class Trainer(Generic[M]):
 
     def refine(self, iteration: int) -> int:
         """Edits if it is time to; returns by how many triangles the model grew."""
-        if iteration == self.exposure.measured_at:
+        if iteration == self.exposure.next_measurement(iteration):
             self._stepper.measure_exposure()
             self._known_loss = None
         if iteration == self.depths.measured_at:

@@ -131,7 +131,7 @@ def mesh_steps(config: TrainConfig) -> int:
 
 def _take_over(exposure: Exposure, known: Exposure) -> None:
     """Begins with what is known of the photos, and does not measure them again."""
-    exposure.measured_at = NEVER
+    exposure.measured_at = exposure.again_at = NEVER
     exposure.load_state(known.state())
 
 
