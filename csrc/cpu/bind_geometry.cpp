@@ -85,12 +85,12 @@ void bind_geometry(nb::module_& m) {
     // points (P, 3), own (P, K), corners (F, 9) with F > 0; counts (P,).
     def_function(
         m, "count_crossings",
-        [](Array<const double, 2> points, Array<const int64_t, 2> own, Array<const double, 2> corners,
-           Array<int64_t, 1> counts) {
-            count_crossings(points.data(), own.data(), points.size(0), own.size(1), corners.data(), corners.size(0),
-                            counts.data());
+        [](Array<const double, 2> points, Array<const int64_t, 2> own, Array<const double, 2> vertices,
+           Array<const int64_t, 2> faces, Array<int64_t, 1> counts) {
+            count_crossings(points.data(), own.data(), points.size(0), own.size(1), vertices.data(), faces.data(),
+                            faces.size(0), counts.data());
         },
-        "points", "own", "corners", "counts");
+        "points", "own", "vertices", "faces", "counts");
 }
 
 }  // namespace etsplat

@@ -3,6 +3,8 @@
 #include <limits>
 #include <utility>
 
+#include "parallel.h"
+
 namespace etsplat {
 namespace {
 
@@ -92,10 +94,12 @@ int32_t Bvh::build(int64_t begin, int64_t end, std::vector<Centered>& order, con
 }
 
 void Bvh::move(const double* vertices, const int64_t* faces) {
-    for (size_t slot = 0; slot < faces_.size(); ++slot) {
-        triangles_[slot] = triangle(vertices, faces + 3 * faces_[slot]);
-        boxes_[slot] = bounds(triangles_[slot]);
-    }
+    parallel_for(static_cast<int64_t>(faces_.size()), 4096, [&](int64_t begin, int64_t end) {
+        for (int64_t slot = begin; slot < end; ++slot) {
+            triangles_[slot] = triangle(vertices, faces + 3 * faces_[slot]);
+            boxes_[slot] = bounds(triangles_[slot]);
+        }
+    });
     for (int64_t index = static_cast<int64_t>(nodes_.size()) - 1; index >= 0; --index) {  // children lie behind parents
         Node& node = nodes_[index];
         node.box = node.right ? join(nodes_[index + 1].box, nodes_[node.right].box) : nothing;

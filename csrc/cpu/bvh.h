@@ -67,10 +67,6 @@ public:
     template <class Visit>
     void meeting(int64_t leaf, const Chosen& chosen, Visit&& visit) const;
 
-    // Calls visit(slot) for every slot whose box meets that one.
-    template <class Visit>
-    void touching(const Box& box, Visit&& visit) const;
-
 private:
     struct Centered {
         Vec3 twice_center;  // of a face's box
@@ -131,15 +127,6 @@ void Bvh::meeting(int64_t leaf, const Chosen& chosen, Visit&& visit) const {
                 if (other == slot || (other < slot && chosen.chosen[other])) continue;
                 if (box.overlaps(boxes_[other])) visit(slot, other);
             }
-        }
-    });
-}
-
-template <class Visit>
-void Bvh::touching(const Box& box, Visit&& visit) const {
-    descend([&](const Node& node) { return node.box.overlaps(box); }, [&](const Node& leaf) {
-        for (int32_t slot = leaf.begin; slot < leaf.end; ++slot) {
-            if (boxes_[slot].overlaps(box)) visit(slot);
         }
     });
 }

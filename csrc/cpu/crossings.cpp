@@ -1,12 +1,14 @@
+// Faces are gone through once, with the points in order of y: those beside a face are one run of them. There are mostly few
+// points, so that a hierarchy of the faces would take longer to build.
 #include "crossings.h"
 
 #include <algorithm>
-#include <limits>
+#include <atomic>
 #include <numeric>
 #include <vector>
 
-#include "bvh.h"
 #include "parallel.h"
+#include "vec3.h"
 
 namespace etsplat {
 namespace {
@@ -29,22 +31,30 @@ int crossing(const Triangle& t, Vec3 p) {
 }  // namespace
 
 void count_crossings(const double* points, const int64_t* own, int64_t num_points, int64_t num_own,
-                     const double* corners, int64_t num_faces, int64_t* counts) {
-    std::vector<int64_t> faces(3 * num_faces);
-    std::iota(faces.begin(), faces.end(), 0);
-    const Bvh bvh(corners, faces.data(), num_faces);
-    parallel_for(num_points, 64, [&](int64_t begin, int64_t end) {
-        for (int64_t i = begin; i < end; ++i) {
-            const Vec3 p = vertex(points, i);
-            const int64_t* mine = own + num_own * i;
-            int64_t count = 0;
-            bvh.touching({p, {std::numeric_limits<double>::infinity(), p.y, p.z}}, [&](int32_t slot) {
-                if (std::find(mine, mine + num_own, bvh.faces()[slot]) != mine + num_own) return;
-                count += crossing(bvh.triangles()[slot], p);
-            });
-            counts[i] = count;
+                     const double* vertices, const int64_t* faces, int64_t num_faces, int64_t* counts) {
+    std::vector<int64_t> order(num_points);
+    std::iota(order.begin(), order.end(), 0);
+    std::sort(order.begin(), order.end(), [points](int64_t a, int64_t b) { return points[3 * a + 1] < points[3 * b + 1]; });
+    std::vector<double> down(num_points);
+    for (int64_t i = 0; i < num_points; ++i) down[i] = points[3 * order[i] + 1];
+    std::vector<std::atomic<int64_t>> sums(num_points);
+    parallel_for(num_faces, 4096, [&](int64_t begin, int64_t end) {
+        for (int64_t face = begin; face < end; ++face) {
+            const Triangle t = triangle(vertices, faces + 3 * face);
+            const Vec3 low = min(min(t.corner[0], t.corner[1]), t.corner[2]);
+            const Vec3 high = max(max(t.corner[0], t.corner[1]), t.corner[2]);
+            auto at = std::lower_bound(down.begin(), down.end(), low.y);
+            for (; at != down.end() && *at <= high.y; ++at) {
+                const int64_t i = order[at - down.begin()];
+                const Vec3 p = vertex(points, i);
+                if (p.x > high.x || p.z < low.z || p.z > high.z) continue;
+                const int64_t* mine = own + num_own * i;
+                if (std::find(mine, mine + num_own, face) != mine + num_own) continue;
+                if (const int passed = crossing(t, p)) sums[i].fetch_add(passed, std::memory_order_relaxed);
+            }
         }
     });
+    for (int64_t i = 0; i < num_points; ++i) counts[i] = sums[i].load(std::memory_order_relaxed);
 }
 
 }  // namespace etsplat

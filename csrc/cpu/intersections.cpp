@@ -84,16 +84,12 @@ void mark_intersecting_faces(const Bvh& bvh, const uint8_t* again, uint8_t* inte
     const auto& triangles = bvh.triangles();
     const auto num_faces = static_cast<int64_t>(triangles.size());
     const auto marks = std::make_unique<std::atomic<bool>[]>(num_faces);
-    const auto no_interior = std::make_unique<bool[]>(num_faces);
-    parallel_for(num_faces, 1024, [&](int64_t begin, int64_t end) {
-        for (int64_t slot = begin; slot < end; ++slot) no_interior[slot] = collinear(triangles[slot]);
-    });
     parallel_for(bvh.leaves(), 32, [&](int64_t begin, int64_t end) {
         for (int64_t leaf = begin; leaf < end; ++leaf) {
             bvh.meeting(leaf, chosen, [&](int32_t slot, int32_t other) {
                 const bool known = marks[slot].load(std::memory_order_relaxed) &&
                                    marks[other].load(std::memory_order_relaxed);
-                if (known || no_interior[slot] || no_interior[other]) return;
+                if (known || collinear(triangles[slot]) || collinear(triangles[other])) return;
                 if (interiors_meet(triangles[slot], triangles[other])) {
                     marks[slot].store(true, std::memory_order_relaxed);
                     marks[other].store(true, std::memory_order_relaxed);

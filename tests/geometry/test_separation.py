@@ -14,9 +14,7 @@ from etsplat.geometry.untangle import untangle
 def crossing(vertices: torch.Tensor, topology: MeshTopology) -> tuple[Piercings, list[int]]:
     """What pierces what, and the winding numbers outside of both sheets."""
     found = find_piercings(vertices, topology, intersecting_faces(vertices, topology.faces))
-    a, b, c = vertices[topology.faces].unbind(1)
-    normals = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=1)
-    return found, sorted(set(outer_windings(vertices, topology, normals, found).tolist()))
+    return found, sorted(set(outer_windings(vertices, topology, found).tolist()))
 
 
 def spheres(*placed: tuple[float, tuple[float, float, float]]) -> tuple[torch.Tensor, MeshTopology]:

@@ -93,7 +93,7 @@ def _way_through(
     """From each vertex along its direction to the nearest face that looks against it; infinite where none is near."""
     starts, count = vertices[moving], len(moving)
     lines = torch.stack([starts, starts + thick * directions, starts], dim=1)
-    first, second = overlapping_boxes(torch.cat([lines, vertices[faces]]), torch.arange(count + len(faces)))
+    first, second = overlapping_boxes(torch.cat([lines, vertices[faces]]))
     line, face = torch.minimum(first, second), torch.maximum(first, second) - count
     of_both = (line < count) & (face >= 0)
     line, face = line[of_both], face[of_both]

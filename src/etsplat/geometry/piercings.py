@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from etsplat import _native
 from etsplat.geometry.topology import MeshTopology, connected
@@ -36,10 +37,11 @@ def find_piercings(vertices: Float[Tensor, "V 3"], topology: MeshTopology, marke
         topology: of the mesh, on the CPU.
         marked: (F,) faces that intersect others, as of `intersecting_faces`.
     """
-    first, second = overlapping_boxes(vertices[topology.faces], marked.nonzero()[:, 0])
+    chosen = marked.nonzero()[:, 0]
+    first, second = (chosen[each] for each in overlapping_boxes(vertices[topology.faces[chosen]]))
     edges = torch.cat([topology.face_edges[first], topology.face_edges[second]]).reshape(-1)
     faces = torch.cat([second, first]).repeat_interleave(3)
-    near = _near(vertices[topology.edges], vertices[topology.faces], edges, faces)
+    near = _boxes_meet(vertices[topology.edges[edges]], vertices[topology.faces[faces]])
     edges, faces = edges[near], faces[near]
     both = torch.unique(edges * topology.num_faces + faces)
     edges, faces = both // max(topology.num_faces, 1), both % max(topology.num_faces, 1)
@@ -53,9 +55,7 @@ def find_piercings(vertices: Float[Tensor, "V 3"], topology: MeshTopology, marke
     return Piercings(edges[through], faces[through], weights / weights.sum(dim=1, keepdim=True))
 
 
-def outer_windings(
-    vertices: Float[Tensor, "V 3"], topology: MeshTopology, normals: Float[Tensor, "F 3"], found: Piercings
-) -> Int[Tensor, " P"]:
+def outer_windings(vertices: Float[Tensor, "V 3"], topology: MeshTopology, found: Piercings) -> Int[Tensor, " P"]:
     """How often the mesh winds around what lies outside both sheets that cross, just beside each piercing.
 
     Two oriented sheets that cross part space into four: outside of both, with winding number k, inside of one, with
@@ -67,7 +67,6 @@ def outer_windings(
     Args:
         vertices: (V, 3) float64 on the CPU.
         topology: of the mesh, on the CPU.
-        normals: (F, 3) unit normals of its faces.
         found: from `find_piercings`.
     """
     offsets = topology.edge_face_offsets
@@ -75,11 +74,18 @@ def outer_windings(
     last = topology.edge_faces[offsets[found.edges + 1] - 1]
     points = (vertices[topology.faces[found.faces]] * found.weights[:, :, None]).sum(dim=1) @ _TURN
     beside = vertices[topology.faces[last]].mean(dim=1) - vertices[topology.edges[found.edges, 0]]
-    convex = (beside * normals[first]).sum(dim=1) < 0
-    inward = normals @ _TURN[:, 0] < 0
-    in_edge = torch.where(convex, inward[first] & inward[last], inward[first] | inward[last])
     own = torch.stack([found.faces, first, last], dim=1)
-    return _crossings(points, _closed(vertices @ _TURN, topology), own) - inward[found.faces].long() - in_edge.long()
+    normals = unit_normals(vertices, topology.faces[own])
+    convex = (beside * normals[:, 1]).sum(dim=1) < 0
+    in_face, in_first, in_last = (normals @ _TURN[:, 0] < 0).unbind(dim=1)
+    in_edge = torch.where(convex, in_first & in_last, in_first | in_last)
+    return _crossings(points, _closed(vertices @ _TURN, topology), own) - in_face.long() - in_edge.long()
+
+
+def unit_normals(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "*F 3"]) -> Float[Tensor, "*F 3"]:
+    """Of length 1, or 0 where a face has no area."""
+    a, b, c = vertices[faces].unbind(-2)
+    return normalize(torch.linalg.cross(b - a, c - a), dim=-1, eps=1e-30)
 
 
 def winding_numbers(
@@ -96,44 +102,41 @@ def winding_numbers(
     return _crossings(points @ _TURN, _closed(vertices @ _TURN, topology), none)
 
 
-def overlapping_boxes(
-    corners: Float[Tensor, "F 3 3"], chosen: Int[Tensor, " K"]
-) -> tuple[Int[Tensor, " N"], Int[Tensor, " N"]]:
-    """Pairs of the chosen faces whose boxes overlap, each once, in an order that depends on these faces alone.
+def overlapping_boxes(corners: Float[Tensor, "F 3 3"]) -> tuple[Int[Tensor, " N"], Int[Tensor, " N"]]:
+    """Pairs of faces whose boxes overlap, each once, in an order that depends on these faces alone.
 
     Args:
         corners: float64 on the CPU, finite.
-        chosen: rows of them.
     """
-    if len(chosen) == 0:
-        return chosen, chosen
-    faces = torch.arange(3 * len(chosen)).reshape(-1, 3)
-    tree = _native.face_tree(vertices=corners[chosen].reshape(-1, 3), faces=faces)
+    count = len(corners)
+    if count == 0:
+        return torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.int64)
+    tree = _native.face_tree(vertices=corners.reshape(-1, 3), faces=torch.arange(3 * count).reshape(-1, 3))
     first, second = torch.from_numpy(_native.overlapping_boxes(tree=tree)).unbind(1)
-    return chosen[first], chosen[second]
+    return first, second
 
 
-def _closed(vertices: Float[Tensor, "V 3"], topology: MeshTopology) -> Float[Tensor, "G 3 3"]:
-    """The corners of all faces, and behind them those of a cone over each border, with its tip in the middle of it."""
-    corners = vertices[topology.faces]
+def _closed(
+    vertices: Float[Tensor, "V 3"], topology: MeshTopology
+) -> tuple[Float[Tensor, "W 3"], Int[Tensor, "G 3"]]:
+    """The mesh, and behind its faces those of a cone over each border, with its tip in the middle of it."""
     alone = topology.edge_face_counts == 1
     if not bool(alone.any()):
-        return corners
+        return vertices, topology.faces
     at_border = alone[topology.face_edges]
     tail, head = topology.faces[at_border].long(), topology.faces.roll(-1, dims=1)[at_border].long()
     _, loop = connected(torch.stack([tail, head], dim=1), len(vertices))
     ends, own = torch.cat([tail, head]), torch.cat([loop[tail], loop[head]])
     sums = torch.zeros_like(vertices).index_add_(0, own, vertices[ends])
-    tips = (sums / own.bincount(minlength=len(vertices)).clamp(min=1)[:, None])[loop[tail]]
-    return torch.cat([corners, torch.stack([vertices[head], vertices[tail], tips], dim=1)])
+    tips = sums / own.bincount(minlength=len(vertices)).clamp(min=1)[:, None]
+    cones = torch.stack([head, tail, len(vertices) + loop[tail]], dim=1)
+    return torch.cat([vertices, tips]), torch.cat([topology.faces, cones])
 
 
-def _near(
-    ends: Float[Tensor, "E 2 3"], corners: Float[Tensor, "F 3 3"], edges: Int[Tensor, " N"], faces: Int[Tensor, " N"]
-) -> Bool[Tensor, " N"]:
-    """Whether the boxes of edges and of faces overlap."""
-    low = ends.amin(dim=1)[edges] <= corners.amax(dim=1)[faces]
-    high = ends.amax(dim=1)[edges] >= corners.amin(dim=1)[faces]
+def _boxes_meet(first: Float[Tensor, "N K 3"], second: Float[Tensor, "N L 3"]) -> Bool[Tensor, " N"]:
+    """Whether the boxes of each two sets of points overlap."""
+    low = first.amin(dim=1) <= second.amax(dim=1)
+    high = first.amax(dim=1) >= second.amin(dim=1)
     return (low & high).all(dim=1)
 
 
@@ -143,12 +146,12 @@ def _volume(a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> Float[Tensor, " P"]:
 
 
 def _crossings(
-    points: Float[Tensor, "P 3"], corners: Float[Tensor, "F 3 3"], own: Int[Tensor, "P K"]
+    points: Float[Tensor, "P 3"], mesh: tuple[Float[Tensor, "V 3"], Int[Tensor, "F 3"]], own: Int[Tensor, "P K"]
 ) -> Int[Tensor, " P"]:
     """How many faces a ray along +x leaves through less those it enters through, but for each point's own faces."""
+    vertices, faces = mesh
     counts = torch.zeros(len(points), dtype=torch.int64)
-    if len(points) and len(corners):
-        _native.count_crossings(
-            points=points.contiguous(), own=own.contiguous(), corners=corners.reshape(-1, 9), counts=counts
-        )
+    _native.count_crossings(
+        points=points.contiguous(), own=own.contiguous(), vertices=vertices, faces=faces.contiguous(), counts=counts
+    )
     return counts

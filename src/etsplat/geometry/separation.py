@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from etsplat.geometry.piercings import Piercings, find_piercings, outer_windings
+from etsplat.geometry.piercings import Piercings, find_piercings, outer_windings, unit_normals
 from etsplat.geometry.topology import MeshTopology
 
 GAP = 0.03
@@ -30,11 +30,11 @@ def separated(
         marked: (F,) faces that intersect others.
     """
     found = find_piercings(vertices, topology, marked)
-    a, b, c = vertices[topology.faces].unbind(1)
-    normals = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=1, eps=1e-30)
+    if len(found.edges) == 0:
+        return vertices
     ends = vertices[topology.edges]
     gap = GAP * float((ends[:, 0] - ends[:, 1]).norm(dim=1).median())
-    moves = _least_moves(vertices, topology, normals, found, gap)
+    moves = _least_moves(vertices, topology, found, gap)
     asked = torch.cat([topology.edges[found.edges], topology.faces[found.faces]], dim=1).reshape(-1)
     moves = moves.reshape(-1, 3)
     sums = torch.zeros_like(vertices).index_add_(0, asked, moves)
@@ -46,14 +46,15 @@ def separated(
 def _least_moves(
     vertices: Float[Tensor, "V 3"],
     topology: MeshTopology,
-    normals: Float[Tensor, "F 3"],
     found: Piercings,
     gap: float,
 ) -> Float[Tensor, "P 5 3"]:
     """How the two ends of each edge and the three corners of each face are to move."""
-    out = torch.where(outer_windings(vertices, topology, normals, found) >= 0, 1.0, -1.0).to(vertices)
+    out = torch.where(outer_windings(vertices, topology, found) >= 0, 1.0, -1.0).to(vertices)
     (p, q), corners = vertices[topology.edges[found.edges]].unbind(1), vertices[topology.faces[found.faces]]
-    normal, of_edges = normals[found.faces], _edge_normals(topology, normals)
+    normal = unit_normals(vertices, topology.faces[found.faces])
+    of_edge = _edge_normals(vertices, topology, found.edges)
+    of_sides = _edge_normals(vertices, topology, topology.face_edges[found.faces].reshape(-1)).view(-1, 3, 3)
     choice = _Least(len(p), vertices, gap)
     for end, x in enumerate((p, q)):
         distance = ((x - corners[:, 0]) * normal).sum(dim=1)
@@ -70,7 +71,7 @@ def _least_moves(
         t = (torch.linalg.cross(between, other) * across).sum(dim=1) / length
         s = (torch.linalg.cross(between, along) * across).sum(dim=1) / length
         direction = distance.sign()[:, None] * across
-        outwards = of_edges[topology.face_edges[found.faces, k]] - of_edges[found.edges]
+        outwards = of_sides[:, k] - of_edge
         right = out * (direction * outwards).sum(dim=1) > 0
         weights = torch.zeros(len(p), 5).to(vertices)
         weights[:, 0], weights[:, 1] = 1 - t, t
@@ -102,7 +103,12 @@ class _Least:
         self._cost = torch.where(taken, cost, self._cost)
 
 
-def _edge_normals(topology: MeshTopology, normals: Float[Tensor, "F 3"]) -> Float[Tensor, "E 3"]:
-    """The sum of the normals of the faces around each edge."""
-    owner: Int[Tensor, " 3F"] = torch.repeat_interleave(torch.arange(len(topology.edges)), topology.edge_face_counts)
-    return torch.zeros(len(topology.edges), 3).to(normals).index_add_(0, owner, normals[topology.edge_faces])
+def _edge_normals(
+    vertices: Float[Tensor, "V 3"], topology: MeshTopology, edges: Int[Tensor, " N"]
+) -> Float[Tensor, "N 3"]:
+    """The sum of the normals of the faces around each of some edges."""
+    begin, counts = topology.edge_face_offsets[edges], topology.edge_face_counts[edges]
+    owner = torch.repeat_interleave(torch.arange(len(edges)), counts)
+    number = torch.arange(len(owner)) - (counts.cumsum(0) - counts)[owner]
+    normals = unit_normals(vertices, topology.faces[topology.edge_faces[begin[owner] + number]])
+    return torch.zeros(len(edges), 3).to(vertices).index_add_(0, owner, normals)
