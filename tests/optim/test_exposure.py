@@ -291,8 +291,8 @@ def test_photos_are_measured_when_each_was_seen(iterations: int, epoch: float, a
 def test_what_is_in_doubt_is_measured_again(
     monkeypatch: pytest.MonkeyPatch, views: Dataset, explained: list[float], learned: bool
 ) -> None:
-    """After as many steps more; a checkpoint between the two forgets nothing."""
-    trainer = true_shape(views, exposure := Exposure.of("auto", 100, 1))
+    """When photos have been seen ten times, not five; a checkpoint between the two forgets nothing."""
+    trainer = true_shape(views, exposure := Exposure.of("auto", 100, 2))
     answers = iter(explained)
     monkeypatch.setattr(
         "etsplat.optim.exposure.explained_error", lambda *_: (next(answers), torch.zeros(len(views.train), 3))
@@ -309,9 +309,12 @@ def test_what_is_in_doubt_is_measured_again(
     assert exposure.explained == explained[-1]
 
 
-def test_in_a_short_run_the_first_answer_counts(monkeypatch: pytest.MonkeyPatch, views: Dataset) -> None:
-    """Where there is no time for another."""
-    trainer = true_shape(views, exposure := Exposure.of("auto", 20, 2))
+@pytest.mark.parametrize(("iterations", "epoch"), [(20, 2), (100, 1)])
+def test_the_first_answer_counts(
+    monkeypatch: pytest.MonkeyPatch, views: Dataset, iterations: int, epoch: float
+) -> None:
+    """Where there is no time for another, and where photos have been seen ten times by then."""
+    trainer = true_shape(views, exposure := Exposure.of("auto", iterations, epoch))
     assert exposure.again_at <= exposure.measured_at == 10
     monkeypatch.setattr("etsplat.optim.exposure.explained_error", lambda *_: (0.15, torch.zeros(len(views.train), 3)))
     trainer.refine(10)

@@ -34,12 +34,12 @@ WEIGHT = 0.001
 """Of g^2 + |D|^2, mean over the photos of a step, in the objective."""
 
 NEEDED, SURE = 0.1, 0.2
-"""Exposures are learned where they explain more than this part of the squared error. Up to the second, of photos that
-were exposed alike, that may be what the model does not have yet, so that it is measured again after as many steps."""
+"""Exposures are learned where they explain more than this part of the squared error. Early on up to the second is in
+doubt: of photos that were exposed alike that may be what the model does not have yet."""
 
-MEASURED_AT, EPOCHS = 0.1, 5
-"""When it is measured whether photos need it, as a fraction of a run; and how often each must have been seen by then,
-so that the model is not that of the last few."""
+MEASURED_AT, EPOCHS, ENOUGH = 0.1, 5, 10
+"""When it is measured whether photos need it, as a fraction of a run; how often each must have been seen by then, so
+that the model is not that of the last few; and how often, so that there is no doubt."""
 
 TILES, COVERED, FARTHEST = 8, 0.95, 0.7
 """Fields along each side of a photo, every other of which predicts the rest; how opaque pixels of objects are that
@@ -76,7 +76,7 @@ class Exposure:
         early = max(1, round(MEASURED_AT * iterations), round(EPOCHS * epoch))
         half = max(1, iterations // 2)
         measured = {"auto": early, "on": min(early, half), "off": NEVER}[choice]
-        again = min(2 * early, half) if choice == "auto" else 0
+        again = min(round(ENOUGH * epoch), half) if choice == "auto" else 0
         needed = -math.inf if choice == "on" else NEEDED
         rate = partial(_falling, iterations=iterations)
         return Exposure(measured, again_at=again, needed=needed, rate=rate)
@@ -174,7 +174,7 @@ class Exposure:
     def measure(self, model: Model, views: Sequence[View], background: Float[Tensor, "1 3"]) -> None:
         """Measures whether photos need it, and learns from now on if they do. Changes nothing else.
 
-        Where exposures explain hardly more than is needed, that is said by the next measurement.
+        Where that is in doubt the next measurement says it.
 
         Args:
             model: as it is now.
