@@ -48,6 +48,7 @@ def planes(count: int = 33) -> Float[Tensor, " D"]:
     return 1.0 + (torch.arange(count) - count // 2 - 0.25) * 0.05
 
 
+@pytest.mark.sanitize
 @pytest.mark.parametrize(("height", "width"), [(40, 53), (7, 16), (3, 8), (33, 64)])
 def test_native_code_finds_what_torch_finds(instruction_set: str, height: int, width: int) -> None:
     """For photos of any size, smaller than a window too."""

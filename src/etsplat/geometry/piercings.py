@@ -116,9 +116,7 @@ def overlapping_boxes(corners: Float[Tensor, "F 3 3"]) -> tuple[Int[Tensor, " N"
     return first, second
 
 
-def _closed(
-    vertices: Float[Tensor, "V 3"], topology: MeshTopology
-) -> tuple[Float[Tensor, "W 3"], Int[Tensor, "G 3"]]:
+def _closed(vertices: Float[Tensor, "V 3"], topology: MeshTopology) -> tuple[Float[Tensor, "W 3"], Int[Tensor, "G 3"]]:
     """The mesh, and behind its faces those of a cone over each border, with its tip in the middle of it."""
     alone = topology.edge_face_counts == 1
     if not bool(alone.any()):
