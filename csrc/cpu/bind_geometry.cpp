@@ -82,7 +82,7 @@ void bind_geometry(nb::module_& m) {
         },
         nb::kw_only(), nb::arg("tree"),
         nb::sig("def overlapping_boxes(*, tree: FaceTree) -> numpy.typing.NDArray[numpy.int64]"));
-    // points (P, 3), own (P, K), corners (F, 9) with F > 0; counts (P,).
+    // points (P, 3), own (P, K); counts (P,).
     def_function(
         m, "count_crossings",
         [](Array<const double, 2> points, Array<const int64_t, 2> own, Array<const double, 2> vertices,

@@ -1,6 +1,7 @@
 // Planes run in parallel, then rows: each has its own place in memory, so bits do not depend on the threads.
 #include <algorithm>
 #include <stdexcept>
+#include <utility>
 #include <vector>
 
 #include "bindings.h"
@@ -37,8 +38,8 @@ Scratch<float> padded(const float* rows, int64_t height, int64_t width, int64_t 
 }
 
 // 1 over how many places of a window are within a size, and 0 beyond it.
-std::vector<float> shares(int64_t size, int64_t reach, int64_t padded) {
-    std::vector<float> found(static_cast<size_t>(padded), 0.0f);
+std::vector<float> shares(int64_t size, int64_t reach, int64_t stride) {
+    std::vector<float> found(static_cast<size_t>(stride), 0.0f);
     for (int64_t i = 0; i < size; ++i) {
         const int64_t count = 1 + std::min(i, reach) + std::min(size - 1 - i, reach);
         found[static_cast<size_t>(i)] = 1.0f / static_cast<float>(count);
@@ -68,7 +69,7 @@ void bind_plane_sweep(nb::module_& m) {
         [](Array<const float, 2> grey, Array<const float, 2> mean, Array<const float, 2> variance,
            const std::vector<Array<const float, 2>>& neighbours, Array<const float, 3> rays,
            Array<const float, 2> starts, Array<const float, 1> inverse, int64_t window, int64_t agreeing,
-           int64_t beside, Array<float, 2> place, Array<float, 2> best, Array<float, 2> elsewhere) {
+           int64_t beside, float least_variance, float least_depth, Array<float, 2> place, Array<float, 2> best, Array<float, 2> elsewhere) {
             const auto count = static_cast<int64_t>(neighbours.size());
             if (count < agreeing || count > kMostSwept || window > 2 * kSweepLanes) {
                 throw std::invalid_argument("plane_sweep: too few or too many neighbours, or too wide a window");
@@ -88,11 +89,12 @@ void bind_plane_sweep(nb::module_& m) {
             }
             Scratch<float> judged(height * inverse.size(0) * stride);
             run({shown.begin(), means.begin(), variances.begin(), across.data(), down.data(), width, height, stride,
-                 std::move(others), reach, agreeing, beside, inverse.data(), inverse.size(0), judged.data()},
+                 std::move(others), reach, agreeing, beside, least_variance, least_depth,
+                 inverse.data(), inverse.size(0), judged.data()},
                 {place.data(), best.data(), elsewhere.data()});
         },
-        "grey", "mean", "variance", "neighbours", "rays", "starts", "inverse", "window", "agreeing", "beside", "place",
-        "best", "elsewhere");
+        "grey", "mean", "variance", "neighbours", "rays", "starts", "inverse", "window", "agreeing", "beside",
+        "least_variance", "least_depth", "place", "best", "elsewhere");
 }
 
 }  // namespace etsplat

@@ -56,9 +56,10 @@ Sides sides_of(const Triangle& t, const Triangle& plane) {
     return {!above && !below, above && below, alone};
 }
 
+// A collinear triangle spans no plane: all others are coplanar with it, and it meets none.
 bool interiors_meet(const Triangle& s, const Triangle& t) {
     const Sides s_sides = sides_of(s, t);
-    if (s_sides.coplanar) return coplanar_interiors_meet(s, t);
+    if (s_sides.coplanar) return !collinear(s) && !collinear(t) && coplanar_interiors_meet(s, t);
     if (!s_sides.crosses) return false;
     const Sides t_sides = sides_of(t, s);
     if (!t_sides.crosses) return false;
@@ -89,7 +90,7 @@ void mark_intersecting_faces(const Bvh& bvh, const uint8_t* again, uint8_t* inte
             bvh.meeting(leaf, chosen, [&](int32_t slot, int32_t other) {
                 const bool known = marks[slot].load(std::memory_order_relaxed) &&
                                    marks[other].load(std::memory_order_relaxed);
-                if (known || collinear(triangles[slot]) || collinear(triangles[other])) return;
+                if (known) return;
                 if (interiors_meet(triangles[slot], triangles[other])) {
                     marks[slot].store(true, std::memory_order_relaxed);
                     marks[other].store(true, std::memory_order_relaxed);

@@ -29,6 +29,7 @@ struct PlaneSweep {
     int64_t reach;     // pixels on each side of a window's middle
     int64_t agreeing;  // the mean of so many correlations, the best ones, counts
     int64_t beside;    // planes up to so far from the best one are beside it
+    float least_variance, least_depth;  // what is divided by is no less
     const float* inverse;  // (planes,) 1 over their depths
     int64_t planes;
     float* judged;  // (height, planes, stride) mean correlations

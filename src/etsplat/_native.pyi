@@ -243,6 +243,8 @@ def plane_sweep(
     window: int,
     agreeing: int,
     beside: int,
+    least_variance: float,
+    least_depth: float,
     place: torch.Tensor,
     best: torch.Tensor,
     elsewhere: torch.Tensor,

@@ -28,7 +28,7 @@ def painted(x: Float[Tensor, "h w"], y: Float[Tensor, "h w"]) -> Float[Tensor, "
 
 
 def pair(height: int, width: int, shift: float = 8.0) -> tuple[Float[Tensor, "h w"], list[Neighbour]]:
-    """A photo of a plane at depth 1, and neighbours that see it moved by up to `shift` pixels over the inverse depth.
+    """A photo of a plane at depth 1, and neighbours that see it moved by up to `shift` pixels times the inverse depth.
 
     Of other sizes than the photo; the last of them looks away.
     """
@@ -55,6 +55,7 @@ def test_native_code_finds_what_torch_finds(instruction_set: str, height: int, w
     grey, neighbours = pair(height, width)
     here, there = best_matches(grey, neighbours, planes()), matches_in_torch(grey, neighbours, planes())
     torch.testing.assert_close(here.best, there.best, rtol=0, atol=1e-4)
+    assert torch.equal(here.contrast, there.contrast)
     same = (here.place - there.place).abs() < 0.01
     assert float(same.float().mean()) > 0.99  # two planes may be as good, but for rounding
     torch.testing.assert_close(here.elsewhere[same], there.elsewhere[same], rtol=0, atol=1e-4)

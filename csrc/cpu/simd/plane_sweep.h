@@ -15,8 +15,6 @@ namespace {
 
 static_assert(kSweepLanes == kLanes);
 
-constexpr float kLeastVariance = 1e-6f, kLeastDepth = 1e-6f;
-
 ETSPLAT_FN Vec lanes_from(int64_t first) {
     float lanes[kLanes];
     for (int i = 0; i < kLanes; ++i) lanes[i] = static_cast<float>(first + i);
@@ -33,11 +31,11 @@ void show_row(const PlaneSweep& sweep, const SweptNeighbour& there, float invers
     const Vec zero(0.0f), half(0.5f), one(1.0f), wide(width), high(height), end(static_cast<float>(sweep.width));
     for (int64_t x = 0; x < sweep.stride; x += kLanes) {
         const Vec number = lanes_from(x), column = number + half;
-        const Vec depth = vfma(Vec(m[6]), column, Vec(at[2])), over = one / vmax(depth, Vec(kLeastDepth));
+        const Vec depth = vfma(Vec(m[6]), column, Vec(at[2])), over = one / vmax(depth, Vec(sweep.least_depth));
         const Vec right = vfma(Vec(m[0]), column, Vec(at[0])) * over, below = vfma(Vec(m[3]), column, Vec(at[1])) * over;
         const VecMask inside = (right > zero) & (right < wide) & (below > zero) & (below < high) & (depth > zero);
         const Vec u = vmin(vmax(right + half, zero), wide + one), v = vmin(vmax(below + half, zero), high + one);
-        const Vec left = vmin(vfloor(u), wide + one), top = vmin(vfloor(v), high + one);
+        const Vec left = vfloor(u), top = vfloor(v);
         Vec corners[4];
         vlookup4(there.quads, Vec(4.0f) * vfma(top, wide + Vec(2.0f), left), corners);
         const Vec part = u - left;
@@ -87,7 +85,7 @@ void correlate_row(const PlaneSweep& sweep, const SweptRing& ring, int64_t y, fl
         for (int64_t k = 0; k < neighbours; ++k) {
             Vec means[kSweptSums];
             for (int64_t q = 0; q < kSweptSums; ++q) means[q] = over * sum_down(ring, k, first, last, q * sweep.stride + x);
-            const Vec variance = vmax(means[1] - means[0] * means[0], Vec(kLeastVariance));
+            const Vec variance = vmax(means[1] - means[0] * means[0], Vec(sweep.least_variance));
             const Vec correlation = (means[2] - here * means[0]) / vsqrt(varies * variance);
             const Vec shown = Vec::load(ring.of(k, y) + kSweptSums * sweep.stride + x);
             Vec lower = vselect(shown > Vec(0.0f), correlation, Vec(-1.0f));

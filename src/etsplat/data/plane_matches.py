@@ -49,11 +49,13 @@ class Matches(NamedTuple):
         place: (H, W) the number of the best plane, with a fraction; -1 where that is the first or the last.
         best: (H, W) its correlation.
         elsewhere: (H, W) the best one of planes that are not beside it.
+        contrast: (H, W) standard deviation of the photo in the window.
     """
 
     place: Float[Tensor, "H W"]
     best: Float[Tensor, "H W"]
     elsewhere: Float[Tensor, "H W"]
+    contrast: Float[Tensor, "H W"]
 
 
 def best_matches(grey: Float[Tensor, "H W"], neighbours: Sequence[Neighbour], inverse: Float[Tensor, " D"]) -> Matches:
@@ -68,8 +70,8 @@ def best_matches(grey: Float[Tensor, "H W"], neighbours: Sequence[Neighbour], in
 
 
 def _native_matches(grey: Tensor, neighbours: Sequence[Neighbour], inverse: Tensor) -> Matches:
-    mean, variance = spread(grey[None])
-    found = Matches(*(torch.empty_like(grey) for _ in Matches._fields))
+    mean, variance = _spread(grey[None])
+    place, best, elsewhere = (torch.empty_like(grey) for _ in range(3))
     _native.plane_sweep(
         grey=grey.contiguous(),
         mean=mean[0].contiguous(),
@@ -81,16 +83,21 @@ def _native_matches(grey: Tensor, neighbours: Sequence[Neighbour], inverse: Tens
         window=WINDOW,
         agreeing=AGREEING,
         beside=BESIDE,
-        **found._asdict(),
+        least_variance=_LEAST_VARIANCE,
+        least_depth=_LEAST_DEPTH,
+        place=place,
+        best=best,
+        elsewhere=elsewhere,
     )
-    return found
+    return Matches(place, best, elsewhere, variance[0].sqrt())
 
 
 def matches_in_torch(
     grey: Float[Tensor, "H W"], neighbours: Sequence[Neighbour], inverse: Float[Tensor, " D"]
 ) -> Matches:
     """`best_matches` on any device, within rounding."""
-    correlations = torch.stack([_correlation(grey, neighbour, inverse) for neighbour in neighbours])
+    moments = _spread(grey[None])
+    correlations = torch.stack([_correlation(grey, moments, neighbour, inverse) for neighbour in neighbours])
     judged = correlations.topk(AGREEING, dim=0).values.mean(dim=0)
     best, plane = judged.max(dim=0)
     number = torch.arange(len(inverse), device=grey.device)[:, None, None]
@@ -98,10 +105,13 @@ def matches_in_torch(
     within = plane.clamp(1, len(inverse) - 2)
     before, at, after = (judged.gather(0, (within + step)[None])[0] for step in (-1, 0, 1))
     between = ((before - after) / (2 * (before - 2 * at + after)).clamp_max(-1e-6)).clamp(-0.5, 0.5)
-    return Matches(torch.where(plane == within, plane + between, -1.0), best, elsewhere)
+    place = torch.where(plane == within, plane + between, -1.0)
+    return Matches(place, best, elsewhere, moments[1][0].sqrt())
 
 
-def _correlation(grey: Tensor, neighbour: Neighbour, inverse: Tensor) -> Float[Tensor, "D H W"]:
+def _correlation(
+    grey: Tensor, moments: tuple[Tensor, Tensor], neighbour: Neighbour, inverse: Tensor
+) -> Float[Tensor, "D H W"]:
     """Of the windows of a photo with those of another as each of the planes has it; -1 where that shows nothing."""
     h, w = neighbour.grey.shape
     row, column = (torch.arange(size, device=grey.device) + 0.5 for size in grey.shape)
@@ -112,13 +122,12 @@ def _correlation(grey: Tensor, neighbour: Neighbour, inverse: Tensor) -> Float[T
     places = 2 * seen[..., :2] / seen[..., 2:].clamp_min(_LEAST_DEPTH) / size - 1  # from -1 to 1 across the other
     outside = ~((places.abs() < 1).all(dim=-1) & (seen[..., 2] > 0))
     warped = grid_sample(neighbour.grey.expand(len(inverse), 1, -1, -1), places, align_corners=False)[:, 0]
-    mean, variance = spread(grey[None])
-    there, varies = spread(warped)
+    (mean, variance), (there, varies) = moments, _spread(warped)
     together = _windows(warped * grey) - mean * there
     return (together / (variance * varies).sqrt()).masked_fill(outside, -1.0)
 
 
-def spread(images: Float[Tensor, "D H W"]) -> tuple[Float[Tensor, "D H W"], Float[Tensor, "D H W"]]:
+def _spread(images: Float[Tensor, "D H W"]) -> tuple[Float[Tensor, "D H W"], Float[Tensor, "D H W"]]:
     """Mean and variance in the window around each pixel."""
     mean = _windows(images)
     return mean, (_windows(images.square()) - mean.square()).clamp_min(_LEAST_VARIANCE)

@@ -19,7 +19,7 @@ from etsplat.data.agreement import reduced
 from etsplat.data.dataset import Dataset
 from etsplat.data.depth_points import framed, project
 from etsplat.data.pictures import as_float, unpremultiplied
-from etsplat.data.plane_matches import AGREEING, Neighbour, best_matches, spread
+from etsplat.data.plane_matches import AGREEING, Neighbour, best_matches
 from etsplat.engines.threads import num_threads, one_torch_thread
 
 WIDEST = 200
@@ -183,8 +183,7 @@ def _depths(photo: _Photo, others: Sequence[_Photo], known: Float[Tensor, " K"])
     planes = _planes(photo, others, near, far)
     inverse = torch.linspace(1 / near, 1 / far, planes, device=photo.grey.device)
     found = best_matches(photo.grey, [photo.beside(other) for other in others], inverse)
-    contrast = spread(photo.grey[None])[1][0].sqrt()
-    clear = (found.best > CORRELATED) & (found.best - found.elsewhere > CLEARLY) & (contrast > CONTRAST)
+    clear = (found.best > CORRELATED) & (found.best - found.elsewhere > CLEARLY) & (found.contrast > CONTRAST)
     depths = 1 / (inverse[0] + found.place * (inverse[1] - inverse[0]))
     return torch.where(clear & (found.place >= 0) & photo.counts, depths, 0.0)
 
