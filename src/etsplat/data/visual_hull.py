@@ -44,7 +44,7 @@ _BISECTIONS = 8
 
 
 def visual_hull(
-    dataset: Dataset, faces: int, *, radius: float = 1.0
+    dataset: Dataset, faces: int, *, radius: float = 1.0, free: Distance | None = None
 ) -> tuple[Float[Tensor, "V 3"], Int64[Tensor, "F 3"]]:
     """The hull of the training views' silhouettes (alpha 0.5) within a ball around the origin, as a closed manifold.
 
@@ -55,6 +55,7 @@ def visual_hull(
         dataset: photos with alpha around an object at the origin, as `bounding_sphere` and `renormalized` place it.
         faces: about how many are wanted.
         radius: of the ball.
+        free: positive at points that are cut away from the hull; None for the hull as it is.
 
     Returns:
         vertices (V, 3) float32 and faces (F, 3) int64, counter-clockwise seen from outside; (0, 3) both if the
@@ -62,9 +63,12 @@ def visual_hull(
     """
     outside = outside_hull(dataset)
 
+    def beyond(points: Tensor) -> Tensor:
+        return outside(points) if free is None else torch.maximum(outside(points), free(points))
+
     def distance(points: np.ndarray) -> np.ndarray:
         chunks = torch.from_numpy(points).float().split(_CHUNK)
-        found = torch.cat([outside(chunk) for chunk in chunks]).double().numpy()
+        found = torch.cat([beyond(chunk) for chunk in chunks]).double().numpy()
         return np.maximum(found, np.linalg.norm(points, axis=1) - radius)
 
     cells = _FIRST_CELLS

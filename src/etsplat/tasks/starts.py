@@ -16,13 +16,14 @@ from etsplat.data.hollows import Opened, open_hollows
 from etsplat.data.lids import without_lids
 from etsplat.data.plain_sides import with_flat_sides
 from etsplat.data.silhouettes import silhouette, touches_border
-from etsplat.data.visual_hull import NEAR, visual_hull
+from etsplat.data.visual_hull import NEAR, Distance, visual_hull
 from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.parts import Shape, shape_of
 from etsplat.geometry.topology import MeshTopology
 from etsplat.geometry.untangle import untangle
 from etsplat.io.mesh_files import MeshFile, load_mesh, weld_vertices
 from etsplat.model.triangle_mesh import MeshAppearance, TriangleMesh
+from etsplat.tasks.coarse_soup import seen_through
 from etsplat.tasks.judgement import CONTRADICTED, Start
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 
@@ -43,6 +44,14 @@ at outlines. Hollows are opened while triangles are soft."""
 _UNCOVERED, _LESS = 0.0005, 0.9
 """A hull that leaves more of the silhouettes uncovered lacks thin parts if a finer one leaves at most so many times as
 much: what rough masks leave does not depend on how fine it is."""
+
+
+_MARGINS = (0.05, 0.03, 0.08)
+"""How far in front of what a coarse soup shows a hull is cut, in units of the object's radius; in turn, until photos
+contradict it no more. Nearer takes away what is thin, farther leaves more of a lid to be pushed in."""
+
+_CLEARLY = 0.7
+"""A cut hull is taken where photos contradict at most so many times as much of it."""
 
 
 class Hull(NamedTuple):
@@ -69,12 +78,14 @@ class Started(NamedTuple):
         kind: where it comes from.
         opened: the hull with its hollows open, and what photos say of it; None for another kind.
         hull: that it was, before it was mended; None for another kind.
+        cut: whether it was cut where a coarse soup sees through it.
     """
 
     mesh: TriangleMesh
     kind: Start
     opened: Opened | None = None
     hull: Hull | None = None
+    cut: bool = False
 
     @property
     def contradicted(self) -> float:
@@ -114,9 +125,9 @@ def _explained(views: Dataset, radius: float) -> bool:
     return float(lost.mean()) <= _LOST
 
 
-def _carved(views: Dataset, faces: int, radius: float) -> Hull:
+def _carved(views: Dataset, faces: int, radius: float, free: Distance | None = None) -> Hull:
     """A hull of about so many faces; where the silhouettes have no point in common it has none, and covers nothing."""
-    surface = visual_hull(views, faces, radius=radius)
+    surface = visual_hull(views, faces, radius=radius, free=free)
     return Hull(*surface, faces, _uncovered(photos_of(views), *surface) if len(surface[1]) else 1.0)
 
 
@@ -147,11 +158,12 @@ def make_start(
     """
     colors: Tensor | float = config.start.color
     kind: Start = start_shape(config, views) if start is None else "mesh"
-    opened, hull = None, None
+    opened, hull, cut = None, None, False
     if kind == "hull":
         hull = plain_hull(views, config)
-        mended = without_lids(views, *without_false_handles(views, hull.vertices, hull.faces))
-        opened = open_hollows(views, *mended)
+        opened = _opened(views, hull)
+        if opened.contradicted > CONTRADICTED:
+            opened, cut = _cut_open(views, hull, opened, config, device)
         faces = opened.faces
         vertices = with_flat_sides(views, opened.vertices, faces)
         vertices = untangle(vertices, MeshTopology.from_faces(faces, len(vertices)))[0]
@@ -173,7 +185,33 @@ def make_start(
         appearance=MeshAppearance(kernel, config.drawing.distance, config.drawing.backend),
         harmonics=config.drawing.harmonics,
     )
-    return Started(mesh, kind, opened, hull)
+    return Started(mesh, kind, opened, hull, cut)
+
+
+def _opened(views: Dataset, hull: Hull) -> Opened:
+    return open_hollows(views, *without_lids(views, *without_false_handles(views, hull.vertices, hull.faces)))
+
+
+def _cut_open(
+    views: Dataset, hull: Hull, opened: Opened, config: ReconstructConfig, device: torch.device | None
+) -> tuple[Opened, bool]:
+    """A hull that photos contradict, cut where a coarse soup sees through it, if they contradict that clearly less.
+
+    No cut is taken that leaves silhouettes uncovered.
+    """
+    free, best, photos = seen_through(views, hull.vertices, config, device), opened, photos_of(views)
+    for margin in _MARGINS:
+        cut = _carved(views, hull.wanted, config.start.radius, lambda points, margin=margin: free(points) - margin)
+        if len(cut.faces) == 0:
+            continue
+        found = _opened(views, cut)
+        covers = _uncovered(photos, found.vertices, found.faces) <= hull.uncovered + _UNCOVERED
+        if covers and found.contradicted < best.contradicted:
+            best = found
+        if best.contradicted <= CONTRADICTED:
+            break
+    better = best.contradicted <= _CLEARLY * opened.contradicted
+    return (best, True) if better else (opened, False)
 
 
 @torch.no_grad()

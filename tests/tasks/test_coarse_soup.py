@@ -1,0 +1,44 @@
+"""What a coarse soup sees of a hollow into which no lid of the hull can be pushed."""
+
+import pytest
+
+import etsplat.tasks.starts as starts
+from etsplat.data.closed_hollows import closed_hollows
+from etsplat.data.hollows import open_hollows
+from etsplat.data.visual_hull import visual_hull
+from etsplat.tasks.judgement import CONTRADICTED
+from etsplat.tasks.reconstruct_config import ReconstructConfig
+from helpers.painting import painted_pictures
+from helpers.revolved import BOWL, VASE, revolved
+
+CONFIG = ReconstructConfig.quick().changed({"start.hull_faces": 1600})
+
+
+def test_a_hull_that_photos_contradict_is_cut_open_where_a_soup_sees_through_it() -> None:
+    """A vase, behind whose opening hardly a point is seen by two photos."""
+    vertices, faces, views = painted_pictures(*revolved(VASE))
+    lidded = open_hollows(views, *visual_hull(views, 1600))
+    assert lidded.contradicted > CONTRADICTED
+    started = starts.make_start(None, views, CONFIG)
+    assert started.cut
+    assert started.contradicted < CONTRADICTED
+    closed = closed_hollows(views, (vertices, faces), (lidded.vertices, lidded.faces))
+    assert closed_hollows(views, (vertices, faces), started.mesh.surface()) < 0.6 * closed
+
+
+def test_no_soup_is_asked_where_photos_agree(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A bowl, whose lid goes down by itself."""
+    monkeypatch.setattr(starts, "seen_through", None)
+    _, _, views = painted_pictures(*revolved(BOWL))
+    assert not starts.make_start(None, views, CONFIG).cut
+
+
+def test_a_cut_that_photos_contradict_as_much_is_not_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Here all space is free but for a ball, or none is."""
+    _, _, views = painted_pictures(*revolved(VASE))
+    plain = open_hollows(views, *visual_hull(views, 1600))
+    for free in (lambda points: points.norm(dim=1) - 0.5, lambda points: points[:, 0] * 0 + 1):
+        monkeypatch.setattr(starts, "seen_through", lambda *_, free=free: free)
+        started = starts.make_start(None, views, CONFIG)
+        assert not started.cut
+        assert started.contradicted == pytest.approx(plain.contradicted, abs=0.01)
