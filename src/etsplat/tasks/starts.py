@@ -50,7 +50,7 @@ _MARGINS = (0.05, 0.03, 0.08)
 """How far in front of what a coarse soup shows a hull is cut, in units of the object's radius; in turn, until photos
 contradict it no more. Nearer takes away what is thin, farther leaves more of a lid to be pushed in."""
 
-_CLEARLY, _CUT_OFF = 0.7, 0.01
+_CLEARLY, _RIMS = 0.7, 0.01
 """A cut hull is taken where photos contradict at most so many times as much of it, and if it leaves no more of the
 silhouettes uncovered than this and the hull do: of a thin rim, which grows again."""
 
@@ -206,7 +206,7 @@ def _cut_open(
         if len(cut.faces) == 0:
             continue
         found = _opened(views, cut)
-        covers = _uncovered(photos, found.vertices, found.faces) <= hull.uncovered + _CUT_OFF
+        covers = _uncovered(photos, found.vertices, found.faces) <= hull.uncovered + _RIMS
         if covers and found.contradicted < best.contradicted:
             best = found
         if best.contradicted <= CONTRADICTED:
