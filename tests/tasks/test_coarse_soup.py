@@ -1,11 +1,14 @@
 """What a coarse soup sees of a hollow into which no lid of the hull can be pushed."""
 
 import pytest
+import torch
 
+import etsplat.tasks.coarse_soup as coarse_soup
 import etsplat.tasks.starts as starts
 from etsplat.data.closed_hollows import closed_hollows
 from etsplat.data.hollows import open_hollows
 from etsplat.data.visual_hull import visual_hull
+from etsplat.engines.threads import num_threads, set_num_threads
 from etsplat.tasks.judgement import CONTRADICTED
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 from helpers.painting import painted_pictures
@@ -24,6 +27,21 @@ def test_a_hull_that_photos_contradict_is_cut_open_where_a_soup_sees_through_it(
     assert started.contradicted < CONTRADICTED
     closed = closed_hollows(views, (vertices, faces), (lidded.vertices, lidded.faces))
     assert closed_hollows(views, (vertices, faces), started.mesh.surface()) < 0.6 * closed
+
+
+def test_what_is_free_is_the_same_to_the_bit_on_any_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As the surface of a resumed run, which starts once more, must be; another seed sees something else."""
+    monkeypatch.setattr(coarse_soup, "STEPS", 20)
+    _, _, views = painted_pictures(*revolved(VASE))
+    vertices, _ = visual_hull(views, 400)
+    points = torch.rand(1000, 3, generator=torch.Generator().manual_seed(3)) - 0.5
+    before, found = num_threads(), []
+    for threads, seed in ((1, 0), (3, 0), (1, 1)):
+        set_num_threads(threads)
+        found.append(coarse_soup.seen_through(views, vertices, CONFIG.changed({"seed": seed}))(points))
+    set_num_threads(before)
+    assert torch.equal(found[0], found[1])
+    assert not torch.equal(found[0], found[2])
 
 
 def test_no_soup_is_asked_where_photos_agree(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -146,6 +146,7 @@ def test_a_hull_that_is_near_all_over_takes_the_fewer_iterations() -> None:
     others = [opened._replace(**{name: value}) for name, value in (("doubtful", 0.051), ("agreed", 0.49))]
     for other in (*others, opened._replace(contradicted=0.006), None):
         assert within_need(quick, Started(mesh, "hull", other)) == (quick, None)
+    assert within_need(quick, near._replace(cut=True)) == (quick, None)
     for asked in ({"iterations": 4999}, {"iterations": 5001}, {"start.near_iterations": None}):
         assert within_need(quick.changed(asked), near)[1] is None
     best, sooner = ReconstructConfig.best(), {"drawing.opaque_from": 0.8}

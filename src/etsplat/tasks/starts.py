@@ -34,8 +34,9 @@ _LOST = 0.05
 """The part of silhouettes that it may leave uncovered, in the mean: less than a limb."""
 
 _DOUBTFUL, _AGREED = 0.05, 0.5
-"""A hull is near the surface all over if no larger part of its vertices was moved or is not seen by two photos:
-hollows, which travel on to the end of a run; and if photos agree on so many, which they hardly do on thin parts."""
+"""A hull is near the surface all over if it was not cut, and no larger part of its vertices was moved or is not seen by
+two photos: hollows, which travel on to the end of a run; and if photos agree on so many, which they hardly do on thin
+parts."""
 
 _OPAQUE_FROM = 0.8
 """From this fraction of a run on triangles are opaque, where a hull is near the surface all over: what is left to do is
@@ -290,7 +291,7 @@ def within_need(config: ReconstructConfig, started: Started) -> tuple[Reconstruc
     Returns:
         What the run is made with; and a sentence about its length, or None if that is what was asked for.
     """
-    if not _near(started.opened):
+    if started.cut or not _near(started.opened):
         return config, None
     if config.drawing.opaque_from < 1:
         sooner = min(config.drawing.opaque_from, _OPAQUE_FROM)
