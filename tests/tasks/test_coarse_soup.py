@@ -48,7 +48,7 @@ def test_no_soup_is_asked_where_photos_agree(monkeypatch: pytest.MonkeyPatch) ->
     """A bowl, whose lid goes down by itself."""
     monkeypatch.setattr(starts, "seen_through", None)
     _, _, views = painted_pictures(*revolved(BOWL))
-    assert not starts.make_start(None, views, CONFIG).cut
+    assert starts.make_start(None, views, CONFIG).cut is None
 
 
 def test_a_cut_that_photos_contradict_as_much_is_not_taken(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -58,5 +58,5 @@ def test_a_cut_that_photos_contradict_as_much_is_not_taken(monkeypatch: pytest.M
     for free in (lambda points: points.norm(dim=1) - 0.5, lambda points: points[:, 0] * 0 + 1):
         monkeypatch.setattr(starts, "seen_through", lambda *_, free=free: free)
         started = starts.make_start(None, views, CONFIG)
-        assert not started.cut
+        assert started.cut is False
         assert started.contradicted == pytest.approx(plain.contradicted, abs=0.01)

@@ -172,8 +172,12 @@ def reconstruct(
         if begun == "hull":
             holes = f"holes in each part: {genera(mesh.faces.cpu(), len(mesh.vertices))}"
             form = holes if mesh.topology.is_closed() else "open where photos look onto the inner side of its surface"
-            cut = ", cut open where a coarse soup sees through it" * started.cut
-            job.announce(NoteEvent(f"start: the visual hull{cut}, {mesh.count:,} faces; {form}"))
+            cut = {
+                None: "",
+                True: ", cut open where a coarse soup sees through it",
+                False: ", though photos contradict it",
+            }
+            job.announce(NoteEvent(f"start: the visual hull{cut[started.cut]}, {mesh.count:,} faces; {form}"))
             config = nearby(config)
         config = _told(job, *within_need(config, started))
         config = _told(job, *within_pixels(config, views, mesh))

@@ -80,14 +80,14 @@ class Started(NamedTuple):
         kind: where it comes from.
         opened: the hull with its hollows open, and what photos say of it; None for another kind.
         hull: that it was, before it was mended; None for another kind.
-        cut: whether it was cut where a coarse soup sees through it.
+        cut: whether it was cut where a coarse soup sees through it; None where no soup was asked.
     """
 
     mesh: TriangleMesh
     kind: Start
     opened: Opened | None = None
     hull: Hull | None = None
-    cut: bool = False
+    cut: bool | None = None
 
     @property
     def contradicted(self) -> float:
@@ -160,7 +160,7 @@ def make_start(
     """
     colors: Tensor | float = config.start.color
     kind: Start = start_shape(config, views) if start is None else "mesh"
-    opened, hull, cut = None, None, False
+    opened, hull, cut = None, None, None
     if kind == "hull":
         hull = plain_hull(views, config)
         opened = _opened(views, hull)
