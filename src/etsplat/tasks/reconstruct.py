@@ -58,6 +58,10 @@ DEPTHS_NEAR, DEPTHS_FAR = 0.02, 0.15
 """When depth maps are compared with the mesh, as a fraction of a run that starts near the surface, or far from it."""
 
 
+_CUT = {None: "", True: ", cut open where a coarse soup sees through it", False: ", though photos contradict it"}
+"""What is said of a hull by `Started.cut`."""
+
+
 @dataclass(frozen=True)
 class ReconstructResult(Result):
     """What a run gives back; all of it is in the run directory too.
@@ -166,18 +170,14 @@ def reconstruct(
             supersampling=config.pictures.supersampling,
             lpips=load_lpips(config.output.lpips_weights, job.device),
         )
-        started = make_start(start, views, config, job.device)
+        started = make_start(start, views, config, job.device, lambda text: job.announce(NoteEvent(text)))
         mesh, begun = started.mesh, started.kind
         judging = partial(_judge, scorer, views, truth, config, started, shape_of(*mesh.surface()))
         if begun == "hull":
             holes = f"holes in each part: {genera(mesh.faces.cpu(), len(mesh.vertices))}"
             form = holes if mesh.topology.is_closed() else "open where photos look onto the inner side of its surface"
-            cut = {
-                None: "",
-                True: ", cut open where a coarse soup sees through it",
-                False: ", though photos contradict it",
-            }
-            job.announce(NoteEvent(f"start: the visual hull{cut[started.cut]}, {mesh.count:,} faces; {form}"))
+            hull = f"the visual hull{_CUT[started.cut]}, {mesh.count:,} faces"
+            job.announce(NoteEvent(f"start: {hull}; {form}"))
             config = nearby(config)
         config = _told(job, *within_need(config, started))
         config = _told(job, *within_pixels(config, views, mesh))

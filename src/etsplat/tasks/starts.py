@@ -1,5 +1,6 @@
 """What a reconstruction starts from: a sphere, the visual hull, or a given mesh."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -145,7 +146,11 @@ def _uncovered(photos: list[Photo], vertices: Tensor, faces: Tensor) -> float:
 
 
 def make_start(
-    start: MeshFile | None, views: Dataset, config: ReconstructConfig, device: torch.device | None = None
+    start: MeshFile | None,
+    views: Dataset,
+    config: ReconstructConfig,
+    device: torch.device | None = None,
+    tell: Callable[[str], None] | None = None,
 ) -> Started:
     """The mesh that a run starts from, in the unit frame: an icosphere around the object, its hull, or the given mesh.
 
@@ -154,6 +159,7 @@ def make_start(
         views: of the unit frame.
         config: shape, colour, opacity and softness.
         device: of the mesh; None for the CPU.
+        tell: called with a sentence before what takes long.
 
     Raises:
         InputError: the hull is asked for, and the views have no masks, or masks that exclude everything.
@@ -165,6 +171,9 @@ def make_start(
         hull = plain_hull(views, config)
         opened = _opened(views, hull)
         if opened.contradicted > CONTRADICTED:
+            if tell is not None:
+                part = f"{100 * opened.contradicted:.1f} % of its surface"
+                tell(f"photos contradict the visual hull on {part}: a coarse soup is asked what is free")
             opened, cut = _cut_open(views, hull, opened, config, device)
         faces = opened.faces
         vertices = with_flat_sides(views, opened.vertices, faces)
