@@ -52,7 +52,7 @@ _MARGINS = (0.05, 0.03, 0.08)
 """How far in front of what a coarse soup shows a hull is cut, in units of the object's radius; in turn, until photos
 contradict it no more. Nearer takes away what is thin, farther leaves more of a lid to be pushed in."""
 
-_CLEARLY, _RIMS = 0.7, 0.01
+_CLEARLY, _RIMS = 0.7, 0.003
 """A cut hull is taken where photos contradict at most so many times as much of it, and if it leaves no more of the
 silhouettes uncovered than this and the hull do: of a thin rim, which grows again."""
 
