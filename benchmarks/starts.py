@@ -1,10 +1,12 @@
-"""What runs start from: the visual hull, without false handles, with its hollows open, and with its plain sides flat.
+"""From the visual hull to what runs start from: without false handles, with its hollows open, with plain sides flat.
 
     python -m benchmarks.starts FOLDERS [--objects NAMES]
 
 Inputs are those of `python -m studies.gallery`, with a known surface. Of each of the four its holes, and the exact
 Chamfer distance x 1e-3 of 20,000 samples; photos, faces and frame are those of preset quick. With CPU seconds; of the
-hull also what it leaves uncovered of the silhouettes, and the parts and holes of a finer one if it has others.
+hull also what it leaves uncovered of the silhouettes, and the parts and holes of a finer one if it has others. Lids
+that photos look through go before hollows are opened, and a hull that they still contradict is cut: neither is done
+here.
 """
 
 import argparse

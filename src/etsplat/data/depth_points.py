@@ -102,6 +102,23 @@ def project(
     return depth, K[0, 0] * across / depth + K[0, 2], K[1, 1] * down / depth + K[1, 2]
 
 
+def on_map(
+    dataset: Dataset, view: int, shown: Float[Tensor, "H W"], points: Float[Tensor, "P 3"]
+) -> tuple[Float[Tensor, " P"], Float[Tensor, " P"]]:
+    """What a map of a view shows at the pixels of points, 0 out of its frame; and the points' own depths.
+
+    Args:
+        dataset: whose view it is.
+        view: its index.
+        shown: (H, W) of the pixels of its photo.
+        points: (P, 3) float64 in the data set's frame.
+    """
+    depth, column, row = located = project(dataset, view, points)
+    inside = framed(dataset, view, *located)
+    column, row = (torch.where(inside, each, 0.0).long() for each in (column, row))
+    return torch.where(inside, shown[row, column], 0.0), depth
+
+
 def unproject(
     dataset: Dataset, view: int, depth: Float[Tensor, " P"], column: Float[Tensor, " P"], row: Float[Tensor, " P"]
 ) -> Float[Tensor, "P 3"]:

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from etsplat.data.dataset import Dataset
-from etsplat.data.depth_points import framed, project
+from etsplat.data.depth_points import on_map
 from etsplat.data.visual_hull import Distance
 
 TRUNCATED = 0.1
@@ -32,12 +32,9 @@ def free_space(dataset: Dataset, depths: Mapping[int, Float[Tensor, "H W"]]) -> 
     def ahead(points: Tensor) -> Tensor:
         total, asked = torch.zeros(len(points)), torch.zeros(len(points))
         for view, shown in depths.items():
-            depth, column, row = located = project(dataset, view, points.double())
-            inside = framed(dataset, view, *located)
-            column, row = (torch.where(inside, each, 0.0).long() for each in (column, row))
-            surface = shown[row, column]
+            surface, depth = on_map(dataset, view, shown, points.double())
             before = (surface - depth).float()
-            tells = inside & (surface > 0) & (before > -TRUNCATED)
+            tells = (surface > 0) & (before > -TRUNCATED)
             total += torch.where(tells, before.clamp_max(TRUNCATED), 0.0)
             asked += tells
         return torch.where(asked >= ASKED, total / asked.clamp_min(1), -TRUNCATED)

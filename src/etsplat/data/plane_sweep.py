@@ -17,7 +17,7 @@ from torch.nn.functional import normalize
 
 from etsplat.data.agreement import reduced
 from etsplat.data.dataset import Dataset
-from etsplat.data.depth_points import framed, project
+from etsplat.data.depth_points import framed, on_map, project
 from etsplat.data.pictures import as_float, unpremultiplied
 from etsplat.data.plane_matches import AGREEING, Neighbour, best_matches
 from etsplat.engines.threads import num_threads, one_torch_thread
@@ -223,8 +223,5 @@ def _agreed(
 
 def _found(photo: _Photo, depths: Float[Tensor, "h w"], places: Float[Tensor, "P 3"]) -> Bool[Tensor, " P"]:
     """Whether a photo found the same places."""
-    expected, column, row = located = photo.located(places)
-    inside = photo.frames(located)
-    column, row = (torch.where(inside, each, 0.0).long() for each in (column, row))
-    there = depths[row, column]
-    return inside & (there > 0) & ((there - expected).abs() < SAME * expected)
+    there, expected = on_map(photo.dataset, photo.index, depths, places)
+    return (there > 0) & ((there - expected).abs() < SAME * expected)

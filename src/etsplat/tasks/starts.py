@@ -17,7 +17,7 @@ from etsplat.data.hollows import Opened, open_hollows
 from etsplat.data.lids import without_lids
 from etsplat.data.plain_sides import with_flat_sides
 from etsplat.data.silhouettes import silhouette, touches_border
-from etsplat.data.visual_hull import NEAR, Distance, visual_hull
+from etsplat.data.visual_hull import NEAR, visual_hull
 from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.parts import Shape, shape_of
 from etsplat.geometry.topology import MeshTopology
@@ -53,8 +53,8 @@ _MARGINS = (0.05, 0.03, 0.08)
 contradict it no more. Nearer takes away what is thin, farther leaves more of a lid to be pushed in."""
 
 _CLEARLY, _RIMS = 0.7, 0.003
-"""A cut hull is taken where photos contradict at most so many times as much of it, and if it leaves no more of the
-silhouettes uncovered than this and the hull do: of a thin rim, which grows again."""
+"""A cut hull is taken where photos contradict at most so many times as much of it, and if it leaves at most this part
+of the silhouettes uncovered beside what the hull does: a little of a thin rim, which grows again."""
 
 
 class Hull(NamedTuple):
@@ -128,9 +128,9 @@ def _explained(views: Dataset, radius: float) -> bool:
     return float(lost.mean()) <= _LOST
 
 
-def _carved(views: Dataset, faces: int, radius: float, free: Distance | None = None) -> Hull:
+def _carved(views: Dataset, faces: int, radius: float) -> Hull:
     """A hull of about so many faces; where the silhouettes have no point in common it has none, and covers nothing."""
-    surface = visual_hull(views, faces, radius=radius, free=free)
+    surface = visual_hull(views, faces, radius=radius)
     return Hull(*surface, faces, _uncovered(photos_of(views), *surface) if len(surface[1]) else 1.0)
 
 
@@ -169,7 +169,7 @@ def make_start(
     opened, hull, cut = None, None, None
     if kind == "hull":
         hull = plain_hull(views, config)
-        opened = _opened(views, hull)
+        opened = _opened(views, hull.vertices, hull.faces)
         if opened.contradicted > CONTRADICTED:
             if tell is not None:
                 part = f"{100 * opened.contradicted:.1f} % of its surface"
@@ -199,8 +199,8 @@ def make_start(
     return Started(mesh, kind, opened, hull, cut)
 
 
-def _opened(views: Dataset, hull: Hull) -> Opened:
-    return open_hollows(views, *without_lids(views, *without_false_handles(views, hull.vertices, hull.faces)))
+def _opened(views: Dataset, vertices: Tensor, faces: Tensor) -> Opened:
+    return open_hollows(views, *without_lids(views, *without_false_handles(views, vertices, faces)))
 
 
 def _cut_open(
@@ -211,18 +211,19 @@ def _cut_open(
     No cut is taken that leaves much of the silhouettes uncovered.
     """
     free, best, photos = seen_through(views, hull.vertices, config, device), opened, photos_of(views)
+    most, radius = hull.uncovered + _RIMS, config.start.radius
     for margin in _MARGINS:
-        cut = _carved(views, hull.wanted, config.start.radius, lambda points, margin=margin: free(points) - margin)
-        if len(cut.faces) == 0:
+        vertices, faces = visual_hull(views, hull.wanted, radius=radius, free=lambda p, margin=margin: free(p) - margin)
+        if len(faces) == 0:
             continue
-        found = _opened(views, cut)
-        covers = _uncovered(photos, found.vertices, found.faces) <= hull.uncovered + _RIMS
-        if covers and found.contradicted < best.contradicted:
+        found = _opened(views, vertices, faces)
+        better = found.contradicted < best.contradicted
+        if better and _uncovered(photos, found.vertices, found.faces) <= most:
             best = found
         if best.contradicted <= CONTRADICTED:
             break
-    better = best.contradicted <= _CLEARLY * opened.contradicted
-    return (best, True) if better else (opened, False)
+    clearly = best.contradicted <= _CLEARLY * opened.contradicted
+    return (best, True) if clearly else (opened, False)
 
 
 @torch.no_grad()
