@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
@@ -16,6 +17,7 @@ import torch
 
 import etsplat
 from benchmarks import (
+    contention,
     determinism,
     floaters,
     gpu,
@@ -361,3 +363,22 @@ def test_stages_of_a_run_exist_and_each_second_is_counted_once(monkeypatch):
     clock.timed("steps", clock.timed("guard", lambda: None))()
     assert clock.seconds["steps"] == 5.0
     assert clock.seconds["guard"] == 2.0
+
+
+@pytest.mark.skipif(
+    not Path("/proc/self/stat").exists(), reason="asks the state of a process in /proc, which is not here"
+)
+def test_the_second_copy_rests_in_quiet_turns_and_draws_in_the_others():
+    states = []
+
+    with contention.second_copy("sphere1", 1) as copy:
+
+        def turn():
+            time.sleep(0.05)
+            states.append(Path(f"/proc/{copy.pid}/stat").read_text().rpartition(")")[2].split()[0])
+            return [float(len(states))]
+
+        quiet, beside = contention.quiet_and_beside(copy, 2, {"turn": turn})["turn"]
+    assert states == ["T", "R", "T", "R"]
+    assert (quiet, beside) == (2.0, 3.0)  # medians of 1, 3 and 2, 4
+    assert copy.returncode is not None
