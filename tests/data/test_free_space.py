@@ -5,7 +5,7 @@ import torch
 
 from etsplat.data.free_space import TRUNCATED, free_space
 from etsplat.data.photograph import photograph
-from etsplat.data.visual_hull import HullGrid, visual_hull
+from etsplat.data.visual_hull import visual_hull
 from etsplat.geometry.icosphere import icosphere
 from etsplat.io.mesh_files import MeshFile
 from etsplat.ops.rasterize_opaque import rasterize_opaque
@@ -56,8 +56,7 @@ def test_a_hull_is_cut_where_space_is_free(shown):
     """By so much in front of what the maps show."""
     views, maps = shown
     free = free_space(views, maps)
-    cells, *_ = HullGrid(views).of_about(2000)
-    vertices, faces = HullGrid(views, free=lambda points: free(points) - 0.05).surface(cells)
+    vertices, faces = visual_hull(views, 2000, free=lambda points: free(points) - 0.05)
     whole, _ = visual_hull(views, 2000)
     assert float(whole.norm(dim=1).min()) > 0.95
     radii = vertices.norm(dim=1)
@@ -65,19 +64,3 @@ def test_a_hull_is_cut_where_space_is_free(shown):
     assert RADIUS < float(radii.median()) < RADIUS + 0.05
     assert float(radii.min()) > RADIUS - 0.05
     assert float(radii.max()) < RADIUS + 0.1
-
-
-def test_what_is_not_cut_stays_vertex_for_vertex(shown):
-    """Also what is as thin as a cell, though the surface of a ball with a deep hole has many more faces."""
-    views, _ = shown
-    cells, *whole = HullGrid(views).of_about(2000)
-    cut, faces = HullGrid(
-        views, free=lambda points: 0.7 - (points - points.new_tensor([0.0, 0.0, 0.5])).norm(dim=1)
-    ).surface(cells)
-    assert len(faces) > 1.1 * len(whole[1])
-
-    def far(vertices):
-        return vertices[vertices[:, 2] < -0.45]
-
-    assert len(far(cut)) == len(far(whole[0])) > 300
-    assert float(torch.cdist(far(cut), far(whole[0])).amin(dim=1).max()) < 0.01 * 2 / cells

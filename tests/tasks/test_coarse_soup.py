@@ -2,19 +2,13 @@
 
 import pytest
 import torch
-import trimesh
 
 import etsplat.tasks.coarse_soup as coarse_soup
 import etsplat.tasks.starts as starts
-from etsplat.data.agreement import photos_of
 from etsplat.data.closed_hollows import closed_hollows
-from etsplat.data.dataset import Dataset
-from etsplat.data.hollows import Opened, open_hollows
-from etsplat.data.photograph import photograph
-from etsplat.data.visual_hull import HullGrid, visual_hull
+from etsplat.data.hollows import open_hollows
+from etsplat.data.visual_hull import visual_hull
 from etsplat.engines.threads import num_threads, set_num_threads
-from etsplat.geometry.icosphere import icosphere
-from etsplat.io.mesh_files import MeshFile
 from etsplat.tasks.judgement import CONTRADICTED
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 from helpers.painting import painted_pictures
@@ -68,32 +62,3 @@ def test_a_cut_that_photos_contradict_as_much_is_not_taken(monkeypatch: pytest.M
         started = starts.make_start(None, views, CONFIG)
         assert started.cut is False
         assert started.contradicted == pytest.approx(plain.contradicted, abs=0.01)
-
-
-def test_a_cut_breaks_no_thin_part_that_the_hull_has(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A ball with a thin ring around it; the cut's caves have so many faces that the grid would be coarser by them."""
-    ring = trimesh.creation.torus(1.0, 0.045, major_sections=64, minor_sections=8)
-    ball, faces = icosphere(3)
-    vertices = torch.cat([0.7 * ball, torch.from_numpy(ring.vertices.copy()).float()])
-    mesh = MeshFile(vertices, torch.cat([faces, len(ball) + torch.from_numpy(ring.faces.copy())]))
-    views = photograph(mesh, 128, 128, supersampling=1)
-    config = CONFIG.changed({"start.hull_faces": 6000, "max_faces": 40_000})
-
-    def opened(views: Dataset, vertices: torch.Tensor, faces: torch.Tensor) -> Opened:
-        """As if the caves were what photos show."""
-        caves = float((vertices.norm(dim=1) < 0.5).any())
-        return Opened(vertices, faces, 0, 0.1 - 0.09 * caves, 0.0, 1.0)
-
-    def free(points: torch.Tensor) -> torch.Tensor:
-        return torch.minimum(0.55 - points.norm(dim=1), 0.1 + 0.2 * (20 * points).sin().prod(dim=1))
-
-    monkeypatch.setattr(starts, "_opened", opened)
-    monkeypatch.setattr(starts, "seen_through", lambda *_: free)
-    hull, photos = starts.plain_hull(views, config), photos_of(views)
-    cells, *coarse = HullGrid(views, free=free).of_about(hull.wanted)
-    assert cells < hull.cells
-    assert hull.uncovered < 0.001
-    assert starts._uncovered(photos, *coarse) > 0.05
-    started = starts.make_start(None, views, config)
-    assert started.cut
-    assert starts._uncovered(photos, *started.mesh.surface()) < 0.002

@@ -44,7 +44,7 @@ _BISECTIONS = 8
 
 
 def visual_hull(
-    dataset: Dataset, faces: int, *, radius: float = 1.0
+    dataset: Dataset, faces: int, *, radius: float = 1.0, free: Distance | None = None
 ) -> tuple[Float[Tensor, "V 3"], Int64[Tensor, "F 3"]]:
     """The hull of the training views' silhouettes (alpha 0.5) within a ball around the origin, as a closed manifold.
 
@@ -55,62 +55,35 @@ def visual_hull(
         dataset: photos with alpha around an object at the origin, as `bounding_sphere` and `renormalized` place it.
         faces: about how many are wanted.
         radius: of the ball.
+        free: positive at points that are cut away from the hull; None for the hull as it is.
 
     Returns:
         vertices (V, 3) float32 and faces (F, 3) int64, counter-clockwise seen from outside; (0, 3) both if the
         silhouettes have no point in common.
     """
-    return HullGrid(dataset, radius).of_about(faces)[1:]
+    outside = outside_hull(dataset)
 
+    def beyond(points: Tensor) -> Tensor:
+        return outside(points) if free is None else torch.maximum(outside(points), free(points))
 
-class HullGrid:
-    """The visual hull on grids as fine as one likes.
+    def distance(points: np.ndarray) -> np.ndarray:
+        chunks = torch.from_numpy(points).float().split(_CHUNK)
+        found = torch.cat([beyond(chunk) for chunk in chunks]).double().numpy()
+        return np.maximum(found, np.linalg.norm(points, axis=1) - radius)
 
-    Args:
-        dataset: as in `visual_hull`.
-        radius: likewise.
-        free: positive at points that are cut away from the hull; None for the hull as it is.
-    """
-
-    def __init__(self, dataset: Dataset, radius: float = 1.0, free: Distance | None = None) -> None:
-        self._outside, self._radius, self._free = outside_hull(dataset), radius, free
-
-    def of_about(self, faces: int) -> tuple[int, Float[Tensor, "V 3"], Int64[Tensor, "F 3"]]:
-        """The cells at a side of the grid whose surface has about so many faces, and that surface."""
-        cells = _FIRST_CELLS
-        surface = self._contoured(cells)
-        for _ in range(_TRIES - 1):
-            found = len(surface[1])
-            if found == 0 or abs(found - faces) <= NEAR * faces:
-                break
-            wanted = round(cells * (faces / found) ** 0.5)
-            if cells == (cells := min(max(wanted, _FIRST_CELLS // 2), _MOST_CELLS)):
-                break
-            surface = self._contoured(cells)
-        return cells, *_cleaned(*surface)
-
-    def surface(self, cells: int) -> tuple[Float[Tensor, "V 3"], Int64[Tensor, "F 3"]]:
-        """What a grid of so many cells at a side shows, as `visual_hull` returns it."""
-        return _cleaned(*self._contoured(cells))
-
-    def _contoured(self, cells: int) -> tuple[np.ndarray, np.ndarray]:
-        cell = 2 * self._radius / (cells - 2 * _MARGIN)
+    cells = _FIRST_CELLS
+    vertices, triangles = np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)
+    for _ in range(_TRIES):
+        cell = 2 * radius / (cells - 2 * _MARGIN)
         corner = -0.5 * cell * cells
         lower, counts = (corner, corner, corner), (cells, cells, cells)
-        return dual_contour(self._distance, lower, cell, counts, bisections=_BISECTIONS)
-
-    def _distance(self, points: np.ndarray) -> np.ndarray:
-        chunks = torch.from_numpy(points).float().split(_CHUNK)
-        found = torch.cat([self._beyond(chunk) for chunk in chunks]).double().numpy()
-        return np.maximum(found, np.linalg.norm(points, axis=1) - self._radius)
-
-    def _beyond(self, points: Tensor) -> Tensor:
-        outside = self._outside(points)
-        return outside if self._free is None else torch.maximum(outside, self._free(points))
-
-
-def _cleaned(vertices: np.ndarray, faces: np.ndarray) -> tuple[Tensor, Tensor]:
-    return without_specks(*taken_apart(torch.from_numpy(vertices).float(), torch.from_numpy(faces)))
+        vertices, triangles = dual_contour(distance, lower, cell, counts, bisections=_BISECTIONS)
+        if len(triangles) == 0 or abs(len(triangles) - faces) <= NEAR * faces:
+            break
+        wanted = round(cells * (faces / len(triangles)) ** 0.5)
+        if cells == (cells := min(max(wanted, _FIRST_CELLS // 2), _MOST_CELLS)):
+            break
+    return without_specks(*taken_apart(torch.from_numpy(vertices).float(), torch.from_numpy(triangles)))
 
 
 def outside_hull(dataset: Dataset) -> Distance:

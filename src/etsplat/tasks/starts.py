@@ -17,7 +17,7 @@ from etsplat.data.hollows import Opened, open_hollows
 from etsplat.data.lids import without_lids
 from etsplat.data.plain_sides import with_flat_sides
 from etsplat.data.silhouettes import silhouette, touches_border
-from etsplat.data.visual_hull import NEAR, HullGrid, visual_hull
+from etsplat.data.visual_hull import NEAR, visual_hull
 from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.parts import Shape, shape_of
 from etsplat.geometry.topology import MeshTopology
@@ -64,14 +64,12 @@ class Hull(NamedTuple):
         vertices: (V, 3), in the unit frame.
         faces: (F, 3).
         wanted: about how many faces it should have.
-        cells: at a side of the grid that it was found on.
         uncovered: the part of silhouettes that is more than a pixel beside what it covers, in the mean.
     """
 
     vertices: Tensor
     faces: Tensor
     wanted: int
-    cells: int
     uncovered: float
 
 
@@ -132,8 +130,8 @@ def _explained(views: Dataset, radius: float) -> bool:
 
 def _carved(views: Dataset, faces: int, radius: float) -> Hull:
     """A hull of about so many faces; where the silhouettes have no point in common it has none, and covers nothing."""
-    cells, *surface = HullGrid(views, radius).of_about(faces)
-    return Hull(*surface, faces, cells, _uncovered(photos_of(views), *surface) if len(surface[1]) else 1.0)
+    surface = visual_hull(views, faces, radius=radius)
+    return Hull(*surface, faces, _uncovered(photos_of(views), *surface) if len(surface[1]) else 1.0)
 
 
 def _uncovered(photos: list[Photo], vertices: Tensor, faces: Tensor) -> float:
@@ -213,16 +211,13 @@ def _cut_open(
     No cut is taken that leaves much of the silhouettes uncovered.
     """
     free, best, photos = seen_through(views, hull.vertices, config, device), opened, photos_of(views)
-    most = hull.uncovered + _RIMS
+    most, radius = hull.uncovered + _RIMS, config.start.radius
     for margin in _MARGINS:
-        grid = HullGrid(views, config.start.radius, lambda points, margin=margin: free(points) - margin)
-        cells, vertices, faces = grid.of_about(hull.wanted)
+        vertices, faces = visual_hull(views, hull.wanted, radius=radius, free=lambda p, margin=margin: free(p) - margin)
         if len(faces) == 0:
             continue
-        if cells < hull.cells and _uncovered(photos, vertices, faces) > most:  # so coarse a grid breaks what is thin
-            vertices, faces = grid.surface(hull.cells)
         found = _opened(views, vertices, faces)
-        better = found.contradicted < best.contradicted and len(found.faces) <= config.max_faces
+        better = found.contradicted < best.contradicted
         if better and _uncovered(photos, found.vertices, found.faces) <= most:
             best = found
         if best.contradicted <= CONTRADICTED:
@@ -249,8 +244,7 @@ def plain_hull(views: Dataset, config: ReconstructConfig) -> Hull:
     if len(hull.faces) == 0:
         raise InputError(
             "start.shape: the masks have no point in common, so there is no hull; check that masks are white inside the"
-            " object, that poses and images belong together, and that no mask is empty, as that of a flat sheet is from"
-            " its side: give it a thickness"
+            " object and that poses and images belong together"
         )
     more = min(2 * wanted, round(config.max_faces / (1 + NEAR)))
     if hull.uncovered <= _UNCOVERED or more <= wanted:
