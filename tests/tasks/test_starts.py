@@ -205,3 +205,11 @@ def test_a_hull_needs_masks(pebble: MeshFile, tmp_path: Path) -> None:
     config = SHORT.changed({"start.shape": "hull"})
     with pytest.raises(InputError, match="needs masks"):
         reconstruct(replace(views, images=StoredPictures(opaque)), tmp_path, config)
+
+
+def test_a_flat_mesh_is_refused_with_what_to_do() -> None:
+    """Seen from its side it leaves no mask."""
+    square = torch.tensor([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
+    sheet = MeshFile(square, torch.tensor([[0, 1, 2], [0, 2, 3]]))
+    with pytest.raises(InputError, match=r"no flat sheet.*give it a thickness"):
+        plain_hull(photograph(sheet, 32, 32, supersampling=1), ReconstructConfig.tiny())

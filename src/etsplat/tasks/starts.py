@@ -244,7 +244,8 @@ def plain_hull(views: Dataset, config: ReconstructConfig) -> Hull:
     if len(hull.faces) == 0:
         raise InputError(
             "start.shape: the masks have no point in common, so there is no hull; check that masks are white inside the"
-            " object and that poses and images belong together"
+            " object, that poses and images belong together, and that the object is no flat sheet, whose mask is empty"
+            " from its side: give it a thickness"
         )
     more = min(2 * wanted, round(config.max_faces / (1 + NEAR)))
     if hull.uncovered <= _UNCOVERED or more <= wanted:
