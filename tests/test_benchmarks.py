@@ -369,16 +369,22 @@ def test_stages_of_a_run_exist_and_each_second_is_counted_once(monkeypatch):
     not Path("/proc/self/stat").exists(), reason="asks the state of a process in /proc, which is not here"
 )
 def test_the_second_copy_rests_in_quiet_turns_and_draws_in_the_others():
-    states = []
+    expected, found = [True, False, True, False], []
 
     with contention.second_copy("sphere1", 1) as copy:
 
+        def halted():
+            return Path(f"/proc/{copy.pid}/stat").read_text().rpartition(")")[2].split()[0] == "T"
+
         def turn():
-            time.sleep(0.05)
-            states.append(Path(f"/proc/{copy.pid}/stat").read_text().rpartition(")")[2].split()[0])
-            return [float(len(states))]
+            """The copy changes when it is scheduled next."""
+            last = time.monotonic() + 20
+            while halted() != expected[len(found)] and time.monotonic() < last:
+                time.sleep(0.01)
+            found.append(halted())
+            return [float(len(found))]
 
         quiet, beside = contention.quiet_and_beside(copy, 2, {"turn": turn})["turn"]
-    assert states == ["T", "R", "T", "R"]
+    assert found == expected
     assert (quiet, beside) == (2.0, 3.0)  # medians of 1, 3 and 2, 4
     assert copy.returncode is not None
