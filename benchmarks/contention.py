@@ -4,9 +4,9 @@ python -m benchmarks.contention                       sphere6 on one thread and 
 python -m benchmarks.contention --scene sphere4 --threads 2 --rounds 20
 
 The copy is another process with as many threads, which draws all the time; it is halted and goes on in turn, so that
-both see the same moods of the machine. Where the two have more threads than there are cores each has its share of
-these, which is set against a quiet machine beside the times themselves: 1.00 is a fair share, and more is what
-contention costs. The prototype (`prototype.py`), where it is there, is measured beside the same copy.
+both see the same moods of the machine. Where the two have more threads than there are cores, a call takes longer by
+that alone: 1.00 of a fair share is so much, and what is above it contention costs. The prototype (`prototype.py`),
+where it is there, is measured beside the same copy.
 """
 
 import argparse
@@ -29,13 +29,14 @@ from etsplat import _native
 READY = "drawing"
 
 
-def draw_for_ever(scene: str, threads: int) -> None:
-    """The second copy; ends when it is killed."""
+def draw_on(scene: str, threads: int) -> None:
+    """The second copy: draws until the process that started it is gone, or kills it."""
+    parent = os.getppid()
     use(threads, _native.available_instruction_sets()[0])
     loaded = scenes.load(scene)
     repetition(loaded, Timings())
     print(READY, flush=True)
-    while True:
+    while os.getppid() == parent:
         repetition(loaded, Timings())
 
 
@@ -75,7 +76,8 @@ def main() -> None:
     parser.add_argument("--copy", action="store_true", help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.copy:
-        draw_for_ever(options.scene, options.threads[0])
+        draw_on(options.scene, options.threads[0])
+        return
     console = Console(width=150)
     console.print(f"{cpu_model()}, {cores()} cores, commit {commit()}", highlight=False)
     scene, prototype = scenes.load(options.scene), Prototype()

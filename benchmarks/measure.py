@@ -91,6 +91,9 @@ def yardstick(scene: Scene, threads: int, instruction_set: str, prototype: Proto
             return plain, partial(turn_milliseconds, load(scene.name.removesuffix(ending)))
     if prototype.program is not None and scene.name.startswith("sphere") and instruction_set == "avx512":
         return "prototype", lambda: prototype.milliseconds(int(scene.name[6:]), threads)
+    widest = _native.available_instruction_sets()[0]
+    if instruction_set != widest:
+        return widest, partial(turn_on, scene, widest, instruction_set)
     return None
 
 
@@ -105,6 +108,15 @@ def one_turn(scene: Scene) -> Timings:
 def turn_milliseconds(scene: Scene) -> list[float]:
     """Of each repetition of one turn."""
     return one_turn(scene).total
+
+
+def turn_on(scene: Scene, instruction_set: str, usual: str) -> list[float]:
+    """The same on another instruction set than the usual one."""
+    _native.set_instruction_set(instruction_set)
+    try:
+        return turn_milliseconds(scene)
+    finally:
+        _native.set_instruction_set(usual)
 
 
 def measure(

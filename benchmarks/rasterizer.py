@@ -7,6 +7,7 @@ Spheres are compared with the prototype (`prototype.py`), where that is there: i
 run in turn with the engine, so that both see the same moods of the machine. A turn is three timed repetitions of each.
 Scenes with colours at the vertices ("sphere6-vertex") are compared with themselves under constant colours, in turn too,
 and those with a kernel that is registered from Python ("sphere6-registered") with themselves under the built-in one.
+What else is drawn on a narrower instruction set is compared with itself on the widest.
 Counters, memory and the serial part are described in research/performance.md.
 """
 

@@ -28,6 +28,7 @@ from benchmarks import (
     gpu_scenes,
     gpu_timing,
     gpu_train,
+    measure,
     opaque_errors,
     opaque_mesh,
     peers,
@@ -38,6 +39,7 @@ from benchmarks import (
     workers,
 )
 from benchmarks.measure import native_state
+from benchmarks.prototype import Prototype
 from etsplat import _native, rasterize
 from etsplat.core.cameras import Cameras
 from etsplat.data.agreement import Photo
@@ -388,3 +390,22 @@ def test_the_second_copy_rests_in_quiet_turns_and_draws_in_the_others():
     assert found == expected
     assert (quiet, beside) == (2.0, 3.0)  # medians of 1, 3 and 2, 4
     assert copy.returncode is not None
+
+
+@pytest.mark.skipif(len(_native.available_instruction_sets()) < 2, reason="the processor has one instruction set alone")
+def test_a_narrower_instruction_set_is_compared_with_the_widest_in_turn(monkeypatch):
+    widest, *_, narrow = _native.available_instruction_sets()
+    used = []
+    monkeypatch.setattr(measure, "repetition", lambda scene, timings: used.append(_native.instruction_set()))
+    scene, before = scenes.load("sphere1"), _native.instruction_set()
+    _native.set_instruction_set(narrow)
+    try:
+        name, turn = measure.yardstick(scene, 1, narrow, Prototype(wanted=False))
+        turn()
+        measure.one_turn(scene)
+    finally:
+        _native.set_instruction_set(before)
+    assert name == widest
+    assert set(used[: len(used) // 2]) == {widest}
+    assert set(used[len(used) // 2 :]) == {narrow}
+    assert measure.yardstick(scene, 1, widest, Prototype(wanted=False)) is None
