@@ -16,6 +16,7 @@ from rich.table import Table
 
 import etsplat
 from etsplat.core.cameras import Cameras, intrinsics, look_at
+from etsplat.core.soup_numbers import SoupNumbers
 from etsplat.engines.threads import num_threads, one_torch_thread, set_num_threads
 from etsplat.geometry.topology import MeshTopology
 from etsplat.ops.adam import Adam
@@ -163,7 +164,7 @@ def soup_losses(size: int, vertices: torch.Tensor, faces: torch.Tensor) -> list[
     def activation() -> None:
         logits.grad = None
         with one_torch_thread():
-            opacities, _ = soup_activation(corners, logits, logits.detach(), (0.0, math.inf), camera)
+            opacities, _ = soup_activation(corners, logits, logits.detach(), SoupNumbers(), camera)
             opacities.sum().backward()
 
     pixels, triangles = f"{size} x {size}", f"{len(faces):,} triangles"

@@ -7,8 +7,9 @@ namespace etsplat {
 
 constexpr float kSoupSigmaFloor = 0.01f;
 
-struct SoupLimits {
-    float opacity_floor, sigma_ceiling;
+// `dropout`: the share of the triangles that a draw leaves out by chance; `draw`: its number, a whole one below 2^24.
+struct SoupNumbers {
+    float opacity_floor, sigma_ceiling, dropout, draw;
 };
 
 // Pixels: of the incircle's radius, and of the distance from the mean of the vertices to the farthest.
@@ -22,18 +23,31 @@ struct Activated {
 
 ETSPLAT_FN float natural_exp(float x) { return vexp2(x * 1.4426950408889634f); }
 
-ETSPLAT_FN Activated activate(float logit, float raw, SoupLimits limits) {
+ETSPLAT_FN Activated activate(float logit, float raw, SoupNumbers numbers) {
     const float sigmoid = 1.0f / (1.0f + natural_exp(-logit));
-    return {limits.opacity_floor + (1.0f - limits.opacity_floor) * sigmoid,
-            vmin(kSoupSigmaFloor + natural_exp(raw), limits.sigma_ceiling)};
+    return {numbers.opacity_floor + (1.0f - numbers.opacity_floor) * sigmoid,
+            vmin(kSoupSigmaFloor + natural_exp(raw), numbers.sigma_ceiling)};
 }
 
 // From gradients by the activated numbers to those by the parameters; nothing passes the ceiling.
-ETSPLAT_FN Activated activate_backward(float logit, float raw, SoupLimits limits, Activated grad) {
+ETSPLAT_FN Activated activate_backward(float logit, float raw, SoupNumbers numbers, Activated grad) {
     const float sigmoid = 1.0f / (1.0f + natural_exp(-logit)), sharpness = natural_exp(raw);
-    const bool cut = kSoupSigmaFloor + sharpness > limits.sigma_ceiling;
-    return {grad.opacity * (1.0f - limits.opacity_floor) * sigmoid * (1.0f - sigmoid),
+    const bool cut = kSoupSigmaFloor + sharpness > numbers.sigma_ceiling;
+    return {grad.opacity * (1.0f - numbers.opacity_floor) * sigmoid * (1.0f - sigmoid),
             cut ? 0.0f : grad.sigma * sharpness};
+}
+
+// Murmur3's finalizer: each bit of the result depends on all of x.
+ETSPLAT_FN unsigned mixed_bits(unsigned x) {
+    x = (x ^ (x >> 16)) * 0x85ebca6bu;
+    x = (x ^ (x >> 13)) * 0xc2b2ae35u;
+    return x ^ (x >> 16);
+}
+
+// Whether triangle n is left out by chance: another choice for each draw, and the same wherever it is made.
+ETSPLAT_FN bool is_dropped(unsigned n, SoupNumbers numbers) {
+    const unsigned bits = mixed_bits(n ^ mixed_bits(static_cast<unsigned>(numbers.draw)));
+    return static_cast<float>(bits >> 8) * 0x1p-24f < numbers.dropout;
 }
 
 // Whether the projected triangle is too small, its incircle's radius being 2 area / perimeter, or too large. Vertices behind

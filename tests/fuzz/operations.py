@@ -169,7 +169,10 @@ def _activations() -> list[Arguments]:
     logits, raw = torch.randn(2, 9, generator=RNG)
     corners = torch.randn(9, 3, 3, generator=RNG)
     tensors = {"vertices": corners, "opacity_logits": logits, "sigma_raw": raw}
-    return [{**tensors, "view": view, "limits": (0.1, 1.0), "smallest": 0.5, "largest": 50.0} for view in (True, False)]
+    return [
+        {**tensors, "view": view, "numbers": (0.1, 1.0, 0.2, 3.0), "smallest": 0.5, "largest": 50.0}
+        for view in (True, False)
+    ]
 
 
 def _sum(first: Any, second: Any, weight: Any, scale: Any) -> Any:

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from etsplat import Cameras, TriangleMesh, TriangleSoup, intrinsics, look_at, rasterize, rasterize_antialiased
+from etsplat.core.soup_numbers import SoupNumbers
 from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.topology import MeshTopology
 from etsplat.ops.mesh_energies import mesh_energies
@@ -116,7 +117,9 @@ def _soup_activation(rng: torch.Generator, engine: str) -> Case:
     camera = Cameras(torch.eye(4)[None], intrinsics(50, 32, 32)[None], 32, 32)
     leaves = {"opacity_logits": logits, "sigma_raw": raw}
     corners = torch.randn(30, 3, 3, generator=rng)
-    return case(engine, leaves, soup_activation, vertices=corners, limits=(0.1, 1.0), camera=camera)
+    return case(
+        engine, leaves, soup_activation, vertices=corners, numbers=SoupNumbers(0.1, 1.0, 0.2, 3.0), camera=camera
+    )
 
 
 def _soup_colors(rng: torch.Generator, engine: str) -> Case:

@@ -256,6 +256,35 @@ def test_a_schedule_sets_values_and_appearance(object_views: Dataset) -> None:
     assert float(soup.drawn_opacities.detach().min()) > 0.4
 
 
+def test_steps_leave_out_triangles_and_nothing_else_does(object_views: Dataset) -> None:
+    """Other ones in each step, the same in a second run; between steps, and where a run is watched, all are drawn."""
+
+    def fitted(dropout: float) -> tuple[TriangleSoup, list[int], list[float]]:
+        soup, seen, between = a_soup(), list[int](), list[float]()
+
+        def look(iteration: int) -> Any:
+            return replace(soup.appearance, dropout=dropout, draw=iteration)
+
+        class Counting(Strategy):
+            outputs = ("statistics",)
+
+            def observe(self, seen_now: Any, *, epoch_starts: bool) -> None:
+                seen.append(int((seen_now.statistics.screen_size > 0).sum()))
+                between.append(soup.appearance.dropout)
+
+        schedule = Schedule(TriangleSoup.RATES, appearance=look)
+        Trainer(soup, object_views, soup_objective(), Counting(), schedule=schedule, batch=1).fit(4)
+        return soup, seen, between
+
+    all_drawn, whole, _ = fitted(0.0)
+    (first, fewer, between), (second, _, _) = fitted(0.5), fitted(0.5)
+    assert between == [0.0] * 4
+    assert all(0 < some < every for some, every in zip(fewer, whole, strict=True))
+    assert torch.equal(first.vertices, second.vertices)
+    assert not torch.equal(first.vertices, all_drawn.vertices)
+    assert first.appearance.dropout == first.finished().appearance.draw == 0
+
+
 def test_photos_are_halved_when_the_schedule_says(object_views: Dataset) -> None:
     """Pictures of the first two steps have half the size."""
     widths: list[int] = []

@@ -244,10 +244,11 @@ def test_few_pixels_carry_few_triangles(capture: Dataset) -> None:
     """One for so many of the training photos' pixels, and a note says so; the test photos do not count."""
     pixels = sum(capture.images.sizes[index][0] * capture.images.sizes[index][1] for index in capture.train)
     config = TrainConfig.quick()
-    assert pixels / 75 < config.max_triangles
-    assert triangle_limit(capture, config) == int(pixels / 75)
+    assert pixels / 45 < config.max_triangles
+    assert triangle_limit(capture, config) == int(pixels / 45)
     notes = check_train(capture, config, config.iterations, torch.device("cpu"))
-    assert any(f"few pixels: at most {int(pixels / 75):,} triangles, not 100,000" in note for note in notes)
+    assert any(f"few pixels: at most {int(pixels / 45):,} triangles, not 100,000" in note for note in notes)
+    assert triangle_limit(capture, replace(config, finish="opaque")) == int(pixels / 75)
     assert triangle_limit(capture, replace(config, pixels_per_triangle=None)) == 100_000
     assert triangle_limit(capture, replace(config, max_triangles=5)) == 5
 

@@ -37,6 +37,11 @@ class Appearance:
         """All but the numbers: what changes the kernels that are launched, and so seldom. Comparable."""
         return self
 
+    @property
+    def whole(self: A) -> A:
+        """The same with all that single steps leave out by chance: what is looked at between steps."""
+        return self
+
     def on_device(self: A, numbers: Float[Tensor, " K"]) -> A:
         """The same with its `numbers` read from device memory, for steps that the host does not look at."""
         return self

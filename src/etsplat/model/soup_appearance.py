@@ -10,6 +10,7 @@ from torch import Tensor
 
 from etsplat.core.harmonics import MAX_DEGREE
 from etsplat.core.kernels import DISTANCES
+from etsplat.core.soup_numbers import SoupNumbers
 from etsplat.io.json_text import parse_json
 from etsplat.model.model import Appearance
 
@@ -36,7 +37,9 @@ class SoupAppearance(Appearance):
         background: display colour behind them where nobody names another.
         opacity_floor: opacities are squeezed into [floor, 1].
         sigma_ceiling: softness is cut here.
-        limits: (2,) floor and ceiling in device memory, in the place of the two above, within a queued step.
+        dropout: so large a share of the triangles is left out by chance in steps of a training, and only there.
+        draw: the number of the draw that says which; of the iteration.
+        on_device_numbers: (4,) the four above in device memory, in their place, within a queued step.
 
     Example:
         >>> etsplat.SoupAppearance(kernel="bilateral", background=(1.0, 1.0, 1.0)).distance
@@ -53,16 +56,18 @@ class SoupAppearance(Appearance):
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     opacity_floor: float = 0.0
     sigma_ceiling: float = float("inf")
-    limits: Float[Tensor, "2"] | None = field(default=None, compare=False, repr=False)
+    dropout: float = 0.0
+    draw: int = 0
+    on_device_numbers: Float[Tensor, "4"] | None = field(default=None, compare=False, repr=False)
 
     @property
-    def numbers(self) -> tuple[float, float]:
-        """Opacity floor and sigma ceiling, which may change at every step."""
-        return self.opacity_floor, self.sigma_ceiling
+    def numbers(self) -> SoupNumbers:
+        """What may change at every step."""
+        return SoupNumbers(self.opacity_floor, self.sigma_ceiling, self.dropout, float(self.draw))
 
     def to_json(self) -> str:
-        """For files; `limits` are not in it, nor is what is infinite, as JSON has no such numbers."""
-        values = {entry.name: getattr(self, entry.name) for entry in fields(self) if entry.name != "limits"}
+        """For files; what is of steps alone is not in it, nor is what is infinite, as JSON has no such numbers."""
+        values = {entry.name: getattr(self, entry.name) for entry in fields(self) if entry.name in _SOUND}
         return json.dumps({name: value for name, value in values.items() if value != float("inf")})
 
     @staticmethod
@@ -85,12 +90,17 @@ class SoupAppearance(Appearance):
 
     @property
     def structure(self) -> "SoupAppearance":
-        """The same without floor and ceiling."""
-        return replace(self, opacity_floor=0.0, sigma_ceiling=float("inf"), limits=None)
+        """The same without its numbers."""
+        return replace(self.whole, opacity_floor=0.0, sigma_ceiling=float("inf"), on_device_numbers=None)
 
-    def on_device(self, numbers: Float[Tensor, "2"]) -> "SoupAppearance":
-        """The same with floor and ceiling read from device memory."""
-        return replace(self, limits=numbers)
+    @property
+    def whole(self) -> "SoupAppearance":
+        """The same with all triangles."""
+        return replace(self, dropout=0.0, draw=0)
+
+    def on_device(self, numbers: Float[Tensor, "4"]) -> "SoupAppearance":
+        """The same with its numbers read from device memory."""
+        return replace(self, on_device_numbers=numbers)
 
 
 def _number(low: float, high: float) -> Callable[[Any], bool]:

@@ -277,7 +277,7 @@ class TriangleSoup(Model):
             self.vertices,
             self.opacity_logits,
             self.sigma_raw,
-            look.numbers if look.limits is None else look.limits,
+            look.numbers if look.on_device_numbers is None else look.on_device_numbers,
             cameras if culls else None,
             smallest=SMALLEST_INRADIUS if look.cull_small else 0.0,
             largest=look.cull_large * max(cameras.width, cameras.height),

@@ -81,6 +81,7 @@ class Stepper(Generic[M]):
         self._background, self._update = background, update
         self.sampler = ViewSampler(dataset.train, generator)
         parameters = model.parameters()
+        _check_names(schedule, model)
         self._device = next(iter(parameters.values())).device
         self.adam = Adam(parameters, self._rates(1))
         self._halvings = -1
@@ -137,8 +138,8 @@ class Stepper(Generic[M]):
             self.queue.restart()
 
     def arrive(self, iteration: int) -> None:
-        """Lets all that is scheduled be as it is at an iteration."""
-        self._model.appearance = self._appearance(iteration)
+        """Lets all that is scheduled be as it is after an iteration."""
+        self._model.appearance = self._appearance(iteration).whole
         if iteration:
             self._set(self._values(iteration))
         halvings = self._schedule.halvings(max(1, iteration))
@@ -152,7 +153,7 @@ class Stepper(Generic[M]):
         """How the model is drawn after an iteration, which photos it is fitted to, and where photos are seen from."""
         values = self._values(iteration) if iteration else {}
         halvings = self._schedule.halvings(max(1, iteration))
-        return self._appearance(iteration), halvings, values, self._cameras.stage(iteration)
+        return self._appearance(iteration).whole, halvings, values, self._cameras.stage(iteration)
 
     def alike_until(self, iteration: int) -> int:
         """The last iteration, from this one on, before steps are of another kind; NEVER if they stay as they are."""
@@ -193,7 +194,9 @@ class Stepper(Generic[M]):
             alone = partial(self._of_parameters, weights, scale, decayed=decayed)
             apart = Apart(self._model.COLORED, alone if separable else None)
         indices, optimizers = [c.view for c in chosen], [self.adam, self._exposure.adam]
+        self._model.appearance = self._appearance(iteration)
         loss, seen = shared_gradients(group, indices, gradients, optimizers, self._strategy.outputs, apart)
+        self._model.appearance = self._model.appearance.whole
         if self._update is None:
             self.adam.step(self._objective.decays(self._model, weights, scale))
         else:
@@ -367,3 +370,14 @@ class Stepper(Generic[M]):
     def _set(self, values: dict[str, float] | dict[str, Tensor]) -> None:
         for name, value in values.items():
             self._model.parameters()[name].fill_(value)
+
+
+def _check_names(schedule: Schedule, model: Model) -> None:
+    """Raises ValueError where a schedule names what such models never have, or has no rate for what this one has."""
+    parameters = list(model.parameters())
+    named = {"rates": schedule.rates, "values": schedule.values, "calm_from": schedule.calm_from}
+    for what, given in named.items():
+        if unknown := sorted(set(given) - {*model.RATES, *parameters}):
+            raise ValueError(f"schedule.{what} names {', '.join(unknown)}; the model has {', '.join(parameters)}")
+    if missing := [name for name in parameters if name not in schedule.rates]:
+        raise ValueError(f"schedule.rates has none for {', '.join(missing)}: add model.rates, or 0 for what stays")

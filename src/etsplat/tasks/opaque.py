@@ -91,7 +91,7 @@ def start_mesh(soup: TriangleSoup, exposure: Exposure, capture: Dataset, config:
         capture,
         iterations=mesh_steps(config),
         unit=shown_across(soup, capture),
-        carried=triangle_limit(capture, config),
+        carried=_carried(capture, config),
         max_faces=config.max_triangles,
         around=around,
         background=background_of(config),
@@ -151,6 +151,7 @@ def towards_opaque(capture: Dataset, config: TrainConfig) -> TrainConfig:
     """Settings of the soup that becomes opaque beside a soft one. The mesh has no colours for each direction."""
     usual = TrainConfig.of(config.preset, config.scene_type)
     without = (
+        "drawing.dropout",
         "loss.lambda_opacity",
         "loss.lambda_harmonics",
         "densification.replace_dead",
@@ -164,9 +165,14 @@ def towards_opaque(capture: Dataset, config: TrainConfig) -> TrainConfig:
             "refine_cameras": "off",  # the capture has refined ones by now
             "drawing.sh_degree": 0,
             "iterations": max(1, round(SOUP_SHARE * config.iterations)),
-            "max_triangles": max(1, round(SOUP_TRIANGLES * triangle_limit(capture, config))),
+            "max_triangles": max(1, round(SOUP_TRIANGLES * _carried(capture, config))),
         }
     )
+
+
+def _carried(capture: Dataset, config: TrainConfig) -> int:
+    """How many opaque triangles the pixels of the photos carry."""
+    return triangle_limit(capture, replace(config, finish="opaque"))
 
 
 def opaque_mesh(

@@ -11,11 +11,16 @@ from etsplat.tasks.train_config import TrainConfig
 _FEWEST = 5000
 """Iterations that are left of a run that had more: shapes and outlines need them however few the faces are."""
 
+_OPAQUE = 5 / 3
+"""So many times as many pixels as a soft triangle an opaque one needs: no others lie over it, and in training none is
+left out by chance."""
+
 
 def triangle_limit(capture: Dataset, config: TrainConfig) -> int:
     """How many triangles there may be: `max_triangles`, or fewer where the training photos have few pixels."""
     pixels = sum(width * height for width, height in (capture.images.sizes[index] for index in capture.train))
-    return _carried(pixels, config.pixels_per_triangle, config.max_triangles)
+    shared = 1.0 if config.finish == "none" else _OPAQUE
+    return _carried(pixels / shared, config.pixels_per_triangle, config.max_triangles)
 
 
 def within_pixels(

@@ -1,7 +1,7 @@
 """What fits a soup to photos, as settings say: the start, L_nvs, Adam's rates, densification and pruning."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import replace
 from functools import partial
 
@@ -38,6 +38,9 @@ SETTLED = 0.1
 LEAST_EVERY = 30
 """Steps between edits of a short run, or a tenth of it if that is less: in fewer, triangles that are of use are still
 as faint as those that are not, and all would die (research/ablations.md)."""
+
+MOST_DROPPED, DRAWS = 0.1, 2**24
+"""The largest share of dropout, and how many different draws there are."""
 
 DEPTH_UNTIL = 0.5
 """Up to this part of a run depth maps count; then photos alone, so that what is wrong with maps costs no picture."""
@@ -114,7 +117,7 @@ def make_trainer(
         capture,
         _objective(config, len(capture.train), spared, depths, squared=squared),
         _strategy(config, triangle_limit(capture, config), spared),
-        schedule=_schedule(config, vertex_unit(soup, capture, config)),
+        schedule=_schedule(config, vertex_unit(soup, capture, config), len(capture.train), soup.parameters()),
         batch=config.batch,
         background=None if config.background == "random" else background_of(config),
         exposure=exposure if part is None else part.exposures(capture),
@@ -196,7 +199,7 @@ def shown_across(soup: TriangleSoup, capture: Dataset) -> float:
     return shown_width(capture, points) or 1.0
 
 
-def _schedule(config: TrainConfig, unit: float) -> Schedule:
+def _schedule(config: TrainConfig, unit: float, photos: int, parameters: Collection[str]) -> Schedule:
     length, given = config.iterations, config.optimizer
     faster = 1.0 if given.lr_vertices_length is None else math.sqrt(given.lr_vertices_length / length)
 
@@ -217,11 +220,12 @@ def _schedule(config: TrainConfig, unit: float) -> Schedule:
         "sh_rest": settling(given.lr_sh_rest),
         "rest_dc": settling(given.lr_sh_dc),
     }
-    return Schedule(rates, appearance=partial(_appearance, config))
+    rates = {name: rates[name] for name in parameters}
+    return Schedule(rates, appearance=partial(_appearance, config, photos))
 
 
-def _appearance(config: TrainConfig, iteration: int) -> SoupAppearance:
-    """How the soup is drawn at an iteration: bands of the colours come one by one; the opaque finish."""
+def _appearance(config: TrainConfig, photos: int, iteration: int) -> SoupAppearance:
+    """How the soup is drawn at an iteration: bands of the colours come one by one; dropout, or the opaque finish."""
     plain = SoupAppearance(
         kernel=config.kernel,
         distance=config.distance,
@@ -233,7 +237,7 @@ def _appearance(config: TrainConfig, iteration: int) -> SoupAppearance:
         background=background_of(config),
     )
     if config.finish == "none":
-        return plain
+        return replace(plain, dropout=min(MOST_DROPPED, config.drawing.dropout / photos), draw=iteration % DRAWS)
     opaque = ramp(iteration, 0, round(OPAQUE_AT * config.iterations))
     sharp = ramp(iteration, round(SHARP_FROM * config.iterations), round(SHARP_AT * config.iterations))
     ceiling = FIRST_CEILING * (FINAL_CEILING / FIRST_CEILING) ** sharp

@@ -32,6 +32,9 @@ class Drawing:
     """Leave out triangles that reach farther than this from their middle, in units of the photo's longer side."""
     sh_degree: Annotated[int, Range(0, 3)] = 3
     """Degree of the view-dependent colours."""
+    dropout: Annotated[float, Range(0, 100), _TRANSPARENT] = 2.0
+    """Each step leaves out a random share of the triangles: this, divided by the number of photos to train on;
+    a tenth at most. Triangles that few photos see are held by one another, and stand alone so."""
     freeze_inradius: Annotated[bool, _SINGLE_SIDED] = True
     """With single-sided, hold the inradius constant in the backward pass, as Triangle Splatting does."""
 
@@ -208,10 +211,10 @@ class TrainConfig(Settings):
     """Wider images are scaled down to this width; None shrinks those wider than 1600 pixels to 1600."""
     max_triangles: Annotated[int, Range(1, 10**8)] = 100_000
     """Densification stops here, or earlier where photos are few or small."""
-    pixels_per_triangle: Annotated[float | None, Range(0.01), Rare] = 75.0
+    pixels_per_triangle: Annotated[float | None, Range(0.01), Rare] = 45.0
     """Densification stops where there is a triangle for so many pixels of the training photos.
     More learn the photos by heart, and other views fall apart; None for `max_triangles` whatever the photos.
-    The opaque mesh has more where photos agree on them."""
+    Opaque triangles are fewer, a triangle for 5/3 as many; of the opaque mesh more where photos agree on them."""
     normalize: Annotated[bool, Rare] = True
     """Train in the frame where the cameras are centred and the scene has extent 1. Results are in the scene's units."""
     background: Annotated[Literal["black", "white", "random"], Rare] = "black"
@@ -316,6 +319,7 @@ _PAPER: dict[str, Any] = {
     "sky": "dome",
     "drawing.near_plane": 0.2,
     "drawing.cull_small": True,
+    "drawing.dropout": 0.0,
     "start.dense": False,
     "start.nearest": 0.0,
     "start.limit": None,
@@ -344,6 +348,7 @@ _TINY: dict[str, Any] = {
     "width": 64,
     "max_triangles": 2000,
     "sky": "dome",
+    "drawing.dropout": 0.0,
     "drawing.sh_degree": 1,
     "start.dense": False,
     "start.nearest": 0.0,

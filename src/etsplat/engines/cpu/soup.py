@@ -7,6 +7,7 @@ from torch import Tensor
 
 from etsplat import _native
 from etsplat.core.cameras import Cameras
+from etsplat.core.soup_numbers import SoupNumbers
 from etsplat.core.validation import dense
 from etsplat.engines.native.operation import differentiable
 from etsplat.engines.native.pool import empty_image
@@ -17,7 +18,7 @@ def _activation(
     vertices: Tensor,
     logits: Tensor,
     raw: Tensor,
-    limits: tuple[float, float],
+    numbers: SoupNumbers,
     camera: Cameras | None,
     smallest: float,
     largest: float,
@@ -31,25 +32,23 @@ def _activation(
         Ks=None if camera is None else dense(camera.Ks, "Ks"),
         smallest=smallest,
         largest=largest,
-        opacity_floor=limits[0],
-        sigma_ceiling=limits[1],
+        numbers=numbers,
         opacities=opacities,
         sigma=sigma,
     )
-    return (opacities, sigma), (logits, raw, opacities, limits)
+    return (opacities, sigma), (logits, raw, opacities, numbers)
 
 
 def _activation_backward(
     kept: Any, _needed: Any, grad_opacities: Tensor | None, grad_sigma: Tensor | None
 ) -> tuple[None, Tensor, Tensor]:
-    logits, raw, opacities, limits = kept
+    logits, raw, opacities, numbers = kept
     grad_logits, grad_raw = empty_image(len(logits)), empty_image(len(raw))
     _native.soup_activate_backward(
         logits=logits,
         raw=raw,
         opacities=opacities,
-        opacity_floor=limits[0],
-        sigma_ceiling=limits[1],
+        numbers=numbers,
         grad_opacities=grad_opacities,
         grad_sigma=grad_sigma,
         grad_logits=grad_logits,

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from etsplat.core.cameras import Cameras
+from etsplat.core.soup_numbers import SoupNumbers
 from etsplat.core.validation import dense
 from etsplat.engines.cuda.launch import launch_each, upload
 from etsplat.engines.cuda.program import Program
@@ -22,17 +23,17 @@ def _activation(
     vertices: Tensor,
     logits: Tensor,
     raw: Tensor,
-    limits: tuple[float, float] | Tensor,
+    numbers: SoupNumbers | Tensor,
     camera: Cameras | None,
     smallest: float,
     largest: float,
 ) -> tuple[tuple[Tensor, Tensor], Any]:
-    limits = limits if isinstance(limits, Tensor) else upload(limits, vertices.device)
+    numbers = numbers if isinstance(numbers, Tensor) else upload(numbers, vertices.device)
     view = (None, None) if camera is None else (dense(camera.viewmats, "viewmats"), dense(camera.Ks, "Ks"))
     opacities, sigma = torch.empty_like(logits), torch.empty_like(raw)
-    arguments = (len(logits), vertices, logits, raw, *view, smallest, largest, limits, opacities, sigma)
+    arguments = (len(logits), vertices, logits, raw, *view, smallest, largest, numbers, opacities, sigma)
     launch_each(_ACTIVATION, "soup_activate", len(logits), arguments)
-    return (opacities, sigma), (logits, raw, opacities, limits)
+    return (opacities, sigma), (logits, raw, opacities, numbers)
 
 
 def _activation_backward(saved: Any, _needed: Any, *cotangents: Tensor | None) -> tuple[None, Tensor, Tensor]:

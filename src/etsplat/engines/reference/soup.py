@@ -6,6 +6,7 @@ from torch import Tensor
 
 from etsplat.core.cameras import Cameras
 from etsplat.core.rasterization import SOUP_SIGMA_FLOOR
+from etsplat.core.soup_numbers import SoupNumbers
 
 _MIN_LENGTH = 1e-12
 
@@ -14,17 +15,32 @@ def soup_activation(
     vertices: Tensor,
     opacity_logits: Tensor,
     sigma_raw: Tensor,
-    limits: tuple[float, float] | Tensor,
+    numbers: SoupNumbers | Tensor,
     camera: Cameras | None,
     smallest: float,
     largest: float,
 ) -> tuple[Tensor, Tensor]:
     """See `etsplat.ops.soup_activation`."""
-    floor, ceiling = limits
+    floor, ceiling, dropout, draw = numbers
     opacities = floor + (1.0 - floor) * torch.sigmoid(opacity_logits)
     if camera is not None:
         opacities = torch.where(_left_out(vertices, camera, smallest, largest), 0.0, opacities)
+    opacities = torch.where(_dropped(len(vertices), float(dropout), int(draw), vertices.device), 0.0, opacities)
     return opacities, (SOUP_SIGMA_FLOOR + torch.exp(sigma_raw)).clamp_max(ceiling)
+
+
+def _dropped(count: int, dropout: float, draw: int, device: torch.device) -> Bool[Tensor, " N"]:
+    """Which triangles a draw leaves out: those whose hash, as a fraction of the largest, is below the share."""
+    rows = torch.arange(count, device=device)
+    fraction = (_mixed_bits(rows ^ _mixed_bits(torch.tensor(draw, device=device))) >> 8).float() / 2**24
+    return fraction < dropout
+
+
+def _mixed_bits(x: Tensor) -> Tensor:
+    """Murmur3's finalizer of 32 bits, in int64."""
+    for shift, factor in ((16, 0x85EBCA6B), (13, 0xC2B2AE35)):
+        x = ((x ^ (x >> shift)) * factor) & 0xFFFFFFFF
+    return x ^ (x >> 16)
 
 
 def _left_out(vertices: Float[Tensor, "N 3 3"], camera: Cameras, smallest: float, largest: float) -> Bool[Tensor, " N"]:
