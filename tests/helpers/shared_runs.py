@@ -143,8 +143,9 @@ def handed_round(owners: list[int]) -> tuple[list[str], list[list[int]]]:
 def with_nan(dataset: Dataset, view: int) -> Dataset:
     """One photo is not a number somewhere."""
     pixels = [dataset.images[index].clone() for index in range(len(dataset))]
-    pixels[view][3, 4] = math.nan
-    return replace(dataset, images=StoredPictures(pixels))
+    stored = StoredPictures(pixels)
+    pixels[view][3, 4] = math.nan  # as a file may have it, of which nothing is known before it is read
+    return replace(dataset, images=stored)
 
 
 def trainer_of(kind: str, batch: int) -> Trainer[Any]:

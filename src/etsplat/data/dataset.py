@@ -11,6 +11,12 @@ from torch import Tensor
 
 from etsplat.core.cameras import Cameras, camera_centers
 from etsplat.core.errors import InputError
+from etsplat.data.dataset_checks import (
+    checked_intrinsics,
+    checked_points,
+    checked_split,
+    checked_viewmats,
+)
 from etsplat.data.pictures import Pictures, as_float, halved
 from etsplat.io.georeference import Georeference
 
@@ -70,9 +76,18 @@ class Dataset:
         georeference: where the input's own units lie in the world; None where nobody said so.
 
     Raises:
-        ValueError: fields that contradict each other.
+        ValueError: fields that contradict each other; poses that are no rotations; numbers that are not finite.
 
     Example:
+        Photos of your own, of an object before nothing, seen by cameras of your own:
+
+        >>> rgba = [torch.zeros(48, 64, 4, dtype=torch.uint8) for _ in range(6)]  # premultiplied
+        >>> cameras = etsplat.orbit_cameras(64, 48, elevations=(10.0,), azimuths=6)
+        >>> names = [f"photo_{index}" for index in range(6)]
+        >>> pictures = etsplat.StoredPictures(rgba)
+        >>> len(etsplat.Dataset(cameras.viewmats, cameras.Ks, pictures, names, train=[1, 2, 3, 4, 5], test=[0]))
+        6
+
         >>> photos = etsplat.photograph(etsplat.demo_object(), 16, 16)
         >>> len(photos.train), len(photos.test), photos.images[0].shape
         (32, 8, torch.Size([16, 16, 4]))
@@ -92,15 +107,24 @@ class Dataset:
     georeference: Georeference | None = None
 
     def __post_init__(self) -> None:
+        if not isinstance(self.images, Pictures):
+            raise ValueError(f"images must be Pictures, got {type(self.images).__name__}: pass StoredPictures(images)")
+        fields = {"viewmats": checked_viewmats(self.viewmats), "Ks": checked_intrinsics(self.Ks)}
         B = len(self.viewmats)
         for name, count in (("Ks", len(self.Ks)), ("images", len(self.images.sizes)), ("names", len(self.names))):
             if count != B:
                 raise ValueError(f"{name}: expected {B}, one per viewmat, got {count}")
-        split = [*self.train, *self.test, *self.watched]
+        if len(set(self.names)) != B:
+            raise ValueError("names: expected another one for each view")
+        splits = {name: checked_split(name, getattr(self, name), B) for name in ("train", "test", "watched")}
+        split = [index for views in splits.values() for index in views]
         if len(split) != len(set(split)):
             raise ValueError("train, test, watched: expected disjoint indices without repetition")
-        if not all(0 <= index < B for index in split):
-            raise ValueError(f"train, test, watched: expected indices in [0, {B})")
+        if self.exact_points is not None:
+            points, colors = checked_points(self.exact_points, self.point_colors)
+            fields |= {"exact_points": points, "point_colors": colors}
+        for name, value in {**fields, **splits}.items():
+            object.__setattr__(self, name, value)
 
     def __len__(self) -> int:
         return len(self.viewmats)

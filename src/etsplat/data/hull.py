@@ -132,7 +132,7 @@ def _silhouettes(dataset: Dataset, names: list[str], steps: np.ndarray) -> list[
         raise InputError(
             "masks: the images have neither transparency nor masks, so the object cannot be told from its background;"
             " add a folder masks/ with a white-on-black picture for every image, as `etsplat data masks` writes them of"
-            " an object before a plain background"
+            " an object before a plain background; photos in memory need an alpha channel"
         )
     if full:
         raise InputError(

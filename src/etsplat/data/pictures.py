@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from etsplat.core.workers import workers
+from etsplat.data.dataset_checks import as_many, checked_mask, checked_pixels, is_straight
 from etsplat.io.depth_maps import resize_depth
 from etsplat.io.memory import available_memory
 
@@ -59,12 +60,15 @@ class Pictures(ABC):
         total_bytes: what all of them take in memory.
         streamed: whether they do not fit into memory, so that each is made anew when it is needed.
         with_depth: the views whose photos have depth maps.
+        straight: the views whose colours are above their alpha though they are to be premultiplied; of photos that are
+            in memory already.
     """
 
     sizes: list[tuple[int, int]]
     total_bytes: int
     streamed: bool = False
     with_depth: frozenset[int] = frozenset()
+    straight: tuple[int, ...] = ()
 
     @property
     @abstractmethod
@@ -114,21 +118,33 @@ class StoredPictures(Pictures):
     def __init__(
         self,
         pixels: Sequence[Pixels],
-        masks: Sequence[UInt8[Tensor, "H W"] | None] | None = None,
+        masks: Sequence[Tensor | None] | None = None,
         depths: Sequence[Float[Tensor, "H W"] | None] | None = None,
     ) -> None:
         """Takes them, with masks and depth maps of some or all.
 
+        Args:
+            pixels: (H, W, 3) bytes, or (H, W, 4) premultiplied, or float32 in [0, 1]. Alpha says what belongs to an
+                object; where it is below 1 a background shows.
+            masks: (H, W) of booleans, of floats in [0, 1], or of bytes with 255 where pixels count. Others are ignored:
+                a mask says nothing of an object, which has alpha.
+            depths: (H, W), as of `Picture`.
+
         Raises:
-            ValueError: a depth map of another shape than its photo.
+            ValueError: a photo, mask or depth map of another shape or kind.
         """
-        masks = [None] * len(pixels) if masks is None else masks
-        maps = [None] * len(pixels) if depths is None else depths
+        pixels = [checked_pixels(f"pixels[{index}]", image) for index, image in enumerate(pixels)]
+        masks = [
+            None if mask is None else checked_mask(f"masks[{index}]", mask, image)
+            for index, (mask, image) in enumerate(zip(as_many("masks", masks, len(pixels)), pixels, strict=True))
+        ]
+        maps = as_many("depths", depths, len(pixels))
         self._pictures = [Picture(*each) for each in zip(pixels, masks, maps, strict=True)]
         for index, (image, depth) in enumerate(zip(pixels, maps, strict=True)):
             if depth is not None and depth.shape != image.shape[:2]:
                 raise ValueError(f"depths[{index}]: expected {tuple(image.shape[:2])}, got {tuple(depth.shape)}")
         self.with_depth = frozenset(index for index, depth in enumerate(maps) if depth is not None)
+        self.straight = tuple(index for index, image in enumerate(pixels) if is_straight(image))
         self._tensors = [*pixels, *masks, *(maps if self.with_depth else [])]
         self.sizes = [(image.shape[1], image.shape[0]) for image in pixels]
         self.total_bytes = sum(image.numel() * image.element_size() for image in self._tensors if image is not None)

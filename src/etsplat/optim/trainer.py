@@ -113,8 +113,15 @@ class Trainer(Generic[M]):
             seed: of the order of views and every other random choice; or a generator to go on with.
 
         Raises:
-            ValueError: cameras are to be refined, and no photos are kept aside to judge them.
+            ValueError: cameras are to be refined, and no photos are kept aside to judge them; there is no view to fit
+                to; the schedule names other parameters than the model's.
         """
+        if not dataset.train:
+            raise ValueError("dataset: has no view in `train` to fit to")
+        if not isinstance(objective, Objective):
+            raise ValueError(f"objective must be an Objective, got {type(objective).__name__}: Objective(photometric)")
+        if batch < 1:
+            raise ValueError(f"batch must be at least 1, got {batch}")
         self.model, self.strategy, self.progress = model, strategy or Fixed(), Progress()
         self.exposure, self.depths, self.guard = exposure or Exposure(NEVER), depths or DepthTrust([]), guard
         self.cameras = cameras or CameraRefinement()
@@ -123,7 +130,7 @@ class Trainer(Generic[M]):
         generator = seed if isinstance(seed, torch.Generator) else torch.Generator().manual_seed(seed)
         self._began = generator.get_state()
         self._kernel = getattr(model.appearance, "kernel", None)  # of what is soft at first; None for other models
-        behind = None if background is None else torch.tensor(background)[None]
+        behind = None if background is None else torch.tensor(background, dtype=torch.float32)[None]
         self._stepper = Stepper(
             model,
             dataset,

@@ -43,6 +43,17 @@ from etsplat.tasks.train_config import TrainConfig
 Source = str | Path | MeshFile | Dataset
 
 
+_A_FOLDER = "a folder with posed images, and a mesh, a Dataset and a demo have none"
+
+
+def straight_alpha(capture: Dataset) -> list[str]:
+    """A sentence about photos that are not premultiplied, though they are to be; none where all are."""
+    if not (straight := capture.images.straight):
+        return []
+    some = ", ".join(capture.names[index] for index in straight[:3]) + (", ..." if len(straight) > 3 else "")
+    return [f"colours above their alpha in {some}: photos with alpha must be premultiplied, rgb * alpha"]
+
+
 def load_source(
     source: Source,
     config: ReconstructConfig,
@@ -72,11 +83,11 @@ def load_source(
     """
     for name, folder in (("masks", masks), ("depths", None if isinstance(depths, bool) else depths)):
         if folder is not None and (isinstance(source, MeshFile | Dataset) or not Path(source).is_dir()):
-            raise InputError(f"{name} {folder}: belong to a folder with posed images; leave them out for a mesh")
+            raise InputError(f"{name} {folder}: belong to {_A_FOLDER}; leave them out")
     if isinstance(source, MeshFile):
         return source, source.notes
     if isinstance(source, Dataset):
-        return source, []
+        return source, straight_alpha(source)
     check_demo(source, "reconstruct")
     if str(source) == DEMO_OBJECT:
         return demo_object(), []
@@ -135,7 +146,14 @@ def load_scene(
         depth_unit: likewise.
         preload: decode all photos now.
         memory: as of `load_dataset`.
+
+    Raises:
+        InputError: what is there cannot be used; a folder of pictures for something else than a scene folder.
     """
+    folders = {"images": images, "masks": masks, "depths": None if isinstance(depths, bool) else depths}
+    for name, folder in folders.items():
+        if folder is not None and (isinstance(source, Dataset) or str(source) == DEMO_SCENE):
+            raise InputError(f"{name} {folder}: belong to {_A_FOLDER}; leave them out")
     if isinstance(source, Dataset):
         return source
     check_demo(source, "train")
@@ -275,7 +293,10 @@ class SoupRun:
             InputError: it is not known.
         """
         if self.capture is None:
-            raise InputError(f"{self.path}: a file does not say which scene it shows; name the scene with --scene")
+            why = "a file does not say which scene it shows"
+            if is_run(self.path):
+                why = "the scene of this run is in no folder: it was a Dataset in memory, or has moved"
+            raise InputError(f"{self.path}: {why}; name the scene's folder with --scene")
         return self.capture
 
 

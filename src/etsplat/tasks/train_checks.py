@@ -5,6 +5,7 @@ import torch
 from etsplat.core.errors import InputError
 from etsplat.data.dataset import Dataset
 from etsplat.tasks.pixel_limits import triangle_limit
+from etsplat.tasks.sources import straight_alpha
 from etsplat.tasks.train_config import TrainConfig
 from etsplat.tasks.train_memory import check_memory
 
@@ -36,6 +37,7 @@ def check_train(
     if (limit := triangle_limit(capture, config)) < config.max_triangles:
         setting = f"pixels_per_triangle {config.pixels_per_triangle:g}"
         notes.append(f"few pixels: at most {limit:,} triangles, not {config.max_triangles:,} ({setting})")
+    notes += straight_alpha(capture)
     if capture.images.streamed:
         notes.append("the photos do not fit into memory: they are decoded anew whenever they are needed")
     if capture.exact_points is None:
