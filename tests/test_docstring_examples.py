@@ -18,7 +18,7 @@ EXAMPLES = {
     for found in FINDER.find(inspect.unwrap(getattr(etsplat, name)), name, module=False, globs={})
     if found.examples
 }
-AFTER = {"reconstruct": ("ReconstructResult", "write_report", "texture_mesh"), "train": ("TrainResult",)}
+AFTER = {"reconstruct": ("ReconstructResult", "write_report", "texture_mesh"), "train": ("TrainResult", "export")}
 """Whose examples go on with the run that another one made."""
 
 

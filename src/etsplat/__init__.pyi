@@ -106,6 +106,8 @@ from etsplat.optim.trainer import Trainer as Trainer
 from etsplat.optim.vertex_updates import UniformSteps as UniformSteps
 from etsplat.optim.watch import Outcome as Outcome
 from etsplat.report.html import write_report as write_report
+from etsplat.tasks.export import export as export
+from etsplat.tasks.export_config import ExportConfig as ExportConfig
 from etsplat.tasks.export_mesh import texture_mesh as texture_mesh
 from etsplat.tasks.reconstruct import ReconstructResult as ReconstructResult
 from etsplat.tasks.reconstruct import reconstruct as reconstruct

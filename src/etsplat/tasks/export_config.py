@@ -21,7 +21,12 @@ _WITH_NORMALS = Only("with --normals", lambda config: config.normals)
 
 @dataclass(frozen=True)
 class ExportConfig(Settings):
-    """How a soup, or the mesh of a reconstruction, leaves for other programs."""
+    """How a soup, or the mesh of a reconstruction, leaves for other programs.
+
+    Example:
+        >>> etsplat.ExportConfig(clean=True, up="z").colors
+        'mean'
+    """
 
     texture: Annotated[int | None, TEXELS] = None
     """Of a run of `etsplat reconstruct`: a light mesh under a texture with so many texels along each side.

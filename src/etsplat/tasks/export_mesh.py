@@ -93,7 +93,7 @@ def is_reconstruction(path: Path) -> bool:
 
 def open_reconstruction(
     path: Path | str,
-    scene: Path | str | None = None,
+    scene: Dataset | Path | str | None = None,
     device: str | None = None,
     tell: Tell = lambda phase, done, total: None,
 ) -> Reconstruction:
@@ -101,7 +101,7 @@ def open_reconstruction(
 
     Args:
         path: the run directory.
-        scene: the folder or mesh that the run is of, where it has moved or is not known.
+        scene: the folder, mesh or data set that the run is of, where it has moved or is not known.
         device: "cpu", "cuda", or None for cuda where there is a GPU.
         tell: is told how far it is.
 
@@ -113,9 +113,11 @@ def open_reconstruction(
         raise InputError(f"{path}: is no run of `etsplat reconstruct`, whose photos a texture is made of; name one")
     _mesh_of(run)
     record = read_record(run, ReconstructConfig, ["resolution", "pictures.supersampling"], "paths.source", "source")
-    paths, source = record["paths"], scene or record["paths"]["source"]
+    paths, source = record["paths"], record["paths"]["source"] if scene is None else scene
     if source is None:
-        raise InputError(f"{path}: does not say what it is of; name the folder with its photos with --scene")
+        raise InputError(
+            f"{path}: does not say what it is of, a Dataset in memory perhaps; name the folder with its photos with --scene"
+        )
     then = record["config"]
     config = ReconstructConfig(
         resolution=then["resolution"], pictures=Pictures(supersampling=then["pictures"]["supersampling"])
@@ -123,7 +125,8 @@ def open_reconstruction(
     tell("Reading the photos", 0, 0)
     loaded, _ = load_source(source, config, paths.get("masks"))
     if fingerprint(loaded) != record["source"].get("fingerprint"):
-        raise InputError(f"{path}: {source} is not what the run was made of; name that with --scene")
+        name = "the data set" if isinstance(source, Dataset) else source
+        raise InputError(f"{path}: {name} is not what the run was made of; name that with --scene")
     views, _ = make_subject(loaded, replace(config, watch=0), partial(tell, "Photographing"), place)
     return Reconstruction.of(run, views, place)
 
@@ -139,7 +142,7 @@ def texture_mesh(
     *,
     size: int = 2048,
     faces: int = LIGHT_FACES,
-    scene: Path | str | None = None,
+    scene: Dataset | Path | str | None = None,
     device: str | None = None,
     seed: int = 0,
     tell: Tell = lambda phase, done, total: None,
@@ -152,7 +155,7 @@ def texture_mesh(
         run: directory of a finished run of `etsplat reconstruct`.
         size: texels along each side of the texture, a multiple of 4 from 64 to 8192.
         faces: at most so many.
-        scene: the folder or mesh that the run is of, where it has moved.
+        scene: the folder, mesh or data set that the run is of, where it has moved or was in memory.
         device: "cpu", "cuda", or None for cuda where there is a GPU.
         seed: of the order of the photos and the backgrounds; one gives the same bits on the same machine.
         tell: is called with a phase, steps done and steps in all.

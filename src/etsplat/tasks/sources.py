@@ -301,13 +301,16 @@ class SoupRun:
 
 
 def open_run(
-    path: Path | str, scene: Path | str | None = None, device: str | None = None, engine: str | None = None
+    path: Path | str,
+    scene: Dataset | Path | str | None = None,
+    device: str | None = None,
+    engine: str | None = None,
 ) -> SoupRun:
     """Open the run directory of `etsplat train`, or any file that `etsplat.model.soup_import.open_soup` reads.
 
     Args:
         path: of the run or the file.
-        scene: the capture's folder, where it has moved or is not known.
+        scene: the capture or its folder, where it has moved or is not known.
         device: of the soup, and so of what is drawn of it: "cpu", "cuda", or None for cuda where there is a GPU.
         engine: that draws what is rendered and viewed, by its name; None for the one of the device.
 
@@ -320,7 +323,7 @@ def open_run(
         raise InputError(f"{path}: no such file or folder; {path_remedy(path)}")
     if path.is_dir():
         return replace(_open_directory(path, scene, place), engine=engine)
-    capture = None if scene is None else load_dataset(scene, preload=False)
+    capture = scene if scene is None or isinstance(scene, Dataset) else load_dataset(scene, preload=False)
     return SoupRun(path, open_soup(path).to(place), capture, engine=engine)
 
 
@@ -368,7 +371,7 @@ def training_cameras(capture: Dataset) -> list[Cameras]:
     return [cameras[index] for index in capture.train]
 
 
-def _open_directory(path: Path, scene: Path | str | None, device: torch.device) -> SoupRun:
+def _open_directory(path: Path, scene: Dataset | Path | str | None, device: torch.device) -> SoupRun:
     if not is_run(path):
         raise InputError(f"{path}: is not a run of etsplat; name a folder that was given to --out, or a soup's file")
     check_trains(path)
@@ -380,12 +383,15 @@ def _open_directory(path: Path, scene: Path | str | None, device: torch.device) 
     soup = TriangleSoup.load(run.soup_path).to(device)
     config = read_record(run, TrainConfig, ["width"], "paths.source")
     paths, width = config["paths"], config["config"]["width"]
-    source = scene or paths["source"]
+    source = paths["source"] if scene is None else scene
     opaque = load_opaque(run.opaque_path) if run.opaque_path.is_file() else None
     if source is None:
         return SoupRun(path, soup, None, opaque)
     if scene is None and source != DEMO_SCENE and not Path(source).is_dir():
         raise InputError(f"{path}: its scene {source} has gone; name where it is now with --scene")
-    given = load_scene(source, width, paths.get("images"), paths.get("masks"), preload=False)
+    if isinstance(source, Dataset):
+        given = source
+    else:
+        given = load_scene(source, width, paths.get("images"), paths.get("masks"), preload=False)
     capture = refined_capture(given, path)
     return SoupRun(path, soup, capture, opaque, {} if capture is given else alignment_starts(given, capture))

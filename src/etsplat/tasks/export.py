@@ -1,0 +1,57 @@
+"""`etsplat.export`: a soup as a file for other programs, whatever it comes from."""
+
+from pathlib import Path
+
+import torch
+
+from etsplat.core.errors import InputError
+from etsplat.data.dataset import Dataset
+from etsplat.data.load import load_dataset
+from etsplat.model.triangle_soup import TriangleSoup
+from etsplat.tasks.export_config import ExportConfig
+from etsplat.tasks.export_soup import Export, export_soup
+from etsplat.tasks.running import settings_for
+from etsplat.tasks.sources import SoupRun, open_run
+from etsplat.tasks.train import TrainResult
+
+
+def export(
+    source: TrainResult | TriangleSoup | str | Path,
+    path: str | Path,
+    config: ExportConfig | None = None,
+    *,
+    scene: Dataset | str | Path | None = None,
+) -> Export:
+    """Writes the triangles of a scene as a file for other programs, as `etsplat export` does.
+
+    Args:
+        source: the result of `train`, its folder, a soup, or a file that holds one (safetensors, ply, etz). Of the
+            first two, the opaque mesh that the run made is written where the file is one of opaque triangles.
+        path: of the file; its suffix chooses the kind: glb, obj, ply, off, safetensors, etz, html.
+        config: what is written, and how; None for the defaults.
+        scene: the capture, or its folder, by which colours are baked and what nobody sees is left out; None for what
+            the run says of it. A run of a `Dataset` in memory does not say.
+
+    Returns:
+        What was written: `path`, `triangles`, what was `removed`, and `transform`, from the capture's units and axes to
+        those of the file.
+
+    Raises:
+        InputError: nothing is left; settings that contradict each other or the kind of file; the file cannot be
+            written, or `source` cannot be read.
+        ValueError: `config` is of another kind.
+
+    Example:
+        >>> written = etsplat.export(result, "scene.html")  # of the example of `train`: a page
+        >>> written.path.name, written.triangles > 0
+        ('scene.html', True)
+    """
+    config = settings_for(config, ExportConfig)
+    for name in ("texture", "faces"):
+        if getattr(config, name) is not None:
+            raise InputError(f"{name}: belongs to a run of reconstruct; take etsplat.texture_mesh")
+    if isinstance(source, TriangleSoup):
+        capture = scene if scene is None or isinstance(scene, Dataset) else load_dataset(scene, preload=False)
+        soup = source.finished().to(torch.device("cpu"))
+        return export_soup(SoupRun(Path(path).parent, soup, capture), path, config)
+    return export_soup(open_run(source.path if isinstance(source, TrainResult) else source, scene, "cpu"), path, config)
