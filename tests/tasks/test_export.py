@@ -9,7 +9,10 @@ import trimesh
 
 import etsplat
 from etsplat.core.errors import InputError
+from etsplat.model.solid_soup import SolidSoup
 from etsplat.tasks.export_soup import export_soup
+from etsplat.tasks.render_config import RenderConfig
+from etsplat.tasks.render_soup import draw, drawn_soup
 from etsplat.tasks.sources import open_run
 
 TINY = etsplat.TrainConfig.tiny().changed({"width": 32, "iterations": 60})
@@ -59,6 +62,20 @@ def test_what_it_cannot_do_is_said(result, tmp_path: Path) -> None:
         etsplat.export(result, tmp_path / "scene.glb", etsplat.ExportConfig(clean=True))
     with pytest.raises(ValueError, match="config must be a ExportConfig"):
         etsplat.export(result, tmp_path / "scene.glb", TINY)
+
+
+def test_settings_of_soups_say_so_where_there_is_an_opaque_mesh(result, capture, tmp_path: Path) -> None:
+    """Which has no opacities; its depths and normals are drawn of it, as its colours are."""
+    with pytest.raises(InputError, match=r"--min-opacity: the opaque mesh has no fainter triangles"):
+        etsplat.export(result, tmp_path / "scene.glb", etsplat.ExportConfig(min_opacity=0.5))
+    soup = etsplat.ExportConfig(min_opacity=0.1, triangles="soup")
+    assert etsplat.export(result, tmp_path / "scene.glb", soup).triangles != len(result.opaque.faces)
+    run = open_run(result.path, capture)
+    drawn = drawn_soup(run, RenderConfig(opaque=True, depth=True, normals=True))
+    assert isinstance(drawn, SolidSoup)
+    pictures = draw(drawn, capture.cameras[0], RenderConfig(opaque=True, depth=True, normals=True))
+    assert torch.equal(pictures["color"], draw(drawn, capture.cameras[0], RenderConfig(opaque=True))["color"])
+    assert (pictures["depth"] > 0).float().mean() > 0.9
 
 
 def test_a_texture_of_a_run_in_memory_is_made_of_the_data_set(tmp_path: Path) -> None:

@@ -215,5 +215,5 @@ def test_the_command_says_what_was_left_out_and_why(tmp_path, capsys):
     assert text.endswith(" outside of the crop.\n")
     with pytest.raises(InputError, match=r"^--crop: is 'box:1,2'; write auto, sphere:X,Y,Z,R or box"):
         parse([*words, "--crop", "box:1,2"]).run([])
-    with pytest.raises(InputError, match="name the scene with --scene"):
+    with pytest.raises(InputError, match="name the scene's folder with --scene"):
         parse([*words, "--clean"]).run([])

@@ -160,7 +160,7 @@ def test_where_nothing_is_left_the_error_says_why(run: SoupRun) -> None:
         select(run, crop=Sphere((500.0, 0.0, 0.0), 1.0))
     with pytest.raises(InputError, match="no triangle is opaque enough; lower --min-opacity"):
         select(run, min_opacity=1.0)
-    with pytest.raises(InputError, match="name the scene with --scene"):
+    with pytest.raises(InputError, match="name the scene's folder with --scene"):
         select(replace(run, capture=None), clean=True)
-    with pytest.raises(InputError, match="name the scene with --scene"):
+    with pytest.raises(InputError, match="name the scene's folder with --scene"):
         select(replace(run, capture=None), crop="auto")

@@ -126,7 +126,10 @@ def _silhouettes(dataset: Dataset, names: list[str], steps: np.ndarray) -> list[
     masks = [silhouette(dataset.images[index]) for index in dataset.train]
     empty = [name for name, mask in zip(names, masks, strict=True) if not mask.any()]
     if empty:
-        raise InputError(f"view {empty[0]}: its mask is empty, it sees nothing of the object; remove the view")
+        raise InputError(
+            f"view {empty[0]}: its mask is empty, it sees nothing of the object; remove the view, or write 255 inside "
+            "masks that have 1 there"
+        )
     full = [name for name, mask in zip(names, masks, strict=True) if mask.all()]
     if len(full) == len(names):
         raise InputError(

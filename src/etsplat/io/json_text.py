@@ -22,13 +22,13 @@ _NAMES = {
 
 
 def parse_json(text: str | bytes) -> Any:
-    """What a text says.
+    """What a text says; a mark of its byte order, as some editors put it first, says nothing.
 
     Raises:
         ValueError: it is not JSON, or nested deeper than Python can follow.
     """
     try:
-        return json.loads(text)
+        return json.loads(text.removeprefix("\ufeff") if isinstance(text, str) else text)
     except RecursionError as error:
         raise ValueError("nested too deep") from error
 

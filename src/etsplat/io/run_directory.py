@@ -200,8 +200,10 @@ class RunDirectory:
         for section in ("task", "config", "source"):
             differences = json_differences(stored.get(section), as_json(config.get(section)))
             if differences:
+                other = "other photos, cameras or meshes: " if section == "source" else ""
                 raise InputError(
-                    f"{path}: was started with {'; '.join(differences)}; resume with the same, or choose another folder"
+                    f"{path}: was started with {other}{'; '.join(differences)}; resume with the same, or choose "
+                    "another folder"
                 )
         _check_writable(path)
         run._remove_unfinished()

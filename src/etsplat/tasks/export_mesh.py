@@ -116,7 +116,8 @@ def open_reconstruction(
     paths, source = record["paths"], record["paths"]["source"] if scene is None else scene
     if source is None:
         raise InputError(
-            f"{path}: does not say what it is of, a Dataset in memory perhaps; name the folder with its photos with --scene"
+            f"{path}: does not say what it is of, a Dataset in memory perhaps; "
+            "name the folder with its photos with --scene"
         )
     then = record["config"]
     config = ReconstructConfig(
@@ -204,8 +205,8 @@ def export_mesh(
     check_stored(path, config)
     if config.texture is not None:
         return _export_textured(run, path, config, scene, device, tell)
-    if kind_of(path) not in suffixes():
-        raise InputError(f"{path}: files of this kind are for soups; choose one of {', '.join(suffixes())} for a mesh")
+    if kind_of(path) not in (kinds := suffixes("vertex_colors")):
+        raise InputError(f"{path}: files of this kind are for soups; choose one of {', '.join(kinds)} for a mesh")
     mesh = load_mesh(_mesh_of(RunDirectory(run)))
     if config.faces is not None and config.faces < len(mesh.faces):
         vertices, faces = decimated(mesh.vertices, mesh.faces, config.faces)

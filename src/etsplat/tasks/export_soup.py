@@ -78,7 +78,11 @@ def export_soup(run: SoupRun, path: Path | str, config: ExportConfig, crop: Crop
     soft = keeps_all or config.alpha or config.colors == "keep"
     apart = config.sky == "apart" and not keeps_all and "objects" in writer_of(path).HOLDS
     least = (0.0 if keeps_all else OPAQUE_FROM) if config.min_opacity is None else config.min_opacity
-    if run.solid is not None and config.triangles == "opaque" and not soft and config.min_opacity is None:
+    if run.solid is not None and config.triangles == "opaque" and not soft:
+        if config.min_opacity is not None:
+            raise InputError(
+                "--min-opacity: the opaque mesh has no fainter triangles; leave it out, or --triangles soup"
+            )
         run = replace(run, soup=run.solid)
     chosen = select(
         run,

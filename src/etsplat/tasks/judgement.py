@@ -209,7 +209,8 @@ def judge(
         poor.append(f"the result {found.unclear}, the input mesh is a closed surface: try --start.shape sphere")
     if iou is not None and iou < GOOD_IOU:
         remedies = " or ".join(filter(None, (hull, longer))) or "--init-mesh, and check masks and poses"
-        poor.append(f"silhouette IoU {iou:.3f} where good results have {GOOD_IOU:.2f} on {views} views: try {remedies}")
+        shown = f"{iou:.3f}" if round(iou, 3) < GOOD_IOU else f"{iou:.6f}"
+        poor.append(f"silhouette IoU {shown} where good results have {GOOD_IOU:.2f} on {views} views: try {remedies}")
     if intersecting_percent > GOOD_INTERSECTING:
         remedy = (hull or longer or "--init-mesh") if untangled else "--refinement.untanglings 6"
         poor.append(f"{intersecting_percent:.1f} % of its faces cut through others: try {remedy}")

@@ -110,7 +110,8 @@ def drawn_soup(run: SoupRun, config: RenderConfig, crop: Crop | None = None) -> 
     Raises:
         InputError: nothing is.
     """
-    solid = config.opaque and not (config.depth or config.normals)  # which are of the soft triangles
+    # where a run has no opaque mesh, depths and normals are of the soft triangles
+    solid = config.opaque and (run.solid is not None or not (config.depth or config.normals))
     run = replace(run, soup=run.solid) if solid and run.solid is not None else run
     if config.sky and not config.clean and crop is None:
         return run.soup

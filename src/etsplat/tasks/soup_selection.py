@@ -205,5 +205,5 @@ def _nothing_left(removed: Mapping[Reason, int]) -> str:
     if "crop" in removed:
         remedy = "choose another --crop, in the units and axes of the capture"
     elif list(removed) == ["faint"]:
-        return "no triangle is opaque enough; lower --min-opacity, or train with --asset"
+        return "no triangle is opaque enough; lower --min-opacity, or take the opaque mesh (train --asset)"
     return f"nothing is left of it ({in_words(removed)}); {remedy}"

@@ -29,7 +29,7 @@ def truth():
     return photograph(demo_object(), 40, 30, elevations=(-30.0, 20.0), azimuths=5, supersampling=2)
 
 
-def write_scene(folder, views, binary, model=("PINHOLE", 1)):
+def write_scene(folder, views, binary, model=("PINHOLE", 1), distortion=0.01):
     """One camera per image; its numbers double those of the images, which are half-size copies."""
     sparse = folder / "sparse" / "0"
     sparse.mkdir(parents=True)
@@ -39,7 +39,7 @@ def write_scene(folder, views, binary, model=("PINHOLE", 1)):
     if model[0] == "SIMPLE_PINHOLE":
         params = params[1:]
     elif model[0] == "SIMPLE_RADIAL":
-        params = [*params[1:], 0.01]
+        params = [*params[1:], distortion]
     camera_bytes, image_bytes = struct.pack("<Q", 1), struct.pack("<Q", len(views))
     camera_text, image_text = "# cameras\n", "# images\n"
     camera_bytes += struct.pack(f"<iiQQ{len(params)}d", 3, model[1], W, H, *params)
@@ -104,6 +104,12 @@ def test_distorted_cameras_name_the_undistorter(tmp_path, truth, binary):
     write_scene(tmp_path, truth, binary, ("SIMPLE_RADIAL", 2))
     with pytest.raises(InputError, match=r"SIMPLE_RADIAL.*colmap image_undistorter"):
         load_colmap(tmp_path)
+
+
+def test_a_lens_that_distorts_by_nothing_is_none(tmp_path, truth):
+    """COLMAP writes its usual model for photos without distortion, too."""
+    write_scene(tmp_path, truth, True, ("SIMPLE_RADIAL", 2), distortion=0.0)
+    assert load_colmap(tmp_path).Ks[0, 0, 0] == pytest.approx(float(truth.Ks[0, 1, 1]))
 
 
 @pytest.mark.parametrize("name", ["cameras.bin", "images.bin"])

@@ -63,7 +63,7 @@ def list_frames(folder: Path, wanted: Wanted) -> Listing:
                 _viewmat(image),
                 pinhole(fx, fy, cx, cy),
                 (camera.width, camera.height),
-                lens if distortion else None,
+                lens if any(distortion) or "FISHEYE" in camera.model else None,
                 wanted.depth_of(folder, image.name, model),
                 wanted.depth_unit,
             )
