@@ -30,6 +30,7 @@ from helpers.trainers import OnEngine, same_bits
 CONFIG = TrainConfig.tiny().changed(
     {
         "iterations": 6,
+        "drawing.dropout": 2.0,
         "optimizer.lr_vertices_length": None,  # so that the steps of a few iterations are no larger than those of many
         "densification.every": 15_000,
         "densification.begin": 0,
