@@ -60,7 +60,7 @@ def test_what_it_cannot_do_is_said(result, tmp_path: Path) -> None:
         etsplat.export(result, tmp_path / "scene.glb", etsplat.ExportConfig(texture=512))
     with pytest.raises(InputError, match="was a Dataset in memory, or has moved; name the scene's folder"):
         etsplat.export(result, tmp_path / "scene.glb", etsplat.ExportConfig(clean=True))
-    with pytest.raises(ValueError, match="config must be a ExportConfig"):
+    with pytest.raises(ValueError, match="config must be an ExportConfig, got TrainConfig"):
         etsplat.export(result, tmp_path / "scene.glb", TINY)
 
 

@@ -10,7 +10,6 @@ from etsplat.data.load import load_dataset
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.tasks.export_config import ExportConfig
 from etsplat.tasks.export_soup import Export, export_soup
-from etsplat.tasks.running import settings_for
 from etsplat.tasks.sources import SoupRun, open_run
 from etsplat.tasks.train import TrainResult
 
@@ -46,7 +45,9 @@ def export(
         >>> written.path.name, written.triangles > 0
         ('scene.html', True)
     """
-    config = settings_for(config, ExportConfig)
+    config = ExportConfig() if config is None else config
+    if not isinstance(config, ExportConfig):
+        raise ValueError(f"config must be an ExportConfig, got {type(config).__name__}")
     for name in ("texture", "faces"):
         if getattr(config, name) is not None:
             raise InputError(f"{name}: belongs to a run of reconstruct; take etsplat.texture_mesh")

@@ -387,10 +387,10 @@ def _open_directory(path: Path, scene: Dataset | Path | str | None, device: torc
     opaque = load_opaque(run.opaque_path) if run.opaque_path.is_file() else None
     if source is None:
         return SoupRun(path, soup, None, opaque)
-    if scene is None and source != DEMO_SCENE and not Path(source).is_dir():
-        raise InputError(f"{path}: its scene {source} has gone; name where it is now with --scene")
     if isinstance(source, Dataset):
         given = source
+    elif scene is None and source != DEMO_SCENE and not Path(source).is_dir():
+        raise InputError(f"{path}: its scene {source} has gone; name where it is now with --scene")
     else:
         given = load_scene(source, width, paths.get("images"), paths.get("masks"), preload=False)
     capture = refined_capture(given, path)
