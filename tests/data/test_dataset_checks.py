@@ -124,6 +124,14 @@ def test_photos_that_are_not_premultiplied_are_spoken_of():
     assert straight_alpha(dataset(images=StoredPictures([straight * straight[..., 3:]] * 3))) == []
 
 
+def test_masks_that_leave_out_everything_are_refused(tmp_path):
+    """A run would have nothing to fit to, and perfect scores."""
+    masks = [torch.zeros(6, 8).bool()] * 3
+    made = dataset(images=StoredPictures([PHOTO] * 3, masks), exact_points=torch.rand(200, 3))
+    with pytest.raises(InputError, match="masks: leave out every pixel of all training photos"):
+        train(made, tmp_path / "run", TrainConfig.tiny().changed({"iterations": 2}))
+
+
 @pytest.mark.parametrize("folder", ["images", "masks", "depths"])
 def test_folders_of_pictures_belong_to_scene_folders(folder, tmp_path):
     """Not to what is in memory already, nor to the demo: they would have no effect."""

@@ -11,7 +11,7 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter
 from etsplat.data.dataset import Dataset
 from etsplat.data.photograph import photograph
 from etsplat.data.pictures import StoredPictures
-from etsplat.data.silhouettes import Evidence, Silhouette, contradicting, silhouette
+from etsplat.data.silhouettes import Evidence, Silhouette, contradicting, looks_inverted, silhouette
 from etsplat.data.visual_hull import visual_hull
 from etsplat.geometry.parts import genera
 from helpers.meshes import ring_and_ball
@@ -97,3 +97,19 @@ def test_rough_masks_keep_what_is_thin(views: Dataset) -> None:
     assert contradicting(every) == []
     vertices, faces = visual_hull(every, 6000)
     assert genera(faces, len(vertices)) == [1, 0]
+
+
+def test_inverted_masks_are_noticed(views):
+    """Of most photos; an object that fills some frames, and photos without masks, are not."""
+
+    def with_alpha(change):
+        images = []
+        for index, image in enumerate(views.images):
+            alpha = change(index, image[..., 3:])
+            images.append(torch.cat([image[..., :3] * 0, alpha], dim=-1))
+        return replace(views, images=StoredPictures(images))
+
+    assert looks_inverted(with_alpha(lambda index, alpha: 1 - alpha))
+    assert not looks_inverted(with_alpha(lambda index, alpha: alpha))
+    assert not looks_inverted(with_alpha(lambda index, alpha: 1 - alpha if index % 3 == 0 else alpha))
+    assert not looks_inverted(with_alpha(lambda index, alpha: torch.ones_like(alpha)))

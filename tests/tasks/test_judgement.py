@@ -111,7 +111,9 @@ def test_of_a_good_result_nothing_is_said_but_its_numbers():
 
 
 def test_photos_without_masks_have_no_outline_to_judge():
-    assert judged(scores={"silhouette_iou": None, "psnr_mesh": 20.0}).verdict.startswith("good on test views: PSNR of")
+    assert judged(scores={"silhouette_iou": None, "psnr_mesh": 20.0}).verdict.startswith(
+        "not judged, since photos have no outlines to compare with: add masks; on test views: PSNR of"
+    )
 
 
 def test_other_parts_and_holes_are_said_with_what_to_try():

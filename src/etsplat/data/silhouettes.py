@@ -36,6 +36,9 @@ _EXCLUDES, _EXCEEDS = 0.01, 0.2
 _ALONE = 4.0
 """And if it does so many times as much as others do."""
 
+_ALL_AROUND = 0.9
+"""Of the border of a photo: where silhouettes have more of it in most, inside and outside were taken for each other."""
+
 _KEPT = 0.75
 """So many of the views are kept at least."""
 
@@ -48,6 +51,16 @@ def silhouette(photo: Pixels) -> Bool[np.ndarray, "H W"]:
 def touches_border(mask: Bool[np.ndarray, "H W"]) -> bool:
     """Whether a silhouette goes on, as far as one knows, beyond its picture."""
     return any(edge.any() for edge in (mask[0], mask[-1], mask[:, 0], mask[:, -1]))
+
+
+def looks_inverted(dataset: Dataset) -> bool:
+    """Whether most training photos show the object along nearly all of their border, and do not where it is inside."""
+    found = 0
+    for view in dataset.train:
+        mask = silhouette(dataset.images[view])
+        border = np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]])
+        found += bool(border.mean() > _ALL_AROUND and not mask.all())
+    return 2 * found > len(dataset.train)
 
 
 class Silhouette:

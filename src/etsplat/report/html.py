@@ -90,7 +90,7 @@ def _title(run: Run) -> str:
 
 
 def _verdict(verdict: str) -> str:
-    kind = "poor" if verdict.startswith("poor") else "good"
+    kind = next((kind for kind in ("good", "poor") if verdict.startswith(kind)), "unknown")
     return f'<p class="verdict {kind}">The result is {escape(verdict)}.</p>'
 
 

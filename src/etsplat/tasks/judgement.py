@@ -235,6 +235,9 @@ def judge(
             f"in silhouettes alone, which show no hollow, {praise}; hollows were not compared: {100 * plain:.1f} % of "
             "its surface is one plain piece, where photos do not tell a side from a lid over a hollow: look at it"
         )
+    good = f"good {praise}"
+    if iou is None:
+        good = f"not judged, since photos have no outlines to compare with: add masks; {praise}"
     return Judgement(
         views=views,
         silhouette_iou=iou,
@@ -245,7 +248,7 @@ def judge(
         expected_parts=expected.shape.parts,
         expected_holes=expected.shape.holes,
         expected_of=expected.of,
-        verdict=f"poor: {'; '.join(poor)}" if poor else f"good {praise}",
+        verdict=f"poor: {'; '.join(poor)}" if poor else good,
     )
 
 

@@ -86,7 +86,7 @@ class ReconstructResult(Result):
 
     @property
     def verdict(self) -> str:
-        """A sentence that begins with "good" or "poor"; of a poor result it says what is wrong and what to try."""
+        """A sentence that begins with "good", "poor" or "not judged"; it says what is wrong and what to try."""
         return self.metrics["judgement"]["verdict"]
 
 

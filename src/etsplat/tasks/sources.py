@@ -23,7 +23,7 @@ from etsplat.data.frame_gaps import without_frame_gaps
 from etsplat.data.hull import bounding_sphere
 from etsplat.data.load import load_dataset
 from etsplat.data.photograph import normalize_mesh, photograph
-from etsplat.data.silhouettes import contradicting
+from etsplat.data.silhouettes import contradicting, looks_inverted
 from etsplat.engines.choice import resolve_device
 from etsplat.io.mesh_files import MeshFile, load_mesh
 from etsplat.io.opaque_files import load_opaque
@@ -113,6 +113,8 @@ def _agreeing(scene: Dataset) -> tuple[Dataset, list[str]]:
     if cropped:
         names = ", ".join(scene.names[index] for index in cropped)
         notes.append(f"cropped, since a mask ends along the frame just before it: {names}")
+    if looks_inverted(scene):
+        notes.append("masks are white along the border of most photos: they are to be white inside the object alone")
     wrong = contradicting(scene)
     if wrong:
         names = ", ".join(scene.names[index] for index in sorted(wrong))

@@ -27,6 +27,11 @@ def check_train(
     """
     if not capture.train:
         raise InputError("capture: has no view to train on; name some in its split")
+    images = capture.images
+    if not images.streamed and not any(
+        (mask := images.mask(view)) is None or bool(mask.any()) for view in capture.train
+    ):
+        raise InputError("masks: leave out every pixel of all training photos; they are white where pixels count")
     needed = check_memory(capture, config, triangle_limit(capture, config), device, around)
     aside = f", {len(capture.watched)} to watch the run" if capture.watched else ""
     views = f"{len(capture.train)} photos to train on{aside}, {len(capture.test)} to test"
