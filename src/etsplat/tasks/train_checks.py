@@ -27,10 +27,8 @@ def check_train(
     """
     if not capture.train:
         raise InputError("capture: has no view to train on; name some in its split")
-    images = capture.images
-    if not images.streamed and not any(
-        (mask := images.mask(view)) is None or bool(mask.any()) for view in capture.train
-    ):
+    masks = (capture.images.mask(view) for view in capture.train)
+    if not capture.images.streamed and all(mask is not None and not bool(mask.any()) for mask in masks):
         raise InputError("masks: leave out every pixel of all training photos; they are white where pixels count")
     needed = check_memory(capture, config, triangle_limit(capture, config), device, around)
     aside = f", {len(capture.watched)} to watch the run" if capture.watched else ""
