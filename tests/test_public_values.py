@@ -91,6 +91,7 @@ VALUES: dict[str, Callable[[], Any]] = {
     "PrepareEvent": lambda: etsplat.PrepareEvent(1, 2),
     "PruneRules": lambda: etsplat.PruneRules(views=3),
     "Rasterization": _rasterization,
+    "ExportConfig": lambda: etsplat.ExportConfig(clean=True),
     "ReconstructConfig": lambda: etsplat.ReconstructConfig.demo(),
     "ReconstructResult": lambda: etsplat.ReconstructResult(Path("x"), MESH, {"psnr": 30.0}),
     "CameraRefinement": lambda: etsplat.CameraRefinement.of("poses", 1000, 40),

@@ -7,6 +7,7 @@ import torch
 
 from etsplat.data.dataset import Dataset
 from etsplat.data.demo_scene import demo_scene
+from etsplat.data.pictures import StoredPictures
 from etsplat.model.soup_appearance import SoupAppearance
 from etsplat.model.soup_init import StartPoints
 from etsplat.model.surroundings import Surroundings
@@ -49,13 +50,8 @@ def test_every_view_is_covered(capture: Dataset, sphere: TriangleSoup) -> None:
 def test_colours_are_those_of_the_photos_there_and_next_to_it(capture: Dataset) -> None:
     """Red photos make a red sphere, also where none shows it."""
 
-    class Red:
-        sizes = capture.images.sizes
-
-        def __getitem__(self, _: int) -> torch.Tensor:
-            return torch.tensor([255, 0, 0], dtype=torch.uint8).expand(24, 32, 3)
-
-    red = replace(capture, images=Red())  # type: ignore[arg-type]
+    photo = torch.tensor([255, 0, 0], dtype=torch.uint8).repeat(24, 32, 1)
+    red = replace(capture, images=StoredPictures([photo] * len(capture)))
     colors = Surroundings.of(red).soup(red, 0).display_colors()
     torch.testing.assert_close(colors, torch.tensor([[1.0, 0, 0]]).expand_as(colors), rtol=0, atol=1e-3)
     colors = Surroundings.of(red).backdrop(red)[1]
