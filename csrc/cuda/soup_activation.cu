@@ -5,8 +5,8 @@
 
 using namespace etsplat;
 
-// logits, raw (N); numbers (4): those of SoupNumbers, in their order. viewmat (4, 4), K (3, 3) of the camera for which those of the
-// triangles (N, 3, 3) get opacity 0 that are smaller or larger than this, or null.
+// logits, raw (N); numbers (4): those of SoupNumbers, in their order. viewmat (4, 4), K (3, 3) of the camera for which those
+// of the triangles (N, 3, 3) get opacity 0 that are smaller or larger than this, or null.
 extern "C" __global__ void soup_activate(int triangles, const float* vertices, const float* logits, const float* raw,
                                          const float* viewmat, const float* K, float smallest, float largest,
                                          const float* numbers, float* opacities, float* sigma) {

@@ -11,12 +11,7 @@ from torch import Tensor
 
 from etsplat.core.cameras import Cameras, camera_centers
 from etsplat.core.errors import InputError
-from etsplat.data.dataset_checks import (
-    checked_intrinsics,
-    checked_points,
-    checked_split,
-    checked_viewmats,
-)
+from etsplat.data.dataset_checks import checked_intrinsics, checked_points, checked_split, checked_viewmats
 from etsplat.data.pictures import Pictures, as_float, halved
 from etsplat.io.georeference import Georeference
 

@@ -6,11 +6,10 @@ import torch
 
 from etsplat.core.errors import InputError
 from etsplat.data.dataset import Dataset
-from etsplat.data.load import load_dataset
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.tasks.export_config import ExportConfig
 from etsplat.tasks.export_soup import Export, export_soup
-from etsplat.tasks.sources import SoupRun, open_run
+from etsplat.tasks.sources import SoupRun, capture_at, open_run
 from etsplat.tasks.train import TrainResult
 
 
@@ -52,7 +51,6 @@ def export(
         if getattr(config, name) is not None:
             raise InputError(f"{name}: belongs to a run of reconstruct; take etsplat.texture_mesh")
     if isinstance(source, TriangleSoup):
-        capture = scene if scene is None or isinstance(scene, Dataset) else load_dataset(scene, preload=False)
         soup = source.finished().to(torch.device("cpu"))
-        return export_soup(SoupRun(Path(path).parent, soup, capture), path, config)
+        return export_soup(SoupRun(Path(path).parent, soup, capture_at(scene)), path, config)
     return export_soup(open_run(source.path if isinstance(source, TrainResult) else source, scene, "cpu"), path, config)

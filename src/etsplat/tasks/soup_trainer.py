@@ -7,6 +7,7 @@ from functools import partial
 
 import torch
 
+from etsplat.core.soup_numbers import DRAWS
 from etsplat.data.dataset import Dataset, Normalization
 from etsplat.data.shown_width import shown_width
 from etsplat.model.soup_appearance import SoupAppearance
@@ -39,8 +40,8 @@ LEAST_EVERY = 30
 """Steps between edits of a short run, or a tenth of it if that is less: in fewer, triangles that are of use are still
 as faint as those that are not, and all would die (research/ablations.md)."""
 
-MOST_DROPPED, DRAWS = 0.1, 2**24
-"""The largest share of dropout, and how many different draws there are."""
+MOST_DROPPED = 0.1
+"""The largest share of dropout."""
 
 DEPTH_UNTIL = 0.5
 """Up to this part of a run depth maps count; then photos alone, so that what is wrong with maps costs no picture."""

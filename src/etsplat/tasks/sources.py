@@ -325,8 +325,12 @@ def open_run(
         raise InputError(f"{path}: no such file or folder; {path_remedy(path)}")
     if path.is_dir():
         return replace(_open_directory(path, scene, place), engine=engine)
-    capture = scene if scene is None or isinstance(scene, Dataset) else load_dataset(scene, preload=False)
-    return SoupRun(path, open_soup(path).to(place), capture, engine=engine)
+    return SoupRun(path, open_soup(path).to(place), capture_at(scene), engine=engine)
+
+
+def capture_at(scene: Dataset | Path | str | None) -> Dataset | None:
+    """A capture by its folder, or as it is; photos of a folder are decoded when they are asked for."""
+    return scene if scene is None or isinstance(scene, Dataset) else load_dataset(scene, preload=False)
 
 
 def check_trains(run: Path) -> None:

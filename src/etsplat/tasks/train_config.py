@@ -34,7 +34,7 @@ class Drawing:
     """Degree of the view-dependent colours."""
     dropout: Annotated[float, Range(0, 100), _TRANSPARENT] = 2.0
     """Each step leaves out a random share of the triangles: this, divided by the number of photos to train on;
-    a tenth at most. Triangles that few photos see are held by one another, and stand alone so."""
+    a tenth at most. So what one photo asked for, hidden from the others behind other triangles, is seen by them too."""
     freeze_inradius: Annotated[bool, _SINGLE_SIDED] = True
     """With single-sided, hold the inradius constant in the backward pass, as Triangle Splatting does."""
 
