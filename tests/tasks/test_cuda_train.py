@@ -30,7 +30,6 @@ from helpers.trainers import OnEngine, same_bits
 CONFIG = TrainConfig.tiny().changed(
     {
         "iterations": 6,
-        "drawing.dropout": 2.0,
         "optimizer.lr_vertices_length": None,  # so that the steps of a few iterations are no larger than those of many
         "densification.every": 15_000,
         "densification.begin": 0,
@@ -82,8 +81,9 @@ def fitting(capture: Dataset, engine: str, device: torch.device = CPU, config: T
         },
         {"method": "single-sided", "background": "random"},
         {"batch": 2},
+        {"drawing.dropout": 2.0},
     ],
-    ids=["plain", "finish", "paper", "single-sided", "batch"],
+    ids=["plain", "finish", "paper", "single-sided", "batch", "dropout"],
 )
 def test_steps_are_those_of_the_cpu_engine(cuda_device: torch.device, capture: Dataset, settings: Any) -> None:
     """Three steps: the same losses, and statistics to rounding but for a few triangles, and parameters but for
@@ -107,7 +107,7 @@ def test_steps_are_those_of_the_cpu_engine(cuda_device: torch.device, capture: D
 
 def test_steps_queued_together_are_the_steps_one_by_one(cuda_device: torch.device) -> None:
     """The same bits, however many steps are queued before the host looks, and though room runs out on the way."""
-    capture, config = demo_scene(40, 32), CONFIG.changed({"densification.begin": 25_000})
+    capture, config = demo_scene(40, 32), CONFIG.changed({"densification.begin": 25_000, "drawing.dropout": 2.0})
     together, one_by_one = (fitting(capture, "cuda", cuda_device, config) for _ in range(2))
     losses = together.advance(1, 1)
     with room_for_16_pairs() as repairs:
