@@ -21,6 +21,7 @@ from etsplat.tasks import texturing
 from etsplat.tasks.reconstruct import reconstruct
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.sources import open_run
+from helpers.captures import circle_poses, write_colmap
 from helpers.gltf import check_glb
 
 pytest.importorskip("xatlas")
@@ -156,7 +157,7 @@ def test_a_run_of_something_else_by_now_is_refused(run: Path, tmp_path: Path) ->
 
 def test_a_mesh_goes_to_the_world_where_the_run_says(run: Path, tmp_path: Path) -> None:
     """In doubles; without a record, and to a place of its own it is refused."""
-    with pytest.raises(InputError, match=r"has no georeference\.json"):
+    with pytest.raises(InputError, match=r"does not say where it lies in the world; write georeference\.json"):
         export(run, "--place", "world", "--out", tmp_path / "a.ply")
     Georeference((500_000.0, 5_400_000.0, 300.0), 2.0, "z").write(run)
     try:
@@ -165,8 +166,6 @@ def test_a_mesh_goes_to_the_world_where_the_run_says(run: Path, tmp_path: Path) 
         found = np.stack([table[axis] for axis in "xyz"], axis=1)
         expected = 2 * own.vertices.double().numpy() + [500_000.0, 5_400_000.0, 300.0]
         assert np.abs(found - expected).max() < 1e-5
-        with pytest.raises(InputError, match="a mesh knows --place world"):
-            export(run, "--place", "center", "--out", tmp_path / "b.glb")
     finally:
         (run / "georeference.json").unlink()
 
@@ -179,7 +178,9 @@ def test_a_textured_mesh_goes_to_the_world_too(run: Path, tmp_path: Path) -> Non
         export(run, *light, "--out", tmp_path / "near.glb")
         for end, more in ((".glb", ("--compress", "quantize")), (".obj", ())):
             export(run, *light, *more, "--place", "world", "--out", tmp_path / f"far{end}")
-        with pytest.raises(InputError, match=r"hold no coordinates of maps; choose --format glb or obj or ply"):
+        with pytest.raises(
+            InputError, match=r"leave out --up, --scale and --place, or choose --format glb or obj or ply"
+        ):
             export(run, *light, "--place", "world", "--format", "safetensors")
     finally:
         (run / "georeference.json").unlink()
@@ -191,6 +192,44 @@ def test_a_textured_mesh_goes_to_the_world_too(run: Path, tmp_path: Path) -> Non
     rows = [line.split()[1:] for line in (tmp_path / "far.obj").read_text().splitlines() if line.startswith("v ")]
     places = np.array(rows, dtype=np.float64) - [500_000, 5_400_000, 300]
     assert abs(places - np.clip(places, low.numpy() - 1e-4, high.numpy() + 1e-4)).max() == 0
+
+
+def test_a_mesh_is_turned_scaled_and_placed(run: Path, tmp_path: Path) -> None:
+    """By where up is as its photos were held; the object of a mesh has +y or +z up as it is."""
+    sideways = torch.tensor([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], dtype=torch.float64)  # y to z
+    poses = circle_poses(6)
+    poses[:, :3, :3] = poses[:, :3, :3] @ sideways.T
+    write_colmap(tmp_path / "scene", [(16, 12)] * 6, poses=poses)
+    own = load_mesh(run / "mesh.ply").vertices.double()
+    export(run, "--scale", "0.5", "--up", "z", "--place", "ground", "--out", tmp_path / "still.ply")
+    still = load_mesh(tmp_path / "still.ply").vertices.double()
+    assert (still - still[0] - 0.5 * (own - own[0])).abs().max() < 1e-5
+    export(run, "--scene", tmp_path / "scene", "--up", "y", "--place", "ground", "--out", tmp_path / "up.glb")
+    found = trimesh.load_mesh(tmp_path / "up.glb")
+    low, high = torch.tensor(found.bounds)
+    assert abs(float(low[1])) < 1e-5
+    assert (low + high)[[0, 2]].abs().max() < 1e-5
+    height = (own @ sideways).amax(0) - (own @ sideways).amin(0)
+    assert abs(float(high[1] - low[1] - height[1])) < 1e-3
+    with pytest.raises(InputError, match="needs to know which way is up"):
+        export(run, "--place", "ground", "--out", tmp_path / "b.glb")
+    with pytest.raises(InputError, match="leave out --up z, or choose"):
+        export(run, "--up", "z", "--out", tmp_path / "b.glb")
+
+
+def test_a_textured_mesh_is_turned_with_its_normals(run: Path, tmp_path: Path) -> None:
+    """Up is +z by the record: what was at (x, y, z) is at 2 (x, z, -y)."""
+    light = ("--texture", "64", "--faces", "100", "--normals")
+    export(run, *light, "--out", tmp_path / "own.glb")
+    Georeference((0.0, 0.0, 0.0), 1.0, "z").write(run)
+    try:
+        export(run, *light, "--up", "y", "--scale", "2", "--out", tmp_path / "up.glb")
+    finally:
+        (run / "georeference.json").unlink()
+    own, up = (trimesh.load_mesh(tmp_path / name, process=False) for name in ("own.glb", "up.glb"))
+    turn = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+    np.testing.assert_allclose(up.vertices, 2 * own.vertices @ turn.T, atol=1e-5)
+    np.testing.assert_allclose(up.vertex_normals, own.vertex_normals @ turn.T, atol=1e-5)
 
 
 def test_how_a_file_is_stored(run: Path, tmp_path: Path) -> None:

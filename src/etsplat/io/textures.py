@@ -92,3 +92,9 @@ class NormalMap:
     normals: Float[Tensor, "F 3 3"]
     tangents: Float[Tensor, "F 3 4"]
     occlusion: UInt8[Tensor, "H W"] | None = None
+
+    def turned(self, rotation: Float[Tensor, "3 3"]) -> "NormalMap":
+        """The same over faces that were turned."""
+        back = rotation.to(self.normals).T
+        tangents = torch.cat([self.tangents[..., :3] @ back, self.tangents[..., 3:]], dim=-1)
+        return replace(self, normals=self.normals @ back, tangents=tangents)

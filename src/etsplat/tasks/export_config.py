@@ -75,9 +75,9 @@ class ExportConfig(Settings):
     in files of soft triangles, of 16 photos and more, those that a single one shows;
     then small groups that stand alone.
     What photos show changes next to nothing."""
-    up: Literal["y", "z", "keep"] = "y"
-    """Turn the scene so that up, by the photos' place in the world or as cameras were held, is +y or +z;
-    or keep the capture's axes.
+    up: Literal["y", "z", "keep"] | None = None
+    """Turn what is exported so that up, by the photos' place in the world or as cameras were held, is +y or +z;
+    or keep the capture's axes. None is y for soups, but keep with --colors keep and for the mesh of a reconstruction.
     GLB has +y up, which programs with another axis turn by themselves: z is for the other kinds of files."""
     scale: Annotated[float, Range(1e-6, 1e6)] = 1.0
     """Multiply all lengths: 0.01 if a unit of the capture is a centimetre, and metres are wanted."""

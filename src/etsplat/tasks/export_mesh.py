@@ -11,9 +11,11 @@ from torch import Tensor
 
 from etsplat.core.errors import InputError
 from etsplat.data.dataset import Dataset
+from etsplat.data.where_up import told_up, up_of
 from etsplat.engines.choice import resolve_device
 from etsplat.engines.threads import one_torch_thread
 from etsplat.geometry.decimation import decimated
+from etsplat.geometry.similarity import Similarity
 from etsplat.io.georeference import GEOREFERENCE_FILE, Georeference
 from etsplat.io.mesh_files import MeshFile, load_mesh, save_mesh
 from etsplat.io.meshopt import load_meshopt
@@ -21,15 +23,17 @@ from etsplat.io.paths import kind_of
 from etsplat.io.run_directory import RunDirectory, is_run
 from etsplat.io.writers import suffixes
 from etsplat.model.textured_mesh import TexturedMesh
+from etsplat.tasks.demos import DEMO_OBJECT
 from etsplat.tasks.export_config import LIGHT_FACES, ExportConfig
 from etsplat.tasks.normal_map import normal_map_of
+from etsplat.tasks.placing import apart_from_world, check_placed, placement
 from etsplat.tasks.reconstruct_config import Pictures, ReconstructConfig
 from etsplat.tasks.refined_cameras import refined_capture
 from etsplat.tasks.settings import settings_of
-from etsplat.tasks.sources import fingerprint, load_source, make_subject, read_record
+from etsplat.tasks.sources import capture_at, fingerprint, load_source, make_subject, read_record
 from etsplat.tasks.texturing import Tell, check_installed, coarser, colors_at, texture_object
 
-_OF_MESHES = ("texture", "faces", "normals", "occlusion", "lods", "compress", "pictures", "place")
+_OF_MESHES = ("texture", "faces", "normals", "occlusion", "lods", "compress", "pictures", "up", "scale", "place")
 """Settings that meshes of reconstructions know."""
 
 
@@ -200,8 +204,7 @@ def export_mesh(
             option = name.replace("_", "-")
             ours = ", ".join(f"--{other}" for other in _OF_MESHES)
             raise InputError(f"--{option}: is for soups; of a reconstruction's mesh there are {ours}")
-    if config.place not in ("keep", "world"):
-        raise InputError(f"--place {config.place}: is for soups; a mesh knows --place world")
+    config = replace(config, up=config.up or "keep")
     check_stored(path, config)
     if config.texture is not None:
         return _export_textured(run, path, config, scene, device, tell)
@@ -212,9 +215,9 @@ def export_mesh(
         vertices, faces = decimated(mesh.vertices, mesh.faces, config.faces)
         colors = colors_at(mesh, vertices[faces].mean(dim=1))
         mesh = MeshFile(vertices, faces, face_colors=colors)
-    far = _georeference(run) if config.place == "world" else None
-    vertices = mesh.vertices if far is None else mesh.vertices * far.scale
-    by_face, by_vertex = mesh.face_colors, _only_by_vertex(mesh)
+    check_placed(path, config)
+    near, far = _placement(RunDirectory(run), config, scene, mesh.vertices)
+    vertices, by_face, by_vertex = near.apply(mesh.vertices).float(), mesh.face_colors, _only_by_vertex(mesh)
     save_mesh(path, vertices, mesh.faces, by_face, vertex_colors=by_vertex, world=far, compress=config.compress)
     return {path: len(mesh.faces)}
 
@@ -229,14 +232,18 @@ def _export_textured(
         raise InputError(f"{path}: files of this kind hold no texture; choose --format {kinds}")
     if config.normals and kind_of(path) != ".glb":
         raise InputError(f"{path}: files of this kind hold no normal map; leave out --normals, or choose --format glb")
-    if config.place == "world" and kind_of(path) not in suffixes("offset"):
+    if kind_of(path) in suffixes("texture"):
+        check_placed(path, config)
+    elif (config.up, config.scale, config.place) != ("keep", 1.0, "keep"):
         kinds = " or ".join(suffix[1:] for suffix in suffixes("texture"))
-        raise InputError(f"{path}: files of this kind hold no coordinates of maps; choose --format {kinds}")
+        raise InputError(
+            f"{path}: keeps units and axes; leave out --up, --scale and --place, or choose --format {kinds}"
+        )
     if not path.parent.is_dir():  # rather than after a minute
         raise InputError(f"{path}: there is no folder {path.parent}; create the folder first")
     check_installed()
-    far = _georeference(run) if config.place == "world" else None
     opened, written = open_reconstruction(run, scene, device, tell), {}
+    near, far = _placement(RunDirectory(run), config, scene, opened.views.normalization.invert(opened.mesh.vertices))
     mesh = opened.textured(config.texture, config.faces or LIGHT_FACES, tell=tell)
     for level in range(config.lods + 1):
         if level:
@@ -244,9 +251,9 @@ def _export_textured(
             mesh = coarser(mesh, max(4, mesh.count // 4), config.texture >> level)
         place = path.with_name(f"{path.stem}_lod{level}{path.suffix}") if level else path
         relief = normal_map_of(mesh, opened.mesh, occlusion=config.occlusion) if config.normals else None
+        relief = None if relief is None else relief.turned(near.rotation)
         placed = opened.in_own_units(mesh)
-        if far is not None:
-            placed = replace(placed, vertices=placed.vertices.detach() * far.scale).learnable()
+        placed = replace(placed, vertices=near.apply(placed.vertices.detach()).float()).learnable()
         placed.save(place, relief, world=far, compress=config.compress, pictures=config.pictures)
         written[place] = mesh.count
     return written
@@ -261,11 +268,28 @@ def check_stored(path: Path, config: ExportConfig) -> None:
         load_meshopt()
 
 
-def _georeference(run: Path) -> Georeference:
-    """Where the mesh lies in the world."""
-    if not (run / GEOREFERENCE_FILE).is_file():
-        raise InputError(f"{run}: has no {GEOREFERENCE_FILE}; write one beside the photos and reconstruct anew")
-    return Georeference.read(run / GEOREFERENCE_FILE)
+def _placement(
+    run: RunDirectory, config: ExportConfig, scene: Path | None, vertices: Float[Tensor, "V 3"]
+) -> tuple[Similarity, Georeference | None]:
+    """How vertices in the units of the input are moved, and by which offset beside it."""
+    file = run.path / GEOREFERENCE_FILE
+    georeference = Georeference.read(file) if file.is_file() else None
+    up = None if config.up == "keep" else _up(run, scene, georeference)
+    return apart_from_world(placement(run.path, config, vertices, up, georeference), config, georeference)
+
+
+def _up(run: RunDirectory, scene: Path | None, georeference: Georeference | None) -> Float[Tensor, "3"] | None:
+    """Where up is; None for the object of a mesh, whose photos say nothing, and where photos contradict each other."""
+    told = told_up(georeference)
+    if told is not None:
+        return told
+    source = run.read_config("paths.source")["paths"]["source"] if scene is None else scene
+    if source is None:
+        raise InputError(f"{run.path}: does not say what it is of; name the folder with its photos with --scene")
+    if source == DEMO_OBJECT or Path(source).is_file():
+        return None
+    photos = capture_at(source)
+    return None if photos is None else up_of(photos)
 
 
 def _only_by_vertex(mesh: MeshFile) -> Tensor | None:

@@ -12,9 +12,9 @@ from torch import Tensor
 from etsplat.core.cameras import Cameras
 from etsplat.core.errors import InputError
 from etsplat.data.where_up import told_up, up_of
-from etsplat.geometry.similarity import Similarity, rotation_between
+from etsplat.geometry.similarity import Similarity
 from etsplat.io.atomic import atomic_write
-from etsplat.io.georeference import GEOREFERENCE_FILE, Georeference
+from etsplat.io.georeference import Georeference
 from etsplat.io.mesh_files import save_triangles
 from etsplat.io.paths import kind_of
 from etsplat.io.writers import suffixes, writer_of
@@ -24,6 +24,7 @@ from etsplat.model.triangle_soup import GEOREFERENCE_NOTE, TriangleSoup
 from etsplat.ops.soup_colors import soup_colors
 from etsplat.tasks.export_config import ExportConfig
 from etsplat.tasks.export_mesh import check_stored
+from etsplat.tasks.placing import apart_from_world, check_placed, placement
 from etsplat.tasks.scene_page import compact_bytes, scene_of, small_camera
 from etsplat.tasks.soup_selection import Crop, Reason, Selection, select
 from etsplat.tasks.sources import SoupRun, training_cameras
@@ -32,8 +33,8 @@ from etsplat.web.pages import render_scene_page
 WHOLE = (".safetensors", ".etz", ".html")
 """Kinds of files that hold a soup as soft as it is, in the units and axes of its capture."""
 
-_LOWEST, _HIGHEST = 0.01, 0.99
-"""Quantiles of coordinates between which nearly everything lies, whatever strays."""
+_STRAYS = 0.01
+"""Share of a soup's corners beyond its extent at either end of an axis."""
 
 
 @dataclass(frozen=True)
@@ -73,6 +74,7 @@ def export_soup(run: SoupRun, path: Path | str, config: ExportConfig, crop: Crop
         InputError: settings that contradict each other; nothing is left; the file cannot be written.
     """
     path = Path(path)
+    config = replace(config, up=config.up or ("keep" if config.colors == "keep" else "y"))
     _check(path, config)
     keeps_all = kind_of(path) in WHOLE
     soft = keeps_all or config.alpha or config.colors == "keep"
@@ -112,17 +114,7 @@ def _check(path: Path, config: ExportConfig) -> None:
         raise InputError(f"colours that depend on the direction (--colors keep) need --format {kinds} and --up keep")
     if config.alpha and "alpha" not in holds:
         raise InputError(f"{path}: files of this kind hold no opacities; leave out --alpha, or choose another --format")
-    if config.up == "z" and "z_up" not in holds:
-        kinds = " or ".join(suffix[1:] for suffix in suffixes("z_up"))
-        raise InputError(
-            f"{path}: files of this kind have +y up, which programs turn to their own axis; leave out --up z, "
-            f"or choose --format {kinds}"
-        )
-    if config.place == "world" and "offset" not in holds:
-        kinds = " or ".join(suffix[1:] for suffix in suffixes("offset"))
-        raise InputError(f"{path}: files of this kind hold no coordinates of maps; choose --format {kinds}")
-    if config.place == "ground" and config.up == "keep":
-        raise InputError("--place ground needs to know which way is up; take --up y or z")
+    check_placed(path, config)
 
 
 def _write_whole(run: SoupRun, path: Path, config: ExportConfig, chosen: Selection) -> None:
@@ -168,10 +160,8 @@ def _write(run: SoupRun, path: Path, config: ExportConfig, chosen: Selection, *,
         if isinstance(soup, SolidSoup):
             colors[turned.to(colors.device)] = colors[turned.to(colors.device)].flip(1)
     transform = transform_of(run, config, vertices[~(chosen.sky[kept].cpu())])
-    georeference, world, near = _georeference(run), None, transform
-    if config.place == "world" and georeference is not None:  # the sum of both float32 could not hold
-        x, y, z = transform.translation.tolist()
-        world, near = replace(georeference, offset=(x, y, z)), replace(transform, translation=torch.zeros(3).double())
+    georeference = _georeference(run)
+    near, world = apart_from_world(transform, config, georeference)
     vertices = near.apply(vertices).float()
     if config.alpha:
         colors = torch.cat([colors, opacities[:, None]], dim=1)
@@ -194,39 +184,12 @@ def _write(run: SoupRun, path: Path, config: ExportConfig, chosen: Selection, *,
 
 
 def transform_of(run: SoupRun, config: ExportConfig, corners: Float[Tensor, "N 3 3"]) -> Similarity:
-    """How the capture's frame is turned, scaled and moved.
-
-    Args:
-        run: with its capture, to know where up is; without one, or where the cameras contradict each other, nothing is
-            turned, and +y or +z is up as it is.
-        config: up, scale and place. The world's axes are those of the capture, and GLB's nodes turn them if need be.
-        corners: of what is placed, on the CPU. Between the 1st and 99th of a hundred parts of their coordinates
-            along each axis is what the middle is the middle of; at the 1st is the ground.
-    """
+    """The `placement` of a soup; without its capture, or where cameras contradict each other, nothing is turned."""
     georeference = _georeference(run)
-    if config.place == "world":
-        if georeference is None:
-            raise InputError(
-                f"{run.path}: does not say where it lies in the world; write {GEOREFERENCE_FILE}, or train anew"
-            )
-        place = torch.tensor(georeference.offset, dtype=torch.float64)
-        return Similarity(scale=georeference.scale * config.scale, translation=place * config.scale)
-    up = None
-    if config.up != "keep":
-        up = told_up(georeference)
-        if up is None and run.capture is not None:
-            up = up_of(run.capture)
-    axis = torch.eye(3, dtype=torch.float64)[2 if config.up == "z" else 1]
-    turned = Similarity(scale=config.scale)
-    if up is not None:
-        turned = replace(turned, rotation=rotation_between(up, axis))
-    if config.place == "keep" or not len(corners):
-        return turned
-    ordered = turned.apply(corners.reshape(-1, 3)).sort(dim=0).values
-    last = len(ordered) - 1
-    low, high = ordered[round(_LOWEST * last)], ordered[round(_HIGHEST * last)]
-    middle = (low + high) / 2
-    return turned.moved(-(middle if config.place == "center" else middle + (low - middle) * axis))
+    up = told_up(georeference)
+    if up is None and run.capture is not None:
+        up = up_of(run.capture)
+    return placement(run.path, config, corners, up, georeference, _STRAYS)
 
 
 def _georeference(run: SoupRun) -> Georeference | None:
