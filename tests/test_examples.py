@@ -90,6 +90,11 @@ def test_the_loop_of_the_documents_runs(tmp_path: Path) -> None:
     assert len(etsplat.load_mesh(tmp_path / "owl.glb").faces) == 1280
 
 
+def test_photos_in_memory_are_a_data_set(tmp_path: Path) -> None:
+    """docs/library.md: what stands there runs as it stands."""
+    assert run(["-c", code_of("docs/library.md", "StoredPictures(")], tmp_path) == ""
+
+
 def test_the_trainer_of_the_documents_runs(tmp_path: Path) -> None:
     """docs/library.md: the same in fewer lines, with a term and a strategy."""
     printed = run(["-c", code_of("docs/library.md", "Trainer")], tmp_path)

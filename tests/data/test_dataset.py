@@ -44,6 +44,14 @@ def test_renormalising_twice_composes(views, rng):
     torch.testing.assert_close(twice.normalization.invert(expected), points)
 
 
+def test_what_was_moved_comes_back_to_the_units_of_the_input(views):
+    moved = views.renormalized(torch.tensor([5.0, -1.0, 3.0], dtype=torch.float64), 4.0)
+    back, start = moved.in_input_units(), views.in_input_units()
+    torch.testing.assert_close(back.viewmats, start.viewmats, rtol=0, atol=1e-6)
+    assert back.normalization.radius == 1
+    assert not back.normalization.center.any()
+
+
 def test_contradicting_fields_are_refused(views):
     with pytest.raises(ValueError, match="images: expected 5, one per viewmat, got 4"):
         replace(views, images=StoredPictures(list(views.images)[:4]))

@@ -105,6 +105,17 @@ def toy(monkeypatch: pytest.MonkeyPatch) -> Toy:
     return toy
 
 
+def test_what_is_built_in_stays(toy: Toy):
+    """An engine without a name of its own would take the place of the oracle; one of yours may be replaced."""
+    etsplat.register_engine(Toy())
+    for name in ("reference", "cpu"):
+        toy.name = name
+        with pytest.raises(ValueError, match=f"engine must have a name of its own, got '{name}', which is built in"):
+            etsplat.register_engine(toy)
+    with pytest.raises(ValueError, match="engine must be an Engine, got int"):
+        etsplat.register_engine(3)  # pyright: ignore[reportArgumentType]
+
+
 def test_an_engine_of_ones_own_is_used_where_it_is_chosen(toy: Toy):
     """Registered, it runs the operations of its block and no others, and is in the list of those that there are."""
     topology = MeshTopology.from_faces(icosphere(1)[1], 42)

@@ -363,6 +363,9 @@ def test_save_mesh_names_the_wrong_argument(tmp_path, ball):
         save_mesh(tmp_path / "a.ply", vertices, faces, colors[:-1])
     with pytest.raises(ValueError, match="faces: expected whole numbers"):
         save_mesh(tmp_path / "a.ply", vertices, faces.float())
+    for bright in ((255 * colors).byte(), 255 * colors):
+        with pytest.raises(ValueError, match=r"face_colors: expected floating-point display values in \[0, 1\]"):
+            save_mesh(tmp_path / "a.ply", vertices, faces, bright)
     with pytest.raises(ValueError, match="path: expected one of the suffixes"):
         save_mesh(tmp_path / "a.xyz", vertices, faces)
     assert list(tmp_path.iterdir()) == []

@@ -76,8 +76,18 @@ def test_bad_arguments_are_named():
         flip(image.byte(), image)
     with pytest.raises(ValueError, match=r"image: expected a pixel or more, got shape \(0, 5, 3\)"):
         flip(image[:0], image[:0])
+    with pytest.raises(ValueError, match=r"truth: expected values in \[0, 1\], got others; divide by 255"):
+        flip(image, image + 255)
     with pytest.raises(ValueError, match="pixels_per_degree: expected a positive number, got 0"):
         flip(image, image, pixels_per_degree=0.0)
+
+
+def test_what_is_no_number_is_no_likeness_and_half_precision_no_difference(rng):
+    image, truth = torch.rand(2, 16, 16, 3, generator=rng)
+    spoilt = image.clone()
+    spoilt[3, 3] = torch.nan
+    assert bool(flip(spoilt, truth).isnan())
+    assert float(flip(image.half(), truth.half())) == pytest.approx(float(flip(image, truth)), abs=1e-3)
 
 
 def test_equal_bits_on_any_number_of_torchs_threads(rng):

@@ -109,6 +109,10 @@ def test_shapes_that_do_not_fit_are_refused(metric, pair):
         metric(pair[0], pair[1][:-1])
     with pytest.raises(ValueError, match=r"image: expected shape \(H, W, C\)"):
         metric(pair[0][None], pair[1][None])
+    with pytest.raises(ValueError, match="image must be of floating-point numbers"):
+        metric(pair[0].byte(), pair[1])
+    with pytest.raises(ValueError, match="image: expected a pixel or more"):
+        metric(pair[0][:0], pair[1][:0])
     with pytest.raises(ValueError, match="at least 11 pixels"):
         ssim(pair[0][:8], pair[1][:8], interior=True)
 

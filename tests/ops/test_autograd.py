@@ -66,6 +66,8 @@ def test_every_public_operation_is_in_the_table_or_says_why_not() -> None:
 
 
 FACTORIES = CASES | COMPOSED
+OF_TORCH = ("pick_values", "weighted_sum")
+"""Operations that engine cpu has no code of its own for."""
 EVERY_OPERATION = pytest.mark.parametrize("name", FACTORIES)
 
 
@@ -108,6 +110,17 @@ def test_compiled_by_torch_it_is_the_same(name, rng):
     torch._dynamo.reset()
     compiled = torch.compile(outputs, backend="eager", fullgraph=False)
     _assert_same(_gradients(values, compiled), _gradients(values, outputs))
+
+
+@pytest.mark.parametrize("name", [name for name in CASES if name not in OF_TORCH])
+def test_gradients_of_gradients_are_refused_by_native_engines(name, rng):
+    """Rather than to be zero without a word; the gradients themselves are the same."""
+    values, outputs = _grown(name, "cpu", rng)
+    expected = _gradients(values, outputs)
+    found = torch.autograd.grad(loss(outputs(*values)), values, create_graph=True)
+    _assert_same(list(found), expected)
+    with pytest.raises(RuntimeError, match=r'with etsplat\.engine\("reference"\)'):
+        torch.stack([gradient.square().sum() for gradient in found]).sum().backward()
 
 
 @EVERY_OPERATION

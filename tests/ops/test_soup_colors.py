@@ -87,3 +87,22 @@ def test_wrong_arguments_are_named(rng):
         soup_colors(vertices, dc, rest, centers, 4)
     with pytest.raises(ValueError, match="centers"):
         soup_colors(vertices, dc, rest, centers.double(), 1)
+
+
+@pytest.mark.parametrize("views", [1, 3])
+def test_cameras_get_the_gradient_of_where_they_are(engine, rng, views):
+    """As finite differences in float64 have it; without a wish for it colours have the same bits as ever."""
+    inputs = problem(rng, 40, views)
+    leaves = [tensor.clone().requires_grad_() for tensor in inputs]
+    colors = on(engine, soup_colors, *leaves, 2)
+    torch.testing.assert_close(colors.detach(), on(engine, soup_colors, *inputs, 2), rtol=1e-4, atol=1e-5)
+    weights = torch.randn(colors.shape, generator=rng)
+    colors.backward(weights)
+    exact = [tensor.double() for tensor in inputs]
+    move = torch.zeros_like(exact[3])
+    for index in range(move.numel()):
+        move.flatten()[index] = 1e-6
+        ahead, behind = (soup_colors(*exact[:3], exact[3] + sign * move, 2) for sign in (1, -1))
+        found = float((weights * (ahead - behind)).sum() / 2e-6)
+        move.zero_()
+        assert float(leaves[3].grad.flatten()[index]) == pytest.approx(found, rel=2e-3, abs=2e-3)

@@ -19,7 +19,7 @@ from etsplat.geometry.icosphere import icosphere
 from etsplat.io.locks import writing_run
 from etsplat.io.run_directory import RunDirectory
 from etsplat.model.soup_init import StartPoints, start_soup
-from etsplat.model.triangle_mesh import TriangleMesh
+from etsplat.model.triangle_mesh import MeshAppearance, TriangleMesh
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.optim.loop import DoneEvent, RefineEvent, StepEvent
 from etsplat.optim.objective import Custom, Drawing, Objective, Term
@@ -127,6 +127,27 @@ def test_any_model_fits_any_data(
     state, expected = resumed.state(), trainer.state()
     assert [name for name in expected if not torch.equal(state[name], expected[name])] == []
     assert [line["loss"] for line in run.read_history()] == losses
+
+
+def test_a_run_of_other_parts_is_not_gone_on_with(object_views: Dataset, tmp_path: Path) -> None:
+    """Another kernel, background or photometric term is another run; parameters of a file learn as others do."""
+    vertices, faces = icosphere(1)
+
+    class Mine(Photometric):
+        pass
+
+    def fit(iterations: int, kernel: str = "elastic", term: Term | None = None, **options: Any) -> None:
+        look = MeshAppearance(kernel=kernel)
+        mesh = TriangleMesh.from_mesh(vertices, faces, colors=0.7, opacity=0.9, sigma=0.3, appearance=look)
+        for parameter in mesh.parameters().values():
+            parameter.requires_grad_(False)
+        Trainer(mesh, object_views, Objective(term or Photometric()), **options).fit(iterations, run=tmp_path / "run")
+
+    fit(2)
+    fit(3)
+    for changes in ({"kernel": "bilateral"}, {"term": Mine()}, {"background": (1.0, 1.0, 1.0)}):
+        with pytest.raises(InputError, match=r"other settings|another"):
+            fit(4, **changes)
 
 
 def test_a_fit_can_be_gone_on_with(object_views: Dataset) -> None:

@@ -9,7 +9,9 @@ import torch
 
 from etsplat.cli.parse import parse
 from etsplat.core.errors import InputError
+from etsplat.data.dataset import Dataset, Normalization
 from etsplat.data.demo_object import demo_object
+from etsplat.data.hull import bounding_sphere
 from etsplat.data.load import load_dataset
 from etsplat.data.photograph import photograph
 from etsplat.data.pictures import StoredPictures
@@ -131,6 +133,24 @@ def test_folders_without_a_soup_are_input_errors(tmp_path, trained):
     (tmp_path / "run" / "soup.safetensors").unlink()
     with pytest.raises(InputError, match="got to a checkpoint"):
         open_run(tmp_path / "run")
+
+
+def test_an_object_in_a_data_set_is_found_by_its_outlines():
+    """In its own units; one that is in the unit sphere, or was moved by somebody, or has no outlines, stays."""
+    views = photograph(demo_object(), 64, 64).in_input_units()
+    assert load_source(views, ReconstructConfig.tiny()) == (views, [])
+    far = views.renormalized(torch.tensor([-3.0, 1.0, -2.0], dtype=torch.float64), 0.1)
+    far = replace(far, normalization=Normalization())
+    found, notes = load_source(far, ReconstructConfig.tiny())
+    assert isinstance(found, Dataset)
+    center, radius = bounding_sphere(views)
+    assert found.normalization.radius == pytest.approx(10 * radius, rel=0.1)
+    expected = torch.tensor([30.0, -10.0, 20.0]) + 10 * center
+    torch.testing.assert_close(found.normalization.center.float(), expected, rtol=0, atol=1.0)
+    assert "the object is about (3" in notes[0]
+    assert load_source(found, ReconstructConfig.tiny()) == (found, [])
+    opaque = replace(far, images=StoredPictures([image[..., :3] for image in far.images]))
+    assert load_source(opaque, ReconstructConfig.tiny()) == (opaque, [])
 
 
 def test_photos_whose_masks_contradict_the_others_are_left_out_and_named(tmp_path):

@@ -98,8 +98,8 @@ def check_native(name: str, tensor: Tensor) -> None:
     """`check_memory`, and ValueError within a transform of torch.func."""
     if isinstance(tensor, Tensor) and _address(tensor) == 0 and _is_transformed(tensor):
         raise ValueError(
-            f"{name} must be a plain tensor, got one within a transform of torch.func, which native code cannot see "
-            "through: take torch.autograd.grad for gradients, and several cameras in one call in the place of vmap"
+            f"{name} must be a plain tensor, got one within a transform of torch.func, which no engine supports: "
+            "take torch.autograd.grad for gradients, and several cameras in one call in the place of vmap"
         )
     check_memory(name, tensor)
 

@@ -243,6 +243,17 @@ class Dataset:
         total = Normalization(before.invert(center), before.radius * radius)
         return replace(self, viewmats=viewmats, exact_points=points, normalization=total)
 
+    def in_input_units(self) -> "Dataset":
+        """The same views in the units and axes of the input, as results of `reconstruct` and `train` are.
+
+        Example:
+            >>> own = etsplat.photograph(etsplat.demo_object(), 8, 8).in_input_units()
+            >>> own.normalization.radius
+            1.0
+        """
+        center, radius = self.normalization.center.double(), self.normalization.radius
+        return replace(self.renormalized(-center / radius, 1 / radius), normalization=Normalization())
+
     def _center_and_extent(self) -> tuple[Float[Tensor, "3"], float]:
         centers = self.centers[self.train or list(range(len(self)))]
         center = centers.mean(dim=0)

@@ -16,15 +16,19 @@ from etsplat.engines.engine import Engine
 from etsplat.engines.webgpu.engine import WebGpuEngine
 
 _REFERENCE = Engine()
-_engines: dict[str, Engine] = {}
+_BUILT_IN: dict[str, Engine] = {own.name: own for own in (_REFERENCE, CpuEngine(), CudaEngine(), WebGpuEngine())}
+_engines = dict(_BUILT_IN)
 _chosen: ContextVar[Engine | None] = ContextVar("etsplat.engine", default=None)
 
 
 def register_engine(engine: Engine) -> None:
-    """Make an engine known by its name, in the place of one that had it.
+    """Make an engine known by its name, in the place of one of yours that had it.
 
     It is then what `with etsplat.engine(name)` chooses; and if it has a device of its own that no earlier one has, it
     runs what is on such a device in float32.
+
+    Raises:
+        ValueError: it is no `Engine`, or has the name of one that is built in.
 
     Example:
         >>> from etsplat.engines.engine import Engine
@@ -39,11 +43,11 @@ def register_engine(engine: Engine) -> None:
         ...     float(etsplat.photometric_loss(torch.zeros(1, 8, 8, 3), torch.ones(1, 8, 8, 3), 0.0))
         2.0
     """
+    if not isinstance(engine, Engine):
+        raise ValueError(f"engine must be an Engine, got {type(engine).__name__}")
+    if engine.name in _BUILT_IN:
+        raise ValueError(f"engine must have a name of its own, got {engine.name!r}, which is built in")
     _engines[engine.name] = engine
-
-
-for _built_in in (_REFERENCE, CpuEngine(), CudaEngine(), WebGpuEngine()):
-    register_engine(_built_in)
 
 
 def engine_names() -> tuple[str, ...]:

@@ -90,6 +90,10 @@ def load_mesh(path: Path | str) -> MeshFile:
     return _clean(path, raw)
 
 
+_BRIGHTEST = 2.0
+"""Of colours that are clamped: others are not from 0 to 1."""
+
+
 def save_mesh(
     path: Path | str,
     vertices: Float[Tensor, "V 3"],
@@ -116,7 +120,7 @@ def save_mesh(
         path: ends in .ply, .obj or .glb.
         vertices: finite positions.
         faces: indices into `vertices`.
-        face_colors: display values in [0, 1] (others are clamped); at most one of the two kinds of colours.
+        face_colors: display values in [0, 1] (up to 2 they are clamped); at most one of the two kinds of colours.
         vertex_colors: the same for vertices.
         texture: one picture over all faces, in the place of colours; for GLB, and OBJ and PLY with a PNG beside them.
         normal_map: how light falls on the faces under the texture, for GLB alone, whose material then is lit.
@@ -383,6 +387,8 @@ def _check_arguments(vertices: Tensor, faces: Tensor, face_colors: Tensor | None
             raise ValueError(f"{name}: expected shape {wanted}, got {tuple(values.shape)}")
         if not bool(torch.isfinite(values).all()):
             raise ValueError(f"{name}: expected finite values, got NaN or Inf")
+        if name.endswith("colors") and (not values.is_floating_point() or float(values.max()) > _BRIGHTEST):
+            raise ValueError(f"{name}: expected floating-point display values in [0, 1]; divide by 255 what is to 255")
     if faces.is_floating_point():
         raise ValueError(f"faces: expected whole numbers, got {faces.dtype}")
     if len(faces) == 0 or int(faces.min()) < 0 or int(faces.max()) >= len(vertices):

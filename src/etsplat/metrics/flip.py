@@ -33,6 +33,9 @@ _WIDEST = 0.04
 _COLOR_POWER, _COLOR_SHARE, _COLOR_RANGE = 0.7, 0.4, 0.95
 """q_c, p_c, p_t: differences up to p_c of the largest take p_t of the range."""
 
+_BEYOND = 0.01
+"""Values of the truth may be as far outside of [0, 1], by rounding."""
+
 _FEATURE_WIDTH, _FEATURE_POWER = 0.082, 0.5
 """Width of what counts as an edge or a point, in degrees, and q_f."""
 
@@ -53,8 +56,8 @@ def flip(
         pixels_per_degree: of visual angle; above 0.
 
     Raises:
-        ValueError: shapes differ or are not (H, W, 3), there are no pixels, or no floating-point numbers;
-            `pixels_per_degree` is not positive.
+        ValueError: shapes differ or are not (H, W, 3), there are no pixels, or no floating-point numbers; `truth` has
+            values beyond [0, 1]; `pixels_per_degree` is not positive.
 
     Example:
         >>> black, white = torch.zeros(8, 8, 3), torch.ones(8, 8, 3)
@@ -73,11 +76,14 @@ def flip(
         raise ValueError(f"image: expected a pixel or more, got shape {tuple(image.shape)}")
     if not 0 < pixels_per_degree < math.inf:
         raise ValueError(f"pixels_per_degree: expected a positive number, got {pixels_per_degree}")
+    if float((truth.detach() - 0.5).abs().max()) > 0.5 + _BEYOND:  # not of those that are NaN
+        raise ValueError("truth: expected values in [0, 1], got others; divide by 255 what is from 0 to 255")
+    image = image.float() if image.dtype in (torch.float16, torch.bfloat16) else image
     pair = torch.stack([image, truth.to(image)]).movedim(-1, 1)
     opponent = _opponent(_xyz(pair))
     color = _redistributed(_hyab(*_perceived(opponent, pixels_per_degree)))
     feature = _feature_difference(opponent[:, 0] / 116 + 16 / 116, pixels_per_degree)
-    return _power(color, 1 - feature).mean()
+    return _power(color, 1 - feature).mean() + 0 * pair.sum()  # NaN stays NaN, which clamping hides
 
 
 def _xyz(srgb: Float[Tensor, "B 3 H W"]) -> Float[Tensor, "B 3 H W"]:

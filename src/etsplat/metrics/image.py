@@ -16,7 +16,7 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from etsplat.core.errors import InputError
-from etsplat.core.validation import check_device, check_memory
+from etsplat.core.validation import check_device, check_floating, check_memory
 from etsplat.engines.threads import all_torch_threads, one_torch_thread
 from etsplat.io.paths import kind_of
 from etsplat.io.tensors import read_state_dict
@@ -48,7 +48,7 @@ def psnr(image: Float[Tensor, "H W C"], truth: Float[Tensor, "H W C"]) -> float:
     Infinite for equal images. For several views the field takes the mean of their PSNRs.
 
     Raises:
-        ValueError: shapes differ or are not (H, W, C).
+        ValueError: shapes differ or are not (H, W, C), there are no pixels, or no floating-point numbers.
 
     Example:
         >>> truth = torch.zeros(8, 8, 3)
@@ -304,6 +304,10 @@ def _check_pair(image: Tensor, truth: Tensor) -> None:
         raise ValueError(f"image: expected shape (H, W, C), got {tuple(image.shape)}")
     if image.shape != truth.shape:
         raise ValueError(f"truth: expected the image's shape {tuple(image.shape)}, got {tuple(truth.shape)}")
+    check_floating("image", image)
+    check_floating("truth", truth)
+    if image.numel() == 0:
+        raise ValueError(f"image: expected a pixel or more, got shape {tuple(image.shape)}")
 
 
 def _blur(planes: Float[Tensor, "M C H W"], padding: int) -> Float[Tensor, "M C H2 W2"]:

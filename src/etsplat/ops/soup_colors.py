@@ -27,11 +27,12 @@ def soup_colors(
         vertices: (N, 3, 3) corners in world space.
         sh_dc: (N, 1, 3) coefficient of the constant band.
         sh_rest: (N, R, 3) those of the other bands, R >= (degree + 1)^2 - 1; bands above ``degree`` get zero gradient.
-        centers: (B, 3) camera positions; they receive no gradient.
+        centers: (B, 3) camera positions.
         degree: 0 to 3.
 
     Returns:
-        (B, N, 3), at least 0. Gradients reach the first three tensors; there is none where the colour was clamped.
+        (B, N, 3), at least 0. Gradients reach all tensors, within `EndAtColors` none of them; there is none where the
+        colour was clamped.
 
     Raises:
         ValueError: Wrong shape, dtype, device or degree; the message names the argument.
@@ -47,9 +48,15 @@ def soup_colors(
         check_like(name, tensor, "vertices", vertices)
     if sh_rest.shape[1] < (degree + 1) ** 2 - 1:
         raise ValueError(f"sh_rest must have {(degree + 1) ** 2 - 1} bases for degree {degree}, got {sh_rest.shape[1]}")
-    colors = engine_for(vertices).soup_colors(vertices, sh_dc, sh_rest[:, :MAX_REST], centers.detach(), degree)
-    ending = _ending.get()
-    return colors if ending is None else ending.taken(colors, (vertices, sh_dc, sh_rest), centers, degree)
+    ending, rest = _ending.get(), sh_rest[:, :MAX_REST]
+    if ending is not None and torch.is_grad_enabled() and ending.takes(vertices, sh_dc, sh_rest):
+        colors = engine_for(vertices).soup_colors(vertices, sh_dc, rest, centers.detach(), degree)
+        return ending.taken(colors, centers, degree)
+    if not (centers.requires_grad and torch.is_grad_enabled()):
+        return engine_for(vertices).soup_colors(vertices, sh_dc, rest, centers, degree)
+    engine, origin = engine_for(vertices), torch.zeros_like(centers[:1])
+    views = [engine.soup_colors(vertices - center, sh_dc, rest, origin, degree) for center in centers]
+    return torch.cat(views) if views else vertices.new_empty((0, N, 3))
 
 
 class EndAtColors:
@@ -80,12 +87,16 @@ class EndAtColors:
     def __exit__(self, *_: Any) -> None:
         _ending.reset(self._token)
 
-    def taken(self, colors: Tensor, of: tuple[Tensor, ...], centers: Tensor, degree: int) -> Tensor:
-        """A leaf in the place of the first colours of the tensors; others are given back."""
-        if not colors.requires_grad or any(one is not other for one, other in zip(of, self.of, strict=True)):
-            return colors
-        if self.colors is not None:
-            self.again = True
+    def takes(self, *of: Tensor) -> bool:
+        """Whether the gradient ends at colours of these tensors: it does at the first that are made of its own."""
+        if any(one is not other for one, other in zip(of, self.of, strict=True)):
+            return False
+        self.again = self.again or self.colors is not None
+        return self.colors is None
+
+    def taken(self, colors: Tensor, centers: Tensor, degree: int) -> Tensor:
+        """A leaf in the place of colours, unless nothing wants their gradient."""
+        if not colors.requires_grad:
             return colors
         self.colors, self.centers, self.degree = colors.detach().requires_grad_(), centers.detach(), degree
         return self.colors

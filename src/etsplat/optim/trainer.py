@@ -122,7 +122,7 @@ class Trainer(Generic[M]):
             raise ValueError(f"objective must be an Objective, got {type(objective).__name__}: Objective(photometric)")
         if batch < 1:
             raise ValueError(f"batch must be at least 1, got {batch}")
-        self.model, self.strategy, self.progress = model, strategy or Fixed(), Progress()
+        self.model, self.strategy, self.progress = model.learnable(), strategy or Fixed(), Progress()
         self.exposure, self.depths, self.guard = exposure or Exposure(NEVER), depths or DepthTrust([]), guard
         self.cameras = cameras or CameraRefinement()
         self._objective, self._dataset, self._batch, self._evaluate = objective, dataset, batch, evaluate
@@ -130,6 +130,7 @@ class Trainer(Generic[M]):
         generator = seed if isinstance(seed, torch.Generator) else torch.Generator().manual_seed(seed)
         self._began = generator.get_state()
         self._kernel = getattr(model.appearance, "kernel", None)  # of what is soft at first; None for other models
+        self._background = None if background is None else [float(channel) for channel in background]
         behind = None if background is None else torch.tensor(background, dtype=torch.float32)[None]
         self._stepper = Stepper(
             model,
@@ -187,7 +188,7 @@ class Trainer(Generic[M]):
             run: gets checkpoints and history.jsonl, and is gone on with if it has a checkpoint; made if it is missing.
                 None writes nothing.
             run_hash: identifies all that the result depends on; a checkpoint of another run is refused. None for one of
-                the photos, the seed and the kinds of the parts.
+                the photos, the seed, the kinds of the parts, the kernel and the background.
 
         Returns:
             Where the run stands.
@@ -389,7 +390,8 @@ class Trainer(Generic[M]):
         return self._known_loss
 
     def _hash(self) -> str:
-        kinds = [type(part).__name__ for part in (self.model, self.strategy, *self._objective.terms)]
+        parts = (self.model, self.strategy, self._objective.photometric, *self._objective.terms)
+        kinds = [*(type(part).__name__ for part in parts), self._kernel, self._background]
         about = [self._dataset.fingerprint(), self._batch, kinds, self._objective.weights(1), self._began.tolist()]
         return hashlib.sha256(json.dumps(about).encode()).hexdigest()
 

@@ -113,8 +113,8 @@ def reconstruct(
 
     Args:
         source: a mesh file or `MeshFile`, which is photographed from 40 sides; "demo:owl", an object built in code; a
-            folder with posed images and masks, or a `Dataset` with the object in the unit sphere (`renormalized` and
-            `bounding_sphere` bring it there).
+            folder with posed images and masks, or a `Dataset`. Where the object is, outlines say; without
+            them it must be in the unit sphere (`Dataset.renormalized`).
         out: the run directory; made if it does not exist. README.txt in it explains what is there.
         config: settings; None for preset "best". See `ReconstructConfig`.
         init_mesh: a mesh to start from, in the units of the source.

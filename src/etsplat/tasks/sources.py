@@ -43,6 +43,10 @@ from etsplat.tasks.train_config import TrainConfig
 Source = str | Path | MeshFile | Dataset
 
 
+_NEAR, _SMALL, _LARGE = 0.5, 0.25, 2.0
+"""How far from the origin the sphere around an object may be, and its radius, where a data set has it in the unit
+sphere; the sphere is a rough one."""
+
 _A_FOLDER = "a folder with posed images, and a mesh, a Dataset and a demo have none"
 
 
@@ -87,7 +91,8 @@ def load_source(
     if isinstance(source, MeshFile):
         return source, source.notes
     if isinstance(source, Dataset):
-        return source, straight_alpha(source)
+        scene, notes = _in_unit_sphere(source)
+        return scene, [*notes, *straight_alpha(source)]
     check_demo(source, "reconstruct")
     if str(source) == DEMO_OBJECT:
         return demo_object(), []
@@ -104,6 +109,21 @@ def load_source(
         mesh = load_mesh(path)
         return mesh, mesh.notes
     raise InputError(f"{path}: no such file or folder; {path_remedy(path)}")
+
+
+def _in_unit_sphere(scene: Dataset) -> tuple[Dataset, list[str]]:
+    """A data set as it is where its object is in the unit sphere, or else moved there, which a note says."""
+    if scene.normalization.radius != 1 or bool(scene.normalization.center.any()):  # somebody has moved it
+        return scene, []
+    try:
+        center, radius = bounding_sphere(scene)
+    except InputError:  # no outlines: it starts from a sphere about the origin
+        return scene, []
+    if float(center.norm()) <= _NEAR and radius <= _LARGE and radius >= _SMALL:
+        return scene, []
+    x, y, z = center.tolist()
+    where = f"the object is about ({x:.3g}, {y:.3g}, {z:.3g}), in a sphere of radius {radius:.3g}"
+    return scene.renormalized(center, radius), [f"{where}: moved into the unit sphere; results are in the units given"]
 
 
 def _agreeing(scene: Dataset) -> tuple[Dataset, list[str]]:

@@ -6,7 +6,6 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from etsplat.core.validation import check_native, dense
 
@@ -36,8 +35,26 @@ class _Native(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *cotangents: Tensor | None) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        # Only where gradients are to have gradients does autograd follow what is done here.
-        return (_once if torch.is_grad_enabled() else _backward)(ctx, *cotangents)
+        if not torch.is_grad_enabled():
+            return _backward(ctx, *cotangents)
+        with torch.no_grad():  # these gradients are to have gradients
+            gradients = _backward(ctx, *cotangents)
+        return _Once.apply(torch.zeros((), requires_grad=True), *gradients)  # pyright: ignore[reportReturnType]
+
+
+class _Once(torch.autograd.Function):
+    """Refuses the gradients of gradients, which would be zero without a word."""
+
+    @staticmethod
+    def forward(ctx: Any, anchor: Tensor, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
+        return tuple(None if gradient is None else gradient.detach() for gradient in gradients)
+
+    @staticmethod
+    def backward(ctx: Any, *cotangents: Tensor | None) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        raise RuntimeError(
+            'native engines have no gradients of gradients; compute them with engine("reference"): '
+            'with etsplat.engine("reference"): ...'
+        )
 
 
 def _backward(ctx: Any, *cotangents: Tensor | None) -> tuple[Tensor | None, ...]:
@@ -46,9 +63,6 @@ def _backward(ctx: Any, *cotangents: Tensor | None) -> tuple[Tensor | None, ...]
     needed = ctx.needs_input_grad[2:]
     gradients = ctx.gradients(kept, needed, *[None if given is None else _checked(given) for given in cotangents])
     return None, None, *gradients, *(None,) * (len(needed) - len(gradients))
-
-
-_once = once_differentiable(_backward)
 
 
 def _checked(tensor: Tensor) -> Tensor:
