@@ -6,10 +6,12 @@ import torch
 from etsplat.data.demo_object import demo_object
 from etsplat.data.photograph import photograph
 from etsplat.data.pictures import StoredPictures
-from etsplat.data.visual_hull import visual_hull
+from etsplat.data.visual_hull import visual_hull, without_specks
 from etsplat.geometry.distance import closest_points
-from etsplat.geometry.parts import genera
+from etsplat.geometry.icosphere import icosphere
+from etsplat.geometry.parts import face_parts, genera
 from etsplat.geometry.topology import MeshTopology
+from etsplat.io.mesh_files import MeshFile
 from helpers.meshes import ring_and_ball
 
 
@@ -72,3 +74,25 @@ def test_a_hull_that_touches_itself_is_taken_apart():
     assert topology.is_closed()
     assert topology.is_manifold()
     assert topology.is_oriented()
+
+
+@pytest.mark.parametrize(("away", "parts"), [(1.4, 2), (0.98, 1)])
+def test_a_small_part_that_photos_show_apart_stays(away: float, parts: int):
+    """A ball of a hundredth of the surface; one whose gap is below what the grid tells apart is a bit of the large."""
+    v, f = icosphere(3)
+    ball = 0.08 * v + torch.tensor([away, 0.0, 0.0])
+    views = photograph(MeshFile(torch.cat([0.9 * v, ball]), torch.cat([f, f + len(v)])), 160, 160, supersampling=2)
+    found, triangles = visual_hull(views, 8000)
+    assert len(genera(triangles, len(found))) == parts
+
+
+def test_what_was_a_part_before_a_cut_is_no_speck_after_it():
+    large, small = ring_and_ball(0.12), icosphere(2)
+    vertices = torch.cat([large.vertices, 0.05 * small[0] + torch.tensor([0.0, 0.0, -0.6])])
+    faces = torch.cat([large.faces, small[1] + len(large.vertices)])
+    views = photograph(MeshFile(vertices, faces), 160, 160, supersampling=2)
+    found, triangles = visual_hull(views, 8000)
+    assert len(genera(triangles, len(found))) == 3
+    _, kept = without_specks(found, triangles, least=int(face_parts(triangles, len(found)).bincount().min()))
+    assert len(kept) == len(triangles)
+    assert len(without_specks(found, triangles)[1]) < len(triangles)

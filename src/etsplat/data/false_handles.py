@@ -23,7 +23,7 @@ from etsplat.data.visual_hull import without_specks
 from etsplat.geometry.discs import with_discs
 from etsplat.geometry.loops import short_loops
 from etsplat.geometry.measures import mean_edge
-from etsplat.geometry.parts import genera
+from etsplat.geometry.parts import face_parts, genera
 from etsplat.geometry.topology import MeshTopology, connected
 
 _LEVELS = (0.4, 0.5, 0.6, 0.7)
@@ -98,7 +98,7 @@ def _cut(
         agreed: from `_agreement`.
         most: (B, 2) errors of silhouettes that are allowed.
     """
-    before, (score, hidden) = genera(faces, len(vertices)), agreed
+    before, (score, hidden), least = genera(faces, len(vertices)), agreed, _smallest(faces, len(vertices))
     tried = torch.zeros(len(vertices), dtype=torch.bool)
     for loop in short_loops(vertices, faces):
         if len(loop) > _THIN or 2 * int(tried[loop].sum()) > len(loop):
@@ -108,7 +108,7 @@ def _cut(
         around = faces[band].unique()
         if not (float(hidden[around].float().mean()) > 0.5 or float(score[around].nanmean()) < _LEVELS[-1]):
             continue
-        found = without_specks(*with_discs(vertices, faces, band))
+        found = without_specks(*with_discs(vertices, faces, band), least=least)
         after = genera(found[1], len(found[0]))
         if sum(after) >= sum(before) or len(after) != len(before):
             continue
@@ -129,7 +129,7 @@ def _simpler(
     photos: list[Photo], vertices: Tensor, faces: Tensor, agreed: tuple[Tensor, Tensor], level: float, most: Tensor
 ) -> tuple[Tensor, Tensor] | None:
     """The surface with a smaller genus, if there is one: the largest region is tried first. Arguments as of `_cut`."""
-    before, (score, _) = genera(faces, len(vertices)), agreed
+    before, (score, _), least = genera(faces, len(vertices)), agreed, _smallest(faces, len(vertices))
     low, unseen = score < level, score.isnan()
     edges = MeshTopology.from_faces(faces, len(vertices)).edges.long()
     was, deep = None, _DEEP * mean_edge(vertices, edges) / pixel_size(photos)
@@ -137,7 +137,7 @@ def _simpler(
     regions = _regions(faces, low[faces].all(dim=1))
     hidden = _regions(faces, (low | unseen)[faces].all(dim=1))
     for region in [*regions, *(each for each in hidden if 2 * low[faces[each]].float().mean() >= 1)]:
-        found = without_specks(*with_discs(vertices, faces, region))
+        found = without_specks(*with_discs(vertices, faces, region), least=least)
         after = genera(found[1], len(found[0]))
         if sum(after) >= sum(before) or len(after) != len(before):
             continue
@@ -147,6 +147,11 @@ def _simpler(
             if not _closes(photos, was, covered, deep):
                 return found
     return None
+
+
+def _smallest(faces: Tensor, num_vertices: int) -> int:
+    """Faces of the smallest part, which is to stay."""
+    return int(face_parts(faces, num_vertices).bincount().min())
 
 
 def _closes(photos: list[Photo], was: list[Tensor], covered: list[Tensor], deep: float) -> bool:

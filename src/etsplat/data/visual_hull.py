@@ -4,13 +4,17 @@ It has the holes and the parts that the silhouettes show, so a run that starts f
 that no silhouette shows are closed in it.
 """
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int64
+from scipy.spatial import KDTree
 from torch import Tensor
+from torch.nn.functional import max_pool2d
 
+from etsplat.data.agreement import first_hits, photos_of
 from etsplat.data.carving import Carving
 from etsplat.data.dataset import Dataset
 from etsplat.data.meshing import dual_contour
@@ -32,6 +36,10 @@ NEAR = 0.15
 
 _SPECK = 0.02
 """Parts with fewer faces than this fraction of the largest are dropped: dents of rough masks leave them."""
+
+_FEWEST, _APART, _PIXELS, _PHOTOS = 12, 3, 4, 3
+"""But not those of so many faces, so many cells from all others, that are all that explains so many pixels in so many
+photos: a part is there, however small. Nearer ones are bits of what is too thin for the grid."""
 
 _CHUNK = 1 << 17
 """Points that are looked up together."""
@@ -71,7 +79,7 @@ def visual_hull(
         found = torch.cat([beyond(chunk) for chunk in chunks]).double().numpy()
         return np.maximum(found, np.linalg.norm(points, axis=1) - radius)
 
-    cells = _FIRST_CELLS
+    cells, cell = _FIRST_CELLS, 1.0
     vertices, triangles = np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)
     for _ in range(_TRIES):
         cell = 2 * radius / (cells - 2 * _MARGIN)
@@ -83,7 +91,8 @@ def visual_hull(
         wanted = round(cells * (faces / len(triangles)) ** 0.5)
         if cells == (cells := min(max(wanted, _FIRST_CELLS // 2), _MOST_CELLS)):
             break
-    return without_specks(*taken_apart(torch.from_numpy(vertices).float(), torch.from_numpy(triangles)))
+    found = taken_apart(torch.from_numpy(vertices).float(), torch.from_numpy(triangles))
+    return without_specks(*found, spared=_shown_apart(dataset, *found, _APART * cell))
 
 
 def outside_hull(dataset: Dataset) -> Distance:
@@ -104,11 +113,47 @@ def outside_hull(dataset: Dataset) -> Distance:
     return outside
 
 
-def without_specks(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
-    """Only the large parts of a surface, and the vertices that these use."""
+def _shown_apart(dataset: Dataset, vertices: Tensor, faces: Tensor, gap: float) -> list[int]:
+    """The small parts of a hull that are farther than `gap` from all others, and that photos show beside the large."""
+    part = face_parts(faces, len(vertices))
+    sizes = part.bincount()
+    large = sizes >= _SPECK * sizes.amax() if len(sizes) else sizes > 0
+    candidates = [int(number) for number in (~large & (sizes >= _FEWEST)).nonzero()[:, 0]]
+    alone = [number for number in candidates if _gap(vertices, faces, part == number) > gap]
+    if not alone:
+        return []
+    shown = torch.zeros(len(sizes), dtype=torch.int64)
+    for photo in photos_of(dataset):
+        near = first_hits(photo, vertices, faces[large[part]])[1] >= 0
+        near = max_pool2d(near[None, None].float(), 3, stride=1, padding=1)[0, 0] > 0
+        hit = first_hits(photo, vertices, faces)[1]
+        own = hit[(hit >= 0) & ~near & (photo.pixels[0, 3] > 0.95)]
+        shown += part[own].bincount(minlength=len(sizes)) >= _PIXELS
+    return [number for number in alone if shown[number] >= _PHOTOS]
+
+
+def _gap(vertices: Tensor, faces: Tensor, own: Tensor) -> float:
+    """How far the vertices of some faces are from those of the others."""
+    mine, others = (vertices[faces[which].unique()].numpy() for which in (own, ~own))
+    return float(KDTree(others).query(mine)[0].min())
+
+
+def without_specks(
+    vertices: Tensor, faces: Tensor, *, spared: Sequence[int] = (), least: float = math.inf
+) -> tuple[Tensor, Tensor]:
+    """Only the large parts of a surface, and the vertices that these use.
+
+    Args:
+        vertices: (V, 3).
+        faces: (F, 3).
+        spared: small parts that stay, by their numbers as of `face_parts`.
+        least: parts of so many faces and more stay.
+    """
     if len(faces) == 0:
         return vertices[:0], faces
     part = face_parts(faces, len(vertices))
     sizes = part.bincount()
-    used, renumbered = faces[sizes[part] >= _SPECK * sizes[0]].unique(return_inverse=True)
+    stays = sizes >= min(_SPECK * float(sizes[0]), least)
+    stays[list(spared)] = True
+    used, renumbered = faces[stays[part]].unique(return_inverse=True)
     return vertices[used], renumbered
