@@ -81,7 +81,7 @@ def fitting(capture: Dataset, engine: str, device: torch.device = CPU, config: T
         },
         {"method": "single-sided", "background": "random"},
         {"batch": 2},
-        {"drawing.dropout": 2.0},
+        {"drawing.dropout": 4.5},
     ],
     ids=["plain", "finish", "paper", "single-sided", "batch", "dropout"],
 )
@@ -107,7 +107,7 @@ def test_steps_are_those_of_the_cpu_engine(cuda_device: torch.device, capture: D
 
 def test_steps_queued_together_are_the_steps_one_by_one(cuda_device: torch.device) -> None:
     """The same bits, however many steps are queued before the host looks, and though room runs out on the way."""
-    capture, config = demo_scene(40, 32), CONFIG.changed({"densification.begin": 25_000, "drawing.dropout": 2.0})
+    capture, config = demo_scene(40, 32), CONFIG.changed({"densification.begin": 25_000, "drawing.dropout": 4.5})
     together, one_by_one = (fitting(capture, "cuda", cuda_device, config) for _ in range(2))
     losses = together.advance(1, 1)
     with room_for_16_pairs() as repairs:

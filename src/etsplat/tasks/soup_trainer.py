@@ -238,7 +238,8 @@ def _appearance(config: TrainConfig, photos: int, iteration: int) -> SoupAppeara
         background=background_of(config),
     )
     if config.finish == "none":
-        return replace(plain, dropout=min(MOST_DROPPED, config.drawing.dropout / photos), draw=iteration % DRAWS)
+        share = min(MOST_DROPPED, (config.drawing.dropout / photos) ** 2)
+        return replace(plain, dropout=share, draw=iteration % DRAWS)
     opaque = ramp(iteration, 0, round(OPAQUE_AT * config.iterations))
     sharp = ramp(iteration, round(SHARP_FROM * config.iterations), round(SHARP_AT * config.iterations))
     ceiling = FIRST_CEILING * (FINAL_CEILING / FIRST_CEILING) ** sharp

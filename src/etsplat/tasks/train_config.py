@@ -32,8 +32,8 @@ class Drawing:
     """Leave out triangles that reach farther than this from their middle, in units of the photo's longer side."""
     sh_degree: Annotated[int, Range(0, 3)] = 3
     """Degree of the view-dependent colours."""
-    dropout: Annotated[float, Range(0, 100), _TRANSPARENT] = 2.0
-    """Each step leaves out a random share of the triangles: this, divided by the number of photos to train on;
+    dropout: Annotated[float, Range(0, 100), _TRANSPARENT] = 4.5
+    """Each step leaves out a random share of the triangles: the square of this over the number of photos to train on;
     a tenth at most. So what one photo asked for, hidden from the others behind other triangles, is seen by them too."""
     freeze_inradius: Annotated[bool, _SINGLE_SIDED] = True
     """With single-sided, hold the inradius constant in the backward pass, as Triangle Splatting does."""
