@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from etsplat import Cameras, intrinsics, look_at, sphere_grid
+from etsplat import Cameras, intrinsics, look_at, orbit_cameras, sphere_grid
 
 UP = torch.tensor([0.0, 1.0, 0.0])
 ORIGIN = torch.zeros(3)
@@ -109,6 +109,44 @@ def test_cameras_are_scaled_by_positive_finite_factors_alone(factor):
         cameras.scaled(factor)
 
 
+@pytest.mark.parametrize("size", [[32], "32", None, True, 32.5, 0, 2**27])
+def test_sizes_of_images_are_whole_numbers(size):
+    viewmats, K = torch.eye(4)[None], intrinsics(50, 9, 8)
+    for name, sizes in (("width", (size, 8)), ("height", (9, size))):
+        with pytest.raises(ValueError, match=f"{name} must be an integer from 1 to 67108864, got"):
+            Cameras(viewmats, K[None], *sizes)
+        with pytest.raises(ValueError, match=f"{name} must be an integer from 1 to 67108864, got"):
+            intrinsics(50, *sizes)
+
+
+@pytest.mark.parametrize(("degrees", "got"), [("60", "a number, got '60'"), (True, "a number"), (180, "between")])
+def test_a_field_of_view_is_a_number(degrees, got):
+    with pytest.raises(ValueError, match=f"fov_y_degrees must be {got}"):
+        intrinsics(degrees, 9, 8)
+
+
+def test_there_are_as_many_cameras_as_there_are(cameras):
+    """Also for loops over them, which end at an IndexError."""
+    assert len(list(cameras)) == 3
+    for index in (3, -4):
+        with pytest.raises(IndexError, match=f"index of a camera must be below 3, as there are so many, got {index}"):
+            cameras[index]
+
+
+@pytest.mark.parametrize(
+    ("odd", "text"),
+    [
+        ({"azimuths": 0}, "azimuths must be an integer of at least 1, got 0"),
+        ({"azimuths": 2.0}, "azimuths must be an integer"),
+        ({"elevations": ()}, "elevations must be degrees"),
+        ({"elevations": (0.0, 90)}, "elevations must be degrees, none of them straight above or below"),
+    ],
+)
+def test_an_orbit_has_cameras(odd, text):
+    with pytest.raises(ValueError, match=text):
+        orbit_cameras(9, 8, **odd)
+
+
 def test_cameras_of_integers_are_refused():
     with pytest.raises(ValueError, match=r"viewmats must be of floating-point numbers, got torch\.int64"):
         Cameras(torch.eye(4)[None].long(), intrinsics(50, 9, 8)[None], 9, 8)
@@ -121,6 +159,10 @@ def test_cameras_of_integers_are_refused():
         ({"eye": torch.ones(5, 3, dtype=torch.int64)}, "eye must be of floating-point numbers"),
         ({"target": torch.zeros(4, 3)}, r"target must have shape \(3,\) or that of eye, \(5, 3\), got \(4, 3\)"),
         ({"target": torch.zeros(2, 5, 3)}, "target must have shape"),
+        ({"eye": torch.full((5, 3), math.nan)}, "eye must be finite, got 15 NaN"),
+        ({"eye": torch.full((5, 3), math.inf)}, "eye must be finite"),
+        ({"target": (0, 0, math.nan)}, "target must be finite"),
+        ({"up": (0, math.inf, 0)}, "up must be finite"),
         ({"up": torch.ones(1)}, "up must have shape"),
         ({"up": None}, "up must be a tensor or three numbers, got None"),
         ({"up": "y"}, "up must be a tensor or three numbers, got 'y'"),

@@ -6,6 +6,8 @@ import sys
 
 import pytest
 
+import etsplat
+
 DRAWING = """
 import os, signal, threading, time, torch
 from etsplat import Cameras, intrinsics, look_at, rasterize, set_num_threads
@@ -51,6 +53,12 @@ def test_children_of_a_process_that_renders_can_render():
     """Nobody whom the child has not holds its locks, and its pool has threads of its own."""
     done = run(DRAWING + FORKING)
     assert done.stdout == f"{[0] * 30}\n", done.stderr
+
+
+@pytest.mark.parametrize("count", [1.5, -1, "2", True])
+def test_threads_are_a_whole_number(count):
+    with pytest.raises(ValueError, match="count must be an integer of at least 0, got"):
+        etsplat.set_num_threads(count)
 
 
 def test_the_interpreter_ends_while_threads_draw():

@@ -154,6 +154,10 @@ def test_bad_arguments_are_named():
         longest_edge_plan(TRIANGLE, topology, torch.ones(2), 4)
     with pytest.raises(ValueError, match="scores must be finite"):
         longest_edge_plan(TRIANGLE, topology, scores / 0, 4)
+    with pytest.raises(ValueError, match=r"budget_faces must be an integer of at least 0, got 4\.5"):
+        longest_edge_plan(TRIANGLE, topology, scores, 4.5)
+    with pytest.raises(ValueError, match="topology must be a MeshTopology, got MeshConnectivity: pass MeshTopology"):
+        longest_edge_plan(TRIANGLE, topology.connectivity, scores, 4)
     plan = longest_edge_plan(TRIANGLE, topology, scores, 4)
     with pytest.raises(ValueError, match="a row for each of 3 vertices, got 2"):
         plan.interpolate(TRIANGLE[:2])

@@ -261,6 +261,10 @@ def test_nvdiffrast_agrees(kind, rng):
         ({"viewmats": torch.eye(4)}, "viewmats"),
         ({"Ks": torch.eye(3).double()[None]}, "Ks"),
         ({"width": 0}, "width"),
+        (
+            {"connectivity": MeshTopology.from_faces(icosphere(0)[1], 12)},
+            r"connectivity must be a MeshConnectivity",
+        ),
     ],
 )
 def test_wrong_arguments_are_named(change, message):

@@ -185,6 +185,10 @@ def test_wrong_arguments_are_named(rng):
     vertices, connectivity = bumpy_sphere(rng, 0, 0.0)
     with pytest.raises(ValueError, match="vertices must have shape"):
         mesh_energies(vertices[:-1], connectivity)
+    with pytest.raises(ValueError, match=r"vertices must be of floating-point numbers, got torch\.int32"):
+        mesh_energies(vertices.int(), connectivity)
+    with pytest.raises(ValueError, match=r"connectivity must be a MeshConnectivity, got MeshTopology: .*connectivity"):
+        mesh_energies(vertices, MeshTopology.from_faces(connectivity.faces, len(vertices)))
     with pytest.raises(ValueError, match="edge_power"):
         mesh_energies(vertices, connectivity, edge_power=3)
     arrays = {

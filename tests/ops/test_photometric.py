@@ -159,8 +159,9 @@ def test_wrong_arguments_are_named(rng):
         photometric_loss(color, target, 0.2, torch.ones(1, 9, 8))
     with pytest.raises(ValueError, match="backgrounds"):
         photometric_loss(color, target, 0.2, backgrounds=torch.ones(3))
-    with pytest.raises(ValueError, match="dssim_weight"):
-        photometric_loss(color, target, 1.2)
+    for weight, message in ((1.2, "from 0 to 1, got 1.2"), ("x", "a number, got 'x'"), (float("nan"), "from 0 to 1")):
+        with pytest.raises(ValueError, match=f"dssim_weight must be {message}"):
+            photometric_loss(color, target, weight)
     with pytest.raises(ValueError, match="color"):
         photometric_loss(color[:, :0], target[:, :0], 0.2)
     with pytest.raises(ValueError, match="target"):

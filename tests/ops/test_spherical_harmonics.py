@@ -163,7 +163,8 @@ def test_empty_and_non_contiguous(rng):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"degree": 4}, "degree"),
+        ({"degree": 4}, "degree must be an integer from 0 to 3, got 4"),
+        ({"degree": 1.0}, r"degree must be an integer from 0 to 3, got 1\.0"),
         ({"coefficients": torch.zeros(5, 4, 3)}, "coefficients"),
         ({"coefficients": torch.zeros(5, 9)}, "coefficients"),
         ({"directions": torch.zeros(4, 3)}, "directions"),

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from etsplat.core.precision import as_given
-from etsplat.core.validation import check_floating, check_memory
+from etsplat.core.validation import check_above, check_count, check_finite, check_floating, check_memory, check_number
 
 MAX_SIDE = 1 << 26
 """Pixels of the width or height of an image: with 16 samples in each they can still be numbered in 32 bits."""
@@ -24,6 +24,9 @@ class Cameras:
         Ks: (B, 3, 3) intrinsics in pixels; pixel (i, j) has its centre at (j + 0.5, i + 0.5).
         width: Image width in pixels.
         height: Image height in pixels.
+
+    Raises:
+        ValueError: A wrong shape or dtype, or a width or height that is no whole number from 1 to 2^26.
 
     Example:
         >>> around = etsplat.orbit_cameras(64, 48, elevations=(0.0, 30.0), azimuths=4)
@@ -47,14 +50,19 @@ class Cameras:
             raise ValueError(f"viewmats must have shape (B, 4, 4), got {tuple(self.viewmats.shape)}")
         if self.Ks.shape != (batch, 3, 3):
             raise ValueError(f"Ks must have shape ({batch}, 3, 3), one per viewmat, got {tuple(self.Ks.shape)}")
-        if not (1 <= self.width <= MAX_SIDE and 1 <= self.height <= MAX_SIDE):
-            raise ValueError(f"width and height must be from 1 to {MAX_SIDE}, got {self.width} x {self.height}")
+        check_size(self.width, self.height)
 
     def __len__(self) -> int:
         return self.viewmats.shape[0]
 
     def __getitem__(self, index: int | slice | Sequence[int] | Tensor) -> "Cameras":
-        """The chosen cameras, always as a batch: an int gives a batch of one."""
+        """The chosen cameras, always as a batch: an int gives a batch of one.
+
+        Raises:
+            IndexError: There is no camera of that index.
+        """
+        if isinstance(index, int) and not -len(self) <= index < len(self):
+            raise IndexError(f"index of a camera must be below {len(self)}, as there are so many, got {index}")
         chosen = [index] if isinstance(index, int) else index
         return Cameras(self.viewmats[chosen], self.Ks[chosen], self.width, self.height)
 
@@ -78,8 +86,7 @@ class Cameras:
         Raises:
             ValueError: ``factor`` is not positive and finite, or the images become too large.
         """
-        if not 0.0 < factor < math.inf:
-            raise ValueError(f"factor must be positive and finite, got {factor}")
+        check_above("factor", factor)
         width, height = max(1, round(self.width * factor)), max(1, round(self.height * factor))
         ratios = [width / self.width, height / self.height, 1.0]
         ratio = torch.tensor(ratios, dtype=self.Ks.dtype, device=self.Ks.device)
@@ -93,6 +100,22 @@ class Cameras:
             self.width,
             self.height,
         )
+
+
+def check_size(width: object, height: object) -> None:
+    """Raise ValueError unless both are whole numbers of pixels, from 1 to `MAX_SIDE`."""
+    check_count("width", width, most=MAX_SIDE)
+    check_count("height", height, most=MAX_SIDE)
+
+
+def check_cameras(cameras: object, like_name: str, like: Tensor) -> None:
+    """Raise ValueError unless they are `Cameras` of the dtype and on the device of ``like``."""
+    if not isinstance(cameras, Cameras):
+        raise ValueError(f"cameras must be Cameras, got {_made(cameras)}")
+    for wanted, got in ((like.dtype, cameras.viewmats.dtype), (like.device, cameras.viewmats.device)):
+        if got != wanted:
+            here = f"cameras.to({like_name}.device, {like_name}.dtype)"
+            raise ValueError(f"cameras must be {wanted} like {like_name}, got {got}: pass {here}")
 
 
 @as_given
@@ -144,8 +167,8 @@ def look_at(
         (..., 4, 4) with OpenCV axes.
 
     Raises:
-        ValueError: A wrong shape or dtype; ``eye`` coincides with ``target``, or ``up`` is parallel to the line of
-            sight.
+        ValueError: A wrong shape or dtype; values that are not finite; ``eye`` coincides with ``target``, or ``up`` is
+            parallel to the line of sight.
 
     Example:
         >>> eye = torch.tensor([0.0, 0.0, 3.0])
@@ -157,15 +180,18 @@ def look_at(
     check_floating("eye", eye)
     if eye.shape[-1:] != (3,):
         raise ValueError(f"eye must have shape (..., 3), got {tuple(eye.shape)}")
-    forward = _like_eye("target", target, eye) - eye
+    target = _like_eye("target", target, eye)
+    forward = target - eye
     distance = forward.norm(dim=-1, keepdim=True)
     if not bool((distance > 0).all()):
+        _check_finite(eye=eye, target=target)
         raise ValueError("eye must differ from target")
     forward = forward / distance
     up = _like_eye("up", up, eye).expand_as(forward)
     right = torch.linalg.cross(forward, up / up.norm(dim=-1, keepdim=True))
     length = right.norm(dim=-1, keepdim=True)
     if not bool((length > 1e-6).all()):
+        _check_finite(eye=eye, target=target, up=up)
         raise ValueError("up must not be parallel to the line of sight from eye to target")
     right = right / length
     down = torch.linalg.cross(forward, right)
@@ -175,6 +201,11 @@ def look_at(
     viewmats[..., :3, 3] = -(rotation @ eye[..., None])[..., 0]
     viewmats[..., 3, 3] = 1.0
     return viewmats
+
+
+def _check_finite(**points: Tensor) -> None:
+    for name, tensor in points.items():
+        check_finite(name, tensor.detach())
 
 
 def _like_eye(name: str, given: Tensor | Sequence[float], eye: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*#batch 3"]:
@@ -205,12 +236,14 @@ def intrinsics(
         dtype: Floating-point type of the result.
 
     Raises:
-        ValueError: The field of view is outside (0, 180).
+        ValueError: The field of view is outside (0, 180), or the size is none of an image.
 
     Example:
         >>> etsplat.intrinsics(90.0, 200, 100).tolist()
         [[50.0, 0.0, 100.0], [0.0, 50.0, 50.0], [0.0, 0.0, 1.0]]
     """
+    check_size(width, height)
+    check_number("fov_y_degrees", fov_y_degrees)
     if not 0.0 < fov_y_degrees < 180.0:
         raise ValueError(f"fov_y_degrees must be between 0 and 180, got {fov_y_degrees}")
     focal = 0.5 * height / math.tan(math.radians(fov_y_degrees) / 2)

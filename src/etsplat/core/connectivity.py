@@ -8,6 +8,9 @@ from torch import Tensor
 
 from etsplat.core.validation import check_indices, check_shape, dense
 
+HOW_CONNECTED = "pass MeshTopology.from_faces(faces, num_vertices).connectivity"
+"""For the end of messages of functions that are given something else."""
+
 
 @dataclass(frozen=True)
 class MeshConnectivity:

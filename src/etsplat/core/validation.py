@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from numbers import Integral
+from numbers import Integral, Real
 
 import numpy as np
 import torch
@@ -209,9 +209,48 @@ def check_flags(**values: object) -> None:
 
 def check_count(name: str, value: object, *, least: int = 1, most: float = math.inf) -> None:
     """Raise ValueError unless ``value`` is an integer, and no bool, from ``least`` to ``most``."""
+    if type(value) is int and least <= value <= most:  # as nearly always
+        return
     if isinstance(value, bool) or not isinstance(value, Integral) or not least <= int(value) <= most:
         bounds = f"of at least {least}" if most == math.inf else f"from {least} to {most}"
         raise ValueError(f"{name} must be an integer {bounds}, got {value!r}")
+
+
+def check_number(name: str, value: object, low: float = -math.inf, high: float = math.inf) -> None:
+    """Raise ValueError unless ``value`` is a number, no bool, from ``low`` to ``high``, as NaN is only unbounded."""
+    if type(value) is float and low <= value <= high:  # as nearly always
+        return
+    number = isinstance(value, Real) or (isinstance(value, Tensor) and value.ndim == 0)
+    if isinstance(value, bool) or not number:
+        raise ValueError(f"{name} must be a number, got {shown(value)}")
+    if low > -math.inf and not low <= float(value) <= high:  # pyright: ignore[reportArgumentType]
+        bounds = f"from {low:g} to {high:g}" if high < math.inf else f"at least {low:g}"
+        raise ValueError(f"{name} must be {bounds}, got {value}")
+
+
+def check_above(name: str, value: object, least: float = 0.0) -> None:
+    """Raise ValueError unless ``value`` is a finite number above ``least``."""
+    check_number(name, value)
+    if not least < float(value) < math.inf:  # pyright: ignore[reportArgumentType]
+        bound = "positive" if least == 0 else f"above {least:g}"
+        raise ValueError(f"{name} must be {bound} and finite, got {value}")
+
+
+def check_kind(name: str, value: object, kind: type, remedy: str = "") -> None:
+    """Raise ValueError unless ``value`` is a ``kind``; ``remedy`` says how to make one, for the end of the message."""
+    if not isinstance(value, kind):
+        article = "" if kind.__name__.endswith("s") else "an " if kind.__name__[0] in "AEIOU" else "a "
+        raise ValueError(f"{name} must be {article}{kind.__name__}, got {shown(value)}{remedy and ': ' + remedy}")
+
+
+def shown(value: object) -> str:
+    """What was given, for the end of a message: small values as Python writes them, and of others their kind."""
+    if isinstance(value, type):
+        return f"the class {value.__name__}"
+    if isinstance(value, Tensor):
+        return f"a tensor of shape {tuple(value.shape)}"
+    small = value is None or isinstance(value, str | bool | int | float)
+    return repr(value) if small else type(value).__name__
 
 
 def check_floating(name: str, tensor: Tensor) -> None:
@@ -221,7 +260,8 @@ def check_floating(name: str, tensor: Tensor) -> None:
 
 
 def check_open_unit(name: str, value: float) -> None:
-    """Raise ValueError unless ``value`` is between 0 and 1, as what passes through a sigmoid."""
+    """Raise ValueError unless ``value`` is a number between 0 and 1, as what passes through a sigmoid."""
+    check_number(name, value)
     if not 0 < value < 1:
         raise ValueError(f"{name} must be between 0 and 1, got {value:g}")
 

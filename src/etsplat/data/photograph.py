@@ -17,6 +17,7 @@ from torch import Tensor
 
 from etsplat.core.cameras import Cameras, intrinsics, look_at, sphere_grid
 from etsplat.core.errors import InputError
+from etsplat.core.validation import check_count
 from etsplat.data.dataset import Dataset, Normalization
 from etsplat.data.pictures import StoredPictures
 from etsplat.geometry.measures import bounding_ball
@@ -34,6 +35,9 @@ FILL = 0.9
 """Part of the image height that the unit sphere's silhouette takes."""
 
 AMBIENT, DIFFUSE = 0.4, 0.6
+
+_STEEPEST = 1e-6
+"""What is left of a line of sight, seen from above, where `look_at` no longer knows which side of a picture is up."""
 
 CAMERA_DISTANCE = math.hypot(1.0, 1.0 / (FILL * math.tan(math.radians(FIELD_OF_VIEW / 2))))
 """A sphere of radius 1 at distance d has a silhouette of half-angle asin(1/d), whose tangent is 1/sqrt(d^2 - 1)."""
@@ -165,10 +169,17 @@ def draw_textured(
 def orbit_cameras(width: int, height: int, *, elevations: Sequence[float] = ELEVATIONS, azimuths: int = 8) -> Cameras:
     """Cameras on the sphere of radius CAMERA_DISTANCE that look at the origin, +y up; the azimuth varies fastest.
 
+    Raises:
+        ValueError: No elevation or azimuth, one straight above or below, or a size that is none of an image.
+
     Example:
         >>> len(etsplat.orbit_cameras(64, 64))
         40
     """
+    check_count("azimuths", azimuths)
+    heights = torch.as_tensor(elevations, dtype=torch.float64)
+    if not heights.numel() or not bool((heights.deg2rad().cos().abs() > _STEEPEST).all()):
+        raise ValueError(f"elevations must be degrees, none of them straight above or below, got {elevations}")
     degrees = [360.0 * k / azimuths for k in range(azimuths)]
     eyes = sphere_grid(elevations, degrees, CAMERA_DISTANCE, dtype=torch.float64)
     viewmats = look_at(eyes, torch.zeros(3, dtype=torch.float64), torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64))

@@ -7,6 +7,7 @@ from contextvars import ContextVar
 import torch
 
 from etsplat import _native
+from etsplat.core.validation import check_count
 
 
 def num_threads() -> int:
@@ -25,7 +26,7 @@ def set_num_threads(count: int) -> None:
     Results do not depend on it, to the bit.
 
     Raises:
-        ValueError: ``count`` is negative.
+        ValueError: ``count`` is negative, or no whole number.
 
     Example:
         >>> before = etsplat.num_threads()
@@ -34,8 +35,7 @@ def set_num_threads(count: int) -> None:
         1
         >>> etsplat.set_num_threads(before)
     """
-    if count < 0:
-        raise ValueError(f"count must be 0 (all cores) or positive, got {count}")
+    check_count("count", count, least=0)
     _native.set_num_threads(count=count)
 
 

@@ -10,7 +10,7 @@ from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
 from etsplat import _native
-from etsplat.core.validation import check_shape
+from etsplat.core.validation import check_count, check_kind, check_shape
 from etsplat.geometry.topology import MeshTopology
 
 
@@ -70,7 +70,7 @@ def longest_edge_plan(
         budget_faces: most faces that the subdivided mesh may have. At or below F, the plan is empty.
 
     Raises:
-        ValueError: a shape does not fit the topology, or a score is not finite.
+        ValueError: a shape does not fit the topology, a score is not finite, or the budget is no whole number.
 
     Example:
         >>> vertices, faces = etsplat.icosphere(0)
@@ -80,6 +80,7 @@ def longest_edge_plan(
         30
     """
     _check(vertices, topology, scores)
+    check_count("budget_faces", budget_faces, least=0)
     order = torch.sort(scores.detach().cpu(), descending=True, stable=True).indices
     longest = _longest_edges(vertices.detach().cpu().double(), topology)
     split_edge = torch.full((topology.num_faces,), -1, dtype=torch.int64)
@@ -95,6 +96,7 @@ def longest_edge_plan(
 
 
 def _check(vertices: Tensor, topology: MeshTopology, scores: Tensor) -> None:
+    check_kind("topology", topology, MeshTopology, "pass MeshTopology.from_faces(faces, num_vertices)")
     check_shape("vertices", vertices, (topology.num_vertices, 3))
     check_shape("scores", scores, (topology.num_faces,))
     if not bool(scores.isfinite().all()):

@@ -19,10 +19,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from etsplat.core.cameras import Cameras, view_arguments
-from etsplat.core.connectivity import MeshConnectivity
+from etsplat.core.connectivity import HOW_CONNECTED, MeshConnectivity
 from etsplat.core.precision import as_given
 from etsplat.core.rasterization import Rasterization
-from etsplat.core.validation import check_device, check_finite, check_like, check_shape
+from etsplat.core.validation import check_device, check_finite, check_kind, check_like, check_shape
 from etsplat.engines.choice import engine_for
 from etsplat.ops.rasterize import LARGEST_COLOR, one_kind_of_colors
 from etsplat.ops.rasterize_opaque import rasterize_opaque
@@ -92,6 +92,7 @@ def rasterize_antialiased(
         True
     """
     viewmats, Ks, width, height = view_arguments(cameras, viewmats, Ks, width, height)
+    check_kind("connectivity", connectivity, MeshConnectivity, HOW_CONNECTED)
     check_shape("vertices", vertices, (connectivity.num_vertices, 3))
     check_device("connectivity", connectivity.faces, "vertices", vertices)
     if sum(given is not None for given in (face_colors, vertex_colors, texture)) != 1:

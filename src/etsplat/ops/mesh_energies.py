@@ -13,9 +13,9 @@ from typing import NamedTuple
 from jaxtyping import Float
 from torch import Tensor
 
-from etsplat.core.connectivity import MeshConnectivity
+from etsplat.core.connectivity import HOW_CONNECTED, MeshConnectivity
 from etsplat.core.precision import as_given
-from etsplat.core.validation import check_shape
+from etsplat.core.validation import check_floating, check_kind, check_shape
 from etsplat.engines.choice import engine_for
 
 
@@ -59,7 +59,7 @@ def mesh_energies(
         threads.
 
     Raises:
-        ValueError: Wrong shape, dtype or device, or another power.
+        ValueError: Wrong shape, dtype or device, another power, or a topology in the place of its connectivity.
 
     Example:
         >>> vertices, faces = etsplat.icosphere(2)
@@ -69,7 +69,9 @@ def mesh_energies(
         >>> vertices.grad.shape
         torch.Size([162, 3])
     """
+    check_kind("connectivity", connectivity, MeshConnectivity, HOW_CONNECTED)
     check_shape("vertices", vertices, (connectivity.num_vertices, 3))
+    check_floating("vertices", vertices)
     if connectivity.faces.device != vertices.device:
         raise ValueError(f"connectivity must be on {vertices.device}, got {connectivity.faces.device}")
     if edge_power not in (1, 2):

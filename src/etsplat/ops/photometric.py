@@ -14,7 +14,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from etsplat.core.precision import as_given
-from etsplat.core.validation import check_choice, check_device, check_like, check_shape
+from etsplat.core.validation import check_choice, check_device, check_like, check_number, check_shape
 from etsplat.engines.choice import engine_for
 
 
@@ -51,8 +51,7 @@ def photometric_loss(
     """
     _check(color, target, mask, backgrounds)
     check_choice("pixel", pixel, ("l1", "l2"))
-    if not 0.0 <= dssim_weight <= 1.0:
-        raise ValueError(f"dssim_weight must be from 0 to 1, got {dssim_weight}")
+    check_number("dssim_weight", dssim_weight, 0, 1)
     return engine_for(color).photometric_loss(color, target, mask, backgrounds, dssim_weight, pixel == "l2")
 
 

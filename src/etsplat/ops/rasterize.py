@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from etsplat.core.cameras import MAX_SIDE, Cameras, view_arguments
+from etsplat.core.cameras import Cameras, check_size, view_arguments
 from etsplat.core.kernels import DISTANCES, KERNELS, kernel_name
 from etsplat.core.precision import as_given
 from etsplat.core.rasterization import (
@@ -23,6 +23,7 @@ from etsplat.core.rasterization import (
 )
 from etsplat.core.validation import (
     Shape,
+    check_above,
     check_choice,
     check_device,
     check_finite,
@@ -31,9 +32,11 @@ from etsplat.core.validation import (
     check_indices,
     check_integers,
     check_intrinsics,
+    check_kind,
     check_like,
     check_positive,
     check_shape,
+    shown,
 )
 from etsplat.engines.choice import engine_for
 
@@ -138,7 +141,7 @@ def rasterize(
         height=height,
         kernel=kernel_name(kernel),
         distance=distance,
-        outputs=frozenset([outputs] if isinstance(outputs, str) else outputs),
+        outputs=_names_of(outputs),
         depth_of=depth_of,
         near_plane=near_plane,
         freeze_inradius=freeze_inradius,
@@ -200,20 +203,23 @@ def _check_vertices(vertices: Tensor, faces: Tensor | None) -> None:
         raise ValueError(f"vertices must be float32 or float64, got {vertices.dtype}")
 
 
+def _names_of(outputs: Sequence[str]) -> frozenset[str]:
+    try:
+        return frozenset([outputs] if isinstance(outputs, str) else outputs)
+    except TypeError:
+        raise ValueError(f"outputs must be names, such as ('depth',), got {shown(outputs)}") from None
+
+
 def _check_settings(settings: RasterizeSettings) -> None:
-    for name, size in (("width", settings.width), ("height", settings.height)):
-        if not isinstance(size, int) or size < 1:
-            raise ValueError(f"{name} must be a positive integer, got {size!r}")
-        if size > MAX_SIDE:
-            raise ValueError(f"{name} must be at most {MAX_SIDE}, got {size}")
+    check_size(settings.width, settings.height)
     check_flags(freeze_inradius=settings.freeze_inradius)
     check_choice("kernel", settings.kernel, list(KERNELS))
     check_choice("distance", settings.distance, DISTANCES)
     check_choice("depth_of", settings.depth_of, DEPTHS)
     for name in sorted(settings.outputs, key=str):
         check_choice("outputs", name, OUTPUTS)
-    if not 0.0 < settings.near_plane < float("inf"):
-        raise ValueError(f"near_plane must be positive and finite, got {settings.near_plane}")
+    check_above("near_plane", settings.near_plane)
+    check_kind("cutoffs", settings.cutoffs, Cutoffs, "pass etsplat.Cutoffs(), with what is to differ")
     alpha_min, alpha_max, x_max, transmittance_min = settings.cutoffs
     if not (0.0 <= alpha_min < alpha_max <= 1.0 and x_max > 0.0 and 0.0 <= transmittance_min < 1.0):
         raise ValueError(

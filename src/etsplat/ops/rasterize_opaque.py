@@ -13,6 +13,8 @@ from torch import Tensor
 from etsplat.core.cameras import Cameras, view_arguments
 from etsplat.core.rasterization import OpaqueView, Rasterization
 from etsplat.core.validation import (
+    check_above,
+    check_count,
     check_device,
     check_flags,
     check_indices,
@@ -144,8 +146,7 @@ def render_opaque(
         points, colors = points[triangles.long()].view(-1, 3), colors.view(3 * count, -1)
         triangles = _separate(points)
     check_flags(cull_backfaces=cull_backfaces)
-    if not 1 <= supersampling <= MAX_SUPERSAMPLING:
-        raise ValueError(f"supersampling must be from 1 to {MAX_SUPERSAMPLING}, got {supersampling}")
+    check_count("supersampling", supersampling, most=MAX_SUPERSAMPLING)
     image = vertices.new_empty((len(views), views.height, views.width, colors.shape[1] + 1))
     engine = engine_for(vertices)
     for b in range(len(views)):
@@ -181,6 +182,5 @@ def _check_views(vertices: Tensor, viewmats: Tensor, Ks: Tensor, width: int, hei
     check_like("Ks", Ks, "vertices", vertices)
     if Ks.is_cpu:  # reading them would wait for a GPU
         check_intrinsics("Ks", Ks)
-    if not 0.0 < near_plane < float("inf"):
-        raise ValueError(f"near_plane must be positive and finite, got {near_plane}")
+    check_above("near_plane", near_plane)
     return Cameras(dense(viewmats, "viewmats"), dense(Ks, "Ks"), width, height)

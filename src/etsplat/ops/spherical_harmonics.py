@@ -10,7 +10,7 @@ from torch import Tensor
 
 from etsplat.core.harmonics import MAX_DEGREE
 from etsplat.core.precision import as_given
-from etsplat.core.validation import check_like, check_memory, check_shape
+from etsplat.core.validation import check_count, check_like, check_memory, check_shape
 from etsplat.engines.choice import engine_for
 
 
@@ -39,8 +39,7 @@ def spherical_harmonics(
         >>> etsplat.spherical_harmonics(coefficients, torch.tensor([[0.0, 0.0, 1.0]]), degree=1).tolist()
         [[0.5, 0.5, 0.5]]
     """
-    if not 0 <= degree <= MAX_DEGREE:
-        raise ValueError(f"degree must be from 0 to {MAX_DEGREE}, got {degree}")
+    check_count("degree", degree, least=0, most=MAX_DEGREE)
     check_shape("coefficients", coefficients, ("N", "K", "C"))
     if coefficients.shape[1] < (degree + 1) ** 2:
         raise ValueError(
