@@ -68,7 +68,12 @@ def test_poses_that_are_none_are_refused(spoil, message):
         ({"Ks": torch.zeros(3, 3, 3)}, r"Ks\[0\]: focal lengths"),
         ({"images": [PHOTO] * 3}, "images must be Pictures, got list"),
         ({"names": list("aba")}, "names: expected another one"),
-        ({"train": [0, 3]}, r"train: expected indices in \[0, 3\)"),
+        ({"names": None}, "names: expected a list of 3, one per viewmat, got None"),
+        ({"names": "abc"}, "names: expected a list of 3, one per viewmat, got 'abc'"),
+        ({"train": [0, 3]}, r"train: expected indices in \[0, 3\), got 3"),
+        ({"train": "abc"}, r"train: expected indices in \[0, 3\), got 'abc'"),
+        ({"test": None}, r"test: expected indices in \[0, 3\), got None"),
+        ({"train": [0.5]}, r"train: expected indices in \[0, 3\), got list"),
         ({"exact_points": torch.zeros(0, 3)}, "exact_points: expected at least one"),
         ({"exact_points": torch.full((2, 3), torch.inf)}, "exact_points must be finite"),
         ({"exact_points": torch.zeros(2, 3), "point_colors": torch.zeros(3, 3)}, "point_colors must have shape"),
@@ -80,6 +85,14 @@ def test_other_fields_that_are_wrong_are_named(changes, message):
     """Before a run begins."""
     with pytest.raises(ValueError, match=message):
         dataset(**changes)
+
+
+def test_only_views_that_there_are_can_be_chosen():
+    """Also by numbers of numpy and torch."""
+    for views in ([99], [-1], "a", None):
+        with pytest.raises(ValueError, match=r"views: expected indices in \[0, 3\), got"):
+            dataset().of_views(views)
+    assert dataset().of_views(torch.tensor([2, 0])).names == dataset().of_views([2, 0]).names
 
 
 def test_masks_of_three_kinds_are_the_same():
@@ -157,7 +170,7 @@ def test_a_schedule_names_what_a_model_has():
             etsplat.Trainer(sphere(), photos, objective, schedule=schedule)
     with pytest.raises(ValueError, match="no view in `train`"):
         etsplat.Trainer(sphere(), replace(photos, train=[]), objective)
-    with pytest.raises(ValueError, match="batch must be at least 1"):
+    with pytest.raises(ValueError, match="batch must be an integer of at least 1"):
         etsplat.Trainer(sphere(), photos, objective, batch=0)
     with pytest.raises(ValueError, match="objective must be an Objective, got Photometric"):
         etsplat.Trainer(sphere(), photos, etsplat.Photometric())  # pyright: ignore[reportArgumentType]

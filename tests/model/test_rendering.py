@@ -1,7 +1,9 @@
 from dataclasses import replace
 
+import pytest
 import torch
 
+import etsplat
 from etsplat.core.cameras import Cameras, intrinsics, look_at
 from etsplat.model.soup_appearance import SoupAppearance
 from etsplat.model.triangle_soup import TriangleSoup
@@ -66,3 +68,30 @@ def test_faint_triangles_are_not_drawn_opaque():
     assert soup.render_opaque(camera())[0, 24, 24].tolist() == [0, 0, 0, 0]
     assert len(soup.surface()[1]) == 0
     assert soup_of(LARGE).surface()[0].shape == (3, 3)
+
+
+def models_of(dtype: torch.dtype) -> list:
+    """One of each kind."""
+    vertices, faces = etsplat.icosphere(1)
+    vertices = vertices.to(dtype)
+    look = {"opacity": 0.9, "sigma": 0.3}
+    return [
+        TriangleSoup.from_triangles(vertices[faces], torch.rand(80, 3), sh_degree=1, **look),
+        etsplat.TriangleMesh.from_mesh(vertices, faces, colors=0.5, **look),
+        etsplat.TriangleMesh.from_mesh(vertices, faces, colors=0.5, opacity=None, sigma=None),
+        etsplat.TexturedMesh.from_mesh(vertices, faces, torch.rand(8, 8, 3, dtype=dtype), vertices[faces][..., :2]),
+    ]
+
+
+@pytest.mark.parametrize(("own", "given"), [(torch.float32, torch.float64), (torch.float64, torch.float32)])
+def test_cameras_of_another_precision_than_a_model_are_named(own: torch.dtype, given: torch.dtype) -> None:
+    for model in models_of(own):
+        message = rf"cameras must be {own} like \w+\.vertices, got {given}: pass cameras\.to\("
+        with pytest.raises(ValueError, match=message):
+            model.render(camera().to(dtype=given))
+        with pytest.raises(ValueError, match="cameras must be Cameras, got Tensor: make them by"):
+            model.render(torch.eye(4))
+        model.render(camera().to(dtype=own))
+        if not isinstance(model, etsplat.TexturedMesh):
+            with pytest.raises(ValueError, match=message):
+                model.render_opaque(camera().to(dtype=given))

@@ -56,3 +56,20 @@ def test_some_of_the_triangles_are_a_soup_of_the_same_kind(rng):
     for name, values in some.parameters().items():
         assert torch.equal(values, getattr(whole, name)[rows])
         assert not values.requires_grad
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"opacity": torch.full((3,), 0.5)}, r"opacity must be a number, got a tensor of shape \(3,\)"),
+        ({"opacity": 1.0}, "opacity must be between 0 and 1, got 1"),
+        ({"sigma": 0.01}, r"sigma must be above 0\.01 and finite, got 0\.01"),
+        ({"sigma": "soft"}, "sigma must be a number, got 'soft'"),
+        ({"sh_degree": 4}, "sh_degree must be an integer from 0 to 3, got 4"),
+    ],
+)
+def test_numbers_of_a_start_are_checked_where_it_is_made(given, message):
+    """All triangles begin alike."""
+    start = {"opacity": 0.5, "sigma": 0.5, "sh_degree": 0, **given}
+    with pytest.raises(ValueError, match=message):
+        TriangleSoup.from_triangles(torch.rand(5, 3, 3), torch.rand(5, 3), **start)

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from etsplat.core.cameras import Cameras, camera_centers
 from etsplat.core.errors import InputError
+from etsplat.core.validation import shown
 from etsplat.data.dataset_checks import checked_intrinsics, checked_points, checked_split, checked_viewmats
 from etsplat.data.pictures import Pictures, as_float, halved
 from etsplat.io.georeference import Georeference
@@ -106,6 +107,8 @@ class Dataset:
             raise ValueError(f"images must be Pictures, got {type(self.images).__name__}: pass StoredPictures(images)")
         fields = {"viewmats": checked_viewmats(self.viewmats), "Ks": checked_intrinsics(self.Ks)}
         B = len(self.viewmats)
+        if not isinstance(self.names, Sequence) or isinstance(self.names, str):
+            raise ValueError(f"names: expected a list of {B}, one per viewmat, got {shown(self.names)}")
         for name, count in (("Ks", len(self.Ks)), ("images", len(self.images.sizes)), ("names", len(self.names))):
             if count != B:
                 raise ValueError(f"{name}: expected {B}, one per viewmat, got {count}")
@@ -191,7 +194,11 @@ class Dataset:
 
         Args:
             views: indices, without repetition.
+
+        Raises:
+            ValueError: there is no view of such an index.
         """
+        views = checked_split("views", views, len(self))
         place = {view: number for number, view in enumerate(views)}
         chosen = list(views)
         return replace(

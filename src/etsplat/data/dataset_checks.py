@@ -1,5 +1,6 @@
 """What is made of the fields of a data set that is built in memory, and which are refused."""
 
+import operator
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -7,7 +8,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from etsplat.core.validation import check_shape
+from etsplat.core.validation import check_shape, shown
 
 _ROTATION = 0.01
 """How far R R^T may be from the identity: poses are written down with few digits."""
@@ -117,9 +118,12 @@ def checked_points(points: Any, colors: Any) -> tuple[Tensor, Tensor | None]:
 
 def checked_split(name: str, views: Iterable[Any], count: int) -> list[int]:
     """Indices of views as a list. Raises ValueError where one is none."""
-    indices = [int(view) for view in views]
-    if not all(0 <= index < count for index in indices):
-        raise ValueError(f"{name}: expected indices in [0, {count})")
+    try:
+        indices = [operator.index(view) for view in views]
+    except TypeError:
+        raise ValueError(f"{name}: expected indices in [0, {count}), got {shown(views)}") from None
+    if wrong := [index for index in indices if not 0 <= index < count]:
+        raise ValueError(f"{name}: expected indices in [0, {count}), got {wrong[0]}")
     return indices
 
 

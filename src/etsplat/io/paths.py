@@ -12,6 +12,20 @@ def kind_of(path: Path | str) -> str:
     return Path(path).suffix.lower()
 
 
+def given_path(name: str, path: object, what: str = "a path") -> Path:
+    """What was given as a path. Raises InputError, with the name of the argument, where it is none.
+
+    Args:
+        name: of the argument.
+        path: what was given.
+        what: what it must be, as it follows "it must be".
+    """
+    if not isinstance(path, str | os.PathLike):
+        got = "None" if path is None else f"of type {type(path).__name__}"
+        raise InputError(f"{name}: is {got}; it must be {what}")
+    return Path(path)
+
+
 def path_within(folder: Path, name: str, source: Path | str) -> Path:
     """Where the file lies that another file names: `folder` / `name`, never outside of the folder.
 

@@ -48,6 +48,14 @@ class Appearance:
 
 
 M = TypeVar("M", bound="Model")
+K = TypeVar("K", bound="Model")
+
+
+def model_for(user: object, model: Any, kind: type[K]) -> K:
+    """The model. Raises ValueError, naming whoever has a use for one kind alone, where it is of another."""
+    if not isinstance(model, kind):
+        raise ValueError(f"{type(user).__name__} needs a {kind.__name__}, got a {type(model).__name__}")
+    return model
 
 
 class Model(Protocol):

@@ -11,6 +11,7 @@ from torch import Tensor
 from etsplat.core.harmonics import MAX_DEGREE
 from etsplat.core.kernels import DISTANCES
 from etsplat.core.soup_numbers import SoupNumbers
+from etsplat.core.validation import check_choice
 from etsplat.io.json_text import parse_json
 from etsplat.model.model import Appearance
 
@@ -41,6 +42,9 @@ class SoupAppearance(Appearance):
         draw: the number of the draw that says which; of the iteration.
         on_device_numbers: (4,) the four above in device memory, in their place, within a queued step.
 
+    Raises:
+        ValueError: there is no such distance. Kernels are looked for where one draws: they may be registered by then.
+
     Example:
         >>> etsplat.SoupAppearance(kernel="bilateral", background=(1.0, 1.0, 1.0)).distance
         'barycentric'
@@ -59,6 +63,9 @@ class SoupAppearance(Appearance):
     dropout: float = 0.0
     draw: int = 0
     on_device_numbers: Float[Tensor, "4"] | None = field(default=None, compare=False, repr=False)
+
+    def __post_init__(self) -> None:
+        check_choice("distance", self.distance, DISTANCES)
 
     @property
     def numbers(self) -> SoupNumbers:

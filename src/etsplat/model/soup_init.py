@@ -8,6 +8,7 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 from torch import Tensor
 
+from etsplat.core.validation import check_above
 from etsplat.model.triangle_soup import TriangleSoup
 
 NEIGHBOURS = 3
@@ -121,12 +122,16 @@ def start_soup(
         limit: no triangle is larger than this times its distance to the nearest camera; None for any size. Without it,
             triangles at stray points near the cameras cover whole pictures.
 
+    Raises:
+        ValueError: a number out of its range.
+
     Example:
         >>> points = etsplat.StartPoints(torch.rand(50, 3), torch.rand(50, 3))
         >>> chance = torch.Generator().manual_seed(0)
         >>> etsplat.start_soup(points, chance, scale=1.0, opacity=0.5, sigma=1.0, sh_degree=1).count
         50
     """
+    check_above("scale", scale)
     count = len(points)
     radius = scale * spacing(points.positions)
     if limit is not None and centers is not None and count:

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from etsplat.core.cameras import Cameras
+from etsplat.core.cameras import Cameras, check_cameras
 from etsplat.core.errors import InputError
 from etsplat.core.rasterization import Rasterization
 from etsplat.core.validation import check_like, check_shape
@@ -189,7 +189,11 @@ class TexturedMesh(Model):
             backgrounds: (B, 3); None is black.
             outputs: colour alone.
             depth_of: has no effect.
+
+        Raises:
+            ValueError: the cameras are none, or of another dtype or device than the parameters; other outputs.
         """
+        check_cameras(cameras, "mesh.vertices", self.vertices)
         if set(outputs) - {"color", "alpha"}:
             raise ValueError(f"outputs of opaque triangles must be colour alone, got {outputs}")
         return rasterize_antialiased(

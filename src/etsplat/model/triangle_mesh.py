@@ -10,10 +10,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from etsplat.core.cameras import Cameras
-from etsplat.core.harmonics import SH_CONSTANT
+from etsplat.core.cameras import Cameras, check_cameras
+from etsplat.core.harmonics import MAX_DEGREE, SH_CONSTANT
 from etsplat.core.rasterization import Rasterization
-from etsplat.core.validation import check_open_unit, check_shape
+from etsplat.core.validation import check_above, check_count, check_number, check_open_unit, check_shape
 from etsplat.data.dataset import Normalization
 from etsplat.geometry.topology import MeshTopology
 from etsplat.io.mesh_files import MeshFile, load_mesh, save_mesh, weld_vertices
@@ -135,6 +135,7 @@ class TriangleMesh(Model):
         check_shape("colors", start, (letter, 3), sizes=sizes)
         vertices = vertices.detach().clone()
         soft = _is_soft(opacity, sigma)
+        check_count("harmonics", harmonics, least=0, most=MAX_DEGREE)
         if harmonics and (vertex_colored or not soft):
             raise ValueError("harmonics must be 0 where triangles are opaque or colours belong to vertices")
         rest = vertices.new_zeros(len(faces), (harmonics + 1) ** 2 - 1, 3) if harmonics else None
@@ -203,7 +204,12 @@ class TriangleMesh(Model):
 
         Returns:
             Images that are not clamped: blended silhouettes can leave [0, 1] by a little.
+
+        Raises:
+            ValueError: the cameras are none, or of another dtype or device than the parameters; outputs that opaque
+                triangles do not have.
         """
+        check_cameras(cameras, "mesh.vertices", self.vertices)
         look = self.appearance
         if look.kernel is None:
             if set(outputs) - {"color", "alpha"}:
@@ -235,7 +241,12 @@ class TriangleMesh(Model):
 
     @torch.no_grad()
     def render_opaque(self, cameras: Cameras, *, supersampling: int = 4) -> Float[Tensor, "B H W 4"]:
-        """What a mesh viewer shows: opaque triangles in display colours, premultiplied RGBA."""
+        """What a mesh viewer shows: opaque triangles in display colours, premultiplied RGBA.
+
+        Raises:
+            ValueError: the cameras are none, or of another dtype or device than the parameters.
+        """
+        check_cameras(cameras, "mesh.vertices", self.vertices)
         return render_opaque(
             self.vertices.detach(),
             **self.named(self.display_colors),
@@ -338,8 +349,7 @@ class TriangleMesh(Model):
 
 def _grey(value: float) -> float:
     """One value for all colours, if it is one."""
-    if not 0 <= value <= 1:
-        raise ValueError(f"colors must be from 0 to 1, got {value:g}")
+    check_number("colors", value, 0, 1)
     return value
 
 
@@ -350,6 +360,5 @@ def _is_soft(opacity: float | None, sigma: float | None) -> bool:
     if opacity is None or sigma is None:
         return False
     check_open_unit("opacity", opacity)
-    if not 0 < sigma < math.inf:
-        raise ValueError(f"sigma must be positive and finite, got {sigma:g}")
+    check_above("sigma", sigma)
     return True

@@ -1,6 +1,5 @@
 """The learnable triangle soup of novel-view synthesis."""
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -11,11 +10,11 @@ from jaxtyping import Bool, Float, Int
 from safetensors import SafetensorError
 from torch import Tensor
 
-from etsplat.core.cameras import Cameras
+from etsplat.core.cameras import Cameras, check_cameras
 from etsplat.core.errors import InputError
 from etsplat.core.harmonics import MAX_DEGREE, SH_CONSTANT
 from etsplat.core.rasterization import SOUP_SIGMA_FLOOR, Rasterization, joined
-from etsplat.core.validation import check_open_unit, check_shape
+from etsplat.core.validation import check_above, check_count, check_open_unit, check_shape
 from etsplat.io.kernel_files import adopt_kernel, kernel_tensors
 from etsplat.io.paths import kind_of
 from etsplat.io.tensors import read_tensors, save_tensors
@@ -139,8 +138,8 @@ class TriangleSoup(Model):
         check_shape("vertices", vertices, ("N", 3, 3))
         check_shape("colors", colors, (N := len(vertices), 3))
         check_open_unit("opacity", opacity)
-        if not SOUP_SIGMA_FLOOR < sigma < math.inf:
-            raise ValueError(f"sigma must be above {SOUP_SIGMA_FLOOR} and finite, got {sigma:g}")
+        check_above("sigma", sigma, SOUP_SIGMA_FLOOR)
+        check_count("sh_degree", sh_degree, least=0, most=MAX_DEGREE)
         logit = torch.logit(torch.tensor(opacity, dtype=torch.float64)).to(vertices)
         raw = torch.tensor(sigma - SOUP_SIGMA_FLOOR, dtype=torch.float64).log().to(vertices)
         return cls(
@@ -240,7 +239,11 @@ class TriangleSoup(Model):
             backgrounds: (B, 3); None is black.
             outputs: as in `etsplat.rasterize`.
             depth_of: as there.
+
+        Raises:
+            ValueError: the cameras are none, or of another dtype or device than the parameters.
         """
+        check_cameras(cameras, "soup.vertices", self.vertices)
         look = self.appearance
         culls = look.cull_small or look.cull_large < float("inf")
         if culls and len(cameras) > 1:  # which triangles are left out differs from view to view
@@ -294,7 +297,11 @@ class TriangleSoup(Model):
 
         Returns:
             (B, H, W, 4) premultiplied RGBA. Triangles with an opacity below one half are left out.
+
+        Raises:
+            ValueError: as of `render`.
         """
+        check_cameras(cameras, "soup.vertices", self.vertices)
         kept = self.seen_opaque
         vertices, dc, rest = (tensor.detach()[kept] for tensor in (self.vertices, self.sh_dc, self.sh_rest))
         images = [

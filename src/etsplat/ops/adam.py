@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from etsplat.core.validation import check_like, check_shape, check_written, dense
+from etsplat.core.validation import check_like, check_number, check_shape, check_written, dense
 from etsplat.engines.choice import engine_for, queued_steps
 from etsplat.engines.engine import Engine
 from etsplat.engines.reference.steps import AdamGroup, step_rates
@@ -74,8 +74,9 @@ class Adam:
             raise ValueError(f"learning_rates must name {sorted(parameters)}, got {got}")
         if not all(0 <= beta < 1 for beta in betas):
             raise ValueError(f"betas must be in [0, 1), got {betas}")
-        if eps < 0:
-            raise ValueError(f"eps must be at least 0, got {eps}")
+        check_number("eps", eps, 0)
+        for name, rate in learning_rates.items():
+            check_number(f"learning_rates[{name}]", rate, 0)
         for name, parameter in parameters.items():
             check_written(f"parameters[{name}]", parameter)
         self.parameters = dict(parameters)

@@ -12,13 +12,14 @@ which does not learn of them; whether refined poses stay, they decide (`optim/ca
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
-from typing import Literal
+from typing import Literal, get_args
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from etsplat.core.cameras import Cameras
+from etsplat.core.validation import check_choice
 from etsplat.data.dataset import Dataset
 from etsplat.data.loader import View
 from etsplat.ops.adam import Adam
@@ -69,7 +70,11 @@ class CameraRefinement:
             choice: which of these.
             iterations: of the run.
             epoch: how many iterations show every photo once.
+
+        Raises:
+            ValueError: there is no such choice.
         """
+        check_choice("choice", choice, get_args(Choice))
         if choice == "off":
             return CameraRefinement()
         begin, judged, end = (max(1, round(part * iterations)) for part in (BEGIN, JUDGED, END))

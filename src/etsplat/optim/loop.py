@@ -18,6 +18,7 @@ from typing import Protocol
 
 from torch import Tensor
 
+from etsplat.core.validation import check_count
 from etsplat.core.workers import workers
 from etsplat.optim.camera_event import CamerasEvent
 from etsplat.optim.checkpoints import list_checkpoints
@@ -322,16 +323,25 @@ class LoopSettings:
     """When things happen.
 
     Attributes:
-        iterations: length of the run, >= 1.
+        iterations: length of the run, >= 0.
         log_every: iterations between StepEvents, >= 1.
         evaluate_every: iterations between evaluations; 0 for none before the last iteration, which always has one.
         checkpoint_every: iterations between checkpoints; 0 for none before the last iteration, which always has one.
+
+    Raises:
+        ValueError: one of them is out of its range, or no whole number.
     """
 
     iterations: int
     log_every: int
     evaluate_every: int
     checkpoint_every: int
+
+    def __post_init__(self) -> None:
+        check_count("iterations", self.iterations, least=0)
+        check_count("log_every", self.log_every)
+        check_count("evaluate_every", self.evaluate_every, least=0)
+        check_count("checkpoint_every", self.checkpoint_every, least=0)
 
 
 def optimize(

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from etsplat.core.cameras import Cameras
 from etsplat.core.rasterization import Rasterization
+from etsplat.core.validation import shown
 from etsplat.model.model import Depth
 from etsplat.ops.weighted_sum import Term as Summand
 from etsplat.ops.weighted_sum import weighted_sum
@@ -117,10 +118,14 @@ class Custom(Term):
     """
 
     def __init__(
-        self, value: Callable[[Drawing], Float[Tensor, ""]], weight: Scheduled = 1.0, *, outputs: tuple[str, ...] = ()
+        self,
+        value: Callable[[Drawing], Float[Tensor, ""]],
+        weight: Scheduled = 1.0,
+        *,
+        outputs: str | Sequence[str] = (),
     ) -> None:
         super().__init__(weight)
-        self._value, self.outputs = value, outputs
+        self._value, self.outputs = value, (outputs,) if isinstance(outputs, str) else tuple(outputs)
 
     def __call__(self, drawing: Drawing) -> Float[Tensor, ""]:
         """Of the function."""
@@ -179,18 +184,21 @@ class Objective:
             whole: whether terms that depend on the parameters alone belong to this view.
             apart: whether those count with their values alone, and `of_parameters` has their gradients.
             decayed: whether sums of squares count with their values alone, and `decays` has their gradients.
+
+        Raises:
+            ValueError: a term is no scalar tensor of the model's dtype and device.
         """
-        first = self.photometric(drawing)
+        first = _value_of("photometric", self.photometric, drawing)
         if views > 1:
             first = first / views
         if not isinstance(scale, Tensor) and scale == 0.0:
             return first
         summands = []
-        for term, weight in zip(self.terms, weights, strict=True):
+        for number, (term, weight) in enumerate(zip(self.terms, weights, strict=True)):
             if weight and (whole or term.outputs):
                 elsewhere = (apart and not term.outputs) or (decayed and term.squares is not None)
                 with torch.set_grad_enabled(torch.is_grad_enabled() and not elsewhere):
-                    value = term(drawing)
+                    value = _value_of(f"terms[{number}]", term, drawing, first)
                 summands.append(Summand(weight / views if term.outputs else weight, value, term.power))
         return weighted_sum(first, summands, scale)
 
@@ -229,12 +237,30 @@ class Objective:
             weights: of the terms, as of `weights`.
             scale: of them all.
             decayed: whether sums of squares are left out, as `decays` has their gradients.
+
+        Raises:
+            ValueError: a term is no scalar tensor.
         """
-        counting = zip(self.terms, weights, strict=True)
-        here = [(term, weight) for term, weight in counting if not (decayed and term.squares)]
-        alone = [(term, weight) for term, weight in here if weight and not term.outputs]
+        counting = enumerate(zip(self.terms, weights, strict=True))
+        here = [(number, *each) for number, each in counting if not (decayed and each[0].squares)]
+        alone = [(number, term, weight) for number, term, weight in here if weight and not term.outputs]
         if not alone or scale == 0.0:
             return None
         drawing: Any = OfParameters(model)
-        summands = [Summand(weight, term(drawing), term.power) for term, weight in alone]
+        summands = [
+            Summand(weight, _value_of(f"terms[{number}]", term, drawing), term.power) for number, term, weight in alone
+        ]
         return weighted_sum(torch.zeros_like(summands[0].value), summands, scale)
+
+
+def _value_of(name: str, term: Term, drawing: Drawing, like: Tensor | None = None) -> Float[Tensor, ""]:
+    """What a term returns. ValueError where that is no scalar tensor, or one unlike the others."""
+    value = term(drawing)
+    if isinstance(value, Tensor) and value.ndim == 0:
+        if like is None or (value.dtype == like.dtype and value.device == like.device):
+            return value
+        got = f"{value.dtype} on {value.device}, where photometric has {like.dtype} on {like.device}"
+    else:
+        got = shown(value)
+    who = f"{name} of the objective, {type(term).__name__},"
+    raise ValueError(f"{who} must return a scalar tensor of the model's dtype and device, got {got}")

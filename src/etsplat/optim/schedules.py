@@ -5,6 +5,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from etsplat.core.validation import check_number
+
 NEVER = 1 << 62
 """An iteration that no run gets to."""
 
@@ -34,6 +36,9 @@ class Schedule:
         calm_from: by name of a parameter, the iteration from which on it is one of `Adam.calmed`. What Adam knows of
             its gradients begins anew there, as they are then of another kind.
 
+    Raises:
+        ValueError: a rate is negative, or no number.
+
     Example:
         >>> falling = etsplat.Schedule({"vertices": lambda k: 1e-2 * etsplat.exponential_decay(k, 1000, 0.1)})
         >>> round(falling.rates["vertices"](1000), 6)
@@ -45,6 +50,11 @@ class Schedule:
     appearance: Callable[[int], Any] | None = None
     halvings: Callable[[int], int] = _never
     calm_from: Mapping[str, int] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name, rate in self.rates.items():
+            if not callable(rate):
+                check_number(f"rates[{name}]", rate, 0)
 
 
 def begun_anew(iteration: int, first: int, betas: tuple[float, float]) -> float:

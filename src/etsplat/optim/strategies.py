@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from etsplat.core.rasterization import Rasterization
+from etsplat.core.validation import check_choice, check_count, check_number
 from etsplat.geometry.discs import cut_open
 from etsplat.geometry.films import film
 from etsplat.geometry.flips import flipped
@@ -15,6 +16,7 @@ from etsplat.geometry.measures import face_areas
 from etsplat.geometry.subdivision import longest_edge_plan
 from etsplat.geometry.topology import MeshTopology
 from etsplat.geometry.untangle import untangle
+from etsplat.model.model import model_for
 from etsplat.model.triangle_mesh import TriangleMesh
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.ops.adam import Adam
@@ -142,6 +144,10 @@ class SubdivideAndUntangle(Strategy):
         self._reaches = (reach, _SHORT) if reach > _SHORT else (reach,)
         self._flips, self._lids = flips, lids
         self._found: dict[int, Tensor | None] = {}
+
+    def start(self, model: TriangleMesh, adam: Adam, views: int, generator: torch.Generator) -> None:
+        """Takes a mesh. Raises ValueError for another model."""
+        super().start(model_for(self, model, TriangleMesh), adam, views, generator)
 
     def next_edit(self, iteration: int) -> int:
         """The next of the given times."""
@@ -301,6 +307,9 @@ class DensifyAndPrune(Strategy):
         prune: when a triangle dies.
         spared: of which triangles, by their corners, those that no view has seen stay.
 
+    Raises:
+        ValueError: `every` or `growth` below 1, or another word for `sample_by`.
+
     Example:
         >>> strategy = etsplat.DensifyAndPrune(begin=200, every=50, max_triangles=20_000)
         >>> strategy.max_triangles
@@ -322,9 +331,14 @@ class DensifyAndPrune(Strategy):
 
     outputs = ("statistics",)
 
+    def __post_init__(self) -> None:
+        check_count("every", self.every)
+        check_number("growth", self.growth, 1)
+        check_choice("sample_by", self.sample_by, ("alternate", "opacity", "sharpness"))
+
     def start(self, model: TriangleSoup, adam: Adam, views: int, generator: torch.Generator) -> None:
-        """Nobody has seen any triangle yet."""
-        super().start(model, adam, views, generator)
+        """Nobody has seen any triangle yet. Raises ValueError for another model than a soup."""
+        super().start(model_for(self, model, TriangleSoup), adam, views, generator)
         self.statistics = SoupStatistics.zeros(model.count, model.vertices.device)
 
     def next_edit(self, iteration: int) -> int:

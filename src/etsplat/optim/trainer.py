@@ -27,11 +27,12 @@ from etsplat.optim.drive import drive
 from etsplat.optim.exposure import Exposure
 from etsplat.optim.gauge import Gauge
 from etsplat.optim.guard import Guard
-from etsplat.optim.loop import Callback, LoopSettings, Progress, Return, UndoEvent
+from etsplat.optim.loop import Callback, DivergedError, LoopSettings, Progress, Return, UndoEvent
 from etsplat.optim.objective import Objective
 from etsplat.optim.schedules import NEVER, Schedule
 from etsplat.optim.stepper import Stepper
 from etsplat.optim.strategies import Fixed, Strategy
+from etsplat.optim.trainer_checks import check_callbacks, check_parts
 from etsplat.optim.watch import Outcome, Watch
 
 GUARD_SIDE, GUARD_VIEWS = 128, 32
@@ -114,14 +115,9 @@ class Trainer(Generic[M]):
 
         Raises:
             ValueError: cameras are to be refined, and no photos are kept aside to judge them; there is no view to fit
-                to; the schedule names other parameters than the model's.
+                to; the schedule or the paces name other parameters than the model's; an argument is of another kind.
         """
-        if not dataset.train:
-            raise ValueError("dataset: has no view in `train` to fit to")
-        if not isinstance(objective, Objective):
-            raise ValueError(f"objective must be an Objective, got {type(objective).__name__}: Objective(photometric)")
-        if batch < 1:
-            raise ValueError(f"batch must be at least 1, got {batch}")
+        check_parts(model, dataset, objective, strategy, batch, paces or {})
         self.model, self.strategy, self.progress = model.learnable(), strategy or Fixed(), Progress()
         self.exposure, self.depths, self.guard = exposure or Exposure(NEVER), depths or DepthTrust([]), guard
         self.cameras = cameras or CameraRefinement()
@@ -194,10 +190,14 @@ class Trainer(Generic[M]):
             Where the run stands.
 
         Raises:
-            DivergedError: a loss or parameter is not finite.
+            DivergedError: a loss or parameter is not finite; no triangle is left.
             InputError: a checkpoint is damaged or of another run; somebody else writes the run; the disk is full.
+            ValueError: a number is out of its range; checkpoints without a run; `callbacks` is one function.
         """
         settings = LoopSettings(iterations, log_every, evaluate_every, checkpoint_every)
+        check_callbacks(callbacks)
+        if checkpoint_every and run is None:
+            raise ValueError("checkpoint_every must be 0 without `run`, the folder that checkpoints go to")
         if run_hash is None and (run is not None or workers().count > 1):
             run_hash = self._hash()
         with contextlib.ExitStack() as stack:
@@ -253,6 +253,8 @@ class Trainer(Generic[M]):
             guard.hold(self.progress, following, loss, self._state())
         edited, self._known_loss = self.strategy.edit(iteration), None  # it may change tensors in place
         if edited:
+            if not self.count:
+                raise DivergedError(f"{type(self.strategy).__name__} left no triangle at iteration {iteration}")
             self._set_paces()
             self.edited()
         elif guard is not None:

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from etsplat.geometry.laplacians import laplacian, solver
 from etsplat.geometry.topology import MeshTopology
+from etsplat.model.model import model_for
 from etsplat.model.triangle_mesh import TriangleMesh
 from etsplat.ops.adam import Adam
 
@@ -52,7 +53,8 @@ class UniformSteps:
         self._topology: MeshTopology | None = None
 
     def __call__(self, adam: Adam, mesh: TriangleMesh) -> None:
-        """One step, by the gradients and learning rates that `adam` has."""
+        """One step, by the gradients and learning rates that `adam` has. ValueError for another model than a mesh."""
+        mesh = model_for(self, mesh, TriangleMesh)
         if self._smoothing is not None and mesh.topology is not self._topology:
             self._topology, self._solve = mesh.topology, laplacian_solver(mesh.topology, self._smoothing)
         uniform_step(adam, "vertices", adam.learning_rates["vertices"], self._solve)

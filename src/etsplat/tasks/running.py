@@ -19,6 +19,7 @@ from etsplat.engines.choice import engine_for, resolve_device
 from etsplat.engines.threads import num_threads
 from etsplat.io.kernel_files import kernel_digest, write_kernel
 from etsplat.io.locks import check_nobody_writes, writing_run
+from etsplat.io.paths import given_path
 from etsplat.io.run_directory import RunDirectory, is_run
 from etsplat.optim.exposure import Exposure
 from etsplat.optim.loop import Callback, Event, NoteEvent, PrepareEvent, Progress, StageEvent, StepEvent
@@ -26,6 +27,7 @@ from etsplat.optim.objective import Term
 from etsplat.optim.schedules import Scheduled
 from etsplat.optim.terms import named_terms
 from etsplat.optim.trainer import M, Trainer
+from etsplat.optim.trainer_checks import check_callbacks
 from etsplat.optim.watch import Outcome
 from etsplat.tasks.notebook import notebook_callbacks, result_html
 from etsplat.tasks.reconstruct_config import ReconstructConfig
@@ -146,11 +148,16 @@ class Job(Generic[C]):
         resume: bool,
         overwrite: bool,
     ) -> None:
-        """Raises InputError where there is no run to continue, or no place for a new one."""
+        """Raises InputError where there is no run to continue, or no place for a new one.
+
+        Raises ValueError for one function in the place of several callbacks.
+        """
+        out = given_path("out", out, "the path of a folder")
+        check_callbacks(callbacks)
         self.config, self.device = config, resolve_device(config.device, config.engine)
         self._callbacks = (callbacks or notebook_callbacks()) if workers().leads else []
         again = restarted() and self.first(lambda: is_run(out))
-        self.place = Place(Path(out), resume or again, overwrite and not again)
+        self.place = Place(out, resume or again, overwrite and not again)
         self.first(self.place.check)
         if workers().count > config.batch:
             text = f"batch is {config.batch}: of {workers().count} workers no more have something to do in a step"

@@ -3,16 +3,11 @@
 from jaxtyping import Float
 from torch import Tensor
 
+from etsplat.model.model import model_for
 from etsplat.model.triangle_mesh import TriangleMesh
 from etsplat.ops.mesh_energies import MeshEnergies, mesh_energies
 from etsplat.optim.objective import Drawing, Term
 from etsplat.optim.schedules import Scheduled
-
-
-def _mesh(drawing: Drawing, term: Term) -> TriangleMesh:
-    if not isinstance(drawing.model, TriangleMesh):
-        raise ValueError(f"{type(term).__name__} needs a TriangleMesh, got a {type(drawing.model).__name__}")
-    return drawing.model
 
 
 def _energies(drawing: Drawing, term: Term, edge_power: int | None = None) -> MeshEnergies:
@@ -20,7 +15,7 @@ def _energies(drawing: Drawing, term: Term, edge_power: int | None = None) -> Me
     energies = drawing.shared.setdefault("mesh_energies", {})
     chosen = edge_power or next(iter(energies), 1)
     if chosen not in energies:
-        mesh = _mesh(drawing, term)
+        mesh = model_for(term, drawing.model, TriangleMesh)
         energies[chosen] = mesh_energies(mesh.vertices, mesh.topology.connectivity, edge_power=chosen)
     return energies[chosen]
 
@@ -106,4 +101,4 @@ class Softness(Term):
 
     def __call__(self, drawing: Drawing) -> Float[Tensor, ""]:
         """Sigma."""
-        return _mesh(drawing, self).sigma
+        return model_for(self, drawing.model, TriangleMesh).sigma

@@ -5,6 +5,7 @@ from typing import Literal
 from jaxtyping import Float
 from torch import Tensor
 
+from etsplat.core.validation import check_choice, check_number
 from etsplat.ops.photometric import photometric_loss
 from etsplat.optim.objective import Drawing, Term
 
@@ -32,7 +33,12 @@ class Photometric(Term):
             dssim: l, the share of 1 - SSIM, from 0 to 1.
             pixel: "l1"; "l2" for squares, as Triangle Splatting has it for very large outdoor scenes; or "rms" for the
                 root of their mean.
+
+        Raises:
+            ValueError: another share, or another kind of difference.
         """
+        check_number("dssim", dssim, 0, 1)
+        check_choice("pixel", pixel, ("l1", "l2", "rms"))
         super().__init__()
         self._dssim = dssim
         self._pixel: Literal["l1", "l2", "rms"] = pixel

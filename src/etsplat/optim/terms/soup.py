@@ -8,6 +8,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from etsplat.model.model import model_for
+from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.ops.normal_consistency import normal_consistency
 from etsplat.ops.triangle_area import mean_area
 from etsplat.optim.objective import Drawing, Term
@@ -65,7 +67,7 @@ class Size(Term):
 
     def __call__(self, drawing: Drawing) -> Float[Tensor, ""]:
         """Mean area."""
-        return mean_area(drawing.model.vertices)
+        return mean_area(model_for(self, drawing.model, TriangleSoup).vertices)
 
 
 class Harmonics(Term):
@@ -90,7 +92,7 @@ class Harmonics(Term):
 
     def __call__(self, drawing: Drawing) -> Float[Tensor, ""]:
         """Of the soup."""
-        coefficients = drawing.model.sh_rest
+        coefficients = model_for(self, drawing.model, TriangleSoup).sh_rest
         return _SquaredNorm.apply(coefficients) / len(coefficients)
 
 

@@ -1,0 +1,165 @@
+"""What a trainer and its parts cannot work with is refused where it is handed over, by its name."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+import etsplat
+from etsplat.model.model import Model
+from etsplat.ops.adam import Adam
+
+PHOTOS = etsplat.photograph(etsplat.demo_object(), 16, 16, elevations=(0.0,), azimuths=3, supersampling=1)
+POINTS = etsplat.StartPoints(torch.rand(50, 3, generator=torch.Generator().manual_seed(0)), torch.full((50, 3), 0.5))
+
+
+def a_mesh(dtype: torch.dtype = torch.float32) -> etsplat.TriangleMesh:
+    vertices, faces = etsplat.icosphere(1)
+    return etsplat.TriangleMesh.from_mesh(vertices.to(dtype), faces, colors=0.7, opacity=0.98, sigma=0.25)
+
+
+def a_soup(scale: float = 1.0) -> etsplat.TriangleSoup:
+    return etsplat.start_soup(POINTS, torch.Generator(), scale=scale, opacity=0.3, sigma=1.0, sh_degree=1)
+
+
+def a_trainer(model: Any = None, terms: tuple[etsplat.Term, ...] = (), **given: Any) -> etsplat.Trainer[Any]:
+    objective = etsplat.Objective(given.pop("photometric", etsplat.Photometric()), terms)
+    return etsplat.Trainer(model or a_mesh(), given.pop("dataset", PHOTOS), objective, **given)
+
+
+def custom(value: Callable[[etsplat.Drawing], Any], **given: Any) -> etsplat.Term:
+    return etsplat.Custom(value, 0.5, **given)
+
+
+WRONG = "must return a scalar tensor of the model's dtype and device, got"
+
+
+@pytest.mark.parametrize(
+    ("value", "got"),
+    [
+        (lambda drawing: 0.5, r"0\.5"),
+        (lambda drawing: drawing.rendering.color, r"a tensor of shape \(1, 16, 16, 3\)"),
+        (lambda drawing: drawing.model.vertices.mean().double(), r"torch\.float64 on cpu, where photometric has"),
+    ],
+)
+def test_a_term_that_returns_something_else_is_named(value: Callable[[etsplat.Drawing], Any], got: str) -> None:
+    with pytest.raises(ValueError, match=rf"terms\[1\] of the objective, Custom, {WRONG} {got}"):
+        a_trainer(terms=(etsplat.EdgeLength(0.1), custom(value))).fit(1)
+
+
+def test_a_photometric_term_that_returns_something_else_is_named() -> None:
+    with pytest.raises(ValueError, match=rf"photometric of the objective, Custom, {WRONG} 0\.5"):
+        a_trainer(photometric=custom(lambda drawing: 0.5)).fit(1)
+
+
+def test_a_term_of_parameters_alone_that_returns_something_else_is_named() -> None:
+    objective = etsplat.Objective(etsplat.Photometric(), [custom(lambda drawing: 0.5)])
+    with pytest.raises(ValueError, match=rf"terms\[0\] of the objective, Custom, {WRONG} 0\.5"):
+        objective.of_parameters(a_mesh(), (0.5,), 1.0)
+
+
+def test_one_output_is_named_by_a_word() -> None:
+    """As `rasterize` takes it."""
+    seen = [custom(lambda drawing: drawing.rendering.depth.mean(), outputs=each) for each in ("depth", ["depth"])]
+    assert [term.outputs for term in seen] == [("depth",), ("depth",)]
+    a_trainer(terms=tuple(seen)).fit(1)
+
+
+@pytest.mark.parametrize(
+    ("model", "strategy", "message"),
+    [
+        (a_mesh, etsplat.DensifyAndPrune(), "DensifyAndPrune needs a TriangleSoup, got a TriangleMesh"),
+        (a_soup, etsplat.SubdivideAndUntangle({2: 99}), "SubdivideAndUntangle needs a TriangleMesh, got a TriangleS"),
+    ],
+)
+def test_strategies_say_which_model_they_edit(
+    model: Callable[[], Model], strategy: etsplat.Strategy, message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        a_trainer(model(), strategy=strategy)
+
+
+def test_steps_and_terms_say_which_model_they_are_for() -> None:
+    with pytest.raises(ValueError, match="UniformSteps needs a TriangleMesh, got a TriangleSoup"):
+        a_trainer(a_soup(), update=etsplat.UniformSteps()).fit(1)
+    for term in (etsplat.Size(), etsplat.Harmonics()):
+        with pytest.raises(ValueError, match=f"{type(term).__name__} needs a TriangleSoup, got a TriangleMesh"):
+            term(etsplat.Drawing(a_mesh(), *[None] * 5))
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"strategy": etsplat.Fixed}, "strategy must be a Strategy, got the class Fixed: make one"),
+        ({"strategy": "fixed"}, "strategy must be a Strategy, got 'fixed'"),
+        ({"dataset": "scene"}, r"dataset must be a Dataset, got 'scene': etsplat\.load_dataset\(path\) reads one"),
+        ({"paces": {"vertexes": torch.ones_like}}, "paces name vertexes; the model has vertices, colors"),
+        ({"batch": 1.5}, r"batch must be an integer of at least 1, got 1\.5"),
+        ({"model": a_mesh(torch.float64)}, r"model must be float32, .* got vertices in torch\.float64"),
+    ],
+)
+def test_a_trainer_names_what_it_cannot_begin_with(given: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        a_trainer(**given)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"iterations": -1}, "iterations must be an integer of at least 0, got -1"),
+        ({"iterations": 1.5}, r"iterations must be an integer of at least 0, got 1\.5"),
+        ({"log_every": 0}, "log_every must be an integer of at least 1, got 0"),
+        ({"evaluate_every": -1}, "evaluate_every must be an integer of at least 0"),
+        ({"callbacks": print}, r"callbacks must be a sequence of functions, got .*: pass \[callback\]"),
+        ({"checkpoint_every": 1}, "checkpoint_every must be 0 without `run`"),
+    ],
+)
+def test_a_fit_names_what_it_cannot_do(given: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        a_trainer().fit(**{"iterations": 2, **given})
+
+
+def test_callbacks_of_a_task_are_several(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="callbacks must be a sequence of functions"):
+        etsplat.reconstruct("demo:owl", tmp_path / "run", callbacks=print)
+    assert not (tmp_path / "run").exists()
+
+
+class RemoveAll(etsplat.Strategy):
+    """Leaves nothing."""
+
+    def next_edit(self, iteration: int) -> int:
+        return iteration
+
+    def edit(self, iteration: int) -> bool:
+        kept = torch.zeros(self.model.count, dtype=torch.bool)
+        self.model.load_state(etsplat.apply_rows(etsplat.RowPlan.keeping(kept), self.adam, {})[0])
+        return True
+
+
+def test_a_strategy_that_removes_all_triangles_ends_the_run() -> None:
+    with pytest.raises(etsplat.DivergedError, match="RemoveAll left no triangle at iteration 1"):
+        a_trainer(a_soup(), strategy=RemoveAll()).fit(2)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: etsplat.DensifyAndPrune(sample_by="foo"), "sample_by must be one of 'alternate', .* got 'foo'"),
+        (lambda: etsplat.DensifyAndPrune(growth=0.5), r"growth must be at least 1, got 0\.5"),
+        (lambda: etsplat.DensifyAndPrune(every=0), "every must be an integer of at least 1, got 0"),
+        (lambda: etsplat.Photometric(pixel="l3"), "pixel must be one of 'l1', 'l2', 'rms', got 'l3'"),
+        (lambda: etsplat.Photometric(2.0), r"dssim must be from 0 to 1, got 2\.0"),
+        (lambda: etsplat.CameraRefinement.of("foo", 10, 1.0), "choice must be one of 'off', 'poses', 'all', got 'foo'"),
+        (lambda: etsplat.Schedule({"vertices": -1e-3}), r"rates\[vertices\] must be at least 0, got -0\.001"),
+        (lambda: etsplat.Schedule({"vertices": "1"}), r"rates\[vertices\] must be a number, got '1'"),
+        (lambda: Adam({"p": torch.zeros(2)}, {"p": -1.0}), r"learning_rates\[p\] must be at least 0, got -1\.0"),
+        (lambda: a_soup(scale=-1.0), r"scale must be positive and finite, got -1\.0"),
+        (lambda: etsplat.SoupAppearance(distance="bar"), "distance must be one of 'barycentric', 'sdf', got 'bar'"),
+    ],
+)
+def test_settings_out_of_their_range_are_named_where_they_are_given(make: Callable[[], Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make()
