@@ -12,7 +12,7 @@ from etsplat.data.dataset import Dataset
 from etsplat.data.frames import LARGEST, Listing, MasksAs, Wanted, posed
 from etsplat.data.georeferencing import near_origin
 from etsplat.data.pictures import LazyPictures
-from etsplat.io.paths import kind_of, path_remedy
+from etsplat.io.paths import given_path, kind_of, path_remedy
 from etsplat.io.photos import PHOTO_SUFFIXES, picture_remedy
 from etsplat.io.run_directory import is_run
 
@@ -100,7 +100,7 @@ def load_dataset(
         raise ValueError(f"depth_unit: expected a positive number, got {depth_unit}")
     if width is not None and width < 1:
         raise ValueError(f"width: expected at least 1, got {width}")
-    path = Path(path)
+    path = given_path("path", path, "the path of a folder")
     if not path.is_dir():
         wrong = "is a file; name the scene's folder" if path.is_file() else f"no such folder; {path_remedy(path)}"
         raise InputError(f"scene {path}: {picture_remedy(path) or wrong}")

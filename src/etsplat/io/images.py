@@ -13,7 +13,7 @@ from etsplat.core.errors import InputError
 from etsplat.core.validation import check_floating, check_memory
 from etsplat.io.atomic import atomic_write
 from etsplat.io.exif import on_its_side, turn_of
-from etsplat.io.paths import kind_of
+from etsplat.io.paths import given_path, kind_of
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 """File name endings, lower case, that are tried when a scene names an image without one."""
@@ -124,7 +124,7 @@ def load_image(path: Path | str, shape: tuple[int, int] | None = None) -> Float[
         >>> etsplat.load_image("grey.png").shape
         torch.Size([2, 3, 3])
     """
-    decoded = _decoded(path, shape=shape)
+    decoded = _decoded(given_path("path", path, "the path of an image"), shape=shape)
     if isinstance(decoded, Tensor):
         return decoded[..., None].repeat(1, 1, 3)
     return torch.from_numpy(np.array(decoded)).to(torch.float32) / 255

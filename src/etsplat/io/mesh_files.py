@@ -14,7 +14,7 @@ from etsplat.core.errors import InputError
 from etsplat.core.validation import check_memory, dense
 from etsplat.io._mesh_readers import READERS, RawMesh
 from etsplat.io.georeference import Georeference
-from etsplat.io.paths import kind_of, path_remedy
+from etsplat.io.paths import given_path, kind_of, path_remedy
 from etsplat.io.textures import NormalMap, Texture
 from etsplat.io.writers import (
     Compression,
@@ -53,6 +53,10 @@ class MeshFile:
     notes: tuple[str, ...] = ()
     texture: Texture | None = None
 
+    def check(self) -> None:
+        """Raises ValueError, naming the array, unless they are tensors of these shapes, finite, with faces in range."""
+        _check_arrays(self.vertices, self.faces, self.face_colors, self.vertex_colors)
+
 
 def load_mesh(path: Path | str) -> MeshFile:
     """Read a triangle mesh.
@@ -76,7 +80,7 @@ def load_mesh(path: Path | str) -> MeshFile:
         >>> etsplat.load_mesh("sphere.ply").faces.shape
         torch.Size([80, 3])
     """
-    path = Path(path)
+    path = given_path("path", path)
     if not path.exists():
         raise InputError(f"mesh {path}: no such file; {path_remedy(path)}")
     if path.is_dir():
@@ -148,7 +152,9 @@ def save_mesh(
     writer_of(path, holding="vertex_colors" if texture is None else "texture" if normal_map is None else "normals")
     if texture is not None and (face_colors is not None or vertex_colors is not None):
         raise ValueError("texture: expected no colours beside it")
-    _check_arguments(vertices, faces, face_colors, vertex_colors)
+    if face_colors is not None and vertex_colors is not None:
+        raise ValueError("face_colors, vertex_colors: expected one of them at most, got both")
+    _check_arrays(vertices, faces, face_colors, vertex_colors)
     v, f = dense(vertices).to("cpu", torch.float64).numpy(), dense(faces).to("cpu", torch.int64).numpy()
     per_face = None if face_colors is None else _display_values(face_colors)
     per_vertex = None if vertex_colors is None else _display_values(vertex_colors)
@@ -373,9 +379,7 @@ def _display_values(colors: Tensor) -> np.ndarray:
     return colors.detach().to("cpu", torch.float64).clamp(0, 1).numpy()
 
 
-def _check_arguments(vertices: Tensor, faces: Tensor, face_colors: Tensor | None, vertex_colors: Tensor | None) -> None:
-    if face_colors is not None and vertex_colors is not None:
-        raise ValueError("face_colors, vertex_colors: expected one of them at most, got both")
+def _check_arrays(vertices: Tensor, faces: Tensor, face_colors: Tensor | None, vertex_colors: Tensor | None) -> None:
     tables = {"vertices": (vertices, vertices), "faces": (faces, faces)}
     tables |= {} if face_colors is None else {"face_colors": (face_colors, faces)}
     tables |= {} if vertex_colors is None else {"vertex_colors": (vertex_colors, vertices)}

@@ -6,9 +6,13 @@ import torch
 
 from etsplat.core.errors import InputError
 from etsplat.data.dataset import Dataset
+from etsplat.io.mesh_files import MeshFile
+from etsplat.io.paths import given_path
+from etsplat.model.triangle_mesh import TriangleMesh
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.tasks.export_config import ExportConfig
 from etsplat.tasks.export_soup import Export, export_soup
+from etsplat.tasks.reconstruct import ReconstructResult
 from etsplat.tasks.sources import SoupRun, capture_at, open_run
 from etsplat.tasks.train import TrainResult
 
@@ -50,7 +54,13 @@ def export(
     for name in ("texture", "faces"):
         if getattr(config, name) is not None:
             raise InputError(f"{name}: belongs to a run of reconstruct; take etsplat.texture_mesh")
+    path = given_path("path", path, "the path of a file")
+    if isinstance(source, ReconstructResult | TriangleMesh | MeshFile):
+        how = "etsplat.texture_mesh gives it a texture, etsplat.save_mesh writes a mesh as it is"
+        raise InputError(f"source: is of type {type(source).__name__}, and no soup; {how}")
     if isinstance(source, TriangleSoup):
         soup = source.finished().to(torch.device("cpu"))
-        return export_soup(SoupRun(Path(path).parent, soup, capture_at(scene)), path, config)
-    return export_soup(open_run(source.path if isinstance(source, TrainResult) else source, scene, "cpu"), path, config)
+        return export_soup(SoupRun(path.parent, soup, capture_at(scene)), path, config)
+    found = source.path if isinstance(source, TrainResult) else source
+    given_path("source", found, "a result of train, a TriangleSoup or a path")
+    return export_soup(open_run(found, scene, "cpu"), path, config)

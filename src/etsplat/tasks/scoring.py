@@ -18,6 +18,7 @@ from torch import Tensor
 
 from etsplat.core.cameras import Cameras
 from etsplat.core.errors import InputError
+from etsplat.core.validation import check_kind
 from etsplat.data.dataset import Dataset
 from etsplat.data.loader import ViewLoader
 from etsplat.engines.choice import engine_for
@@ -75,7 +76,7 @@ class Scorer:
     def __init__(
         self,
         dataset: Dataset,
-        device: torch.device,
+        device: torch.device | str,
         *,
         background: Sequence[float] = (0.0, 0.0, 0.0),
         truth: MeshFile | None = None,
@@ -93,7 +94,12 @@ class Scorer:
             samples: points on each surface for the Chamfer distance.
             supersampling: samples along each axis of a pixel of opaque pictures.
             lpips: from `load_lpips`; not measured by default.
+
+        Raises:
+            ValueError: `dataset` is none.
         """
+        check_kind("dataset", dataset, Dataset, "etsplat.load_dataset(path) reads one")
+        device = torch.device(device)
         self._dataset, self._views, self._device = dataset, ViewLoader(dataset, device), device
         self._background = torch.tensor(background, device=device)
         self._truth, self._samples, self._supersampling = truth, samples, supersampling

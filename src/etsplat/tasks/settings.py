@@ -159,6 +159,10 @@ class Settings:
         return object.__new__(cls)
 
     def __post_init__(self) -> None:
+        for name, kind in groups_of(type(self)).items():
+            if not isinstance(getattr(self, name), kind):
+                changed = f"{type(self).__name__}().changed({{{name!r}: {{...}}}}) takes some by name"
+                raise InputError(f"{name}: is a group of settings, {kind.__name__}; {changed}")
         known = settings_of(type(self))
         for name, setting in known.items():
             value = get(self, name)
@@ -209,8 +213,10 @@ class Settings:
             changes: by dotted name, or with a mapping for a group: ``{"optimizer": {"lr_vertices": 5e-3}}``.
 
         Raises:
-            InputError: there is no such setting, or its value cannot be used.
+            InputError: there is no such setting, or its value cannot be used; `changes` is no mapping.
         """
+        if not isinstance(changes, Mapping):
+            raise InputError(f"changes: are of type {type(changes).__name__}; they must be values by name, as a dict")
         known, flat = settings_of(type(self)), flatten(changes)
         for name in flat:
             if any(other.startswith(f"{name}.") for other in known):
@@ -313,6 +319,13 @@ def settings_of(kind: type) -> dict[str, Setting]:
     return found
 
 
+@cache
+def groups_of(kind: type) -> dict[str, type]:
+    """The groups of a config class by name, in the order of the fields."""
+    hints = get_type_hints(kind)
+    return {field.name: hints[field.name] for field in fields(kind) if is_dataclass(hints[field.name])}
+
+
 def kernel_methods() -> tuple[str, ...]:
     """The methods of soft triangles: ours, and what was given to `register_kernel`, if anybody has imported that."""
     kernels = sys.modules.get("etsplat.core.kernels")
@@ -387,7 +400,9 @@ def _setting(hint: Any, default: Any) -> Setting:
 
 
 def _typed(setting: Setting, value: Any) -> Any:
-    """A value of JSON, which has no paths and may have floats without a point, as its setting has it."""
+    """A value as its setting has it: of JSON, which has no paths and may have floats without a point, or of numpy."""
+    if getattr(value, "shape", None) == ():
+        value = value.item()
     if setting.kind is float and isinstance(value, int) and not isinstance(value, bool):
         with suppress(OverflowError):  # and then its check complains of the integer
             return float(value)

@@ -27,7 +27,7 @@ from etsplat.data.silhouettes import contradicting, looks_inverted
 from etsplat.engines.choice import resolve_device
 from etsplat.io.mesh_files import MeshFile, load_mesh
 from etsplat.io.opaque_files import load_opaque
-from etsplat.io.paths import path_remedy
+from etsplat.io.paths import given_path, path_remedy
 from etsplat.io.photos import picture_remedy
 from etsplat.io.point_clouds import load_cloud
 from etsplat.io.run_directory import RunDirectory, is_run
@@ -84,11 +84,15 @@ def load_source(
     Raises:
         InputError: there is nothing at the path, or what is there cannot be used; masks for something else than a
             scene folder.
+        ValueError: the arrays of a mesh are no such arrays.
     """
+    if not isinstance(source, MeshFile | Dataset):
+        given_path("source", source, "a path, a demo's name, a MeshFile or a Dataset")
     for name, folder in (("masks", masks), ("depths", None if isinstance(depths, bool) else depths)):
         if folder is not None and (isinstance(source, MeshFile | Dataset) or not Path(source).is_dir()):
             raise InputError(f"{name} {folder}: belong to {_A_FOLDER}; leave them out")
     if isinstance(source, MeshFile):
+        source.check()
         return source, source.notes
     if isinstance(source, Dataset):
         scene, notes = _in_unit_sphere(source)
@@ -178,6 +182,7 @@ def load_scene(
             raise InputError(f"{name} {folder}: belong to {_A_FOLDER}; leave them out")
     if isinstance(source, Dataset):
         return source
+    given_path("source", source, "a path, a demo's name or a Dataset")
     check_demo(source, "train")
     if str(source) == DEMO_SCENE:
         width = min(WIDTH, width or WIDTH)

@@ -23,6 +23,7 @@ from etsplat.geometry.parts import Shape, shape_of
 from etsplat.geometry.topology import MeshTopology
 from etsplat.geometry.untangle import untangle
 from etsplat.io.mesh_files import MeshFile, load_mesh, weld_vertices
+from etsplat.io.paths import given_path
 from etsplat.model.triangle_mesh import MeshAppearance, TriangleMesh
 from etsplat.tasks.coarse_soup import seen_through
 from etsplat.tasks.judgement import CONTRADICTED, Start
@@ -97,9 +98,16 @@ class Started(NamedTuple):
 
 
 def load_start(start: str | Path | MeshFile | None) -> MeshFile | None:
-    """Reads the mesh to start from and merges vertices at equal positions, so that neighbours move together."""
+    """Reads the mesh to start from and merges vertices at equal positions, so that neighbours move together.
+
+    Raises ValueError where the arrays of a mesh in memory are no such arrays, InputError for what is no mesh.
+    """
     if start is None:
         return None
+    if isinstance(start, MeshFile):
+        start.check()
+    else:
+        given_path("init_mesh", start, "a path or a MeshFile")
     return weld_vertices(start if isinstance(start, MeshFile) else load_mesh(start))
 
 
