@@ -339,3 +339,16 @@ def test_masks_count_as_transparency_or_say_what_to_ignore(tmp_path):
         torch.testing.assert_close(whole.images[index][..., 3], mask, atol=1 / 255, rtol=0)
         torch.testing.assert_close(whole.images[index][..., :3], photo * mask[..., None], atol=1 / 255, rtol=0)
     assert whole.fingerprint() == load_dataset(tmp_path, masks_as="alpha").fingerprint()
+
+
+def test_masks_of_half_the_size_are_enlarged_as_transparency_too(tmp_path):
+    write_transforms(tmp_path, 3)
+    for index in range(3):
+        write_photo(tmp_path / "masks" / f"{index:04d}.png", 8, 6, seed=index)
+    scene, whole = load_dataset(tmp_path), load_dataset(tmp_path, masks_as="alpha")
+    for index in range(3):
+        mask = scene.images.mask(index).float() / 255
+        torch.testing.assert_close(whole.images[index][..., 3], mask, atol=1 / 255, rtol=0)
+    write_photo(tmp_path / "masks" / "0001.png", 8, 8)
+    with pytest.raises(InputError, match=r"0001\.png: is 8x8, its image is 16x12; resize the mask"):
+        load_dataset(tmp_path, masks_as="alpha")

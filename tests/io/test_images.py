@@ -14,6 +14,7 @@ from etsplat.io.images import (
     image_size,
     load_image,
     load_mask,
+    load_mask_pixels,
     load_pixels,
     over_background,
     premultiply,
@@ -210,3 +211,14 @@ def test_an_image_is_turned_where_only_then_it_has_the_shape_of_its_camera(tmp_p
     as_stored = stored.shape[1::-1]
     assert size_for(tmp_path / "a.png", as_stored) == as_stored
     assert np.array_equal(load_pixels(tmp_path / "a.png", *as_stored).numpy(), stored)
+
+
+@pytest.mark.parametrize(("kind", "white"), [(np.uint8, 1), (np.uint16, 1), (np.uint16, 255)])
+def test_a_mask_with_another_white_than_its_format_is_refused(tmp_path, kind, white):
+    """It would count as nearly all black. One that is black all over is a mask of nothing."""
+    inside = np.eye(12, 16)
+    Image.fromarray((inside * white).astype(kind)).save(tmp_path / "a.png")
+    with pytest.raises(InputError, match=r"a\.png: is nearly black all over.*write 255 inside masks that have 1 there"):
+        load_mask_pixels(tmp_path / "a.png", 16, 12)
+    Image.fromarray((inside * 0).astype(kind)).save(tmp_path / "a.png")
+    assert not load_mask(tmp_path / "a.png").any()

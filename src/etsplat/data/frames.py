@@ -313,13 +313,7 @@ def _masked_rgba(frame: Frame, size: tuple[int, int]) -> Picture:
     """Shrunk in float, after the mask: a silhouette keeps its place to a part of a pixel."""
     image = premultiply(load_image(frame.image, frame.size))
     if frame.mask is not None:
-        mask = load_mask(frame.mask)
-        if mask.shape != image.shape[:2]:
-            raise InputError(
-                f"mask {frame.mask}: is {mask.shape[1]}x{mask.shape[0]}, its image is"
-                f" {image.shape[1]}x{image.shape[0]}; resize the mask"
-            )
-        image = image * mask[..., None]
+        image = image * load_mask(frame.mask, (image.shape[1], image.shape[0]))[..., None]
     return Picture(image if size == (image.shape[1], image.shape[0]) else resize_image(image, *size))
 
 

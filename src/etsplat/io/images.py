@@ -29,6 +29,9 @@ WEBP_QUALITY = 90
 
 _WEBP_SIDE = 16383
 
+_DARKEST = 1.5 / 255
+"""Masks that are nowhere brighter, but not black, have been written in other steps than those of their format."""
+
 _DENSEST = 520
 """Pixels of 16 bits in a byte of PNG, of which deflate makes at most 1032; JPEG needs a bit for 64 pixels at least."""
 
@@ -173,33 +176,37 @@ def load_pixels(path: Path | str, width: int, height: int) -> UInt8[Tensor, "H W
 
 
 def load_mask_pixels(path: Path | str, width: int, height: int) -> UInt8[Tensor, "H W"]:
-    """Read a mask as 8-bit levels of the given size, 255 inside; see `load_mask`.
-
-    Raises:
-        InputError: as `load_image`, or the mask has another shape than width : height.
-    """
-    mask = load_mask(path)
-    H, W = mask.shape
-    if abs(H * width / W - height) > 2:
-        raise InputError(f"mask {path}: is {W}x{H}, its image is {width}x{height}; resize the mask")
-    if (width, height) != (W, H):
-        mask = resize_image(mask[..., None], width, height)[..., 0]
-    return to_8_bit(mask)
+    """Read a mask as 8-bit levels of the given size, 255 inside. Raises InputError as `load_mask`."""
+    return to_8_bit(load_mask(path, (width, height)))
 
 
-def load_mask(path: Path | str) -> Float[Tensor, "H W"]:
+def load_mask(path: Path | str, size: tuple[int, int] | None = None) -> Float[Tensor, "H W"]:
     """Read a mask, 1 inside the object: the alpha channel where it varies, else the grey level.
+
+    Args:
+        path: a PNG or JPEG file.
+        size: (width, height) that it is shrunk or enlarged to; None for its own.
 
     Returns:
         float32 in [0, 1].
 
     Raises:
-        InputError: as `load_image`.
+        InputError: as `load_image`; it is nearly black all over, as with 1 for white; or it has another shape than
+            `size`.
     """
     image = load_image(path)
-    if image.shape[-1] == 4 and image[..., 3].min() < 1:
-        return image[..., 3].contiguous()
-    return image[..., :3].mean(dim=-1)
+    varies = image.shape[-1] == 4 and bool(image[..., 3].min() < 1)
+    mask = image[..., 3].contiguous() if varies else image[..., :3].mean(dim=-1)
+    if 0 < float(mask.max()) < _DARKEST:
+        raise InputError(
+            f"mask {path}: is nearly black all over, so it may have 1 for white, or 255 in 16 bits; write 255 inside"
+            " masks that have 1 there, 65535 in 16 bits"
+        )
+    H, W = mask.shape
+    width, height = size or (W, H)
+    if abs(H * width / W - height) > 2:
+        raise InputError(f"mask {path}: is {W}x{H}, its image is {width}x{height}; resize the mask")
+    return mask if (width, height) == (W, H) else resize_image(mask[..., None], width, height)[..., 0]
 
 
 def image_size(path: Path | str) -> tuple[int, int]:
