@@ -52,6 +52,10 @@ def test_folders_that_cannot_be_used_are_input_errors(tmp_path):
     for photos, out in (("photos", "photos/a.jpg/scene"), ("photos/a.jpg", "scene")):
         with pytest.raises(InputError, match=r"is one photo; name the folder|a file is in the way"):
             find_cameras(tmp_path / photos, tmp_path / out)
+    (tmp_path / "photos.zip").write_bytes(b"PK")
+    for read in (lambda path: find_cameras(path, tmp_path / "scene"), load_dataset):
+        with pytest.raises(InputError, match=r"photos\.zip: is an archive; unpack it and name the folder"):
+            read(tmp_path / "photos.zip")
     with pytest.raises(InputError, match=r"scene .*/photoz: no such folder; did you mean .*/photos\?"):
         undistort_scene(tmp_path / "photoz", tmp_path / "scene")
     with pytest.raises(InputError, match="is there already"):
@@ -104,6 +108,7 @@ def test_real_photos_become_a_scene_that_loads(tmp_path, shared_data):
     assert len(capture) == 5
     assert len(capture.points) == found.points > 100
     assert list(dict.fromkeys(phases)) == [
+        "Reading photos",
         "Finding features",
         "Comparing photos",
         "Placing cameras",

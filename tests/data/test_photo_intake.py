@@ -52,7 +52,16 @@ def test_upright_photos_are_linked_and_others_turned_under_their_names(mixed, tm
             assert image.size == photo.file.size
     assert (tmp_path / "work" / "one" / "a.jpg").samefile(mixed / "one" / "a.jpg")
     assert not (tmp_path / "work" / "two" / "e.jpg").samefile(mixed / "two" / "e.jpg")
-    assert told[-1] == ("Turning photos upright", 1, 1)
+    assert told[-1] == ("Reading photos", 7, 7)
+
+
+def test_photos_cut_short_are_refused(mixed, tmp_path):
+    """Their headers are whole, and COLMAP takes what is there."""
+    path = mixed / "two" / "c.jpg"
+    path.write_bytes(path.read_bytes()[:-100])
+    photos = list_photos(mixed)
+    with pytest.raises(InputError, match=r"two/c\.jpg: damaged or cut short .*; copy it again"):
+        take_in(photos, tmp_path / "work", 1, lambda *state: None)
 
 
 def test_what_is_hidden_is_no_photo_and_two_of_one_name_are_refused(mixed):

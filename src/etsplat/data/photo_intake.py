@@ -9,7 +9,7 @@ from pathlib import Path, PurePosixPath
 from typing import Literal
 
 from etsplat.core.errors import InputError
-from etsplat.io.images import IMAGE_SUFFIXES
+from etsplat.io.images import IMAGE_SUFFIXES, load_rgb
 from etsplat.io.paths import kind_of, path_remedy
 from etsplat.io.photos import PHOTO_SUFFIXES, PhotoFile, inspect_photo, picture_remedy, write_upright
 
@@ -66,26 +66,24 @@ def list_photos(folder: Path) -> list[Photo]:
 def take_in(photos: list[Photo], folder: Path, threads: int | None, report: Callable[[str, int, int], None]) -> None:
     """Puts photos into a folder by their names: links to those that are upright, upright copies of the others.
 
+    All are decoded: of a photo that is cut short COLMAP takes what is there, and grey for the rest.
+
     Raises:
         InputError: a photo is damaged.
         OSError: it cannot be written.
     """
     for photo in photos:
         (folder / photo.name).parent.mkdir(parents=True, exist_ok=True)
-        if photo.file.upright:
-            _link(photo.path, folder / photo.name)
-    turned = [photo for photo in photos if not photo.file.upright]
     with ThreadPoolExecutor(threads or os.cpu_count()) as pool:
-        futures = [pool.submit(write_upright, photo.path, folder / photo.name) for photo in turned]
+        futures = [pool.submit(_take_in, photo, folder / photo.name) for photo in photos]
         try:
             for done, future in enumerate(futures):
-                report("Turning photos upright", done, len(turned))
+                report("Reading photos", done, len(photos))
                 future.result()
         finally:
             for future in futures:
                 future.cancel()
-    if turned:
-        report("Turning photos upright", len(turned), len(turned))
+    report("Reading photos", len(photos), len(photos))
 
 
 def by_camera(photos: list[Photo], sharing: CameraSharing) -> list[list[str]]:
@@ -107,8 +105,12 @@ def _camera_of(photo: Photo) -> object:
     return camera if says else PurePosixPath(photo.name).parent
 
 
-def _link(path: Path, link: Path) -> None:
+def _take_in(photo: Photo, target: Path) -> None:
+    if not photo.file.upright:
+        write_upright(photo.path, target)
+        return
+    load_rgb(photo.path)
     try:
-        link.symlink_to(path.resolve())
+        target.symlink_to(photo.path.resolve())
     except OSError:  # a system or a disk without links
-        shutil.copyfile(path, link)
+        shutil.copyfile(photo.path, target)

@@ -24,7 +24,7 @@ from etsplat.data.video_intake import FRAMES, frames_of_video
 from etsplat.io.atomic import write_error
 from etsplat.io.georeference import Georeference
 from etsplat.io.paths import kind_of
-from etsplat.io.photos import PHOTO_SUFFIXES
+from etsplat.io.photos import ARCHIVE_SUFFIXES, PHOTO_SUFFIXES
 
 Matching = Literal["auto", "exhaustive", "sequential"]
 Masks = Literal["none", "auto"]
@@ -99,7 +99,7 @@ def find_cameras(
     """
     pycolmap = import_pycolmap()
     source, out = Path(photos), Path(out)
-    is_video = source.is_file() and kind_of(source) not in PHOTO_SUFFIXES
+    is_video = source.is_file() and kind_of(source) not in (*PHOTO_SUFFIXES, *ARCHIVE_SUFFIXES)
     check_size(max_size)
     check_output(out, (FRAMES,) if is_video else ())
     if out.resolve().is_relative_to(source.resolve()):

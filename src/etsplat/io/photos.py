@@ -14,6 +14,7 @@ from etsplat.io.paths import kind_of
 HEIC_SUFFIXES = (".heic", ".heif")
 PHOTO_SUFFIXES = (*IMAGE_SUFFIXES, *HEIC_SUFFIXES)
 VIDEO_SUFFIXES = (".avi", ".m4v", ".mkv", ".mov", ".mp4", ".webm")
+ARCHIVE_SUFFIXES = (".7z", ".gz", ".r3d", ".rar", ".tar", ".tgz", ".zip")
 """File name endings, lower case."""
 
 _QUALITY = 95
@@ -85,11 +86,13 @@ def write_upright(path: Path | str, target: Path) -> None:
 
 
 def picture_remedy(path: Path) -> str:
-    """The end of the error for a photo or a video that stands where a capture belongs, or ""."""
+    """The end of the error for a photo, a video or an archive that stands where a capture belongs, or ""."""
     if not path.is_file():
         return ""
     if kind_of(path) in PHOTO_SUFFIXES:
         return "is one photo; name the folder that has all of them and their cameras"
     if kind_of(path) in VIDEO_SUFFIXES:
         return f"is a video; make a scene of it: etsplat data sfm {path} --out SCENE"
+    if kind_of(path) in ARCHIVE_SUFFIXES:
+        return "is an archive; unpack it and name the folder"
     return ""
