@@ -191,6 +191,45 @@ def test_a_distorted_scene_is_refused_with_the_remedy_and_undistorted_once(tmp_p
         undistort_scene(tmp_path, tmp_path / "newer")
 
 
+def test_smaller_copies_with_other_endings_are_undistorted_as_they_would_be_read(tmp_path):
+    """Whose masks have the size that the model is for; the smaller copy is what the large photo is, shrunk."""
+    pytest.importorskip("pycolmap")
+    for name, size in (("large", (160, 120)), ("small", (80, 60))):
+        scene = tmp_path / name
+        write_colmap(scene, [(160, 120)] * 3, model="SIMPLE_RADIAL", extra=(-0.1,))
+        for index in range(3):
+            (scene / "images" / f"{index:04d}.jpg").unlink()
+            file = f"{index:04d}.JPG" if name == "large" or index else "0000.png"
+            write_photo(scene / "images" / file, *size, seed=index)
+            write_photo(scene / "masks" / f"{index:04d}.png", 160, 120, seed=9)
+    assert undistort_scene(tmp_path / "small", tmp_path / "new") == ["0000.png", "0001.JPG", "0002.JPG"]
+    undistort_scene(tmp_path / "large", tmp_path / "new large")
+    small, large = load_dataset(tmp_path / "new"), load_dataset(tmp_path / "new large", width=80)
+    assert len(small.points) == 20
+    torch.testing.assert_close(small.viewmats, large.viewmats)
+    for index in range(3):
+        width = small.images.sizes[index][0]
+        assert 70 < width < 90
+        assert abs(small.Ks[index, 0, 0] / width - large.Ks[index, 0, 0] / 80) < 0.02
+        assert abs(float(small.images[index].float().mean() - large.images[index].float().mean())) < 3
+        assert abs(float(small.images.mask(index).float().mean() - large.images.mask(index).float().mean())) < 3
+    write_photo(tmp_path / "small" / "images" / "0001.JPG", 80, 80)
+    with pytest.raises(InputError, match=r"0001\.jpg is 80x80, but its camera is for 160x120"):
+        undistort_scene(tmp_path / "small", tmp_path / "newer")
+
+
+@pytest.mark.parametrize("file", ["images/0001.jpg", "masks/0001.png"])
+def test_pictures_cut_short_are_not_undistorted(tmp_path, file):
+    pytest.importorskip("pycolmap")
+    write_colmap(tmp_path / "scene", [(64, 48)] * 3, model="SIMPLE_RADIAL", extra=(-0.1,))
+    for index in range(3):
+        write_photo(tmp_path / "scene" / "masks" / f"{index:04d}.png", 64, 48, seed=index)
+    path = tmp_path / "scene" / file
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    with pytest.raises(InputError, match=rf"{file}: damaged or cut short .*; copy it again"):
+        undistort_scene(tmp_path / "scene", tmp_path / "new")
+
+
 LENSES = {
     "OPENCV": {"k1": -0.2, "k2": 0.05, "p1": 0.01, "p2": -0.02},
     "OPENCV_FISHEYE": {"k1": -0.05, "k2": 0.02, "k3": -0.01, "k4": 0.002},

@@ -279,6 +279,16 @@ def _with_any_ending(path: Path, suffixes: Sequence[str] = IMAGE_SUFFIXES) -> Pa
     return next((candidate for candidate in candidates if candidate.is_file()), None)
 
 
+def check_copy(scene: Path, name: str, size: tuple[int, int], whole: tuple[int, int]) -> None:
+    """Raises InputError where an image of `size` is no copy, smaller or larger, of the one that a camera is for."""
+    scale = size[0] / whole[0]
+    if abs(whole[1] * scale - size[1]) > min(2, 0.1 * size[1]):  # smaller copies are rounded to whole pixels
+        raise InputError(
+            f"scene {scene}: {name} is {size[0]}x{size[1]}, but its camera is for {whole[0]}x{whole[1]}; use the images"
+            " that the poses were made from"
+        )
+
+
 def scaled_intrinsics(
     scene: Path, frame: Frame, size: tuple[int, int], target: tuple[int, int]
 ) -> Float[Tensor, "3 3"]:
@@ -287,12 +297,7 @@ def scaled_intrinsics(
     Raises:
         InputError: the file has another shape than K's image.
     """
-    scale = size[0] / frame.size[0]
-    if abs(frame.size[1] * scale - size[1]) > min(2, 0.1 * size[1]):  # smaller copies are rounded to whole pixels
-        raise InputError(
-            f"scene {scene}: {frame.name} is {size[0]}x{size[1]}, but its camera is for"
-            f" {frame.size[0]}x{frame.size[1]}; use the images that the poses were made from"
-        )
+    check_copy(scene, frame.name, size, frame.size)
     ratio = torch.tensor([target[0] / frame.size[0], target[1] / frame.size[1], 1.0], dtype=torch.float64)
     return frame.K * ratio[:, None]
 

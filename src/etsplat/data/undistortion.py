@@ -1,22 +1,24 @@
 """Scenes without lens distortion out of scenes with it, once and for all, with pycolmap (an extra)."""
 
 import contextlib
+import copy
 import os
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 from etsplat.core.errors import InputError
 from etsplat.data.colmap_process import Progress, import_pycolmap, run_apart, undistort_images
 from etsplat.data.formats.colmap import find_model
-from etsplat.data.frames import Frame, Points, Wanted, check_frames, scaled_intrinsics
+from etsplat.data.frames import Frame, Points, Wanted, check_copy, check_frames, find_image, scaled_intrinsics
 from etsplat.data.load import format_of
 from etsplat.io.atomic import write_error
 from etsplat.io.georeference import GEOREFERENCE_FILE
-from etsplat.io.images import image_size, load_pixels, size_for
+from etsplat.io.images import image_size, load_mask, load_pixels, save_image, size_for
 from etsplat.io.locks import scratch_folder
-from etsplat.io.paths import kind_of, path_remedy, path_within
+from etsplat.io.paths import path_remedy
 from etsplat.io.photos import write_upright
 
 LEAST_SIZE = 16
@@ -41,8 +43,8 @@ def undistort_scene(scene: Path | str, out: Path | str, *, max_size: int = 1600)
         The names of the images. Every 8th is for testing, whatever the scene said.
 
     Raises:
-        InputError: pycolmap is missing; there is no scene, or it cannot be read; images are missing or transparent;
-            `out` cannot be used; the disk is full.
+        InputError: pycolmap is missing; there is no scene, or it cannot be read; images are missing, damaged or
+            transparent; `out` cannot be used; the disk is full.
     """
     pycolmap = import_pycolmap()
     scene, out = Path(scene), Path(out)
@@ -61,9 +63,7 @@ def undistort_scene(scene: Path | str, out: Path | str, *, max_size: int = 1600)
         photos = _common_folder(scene, frames)
         model, masks = _make_model(pycolmap, scene, photos, frames, listing.points)
     names = _placed(model)
-    for photo in (photos / name for name in names):
-        if kind_of(photo) == ".png" and load_pixels(photo, *image_size(photo)).shape[2] == 4:
-            raise InputError(f"image {photo}: has transparency, which would be lost; put it into {scene}/masks")
+    _check_pictures(scene, [photos / name for name in names], masks.values())
     check_space(out, [*(photos / name for name in names), *masks.values(), *masks.values()])
     with working_folder(out) as work:
         undistort_model(model, _as_cameras_have_them(model, photos, names, work), names, work, max_size)
@@ -73,6 +73,20 @@ def undistort_scene(scene: Path | str, out: Path | str, *, max_size: int = 1600)
             shutil.copyfile(scene / GEOREFERENCE_FILE, work / "scene" / GEOREFERENCE_FILE)
         os.replace(work / "scene", out)
     return names
+
+
+def _check_pictures(scene: Path, photos: list[Path], masks: Iterable[Path]) -> None:
+    """Raises InputError where one is damaged, of which COLMAP takes what is there, or a photo is transparent."""
+    with ThreadPoolExecutor() as pool:
+        for photo, channels in zip(photos, pool.map(_channels, photos), strict=True):
+            if channels == 4:
+                raise InputError(f"image {photo}: has transparency, which would be lost; put it into {scene}/masks")
+        for _ in pool.map(load_mask, masks):
+            pass
+
+
+def _channels(photo: Path) -> int:
+    return load_pixels(photo, *image_size(photo)).shape[2]
 
 
 def _as_cameras_have_them(model: Any, photos: Path, names: list[str], work: Path) -> Path:
@@ -86,9 +100,9 @@ def _as_cameras_have_them(model: Any, photos: Path, names: list[str], work: Path
     if not lying:
         return photos
     for name in names:
-        copy = work / "upright" / name
-        copy.parent.mkdir(parents=True, exist_ok=True)
-        (write_upright if name in lying else shutil.copyfile)(photos / name, copy)
+        target = work / "upright" / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        (write_upright if name in lying else shutil.copyfile)(photos / name, target)
     return work / "upright"
 
 
@@ -180,16 +194,48 @@ def _placed(model: Any) -> list[str]:
 
 
 def _read_model(pycolmap: Any, scene: Path, folder: Path) -> tuple[Any, dict[str, Path]]:
-    """A COLMAP scene's model, and masks by the names of the images."""
+    """A COLMAP scene's model for the images that are there, which may be copies; and masks by their names."""
     try:
         model = pycolmap.Reconstruction(folder)
     except (ValueError, RuntimeError, OSError, LookupError) as error:  # what its C++ throws
         raise InputError(f"scene {folder}: cannot be read as a model ({str(error).splitlines()[0]})") from error
-    names = _placed(model)
-    missing = [name for name in names if not path_within(scene / "images", name, folder).is_file()]
+    files = {name: find_image(scene / "images", name, folder) for name in _placed(model)}
+    missing = [name for name, file in files.items() if not file.is_file()]
     if missing:
         raise InputError(f"scene {scene}: {len(missing)} images are missing (first: {missing[0]}); copy them there")
-    return model, {name: mask for name in names if (mask := Wanted().mask_of(scene, name, folder)) is not None}
+    found = ((file, Wanted().mask_of(scene, name, folder)) for name, file in files.items())
+    masks = {file.relative_to(scene / "images").as_posix(): mask for file, mask in found if mask is not None}
+    return _of_files(pycolmap, scene, model, files), masks
+
+
+def _of_files(pycolmap: Any, scene: Path, model: Any, files: dict[str, Path]) -> Any:
+    """The model with images named as their files; if some have another size than their camera, made anew with it."""
+    images = [image for image in model.images.values() if image.name in files]
+    sizes, fit = {}, True
+    for image in images:
+        camera, file = model.cameras[image.camera_id], files[image.name]
+        whole = camera.width, camera.height
+        sizes[image.image_id] = size = size_for(file, whole)
+        check_copy(scene, image.name, size, whole)
+        fit = fit and size == whole
+        image.name = file.relative_to(scene / "images").as_posix()
+    if fit:
+        return model
+    resized = pycolmap.Reconstruction()
+    for image in images:
+        camera = copy.deepcopy(model.cameras[image.camera_id])
+        camera.rescale(*sizes[image.image_id])
+        _add_image(pycolmap, resized, image.image_id, image.name, camera, image.cam_from_world())
+    for point in model.points3D.values():
+        resized.add_point3D(point.xyz, pycolmap.Track(), point.color)
+    return resized
+
+
+def _add_image(pycolmap: Any, model: Any, index: int, name: str, camera: Any, pose: Any) -> None:
+    """With a camera of its own."""
+    camera.camera_id = index
+    model.add_camera_with_trivial_rig(camera)
+    model.add_image_with_trivial_frame(pycolmap.Image(name=name, camera_id=index, image_id=index), pose)
 
 
 def _common_folder(scene: Path, frames: list[Frame]) -> Path:
@@ -211,10 +257,8 @@ def _make_model(
         K = scaled_intrinsics(scene, frame, size, size)
         lens, coefficients = ("PINHOLE", ()) if frame.lens is None else (frame.lens.model, frame.lens.coefficients)
         params = [float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]), *coefficients]
-        camera = pycolmap.Camera(model=lens, width=size[0], height=size[1], params=params, camera_id=index)
-        model.add_camera_with_trivial_rig(camera)
-        image = pycolmap.Image(name=name, camera_id=index, image_id=index)
-        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(frame.viewmat[:3].numpy()))
+        camera = pycolmap.Camera(model=lens, width=size[0], height=size[1], params=params)
+        _add_image(pycolmap, model, index, name, camera, pycolmap.Rigid3d(frame.viewmat[:3].numpy()))
         if frame.mask is not None:
             masks[name] = frame.mask
     if points is not None:
@@ -228,11 +272,14 @@ def undistort_masks(model: Any, masks: dict[str, Path], work: Path, max_size: in
     (work / "images").mkdir()
     (work / "scene").rename(work / "whole")
     for image in model.images.values():
-        mask = masks[image.name]
+        mask, camera = masks[image.name], model.cameras[image.camera_id]
         image.name = str(PurePosixPath(image.name).with_suffix(mask.suffix))
-        copy = work / "images" / image.name
-        copy.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(mask, copy)
+        target, size = work / "images" / image.name, (camera.width, camera.height)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if image_size(mask) == size:
+            shutil.copyfile(mask, target)
+        else:
+            save_image(target, load_mask(mask, size)[..., None])
     undistort_model(model, work / "images", sorted(image.name for image in model.images.values()), work, max_size)
     (work / "scene" / "images").rename(work / "whole" / "masks")
     shutil.rmtree(work / "scene")
