@@ -4,6 +4,7 @@ import torch
 from etsplat.data.load import load_dataset
 from etsplat.io.georeference import Georeference
 from helpers import foreign_captures as foreign
+from helpers.captures import circle_poses, write_colmap
 
 FAR = (500_000.0, 5_400_000.0, 300.0)
 
@@ -27,6 +28,17 @@ def test_coordinates_of_maps_are_made_relative_to_whole_units_nearby(tmp_path):
 def test_only_what_is_far_is_moved(tmp_path, center, moved):
     foreign.write_openmvg(tmp_path, foreign.truth(center=center))
     assert (load_dataset(tmp_path).georeference is not None) == moved
+
+
+def test_cameras_at_one_place_are_not_far_from_the_origin(tmp_path):
+    """How far they are from each other is rounding, here of poses with eight digits. Zeros have no sign."""
+    near = circle_poses(6)
+    near[:, :3, 3] = (-near[:, :3, :3] @ torch.tensor([0.3, -0.2, -1.0]).double()).float().double()
+    write_colmap(tmp_path / "near", [(16, 12)] * 6, poses=near)
+    assert load_dataset(tmp_path / "near").georeference is None
+    write_colmap(tmp_path / "far", [(16, 12)] * 6, poses=circle_poses(6, (-0.2, -1.3, 5e5)))
+    found = load_dataset(tmp_path / "far")
+    assert "relative to (0, 0, 500000)" in found.notes[0]
 
 
 def test_poses_with_few_digits_keep_their_places(tmp_path):

@@ -97,7 +97,7 @@ def test_views_without_masks_or_with_an_empty_or_full_mask_are_refused(owl_views
         images[index, ..., 3] = value
         return replace(owl_views, images=StoredPictures(images))
 
-    with pytest.raises(InputError, match="neither transparency nor masks"):
+    with pytest.raises(InputError, match="neither transparency nor masks, or these are white all over"):
         bounding_sphere(with_alpha(slice(None), 1.0))
     with pytest.raises(InputError, match="view 005: its mask is empty"):
         bounding_sphere(with_alpha(5, 0.0))

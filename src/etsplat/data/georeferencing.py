@@ -16,6 +16,9 @@ _AFAR = 10_000.0
 _AFAR_OF_SPREAD, _NEAR_OF_SPREAD = 168.0, 10.0
 """Times the spread of the cameras: from the one on steps are 1e-5 of it; within the other nothing is moved."""
 
+_ROUNDING = 1e-6
+"""Of the distance from the origin: so far apart are places that were one, where poses are written with few digits."""
+
 
 def near_origin(scene: Path, listing: Listing) -> Listing:
     """The same, moved by whole units if its cameras are so far from the origin that float32 would be coarse.
@@ -44,6 +47,13 @@ def near_origin(scene: Path, listing: Listing) -> Listing:
     )
 
 
+def middle_and_spread(centers: Float[Tensor, "B 3"]) -> tuple[Float[Tensor, "3"], float]:
+    """The mean of camera positions and the largest distance from it; 0 if they are at one place but for rounding."""
+    middle = centers.mean(dim=0)
+    spread = float((centers - middle).norm(dim=1).max())
+    return middle, spread if spread > _ROUNDING * float(middle.norm()) else 0.0
+
+
 def _shift(listing: Listing) -> Float[Tensor, "3"] | None:
     """To where the origin goes: the mean of the cameras in whole units; None if it stays."""
     if not listing.frames:
@@ -53,10 +63,10 @@ def _shift(listing: Listing) -> Float[Tensor, "3"] | None:
         return None
     # By the inverse: rotations are only as right as the digits that were written of them.
     centers = -torch.linalg.solve(stacked[:, :3, :3], stacked[:, :3, 3:])[..., 0]
-    middle = centers.mean(dim=0)
-    spread, distance = float((centers - middle).norm(dim=1).max()), float(middle.norm())
+    middle, spread = middle_and_spread(centers)
+    distance = float(middle.norm())
     if distance > _AFAR_OF_SPREAD * spread > 0 or (distance > _AFAR and distance > _NEAR_OF_SPREAD * spread):
-        return middle.round()
+        return middle.round() + 0.0  # which is no -0
     return None
 
 

@@ -3,12 +3,14 @@
 import importlib
 import pkgutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Protocol, cast
 
 from etsplat.core.errors import InputError
 from etsplat.data import formats
 from etsplat.data.dataset import Dataset
+from etsplat.data.doubtful_poses import pose_notes
 from etsplat.data.frames import LARGEST, Listing, MasksAs, Wanted, posed
 from etsplat.data.georeferencing import near_origin
 from etsplat.data.pictures import LazyPictures
@@ -109,6 +111,7 @@ def load_dataset(
     folder = depths if isinstance(depths, bool) else Path(depths)
     wanted = Wanted(masks_as, images, width, None if masks is None else Path(masks), memory, folder, depth_unit)
     dataset = posed(path, near_origin(path, format_of(path).list_frames(path, wanted)), wanted)
+    dataset = replace(dataset, notes=(*dataset.notes, *pose_notes(dataset)))
     if preload and isinstance(dataset.images, LazyPictures):
         dataset.images.preload(progress)
     return dataset

@@ -27,6 +27,10 @@ def truth():
     return photograph(demo_object(), 40, 40, elevations=(-30.0, 20.0), azimuths=5, supersampling=2)
 
 
+def transposed(document):
+    return torch.tensor(document["frames"][2]["transform_matrix"]).T.tolist()
+
+
 def rewrite(folder, change):
     """Loads transforms.json, lets `change` edit it, writes it back."""
     document = json.loads((folder / "transforms.json").read_text())
@@ -113,6 +117,10 @@ def test_the_bounding_sphere_brings_the_object_into_the_unit_sphere(scene, truth
         (lambda d: d["frames"][2].update(transform_matrix=[[1, 2], [3]]), "no transform_matrix of 16"),
         (lambda d: d["frames"][2]["transform_matrix"][0].__setitem__(0, float("nan")), "no transform_matrix of 16"),
         (lambda d: d["frames"][2].update(transform_matrix=torch.diag(torch.tensor([2.0, 2, 2, 1])).tolist()), "scales"),
+        (
+            lambda d: d["frames"][2].update(transform_matrix=transposed(d)),
+            r"002 has .* last row is not 0 0 0 1; .*trans",
+        ),
         (lambda d: d.pop("camera_angle_x"), "neither fl_x nor camera_angle_x"),
         (lambda d: d.update(fl_x=-3), "not positive"),
         (lambda d: d.update(fl_x="wide"), "not a number"),
@@ -167,7 +175,7 @@ def test_masks_that_are_missing_or_of_another_size_are_input_errors(scene, truth
         save_image(scene / "masks" / f"{index:03d}.png", truth.images[index][..., 3:])
     with pytest.raises(InputError, match=r"no mask for image 009\.png"):
         load_transforms(scene)
-    save_image(scene / "masks" / "009.png", torch.zeros(20, 20, 1))
+    save_image(scene / "masks" / "009.png", torch.zeros(20, 30, 1))
     with pytest.raises(InputError, match="resize the mask"):
         load_transforms(scene)
 

@@ -8,6 +8,7 @@ import math
 from pathlib import Path
 from typing import Any
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -178,4 +179,8 @@ def _intrinsics(entry: Entry, size: tuple[int, int]) -> Float[Tensor, "3 3"]:
 def _viewmat(entry: Entry) -> Float[Tensor, "4 4"]:
     rows = entry.said.get("transform_matrix")
     matrix = entry.numbers("transform_matrix", 12 if isinstance(rows, list) and len(rows) == 3 else 16).reshape(-1, 4)
+    if not torch.allclose(matrix[3:], torch.tensor([0.0, 0, 0, 1], dtype=torch.float64), rtol=0, atol=1e-6):
+        raise entry.wrong(
+            "has a transform_matrix whose last row is not 0 0 0 1; if it is transposed, write its rows as columns"
+        )
     return entry.viewmat(matrix[:3, :3], matrix[:3, 3], OPENGL)
