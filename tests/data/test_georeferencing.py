@@ -1,6 +1,7 @@
 import pytest
 import torch
 
+from etsplat.core.cameras import camera_centers
 from etsplat.data.load import load_dataset
 from etsplat.io.georeference import Georeference
 from helpers import foreign_captures as foreign
@@ -22,6 +23,15 @@ def test_coordinates_of_maps_are_made_relative_to_whole_units_nearby(tmp_path):
     assert found.exact_points is not None
     torch.testing.assert_close(found.exact_points + offset, capture.points, atol=1e-8, rtol=0)
     assert found.notes[-1].startswith("coordinates are relative to (")
+
+
+def test_colmaps_cameras_keep_all_digits_too(tmp_path):
+    """In single precision they were off by up to a quarter of a unit."""
+    poses = circle_poses(6, FAR)
+    write_colmap(tmp_path, [(16, 12)] * 6, poses=poses)
+    found = load_dataset(tmp_path)
+    offset = torch.tensor(found.georeference.offset, dtype=torch.float64)
+    torch.testing.assert_close(found.centers + offset, camera_centers(poses), atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize(("center", "moved"), [((0.0, 0.0, 0.0), False), ((100.0, 0.0, 0.0), False), (FAR, True)])

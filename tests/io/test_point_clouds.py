@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from etsplat.core.errors import InputError
-from etsplat.io.ply_tables import encode_ply
+from etsplat.io.ply_tables import encode_ply, load_points
 from etsplat.io.point_clouds import load_cloud
 
 PLACES = np.random.default_rng(0).normal(size=(50, 3))
@@ -53,6 +53,16 @@ def test_colours_have_8_or_16_bits(tmp_path, highest):
     found = load_cloud(tmp_path / "a.ply")[1]
     assert found is not None
     assert torch.allclose(found, torch.tensor(0.2))
+
+
+@pytest.mark.parametrize(("kind", "value"), [("f4", 0.5), ("f4", 127.5), ("i4", 127), ("u1", 127), ("u2", 32767)])
+def test_colours_of_points_are_of_any_kind(tmp_path, kind, value):
+    """Of floating-point numbers and integers with signs those up to 1 are display values, others are from 0 to 255."""
+    table = np.zeros(4, [*((axis, "f4") for axis in "xyz"), *((name, kind) for name in ("red", "green", "blue"))])
+    for name in ("red", "green", "blue"):
+        table[name] = value
+    (tmp_path / "a.ply").write_bytes(encode_ply({"vertex": table}))
+    assert load_points(tmp_path / "a.ply")[1] == pytest.approx(0.5, abs=3e-3)
 
 
 def test_black_scans_have_no_colours(tmp_path):

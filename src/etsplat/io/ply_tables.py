@@ -157,6 +157,8 @@ def load_points(path: Path | str) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "
         colors = columns(path, table, "red", "green", "blue").float()
         if table.dtype["red"].kind == "u":
             colors /= np.iinfo(table.dtype["red"]).max
+        elif bool((colors > 1).any()):  # as some programs write what is from 0 to 255
+            colors /= 255
     finite = points.isfinite().all(dim=1) & colors.isfinite().all(dim=1)
     return points[finite], colors[finite].clamp(0, 1)
 

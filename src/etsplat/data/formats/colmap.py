@@ -89,5 +89,5 @@ def _viewmat(image: ColmapImage) -> Float[Tensor, "4 4"]:
         raise InputError(f"scene: the pose of {image.name} is not finite; run COLMAP's mapper again")
     viewmat = torch.eye(4, dtype=torch.float64)
     viewmat[:3, :3] = quaternion_rotation(*(q / norm))
-    viewmat[:3, 3] = torch.tensor(image.translation)
+    viewmat[:3, 3] = torch.tensor(image.translation, dtype=torch.float64)
     return viewmat
