@@ -237,7 +237,7 @@ def _resize(folder):
         (_pose("nan"), "not finite"),
         (_pose("1e30"), "0000.jpg has a pose or camera with numbers beyond"),
         (_name("x" * 300), "is no file name"),
-        (_name("x/.."), "leads out"),
+        (_name("x/.."), "2 of|1 of 1 images are missing"),
         (_camera("PINHOLE 16 12 1e308 1e308 8 6"), "numbers beyond"),
         (_camera("PINHOLE 16 12 nan 10 8 6"), "not positive"),
         (_camera("PINHOLE 16 12 10 10 8 inf"), "numbers beyond"),

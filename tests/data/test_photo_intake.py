@@ -74,3 +74,10 @@ def test_what_is_hidden_is_no_photo_and_two_of_one_name_are_refused(mixed):
     write_phone_photo(mixed / "one" / "a.heic", upright_picture())
     with pytest.raises(InputError, match=r"a\.heic and a\.jpg would both be one/a\.jpg; keep one"):
         list_photos(mixed)
+
+
+def test_pictures_of_kinds_that_are_not_read_are_counted_where_photos_lack(tmp_path):
+    for name in ("a.webp", "b.webp", "c.TIF"):
+        (tmp_path / name).write_bytes(b"a picture")
+    with pytest.raises(InputError, match=r"0 JPEG, PNG or HEIC files, and 3 pictures of kinds that are not read: conv"):
+        list_photos(tmp_path)

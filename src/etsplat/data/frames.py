@@ -2,6 +2,7 @@
 
 import hashlib
 import os
+import unicodedata
 from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -30,6 +31,7 @@ from etsplat.io.images import (
     size_for,
 )
 from etsplat.io.paths import kind_of, path_remedy, path_within
+from etsplat.io.photos import HEIC_SUFFIXES, UNREAD_SUFFIXES
 
 MAX_WIDTH = 1600
 """Wider images are shrunk to this width unless another is asked for, as 3DGS does."""
@@ -148,8 +150,7 @@ class Wanted:
         folders = [scene / own for own in DEPTH_FOLDERS] if self.depths is True else [self.depths]
         if self.depths is not True and not self.depths.is_dir():
             raise InputError(f"depths {self.depths}: no such folder; {path_remedy(self.depths)}")
-        paths = [path_within(folder, name, source) for folder in folders]
-        return next((found for path in paths if (found := _with_any_ending(path, DEPTH_SUFFIXES))), None)
+        return next((found for folder in folders if (found := _spelled(folder, name, source, DEPTH_SUFFIXES))), None)
 
 
 def pinhole(fx: float, fy: float, cx: float, cy: float) -> Float[Tensor, "3 3"]:
@@ -215,18 +216,19 @@ def posed(scene: Path, listing: Listing, wanted: Wanted) -> Dataset:
 
 
 def check_frames(scene: Path, frames: Sequence[Frame]) -> None:
-    """Raises InputError where two have one name, images are missing, or numbers cannot be meant."""
+    """Raises InputError where images are missing, two frames have one, or numbers cannot be meant."""
     if not frames:
         raise InputError(f"scene {scene}: has no posed images; at least 2 are needed, better 20")
-    name, count = Counter(frame.name for frame in frames).most_common(1)[0]
-    if count > 1:
-        raise InputError(f"scene {scene}: {count} frames have the image {name}; keep one of them")
     missing = [frame for frame in frames if not frame.image.is_file()]
     if missing:
         raise InputError(
             f"scene {scene}: {len(missing)} of {len(frames)} images are missing"
-            f" (first: {missing[0].image}); copy them there or remove their poses"
+            f" (first: {missing[0].image}); {_missing_remedy(missing[0].image)}"
         )
+    image, count = Counter(frame.image for frame in frames).most_common(1)[0]
+    if count > 1:
+        name = next(frame.name for frame in frames if frame.image == image)
+        raise InputError(f"scene {scene}: {count} frames have the image {name}; keep one of them")
     for frame in frames:
         if not float(frame.K.diagonal()[:2].min()) >= 1 / LARGEST:
             raise InputError(
@@ -241,10 +243,22 @@ def check_frames(scene: Path, frames: Sequence[Frame]) -> None:
 
 
 def _view_names(frames: Sequence[Frame]) -> list[str]:
-    """Names fit for files: folders joined by underscores, endings dropped unless that made two alike."""
+    """Names fit for files: folders joined by underscores, endings dropped unless that made two alike.
+
+    Where joining made two alike, a/b.jpg and a_b.jpg, all are numbered.
+    """
     full = [frame.name.removeprefix("./").replace("/", "_") for frame in frames]
     short = [PurePosixPath(name).stem for name in full]
-    return short if len(set(short)) == len(short) else full
+    numbered = [f"{index:04d}_{name}" for index, name in enumerate(full)]
+    return next(names for names in (short, full, numbered) if len(set(names)) == len(names))
+
+
+def _missing_remedy(image: Path) -> str:
+    """What to do about an image that is not there: it may lie there as a kind of file that is not read."""
+    other = _with_any_ending(image, (*HEIC_SUFFIXES, *UNREAD_SUFFIXES))
+    if other is None:
+        return "copy them there or remove their poses"
+    return f"{other.name} is there, which is not read: convert it, and others like it, to JPEG or PNG"
 
 
 def find_image(folder: Path, name: str, source: Path) -> Path:
@@ -253,8 +267,7 @@ def find_image(folder: Path, name: str, source: Path) -> Path:
     Raises:
         InputError: the name, which the file `source` gives, leads out of the folder.
     """
-    path = path_within(folder, name, source)
-    return _with_any_ending(path) or path
+    return _spelled(folder, name, source) or folder / name
 
 
 def find_mask(folder: Path, name: str, source: Path) -> Path:
@@ -265,14 +278,24 @@ def find_mask(folder: Path, name: str, source: Path) -> Path:
     """
     if not folder.is_dir():
         raise InputError(f"masks {folder}: no such folder; {path_remedy(folder)}")
-    path = path_within(folder, name, source)
-    found = _with_any_ending(path)
+    found = _spelled(folder, name, source)
     if found is None:
-        raise InputError(f"masks {folder}: no mask for image {name}; add {path.with_suffix('.png').name}")
+        raise InputError(f"masks {folder}: no mask for image {name}; add {(folder / name).with_suffix('.png').name}")
     return found
 
 
-def _with_any_ending(path: Path, suffixes: Sequence[str] = IMAGE_SUFFIXES) -> Path | None:
+def _spelled(folder: Path, name: str, source: Path, suffixes: Sequence[str] = IMAGE_SUFFIXES) -> Path | None:
+    """The file `name` in a folder, with any of the endings; letters with marks may be one character there, or two.
+
+    Raises:
+        InputError: as `path_within`.
+    """
+    spellings = dict.fromkeys((name, unicodedata.normalize("NFC", name), unicodedata.normalize("NFD", name)))
+    paths = [path_within(folder, spelling, source) for spelling in spellings]
+    return next((found for path in paths if (found := _with_any_ending(path, suffixes))), None)
+
+
+def _with_any_ending(path: Path, suffixes: Sequence[str]) -> Path | None:
     """The file at a path, or one with one of the endings, small or large, in place of its own or added to it."""
     endings = [ending for suffix in suffixes for ending in (suffix, suffix.upper())]
     candidates = [path, *(path.with_suffix(ending) for ending in endings), *(Path(f"{path}{s}") for s in endings)]

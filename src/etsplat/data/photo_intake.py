@@ -11,7 +11,7 @@ from typing import Literal
 from etsplat.core.errors import InputError
 from etsplat.io.images import IMAGE_SUFFIXES, load_rgb
 from etsplat.io.paths import kind_of, path_remedy
-from etsplat.io.photos import PHOTO_SUFFIXES, PhotoFile, inspect_photo, picture_remedy, write_upright
+from etsplat.io.photos import PHOTO_SUFFIXES, UNREAD_SUFFIXES, PhotoFile, inspect_photo, picture_remedy, write_upright
 
 CameraSharing = Literal["auto", "folder", "photo"]
 """Which photos have one camera: those that say the same of camera and focal length, or else are of one subfolder; those
@@ -48,8 +48,10 @@ def list_photos(folder: Path) -> list[Photo]:
     paths = sorted(path for path in folder.rglob("*") if kind_of(path) in PHOTO_SUFFIXES and path.is_file())
     shown = [path for path in paths if not any(part.startswith(".") for part in path.relative_to(folder).parts)]
     if len(shown) < LEAST_COUNT:
+        unread = sum(kind_of(path) in UNREAD_SUFFIXES for path in folder.rglob("*"))
+        others = f", and {unread} pictures of kinds that are not read: convert them to JPEG or PNG" if unread else ""
         raise InputError(
-            f"photos {folder}: {len(shown)} JPEG, PNG or HEIC files; at least 3 are needed, better 20 or more"
+            f"photos {folder}: {len(shown)} JPEG, PNG or HEIC files{others}; at least 3 are needed, better 20 or more"
         )
     photos: dict[str, Photo] = {}
     for path in shown:

@@ -1,6 +1,6 @@
 """What readers of other programs' files share: entries with numbers, poses, lenses, and where the images lie now."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -223,10 +223,23 @@ def head_of(path: Path, size: int = 4096) -> str:
 
 
 def placed_image(folder: Path, said: str, source: Path, wanted: Wanted) -> tuple[str, Path]:
-    """Where an image lies that a file names as it was called on another computer.
+    """Where an image lies that a file names: in the folder or its `images`, by `placed_file`; without its ending too.
 
-    The end of the path, as much of it as there is, in the folder or in its `images`; without its ending too. With
-    `wanted.images` in that folder alone.
+    With `wanted.images` in that folder alone.
+
+    Raises:
+        InputError: it is no name.
+    """
+    places = [folder / "images", folder] if wanted.images is None else [folder / wanted.images]
+    return placed_file(places, said, source, find_image)
+
+
+def placed_file(
+    places: Sequence[Path], said: str, source: Path, find: Callable[[Path, str, Path], Path] = path_within
+) -> tuple[str, Path]:
+    """Where a file lies that another names as it was called on another computer.
+
+    The end of the path, as much of it as there is, in one of the places; the first of these comes first.
 
     Returns:
         The name, from the first folder on that is here too, and the file; one that is not there if none is.
@@ -234,17 +247,15 @@ def placed_image(folder: Path, said: str, source: Path, wanted: Wanted) -> tuple
     Raises:
         InputError: it is no name.
     """
-    parts = [
-        part for part in PurePosixPath(said.replace("\\", "/")).parts if part not in ("/", "..") and part[1:] != ":"
-    ]
+    whole = PurePosixPath(said.replace("\\", "/")).parts
+    parts = [part for part in whole if part not in ("/", "..") and part[1:] != ":"]
     ends = ["/".join(parts[start:]) for start in range(len(parts))] or [said]
-    places = [folder / "images", folder] if wanted.images is None else [folder / wanted.images]
     for name in ends:
         for place in places:
-            path = find_image(place, name, source)
+            path = find(place, name, source)
             if path.is_file():
                 return name, path
-    return ends[-1], path_within(places[0], ends[-1], source)
+    return ends[0], places[0] / (ends[0] if len(parts) == len(whole) else ends[-1])
 
 
 def name_below(image: Path, folder: Path) -> str:

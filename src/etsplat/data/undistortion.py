@@ -12,8 +12,9 @@ from typing import Any
 from etsplat.core.errors import InputError
 from etsplat.data.colmap_process import Progress, import_pycolmap, run_apart, undistort_images
 from etsplat.data.formats.colmap import find_model
-from etsplat.data.frames import Frame, Points, Wanted, check_copy, check_frames, find_image, scaled_intrinsics
+from etsplat.data.frames import Frame, Points, Wanted, check_copy, check_frames, scaled_intrinsics
 from etsplat.data.load import format_of
+from etsplat.data.scene_files import placed_image
 from etsplat.io.atomic import write_error
 from etsplat.io.georeference import GEOREFERENCE_FILE
 from etsplat.io.images import image_size, load_mask, load_pixels, save_image, size_for
@@ -54,8 +55,7 @@ def undistort_scene(scene: Path | str, out: Path | str, *, max_size: int = 1600)
     check_size(max_size)
     check_output(out)
     if colmap is not None:
-        photos = scene / "images"
-        model, masks = _read_model(pycolmap, scene, colmap)
+        model, photos, masks = _read_model(pycolmap, scene, colmap)
     else:
         listing = format_of(scene).list_frames(scene, Wanted())
         frames = sorted(listing.frames, key=lambda frame: frame.name)
@@ -193,22 +193,29 @@ def _placed(model: Any) -> list[str]:
     return sorted(image.name for image in model.images.values() if image.has_pose)
 
 
-def _read_model(pycolmap: Any, scene: Path, folder: Path) -> tuple[Any, dict[str, Path]]:
-    """A COLMAP scene's model for the images that are there, which may be copies; and masks by their names."""
+def _read_model(pycolmap: Any, scene: Path, folder: Path) -> tuple[Any, Path, dict[str, Path]]:
+    """A COLMAP scene's model for the images that are there, which may be copies.
+
+    And the folder that its images are named in now, and masks by these names.
+    """
     try:
         model = pycolmap.Reconstruction(folder)
     except (ValueError, RuntimeError, OSError, LookupError) as error:  # what its C++ throws
         raise InputError(f"scene {folder}: cannot be read as a model ({str(error).splitlines()[0]})") from error
-    files = {name: find_image(scene / "images", name, folder) for name in _placed(model)}
-    missing = [name for name, file in files.items() if not file.is_file()]
+    found = {name: placed_image(scene, name, folder, Wanted()) for name in _placed(model)}
+    files = {name: path for name, (_, path) in found.items()}
+    missing = [name for name, path in files.items() if not path.is_file()]
     if missing:
         raise InputError(f"scene {scene}: {len(missing)} images are missing (first: {missing[0]}); copy them there")
-    found = ((file, Wanted().mask_of(scene, name, folder)) for name, file in files.items())
-    masks = {file.relative_to(scene / "images").as_posix(): mask for file, mask in found if mask is not None}
-    return _of_files(pycolmap, scene, model, files), masks
+    if len(set(files.values())) < len(files):
+        raise InputError(f"scene {scene}: two images of the model are one file here; keep the folders they were in")
+    photos = scene / "images" if all(path.is_relative_to(scene / "images") for path in files.values()) else scene
+    named = ((path, Wanted().mask_of(scene, name, folder)) for name, path in found.values())
+    masks = {path.relative_to(photos).as_posix(): mask for path, mask in named if mask is not None}
+    return _of_files(pycolmap, scene, photos, model, files), photos, masks
 
 
-def _of_files(pycolmap: Any, scene: Path, model: Any, files: dict[str, Path]) -> Any:
+def _of_files(pycolmap: Any, scene: Path, photos: Path, model: Any, files: dict[str, Path]) -> Any:
     """The model with images named as their files; if some have another size than their camera, made anew with it."""
     images = [image for image in model.images.values() if image.name in files]
     sizes, fit = {}, True
@@ -218,7 +225,7 @@ def _of_files(pycolmap: Any, scene: Path, model: Any, files: dict[str, Path]) ->
         sizes[image.image_id] = size = size_for(file, whole)
         check_copy(scene, image.name, size, whole)
         fit = fit and size == whole
-        image.name = file.relative_to(scene / "images").as_posix()
+        image.name = file.relative_to(photos).as_posix()
     if fit:
         return model
     resized = pycolmap.Reconstruction()

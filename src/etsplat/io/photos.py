@@ -15,7 +15,8 @@ HEIC_SUFFIXES = (".heic", ".heif")
 PHOTO_SUFFIXES = (*IMAGE_SUFFIXES, *HEIC_SUFFIXES)
 VIDEO_SUFFIXES = (".avi", ".m4v", ".mkv", ".mov", ".mp4", ".webm")
 ARCHIVE_SUFFIXES = (".7z", ".gz", ".r3d", ".rar", ".tar", ".tgz", ".zip")
-"""File name endings, lower case."""
+UNREAD_SUFFIXES = (".webp", ".tif", ".tiff", ".avif", ".jxl", ".bmp", ".gif", ".dng", ".cr2", ".cr3", ".nef", ".arw")
+"""File name endings, lower case: of photos, of videos, of archives, and of pictures that are not read."""
 
 _QUALITY = 95
 

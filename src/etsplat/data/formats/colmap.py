@@ -12,8 +12,8 @@ from torch import Tensor
 
 from etsplat.core.errors import InputError
 from etsplat.data.colmap_model import PARAMETERS, ColmapImage, read_cameras, read_images, read_points
-from etsplat.data.frames import Frame, Lens, Listing, Wanted, find_image, pinhole
-from etsplat.data.scene_files import quaternion_rotation
+from etsplat.data.frames import Frame, Lens, Listing, Wanted, pinhole
+from etsplat.data.scene_files import placed_image, quaternion_rotation
 
 MARK = "sparse/"
 RANK = 2
@@ -28,9 +28,9 @@ def list_frames(folder: Path, wanted: Wanted) -> Listing:
     """The registered images of a COLMAP scene, and the model's points; every 8th image by name is test.
 
     Args:
-        folder: holds `images/` and `sparse/0/` (or `sparse/`), binary or text; binary is preferred. Its `masks/`, if it
-            is there, has a mask for every image; images with an alpha channel need none. Its `depths/` or `depth/` may
-            have depth maps.
+        folder: holds the images, most often in `images/`, and `sparse/0/` (or `sparse/`), binary or text; binary is
+            preferred. Its `masks/`, if it is there, has a mask for every image; images with an alpha channel need none.
+            Its `depths/` or `depth/` may have depth maps.
         wanted: other images and masks. `images_4` and the like may hold smaller copies, also with other endings.
 
     Raises:
@@ -55,16 +55,17 @@ def list_frames(folder: Path, wanted: Wanted) -> Listing:
         one_focal_length = "SIMPLE" in camera.model or "RADIAL" in camera.model
         fx, fy, cx, cy, *distortion = (camera.params[0], *camera.params) if one_focal_length else camera.params
         lens = Lens(camera.model, tuple(distortion), f"a {camera.model} camera with lens distortion")
+        name, photo = placed_image(folder, image.name, model, wanted)
         frames.append(
             Frame(
-                image.name,
-                find_image(folder / (wanted.images or "images"), image.name, model),
-                wanted.mask_of(folder, image.name, model),
+                name,
+                photo,
+                wanted.mask_of(folder, name, model),
                 _viewmat(image),
                 pinhole(fx, fy, cx, cy),
                 (camera.width, camera.height),
                 lens if any(distortion) or "FISHEYE" in camera.model else None,
-                wanted.depth_of(folder, image.name, model),
+                wanted.depth_of(folder, name, model),
                 wanted.depth_unit,
             )
         )

@@ -14,8 +14,16 @@ from torch import Tensor
 
 from etsplat.core.errors import InputError
 from etsplat.data.frames import LARGEST, Frame, Lens, Listing, Points, Wanted, find_image, pinhole
-from etsplat.data.scene_files import OPENGL, Entry, brown_lens, name_below, read_object, size_of
-from etsplat.io.paths import path_within
+from etsplat.data.scene_files import (
+    OPENGL,
+    Entry,
+    brown_lens,
+    name_below,
+    placed_file,
+    placed_image,
+    read_object,
+    size_of,
+)
 from etsplat.io.ply_tables import load_points
 
 MARK = "transforms.json"
@@ -69,7 +77,9 @@ def _named_split(path: Path, document: dict[str, Any], frames: list[Frame]) -> t
     for key in ("train_filenames", "test_filenames"):
         if not isinstance(document[key], list) or not all(isinstance(name, str) for name in document[key]):
             raise InputError(f"scene {path}: {key} is not a list of file names; correct or remove it")
-    train_names, test_names = ({_plain(n) for n in document[key]} for key in ("train_filenames", "test_filenames"))
+    train_names, test_names = (
+        {_image(path, name)[0] for name in document[key]} for key in ("train_filenames", "test_filenames")
+    )
     train = [index for index, frame in enumerate(frames) if frame.name in train_names]
     test = [index for index, frame in enumerate(frames) if frame.name in test_names - train_names]
     if not train:
@@ -84,13 +94,13 @@ def _points(path: Path, document: dict[str, Any]) -> Points | None:
         return None
     if not isinstance(name, str):
         raise InputError(f"scene {path}: ply_file_path = {name!r:.40} is not a file name; correct or remove it")
-    points = load_points(path_within(path.parent, _plain(name), path))
+    points = load_points(placed_file([path.parent], name, path)[1])
     return points if len(points[0]) else None
 
 
-def _plain(name: str) -> str:
-    """A path as frames are named: forward slashes, nothing before the first folder."""
-    return name.replace("\\", "/").removeprefix("./")
+def _image(path: Path, said: str) -> tuple[str, Path]:
+    """Name and file of an image; names lead from the folder itself, or from its `images`."""
+    return placed_file([path.parent, path.parent / "images"], said, path, find_image)
 
 
 def _frames(path: Path, document: dict[str, Any], wanted: Wanted) -> list[Frame]:
@@ -103,13 +113,12 @@ def _frames(path: Path, document: dict[str, Any], wanted: Wanted) -> list[Frame]
 def _frame(path: Path, document: dict[str, Any], own: Any, wanted: Wanted) -> Frame:
     if not isinstance(own, dict) or not isinstance(own.get("file_path"), str):
         raise InputError(f"scene {path}: a frame without `file_path`; export the poses again")
-    entry = Entry(path, _plain(own["file_path"]), {**document, **own})
-    if wanted.images is None:
-        image = find_image(path.parent, entry.name, path)
-    else:  # it replaces the first folder
-        image = find_image(path.parent / wanted.images, entry.name.split("/", 1)[-1], path)
+    name, image = _image(path, own["file_path"])
+    entry = Entry(path, name, {**document, **own})
+    if wanted.images is not None:
+        image = placed_image(path.parent, own["file_path"], path, wanted)[1]
     if wanted.masks is None and isinstance(own.get("mask_path"), str):
-        mask = path_within(path.parent, _plain(own["mask_path"]), path)
+        mask = placed_file([path.parent], own["mask_path"], path)[1]
     else:
         mask = wanted.mask_of(path.parent, name_below(image, path.parent), path)
     size = _size(entry, image)
@@ -126,7 +135,7 @@ def _depth(entry: Entry, image: Path, wanted: Wanted) -> tuple[Path | None, floa
             raise entry.wrong(f"has depth_unit_scale_factor = {unit:g}; write a positive number")
     named = entry.said.get("depth_file_path")
     if wanted.depths is True and isinstance(named, str):
-        path = path_within(entry.path.parent, _plain(named), entry.path)
+        path = placed_file([entry.path.parent], named, entry.path)[1]
         if not path.is_file():
             raise entry.wrong(f"has the depth map {path}, which is not there; copy it there or remove depth_file_path")
         return path, unit
