@@ -2,6 +2,7 @@
 
 import struct
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -14,10 +15,13 @@ Row = TypeVar("Row")
 
 _MODELS = (
     *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV"),
-    *("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE"),
+    *("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE"),
+    *("SIMPLE_DIVISION", "DIVISION", "SIMPLE_FISHEYE", "FISHEYE", "EUCM", "EQUIRECTANGULAR"),
 )
 PARAMETERS = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8, "OPENCV_FISHEYE": 8}
 PARAMETERS |= {"FULL_OPENCV": 12, "FOV": 5, "SIMPLE_RADIAL_FISHEYE": 4, "RADIAL_FISHEYE": 5, "THIN_PRISM_FISHEYE": 12}
+PARAMETERS |= {"RAD_TAN_THIN_PRISM_FISHEYE": 16, "SIMPLE_DIVISION": 4, "DIVISION": 5, "SIMPLE_FISHEYE": 3}
+PARAMETERS |= {"FISHEYE": 4, "EUCM": 6, "EQUIRECTANGULAR": 2}
 
 
 @dataclass(frozen=True)
@@ -50,12 +54,14 @@ def read_cameras(model: Path) -> dict[int, ColmapCamera]:
     def binary(reader: _Reader) -> tuple[int, ColmapCamera]:
         identity, kind, width, height = reader.numbers("iiQQ")
         if not 0 <= kind < len(_MODELS):
-            raise InputError(f"scene {reader.path}: unknown camera model {kind}; run `colmap image_undistorter` first")
+            raise _unknown(reader.path, kind)
         name = _MODELS[kind]
         return identity, ColmapCamera(name, width, height, reader.numbers(f"{PARAMETERS[name]}d"))
 
     def text(line: str) -> tuple[int, ColmapCamera]:
         words = _words(line, 5)
+        if words[1] not in PARAMETERS:
+            raise _unknown(model / "cameras.txt", words[1])
         params = tuple(float(word) for word in words[4:])
         return int(words[0]), ColmapCamera(words[1], int(words[2]), int(words[3]), params)
 
@@ -80,8 +86,15 @@ def read_images(model: Path) -> list[ColmapImage]:
         w, x, y, z, tx, ty, tz = (float(word) for word in words[1:8])
         return ColmapImage(words[9], int(words[8]), (w, x, y, z), (tx, ty, tz))
 
-    # Every second line of text lists the image's key points, and may be empty.
-    return _rows(model / "images", binary, text, every=2)
+    return _rows(model / "images", binary, text, _image_lines)
+
+
+def count_images(model: Path) -> int:
+    """Registered images of a sparse model; 0 where that cannot be read."""
+    with suppress(InputError, OSError):
+        path = model / "images.bin"
+        return _Reader(path).numbers("Q")[0] if path.is_file() else len(read_images(model))
+    return 0
 
 
 def read_points(model: Path) -> tuple[np.ndarray, np.ndarray] | None:
@@ -125,17 +138,54 @@ class _Reader:
         return self._data[self._at - size : self._at]
 
 
-def _rows(path: Path, binary: Callable[[_Reader], Row], text: Callable[[str], Row], every: int = 1) -> list[Row]:
-    """All records of `path`.bin, or else what every so manieth line of `path`.txt says, empty ones included."""
+def _filled(lines: list[str]) -> list[str]:
+    return [line for line in lines if line.strip()]
+
+
+def _image_lines(lines: list[str]) -> list[str]:
+    """Those of images: each is followed by one of key points, which may be empty, or left out by an editor."""
+    found, key_points = [], False
+    for line in lines:
+        if key_points and not _is_image(line):
+            key_points = False
+        elif line.strip():
+            found.append(line)
+            key_points = True
+    return found
+
+
+def _is_image(line: str) -> bool:
+    """Rather than key points, which are three numbers each."""
+    words = line.split(maxsplit=10)
+    if len(words) < 10:
+        return False
+    try:
+        float(line.rsplit(maxsplit=1)[-1])
+    except ValueError:
+        return True
+    return len(words) == 10
+
+
+def _unknown(path: Path, model: object) -> InputError:
+    return InputError(f"scene {path}: unknown camera model {model}; run `colmap image_undistorter` first")
+
+
+def _rows(
+    path: Path,
+    binary: Callable[[_Reader], Row],
+    text: Callable[[str], Row],
+    those: Callable[[list[str]], list[str]] = _filled,
+) -> list[Row]:
+    """All records of `path`.bin, or else what `those` lines of `path`.txt say that are no comments."""
     if path.with_suffix(".bin").is_file():
         reader = _Reader(path.with_suffix(".bin"))
         return [binary(reader) for _ in range(reader.numbers("Q")[0])]
     path = path.with_suffix(".txt")
     if not path.is_file():
         raise InputError(f"scene {path}: no such file; export the model again")
-    lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+    lines = path.read_text(encoding="utf-8-sig", errors="replace").splitlines()
     rows = []
-    for line in [line for line in lines if not line.startswith("#") and (every > 1 or line.strip())][::every]:
+    for line in those([line for line in lines if not line.startswith("#")]):
         try:
             rows.append(text(line))
         except ValueError as error:

@@ -10,7 +10,7 @@ from etsplat.data.hull import bounding_sphere
 from etsplat.data.load import load_dataset
 from etsplat.data.photograph import photograph
 from etsplat.io.images import save_image
-from helpers.captures import quaternion
+from helpers.captures import quaternion, write_colmap
 
 NAMES = [f"photo {k:02d}.png" for k in range(10)]
 
@@ -197,3 +197,85 @@ def test_the_shared_lego_has_the_same_cameras_in_both_layouts(shared_data):
     index = blender.names.index("train_r_7")
     other = colmap.names.index("train_007")
     torch.testing.assert_close(colmap.viewmats[other], blender.viewmats[index], atol=1e-4, rtol=0)
+
+
+def test_of_several_models_the_one_with_the_most_images_is_read_and_noted(tmp_path, truth):
+    """COLMAP's mapper numbers them as it makes them. Those that cannot be read count for nothing."""
+    write_scene(tmp_path, truth, True)
+    whole, sparse = load_colmap(tmp_path), tmp_path / "sparse"
+    (sparse / "0").rename(sparse / "1")
+    alone = load_colmap(tmp_path)
+    assert (alone.names, alone.notes) == (whole.names, ())
+    write_colmap(tmp_path / "other", [(80, 60)] * 3)
+    (tmp_path / "other" / "sparse" / "0").rename(sparse / "0")
+    (sparse / "10").mkdir()
+    (sparse / "10" / "cameras.bin").write_bytes(b"")
+    found = load_colmap(tmp_path)
+    assert found.names == whole.names
+    assert torch.equal(found.viewmats, whole.viewmats)
+    assert found.notes == ("3 models in sparse/: 1, which has the most images, is read, and no other",)
+
+
+MODELS = {
+    "RAD_TAN_THIN_PRISM_FISHEYE": (11, 12),
+    "SIMPLE_DIVISION": (12, 1),
+    "DIVISION": (13, 1),
+    "SIMPLE_FISHEYE": (14, 0),
+    "FISHEYE": (15, 0),
+    "EUCM": (16, 2),
+}
+"""Numbers of COLMAP's newer camera models, and of their parameters beside focal lengths and principal point."""
+
+
+@pytest.mark.parametrize("binary", [True, False], ids=["bin", "txt"])
+@pytest.mark.parametrize("model", MODELS)
+def test_newer_camera_models_are_named_with_the_remedy(tmp_path, truth, model, binary):
+    write_scene(tmp_path, truth, True)
+    number, count = MODELS[model]
+    params = [80.0] * (1 if "SIMPLE" in model else 2) + [40.0, 30.0] + [0.1] * count
+    sparse = tmp_path / "sparse" / "0"
+    (sparse / "cameras.bin").write_bytes(struct.pack(f"<QiiQQ{len(params)}d", 1, 3, number, 80, 60, *params))
+    if not binary:
+        (sparse / "cameras.bin").unlink()
+        (sparse / "cameras.txt").write_text(f"3 {model} 80 60 {' '.join(map(str, params))}\n")
+    with pytest.raises(InputError, match=rf" a {model} camera with lens distortion; run `etsplat data undistort"):
+        load_colmap(tmp_path)
+
+
+def test_cameras_all_around_and_unknown_ones_say_what_to_do(tmp_path, truth):
+    write_scene(tmp_path, truth, True)
+    path = tmp_path / "sparse" / "0" / "cameras.bin"
+    path.write_bytes(struct.pack("<QiiQQ2d", 1, 3, 17, 80, 60, 80.0, 60.0))
+    with pytest.raises(InputError, match="has an EQUIRECTANGULAR camera, which is not read; make perspective pictures"):
+        load_colmap(tmp_path)
+    path.write_bytes(struct.pack("<QiiQQ2d", 1, 3, 18, 80, 60, 80.0, 60.0))
+    with pytest.raises(InputError, match="unknown camera model 18; run `colmap image_undistorter`"):
+        load_colmap(tmp_path)
+
+
+EDITS = {
+    "byte order mark": lambda text: "\ufeff" + text,
+    "end": lambda text: text + "\n\n",
+    "head": lambda text: text.replace("# images\n", "# images\n\n"),
+    "stripped": lambda text: "".join(f"{line}\n" for line in text.splitlines() if line),
+    "no key points": lambda text: "".join(f"{line}\n" for line in text.splitlines() if "photo" in line),
+    "numbers as names": lambda text: "".join(
+        f"{line.replace('photo ', '').replace('.png', '')}\n" for line in text.splitlines() if "photo" in line
+    ),
+}
+
+
+@pytest.mark.parametrize("edit", EDITS)
+def test_texts_that_were_edited_have_the_same_images(tmp_path, truth, edit):
+    """Empty lines of key points may be left out, others added."""
+    write_scene(tmp_path, truth, False)
+    whole = load_colmap(tmp_path)
+    if edit == "numbers as names":
+        for name in NAMES:
+            (tmp_path / "images" / name).rename(tmp_path / "images" / name.removeprefix("photo "))
+    for name in ("cameras.txt", "images.txt") if edit == "byte order mark" else ("images.txt",):
+        path = tmp_path / "sparse" / "0" / name
+        path.write_text(EDITS[edit](path.read_text()), encoding="utf-8")
+    found = load_colmap(tmp_path)
+    assert [name[-2:] for name in found.names] == [name[-2:] for name in whole.names]
+    assert torch.equal(found.viewmats, whole.viewmats)

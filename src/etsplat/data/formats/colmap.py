@@ -11,9 +11,19 @@ from jaxtyping import Float
 from torch import Tensor
 
 from etsplat.core.errors import InputError
-from etsplat.data.colmap_model import PARAMETERS, ColmapImage, read_cameras, read_images, read_points
+from etsplat.data.colmap_model import (
+    PARAMETERS,
+    ColmapCamera,
+    ColmapImage,
+    count_images,
+    read_cameras,
+    read_images,
+    read_points,
+)
 from etsplat.data.frames import Frame, Lens, Listing, Wanted, pinhole
-from etsplat.data.scene_files import placed_image, quaternion_rotation
+from etsplat.data.scene_files import placed_image, quaternion_rotation, unplaced_note
+from etsplat.io.images import IMAGE_SUFFIXES
+from etsplat.io.paths import kind_of
 
 MARK = "sparse/"
 RANK = 2
@@ -45,41 +55,73 @@ def list_frames(folder: Path, wanted: Wanted) -> Listing:
     registered = sorted(read_images(model), key=lambda image: image.name)
     if not registered:
         raise InputError(f"scene {folder}: the sparse model has no registered image; run COLMAP's mapper again")
-    frames = []
-    for image in registered:
-        camera = cameras.get(image.camera)
-        if camera is None:
-            raise InputError(f"scene {model}: {image.name} uses camera {image.camera}, which is missing; export again")
-        if len(camera.params) != PARAMETERS.get(camera.model):
-            raise InputError(f"scene {model}: the camera of {image.name} is malformed; export the model again")
-        one_focal_length = "SIMPLE" in camera.model or "RADIAL" in camera.model
-        fx, fy, cx, cy, *distortion = (camera.params[0], *camera.params) if one_focal_length else camera.params
-        lens = Lens(camera.model, tuple(distortion), f"a {camera.model} camera with lens distortion")
-        name, photo = placed_image(folder, image.name, model, wanted)
-        frames.append(
-            Frame(
-                name,
-                photo,
-                wanted.mask_of(folder, name, model),
-                _viewmat(image),
-                pinhole(fx, fy, cx, cy),
-                (camera.width, camera.height),
-                lens if any(distortion) or "FISHEYE" in camera.model else None,
-                wanted.depth_of(folder, name, model),
-                wanted.depth_unit,
-            )
-        )
+    frames = [_frame(folder, model, image, cameras.get(image.camera), wanted) for image in registered]
+    notes = _unplaced(frames)
+    if (count := len(_models(folder))) > 1:
+        notes += (f"{count} models in sparse/: {model.name}, which has the most images, is read, and no other",)
     found = read_points(model)
     if found is None or not len(found[0]):
-        return Listing(frames)
+        return Listing(frames, notes=notes)
     points, colors = torch.from_numpy(found[0]), torch.from_numpy(found[1].astype(np.float32) / 255)
-    return Listing(frames, points=(points, colors))
+    return Listing(frames, points=(points, colors), notes=notes)
+
+
+def _frame(folder: Path, model: Path, image: ColmapImage, camera: ColmapCamera | None, wanted: Wanted) -> Frame:
+    if camera is None:
+        raise InputError(f"scene {model}: {image.name} uses camera {image.camera}, which is missing; export again")
+    if len(camera.params) != PARAMETERS[camera.model]:
+        raise InputError(f"scene {model}: the camera of {image.name} is malformed; export the model again")
+    if camera.model == "EQUIRECTANGULAR":
+        raise InputError(
+            f"scene {model}: {image.name} has an EQUIRECTANGULAR camera, which is not read; make perspective pictures"
+            " and find their cameras"
+        )
+    one_focal_length = "SIMPLE" in camera.model or "RADIAL" in camera.model
+    fx, fy, cx, cy, *distortion = (camera.params[0], *camera.params) if one_focal_length else camera.params
+    lens = Lens(camera.model, tuple(distortion), f"a {camera.model} camera with lens distortion")
+    name, photo = placed_image(folder, image.name, model, wanted)
+    return Frame(
+        name,
+        photo,
+        wanted.mask_of(folder, name, model),
+        _viewmat(image),
+        pinhole(fx, fy, cx, cy),
+        (camera.width, camera.height),
+        lens if any(distortion) or "FISHEYE" in camera.model else None,
+        wanted.depth_of(folder, name, model),
+        wanted.depth_unit,
+    )
 
 
 def find_model(folder: Path) -> Path | None:
-    """The sparse model of a scene folder: `sparse/0` or `sparse`, or None."""
-    folders = [folder / "sparse" / "0", folder / "sparse"]
-    return next((path for path in folders if any((path / f"cameras.{s}").is_file() for s in ("bin", "txt"))), None)
+    """The sparse model of a scene folder: `sparse/0`, or the like that has the most images; or `sparse`."""
+    models = _models(folder)
+    return max(models, key=count_images) if len(models) > 1 else next(iter(models), None)
+
+
+def _models(folder: Path) -> list[Path]:
+    """The mapper makes several where photos do not hang together, and numbers them."""
+    numbered = sorted(
+        (path for path in (folder / "sparse").glob("*") if path.name.isdecimal()), key=lambda path: int(path.name)
+    )
+    found = [path for path in (*numbered, folder / "sparse") if _has_cameras(path)]
+    return [path for path in found if path != folder / "sparse"] or found
+
+
+def _has_cameras(folder: Path) -> bool:
+    return any((folder / f"cameras.{suffix}").is_file() for suffix in ("bin", "txt"))
+
+
+def _unplaced(frames: list[Frame]) -> tuple[str, ...]:
+    """A note on photos beside the placed ones that the model does not have."""
+    placed = {frame.image.with_suffix("") for frame in frames}
+    beside = {
+        path.with_suffix("")
+        for folder in {stem.parent for stem in placed if stem.parent.is_dir()}
+        for path in folder.iterdir()
+        if kind_of(path) in IMAGE_SUFFIXES and not path.name.startswith(".")
+    }
+    return unplaced_note(len(beside - placed), len(beside | placed))
 
 
 def _viewmat(image: ColmapImage) -> Float[Tensor, "4 4"]:
