@@ -305,7 +305,7 @@ def test_transparency_that_undistortion_would_lose_is_refused(tmp_path):
 
 def test_lenses_that_programs_disagree_about_are_refused(tmp_path):
     pytest.importorskip("pycolmap")
-    unknown = [{"k4": 0.1}, {"is_fisheye": True, "p1": 0.1}, {"camera_model": "EQUIRECTANGULAR"}]
+    unknown = [{"k4": 0.1}, {"is_fisheye": True, "p1": 0.1}, {"camera_model": "RADIAL", "k5": 0.1}]
     for number, settings in enumerate(unknown):
         write_transforms(tmp_path / str(number), 3, **settings)
         with pytest.raises(InputError, match="coefficients that are not known here"):

@@ -77,6 +77,45 @@ def test_split_is_every_eighth_by_name_or_as_the_file_says(scene):
     rewrite(scene, lambda d: d.update(train_filenames=names[2:], test_filenames=names[:2]))
     views = load_transforms(scene)
     assert (views.test, views.train) == ([0, 1], list(range(2, 10)))
+    assert views.notes == ()
+
+
+@pytest.mark.parametrize("tests", [{"test_filenames": []}, {}])
+def test_photos_for_validation_are_for_testing_where_no_others_are(scene, tests):
+    names = [f"./images/{k:03d}" for k in range(10)]
+    rewrite(scene, lambda d: d.update(train_filenames=names[3:], val_filenames=names[:3], **tests))
+    views = load_transforms(scene)
+    assert (views.test, views.train, views.notes) == ([0, 1, 2], list(range(3, 10)), ())
+    rewrite(scene, lambda d: d.update(test_filenames=names[:1]))
+    views = load_transforms(scene)
+    assert (views.test, views.train) == ([0], list(range(3, 10)))
+    assert views.notes == ("2 of 10 photos are named neither for training nor for testing and are left out",)
+
+
+@pytest.mark.parametrize("said", [{"w": 80}, {"h": 80}])
+def test_one_side_alone_says_what_the_intrinsics_are_for(scene, said):
+    """The photos are 40 pixels wide."""
+    rewrite(scene, lambda d: d.update(fl_x=100.0, cx=41.0, cy=39.0, **said))
+    assert load_transforms(scene).Ks[0].tolist() == [[50, 0, 20.5], [0, 50, 19.5], [0, 0, 1]]
+
+
+def test_intrinsics_without_a_size_are_for_the_photos_that_the_file_names(scene, truth):
+    """Whichever copies of these are used."""
+    for index in range(10):
+        (scene / "images_2").mkdir(exist_ok=True)
+        save_image(scene / "images_2" / f"{index:03d}.png", truth.images[index][::2, ::2])
+    rewrite(scene, lambda d: d.update(fl_x=100.0))
+    assert load_transforms(scene).Ks[0, 0, 0] == 100
+    assert load_dataset(scene, images="images_2").Ks[0, 0, 0] == 50
+    (scene / "images" / "000.png").unlink()
+    with pytest.raises(InputError, match="images/000 has neither w nor h, and the photo that it names is missing"):
+        load_dataset(scene, images="images_2")
+
+
+def test_a_radial_camera_without_distortion_is_a_pinhole(scene):
+    before = load_transforms(scene)
+    rewrite(scene, lambda d: d.update(camera_model="SIMPLE_RADIAL", k1=0.0))
+    assert torch.equal(load_transforms(scene).Ks, before.Ks)
 
 
 def test_masks_come_from_mask_path_or_a_masks_folder(scene, truth):
@@ -127,6 +166,9 @@ def test_the_bounding_sphere_brings_the_object_into_the_unit_sphere(scene, truth
         (lambda d: d.update(w=80, h=40), "its camera is for 80x40"),
         (lambda d: d.update(w=float("nan"), h=40), "has the size nanx40"),
         (lambda d: d.update(w=40, h=float("inf")), "has the size 40xinf"),
+        (lambda d: d.update(w=0), "has the size 0; correct w and h"),
+        (lambda d: d.update(camera_model="EQUIRECTANGULAR"), "has a EQUIRECTANGULAR camera, which is not read; export"),
+        (lambda d: d.update(camera_model="SIMPLE_RADIAL", k1=0.1), r"lens distortion \(k1\).*etsplat data undistort"),
         (lambda d: d.update(w=10**400, h=40), "w = 1000.*not a number"),
         (lambda d: d.update(k1=10**400), "k1 = 1000.*not a number"),
         (lambda d: d.update(fl_x=10**400), "fl_x = 1000.*not a number"),

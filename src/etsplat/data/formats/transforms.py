@@ -23,6 +23,7 @@ from etsplat.data.scene_files import (
     placed_image,
     read_object,
     size_of,
+    unplaced_note,
 )
 from etsplat.io.ply_tables import load_points
 
@@ -30,7 +31,10 @@ MARK = "transforms.json"
 RANK = 1
 
 _DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
-_PERSPECTIVE, _FISHEYE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE"), ("OPENCV_FISHEYE", "FISHEYE")
+_PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL")
+_FISHEYE = ("OPENCV_FISHEYE", "FISHEYE")
+_PIXELS = {"fl_x", "fl_y", "cx", "cy"}
+"""In pixels of an image of `w` x `h`."""
 
 
 def recognises(folder: Path) -> bool:
@@ -44,8 +48,8 @@ def list_frames(folder: Path, wanted: Wanted) -> Listing:
     Masks come from each frame's `mask_path`, or from a folder `masks/` with a file for every image; RGBA images need
     none. Depth maps, where they are wanted, come from each frame's `depth_file_path`, in steps of
     `depth_unit_scale_factor` if that is there, or from a folder `depths/` or `depth/`. With one `transforms.json` its
-    `train_filenames` and `test_filenames` make the split; without them, every 8th image by name is test.
-    `transforms_val.json` is not used. `ply_file_path` names the points.
+    `train_filenames` and `test_filenames` make the split, or its `val_filenames` where nothing is for testing; without
+    them, every 8th image by name is test. `transforms_val.json` is not used. `ply_file_path` names the points.
 
     Args:
         folder: the scene.
@@ -54,11 +58,14 @@ def list_frames(folder: Path, wanted: Wanted) -> Listing:
     Raises:
         InputError: a file is missing, damaged or of another layout.
     """
-    path, split = folder / "transforms.json", None
+    path, split, notes = folder / "transforms.json", None, ()
     if path.is_file():
         document = read_object(path)
         frames = sorted(_frames(path, document, wanted), key=lambda frame: frame.name)
         split = _named_split(path, document, frames)
+        if split is not None:
+            neither = len(frames) - len(split[0]) - len(split[1])
+            notes = unplaced_note(neither, len(frames), "are named neither for training nor for testing")
     else:
         path, test_file = folder / "transforms_train.json", folder / "transforms_test.json"
         document = read_object(path)
@@ -67,19 +74,20 @@ def list_frames(folder: Path, wanted: Wanted) -> Listing:
             count = len(frames)
             frames += _frames(test_file, read_object(test_file), wanted)
             split = list(range(count)), list(range(count, len(frames)))
-    return Listing(frames, split, _points(path, document))
+    return Listing(frames, split, _points(path, document), notes)
 
 
 def _named_split(path: Path, document: dict[str, Any], frames: list[Frame]) -> tuple[list[int], list[int]] | None:
     """As the file says; None where it does not."""
-    if not {"train_filenames", "test_filenames"} <= document.keys():
+    if "train_filenames" not in document or not {"test_filenames", "val_filenames"} & document.keys():
         return None
-    for key in ("train_filenames", "test_filenames"):
-        if not isinstance(document[key], list) or not all(isinstance(name, str) for name in document[key]):
+    names: list[set[str]] = []
+    for key in ("train_filenames", "test_filenames", "val_filenames"):
+        named = document.get(key, [])
+        if not isinstance(named, list) or not all(isinstance(name, str) for name in named):
             raise InputError(f"scene {path}: {key} is not a list of file names; correct or remove it")
-    train_names, test_names = (
-        {_image(path, name)[0] for name in document[key]} for key in ("train_filenames", "test_filenames")
-    )
+        names.append({_image(path, name)[0] for name in named})
+    train_names, test_names = names[0], names[1] or names[2]
     train = [index for index, frame in enumerate(frames) if frame.name in train_names]
     test = [index for index, frame in enumerate(frames) if frame.name in test_names - train_names]
     if not train:
@@ -115,13 +123,14 @@ def _frame(path: Path, document: dict[str, Any], own: Any, wanted: Wanted) -> Fr
         raise InputError(f"scene {path}: a frame without `file_path`; export the poses again")
     name, image = _image(path, own["file_path"])
     entry = Entry(path, name, {**document, **own})
+    whole = image
     if wanted.images is not None:
         image = placed_image(path.parent, own["file_path"], path, wanted)[1]
     if wanted.masks is None and isinstance(own.get("mask_path"), str):
         mask = placed_file([path.parent], own["mask_path"], path)[1]
     else:
         mask = wanted.mask_of(path.parent, name_below(image, path.parent), path)
-    size = _size(entry, image)
+    size = _size(entry, image, whole)
     depth, unit = _depth(entry, image, wanted)
     return Frame(entry.name, image, mask, _viewmat(entry), _intrinsics(entry, size), size, _lens(entry), depth, unit)
 
@@ -147,10 +156,13 @@ def _lens(entry: Entry) -> Lens | None:
     model = entry.said.get("camera_model", "OPENCV")
     values = {key: entry.number(key, 0.0) for key in _DISTORTION}
     k1, k2, k3, k4, k5, k6, p1, p2 = values.values()
-    if entry.said.get("is_fisheye") or model in _FISHEYE:  # the former is instant-ngp's
+    fisheye = entry.said.get("is_fisheye") or model in _FISHEYE  # the former is instant-ngp's
+    if not fisheye and model not in _PERSPECTIVE:
+        raise entry.wrong(f"has a {model!s:.40} camera, which is not read; export perspective or fisheye images")
+    if fisheye:
         if p1 == p2 == k5 == k6 == 0:
             return Lens("OPENCV_FISHEYE", (k1, k2, k3, k4), f"a {model} camera")
-    elif model in _PERSPECTIVE and k4 == k5 == k6 == 0:  # of k4 on, programs disagree what it means
+    elif k4 == k5 == k6 == 0:  # of k4 on, programs disagree what it means
         told = f"lens distortion ({', '.join(key for key, value in values.items() if value != 0)})"
         return brown_lens(told, k1, k2, k3, p1, p2)
     raise entry.wrong(
@@ -159,13 +171,28 @@ def _lens(entry: Entry) -> Lens | None:
     )
 
 
-def _size(entry: Entry, image: Path) -> tuple[int, int]:
-    if "w" in entry.said and "h" in entry.said:
-        width, height = entry.number("w"), entry.number("h")
-        if not (1 <= width < 2**31 and 1 <= height < 2**31):
-            raise entry.wrong(f"has the size {width:g}x{height:g}; correct w and h")
-        return int(width), int(height)
-    return size_of(image)
+def _size(entry: Entry, image: Path, whole: Path) -> tuple[int, int]:
+    """That of the intrinsics: as the file says, one side by the other and the photo's shape, or else the photo's.
+
+    Args:
+        entry: of the frame.
+        image: that is used.
+        whole: that the file names, of which `image` may be a smaller copy.
+    """
+    said = {key: entry.number(key) for key in ("w", "h") if key in entry.said}
+    if not all(1 <= side < 2**31 for side in said.values()):
+        shown = "x".join(f"{side:g}" for side in said.values())
+        raise entry.wrong(f"has the size {shown}; correct w and h")
+    if len(said) == 2:
+        return int(said["w"]), int(said["h"])
+    if not said and image != whole and _PIXELS & entry.said.keys():
+        if not whole.is_file():
+            raise entry.wrong("has neither w nor h, and the photo that it names is missing; write w and h there")
+        image = whole
+    width, height = size_of(image)
+    if "w" in said:
+        return int(said["w"]), max(1, round(height * said["w"] / width))
+    return (max(1, round(width * said["h"] / height)), int(said["h"])) if said else (width, height)
 
 
 def _intrinsics(entry: Entry, size: tuple[int, int]) -> Float[Tensor, "3 3"]:
