@@ -11,6 +11,9 @@ from PIL import Image
 from etsplat.core.errors import InputError
 from etsplat.data import formats
 from etsplat.data.load import load_dataset
+from etsplat.data.photo_intake import list_photos
+from etsplat.tasks.reconstruct_config import ReconstructConfig
+from etsplat.tasks.sources import load_source
 from helpers.captures import circle_poses, write_colmap, write_photo, write_transforms
 
 SIZES = [(40, 30), (30, 40), (20, 20)] * 3
@@ -353,3 +356,38 @@ def test_masks_of_half_the_size_are_enlarged_as_transparency_too(tmp_path):
     write_photo(tmp_path / "masks" / "0001.png", 8, 8)
     with pytest.raises(InputError, match=r"0001\.png: is 8x8, its image is 16x12; resize the mask"):
         load_dataset(tmp_path, masks_as="alpha")
+
+
+def test_a_folder_mask_is_one_of_masks_where_there_is_no_other(tmp_path):
+    write_colmap(tmp_path, [(16, 12)] * 3)
+    for index in range(3):
+        write_photo(tmp_path / "mask" / f"{index:04d}.png", 16, 12, seed=10 + index)
+    first = load_dataset(tmp_path).images.mask(1)
+    assert first is not None
+    shutil.copytree(tmp_path / "mask", tmp_path / "masks")
+    write_photo(tmp_path / "mask" / "0001.png", 16, 12, seed=99)
+    again = load_dataset(tmp_path).images.mask(1)
+    assert again is not None
+    assert torch.equal(again, first)
+
+
+def test_a_part_of_a_scene_and_what_it_lies_in_say_which_folder_is_meant(tmp_path, monkeypatch):
+    scene = tmp_path / "scan" / "dense"
+    write_colmap(scene, [(16, 12)] * 3)
+    (scene / "keyframes" / "cameras").mkdir(parents=True)
+    for part in ("sparse", "sparse/0", "images", "keyframes"):
+        with pytest.raises(InputError, match=rf"choose the scene's folder: did you mean {scene}\?"):
+            load_dataset(scene / part)
+    with pytest.raises(InputError, match=rf"did you mean {scene}\?"):
+        load_dataset(tmp_path / "scan")
+    monkeypatch.chdir(scene / "images")
+    with pytest.raises(InputError, match=rf"did you mean {scene}\?"):
+        load_dataset(".")
+
+
+@pytest.mark.parametrize("name", ["cap.zip", "scan.r3d", "scan.tar.gz"])
+def test_archives_are_to_be_unpacked(tmp_path, name):
+    (tmp_path / name).write_bytes(b"PK")
+    for read in (load_dataset, list_photos, lambda path: load_source(path, ReconstructConfig())):
+        with pytest.raises(InputError, match=f"{name}: is an archive; unpack it and name the folder"):
+            read(tmp_path / name)

@@ -2,7 +2,8 @@
 
 import importlib
 import pkgutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Protocol, cast
@@ -15,7 +16,7 @@ from etsplat.data.frames import LARGEST, Listing, MasksAs, Wanted, posed
 from etsplat.data.georeferencing import near_origin
 from etsplat.data.pictures import LazyPictures
 from etsplat.io.paths import given_path, kind_of, path_remedy
-from etsplat.io.photos import PHOTO_SUFFIXES, picture_remedy
+from etsplat.io.photos import PHOTO_SUFFIXES, UNREAD_SUFFIXES, file_remedy
 from etsplat.io.run_directory import is_run
 
 
@@ -105,7 +106,7 @@ def load_dataset(
     path = given_path("path", path, "the path of a folder")
     if not path.is_dir():
         wrong = "is a file; name the scene's folder" if path.is_file() else f"no such folder; {path_remedy(path)}"
-        raise InputError(f"scene {path}: {picture_remedy(path) or wrong}")
+        raise InputError(f"scene {path}: {file_remedy(path) or wrong}")
     if images is not None and not (path / images).is_dir():
         raise InputError(f"scene {path}: no folder {images} in it; choose another or leave it out")
     folder = depths if isinstance(depths, bool) else Path(depths)
@@ -129,13 +130,19 @@ def format_of(path: Path) -> Format:
         if layout.recognises(path):
             return layout
     marks = ", ".join(layout.MARK for layout in known)
-    raise InputError(f"scene {path}: none of {marks} in it; choose the scene's folder{_offer(path)}")
+    raise InputError(f"scene {path}: none of {marks} in it; choose the scene's folder{_offer(path, known)}")
 
 
-def _offer(path: Path) -> str:
-    """For a run: that it is one. For a folder of photos: how to find the cameras."""
+def _offer(path: Path, known: Sequence[Format]) -> str:
+    """For a run: that it is one. For a part of a scene, or what it lies in: that scene. For photos: how to go on."""
     if is_run(path):
         return " that this run was made from"
-    if any(kind_of(file) in PHOTO_SUFFIXES for file in path.iterdir()):
+    around = path.absolute().parents[:2]
+    with suppress(OSError):  # folders that may not be read
+        places = [*around, *sorted(place for place in path.iterdir() if place.is_dir())]
+        meant = next((place for place in places if any(layout.recognises(place) for layout in known)), None)
+        if meant is not None:
+            return f": did you mean {meant}?"
+    if any(kind_of(file) in (*PHOTO_SUFFIXES, *UNREAD_SUFFIXES) for file in path.iterdir()):
         return f", or find the cameras of these photos: etsplat data sfm {path} --out SCENE"
     return ""

@@ -11,7 +11,7 @@ from typing import Literal
 from etsplat.core.errors import InputError
 from etsplat.io.images import IMAGE_SUFFIXES, load_rgb
 from etsplat.io.paths import kind_of, path_remedy
-from etsplat.io.photos import PHOTO_SUFFIXES, UNREAD_SUFFIXES, PhotoFile, inspect_photo, picture_remedy, write_upright
+from etsplat.io.photos import PHOTO_SUFFIXES, UNREAD_SUFFIXES, PhotoFile, file_remedy, inspect_photo, write_upright
 
 CameraSharing = Literal["auto", "folder", "photo"]
 """Which photos have one camera: those that say the same of camera and focal length, or else are of one subfolder; those
@@ -42,7 +42,7 @@ def list_photos(folder: Path) -> list[Photo]:
         InputError: no such folder; fewer than three photos; one cannot be opened; two would have one name.
     """
     if folder.is_file():
-        raise InputError(f"photos {folder}: {picture_remedy(folder) or 'is a file; name the folder of the photos'}")
+        raise InputError(f"photos {folder}: {file_remedy(folder) or 'is a file; name the folder of the photos'}")
     if not folder.is_dir():
         raise InputError(f"photos {folder}: no such file or folder; {path_remedy(folder)}")
     paths = sorted(path for path in folder.rglob("*") if kind_of(path) in PHOTO_SUFFIXES and path.is_file())

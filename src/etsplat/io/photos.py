@@ -14,7 +14,7 @@ from etsplat.io.paths import kind_of
 HEIC_SUFFIXES = (".heic", ".heif")
 PHOTO_SUFFIXES = (*IMAGE_SUFFIXES, *HEIC_SUFFIXES)
 VIDEO_SUFFIXES = (".avi", ".m4v", ".mkv", ".mov", ".mp4", ".webm")
-ARCHIVE_SUFFIXES = (".7z", ".gz", ".r3d", ".rar", ".tar", ".tgz", ".zip")
+ARCHIVE_SUFFIXES = (".7z", ".bz2", ".gz", ".r3d", ".rar", ".tar", ".tgz", ".xz", ".zip")
 UNREAD_SUFFIXES = (".webp", ".tif", ".tiff", ".avif", ".jxl", ".bmp", ".gif", ".dng", ".cr2", ".cr3", ".nef", ".arw")
 """File name endings, lower case: of photos, of videos, of archives, and of pictures that are not read."""
 
@@ -86,7 +86,7 @@ def write_upright(path: Path | str, target: Path) -> None:
         pixels.save(temporary, kind, quality=_QUALITY, subsampling=0, exif=exif)  # PNG ignores the first two
 
 
-def picture_remedy(path: Path) -> str:
+def file_remedy(path: Path) -> str:
     """The end of the error for a photo, a video or an archive that stands where a capture belongs, or ""."""
     if not path.is_file():
         return ""

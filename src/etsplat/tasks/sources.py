@@ -28,7 +28,7 @@ from etsplat.engines.choice import resolve_device
 from etsplat.io.mesh_files import MeshFile, load_mesh
 from etsplat.io.opaque_files import load_opaque
 from etsplat.io.paths import given_path, path_remedy
-from etsplat.io.photos import picture_remedy
+from etsplat.io.photos import file_remedy
 from etsplat.io.point_clouds import load_cloud
 from etsplat.io.run_directory import RunDirectory, is_run
 from etsplat.model.solid_soup import SolidSoup
@@ -107,7 +107,7 @@ def load_source(
         )
         scene, notes = _agreeing(loaded)
         return scene.renormalized(*bounding_sphere(scene)), [*scene.notes, *notes]
-    if remedy := picture_remedy(path):
+    if remedy := file_remedy(path):
         raise InputError(f"{path}: {remedy}")
     if path.is_file():
         mesh = load_mesh(path)
