@@ -79,6 +79,15 @@ def test_it_is_named_in_any_units_and_among_others(views: Dataset) -> None:
     assert sorted(contradicting(far)) == wrong
 
 
+@pytest.mark.parametrize("change", [without_lower_half, elsewhere, with_a_blob])
+def test_a_test_photo_is_named_too_and_speaks_against_nobody(views: Dataset, change: Callable[[Mask], Mask]) -> None:
+    assert contradicting(spoilt(views, change, [views.test[2]])) == [views.test[2]]
+    wrong = [views.train[7], *views.test[2:4]]
+    found = contradicting(spoilt(views, change, wrong))
+    assert (found[0], sorted(found[1:])) == (wrong[0], wrong[1:])
+    assert sorted(contradicting(spoilt(views, change, views.test))) == views.test
+
+
 def test_a_quarter_is_named_at_most(views: Dataset) -> None:
     some = replace(views, train=views.train[:12])
     assert len(contradicting(spoilt(some, elsewhere, some.train[::3]))) == 3

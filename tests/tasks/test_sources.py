@@ -153,20 +153,46 @@ def test_an_object_in_a_data_set_is_found_by_its_outlines():
     assert load_source(opaque, ReconstructConfig.tiny()) == (opaque, [])
 
 
-def test_photos_whose_masks_contradict_the_others_are_left_out_and_named(tmp_path):
-    """Half of one mask is lost: the hull would lose that half of the object, and so would the sphere about it."""
+def write_spoilt(folder, spoil):
+    """A capture of the demo's object; `spoil` changes the pixels of its photos, and the data set comes back."""
     views = photograph(demo_object(), 64, 64, supersampling=2)
     images = [image.clone() for image in views.images]
-    images[views.train[4]][32:] = 0
+    spoil(images, views)
     spoilt = replace(views, images=StoredPictures(images))
-    write_views(tmp_path, spoilt, views.train, "transforms_train.json")
-    write_views(tmp_path, spoilt, views.test, "transforms_test.json")
+    write_views(folder, spoilt, views.train, "transforms_train.json")
+    write_views(folder, spoilt, views.test, "transforms_test.json")
+    return views
+
+
+def without_lower_half(image):
+    image[32:] = 0
+
+
+def test_photos_whose_masks_contradict_the_others_are_left_out_and_named(tmp_path):
+    """Half of one mask is lost: the hull would lose that half of the object, and so would the sphere about it."""
+    views = write_spoilt(tmp_path, lambda images, views: without_lower_half(images[views.train[4]]))
     scene, notes = load_source(tmp_path, ReconstructConfig.tiny())
     names = [scene.names[index] for index in scene.train]
     wrong = f"images_{views.train[4]:03d}"
     assert wrong not in names
-    assert len(names) == len(views.train) - 1
+    assert (len(names), len(scene.test)) == (len(views.train) - 1, len(views.test))
     assert notes == [f"left out, since its mask contradicts the others: {wrong}"]
+
+
+def test_so_are_test_photos_by_which_a_good_result_would_be_called_poor(tmp_path):
+    views = write_spoilt(tmp_path, lambda images, views: without_lower_half(images[views.test[4]]))
+    scene, notes = load_source(tmp_path, ReconstructConfig.tiny())
+    wrong = f"images_{views.test[4]:03d}"
+    assert wrong not in [scene.names[index] for index in scene.test]
+    assert (len(scene.train), len(scene.test)) == (len(views.train), len(views.test) - 1)
+    assert notes == [f"left out, since its mask contradicts the others: {wrong}"]
+
+
+@pytest.mark.parametrize("kind", ["train", "test"])
+def test_photos_whose_mask_is_empty_are_refused(tmp_path, kind):
+    views = write_spoilt(tmp_path, lambda images, views: images[getattr(views, kind)[1]].zero_())
+    with pytest.raises(InputError, match=rf"view images_{getattr(views, kind)[1]:03d}: its mask is empty"):
+        load_source(tmp_path, ReconstructConfig.tiny())
 
 
 def test_photos_whose_mask_ends_just_before_the_frame_are_cropped_and_named(tmp_path):

@@ -4,6 +4,7 @@ The visual hull (Laurentini 1994) is the set of points that fall inside the silh
 object.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -67,6 +68,7 @@ def bounding_sphere(dataset: Dataset) -> tuple[Float[Tensor, "3"], float]:
         >>> 0.9 < radius < 1.1
         True
     """
+    check_not_empty(dataset, dataset.train)
     names = [dataset.names[index] for index in dataset.train]
     steps = np.array([max(1, dataset.images.sizes[index][0] // _MASK_WIDTH) for index in dataset.train])
     inside = _silhouettes(dataset, names, steps)
@@ -98,6 +100,16 @@ def bounding_sphere(dataset: Dataset) -> tuple[Float[Tensor, "3"], float]:
     return center.float(), radius
 
 
+def check_not_empty(dataset: Dataset, views: Sequence[int]) -> None:
+    """Raises InputError where one of the views has a mask without a pixel of the object."""
+    for index in views:
+        if not silhouette(dataset.images[index]).any():
+            raise InputError(
+                f"view {dataset.names[index]}: its mask is empty, it sees nothing of the object; remove the view, or "
+                "write 255 inside masks that have 1 there"
+            )
+
+
 def _carving(dataset: Dataset, center: Tensor) -> Carving:
     views = [Silhouette(dataset, index) for index in dataset.train]
     return Carving.of(views, center, reach_of(views, center))
@@ -124,12 +136,6 @@ def _carve(views: list[_View], center: np.ndarray, reach: float, outvoted: int) 
 def _silhouettes(dataset: Dataset, names: list[str], steps: np.ndarray) -> list[np.ndarray]:
     """Masks of the training views, each so many times smaller; a pixel is inside if any of those in it was."""
     masks = [silhouette(dataset.images[index]) for index in dataset.train]
-    empty = [name for name, mask in zip(names, masks, strict=True) if not mask.any()]
-    if empty:
-        raise InputError(
-            f"view {empty[0]}: its mask is empty, it sees nothing of the object; remove the view, or write 255 inside "
-            "masks that have 1 there"
-        )
     full = [name for name, mask in zip(names, masks, strict=True) if mask.all()]
     if len(full) == len(names):
         raise InputError(

@@ -1,6 +1,6 @@
 """Silhouettes with their cameras: how deep points are within them, and whether they contradict each other."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -184,11 +184,12 @@ def _best_along(views: Sequence[Silhouette], starts: Tensor, along: Tensor, midd
 
 
 def contradicting(dataset: Dataset) -> list[int]:
-    """Training views whose masks cannot be of the object that the others show, worst first.
+    """Views whose masks cannot be of the object that the others show: training views, worst first, then test views.
 
     Each pixel of the object has a point on its line of sight that is in all silhouettes, if masks and poses are right.
     A view that by itself excludes much of what the others show is wrong, and so is one much of which the others
-    exclude. At most a quarter of the views are named, none where there are fewer than six.
+    exclude. Test views are asked of those training views that are right, and do not speak against these. At most a
+    quarter of the views are named each time, none where fewer than six train.
 
     Args:
         dataset: photos with alpha around an object, in any frame.
@@ -196,17 +197,30 @@ def contradicting(dataset: Dataset) -> list[int]:
     Returns:
         Their indices; none where a mask is empty, which `bounding_sphere` refuses.
     """
-    left, wrong = list(dataset.train), []
-    center = axes_meeting_point(dataset.viewmats[left].float())
-    silhouettes = {index: Silhouette(dataset, index) for index in left} if len(left) >= _FEWEST else {}
-    if center is None or not all(view.inside.any() for view in silhouettes.values()):
+    center = axes_meeting_point(dataset.viewmats[dataset.train].float())
+    if center is None or len(dataset.train) < _FEWEST:
         return []
-    while len(left) >= max(_FEWEST, _KEPT * len(dataset.train) + 1):
-        views = [silhouettes[index] for index in left]
-        guilt = _guilt(views, Evidence.of(views, center.float(), reach_of(views, center.float())))
-        if float(guilt.max()) < 1:
+    silhouettes = {index: Silhouette(dataset, index) for index in (*dataset.train, *dataset.test)}
+    if not all(view.inside.any() for view in silhouettes.values()):
+        return []
+    wrong = _wrong(silhouettes, dataset.train, dataset.train, center.float())
+    right = [index for index in dataset.train if index not in wrong]
+    return wrong + _wrong(silhouettes, [*right, *dataset.test], dataset.test, center.float())
+
+
+def _wrong(
+    silhouettes: Mapping[int, Silhouette], views: Sequence[int], asked: Sequence[int], center: Float[Tensor, "3"]
+) -> list[int]:
+    """Which of those views that are `asked` contradict the other views, worst first."""
+    left, wrong = list(views), []
+    while len(wrong) < len(asked) and len(left) >= max(_FEWEST, _KEPT * len(views) + 1):
+        seen = [silhouettes[index] for index in left]
+        guilt = dict(zip(left, _guilt(seen, Evidence.of(seen, center, reach_of(seen, center))).tolist(), strict=True))
+        worst = max((index for index in asked if index not in wrong), key=guilt.__getitem__)
+        if guilt[worst] < 1:
             break
-        wrong.append(left.pop(int(guilt.argmax())))
+        wrong.append(worst)
+        left.remove(worst)
     return wrong
 
 

@@ -20,7 +20,7 @@ from etsplat.data.demo_object import demo_object
 from etsplat.data.demo_scene import HEIGHT, WIDTH, demo_scene
 from etsplat.data.dense_cloud import FEWEST_POINTS, dense_start
 from etsplat.data.frame_gaps import without_frame_gaps
-from etsplat.data.hull import bounding_sphere
+from etsplat.data.hull import bounding_sphere, check_not_empty
 from etsplat.data.load import load_dataset
 from etsplat.data.photograph import normalize_mesh, photograph
 from etsplat.data.silhouettes import contradicting, looks_inverted
@@ -68,7 +68,7 @@ def load_source(
 ) -> tuple[MeshFile | Dataset, Sequence[str]]:
     """Reads a mesh file or a scene folder, or makes the demo's object; objects are passed through.
 
-    Of a folder, training views are left out whose masks contradict the others', and photos are cropped where their mask
+    Of a folder, views are left out whose masks contradict the others', and photos are cropped where their mask
     ends just before the frame that cuts the object off.
 
     Args:
@@ -131,7 +131,7 @@ def _in_unit_sphere(scene: Dataset) -> tuple[Dataset, list[str]]:
 
 
 def _agreeing(scene: Dataset) -> tuple[Dataset, list[str]]:
-    """Without training views whose masks contradict the others', nor gaps at frames; and notes that name the photos."""
+    """Without views whose masks contradict the others', nor gaps at frames; and notes that name the photos."""
     scene, cropped = without_frame_gaps(scene)
     notes = []
     if cropped:
@@ -139,12 +139,14 @@ def _agreeing(scene: Dataset) -> tuple[Dataset, list[str]]:
         notes.append(f"cropped, since a mask ends along the frame just before it: {names}")
     if looks_inverted(scene):
         notes.append("masks are white along the border of most photos: they are to be white inside the object alone")
+    check_not_empty(scene, scene.test)  # of training views `bounding_sphere` does
     wrong = contradicting(scene)
     if wrong:
         names = ", ".join(scene.names[index] for index in sorted(wrong))
         contradict = "its mask contradicts" if len(wrong) == 1 else "their masks contradict"
         notes.append(f"left out, since {contradict} the others: {names}")
-        scene = replace(scene, train=[index for index in scene.train if index not in wrong])
+        train, test = ([index for index in some if index not in wrong] for some in (scene.train, scene.test))
+        scene = replace(scene, train=train, test=test)
     return scene, notes
 
 
