@@ -11,6 +11,7 @@ import trimesh
 from etsplat.core.errors import InputError
 from etsplat.geometry.icosphere import icosphere
 from etsplat.io import _mesh_readers
+from etsplat.io.georeference import Georeference
 from etsplat.io.mesh_files import load_mesh, save_mesh, save_triangles, weld_vertices
 from etsplat.io.srgb import linear_from_srgb, srgb_from_linear
 
@@ -407,3 +408,16 @@ def test_a_record_does_not_disturb_readers(tmp_path, kind):
     assert torch.equal(load_mesh(tmp_path / f"a.{kind}").vertices, vertices.reshape(-1, 3))
     assert (b'{"by": "Zo\\u00eb\\n"' in (tmp_path / f"a.{kind}").read_bytes()) is (kind in ("obj", "ply"))
     assert len(trimesh.load_mesh(tmp_path / f"a.{kind}", process=False).faces) == 4
+
+
+def test_a_mesh_that_32_bits_cannot_hold_is_refused_with_the_reason(tmp_path, ball):
+    """A ball in coordinates of maps: most of its faces would have zero area."""
+    vertices, faces, _ = ball
+    world = Georeference(offset=(500_000.0, 5_400_000.0, 300.0))
+    save_mesh(tmp_path / "small.ply", 0.1 * vertices, faces, world=world)
+    with pytest.raises(InputError, match=r"too far from the origin for its size: it is 0\.2 across about \(5"):
+        load_mesh(tmp_path / "small.ply")
+    save_mesh(tmp_path / "large.ply", 1e4 * vertices, faces, world=world)
+    assert len(load_mesh(tmp_path / "large.ply").faces) == len(faces)
+    (tmp_path / "stray.obj").write_text(f"{TRIANGLE}v 1e9 0.1 0\nf 1 2 3\n")
+    assert len(load_mesh(tmp_path / "stray.obj").faces) == 1

@@ -73,7 +73,8 @@ def load_mesh(path: Path | str) -> MeshFile:
 
     Raises:
         InputError: the file is missing, empty, cut short, of another kind, has no faces, non-finite vertices, or
-            indices out of range.
+            indices out of range; 32 bits would move its vertices by more than 1/10,000 of its size, as they are so far
+            from the origin.
 
     Example:
         >>> etsplat.save_mesh("sphere.ply", *etsplat.icosphere(1))
@@ -93,6 +94,9 @@ def load_mesh(path: Path | str) -> MeshFile:
     _check(path, raw)
     return _clean(path, raw)
 
+
+_MOVED = 1e-4
+"""Of a mesh's size: by so much at most 32 bits may move a vertex. A photo of a thousand pixels shows ten times that."""
 
 _BRIGHTEST = 2.0
 """Of colours that are clamped: others are not from 0 to 1."""
@@ -320,12 +324,25 @@ def _check(path: Path, raw: RawMesh) -> None:
         )
 
 
+def _check_near(path: Path, vertices: np.ndarray) -> None:
+    """Raise InputError where 32 bits do not hold what 64 do, as coordinates of maps."""
+    size, moved = np.ptp(vertices, axis=0).max(), np.abs(vertices.astype(np.float32) - vertices).max()
+    if size > 0 and moved > _MOVED * size:
+        x, y, z = vertices.mean(axis=0)
+        raise InputError(
+            f"mesh {path}: its coordinates are too far from the origin for its size: it is {size:.3g} across about"
+            f" ({x:.8g}, {y:.8g}, {z:.8g}), where 32 bits move vertices by up to {moved:.2g}; subtract an offset from"
+            " its vertices, so that it is near the origin"
+        )
+
+
 def _clean(path: Path, raw: RawMesh) -> MeshFile:
     """Float32 and int64 tensors; faces without area, repeated faces and loose vertices dropped."""
 
     def colors(values: np.ndarray | None) -> Tensor | None:
         return None if values is None else torch.from_numpy(values.clip(0, 1).astype(np.float32))
 
+    _check_near(path, raw.vertices[np.unique(raw.faces)].astype(np.float64))
     mesh = MeshFile(
         torch.from_numpy(np.ascontiguousarray(raw.vertices, dtype=np.float32)),
         torch.from_numpy(np.ascontiguousarray(raw.faces, dtype=np.int64)),
