@@ -14,6 +14,7 @@ from etsplat.data.agreement import (
     looked_at,
     photos_of,
     pixel_size,
+    unseen_share,
     unseen_vertices,
 )
 from etsplat.data.photograph import photograph
@@ -35,6 +36,15 @@ def test_of_a_ball_all_is_seen_and_of_a_deep_pit_in_it_the_bottom_is_not() -> No
         assert bool(hidden[pit].all()) is hides
         assert bool(hidden[pit].any()) is hides
         assert not hidden[~pit].any()
+
+
+def test_of_a_ball_that_is_seen_from_above_alone_the_lower_part_is_in_no_photo() -> None:
+    vertices, faces = icosphere(4)
+    views = photograph(MeshFile(vertices, faces), 200, 200, supersampling=1, elevations=[60.0])
+    assert unseen_share(looked_at(views, vertices, faces)) == pytest.approx(0.41, abs=0.02)  # below -11 degrees
+    around = photograph(MeshFile(vertices, faces), 200, 200, supersampling=1)
+    assert unseen_share(looked_at(around, vertices, faces)) == 0
+    assert unseen_share(None) == 0
 
 
 def looked_up(plane: Tensor, places: Tensor, mode: str) -> Tensor:

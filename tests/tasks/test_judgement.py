@@ -14,7 +14,7 @@ from etsplat.data.photograph import photograph
 from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.parts import Shape
 from etsplat.io.mesh_files import MeshFile
-from etsplat.tasks.judgement import Expected, Judgement, Start, expect_mesh, expect_photos, judge, spread
+from etsplat.tasks.judgement import Expected, Judgement, Run, Shares, Start, expect_mesh, expect_photos, judge, spread
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 
 BALL, RING = Shape(1, 0), Shape(1, 1)
@@ -55,16 +55,14 @@ def judged(
     begun: Start = "sphere",
     preset: str = "quick",
     untangled: bool = True,
+    photos: int = 40,
+    inverted: bool = False,
     shown: bool = True,
-    contradicted: float = 0.0,
-    cut_off: float = 0.0,
-    closed: float = 0.0,
-    plain: float = 0.0,
+    **shares: float,
 ) -> Judgement:
     wanted = Expected(expected, None if expected.unclear else "input mesh", shown)
-    shares = {"contradicted": contradicted, "cut_off": cut_off, "closed": closed, "plain": plain}
-    run = {"begun": begun, "preset": preset, "untangled": untangled}
-    return judge("test", scores, intersecting, found, wanted, **shares, **run)
+    run = Run(begun, preset, untangled, photos, inverted)
+    return judge("test", scores, intersecting, found, wanted, Shares(**shares), run)
 
 
 def test_a_patch_that_photos_contradict_is_told():
@@ -87,6 +85,33 @@ def test_a_plain_piece_is_told_where_nothing_else_is_wrong():
     assert "plain piece" not in judged(plain=0.139, contradicted=0.028).verdict
 
 
+def test_what_is_in_no_photo_is_told_of_a_good_result():
+    """It stays good: hardly a capture has the side on which its object stands."""
+    assert "no photo" not in judged(unseen=0.04).verdict
+    verdict = judged(unseen=0.159).verdict
+    assert verdict.startswith("good where photos look, on test views: silhouette IoU 0.990, ")
+    assert verdict.endswith("; 15.9 % of its surface is in no photo, where a hollow would be closed: look at it")
+    both = judged(unseen=0.159, plain=0.139).verdict
+    assert both.startswith("good where photos look, in silhouettes alone, which show no hollow, on test views: ")
+
+
+def test_few_photos_are_the_first_thing_to_mend_of_a_poor_outline():
+    off = {**GOOD, "silhouette_iou": 0.813}
+    assert judged(scores=off, photos=3, begun="hull").verdict == (
+        "poor: silhouette IoU 0.813 where good results have 0.97 on test views: "
+        "try more photos, from all sides: it was made from 3"
+    )
+    assert "more photos" not in judged(scores=off, photos=16).verdict
+    assert judged(photos=3).verdict.startswith("good")
+
+
+def test_masks_that_look_inverted_are_said_first_of_a_poor_result():
+    off = {**GOOD, "silhouette_iou": 0.86}
+    verdict = judged(scores=off, expected=Shape(8, 8), inverted=True).verdict
+    assert verdict.startswith("poor: masks are white around the object, not inside it: try them inverted; the result")
+    assert judged(inverted=True).verdict.startswith("good")
+
+
 def test_where_no_photo_says_how_an_object_goes_on_is_told():
     assert judged(cut_off=0.004).verdict.startswith("good")
     assert judged(cut_off=0.016).verdict == (
@@ -101,6 +126,11 @@ def test_a_hollow_of_the_input_mesh_that_is_closed_is_told():
         "poor: on 2.3 % of what photos show the result lies far in front of the input mesh, so a hollow is closed: "
         "try --init-mesh with a mesh that has it, or a texture for photos to agree on"
     )
+
+
+def test_no_hollow_is_called_closed_before_the_outline_is_near():
+    assert "hollow" in judged(closed=0.165, scores={**GOOD, "silhouette_iou": 0.93}).verdict
+    assert "hollow" not in judged(closed=0.165, scores={**GOOD, "silhouette_iou": 0.76}).verdict
 
 
 def test_of_a_good_result_nothing_is_said_but_its_numbers():

@@ -235,6 +235,21 @@ def plain_share(looked: Looked | None) -> float:
     return _largest_patch(seen & score.isnan(), vertices, faces, topology.edges.long())
 
 
+@torch.no_grad()
+def unseen_share(looked: Looked | None) -> float:
+    """Faces of which no photo sees a corner, as a fraction of a surface's area; 0 where there are no photos.
+
+    Args:
+        looked: from `looked_at`.
+    """
+    if looked is None:
+        return 0.0
+    photos, vertices, faces, _, hits, _ = looked
+    unseen = ~seen_by(photos, hits, vertices, pixel_size(photos)).any(dim=0)
+    area = face_areas(vertices, faces)
+    return float(area[unseen[faces].all(dim=1)].sum() / area.sum())
+
+
 def contradicted_share(
     score: Float[Tensor, " V"], vertices: Tensor, faces: Tensor, edges: Tensor, wrong: Bool[Tensor, " F"] | None = None
 ) -> float:

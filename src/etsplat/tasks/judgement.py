@@ -31,6 +31,15 @@ CLOSED = 0.005
 PLAIN = 0.05
 """Share of the surface in one patch on which photos show nothing to compare: from there on the verdict says so."""
 
+UNSEEN = 0.05
+"""Share of the surface that no photo shows: from there on the verdict says so. Of a cube, its bottom is 0.17."""
+
+CONVERGED = 0.9
+"""Silhouette IoU below which a result is too far from an input mesh for a hollow to be called closed."""
+
+FEW_PHOTOS = 16
+"""With fewer training photos it is more photos that a poor outline needs."""
+
 CUT_OFF = 0.005
 """Share of the visual hull's surface where the frame cuts it off, which good results have at most."""
 
@@ -79,7 +88,8 @@ class Judgement:
         expected_holes: what it should have.
         expected_of: "input mesh" or "visual hull"; None where neither tells.
         verdict: a sentence that begins with "good" or "poor"; of a poor result it says what is wrong and what to try,
-            of a good one of photos first that it is so "in silhouettes alone", where a large piece is plain.
+            of a good one of photos first that it is so "in silhouettes alone", where a large piece is plain, or "where
+            photos look", where they leave much of it out.
     """
 
     views: Views
@@ -166,20 +176,63 @@ def spread(items: Sequence[int], count: int) -> list[int]:
     return [items[number * len(items) // kept] for number in range(kept)]
 
 
+@dataclass(frozen=True)
+class Run:
+    """What a run was like, which decides what to try next.
+
+    Attributes:
+        begun: what it started from.
+        preset: of it.
+        untangled: whether faces that cut through others were smoothed away.
+        photos: how many it was trained on.
+        inverted: whether their masks look as if they were white outside the object.
+    """
+
+    begun: Start
+    preset: str
+    untangled: bool
+    photos: int
+    inverted: bool = False
+
+    @property
+    def hull(self) -> str | None:
+        """How to start from the hull, where it has not."""
+        return "--start.shape hull" if self.begun == "sphere" else None
+
+    @property
+    def longer(self) -> str | None:
+        """How to run longer, where it could."""
+        return None if self.preset == "best" else "--preset best"
+
+
+@dataclass(frozen=True)
+class Shares:
+    """Fractions of a surface on which something is wrong or not known.
+
+    Attributes:
+        contradicted: the largest patch that photos contradict.
+        cut_off: where the visual hull ends because photos do, of its surface.
+        closed: where the result fills a hollow of the input mesh, of what photos see of it.
+        plain: the largest patch on which photos show nothing to compare; 0 where hollows are compared with those of
+            the input mesh.
+        unseen: what no photo shows; 0 where a mesh was photographed, so that the rest is known.
+    """
+
+    contradicted: float = 0.0
+    cut_off: float = 0.0
+    closed: float = 0.0
+    plain: float = 0.0
+    unseen: float = 0.0
+
+
 def judge(
     views: Views,
     scores: Mapping[str, float | None],
     intersecting_percent: float,
     found: Shape,
     expected: Expected,
-    *,
-    contradicted: float,
-    cut_off: float,
-    closed: float,
-    plain: float,
-    begun: Start,
-    preset: str,
-    untangled: bool,
+    shares: Shares,
+    run: Run,
 ) -> Judgement:
     """Judges a result.
 
@@ -189,53 +242,20 @@ def judge(
         intersecting_percent: faces that cut through others.
         found: what the result looks like.
         expected: what it should look like.
-        contradicted: the largest patch that photos contradict, as a fraction of the surface.
-        cut_off: where the visual hull ends because photos do, as a fraction of its surface.
-        closed: where the result fills a hollow of the input mesh, as a fraction of what photos see of it.
-        plain: the largest patch on which photos show nothing to compare, as a fraction of the surface; 0 where hollows
-            are compared with those of the input mesh.
-        begun: what the run started from; with the rest it decides what to try next.
-        preset: of the run.
-        untangled: whether faces that cut through others were smoothed away.
+        shares: where something is wrong with its surface, or not known.
+        run: that it is of.
     """
-    iou, poor = scores["silhouette_iou"], []
-    hull = "--start.shape hull" if begun == "sphere" else None
-    longer = None if preset == "best" else "--preset best"
-    if expected.shown and _differ(found, expected.shape):
-        fewer = begun == "hull" and (found.holes or 0) > (expected.shape.holes or 0)
-        remedy = hull or f"{'--start.shape sphere or ' * fewer}--init-mesh with a mesh that has them"
-        poor.append(f"the result has {_counted(found)}, the {expected.of} {_counted(expected.shape)}: try {remedy}")
-    if found.unclear and expected.of == "input mesh":
-        poor.append(f"the result {found.unclear}, the input mesh is a closed surface: try --start.shape sphere")
-    if iou is not None and iou < GOOD_IOU:
-        remedies = " or ".join(filter(None, (hull, longer))) or "--init-mesh, and check masks and poses"
-        shown = f"{iou:.3f}" if round(iou, 3) < GOOD_IOU else f"{iou:.6f}"
-        poor.append(f"silhouette IoU {shown} where good results have {GOOD_IOU:.2f} on {views} views: try {remedies}")
-    if intersecting_percent > GOOD_INTERSECTING:
-        remedy = (hull or longer or "--init-mesh") if untangled else "--refinement.untanglings 6"
-        poor.append(f"{intersecting_percent:.1f} % of its faces cut through others: try {remedy}")
-    if contradicted > CONTRADICTED:
-        poor.append(
-            f"photos contradict each other on {100 * contradicted:.1f} % of its surface, where a hollow may be closed: "
-            "try more photos that look into it, or depth maps"
-        )
-    if cut_off > CUT_OFF:
-        poor.append(
-            f"the frame cuts the object off on {100 * cut_off:.1f} % of the visual hull's surface, where nothing says "
-            "how it goes on: try photos that show all of it"
-        )
-    if closed > CLOSED:
-        poor.append(
-            f"on {100 * closed:.1f} % of what photos show the result lies far in front of the input mesh, so a "
-            "hollow is closed: try --init-mesh with a mesh that has it, or a texture for photos to agree on"
-        )
+    iou = scores["silhouette_iou"]
+    poor = [
+        *_unlike(found, expected, run),
+        *([] if iou is None else _off(iou, views, run)),
+        *_tangled(intersecting_percent, run),
+        *_wrong_places(shares, converged=iou is None or iou >= CONVERGED),
+    ]
+    if poor and run.inverted:
+        poor.insert(0, "masks are white around the object, not inside it: try them inverted")
     praise = f"on {views} views: {_praise(scores, intersecting_percent, found, expected)}"
-    if plain > PLAIN:
-        praise = (
-            f"in silhouettes alone, which show no hollow, {praise}; hollows were not compared: {100 * plain:.1f} % of "
-            "its surface is one plain piece, where photos do not tell a side from a lid over a hollow: look at it"
-        )
-    good = f"good {praise}"
+    good = f"good {_reserved(praise, shares)}"
     if iou is None:
         good = f"not judged, since photos have no outlines to compare with: add masks; {praise}"
     return Judgement(
@@ -250,6 +270,73 @@ def judge(
         expected_of=expected.of,
         verdict=f"poor: {'; '.join(poor)}" if poor else good,
     )
+
+
+def _unlike(found: Shape, expected: Expected, run: Run) -> list[str]:
+    """What is wrong with parts and holes."""
+    poor = []
+    if expected.shown and _differ(found, expected.shape):
+        fewer = run.begun == "hull" and (found.holes or 0) > (expected.shape.holes or 0)
+        remedy = run.hull or f"{'--start.shape sphere or ' * fewer}--init-mesh with a mesh that has them"
+        poor.append(f"the result has {_counted(found)}, the {expected.of} {_counted(expected.shape)}: try {remedy}")
+    if found.unclear and expected.of == "input mesh":
+        poor.append(f"the result {found.unclear}, the input mesh is a closed surface: try --start.shape sphere")
+    return poor
+
+
+def _off(iou: float, views: Views, run: Run) -> list[str]:
+    """What is wrong with the outline."""
+    if iou >= GOOD_IOU:
+        return []
+    remedies = " or ".join(filter(None, (run.hull, run.longer))) or "--init-mesh, and check masks and poses"
+    if run.photos < FEW_PHOTOS:
+        remedies = f"more photos, from all sides: it was made from {run.photos}"
+    shown = f"{iou:.3f}" if round(iou, 3) < GOOD_IOU else f"{iou:.6f}"
+    return [f"silhouette IoU {shown} where good results have {GOOD_IOU:.2f} on {views} views: try {remedies}"]
+
+
+def _tangled(intersecting_percent: float, run: Run) -> list[str]:
+    if intersecting_percent <= GOOD_INTERSECTING:
+        return []
+    remedy = (run.hull or run.longer or "--init-mesh") if run.untangled else "--refinement.untanglings 6"
+    return [f"{intersecting_percent:.1f} % of its faces cut through others: try {remedy}"]
+
+
+def _wrong_places(shares: Shares, *, converged: bool) -> list[str]:
+    """What is wrong with pieces of the surface."""
+    poor = []
+    if shares.contradicted > CONTRADICTED:
+        poor.append(
+            f"photos contradict each other on {100 * shares.contradicted:.1f} % of its surface, where a hollow may be "
+            "closed: try more photos that look into it, or depth maps"
+        )
+    if shares.cut_off > CUT_OFF:
+        poor.append(
+            f"the frame cuts the object off on {100 * shares.cut_off:.1f} % of the visual hull's surface, where "
+            "nothing says how it goes on: try photos that show all of it"
+        )
+    if shares.closed > CLOSED and converged:
+        poor.append(
+            f"on {100 * shares.closed:.1f} % of what photos show the result lies far in front of the input mesh, so a "
+            "hollow is closed: try --init-mesh with a mesh that has it, or a texture for photos to agree on"
+        )
+    return poor
+
+
+def _reserved(praise: str, shares: Shares) -> str:
+    """Praise with what photos leave open: first how far it goes, and why at the end."""
+    if shares.plain > PLAIN:
+        praise = (
+            f"in silhouettes alone, which show no hollow, {praise}; hollows were not compared: "
+            f"{100 * shares.plain:.1f} % of its surface is one plain piece, where photos do not tell a side from a lid "
+            "over a hollow: look at it"
+        )
+    if shares.unseen > UNSEEN:
+        praise = (
+            f"where photos look, {praise}; {100 * shares.unseen:.1f} % of its surface is in no photo, where a hollow "
+            "would be closed: look at it"
+        )
+    return praise
 
 
 def _differ(found: Shape, expected: Shape) -> bool:

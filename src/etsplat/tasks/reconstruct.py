@@ -8,12 +8,13 @@ from typing import Any
 
 from etsplat.core.errors import InputError
 from etsplat.core.workers import together
-from etsplat.data.agreement import contradicted, looked_at, plain_share, unseen_vertices
+from etsplat.data.agreement import contradicted, looked_at, plain_share, unseen_share, unseen_vertices
 from etsplat.data.closed_hollows import closed_hollows
 from etsplat.data.cut_off import cut_off
 from etsplat.data.dataset import Dataset
 from etsplat.data.lids import lids
 from etsplat.data.outlines import outlines
+from etsplat.data.silhouettes import looks_inverted
 from etsplat.engines.choice import engine
 from etsplat.engines.threads import one_torch_thread
 from etsplat.geometry.parts import Shape, genera, shape_of
@@ -38,6 +39,8 @@ from etsplat.tasks.judgement import (
     CONTRADICTED,
     TRAINING_VIEWS,
     Judgement,
+    Run,
+    Shares,
     Start,
     expect_hull,
     expect_mesh,
@@ -262,8 +265,8 @@ def _judge(
     """
     found = shape_of(*mesh.surface())
     doubtful, hull = started.contradicted > CONTRADICTED, started.hull
-    may_be_plain = truth is None and views.has_masks
-    looked = looked_at(views, *mesh.surface()) if doubtful or may_be_plain else None
+    from_photos = truth is None and views.has_masks
+    looked = looked_at(views, *mesh.surface()) if doubtful or from_photos else None
     if truth is not None:
         expected = expect_mesh(truth, views, found, config.start.radius)
     elif hull is not None:
@@ -276,13 +279,20 @@ def _judge(
         100 * scores["self_intersections"] / mesh.count,
         found,
         expected,
-        contradicted=contradicted(looked, mesh.display_face_colors.cpu()) if doubtful else 0.0,
-        cut_off=0.0 if hull is None else cut_off(views, hull.vertices, hull.faces),
-        closed=0.0 if truth is None else closed_hollows(views, (truth.vertices, truth.faces), mesh.surface()),
-        plain=plain_share(looked) if may_be_plain else 0.0,
-        begun=started.kind,
-        preset=config.preset,
-        untangled=config.refinement.untanglings > 0,
+        Shares(
+            contradicted=contradicted(looked, mesh.display_face_colors.cpu()) if doubtful else 0.0,
+            cut_off=0.0 if hull is None else cut_off(views, hull.vertices, hull.faces),
+            closed=0.0 if truth is None else closed_hollows(views, (truth.vertices, truth.faces), mesh.surface()),
+            plain=plain_share(looked) if from_photos else 0.0,
+            unseen=unseen_share(looked) if from_photos else 0.0,
+        ),
+        Run(
+            begun=started.kind,
+            preset=config.preset,
+            untangled=config.refinement.untanglings > 0,
+            photos=len(views.train),
+            inverted=from_photos and looks_inverted(views),
+        ),
     )
 
 
