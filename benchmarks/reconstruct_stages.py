@@ -45,6 +45,7 @@ STAGES = {
         "tasks.reconstruct:looked_at",
         "tasks.reconstruct:contradicted",
         "tasks.reconstruct:plain_share",
+        "tasks.reconstruct:unseen_share",
         "tasks.reconstruct:cut_off",
     ],
     "verdict: the input mesh": ["tasks.reconstruct:closed_hollows"],
