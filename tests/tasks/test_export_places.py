@@ -16,6 +16,7 @@ from etsplat.data.where_up import held_up, up_of
 from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.regions import Box, Sphere
 from etsplat.geometry.similarity import Similarity, rotation_between
+from etsplat.io.mesh_files import load_mesh
 from etsplat.model.soup_import import open_soup
 from etsplat.model.surroundings import Surroundings
 from etsplat.model.triangle_soup import TriangleSoup
@@ -23,7 +24,7 @@ from etsplat.tasks.export_config import ExportConfig
 from etsplat.tasks.export_soup import export_soup, transform_of
 from etsplat.tasks.sources import SoupRun, open_run
 from helpers.captures import write_colmap
-from helpers.exported_soups import CAMERA, UP_AXIS, difference, odd_soup
+from helpers.exported_soups import CAMERA, UP_AXIS, difference, odd_soup, run_of
 from helpers.gltf import check_glb
 
 
@@ -133,7 +134,8 @@ def test_the_record_leads_from_the_file_back_to_the_capture(tmp_path, soup):
     matrix = torch.tensor(record["transform"], dtype=torch.float64)
     assert torch.equal(matrix, written.transform.matrix)
     inside = soup.vertices.mean(dim=1).norm(dim=1) <= 1.5
-    back = Similarity.of_matrix(matrix).invert(open_soup(tmp_path / "a.glb").vertices)
+    mesh = load_mesh(tmp_path / "a.glb")
+    back = Similarity.of_matrix(matrix).invert(mesh.vertices[mesh.faces])
     torch.testing.assert_close(back.float(), soup.vertices[inside], rtol=0, atol=1e-5)
     assert record["removed"] == {"crop": int((~inside).sum())}
     assert (record["up"], record["scale"], record["place"], record["clean"]) == ("y", 2.5, "center", False)
@@ -147,6 +149,46 @@ def test_the_record_leads_from_the_file_back_to_the_capture(tmp_path, soup):
     assert document["nodes"] == [{"mesh": 0, "name": "a"}]
 
 
+@pytest.mark.parametrize("kind", ["ply", "glb", "obj"])
+@pytest.mark.parametrize("compress", ["none", "quantize"])
+def test_a_file_that_is_opened_lies_in_the_frame_of_its_capture(tmp_path, soup, kind, compress):
+    """Turned, scaled and placed as it is: so that it is compared with the photos, and is not turned twice."""
+    if compress != "none" and kind != "glb":
+        return
+    write_colmap(tmp_path / "scene", [(33, 24)] * 9)
+    run = SoupRun(tmp_path, soup, load_dataset(tmp_path / "scene"))
+    config = ExportConfig(colors="constant", min_opacity=0.0, scale=2.5, place="center", compress=compress)
+    first = export_soup(run, tmp_path / f"a.{kind}", config)
+    assert not torch.equal(first.transform.rotation, torch.eye(3, dtype=torch.float64))
+    near = {"rtol": 0, "atol": 1e-5 if compress == "none" else 2e-3}
+    torch.testing.assert_close(open_soup(first.path).vertices, soup.vertices, **near)
+    for scene in (None, tmp_path / "scene"):  # where up is the file says too
+        again = export_soup(open_run(first.path, scene), tmp_path / f"b.{kind}", config)
+        torch.testing.assert_close(again.transform.rotation, first.transform.rotation)
+        torch.testing.assert_close(load_mesh(again.path).vertices, load_mesh(first.path).vertices, rtol=0, atol=5e-3)
+
+
+@pytest.mark.parametrize(
+    "transform",
+    [
+        "[[1, 0]]",
+        '"abc"',
+        "[",
+        "NaN",
+        "[[0,0,0,0],[0,0,0,0],[0,0,0,0],[0,0,0,1]]",
+        "[[1,0,0,0],[0,2,0,0],[0,0,1,0],[0,0,0,1]]",
+    ],
+)
+def test_a_file_whose_transform_is_damaged_is_refused(tmp_path, soup, transform):
+    path = tmp_path / "a.ply"
+    export_soup(replace(run_of(soup), path=tmp_path), path, ExportConfig(min_opacity=0.0))
+    data = path.read_bytes()
+    start = data.index(b"comment transform ") + len(b"comment transform ")
+    path.write_bytes(data[:start] + transform.encode() + data[data.index(b"\n", start) :])
+    with pytest.raises(InputError, match=r"a\.ply: its record of the export has no usable `transform`; export"):
+        open_soup(path)
+
+
 def test_up_may_be_z_but_in_glb(tmp_path, soup):
     """The cameras' up is +y here: it comes to be +z, and nothing is mirrored."""
     write_colmap(tmp_path / "scene", [(33, 24)] * 9)
@@ -155,7 +197,8 @@ def test_up_may_be_z_but_in_glb(tmp_path, soup):
     written = export_soup(run, tmp_path / "a.ply", ExportConfig(up="z", min_opacity=0.0, sky="joined"))
     torch.testing.assert_close(written.transform.rotation @ up, torch.tensor([0.0, 0, 1], dtype=torch.float64))
     turned = (soup.vertices.double() @ written.transform.rotation.T).float()
-    assert torch.equal(open_soup(tmp_path / "a.ply").vertices, turned)
+    mesh = load_mesh(tmp_path / "a.ply")
+    assert torch.equal(mesh.vertices[mesh.faces], turned)
     with pytest.raises(InputError, match=r"a\.glb: files of this kind have \+y up.*--format obj or off or ply"):
         export_soup(run, tmp_path / "a.glb", ExportConfig(up="z"))
 

@@ -59,6 +59,31 @@ def test_ply_with_harmonics_returns_the_same_soft_picture(tmp_path, soup, kernel
     assert np.asarray(trimesh.load_mesh(path, process=False).vertices).shape == (180, 3)
 
 
+def test_ply_with_harmonics_returns_how_it_is_drawn_and_its_notes(tmp_path, soup):
+    look = SoupAppearance(
+        "bilateral", "sdf", sh_degree=1, cull_small=True, cull_large=0.6, near_plane=3.5, background=(1.0, 0.0, 0.5)
+    )
+    kept = replace(soup, appearance=look, notes={"sky": "none", "focal": "800", "iteration": "7"})
+    path = tmp_path / "soup.ply"
+    config = ExportConfig(colors="keep", min_opacity=0.0, scale=3.0)
+    export_soup(replace(run_of(soup), soup=kept), path, config)
+    returned = open_soup(path)
+    assert returned.appearance == look
+    assert returned.notes == {**kept.notes, "source": "soup.ply"}
+    assert difference(returned.render(CAMERA).color, kept.render(CAMERA).color) < 1e-4
+    path.write_bytes(re.sub(rb"comment (appearance|notes) .*\n", b"", path.read_bytes()))  # as of earlier versions
+    assert open_soup(path).appearance == SoupAppearance("bilateral", "sdf")
+
+
+@pytest.mark.parametrize(("name", "said"), [("appearance", '{"near_plane": 0}'), ("appearance", "3"), ("notes", "[1]")])
+def test_a_ply_that_cannot_be_drawn_as_it_says_is_refused(tmp_path, soup, name, said):
+    path = tmp_path / "soup.ply"
+    export_soup(run_of(soup), path, ExportConfig(colors="keep"))
+    path.write_bytes(re.sub(rb"(comment %s ).*\n" % name.encode(), rb"\g<1>%s\n" % said.encode(), path.read_bytes()))
+    with pytest.raises(InputError, match=rf"soup\.ply: its record of the export has no usable `{name}`"):
+        open_soup(path)
+
+
 def test_opacity_floor_and_softness_ceiling_are_in_the_exported_numbers(tmp_path, soup):
     limits = {"opacity_floor": 0.6, "sigma_ceiling": 0.3}
     export_soup(run_of(soup, **limits), tmp_path / "soup.ply", ExportConfig(colors="keep", up="keep"))

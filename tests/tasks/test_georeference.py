@@ -12,6 +12,7 @@ from etsplat import TrainConfig, train
 from etsplat.core.errors import InputError
 from etsplat.io.georeference import Georeference
 from etsplat.io.ply_tables import read_ply_tables
+from etsplat.model.soup_import import open_soup
 from etsplat.tasks.export_config import ExportConfig
 from etsplat.tasks.export_soup import export_soup
 from etsplat.tasks.sources import open_run
@@ -129,6 +130,22 @@ def test_a_world_with_z_up_stands_upright_in_glb(runs, tmp_path):
     table = read_ply_tables(turned.path)["vertex"]
     local = (world - OFFSET) / 2
     assert np.abs(np.stack([table[a] for a in "xyz"], axis=1) - local[:, [0, 2, 1]] * [1, 1, -1]).max() < MILLIMETRE
+
+
+@pytest.mark.parametrize("up", ["y", "z"])
+@pytest.mark.parametrize("suffix", [".ply", ".obj", ".glb"])
+def test_what_was_placed_in_the_world_comes_back_to_its_capture(runs, tmp_path, suffix, up):
+    """To less than a millimetre, which float32 coordinates of the world could not hold; and still knows the world."""
+    folder, _ = runs
+    run = open_run(folder / "far_run")
+    said = Georeference(OFFSET, 2.0, up, "EPSG:25832")
+    object.__setattr__(run.soup, "notes", {**run.soup.notes, "georeference": said.to_json()})
+    local = export_soup(run, tmp_path / "local.ply", exported(up="keep", sky="none"))
+    placed = export_soup(run, tmp_path / f"placed{suffix}", exported(place="world", sky="none"))
+    opened = open_run(placed.path)
+    assert torch.allclose(opened.soup.vertices, open_soup(local.path).vertices, rtol=0, atol=MILLIMETRE)
+    again = export_soup(opened, tmp_path / "again.ply", exported(place="world"))
+    assert np.abs(again.transform.translation.numpy() - OFFSET).max() < MILLIMETRE
 
 
 def test_a_soup_on_its_own_still_knows(runs, tmp_path):

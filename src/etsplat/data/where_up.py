@@ -36,6 +36,15 @@ def told_up(georeference: Georeference | None) -> Float[Tensor, "3"] | None:
     return torch.eye(3, dtype=torch.float64)["xyz".index(georeference.up)]
 
 
+def noted_up(note: str | None) -> Float[Tensor, "3"] | None:
+    """Where up is by the note of a soup from a file, float64; None where it has no such note, or no usable one."""
+    try:
+        up = torch.tensor([float(word) for word in (note or "").split()], dtype=torch.float64)
+    except ValueError:
+        return None
+    return up if up.shape == (3,) and abs(float(up.norm()) - 1) < 1e-6 else None
+
+
 def held_up(viewmats: Float[Tensor, "B 4 4"]) -> Float[Tensor, "3"] | None:
     """Where up is by how cameras were held, float64; None if they contradict each other.
 

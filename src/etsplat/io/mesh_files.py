@@ -13,6 +13,7 @@ from torch import Tensor
 from etsplat.core.errors import InputError
 from etsplat.core.validation import check_memory, dense
 from etsplat.io._mesh_readers import READERS, RawMesh
+from etsplat.io.export_records import read_record, transform_of_record
 from etsplat.io.georeference import Georeference
 from etsplat.io.paths import given_path, kind_of, path_remedy
 from etsplat.io.textures import NormalMap, Texture
@@ -25,6 +26,12 @@ from etsplat.io.writers import (
     save_surface,
     writer_of,
 )
+
+_MOVED = 1e-4
+"""Of a mesh's size: by so much at most 32 bits may move a vertex. A photo of a thousand pixels shows ten times that."""
+
+_BRIGHTEST = 2.0
+"""Of colours that are clamped: others are not from 0 to 1."""
 
 
 @dataclass(frozen=True)
@@ -82,6 +89,23 @@ def load_mesh(path: Path | str) -> MeshFile:
         torch.Size([80, 3])
     """
     path = given_path("path", path)
+    return _clean(path, _read(path))
+
+
+def load_exported(path: Path) -> tuple[MeshFile, dict[str, Any]]:
+    """A mesh as `load_mesh`, in the frame of the capture that `etsplat export` had it from; and what the file says.
+
+    Raises:
+        InputError: as `load_mesh`; the file's record of the export is damaged.
+    """
+    raw, record = _read(path), read_record(path)
+    if "transform" in record:
+        raw.vertices = transform_of_record(path, record).invert(torch.from_numpy(raw.vertices)).numpy()
+    return _clean(path, raw), record
+
+
+def _read(path: Path) -> RawMesh:
+    """What is in a file, with nothing in it that cannot be repaired."""
     if not path.exists():
         raise InputError(f"mesh {path}: no such file; {path_remedy(path)}")
     if path.is_dir():
@@ -92,14 +116,7 @@ def load_mesh(path: Path | str) -> MeshFile:
         raise InputError(f"mesh {path}: the file is empty; export it again")
     raw = READERS[kind_of(path)](path)
     _check(path, raw)
-    return _clean(path, raw)
-
-
-_MOVED = 1e-4
-"""Of a mesh's size: by so much at most 32 bits may move a vertex. A photo of a thousand pixels shows ten times that."""
-
-_BRIGHTEST = 2.0
-"""Of colours that are clamped: others are not from 0 to 1."""
+    return raw
 
 
 def save_mesh(

@@ -1,8 +1,11 @@
 """Soups from files of other programs: Triangle Splatting's state, Gaussian scenes, meshes; and our own exports."""
 
+import json
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,13 +15,14 @@ from etsplat.core.errors import InputError
 from etsplat.core.harmonics import MAX_DEGREE, SH_CONSTANT
 from etsplat.core.kernels import DISTANCES, KERNELS
 from etsplat.core.rasterization import SOUP_SIGMA_FLOOR
-from etsplat.io.mesh_files import load_mesh
+from etsplat.io.export_records import damaged, read_record, transform_of_record
+from etsplat.io.mesh_files import load_exported
 from etsplat.io.paths import kind_of
 from etsplat.io.ply_tables import CORNERS, columns, read_ply_header, read_ply_tables
 from etsplat.io.tensors import read_state_dict
 from etsplat.model.soup_appearance import SoupAppearance
 from etsplat.model.soup_compact import open_compact
-from etsplat.model.triangle_soup import TriangleSoup
+from etsplat.model.triangle_soup import GEOREFERENCE_NOTE, UP_NOTE, TriangleSoup
 
 GAUSSIAN_SIGMA = 1.0
 """With it the elastic kernel is exp(-x^2): the profile of a Gaussian."""
@@ -38,7 +42,8 @@ def open_soup(path: Path | str) -> TriangleSoup:
     Args:
         path: `.safetensors` of `etsplat train`; `.etz` of `etsplat export`; `.pt` of Triangle Splatting
             (`point_cloud_state_dict.pt`); `.ply` that `etsplat export` wrote, of a Gaussian scene or of a mesh; `.obj`,
-            `.off`, `.glb`, `.gltf`, `.stl`.
+            `.off`, `.glb`, `.gltf`, `.stl`. What `etsplat export` turned, scaled and placed is in the frame of its
+            capture again, where the file says how (OFF does not).
 
     Raises:
         InputError: the file is missing, damaged or of another kind.
@@ -52,7 +57,7 @@ def open_soup(path: Path | str) -> TriangleSoup:
         soup = open_compact(path)
     else:
         soup = {".pt": _read_triangle_splatting, ".ply": _read_ply}.get(kind_of(path), _read_mesh)(path)
-        soup = replace(soup, **soup.state(), notes={"source": path.name})
+        soup = replace(soup, **soup.state(), notes={"source": path.name, **soup.notes})
     if not len(soup):
         raise InputError(f"soup {path}: holds no triangle; take another file")
     soup.check_finite(path)
@@ -92,9 +97,10 @@ def _read_ply(path: Path) -> TriangleSoup:
 
 
 def _read_exported(path: Path, comments: list[str]) -> TriangleSoup:
+    record = read_record(path)
     tables = read_ply_tables(path, ("vertex", "face"))
     vertex, face = tables["vertex"], tables["face"]
-    points = columns(path, vertex, *"xyz").float()
+    points = transform_of_record(path, record).invert(columns(path, vertex, *"xyz")).float()
     corners = face[CORNERS].astype(np.int64)
     if corners.size and not 0 <= corners.min() <= corners.max() < len(points):
         raise InputError(f"soup {path}: has corners that name no vertex; export it again")
@@ -111,13 +117,42 @@ def _read_exported(path: Path, comments: list[str]) -> TriangleSoup:
         dc,
         rest,
     )
+    soup = replace(soup, notes=_notes(path, record))
+    if "appearance" in record:
+        return replace(soup, appearance=_appearance(path, record["appearance"]))
     words = next((comment.split() for comment in comments if comment.startswith("etsplat ")), [])
     known = len(words) == 3 and words[2] in DISTANCES
-    if known and words[1] not in KERNELS:
+    return replace(soup, appearance=_known(path, SoupAppearance(words[1], words[2]))) if known else soup
+
+
+def _appearance(path: Path, said: Any) -> SoupAppearance:
+    try:
+        return _known(path, SoupAppearance.from_json(json.dumps(said)))
+    except ValueError as error:
+        raise damaged(path, "appearance") from error
+
+
+def _known(path: Path, appearance: SoupAppearance) -> SoupAppearance:
+    """Raises InputError for a kernel that is not there."""
+    if appearance.kernel not in KERNELS:
         raise InputError(
-            f"soup {path}: is drawn with kernel {words[1]!r}, which is not registered; take soup.safetensors"
+            f"soup {path}: is drawn with kernel {appearance.kernel!r}, which is not registered; take soup.safetensors"
         )
-    return replace(soup, appearance=SoupAppearance(words[1], words[2])) if known else soup
+    return appearance
+
+
+def _notes(path: Path, record: Mapping[str, Any]) -> dict[str, str]:
+    """Those of the soup that was exported, where the file has them, and what its record says of up and of the world."""
+    notes = record.get("notes", {})
+    if not isinstance(notes, dict) or not all(isinstance(value, str) for value in notes.values()):
+        raise damaged(path, "notes")
+    told = {}
+    if record.get("georeference") is not None:
+        told[GEOREFERENCE_NOTE] = json.dumps(record["georeference"])
+    if record.get("up") in ("y", "z") and record.get("place") != "world":
+        up = transform_of_record(path, dict(record)).rotation["xyz".index(record["up"])]
+        told[UP_NOTE] = " ".join(map(repr, up.tolist()))
+    return told | notes
 
 
 def _read_gaussians(path: Path) -> TriangleSoup:
@@ -139,7 +174,7 @@ def _read_gaussians(path: Path) -> TriangleSoup:
 
 
 def _read_mesh(path: Path) -> TriangleSoup:
-    mesh = load_mesh(path)
+    mesh, record = load_exported(path)
     if mesh.face_colors is not None:
         colors = mesh.face_colors
     elif mesh.vertex_colors is not None:
@@ -147,7 +182,8 @@ def _read_mesh(path: Path) -> TriangleSoup:
     else:
         colors = torch.full((len(mesh.faces), 3), 0.8)
     corners = mesh.vertices[mesh.faces]
-    return TriangleSoup.from_triangles(corners, colors, opacity=MESH_OPACITY, sigma=MESH_SIGMA, sh_degree=0)
+    soup = TriangleSoup.from_triangles(corners, colors, opacity=MESH_OPACITY, sigma=MESH_SIGMA, sh_degree=0)
+    return replace(soup, **soup.state(), notes=_notes(path, record))
 
 
 def _harmonics(path: Path, table: np.ndarray) -> tuple[Tensor, Tensor]:

@@ -34,6 +34,9 @@ FOCAL_NOTE = "focal"
 GEOREFERENCE_NOTE = "georeference"
 """Note of a trained soup: where its units lie in the world, as `etsplat.io.georeference.Georeference` writes it."""
 
+UP_NOTE = "up"
+"""Note of a soup from a file that was turned: where up is in the frame of its capture, three numbers."""
+
 
 class Drawn(NamedTuple):
     """What pictures of N triangles are made of.

@@ -1,5 +1,6 @@
 """A soup as a file for other programs: colours baked, what is not wanted left out, turned, scaled and placed."""
 
+import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -11,7 +12,7 @@ from torch import Tensor
 
 from etsplat.core.cameras import Cameras
 from etsplat.core.errors import InputError
-from etsplat.data.where_up import told_up, up_of
+from etsplat.data.where_up import noted_up, told_up, up_of
 from etsplat.geometry.similarity import Similarity
 from etsplat.io.atomic import atomic_write
 from etsplat.io.georeference import Georeference
@@ -20,7 +21,7 @@ from etsplat.io.paths import kind_of
 from etsplat.io.writers import suffixes, writer_of
 from etsplat.model.solid_soup import SolidSoup
 from etsplat.model.soup_appearance import OPAQUE_FROM
-from etsplat.model.triangle_soup import GEOREFERENCE_NOTE, TriangleSoup
+from etsplat.model.triangle_soup import GEOREFERENCE_NOTE, UP_NOTE, TriangleSoup
 from etsplat.ops.soup_colors import soup_colors
 from etsplat.tasks.export_config import ExportConfig
 from etsplat.tasks.export_mesh import check_stored
@@ -175,7 +176,7 @@ def _write(run: SoupRun, path: Path, config: ExportConfig, chosen: Selection, *,
         weld=config.weld or isinstance(soup, SolidSoup),  # whose neighbours share corners as they are
         numbers=numbers,
         comment=f"etsplat {soup.appearance.kernel} {soup.appearance.distance}",
-        record=_record(config, chosen, transform, georeference),
+        record=_record(soup, config, chosen, transform, georeference),
         sky=sky if bool(sky.any()) else None,
         world=world,
         compress=config.compress,
@@ -184,11 +185,13 @@ def _write(run: SoupRun, path: Path, config: ExportConfig, chosen: Selection, *,
 
 
 def transform_of(run: SoupRun, config: ExportConfig, corners: Float[Tensor, "N 3 3"]) -> Similarity:
-    """The `placement` of a soup; without its capture, or where cameras contradict each other, nothing is turned."""
+    """The `placement` of a soup; nothing is turned where nobody knows where up is."""
     georeference = _georeference(run)
     up = told_up(georeference)
     if up is None and run.capture is not None:
         up = up_of(run.capture)
+    if up is None:
+        up = noted_up(run.soup.notes.get(UP_NOTE))
     return placement(run.path, config, corners, up, georeference, _STRAYS)
 
 
@@ -200,11 +203,17 @@ def _georeference(run: SoupRun) -> Georeference | None:
 
 
 def _record(
-    config: ExportConfig, chosen: Selection, transform: Similarity, georeference: Georeference | None
+    soup: TriangleSoup,
+    config: ExportConfig,
+    chosen: Selection,
+    transform: Similarity,
+    georeference: Georeference | None,
 ) -> dict[str, Any]:
-    """What the file says of how it was made."""
+    """What the file says of how it was made; where it comes back as the same soup, of how that is drawn too."""
+    look = {"appearance": json.loads(soup.appearance.structure.to_json()), "notes": dict(soup.notes)}
     return {
         **({} if georeference is None else {"georeference": asdict(georeference)}),
+        **(look if config.colors == "keep" else {}),
         "transform": transform.matrix.tolist(),
         **{name: getattr(config, name) for name in ("up", "scale", "place", "sky", "clean")},
         "crop": None if chosen.crop is None else str(chosen.crop),

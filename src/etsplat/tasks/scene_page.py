@@ -11,11 +11,12 @@ from etsplat.core.cameras import Cameras
 from etsplat.data.camera_coverage import focus_point
 from etsplat.data.dataset import Dataset
 from etsplat.data.looked_at import middle_photo
-from etsplat.data.where_up import up_of
+from etsplat.data.where_up import noted_up, up_of
+from etsplat.geometry.similarity import rotation_between
 from etsplat.io.compact_soups import encode_compact
 from etsplat.model.solid_soup import SolidSoup
 from etsplat.model.soup_compact import compact_of, ranks
-from etsplat.model.triangle_soup import TriangleSoup
+from etsplat.model.triangle_soup import UP_NOTE, TriangleSoup
 from etsplat.tasks.sources import SoupRun, training_cameras
 from etsplat.web.pages import ScenePage
 
@@ -81,13 +82,16 @@ def _photos(capture: Dataset) -> dict[str, Any]:
 
 
 def _without_photos(soup: TriangleSoup) -> dict[str, Any]:
-    """One camera, far enough away to see nine tenths of the triangles, with +y up."""
+    """One camera, far enough away to see nine tenths of the triangles, with +y up unless the soup knows better."""
     centers = soup.vertices.detach().double().mean(dim=1).cpu()
     middle = centers.median(dim=0).values
     radius = max(float(torch.quantile((centers - middle).norm(dim=1)[:1_000_000], 0.9)), 1e-6)
-    eye = middle + torch.tensor([0.3, 0.3, 0.9], dtype=torch.float64) * 2.5 * radius
+    level = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
+    known = noted_up(soup.notes.get(UP_NOTE))
+    up = level if known is None else known
+    aside = rotation_between(level, up) @ torch.tensor([0.3, 0.3, 0.9], dtype=torch.float64)
+    eye = middle + aside * 2.5 * radius
     forward = torch.nn.functional.normalize(middle - eye, dim=0)
-    up = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
     right = torch.nn.functional.normalize(torch.linalg.cross(-up, forward), dim=0)
     rows = torch.stack([right, torch.linalg.cross(forward, right), forward])
     overview = {"name": "overview", "rows": rows.tolist(), "eye": eye.tolist(), "lens": list(_USUAL_LENS)}
