@@ -93,6 +93,11 @@ def test_the_run_is_one_for_all_that_comes_after(run: tuple[TrainResult, list[ob
     assert len(result.metrics["test_views"]) == len(capture.test)
 
 
+def test_faint_soups_of_blocks_are_not_to_be_trained_with_an_opaque_mesh(run: tuple[TrainResult, list[object]]) -> None:
+    with pytest.raises(InputError, match="lower --min-opacity, or train with --finish opaque; no opaque mesh is made"):
+        export_soup(open_run(run[0].path), run[0].path / "faint.glb", ExportConfig(min_opacity=1.0))
+
+
 def test_what_is_there_and_needed_is_said_beforehand(run: tuple[TrainResult, list[object]]) -> None:
     notes = [event.text for event in run[1] if isinstance(event, NoteEvent)]
     assert notes[0].startswith("2 blocks of ")

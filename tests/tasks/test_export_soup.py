@@ -211,7 +211,7 @@ def test_the_page_of_a_cropped_run_has_the_cropped_mesh(tmp_path, soup):
 def test_an_export_that_leaves_out_most_says_what_to_do(tmp_path, soup, capsys, floor, advised):
     soup.save(tmp_path / "soup.safetensors")
     assert parse(["export", str(tmp_path / "soup.safetensors"), "--min-opacity", floor]).run([]) == 0
-    assert ("train with --asset" in capsys.readouterr().out) is advised
+    assert ("train --asset" in capsys.readouterr().out) is advised
 
 
 @pytest.mark.parametrize("kind", ["PLY", "OBJ", "OFF", "GLB", "SafeTensors"])

@@ -10,6 +10,7 @@ import torch
 import trimesh
 from safetensors.torch import load_file
 
+from etsplat.cli.parse import parse
 from etsplat.core.errors import InputError
 from etsplat.data.dataset import Dataset
 from etsplat.data.demo_scene import demo_scene
@@ -268,6 +269,25 @@ def test_exports_and_opaque_pictures_are_of_the_mesh(run: tuple[RunDirectory, li
     assert 0 < len(cropped) < len(opened.solid)
     assert isinstance(cropped, SolidSoup)
     assert len(cropped.corner_colors) == len(cropped)
+
+
+def test_the_soup_in_the_place_of_the_mesh_is_whole_and_said(
+    run: tuple[RunDirectory, list[Event]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With --alpha what is faint stays; where most is left out the remedy is not to train with what it was trained."""
+    opacities = TriangleSoup.load(run[0].soup_path).drawn_opacities
+    most = float(opacities.quantile(0.8))
+    command = ["export", str(run[0].path), "--sky", "joined", "--out"]
+    assert parse([*command, str(tmp_path / "a.glb"), "--alpha"]).run([]) == 0
+    said = capsys.readouterr().out
+    assert f"{len(opacities):,} triangles" in said
+    assert "It is the soup, not the run's opaque mesh (--alpha)." in said
+    assert "Left out" not in said
+    assert parse([*command, str(tmp_path / "b.glb"), "--triangles", "soup", "--min-opacity", str(most)]).run([]) == 0
+    said = capsys.readouterr().out
+    assert "not the run's opaque mesh (--triangles soup)" in said
+    assert "Most of it is too faint; lower --min-opacity, or take the run's opaque mesh (without" in said
+    assert "--asset" not in said
 
 
 def test_corners_of_the_sky_keep_their_colours_when_they_are_turned_inwards(tmp_path: Path) -> None:

@@ -60,17 +60,44 @@ def test_every_checkpoint_comes_with_a_soup_to_look_at(trained):
     assert trained[2][:1] == ["10"]
 
 
+def without_scene(folder, to):
+    """A copy of the run whose scene is not where it was."""
+    shutil.copytree(folder / "run", to)
+    config = to / "config.json"
+    config.write_text(config.read_text().replace(str(folder / "scene"), str(folder / "gone")))
+    return to
+
+
 def test_a_scene_that_moved_is_named_with_an_option(trained, tmp_path):
     folder, _, _ = trained
     shutil.copytree(folder / "scene", tmp_path / "moved")
-    shutil.copytree(folder / "run", tmp_path / "run")
-    config = tmp_path / "run" / "config.json"
-    config.write_text(config.read_text().replace(str(folder / "scene"), str(folder / "gone")))
-    with pytest.raises(InputError, match=r"has gone; name where it is now with --scene"):
-        open_run(tmp_path / "run")
+    without_scene(folder, tmp_path / "run")
+    for command in ("eval", "render"):
+        with pytest.raises(InputError, match=r"/gone has gone; name where it is now with --scene"):
+            parse([command, str(tmp_path / "run")]).run([])
     assert len(open_run(tmp_path / "run", tmp_path / "moved").capture) == 9
     with pytest.raises(InputError, match=r"scene .*/mover: no such folder; did you mean .*/moved\?"):
         open_run(tmp_path / "run", tmp_path / "mover")
+
+
+def test_what_needs_no_photos_works_when_the_scene_has_gone(trained, tmp_path, capsys):
+    """And says what is otherwise without them; nothing is of the soup itself."""
+    folder, result, _ = trained
+    run = without_scene(folder, tmp_path / "run")
+    notes = {
+        "safetensors": "",
+        "etz": "in order of opacity",
+        "html": "no photos on the page",
+        "glb": "nothing is turned",
+    }
+    for kind, note in notes.items():
+        assert parse(["export", str(run), "--out", str(tmp_path / f"out.{kind}"), "--min-opacity", "0"]).run([]) == 0
+        said = capsys.readouterr().out
+        assert (f"{folder / 'gone'} has gone: " in said) is bool(note)
+        assert note in said
+    assert torch.equal(TriangleSoup.load(run / "soup.safetensors").vertices, result.soup.vertices)
+    with pytest.raises(InputError, match="has gone; name where it is now with --scene"):
+        parse(["export", str(run), "--clean"]).run([])
 
 
 @pytest.mark.parametrize(

@@ -218,8 +218,8 @@ class Export(Command):
     def run(self, arguments: Sequence[str]) -> int:
         """Writes the file and says what is in it."""
         from etsplat.tasks.export_mesh import is_reconstruction
-        from etsplat.tasks.export_soup import export_soup
-        from etsplat.tasks.soup_selection import in_words
+        from etsplat.tasks.export_soup import export_soup, why_soup
+        from etsplat.tasks.soup_selection import faint_remedy, in_words
         from etsplat.tasks.sources import open_run
 
         if is_reconstruction(self.run_dir):
@@ -238,8 +238,12 @@ class Export(Command):
         print(f"{written.path}: {written.triangles:,} triangles{sky}")
         if written.removed:
             print(f"Left out: {in_words(written.removed)}.")
+        for note in written.notes:
+            print(f"  {note}")
+        if opened.solid is not None and (why := why_soup(out, self.settings)):
+            print(f"It is the soup, not the run's opaque mesh ({why}).")
         if written.dropped > written.triangles:
-            print("Most of it is too faint to be drawn opaque; train with --asset, or lower --min-opacity.")
+            print(f"Most of it is too faint; {faint_remedy(opened)}.")
         return 0
 
     def _out(self, folder: Path, name: str) -> Path:
@@ -317,6 +321,8 @@ class View(Command):
             if not self.run_dir.is_file():
                 wait_for_soup(self.run_dir, lambda text: print(f"{text} (Ctrl-C ends it)", flush=True))
             opened = open_run(self.run_dir, self.scene, self.device, self.engine)
+            if opened.gone is not None:
+                print(f"  its scene {opened.gone} has gone: shown without its photos (--scene names it)", flush=True)
             serve(
                 opened,
                 self.host,

@@ -55,9 +55,11 @@ class ExportConfig(Settings):
     constant: one per triangle, the constant part of its harmonics;
     keep: that, and the harmonics beside it (PLY only): the file comes back with the same colours from every side."""
     min_opacity: Annotated[float | None, Range(0, 1)] = None
-    """Leave out triangles less opaque than this; by default 0.5, as `etsplat render --opaque` does."""
+    """Leave out triangles less opaque than this.
+    By default 0.5, as `etsplat render --opaque` does, but 0 with --alpha and in safetensors, etz and html."""
     alpha: bool = False
-    """Write opacities as alpha too (PLY, OFF, GLB). Most viewers sort transparent triangles badly."""
+    """Write the triangles of the soup, faint ones too, with their opacities as alpha (PLY, OFF, GLB).
+    Most viewers sort transparent triangles badly."""
     weld: bool = False
     """Let triangles share vertices where positions and colours are equal."""
     triangles: Literal["opaque", "soup"] = "opaque"

@@ -48,6 +48,7 @@ class Export:
         sky: those of the sky, where they are an object of their own.
         removed: how many were left out, by the reason (`etsplat.tasks.soup_selection.REASONS`).
         transform: from the capture's own units and axes to those of the file.
+        notes: a sentence if it would be another file if the capture had not gone.
     """
 
     path: Path
@@ -55,6 +56,7 @@ class Export:
     sky: int
     removed: Mapping[Reason, int]
     transform: Similarity
+    notes: tuple[str, ...] = ()
 
     @property
     def dropped(self) -> int:
@@ -80,8 +82,8 @@ def export_soup(run: SoupRun, path: Path | str, config: ExportConfig, crop: Crop
     keeps_all = kind_of(path) in WHOLE
     soft = keeps_all or config.alpha or config.colors == "keep"
     apart = config.sky == "apart" and not keeps_all and "objects" in writer_of(path).HOLDS
-    least = (0.0 if keeps_all else OPAQUE_FROM) if config.min_opacity is None else config.min_opacity
-    if run.solid is not None and config.triangles == "opaque" and not soft:
+    least = (0.0 if keeps_all or config.alpha else OPAQUE_FROM) if config.min_opacity is None else config.min_opacity
+    if run.solid is not None and not keeps_all and why_soup(path, config) is None:
         if config.min_opacity is not None:
             raise InputError(
                 "--min-opacity: the opaque mesh has no fainter triangles; leave it out, or --triangles soup"
@@ -97,8 +99,20 @@ def export_soup(run: SoupRun, path: Path | str, config: ExportConfig, crop: Crop
     )
     if keeps_all:
         _write_whole(run, path, config, chosen)
-        return Export(path, int(chosen.kept.sum()), 0, chosen.removed, Similarity())
-    return _write(run, path, config, chosen, apart=apart)
+        written = Export(path, int(chosen.kept.sum()), 0, chosen.removed, Similarity())
+    else:
+        written = _write(run, path, config, chosen, apart=apart)
+    return replace(written, notes=_without_capture(run, path, config))
+
+
+def why_soup(path: Path, config: ExportConfig) -> str | None:
+    """The setting by which a file of triangles has those of the soup, and not a run's opaque mesh; None if none has."""
+    reasons = {
+        "--alpha": config.alpha,
+        "--colors keep": config.colors == "keep",
+        "--triangles soup": config.triangles == "soup",
+    }
+    return None if kind_of(path) in WHOLE else next((reason for reason, holds in reasons.items() if holds), None)
 
 
 def _check(path: Path, config: ExportConfig) -> None:
@@ -186,13 +200,31 @@ def _write(run: SoupRun, path: Path, config: ExportConfig, chosen: Selection, *,
 
 def transform_of(run: SoupRun, config: ExportConfig, corners: Float[Tensor, "N 3 3"]) -> Similarity:
     """The `placement` of a soup; nothing is turned where nobody knows where up is."""
-    georeference = _georeference(run)
-    up = told_up(georeference)
+    return placement(run.path, config, corners, _up(run), _georeference(run), _STRAYS)
+
+
+def _up(run: SoupRun) -> Float[Tensor, "3"] | None:
+    """Where up is, by the place in the world, the cameras, or a file that was turned already."""
+    up = told_up(_georeference(run))
     if up is None and run.capture is not None:
         up = up_of(run.capture)
-    if up is None:
-        up = noted_up(run.soup.notes.get(UP_NOTE))
-    return placement(run.path, config, corners, up, georeference, _STRAYS)
+    return noted_up(run.soup.notes.get(UP_NOTE)) if up is None else up
+
+
+def _without_capture(run: SoupRun, path: Path, config: ExportConfig) -> tuple[str, ...]:
+    """What is otherwise in a file because the capture has gone, and the remedy; nothing if nothing is."""
+    kind = kind_of(path)
+    triangles = kind not in WHOLE
+    one_color = config.colors == "mean" and not isinstance(run.soup, SolidSoup) and run.soup.drawn_degree > 0
+    turned = config.up != "keep" and config.place != "world"
+    effects = {
+        "colours are what is the same from every side": triangles and one_color,
+        "nothing is turned, since nobody knows where up is": triangles and turned and _up(run) is None,
+        "triangles are in order of opacity and size, not of what photos show": kind in (".etz", ".html"),
+        "there are no photos on the page": kind == ".html",
+    }
+    said = "; ".join(effect for effect, holds in effects.items() if holds)
+    return (f"its scene {run.gone} has gone: {said} (--scene names it)",) if run.gone is not None and said else ()
 
 
 def _georeference(run: SoupRun) -> Georeference | None:

@@ -105,7 +105,7 @@ def select(
         _clean(choice, soup, run.needed_capture(), on_sky, drawn if opaque else None)
     removed: dict[Reason, int] = {reason: count for reason, count in choice.removed.items() if count}
     if not bool(choice.kept.any()):
-        raise InputError(f"{run.path}: {_nothing_left(removed)}")
+        raise InputError(f"{run.path}: {_nothing_left(run, removed)}")
     return Selection(choice.kept, on_sky, surroundings, region, removed)
 
 
@@ -200,10 +200,19 @@ def _clean(
     choice.leave_out("alone", alone)
 
 
-def _nothing_left(removed: Mapping[Reason, int]) -> str:
+def faint_remedy(run: SoupRun) -> str:
+    """What to do where most of a soup is left out as too faint."""
+    if run.opaque is not None:
+        return "lower --min-opacity, or take the run's opaque mesh (without --alpha, --colors keep, --triangles soup)"
+    if run.in_blocks:
+        return "lower --min-opacity, or train with --finish opaque; no opaque mesh is made of blocks"
+    return "lower --min-opacity, or take the opaque mesh (train --asset)"
+
+
+def _nothing_left(run: SoupRun, removed: Mapping[Reason, int]) -> str:
     remedy = "leave out --clean"
     if "crop" in removed:
         remedy = "choose another --crop, in the units and axes of the capture"
     elif list(removed) == ["faint"]:
-        return "no triangle is opaque enough; lower --min-opacity, or take the opaque mesh (train --asset)"
+        return f"no triangle is opaque enough; {faint_remedy(run)}"
     return f"nothing is left of it ({in_words(removed)}); {remedy}"

@@ -287,10 +287,12 @@ class SoupRun:
     Attributes:
         path: what was opened: a run directory or a file.
         soup: the triangles.
-        capture: cameras and photos; images are decoded when they are asked for. None for a file without its scene.
+        capture: cameras and photos; images are decoded when they are asked for. None where it is not known.
         opaque: the opaque mesh that the run made beside the soup, on the CPU; None if it made none.
         test_cameras: of a run that refined cameras, those of test views, by their index, from which they are aligned.
         engine: that draws videos, pictures and what the viewer shows; None for the one of the soup's device.
+        in_blocks: whether it was trained in blocks, of which no opaque mesh is made.
+        gone: the folder of its scene, where that is not there any more.
     """
 
     path: Path
@@ -299,6 +301,8 @@ class SoupRun:
     opaque: MeshFile | None = None
     test_cameras: Mapping[int, Cameras] = field(default_factory=dict)
     engine: str | None = None
+    in_blocks: bool = False
+    gone: str | None = None
 
     @property
     def device(self) -> torch.device:
@@ -321,6 +325,8 @@ class SoupRun:
         Raises:
             InputError: it is not known.
         """
+        if self.gone is not None:
+            raise InputError(f"{self.path}: its scene {self.gone} has gone; name where it is now with --scene")
         if self.capture is None:
             why = "a file does not say which scene it shows"
             if is_run(self.path):
@@ -345,7 +351,8 @@ def open_run(
 
     Raises:
         EngineUnavailableError: `device` or `engine` asks for a GPU, and something is missing.
-        InputError: nothing there, neither a run with a soup nor a readable file; the capture has gone.
+        InputError: nothing there, neither a run with a soup nor a readable file. A capture that has gone is an error
+            only where it is needed.
     """
     path, place = Path(path), resolve_device(device, engine)
     if not path.exists():
@@ -418,13 +425,14 @@ def _open_directory(path: Path, scene: Dataset | Path | str | None, device: torc
     paths, width = config["paths"], config["config"]["width"]
     source = paths["source"] if scene is None else scene
     opaque = load_opaque(run.opaque_path) if run.opaque_path.is_file() else None
+    opened = SoupRun(path, soup, None, opaque, in_blocks=paths.get("blocks") is not None)
     if source is None:
-        return SoupRun(path, soup, None, opaque)
+        return opened
     if isinstance(source, Dataset):
         given = source
     elif scene is None and source != DEMO_SCENE and not Path(source).is_dir():
-        raise InputError(f"{path}: its scene {source} has gone; name where it is now with --scene")
+        return replace(opened, gone=source)
     else:
         given = load_scene(source, width, paths.get("images"), paths.get("masks"), preload=False)
     capture = refined_capture(given, path)
-    return SoupRun(path, soup, capture, opaque, {} if capture is given else alignment_starts(given, capture))
+    return replace(opened, capture=capture, test_cameras={} if capture is given else alignment_starts(given, capture))
