@@ -43,6 +43,16 @@ def test_a_missing_folder_is_an_input_error(tmp_path):
         file.write_text("x")
 
 
+def test_a_file_in_the_place_of_a_folder_is_an_input_error_that_names_what_was_asked_for(tmp_path):
+    """Of an earlier version it speaks where there is one."""
+    (tmp_path / "a").write_text("old")
+    with pytest.raises(InputError, match=r"cannot write .*/a/b\.txt: Not a directory; .*choose another folder$"):  # noqa: SIM117
+        with atomic_write(tmp_path / "a" / "b.txt") as file:
+            file.write_text("x")
+    with pytest.raises(InputError, match="an earlier version of the file is unchanged"), atomic_write(tmp_path / "a"):
+        raise OSError(28, "No space left on device")
+
+
 @pytest.mark.skipif(hasattr(os, "geteuid") and os.geteuid() == 0, reason="the superuser may write anywhere")
 def test_a_read_only_folder_is_an_input_error(tmp_path):
     tmp_path.chmod(0o500)

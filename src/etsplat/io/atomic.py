@@ -5,7 +5,7 @@ import os
 import re
 import secrets
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from etsplat.core.errors import InputError
@@ -51,7 +51,8 @@ def atomic_write(path: Path | str) -> Iterator[Path]:
     except OSError as error:
         raise write_error(path, error) from error
     finally:
-        temporary.unlink(missing_ok=True)
+        with suppress(FileNotFoundError, NotADirectoryError):
+            temporary.unlink()
 
 
 def destination_of(temporary: Path) -> Path | None:
@@ -64,7 +65,8 @@ def write_error(path: Path | str, error: OSError) -> InputError:
     """The one-line InputError for a failed write to `path`: what the system said, and what to do."""
     reason = error.strerror or str(error) or type(error).__name__  # some libraries raise OSError without a number
     remedy = _REMEDIES.get(error.errno or 0, "check the disk and the folder's permissions")
-    return InputError(f"cannot write {path}: {reason}; {remedy} (an earlier version of the file is unchanged)")
+    stays = " (an earlier version of the file is unchanged)" if os.path.isfile(path) else ""
+    return InputError(f"cannot write {path}: {reason}; {remedy}{stays}")
 
 
 def _flush(path: Path) -> None:
