@@ -290,6 +290,19 @@ def test_the_soup_in_the_place_of_the_mesh_is_whole_and_said(
     assert "--asset" not in said
 
 
+def test_the_file_of_the_opaque_mesh_is_drawn_and_exported_by_itself(
+    run: tuple[RunDirectory, list[Event]], capture: Dataset, tmp_path: Path
+) -> None:
+    whole, alone = open_run(run[0].path), open_run(run[0].opaque_path)
+    assert whole.solid is not None
+    camera = capture.cameras[0]
+    assert torch.equal(alone.soup.render_opaque(camera), whole.solid.render_opaque(camera))
+    config = ExportConfig(up="keep", sky="joined")
+    for opened, name in ((whole, "a.ply"), (alone, "b.ply")):
+        export_soup(opened, tmp_path / name, config)
+    assert torch.equal(load_mesh(tmp_path / "a.ply").vertices, load_mesh(tmp_path / "b.ply").vertices)
+
+
 def test_corners_of_the_sky_keep_their_colours_when_they_are_turned_inwards(tmp_path: Path) -> None:
     """A sky triangle that runs outwards is turned in the file; what each of its corners is coloured stays."""
     far = torch.tensor([[10.0, -1, 0], [10, 1, 0], [10, 0, 1]])  # counterclockwise from outside

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from jaxtyping import Float, Int64
-from safetensors import SafetensorError
+from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from etsplat.core.errors import InputError
@@ -39,6 +39,15 @@ def save_opaque(path: Path, mesh: MeshFile) -> None:
     assert mesh.vertex_colors is not None
     tensors = {"vertices": mesh.vertices, "faces": mesh.faces, "vertex_colors": mesh.vertex_colors}
     save_tensors(path, tensors, {"format": FORMAT})
+
+
+def holds_opaque(path: Path) -> bool:
+    """Whether a file of tensors is one of `save_opaque`."""
+    try:
+        with safe_open(path, framework="pt") as file:
+            return (file.metadata() or {}).get("format") == FORMAT
+    except (SafetensorError, OSError, ValueError):
+        return False
 
 
 def load_opaque(path: Path) -> MeshFile:

@@ -17,9 +17,11 @@ from etsplat.core.kernels import DISTANCES, KERNELS
 from etsplat.core.rasterization import SOUP_SIGMA_FLOOR
 from etsplat.io.export_records import damaged, read_record, transform_of_record
 from etsplat.io.mesh_files import load_exported
+from etsplat.io.opaque_files import holds_opaque, load_opaque
 from etsplat.io.paths import kind_of
 from etsplat.io.ply_tables import CORNERS, columns, read_ply_header, read_ply_tables
 from etsplat.io.tensors import read_state_dict
+from etsplat.model.solid_soup import SolidSoup
 from etsplat.model.soup_appearance import SoupAppearance
 from etsplat.model.soup_compact import open_compact
 from etsplat.model.triangle_soup import GEOREFERENCE_NOTE, UP_NOTE, TriangleSoup
@@ -40,8 +42,8 @@ def open_soup(path: Path | str) -> TriangleSoup:
     """Read triangles from any file that holds some.
 
     Args:
-        path: `.safetensors` of `etsplat train`; `.etz` of `etsplat export`; `.pt` of Triangle Splatting
-            (`point_cloud_state_dict.pt`); `.ply` that `etsplat export` wrote, of a Gaussian scene or of a mesh; `.obj`,
+        path: `.safetensors` of `etsplat train`, its opaque mesh too; `.etz` of `etsplat export`; `.pt` of Triangle
+            Splatting (`point_cloud_state_dict.pt`); `.ply` that `etsplat export` wrote, of a Gaussian scene or of a mesh; `.obj`,
             `.off`, `.glb`, `.gltf`, `.stl`. What `etsplat export` turned, scaled and placed is in the frame of its
             capture again, where the file says how (OFF does not).
 
@@ -51,7 +53,12 @@ def open_soup(path: Path | str) -> TriangleSoup:
     path = Path(path)
     if not path.is_file():
         raise InputError(f"soup {path}: no such file; check the path")
-    if kind_of(path) == ".safetensors":
+    if kind_of(path) == ".safetensors" and holds_opaque(path):
+        mesh = load_opaque(path)
+        assert mesh.vertex_colors is not None
+        corners, colors = mesh.vertices[mesh.faces], mesh.vertex_colors[mesh.faces]
+        soup = SolidSoup.of_corners(corners, colors, SoupAppearance(), {"source": path.name})
+    elif kind_of(path) == ".safetensors":
         soup = TriangleSoup.load(path)
     elif kind_of(path) == ".etz":
         soup = open_compact(path)
