@@ -193,7 +193,9 @@ def test_the_page_of_a_soup_has_no_mesh_but_opaque_pictures_and_bands(tmp_path: 
 
 def test_what_eval_measured_is_on_the_page(tmp_path: Path) -> None:
     folder = write_soup_run(tmp_path / "run")
-    assert "not measured" in write_report(folder).read_text(encoding="utf-8")
+    before = write_report(folder).read_text(encoding="utf-8")
+    assert "not measured" in before
+    assert "`etsplat eval` with `--lpips-weights download`, or a file of weights, measures it" in before
     RunDirectory(folder).write_evaluation({"fps": 12.34, "ms_per_million": 820.4, "lpips_3dgs": 0.2345})
     page = write_report(folder).read_text(encoding="utf-8")
     assert "not measured" not in page

@@ -115,3 +115,11 @@ def test_photos_in_memory_are_not_asked_for_again(capture: Dataset, monkeypatch:
     lazy.preload()
     assert lazy.held_bytes == size * count
     assert check_memory(views, SHORT, 600, CPU).kept == size * count
+
+
+def test_photos_that_are_decoded_anew_on_purpose_are_not_said_to_be_too_large(capture: Dataset) -> None:
+    own = capture.images
+    many = replace(capture, images=LazyPictures(own.picture, own.sizes, [99] * len(own.sizes), own.fingerprint, 0))
+    for streams in (False, True):
+        notes = check_train(many, SHORT, 2, CPU, streams=streams)
+        assert any("do not fit into memory" in note for note in notes) is not streams

@@ -139,12 +139,13 @@ def _textured_cards(metrics: dict[str, Any]) -> list[Metric]:
 def describe_soup(metrics: dict[str, Any]) -> list[Metric]:
     """The cards for the metrics.json of a soup, together with what `etsplat eval` found, if it was asked."""
     ask = "`etsplat eval` measures it"
+    weights = "`etsplat eval` with `--lpips-weights download`, or a file of weights, measures it"
     no_views = "no test views"
     return [
         number_card(metrics, "psnr", "PSNR", "dB", fixed(2), _SOUP_PSNR, no_views),
         number_card(metrics, "ssim", "SSIM", "", fixed(4), _SOUP_SSIM, no_views),
         number_card(metrics, "flip", "FLIP", "", fixed(4), _FLIP, no_views),
-        number_card(metrics, "lpips_3dgs", "LPIPS", "", fixed(4), _SOUP_LPIPS, metrics.get("lpips_reason") or ask),
+        number_card(metrics, "lpips_3dgs", "LPIPS", "", fixed(4), _SOUP_LPIPS, metrics.get("lpips_reason") or weights),
         *_opaque_cards(metrics),
         number_card(metrics, "psnr_affine", "PSNR, colours fitted", "dB", fixed(2), _PSNR_AFFINE, no_views),
         Metric("Triangles", f"{metrics['triangles']:,}", "", _triangles_meaning(metrics)),

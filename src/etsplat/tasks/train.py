@@ -167,7 +167,8 @@ def _fit(
     iterations = limited_iterations(config.iterations, config.schedule.max_epochs, len(own.train), config.batch)
     degree = config.drawing.sh_degree
     around = 0 if part is None else bytes_around(len(part.rest), degree, recolored=part.recolors)
-    for note in (*own.notes, *check_train(own, config, iterations, job.device, around)):
+    streams = part is not None and part.recolors  # the sky among all blocks
+    for note in (*own.notes, *check_train(own, config, iterations, job.device, around, streams=streams)):
         job.announce(NoteEvent(note))
     hashes = {"fingerprint": own.fingerprint(), **({} if part is None else {"part": part.digest()})}
     job.identify(hashes, paths, iterations)

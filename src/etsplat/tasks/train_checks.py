@@ -14,7 +14,13 @@ USUAL_EXTENT = (0.5, 50.0)
 
 
 def check_train(
-    capture: Dataset, config: TrainConfig, iterations: int, device: torch.device, around: int = 0
+    capture: Dataset,
+    config: TrainConfig,
+    iterations: int,
+    device: torch.device,
+    around: int = 0,
+    *,
+    streams: bool = False,
 ) -> list[str]:
     """Refuses what cannot work; returns what the owner of a run of so many iterations should know.
 
@@ -24,6 +30,7 @@ def check_train(
         iterations: of the run.
         device: where it runs.
         around: bytes of triangles that are drawn as well (`bytes_around`).
+        streams: whether photos are decoded anew on purpose, as those of all blocks.
     """
     if not capture.train:
         raise InputError("capture: has no view to train on; name some in its split")
@@ -41,7 +48,7 @@ def check_train(
         setting = f"pixels_per_triangle {config.pixels_per_triangle:g}"
         notes.append(f"few pixels: at most {limit:,} triangles, not {config.max_triangles:,} ({setting})")
     notes += straight_alpha(capture)
-    if capture.images.streamed:
+    if capture.images.streamed and not streams:
         notes.append("the photos do not fit into memory: they are decoded anew whenever they are needed")
     if capture.exact_points is None:
         unless = " unless its depth maps agree" if capture.images.with_depth and config.loss.depth != "off" else ""
