@@ -47,7 +47,11 @@ if TYPE_CHECKING:
 else:
     Kind = Literal[(*PURPOSES, None)]  # within: of a union tyro's errors would list them in another order each time
 _FORMAT = "\n".join(
-    ["Kind of file; by default what --out ends in, or glb.", *(f"{kind}: {use}" for kind, use in PURPOSES.items())]
+    [
+        "Kind of file; by default what --out ends in, or glb. Of a reconstruction glb, obj, ply;",
+        "with --texture safetensors too, for etsplat.",
+        *(f"{kind}: {use}" for kind, use in PURPOSES.items()),
+    ]
 )
 
 
@@ -204,7 +208,8 @@ class Export(Command):
     format: Annotated[Kind, tyro.conf.arg(help=_FORMAT)] = None
     out: Path | None = None
     """The file to write; by default soup.FORMAT in the run's folder;
-    of a reconstruction textured.FORMAT, or light.FORMAT with --faces alone."""
+    of a reconstruction textured.FORMAT, or light.FORMAT with --faces alone;
+    with neither --texture nor --faces mesh.FORMAT, in the place of the one that the run wrote."""
     scene: Path | None = None
     """The capture's folder, if it has moved or a file is given: for colours as the cameras saw them, and for up."""
     device: Device | None = None
