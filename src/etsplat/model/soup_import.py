@@ -43,9 +43,9 @@ def open_soup(path: Path | str) -> TriangleSoup:
 
     Args:
         path: `.safetensors` of `etsplat train`, its opaque mesh too; `.etz` of `etsplat export`; `.pt` of Triangle
-            Splatting (`point_cloud_state_dict.pt`); `.ply` that `etsplat export` wrote, of a Gaussian scene or of a mesh; `.obj`,
-            `.off`, `.glb`, `.gltf`, `.stl`. What `etsplat export` turned, scaled and placed is in the frame of its
-            capture again, where the file says how (OFF does not).
+            Splatting (`point_cloud_state_dict.pt`); `.ply` that `etsplat export` wrote, of a Gaussian scene or of a
+            mesh; `.obj`, `.off`, `.glb`, `.gltf`, `.stl`. What `etsplat export` turned, scaled and placed is in the
+            frame of its capture again, where the file says how (OFF does not).
 
     Raises:
         InputError: the file is missing, damaged or of another kind.
