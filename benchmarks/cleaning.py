@@ -12,9 +12,9 @@ from statistics import fmean
 
 from etsplat.metrics.image import psnr
 from etsplat.model.soup_appearance import OPAQUE_FROM
+from etsplat.tasks.opened_runs import SoupRun, open_run
 from etsplat.tasks.scoring import Scorer
 from etsplat.tasks.soup_selection import Selection, select
-from etsplat.tasks.sources import SoupRun, open_run
 
 COLUMNS = (
     "run",

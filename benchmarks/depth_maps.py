@@ -24,7 +24,7 @@ from etsplat.io.mesh_files import MeshFile, load_mesh
 from etsplat.io.ply_tables import encode_ply
 from etsplat.metrics.geometry import geometry_metrics
 from etsplat.ops.rasterize_opaque import rasterize_opaque
-from etsplat.tasks.sources import open_run
+from etsplat.tasks.opened_runs import open_run
 
 COMMAND = "import sys; from etsplat.cli import main; sys.exit(main())"
 SAMPLES, CLOUD = 50_000, "cloud.ply"

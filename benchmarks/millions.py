@@ -24,7 +24,7 @@ from etsplat.model.soup_import import open_soup
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.tasks.export_config import ExportConfig
 from etsplat.tasks.export_soup import export_soup
-from etsplat.tasks.sources import open_run
+from etsplat.tasks.opened_runs import open_run
 from tests.helpers.browser import browser_page
 
 STEPS: dict[str, tuple[str, ExportConfig]] = {

@@ -25,9 +25,10 @@ from etsplat.data.dataset import Dataset
 from etsplat.io.tensors import read_tensors
 from etsplat.metrics.image import psnr
 from etsplat.optim.camera_motion import distance_shown, moved
+from etsplat.tasks.opened_runs import open_run
 from etsplat.tasks.refined_cameras import alignment_starts, refined_capture
 from etsplat.tasks.scoring import Scorer
-from etsplat.tasks.sources import load_source, open_run
+from etsplat.tasks.sources import load_source
 
 DEGREES, OF_DISTANCE = 0.5, 0.01
 

@@ -27,8 +27,8 @@ from etsplat.model.soup_import import open_soup
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.tasks.export_config import ExportConfig
 from etsplat.tasks.export_soup import export_soup
+from etsplat.tasks.opened_runs import SoupRun, open_run
 from etsplat.tasks.scoring import Scorer
-from etsplat.tasks.sources import SoupRun, open_run
 from tests.helpers.browser import WEBGPU, Page, browser_page
 
 FRAME = """sceneViewer.then((v) => {

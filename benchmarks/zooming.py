@@ -21,9 +21,10 @@ from etsplat.data.pictures import as_float
 from etsplat.io.images import over_background
 from etsplat.io.run_directory import RunDirectory
 from etsplat.metrics.image import psnr
+from etsplat.tasks.opened_runs import SoupRun, open_run
 from etsplat.tasks.render_config import RenderConfig
 from etsplat.tasks.render_soup import draw
-from etsplat.tasks.sources import SoupRun, load_scene, open_run
+from etsplat.tasks.sources import load_scene
 
 FACTORS = (0.25, 0.5, 1.0, 2.0)
 

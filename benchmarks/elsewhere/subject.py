@@ -17,8 +17,8 @@ from etsplat.model.model import Model
 from etsplat.model.textured_mesh import TexturedMesh
 from etsplat.model.triangle_mesh import TriangleMesh
 from etsplat.tasks.export_mesh import is_reconstruction, open_reconstruction
+from etsplat.tasks.opened_runs import open_run
 from etsplat.tasks.scoring import Scorer
-from etsplat.tasks.sources import open_run
 from tests.helpers.gltf import read_glb
 
 AROUND, SIDE, ANGLE = 6, 400, 40.0

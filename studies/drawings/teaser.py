@@ -13,11 +13,11 @@ from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.measures import bounding_ball
 from etsplat.io.mesh_files import load_mesh
 from etsplat.io.run_directory import RunDirectory, is_run
+from etsplat.tasks.opened_runs import open_run
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.render_config import RenderConfig
 from etsplat.tasks.render_soup import draw
 from etsplat.tasks.soup_trainer import start_trainer
-from etsplat.tasks.sources import open_run
 from etsplat.tasks.train_config import TrainConfig
 from studies.objects.pictures import draw_shape
 

@@ -142,8 +142,8 @@ def evaluate_cells(
 
     Speed is measured here, with nothing else running, and not while the grid runs.
     """
+    from etsplat.tasks.opened_runs import open_run
     from etsplat.tasks.scoring import evaluate_run
-    from etsplat.tasks.sources import open_run
     from studies.peers.training import evaluate_peer
 
     done, rows = [cell for cell in cells if cell.state == "done"], []

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from etsplat.model.triangle_soup import TriangleSoup
-from etsplat.tasks.sources import SoupRun
+from etsplat.tasks.opened_runs import SoupRun
 from etsplat.viewer import server
 from helpers.captures import write_colmap
 from helpers.commands import Run, assert_one_line_error

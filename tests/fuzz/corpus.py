@@ -30,7 +30,7 @@ from etsplat.model.soup_compact import compact_of
 from etsplat.optim.checkpoints import save_checkpoint
 from etsplat.tasks.export_config import ExportConfig
 from etsplat.tasks.export_soup import export_soup
-from etsplat.tasks.sources import SoupRun
+from etsplat.tasks.opened_runs import SoupRun
 from helpers import foreign_captures
 from helpers.captures import write_colmap, write_transforms
 from helpers.photos import upright_picture, write_phone_photo

@@ -31,7 +31,7 @@ from etsplat.io.run_directory import RunDirectory, is_run
 from etsplat.metrics.image import Lpips
 from etsplat.model.soup_import import open_soup
 from etsplat.optim.checkpoints import load_latest_checkpoint
-from etsplat.tasks.sources import open_run
+from etsplat.tasks.opened_runs import open_run
 from tests.fuzz import corpus
 from tests.fuzz.mutate import mutated
 from tests.fuzz.session import Refused

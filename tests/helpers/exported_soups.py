@@ -8,7 +8,7 @@ from etsplat import intrinsics, look_at
 from etsplat.core.cameras import Cameras
 from etsplat.model.soup_appearance import SoupAppearance
 from etsplat.model.triangle_soup import TriangleSoup
-from etsplat.tasks.sources import SoupRun
+from etsplat.tasks.opened_runs import SoupRun
 
 UP_AXIS = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
 CAMERA = Cameras(

@@ -10,7 +10,7 @@ from etsplat.model.soup_appearance import SoupAppearance
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.tasks.export_config import ExportConfig
 from etsplat.tasks.export_soup import export_soup
-from etsplat.tasks.sources import SoupRun
+from etsplat.tasks.opened_runs import SoupRun
 
 SIZE = (400, 300)
 

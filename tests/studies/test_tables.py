@@ -8,10 +8,10 @@ from typing import Any
 import pytest
 
 from etsplat.engines.threads import num_threads, set_num_threads
+from etsplat.tasks.opened_runs import open_run
 from etsplat.tasks.reconstruct import reconstruct
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.scoring import evaluate_run
-from etsplat.tasks.sources import open_run
 from etsplat.tasks.sweeps.cells import run_cells
 from etsplat.tasks.sweeps.places import Where
 from etsplat.tasks.train import train

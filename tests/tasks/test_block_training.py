@@ -24,8 +24,8 @@ from etsplat.tasks import block_training, train_memory
 from etsplat.tasks import train as tasks_train
 from etsplat.tasks.export_config import ExportConfig
 from etsplat.tasks.export_soup import export_soup
+from etsplat.tasks.opened_runs import open_run
 from etsplat.tasks.scene_part import ScenePart
-from etsplat.tasks.sources import open_run
 from etsplat.tasks.train import TrainResult, train
 from etsplat.tasks.train_config import TrainConfig
 from helpers.captures import small_demo_scene

@@ -11,9 +11,9 @@ import etsplat
 from etsplat.core.errors import InputError
 from etsplat.model.solid_soup import SolidSoup
 from etsplat.tasks.export_soup import export_soup
+from etsplat.tasks.opened_runs import open_run
 from etsplat.tasks.render_config import RenderConfig
 from etsplat.tasks.render_soup import draw, drawn_soup
-from etsplat.tasks.sources import open_run
 
 TINY = etsplat.TrainConfig.tiny().changed({"width": 32, "iterations": 60})
 

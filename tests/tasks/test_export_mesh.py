@@ -18,9 +18,9 @@ from etsplat.io.ply_tables import read_ply_tables
 from etsplat.io.run_directory import RunDirectory
 from etsplat.model.textured_mesh import TexturedMesh
 from etsplat.tasks import texturing
+from etsplat.tasks.opened_runs import open_run
 from etsplat.tasks.reconstruct import reconstruct
 from etsplat.tasks.reconstruct_config import ReconstructConfig
-from etsplat.tasks.sources import open_run
 from helpers.captures import circle_poses, write_colmap
 from helpers.gltf import check_glb
 

@@ -22,7 +22,7 @@ from etsplat.model.surroundings import Surroundings
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.tasks.export_config import ExportConfig
 from etsplat.tasks.export_soup import export_soup, transform_of
-from etsplat.tasks.sources import SoupRun, open_run
+from etsplat.tasks.opened_runs import SoupRun, open_run
 from helpers.captures import write_colmap
 from helpers.exported_soups import CAMERA, UP_AXIS, difference, odd_soup, run_of
 from helpers.gltf import check_glb

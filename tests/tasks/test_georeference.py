@@ -15,7 +15,7 @@ from etsplat.io.ply_tables import read_ply_tables
 from etsplat.model.soup_import import open_soup
 from etsplat.tasks.export_config import ExportConfig
 from etsplat.tasks.export_soup import export_soup
-from etsplat.tasks.sources import open_run
+from etsplat.tasks.opened_runs import open_run
 from helpers import foreign_captures as foreign
 from helpers.captures import small_demo_scene
 

@@ -31,11 +31,11 @@ from etsplat.tasks import train as tasks_train
 from etsplat.tasks.export_config import ExportConfig
 from etsplat.tasks.export_soup import export_soup
 from etsplat.tasks.opaque import finished_mesh, make_opaque_trainer, opaque_mesh, start_mesh
+from etsplat.tasks.opened_runs import SoupRun, open_run
 from etsplat.tasks.render_config import RenderConfig
 from etsplat.tasks.render_soup import draw, drawn_soup
 from etsplat.tasks.scoring import evaluate_run
 from etsplat.tasks.soup_trainer import shown_across
-from etsplat.tasks.sources import SoupRun, open_run
 from etsplat.tasks.train import train
 from etsplat.tasks.train_config import TrainConfig
 from helpers.captures import small_demo_scene

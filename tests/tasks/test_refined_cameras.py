@@ -20,11 +20,11 @@ from etsplat.report.cards import cards_of
 from etsplat.report.data import read_run
 from etsplat.tasks.camera_results import angle
 from etsplat.tasks.export_mesh import Reconstruction
+from etsplat.tasks.opened_runs import SoupRun
 from etsplat.tasks.reconstruct import reconstruct
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.refined_cameras import alignment_starts, kept_aside, refined_capture
 from etsplat.tasks.scoring import evaluate_run
-from etsplat.tasks.sources import SoupRun
 from etsplat.tasks.train import train
 from etsplat.tasks.train_config import TrainConfig
 

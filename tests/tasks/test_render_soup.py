@@ -16,9 +16,9 @@ from etsplat.io.images import load_image, over_background
 from etsplat.io.videos import open_video
 from etsplat.model.soup_appearance import SoupAppearance
 from etsplat.model.triangle_soup import FOCAL_NOTE, TriangleSoup
+from etsplat.tasks.opened_runs import SoupRun
 from etsplat.tasks.render_config import RenderConfig
 from etsplat.tasks.render_soup import color_depth, draw, drawn_soup, render_run, samples_of
-from etsplat.tasks.sources import SoupRun
 from helpers.captures import circle_poses, write_colmap
 from helpers.engines import noted_engine
 

@@ -14,9 +14,9 @@ from etsplat.data.demo_scene import demo_scene
 from etsplat.io.run_directory import RunDirectory
 from etsplat.optim.loop import CheckpointEvent
 from etsplat.report import write_report
+from etsplat.tasks.opened_runs import open_run
 from etsplat.tasks.reconstruct import reconstruct
 from etsplat.tasks.reconstruct_config import ReconstructConfig
-from etsplat.tasks.sources import open_run
 from etsplat.tasks.train import train
 from etsplat.tasks.train_config import TrainConfig
 

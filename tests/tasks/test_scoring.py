@@ -9,8 +9,8 @@ from etsplat.io.images import save_image
 from etsplat.metrics.flip import flip
 from etsplat.metrics.image import colors_fitted, psnr, ssim
 from etsplat.model.triangle_soup import TriangleSoup
+from etsplat.tasks.opened_runs import SoupRun
 from etsplat.tasks.scoring import evaluate_run
-from etsplat.tasks.sources import SoupRun
 from helpers.captures import write_colmap, write_photo
 
 

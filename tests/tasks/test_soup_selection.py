@@ -15,8 +15,8 @@ from etsplat.geometry.regions import Box, Sphere
 from etsplat.model.surroundings import SPHERE_TRIANGLES, Surroundings
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.tasks import soup_selection
+from etsplat.tasks.opened_runs import SoupRun, training_cameras
 from etsplat.tasks.soup_selection import in_words, select, surroundings_of, times_shown
-from etsplat.tasks.sources import SoupRun, training_cameras
 
 BALL = 80
 HIDDEN, ABOVE, LONE, SKY = BALL, BALL + 1, BALL + 2, slice(BALL + 3, None)

@@ -18,9 +18,10 @@ from etsplat.data.pictures import StoredPictures
 from etsplat.io.run_directory import RunDirectory
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.optim.loop import CheckpointEvent
+from etsplat.tasks.opened_runs import open_run
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.scoring import evaluate_run
-from etsplat.tasks.sources import load_source, open_run
+from etsplat.tasks.sources import load_source
 from etsplat.tasks.train import train
 from etsplat.tasks.train_config import TrainConfig
 from helpers.captures import write_colmap, write_photo, write_views

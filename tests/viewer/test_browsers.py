@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from etsplat.io.run_directory import RunDirectory
-from etsplat.tasks.sources import SoupRun
+from etsplat.tasks.opened_runs import SoupRun
 from etsplat.viewer import server
 from etsplat.viewer.follow import Followed
 from etsplat.viewer.server import MOST_PIXELS, TALLEST, Viewer, camera_of

@@ -6,7 +6,7 @@ import threading
 
 import pytest
 
-from etsplat.tasks.sources import SoupRun
+from etsplat.tasks.opened_runs import SoupRun
 from etsplat.viewer.guard import Guard
 from etsplat.viewer.server import Viewer
 from viewer.test_viewer import make_soup

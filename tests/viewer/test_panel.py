@@ -20,7 +20,7 @@ from etsplat.data.load import load_dataset
 from etsplat.data.looked_at import middle_photo
 from etsplat.geometry.regions import Sphere
 from etsplat.io.camera_path_files import read_camera_path
-from etsplat.tasks.sources import SoupRun
+from etsplat.tasks.opened_runs import SoupRun
 from etsplat.viewer.pictures import MODES, beside_photo, cropped, picture
 from etsplat.viewer.server import Viewer
 from helpers.captures import write_colmap

@@ -13,7 +13,7 @@ from etsplat.core.errors import InputError
 from etsplat.data.load import load_dataset
 from etsplat.io.run_directory import RunDirectory
 from etsplat.model.triangle_soup import TriangleSoup
-from etsplat.tasks.sources import SoupRun
+from etsplat.tasks.opened_runs import SoupRun
 from etsplat.viewer import follow, server, standing
 from etsplat.viewer.follow import Followed, wait_for_soup
 from etsplat.viewer.pace import SMALLEST, Pace

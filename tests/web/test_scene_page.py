@@ -13,7 +13,7 @@ from etsplat.model.soup_import import open_soup
 from etsplat.report import write_report
 from etsplat.tasks.export_config import ExportConfig
 from etsplat.tasks.export_soup import export_soup
-from etsplat.tasks.sources import SoupRun
+from etsplat.tasks.opened_runs import SoupRun
 from etsplat.web.pages import SCENE_SCRIPTS, SHARED_SCRIPTS, asset
 from helpers.finished_runs import write_run, write_soup_run
 from helpers.scene_pages import (

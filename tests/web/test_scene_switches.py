@@ -9,7 +9,7 @@ from torch.nn import functional
 from etsplat.model.soup_import import open_soup
 from etsplat.tasks.export_config import ExportConfig
 from etsplat.tasks.export_soup import export_soup
-from etsplat.tasks.sources import SoupRun
+from etsplat.tasks.opened_runs import SoupRun
 from helpers.scene_pages import camera_of, decibels, make_soup, opaque_of, soft_of, written
 
 BACKGROUND = (0.2, 0.4, 0.6)

@@ -9,7 +9,7 @@ import torch
 from etsplat.model.soup_import import open_soup
 from etsplat.tasks.export_config import ExportConfig
 from etsplat.tasks.export_soup import export_soup
-from etsplat.tasks.sources import SoupRun
+from etsplat.tasks.opened_runs import SoupRun
 from etsplat.web.pages import asset
 from helpers.browser import WEBGPU
 from helpers.scene_pages import (

@@ -86,8 +86,8 @@ class Evaluate(Command):
         from etsplat.cli.progress import PhaseBar
         from etsplat.io.run_directory import RunDirectory, is_run
         from etsplat.report import write_report
+        from etsplat.tasks.opened_runs import open_run
         from etsplat.tasks.scoring import evaluate_run
-        from etsplat.tasks.sources import open_run
 
         opened = open_run(self.run_dir, self.scene, self.device)
         folder = RunDirectory(self.out or opened.folder)
@@ -167,8 +167,8 @@ class Render(Command):
     def run(self, arguments: Sequence[str]) -> int:
         """Draws, and says where the pictures are."""
         from etsplat.cli.progress import PhaseBar
+        from etsplat.tasks.opened_runs import open_run
         from etsplat.tasks.render_soup import render_run
-        from etsplat.tasks.sources import open_run
 
         crop = _crop(self.crop)
         opened = open_run(self.run_dir, self.scene, self.device, self.engine)
@@ -224,8 +224,8 @@ class Export(Command):
         """Writes the file and says what is in it."""
         from etsplat.tasks.export_mesh import is_reconstruction
         from etsplat.tasks.export_soup import export_soup, why_soup
+        from etsplat.tasks.opened_runs import open_run
         from etsplat.tasks.soup_selection import faint_remedy, in_words
-        from etsplat.tasks.sources import open_run
 
         if is_reconstruction(self.run_dir):
             return self._export_mesh()
@@ -315,7 +315,7 @@ class View(Command):
             if not low <= value <= high:
                 raise InputError(f"{name}: is {value}; it must be between {low} and {high}")
         from etsplat.io.paths import path_remedy
-        from etsplat.tasks.sources import open_run
+        from etsplat.tasks.opened_runs import open_run
         from etsplat.viewer.follow import wait_for_soup
         from etsplat.viewer.server import serve
 

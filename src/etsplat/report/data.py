@@ -9,7 +9,7 @@ from etsplat.io.json_text import check_entries, is_number
 from etsplat.io.overview import TestView, find_test_views
 from etsplat.io.run_directory import RunDirectory, is_run
 from etsplat.report.command import CONFIGS
-from etsplat.tasks.sources import read_record
+from etsplat.tasks.opened_runs import read_record
 
 _NEEDED: dict[str, Any] = {
     "iterations": int,

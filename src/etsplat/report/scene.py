@@ -9,8 +9,8 @@ from etsplat.io.run_directory import RunDirectory
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.report.data import Run
 from etsplat.tasks.demos import DEMO_SCENE
+from etsplat.tasks.opened_runs import SoupRun, open_run
 from etsplat.tasks.scene_page import scene_of
-from etsplat.tasks.sources import SoupRun, open_run
 from etsplat.web.pages import asset, filled, render_scene
 
 MOST_TRIANGLES = 100_000

@@ -12,8 +12,8 @@ from etsplat.model.triangle_mesh import TriangleMesh
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.tasks.export_config import ExportConfig
 from etsplat.tasks.export_soup import Export, export_soup
+from etsplat.tasks.opened_runs import SoupRun, capture_at, open_run
 from etsplat.tasks.reconstruct import ReconstructResult
-from etsplat.tasks.sources import SoupRun, capture_at, open_run
 from etsplat.tasks.train import TrainResult
 
 

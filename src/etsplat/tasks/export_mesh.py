@@ -26,11 +26,12 @@ from etsplat.model.textured_mesh import TexturedMesh
 from etsplat.tasks.demos import DEMO_OBJECT
 from etsplat.tasks.export_config import LIGHT_FACES, ExportConfig
 from etsplat.tasks.normal_map import normal_map_of
+from etsplat.tasks.opened_runs import capture_at, read_record
 from etsplat.tasks.placing import apart_from_world, check_placed, placement
 from etsplat.tasks.reconstruct_config import Pictures, ReconstructConfig
 from etsplat.tasks.refined_cameras import refined_capture
 from etsplat.tasks.settings import settings_of
-from etsplat.tasks.sources import capture_at, fingerprint, load_source, make_subject, read_record
+from etsplat.tasks.sources import fingerprint, load_source, make_subject
 from etsplat.tasks.texturing import Tell, check_installed, coarser, colors_at, texture_object
 
 _OF_MESHES = ("texture", "faces", "normals", "occlusion", "lods", "compress", "pictures", "up", "scale", "place")

@@ -25,10 +25,10 @@ from etsplat.model.triangle_soup import GEOREFERENCE_NOTE, UP_NOTE, TriangleSoup
 from etsplat.ops.soup_colors import soup_colors
 from etsplat.tasks.export_config import ExportConfig
 from etsplat.tasks.export_mesh import check_stored
+from etsplat.tasks.opened_runs import SoupRun, training_cameras
 from etsplat.tasks.placing import apart_from_world, check_placed, placement
 from etsplat.tasks.scene_page import compact_bytes, scene_of, small_camera
 from etsplat.tasks.soup_selection import Crop, Reason, Selection, select
-from etsplat.tasks.sources import SoupRun, training_cameras
 from etsplat.web.pages import render_scene_page
 
 WHOLE = (".safetensors", ".etz", ".html")

@@ -32,11 +32,11 @@ from etsplat.optim.schedules import NEVER, Schedule, Scheduled, exponential_deca
 from etsplat.optim.strategies import HalveWhereWrong
 from etsplat.optim.terms.photometric import Photometric
 from etsplat.optim.trainer import Trainer
+from etsplat.tasks.opened_runs import training_cameras
 from etsplat.tasks.pixel_limits import triangle_limit
 from etsplat.tasks.running import Job
 from etsplat.tasks.settings import get
 from etsplat.tasks.soup_trainer import background_of, shown_across, start_trainer, surroundings_of_run
-from etsplat.tasks.sources import training_cameras
 from etsplat.tasks.train_config import TrainConfig
 
 SOUP_SHARE, SOUP_TRIANGLES, MESH_SHARE = 0.3, 0.5, 1 / 3

@@ -25,9 +25,9 @@ from etsplat.io.paths import kind_of
 from etsplat.io.videos import VideoSink, open_video
 from etsplat.model.soup_appearance import OPAQUE_FROM
 from etsplat.model.triangle_soup import FOCAL_NOTE, TriangleSoup
+from etsplat.tasks.opened_runs import SoupRun
 from etsplat.tasks.render_config import RenderConfig
 from etsplat.tasks.soup_selection import Crop, select
-from etsplat.tasks.sources import SoupRun
 
 _MOST_SAMPLES = 8
 

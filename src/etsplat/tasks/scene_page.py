@@ -17,7 +17,7 @@ from etsplat.io.compact_soups import encode_compact
 from etsplat.model.solid_soup import SolidSoup
 from etsplat.model.soup_compact import compact_of, ranks
 from etsplat.model.triangle_soup import UP_NOTE, TriangleSoup
-from etsplat.tasks.sources import SoupRun, training_cameras
+from etsplat.tasks.opened_runs import SoupRun, training_cameras
 from etsplat.web.pages import ScenePage
 
 SMALL_WIDTH = 400

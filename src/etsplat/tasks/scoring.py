@@ -32,9 +32,9 @@ from etsplat.metrics.geometry import SAMPLES, Surface, chamfer, geometry_metrics
 from etsplat.metrics.image import WINDOW, Lpips, find_lpips_weights, psnr, silhouette_iou, ssim
 from etsplat.model.model import Model
 from etsplat.model.triangle_mesh import TriangleMesh
+from etsplat.tasks.opened_runs import SoupRun
 from etsplat.tasks.running import device_name
 from etsplat.tasks.seen import Seen
-from etsplat.tasks.sources import SoupRun
 
 SMALLEST = 16
 """Pixels a side below which LPIPS is not defined."""

@@ -17,7 +17,7 @@ from etsplat.geometry.regions import Region
 from etsplat.model.surroundings import Surroundings
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.ops.rasterize_opaque import rasterize_opaque
-from etsplat.tasks.sources import SoupRun, training_cameras
+from etsplat.tasks.opened_runs import SoupRun, training_cameras
 
 Crop = Region | Literal["auto"]
 """What a soup is cropped to, in its capture's own units and axes; "auto" is what the photos look at."""

@@ -29,13 +29,14 @@ from etsplat.tasks.depths import trusted_depths, wanted_depths, with_shown_point
 from etsplat.tasks.export_config import ExportConfig
 from etsplat.tasks.export_soup import export_soup
 from etsplat.tasks.opaque import fit_opaque_mesh
+from etsplat.tasks.opened_runs import SoupRun
 from etsplat.tasks.pixel_limits import triangle_limit
 from etsplat.tasks.refined_cameras import kept_aside
 from etsplat.tasks.running import Job, Result, path_of, settings_for
 from etsplat.tasks.scene_part import ScenePart, keep_colors
 from etsplat.tasks.scoring import Scorer
 from etsplat.tasks.soup_trainer import background_of, start_trainer, surroundings_of_run
-from etsplat.tasks.sources import SoupRun, load_scene, with_cloud
+from etsplat.tasks.sources import load_scene, with_cloud
 from etsplat.tasks.train_checks import check_train, doubtful_scale
 from etsplat.tasks.train_config import TrainConfig
 from etsplat.tasks.train_memory import bytes_around

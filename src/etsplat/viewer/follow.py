@@ -11,7 +11,7 @@ from etsplat.io.json_text import is_number
 from etsplat.io.locks import was_killed
 from etsplat.io.run_directory import RunDirectory, is_empty, is_run
 from etsplat.model.triangle_soup import TriangleSoup
-from etsplat.tasks.sources import check_trains
+from etsplat.tasks.opened_runs import check_trains
 
 WAITING_SECONDS = 1.0
 

@@ -10,8 +10,8 @@ from etsplat.data.dataset import Dataset
 from etsplat.io.json_text import is_number
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.optim.loop import Event, StepEvent
+from etsplat.tasks.opened_runs import SoupRun
 from etsplat.tasks.running import end_of
-from etsplat.tasks.sources import SoupRun
 from etsplat.viewer.server import Viewer, check_can_serve
 
 LEAST_SECONDS = 1.0

@@ -28,7 +28,7 @@ from etsplat.data.where_up import up_of
 from etsplat.engines.choice import engine
 from etsplat.io.camera_path_files import KeyPoses
 from etsplat.model.triangle_soup import TriangleSoup
-from etsplat.tasks.sources import SoupRun
+from etsplat.tasks.opened_runs import SoupRun
 from etsplat.viewer.follow import Followed
 from etsplat.viewer.guard import Guard
 from etsplat.viewer.pace import Pace
