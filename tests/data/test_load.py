@@ -358,17 +358,14 @@ def test_masks_of_half_the_size_are_enlarged_as_transparency_too(tmp_path):
         load_dataset(tmp_path, masks_as="alpha")
 
 
-def test_a_folder_mask_is_one_of_masks_where_there_is_no_other(tmp_path):
+def test_a_folder_that_is_called_nearly_as_that_of_masks_is_noted(tmp_path):
     write_colmap(tmp_path, [(16, 12)] * 3)
-    for index in range(3):
-        write_photo(tmp_path / "mask" / f"{index:04d}.png", 16, 12, seed=10 + index)
-    first = load_dataset(tmp_path).images.mask(1)
-    assert first is not None
-    shutil.copytree(tmp_path / "mask", tmp_path / "masks")
-    write_photo(tmp_path / "mask" / "0001.png", 16, 12, seed=99)
-    again = load_dataset(tmp_path).images.mask(1)
-    assert again is not None
-    assert torch.equal(again, first)
+    write_photo(tmp_path / "mask" / "0001.png", 16, 12)
+    found = load_dataset(tmp_path)
+    assert found.images.mask(1) is None
+    assert found.notes[0].startswith("mask/ is not read: call it masks/")
+    shutil.copytree(tmp_path / "images", tmp_path / "masks")
+    assert load_dataset(tmp_path).notes == ()
 
 
 def test_a_part_of_a_scene_and_what_it_lies_in_say_which_folder_is_meant(tmp_path, monkeypatch):

@@ -104,17 +104,17 @@ def test_photos_are_found_by_the_end_of_their_path_in_transforms(tmp_path, place
     assert (again.images[1] == found.images[1]).all()
 
 
-@pytest.mark.parametrize("place", [*ELSEWHERE, "subfolder"])
-@pytest.mark.parametrize("folder", ["images", "."])
+@pytest.mark.parametrize(
+    ("folder", "place"), [(folder, place) for folder in ("images", ".") for place in ELSEWHERE if place != "own"]
+)
 def test_photos_are_found_by_the_end_of_their_path_in_colmaps_models(tmp_path, place, folder):
     """Beside sparse/ as well as in images/; undistortion finds the same."""
     pytest.importorskip("pycolmap")
     scene, names = tmp_path / "scene", [f"{index:04d}.jpg" for index in range(4)]
     write_colmap(scene, [(32, 24)] * 4, image_folder=folder)
     images = scene / "sparse" / "0" / "images.txt"
-    told = {"subfolder": "cam0/{name}", **ELSEWHERE}[place]
     for name in names:
-        new = told.format(scene=scene, name=name, stem=name.removesuffix(".jpg"))
+        new = ELSEWHERE[place].format(scene=scene, name=name, stem=name.removesuffix(".jpg"))
         images.write_text(images.read_text().replace(f" {name}", f" {new}"))
     found = load_dataset(scene)
     assert [name.removeprefix("images_") for name in found.names] == ["0000", "0001", "0002", "0003"]
@@ -125,9 +125,27 @@ def test_photos_are_found_by_the_end_of_their_path_in_colmaps_models(tmp_path, p
 def test_two_names_that_lead_to_one_file_are_refused(tmp_path):
     write_colmap(tmp_path, [(32, 24)] * 4)
     path = tmp_path / "sparse" / "0" / "images.txt"
-    path.write_text(path.read_text().replace("0000.jpg", "cam0/0000.jpg").replace("0001.jpg", "cam1/0000.jpg"))
+    path.write_text(path.read_text().replace("0000.jpg", "/a/0000.jpg").replace("0001.jpg", "/b/0000.jpg"))
     with pytest.raises(InputError, match=r"2 frames have the image 0000\.jpg; keep one"):
         load_dataset(tmp_path)
+
+
+@pytest.mark.parametrize("other", ["0000.png", "other/0000.png"])
+def test_no_other_photo_takes_the_place_of_one_that_is_missing(tmp_path, other):
+    """Nor a photo that of a mask: a name that does not lead out of the capture is the name of that file alone."""
+    write_transforms(tmp_path, 4)
+    (tmp_path / other).parent.mkdir(exist_ok=True)
+    shutil.move(tmp_path / "images" / "0000.png", tmp_path / other)
+    with pytest.raises(InputError, match="1 of 4 images are missing"):
+        load_dataset(tmp_path)
+    shutil.move(tmp_path / other, tmp_path / "images" / "0000.png")
+    path = tmp_path / "transforms.json"
+    document = json.loads(path.read_text())
+    for told in ("masks/0000.png", "/home/me/cap/masks/0000.png"):
+        document["frames"][0]["mask_path"] = told
+        path.write_text(json.dumps(document))
+        with pytest.raises(InputError, match="no such file"):
+            _ = load_dataset(tmp_path).images[0]
 
 
 def test_views_have_names_of_their_own_whatever_their_folders(tmp_path):

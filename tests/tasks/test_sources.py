@@ -177,6 +177,10 @@ def test_an_object_in_a_data_set_is_found_by_its_outlines():
     torch.testing.assert_close(found.normalization.center.float(), expected, rtol=0, atol=1.0)
     assert "the object is about (3" in notes[0]
     assert load_source(found, ReconstructConfig.tiny()) == (found, [])
+    images = [image.clone() for image in far.images]
+    images[far.train[2]][:] = 0
+    with pytest.raises(InputError, match="its mask is empty"):
+        load_source(replace(far, images=StoredPictures(images)), ReconstructConfig.tiny())
     opaque = replace(far, images=StoredPictures([image[..., :3] for image in far.images]))
     assert load_source(opaque, ReconstructConfig.tiny()) == (opaque, [])
 

@@ -217,13 +217,13 @@ def check_count(name: str, value: object, *, least: int = 1, most: float = math.
 
 
 def check_number(name: str, value: object, low: float = -math.inf, high: float = math.inf) -> None:
-    """Raise ValueError unless ``value`` is a number, no bool, from ``low`` to ``high``, as NaN is only unbounded."""
+    """Raise ValueError unless ``value`` is a number, no bool, from ``low`` to ``high`` if these are given."""
     if type(value) is float and low <= value <= high:  # as nearly always
         return
-    number = isinstance(value, Real) or (isinstance(value, Tensor) and value.ndim == 0)
+    number = isinstance(value, Real) or (isinstance(value, Tensor | np.ndarray) and value.ndim == 0)
     if isinstance(value, bool) or not number:
         raise ValueError(f"{name} must be a number, got {shown(value)}")
-    if low > -math.inf and not low <= float(value) <= high:  # pyright: ignore[reportArgumentType]
+    if (low > -math.inf or high < math.inf) and not low <= float(value) <= high:  # pyright: ignore[reportArgumentType]
         bounds = f"from {low:g} to {high:g}" if high < math.inf else f"at least {low:g}"
         raise ValueError(f"{name} must be {bounds}, got {value}")
 

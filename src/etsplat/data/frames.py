@@ -42,8 +42,8 @@ _SAMPLE = 4096
 LARGEST = 1e18
 """Of all numbers of poses and cameras: float32 holds their squares."""
 
-MASK_FOLDERS = ("masks", "mask")
-"""Of a scene, with a mask for each image, called like it; the first that is there."""
+MASK_FOLDER = "masks"
+"""Of a scene, with a mask for each image, called like it."""
 
 DEPTH_FOLDERS = ("depths", "depth")
 """Of a scene, with a depth map for each image, called like it."""
@@ -135,9 +135,8 @@ class Wanted:
         Raises:
             InputError: the folder lacks it; or as `path_within`.
         """
-        own = next((scene / folder for folder in MASK_FOLDERS if (scene / folder).is_dir()), None)
-        folder = self.masks or own
-        if folder is None:
+        folder = self.masks or scene / MASK_FOLDER
+        if self.masks is None and not folder.is_dir():
             return None
         with suppress(InputError):
             return find_mask(folder, name, source)

@@ -12,7 +12,7 @@ from etsplat.core.errors import InputError
 from etsplat.data import formats
 from etsplat.data.dataset import Dataset
 from etsplat.data.doubtful_poses import pose_notes
-from etsplat.data.frames import LARGEST, Listing, MasksAs, Wanted, posed
+from etsplat.data.frames import LARGEST, MASK_FOLDER, Listing, MasksAs, Wanted, posed
 from etsplat.data.georeferencing import near_origin
 from etsplat.data.pictures import LazyPictures
 from etsplat.io.paths import given_path, kind_of, path_remedy
@@ -112,10 +112,17 @@ def load_dataset(
     folder = depths if isinstance(depths, bool) else Path(depths)
     wanted = Wanted(masks_as, images, width, None if masks is None else Path(masks), memory, folder, depth_unit)
     dataset = posed(path, near_origin(path, format_of(path).list_frames(path, wanted)), wanted)
-    dataset = replace(dataset, notes=(*dataset.notes, *pose_notes(dataset)))
+    dataset = replace(dataset, notes=(*dataset.notes, *_other_masks(path, wanted), *pose_notes(dataset)))
     if preload and isinstance(dataset.images, LazyPictures):
         dataset.images.preload(progress)
     return dataset
+
+
+def _other_masks(path: Path, wanted: Wanted) -> tuple[str, ...]:
+    """A note on a folder that is called nearly as that of masks, where there is none."""
+    if wanted.masks is not None or (path / MASK_FOLDER).is_dir() or not (path / "mask").is_dir():
+        return ()
+    return (f"mask/ is not read: call it {MASK_FOLDER}/, or name it with --masks, if masks of all images are there",)
 
 
 def format_of(path: Path) -> Format:

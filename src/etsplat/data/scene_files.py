@@ -222,7 +222,7 @@ def head_of(path: Path, size: int = 4096) -> str:
     return data.decode("utf-16" if utf16 else "utf-8-sig", errors="ignore")
 
 
-def placed_image(folder: Path, said: str, source: Path, wanted: Wanted) -> tuple[str, Path]:
+def placed_image(folder: Path, said: str, source: Path, wanted: Wanted, *, any_end: bool = True) -> tuple[str, Path]:
     """Where an image lies that a file names: in the folder or its `images`, by `placed_file`; without its ending too.
 
     With `wanted.images` in that folder alone.
@@ -231,15 +231,30 @@ def placed_image(folder: Path, said: str, source: Path, wanted: Wanted) -> tuple
         InputError: it is no name.
     """
     places = [folder / "images", folder] if wanted.images is None else [folder / wanted.images]
-    return placed_file(places, said, source, find_image)
+    return placed_file(places, said, source, find_image, any_end=any_end)
 
 
 def placed_file(
-    places: Sequence[Path], said: str, source: Path, find: Callable[[Path, str, Path], Path] = path_within
+    places: Sequence[Path],
+    said: str,
+    source: Path,
+    find: Callable[[Path, str, Path], Path] = path_within,
+    *,
+    least: int = 1,
+    any_end: bool = False,
 ) -> tuple[str, Path]:
     """Where a file lies that another names as it was called on another computer.
 
-    The end of the path, as much of it as there is, in one of the places; the first of these comes first.
+    That name in one of the places, the first of these first. Of a path that leads out of them, as from the root of
+    another computer, the end, as much of it as there is.
+
+    Args:
+        places: folders.
+        said: the path.
+        source: what says it, for messages.
+        find: the file of a name in a folder, with another ending perhaps.
+        least: parts of such an end: with 2 its folder too, of what could be taken for another file.
+        any_end: the end of any path.
 
     Returns:
         The name, from the first folder on that is here too, and the file; one that is not there if none is.
@@ -249,7 +264,8 @@ def placed_file(
     """
     whole = PurePosixPath(said.replace("\\", "/")).parts
     parts = [part for part in whole if part not in ("/", "..") and part[1:] != ":"]
-    ends = ["/".join(parts[start:]) for start in range(len(parts))] or [said]
+    starts = max(1, len(parts) - least + 1) if any_end or len(parts) < len(whole) else 1
+    ends = ["/".join(parts[start:]) for start in range(starts)] if parts else [said]
     for name in ends:
         for place in places:
             path = find(place, name, source)

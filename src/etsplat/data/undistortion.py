@@ -202,7 +202,7 @@ def _read_model(pycolmap: Any, scene: Path, folder: Path) -> tuple[Any, Path, di
         model = pycolmap.Reconstruction(folder)
     except (ValueError, RuntimeError, OSError, LookupError) as error:  # what its C++ throws
         raise InputError(f"scene {folder}: cannot be read as a model ({str(error).splitlines()[0]})") from error
-    found = {name: placed_image(scene, name, folder, Wanted()) for name in _placed(model)}
+    found = {name: placed_image(scene, name, folder, Wanted(), any_end=False) for name in _placed(model)}
     files = {name: path for name, (_, path) in found.items()}
     missing = [name for name, path in files.items() if not path.is_file()]
     if missing:

@@ -29,8 +29,9 @@ WEBP_QUALITY = 90
 
 _WEBP_SIDE = 16383
 
-_DARKEST = 1.5 / 255
-"""Masks that are nowhere brighter, but not black, have been written in other steps than those of their format."""
+_DARKEST, _NOISE = 1.5 / 255, 0.01
+"""Masks that are nowhere brighter, but not black on more than this part, have been written in other steps than those
+of their format."""
 
 _DENSEST = 520
 """Pixels of 16 bits in a byte of PNG, of which deflate makes at most 1032; JPEG needs a bit for 64 pixels at least."""
@@ -197,7 +198,7 @@ def load_mask(path: Path | str, size: tuple[int, int] | None = None) -> Float[Te
     image = load_image(path)
     varies = image.shape[-1] == 4 and bool(image[..., 3].min() < 1)
     mask = image[..., 3].contiguous() if varies else image[..., :3].mean(dim=-1)
-    if 0 < float(mask.max()) < _DARKEST:
+    if float(mask.max()) < _DARKEST and float((mask > 0).float().mean()) > _NOISE:
         raise InputError(
             f"mask {path}: is nearly black all over, so it may have 1 for white, or 255 in 16 bits; write 255 inside"
             " masks that have 1 there, 65535 in 16 bits"

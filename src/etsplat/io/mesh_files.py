@@ -425,7 +425,7 @@ def _check_arrays(vertices: Tensor, faces: Tensor, face_colors: Tensor | None, v
             raise ValueError(f"{name}: expected shape {wanted}, got {tuple(values.shape)}")
         if not bool(torch.isfinite(values).all()):
             raise ValueError(f"{name}: expected finite values, got NaN or Inf")
-        if name.endswith("colors") and (not values.is_floating_point() or float(values.max()) > _BRIGHTEST):
+        if name.endswith("colors") and (not values.is_floating_point() or bool((values > _BRIGHTEST).any())):
             raise ValueError(f"{name}: expected floating-point display values in [0, 1]; divide by 255 what is to 255")
     if faces.is_floating_point():
         raise ValueError(f"faces: expected whole numbers, got {faces.dtype}")

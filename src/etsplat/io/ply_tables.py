@@ -25,6 +25,9 @@ _TYPES = {
 _ALIASES = {"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"}
 _ALIASES |= {"float32": "f4", "float64": "f8", **_TYPES}
 _NAMES = {np.dtype(kind): name for name, kind in _TYPES.items()}
+_BRIGHTEST = 2
+"""Of colours that are no bytes: larger ones are from 0 to 255, others from 0 to 1, and clamped."""
+
 _FORMATS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 _LONGEST_HEADER = 1 << 16
 
@@ -157,7 +160,7 @@ def load_points(path: Path | str) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "
         colors = columns(path, table, "red", "green", "blue").float()
         if table.dtype["red"].kind == "u":
             colors /= np.iinfo(table.dtype["red"]).max
-        elif bool((colors > 1).any()):  # as some programs write what is from 0 to 255
+        elif bool((colors > _BRIGHTEST).any()):  # as some programs write what is from 0 to 255
             colors /= 255
     finite = points.isfinite().all(dim=1) & colors.isfinite().all(dim=1)
     return points[finite], colors[finite].clamp(0, 1)

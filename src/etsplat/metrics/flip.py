@@ -33,8 +33,8 @@ _WIDEST = 0.04
 _COLOR_POWER, _COLOR_SHARE, _COLOR_RANGE = 0.7, 0.4, 0.95
 """q_c, p_c, p_t: differences up to p_c of the largest take p_t of the range."""
 
-_BEYOND = 0.01
-"""Values of the truth may be as far outside of [0, 1], by rounding."""
+_BEYOND = 0.5
+"""Values of the truth may be as far outside of [0, 1], as resampling leaves them."""
 
 _FEATURE_WIDTH, _FEATURE_POWER = 0.082, 0.5
 """Width of what counts as an edge or a point, in degrees, and q_f."""

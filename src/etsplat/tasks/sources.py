@@ -104,10 +104,9 @@ def _in_unit_sphere(scene: Dataset) -> tuple[Dataset, list[str]]:
     """A data set as it is where its object is in the unit sphere, or else moved there, which a note says."""
     if scene.normalization.radius != 1 or bool(scene.normalization.center.any()):  # somebody has moved it
         return scene, []
-    try:
-        center, radius = bounding_sphere(scene)
-    except InputError:  # no outlines: it starts from a sphere about the origin
+    if not scene.has_masks:  # it starts from a sphere about the origin
         return scene, []
+    center, radius = bounding_sphere(scene)
     if float(center.norm()) <= _NEAR and radius <= _LARGE and radius >= _SMALL:
         return scene, []
     x, y, z = center.tolist()

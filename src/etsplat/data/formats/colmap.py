@@ -79,7 +79,7 @@ def _frame(folder: Path, model: Path, image: ColmapImage, camera: ColmapCamera |
     one_focal_length = "SIMPLE" in camera.model or "RADIAL" in camera.model
     fx, fy, cx, cy, *distortion = (camera.params[0], *camera.params) if one_focal_length else camera.params
     lens = Lens(camera.model, tuple(distortion), f"a {camera.model} camera with lens distortion")
-    name, photo = placed_image(folder, image.name, model, wanted)
+    name, photo = placed_image(folder, image.name, model, wanted, any_end=False)
     return Frame(
         name,
         photo,
@@ -119,7 +119,7 @@ def _unplaced(frames: list[Frame]) -> tuple[str, ...]:
         path.with_suffix("")
         for folder in {stem.parent for stem in placed if stem.parent.is_dir()}
         for path in folder.iterdir()
-        if kind_of(path) in IMAGE_SUFFIXES and not path.name.startswith(".")
+        if kind_of(path) in IMAGE_SUFFIXES and not path.name.startswith(".") and not path.stem.endswith("_mask")
     }
     return unplaced_note(len(beside - placed), len(beside | placed))
 

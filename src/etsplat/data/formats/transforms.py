@@ -8,7 +8,6 @@ import math
 from pathlib import Path
 from typing import Any
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -33,6 +32,7 @@ RANK = 1
 _DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL")
 _FISHEYE = ("OPENCV_FISHEYE", "FISHEYE")
+_ROUNDING = 1e-6
 _PIXELS = {"fl_x", "fl_y", "cx", "cy"}
 """In pixels of an image of `w` x `h`."""
 
@@ -83,11 +83,13 @@ def _named_split(path: Path, document: dict[str, Any], frames: list[Frame]) -> t
         return None
     names: list[set[str]] = []
     for key in ("train_filenames", "test_filenames", "val_filenames"):
-        named = document.get(key, [])
+        named = document.get(key) or []
         if not isinstance(named, list) or not all(isinstance(name, str) for name in named):
             raise InputError(f"scene {path}: {key} is not a list of file names; correct or remove it")
         names.append({_image(path, name)[0] for name in named})
     train_names, test_names = names[0], names[1] or names[2]
+    if not test_names and document.get("test_filenames") is None:
+        return None
     train = [index for index, frame in enumerate(frames) if frame.name in train_names]
     test = [index for index, frame in enumerate(frames) if frame.name in test_names - train_names]
     if not train:
@@ -127,7 +129,7 @@ def _frame(path: Path, document: dict[str, Any], own: Any, wanted: Wanted) -> Fr
     if wanted.images is not None:
         image = placed_image(path.parent, own["file_path"], path, wanted)[1]
     if wanted.masks is None and isinstance(own.get("mask_path"), str):
-        mask = placed_file([path.parent], own["mask_path"], path)[1]
+        mask = placed_file([path.parent], own["mask_path"], path, least=2)[1]
     else:
         mask = wanted.mask_of(path.parent, name_below(image, path.parent), path)
     size = _size(entry, image, whole)
@@ -144,7 +146,7 @@ def _depth(entry: Entry, image: Path, wanted: Wanted) -> tuple[Path | None, floa
             raise entry.wrong(f"has depth_unit_scale_factor = {unit:g}; write a positive number")
     named = entry.said.get("depth_file_path")
     if wanted.depths is True and isinstance(named, str):
-        path = placed_file([entry.path.parent], named, entry.path)[1]
+        path = placed_file([entry.path.parent], named, entry.path, least=2)[1]
         if not path.is_file():
             raise entry.wrong(f"has the depth map {path}, which is not there; copy it there or remove depth_file_path")
         return path, unit
@@ -215,8 +217,6 @@ def _intrinsics(entry: Entry, size: tuple[int, int]) -> Float[Tensor, "3 3"]:
 def _viewmat(entry: Entry) -> Float[Tensor, "4 4"]:
     rows = entry.said.get("transform_matrix")
     matrix = entry.numbers("transform_matrix", 12 if isinstance(rows, list) and len(rows) == 3 else 16).reshape(-1, 4)
-    if not torch.allclose(matrix[3:], torch.tensor([0.0, 0, 0, 1], dtype=torch.float64), rtol=0, atol=1e-6):
-        raise entry.wrong(
-            "has a transform_matrix whose last row is not 0 0 0 1; if it is transposed, write its rows as columns"
-        )
+    if bool((matrix[3:, :3].abs() > _ROUNDING).any()):
+        raise entry.wrong("has a transform_matrix whose last row is not 0 0 0 1; if transposed, write rows as columns")
     return entry.viewmat(matrix[:3, :3], matrix[:3, 3], OPENGL)

@@ -35,26 +35,12 @@ class _Native(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *cotangents: Tensor | None) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        if not torch.is_grad_enabled():
-            return _backward(ctx, *cotangents)
-        with torch.no_grad():  # these gradients are to have gradients
-            gradients = _backward(ctx, *cotangents)
-        return _Once.apply(torch.zeros((), requires_grad=True), *gradients)  # pyright: ignore[reportReturnType]
-
-
-class _Once(torch.autograd.Function):
-    """Refuses the gradients of gradients, which would be zero without a word."""
-
-    @staticmethod
-    def forward(ctx: Any, anchor: Tensor, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
-        return tuple(None if gradient is None else gradient.detach() for gradient in gradients)
-
-    @staticmethod
-    def backward(ctx: Any, *cotangents: Tensor | None) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        raise RuntimeError(
-            'native engines have no gradients of gradients; compute them with engine("reference"): '
-            'with etsplat.engine("reference"): ...'
-        )
+        if torch.is_grad_enabled():  # these gradients are to have gradients, which would be zero without a word
+            raise RuntimeError(
+                "native engines have no gradients of gradients (create_graph=True); compute both within "
+                'engine("reference"): with etsplat.engine("reference"): ...'
+            )
+        return _backward(ctx, *cotangents)
 
 
 def _backward(ctx: Any, *cotangents: Tensor | None) -> tuple[Tensor | None, ...]:
