@@ -57,11 +57,12 @@ def judged(
     untangled: bool = True,
     photos: int = 40,
     inverted: bool = False,
+    lacking: float = 0.0,
     shown: bool = True,
     **shares: float,
 ) -> Judgement:
     wanted = Expected(expected, None if expected.unclear else "input mesh", shown)
-    run = Run(begun, preset, untangled, photos, inverted)
+    run = Run(begun, preset, untangled, photos, inverted, lacking)
     return judge("test", scores, intersecting, found, wanted, Shares(**shares), run)
 
 
@@ -103,6 +104,14 @@ def test_few_photos_are_the_first_thing_to_mend_of_a_poor_outline():
     )
     assert "more photos" not in judged(scores=off, photos=16).verdict
     assert judged(photos=3).verdict.startswith("good")
+
+
+def test_a_hull_that_lacks_thin_parts_is_what_a_poor_outline_is_for_want_of():
+    off = {**GOOD, "silhouette_iou": 0.724}
+    verdict = judged(scores=off, begun="hull", preset="quick", lacking=0.1298).verdict
+    assert verdict.endswith("or --init-mesh: the visual hull that it started from lacks 13 % of what masks show")
+    assert "lacks" not in judged(scores=off, begun="hull", preset="quick", lacking=0.02).verdict
+    assert judged(begun="hull", lacking=0.1298).verdict.startswith("good")
 
 
 def test_masks_that_look_inverted_are_said_first_of_a_poor_result():

@@ -163,6 +163,15 @@ def test_folders_without_a_soup_are_input_errors(tmp_path, trained):
         open_run(tmp_path / "run")
 
 
+def test_colours_of_a_mesh_without_texture_are_said_not_to_be_used():
+    mesh = demo_object()
+    plain = replace(mesh, texture=None, face_colors=None, vertex_colors=None)
+    for given, count in ((plain, 0), (replace(plain, vertex_colors=torch.rand(len(plain.vertices), 3)), 1)):
+        found, notes = load_source(given, ReconstructConfig.tiny())
+        assert found is given
+        assert sum("colours of its faces or vertices are not used" in note for note in notes) == count
+
+
 def test_an_object_in_a_data_set_is_found_by_its_outlines():
     """In its own units; one that is in the unit sphere, or was moved by somebody, or has no outlines, stays."""
     views = photograph(demo_object(), 64, 64).in_input_units()
@@ -208,7 +217,7 @@ def test_photos_whose_masks_contradict_the_others_are_left_out_and_named(tmp_pat
     wrong = f"images_{views.train[4]:03d}"
     assert wrong not in names
     assert (len(names), len(scene.test)) == (len(views.train) - 1, len(views.test))
-    assert notes == [f"left out, since its mask contradicts the others: {wrong}"]
+    assert notes == [f"left out, since its mask or pose contradicts the others: {wrong}"]
 
 
 def test_so_are_test_photos_by_which_a_good_result_would_be_called_poor(tmp_path):
@@ -217,7 +226,7 @@ def test_so_are_test_photos_by_which_a_good_result_would_be_called_poor(tmp_path
     wrong = f"images_{views.test[4]:03d}"
     assert wrong not in [scene.names[index] for index in scene.test]
     assert (len(scene.train), len(scene.test)) == (len(views.train), len(views.test) - 1)
-    assert notes == [f"left out, since its mask contradicts the others: {wrong}"]
+    assert notes == [f"left out, since its mask or pose contradicts the others: {wrong}"]
 
 
 @pytest.mark.parametrize("kind", ["train", "test"])

@@ -40,6 +40,9 @@ CONVERGED = 0.9
 FEW_PHOTOS = 16
 """With fewer training photos it is more photos that a poor outline needs."""
 
+LACKING = 0.03
+"""Part of what masks show that the visual hull leaves out: from there on a poor outline is for want of that."""
+
 CUT_OFF = 0.005
 """Share of the visual hull's surface where the frame cuts it off, which good results have at most."""
 
@@ -186,6 +189,7 @@ class Run:
         untangled: whether faces that cut through others were smoothed away.
         photos: how many it was trained on.
         inverted: whether their masks look as if they were white outside the object.
+        lacking: the part of what masks show that the hull that it started from leaves out; 0 of another start.
     """
 
     begun: Start
@@ -193,6 +197,7 @@ class Run:
     untangled: bool
     photos: int
     inverted: bool = False
+    lacking: float = 0.0
 
     @property
     def hull(self) -> str | None:
@@ -289,6 +294,9 @@ def _off(iou: float, views: Views, run: Run) -> list[str]:
     if iou >= GOOD_IOU:
         return []
     remedies = " or ".join(filter(None, (run.hull, run.longer))) or "--init-mesh, and check masks and poses"
+    if run.lacking > LACKING:
+        part = f"the visual hull that it started from lacks {100 * run.lacking:.0f} % of what masks show"
+        remedies = f"masks that have thin parts whole, photos that show them larger, or --init-mesh: {part}"
     if run.photos < FEW_PHOTOS:
         remedies = f"more photos, from all sides: it was made from {run.photos}"
     shown = f"{iou:.3f}" if round(iou, 3) < GOOD_IOU else f"{iou:.6f}"

@@ -292,6 +292,7 @@ def _judge(
             untangled=config.refinement.untanglings > 0,
             photos=len(views.train),
             inverted=from_photos and looks_inverted(views),
+            lacking=0.0 if hull is None else hull.uncovered,
         ),
     )
 

@@ -78,7 +78,7 @@ def load_source(
             raise InputError(f"{name} {folder}: belong to {_A_FOLDER}; leave them out")
     if isinstance(source, MeshFile):
         source.check()
-        return source, source.notes
+        return source, _mesh_notes(source)
     if isinstance(source, Dataset):
         scene, notes = _in_unit_sphere(source)
         return scene, [*notes, *straight_alpha(source)]
@@ -96,8 +96,15 @@ def load_source(
         raise InputError(f"{path}: {remedy}")
     if path.is_file():
         mesh = load_mesh(path)
-        return mesh, mesh.notes
+        return mesh, _mesh_notes(mesh)
     raise InputError(f"{path}: no such file or folder; {path_remedy(path)}")
+
+
+def _mesh_notes(mesh: MeshFile) -> list[str]:
+    """Of a mesh that is to be photographed."""
+    colored = mesh.texture is None and not (mesh.face_colors is None and mesh.vertex_colors is None)
+    white = "colours of its faces or vertices are not used: it is photographed white, in a light; a texture is used"
+    return [*mesh.notes, *([white] if colored else [])]
 
 
 def _in_unit_sphere(scene: Dataset) -> tuple[Dataset, list[str]]:
@@ -127,7 +134,7 @@ def _agreeing(scene: Dataset) -> tuple[Dataset, list[str]]:
     wrong = contradicting(scene)
     if wrong:
         names = ", ".join(scene.names[index] for index in sorted(wrong))
-        contradict = "its mask contradicts" if len(wrong) == 1 else "their masks contradict"
+        contradict = "its mask or pose contradicts" if len(wrong) == 1 else "their masks or poses contradict"
         notes.append(f"left out, since {contradict} the others: {names}")
         train, test = ([index for index in some if index not in wrong] for some in (scene.train, scene.test))
         scene = replace(scene, train=train, test=test)
