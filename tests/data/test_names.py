@@ -63,7 +63,7 @@ def test_transforms_read_nothing_outside_of_their_folder(tmp_path, key, name):
 
 ELSEWHERE = {
     "absolute": "{scene}/images/{name}",
-    "another computer": "/home/me/cap/images/{name}",
+    "another computer": "/mnt/me/cap/images/{name}",
     "Windows": "C:\\Users\\me\\cap\\images\\{name}",
     "up": "../cap/images/{name}",
     "bare": "{name}",
@@ -91,7 +91,7 @@ def test_photos_are_found_by_the_end_of_their_path_in_transforms(tmp_path, place
         "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
         "end_header\n1 2 3\n"
     )
-    document |= {"ply_file_path": "/home/me/cap/points.ply", "train_filenames": names[:3], "test_filenames": names[3:]}
+    document |= {"ply_file_path": "/mnt/me/cap/points.ply", "train_filenames": names[:3], "test_filenames": names[3:]}
     path.write_text(json.dumps(document))
     found = load_dataset(tmp_path)
     folder = "" if place in ("bare", "stem") else "images_"
@@ -141,7 +141,7 @@ def test_no_other_photo_takes_the_place_of_one_that_is_missing(tmp_path, other):
     shutil.move(tmp_path / other, tmp_path / "images" / "0000.png")
     path = tmp_path / "transforms.json"
     document = json.loads(path.read_text())
-    for told in ("masks/0000.png", "/home/me/cap/masks/0000.png"):
+    for told in ("masks/0000.png", "/mnt/me/cap/masks/0000.png"):
         document["frames"][0]["mask_path"] = told
         path.write_text(json.dumps(document))
         with pytest.raises(InputError, match="no such file"):

@@ -113,7 +113,6 @@ def test_a_trainer_names_what_it_cannot_begin_with(given: dict[str, Any], messag
         ({"log_every": 0}, "log_every must be an integer of at least 1, got 0"),
         ({"evaluate_every": -1}, "evaluate_every must be an integer of at least 0"),
         ({"callbacks": print}, r"callbacks must be a sequence of functions, got .*: pass \[callback\]"),
-        ({"checkpoint_every": 1}, "checkpoint_every must be 0 without `run`"),
     ],
 )
 def test_a_fit_names_what_it_cannot_do(given: dict[str, Any], message: str) -> None:

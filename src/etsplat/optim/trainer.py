@@ -192,12 +192,10 @@ class Trainer(Generic[M]):
         Raises:
             DivergedError: a loss or parameter is not finite; no triangle is left.
             InputError: a checkpoint is damaged or of another run; somebody else writes the run; the disk is full.
-            ValueError: a number is out of its range; checkpoints without a run; `callbacks` is one function.
+            ValueError: a number is out of its range; `callbacks` is one function.
         """
         settings = LoopSettings(iterations, log_every, evaluate_every, checkpoint_every)
         check_callbacks(callbacks)
-        if checkpoint_every and run is None:
-            raise ValueError("checkpoint_every must be 0 without `run`, the folder that checkpoints go to")
         if run_hash is None and (run is not None or workers().count > 1):
             run_hash = self._hash()
         with contextlib.ExitStack() as stack:
