@@ -163,15 +163,6 @@ def test_folders_without_a_soup_are_input_errors(tmp_path, trained):
         open_run(tmp_path / "run")
 
 
-def test_colours_of_a_mesh_without_texture_are_said_not_to_be_used():
-    mesh = demo_object()
-    plain = replace(mesh, texture=None, face_colors=None, vertex_colors=None)
-    for given, count in ((plain, 0), (replace(plain, vertex_colors=torch.rand(len(plain.vertices), 3)), 1)):
-        found, notes = load_source(given, ReconstructConfig.tiny())
-        assert found is given
-        assert sum("colours of its faces or vertices are not used" in note for note in notes) == count
-
-
 def test_an_object_in_a_data_set_is_found_by_its_outlines():
     """In its own units; one that is in the unit sphere, or was moved by somebody, or has no outlines, stays."""
     views = photograph(demo_object(), 64, 64).in_input_units()

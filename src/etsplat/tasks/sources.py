@@ -78,7 +78,7 @@ def load_source(
             raise InputError(f"{name} {folder}: belong to {_A_FOLDER}; leave them out")
     if isinstance(source, MeshFile):
         source.check()
-        return source, _mesh_notes(source)
+        return source, source.notes
     if isinstance(source, Dataset):
         scene, notes = _in_unit_sphere(source)
         return scene, [*notes, *straight_alpha(source)]
@@ -96,15 +96,8 @@ def load_source(
         raise InputError(f"{path}: {remedy}")
     if path.is_file():
         mesh = load_mesh(path)
-        return mesh, _mesh_notes(mesh)
+        return mesh, mesh.notes
     raise InputError(f"{path}: no such file or folder; {path_remedy(path)}")
-
-
-def _mesh_notes(mesh: MeshFile) -> list[str]:
-    """Of a mesh that is to be photographed."""
-    colored = mesh.texture is None and not (mesh.face_colors is None and mesh.vertex_colors is None)
-    white = "colours of its faces or vertices are not used: it is photographed white, in a light; a texture is used"
-    return [*mesh.notes, *([white] if colored else [])]
 
 
 def _in_unit_sphere(scene: Dataset) -> tuple[Dataset, list[str]]:
