@@ -27,7 +27,8 @@ def dataset(**changes: Any) -> Dataset:
 
 def test_poses_and_splits_of_any_kind_become_what_runs_need():
     """Single precision and arrays are taken."""
-    made = dataset(train=np.array([0, 1]), test=torch.tensor([2]))
+    made = dataset(train=np.array([0, 1]), test=torch.tensor([2]), names=np.array(["a", "b", "c"]))
+    assert made.names == ["a", "b", "c"]
     assert made.viewmats.dtype == made.Ks.dtype == torch.float64
     assert made.train == [0, 1]
     assert made.test == [2]

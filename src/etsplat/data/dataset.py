@@ -4,6 +4,7 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
@@ -106,7 +107,7 @@ class Dataset:
     def __post_init__(self) -> None:
         if not isinstance(self.images, Pictures):
             raise ValueError(f"images must be Pictures, got {type(self.images).__name__}: pass StoredPictures(images)")
-        fields = {"viewmats": checked_viewmats(self.viewmats), "Ks": checked_intrinsics(self.Ks)}
+        fields: dict[str, Any] = {"viewmats": checked_viewmats(self.viewmats), "Ks": checked_intrinsics(self.Ks)}
         B = len(self.viewmats)
         if isinstance(self.names, str) or not isinstance(self.names, Sequence | np.ndarray):
             raise ValueError(f"names: expected a list of {B}, one per viewmat, got {shown(self.names)}")
@@ -122,6 +123,7 @@ class Dataset:
         if self.exact_points is not None:
             points, colors = checked_points(self.exact_points, self.point_colors)
             fields |= {"exact_points": points, "point_colors": colors}
+        fields["names"] = [str(name) for name in self.names]  # of an array too
         for name, value in {**fields, **splits}.items():
             object.__setattr__(self, name, value)
 

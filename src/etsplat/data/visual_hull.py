@@ -115,9 +115,11 @@ def outside_hull(dataset: Dataset) -> Distance:
 
 def _shown_apart(dataset: Dataset, vertices: Tensor, faces: Tensor, gap: float) -> list[int]:
     """The small parts of a hull that are farther than `gap` from all others, and that photos show beside the large."""
+    if len(faces) == 0:
+        return []
     part = face_parts(faces, len(vertices))
     sizes = part.bincount()
-    large = sizes >= _SPECK * sizes.amax() if len(sizes) else sizes > 0
+    large = sizes >= _SPECK * float(sizes[0])
     candidates = [int(number) for number in (~large & (sizes >= _FEWEST)).nonzero()[:, 0]]
     alone = [number for number in candidates if _gap(vertices, faces, part == number) > gap]
     if not alone:

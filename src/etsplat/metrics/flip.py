@@ -83,7 +83,7 @@ def flip(
     opponent = _opponent(_xyz(pair))
     color = _redistributed(_hyab(*_perceived(opponent, pixels_per_degree)))
     feature = _feature_difference(opponent[:, 0] / 116 + 16 / 116, pixels_per_degree)
-    return _power(color, 1 - feature).mean() + 0 * pair.sum()  # NaN stays NaN, which clamping hides
+    return _power(color, 1 - feature).mean() + 0 * pair.sum()  # NaN where a value is not finite, which clamping hides
 
 
 def _xyz(srgb: Float[Tensor, "B 3 H W"]) -> Float[Tensor, "B 3 H W"]:

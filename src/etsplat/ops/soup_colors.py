@@ -48,13 +48,13 @@ def soup_colors(
         check_like(name, tensor, "vertices", vertices)
     if sh_rest.shape[1] < (degree + 1) ** 2 - 1:
         raise ValueError(f"sh_rest must have {(degree + 1) ** 2 - 1} bases for degree {degree}, got {sh_rest.shape[1]}")
-    ending, rest = _ending.get(), sh_rest[:, :MAX_REST]
+    engine, ending, rest = engine_for(vertices), _ending.get(), sh_rest[:, :MAX_REST]
     if ending is not None and torch.is_grad_enabled() and ending.takes(vertices, sh_dc, sh_rest):
-        colors = engine_for(vertices).soup_colors(vertices, sh_dc, rest, centers.detach(), degree)
-        return ending.taken(colors, centers, degree)
+        return ending.taken(engine.soup_colors(vertices, sh_dc, rest, centers.detach(), degree), centers, degree)
     if not (centers.requires_grad and torch.is_grad_enabled()):
-        return engine_for(vertices).soup_colors(vertices, sh_dc, rest, centers, degree)
-    engine, origin = engine_for(vertices), torch.zeros_like(centers[:1])
+        return engine.soup_colors(vertices, sh_dc, rest, centers, degree)
+    # Engines have no gradient to cameras, but to corners: so these are seen from where each camera is, one by one.
+    origin = torch.zeros_like(centers[:1])
     views = [engine.soup_colors(vertices - center, sh_dc, rest, origin, degree) for center in centers]
     return torch.cat(views) if views else vertices.new_empty((0, N, 3))
 
@@ -88,7 +88,7 @@ class EndAtColors:
         _ending.reset(self._token)
 
     def takes(self, *of: Tensor) -> bool:
-        """Whether the gradient ends at colours of these tensors: it does at the first that are made of its own."""
+        """Whether the gradient ends at colours of these tensors: at the first of its own; `again` tells of others."""
         if any(one is not other for one, other in zip(of, self.of, strict=True)):
             return False
         self.again = self.again or self.colors is not None
