@@ -127,6 +127,19 @@ def test_a_textured_mesh_is_photographed_in_the_colours_of_its_texture():
     assert bool((seen[..., :3] <= seen[..., 3:] + 1e-6).all())
 
 
+def test_colours_of_faces_and_of_vertices_are_photographed_under_the_lights(sphere, sphere_views):
+    """A sphere that is red above and blue below: half as bright in the colour of each half where white is bright."""
+    halves = torch.tensor([[0.5, 0, 0], [0, 0, 0.5]])
+    of_vertices = halves[(sphere.vertices[:, 1] < 0).long()]
+    of_faces = halves[(sphere.vertices[sphere.faces].mean(dim=1)[:, 1] < 0).long()]
+    white = sphere_views.images[16]
+    for painted in (replace(sphere, vertex_colors=of_vertices), replace(sphere, face_colors=of_faces)):
+        seen = photograph(painted, 96, 96).images[16]
+        assert torch.equal(seen[..., 3], white[..., 3])
+        for row, color in ((30, halves[0]), (66, halves[1])):
+            torch.testing.assert_close(seen[row, :, :3], white[row, :, :3] * color, atol=1e-6, rtol=0)
+
+
 def test_a_texture_belongs_to_the_fingerprint_of_a_source(sphere):
     texture = Texture.of(
         [torch.zeros(1, 1, 3, dtype=torch.uint8)],

@@ -2,8 +2,8 @@
 
 The set-up (docs/conventions.md): the mesh is scaled to its bounding box's centre and a largest radius of 1; +y is up;
 five elevations from -70 to 70 degrees by eight azimuths, azimuth 0 on +z; a vertical field of view of 40 degrees; the
-silhouette of the unit sphere fills 90 % of the height; white albedo under two lights along +z and -z. A mesh with a
-texture is seen in the texture's own colours, without light.
+silhouette of the unit sphere fills 90 % of the height; white albedo, or the colours of faces or vertices, under two
+lights along +z and -z. A mesh with a texture is seen in the texture's own colours, without light.
 """
 
 import itertools
@@ -78,7 +78,7 @@ def photograph(
     """Normalise a mesh and take its pictures. View index is `azimuths` * elevation + azimuth.
 
     Args:
-        mesh: the object, in any units; its texture is used, colours of faces and vertices are not.
+        mesh: the object, in any units; in its texture, or else in its colours of faces, vertices or white under light.
         width: image width in pixels, at least `height` (the sphere is fitted to the height).
         height: image height in pixels.
         elevations: degrees, strictly between -90 and 90.
@@ -107,13 +107,18 @@ def photograph(
     cameras = orbit_cameras(width, height, elevations=elevations, azimuths=azimuths)
     vertices, faces = unit.vertices.to(device), unit.faces.to(device)
     texture = None if unit.texture is None else unit.texture.to(device)
-    colors = shade_faces(unit.vertices, unit.faces).to(device)
+    face_colors, corner_colors = (None if each is None else each.to(device) for each in _lit_colors(unit))
     images = []
     for view in range(len(cameras)):
         camera = cameras[view].to(device)
         if texture is None:
             image = render_opaque(
-                vertices, face_colors=colors, cameras=camera, faces=faces, supersampling=supersampling
+                vertices,
+                face_colors=face_colors,
+                corner_colors=corner_colors,
+                cameras=camera,
+                faces=faces,
+                supersampling=supersampling,
             ).rgba[0]
         else:
             image = draw_textured(vertices, faces, texture, camera, supersampling)
@@ -132,6 +137,16 @@ def photograph(
         test,
         normalization=normalization,
     )
+
+
+def _lit_colors(mesh: MeshFile) -> tuple[Float[Tensor, "F 3"] | None, Float[Tensor, "F 3 3"] | None]:
+    """Colours under the lights of a mesh without a texture: of its faces, or else of their corners."""
+    light = shade_faces(mesh.vertices, mesh.faces)
+    if mesh.face_colors is not None:
+        return light * mesh.face_colors, None
+    if mesh.vertex_colors is not None:
+        return None, light[:, None] * mesh.vertex_colors[mesh.faces]
+    return light, None
 
 
 def draw_textured(
