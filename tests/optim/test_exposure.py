@@ -23,7 +23,7 @@ from etsplat.io.run_directory import RunDirectory
 from etsplat.metrics.image import psnr
 from etsplat.model.soup_init import StartPoints, start_soup
 from etsplat.model.triangle_mesh import TriangleMesh
-from etsplat.optim.exposure import Exposure
+from etsplat.optim.exposure import Exposure, share_of_their_own
 from etsplat.optim.loop import StepEvent
 from etsplat.optim.objective import Objective
 from etsplat.optim.schedules import NEVER, Schedule, exponential_decay
@@ -47,9 +47,8 @@ def views() -> Dataset:
 
 def ball() -> MeshFile:
     vertices, faces = icosphere(2)
-    return MeshFile(
-        vertices, faces, face_colors=torch.rand((len(faces), 3), generator=torch.Generator().manual_seed(8))
-    )
+    colors = torch.rand((len(faces), 3), generator=torch.Generator().manual_seed(8))
+    return MeshFile(vertices, faces, face_colors=0.6 + 0.4 * colors)
 
 
 @pytest.fixture(scope="module")
@@ -319,6 +318,44 @@ def test_the_first_answer_counts(
     monkeypatch.setattr("etsplat.optim.exposure.explained_error", lambda *_: (0.15, torch.zeros(len(views.train), 3)))
     trainer.refine(10)
     assert exposure.learned
+
+
+def along_the_path(views: Dataset) -> Tensor:
+    """(P, 3) logarithms of gains that follow where the training cameras are, as along a film."""
+    around = torch.atan2(*views.centers[views.train][:, [0, 2]].T).float()
+    gains = 0.2 * around.cos()[:, None].expand(-1, 3)
+    return gains - gains.mean(dim=0)
+
+
+def as_views(views: Dataset) -> list[View]:
+    return [View(views.cameras[index], torch.zeros(1), None, torch.tensor([index])) for index in views.train]
+
+
+def test_exposures_that_follow_the_cameras_are_told_from_those_of_their_own(views: Dataset, gains: Tensor) -> None:
+    smooth, own = along_the_path(views), gains[views.train].log()
+    assert share_of_their_own(smooth, as_views(views)) < 0.25
+    assert share_of_their_own(own, as_views(views)) == 1.0
+    assert 0.2 < share_of_their_own(2 * smooth + own, as_views(views)) < 0.8
+    assert share_of_their_own(smooth[:2], as_views(views)[:2]) == 1.0, "too few to tell"
+    assert share_of_their_own(0 * smooth, as_views(views)) == 1.0
+
+
+@pytest.mark.parametrize(
+    ("by_direction", "follows", "learned"), [(True, True, False), (True, False, True), (False, True, True)]
+)
+def test_what_colours_by_direction_explain_is_not_learned_as_exposures(
+    monkeypatch: pytest.MonkeyPatch, views: Dataset, gains: Tensor, by_direction: bool, follows: bool, learned: bool
+) -> None:
+    """A model of one colour for all directions learns it."""
+    exposure = Exposure.of("auto", 100, 1, by_direction=by_direction)
+    exposure.start(views.train, 1, torch.zeros(()))
+    found = along_the_path(views) if follows else gains[views.train].log()
+    monkeypatch.setattr("etsplat.optim.exposure.explained_error", lambda *_: (0.3, found))
+    measure: Callable[..., None] = exposure.measure
+    measure(None, as_views(views), torch.zeros(1, 3))
+    assert exposure.learned is learned
+    assert exposure.explained is not None
+    assert (exposure.explained == 0.3) is learned
 
 
 def test_a_step_that_does_not_count_changes_nothing(simt: object, scene: Dataset) -> None:

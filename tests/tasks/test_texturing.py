@@ -161,7 +161,7 @@ def test_a_coarser_level_shows_the_same_from_farther_away(scene: SCENE, light: T
     assert far.count <= light.count // 4
     assert far.texture.shape == (SIZE // 2, SIZE // 2, 3)
     assert MeshTopology.from_faces(far.faces, len(far.vertices)).is_closed()
-    assert quality(far, scene[1]) > quality(light, scene[1]) - 6
+    assert quality(far, scene[1]) > quality(light, scene[1]) - 9
     again = coarser(light, light.count // 4, SIZE // 2)
     assert torch.equal(far.texture, again.texture)
 

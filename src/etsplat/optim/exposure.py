@@ -19,6 +19,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from etsplat.core.cameras import camera_centers
 from etsplat.core.rasterization import Rasterization
 from etsplat.core.workers import workers
 from etsplat.data.loader import View
@@ -41,6 +42,9 @@ MEASURED_AT, EPOCHS, ENOUGH = 0.1, 5, 10
 """When it is measured whether photos need it, as a fraction of a run; how often each must have been seen by then, so
 that the model is not that of the last few; and how often, so that there is no doubt."""
 
+BESIDE = 2
+"""Photos by the nearest cameras, whose mean gain says what a photo's would be if it followed the camera."""
+
 TILES, COVERED, FARTHEST = 8, 0.95, 0.7
 """Fields along each side of a photo, every other of which predicts the rest; how opaque pixels of objects are that
 count; the largest logarithm of a gain that is started from."""
@@ -53,7 +57,8 @@ class Exposure:
         measured_at: iteration after which it is measured whether photos need it.
         again_at: iteration after which that is measured again if the answer was in doubt.
         learned: whether it is, by now.
-        explained: the part of the squared error that exposures explained when it was measured last; None before.
+        explained: the part of the squared error that exposures explained when it was measured last, but for what
+            follows the cameras where the model may know that; None before.
         adam: the optimizer of "values", (P, 10): of each photo g, then D by rows.
 
     Example:
@@ -65,13 +70,16 @@ class Exposure:
     adam: Adam
 
     @staticmethod
-    def of(choice: Literal["auto", "on", "off"], iterations: int, epoch: float) -> "Exposure":
+    def of(
+        choice: Literal["auto", "on", "off"], iterations: int, epoch: float, *, by_direction: bool = False
+    ) -> "Exposure":
         """Learned if a measurement says so, in any case, or not at all. Runs too short for it are not measured.
 
         Args:
             choice: which of these.
             iterations: of the run.
             epoch: how many iterations show every photo once.
+            by_direction: see `Exposure`.
         """
         early = max(1, round(MEASURED_AT * iterations), round(EPOCHS * epoch))
         half = max(1, iterations // 2)
@@ -79,7 +87,7 @@ class Exposure:
         again = min(round(ENOUGH * epoch), half) if choice == "auto" else 0
         needed = -math.inf if choice == "on" else NEEDED
         rate = partial(_falling, iterations=iterations)
-        return Exposure(measured, again_at=again, needed=needed, rate=rate)
+        return Exposure(measured, again_at=again, needed=needed, by_direction=by_direction, rate=rate)
 
     def __init__(
         self,
@@ -87,6 +95,7 @@ class Exposure:
         *,
         again_at: int = 0,
         needed: float = NEEDED,
+        by_direction: bool = False,
         rate: Scheduled = RATE,
         weight: float = WEIGHT,
     ) -> None:
@@ -98,12 +107,15 @@ class Exposure:
                 that is later than the first for an answer at once.
             needed: learned from then on if it explains more than this part of the squared error. It starts from what
                 was measured.
+            by_direction: whether the model's colours depend on the direction. Exposures that follow the cameras, as
+                along a film, are then learned with them, and views between two photos come out as exposed as these;
+                what they explain does not count.
             rate: how far a number of a photo moves each time that the photo is seen.
             weight: of what holds the numbers near zero.
         """
         self.measured_at, self.again_at, self.learned = measured_at, again_at, False
         self.explained: float | None = None
-        self._needed, self._rate, self._weight = needed, rate, weight
+        self._needed, self._by_direction, self._rate, self._weight = needed, by_direction, rate, weight
 
     def start(self, views: Sequence[int], batch: int, like: Tensor) -> None:
         """All photos are neutral.
@@ -182,7 +194,8 @@ class Exposure:
             background: behind photos without transparency.
         """
         first = self.explained is None and self.again_at > self.measured_at
-        self.explained, gains = explained_error(model, views, background)
+        explained, gains = explained_error(model, views, background)
+        self.explained = explained * share_of_their_own(gains, views) if self._by_direction else explained
         self.learned = self.explained > (max(SURE, self._needed) if first else self._needed)
         if self.learned:
             overall = gains.mean(dim=1)
@@ -270,6 +283,24 @@ def explained_error(
     logs = _ratio(products.sum(dim=1), squares.sum(dim=1)).clamp_min(1e-3).log()
     gains = (logs - logs.mean(dim=0)).clamp(-FARTHEST, FARTHEST)
     return (1 - error(predicted) / before if before > 0 else 0.0), gains
+
+
+def share_of_their_own(gains: Float[Tensor, "P 3"], views: Sequence[View]) -> float:
+    """The part of the variance of photos' gains that those of the photos by the nearest cameras do not predict, 0 to 1.
+
+    Args:
+        gains: logarithms, beside their mean.
+        views: of these photos; near are cameras at nearly one place that look in nearly one direction.
+    """
+    variance = float(gains.square().sum())
+    if len(views) <= BESIDE or variance == 0:
+        return 1.0
+    viewmats = torch.cat([view.camera.viewmats for view in views]).to(gains.device)
+    centers, ahead = camera_centers(viewmats), viewmats[:, 2, :3]
+    spread = (centers - centers.mean(dim=0)).norm(dim=1).mean().clamp_min(1e-12)
+    apart = torch.cdist(centers, centers) / spread + torch.cdist(ahead, ahead)
+    beside = apart.fill_diagonal_(torch.inf).topk(BESIDE, largest=False).indices
+    return min(1.0, float((gains - gains[beside].mean(dim=1)).square().sum()) / variance)
 
 
 def _products(model: Model, view: View, background: Float[Tensor, "1 3"]) -> Float[Tensor, "2 3 3"]:

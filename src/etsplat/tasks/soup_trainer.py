@@ -112,7 +112,8 @@ def make_trainer(
     if part is not None and part.closed is not None:
         closed = sphere_in_frame(part.closed, capture.normalization)
     spared = None if closed is None else closed.to(soup.vertices.device).outermost
-    exposure = Exposure.of(config.exposure, config.iterations, len(capture.train) / config.batch)
+    by_direction, epoch = config.drawing.sh_degree > 0, len(capture.train) / config.batch
+    exposure = Exposure.of(config.exposure, config.iterations, epoch, by_direction=by_direction)
     return Trainer(
         soup,
         capture,
@@ -123,7 +124,7 @@ def make_trainer(
         background=None if config.background == "random" else background_of(config),
         exposure=exposure if part is None else part.exposures(capture),
         depths=depths,
-        cameras=CameraRefinement.of(config.refine_cameras, config.iterations, len(capture.train) / config.batch),
+        cameras=CameraRefinement.of(config.refine_cameras, config.iterations, epoch),
         evaluate=evaluate,
         seed=generator or config.seed,
     )
