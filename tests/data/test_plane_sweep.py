@@ -7,13 +7,14 @@ import pytest
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from etsplat.data.dataset import Dataset
 from etsplat.data.pictures import StoredPictures
 from etsplat.data.plane_sweep import swept_points
 from etsplat.engines.threads import num_threads, set_num_threads
 from etsplat.optim.loop import Event, NoteEvent
-from etsplat.tasks.dense_starts import LEAST_SHARE, with_swept_points
+from etsplat.tasks.dense_starts import LEAST_SHARE, POOR, with_swept_points
 
 CPU = torch.device("cpu")
 W, H = 96, 64
@@ -73,6 +74,18 @@ def test_points_lie_on_the_wall() -> None:
     assert float((swept.colors - painted(swept.positions)).abs().mean()) < 0.02
 
 
+def test_other_photos_find_less_of_what_one_finds_by_poorer_poses() -> None:
+    """Each camera turned about another axis, by a quarter of a degree and by a whole one."""
+    capture, found = wall(7), list[float]()
+    axes = normalize(torch.randn((len(capture), 3), generator=torch.Generator().manual_seed(2)), dim=1).double()
+    crossed = torch.stack([torch.linalg.cross(axes, each.expand_as(axes)) for each in torch.eye(3).double()], dim=2)
+    for degrees in (0.0, 0.25, 1.0):
+        turned = capture.viewmats.clone()
+        turned[:, :3] = torch.linalg.matrix_exp(math.radians(degrees) * crossed) @ turned[:, :3]
+        found.append(swept_points(replace(capture, viewmats=turned), CPU).consistent)
+    assert found[0] > 0.7 > POOR > found[1] > 1.5 * found[2], found
+
+
 def test_bits_do_not_depend_on_threads() -> None:
     """Nor on those of torch."""
     before, ours, found = torch.get_num_threads(), num_threads(), []
@@ -101,9 +114,11 @@ def test_a_gpu_finds_the_same_places() -> None:
 def test_photos_of_different_things_agree_on_nothing() -> None:
     """Not even by chance; then the capture keeps its own points, and the run says why."""
     capture = wall(alike=False)
-    assert swept_points(capture, CPU).share < LEAST_SHARE / 10
+    swept = swept_points(capture, CPU)
+    assert swept.share < LEAST_SHARE / 10
+    assert math.isnan(swept.consistent), "each finds nothing by itself, as of a blank wall"
     events = list[Event]()
-    assert with_swept_points(capture, 4000, CPU, events.append, nothing) is capture
+    assert with_swept_points(capture, 4000, CPU, events.append, nothing)[0] is capture
     assert any(isinstance(each, NoteEvent) and "agree on 0 %" in each.text for each in events)
 
 
@@ -127,14 +142,14 @@ def test_what_masks_exclude_or_is_transparent_gets_no_points() -> None:
 def test_what_is_found_joins_the_points_of_the_capture() -> None:
     """Up to half of the triangles that there may be, or to as many as the capture has, two thirds of which stay."""
     events, capture = list[Event](), wall()
-    dense = with_swept_points(capture, 4000, CPU, events.append, nothing)
+    dense, _ = with_swept_points(capture, 4000, CPU, events.append, nothing)
     assert capture.exact_points is not None
     assert dense.exact_points is not None
     assert dense.point_colors is not None
     assert torch.equal(dense.exact_points[:300], capture.exact_points)
     assert 1000 < len(dense.exact_points) == len(dense.point_colors) <= 2000
     assert any(isinstance(each, NoteEvent) and "join 300 of the capture's 300 points" in each.text for each in events)
-    full = with_swept_points(capture, 600, CPU, events.append, nothing)
+    full, _ = with_swept_points(capture, 600, CPU, events.append, nothing)
     assert full.exact_points is not None
     assert 200 < len(full.exact_points) <= 300
     assert any(isinstance(each, NoteEvent) and "of the capture's 300 points" in each.text for each in events[-1:])
@@ -142,7 +157,7 @@ def test_what_is_found_joins_the_points_of_the_capture() -> None:
 
 def test_what_is_found_has_its_colours_beside_points_without() -> None:
     """Those are grey, as they are where nothing is found."""
-    dense = with_swept_points(replace(wall(), point_colors=None), 4000, CPU, list[Event]().append, nothing)
+    dense, _ = with_swept_points(replace(wall(), point_colors=None), 4000, CPU, list[Event]().append, nothing)
     assert dense.exact_points is not None
     assert dense.point_colors is not None
     assert (dense.point_colors[:300] == 0.5).all()
@@ -160,7 +175,7 @@ def test_a_photo_from_beyond_the_nearest_plane_is_no_obstacle() -> None:
 def test_without_points_nothing_is_swept() -> None:
     """Nobody says how far away things are."""
     capture = replace(wall(), exact_points=None, point_colors=None)
-    assert with_swept_points(capture, 4000, CPU, nothing_told, nothing) is capture
+    assert with_swept_points(capture, 4000, CPU, nothing_told, nothing)[0] is capture
 
 
 def nothing_told(event: Event) -> None:

@@ -121,6 +121,7 @@ def test_presets_of_train_are_what_they_were(preset: str, scene: str) -> None:
     since |= {"optimizer.lr_vertices_unit": "frame" if off else "view", "pixels_per_triangle": None if off else 45.0}
     since |= {"loss.depth": "off" if off else "auto", "loss.lambda_depth": 0.02, "loss.depth_from": 6000}
     since["loss.lambda_harmonics"] = 0.0 if off else 2.0
+    since["schedule.doubtful_epochs"] = None if off else 20
     since["drawing.dropout"] = 0.0 if preset in ("paper", "tiny") else 4.5
     since["asset"] = preset not in ("paper", "tiny")
     since["start.dense"] = preset not in ("paper", "tiny")

@@ -53,3 +53,29 @@ def test_what_becomes_opaque_starts_at_the_capture_s_points(scene: Dataset, tmp_
     events = list[Event]()
     train(scene, tmp_path, DENSE.changed({"finish": "opaque"}), callbacks=[events.append])
     assert not joined(events)
+
+
+def test_a_run_by_doubtful_poses_says_so_and_ends_sooner(scene: Dataset, tmp_path: Path) -> None:
+    """Photos of other places than the poses say; resumed, it has the same length and the same bits."""
+    dealt = torch.randperm(len(scene), generator=torch.Generator().manual_seed(0)).tolist()
+    swapped = replace(scene, images=StoredPictures([scene.images[view] for view in dealt]))
+    config = DENSE.changed({"schedule.doubtful_epochs": 1})
+    events = list[Event]()
+    whole = train(swapped, tmp_path / "whole", config, callbacks=[events.append])
+    steps = len(scene.watching().train)
+    assert whole.metrics["iterations"] == steps < config.iterations
+    told = [event.text for event in events if isinstance(event, NoteEvent) and event.text.startswith("poses: ")]
+    assert len(told) == 1
+    assert f"{steps} iterations, not 40 (schedule.doubtful_epochs 1)" in told[0]
+    with pytest.raises(KilledError):
+        train(swapped, tmp_path / "killed", config, callbacks=[kill_at(20)])
+    resumed = train(swapped, tmp_path / "killed", config, resume=True, callbacks=[lambda event: None])
+    assert resumed.metrics["iterations"] == steps
+    assert torch.equal(resumed.soup.vertices, whole.soup.vertices)
+
+
+def test_right_poses_are_not_doubted(scene: Dataset, tmp_path: Path) -> None:
+    events = list[Event]()
+    done = train(scene, tmp_path, DENSE.changed({"schedule.doubtful_epochs": 1}), callbacks=[events.append])
+    assert done.metrics["iterations"] == DENSE.iterations
+    assert not [event for event in events if isinstance(event, NoteEvent) and event.text.startswith("poses: ")]

@@ -6,12 +6,12 @@ elsewhere, and if other photos found the same place.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -49,6 +49,9 @@ deviation of grey values in a window."""
 SAME, SEEN_BY = 0.015, 2
 """Depths in other photos are the same up to this part of them; in so many others a place must have been found."""
 
+TOLD_BY = 0.02
+"""Of the pixels, how many must have a depth so that these say something of the poses."""
+
 
 @dataclass(frozen=True)
 class Swept:
@@ -58,11 +61,14 @@ class Swept:
         positions: (P, 3) float64, in the frame of the data set.
         colors: (P, 3) float32 in [0, 1] as displayed.
         share: of the pixels that were compared, how many have a point.
+        consistent: of the places that each photo found, how many the photos that it was compared with found too, which
+            poses that are off by a pixel leave few of; NaN where hardly any was found.
     """
 
     positions: Float[Tensor, "P 3"]
     colors: Float[Tensor, "P 3"]
     share: float
+    consistent: float
 
 
 @dataclass(frozen=True)
@@ -146,11 +152,13 @@ def swept_points(capture: Dataset, device: torch.device, progress: Callable[[int
             if progress is not None:
                 progress(len(depths), len(photos))
         agreed = list(pool.map(lambda number: _agreed(photos, depths, number, beside[number]), range(len(photos))))
-    positions = [photo.places(found)[kept] for photo, found, kept in zip(photos, depths, agreed, strict=True)]
-    colors = [photo.colors[found > 0][kept] for photo, found, kept in zip(photos, depths, agreed, strict=True)]
+    positions = [photo.places(found)[kept] for photo, found, (kept, _) in zip(photos, depths, agreed, strict=True)]
+    colors = [photo.colors[found > 0][kept] for photo, found, (kept, _) in zip(photos, depths, agreed, strict=True)]
     compared = sum(int(photo.counts.sum()) for photo in photos)
+    clear = sum(int((each > 0).sum()) for each in depths)
     count = sum(len(each) for each in positions)
-    return Swept(torch.cat(positions), torch.cat(colors), count / max(compared, 1))
+    consistent = sum(near for _, near in agreed) / clear if clear > TOLD_BY * compared else math.nan
+    return Swept(torch.cat(positions), torch.cat(colors), count / max(compared, 1), consistent)
 
 
 def _neighbours(
@@ -203,8 +211,8 @@ def _planes(photo: _Photo, others: Sequence[_Photo], near: float, far: float) ->
 
 def _agreed(
     photos: Sequence[_Photo], depths: Sequence[Float[Tensor, "h w"]], number: int, first: Sequence[int]
-) -> Bool[Tensor, " P"]:
-    """Whether other photos found the places that one has a depth of, in `SEEN_BY` of them.
+) -> tuple[Bool[Tensor, " P"], int]:
+    """Whether other photos found the places that one has a depth of, in `SEEN_BY` of them; and how many the first did.
 
     Args:
         photos: all.
@@ -214,11 +222,17 @@ def _agreed(
     """
     places = photos[number].places(depths[number])
     count, doubtful = torch.zeros(len(places), dtype=torch.int32), torch.arange(len(places))
-    for other in (*first, *(each for each in range(len(photos)) if each not in (number, *first))):
-        found = _found(photos[other], depths[other], places[doubtful])
-        count[doubtful] += found
-        doubtful = doubtful[count[doubtful] < SEEN_BY]
-    return count >= SEEN_BY
+
+    def ask(some: Iterable[int], doubtful: Int64[Tensor, " D"]) -> Int64[Tensor, " E"]:
+        for other in some:
+            count[doubtful] += _found(photos[other], depths[other], places[doubtful])
+            doubtful = doubtful[count[doubtful] < SEEN_BY]
+        return doubtful
+
+    doubtful = ask(first, doubtful)
+    near = len(places) - len(doubtful)
+    ask((each for each in range(len(photos)) if each not in (number, *first)), doubtful)
+    return count >= SEEN_BY, near
 
 
 def _found(photo: _Photo, depths: Float[Tensor, "h w"], places: Float[Tensor, "P 3"]) -> Bool[Tensor, " P"]:

@@ -24,7 +24,7 @@ from etsplat.optim.loop import Callback, CheckpointEvent, DivergedError, Event, 
 from etsplat.optim.schedules import limited_iterations
 from etsplat.tasks.block_training import check_blocks, shape_of, train_blocks
 from etsplat.tasks.camera_results import conclude_cameras
-from etsplat.tasks.dense_starts import with_swept_points
+from etsplat.tasks.dense_starts import DOUBTFUL, POOR, with_swept_points
 from etsplat.tasks.depths import trusted_depths, wanted_depths, with_shown_points
 from etsplat.tasks.export_config import ExportConfig
 from etsplat.tasks.export_soup import export_soup
@@ -186,7 +186,9 @@ def _fit(
             most = triangle_limit(own, config)
             start = with_shown_points(capture, trust, most, job.announce)
             if start is capture and config.start.dense and config.finish == "none" and paths["init_points"] is None:
-                start = with_swept_points(capture, most, job.device, job.announce, job.prepared)
+                start, consistent = with_swept_points(capture, most, job.device, job.announce, job.prepared)
+                if consistent < POOR and config.refine_cameras == "off":
+                    config = _of_poor_poses(job, consistent, len(own.train), shorten=trust is None)
         trainer = start_trainer(start, config, scorer.cheap, job.device, trust, part)
 
         def look(iteration: int) -> None:
@@ -236,6 +238,22 @@ def _fit(
                 "finish": config.finish,
             }
             return TrainResult(job.run.path, job.finish(trainer.progress, found, soup.vertices), result, opaque)
+
+
+def _of_poor_poses(job: Job[TrainConfig], consistent: float, views: int, *, shorten: bool) -> TrainConfig:
+    """The settings of a run whose photos contradict each other's depths: it says so, and may have fewer iterations."""
+    config, most = job.config, job.config.schedule.doubtful_epochs
+    told = (
+        f"poses: of the places that a photo finds its neighbours find only {100 * consistent:.0f} %: cameras are off by"
+        " a pixel and more, or things moved. --refine-cameras poses mends small errors, etsplat data sfm finds cameras"
+        " anew"
+    )
+    iterations = limited_iterations(config.iterations, most, views, config.batch)
+    if shorten and consistent < DOUBTFUL and iterations < config.iterations:
+        told += f"; {iterations:,} iterations, not {config.iterations:,} (schedule.doubtful_epochs {most})"
+        job.shorten(iterations)
+    job.announce(NoteEvent(told))
+    return job.config
 
 
 def _opaque_mesh(

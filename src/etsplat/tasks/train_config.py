@@ -70,6 +70,8 @@ class Schedule:
     """What the iterations of this and the next groups refer to, but for those of `output`."""
     max_epochs: Annotated[int | None, Range(1)] = 100
     """A run ends earlier where it would see a photo more often than this; few photos are soon learnt by heart."""
+    doubtful_epochs: Annotated[int | None, Range(1)] = 20
+    """The same where start.dense finds that photos hardly agree on depths: by poor poses more is learnt by heart."""
     sh_every: Annotated[int, Range(1), _HARMONICS] = 1000
     """Iterations between steps of the colours' degree, from 0."""
 
@@ -324,6 +326,7 @@ _PAPER: dict[str, Any] = {
     "start.nearest": 0.0,
     "start.limit": None,
     "schedule.max_epochs": None,
+    "schedule.doubtful_epochs": None,
     "optimizer.lr_vertices": 0.0018,
     "optimizer.lr_vertices_unit": "frame",
     "optimizer.lr_vertices_length": None,
