@@ -9,6 +9,7 @@ import torch
 
 from etsplat.cli.parse import parse
 from etsplat.core.errors import InputError
+from etsplat.data.close_ups import object_side
 from etsplat.data.dataset import Dataset, Normalization
 from etsplat.data.demo_object import demo_object
 from etsplat.data.hull import bounding_sphere
@@ -242,3 +243,27 @@ def test_photos_whose_mask_ends_just_before_the_frame_are_cropped_and_named(tmp_
     assert len(cropped) > len(scene) / 2
     assert notes[0] == f"cropped, since a mask ends along the frame just before it: {', '.join(cropped)}"
     assert all(float(scene.Ks[scene.names.index(name), 0, 2]) == 9 for name in cropped)
+
+
+@pytest.mark.parametrize("refined", ["off", "poses"])
+def test_an_object_that_is_small_in_its_photos_is_read_as_large_as_one_that_fills_them(tmp_path, refined):
+    """Nine tenths of what the photos show is background."""
+    views = photograph(demo_object(), 64, 64, supersampling=2)
+    padded = [torch.nn.functional.pad(image, (0, 0, 66, 62, 66, 62)) for image in views.images]
+    spoilt = replace(views, images=StoredPictures(padded))
+    camera = {"fl_x": float(views.Ks[0, 0, 0]), "cx": 98, "cy": 98, "w": 192, "h": 192}
+    write_views(tmp_path, spoilt, views.train, "transforms_train.json", **camera)
+    write_views(tmp_path, spoilt, views.test, "transforms_test.json", **camera)
+    config = replace(ReconstructConfig.tiny(), resolution=64, refine_cameras=refined)
+    scene, notes = load_source(tmp_path, config)
+    assert isinstance(scene, Dataset)
+    close = refined == "off"
+    assert notes == ["the object is small in the photos: they are cropped to it"] * close
+    assert object_side(scene) == pytest.approx(object_side(views) / (1 if close else 3), abs=6)
+    assert all(max(size) <= 90 for size in scene.images.sizes)
+    torch.testing.assert_close(scene.normalization.center, torch.zeros(3), rtol=0, atol=0.02)
+    if close:
+        given = replace(spoilt, Ks=views.Ks + torch.tensor([[0, 0, 66], [0, 0, 66], [0, 0, 0]]))
+        near, said = load_source(given, config)
+        assert isinstance(near, Dataset)
+        assert (len(set(near.images.sizes)), said) == (1, notes)

@@ -15,13 +15,14 @@ from torch.nn.functional import grid_sample, max_pool2d, normalize
 
 from etsplat import _native
 from etsplat.core.cameras import camera_centers
+from etsplat.data.close_ups import object_side
 from etsplat.data.dataset import Dataset
 from etsplat.data.pictures import as_float
 from etsplat.geometry.measures import face_areas, vertex_normals
 from etsplat.geometry.topology import MeshTopology, connected
 
-_WIDEST = 320
-"""Photos are halved until none is wider: agreement asks for texture, not for detail."""
+_LONGEST = 240
+"""Photos are halved until the object is no longer in them: agreement asks for texture, not for detail."""
 
 _NEAR_PLANE = 0.01
 """Of cameras around an object in the unit ball, which none is in."""
@@ -95,10 +96,14 @@ class Photo:
         return grid_sample(planes, places[None], mode=mode, align_corners=False)[0]
 
 
-def reduced(dataset: Dataset, widest: int = _WIDEST) -> Dataset:
-    """Halved until no training view is wider, by default than agreement of surfaces asks for."""
-    while dataset.train and max(dataset.images.sizes[index][0] for index in dataset.train) > widest:
-        dataset = dataset.halved()
+def reduced(dataset: Dataset, longest: int = _LONGEST) -> Dataset:
+    """Halved until the object is no longer in its training views, by default than agreement of surfaces asks for.
+
+    However much of a photo is background, what is shown of the object counts.
+    """
+    side = object_side(dataset)
+    while side > longest:
+        dataset, side = dataset.halved(), side / 2
     return dataset
 
 

@@ -16,7 +16,7 @@ from etsplat.data.dataset import Dataset
 from etsplat.data.pictures import Box, cropped
 from etsplat.data.silhouettes import silhouette
 
-_GAP = 0.01
+GAP = 0.01
 """Widest gap, as a fraction of the picture's longer side, rounded up."""
 
 _DEEP = 3
@@ -48,7 +48,7 @@ def without_frame_gaps(dataset: Dataset) -> tuple[Dataset, list[int]]:
 def _box(mask: Bool[np.ndarray, "H W"]) -> Box:
     """What is left of a photo without its gaps."""
     height, width = mask.shape
-    gap = math.ceil(_GAP * max(mask.shape))
+    gap = math.ceil(GAP * max(mask.shape))
     sides = (mask.T, mask, mask.T[::-1], mask[::-1])
     left, upper, right, lower = (gap if min(mask.shape) > 2 * gap and _is_gap(side, gap) else 0 for side in sides)
     return Box(left, upper, width - right, height - lower)

@@ -15,7 +15,6 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from etsplat.data.agreement import reduced
 from etsplat.data.dataset import Dataset
 from etsplat.data.depth_points import framed, on_map, project
 from etsplat.data.pictures import as_float, unpremultiplied
@@ -136,7 +135,9 @@ def swept_points(capture: Dataset, device: torch.device, progress: Callable[[int
     """
     assert capture.exact_points is not None
     some = capture.train[:: math.ceil(len(capture.train) / PHOTOS)]
-    small = reduced(capture.of_views(some), WIDEST)
+    small = capture.of_views(some)
+    while max(width for width, _ in small.images.sizes) > WIDEST:
+        small = small.halved()
     photos, points = [_Photo.of(small, index) for index in small.train], capture.exact_points
     located = [photo.located(points) for photo in photos]
     inside = [photo.frames(each) for photo, each in zip(photos, located, strict=True)]

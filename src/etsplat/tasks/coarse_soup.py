@@ -20,8 +20,8 @@ from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.soup_trainer import start_trainer
 from etsplat.tasks.train_config import TrainConfig
 
-WIDEST, STEPS = 130, 800
-"""Photos are halved until none is wider; and how often one is looked at."""
+LONGEST, STEPS = 120, 800
+"""Photos are halved until the object is no longer in them; and how often one is looked at."""
 
 INSIDE, CHILDREN = 4000, 2000
 """Triangles that begin within the hull, beside those on it, and how many more there may be."""
@@ -46,7 +46,7 @@ def seen_through(
         config: of the run: its seed, and whether photos are exposed differently.
         device: where the soup is fitted; None for the CPU.
     """
-    small = reduced(views, WIDEST)
+    small = reduced(views, LONGEST)
     points = torch.cat([vertices[::2], _within(views, vertices, config.seed)]).double()
     capture = replace(small, exact_points=points, point_colors=torch.full((len(points), 3), _GREY))
     trainer = start_trainer(capture, _settings(config, len(points)), device=device)

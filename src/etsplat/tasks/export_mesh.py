@@ -117,7 +117,9 @@ def open_reconstruction(
     if not is_reconstruction(run.path):
         raise InputError(f"{path}: is no run of `etsplat reconstruct`, whose photos a texture is made of; name one")
     _mesh_of(run)
-    record = read_record(run, ReconstructConfig, ["resolution", "pictures.supersampling"], "paths.source", "source")
+    record = read_record(
+        run, ReconstructConfig, ["resolution", "pictures.supersampling", "refine_cameras"], "paths.source", "source"
+    )
     paths, source = record["paths"], record["paths"]["source"] if scene is None else scene
     if source is None:
         raise InputError(
@@ -129,7 +131,7 @@ def open_reconstruction(
         resolution=then["resolution"], pictures=Pictures(supersampling=then["pictures"]["supersampling"])
     )
     tell("Reading the photos", 0, 0)
-    loaded, _ = load_source(source, config, paths.get("masks"))
+    loaded, _ = load_source(source, replace(config, refine_cameras=then["refine_cameras"]), paths.get("masks"))
     if fingerprint(loaded) != record["source"].get("fingerprint"):
         name = "the data set" if isinstance(source, Dataset) else source
         raise InputError(f"{path}: {name} is not what the run was made of; name that with --scene")

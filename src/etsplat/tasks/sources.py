@@ -3,11 +3,13 @@
 import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import torch
 
 from etsplat.core.errors import InputError
+from etsplat.data.close_ups import close_ups, cropped_to
 from etsplat.data.dataset import Dataset
 from etsplat.data.demo_object import demo_object
 from etsplat.data.demo_scene import HEIGHT, WIDTH, demo_scene
@@ -54,11 +56,13 @@ def load_source(
     """Reads a mesh file or a scene folder, or makes the demo's object; objects are passed through.
 
     Of a folder, views are left out whose masks contradict the others', and photos are cropped where their mask
-    ends just before the frame that cuts the object off.
+    ends just before the frame that cuts the object off. Photos in which the object is small are cropped to it, and
+    those of a folder are read larger first, so that a close-up is as wide as photos are to be; not where their cameras
+    are refined, which are those of whole photos.
 
     Args:
         source: what to read.
-        config: the resolution of a scene's images.
+        config: the resolution of a scene's images; whether cameras are refined.
         masks: folder with a mask for every image of a scene folder, instead of the scene's own.
         depths: as of `load_dataset`.
         depth_unit: likewise.
@@ -80,24 +84,45 @@ def load_source(
         source.check()
         return source, source.notes
     if isinstance(source, Dataset):
-        scene, notes = _in_unit_sphere(source)
-        return scene, [*notes, *straight_alpha(source)]
+        close, found = (source, []) if config.refine_cameras != "off" else _closer(source, lambda width: source)
+        scene, notes = _in_unit_sphere(close)
+        return scene, [*found, *notes, *straight_alpha(source)]
     check_demo(source, "reconstruct")
     if str(source) == DEMO_OBJECT:
         return demo_object(), []
     path = Path(source)
     if path.is_dir():
-        loaded = load_dataset(
-            path, masks_as="alpha", width=config.resolution, masks=masks, depths=depths, depth_unit=depth_unit
-        )
+        read = partial(load_dataset, path, masks_as="alpha", masks=masks, depths=depths, depth_unit=depth_unit)
+        loaded, close = read(width=config.resolution), list[str]()
+        if config.refine_cameras == "off":
+            # What is read to be cropped is let go of again.
+            loaded, close = _closer(loaded, partial(read, memory=0, preload=False))
         scene, notes = _agreeing(loaded)
-        return scene.renormalized(*bounding_sphere(scene)), [*scene.notes, *notes]
+        return scene.renormalized(*bounding_sphere(scene)), [*scene.notes, *close, *notes]
     if remedy := file_remedy(path):
         raise InputError(f"{path}: {remedy}")
     if path.is_file():
         mesh = load_mesh(path)
         return mesh, mesh.notes
     raise InputError(f"{path}: no such file or folder; {path_remedy(path)}")
+
+
+def _closer(scene: Dataset, read: Callable[..., Dataset]) -> tuple[Dataset, list[str]]:
+    """Photos cropped to the object, where it is small in them, which a note says.
+
+    Args:
+        scene: photos with alpha.
+        read: the same with photos of another `width`.
+    """
+    boxes = close_ups(scene)
+    if boxes is None:
+        return scene, []
+    sizes = scene.images.sizes
+    shares = [(box.right - box.left) / width for box, (width, _) in zip(boxes, sizes, strict=True)]
+    width = max(width for width, _ in sizes)
+    wider = read(width=round(width / sorted(shares)[len(shares) // 2]))
+    found = cropped_to(wider, boxes, sizes)
+    return found, ["the object is small in the photos: they are cropped to it"]
 
 
 def _in_unit_sphere(scene: Dataset) -> tuple[Dataset, list[str]]:
