@@ -108,6 +108,17 @@ def test_a_hull_that_lacks_thin_parts_is_known_by_what_it_leaves_uncovered() -> 
     assert finer_shape(whole, views, config.start.radius) is None
 
 
+def test_of_wires_that_no_grid_of_a_run_holds_a_hull_with_thin_parts_is_taken() -> None:
+    """A ring of two pixels, of which a run's grid has hardly anything, whatever its cells."""
+    views = photograph(ring_of(0.012), 200, 200, supersampling=2)
+    config = ReconstructConfig.quick().changed({"start.hull_faces": 600, "max_faces": 6000})
+    found = plain_hull(views, config)
+    assert found.thin
+    assert found.uncovered < 0.0005
+    assert hull_shape(found) == Shape(1, 1)
+    assert finer_shape(found, views, config.start.radius) is None
+
+
 def test_what_masks_lack_is_no_matter_of_how_fine_a_hull_is() -> None:
     """They lack it on any grid: here one in four has lost half of the object, and is outvoted by none."""
     whole = photograph(MeshFile(*icosphere(3)), 96, 96, supersampling=1)

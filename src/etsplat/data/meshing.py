@@ -29,6 +29,7 @@ def dual_contour(
     cells: tuple[int, int, int],
     *,
     bisections: int = 30,
+    values: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Mesh the zero level of `sdf` inside a box of cubic cells. The surface must stay off the box's outermost cells.
 
@@ -41,6 +42,7 @@ def dual_contour(
         cell: side of a cell.
         cells: number of cells along x, y, z.
         bisections: the surface is found to this power of 2 of a cell; 30 are far below float32 resolution.
+        values: of `sdf` at the cells' corners, (x + 1, y + 1, z + 1), where they are known.
 
     Returns:
         vertices (V, 3) float64 and faces (F, 3) int64.
@@ -49,9 +51,10 @@ def dual_contour(
         ValueError: the surface reaches the border of the box.
     """
     origin = np.asarray(lower, dtype=np.float64)
-    axes = [origin[k] + cell * np.arange(cells[k] + 1) for k in range(3)]
-    nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-    values = sdf(nodes.reshape(-1, 3)).reshape(nodes.shape[:3])
+    if values is None:
+        axes = [origin[k] + cell * np.arange(cells[k] + 1) for k in range(3)]
+        nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+        values = sdf(nodes.reshape(-1, 3)).reshape(nodes.shape[:3])
     inside = values < 0
 
     sheet, corners = _sheets(), _corner_codes(inside)

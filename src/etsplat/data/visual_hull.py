@@ -19,6 +19,7 @@ from etsplat.data.carving import Carving
 from etsplat.data.dataset import Dataset
 from etsplat.data.meshing import dual_contour
 from etsplat.data.silhouettes import Silhouette
+from etsplat.data.thin_parts import ThinParts
 from etsplat.geometry.manifold import taken_apart
 from etsplat.geometry.parts import face_parts
 
@@ -52,7 +53,7 @@ _BISECTIONS = 8
 
 
 def visual_hull(
-    dataset: Dataset, faces: int, *, radius: float = 1.0, free: Distance | None = None
+    dataset: Dataset, faces: int, *, radius: float = 1.0, free: Distance | None = None, thin: bool = False
 ) -> tuple[Float[Tensor, "V 3"], Int64[Tensor, "F 3"]]:
     """The hull of the training views' silhouettes (alpha 0.5) within a ball around the origin, as a closed manifold.
 
@@ -64,6 +65,7 @@ def visual_hull(
         faces: about how many are wanted.
         radius: of the ball.
         free: positive at points that are cut away from the hull; None for the hull as it is.
+        thin: parts that are thinner than cells are whole (`ThinParts`), and gaps beside them of two cells may close.
 
     Returns:
         vertices (V, 3) float32 and faces (F, 3) int64, counter-clockwise seen from outside; (0, 3) both if the
@@ -85,7 +87,13 @@ def visual_hull(
         cell = 2 * radius / (cells - 2 * _MARGIN)
         corner = -0.5 * cell * cells
         lower, counts = (corner, corner, corner), (cells, cells, cells)
-        vertices, triangles = dual_contour(distance, lower, cell, counts, bisections=_BISECTIONS)
+        if thin:
+            parts = ThinParts.of(distance, cells, cell)
+            values = parts.values - parts.skin
+            found = dual_contour(parts.skinned, lower, cell, counts, bisections=_BISECTIONS, values=values)
+            vertices, triangles = parts.without_skin(found[0]), found[1]
+        else:
+            vertices, triangles = dual_contour(distance, lower, cell, counts, bisections=_BISECTIONS)
         if len(triangles) == 0 or abs(len(triangles) - faces) <= NEAR * faces:
             break
         wanted = round(cells * (faces / len(triangles)) ** 0.5)

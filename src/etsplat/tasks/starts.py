@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -48,6 +49,9 @@ _UNCOVERED, _LESS = 0.0005, 0.9
 """A hull that leaves more of the silhouettes uncovered lacks thin parts if a finer one leaves at most so many times as
 much: what rough masks leave does not depend on how fine it is."""
 
+_LACKING, _THIN, _FINEST = 0.003, 0.5, 4
+"""Where a hull leaves more of the silhouettes uncovered, one is tried that has thin parts whole, of up to so many times
+as many faces: around wires they are small. It is taken if it leaves at most so large a part of that."""
 
 _MARGINS = (0.05, 0.03, 0.08)
 """How far in front of what a coarse soup shows a hull is cut, in units of the object's radius; in turn, until photos
@@ -66,12 +70,14 @@ class Hull(NamedTuple):
         faces: (F, 3).
         wanted: about how many faces it should have.
         uncovered: the part of silhouettes that is more than a pixel beside what it covers, in the mean.
+        thin: whether it has parts that are thinner than its cells.
     """
 
     vertices: Tensor
     faces: Tensor
     wanted: int
     uncovered: float
+    thin: bool = False
 
 
 class Started(NamedTuple):
@@ -136,10 +142,10 @@ def _explained(views: Dataset, radius: float) -> bool:
     return float(lost.mean()) <= _LOST
 
 
-def _carved(views: Dataset, faces: int, radius: float) -> Hull:
+def _carved(views: Dataset, faces: int, radius: float, *, thin: bool = False) -> Hull:
     """A hull of about so many faces; where the silhouettes have no point in common it has none, and covers nothing."""
-    surface = visual_hull(views, faces, radius=radius)
-    return Hull(*surface, faces, _uncovered(photos_of(views), *surface) if len(surface[1]) else 1.0)
+    surface = visual_hull(views, faces, radius=radius, thin=thin)
+    return Hull(*surface, faces, _uncovered(photos_of(views), *surface) if len(surface[1]) else 1.0, thin)
 
 
 def _uncovered(photos: list[Photo], vertices: Tensor, faces: Tensor) -> float:
@@ -221,7 +227,8 @@ def _cut_open(
     free, best, photos = seen_through(views, hull.vertices, config, device), opened, photos_of(views)
     most, radius = hull.uncovered + _RIMS, config.start.radius
     for margin in _MARGINS:
-        vertices, faces = visual_hull(views, hull.wanted, radius=radius, free=lambda p, margin=margin: free(p) - margin)
+        cut = partial(visual_hull, views, hull.wanted, radius=radius, thin=hull.thin)
+        vertices, faces = cut(free=lambda points, margin=margin: free(points) - margin)
         if len(faces) == 0:
             continue
         found = _opened(views, vertices, faces)
@@ -236,7 +243,7 @@ def _cut_open(
 
 @torch.no_grad()
 def plain_hull(views: Dataset, config: ReconstructConfig) -> Hull:
-    """The visual hull, with at most half of a run's faces, or twice as fine where thin parts of that one are broken.
+    """The visual hull, with at most half of a run's faces; finer where thin parts of that one are broken or lacking.
 
     Args:
         views: of the unit frame.
@@ -248,18 +255,22 @@ def plain_hull(views: Dataset, config: ReconstructConfig) -> Hull:
     if not views.has_masks:
         raise InputError("start.shape: hull needs masks or transparent pictures; give masks, or start from a sphere")
     wanted, radius = min(config.start.hull_faces, max(1, config.max_faces // 2)), config.start.radius
-    hull = _carved(views, wanted, radius)
+    hull, most = _carved(views, wanted, radius), round(config.max_faces / (1 + NEAR))
+    if hull.uncovered > _UNCOVERED and most > wanted:
+        finer = _carved(views, min(2 * wanted, most), radius)
+        if len(finer.faces) <= config.max_faces and _mends(finer, hull):
+            return finer
+    if hull.uncovered > _LACKING:
+        thin = _carved(views, min(_FINEST * wanted, most), radius, thin=True)
+        if len(thin.faces) <= config.max_faces and thin.uncovered <= _THIN * hull.uncovered:
+            return thin
     if len(hull.faces) == 0:
         raise InputError(
             "start.shape: the masks have no point in common, so there is no hull; check that masks are white inside the"
             " object, that poses and images belong together, and that the object is no flat sheet, whose mask is empty"
             " from its side: give it a thickness"
         )
-    more = min(2 * wanted, round(config.max_faces / (1 + NEAR)))
-    if hull.uncovered <= _UNCOVERED or more <= wanted:
-        return hull
-    finer = _carved(views, more, radius)
-    return finer if len(finer.faces) <= config.max_faces and _mends(finer, hull) else hull
+    return hull
 
 
 def _mends(finer: Hull, hull: Hull) -> bool:
