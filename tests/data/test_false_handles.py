@@ -120,6 +120,30 @@ def test_a_small_hole_that_light_comes_through_stays_whatever_photos_say() -> No
     assert _simpler(photos, *truth, (score, seen), 0.5, most) is None
 
 
+def on_a_plate(places: np.ndarray) -> np.ndarray:
+    """A post that an arch joins to its plate, whose rim hides the post's foot from aside."""
+    x, y, z = places.T
+    around = np.hypot(x, z)
+    plate = np.maximum(around - 1.05, np.abs(y + 0.55) - 0.1)
+    rim = np.maximum(np.abs(around - 1.0) - 0.05, np.abs(y + 0.4) - 0.12)
+    post = np.maximum(around - 0.35, np.abs(y + 0.05) - 0.55)
+    arch = np.maximum(np.hypot(np.hypot(x - 0.35, y + 0.5) - 0.5, z) - 0.08, 0.3 - x)
+    return np.minimum(np.minimum(plate, rim), np.minimum(post, np.maximum(arch, -0.55 - y)))
+
+
+def test_a_post_is_not_cut_where_its_plate_hides_the_gap() -> None:
+    """A cup on a saucer lost its handle's hole: its foot was cut, and the handle alone held the two together."""
+    (vertices, faces), views = photographed(on_a_plate)
+    assert genera(faces, len(vertices)) == [1]
+    photos, unit = photos_of(views), views.normalization
+    places = unit.invert(vertices)
+    foot = (places[:, 1] + 0.36).abs() < 0.1
+    foot &= (places[:, [0, 2]].norm(dim=1) - 0.35).abs() < 0.1
+    most = silhouette_errors(photos, vertices, faces) + torch.tensor([_LOST, _ADDED])
+    agreed = (~foot).float(), torch.zeros(len(vertices), dtype=torch.bool)
+    assert _simpler(photos, vertices, faces, agreed, 0.5, most) is None
+
+
 def bridged(places: np.ndarray) -> np.ndarray:
     """The bowl with a bridge over the corner at its bottom, as thin as the grid."""
     x, y, z = places.T

@@ -14,7 +14,7 @@ needs it.
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int64
-from scipy.ndimage import distance_transform_edt
+from scipy.ndimage import distance_transform_edt, label
 from torch import Tensor
 
 from etsplat.data.agreement import COMPARED, Photo, first_hits, photos_of, pixel_size, seen_by, surface_agreement
@@ -25,6 +25,7 @@ from etsplat.geometry.loops import short_loops
 from etsplat.geometry.measures import mean_edge
 from etsplat.geometry.parts import face_parts, genera
 from etsplat.geometry.topology import MeshTopology, connected
+from etsplat.geometry.windings import winds_around
 
 _LEVELS = (0.4, 0.5, 0.6, 0.7)
 """Correlations below which photos are said to contradict each other, the surest first."""
@@ -38,6 +39,9 @@ _LOST, _ADDED = 0.001, 0.01
 _DEEP = 0.9
 """Of a mean edge, how deep what is covered beside a silhouette may be: discs overhang by less, and what is seen through
 a hole in the view that shows it best is deeper, however little of a large silhouette it is."""
+
+_SHOWN = 2
+"""Pixels from its rim to the middle of a hole in a silhouette that is no fault of a mask."""
 
 _BESIDE = 0.05
 """Alpha of what is certainly beside a silhouette."""
@@ -144,7 +148,7 @@ def _simpler(
         covered = _covered(photos, *found)
         if bool((_errors(photos, covered) <= most).all()):
             was = was or _covered(photos, vertices, faces)
-            if not _closes(photos, was, covered, deep):
+            if not _closes(photos, was, covered, deep) and not _lets_go(photos, (vertices, faces), found):
                 return found
     return None
 
@@ -162,6 +166,37 @@ def _closes(photos: list[Photo], was: list[Tensor], covered: list[Tensor], deep:
         if depth.max() > deep:
             return True
     return False
+
+
+def _lets_go(photos: list[Photo], before: tuple[Tensor, Tensor], after: tuple[Tensor, Tensor]) -> bool:
+    """Whether the surface went around a hole of a silhouette, and does not any more.
+
+    Where the matter beside a hole is cut, and another part hides the gap, no silhouette misses anything.
+    """
+    edges = [MeshTopology.from_faces(faces, len(vertices)).edges.long() for vertices, faces in (before, after)]
+    for photo in photos:
+        size = torch.tensor(photo.pixels.shape[:1:-1])
+        places = [(photo.project(vertices)[0] + 1) / 2 * size for vertices, _ in (before, after)]
+        for hole in _holes(photo):
+            if winds_around(places[0], edges[0], hole) and not winds_around(places[1], edges[1], hole):
+                return True
+    return False
+
+
+def _holes(photo: Photo) -> list[Float[Tensor, "2"]]:
+    """Of each hole in a silhouette, but for the smallest, the place farthest within: column, row."""
+    beside = (photo.pixels[0, 3] < _BESIDE).numpy()
+    around = np.pad(beside, 1, constant_values=True)  # so that all that reaches the frame is one piece
+    piece = np.zeros(around.shape, dtype=np.int32)
+    label(around, output=piece)
+    depth = np.asarray(distance_transform_edt(around)) * (piece != piece[0, 0])
+    found = []
+    for number in range(1, int(piece.max()) + 1):
+        inside = depth * (piece == number)
+        if inside.max() > _SHOWN:
+            row, column = np.unravel_index(inside.argmax(), inside.shape)
+            found.append(torch.tensor([column - 0.5, row - 0.5]))
+    return found
 
 
 def _regions(faces: Tensor, low: Bool[Tensor, " F"]) -> list[Bool[Tensor, " F"]]:
