@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 
@@ -171,3 +172,44 @@ def test_cameras_of_integers_are_refused():
 def test_what_cannot_be_looked_at_is_refused_by_name(odd, text):
     with pytest.raises(ValueError, match=text):
         look_at(**{"eye": torch.rand(5, 3) + 1, "target": torch.zeros(3), "up": (0, 1, 0), **odd})
+
+
+@pytest.mark.parametrize("index", [2, -1, np.int64(2), np.array(2), torch.tensor(2)])
+def test_one_camera_is_chosen_by_whole_numbers_of_every_library(cameras, index):
+    one = cameras[index]
+    assert len(one) == 1
+    assert torch.equal(one.viewmats, cameras.viewmats[2:3])
+
+
+def test_several_cameras_are_chosen_by_whatever_holds_their_indices(cameras):
+    """A tuple too, which torch takes as an index for each axis; or by a mask."""
+    mask = torch.tensor([True, False, True])
+    for index in ((0, 2), [0, 2], np.array([0, 2]), torch.tensor([0, 2]), range(0, 3, 2), slice(0, 3, 2), mask):
+        assert torch.equal(cameras[index].viewmats, cameras.viewmats[[0, 2]]), index
+
+
+def test_cameras_can_be_looked_for(cameras):
+    """They are compared as objects: tensors have no answer of one word."""
+    one, other = cameras[0], cameras[0]
+    assert [other, one].index(one) == 1
+    assert one != other
+    assert {one: "one"}[one] == "one"
+
+
+def test_sizes_are_ints_whatever_they_were_given_as(cameras):
+    made = Cameras(cameras.viewmats, cameras.Ks, torch.tensor(64), np.int32(48))
+    assert (made.width, type(made.width), made.height, type(made.height)) == (64, int, 48, int)
+    assert made.scaled(torch.tensor(0.5)).width == 32
+
+
+@pytest.mark.parametrize(
+    ("odd", "text"),
+    [
+        (lambda: Cameras.stacked([]), "cameras: expected at least one, got none"),
+        (lambda: Cameras.stacked([torch.eye(4)]), r"cameras\[0\] must be Cameras, got a tensor of shape \(4, 4\)"),
+        (lambda: sphere_grid([0.0], [0.0], "2"), "distance must be a number, got '2'"),
+    ],
+)
+def test_what_cannot_be_stacked_or_placed_is_named(odd, text):
+    with pytest.raises(ValueError, match=text):
+        odd()

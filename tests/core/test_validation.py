@@ -1,9 +1,10 @@
 """Values of arguments are checked the same on native arrays and on any other tensor."""
 
+import numpy as np
 import pytest
 import torch
 
-from etsplat.core.validation import check_finite, check_indices, check_positive, first_not_finite
+from etsplat.core.validation import check_count, check_finite, check_indices, check_positive, first_not_finite
 from etsplat.engines.native.pool import zeros_image
 
 LARGE = 100_000  # several ranges of the native scans
@@ -85,3 +86,18 @@ def test_a_tensor_that_is_not_finite_is_named():
     assert first_not_finite(tensors) == "b"
     assert first_not_finite({"a": tensors["a"], "c": tensors["c"]}) == "c"
     assert first_not_finite({"a": tensors["a"]}) is None
+
+
+@pytest.mark.parametrize("count", [3, np.int64(3), np.uint8(3), np.array(3), torch.tensor(3), torch.tensor(3).short()])
+def test_whole_numbers_of_every_library_are_ints(count):
+    """As shapes and loops of others give them."""
+    found = check_count("count", count, most=4)
+    assert (found, type(found)) == (3, int)
+
+
+@pytest.mark.parametrize(
+    "count", [3.0, True, np.bool_(True), torch.tensor(True), torch.tensor(3.0), torch.tensor([3]), np.array([3]), "3"]
+)
+def test_what_is_no_whole_number_is_no_count(count):
+    with pytest.raises(ValueError, match="count must be an integer of at least 1, got"):
+        check_count("count", count)

@@ -74,7 +74,11 @@ def test_poses_that_are_none_are_refused(spoil, message):
         ({"train": [0, 3]}, r"train: expected indices in \[0, 3\), got 3"),
         ({"train": "abc"}, r"train: expected indices in \[0, 3\), got 'abc'"),
         ({"test": None}, r"test: expected indices in \[0, 3\), got None"),
-        ({"train": [0.5]}, r"train: expected indices in \[0, 3\), got list"),
+        ({"train": [0.5]}, r"train: expected indices in \[0, 3\), got 0\.5"),
+        ({"train": [1.0]}, r"train: expected indices in \[0, 3\), got 1\.0"),
+        ({"train": 1}, r"train: expected indices in \[0, 3\), got 1"),
+        ({"train": [True, False, True]}, r"got True: of a mask of all views pass the indices"),
+        ({"train": torch.tensor([False, True, True])}, r"of a mask of all views pass the indices"),
         ({"exact_points": torch.zeros(0, 3)}, "exact_points: expected at least one"),
         ({"exact_points": torch.full((2, 3), torch.inf)}, "exact_points must be finite"),
         ({"exact_points": torch.zeros(2, 3), "point_colors": torch.zeros(3, 3)}, "point_colors must have shape"),
@@ -94,6 +98,35 @@ def test_only_views_that_there_are_can_be_chosen():
         with pytest.raises(ValueError, match=r"views: expected indices in \[0, 3\), got"):
             dataset().of_views(views)
     assert dataset().of_views(torch.tensor([2, 0])).names == dataset().of_views([2, 0]).names
+
+
+def test_no_gradients_reach_what_was_measured():
+    """A run would walk through the caller's graph once more in every step."""
+    turned = (dataset().viewmats.clone().requires_grad_() * 1.0).float()
+    made = dataset(viewmats=turned, Ks=dataset().Ks.clone().requires_grad_())
+    assert not made.viewmats.requires_grad
+    assert not made.Ks.requires_grad
+
+
+def test_a_data_set_is_moved_by_any_three_numbers():
+    for center in (torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64), (1, 2, 3), np.array([1.0, 2.0, 3.0])):
+        moved = dataset().renormalized(center, np.float32(2.0))
+        assert moved.normalization.center.tolist() == [1.0, 2.0, 3.0]
+        assert moved.viewmats.equal(dataset().renormalized(torch.tensor([1.0, 2.0, 3.0]).double(), 2.0).viewmats)
+
+
+@pytest.mark.parametrize(
+    ("moved", "message"),
+    [
+        (lambda: dataset().renormalized((0, 0), 1.0), "center must be a tensor of shape"),
+        (lambda: dataset().renormalized(torch.zeros(3), 0), "radius must be positive and finite, got 0"),
+        (lambda: dataset().watching("2"), "one_in must be an integer of at least 0, got '2'"),
+        (lambda: dataset().watching(2.5), r"one_in must be an integer of at least 0, got 2\.5"),
+    ],
+)
+def test_numbers_that_say_nothing_of_a_data_set_are_named(moved, message):
+    with pytest.raises(ValueError, match=message):
+        moved()
 
 
 def test_masks_of_three_kinds_are_the_same():

@@ -9,13 +9,22 @@ from jaxtyping import Float
 from torch import Tensor
 
 from etsplat.core.precision import as_given
-from etsplat.core.validation import check_above, check_count, check_finite, check_floating, check_memory, check_number
+from etsplat.core.validation import (
+    check_above,
+    check_count,
+    check_finite,
+    check_floating,
+    check_kind,
+    check_memory,
+    check_number,
+    whole_number,
+)
 
 MAX_SIDE = 1 << 26
 """Pixels of the width or height of an image: with 16 samples in each they can still be numbered in 32 bits."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Cameras:
     """B pinhole cameras with one image size.
 
@@ -50,7 +59,8 @@ class Cameras:
             raise ValueError(f"viewmats must have shape (B, 4, 4), got {tuple(self.viewmats.shape)}")
         if self.Ks.shape != (batch, 3, 3):
             raise ValueError(f"Ks must have shape ({batch}, 3, 3), one per viewmat, got {tuple(self.Ks.shape)}")
-        check_size(self.width, self.height)
+        for name, side in zip(("width", "height"), check_size(self.width, self.height), strict=True):
+            object.__setattr__(self, name, side)
 
     def __len__(self) -> int:
         return self.viewmats.shape[0]
@@ -58,12 +68,17 @@ class Cameras:
     def __getitem__(self, index: int | slice | Sequence[int] | Tensor) -> "Cameras":
         """The chosen cameras, always as a batch: an int gives a batch of one.
 
+        Args:
+            index: One, a slice, several, or a mask of all.
+
         Raises:
             IndexError: There is no camera of that index.
         """
-        if isinstance(index, int) and not -len(self) <= index < len(self):
-            raise IndexError(f"index of a camera must be below {len(self)}, as there are so many, got {index}")
-        chosen = [index] if isinstance(index, int) else index
+        one = whole_number(index)
+        if one is not None and not -len(self) <= one < len(self):
+            raise IndexError(f"index of a camera must be below {len(self)}, as there are so many, got {one}")
+        several = list(index) if isinstance(index, tuple) else index  # torch takes a tuple as one index for each axis
+        chosen = several if one is None else [one]
         return Cameras(self.viewmats[chosen], self.Ks[chosen], self.width, self.height)
 
     @property
@@ -73,7 +88,11 @@ class Cameras:
 
     @staticmethod
     def stacked(cameras: Sequence["Cameras"]) -> "Cameras":
-        """Cameras of one size as a batch. Raises ValueError where sizes differ."""
+        """Cameras of one size as a batch. Raises ValueError where there are none, or where sizes differ."""
+        for index, camera in enumerate(cameras):
+            check_kind(f"cameras[{index}]", camera, Cameras)
+        if not cameras:
+            raise ValueError("cameras: expected at least one, got none")
         sizes = {(camera.width, camera.height) for camera in cameras}
         if len(sizes) != 1:
             raise ValueError(f"cameras: expected images of one size, got {sorted(sizes)}")
@@ -87,6 +106,7 @@ class Cameras:
             ValueError: ``factor`` is not positive and finite, or the images become too large.
         """
         check_above("factor", factor)
+        factor = float(factor)
         width, height = max(1, round(self.width * factor)), max(1, round(self.height * factor))
         ratios = [width / self.width, height / self.height, 1.0]
         ratio = torch.tensor(ratios, dtype=self.Ks.dtype, device=self.Ks.device)
@@ -102,10 +122,9 @@ class Cameras:
         )
 
 
-def check_size(width: object, height: object) -> None:
-    """Raise ValueError unless both are whole numbers of pixels, from 1 to `MAX_SIDE`."""
-    check_count("width", width, most=MAX_SIDE)
-    check_count("height", height, most=MAX_SIDE)
+def check_size(width: object, height: object) -> tuple[int, int]:
+    """Both as ints; ValueError unless they are whole numbers of pixels, from 1 to `MAX_SIDE`."""
+    return check_count("width", width, most=MAX_SIDE), check_count("height", height, most=MAX_SIDE)
 
 
 def check_cameras(cameras: object, like_name: str, like: Tensor) -> None:
@@ -139,12 +158,12 @@ def view_arguments(
     """What a drawing function was given to look from: ``cameras``, or the four others.
 
     Raises:
-        ValueError: Both, neither or only some of the four are given.
+        ValueError: Both, neither or only some of the four are given; a size that is none of an image.
     """
     if cameras is None:
         if viewmats is None or Ks is None or width is None or height is None:
             raise ValueError("either cameras, or all of viewmats, Ks, width and height must be given")
-        return viewmats, Ks, width, height
+        return viewmats, Ks, *check_size(width, height)
     if not isinstance(cameras, Cameras):
         raise ValueError(f"cameras must be Cameras, got {_made(cameras)}")
     if any(given is not None for given in (viewmats, Ks, width, height)):
@@ -242,7 +261,7 @@ def intrinsics(
         >>> etsplat.intrinsics(90.0, 200, 100).tolist()
         [[50.0, 0.0, 100.0], [0.0, 50.0, 50.0], [0.0, 0.0, 1.0]]
     """
-    check_size(width, height)
+    width, height = check_size(width, height)
     check_number("fov_y_degrees", fov_y_degrees)
     if not 0.0 < fov_y_degrees < 180.0:
         raise ValueError(f"fov_y_degrees must be between 0 and 180, got {fov_y_degrees}")
@@ -264,10 +283,14 @@ def sphere_grid(
     Returns:
         (len(elevations) * len(azimuths), 3); the azimuth varies fastest.
 
+    Raises:
+        ValueError: ``distance`` is no number.
+
     Example:
         >>> etsplat.sphere_grid([0.0], [0.0, 90.0], distance=2.0).round(decimals=4).abs().tolist()
         [[0.0, 0.0, 2.0], [2.0, 0.0, 0.0]]
     """
+    check_number("distance", distance)
     elevation, azimuth = torch.meshgrid(
         torch.deg2rad(torch.as_tensor(elevations, dtype=torch.float64)),
         torch.deg2rad(torch.as_tensor(azimuths, dtype=torch.float64)),

@@ -96,7 +96,7 @@ class OpaqueView(NamedTuple):
     near_plane: float
 
 
-@dataclass
+@dataclass(eq=False)
 class TriangleStatistics:
     """Per view and triangle, without gradients; all 0 where ``visible`` is False.
 
@@ -122,7 +122,7 @@ class TriangleStatistics:
     visible: Bool[Tensor, "B N"]
 
 
-@dataclass
+@dataclass(eq=False)
 class Rasterization:
     """Images of the rasterizers; what was not asked for, or what a rasterizer does not have, is None.
 

@@ -1,8 +1,9 @@
 """Checks of tensor arguments; every failure is a ValueError that names the argument, what it got and what it wants."""
 
 import math
+import operator
 from collections.abc import Mapping, Sequence
-from numbers import Integral, Real
+from numbers import Real
 
 import numpy as np
 import torch
@@ -207,13 +208,25 @@ def check_flags(**values: object) -> None:
             raise ValueError(f"{name} must be True or False, got {value!r}")
 
 
-def check_count(name: str, value: object, *, least: int = 1, most: float = math.inf) -> None:
-    """Raise ValueError unless ``value`` is an integer, and no bool, from ``least`` to ``most``."""
+def check_count(name: str, value: object, *, least: int = 1, most: float = math.inf) -> int:
+    """``value`` as an int; ValueError unless it is a `whole_number` from ``least`` to ``most``."""
     if type(value) is int and least <= value <= most:  # as nearly always
-        return
-    if isinstance(value, bool) or not isinstance(value, Integral) or not least <= int(value) <= most:
+        return value
+    count = whole_number(value)
+    if count is None or not least <= count <= most:
         bounds = f"of at least {least}" if most == math.inf else f"from {least} to {most}"
         raise ValueError(f"{name} must be an integer {bounds}, got {value!r}")
+    return count
+
+
+def whole_number(value: object) -> int | None:
+    """An integer of Python or numpy, or a tensor or array () of one, as an int; None for booleans and all else."""
+    if isinstance(value, Tensor | np.ndarray) and (value.ndim or value.dtype in (torch.bool, np.bool_)):
+        return None
+    try:
+        return None if isinstance(value, bool | np.bool_) else operator.index(value)  # pyright: ignore[reportArgumentType]
+    except TypeError:
+        return None
 
 
 def check_number(name: str, value: object, low: float = -math.inf, high: float = math.inf) -> None:

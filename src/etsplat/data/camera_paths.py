@@ -45,7 +45,7 @@ def orbit(viewmats: Viewmats, up: Float[Tensor, "3"], frames: int) -> Viewmats:
         >>> etsplat.orbit(cameras.viewmats, torch.tensor([0.0, 1.0, 0.0]), frames=30).shape
         torch.Size([30, 4, 4])
     """
-    _check(viewmats, up, frames)
+    frames = _check(viewmats, up, frames)
     covered = coverage(viewmats, up)
     if covered is None:
         return photos(viewmats, up, frames)
@@ -62,7 +62,7 @@ def ellipse(viewmats: Viewmats, up: Float[Tensor, "3"], frames: int) -> Viewmats
         >>> etsplat.ellipse(cameras.viewmats, torch.tensor([0.0, 1.0, 0.0]), frames=30).shape
         torch.Size([30, 4, 4])
     """
-    _check(viewmats, up, frames)
+    frames = _check(viewmats, up, frames)
     covered = coverage(viewmats, up)
     if covered is None:
         return photos(viewmats, up, frames)
@@ -80,7 +80,7 @@ def spiral(viewmats: Viewmats, up: Float[Tensor, "3"], frames: int) -> Viewmats:
         >>> etsplat.spiral(cameras.viewmats, torch.tensor([0.0, 1.0, 0.0]), frames=30).shape
         torch.Size([30, 4, 4])
     """
-    _check(viewmats, up, frames)
+    frames = _check(viewmats, up, frames)
     focus, centers = focus_point(viewmats), camera_centers(viewmats.double())
     offsets = centers - centers.mean(dim=0)
     middle = int(offsets.norm(dim=1).argmin())
@@ -98,7 +98,7 @@ def photos(viewmats: Viewmats, up: Float[Tensor, "3"], frames: int) -> Viewmats:
 
     `up` is not used: orientations are means of the cameras' own.
     """
-    _check(viewmats, up, frames)
+    frames = _check(viewmats, up, frames)
     if len(viewmats) == 1:
         return viewmats.double().expand(frames, 4, 4)
     positions, rotations, passed = _along(viewmats)
@@ -120,7 +120,7 @@ def interpolated(viewmats: Viewmats, up: Float[Tensor, "3"], frames: int) -> Vie
         >>> etsplat.interpolated(cameras.viewmats, torch.tensor([0.0, 1.0, 0.0]), frames=30).shape
         torch.Size([30, 4, 4])
     """
-    _check(viewmats, up, frames)
+    frames = _check(viewmats, up, frames)
     if len(viewmats) == 1:
         return viewmats.double().expand(frames, 4, 4)
     centers = camera_centers(viewmats.double())
@@ -219,7 +219,8 @@ def _viewmats(positions: Float[Tensor, "F 3"], rotations: Float[Tensor, "F 3 3"]
     return result
 
 
-def _check(viewmats: Tensor, up: Tensor, frames: int) -> None:
+def _check(viewmats: Tensor, up: Tensor, frames: int) -> int:
+    """The number of frames."""
     check_shape("viewmats", viewmats, ("B", 4, 4))
     check_shape("up", up, (3,))
     for name, tensor in (("viewmats", viewmats), ("up", up)):
@@ -229,4 +230,4 @@ def _check(viewmats: Tensor, up: Tensor, frames: int) -> None:
         check_finite(name, tensor)
     if len(viewmats) == 0:
         raise ValueError("viewmats must hold at least one camera, got 0")
-    check_count("frames", frames, most=MAX_FRAMES)
+    return check_count("frames", frames, most=MAX_FRAMES)

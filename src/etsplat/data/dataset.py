@@ -13,8 +13,14 @@ from torch import Tensor
 
 from etsplat.core.cameras import Cameras, camera_centers
 from etsplat.core.errors import InputError
-from etsplat.core.validation import shown
-from etsplat.data.dataset_checks import checked_intrinsics, checked_points, checked_split, checked_viewmats
+from etsplat.core.validation import check_above, check_count, shown
+from etsplat.data.dataset_checks import (
+    checked_intrinsics,
+    checked_point,
+    checked_points,
+    checked_split,
+    checked_viewmats,
+)
 from etsplat.data.pictures import Pictures, as_float, halved
 from etsplat.io.georeference import Georeference
 
@@ -25,7 +31,7 @@ SPREAD_FACTOR = 1.1
 """Extent = this times the largest distance of a training camera from their mean, as 3DGS has it."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Normalization:
     """The similarity between the input's own units and another frame: x_frame = (x - center) / radius.
 
@@ -51,12 +57,12 @@ class Normalization:
         return points * self.radius + self.center.to(points)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Dataset:
     """Posed photos, each with a camera of its own size.
 
     Poses and points are kept in double precision, so that a scene far from its origin can be moved there without loss;
-    `cameras` and `points` give them in the engines' float32.
+    `cameras` and `points` give them in the engines' float32. They are measurements: no gradients reach them.
 
     Attributes:
         viewmats: (B, 4, 4) float64, world to camera, OpenCV axes.
@@ -179,7 +185,9 @@ class Dataset:
 
         Raises:
             InputError: that would be none, or all.
+            ValueError: `one_in` is no whole number.
         """
+        one_in = None if one_in is None else check_count("one_in", one_in, least=0)
         count = len(self.train)
         if self.watched or one_in == 0 or (one_in is None and count < WATCHED_FROM):
             return self
@@ -239,12 +247,21 @@ class Dataset:
         """From the present frame to that of `normalized`."""
         return Normalization(*self._center_and_extent())
 
-    def renormalized(self, center: Float[Tensor, "3"], radius: float) -> "Dataset":
+    def renormalized(self, center: Float[Tensor, "3"] | Sequence[float], radius: float) -> "Dataset":
         """The same views in the frame where the sphere (center, radius) of the present frame is the unit sphere.
 
         A point maps to x' = (x - center) / radius, so a camera [R | t] becomes [R | (t + R center) / radius]; images
         and intrinsics do not change. Computed in the precision of `center`.
+
+        Args:
+            center: (3,), or three numbers.
+            radius: > 0.
+
+        Raises:
+            ValueError: they are no such point and number.
         """
+        check_above("radius", radius)
+        center, radius = checked_point("center", center), float(radius)
         viewmats = self.viewmats.clone()
         rotations, translations = viewmats[:, :3, :3].to(center), viewmats[:, :3, 3].to(center)
         viewmats[:, :3, 3] = ((translations + rotations @ center) / radius).double()

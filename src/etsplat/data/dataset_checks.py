@@ -1,14 +1,14 @@
 """What is made of the fields of a data set that is built in memory, and which are refused."""
 
-import operator
 from collections.abc import Iterable, Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from etsplat.core.validation import check_shape, shown
+from etsplat.core.validation import check_finite, check_floating, check_shape, shown, whole_number
 
 _ROTATION = 0.01
 """How far R R^T may be from the identity: poses are written down with few digits."""
@@ -18,6 +18,8 @@ _ABOVE = 2 / 255
 
 _BRIGHTEST = 4.0
 """Exposed photos may be brighter than 1; what is brighter than this is not in [0, 1] at all."""
+
+_INDICES_OF_FLAGS = ": of a mask of all views pass the indices, torch.tensor(mask).nonzero().flatten()"
 
 
 def checked_pixels(name: str, pixels: Any) -> Tensor:
@@ -113,18 +115,38 @@ def checked_points(points: Any, colors: Any) -> tuple[Tensor, Tensor | None]:
     low, high = (float(value) for value in torch.aminmax(colors))
     if not (low >= -_ABOVE and high <= 1 + _ABOVE):
         raise ValueError(f"point_colors must be in [0, 1], got {low:.4g} to {high:.4g}")
-    return points, colors.float()
+    return points, colors.detach().float()
+
+
+def checked_point(name: str, point: Any) -> Float[Tensor, "3"]:
+    """A tensor (3,) as it is, or three numbers in float64. Raises ValueError for anything else."""
+    if isinstance(point, list | tuple | np.ndarray) and len(point) == 3:
+        point = torch.tensor([float(number) for number in point], dtype=torch.float64)
+    check_shape(name, point, (3,))
+    check_floating(name, point)
+    check_finite(name, point)
+    return point
 
 
 def checked_split(name: str, views: Iterable[Any], count: int) -> list[int]:
-    """Indices of views as a list. Raises ValueError where one is none."""
-    try:
-        indices = [operator.index(view) for view in views]
-    except TypeError:
-        raise ValueError(f"{name}: expected indices in [0, {count}), got {shown(views)}") from None
-    if wrong := [index for index in indices if not 0 <= index < count]:
-        raise ValueError(f"{name}: expected indices in [0, {count}), got {wrong[0]}")
+    """Indices of views as a list. Raises ValueError where one is none: floats are not, nor is a mask of all views."""
+    wanted = f"{name}: expected indices in [0, {count}), got"
+    if isinstance(views, str) or not isinstance(views, Iterable):
+        raise ValueError(f"{wanted} {shown(views)}")
+    indices = []
+    for view in views:
+        index = whole_number(view)
+        if index is None:
+            raise ValueError(f"{wanted} {view!r}{_INDICES_OF_FLAGS if isinstance(_plain(view), bool) else ''}")
+        if not 0 <= index < count:
+            raise ValueError(f"{wanted} {index}")
+        indices.append(index)
     return indices
+
+
+def _plain(value: Any) -> Any:
+    """Of a tensor or array () what it holds."""
+    return value.item() if isinstance(value, Tensor | np.ndarray | np.generic) and value.ndim == 0 else value
 
 
 def _in_double(name: str, values: Any, shape: tuple[str | int, ...]) -> Tensor:
@@ -133,4 +155,4 @@ def _in_double(name: str, values: Any, shape: tuple[str | int, ...]) -> Tensor:
         raise ValueError(f"{name} must be floats, got {values.dtype}")
     if not bool(values.isfinite().all()):
         raise ValueError(f"{name} must be finite")
-    return values.double()
+    return values.detach().double()  # a run that walked through a graph of the caller's would find it freed

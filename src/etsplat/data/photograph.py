@@ -191,7 +191,7 @@ def orbit_cameras(width: int, height: int, *, elevations: Sequence[float] = ELEV
         >>> len(etsplat.orbit_cameras(64, 64))
         40
     """
-    check_count("azimuths", azimuths)
+    azimuths = check_count("azimuths", azimuths)
     heights = torch.as_tensor(elevations, dtype=torch.float64)
     if not heights.numel() or not bool((heights.deg2rad().cos().abs() > _STEEPEST).all()):
         raise ValueError(f"elevations must be degrees, none of them straight above or below, got {elevations}")

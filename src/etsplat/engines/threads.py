@@ -35,7 +35,7 @@ def set_num_threads(count: int) -> None:
         1
         >>> etsplat.set_num_threads(before)
     """
-    check_count("count", count, least=0)
+    count = check_count("count", count, least=0)
     _native.set_num_threads(count=count)
 
 

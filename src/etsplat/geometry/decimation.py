@@ -39,7 +39,7 @@ def decimated(
     check_shape("vertices", vertices, ("V", 3))
     check_shape("faces", faces, ("F", 3))
     check_indices("faces", faces, len(vertices))
-    check_count("count", count, least=4)
+    count = check_count("count", count, least=4)
     vertices, faces = vertices.detach().cpu(), faces.detach().cpu().long()
     if len(faces) <= count:
         return vertices, faces

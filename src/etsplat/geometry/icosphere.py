@@ -31,7 +31,7 @@ def icosphere(level: int) -> tuple[Float[Tensor, "V 3"], Int[Tensor, "F 3"]]:
         >>> vertices.shape, faces.shape
         (torch.Size([2562, 3]), torch.Size([5120, 3]))
     """
-    check_count("level", level, least=0, most=MAX_LEVEL)
+    level = check_count("level", level, least=0, most=MAX_LEVEL)
     vertices, faces = _icosahedron()
     for _ in range(level):
         topology = MeshTopology.from_faces(faces, len(vertices))

@@ -80,7 +80,7 @@ def longest_edge_plan(
         30
     """
     _check(vertices, topology, scores)
-    check_count("budget_faces", budget_faces, least=0)
+    budget_faces = check_count("budget_faces", budget_faces, least=0)
     order = torch.sort(scores.detach().cpu(), descending=True, stable=True).indices
     longest = _longest_edges(vertices.detach().cpu().double(), topology)
     split_edge = torch.full((topology.num_faces,), -1, dtype=torch.int64)

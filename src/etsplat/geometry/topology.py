@@ -18,7 +18,7 @@ from etsplat.core.validation import check_indices, check_shape
 from etsplat.ops.mesh_energies import MeshConnectivity
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class MeshTopology:
     """Connectivity of a triangle mesh, int64, on the device of its faces. Build it with `from_faces`.
 

@@ -34,7 +34,7 @@ def unwrapped(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], size: i
     check_shape("vertices", vertices, ("V", 3))
     check_shape("faces", faces, ("F", 3))
     check_indices("faces", faces, len(vertices))
-    check_count("size", size, least=16)
+    size = check_count("size", size, least=16)
     xatlas = load_xatlas()
     atlas, options = xatlas.Atlas(), xatlas.PackOptions()
     options.resolution, options.padding = size, max(1, GUTTER * size // GUTTER_AT)

@@ -34,7 +34,7 @@ _BRIGHTEST = 2.0
 """Of colours that are clamped: others are not from 0 to 1."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class MeshFile:
     """A triangle mesh as files hold it.
 

@@ -101,8 +101,8 @@ def sample_pair(
             raise ValueError(f"{name} must have at least one row, got none")
     check_indices("faces", faces, len(vertices))
     check_indices("true_faces", true_faces, len(true_vertices))
-    check_count("samples", samples, most=MAX_SAMPLES)
-    check_count("seed", seed, least=0)
+    samples = check_count("samples", samples, most=MAX_SAMPLES)
+    seed = check_count("seed", seed, least=0)
     center, radius = bounding_ball(true_vertices)
 
     def sampled(points: Tensor, triangles: Tensor, side: int) -> Surface:

@@ -19,7 +19,7 @@ that of the NeRF-synthetic scenes, whose cube reaches to 1.3 and whose cameras a
 _SMALLEST_SQUARE = 1e-7
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class StartPoints:
     """Points to put triangles at.
 

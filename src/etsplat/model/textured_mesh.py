@@ -50,7 +50,7 @@ class TextureAppearance(Appearance):
     max_level: int | None = None
 
 
-@dataclass
+@dataclass(eq=False)
 class TexturedMesh(Model):
     """A mesh of opaque triangles under one texture.
 

@@ -54,7 +54,7 @@ class MeshAppearance(Appearance):
         return self.kernel is None and self.backend == "nvdiffrast"
 
 
-@dataclass
+@dataclass(eq=False)
 class TriangleMesh(Model):
     """A triangle mesh with a colour per face or per vertex; where it is soft, an opacity per face and one softness.
 
@@ -135,7 +135,7 @@ class TriangleMesh(Model):
         check_shape("colors", start, (letter, 3), sizes=sizes)
         vertices = vertices.detach().clone()
         soft = _is_soft(opacity, sigma)
-        check_count("harmonics", harmonics, least=0, most=MAX_DEGREE)
+        harmonics = check_count("harmonics", harmonics, least=0, most=MAX_DEGREE)
         if harmonics and (vertex_colored or not soft):
             raise ValueError("harmonics must be 0 where triangles are opaque or colours belong to vertices")
         rest = vertices.new_zeros(len(faces), (harmonics + 1) ** 2 - 1, 3) if harmonics else None

@@ -58,7 +58,7 @@ _NEAR_ONE = 1 - 2.0**-24
 """The largest float below 1: what the floor brings to 1 has no finite logit."""
 
 
-@dataclass
+@dataclass(eq=False)
 class TriangleSoup(Model):
     """N separate triangles, each with its own opacity, softness and view-dependent colour.
 
@@ -142,7 +142,7 @@ class TriangleSoup(Model):
         check_shape("colors", colors, (N := len(vertices), 3))
         check_open_unit("opacity", opacity)
         check_above("sigma", sigma, SOUP_SIGMA_FLOOR)
-        check_count("sh_degree", sh_degree, least=0, most=MAX_DEGREE)
+        sh_degree = check_count("sh_degree", sh_degree, least=0, most=MAX_DEGREE)
         logit = torch.logit(torch.tensor(opacity, dtype=torch.float64)).to(vertices)
         raw = torch.tensor(sigma - SOUP_SIGMA_FLOOR, dtype=torch.float64).log().to(vertices)
         return cls(

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from etsplat.core.cameras import Cameras, check_size, view_arguments
+from etsplat.core.cameras import Cameras, view_arguments
 from etsplat.core.kernels import DISTANCES, KERNELS, kernel_name
 from etsplat.core.precision import as_given
 from etsplat.core.rasterization import (
@@ -211,7 +211,6 @@ def _names_of(outputs: Sequence[str]) -> frozenset[str]:
 
 
 def _check_settings(settings: RasterizeSettings) -> None:
-    check_size(settings.width, settings.height)
     check_flags(freeze_inradius=settings.freeze_inradius)
     check_choice("kernel", settings.kernel, list(KERNELS))
     check_choice("distance", settings.distance, DISTANCES)

@@ -146,7 +146,7 @@ def render_opaque(
         points, colors = points[triangles.long()].view(-1, 3), colors.view(3 * count, -1)
         triangles = _separate(points)
     check_flags(cull_backfaces=cull_backfaces)
-    check_count("supersampling", supersampling, most=MAX_SUPERSAMPLING)
+    supersampling = check_count("supersampling", supersampling, most=MAX_SUPERSAMPLING)
     image = vertices.new_empty((len(views), views.height, views.width, colors.shape[1] + 1))
     engine = engine_for(vertices)
     for b in range(len(views)):

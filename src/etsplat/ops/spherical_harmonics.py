@@ -39,7 +39,7 @@ def spherical_harmonics(
         >>> etsplat.spherical_harmonics(coefficients, torch.tensor([[0.0, 0.0, 1.0]]), degree=1).tolist()
         [[0.5, 0.5, 0.5]]
     """
-    check_count("degree", degree, least=0, most=MAX_DEGREE)
+    degree = check_count("degree", degree, least=0, most=MAX_DEGREE)
     check_shape("coefficients", coefficients, ("N", "K", "C"))
     if coefficients.shape[1] < (degree + 1) ** 2:
         raise ValueError(

@@ -73,7 +73,7 @@ def count_levels(texture: Float[Tensor, "H W C"], max_level: int | None) -> int:
         ValueError: ``max_level`` is neither None nor an integer of at least 0.
     """
     if max_level is not None:
-        check_count("max_level", max_level, least=0)
+        max_level = check_count("max_level", max_level, least=0)
     height, width = texture.shape[:2]
     levels = 1
     while height % 2 == width % 2 == 0 and (max_level is None or levels <= max_level):

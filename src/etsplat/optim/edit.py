@@ -70,7 +70,7 @@ def apply_subdivision(
     return {name: _carry(name, move, move, adam, statistics) for name, move in carry.items()}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class RowPlan:
     """How N separate primitives become M.
 

@@ -338,10 +338,8 @@ class LoopSettings:
     checkpoint_every: int
 
     def __post_init__(self) -> None:
-        check_count("iterations", self.iterations, least=0)
-        check_count("log_every", self.log_every)
-        check_count("evaluate_every", self.evaluate_every, least=0)
-        check_count("checkpoint_every", self.checkpoint_every, least=0)
+        for name, least in (("iterations", 0), ("log_every", 1), ("evaluate_every", 0), ("checkpoint_every", 0)):
+            object.__setattr__(self, name, check_count(name, getattr(self, name), least=least))
 
 
 def optimize(

@@ -24,7 +24,7 @@ from etsplat.ops.weighted_sum import weighted_sum
 from etsplat.optim.schedules import Scheduled, at
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Drawing:
     """One view of a step: what terms look at.
 

@@ -332,7 +332,7 @@ class DensifyAndPrune(Strategy):
     outputs = ("statistics",)
 
     def __post_init__(self) -> None:
-        check_count("every", self.every)
+        self.every = check_count("every", self.every)
         check_number("growth", self.growth, 1)
         check_choice("sample_by", self.sample_by, ("alternate", "opacity", "sharpness"))
 

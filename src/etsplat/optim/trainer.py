@@ -11,7 +11,7 @@ from typing import Any, Generic, TypeVar
 import torch
 from torch import Tensor
 
-from etsplat.core.validation import first_not_finite
+from etsplat.core.validation import check_count, first_not_finite
 from etsplat.core.workers import workers
 from etsplat.data.dataset import Dataset, middles_of
 from etsplat.engines.choice import engine_for
@@ -117,7 +117,8 @@ class Trainer(Generic[M]):
             ValueError: cameras are to be refined, and no photos are kept aside to judge them; there is no view to fit
                 to; the schedule or the paces name other parameters than the model's; an argument is of another kind.
         """
-        check_parts(model, dataset, objective, strategy, batch, paces or {})
+        check_parts(model, dataset, objective, strategy, paces or {})
+        batch = check_count("batch", batch)
         self.model, self.strategy, self.progress = model.learnable(), strategy or Fixed(), Progress()
         self.exposure, self.depths, self.guard = exposure or Exposure(NEVER), depths or DepthTrust([]), guard
         self.cameras = cameras or CameraRefinement()

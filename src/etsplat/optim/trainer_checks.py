@@ -5,7 +5,7 @@ from typing import Any
 
 import torch
 
-from etsplat.core.validation import check_count, check_kind, shown
+from etsplat.core.validation import check_kind, shown
 from etsplat.data.dataset import Dataset
 from etsplat.model.model import Model
 from etsplat.optim.objective import Objective
@@ -17,7 +17,6 @@ def check_parts(
     dataset: Dataset,
     objective: Objective,
     strategy: Strategy | None,
-    batch: int,
     paces: Mapping[str, Any],
 ) -> None:
     """Raises ValueError, naming the argument, for what no run can be made of; arguments are those of `Trainer`."""
@@ -27,7 +26,6 @@ def check_parts(
     check_kind("objective", objective, Objective, "Objective(photometric)")
     if strategy is not None:
         check_kind("strategy", strategy, Strategy, "make one, such as etsplat.Fixed()")
-    check_count("batch", batch)
     parameters = model.parameters()
     for name, parameter in parameters.items():
         if parameter.dtype != torch.float32:
