@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor
+from torch._subclasses.fake_tensor import FakeTensorMode
 
 from etsplat import (
     Adam,
@@ -110,6 +111,7 @@ def _odd(value: Tensor) -> dict[str, Any]:
         "short": short,
         "zero": torch._efficientzerotensor(value.shape, dtype=value.dtype),  # pyright: ignore[reportPrivateImportUsage]
         "meta": value.to("meta"),
+        "fake": FakeTensorMode().from_tensor(value),  # what torch.export hands in; its address was read
         "sparse": value.to_sparse(),
         "nested": torch.nested.nested_tensor([torch.rand(2, 3)]),
         "quantized": torch.quantize_per_tensor(value.float(), 0.1, 0, torch.quint8),
@@ -129,7 +131,9 @@ def _message(run: Callable[..., Any], arguments: dict[str, Any]) -> str:
     return "(taken)"
 
 
-@pytest.mark.filterwarnings("ignore:The PyTorch API of nested tensors", "ignore:Sparse")
+@pytest.mark.filterwarnings(
+    "ignore:The PyTorch API of nested tensors", "ignore:Sparse", "ignore:Accessing the data pointer of FakeTensor"
+)
 @pytest.mark.parametrize("name", NAMES)
 def test_tensors_without_numbers_in_memory_are_refused_by_name(name: str, tmp_path: Path) -> None:
     run, arguments = _cases(tmp_path)[name]

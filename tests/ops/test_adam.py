@@ -1,6 +1,7 @@
 import pytest
 import torch
 
+import etsplat
 from etsplat.engines.threads import num_threads, set_num_threads
 from etsplat.ops.adam import Adam
 from helpers.engines import device_of, dtype_of, on
@@ -265,6 +266,25 @@ def test_missing_gradients_and_wrong_names_are_errors(rng):
     assert all(parameter.grad is None for parameter in ours.values())
     with pytest.raises(ValueError, match="first_moments"):
         adam.load_state_dict({**adam.state_dict(), "first_moments": {}})
+
+
+def test_what_requires_no_gradient_stays_as_it_is(engine, rng):
+    """Until it has one again; the others step as they would alone."""
+    device = device_of(engine)
+    both = {name: torch.randn(4, 3, generator=rng).to(device) for name in ("frozen", "free")}
+    both["free"].requires_grad_()
+    alone = {"free": both["free"].detach().clone().requires_grad_()}
+    before = both["frozen"].clone()
+    two, one = (Adam(tensors, dict.fromkeys(tensors, 0.1)) for tensors in (both, alone))
+    with etsplat.engine(engine):
+        for adam, tensors in ((two, both), (one, alone)):
+            tensors["free"].square().sum().backward()
+            adam.step()
+        assert both["frozen"].equal(before)
+        assert both["free"].equal(alone["free"])
+        both["frozen"].requires_grad_().sum().backward()
+        two.step()
+    assert not both["frozen"].equal(before)
 
 
 def test_parameters_without_a_place_for_each_element_are_refused_before_anything_changes():

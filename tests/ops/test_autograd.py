@@ -136,6 +136,41 @@ def test_autocast_changes_nothing(name, engine, rng, monkeypatch):
         _assert_same(outputs(*values), expected)
 
 
+def test_what_autocast_has_halved_is_whole_again(rng):
+    """As for torch's own operations that want float32: colours of a network, and their gradients."""
+    network, features = torch.nn.Linear(4, 3), torch.rand(80, 4, generator=rng)
+    vertices, faces = etsplat.icosphere(1)
+    look = {"opacities": torch.ones(80), "sigma": 0.3, "cameras": etsplat.orbit_cameras(16, 16, azimuths=1)}
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        colors = network(features)
+        assert colors.dtype == torch.bfloat16
+        seen = etsplat.rasterize(vertices, faces=faces, face_colors=colors, **look).color
+    assert seen.dtype == torch.float32
+    assert seen.equal(etsplat.rasterize(vertices, faces=faces, face_colors=colors.float(), **look).color)
+    seen.sum().backward()
+    assert network.weight.grad is not None
+    assert network.weight.grad.any()
+    with pytest.raises(ValueError, match=r"face_colors must be torch\.float32 like vertices, got torch\.bfloat16"):
+        etsplat.rasterize(vertices, faces=faces, face_colors=colors, **look)
+
+
+def test_a_graph_without_a_break_says_what_breaks_it():
+    """And none of the caches that the compiler warns of stand in its way."""
+    target = torch.zeros(1, 8, 8, 3)
+    torch._dynamo.reset()
+    compiled = torch.compile(lambda color: etsplat.photometric_loss(color, target), backend="eager", fullgraph=True)
+    with pytest.raises(torch._dynamo.exc.Unsupported, match=r"etsplat runs native code here.*leave fullgraph=False"):
+        compiled(torch.ones(1, 8, 8, 3))
+
+
+def test_gradients_in_batches_are_refused(rng):
+    """They are torch's vmap by another name, and ended in its words."""
+    values, outputs = _grown("rasterize", "cpu", rng)
+    several = outputs(*values)[0].flatten()[:3]
+    with pytest.raises(ValueError, match="without is_grads_batched or vectorize"):
+        torch.autograd.grad(several, values, torch.eye(3), is_grads_batched=True, allow_unused=True)
+
+
 @EVERY_OPERATION
 def test_inference_mode_changes_nothing(name, engine, rng):
     values, outputs = _grown(name, engine, rng)

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -18,6 +19,13 @@ POINTS = etsplat.StartPoints(torch.rand(50, 3, generator=torch.Generator().manua
 def a_mesh(dtype: torch.dtype = torch.float32) -> etsplat.TriangleMesh:
     vertices, faces = etsplat.icosphere(1)
     return etsplat.TriangleMesh.from_mesh(vertices.to(dtype), faces, colors=0.7, opacity=0.98, sigma=0.25)
+
+
+def frozen() -> etsplat.TriangleMesh:
+    """Its vertices are, or they came by `replace`: the trainer cannot tell."""
+    mesh = a_mesh()
+    mesh.vertices.requires_grad_(False)
+    return mesh
 
 
 def a_soup(scale: float = 1.0) -> etsplat.TriangleSoup:
@@ -97,6 +105,18 @@ def test_steps_and_terms_say_which_model_they_are_for() -> None:
         ({"dataset": "scene"}, r"dataset must be a Dataset, got 'scene': etsplat\.load_dataset\(path\) reads one"),
         ({"paces": {"vertexes": torch.ones_like}}, "paces name vertexes; the model has vertices, colors"),
         ({"batch": 1.5}, r"batch must be an integer of at least 1, got 1\.5"),
+        ({"model": torch.nn.Linear(2, 2)}, r"model must be a model, such as etsplat\.TriangleMesh, got Linear"),
+        ({"schedule": {"vertices": 1e-2}}, r"schedule must be a Schedule, got dict: etsplat\.Schedule\(rates\)"),
+        ({"seed": "3"}, r"seed must be an integer or a torch\.Generator, got '3'"),
+        ({"seed": None}, r"seed must be an integer or a torch\.Generator, got None"),
+        ({"background": 1.0}, r"background must be three numbers from 0 to 1, or None, got 1\.0"),
+        ({"background": "white"}, "background must be three numbers from 0 to 1, or None, got 'white'"),
+        ({"background": (1, 1, 1, 1)}, "background must be three numbers from 0 to 1, or None, got 4 of them"),
+        ({"background": (0, 255, 0)}, r"background\[1\] must be from 0 to 1, got 255"),
+        (
+            {"model": frozen()},
+            "model requires gradients of colors, opacity_logits, log_sigma, and none of vertices: mod",
+        ),
         ({"model": a_mesh(torch.float64)}, r"model must be float32, .* got vertices in torch\.float64"),
     ],
 )
@@ -113,11 +133,52 @@ def test_a_trainer_names_what_it_cannot_begin_with(given: dict[str, Any], messag
         ({"log_every": 0}, "log_every must be an integer of at least 1, got 0"),
         ({"evaluate_every": -1}, "evaluate_every must be an integer of at least 0"),
         ({"callbacks": print}, r"callbacks must be a sequence of functions, got .*: pass \[callback\]"),
+        ({"callbacks": None}, "callbacks must be a sequence of functions, got None"),
+        ({"callbacks": [print, None]}, r"callbacks\[1\] must be a function of an event, got None"),
+        ({"run": 3}, "run: is of type int; it must be a path"),
     ],
 )
 def test_a_fit_names_what_it_cannot_do(given: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises((ValueError, etsplat.InputError), match=message):
         a_trainer().fit(**{"iterations": 2, **given})
+
+
+def test_numbers_of_numpy_and_torch_begin_the_same_run() -> None:
+    def fitted(**given: Any) -> torch.Tensor:
+        trainer = a_trainer(**given)
+        trainer.fit(2)
+        return trainer.model.vertices
+
+    plain = fitted(seed=3, batch=2, background=(0, 0.5, 1))
+    assert fitted(seed=np.int64(3), batch=torch.tensor(2), background=torch.tensor([0, 0.5, 1])).equal(plain)
+    assert fitted(seed=torch.tensor(3), batch=np.int8(2), background=np.array([0, 0.5, 1])).equal(plain)
+
+
+@pytest.mark.parametrize("value", [2.5, torch.tensor(2.5), np.float32(2.5), np.array(2.5)])
+def test_metrics_of_ones_own_are_kept_as_numbers(value: Any, tmp_path: Path) -> None:
+    """A run ended at its last step, as JSON has no tensors."""
+    a_trainer(evaluate=lambda model: {"mine": value}).fit(1, run=tmp_path / "run")
+    assert '"mine": 2.5' in (tmp_path / "run" / "history.jsonl").read_text()
+
+
+@pytest.mark.parametrize(("value", "got"), [(3.0, r"3\.0"), ({"x": torch.zeros(2)}, "a tensor .* for 'x'")])
+def test_metrics_that_are_none_are_named(value: Any, got: str) -> None:
+    with pytest.raises(ValueError, match=f"evaluate must return numbers by name, got {got}"):
+        a_trainer(evaluate=lambda model: value).fit(1)
+
+
+@pytest.mark.parametrize(
+    ("photometric", "terms", "message"),
+    [
+        (None, (), "photometric must be a Term, got None: make one"),
+        (etsplat.Photometric, (), "photometric must be a Term, got the class Photometric: make one"),
+        (etsplat.Photometric(), etsplat.EdgeLength(0.5), r"terms must be a sequence of terms, got EdgeLength"),
+        (etsplat.Photometric(), [lambda drawing: 0], r"terms\[0\] must be a Term, .*: etsplat\.Custom\(function\)"),
+    ],
+)
+def test_an_objective_is_made_of_terms(photometric: Any, terms: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        etsplat.Objective(photometric, terms)
 
 
 def test_callbacks_of_a_task_are_several(tmp_path: Path) -> None:

@@ -2,19 +2,23 @@
 
 import sys
 from collections.abc import Callable
-from functools import cache, wraps
-from typing import ParamSpec, TypeVar, cast
+from functools import wraps
+from typing import Any, ParamSpec, TypeVar, cast
 
 import torch
 
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
 
+_UNCOMPILED = "etsplat runs native code here, which torch.compile cannot trace: leave fullgraph=False"
+
 
 def as_given(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
     """The same function, for which `torch.autocast` around it is off: bfloat16 would spoil positions and depths.
 
-    `torch.compile` calls it as it is: there is nothing to gain in native calls, and old versions end at them.
+    What autocast has made half as precise before, such as colours of a network, is float32 again, as for all of
+    torch's own operations that want that. `torch.compile` calls it as it is: there is nothing to gain in native calls,
+    and old versions end at them.
     """
 
     @wraps(function)
@@ -22,13 +26,25 @@ def as_given(function: Callable[Arguments, Result]) -> Callable[Arguments, Resul
         if not (torch.is_autocast_enabled("cpu") or torch.is_autocast_enabled("cuda")):
             return function(*arguments, **named)
         with torch.autocast("cpu", enabled=False), torch.autocast("cuda", enabled=False):
-            return function(*arguments, **named)
+            whole = {name: _whole(argument) for name, argument in named.items()}
+            return cast(Any, function)(*map(_whole, arguments), **whole)
 
-    uncompiled = cache(lambda: cast(Callable[Arguments, Result], torch.compiler.disable(called)))
+    uncompiled: list[Callable[Arguments, Result]] = []
 
     @wraps(function)
     def chosen(*arguments: Arguments.args, **named: Arguments.kwargs) -> Result:
         # To disable imports the compiler, which takes seconds: only where it is at work.
-        return (uncompiled() if "torch._dynamo" in sys.modules else called)(*arguments, **named)
+        if "torch._dynamo" not in sys.modules:
+            return called(*arguments, **named)
+        if not uncompiled:
+            uncompiled.append(cast(Callable[Arguments, Result], torch.compiler.disable(called)))
+        return uncompiled[0](*arguments, **named)
 
+    for name, value in (("_torchdynamo_disable", True), ("_torchdynamo_disable_msg", _UNCOMPILED)):
+        setattr(chosen, name, value)  # what the compiler says where it may not leave its graph
     return chosen
+
+
+def _whole(argument: object) -> object:
+    halved = isinstance(argument, torch.Tensor) and argument.dtype in (torch.float16, torch.bfloat16)
+    return cast(torch.Tensor, argument).float() if halved else argument

@@ -90,13 +90,21 @@ def check_memory(name: str, tensor: Tensor) -> None:
         spanned = tensor.numel()
     else:
         spanned = 1 + sum((n - 1) * step for n, step in zip(tensor.shape, tensor.stride(), strict=True))
-    needed, held = (tensor.storage_offset() + spanned) * tensor.element_size(), tensor.untyped_storage().nbytes()
+    storage = tensor.untyped_storage()
+    if storage.device.type == "meta":  # of FakeTensorMode; behind an offset it has an address
+        raise ValueError(f"{name} must be in memory, got a {type(tensor).__name__}: torch.export cannot trace this")
+    needed, held = (tensor.storage_offset() + spanned) * tensor.element_size(), storage.nbytes()
     if held < needed:
         raise ValueError(f"{name} must have memory of its own: it needs {needed} bytes, and its storage holds {held}")
 
 
 def check_native(name: str, tensor: Tensor) -> None:
     """`check_memory`, and ValueError within a transform of torch.func."""
+    if isinstance(tensor, Tensor) and _address(tensor) == 0 and _is_batched(tensor):
+        raise ValueError(
+            f"{name} must be a plain tensor, got a batch of them, which no engine supports: take one gradient at a "
+            "time, without is_grads_batched or vectorize"
+        )
     if isinstance(tensor, Tensor) and _address(tensor) == 0 and _is_transformed(tensor):
         raise ValueError(
             f"{name} must be a plain tensor, got one within a transform of torch.func, which no engine supports: "
@@ -115,6 +123,11 @@ def _address(tensor: Tensor) -> int:
 
 def _is_transformed(tensor: Tensor) -> bool:
     return torch._C._functorch.is_functorch_wrapped_tensor(tensor)  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def _is_batched(tensor: Tensor) -> bool:
+    """By the vmap that autograd has of its own."""
+    return torch._C._functorch.is_legacy_batchedtensor(tensor)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def _remedy(name: str, value: object) -> str:

@@ -120,12 +120,12 @@ def checked_points(points: Any, colors: Any) -> tuple[Tensor, Tensor | None]:
 
 def checked_point(name: str, point: Any) -> Float[Tensor, "3"]:
     """A tensor (3,) as it is, or three numbers in float64. Raises ValueError for anything else."""
-    if isinstance(point, list | tuple | np.ndarray) and len(point) == 3:
-        point = torch.tensor([float(number) for number in point], dtype=torch.float64)
-    check_shape(name, point, (3,))
-    check_floating(name, point)
-    check_finite(name, point)
-    return point
+    three = isinstance(point, list | tuple | np.ndarray) and len(point) == 3
+    tensor: Any = torch.tensor([float(number) for number in point], dtype=torch.float64) if three else point
+    check_shape(name, tensor, (3,))
+    check_floating(name, tensor)
+    check_finite(name, tensor)
+    return tensor
 
 
 def checked_split(name: str, views: Iterable[Any], count: int) -> list[int]:

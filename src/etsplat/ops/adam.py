@@ -91,14 +91,14 @@ class Adam:
 
     @torch.no_grad()
     def step(self, decays: Mapping[str, float] | None = None) -> None:
-        """Update every parameter from its gradient.
+        """Update every parameter from its gradient; those that require none, and have none, stay as they are.
 
         Args:
             decays: By name of a parameter, how many times the parameter itself is added to its gradient: 2 c where c
                 times the sum of its squares is minimised, whose gradient then takes no memory of its own.
 
         Raises:
-            ValueError: A parameter without gradient or without a place for each element, paces that do not fit it, or a
+            ValueError: A parameter that lacks its gradient or a place for each element, paces that do not fit it, or a
                 decay of none that there is; nothing is updated then.
         """
         decays = decays or {}
@@ -107,6 +107,8 @@ class Adam:
         together: dict[Engine, list[str]] = {}
         for name, parameter in self.parameters.items():
             check_written(f"parameters[{name}]", parameter)  # `data` may have been set since
+            if parameter.grad is None and not parameter.requires_grad:
+                continue  # frozen, as torch.optim has it
             together.setdefault(engine_for(parameter), []).append(name)
         groups_of = {engine: {name: self._group(name) for name in names} for engine, names in together.items()}
         self.step_count += 1

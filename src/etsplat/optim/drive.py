@@ -1,7 +1,9 @@
 """The loop from the last checkpoint on, with checkpoints and the history of a run."""
 
 import hashlib
-from collections.abc import Mapping, Sequence
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +12,35 @@ from torch import Tensor
 
 from etsplat.core.errors import InputError
 from etsplat.core.workers import about_this, workers
-from etsplat.io.run_directory import RunDirectory
+from etsplat.io.locks import writing_run
+from etsplat.io.paths import given_path
+from etsplat.io.run_directory import RunDirectory, is_run
 from etsplat.optim.camera_event import CamerasEvent
 from etsplat.optim.checkpoints import Checkpoint, checkpoint_path, load_latest_checkpoint, save_checkpoint
 from etsplat.optim.loop import Callback, Event, LoopSettings, Problem, Progress, StepEvent, UndoEvent, optimize
+
+
+@contextmanager
+def kept_in(run: RunDirectory | Path | str | None, settings: LoopSettings) -> Iterator[RunDirectory | None]:
+    """Within the block the folder of a run is there, and locked where this worker is the one that writes it.
+
+    Args:
+        run: a path is one of a run or becomes one; a `RunDirectory` has been made and locked by the caller.
+        settings: of the loop.
+
+    Raises:
+        InputError: it is no path, or of something else; somebody else writes the run.
+    """
+    if run is None or isinstance(run, RunDirectory):
+        yield run
+        return
+    folder = given_path("run", run)
+    if not workers().leads:
+        yield RunDirectory(folder)
+        return
+    with writing_run(folder, warnings.warn):
+        record = {"task": "fit", "iterations": settings.iterations}
+        yield RunDirectory(folder) if is_run(folder) else RunDirectory.create(folder, record)
 
 
 def drive(

@@ -310,12 +310,14 @@ class Progress:
         seconds: time spent on them.
         loss_sum: sum of the losses since the last StepEvent.
         loss_count: how many.
+        ending: whether the run is to end after the iteration at hand; no part of a checkpoint.
     """
 
     iteration: int = 0
     seconds: float = 0.0
     loss_sum: float = 0.0
     loss_count: int = 0
+    ending: bool = False
 
 
 @dataclass(frozen=True)
@@ -352,7 +354,7 @@ def optimize(
     """Runs `problem` from `progress` to the last iteration.
 
     Ctrl-C finishes the iteration at hand, saves a checkpoint, and then raises KeyboardInterrupt, on all workers where
-    one was interrupted; a second Ctrl-C raises at once.
+    one was interrupted; a second Ctrl-C raises at once. `progress.ending` ends it likewise, without an exception.
 
     Args:
         problem: what to optimise; changed in place.
@@ -368,32 +370,36 @@ def optimize(
         DivergedError: the loss or a parameter is not finite.
         KeyboardInterrupt: after Ctrl-C.
     """
+    progress.ending = ending = False
     with _deferred_interrupt() as interrupted:
-        while progress.iteration < settings.iterations:
+        while progress.iteration < settings.iterations and not ending:
             added, undone = _advance(problem, progress, _next_stop(settings, progress.iteration), folder)
             iteration = progress.iteration
             last = iteration == settings.iterations
             evaluating = last or _due(iteration, settings.evaluate_every)
-            stopping = workers().any(interrupted())
-            saving = save is not None and (
-                last or stopping or undone is not None or _due(iteration, settings.checkpoint_every)
-            )
             logging = evaluating or _due(iteration, settings.log_every)
-            if (logging or saving) and (name := problem.first_not_finite()):
-                raise DivergedError(f"{name} is not finite at iteration {iteration}; {_what_is_left(folder)}")
+            saving = last or undone is not None or _due(iteration, settings.checkpoint_every)
+            if logging or saving:
+                _check_finite(problem, iteration, folder)
             if undone is not None:
                 yield undone
             if logging:
                 yield _step_event(problem, settings, progress, problem.evaluate() if evaluating else {})
             if added:
                 yield RefineEvent(iteration, problem.count, added)
-            if save is not None and saving:
+            ending = workers().any(interrupted() or progress.ending)  # by whoever was told of the above, too
+            if save is not None and (saving or ending):
+                if not (logging or saving):
+                    _check_finite(problem, iteration, folder)
                 yield CheckpointEvent(iteration, save(progress))
-            if stopping:
-                raise KeyboardInterrupt
         if workers().any(interrupted()):
             raise KeyboardInterrupt
     yield DoneEvent(progress.iteration, progress.seconds)
+
+
+def _check_finite(problem: Problem, iteration: int, folder: Path | None) -> None:
+    if name := problem.first_not_finite():
+        raise DivergedError(f"{name} is not finite at iteration {iteration}; {_what_is_left(folder)}")
 
 
 def _advance(problem: Problem, progress: Progress, stop: int, folder: Path | None) -> tuple[int, Return | None]:

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from etsplat.core.cameras import Cameras
 from etsplat.core.rasterization import Rasterization
-from etsplat.core.validation import shown
+from etsplat.core.validation import check_kind, shown
 from etsplat.model.model import Depth
 from etsplat.ops.weighted_sum import Term as Summand
 from etsplat.ops.weighted_sum import weighted_sum
@@ -151,7 +151,17 @@ class Objective:
     def __init__(
         self, photometric: Term, terms: Sequence[Term] = (), *, scale: Scheduled = 1.0, depth_of: Depth = "plane"
     ) -> None:
+        """Takes them.
+
+        Raises:
+            ValueError: one of them is no `Term`.
+        """
+        if isinstance(terms, Term):
+            raise ValueError(f"terms must be a sequence of terms, got {type(terms).__name__}: pass [term]")
         self.photometric, self.terms, self.scale = photometric, tuple(terms), scale
+        for name, term in (("photometric", photometric), *((f"terms[{k}]", t) for k, t in enumerate(self.terms))):
+            function = callable(term) and not isinstance(term, type)
+            check_kind(name, term, Term, "etsplat.Custom(function) makes one" if function else "make one")
         self.depth_of: Depth = depth_of
 
     def weights(self, iteration: int) -> tuple[float, ...]:

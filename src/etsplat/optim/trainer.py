@@ -3,7 +3,6 @@
 import contextlib
 import hashlib
 import json
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Generic, TypeVar
@@ -16,14 +15,13 @@ from etsplat.core.workers import workers
 from etsplat.data.dataset import Dataset, middles_of
 from etsplat.engines.choice import engine_for
 from etsplat.io.kernel_files import adopt_kernel, kernel_tensors
-from etsplat.io.locks import writing_run
-from etsplat.io.run_directory import RunDirectory, is_run
+from etsplat.io.run_directory import RunDirectory
 from etsplat.model.model import Model
 from etsplat.ops.adam import Adam
 from etsplat.optim.camera_refinement import CameraRefinement
 from etsplat.optim.camera_trial import CameraTrial
 from etsplat.optim.depth_trust import DepthTrust
-from etsplat.optim.drive import drive
+from etsplat.optim.drive import drive, kept_in
 from etsplat.optim.exposure import Exposure
 from etsplat.optim.gauge import Gauge
 from etsplat.optim.guard import Guard
@@ -32,7 +30,13 @@ from etsplat.optim.objective import Objective
 from etsplat.optim.schedules import NEVER, Schedule
 from etsplat.optim.stepper import Stepper
 from etsplat.optim.strategies import Fixed, Strategy
-from etsplat.optim.trainer_checks import check_callbacks, check_parts
+from etsplat.optim.trainer_checks import (
+    check_callbacks,
+    check_parts,
+    checked_background,
+    checked_metrics,
+    generator_of,
+)
 from etsplat.optim.watch import Outcome, Watch
 
 GUARD_SIDE, GUARD_VIEWS = 128, 32
@@ -94,7 +98,8 @@ class Trainer(Generic[M]):
         """Starts a run.
 
         Args:
-            model: the start, on the device where the run is to be.
+            model: the start, on the device where the run is to be. All of its parameters are learned; one that is to
+                stay as it is has the rate 0 in the schedule.
             dataset: photos and cameras; the views in `dataset.train` are fitted to, those in `dataset.watched` are
                 measured at every evaluation, and choose the state that `outcome` gives.
             objective: what is minimised.
@@ -117,18 +122,17 @@ class Trainer(Generic[M]):
             ValueError: cameras are to be refined, and no photos are kept aside to judge them; there is no view to fit
                 to; the schedule or the paces name other parameters than the model's; an argument is of another kind.
         """
-        check_parts(model, dataset, objective, strategy, paces or {})
-        batch = check_count("batch", batch)
+        check_parts(model, dataset, objective, strategy, schedule, paces or {})
+        batch, generator = check_count("batch", batch), generator_of(seed)
         self.model, self.strategy, self.progress = model.learnable(), strategy or Fixed(), Progress()
         self.exposure, self.depths, self.guard = exposure or Exposure(NEVER), depths or DepthTrust([]), guard
         self.cameras = cameras or CameraRefinement()
         self._objective, self._dataset, self._batch, self._evaluate = objective, dataset, batch, evaluate
         self._paces = dict(paces or {})
-        generator = seed if isinstance(seed, torch.Generator) else torch.Generator().manual_seed(seed)
         self._began = generator.get_state()
         self._kernel = getattr(model.appearance, "kernel", None)  # of what is soft at first; None for other models
-        self._background = None if background is None else [float(channel) for channel in background]
-        behind = None if background is None else torch.tensor(background, dtype=torch.float32)[None]
+        self._background = checked_background(background)
+        behind = None if self._background is None else torch.tensor([self._background])
         self._stepper = Stepper(
             model,
             dataset,
@@ -174,7 +178,8 @@ class Trainer(Generic[M]):
     ) -> Progress:
         """Makes all steps up to an iteration that have not been made, and the edits between them.
 
-        Ctrl-C finishes the iteration at hand first, and saves a checkpoint if there is a run directory.
+        Ctrl-C finishes the iteration at hand first, and saves a checkpoint if there is a run directory. What a callback
+        raises ends it after the iteration at hand, too; the trainer can be gone on with.
 
         Args:
             iterations: length of the run, counted from its start.
@@ -193,7 +198,7 @@ class Trainer(Generic[M]):
         Raises:
             DivergedError: a loss or parameter is not finite; no triangle is left.
             InputError: a checkpoint is damaged or of another run; somebody else writes the run; the disk is full.
-            ValueError: a number is out of its range; `callbacks` is one function.
+            ValueError: a number is out of its range; `callbacks` are no functions; `evaluate` returned no numbers.
         """
         settings = LoopSettings(iterations, log_every, evaluate_every, checkpoint_every)
         check_callbacks(callbacks)
@@ -201,14 +206,16 @@ class Trainer(Generic[M]):
             run_hash = self._hash()
         with contextlib.ExitStack() as stack:
             stack.enter_context(engine_for(next(iter(self.model.parameters().values()))).looping())
-            if isinstance(run, Path | str) and not workers().leads:
-                run = RunDirectory(Path(run))
-            elif isinstance(run, Path | str):
-                stack.enter_context(writing_run(Path(run), warnings.warn))
-                record = {"task": "fit", "iterations": iterations}
-                run = RunDirectory(Path(run)) if is_run(run) else RunDirectory.create(run, record)
-            drive(self, self.progress, settings, callbacks, run, run_hash or "")
+            kept = stack.enter_context(kept_in(run, settings))
+            drive(self, self.progress, settings, callbacks, kept, run_hash or "")
         return self.progress
+
+    def stop(self) -> None:
+        """Lets `fit` end after the iteration at hand, with a checkpoint if there is a run directory; for callbacks.
+
+        Another `fit` goes on from there.
+        """
+        self.progress.ending = True
 
     @property
     def count(self) -> int:
@@ -301,7 +308,7 @@ class Trainer(Generic[M]):
 
     def evaluate(self) -> dict[str, float]:
         """Cheap metrics of the present state, which is kept if the watched photos speak for it."""
-        metrics = self._evaluate(self.model) if self._evaluate and workers().leads else {}
+        metrics = checked_metrics(self._evaluate(self.model)) if self._evaluate and workers().leads else {}
         watched = self._watch.observe(self.model, self.progress.iteration) if self._watch else {}
         if watched and self.progress.iteration <= self._stepper.alike_until(0):  # what opaque ones say is another thing
             self.depths.observe(watched["watched_psnr"])

@@ -1,14 +1,17 @@
-"""What a trainer refuses before it begins."""
+"""What a trainer refuses before it begins, and what it makes of its arguments."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import torch
+from torch import Tensor
 
-from etsplat.core.validation import check_kind, shown
+from etsplat.core.validation import check_kind, check_number, shown, whole_number
 from etsplat.data.dataset import Dataset
 from etsplat.model.model import Model
 from etsplat.optim.objective import Objective
+from etsplat.optim.schedules import Schedule
 from etsplat.optim.strategies import Strategy
 
 
@@ -17,24 +20,79 @@ def check_parts(
     dataset: Dataset,
     objective: Objective,
     strategy: Strategy | None,
+    schedule: Schedule | None,
     paces: Mapping[str, Any],
 ) -> None:
     """Raises ValueError, naming the argument, for what no run can be made of; arguments are those of `Trainer`."""
+    if Model not in type(model).__mro__:  # a protocol, which isinstance would compare by its names
+        raise ValueError(f"model must be a model, such as etsplat.TriangleMesh, got {shown(model)}")
     check_kind("dataset", dataset, Dataset, "etsplat.load_dataset(path) reads one")
     if not dataset.train:
         raise ValueError("dataset: has no view in `train` to fit to")
     check_kind("objective", objective, Objective, "Objective(photometric)")
     if strategy is not None:
         check_kind("strategy", strategy, Strategy, "make one, such as etsplat.Fixed()")
+    if schedule is not None:
+        check_kind("schedule", schedule, Schedule, "etsplat.Schedule(rates) makes one of rates by name")
     parameters = model.parameters()
     for name, parameter in parameters.items():
         if parameter.dtype != torch.float32:
             raise ValueError(f"model must be float32, as cameras of data sets are, got {name} in {parameter.dtype}")
+    learned = [name for name, parameter in parameters.items() if parameter.requires_grad]
+    if learned and (frozen := [name for name in parameters if name not in learned]):
+        raise ValueError(
+            f"model requires gradients of {', '.join(learned)}, and none of {', '.join(frozen)}: model.learnable() "
+            "learns all; what is to stay as it is gets the rate 0 in schedule.rates"
+        )
     if unknown := sorted(set(paces) - set(parameters)):
         raise ValueError(f"paces name {', '.join(unknown)}; the model has {', '.join(parameters)}")
 
 
+def checked_background(background: Sequence[float] | Tensor | None) -> list[float] | None:
+    """Of `Trainer`, as floats. Raises ValueError where it is no colour."""
+    if background is None:
+        return None
+    wanted = "background must be three numbers from 0 to 1, or None"
+    if isinstance(background, str) or not isinstance(background, Iterable):
+        raise ValueError(f"{wanted}, got {shown(background)}")
+    channels = list(background)
+    for index, channel in enumerate(channels):
+        check_number(f"background[{index}]", channel, 0, 1)
+    if len(channels) != 3:
+        raise ValueError(f"{wanted}, got {len(channels)} of them")
+    return [float(channel) for channel in channels]
+
+
+def generator_of(seed: object) -> torch.Generator:
+    """What all random choices are taken from. Raises ValueError where there is neither a seed nor a generator."""
+    if isinstance(seed, torch.Generator):
+        return seed
+    number = whole_number(seed)
+    if number is None:
+        raise ValueError(f"seed must be an integer or a torch.Generator, got {shown(seed)}")
+    return torch.Generator().manual_seed(number)
+
+
+def checked_metrics(found: object) -> dict[str, Any]:
+    """What `evaluate` returned, its numbers as those of Python, which a run can keep. Raises ValueError for others."""
+    if not isinstance(found, Mapping):
+        raise ValueError(f"evaluate must return numbers by name, got {shown(found)}")
+    metrics = {
+        name: value.item() if isinstance(value, Tensor | np.ndarray | np.generic) and value.ndim == 0 else value
+        for name, value in found.items()
+    }
+    for name, value in metrics.items():
+        if value is not None and not isinstance(value, int | float):
+            raise ValueError(f"evaluate must return numbers by name, got {shown(value)} for {name!r}")
+    return metrics
+
+
 def check_callbacks(callbacks: object) -> None:
-    """Raises ValueError for one function in the place of several."""
+    """Raises ValueError where they are no functions, or one in the place of several."""
     if callable(callbacks):
         raise ValueError(f"callbacks must be a sequence of functions, got {shown(callbacks)}: pass [callback]")
+    if not isinstance(callbacks, Sequence):
+        raise ValueError(f"callbacks must be a sequence of functions, got {shown(callbacks)}")
+    for index, callback in enumerate(callbacks):
+        if not callable(callback):
+            raise ValueError(f"callbacks[{index}] must be a function of an event, got {shown(callback)}")
