@@ -88,6 +88,7 @@ VALUES: dict[str, Callable[[], Any]] = {
     "Opacity": lambda: etsplat.Opacity(0.5),
     "Photometric": lambda: etsplat.Photometric(0.2, "l2"),
     "Outcome": lambda: etsplat.Outcome(_soup(), 250, 2, 30.0, 29.5),
+    "Picture": lambda: PICTURES.picture(0),
     "PrepareEvent": lambda: etsplat.PrepareEvent(1, 2),
     "PruneRules": lambda: etsplat.PruneRules(views=3),
     "Rasterization": _rasterization,
@@ -122,6 +123,7 @@ VALUES: dict[str, Callable[[], Any]] = {
 NO_VALUES = {
     "Custom": "holds a function of the caller's",
     "Drawing": "a step's model, photo and rendering, while its loss is computed",
+    "LazyPictures": "holds a function of the caller's, and a pool of threads at work",
     "Scorer": "a device and a pool of threads at work",
     "Term": "what terms derive from",
     "Trainer": "at work; its state is in checkpoints",

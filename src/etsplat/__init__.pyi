@@ -22,6 +22,8 @@ from etsplat.data.load import load_dataset as load_dataset
 from etsplat.data.photograph import normalize_mesh as normalize_mesh
 from etsplat.data.photograph import orbit_cameras as orbit_cameras
 from etsplat.data.photograph import photograph as photograph
+from etsplat.data.pictures import LazyPictures as LazyPictures
+from etsplat.data.pictures import Picture as Picture
 from etsplat.data.pictures import StoredPictures as StoredPictures
 from etsplat.engines.choice import engine as engine
 from etsplat.engines.choice import register_engine as register_engine

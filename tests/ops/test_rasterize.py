@@ -205,3 +205,16 @@ def test_cameras_in_one_or_one_by_one_are_the_same(engine, scene):
     assert torch.equal(
         on(engine, rasterize, **prepare(rest, engine), cameras=cameras, kernel="single-sided").color, expected.cpu()
     )
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"sigma": True}, "sigma must be a tensor of shape"),
+        ({"opacities": 0.5}, r"opacities must be a tensor of shape \(N,\), got float: pass torch\.full\(shape, 0\.5\)"),
+    ],
+)
+def test_numbers_in_the_place_of_tensors_are_named(changes, message):
+    look = {"opacities": torch.ones(1), "sigma": 0.5, "face_colors": torch.ones(1, 3)}
+    with pytest.raises(ValueError, match=message):
+        etsplat.rasterize(torch.eye(3)[None], **{**look, **changes}, cameras=etsplat.orbit_cameras(8, 8, azimuths=1))

@@ -103,7 +103,8 @@ def test_photos_in_memory_are_not_asked_for_again(capture: Dataset, monkeypatch:
     size = 50 << 20
 
     def make(index: int) -> Picture:
-        return Picture(torch.zeros(4, 4, 3, dtype=torch.uint8))
+        width, height = capture.images.sizes[index]
+        return Picture(torch.zeros(height, width, 3, dtype=torch.uint8))
 
     count = len(capture)
     lazy = LazyPictures(make, capture.images.sizes, [size] * count, lambda: b"", limit=size * count)

@@ -17,6 +17,7 @@ from etsplat.core.validation import (
     check_kind,
     check_memory,
     check_number,
+    check_place,
     whole_number,
 )
 
@@ -113,7 +114,8 @@ class Cameras:
         return Cameras(self.viewmats, self.Ks * ratio[:, None], width, height)
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> "Cameras":
-        """The same cameras on another device or in another precision."""
+        """The same cameras on another device or in another precision. Raises ValueError where `device` is a dtype."""
+        check_place(device)
         return Cameras(
             self.viewmats.to(device=device, dtype=dtype),
             self.Ks.to(device=device, dtype=dtype),

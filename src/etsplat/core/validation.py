@@ -29,7 +29,9 @@ def check_shape(name: str, tensor: Tensor, *shapes: Shape, sizes: dict[str, int]
     """
     sizes = {} if sizes is None else sizes
     if not isinstance(tensor, Tensor):
-        got = f"{type(tensor).__name__}{_remedy(name, tensor)}"
+        full = isinstance(tensor, Real) and () not in shapes
+        remedy = f": pass torch.full(shape, {tensor})" if full else _remedy(name, tensor)
+        got = f"{type(tensor).__name__}{remedy}"
         raise ValueError(f"{name} must be a tensor of shape {_written(shapes)}, got {got}")
     check_native(name, tensor)
     for shape in shapes:
@@ -148,6 +150,12 @@ def check_device(name: str, tensor: Tensor, other_name: str, other: Tensor) -> N
     """Raise ValueError unless ``tensor`` is on the device of ``other``."""
     if tensor.device != other.device:
         raise ValueError(f"{name} must be on {other.device} like {other_name}, got {tensor.device}")
+
+
+def check_place(device: object) -> None:
+    """Raise ValueError for a dtype in the place of a device, as tensors take it."""
+    if isinstance(device, torch.dtype):
+        raise ValueError(f"device must be a device, got {device}: pass dtype={device}")
 
 
 def check_integers(name: str, indices: Tensor) -> None:

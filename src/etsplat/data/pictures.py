@@ -6,15 +6,16 @@ import os
 import threading
 from abc import ABC, abstractmethod
 from collections import OrderedDict
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
+from etsplat.core.cameras import check_size
 from etsplat.core.workers import workers
 from etsplat.data.dataset_checks import as_many, checked_mask, checked_pixels, is_straight
 from etsplat.io.depth_maps import resize_depth
@@ -36,7 +37,7 @@ def unpremultiplied(pixels: Float[Tensor, "*N C"]) -> tuple[Float[Tensor, "*N 3"
     return pixels[..., :3] / pixels[..., 3:].clamp_min(1e-3), pixels[..., 3] > 0.5
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Picture:
     """One photo.
 
@@ -45,6 +46,11 @@ class Picture:
         mask: (H, W), 255 where pixels count and 0 where they are to be ignored; None if all count.
         depth: (H, W) distances along the optical axis, in the units of the capture's files whatever frame the data set
             is in; 0 where they are not known. None without.
+
+    Example:
+        >>> grey = torch.full((48, 64, 3), 128, dtype=torch.uint8)
+        >>> etsplat.Picture(grey, mask=torch.full((48, 64), 255, dtype=torch.uint8)).depth is None
+        True
     """
 
     pixels: Pixels
@@ -165,10 +171,7 @@ class StoredPictures(Pictures):
 
     def fingerprint(self) -> bytes:
         """Of all pixels, masks and depth maps."""
-        digest = hashlib.sha256()
-        for image in self._tensors:
-            digest.update(b"none" if image is None else image.contiguous().cpu().numpy().data)
-        return digest.digest()
+        return _digest(self._tensors)
 
 
 class LazyPictures(Pictures):
@@ -176,35 +179,67 @@ class LazyPictures(Pictures):
 
     Within `limit` bytes everything stays. Beyond it the photos used last are kept, and `expect` makes those that are
     needed next while the caller works.
+
+    Example:
+        Photos of a simulator, as a run needs them:
+
+        >>> cameras = etsplat.orbit_cameras(16, 12, elevations=(20.0,), azimuths=8)
+        >>> vertices, faces = etsplat.icosphere(2)
+        >>> def shoot(view):
+        ...     colors = torch.linspace(0, 1, len(faces))[:, None].expand(-1, 3)
+        ...     return etsplat.render_opaque(vertices, faces=faces, face_colors=colors, cameras=cameras[view]).rgba[0]
+        >>> photos = etsplat.LazyPictures(shoot, [(16, 12)] * 8)
+        >>> photos.held_bytes, photos[3].shape
+        (0, torch.Size([12, 16, 4]))
     """
 
     def __init__(
         self,
-        make: Callable[[int], Picture],
+        make: Callable[[int], Picture | Pixels],
         sizes: Sequence[tuple[int, int]],
-        sizes_in_bytes: Sequence[int],
-        fingerprint: Callable[[], bytes],
+        sizes_in_bytes: Sequence[int] | None = None,
+        fingerprint: Callable[[], bytes] | None = None,
         limit: int | None = None,
         with_depth: Collection[int] = (),
     ) -> None:
         """Makes nothing yet.
 
         Args:
-            make: the photo of a view; called from other threads.
+            make: the photo of a view, or its pixels alone as `StoredPictures` takes them; the same at each call, which
+                come from other threads.
             sizes: (width, height) of each.
-            sizes_in_bytes: upper bounds.
-            fingerprint: of all of them, without making any.
+            sizes_in_bytes: upper bounds; None for those of floats with alpha, a mask and depths.
+            fingerprint: of all of them, without making any; None makes all of them for it, where a run is kept.
             limit: bytes that may be kept; None for half of the memory that is free, shared with other workers.
             with_depth: the views whose photos have depth maps.
+
+        Raises:
+            ValueError: a size is none of an image; and later, where they are made, photos of another size or kind.
         """
         self.with_depth = frozenset(with_depth)
-        self.sizes, self.total_bytes = list(sizes), sum(sizes_in_bytes)
-        self._make, self._bytes, self._fingerprint = make, list(sizes_in_bytes), fingerprint
+        self.sizes = [check_size(width, height) for width, height in sizes]
+        self._bytes = [21 * width * height for width, height in self.sizes]
+        if sizes_in_bytes is not None:
+            self._bytes = list(as_many("sizes_in_bytes", sizes_in_bytes, len(self.sizes)))
+        self.total_bytes = sum(self._bytes)
+        self._given, self._fingerprint = make, fingerprint
         self._limit = available_memory() // 2 // workers().neighbours if limit is None else limit
         self.streamed = self.total_bytes > self._limit
         self._kept: OrderedDict[int, Future[Picture]] = OrderedDict()
         self._lock = threading.Lock()
         self._pool = ThreadPoolExecutor(max_workers=min(os.cpu_count() or 1, 8), thread_name_prefix="images")
+
+    def _make(self, index: int) -> Picture:
+        """As it is given, once it has been looked at."""
+        found, name = self._given(index), f"make({index})"
+        picture = found if isinstance(found, Picture) else Picture(found)
+        pixels, (width, height) = checked_pixels(name, picture.pixels), self.sizes[index]
+        if tuple(pixels.shape[:2]) != (height, width):
+            got = tuple(pixels.shape)
+            raise ValueError(f"{name} must have {width} x {height} pixels, as `sizes` says, got shape {got}")
+        if picture.mask is None or picture.mask.dtype == torch.uint8:  # bytes as files have them need no look
+            return picture
+        return replace(picture, mask=checked_mask(f"the mask of {name}", picture.mask, pixels))
 
     @property
     def held_bytes(self) -> int:
@@ -228,10 +263,10 @@ class LazyPictures(Pictures):
         chosen = list(indices)
 
         def fingerprint() -> bytes:
-            return hashlib.sha256(self._fingerprint() + repr(chosen).encode()).digest()
+            return hashlib.sha256(self.fingerprint() + repr(chosen).encode()).digest()
 
         return LazyPictures(
-            lambda index: self._make(chosen[index]),
+            lambda index: self._given(chosen[index]),
             [self.sizes[index] for index in chosen],
             [self._bytes[index] for index in chosen],
             fingerprint,
@@ -239,8 +274,11 @@ class LazyPictures(Pictures):
         )
 
     def fingerprint(self) -> bytes:
-        """Made by what it was constructed with."""
-        return self._fingerprint()
+        """Made by what it was constructed with, or of all pixels, masks and depth maps."""
+        if self._fingerprint is not None:
+            return self._fingerprint()
+        pictures = map(self.picture, range(len(self.sizes)))
+        return _digest(tensor for one in pictures for tensor in (one.pixels, one.mask, one.depth))
 
     def expect(self, indices: Sequence[int]) -> None:
         """Start to make those that are needed soon, as many as fit."""
@@ -287,6 +325,13 @@ class LazyPictures(Pictures):
                 used -= self._bytes[next(iter(self._kept))]
                 self._kept.popitem(last=False)
             return self._kept[index]
+
+
+def _digest(tensors: Iterable[Tensor | None]) -> bytes:
+    digest = hashlib.sha256()
+    for tensor in tensors:
+        digest.update(b"none" if tensor is None else tensor.contiguous().cpu().numpy().data)
+    return digest.digest()
 
 
 class Box(NamedTuple):

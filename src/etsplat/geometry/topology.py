@@ -87,9 +87,9 @@ class MeshTopology:
             neighbor_indices=neighbor_indices,
         )
 
-    def to(self, device: torch.device) -> "MeshTopology":
-        """The same connectivity on another device."""
-        if self.faces.device == device:
+    def to(self, device: torch.device | str | None) -> "MeshTopology":
+        """The same connectivity on another device; None for where it is."""
+        if device is None or self.faces.device == torch.device(device):
             return self
         return replace(self, **{name: a.to(device) for name, a in vars(self).items() if isinstance(a, Tensor)})
 

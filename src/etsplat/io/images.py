@@ -63,7 +63,7 @@ def open_image(path: Path | str, data: bytes | None = None, formats: tuple[str, 
     Raises:
         InputError: the file is missing, empty, too large, or not such an image.
     """
-    path = Path(path)
+    path = given_path("path", path)
     if not path.is_file():
         raise InputError(f"image {path}: no such file; check the path")
     size = path.stat().st_size if data is None else len(data)
@@ -245,7 +245,7 @@ def save_image(path: Path | str, image: Float[Tensor, "H W C"]) -> None:
         >>> etsplat.load_image("grey.png").shape
         torch.Size([4, 6, 3])
     """
-    path = Path(path)
+    path = given_path("path", path)
     channels = (1, 3) if kind_of(path) in (".jpg", ".jpeg") else (1, 3, 4)
     if kind_of(path) not in IMAGE_SUFFIXES:
         raise ValueError(f"path: expected one of the suffixes {', '.join(IMAGE_SUFFIXES)}, got {path.name}")

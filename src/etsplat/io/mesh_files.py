@@ -167,7 +167,7 @@ def save_mesh(
         >>> len(etsplat.load_mesh("ball.ply").faces)
         80
     """
-    path = Path(path)
+    path = given_path("path", path)
     if compress != "none" or pictures != "png":
         writer_of(path, holding="compressed")
     writer_of(path, holding="vertex_colors" if texture is None else "texture" if normal_map is None else "normals")
@@ -246,7 +246,7 @@ def save_triangles(
         ValueError: another suffix or wrong shapes; a sky where there is no room for it.
         InputError: the file cannot be written.
     """
-    path = Path(path)
+    path = given_path("path", path)
     writer_of(path, holding=None if sky is None else "objects")
     if compress != "none":
         writer_of(path, holding="compressed")

@@ -9,7 +9,7 @@ from etsplat.core.errors import InputError
 
 def kind_of(path: Path | str) -> str:
     """The suffix of a file's name, which says what kind of file it is, in lower case: cameras write .JPG."""
-    return Path(path).suffix.lower()
+    return given_path("path", path).suffix.lower()
 
 
 def given_path(name: str, path: object, what: str = "a path") -> Path:

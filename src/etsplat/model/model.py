@@ -11,6 +11,7 @@ from torch import Tensor
 
 from etsplat.core.cameras import Cameras
 from etsplat.core.rasterization import Rasterization
+from etsplat.core.validation import check_place
 
 Depth = Literal["plane", "centroid"]
 A = TypeVar("A", bound="Appearance")
@@ -129,11 +130,17 @@ class Model(Protocol):
             if name in state:
                 setattr(self, name, state[name].to(old.device).requires_grad_(old.requires_grad))
 
-    def to(self: M, device: torch.device) -> M:
-        """The same on another device, in leaf tensors of its own."""
+    def to(self: M, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> M:
+        """The same on another device or in another precision, in leaf tensors of its own.
+
+        Raises:
+            ValueError: `device` is a dtype.
+        """
+        check_place(device)
         moved = copy(self)
         for name, parameter in self.parameters().items():
-            setattr(moved, name, parameter.detach().to(device).requires_grad_(parameter.requires_grad))
+            tensor = parameter.detach().to(device=device, dtype=dtype)
+            setattr(moved, name, tensor.requires_grad_(parameter.requires_grad))
         return moved
 
     def save(self, path: Path | str) -> None:

@@ -45,9 +45,9 @@ class SolidSoup(TriangleSoup):
         flat = TriangleSoup.from_triangles(vertices, colors.mean(dim=1), opacity=_OPACITY, sigma=_SIGMA, sh_degree=0)
         return cls(**flat.state(), appearance=appearance, notes=notes, corner_colors=colors)
 
-    def to(self, device: torch.device) -> "SolidSoup":
-        """The same on another device."""
-        return replace(super().to(device), corner_colors=self.corner_colors.to(device))
+    def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> "SolidSoup":
+        """The same on another device or in another precision."""
+        return replace(super().to(device, dtype), corner_colors=self.corner_colors.to(device=device, dtype=dtype))
 
     def kept(self, rows: Bool[Tensor, " N"]) -> "SolidSoup":
         """Some of the triangles."""

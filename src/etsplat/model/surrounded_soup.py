@@ -40,10 +40,10 @@ class SurroundedSoup(TriangleSoup):
         dc = rest.sh_dc.detach().clone().requires_grad_(True) if recolored else None
         return cls(**soup.parameters(), appearance=soup.appearance, notes=soup.notes, rest=rest, rest_dc=dc)
 
-    def to(self, device: torch.device) -> "SurroundedSoup":
-        """Both on another device."""
-        moved = super().to(device)
-        moved.rest = self.rest.to(device)
+    def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> "SurroundedSoup":
+        """Both on another device or in another precision."""
+        moved = super().to(device, dtype)
+        moved.rest = self.rest.to(device, dtype)
         return moved
 
     def drawn(self, cameras: Cameras, *, culls: bool) -> Drawn:

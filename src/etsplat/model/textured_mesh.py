@@ -18,11 +18,12 @@ from etsplat.io.georeference import Georeference
 from etsplat.io.images import to_8_bit
 from etsplat.io.mesh_files import load_mesh, save_mesh, weld_vertices
 from etsplat.io.opaque_files import TexturedFile, load_textured, save_textured
-from etsplat.io.paths import kind_of
+from etsplat.io.paths import given_path, kind_of
 from etsplat.io.textures import NormalMap, Texture
 from etsplat.io.writers import Compression, PictureKind
 from etsplat.model.model import Appearance, Depth, Model
 from etsplat.ops.antialias import rasterize_antialiased
+from etsplat.ops.rasterize import names_of
 from etsplat.ops.rasterize_opaque import rasterize_opaque
 from etsplat.ops.texture import texture_at_pixels
 
@@ -102,6 +103,8 @@ class TexturedMesh(Model):
         check_shape("vertices", vertices, ("V", 3))
         check_shape("faces", faces, ("F", 3))
         check_shape("texture", texture, ("H", "W", 3))
+        if isinstance(face_uvs, Tensor) and face_uvs.shape == (len(vertices), 2):
+            raise ValueError("face_uvs must be of the corners of faces, got those of vertices: pass uvs[faces]")
         check_shape("face_uvs", face_uvs, (len(faces), 3, 2))
         check_like("texture", texture, "vertices", vertices)
         check_like("face_uvs", face_uvs, "vertices", vertices)
@@ -117,7 +120,7 @@ class TexturedMesh(Model):
             InputError: the file is missing, damaged, without a texture, or has one of several pictures, or one that
                 repeats.
         """
-        path = Path(path)
+        path = given_path("path", path)
         if kind_of(path) == _EXACT:
             mesh = load_textured(path)
             return cls.from_mesh(*mesh[:4], max_level=mesh.max_level)
@@ -170,9 +173,10 @@ class TexturedMesh(Model):
             pictures=pictures,
         )
 
-    def to(self, device: torch.device) -> "TexturedMesh":
-        """The same mesh on another device, its parameters leaf tensors as they are here."""
-        return replace(super().to(device), topology=self.topology.to(device), face_uvs=self.face_uvs.to(device))
+    def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> "TexturedMesh":
+        """The same mesh on another device or in another precision, its parameters leaf tensors as they are here."""
+        moved = super().to(device, dtype)
+        return replace(moved, topology=self.topology.to(device), face_uvs=self.face_uvs.to(device=device, dtype=dtype))
 
     def render(
         self,
@@ -194,7 +198,7 @@ class TexturedMesh(Model):
             ValueError: the cameras are none, or of another dtype or device than the parameters; other outputs.
         """
         check_cameras(cameras, "mesh.vertices", self.vertices)
-        if set(outputs) - {"color", "alpha"}:
+        if set(names_of(outputs)) - {"color", "alpha"}:
             raise ValueError(f"outputs of opaque triangles must be colour alone, got {outputs}")
         return rasterize_antialiased(
             self.vertices,

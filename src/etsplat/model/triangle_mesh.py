@@ -1,7 +1,7 @@
 """The learnable mesh of shape reconstruction."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -13,13 +13,22 @@ from torch import Tensor
 from etsplat.core.cameras import Cameras, check_cameras
 from etsplat.core.harmonics import MAX_DEGREE, SH_CONSTANT
 from etsplat.core.rasterization import Rasterization
-from etsplat.core.validation import check_above, check_count, check_number, check_open_unit, check_shape
+from etsplat.core.validation import (
+    check_above,
+    check_count,
+    check_finite,
+    check_floating,
+    check_kind,
+    check_open_unit,
+    check_shape,
+)
 from etsplat.data.dataset import Normalization
 from etsplat.geometry.topology import MeshTopology
 from etsplat.io.mesh_files import MeshFile, load_mesh, save_mesh, weld_vertices
 from etsplat.model.model import Appearance, Depth, Model
+from etsplat.model.start_colors import start_colors
 from etsplat.ops.antialias import rasterize_antialiased
-from etsplat.ops.rasterize import rasterize
+from etsplat.ops.rasterize import names_of, rasterize
 from etsplat.ops.rasterize_opaque import render_opaque
 from etsplat.ops.soup_colors import soup_colors
 from etsplat.ops.spherical_harmonics import spherical_harmonics
@@ -104,7 +113,7 @@ class TriangleMesh(Model):
         vertices: Float[Tensor, "V 3"],
         faces: Int[Tensor, "F 3"],
         *,
-        colors: Float[Tensor, "F 3"] | Float[Tensor, "V 3"] | float,
+        colors: Float[Tensor, "F 3"] | Float[Tensor, "V 3"] | Sequence[float] | float,
         opacity: float | None,
         sigma: float | None,
         vertex_colored: bool = False,
@@ -116,7 +125,7 @@ class TriangleMesh(Model):
         Args:
             vertices: (V, 3) positions in the unit frame.
             faces: (F, 3) vertex indices.
-            colors: (F, 3), (V, 3) if `vertex_colored`, or one grey value for all, in [0, 1].
+            colors: (F, 3), (V, 3) if `vertex_colored`, or of all three numbers, or one grey value, in [0, 1].
             opacity: of every face, in (0, 1); None, as is `sigma`, for opaque triangles.
             sigma: softness, > 0.
             vertex_colored: whether colours belong to vertices.
@@ -131,20 +140,22 @@ class TriangleMesh(Model):
         check_shape("vertices", vertices, ("V", 3), sizes=sizes)
         check_shape("faces", faces, ("F", 3), sizes=sizes)
         letter = "V" if vertex_colored else "F"
-        start = torch.full((sizes[letter], 3), _grey(colors)) if isinstance(colors, float | int) else colors
-        check_shape("colors", start, (letter, 3), sizes=sizes)
+        check_floating("vertices", vertices)
+        check_finite("vertices", vertices.detach())
         vertices = vertices.detach().clone()
         soft = _is_soft(opacity, sigma)
+        if appearance is not None:
+            check_kind("appearance", appearance, MeshAppearance, "MeshAppearance(kernel) makes one")
         harmonics = check_count("harmonics", harmonics, least=0, most=MAX_DEGREE)
         if harmonics and (vertex_colored or not soft):
             raise ValueError("harmonics must be 0 where triangles are opaque or colours belong to vertices")
         rest = vertices.new_zeros(len(faces), (harmonics + 1) ** 2 - 1, 3) if harmonics else None
-        logit = torch.logit(torch.tensor(opacity, dtype=torch.float64)).to(vertices) if soft else None
+        logit = torch.logit(_double(opacity)).to(vertices) if soft else None
         return cls(
             vertices=vertices,
-            colors=start.detach().clone().to(vertices),
+            colors=start_colors(colors, letter, sizes[letter], vertices),
             opacity_logits=None if logit is None else logit.repeat(len(faces)),
-            log_sigma=torch.tensor(sigma, dtype=torch.float64).log().to(vertices) if soft else None,
+            log_sigma=_double(sigma).log().to(vertices) if soft else None,
             topology=MeshTopology.from_faces(faces, len(vertices)),
             vertex_colored=vertex_colored,
             appearance=appearance or MeshAppearance("elastic" if soft else None),
@@ -173,6 +184,8 @@ class TriangleMesh(Model):
 
     def to_file(self, frame: Normalization | None = None) -> MeshFile:
         """Its surface with display colours, on the CPU; in the input's units where `frame` leads back to these."""
+        if frame is not None:
+            check_kind("frame", frame, Normalization, "Dataset.normalization is one")
         vertices, faces = self.surface()
         vertices = vertices if frame is None else frame.invert(vertices)
         return MeshFile(vertices, faces, **self.named(self.display_colors.cpu()))
@@ -182,9 +195,9 @@ class TriangleMesh(Model):
         file = self.to_file(frame)
         save_mesh(path, file.vertices, file.faces, face_colors=file.face_colors, vertex_colors=file.vertex_colors)
 
-    def to(self, device: torch.device) -> "TriangleMesh":
-        """The same mesh on another device, its parameters leaf tensors as they are here."""
-        return replace(super().to(device), topology=self.topology.to(device))
+    def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> "TriangleMesh":
+        """The same mesh on another device or in another precision, its parameters leaf tensors as they are here."""
+        return replace(super().to(device, dtype), topology=self.topology.to(device))
 
     def render(
         self,
@@ -212,7 +225,7 @@ class TriangleMesh(Model):
         check_cameras(cameras, "mesh.vertices", self.vertices)
         look = self.appearance
         if look.kernel is None:
-            if set(outputs) - {"color", "alpha"}:
+            if set(names_of(outputs)) - {"color", "alpha"}:
                 raise ValueError(f"outputs of opaque triangles must be colour alone, got {outputs}")
             draw = rasterize_antialiased
             if look.backend == "nvdiffrast":
@@ -347,10 +360,8 @@ class TriangleMesh(Model):
         return {"vertex_colors" if self.vertex_colored else "face_colors": colors}
 
 
-def _grey(value: float) -> float:
-    """One value for all colours, if it is one."""
-    check_number("colors", value, 0, 1)
-    return value
+def _double(value: Any) -> Float[Tensor, ""]:
+    return torch.tensor(float(value), dtype=torch.float64)
 
 
 def _is_soft(opacity: float | None, sigma: float | None) -> bool:

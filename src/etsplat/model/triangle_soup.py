@@ -1,6 +1,6 @@
 """The learnable triangle soup of novel-view synthesis."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
@@ -14,12 +14,13 @@ from etsplat.core.cameras import Cameras, check_cameras
 from etsplat.core.errors import InputError
 from etsplat.core.harmonics import MAX_DEGREE, SH_CONSTANT
 from etsplat.core.rasterization import SOUP_SIGMA_FLOOR, Rasterization, joined
-from etsplat.core.validation import check_above, check_count, check_open_unit, check_shape
+from etsplat.core.validation import check_above, check_count, check_floating, check_open_unit, check_shape
 from etsplat.io.kernel_files import adopt_kernel, kernel_tensors
-from etsplat.io.paths import kind_of
+from etsplat.io.paths import given_path, kind_of
 from etsplat.io.tensors import read_tensors, save_tensors
 from etsplat.model.model import Depth, Model
 from etsplat.model.soup_appearance import OPAQUE_FROM, SMALLEST_INRADIUS, SoupAppearance
+from etsplat.model.start_colors import start_colors
 from etsplat.ops.rasterize import rasterize
 from etsplat.ops.rasterize_opaque import render_opaque
 from etsplat.ops.soup_activation import soup_activation
@@ -120,7 +121,7 @@ class TriangleSoup(Model):
     def from_triangles(
         cls,
         vertices: Float[Tensor, "N 3 3"],
-        colors: Float[Tensor, "N 3"],
+        colors: Float[Tensor, "N 3"] | Sequence[float] | float,
         *,
         opacity: float,
         sigma: float,
@@ -130,7 +131,7 @@ class TriangleSoup(Model):
 
         Args:
             vertices: (N, 3, 3) corner positions.
-            colors: (N, 3) in [0, 1].
+            colors: (N, 3), or of all three numbers, or one grey value, in [0, 1].
             opacity: of every triangle, in (0, 1).
             sigma: softness of every triangle, above 0.01.
             sh_degree: of the colours, 0 to 3.
@@ -139,17 +140,18 @@ class TriangleSoup(Model):
             ValueError: wrong shapes, or numbers out of their range.
         """
         check_shape("vertices", vertices, ("N", 3, 3))
-        check_shape("colors", colors, (N := len(vertices), 3))
+        check_floating("vertices", vertices)
+        start = start_colors(colors, "N", N := len(vertices), vertices)
         check_open_unit("opacity", opacity)
         check_above("sigma", sigma, SOUP_SIGMA_FLOOR)
         sh_degree = check_count("sh_degree", sh_degree, least=0, most=MAX_DEGREE)
-        logit = torch.logit(torch.tensor(opacity, dtype=torch.float64)).to(vertices)
-        raw = torch.tensor(sigma - SOUP_SIGMA_FLOOR, dtype=torch.float64).log().to(vertices)
+        logit = torch.logit(torch.tensor(float(opacity), dtype=torch.float64)).to(vertices)
+        raw = torch.tensor(float(sigma) - SOUP_SIGMA_FLOOR, dtype=torch.float64).log().to(vertices)
         return cls(
             vertices=vertices.detach().clone(),
             opacity_logits=logit.repeat(N),
             sigma_raw=raw.repeat(N),
-            sh_dc=((colors.detach().to(vertices) - 0.5) / SH_CONSTANT)[:, None, :].clone(),
+            sh_dc=((start - 0.5) / SH_CONSTANT)[:, None, :],
             sh_rest=vertices.new_zeros((N, (sh_degree + 1) ** 2 - 1, 3)),
         ).learnable()
 
@@ -160,7 +162,7 @@ class TriangleSoup(Model):
         Raises:
             InputError: the file is missing, cut short, of another kind, or holds numbers that are not finite.
         """
-        path = Path(path)
+        path = given_path("path", path)
         if not path.is_file():
             raise InputError(f"soup {path}: no such file; check the path")
         try:
@@ -184,9 +186,11 @@ class TriangleSoup(Model):
             ValueError: `path` does not end in .safetensors.
             InputError: the file cannot be written.
         """
-        path = Path(path)
+        path = given_path("path", path)
         if kind_of(path) != ".safetensors":
-            raise ValueError(f"path: expected the suffix .safetensors, got {path.name}")
+            raise ValueError(
+                f"path: expected the suffix .safetensors, got {path.name}; etsplat.export writes files of other kinds"
+            )
         notes = {f"note.{key}": value for key, value in self.notes.items()}
         tensors = {**self.state(), **kernel_tensors(self.appearance.kernel)}
         save_tensors(path, tensors, {**notes, "format": FORMAT, "appearance": self.appearance.to_json()})

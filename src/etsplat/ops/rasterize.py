@@ -2,7 +2,8 @@
 
 import math
 from collections.abc import Sequence
-from typing import Literal
+from numbers import Real
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -141,7 +142,7 @@ def rasterize(
         height=height,
         kernel=kernel_name(kernel),
         distance=distance,
-        outputs=_names_of(outputs),
+        outputs=names_of(outputs),
         depth_of=depth_of,
         near_plane=near_plane,
         freeze_inradius=freeze_inradius,
@@ -149,12 +150,10 @@ def rasterize(
     )
     _check_settings(settings)
     _check_vertices(vertices, faces)
-    if not isinstance(sigma, Tensor) and isinstance(sigma, float | int | np.number):
-        sigma = torch.full((), float(sigma), dtype=vertices.dtype, device=vertices.device)
     tensors = RasterizeTensors(
         vertices=vertices,
         opacities=opacities,
-        sigma=sigma,
+        sigma=sigma if isinstance(sigma, Tensor) else _filled(sigma, vertices),
         viewmats=viewmats,
         Ks=Ks,
         faces=faces,
@@ -203,7 +202,15 @@ def _check_vertices(vertices: Tensor, faces: Tensor | None) -> None:
         raise ValueError(f"vertices must be float32 or float64, got {vertices.dtype}")
 
 
-def _names_of(outputs: Sequence[str]) -> frozenset[str]:
+def _filled(number: Any, like: Tensor) -> Any:
+    """A number as a tensor (); anything else as it is."""
+    if isinstance(number, Real | np.ndarray) and np.ndim(number) == 0 and not isinstance(number, bool):  # pyright: ignore[reportArgumentType]
+        return torch.full((), float(number), dtype=like.dtype, device=like.device)
+    return number
+
+
+def names_of(outputs: Sequence[str]) -> frozenset[str]:
+    """Outputs that are asked for, of which one may be a word. Raises ValueError where they are no names."""
     try:
         return frozenset([outputs] if isinstance(outputs, str) else outputs)
     except TypeError:
