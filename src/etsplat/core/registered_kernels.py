@@ -9,6 +9,7 @@ from torch import Tensor
 
 from etsplat.core.kernel_table import KNOTS, LEFT, ROWS, KernelTable, knots, limited_slopes
 from etsplat.core.kernels import KERNELS, RIM_FLOOR, SIGMA_FLOOR, X_FLOOR, Kernel
+from etsplat.core.validation import check_kind, shown
 
 LARGEST_ERROR = 5e-3
 """Of a table, in units of G: about one level of an 8-bit image."""
@@ -66,6 +67,9 @@ def register_kernel(
         >>> error.elsewhere < 0.005  # a table that is farther off is refused
         True
     """
+    check_kind("name", name, str)
+    if not callable(value):
+        raise ValueError(f"value must be a function of x and sigma, got {shown(value)}")
     if not name.isidentifier() or name in _BUILT_IN:
         raise ValueError(f"register_kernel: name must be a Python identifier and no built-in kernel, got {name!r}")
     low, high = sigma

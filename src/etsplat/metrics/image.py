@@ -103,7 +103,7 @@ def silhouette_iou(coverage: Float[Tensor, "H W"], truth: Float[Tensor, "H W"]) 
     """Intersection over union of two silhouettes: pixels that are covered by at least half. 1 where both are empty.
 
     Raises:
-        ValueError: shapes or devices differ.
+        ValueError: shapes or devices differ; bytes, of which half is no 0.5.
 
     Example:
         >>> left, all_of_it = torch.zeros(4, 4), torch.ones(4, 4)
@@ -116,6 +116,9 @@ def silhouette_iou(coverage: Float[Tensor, "H W"], truth: Float[Tensor, "H W"]) 
     check_device("truth", truth, "coverage", coverage)
     if truth.shape != coverage.shape:
         raise ValueError(f"truth must have the coverage's shape {tuple(coverage.shape)}, got {tuple(truth.shape)}")
+    for name, given in (("coverage", coverage), ("truth", truth)):
+        if not (given.is_floating_point() or given.dtype == torch.bool):
+            raise ValueError(f"{name} must be floats in [0, 1] or booleans, got {given.dtype}")
     ours, theirs = coverage >= 0.5, truth >= 0.5
     union = int((ours | theirs).sum())
     return int((ours & theirs).sum()) / union if union else 1.0

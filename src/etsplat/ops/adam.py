@@ -5,6 +5,7 @@ Moments are plain tensors under the parameter's name, so that structural edits c
 """
 
 from collections.abc import Mapping, Sequence
+from numbers import Real
 from typing import Any
 
 import torch
@@ -72,8 +73,8 @@ class Adam:
         if not isinstance(learning_rates, Mapping) or set(parameters) != set(learning_rates):
             got = sorted(learning_rates) if isinstance(learning_rates, Mapping) else learning_rates
             raise ValueError(f"learning_rates must name {sorted(parameters)}, got {got}")
-        if not all(0 <= beta < 1 for beta in betas):
-            raise ValueError(f"betas must be in [0, 1), got {betas}")
+        if not (isinstance(betas, Sequence) and len(betas) == 2 and all(_is_decay(beta) for beta in betas)):
+            raise ValueError(f"betas must be two numbers in [0, 1), got {betas}")
         check_number("eps", eps, 0)
         for name, rate in learning_rates.items():
             check_number(f"learning_rates[{name}]", rate, 0)
@@ -254,6 +255,10 @@ class Adam:
                 torch.autograd.graph.increment_version(parameter)  # so that a stale graph fails loudly in backward
             else:
                 parameter.copy_(value)
+
+
+def _is_decay(beta: object) -> bool:
+    return isinstance(beta, Real) and 0 <= float(beta) < 1
 
 
 def _calm(second: Tensor) -> Tensor:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from etsplat.core.validation import check_count, check_number
 from etsplat.optim.loop import Progress
 from etsplat.optim.schedules import NEVER
 
@@ -54,7 +55,12 @@ class Guard:
             tolerance: by which part the loss may be higher than before the edit.
             steps: after so many steps an edit is judged, or before the next edit if that comes earlier.
             until: length of the run: an edit is judged after its last step if nothing comes earlier.
+
+        Raises:
+            ValueError: a number is out of its range, or none.
         """
+        check_number("tolerance", tolerance, 0)
+        steps, until = check_count("steps", steps), check_count("until", until, least=0)
         self._tolerance, self._steps, self._until = tolerance, steps, until
         self.held: Held | None = None
         self.undone: list[int] = []

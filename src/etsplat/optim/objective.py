@@ -16,8 +16,8 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from etsplat.core.cameras import Cameras
-from etsplat.core.rasterization import Rasterization
-from etsplat.core.validation import check_kind, shown
+from etsplat.core.rasterization import OUTPUTS, Rasterization
+from etsplat.core.validation import check_choice, check_kind, check_number, shown
 from etsplat.model.model import Depth
 from etsplat.ops.weighted_sum import Term as Summand
 from etsplat.ops.weighted_sum import weighted_sum
@@ -100,6 +100,9 @@ class Term(ABC):
     squares: ClassVar[str | None] = None
 
     def __init__(self, weight: Scheduled = 1.0) -> None:
+        """Takes its weight. Raises ValueError where that is neither a number nor a function."""
+        if not callable(weight):
+            check_number("weight", weight)
         self.weight = weight
 
     @abstractmethod
@@ -124,8 +127,17 @@ class Custom(Term):
         *,
         outputs: str | Sequence[str] = (),
     ) -> None:
+        """Takes them.
+
+        Raises:
+            ValueError: `value` is no function, the weight neither a number nor one, or there is no such output.
+        """
         super().__init__(weight)
+        if not callable(value):
+            raise ValueError(f"value must be a function of a drawing, got {shown(value)}")
         self._value, self.outputs = value, (outputs,) if isinstance(outputs, str) else tuple(outputs)
+        for name in self.outputs:
+            check_choice("outputs", name, OUTPUTS)
 
     def __call__(self, drawing: Drawing) -> Float[Tensor, ""]:
         """Of the function."""

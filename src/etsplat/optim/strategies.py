@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from etsplat.core.rasterization import Rasterization
-from etsplat.core.validation import check_choice, check_count, check_number
+from etsplat.core.validation import check_choice, check_count, check_number, shown
 from etsplat.geometry.discs import cut_open
 from etsplat.geometry.films import film
 from etsplat.geometry.flips import flipped
@@ -138,8 +138,15 @@ class SubdivideAndUntangle(Strategy):
                 at each edit but the last, before what else it does, or stay where that spoils the pictures.
             outlines: of vertices and how they hang together, on the CPU, where outlines say that vertices belong.
             outlines_after: the iteration after which they are brought there.
+
+        Raises:
+            ValueError: iterations or numbers of faces are no whole numbers of at least 1.
         """
-        self._budgets, self._untangle_after, self._unseen = dict(budgets), set(untangle_after), unseen
+        if not isinstance(budgets, Mapping):
+            raise ValueError(f"budgets must be numbers of faces by iteration, got {shown(budgets)}")
+        times = {check_count("an iteration of budgets", time): faces for time, faces in budgets.items()}
+        self._budgets = {time: check_count(f"budgets[{time}]", faces) for time, faces in times.items()}
+        self._untangle_after, self._unseen = {check_count("untangle_after", time) for time in untangle_after}, unseen
         self._outlines, self._outlines_after = outlines, NEVER if outlines is None else outlines_after
         self._reaches = (reach, _SHORT) if reach > _SHORT else (reach,)
         self._flips, self._lids = flips, lids

@@ -122,7 +122,9 @@ class Trainer(Generic[M]):
             ValueError: cameras are to be refined, and no photos are kept aside to judge them; there is no view to fit
                 to; the schedule or the paces name other parameters than the model's; an argument is of another kind.
         """
-        check_parts(model, dataset, objective, strategy, schedule, paces or {})
+        others: dict[str, tuple[object, type]] = {"schedule": (schedule, Schedule), "exposure": (exposure, Exposure)}
+        others |= {"cameras": (cameras, CameraRefinement), "guard": (guard, Guard)}
+        check_parts(model, dataset, objective, strategy, others, paces or {})
         batch, generator = check_count("batch", batch), generator_of(seed)
         self.model, self.strategy, self.progress = model.learnable(), strategy or Fixed(), Progress()
         self.exposure, self.depths, self.guard = exposure or Exposure(NEVER), depths or DepthTrust([]), guard

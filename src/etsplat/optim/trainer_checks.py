@@ -11,7 +11,6 @@ from etsplat.core.validation import check_kind, check_number, shown, whole_numbe
 from etsplat.data.dataset import Dataset
 from etsplat.model.model import Model
 from etsplat.optim.objective import Objective
-from etsplat.optim.schedules import Schedule
 from etsplat.optim.strategies import Strategy
 
 
@@ -20,10 +19,13 @@ def check_parts(
     dataset: Dataset,
     objective: Objective,
     strategy: Strategy | None,
-    schedule: Schedule | None,
+    others: Mapping[str, tuple[object, type]],
     paces: Mapping[str, Any],
 ) -> None:
-    """Raises ValueError, naming the argument, for what no run can be made of; arguments are those of `Trainer`."""
+    """Raises ValueError, naming the argument, for what no run can be made of; arguments are those of `Trainer`.
+
+    Of the `others`, by name, a value may be None or of its kind.
+    """
     if Model not in type(model).__mro__:  # a protocol, which isinstance would compare by its names
         raise ValueError(f"model must be a model, such as etsplat.TriangleMesh, got {shown(model)}")
     check_kind("dataset", dataset, Dataset, "etsplat.load_dataset(path) reads one")
@@ -32,8 +34,9 @@ def check_parts(
     check_kind("objective", objective, Objective, "Objective(photometric)")
     if strategy is not None:
         check_kind("strategy", strategy, Strategy, "make one, such as etsplat.Fixed()")
-    if schedule is not None:
-        check_kind("schedule", schedule, Schedule, "etsplat.Schedule(rates) makes one of rates by name")
+    for name, (value, kind) in others.items():
+        if value is not None:
+            check_kind(name, value, kind, f"etsplat.{kind.__name__} makes one")
     parameters = model.parameters()
     for name, parameter in parameters.items():
         if parameter.dtype != torch.float32:
