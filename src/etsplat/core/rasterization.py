@@ -8,6 +8,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from etsplat.core.validation import shown
+
 # Depths that the distortion maps to [0, 1]; those of 2DGS and Triangle Splatting.
 DISTORTION_NEAR = 0.2
 DISTORTION_FAR = 100.0
@@ -162,6 +164,14 @@ class Rasterization:
     def rgba(self) -> Float[Tensor, "B H W C+1"]:
         """Colour, then alpha, as one tensor."""
         return torch.cat([self.color, self.alpha], dim=-1)
+
+
+def names_of(outputs: Sequence[str]) -> frozenset[str]:
+    """Outputs that are asked for, of which one may be a word. Raises ValueError where they are no names."""
+    try:
+        return frozenset([outputs] if isinstance(outputs, str) else outputs)
+    except TypeError:
+        raise ValueError(f"outputs must be names, such as ('depth',), got {shown(outputs)}") from None
 
 
 def joined(renderings: Sequence[Rasterization]) -> Rasterization:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from etsplat.core.cameras import Cameras, check_cameras
 from etsplat.core.errors import InputError
-from etsplat.core.rasterization import Rasterization
+from etsplat.core.rasterization import Rasterization, names_of
 from etsplat.core.validation import check_like, check_shape
 from etsplat.geometry.topology import MeshTopology
 from etsplat.io.georeference import Georeference
@@ -23,7 +23,6 @@ from etsplat.io.textures import NormalMap, Texture
 from etsplat.io.writers import Compression, PictureKind
 from etsplat.model.model import Appearance, Depth, Model
 from etsplat.ops.antialias import rasterize_antialiased
-from etsplat.ops.rasterize import names_of
 from etsplat.ops.rasterize_opaque import rasterize_opaque
 from etsplat.ops.texture import texture_at_pixels
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from etsplat.core.cameras import Cameras, check_cameras
 from etsplat.core.harmonics import MAX_DEGREE, SH_CONSTANT
-from etsplat.core.rasterization import Rasterization
+from etsplat.core.rasterization import Rasterization, names_of
 from etsplat.core.validation import (
     check_above,
     check_count,
@@ -28,7 +28,7 @@ from etsplat.io.mesh_files import MeshFile, load_mesh, save_mesh, weld_vertices
 from etsplat.model.model import Appearance, Depth, Model
 from etsplat.model.start_colors import start_colors
 from etsplat.ops.antialias import rasterize_antialiased
-from etsplat.ops.rasterize import names_of, rasterize
+from etsplat.ops.rasterize import rasterize
 from etsplat.ops.rasterize_opaque import render_opaque
 from etsplat.ops.soup_colors import soup_colors
 from etsplat.ops.spherical_harmonics import spherical_harmonics

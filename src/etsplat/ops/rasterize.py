@@ -21,6 +21,7 @@ from etsplat.core.rasterization import (
     Rasterization,
     RasterizeSettings,
     RasterizeTensors,
+    names_of,
 )
 from etsplat.core.validation import (
     Shape,
@@ -37,7 +38,6 @@ from etsplat.core.validation import (
     check_like,
     check_positive,
     check_shape,
-    shown,
 )
 from etsplat.engines.choice import engine_for
 
@@ -207,14 +207,6 @@ def _filled(number: Any, like: Tensor) -> Any:
     if isinstance(number, Real | np.ndarray) and np.ndim(number) == 0 and not isinstance(number, bool):  # pyright: ignore[reportArgumentType]
         return torch.full((), float(number), dtype=like.dtype, device=like.device)
     return number
-
-
-def names_of(outputs: Sequence[str]) -> frozenset[str]:
-    """Outputs that are asked for, of which one may be a word. Raises ValueError where they are no names."""
-    try:
-        return frozenset([outputs] if isinstance(outputs, str) else outputs)
-    except TypeError:
-        raise ValueError(f"outputs must be names, such as ('depth',), got {shown(outputs)}") from None
 
 
 def _check_settings(settings: RasterizeSettings) -> None:

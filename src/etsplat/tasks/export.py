@@ -1,4 +1,4 @@
-"""`etsplat.export`: a soup as a file for other programs, whatever it comes from."""
+"""`etsplat.export`: a soup, or the mesh of a reconstruction, as a file for other programs, whatever it comes from."""
 
 from pathlib import Path
 
@@ -11,6 +11,7 @@ from etsplat.io.paths import given_path
 from etsplat.model.triangle_mesh import TriangleMesh
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.tasks.export_config import ExportConfig
+from etsplat.tasks.export_mesh import checked_for_meshes, is_reconstruction, write_mesh
 from etsplat.tasks.export_soup import Export, export_soup
 from etsplat.tasks.opened_runs import SoupRun, capture_at, open_run
 from etsplat.tasks.reconstruct import ReconstructResult
@@ -18,17 +19,18 @@ from etsplat.tasks.train import TrainResult
 
 
 def export(
-    source: TrainResult | TriangleSoup | str | Path,
+    source: TrainResult | ReconstructResult | TriangleSoup | str | Path,
     path: str | Path,
     config: ExportConfig | None = None,
     *,
     scene: Dataset | str | Path | None = None,
 ) -> Export:
-    """Writes the triangles of a scene as a file for other programs, as `etsplat export` does.
+    """Writes the triangles of a scene or an object as a file for other programs, as `etsplat export` does.
 
     Args:
         source: the result of `train`, its folder, a soup, or a file that holds one (safetensors, ply, etz). Of the
-            first two, the opaque mesh that the run made is written where the file is one of opaque triangles.
+            first two, the opaque mesh that the run made is written where the file is one of opaque triangles. Or the
+            result of `reconstruct`, or its folder: a mesh, for glb, obj and ply.
         path: of the file; its suffix chooses the kind: glb, obj, ply, off, safetensors, etz, html.
         config: what is written, and how; None for the defaults.
         scene: the capture, or its folder, by which colours are baked and what nobody sees is left out; None for what
@@ -55,12 +57,24 @@ def export(
         if getattr(config, name) is not None:
             raise InputError(f"{name}: belongs to a run of reconstruct; take etsplat.texture_mesh")
     path = given_path("path", path, "the path of a file")
-    if isinstance(source, ReconstructResult | TriangleMesh | MeshFile):
+    if isinstance(source, ReconstructResult):
+        return _export_mesh(source.path, path, config, scene)
+    if isinstance(source, TriangleMesh | MeshFile):
         how = "etsplat.texture_mesh gives it a texture, etsplat.save_mesh writes a mesh as it is"
         raise InputError(f"source: is of type {type(source).__name__}, and no soup; {how}")
     if isinstance(source, TriangleSoup):
         soup = source.finished().to(torch.device("cpu"))
         return export_soup(SoupRun(path.parent, soup, capture_at(scene)), path, config)
-    found = source.path if isinstance(source, TrainResult) else source
-    given_path("source", found, "a result of train, a TriangleSoup or a path")
+    found = given_path(
+        "source",
+        source.path if isinstance(source, TrainResult) else source,
+        "a result of train or reconstruct, a TriangleSoup or a path",
+    )
+    if is_reconstruction(found):
+        return _export_mesh(found, path, config, scene)
     return export_soup(open_run(found, scene, "cpu"), path, config)
+
+
+def _export_mesh(run: Path, path: Path, config: ExportConfig, scene: Dataset | str | Path | None) -> Export:
+    faces, transform = write_mesh(run, path, checked_for_meshes(path, config), scene)
+    return Export(path, faces, 0, {}, transform)

@@ -202,6 +202,14 @@ def export_mesh(
     Raises:
         InputError: settings that meshes do not know; as `texture_mesh`; the file cannot be written.
     """
+    config = checked_for_meshes(path, config)
+    if config.texture is not None:
+        return _export_textured(run, path, config, scene, device, tell)
+    return {path: write_mesh(run, path, config, scene)[0]}
+
+
+def checked_for_meshes(path: Path, config: ExportConfig) -> ExportConfig:
+    """With axes that are chosen. Raises InputError for settings that meshes do not know, or files of this kind."""
     for name in settings_of(ExportConfig):
         if name not in _OF_MESHES and getattr(config, name) != getattr(ExportConfig(), name):
             option = name.replace("_", "-")
@@ -209,8 +217,13 @@ def export_mesh(
             raise InputError(f"--{option}: is for soups; of a reconstruction's mesh there are {ours}")
     config = replace(config, up=config.up or "keep")
     check_stored(path, config)
-    if config.texture is not None:
-        return _export_textured(run, path, config, scene, device, tell)
+    return config
+
+
+def write_mesh(
+    run: Path, path: Path, config: ExportConfig, scene: Dataset | Path | str | None
+) -> tuple[int, Similarity]:
+    """`export_mesh` without a texture: how many faces, and the way from the input's units and axes to the file's."""
     if kind_of(path) not in (kinds := suffixes("vertex_colors")):
         raise InputError(f"{path}: files of this kind are for soups; choose one of {', '.join(kinds)} for a mesh")
     mesh = load_mesh(_mesh_of(RunDirectory(run)))
@@ -219,10 +232,10 @@ def export_mesh(
         colors = colors_at(mesh, vertices[faces].mean(dim=1))
         mesh = MeshFile(vertices, faces, face_colors=colors)
     check_placed(path, config)
-    near, far = _placement(RunDirectory(run), config, scene, mesh.vertices)
+    transform, near, far = _placement(RunDirectory(run), config, scene, mesh.vertices)
     vertices, by_face, by_vertex = near.apply(mesh.vertices).float(), mesh.face_colors, _only_by_vertex(mesh)
     save_mesh(path, vertices, mesh.faces, by_face, vertex_colors=by_vertex, world=far, compress=config.compress)
-    return {path: len(mesh.faces)}
+    return len(mesh.faces), transform
 
 
 def _export_textured(
@@ -246,7 +259,7 @@ def _export_textured(
         raise InputError(f"{path}: there is no folder {path.parent}; create the folder first")
     check_installed()
     opened, written = open_reconstruction(run, scene, device, tell), {}
-    near, far = _placement(RunDirectory(run), config, scene, opened.views.normalization.invert(opened.mesh.vertices))
+    _, near, far = _placement(RunDirectory(run), config, scene, opened.views.normalization.invert(opened.mesh.vertices))
     mesh = opened.textured(config.texture, config.faces or LIGHT_FACES, tell=tell)
     for level in range(config.lods + 1):
         if level:
@@ -272,16 +285,19 @@ def check_stored(path: Path, config: ExportConfig) -> None:
 
 
 def _placement(
-    run: RunDirectory, config: ExportConfig, scene: Path | None, vertices: Float[Tensor, "V 3"]
-) -> tuple[Similarity, Georeference | None]:
-    """How vertices in the units of the input are moved, and by which offset beside it."""
+    run: RunDirectory, config: ExportConfig, scene: Dataset | Path | str | None, vertices: Float[Tensor, "V 3"]
+) -> tuple[Similarity, Similarity, Georeference | None]:
+    """How vertices in the units of the input are moved: in all, and as a part in the file and an offset beside it."""
     file = run.path / GEOREFERENCE_FILE
     georeference = Georeference.read(file) if file.is_file() else None
     up = None if config.up == "keep" else _up(run, scene, georeference)
-    return apart_from_world(placement(run.path, config, vertices, up, georeference), config, georeference)
+    transform = placement(run.path, config, vertices, up, georeference)
+    return transform, *apart_from_world(transform, config, georeference)
 
 
-def _up(run: RunDirectory, scene: Path | None, georeference: Georeference | None) -> Float[Tensor, "3"] | None:
+def _up(
+    run: RunDirectory, scene: Dataset | Path | str | None, georeference: Georeference | None
+) -> Float[Tensor, "3"] | None:
     """Where up is; None for the object of a mesh, whose photos say nothing, and where photos contradict each other."""
     told = told_up(georeference)
     if told is not None:
@@ -289,7 +305,7 @@ def _up(run: RunDirectory, scene: Path | None, georeference: Georeference | None
     source = run.read_config("paths.source")["paths"]["source"] if scene is None else scene
     if source is None:
         raise InputError(f"{run.path}: does not say what it is of; name the folder with its photos with --scene")
-    if source == DEMO_OBJECT or Path(source).is_file():
+    if not isinstance(source, Dataset) and (source == DEMO_OBJECT or Path(source).is_file()):
         return None
     photos = capture_at(source)
     return None if photos is None else up_of(photos)

@@ -1,0 +1,39 @@
+"""`etsplat.export` of the mesh of a reconstruction, from Python."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+import etsplat
+
+TINY = etsplat.ReconstructConfig.tiny().changed({"iterations": 5, "resolution": 24})
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory: pytest.TempPathFactory) -> etsplat.ReconstructResult:
+    return etsplat.reconstruct("demo:owl", tmp_path_factory.mktemp("runs") / "owl", TINY)
+
+
+@pytest.mark.parametrize("folder", [False, True])
+def test_the_mesh_is_written_as_it_is(result: etsplat.ReconstructResult, folder: bool, tmp_path: Path) -> None:
+    written = etsplat.export(result.path if folder else result, tmp_path / "owl.ply")
+    found = etsplat.load_mesh(written.path)
+    assert written.triangles == len(found.faces) == len(result.mesh.faces)
+    torch.testing.assert_close(found.vertices, result.mesh.vertices)
+
+
+def test_it_is_scaled_and_placed_and_says_how(result: etsplat.ReconstructResult, tmp_path: Path) -> None:
+    config = etsplat.ExportConfig(up="y", scale=2.0, place="ground")
+    written = etsplat.export(result, tmp_path / "owl.obj", config)
+    found = etsplat.load_mesh(written.path).vertices
+    assert float(found[:, 1].min()) == pytest.approx(0, abs=1e-5)
+    moved = written.transform.apply(result.mesh.vertices).float()
+    torch.testing.assert_close(moved.aminmax(dim=0).max, found.aminmax(dim=0).max, atol=1e-5, rtol=0)
+
+
+def test_what_meshes_do_not_know_is_refused(result: etsplat.ReconstructResult, tmp_path: Path) -> None:
+    with pytest.raises(etsplat.InputError, match="is for soups"):
+        etsplat.export(result, tmp_path / "owl.glb", etsplat.ExportConfig(colors="keep"))
+    with pytest.raises(etsplat.InputError, match="files of this kind are for soups"):
+        etsplat.export(result, tmp_path / "owl.html")
