@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from etsplat.core.precision import as_given
+from etsplat.core.short_repr import short_repr
 from etsplat.core.validation import (
     check_above,
     check_count,
@@ -45,6 +46,8 @@ class Cameras:
         >>> around[2].width  # one of them, or a slice
         64
     """
+
+    __repr__ = short_repr
 
     viewmats: Float[Tensor, "B 4 4"]
     Ks: Float[Tensor, "B 3 3"]

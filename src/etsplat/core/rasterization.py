@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from etsplat.core.short_repr import short_repr
 from etsplat.core.validation import shown
 
 # Depths that the distortion maps to [0, 1]; those of 2DGS and Triangle Splatting.
@@ -118,6 +119,8 @@ class TriangleStatistics:
         (True, False)
     """
 
+    __repr__ = short_repr
+
     max_weight: Float[Tensor, "B N"]
     screen_size: Float[Tensor, "B N"]
     inradius: Float[Tensor, "B N"]
@@ -149,6 +152,8 @@ class Rasterization:
         >>> seen.alpha.shape, seen.depth is None
         (torch.Size([1, 16, 16, 1]), True)
     """
+
+    __repr__ = short_repr
 
     color: Float[Tensor, "B H W C"]
     alpha: Float[Tensor, "B H W 1"]

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from etsplat.core.cameras import Cameras, camera_centers
 from etsplat.core.errors import InputError
+from etsplat.core.short_repr import short_repr
 from etsplat.core.validation import check_above, check_count, shown
 from etsplat.data.dataset_checks import (
     checked_intrinsics,
@@ -96,6 +97,8 @@ class Dataset:
         >>> len(photos.train), len(photos.test), photos.images[0].shape
         (32, 8, torch.Size([16, 16, 4]))
     """
+
+    __repr__ = short_repr
 
     viewmats: Float[Tensor, "B 4 4"]
     Ks: Float[Tensor, "B 3 3"]

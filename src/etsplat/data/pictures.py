@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from etsplat.core.cameras import check_size
+from etsplat.core.short_repr import short_repr
 from etsplat.core.workers import workers
 from etsplat.data.dataset_checks import as_many, checked_mask, checked_pixels, is_straight
 from etsplat.io.depth_maps import resize_depth
@@ -52,6 +53,8 @@ class Picture:
         >>> etsplat.Picture(grey, mask=torch.full((48, 64), 255, dtype=torch.uint8)).depth is None
         True
     """
+
+    __repr__ = short_repr
 
     pixels: Pixels
     mask: UInt8[Tensor, "H W"] | None = None

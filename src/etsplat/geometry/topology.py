@@ -14,6 +14,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
+from etsplat.core.short_repr import short_repr
 from etsplat.core.validation import check_indices, check_shape
 from etsplat.ops.mesh_energies import MeshConnectivity
 
@@ -40,6 +41,8 @@ class MeshTopology:
         >>> len(topology.edges), len(topology.face_pairs)
         (30, 30)
     """
+
+    __repr__ = short_repr
 
     num_vertices: int
     faces: Int[Tensor, "F 3"]

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from etsplat.core.errors import InputError
+from etsplat.core.short_repr import short_repr
 from etsplat.core.validation import check_memory, dense
 from etsplat.io._mesh_readers import READERS, RawMesh
 from etsplat.io.export_records import read_record, transform_of_record
@@ -52,6 +53,8 @@ class MeshFile:
         >>> mesh = etsplat.MeshFile(vertices, faces, face_colors=torch.ones(len(faces), 3))
         >>> etsplat.save_mesh("sphere.ply", mesh.vertices, mesh.faces, mesh.face_colors)
     """
+
+    __repr__ = short_repr
 
     vertices: Float[Tensor, "V 3"]
     faces: Int64[Tensor, "F 3"]

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 from torch import Tensor
 
+from etsplat.core.short_repr import short_repr
 from etsplat.core.validation import check_above
 from etsplat.model.triangle_soup import TriangleSoup
 
@@ -33,6 +34,8 @@ class StartPoints:
         >>> soup.count
         100
     """
+
+    __repr__ = short_repr
 
     positions: Float[Tensor, "P 3"]
     colors: Float[Tensor, "P 3"]

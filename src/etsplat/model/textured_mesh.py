@@ -12,6 +12,7 @@ from torch import Tensor
 from etsplat.core.cameras import Cameras, check_cameras
 from etsplat.core.errors import InputError
 from etsplat.core.rasterization import Rasterization, names_of
+from etsplat.core.short_repr import short_repr
 from etsplat.core.validation import check_like, check_shape
 from etsplat.geometry.topology import MeshTopology
 from etsplat.io.georeference import Georeference
@@ -74,6 +75,8 @@ class TexturedMesh(Model):
         >>> mesh.texture.grad.shape, bool(mesh.texture.grad.any())
         (torch.Size([16, 16, 3]), True)
     """
+
+    __repr__ = short_repr
 
     RATES: ClassVar[Mapping[str, float]] = {"vertices": 2e-3, "texture": 1e-2}
     OPAQUE: ClassVar[str] = "mesh"

@@ -13,6 +13,7 @@ from torch import Tensor
 from etsplat.core.cameras import Cameras, check_cameras
 from etsplat.core.harmonics import MAX_DEGREE, SH_CONSTANT
 from etsplat.core.rasterization import Rasterization, names_of
+from etsplat.core.short_repr import short_repr
 from etsplat.core.validation import (
     check_above,
     check_count,
@@ -88,6 +89,8 @@ class TriangleMesh(Model):
         >>> mesh.render(etsplat.orbit_cameras(32, 32, azimuths=1)[0]).color.shape
         torch.Size([1, 32, 32, 3])
     """
+
+    __repr__ = short_repr
 
     RATES: ClassVar[Mapping[str, float]] = {
         "vertices": 2e-3,

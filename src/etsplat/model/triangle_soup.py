@@ -14,6 +14,7 @@ from etsplat.core.cameras import Cameras, check_cameras
 from etsplat.core.errors import InputError
 from etsplat.core.harmonics import MAX_DEGREE, SH_CONSTANT
 from etsplat.core.rasterization import SOUP_SIGMA_FLOOR, Rasterization, joined
+from etsplat.core.short_repr import short_repr
 from etsplat.core.validation import check_above, check_count, check_floating, check_open_unit, check_shape
 from etsplat.io.kernel_files import adopt_kernel, kernel_tensors
 from etsplat.io.paths import given_path, kind_of
@@ -83,6 +84,8 @@ class TriangleSoup(Model):
         >>> soup.render(etsplat.orbit_cameras(16, 12)[0]).color.shape
         torch.Size([1, 12, 16, 3])
     """
+
+    __repr__ = short_repr
 
     RATES: ClassVar[Mapping[str, float]] = {
         "vertices": 1.5e-3,
