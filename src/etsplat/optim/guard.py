@@ -59,7 +59,7 @@ class Guard:
         Raises:
             ValueError: a number is out of its range, or none.
         """
-        check_number("tolerance", tolerance, 0)
+        check_number("tolerance", tolerance)
         steps, until = check_count("steps", steps), check_count("until", until, least=0)
         self._tolerance, self._steps, self._until = tolerance, steps, until
         self.held: Held | None = None
