@@ -6,10 +6,10 @@ from typing import Any
 from torch import Tensor
 
 
-def short_repr(value: Any) -> str:
+def short_repr(self: Any) -> str:  # by the name that a method has it by
     """For the ``__repr__`` of a dataclass: tensors by their shapes, with their dtype where that is not float32."""
-    shown = ", ".join(f"{field.name}={_short(getattr(value, field.name))}" for field in fields(value))
-    return f"{type(value).__name__}({shown})"
+    shown = ", ".join(f"{field.name}={_short(getattr(self, field.name))}" for field in fields(self))
+    return f"{type(self).__name__}({shown})"
 
 
 def _short(value: Any) -> str:
