@@ -226,6 +226,21 @@ class TestRefused:
         with pytest.raises(ValueError, match="another kernel is registered as 'mine'"):
             etsplat.register_kernel("mine", waves)
 
+    def test_a_cell_that_is_run_again_replaces_its_kernel(self):
+        """On engine cpu, which has the table, and in a model that names it."""
+        etsplat.register_kernel("mine", logistic)
+        mesh = etsplat.TriangleMesh.from_mesh(
+            *etsplat.icosphere(0), colors=0.5, opacity=0.9, sigma=0.5, appearance=etsplat.MeshAppearance("mine")
+        )
+        camera = etsplat.orbit_cameras(16, 16, elevations=(0.0,), azimuths=1)
+        before = mesh.render(camera).color
+        etsplat.register_kernel("mine", waves, replace=True)
+        again = mesh.render(camera).color
+        etsplat.register_kernel("other", waves)
+        mesh.appearance = etsplat.MeshAppearance("other")
+        assert torch.equal(again, mesh.render(camera).color)
+        assert not torch.equal(again, before)
+
 
 class TestFiles:
     """A table comes back from what a file holds, and is drawn without the function."""

@@ -37,7 +37,12 @@ class TableError(NamedTuple):
 
 
 def register_kernel(
-    name: str, value: KernelFunction, sigma: tuple[float, float] = (0.01, 4.0), x_max: float = 2.0
+    name: str,
+    value: KernelFunction,
+    sigma: tuple[float, float] = (0.01, 4.0),
+    x_max: float = 2.0,
+    *,
+    replace: bool = False,
 ) -> TableError:
     """Make ``rasterize(kernel=name)`` draw with a kernel G(x) of one's own, in every engine and without a compiler.
 
@@ -52,12 +57,14 @@ def register_kernel(
             the centre of the triangle and 1 on its edge, sigma the softness. Differentiable by autograd.
         sigma: Smallest and largest softness of the table.
         x_max: Largest x that a call may draw, ``Cutoffs.x_max``; > 1.
+        replace: Whether it takes the place of another kernel of that name, as where a notebook's cell is run again.
+            Models that have it are drawn by the new one from then on.
 
     Returns:
         How far the table is from the function.
 
     Raises:
-        ValueError: The name is taken; ``value`` is not in [0, 1], or it or a derivative is not finite (with the x and
+        ValueError: The name is taken, and ``replace`` is False; ``value`` is not in [0, 1], or it or a derivative is not finite (with the x and
             sigma of the first place); it has a step; or the table is off by more than 0.005 between its knots.
 
     Example:
@@ -81,7 +88,8 @@ def register_kernel(
     table = _tabulate(function, (float(low), float(high)), float(x_max))
     error = _measure(function, table)
     kernel = Kernel(name, function.value, function.gradient, _support(table), _area(function.value, x_max), table)
-    _check_free(name, table)
+    if not replace:
+        _check_free(name, table, ", or pass replace=True")
     KERNELS[name] = kernel
     return error
 
@@ -109,10 +117,10 @@ def adopt_table(name: str, table: KernelTable) -> None:
     KERNELS[name] = Kernel(name, value, gradient, _support(table), _area(value, table.x_max), table)
 
 
-def _check_free(name: str, table: KernelTable) -> None:
-    """A name means one kernel as long as the process lives: what was drawn with it is drawn alike later."""
+def _check_free(name: str, table: KernelTable, otherwise: str = "") -> None:
+    """A name means one kernel unless somebody replaces it: what was drawn with it is drawn alike later."""
     if name in KERNELS and KERNELS[name].table != table:
-        raise ValueError(f"another kernel is registered as {name!r} in this process: choose another name")
+        raise ValueError(f"another kernel is registered as {name!r} in this process: choose another name{otherwise}")
 
 
 class _Function:
