@@ -49,7 +49,7 @@ _UNCOVERED, _LESS = 0.0005, 0.9
 """A hull that leaves more of the silhouettes uncovered lacks thin parts if a finer one leaves at most so many times as
 much: what rough masks leave does not depend on how fine it is."""
 
-_LACKING, _THIN, _FINEST = 0.003, 0.5, 4
+_LACKING, _THIN, _FINEST = 0.02, 0.5, 4
 """Where a hull leaves more of the silhouettes uncovered, one is tried that has thin parts whole, of up to so many times
 as many faces: around wires they are small. It is taken if it leaves at most so large a part of that."""
 
