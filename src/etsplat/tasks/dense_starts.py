@@ -15,7 +15,7 @@ from etsplat.optim.loop import Event, NoteEvent
 LEAST_SHARE = 0.1
 """Photos that agree on a smaller part of their pixels do so by chance (0.01 of `lund`, and 0.4 to 0.6 of others)."""
 
-POOR, DOUBTFUL = 0.35, 0.07
+POOR, DOUBTFUL = 0.3, 0.07
 """Of the places that a photo finds its neighbours find 0.44 to 0.84 where poses are right, 0.07 to 0.31 where cameras
 are turned by a quarter of a degree (0.7 pixels of photos that are 200 wide), and 0.01 to 0.08 by a whole one. By poses
 of the last kind more is learnt by heart than of the scene."""

@@ -244,9 +244,9 @@ def _of_poor_poses(job: Job[TrainConfig], consistent: float, views: int, *, shor
     """The settings of a run whose photos contradict each other's depths: it says so, and may have fewer iterations."""
     config, most = job.config, job.config.schedule.doubtful_epochs
     told = (
-        f"poses: of the places that a photo finds its neighbours find only {100 * consistent:.0f} %: cameras are off by"
-        " a pixel and more, or things moved. --refine-cameras poses mends small errors, etsplat data sfm finds cameras"
-        " anew"
+        f"poses: of the places that a photo finds its neighbours find only {100 * consistent:.0f} %: cameras are"
+        " probably off by a pixel and more, or things moved. --refine-cameras poses mends small errors, etsplat data"
+        " sfm finds cameras anew"
     )
     iterations = limited_iterations(config.iterations, most, views, config.batch)
     if shorten and consistent < DOUBTFUL and iterations < config.iterations:
