@@ -64,8 +64,8 @@ def register_kernel(
         How far the table is from the function.
 
     Raises:
-        ValueError: The name is taken, and ``replace`` is False; ``value`` is not in [0, 1], or it or a derivative is not
-            finite (with the x and sigma of the first place); it has a step; or the table is off by more than 0.005
+        ValueError: The name is taken, and ``replace`` is False; ``value`` is not in [0, 1], or it or a derivative is
+            not finite (with the x and sigma of the first place); it has a step; or the table is off by more than 0.005
             between its knots.
 
     Example:
