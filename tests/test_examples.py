@@ -95,9 +95,14 @@ def test_photos_in_memory_are_a_data_set(tmp_path: Path) -> None:
     assert run(["-c", code_of("docs/library.md", "StoredPictures(")], tmp_path) == ""
 
 
+def test_the_patience_of_the_documents_runs(tmp_path: Path) -> None:
+    """docs/library.md: a run that a callback ends."""
+    run(["-c", code_of("docs/library.md", "trainer.stop()\n")], tmp_path)
+
+
 def test_the_trainer_of_the_documents_runs(tmp_path: Path) -> None:
     """docs/library.md: the same in fewer lines, with a term and a strategy."""
-    printed = run(["-c", code_of("docs/library.md", "Trainer")], tmp_path)
+    printed = run(["-c", code_of("docs/library.md", "SubdivideAndUntangle")], tmp_path)
     assert "iterations in" in printed
     assert etsplat.TriangleMesh.load(tmp_path / "owl.glb").count > 1280
 

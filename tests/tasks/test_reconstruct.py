@@ -144,7 +144,7 @@ def test_a_killed_run_resumes_to_the_same_bits(
 def test_ctrl_c_leaves_a_checkpoint_to_resume_from(
     pebble: MeshFile, whole_run: ReconstructResult, tmp_path: Path
 ) -> None:
-    """Interrupted at iteration 15, the run keeps a checkpoint of 16 and ends with the whole run's bits."""
+    """Interrupted at iteration 15, the run keeps a checkpoint of it and ends with the whole run's bits."""
 
     def press(event: Event) -> None:
         if isinstance(event, StepEvent) and event.iteration == 15:
@@ -152,10 +152,10 @@ def test_ctrl_c_leaves_a_checkpoint_to_resume_from(
 
     with pytest.raises(KeyboardInterrupt):
         reconstruct(pebble, tmp_path, SHORT, callbacks=[press])
-    assert (tmp_path / "checkpoints" / "step_000016.safetensors").exists()
+    assert (tmp_path / "checkpoints" / "step_000015.safetensors").exists()
     events: list[Event] = []
     reconstruct(pebble, tmp_path, SHORT, callbacks=[events.append], resume=True)
-    assert min(event.iteration for event in events if not isinstance(event, PrepareEvent)) > 16
+    assert min(event.iteration for event in events if not isinstance(event, PrepareEvent)) > 15
     assert untimed(tmp_path) == untimed(whole_run.path)
 
 

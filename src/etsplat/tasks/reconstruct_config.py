@@ -246,8 +246,8 @@ class ReconstructConfig(Settings):
     iterations: Annotated[int, Range(1)] = 30_000
     """Optimization steps; of more than 5,000, fewer where photos carry fewer faces (`pixels_per_face`)."""
     resolution: Annotated[int, Range(1, 8192)] = 1024
-    """Side of the pictures taken of a mesh, in pixels; wider images of a scene, or close-ups of an object that is small
-    in them, are scaled down to this width."""
+    """Side of the pictures taken of a mesh, in pixels; wider images of a scene are scaled down to this width.
+    So are close-ups, to which photos are cropped in which the object is small."""
     max_faces: Annotated[int, Range(1)] = 100_000
     """Subdivision stops here, or earlier where photos are small."""
     pixels_per_face: Annotated[float | None, Range(0.01), Rare] = 3.5
