@@ -14,7 +14,7 @@ needs it.
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int64
-from scipy.ndimage import distance_transform_edt, label
+from scipy.ndimage import distance_transform_edt, label, maximum, maximum_position
 from torch import Tensor
 
 from etsplat.data.agreement import COMPARED, Photo, first_hits, photos_of, pixel_size, seen_by, surface_agreement
@@ -190,13 +190,9 @@ def _holes(photo: Photo) -> list[Float[Tensor, "2"]]:
     piece = np.zeros(around.shape, dtype=np.int32)
     label(around, output=piece)
     depth = np.asarray(distance_transform_edt(around)) * (piece != piece[0, 0])
-    found = []
-    for number in range(1, int(piece.max()) + 1):
-        inside = depth * (piece == number)
-        if inside.max() > _SHOWN:
-            row, column = np.unravel_index(inside.argmax(), inside.shape)
-            found.append(torch.tensor([column - 0.5, row - 0.5]))
-    return found
+    numbers = np.arange(1, int(piece.max()) + 1)
+    middles = zip(maximum(depth, piece, numbers), maximum_position(depth, piece, numbers), strict=True)
+    return [torch.tensor([column - 0.5, row - 0.5]) for deepest, (row, column) in middles if deepest > _SHOWN]
 
 
 def _regions(faces: Tensor, low: Bool[Tensor, " F"]) -> list[Bool[Tensor, " F"]]:
