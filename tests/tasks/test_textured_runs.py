@@ -53,7 +53,7 @@ def test_a_run_ends_with_the_file_that_export_writes(ball: Path, tmp_path: Path)
     found = TexturedMesh.load(run.textured_path)
     assert found.count == result.metrics["textured_faces"] <= 200
     assert found.texture.shape == (64, 64, 3)
-    assert result.metrics["psnr_textured"] > result.metrics["psnr_mesh"] - 2
+    assert result.metrics["psnr_textured"] > result.metrics["psnr_mesh"] + 5
     stages = [event for event in events if isinstance(event, StageEvent)]
     assert {event.name for event in stages} == {"Simplifying", "Unwrapping", "Fitting the texture"}
     assert (stages[-1].done, stages[-1].total) == (96, 96)

@@ -59,7 +59,7 @@ def test_it_shows_what_the_photos_show_with_few_faces(scene: SCENE, light: Textu
     assert light.count <= FACES
     assert light.texture.shape == (SIZE, SIZE, 3)
     assert MeshTopology.from_faces(light.faces, len(light.vertices)).is_closed()
-    assert quality(light, scene[1]) > 24
+    assert quality(light, scene[1]) > 32
 
 
 def test_colours_come_from_the_photos(scene: SCENE, light: TexturedMesh) -> None:
@@ -161,7 +161,7 @@ def test_a_coarser_level_shows_the_same_from_farther_away(scene: SCENE, light: T
     assert far.count <= light.count // 4
     assert far.texture.shape == (SIZE // 2, SIZE // 2, 3)
     assert MeshTopology.from_faces(far.faces, len(far.vertices)).is_closed()
-    assert quality(far, scene[1]) > quality(light, scene[1]) - 9
+    assert quality(far, scene[1]) > 25
     again = coarser(light, light.count // 4, SIZE // 2)
     assert torch.equal(far.texture, again.texture)
 
