@@ -158,7 +158,7 @@ def test_wrong_arguments_are_named(rng):
     with pytest.raises(ValueError, match="mask"):
         photometric_loss(color, target, 0.2, torch.ones(1, 9, 8))
     with pytest.raises(ValueError, match="backgrounds"):
-        photometric_loss(color, target, 0.2, backgrounds=torch.ones(3))
+        photometric_loss(color, target, 0.2, backgrounds=torch.ones(4))
     for weight, message in ((1.2, "from 0 to 1, got 1.2"), ("x", "a number, got 'x'"), (float("nan"), "from 0 to 1")):
         with pytest.raises(ValueError, match=f"dssim_weight must be {message}"):
             photometric_loss(color, target, weight)

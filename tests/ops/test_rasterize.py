@@ -218,3 +218,9 @@ def test_numbers_in_the_place_of_tensors_are_named(changes, message):
     look = {"opacities": torch.ones(1), "sigma": 0.5, "face_colors": torch.ones(1, 3)}
     with pytest.raises(ValueError, match=message):
         etsplat.rasterize(torch.eye(3)[None], **{**look, **changes}, cameras=etsplat.orbit_cameras(8, 8, azimuths=1))
+
+
+@pytest.mark.parametrize(("name", "value"), [("x_max", "1"), ("alpha_min", None), ("alpha_max", True)])
+def test_a_cutoff_that_is_no_number_is_named(name, value, rng):
+    with pytest.raises(ValueError, match=rf"cutoffs\.{name} must be a number, got {value!r}"):
+        rasterize(**soup(rng, 5), cutoffs=Cutoffs(**{name: value}))

@@ -11,9 +11,10 @@ from torch import Tensor
 
 from etsplat.core.cameras import Cameras
 from etsplat.core.rasterization import Rasterization
-from etsplat.core.validation import check_place
+from etsplat.core.validation import check_place, check_shape
 
 Depth = Literal["plane", "centroid"]
+Backgrounds = Float[Tensor, "3"] | Float[Tensor, "B 3"]
 A = TypeVar("A", bound="Appearance")
 
 
@@ -101,11 +102,11 @@ class Model(Protocol):
         self,
         cameras: Cameras,
         *,
-        backgrounds: Float[Tensor, "B 3"] | None = None,
+        backgrounds: Backgrounds | None = None,
         outputs: tuple[str, ...] = ("color",),
         depth_of: Depth = "plane",
     ) -> Rasterization:
-        """Pictures of B cameras, differentiable; `outputs` and `depth_of` as in `etsplat.rasterize`."""
+        """Pictures of B cameras, differentiable; all else as in `etsplat.rasterize`."""
         ...
 
     def render_opaque(self, cameras: Cameras, *, supersampling: int = 4) -> Float[Tensor, "B H W 4"]:
@@ -121,14 +122,41 @@ class Model(Protocol):
         ...
 
     def state(self) -> dict[str, Tensor]:
-        """Every tensor that the model consists of, detached, by name, for a checkpoint."""
+        """Every tensor that the model consists of, detached, by name, for a checkpoint.
+
+        They share memory with the model: what is kept while it learns is to be cloned.
+        """
         return {name: parameter.detach() for name, parameter in self.parameters().items()}
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """Takes these tensors in the place of its own, onto its device; those not named stay."""
+        """Takes these tensors, not copies, in the place of its own, onto its device; those not named stay.
+
+        An optimizer of one's own knows the tensors before, and is to be made anew.
+
+        Raises:
+            ValueError: a name that the model does not have, or a tensor that does not fit it or the others; nothing is
+                changed then.
+        """
+        self._check_state(state)
         for name, old in self.parameters().items():
             if name in state:
                 setattr(self, name, state[name].to(old.device).requires_grad_(old.requires_grad))
+
+    def _rows(self, state: Mapping[str, Tensor]) -> Mapping[str, int]:
+        """How many rows each tensor has to have once this state is loaded, of those that depend on each other."""
+        return {}
+
+    def _check_state(self, state: Mapping[str, Tensor]) -> None:
+        own = self.state()
+        if unknown := sorted(set(state) - set(own)):
+            raise ValueError(f"state must name some of {', '.join(own)}, got {', '.join(unknown)}")
+        for name, given in state.items():
+            check_shape(f"state[{name}]", given, ("rows", *own[name].shape[1:]) if own[name].ndim else ())
+            if given.dtype != own[name].dtype and own[name].is_floating_point():
+                raise ValueError(f"state[{name}] must be {own[name].dtype} as the model, got {given.dtype}")
+        for name, rows in self._rows(state).items():
+            if (got := len(state.get(name, own[name]))) != rows:
+                raise ValueError(f"state[{name}] must have {rows} rows beside the others, got {got}: load all together")
 
     def to(self: M, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> M:
         """The same on another device or in another precision, in leaf tensors of its own.

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from etsplat.core.cameras import Cameras
 from etsplat.core.rasterization import Rasterization, TriangleStatistics
-from etsplat.model.model import Depth
+from etsplat.model.model import Backgrounds, Depth
 from etsplat.model.triangle_soup import Drawn, TriangleSoup
 
 
@@ -56,7 +56,7 @@ class SurroundedSoup(TriangleSoup):
         self,
         cameras: Cameras,
         *,
-        backgrounds: Float[Tensor, "B 3"] | None = None,
+        backgrounds: Backgrounds | None = None,
         outputs: tuple[str, ...] = ("color",),
         depth_of: Depth = "plane",
     ) -> Rasterization:

@@ -22,7 +22,7 @@ from etsplat.io.opaque_files import TexturedFile, load_textured, save_textured
 from etsplat.io.paths import given_path, kind_of
 from etsplat.io.textures import NormalMap, Texture
 from etsplat.io.writers import Compression, PictureKind
-from etsplat.model.model import Appearance, Depth, Model
+from etsplat.model.model import Appearance, Backgrounds, Depth, Model
 from etsplat.ops.antialias import rasterize_antialiased
 from etsplat.ops.rasterize_opaque import rasterize_opaque
 from etsplat.ops.texture import texture_at_pixels
@@ -184,7 +184,7 @@ class TexturedMesh(Model):
         self,
         cameras: Cameras,
         *,
-        backgrounds: Float[Tensor, "B 3"] | None = None,
+        backgrounds: Backgrounds | None = None,
         outputs: tuple[str, ...] = ("color",),
         depth_of: Depth = "plane",
     ) -> Rasterization:
@@ -192,7 +192,7 @@ class TexturedMesh(Model):
 
         Args:
             cameras: B cameras.
-            backgrounds: (B, 3); None is black.
+            backgrounds: (3,) behind all views, or (B, 3); None is black.
             outputs: colour alone.
             depth_of: has no effect.
 
@@ -244,11 +244,18 @@ class TexturedMesh(Model):
         """Parameters, faces and where these lie in the texture, detached, by name."""
         return {**super().state(), "faces": self.faces, "face_uvs": self.face_uvs}
 
+    def _rows(self, state: Mapping[str, Tensor]) -> Mapping[str, int]:
+        fixed = {} if "faces" in state else {"vertices": len(self.vertices)}
+        return {"face_uvs": len(state.get("faces", self.faces)), **fixed}
+
     def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """Takes these tensors in the place of its own, onto its device; those not named stay."""
+        """As of any `Model`."""
+        topology, faces = self.topology, state.get("faces")
+        if faces is not None:
+            count = len(state.get("vertices", self.vertices))
+            topology = MeshTopology.from_faces(faces.to(self.vertices.device), count)
         super().load_state(state)
-        if "faces" in state:
-            self.topology = MeshTopology.from_faces(state["faces"].to(self.vertices.device), len(self.vertices))
+        self.topology = topology
         if "face_uvs" in state:
             self.face_uvs = state["face_uvs"].to(self.vertices.device)
 

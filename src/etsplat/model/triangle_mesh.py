@@ -26,7 +26,7 @@ from etsplat.core.validation import (
 from etsplat.data.dataset import Normalization
 from etsplat.geometry.topology import MeshTopology
 from etsplat.io.mesh_files import MeshFile, load_mesh, save_mesh, weld_vertices
-from etsplat.model.model import Appearance, Depth, Model
+from etsplat.model.model import Appearance, Backgrounds, Depth, Model
 from etsplat.model.start_colors import start_colors
 from etsplat.ops.antialias import rasterize_antialiased
 from etsplat.ops.rasterize import rasterize
@@ -206,7 +206,7 @@ class TriangleMesh(Model):
         self,
         cameras: Cameras,
         *,
-        backgrounds: Float[Tensor, "B 3"] | None = None,
+        backgrounds: Backgrounds | None = None,
         outputs: tuple[str, ...] = ("color",),
         depth_of: Depth = "plane",
     ) -> Rasterization:
@@ -214,7 +214,7 @@ class TriangleMesh(Model):
 
         Args:
             cameras: B cameras.
-            backgrounds: (B, 3); None is black.
+            backgrounds: (3,) behind all views, or (B, 3); None is black.
             outputs: as in `etsplat.rasterize`; of opaque triangles there is colour alone.
             depth_of: as there.
 
@@ -289,10 +289,19 @@ class TriangleMesh(Model):
         return {**super().state(), "faces": self.faces}
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """Takes these tensors in the place of its own, onto its device; those not named stay."""
+        """As of any `Model`."""
+        topology, faces = self.topology, state.get("faces")
+        if faces is not None:
+            count = len(state.get("vertices", self.vertices))
+            topology = MeshTopology.from_faces(faces.to(self.vertices.device), count)
         super().load_state(state)
-        if "faces" in state:
-            self.topology = MeshTopology.from_faces(state["faces"].to(self.vertices.device), len(self.vertices))
+        self.topology = topology
+
+    def _rows(self, state: Mapping[str, Tensor]) -> Mapping[str, int]:
+        vertices = len(state.get("vertices", self.vertices) if "faces" in state else self.vertices)
+        faces = len(state.get("faces", self.faces))
+        apart = [name for name, parameter in self.parameters().items() if parameter.ndim]
+        return {name: vertices if name in self.vertex_parameters else faces for name in apart}
 
     @property
     def vertex_parameters(self) -> tuple[str, ...]:

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 from safetensors import SafetensorError
 from torch import Tensor
 
+from etsplat.core.backgrounds import for_each_view
 from etsplat.core.cameras import Cameras, check_cameras
 from etsplat.core.errors import InputError
 from etsplat.core.harmonics import MAX_DEGREE, SH_CONSTANT
@@ -19,7 +20,7 @@ from etsplat.core.validation import check_above, check_count, check_floating, ch
 from etsplat.io.kernel_files import adopt_kernel, kernel_tensors
 from etsplat.io.paths import given_path, kind_of
 from etsplat.io.tensors import read_tensors, save_tensors
-from etsplat.model.model import Depth, Model
+from etsplat.model.model import Backgrounds, Depth, Model
 from etsplat.model.soup_appearance import OPAQUE_FROM, SMALLEST_INRADIUS, SoupAppearance
 from etsplat.model.start_colors import start_colors
 from etsplat.ops.rasterize import rasterize
@@ -238,7 +239,7 @@ class TriangleSoup(Model):
         self,
         cameras: Cameras,
         *,
-        backgrounds: Float[Tensor, "B 3"] | None = None,
+        backgrounds: Backgrounds | None = None,
         outputs: tuple[str, ...] = ("color",),
         depth_of: Depth = "plane",
     ) -> Rasterization:
@@ -246,7 +247,7 @@ class TriangleSoup(Model):
 
         Args:
             cameras: B cameras.
-            backgrounds: (B, 3); None is black.
+            backgrounds: (3,) behind all views, or (B, 3); None is black.
             outputs: as in `etsplat.rasterize`.
             depth_of: as there.
 
@@ -257,8 +258,9 @@ class TriangleSoup(Model):
         look = self.appearance
         culls = look.cull_small or look.cull_large < float("inf")
         if culls and len(cameras) > 1:  # which triangles are left out differs from view to view
-            behind = [None] * len(cameras) if backgrounds is None else backgrounds.split(1)
-            views = [(cameras[index], behind[index]) for index in range(len(cameras))]
+            if (behind := for_each_view(backgrounds, len(cameras))) is not None:
+                check_shape("backgrounds", behind, (3,), (len(cameras), 3))
+            views = [(cameras[i], None if behind is None else behind[i : i + 1]) for i in range(len(cameras))]
             return joined([self.render(v, backgrounds=b, outputs=outputs, depth_of=depth_of) for v, b in views])
         drawn = self.drawn(cameras, culls=culls)
         return rasterize(
@@ -276,6 +278,10 @@ class TriangleSoup(Model):
             freeze_inradius=look.freeze_inradius,
             validate=False,
         )
+
+    def _rows(self, state: Mapping[str, Tensor]) -> Mapping[str, int]:
+        count = len(state.get("vertices", self.vertices))
+        return {name: count for name in self.parameters() if name not in self.BESIDE}
 
     def drawn(self, cameras: Cameras, *, culls: bool) -> Drawn:
         """What is rasterized, differentiable.

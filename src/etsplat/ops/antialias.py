@@ -18,6 +18,7 @@ silhouette.
 from jaxtyping import Float
 from torch import Tensor
 
+from etsplat.core.backgrounds import for_each_view
 from etsplat.core.cameras import Cameras, view_arguments
 from etsplat.core.connectivity import HOW_CONNECTED, MeshConnectivity
 from etsplat.core.precision import as_given
@@ -44,7 +45,7 @@ def rasterize_antialiased(
     width: int | None = None,
     height: int | None = None,
     cameras: Cameras | None = None,
-    backgrounds: Float[Tensor, "B C"] | None = None,
+    backgrounds: Float[Tensor, " C"] | Float[Tensor, "B C"] | None = None,
     near_plane: float = 0.01,
     validate: bool | None = None,
 ) -> Rasterization:
@@ -66,7 +67,7 @@ def rasterize_antialiased(
         width: Image width in pixels.
         height: Image height in pixels.
         cameras: All of the four above in one.
-        backgrounds: (B, C); None is black.
+        backgrounds: (C,) behind all views, or (B, C); None is black.
         near_plane: Triangles with a vertex at this depth or nearer are dropped; > 0.
         validate: Raise on colours and backgrounds that are not finite, or beyond 1e30, whose products in the gradients
             overflow; None means on the CPU.
@@ -106,8 +107,10 @@ def rasterize_antialiased(
         check_shape(name, colors, (len(vertices) if face_colors is None else len(connectivity.faces), "C"))
     check_like(name, colors, "vertices", vertices)
     if backgrounds is None:
-        backgrounds = vertices.new_zeros(len(viewmats), colors.shape[-1])
-    check_shape("backgrounds", backgrounds, (len(viewmats), colors.shape[-1]))
+        backgrounds = vertices.new_zeros(colors.shape[-1])
+    backgrounds = for_each_view(backgrounds, len(viewmats))
+    channels = colors.shape[-1]
+    check_shape("backgrounds", backgrounds, (channels,), (len(viewmats), channels))
     check_like("backgrounds", backgrounds, "vertices", vertices)
     if validate or (validate is None and vertices.is_cpu):
         check_finite(name, colors, LARGEST_COLOR)

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from etsplat.core.backgrounds import for_each_view
 from etsplat.core.cameras import Cameras
 from etsplat.core.connectivity import MeshConnectivity
 from etsplat.core.errors import InputError
@@ -26,7 +27,7 @@ def rasterize_nvdiffrast(
     cameras: Cameras,
     face_colors: Float[Tensor, "F C"] | None = None,
     vertex_colors: Float[Tensor, "V C"] | None = None,
-    backgrounds: Float[Tensor, "B C"] | None = None,
+    backgrounds: Float[Tensor, " C"] | Float[Tensor, "B C"] | None = None,
     near_plane: float = 0.01,
 ) -> Rasterization:
     """As ``etsplat.rasterize_antialiased``, computed on the GPU; colour and alpha are on ``vertices``' device.
@@ -46,6 +47,7 @@ def rasterize_nvdiffrast(
         assert face_colors is not None
         colors = face_colors.to(device)[(seen[..., 3].long() - 1).clamp(min=0)]
     empty = seen[..., 3:] == 0
+    backgrounds = for_each_view(backgrounds, len(cameras))
     behind = colors.new_zeros(()) if backgrounds is None else backgrounds.to(device)[:, None, None, :]
     image = library.antialias(torch.where(empty, behind, colors).contiguous(), seen, clip, faces)
     return Rasterization(image.to(home), (~empty).to(home, vertices.dtype))

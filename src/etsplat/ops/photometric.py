@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from etsplat.core.backgrounds import for_each_view
 from etsplat.core.precision import as_given
 from etsplat.core.validation import check_choice, check_device, check_like, check_number, check_shape
 from etsplat.engines.choice import engine_for
@@ -25,7 +26,7 @@ def photometric_loss(
     dssim_weight: float,
     mask: Float[Tensor, "B H W"] | None = None,
     *,
-    backgrounds: Float[Tensor, "B 3"] | None = None,
+    backgrounds: Float[Tensor, "3"] | Float[Tensor, "B 3"] | None = None,
     pixel: Literal["l1", "l2"] = "l1",
 ) -> Float[Tensor, ""]:
     """Mean difference of ``color`` and ``target``, in value and in structure.
@@ -35,7 +36,7 @@ def photometric_loss(
         target: (B, H, W, 3), or (B, H, W, 4) premultiplied RGBA; bytes, or floating point in [0, 1].
         dssim_weight: l, from 0 to 1. At 0 no SSIM is computed.
         mask: (B, H, W) in [0, 1]: how much each pixel counts. None for all.
-        backgrounds: (B, 3), one colour per view, behind a target with alpha; None for black.
+        backgrounds: (3,), or (B, 3) of each view, behind a target with alpha; None for black.
         pixel: "l1" for the mean absolute difference, "l2" for the mean square.
 
     Returns:
@@ -49,6 +50,8 @@ def photometric_loss(
         >>> etsplat.photometric_loss(photo, photo + 0.25, dssim_weight=0.0)
         tensor(0.2500)
     """
+    check_shape("color", color, ("B", "H", "W", 3))
+    backgrounds = for_each_view(backgrounds, len(color))
     _check(color, target, mask, backgrounds)
     check_choice("pixel", pixel, ("l1", "l2"))
     check_number("dssim_weight", dssim_weight, 0, 1)
@@ -56,7 +59,6 @@ def photometric_loss(
 
 
 def _check(color: Tensor, target: Tensor, mask: Tensor | None, backgrounds: Tensor | None) -> None:
-    check_shape("color", color, ("B", "H", "W", 3))
     check_shape("target", target, (*color.shape[:3], 3), (*color.shape[:3], 4))
     if color.numel() == 0:
         raise ValueError(f"color must hold at least one pixel, got shape {tuple(color.shape)}")
@@ -70,7 +72,7 @@ def _check(color: Tensor, target: Tensor, mask: Tensor | None, backgrounds: Tens
         check_like("mask", mask, "color", color)
         constants["mask"] = mask
     if backgrounds is not None:
-        check_shape("backgrounds", backgrounds, (color.shape[0], 3))
+        check_shape("backgrounds", backgrounds, (3,), (color.shape[0], 3))
         check_like("backgrounds", backgrounds, "color", color)
         constants["backgrounds"] = backgrounds
     for name, constant in constants.items():

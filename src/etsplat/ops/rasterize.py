@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from etsplat.core.backgrounds import for_each_view
 from etsplat.core.cameras import Cameras, view_arguments
 from etsplat.core.kernels import DISTANCES, KERNELS, kernel_name
 from etsplat.core.precision import as_given
@@ -36,6 +37,7 @@ from etsplat.core.validation import (
     check_intrinsics,
     check_kind,
     check_like,
+    check_number,
     check_positive,
     check_shape,
 )
@@ -52,7 +54,7 @@ _SHAPES: dict[str, tuple[Shape, ...]] = {
     "face_colors": (("N", "C"), ("B", "N", "C")),
     "vertex_colors": (("V", "C"),),
     "corner_colors": (("N", 3, "C"),),
-    "backgrounds": (("B", "C"),),
+    "backgrounds": (("C",), ("B", "C")),
 }
 LARGEST_COLOR = 1e30  # beyond, the gradients of the triangles around overflow
 
@@ -72,7 +74,7 @@ def rasterize(
     height: int | None = None,
     cameras: Cameras | None = None,
     faces: Int[Tensor, "N 3"] | None = None,
-    backgrounds: Float[Tensor, "B C"] | None = None,
+    backgrounds: Float[Tensor, " C"] | Float[Tensor, "B C"] | None = None,
     kernel: str = "elastic",
     distance: str = "barycentric",
     outputs: Sequence[str] = ("color",),
@@ -104,7 +106,7 @@ def rasterize(
         height: Image height in pixels.
         cameras: All of the four above in one.
         faces: (N, 3) int32 or int64 indices into ``vertices``.
-        backgrounds: (B, C); None is black.
+        backgrounds: (C,) behind all views, or (B, C); None is black.
         kernel: "elastic", "bilateral", "single_sided", "hard", or a name given to ``register_kernel``.
         distance: "barycentric" (about the mean of the projected vertices) or "sdf" (about the incentre).
         outputs: What is wanted besides colour and alpha, which are always there: "depth", "median_depth", "normal",
@@ -160,7 +162,7 @@ def rasterize(
         face_colors=face_colors,
         vertex_colors=vertex_colors,
         corner_colors=corner_colors,
-        backgrounds=backgrounds,
+        backgrounds=for_each_view(backgrounds, len(viewmats)),
     )
     # Looking at values on a GPU would mean to wait for it.
     look = validate or (validate is None and vertices.is_cpu)
@@ -218,6 +220,8 @@ def _check_settings(settings: RasterizeSettings) -> None:
         check_choice("outputs", name, OUTPUTS)
     check_above("near_plane", settings.near_plane)
     check_kind("cutoffs", settings.cutoffs, Cutoffs, "pass etsplat.Cutoffs(), with what is to differ")
+    for name, number in settings.cutoffs._asdict().items():
+        check_number(f"cutoffs.{name}", number)
     alpha_min, alpha_max, x_max, transmittance_min = settings.cutoffs
     if not (0.0 <= alpha_min < alpha_max <= 1.0 and x_max > 0.0 and 0.0 <= transmittance_min < 1.0):
         raise ValueError(
