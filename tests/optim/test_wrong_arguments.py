@@ -48,13 +48,38 @@ WRONG = "must return a scalar tensor of the model's dtype and device, got"
     ("value", "got"),
     [
         (lambda drawing: 0.5, r"0\.5"),
-        (lambda drawing: drawing.rendering.color, r"a tensor of shape \(1, 16, 16, 3\)"),
+        (lambda drawing: drawing.model.vertices, r"a tensor of shape \(42, 3\)"),
         (lambda drawing: drawing.model.vertices.mean().double(), r"torch\.float64 on cpu, where photometric has"),
     ],
 )
 def test_a_term_that_returns_something_else_is_named(value: Callable[[etsplat.Drawing], Any], got: str) -> None:
     with pytest.raises(ValueError, match=rf"terms\[1\] of the objective, Custom, {WRONG} {got}"):
         a_trainer(terms=(etsplat.EdgeLength(0.1), custom(value))).fit(1)
+
+
+@pytest.mark.parametrize("name", ["rendering", "photo", "camera", "index"])
+def test_a_term_without_outputs_is_given_no_picture(name: str) -> None:
+    """On some ways of making a step it saw the first view, and on others ended in torch."""
+    looks = custom(lambda drawing: getattr(drawing, name) * 0.0)
+    with pytest.raises(ValueError, match=rf"terms\[1\] .*, Custom, looks at drawing\.{name}; without outputs .*\("):
+        a_trainer(terms=(etsplat.EdgeLength(0.1), looks)).fit(1)
+    with pytest.raises(ValueError, match=rf"terms\[0\] .*, Custom, looks at drawing\.{name}"):
+        etsplat.Objective(etsplat.Photometric(), [looks]).of_parameters(a_mesh(), (0.5,), 1.0)
+
+
+@pytest.mark.parametrize("outputs", ["normal", ("color", "normal")])
+def test_a_term_that_names_too_few_outputs_is_told_of_the_others(outputs: Any) -> None:
+    flat = custom(lambda drawing: drawing.rendering.depth.mean(), outputs=outputs)
+    with pytest.raises(
+        ValueError, match=r"terms\[0\] .* 'mean'\. Its outputs are .*; drawing\.rendering has no depth, "
+    ):
+        a_trainer(terms=(flat,)).fit(1)
+
+
+def test_mistakes_of_a_term_stay_what_they_are() -> None:
+    for looks in (lambda drawing: drawing.vertexes, lambda drawing: drawing.model.vertexes):
+        with pytest.raises(AttributeError, match="vertexes"):
+            a_trainer(terms=(custom(looks, outputs="color"),)).fit(1)
 
 
 def test_a_photometric_term_that_returns_something_else_is_named() -> None:

@@ -60,15 +60,27 @@ class Drawing:
     depth: Float[Tensor, "1 H W"] | None = None
 
 
+class _NotGivenError(AttributeError):
+    """What a term looks at, and is not given."""
+
+
 @dataclass(frozen=True)
 class OfParameters:
     """What terms look at that depend on the parameters alone.
 
     Attributes:
         model: as it is now.
+        shared: what one term has computed for others, by its name.
     """
 
     model: Any
+    shared: dict[Hashable, Any] = field(default_factory=dict)
+
+    def __getattr__(self, name: str) -> Any:
+        raise _NotGivenError(
+            f"looks at drawing.{name}; without outputs it is given drawing.model alone, and counts once for all views "
+            'of a step: name what it looks at, as etsplat.Custom(function, outputs=("color",))'
+        )
 
 
 class Term(ABC):
@@ -111,7 +123,7 @@ class Term(ABC):
 
 
 class Custom(Term):
-    """A term of one's own from a function of the drawing.
+    """A term of one's own from a function of the drawing; without `outputs`, of `drawing.model` alone.
 
     Example:
         >>> def flat(drawing):
@@ -210,7 +222,7 @@ class Objective:
         Raises:
             ValueError: a term is no scalar tensor of the model's dtype and device.
         """
-        first = _value_of("photometric", self.photometric, drawing)
+        first, alone = _value_of("photometric", self.photometric, drawing), OfParameters(drawing.model, drawing.shared)
         if views > 1:
             first = first / views
         if not isinstance(scale, Tensor) and scale == 0.0:
@@ -220,7 +232,7 @@ class Objective:
             if weight and (whole or term.outputs):
                 elsewhere = (apart and not term.outputs) or (decayed and term.squares is not None)
                 with torch.set_grad_enabled(torch.is_grad_enabled() and not elsewhere):
-                    value = _value_of(f"terms[{number}]", term, drawing, first)
+                    value = _value_of(f"terms[{number}]", term, drawing if term.outputs else alone, first)
                 summands.append(Summand(weight / views if term.outputs else weight, value, term.power))
         return weighted_sum(first, summands, scale)
 
@@ -268,21 +280,32 @@ class Objective:
         alone = [(number, term, weight) for number, term, weight in here if weight and not term.outputs]
         if not alone or scale == 0.0:
             return None
-        drawing: Any = OfParameters(model)
+        drawing = OfParameters(model)
         summands = [
             Summand(weight, _value_of(f"terms[{number}]", term, drawing), term.power) for number, term, weight in alone
         ]
         return weighted_sum(torch.zeros_like(summands[0].value), summands, scale)
 
 
-def _value_of(name: str, term: Term, drawing: Drawing, like: Tensor | None = None) -> Float[Tensor, ""]:
+def _value_of(name: str, term: Term, drawing: Any, like: Tensor | None = None) -> Float[Tensor, ""]:
     """What a term returns. ValueError where that is no scalar tensor, or one unlike the others."""
-    value = term(drawing)
+    who = f"{name} of the objective, {type(term).__name__},"
+    try:
+        value = term(drawing)
+    except _NotGivenError as error:
+        raise ValueError(f"{who} {error}") from None
+    except (AttributeError, TypeError) as error:
+        if not isinstance(drawing, Drawing) or "NoneType" not in str(error):
+            raise
+        lacking = [output for output in OUTPUTS if getattr(drawing.rendering, output, None) is None]
+        raise ValueError(
+            f"{who} ended with: {error}. Its outputs are {term.outputs}; drawing.rendering has no "
+            f"{', '.join(lacking)} where they do not name these"
+        ) from error
     if isinstance(value, Tensor) and value.ndim == 0:
         if like is None or (value.dtype == like.dtype and value.device == like.device):
             return value
         got = f"{value.dtype} on {value.device}, where photometric has {like.dtype} on {like.device}"
     else:
         got = shown(value)
-    who = f"{name} of the objective, {type(term).__name__},"
     raise ValueError(f"{who} must return a scalar tensor of the model's dtype and device, got {got}")
