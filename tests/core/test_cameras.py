@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+import etsplat
 from etsplat import Cameras, intrinsics, look_at, orbit_cameras, sphere_grid
 
 UP = torch.tensor([0.0, 1.0, 0.0])
@@ -213,3 +214,19 @@ def test_sizes_are_ints_whatever_they_were_given_as(cameras):
 def test_what_cannot_be_stacked_or_placed_is_named(odd, text):
     with pytest.raises(ValueError, match=text):
         odd()
+
+
+def test_an_image_that_no_memory_holds_is_refused(cameras):
+    """By 2^18 x 2^18 pixels it ended in a MemoryError of native code, or in torch's words."""
+    with pytest.raises(ValueError, match=r"at most 2147483648 pixels together, got 262144 x 262144: draw it in parts"):
+        Cameras(cameras.viewmats, cameras.Ks, 1 << 18, 1 << 18)
+    assert Cameras(cameras.viewmats, cameras.Ks, 1 << 26, 1 << 5).width == 1 << 26
+
+
+def test_a_list_of_cameras_is_told_how_to_become_one(cameras):
+    """As `Dataset.cameras[:3]` is."""
+    mesh = etsplat.TriangleMesh.from_mesh(*etsplat.icosphere(0), colors=0.5, opacity=0.9, sigma=0.3)
+    with pytest.raises(ValueError, match=r"got list of them: pass etsplat\.Cameras\.stacked\(cameras\)"):
+        mesh.render([cameras[0], cameras[1]])
+    with pytest.raises(ValueError, match=r"got list: make them by etsplat\.Cameras\("):
+        mesh.render([])

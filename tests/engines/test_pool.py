@@ -7,6 +7,7 @@ import sys
 import pytest
 
 import etsplat
+from etsplat.engines.native.pool import empty_image, zeros_image
 
 DRAWING = """
 import os, signal, threading, time, torch
@@ -65,3 +66,9 @@ def test_the_interpreter_ends_while_threads_draw():
     """Before Python 3.14 it ends threads that come back to it, in the middle of C++ that may not be left so."""
     done = run(DRAWING + "time.sleep(0.1)")
     assert done.returncode == 0, done.stderr
+
+
+def test_images_for_which_there_is_no_room_say_how_much_they_want() -> None:
+    for make in (empty_image, zeros_image):
+        with pytest.raises(MemoryError, match=r"no room for an image of shape \(4194304, 4194304, 4\), 281,475 GB"):
+            make(1 << 22, 1 << 22, 4)

@@ -12,7 +12,7 @@ from etsplat.core.errors import InputError
 from etsplat.geometry.icosphere import icosphere
 from etsplat.io import _mesh_readers
 from etsplat.io.georeference import Georeference
-from etsplat.io.mesh_files import load_mesh, save_mesh, save_triangles, weld_vertices
+from etsplat.io.mesh_files import MeshFile, load_mesh, save_mesh, save_triangles, weld_vertices
 from etsplat.io.srgb import linear_from_srgb, srgb_from_linear
 
 PLY_HEADER = (
@@ -421,3 +421,13 @@ def test_a_mesh_that_32_bits_cannot_hold_is_refused_with_the_reason(tmp_path, ba
     assert len(load_mesh(tmp_path / "large.ply").faces) == len(faces)
     (tmp_path / "stray.obj").write_text(f"{TRIANGLE}v 1e9 0.1 0\nf 1 2 3\n")
     assert len(load_mesh(tmp_path / "stray.obj").faces) == 1
+
+
+@pytest.mark.parametrize("name", ["vertices", "faces", "face_colors", "vertex_colors"])
+def test_a_mesh_of_arrays_says_how_to_make_tensors(name):
+    """It was noticed somewhere later, in words of torch."""
+    vertices, faces = icosphere(0)
+    arrays = {"vertices": vertices, "faces": faces, "face_colors": torch.ones(20, 3), "vertex_colors": None}
+    arrays[name] = np.ones((12, 3))
+    with pytest.raises(ValueError, match=rf"{name} must be a tensor, got ndarray: pass torch\.from_numpy\({name}\)"):
+        MeshFile(**arrays)

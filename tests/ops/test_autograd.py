@@ -126,6 +126,18 @@ def test_gradients_of_gradients_are_refused_by_native_engines(name, rng):
             way()
 
 
+@pytest.mark.parametrize(
+    ("name", "by"), [*((name, "cpu") for name in CASES if name not in OF_TORCH), ("rasterize", "reference")]
+)
+def test_derivatives_in_forward_mode_are_refused(name, by, rng):
+    """It was in words of torch, which said to write a function anew."""
+    values, outputs = _grown(name, by, rng)
+    with torch.autograd.forward_ad.dual_level():
+        duals = [torch.autograd.forward_ad.make_dual(value.detach(), torch.ones_like(value)) for value in values]
+        with pytest.raises(RuntimeError, match=r"no derivatives in forward mode .*: take backward\(\)"):
+            outputs(*duals)
+
+
 @EVERY_OPERATION
 def test_autocast_changes_nothing(name, engine, rng, monkeypatch):
     """Operations compute in the precision of their arguments, also where autocast is on."""

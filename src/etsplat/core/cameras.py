@@ -25,6 +25,9 @@ from etsplat.core.validation import (
 MAX_SIDE = 1 << 26
 """Pixels of the width or height of an image: with 16 samples in each they can still be numbered in 32 bits."""
 
+MAX_PIXELS = 1 << 31
+"""Of one image: a colour and alpha of each take 34 GB."""
+
 
 @dataclass(frozen=True, eq=False)
 class Cameras:
@@ -37,7 +40,8 @@ class Cameras:
         height: Image height in pixels.
 
     Raises:
-        ValueError: A wrong shape or dtype, or a width or height that is no whole number from 1 to 2^26.
+        ValueError: A wrong shape or dtype, a width or height that is no whole number from 1 to 2^26, or more than 2^31
+            pixels.
 
     Example:
         >>> around = etsplat.orbit_cameras(64, 48, elevations=(0.0, 30.0), azimuths=4)
@@ -128,8 +132,14 @@ class Cameras:
 
 
 def check_size(width: object, height: object) -> tuple[int, int]:
-    """Both as ints; ValueError unless they are whole numbers of pixels, from 1 to `MAX_SIDE`."""
-    return check_count("width", width, most=MAX_SIDE), check_count("height", height, most=MAX_SIDE)
+    """Both as ints; ValueError unless they are whole numbers, from 1 to `MAX_SIDE`, of no more than `MAX_PIXELS`."""
+    columns, rows = check_count("width", width, most=MAX_SIDE), check_count("height", height, most=MAX_SIDE)
+    if columns * rows > MAX_PIXELS:
+        raise ValueError(
+            f"width and height must be of at most {MAX_PIXELS} pixels together, got {columns} x {rows}: draw it in "
+            "parts, each with its principal point, cx and cy of Ks, moved by where it begins"
+        )
+    return columns, rows
 
 
 def check_cameras(cameras: object, like_name: str, like: Tensor) -> None:
@@ -150,6 +160,8 @@ def camera_centers(viewmats: Float[Tensor, "B 4 4"]) -> Float[Tensor, "B 3"]:
 
 def _made(cameras: object) -> str:
     """What is no `Cameras`, and how these are made."""
+    if isinstance(cameras, list | tuple) and any(isinstance(camera, Cameras) for camera in cameras):
+        return f"{type(cameras).__name__} of them: pass etsplat.Cameras.stacked(cameras), or one after the other"
     return f"{type(cameras).__name__}: make them by etsplat.Cameras(viewmats, Ks, width, height)"
 
 

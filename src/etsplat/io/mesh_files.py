@@ -48,6 +48,9 @@ class MeshFile:
             what of its textures is left out.
         texture: pictures over the faces (OBJ with MTL, glTF), or None.
 
+    Raises:
+        ValueError: one of them is no tensor: `torch.from_numpy` makes one of an array.
+
     Example:
         >>> vertices, faces = etsplat.icosphere(1)
         >>> mesh = etsplat.MeshFile(vertices, faces, face_colors=torch.ones(len(faces), 3))
@@ -62,6 +65,11 @@ class MeshFile:
     vertex_colors: Float[Tensor, "V 3"] | None = None
     notes: tuple[str, ...] = ()
     texture: Texture | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("vertices", "faces", "face_colors", "vertex_colors"):
+            if (array := getattr(self, name)) is not None:
+                check_memory(name, array)
 
     def check(self) -> None:
         """Raises ValueError, naming the array, unless they are tensors of these shapes, finite, with faces in range."""

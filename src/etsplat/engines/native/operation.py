@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from etsplat.core.forward_mode import refuse_forward_mode
 from etsplat.core.validation import check_native, dense
 
 
@@ -41,6 +42,8 @@ class _Native(torch.autograd.Function):
                 'engine("reference"): with etsplat.engine("reference"): ...'
             )
         return _backward(ctx, *cotangents)
+
+    jvp = staticmethod(refuse_forward_mode)
 
 
 def _backward(ctx: Any, *cotangents: Tensor | None) -> tuple[Tensor | None, ...]:

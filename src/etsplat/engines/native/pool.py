@@ -1,5 +1,8 @@
 """Tensors from recycled memory."""
 
+import math
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
@@ -9,10 +12,12 @@ from etsplat import _native
 def empty_image(*shape: int) -> Tensor:
     """An uninitialised float32 CPU tensor, contiguous.
 
+    Raises MemoryError, which says how much was wanted, where there is no room for it.
+
     Memory new to the process costs a page fault every 4 KiB at its first write, for an image of a million pixels as
     much as rendering it. Blocks return to the pool (csrc/cpu/pool.h) when their last tensor is freed.
     """
-    return _native.empty_floats(shape=shape)
+    return _image(_native.empty_floats, shape)
 
 
 def empty(like: Tensor, *shape: int) -> Tensor:
@@ -22,7 +27,17 @@ def empty(like: Tensor, *shape: int) -> Tensor:
 
 def zeros_image(*shape: int) -> Tensor:
     """Like ``empty_image``, zeroed by the engine's threads."""
-    return _native.zero_floats(shape=shape)
+    return _image(_native.zero_floats, shape)
+
+
+def _image(make: Callable[..., Tensor], shape: tuple[int, ...]) -> Tensor:
+    try:
+        return make(shape=shape)
+    except MemoryError:
+        size = 4e-9 * math.prod(shape)
+        raise MemoryError(
+            f"no room for an image of shape {shape}, {size:,.0f} GB: draw fewer or smaller ones"
+        ) from None
 
 
 def copied_indices(indices: Tensor) -> Tensor:

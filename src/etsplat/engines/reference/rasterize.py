@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
+from etsplat.core.forward_mode import refuse_forward_mode
 from etsplat.core.kernels import KERNELS, Kernel
 from etsplat.core.rasterization import (
     DISTORTION_FAR,
@@ -313,6 +314,8 @@ class _KernelValue(torch.autograd.Function):
         x, sigma = ctx.saved_tensors
         dx, dsigma = ctx.kernel.gradient(x, sigma)
         return grad * dx, grad * dsigma, None
+
+    jvp = staticmethod(refuse_forward_mode)
 
 
 def _transmittance(alpha: Tensor) -> Tensor:

@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from etsplat.core.forward_mode import refuse_forward_mode
 from etsplat.model.model import model_for
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.ops.normal_consistency import normal_consistency
@@ -109,6 +110,8 @@ class _SquaredNorm(torch.autograd.Function):
     def backward(ctx: Any, gradient: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
         (values,) = ctx.saved_tensors
         return values * (2 * gradient)
+
+    jvp = staticmethod(refuse_forward_mode)
 
 
 class DepthNormals(Term):
