@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+import etsplat
 from etsplat.cli.parse import parse
 from etsplat.core.errors import InputError
 from etsplat.data.close_ups import object_side
@@ -25,7 +26,7 @@ from etsplat.tasks.scoring import evaluate_run
 from etsplat.tasks.sources import load_source
 from etsplat.tasks.train import train
 from etsplat.tasks.train_config import TrainConfig
-from helpers.captures import write_colmap, write_photo, write_views
+from helpers.captures import circle_poses, write_colmap, write_photo, write_views
 
 
 @pytest.fixture(scope="module")
@@ -267,3 +268,26 @@ def test_an_object_that_is_small_in_its_photos_is_read_as_large_as_one_that_fill
         near, said = load_source(given, config)
         assert isinstance(near, Dataset)
         assert (len(set(near.images.sizes)), said) == (1, notes)
+
+
+def test_another_scene_than_that_of_the_training_is_noticed(trained, tmp_path, capsys):
+    """Its numbers came to stand in the run's own report, without a word."""
+    folder, _, _ = trained
+    shutil.copytree(folder / "run", tmp_path / "run")
+    shutil.copytree(folder / "scene", tmp_path / "moved")
+    write_colmap(tmp_path / "other", [(64, 48)] * 9, poses=[pose.roll(1, 0) for pose in circle_poses(9)])
+    shutil.copytree(tmp_path / "other" / "images", tmp_path / "other" / "images_2")
+    asked = ["eval", str(tmp_path / "run"), "--scene"]
+    assert not open_run(tmp_path / "run", tmp_path / "moved").other_scene
+    with pytest.raises(InputError, match=r"other: is not the scene that .*run was trained on, .* with --out, or leave"):
+        parse([*asked, str(tmp_path / "other")]).run([])
+    assert not (tmp_path / "run" / "evaluation.json").exists()
+    parse([*asked, str(tmp_path / "other"), "--out", str(tmp_path / "measured")]).run([])
+    assert "on another scene than the run was trained on" in capsys.readouterr().out
+    assert json.loads((tmp_path / "measured" / "evaluation.json").read_text())["other_scene"] is True
+    written = etsplat.export(
+        tmp_path / "run", tmp_path / "soup.glb", etsplat.ExportConfig(min_opacity=0.01), scene=tmp_path / "other"
+    )
+    assert written.notes == (
+        "it is of another scene than the run was trained on: colours and what is seen are by its photos",
+    )

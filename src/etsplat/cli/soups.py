@@ -73,7 +73,7 @@ class Evaluate(Command):
     out: Path | None = None
     """Folder for evaluation.json and pictures side by side; by default the run's, whose report is written anew."""
     scene: Path | None = None
-    """The capture's folder, if it has moved or a file is given."""
+    """The capture's folder, if it has moved or a file is given; another one of the same place wants --out."""
     device: Device | None = None
     """Where it is drawn: cpu, cuda (an NVIDIA GPU), or None for cuda where there is one."""
     lpips_weights: Path | None = None
@@ -90,6 +90,11 @@ class Evaluate(Command):
         from etsplat.tasks.scoring import evaluate_run
 
         opened = open_run(self.run_dir, self.scene, self.device)
+        if opened.other_scene and self.out is None:
+            raise InputError(
+                f"{self.scene}: is not the scene that {self.run_dir} was trained on, by the names and poses of its "
+                "photos; name a folder for what is measured on it with --out, or leave out --scene"
+            )
         folder = RunDirectory(self.out or opened.folder)
         console = Console()
         with PhaseBar(console) as bar:
@@ -119,6 +124,8 @@ def _print(console: "Console", found: dict[str, Any]) -> None:
     console.print(table)
     if found["lpips"] is None and found["lpips_reason"]:
         console.print(f"LPIPS: {found['lpips_reason']}", soft_wrap=True)
+    if found["other_scene"]:
+        console.print("Measured on another scene than the run was trained on.", soft_wrap=True)
     threads = "1 thread" if found["threads"] == 1 else f"{found['threads']} threads"
     console.print(
         f"{found['fps']:.1f} frames/s at {found['width']}x{found['height']}, {found['ms_per_million']:.0f} ms per "

@@ -31,6 +31,7 @@ from etsplat.tasks.running import Job
 from etsplat.tasks.scene_part import ScenePart, in_frame, recolored
 from etsplat.tasks.scoring import Scorer
 from etsplat.tasks.soup_trainer import background_of
+from etsplat.tasks.sources import views_digest
 from etsplat.tasks.train_config import TrainConfig
 from etsplat.tasks.train_memory import bytes_around, bytes_of_values, check_memory, in_words, memory_of
 
@@ -139,7 +140,8 @@ def train_blocks(
     last = [] if config.sky == "none" else [(own, _of_sky(each, coarse))]
     all_runs = [(own, coarse), *((part, each) for part in parts), *last]
     steps = sum(_steps(views, settings) for views, settings in all_runs)
-    job.identify({"fingerprint": own.fingerprint(), "blocks": "x".join(map(str, shape))}, paths, steps)
+    hashes = {"fingerprint": own.fingerprint(), "blocks": "x".join(map(str, shape))}
+    job.identify(hashes, paths, steps, views=views_digest(own))
     with job.writing():
         done = _run(job, COARSE, coarse, thin.halved(), None, fit)
         runs, whole = [done.giving(done.soup)], _whole(own, done.soup, job.run.path / FOLDER / COARSE)

@@ -212,7 +212,9 @@ def _up(run: SoupRun) -> Float[Tensor, "3"] | None:
 
 
 def _without_capture(run: SoupRun, path: Path, config: ExportConfig) -> tuple[str, ...]:
-    """What is otherwise in a file because the capture has gone, and the remedy; nothing if nothing is."""
+    """What is otherwise in a file because the capture has gone or is another, and the remedy; nothing if nothing is."""
+    if run.other_scene and kind_of(path) != ".safetensors":
+        return ("it is of another scene than the run was trained on: colours and what is seen are by its photos",)
     kind = kind_of(path)
     triangles = kind not in WHOLE
     one_color = config.colors == "mean" and not isinstance(run.soup, SolidSoup) and run.soup.drawn_degree > 0

@@ -24,7 +24,7 @@ from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.tasks.demos import DEMO_SCENE
 from etsplat.tasks.refined_cameras import alignment_starts, refined_capture
 from etsplat.tasks.settings import Settings, settings_of
-from etsplat.tasks.sources import load_scene
+from etsplat.tasks.sources import load_scene, views_digest
 from etsplat.tasks.train_config import TrainConfig
 
 
@@ -41,6 +41,7 @@ class SoupRun:
         engine: that draws videos, pictures and what the viewer shows; None for the one of the soup's device.
         in_blocks: whether it was trained in blocks, of which no opaque mesh is made.
         gone: the folder of its scene, where that is not there any more.
+        other_scene: whether the capture is known to be another one than that of the training.
     """
 
     path: Path
@@ -51,6 +52,7 @@ class SoupRun:
     engine: str | None = None
     in_blocks: bool = False
     gone: str | None = None
+    other_scene: bool = False
 
     @property
     def device(self) -> torch.device:
@@ -182,5 +184,7 @@ def _open_directory(path: Path, scene: Dataset | Path | str | None, device: torc
         return replace(opened, gone=source)
     else:
         given = load_scene(source, width, paths.get("images"), paths.get("masks"), preload=False)
+    known = config.get("views")
+    opened = replace(opened, other_scene=scene is not None and known is not None and known != views_digest(given))
     capture = refined_capture(given, path)
     return replace(opened, capture=capture, test_cameras={} if capture is given else alignment_starts(given, capture))

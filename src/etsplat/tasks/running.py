@@ -178,14 +178,19 @@ class Job(Generic[C]):
         self.announce(PrepareEvent(done, total))
 
     def identify(
-        self, hashes: Mapping[str, str | None], paths: Mapping[str, str | None], iterations: int | None = None
+        self,
+        hashes: Mapping[str, str | None],
+        paths: Mapping[str, str | None],
+        iterations: int | None = None,
+        *,
+        views: str | None = None,
     ) -> None:
-        """Takes what the run is of, as `make_record` does. A run that goes on must be of the same.
+        """Takes what the run is of, as `make_record` does. A run that goes on must be of the same, by its hashes.
 
         Raises:
             InputError: the run in the folder was started with other settings or input.
         """
-        self._record = make_record(self.config, iterations or self.config.iterations, hashes, paths)
+        self._record = make_record(self.config, iterations or self.config.iterations, hashes, paths, views)
         about = {"device": device_name(self.device), "iterations": self._record["iterations"], **self._record["source"]}
         workers().agree({**about_this(), **about, **flattened(self._record["config"])})
         if self.place.resume:
@@ -334,7 +339,11 @@ def terms_of(
 
 
 def make_record(
-    config: Settings, iterations: int, hashes: Mapping[str, str | None], paths: Mapping[str, str | None]
+    config: Settings,
+    iterations: int,
+    hashes: Mapping[str, str | None],
+    paths: Mapping[str, str | None],
+    views: str | None = None,
 ) -> dict[str, Any]:
     """What config.json holds. Inputs are identified by their hashes; paths are for the reader.
 
@@ -343,6 +352,7 @@ def make_record(
         iterations: of this run, which may be fewer.
         hashes: of the input, by kind. That of a kernel from Python joins them.
         paths: where it was read from, by kind.
+        views: hash of the photos' names and poses, by which a capture is known again; None where nobody asks.
     """
     settings = config.to_dict()
     return {
@@ -351,6 +361,7 @@ def make_record(
         "iterations": iterations,
         "source": {**hashes, **kernel_digest(settings.get("method"))},
         "paths": paths,
+        **({} if views is None else {"views": views}),
         "versions": versions(),
     }
 

@@ -297,7 +297,8 @@ def evaluate_run(
         (psnr, ssim and flip); psnr_affine, after a fit of the colours to each photograph;
         psnr_aligned, of runs that refined cameras, after a fit of the pose of each;
         `views`, the same for each; fps, ms_per_frame, ms_per_million and their circumstances. null where something
-        could not be measured, `lpips_reason` says why.
+        could not be measured, `lpips_reason` says why. `other_scene` says whether the capture is known to be another
+        one than that of the training.
 
     Raises:
         InputError: no capture, no test views, weights that cannot be read, `pictures` cannot be written to.
@@ -336,7 +337,8 @@ def evaluate_run(
 
     cameras = [capture.cameras[view] for view in capture.test]
     speed = {**drawing_speed(draw, cameras, place, len(soup)), "engine": engine_for(soup.vertices).name}
-    return {**mean_scores(rows), "lpips_reason": reason, **speed, "triangles": len(soup), "views": rows}
+    about = {"triangles": len(soup), "other_scene": run.other_scene}
+    return {**mean_scores(rows), "lpips_reason": reason, **speed, **about, "views": rows}
 
 
 def mean_scores(rows: Sequence[dict[str, Any]]) -> dict[str, float | None]:

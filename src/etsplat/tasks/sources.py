@@ -274,6 +274,13 @@ def _kept(views: Dataset, config: ReconstructConfig) -> Dataset:
     return kept_aside(views, config.watch, config.refine_cameras)
 
 
+def views_digest(views: Dataset) -> str:
+    """A short hash of what photos are called and where they were taken from, whatever becomes of them in a run."""
+    places = (views.viewmats.double() * 1000).round().long()  # apart from what another machine rounds otherwise
+    text = repr((views.names, places.tolist()))
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
 def fingerprint(source: MeshFile | Dataset | None) -> str | None:
     """A short hash of everything in a source that a run depends on."""
     if source is None:

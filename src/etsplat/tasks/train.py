@@ -36,7 +36,7 @@ from etsplat.tasks.running import Job, Result, path_of, settings_for
 from etsplat.tasks.scene_part import ScenePart, keep_colors
 from etsplat.tasks.scoring import Scorer
 from etsplat.tasks.soup_trainer import background_of, start_trainer, surroundings_of_run
-from etsplat.tasks.sources import load_scene, with_cloud
+from etsplat.tasks.sources import load_scene, views_digest, with_cloud
 from etsplat.tasks.train_checks import check_train, doubtful_scale
 from etsplat.tasks.train_config import TrainConfig
 from etsplat.tasks.train_memory import bytes_around
@@ -172,7 +172,7 @@ def _fit(
     for note in (*own.notes, *check_train(own, config, iterations, job.device, around, streams=streams)):
         job.announce(NoteEvent(note))
     hashes = {"fingerprint": own.fingerprint(), **({} if part is None else {"part": part.digest()})}
-    job.identify(hashes, paths, iterations)
+    job.identify(hashes, paths, iterations, views=views_digest(own))
     if part is not None and (metrics := job.measured()) is not None:  # a block that is done
         path = job.place.path
         return TrainResult(path, metrics, job.first(lambda: TriangleSoup.load(RunDirectory(path).soup_path)))
