@@ -6,6 +6,9 @@ import pytest
 import torch
 
 import etsplat
+from etsplat.io.mesh_files import load_exported
+from etsplat.model.soup_import import open_soup
+from etsplat.tasks.export_mesh import export_mesh
 
 TINY = etsplat.ReconstructConfig.tiny().changed({"iterations": 5, "resolution": 24})
 
@@ -37,3 +40,25 @@ def test_what_meshes_do_not_know_is_refused(result: etsplat.ReconstructResult, t
         etsplat.export(result, tmp_path / "owl.glb", etsplat.ExportConfig(colors="keep"))
     with pytest.raises(etsplat.InputError, match="files of this kind are for soups"):
         etsplat.export(result, tmp_path / "owl.html")
+
+
+@pytest.mark.parametrize(
+    ("kind", "textured"), [("glb", False), ("ply", False), ("obj", False), ("glb", True), ("obj", True)]
+)
+def test_a_file_says_how_it_was_moved_and_is_led_back(
+    result: etsplat.ReconstructResult, kind: str, textured: bool, tmp_path: Path
+) -> None:
+    """It said nothing, where files of scenes do."""
+    path = tmp_path / f"owl.{kind}"
+    config = etsplat.ExportConfig(up="y", scale=3.0, place="ground", **({"texture": 64} if textured else {}))
+    export_mesh(result.path, path, config)
+    there, (back, record) = etsplat.load_mesh(path).vertices, load_exported(path)
+    assert (record["up"], record["place"]) == ("y", "ground")
+    assert float(there[:, 1].min()) == pytest.approx(0, abs=0.05)
+    low, high = result.mesh.vertices.aminmax(dim=0)
+    found_low, found_high = back.vertices.aminmax(dim=0)
+    tolerance = 0.2 if textured else 1e-5  # fewer faces
+    torch.testing.assert_close(found_low, low, atol=tolerance, rtol=0)
+    torch.testing.assert_close(found_high, high, atol=tolerance, rtol=0)
+    opened = open_soup(path).vertices.reshape(-1, 3)
+    torch.testing.assert_close(opened.aminmax(dim=0).max, found_high, atol=1e-5, rtol=0)

@@ -144,6 +144,7 @@ def save_mesh(
     world: Georeference | None = None,
     compress: Compression = "none",
     pictures: PictureKind = "png",
+    record: Mapping[str, Any] | None = None,
 ) -> None:
     """Write a triangle mesh with colours per face or per vertex, or a texture. Atomic.
 
@@ -167,6 +168,7 @@ def save_mesh(
         compress: how GLB stores arrays: "none": 32 bits; "quantize": positions, coordinates and colours of 16 bits,
             normals of 8; "meshopt": those compressed, for which pip install 'etsplat[compress]' is needed.
         pictures: how GLB stores the texture and what lies beside it.
+        record: how the mesh was made, by name, as JSON has it; OFF has no room for it.
 
     Raises:
         ValueError: wrong shapes, indices out of range, or values that are not finite.
@@ -196,7 +198,8 @@ def save_mesh(
     if per_face is not None:
         per_vertex = np.repeat(per_face, 3, axis=0) if split else _vertex_means(v, f, per_face)
     skin = None if texture is None else _surface_texture(texture, len(faces), mipmaps, normal_map, pictures)
-    more: dict[str, Any] = {"name": path.stem, "texture": skin, "compress": compress, **_far(path, world)}
+    said = {} if record is None else {"record": record, "comment": "etsplat mesh"}
+    more: dict[str, Any] = {"name": path.stem, "texture": skin, "compress": compress, **said, **_far(path, world)}
     save_surface(path, Surface(v.astype(np.float32), f, per_vertex, per_face, **more))
 
 

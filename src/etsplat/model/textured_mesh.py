@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Float, Int
@@ -143,16 +143,18 @@ class TexturedMesh(Model):
         world: Georeference | None = None,
         compress: Compression = "none",
         pictures: PictureKind = "png",
+        record: Mapping[str, Any] | None = None,
     ) -> None:
         """Write a file, atomically: .safetensors exactly; .glb, or .obj and .ply with a .png beside them, of 8 bits.
 
         Args:
             path: of the file.
             normal_map: for .glb alone, whose material is lit then.
-            world: where it lies; as the two after it of `etsplat.io.mesh_files.save_mesh`, for other files than
+            world: where it lies; as those after it of `etsplat.io.mesh_files.save_mesh`, for other files than
                 .safetensors.
             compress: for .glb alone.
             pictures: so.
+            record: how it was made.
         """
         vertices, faces = self.surface()
         texture, uvs = self.texture.detach().cpu(), self.face_uvs.cpu()
@@ -173,6 +175,7 @@ class TexturedMesh(Model):
             world=world,
             compress=compress,
             pictures=pictures,
+            record=record,
         )
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> "TexturedMesh":

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -27,7 +28,7 @@ from etsplat.tasks.demos import DEMO_OBJECT
 from etsplat.tasks.export_config import LIGHT_FACES, ExportConfig
 from etsplat.tasks.normal_map import normal_map_of
 from etsplat.tasks.opened_runs import capture_at, read_record
-from etsplat.tasks.placing import apart_from_world, check_placed, placement
+from etsplat.tasks.placing import apart_from_world, check_placed, placed_record, placement
 from etsplat.tasks.reconstruct_config import Pictures, ReconstructConfig
 from etsplat.tasks.refined_cameras import refined_capture
 from etsplat.tasks.settings import settings_of
@@ -232,9 +233,10 @@ def write_mesh(
         colors = colors_at(mesh, vertices[faces].mean(dim=1))
         mesh = MeshFile(vertices, faces, face_colors=colors)
     check_placed(path, config)
-    transform, near, far = _placement(RunDirectory(run), config, scene, mesh.vertices)
+    transform, near, far, record = _placement(RunDirectory(run), config, scene, mesh.vertices)
     vertices, by_face, by_vertex = near.apply(mesh.vertices).float(), mesh.face_colors, _only_by_vertex(mesh)
-    save_mesh(path, vertices, mesh.faces, by_face, vertex_colors=by_vertex, world=far, compress=config.compress)
+    how = {"world": far, "compress": config.compress, "record": record}
+    save_mesh(path, vertices, mesh.faces, by_face, vertex_colors=by_vertex, **how)
     return len(mesh.faces), transform
 
 
@@ -259,7 +261,8 @@ def _export_textured(
         raise InputError(f"{path}: there is no folder {path.parent}; create the folder first")
     check_installed()
     opened, written = open_reconstruction(run, scene, device, tell), {}
-    _, near, far = _placement(RunDirectory(run), config, scene, opened.views.normalization.invert(opened.mesh.vertices))
+    corners = opened.views.normalization.invert(opened.mesh.vertices)
+    _, near, far, record = _placement(RunDirectory(run), config, scene, corners)
     mesh = opened.textured(config.texture, config.faces or LIGHT_FACES, tell=tell)
     for level in range(config.lods + 1):
         if level:
@@ -270,7 +273,8 @@ def _export_textured(
         relief = None if relief is None else relief.turned(near.rotation)
         placed = opened.in_own_units(mesh)
         placed = replace(placed, vertices=near.apply(placed.vertices.detach()).float()).learnable()
-        placed.save(place, relief, world=far, compress=config.compress, pictures=config.pictures)
+        stored = {"compress": config.compress, "pictures": config.pictures}
+        placed.save(place, relief, world=far, record=record, **stored)
         written[place] = mesh.count
     return written
 
@@ -286,13 +290,16 @@ def check_stored(path: Path, config: ExportConfig) -> None:
 
 def _placement(
     run: RunDirectory, config: ExportConfig, scene: Dataset | Path | str | None, vertices: Float[Tensor, "V 3"]
-) -> tuple[Similarity, Similarity, Georeference | None]:
-    """How vertices in the units of the input are moved: in all, and as a part in the file and an offset beside it."""
+) -> tuple[Similarity, Similarity, Georeference | None, dict[str, Any]]:
+    """How vertices in the units of the input are moved: in all, and as a part in the file and an offset beside it.
+
+    Last, what the file says of it, by which it is led back.
+    """
     file = run.path / GEOREFERENCE_FILE
     georeference = Georeference.read(file) if file.is_file() else None
     up = None if config.up == "keep" else _up(run, scene, georeference)
     transform = placement(run.path, config, vertices, up, georeference)
-    return transform, *apart_from_world(transform, config, georeference)
+    return transform, *apart_from_world(transform, config, georeference), placed_record(config, transform, georeference)
 
 
 def _up(

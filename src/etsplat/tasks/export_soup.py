@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,7 @@ from etsplat.ops.soup_colors import soup_colors
 from etsplat.tasks.export_config import ExportConfig
 from etsplat.tasks.export_mesh import check_stored
 from etsplat.tasks.opened_runs import SoupRun, training_cameras
-from etsplat.tasks.placing import apart_from_world, check_placed, placement
+from etsplat.tasks.placing import apart_from_world, check_placed, placed_record, placement
 from etsplat.tasks.scene_page import compact_bytes, scene_of, small_camera
 from etsplat.tasks.soup_selection import Crop, Reason, Selection, select
 from etsplat.web.pages import render_scene_page
@@ -246,10 +246,9 @@ def _record(
     """What the file says of how it was made; where it comes back as the same soup, of how that is drawn too."""
     look = {"appearance": json.loads(soup.appearance.structure.to_json()), "notes": dict(soup.notes)}
     return {
-        **({} if georeference is None else {"georeference": asdict(georeference)}),
         **(look if config.colors == "keep" else {}),
-        "transform": transform.matrix.tolist(),
-        **{name: getattr(config, name) for name in ("up", "scale", "place", "sky", "clean")},
+        **placed_record(config, transform, georeference),
+        **{name: getattr(config, name) for name in ("sky", "clean")},
         "crop": None if chosen.crop is None else str(chosen.crop),
         "removed": dict(chosen.removed),
     }

@@ -1,7 +1,8 @@
 """How what is exported is turned, scaled and moved: `--up`, `--scale` and `--place`, of soups and of meshes."""
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -70,6 +71,15 @@ def placement(
     low, high = ordered[round(strays * last)], ordered[round((1 - strays) * last)]
     middle = (low + high) / 2
     return turned.moved(-(middle if config.place == "center" else middle + (low - middle) * axis))
+
+
+def placed_record(config: ExportConfig, transform: Similarity, georeference: Georeference | None) -> dict[str, Any]:
+    """What a file says of its placement, by which `etsplat.io.export_records` leads back to the capture."""
+    return {
+        **({} if georeference is None else {"georeference": asdict(georeference)}),
+        "transform": transform.matrix.tolist(),
+        **{name: getattr(config, name) for name in ("up", "scale", "place")},
+    }
 
 
 def apart_from_world(

@@ -24,10 +24,10 @@ def write(path: Path, surface: Surface) -> None:
     if surface.texture is not None:
         _write_material(path.parent, surface.name, surface.texture)
     with open(path, "w", encoding="utf-8", newline="\n") as file:
-        if surface.texture is not None:
-            file.write(f"mtllib {surface.name}.mtl\n")
         for name, value in surface.record.items():
             file.write(f"# {name} {json.dumps(value)}\n")
+        if surface.texture is not None:
+            file.write(f"mtllib {surface.name}.mtl\n")
         if surface.sky is None:
             _write_object(file, surface, 1)
             return
