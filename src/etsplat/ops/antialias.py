@@ -15,6 +15,7 @@ barycentrics. Edges within the surface give none, so the mesh must be welded. A 
 silhouette.
 """
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -22,7 +23,7 @@ from etsplat.core.backgrounds import for_each_view
 from etsplat.core.cameras import Cameras, view_arguments
 from etsplat.core.connectivity import HOW_CONNECTED, MeshConnectivity
 from etsplat.core.precision import as_given
-from etsplat.core.rasterization import Rasterization
+from etsplat.core.rasterization import Rasterization, joined
 from etsplat.core.validation import check_device, check_finite, check_kind, check_like, check_shape
 from etsplat.engines.choice import engine_for
 from etsplat.ops.rasterize import LARGEST_COLOR, one_kind_of_colors
@@ -49,7 +50,7 @@ def rasterize_antialiased(
     near_plane: float = 0.01,
     validate: bool | None = None,
 ) -> Rasterization:
-    """Picture of an opaque mesh, differentiable by vertices, colours, texture and backgrounds.
+    """Picture of an opaque mesh, differentiable by vertices, colours, texture, backgrounds and cameras.
 
     Args:
         vertices: (V, 3) of a welded mesh, world space.
@@ -115,6 +116,25 @@ def rasterize_antialiased(
     if validate or (validate is None and vertices.is_cpu):
         check_finite(name, colors, LARGEST_COLOR)
         check_finite("backgrounds", backgrounds, LARGEST_COLOR)
+    if torch.is_grad_enabled() and (viewmats.requires_grad or Ks.requires_grad):
+        return joined(
+            [
+                rasterize_antialiased(
+                    moved,
+                    connectivity=connectivity,
+                    face_colors=face_colors,
+                    vertex_colors=vertex_colors,
+                    texture=texture,
+                    face_uvs=face_uvs,
+                    max_level=max_level,
+                    cameras=Cameras(torch.eye(4).to(viewmats)[None], Ks[view : view + 1].detach(), width, height),
+                    backgrounds=backgrounds[view],
+                    near_plane=near_plane,
+                    validate=False,
+                )
+                for view, moved in enumerate(_seen_from(vertices, viewmats, Ks))
+            ]
+        )
     seen = rasterize_opaque(
         vertices, viewmats=viewmats, Ks=Ks, width=width, height=height, faces=connectivity.faces, near_plane=near_plane
     )
@@ -130,6 +150,21 @@ def rasterize_antialiased(
         vertices, colors, backgrounds, viewmats, Ks, *found, near_plane, colors_of, connectivity
     )
     return seen
+
+
+def _seen_from(vertices: Tensor, viewmats: Tensor, Ks: Tensor) -> list[Float[Tensor, "V 3"]]:
+    """The vertices before each camera, which project by its K without gradients to where they do by its own.
+
+    Engines have no gradient to cameras, but to vertices.
+    """
+    check_shape("viewmats", viewmats, ("B", 4, 4))
+    check_shape("Ks", Ks, (len(viewmats), 3, 3))
+    for name, tensor in (("viewmats", viewmats), ("Ks", Ks)):
+        check_like(name, tensor, "vertices", vertices)
+    points = vertices @ viewmats[:, :3, :3].mT + viewmats[:, None, :3, 3]
+    focal, middle, fixed = Ks[:, None, [0, 1], [0, 1]], Ks[:, None, :2, 2], Ks.detach()
+    shifted = focal * points[..., :2] + (middle - fixed[:, None, :2, 2]) * points[..., 2:]
+    return list(torch.cat([shifted / fixed[:, None, [0, 1], [0, 1]], points[..., 2:]], dim=-1))
 
 
 def _check_texture(texture: Tensor, face_uvs: Tensor | None, vertices: Tensor, connectivity: MeshConnectivity) -> None:
