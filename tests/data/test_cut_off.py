@@ -6,10 +6,10 @@ import pytest
 import torch
 import trimesh
 
+from etsplat.data.changed_pictures import Box, cropped
 from etsplat.data.cut_off import cut_off
 from etsplat.data.dataset import Dataset
 from etsplat.data.photograph import photograph
-from etsplat.data.pictures import Box, cropped
 from etsplat.data.visual_hull import visual_hull
 from etsplat.io.mesh_files import MeshFile
 from etsplat.tasks.reconstruct_config import ReconstructConfig

@@ -5,11 +5,12 @@ from dataclasses import replace
 import pytest
 import torch
 
+from etsplat.data.changed_pictures import Box, cropped
 from etsplat.data.dataset import Dataset
 from etsplat.data.frame_gaps import without_frame_gaps
 from etsplat.data.hull import bounding_sphere
 from etsplat.data.photograph import photograph
-from etsplat.data.pictures import Box, StoredPictures, cropped
+from etsplat.data.pictures import StoredPictures
 from etsplat.geometry.icosphere import icosphere
 from etsplat.io.mesh_files import MeshFile
 

@@ -303,7 +303,7 @@ def test_gradients_to_cameras_are_those_of_finite_differences(kind, rng):
 
     leaves = [viewmats.clone().requires_grad_(), Ks.clone().requires_grad_()]
     seen = value(*leaves)
-    assert float(seen) == pytest.approx(float(value(viewmats, Ks)), abs=1e-9)
+    assert seen.item() == pytest.approx(value(viewmats, Ks).item(), abs=1e-9)
     gradients = torch.autograd.grad(seen, leaves)
     step = 1e-6
     for which, places in enumerate([[(0, 0, 3), (1, 2, 3), (1, 0, 1)], [(0, 0, 0), (0, 1, 2), (1, 1, 1)]]):

@@ -9,10 +9,11 @@ import torch
 import trimesh
 
 from etsplat.core.errors import InputError
+from etsplat.data.changed_pictures import Box, cropped
 from etsplat.data.dataset import Dataset
 from etsplat.data.hollows import Opened
 from etsplat.data.photograph import photograph
-from etsplat.data.pictures import Box, StoredPictures, cropped
+from etsplat.data.pictures import StoredPictures
 from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.parts import Shape, genera, shape_of
 from etsplat.io.mesh_files import MeshFile

@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from jaxtyping import Bool
 
+from etsplat.data.changed_pictures import Box, cropped
 from etsplat.data.dataset import Dataset
 from etsplat.data.frame_gaps import GAP
-from etsplat.data.pictures import Box, cropped
 from etsplat.data.silhouettes import silhouette
 
 _SMALL = 0.5

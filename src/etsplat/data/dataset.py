@@ -15,6 +15,7 @@ from etsplat.core.cameras import Cameras, camera_centers
 from etsplat.core.errors import InputError
 from etsplat.core.short_repr import short_repr
 from etsplat.core.validation import check_above, check_count, shown
+from etsplat.data.changed_pictures import halved
 from etsplat.data.dataset_checks import (
     checked_intrinsics,
     checked_point,
@@ -22,7 +23,7 @@ from etsplat.data.dataset_checks import (
     checked_split,
     checked_viewmats,
 )
-from etsplat.data.pictures import Pictures, as_float, halved
+from etsplat.data.pictures import Pictures, as_float
 from etsplat.io.georeference import Georeference
 
 WATCHED_ONE_IN, WATCHED_FROM = 16, 24

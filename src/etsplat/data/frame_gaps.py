@@ -12,8 +12,8 @@ import numpy as np
 import torch
 from jaxtyping import Bool
 
+from etsplat.data.changed_pictures import Box, cropped
 from etsplat.data.dataset import Dataset
-from etsplat.data.pictures import Box, cropped
 from etsplat.data.silhouettes import silhouette
 
 GAP = 0.01

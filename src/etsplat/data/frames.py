@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Literal
 
@@ -191,20 +192,13 @@ def posed(scene: Path, listing: Listing, wanted: Wanted) -> Dataset:
         across = min(size[0], wanted.width or MAX_WIDTH)
         sizes.append((across, max(1, round(size[1] * across / size[0]))))
         Ks.append(scaled_intrinsics(scene, frame, size, sizes[-1]))
-    decode = _DECODERS[wanted.masks_as]
     files = [file for frame in frames for file in (frame.image, frame.mask, frame.depth) if file is not None]
     units = {frame.depth_unit for frame in frames if frame.depth is not None}
-
-    def make(view: int) -> Picture:
-        frame, size = frames[view], sizes[view]
-        picture = decode(frame, size)
-        return picture if frame.depth is None else replace(picture, depth=_depth(frame.depth, frame.depth_unit, size))
-
     pictures = LazyPictures(
-        make,
+        partial(_decoded, frames, sizes, wanted.masks_as),
         sizes,
         [_size_in_bytes(frame, size, wanted.masks_as) for frame, size in zip(frames, sizes, strict=True)],
-        lambda: _fingerprint(files) + (repr(sorted(map(str, units))).encode() if units else b""),
+        partial(_fingerprint, files, repr(sorted(map(str, units))) if units else ""),
         wanted.memory,
         [view for view, frame in enumerate(frames) if frame.depth is not None],
     )
@@ -363,13 +357,20 @@ _DECODERS: dict[MasksAs, Callable[[Frame, tuple[int, int]], Picture]] = {
 }
 
 
-def _fingerprint(files: Sequence[Path]) -> bytes:
-    """What the files hold, not when they were written: the same for a copy. Decodes nothing."""
+def _decoded(frames: Sequence[Frame], sizes: Sequence[tuple[int, int]], masks_as: MasksAs, view: int) -> Picture:
+    """The photo of a view, with its depths. A function that other processes find by its name."""
+    frame, size = frames[view], sizes[view]
+    picture = _DECODERS[masks_as](frame, size)
+    return picture if frame.depth is None else replace(picture, depth=_depth(frame.depth, frame.depth_unit, size))
+
+
+def _fingerprint(files: Sequence[Path], units: str) -> bytes:
+    """What the files hold, not when they were written: the same for a copy. Decodes nothing. Then units of depths."""
     digest = hashlib.sha256()
     with ThreadPoolExecutor() as pool:
         for sample in pool.map(_sample, files):
             digest.update(sample)
-    return digest.digest()
+    return digest.digest() + units.encode()
 
 
 def _sample(path: Path) -> bytes:

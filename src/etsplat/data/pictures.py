@@ -1,7 +1,6 @@
 """The photos of a data set: made in parallel when they are needed, and kept in memory as far as they fit there."""
 
 import hashlib
-import math
 import os
 import threading
 from abc import ABC, abstractmethod
@@ -9,7 +8,8 @@ from collections import OrderedDict
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from functools import partial
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, UInt8
@@ -17,9 +17,9 @@ from torch import Tensor
 
 from etsplat.core.cameras import check_size
 from etsplat.core.short_repr import short_repr
+from etsplat.core.validation import shown, whole_number
 from etsplat.core.workers import workers
 from etsplat.data.dataset_checks import as_many, checked_mask, checked_pixels, is_straight
-from etsplat.io.depth_maps import resize_depth
 from etsplat.io.memory import available_memory
 
 Pixels = UInt8[Tensor, "H W C"] | Float[Tensor, "H W 4"]
@@ -99,9 +99,27 @@ class Pictures(ABC):
     def expect(self, indices: Sequence[int]) -> None:  # noqa: B027 -- a wish, which a subclass may leave
         """Start to make those that are needed soon, as many as fit."""
 
+    def __len__(self) -> int:
+        """How many."""
+        return len(self.sizes)
+
     def __getitem__(self, index: int) -> Pixels:
-        """Raises what `picture` raises."""
-        return self.picture(index).pixels
+        """Pixels of one photo; of several there is `subset`.
+
+        Raises:
+            IndexError: the index is none of a photo; and what `picture` raises.
+        """
+        one = whole_number(index)
+        if one is None:
+            raise IndexError(
+                f"index of a photo must be a whole number, got {shown(index)}: subset(indices) has several"
+            )
+        return self.picture(one + len(self) if one < 0 else one).pixels
+
+    def __repr__(self) -> str:
+        """How many, in which sizes."""
+        sizes = sorted({f"{width}x{height}" for width, height in self.sizes})
+        return f"{type(self).__name__}({len(self)} of {', '.join(sizes[:3])}{', ...' if len(sizes) > 3 else ''})"
 
     def __iter__(self) -> Iterator[Pixels]:
         return (self[index] for index in range(len(self.sizes)))
@@ -228,9 +246,28 @@ class LazyPictures(Pictures):
         self._given, self._fingerprint = make, fingerprint
         self._limit = available_memory() // 2 // workers().neighbours if limit is None else limit
         self.streamed = self.total_bytes > self._limit
+        self._begin()
+
+    def _begin(self) -> None:
+        """With threads of this process, and no photo."""
         self._kept: OrderedDict[int, Future[Picture]] = OrderedDict()
         self._lock = threading.Lock()
         self._pool = ThreadPoolExecutor(max_workers=min(os.cpu_count() or 1, 8), thread_name_prefix="images")
+        self._process = os.getpid()
+
+    def _here(self) -> None:
+        """In a process that was forked, as workers of a DataLoader are, the threads are gone, and locks may be held."""
+        if self._process != os.getpid():
+            self._begin()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """For copies and other processes, which make their photos themselves."""
+        return {name: value for name, value in vars(self).items() if name not in _AT_WORK}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """As handed over by `__getstate__`."""
+        vars(self).update(state)
+        self._begin()
 
     def _make(self, index: int) -> Picture:
         """As it is given, once it has been looked at."""
@@ -247,11 +284,13 @@ class LazyPictures(Pictures):
     @property
     def held_bytes(self) -> int:
         """Of those that were made, or are being made, and are kept."""
+        self._here()
         with self._lock:
             return sum(self._bytes[kept] for kept in self._kept)
 
     def picture(self, index: int) -> Picture:
         """Raises IndexError where there is no such view, and what making it raises."""
+        self._here()
         if not 0 <= index < len(self.sizes):
             raise IndexError(f"view {index}: expected one in [0, {len(self.sizes)})")
         try:
@@ -264,15 +303,11 @@ class LazyPictures(Pictures):
     def subset(self, indices: Sequence[int]) -> "LazyPictures":
         """Made anew, and kept where they fit into what is free now."""
         chosen = list(indices)
-
-        def fingerprint() -> bytes:
-            return hashlib.sha256(self.fingerprint() + repr(chosen).encode()).digest()
-
         return LazyPictures(
-            lambda index: self._given(chosen[index]),
+            partial(_chosen, self._given, chosen),
             [self.sizes[index] for index in chosen],
             [self._bytes[index] for index in chosen],
-            fingerprint,
+            partial(_name_of_chosen, self, chosen),
             with_depth=[place for place, index in enumerate(chosen) if index in self.with_depth],
         )
 
@@ -285,6 +320,7 @@ class LazyPictures(Pictures):
 
     def expect(self, indices: Sequence[int]) -> None:
         """Start to make those that are needed soon, as many as fit."""
+        self._here()
         space = self._limit
         for index in indices:
             space -= self._bytes[index]
@@ -303,6 +339,7 @@ class LazyPictures(Pictures):
         Raises:
             InputError: a file is damaged.
         """
+        self._here()
         group = workers()
         views = range(group.rank, len(self.sizes), group.count)
         futures = [self._pool.submit(self._check, view) if self.streamed else self._future(view) for view in views]
@@ -330,62 +367,20 @@ class LazyPictures(Pictures):
             return self._kept[index]
 
 
+_AT_WORK = ("_kept", "_lock", "_pool", "_process")
+"""Attributes of `LazyPictures` that belong to one process."""
+
+
+def _chosen(make: Callable[[int], Picture | Pixels], chosen: Sequence[int], index: int) -> Picture | Pixels:
+    return make(chosen[index])
+
+
+def _name_of_chosen(pictures: Pictures, chosen: list[int]) -> bytes:
+    return hashlib.sha256(pictures.fingerprint() + repr(chosen).encode()).digest()
+
+
 def _digest(tensors: Iterable[Tensor | None]) -> bytes:
     digest = hashlib.sha256()
     for tensor in tensors:
         digest.update(b"none" if tensor is None else tensor.contiguous().cpu().numpy().data)
     return digest.digest()
-
-
-class Box(NamedTuple):
-    """A part of a picture: its first column and row, and those after its last."""
-
-    left: int
-    upper: int
-    right: int
-    lower: int
-
-
-def cropped(pictures: Pictures, boxes: Sequence[Box]) -> LazyPictures:
-    """Of each photo, its mask and its depths what is in a box."""
-    sizes = [(box.right - box.left, box.lower - box.upper) for box in boxes]
-
-    def make(index: int) -> Picture:
-        picture, box = pictures.picture(index), boxes[index]
-        rows, columns = slice(box.upper, box.lower), slice(box.left, box.right)
-        mask = None if picture.mask is None else picture.mask[rows, columns].contiguous()
-        depth = None if picture.depth is None else picture.depth[rows, columns].contiguous()
-        return Picture(picture.pixels[rows, columns].contiguous(), mask, depth)
-
-    def fingerprint() -> bytes:
-        return hashlib.sha256(pictures.fingerprint() + repr(boxes).encode()).digest()
-
-    return LazyPictures(make, sizes, _bytes_of(pictures, sizes), fingerprint, with_depth=pictures.with_depth)
-
-
-def halved(pictures: Pictures) -> LazyPictures:
-    """Photos and masks at half the size, each pixel the mean of those it replaces; odd sizes are rounded down.
-
-    Depths are not averaged (`resize_depth`).
-    """
-    sizes = [(max(1, width // 2), max(1, height // 2)) for width, height in pictures.sizes]
-
-    def make(index: int) -> Picture:
-        picture, (width, height) = pictures.picture(index), sizes[index]
-        mask = None if picture.mask is None else _area_mean(picture.mask[..., None], width, height)[..., 0]
-        depth = None if picture.depth is None else resize_depth(picture.depth, width, height)
-        return Picture(_area_mean(picture.pixels, width, height), mask, depth)
-
-    return LazyPictures(make, sizes, _bytes_of(pictures, sizes), pictures.fingerprint, with_depth=pictures.with_depth)
-
-
-def _bytes_of(pictures: Pictures, sizes: Sequence[tuple[int, int]]) -> list[int]:
-    """What photos of other sizes take."""
-    per_pixel = math.ceil(pictures.total_bytes / sum(width * height for width, height in pictures.sizes))
-    return [per_pixel * width * height for width, height in sizes]
-
-
-def _area_mean(image: Pixels, width: int, height: int) -> Pixels:
-    planes = image.movedim(-1, 0)[None]
-    mean = torch.nn.functional.interpolate(planes.float(), (height, width), mode="area")[0].movedim(0, -1)
-    return ((mean + 0.5).to(torch.uint8) if image.dtype == torch.uint8 else mean).contiguous()
