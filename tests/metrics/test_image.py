@@ -243,3 +243,14 @@ def test_equal_bits_on_any_number_of_torchs_threads(rng):
     image, truth = (torch.rand(401, 403, 3, generator=rng) for _ in range(2))
     found = on_each_count(lambda: (psnr(image, truth), ssim(image, truth), ssim(image, truth, interior=True)))
     assert len(set(found)) == 1
+
+
+@pytest.mark.parametrize("measure", [psnr, ssim])
+def test_pictures_of_other_programs_are_told_apart(measure):
+    """Channels first had an SSIM of 32 channels along 3 rows; bytes as floats a PSNR below 0."""
+    picture = torch.rand(32, 32, 3)
+    with pytest.raises(ValueError, match=r"image: expected shape \(H, W, C\), got \(3, 32, 32\): pass image\.permute"):
+        measure(picture.permute(2, 0, 1), picture.permute(2, 0, 1))
+    with pytest.raises(ValueError, match=r"truth: expected values in \[0, 1\], got others; divide by 255"):
+        measure(picture, 255 * picture)
+    assert math.isfinite(measure(picture, 1.5 * picture))  # as optimization leaves them

@@ -306,3 +306,21 @@ def test_parameters_without_a_place_for_each_element_are_refused_before_anything
     assert torch.equal(first, torch.ones(7))
     with pytest.raises(ValueError, match="parameter must have a place for each element"):
         adam.replace("first", expanded, first, first)
+
+
+@pytest.mark.parametrize(
+    ("state", "message"),
+    [
+        ({}, "state must be what state_dict.. of an etsplat.Adam returns, got one without betas, .*step_count"),
+        (torch.optim.Adam([torch.zeros(2)]).state_dict(), "without betas, .*: it is of torch.optim"),
+        ([], "state must be .*, got list"),
+    ],
+)
+def test_a_state_of_something_else_is_named(state, message):
+    """It was a KeyError."""
+    with pytest.raises(ValueError, match=message):
+        Adam({"p": torch.zeros(2)}, {"p": 0.1}).load_state_dict(state)
+
+
+def test_it_says_its_rates_in_a_line():
+    assert repr(Adam({"p": torch.zeros(2)}, {"p": 0.1})) == "Adam(p: 0.1; 0 steps)"

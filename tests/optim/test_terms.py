@@ -342,3 +342,12 @@ def test_a_map_that_is_not_believed_counts_nothing():
     assert objective.weights(1) == (0.5,)
     trust.kind = None
     assert objective.weights(1) == (0.0,)
+
+
+def test_an_objective_says_what_it_is_made_of():
+    def flat(drawing):
+        return drawing.rendering.depth.mean()
+
+    terms = [EdgeLength(0.5), Custom(flat, lambda iteration: 0.1, outputs="depth")]
+    told = "Photometric(0.2, 'l1') + EdgeLength(0.5) + Custom(flat, <lambda>, outputs=('depth',))"
+    assert repr(Objective(Photometric(0.2), terms)) == f"Objective({told}, scale=1)"

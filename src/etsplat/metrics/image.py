@@ -16,7 +16,7 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from etsplat.core.errors import InputError
-from etsplat.core.validation import check_device, check_floating, check_memory
+from etsplat.core.validation import check_device, check_display_image, check_floating, check_memory
 from etsplat.engines.threads import all_torch_threads, one_torch_thread
 from etsplat.io.paths import kind_of
 from etsplat.io.tensors import read_state_dict
@@ -311,6 +311,8 @@ def _check_pair(image: Tensor, truth: Tensor) -> None:
     check_floating("truth", truth)
     if image.numel() == 0:
         raise ValueError(f"image: expected a pixel or more, got shape {tuple(image.shape)}")
+    check_display_image("image", image)
+    check_display_image("truth", truth)
 
 
 def _blur(planes: Float[Tensor, "M C H W"], padding: int) -> Float[Tensor, "M C H2 W2"]:

@@ -90,6 +90,10 @@ class Adam:
         self.paces: dict[str, Tensor] = {}
         self.calmed: frozenset[str] = frozenset()
 
+    def __repr__(self) -> str:
+        rates = ", ".join(f"{name}: {rate:.3g}" for name, rate in self.learning_rates.items())
+        return f"{type(self).__name__}({rates}; {self.step_count} steps)"
+
     @torch.no_grad()
     def step(self, decays: Mapping[str, float] | None = None) -> None:
         """Update every parameter from its gradient; those that require none, and have none, stay as they are.
@@ -169,8 +173,12 @@ class Adam:
         """Continue from a ``state_dict`` of an optimizer over parameters of the same names and shapes.
 
         Raises:
-            ValueError: Other names or shapes; nothing is changed then.
+            ValueError: No such state, other names or shapes; nothing is changed then.
         """
+        if lacking := sorted(set(self.state_dict()) - set(state if isinstance(state, Mapping) else ())):
+            kind = ": it is of torch.optim" if "param_groups" in state else ""
+            got = f"one without {', '.join(lacking)}{kind}" if isinstance(state, Mapping) else type(state).__name__
+            raise ValueError(f"state must be what state_dict() of an etsplat.Adam returns, got {got}")
         for key in ("learning_rates", "first_moments", "second_moments"):
             if set(state[key]) != set(self.parameters):
                 raise ValueError(f"{key} must name {sorted(self.parameters)}, got {sorted(state[key])}")

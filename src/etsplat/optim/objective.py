@@ -117,6 +117,9 @@ class Term(ABC):
             check_number("weight", weight)
         self.weight = weight
 
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({_named(self.weight)})"
+
     @abstractmethod
     def __call__(self, drawing: Drawing) -> Float[Tensor, ""]:
         """The value, differentiable."""
@@ -150,6 +153,11 @@ class Custom(Term):
         self._value, self.outputs = value, (outputs,) if isinstance(outputs, str) else tuple(outputs)
         for name in self.outputs:
             check_choice("outputs", name, OUTPUTS)
+
+    def __repr__(self) -> str:
+        name = getattr(self._value, "__name__", type(self._value).__name__)
+        outputs = f", outputs={self.outputs}" if self.outputs else ""
+        return f"{type(self).__name__}({name}, {_named(self.weight)}{outputs})"
 
     def __call__(self, drawing: Drawing) -> Float[Tensor, ""]:
         """Of the function."""
@@ -187,6 +195,10 @@ class Objective:
             function = callable(term) and not isinstance(term, type)
             check_kind(name, term, Term, "etsplat.Custom(function) makes one" if function else "make one")
         self.depth_of: Depth = depth_of
+
+    def __repr__(self) -> str:
+        terms = [repr(self.photometric), *map(repr, self.terms)]
+        return f"{type(self).__name__}({' + '.join(terms)}, scale={_named(self.scale)})"
 
     def weights(self, iteration: int) -> tuple[float, ...]:
         """Of the terms."""
@@ -285,6 +297,11 @@ class Objective:
             Summand(weight, _value_of(f"terms[{number}]", term, drawing), term.power) for number, term, weight in alone
         ]
         return weighted_sum(torch.zeros_like(summands[0].value), summands, scale)
+
+
+def _named(weight: Scheduled) -> str:
+    """A number, or the name of a function of the iteration."""
+    return getattr(weight, "__name__", type(weight).__name__) if callable(weight) else f"{weight:.3g}"
 
 
 def _value_of(name: str, term: Term, drawing: Any, like: Tensor | None = None) -> Float[Tensor, ""]:

@@ -43,6 +43,9 @@ class Photometric(Term):
         self._dssim = dssim
         self._pixel: Literal["l1", "l2", "rms"] = pixel
 
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self._dssim:.3g}, {self._pixel!r})"
+
     def __call__(self, drawing: Drawing) -> Float[Tensor, ""]:
         """Of one view; pixels that its mask leaves out count as right."""
         mask = None if drawing.mask is None else drawing.mask.float() / 255
