@@ -76,6 +76,29 @@ def test_a_term_that_names_too_few_outputs_is_told_of_the_others(outputs: Any) -
         a_trainer(terms=(flat,)).fit(1)
 
 
+class Named(etsplat.Term):
+    """One that knows nothing of the constructor of `Term`."""
+
+    def __init__(self, outputs: Any) -> None:
+        self.outputs = outputs
+
+    def __call__(self, drawing: etsplat.Drawing) -> torch.Tensor:
+        return drawing.model.vertices.mean()
+
+
+def test_a_term_has_weight_1_unless_it_says_otherwise() -> None:
+    objective = etsplat.Objective(etsplat.Photometric(), [Named(()), etsplat.EdgeLength(lambda i: torch.tensor(0.5))])
+    assert objective.weights(1) == (1.0, 0.5)
+    a_trainer(terms=(Named(()),)).fit(1)
+
+
+def test_a_weight_that_becomes_none_is_named() -> None:
+    """Such a term was left out, without a word."""
+    forgot = etsplat.EdgeLength(lambda iteration: None)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match=r"the weight of terms\[0\] .* at iteration 1 must be a number, got None"):
+        a_trainer(terms=(forgot,)).fit(1)
+
+
 def test_mistakes_of_a_term_stay_what_they_are() -> None:
     for looks in (lambda drawing: drawing.vertexes, lambda drawing: drawing.model.vertexes):
         with pytest.raises(AttributeError, match="vertexes"):
@@ -201,6 +224,8 @@ def test_metrics_that_are_none_are_named(value: Any, got: str) -> None:
         (None, (), "photometric must be a Term, got None: make one"),
         (etsplat.Photometric, (), "photometric must be a Term, got the class Photometric: make one"),
         (etsplat.Photometric(), etsplat.EdgeLength(0.5), r"terms must be a sequence of terms, got EdgeLength"),
+        (etsplat.Photometric(), [Named("depth")], r"terms\[0\]\.outputs must be a sequence of names, got 'depth'"),
+        (etsplat.Photometric(), [Named(("rgb",))], r"terms\[0\]\.outputs must be one of 'color', .*, got 'rgb'"),
         (etsplat.Photometric(), [lambda drawing: 0], r"terms\[0\] must be a Term, .*: etsplat\.Custom\(function\)"),
     ],
 )

@@ -56,9 +56,8 @@ def normalize_mesh(mesh: MeshFile) -> tuple[MeshFile, Normalization]:
         1.0
     """
     if not isinstance(mesh, MeshFile):
-        raise ValueError(
-            f"mesh must be a MeshFile, got {type(mesh).__name__}: etsplat.load_mesh reads one, etsplat.MeshFile(vertices, faces) makes one"
-        )
+        made = "etsplat.load_mesh reads one, etsplat.MeshFile(vertices, faces) makes one of tensors"
+        raise ValueError(f"mesh must be a MeshFile, got {type(mesh).__name__}: {made}")
     center, radius = bounding_ball(mesh.vertices)
     if radius <= 0:
         raise InputError("mesh: all vertices are at one point; there is nothing to photograph")

@@ -106,6 +106,7 @@ class Term(ABC):
     """
 
     name: ClassVar[str | None] = None
+    weight: Scheduled = 1.0
     outputs: tuple[str, ...] = ()
     power: Literal[1, -1, -2] = 1
     looks_at: ClassVar[Literal["parameters", "colors"] | None] = None
@@ -186,7 +187,7 @@ class Objective:
         """Takes them.
 
         Raises:
-            ValueError: one of them is no `Term`.
+            ValueError: one of them is no `Term`, or asks for outputs that there are not.
         """
         if isinstance(terms, Term):
             raise ValueError(f"terms must be a sequence of terms, got {type(terms).__name__}: pass [term]")
@@ -194,6 +195,10 @@ class Objective:
         for name, term in (("photometric", photometric), *((f"terms[{k}]", t) for k, t in enumerate(self.terms))):
             function = callable(term) and not isinstance(term, type)
             check_kind(name, term, Term, "etsplat.Custom(function) makes one" if function else "make one")
+            if isinstance(term.outputs, str):
+                raise ValueError(f"{name}.outputs must be a sequence of names, got {term.outputs!r}: make it a tuple")
+            for output in term.outputs:
+                check_choice(f"{name}.outputs", output, OUTPUTS)
         self.depth_of: Depth = depth_of
 
     def __repr__(self) -> str:
@@ -201,8 +206,11 @@ class Objective:
         return f"{type(self).__name__}({' + '.join(terms)}, scale={_named(self.scale)})"
 
     def weights(self, iteration: int) -> tuple[float, ...]:
-        """Of the terms."""
-        return tuple(at(term.weight, iteration) for term in self.terms)
+        """Of the terms. Raises ValueError where a function of the iteration returns no number."""
+        found = tuple(at(term.weight, iteration) for term in self.terms)
+        for number, weight in enumerate(found):
+            check_number(f"the weight of terms[{number}] of the objective at iteration {iteration}", weight)
+        return found
 
     def outputs(self, weights: Sequence[float]) -> tuple[str, ...]:
         """What pictures must hold for the terms that count."""

@@ -273,8 +273,7 @@ def _export_textured(
         relief = None if relief is None else relief.turned(near.rotation)
         placed = opened.in_own_units(mesh)
         placed = replace(placed, vertices=near.apply(placed.vertices.detach()).float()).learnable()
-        stored = {"compress": config.compress, "pictures": config.pictures}
-        placed.save(place, relief, world=far, record=record, **stored)
+        placed.save(place, relief, world=far, compress=config.compress, pictures=config.pictures, record=record)
         written[place] = mesh.count
     return written
 
