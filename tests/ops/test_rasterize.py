@@ -110,7 +110,7 @@ BAD_ARGUMENTS = {
     "viewmats": ({"viewmats": torch.eye(4)}, "viewmats must have shape"),
     "no cameras": ({"viewmats": torch.zeros(0, 4, 4), "Ks": torch.zeros(0, 3, 3), "backgrounds": None}, "viewmats"),
     "Ks": ({"Ks": torch.eye(3)[None]}, r"Ks must have shape \(B, 3, 3\) with B=2"),
-    "backgrounds": ({"backgrounds": torch.zeros(3)}, r"backgrounds must have shape \(B, C\)"),
+    "backgrounds": ({"backgrounds": torch.zeros(4)}, r"backgrounds must have shape \(C,\) or \(B, C\)"),
     "both colors": ({"corner_colors": torch.zeros(5, 3, 3)}, "exactly one of .* got face_colors and corner_colors"),
     "no colors": (
         {"face_colors": None},
