@@ -224,14 +224,9 @@ def test_a_mask_with_another_white_than_its_format_is_refused(tmp_path, kind, wh
     assert not load_mask(tmp_path / "a.png").any()
 
 
-@pytest.mark.parametrize(
-    ("image", "message"),
-    [
-        (255 * torch.rand(8, 8, 3), r"image: expected values in \[0, 1\], got others; divide by 255"),
-        (torch.rand(3, 8, 8), r"image: expected shape \(H, W, C\), got \(3, 8, 8\): pass image\.permute\(1, 2, 0\)"),
-    ],
-)
-def test_pictures_of_other_programs_are_not_written_as_white(image, message, tmp_path):
-    with pytest.raises(ValueError, match=message):
-        save_image(tmp_path / "x.png", image)
+def test_a_picture_with_channels_first_is_named(tmp_path):
+    with pytest.raises(
+        ValueError, match=r"image: expected shape \(H, W, C\), got \(3, 8, 8\): pass image\.permute\(1, 2, 0\)"
+    ):
+        save_image(tmp_path / "x.png", torch.rand(3, 8, 8))
     assert not (tmp_path / "x.png").exists()

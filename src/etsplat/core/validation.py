@@ -13,9 +13,6 @@ from etsplat import _native
 
 Shape = tuple[str | int, ...]
 
-_BRIGHT = 2.0
-"""No picture of values in [0, 1], with what optimization leaves beyond, is so bright in the mean."""
-
 
 def check_shape(name: str, tensor: Tensor, *shapes: Shape, sizes: dict[str, int] | None = None) -> None:
     """Match ``tensor`` to one of ``shapes`` and remember the sizes of the letters in it.
@@ -316,10 +313,8 @@ def check_choice(name: str, value: object, choices: Sequence[object]) -> None:
         raise ValueError(f"{name} must be one of {', '.join(map(repr, choices))}, got {value!r}")
 
 
-def check_display_image(name: str, image: Tensor) -> None:
-    """Raise ValueError where an (H, W, C) image has its channels first, or values up to 255 in the place of 1."""
+def check_channels_last(name: str, image: Tensor) -> None:
+    """Raise ValueError where an (H, W, C) image has its channels first."""
     if image.shape[0] in (1, 3, 4) and image.shape[-1] > 4:
         got = tuple(image.shape)
         raise ValueError(f"{name}: expected shape (H, W, C), got {got}: pass {name}.permute(1, 2, 0)")
-    if float(image.detach().mean()) > _BRIGHT:  # not of one that is NaN
-        raise ValueError(f"{name}: expected values in [0, 1], got others; divide by 255 what is from 0 to 255")

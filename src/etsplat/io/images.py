@@ -10,7 +10,7 @@ from PIL import Image, UnidentifiedImageError, features
 from torch import Tensor
 
 from etsplat.core.errors import InputError
-from etsplat.core.validation import check_display_image, check_floating, check_memory
+from etsplat.core.validation import check_channels_last, check_floating, check_memory
 from etsplat.io.atomic import atomic_write
 from etsplat.io.exif import on_its_side, turn_of
 from etsplat.io.paths import given_path, kind_of
@@ -237,7 +237,7 @@ def save_image(path: Path | str, image: Float[Tensor, "H W C"]) -> None:
         image: 1, 3 or 4 channels (straight alpha; JPEG has none), values in [0, 1] (others are clamped).
 
     Raises:
-        ValueError: wrong shape, whole numbers, values up to 255, or some that are not finite.
+        ValueError: wrong shape, whole numbers, or values that are not finite.
         InputError: the file cannot be written.
 
     Example:
@@ -252,7 +252,7 @@ def save_image(path: Path | str, image: Float[Tensor, "H W C"]) -> None:
     check_memory("image", image)
     check_floating("image", image)
     if image.ndim == 3 and image.numel():
-        check_display_image("image", image)
+        check_channels_last("image", image)
     if image.ndim != 3 or image.shape[-1] not in channels:
         raise ValueError(f"image: expected shape (H, W, C) with C in {channels}, got {tuple(image.shape)}")
     pixels = Image.fromarray(to_8_bit(image).cpu().numpy().squeeze(axis=-1 if image.shape[-1] == 1 else ()))

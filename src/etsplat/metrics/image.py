@@ -16,10 +16,13 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from etsplat.core.errors import InputError
-from etsplat.core.validation import check_device, check_display_image, check_floating, check_memory
+from etsplat.core.validation import check_channels_last, check_device, check_floating, check_memory
 from etsplat.engines.threads import all_torch_threads, one_torch_thread
 from etsplat.io.paths import kind_of
 from etsplat.io.tensors import read_state_dict
+
+_BRIGHT = 2.0
+"""No photo of values in [0, 1] is so bright in the mean."""
 
 _C1, _C2 = 0.01**2, 0.03**2
 WINDOW, _SIGMA = 11, 1.5
@@ -311,8 +314,9 @@ def _check_pair(image: Tensor, truth: Tensor) -> None:
     check_floating("truth", truth)
     if image.numel() == 0:
         raise ValueError(f"image: expected a pixel or more, got shape {tuple(image.shape)}")
-    check_display_image("image", image)
-    check_display_image("truth", truth)
+    check_channels_last("image", image)
+    if float(truth.mean()) > _BRIGHT:  # not of one that is NaN; the image may be what optimization left
+        raise ValueError("truth: expected values in [0, 1], got others; divide by 255 what is from 0 to 255")
 
 
 def _blur(planes: Float[Tensor, "M C H W"], padding: int) -> Float[Tensor, "M C H2 W2"]:
