@@ -175,6 +175,25 @@ def test_a_thin_bridge_is_cut_where_no_photo_sees_it() -> None:
     assert genera(found[1], len(found[0])) == [0]
 
 
+def looped(places: np.ndarray) -> np.ndarray:
+    """The bowl with a loop on its bottom, two cells wide, as a cut leaves it."""
+    x, y, z = places.T
+    return np.minimum(bowl(places), np.hypot(np.hypot(x, y + 0.2) - 0.12, z) - 0.05)
+
+
+@pytest.mark.parametrize(("shape", "holes"), [(looped, 0), (handled, 1)])
+def test_a_handle_of_a_few_faces_goes_although_photos_agree_on_it(shape: SignedDistance, holes: int) -> None:
+    """A cup on a saucer ended with one on the bottom of its hollow, so near to it that photos agreed."""
+    _, views = photographed(shape)
+    photos, (vertices, faces) = photos_of(views), placed(shape, views)
+    assert genera(faces, len(vertices)) == [1]
+    most = silhouette_errors(photos, vertices, faces) + torch.tensor([0, _BLOCKED])
+    agreed = torch.ones(len(vertices)), torch.zeros(len(vertices), dtype=torch.bool)
+    found = _cut(photos, vertices, faces, agreed, most)
+    vertices, faces = (vertices, faces) if found is None else found
+    assert genera(faces, len(vertices)) == [holes]
+
+
 def test_a_surface_without_handles_is_left_alone() -> None:
     truth, views = photographed(bowl)
     found = without_false_handles(views, *truth)

@@ -8,7 +8,7 @@ would leave a gap in some, and a true hole that is closed would block the light 
 A bridge between two feet that nearly touch is no such region, and one with the feet is what silhouettes need. So then
 the shortest loops that bound no disc are looked at: what is as thin as a few edges, or a hole as narrow, is cut there
 and closed by two discs, if photos contradict each other along the loop, or too few see it to say, and no silhouette
-needs it.
+needs it. Where all of a handle is as small as that, photos that agree only say that something is near.
 """
 
 import numpy as np
@@ -48,6 +48,9 @@ _BESIDE = 0.05
 
 _THIN = 8
 """Edges of a loop at most: whether a thicker handle is there photos can tell by its whole surface."""
+
+_RINGS = 2
+"""Of faces around a band along a loop, within which a small handle is with its hole."""
 
 _BLOCKED = 0.001
 """So much beside a silhouette may be covered where a loop is cut, and no pixel of it uncovered: the gap that a cut
@@ -110,15 +113,29 @@ def _cut(
         band = torch.isin(faces, torch.tensor(loop)).any(dim=1)
         tried[faces[band]] = True
         around = faces[band].unique()
-        if not (float(hidden[around].float().mean()) > 0.5 or float(score[around].nanmean()) < _LEVELS[-1]):
+        doubted = float(hidden[around].float().mean()) > 0.5 or float(score[around].nanmean()) < _LEVELS[-1]
+        if not doubted and not _small(faces, band):
             continue
         found = without_specks(*with_discs(vertices, faces, band), least=least)
         after = genera(found[1], len(found[0]))
         if sum(after) >= sum(before) or len(after) != len(before):
             continue
-        if all(bool((silhouette_errors([p], *found) <= limit).all()) for p, limit in zip(photos, most, strict=True)):
+        kept = (bool((silhouette_errors([p], *found) <= limit).all()) for p, limit in zip(photos, most, strict=True))
+        if all(kept) and (doubted or not _lets_go(photos, (vertices, faces), found)):
             return found
     return None
+
+
+def _small(faces: Tensor, band: Bool[Tensor, " F"]) -> bool:
+    """Whether a few rings of faces around a band along a loop have all of a handle, with its hole."""
+    for _ in range(_RINGS):
+        band = torch.isin(faces, faces[band].unique()).any(dim=1)
+    used, inside = faces[band].unique(return_inverse=True)
+    topology = MeshTopology.from_faces(inside, len(used))
+    rim = topology.edges.long()[topology.edge_face_counts == 1]
+    ends, numbered = rim.unique(return_inverse=True)
+    rims = connected(numbered, len(ends))[0] if len(rim) else 0
+    return len(used) - len(topology.edges) + len(inside) + rims < 2
 
 
 def _agreement(photos: list[Photo], vertices: Tensor, faces: Tensor) -> tuple[Float[Tensor, " V"], Bool[Tensor, " V"]]:
