@@ -7,7 +7,14 @@ import numpy as np
 import pytest
 import torch
 
-from etsplat.data.agreement import contradicted, first_hits, looked_at, photos_of, plain_share
+from etsplat.data.agreement import (
+    contradicted,
+    first_hits,
+    looked_at,
+    photos_of,
+    plain_share,
+    surface_agreement,
+)
 from etsplat.data.closed_hollows import closed_hollows
 from etsplat.data.hollows import _mistaken, _where_agreed, _without_unseen, open_hollows
 from etsplat.data.meshing import dual_contour
@@ -145,7 +152,36 @@ def test_what_silhouettes_need_is_no_lid(bowl, inwards, mistaken):
     rim = height > 0.39
     moved = truth.clone()
     moved[rim, 1] -= 0.06 * float(inwards)
-    assert bool(_mistaken(photos, hits, moved, faces, rim, edges).any()) is mistaken
+    score = torch.zeros(len(truth))
+    assert bool(_mistaken(photos, hits, score, moved, faces, score, rim, edges).any()) is mistaken
+
+
+def test_what_photos_agree_on_no_better_once_it_is_open_is_no_lid(bowl):
+    """On ribs that repeat photos agree a rib too deep as well."""
+    truth, faces, views, *_ = bowl
+    photos = photos_of(views)
+    hits = [first_hits(photo, truth, faces) for photo in photos]
+    edges = MeshTopology.from_faces(faces, len(truth)).edges.long()
+    score = surface_agreement(photos, hits, truth, faces, edges)
+    deep = score > 0.8
+    assert deep.float().mean() > 0.3
+    for before, way, mistaken in ((score, 0.12, True), (score - 0.3, 0.12, False), (score, 0.05, False)):
+        far = torch.full_like(score, way)
+        assert bool(_mistaken(photos, hits, before, truth, faces, far, deep, edges)[deep].all()) is mistaken
+
+
+def ribbed(places: np.ndarray) -> np.ndarray:
+    """A column with ten ribs."""
+    x, y, z = places.T
+    return np.maximum(np.hypot(x, z) - 0.28 - 0.03 * np.cos(10 * np.arctan2(z, x)), np.abs(y) - 0.9)
+
+
+def test_ribs_stay_where_they_are():
+    """A cactus: its trunk was pushed in all around, three times as far off as its hull."""
+    vertices, faces = (torch.from_numpy(each) for each in dual_contour(ribbed, (-1.2, -1.2, -1.2), 0.04, (60, 60, 60)))
+    views = photograph(MeshFile(vertices.float(), faces), 160, 160, supersampling=2)
+    hull, triangles = visual_hull(views, 1600)
+    assert open_hollows(views, hull, triangles).moved < 0.05 * len(hull)
 
 
 def test_it_repeats_to_the_bit(bowl):

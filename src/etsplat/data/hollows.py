@@ -45,6 +45,10 @@ hollow with dark walls little is seen before it is open."""
 _CONFIRMED = 0.5
 """Mean correlation on a hollow as photos see it once it is open, at least: its walls are seen at a slant."""
 
+_GAIN, _FAR = 0.1, 0.1
+"""And by so much more than on the lid before where lids go in by more than this, in units of the object's radius, in
+the mean: on ribs that repeat, photos agree a rib too deep, no better."""
+
 _LOST = 10.0
 """The correlation counts so much less, times the share of a lid's pixels at which silhouettes show what is gone once it
 is open: a few along its border, many where a wall is pushed in."""
@@ -194,7 +198,8 @@ def _push(photos: list[Photo], outside: Distance, vertices: Tensor, faces: Tenso
     moved[own] = vertices[own] + way[:, None] * inward
     deep = torch.zeros(len(vertices), dtype=torch.bool)
     deep[own] = way > depths[1]
-    way = way.masked_fill(_mistaken(photos, hits, moved, faces, deep, edges)[own], 0.0)
+    far = torch.zeros(len(vertices)).index_copy(0, own, way)
+    way = way.masked_fill(_mistaken(photos, hits, score, moved, faces, far, deep, edges)[own], 0.0)
     moved[own] = vertices[own] + way[:, None] * inward
     return _Look(moved, int((way > depths[1]).sum()), *said)
 
@@ -301,12 +306,14 @@ def _means(values: Float[Tensor, " N"], group: Int64[Tensor, " N"], count: int) 
 def _mistaken(
     photos: list[Photo],
     before: list[tuple[Tensor, Tensor]],
+    score: Float[Tensor, " V"],
     moved: Float[Tensor, "V 3"],
     faces: Int64[Tensor, "F 3"],
+    far: Float[Tensor, " V"],
     deep: Bool[Tensor, " V"],
     edges: Int64[Tensor, "E 2"],
 ) -> Bool[Tensor, " V"]:
-    """Moved vertices of what is no lid: once it is open photos do not agree, or silhouettes show what is gone.
+    """Moved vertices of what is no lid: once it is open photos agree no better, or silhouettes show what is gone.
 
     Where little is textured photos agree by chance at some depth, seen through a lid that is none: a plain wall, behind
     which nobody would see what agreed.
@@ -314,22 +321,26 @@ def _mistaken(
     Args:
         photos: which look.
         before: first hits of each, when nothing had moved.
+        score: (V,) how far they agreed then (`surface_agreement`).
         moved: (V, 3).
         faces: (F, 3).
+        far: (V,) how far.
         deep: (V,) which have.
         edges: (E, 2).
     """
     after = [first_hits(photo, moved, faces) for photo in photos]
     shown = surface_agreement(photos, after, moved, faces, edges)
     count, lid = connected(edges[deep[edges].all(dim=1)], len(deep))
-    agreement, _ = _means(torch.where(deep, shown, torch.nan), lid, count)
+    agreement, closed = (_means(torch.where(deep, each, torch.nan), lid, count)[0] for each in (shown, score))
     own = torch.where(deep, lid, -1)[faces].amax(dim=1)
     seen, lost = torch.zeros(count), torch.zeros(count)
     for photo, (_, was), (_, hit) in zip(photos, before, after, strict=True):
         of = torch.where(was >= 0, own[was.clamp_min(0)], -1)
         seen += of[of >= 0].bincount(minlength=count)
         lost += of[(of >= 0) & (hit < 0) & (photo.pixels[0, 3] > 0.95)].bincount(minlength=count)
-    return deep & (agreement - _LOST * lost / seen.clamp_min(1) < _CONFIRMED)[lid]
+    way, _ = _means(torch.where(deep, far, torch.nan), lid, count)
+    least = torch.where(way > _FAR, closed + _GAIN, 0.0).clamp_min(_CONFIRMED)
+    return deep & (agreement - _LOST * lost / seen.clamp_min(1) < least)[lid]
 
 
 def _without_shafts(depth: Int64[Tensor, " N"], edges: Int64[Tensor, "E 2"], edge: float) -> Int64[Tensor, " N"]:
