@@ -48,7 +48,7 @@ WRONG = "must return a scalar tensor of the model's dtype and device, got"
     ("value", "got"),
     [
         (lambda drawing: 0.5, r"0\.5"),
-        (lambda drawing: drawing.model.vertices, r"a tensor of shape \(42, 3\)"),
+        (lambda drawing: drawing.rendering.color, r"a tensor of shape \(1, 16, 16, 3\)"),
         (lambda drawing: drawing.model.vertices.mean().double(), r"torch\.float64 on cpu, where photometric has"),
     ],
 )
@@ -58,13 +58,17 @@ def test_a_term_that_returns_something_else_is_named(value: Callable[[etsplat.Dr
 
 
 @pytest.mark.parametrize("name", ["rendering", "photo", "camera", "index"])
-def test_a_term_without_outputs_is_given_no_picture(name: str) -> None:
+def test_a_term_without_outputs_is_given_none_of_several_pictures(name: str) -> None:
     """On some ways of making a step it saw the first view, and on others ended in torch."""
     looks = custom(lambda drawing: getattr(drawing, name) * 0.0)
     with pytest.raises(ValueError, match=rf"terms\[1\] .*, Custom, looks at drawing\.{name}; without outputs .*\("):
-        a_trainer(terms=(etsplat.EdgeLength(0.1), looks)).fit(1)
+        a_trainer(terms=(etsplat.EdgeLength(0.1), looks), batch=2).fit(1)
     with pytest.raises(ValueError, match=rf"terms\[0\] .*, Custom, looks at drawing\.{name}"):
         etsplat.Objective(etsplat.Photometric(), [looks]).of_parameters(a_mesh(), (0.5,), 1.0)
+
+
+def test_a_term_without_outputs_may_look_at_the_only_picture_of_a_step() -> None:
+    a_trainer(terms=(custom(lambda drawing: drawing.rendering.color.mean()),)).fit(2)
 
 
 @pytest.mark.parametrize("outputs", ["normal", ("color", "normal")])

@@ -78,8 +78,9 @@ class OfParameters:
 
     def __getattr__(self, name: str) -> Any:
         raise _NotGivenError(
-            f"looks at drawing.{name}; without outputs it is given drawing.model alone, and counts once for all views "
-            'of a step: name what it looks at, as etsplat.Custom(function, outputs=("color",))'
+            f"looks at drawing.{name}; without outputs it counts once for all views of a step, and is given "
+            "drawing.model alone where there are several: name what it looks at, as etsplat.Custom(function, "
+            'outputs=("color",))'
         )
 
 
@@ -127,7 +128,7 @@ class Term(ABC):
 
 
 class Custom(Term):
-    """A term of one's own from a function of the drawing; without `outputs`, of `drawing.model` alone.
+    """A term of one's own from a function of the drawing; without `outputs` it counts once for all views of a step.
 
     Example:
         >>> def flat(drawing):
@@ -242,7 +243,8 @@ class Objective:
         Raises:
             ValueError: a term is no scalar tensor of the model's dtype and device.
         """
-        first, alone = _value_of("photometric", self.photometric, drawing), OfParameters(drawing.model, drawing.shared)
+        first = _value_of("photometric", self.photometric, drawing)
+        given = drawing if views == 1 else OfParameters(drawing.model, drawing.shared)  # not one view for all of them
         if views > 1:
             first = first / views
         if not isinstance(scale, Tensor) and scale == 0.0:
@@ -252,7 +254,7 @@ class Objective:
             if weight and (whole or term.outputs):
                 elsewhere = (apart and not term.outputs) or (decayed and term.squares is not None)
                 with torch.set_grad_enabled(torch.is_grad_enabled() and not elsewhere):
-                    value = _value_of(f"terms[{number}]", term, drawing if term.outputs else alone, first)
+                    value = _value_of(f"terms[{number}]", term, drawing if term.outputs else given, first)
                 summands.append(Summand(weight / views if term.outputs else weight, value, term.power))
         return weighted_sum(first, summands, scale)
 
