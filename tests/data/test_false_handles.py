@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from etsplat.core.cameras import camera_centers
-from etsplat.data.agreement import photos_of
+from etsplat.data.agreement import Photo, photos_of
 from etsplat.data.dataset import Dataset
 from etsplat.data.false_handles import (
     _ADDED,
@@ -27,6 +27,7 @@ from etsplat.geometry.topology import MeshTopology
 from helpers.painting import painted_pictures
 
 Surface = tuple[torch.Tensor, torch.Tensor]
+Agreement = tuple[torch.Tensor, torch.Tensor]
 
 
 def bowl(places: np.ndarray) -> np.ndarray:
@@ -151,14 +152,19 @@ def bridged(places: np.ndarray) -> np.ndarray:
     return np.minimum(bowl(places), np.maximum(aside - 0.06, np.abs(x - 0.43) - 0.2))
 
 
+def cut(photos: list[Photo], vertices: torch.Tensor, faces: torch.Tensor, agreed: Agreement) -> Surface:
+    """A surface without what `_cut` cuts, or as it was."""
+    most = silhouette_errors(photos, vertices, faces) + torch.tensor([0, _BLOCKED])
+    return _cut(photos, vertices, faces, agreed, most) or (vertices, faces)
+
+
 @pytest.mark.parametrize(("shown", "holes"), [(bowl, 0), (bridged, 1)])
 def test_a_thin_bridge_is_cut_unless_photos_show_it(shown: SignedDistance, holes: int) -> None:
     _, views = photographed(shown)
     photos, (vertices, faces) = photos_of(views), placed(bridged, views)
     assert genera(faces, len(vertices)) == [1]
     most = silhouette_errors(photos, vertices, faces) + torch.tensor([0, _BLOCKED])
-    found = _cut(photos, vertices, faces, _agreement(photos, vertices, faces), most)
-    vertices, faces = (vertices, faces) if found is None else found
+    vertices, faces = cut(photos, vertices, faces, _agreement(photos, vertices, faces))
     assert genera(faces, len(vertices)) == [holes]
     assert bool((silhouette_errors(photos, vertices, faces) <= most).all())
 
@@ -169,10 +175,9 @@ def test_a_thin_bridge_is_cut_where_no_photo_sees_it() -> None:
     below = [index for index in views.train if float(camera_centers(views.viewmats[index][None])[0, 1]) < -0.5]
     assert len(below) >= 3
     photos, (vertices, faces) = photos_of(replace(views, train=below)), placed(bridged, views)
-    most = silhouette_errors(photos, vertices, faces) + torch.tensor([0, _BLOCKED])
-    found = _cut(photos, vertices, faces, _agreement(photos, vertices, faces), most)
-    assert found is not None
-    assert genera(found[1], len(found[0])) == [0]
+    assert genera(faces, len(vertices)) == [1]
+    vertices, faces = cut(photos, vertices, faces, _agreement(photos, vertices, faces))
+    assert genera(faces, len(vertices)) == [0]
 
 
 def looped(places: np.ndarray) -> np.ndarray:
@@ -187,10 +192,7 @@ def test_a_handle_of_a_few_faces_goes_although_photos_agree_on_it(shape: SignedD
     _, views = photographed(shape)
     photos, (vertices, faces) = photos_of(views), placed(shape, views)
     assert genera(faces, len(vertices)) == [1]
-    most = silhouette_errors(photos, vertices, faces) + torch.tensor([0, _BLOCKED])
-    agreed = torch.ones(len(vertices)), torch.zeros(len(vertices), dtype=torch.bool)
-    found = _cut(photos, vertices, faces, agreed, most)
-    vertices, faces = (vertices, faces) if found is None else found
+    vertices, faces = cut(photos, vertices, faces, (torch.ones(len(vertices)), torch.zeros(len(vertices)).bool()))
     assert genera(faces, len(vertices)) == [holes]
 
 

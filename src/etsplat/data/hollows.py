@@ -196,9 +196,8 @@ def _push(photos: list[Photo], outside: Distance, vertices: Tensor, faces: Tenso
     seen = seen_by(photos, [first_hits(photo, moved, faces) for photo in photos], moved[own], pixel)
     way = _without_unseen(way, seen, edges.flatten().bincount(minlength=len(vertices))[own], links)
     moved[own] = vertices[own] + way[:, None] * inward
-    deep = torch.zeros(len(vertices), dtype=torch.bool)
-    deep[own] = way > depths[1]
     far = torch.zeros(len(vertices)).index_copy(0, own, way)
+    deep = far > depths[1]
     way = way.masked_fill(_mistaken(photos, hits, score, moved, faces, far, deep, edges)[own], 0.0)
     moved[own] = vertices[own] + way[:, None] * inward
     return _Look(moved, int((way > depths[1]).sum()), *said)

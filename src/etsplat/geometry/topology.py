@@ -9,7 +9,7 @@ from functools import cached_property
 
 import numpy as np
 import torch
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
@@ -89,6 +89,16 @@ class MeshTopology:
             neighbor_offsets=neighbor_offsets,
             neighbor_indices=neighbor_indices,
         )
+
+    def changed(self, faces: Int[Tensor, "F 3"] | None, vertices: Float[Tensor, "V 3"] | None) -> "MeshTopology":
+        """That of other faces, on the same device, of these vertices or as many as before; this one if faces are None.
+
+        Raises:
+            ValueError: as `from_faces`.
+        """
+        if faces is None:
+            return self
+        return self.from_faces(faces.to(self.faces.device), self.num_vertices if vertices is None else len(vertices))
 
     def to(self, device: torch.device | str | None) -> "MeshTopology":
         """The same connectivity on another device; None for where it is."""

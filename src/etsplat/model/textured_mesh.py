@@ -253,10 +253,7 @@ class TexturedMesh(Model):
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
         """As of any `Model`."""
-        topology, faces = self.topology, state.get("faces")
-        if faces is not None:
-            count = len(state.get("vertices", self.vertices))
-            topology = MeshTopology.from_faces(faces.to(self.vertices.device), count)
+        topology = self.topology.changed(state.get("faces"), state.get("vertices"))
         super().load_state(state)
         self.topology = topology
         if "face_uvs" in state:
