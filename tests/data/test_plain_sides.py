@@ -6,11 +6,13 @@ from dataclasses import replace
 import pytest
 import torch
 
-from etsplat.data.agreement import photos_of
+from etsplat.core.cameras import camera_centers
+from etsplat.data.agreement import first_hits, photos_of
 from etsplat.data.false_handles import silhouette_errors
-from etsplat.data.plain_sides import _held, with_flat_sides
+from etsplat.data.plain_sides import with_flat_sides
 from etsplat.data.visual_hull import outside_hull, visual_hull
 from etsplat.geometry.distance import closest_points
+from etsplat.geometry.films import held
 from etsplat.geometry.topology import MeshTopology
 from helpers.painting import painted_pictures
 
@@ -67,6 +69,21 @@ def test_vertices_move_inwards_only(plain) -> None:
     assert float(outside_hull(views)(flat[moved]).max()) < 1e-3
 
 
+def test_a_bottom_that_no_photo_sees_is_flat() -> None:
+    """Photos from above alone: under the cube the hull is a cone. What photos see hides nothing of it afterwards."""
+    vertices, _, views = painted_pictures(*box())
+    above = [index for index in views.train if float(camera_centers(views.viewmats[index][None])[0, 1]) > 0.5]
+    views = replace(views, train=above)
+    hull = visual_hull(views, FACES)
+    flat = with_flat_sides(views, *hull), hull[1]
+    lowest = float(vertices[:, 1].min())
+    assert float(hull[0][:, 1].min()) < lowest - 0.2
+    assert float(flat[0][:, 1].min()) > lowest - 0.05
+    for photo in photos_of(views):
+        (before, _), (after, hit) = (first_hits(photo, *surface) for surface in (hull, flat))
+        assert float((before - after)[hit >= 0].max()) < 0.05
+
+
 def test_what_photos_tell_apart_stays() -> None:
     _, _, views = painted_pictures(*box(16), painted=True)
     hull = visual_hull(views, FACES)
@@ -93,4 +110,4 @@ def test_borders_stay(plain) -> None:
 def test_parts_that_nothing_holds_stay() -> None:
     edges = torch.tensor([[0, 1], [1, 2], [3, 4]])
     free = torch.tensor([True, True, False, True, True])
-    assert _held(free, edges).tolist() == [True, True, False, False, False]
+    assert held(free, edges).tolist() == [True, True, False, False, False]

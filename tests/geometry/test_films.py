@@ -2,7 +2,7 @@
 
 import torch
 
-from etsplat.geometry.films import film, tight_film
+from etsplat.geometry.films import film, slits_closed, tight_film
 from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.measures import enclosed_volume
 from etsplat.geometry.topology import MeshTopology
@@ -17,6 +17,18 @@ def test_a_slit_in_a_ball_closes() -> None:
     assert torch.equal(closed[~slit], vertices[~slit])
     assert (closed[slit] - vertices[slit]).norm(dim=1).max() < 0.05
     assert 0.98 * enclosed_volume(vertices, faces) < enclosed_volume(closed, faces) <= enclosed_volume(vertices, faces)
+
+
+def test_a_hollow_beside_a_slit_stays_open() -> None:
+    """Each patch by itself."""
+    vertices, faces = icosphere(4)
+    slit, hollow = ((vertices[:, 0].abs() < 0.1) & (side * vertices[:, 1] > 0.5) for side in (1, -1))
+    cut = vertices.clone()
+    cut[slit, 1] -= 0.15
+    cut[hollow, 1] += 0.5
+    closed = slits_closed(cut, faces, slit | hollow, 0.4)
+    assert torch.equal(closed[hollow], cut[hollow])
+    assert (closed[slit] - vertices[slit]).norm(dim=1).max() < 0.05
 
 
 def test_where_nothing_is_free_nothing_moves() -> None:

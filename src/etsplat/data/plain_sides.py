@@ -1,8 +1,9 @@
-"""Plain sides of a hull: over a flat side it stands like a tent, and where photos show one colour nothing says so.
+"""Sides of a hull of which photos say nothing: over a flat side it stands like a tent.
 
-The silhouettes need the side's edges alone: each line of sight that touches the tent touches an edge too, where the
-hull is sharper. So of the vertices that silhouettes need, the sharpest stay; the others, where photos that see them
-show nothing to compare, are drawn to the smallest surface between those that stay, and inwards only.
+Where photos show one colour, the silhouettes need the side's edges alone: each line of sight that touches the tent
+touches an edge too, where the hull is sharper. So of the vertices that silhouettes need, the sharpest stay; the others
+are drawn to the smallest surface between those that stay, and inwards only. So is what no photo sees, such as the
+bottom of what stands on a table, under which the hull is a cone: all of it, as far as it hides nothing that is seen.
 """
 
 import numpy as np
@@ -21,9 +22,9 @@ from etsplat.data.agreement import (
 )
 from etsplat.data.dataset import Dataset
 from etsplat.data.silhouettes import Silhouette
-from etsplat.geometry.films import tight_film
+from etsplat.geometry.films import held, tight_film
 from etsplat.geometry.measures import mean_edge, vertex_normals
-from etsplat.geometry.topology import MeshTopology, connected
+from etsplat.geometry.topology import MeshTopology
 
 _OUTLINE = 1.5
 """Pixels from the outline, within which a vertex touches it."""
@@ -42,6 +43,9 @@ _REACH = 0.75
 
 _LEAST = 0.02
 """Share of the vertices that plain sides have at least: for less a hull is better left as it is."""
+
+_HIDES = 2.0
+"""Pixels in front of what was seen before, from which on a vertex hides it."""
 
 _SOLVES = 8
 """Rounds in which vertices are found that have to stay after all."""
@@ -65,29 +69,27 @@ def with_flat_sides(
     topology = MeshTopology.from_faces(faces, len(vertices))
     edges = topology.edges.long()
     hits = [first_hits(photo, vertices, faces) for photo in photos]
-    free = _plain(photos, hits, vertices, faces, edges)
+    sees = seen_by(photos, hits, vertices, pixel_size(photos)).sum(dim=0)
+    unseen, score = sees == 0, surface_agreement(photos, hits, vertices, faces, edges)
+    free = _silent(unseen | (score.isnan() & (sees >= 2)), score, edges)
     free[edges[topology.edge_face_counts == 1].reshape(-1)] = False  # borders, where lids were
     if float(free.float().mean()) < _LEAST:
         return vertices
     normals = vertex_normals(vertices, faces)
     views = [Silhouette(dataset, index) for index in dataset.train]
-    free &= ~_needed(photos, views, vertices, normals, edges, free)
-    free = _held(free, edges)
-    return _drawn_flat(photos, [face for _, face in hits], vertices, faces, edges, normals, free)
+    free &= unseen | ~_needed(photos, views, vertices, normals, edges, free)
+    free = held(free, edges)
+    return _drawn_flat(photos, hits, vertices, faces, edges, normals, free, unseen)
 
 
-def _plain(
-    photos: list[Photo], hits: list[tuple[Tensor, Tensor]], vertices: Tensor, faces: Tensor, edges: Tensor
-) -> Bool[Tensor, " V"]:
-    """Where photos show nothing to compare, though two at least see it, and beside that where they do not agree."""
-    pixel = pixel_size(photos)
-    score = surface_agreement(photos, hits, vertices, faces, edges)
-    plain = score.isnan() & (seen_by(photos, hits, vertices, pixel).sum(dim=0) >= 2)
+def _silent(nothing: Bool[Tensor, " V"], score: Float[Tensor, " V"], edges: Int64[Tensor, "E 2"]) -> Bool[Tensor, " V"]:
+    """Where photos say nothing, and beside that where they do not agree."""
+    silent = nothing.clone()
     source, target = torch.cat([edges, edges.flip(1)]).T
     for _ in range(_BESIDE):
-        beside = torch.zeros(len(plain)).index_add(0, target, plain[source].float()) > 0
-        plain = plain | (beside & (score < _AGREED))
-    return plain
+        beside = torch.zeros(len(silent)).index_add(0, target, silent[source].float()) > 0
+        silent |= beside & ~(score >= _AGREED)
+    return silent
 
 
 def _needed(
@@ -151,31 +153,30 @@ class _Outline:
         self._bare[self._near(vertices, reach)] = False
 
 
-def _held(free: Bool[Tensor, " V"], edges: Int64[Tensor, "E 2"]) -> Bool[Tensor, " V"]:
-    """The free vertices of parts of which some vertex stays: others would shrink to a point."""
-    count, part = connected(edges, len(free))
-    return free & (torch.zeros(count).index_add(0, part, (~free).float()) > 0)[part]
-
-
 def _drawn_flat(
     photos: list[Photo],
-    seen: list[Tensor],
+    hits: list[tuple[Tensor, Tensor]],
     vertices: Tensor,
     faces: Tensor,
     edges: Tensor,
     normals: Tensor,
     free: Tensor,
+    unseen: Tensor,
 ) -> Float[Tensor, "V 3"]:
-    """The smallest surface with free vertices, but for those that would move outwards or that silhouettes miss."""
-    free, moved = free.clone(), vertices
+    """The smallest surface; free vertices stay that outlines miss, that would move outwards, or hide others."""
+    free, moved, slack = free.clone(), vertices, _HIDES * pixel_size(photos)
     for _ in range(_SOLVES):
         if not bool(free.any()):
             return vertices
         moved = tight_film(vertices, edges, free)
         stay = free & (((moved - vertices) * normals).sum(dim=1) > 0)
-        for photo, before in zip(photos, seen, strict=True):
-            missed = (before >= 0) & (first_hits(photo, moved, faces)[1] < 0) & (photo.pixels[0, 3] > 0.95)
+        for photo, (depth, before) in zip(photos, hits, strict=True):
+            nearest, after = first_hits(photo, moved, faces)
+            missed = (before >= 0) & (after < 0) & (photo.pixels[0, 3] > 0.95)
+            hides = (before >= 0) & (after >= 0) & (nearest < depth - slack)
             stay[faces[before[missed]].reshape(-1)] = True
+            hiding = faces[after[hides]].reshape(-1)
+            stay[hiding[unseen[hiding]]] = True
         stay &= free
         if not bool(stay.any()):
             break

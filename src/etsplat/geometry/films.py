@@ -6,7 +6,7 @@ from scipy.sparse.linalg import splu
 from torch import Tensor
 
 from etsplat.geometry.laplacians import laplacian
-from etsplat.geometry.topology import MeshTopology
+from etsplat.geometry.topology import MeshTopology, connected
 
 _SWEEPS = 200
 """Of vertices between their neighbours."""
@@ -50,3 +50,30 @@ def tight_film(
     held[own] = 0
     places[own] = splu(rows[:, own].tocsc()).solve(-(rows @ held))
     return torch.from_numpy(places).to(vertices)
+
+
+def slits_closed(
+    vertices: Float[Tensor, "V 3"], faces: Int64[Tensor, "F 3"], free: Bool[Tensor, " V"], deepest: float
+) -> Float[Tensor, "V 3"]:
+    """A film at rest, but of those patches alone in which no vertex goes farther: what is deeper is a hollow, no slit.
+
+    Args:
+        vertices: (V, 3).
+        faces: (F, 3).
+        free: (V,) which may move; where all of a part may, it stays.
+        deepest: how far, in the units of the vertices.
+    """
+    edges = MeshTopology.from_faces(faces, len(vertices)).edges.long()
+    free = held(free, edges)
+    if not bool(free.any()):
+        return vertices
+    moved = tight_film(vertices, edges, free)
+    count, patch = connected(edges[free[edges].all(dim=1)], len(vertices))
+    farthest = torch.zeros(count).scatter_reduce(0, patch, (moved - vertices).norm(dim=1).float(), "amax")
+    return torch.where((farthest <= deepest)[patch, None], moved, vertices)
+
+
+def held(free: Bool[Tensor, " V"], edges: Int64[Tensor, "E 2"]) -> Bool[Tensor, " V"]:
+    """The free vertices of parts of which some vertex stays: others would shrink to a point."""
+    count, part = connected(edges, len(free))
+    return free & (torch.zeros(count).index_add(0, part, (~free).float()) > 0)[part]

@@ -10,7 +10,7 @@ from torch import Tensor
 from etsplat.core.rasterization import Rasterization
 from etsplat.core.validation import check_choice, check_count, check_number, shown
 from etsplat.geometry.discs import cut_open
-from etsplat.geometry.films import film
+from etsplat.geometry.films import slits_closed
 from etsplat.geometry.flips import flipped
 from etsplat.geometry.measures import face_areas
 from etsplat.geometry.subdivision import longest_edge_plan
@@ -29,6 +29,10 @@ from etsplat.optim.terms.soup import Spared
 
 _SHORT = 0.5
 """Folds in which a vertex would have to move farther than this stay where a longer reach spoilt the pictures."""
+
+
+_DEEPEST = 0.4
+"""Slits in what nobody sees are no deeper, in units of the ball around an object; what is deeper is a hollow."""
 
 
 class Strategy:
@@ -133,7 +137,8 @@ class SubdivideAndUntangle(Strategy):
             reach: folds in which a vertex would have to move farther stay (`geometry.untangle`). If it is more than a
                 half, and that spoils the pictures, a half is tried.
             unseen: of vertices and faces, on the CPU, which vertices no picture shows. Before each untangling they
-                become a film (`geometry.films`): regularizers alone leave slits in what nobody sees, and deepen them.
+                become a film (`geometry.films`), but for hollows: regularizers alone leave slits in what nobody sees,
+                and deepen them.
             lids: of vertices, faces and their colours, on the CPU, which faces pictures look through. They are removed
                 at each edit but the last, before what else it does, or stay where that spoils the pictures.
             outlines: of vertices and how they hang together, on the CPU, where outlines say that vertices belong.
@@ -212,7 +217,7 @@ class SubdivideAndUntangle(Strategy):
         with torch.no_grad():
             vertices, faces = model.vertices.detach().cpu(), topology.faces.long()
             if self._unseen is not None:
-                vertices = film(vertices, faces, self._unseen(vertices, faces))
+                vertices = slits_closed(vertices, faces, self._unseen(vertices, faces), _DEEPEST)
             model.vertices.copy_(untangle(vertices, topology, reach=reach)[0])
 
     def _lids_at(self, iteration: int) -> Tensor | None:
