@@ -6,7 +6,7 @@ import torch
 from etsplat.data.demo_object import demo_object
 from etsplat.data.photograph import photograph
 from etsplat.data.pictures import StoredPictures
-from etsplat.data.visual_hull import visual_hull, without_specks
+from etsplat.data.visual_hull import outside_hull, visual_hull, without_specks
 from etsplat.geometry.distance import closest_points
 from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.parts import face_parts, genera
@@ -96,3 +96,14 @@ def test_what_was_a_part_before_a_cut_is_no_speck_after_it():
     _, kept = without_specks(found, triangles, least=int(face_parts(triangles, len(found)).bincount().min()))
     assert len(kept) == len(triangles)
     assert len(without_specks(found, triangles)[1]) < len(triangles)
+
+
+def test_what_is_free_within_the_hull_is_no_part_of_its_surface(object_and_views):
+    """Nobody sees into it."""
+    _, _, views = object_and_views
+    places = 2 * torch.rand(20_000, 3, generator=torch.Generator().manual_seed(0)) - 1
+    depth, deepest = (-outside_hull(views)(places)).max(dim=0)
+    found, triangles = visual_hull(
+        views, 4000, free=lambda points: 0.6 * depth - (points - places[deepest]).norm(dim=1)
+    )
+    assert genera(triangles, len(found)) == [1, 0]

@@ -55,3 +55,15 @@ CAN = [
     *line((0.7, 0.4), (0.04, 0.4)),
     (0.0, 0.4),
 ]
+MUG_WALL = 0.1
+"""Thickness of the walls and of the bottom of `MUG`."""
+
+MUG = [
+    (0.0, -0.7),
+    *line((0.04, -0.7), (0.5, -0.7)),
+    *line((0.5, -0.7), (0.5, 0.6)),
+    *line((0.5, 0.6), (0.5 - MUG_WALL, 0.6), 3),
+    *line((0.5 - MUG_WALL, 0.6), (0.5 - MUG_WALL, -0.7 + MUG_WALL)),
+    *line((0.5 - MUG_WALL, -0.7 + MUG_WALL), (0.04, -0.7 + MUG_WALL)),
+    (0.0, -0.7 + MUG_WALL),
+]

@@ -1,5 +1,7 @@
 """What a coarse soup sees of a hollow into which no lid of the hull can be pushed."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -9,10 +11,11 @@ from etsplat.data.closed_hollows import closed_hollows
 from etsplat.data.hollows import open_hollows
 from etsplat.data.visual_hull import visual_hull
 from etsplat.engines.threads import num_threads, set_num_threads
+from etsplat.geometry.parts import Shape, shape_of
 from etsplat.tasks.judgement import CONTRADICTED
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 from helpers.painting import painted_pictures
-from helpers.revolved import BOWL, VASE, revolved
+from helpers.revolved import BOWL, MUG, VASE, revolved
 
 CONFIG = ReconstructConfig.quick().changed({"start.hull_faces": 1600})
 
@@ -51,6 +54,22 @@ def test_no_soup_is_asked_where_photos_agree(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(starts, "seen_through", None)
     _, _, views = painted_pictures(*revolved(BOWL))
     assert starts.make_start(None, views, CONFIG).cut is None
+
+
+def test_no_soup_is_asked_where_photos_agree_on_the_walls_of_a_hollow(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A mug in few photos, whose lid does not go down."""
+    monkeypatch.setattr(starts, "seen_through", None)
+    vertices, faces, views = painted_pictures(*revolved(MUG))
+    views = replace(views, train=views.train[::2])
+    lidded = open_hollows(views, *visual_hull(views, 3200))
+    assert lidded.contradicted > CONTRADICTED
+    started = starts.make_start(None, views, CONFIG.changed({"start.hull_faces": 3200}))
+    assert started.cut
+    assert started.contradicted <= CONTRADICTED
+    assert shape_of(*started.mesh.surface()) == Shape(1, 0)
+    before, after = ((lidded.vertices, lidded.faces), started.mesh.surface())
+    closed = closed_hollows(views, (vertices, faces), before)
+    assert closed_hollows(views, (vertices, faces), after) < 0.1 * closed
 
 
 def test_a_cut_that_photos_contradict_as_much_is_not_taken(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -21,6 +21,7 @@ from etsplat.data.meshing import dual_contour
 from etsplat.data.silhouettes import Silhouette
 from etsplat.data.thin_parts import ThinParts
 from etsplat.geometry.manifold import taken_apart
+from etsplat.geometry.measures import enclosed_volume
 from etsplat.geometry.parts import face_parts
 
 Distance = Callable[[Float[Tensor, "N 3"]], Float[Tensor, " N"]]
@@ -99,7 +100,7 @@ def visual_hull(
         wanted = round(cells * (faces / len(triangles)) ** 0.5)
         if cells == (cells := min(max(wanted, _FIRST_CELLS // 2), _MOST_CELLS)):
             break
-    found = taken_apart(torch.from_numpy(vertices).float(), torch.from_numpy(triangles))
+    found = without_voids(*taken_apart(torch.from_numpy(vertices).float(), torch.from_numpy(triangles)))
     return without_specks(*found, spared=_shown_apart(dataset, *found, _APART * cell))
 
 
@@ -146,6 +147,15 @@ def _gap(vertices: Tensor, faces: Tensor, own: Tensor) -> float:
     """How far the vertices of some faces are from those of the others."""
     mine, others = (vertices[faces[which].unique()].numpy() for which in (own, ~own))
     return float(KDTree(others).query(mine)[0].min())
+
+
+def without_voids(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
+    """Only the parts of a closed surface that enclose something: what is free within another part nobody sees."""
+    part = face_parts(faces, len(vertices))
+    count = int(part.max()) + 1 if len(part) else 0
+    turned = [number for number in range(1, count) if enclosed_volume(vertices, faces[part == number]) < 0]
+    used, renumbered = faces[~torch.isin(part, torch.tensor(turned))].unique(return_inverse=True)
+    return vertices[used], renumbered
 
 
 def without_specks(

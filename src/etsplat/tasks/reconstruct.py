@@ -61,7 +61,7 @@ DEPTHS_NEAR, DEPTHS_FAR = 0.02, 0.15
 """When depth maps are compared with the mesh, as a fraction of a run that starts near the surface, or far from it."""
 
 
-_CUT = {None: "", True: ", cut open where a coarse soup sees through it", False: ", though photos contradict it"}
+_CUT = {None: "", True: ", cut open where photos see into it", False: ", though photos contradict it"}
 """What is said of a hull by `Started.cut`."""
 
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -18,7 +17,8 @@ from etsplat.data.hollows import Opened, open_hollows
 from etsplat.data.lids import without_lids
 from etsplat.data.plain_sides import with_flat_sides
 from etsplat.data.silhouettes import silhouette, touches_border
-from etsplat.data.visual_hull import NEAR, visual_hull
+from etsplat.data.visual_hull import NEAR, Distance, visual_hull
+from etsplat.data.walls import between_walls
 from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.parts import Shape, shape_of
 from etsplat.geometry.topology import MeshTopology
@@ -88,7 +88,7 @@ class Started(NamedTuple):
         kind: where it comes from.
         opened: the hull with its hollows open, and what photos say of it; None for another kind.
         hull: that it was, before it was mended; None for another kind.
-        cut: whether it was cut where a coarse soup sees through it; None where no soup was asked.
+        cut: whether it was cut open; None where photos do not contradict it.
     """
 
     mesh: TriangleMesh
@@ -185,10 +185,7 @@ def make_start(
         hull = plain_hull(views, config)
         opened = _opened(views, hull.vertices, hull.faces)
         if opened.contradicted > CONTRADICTED:
-            if tell is not None:
-                part = f"{100 * opened.contradicted:.1f} % of its surface"
-                tell(f"photos contradict the visual hull on {part}: a coarse soup is asked what is free")
-            opened, cut = _cut_open(views, hull, opened, config, device)
+            opened, cut = _cut_open(views, hull, opened, config, device, tell)
         faces = opened.faces
         vertices = with_flat_sides(views, opened.vertices, faces)
         vertices = untangle(vertices, MeshTopology.from_faces(faces, len(vertices)))[0]
@@ -218,27 +215,47 @@ def _opened(views: Dataset, vertices: Tensor, faces: Tensor) -> Opened:
 
 
 def _cut_open(
-    views: Dataset, hull: Hull, opened: Opened, config: ReconstructConfig, device: torch.device | None
+    views: Dataset,
+    hull: Hull,
+    opened: Opened,
+    config: ReconstructConfig,
+    device: torch.device | None,
+    tell: Callable[[str], None] | None,
 ) -> tuple[Opened, bool]:
-    """A hull that photos contradict, cut where a coarse soup sees through it, if they contradict that clearly less.
+    """A hull that photos contradict, cut out between walls, or where a coarse soup sees through it.
 
-    No cut is taken that leaves much of the silhouettes uncovered.
+    It is taken if photos contradict it clearly less, and much of the silhouettes is not left uncovered. A soup is asked
+    where there are no walls on which photos agree, or walls are not all.
     """
-    free, best, photos = seen_through(views, hull.vertices, config, device), opened, photos_of(views)
-    most, radius = hull.uncovered + _RIMS, config.start.radius
-    for margin in _MARGINS:
-        cut = partial(visual_hull, views, hull.wanted, radius=radius, thin=hull.thin)
-        vertices, faces = cut(free=lambda points, margin=margin: free(points) - margin)
-        if len(faces) == 0:
-            continue
-        found = _opened(views, vertices, faces)
-        better = found.contradicted < best.contradicted
-        if better and _uncovered(photos, found.vertices, found.faces) <= most:
-            best = found
-        if best.contradicted <= CONTRADICTED:
-            break
+    photos, most = photos_of(views), hull.uncovered + _RIMS
+
+    def cut(free: Distance, wanted: int) -> Opened:
+        surface = visual_hull(views, wanted, radius=config.start.radius, thin=hull.thin, free=free)
+        found = _opened(views, *surface) if len(surface[1]) else opened
+        return found if _uncovered(photos, found.vertices, found.faces) <= most else opened
+
+    def less(one: Opened, other: Opened) -> Opened:
+        return min(one, other, key=lambda each: each.contradicted)
+
+    flat = with_flat_sides(views, opened.vertices, opened.faces)
+    walls = between_walls(views, flat, opened.faces)
+    best = opened if walls is None else less(opened, cut(walls, min(2 * hull.wanted, _most_faces(config))))
+    if best.contradicted > CONTRADICTED:
+        if tell is not None:
+            part = f"{100 * opened.contradicted:.1f} % of its surface"
+            tell(f"photos contradict the visual hull on {part}: a coarse soup is asked what is free")
+        ahead = seen_through(views, hull.vertices, config, device)
+        for margin in _MARGINS:
+            best = less(best, cut(lambda points, margin=margin: ahead(points) - margin, hull.wanted))
+            if best.contradicted <= CONTRADICTED:
+                break
     clearly = best.contradicted <= _CLEARLY * opened.contradicted
     return (best, True) if clearly else (opened, False)
+
+
+def _most_faces(config: ReconstructConfig) -> int:
+    """That a hull may be asked for, and not have more than a run may have."""
+    return round(config.max_faces / (1 + NEAR))
 
 
 @torch.no_grad()
@@ -255,7 +272,7 @@ def plain_hull(views: Dataset, config: ReconstructConfig) -> Hull:
     if not views.has_masks:
         raise InputError("start.shape: hull needs masks or transparent pictures; give masks, or start from a sphere")
     wanted, radius = min(config.start.hull_faces, max(1, config.max_faces // 2)), config.start.radius
-    hull, most = _carved(views, wanted, radius), round(config.max_faces / (1 + NEAR))
+    hull, most = _carved(views, wanted, radius), _most_faces(config)
     if hull.uncovered > _UNCOVERED and most > wanted:
         finer = _carved(views, min(2 * wanted, most), radius)
         if len(finer.faces) <= config.max_faces and _mends(finer, hull):

@@ -1,0 +1,147 @@
+"""Hollows between walls that are about as thick everywhere: mugs, bowls and pots, whose lids may not be pushed in.
+
+Of a deep hollow photos see the walls at a slant, and few its bottom. So the whole of it is supposed at once: all that
+is farther than a wall's thickness from the hull, but for the lid, is free. Photos that look in through the lid agree on
+such walls where they are that thick, and hardly where they are not.
+"""
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int64
+from torch import Tensor
+
+from etsplat.data.agreement import Looked, agreement, averaged, first_hits, looked_at, pixel_size
+from etsplat.data.dataset import Dataset
+from etsplat.data.visual_hull import Distance
+from etsplat.geometry.distance import closest_points
+from etsplat.geometry.measures import face_areas, mean_edge, vertex_normals
+from etsplat.geometry.topology import connected
+
+_LID, _LIDS = 0.6, 3
+"""Correlation below which a vertex may be a lid's, and how many of the largest are looked at."""
+
+_LARGE = 0.01
+"""Of the surface, what a lid covers at least."""
+
+_PIXELS = range(2, 20)
+"""Thicknesses that are tried: agreement is about three pixels wide."""
+
+_SMOOTH = 3
+"""Rounds in which normals are averaged with their neighbours'."""
+
+_ALONE = 0.9
+"""A place is on a wall if nothing else of the surface is nearer than this, in units of the thickness."""
+
+_AGREED, _PEAK = 0.5, 0.3
+"""Mean correlation on walls, at least, which are seen at a slant; and by so much more than on the lid, or at the least
+likely thickness."""
+
+_THICK = 1.5
+"""Mean edges of the hull: thinner walls would have holes once they are meshed."""
+
+_KNOWN, _FEWEST = 0.2, 64
+"""Of the places on walls that two photos see, so many have texture, and so many there are: else it may be chance."""
+
+
+class _Walls(NamedTuple):
+    """A surface without a lid, and how thick it is there."""
+
+    faces: Int64[Tensor, "F 3"]
+    thickness: float
+
+
+@torch.no_grad()
+def between_walls(dataset: Dataset, vertices: Float[Tensor, "V 3"], faces: Int64[Tensor, "F 3"]) -> Distance | None:
+    """How far points within a hull are beyond its walls, in hollows whose walls photos agree on: positive there.
+
+    Args:
+        dataset: photos with alpha around an object in the unit ball.
+        vertices: (V, 3) of the hull.
+        faces: (F, 3) of it.
+
+    Returns:
+        A function of points; None where there is no such hollow.
+    """
+    looked = looked_at(dataset, vertices, faces)
+    found = [] if looked is None else [walls for lid in _lids(looked) if (walls := _walls(_Through(looked, lid)))]
+    if not found:
+        return None
+
+    def beyond(points: Tensor) -> Tensor:
+        deep = [closest_points(points, vertices, rest)[0].sqrt().to(points) - thick for rest, thick in found]
+        return torch.stack(deep).amax(dim=0)
+
+    return beyond
+
+
+def _lids(looked: Looked) -> list[Bool[Tensor, " F"]]:
+    """The largest patches on which photos do not agree, each with a ring of faces around it."""
+    vertices, faces, edges = looked.vertices, looked.faces, looked.topology.edges.long()
+    lid = looked.score < _LID
+    count, patch = connected(edges[lid[edges].all(dim=1)], len(vertices))
+    within, area = lid[faces].all(dim=1), face_areas(vertices, faces)
+    sizes = torch.zeros(count).index_add(0, patch[faces[within, 0]], area[within]) / area.sum()
+    largest = sizes.topk(min(_LIDS, count))
+    return [
+        torch.isin(faces, faces[within & (patch[faces[:, 0]] == number)].unique()).any(dim=1)
+        for size, number in zip(*largest, strict=True)
+        if size >= _LARGE
+    ]
+
+
+def _walls(through: "_Through") -> _Walls | None:
+    """The walls around the hollow under a lid, no thinner than a mesh of it can be; None where photos agree on none."""
+    thicknesses = [through.pixel * pixels for pixels in _PIXELS]
+    agreed = [through.agreed(thickness) for thickness in thicknesses]
+    best = max(range(len(agreed)), key=agreed.__getitem__)
+    least = min([through.closed, *(each for each in agreed if each > 0)])
+    if agreed[best] < max(_AGREED, least + _PEAK):
+        return None
+    return _Walls(through.rest, max(thicknesses[best], _THICK * through.edge))
+
+
+class _Through:
+    """What photos see through a lid.
+
+    Attributes:
+        rest: (F2, 3) the faces without it.
+        closed: mean correlation on it.
+        pixel: how large one is at the object.
+        edge: mean length of the surface's edges.
+    """
+
+    def __init__(self, looked: Looked, lid: Bool[Tensor, " F"]) -> None:
+        vertices, faces, edges = looked.vertices, looked.faces, looked.topology.edges.long()
+        self.rest, self.pixel, self.edge = faces[~lid], pixel_size(looked.photos), mean_edge(vertices, edges)
+        self.closed = float(looked.score[faces[lid].unique()].nanmean())
+        self._photos, self._vertices, self._own = looked.photos, vertices, self.rest.unique()
+        self._normals = averaged(vertex_normals(vertices, faces), edges, _SMOOTH)[self._own]
+        self._lid = [((hit >= 0) & lid[hit.clamp_min(0)]).float()[None, None] for _, hit in looked.hits]
+        self._behind = [first_hits(photo, vertices, self.rest)[0][None, None] for photo in looked.photos]
+
+    def agreed(self, thickness: float) -> float:
+        """Mean correlation on walls so thick, by how many photos see each place; 0 where too little is known."""
+        places = self._vertices[self._own] - thickness * self._normals
+        near = closest_points(places, self._vertices, self.rest)[0].sqrt() < _ALONE * thickness
+        places, normals = places[~near], -self._normals[~near]
+        seen = torch.stack([self._seen(number, places) for number in range(len(self._photos))])
+        views = seen.sum(dim=0)
+        asked = views >= 2
+        if not bool(asked.any()):
+            return 0.0
+        score = agreement(self._photos, self._lid, places[asked], normals[asked], seen[:, asked], self.pixel, fewest=2)
+        weight = torch.where(score.isnan(), 0, views[asked]).float()
+        known = int((weight > 0).sum())
+        if known < max(_FEWEST, _KNOWN * len(score)):
+            return 0.0
+        return float((weight * score.nan_to_num()).sum() / weight.sum())
+
+    def _seen(self, number: int, places: Float[Tensor, "N 3"]) -> Bool[Tensor, " N"]:
+        """Which places a photo sees through the lid, before it sees the outer side of the walls from within."""
+        photo = self._photos[number]
+        place, z = photo.project(places)
+        through, behind = (
+            photo.look_up(plane, place[None], "nearest")[0, 0] for plane in (self._lid[number], self._behind[number])
+        )
+        return (through > 0.5) & ((behind == 0) | (z <= behind + 0.5 * self.pixel))
