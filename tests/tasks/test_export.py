@@ -1,5 +1,6 @@
 """`etsplat.export`: from memory and from folders, what `etsplat export` writes."""
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import torch
 import trimesh
 
 import etsplat
+from etsplat.cli.parse import parse
 from etsplat.core.errors import InputError
 from etsplat.model.solid_soup import SolidSoup
 from etsplat.tasks.export_soup import export_soup
@@ -88,3 +90,15 @@ def test_a_texture_of_a_run_in_memory_is_made_of_the_data_set(tmp_path: Path) ->
         etsplat.texture_mesh(tmp_path / "run", size=64, faces=100)
     with pytest.raises(InputError, match="the data set is not what the run was made of"):
         etsplat.texture_mesh(tmp_path / "run", size=64, faces=100, scene=replace(views, train=views.train[1:]))
+
+
+@pytest.mark.parametrize("name", ["soup.safetensors", "opaque.safetensors"])
+def test_what_a_run_is_read_from_is_not_written_over(result, tmp_path: Path, name: str) -> None:
+    """The opaque mesh of a run was replaced by its soup, after which nothing could open the run."""
+    shutil.copytree(result.path, tmp_path / "run")
+    before = (tmp_path / "run" / name).read_bytes()
+    with pytest.raises(InputError, match=rf"^\S*{name}: is what is read; choose another file$"):
+        etsplat.export(tmp_path / "run", tmp_path / "run" / name)
+    with pytest.raises(InputError, match=rf"^--out \S*{name}: is what is read; choose another file$"):
+        parse(["export", str(tmp_path / "run"), "--out", str(tmp_path / "run" / name)]).run([])
+    assert (tmp_path / "run" / name).read_bytes() == before

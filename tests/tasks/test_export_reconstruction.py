@@ -42,6 +42,13 @@ def test_what_meshes_do_not_know_is_refused(result: etsplat.ReconstructResult, t
         etsplat.export(result, tmp_path / "owl.html")
 
 
+def test_the_mesh_that_is_read_is_not_written_over(result: etsplat.ReconstructResult) -> None:
+    """Moved in its own place it would be moved again by the next export, and a texture fitted to it where it is not."""
+    for source in (result, result.path):
+        with pytest.raises(etsplat.InputError, match=r"mesh\.ply: is what is read; choose another file"):
+            etsplat.export(source, result.path / "mesh.ply", etsplat.ExportConfig(scale=2.0))
+
+
 @pytest.mark.parametrize(
     ("kind", "textured"), [("glb", False), ("ply", False), ("obj", False), ("glb", True), ("obj", True)]
 )

@@ -231,7 +231,7 @@ class Export(Command):
         """Writes the file and says what is in it."""
         from etsplat.tasks.export_mesh import is_reconstruction
         from etsplat.tasks.export_soup import export_soup, why_soup
-        from etsplat.tasks.opened_runs import open_run
+        from etsplat.tasks.opened_runs import check_not_read, open_run
         from etsplat.tasks.soup_selection import faint_remedy, in_words
 
         if is_reconstruction(self.run_dir):
@@ -242,9 +242,7 @@ class Export(Command):
         crop = _crop(self.crop)
         opened = open_run(self.run_dir, self.scene, self.device)
         out = self._out(opened.folder, "soup")
-        read = self.run_dir / "soup.safetensors" if self.run_dir.is_dir() else self.run_dir
-        if out.resolve() == read.resolve():
-            raise InputError(f"--out {out}: is what is read; choose another file")
+        check_not_read(out, self.run_dir, "--out ")
         written = export_soup(opened, out, self.settings, crop)
         sky = f", {written.sky:,} of them in the object sky" if written.sky else ""
         print(f"{written.path}: {written.triangles:,} triangles{sky}")
@@ -270,15 +268,14 @@ class Export(Command):
 
     def _export_mesh(self) -> int:
         from etsplat.cli.progress import PhaseBar
-        from etsplat.io.run_directory import RunDirectory
         from etsplat.tasks.export_mesh import export_mesh
+        from etsplat.tasks.opened_runs import check_not_read
 
         if self.crop is not None:
             raise InputError("--crop: is for soups; leave it out for the mesh of a reconstruction")
         name = "textured" if self.settings.texture else "light" if self.settings.faces else "mesh"
         out = self._out(self.run_dir, name)
-        if out.resolve() == RunDirectory(self.run_dir).mesh_path(".ply").resolve():
-            raise InputError(f"--out {out}: is what is read; choose another file")
+        check_not_read(out, self.run_dir, "--out ")
         with PhaseBar() as bar:
             written = export_mesh(self.run_dir, out, self.settings, self.scene, self.device, bar.show)
         for path, faces in written.items():

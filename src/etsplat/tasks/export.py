@@ -13,7 +13,7 @@ from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.tasks.export_config import ExportConfig
 from etsplat.tasks.export_mesh import checked_for_meshes, is_reconstruction, write_mesh
 from etsplat.tasks.export_soup import Export, export_soup
-from etsplat.tasks.opened_runs import SoupRun, capture_at, open_run
+from etsplat.tasks.opened_runs import SoupRun, capture_at, check_not_read, open_run
 from etsplat.tasks.reconstruct import ReconstructResult
 from etsplat.tasks.train import TrainResult
 
@@ -57,8 +57,6 @@ def export(
         if getattr(config, name) is not None:
             raise InputError(f"{name}: belongs to a run of reconstruct; take etsplat.texture_mesh")
     path = given_path("path", path, "the path of a file")
-    if isinstance(source, ReconstructResult):
-        return _export_mesh(source.path, path, config, scene)
     if isinstance(source, TriangleMesh | MeshFile):
         how = "etsplat.texture_mesh gives it a texture, etsplat.save_mesh writes a mesh as it is"
         raise InputError(f"source: is of type {type(source).__name__}, and no soup; {how}")
@@ -67,9 +65,10 @@ def export(
         return export_soup(SoupRun(path.parent, soup, capture_at(scene)), path, config)
     found = given_path(
         "source",
-        source.path if isinstance(source, TrainResult) else source,
+        source.path if isinstance(source, TrainResult | ReconstructResult) else source,
         "a result of train or reconstruct, a TriangleSoup or a path",
     )
+    check_not_read(path, found)
     if is_reconstruction(found):
         return _export_mesh(found, path, config, scene)
     return export_soup(open_run(found, scene, "cpu"), path, config)

@@ -117,6 +117,23 @@ def capture_at(scene: Dataset | Path | str | None) -> Dataset | None:
     return scene if scene is None or isinstance(scene, Dataset) else load_dataset(scene, preload=False)
 
 
+def check_not_read(path: Path, source: Path, named: str = "") -> None:
+    """Sees to it that a file to write is none of those from which it is made, which it would replace.
+
+    Args:
+        path: of the file to write.
+        source: a run directory, or a file.
+        named: before the path in the message.
+
+    Raises:
+        InputError: it is.
+    """
+    run = RunDirectory(source)
+    read = (run.soup_path, run.opaque_path, run.mesh_path(".ply")) if source.is_dir() else (source,)
+    if path.resolve() in [file.resolve() for file in read]:
+        raise InputError(f"{named}{path}: is what is read; choose another file")
+
+
 def check_trains(run: Path) -> None:
     """Sees to it that a run is one that has a soup, or will have.
 
