@@ -26,6 +26,7 @@ from etsplat.tasks.scoring import evaluate_run
 from etsplat.tasks.sources import load_source
 from etsplat.tasks.train import train
 from etsplat.tasks.train_config import TrainConfig
+from etsplat.viewer import server
 from helpers.captures import circle_poses, write_colmap, write_photo, write_views
 
 
@@ -270,7 +271,7 @@ def test_an_object_that_is_small_in_its_photos_is_read_as_large_as_one_that_fill
         assert (len(set(near.images.sizes)), said) == (1, notes)
 
 
-def test_another_scene_than_that_of_the_training_is_noticed(trained, tmp_path, capsys):
+def test_another_scene_than_that_of_the_training_is_noticed(trained, tmp_path, capsys, monkeypatch):
     """Its numbers came to stand in the run's own report, without a word."""
     folder, _, _ = trained
     shutil.copytree(folder / "run", tmp_path / "run")
@@ -285,6 +286,12 @@ def test_another_scene_than_that_of_the_training_is_noticed(trained, tmp_path, c
     parse([*asked, str(tmp_path / "other"), "--out", str(tmp_path / "measured")]).run([])
     assert "on another scene than the run was trained on" in capsys.readouterr().out
     assert json.loads((tmp_path / "measured" / "evaluation.json").read_text())["other_scene"] is True
+    monkeypatch.setattr(server, "serve", lambda *_: None)
+    for command in (["render", "--width", "16", "--path", "photos", "--frames", "1", "--format", "frames"], ["view"]):
+        for name, said in (("moved", False), ("other", True)):
+            parse([*command, str(tmp_path / "run"), "--scene", str(tmp_path / name)]).run([])
+            about = f"{name} is another scene than the run was trained on: cameras are those of its photos"
+            assert (about in capsys.readouterr().out) == said
     written = etsplat.export(
         tmp_path / "run", tmp_path / "soup.glb", etsplat.ExportConfig(min_opacity=0.01), scene=tmp_path / "other"
     )

@@ -18,6 +18,7 @@ from etsplat.tasks.settings import Device, OneOf, engine_names
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from etsplat.tasks.opened_runs import SoupRun
     from etsplat.tasks.soup_selection import Crop
 
 AnySettings = TypeVar("AnySettings")
@@ -133,6 +134,12 @@ def _print(console: "Console", found: dict[str, Any]) -> None:
     )
 
 
+def _say_if_other(opened: "SoupRun", scene: Path | None) -> None:
+    """That pictures are drawn from where the photos of another scene were taken, on purpose or by a mistyped name."""
+    if opened.other_scene:
+        print(f"  {scene} is another scene than the run was trained on: cameras are those of its photos", flush=True)
+
+
 def _crop(text: str | None) -> "Crop | None":
     """What --crop says."""
     from etsplat.geometry.regions import region_of
@@ -179,6 +186,7 @@ class Render(Command):
 
         crop = _crop(self.crop)
         opened = open_run(self.run_dir, self.scene, self.device, self.engine)
+        _say_if_other(opened, self.scene)
         out = self.out or opened.folder / "renders"
         with PhaseBar() as bar:
             files = render_run(
@@ -330,6 +338,7 @@ class View(Command):
             if not self.run_dir.is_file():
                 wait_for_soup(self.run_dir, lambda text: print(f"{text} (Ctrl-C ends it)", flush=True))
             opened = open_run(self.run_dir, self.scene, self.device, self.engine)
+            _say_if_other(opened, self.scene)
             if opened.gone is not None:
                 print(f"  its scene {opened.gone} has gone: shown without its photos (--scene names it)", flush=True)
             serve(
