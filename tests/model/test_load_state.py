@@ -44,6 +44,7 @@ WRONG: list[tuple[str, dict[str, Any], str]] = [
     ("mesh", {"vertices": torch.zeros(42, 3).double()}, r"state\[vertices\] must be torch\.float32 as the model, got"),
     ("mesh", {"vertexes": torch.zeros(42, 3)}, "state must name some of vertices, .* got vertexes"),
     ("mesh", {"colors": torch.ones(80, 3), "faces": torch.full((80, 3), 42)}, "faces"),
+    ("mesh", {"faces": [[0, 1, 2]]}, r"state\[faces\] must be a tensor of shape \(rows, 3\), got list"),
     ("soup", {"opacity_logits": torch.zeros(5)}, r"state\[opacity_logits\] must have 80 rows .*, got 5: load all tog"),
     ("soup", {"sh_rest": torch.zeros(80, 8, 3)}, r"state\[sh_rest\] must have shape \(rows, 3, 3\), got \(80, 8, 3\)"),
     ("soup", {"sh_dc": [0.5]}, r"state\[sh_dc\] must be a tensor of shape \(rows, 1, 3\), got list"),
@@ -59,3 +60,11 @@ def test_what_does_not_fit_is_named_and_nothing_changes(kind: str, state: dict[s
     with pytest.raises(ValueError, match=message):
         model.load_state(state)
     assert all(tensor.equal(before[name]) for name, tensor in model.state().items())
+
+
+@pytest.mark.parametrize("kind", MODELS)
+@pytest.mark.parametrize("given", [None, ({}, {})])
+def test_what_is_no_state_is_named(kind: str, given: Any) -> None:
+    """As the pair that `apply_rows` returns, whose first is one."""
+    with pytest.raises(ValueError, match=r"state must be a Mapping, got (None|tuple): a dict of tensors by name"):
+        MODELS[kind]().load_state(given)

@@ -149,11 +149,27 @@ def test_steps_and_terms_say_which_model_they_are_for() -> None:
             term(etsplat.Drawing(a_mesh(), *[None] * 5))
 
 
+class OneWord(etsplat.Strategy):
+    outputs = "statistics"  # pyright: ignore[reportAssignmentType]
+
+
+class Unknown(etsplat.Strategy):
+    outputs = ("weights",)
+
+
+class Attribute(etsplat.Strategy):
+    def __init__(self) -> None:
+        self.state = {}  # pyright: ignore[reportAttributeAccessIssue]
+
+
 @pytest.mark.parametrize(
     ("given", "message"),
     [
         ({"strategy": etsplat.Fixed}, "strategy must be a Strategy, got the class Fixed: make one"),
         ({"strategy": "fixed"}, "strategy must be a Strategy, got 'fixed'"),
+        ({"strategy": OneWord()}, r"strategy\.outputs must be a sequence of names, got 'statistics': make it a tuple"),
+        ({"strategy": Unknown()}, r"strategy\.outputs must be one of 'color', .* got 'weights'"),
+        ({"strategy": Attribute()}, r"strategy\.state must be a method that returns tensors by name, got dict"),
         ({"dataset": "scene"}, r"dataset must be a Dataset, got 'scene': etsplat\.load_dataset\(path\) reads one"),
         ({"paces": {"vertexes": torch.ones_like}}, "paces name vertexes; the model has vertices, colors"),
         ({"batch": 1.5}, r"batch must be an integer of at least 1, got 1\.5"),
@@ -254,6 +270,70 @@ class RemoveAll(etsplat.Strategy):
         kept = torch.zeros(self.model.count, dtype=torch.bool)
         self.model.load_state(etsplat.apply_rows(etsplat.RowPlan.keeping(kept), self.adam, {})[0])
         return True
+
+
+class Edits(etsplat.Strategy):
+    """Edits at each iteration by a function of the strategy, which says what `edit` returns."""
+
+    def __init__(self, edit_by: Callable[[etsplat.Strategy], Any]) -> None:
+        self.edit_by = edit_by
+
+    def next_edit(self, iteration: int) -> int:
+        return iteration
+
+    def edit(self, iteration: int) -> bool:
+        return self.edit_by(self)
+
+
+def _assigned(strategy: etsplat.Strategy) -> bool:
+    strategy.model.vertices = strategy.model.vertices.detach()[1:]
+    return True
+
+
+def _without_adam(strategy: etsplat.Strategy) -> bool:
+    strategy.model.load_state({name: tensor[1:] for name, tensor in strategy.model.state().items()})
+    return True
+
+
+def _without_model(strategy: etsplat.Strategy) -> bool:
+    etsplat.apply_rows(etsplat.RowPlan.keeping(torch.arange(strategy.model.count) > 0), strategy.adam, {})
+    return True
+
+
+def _silently(strategy: etsplat.Strategy) -> None:
+    plan = etsplat.RowPlan.keeping(torch.arange(strategy.model.count) > 0)
+    strategy.model.load_state(etsplat.apply_rows(plan, strategy.adam, {})[0])
+
+
+@pytest.mark.parametrize(
+    ("edit", "message"),
+    [
+        (
+            _assigned,
+            "Edits replaced vertices of the model or of its optimizer at iteration 1, and not of both: edit by",
+        ),
+        (_without_adam, "Edits replaced vertices, .* of the model or of its optimizer at iteration 1, and not of both"),
+        (
+            _without_model,
+            "Edits replaced vertices, .* of the model or of its optimizer at iteration 1, and not of both",
+        ),
+        (_silently, "Edits replaced tensors at iteration 1, and returned None: edit is to return True"),
+    ],
+)
+def test_an_edit_of_half_is_named(edit: Callable[[etsplat.Strategy], Any], message: str) -> None:
+    """The next step said that a parameter had no gradient, or another shape than one that nobody had touched."""
+    with pytest.raises(ValueError, match=message):
+        a_trainer(a_soup(), strategy=Edits(edit)).fit(3)
+
+
+@pytest.mark.parametrize("found", [{"seen": 3}, {"seen": {}}, [torch.zeros(1)], None])
+def test_a_strategy_whose_state_cannot_be_kept_is_named(found: Any, tmp_path: Path) -> None:
+    class Counting(etsplat.Strategy):
+        def state(self) -> Any:
+            return found
+
+    with pytest.raises(ValueError, match=r"Counting\.state must return tensors by name, got "):
+        a_trainer(strategy=Counting()).fit(1, run=tmp_path / "run")
 
 
 def test_a_strategy_that_removes_all_triangles_ends_the_run() -> None:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from etsplat.core.cameras import Cameras
 from etsplat.core.rasterization import Rasterization
-from etsplat.core.validation import check_place, check_shape
+from etsplat.core.validation import check_kind, check_place, check_shape
 
 Depth = Literal["plane", "centroid"]
 Backgrounds = Float[Tensor, "3"] | Float[Tensor, "B 3"]
@@ -147,6 +147,7 @@ class Model(Protocol):
         return {}
 
     def _check_state(self, state: Mapping[str, Tensor]) -> None:
+        check_kind("state", state, Mapping, "a dict of tensors by name, as state() returns")
         own = self.state()
         if unknown := sorted(set(state) - set(own)):
             raise ValueError(f"state must name some of {', '.join(own)}, got {', '.join(unknown)}")

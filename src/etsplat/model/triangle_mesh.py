@@ -290,6 +290,7 @@ class TriangleMesh(Model):
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
         """As of any `Model`."""
+        self._check_state(state)
         topology = self.topology.changed(state.get("faces"), state.get("vertices"))
         super().load_state(state)
         self.topology = topology

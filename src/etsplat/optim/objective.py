@@ -196,10 +196,7 @@ class Objective:
         for name, term in (("photometric", photometric), *((f"terms[{k}]", t) for k, t in enumerate(self.terms))):
             function = callable(term) and not isinstance(term, type)
             check_kind(name, term, Term, "etsplat.Custom(function) makes one" if function else "make one")
-            if isinstance(term.outputs, str):
-                raise ValueError(f"{name}.outputs must be a sequence of names, got {term.outputs!r}: make it a tuple")
-            for output in term.outputs:
-                check_choice(f"{name}.outputs", output, OUTPUTS)
+            check_asked(name, term.outputs)
         self.depth_of: Depth = depth_of
 
     def __repr__(self) -> str:
@@ -307,6 +304,14 @@ class Objective:
             Summand(weight, _value_of(f"terms[{number}]", term, drawing), term.power) for number, term, weight in alone
         ]
         return weighted_sum(torch.zeros_like(summands[0].value), summands, scale)
+
+
+def check_asked(name: str, outputs: Sequence[str]) -> None:
+    """Raises ValueError where a part of a run asks for outputs that there are not, or by one word."""
+    if isinstance(outputs, str):
+        raise ValueError(f"{name}.outputs must be a sequence of names, got {outputs!r}: make it a tuple")
+    for output in outputs:
+        check_choice(f"{name}.outputs", output, OUTPUTS)
 
 
 def _named(weight: Scheduled) -> str:

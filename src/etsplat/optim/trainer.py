@@ -32,10 +32,12 @@ from etsplat.optim.stepper import Stepper
 from etsplat.optim.strategies import Fixed, Strategy
 from etsplat.optim.trainer_checks import (
     check_callbacks,
+    check_edited,
     check_parts,
     checked_background,
     checked_metrics,
     generator_of,
+    state_of,
 )
 from etsplat.optim.watch import Outcome, Watch
 
@@ -259,7 +261,9 @@ class Trainer(Generic[M]):
             following = min(self.strategy.next_edit(iteration + 1), self._stepper.alike_until(iteration))
             loss = self._loss()
             guard.hold(self.progress, following, loss, self._state())
+        parameters = self.model.parameters()
         edited, self._known_loss = self.strategy.edit(iteration), None  # it may change tensors in place
+        check_edited(self.strategy, iteration, edited, parameters, self.model, self.adam)
         if edited:
             if not self.count:
                 raise DivergedError(f"{type(self.strategy).__name__} left no triangle at iteration {iteration}")
@@ -353,7 +357,7 @@ class Trainer(Generic[M]):
             "adam.first": self.adam.first_moments,
             "adam.second": self.adam.second_moments,
             "adam.paces": self.adam.paces,
-            "strategy": self.strategy.state(),
+            "strategy": state_of(self.strategy),
             "sampler": self._stepper.sampler.state(),
             "watch": self._watch.state() if self._watch else {},
             "exposure": self.exposure.state(),

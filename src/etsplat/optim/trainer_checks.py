@@ -1,7 +1,7 @@
 """What a trainer refuses before it begins, and what it makes of its arguments."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -10,7 +10,8 @@ from torch import Tensor
 from etsplat.core.validation import check_kind, check_number, shown, whole_number
 from etsplat.data.dataset import Dataset
 from etsplat.model.model import Model
-from etsplat.optim.objective import Objective
+from etsplat.ops.adam import Adam
+from etsplat.optim.objective import Objective, check_asked
 from etsplat.optim.strategies import Strategy
 
 
@@ -34,6 +35,11 @@ def check_parts(
     check_kind("objective", objective, Objective, "Objective(photometric)")
     if strategy is not None:
         check_kind("strategy", strategy, Strategy, "make one, such as etsplat.Fixed()")
+        check_asked("strategy", strategy.outputs)
+        if not callable(strategy.state):
+            raise ValueError(
+                f"strategy.state must be a method that returns tensors by name, got {shown(strategy.state)}"
+            )
     for name, (value, kind) in others.items():
         if value is not None:
             check_kind(name, value, kind, f"etsplat.{kind.__name__} makes one")
@@ -99,3 +105,27 @@ def check_callbacks(callbacks: object) -> None:
     for index, callback in enumerate(callbacks):
         if not callable(callback):
             raise ValueError(f"callbacks[{index}] must be a function of an event, got {shown(callback)}")
+
+
+def check_edited(
+    strategy: Strategy, iteration: int, edited: bool, before: Mapping[str, Tensor], model: Model, adam: Adam
+) -> None:
+    """Raises ValueError where an edit replaced tensors, as they were `before`, of one of both, or did not say so."""
+    who, after = type(strategy).__name__, model.parameters()
+    if apart := [name for name, tensor in after.items() if adam.parameters[name] is not tensor]:
+        raise ValueError(
+            f"{who} replaced {', '.join(apart)} of the model or of its optimizer at iteration {iteration}, and not of "
+            "both: edit by etsplat.apply_rows, and give the first that it returns to model.load_state"
+        )
+    if not edited and any(tensor is not before.get(name) for name, tensor in after.items()):
+        got = shown(edited)
+        raise ValueError(f"{who} replaced tensors at iteration {iteration}, and returned {got}: edit is to return True")
+
+
+def state_of(strategy: Strategy) -> Mapping[str, Tensor]:
+    """Its state. Raises ValueError where a checkpoint cannot hold it."""
+    found: object = strategy.state()
+    values = list(found.values()) if isinstance(found, Mapping) else [found]
+    if wrong := [value for value in values if not isinstance(value, Tensor)]:
+        raise ValueError(f"{type(strategy).__name__}.state must return tensors by name, got {shown(wrong[0])}")
+    return cast(Mapping[str, Tensor], found)
