@@ -1,6 +1,7 @@
 """The mesh of a reconstruction as a file, through the command line."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -153,6 +154,18 @@ def test_a_run_of_something_else_by_now_is_refused(run: Path, tmp_path: Path) ->
     with pytest.raises(InputError, match=r"has no mesh\.ply"):
         etsplat.texture_mesh(copy, size=64)
     assert json.loads((copy / "config.json").read_text())["task"] == "reconstruct"
+
+
+@pytest.mark.parametrize("words", [["--up", "y"], ["--texture", "64"]])
+def test_what_a_run_is_of_may_have_gone(run: Path, tmp_path: Path, words: list[str]) -> None:
+    """Which was answered as if its path had been mistyped, with another that it might be."""
+    shutil.copytree(run, tmp_path / "run")
+    config = RunDirectory(run).read_config()
+    config["paths"]["source"] = str(tmp_path / "photos")
+    (tmp_path / "photo").mkdir()
+    (tmp_path / "run" / "config.json").write_text(json.dumps(config))
+    with pytest.raises(InputError, match=r"run: what it is of, .*photos, has gone; name where it is now with --scene$"):
+        export(tmp_path / "run", *words)
 
 
 def test_a_mesh_goes_to_the_world_where_the_run_says(run: Path, tmp_path: Path) -> None:

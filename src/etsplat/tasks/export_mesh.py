@@ -121,13 +121,7 @@ def open_reconstruction(
     record = read_record(
         run, ReconstructConfig, ["resolution", "pictures.supersampling", "refine_cameras"], "paths.source", "source"
     )
-    paths, source = record["paths"], record["paths"]["source"] if scene is None else scene
-    if source is None:
-        raise InputError(
-            f"{path}: does not say what it is of, a Dataset in memory perhaps; "
-            "name the folder with its photos with --scene"
-        )
-    then = record["config"]
+    paths, then, source = record["paths"], record["config"], _source_of(run, scene)
     config = ReconstructConfig(
         resolution=then["resolution"], pictures=Pictures(supersampling=then["pictures"]["supersampling"])
     )
@@ -308,13 +302,26 @@ def _up(
     told = told_up(georeference)
     if told is not None:
         return told
-    source = run.read_config("paths.source")["paths"]["source"] if scene is None else scene
-    if source is None:
-        raise InputError(f"{run.path}: does not say what it is of; name the folder with its photos with --scene")
+    source = _source_of(run, scene)
     if not isinstance(source, Dataset) and (source == DEMO_OBJECT or Path(source).is_file()):
         return None
     photos = capture_at(source)
     return None if photos is None else up_of(photos)
+
+
+def _source_of(run: RunDirectory, scene: Dataset | Path | str | None) -> Dataset | Path | str:
+    """What a run is of. Raises InputError where nobody says, or it has gone."""
+    if scene is not None:
+        return scene
+    source = run.read_config("paths.source")["paths"]["source"]
+    if source is None:
+        raise InputError(
+            f"{run.path}: does not say what it is of, a Dataset in memory perhaps; "
+            "name the folder with its photos with --scene"
+        )
+    if source != DEMO_OBJECT and not Path(source).exists():
+        raise InputError(f"{run.path}: what it is of, {source}, has gone; name where it is now with --scene")
+    return source
 
 
 def _only_by_vertex(mesh: MeshFile) -> Tensor | None:
