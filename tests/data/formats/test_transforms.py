@@ -92,6 +92,22 @@ def test_photos_for_validation_are_for_testing_where_no_others_are(scene, tests)
     assert views.notes == ("2 of 10 photos are named neither for training nor for testing and are left out",)
 
 
+@pytest.mark.parametrize("key", ["test_filenames", "val_filenames"])
+def test_photos_for_testing_alone_leave_all_others_for_training(scene, key):
+    """Others were tested in their place, and these trained on, without a word."""
+    rewrite(scene, lambda d: d.update({key: [f"./images/{k:03d}" for k in (3, 4)]}))
+    views = load_transforms(scene)
+    assert (views.test, views.train) == ([3, 4], [0, 1, 2, 5, 6, 7, 8, 9])
+
+
+@pytest.mark.parametrize("tests", [{}, {"val_filenames": []}])
+def test_photos_for_training_alone_are_said_to_be_passed_over(scene, tests):
+    rewrite(scene, lambda d: d.update(train_filenames=[f"./images/{k:03d}" for k in range(9)], **tests))
+    views = load_transforms(scene)
+    assert views.test == [0, 8]
+    assert views.notes == ("train_filenames is without test_filenames: every 8th of all photos is tested",)
+
+
 @pytest.mark.parametrize("said", [{"w": 80}, {"h": 80}])
 def test_one_side_alone_says_what_the_intrinsics_are_for(scene, said):
     """The photos are 40 pixels wide."""
@@ -186,6 +202,11 @@ def test_the_bounding_sphere_brings_the_object_into_the_unit_sphere(scene, truth
         (lambda d: d.update(ply_file_path="./"), "is no file name"),
         (lambda d: d.update(ply_file_path=[7]), "is not a file name"),
         (lambda d: d.update(train_filenames=["x"], test_filenames=["y"]), "names none of the frames"),
+        (lambda d: d.update(test_filenames=["y"]), r"test_filenames names none of the frames; correct or remove it"),
+        (
+            lambda d: d.update(train_filenames=["images/000"], val_filenames=["y"]),
+            "val_filenames names none of the frames",
+        ),
     ],
 )
 def test_unusable_descriptions_are_one_line_input_errors(scene, change, message):

@@ -49,7 +49,8 @@ def list_frames(folder: Path, wanted: Wanted) -> Listing:
     none. Depth maps, where they are wanted, come from each frame's `depth_file_path`, in steps of
     `depth_unit_scale_factor` if that is there, or from a folder `depths/` or `depth/`. With one `transforms.json` its
     `train_filenames` and `test_filenames` make the split, or its `val_filenames` where nothing is for testing; without
-    them, every 8th image by name is test. `transforms_val.json` is not used. `ply_file_path` names the points.
+    the first, all others are for training. Without them, every 8th image by name is test. `transforms_val.json` is not
+    used. `ply_file_path` names the points.
 
     Args:
         folder: the scene.
@@ -66,6 +67,8 @@ def list_frames(folder: Path, wanted: Wanted) -> Listing:
         if split is not None:
             neither = len(frames) - len(split[0]) - len(split[1])
             notes = unplaced_note(neither, len(frames), "are named neither for training nor for testing")
+        elif document.get("train_filenames"):
+            notes = ("train_filenames is without test_filenames: every 8th of all photos is tested",)
     else:
         path, test_file = folder / "transforms_train.json", folder / "transforms_test.json"
         document = read_object(path)
@@ -78,23 +81,34 @@ def list_frames(folder: Path, wanted: Wanted) -> Listing:
 
 
 def _named_split(path: Path, document: dict[str, Any], frames: list[Frame]) -> tuple[list[int], list[int]] | None:
-    """As the file says; None where it does not."""
-    if "train_filenames" not in document or not {"test_filenames", "val_filenames"} & document.keys():
+    """As the file says; None where it does not say what is for testing."""
+    train_names, test_names, val_names = (
+        _named(path, document, key, frames) for key in ("train_filenames", "test_filenames", "val_filenames")
+    )
+    tested = test_names or val_names
+    if not tested and (test_names is None or train_names is None):
         return None
-    names: list[set[str]] = []
-    for key in ("train_filenames", "test_filenames", "val_filenames"):
-        named = document.get(key) or []
-        if not isinstance(named, list) or not all(isinstance(name, str) for name in named):
-            raise InputError(f"scene {path}: {key} is not a list of file names; correct or remove it")
-        names.append({_image(path, name)[0] for name in named})
-    train_names, test_names = names[0], names[1] or names[2]
-    if not test_names and document.get("test_filenames") is None:
-        return None
+    tested = tested or set()
+    if train_names is None:  # whatever is not for testing
+        train_names = {frame.name for frame in frames} - tested
     train = [index for index, frame in enumerate(frames) if frame.name in train_names]
-    test = [index for index, frame in enumerate(frames) if frame.name in test_names - train_names]
+    test = [index for index, frame in enumerate(frames) if frame.name in tested - train_names]
     if not train:
-        raise InputError(f"scene {path}: train_filenames names none of the frames; correct or remove it")
+        raise InputError(f"scene {path}: no frame is left for training; correct train_filenames or remove it")
     return train, test
+
+
+def _named(path: Path, document: dict[str, Any], key: str, frames: list[Frame]) -> set[str] | None:
+    """Names of the frames that an entry lists; None without it. Raises InputError where it lists none that there is."""
+    said = document.get(key)
+    if said is None:
+        return None
+    if not isinstance(said, list) or not all(isinstance(name, str) for name in said):
+        raise InputError(f"scene {path}: {key} is not a list of file names; correct or remove it")
+    names = {_image(path, name)[0] for name in said}
+    if names and names.isdisjoint(frame.name for frame in frames):
+        raise InputError(f"scene {path}: {key} names none of the frames; correct or remove it")
+    return names
 
 
 def _points(path: Path, document: dict[str, Any]) -> Points | None:
