@@ -8,9 +8,10 @@ import torch
 import etsplat.tasks.coarse_soup as coarse_soup
 import etsplat.tasks.starts as starts
 from etsplat.data.closed_hollows import closed_hollows
-from etsplat.data.hollows import open_hollows
+from etsplat.data.hollows import Opened, open_hollows
 from etsplat.data.visual_hull import visual_hull
 from etsplat.engines.threads import num_threads, set_num_threads
+from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.parts import Shape, shape_of
 from etsplat.tasks.judgement import CONTRADICTED
 from etsplat.tasks.reconstruct_config import ReconstructConfig
@@ -70,6 +71,22 @@ def test_no_soup_is_asked_where_photos_agree_on_the_walls_of_a_hollow(monkeypatc
     before, after = ((lidded.vertices, lidded.faces), started.mesh.surface())
     closed = closed_hollows(views, (vertices, faces), before)
     assert closed_hollows(views, (vertices, faces), after) < 0.1 * closed
+
+
+@pytest.mark.parametrize(("most", "taken"), [(5000, False), (6000, True)])
+def test_no_start_has_more_faces_than_a_run_may_have(monkeypatch: pytest.MonkeyPatch, most: int, taken: bool) -> None:
+    """Walls have two sides."""
+    _, _, views = painted_pictures(*revolved(VASE))
+    vertices, faces = icosphere(4)
+    assert len(faces) == 5120
+    monkeypatch.setattr(starts, "between_walls", lambda *_: lambda points: points[:, 0] * 0 - 1)
+    monkeypatch.setattr(starts, "seen_through", lambda *_: lambda points: points[:, 0] * 0 - 1)
+    monkeypatch.setattr(starts, "visual_hull", lambda *_, **others: (vertices, faces))
+    monkeypatch.setattr(starts, "_opened", lambda _, v, f: Opened(v, f, 0, 0.0, 1.0, 1.0))
+    contradicted = Opened(vertices, faces[:1000], 0, 0.5, 1.0, 0.0)
+    config = CONFIG.changed({"max_faces": most})
+    _, cut = starts._cut_open(views, starts.Hull(vertices, faces, 1400, 0.5), contradicted, config, None, None)
+    assert cut == taken
 
 
 def test_a_cut_that_photos_contradict_as_much_is_not_taken(monkeypatch: pytest.MonkeyPatch) -> None:

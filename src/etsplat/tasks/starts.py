@@ -224,15 +224,16 @@ def _cut_open(
 ) -> tuple[Opened, bool]:
     """A hull that photos contradict, cut out between walls, or where a coarse soup sees through it.
 
-    It is taken if photos contradict it clearly less, and much of the silhouettes is not left uncovered. A soup is asked
-    where there are no walls on which photos agree, or walls are not all.
+    It is taken if photos contradict it clearly less, it has no more faces than a run may have, and much of the
+    silhouettes is not left uncovered. A soup is asked where no walls that photos agree on will do.
     """
     photos, most = photos_of(views), hull.uncovered + _RIMS
 
     def cut(free: Distance, wanted: int) -> Opened:
         surface = visual_hull(views, wanted, radius=config.start.radius, thin=hull.thin, free=free)
         found = _opened(views, *surface) if len(surface[1]) else opened
-        return found if _uncovered(photos, found.vertices, found.faces) <= most else opened
+        covers = _uncovered(photos, found.vertices, found.faces) <= most
+        return found if covers and len(found.faces) <= config.max_faces else opened
 
     def less(one: Opened, other: Opened) -> Opened:
         return min(one, other, key=lambda each: each.contradicted)
