@@ -154,7 +154,7 @@ def without_voids(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
     part = face_parts(faces, len(vertices))
     count = int(part.max()) + 1 if len(part) else 0
     turned = [number for number in range(1, count) if enclosed_volume(vertices, faces[part == number]) < 0]
-    used, renumbered = faces[~torch.isin(part, torch.tensor(turned))].unique(return_inverse=True)
+    used, renumbered = faces[~torch.isin(part, torch.tensor(turned, dtype=part.dtype))].unique(return_inverse=True)
     return vertices[used], renumbered
 
 
