@@ -1,10 +1,11 @@
 """Objects in captures that show less than all sides: what runs make of what few photos see, or none.
 
-    python -m benchmarks.few_views MESHES --out RUNS [--kinds NAMES] [--size PIXELS] [--up z]
+    python -m benchmarks.few_views FOLDERS --out RUNS [--objects NAMES] [--kinds NAMES] [--size PIXELS] [--up z]
 
-Each mesh is divided finely, painted with soft spots and photographed under light; it is reconstructed at preset quick.
-Of each it is printed: the start's exact Chamfer distance x 1e-3 of 20,000 samples, the result's, its parts and holes
-and the true ones, the verdict, and CPU seconds. Kinds:
+Inputs are those of `python -m studies.gallery`, with a known surface. Each is divided finely, painted with soft spots
+and photographed under light; it is reconstructed at preset quick. Of each it is printed: the start's exact Chamfer
+distance x 1e-3 of 20,000 samples, the result's, its parts and holes and the true ones, the verdict, and CPU seconds.
+Kinds:
 
     few    twenty photos from all sides: four around it at each of five heights
     ring   twenty-four around it, from 25 degrees above
@@ -29,6 +30,7 @@ from etsplat.io.mesh_files import MeshFile, load_mesh
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.sources import load_source, make_subject
 from etsplat.tasks.starts import make_start
+from studies.objects.subjects import Subject, find_subjects
 
 KINDS: dict[str, dict[str, Any]] = {
     "few": {"azimuths": 4},
@@ -38,7 +40,6 @@ KINDS: dict[str, dict[str, Any]] = {
 
 WAVES, FREQUENCY = 6, 9.0
 """Of each colour of the paint: how many are summed, and their numbers in the object's radius, about."""
-
 
 FINE = 0.03
 """Longest edge of a painted mesh, in units of its radius."""
@@ -55,9 +56,11 @@ def painted(mesh: MeshFile, up: str) -> MeshFile:
     return MeshFile(vertices, faces, vertex_colors=colors.clamp(0.05, 0.95))
 
 
-def row(path: Path, kind: str, out: Path, size: int, up: str) -> str:
+def row(subject: Subject, kind: str, out: Path, size: int, up: str) -> str:
     """Of the table; the run is made if it is not there yet."""
-    mesh, config, begun = painted(load_mesh(path), up), ReconstructConfig.quick(), time.process_time()
+    if subject.surface is None:
+        raise SystemExit(f"{subject.name}: its surface is not known")
+    mesh, config, begun = painted(load_mesh(subject.surface), up), ReconstructConfig.quick(), time.process_time()
     photos = etsplat.photograph(mesh, size, size, **KINDS[kind])
     views, _ = make_subject(load_source(photos, config)[0], config, lambda *_: None, torch.device("cpu"))
     start = _off(*make_start(None, views, config).mesh.surface(), mesh, views)
@@ -67,7 +70,7 @@ def row(path: Path, kind: str, out: Path, size: int, up: str) -> str:
     end = _off(views.normalization.apply(result.vertices), result.faces, mesh, views)
     shapes = (shape_of(each.vertices, each.faces.long()) for each in (result, mesh))
     found, true = (f"{shape.parts}, {shape.holes}" for shape in shapes)
-    cells = (path.parent.name, kind, f"{start:.3f}", f"{end:.3f}", found, true, judged["verdict"])
+    cells = (subject.name, kind, f"{start:.3f}", f"{end:.3f}", found, true, judged["verdict"])
     return f"| {' | '.join(cells)} | {time.process_time() - begun:.0f} |"
 
 
@@ -79,7 +82,8 @@ def _off(vertices: torch.Tensor, faces: torch.Tensor, truth: MeshFile, views: Da
 def main() -> None:
     """Makes what is not there yet, and prints the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("meshes", nargs="+", type=Path)
+    parser.add_argument("inputs", nargs="+", type=Path)
+    parser.add_argument("--objects", nargs="*", default=())
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--kinds", nargs="*", default=list(KINDS), choices=list(KINDS))
     parser.add_argument("--size", type=int, default=320)
@@ -87,9 +91,9 @@ def main() -> None:
     options = parser.parse_args()
     titles = ("object", "photos", "start", "result", "parts, holes", "true", "verdict", "CPU s")
     print(f"| {' | '.join(titles)} |\n|{'---|' * len(titles)}", flush=True)
-    for path in options.meshes:
+    for subject in find_subjects(options.inputs, options.objects):
         for kind in options.kinds:
-            print(row(path, kind, options.out / path.parent.name / kind, options.size, options.up), flush=True)
+            print(row(subject, kind, options.out / subject.name / kind, options.size, options.up), flush=True)
 
 
 if __name__ == "__main__":

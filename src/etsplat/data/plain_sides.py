@@ -11,20 +11,11 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from etsplat.data.agreement import (
-    Photo,
-    first_hits,
-    photos_of,
-    pixel_size,
-    reduced,
-    seen_by,
-    surface_agreement,
-)
+from etsplat.data.agreement import Photo, first_hits, looked_at, pixel_size, reduced, seen_by
 from etsplat.data.dataset import Dataset
 from etsplat.data.silhouettes import Silhouette
 from etsplat.geometry.films import held, tight_film
 from etsplat.geometry.measures import mean_edge, vertex_normals
-from etsplat.geometry.topology import MeshTopology
 
 _OUTLINE = 1.5
 """Pixels from the outline, within which a vertex touches it."""
@@ -63,14 +54,12 @@ def with_flat_sides(
         faces: (F, 3) of it.
     """
     dataset = reduced(dataset)
-    photos = photos_of(dataset)
-    if len(photos) < 2 or len(vertices) == 0:
+    looked = looked_at(dataset, vertices, faces)
+    if looked is None:
         return vertices
-    topology = MeshTopology.from_faces(faces, len(vertices))
-    edges = topology.edges.long()
-    hits = [first_hits(photo, vertices, faces) for photo in photos]
-    sees = seen_by(photos, hits, vertices, pixel_size(photos)).sum(dim=0)
-    unseen, score = sees == 0, surface_agreement(photos, hits, vertices, faces, edges)
+    photos, _, _, topology, hits, score = looked
+    edges, sees = topology.edges.long(), seen_by(photos, hits, vertices, pixel_size(photos)).sum(dim=0)
+    unseen = sees == 0
     free = _silent(unseen | (score.isnan() & (sees >= 2)), score, edges)
     free[edges[topology.edge_face_counts == 1].reshape(-1)] = False  # borders, where lids were
     if float(free.float().mean()) < _LEAST:

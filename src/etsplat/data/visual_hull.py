@@ -100,7 +100,7 @@ def visual_hull(
         wanted = round(cells * (faces / len(triangles)) ** 0.5)
         if cells == (cells := min(max(wanted, _FIRST_CELLS // 2), _MOST_CELLS)):
             break
-    found = without_voids(*taken_apart(torch.from_numpy(vertices).float(), torch.from_numpy(triangles)))
+    found = _without_voids(*taken_apart(torch.from_numpy(vertices).float(), torch.from_numpy(triangles)))
     return without_specks(*found, spared=_shown_apart(dataset, *found, _APART * cell))
 
 
@@ -149,7 +149,7 @@ def _gap(vertices: Tensor, faces: Tensor, own: Tensor) -> float:
     return float(KDTree(others).query(mine)[0].min())
 
 
-def without_voids(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
+def _without_voids(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
     """Only the parts of a closed surface that enclose something: what is free within another part nobody sees."""
     part = face_parts(faces, len(vertices))
     count = int(part.max()) + 1 if len(part) else 0

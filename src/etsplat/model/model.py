@@ -138,6 +138,10 @@ class Model(Protocol):
                 changed then.
         """
         self._check_state(state)
+        self._take(state)
+
+    def _take(self, state: Mapping[str, Tensor]) -> None:
+        """As `load_state`, of what fits; what else can be wrong with it is raised before anything is changed."""
         for name, old in self.parameters().items():
             if name in state:
                 setattr(self, name, state[name].to(old.device).requires_grad_(old.requires_grad))

@@ -251,11 +251,9 @@ class TexturedMesh(Model):
         fixed = {} if "faces" in state else {"vertices": len(self.vertices)}
         return {"face_uvs": len(state.get("faces", self.faces)), **fixed}
 
-    def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """As of any `Model`."""
-        self._check_state(state)
+    def _take(self, state: Mapping[str, Tensor]) -> None:
         topology = self.topology.changed(state.get("faces"), state.get("vertices"))
-        super().load_state(state)
+        super()._take(state)
         self.topology = topology
         if "face_uvs" in state:
             self.face_uvs = state["face_uvs"].to(self.vertices.device)

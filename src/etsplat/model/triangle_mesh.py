@@ -288,11 +288,9 @@ class TriangleMesh(Model):
         """Parameters and faces, detached, by name."""
         return {**super().state(), "faces": self.faces}
 
-    def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """As of any `Model`."""
-        self._check_state(state)
+    def _take(self, state: Mapping[str, Tensor]) -> None:
         topology = self.topology.changed(state.get("faces"), state.get("vertices"))
-        super().load_state(state)
+        super()._take(state)
         self.topology = topology
 
     def _rows(self, state: Mapping[str, Tensor]) -> Mapping[str, int]:
