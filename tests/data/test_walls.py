@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+import trimesh
 
 from etsplat.data.hollows import open_hollows
 from etsplat.data.visual_hull import visual_hull
@@ -41,6 +42,21 @@ def test_a_hull_cut_out_between_walls_is_near_the_surface(mug) -> None:
     assert shape_of(vertices, faces) == Shape(1, 0)
     before, after = (closest_points(truth[0], *each)[0].mean() for each in (hull, (vertices, faces)))
     assert after < before / 5
+
+
+def test_a_bail_over_the_hollow_is_none_of_its_lid() -> None:
+    """Photos agree little on what is thin, and the bail grows out of the rim."""
+    vertices, faces = revolved(MUG)
+    ring = trimesh.creation.torus(0.5 - MUG_WALL / 2, 0.06, major_sections=48, minor_sections=12)
+    around, rest = torch.from_numpy(ring.vertices).float() + torch.tensor([0, 0.55, 0]), torch.from_numpy(ring.faces)
+    bail = rest[(around[rest][..., 1] > 0.55).all(dim=1)]
+    _, _, views = painted_pictures(torch.cat([vertices, around]), torch.cat([faces, bail + len(vertices)]))
+    beyond = between_walls(views, *visual_hull(views, FACES))
+    assert beyond is not None
+    angles = torch.linspace(0.2, 2.9, 12)
+    middle = torch.stack([angles.cos(), angles.sin(), 0 * angles], dim=1) * (0.5 - MUG_WALL / 2)
+    assert float(beyond(views.normalization.apply(middle + torch.tensor([0, 0.55, 0]))).max()) < 0
+    assert float(beyond(views.normalization.apply(torch.tensor([[0.0, 0.2, 0.0]])))) > 0.2
 
 
 def test_what_is_no_hollow_has_no_walls() -> None:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from etsplat.data.agreement import Looked, agreement, averaged, first_hits, looked_at, pixel_size
 from etsplat.data.dataset import Dataset
-from etsplat.data.visual_hull import Distance
+from etsplat.data.visual_hull import Distance, outside_hull
 from etsplat.geometry.distance import closest_points
 from etsplat.geometry.measures import face_areas, mean_edge, vertex_normals
 from etsplat.geometry.topology import connected
@@ -23,6 +23,9 @@ _LID, _LIDS = 0.6, 3
 
 _LARGE = 0.01
 """Of the surface, what a lid covers at least."""
+
+_BELOW = 12
+"""Pixels under a lid at which the hull goes on: on thin limbs photos agree little, too."""
 
 _PIXELS = range(2, 20)
 """Thicknesses that are tried: agreement is about three pixels wide."""
@@ -64,7 +67,8 @@ def between_walls(dataset: Dataset, vertices: Float[Tensor, "V 3"], faces: Int64
         A function of points; None where there is no such hollow.
     """
     looked = looked_at(dataset, vertices, faces)
-    found = [] if looked is None else [walls for lid in _lids(looked) if (walls := _walls(_Through(looked, lid)))]
+    lids = [] if looked is None else _lids(looked, outside_hull(dataset))
+    found = [walls for lid in lids if (walls := _walls(_Through(looked, lid)))]
     if not found:
         return None
 
@@ -75,10 +79,11 @@ def between_walls(dataset: Dataset, vertices: Float[Tensor, "V 3"], faces: Int64
     return beyond
 
 
-def _lids(looked: Looked) -> list[Bool[Tensor, " F"]]:
+def _lids(looked: Looked, outside: Distance) -> list[Bool[Tensor, " F"]]:
     """The largest patches on which photos do not agree, each with a ring of faces around it."""
     vertices, faces, edges = looked.vertices, looked.faces, looked.topology.edges.long()
-    lid = looked.score < _LID
+    inward = -averaged(vertex_normals(vertices, faces), edges, _SMOOTH)
+    lid = (looked.score < _LID) & (outside(vertices + _BELOW * pixel_size(looked.photos) * inward) < 0)
     count, patch = connected(edges[lid[edges].all(dim=1)], len(vertices))
     within, area = lid[faces].all(dim=1), face_areas(vertices, faces)
     sizes = torch.zeros(count).index_add(0, patch[faces[within, 0]], area[within]) / area.sum()
