@@ -89,6 +89,22 @@ def test_no_start_has_more_faces_than_a_run_may_have(monkeypatch: pytest.MonkeyP
     assert cut == taken
 
 
+@pytest.mark.parametrize(("soup", "taken"), [(0.09, 2800), (0.05, 1400)])
+def test_a_soup_must_be_clearly_better_than_walls(monkeypatch: pytest.MonkeyPatch, soup: float, taken: int) -> None:
+    """Of walls and a soup's cut that are contradicted about alike, walls are nearer; faces tell here which was cut."""
+    _, _, views = painted_pictures(*revolved(VASE))
+    vertices, faces = icosphere(4)
+    monkeypatch.setattr(starts, "between_walls", lambda *_: lambda points: points[:, 0])
+    monkeypatch.setattr(starts, "seen_through", lambda *_: lambda points: points[:, 0])
+    monkeypatch.setattr(starts, "visual_hull", lambda _, wanted, **others: (vertices, faces[:wanted]))
+    shares = {2800: 0.1, 1400: soup}  # contradicted: of walls, which have twice the faces, and of the soup's cut
+    monkeypatch.setattr(starts, "_opened", lambda _, v, f: Opened(v, f, 0, shares[len(f)], 1.0, 1.0))
+    contradicted, hull = Opened(vertices, faces, 0, 0.5, 1.0, 0.0), starts.Hull(vertices, faces, 1400, 1.0)
+    best, cut = starts._cut_open(views, hull, contradicted, CONFIG.changed({"max_faces": 6000}), None, None)
+    assert cut
+    assert len(best.faces) == taken
+
+
 def test_a_cut_that_photos_contradict_as_much_is_not_taken(monkeypatch: pytest.MonkeyPatch) -> None:
     """Here all space is free but for a ball, or none is."""
     _, _, views = painted_pictures(*revolved(VASE))

@@ -224,8 +224,8 @@ def _cut_open(
 ) -> tuple[Opened, bool]:
     """A hull that photos contradict, cut out between walls, or where a coarse soup sees through it.
 
-    It is taken if photos contradict it clearly less, it has no more faces than a run may have, and much of the
-    silhouettes is not left uncovered. A soup is asked where no walls that photos agree on will do.
+    Either is taken if photos contradict it clearly less than what it cuts, it has no more faces than a run may have,
+    and much of the silhouettes is not left uncovered. A soup is asked where no walls that photos agree on will do.
     """
     photos, most = photos_of(views), hull.uncovered + _RIMS
 
@@ -235,23 +235,26 @@ def _cut_open(
         covers = _uncovered(photos, found.vertices, found.faces) <= most
         return found if covers and len(found.faces) <= config.max_faces else opened
 
-    def less(one: Opened, other: Opened) -> Opened:
-        return min(one, other, key=lambda each: each.contradicted)
-
-    flat = with_flat_sides(views, opened.vertices, opened.faces)
-    walls = between_walls(views, flat, opened.faces)
-    best = opened if walls is None else less(opened, cut(walls, min(2 * hull.wanted, _most_faces(config))))
+    best = opened
+    walls = between_walls(views, with_flat_sides(views, opened.vertices, opened.faces), opened.faces)
+    if walls is not None:
+        best = _clearer(cut(walls, min(2 * hull.wanted, _most_faces(config))), opened)
     if best.contradicted > CONTRADICTED:
         if tell is not None:
             part = f"{100 * opened.contradicted:.1f} % of its surface"
             tell(f"photos contradict the visual hull on {part}: a coarse soup is asked what is free")
-        ahead = seen_through(views, hull.vertices, config, device)
+        ahead, tries = seen_through(views, hull.vertices, config, device), []
         for margin in _MARGINS:
-            best = less(best, cut(lambda points, margin=margin: ahead(points) - margin, hull.wanted))
-            if best.contradicted <= CONTRADICTED:
+            tries.append(cut(lambda points, margin=margin: ahead(points) - margin, hull.wanted))
+            if tries[-1].contradicted <= CONTRADICTED:
                 break
-    clearly = best.contradicted <= _CLEARLY * opened.contradicted
-    return (best, True) if clearly else (opened, False)
+        best = _clearer(min(tries, key=lambda each: each.contradicted), best)
+    return best, best is not opened
+
+
+def _clearer(cut: Opened, before: Opened) -> Opened:
+    """The first, if photos contradict it clearly less."""
+    return cut if cut.contradicted <= _CLEARLY * before.contradicted else before
 
 
 def _most_faces(config: ReconstructConfig) -> int:
