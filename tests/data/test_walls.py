@@ -8,7 +8,7 @@ import trimesh
 
 from etsplat.data.hollows import open_hollows
 from etsplat.data.visual_hull import visual_hull
-from etsplat.data.walls import between_walls
+from etsplat.data.walls import _Walls, between_walls
 from etsplat.geometry.distance import closest_points
 from etsplat.geometry.parts import Shape, shape_of
 from helpers.painting import painted_pictures
@@ -34,6 +34,16 @@ def test_what_is_free_lies_between_walls_of_their_true_thickness(mug) -> None:
     wall = 0.5 - beyond(views.normalization.apply(heights)) * views.normalization.radius
     assert float((wall - MUG_WALL).abs().max()) < 0.02
     assert float(beyond(views.normalization.apply(torch.tensor([[0.5 - MUG_WALL / 3, 0.0, 0.0]])))) < 0
+
+
+def test_walls_have_no_brim() -> None:
+    """Right under a lid all is free up to a wall's thickness from the sides, and what is under the rim stays."""
+    vertices, faces = revolved(CAN)
+    middles = vertices[faces].mean(dim=1)
+    top, out = middles[:, 1] > 0.399, middles[:, [0, 2]].norm(dim=1)
+    walls = _Walls(vertices, faces[top & (out < 0.4)], faces[top & (out > 0.4)], faces[~top], 0.1)
+    places = torch.tensor([[0.35, 0.37, 0.0], [0.5, 0.37, 0.0], [0.5, 0.2, 0.0], [0.65, 0.2, 0.0], [0.0, -0.45, 0.0]])
+    assert (walls.beyond(places) > 0).tolist() == [True, False, True, False, False]
 
 
 def test_a_hull_cut_out_between_walls_is_near_the_surface(mug) -> None:

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from etsplat.data.agreement import Looked, agreement, averaged, first_hits, looked_at, pixel_size
 from etsplat.data.dataset import Dataset
@@ -40,6 +41,9 @@ _AGREED, _PEAK = 0.5, 0.3
 """Mean correlation on walls, at least, which are seen at a slant; and by so much more than on the lid, or at the least
 likely thickness."""
 
+_LEVEL = 0.7
+"""Cosine of the angle between normals of a lid and of the rim around it, at least."""
+
 _THICK = 1.5
 """Mean edges of the hull: thinner walls would have holes once they are meshed."""
 
@@ -48,10 +52,29 @@ _KNOWN, _FEWEST = 0.2, 64
 
 
 class _Walls(NamedTuple):
-    """A surface without a lid, and how thick it is there."""
+    """Walls around a hollow under a lid.
 
-    faces: Int64[Tensor, "F 3"]
+    Attributes:
+        vertices: (V, 3) of all.
+        lid: (L, 3) faces.
+        rim: (R, 3) those around it that are as level, as far as walls are thick.
+        sides: (F, 3) all others.
+        thickness: of the walls.
+    """
+
+    vertices: Tensor
+    lid: Tensor
+    rim: Tensor
+    sides: Tensor
     thickness: float
+
+    def beyond(self, points: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:
+        """How far points are farther than walls are thick from all but the lid, and under it from the sides alone.
+
+        Measured from a rim, too, walls would have a brim there.
+        """
+        lid, rim, sides = (_distance(points, self.vertices, faces) for faces in (self.lid, self.rim, self.sides))
+        return torch.where(lid < rim, sides, torch.minimum(rim, sides)) - self.thickness
 
 
 @torch.no_grad()
@@ -72,11 +95,7 @@ def between_walls(dataset: Dataset, vertices: Float[Tensor, "V 3"], faces: Int64
     if not found:
         return None
 
-    def beyond(points: Tensor) -> Tensor:
-        deep = [closest_points(points, vertices, rest)[0].sqrt().to(points) - thick for rest, thick in found]
-        return torch.stack(deep).amax(dim=0)
-
-    return beyond
+    return lambda points: torch.stack([walls.beyond(points) for walls in found]).amax(dim=0)
 
 
 def _lids(looked: Looked, outside: Distance) -> list[Bool[Tensor, " F"]]:
@@ -103,7 +122,20 @@ def _walls(through: "_Through") -> _Walls | None:
     least = min([through.closed, *(each for each in agreed if each > 0)])
     if agreed[best] < max(_AGREED, least + _PEAK):
         return None
-    return _Walls(through.rest, max(thicknesses[best], _THICK * through.edge))
+    return through.walls(max(thicknesses[best], _THICK * through.edge))
+
+
+def _distance(points: Tensor, vertices: Tensor, faces: Tensor) -> Tensor:
+    """(N,) of points from some faces, infinite if there are none."""
+    if len(faces) == 0:
+        return points.new_full((len(points),), torch.inf)
+    return closest_points(points, vertices, faces)[0].sqrt().to(points)
+
+
+def _cross(vertices: Tensor, faces: Tensor) -> Tensor:
+    """(F, 3) normals of faces, as long as twice their areas."""
+    a, b, c = vertices[faces].unbind(dim=1)
+    return torch.linalg.cross(b - a, c - a)
 
 
 class _Through:
@@ -118,6 +150,7 @@ class _Through:
 
     def __init__(self, looked: Looked, lid: Bool[Tensor, " F"]) -> None:
         vertices, faces, edges = looked.vertices, looked.faces, looked.topology.edges.long()
+        self._lid_faces = faces[lid]
         self.rest, self.pixel, self.edge = faces[~lid], pixel_size(looked.photos), mean_edge(vertices, edges)
         self.closed = float(looked.score[faces[lid].unique()].nanmean())
         self._photos, self._vertices, self._own = looked.photos, vertices, self.rest.unique()
@@ -125,10 +158,21 @@ class _Through:
         self._lid = [((hit >= 0) & lid[hit.clamp_min(0)]).float()[None, None] for _, hit in looked.hits]
         self._behind = [first_hits(photo, vertices, self.rest)[0][None, None] for photo in looked.photos]
 
+    def walls(self, thickness: float) -> _Walls:
+        """So thick ones around what is under the lid, but for what of it is not level, or lies on walls."""
+        vertices, rest = self._vertices, self.rest
+        up = normalize(_cross(vertices, self._lid_faces).sum(dim=0), dim=0)
+        lid = self._lid_faces[normalize(_cross(vertices, self._lid_faces), dim=1) @ up > _LEVEL]
+        near = _distance(vertices[rest].mean(dim=1), vertices, lid) <= thickness
+        level = near & (normalize(_cross(vertices, rest), dim=1) @ up > _LEVEL)
+        sides, below = rest[~level], vertices[lid].mean(dim=1) - 2 * thickness * up
+        on_walls = _distance(below, vertices, sides) <= thickness
+        return _Walls(vertices, lid[~on_walls], torch.cat([rest[level], lid[on_walls]]), sides, thickness)
+
     def agreed(self, thickness: float) -> float:
         """Mean correlation on walls so thick, by how many photos see each place; 0 where too little is known."""
         places = self._vertices[self._own] - thickness * self._normals
-        near = closest_points(places, self._vertices, self.rest)[0].sqrt() < _ALONE * thickness
+        near = _distance(places, self._vertices, self.rest) < _ALONE * thickness
         places, normals = places[~near], -self._normals[~near]
         seen = torch.stack([self._seen(number, places) for number in range(len(self._photos))])
         views = seen.sum(dim=0)
