@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from etsplat.data.agreement import unseen_vertices
 from etsplat.data.dataset import Dataset
 from etsplat.data.demo_object import demo_object
 from etsplat.data.photograph import photograph
@@ -147,6 +148,27 @@ def test_the_rate_of_vertices_falls_late_near_the_surface_alone(near: bool) -> N
     trainer.fit(6)
     halfway = 0.04 + 0.96 / 4 if near else 0.04**0.5
     assert trainer.adam.learning_rates["vertices"] == pytest.approx(halfway * config.optimizer.lr_vertices)
+
+
+@pytest.mark.parametrize("update", ["adam", "large-steps"])
+def test_what_no_photo_sees_of_a_start_that_was_cut_open_stays(update: str) -> None:
+    """Regularizers would draw it together: the inner side of walls, of which photos see the upper part, to the outer.
+
+    Of other starts it goes as regularizers have it.
+    """
+    vertices, faces = icosphere(3)
+    views = photograph(MeshFile(vertices, faces), 64, 64, elevations=(40.0,), azimuths=6)
+    hidden = unseen_vertices(views)(vertices, faces)
+    assert 100 < int(hidden.sum()) < 400
+    config = SHORT.changed({"iterations": 11, "refinement.subdivisions": 0, "optimizer.vertex_update": update})
+    moved = {}
+    for cut in (True, False):
+        mesh = TriangleMesh.from_mesh(vertices, faces, colors=0.75, opacity=0.98, sigma=0.25)
+        make_trainer(mesh, views, config, near=True, cut=cut).fit(6)
+        moved[cut] = (mesh.vertices.detach() - vertices).norm(dim=1)
+    assert float(moved[True][hidden].max()) == 0
+    assert float(moved[False][hidden].min()) > 0
+    assert float(moved[True][~hidden].min()) > 0
 
 
 def test_a_mesh_is_opaque_at_last_and_its_outline_comes_nearer() -> None:

@@ -66,6 +66,8 @@ def uniform_step(adam: Adam, name: str, rate: float, solve: Solve | None) -> Non
 
         p <- p - rate M^-1 m / max(sqrt(v)),   m and v the bias-corrected moments of M^-1 g
 
+    times the pace of each row, where it has one.
+
     Args:
         adam: every parameter has its gradient.
         name: which one.
@@ -80,4 +82,5 @@ def uniform_step(adam: Adam, name: str, rate: float, solve: Solve | None) -> Non
     beta1, beta2 = adam.betas
     scale = float(adam.second_moments[name].max()) / (1 - beta2**adam.step_count)
     direction = adam.first_moments[name] / ((1 - beta1**adam.step_count) * (scale**0.5 + adam.eps))
-    parameter -= rate * (direction if solve is None else solve(direction))
+    step = rate * (direction if solve is None else solve(direction))
+    parameter -= step * adam.paces[name][:, None] if name in adam.paces else step

@@ -6,6 +6,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from torch import Tensor
+
 from etsplat.core.errors import InputError
 from etsplat.core.workers import together
 from etsplat.data.agreement import contradicted, looked_at, plain_share, unseen_share, unseen_vertices
@@ -185,7 +187,7 @@ def reconstruct(
         config = _told(job, *within_need(config, started))
         config = _told(job, *within_pixels(config, views, mesh))
         trust = _trusted_depths(views, config, begun, job)
-        trainer = make_trainer(mesh, views, config, scorer.cheap, trust, near=begun == "hull")
+        trainer = make_trainer(mesh, views, config, scorer.cheap, trust, near=begun == "hull", cut=bool(started.cut))
         with job.writing():  # what only the first of several workers does goes through `job.first`
             if views.georeference is not None:
                 job.first(partial(views.georeference.write, job.run.path))
@@ -297,6 +299,16 @@ def _judge(
     )
 
 
+def _resting(mesh: TriangleMesh, views: Dataset) -> Callable[[Tensor], Tensor]:
+    """Paces of a mesh's vertices: those that no view sees stay where the start has them."""
+    unseen = unseen_vertices(views)
+
+    def paces(vertices: Tensor) -> Tensor:
+        return (~unseen(vertices.cpu(), mesh.faces.cpu())).to(vertices)
+
+    return paces
+
+
 def make_trainer(
     mesh: TriangleMesh,
     views: Dataset,
@@ -305,6 +317,7 @@ def make_trainer(
     depths: DepthTrust | None = None,
     *,
     near: bool = False,
+    cut: bool = False,
 ) -> Trainer[TriangleMesh]:
     """The paper's way from a start to the object that views show: L_mesh, Adam, subdivision.
 
@@ -315,6 +328,8 @@ def make_trainer(
         evaluate: cheap metrics of a mesh.
         depths: which depth maps are believed; None where none are used.
         near: whether the start is near the surface, so that what no view sees of the mesh is no part of it on its way.
+        cut: whether it has hollows that were cut out: their walls are where they belong beyond what views see of them,
+            and what none sees stays as it is.
     """
     length, regularization, refinement = config.iterations, config.regularization, config.refinement
     terms = terms_of(
@@ -344,7 +359,7 @@ def make_trainer(
             untanglings,
             flips=refinement.flips,
             reach=refinement.reach,
-            unseen=unseen_vertices(views) if near else None,
+            unseen=unseen_vertices(views) if near and not cut else None,
             lids=lids(views) if near else None,
             outlines=outlines(views),
             outlines_after=outlines_after(config),
@@ -355,6 +370,7 @@ def make_trainer(
         depths=depths,
         cameras=CameraRefinement.of(config.refine_cameras, length, len(views.train) / config.batch),
         update=None if config.optimizer.vertex_update == "adam" else UniformSteps(smoothing),
+        paces={"vertices": _resting(mesh, views)} if cut else None,
         evaluate=evaluate,
         guard=Guard(tolerance=refinement.guard, until=length) if refinement.guard else None,
         seed=config.seed,
