@@ -172,11 +172,26 @@ def test_a_photo_from_beyond_the_nearest_plane_is_no_obstacle() -> None:
     assert swept_points(replace(capture, viewmats=ahead), CPU).share > 0.15
 
 
-def test_without_points_nothing_is_swept() -> None:
-    """Nobody says how far away things are."""
-    capture = replace(wall(), exact_points=None, point_colors=None)
-    assert with_swept_points(capture, 4000, CPU, nothing_told, nothing)[0] is capture
+@pytest.mark.parametrize("scale", [0.01, 1.0, 100.0])
+def test_without_points_photos_say_how_far_away_things_are(scale: float) -> None:
+    """In units of any size: places on the wall, in its colours, half as many as there may be triangles."""
+    events, capture = list[Event](), wall(7)
+    viewmats = capture.viewmats.clone()
+    viewmats[:, :3, 3] *= scale
+    blind = replace(capture, viewmats=viewmats, exact_points=None, point_colors=None)
+    dense, consistent = with_swept_points(blind, 4000, CPU, events.append, nothing)
+    assert dense.exact_points is not None
+    assert dense.point_colors is not None
+    assert consistent > POOR
+    assert 500 < len(dense.exact_points) == len(dense.point_colors) <= 2000
+    places = dense.exact_points / scale
+    assert float(((places @ NORMAL - OFFSET).abs() / NORMAL.norm()).quantile(0.95)) < 0.015 * OFFSET
+    assert float((dense.point_colors - painted(places)).abs().mean()) < 0.05
+    assert any(isinstance(each, NoteEvent) and "these places are the start" in each.text for each in events)
 
 
-def nothing_told(event: Event) -> None:
-    raise AssertionError(event)
+def test_without_points_photos_of_different_things_start_nothing() -> None:
+    """The run begins at random places, and says why."""
+    events, capture = list[Event](), replace(wall(alike=False), exact_points=None, point_colors=None)
+    assert with_swept_points(capture, 4000, CPU, events.append, nothing)[0] is capture
+    assert any(isinstance(each, NoteEvent) and "random places" in each.text for each in events)

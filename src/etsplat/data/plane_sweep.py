@@ -27,6 +27,9 @@ WIDEST = 200
 PHOTOS = 64
 """So many photos at most are compared; of more, every second, third, ... one."""
 
+GUESSED = 0.2, 20.0
+"""Where a capture has no points, things are supposed to be between so far away, relative to its extent."""
+
 NEIGHBOURS = 4
 """Photos that a photo is compared with."""
 
@@ -125,18 +128,39 @@ class _Photo:
         return self.center + rays.T * depths[known, None]
 
 
-def swept_points(capture: Dataset, device: torch.device, progress: Callable[[int, int], None] | None = None) -> Swept:
+def guessed_points(capture: Dataset) -> Float[Tensor, "P 3"]:
+    """Places that training photos look at, were they at any depth: for sweeps of captures without points."""
+    generator, each = torch.Generator().manual_seed(0), math.ceil(ASKED / len(capture.train))
+    near, far = (math.log(factor * capture.extent) for factor in GUESSED)
+    places = []
+    for view in capture.train:
+        across, depths = torch.rand((2, each), generator=generator), torch.rand(each, generator=generator)
+        sizes = torch.tensor(capture.images.sizes[view])
+        pixels = torch.cat([across * sizes[:, None], torch.ones((1, each))]).double()
+        rays = capture.viewmats[view, :3, :3].T @ torch.linalg.inv(capture.Ks[view]) @ pixels
+        places.append(capture.centers[view] + ((near + depths.double() * (far - near)).exp() * rays).T)
+    return torch.cat(places)
+
+
+def swept_points(
+    capture: Dataset,
+    device: torch.device,
+    progress: Callable[[int, int], None] | None = None,
+    *,
+    widest: int = WIDEST,
+) -> Swept:
     """The points that the training photos agree on.
 
     Args:
         capture: photos, with points that say how far away things are.
         device: where photos are compared; results are on the CPU.
         progress: called with (photos compared, photos in all).
+        widest: photos are halved until none is wider.
     """
     assert capture.exact_points is not None
     some = capture.train[:: math.ceil(len(capture.train) / PHOTOS)]
     small = capture.of_views(some)
-    while max(width for width, _ in small.images.sizes) > WIDEST:
+    while max(width for width, _ in small.images.sizes) > widest:
         small = small.halved()
     photos, points = [_Photo.of(small, index) for index in small.train], capture.exact_points
     located = [photo.located(points) for photo in photos]

@@ -51,7 +51,9 @@ def check_train(
     if capture.images.streamed and not streams:
         notes.append("the photos do not fit into memory: they are decoded anew whenever they are needed")
     if capture.exact_points is None:
-        unless = " unless its depth maps agree" if capture.images.with_depth and config.loss.depth != "off" else ""
+        maps = ["its depth maps"] if capture.images.with_depth and config.loss.depth != "off" else []
+        photos = ["its photos"] if config.start.dense and config.finish == "none" else []
+        unless = f" unless {' or '.join(maps + photos)} agree" if maps or photos else ""
         notes.append(f"no points in the capture: starting from {config.start.points:,} random ones{unless}")
     if doubt := doubtful_scale(capture, config):
         notes.append(doubt)

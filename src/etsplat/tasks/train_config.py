@@ -44,11 +44,11 @@ class Start:
     """The triangles that the optimization starts from: one at each point of the capture."""
 
     points: Annotated[int, Range(1, 10**8)] = 100_000
-    """So many random triangles to start from where the capture has no points."""
+    """So many random triangles to start from where the capture has no points and its photos agree on too little."""
     dense: bool = True
     """Triangles start at places that photos agree on, too, where photos agree on many places:
-    in a third of the start or more, which is half of the triangles that there may be or as many as there are points.
-    Not where the capture has no points, nor for triangles that become opaque (finish, asset)."""
+    in a third of the start or more, which is half of the triangles that there may be or as many as there are points;
+    in all of it where the capture has no points. Not for triangles that become opaque (finish, asset)."""
     nearest: Annotated[float, Range(0, 1)] = 0.75
     """Points before everything else that photos see in different colours are left out, for veils grow from them.
     Before everything: nearer to a photo than this times where all points but a hundredth begin; 0 keeps all."""
