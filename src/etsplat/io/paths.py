@@ -64,6 +64,8 @@ def path_remedy(path: Path | str) -> str:
         names = os.listdir(missing.parent)
     except OSError:  # may not be read, or is a file
         names = []
+    if not missing.name.startswith("."):  # a command that was killed leaves hidden folders named like its result
+        names = [name for name in names if not name.startswith(".")]
     meant = [missing.with_name(name) for name in difflib.get_close_matches(missing.name, names, n=1)]
     whole = [found / rest for found in meant if (found / rest).exists()]
     return f"did you mean {(whole or meant)[0]}?" if meant else "check the path"
