@@ -90,11 +90,12 @@ def between_walls(dataset: Dataset, vertices: Float[Tensor, "V 3"], faces: Int64
         A function of points; None where there is no such hollow.
     """
     looked = looked_at(dataset, vertices, faces)
-    lids = [] if looked is None else _lids(looked, outside_hull(dataset))
-    found = [walls for lid in lids if (walls := _walls(_Through(looked, lid)))]
+    if looked is None:
+        return None
+    hollows = (_Through(looked, lid) for lid in _lids(looked, outside_hull(dataset)))
+    found = [walls for hollow in hollows if (walls := _walls(hollow))]
     if not found:
         return None
-
     return lambda points: torch.stack([walls.beyond(points) for walls in found]).amax(dim=0)
 
 
