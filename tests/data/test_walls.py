@@ -6,9 +6,10 @@ import pytest
 import torch
 import trimesh
 
+from etsplat.data.agreement import looked_at, pixel_size
 from etsplat.data.hollows import open_hollows
 from etsplat.data.visual_hull import visual_hull
-from etsplat.data.walls import _Walls, between_walls
+from etsplat.data.walls import _Through, _Walls, between_walls
 from etsplat.geometry.distance import closest_points
 from etsplat.geometry.parts import Shape, shape_of
 from helpers.painting import painted_pictures
@@ -44,6 +45,20 @@ def test_walls_have_no_brim() -> None:
     walls = _Walls(vertices, faces[top & (out < 0.4)], faces[top & (out > 0.4)], faces[~top], 0.1)
     places = torch.tensor([[0.35, 0.37, 0.0], [0.5, 0.37, 0.0], [0.5, 0.2, 0.0], [0.65, 0.2, 0.0], [0.0, -0.45, 0.0]])
     assert (walls.beyond(places) > 0).tolist() == [True, False, True, False, False]
+
+
+def test_a_lid_goes_on_beside_where_photos_contradict_it_and_ends_at_walls() -> None:
+    """Of two tenths: three pixels farther than a lid that is small, and nothing over the walls of one that is large."""
+    vertices, faces, views = painted_pictures(*revolved(CAN))
+    looked = looked_at(views, vertices, faces)
+    assert looked is not None
+    middles = vertices[faces].mean(dim=1)
+    top, out = middles[:, 1] > 0.99 * float(vertices[:, 1].max()), middles[:, [0, 2]].norm(dim=1)
+    outer = float(out.max())
+    for radius, most in ((0.4, 0.4 * outer + 3 * pixel_size(looked.photos)), (0.95, outer - 0.2)):
+        found = _Through(looked, top & (out < radius * outer)).walls(0.2)
+        reached = vertices[found.lid].mean(dim=1)[:, [0, 2]].norm(dim=1).max()
+        assert most - 0.04 < float(reached) <= most
 
 
 def test_a_hull_cut_out_between_walls_is_near_the_surface(mug) -> None:

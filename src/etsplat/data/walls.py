@@ -44,6 +44,9 @@ likely thickness."""
 _LEVEL = 0.7
 """Cosine of the angle between normals of a lid and of the rim around it, at least."""
 
+_BRIM = 3
+"""Pixels beside a lid on which photos hardly tell that there is none, since walls are right behind it."""
+
 _THICK = 1.5
 """Mean edges of the hull: thinner walls would have holes once they are meshed."""
 
@@ -56,16 +59,16 @@ class _Walls(NamedTuple):
 
     Attributes:
         vertices: (V, 3) of all.
-        lid: (L, 3) faces.
+        lid: (L, 3) faces over what is free.
         rim: (R, 3) those around it that are as level, as far as walls are thick.
         sides: (F, 3) all others.
         thickness: of the walls.
     """
 
-    vertices: Tensor
-    lid: Tensor
-    rim: Tensor
-    sides: Tensor
+    vertices: Float[Tensor, "V 3"]
+    lid: Int64[Tensor, "L 3"]
+    rim: Int64[Tensor, "R 3"]
+    sides: Int64[Tensor, "F 3"]
     thickness: float
 
     def beyond(self, points: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:
@@ -160,15 +163,21 @@ class _Through:
         self._behind = [first_hits(photo, vertices, self.rest)[0][None, None] for photo in looked.photos]
 
     def walls(self, thickness: float) -> _Walls:
-        """So thick ones around what is under the lid, but for what of it is not level, or lies on walls."""
-        vertices, rest = self._vertices, self.rest
+        """So thick ones around what is under the lid and its brim, but for what of these is not level, or on walls."""
+        vertices, rest, brim = self._vertices, self.rest, _BRIM * self.pixel
         up = normalize(_cross(vertices, self._lid_faces).sum(dim=0), dim=0)
-        lid = self._lid_faces[normalize(_cross(vertices, self._lid_faces), dim=1) @ up > _LEVEL]
-        near = _distance(vertices[rest].mean(dim=1), vertices, lid) <= thickness
-        level = near & (normalize(_cross(vertices, rest), dim=1) @ up > _LEVEL)
-        sides, below = rest[~level], vertices[lid].mean(dim=1) - 2 * thickness * up
+        lid = self._lid_faces[self._level(self._lid_faces, up)]
+        away = _distance(vertices[rest].mean(dim=1), vertices, lid)
+        around = self._level(rest, up) & (away <= thickness + brim)
+        sides, above = rest[~around], torch.cat([lid, rest[around & (away <= brim)]])
+        below = vertices[above].mean(dim=1) - 2 * thickness * up
         on_walls = _distance(below, vertices, sides) <= thickness
-        return _Walls(vertices, lid[~on_walls], torch.cat([rest[level], lid[on_walls]]), sides, thickness)
+        rim = torch.cat([rest[around & (away > brim)], above[on_walls]])
+        return _Walls(vertices, above[~on_walls], rim, sides, thickness)
+
+    def _level(self, faces: Int64[Tensor, "F 3"], up: Float[Tensor, " 3"]) -> Bool[Tensor, " F"]:
+        """Which faces look up as a lid does."""
+        return normalize(_cross(self._vertices, faces), dim=1) @ up > _LEVEL
 
     def agreed(self, thickness: float) -> float:
         """Mean correlation on walls so thick, by how many photos see each place; 0 where too little is known."""
