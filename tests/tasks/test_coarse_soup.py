@@ -13,7 +13,9 @@ from etsplat.data.visual_hull import visual_hull
 from etsplat.engines.threads import num_threads, set_num_threads
 from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.parts import Shape, shape_of
-from etsplat.tasks.judgement import CONTRADICTED
+from etsplat.model.triangle_mesh import TriangleMesh
+from etsplat.tasks.judgement import CLOSED, CONTRADICTED
+from etsplat.tasks.reconstruct import _grown_over
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 from helpers.painting import painted_pictures
 from helpers.revolved import BOWL, MUG, VASE, revolved
@@ -71,6 +73,18 @@ def test_no_soup_is_asked_where_photos_agree_on_the_walls_of_a_hollow(monkeypatc
     before, after = ((lidded.vertices, lidded.faces), started.mesh.surface())
     closed = closed_hollows(views, (vertices, faces), before)
     assert closed_hollows(views, (vertices, faces), after) < 0.1 * closed
+
+
+def test_a_hollow_that_was_cut_open_and_is_closed_again_is_noticed() -> None:
+    """Of a result that is the hull once more, and not of one that is open, nor where nothing was cut."""
+    vertices, faces, views = painted_pictures(*revolved(MUG))
+    opened, over = Opened(vertices, faces, 0, 0.0, 1.0, 1.0), visual_hull(views, 3200)
+    look = {"colors": 0.5, "opacity": 0.98, "sigma": 0.25}
+    closed, open_ = (TriangleMesh.from_mesh(*each, **look) for each in (over, (vertices, faces)))
+    cut, whole = (starts.Started(open_, "hull", opened, None, cut) for cut in (True, None))
+    assert _grown_over(views, cut, closed) > 10 * CLOSED
+    assert _grown_over(views, cut, open_) == 0
+    assert _grown_over(views, whole, closed) == 0
 
 
 @pytest.mark.parametrize(("most", "taken"), [(5000, False), (6000, True)])

@@ -137,6 +137,14 @@ def test_a_hollow_of_the_input_mesh_that_is_closed_is_told():
     )
 
 
+def test_a_film_over_a_hollow_that_was_cut_open_is_told():
+    assert judged(grown_over=0.004).verdict.startswith("good")
+    assert judged(grown_over=0.012).verdict == (
+        "poor: on 1.2 % of what photos show the result lies far in front of the hull as it was cut open, so a film may "
+        "have grown over a hollow: try more photos that look into it"
+    )
+
+
 def test_no_hollow_is_called_closed_before_the_outline_is_near():
     assert "hollow" in judged(closed=0.165, scores={**GOOD, "silhouette_iou": 0.93}).verdict
     assert "hollow" not in judged(closed=0.165, scores={**GOOD, "silhouette_iou": 0.76}).verdict

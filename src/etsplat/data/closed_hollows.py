@@ -1,6 +1,7 @@
-"""Hollows of an input mesh that its reconstruction has not: photos look deeper into the one than into the other.
+"""Hollows of a mesh that a reconstruction has not: photos look deeper into the one than into the other.
 
-Of plain objects no picture and no outline tells that, so it is asked of the input mesh itself.
+Of plain objects no picture and no outline tells that, so it is asked of the input mesh itself; of photos, of a hull
+that was cut open, over whose dark hollows a film may grow that has their colours.
 """
 
 import torch
@@ -19,11 +20,11 @@ Surface = tuple[Float[Tensor, "V 3"], Int64[Tensor, "F 3"]]
 
 @torch.no_grad()
 def closed_hollows(dataset: Dataset, truth: Surface, found: Surface) -> float:
-    """Of the pixels at which training views see the input mesh, the part where the result lies far in front of it.
+    """Of the pixels at which training views see a mesh, the part where the result lies far in front of it.
 
     Args:
         dataset: photos of it in the unit ball.
-        truth: the input mesh there.
+        truth: the input mesh there, or what a run started from.
         found: the result.
     """
     closed, seen = 0, 0

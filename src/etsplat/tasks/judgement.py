@@ -218,6 +218,7 @@ class Shares:
         contradicted: the largest patch that photos contradict.
         cut_off: where the visual hull ends because photos do, of its surface.
         closed: where the result fills a hollow of the input mesh, of what photos see of it.
+        grown_over: the same of a hollow that was cut out of the hull; 0 where a mesh was photographed.
         plain: the largest patch on which photos show nothing to compare; 0 where hollows are compared with those of
             the input mesh.
         unseen: what no photo shows; 0 where a mesh was photographed, so that the rest is known.
@@ -226,6 +227,7 @@ class Shares:
     contradicted: float = 0.0
     cut_off: float = 0.0
     closed: float = 0.0
+    grown_over: float = 0.0
     plain: float = 0.0
     unseen: float = 0.0
 
@@ -327,6 +329,11 @@ def _wrong_places(shares: Shares, *, converged: bool) -> list[str]:
         poor.append(
             f"on {100 * shares.closed:.1f} % of what photos show the result lies far in front of the input mesh, so a "
             "hollow is closed: try --init-mesh with a mesh that has it, or a texture for photos to agree on"
+        )
+    if shares.grown_over > CLOSED and converged:
+        poor.append(
+            f"on {100 * shares.grown_over:.1f} % of what photos show the result lies far in front of the hull as it "
+            "was cut open, so a film may have grown over a hollow: try more photos that look into it"
         )
     return poor
 

@@ -285,6 +285,7 @@ def _judge(
             contradicted=contradicted(looked, mesh.display_face_colors.cpu()) if doubtful else 0.0,
             cut_off=0.0 if hull is None else cut_off(views, hull.vertices, hull.faces),
             closed=0.0 if truth is None else closed_hollows(views, (truth.vertices, truth.faces), mesh.surface()),
+            grown_over=_grown_over(views, started, mesh) if from_photos else 0.0,
             plain=plain_share(looked) if from_photos else 0.0,
             unseen=unseen_share(looked) if from_photos else 0.0,
         ),
@@ -297,6 +298,13 @@ def _judge(
             lacking=0.0 if hull is None else hull.uncovered,
         ),
     )
+
+
+def _grown_over(views: Dataset, started: Started, mesh: TriangleMesh) -> float:
+    """Where a hollow that was cut open is closed again, of what photos see of the start."""
+    if not started.cut or started.opened is None:
+        return 0.0
+    return closed_hollows(views, (started.opened.vertices, started.opened.faces), mesh.surface())
 
 
 def _resting(mesh: TriangleMesh, views: Dataset) -> Callable[[Tensor], Tensor]:
