@@ -332,6 +332,21 @@ def helix(g: Grid) -> Field:
     return union(g.disc(-0.75, 0.62, 0.05), g.disc(0.75, 0.62, 0.05), *(g.rod(a, b, 0.045) for a, b in pairwise(path)))
 
 
+def jug(g: Grid) -> Field:
+    """A belly under a neck, hollow, with a handle."""
+    radius = 0.36 + 0.1 * np.sin(3 * (g.z + 0.2))
+    wall = np.maximum(0.85 * np.abs(g.around - radius) - 0.035, np.abs(g.z) - 0.7)
+    handle = np.maximum(g.ring((-0.42, 0, 0.05), 0.34, 0.045, 1), -0.85 * (g.around - radius))
+    return union(wall, g.disc(-0.68, 0.3, 0.05), handle)
+
+
+def goblet(g: Grid) -> Field:
+    """A deep cup with a thin wall on a stem and a foot."""
+    egg = np.sqrt((g.around / 0.42) ** 2 + ((g.z - 0.35) / 0.5) ** 2) - 1
+    cup = np.maximum(0.4 * np.abs(egg) - 0.03, g.z - 0.55)
+    return union(cup, g.rod((0, 0, -0.15), (0, 0, -0.75), 0.05), g.disc(-0.78, 0.36, 0.04))
+
+
 SHAPES: dict[str, Callable[[Grid], Field]] = {
     shape.__name__: shape
     for shape in (
@@ -339,5 +354,6 @@ SHAPES: dict[str, Callable[[Grid], Field]] = {
         *(teapot, comb, clasp, basket, shelf),
         *(cottage, tree, violin, well),
         *(bucket, glasses, lantern, pretzel, book, can, rings, bottle, helix),
+        *(jug, goblet),
     )
 }

@@ -16,7 +16,7 @@ from etsplat.data.agreement import Looked, agreement, averaged, first_hits, look
 from etsplat.data.dataset import Dataset
 from etsplat.data.visual_hull import Distance, outside_hull
 from etsplat.geometry.distance import closest_points
-from etsplat.geometry.measures import face_areas, mean_edge, vertex_normals
+from etsplat.geometry.measures import area_normals, face_areas, mean_edge, vertex_normals
 from etsplat.geometry.topology import connected
 
 _LID, _LIDS = 0.6, 3
@@ -42,10 +42,10 @@ _AGREED, _PEAK = 0.5, 0.3
 likely thickness."""
 
 _LEVEL = 0.7
-"""Cosine of the angle between normals of a lid and of the rim around it, at least."""
+"""Cosine of the angle between a lid's mean normal and those of its own faces and of the rim's, at least."""
 
-_BRIM = 3
-"""Pixels beside a lid on which photos hardly tell that there is none, since walls are right behind it."""
+_BESIDE = 3
+"""Pixels beside where photos contradict a lid that are the lid's, too: of walls right behind it they see the like."""
 
 _THICK = 1.5
 """Mean edges of the hull: thinner walls would have holes once they are meshed."""
@@ -60,7 +60,7 @@ class _Walls(NamedTuple):
     Attributes:
         vertices: (V, 3) of all.
         lid: (L, 3) faces over what is free.
-        rim: (R, 3) those around it that are as level, as far as walls are thick.
+        rim: (R, 3) those around it that are as level, as far as the sides.
         sides: (F, 3) all others.
         thickness: of the walls.
     """
@@ -136,12 +136,6 @@ def _distance(points: Tensor, vertices: Tensor, faces: Tensor) -> Tensor:
     return closest_points(points, vertices, faces)[0].sqrt().to(points)
 
 
-def _cross(vertices: Tensor, faces: Tensor) -> Tensor:
-    """(F, 3) normals of faces, as long as twice their areas."""
-    a, b, c = vertices[faces].unbind(dim=1)
-    return torch.linalg.cross(b - a, c - a)
-
-
 class _Through:
     """What photos see through a lid.
 
@@ -163,21 +157,21 @@ class _Through:
         self._behind = [first_hits(photo, vertices, self.rest)[0][None, None] for photo in looked.photos]
 
     def walls(self, thickness: float) -> _Walls:
-        """So thick ones around what is under the lid and its brim, but for what of these is not level, or on walls."""
-        vertices, rest, brim = self._vertices, self.rest, _BRIM * self.pixel
-        up = normalize(_cross(vertices, self._lid_faces).sum(dim=0), dim=0)
+        """So thick ones around what is under the lid, with what is beside it, where that is level and not on walls."""
+        vertices, rest, beside = self._vertices, self.rest, _BESIDE * self.pixel
+        up = normalize(area_normals(vertices, self._lid_faces).sum(dim=0), dim=0)
         lid = self._lid_faces[self._level(self._lid_faces, up)]
         away = _distance(vertices[rest].mean(dim=1), vertices, lid)
-        around = self._level(rest, up) & (away <= thickness + brim)
-        sides, above = rest[~around], torch.cat([lid, rest[around & (away <= brim)]])
+        around = self._level(rest, up) & (away <= thickness + beside)
+        sides, above = rest[~around], torch.cat([lid, rest[around & (away <= beside)]])
         below = vertices[above].mean(dim=1) - 2 * thickness * up
         on_walls = _distance(below, vertices, sides) <= thickness
-        rim = torch.cat([rest[around & (away > brim)], above[on_walls]])
+        rim = torch.cat([rest[around & (away > beside)], above[on_walls]])
         return _Walls(vertices, above[~on_walls], rim, sides, thickness)
 
     def _level(self, faces: Int64[Tensor, "F 3"], up: Float[Tensor, " 3"]) -> Bool[Tensor, " F"]:
         """Which faces look up as a lid does."""
-        return normalize(_cross(self._vertices, faces), dim=1) @ up > _LEVEL
+        return normalize(area_normals(self._vertices, faces), dim=1) @ up > _LEVEL
 
     def agreed(self, thickness: float) -> float:
         """Mean correlation on walls so thick, by how many photos see each place; 0 where too little is known."""

@@ -7,17 +7,20 @@ from torch import Tensor
 from etsplat.core.validation import check_indices, check_shape, dense
 
 
+def area_normals(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> Float[Tensor, "F 3"]:
+    """Normals of faces, as long as twice their areas."""
+    a, b, c = vertices[faces].unbind(1)
+    return torch.linalg.cross(b - a, c - a)
+
+
 def face_areas(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> Float[Tensor, " F"]:
     """The area of each face, in the dtype of the vertices; zero where a face repeats a vertex."""
-    a, b, c = vertices[faces].unbind(1)
-    return 0.5 * torch.linalg.cross(b - a, c - a).norm(dim=1)
+    return 0.5 * area_normals(vertices, faces).norm(dim=1)
 
 
 def vertex_normals(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> Float[Tensor, "V 3"]:
     """(V, 3) unit normals, the mean of the faces' weighted by area; 0 for a vertex without one."""
-    a, b, c = vertices[faces].unbind(1)
-    across = torch.linalg.cross(b - a, c - a)
-    total = torch.zeros_like(vertices)
+    across, total = area_normals(vertices, faces), torch.zeros_like(vertices)
     for corner in faces.T:
         total = total.index_add(0, corner, across)
     return torch.nn.functional.normalize(total, dim=1)

@@ -24,6 +24,7 @@ from etsplat.core.validation import (
     check_shape,
 )
 from etsplat.data.dataset import Normalization
+from etsplat.geometry.measures import area_normals
 from etsplat.geometry.topology import MeshTopology
 from etsplat.io.mesh_files import MeshFile, load_mesh, save_mesh, weld_vertices
 from etsplat.model.model import Appearance, Backgrounds, Depth, Model
@@ -336,8 +337,7 @@ class TriangleMesh(Model):
         """
         if self.harmonics is None:
             return self.colors.detach().clamp(0.0, 1.0)
-        corners = self.vertices.detach()[self.faces]
-        normals = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        normals = area_normals(self.vertices.detach(), self.faces)
         parts = [part for band, part in enumerate(_SEEN_FROM_FRONT, 1) for _ in range(2 * band + 1)]
         weights = normals.new_tensor(parts[: self.harmonics.shape[1]])[:, None]
         coefficients = torch.cat([self._constant_band(), weights * self.harmonics], dim=1).detach()
