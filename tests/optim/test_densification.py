@@ -14,7 +14,7 @@ def soup_tensors(rng: torch.Generator, count: int):
     return vertices, torch.randn(count, generator=rng), 0.1 + torch.rand(count, generator=rng)
 
 
-def plan_for(rng, count=40, target=60, screen_size=None, dead=None, by="opacity"):
+def plan_for(rng, count=40, target=60, screen_size=None, dead=None, by="opacity", barren=None):
     vertices, logits, sigma = soup_tensors(rng, count)
     plan = densify_plan(
         vertices,
@@ -24,6 +24,7 @@ def plan_for(rng, count=40, target=60, screen_size=None, dead=None, by="opacity"
         torch.zeros(count, dtype=torch.bool) if dead is None else dead,
         target=target,
         by=by,
+        barren=barren,
         split_size=24.0,
         noise=1.5,
         generator=rng,
@@ -134,6 +135,14 @@ def test_a_trial_is_one_whole_epoch():
     statistics.restart(statistics.judged(4))
     statistics.update(rendering(1), 4, epoch_starts=False)
     assert int(statistics.trial) == 0
+
+
+@pytest.mark.parametrize("by", ["opacity", "sharpness"])
+def test_who_is_barren_has_no_children(rng, by):
+    """Whatever its opacity and softness."""
+    plan, *_ = plan_for(rng, by=by, barren=torch.arange(40) % 4 != 0)
+    assert len(plan.source[plan.fresh].unique()) == 10
+    assert bool((plan.source[plan.fresh] % 4 == 0).all())
 
 
 @pytest.mark.parametrize("views", [20, 300, 520, 1300])

@@ -240,6 +240,20 @@ def test_what_is_spared_stays_where_nobody_looks(rng: torch.Generator) -> None:
     assert soup.count == 25
 
 
+def test_who_is_barren_does_not_multiply(rng: torch.Generator) -> None:
+    """Though it is the most opaque. It stays."""
+    strategy, soup = DensifyAndPrune(growth=1.5, split_size=1e9, barren=lambda soup: soup.opacities > 0.9), a_soup(rng)
+    started(strategy, soup)
+    seen_by_all(strategy)
+    with torch.no_grad():
+        soup.opacity_logits[:20] = 9
+        soup.sh_dc.copy_(torch.arange(40.0)[:, None, None].expand(40, 1, 3))
+    strategy.densify(200)
+    numbers = soup.sh_dc.detach()[:, 0, 0].int().bincount(minlength=40)
+    assert numbers[:20].tolist() == [1] * 20
+    assert numbers[20:].tolist() == [2] * 20
+
+
 def test_a_soup_that_dies_out_is_an_error(rng: torch.Generator) -> None:
     """In words that name the iteration and what to change."""
     strategy, soup = DensifyAndPrune(prune=PruneRules(opacity=0.9)), a_soup(rng)

@@ -136,6 +136,7 @@ def densify_plan(
     *,
     target: int,
     by: Literal["opacity", "sharpness"],
+    barren: Bool[Tensor, " N"] | None = None,
     split_size: float,
     noise: float,
     generator: torch.Generator,
@@ -155,13 +156,15 @@ def densify_plan(
         dead: (N,).
         target: never exceeded, unless there are more survivors.
         by: what makes a parent.
+        barren: (N,) who else has no children.
         split_size: pixels.
         noise: size of the shift along each axis, as a multiple of the triangle's extent.
         generator: of every random choice.
     """
     N = len(vertices)
     weights = torch.sigmoid(opacity_logits) if by == "opacity" else 1.0 / sigma
-    weights = torch.where(dead | ~weights.isfinite() | (screen_size == 0), 0.0, weights)
+    childless = dead | ~weights.isfinite() | (screen_size == 0)
+    weights = torch.where(childless if barren is None else childless | barren, 0.0, weights)
     parents = _draw(weights, target - (N - int(dead.sum())), generator)
     large = screen_size[parents] > split_size
     cost = torch.where(large, SPLIT_PARTS - 1, 1).cumsum(0)

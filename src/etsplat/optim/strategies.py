@@ -318,6 +318,7 @@ class DensifyAndPrune(Strategy):
         clone_noise: how far a clone is shifted, as a multiple of the triangle's extent.
         prune: when a triangle dies.
         spared: of which triangles, by their corners, those that no view has seen stay.
+        barren: which triangles of the soup do not multiply.
 
     Raises:
         ValueError: `every` or `growth` below 1, or another word for `sample_by`.
@@ -340,6 +341,7 @@ class DensifyAndPrune(Strategy):
     clone_noise: float = 1.5
     prune: PruneRules = field(default_factory=PruneRules)
     spared: Spared | None = None
+    barren: Callable[[TriangleSoup], Tensor] | None = None
 
     outputs = ("statistics",)
 
@@ -381,6 +383,7 @@ class DensifyAndPrune(Strategy):
             dead,
             target=grown_count(count, self.growth, self.max_triangles),
             by=by,
+            barren=None if self.barren is None else self.barren(soup),
             split_size=self.split_size,
             noise=self.clone_noise,
             generator=self.generator,

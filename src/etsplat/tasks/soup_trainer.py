@@ -19,6 +19,7 @@ from etsplat.optim.camera_refinement import CameraRefinement
 from etsplat.optim.densification import PruneRules
 from etsplat.optim.depth_trust import DepthTrust
 from etsplat.optim.exposure import Exposure
+from etsplat.optim.hidden_sky import HiddenSky
 from etsplat.optim.objective import Objective
 from etsplat.optim.schedules import Schedule, Scheduled, exponential_decay, ramp
 from etsplat.optim.strategies import DensifyAndPrune
@@ -118,7 +119,7 @@ def make_trainer(
         soup,
         capture,
         _objective(config, len(capture.train), spared, depths, squared=squared),
-        _strategy(config, triangle_limit(capture, config), spared),
+        _strategy(config, capture, spared),
         schedule=_schedule(config, vertex_unit(soup, capture, config), len(capture.train), soup.parameters()),
         batch=config.batch,
         background=None if config.background == "random" else background_of(config),
@@ -165,7 +166,7 @@ def _objective(
     return Objective(photometric, terms, depth_of="centroid" if depths is None else "plane")
 
 
-def _strategy(config: TrainConfig, most: int, spared: Spared | None) -> DensifyAndPrune:
+def _strategy(config: TrainConfig, capture: Dataset, spared: Spared | None) -> DensifyAndPrune:
     times = {name: config.at(getattr(config.densification, name)) for name in ("begin", "end", "every")}
     least = min(LEAST_EVERY, config.iterations // 10)
     times |= {"begin": max(times["begin"], 2 * least), "every": max(times["every"], least)}
@@ -175,9 +176,10 @@ def _strategy(config: TrainConfig, most: int, spared: Spared | None) -> DensifyA
     return DensifyAndPrune(
         **{**vars(config.densification), **times},
         last=config.iterations,
-        max_triangles=most,
+        max_triangles=triangle_limit(capture, config),
         prune=PruneRules(**rules),
         spared=spared,
+        barren=None if spared is None else HiddenSky(capture, spared),
     )
 
 
