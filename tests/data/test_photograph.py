@@ -148,3 +148,24 @@ def test_a_texture_belongs_to_the_fingerprint_of_a_source(sphere):
     )
     black, white = (replace(sphere, texture=replace(texture, pixels=texture.pixels + shade)) for shade in (0, 255))
     assert len({fingerprint(mesh) for mesh in (sphere, black, white)}) == 3
+
+
+def test_arrays_that_do_not_belong_together_are_named_and_colours_may_be_doubles():
+    """Colours of vertices in the place of faces' ended in sizes of tensors that must match."""
+    vertices, faces = icosphere(1)
+
+    def first(mesh: MeshFile, supersampling: int = 1):
+        return photograph(mesh, 8, 8, elevations=(0.0,), azimuths=5, supersampling=supersampling).images[0]
+
+    with pytest.raises(ValueError, match=r"face_colors: expected shape \(80, 3\), got \(42, 3\)"):
+        first(MeshFile(vertices, faces, face_colors=torch.ones(42, 3)))
+    with pytest.raises(ValueError, match="faces: expected indices"):
+        first(MeshFile(vertices, faces + 1))
+    for name, count in (("face_colors", 80), ("vertex_colors", 42)):
+        colors = torch.rand(count, 3, generator=torch.Generator().manual_seed(0))
+        mesh = MeshFile(vertices, faces, **{name: colors})
+        assert torch.equal(first(replace(mesh, **{name: colors.double()})), first(mesh))
+    texture = Texture.of([torch.zeros(1, 1, 3, dtype=torch.uint8)], torch.zeros(80).long(), torch.zeros(80, 3, 2))
+    for mesh in (MeshFile(vertices, faces), MeshFile(vertices, faces, texture=texture)):
+        with pytest.raises(ValueError, match="supersampling must be an integer from 1 to 16"):
+            first(mesh, 0)

@@ -1,4 +1,5 @@
 import contextlib
+import gc
 import io
 import struct
 import tracemalloc
@@ -230,3 +231,19 @@ def test_a_picture_with_channels_first_is_named(tmp_path):
     ):
         save_image(tmp_path / "x.png", torch.rand(3, 8, 8))
     assert not (tmp_path / "x.png").exists()
+
+
+def test_an_image_that_may_not_be_read_is_one_line(tmp_path, monkeypatch, capfd):
+    """Nor is anything written where the file, which was never opened, is let go of."""
+    save_image(tmp_path / "a.png", torch.zeros(4, 4, 3))
+
+    def refuse(path):
+        raise PermissionError(13, "Permission denied", path)
+
+    monkeypatch.setattr("etsplat.io.images.io.FileIO", refuse)
+    with pytest.raises(
+        InputError, match=r"image .*a\.png: cannot be read \(Permission denied\); check its permissions"
+    ):
+        load_image(tmp_path / "a.png")
+    gc.collect()
+    assert capfd.readouterr().err == ""

@@ -349,6 +349,38 @@ def test_gltf_reads_no_file_outside_of_its_folder(tmp_path, ball, uri):
         load_mesh(tmp_path / "in" / "a.gltf")
 
 
+def test_a_glb_whose_surface_is_in_an_extension_that_is_not_read_says_which(tmp_path, ball):
+    """Draco's arrays were read as zeros, of which all faces had no area; of copies the first one was there."""
+    trimesh.Trimesh(ball[0].numpy(), ball[1].numpy(), process=False).export(tmp_path / "whole.glb")
+    data = (tmp_path / "whole.glb").read_bytes()
+    size = struct.unpack("<I", data[12:16])[0]
+    (tmp_path / "b.bin").write_bytes(data[28 + size :])
+
+    def load(edit):
+        document = json.loads(data[20 : 20 + size])
+        document["buffers"][0]["uri"] = "b.bin"
+        edit(document)
+        (tmp_path / "a.gltf").write_text(json.dumps(document))
+        return load_mesh(tmp_path / "a.gltf")
+
+    def draco(document):
+        for accessor in document["accessors"]:
+            del accessor["bufferView"]
+        packed = {"bufferView": 0, "attributes": {"POSITION": 0}}
+        document["meshes"][0]["primitives"][0]["extensions"] = {"KHR_draco_mesh_compression": packed}
+        document["extensionsRequired"] = ["KHR_draco_mesh_compression"]
+
+    def copies(document):
+        node = next(node for node in document["nodes"] if "mesh" in node)
+        node["extensions"] = {"EXT_mesh_gpu_instancing": {"attributes": {"TRANSLATION": 0}}}
+
+    assert len(load(lambda document: None).faces) == len(ball[1])
+    with pytest.raises(InputError, match=r"a\.gltf: is compressed by Draco .*export it without compression"):
+        load(draco)
+    with pytest.raises(InputError, match=r"a\.gltf: places copies of its meshes by EXT_mesh_gpu_instancing"):
+        load(copies)
+
+
 def test_a_folder_is_an_input_error(tmp_path):
     with pytest.raises(InputError, match="is a folder"):
         load_mesh(tmp_path)

@@ -69,6 +69,15 @@ def test_colours_of_points_are_of_any_kind(tmp_path, kind, value):
         assert load_points(tmp_path / "a.ply")[1][1:] == pytest.approx(0.5, abs=3e-3)
 
 
+@pytest.mark.parametrize("name", ["#", "#x", "#kind"])
+def test_other_properties_have_any_name(tmp_path, name):
+    """One is no number of corners because of a sign in its name."""
+    head = f"ply\nformat ascii 1.0\nelement vertex 1\nproperty float {name}\n"
+    places = "".join(f"property float {axis}\n" for axis in "xyz")
+    (tmp_path / "a.ply").write_text(f"{head}{places}end_header\n7 1 2 3\n")
+    assert load_points(tmp_path / "a.ply")[0].tolist() == [[1.0, 2.0, 3.0]]
+
+
 def test_black_scans_have_no_colours(tmp_path):
     write_las(tmp_path / "a.las", np.zeros((50, 3), dtype=np.uint16))
     assert load_cloud(tmp_path / "a.las")[1] is None

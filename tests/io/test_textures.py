@@ -226,3 +226,54 @@ def test_indices_of_textures_out_of_range_are_an_input_error(tmp_path):
 
     with pytest.raises(InputError, match=r"model\.gltf: cannot be read as GLTF"):
         load_mesh(change(gltf(tmp_path, "gltf"), edit))
+
+
+PAINTS = "newmtl red\nKd 1 0 0\nnewmtl blue\nKd 0 0 1\n"
+TWO = "usemtl red\nf 1 2 3\nusemtl blue\nf 1 3 4\n"
+
+
+def test_without_pictures_faces_have_the_plain_colours_of_their_materials(tmp_path):
+    """They were white, without a word."""
+    mesh = obj(tmp_path, PAINTS, TWO)
+    assert mesh.texture is None
+    assert mesh.face_colors is not None
+    assert mesh.face_colors.tolist() == [[1, 0, 0], [0, 0, 1]]
+    assert mesh.notes == ()
+
+
+@pytest.mark.parametrize(
+    ("mtl", "points"),
+    [
+        (PAINTS.replace("1 0 0", "0.8 0.8 0.8").replace("0 0 1", "0.8 0.8 0.8"), QUAD),
+        (PAINTS, "v 0 0 0 0 1 0\nv 1 0 0 0 1 0\nv 1 1 0 0 1 0\nv 0 1 0 0 1 0\n"),
+    ],
+)
+def test_one_grey_for_all_is_no_colour_and_colours_of_vertices_come_first(tmp_path, mtl, points):
+    """Programs write a grey where nobody chose a colour."""
+    mesh = obj(tmp_path, mtl, TWO, points)
+    assert mesh.face_colors is None
+    assert (mesh.vertex_colors is None) == (points == QUAD)
+
+
+def test_a_gltf_without_pictures_has_the_plain_colours_of_its_materials(tmp_path):
+    """Half of linear light is 188 as displayed. Colours of vertices are multiplied by them, which was left out."""
+
+    def edit(document, colored=False):
+        document["materials"] = [
+            {"pbrMetallicRoughness": {"baseColorFactor": [0.5, 0, 0, 1]}},
+            {"pbrMetallicRoughness": {"baseColorFactor": [0, 0, 1, 1]}},
+        ]
+        first = document["meshes"][0]["primitives"][0]
+        if colored:
+            first["attributes"]["COLOR_0"] = first["attributes"]["POSITION"]
+        document["meshes"][0]["primitives"] = [first | {"material": 0}, first | {"material": 1}]
+
+    mesh = load_mesh(change(gltf(tmp_path, "gltf"), edit))
+    assert mesh.texture is None
+    assert mesh.face_colors is not None
+    assert (255 * mesh.face_colors).round().tolist() == [[188, 0, 0]] * 2 + [[0, 0, 255]] * 2
+    mesh = load_mesh(change(gltf(tmp_path, "gltf"), lambda document: edit(document, colored=True)))
+    assert mesh.face_colors is None
+    assert mesh.vertex_colors is not None
+    corner = (mesh.vertices == torch.tensor([1.0, 1.0, 0.0])).all(dim=1)
+    assert (255 * mesh.vertex_colors[corner]).round().tolist() == [[188, 0, 0], [0, 0, 0]]

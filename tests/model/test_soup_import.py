@@ -30,6 +30,13 @@ def write_gaussians(path, properties):
     path.write_bytes(head.encode() + np.full((5, len(properties)), 0.1, "<f4").tobytes())
 
 
+def test_of_a_file_that_holds_no_soup_all_kinds_are_told_that_do(tmp_path):
+    """Not those of meshes alone."""
+    (tmp_path / "notes.txt").touch()
+    with pytest.raises(InputError, match=r"soup .*notes\.txt: .* \.safetensors, \.etz, \.pt, .*\.glb.* a run's folder"):
+        open_soup(tmp_path / "notes.txt")
+
+
 @pytest.mark.parametrize("count", [0, 9, 24, 45])
 def test_a_gaussian_scene_may_have_harmonics_of_any_degree(tmp_path, count):
     write_gaussians(tmp_path / "gaussians.ply", [*GAUSSIAN, *rest(count)])

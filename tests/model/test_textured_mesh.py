@@ -14,6 +14,7 @@ from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.triangle_atlas import pack_triangles
 from etsplat.io.mesh_files import load_mesh, save_mesh
 from etsplat.io.textures import Texture
+from etsplat.model.soup_import import open_soup
 from etsplat.model.textured_mesh import TexturedMesh
 
 CAMERAS = etsplat.orbit_cameras(40, 30, azimuths=2)[:2]
@@ -66,8 +67,8 @@ def test_trimesh_reads_the_glb_with_the_same_picture(mesh, tmp_path):
 
 
 def test_trimesh_reads_the_ply_with_the_same_picture(mesh, tmp_path):
-    """As MeshLab does: places of corners in lists at faces, counted from the bottom, and a PNG beside the file. Our own
-    reader says that it takes no texture from PLY."""
+    """As MeshLab does: places of corners in lists at faces, counted from the bottom, and a PNG beside the file. So does
+    our own reader; without the PNG it says so."""
     mesh.save(tmp_path / "ball.ply")
     found = trimesh.load(tmp_path / "ball.ply", process=False)
     assert found.visual.kind == "texture"
@@ -79,8 +80,48 @@ def test_trimesh_reads_the_ply_with_the_same_picture(mesh, tmp_path):
     assert abs(picture - mesh.texture.detach().clamp(0, 1).numpy()).max() <= 0.51 / 255
     read = load_mesh(tmp_path / "ball.ply")
     assert len(read.faces) == mesh.count
+    assert read.notes == ()
+    again = TexturedMesh.load(tmp_path / "ball.ply")
+    torch.testing.assert_close(again.face_uvs, mesh.face_uvs, atol=1e-6, rtol=0)
+    torch.testing.assert_close(again.texture, mesh.texture.clamp(0, 1), atol=0.51 / 255, rtol=0)
+    (tmp_path / "ball.png").unlink()
+    alone = load_mesh(tmp_path / "ball.ply")
+    assert alone.texture is None
+    assert len(alone.notes) == 1
+    assert "a texture is left out: " in alone.notes[0]
+    assert "ball.png" in alone.notes[0]
+
+
+@pytest.mark.parametrize(
+    ("line", "told"),
+    [
+        ("comment TextureFile a.png\ncomment TextureFile b.png\n", "2 pictures, and one is read from PLY"),
+        ("comment TextureFile a.png\n", "has no list texcoord at faces"),
+        ("comment TextureFile ../a.png\nT", "a.png"),
+    ],
+)
+def test_textures_of_ply_that_cannot_be_read_are_said_to_be_left_out(tmp_path, line, told):
+    places = "property list uchar float texcoord\n" if line.endswith("T") else ""
+    (tmp_path / "a.ply").write_text(
+        f"ply\nformat ascii 1.0\n{line.rstrip('T')}element vertex 4\nproperty float x\nproperty float y\n"
+        f"property float z\nelement face 2\nproperty list uchar int vertex_index\n{places}end_header\n"
+        "0 0 0\n1 0 0\n0 1 0\n1 1 0\n" + "".join(f"3 {k} 1 2{' 6 0 0 1 0 0 1' if places else ''}\n" for k in (0, 3))
+    )
+    read = load_mesh(tmp_path / "a.ply")
     assert read.texture is None
-    assert read.notes == ("its texture is left out: PLY is read without; save it as glb",)
+    assert told in read.notes[0]
+
+
+@pytest.mark.parametrize("kind", ["glb", "obj", "ply"])
+def test_a_soup_of_a_textured_file_has_the_colours_of_its_texture(mesh, tmp_path, kind):
+    """It was grey, and of PLY refused, without a word of the texture."""
+    with torch.no_grad():
+        mesh.texture[:] = torch.tensor([0.9, 0.4, 0.1])
+    mesh.save(tmp_path / f"ball.{kind}")
+    soup = open_soup(tmp_path / f"ball.{kind}")
+    assert len(soup) == mesh.count
+    colors = 0.5 + 0.28209479 * soup.sh_dc[:, 0]
+    torch.testing.assert_close(colors, torch.tensor([0.9, 0.4, 0.1]).expand_as(colors), atol=0.01, rtol=0)
 
 
 def test_a_glb_shares_vertices_where_its_faces_share_places(tmp_path):

@@ -1,7 +1,8 @@
-"""Operations compute in the precision of their arguments."""
+"""Operations compute in the precision of their arguments; runs in 32 bits, whatever torch's defaults are."""
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from functools import wraps
 from typing import Any, ParamSpec, TypeVar, cast
 
@@ -48,3 +49,20 @@ def as_given(function: Callable[Arguments, Result]) -> Callable[Arguments, Resul
 def _whole(argument: object) -> object:
     halved = isinstance(argument, torch.Tensor) and argument.dtype in (torch.float16, torch.bfloat16)
     return cast(torch.Tensor, argument).float() if halved else argument
+
+
+@contextmanager
+def usual_defaults() -> Iterator[None]:
+    """Within the block what torch makes is float32 and on the CPU unless it is told otherwise.
+
+    As it is where nobody has called `torch.set_default_dtype` or `torch.set_default_device`, by whose choice random
+    numbers, backgrounds and the like would be of another kind than photos and models.
+    """
+    given = torch.get_default_dtype()
+    with ExitStack() as stack:
+        if torch.get_default_device().type != "cpu":
+            stack.enter_context(torch.device("cpu"))
+        if given != torch.float32:
+            stack.callback(torch.set_default_dtype, given)
+            torch.set_default_dtype(torch.float32)
+        yield

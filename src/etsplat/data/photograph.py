@@ -17,13 +17,14 @@ from torch import Tensor
 
 from etsplat.core.cameras import Cameras, intrinsics, look_at, sphere_grid
 from etsplat.core.errors import InputError
+from etsplat.core.precision import usual_defaults
 from etsplat.core.validation import check_count
 from etsplat.data.dataset import Dataset, Normalization
 from etsplat.data.pictures import StoredPictures
 from etsplat.geometry.measures import bounding_ball
 from etsplat.io.mesh_files import MeshFile
 from etsplat.io.textures import Texture
-from etsplat.ops.rasterize_opaque import rasterize_opaque, render_opaque
+from etsplat.ops.rasterize_opaque import MAX_SUPERSAMPLING, rasterize_opaque, render_opaque
 
 ELEVATIONS = (-70.0, -35.0, 0.0, 35.0, 70.0)
 """Degrees above the horizon."""
@@ -65,6 +66,7 @@ def normalize_mesh(mesh: MeshFile) -> tuple[MeshFile, Normalization]:
     return replace(mesh, vertices=unit), Normalization(center.float(), radius)
 
 
+@usual_defaults()
 def photograph(
     mesh: MeshFile,
     width: int = 1024,
@@ -92,7 +94,8 @@ def photograph(
         Views in the unit frame with float32 pictures; those with index % 5 == 2 are test views.
 
     Raises:
-        ValueError: `width` below `height`, or elevations that look along the vertical.
+        ValueError: `width` below `height`, elevations that look along the vertical, a `supersampling` that is no
+            integer from 1 to 16, or a mesh whose arrays do not belong together.
         InputError: as `normalize_mesh`.
 
     Example:
@@ -104,7 +107,9 @@ def photograph(
         raise ValueError(f"width: expected at least the height ({height}), got {width}")
     if not all(-90 < elevation < 90 for elevation in elevations):
         raise ValueError(f"elevations: expected degrees strictly between -90 and 90, got {list(elevations)}")
+    supersampling = check_count("supersampling", supersampling, most=MAX_SUPERSAMPLING)
     unit, normalization = normalize_mesh(mesh)
+    unit.check()
     cameras = orbit_cameras(width, height, elevations=elevations, azimuths=azimuths)
     vertices, faces = unit.vertices.to(device), unit.faces.to(device)
     texture = None if unit.texture is None else unit.texture.to(device)
@@ -144,9 +149,9 @@ def _lit_colors(mesh: MeshFile) -> tuple[Float[Tensor, "F 3"] | None, Float[Tens
     """Colours under the lights of a mesh without a texture: of its faces, or else of their corners."""
     light = shade_faces(mesh.vertices, mesh.faces)
     if mesh.face_colors is not None:
-        return light * mesh.face_colors, None
+        return light * mesh.face_colors.to(light), None
     if mesh.vertex_colors is not None:
-        return None, light[:, None] * mesh.vertex_colors[mesh.faces]
+        return None, light[:, None] * mesh.vertex_colors.to(light)[mesh.faces]
     return light, None
 
 

@@ -14,6 +14,7 @@ from etsplat.io.paths import path_within
 
 _COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 _KINDS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+_DRACO, _INSTANCING = "KHR_draco_mesh_compression", "EXT_mesh_gpu_instancing"
 _SHARING = 4
 """Accessors may share bytes; together they have no more than this many times those that there are."""
 
@@ -96,6 +97,20 @@ def check_gltf(path: Path) -> bytes:
 def is_compressed(document: dict[str, Any]) -> bool:
     """Whether arrays have to be decoded."""
     return any(_packed(view) is not None for view in document.get("bufferViews", []))
+
+
+def refuse_unread(path: Path, document: dict[str, Any]) -> None:
+    """Raise InputError for extensions without which another surface would be read, or none."""
+    primitives = (primitive for mesh in document.get("meshes", []) for primitive in mesh["primitives"])
+    if any(_DRACO in primitive.get("extensions", {}) for primitive in primitives):
+        raise InputError(
+            f"mesh {path}: is compressed by Draco ({_DRACO}), which is not read; export it without compression,"
+            " or with EXT_meshopt_compression"
+        )
+    if any(_INSTANCING in node.get("extensions", {}) for node in document.get("nodes", [])):
+        raise InputError(
+            f"mesh {path}: places copies of its meshes by {_INSTANCING}, which is not read; export each copy as a node"
+        )
 
 
 def unpack(path: Path, document: dict[str, Any], binary: bytes) -> bool:

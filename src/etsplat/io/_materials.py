@@ -12,6 +12,7 @@ import torch
 from etsplat.core.errors import InputError
 from etsplat.io._gltf import local_file, view_bytes
 from etsplat.io.images import IMAGE_FORMATS, MAX_PIXELS, load_colors
+from etsplat.io.ply_tables import PLACES, read_ply_tables
 from etsplat.io.srgb import linear_from_srgb, srgb_from_linear
 from etsplat.io.textures import Texture
 
@@ -92,6 +93,14 @@ class Pictures:
             images, torch.from_numpy(face_images.astype(np.int64)), torch.from_numpy(corner_uvs.astype(np.float32))
         )
 
+    def colors(self, face_images: np.ndarray) -> np.ndarray | None:
+        """(F, 3) the plain colours of faces in [0, 1], where no picture could be used; None of one grey for all."""
+        if self.textured or not len(face_images):
+            return None
+        colors = np.concatenate(self._images)[face_images, 0]
+        plain = (colors == colors[0, 0]).all()
+        return None if plain else colors / 255
+
     def _number(self, key: object, load: Callable[[], np.ndarray]) -> int:
         if key not in self._numbers:
             image = load()
@@ -120,6 +129,30 @@ def read_mtl(path: Path) -> tuple[dict[str, dict[str, str]], list[str]]:
     return materials, [f"{path.name}: {', '.join(sorted(ignored))} ignored; only map_Kd is seen"] if ignored else []
 
 
+def ply_texture(path: Path, names: list[str], faces: int) -> tuple[Texture | None, list[str]]:
+    """The texture of a PLY, and notes.
+
+    Args:
+        path: of the file.
+        names: of the pictures that its comments name.
+        faces: how many it has.
+    """
+    pictures = Pictures()
+    try:
+        if len(names) > 1:
+            raise InputError(f"{len(names)} pictures, and one is read from PLY; save it as glb")
+        table = read_ply_tables(path, ("face",))["face"]
+        if PLACES not in (table.dtype.names or ()) or len(table) != faces:
+            raise InputError(f"{path.name} has no list {PLACES} at faces; save it as glb")
+        places = table[PLACES].reshape(-1, 3, 2).astype(np.float64)
+        if not (np.abs(places) < np.finfo(np.float32).max).all():
+            raise InputError("texture coordinates that are not finite; export it again")
+    except InputError as error:
+        return None, [f"its texture is left out: {error}"]
+    number = pictures.read(names[0], lambda: (local_file(path.parent, names[0], path), None), np.ones(3), 0)
+    return pictures.texture(np.full(faces, number), places), pictures.notes
+
+
 def obj_texture(
     path: Path,
     libraries: list[str],
@@ -127,8 +160,8 @@ def obj_texture(
     face_materials: np.ndarray,
     uvs: np.ndarray,
     face_uvs: np.ndarray,
-) -> tuple[Texture | None, list[str]]:
-    """The texture of an OBJ, and notes.
+) -> tuple[Texture | None, np.ndarray | None, list[str]]:
+    """The texture of an OBJ, or the plain colours of its faces where it has none, and notes.
 
     Args:
         path: of the OBJ.
@@ -170,7 +203,7 @@ def obj_texture(
         pictures.note(f"{missing} faces have no coordinates for their texture, but its material's plain colour")
     corners = np.zeros((len(face_uvs), 3, 2))
     corners[placed] = uvs[face_uvs[placed]]
-    return pictures.texture(np.where(placed, wanted, plainly), corners), pictures.notes
+    return pictures.texture(np.where(placed, wanted, plainly), corners), pictures.colors(plainly), pictures.notes
 
 
 def _numbers(text: str) -> np.ndarray:
@@ -194,7 +227,7 @@ def _picture_name(text: str) -> tuple[str, list[str]]:
 
 
 class GltfMaterials:
-    """The materials of a glTF document whose base colours are pictures."""
+    """The materials of a glTF document whose base colours are pictures, or other than white."""
 
     def __init__(self, path: Path, document: dict[str, Any], binary: bytes) -> None:
         self._path, self._document, self._binary = path, document, binary
@@ -203,8 +236,9 @@ class GltfMaterials:
 
     @property
     def wanted(self) -> bool:
-        """Whether any material has a picture for its base colour."""
-        return any("baseColorTexture" in _base(material) for material in self._document.get("materials", []))
+        """Whether any material has a picture for its base colour, or a colour."""
+        bases = [_base(material) for material in self._document.get("materials", [])]
+        return any("baseColorTexture" in base or bool((_factor(base) != 1).any()) for base in bases)
 
     def mark(self) -> None:
         """Gives the vertices of each primitive an attribute that says its material and where they are in its picture.
@@ -226,10 +260,15 @@ class GltfMaterials:
             if base and "COLOR_0" in attributes:
                 self.pictures.note(f"{self._path.name}: colours of vertices under a texture are ignored")
 
+    def factor(self, attributes: dict[str, np.ndarray]) -> np.ndarray:
+        """(3,) what multiplies the linear light of a primitive's vertices."""
+        _, number = _marked(attributes)
+        return _factor(_base(self._document["materials"][number])) if number >= 0 else np.ones(3)
+
     def uvs(self, attributes: dict[str, np.ndarray]) -> tuple[int, np.ndarray]:
         """The number of a primitive's picture, and (V, 2) where its vertices are in that."""
-        name = next(name for name in attributes if name.startswith(UV))
-        values, number = np.asarray(attributes[name]), int(name[len(UV) :])
+        name, number = _marked(attributes)
+        values = np.asarray(attributes[name])
         if values.dtype.kind == "u":
             values = values / np.iinfo(values.dtype).max
         uvs = values[:, :2].astype(np.float64)
@@ -241,7 +280,7 @@ class GltfMaterials:
     def _picture(self, number: int) -> int:
         material = self._document["materials"][number] if number >= 0 else {}
         base = _base(material)
-        tint = np.array(base.get("baseColorFactor", [1.0, 1.0, 1.0, 1.0])[:3], dtype=np.float64)
+        tint = _factor(base)
         color = self.pictures.plain(srgb_from_linear(tint))
         used = {"normalTexture", "occlusionTexture", "emissiveTexture"} & set(material)
         used |= {"metallicRoughnessTexture"} & set(material.get("pbrMetallicRoughness", {}))
@@ -277,3 +316,14 @@ class GltfMaterials:
 
 def _base(material: dict[str, Any]) -> dict[str, Any]:
     return material.get("pbrMetallicRoughness", {})
+
+
+def _factor(base: dict[str, Any]) -> np.ndarray:
+    """(3,) linear light that multiplies a picture, or is there without one."""
+    return np.array(base.get("baseColorFactor", [1.0, 1.0, 1.0, 1.0])[:3], dtype=np.float64)
+
+
+def _marked(attributes: dict[str, np.ndarray]) -> tuple[str, int]:
+    """The attribute that `GltfMaterials.mark` gave a primitive, and the number of its material, -1 for none."""
+    name = next(name for name in attributes if name.startswith(UV))
+    return name, int(name[len(UV) :])

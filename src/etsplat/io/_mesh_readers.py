@@ -12,10 +12,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from etsplat.core.errors import InputError
-from etsplat.io._gltf import check_gltf, is_compressed, join_gltf, split_gltf, unpack
-from etsplat.io._materials import GltfMaterials, obj_texture
+from etsplat.io._gltf import check_gltf, is_compressed, join_gltf, refuse_unread, split_gltf, unpack
+from etsplat.io._materials import GltfMaterials, obj_texture, ply_texture
+from etsplat.io._ply_polygons import with_triangles
+from etsplat.io._polygons import cut_concave
 from etsplat.io.meshopt import load_meshopt
 from etsplat.io.paths import kind_of
+from etsplat.io.ply_tables import read_ply_comments
 from etsplat.io.srgb import srgb_from_linear
 from etsplat.io.textures import Texture
 
@@ -54,6 +57,7 @@ def read_obj(path: Path) -> RawMesh:
     libraries: list[str] = []
     materials, material, face_materials = {"": 0}, 0, []
     faces: list[Corners] = []
+    polygons: list[tuple[int, int]] = []
     file_faces = 0
     with open(path, encoding="utf-8", errors="replace") as file:
         for number, line in enumerate(file, 1):
@@ -69,6 +73,8 @@ def read_obj(path: Path) -> RawMesh:
                     if 0 in corners:
                         raise ValueError("vertex number 0; they count from 1")
                     cut = _fan([corner - 1 if corner > 0 else len(rows) + corner for corner in corners])
+                    if len(cut) > 1:
+                        polygons.append((len(faces), len(corners)))
                     faces += cut
                     file_faces += 1
                     if libraries:
@@ -89,11 +95,12 @@ def read_obj(path: Path) -> RawMesh:
     table = np.array([row[:3] for row in rows], dtype=np.float64).reshape(-1, 3)
     colored = len(rows) > 0 and all(len(row) == 6 for row in rows)
     colors = np.array([row[3:] for row in rows], dtype=np.float64) if colored else None
-    mesh = RawMesh(table, np.array(faces, dtype=np.int64).reshape(-1, 3), vertex_colors=colors, file_faces=file_faces)
+    triangles, numbers = np.array(faces, dtype=np.int64).reshape(-1, 3), np.array(face_uvs).reshape(-1, 3)
+    cut_concave(table, triangles, polygons, *([numbers] if len(numbers) == len(triangles) else []))
+    mesh = RawMesh(table, triangles, vertex_colors=colors, file_faces=file_faces)
     if libraries and len(face_uvs) < len(faces):
         mesh.notes.append("its materials are named behind its faces; they are left out")
     elif len(face_uvs) > 0:
-        numbers = np.array(face_uvs)
         if numbers.max() >= len(uvs):
             raise InputError(
                 f"mesh {path}: a face uses texture coordinate {int(numbers.max()) + 1}, but there are {len(uvs)};"
@@ -102,9 +109,10 @@ def read_obj(path: Path) -> RawMesh:
         table = np.array(uvs, dtype=np.float64).reshape(-1, 2)
         if not (np.abs(table) < np.finfo(np.float32).max).all():
             raise InputError(f"mesh {path}: texture coordinates that are not finite; export it again")
-        mesh.texture, mesh.notes = obj_texture(
+        mesh.texture, plain, mesh.notes = obj_texture(
             path, libraries, list(materials), np.array(face_materials), table, numbers
         )
+        mesh.face_colors = plain if mesh.vertex_colors is None else None
     return mesh
 
 
@@ -131,6 +139,7 @@ def read_off(path: Path) -> RawMesh:
     with open(path, encoding="utf-8", errors="replace") as file:
         rows = [words for line in file if (words := line.split("#")[0].split())]
     faces: list[Corners] = []
+    polygons: list[tuple[int, int]] = []
     tails: list[list[str]] = []
     try:
         if rows[0].pop(0) not in ("OFF", "COFF"):
@@ -145,6 +154,8 @@ def read_off(path: Path) -> RawMesh:
             if len(row) < behind:
                 raise ValueError(f"a face of {row[0]} corners with {len(row) - 1}")
             cut = _fan([int(word) for word in row[1:behind]])
+            if len(cut) > 1:
+                polygons.append((len(faces), len(cut) + 2))
             faces += cut
             tails += [row[behind : behind + 3]] * len(cut)
         colors = None
@@ -154,12 +165,17 @@ def read_off(path: Path) -> RawMesh:
     except (ValueError, IndexError) as error:
         raise _unreadable(path, error) from error
     table = np.array(faces, dtype=np.int64).reshape(-1, 3)
+    cut_concave(vertices, table, polygons)
     return RawMesh(vertices, table, face_colors=colors, file_faces=face_count)
 
 
 def read_ply(path: Path) -> RawMesh:
-    """PLY, ASCII or binary, through trimesh; a file with fewer faces than its header announces is an error."""
-    mesh = _read_with_trimesh(path)
+    """PLY, ASCII or binary, through trimesh; a file with fewer faces than its header announces is an error.
+
+    Polygons are cut before: trimesh reads no binary file of triangles and quads, and loses whose colours are whose.
+    One picture is read with the places of corners in lists at faces, as MeshLab and we write it.
+    """
+    mesh = _read_with_trimesh(path, with_triangles(path))
     with open(path, "rb") as file:
         header = [line.split() for line in file.read(1 << 16).split(b"end_header")[0].splitlines()]
     try:
@@ -172,8 +188,9 @@ def read_ply(path: Path) -> RawMesh:
             " the file is cut short or has faces with fewer than three corners: export it again"
         )
     mesh.file_faces = announced
-    if any(words[:2] == [b"comment", b"TextureFile"] for words in header):
-        mesh.notes.append("its texture is left out: PLY is read without; save it as glb")
+    names = [line.removeprefix("TextureFile ") for line in read_ply_comments(path) if line.startswith("TextureFile ")]
+    if names:
+        mesh.texture, mesh.notes = ply_texture(path, names, len(mesh.faces))
     return mesh
 
 
@@ -185,7 +202,10 @@ def read_gltf(path: Path) -> RawMesh:
     try:
         data = check_gltf(path)
         document, binary = split_gltf(data)
+        refuse_unread(path, document)
         compressed = is_compressed(document)
+    except InputError:
+        raise
     except Exception as error:
         raise _unreadable(path, error) from error
     if compressed:
@@ -242,33 +262,42 @@ def _read_with_trimesh(path: Path, changed: bytes | None = None, materials: Gltf
         if sum(len(scene.geometry[scene.graph[node][1]].vertices) for node in nodes) > _MOST_VERTICES:
             raise ValueError(f"its {len(nodes)} nodes have more than {_MOST_VERTICES} vertices")
         parts = [_placed(scene, node) for node in nodes]
-        texture = _gltf_texture(scene, parts, materials) if textured and materials is not None else None
+        texture, plain = _gltf_texture(scene, parts, materials) if textured and materials is not None else (None, None)
     except Exception as error:
         raise _unreadable(path, error) from error
     if not parts:
         return RawMesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
     offsets = np.cumsum([0] + [len(part.vertices) for part in parts])
+    vertex_colors = _joined([part.vertex_colors for part in parts])
     return RawMesh(
         np.concatenate([part.vertices for part in parts]),
         np.concatenate([part.faces + offset for part, offset in zip(parts, offsets, strict=False)]),
-        _joined([part.face_colors for part in parts]),
-        _joined([part.vertex_colors for part in parts]),
+        _joined([part.face_colors for part in parts]) if plain is None or vertex_colors is not None else plain,
+        vertex_colors,
         texture=texture,
         notes=materials.pictures.notes if textured and materials is not None else [],
     )
 
 
-def _gltf_texture(scene: "trimesh.Scene", parts: list[RawMesh], materials: GltfMaterials) -> Texture | None:
-    """Of the faces of all nodes."""
+def _gltf_texture(
+    scene: "trimesh.Scene", parts: list[RawMesh], materials: GltfMaterials
+) -> tuple[Texture | None, np.ndarray | None]:
+    """Of the faces of all nodes; or the plain colours of these, which multiply colours of vertices in their parts."""
     images, corners = [], []
     for node, part in zip(scene.graph.nodes_geometry, parts, strict=True):
         if len(part.faces):
-            number, uvs = materials.uvs(scene.geometry[scene.graph[node][1]].vertex_attributes)
-            if not np.isfinite(uvs.astype(np.float32)).all():
+            attributes = scene.geometry[scene.graph[node][1]].vertex_attributes
+            number, uvs = materials.uvs(attributes)
+            if part.vertex_colors is not None:
+                part.vertex_colors = part.vertex_colors * materials.factor(attributes)
+            if materials.pictures.textured and not np.isfinite(uvs.astype(np.float32)).all():
                 raise ValueError("texture coordinates that are not finite")
             images.append(np.full(len(part.faces), number))
             corners.append(uvs[part.faces])
-    return materials.pictures.texture(np.concatenate(images), np.concatenate(corners)) if images else None
+    if not images:
+        return None, None
+    numbers = np.concatenate(images)
+    return materials.pictures.texture(numbers, np.concatenate(corners)), materials.pictures.colors(numbers)
 
 
 def _joined(colors: list[np.ndarray | None]) -> np.ndarray | None:
@@ -290,6 +319,8 @@ def _placed(scene: "trimesh.Scene", node: str) -> RawMesh:
         mesh.face_colors = visual.face_colors[:, :3] / 255 if visual.kind == "face" else _ply_face_colors(geometry)
         if visual.kind == "vertex" and mesh.face_colors is None:
             mesh.vertex_colors = visual.vertex_colors[:, :3] / 255
+    if mesh.face_colors is not None and len(mesh.face_colors) != len(mesh.faces):
+        raise ValueError(f"colours of {len(mesh.face_colors)} faces for {len(mesh.faces)}")
     return mesh
 
 

@@ -11,12 +11,12 @@ from etsplat.geometry.similarity import Similarity
 from etsplat.io._gltf import split_gltf
 from etsplat.io.json_text import parse_json
 from etsplat.io.paths import kind_of
-from etsplat.io.ply_tables import read_ply_header
+from etsplat.io.ply_tables import read_ply_comments
 
 _ENTRIES = ("transform", "up", "place", "georeference", "appearance", "notes")
 """What is read again; the rest is for people."""
 
-_Z_TO_Y = torch.tensor([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]], dtype=torch.float64)
+_Z_TO_Y = torch.tensor([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]], dtype=torch.float64, device="cpu")
 """What the nodes of a GLB do with a world that has z up."""
 
 
@@ -27,7 +27,7 @@ def read_record(path: Path) -> dict[str, Any]:
         InputError: it is damaged.
     """
     if kind_of(path) == ".ply":
-        comments = read_ply_header(path).comments
+        comments = read_ply_comments(path)
         return _of_lines(path, comments) if any(line.startswith("etsplat ") for line in comments) else {}
     if kind_of(path) == ".obj":
         with open(path, encoding="utf-8", errors="replace") as file:

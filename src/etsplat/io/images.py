@@ -1,6 +1,7 @@
 """Images on disk (8-bit PNG and JPEG) and in memory (float32, channels last, values in [0, 1])."""
 
 import io
+import os
 from pathlib import Path
 
 import numpy as np
@@ -40,9 +41,9 @@ _DENSEST = 520
 class _Bounded(io.BufferedReader):
     """A file that reads no more than it holds: what a part of a PNG claims to hold is allocated before it is read."""
 
-    def __init__(self, path: Path) -> None:
-        super().__init__(io.FileIO(path))
-        self._size = path.stat().st_size
+    def __init__(self, file: io.FileIO) -> None:
+        super().__init__(file)
+        self._size = os.fstat(file.fileno()).st_size
 
     def read(self, size: int | None = -1, /) -> bytes:
         """As of any file."""
@@ -70,8 +71,12 @@ def open_image(path: Path | str, data: bytes | None = None, formats: tuple[str, 
     if size == 0:
         raise InputError(f"image {path}: the file is empty; copy it again")
     try:
+        file = _Bounded(io.FileIO(path)) if data is None else io.BytesIO(data)
+    except OSError as error:
+        raise InputError(f"image {path}: cannot be read ({error.strerror}); check its permissions") from error
+    try:
         # Without formats Pillow tries all it knows, and starts programs.
-        image = Image.open(_Bounded(path) if data is None else io.BytesIO(data), formats=formats)
+        image = Image.open(file, formats=formats)
     except UnidentifiedImageError as error:
         raise InputError(f"image {path}: not an image that can be read; convert it to PNG or JPEG") from error
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
@@ -216,7 +221,7 @@ def image_size(path: Path | str) -> tuple[int, int]:
         return image.size
 
 
-def size_for(path: Path | str, shape: tuple[int, int]) -> tuple[int, int]:
+def size_for(path: Path | str, shape: tuple[float, float]) -> tuple[int, int]:
     """(width, height) of an image file whose camera has the shape `shape`.
 
     Poses mean the pixels as whoever found them read them: COLMAP as stored, others turned as EXIF says. Which of the
@@ -316,7 +321,7 @@ def resize_image(image: Float[Tensor, "H W C"], width: int, height: int) -> Floa
     return resized[0].movedim(0, -1).clamp(0, 1).contiguous()
 
 
-def _is_to_turn(image: Image.Image, shape: tuple[int, int]) -> bool:
+def _is_to_turn(image: Image.Image, shape: tuple[float, float]) -> bool:
     return (image.width - image.height) * (shape[0] - shape[1]) < 0 and on_its_side(image)
 
 

@@ -1,6 +1,7 @@
 """Triangle meshes on disk: PLY, OBJ, GLB, STL and OFF in; whatever `etsplat.io.writers` writes out."""
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from etsplat.core.errors import InputError
+from etsplat.core.precision import usual_defaults
 from etsplat.core.short_repr import short_repr
 from etsplat.core.validation import check_memory, dense
 from etsplat.io._mesh_readers import READERS, RawMesh
@@ -46,7 +48,7 @@ class MeshFile:
         vertex_colors: (V, 3) float32 in [0, 1] as displayed (sRGB), or None.
         notes: one sentence for each repair made while reading (polygons cut into triangles, faces dropped), and for
             what of its textures is left out.
-        texture: pictures over the faces (OBJ with MTL, glTF), or None.
+        texture: pictures over the faces (OBJ with MTL, glTF, PLY), or None.
 
     Raises:
         ValueError: one of them is no tensor: `torch.from_numpy` makes one of an array.
@@ -76,11 +78,13 @@ class MeshFile:
         _check_arrays(self.vertices, self.faces, self.face_colors, self.vertex_colors)
 
 
+@usual_defaults()
 def load_mesh(path: Path | str) -> MeshFile:
     """Read a triangle mesh.
 
     Polygons are cut into triangles, faces of zero area, repeated faces and vertices without a face are dropped; each
-    of these is told in `notes`. Positions and connectivity are otherwise as in the file: no welding.
+    of these is told in `notes`. Positions and connectivity are otherwise as in the file: no welding. One that `etsplat
+    export` turned, scaled or moved stays so, with a note; `transform` of what it returned leads back.
 
     Args:
         path: .ply, .obj, .glb, .gltf, .stl or .off.
@@ -100,7 +104,12 @@ def load_mesh(path: Path | str) -> MeshFile:
         torch.Size([80, 3])
     """
     path = given_path("path", path)
-    return _clean(path, _read(path))
+    mesh = _clean(path, _read(path))
+    with suppress(InputError):  # of a record that cannot be used; here it is for people alone
+        if transform_of_record(path, read_record(path)).moves:
+            note = "etsplat export turned, scaled or moved it: it lies as in the file, and not as the run that it is of"
+            return replace(mesh, notes=(*mesh.notes, note))
+    return mesh
 
 
 def load_exported(path: Path) -> tuple[MeshFile, dict[str, Any]]:
@@ -110,8 +119,9 @@ def load_exported(path: Path) -> tuple[MeshFile, dict[str, Any]]:
         InputError: as `load_mesh`; the file's record of the export is damaged.
     """
     raw, record = _read(path), read_record(path)
-    if "transform" in record:
-        raw.vertices = transform_of_record(path, record).invert(torch.from_numpy(raw.vertices)).numpy()
+    if (transform := transform_of_record(path, record)).moves:
+        raw.vertices = transform.invert(torch.from_numpy(raw.vertices)).numpy()
+        raw.notes = [*raw.notes, "etsplat export had turned, scaled or moved it: it is led back to where it was"]
     return _clean(path, raw), record
 
 

@@ -32,7 +32,10 @@ _FORMATS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 _LONGEST_HEADER = 1 << 16
 
 CORNERS = "vertex_indices"
-"""The list property of a face: the only kind of list that is read, with three entries each."""
+"""The list property of a face: its three corners."""
+
+PLACES = "texcoord"
+"""The other list property that is read: where these three are in a texture, (0, 0) in its lower left corner."""
 
 GREY = 0.5
 """The colour of points without one."""
@@ -58,6 +61,15 @@ class PlyHeader:
     def properties(self, element: str) -> set[str]:
         """The names of an element's properties; none if there is no such element."""
         return set(self.tables[element][1].names or ()) if element in self.tables else set()
+
+
+def type_of(word: str) -> str:
+    """How numpy calls a type of PLY.
+
+    Raises:
+        KeyError: there is none of this name.
+    """
+    return _ALIASES[word]
 
 
 def read_ply_header(path: Path | str) -> PlyHeader:
@@ -97,6 +109,13 @@ def read_ply_header(path: Path | str) -> PlyHeader:
     return PlyHeader(tables, comments, order == "=", len(head) + len(mark) + line_end)
 
 
+def read_ply_comments(path: Path) -> list[str]:
+    """The lines of text in the header of a readable file, whatever properties it has."""
+    with open(path, "rb") as file:
+        head = file.read(_LONGEST_HEADER).partition(b"end_header")[0].decode("ascii", errors="replace")
+    return [line.removeprefix("comment ").strip() for line in head.splitlines() if line.startswith("comment ")]
+
+
 def read_ply_tables(path: Path | str, elements: tuple[str, ...] = ("vertex",)) -> dict[str, np.ndarray]:
     """Read elements of a PLY file, ASCII or binary, up to the last one asked for.
 
@@ -128,7 +147,8 @@ def read_ply_tables(path: Path | str, elements: tuple[str, ...] = ("vertex",)) -
         else:
             tables[element] = np.frombuffer(data, dtype, count, start)
             start += count * dtype.itemsize
-        if any(name.startswith("#") and (tables[element][name] != 3).any() for name in dtype.names or ()):
+        lists = [name for name in dtype.names or () if dtype[name].shape]
+        if any((tables[element][f"#{name}"] != dtype[name].shape[0]).any() for name in lists):
             raise InputError(f"PLY file {path}: has faces with other than three corners; triangulate it")
     return {name: tables[name] for name in elements}
 
@@ -186,13 +206,14 @@ def encode_ply(tables: Mapping[str, np.ndarray], comments: Sequence[str] = ()) -
 
 
 def _fields(path: Path, order: str, line: str) -> list[tuple]:
-    """Of a property, as numpy has them: one, or two of a list of corners."""
+    """Of a property, as numpy has them: one, or two of a list of corners or their places."""
     words = line.split()
     if len(words) == 3 and words[1] in _ALIASES:
         return [(words[2], order + _ALIASES[words[1]])]
-    corners = len(words) == 5 and words[1] == "list" and re.fullmatch(r"vertex_ind(ex|ices)", words[4])
-    if corners and words[2] in ("uchar", "uint8") and words[3] in _ALIASES:
-        return [(f"#{CORNERS}", "u1"), (CORNERS, order + _ALIASES[words[3]], (3,))]
+    if len(words) == 5 and words[1] == "list" and words[2] in ("uchar", "uint8") and words[3] in _ALIASES:
+        name = CORNERS if re.fullmatch(r"vertex_ind(ex|ices)", words[4]) else words[4]
+        if name in (CORNERS, PLACES):
+            return [(f"#{name}", "u1"), (name, order + _ALIASES[words[3]], (3 if name == CORNERS else 6,))]
     raise InputError(f"PLY file {path}: cannot read `{line.strip()[:50]}`; export it again")
 
 

@@ -16,11 +16,12 @@ from etsplat.core.harmonics import MAX_DEGREE, SH_CONSTANT
 from etsplat.core.kernels import DISTANCES, KERNELS
 from etsplat.core.rasterization import SOUP_SIGMA_FLOOR
 from etsplat.io.export_records import damaged, read_record, transform_of_record
-from etsplat.io.mesh_files import load_exported
+from etsplat.io.mesh_files import READERS, load_exported
 from etsplat.io.opaque_files import holds_opaque, load_opaque
 from etsplat.io.paths import kind_of
 from etsplat.io.ply_tables import CORNERS, columns, read_ply_header, read_ply_tables
 from etsplat.io.tensors import read_state_dict
+from etsplat.io.textures import Texture
 from etsplat.model.solid_soup import SolidSoup
 from etsplat.model.soup_appearance import SoupAppearance
 from etsplat.model.soup_compact import open_compact
@@ -34,6 +35,12 @@ GAUSSIAN_INRADIUS = math.sqrt(2 * math.pi / (3 * math.sqrt(3)))
 
 MESH_OPACITY, MESH_SIGMA = 0.999, 0.02
 """A mesh becomes a soup that is drawn all but opaque and sharp."""
+
+_SPREAD = 4
+"""Parts of each edge: of a face there are so many rows of points, where its texture is looked at."""
+
+_KINDS = (".safetensors", ".etz", ".pt", *READERS)
+"""Of files that hold triangles."""
 
 _TS_KEYS = ("triangles_points", "opacity", "sigma", "features_dc", "features_rest")
 
@@ -53,6 +60,8 @@ def open_soup(path: Path | str) -> TriangleSoup:
     path = Path(path)
     if not path.is_file():
         raise InputError(f"soup {path}: no such file; check the path")
+    if kind_of(path) not in _KINDS:
+        raise InputError(f"soup {path}: unknown kind of file; choose one of {', '.join(_KINDS)}, or a run's folder")
     if kind_of(path) == ".safetensors" and holds_opaque(path):
         mesh = load_opaque(path)
         assert mesh.vertex_colors is not None
@@ -182,7 +191,9 @@ def _read_gaussians(path: Path) -> TriangleSoup:
 
 def _read_mesh(path: Path) -> TriangleSoup:
     mesh, record = load_exported(path)
-    if mesh.face_colors is not None:
+    if mesh.texture is not None:
+        colors = _means(mesh.texture)
+    elif mesh.face_colors is not None:
         colors = mesh.face_colors
     elif mesh.vertex_colors is not None:
         colors = mesh.vertex_colors[mesh.faces].mean(dim=1)
@@ -191,6 +202,16 @@ def _read_mesh(path: Path) -> TriangleSoup:
     corners = mesh.vertices[mesh.faces]
     soup = TriangleSoup.from_triangles(corners, colors, opacity=MESH_OPACITY, sigma=MESH_SIGMA, sh_degree=0)
     return replace(soup, **soup.state(), notes=_notes(path, record))
+
+
+def _means(texture: Texture) -> Tensor:
+    """(F, 3) colours of faces under a texture: of points evenly spread over each, the mean."""
+    faces, total = torch.arange(len(texture.corner_uvs)), torch.zeros(len(texture.corner_uvs), 3)
+    steps = [(i + 1 / 3, j + 1 / 3) for i in range(_SPREAD) for j in range(_SPREAD - i)]
+    for a, b in steps:
+        weights = torch.tensor([a, b, _SPREAD - a - b]) / _SPREAD
+        total += texture.colors(faces, weights.expand(len(faces), 3))
+    return total / len(steps)
 
 
 def _harmonics(path: Path, table: np.ndarray) -> tuple[Tensor, Tensor]:

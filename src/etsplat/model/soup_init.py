@@ -8,6 +8,7 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 from torch import Tensor
 
+from etsplat.core.precision import usual_defaults
 from etsplat.core.short_repr import short_repr
 from etsplat.core.validation import check_above
 from etsplat.model.triangle_soup import TriangleSoup
@@ -98,6 +99,7 @@ def spacing(positions: Float[Tensor, "P 3"]) -> Float[Tensor, " P"]:
     return squares.clamp_min(_SMALLEST_SQUARE).sqrt().to(positions)
 
 
+@usual_defaults()
 def start_soup(
     points: StartPoints,
     generator: torch.Generator,

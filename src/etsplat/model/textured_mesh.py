@@ -116,7 +116,7 @@ class TexturedMesh(Model):
 
     @classmethod
     def load(cls, path: Path | str) -> "TexturedMesh":
-        """What `save` wrote, or another program: a mesh with one picture (OBJ with MTL, glTF); it is welded.
+        """What `save` wrote, or another program: a mesh with one picture (OBJ with MTL, glTF, PLY); it is welded.
 
         Raises:
             InputError: the file is missing, damaged, without a texture, or has one of several pictures, or one that

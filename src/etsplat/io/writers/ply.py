@@ -7,12 +7,10 @@ import numpy as np
 
 from etsplat.io.atomic import atomic_write
 from etsplat.io.images import encode_png
-from etsplat.io.ply_tables import CORNERS, encode_ply
+from etsplat.io.ply_tables import CORNERS, PLACES, encode_ply
 from etsplat.io.writers import Colors, Content, Surface
 
 HOLDS: frozenset[Content] = frozenset({"vertex_colors", "face_colors", "texture", "alpha", "numbers", "z_up", "offset"})
-
-_PLACES = "texcoord"
 
 
 def write(path: Path, surface: Surface) -> None:
@@ -29,7 +27,7 @@ def write(path: Path, surface: Surface) -> None:
     for axis, values in zip("xyz", surface.places.T, strict=True):
         vertex[axis] = values
     extra = [(name, "f4") for name in surface.numbers]
-    places = [] if surface.texture is None else [(_PLACES, "f4", (6,))]
+    places = [] if surface.texture is None else [(PLACES, "f4", (6,))]
     face = np.empty(len(surface.faces), [(CORNERS, "i4", (3,)), *places, *_color_fields(surface.face_colors), *extra])
     face[CORNERS] = surface.faces
     for name, values in surface.numbers.items():
@@ -40,7 +38,7 @@ def write(path: Path, surface: Surface) -> None:
     comments = [surface.comment] if surface.comment else []
     if surface.texture is not None:
         uvs = surface.texture.corner_uvs
-        face[_PLACES] = np.stack([uvs[..., 0], 1 - uvs[..., 1]], axis=-1).reshape(-1, 6)
+        face[PLACES] = np.stack([uvs[..., 0], 1 - uvs[..., 1]], axis=-1).reshape(-1, 6)
         comments.append(f"TextureFile {surface.name}.png")
         with atomic_write(path.parent / f"{surface.name}.png") as temporary:
             temporary.write_bytes(encode_png(surface.texture.pixels))
