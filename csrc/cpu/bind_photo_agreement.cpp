@@ -1,3 +1,4 @@
+#include "belief_propagation.h"
 #include "bindings.h"
 #include "photo_agreement.h"
 
@@ -34,6 +35,15 @@ void bind_photo_agreement(nb::module_& m) {
             add_differences(pixels.data(), seen.count(), opaque, seen.data(), faces, colors.data(), sums.data());
         },
         "pixels", "opaque", "seen", "shown", "colors", "sums");
+    // cost and belief (N, D), edges (E, 2).
+    def_function(
+        m, "propagate_beliefs",
+        [](Array<const float, 2> cost, Array<const int64_t, 2> edges, float bend, float tear, int64_t rounds,
+           Array<float, 2> belief) {
+            propagate_beliefs(cost.data(), cost.size(0), cost.size(1), edges.data(), edges.size(0), {bend, tear}, rounds,
+                              belief.data());
+        },
+        "cost", "edges", "bend", "tear", "rounds", "belief");
 }
 
 }  // namespace etsplat

@@ -23,6 +23,7 @@ void bind_plane_sweep(nb::module_& m);
 void bind_pool(nb::module_& m);
 void bind_rasterize(nb::module_& m);
 void bind_rasterize_opaque(nb::module_& m);
+void bind_silhouettes(nb::module_& m);
 void bind_soup_activation(nb::module_& m);
 void bind_soup_colors(nb::module_& m);
 void bind_spherical_harmonics(nb::module_& m);
@@ -74,6 +75,7 @@ NB_MODULE(_native, m) {
     bind_pool(m);
     bind_rasterize(m);
     bind_rasterize_opaque(m);
+    bind_silhouettes(m);
     bind_soup_activation(m);
     bind_soup_colors(m);
     bind_spherical_harmonics(m);

@@ -221,6 +221,9 @@ def add_differences(
     colors: torch.Tensor,
     sums: torch.Tensor,
 ) -> None: ...
+def propagate_beliefs(
+    *, cost: torch.Tensor, edges: torch.Tensor, bend: float, tear: float, rounds: int, belief: torch.Tensor
+) -> None: ...
 def photometric(
     *,
     color: torch.Tensor,
@@ -389,6 +392,29 @@ def render_opaque(
     supersampling: int,
     cull_backfaces: bool,
     image: torch.Tensor,
+) -> None: ...
+def lowest_depths(
+    *,
+    distances: Sequence[torch.Tensor],
+    viewmats: torch.Tensor,
+    Ks: torch.Tensor,
+    whole: torch.Tensor,
+    points: torch.Tensor,
+    own: torch.Tensor | None,
+    grown: float,
+    in_units: bool,
+    depth: torch.Tensor,
+    judges: torch.Tensor,
+) -> None: ...
+def exclusion_costs(
+    *,
+    distances: Sequence[torch.Tensor],
+    viewmats: torch.Tensor,
+    Ks: torch.Tensor,
+    whole: torch.Tensor,
+    points: torch.Tensor,
+    most: torch.Tensor,
+    cost: torch.Tensor,
 ) -> None: ...
 def soup_activate(
     *,

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample, normalize
 
+from etsplat.core.cameras import camera_centers
 from etsplat.data.agreement import (
     Photo,
     agreement,
@@ -135,6 +136,21 @@ def test_no_more_photos_than_twelve_are_asked() -> None:
     )
     assert torch.isclose(every, best, equal_nan=True).float().mean() > 0.9  # but for equal cosines
     assert (~every.isnan()).sum() > 100
+
+
+@pytest.mark.parametrize(("photos", "fewest"), [(9, 3), (20, 4), (32, 5)])
+def test_what_hardly_a_photo_sees_contradicts_nothing(photos: int, fewest: int) -> None:
+    """The more photos there are, the more see a lid over a hollow; where few see what is in it, it is noise."""
+    vertices, faces, views = painted_pictures(*icosphere(3), painted=False)
+    highest = sorted(views.train, key=lambda index: -float(camera_centers(views.viewmats[index][None])[0, 1]))
+    looked = looked_at(replace(views, train=highest[:photos]), vertices, faces)
+    assert looked is not None
+    colors = mean_colors(views, vertices, faces)
+    colors[vertices[faces].mean(dim=1)[:, 1] > 0.8] += 0.1
+    for seeing, counted in ((fewest - 1, False), (fewest, True)):
+        sees = looked.seen & (torch.arange(photos)[:, None] < seeing)
+        few = looked._replace(seen=sees, score=torch.zeros(len(vertices)))
+        assert (contradicted(few, colors) > 0.05) is counted
 
 
 @pytest.mark.parametrize(("shift", "counted"), [(0.01, False), (0.018, True)])

@@ -8,7 +8,7 @@ import pytest
 import torch
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 
-from etsplat.data.carving import Carving, Lowest
+from etsplat.data.carving import Carving
 from etsplat.data.dataset import Dataset
 from etsplat.data.hull import bounding_sphere
 from etsplat.data.photograph import photograph
@@ -107,15 +107,6 @@ def test_the_sphere_around_the_object_holds_what_one_photo_lacks(views: Dataset)
 
     whole, bitten = bounding_sphere(views), bounding_sphere(spoilt(views, without_tip))
     assert bitten[1] > 0.99 * whole[1]
-
-
-def test_lowest_keeps_the_lowest_in_order() -> None:
-    """Against sorting all."""
-    numbers = torch.randn(7, 50, generator=torch.Generator().manual_seed(0))
-    lowest = Lowest(3, 50)
-    for row in numbers:
-        lowest.add(row)
-    assert torch.equal(torch.stack(lowest.values), numbers.sort(dim=0).values[:3])
 
 
 @pytest.mark.parametrize("outvoted", [0, 1])

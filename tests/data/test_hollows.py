@@ -11,12 +11,13 @@ from etsplat.data.agreement import (
     contradicted,
     first_hits,
     looked_at,
+    looked_by,
     photos_of,
     plain_share,
-    surface_agreement,
+    settled,
 )
 from etsplat.data.closed_hollows import closed_hollows
-from etsplat.data.hollows import _mistaken, _where_agreed, _without_unseen, open_hollows
+from etsplat.data.hollows import _BEND, _TEAR, _depths, _mistaken, _where_agreed, _without_unseen, open_hollows
 from etsplat.data.meshing import dual_contour
 from etsplat.data.photograph import photograph
 from etsplat.data.visual_hull import visual_hull
@@ -69,6 +70,17 @@ def test_a_lid_goes_down_to_the_bottom(bowl):
     assert (depth + 0.2).abs().quantile(0.9) < 0.06
     before, after = (closest_points(points, truth, faces)[0].square().mean() for points in (hull, found))
     assert after < before / 10
+
+
+def test_photos_agree_on_what_has_settled_and_not_on_a_lid(bowl):
+    _, _, views, (hull, faces), (found, opened, *_) = bowl
+    part, lid = settled(views), inner(views, hull)
+    before, after = part(hull, faces), part(found, opened)
+    assert float(before.min()) >= 0
+    assert float(before.max()) <= 1
+    assert float(before[lid].mean()) < 0.1
+    assert float(after[: len(hull)][lid].mean()) > 0.9
+    assert float(before[~lid].mean()) > 0.6
 
 
 def test_the_side_which_is_no_lid_stays(bowl):
@@ -160,9 +172,8 @@ def test_what_photos_agree_on_no_better_once_it_is_open_is_no_lid(bowl):
     """On ribs that repeat photos agree a rib too deep as well."""
     truth, faces, views, *_ = bowl
     photos = photos_of(views)
-    hits = [first_hits(photo, truth, faces) for photo in photos]
-    edges = MeshTopology.from_faces(faces, len(truth)).edges.long()
-    score = surface_agreement(photos, hits, truth, faces, edges)
+    looked = looked_by(photos, truth, faces)
+    hits, score, edges = looked.hits, looked.score, looked.topology.edges.long()
     deep = score > 0.8
     assert deep.float().mean() > 0.3
     for before, way, mistaken in ((score, 0.12, True), (score - 0.3, 0.12, False), (score, 0.05, False)):
@@ -247,3 +258,16 @@ def test_what_photos_would_not_see_goes_no_deeper_than_what_is_beside_it():
     expected = torch.tensor([0.2, 0.2, 0.3, 0.4, 0.4])
     torch.testing.assert_close(_without_unseen(way, seen, neighbours, links), expected)
     assert _without_unseen(way, torch.zeros_like(seen), neighbours, links).abs().max() == 0
+
+
+def test_depths_have_the_least_cost_there_is_on_a_chain() -> None:
+    """Against all choices: on a chain belief propagation is exact, whatever tears. Some depths are not allowed."""
+    generator = torch.Generator().manual_seed(3)
+    for _ in range(20):
+        cost = torch.rand(5, 7, generator=generator)
+        cost[:, 2:] = cost[:, 2:].masked_fill(torch.rand(5, 5, generator=generator) < 0.2, torch.inf)
+        edges = torch.tensor([[0, 1], [2, 1], [2, 3], [3, 4]])
+        every = torch.cartesian_prod(*[torch.arange(7)] * 5)
+        steps = (every[:, edges[:, 0]] - every[:, edges[:, 1]]).abs()
+        total = cost[torch.arange(5), every].sum(dim=1) + (_BEND * steps).clamp_max(_TEAR).sum(dim=1)
+        assert torch.equal(_depths(cost, edges), every[total.argmin()])

@@ -120,6 +120,11 @@ def test_cameras_that_cannot_work_are_refused(owl_views):
         bounding_sphere(replace(away, viewmats=flipped))
     parallel = away.viewmats[:1].repeat(2, 1, 1)
     parallel[1, 0, 3] += 1
+    flip = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
+    with pytest.raises(InputError, match="all cameras look away from the object; the poses have other axes"):
+        bounding_sphere(replace(owl_views, viewmats=flip @ owl_views.viewmats))
+    with pytest.raises(InputError, match="views: 1 to train on; an object needs photos from around it"):
+        bounding_sphere(replace(away, train=[0], test=[1]))
     with pytest.raises(InputError, match="parallel"):
         bounding_sphere(replace(away, viewmats=parallel))
 

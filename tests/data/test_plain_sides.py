@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from torch.nn.functional import max_pool2d
 
 from etsplat.core.cameras import camera_centers
 from etsplat.data.agreement import first_hits, photos_of
@@ -81,7 +82,9 @@ def test_a_bottom_that_no_photo_sees_is_flat() -> None:
     assert float(flat[0][:, 1].min()) > lowest - 0.05
     for photo in photos_of(views):
         (before, _), (after, hit) = (first_hits(photo, *surface) for surface in (hull, flat))
-        assert float((before - after)[hit >= 0].max()) < 0.05
+        # At an outline a pixel may show what is on either side of it: of the surface before that is the nearest around.
+        nearest = -max_pool2d(-torch.where(before > 0, before, torch.inf)[None, None], 3, stride=1, padding=1)[0, 0]
+        assert float((nearest - after)[hit >= 0].max()) < 0.05
 
 
 def test_what_photos_tell_apart_stays() -> None:

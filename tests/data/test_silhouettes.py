@@ -8,10 +8,19 @@ import pytest
 import torch
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 
+from etsplat import _native
 from etsplat.data.dataset import Dataset
 from etsplat.data.photograph import photograph
 from etsplat.data.pictures import StoredPictures
-from etsplat.data.silhouettes import Evidence, Silhouette, contradicting, looks_inverted, silhouette
+from etsplat.data.silhouettes import (
+    Evidence,
+    Silhouette,
+    _asked,
+    contradicting,
+    looks_inverted,
+    lowest_depths,
+    silhouette,
+)
 from etsplat.data.visual_hull import visual_hull
 from etsplat.geometry.parts import genera
 from helpers.meshes import ring_and_ball
@@ -122,3 +131,54 @@ def test_inverted_masks_are_noticed(views):
     assert not looks_inverted(with_alpha(lambda index, alpha: alpha))
     assert not looks_inverted(with_alpha(lambda index, alpha: 1 - alpha if index % 3 == 0 else alpha))
     assert not looks_inverted(with_alpha(lambda index, alpha: torch.ones_like(alpha)))
+
+
+def by_torch(view: Silhouette, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """(N,) pixels that points are within a silhouette, infinite where it does not judge; and (N,) their depths."""
+    camera = points.double() @ view.viewmat[:3, :3].double().T + view.viewmat[:3, 3].double()
+    z = camera[:, 2]
+    pixel = camera @ view.K[:2].double().T / torch.where(z > 0, z, 1.0)[:, None]
+    place = 2 * pixel / torch.tensor(view.distance.shape[:1:-1]) - 1
+    found = torch.nn.functional.grid_sample(
+        view.distance.double(), place[None, None], padding_mode="border", align_corners=False
+    )
+    judged = (z > 0) & (view.whole | (place.abs() < 1).all(dim=1))
+    return torch.where(judged, found[0, 0, 0], torch.inf), z
+
+
+@pytest.mark.parametrize(
+    ("grown", "in_units", "with_own"), [(0.0, False, False), (1.5, True, False), (0.0, False, True)]
+)
+def test_lowest_depths_are_those_of_each_view_in_order(
+    views: Dataset, grown: float, in_units: bool, with_own: bool
+) -> None:
+    """Against torch: points all around, some behind cameras, of views that show all and of others."""
+    silhouettes = [Silhouette(views, index) for index in views.train]
+    for view in silhouettes[::3]:
+        view.whole = False
+    generator = torch.Generator().manual_seed(0)
+    points = 8 * torch.rand(3000, 3, generator=generator) - 4
+    points[::2] /= 5
+    own = torch.randint(len(silhouettes), (3000,), generator=generator) if with_own else None
+    each = []
+    for number, view in enumerate(silhouettes):
+        pixels, z = by_torch(view, points)
+        depth = torch.where(pixels.isfinite(), (pixels + grown) * (z / view.K[0, 0] if in_units else 1.0), torch.inf)
+        each.append(torch.where(own == number, torch.inf, depth) if own is not None else depth)
+    expected = torch.stack(each).sort(dim=0).values
+
+    found, judges = lowest_depths(silhouettes, points, 3, grown=grown, in_units=in_units, own=own)
+    assert torch.equal(judges, expected.isfinite().sum(dim=0).float())
+    assert judges.min() < judges.max() == len(silhouettes) - with_own
+    torch.testing.assert_close(found.double(), expected[:3], rtol=1e-4, atol=1e-3)
+
+
+def test_costs_count_what_lies_outside_up_to_a_limit(views: Dataset) -> None:
+    """Against sampling each map by torch."""
+    silhouettes = [Silhouette(views, index) for index in views.train]
+    points = 3 * torch.rand(2000, 3, generator=torch.Generator().manual_seed(1)) - 1.5
+    most, cost = torch.linspace(1, 9, len(silhouettes)), torch.empty(2000)
+    depths = torch.stack([by_torch(view, points)[0] for view in silhouettes])
+    expected = (-depths).clamp_min(0).minimum(most[:, None]).sum(dim=0) - 1e-3 * depths.clamp(0, 1).sum(dim=0)
+    _native.exclusion_costs(**_asked(silhouettes, points), most=most, cost=cost)
+    torch.testing.assert_close(cost.double(), expected, rtol=1e-4, atol=1e-3)

@@ -1,6 +1,8 @@
 """What a coarse soup sees of a hollow into which no lid of the hull can be pushed."""
 
+import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -15,9 +17,9 @@ from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.parts import Shape, shape_of
 from etsplat.model.triangle_mesh import TriangleMesh
 from etsplat.tasks.judgement import CLOSED, CONTRADICTED
-from etsplat.tasks.reconstruct import _grown_over
+from etsplat.tasks.reconstruct import _grown_over, _judge
 from etsplat.tasks.reconstruct_config import ReconstructConfig
-from helpers.painting import painted_pictures
+from helpers.painting import mean_colors, painted_pictures
 from helpers.revolved import BOWL, MUG, VASE, revolved
 
 CONFIG = ReconstructConfig.quick().changed({"start.hull_faces": 1600})
@@ -30,8 +32,12 @@ def test_a_hull_that_photos_contradict_is_cut_open_where_a_soup_sees_through_it(
     assert lidded.contradicted > CONTRADICTED
     told = list[str]()
     started = starts.make_start(None, views, CONFIG, tell=told.append)
-    assert started.cut
-    assert told == ["photos contradict the visual hull on 2.1 % of its surface: a coarse soup is asked what is free"]
+    assert started.cut == "soup"
+    said = "photos contradict the visual hull on (.*) % of its surface: a coarse soup is asked what is free"
+    (sentence,) = told
+    share = re.fullmatch(said, sentence)
+    assert share
+    assert float(share[1]) == pytest.approx(2, abs=0.2)  # it differs by what processors round
     assert started.contradicted < 0.5 * lidded.contradicted
     closed = closed_hollows(views, (vertices, faces), (lidded.vertices, lidded.faces))
     assert closed_hollows(views, (vertices, faces), started.mesh.surface()) < 0.6 * closed
@@ -67,7 +73,7 @@ def test_no_soup_is_asked_where_photos_agree_on_the_walls_of_a_hollow(monkeypatc
     lidded = open_hollows(views, *visual_hull(views, 3200))
     assert lidded.contradicted > CONTRADICTED
     started = starts.make_start(None, views, CONFIG.changed({"start.hull_faces": 3200}))
-    assert started.cut
+    assert started.cut == "walls"
     assert started.contradicted <= CONTRADICTED
     assert shape_of(*started.mesh.surface()) == Shape(1, 0)
     before, after = ((lidded.vertices, lidded.faces), started.mesh.surface())
@@ -81,7 +87,7 @@ def test_a_hollow_that_was_cut_open_and_is_closed_again_is_noticed() -> None:
     opened, over = Opened(vertices, faces, 0, 0.0, 1.0, 1.0), visual_hull(views, 3200)
     look = {"colors": 0.5, "opacity": 0.98, "sigma": 0.25}
     closed, open_ = (TriangleMesh.from_mesh(*each, **look) for each in (over, (vertices, faces)))
-    cut, whole = (starts.Started(open_, "hull", opened, None, cut) for cut in (True, None))
+    cut, whole = (starts.Started(open_, "hull", opened, None, cut) for cut in ("soup", None))
     assert _grown_over(views, cut, closed) > 10 * CLOSED
     assert _grown_over(views, cut, open_) == 0
     assert _grown_over(views, whole, closed) == 0
@@ -100,11 +106,13 @@ def test_no_start_has_more_faces_than_a_run_may_have(monkeypatch: pytest.MonkeyP
     contradicted = Opened(vertices, faces[:1000], 0, 0.5, 1.0, 0.0)
     config = CONFIG.changed({"max_faces": most})
     _, cut = starts._cut_open(views, starts.Hull(vertices, faces, 1400, 0.5), contradicted, config, None, None)
-    assert cut == taken
+    assert bool(cut) == taken
 
 
-@pytest.mark.parametrize(("soup", "taken"), [(0.09, 2800), (0.05, 1400)])
-def test_a_soup_must_be_clearly_better_than_walls(monkeypatch: pytest.MonkeyPatch, soup: float, taken: int) -> None:
+@pytest.mark.parametrize(("soup", "taken", "by"), [(0.09, 2800, "walls"), (0.05, 1400, "soup")])
+def test_a_soup_must_be_clearly_better_than_walls(
+    monkeypatch: pytest.MonkeyPatch, soup: float, taken: int, by: str
+) -> None:
     """Of walls and a soup's cut that are contradicted about alike, walls are nearer; faces tell here which was cut."""
     _, _, views = painted_pictures(*revolved(VASE))
     vertices, faces = icosphere(4)
@@ -115,7 +123,7 @@ def test_a_soup_must_be_clearly_better_than_walls(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(starts, "_opened", lambda _, v, f: Opened(v, f, 0, shares[len(f)], 1.0, 1.0))
     contradicted, hull = Opened(vertices, faces, 0, 0.5, 1.0, 0.0), starts.Hull(vertices, faces, 1400, 1.0)
     best, cut = starts._cut_open(views, hull, contradicted, CONFIG.changed({"max_faces": 6000}), None, None)
-    assert cut
+    assert cut == by
     assert len(best.faces) == taken
 
 
@@ -128,3 +136,18 @@ def test_a_cut_that_photos_contradict_as_much_is_not_taken(monkeypatch: pytest.M
         started = starts.make_start(None, views, CONFIG)
         assert started.cut is False
         assert started.contradicted == pytest.approx(plain.contradicted, abs=0.01)
+
+
+@pytest.mark.parametrize(("share", "verdict"), [(0.002, "good"), (0.003, "poor: photos contradict each other on")])
+def test_a_result_is_asked_what_photos_contradict_where_its_start_was_in_doubt(share: float, verdict: str) -> None:
+    """A start just below what is cut open is so far from photos that its hollows may be closed: a pipe's two lids."""
+    _, _, views = painted_pictures(*revolved(BOWL))
+    vertices, faces = visual_hull(views, 1600)
+    colors = mean_colors(views, vertices, faces)
+    mesh = TriangleMesh.from_mesh(vertices, faces, colors=colors, opacity=None, sigma=None)
+    hull = starts.Hull(vertices, faces, 1600, 0.0)
+    started = starts.Started(mesh, "hull", Opened(vertices, faces, 0, share, 0.0, 1.0), hull, False)
+    scorer = SimpleNamespace(opaque=lambda *_: {"silhouette_iou": 0.99, "psnr_mesh": 30.0})
+    scores = {"silhouette_iou": 0.99, "psnr_mesh": 30.0, "self_intersections": 0}
+    found = _judge(scorer, views, None, CONFIG, started, shape_of(vertices, faces), mesh, scores)
+    assert found.verdict.startswith(verdict)

@@ -5,10 +5,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from etsplat.data.agreement import unseen_vertices
+from etsplat.data.agreement import settled, unseen_vertices
 from etsplat.data.dataset import Dataset
 from etsplat.data.demo_object import demo_object
 from etsplat.data.photograph import photograph
+from etsplat.data.visual_hull import visual_hull
 from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.intersections import count_self_intersections
 from etsplat.geometry.topology import MeshTopology
@@ -24,6 +25,8 @@ from etsplat.tasks.reconstruct import make_trainer, reconstruct
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.reconstruct_schedule import outlines_after
 from helpers.meshes import bumpy_sphere
+from helpers.painting import painted_pictures
+from helpers.revolved import BOWL, revolved
 
 SHORT = ReconstructConfig.tiny().changed(
     {"iterations": 40, "output.checkpoint_every": 10, "refinement.subdivisions": 3, "output.chamfer_samples": 2000}
@@ -169,6 +172,21 @@ def test_what_no_photo_sees_of_a_start_that_was_cut_open_stays(update: str) -> N
     assert float(moved[True][hidden].max()) == 0
     assert float(moved[False][hidden].min()) > 0
     assert float(moved[True][~hidden].min()) > 0
+
+
+def test_what_photos_agree_on_moves_slowly_from_a_hull_and_the_rest_at_the_whole_rate() -> None:
+    """A painted bowl with a lid: noise throws about what is there, and the lid has a way to go."""
+    _, _, views = painted_pictures(*revolved(BOWL))
+    vertices, faces = visual_hull(views, 1600)
+    agreed = settled(views)(vertices, faces)
+    config, paces = SHORT.changed({"start.shape": "hull", "start.near_pace": 0.2}), []
+    for near, changes in ((True, {}), (False, {}), (True, {"start.near_pace": 1.0})):
+        mesh = TriangleMesh.from_mesh(vertices, faces, colors=0.75, opacity=0.98, sigma=0.25)
+        paces.append(make_trainer(mesh, views, config.changed(changes), near=near).adam.paces)
+    assert paces[1:] == [{}, {}]
+    torch.testing.assert_close(paces[0]["vertices"], 1 - 0.8 * agreed)
+    assert float(agreed.min()) == 0
+    assert float(agreed.max()) == 1
 
 
 def test_a_mesh_is_opaque_at_last_and_its_outline_comes_nearer() -> None:

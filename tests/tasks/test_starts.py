@@ -151,14 +151,13 @@ def test_a_hull_that_is_near_all_over_takes_the_fewer_iterations() -> None:
     near = Started(mesh, "hull", opened)
     config, about = within_need(quick, near)
     third = 1 / 3 * quick.optimizer.lr_vertices
-    changes = {"iterations": 2000, "optimizer.lr_vertices": third, "drawing.opaque_from": 0.8}
+    changes = {"iterations": 1400, "optimizer.lr_vertices": third, "drawing.opaque_from": 0.8, "start.near_pace": 1.0}
     assert config == quick.changed(changes)
     assert about is not None
-    assert "2,000 iterations, not 5,000" in about
+    assert "1,400 iterations, not 5,000" in about
     others = [opened._replace(**{name: value}) for name, value in (("doubtful", 0.051), ("agreed", 0.49))]
     for other in (*others, opened._replace(contradicted=0.006), None):
         assert within_need(quick, Started(mesh, "hull", other)) == (quick, None)
-    assert within_need(quick, near._replace(cut=True)) == (quick, None)
     for asked in ({"iterations": 4999}, {"iterations": 5001}, {"start.near_iterations": None}):
         assert within_need(quick.changed(asked), near)[1] is None
     best, sooner = ReconstructConfig.best(), {"drawing.opaque_from": 0.8}
@@ -169,6 +168,16 @@ def test_a_hull_that_is_near_all_over_takes_the_fewer_iterations() -> None:
     kept = ReconstructConfig.paper()
     assert within_need(kept, near) == (kept, None)
     assert within_need(best.changed({"drawing.opaque_from": 0.5}), near)[0].drawing.opaque_from == 0.5
+
+
+def test_a_hull_that_was_cut_out_between_walls_moves_slowly_in_all_iterations() -> None:
+    """Flaps that noise throws from the rim over a dark hollow stay there; what a soup cut has a way to go."""
+    quick, (vertices, faces) = ReconstructConfig.quick(), icosphere(1)
+    mesh = TriangleMesh.from_mesh(vertices, faces, colors=0.5, opacity=0.98, sigma=0.25)
+    opened = Opened(vertices, faces, 0, 0.006, 1.0, 0.0)
+    slower = quick.changed({"optimizer.lr_vertices": 1 / 3 * quick.optimizer.lr_vertices, "start.near_pace": 1.0})
+    assert within_need(quick, Started(mesh, "hull", opened, cut="walls")) == (slower, None)
+    assert within_need(quick, Started(mesh, "hull", opened, cut="soup")) == (quick, None)
 
 
 def test_a_run_that_needs_fewer_iterations_is_shorter_and_says_why(tmp_path: Path) -> None:
@@ -193,6 +202,30 @@ def test_a_given_mesh_is_the_start(pebble: MeshFile, tmp_path: Path) -> None:
     assert result.metrics["faces"] == len(pebble.faces)
     assert result.metrics["vertices"] == len(pebble.vertices)
     assert result.metrics["chamfer_exact"] < 1e-4
+
+
+@pytest.mark.parametrize(
+    ("scale", "offset", "told"),
+    [
+        (1.0, 0.0, None),
+        (1.5, 2.0, None),
+        (0.1, 0.0, "as large as the object"),
+        (100.0, 0.0, "as large as the object"),
+        (1.0, 30.0, "of the object's radii from it"),
+    ],
+)
+def test_a_start_that_is_elsewhere_than_the_object_is_doubted(
+    pebble: MeshFile, tmp_path: Path, scale: float, offset: float, told: str | None
+) -> None:
+    """As of other units: the run ended poor, and did not say why."""
+    middle = pebble.vertices.mean(dim=0)
+    other = MeshFile((pebble.vertices - middle) * scale + middle + offset, pebble.faces)
+    events = list[Event]()
+    config = SHORT.changed({"iterations": 1, "max_faces": 100})
+    reconstruct(pebble, tmp_path, config, init_mesh=other, callbacks=[events.append])
+    notes = [event.text for event in events if isinstance(event, NoteEvent) and event.text.startswith("init_mesh")]
+    assert [note for note in notes if told is None or told not in note] == []
+    assert len(notes) == (told is not None)
 
 
 def test_a_start_from_the_hull_keeps_the_hole_and_ends_the_same_when_resumed(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ That is the normalised cross-correlation of patches, so exposure does not matter
 is known.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -17,6 +18,7 @@ from etsplat import _native
 from etsplat.core.cameras import camera_centers
 from etsplat.data.close_ups import object_side
 from etsplat.data.dataset import Dataset
+from etsplat.data.kept import kept
 from etsplat.data.pictures import as_float
 from etsplat.geometry.measures import face_areas, vertex_normals
 from etsplat.geometry.topology import MeshTopology, connected
@@ -48,9 +50,14 @@ COMPARED = 3
 _SMOOTH = 3
 """Rounds in which normals are averaged with their neighbours'."""
 
+AGREED = 0.75
+"""Correlation of photos that show one surface; those of different ones have about 0.3."""
+
 _CONTRADICTED = 0.4
 """Correlation below which photos show different things, as on a lid over a hollow; gloss seldom goes so low."""
 
+_FEWEST = 5
+"""Photos that see what they contradict in a result, at least: the root of their number where that is less."""
 
 _WRONG, _UNUSUAL = 0.01, 1.3
 """Mean difference of colours from which photos are said to show something else than a face does, and so many times
@@ -96,6 +103,7 @@ class Photo:
         return grid_sample(planes, places[None], mode=mode, align_corners=False)[0]
 
 
+@kept
 def reduced(dataset: Dataset, longest: int = _LONGEST) -> Dataset:
     """Halved until the object is no longer in its training views, by default than agreement of surfaces asks for.
 
@@ -109,7 +117,11 @@ def reduced(dataset: Dataset, longest: int = _LONGEST) -> Dataset:
 
 def photos_of(dataset: Dataset) -> list[Photo]:
     """Of the training views, as `reduced` makes them."""
-    dataset = reduced(dataset)
+    return _photos(reduced(dataset))
+
+
+@kept
+def _photos(dataset: Dataset) -> list[Photo]:
     pixels = (as_float(dataset.images[index]).permute(2, 0, 1)[None].contiguous() for index in dataset.train)
     return [Photo.of(dataset, *each) for each in zip(dataset.train, pixels, strict=True)]
 
@@ -123,6 +135,18 @@ def unseen_vertices(dataset: Dataset) -> Callable[[Tensor, Tensor], Bool[Tensor,
         return ~seen_by(photos, hits, vertices, pixel_size(photos)).any(dim=0)
 
     return unseen
+
+
+def settled(dataset: Dataset) -> Callable[[Tensor, Tensor], Float[Tensor, " V"]]:
+    """Of a surface (V, 3), (F, 3), on the CPU, on what part of the vertices around each the training views agree."""
+    photos = photos_of(dataset)
+
+    @torch.no_grad()
+    def part(vertices: Tensor, faces: Tensor) -> Tensor:
+        looked = looked_by(photos, vertices, faces)
+        return _ring_mean((looked.score >= AGREED).float(), looked.topology.edges.long())
+
+    return part
 
 
 def blank_photos(dataset: Dataset) -> list[Photo]:
@@ -147,22 +171,20 @@ def first_hits(photo: Photo, vertices: Tensor, faces: Tensor) -> tuple[Tensor, T
 
 
 def surface_agreement(
-    photos: list[Photo], hits: list[tuple[Tensor, Tensor]], vertices: Tensor, faces: Tensor, edges: Tensor
+    photos: list[Photo], seen: Bool[Tensor, "B V"], vertices: Tensor, faces: Tensor, edges: Tensor
 ) -> Float[Tensor, " V"]:
     """How far photos agree at the vertices that they see, mean over a vertex and its neighbours; NaN if none is known.
 
     Args:
         photos: from `photos_of`.
-        hits: of each, from `first_hits`.
+        seen: from `seen_by`.
         vertices: (V, 3) of the surface.
         faces: (F, 3).
         edges: (E, 2).
     """
-    pixel = pixel_size(photos)
     masks = [(photo.pixels[:, 3:] >= 0.95).float() for photo in photos]
     normals = averaged(vertex_normals(vertices, faces), edges, _SMOOTH)
-    seen = seen_by(photos, hits, vertices, pixel)
-    return _ring_mean(agreement(photos, masks, vertices, normals, seen, pixel, fewest=COMPARED), edges)
+    return _ring_mean(agreement(photos, masks, vertices, normals, seen, pixel_size(photos), fewest=COMPARED), edges)
 
 
 class Looked(NamedTuple):
@@ -174,6 +196,7 @@ class Looked(NamedTuple):
         faces: (F, 3).
         topology: of them.
         hits: of each photo, from `first_hits`.
+        seen: (B, V) which photos see which vertices.
         score: (V,) from `surface_agreement`.
     """
 
@@ -182,6 +205,7 @@ class Looked(NamedTuple):
     faces: Tensor
     topology: MeshTopology
     hits: list[tuple[Tensor, Tensor]]
+    seen: Tensor
     score: Tensor
 
 
@@ -195,12 +219,16 @@ def looked_at(dataset: Dataset, vertices: Float[Tensor, "V 3"], faces: Int64[Ten
         faces: (F, 3).
     """
     photos = photos_of(dataset)
-    if len(photos) < 2 or len(vertices) == 0:
-        return None
+    return None if len(photos) < 2 or len(vertices) == 0 else looked_by(photos, vertices, faces)
+
+
+def looked_by(photos: list[Photo], vertices: Float[Tensor, "V 3"], faces: Int64[Tensor, "F 3"]) -> Looked:
+    """What photos, of `photos_of`, see of a surface."""
     topology = MeshTopology.from_faces(faces, len(vertices))
     hits = [first_hits(photo, vertices, faces) for photo in photos]
-    score = surface_agreement(photos, hits, vertices, faces, topology.edges.long())
-    return Looked(photos, vertices, faces, topology, hits, score)
+    seen = seen_by(photos, hits, vertices, pixel_size(photos))
+    score = surface_agreement(photos, seen, vertices, faces, topology.edges.long())
+    return Looked(photos, vertices, faces, topology, hits, seen, score)
 
 
 @torch.no_grad()
@@ -208,7 +236,8 @@ def contradicted(looked: Looked | None, colors: Float[Tensor, "F 3"]) -> float:
     """As `contradicted_share`, of a surface whose colours were fitted to the photos.
 
     Where the photos do not correlate and yet the colours explain them, what they show there is noise: a plain surface
-    is no lid. 0 where there are no photos.
+    is no lid. Nor counts what few of the photos see, as in a hollow: a lid over it is seen by more, and of few photos
+    at a slant none need be alike. 0 where there are no photos.
 
     Args:
         looked: from `looked_at`.
@@ -216,12 +245,13 @@ def contradicted(looked: Looked | None, colors: Float[Tensor, "F 3"]) -> float:
     """
     if looked is None:
         return 0.0
-    photos, vertices, faces, topology, hits, score = looked
+    photos, vertices, faces, topology, hits, seen, score = looked
     sums = torch.stack([differences(photo, hit, [hit], colors) for photo, (_, hit) in zip(photos, hits, strict=True)])
     wrong = per_pixel(sums.sum(dim=0), topology.face_pairs.long())[:, 0]
     usual = wrong[wrong > 0].median() if bool((wrong > 0).any()) else wrong.new_zeros(())
     unlike = wrong > torch.maximum(_UNUSUAL * usual, usual + _WRONG)
-    return contradicted_share(score, vertices, faces, topology.edges.long(), unlike)
+    enough = seen.sum(dim=0) >= min(max(math.isqrt(len(photos)), COMPARED), _FEWEST)
+    return _largest_patch((score < _CONTRADICTED) & enough, vertices, faces, topology.edges.long(), unlike)
 
 
 @torch.no_grad()
@@ -235,9 +265,8 @@ def plain_share(looked: Looked | None) -> float:
     """
     if looked is None:
         return 0.0
-    photos, vertices, faces, topology, hits, score = looked
-    seen = seen_by(photos, hits, vertices, pixel_size(photos)).sum(dim=0) >= COMPARED
-    return _largest_patch(seen & score.isnan(), vertices, faces, topology.edges.long())
+    plain = looked.score.isnan() & (looked.seen.sum(dim=0) >= COMPARED)
+    return _largest_patch(plain, looked.vertices, looked.faces, looked.topology.edges.long())
 
 
 @torch.no_grad()
@@ -249,25 +278,14 @@ def unseen_share(looked: Looked | None) -> float:
     """
     if looked is None:
         return 0.0
-    photos, vertices, faces, _, hits, _ = looked
-    unseen = ~seen_by(photos, hits, vertices, pixel_size(photos)).any(dim=0)
-    area = face_areas(vertices, faces)
-    return float(area[unseen[faces].all(dim=1)].sum() / area.sum())
+    area, unseen = face_areas(looked.vertices, looked.faces), ~looked.seen.any(dim=0)
+    return float(area[unseen[looked.faces].all(dim=1)].sum() / area.sum())
 
 
-def contradicted_share(
-    score: Float[Tensor, " V"], vertices: Tensor, faces: Tensor, edges: Tensor, wrong: Bool[Tensor, " F"] | None = None
-) -> float:
-    """The largest patch of a surface on which photos show different things, as a fraction of its area.
-
-    Args:
-        score: (V,) from `surface_agreement`.
-        vertices: (V, 3).
-        faces: (F, 3).
-        edges: (E, 2).
-        wrong: (F,) only these faces count; None for all.
-    """
-    return _largest_patch(score < _CONTRADICTED, vertices, faces, edges, wrong)
+def contradicted_share(looked: Looked) -> float:
+    """The largest patch of a surface on which photos show different things, as a fraction of its area."""
+    patch = looked.score < _CONTRADICTED
+    return _largest_patch(patch, looked.vertices, looked.faces, looked.topology.edges.long())
 
 
 def _largest_patch(

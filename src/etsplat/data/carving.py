@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from etsplat.core.cameras import camera_centers
-from etsplat.data.silhouettes import Silhouette, points_along, within_ball
+from etsplat.data.silhouettes import Silhouette, lowest_depths, points_along, within_ball
 
 _RAYS, _LEAST_RAYS = 1024, 8
 """Pixels that are asked for on each side of the outlines, in all views together, and of each at least."""
@@ -78,29 +78,8 @@ class Carving:
         self, views: Sequence[Silhouette], points: Float[Tensor, "N 3"]
     ) -> tuple[Float[Tensor, " N"], Float[Tensor, " N"]]:
         """How deep points are by those views that judge, infinite where none does; and how many these are."""
-        lowest, judges = Lowest(self.outvoted + 1, len(points)), torch.zeros(len(points))
-        points = points.T.contiguous().T
-        for view in views:
-            found, unit, judged = view.depth(points)
-            lowest.add(torch.where(judged, (found + self.grown) * unit, torch.inf))
-            judges += judged
-        return lowest.values[-1], judges
-
-
-class Lowest:
-    """The lowest so many of the numbers that were added at each of N places.
-
-    Attributes:
-        values: (N,) each, ascending; infinite as long as fewer were added.
-    """
-
-    def __init__(self, count: int, *shape: int) -> None:
-        self.values = [torch.full(shape, torch.inf) for _ in range(count)]
-
-    def add(self, number: Tensor) -> None:
-        """Another one at each place."""
-        for place, value in enumerate(self.values):
-            self.values[place], number = torch.minimum(value, number), torch.maximum(value, number)
+        depths, judges = lowest_depths(views, points, self.outvoted + 1, grown=self.grown, in_units=True)
+        return depths[-1], judges
 
 
 class _Lines(NamedTuple):
@@ -164,13 +143,9 @@ def _look(
     """Places along each line, and how deep the points there are by each number of views that are outvoted."""
     t = middle[:, None] + half[:, None] * torch.linspace(-1, 1, samples)
     points = points_along(lines.start, lines.along, t)
-    lowest, judges = Lowest(_MOST + 1, *t.shape), torch.zeros(t.shape)
-    for number, view in enumerate(views):
-        found, _, judged = (x.reshape(t.shape) for x in view.depth(points))
-        judged = judged & (lines.view != number)[:, None]
-        lowest.add(torch.where(judged, found, torch.inf))
-        judges += judged
-    return t, [torch.where(2 * judges >= len(views) - 1, depth, -torch.inf) for depth in lowest.values]
+    lowest, judges = lowest_depths(views, points, _MOST + 1, own=lines.view.repeat_interleave(samples))
+    known = 2 * judges >= len(views) - 1
+    return t, list(torch.where(known, lowest, -torch.inf).view(-1, *t.shape))
 
 
 def _best_growth(depth: Float[Tensor, " R"], shown: Bool[Tensor, " R"], limit: float) -> tuple[float, float]:

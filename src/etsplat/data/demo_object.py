@@ -8,6 +8,7 @@ base).
 import numpy as np
 import torch
 
+from etsplat.core.precision import usual_defaults
 from etsplat.data.meshing import dual_contour
 from etsplat.io.mesh_files import MeshFile
 
@@ -16,6 +17,7 @@ _CELLS = (45, 55, 45)
 _LOWER = (-22.5 * _CELL, -1.22, -22.5 * _CELL)  # x = 0 runs through cell centres: the mesh is symmetric too
 
 
+@usual_defaults()
 def demo_object() -> MeshFile:
     """The demo's mesh: closed, manifold, genus 0, about 16,000 faces, all white; +y up, looking along +z.
 

@@ -13,6 +13,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from etsplat.core.cameras import Cameras, intrinsics, look_at, sphere_grid
+from etsplat.core.precision import usual_defaults
 from etsplat.data.dataset import Dataset, every_eighth
 from etsplat.data.pictures import StoredPictures
 from etsplat.engines.threads import one_torch_thread
@@ -29,6 +30,7 @@ Part = tuple[np.ndarray, np.ndarray]
 """Corner positions (F, 3, 3) and colours (F, 3)."""
 
 
+@usual_defaults()
 def demo_scene(
     width: int = WIDTH, height: int = HEIGHT, *, progress: Callable[[int, int], None] | None = None
 ) -> Dataset:

@@ -17,7 +17,14 @@ from jaxtyping import Bool, Float, Int64
 from scipy.ndimage import distance_transform_edt, label, maximum, maximum_position
 from torch import Tensor
 
-from etsplat.data.agreement import COMPARED, Photo, first_hits, photos_of, pixel_size, seen_by, surface_agreement
+from etsplat.data.agreement import (
+    COMPARED,
+    Photo,
+    first_hits,
+    looked_by,
+    photos_of,
+    pixel_size,
+)
 from etsplat.data.dataset import Dataset
 from etsplat.data.visual_hull import without_specks
 from etsplat.geometry.discs import with_discs
@@ -140,10 +147,8 @@ def _small(faces: Tensor, band: Bool[Tensor, " F"]) -> bool:
 
 def _agreement(photos: list[Photo], vertices: Tensor, faces: Tensor) -> tuple[Float[Tensor, " V"], Bool[Tensor, " V"]]:
     """How far photos agree at the vertices, NaN where it is not known; and which of them too few see."""
-    edges = MeshTopology.from_faces(faces, len(vertices)).edges.long()
-    hits = [first_hits(photo, vertices, faces) for photo in photos]
-    seen = seen_by(photos, hits, vertices, pixel_size(photos)).sum(dim=0)
-    return surface_agreement(photos, hits, vertices, faces, edges), seen < COMPARED
+    looked = looked_by(photos, vertices, faces)
+    return looked.score, looked.seen.sum(dim=0) < COMPARED
 
 
 def _simpler(

@@ -11,12 +11,15 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
+from etsplat import _native
 from etsplat.data.agreement import (
+    AGREED,
     Photo,
     agreement,
     averaged,
     contradicted_share,
     first_hits,
+    looked_by,
     photos_of,
     pixel_size,
     reduced,
@@ -34,9 +37,6 @@ _STEP = 1.5
 
 _DEEPEST = 1.5
 """Depths end here, in units of the object's radius."""
-
-_AGREED = 0.75
-"""Correlation of photos that show one surface; those of different ones have about 0.3."""
 
 _PARTLY, _BETTER, _WIDE = 0.55, 0.3, 64
 """Or so much, if that is by so much more than on the lid, and on so many vertices that it is no chance: of a deep
@@ -156,16 +156,13 @@ def open_hollows(dataset: Dataset, vertices: Float[Tensor, "V 3"], faces: Int64[
 
 def _push(photos: list[Photo], outside: Distance, vertices: Tensor, faces: Tensor) -> _Look:
     """One look at all lids."""
-    edges = MeshTopology.from_faces(faces, len(vertices)).edges.long()
-    pixel = pixel_size(photos)
-    hits = [first_hits(photo, vertices, faces) for photo in photos]
-
-    score = surface_agreement(photos, hits, vertices, faces, edges)
-    lid = score < _AGREED
+    looked = looked_by(photos, vertices, faces)
+    hits, score, edges = looked.hits, looked.score, looked.topology.edges.long()
+    pixel, lid = pixel_size(photos), score < AGREED
     said = (
-        contradicted_share(score, vertices, faces, edges),
+        contradicted_share(looked),
         float(score.isnan().float().mean()),
-        float((score >= _AGREED).float().mean()),
+        float((score >= AGREED).float().mean()),
     )
     own = lid.nonzero()[:, 0]
     if len(own) < _FEWEST:
@@ -257,24 +254,10 @@ def _within(outside: Distance, points: Tensor, inward: Tensor, depths: Tensor) -
 
 def _depths(cost: Float[Tensor, "N D"], edges: Int64[Tensor, "E 2"]) -> Int64[Tensor, " N"]:
     """The depths of least cost with that of the edges, by min-sum belief propagation with a truncated linear cost."""
-    source, target = torch.cat([edges, edges.flip(1)]).T
-    back = torch.arange(len(source)).roll(len(edges))
-    message = torch.zeros(len(source), cost.shape[1])
-
-    def belief() -> Tensor:
-        return cost.index_add(0, target, message)
-
-    for _ in range(_ROUNDS):
-        sent = belief()[source] - message[back]
-        least = sent.amin(dim=1, keepdim=True)
-        rows = sent.T.contiguous()  # a depth in each, in one piece of memory
-        for order in (range(1, cost.shape[1]), range(cost.shape[1] - 2, -1, -1)):
-            for k in order:
-                behind = k - 1 if order.step > 0 else k + 1
-                torch.minimum(rows[k], rows[behind] + _BEND, out=rows[k])
-        sent = torch.minimum(rows.T, least + _TEAR).contiguous()
-        message = (message + sent - sent.amin(dim=1, keepdim=True)) / 2
-    return belief().argmin(dim=1)
+    belief = torch.empty_like(cost)
+    rules = {"bend": _BEND, "tear": _TEAR, "rounds": _ROUNDS}
+    _native.propagate_beliefs(cost=cost.contiguous(), edges=edges.contiguous(), **rules, belief=belief)
+    return belief.argmin(dim=1)
 
 
 def _where_agreed(depth: Tensor, found: Tensor, edges: Tensor, edge: float) -> Tensor:
@@ -291,7 +274,7 @@ def _where_agreed(depth: Tensor, found: Tensor, edges: Tensor, edge: float) -> T
     closed, _ = _means(found[:, 0], lid, count)
     deepest = torch.zeros(count).scatter_reduce(0, lid, depth.float(), "amax")
     partly = (size >= _WIDE) & (agreement >= _PARTLY) & (agreement - closed >= _BETTER)
-    opened = (size >= _FEWEST) & (2 * asked >= size) & ((agreement >= _AGREED) | partly)
+    opened = (size >= _FEWEST) & (2 * asked >= size) & ((agreement >= AGREED) | partly)
     opened &= deepest <= _SLENDER * edge * size.sqrt()
     return _without_shafts(torch.where(deep & opened[lid], depth, 0), edges, edge)
 
@@ -328,7 +311,8 @@ def _mistaken(
         edges: (E, 2).
     """
     after = [first_hits(photo, moved, faces) for photo in photos]
-    shown = surface_agreement(photos, after, moved, faces, edges)
+    seeing = seen_by(photos, after, moved, pixel_size(photos))
+    shown = surface_agreement(photos, seeing, moved, faces, edges)
     count, lid = connected(edges[deep[edges].all(dim=1)], len(deep))
     agreement, closed = (_means(torch.where(deep, each, torch.nan), lid, count)[0] for each in (shown, score))
     own = torch.where(deep, lid, -1)[faces].amax(dim=1)

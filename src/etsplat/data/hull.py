@@ -68,6 +68,8 @@ def bounding_sphere(dataset: Dataset) -> tuple[Float[Tensor, "3"], float]:
         >>> 0.9 < radius < 1.1
         True
     """
+    if len(dataset.train) == 1:
+        raise InputError("views: 1 to train on; an object needs photos from around it, better 20")
     check_not_empty(dataset, dataset.train)
     names = [dataset.names[index] for index in dataset.train]
     steps = np.array([max(1, dataset.images.sizes[index][0] // _MASK_WIDTH) for index in dataset.train])
@@ -78,6 +80,11 @@ def bounding_sphere(dataset: Dataset) -> tuple[Float[Tensor, "3"], float]:
         raise InputError("cameras: their axes are parallel and meet nowhere; photograph the object from around it")
     meeting = center.numpy()
     depth = viewmats[:, 2, :3] @ meeting + viewmats[:, 2, 3]
+    if (depth <= 0).all():
+        raise InputError(
+            "cameras: all cameras look away from the object; the poses have other axes than was supposed: cameras look"
+            " along +z with y down, but in transforms.json along -z with y up (docs/conventions.md)"
+        )
     if (depth <= 0).any():
         raise InputError(
             f"view {names[depth.argmin()]}: looks away from where the others look; an object needs views around it"

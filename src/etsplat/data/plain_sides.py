@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from etsplat.data.agreement import Photo, first_hits, looked_at, pixel_size, reduced, seen_by
+from etsplat.data.agreement import AGREED, Photo, first_hits, looked_at, pixel_size, reduced
 from etsplat.data.dataset import Dataset
 from etsplat.data.silhouettes import Silhouette
 from etsplat.geometry.films import held, tight_film
@@ -26,7 +26,7 @@ _ALIKE = 0.5
 _ROUND = 3
 """Rounds in which places are averaged with their neighbours', to see where the hull is sharp."""
 
-_BESIDE, _AGREED = 2, 0.75
+_BESIDE = 2
 """So many neighbours away patches may show a side's edge, at which photos agree if the hull is the surface there."""
 
 _REACH = 0.75
@@ -57,8 +57,8 @@ def with_flat_sides(
     looked = looked_at(dataset, vertices, faces)
     if looked is None:
         return vertices
-    photos, _, _, topology, hits, score = looked
-    edges, sees = topology.edges.long(), seen_by(photos, hits, vertices, pixel_size(photos)).sum(dim=0)
+    photos, _, _, topology, hits, seen, score = looked
+    edges, sees = topology.edges.long(), seen.sum(dim=0)
     unseen = sees == 0
     free = _silent(unseen | (score.isnan() & (sees >= 2)), score, edges)
     free[edges[topology.edge_face_counts == 1].reshape(-1)] = False  # borders, where lids were
@@ -77,7 +77,7 @@ def _silent(nothing: Bool[Tensor, " V"], score: Float[Tensor, " V"], edges: Int6
     source, target = torch.cat([edges, edges.flip(1)]).T
     for _ in range(_BESIDE):
         beside = torch.zeros(len(silent)).index_add(0, target, silent[source].float()) > 0
-        silent |= beside & ~(score >= _AGREED)
+        silent |= beside & ~(score >= AGREED)
     return silent
 
 

@@ -2,14 +2,15 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int64
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
-from torch.nn.functional import grid_sample
 
+from etsplat import _native
 from etsplat.core.cameras import camera_centers
 from etsplat.data.camera_coverage import axes_meeting_point
 from etsplat.data.dataset import Dataset
@@ -86,21 +87,6 @@ class Silhouette:
         self.whole = not touches_border(inside)
         self.viewmat, self.K = dataset.viewmats[index].float(), dataset.Ks[index].float()
 
-    def depth(self, points: Float[Tensor, "N 3"]) -> tuple[Tensor, Tensor, Tensor]:
-        """How deep points are within it: (N,) in pixels, (N,) units of the scene for each, and (N,) if it judges.
-
-        It is fastest where each coordinate lies in a row of memory, as in the transposed of (3, N).
-        """
-        camera = self.viewmat[:3, :3] @ points.T + self.viewmat[:3, 3:]
-        z = camera[2]
-        front = z > 0
-        height, width = self.distance.shape[2:]
-        pixel = self.K[:2] @ camera / torch.where(front, z, 1.0)
-        place = 2 * pixel / torch.tensor([[width], [height]]) - 1
-        found = grid_sample(self.distance, place.T[None, None], padding_mode="border", align_corners=False)
-        judged = front if self.whole else front & (place.abs() < 1).all(dim=0)
-        return found[0, 0, 0], z / self.K[0, 0], judged
-
     def rays(self, count: int) -> tuple[Float[Tensor, "3"], Float[Tensor, "R 3"]]:
         """The camera's centre, and unit directions of so many pixels of the object, evenly spread over its rows."""
         inside = np.flatnonzero(self.inside)
@@ -158,29 +144,61 @@ def within_ball(start: Tensor, along: Tensor, center: Tensor, radius: float) -> 
 def points_along(
     start: Float[Tensor, "R 3"], along: Float[Tensor, "R 3"], t: Float[Tensor, "R S"]
 ) -> Float[Tensor, "RS 3"]:
-    """Points on lines of sight at S distances on each, as `Silhouette.depth` takes them fastest."""
-    return torch.stack([(a[:, None] + t * b[:, None]).view(-1) for a, b in zip(start.T, along.T, strict=True)]).T
+    """Points on lines of sight at S distances on each."""
+    return (start[:, None] + t[..., None] * along[:, None]).view(-1, 3)
+
+
+def _asked(views: Sequence[Silhouette], points: Tensor) -> dict[str, Any]:
+    """Arguments of native calls that ask views about points."""
+    return {
+        "distances": [view.distance for view in views],
+        "viewmats": torch.stack([view.viewmat for view in views]),
+        "Ks": torch.stack([view.K for view in views]),
+        "whole": torch.tensor([view.whole for view in views]),
+        "points": points.contiguous(),
+    }
+
+
+def lowest_depths(
+    views: Sequence[Silhouette],
+    points: Float[Tensor, "N 3"],
+    count: int,
+    *,
+    grown: float = 0.0,
+    in_units: bool = False,
+    own: Int64[Tensor, " N"] | None = None,
+) -> tuple[Float[Tensor, "K N"], Float[Tensor, " N"]]:
+    """How deep points are within silhouettes: the least depths, ascending, and how many views judge.
+
+    Depths are in pixels, negative outside, and infinite where so many views do not judge: one does what lies before it,
+    and in its picture unless that shows all of the object.
+
+    Args:
+        views: which are asked.
+        points: (N, 3).
+        count: how many depths of each point.
+        grown: pixels by which silhouettes are taken to be larger.
+        in_units: depths are in units of the scene.
+        own: (N,) a view that does not judge each; None for no such view.
+    """
+    depth, judges = torch.empty(count, len(points)), torch.empty(len(points))
+    rule = {"own": own, "grown": grown, "in_units": in_units}
+    _native.lowest_depths(**_asked(views, points), **rule, depth=depth, judges=judges)
+    return depth, judges
 
 
 def _best_along(views: Sequence[Silhouette], starts: Tensor, along: Tensor, middle: Tensor, half: Tensor) -> Tensor:
     """(R, N) depths of the point on each line that the fewest exclude, within `half` of its `middle`."""
     every = torch.arange(len(starts))
-    best = torch.empty(len(starts), len(views))
+    most = 2 * torch.tensor([view.far for view in views])  # views that are right outvote one that is not
     for samples in (_SAMPLES, *_FINER):
-        offsets = torch.linspace(-1, 1, samples)
-        t = middle[:, None] + half[:, None] * offsets
-        points = points_along(starts, along, t)
-        depths = torch.empty(len(views), len(starts), samples)
-        cost = torch.zeros(len(starts), samples)
-        for depth, view in zip(depths, views, strict=True):
-            found, _, judged = view.depth(points)
-            depth.copy_(torch.where(judged, found, torch.inf).reshape(depth.shape))
-            # Beyond what is a contradiction it does not matter how far: views that are right outvote one that is not.
-            cost += (-depth).clamp(0, 2 * view.far) - 1e-3 * depth.clamp(0, 1)
-        choice = cost.argmin(dim=1)
-        best = depths[:, every, choice].T
+        t = middle[:, None] + half[:, None] * torch.linspace(-1, 1, samples)
+        cost = torch.empty(t.numel())
+        _native.exclusion_costs(**_asked(views, points_along(starts, along, t)), most=most, cost=cost)
+        choice = cost.view(t.shape).argmin(dim=1)
         middle, half = t[every, choice], half * 2 / (samples - 1)
-    return best
+    best = points_along(starts, along, middle[:, None])
+    return torch.stack([lowest_depths([view], best, 1)[0][0] for view in views], dim=1)
 
 
 def contradicting(dataset: Dataset) -> list[int]:

@@ -17,6 +17,7 @@ from torch.nn.functional import max_pool2d
 from etsplat.data.agreement import first_hits, photos_of
 from etsplat.data.carving import Carving
 from etsplat.data.dataset import Dataset
+from etsplat.data.kept import kept
 from etsplat.data.meshing import dual_contour
 from etsplat.data.silhouettes import Silhouette
 from etsplat.data.thin_parts import ThinParts
@@ -104,6 +105,7 @@ def visual_hull(
     return without_specks(*found, spared=_shown_apart(dataset, *found, _APART * cell))
 
 
+@kept
 def outside_hull(dataset: Dataset) -> Distance:
     """How far points are outside the visual hull: a function of them, in units of the scene, negative inside.
 

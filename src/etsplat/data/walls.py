@@ -14,6 +14,7 @@ from torch.nn.functional import normalize
 
 from etsplat.data.agreement import Looked, agreement, averaged, first_hits, looked_at, pixel_size
 from etsplat.data.dataset import Dataset
+from etsplat.data.passages import through_wide_passages
 from etsplat.data.visual_hull import Distance, outside_hull
 from etsplat.geometry.distance import closest_points
 from etsplat.geometry.measures import area_normals, face_areas, mean_edge, vertex_normals
@@ -79,6 +80,11 @@ class _Walls(NamedTuple):
         lid, rim, sides = (_distance(points, self.vertices, faces) for faces in (self.lid, self.rim, self.sides))
         return torch.where(lid < rim, sides, torch.minimum(rim, sides)) - self.thickness
 
+    def hollow(self, outside: Distance) -> Distance:
+        """The same of the hollow under the lid alone, which ends at passages no wider than both walls beside them."""
+        opening = self.vertices[self.lid].mean(dim=1)
+        return through_wide_passages(self.beyond, outside, opening, self.vertices, self.thickness)
+
 
 @torch.no_grad()
 def between_walls(dataset: Dataset, vertices: Float[Tensor, "V 3"], faces: Int64[Tensor, "F 3"]) -> Distance | None:
@@ -95,11 +101,12 @@ def between_walls(dataset: Dataset, vertices: Float[Tensor, "V 3"], faces: Int64
     looked = looked_at(dataset, vertices, faces)
     if looked is None:
         return None
-    hollows = (_Through(looked, lid) for lid in _lids(looked, outside_hull(dataset)))
-    found = [walls for hollow in hollows if (walls := _walls(hollow))]
+    outside = outside_hull(dataset)
+    hollows = (_Through(looked, lid) for lid in _lids(looked, outside))
+    found = [walls.hollow(outside) for hollow in hollows if (walls := _walls(hollow))]
     if not found:
         return None
-    return lambda points: torch.stack([walls.beyond(points) for walls in found]).amax(dim=0)
+    return lambda points: torch.stack([free(points) for free in found]).amax(dim=0)
 
 
 def _lids(looked: Looked, outside: Distance) -> list[Bool[Tensor, " F"]]:

@@ -10,7 +10,8 @@ from torch.nn.functional import normalize
 from etsplat import _native
 from etsplat.geometry.topology import MeshTopology, connected
 
-_TURN = torch.linalg.qr(torch.tensor([[0.83, -0.31, 0.47], [0.29, 0.91, -0.17], [-0.41, 0.23, 0.87]]).double()).Q
+_TURNED = [[0.83, -0.31, 0.47], [0.29, 0.91, -0.17], [-0.41, 0.23, 0.87]]
+_TURN = torch.linalg.qr(torch.tensor(_TURNED, dtype=torch.float32, device="cpu").double()).Q
 """Some rotation: rays are cast along its first axis, since meshes often have edges in planes of the coordinate axes."""
 
 

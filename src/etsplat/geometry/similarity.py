@@ -28,6 +28,11 @@ class Similarity:
         made[:3, :3], made[:3, 3] = self.scale * self.rotation, self.translation
         return made
 
+    @property
+    def moves(self) -> bool:
+        """Whether it changes any point."""
+        return not bool((self.matrix == torch.eye(4, dtype=torch.float64)).all())
+
     @classmethod
     def of_matrix(cls, matrix: Float[Tensor, "4 4"]) -> "Similarity":
         """The one that `matrix` is of, as it was read from a file."""

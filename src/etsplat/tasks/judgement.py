@@ -25,6 +25,9 @@ GOOD_INTERSECTING = 1.0
 CONTRADICTED = 0.005
 """Share of the surface that photos contradict in one patch, which good results have at most."""
 
+DOUBTED = 0.0025
+"""Share of a start's surface in one patch, from which on its result is asked for what photos contradict."""
+
 CLOSED = 0.005
 """Share of what photos see of an input mesh that lies far behind the result, of good results at most."""
 

@@ -12,7 +12,6 @@ import torch
 from etsplat.core.cameras import Cameras
 from etsplat.core.errors import InputError
 from etsplat.data.dataset import Dataset
-from etsplat.data.load import load_dataset
 from etsplat.engines.choice import resolve_device
 from etsplat.io.mesh_files import MeshFile
 from etsplat.io.opaque_files import load_opaque
@@ -113,8 +112,8 @@ def open_run(
 
 
 def capture_at(scene: Dataset | Path | str | None) -> Dataset | None:
-    """A capture by its folder, or as it is; photos of a folder are decoded when they are asked for."""
-    return scene if scene is None or isinstance(scene, Dataset) else load_dataset(scene, preload=False)
+    """A capture by its folder or as the demo's, or as it is; photos of a folder are decoded when they are asked for."""
+    return None if scene is None else load_scene(scene, None, preload=False)
 
 
 def check_not_read(path: Path, source: Path, named: str = "") -> None:

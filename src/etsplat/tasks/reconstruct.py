@@ -9,8 +9,9 @@ from typing import Any
 from torch import Tensor
 
 from etsplat.core.errors import InputError
+from etsplat.core.precision import usual_defaults
 from etsplat.core.workers import together
-from etsplat.data.agreement import contradicted, looked_at, plain_share, unseen_share, unseen_vertices
+from etsplat.data.agreement import contradicted, looked_at, plain_share, settled, unseen_share, unseen_vertices
 from etsplat.data.closed_hollows import closed_hollows
 from etsplat.data.cut_off import cut_off
 from etsplat.data.dataset import Dataset
@@ -38,7 +39,7 @@ from etsplat.tasks.camera_results import conclude_cameras
 from etsplat.tasks.depths import trusted_depths, wanted_depths
 from etsplat.tasks.export_mesh import Reconstruction
 from etsplat.tasks.judgement import (
-    CONTRADICTED,
+    DOUBTED,
     TRAINING_VIEWS,
     Judgement,
     Run,
@@ -55,15 +56,20 @@ from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.reconstruct_schedule import held_from, make_schedule, outlines_after, soft_until, while_soft
 from etsplat.tasks.running import Job, Result, path_of, settings_for, terms_of
 from etsplat.tasks.scoring import Scorer, load_lpips
-from etsplat.tasks.sources import Source, fingerprint, load_source, make_subject
-from etsplat.tasks.starts import Started, finer_shape, load_start, make_start, nearby, within_need
+from etsplat.tasks.sources import Source, directions_digest, fingerprint, load_source, make_subject
+from etsplat.tasks.starts import Cut, Started, doubtful_start, finer_shape, load_start, make_start, nearby, within_need
 from etsplat.tasks.texturing import check_installed
 
 DEPTHS_NEAR, DEPTHS_FAR = 0.02, 0.15
 """When depth maps are compared with the mesh, as a fraction of a run that starts near the surface, or far from it."""
 
 
-_CUT = {None: "", True: ", cut open where photos see into it", False: ", though photos contradict it"}
+_CUT: dict[Cut | None, str] = {
+    None: "",
+    "walls": ", cut out between walls",
+    "soup": ", cut open where photos see into it",
+    False: ", though photos contradict it",
+}
 """What is said of a hull by `Started.cut`."""
 
 
@@ -97,6 +103,7 @@ class ReconstructResult(Result):
 
 @together()
 @one_torch_thread()
+@usual_defaults()
 def reconstruct(
     source: Source,
     out: str | Path,
@@ -154,7 +161,8 @@ def reconstruct(
     start = load_start(init_mesh)
     hashes = {"fingerprint": fingerprint(loaded), "init_mesh": fingerprint(start)}
     paths = {"source": source, "init_mesh": init_mesh, "masks": masks, "depths": depths}
-    job.identify(hashes, {name: path_of(path) for name, path in paths.items()})
+    held = directions_digest(loaded) if isinstance(loaded, Dataset) else None
+    job.identify(hashes, {name: path_of(path) for name, path in paths.items()}, views=held)
     for name, found in (("source", notes), ("init_mesh", start.notes if start else [])):
         for note in found:
             job.announce(NoteEvent(f"{name}: {note}"))
@@ -162,6 +170,8 @@ def reconstruct(
     for note in views.notes:
         if note not in notes:
             job.announce(NoteEvent(note))
+    if (doubt := doubtful_start(start, views)) is not None:
+        job.announce(NoteEvent(f"init_mesh: {doubt}"))
     if config.drawing.backend == "nvdiffrast":
         load_nvdiffrast()  # now rather than at the first step
     if config.texture is not None:
@@ -266,7 +276,7 @@ def _judge(
         scores: of it.
     """
     found = shape_of(*mesh.surface())
-    doubtful, hull = started.contradicted > CONTRADICTED, started.hull
+    doubtful, hull = started.contradicted > DOUBTED, started.hull
     from_photos = truth is None and views.has_masks
     looked = looked_at(views, *mesh.surface()) if doubtful or from_photos else None
     if truth is not None:
@@ -307,14 +317,20 @@ def _grown_over(views: Dataset, started: Started, mesh: TriangleMesh) -> float:
     return closed_hollows(views, (started.opened.vertices, started.opened.faces), mesh.surface())
 
 
-def _resting(mesh: TriangleMesh, views: Dataset) -> Callable[[Tensor], Tensor]:
-    """Paces of a mesh's vertices: those that no view sees stay where the start has them."""
-    unseen = unseen_vertices(views)
+def _paces(
+    mesh: TriangleMesh, views: Dataset, config: ReconstructConfig, *, near: bool, cut: bool
+) -> dict[str, Callable[[Tensor], Tensor]]:
+    """Those of a mesh's vertices: what no view sees of a start that was cut open rests, what views agree on is slow."""
+    if not cut and (not near or config.start.near_pace == 1):
+        return {}
+    measure = unseen_vertices(views) if cut else settled(views)
+    slow = 0.0 if cut else config.start.near_pace
 
     def paces(vertices: Tensor) -> Tensor:
-        return (~unseen(vertices.cpu(), mesh.faces.cpu())).to(vertices)
+        found = measure(vertices.cpu(), mesh.faces.cpu().long()).to(vertices)
+        return 1 - (1 - slow) * found
 
-    return paces
+    return {"vertices": paces}
 
 
 def make_trainer(
@@ -378,7 +394,7 @@ def make_trainer(
         depths=depths,
         cameras=CameraRefinement.of(config.refine_cameras, length, len(views.train) / config.batch),
         update=None if config.optimizer.vertex_update == "adam" else UniformSteps(smoothing),
-        paces={"vertices": _resting(mesh, views)} if cut else None,
+        paces=_paces(mesh, views, config, near=near, cut=cut),
         evaluate=evaluate,
         guard=Guard(tolerance=refinement.guard, until=length) if refinement.guard else None,
         seed=config.seed,

@@ -14,6 +14,7 @@ from etsplat.data.agreement import Photo, first_hits, photos_of
 from etsplat.data.dataset import Dataset
 from etsplat.data.false_handles import silhouette_errors, without_false_handles
 from etsplat.data.hollows import Opened, open_hollows
+from etsplat.data.kept import keeping
 from etsplat.data.lids import without_lids
 from etsplat.data.plain_sides import with_flat_sides
 from etsplat.data.silhouettes import silhouette, touches_border
@@ -23,7 +24,7 @@ from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.parts import Shape, shape_of
 from etsplat.geometry.topology import MeshTopology
 from etsplat.geometry.untangle import untangle
-from etsplat.io.mesh_files import MeshFile, load_mesh, weld_vertices
+from etsplat.io.mesh_files import MeshFile, load_exported, weld_vertices
 from etsplat.io.paths import given_path
 from etsplat.model.triangle_mesh import MeshAppearance, TriangleMesh
 from etsplat.tasks.coarse_soup import seen_through
@@ -45,6 +46,10 @@ _OPAQUE_FROM = 0.8
 """From this fraction of a run on triangles are opaque, where a hull is near the surface all over: what is left to do is
 at outlines. Hollows are opened while triangles are soft."""
 
+_BESIDE, _OTHER_SIZE = 1.0, 4.0
+"""A given mesh is doubted that is farther from the object than that, in radii of the larger one, or so many times as
+large or small: of half the diagonal of its box."""
+
 _UNCOVERED, _LESS = 0.0005, 0.9
 """A hull that leaves more of the silhouettes uncovered lacks thin parts if a finer one leaves at most so many times as
 much: what rough masks leave does not depend on how fine it is."""
@@ -60,6 +65,10 @@ contradict it no more. Nearer takes away what is thin, farther leaves more of a 
 _CLEARLY, _RIMS = 0.7, 0.003
 """A cut hull is taken where photos contradict at most so many times as much of it, and if it leaves at most this part
 of the silhouettes uncovered beside what the hull does: a little of a thin rim, which grows again."""
+
+
+Cut = Literal["walls", "soup", False]
+"""What a hull that photos contradict was cut open by: walls of one thickness, what a coarse soup shows, or nothing."""
 
 
 class Hull(NamedTuple):
@@ -88,14 +97,14 @@ class Started(NamedTuple):
         kind: where it comes from.
         opened: the hull with its hollows open, and what photos say of it; None for another kind.
         hull: that it was, before it was mended; None for another kind.
-        cut: whether it was cut open; None where photos do not contradict it.
+        cut: by what it was cut open, if by anything; None where photos do not contradict it.
     """
 
     mesh: TriangleMesh
     kind: Start
     opened: Opened | None = None
     hull: Hull | None = None
-    cut: bool | None = None
+    cut: Cut | None = None
 
     @property
     def contradicted(self) -> float:
@@ -106,15 +115,34 @@ class Started(NamedTuple):
 def load_start(start: str | Path | MeshFile | None) -> MeshFile | None:
     """Reads the mesh to start from and merges vertices at equal positions, so that neighbours move together.
 
+    One that `etsplat export` moved is led back to the units and axes of its run, with a note.
+
     Raises ValueError where the arrays of a mesh in memory are no such arrays, InputError for what is no mesh.
     """
     if start is None:
         return None
     if isinstance(start, MeshFile):
         start.check()
-    else:
-        given_path("init_mesh", start, "a path or a MeshFile")
-    return weld_vertices(start if isinstance(start, MeshFile) else load_mesh(start))
+        return weld_vertices(start)
+    return weld_vertices(load_exported(given_path("init_mesh", start, "a path or a MeshFile"))[0])
+
+
+def doubtful_start(start: MeshFile | None, views: Dataset) -> str | None:
+    """A note where a mesh to start from is elsewhere than the object, or much larger or smaller; None where it is not.
+
+    Args:
+        start: from `load_start`, in the input's units.
+        views: of the unit frame.
+    """
+    if start is None:
+        return None
+    places = views.normalization.apply(start.vertices)
+    low, high = places.aminmax(dim=0)
+    middle, radius = (low + high) / 2, float((high - low).norm()) / 2
+    if float(middle.norm()) <= _BESIDE * max(1, radius) and 1 / _OTHER_SIZE <= radius <= _OTHER_SIZE:
+        return None
+    where = f"it is {radius:.2g} times as large as the object, {float(middle.norm()):.2g} of the object's radii from it"
+    return f"{where}: is it in the units and axes of the input?"
 
 
 def start_shape(config: ReconstructConfig, views: Dataset) -> Literal["sphere", "hull"]:
@@ -159,6 +187,7 @@ def _uncovered(photos: list[Photo], vertices: Tensor, faces: Tensor) -> float:
     return sum(found) / max(1, len(found))
 
 
+@keeping()
 def make_start(
     start: MeshFile | None,
     views: Dataset,
@@ -221,7 +250,7 @@ def _cut_open(
     config: ReconstructConfig,
     device: torch.device | None,
     tell: Callable[[str], None] | None,
-) -> tuple[Opened, bool]:
+) -> tuple[Opened, Cut]:
     """A hull that photos contradict, cut out between walls, or where a coarse soup sees through it.
 
     Either is taken if photos contradict it clearly less than what it cuts, it has no more faces than a run may have,
@@ -235,10 +264,11 @@ def _cut_open(
         covers = _uncovered(photos, found.vertices, found.faces) <= most
         return found if covers and len(found.faces) <= config.max_faces else opened
 
-    best = opened
+    best, by = opened, False
     walls = between_walls(views, with_flat_sides(views, opened.vertices, opened.faces), opened.faces)
     if walls is not None:
         best = _clearer(cut(walls, min(2 * hull.wanted, _most_faces(config))), opened)
+        by = "walls" if best is not opened else False
     if best.contradicted > CONTRADICTED:
         if tell is not None:
             part = f"{100 * opened.contradicted:.1f} % of its surface"
@@ -248,8 +278,9 @@ def _cut_open(
             tries.append(cut(lambda points, margin=margin: ahead(points) - margin, hull.wanted))
             if tries[-1].contradicted <= CONTRADICTED:
                 break
-        best = _clearer(min(tries, key=lambda each: each.contradicted), best)
-    return best, best is not opened
+        kept, best = best, _clearer(min(tries, key=lambda each: each.contradicted), best)
+        by = by if best is kept else "soup"
+    return best, by
 
 
 def _clearer(cut: Opened, before: Opened) -> Opened:
@@ -334,6 +365,8 @@ def within_need(config: ReconstructConfig, started: Started) -> tuple[Reconstruc
     """The settings for a hull that is near the surface all over: triangles are opaque sooner.
 
     With `start.near_iterations` there are also fewer iterations: noise goes on making dents as long as a run lasts.
+    A hull that was cut out between walls has all of them, at the same rate of vertices: photos agree on its walls, and
+    at the whole rate noise throws flaps of the rim over the opening, which stay where it is dark behind them.
 
     Args:
         config: as asked for. A length that is not its preset's own stays.
@@ -342,7 +375,9 @@ def within_need(config: ReconstructConfig, started: Started) -> tuple[Reconstruc
     Returns:
         What the run is made with; and a sentence about its length, or None if that is what was asked for.
     """
-    if started.cut or not _near(started.opened):
+    if started.cut:
+        return _slower(config) if started.cut == "walls" else config, None
+    if not _near(started.opened):
         return config, None
     if config.drawing.opaque_from < 1:
         sooner = min(config.drawing.opaque_from, _OPAQUE_FROM)
@@ -352,8 +387,14 @@ def within_need(config: ReconstructConfig, started: Started) -> tuple[Reconstruc
         return config, None
     less = f"{enough:,} iterations, not {own:,}, and vertices at {config.start.near_rate:.2g} of their rate"
     about = f"the hull is near the surface all over: {less} (start.near_iterations)"
-    calmer = replace(config.optimizer, lr_vertices=config.start.near_rate * config.optimizer.lr_vertices)
-    return replace(config, iterations=enough, optimizer=calmer), about
+    return replace(_slower(config), iterations=enough), about
+
+
+def _slower(config: ReconstructConfig) -> ReconstructConfig:
+    """Vertices, all of them, at the rate that is enough near the surface."""
+    rates, start = config.optimizer, replace(config.start, near_pace=1.0)
+    slower = replace(rates, lr_vertices=config.start.near_rate * rates.lr_vertices)
+    return replace(config, optimizer=slower, start=start)
 
 
 def _near(opened: Opened | None) -> bool:
