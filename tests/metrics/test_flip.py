@@ -74,6 +74,8 @@ def test_bad_arguments_are_named():
         flip(image, image[1:])
     with pytest.raises(ValueError, match="image must be of floating-point numbers"):
         flip(image.byte(), image)
+    with pytest.raises(ValueError, match="truth must be of floating-point numbers"):
+        flip(image, image.bool())
     with pytest.raises(ValueError, match=r"image: expected a pixel or more, got shape \(0, 5, 3\)"):
         flip(image[:0], image[:0])
     with pytest.raises(ValueError, match=r"truth: expected values in \[0, 1\], got others; divide by 255"):

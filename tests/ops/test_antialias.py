@@ -259,7 +259,9 @@ def test_nvdiffrast_agrees(kind, rng):
         ({"vertex_colors": torch.zeros(12, 3)}, "exactly one"),
         ({"backgrounds": torch.zeros(1, 2)}, "backgrounds"),
         ({"viewmats": torch.eye(4)}, "viewmats"),
+        ({"viewmats": "elastic"}, "viewmats must be a tensor"),
         ({"Ks": torch.eye(3).double()[None]}, "Ks"),
+        ({"Ks": "elastic"}, "Ks must be a tensor"),
         ({"width": 0}, "width"),
         (
             {"connectivity": MeshTopology.from_faces(icosphere(0)[1], 12)},

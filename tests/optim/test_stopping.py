@@ -1,5 +1,7 @@
 """Runs that end early: by `Trainer.stop`, or by what a callback raises."""
 
+import copy
+import pickle
 from pathlib import Path
 from typing import Any
 
@@ -52,3 +54,16 @@ def test_what_a_callback_raises_ends_a_run_which_can_be_gone_on_with() -> None:
     assert trainer.progress.iteration == 2
     trainer.fit(9)
     assert trainer.model.vertices.equal(finished())
+
+
+def test_a_trainer_is_not_pickled_but_says_what_to_do_and_is_copied() -> None:
+    """It ended with the name of a function within it."""
+    trainer = a_trainer()
+    trainer.fit(4)
+    with pytest.raises(TypeError, match=r"a Trainer cannot be pickled.*fit\(n, run=FOLDER"):
+        pickle.dumps(trainer)
+    twin = copy.deepcopy(trainer)
+    trainer.fit(6)
+    twin.fit(9)
+    assert trainer.progress.iteration == 6
+    assert twin.model.vertices.equal(finished())

@@ -67,6 +67,32 @@ def test_a_term_without_outputs_is_given_none_of_several_pictures(name: str) -> 
         etsplat.Objective(etsplat.Photometric(), [looks]).of_parameters(a_mesh(), (0.5,), 1.0)
 
 
+@pytest.mark.parametrize(
+    ("value", "outputs"),
+    [
+        (lambda drawing: drawing.rendering.color.detach().mean(), ("color",)),
+        (lambda drawing: torch.tensor(drawing.rendering.color.mean().item()), ("color",)),
+        (lambda drawing: (drawing.rendering.color > -1).float().mean(), "color"),
+        (lambda drawing: drawing.model.vertices.detach().square().mean(), ()),
+    ],
+)
+@pytest.mark.parametrize("batch", [1, 2])
+def test_a_term_that_changes_nothing_is_told_so(
+    value: Callable[[etsplat.Drawing], Any], outputs: Any, batch: int
+) -> None:
+    """Its gradient was lost on the way: runs went on as without it."""
+    with pytest.raises(
+        ValueError, match=r"terms\[0\] of the objective, Custom, has no gradient and so changes nothing"
+    ):
+        a_trainer(terms=(custom(value, outputs=outputs),), batch=batch).fit(1)
+
+
+def test_a_term_may_be_zero_where_there_is_nothing_to_compare_with() -> None:
+    a_trainer(terms=(custom(lambda drawing: torch.zeros(()), outputs="depth"), custom(lambda d: torch.zeros(())))).fit(
+        2
+    )
+
+
 def test_a_term_without_outputs_may_look_at_the_only_picture_of_a_step() -> None:
     a_trainer(terms=(custom(lambda drawing: drawing.rendering.color.mean()),)).fit(2)
 

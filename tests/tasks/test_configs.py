@@ -87,8 +87,9 @@ def test_presets_of_reconstruct_are_what_they_were(preset: str) -> None:
     config = flatten(ReconstructConfig.of(preset).to_dict())
     since = {"start.hull_faces": 12_500, "start.near": 0.3, "start.near_edge": 0.02, "start.near_reach": 2.0}
     since["start.near_fall"] = "exponential" if preset in ("paper", "study", "tiny") else "late"
-    since["start.near_iterations"] = 2000 if preset == "quick" else 8000 if preset in ("best", "demo") else None
+    since["start.near_iterations"] = 1400 if preset == "quick" else 8000 if preset in ("best", "demo") else None
     since["start.near_rate"] = 1 / 3 if preset == "quick" else 0.7
+    since["start.near_pace"] = 1 / 3 if preset == "quick" else 1.0
     since["drawing.opaque_from"] = 1.0 if preset in ("paper", "study", "tiny") else 0.9
     since["optimizer.lr_opaque"] = 6e-5 if preset in ("best", "paper") else 3e-4
     since["refinement.reach"] = 0.5
@@ -105,7 +106,8 @@ def test_presets_of_reconstruct_are_what_they_were(preset: str) -> None:
     since["pixels_per_face"] = None if preset in ("paper", "study", "tiny") else 3.5
     expected = {**before.RECONSTRUCT_PAPER, **before.RECONSTRUCT_CHANGES[preset]}
     named = {before.RECONSTRUCT_NAMES[name]: expected[name] for name in expected}
-    named["iterations"] = 2500 if preset == "demo" else named["iterations"]
+    if preset == "demo":
+        named |= {"iterations": 1500, "refinement.subdivisions": 5, "refinement.untanglings": 3}
     assert config == {"preset": preset, **since, **named}
 
 

@@ -71,6 +71,23 @@ def test_a_folder_of_maps_may_be_named_and_lack_some(tmp_path):
     assert len(load_dataset(tmp_path, depths=tmp_path / "elsewhere").images.with_depth) == 15
     with pytest.raises(InputError, match=r"depths .*gone: no such folder"):
         load_dataset(tmp_path, depths=tmp_path / "gone")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match=r"depths .*empty: has no map for any photo; call them like their photos"):
+        load_dataset(tmp_path, depths=tmp_path / "empty")
+
+
+def test_it_is_told_how_many_photos_have_a_map_where_not_all_have_one(tmp_path):
+    """Nothing said so where a folder was half copied; of photos for testing no map is needed."""
+    write_ball(tmp_path)
+    found = load_dataset(tmp_path, depths=True)
+    maps = sorted((tmp_path / "depths").glob("*.npy"))
+    for index in found.test:
+        maps[index].unlink()
+    assert load_dataset(tmp_path, depths=True).notes == found.notes == ()
+    for index in found.train[:5]:
+        maps[index].unlink()
+    assert load_dataset(tmp_path, depths=True).notes == ("9 of 14 photos for training have a depth map",)
+    assert load_dataset(tmp_path).notes == ()
 
 
 def test_maps_of_another_shape_are_refused(tmp_path):

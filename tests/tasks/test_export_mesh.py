@@ -18,11 +18,11 @@ from etsplat.io.mesh_files import load_mesh, save_mesh
 from etsplat.io.ply_tables import read_ply_tables
 from etsplat.io.run_directory import RunDirectory
 from etsplat.model.textured_mesh import TexturedMesh
-from etsplat.tasks import texturing
+from etsplat.tasks import sources, texturing
 from etsplat.tasks.opened_runs import open_run
 from etsplat.tasks.reconstruct import reconstruct
 from etsplat.tasks.reconstruct_config import ReconstructConfig
-from helpers.captures import circle_poses, write_colmap
+from helpers.captures import circle_poses, small_demo_scene, write_colmap
 from helpers.gltf import check_glb
 
 pytest.importorskip("xatlas")
@@ -207,7 +207,7 @@ def test_a_textured_mesh_goes_to_the_world_too(run: Path, tmp_path: Path) -> Non
     assert abs(places - np.clip(places, low.numpy() - 1e-4, high.numpy() + 1e-4)).max() == 0
 
 
-def test_a_mesh_is_turned_scaled_and_placed(run: Path, tmp_path: Path) -> None:
+def test_a_mesh_is_turned_scaled_and_placed(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """By where up is as its photos were held; the object of a mesh has +y or +z up as it is."""
     sideways = torch.tensor([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], dtype=torch.float64)  # y to z
     poses = circle_poses(6)
@@ -217,9 +217,12 @@ def test_a_mesh_is_turned_scaled_and_placed(run: Path, tmp_path: Path) -> None:
     export(run, "--scale", "0.5", "--up", "z", "--place", "ground", "--out", tmp_path / "still.ply")
     still = load_mesh(tmp_path / "still.ply").vertices.double()
     assert (still - still[0] - 0.5 * (own - own[0])).abs().max() < 1e-5
+    said = capsys.readouterr().out
+    assert "nothing is turned, since photos do not say where up is: +z is up if it was in the input" in said
     export(run, "--scene", tmp_path / "scene", "--up", "y", "--place", "ground", "--out", tmp_path / "up.glb")
     found = trimesh.load_mesh(tmp_path / "up.glb")
     low, high = torch.tensor(found.bounds)
+    assert "turned by the photos of another scene" in capsys.readouterr().out
     assert abs(float(low[1])) < 1e-5
     assert (low + high)[[0, 2]].abs().max() < 1e-5
     height = (own @ sideways).amax(0) - (own @ sideways).amin(0)
@@ -274,3 +277,15 @@ def test_ambient_occlusion_lies_beside_normals(run: Path, tmp_path: Path) -> Non
     shade = np.asarray(trimesh.load_mesh(tmp_path / "ball.glb").visual.material.occlusionTexture)
     assert shade.shape == (64, 64)
     assert np.median(shade) > 230
+
+
+def test_a_demo_is_a_scene_of_files_and_meshes_too(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its name was taken for a folder's."""
+    monkeypatch.setattr(sources, "demo_scene", lambda *size, progress=None: small_demo_scene())
+    assert open_run(run / "mesh.glb", Path("demo:scene"), "cpu").needed_capture().names == small_demo_scene().names
+    export(run, "--scene", "demo:owl", "--up", "y", "--out", tmp_path / "up.glb")
+    assert "nothing is turned" in capsys.readouterr().out
+    with pytest.raises(InputError, match="demo:owls"):
+        open_run(run / "mesh.glb", "demo:owls", "cpu")

@@ -1,5 +1,6 @@
 """`etsplat.export` of the mesh of a reconstruction, from Python."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,7 @@ import etsplat
 from etsplat.io.mesh_files import load_exported
 from etsplat.model.soup_import import open_soup
 from etsplat.tasks.export_mesh import export_mesh
+from etsplat.tasks.starts import load_start
 
 TINY = etsplat.ReconstructConfig.tiny().changed({"iterations": 5, "resolution": 24})
 
@@ -69,3 +71,40 @@ def test_a_file_says_how_it_was_moved_and_is_led_back(
     torch.testing.assert_close(found_high, high, atol=tolerance, rtol=0)
     opened = open_soup(path).vertices.reshape(-1, 3)
     torch.testing.assert_close(opened.aminmax(dim=0).max, found_high, atol=1e-5, rtol=0)
+
+
+def test_photos_of_another_scene_are_said_to_turn_it(tmp_path: Path) -> None:
+    """As where a name was mistyped; the same photos elsewhere, in another unit, are its own."""
+    own = etsplat.photograph(etsplat.demo_object(), 16, 16)
+    result = etsplat.reconstruct(own, tmp_path / "run", TINY)
+    assert result.path is not None
+    config = etsplat.ExportConfig(up="y")
+    moved = own.renormalized((1.0, 2.0, 3.0), 2.0)
+    assert etsplat.export(result, tmp_path / "own.ply", config, scene=moved).notes == ()
+    other = replace(own, viewmats=own.viewmats.flip(0))
+    (note,) = etsplat.export(result, tmp_path / "other.ply", config, scene=other).notes
+    assert note == "it is turned by the photos of another scene than the run was made of, which --scene names"
+
+
+def test_a_scene_that_has_no_use_is_told(result: etsplat.ReconstructResult, tmp_path: Path) -> None:
+    """Where nothing is turned, even a folder that is not there was taken without a word."""
+    (note,) = etsplat.export(result, tmp_path / "a.ply", scene=tmp_path / "nowhere").notes
+    assert note.startswith("--scene has no use here")
+
+
+@pytest.mark.parametrize("kind", ["glb", "ply", "obj"])
+def test_a_mesh_that_was_moved_says_so_and_is_led_back_where_runs_start_from_it(
+    result: etsplat.ReconstructResult, kind: str, tmp_path: Path
+) -> None:
+    """It lay elsewhere than its run without a word; a run that was to start from it began beside its object."""
+    path, still = tmp_path / f"moved.{kind}", tmp_path / f"still.{kind}"
+    etsplat.export(result, path, etsplat.ExportConfig(up="y", scale=100.0, place="ground"))
+    etsplat.export(result, still)
+    assert etsplat.load_mesh(still).notes == ()
+    (note,) = etsplat.load_mesh(path).notes
+    assert "lies as in the file, and not as the run that it is of" in note
+    start, same = load_start(path), load_start(still)
+    assert start is not None
+    assert same is not None
+    assert "led back to where it was" in start.notes[0]
+    torch.testing.assert_close(start.vertices.aminmax(dim=0), same.vertices.aminmax(dim=0), atol=1e-4, rtol=0)

@@ -338,18 +338,34 @@ def test_without_points_the_mesh_begins_where_the_soup_is(capture: Dataset, tmp_
     assert metrics["psnr_asset"] > metrics["psnr"] - 4
 
 
+def fallen_apart(*_: object) -> TriangleMesh:
+    raise DivergedError("no triangle is left at iteration 3")
+
+
+def nothing_but_sky(job: object, soup: TriangleSoup, exposure: Exposure, capture: Dataset, _: object) -> TriangleMesh:
+    return opaque_mesh(
+        replace(soup, **{name: values[:0] for name, values in soup.state().items()}),
+        Surroundings.of(capture).backdrop(capture),
+    )
+
+
+@pytest.mark.parametrize(
+    ("fit", "told"),
+    [(fallen_apart, "no triangle is left at iteration 3"), (nothing_but_sky, "nothing but the sky is left")],
+)
 def test_a_mesh_that_falls_apart_takes_nothing_from_the_soup(
-    run: tuple[RunDirectory, list[Event]], capture: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run: tuple[RunDirectory, list[Event]],
+    capture: Dataset,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    fit: Callable[..., TriangleMesh],
+    told: str,
 ) -> None:
     """The run ends as one without a mesh, and a note says why."""
-
-    def fail(*_: object) -> None:
-        raise DivergedError("no triangle is left at iteration 3")
-
-    monkeypatch.setattr(tasks_train, "fit_opaque_mesh", fail)
+    monkeypatch.setattr(tasks_train, "fit_opaque_mesh", fit)
     events: list[Event] = []
     result = train(capture, tmp_path / "run", CONFIG, callbacks=[events.append])
-    assert "no opaque mesh: no triangle is left at iteration 3" in [str(event) for event in events]
+    assert f"no opaque mesh: {told}" in [str(event) for event in events]
     assert result.opaque is None
     assert "asset_triangles" not in result.metrics
     assert (result.path / "soup.safetensors").read_bytes() == run[0].soup_path.read_bytes()

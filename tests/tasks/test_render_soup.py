@@ -63,7 +63,7 @@ def test_small_pictures_have_as_many_samples_as_the_photos_had(run):
     ]
 
 
-@pytest.mark.parametrize("name", ["orbit.mp4", "there.txt"])
+@pytest.mark.parametrize("name", ["orbit.mp4", "orbit.gif", "orbit.MOV", "view.jpg", "there.txt"])
 def test_a_file_instead_of_a_folder_is_refused(run, name):
     """Pictures and videos have names of their own: a folder named like a video would only confuse."""
     (run.folder / "there.txt").write_text("")

@@ -253,6 +253,17 @@ def test_few_pixels_carry_few_triangles(capture: Dataset) -> None:
     assert triangle_limit(capture, replace(config, max_triangles=5)) == 5
 
 
+def test_more_points_than_there_may_be_triangles_are_told(capture: Dataset) -> None:
+    """All of them become triangles all the same: the limit is that of densification."""
+    assert capture.exact_points is not None
+    count = len(capture.exact_points)
+    for most in (count, count - 1):
+        config = TrainConfig.quick().changed({"max_triangles": most, "pixels_per_triangle": None})
+        notes = check_train(capture, config, config.iterations, torch.device("cpu"))
+        told = f"{count:,} points, each of which becomes a triangle: more than the limit of {most:,}"
+        assert any(note.startswith(told) for note in notes) is (most < count)
+
+
 def test_rates_settle_towards_the_end(capture: Dataset) -> None:
     """With `lr_settle` colours, opacities and softness come to rest like the vertices; the original's never do."""
     paper = replace(TrainConfig.paper(), iterations=300)

@@ -136,7 +136,7 @@ class Undistort(Command):
     source: tyro.conf.Positional[Path]
     """Folder with images/ and sparse/0/, of any of COLMAP's camera models;
     or of any other program whose files are read: nerfstudio, Metashape, RealityCapture and others.
-    Masks come along; every 8th image is for testing, whatever the scene says."""
+    Masks come along, and which images are for testing; depth maps do not."""
     out: Path
     """Folder for the new scene."""
     max_size: int = 1600
@@ -146,8 +146,11 @@ class Undistort(Command):
         """Writes the scene."""
         from etsplat.data.undistortion import undistort_scene
 
-        names = undistort_scene(self.source, self.out, max_size=self.max_size)
+        notes: list[str] = []
+        names = undistort_scene(self.source, self.out, max_size=self.max_size, tell=notes.append)
         print(f"{len(names)} images without lens distortion; scene in {self.out}")
+        for note in notes:
+            print(f"  {note}")
         return 0
 
 

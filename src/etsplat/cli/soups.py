@@ -284,10 +284,13 @@ class Export(Command):
         name = "textured" if self.settings.texture else "light" if self.settings.faces else "mesh"
         out = self._out(self.run_dir, name)
         check_not_read(out, self.run_dir, "--out ")
+        notes: list[str] = []
         with PhaseBar() as bar:
-            written = export_mesh(self.run_dir, out, self.settings, self.scene, self.device, bar.show)
+            written = export_mesh(self.run_dir, out, self.settings, self.scene, self.device, bar.show, notes.append)
         for path, faces in written.items():
             print(f"{path}: {faces:,} faces, {path.stat().st_size / 1e6:.2f} MB")
+        for note in notes:
+            print(f"  {note}")
         return 0
 
 

@@ -16,9 +16,11 @@ from etsplat.core.validation import (
     check_finite,
     check_floating,
     check_kind,
+    check_like,
     check_memory,
     check_number,
     check_place,
+    check_shape,
     whole_number,
 )
 
@@ -186,6 +188,14 @@ def view_arguments(
     if any(given is not None for given in (viewmats, Ks, width, height)):
         raise ValueError("either cameras, or all of viewmats, Ks, width and height must be given, not some of both")
     return cameras.viewmats, cameras.Ks, cameras.width, cameras.height
+
+
+def check_views(viewmats: Tensor, Ks: Tensor, like_name: str, like: Tensor) -> None:
+    """Raise ValueError unless they are tensors of the shapes (B, 4, 4) and (B, 3, 3), and like ``like``."""
+    check_shape("viewmats", viewmats, ("B", 4, 4))
+    check_shape("Ks", Ks, (len(viewmats), 3, 3))
+    check_like("viewmats", viewmats, like_name, like)
+    check_like("Ks", Ks, like_name, like)
 
 
 @as_given

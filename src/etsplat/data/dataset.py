@@ -13,6 +13,7 @@ from torch import Tensor
 
 from etsplat.core.cameras import Cameras, camera_centers
 from etsplat.core.errors import InputError
+from etsplat.core.precision import usual_defaults
 from etsplat.core.short_repr import short_repr
 from etsplat.core.validation import check_above, check_count, shown
 from etsplat.data.changed_pictures import halved
@@ -114,6 +115,7 @@ class Dataset:
     notes: tuple[str, ...] = ()
     georeference: Georeference | None = None
 
+    @usual_defaults()
     def __post_init__(self) -> None:
         if not isinstance(self.images, Pictures):
             raise ValueError(f"images must be Pictures, got {type(self.images).__name__}: pass StoredPictures(images)")

@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import Protocol, cast
 
 from etsplat.core.errors import InputError
+from etsplat.core.precision import usual_defaults
 from etsplat.data import formats
 from etsplat.data.dataset import Dataset
-from etsplat.data.doubtful_poses import pose_notes
+from etsplat.data.doubtful_poses import lens_notes, pose_notes
 from etsplat.data.frames import LARGEST, MASK_FOLDER, Listing, MasksAs, Wanted, posed
 from etsplat.data.georeferencing import near_origin
 from etsplat.data.pictures import LazyPictures
@@ -44,6 +45,7 @@ class Format(Protocol):
         ...
 
 
+@usual_defaults()
 def load_dataset(
     path: Path | str,
     *,
@@ -111,8 +113,14 @@ def load_dataset(
         raise InputError(f"scene {path}: no folder {images} in it; choose another or leave it out")
     folder = depths if isinstance(depths, bool) else Path(depths)
     wanted = Wanted(masks_as, images, width, None if masks is None else Path(masks), memory, folder, depth_unit)
-    dataset = posed(path, near_origin(path, format_of(path).list_frames(path, wanted)), wanted)
-    dataset = replace(dataset, notes=(*dataset.notes, *_other_masks(path, wanted), *pose_notes(dataset)))
+    listing = format_of(path).list_frames(path, wanted)
+    if isinstance(folder, Path) and not any(frame.depth for frame in listing.frames):
+        raise InputError(
+            f"depths {folder}: has no map for any photo; call them like their photos: a.png, a.npy or a.exr"
+        )
+    dataset = posed(path, near_origin(path, listing), wanted)
+    doubts = *_other_masks(path, wanted), *_maps_of_some(dataset), *lens_notes(dataset), *pose_notes(dataset)
+    dataset = replace(dataset, notes=(*dataset.notes, *doubts))
     if preload and isinstance(dataset.images, LazyPictures):
         dataset.images.preload(progress)
     return dataset
@@ -123,6 +131,14 @@ def _other_masks(path: Path, wanted: Wanted) -> tuple[str, ...]:
     if wanted.masks is not None or (path / MASK_FOLDER).is_dir() or not (path / "mask").is_dir():
         return ()
     return (f"mask/ is not read: call it {MASK_FOLDER}/, or name it with --masks, if masks of all images are there",)
+
+
+def _maps_of_some(dataset: Dataset) -> tuple[str, ...]:
+    """How many photos have a depth map, where not all for training have one."""
+    known = sum(view in dataset.images.with_depth for view in dataset.train)
+    if not dataset.images.with_depth or known == len(dataset.train):
+        return ()
+    return (f"{known} of {len(dataset.train)} photos for training have a depth map",)
 
 
 def format_of(path: Path) -> Format:

@@ -21,7 +21,7 @@ from etsplat.io.ply_tables import GREY, load_points
 POINTS = "points.ply"
 """In the folder of a layout that has no points of its own: points, in the frame of the poses."""
 
-OPENGL = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
+OPENGL = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64, device="cpu")
 """Signs of the axes of a camera that has y up and looks along -z, in those of one that has y down and looks along z."""
 
 _AFAR = 1000.0
@@ -163,7 +163,9 @@ def read_object(path: Path) -> dict[str, Any]:
     """
     try:
         document = parse_json(path.read_text(encoding="utf-8"))
-    except (ValueError, OSError) as error:
+    except OSError as error:
+        raise InputError(f"scene {path}: cannot be read ({error.strerror}); check its permissions") from error
+    except ValueError as error:
         detail = str(error).splitlines()[0]
         raise InputError(f"scene {path}: not valid JSON ({detail}); export the poses again") from error
     if not isinstance(document, dict):
@@ -194,7 +196,9 @@ def read_xml(path: Path) -> ElementTree.Element:
         if b"<!" in data.replace(b"<!--", b"").replace(b"<![CDATA[", b""):
             raise InputError(f"scene {path}: declares types or entities, which are not read; export it again")
         return ElementTree.fromstring(data)
-    except (ElementTree.ParseError, ValueError, LookupError, OSError) as error:
+    except OSError as error:
+        raise InputError(f"scene {path}: cannot be read ({error.strerror}); check its permissions") from error
+    except (ElementTree.ParseError, ValueError, LookupError) as error:
         detail = str(error).splitlines()[0]
         raise InputError(f"scene {path}: not valid XML ({detail}); export the poses again") from error
 

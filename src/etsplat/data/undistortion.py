@@ -4,15 +4,16 @@ import contextlib
 import copy
 import os
 import shutil
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 from etsplat.core.errors import InputError
 from etsplat.data.colmap_process import Progress, import_pycolmap, run_apart, undistort_images
-from etsplat.data.formats.colmap import find_model
-from etsplat.data.frames import Frame, Points, Wanted, check_copy, check_frames, scaled_intrinsics
+from etsplat.data.formats import colmap as colmap_scenes
+from etsplat.data.formats.colmap import find_model, write_tested
+from etsplat.data.frames import DEPTH_FOLDERS, Frame, Points, Wanted, check_copy, check_frames, scaled_intrinsics
 from etsplat.data.load import format_of
 from etsplat.data.scene_files import placed_image
 from etsplat.io.atomic import write_error
@@ -31,7 +32,9 @@ _GROWTH, _SPARE_BYTES = 4, 1 << 20
 """COLMAP writes JPEG with few losses: files grow. Beside them lies the model."""
 
 
-def undistort_scene(scene: Path | str, out: Path | str, *, max_size: int = 1600) -> list[str]:
+def undistort_scene(
+    scene: Path | str, out: Path | str, *, max_size: int = 1600, tell: Callable[[str], None] = lambda note: None
+) -> list[str]:
     """Write a scene anew in COLMAP's layout without lens distortion: images, masks, cameras, points.
 
     Args:
@@ -39,9 +42,10 @@ def undistort_scene(scene: Path | str, out: Path | str, *, max_size: int = 1600)
             layout that is read (`docs/captures.md`). `masks/`, or the masks that it names, come along.
         out: folder of the new scene; must not exist or be empty.
         max_size: longer sides are shrunk to this many pixels.
+        tell: is called with what is left out or not understood, a sentence each.
 
     Returns:
-        The names of the images. Every 8th is for testing, whatever the scene said.
+        The names of the images. Those for testing are the scene's own, if it says which; else every 8th.
 
     Raises:
         InputError: pycolmap is missing; there is no scene, or it cannot be read; images are missing, damaged or
@@ -51,14 +55,16 @@ def undistort_scene(scene: Path | str, out: Path | str, *, max_size: int = 1600)
     scene, out = Path(scene), Path(out)
     if not scene.is_dir():
         raise InputError(f"scene {scene}: no such folder; {path_remedy(scene)}")
-    colmap = find_model(scene)
+    layout = format_of(scene)
+    colmap = find_model(scene) if layout.MARK == colmap_scenes.MARK else None
     check_size(max_size)
     check_output(out)
+    listing = layout.list_frames(scene, Wanted())
+    train, tested = listing.split or (range(len(listing.frames)), None)
+    frames = sorted((listing.frames[view] for view in (*train, *(tested or ()))), key=lambda frame: frame.name)
     if colmap is not None:
         model, photos, masks = _read_model(pycolmap, scene, colmap)
     else:
-        listing = format_of(scene).list_frames(scene, Wanted())
-        frames = sorted(listing.frames, key=lambda frame: frame.name)
         check_frames(scene, frames)
         photos = _common_folder(scene, frames)
         model, masks = _make_model(pycolmap, scene, photos, frames, listing.points)
@@ -71,8 +77,21 @@ def undistort_scene(scene: Path | str, out: Path | str, *, max_size: int = 1600)
             undistort_masks(model, masks, work, max_size)
         if (scene / GEOREFERENCE_FILE).is_file():
             shutil.copyfile(scene / GEOREFERENCE_FILE, work / "scene" / GEOREFERENCE_FILE)
+        if tested is not None:
+            files = sorted(listing.frames[view].image.relative_to(photos).as_posix() for view in tested)
+            write_tested(work / "scene" / "sparse" / "0", files)
         os.replace(work / "scene", out)
+    for note in (*listing.notes, *_left_behind(scene, frames)):
+        tell(note)
     return names
+
+
+def _left_behind(scene: Path, frames: Sequence[Frame]) -> Iterator[str]:
+    for folder in DEPTH_FOLDERS:
+        if (scene / folder).is_dir():
+            yield f"{folder}/ stays behind: depth maps are not freed of distortion"
+    if all(frame.lens is None for frame in frames):
+        yield "no photo has lens distortion: the scene can be used as it was"
 
 
 def _check_pictures(scene: Path, photos: list[Path], masks: Iterable[Path]) -> None:

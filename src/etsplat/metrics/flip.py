@@ -72,6 +72,7 @@ def flip(
     if image.shape != truth.shape:
         raise ValueError(f"truth: expected the image's shape {tuple(image.shape)}, got {tuple(truth.shape)}")
     check_floating("image", image)
+    check_floating("truth", truth)
     if image.numel() == 0:
         raise ValueError(f"image: expected a pixel or more, got shape {tuple(image.shape)}")
     if not 0 < pixels_per_degree < math.inf:

@@ -20,7 +20,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from etsplat.core.backgrounds import for_each_view
-from etsplat.core.cameras import Cameras, view_arguments
+from etsplat.core.cameras import Cameras, check_views, view_arguments
 from etsplat.core.connectivity import HOW_CONNECTED, MeshConnectivity
 from etsplat.core.precision import as_given
 from etsplat.core.rasterization import Rasterization, joined
@@ -96,6 +96,7 @@ def rasterize_antialiased(
     viewmats, Ks, width, height = view_arguments(cameras, viewmats, Ks, width, height)
     check_kind("connectivity", connectivity, MeshConnectivity, HOW_CONNECTED)
     check_shape("vertices", vertices, (connectivity.num_vertices, 3))
+    check_views(viewmats, Ks, "vertices", vertices)
     check_device("connectivity", connectivity.faces, "vertices", vertices)
     if sum(given is not None for given in (face_colors, vertex_colors, texture)) != 1:
         raise ValueError("exactly one of face_colors, vertex_colors and texture must be given")
@@ -157,10 +158,6 @@ def _seen_from(vertices: Tensor, viewmats: Tensor, Ks: Tensor) -> list[Float[Ten
 
     Engines have no gradient to cameras, but to vertices.
     """
-    check_shape("viewmats", viewmats, ("B", 4, 4))
-    check_shape("Ks", Ks, (len(viewmats), 3, 3))
-    for name, tensor in (("viewmats", viewmats), ("Ks", Ks)):
-        check_like(name, tensor, "vertices", vertices)
     points = vertices @ viewmats[:, :3, :3].mT + viewmats[:, None, :3, 3]
     focal, middle, fixed = Ks[:, None, [0, 1], [0, 1]], Ks[:, None, :2, 2], Ks.detach()
     shifted = focal * points[..., :2] + (middle - fixed[:, None, :2, 2]) * points[..., 2:]

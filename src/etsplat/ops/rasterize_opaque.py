@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from etsplat.core.cameras import Cameras, view_arguments
+from etsplat.core.cameras import Cameras, check_views, view_arguments
 from etsplat.core.rasterization import OpaqueView, Rasterization
 from etsplat.core.validation import (
     check_above,
@@ -176,10 +176,7 @@ def _separate(points: Tensor) -> Tensor:
 
 
 def _check_views(vertices: Tensor, viewmats: Tensor, Ks: Tensor, width: int, height: int, near_plane: float) -> Cameras:
-    check_shape("viewmats", viewmats, ("B", 4, 4))
-    check_shape("Ks", Ks, (len(viewmats), 3, 3))
-    check_like("viewmats", viewmats, "vertices", vertices)
-    check_like("Ks", Ks, "vertices", vertices)
+    check_views(viewmats, Ks, "vertices", vertices)
     if Ks.is_cpu:  # reading them would wait for a GPU
         check_intrinsics("Ks", Ks)
     check_above("near_plane", near_plane)

@@ -336,8 +336,26 @@ def _value_of(name: str, term: Term, drawing: Any, like: Tensor | None = None) -
         ) from error
     if isinstance(value, Tensor) and value.ndim == 0:
         if like is None or (value.dtype == like.dtype and value.device == like.device):
+            _check_learns(who, term, value, drawing)
             return value
         got = f"{value.dtype} on {value.device}, where photometric has {like.dtype} on {like.device}"
     else:
         got = shown(value)
     raise ValueError(f"{who} must return a scalar tensor of the model's dtype and device, got {got}")
+
+
+def _check_learns(who: str, term: Term, value: Tensor, drawing: Any) -> None:
+    """ValueError where a value changes nothing though what it is of is learned; not of 0, as where nothing is known."""
+    if value.requires_grad or not torch.is_grad_enabled():
+        return
+    if value.is_cuda and torch.cuda.is_current_stream_capturing():  # its value is not known then
+        return
+    if term.outputs:
+        looked_at = [getattr(drawing.rendering, name) for name in term.outputs]
+    else:
+        looked_at = drawing.model.parameters().values()
+    if value != 0 and any(isinstance(tensor, Tensor) and tensor.requires_grad for tensor in looked_at):
+        raise ValueError(
+            f"{who} has no gradient and so changes nothing: compute it by torch from drawing.model or"
+            " drawing.rendering, without detach(), item(), numpy or comparisons alone"
+        )

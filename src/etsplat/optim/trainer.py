@@ -1,15 +1,17 @@
 """Fits a model to photos: one trainer for every model, objective, strategy and data set."""
 
 import contextlib
+import copy
 import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, NoReturn, TypeVar
 
 import torch
 from torch import Tensor
 
+from etsplat.core.precision import usual_defaults
 from etsplat.core.validation import check_count, first_not_finite
 from etsplat.core.workers import workers
 from etsplat.data.dataset import Dataset, middles_of
@@ -78,6 +80,7 @@ class Trainer(Generic[M]):
 
     onlooker: Callable[[int], None] | None = None
 
+    @usual_defaults()
     def __init__(
         self,
         model: M,
@@ -169,6 +172,7 @@ class Trainer(Generic[M]):
         self.cameras.start(dataset, batch, some)
         self.depths.start(some)
 
+    @usual_defaults()
     def fit(
         self,
         iterations: int,
@@ -220,6 +224,18 @@ class Trainer(Generic[M]):
         Another `fit` goes on from there.
         """
         self.progress.ending = True
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "Trainer[M]":
+        twin = memo[id(self)] = object.__new__(type(self))
+        vars(twin).update(copy.deepcopy(vars(self), memo))
+        return twin
+
+    def __reduce__(self) -> NoReturn:
+        raise TypeError(
+            "a Trainer cannot be pickled, as it holds functions: fit(n, run=FOLDER, checkpoint_every=m) writes"
+            " checkpoints, with which fit(n, run=FOLDER) of a Trainer that is made anew goes on; models, data sets and"
+            " Adam can be"
+        )
 
     @property
     def count(self) -> int:
@@ -312,6 +328,7 @@ class Trainer(Generic[M]):
         self._stepper.restart()
         self._known_loss = None
 
+    @usual_defaults()
     def evaluate(self) -> dict[str, float]:
         """Cheap metrics of the present state, which is kept if the watched photos speak for it."""
         metrics = checked_metrics(self._evaluate(self.model)) if self._evaluate and workers().leads else {}
@@ -320,6 +337,7 @@ class Trainer(Generic[M]):
             self.depths.observe(watched["watched_psnr"])
         return metrics | watched
 
+    @usual_defaults()
     def outcome(self) -> Outcome[M]:
         """What the run gives: the last state, or an earlier one where the watched photos speak for it (optim/watch.py).
 

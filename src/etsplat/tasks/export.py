@@ -5,6 +5,7 @@ from pathlib import Path
 import torch
 
 from etsplat.core.errors import InputError
+from etsplat.core.precision import usual_defaults
 from etsplat.data.dataset import Dataset
 from etsplat.io.mesh_files import MeshFile
 from etsplat.io.paths import given_path
@@ -18,6 +19,7 @@ from etsplat.tasks.reconstruct import ReconstructResult
 from etsplat.tasks.train import TrainResult
 
 
+@usual_defaults()
 def export(
     source: TrainResult | ReconstructResult | TriangleSoup | str | Path,
     path: str | Path,
@@ -37,8 +39,8 @@ def export(
             the run says of it. A run of a `Dataset` in memory does not say.
 
     Returns:
-        What was written: `path`, `triangles`, what was `removed`, and `transform`, from the capture's units and axes to
-        those of the file.
+        What was written: `path`, `triangles`, what was `removed`, `transform`, from the capture's units and axes to
+        those of the file, and `notes` where something is otherwise than one may think.
 
     Raises:
         InputError: nothing is left; settings that contradict each other or the kind of file; the file cannot be
@@ -75,5 +77,6 @@ def export(
 
 
 def _export_mesh(run: Path, path: Path, config: ExportConfig, scene: Dataset | str | Path | None) -> Export:
-    faces, transform = write_mesh(run, path, checked_for_meshes(path, config), scene)
-    return Export(path, faces, 0, {}, transform)
+    notes: list[str] = []
+    faces, transform = write_mesh(run, path, checked_for_meshes(path, config), scene, notes.append)
+    return Export(path, faces, 0, {}, transform, tuple(notes))

@@ -1,6 +1,6 @@
 """The mesh of a reconstruction as a file for other programs: as it is, with fewer faces, or light under a texture."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from etsplat.core.errors import InputError
+from etsplat.core.precision import usual_defaults
 from etsplat.data.dataset import Dataset
 from etsplat.data.where_up import told_up, up_of
 from etsplat.engines.choice import resolve_device
@@ -32,8 +33,10 @@ from etsplat.tasks.placing import apart_from_world, check_placed, placed_record,
 from etsplat.tasks.reconstruct_config import Pictures, ReconstructConfig
 from etsplat.tasks.refined_cameras import refined_capture
 from etsplat.tasks.settings import settings_of
-from etsplat.tasks.sources import fingerprint, load_source, make_subject
+from etsplat.tasks.sources import directions_digest, fingerprint, load_source, make_subject
 from etsplat.tasks.texturing import Tell, check_installed, coarser, colors_at, texture_object
+
+Note = Callable[[str], None]
 
 _OF_MESHES = ("texture", "faces", "normals", "occlusion", "lods", "compress", "pictures", "up", "scale", "place")
 """Settings that meshes of reconstructions know."""
@@ -140,6 +143,7 @@ def _exposures(run: RunDirectory, views: Dataset) -> dict[int, Float[Tensor, "3 
 
 
 @one_torch_thread()
+@usual_defaults()
 def texture_mesh(
     run: Path | str,
     *,
@@ -188,8 +192,11 @@ def export_mesh(
     scene: Path | None = None,
     device: str | None = None,
     tell: Tell = lambda phase, done, total: None,
+    note: Note = lambda text: None,
 ) -> dict[Path, int]:
     """Write the mesh of a run of `etsplat reconstruct`; the suffix of `path` chooses the format.
+
+    `note` is called with a sentence where something is otherwise than one may think.
 
     Returns:
         The files, that at `path` first, and how many faces are in each.
@@ -199,8 +206,8 @@ def export_mesh(
     """
     config = checked_for_meshes(path, config)
     if config.texture is not None:
-        return _export_textured(run, path, config, scene, device, tell)
-    return {path: write_mesh(run, path, config, scene)[0]}
+        return _export_textured(run, path, config, scene, device, tell, note)
+    return {path: write_mesh(run, path, config, scene, note)[0]}
 
 
 def checked_for_meshes(path: Path, config: ExportConfig) -> ExportConfig:
@@ -216,7 +223,7 @@ def checked_for_meshes(path: Path, config: ExportConfig) -> ExportConfig:
 
 
 def write_mesh(
-    run: Path, path: Path, config: ExportConfig, scene: Dataset | Path | str | None
+    run: Path, path: Path, config: ExportConfig, scene: Dataset | Path | str | None, note: Note
 ) -> tuple[int, Similarity]:
     """`export_mesh` without a texture: how many faces, and the way from the input's units and axes to the file's."""
     if kind_of(path) not in (kinds := suffixes("vertex_colors")):
@@ -227,7 +234,9 @@ def write_mesh(
         colors = colors_at(mesh, vertices[faces].mean(dim=1))
         mesh = MeshFile(vertices, faces, face_colors=colors)
     check_placed(path, config)
-    transform, near, far, record = _placement(RunDirectory(run), config, scene, mesh.vertices)
+    if scene is not None and config.up == "keep":
+        note("--scene has no use here: its photos say where up is, with --up y or z, and make a texture")
+    transform, near, far, record = _placement(RunDirectory(run), config, scene, mesh.vertices, note)
     vertices, by_face, by_vertex = near.apply(mesh.vertices).float(), mesh.face_colors, _only_by_vertex(mesh)
     how = {"world": far, "compress": config.compress, "record": record}
     save_mesh(path, vertices, mesh.faces, by_face, vertex_colors=by_vertex, **how)
@@ -235,7 +244,13 @@ def write_mesh(
 
 
 def _export_textured(
-    run: Path, path: Path, config: ExportConfig, scene: Path | None, device: str | None, tell: Tell
+    run: Path,
+    path: Path,
+    config: ExportConfig,
+    scene: Path | None,
+    device: str | None,
+    tell: Tell,
+    note: Note,
 ) -> dict[Path, int]:
     """The light mesh at `path`, and its coarser levels beside it, each made of the one before."""
     assert config.texture is not None
@@ -256,7 +271,7 @@ def _export_textured(
     check_installed()
     opened, written = open_reconstruction(run, scene, device, tell), {}
     corners = opened.views.normalization.invert(opened.mesh.vertices)
-    _, near, far, record = _placement(RunDirectory(run), config, scene, corners)
+    _, near, far, record = _placement(RunDirectory(run), config, scene, corners, note)
     mesh = opened.textured(config.texture, config.faces or LIGHT_FACES, tell=tell)
     for level in range(config.lods + 1):
         if level:
@@ -282,7 +297,11 @@ def check_stored(path: Path, config: ExportConfig) -> None:
 
 
 def _placement(
-    run: RunDirectory, config: ExportConfig, scene: Dataset | Path | str | None, vertices: Float[Tensor, "V 3"]
+    run: RunDirectory,
+    config: ExportConfig,
+    scene: Dataset | Path | str | None,
+    vertices: Float[Tensor, "V 3"],
+    note: Note,
 ) -> tuple[Similarity, Similarity, Georeference | None, dict[str, Any]]:
     """How vertices in the units of the input are moved: in all, and as a part in the file and an offset beside it.
 
@@ -290,23 +309,37 @@ def _placement(
     """
     file = run.path / GEOREFERENCE_FILE
     georeference = Georeference.read(file) if file.is_file() else None
-    up = None if config.up == "keep" else _up(run, scene, georeference)
+    up = None if config.up == "keep" else _up(run, scene, georeference, note)
+    if up is None and config.up != "keep" and config.place != "world":
+        note(f"nothing is turned, since photos do not say where up is: +{config.up} is up if it was in the input")
     transform = placement(run.path, config, vertices, up, georeference)
     return transform, *apart_from_world(transform, config, georeference), placed_record(config, transform, georeference)
 
 
 def _up(
-    run: RunDirectory, scene: Dataset | Path | str | None, georeference: Georeference | None
+    run: RunDirectory, scene: Dataset | Path | str | None, georeference: Georeference | None, note: Note
 ) -> Float[Tensor, "3"] | None:
     """Where up is; None for the object of a mesh, whose photos say nothing, and where photos contradict each other."""
     told = told_up(georeference)
     if told is not None:
         return told
     source = _source_of(run, scene)
-    if not isinstance(source, Dataset) and (source == DEMO_OBJECT or Path(source).is_file()):
+    if not isinstance(source, Dataset) and (str(source) == DEMO_OBJECT or Path(source).is_file()):
         return None
     photos = capture_at(source)
-    return None if photos is None else up_of(photos)
+    if photos is None:
+        return None
+    if _is_of_others(run, photos):
+        note("it is turned by the photos of another scene than the run was made of, which --scene names")
+    return up_of(photos)
+
+
+def _is_of_others(run: RunDirectory, photos: Dataset) -> bool:
+    """Whether a run was made of a mesh, or of other photos, as far as it says."""
+    config = run.read_config("paths.source")
+    source = config["paths"]["source"]
+    of_mesh = source is not None and (source == DEMO_OBJECT or Path(source).is_file())
+    return of_mesh or config.get("views", held := directions_digest(photos)) != held
 
 
 def _source_of(run: RunDirectory, scene: Dataset | Path | str | None) -> Dataset | Path | str:

@@ -48,7 +48,7 @@ class Export:
         sky: those of the sky, where they are an object of their own.
         removed: how many were left out, by the reason (`etsplat.tasks.soup_selection.REASONS`).
         transform: from the capture's own units and axes to those of the file.
-        notes: a sentence if it would be another file if the capture had not gone.
+        notes: a sentence where something is otherwise than one may think, as where the capture has gone.
     """
 
     path: Path

@@ -20,9 +20,9 @@ from etsplat.data.where_up import up_of
 from etsplat.engines.choice import engine
 from etsplat.io.atomic import atomic_write, write_error
 from etsplat.io.camera_path_files import read_camera_path
-from etsplat.io.images import over_background, save_image
+from etsplat.io.images import IMAGE_SUFFIXES, over_background, save_image
 from etsplat.io.paths import kind_of
-from etsplat.io.videos import VideoSink, open_video
+from etsplat.io.videos import VIDEO_SUFFIXES, VideoSink, open_video
 from etsplat.model.soup_appearance import OPAQUE_FROM
 from etsplat.model.triangle_soup import FOCAL_NOTE, TriangleSoup
 from etsplat.tasks.opened_runs import SoupRun
@@ -41,6 +41,10 @@ KEY_FRAMES = 60
 
 USUAL_WIDTH, USUAL_ASPECT = 960, 1.5
 """Of the pictures of a recorded path where neither it nor a capture says."""
+
+
+_PICTURES = (*IMAGE_SUFFIXES, *VIDEO_SUFFIXES, ".webp", ".gif", ".webm")
+"""Ends of the names of files, which no folder is to have."""
 
 
 def render_run(
@@ -71,7 +75,7 @@ def render_run(
             disk is full.
     """
     out = Path(out)
-    if out.is_file() or kind_of(out) in (".mp4", ".png"):
+    if out.is_file() or kind_of(out) in _PICTURES:
         raise InputError(f"{out}: pictures get names of their own; name a folder for them")
     names, cameras = recorded_views(run, config) if config.recorded else views_of(run.needed_capture(), config, tell)
     soup = drawn_soup(run, config, crop)

@@ -7,6 +7,8 @@ from functools import partial
 from pathlib import Path
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from etsplat.core.errors import InputError
 from etsplat.data.close_ups import close_ups, cropped_to
@@ -276,7 +278,16 @@ def _kept(views: Dataset, config: ReconstructConfig) -> Dataset:
 
 def views_digest(views: Dataset) -> str:
     """A short hash of what photos are called and where they were taken from, whatever becomes of them in a run."""
-    places = (views.viewmats.double() * 1000).round().long()  # apart from what another machine rounds otherwise
+    return _named_digest(views, views.viewmats)
+
+
+def directions_digest(views: Dataset) -> str:
+    """A short hash of what photos are called and how they were held, in whatever units and wherever the origin is."""
+    return _named_digest(views, views.viewmats[:, :3, :3])
+
+
+def _named_digest(views: Dataset, matrices: Float[Tensor, "B rows columns"]) -> str:
+    places = (matrices.double() * 1000).round().long()  # apart from what another machine rounds otherwise
     text = repr((views.names, places.tolist()))
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 

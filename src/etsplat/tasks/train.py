@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 
+from etsplat.core.precision import usual_defaults
 from etsplat.core.workers import together, workers
 from etsplat.data.dataset import Dataset
 from etsplat.data.stray_points import without_strays
@@ -71,6 +72,7 @@ class TrainResult(Result):
 
 @together()
 @one_torch_thread()
+@usual_defaults()
 def train(
     source: str | Path | Dataset,
     out: str | Path,
@@ -261,10 +263,15 @@ def _opaque_mesh(
 ) -> TriangleMesh | None:
     """The opaque mesh; without one the soup is still a result, and the run says why there is none."""
     try:
-        return fit_opaque_mesh(job, soup, exposure, capture, config)
+        mesh = fit_opaque_mesh(job, soup, exposure, capture, config)
     except DivergedError as error:
         job.announce(NoteEvent(f"no opaque mesh: {error}"))
         return None
+    around = surroundings_of_run(capture, config)
+    if around is not None and bool(around.outermost(mesh.vertices.detach()[mesh.faces].cpu()).all()):
+        job.announce(NoteEvent("no opaque mesh: nothing but the sky is left"))  # as where poses are all wrong
+        return None
+    return mesh
 
 
 def _write_opaque(done: SoupRun, run: RunDirectory, opaque: MeshFile) -> None:

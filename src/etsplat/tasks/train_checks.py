@@ -47,6 +47,11 @@ def check_train(
     if (limit := triangle_limit(capture, config)) < config.max_triangles:
         setting = f"pixels_per_triangle {config.pixels_per_triangle:g}"
         notes.append(f"few pixels: at most {limit:,} triangles, not {config.max_triangles:,} ({setting})")
+    if capture.exact_points is not None and (points := len(capture.exact_points)) > limit:
+        notes.append(
+            f"{points:,} points, each of which becomes a triangle: more than the limit of {limit:,}, so that none are"
+            " added; thin the points out if these are too many"
+        )
     notes += straight_alpha(capture)
     if capture.images.streamed and not streams:
         notes.append("the photos do not fit into memory: they are decoded anew whenever they are needed")

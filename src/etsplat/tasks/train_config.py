@@ -212,7 +212,8 @@ class TrainConfig(Settings):
     width: Annotated[int | None, Range(1, 16384)] = 800
     """Wider images are scaled down to this width; None shrinks those wider than 1600 pixels to 1600."""
     max_triangles: Annotated[int, Range(1, 10**8)] = 100_000
-    """Densification stops here, or earlier where photos are few or small."""
+    """Densification stops here, or earlier where photos are few or small.
+    A capture's points may be more: each of them becomes a triangle."""
     pixels_per_triangle: Annotated[float | None, Range(0.01), Rare] = 45.0
     """Densification stops where there is a triangle for so many pixels of the training photos.
     More learn the photos by heart, and other views fall apart; None for `max_triangles` whatever the photos.

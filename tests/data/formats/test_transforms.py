@@ -10,7 +10,8 @@ from etsplat.data.hull import bounding_sphere
 from etsplat.data.load import load_dataset
 from etsplat.data.photograph import photograph
 from etsplat.io.images import save_image
-from helpers.captures import write_views
+from helpers.captures import write_transforms, write_views
+from helpers.photos import upright_picture, write_phone_photo
 
 
 def load_transforms(folder, width=None):
@@ -54,6 +55,17 @@ def test_blender_layout_returns_the_cameras_and_premultiplied_images(tmp_path, t
     assert (views.train, views.test) == (list(range(7)), [7, 8, 9])
     assert views.names[3] == "images_003"
     assert views.has_masks
+
+
+@pytest.mark.parametrize(("beside", "tested"), [([], 1), (["val"], 2), (["val", "test"], 3)])
+def test_blender_s_photos_for_validation_are_for_testing_where_no_others_are(tmp_path, truth, beside, tested):
+    """They were passed over, and every 8th photo for training tested."""
+    write_views(tmp_path, truth, range(5), "transforms_train.json")
+    for name in beside:
+        write_views(tmp_path, truth, range(5, 7) if name == "val" else range(7, 10), f"transforms_{name}.json")
+    views = load_transforms(tmp_path)
+    assert len(views.test) == tested
+    assert len(views.train) == (5 if beside else 4)
 
 
 def test_nerfstudio_intrinsics_scale_with_the_files_and_the_requested_width(scene, truth):
@@ -100,12 +112,28 @@ def test_photos_for_testing_alone_leave_all_others_for_training(scene, key):
     assert (views.test, views.train) == ([3, 4], [0, 1, 2, 5, 6, 7, 8, 9])
 
 
+def test_photos_for_both_are_said_to_be_trained_on(scene):
+    names = [f"./images/{k:03d}" for k in range(10)]
+    rewrite(scene, lambda d: d.update(train_filenames=names, test_filenames=names[:3]))
+    views = load_transforms(scene)
+    assert (views.test, len(views.train)) == ([], 10)
+    assert views.notes == ("3 photos are named for training and for testing: they are trained on, not tested",)
+
+
 @pytest.mark.parametrize("tests", [{}, {"val_filenames": []}])
 def test_photos_for_training_alone_are_said_to_be_passed_over(scene, tests):
     rewrite(scene, lambda d: d.update(train_filenames=[f"./images/{k:03d}" for k in range(9)], **tests))
     views = load_transforms(scene)
     assert views.test == [0, 8]
     assert views.notes == ("train_filenames is without test_filenames: every 8th of all photos is tested",)
+
+
+def test_null_says_nothing_and_camera_models_may_be_in_small_letters(scene):
+    """As programs write what they do not know; both were refused."""
+    before = load_transforms(scene)
+    rewrite(scene, lambda d: d.update(cx=None, k1=None, w=None, camera_model="pinhole"))
+    rewrite(scene, lambda d: d["frames"][0].update(camera_angle_x=None, mask_path=None))
+    assert torch.equal(load_transforms(scene).Ks, before.Ks)
 
 
 @pytest.mark.parametrize("said", [{"w": 80}, {"h": 80}])
@@ -126,6 +154,33 @@ def test_intrinsics_without_a_size_are_for_the_photos_that_the_file_names(scene,
     (scene / "images" / "000.png").unlink()
     with pytest.raises(InputError, match="images/000 has neither w nor h, and the photo that it names is missing"):
         load_dataset(scene, images="images_2")
+
+
+@pytest.mark.parametrize(
+    ("said", "size"),
+    [
+        ({"fl_x": 30.0}, (40, 24)),
+        ({"camera_angle_x": 1.2}, (40, 24)),
+        ({"fl_x": 30.0, "cx": 12.0, "cy": 20.0}, (24, 40)),
+        ({"fl_x": 30.0, "cx": 20.0, "cy": 12.0}, (40, 24)),
+        ({"camera_angle_x": 1.0, "camera_angle_y": 1.4}, (24, 40)),
+    ],
+)
+def test_photos_on_their_side_are_turned_where_intrinsics_without_a_size_mean_them_upright(tmp_path, said, size):
+    """As phones store them; a note says so where the intrinsics do not tell."""
+    write_transforms(tmp_path, 4)
+    document = json.loads((tmp_path / "transforms.json").read_text())
+    frames = [{key: own[key] for key in ("file_path", "transform_matrix")} for own in document["frames"]]
+    for frame in frames:
+        frame["file_path"] = frame["file_path"].replace(".png", ".jpg")
+        write_phone_photo(tmp_path / frame["file_path"], upright_picture(24, 40), orientation=6)
+    (tmp_path / "transforms.json").write_text(json.dumps({**said, "frames": frames}))
+    views = load_dataset(tmp_path)
+    assert views.images.sizes == [size] * 4
+    assert views.images[0].shape[:2] == size[::-1]
+    assert views.Ks[0, :2, 2].tolist() == [size[0] / 2, size[1] / 2]
+    told = [note for note in views.notes if note.startswith("4 of 4 photos lie on their side")]
+    assert len(told) == (len(said) == 1)
 
 
 def test_a_radial_camera_without_distortion_is_a_pinhole(scene):

@@ -28,6 +28,9 @@ from etsplat.io.paths import kind_of
 MARK = "sparse/"
 RANK = 2
 
+_TESTED = "test.txt"
+"""Beside a model: the names of its images for testing, a line each, as 3DGS has it."""
+
 
 def recognises(folder: Path) -> bool:
     """Whether there is a model."""
@@ -35,7 +38,9 @@ def recognises(folder: Path) -> bool:
 
 
 def list_frames(folder: Path, wanted: Wanted) -> Listing:
-    """The registered images of a COLMAP scene, and the model's points; every 8th image by name is test.
+    """The registered images of a COLMAP scene, and the model's points.
+
+    Images for testing are those that `test.txt` beside the model names, or else every 8th by name.
 
     Args:
         folder: holds the images, most often in `images/`, and `sparse/0/` (or `sparse/`), binary or text; binary is
@@ -59,11 +64,29 @@ def list_frames(folder: Path, wanted: Wanted) -> Listing:
     notes = _unplaced(frames)
     if (count := len(_models(folder))) > 1:
         notes += (f"{count} models in sparse/: {model.name}, which has the most images, is read, and no other",)
-    found = read_points(model)
+    split, found = _split(model, [image.name for image in registered]), read_points(model)
     if found is None or not len(found[0]):
-        return Listing(frames, notes=notes)
+        return Listing(frames, split, notes=notes)
     points, colors = torch.from_numpy(found[0]), torch.from_numpy(found[1].astype(np.float32) / 255)
-    return Listing(frames, points=(points, colors), notes=notes)
+    return Listing(frames, split, (points, colors), notes)
+
+
+def write_tested(model: Path, names: list[str]) -> None:
+    """Writes down which images of a model are for testing."""
+    (model / _TESTED).write_text("".join(f"{name}\n" for name in names), encoding="utf-8")
+
+
+def _split(model: Path, names: list[str]) -> tuple[list[int], list[int]] | None:
+    """By `test.txt`, if it is there."""
+    path = model / _TESTED
+    if not path.is_file():
+        return None
+    said = {line.strip() for line in path.read_text(encoding="utf-8", errors="replace").splitlines()} - {""}
+    test = [view for view, name in enumerate(names) if name in said]
+    if said and len(test) in (0, len(names)):
+        wrong = "names all images, none is left for training" if test else "names none of the images"
+        raise InputError(f"scene {path}: {wrong}; correct or remove it")
+    return [view for view, name in enumerate(names) if name not in said], test
 
 
 def _frame(folder: Path, model: Path, image: ColmapImage, camera: ColmapCamera | None, wanted: Wanted) -> Frame:

@@ -24,6 +24,7 @@ from etsplat.data.scene_files import (
     size_of,
     unplaced_note,
 )
+from etsplat.io.images import size_for
 from etsplat.io.ply_tables import load_points
 
 MARK = "transforms.json"
@@ -49,8 +50,9 @@ def list_frames(folder: Path, wanted: Wanted) -> Listing:
     none. Depth maps, where they are wanted, come from each frame's `depth_file_path`, in steps of
     `depth_unit_scale_factor` if that is there, or from a folder `depths/` or `depth/`. With one `transforms.json` its
     `train_filenames` and `test_filenames` make the split, or its `val_filenames` where nothing is for testing; without
-    the first, all others are for training. Without them, every 8th image by name is test. `transforms_val.json` is not
-    used. `ply_file_path` names the points.
+    the first, all others are for training. Photos in both are trained on, which a note says. Without them, every 8th
+    image by name is test. `transforms_val.json` is used where there is no other for testing. `ply_file_path` names the
+    points.
 
     Args:
         folder: the scene.
@@ -62,26 +64,33 @@ def list_frames(folder: Path, wanted: Wanted) -> Listing:
     path, split, notes = folder / "transforms.json", None, ()
     if path.is_file():
         document = read_object(path)
-        frames = sorted(_frames(path, document, wanted), key=lambda frame: frame.name)
-        split = _named_split(path, document, frames)
-        if split is not None:
+        frames = _frames(path, document, wanted)
+        lying = _lying_note(path, document, frames)
+        frames.sort(key=lambda frame: frame.name)
+        named = _named_split(path, document, frames)
+        if named is not None:
+            split, twice = named[:2], named[2]
             neither = len(frames) - len(split[0]) - len(split[1])
             notes = unplaced_note(neither, len(frames), "are named neither for training nor for testing")
+            if twice:
+                notes += (f"{twice} photos are named for training and for testing: they are trained on, not tested",)
         elif document.get("train_filenames"):
             notes = ("train_filenames is without test_filenames: every 8th of all photos is tested",)
     else:
-        path, test_file = folder / "transforms_train.json", folder / "transforms_test.json"
+        path = folder / "transforms_train.json"
+        others = (folder / f"transforms_{name}.json" for name in ("test", "val"))
         document = read_object(path)
         frames = _frames(path, document, wanted)
-        if test_file.is_file():
+        lying = _lying_note(path, document, frames)
+        if (test_file := next((other for other in others if other.is_file()), None)) is not None:
             count = len(frames)
             frames += _frames(test_file, read_object(test_file), wanted)
             split = list(range(count)), list(range(count, len(frames)))
-    return Listing(frames, split, _points(path, document), notes)
+    return Listing(frames, split, _points(path, document), (*notes, *lying))
 
 
-def _named_split(path: Path, document: dict[str, Any], frames: list[Frame]) -> tuple[list[int], list[int]] | None:
-    """As the file says; None where it does not say what is for testing."""
+def _named_split(path: Path, document: dict[str, Any], frames: list[Frame]) -> tuple[list[int], list[int], int] | None:
+    """(train, test) as the file says, and how many photos it names for both; None where it names none for testing."""
     train_names, test_names, val_names = (
         _named(path, document, key, frames) for key in ("train_filenames", "test_filenames", "val_filenames")
     )
@@ -95,7 +104,7 @@ def _named_split(path: Path, document: dict[str, Any], frames: list[Frame]) -> t
     test = [index for index, frame in enumerate(frames) if frame.name in tested - train_names]
     if not train:
         raise InputError(f"scene {path}: no frame is left for training; correct train_filenames or remove it")
-    return train, test
+    return train, test, len(train_names & tested)
 
 
 def _named(path: Path, document: dict[str, Any], key: str, frames: list[Frame]) -> set[str] | None:
@@ -109,6 +118,22 @@ def _named(path: Path, document: dict[str, Any], key: str, frames: list[Frame]) 
     if names and names.isdisjoint(frame.name for frame in frames):
         raise InputError(f"scene {path}: {key} names none of the frames; correct or remove it")
     return names
+
+
+def _lying_note(path: Path, document: dict[str, Any], frames: list[Frame]) -> tuple[str, ...]:
+    """That photos are taken as they are stored, where they lie on their side and nothing says which way poses mean."""
+    count = 0
+    for own, frame in zip(document["frames"], frames, strict=True):
+        entry = _entry(path, frame.name, document, own)
+        if not {"w", "h"} & entry.said.keys() and _shape(entry) is None and frame.image.is_file():
+            width, height = frame.size
+            count += size_for(frame.image, (height, width)) != frame.size
+    if not count:
+        return ()
+    return (
+        f"{count} of {len(frames)} photos lie on their side, as their EXIF says, and are taken as they are stored:"
+        f" where poses mean them upright, write w and h of the upright photos into {path.name}",
+    )
 
 
 def _points(path: Path, document: dict[str, Any]) -> Points | None:
@@ -138,7 +163,7 @@ def _frame(path: Path, document: dict[str, Any], own: Any, wanted: Wanted) -> Fr
     if not isinstance(own, dict) or not isinstance(own.get("file_path"), str):
         raise InputError(f"scene {path}: a frame without `file_path`; export the poses again")
     name, image = _image(path, own["file_path"])
-    entry = Entry(path, name, {**document, **own})
+    entry = _entry(path, name, document, own)
     whole = image
     if wanted.images is not None:
         image = placed_image(path.parent, own["file_path"], path, wanted)[1]
@@ -149,6 +174,12 @@ def _frame(path: Path, document: dict[str, Any], own: Any, wanted: Wanted) -> Fr
     size = _size(entry, image, whole)
     depth, unit = _depth(entry, image, wanted)
     return Frame(entry.name, image, mask, _viewmat(entry), _intrinsics(entry, size), size, _lens(entry), depth, unit)
+
+
+def _entry(path: Path, name: str, document: dict[str, Any], own: dict[str, Any]) -> Entry:
+    """What is said of a frame, by it or of all; null says nothing."""
+    said = [(key, value) for source in (document, own) for key, value in source.items() if value is not None]
+    return Entry(path, name, dict(said))
 
 
 def _depth(entry: Entry, image: Path, wanted: Wanted) -> tuple[Path | None, float | None]:
@@ -169,12 +200,12 @@ def _depth(entry: Entry, image: Path, wanted: Wanted) -> tuple[Path | None, floa
 
 def _lens(entry: Entry) -> Lens | None:
     """None without distortion."""
-    model = entry.said.get("camera_model", "OPENCV")
+    model = str(entry.said.get("camera_model", "OPENCV")).upper()
     values = {key: entry.number(key, 0.0) for key in _DISTORTION}
     k1, k2, k3, k4, k5, k6, p1, p2 = values.values()
     fisheye = entry.said.get("is_fisheye") or model in _FISHEYE  # the former is instant-ngp's
     if not fisheye and model not in _PERSPECTIVE:
-        raise entry.wrong(f"has a {model!s:.40} camera, which is not read; export perspective or fisheye images")
+        raise entry.wrong(f"has a {model:.40} camera, which is not read; export perspective or fisheye images")
     if fisheye:
         if p1 == p2 == k5 == k6 == 0:
             return Lens("OPENCV_FISHEYE", (k1, k2, k3, k4), f"a {model} camera")
@@ -182,13 +213,15 @@ def _lens(entry: Entry) -> Lens | None:
         told = f"lens distortion ({', '.join(key for key, value in values.items() if value != 0)})"
         return brown_lens(told, k1, k2, k3, p1, p2)
     raise entry.wrong(
-        f"has a {model!s:.40} camera with coefficients that are not known here; undistort its images with the program"
+        f"has a {model:.40} camera with coefficients that are not known here; undistort its images with the program"
         " that made them"
     )
 
 
 def _size(entry: Entry, image: Path, whole: Path) -> tuple[int, int]:
     """That of the intrinsics: as the file says, one side by the other and the photo's shape, or else the photo's.
+
+    The latter upright, where only then it is wide or high as they are.
 
     Args:
         entry: of the frame.
@@ -205,10 +238,23 @@ def _size(entry: Entry, image: Path, whole: Path) -> tuple[int, int]:
         if not whole.is_file():
             raise entry.wrong("has neither w nor h, and the photo that it names is missing; write w and h there")
         image = whole
+    shape = _shape(entry)
+    if not said and shape is not None and image.is_file():
+        return size_for(image, shape)
     width, height = size_of(image)
     if "w" in said:
         return int(said["w"]), max(1, round(height * said["w"] / width))
     return (max(1, round(width * said["h"] / height)), int(said["h"])) if said else (width, height)
+
+
+def _shape(entry: Entry) -> tuple[float, float] | None:
+    """Width and height up to a factor, as the middle of the image tells them, or angles of view; None without."""
+    if {"cx", "cy"} <= entry.said.keys():
+        return entry.number("cx"), entry.number("cy")
+    angles = [entry.number(f"camera_angle_{axis}", math.nan) for axis in "xy"]
+    if all(0 < angle < math.pi for angle in angles):
+        return math.tan(angles[0] / 2), math.tan(angles[1] / 2)
+    return None
 
 
 def _intrinsics(entry: Entry, size: tuple[int, int]) -> Float[Tensor, "3 3"]:
