@@ -50,11 +50,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if console.is_terminal or not options.seconds:  # an hour, in which one wants to know how far it is
             console.print(f"{number} of {len(targets)}: {target.name}", style="dim")
         kin = [other for other in targets if isinstance(other, type(target))]
-        if options.seconds:
-            tally = run_target(target, options.seed, seconds=options.seconds / len(targets))
-        else:
-            total = options.inputs if target in READERS else options.calls
-            tally = run_target(target, options.seed, inputs=-(-total // len(kin)))
+        total = options.inputs if target in READERS else options.calls
+        seconds = (options.seconds or float("inf")) / len(targets)
+        tally = run_target(target, options.seed, inputs=-(-total // len(kin)), seconds=seconds)
         tallies.append(tally)
         for kind, (what, failure) in enumerate(tally.failures.items()):
             place = FOUND / target.name.replace(" ", "_").replace("/", "_") / str(kind)
@@ -89,7 +87,7 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__)
     parser.add_argument("--inputs", type=int, default=1_000_000, help="over all readers")
     parser.add_argument("--calls", type=int, default=100_000, help="over all operations")
-    parser.add_argument("--seconds", type=float, help="for all targets together, in the place of both")
+    parser.add_argument("--seconds", type=float, help="at most, for all targets together")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--targets", default="*", metavar="PATTERN", help="only those whose name matches")
     parser.add_argument("--replay", nargs=2, metavar=("TARGET", "INPUT"), help="run one input again, without bounds")

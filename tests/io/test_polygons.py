@@ -133,3 +133,12 @@ def test_a_ply_of_polygons_that_is_cut_short_or_has_edges_for_faces_is_an_input_
     ply(tmp_path / "a.ply", [[0, 1, 2], [0, 1]], kind)
     with pytest.raises(InputError, match="a face with 2 corners"):
         load_mesh(tmp_path / "a.ply")
+
+
+def test_a_ply_whose_corners_are_no_list_is_an_input_error(tmp_path):
+    """A byte that is no space in the header, as of a file that was damaged, ended in numpy's words."""
+    ply(tmp_path / "a.ply", FACES, "<")
+    data = (tmp_path / "a.ply").read_bytes()
+    (tmp_path / "a.ply").write_bytes(data.replace(b"list uchar", b"list\0uchar"))
+    with pytest.raises(InputError, match=r"a\.ply"):
+        load_mesh(tmp_path / "a.ply")

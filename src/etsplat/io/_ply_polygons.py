@@ -46,7 +46,8 @@ def with_triangles(path: Path) -> bytes | None:
         order, elements, start = _header(data)
         faces = next(element for element in elements if element.name == "face")
         before = elements[: elements.index(faces)]
-        if faces.properties[0][0] not in _CORNER_NAMES or any(kind[2] for each in before for kind in each.properties):
+        name, _, length = faces.properties[0]
+        if name not in _CORNER_NAMES or length is None or any(kind[2] for each in before for kind in each.properties):
             return None
         words = [] if order else data[start:].split()
         if _are_triangles(data, start, order, before, faces) if order else _are_triangles_in(words, before, faces):
