@@ -64,6 +64,19 @@ def test_a_video_whose_frames_are_all_skipped_is_refused(video):
         list(grey_frames(video, 80))
 
 
+def test_a_video_whose_pictures_change_in_size_is_refused(tmp_path):
+    """From there on FFmpeg counts from 0 again: other frames than those that were chosen would be written."""
+    whole, options = b"", ("-c:v", "mjpeg", "-pix_fmt", "yuvj420p")
+    for width in (160, 80):
+        write_video(tmp_path / "part.mjpeg", pan(range(4), width=width), *options)
+        whole += (tmp_path / "part.mjpeg").read_bytes()
+    (tmp_path / "both.mjpeg").write_bytes(whole)
+    rewrite_video(tmp_path / "both.mjpeg", tmp_path / "video.avi")
+    for numbers in ([0, 2, 5], [5, 7]):  # more than are chosen, and none
+        with pytest.raises(InputError, match="change in size on the way"):
+            write_video_frames(tmp_path / "video.avi", numbers, tmp_path, lambda done, of: None)
+
+
 def test_what_is_no_video_is_refused_in_one_line(video, tmp_path):
     """Empty, text, cut short, damaged, sound alone, and lists of other files, which are not opened."""
     whole = video.read_bytes()

@@ -78,7 +78,7 @@ def write_video_frames(
         report: called with (frames written, of how many).
 
     Raises:
-        InputError: as `grey_frames`.
+        InputError: as `grey_frames`; or frames change in size on the way, from where on FFmpeg's numbers begin again.
         OSError: the files cannot be written.
     """
     chosen = "+".join(f"eq(n,{number})" for number in numbers)
@@ -91,7 +91,7 @@ def write_video_frames(
                 report(min(int(value), len(files)), len(files))
     written = sorted(folder.glob("new_*.jpg"))
     if len(written) != len(files):
-        raise OSError(f"{len(written)} of {len(files)} frames could be written")
+        raise InputError(f"video {path}: its pictures change in size on the way; convert it to MP4 anew, in one size")
     for source, target in zip(written, files, strict=True):
         source.rename(target)
     return files
