@@ -120,6 +120,20 @@ def test_of_wires_that_no_grid_of_a_run_holds_a_hull_with_thin_parts_is_taken() 
     assert finer_shape(found, views, config.start.radius) is None
 
 
+def test_a_rod_of_a_large_object_is_whole_in_its_hull() -> None:
+    """It is a hundredth of the silhouettes, as that of a blowtorch's handle, which was gone from the start."""
+    body, rod = icosphere(3), icosphere(3)
+    slender = rod[0] * torch.tensor([0.01, 0.01, 0.45]) + torch.tensor([0.85, 0.0, 0.0])
+    both = torch.cat([body[0] * 0.5, slender]), torch.cat([body[1], rod[1] + len(body[0])])
+    views = photograph(MeshFile(*both), 200, 200, supersampling=2)
+    config = ReconstructConfig.quick().changed({"start.hull_faces": 2000, "max_faces": 4000})
+    found = plain_hull(views, config)
+    assert found.thin
+    assert found.uncovered < 0.0005
+    assert len(found.faces) < 2600
+    assert hull_shape(found) == Shape(2, 0)
+
+
 def test_what_masks_lack_is_no_matter_of_how_fine_a_hull_is() -> None:
     """They lack it on any grid: here one in four has lost half of the object, and is outvoted by none."""
     whole = photograph(MeshFile(*icosphere(3)), 96, 96, supersampling=1)

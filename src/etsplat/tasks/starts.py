@@ -54,9 +54,13 @@ _UNCOVERED, _LESS = 0.0005, 0.9
 """A hull that leaves more of the silhouettes uncovered lacks thin parts if a finer one leaves at most so many times as
 much: what rough masks leave does not depend on how fine it is."""
 
-_LACKING, _THIN, _FINEST = 0.02, 0.5, 4
-"""Where a hull leaves more of the silhouettes uncovered, one is tried that has thin parts whole, of up to so many times
-as many faces: around wires they are small. It is taken if it leaves at most so large a part of that."""
+_LACKING, _WIRES, _FINEST = 0.005, 0.02, 4
+"""Where a hull leaves more than the first of the silhouettes uncovered, one is tried that has thin parts whole; where
+more than the second, of up to so many times as many faces: around wires they are small."""
+
+_THIN = 0.5
+"""It is taken if it differs from silhouettes in at most so many times as many pixels: gaps beside thin parts may close
+by it."""
 
 _MARGINS = (0.05, 0.03, 0.08)
 """How far in front of what a coarse soup shows a hull is cut, in units of the object's radius; in turn, until photos
@@ -313,8 +317,9 @@ def plain_hull(views: Dataset, config: ReconstructConfig) -> Hull:
         if len(finer.faces) <= config.max_faces and _mends(finer, hull):
             return finer
     if hull.uncovered > _LACKING:
-        thin = _carved(views, min(_FINEST * wanted, most), radius, thin=True)
-        if len(thin.faces) <= config.max_faces and thin.uncovered <= _THIN * hull.uncovered:
+        enough = min(_FINEST * wanted, most) if hull.uncovered > _WIRES else wanted
+        thin = _carved(views, enough, radius, thin=True)
+        if len(thin.faces) <= config.max_faces and _differs(views, thin) <= _THIN * _differs(views, hull):
             return thin
     if len(hull.faces) == 0:
         raise InputError(
@@ -323,6 +328,13 @@ def plain_hull(views: Dataset, config: ReconstructConfig) -> Hull:
             " from its side: give it a thickness"
         )
     return hull
+
+
+def _differs(views: Dataset, hull: Hull) -> float:
+    """The pixels that a hull should cover and does not, and the reverse, as a part of silhouettes, in the mean."""
+    if len(hull.faces) == 0:
+        return 1.0
+    return float(silhouette_errors(photos_of(views), hull.vertices, hull.faces).sum(dim=1).mean())
 
 
 def _mends(finer: Hull, hull: Hull) -> bool:
