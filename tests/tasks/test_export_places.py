@@ -168,6 +168,32 @@ def test_a_file_that_is_opened_lies_in_the_frame_of_its_capture(tmp_path, soup, 
         torch.testing.assert_close(load_mesh(again.path).vertices, load_mesh(first.path).vertices, rtol=0, atol=5e-3)
 
 
+@pytest.mark.parametrize("kind", ["ply", "obj"])
+def test_where_nobody_knows_up_nothing_is_turned_nor_called_upright(tmp_path, soup, kind):
+    """A note says so; the file claimed that +z was up, by which a second export turned it."""
+    soup.save(tmp_path / "soup.safetensors")
+    told = ExportConfig(up="z", min_opacity=0.0)
+    first = export_soup(open_run(tmp_path / "soup.safetensors"), tmp_path / f"a.{kind}", told)
+    unknown = "nothing is turned, since nobody knows where up is (--scene names the capture): +z is up if it was before"
+    assert first.notes == (unknown,)
+    assert not first.transform.moves
+    assert open_soup(first.path).notes.get("up") is None
+    again = export_soup(open_run(first.path), tmp_path / f"b.{kind}", ExportConfig(up="y"))
+    assert not again.transform.moves
+    assert again.notes == (unknown.replace("+z", "+y"),)
+    assert export_soup(open_run(first.path), tmp_path / f"c.{kind}", ExportConfig(up="keep")).notes == ()
+    write_colmap(tmp_path / "scene", [(33, 24)] * 4)
+    capture = load_dataset(tmp_path / "scene")
+    around = capture.viewmats.clone()
+    around[::2, :2] *= -1  # every other camera upside down
+    torn = SoupRun(tmp_path, soup, replace(capture, viewmats=around))
+    assert up_of(torn.capture) is None
+    said = export_soup(torn, tmp_path / f"d.{kind}", told).notes
+    assert said == (
+        "nothing is turned, since the cameras contradict each other about where up is: +z is up if it was before",
+    )
+
+
 @pytest.mark.parametrize(
     "transform",
     [
@@ -255,7 +281,10 @@ def test_the_command_says_what_was_left_out_and_why(tmp_path, capsys):
     assert parse([*words, "--no-sky", "--crop", "box:-99,2,-99,99,99,99"]).run([]) == 0
     text = capsys.readouterr().out
     assert "Left out: 320 of the sky, " in text
-    assert text.endswith(" outside of the crop.\n")
+    assert " outside of the crop.\n  nothing is turned, since nobody knows where up is " in text
+    assert text.count("\n") == 3
+    assert parse([*words, "--no-sky", "--up", "keep"]).run([]) == 0
+    assert capsys.readouterr().out.endswith("Left out: 320 of the sky.\n")
     with pytest.raises(InputError, match=r"^--crop: is 'box:1,2'; write auto, sphere:X,Y,Z,R or box"):
         parse([*words, "--crop", "box:1,2"]).run([])
     with pytest.raises(InputError, match="name the scene's folder with --scene"):

@@ -102,7 +102,7 @@ def export_soup(run: SoupRun, path: Path | str, config: ExportConfig, crop: Crop
         written = Export(path, int(chosen.kept.sum()), 0, chosen.removed, Similarity())
     else:
         written = _write(run, path, config, chosen, apart=apart)
-    return replace(written, notes=_without_capture(run, path, config))
+    return replace(written, notes=_without_capture(run, path, config) + _not_turned(run, path, config))
 
 
 def why_soup(path: Path, config: ExportConfig) -> str | None:
@@ -175,6 +175,7 @@ def _write(run: SoupRun, path: Path, config: ExportConfig, chosen: Selection, *,
         if isinstance(soup, SolidSoup):
             colors[turned.to(colors.device)] = colors[turned.to(colors.device)].flip(1)
     transform = transform_of(run, config, vertices[~(chosen.sky[kept].cpu())])
+    known = config if _up(run) is not None else replace(config, up="keep")  # the file must not say that it is upright
     georeference = _georeference(run)
     near, world = apart_from_world(transform, config, georeference)
     vertices = near.apply(vertices).float()
@@ -190,7 +191,7 @@ def _write(run: SoupRun, path: Path, config: ExportConfig, chosen: Selection, *,
         weld=config.weld or isinstance(soup, SolidSoup),  # whose neighbours share corners as they are
         numbers=numbers,
         comment=f"etsplat {soup.appearance.kernel} {soup.appearance.distance}",
-        record=_record(soup, config, chosen, transform, georeference),
+        record=_record(soup, known, chosen, transform, georeference),
         sky=sky if bool(sky.any()) else None,
         world=world,
         compress=config.compress,
@@ -227,6 +228,17 @@ def _without_capture(run: SoupRun, path: Path, config: ExportConfig) -> tuple[st
     }
     said = "; ".join(effect for effect, holds in effects.items() if holds)
     return (f"its scene {run.gone} has gone: {said} (--scene names it)",) if run.gone is not None and said else ()
+
+
+def _not_turned(run: SoupRun, path: Path, config: ExportConfig) -> tuple[str, ...]:
+    """That `up` had no effect, where the scene has not gone, which says so itself; nothing if it had one."""
+    turned = kind_of(path) not in WHOLE and config.up != "keep" and config.place != "world"
+    if not turned or run.gone is not None or _up(run) is not None:
+        return ()
+    why = "nobody knows where up is (--scene names the capture)"
+    if run.capture is not None:
+        why = "the cameras contradict each other about where up is"
+    return (f"nothing is turned, since {why}: +{config.up} is up if it was before",)
 
 
 def _georeference(run: SoupRun) -> Georeference | None:
