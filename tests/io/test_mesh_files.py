@@ -11,6 +11,7 @@ import trimesh
 from etsplat.core.errors import InputError
 from etsplat.geometry.icosphere import icosphere
 from etsplat.io import _mesh_readers
+from etsplat.io._gltf import join_gltf, split_gltf
 from etsplat.io.georeference import Georeference
 from etsplat.io.mesh_files import MeshFile, load_mesh, save_mesh, save_triangles, weld_vertices
 from etsplat.io.srgb import linear_from_srgb, srgb_from_linear
@@ -379,6 +380,25 @@ def test_a_glb_whose_surface_is_in_an_extension_that_is_not_read_says_which(tmp_
         load(draco)
     with pytest.raises(InputError, match=r"a\.gltf: places copies of its meshes by EXT_mesh_gpu_instancing"):
         load(copies)
+
+
+@pytest.mark.parametrize(
+    ("edit", "said"),
+    [
+        (lambda document: document.update(scenes=[]), "has no scene, .*export it again with one"),
+        (lambda document: document.pop("scenes"), "has no scene"),
+        (lambda document: document["meshes"][0]["primitives"][0].update(mode=6), "has fans .*export it as triangles"),
+    ],
+)
+def test_a_gltf_of_which_nothing_would_be_there_says_why(tmp_path, ball, edit, said):
+    """It was called cut short; fans beside other primitives were left out without a word."""
+    save_mesh(tmp_path / "a.glb", *ball)
+    data = (tmp_path / "a.glb").read_bytes()
+    document, _ = split_gltf(data)
+    edit(document)
+    (tmp_path / "a.glb").write_bytes(join_gltf(data, document))
+    with pytest.raises(InputError, match=rf"a\.glb: {said}"):
+        load_mesh(tmp_path / "a.glb")
 
 
 def test_a_folder_is_an_input_error(tmp_path):

@@ -65,6 +65,37 @@ def test_an_obj_has_the_colours_of_its_picture_not_times_kd(tmp_path):
     assert mesh.notes == ("1 polygons were cut into 2 triangles",)
 
 
+@pytest.mark.parametrize(
+    ("text", "mtl"),
+    [
+        (f"{QUAD}mtllib quad.mtl\n{FACE}", MTL),
+        (f"\ufeffmtllib quad.mtl\n{QUAD}{FACE}", f"\ufeff{MTL}"),
+        (f"mtllib quad.mtl\n{QUAD}{FACE}", MTL.replace(" ", "\t")),
+        (f"mtllib quad.mtl\n# in C:\\\n{QUAD}usemtl wood\nf 1/1 2/2 \\\n3/3 4/4\n", MTL),
+        (f"mtllib quad.mtl\n{QUAD}{FACE}", MTL.replace("wood.png", "C:\\Users\\me\\my wood.png")),
+        (f"mtllib quad.mtl\n{QUAD}{FACE}", MTL.replace("wood.png", "/mnt/me/my wood.png")),
+    ],
+    ids=["materials named late", "byte order mark", "tabs", "a line goes on", "another computer", "another folder"],
+)
+def test_an_obj_as_programs_write_it_has_its_picture(tmp_path, text, mtl):
+    """It was refused as cut short, or white."""
+    for name in ("wood.png", "my wood.png"):
+        picture(tmp_path / name)
+    (tmp_path / "quad.obj").write_text(text, encoding="utf-8")
+    (tmp_path / "quad.mtl").write_text(mtl, encoding="utf-8")
+    mesh = load_mesh(tmp_path / "quad.obj")
+    assert_quad(mesh)
+    assert mesh.notes == ("1 polygons were cut into 2 triangles",)
+
+
+def test_a_material_that_no_library_has_is_said(tmp_path):
+    """Its faces were white without a word."""
+    picture(tmp_path / "wood.png")
+    assert obj(tmp_path, faces=FACE.replace("wood", "Wood")).notes[0] == (
+        "faces of materials that no MTL file has are white: 'Wood'"
+    )
+
+
 def test_between_pixels_colours_are_bilinear_and_the_picture_repeats():
     """A point between the centres of red and green, one at the border of last and first column, and one far outside."""
     corners = torch.tensor([[[0.5, 0.75], [0.0, 0.75], [7.25, -3.25]]])
@@ -218,6 +249,80 @@ def test_pictures_and_maps_within_a_gltf(tmp_path):
     mesh = load_mesh(change(gltf(tmp_path, "gltf"), edit))
     assert_quad(mesh)
     assert mesh.notes == ("model.gltf: normalTexture ignored; only baseColorTexture is seen",)
+
+
+@pytest.mark.parametrize(
+    ("transform", "where"),
+    [
+        ({"offset": [0.5, 0.0]}, lambda u, v: (u + 0.5, v)),
+        ({"scale": [0.5, 0.25], "offset": [0.0, 0.5]}, lambda u, v: (u / 2, v / 4 + 0.5)),
+        ({"rotation": np.pi / 2}, lambda u, v: (v, -u)),  # counterclockwise as the picture is seen, its rows downwards
+        ({"rotation": np.pi / 2, "scale": [2.0, 0.5], "offset": [0.1, 0.2]}, lambda u, v: (v / 2 + 0.1, 0.2 - 2 * u)),
+    ],
+)
+def test_a_gltf_whose_coordinates_are_transformed_has_the_colours_there(tmp_path, transform, where):
+    """As gltfpack writes them; they were taken as they are stored."""
+
+    def edit(document):
+        info = document["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"]
+        info["extensions"] = {"KHR_texture_transform": transform}
+
+    plain = load_mesh(gltf(tmp_path, "gltf")).texture
+    moved = load_mesh(change(tmp_path / "model.gltf", edit))
+    assert plain is not None
+    assert moved.texture is not None
+    assert moved.notes == ()
+    u, v = where(plain.corner_uvs[..., 0], 1 - plain.corner_uvs[..., 1])  # glTF counts from the top
+    torch.testing.assert_close(moved.texture.corner_uvs, torch.stack([u, 1 - v], dim=-1).float(), rtol=0, atol=1e-6)
+
+
+def test_a_transform_names_the_set_of_coordinates(tmp_path):
+    """That of the picture is for programs without the extension."""
+
+    def edit(document):
+        attributes = document["meshes"][0]["primitives"][0]["attributes"]
+        attributes["TEXCOORD_1"] = attributes.pop("TEXCOORD_0")
+        info = document["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"]
+        info["extensions"] = {"KHR_texture_transform": {"texCoord": 1}}
+
+    assert_quad(load_mesh(change(gltf(tmp_path, "gltf"), edit)))
+
+
+@pytest.mark.parametrize("transform", [{"scale": 2}, {"offset": [1]}, {"rotation": "a"}, [], {"offset": [np.nan, 0]}])
+def test_a_damaged_transform_is_an_input_error(tmp_path, transform):
+    def edit(document):
+        info = document["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"]
+        info["extensions"] = {"KHR_texture_transform": transform}
+
+    with pytest.raises(InputError, match=r"model\.gltf: cannot be read as GLTF"):
+        load_mesh(change(gltf(tmp_path, "gltf"), edit))
+
+
+def test_diffuse_colours_of_a_gltf_are_its_base_colours(tmp_path):
+    """The older model of materials, specular and glossiness, was white without a word."""
+
+    def edit(document):
+        base = document["materials"][0].pop("pbrMetallicRoughness")
+        said = {"diffuseTexture": base["baseColorTexture"], "diffuseFactor": [0.5, 1, 1, 1]}
+        said["specularGlossinessTexture"] = base["baseColorTexture"]
+        document["materials"][0]["extensions"] = {"KHR_materials_pbrSpecularGlossiness": said}
+
+    mesh = load_mesh(change(gltf(tmp_path, "gltf"), edit))
+    assert color_at(mesh, 0.25, 0.75) == [188, 0, 0]
+    assert color_at(mesh, 0.25, 0.25) == [0, 0, 255]
+    assert mesh.notes == ("model.gltf: specularGlossinessTexture ignored; only baseColorTexture is seen",)
+
+
+def test_a_gltf_whose_light_is_in_another_map_says_that_it_is_ignored(tmp_path):
+    """Such a mesh was white without a word."""
+
+    def edit(document):
+        base = document["materials"][0].pop("pbrMetallicRoughness")
+        document["materials"][0] |= {"emissiveTexture": base["baseColorTexture"], "emissiveFactor": [1, 1, 1]}
+
+    mesh = load_mesh(change(gltf(tmp_path, "gltf"), edit))
+    assert mesh.texture is None
+    assert mesh.notes == ("model.gltf: emissiveTexture ignored; only baseColorTexture is seen",)
 
 
 def test_indices_of_textures_out_of_range_are_an_input_error(tmp_path):

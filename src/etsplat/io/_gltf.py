@@ -15,6 +15,9 @@ from etsplat.io.paths import path_within
 _COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 _KINDS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _DRACO, _INSTANCING = "KHR_draco_mesh_compression", "EXT_mesh_gpu_instancing"
+_FAN = 6
+"""Mode of primitives that share their first corner; the readers of the others pass over them."""
+
 _SHARING = 4
 """Accessors may share bytes; together they have no more than this many times those that there are."""
 
@@ -101,7 +104,11 @@ def is_compressed(document: dict[str, Any]) -> bool:
 
 def refuse_unread(path: Path, document: dict[str, Any]) -> None:
     """Raise InputError for extensions without which another surface would be read, or none."""
-    primitives = (primitive for mesh in document.get("meshes", []) for primitive in mesh["primitives"])
+    primitives = [primitive for mesh in document.get("meshes", []) for primitive in mesh["primitives"]]
+    if not document.get("scenes"):
+        raise InputError(f"mesh {path}: has no scene, which says what of it is there; export it again with one")
+    if any(primitive.get("mode") == _FAN for primitive in primitives):
+        raise InputError(f"mesh {path}: has fans of triangles, which are not read; export it as triangles")
     if any(_DRACO in primitive.get("extensions", {}) for primitive in primitives):
         raise InputError(
             f"mesh {path}: is compressed by Draco ({_DRACO}), which is not read; export it without compression,"

@@ -2,7 +2,7 @@
 
 import base64
 from collections.abc import Callable
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from typing import Any
 from urllib.parse import unquote
 
@@ -21,6 +21,8 @@ UV = "_ETSPLAT_MATERIAL_"
 
 GLTF_FORMATS = (*IMAGE_FORMATS, "WEBP")
 """Pillow's names of what pictures may be."""
+
+_TRANSFORM, _OLDER = "KHR_texture_transform", "KHR_materials_pbrSpecularGlossiness"
 
 _OPTIONS = {"-s": 3, "-o": 3, "-t": 3, "-mm": 2}
 """Numbers that follow an option of a picture in an MTL file, at most; others are followed by one word."""
@@ -117,13 +119,13 @@ def read_mtl(path: Path) -> tuple[dict[str, dict[str, str]], list[str]]:
     materials: dict[str, dict[str, str]] = {}
     current: dict[str, str] = {}
     ignored: set[str] = set()
-    with open(path, encoding="utf-8", errors="replace") as file:
+    with open(path, encoding="utf-8-sig", errors="replace") as file:
         for line in file:
-            key, _, rest = line.strip().partition(" ")
+            key, rest = (*line.strip().split(None, 1), "", "")[:2]
             if key == "newmtl":
-                current = materials.setdefault(rest.strip(), {})
+                current = materials.setdefault(rest, {})
             elif key in ("Kd", "map_Kd"):
-                current[key] = rest.strip()
+                current[key] = rest
             elif key.lower().startswith(("map_", "bump", "norm", "disp", "decal", "refl")):
                 ignored.add(key)
     return materials, [f"{path.name}: {', '.join(sorted(ignored))} ignored; only map_Kd is seen"] if ignored else []
@@ -184,6 +186,9 @@ def obj_texture(
         materials |= {name: (file, statements) for name, statements in found.items()}
         for note in notes:
             pictures.note(note)
+    unknown = [name for name in names if name and name not in materials]
+    if unknown and materials:  # without any it was said already
+        pictures.note(f"faces of materials that no MTL file has are white: {', '.join(map(repr, unknown[:3]))}")
     numbers, plain = [], []
     for name in names:
         file, statements = materials.get(name, (path, {}))
@@ -191,6 +196,8 @@ def obj_texture(
         plain.append(color)
         if "map_Kd" in statements:
             image, options = _picture_name(statements["map_Kd"])
+            if PureWindowsPath(image).root and (file.parent / PureWindowsPath(image).name).is_file():
+                image = PureWindowsPath(image).name  # the path is of another computer, and the picture is here
             if options:
                 pictures.note(f"{file.name}: options {', '.join(options)} of map_Kd are ignored")
             key = file.parent, image
@@ -236,9 +243,11 @@ class GltfMaterials:
 
     @property
     def wanted(self) -> bool:
-        """Whether any material has a picture for its base colour, or a colour."""
-        bases = [_base(material) for material in self._document.get("materials", [])]
-        return any("baseColorTexture" in base or bool((_factor(base) != 1).any()) for base in bases)
+        """Whether any material has a picture, or a colour for its base."""
+        materials = self._document.get("materials", [])
+        bases = [_base(material) for material in materials]
+        colored = any("baseColorTexture" in base or bool((_factor(base) != 1).any()) for base in bases)
+        return colored or any(_unseen(material) for material in materials)
 
     def mark(self) -> None:
         """Gives the vertices of each primitive an attribute that says its material and where they are in its picture.
@@ -253,7 +262,11 @@ class GltfMaterials:
             elif not 0 <= number < len(materials):
                 raise ValueError(f"material {number} of {len(materials)}")
             base = _base(materials[number]).get("baseColorTexture", {}) if number >= 0 else {}
-            uv = attributes.get(f"TEXCOORD_{base.get('texCoord', 0)}") if base else None
+            uv = (
+                attributes.get(f"TEXCOORD_{_transform(base).get('texCoord', base.get('texCoord', 0))}")
+                if base
+                else None
+            )
             attributes[f"{UV}{number}"] = attributes["POSITION"] if uv is None else uv
             if base and uv is None:
                 self.pictures.note(f"{self._path.name}: a primitive has no coordinates for its texture")
@@ -271,7 +284,8 @@ class GltfMaterials:
         values = np.asarray(attributes[name])
         if values.dtype.kind == "u":
             values = values / np.iinfo(values.dtype).max
-        uvs = values[:, :2].astype(np.float64)
+        base = _base(self._document["materials"][number]) if number >= 0 else {}
+        uvs = _transformed(values[:, :2].astype(np.float64), _transform(base.get("baseColorTexture", {})))
         uvs[:, 1] = 1 - uvs[:, 1]  # glTF counts from the top
         if number not in self._numbers:
             self._numbers[number] = self._picture(number)
@@ -282,15 +296,12 @@ class GltfMaterials:
         base = _base(material)
         tint = _factor(base)
         color = self.pictures.plain(srgb_from_linear(tint))
-        used = {"normalTexture", "occlusionTexture", "emissiveTexture"} & set(material)
-        used |= {"metallicRoughnessTexture"} & set(material.get("pbrMetallicRoughness", {}))
-        if used:
+        if used := _unseen(material):
             self.pictures.note(f"{self._path.name}: {', '.join(sorted(used))} ignored; only baseColorTexture is seen")
         if "baseColorTexture" not in base:
             return color
-        if base["baseColorTexture"].get("extensions"):
-            names = ", ".join(base["baseColorTexture"]["extensions"])
-            self.pictures.note(f"{self._path.name}: {names} of baseColorTexture is ignored")
+        if unknown := sorted(set(base["baseColorTexture"].get("extensions", {})) - {_TRANSFORM}):
+            self.pictures.note(f"{self._path.name}: {', '.join(unknown)} of baseColorTexture is ignored")
         texture = self._document["textures"][base["baseColorTexture"]["index"]]
         self._check_wrap(texture)
         source = texture.get("extensions", {}).get("EXT_texture_webp", texture).get("source")
@@ -315,7 +326,32 @@ class GltfMaterials:
 
 
 def _base(material: dict[str, Any]) -> dict[str, Any]:
-    return material.get("pbrMetallicRoughness", {})
+    """What is said of a material's own colour; an older model of materials, which goes first, calls that diffuse."""
+    if (older := material.get("extensions", {}).get(_OLDER)) is None:
+        return material.get("pbrMetallicRoughness", {})
+    names = {"diffuseTexture": "baseColorTexture", "diffuseFactor": "baseColorFactor"}
+    return {ours: older[name] for name, ours in names.items() if name in older}
+
+
+def _unseen(material: dict[str, Any]) -> set[str]:
+    """The maps of a material that are ignored, by name."""
+    used = {"normalTexture", "occlusionTexture", "emissiveTexture"} & set(material)
+    used |= {"metallicRoughnessTexture"} & set(material.get("pbrMetallicRoughness", {}))
+    return used | {"specularGlossinessTexture"} & set(material.get("extensions", {}).get(_OLDER, {}))
+
+
+def _transform(info: dict[str, Any]) -> dict[str, Any]:
+    """How texture coordinates are to be transformed for a picture; empty if they are not."""
+    return info.get("extensions", {}).get(_TRANSFORM, {})
+
+
+def _transformed(uvs: np.ndarray, transform: dict[str, Any]) -> np.ndarray:
+    """(V, 2) texture coordinates, v downwards: scaled, turned counterclockwise as the picture is seen, then moved."""
+    if not transform:
+        return uvs
+    (x, y), (width, height) = transform.get("offset", (0, 0)), transform.get("scale", (1, 1))
+    cos, sin = np.cos(transform.get("rotation", 0)), np.sin(transform.get("rotation", 0))
+    return uvs * (width, height) @ np.array([[cos, -sin], [sin, cos]]) + (x, y)
 
 
 def _factor(base: dict[str, Any]) -> np.ndarray:

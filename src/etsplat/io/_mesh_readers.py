@@ -4,7 +4,7 @@ trimesh is imported where it is used: it takes half a second, which runs without
 """
 
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -59,8 +59,8 @@ def read_obj(path: Path) -> RawMesh:
     faces: list[Corners] = []
     polygons: list[tuple[int, int]] = []
     file_faces = 0
-    with open(path, encoding="utf-8", errors="replace") as file:
-        for number, line in enumerate(file, 1):
+    with open(path, encoding="utf-8-sig", errors="replace") as file:
+        for number, line in _statements(file):
             words = line.split()
             try:
                 if words[:1] == ["v"]:
@@ -80,10 +80,8 @@ def read_obj(path: Path) -> RawMesh:
                     if libraries:
                         face_uvs += _fan([_uv_number(word, len(uvs)) for word in words[1:]])
                         face_materials += [material] * len(cut)
-                elif words[:1] == ["vt"] and libraries:
-                    if len(words) < 2:
-                        raise ValueError("a texture coordinate without a number")
-                    uvs.append([float(word) for word in [*words[1:3], "0"][:2]])
+                elif words[:1] == ["vt"]:
+                    uvs.append(_place(words[1:3], wanted=bool(libraries)))
                 elif words[:1] == ["usemtl"]:
                     material = materials.setdefault(line.split(None, 1)[1].strip() if words[1:] else "", len(materials))
                 elif words[:1] == ["mtllib"] and words[1:]:
@@ -114,6 +112,31 @@ def read_obj(path: Path) -> RawMesh:
         )
         mesh.face_colors = plain if mesh.vertex_colors is None else None
     return mesh
+
+
+def _statements(lines: Iterable[str]) -> Iterator[tuple[int, str]]:
+    """The lines of an OBJ with their numbers; one that ends in a backslash goes on in the next, but no comment does."""
+    number, begun = 0, ""
+    for number, line in enumerate(lines, 1):
+        if line.endswith("\\\n") and not (begun or line).startswith("#"):
+            begun += f"{line[:-2]} "
+        else:
+            yield number, begun + line if begun else line
+            begun = ""
+    if begun:
+        yield number, begun
+
+
+def _place(words: list[str], *, wanted: bool) -> list[float]:
+    """A texture coordinate. One that is no number is NaN where nothing has named a material yet."""
+    try:
+        if not words:
+            raise ValueError("a texture coordinate without a number")
+        return [float(word) for word in [*words, "0"][:2]]
+    except ValueError:
+        if wanted:
+            raise
+        return [np.nan, np.nan]
 
 
 def _uv_number(word: str, count: int) -> int:
