@@ -220,7 +220,7 @@ def check_frames(scene: Path, frames: Sequence[Frame]) -> None:
     if missing:
         raise InputError(
             f"scene {scene}: {len(missing)} of {len(frames)} images are missing"
-            f" (first: {missing[0].image}); {_missing_remedy(missing[0].image)}"
+            f" (first: {missing[0].image}); {_missing_remedy(scene, missing[0].image, len(missing) == len(frames))}"
         )
     image, count = Counter(frame.image for frame in frames).most_common(1)[0]
     if count > 1:
@@ -250,8 +250,15 @@ def _view_names(frames: Sequence[Frame]) -> list[str]:
     return next(names for names in (short, full, numbered) if len(set(names)) == len(names))
 
 
-def _missing_remedy(image: Path) -> str:
-    """What to do about an image that is not there: it may lie there as a kind of file that is not read."""
+def _missing_remedy(scene: Path, image: Path, none: bool) -> str:
+    """What to do about an image that is not there: it may lie there as a kind of file that is not read.
+
+    Or in another folder of the scene, as 3DGS has them in input/, where `none` of them is there.
+    """
+    with suppress(OSError):  # folders that may not be read
+        beside = [place for place in sorted(scene.iterdir()) if (place / image.name).is_file()] if none else []
+        if beside:
+            return f"they are in {beside[0].name}/, which --images {beside[0].name} takes them from"
     other = _with_any_ending(image, (*HEIC_SUFFIXES, *UNREAD_SUFFIXES))
     if other is None:
         return "copy them there or remove their poses"

@@ -181,6 +181,15 @@ def test_missing_parts_are_input_errors(tmp_path, truth):
         load_colmap(tmp_path)
 
 
+def test_photos_in_another_folder_of_the_scene_are_offered(tmp_path, truth):
+    """As 3DGS lays them out: they were called missing."""
+    write_scene(tmp_path, truth, True)
+    (tmp_path / "images").rename(tmp_path / "input")
+    with pytest.raises(InputError, match=r"10 of 10 images are missing .*they are in input/, which --images input"):
+        load_colmap(tmp_path)
+    assert len(load_dataset(tmp_path, images="input")) == 10
+
+
 @pytest.mark.parametrize(("scene", "count"), [("fountain-P11", 11), ("lund", 27), ("fox", 50)])
 def test_the_shared_captures_load(shared_data, scene, count):
     views = load_colmap(shared_data / "scenes" / scene, width=64)
