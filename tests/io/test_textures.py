@@ -298,6 +298,20 @@ def test_a_damaged_transform_is_an_input_error(tmp_path, transform):
         load_mesh(change(gltf(tmp_path, "gltf"), edit))
 
 
+@pytest.mark.parametrize(("scale", "notes"), [(1.0, 0), (1.01, 1)])
+def test_a_border_that_is_clamped_is_said_where_coordinates_go_beyond_it(tmp_path, scale, notes):
+    """It was said of every such file, those of our own exports among them."""
+
+    def edit(document):
+        document["samplers"] = [{"wrapS": 33071, "wrapT": 33071}]
+        document["textures"][0]["sampler"] = 0
+        info = document["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"]
+        info["extensions"] = {"KHR_texture_transform": {"scale": [scale, 1.0]}}
+
+    said = load_mesh(change(gltf(tmp_path, "gltf"), edit)).notes
+    assert said == ("model.gltf: a texture repeats here that is clamped or mirrored at its border",) * notes
+
+
 def test_diffuse_colours_of_a_gltf_are_its_base_colours(tmp_path):
     """The older model of materials, specular and glossiness, was white without a word."""
 

@@ -287,6 +287,8 @@ class GltfMaterials:
         base = _base(self._document["materials"][number]) if number >= 0 else {}
         uvs = _transformed(values[:, :2].astype(np.float64), _transform(base.get("baseColorTexture", {})))
         uvs[:, 1] = 1 - uvs[:, 1]  # glTF counts from the top
+        if "baseColorTexture" in base and bool(((uvs < 0) | (uvs > 1)).any()):
+            self._check_wrap(self._document["textures"][base["baseColorTexture"]["index"]])
         if number not in self._numbers:
             self._numbers[number] = self._picture(number)
         return self._numbers[number], uvs
@@ -303,7 +305,6 @@ class GltfMaterials:
         if unknown := sorted(set(base["baseColorTexture"].get("extensions", {})) - {_TRANSFORM}):
             self.pictures.note(f"{self._path.name}: {', '.join(unknown)} of baseColorTexture is ignored")
         texture = self._document["textures"][base["baseColorTexture"]["index"]]
-        self._check_wrap(texture)
         source = texture.get("extensions", {}).get("EXT_texture_webp", texture).get("source")
         return self.pictures.read((source, *tint), lambda: self._image(source), tint, color)
 
