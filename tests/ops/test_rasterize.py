@@ -144,6 +144,14 @@ BAD_ARGUMENTS = {
     "outputs in a list": ({"outputs": [["depth"]]}, r"outputs must be names, such as \('depth',\), got list"),
     "cutoffs": ({"cutoffs": Cutoffs(alpha_min=0.5, alpha_max=0.4)}, "cutoffs must satisfy"),
     "sigma range": ({"sigma": torch.zeros(5)}, "sigma must be positive, got 0.0"),
+    "transposed cameras": (
+        {
+            "viewmats": (torch.eye(4) + torch.nn.functional.one_hot(torch.tensor(14), 16).view(4, 4) * 2.0).repeat(
+                2, 1, 1
+            )
+        },
+        r"viewmats must have the last row \[0, 0, 0, 1\], got one that begins with 0, 0, 2: .* pass viewmats\.mT$",
+    ),
     "skew": ({"Ks": torch.ones(2, 3, 3)}, "Ks must have the form"),
     "NaN vertices": ({"vertices": torch.full((5, 3, 3), torch.nan)}, "vertices must be finite, got 45 NaN"),
     "infinite colors": ({"face_colors": torch.full((5, 3), torch.inf)}, "colors must be finite"),

@@ -322,6 +322,7 @@ def test_non_contiguous_input_is_read_correctly(rng):
         ({"Ks": torch.eye(3).expand(2, 3, 3)}, "Ks"),
         ({"Ks": torch.eye(3).double()[None]}, "Ks"),
         ({"Ks": flat_camera() + torch.tensor([0.0, 0.1, 0.0])}, "Ks must have the form"),
+        ({"viewmats": torch.eye(4)[None] + torch.eye(4).roll(1, 0)[None]}, "viewmats must have the last row"),
         ({"width": 0}, "width"),
         ({"near_plane": 0.0}, "near_plane"),
         ({"face_colors": torch.zeros(2, 3)}, "face_colors"),

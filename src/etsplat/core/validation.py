@@ -13,6 +13,9 @@ from etsplat import _native
 
 Shape = tuple[str | int, ...]
 
+_ROUNDED = 1e-3
+"""In the last row of a world-to-camera matrix, at most, beside its 1: products of matrices leave less."""
+
 
 def check_shape(name: str, tensor: Tensor, *shapes: Shape, sizes: dict[str, int] | None = None) -> None:
     """Match ``tensor`` to one of ``shapes`` and remember the sizes of the letters in it.
@@ -220,6 +223,17 @@ def check_intrinsics(name: str, Ks: Tensor) -> None:
         pinholes = all((k[0][1], k[1][0], *k[2]) == (0, 0, 0, 0, 1) for k in Ks.tolist())
     if not pinholes:
         raise ValueError(f"{name} must have the form [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]; skew is not supported")
+
+
+def check_last_rows(name: str, viewmats: Tensor) -> None:
+    """Raise ValueError where the last row of one of ``viewmats`` (B, 4, 4) moves anything, as of transposed ones."""
+    for row in viewmats[:, 3, :3].tolist():
+        if any(abs(value) > _ROUNDED for value in row):  # what is not finite is looked at elsewhere
+            shown = ", ".join(f"{value:g}" for value in row)
+            raise ValueError(
+                f"{name} must have the last row [0, 0, 0, 1], got one that begins with {shown}: if they are transposed,"
+                f" as for row vectors, pass {name}.mT"
+            )
 
 
 def check_flags(**values: object) -> None:

@@ -36,6 +36,7 @@ from etsplat.core.validation import (
     check_integers,
     check_intrinsics,
     check_kind,
+    check_last_rows,
     check_like,
     check_number,
     check_positive,
@@ -115,9 +116,9 @@ def rasterize(
         near_plane: Triangles with a vertex at z <= near_plane are invisible; > 0.
         freeze_inradius: With distance "sdf", hold the inradius constant in the backward pass, as Triangle Splatting.
         cutoffs: Where compositing stops caring.
-        validate: Raise on non-finite input, sigma <= 0, malformed Ks, and colours beyond 1e30, whose products in the
-            gradients overflow; None means on the CPU. Without it a triangle with data that is not finite, or on a GPU
-            with a wrong index in ``faces``, is invisible and gets zero gradient.
+        validate: Raise on non-finite input, sigma <= 0, malformed Ks, transposed viewmats, and colours beyond 1e30,
+            whose products in the gradients overflow; None means on the CPU. Without it a triangle with data that is not
+            finite, or on a GPU with a wrong index in ``faces``, is invisible and gets zero gradient.
 
     Returns:
         Images, channels last, in the dtype of ``vertices``; see ``Rasterization``.
@@ -264,3 +265,4 @@ def _check_values(given: dict[str, Tensor]) -> None:
         check_finite(name, tensor, LARGEST_COLOR if name in (*COLORS, "backgrounds") else math.inf)
     check_positive("sigma", given["sigma"])
     check_intrinsics("Ks", given["Ks"])
+    check_last_rows("viewmats", given["viewmats"])

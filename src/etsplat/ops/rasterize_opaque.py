@@ -20,6 +20,7 @@ from etsplat.core.validation import (
     check_indices,
     check_integers,
     check_intrinsics,
+    check_last_rows,
     check_like,
     check_shape,
     dense,
@@ -179,5 +180,6 @@ def _check_views(vertices: Tensor, viewmats: Tensor, Ks: Tensor, width: int, hei
     check_views(viewmats, Ks, "vertices", vertices)
     if Ks.is_cpu:  # reading them would wait for a GPU
         check_intrinsics("Ks", Ks)
+        check_last_rows("viewmats", viewmats)
     check_above("near_plane", near_plane)
     return Cameras(dense(viewmats, "viewmats"), dense(Ks, "Ks"), width, height)
