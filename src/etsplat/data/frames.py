@@ -281,7 +281,9 @@ def find_mask(folder: Path, name: str, source: Path) -> Path:
         InputError: there is none, or no folder; or the name, which the file `source` gives, leads out of it.
     """
     if not folder.is_dir():
-        raise InputError(f"masks {folder}: no such folder; {path_remedy(folder)}")
+        made = "`etsplat data masks SCENE --out SCENE/masks` makes them of plain backgrounds"
+        remedy = made if folder.name == "auto" else path_remedy(folder)
+        raise InputError(f"masks {folder}: no such folder; {remedy}")
     found = _spelled(folder, name, source)
     if found is None:
         raise InputError(f"masks {folder}: no mask for image {name}; add {(folder / name).with_suffix('.png').name}")

@@ -173,6 +173,10 @@ def test_missing_parts_are_input_errors(tmp_path, truth):
     write_scene(tmp_path, truth, True)
     with pytest.raises(InputError, match=r"masks .*: no such folder"):
         load_colmap(tmp_path, tmp_path / "absent")
+    with pytest.raises(
+        InputError, match=r"masks auto: no such folder; `etsplat data masks SCENE --out SCENE/masks` makes"
+    ):
+        load_colmap(tmp_path, "auto")  # an option of `data sfm`
     (tmp_path / "images" / NAMES[4]).unlink()
     with pytest.raises(InputError, match=rf"1 of 10 images are missing.*{NAMES[4]}"):
         load_colmap(tmp_path)
