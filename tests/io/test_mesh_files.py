@@ -382,6 +382,26 @@ def test_a_glb_whose_surface_is_in_an_extension_that_is_not_read_says_which(tmp_
         load(copies)
 
 
+def test_a_gltf_that_is_posed_says_that_it_is_read_without(tmp_path, ball):
+    """Figures stood as they were modelled, without a word."""
+
+    def edit(document):
+        first = document["meshes"][0]["primitives"][0]
+        first["targets"] = [{"POSITION": first["attributes"]["POSITION"]}]
+        document["meshes"][0]["weights"] = [1.0]
+        document["skins"] = [{"joints": [0]}]
+        document["nodes"][0]["skin"] = 0
+
+    save_mesh(tmp_path / "a.glb", *ball)
+    data = (tmp_path / "a.glb").read_bytes()
+    document, _ = split_gltf(data)
+    edit(document)
+    (tmp_path / "b.glb").write_bytes(join_gltf(data, document))
+    assert load_mesh(tmp_path / "a.glb").notes == ()
+    said = "b.glb: skins and morph targets are ignored; it is as it is without them, not posed"
+    assert load_mesh(tmp_path / "b.glb").notes == (said,)
+
+
 @pytest.mark.parametrize(
     ("edit", "said"),
     [

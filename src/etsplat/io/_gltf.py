@@ -120,6 +120,17 @@ def refuse_unread(path: Path, document: dict[str, Any]) -> None:
         )
 
 
+def unmoved_note(path: Path, document: dict[str, Any]) -> list[str]:
+    """A note on what would move vertices, and is left out; nothing without."""
+    meshes = [primitive for mesh in document.get("meshes", []) for primitive in mesh["primitives"]]
+    what = {
+        "skins": any("skin" in node for node in document.get("nodes", [])),
+        "morph targets": any(primitive.get("targets") for primitive in meshes),
+    }
+    named = " and ".join(name for name, there in what.items() if there)
+    return [f"{path.name}: {named} are ignored; it is as it is without them, not posed"] if named else []
+
+
 def unpack(path: Path, document: dict[str, Any], binary: bytes) -> bool:
     """Change a document so that its arrays are neither quantised nor compressed; whether any was.
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from etsplat.core.errors import InputError
-from etsplat.io._gltf import check_gltf, is_compressed, join_gltf, refuse_unread, split_gltf, unpack
+from etsplat.io._gltf import check_gltf, is_compressed, join_gltf, refuse_unread, split_gltf, unmoved_note, unpack
 from etsplat.io._materials import GltfMaterials, obj_texture, ply_texture
 from etsplat.io._ply_polygons import with_triangles
 from etsplat.io._polygons import cut_concave
@@ -226,6 +226,7 @@ def read_gltf(path: Path) -> RawMesh:
         data = check_gltf(path)
         document, binary = split_gltf(data)
         refuse_unread(path, document)
+        unmoved = unmoved_note(path, document)
         compressed = is_compressed(document)
     except InputError:
         raise
@@ -248,6 +249,7 @@ def read_gltf(path: Path) -> RawMesh:
     mesh = _read_with_trimesh(path, data if changed or materials.wanted else None, materials)
     if mesh.vertex_colors is not None:
         mesh.vertex_colors = srgb_from_linear(mesh.vertex_colors)
+    mesh.notes = [*mesh.notes, *unmoved]
     return mesh
 
 
