@@ -43,6 +43,19 @@ def test_a_gaussian_scene_may_have_harmonics_of_any_degree(tmp_path, count):
     assert open_soup(tmp_path / "gaussians.ply").sh_rest.shape == (5, count // 3, 3)
 
 
+def test_flat_gaussians_have_two_axes(tmp_path):
+    """As 2DGS writes them: they were refused. Those with a thin third axis are the same triangles."""
+    flat = [name for name in GAUSSIAN if name != "scale_2"]
+    values = np.random.default_rng(2).normal(size=(5, len(flat))).astype("<f4")
+    for name, names in (("flat", flat), ("thin", [*flat, "scale_2"])):
+        header = "".join(f"property float {each}\n" for each in names)
+        rows = values if name == "flat" else np.hstack([values, np.full((5, 1), -20.0, "<f4")])
+        text = f"ply\nformat binary_little_endian 1.0\nelement vertex 5\n{header}end_header\n"
+        (tmp_path / f"{name}.ply").write_bytes(text.encode() + rows.tobytes())
+    flat_soup, thin_soup = (open_soup(tmp_path / f"{name}.ply") for name in ("flat", "thin"))
+    torch.testing.assert_close(flat_soup.vertices, thin_soup.vertices, rtol=0, atol=0)
+
+
 @pytest.mark.parametrize(
     ("properties", "message"),
     [
@@ -52,6 +65,7 @@ def test_a_gaussian_scene_may_have_harmonics_of_any_degree(tmp_path, count):
         ([*GAUSSIAN, *rest(48)], "has 48 properties f_rest"),
         ([*GAUSSIAN, *rest(10)[1:]], "lacks the property f_rest_0"),
         ([name for name in GAUSSIAN if name != "z"], "lacks the property z"),
+        (["packed_position", "packed_color"], "holds compressed Gaussians, .*save it as plain PLY"),
         ([name for name in GAUSSIAN if name != "rot_3"], "lacks the property rot_3"),
         ([name for name in GAUSSIAN if name != "f_dc_1"], "lacks the property f_dc_1"),
     ],

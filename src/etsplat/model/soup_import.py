@@ -105,6 +105,8 @@ def _read_triangle_splatting(path: Path) -> TriangleSoup:
 
 def _read_ply(path: Path) -> TriangleSoup:
     header = read_ply_header(path)
+    if "packed_position" in header.properties("vertex"):
+        raise InputError(f"soup {path}: holds compressed Gaussians, which are not read; save it as plain PLY")
     if {"scale_0", "rot_0", "opacity", "f_dc_0"} <= header.properties("vertex"):
         return _read_gaussians(path)
     if {CORNERS, "opacity", "sigma"} <= header.properties("face"):
@@ -172,10 +174,14 @@ def _notes(path: Path, record: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _read_gaussians(path: Path) -> TriangleSoup:
-    """A triangle for each Gaussian, across its two larger axes; its third axis, the thinnest, is lost."""
+    """A triangle for each Gaussian, across its two larger axes; its third axis, the thinnest, is lost.
+
+    Flat ones, as 2DGS has them, have no third.
+    """
     table = read_ply_tables(path)["vertex"]
     centers = columns(path, table, *"xyz")
-    scales = columns(path, table, "scale_0", "scale_1", "scale_2").exp()
+    third = ["scale_2"] if "scale_2" in (table.dtype.names or ()) else []
+    scales = columns(path, table, "scale_0", "scale_1", *third).exp()
     rotations = _rotations(columns(path, table, "rot_0", "rot_1", "rot_2", "rot_3"))
     logits = columns(path, table, "opacity")[:, 0].float()
     dc, rest = _harmonics(path, table)
