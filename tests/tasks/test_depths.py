@@ -15,6 +15,7 @@ from etsplat.io.ply_tables import encode_ply
 from etsplat.optim.loop import NoteEvent
 from etsplat.tasks.depths import trusted_depths, unit_of_maps, wanted_depths, with_shown_points
 from etsplat.tasks.sources import with_cloud
+from helpers.captures import write_colmap
 from helpers.depths import ball_with_depths
 
 TRAIN = etsplat.TrainConfig.tiny("object").changed({"iterations": 40, "exposure": "off", "output.evaluate_every": 0})
@@ -87,6 +88,18 @@ def test_it_is_told_how_many_photos_have_a_map_where_not_all_have_one(tmp_path):
     for index in found.train[:5]:
         maps[index].unlink()
     assert load_dataset(tmp_path, depths=True).notes == ("9 of 14 photos for training have a depth map",)
+    assert load_dataset(tmp_path).notes == ()
+
+
+def test_a_folder_of_depths_that_are_not_read_is_said(tmp_path):
+    """Of another kind or name: they were passed over without a word."""
+    write_colmap(tmp_path, [(16, 12)] * 4)
+    assert load_dataset(tmp_path, depths=True).notes == ()
+    (tmp_path / "depth").mkdir()
+    for image in (tmp_path / "images").iterdir():
+        np.savez(tmp_path / "depth" / f"{image.stem}.npz", np.ones((12, 16)))
+    said = "depth/ has no map for any photo: call them like their photos, a.png (16 bits), a.npy or a.exr"
+    assert load_dataset(tmp_path, depths=True).notes == (said,)
     assert load_dataset(tmp_path).notes == ()
 
 

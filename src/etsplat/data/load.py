@@ -13,7 +13,7 @@ from etsplat.core.precision import usual_defaults
 from etsplat.data import formats
 from etsplat.data.dataset import Dataset
 from etsplat.data.doubtful_poses import lens_notes, pose_notes
-from etsplat.data.frames import LARGEST, MASK_FOLDER, Listing, MasksAs, Wanted, posed
+from etsplat.data.frames import DEPTH_FOLDERS, LARGEST, MASK_FOLDER, Listing, MasksAs, Wanted, posed
 from etsplat.data.georeferencing import near_origin
 from etsplat.data.pictures import LazyPictures
 from etsplat.io.paths import given_path, kind_of, path_remedy
@@ -119,7 +119,12 @@ def load_dataset(
             f"depths {folder}: has no map for any photo; call them like their photos: a.png, a.npy or a.exr"
         )
     dataset = posed(path, near_origin(path, listing), wanted)
-    doubts = *_other_masks(path, wanted), *_maps_of_some(dataset), *lens_notes(dataset), *pose_notes(dataset)
+    doubts = (
+        *_other_masks(path, wanted),
+        *_maps_of_some(path, wanted, dataset),
+        *lens_notes(dataset),
+        *pose_notes(dataset),
+    )
     dataset = replace(dataset, notes=(*dataset.notes, *doubts))
     if preload and isinstance(dataset.images, LazyPictures):
         dataset.images.preload(progress)
@@ -133,9 +138,12 @@ def _other_masks(path: Path, wanted: Wanted) -> tuple[str, ...]:
     return (f"mask/ is not read: call it {MASK_FOLDER}/, or name it with --masks, if masks of all images are there",)
 
 
-def _maps_of_some(dataset: Dataset) -> tuple[str, ...]:
-    """How many photos have a depth map, where not all for training have one."""
+def _maps_of_some(path: Path, wanted: Wanted, dataset: Dataset) -> tuple[str, ...]:
+    """How many photos have a depth map, where not all for training have one; or that a folder has none that is read."""
     known = sum(view in dataset.images.with_depth for view in dataset.train)
+    own = next((name for name in DEPTH_FOLDERS if (path / name).is_dir()), None)
+    if not dataset.images.with_depth and wanted.depths is True and own is not None:
+        return (f"{own}/ has no map for any photo: call them like their photos, a.png (16 bits), a.npy or a.exr",)
     if not dataset.images.with_depth or known == len(dataset.train):
         return ()
     return (f"{known} of {len(dataset.train)} photos for training have a depth map",)
