@@ -123,6 +123,27 @@ def test_the_sky_of_an_obj_is_an_object_and_other_kinds_of_files_are_without_it(
     assert set(counts.values()) == {50, 370}
 
 
+@pytest.mark.parametrize("kind", ["glb", "obj", "ply"])
+def test_the_sky_of_a_file_is_known_where_it_is_read_again(tmp_path, kind):
+    """--no-sky left it where it was, without a word, and a second file had it joined with the scene."""
+    run, _ = scene_with_sky(tmp_path)
+    export_soup(run, tmp_path / f"a.{kind}", ExportConfig(sky="joined", scale=2.0, up="keep"))
+    opened = open_run(tmp_path / f"a.{kind}")
+    assert export_soup(opened, tmp_path / "b.glb", ExportConfig(up="keep")).sky == 320
+    without = export_soup(opened, tmp_path / "c.obj", ExportConfig(sky="none", up="keep"))
+    assert (without.triangles, without.removed, without.notes) == (50, {"sky": 320}, ())
+
+
+def test_a_sky_that_nobody_knows_is_not_said_to_be_left_out(tmp_path, soup):
+    soup.save(tmp_path / "soup.safetensors")
+    config = ExportConfig(sky="none", up="keep", min_opacity=0.0)
+    unknown = export_soup(open_run(tmp_path / "soup.safetensors"), tmp_path / "a.ply", config).notes
+    assert len(unknown) == 1
+    assert unknown[0].startswith("no triangle is left out as sky, since nobody knows where that is (--scene names")
+    known = replace(soup, notes={"sky": "none"})
+    assert export_soup(SoupRun(tmp_path, known, None), tmp_path / "b.ply", config).notes == ()
+
+
 def test_the_record_leads_from_the_file_back_to_the_capture(tmp_path, soup):
     """Turned, scaled, placed: what GLB has in its asset's extras, PLY and OBJ in comments."""
     write_colmap(tmp_path / "scene", [(33, 24)] * 9)

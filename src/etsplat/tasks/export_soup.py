@@ -21,6 +21,7 @@ from etsplat.io.paths import kind_of
 from etsplat.io.writers import suffixes, writer_of
 from etsplat.model.solid_soup import SolidSoup
 from etsplat.model.soup_appearance import OPAQUE_FROM
+from etsplat.model.surroundings import Surroundings
 from etsplat.model.triangle_soup import GEOREFERENCE_NOTE, UP_NOTE, TriangleSoup
 from etsplat.ops.soup_colors import soup_colors
 from etsplat.tasks.export_config import ExportConfig
@@ -28,7 +29,7 @@ from etsplat.tasks.export_mesh import check_stored
 from etsplat.tasks.opened_runs import SoupRun, training_cameras
 from etsplat.tasks.placing import apart_from_world, check_placed, placed_record, placement
 from etsplat.tasks.scene_page import compact_bytes, scene_of, small_camera
-from etsplat.tasks.soup_selection import Crop, Reason, Selection, select
+from etsplat.tasks.soup_selection import Crop, Reason, Selection, select, surroundings_of
 from etsplat.web.pages import render_scene_page
 
 WHOLE = (".safetensors", ".etz", ".html")
@@ -102,7 +103,8 @@ def export_soup(run: SoupRun, path: Path | str, config: ExportConfig, crop: Crop
         written = Export(path, int(chosen.kept.sum()), 0, chosen.removed, Similarity())
     else:
         written = _write(run, path, config, chosen, apart=apart)
-    return replace(written, notes=_without_capture(run, path, config) + _not_turned(run, path, config))
+    notes = *_without_capture(run, path, config), *_not_turned(run, path, config), *_unknown_sky(run, config)
+    return replace(written, notes=notes)
 
 
 def why_soup(path: Path, config: ExportConfig) -> str | None:
@@ -241,6 +243,14 @@ def _not_turned(run: SoupRun, path: Path, config: ExportConfig) -> tuple[str, ..
     return (f"nothing is turned, since {why}: +{config.up} is up if it was before",)
 
 
+def _unknown_sky(run: SoupRun, config: ExportConfig) -> tuple[str, ...]:
+    """That nothing is left out as sky because nobody knows where that is; nothing if somebody does."""
+    if config.sky != "none" or Surroundings.NOTE in run.soup.notes or surroundings_of(run) is not None:
+        return ()
+    named = "" if run.capture is not None else " (--scene names the capture, whose points tell)"
+    return (f"no triangle is left out as sky, since nobody knows where that is{named}",)
+
+
 def _georeference(run: SoupRun) -> Georeference | None:
     """Where the capture lies in the world: as the soup says, or else the capture; None where neither does."""
     if (note := run.soup.notes.get(GEOREFERENCE_NOTE)) is not None:
@@ -255,10 +265,11 @@ def _record(
     transform: Similarity,
     georeference: Georeference | None,
 ) -> dict[str, Any]:
-    """What the file says of how it was made; where it comes back as the same soup, of how that is drawn too."""
+    """What the file says of how it was made and where its sky is; where it comes back as the same soup, all of that."""
     look = {"appearance": json.loads(soup.appearance.structure.to_json()), "notes": dict(soup.notes)}
+    sky = {name: note for name, note in soup.notes.items() if name == Surroundings.NOTE}
     return {
-        **(look if config.colors == "keep" else {}),
+        **(look if config.colors == "keep" else {"notes": sky} if sky else {}),
         **placed_record(config, transform, georeference),
         **{name: getattr(config, name) for name in ("sky", "clean")},
         "crop": None if chosen.crop is None else str(chosen.crop),
