@@ -4,7 +4,7 @@ import pytest
 from PIL import Image
 
 from etsplat.core.errors import InputError
-from etsplat.data.photo_intake import by_camera, list_photos, take_in
+from etsplat.data.photo_intake import by_camera, list_photos, take_in, unread_pictures
 from helpers.photos import upright_picture, write_phone_photo
 
 
@@ -81,3 +81,11 @@ def test_pictures_of_kinds_that_are_not_read_are_counted_where_photos_lack(tmp_p
         (tmp_path / name).write_bytes(b"a picture")
     with pytest.raises(InputError, match=r"0 JPEG, PNG or HEIC files, and 3 pictures of kinds that are not read: conv"):
         list_photos(tmp_path)
+
+
+def test_pictures_that_are_not_read_are_named_unless_a_photo_of_that_name_is_there(tmp_path):
+    """Raw files lie beside the photos that cameras made of them; of others nobody said that they were left out."""
+    (tmp_path / "day").mkdir()
+    for name in ("a.JPG", "a.NEF", "day/b.webp", ".trash.webp", "c.txt"):
+        (tmp_path / name).touch()
+    assert unread_pictures(tmp_path) == ["day/b.webp"]

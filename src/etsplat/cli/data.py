@@ -70,6 +70,9 @@ class Sfm(Command):
         if found.unplaced:
             shown = ", ".join(found.unplaced[:8]) + (", ..." if len(found.unplaced) > 8 else "")
             print(f"Without a place, and left out: {shown}")
+        if found.unread:
+            shown = ", ".join(found.unread[:8]) + (", ..." if len(found.unread) > 8 else "")
+            print(f"Not read, and left out: {shown}; convert them to JPEG or PNG")
         if found.unmasked:
             why = "; ".join(f"{name}: {problem}" for name, problem in list(found.unmasked.items())[:8])
             print(f"Without a mask, and left out: {len(found.unmasked)} photos ({why})")

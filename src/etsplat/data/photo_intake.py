@@ -48,8 +48,10 @@ def list_photos(folder: Path) -> list[Photo]:
     paths = sorted(path for path in folder.rglob("*") if kind_of(path) in PHOTO_SUFFIXES and path.is_file())
     shown = [path for path in paths if not any(part.startswith(".") for part in path.relative_to(folder).parts)]
     if len(shown) < LEAST_COUNT:
-        unread = sum(kind_of(path) in UNREAD_SUFFIXES for path in folder.rglob("*"))
-        others = f", and {unread} pictures of kinds that are not read: convert them to JPEG or PNG" if unread else ""
+        unread = unread_pictures(folder)
+        others = (
+            f", and {len(unread)} pictures of kinds that are not read: convert them to JPEG or PNG" if unread else ""
+        )
         raise InputError(
             f"photos {folder}: {len(shown)} JPEG, PNG or HEIC files{others}; at least 3 are needed, better 20 or more"
         )
@@ -63,6 +65,15 @@ def list_photos(folder: Path) -> list[Photo]:
             )
         photos[name] = Photo(path, name, inspect_photo(path))
     return list(photos.values())
+
+
+def unread_pictures(folder: Path) -> list[str]:
+    """Names of pictures of kinds that are not read, but for those beside a photo of that name, as cameras write raw."""
+    paths = [path.relative_to(folder) for path in folder.rglob("*") if not path.is_dir()]
+    shown = [path for path in paths if not any(part.startswith(".") for part in path.parts)]
+    photos = {path.with_suffix("") for path in shown if kind_of(path) in PHOTO_SUFFIXES}
+    unread = (path for path in shown if kind_of(path) in UNREAD_SUFFIXES and path.with_suffix("") not in photos)
+    return sorted(path.as_posix() for path in unread)
 
 
 def take_in(photos: list[Photo], folder: Path, threads: int | None, report: Callable[[str, int, int], None]) -> None:

@@ -1,6 +1,7 @@
 """Cameras for a folder of photos: structure from motion with pycolmap (an extra), on the CPU."""
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -10,7 +11,15 @@ import torch
 from etsplat.core.errors import InputError
 from etsplat.data.colmap_process import Job, Mapper, Progress, import_pycolmap, place_photos, run_apart
 from etsplat.data.gps_alignment import MapFit, fit_to_map
-from etsplat.data.photo_intake import LEAST_COUNT, CameraSharing, Photo, by_camera, list_photos, take_in
+from etsplat.data.photo_intake import (
+    LEAST_COUNT,
+    CameraSharing,
+    Photo,
+    by_camera,
+    list_photos,
+    take_in,
+    unread_pictures,
+)
 from etsplat.data.photo_masks import mask_file, write_masks
 from etsplat.data.undistortion import (
     check_output,
@@ -53,6 +62,7 @@ class Placement:
         unmasked: photos that were left out because no mask could be found for them, and why; empty without masks.
         on_map: where the photos say that they were taken; None where too few of them say it. Where it is believed the
             scene has z up and a georeference.json.
+        unread: names of pictures in the folder of kinds that are not read.
     """
 
     scene: Path
@@ -62,6 +72,7 @@ class Placement:
     cameras: int
     unmasked: dict[str, str]
     on_map: MapFit | None = None
+    unread: Sequence[str] = ()
 
 
 def find_cameras(
@@ -151,6 +162,7 @@ def find_cameras(
         len({image.camera_id for image in images}),
         unmasked,
         None if on_map is None else on_map[0],
+        unread_pictures(source),
     )
 
 
