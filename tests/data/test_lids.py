@@ -1,5 +1,7 @@
 """A bowl of one sheet, open below, and a lid across it: photos look through the lid onto the inner side."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -9,6 +11,7 @@ from etsplat.data.agreement import differences, first_hits, per_pixel, photos_of
 from etsplat.data.dataset import Dataset
 from etsplat.data.lids import _without_gaps, lids, without_lids
 from etsplat.data.photograph import photograph, shade_faces
+from etsplat.data.pictures import StoredPictures
 from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.topology import MeshTopology
 from etsplat.io.mesh_files import MeshFile
@@ -39,6 +42,21 @@ def test_a_bottom_that_photos_show_is_no_lid_nor_is_what_is_left_of_an_open_surf
     assert not lids(views)(vertices, faces, mean_colors(views, vertices, faces)).any()
     views, vertices, faces, bottom = photos_and_lid(opened=True)
     assert not lids(views)(vertices, faces[~bottom], mean_colors(views, vertices, faces[~bottom])).any()
+
+
+def test_a_patch_that_a_quarter_of_the_photos_show_is_no_lid() -> None:
+    """As of what is glossy: the other photos' colours are by chance nearer to those of what is behind."""
+    views, vertices, faces, bottom = photos_and_lid(opened=True)
+    closed, *_ = photos_and_lid(opened=False)
+    colors = mean_colors(views, vertices, faces)
+    colors[bottom] = mean_colors(closed, vertices, faces)[bottom]
+    below = sorted((view for view in views.train if views.centers[view, 1] < -0.5), key=lambda k: -views.centers[k, 1])
+    pictures = list(views.images)
+    for view in below[: len(below) // 4 + 1]:  # at a slant, which have the fewest pixels of it
+        pictures[view] = closed.images[view]
+    mixed = replace(views, images=StoredPictures(pictures))
+    assert lids(views)(vertices, faces, colors)[bottom].float().mean() > 0.75
+    assert not lids(mixed)(vertices, faces, colors).any()
 
 
 def test_a_hull_loses_its_lid_and_one_without_stays_as_it_is() -> None:
