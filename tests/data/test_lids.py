@@ -59,6 +59,15 @@ def test_a_patch_that_a_quarter_of_the_photos_show_is_no_lid() -> None:
     assert not lids(mixed)(vertices, faces, colors).any()
 
 
+def test_what_two_photos_see_is_no_lid() -> None:
+    views, vertices, faces, _ = photos_and_lid(opened=True)
+    colors = mean_colors(views, vertices, faces)
+    below = [view for view in views.train if views.centers[view, 1] < -0.5]
+    for left, found in ((5, True), (2, False)):
+        fewer = replace(views, train=[view for view in views.train if view not in below[left:]])
+        assert bool(lids(fewer)(vertices, faces, colors).any()) == found
+
+
 def test_a_hull_loses_its_lid_and_one_without_stays_as_it_is() -> None:
     views, vertices, faces, bottom = photos_and_lid(opened=True)
     found, kept = without_lids(views, vertices, faces)

@@ -57,7 +57,7 @@ _CONTRADICTED = 0.4
 """Correlation below which photos show different things, as on a lid over a hollow; gloss seldom goes so low."""
 
 _FEWEST = 5
-"""Photos that see what they contradict in a result, at least: the root of their number where that is less."""
+"""Photos that are enough to say that a surface is not there; the root of their number where that is less."""
 
 _WRONG, _UNUSUAL = 0.01, 1.3
 """Mean difference of colours from which photos are said to show something else than a face does, and so many times
@@ -231,6 +231,11 @@ def looked_by(photos: list[Photo], vertices: Float[Tensor, "V 3"], faces: Int64[
     return Looked(photos, vertices, faces, topology, hits, seen, score)
 
 
+def witnesses(count: int) -> int:
+    """How many of so many photos must see what they contradict: of few at a slant none need be alike."""
+    return min(max(math.isqrt(count), COMPARED), _FEWEST)
+
+
 @torch.no_grad()
 def contradicted(looked: Looked | None, colors: Float[Tensor, "F 3"]) -> float:
     """As `contradicted_share`, of a surface whose colours were fitted to the photos.
@@ -250,7 +255,7 @@ def contradicted(looked: Looked | None, colors: Float[Tensor, "F 3"]) -> float:
     wrong = per_pixel(sums.sum(dim=0), topology.face_pairs.long())[:, 0]
     usual = wrong[wrong > 0].median() if bool((wrong > 0).any()) else wrong.new_zeros(())
     unlike = wrong > torch.maximum(_UNUSUAL * usual, usual + _WRONG)
-    enough = seen.sum(dim=0) >= min(max(math.isqrt(len(photos)), COMPARED), _FEWEST)
+    enough = seen.sum(dim=0) >= witnesses(len(photos))
     return _largest_patch((score < _CONTRADICTED) & enough, vertices, faces, topology.edges.long(), unlike)
 
 

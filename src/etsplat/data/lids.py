@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from etsplat import _native
-from etsplat.data.agreement import Photo, differences, first_hits, per_pixel, photos_of
+from etsplat.data.agreement import Photo, differences, first_hits, per_pixel, photos_of, witnesses
 from etsplat.data.dataset import Dataset
 from etsplat.geometry.discs import cut_open
 from etsplat.geometry.measures import face_areas
@@ -30,7 +30,7 @@ _BETTER, _CLEARLY = 0.9, 0.4
 """What is behind a lid differs from the photos at most so many times as much as its faces do; and for the lid as a
 whole that holds of what is above the median of all faces."""
 
-_MOST, _MUCH = 0.8, 0.125
+_MOST, _MUCH = 0.9, 0.125
 """So many of the photos must be explained better by what is behind, of those that see at least so many pixels of a lid
 beside the one that sees most of it. Of lids all are, of sides of a blowtorch of brass 0.5 to 0.7."""
 
@@ -151,14 +151,14 @@ def _told_by_most(
 ) -> Bool[Tensor, " M"]:
     """Of each face in a patch, whether what is behind that explains nearly every photo better that sees much of it.
 
-    On what is glossy photos differ from each other, and some from the face by more than from anything.
+    On what is glossy photos differ from each other, and some from the face by more than from anything; so do any two.
     """
     names, of = patch[found].unique(return_inverse=True)
     each = torch.stack([torch.zeros(len(names), 3).index_add(0, of, look[found]) for look in looks])
     pixels, own, behind = each.unbind(dim=2)
     sees = pixels > _MUCH * pixels.amax(dim=0)
-    votes = (sees & (behind < own)).sum(dim=0) / sees.sum(dim=0)
-    return votes[of] >= _MOST
+    told, asked = (sees & (behind < own)).sum(dim=0), sees.sum(dim=0)
+    return ((told >= _MOST * asked) & (asked >= witnesses(len(each))))[of]
 
 
 def _without_gaps(lid: Bool[Tensor, " F"], faces: Int64[Tensor, "F 3"]) -> Bool[Tensor, " F"]:
