@@ -297,4 +297,5 @@ def test_another_scene_than_that_of_the_training_is_noticed(trained, tmp_path, c
     )
     assert written.notes == (
         "it is of another scene than the run was trained on: colours and what is seen are by its photos",
+        "nothing is turned, since the cameras contradict each other about where up is: +y is up if it was before",
     )
