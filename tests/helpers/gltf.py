@@ -3,6 +3,7 @@
 import io
 import json
 import struct
+from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
+
+from etsplat.io._gltf import join_gltf, split_gltf
 
 needs_meshopt = pytest.mark.skipif(find_spec("meshoptimizer") is None, reason="meshoptimizer is not installed")
 
@@ -33,6 +36,15 @@ def read_glb(path: Path) -> tuple[dict[str, Any], bytes]:
     size, kind = struct.unpack("<I4s", rest[:8])
     assert (kind, size % 4, size) == (b"BIN\0", 0, len(rest) - 8)
     return json.loads(text.decode("utf-8"), parse_constant=_refuse), rest[8:]
+
+
+def change_gltf(path: Path, edit: Callable[[dict[str, Any]], object]) -> Path:
+    """Edits the document of a file, GLB or glTF, and returns its path."""
+    data = path.read_bytes()
+    document, _ = split_gltf(data)
+    edit(document)
+    path.write_bytes(join_gltf(data, document))
+    return path
 
 
 def array_of(document: dict[str, Any], buffer: bytes, number: int) -> np.ndarray:

@@ -27,6 +27,20 @@ FAMOUS = [
 ]
 
 
+PLY_HEADER = (
+    "ply\nformat ascii 1.0\nelement vertex {}\nproperty float x\nproperty float y\nproperty float z\n"
+    "element face {}\nproperty list uchar int vertex_indices\nend_header\n"
+)
+"""Of a text with so many vertices and faces."""
+
+
+def colored_ball() -> tuple[Tensor, Tensor, Tensor]:
+    """Vertices and faces of an icosphere, and colours of its faces that 8 bits hold."""
+    vertices, faces = icosphere(2)
+    colors = torch.randint(0, 256, (len(faces), 3), generator=torch.Generator().manual_seed(1)).float() / 255
+    return vertices, faces, colors
+
+
 def bumpy_sphere(level: int, seed: int, amplitude: float = 0.3) -> tuple[Tensor, Tensor]:
     """An icosphere whose vertices are displaced at random, by about `amplitude` edge lengths."""
     vertices, faces = icosphere(level)

@@ -2,7 +2,6 @@
 
 import base64
 import io
-import json
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +13,7 @@ from PIL import Image
 from etsplat.core.errors import InputError
 from etsplat.io.mesh_files import MeshFile, load_mesh
 from etsplat.io.textures import Texture
+from helpers.gltf import change_gltf
 
 PICTURE = np.array([[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [255, 255, 0]]], dtype=np.uint8)
 """Red and green above blue and yellow."""
@@ -223,18 +223,11 @@ def test_the_base_colour_multiplies_linear_light(tmp_path):
     assert color_at(mesh, 0.25, 0.25) == [0, 0, 255]
 
 
-def change(path: Path, edit) -> Path:
-    document = json.loads(path.read_text())
-    edit(document)
-    path.write_text(json.dumps(document))
-    return path
-
-
 @pytest.mark.parametrize("uri", ["../secret.png", "%2e%2e/secret.png", "https://example.org/a.png", "gone.png"])
 def test_a_gltf_reads_no_picture_from_elsewhere(tmp_path, uri):
     (tmp_path / "in").mkdir()
     picture(tmp_path / "secret.png")
-    path = change(gltf(tmp_path / "in", "gltf"), lambda document: document.update(images=[{"uri": uri}]))
+    path = change_gltf(gltf(tmp_path / "in", "gltf"), lambda document: document.update(images=[{"uri": uri}]))
     mesh = load_mesh(path)
     assert mesh.texture is None
     assert len(mesh.faces) == 2
@@ -246,7 +239,7 @@ def test_pictures_and_maps_within_a_gltf(tmp_path):
         document["images"] = [{"uri": "data:image/png;base64," + base64.b64encode(png()).decode()}]
         document["materials"][0]["normalTexture"] = {"index": 0}
 
-    mesh = load_mesh(change(gltf(tmp_path, "gltf"), edit))
+    mesh = load_mesh(change_gltf(gltf(tmp_path, "gltf"), edit))
     assert_quad(mesh)
     assert mesh.notes == ("model.gltf: normalTexture ignored; only baseColorTexture is seen",)
 
@@ -268,7 +261,7 @@ def test_a_gltf_whose_coordinates_are_transformed_has_the_colours_there(tmp_path
         info["extensions"] = {"KHR_texture_transform": transform}
 
     plain = load_mesh(gltf(tmp_path, "gltf")).texture
-    moved = load_mesh(change(tmp_path / "model.gltf", edit))
+    moved = load_mesh(change_gltf(tmp_path / "model.gltf", edit))
     assert plain is not None
     assert moved.texture is not None
     assert moved.notes == ()
@@ -285,7 +278,7 @@ def test_a_transform_names_the_set_of_coordinates(tmp_path):
         info = document["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"]
         info["extensions"] = {"KHR_texture_transform": {"texCoord": 1}}
 
-    assert_quad(load_mesh(change(gltf(tmp_path, "gltf"), edit)))
+    assert_quad(load_mesh(change_gltf(gltf(tmp_path, "gltf"), edit)))
 
 
 @pytest.mark.parametrize("transform", [{"scale": 2}, {"offset": [1]}, {"rotation": "a"}, [], {"offset": [np.nan, 0]}])
@@ -295,7 +288,7 @@ def test_a_damaged_transform_is_an_input_error(tmp_path, transform):
         info["extensions"] = {"KHR_texture_transform": transform}
 
     with pytest.raises(InputError, match=r"model\.gltf: cannot be read as GLTF"):
-        load_mesh(change(gltf(tmp_path, "gltf"), edit))
+        load_mesh(change_gltf(gltf(tmp_path, "gltf"), edit))
 
 
 @pytest.mark.parametrize(("scale", "notes"), [(1.0, 0), (1.01, 1)])
@@ -308,7 +301,7 @@ def test_a_border_that_is_clamped_is_said_where_coordinates_go_beyond_it(tmp_pat
         info = document["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"]
         info["extensions"] = {"KHR_texture_transform": {"scale": [scale, 1.0]}}
 
-    said = load_mesh(change(gltf(tmp_path, "gltf"), edit)).notes
+    said = load_mesh(change_gltf(gltf(tmp_path, "gltf"), edit)).notes
     assert said == ("model.gltf: a texture repeats here that is clamped or mirrored at its border",) * notes
 
 
@@ -321,7 +314,7 @@ def test_diffuse_colours_of_a_gltf_are_its_base_colours(tmp_path):
         said["specularGlossinessTexture"] = base["baseColorTexture"]
         document["materials"][0]["extensions"] = {"KHR_materials_pbrSpecularGlossiness": said}
 
-    mesh = load_mesh(change(gltf(tmp_path, "gltf"), edit))
+    mesh = load_mesh(change_gltf(gltf(tmp_path, "gltf"), edit))
     assert color_at(mesh, 0.25, 0.75) == [188, 0, 0]
     assert color_at(mesh, 0.25, 0.25) == [0, 0, 255]
     assert mesh.notes == ("model.gltf: specularGlossinessTexture ignored; only baseColorTexture is seen",)
@@ -334,7 +327,7 @@ def test_a_gltf_whose_light_is_in_another_map_says_that_it_is_ignored(tmp_path):
         base = document["materials"][0].pop("pbrMetallicRoughness")
         document["materials"][0] |= {"emissiveTexture": base["baseColorTexture"], "emissiveFactor": [1, 1, 1]}
 
-    mesh = load_mesh(change(gltf(tmp_path, "gltf"), edit))
+    mesh = load_mesh(change_gltf(gltf(tmp_path, "gltf"), edit))
     assert mesh.texture is None
     assert mesh.notes == ("model.gltf: emissiveTexture ignored; only baseColorTexture is seen",)
 
@@ -344,7 +337,7 @@ def test_indices_of_textures_out_of_range_are_an_input_error(tmp_path):
         document["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"]["index"] = 7
 
     with pytest.raises(InputError, match=r"model\.gltf: cannot be read as GLTF"):
-        load_mesh(change(gltf(tmp_path, "gltf"), edit))
+        load_mesh(change_gltf(gltf(tmp_path, "gltf"), edit))
 
 
 PAINTS = "newmtl red\nKd 1 0 0\nnewmtl blue\nKd 0 0 1\n"
@@ -387,11 +380,11 @@ def test_a_gltf_without_pictures_has_the_plain_colours_of_its_materials(tmp_path
             first["attributes"]["COLOR_0"] = first["attributes"]["POSITION"]
         document["meshes"][0]["primitives"] = [first | {"material": 0}, first | {"material": 1}]
 
-    mesh = load_mesh(change(gltf(tmp_path, "gltf"), edit))
+    mesh = load_mesh(change_gltf(gltf(tmp_path, "gltf"), edit))
     assert mesh.texture is None
     assert mesh.face_colors is not None
     assert (255 * mesh.face_colors).round().tolist() == [[188, 0, 0]] * 2 + [[0, 0, 255]] * 2
-    mesh = load_mesh(change(gltf(tmp_path, "gltf"), lambda document: edit(document, colored=True)))
+    mesh = load_mesh(change_gltf(gltf(tmp_path, "gltf"), lambda document: edit(document, colored=True)))
     assert mesh.face_colors is None
     assert mesh.vertex_colors is not None
     corner = (mesh.vertices == torch.tensor([1.0, 1.0, 0.0])).all(dim=1)

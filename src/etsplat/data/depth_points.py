@@ -110,12 +110,16 @@ def on_map(
     Args:
         dataset: whose view it is.
         view: its index.
-        shown: (H, W) of the pixels of its photo.
+        shown: (H, W) of its photo, at any size.
         points: (P, 3) float64 in the data set's frame.
     """
     depth, column, row = located = project(dataset, view, points)
     inside = framed(dataset, view, *located)
-    column, row = (torch.where(inside, each, 0.0).long() for each in (column, row))
+    width, height = dataset.images.sizes[view]
+    column, row = (
+        torch.where(inside, each * (count / side), 0.0).long().clamp_max(count - 1)
+        for each, count, side in ((column, shown.shape[1], width), (row, shown.shape[0], height))
+    )
     return torch.where(inside, shown[row, column], 0.0), depth
 
 

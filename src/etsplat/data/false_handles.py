@@ -17,14 +17,7 @@ from jaxtyping import Bool, Float, Int64
 from scipy.ndimage import distance_transform_edt, label, maximum, maximum_position
 from torch import Tensor
 
-from etsplat.data.agreement import (
-    COMPARED,
-    Photo,
-    first_hits,
-    looked_by,
-    photos_of,
-    pixel_size,
-)
+from etsplat.data.agreement import COMPARED, Photo, first_hits, looked_by, photos_of, pixel_size
 from etsplat.data.dataset import Dataset
 from etsplat.data.visual_hull import without_specks
 from etsplat.geometry.discs import with_discs

@@ -262,11 +262,8 @@ class GltfMaterials:
             elif not 0 <= number < len(materials):
                 raise ValueError(f"material {number} of {len(materials)}")
             base = _base(materials[number]).get("baseColorTexture", {}) if number >= 0 else {}
-            uv = (
-                attributes.get(f"TEXCOORD_{_transform(base).get('texCoord', base.get('texCoord', 0))}")
-                if base
-                else None
-            )
+            place = _transform(base).get("texCoord", base.get("texCoord", 0))
+            uv = attributes.get(f"TEXCOORD_{place}") if base else None
             attributes[f"{UV}{number}"] = attributes["POSITION"] if uv is None else uv
             if base and uv is None:
                 self.pictures.note(f"{self._path.name}: a primitive has no coordinates for its texture")

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from etsplat.core.cameras import Cameras
 from etsplat.data.dataset import Dataset, middles_of
+from etsplat.data.depth_points import on_map
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.ops.rasterize import rasterize
 
@@ -30,20 +31,19 @@ class HiddenSky:
             dataset: some of its training views are looked at, evenly spread.
             sky: which triangles belong to the sky, by their corners.
         """
-        views = middles_of(dataset.train, min(_VIEWS, len(dataset.train)))
-        self._cameras = [dataset.cameras[view].scaled(_SCALE) for view in views]
-        self._sky = sky
+        self._dataset, self._sky = dataset, sky
+        self._views = middles_of(dataset.train, min(_VIEWS, len(dataset.train)))
 
     @torch.no_grad()
     def __call__(self, soup: TriangleSoup) -> Bool[Tensor, " N"]:
         """(N,) whether a triangle is of the sky, and at its middle no view has most of its light from the sky."""
         hidden = self._sky(soup.vertices)
-        middles = soup.vertices[hidden].mean(dim=1)
-        shown = torch.zeros(len(middles), dtype=torch.bool, device=middles.device)
-        for camera in self._cameras:
-            view = camera.to(middles.device, middles.dtype)
-            shown |= _at(view, _share(soup, hidden, view), middles) > 0.5
-        hidden[hidden.clone()] = ~shown
+        middles = soup.vertices[hidden].mean(dim=1).cpu().double()
+        shown = torch.zeros(len(middles), dtype=torch.bool)
+        for view in self._views:
+            camera = self._dataset.cameras[view].scaled(_SCALE).to(soup.vertices.device, soup.vertices.dtype)
+            shown |= on_map(self._dataset, view, _share(soup, hidden, camera).cpu(), middles)[0] > 0.5
+        hidden[hidden.clone()] = ~shown.to(hidden.device)
         return hidden
 
 
@@ -63,12 +63,3 @@ def _share(soup: TriangleSoup, sky: Bool[Tensor, " N"], camera: Cameras) -> Floa
     )
     assert seen.color is not None
     return seen.color[0, ..., 0]
-
-
-def _at(camera: Cameras, image: Float[Tensor, "H W"], points: Float[Tensor, "P 3"]) -> Float[Tensor, " P"]:
-    """Values of an image at the pixels of points; 0 where they are not in it."""
-    located = (points @ camera.viewmats[0, :3, :3].T + camera.viewmats[0, :3, 3]) @ camera.Ks[0].T
-    column, row = located[:, 0] / located[:, 2], located[:, 1] / located[:, 2]
-    inside = (located[:, 2] > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-    column, row = (torch.where(inside, each, 0.0).long() for each in (column, row))
-    return torch.where(inside, image[row, column], 0.0)

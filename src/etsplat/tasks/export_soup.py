@@ -221,10 +221,9 @@ def _without_capture(run: SoupRun, path: Path, config: ExportConfig) -> tuple[st
     kind = kind_of(path)
     triangles = kind not in WHOLE
     one_color = config.colors == "mean" and not isinstance(run.soup, SolidSoup) and run.soup.drawn_degree > 0
-    turned = config.up != "keep" and config.place != "world"
     effects = {
         "colours are what is the same from every side": triangles and one_color,
-        "nothing is turned, since nobody knows where up is": triangles and turned and _up(run) is None,
+        "nothing is turned, since nobody knows where up is": _lacks_up(run, path, config),
         "triangles are in order of opacity and size, not of what photos show": kind in (".etz", ".html"),
         "there are no photos on the page": kind == ".html",
     }
@@ -232,10 +231,15 @@ def _without_capture(run: SoupRun, path: Path, config: ExportConfig) -> tuple[st
     return (f"its scene {run.gone} has gone: {said} (--scene names it)",) if run.gone is not None and said else ()
 
 
+def _lacks_up(run: SoupRun, path: Path, config: ExportConfig) -> bool:
+    """Whether a file would be turned if anybody knew where up is."""
+    turned = kind_of(path) not in WHOLE and config.up != "keep" and config.place != "world"
+    return turned and _up(run) is None
+
+
 def _not_turned(run: SoupRun, path: Path, config: ExportConfig) -> tuple[str, ...]:
     """That `up` had no effect, where the scene has not gone, which says so itself; nothing if it had one."""
-    turned = kind_of(path) not in WHOLE and config.up != "keep" and config.place != "world"
-    if not turned or run.gone is not None or _up(run) is not None:
+    if run.gone is not None or not _lacks_up(run, path, config):
         return ()
     why = "nobody knows where up is (--scene names the capture)"
     if run.capture is not None:
