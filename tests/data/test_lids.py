@@ -68,6 +68,28 @@ def test_what_two_photos_see_is_no_lid() -> None:
         assert bool(lids(fewer)(vertices, faces, colors).any()) == found
 
 
+def test_photos_are_compared_as_they_were_exposed() -> None:
+    """In photos that were exposed for less a side may look like what is behind it: holes were cut into a figure."""
+    for opened in (False, True):
+        views, vertices, faces, bottom = photos_and_lid(opened=opened)
+        colors = torch.where(bottom[:, None], 0.5, 0.25).repeat(1, 3)
+        there = (~bottom).nonzero()[:, 0] if opened else torch.arange(len(faces))
+        drawn = [rasterize_opaque(vertices, faces=faces[there], cameras=each).triangle for each in views.cameras]
+        hits = [triangle[0].long() for triangle in drawn if triangle is not None]
+        gains = [0.5 if float(center[1]) < -0.5 else 1.0 for center in views.centers]
+        pictures = [
+            torch.cat([gain * colors[there[hit.clamp_min(0)]], torch.ones(*hit.shape, 1)], dim=2)
+            * (hit >= 0)[..., None]
+            for hit, gain in zip(hits, gains, strict=True)
+        ]
+        exposed = replace(views, images=StoredPictures(pictures))
+        matrices = {view: gains[view] * torch.eye(3) for view in views.train}
+        as_it_is, told = (lids(exposed, how)(vertices, faces, colors) for how in (None, lambda known=matrices: known))
+        assert as_it_is.any()
+        assert bool(told.any()) == opened
+        assert told[~bottom].float().mean() < 0.05  # the brim, where all is of one colour
+
+
 def test_a_hull_loses_its_lid_and_one_without_stays_as_it_is() -> None:
     views, vertices, faces, bottom = photos_and_lid(opened=True)
     found, kept = without_lids(views, vertices, faces)

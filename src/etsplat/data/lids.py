@@ -9,7 +9,8 @@ A lid that is fitted to photos is drawn in, until it lies on what is behind it, 
 best found on the hull that a run starts from, and where that is too coarse, early.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 
 import torch
 from jaxtyping import Bool, Float, Int64
@@ -43,14 +44,28 @@ _GAP = 6
 Lids = Callable[[Float[Tensor, "V 3"], Int64[Tensor, "F 3"], Float[Tensor, "F 3"]], Bool[Tensor, " F"]]
 """Of vertices, faces and their colours, on the CPU, which faces are lids."""
 
+Exposures = Callable[[], Mapping[int, Float[Tensor, "3 3"]]]
+"""By what matrix each training view's photo has other colours than the surface, as far as that is known by now."""
 
-def lids(dataset: Dataset) -> Lids:
+
+def lids(dataset: Dataset, exposures: Exposures | None = None) -> Lids:
     """Which faces of a surface the training views look through, as a function of it and its colours.
 
     Args:
         dataset: photos with alpha around an object in the unit ball.
+        exposures: asked each time; None for photos that were all exposed alike. Where one is darker than another faces
+            differ from both, and of some what is behind is nearer by chance.
     """
-    return _lids(photos_of(dataset))
+    photos = photos_of(dataset)
+    if exposures is None:
+        return _lids(photos)
+
+    def marked(vertices: Tensor, faces: Tensor, colors: Tensor) -> Tensor:
+        known = exposures()
+        neutral = [_neutral(photo, known[view]) for view, photo in zip(dataset.train, photos, strict=True)]
+        return _lids(neutral)(vertices, faces, colors)
+
+    return marked
 
 
 @torch.no_grad()
@@ -92,6 +107,13 @@ def _lids(photos: list[Photo]) -> Lids:
         return _without_gaps(found, faces) if bool(found.any()) else found
 
     return marked
+
+
+def _neutral(photo: Photo, matrix: Float[Tensor, "3 3"]) -> Photo:
+    """A photo in the colours of the surface."""
+    colors, alpha = photo.pixels.split([3, 1], dim=1)
+    colors = torch.einsum("ij,bjhw->bihw", torch.linalg.inv(matrix), colors)
+    return replace(photo, pixels=torch.cat([colors, alpha], dim=1))
 
 
 def _shown(photos: list[Photo], vertices: Tensor, faces: Tensor) -> Float[Tensor, "F 3"]:

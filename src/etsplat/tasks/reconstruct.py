@@ -373,6 +373,7 @@ def make_trainer(
     )
     untanglings = evenly(length, refinement.untanglings, refinement.last)
     untanglings += [held_from(config)] if untanglings else []
+    exposure = Exposure.of(config.exposure, length, len(views.train) / config.batch)
     smoothing = config.optimizer.large_steps_weight if config.optimizer.vertex_update == "large-steps" else None
     return Trainer(
         mesh,
@@ -384,13 +385,13 @@ def make_trainer(
             flips=refinement.flips,
             reach=refinement.reach,
             unseen=unseen_vertices(views) if near and not cut else None,
-            lids=lids(views) if near else None,
+            lids=lids(views, exposure.matrices) if near else None,
             outlines=outlines(views),
             outlines_after=outlines_after(config),
         ),
         schedule=make_schedule(config, mesh.appearance, near=near),
         batch=config.batch,
-        exposure=Exposure.of(config.exposure, length, len(views.train) / config.batch),
+        exposure=exposure,
         depths=depths,
         cameras=CameraRefinement.of(config.refine_cameras, length, len(views.train) / config.batch),
         update=None if config.optimizer.vertex_update == "adam" else UniformSteps(smoothing),
