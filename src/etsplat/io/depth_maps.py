@@ -4,7 +4,6 @@ A pixel whose depth nobody knows is 0: where a file has 0, NaN, infinity, or a n
 1e10 where it sees nothing).
 """
 
-import threading
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from etsplat.core.errors import InputError
+from etsplat.io.arrays import load_npy
 from etsplat.io.images import MAX_PIXELS, open_image
 from etsplat.io.paths import kind_of
 
@@ -29,9 +29,6 @@ _NAMES = ("z", "v", "y", "d", "depth", "r")
 
 _DENSEST = 2000
 """Pixels in a byte of EXR, at most: deflate makes 1032 bytes of one, half a float each."""
-
-_HEADERS = threading.Lock()
-"""NPY's header is Python, and CPython 3.11 loses count of its parser's depth where threads take turns within it."""
 
 
 def load_depth(path: Path | str, unit: float | None = None) -> Float[Tensor, "H W"]:
@@ -97,13 +94,9 @@ def _png(path: Path) -> np.ndarray:
 
 def _npy(path: Path) -> np.ndarray:
     try:
-        # Mapped, so that what the file claims to hold is compared with its size before memory is taken.
-        with _HEADERS:
-            numbers = np.load(path, mmap_mode="r", allow_pickle=False)
-    except Exception as error:  # numpy's parser of headers raises what it runs into
-        raise InputError(f"depth map {path}: damaged, or no NPY file of numbers; write it again") from error
-    if not isinstance(numbers, np.ndarray) or numbers.dtype.kind not in "fiu":
-        raise InputError(f"depth map {path}: holds no array of numbers; write it again")
+        numbers = load_npy(path)
+    except ValueError as error:
+        raise InputError(f"depth map {path}: {error}; write it again") from error
     sides = [side for side in numbers.shape if side != 1] if numbers.ndim == 3 else list(numbers.shape)
     if len(sides) != 2 or not 0 < numbers.size <= MAX_PIXELS:
         raise InputError(f"depth map {path}: has the shape {numbers.shape}; write one number for each pixel, (H, W)")
