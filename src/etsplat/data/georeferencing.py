@@ -23,13 +23,14 @@ _ROUNDING = 1e-6
 def near_origin(scene: Path, listing: Listing) -> Listing:
     """The same, moved by whole units if its cameras are so far from the origin that float32 would be coarse.
 
-    What is in `georeference.json` of the scene, and by how much it was moved, is in the listing's `georeference`.
+    What is in `georeference.json` of the scene, or else what its layout says, and by how much it was moved, is in the
+    listing's `georeference`.
 
     Raises:
         InputError: georeference.json is damaged.
     """
     path = scene / GEOREFERENCE_FILE
-    given = Georeference.read(path) if path.is_file() else None
+    given = Georeference.read(path) if path.is_file() else listing.georeference
     shift = _shift(listing)
     if shift is None:
         return replace(listing, georeference=given)

@@ -13,9 +13,9 @@ from torch import Tensor
 
 from etsplat.core.errors import InputError
 from etsplat.data.frames import Frame, Lens, Points, Wanted, find_image, pinhole
-from etsplat.io.images import image_size
+from etsplat.io.images import IMAGE_SUFFIXES, image_size
 from etsplat.io.json_text import parse_json
-from etsplat.io.paths import path_within
+from etsplat.io.paths import kind_of, path_within
 from etsplat.io.ply_tables import GREY, load_points
 
 POINTS = "points.ply"
@@ -23,6 +23,8 @@ POINTS = "points.ply"
 
 OPENGL = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64, device="cpu")
 """Signs of the axes of a camera that has y up and looks along -z, in those of one that has y down and looks along z."""
+
+_ROUNDING = 1e-6
 
 _AFAR = 1000.0
 """So many times the cameras' own spread from them, points cannot be in their frame."""
@@ -77,6 +79,19 @@ class Entry:
                 if bool(found.isfinite().all()):
                     return found
         raise self.wrong(f"has no {key} of {count} finite numbers; export the poses again")
+
+    def affine(self, key: str) -> Float[Tensor, "3 4"]:
+        """The first three rows of a matrix of three or four, the last of which is 0 0 0 1; as `numbers` takes it.
+
+        Raises:
+            InputError: it is missing, of another size, not finite, or its last row is another.
+        """
+        said = self.said.get(key)
+        three = len(said.split()) == 12 if isinstance(said, str) else isinstance(said, list) and len(said) == 3
+        matrix = self.numbers(key, 12 if three else 16).reshape(-1, 4)
+        if bool((matrix[3:, :3].abs() > _ROUNDING).any()):
+            raise self.wrong(f"has a {key} whose last row is not 0 0 0 1; if transposed, write rows as columns")
+        return matrix[:3]
 
     def whole(self, key: str, default: int | None = None) -> int:
         """A whole number, not negative; without a default it must be there.
@@ -155,19 +170,40 @@ def quaternion_rotation(w: float, x: float, y: float, z: float) -> Float[Tensor,
     )
 
 
+def read_text(path: Path, encoding: str = "utf-8") -> str:
+    """What a text file says; bytes that are none of the encoding's are replaced.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    try:
+        return path.read_text(encoding=encoding, errors="replace")
+    except OSError as error:
+        raise InputError(f"scene {path}: cannot be read ({error.strerror}); copy it there again") from error
+
+
+def read_json(path: Path) -> Any:
+    """What a JSON file says.
+
+    Raises:
+        InputError: it cannot be read, or is no JSON.
+    """
+    try:
+        return parse_json(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"scene {path}: cannot be read ({error.strerror}); check its permissions") from error
+    except ValueError as error:
+        detail = str(error).splitlines()[0]
+        raise InputError(f"scene {path}: not valid JSON ({detail}); export the poses again") from error
+
+
 def read_object(path: Path) -> dict[str, Any]:
     """What a JSON file says.
 
     Raises:
         InputError: it is no JSON object.
     """
-    try:
-        document = parse_json(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"scene {path}: cannot be read ({error.strerror}); check its permissions") from error
-    except ValueError as error:
-        detail = str(error).splitlines()[0]
-        raise InputError(f"scene {path}: not valid JSON ({detail}); export the poses again") from error
+    document = read_json(path)
     if not isinstance(document, dict):
         raise InputError(f"scene {path}: expected a JSON object; export the poses again")
     return document
@@ -339,3 +375,21 @@ def points_beside(folder: Path, frames: Iterable[Frame]) -> Points | None:
 def unplaced_note(count: int, total: int, what: str = "have no pose") -> tuple[str, ...]:
     """That some of the images are left out; none where none is."""
     return (f"{count} of {total} photos {what} and are left out",) if count else ()
+
+
+def unplaced_beside(frames: Iterable[Frame]) -> tuple[str, ...]:
+    """A note on photos that lie beside those with a pose and have none."""
+    placed = {frame.image.with_suffix("") for frame in frames}
+    beside = {
+        path.with_suffix("")
+        for folder in {stem.parent for stem in placed if stem.parent.is_dir()}
+        for path in photos_in(folder)
+        if not path.stem.endswith(("_mask", "_masked"))
+    }
+    return unplaced_note(len(beside - placed), len(beside | placed))
+
+
+def photos_in(folder: Path) -> list[Path]:
+    """The JPEG and PNG files in a folder by their names, without hidden ones."""
+    files = [path for path in folder.iterdir() if kind_of(path) in IMAGE_SUFFIXES and not path.name.startswith(".")]
+    return sorted(files, key=lambda path: path.name)

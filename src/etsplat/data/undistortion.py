@@ -77,6 +77,8 @@ def undistort_scene(
             undistort_masks(model, masks, work, max_size)
         if (scene / GEOREFERENCE_FILE).is_file():
             shutil.copyfile(scene / GEOREFERENCE_FILE, work / "scene" / GEOREFERENCE_FILE)
+        elif listing.georeference is not None:
+            listing.georeference.write(work / "scene")
         if tested is not None:
             files = sorted(listing.frames[view].image.relative_to(photos).as_posix() for view in tested)
             write_tested(work / "scene" / "sparse" / "0", files)

@@ -20,6 +20,7 @@ from etsplat.data.scene_files import (
     brown_lens,
     pinhole_of,
     placed_image,
+    read_text,
     size_of,
     unplaced_note,
 )
@@ -71,10 +72,7 @@ def list_frames(folder: Path, wanted: Wanted) -> Listing:
 
 def _numbers(path: Path) -> tuple[Float[Tensor, " N"], int, Points | None]:
     """All numbers of the cameras, how many cameras, and the points."""
-    try:
-        lines = path.read_text(encoding="ascii", errors="replace").splitlines()
-    except OSError as error:
-        raise InputError(f"scene {path}: cannot be read ({error.strerror}); copy it there again") from error
+    lines = read_text(path, "ascii").splitlines()
     if not lines or not lines[0].startswith("# Bundle file v0.3"):
         raise InputError(f"scene {path}: is no bundle file of version 0.3; export it as that")
     try:
@@ -107,11 +105,7 @@ def _images(folder: Path, bundle: Path) -> list[str]:
     path = next((folder / name for name in _LISTS if (folder / name).is_file()), None)
     if path is None:
         raise InputError(f"scene {bundle}: no list.txt beside it with the names of the images; copy it there")
-    try:
-        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
-    except OSError as error:
-        raise InputError(f"scene {path}: cannot be read ({error.strerror}); copy it there again") from error
-    return [_name(line) for line in lines if line.strip()]
+    return [_name(line) for line in read_text(path).splitlines() if line.strip()]
 
 
 def _name(line: str) -> str:

@@ -21,9 +21,7 @@ from etsplat.data.colmap_model import (
     read_points,
 )
 from etsplat.data.frames import Frame, Lens, Listing, Wanted, pinhole
-from etsplat.data.scene_files import placed_image, quaternion_rotation, unplaced_note
-from etsplat.io.images import IMAGE_SUFFIXES
-from etsplat.io.paths import kind_of
+from etsplat.data.scene_files import placed_image, quaternion_rotation, unplaced_beside
 
 MARK = "sparse/"
 RANK = 2
@@ -61,7 +59,7 @@ def list_frames(folder: Path, wanted: Wanted) -> Listing:
     if not registered:
         raise InputError(f"scene {folder}: the sparse model has no registered image; run COLMAP's mapper again")
     frames = [_frame(folder, model, image, cameras.get(image.camera), wanted) for image in registered]
-    notes = _unplaced(frames)
+    notes = unplaced_beside(frames)
     if (count := len(_models(folder))) > 1:
         notes += (f"{count} models in sparse/: {model.name}, which has the most images, is read, and no other",)
     split, found = _split(model, [image.name for image in registered]), read_points(model)
@@ -133,18 +131,6 @@ def _models(folder: Path) -> list[Path]:
 
 def _has_cameras(folder: Path) -> bool:
     return any((folder / f"cameras.{suffix}").is_file() for suffix in ("bin", "txt"))
-
-
-def _unplaced(frames: list[Frame]) -> tuple[str, ...]:
-    """A note on photos beside the placed ones that the model does not have."""
-    placed = {frame.image.with_suffix("") for frame in frames}
-    beside = {
-        path.with_suffix("")
-        for folder in {stem.parent for stem in placed if stem.parent.is_dir()}
-        for path in folder.iterdir()
-        if kind_of(path) in IMAGE_SUFFIXES and not path.name.startswith(".") and not path.stem.endswith("_mask")
-    }
-    return unplaced_note(len(beside - placed), len(beside | placed))
 
 
 def _viewmat(image: ColmapImage) -> Float[Tensor, "4 4"]:

@@ -31,6 +31,7 @@ from etsplat.data.scene_files import (
     pinhole_of,
     placed_image,
     points_beside,
+    read_text,
     read_xml,
     size_of,
     unplaced_note,
@@ -121,11 +122,7 @@ def _columns(text: str) -> list[str]:
 def _rows(path: Path) -> tuple[list[Entry], tuple[str, ...]]:
     """The cameras of a CSV file; notes name the columns that are not understood."""
     columns = _columns(head_of(path))
-    try:
-        text = path.read_text(encoding="utf-8-sig", errors="replace")
-    except OSError as error:
-        raise InputError(f"scene {path}: cannot be read ({error.strerror}); copy it there again") from error
-    entries = []
+    text, entries = read_text(path, "utf-8-sig"), []
     try:
         for row in csv.reader(line for line in text.splitlines() if line.strip() and not line.startswith("#")):
             if len(row) < len(columns):

@@ -33,7 +33,6 @@ RANK = 1
 _DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL")
 _FISHEYE = ("OPENCV_FISHEYE", "FISHEYE")
-_ROUNDING = 1e-6
 _PIXELS = {"fl_x", "fl_y", "cx", "cy"}
 """In pixels of an image of `w` x `h`."""
 
@@ -275,8 +274,5 @@ def _intrinsics(entry: Entry, size: tuple[int, int]) -> Float[Tensor, "3 3"]:
 
 
 def _viewmat(entry: Entry) -> Float[Tensor, "4 4"]:
-    rows = entry.said.get("transform_matrix")
-    matrix = entry.numbers("transform_matrix", 12 if isinstance(rows, list) and len(rows) == 3 else 16).reshape(-1, 4)
-    if bool((matrix[3:, :3].abs() > _ROUNDING).any()):
-        raise entry.wrong("has a transform_matrix whose last row is not 0 0 0 1; if transposed, write rows as columns")
-    return entry.viewmat(matrix[:3, :3], matrix[:3, 3], OPENGL)
+    matrix = entry.affine("transform_matrix")
+    return entry.viewmat(matrix[:, :3], matrix[:, 3], OPENGL)
