@@ -278,6 +278,12 @@ _FOREIGN = {
     "metashape": (".xml", ".ply"),
     "reality_capture_csv": (".csv", ".ply"),
     "reality_capture_xmp": (".xmp", ".ply"),
+    "neus": (".npz", ".ply"),
+    "llff": (".npy", ".ply"),
+    "opensfm": (".json",),
+    "nsvf": (".txt", ".ply"),
+    "nerf_plus_plus": (".txt", ".ply"),
+    "mvsnet": ("_cam.txt", ".ply"),
 }
 
 

@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -323,6 +323,130 @@ def write_reality_capture_xmp(
     write_points(folder, capture)
 
 
+def write_neus(
+    folder: Path,
+    capture: Truth,
+    *,
+    scale: float = 2.0,
+    offset: tuple[float, float, float] = (3.0, -1.0, 0.5),
+    name: str = "cameras_sphere.npz",
+    precision: type = np.float64,
+) -> None:
+    """The capture's frame is that of the sphere; the centre of the first pixel is at 0; matrices up to a factor."""
+    write_photos(folder / "image", capture)
+    scale_mat = np.diag([scale, scale, scale, 1.0])
+    scale_mat[:3, 3] = offset
+    matrices = {}
+    for index, viewmat in enumerate(capture.viewmats.numpy()):
+        K = np.eye(4)
+        K[:3, :3] = capture.Ks[index].numpy()
+        K[:2, 2] -= 0.5
+        projection = K @ viewmat @ np.linalg.inv(scale_mat)
+        projection[:3] *= (-1) ** index * (1 + index)
+        matrices |= {f"world_mat_{index}": projection, f"scale_mat_{index}": scale_mat}
+        matrices |= {f"scale_mat_inv_{index}": np.linalg.inv(scale_mat)}
+    np.savez(folder / name, **{key: value.astype(precision) for key, value in matrices.items()})
+    write_points(folder, capture)
+
+
+def write_llff(folder: Path, capture: Truth) -> None:
+    """Principal points are in the middle of the photos."""
+    write_photos(folder / "images", capture)
+    rows = []
+    for index, (w, h) in enumerate(capture.sizes):
+        right, down, forward = capture.rotation(index)
+        hwf = [h, w, float(capture.Ks[index, 0, 0])]
+        matrix = np.stack([down, right, -forward, capture.centers[index], hwf], axis=1)
+        rows.append([*matrix.flatten(), 0.5, 9.0])
+    np.save(folder / "poses_bounds.npy", np.array(rows))
+    write_points(folder, capture)
+
+
+def write_opensfm(
+    folder: Path,
+    capture: Truth,
+    *,
+    kind: str = "brown",
+    coefficients: Mapping[str, float] | None = None,
+    place: str = "reconstruction.json",
+    lla: bool = False,
+) -> None:
+    """A camera for each photo; perspective and fisheye ones have principal points in the middle of the photos."""
+    write_photos(folder / "images", capture)
+    cameras, shots = {}, {}
+    for index, (name, (w, h)) in enumerate(zip(capture.names, capture.sizes, strict=True)):
+        K, longer = capture.Ks[index].tolist(), max(w, h)
+        said: dict[str, object] = {"projection_type": kind, "width": w, "height": h, **(coefficients or {})}
+        if kind in ("perspective", "fisheye"):
+            said["focal"] = K[0][0] / longer
+        else:
+            said |= {"focal_x": K[0][0] / longer, "focal_y": K[1][1] / longer}
+            said |= {"c_x": (K[0][2] - w / 2) / longer, "c_y": (K[1][2] - h / 2) / longer}
+        cameras[f"v2 someone {index}"] = said
+        scalar, *axis = quaternion(capture.viewmats[index, :3, :3])
+        length = math.hypot(*axis)
+        angle = 2 * math.atan2(length, scalar)
+        shots[f"{name}.png"] = {
+            "camera": f"v2 someone {index}",
+            "rotation": [part / length * angle for part in axis],
+            "translation": capture.viewmats[index, :3, 3].tolist(),
+            "orientation": 1,
+            "gps_position": [1.0, 2.0, 3.0],
+        }
+    points = {
+        str(index): {"coordinates": point, "color": [float(part) for part in color]}
+        for index, (point, color) in enumerate(zip(capture.points.tolist(), capture.colors.tolist(), strict=True))
+    }
+    document: dict[str, object] = {"cameras": cameras, "shots": dict(reversed(shots.items())), "points": points}
+    if lla:
+        document["reference_lla"] = {"latitude": 46.5, "longitude": 6.25, "altitude": 400.0}
+    (folder / place).parent.mkdir(parents=True, exist_ok=True)
+    (folder / place).write_text(json.dumps([document]))
+
+
+def write_nsvf(folder: Path, capture: Truth, *, intrinsics: str | None = None) -> None:
+    """One camera for all: photos are of one size."""
+    write_photos(folder / "rgb", capture)
+    (folder / "pose").mkdir()
+    for index, name in enumerate(capture.names):
+        (folder / "pose" / f"{name}.txt").write_text(rows_of(torch.linalg.inv(capture.viewmats[index]).numpy()))
+    K = np.eye(4)
+    K[:3, :3] = capture.Ks[0].numpy()
+    (folder / "intrinsics.txt").write_text(rows_of(K) if intrinsics is None else intrinsics)
+    (folder / "bbox.txt").write_text("-1 -1 -1 1 1 1 0.4\n")
+    write_points(folder, capture)
+
+
+def write_nerf_plus_plus(folder: Path, capture: Truth, *, tested: str = "test", tests: int = 1) -> None:
+    """The first photos are for testing."""
+    for index, (name, photo) in enumerate(zip(capture.names, capture.photos, strict=True)):
+        part = folder / (tested if index < tests else "train")
+        for kind in ("rgb", "pose", "intrinsics"):
+            (part / kind).mkdir(parents=True, exist_ok=True)
+        Image.fromarray(photo).save(part / "rgb" / f"{name}.png")
+        K = np.eye(4)
+        K[:3, :3] = capture.Ks[index].numpy()
+        for kind, matrix in (("pose", torch.linalg.inv(capture.viewmats[index]).numpy()), ("intrinsics", K)):
+            (part / kind / f"{name}.txt").write_text(rows_of(matrix).replace("\n", " "))
+    write_points(folder, capture)
+
+
+def write_mvsnet(folder: Path, capture: Truth, *, photos: str = "images") -> None:
+    write_photos(folder / photos, capture)
+    (folder / "cams").mkdir()
+    for index, name in enumerate(capture.names):
+        extrinsic, K = rows_of(capture.viewmats[index].numpy()), rows_of(capture.Ks[index].numpy())
+        text = f"extrinsic\n{extrinsic}\nintrinsic\n{K}\n0.5 0.01 192 2.5\n"
+        (folder / "cams" / f"{name}_cam.txt").write_text(text)
+    (folder / "cams" / "pair.txt").write_text("1\n0\n1 1 0.5\n")
+    write_points(folder, capture)
+
+
+def rows_of(matrix: np.ndarray) -> str:
+    """A matrix as lines of numbers."""
+    return "".join(" ".join(map(repr, row)) + "\n" for row in matrix.tolist())
+
+
 WRITERS: dict[str, Callable[[Path, Truth], None]] = {
     "polycam": write_polycam,
     "record3d": write_record3d,
@@ -332,4 +456,10 @@ WRITERS: dict[str, Callable[[Path, Truth], None]] = {
     "metashape": write_metashape,
     "reality_capture_csv": write_reality_capture_csv,
     "reality_capture_xmp": write_reality_capture_xmp,
+    "neus": write_neus,
+    "llff": write_llff,
+    "opensfm": write_opensfm,
+    "nsvf": write_nsvf,
+    "nerf_plus_plus": write_nerf_plus_plus,
+    "mvsnet": write_mvsnet,
 }

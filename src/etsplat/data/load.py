@@ -64,7 +64,8 @@ def load_dataset(
     Coordinates of maps are made relative to an origin nearby; `Dataset.georeference` says where that is.
 
     `docs/captures.md` lists the programs whose files are read: COLMAP, nerfstudio, Blender, Polycam, Record3D,
-    RealityCapture, Metashape, Meshroom, OpenMVG, Bundler.
+    RealityCapture, Metashape, Meshroom, OpenMVG, Bundler, OpenSfM, OpenDroneMap, and the layouts of NeuS, LLFF, NSVF,
+    NeRF++ and MVSNet.
 
     Args:
         path: the folder.
@@ -120,7 +121,7 @@ def load_dataset(
         )
     dataset = posed(path, near_origin(path, listing), wanted)
     doubts = (
-        *_other_masks(path, wanted),
+        *_other_masks(path, wanted, listing),
         *_maps_of_some(path, wanted, dataset),
         *lens_notes(dataset),
         *pose_notes(dataset),
@@ -131,9 +132,10 @@ def load_dataset(
     return dataset
 
 
-def _other_masks(path: Path, wanted: Wanted) -> tuple[str, ...]:
-    """A note on a folder that is called nearly as that of masks, where there is none."""
-    if wanted.masks is not None or (path / MASK_FOLDER).is_dir() or not (path / "mask").is_dir():
+def _other_masks(path: Path, wanted: Wanted, listing: Listing) -> tuple[str, ...]:
+    """A note on a folder that is called nearly as that of masks, where there is none and the layout has none there."""
+    known = wanted.masks is not None or any(frame.mask for frame in listing.frames)
+    if known or (path / MASK_FOLDER).is_dir() or not (path / "mask").is_dir():
         return ()
     return (f"mask/ is not read: call it {MASK_FOLDER}/, or name it with --masks, if masks of all images are there",)
 

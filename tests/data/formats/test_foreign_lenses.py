@@ -56,6 +56,14 @@ def metashape_fisheye(x, y):
     return u * grown, v * grown
 
 
+def opensfm_fisheye(x, y):
+    """Theta (1 + k1 theta^2 + k2 theta^4), by its documentation."""
+    r = math.hypot(x, y)
+    angle = math.atan(r)
+    grown = angle * (1 + K1 * angle**2 + K2 * angle**4) / r
+    return x * grown, y * grown
+
+
 def numbers(**values):
     return "".join(f"<{key}>{value!r}</{key}>" for key, value in values.items())
 
@@ -89,6 +97,22 @@ CASES = {
         foreign.write_metashape,
         {"kind": "fisheye", "numbers": numbers(**RADIAL, k4=0.001)},
         metashape_fisheye,
+    ),
+    "opensfm perspective": (
+        foreign.write_opensfm,
+        {"kind": "perspective", "coefficients": {"k1": K1, "k2": K2}},
+        bundler,
+    ),
+    "opensfm brown": (foreign.write_opensfm, {"coefficients": {**RADIAL, "p1": P1, "p2": P2}}, openmvg_brown),
+    "opensfm fisheye": (
+        foreign.write_opensfm,
+        {"kind": "fisheye", "coefficients": {"k1": K1, "k2": K2}},
+        opensfm_fisheye,
+    ),
+    "opensfm fisheye_opencv": (
+        foreign.write_opensfm,
+        {"kind": "fisheye_opencv", "coefficients": {**RADIAL, "k4": 0.001}},
+        by_angle,
     ),
     # Its template for OpenCV writes t2, t1 where OpenCV has p1, p2: t1 goes with r^2 + 2 x^2.
     "reality capture csv": (foreign.write_reality_capture_csv, {"coefficients": (K1, K2, K3, 0, P1, P2)}, metashape),
@@ -127,7 +151,7 @@ def test_points_are_seen_where_the_programs_formula_puts_them(tmp_path, case):
         load_dataset(tmp_path)
 
 
-@pytest.mark.parametrize("case", ["bundler", "openmvg fisheye", "metashape", "reality capture xmp"])
+@pytest.mark.parametrize("case", ["bundler", "openmvg fisheye", "metashape", "reality capture xmp", "opensfm brown"])
 def test_undistort_takes_every_layout(tmp_path, case):
     """A dot that the lens saw is afterwards where a camera without lens sees it; cameras keep their places."""
     pytest.importorskip("pycolmap")
