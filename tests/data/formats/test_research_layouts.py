@@ -14,7 +14,7 @@ from etsplat.data.load import format_of, load_dataset
 from etsplat.data.undistortion import undistort_scene
 from etsplat.io.georeference import Georeference
 from helpers import foreign_captures as foreign
-from helpers.foreign_captures import truth, write_photos
+from helpers.foreign_captures import WRITERS, truth, write_photos
 
 
 def one_size(count=6):
@@ -87,6 +87,22 @@ def test_neus_masks_are_taken_by_their_order(tmp_path):
         load_dataset(tmp_path)
     write_masks(tmp_path / "masks", capture, [f"{name}.png" for name in capture.names])
     assert load_dataset(tmp_path).images.mask(3) is not None
+
+
+@pytest.mark.parametrize("kind", ["neus", "llff", "opensfm", "nsvf", "nerf_plus_plus", "mvsnet"])
+def test_undistort_keeps_cameras_masks_and_split(tmp_path, kind):
+    pytest.importorskip("pycolmap")
+    capture = named(one_size(4), ["0_a", "0_b", "0_c", "2_a"])
+    WRITERS[kind](tmp_path / "scene", capture)
+    write_masks(tmp_path / "scene" / "masks", capture, [f"{name}.png" for name in capture.names])
+    before = load_dataset(tmp_path / "scene")
+    undistort_scene(tmp_path / "scene", tmp_path / "new")
+    after = load_dataset(tmp_path / "new")
+    torch.testing.assert_close(after.viewmats, before.viewmats, atol=1e-6, rtol=0)
+    torch.testing.assert_close(after.Ks, before.Ks, atol=1e-6, rtol=0)
+    tested = {name.removeprefix("test_rgb_") for name in after.names if after.names.index(name) in after.test}
+    assert tested == {before.names[view].removeprefix("test_") for view in before.test}
+    assert after.images.mask(0) is not None
 
 
 def test_the_way_back_to_neus_world_is_kept_by_undistort(tmp_path):
