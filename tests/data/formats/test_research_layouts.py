@@ -72,6 +72,21 @@ def test_world_points_of_neus_are_seen_where_its_matrices_put_them(tmp_path, nam
     torch.testing.assert_close(found.viewmats, capture.viewmats, atol=2e-5, rtol=0)
 
 
+def test_a_turned_sphere_of_neus_has_its_cameras_but_no_way_back(tmp_path):
+    """A georeference cannot turn."""
+    capture = truth()
+    foreign.write_neus(tmp_path, capture)
+    turn = np.eye(4)
+    turn[:2, :2] = [[0.6, -0.8], [0.8, 0.6]]
+    with np.load(tmp_path / "cameras_sphere.npz") as file:
+        matrices = dict(file)
+    changed = {key: matrices[key] @ turn for key in matrices if key.startswith("scale_mat") and "inv" not in key}
+    np.savez(tmp_path / "cameras_sphere.npz", **{**matrices, **changed})
+    found = load_dataset(tmp_path)
+    assert found.georeference is None
+    torch.testing.assert_close(found.viewmats, capture.viewmats @ torch.from_numpy(turn))
+
+
 def test_neus_masks_are_taken_by_their_order(tmp_path):
     """DTU calls them otherwise than their photos; and a note that mask/ is not read would be wrong."""
     capture = truth()
@@ -314,7 +329,8 @@ REFUSED = {
     "neus photos": (without_photos, "no folder image or rgb or images beside it"),
     "neus gap": (neus({"world_mat_0": lambda file: None}), "has no world_mat_0; it must have"),
     "neus scale": (neus({"scale_mat_3": lambda file: None}), "has no scale_mat_3; it must have"),
-    "neus fewer": (neus({"world_mat_4": lambda file: None}), "has 4 poses, but there are 6 photos"),
+    "neus middle": (neus({"world_mat_4": lambda file: None}), "has no world_mat_4; it must have"),
+    "neus fewer": (neus({"world_mat_5": lambda file: None}), "has 5 poses, but there are 6 photos"),
     "neus squashed": (neus({f"scale_mat_{k}": squashed for k in range(6)}), "does not scale all directions alike"),
     "neus frames": (neus({"scale_mat_3": lambda file: 2 * file["scale_mat_3"]}), "camera 3 has another scale_mat"),
     "neus skew": (neus({"world_mat_2": skewed}), "camera 2 has skew"),

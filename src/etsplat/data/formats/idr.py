@@ -66,9 +66,7 @@ def _cameras(path: Path) -> list[Entry]:
     """The matrices of each camera."""
     try:
         names = names_in_npz(path)
-        count = next(index for index in range(len(names) + 1) if f"world_mat_{index}" not in names)
-        if not count:
-            raise ValueError("has no world_mat_0")
+        count = max(1, sum(name.removeprefix("world_mat_").isdecimal() for name in names))
         wanted = [f"{kind}_{index}" for kind in ("world_mat", "scale_mat") for index in range(count)]
         if missing := [name for name in wanted if name not in names]:
             raise ValueError(f"has no {missing[0]}")
