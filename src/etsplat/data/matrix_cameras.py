@@ -9,7 +9,8 @@ from torch import Tensor
 
 from etsplat.core.errors import InputError
 from etsplat.data.frames import Wanted, find_image, pinhole
-from etsplat.data.scene_files import Entry, photos_in, placed_image, size_of
+from etsplat.data.scene_files import Entry, placed_image, size_of
+from etsplat.io.images import photos_in
 
 _SKEW = 1e-4
 """Of the focal length: less than a tenth of a pixel in photos of a thousand, which single precision may leave."""

@@ -1,5 +1,6 @@
 """What readers of other programs' files share: entries with numbers, poses, lenses, and where the images lie now."""
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -13,9 +14,9 @@ from torch import Tensor
 
 from etsplat.core.errors import InputError
 from etsplat.data.frames import Frame, Lens, Points, Wanted, find_image, pinhole
-from etsplat.io.images import IMAGE_SUFFIXES, image_size
+from etsplat.io.images import image_size, photos_in
 from etsplat.io.json_text import parse_json
-from etsplat.io.paths import kind_of, path_within
+from etsplat.io.paths import path_within
 from etsplat.io.ply_tables import GREY, load_points
 
 POINTS = "points.ply"
@@ -63,7 +64,11 @@ class Entry:
         raise self.wrong(f"has {key} = {value!r:.40}, which is not a number; export the poses again")
 
     def numbers(self, key: str, count: int, default: list[float] | None = None) -> Float[Tensor, " N"]:
-        """So many finite numbers, float64: a list, a text with spaces between, or lists in a list.
+        """`floats` as a tensor, float64. Raises InputError as they do."""
+        return torch.tensor(self.floats(key, count, default), dtype=torch.float64)
+
+    def floats(self, key: str, count: int, default: list[float] | None = None) -> list[float]:
+        """So many finite numbers: a list, a text with spaces between, or lists in a list.
 
         Raises:
             InputError: they are missing, fewer, more, or not finite.
@@ -75,8 +80,8 @@ class Entry:
             value = [number for row in value for number in row]
         if isinstance(value, list) and len(value) == count:
             with suppress(OverflowError, ValueError, TypeError):
-                found = torch.tensor([float(number) for number in value], dtype=torch.float64)
-                if bool(found.isfinite().all()):
+                found = [float(number) for number in value]
+                if all(map(math.isfinite, found)):
                     return found
         raise self.wrong(f"has no {key} of {count} finite numbers; export the poses again")
 
@@ -387,9 +392,3 @@ def unplaced_beside(frames: Iterable[Frame]) -> tuple[str, ...]:
         if not path.stem.endswith(("_mask", "_masked"))
     }
     return unplaced_note(len(beside - placed), len(beside | placed))
-
-
-def photos_in(folder: Path) -> list[Path]:
-    """The JPEG and PNG files in a folder by their names, without hidden ones."""
-    files = [path for path in folder.iterdir() if kind_of(path) in IMAGE_SUFFIXES and not path.name.startswith(".")]
-    return sorted(files, key=lambda path: path.name)

@@ -215,6 +215,12 @@ def load_mask(path: Path | str, size: tuple[int, int] | None = None) -> Float[Te
     return mask if (width, height) == (W, H) else resize_image(mask[..., None], width, height)[..., 0]
 
 
+def photos_in(folder: Path) -> list[Path]:
+    """The JPEG and PNG files in a folder by their names, without hidden ones."""
+    files = [path for path in folder.iterdir() if kind_of(path) in IMAGE_SUFFIXES and not path.name.startswith(".")]
+    return sorted(files, key=lambda path: path.name)
+
+
 def image_size(path: Path | str) -> tuple[int, int]:
     """(width, height) of an image file, from its header alone. Raises InputError as `load_image`."""
     with open_image(path) as image:

@@ -18,9 +18,10 @@ from torch import Tensor
 from etsplat.core.errors import InputError
 from etsplat.data.frames import MASK_FOLDER, Frame, Listing, Wanted
 from etsplat.data.matrix_cameras import decomposed, photos_by_order
-from etsplat.data.scene_files import Entry, photos_in, points_beside
+from etsplat.data.scene_files import Entry, points_beside
 from etsplat.io.arrays import load_npz, names_in_npz
 from etsplat.io.georeference import Georeference
+from etsplat.io.images import photos_in
 
 MARK = "cameras_sphere.npz or cameras.npz of NeuS"
 RANK = 10

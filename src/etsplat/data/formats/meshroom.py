@@ -119,6 +119,6 @@ def _points(path: Path, document: Mapping[str, Any]) -> Points | None:
     if not document.get("structure"):
         return None
     found = entries_of(path, document, "structure", "point")
-    places = torch.stack([entry.numbers("X", 3) for entry in found])
-    colors = torch.stack([entry.numbers("color", 3, [128.0, 128.0, 128.0]) for entry in found])
+    places = torch.tensor([entry.floats("X", 3) for entry in found], dtype=torch.float64)
+    colors = torch.tensor([entry.floats("color", 3, [128.0] * 3) for entry in found], dtype=torch.float64)
     return points_of(places, colors)

@@ -117,5 +117,5 @@ def _kinds(path: Path, document: Mapping[str, Any]) -> dict[int, str]:
 def _points(path: Path, document: Mapping[str, Any]) -> Points | None:
     if not document.get("structure"):
         return None
-    places = [entry.numbers("X", 3) for _, entry in _values(path, document, "structure", "point")]
-    return points_of(torch.stack(places), None)
+    places = [entry.floats("X", 3) for _, entry in _values(path, document, "structure", "point")]
+    return points_of(torch.tensor(places, dtype=torch.float64), None)

@@ -133,8 +133,8 @@ def _points(path: Path, part: Mapping[str, Any]) -> Points | None:
     found = list(_objects(path, part, "points", "point").values())
     if not found:
         return None
-    places = torch.stack([entry.numbers("coordinates", 3) for entry in found])
-    colors = torch.stack([entry.numbers("color", 3, [128.0, 128.0, 128.0]) for entry in found])
+    places = torch.tensor([entry.floats("coordinates", 3) for entry in found], dtype=torch.float64)
+    colors = torch.tensor([entry.floats("color", 3, [128.0] * 3) for entry in found], dtype=torch.float64)
     return points_of(places, colors)
 
 
