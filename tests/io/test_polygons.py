@@ -1,5 +1,7 @@
 """Polygons with dents: the triangles that they are cut into fill them, and nothing beside them."""
 
+import struct
+
 import numpy as np
 import pytest
 import torch
@@ -142,3 +144,25 @@ def test_a_ply_whose_corners_are_no_list_is_an_input_error(tmp_path):
     (tmp_path / "a.ply").write_bytes(data.replace(b"list uchar", b"list\0uchar"))
     with pytest.raises(InputError, match=r"a\.ply"):
         load_mesh(tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize("kind", ["ascii", "binary_little_endian", "binary_big_endian"])
+def test_strips_of_a_ply_are_triangles_that_all_look_one_way(tmp_path, kind):
+    """As scans of Stanford and VTK have them; they were refused as clouds of points without faces."""
+    corners = torch.tensor([[x, y, 0.0] for x in range(4) for y in (0.0, 1.0)])
+    strips = [0, 2, 1, 3, -1, 2, 4, 3, 5, 5, 4, 4, 6, 5, 7]  # two, in the second of which corners come twice
+    head = f"ply\nformat {kind} 1.0\nelement vertex 8\nproperty float x\nproperty float y\nproperty float z\n"
+    head += "element tristrips 1\nproperty list int int vertex_indices\nend_header\n"
+    if kind == "ascii":
+        rows = [" ".join(str(number) for number in place) for place in corners.tolist()]
+        body = "\n".join([*rows, " ".join(map(str, [len(strips), *strips]))]).encode()
+    else:
+        order = "<" if kind == "binary_little_endian" else ">"
+        body = struct.pack(f"{order}24f", *corners.flatten().tolist())
+        body += struct.pack(f"{order}{1 + len(strips)}i", len(strips), *strips)
+    (tmp_path / "a.ply").write_bytes(head.encode() + body)
+    mesh = load_mesh(tmp_path / "a.ply")
+    assert (len(mesh.faces), mesh.notes) == (6, ())
+    places = mesh.vertices[mesh.faces]
+    areas = torch.linalg.cross(places[:, 1] - places[:, 0], places[:, 2] - places[:, 0])[:, 2] / 2
+    assert areas.tolist() == [0.5] * 6

@@ -210,7 +210,7 @@ def read_ply(path: Path) -> RawMesh:
             f"mesh {path}: {len(mesh.faces)} faces where its header announces {announced};"
             " the file is cut short or has faces with fewer than three corners: export it again"
         )
-    mesh.file_faces = announced
+    mesh.file_faces = announced or None  # none of what has strips
     names = [line.removeprefix("TextureFile ") for line in read_ply_comments(path) if line.startswith("TextureFile ")]
     if names:
         mesh.texture, mesh.notes = ply_texture(path, names, len(mesh.faces))

@@ -1,4 +1,4 @@
-"""PLY files with polygons of any number of corners, rewritten for readers that know triangles alone."""
+"""PLY files with polygons, or strips of triangles, rewritten for readers that know triangles alone."""
 
 import struct
 from collections.abc import Callable
@@ -14,6 +14,10 @@ from etsplat.io.ply_tables import CORNERS, encode_ply, type_of
 
 _ORDERS = {b"ascii": "", b"binary_little_endian": "<", b"binary_big_endian": ">"}
 _CORNER_NAMES = ("vertex_indices", "vertex_index")
+
+_STRIPS = "tristrips"
+"""The element that scans of Stanford and VTK have in the place of faces: lists of corners, of which each three in turn
+are a triangle, every other one the other way round. After -1 another strip begins."""
 
 Take = Callable[[str, int], tuple[Any, ...]]
 """The next so many numbers of a type in a file."""
@@ -33,7 +37,7 @@ class _Element:
 
 
 def with_triangles(path: Path) -> bytes | None:
-    """A PLY file of the same vertices and faces, each polygon cut into triangles, which have its other numbers.
+    """A PLY file of the same vertices and faces, these cut into triangles, which have their other numbers.
 
     Returns:
         A binary file; None where all faces are triangles, and where the file cannot be read here.
@@ -44,19 +48,22 @@ def with_triangles(path: Path) -> bytes | None:
     data = path.read_bytes()
     try:
         order, elements, start = _header(data)
-        faces = next(element for element in elements if element.name == "face")
+        faces = next(element for element in elements if element.name in ("face", _STRIPS))
         before = elements[: elements.index(faces)]
         name, _, length = faces.properties[0]
         if name not in _CORNER_NAMES or length is None or any(kind[2] for each in before for kind in each.properties):
             return None
-        words = [] if order else data[start:].split()
-        if _are_triangles(data, start, order, before, faces) if order else _are_triangles_in(words, before, faces):
+        words, strips = [] if order else data[start:].split(), faces.name == _STRIPS
+        told = _are_triangles(data, start, order, before, faces) if order else _are_triangles_in(words, before, faces)
+        if told and not strips:
             return None
         take = _of_binary(data, start, order) if order else _of_text(words)
         tables = {each.name: _table(take, each) for each in before}
         loops, numbers = _polygons(take, faces)
+        if strips:
+            loops, numbers = _triangles_of(loops, numbers)
         fewest, most = min(map(len, loops)), max(map(len, loops))
-        if fewest == most == 3:
+        if fewest == most == 3 and not strips:
             return None
         table = _cut(tables["vertex"], loops, numbers) if fewest >= 3 else None
     except (ValueError, IndexError, KeyError, StopIteration, OverflowError, struct.error):
@@ -142,6 +149,22 @@ def _polygons(take: Take, faces: _Element) -> tuple[list[tuple[int, ...]], np.nd
         loops.append(row[0])
         rows.append(tuple(row[at][0] for at, (_, _, length) in enumerate(faces.properties) if length is None))
     return loops, np.array(rows, faces.numbers()) if faces.numbers() else np.empty(len(rows), [])
+
+
+def _triangles_of(strips: list[tuple[int, ...]], numbers: np.ndarray) -> tuple[list[tuple[int, ...]], np.ndarray]:
+    """The triangles of strips, without those that have a corner twice, and the numbers of each one's strip."""
+    loops, rows = list[tuple[int, ...]](), list[int]()
+    for row, strip in enumerate(strips):
+        corners, at = np.array(strip, dtype=np.int64), np.arange(len(strip))
+        begun = np.maximum.accumulate(np.where(corners < 0, at + 1, 0)) if len(at) else at
+        first, second, third = corners[:-2], corners[1:-1], corners[2:]
+        odd = (at - begun)[:-2] % 2 == 1
+        found = np.stack([np.where(odd, second, first), np.where(odd, first, second), third], axis=1)
+        apart = (first != second) & (second != third) & (first != third)
+        whole = found[apart & (found >= 0).all(axis=1)]
+        loops += map(tuple, whole.tolist())
+        rows += [row] * len(whole)
+    return loops, numbers[rows]
 
 
 def _cut(vertices: np.ndarray, loops: list[tuple[int, ...]], numbers: np.ndarray) -> np.ndarray:
