@@ -10,9 +10,9 @@ import torch
 import etsplat
 from etsplat.core.errors import InputError
 from etsplat.data.dataset import Dataset
+from etsplat.data.doubtful_poses import doubts
 from etsplat.data.pictures import StoredPictures
 from etsplat.tasks.reconstruct import reconstruct
-from etsplat.tasks.sources import straight_alpha
 from etsplat.tasks.train import train
 from etsplat.tasks.train_config import TrainConfig
 
@@ -165,10 +165,8 @@ def test_photos_that_are_not_premultiplied_are_spoken_of():
     straight[..., 3] = 0.0
     for photo in (straight, (straight * 255).byte()):
         made = dataset(images=StoredPictures([PHOTO, photo, PHOTO]))
-        assert straight_alpha(made) == [
-            "colours above their alpha in b: photos with alpha must be premultiplied, rgb * alpha"
-        ]
-    assert straight_alpha(dataset(images=StoredPictures([straight * straight[..., 3:]] * 3))) == []
+        assert "colours above their alpha in b: photos with alpha must be premultiplied, rgb * alpha" in doubts(made)
+    assert "alpha" not in str(doubts(dataset(images=StoredPictures([straight * straight[..., 3:]] * 3))))
 
 
 def test_masks_that_leave_out_everything_are_refused(tmp_path):

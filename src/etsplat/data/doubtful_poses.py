@@ -1,4 +1,6 @@
-"""Cameras that can be read, and are none of the photos': no points before them, all at one place, or odd lenses."""
+"""What can be read, and is probably wrong: cameras that are none of the photos', odd lenses, straight alpha."""
+
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float
@@ -30,7 +32,25 @@ _NO_BASELINE = 1e-3
 """Of the distance to the points: cameras that are spread no farther see the same, but for their turns."""
 
 
-def pose_notes(dataset: Dataset) -> tuple[str, ...]:
+def doubts(dataset: Dataset) -> tuple[str, ...]:
+    """What is probably wrong with photos and cameras, a sentence each; whether from files or made in memory."""
+    return (*_alpha_notes(dataset), *_lens_notes(dataset), *_pose_notes(dataset))
+
+
+def with_doubts(dataset: Dataset) -> Dataset:
+    """The same, whose notes say what is probably wrong with it."""
+    return replace(dataset, notes=tuple(dict.fromkeys((*dataset.notes, *doubts(dataset)))))
+
+
+def _alpha_notes(dataset: Dataset) -> tuple[str, ...]:
+    """Of photos that are not premultiplied, though they are to be."""
+    if not (straight := dataset.images.straight):
+        return ()
+    some = ", ".join(dataset.names[index] for index in straight[:3]) + (", ..." if len(straight) > 3 else "")
+    return (f"colours above their alpha in {some}: photos with alpha must be premultiplied, rgb * alpha",)
+
+
+def _pose_notes(dataset: Dataset) -> tuple[str, ...]:
     """What is probably wrong with the poses of a data set with its points, in its own units; () if nothing is."""
     if dataset.exact_points is not None and _look_away(dataset, dataset.exact_points):
         return (
@@ -54,7 +74,7 @@ def pose_notes(dataset: Dataset) -> tuple[str, ...]:
     return ()
 
 
-def lens_notes(dataset: Dataset) -> tuple[str, ...]:
+def _lens_notes(dataset: Dataset) -> tuple[str, ...]:
     """What is probably wrong with focal lengths and principal points, as where they are parts of the photos' sides."""
     sides = torch.tensor(dataset.images.sizes, dtype=dataset.Ks.dtype)
     focal, middle = dataset.Ks[:, [0, 1], [0, 1]], dataset.Ks[:, :2, 2]

@@ -12,7 +12,7 @@ from etsplat.core.errors import InputError
 from etsplat.core.precision import usual_defaults
 from etsplat.data import formats
 from etsplat.data.dataset import Dataset
-from etsplat.data.doubtful_poses import lens_notes, pose_notes
+from etsplat.data.doubtful_poses import with_doubts
 from etsplat.data.frames import DEPTH_FOLDERS, LARGEST, MASK_FOLDER, Listing, MasksAs, Wanted, posed
 from etsplat.data.georeferencing import near_origin
 from etsplat.data.pictures import LazyPictures
@@ -120,13 +120,8 @@ def load_dataset(
             f"depths {folder}: has no map for any photo; call them like their photos: a.png, a.npy or a.exr"
         )
     dataset = posed(path, near_origin(path, listing), wanted)
-    doubts = (
-        *_other_masks(path, wanted, listing),
-        *_maps_of_some(path, wanted, dataset),
-        *lens_notes(dataset),
-        *pose_notes(dataset),
-    )
-    dataset = replace(dataset, notes=(*dataset.notes, *doubts))
+    unread = (*_other_masks(path, wanted, listing), *_maps_of_some(path, wanted, dataset))
+    dataset = with_doubts(replace(dataset, notes=(*dataset.notes, *unread)))
     if preload and isinstance(dataset.images, LazyPictures):
         dataset.images.preload(progress)
     return dataset

@@ -38,8 +38,10 @@ from etsplat.optim.trainer_checks import (
     check_parts,
     checked_background,
     checked_metrics,
+    doubts_before,
     generator_of,
     state_of,
+    tell,
 )
 from etsplat.optim.watch import Outcome, Watch
 
@@ -135,7 +137,7 @@ class Trainer(Generic[M]):
         self.exposure, self.depths, self.guard = exposure or Exposure(NEVER), depths or DepthTrust([]), guard
         self.cameras = cameras or CameraRefinement()
         self._objective, self._dataset, self._batch, self._evaluate = objective, dataset, batch, evaluate
-        self._paces = dict(paces or {})
+        self._paces, self._doubts = dict(paces or {}), doubts_before(dataset, own_rates=schedule is None)
         self._began = generator.get_state()
         self._kernel = getattr(model.appearance, "kernel", None)  # of what is soft at first; None for other models
         self._background = checked_background(background)
@@ -191,7 +193,8 @@ class Trainer(Generic[M]):
 
         Args:
             iterations: length of the run, counted from its start.
-            callbacks: each is called with every event (`optim/loop.py`), in the thread of the caller.
+            callbacks: each is called with every event (`optim/loop.py`), in the thread of the caller. The first are
+                notes of what is probably wrong with the data set, which are warnings where there is no callback.
             log_every: iterations between StepEvents.
             evaluate_every: iterations between evaluations; 0 for one at the end only.
             checkpoint_every: iterations between checkpoints; 0 for one at the end only.
@@ -212,6 +215,9 @@ class Trainer(Generic[M]):
         check_callbacks(callbacks)
         if run_hash is None and (run is not None or workers().count > 1):
             run_hash = self._hash()
+        if not isinstance(run, RunDirectory) and workers().leads:  # of a task, which has told what is to be told
+            tell(self._doubts, callbacks)
+            self._doubts = ()
         with contextlib.ExitStack() as stack:
             stack.enter_context(engine_for(next(iter(self.model.parameters().values()))).looping())
             kept = stack.enter_context(kept_in(run, settings))

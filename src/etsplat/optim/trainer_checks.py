@@ -1,5 +1,6 @@
 """What a trainer refuses before it begins, and what it makes of its arguments."""
 
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, cast
 
@@ -9,10 +10,15 @@ from torch import Tensor
 
 from etsplat.core.validation import check_kind, check_number, shown, whole_number
 from etsplat.data.dataset import Dataset
+from etsplat.data.doubtful_poses import doubts
 from etsplat.model.model import Model
 from etsplat.ops.adam import Adam
+from etsplat.optim.loop import Callback, NoteEvent
 from etsplat.optim.objective import Objective, check_asked
 from etsplat.optim.strategies import Strategy
+
+USUAL_EXTENT = (0.5, 50.0)
+"""Extents of the scenes that absolute rates were made for, generously."""
 
 
 def check_parts(
@@ -55,6 +61,33 @@ def check_parts(
         )
     if unknown := sorted(set(paces) - set(parameters)):
         raise ValueError(f"paces name {', '.join(unknown)}; the model has {', '.join(parameters)}")
+
+
+def doubts_before(dataset: Dataset, *, own_rates: bool) -> tuple[str, ...]:
+    """What a run would go on with, and learn little by, a sentence each.
+
+    Args:
+        dataset: of the run.
+        own_rates: whether nobody has chosen the rates, which are absolute.
+    """
+    low, high = USUAL_EXTENT
+    if not own_rates or dataset.extent == 0 or low <= dataset.extent <= high:
+        return doubts(dataset)
+    return (
+        *doubts(dataset),
+        f"the cameras are spread over {dataset.extent:.4g} units, and the model's own rates are made for {low:g} to "
+        f"{high:g}: dataset.normalized() moves a scene, dataset.renormalized(*etsplat.bounding_sphere(dataset)) an "
+        "object with outlines; or choose rates in schedule",
+    )
+
+
+def tell(sentences: Iterable[str], callbacks: Sequence[Callback]) -> None:
+    """Tells all callbacks; where there are none, Python's warnings."""
+    for sentence in sentences:
+        for callback in callbacks:
+            callback(NoteEvent(sentence))
+        if not callbacks:
+            warnings.warn(sentence, stacklevel=4)  # of who calls `fit`, which is decorated
 
 
 def checked_background(background: Sequence[float] | Tensor | None) -> list[float] | None:

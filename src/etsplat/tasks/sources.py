@@ -16,6 +16,7 @@ from etsplat.data.dataset import Dataset
 from etsplat.data.demo_object import demo_object
 from etsplat.data.demo_scene import HEIGHT, WIDTH, demo_scene
 from etsplat.data.dense_cloud import FEWEST_POINTS, dense_start
+from etsplat.data.doubtful_poses import doubts, with_doubts
 from etsplat.data.frame_gaps import without_frame_gaps
 from etsplat.data.hull import bounding_sphere, check_not_empty
 from etsplat.data.load import load_dataset
@@ -37,14 +38,6 @@ _NEAR, _SMALL, _LARGE = 0.5, 0.25, 2.0
 sphere; the sphere is a rough one."""
 
 _A_FOLDER = "a folder with posed images, and a mesh, a Dataset and a demo have none"
-
-
-def straight_alpha(capture: Dataset) -> list[str]:
-    """A sentence about photos that are not premultiplied, though they are to be; none where all are."""
-    if not (straight := capture.images.straight):
-        return []
-    some = ", ".join(capture.names[index] for index in straight[:3]) + (", ..." if len(straight) > 3 else "")
-    return [f"colours above their alpha in {some}: photos with alpha must be premultiplied, rgb * alpha"]
 
 
 def load_source(
@@ -88,7 +81,7 @@ def load_source(
     if isinstance(source, Dataset):
         close, found = (source, []) if config.refine_cameras != "off" else _closer(source, lambda width: source)
         scene, notes = _in_unit_sphere(close)
-        return scene, [*found, *notes, *straight_alpha(source)]
+        return scene, [*found, *notes, *doubts(source)]
     check_demo(source, "reconstruct")
     if str(source) == DEMO_OBJECT:
         return demo_object(), []
@@ -194,7 +187,7 @@ def load_scene(
         if folder is not None and (isinstance(source, Dataset) or str(source) == DEMO_SCENE):
             raise InputError(f"{name} {folder}: belong to {_A_FOLDER}; leave them out")
     if isinstance(source, Dataset):
-        return source
+        return with_doubts(source)
     given_path("source", source, "a path, a demo's name or a Dataset")
     check_demo(source, "train")
     if str(source) == DEMO_SCENE:

@@ -4,13 +4,10 @@ import torch
 
 from etsplat.core.errors import InputError
 from etsplat.data.dataset import Dataset
+from etsplat.optim.trainer_checks import USUAL_EXTENT
 from etsplat.tasks.pixel_limits import triangle_limit
-from etsplat.tasks.sources import straight_alpha
 from etsplat.tasks.train_config import TrainConfig
 from etsplat.tasks.train_memory import check_memory
-
-USUAL_EXTENT = (0.5, 50.0)
-"""Extents of the scenes that the paper's absolute settings were made for, generously."""
 
 
 def check_train(
@@ -52,7 +49,6 @@ def check_train(
             f"{points:,} points, each of which becomes a triangle: more than the limit of {limit:,}, so that none are"
             " added; thin the points out if these are too many"
         )
-    notes += straight_alpha(capture)
     if capture.images.streamed and not streams:
         notes.append("the photos do not fit into memory: they are decoded anew whenever they are needed")
     if capture.exact_points is None:
