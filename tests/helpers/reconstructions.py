@@ -8,7 +8,7 @@ import torch
 from etsplat.geometry.icosphere import icosphere
 from etsplat.io.mesh_files import MeshFile
 from etsplat.io.run_directory import RunDirectory
-from etsplat.optim.loop import Event, NoteEvent, PrepareEvent
+from etsplat.optim.loop import Event, NoteEvent, PrepareEvent, StageEvent
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 
 TINY = ReconstructConfig.tiny()
@@ -33,7 +33,7 @@ def kill_at(iteration: int) -> Callable[[Event], None]:
     """A callback that dies at the first event of an iteration or later."""
 
     def callback(event: Event) -> None:
-        if not isinstance(event, PrepareEvent | NoteEvent) and event.iteration >= iteration:
+        if not isinstance(event, PrepareEvent | NoteEvent | StageEvent) and event.iteration >= iteration:
             raise KilledError
 
     return callback

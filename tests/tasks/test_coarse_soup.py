@@ -16,6 +16,7 @@ from etsplat.engines.threads import num_threads, set_num_threads
 from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.parts import Shape, shape_of
 from etsplat.model.triangle_mesh import TriangleMesh
+from etsplat.optim.loop import Event, NoteEvent, StageEvent
 from etsplat.tasks.judgement import CLOSED, CONTRADICTED
 from etsplat.tasks.reconstruct import _grown_over, _judge
 from etsplat.tasks.reconstruct_config import ReconstructConfig
@@ -30,12 +31,15 @@ def test_a_hull_that_photos_contradict_is_cut_open_where_a_soup_sees_through_it(
     vertices, faces, views = painted_pictures(*revolved(VASE))
     lidded = open_hollows(views, *visual_hull(views, 1600))
     assert lidded.contradicted > CONTRADICTED
-    told = list[str]()
+    told = list[Event]()
     started = starts.make_start(None, views, CONFIG, tell=told.append)
     assert started.cut == "soup"
     said = "photos contradict the visual hull on (.*) % of its surface: a coarse soup is asked what is free"
-    (sentence,) = told
-    share = re.fullmatch(said, sentence)
+    (sentence,) = [event for event in told if isinstance(event, NoteEvent)]
+    fitted = [event for event in told if isinstance(event, StageEvent) and event.name == "Fitting a coarse soup"]
+    assert [event.done for event in fitted] == list(range(20, 801, 20))
+    assert told.index(sentence) < told.index(fitted[0])
+    share = re.fullmatch(said, str(sentence))
     assert share
     assert float(share[1]) == pytest.approx(2, abs=0.2)  # it differs by what processors round
     assert started.contradicted < 0.5 * lidded.contradicted
@@ -102,10 +106,12 @@ def test_no_start_has_more_faces_than_a_run_may_have(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(starts, "between_walls", lambda *_: lambda points: points[:, 0] * 0 - 1)
     monkeypatch.setattr(starts, "seen_through", lambda *_: lambda points: points[:, 0] * 0 - 1)
     monkeypatch.setattr(starts, "visual_hull", lambda *_, **others: (vertices, faces))
-    monkeypatch.setattr(starts, "_opened", lambda _, v, f: Opened(v, f, 0, 0.0, 1.0, 1.0))
+    monkeypatch.setattr(starts, "_opened", lambda _, v, f, tell: Opened(v, f, 0, 0.0, 1.0, 1.0))
     contradicted = Opened(vertices, faces[:1000], 0, 0.5, 1.0, 0.0)
     config = CONFIG.changed({"max_faces": most})
-    _, cut = starts._cut_open(views, starts.Hull(vertices, faces, 1400, 0.5), contradicted, config, None, None)
+    _, cut = starts._cut_open(
+        views, starts.Hull(vertices, faces, 1400, 0.5), contradicted, config, None, lambda event: None
+    )
     assert bool(cut) == taken
 
 
@@ -120,9 +126,11 @@ def test_a_soup_must_be_clearly_better_than_walls(
     monkeypatch.setattr(starts, "seen_through", lambda *_: lambda points: points[:, 0])
     monkeypatch.setattr(starts, "visual_hull", lambda _, wanted, **others: (vertices, faces[:wanted]))
     shares = {2800: 0.1, 1400: soup}  # contradicted: of walls, which have twice the faces, and of the soup's cut
-    monkeypatch.setattr(starts, "_opened", lambda _, v, f: Opened(v, f, 0, shares[len(f)], 1.0, 1.0))
+    monkeypatch.setattr(starts, "_opened", lambda _, v, f, tell: Opened(v, f, 0, shares[len(f)], 1.0, 1.0))
     contradicted, hull = Opened(vertices, faces, 0, 0.5, 1.0, 0.0), starts.Hull(vertices, faces, 1400, 1.0)
-    best, cut = starts._cut_open(views, hull, contradicted, CONFIG.changed({"max_faces": 6000}), None, None)
+    best, cut = starts._cut_open(
+        views, hull, contradicted, CONFIG.changed({"max_faces": 6000}), None, lambda event: None
+    )
     assert cut == by
     assert len(best.faces) == taken
 

@@ -5,6 +5,7 @@ those at its bottom take its colours. So it sees into what is too deep, or seen 
 pushed in.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import torch
@@ -16,6 +17,7 @@ from etsplat.data.dataset import Dataset
 from etsplat.data.free_space import free_space
 from etsplat.data.visual_hull import Distance, outside_hull
 from etsplat.model.triangle_soup import TriangleSoup
+from etsplat.optim.loop import Event, StageEvent, StepEvent
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.soup_trainer import start_trainer
 from etsplat.tasks.train_config import TrainConfig
@@ -36,7 +38,11 @@ _COVERED = 0.9
 
 
 def seen_through(
-    views: Dataset, vertices: Float[Tensor, "V 3"], config: ReconstructConfig, device: torch.device | None = None
+    views: Dataset,
+    vertices: Float[Tensor, "V 3"],
+    config: ReconstructConfig,
+    device: torch.device | None = None,
+    tell: Callable[[Event], None] | None = None,
 ) -> Distance:
     """How far points are in front of what a soup shows that is fitted to the training views (`free_space`).
 
@@ -45,12 +51,18 @@ def seen_through(
         vertices: (V, 3) of their hull.
         config: of the run: its seed, and whether photos are exposed differently.
         device: where the soup is fitted; None for the CPU.
+        tell: called with how far it is.
     """
     small = reduced(views, LONGEST)
     points = torch.cat([vertices[::2], _within(views, vertices, config.seed)]).double()
     capture = replace(small, exact_points=points, point_colors=torch.full((len(points), 3), _GREY))
     trainer = start_trainer(capture, _settings(config, len(points)), device=device)
-    trainer.fit(STEPS)
+
+    def hear(event: Event) -> None:
+        if tell is not None and isinstance(event, StepEvent):
+            tell(StageEvent("Fitting a coarse soup", event.iteration, event.iterations))
+
+    trainer.fit(STEPS, callbacks=[hear], log_every=20)
     soup = trainer.outcome().model.finished()
     return free_space(small, {view: _depth(soup, small, view) for view in small.train})
 

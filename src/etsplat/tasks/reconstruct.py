@@ -185,7 +185,7 @@ def reconstruct(
             supersampling=config.pictures.supersampling,
             lpips=load_lpips(config.output.lpips_weights, job.device),
         )
-        started = make_start(start, views, config, job.device, lambda text: job.announce(NoteEvent(text)))
+        started = make_start(start, views, config, job.device, job.announce)
         mesh, begun = started.mesh, started.kind
         judging = partial(_judge, scorer, views, truth, config, started, shape_of(*mesh.surface()))
         if begun == "hull":

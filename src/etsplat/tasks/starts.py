@@ -27,6 +27,7 @@ from etsplat.geometry.untangle import untangle
 from etsplat.io.mesh_files import MeshFile, load_exported, weld_vertices
 from etsplat.io.paths import given_path
 from etsplat.model.triangle_mesh import MeshAppearance, TriangleMesh
+from etsplat.optim.loop import Event, NoteEvent, StageEvent
 from etsplat.tasks.coarse_soup import seen_through
 from etsplat.tasks.judgement import CONTRADICTED, Start
 from etsplat.tasks.reconstruct_config import ReconstructConfig
@@ -197,7 +198,7 @@ def make_start(
     views: Dataset,
     config: ReconstructConfig,
     device: torch.device | None = None,
-    tell: Callable[[str], None] | None = None,
+    tell: Callable[[Event], None] = lambda event: None,
 ) -> Started:
     """The mesh that a run starts from, in the unit frame: an icosphere around the object, its hull, or the given mesh.
 
@@ -206,7 +207,7 @@ def make_start(
         views: of the unit frame.
         config: shape, colour, opacity and softness.
         device: of the mesh; None for the CPU.
-        tell: called with a sentence before what takes long.
+        tell: called before what takes long, and while it does. What it raises ends this.
 
     Raises:
         InputError: the hull is asked for, and the views have no masks, or masks that exclude everything.
@@ -215,11 +216,13 @@ def make_start(
     kind: Start = start_shape(config, views) if start is None else "mesh"
     opened, hull, cut = None, None, None
     if kind == "hull":
+        tell(StageEvent("Carving the visual hull", 0, 0))
         hull = plain_hull(views, config)
-        opened = _opened(views, hull.vertices, hull.faces)
+        opened = _opened(views, hull.vertices, hull.faces, tell)
         if opened.contradicted > CONTRADICTED:
             opened, cut = _cut_open(views, hull, opened, config, device, tell)
         faces = opened.faces
+        tell(StageEvent("Untangling the start", 0, 0))
         vertices = with_flat_sides(views, opened.vertices, faces)
         vertices = untangle(vertices, MeshTopology.from_faces(faces, len(vertices)))[0]
     elif start is None:
@@ -243,8 +246,13 @@ def make_start(
     return Started(mesh, kind, opened, hull, cut)
 
 
-def _opened(views: Dataset, vertices: Tensor, faces: Tensor) -> Opened:
-    return open_hollows(views, *without_lids(views, *without_false_handles(views, vertices, faces)))
+def _opened(views: Dataset, vertices: Tensor, faces: Tensor, tell: Callable[[Event], None]) -> Opened:
+    tell(StageEvent("Opening hollows", 0, 3))
+    surface = without_false_handles(views, vertices, faces)
+    tell(StageEvent("Opening hollows", 1, 3))
+    surface = without_lids(views, *surface)
+    tell(StageEvent("Opening hollows", 2, 3))
+    return open_hollows(views, *surface)
 
 
 def _cut_open(
@@ -253,7 +261,7 @@ def _cut_open(
     opened: Opened,
     config: ReconstructConfig,
     device: torch.device | None,
-    tell: Callable[[str], None] | None,
+    tell: Callable[[Event], None],
 ) -> tuple[Opened, Cut]:
     """A hull that photos contradict, cut out between walls, or where a coarse soup sees through it.
 
@@ -263,21 +271,22 @@ def _cut_open(
     photos, most = photos_of(views), hull.uncovered + _RIMS
 
     def cut(free: Distance, wanted: int) -> Opened:
+        tell(StageEvent("Cutting the hull open", 0, 0))
         surface = visual_hull(views, wanted, radius=config.start.radius, thin=hull.thin, free=free)
-        found = _opened(views, *surface) if len(surface[1]) else opened
+        found = _opened(views, *surface, tell) if len(surface[1]) else opened
         covers = _uncovered(photos, found.vertices, found.faces) <= most
         return found if covers and len(found.faces) <= config.max_faces else opened
 
     best, by = opened, False
+    tell(StageEvent("Looking for walls", 0, 0))
     walls = between_walls(views, with_flat_sides(views, opened.vertices, opened.faces), opened.faces)
     if walls is not None:
         best = _clearer(cut(walls, min(2 * hull.wanted, _most_faces(config))), opened)
         by = "walls" if best is not opened else False
     if best.contradicted > CONTRADICTED:
-        if tell is not None:
-            part = f"{100 * opened.contradicted:.1f} % of its surface"
-            tell(f"photos contradict the visual hull on {part}: a coarse soup is asked what is free")
-        ahead, tries = seen_through(views, hull.vertices, config, device), []
+        part = f"{100 * opened.contradicted:.1f} % of its surface"
+        tell(NoteEvent(f"photos contradict the visual hull on {part}: a coarse soup is asked what is free"))
+        ahead, tries = seen_through(views, hull.vertices, config, device, tell), []
         for margin in _MARGINS:
             tries.append(cut(lambda points, margin=margin: ahead(points) - margin, hull.wanted))
             if tries[-1].contradicted <= CONTRADICTED:
