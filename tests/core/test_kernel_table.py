@@ -185,6 +185,8 @@ class TestRefused:
                 r"is off by 0\.\d+ near x=0\.\d+, sigma=.* changes too steeply",
             ),
             (lambda x, s: 0.5, "value must return torch.float64 .* like x, got float"),
+            (lambda x, s: 1.0 if x < 1 else 0.5, "value ended with RuntimeError: .*; x and sigma are tensors .*where"),
+            (lambda x, s: math.exp(-x), "value ended with .*, of which it is to return another, by functions of torch"),
             (lambda x, s: torch.exp(-x.float()), "got torch.float32"),
             (lambda x, s: torch.exp(-x).mean(), r"got torch.float64 \(\)"),
         ],

@@ -1,6 +1,7 @@
 import hashlib
 import math
 import pickle
+import warnings
 
 import numpy as np
 import pytest
@@ -254,3 +255,12 @@ def test_pictures_of_other_programs_are_told_apart(measure):
     with pytest.raises(ValueError, match=r"truth: expected values in \[0, 1\], got others; divide by 255"):
         measure(picture, 255 * picture)
     assert math.isfinite(measure(255 * picture, picture))  # as an optimization may leave it
+
+
+@pytest.mark.parametrize("metric", [psnr, ssim])
+def test_pictures_that_require_gradients_are_measured_without_a_warning(metric, pair):
+    """As they come from a renderer, before a step; torch warns where such a tensor becomes a number."""
+    image, truth = pair
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert metric(image.clone().requires_grad_(), truth) == metric(image, truth)

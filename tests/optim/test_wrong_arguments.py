@@ -397,3 +397,28 @@ def test_a_strategy_that_removes_all_triangles_ends_the_run() -> None:
 def test_settings_out_of_their_range_are_named_where_they_are_given(make: Callable[[], Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         make()
+
+
+def test_a_trainer_says_so_where_somebody_else_has_replaced_tensors_of_its_model() -> None:
+    """As a second Trainer on the same mesh does; the first said that a parameter had no gradient."""
+    mesh = etsplat.TriangleMesh.from_mesh(*etsplat.icosphere(1), colors=0.7, opacity=0.98, sigma=0.25)
+    photometric = etsplat.Objective(etsplat.Photometric())
+    first = etsplat.Trainer(mesh, PHOTOS, photometric)
+    first.fit(1)
+    etsplat.Trainer(mesh, PHOTOS, photometric, etsplat.SubdivideAndUntangle({1: 100})).fit(1)
+    with pytest.raises(ValueError, match=r"model: vertices, colors, opacity_logits were replaced .* Trainer anew"):
+        first.fit(2)
+    again = etsplat.Trainer(mesh, PHOTOS, photometric)
+    with torch.no_grad():
+        mesh.vertices.mul_(1.01)
+    again.fit(1)
+    assert repr(again) == f"Trainer(TriangleMesh of {mesh.count} triangles, {len(PHOTOS.train)} photos, 1 steps)"
+
+
+@pytest.mark.parametrize(
+    ("make", "name"),
+    [(lambda: etsplat.CameraRefinement("poses"), "begin"), (lambda: etsplat.Exposure("auto"), "measured_at")],  # pyright: ignore[reportArgumentType]
+)
+def test_choices_in_the_place_of_iterations_are_named(make: Callable[[], Any], name: str) -> None:
+    with pytest.raises(ValueError, match=f"{name} must be an integer of at least 0, got"):
+        make()

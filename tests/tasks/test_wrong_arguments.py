@@ -53,7 +53,14 @@ def a_mesh() -> etsplat.TriangleMesh:
         (lambda: etsplat.train(None, "run"), "source: is None; it must be a path, a demo's name or a Dataset"),
         (lambda: etsplat.train("demo:scene", None), "out: is None; it must be the path of a folder"),
         (lambda: etsplat.export(None, "a.glb"), "source: is None; it must be a result of train or reconstruct, a T"),
-        (lambda: etsplat.export(a_mesh(), "a.glb"), r"source: .* TriangleMesh, and no soup; .*etsplat\.save_mesh"),
+        (
+            lambda: etsplat.export(a_mesh(), "a.glb"),
+            r"source: .* TriangleMesh, and no soup; mesh\.save\('a\.glb'\) writes",
+        ),
+        (
+            lambda: etsplat.export(a_mesh().to_file(), "a.glb"),
+            r"MeshFile, and no soup; etsplat\.save_mesh\('a\.glb', mesh",
+        ),
         (lambda: etsplat.export("run", None), "path: is None; it must be the path of a file"),
         (lambda: etsplat.load_image(None), "path: is None; it must be the path of an image"),
         (lambda: etsplat.load_mesh(None), "path: is None; it must be a path"),
@@ -101,3 +108,14 @@ def test_numbers_of_numpy_are_numbers() -> None:
     assert (type(config.iterations), type(config.densification.growth), type(config.asset)) == (int, float, bool)
     with pytest.raises(InputError, match=r"iterations: is 5\.5; it must be a whole number"):
         etsplat.TrainConfig.tiny().changed({"iterations": np.float64(5.5)})
+
+
+def test_a_scorer_makes_the_folder_that_it_draws_into(tmp_path: Path) -> None:
+    """Also by its name, which ended in an operator of str."""
+    photos = etsplat.photograph(etsplat.demo_object(), 16, 16, elevations=(0.0,), azimuths=5, supersampling=1)
+    scorer = etsplat.Scorer(photos, "cpu")
+    scores = scorer.full(a_mesh(), str(tmp_path / "a" / "b"))
+    assert [view["name"] for view in scores["test_views"]] == [photos.names[view] for view in photos.test]
+    assert len(list((tmp_path / "a" / "b").glob("*.png"))) == 3 * len(photos.test)
+    with pytest.raises(InputError, match="folder: is None; it must be the path of a folder"):
+        scorer.full(a_mesh(), None)  # pyright: ignore[reportArgumentType]

@@ -154,7 +154,13 @@ class _Function:
 
     def _call(self, x: Tensor, sigma: Tensor) -> Tensor:
         x, sigma = torch.broadcast_tensors(x.double(), sigma.double().clamp(min=SIGMA_FLOOR))
-        result = self.function(x, sigma)
+        try:
+            result = self.function(x, sigma)
+        except Exception as error:  # whatever a user's function raises that takes one number at a time
+            raise ValueError(
+                f"kernel {self.name!r}: value ended with {type(error).__name__}: {error}; x and sigma are tensors of"
+                " one shape, of which it is to return another, by functions of torch: torch.where in the place of if"
+            ) from error
         if not isinstance(result, Tensor) or result.shape != x.shape or result.dtype != x.dtype:
             got = f"{result.dtype} {tuple(result.shape)}" if isinstance(result, Tensor) else type(result).__name__
             raise ValueError(f"kernel {self.name!r}: value must return {x.dtype} {tuple(x.shape)} like x, got {got}")

@@ -45,6 +45,7 @@ _WEIGHTS = {
 
 
 @one_torch_thread()
+@torch.no_grad()
 def psnr(image: Float[Tensor, "H W C"], truth: Float[Tensor, "H W C"]) -> float:
     """Peak signal-to-noise ratio in dB, -10 log10 mean((image - truth)^2), peak 1, in float (no rounding to 8 bits).
 
@@ -128,6 +129,7 @@ def silhouette_iou(coverage: Float[Tensor, "H W"], truth: Float[Tensor, "H W"]) 
 
 
 @one_torch_thread()
+@torch.no_grad()
 def ssim(image: Float[Tensor, "H W C"], truth: Float[Tensor, "H W C"], *, interior: bool = False) -> float:
     """Structural similarity (Wang et al. 2004): 11x11 Gaussian window of sigma 1.5, C1 = 0.01^2, C2 = 0.03^2, peak 1.
 

@@ -19,7 +19,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from etsplat.core.cameras import Cameras
-from etsplat.core.validation import check_choice
+from etsplat.core.validation import check_choice, check_count
 from etsplat.data.dataset import Dataset
 from etsplat.data.loader import View
 from etsplat.ops.adam import Adam
@@ -101,7 +101,12 @@ class CameraRefinement:
             end: likewise.
             rate: parts of the picture's longer side, each time that a photo is seen.
             lenses: whether focal lengths and principal points are learned too.
+
+        Raises:
+            ValueError: an iteration is none; `of` takes a choice by name.
         """
+        for name, iteration in (("begin", begin), ("judged", judged), ("end", end)):
+            check_count(name, iteration, least=0)
         self.begin, self.judged, self.end, self.active = begin, judged, end, False
         self._rate, self._lenses = rate, lenses
 

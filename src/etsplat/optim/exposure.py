@@ -21,6 +21,7 @@ from torch import Tensor
 
 from etsplat.core.cameras import camera_centers
 from etsplat.core.rasterization import Rasterization
+from etsplat.core.validation import check_count
 from etsplat.core.workers import workers
 from etsplat.data.loader import View
 from etsplat.data.pictures import as_float
@@ -112,7 +113,14 @@ class Exposure:
                 what they explain does not count.
             rate: how far a number of a photo moves each time that the photo is seen.
             weight: of what holds the numbers near zero.
+
+        Raises:
+            ValueError: an iteration is none; `of` takes a choice by name.
         """
+        measured_at, again_at = (
+            check_count("measured_at", measured_at, least=0),
+            check_count("again_at", again_at, least=0),
+        )
         self.measured_at, self.again_at, self.learned = measured_at, again_at, False
         self.explained: float | None = None
         self._needed, self._by_direction, self._rate, self._weight = needed, by_direction, rate, weight

@@ -36,6 +36,7 @@ from etsplat.optim.trainer_checks import (
     check_callbacks,
     check_edited,
     check_parts,
+    check_unreplaced,
     checked_background,
     checked_metrics,
     doubts_before,
@@ -209,10 +210,12 @@ class Trainer(Generic[M]):
         Raises:
             DivergedError: a loss or parameter is not finite; no triangle is left.
             InputError: a checkpoint is damaged or of another run; somebody else writes the run; the disk is full.
-            ValueError: a number is out of its range; `callbacks` are no functions; `evaluate` returned no numbers.
+            ValueError: a number is out of its range; `callbacks` are no functions; `evaluate` returned no numbers;
+                somebody else has replaced tensors of the model.
         """
         settings = LoopSettings(iterations, log_every, evaluate_every, checkpoint_every)
         check_callbacks(callbacks)
+        check_unreplaced(self.model, self.adam)
         if run_hash is None and (run is not None or workers().count > 1):
             run_hash = self._hash()
         if not isinstance(run, RunDirectory) and workers().leads:  # of a task, which has told what is to be told
@@ -230,6 +233,10 @@ class Trainer(Generic[M]):
         Another `fit` goes on from there.
         """
         self.progress.ending = True
+
+    def __repr__(self) -> str:
+        model = f"{type(self.model).__name__} of {self.count:,} triangles"
+        return f"Trainer({model}, {len(self._dataset.train)} photos, {self.progress.iteration} steps)"
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "Trainer[M]":
         twin = memo[id(self)] = object.__new__(type(self))

@@ -140,6 +140,15 @@ def check_callbacks(callbacks: object) -> None:
             raise ValueError(f"callbacks[{index}] must be a function of an event, got {shown(callback)}")
 
 
+def check_unreplaced(model: Model, adam: Adam) -> None:
+    """Raises ValueError where tensors of the model are no longer those that its optimizer moves."""
+    if apart := [name for name, tensor in model.parameters().items() if adam.parameters.get(name) is not tensor]:
+        raise ValueError(
+            f"model: {', '.join(apart)} were replaced since this Trainer was made, by load_state, another Trainer or an"
+            " assignment: make a Trainer anew, or change values in place, within torch.no_grad()"
+        )
+
+
 def check_edited(
     strategy: Strategy, iteration: int, edited: bool, before: Mapping[str, Tensor], model: Model, adam: Adam
 ) -> None:

@@ -60,8 +60,9 @@ def export(
             raise InputError(f"{name}: belongs to a run of reconstruct; take etsplat.texture_mesh")
     path = given_path("path", path, "the path of a file")
     if isinstance(source, TriangleMesh | MeshFile):
-        how = "etsplat.texture_mesh gives it a texture, etsplat.save_mesh writes a mesh as it is"
-        raise InputError(f"source: is of type {type(source).__name__}, and no soup; {how}")
+        writes = f"etsplat.save_mesh({path.name!r}, mesh.vertices, mesh.faces, mesh.face_colors)"
+        how = f"mesh.save({path.name!r})" if isinstance(source, TriangleMesh) else writes
+        raise InputError(f"source: is of type {type(source).__name__}, and no soup; {how} writes a mesh as it is")
     if isinstance(source, TriangleSoup):
         soup = source.finished().to(torch.device("cpu"))
         return export_soup(SoupRun(path.parent, soup, capture_at(scene)), path, config)

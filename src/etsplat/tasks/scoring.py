@@ -27,6 +27,7 @@ from etsplat.geometry.intersections import count_degenerate_faces, count_self_in
 from etsplat.io.atomic import write_error
 from etsplat.io.images import save_image, to_8_bit
 from etsplat.io.mesh_files import MeshFile
+from etsplat.io.paths import given_path
 from etsplat.metrics.flip import flip
 from etsplat.metrics.geometry import SAMPLES, Surface, chamfer, geometry_metrics, sample_pair
 from etsplat.metrics.image import WINDOW, Lpips, find_lpips_weights, psnr, silhouette_iou, ssim
@@ -125,17 +126,23 @@ class Scorer:
             scores["chamfer"] = chamfer(*pair, queries=self._samples // 10)
         return scores
 
-    def full(self, model: Model, folder: Path) -> dict[str, Any]:
+    def full(self, model: Model, folder: Path | str) -> dict[str, Any]:
         """For metrics.json; draws the test views into `folder` on the way.
 
         Args:
             model: what to measure.
-            folder: gets NNN_render.png, NNN_truth.png and NNN_<model.OPAQUE>.png for every test view.
+            folder: gets NNN_render.png, NNN_truth.png and NNN_<model.OPAQUE>.png for every test view; made if it is
+                missing.
 
         Returns:
             Means over the test views, and what was found of each, null where there are none; geometry, null where there
             is no true mesh.
+
+        Raises:
+            InputError: `folder` is no path, or a picture cannot be written.
         """
+        folder = given_path("folder", folder, "the path of a folder")
+        folder.mkdir(parents=True, exist_ok=True)
         rows: list[dict[str, Any]] = []
         for number, index in enumerate(self._dataset.test):
             seen = self.see(model, index)
