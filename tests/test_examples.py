@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from safetensors.torch import load_file
 
 import etsplat
 
@@ -107,6 +108,22 @@ def test_the_trainer_of_the_documents_runs(tmp_path: Path) -> None:
     assert etsplat.TriangleMesh.load(tmp_path / "owl.glb").count > 1280
 
 
+def test_state_goes_to_a_file_and_to_another_model(tmp_path: Path) -> None:
+    """docs/library.md: of one's own loop; and a checkpoint has it as the page says."""
+    same = "print(again.count, again.vertices.equal(mesh.vertices), adam.step_count)"
+    assert run(["-c", code_of("docs/library.md", "torch.save(") + same], tmp_path).split() == ["320", "True", "1"]
+
+
+def test_a_job_of_the_documents_runs_and_can_be_ended(tmp_path: Path) -> None:
+    """docs/library.md: a service, whose output is bytes and a sentence."""
+    code = code_of("docs/library.md", "mesh_of(")
+    late = "try:\n    mesh_of(photos, seconds=0)\nexcept TooLongError as error:\n    print('ended:', error)"
+    assert run(["-c", code.rpartition("glb, verdict")[0] + late], tmp_path).startswith("ended: ")
+    written, verdict = run(["-c", f"{code}print(len(glb), verdict)"], tmp_path).split(maxsplit=1)
+    assert int(written) > 1000
+    assert verdict.startswith(("good", "poor"))
+
+
 def test_the_call_of_the_readme_runs(tmp_path: Path) -> None:
     """As it stands: it leaves nothing to its readers."""
     code = code_of("README.md", "etsplat.rasterize(")
@@ -127,6 +144,9 @@ def test_the_pieces_of_ones_own_of_the_documents_run(tmp_path: Path) -> None:
     loss = code_of(page, "Custom(").replace("fit(100", "fit(4")
     printed = run(["-c", loss + code_of(page, "class Thin") + "print(soup.count)"], tmp_path)
     assert printed.splitlines()[-1] == "1620"
+    assert run(["-c", code_of(page, "class Grow")], tmp_path).split() == ["551"]
+    checkpoint = load_file(max((tmp_path / "runs" / "grown" / "checkpoints").iterdir()))
+    assert (len(checkpoint["model.vertices"]), len(checkpoint["strategy.weight"])) == (551, 551)
 
 
 def test_the_notebook_runs(tmp_path: Path) -> None:

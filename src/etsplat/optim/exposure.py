@@ -117,11 +117,8 @@ class Exposure:
         Raises:
             ValueError: an iteration is none; `of` takes a choice by name.
         """
-        measured_at, again_at = (
-            check_count("measured_at", measured_at, least=0),
-            check_count("again_at", again_at, least=0),
-        )
-        self.measured_at, self.again_at, self.learned = measured_at, again_at, False
+        self.measured_at = check_count("measured_at", measured_at, least=0)
+        self.again_at, self.learned = check_count("again_at", again_at, least=0), False
         self.explained: float | None = None
         self._needed, self._by_direction, self._rate, self._weight = needed, by_direction, rate, weight
 
