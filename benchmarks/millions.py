@@ -20,7 +20,7 @@ from typing import Any
 import torch
 
 from etsplat.core.cameras import Cameras
-from etsplat.model.soup_import import open_soup
+from etsplat.model.soup_import import load_soup
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.tasks.export_config import ExportConfig
 from etsplat.tasks.export_soup import export_soup
@@ -60,7 +60,7 @@ def make_soup(count: int, degree: int) -> TriangleSoup:
 def act(step: str, folder: Path) -> None:
     """One step, in a process of its own."""
     if step == FINDING:
-        open_soup(folder / "soup.etz")
+        load_soup(folder / "soup.etz")
         return
     run = open_run(folder / "soup.safetensors", device="cpu")
     if step in STEPS:

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from etsplat.core.cameras import Cameras
 from etsplat.metrics.image import psnr
-from etsplat.model.soup_import import open_soup
+from etsplat.model.soup_import import load_soup
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.tasks.export_config import ExportConfig
 from etsplat.tasks.export_soup import export_soup
@@ -101,7 +101,7 @@ def rows_of(run: SoupRun, folder: Path, page: Page) -> list[tuple[str, str]]:
     export_soup(run, compact, ExportConfig())
     seconds = time.perf_counter() - begin
     export_soup(run, html, ExportConfig())
-    exact, found = psnr_of(run, run.soup), open_soup(compact)
+    exact, found = psnr_of(run, run.soup), load_soup(compact)
     rows = [
         ("triangles, of the opaque mesh", f"{len(run.soup):,}, {0 if run.solid is None else len(run.solid):,}"),
         (".safetensors", _size(run.folder / "soup.safetensors")),
@@ -113,7 +113,7 @@ def rows_of(run: SoupRun, folder: Path, page: Page) -> list[tuple[str, str]]:
     for share in (0.75, 0.5, 0.25, 0.1):
         part = folder / "part.etz"
         count = cut(compact, part, share)
-        rows.append((f"of the first {share:.0%} or more: {count:,}", f"{psnr_of(run, open_soup(part)):.2f} dB"))
+        rows.append((f"of the first {share:.0%} or more: {count:,}", f"{psnr_of(run, load_soup(part)):.2f} dB"))
     return rows + drawn(run, html, page)
 
 

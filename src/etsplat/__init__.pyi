@@ -47,6 +47,7 @@ from etsplat.metrics.image import psnr as psnr
 from etsplat.metrics.image import silhouette_iou as silhouette_iou
 from etsplat.metrics.image import ssim as ssim
 from etsplat.model.soup_appearance import SoupAppearance as SoupAppearance
+from etsplat.model.soup_import import load_soup as load_soup
 from etsplat.model.soup_init import StartPoints as StartPoints
 from etsplat.model.soup_init import start_soup as start_soup
 from etsplat.model.textured_mesh import TextureAppearance as TextureAppearance

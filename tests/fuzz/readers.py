@@ -29,7 +29,7 @@ from etsplat.io.point_clouds import load_cloud
 from etsplat.io.refined_camera_files import read_refined_cameras
 from etsplat.io.run_directory import RunDirectory, is_run
 from etsplat.metrics.image import Lpips
-from etsplat.model.soup_import import open_soup
+from etsplat.model.soup_import import load_soup
 from etsplat.optim.checkpoints import load_latest_checkpoint
 from etsplat.tasks.opened_runs import open_run
 from tests.fuzz import corpus
@@ -147,7 +147,7 @@ def _camera_path(path: Path) -> None:
 
 
 def _soup(path: Path) -> None:
-    soup = open_soup(path)
+    soup = load_soup(path)
     assert all(parameter.isfinite().all() for parameter in soup.parameters().values())
     assert soup.render(CAMERA).color.shape == (1, 12, 16, 3)
 

@@ -12,7 +12,7 @@ from etsplat.io.compact_soups import CHUNK, encode_compact, enlargement
 from etsplat.metrics.image import psnr
 from etsplat.model.soup_appearance import SoupAppearance
 from etsplat.model.soup_compact import CUT_SHORT, compact_of, importance, ranks
-from etsplat.model.soup_import import open_soup
+from etsplat.model.soup_import import load_soup
 from etsplat.model.triangle_soup import TriangleSoup
 
 CAMERA = etsplat.orbit_cameras(64, 48, azimuths=1)[0]
@@ -35,7 +35,7 @@ def make_soup(rng, count=200, degree=3, **appearance):
 
 def written(soup, path, order=None):
     path.write_bytes(encode_compact(compact_of(soup, importance(soup) if order is None else order)))
-    return open_soup(path)
+    return load_soup(path)
 
 
 @pytest.mark.parametrize(
@@ -114,7 +114,7 @@ def test_a_part_of_a_soup_says_that_it_is_one(tmp_path, rng):
     soup = make_soup(rng, CHUNK + 10, degree=0)
     written(soup, path := tmp_path / "soup.etz")
     path.write_bytes(path.read_bytes()[:-1])
-    found = open_soup(path)
+    found = load_soup(path)
     assert len(found) == CHUNK
     assert found.notes[CUT_SHORT] == f"{CHUNK:,} of {CHUNK + 10:,} triangles"
     lowest = importance(soup).sort(descending=True).values[CHUNK - 1]
@@ -144,4 +144,4 @@ def test_an_appearance_that_cannot_be_drawn_is_refused(tmp_path, rng, appearance
     compact = replace(compact_of(soup, importance(soup)), appearance=appearance)
     (tmp_path / "soup.etz").write_bytes(encode_compact(compact))
     with pytest.raises(InputError, match=message):
-        open_soup(tmp_path / "soup.etz")
+        load_soup(tmp_path / "soup.etz")

@@ -6,6 +6,7 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
+import etsplat
 from etsplat.core.errors import InputError
 from etsplat.model.soup_appearance import SoupAppearance
 from etsplat.model.triangle_soup import TriangleSoup
@@ -69,3 +70,14 @@ def test_a_kernel_that_is_not_known_is_an_input_error(tmp_path, soup, kernel):
     save_file(load_file(path), path, metadata=metadata)
     with pytest.raises(InputError, match=r"soup\.safetensors.*kernel"):
         TriangleSoup.load(path)
+
+
+@pytest.mark.parametrize("kind", ["ply", "etz", "glb"])
+def test_files_of_other_kinds_are_read_by_their_reader(tmp_path, kind):
+    """`load` said that a header was too large."""
+    path = tmp_path / f"soup.{kind}"
+    triangles = TriangleSoup.from_triangles(torch.rand(9, 3, 3), 0.5, opacity=0.9, sigma=0.5, sh_degree=0)
+    etsplat.export(triangles, path)
+    with pytest.raises(InputError, match=r"is no \.safetensors; etsplat\.load_soup reads other kinds of files"):
+        TriangleSoup.load(path)
+    assert len(etsplat.load_soup(path)) == 9

@@ -12,7 +12,7 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 from etsplat.core.errors import InputError
-from etsplat.model.soup_import import open_soup
+from etsplat.model.soup_import import load_soup
 from etsplat.model.triangle_soup import TriangleSoup
 
 GAUSSIAN = [*"xyz", *(f"f_dc_{k}" for k in range(3)), "opacity"]
@@ -34,13 +34,13 @@ def test_of_a_file_that_holds_no_soup_all_kinds_are_told_that_do(tmp_path):
     """Not those of meshes alone."""
     (tmp_path / "notes.txt").touch()
     with pytest.raises(InputError, match=r"soup .*notes\.txt: .* \.safetensors, \.etz, \.pt, .*\.glb.* a run's folder"):
-        open_soup(tmp_path / "notes.txt")
+        load_soup(tmp_path / "notes.txt")
 
 
 @pytest.mark.parametrize("count", [0, 9, 24, 45])
 def test_a_gaussian_scene_may_have_harmonics_of_any_degree(tmp_path, count):
     write_gaussians(tmp_path / "gaussians.ply", [*GAUSSIAN, *rest(count)])
-    assert open_soup(tmp_path / "gaussians.ply").sh_rest.shape == (5, count // 3, 3)
+    assert load_soup(tmp_path / "gaussians.ply").sh_rest.shape == (5, count // 3, 3)
 
 
 def test_flat_gaussians_have_two_axes(tmp_path):
@@ -52,7 +52,7 @@ def test_flat_gaussians_have_two_axes(tmp_path):
         rows = values if name == "flat" else np.hstack([values, np.full((5, 1), -20.0, "<f4")])
         text = f"ply\nformat binary_little_endian 1.0\nelement vertex 5\n{header}end_header\n"
         (tmp_path / f"{name}.ply").write_bytes(text.encode() + rows.tobytes())
-    flat_soup, thin_soup = (open_soup(tmp_path / f"{name}.ply") for name in ("flat", "thin"))
+    flat_soup, thin_soup = (load_soup(tmp_path / f"{name}.ply") for name in ("flat", "thin"))
     torch.testing.assert_close(flat_soup.vertices, thin_soup.vertices, rtol=0, atol=0)
 
 
@@ -73,7 +73,7 @@ def test_flat_gaussians_have_two_axes(tmp_path):
 def test_a_gaussian_scene_with_other_properties_is_refused_by_name(tmp_path, properties, message):
     write_gaussians(tmp_path / "gaussians.ply", properties)
     with pytest.raises(InputError, match=rf"gaussians\.ply.*{message}"):
-        open_soup(tmp_path / "gaussians.ply")
+        load_soup(tmp_path / "gaussians.ply")
 
 
 @pytest.mark.parametrize(
@@ -97,10 +97,10 @@ def test_an_exported_soup_without_a_property_is_refused_by_name(tmp_path, corner
     face = b"\3" + np.array([0, 1, 2], "<i4").tobytes() + np.full(len(of_face), 0.5, "<f4").tobytes()
     (tmp_path / "soup.ply").write_bytes("\n".join(lines).encode() + table + face)
     if message is None:
-        assert len(open_soup(tmp_path / "soup.ply")) == 1
+        assert len(load_soup(tmp_path / "soup.ply")) == 1
     else:
         with pytest.raises(InputError, match=rf"soup\.ply: .*{message}"):
-            open_soup(tmp_path / "soup.ply")
+            load_soup(tmp_path / "soup.ply")
 
 
 APPEARANCES = [
@@ -143,10 +143,10 @@ def rewrite(path, appearance):
 def test_a_soup_that_cannot_be_drawn_as_it_says_is_refused(tmp_path, appearance):
     path = tmp_path / "soup.safetensors"
     rewrite(path, {"near_plane": 0.5, "background": [0, 0.5, 1], "added_later": "x"})
-    assert open_soup(path).appearance.near_plane == 0.5
+    assert load_soup(path).appearance.near_plane == 0.5
     rewrite(path, appearance)
     with pytest.raises(InputError, match=r"soup\.safetensors: cannot be read") as raised:
-        open_soup(path)
+        load_soup(path)
     assert "\n" not in str(raised.value)
 
 
@@ -185,10 +185,10 @@ def test_odd_entries_of_triangle_splatting_are_refused(tmp_path, entries):
     """One of them claims 3.6 GB, with a stride of 0."""
     path = tmp_path / "point_cloud_state_dict.pt"
     torch.save(state(), path)
-    assert len(open_soup(path)) == 10
+    assert len(load_soup(path)) == 10
     torch.save(state(**entries), path)
     with pytest.raises(InputError, match=r"soup .*\.pt") as raised:
-        open_soup(path)
+        load_soup(path)
     assert "\n" not in str(raised.value)
 
 
@@ -201,7 +201,7 @@ def test_a_state_that_unpacks_to_more_than_its_file_is_refused_unread(tmp_path, 
     assert packed.stat().st_size < path.stat().st_size / 100
     monkeypatch.setattr(torch, "load", None)
     with pytest.raises(InputError, match=r"packed\.pt: cannot be read"):
-        open_soup(packed)
+        load_soup(packed)
 
 
 @pytest.mark.parametrize("size", [2**31, 2**63, 2**64 - 1])
@@ -210,4 +210,4 @@ def test_a_header_of_safetensors_longer_than_the_file_is_refused(tmp_path, size)
     data = (tmp_path / "soup.safetensors").read_bytes()
     (tmp_path / "soup.safetensors").write_bytes(struct.pack("<Q", size) + data[8:])
     with pytest.raises(InputError, match="cannot be read"):
-        open_soup(tmp_path / "soup.safetensors")
+        load_soup(tmp_path / "soup.safetensors")

@@ -14,7 +14,7 @@ from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.triangle_atlas import pack_triangles
 from etsplat.io.mesh_files import load_mesh, save_mesh
 from etsplat.io.textures import Texture
-from etsplat.model.soup_import import open_soup
+from etsplat.model.soup_import import load_soup
 from etsplat.model.textured_mesh import TexturedMesh
 
 CAMERAS = etsplat.orbit_cameras(40, 30, azimuths=2)[:2]
@@ -118,7 +118,7 @@ def test_a_soup_of_a_textured_file_has_the_colours_of_its_texture(mesh, tmp_path
     with torch.no_grad():
         mesh.texture[:] = torch.tensor([0.9, 0.4, 0.1])
     mesh.save(tmp_path / f"ball.{kind}")
-    soup = open_soup(tmp_path / f"ball.{kind}")
+    soup = load_soup(tmp_path / f"ball.{kind}")
     assert len(soup) == mesh.count
     colors = 0.5 + 0.28209479 * soup.sh_dc[:, 0]
     torch.testing.assert_close(colors, torch.tensor([0.9, 0.4, 0.1]).expand_as(colors), atol=0.01, rtol=0)

@@ -17,7 +17,7 @@ from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.regions import Box, Sphere
 from etsplat.geometry.similarity import Similarity, rotation_between
 from etsplat.io.mesh_files import load_mesh
-from etsplat.model.soup_import import open_soup
+from etsplat.model.soup_import import load_soup
 from etsplat.model.surroundings import Surroundings
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.tasks.export_config import ExportConfig
@@ -88,7 +88,7 @@ def test_the_sky_of_a_glb_is_a_node_and_a_material_of_its_own_seen_from_inside(t
     assert [(m["name"], m["doubleSided"]) for m in document["materials"]] == [("opaque", True), ("sky", False)]
     bounds = document["accessors"][document["meshes"][0]["primitives"][0]["attributes"]["POSITION"]]
     assert max(bounds["max"]) < 10  # what a viewer frames is not the sky's
-    returned = open_soup(tmp_path / "a.glb")
+    returned = load_soup(tmp_path / "a.glb")
     drawn = [soup.render_opaque(CAMERA) for soup in (returned, run.soup)]
     assert difference(*drawn) < 6 / 255  # trimesh keeps linear light in 8 bits
     assert float(drawn[0][..., 3].min()) == 1
@@ -101,7 +101,7 @@ def test_the_sky_of_an_obj_is_an_object_and_other_kinds_of_files_are_without_it(
     lines = (tmp_path / "a.obj").read_text().splitlines()
     assert [line for line in lines if line.startswith("o ")] == ["o a", "o sky"]
     assert [line[0] for line in lines[lines.index("o sky") :]].count("f") == 320
-    assert torch.equal(open_soup(tmp_path / "a.obj").vertices[:50], run.soup.vertices[:50])
+    assert torch.equal(load_soup(tmp_path / "a.obj").vertices[:50], run.soup.vertices[:50])
     counts = {}
     for name, config in {
         "a.ply": ExportConfig(),
@@ -116,7 +116,7 @@ def test_the_sky_of_an_obj_is_an_object_and_other_kinds_of_files_are_without_it(
     }.items():
         written = export_soup(run, tmp_path / name, config)
         assert written.sky == 0
-        assert len(open_soup(tmp_path / name)) == written.triangles == 370 - written.removed.get("sky", 0)
+        assert len(load_soup(tmp_path / name)) == written.triangles == 370 - written.removed.get("sky", 0)
         counts[name] = written.triangles
     with_sky = {name for name, count in counts.items() if count == 370}
     assert with_sky == {"b.ply", "c.ply", "c.glb", "b.safetensors"}
@@ -182,7 +182,7 @@ def test_a_file_that_is_opened_lies_in_the_frame_of_its_capture(tmp_path, soup, 
     first = export_soup(run, tmp_path / f"a.{kind}", config)
     assert not torch.equal(first.transform.rotation, torch.eye(3, dtype=torch.float64))
     near = {"rtol": 0, "atol": 1e-5 if compress == "none" else 2e-3}
-    torch.testing.assert_close(open_soup(first.path).vertices, soup.vertices, **near)
+    torch.testing.assert_close(load_soup(first.path).vertices, soup.vertices, **near)
     for scene in (None, tmp_path / "scene"):  # where up is the file says too
         again = export_soup(open_run(first.path, scene), tmp_path / f"b.{kind}", config)
         torch.testing.assert_close(again.transform.rotation, first.transform.rotation)
@@ -198,7 +198,7 @@ def test_where_nobody_knows_up_nothing_is_turned_nor_called_upright(tmp_path, so
     unknown = "nothing is turned, since nobody knows where up is (--scene names the capture): +z is up if it was before"
     assert first.notes == (unknown,)
     assert not first.transform.moves
-    assert open_soup(first.path).notes.get("up") is None
+    assert load_soup(first.path).notes.get("up") is None
     again = export_soup(open_run(first.path), tmp_path / f"b.{kind}", ExportConfig(up="y"))
     assert not again.transform.moves
     assert again.notes == (unknown.replace("+z", "+y"),)
@@ -233,7 +233,7 @@ def test_a_file_whose_transform_is_damaged_is_refused(tmp_path, soup, transform)
     start = data.index(b"comment transform ") + len(b"comment transform ")
     path.write_bytes(data[:start] + transform.encode() + data[data.index(b"\n", start) :])
     with pytest.raises(InputError, match=r"a\.ply: its record of the export has no usable `transform`; export"):
-        open_soup(path)
+        load_soup(path)
 
 
 def test_up_may_be_z_but_in_glb(tmp_path, soup):
@@ -279,7 +279,7 @@ def test_a_soup_for_etsplat_is_cropped_in_the_frame_of_its_capture(tmp_path, sou
     run = SoupRun(tmp_path / "x", replace(soup, notes={"iteration": "7"}), None)
     crop = Sphere((0.0, 0.0, 0.0), 1.0)
     written = export_soup(run, tmp_path / "a.safetensors", ExportConfig(), crop)
-    returned = open_soup(tmp_path / "a.safetensors")
+    returned = load_soup(tmp_path / "a.safetensors")
     assert torch.equal(returned.vertices, soup.vertices[crop.holds(soup.vertices.mean(dim=1))])
     assert (written.triangles, written.removed) == (len(returned), {"crop": 60 - len(returned)})
     assert returned.notes == {"iteration": "7"}

@@ -8,7 +8,7 @@ import torch
 
 import etsplat
 from etsplat.io.mesh_files import load_exported
-from etsplat.model.soup_import import open_soup
+from etsplat.model.soup_import import load_soup
 from etsplat.tasks.export_mesh import export_mesh
 from etsplat.tasks.starts import load_start
 
@@ -69,7 +69,7 @@ def test_a_file_says_how_it_was_moved_and_is_led_back(
     tolerance = 0.2 if textured else 1e-5  # fewer faces
     torch.testing.assert_close(found_low, low, atol=tolerance, rtol=0)
     torch.testing.assert_close(found_high, high, atol=tolerance, rtol=0)
-    opened = open_soup(path).vertices.reshape(-1, 3)
+    opened = load_soup(path).vertices.reshape(-1, 3)
     torch.testing.assert_close(opened.aminmax(dim=0).max, found_high, atol=1e-5, rtol=0)
 
 

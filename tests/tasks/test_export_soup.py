@@ -22,7 +22,7 @@ from etsplat.io.mesh_files import MeshFile, save_mesh
 from etsplat.io.ply_tables import encode_ply, read_ply_tables
 from etsplat.io.srgb import srgb_from_linear
 from etsplat.model.soup_appearance import SoupAppearance
-from etsplat.model.soup_import import open_soup
+from etsplat.model.soup_import import load_soup
 from etsplat.tasks.export_config import ExportConfig
 from etsplat.tasks.export_soup import bake_colors, export_soup
 from helpers.exported_soups import CAMERA, difference, flat, odd_soup, run_of
@@ -40,7 +40,7 @@ def test_a_mesh_viewer_shows_what_the_opaque_render_shows(tmp_path, soup, suffix
     """Every format returns the opaque triangles in their colours, so that a z-buffer draws the same picture."""
     path = tmp_path / f"soup{suffix}"
     export_soup(run_of(soup), path, ExportConfig(colors="constant", weld=weld, up="keep"))
-    returned = open_soup(path)
+    returned = load_soup(path)
     expected = flat(soup).render_opaque(CAMERA)
     # trimesh, which reads GLB, keeps its linear light in 8 bits.
     tolerance = 6 / 255 if suffix == ".glb" else 1.5 / 255
@@ -52,7 +52,7 @@ def test_a_mesh_viewer_shows_what_the_opaque_render_shows(tmp_path, soup, suffix
 def test_ply_with_harmonics_returns_the_same_soft_picture(tmp_path, soup, kernel):
     path = tmp_path / "soup.ply"
     export_soup(run_of(soup, kernel=kernel), path, ExportConfig(colors="keep", min_opacity=0.0, up="keep"))
-    returned = open_soup(path)
+    returned = load_soup(path)
     assert returned.appearance == SoupAppearance(kernel=kernel)
     expected = replace(soup, appearance=SoupAppearance(kernel=kernel)).render(CAMERA).color
     assert difference(returned.render(CAMERA).color, expected) < 1e-4
@@ -67,12 +67,12 @@ def test_ply_with_harmonics_returns_how_it_is_drawn_and_its_notes(tmp_path, soup
     path = tmp_path / "soup.ply"
     config = ExportConfig(colors="keep", min_opacity=0.0, scale=3.0)
     export_soup(replace(run_of(soup), soup=kept), path, config)
-    returned = open_soup(path)
+    returned = load_soup(path)
     assert returned.appearance == look
     assert returned.notes == {**kept.notes, "source": "soup.ply"}
     assert difference(returned.render(CAMERA).color, kept.render(CAMERA).color) < 1e-4
     path.write_bytes(re.sub(rb"comment (appearance|notes) .*\n", b"", path.read_bytes()))  # as of earlier versions
-    assert open_soup(path).appearance == SoupAppearance("bilateral", "sdf")
+    assert load_soup(path).appearance == SoupAppearance("bilateral", "sdf")
 
 
 @pytest.mark.parametrize(("name", "said"), [("appearance", '{"near_plane": 0}'), ("appearance", "3"), ("notes", "[1]")])
@@ -81,13 +81,13 @@ def test_a_ply_that_cannot_be_drawn_as_it_says_is_refused(tmp_path, soup, name, 
     export_soup(run_of(soup), path, ExportConfig(colors="keep"))
     path.write_bytes(re.sub(rb"(comment %s ).*\n" % name.encode(), rb"\g<1>%s\n" % said.encode(), path.read_bytes()))
     with pytest.raises(InputError, match=rf"soup\.ply: its record of the export has no usable `{name}`"):
-        open_soup(path)
+        load_soup(path)
 
 
 def test_opacity_floor_and_softness_ceiling_are_in_the_exported_numbers(tmp_path, soup):
     limits = {"opacity_floor": 0.6, "sigma_ceiling": 0.3}
     export_soup(run_of(soup, **limits), tmp_path / "soup.ply", ExportConfig(colors="keep", up="keep"))
-    returned = open_soup(tmp_path / "soup.ply")
+    returned = load_soup(tmp_path / "soup.ply")
     assert len(returned) == len(soup)
     assert float(returned.opacities.min()) >= 0.6
     assert float(returned.sigma.max()) <= 0.3001
@@ -117,7 +117,7 @@ def test_with_alpha_only_faint_faces_of_a_glb_blend(tmp_path, soup):
         modes[document["materials"][part["material"]]["alphaMode"]] = count
     assert modes == {"OPAQUE": 3 * 20, "BLEND": 3 * 40}
     assert all(material["doubleSided"] for material in document["materials"])
-    assert len(open_soup(tmp_path / "soup.glb")) == 60
+    assert len(load_soup(tmp_path / "soup.glb")) == 60
 
 
 def test_baked_colours_are_what_the_cameras_see(soup):
@@ -140,20 +140,20 @@ def test_triangle_splatting_states_come_in_safely(tmp_path, soup):
         "active_sh_degree": 2,
     }
     torch.save(state, tmp_path / "point_cloud_state_dict.pt")
-    file = open_soup(tmp_path / "point_cloud_state_dict.pt")
+    file = load_soup(tmp_path / "point_cloud_state_dict.pt")
     assert file.appearance == SoupAppearance("single_sided", "sdf", sh_degree=2, cull_small=True, near_plane=0.2)
     for name, tensor in file.parameters().items():
         assert torch.equal(tensor, getattr(soup, name))
     torch.save({"triangles_points": soup.vertices}, tmp_path / "half.pt")
     with pytest.raises(InputError, match="lacks"):
-        open_soup(tmp_path / "half.pt")
+        load_soup(tmp_path / "half.pt")
     torch.save(soup, tmp_path / "code.pt")
     with pytest.raises(InputError, match="cannot be read as a state dict") as raised:
-        open_soup(tmp_path / "code.pt")
+        load_soup(tmp_path / "code.pt")
     assert "weights_only" not in str(raised.value)  # torch's advice is to run the code in the file
     (tmp_path / "letter.pt").write_text("hi\n")  # which torch's unpickler answers with a KeyError
     with pytest.raises(InputError, match="cannot be read as a state dict"):
-        open_soup(tmp_path / "letter.pt")
+        load_soup(tmp_path / "letter.pt")
 
 
 def test_a_kind_of_file_without_opacities_is_refused_with_alpha(tmp_path, soup):
@@ -187,7 +187,7 @@ def test_files_to_send_hold_the_soup_as_soft_as_it_is(tmp_path, soup, capsys, ki
     assert 0 < kept < len(soup)
     assert f"soup.{kind}: {kept} triangles" in capsys.readouterr().out
     if kind == "etz":
-        assert len(open_soup(tmp_path / "soup.etz")) == kept
+        assert len(load_soup(tmp_path / "soup.etz")) == kept
     with pytest.raises(InputError, match=r"keeps the units and axes of the capture; leave out --up, --scale"):
         parse([*command, "--scale", "2"]).run([])
 
@@ -222,7 +222,7 @@ def test_the_kind_of_file_does_not_depend_on_capitals(tmp_path, soup, kind):
         out = tmp_path / f"{name}.{kind}"
         command = ["export", str(tmp_path / "from.SAFETENSORS"), "--out", str(out), "--min-opacity", "0", *more]
         assert parse(command).run([]) == 0
-        assert torch.equal(open_soup(out).vertices, soup.vertices)
+        assert torch.equal(load_soup(out).vertices, soup.vertices)
 
 
 def test_a_kind_of_file_of_ones_own_is_one_module(tmp_path, soup, monkeypatch):
@@ -257,7 +257,7 @@ def test_what_a_kind_of_file_cannot_hold_does_not_depend_on_capitals(tmp_path, s
     with pytest.raises(InputError, match=r"soup\.OBJ: files of this kind hold no opacities"):
         export_soup(run_of(soup), tmp_path / "soup.OBJ", ExportConfig(alpha=True))
     export_soup(run_of(soup), tmp_path / "soup.PLY", ExportConfig(colors="keep", up="keep", min_opacity=0))
-    assert open_soup(tmp_path / "soup.PLY").sh_degree == 2
+    assert load_soup(tmp_path / "soup.PLY").sh_degree == 2
 
 
 def test_a_gaussian_scene_comes_in_at_its_places_with_its_size_and_colours(tmp_path):
@@ -269,7 +269,7 @@ def test_a_gaussian_scene_comes_in_at_its_places_with_its_size_and_colours(tmp_p
     table["scale_0"], table["scale_1"], table["scale_2"] = math.log(0.2), math.log(0.2), -9.0
     table["rot_0"] = 1.0
     (tmp_path / "gaussians.ply").write_bytes(encode_ply({"vertex": table}))
-    soup = open_soup(tmp_path / "gaussians.ply")
+    soup = load_soup(tmp_path / "gaussians.ply")
     assert (len(soup), soup.sh_degree) == (1, 1)
     assert soup.sh_rest[0].tolist() == [[0, 0, 0], [0, 0.25, 0], [0, 0, 0]]
     torch.testing.assert_close(soup.vertices.mean(dim=1), torch.zeros(1, 3), atol=1e-6, rtol=0)
@@ -287,4 +287,4 @@ def test_contradictions_and_empty_results_are_input_errors(tmp_path, soup):
         export_soup(run_of(soup), tmp_path / "soup.obj", ExportConfig(min_opacity=1.0))
     (tmp_path / "broken.ply").write_bytes(b"ply\nformat ascii 1.0\nelement vertex 3\n")
     with pytest.raises(InputError, match="PLY header"):
-        open_soup(tmp_path / "broken.ply")
+        load_soup(tmp_path / "broken.ply")

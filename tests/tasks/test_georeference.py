@@ -12,7 +12,7 @@ from etsplat import TrainConfig, train
 from etsplat.core.errors import InputError
 from etsplat.io.georeference import Georeference
 from etsplat.io.ply_tables import read_ply_tables
-from etsplat.model.soup_import import open_soup
+from etsplat.model.soup_import import load_soup
 from etsplat.tasks.export_config import ExportConfig
 from etsplat.tasks.export_soup import export_soup
 from etsplat.tasks.opened_runs import open_run
@@ -143,7 +143,7 @@ def test_what_was_placed_in_the_world_comes_back_to_its_capture(runs, tmp_path, 
     local = export_soup(run, tmp_path / "local.ply", exported(up="keep", sky="none"))
     placed = export_soup(run, tmp_path / f"placed{suffix}", exported(place="world", sky="none"))
     opened = open_run(placed.path)
-    assert torch.allclose(opened.soup.vertices, open_soup(local.path).vertices, rtol=0, atol=MILLIMETRE)
+    assert torch.allclose(opened.soup.vertices, load_soup(local.path).vertices, rtol=0, atol=MILLIMETRE)
     again = export_soup(opened, tmp_path / "again.ply", exported(place="world"))
     assert np.abs(again.transform.translation.numpy() - OFFSET).max() < MILLIMETRE
 

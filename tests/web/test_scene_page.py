@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from etsplat.io.run_directory import RunDirectory
-from etsplat.model.soup_import import open_soup
+from etsplat.model.soup_import import load_soup
 from etsplat.report import write_report
 from etsplat.tasks.export_config import ExportConfig
 from etsplat.tasks.export_soup import export_soup
@@ -202,7 +202,7 @@ def test_a_part_of_a_scene_is_drawn_larger(tmp_path, page, capture):
     data = (tmp_path / "soup.etz").read_bytes()
     header = json.loads(data[12 : 12 + int.from_bytes(data[8:12], "little")])
     (tmp_path / "soup.etz").write_bytes(data[: -header["chunks"][-1][1]])
-    part = open_soup(tmp_path / "soup.etz")
+    part = load_soup(tmp_path / "soup.etz")
     assert len(part) == 8192
     page.value("sceneViewer.then(v => { v.options.fraction = 0.7; })")
     assert decibels(picture(page, 2, "soft"), part.render(camera_of(capture, 2)).color[0]) > 40

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch.nn import functional
 
-from etsplat.model.soup_import import open_soup
+from etsplat.model.soup_import import load_soup
 from etsplat.tasks.export_config import ExportConfig
 from etsplat.tasks.export_soup import export_soup
 from etsplat.tasks.opened_runs import SoupRun
@@ -97,7 +97,7 @@ def test_a_fraction(tmp_path, page, shown, soup, capture):
         page.press(*DOWN)
         assert page.value("document.querySelector('[data-list=fraction]').value") == asked
         (tmp_path / "part.etz").write_bytes(data[: begin + sum(sizes[:chunks])])
-        part = open_soup(tmp_path / "part.etz")
+        part = load_soup(tmp_path / "part.etz")
         assert len(part) == count
         assert decibels(shown(), soft_of(part, camera)) > 40
     assert decibels(shown(), soft_of(soup, camera)) < 35

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from etsplat.model.soup_import import open_soup
+from etsplat.model.soup_import import load_soup
 from etsplat.tasks.export_config import ExportConfig
 from etsplat.tasks.export_soup import export_soup
 from etsplat.tasks.opened_runs import SoupRun
@@ -97,7 +97,7 @@ def test_every_frame_has_its_own_order(tmp_path, page, capture):
     open_by_webgpu(page, written(tmp_path, soup, capture), 64, 48)
     page.value("sceneViewer.then(v => v.settled())")
     export_soup(SoupRun(tmp_path, soup, capture, None), tmp_path / "soup.etz", ExportConfig())
-    in_file = open_soup(tmp_path / "soup.etz")
+    in_file = load_soup(tmp_path / "soup.etz")
     drawn = """sceneViewer.then(v => [5, 2, 7].map(photo => {
         v.stand(photo);
         const ordered = v.painter.order(v.request());

@@ -18,7 +18,7 @@ from etsplat.core.rasterization import SOUP_SIGMA_FLOOR
 from etsplat.io.export_records import damaged, read_record, transform_of_record
 from etsplat.io.mesh_files import READERS, load_exported
 from etsplat.io.opaque_files import holds_opaque, load_opaque
-from etsplat.io.paths import kind_of
+from etsplat.io.paths import given_path, kind_of
 from etsplat.io.ply_tables import CORNERS, columns, read_ply_header, read_ply_tables
 from etsplat.io.tensors import read_state_dict
 from etsplat.io.textures import Texture
@@ -45,7 +45,7 @@ _KINDS = (".safetensors", ".etz", ".pt", *READERS)
 _TS_KEYS = ("triangles_points", "opacity", "sigma", "features_dc", "features_rest")
 
 
-def open_soup(path: Path | str) -> TriangleSoup:
+def load_soup(path: Path | str) -> TriangleSoup:
     """Read triangles from any file that holds some.
 
     Args:
@@ -56,8 +56,15 @@ def open_soup(path: Path | str) -> TriangleSoup:
 
     Raises:
         InputError: the file is missing, damaged or of another kind.
+
+    Example:
+        >>> corners = torch.rand(12, 3, 3)
+        >>> soup = etsplat.TriangleSoup.from_triangles(corners, 0.5, opacity=0.9, sigma=0.5, sh_degree=0)
+        >>> written = etsplat.export(soup, "scene.ply", etsplat.ExportConfig(colors="keep"))
+        >>> etsplat.load_soup(written.path).vertices.equal(corners)
+        True
     """
-    path = Path(path)
+    path = given_path("path", path)
     if not path.is_file():
         raise InputError(f"soup {path}: no such file; check the path")
     if kind_of(path) not in _KINDS:

@@ -169,6 +169,8 @@ class TriangleSoup(Model):
         path = given_path("path", path)
         if not path.is_file():
             raise InputError(f"soup {path}: no such file; check the path")
+        if kind_of(path) != ".safetensors":
+            raise InputError(f"soup {path}: is no .safetensors; etsplat.load_soup reads other kinds of files")
         try:
             tensors, metadata = read_tensors(path)
             if metadata.get("format") != FORMAT:

@@ -18,7 +18,7 @@ from etsplat.io.opaque_files import load_opaque
 from etsplat.io.paths import path_remedy
 from etsplat.io.run_directory import RunDirectory, is_run
 from etsplat.model.solid_soup import SolidSoup
-from etsplat.model.soup_import import open_soup
+from etsplat.model.soup_import import load_soup
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.tasks.demos import DEMO_SCENE
 from etsplat.tasks.refined_cameras import alignment_starts, refined_capture
@@ -90,7 +90,7 @@ def open_run(
     device: str | None = None,
     engine: str | None = None,
 ) -> SoupRun:
-    """Open the run directory of `etsplat train`, or any file that `etsplat.model.soup_import.open_soup` reads.
+    """Open the run directory of `etsplat train`, or any file that `etsplat.model.soup_import.load_soup` reads.
 
     Args:
         path: of the run or the file.
@@ -108,7 +108,7 @@ def open_run(
         raise InputError(f"{path}: no such file or folder; {path_remedy(path)}")
     if path.is_dir():
         return replace(_open_directory(path, scene, place), engine=engine)
-    return SoupRun(path, open_soup(path).to(place), capture_at(scene), engine=engine)
+    return SoupRun(path, load_soup(path).to(place), capture_at(scene), engine=engine)
 
 
 def capture_at(scene: Dataset | Path | str | None) -> Dataset | None:
