@@ -61,6 +61,7 @@ def a_mesh() -> etsplat.TriangleMesh:
             lambda: etsplat.export(a_mesh().to_file(), "a.glb"),
             r"MeshFile, and no soup; etsplat\.save_mesh\('a\.glb'",
         ),
+        (lambda: etsplat.texture_mesh(None), "run: is None; it must be a result of reconstruct or a path"),
         (lambda: etsplat.export("run", None), "path: is None; it must be the path of a file"),
         (lambda: etsplat.load_image(None), "path: is None; it must be the path of an image"),
         (lambda: etsplat.load_mesh(None), "path: is None; it must be a path"),

@@ -21,7 +21,7 @@ from etsplat.geometry.similarity import Similarity
 from etsplat.io.georeference import GEOREFERENCE_FILE, Georeference
 from etsplat.io.mesh_files import MeshFile, load_mesh, save_mesh
 from etsplat.io.meshopt import load_meshopt
-from etsplat.io.paths import kind_of
+from etsplat.io.paths import given_path, kind_of
 from etsplat.io.run_directory import RunDirectory, is_run
 from etsplat.io.writers import suffixes
 from etsplat.model.textured_mesh import TexturedMesh
@@ -32,6 +32,7 @@ from etsplat.tasks.opened_runs import capture_at, read_record
 from etsplat.tasks.placing import apart_from_world, check_placed, placed_record, placement
 from etsplat.tasks.reconstruct_config import Pictures, ReconstructConfig
 from etsplat.tasks.refined_cameras import refined_capture
+from etsplat.tasks.running import Result
 from etsplat.tasks.settings import settings_of
 from etsplat.tasks.sources import directions_digest, fingerprint, load_source, make_subject
 from etsplat.tasks.texturing import Tell, check_installed, coarser, colors_at, texture_object
@@ -145,7 +146,7 @@ def _exposures(run: RunDirectory, views: Dataset) -> dict[int, Float[Tensor, "3 
 @one_torch_thread()
 @usual_defaults()
 def texture_mesh(
-    run: Path | str,
+    run: Result | Path | str,
     *,
     size: int = 2048,
     faces: int = LIGHT_FACES,
@@ -159,7 +160,7 @@ def texture_mesh(
     Needs xatlas and fast-simplification: pip install 'etsplat[texture]'.
 
     Args:
-        run: directory of a finished run of `etsplat reconstruct`.
+        run: the result of `reconstruct`, or the directory of a finished run.
         size: texels along each side of the texture, a multiple of 4 from 64 to 8192.
         faces: at most so many.
         scene: the folder, mesh or data set that the run is of, where it has moved or was in memory.
@@ -174,14 +175,15 @@ def texture_mesh(
         InputError: a package is missing, the run or its photos cannot be used, or a number is out of range.
 
     Example:
-        >>> asset = etsplat.texture_mesh("runs/owl", size=64, faces=100)  # of the example of `etsplat.reconstruct`
+        >>> asset = etsplat.texture_mesh(result, size=64, faces=100)  # of the example of `etsplat.reconstruct`
         >>> asset.texture.shape, asset.count <= 100
         (torch.Size([64, 64, 3]), True)
         >>> asset.save("owl.glb")
     """
     ExportConfig(texture=size, faces=faces)
     check_installed()
-    opened = open_reconstruction(run, scene, device, tell)
+    path = given_path("run", run.path if isinstance(run, Result) else run, "a result of reconstruct or a path")
+    opened = open_reconstruction(path, scene, device, tell)
     return opened.in_own_units(opened.textured(size, faces, seed, tell))
 
 
