@@ -60,12 +60,12 @@ class PrepareEvent:
 
 @dataclass(frozen=True)
 class StageEvent:
-    """While something is made that belongs to the result beside what the run optimizes.
+    """While the start of a run is made, or what belongs to its result beside what it optimizes.
 
     Attributes:
         name: what is made.
         done: steps done.
-        total: steps in all.
+        total: steps in all; 0 where nobody knows.
 
     Example:
         >>> print(etsplat.StageEvent("texture", 40, 200))
