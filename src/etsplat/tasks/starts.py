@@ -246,12 +246,14 @@ def make_start(
     return Started(mesh, kind, opened, hull, cut)
 
 
-def _opened(views: Dataset, vertices: Tensor, faces: Tensor, tell: Callable[[Event], None]) -> Opened:
-    tell(StageEvent("Opening hollows", 0, 3))
+def _opened(
+    views: Dataset, vertices: Tensor, faces: Tensor, tell: Callable[[Event], None], stage: str = "Opening hollows"
+) -> Opened:
+    tell(StageEvent(stage, 0, 3))
     surface = without_false_handles(views, vertices, faces)
-    tell(StageEvent("Opening hollows", 1, 3))
+    tell(StageEvent(stage, 1, 3))
     surface = without_lids(views, *surface)
-    tell(StageEvent("Opening hollows", 2, 3))
+    tell(StageEvent(stage, 2, 3))
     return open_hollows(views, *surface)
 
 
@@ -271,9 +273,9 @@ def _cut_open(
     photos, most = photos_of(views), hull.uncovered + _RIMS
 
     def cut(free: Distance, wanted: int) -> Opened:
-        tell(StageEvent("Cutting the hull open", 0, 0))
+        tell(StageEvent(stage := "Cutting the hull open", 0, 0))
         surface = visual_hull(views, wanted, radius=config.start.radius, thin=hull.thin, free=free)
-        found = _opened(views, *surface, tell) if len(surface[1]) else opened
+        found = _opened(views, *surface, tell, stage) if len(surface[1]) else opened
         covers = _uncovered(photos, found.vertices, found.faces) <= most
         return found if covers and len(found.faces) <= config.max_faces else opened
 
