@@ -230,3 +230,18 @@ def test_a_record_does_not_disturb_readers(tmp_path, kind):
     assert torch.equal(load_mesh(tmp_path / f"a.{kind}").vertices, vertices.reshape(-1, 3))
     assert (b'{"by": "Zo\\u00eb\\n"' in (tmp_path / f"a.{kind}").read_bytes()) is (kind in ("obj", "ply"))
     assert len(trimesh.load_mesh(tmp_path / f"a.{kind}", process=False).faces) == 4
+
+
+@pytest.mark.parametrize("corners", ["3 0 1 2", "4 0 1 2 3"])
+@pytest.mark.parametrize("names", [("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue")])
+def test_colours_of_ply_by_other_names(tmp_path, names, corners):
+    """They were left out without a word; of triangles and of polygons."""
+    properties = "".join(f"property uchar {name}\n" for name in names)
+    (tmp_path / "a.ply").write_text(
+        "ply\nformat ascii 1.0\ncomment property uchar r\nelement vertex 4\nproperty float x\nproperty float y\n"
+        f"property float z\n{properties}element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+        f"0 0 0 255 51 0\n1 0 0 255 51 0\n1 1 0 255 51 0\n0 1 0 255 51 0\n{corners}\n"
+    )
+    mesh = load_mesh(tmp_path / "a.ply")
+    assert mesh.vertex_colors is not None
+    assert torch.allclose(mesh.vertex_colors, torch.tensor([1.0, 0.2, 0.0]))

@@ -99,3 +99,21 @@ def test_what_is_no_cloud_is_refused_with_what_to_do(tmp_path):
             load_cloud(tmp_path / name)
     with pytest.raises(InputError, match="no such file"):
         load_cloud(tmp_path / "gone.ply")
+
+
+@pytest.mark.parametrize("names", [("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue")])
+def test_colours_of_points_by_other_names(tmp_path, names):
+    """Such clouds were grey, without a word. Where there are red, green and blue, these are meant."""
+    table = np.zeros(2, [*((axis, "f4") for axis in "xyz"), *((name, "u1") for name in names)])
+    for name, value in zip(names, (255, 51, 0), strict=True):
+        table[name] = value
+    (tmp_path / "a.ply").write_bytes(encode_ply({"vertex": table}))
+    found = load_cloud(tmp_path / "a.ply")[1]
+    assert found is not None
+    assert torch.allclose(found, torch.tensor([1.0, 0.2, 0.0]))
+    both = np.zeros(2, table.dtype.descr + [(name, "u1") for name in ("red", "green", "blue")])
+    both[names[0]] = 255
+    (tmp_path / "b.ply").write_bytes(encode_ply({"vertex": both}))
+    found = load_cloud(tmp_path / "b.ply")[1]
+    assert found is not None
+    assert not found.any()

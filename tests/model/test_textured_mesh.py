@@ -76,7 +76,7 @@ def test_trimesh_reads_the_ply_with_the_same_picture(mesh, tmp_path):
     assert torch.allclose(corners, mesh.vertices.detach()[mesh.faces.long()])
     uvs = torch.tensor(found.visual.uv[found.faces], dtype=torch.float32)
     assert torch.allclose(torch.stack([uvs[..., 0], 1 - uvs[..., 1]], dim=-1), mesh.face_uvs, atol=1e-6)
-    picture = np.asarray(Image.open(tmp_path / "ball.png").convert("RGB")) / 255
+    picture = np.asarray(Image.open(tmp_path / "ball_ply.png").convert("RGB")) / 255
     assert abs(picture - mesh.texture.detach().clamp(0, 1).numpy()).max() <= 0.51 / 255
     read = load_mesh(tmp_path / "ball.ply")
     assert len(read.faces) == mesh.count
@@ -84,12 +84,22 @@ def test_trimesh_reads_the_ply_with_the_same_picture(mesh, tmp_path):
     again = TexturedMesh.load(tmp_path / "ball.ply")
     torch.testing.assert_close(again.face_uvs, mesh.face_uvs, atol=1e-6, rtol=0)
     torch.testing.assert_close(again.texture, mesh.texture.clamp(0, 1), atol=0.51 / 255, rtol=0)
-    (tmp_path / "ball.png").unlink()
+    (tmp_path / "ball_ply.png").unlink()
     alone = load_mesh(tmp_path / "ball.ply")
     assert alone.texture is None
     assert len(alone.notes) == 1
     assert "a texture is left out: " in alone.notes[0]
-    assert "ball.png" in alone.notes[0]
+    assert "ball_ply.png" in alone.notes[0]
+
+
+def test_an_obj_and_a_ply_of_one_name_keep_their_own_textures(mesh, tmp_path):
+    """They shared NAME.png: the second file put its picture under the first, in another place of every face."""
+    mesh.save(tmp_path / "ball.obj")
+    other = TexturedMesh.from_mesh(mesh.vertices, mesh.faces, 1 - mesh.texture.detach(), mesh.face_uvs, max_level=0)
+    other.save(tmp_path / "ball.ply")
+    for kind, expected in (("obj", mesh), ("ply", other)):
+        again = TexturedMesh.load(tmp_path / f"ball.{kind}")
+        torch.testing.assert_close(again.texture, expected.texture.detach(), atol=0.51 / 255, rtol=0)
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from etsplat.io._ply_polygons import with_triangles
 from etsplat.io._polygons import cut_concave
 from etsplat.io.meshopt import load_meshopt
 from etsplat.io.paths import kind_of
-from etsplat.io.ply_tables import read_ply_comments
+from etsplat.io.ply_tables import COLORS, read_ply_comments, with_usual_colors
 from etsplat.io.srgb import srgb_from_linear
 from etsplat.io.textures import Texture
 
@@ -198,7 +198,7 @@ def read_ply(path: Path) -> RawMesh:
     Polygons are cut before: trimesh reads no binary file of triangles and quads, and loses whose colours are whose.
     One picture is read with the places of corners in lists at faces, as MeshLab and we write it.
     """
-    mesh = _read_with_trimesh(path, with_triangles(path))
+    mesh = _read_with_trimesh(path, with_usual_colors(path, with_triangles(path)))
     with open(path, "rb") as file:
         header = [line.split() for line in file.read(1 << 16).split(b"end_header")[0].splitlines()]
     try:
@@ -354,7 +354,7 @@ def _ply_face_colors(mesh: "trimesh.Trimesh") -> np.ndarray | None:
     from trimesh.visual.color import to_rgba
 
     element = mesh.metadata.get("_ply_raw", {}).get("face", {})
-    channels = [element["data"][name] for name in ("red", "green", "blue") if name in element.get("properties", {})]
+    channels = [element["data"][name] for name in COLORS if name in element.get("properties", {})]
     if len(channels) < 3 or len(channels[0]) != len(mesh.faces):
         return None
     return to_rgba(np.column_stack(channels))[:, :3] / 255

@@ -31,6 +31,12 @@ _BRIGHTEST = 2
 _FORMATS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 _LONGEST_HEADER = 1 << 16
 
+COLORS = ("red", "green", "blue")
+"""The properties that are a colour."""
+
+_OTHER_COLORS = (("r", "g", "b"), tuple(f"diffuse_{name}" for name in COLORS))
+"""What other programs call them."""
+
 CORNERS = "vertex_indices"
 """The list property of a face: its three corners."""
 
@@ -83,6 +89,8 @@ def read_ply_header(path: Path | str) -> PlyHeader:
         raise InputError(f"PLY file {path}: no such file; check the path")
     with open(path, "rb") as file:
         head, mark, rest = file.read(_LONGEST_HEADER).partition(b"end_header")
+    size = len(head) + len(mark) + len(rest.partition(b"\n")[0]) + 1
+    head = _with_usual_colors(head)
     if not head.startswith(b"ply") or not mark:
         raise InputError(f"PLY file {path}: has no PLY header; export it again")
     order, comments = "", []
@@ -105,8 +113,47 @@ def read_ply_header(path: Path | str) -> PlyHeader:
         tables = {name: (counts[name], np.dtype(kinds)) for name, kinds in zip(counts, fields, strict=True)}
     except ValueError as error:  # a name that comes twice
         raise InputError(f"PLY file {path}: cannot be read ({error}); export it again") from error
-    line_end = len(rest.partition(b"\n")[0]) + 1
-    return PlyHeader(tables, comments, order == "=", len(head) + len(mark) + line_end)
+    return PlyHeader(tables, comments, order == "=", size)
+
+
+def with_usual_colors(path: Path, data: bytes | None) -> bytes | None:
+    """A PLY file whose colours are called red, green and blue, for readers that know no other names.
+
+    Args:
+        path: of the file.
+        data: what is read in its place; None for the file itself.
+
+    Returns:
+        `data` where they are called so, or there are none.
+    """
+    if data is None:
+        with open(path, "rb") as file:
+            head = file.read(_LONGEST_HEADER).partition(b"end_header")[0]
+    else:
+        head = data[:_LONGEST_HEADER].partition(b"end_header")[0]
+    renamed = _with_usual_colors(head)
+    return data if renamed == head else renamed + (data or path.read_bytes())[len(head) :]
+
+
+def _with_usual_colors(head: bytes) -> bytes:
+    """A header in which elements without red, green and blue have these where they have their like."""
+    elements = re.split(rb"(?m)^(?=element\b)", head)
+    for others in _OTHER_COLORS:
+        elements = [_renamed(element, dict(zip(others, COLORS, strict=True))) for element in elements]
+    return b"".join(elements)
+
+
+def _renamed(element: bytes, usual: Mapping[str, str]) -> bytes:
+    """The lines of an element with other names, if it has all of the old ones and none of the new ones."""
+    lines = element.splitlines(keepends=True)
+    words = [line.decode("ascii", errors="replace").split() for line in lines]
+    names = {line[-1] for line in words if line[:1] == ["property"]}
+    if not names.issuperset(usual) or not names.isdisjoint(usual.values()):
+        return element
+    for at, line in enumerate(words):
+        if line[:1] == ["property"] and line[-1] in usual:
+            lines[at] = f"{' '.join([*line[:-1], usual[line[-1]]])}\n".encode()
+    return b"".join(lines)
 
 
 def read_ply_comments(path: Path) -> list[str]:
@@ -176,8 +223,8 @@ def load_points(path: Path | str) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "
     table = read_ply_tables(path)["vertex"]
     points = columns(path, table, *"xyz")
     colors = torch.full(points.shape, GREY)
-    if {"red", "green", "blue"} <= set(table.dtype.names or ()):
-        colors = columns(path, table, "red", "green", "blue").float()
+    if set(COLORS) <= set(table.dtype.names or ()):
+        colors = columns(path, table, *COLORS).float()
         if table.dtype["red"].kind == "u":
             colors /= np.iinfo(table.dtype["red"]).max
         elif bool((colors > _BRIGHTEST).any()):  # as some programs write what is from 0 to 255

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from etsplat.core.errors import InputError
 from etsplat.io.paths import kind_of, path_remedy
-from etsplat.io.ply_tables import load_points, read_ply_header
+from etsplat.io.ply_tables import COLORS, load_points, read_ply_header
 
 MAX_POINTS = 100_000_000
 """Larger clouds are refused before memory is taken for them."""
@@ -52,7 +52,7 @@ def _ply(path: Path) -> Cloud:
     header = read_ply_header(path)
     _check_count(path, header.tables.get("vertex", (0,))[0])
     points, colors = load_points(path)
-    return points, colors if {"red", "green", "blue"} <= header.properties("vertex") else None
+    return points, colors if set(COLORS) <= header.properties("vertex") else None
 
 
 def _las(path: Path) -> Cloud:
@@ -65,8 +65,8 @@ def _las(path: Path) -> Cloud:
             end = header.offset_to_point_data + header.point_count * header.point_format.size
             if end > path.stat().st_size:
                 raise InputError(f"points {path}: cut short; export it again")
-            colored = {"red", "green", "blue"} <= set(header.point_format.dimension_names)
-            names = ("x", "y", "z", *(("red", "green", "blue") if colored else ()))
+            colored = set(COLORS) <= set(header.point_format.dimension_names)
+            names = ("x", "y", "z", *(COLORS if colored else ()))
             parts = [
                 np.stack([np.asarray(chunk[name], dtype=np.float64) for name in names], axis=1)
                 for chunk in file.chunk_iterator(_CHUNK)

@@ -19,7 +19,7 @@ from etsplat.io.export_records import damaged, read_record, transform_of_record
 from etsplat.io.mesh_files import READERS, load_exported
 from etsplat.io.opaque_files import holds_opaque, load_opaque
 from etsplat.io.paths import given_path, kind_of
-from etsplat.io.ply_tables import CORNERS, columns, read_ply_header, read_ply_tables
+from etsplat.io.ply_tables import COLORS, CORNERS, columns, read_ply_header, read_ply_tables
 from etsplat.io.tensors import read_state_dict
 from etsplat.io.textures import Texture
 from etsplat.model.solid_soup import SolidSoup
@@ -133,7 +133,7 @@ def _read_exported(path: Path, comments: list[str]) -> TriangleSoup:
     if "f_dc_0" in (face.dtype.names or ()):
         dc, rest = _harmonics(path, face)
     else:
-        colors = columns(path, face, "red", "green", "blue").float() / 255
+        colors = columns(path, face, *COLORS).float() / 255
         dc, rest = ((colors - 0.5) / SH_CONSTANT)[:, None], torch.zeros(len(face), 0, 3)
     soup = TriangleSoup(
         points[torch.from_numpy(corners)],

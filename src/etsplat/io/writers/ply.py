@@ -7,7 +7,7 @@ import numpy as np
 
 from etsplat.io.atomic import atomic_write
 from etsplat.io.images import encode_png
-from etsplat.io.ply_tables import CORNERS, PLACES, encode_ply
+from etsplat.io.ply_tables import COLORS, CORNERS, PLACES, encode_ply
 from etsplat.io.writers import Colors, Content, Surface
 
 HOLDS: frozenset[Content] = frozenset({"vertex_colors", "face_colors", "texture", "alpha", "numbers", "z_up", "offset"})
@@ -18,8 +18,9 @@ def write(path: Path, surface: Surface) -> None:
 
     With an offset coordinates are doubles.
 
-    A line of comment for each entry of the record. A texture is NAME.png beside the file, which a comment names, and
-    its places are lists at faces, `texcoord`, counted from the bottom: as MeshLab has them. The mesh stays welded.
+    A line of comment for each entry of the record. A texture is NAME_ply.png beside the file, which a comment names:
+    NAME.png is that of an OBJ of this name, and may be another. Its places are lists at faces, `texcoord`, counted from
+    the bottom: as MeshLab has them. The mesh stays welded.
     """
     kind = "f4" if surface.offset is None else "f8"
     columns = [("x", kind), ("y", kind), ("z", kind), *_color_fields(surface.vertex_colors)]
@@ -39,12 +40,13 @@ def write(path: Path, surface: Surface) -> None:
     if surface.texture is not None:
         uvs = surface.texture.corner_uvs
         face[PLACES] = np.stack([uvs[..., 0], 1 - uvs[..., 1]], axis=-1).reshape(-1, 6)
-        comments.append(f"TextureFile {surface.name}.png")
-        with atomic_write(path.parent / f"{surface.name}.png") as temporary:
+        picture = f"{surface.name}_ply.png"
+        comments.append(f"TextureFile {picture}")
+        with atomic_write(path.parent / picture) as temporary:
             temporary.write_bytes(encode_png(surface.texture.pixels))
     comments += [f"{name} {json.dumps(value)}" for name, value in surface.record.items()]
     path.write_bytes(encode_ply({"vertex": vertex, "face": face}, comments))
 
 
 def _color_fields(colors: Colors) -> list[tuple[str, str]]:
-    return [] if colors is None else [(name, "u1") for name in ("red", "green", "blue", "alpha")[: colors.shape[1]]]
+    return [] if colors is None else [(name, "u1") for name in (*COLORS, "alpha")[: colors.shape[1]]]
