@@ -134,6 +134,28 @@ def test_a_soup_of_a_textured_file_has_the_colours_of_its_texture(mesh, tmp_path
     torch.testing.assert_close(colors, torch.tensor([0.9, 0.4, 0.1]).expand_as(colors), atol=0.01, rtol=0)
 
 
+def test_a_mesh_read_as_a_soup_keeps_colours_of_corners_and_says_what_it_lacks_of_a_texture(tmp_path):
+    """Each triangle had one colour, without a word: of a ramp over one large square two greys were left."""
+    square = torch.tensor([[-0.5, -0.5, 0.0], [0.5, -0.5, 0.0], [0.5, 0.5, 0.0], [-0.5, 0.5, 0.0]])
+    faces = torch.tensor([[0, 1, 2], [0, 2, 3]])
+    ramp = (255 * torch.linspace(0, 1, 64)).byte()[None, :, None].expand(64, 64, 3)
+    save_mesh(
+        tmp_path / "a.glb",
+        square,
+        faces,
+        texture=Texture.of([ramp], torch.zeros(2).long(), square[faces][..., :2] + 0.5),
+    )
+    save_mesh(tmp_path / "b.obj", square, faces, vertex_colors=square[:, :1].expand(4, 3) + 0.5)
+    cameras = etsplat.orbit_cameras(40, 40, azimuths=1)[:1]
+    truth = etsplat.render_opaque(square, cameras=cameras, faces=faces, vertex_colors=square[:, :1].expand(4, 3) + 0.5)
+    for name, said in (("a.glb", ["its texture is drawn as colours of 2 triangles"]), ("b.obj", [])):
+        told: list[str] = []
+        soup = load_soup(tmp_path / name, told.append)
+        assert [text[:46] for text in told] == said
+        inside = 0.02 if said else 1e-4  # the border of a texture is half a texel within
+        assert float((soup.render_opaque(cameras) - truth.rgba).abs().max()) < inside
+
+
 def test_a_glb_shares_vertices_where_its_faces_share_places(tmp_path):
     """Of a square of two faces, whose four corners lie in the corners of a texture, there are four."""
     square = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]])

@@ -16,6 +16,7 @@ from etsplat.data.where_up import held_up, up_of
 from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.regions import Box, Sphere
 from etsplat.geometry.similarity import Similarity, rotation_between
+from etsplat.io.export_records import LED_BACK
 from etsplat.io.mesh_files import load_mesh
 from etsplat.model.soup_import import load_soup
 from etsplat.model.surroundings import Surroundings
@@ -131,7 +132,7 @@ def test_the_sky_of_a_file_is_known_where_it_is_read_again(tmp_path, kind):
     opened = open_run(tmp_path / f"a.{kind}")
     assert export_soup(opened, tmp_path / "b.glb", ExportConfig(up="keep")).sky == 320
     without = export_soup(opened, tmp_path / "c.obj", ExportConfig(sky="none", up="keep"))
-    assert (without.triangles, without.removed, without.notes) == (50, {"sky": 320}, ())
+    assert (without.triangles, without.removed, without.notes) == (50, {"sky": 320}, (LED_BACK,))
 
 
 def test_a_sky_that_nobody_knows_is_not_said_to_be_left_out(tmp_path, soup):

@@ -96,6 +96,7 @@ class Evaluate(Command):
                 f"{self.scene}: is not the scene that {self.run_dir} was trained on, by the names and poses of its "
                 "photos; name a folder for what is measured on it with --out, or leave out --scene"
             )
+        _say_of(opened, None)
         folder = RunDirectory(self.out or opened.folder)
         console = Console()
         with PhaseBar(console) as bar:
@@ -134,9 +135,11 @@ def _print(console: "Console", found: dict[str, Any]) -> None:
     )
 
 
-def _say_if_other(opened: "SoupRun", scene: Path | None) -> None:
-    """That pictures are drawn from where the photos of another scene were taken, on purpose or by a mistyped name."""
-    if opened.other_scene:
+def _say_of(opened: "SoupRun", scene: Path | None) -> None:
+    """What of a file is otherwise, and that cameras are those of another scene, on purpose or by a mistyped name."""
+    for note in opened.notes:
+        print(f"  {note}", flush=True)
+    if opened.other_scene and scene is not None:
         print(f"  {scene} is another scene than the run was trained on: cameras are those of its photos", flush=True)
 
 
@@ -186,7 +189,7 @@ class Render(Command):
 
         crop = _crop(self.crop)
         opened = open_run(self.run_dir, self.scene, self.device, self.engine)
-        _say_if_other(opened, self.scene)
+        _say_of(opened, self.scene)
         out = self.out or opened.folder / "renders"
         with PhaseBar() as bar:
             files = render_run(
@@ -341,7 +344,7 @@ class View(Command):
             if not self.run_dir.is_file():
                 wait_for_soup(self.run_dir, lambda text: print(f"{text} (Ctrl-C ends it)", flush=True))
             opened = open_run(self.run_dir, self.scene, self.device, self.engine)
-            _say_if_other(opened, self.scene)
+            _say_of(opened, self.scene)
             if opened.gone is not None:
                 print(f"  its scene {opened.gone} has gone: shown without its photos (--scene names it)", flush=True)
             serve(

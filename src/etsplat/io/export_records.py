@@ -16,6 +16,9 @@ from etsplat.io.ply_tables import read_ply_comments
 _ENTRIES = ("transform", "up", "place", "georeference", "appearance", "notes")
 """What is read again; the rest is for people."""
 
+LED_BACK = "etsplat export had turned, scaled or moved it: it is led back to where it was"
+"""Said of a file whose record leads back."""
+
 _Z_TO_Y = torch.tensor([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]], dtype=torch.float64, device="cpu")
 """What the nodes of a GLB do with a world that has z up."""
 

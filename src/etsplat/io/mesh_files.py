@@ -16,7 +16,7 @@ from etsplat.core.precision import usual_defaults
 from etsplat.core.short_repr import short_repr
 from etsplat.core.validation import check_memory, dense
 from etsplat.io._mesh_readers import READERS, RawMesh
-from etsplat.io.export_records import read_record, transform_of_record
+from etsplat.io.export_records import LED_BACK, read_record, transform_of_record
 from etsplat.io.georeference import Georeference
 from etsplat.io.paths import given_path, kind_of, path_remedy
 from etsplat.io.textures import NormalMap, Texture
@@ -121,7 +121,7 @@ def load_exported(path: Path) -> tuple[MeshFile, dict[str, Any]]:
     raw, record = _read(path), read_record(path)
     if (transform := transform_of_record(path, record)).moves:
         raw.vertices = transform.invert(torch.from_numpy(raw.vertices)).numpy()
-        raw.notes = [*raw.notes, "etsplat export had turned, scaled or moved it: it is led back to where it was"]
+        raw.notes = [*raw.notes, LED_BACK]
     return _clean(path, raw), record
 
 

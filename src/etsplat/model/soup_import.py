@@ -2,20 +2,21 @@
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from etsplat.core.errors import InputError
 from etsplat.core.harmonics import MAX_DEGREE, SH_CONSTANT
 from etsplat.core.kernels import DISTANCES, KERNELS
 from etsplat.core.rasterization import SOUP_SIGMA_FLOOR
-from etsplat.io.export_records import damaged, read_record, transform_of_record
+from etsplat.io.export_records import LED_BACK, damaged, read_record, transform_of_record
 from etsplat.io.mesh_files import READERS, load_exported
 from etsplat.io.opaque_files import holds_opaque, load_opaque
 from etsplat.io.paths import given_path, kind_of
@@ -33,9 +34,6 @@ GAUSSIAN_SIGMA = 1.0
 GAUSSIAN_INRADIUS = math.sqrt(2 * math.pi / (3 * math.sqrt(3)))
 """Inradius, in standard deviations, at which a triangle of that kernel covers the area of the Gaussian."""
 
-MESH_OPACITY, MESH_SIGMA = 0.999, 0.02
-"""A mesh becomes a soup that is drawn all but opaque and sharp."""
-
 _SPREAD = 4
 """Parts of each edge: of a face there are so many rows of points, where its texture is looked at."""
 
@@ -45,14 +43,18 @@ _KINDS = (".safetensors", ".etz", ".pt", *READERS)
 _TS_KEYS = ("triangles_points", "opacity", "sigma", "features_dc", "features_rest")
 
 
-def load_soup(path: Path | str) -> TriangleSoup:
+def load_soup(path: Path | str, tell: Callable[[str], None] = lambda text: None) -> TriangleSoup:
     """Read triangles from any file that holds some.
+
+    Meshes keep the colours of their corners, as other programs interpolate them, where they are drawn opaque; of a
+    texture those that come nearest to it.
 
     Args:
         path: `.safetensors` of `etsplat train`, its opaque mesh too; `.etz` of `etsplat export`; `.pt` of Triangle
             Splatting (`point_cloud_state_dict.pt`); `.ply` that `etsplat export` wrote, of a Gaussian scene or of a
             mesh; `.obj`, `.off`, `.glb`, `.gltf`, `.stl`. What `etsplat export` turned, scaled and placed is in the
             frame of its capture again, where the file says how (OFF does not).
+        tell: called with a sentence for each thing of the file that is otherwise in the soup.
 
     Raises:
         InputError: the file is missing, damaged or of another kind.
@@ -79,7 +81,8 @@ def load_soup(path: Path | str) -> TriangleSoup:
     elif kind_of(path) == ".etz":
         soup = open_compact(path)
     else:
-        soup = {".pt": _read_triangle_splatting, ".ply": _read_ply}.get(kind_of(path), _read_mesh)(path)
+        readers = {".pt": lambda path, _: _read_triangle_splatting(path), ".ply": _read_ply}
+        soup = readers.get(kind_of(path), _read_mesh)(path, tell)
         soup = replace(soup, **soup.state(), notes={"source": path.name, **soup.notes})
     if not len(soup):
         raise InputError(f"soup {path}: holds no triangle; take another file")
@@ -110,22 +113,24 @@ def _read_triangle_splatting(path: Path) -> TriangleSoup:
     return replace(soup, appearance=appearance)
 
 
-def _read_ply(path: Path) -> TriangleSoup:
+def _read_ply(path: Path, tell: Callable[[str], None]) -> TriangleSoup:
     header = read_ply_header(path)
     if "packed_position" in header.properties("vertex"):
         raise InputError(f"soup {path}: holds compressed Gaussians, which are not read; save it as plain PLY")
     if {"scale_0", "rot_0", "opacity", "f_dc_0"} <= header.properties("vertex"):
         return _read_gaussians(path)
     if {CORNERS, "opacity", "sigma"} <= header.properties("face"):
-        return _read_exported(path, header.comments)
-    return _read_mesh(path)
+        return _read_exported(path, header.comments, tell)
+    return _read_mesh(path, tell)
 
 
-def _read_exported(path: Path, comments: list[str]) -> TriangleSoup:
+def _read_exported(path: Path, comments: list[str], tell: Callable[[str], None]) -> TriangleSoup:
     record = read_record(path)
+    if (transform := transform_of_record(path, record)).moves:
+        tell(LED_BACK)
     tables = read_ply_tables(path, ("vertex", "face"))
     vertex, face = tables["vertex"], tables["face"]
-    points = transform_of_record(path, record).invert(columns(path, vertex, *"xyz")).float()
+    points = transform.invert(columns(path, vertex, *"xyz")).float()
     corners = face[CORNERS].astype(np.int64)
     if corners.size and not 0 <= corners.min() <= corners.max() < len(points):
         raise InputError(f"soup {path}: has corners that name no vertex; export it again")
@@ -202,29 +207,33 @@ def _read_gaussians(path: Path) -> TriangleSoup:
     return TriangleSoup(vertices.float(), logits, raw, dc, rest)
 
 
-def _read_mesh(path: Path) -> TriangleSoup:
+def _read_mesh(path: Path, tell: Callable[[str], None]) -> SolidSoup:
     mesh, record = load_exported(path)
+    for note in mesh.notes:
+        tell(note)
     if mesh.texture is not None:
-        colors = _means(mesh.texture)
+        tell(
+            f"its texture is drawn as colours of {len(mesh.faces):,} triangles and their corners, without what is finer"
+        )
+        colors = _fitted(mesh.texture)
     elif mesh.face_colors is not None:
-        colors = mesh.face_colors
+        colors = mesh.face_colors[:, None].repeat(1, 3, 1)
     elif mesh.vertex_colors is not None:
-        colors = mesh.vertex_colors[mesh.faces].mean(dim=1)
+        colors = mesh.vertex_colors[mesh.faces]
     else:
-        colors = torch.full((len(mesh.faces), 3), 0.8)
-    corners = mesh.vertices[mesh.faces]
-    soup = TriangleSoup.from_triangles(corners, colors, opacity=MESH_OPACITY, sigma=MESH_SIGMA, sh_degree=0)
-    return replace(soup, **soup.state(), notes=_notes(path, record))
+        colors = torch.full((len(mesh.faces), 3, 3), 0.8)
+    return SolidSoup.of_corners(mesh.vertices[mesh.faces], colors, SoupAppearance(), _notes(path, record))
 
 
-def _means(texture: Texture) -> Tensor:
-    """(F, 3) colours of faces under a texture: of points evenly spread over each, the mean."""
-    faces, total = torch.arange(len(texture.corner_uvs)), torch.zeros(len(texture.corner_uvs), 3)
+def _fitted(texture: Texture) -> Float[Tensor, "F 3 3"]:
+    """Colours of the corners of faces under a texture: by least squares, of points evenly spread over each."""
+    faces = torch.arange(len(texture.corner_uvs))
     steps = [(i + 1 / 3, j + 1 / 3) for i in range(_SPREAD) for j in range(_SPREAD - i)]
-    for a, b in steps:
-        weights = torch.tensor([a, b, _SPREAD - a - b]) / _SPREAD
-        total += texture.colors(faces, weights.expand(len(faces), 3))
-    return total / len(steps)
+    weights = torch.tensor([(a, b, _SPREAD - a - b) for a, b in steps]) / _SPREAD
+    inverse, colors = torch.linalg.pinv(weights), torch.zeros(len(faces), 3, 3)
+    for point, part in zip(weights, inverse.T, strict=True):
+        colors += part[:, None] * texture.colors(faces, point.expand(len(faces), 3))[:, None]
+    return colors.clamp(0, 1)
 
 
 def _harmonics(path: Path, table: np.ndarray) -> tuple[Tensor, Tensor]:

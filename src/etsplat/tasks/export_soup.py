@@ -103,7 +103,12 @@ def export_soup(run: SoupRun, path: Path | str, config: ExportConfig, crop: Crop
         written = Export(path, int(chosen.kept.sum()), 0, chosen.removed, Similarity())
     else:
         written = _write(run, path, config, chosen, apart=apart)
-    notes = *_without_capture(run, path, config), *_not_turned(run, path, config), *_unknown_sky(run, config)
+    notes = (
+        *run.notes,
+        *_without_capture(run, path, config),
+        *_not_turned(run, path, config),
+        *_unknown_sky(run, config),
+    )
     return replace(written, notes=notes)
 
 
@@ -150,7 +155,7 @@ def _write_whole(run: SoupRun, path: Path, config: ExportConfig, chosen: Selecti
 
 def _chosen_solid(run: SoupRun, config: ExportConfig, chosen: Selection) -> SolidSoup | None:
     """The opaque mesh without what the soup is left without, for pages; None if there is none."""
-    solid = run.solid
+    solid = run.soup if isinstance(run.soup, SolidSoup) else run.solid
     if solid is None or config.triangles == "soup":
         return None
     shown = replace(run, soup=solid)

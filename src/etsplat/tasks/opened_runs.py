@@ -41,6 +41,7 @@ class SoupRun:
         in_blocks: whether it was trained in blocks, of which no opaque mesh is made.
         gone: the folder of its scene, where that is not there any more.
         other_scene: whether the capture is known to be another one than that of the training.
+        notes: a sentence for each thing of a file that is otherwise in the soup.
     """
 
     path: Path
@@ -52,6 +53,7 @@ class SoupRun:
     in_blocks: bool = False
     gone: str | None = None
     other_scene: bool = False
+    notes: tuple[str, ...] = ()
 
     @property
     def device(self) -> torch.device:
@@ -108,7 +110,9 @@ def open_run(
         raise InputError(f"{path}: no such file or folder; {path_remedy(path)}")
     if path.is_dir():
         return replace(_open_directory(path, scene, place), engine=engine)
-    return SoupRun(path, load_soup(path).to(place), capture_at(scene), engine=engine)
+    notes: list[str] = []
+    soup = load_soup(path, notes.append).to(place)
+    return SoupRun(path, soup, capture_at(scene), engine=engine, notes=tuple(notes))
 
 
 def capture_at(scene: Dataset | Path | str | None) -> Dataset | None:
