@@ -56,7 +56,8 @@ def test_transforms_read_nothing_outside_of_their_folder(tmp_path, key, name):
     (document if key == "ply_file_path" else document["frames"][1])[key] = name
     path.write_text(json.dumps(document))
     with pytest.raises(
-        InputError, match=r"(missing|image|PLY file).*/deep/scene/(images/)?stolen\.png(: no such file|\);)"
+        InputError,
+        match=r"(missing|image|PLY file).*/deep/scene/(images/)?stolen\.png(: no such file|\);)|outside of its folder",
     ):
         load_dataset(scene)
 

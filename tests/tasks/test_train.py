@@ -18,7 +18,7 @@ from etsplat.optim.loop import CheckpointEvent, DivergedError, NoteEvent, Refine
 from etsplat.optim.schedules import at
 from etsplat.optim.strategies import DensifyAndPrune
 from etsplat.optim.trainer import Trainer
-from etsplat.tasks.pixel_limits import triangle_limit
+from etsplat.tasks.pixel_limits import random_count, triangle_limit
 from etsplat.tasks.soup_trainer import start_trainer
 from etsplat.tasks.train import TrainResult, train
 from etsplat.tasks.train_checks import check_train
@@ -185,6 +185,17 @@ def test_a_capture_without_points_starts_at_random(capture: Dataset, tmp_path: P
     result = train(bare, tmp_path / "run", SHORT.changed({"start.points": 300}), callbacks=[notes.append])
     assert result.metrics["triangles"] > 100
     assert any("no points" in getattr(note, "text", "") for note in notes)
+
+
+@pytest.mark.parametrize("sky", ["sphere", "dome", "none"])
+def test_random_triangles_are_no_more_than_there_may_be(capture: Dataset, sky: str) -> None:
+    """The note said at most so many, and the run began with thirty times as many, which stayed in part."""
+    bare = replace(capture, exact_points=None, point_colors=None)
+    config = SHORT.changed({"start.points": 100_000, "max_triangles": 1000, "sky": sky, "pixels_per_triangle": None})
+    trainer = start_trainer(bare, config)
+    assert 950 <= len(trainer.model) <= 1000
+    said = next(note for note in check_train(bare, config, 10, torch.device("cpu")) if note.startswith("no points"))
+    assert f"starting from {random_count(bare, config):,} random ones" in said
 
 
 def test_absolute_units_far_off_are_pointed_out(capture: Dataset, tmp_path: Path) -> None:

@@ -26,7 +26,7 @@ from etsplat.optim.strategies import DensifyAndPrune
 from etsplat.optim.terms.photometric import Photometric
 from etsplat.optim.terms.soup import Spared
 from etsplat.optim.trainer import Trainer
-from etsplat.tasks.pixel_limits import triangle_limit
+from etsplat.tasks.pixel_limits import random_count, triangle_limit
 from etsplat.tasks.running import terms_of
 from etsplat.tasks.scene_part import ScenePart, in_frame, sphere_in_frame
 from etsplat.tasks.train_config import TrainConfig
@@ -272,7 +272,7 @@ def _start_points(capture: Dataset, config: TrainConfig, generator: torch.Genera
     """The capture's points, or random ones in a cube that holds what the cameras look at."""
     positions, colors = capture.points, capture.point_colors
     if positions is None:
-        points = random_points(config.start.points, capture.viewmats[capture.train], generator)
+        points = random_points(random_count(capture, config), capture.viewmats[capture.train], generator)
     else:
         grey = torch.full_like(positions, 0.5)
         points = StartPoints(positions, grey if colors is None else colors)

@@ -17,6 +17,7 @@ from etsplat.data.demo_object import demo_object
 from etsplat.data.demo_scene import HEIGHT, WIDTH, demo_scene
 from etsplat.data.dense_cloud import FEWEST_POINTS, dense_start
 from etsplat.data.doubtful_poses import doubts, with_doubts
+from etsplat.data.far_vertices import far_vertices_note
 from etsplat.data.frame_gaps import without_frame_gaps
 from etsplat.data.hull import bounding_sphere, check_not_empty
 from etsplat.data.load import load_dataset
@@ -77,7 +78,7 @@ def load_source(
             raise InputError(f"{name} {folder}: belong to {_A_FOLDER}; leave them out")
     if isinstance(source, MeshFile):
         source.check()
-        return source, source.notes
+        return source, _notes(source)
     if isinstance(source, Dataset):
         close, found = (source, []) if config.refine_cameras != "off" else _closer(source, lambda width: source)
         scene, notes = _in_unit_sphere(close)
@@ -98,8 +99,13 @@ def load_source(
         raise InputError(f"{path}: {remedy}")
     if path.is_file():
         mesh = load_mesh(path)
-        return mesh, mesh.notes
+        return mesh, _notes(mesh)
     raise InputError(f"{path}: no such file or folder; {path_remedy(path)}")
+
+
+def _notes(mesh: MeshFile) -> list[str]:
+    far = far_vertices_note(mesh)
+    return [*mesh.notes, *([] if far is None else [far])]
 
 
 def _closer(scene: Dataset, read: Callable[..., Dataset]) -> tuple[Dataset, list[str]]:

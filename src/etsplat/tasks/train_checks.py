@@ -5,7 +5,7 @@ import torch
 from etsplat.core.errors import InputError
 from etsplat.data.dataset import Dataset
 from etsplat.optim.trainer_checks import USUAL_EXTENT
-from etsplat.tasks.pixel_limits import triangle_limit
+from etsplat.tasks.pixel_limits import random_count, triangle_limit
 from etsplat.tasks.train_config import TrainConfig
 from etsplat.tasks.train_memory import check_memory
 
@@ -55,7 +55,7 @@ def check_train(
         maps = ["its depth maps"] if capture.images.with_depth and config.loss.depth != "off" else []
         photos = ["its photos"] if config.start.dense and config.finish == "none" else []
         unless = f" unless {' or '.join(maps + photos)} agree" if maps or photos else ""
-        notes.append(f"no points in the capture: starting from {config.start.points:,} random ones{unless}")
+        notes.append(f"no points in the capture: starting from {random_count(capture, config):,} random ones{unless}")
     if doubt := doubtful_scale(capture, config):
         notes.append(doubt)
     return notes

@@ -10,6 +10,7 @@ from etsplat.data.dataset import Dataset
 from etsplat.data.loader import stay_on
 from etsplat.io.memory import available_memory
 from etsplat.model.surroundings import SPHERE_TRIANGLES
+from etsplat.tasks.pixel_limits import random_count
 from etsplat.tasks.train_config import TrainConfig
 
 STATISTICS = 16
@@ -113,7 +114,7 @@ def memory_of(capture: Dataset, config: TrainConfig, most: int, device: torch.de
         around: as of `bytes_around`.
     """
     pixels = max(width * height for width, height in capture.images.sizes)
-    points = config.start.points if capture.exact_points is None else len(capture.exact_points)
+    points = random_count(capture, config) if capture.exact_points is None else len(capture.exact_points)
     triangles = max(most, points + (SPHERE_TRIANGLES if config.sky == "sphere" else 0))
     each = bytes_per_triangle(config.drawing.sh_degree, watched=bool(capture.watched))
     stays = not capture.images.streamed and stay_on(device, capture.images.total_bytes)

@@ -315,3 +315,19 @@ def test_the_shared_lego_loads_with_its_published_split(shared_data):
     assert stack(views).shape == (125, 50, 50, 4)
     assert (len(views.train), len(views.test)) == (100, 25)
     assert float(views.Ks[0, 0, 0]) == pytest.approx(0.5 * 50 / math.tan(0.6911112070083618 / 2))
+
+
+def test_a_file_in_a_subfolder_that_leads_out_of_it_says_where_to_move_it(scene):
+    """Its photos were called missing, by a path that nobody had written. There it is read."""
+
+    def lead_out(document):
+        for frame in document["frames"]:
+            frame["file_path"] = f"../{frame['file_path'].removeprefix('./')}"
+
+    rewrite(scene, lead_out)
+    (scene / "poses").mkdir()
+    (scene / "transforms.json").rename(scene / "poses" / "transforms.json")
+    with pytest.raises(InputError, match=r"names '\.\./images.*outside of its folder.*; move transforms\.json to"):
+        load_transforms(scene / "poses")
+    (scene / "poses" / "transforms.json").rename(scene / "transforms.json")
+    assert len(load_transforms(scene).images) == 10

@@ -5,7 +5,7 @@ inverting gives our world-to-camera matrices with OpenCV axes.
 """
 
 import math
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 from jaxtyping import Float
@@ -148,7 +148,22 @@ def _points(path: Path, document: dict[str, Any]) -> Points | None:
 
 def _image(path: Path, said: str) -> tuple[str, Path]:
     """Name and file of an image; names lead from the folder itself, or from its `images`."""
-    return placed_file([path.parent, path.parent / "images"], said, path, find_image)
+    name, image = placed_file([path.parent, path.parent / "images"], said, path, find_image)
+    if not image.is_file():
+        _refuse_outside(path, said)
+    return name, image
+
+
+def _refuse_outside(path: Path, said: str) -> None:
+    """Raises InputError where a name that begins with `..` leads to an image: it would be called missing."""
+    parts = PurePosixPath(said.replace("\\", "/")).parts
+    up = next((count for count, part in enumerate(parts) if part != ".."), 0)
+    above = path.absolute().parents
+    if 0 < up < len(above) and find_image(above[up], "/".join(parts[up:]), path).is_file():
+        raise InputError(
+            f"scene {path}: names {said[:80]!r}, which is outside of its folder, where nothing is looked for; move"
+            f" {path.name} to {above[up]}, where it is read as it is, and name that folder"
+        )
 
 
 def _frames(path: Path, document: dict[str, Any], wanted: Wanted) -> list[Frame]:
