@@ -198,6 +198,27 @@ def test_random_triangles_are_no_more_than_there_may_be(capture: Dataset, sky: s
     assert f"starting from {random_count(bare, config):,} random ones" in said
 
 
+def test_the_sky_of_a_capture_without_points_is_behind_what_photos_agree_on(
+    capture: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It was about the cameras alone once the run had begun: of cameras in a line all of the scene was taken for sky,
+    so that there was no opaque mesh, and nothing was left without a sky."""
+    far = 12 * torch.nn.functional.normalize(torch.randn(200, 3, generator=torch.Generator().manual_seed(0)), dim=1)
+    starts: list[Dataset] = []
+
+    def swept(own: Dataset, *_: object) -> tuple[Dataset, float]:
+        starts.append(replace(own, exact_points=far.double(), point_colors=torch.full((200, 3), 0.5)))
+        return starts[0], 1.0
+
+    monkeypatch.setattr("etsplat.tasks.train.with_swept_points", swept)
+    bare = replace(capture, exact_points=None, point_colors=None)
+    result = train(bare, tmp_path / "run", SHORT.changed({"start.dense": True, "sky": "sphere", "asset": True}))
+    sky = Surroundings.of_note(result.soup.notes[Surroundings.NOTE])
+    assert sky is not None
+    assert sky.radius == pytest.approx(Surroundings.of(starts[0]).radius * starts[0].normalization.radius, rel=1e-4)
+    assert result.opaque is not None
+
+
 def test_absolute_units_far_off_are_pointed_out(capture: Dataset, tmp_path: Path) -> None:
     """Without normalization a scene a thousand times larger gets a note; with it, the same result as the small one."""
     assert capture.exact_points is not None

@@ -192,6 +192,8 @@ def _fit(
                 if consistent < POOR and config.refine_cameras == "off":
                     config = _of_poor_poses(job, consistent, len(own.train), shorten=trust is None)
         trainer = start_trainer(start, config, scorer.cheap, job.device, trust, part)
+        if capture.exact_points is None:  # what was found instead says where the sky is, and the opaque mesh begins
+            capture = replace(capture, exact_points=start.exact_points, point_colors=start.point_colors)
 
         def look(iteration: int) -> None:
             if onlooker is not None and workers().leads:
@@ -248,7 +250,7 @@ def _of_poor_poses(job: Job[TrainConfig], consistent: float, views: int, *, shor
     told = (
         f"poses: of the places that a photo finds its neighbours find only {100 * consistent:.0f} %: cameras are"
         " probably off by a pixel and more, or things moved. --refine-cameras poses mends small errors, etsplat data"
-        " sfm finds cameras anew"
+        " sfm finds cameras anew; of right poses photos are too far apart, or too plain, to tell depths"
     )
     iterations = limited_iterations(config.iterations, most, views, config.batch)
     if shorten and consistent < DOUBTFUL and iterations < config.iterations:
