@@ -192,7 +192,8 @@ def _fit(
                 if consistent < POOR and config.refine_cameras == "off":
                     config = _of_poor_poses(job, consistent, len(own.train), shorten=trust is None)
         trainer = start_trainer(start, config, scorer.cheap, job.device, trust, part)
-        if capture.exact_points is None:  # what was found instead says where the sky is, and the opaque mesh begins
+        if capture.exact_points is None and Surroundings.of(start).radius > Surroundings.of(capture).radius:
+            # Cameras alone do not say that the sky is behind what was found, where the opaque mesh begins, too.
             capture = replace(capture, exact_points=start.exact_points, point_colors=start.point_colors)
 
         def look(iteration: int) -> None:
