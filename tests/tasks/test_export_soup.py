@@ -21,6 +21,7 @@ from etsplat.io.compact_soups import decode_compact
 from etsplat.io.mesh_files import MeshFile, save_mesh
 from etsplat.io.ply_tables import encode_ply, read_ply_tables
 from etsplat.io.srgb import srgb_from_linear
+from etsplat.model.solid_soup import SolidSoup
 from etsplat.model.soup_appearance import SoupAppearance
 from etsplat.model.soup_import import load_soup
 from etsplat.tasks.export_config import ExportConfig
@@ -205,6 +206,18 @@ def test_the_page_of_a_cropped_run_has_the_cropped_mesh(tmp_path, soup):
     inside = vertices[faces].mean(dim=1) - torch.tensor([0.0, 0.0, 1.0])
     assert sizes["mesh"]["mesh"] == int((inside.norm(dim=1) <= 0.9).sum())
     assert sizes["soup"] == {"soup": sizes["mesh"]["soup"]}
+
+
+@pytest.mark.parametrize("kind", ["ply", "obj", "glb"])
+def test_an_opaque_mesh_keeps_the_colours_of_its_corners(tmp_path, soup, kind):
+    """Read again from PLY it had one colour for each triangle."""
+    vertices, faces = icosphere(2)
+    mesh = MeshFile(vertices, faces, vertex_colors=vertices * 0.5 + 0.5)
+    export_soup(replace(run_of(soup), path=tmp_path, opaque=mesh), tmp_path / f"a.{kind}", ExportConfig(up="keep"))
+    again = load_soup(tmp_path / f"a.{kind}")
+    assert isinstance(again, SolidSoup)
+    atol = 0.03 if kind == "glb" else 0.003  # trimesh reads 8 bits of linear light
+    torch.testing.assert_close(again.corner_colors, mesh.vertex_colors[faces], atol=atol, rtol=0)
 
 
 @pytest.mark.parametrize(("floor", "advised"), [("0", False), ("0.97", True)])

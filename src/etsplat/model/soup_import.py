@@ -134,6 +134,8 @@ def _read_exported(path: Path, comments: list[str], tell: Callable[[str], None])
     corners = face[CORNERS].astype(np.int64)
     if corners.size and not 0 <= corners.min() <= corners.max() < len(points):
         raise InputError(f"soup {path}: has corners that name no vertex; export it again")
+    if (colors := _corner_colors(path, vertex, corners)) is not None:
+        return SolidSoup.of_corners(points[torch.from_numpy(corners)], colors, SoupAppearance(), _notes(path, record))
     opacity, sigma = columns(path, face, "opacity", "sigma").float().double().unbind(dim=1)
     if "f_dc_0" in (face.dtype.names or ()):
         dc, rest = _harmonics(path, face)
@@ -153,6 +155,14 @@ def _read_exported(path: Path, comments: list[str], tell: Callable[[str], None])
     words = next((comment.split() for comment in comments if comment.startswith("etsplat ")), [])
     known = len(words) == 3 and words[2] in DISTANCES
     return replace(soup, appearance=_known(path, SoupAppearance(words[1], words[2]))) if known else soup
+
+
+def _corner_colors(path: Path, vertex: np.ndarray, corners: np.ndarray) -> Float[Tensor, "F 3 3"] | None:
+    """What an opaque mesh has; None of a soup, whose triangles have one colour each."""
+    if not set(COLORS) <= set(vertex.dtype.names or ()):
+        return None
+    colors = columns(path, vertex, *COLORS)[torch.from_numpy(corners)].float() / 255
+    return colors if bool((colors != colors[:, :1]).any()) else None
 
 
 def _appearance(path: Path, said: Any) -> SoupAppearance:
