@@ -44,8 +44,8 @@ class Start:
     """The triangles that the optimization starts from: one at each point of the capture."""
 
     points: Annotated[int, Range(1, 10**8)] = 100_000
-    """So many random triangles to start from where the capture has no points and its photos agree on too little,
-    or as many as there may be, if fewer."""
+    """So many random triangles to start from where the capture has no points and its photos agree on too little;
+    as many as there may be, if these are fewer."""
     dense: bool = True
     """Triangles start at places that photos agree on, too, where photos agree on many places:
     in a third of the start or more, which is half of the triangles that there may be or as many as there are points;
