@@ -115,6 +115,24 @@ def test_no_start_has_more_faces_than_a_run_may_have(monkeypatch: pytest.MonkeyP
     assert bool(cut) == taken
 
 
+@pytest.mark.parametrize(
+    ("share", "bottom", "asked"), [(0.007, True, True), (0.007, False, False), (0.02, False, True)]
+)
+def test_what_is_open_is_contradicted_by_more_before_a_soup_is_asked(
+    monkeypatch: pytest.MonkeyPatch, share: float, bottom: bool, asked: bool
+) -> None:
+    """Of a cube without its bottom a soup made walls, and what was between them was filled."""
+    _, _, views = painted_pictures(*revolved(VASE))
+    vertices, faces = icosphere(3)
+    start = Opened(vertices, faces if bottom else faces[100:], 0, share, 1.0, 1.0)
+    monkeypatch.setattr(starts, "plain_hull", lambda *_: starts.Hull(vertices, faces, 1400, 0.0))
+    monkeypatch.setattr(starts, "_opened", lambda *_: start)
+    calls = list[Opened]()
+    monkeypatch.setattr(starts, "_cut_open", lambda _, hull, opened, *more: (calls.append(opened) or opened, False))
+    starts.make_start(None, views, CONFIG.changed({"start.shape": "hull"}))
+    assert bool(calls) == asked
+
+
 @pytest.mark.parametrize(("soup", "taken", "by"), [(0.09, 2800, "walls"), (0.05, 1400, "soup")])
 def test_a_soup_must_be_clearly_better_than_walls(
     monkeypatch: pytest.MonkeyPatch, soup: float, taken: int, by: str

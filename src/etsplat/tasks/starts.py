@@ -67,6 +67,10 @@ _MARGINS = (0.05, 0.03, 0.08)
 """How far in front of what a coarse soup shows a hull is cut, in units of the object's radius; in turn, until photos
 contradict it no more. Nearer takes away what is thin, farther leaves more of a lid to be pushed in."""
 
+_OPEN = 0.01
+"""Of what is open, as a cube without its bottom, photos contradict more by chance than `CONTRADICTED`: it is seen from
+two sides. A soup that is asked all the same makes the walls of a hollow of its one sheet."""
+
 _CLEARLY, _RIMS = 0.7, 0.003
 """A cut hull is taken where photos contradict at most so many times as much of it, and if it leaves at most this part
 of the silhouettes uncovered beside what the hull does: a little of a thin rim, which grows again."""
@@ -219,7 +223,8 @@ def make_start(
         tell(StageEvent("Carving the visual hull", 0, 0))
         hull = plain_hull(views, config)
         opened = _opened(views, hull.vertices, hull.faces, tell)
-        if opened.contradicted > CONTRADICTED:
+        closed = MeshTopology.from_faces(opened.faces, len(opened.vertices)).is_closed()
+        if opened.contradicted > (CONTRADICTED if closed else _OPEN):
             opened, cut = _cut_open(views, hull, opened, config, device, tell)
         faces = opened.faces
         tell(StageEvent("Untangling the start", 0, 0))
