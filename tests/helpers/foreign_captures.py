@@ -7,9 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 from PIL import Image
 
+from etsplat.core.errors import InputError
+from etsplat.data.load import load_dataset
 from helpers.captures import circle_poses, opengl_pose, quaternion
 
 FLIP = np.diag([1.0, -1.0, -1.0])
@@ -463,3 +466,10 @@ WRITERS: dict[str, Callable[[Path, Truth], None]] = {
     "nerf_plus_plus": write_nerf_plus_plus,
     "mvsnet": write_mvsnet,
 }
+
+
+def check_refused(folder: Path, message: str) -> None:
+    """That a capture cannot be read, and one line says why."""
+    with pytest.raises(InputError, match=message) as raised:
+        load_dataset(folder)
+    assert "\n" not in str(raised.value)

@@ -148,7 +148,7 @@ def test_a_ply_whose_corners_are_no_list_is_an_input_error(tmp_path):
 
 @pytest.mark.parametrize("kind", ["ascii", "binary_little_endian", "binary_big_endian"])
 def test_strips_of_a_ply_are_triangles_that_all_look_one_way(tmp_path, kind):
-    """As scans of Stanford and VTK have them; they were refused as clouds of points without faces."""
+    """As some scans have them; they were refused as clouds of points without faces."""
     corners = torch.tensor([[x, y, 0.0] for x in range(4) for y in (0.0, 1.0)])
     strips = [0, 2, 1, 3, -1, 2, 4, 3, 5, 5, 4, 4, 6, 5, 7]  # two, in the second of which corners come twice
     head = f"ply\nformat {kind} 1.0\nelement vertex 8\nproperty float x\nproperty float y\nproperty float z\n"

@@ -37,8 +37,8 @@ _MOST, _MUCH = 0.9, 0.125
 beside the one that sees most of it. Of lids all are, of sides of a blowtorch of brass 0.5 to 0.7."""
 
 _FEWEST = 3
-"""Photos that must see a lid at least, and the root of their number where that is more: a handle of brass looked like a
-lid in five of 55, and lids are seen from two fifths of all directions."""
+"""Photos that must see a lid at least, and the root of their number where that is more: a wooden handle looked like
+a lid in five of 55, and lids are seen from two fifths of all directions."""
 
 _LEAST = 0.005
 """Share of the surface that a lid has at least: for less a mesh is better closed."""

@@ -16,8 +16,8 @@ _ORDERS = {b"ascii": "", b"binary_little_endian": "<", b"binary_big_endian": ">"
 _CORNER_NAMES = ("vertex_indices", "vertex_index")
 
 _STRIPS = "tristrips"
-"""The element that scans of Stanford and VTK have in the place of faces: lists of corners, of which each three in turn
-are a triangle, every other one the other way round. After -1 another strip begins."""
+"""The element that some scans have in the place of faces: lists of corners, of which each three in turn are a triangle,
+every other one the other way round. After -1 another strip begins."""
 
 Take = Callable[[str, int], tuple[Any, ...]]
 """The next so many numbers of a type in a file."""
@@ -55,7 +55,7 @@ def with_triangles(path: Path) -> bytes | None:
             return None
         words, strips = [] if order else data[start:].split(), faces.name == _STRIPS
         told = _are_triangles(data, start, order, before, faces) if order else _are_triangles_in(words, before, faces)
-        if told and not strips:
+        if told and not strips:  # a strip of three corners looks like one
             return None
         take = _of_binary(data, start, order) if order else _of_text(words)
         tables = {each.name: _table(take, each) for each in before}
