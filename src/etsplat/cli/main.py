@@ -12,6 +12,7 @@ import etsplat
 from etsplat.cli.command import FAILED, INTERRUPTED, WRONG_INPUT, Command, fail
 from etsplat.cli.parse import parse
 from etsplat.core.errors import InputError
+from etsplat.core.spelling import spelled_as_options
 
 
 def main() -> NoReturn:
@@ -22,6 +23,7 @@ def main() -> NoReturn:
     run_command(parse, sys.argv[1:])
 
 
+@spelled_as_options()
 def run_command(parse: Callable[[Sequence[str]], Command], arguments: Sequence[str]) -> NoReturn:
     """Runs the command that `parse` makes of the arguments, and ends the process.
 

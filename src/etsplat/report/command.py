@@ -3,6 +3,7 @@
 import shlex
 from typing import Any
 
+from etsplat.core.spelling import as_option
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.settings import Settings, flatten
 from etsplat.tasks.train_config import TrainConfig
@@ -25,17 +26,14 @@ def reproduce_command(config: dict[str, Any], version: str) -> str | None:
     words = [f"etsplat {config['task']} {shlex.quote(paths['source'])} --out DIR"]
     if paths["source"] == "demo:scene":
         words = ["etsplat demo scene --out DIR"]
-    words += [_option(name, paths[name]) for name in ("init_mesh", "images", "masks", "blocks") if paths.get(name)]
-    words += [_option(name, settings[name]) for name in kind.LABELS]
+    words += [_given(name, paths[name]) for name in ("init_mesh", "images", "masks", "blocks") if paths.get(name)]
+    words += [_given(name, settings[name]) for name in kind.LABELS]
     for name, value in flatten(settings).items():
         if name not in kind.LABELS and (not same or name not in implied or implied[name] != value):
-            words.append(_option(name, value))
+            words.append(_given(name, value))
     return " \\\n    ".join(words)
 
 
-def _option(name: str, value: object) -> str:
-    """How a setting is given on the command line."""
-    group, dot, last = name.replace("_", "-").rpartition(".")
-    if isinstance(value, bool):
-        return f"--{group}{dot}{'' if value else 'no-'}{last}"
-    return f"--{group}{dot}{last} {shlex.quote(str(value))}"
+def _given(name: str, value: object) -> str:
+    """How a setting is given on the command line, for a shell."""
+    return as_option(name, value if isinstance(value, bool) else shlex.quote(str(value)))

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from etsplat.core.errors import InputError
+from etsplat.core.spelling import by_options, spelled_as_options
 from etsplat.io.atomic import write_error
 from etsplat.io.locks import check_nobody_writes
 from etsplat.io.run_directory import is_run
@@ -31,6 +32,7 @@ class Work:
         options: what `run` takes besides.
         threads: of the engine and of torch.
         store: where the run directory is kept, as fsspec names it ("s3://..."); None for the folder alone.
+        options_spelled: whether errors spell settings as the command line does, as where the work was made.
     """
 
     run: Callable[..., object]
@@ -40,6 +42,7 @@ class Work:
     options: Mapping[str, Any] = field(default_factory=dict)
     threads: int = 1
     store: str | None = None
+    options_spelled: bool = field(default_factory=by_options)
 
     @property
     def log(self) -> Path:
@@ -64,7 +67,8 @@ def perform(work: Work) -> str:
     try:
         with _logging(work.log) as tell:
             try:
-                _perform(work, tell)
+                with spelled_as_options(work.options_spelled):
+                    _perform(work, tell)
             except Exception as error:
                 if not isinstance(error, InputError):
                     tell(traceback.format_exc())
