@@ -6,6 +6,10 @@ from pathlib import Path
 
 import pytest
 
+from etsplat.core.errors import InputError
+from etsplat.io.run_directory import RunDirectory
+from etsplat.tasks.reconstruct import reconstruct
+from etsplat.tasks.train import train
 from helpers.captures import write_photo
 from tests.helpers.commands import Run, assert_one_line_error
 
@@ -62,3 +66,25 @@ def test_a_package_that_is_needed_and_missing(command: list[str], tmp_path: Path
     line = "etsplat: the module torch is not installed: install etsplat anew, without pip's --no-deps\n"
     assert said(*command) == (1, line)
     assert "Traceback" in said(*command, "--debug")[1]
+
+
+@pytest.mark.parametrize("task", ["reconstruct", "train"])
+def test_settings_are_spelled_as_options_for_the_command_alone(task: str, etsplat: Run, tmp_path: Path) -> None:
+    """Who calls the function reads its arguments, also after a command in the same process."""
+    source, make = {"reconstruct": ("demo:owl", reconstruct), "train": ("demo:scene", train)}[task]
+    RunDirectory.create(tmp_path / "run", {"task": task})
+    there, none = str(tmp_path / "run"), str(tmp_path / "none")
+    shell = "run already; continue it with --resume, replace it with --overwrite, or choose another folder"
+    assert_one_line_error(etsplat(task, source, "--out", there), shell)
+    assert_one_line_error(
+        etsplat(task, source, "--out", none, "--resume"), "no run to resume; start it without --resume"
+    )
+    assert_one_line_error(etsplat(task, source, "--out", none, "--resume", "--overwrite"), "--resume and --overwrite: ")
+    with pytest.raises(
+        InputError, match="run already; continue it with resume=True, replace it with overwrite=True, or"
+    ):
+        make(source, there)
+    with pytest.raises(InputError, match=r"no run to resume; start it without resume$"):
+        make(source, none, resume=True)
+    with pytest.raises(InputError, match=r"^resume and overwrite: contradict each other"):
+        make(source, none, resume=True, overwrite=True)

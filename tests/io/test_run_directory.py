@@ -30,7 +30,7 @@ def test_a_new_folder_is_made_with_its_parents_and_explains_itself(tmp_path: Pat
     assert is_run(run.path)
     assert run.read_config()["config"] == CONFIG["config"]
     readme = (run.path / "README.txt").read_text()
-    for name in ("report.html", "mesh.ply", "metrics.json", "history.jsonl", "checkpoints", "--resume"):
+    for name in ("report.html", "mesh.ply", "metrics.json", "history.jsonl", "checkpoints", "resume=True"):
         assert name in readme
 
 
@@ -143,7 +143,7 @@ def test_a_folder_with_a_run_is_refused_and_left_alone(tmp_path: Path) -> None:
     before = contents(tmp_path)
     with pytest.raises(InputError) as error:
         RunDirectory.create(tmp_path, CONFIG)
-    assert_one_line(error, "--resume", "--overwrite")
+    assert_one_line(error, "resume=True", "overwrite=True")
     assert contents(tmp_path) == before
 
 
@@ -216,7 +216,7 @@ def test_resume_wants_a_run(tmp_path: Path) -> None:
     """Resuming a folder that does not exist or holds no run is an error that says to start it."""
     with pytest.raises(InputError) as error:
         RunDirectory.resume(tmp_path / "run", CONFIG)
-    assert_one_line(error, "no run to resume", "without --resume")
+    assert_one_line(error, "no run to resume", "without resume")
 
 
 def test_resume_wants_the_same_settings_and_input(tmp_path: Path) -> None:

@@ -126,7 +126,9 @@ def test_a_kernel_from_python_is_refused(rng):
     etsplat.register_kernel("for_compact", lambda x, sigma: torch.sigmoid((1 - x) / (0.25 * sigma)))
     try:
         soup = make_soup(rng, 5, kernel="for_compact")
-        with pytest.raises(InputError, match=r"'for_compact': was registered from Python.*--format safetensors"):
+        with pytest.raises(
+            InputError, match=r"'for_compact': was registered from Python.*export to a path that ends in \.safetensors"
+        ):
             compact_of(soup, importance(soup))
     finally:
         del KERNELS["for_compact"]

@@ -218,7 +218,7 @@ def test_a_checkpoint_of_a_version_before_is_refused(right: Dataset, tmp_path: P
     tensors, metadata = read_tensors(path)
     del tensors["cameras.squares"]
     save_tensors(path, tensors, metadata)
-    with pytest.raises(InputError, match=r"step_000060\.safetensors: another .* lacks `squares`; .*--overwrite"):
+    with pytest.raises(InputError, match=r"step_000060\.safetensors: another .* lacks `squares`; .*again in another"):
         resumed.fit(BRIEF + 10, run=tmp_path)
 
 

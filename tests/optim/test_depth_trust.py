@@ -38,7 +38,7 @@ def test_maps_in_another_unit_are_believed_up_to_scale_and_the_factor_is_told():
     trust = DepthTrust(range(6), tell=told.append)
     trust.judge(pairs(lambda depth, _: depth / 4), "the truth")
     assert trust.kind == "pearson"
-    assert "the truth is 4 times as far away: correct the unit with --depth-unit" in told[0]
+    assert "the truth is 4 times as far away: correct the unit with depth_unit=" in told[0]
     asked = DepthTrust(range(6), "l1")
     asked.judge(pairs(lambda depth, _: depth / 4), "the truth")
     assert asked.kind is None

@@ -107,7 +107,7 @@ def test_unfinished_or_foreign_folder_is_an_input_error(tmp_path: Path, run_dir:
     with pytest.raises(InputError, match="is not a run of etsplat"):
         write_report(tmp_path)
     (run_dir / "metrics.json").unlink()
-    with pytest.raises(InputError, match="has not finished; continue it with --resume"):
+    with pytest.raises(InputError, match=r"has not finished; continue it with resume=True$"):
         write_report(run_dir)
 
 

@@ -94,7 +94,7 @@ def test_the_run_is_one_for_all_that_comes_after(run: tuple[TrainResult, list[ob
 
 
 def test_faint_soups_of_blocks_are_not_to_be_trained_with_an_opaque_mesh(run: tuple[TrainResult, list[object]]) -> None:
-    with pytest.raises(InputError, match="lower --min-opacity, or train with --finish opaque; no opaque mesh is made"):
+    with pytest.raises(InputError, match='lower min_opacity, or train with finish="opaque"; no opaque mesh is made'):
         export_soup(open_run(run[0].path), run[0].path / "faint.glb", ExportConfig(min_opacity=1.0))
 
 

@@ -12,6 +12,7 @@ import trimesh
 import etsplat
 from etsplat.cli.parse import parse
 from etsplat.core.errors import InputError
+from etsplat.core.spelling import spelled_as_options
 from etsplat.geometry.icosphere import icosphere
 from etsplat.io.georeference import Georeference
 from etsplat.io.mesh_files import load_mesh, save_mesh
@@ -46,7 +47,8 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def export(*words: str | Path) -> None:
     arguments = ["export", *map(str, words)]
-    assert parse(arguments).run(arguments) == 0
+    with spelled_as_options():
+        assert parse(arguments).run(arguments) == 0
 
 
 def test_a_light_textured_file_lies_where_the_mesh_of_the_run_does(
@@ -136,6 +138,14 @@ def test_what_does_not_go_together_is_refused(run: Path, tmp_path: Path) -> None
     ]:
         with pytest.raises(InputError, match=about):
             export(run, *words)
+    with pytest.raises(InputError, match=r"^normals: has an effect only with texture; leave"):
+        etsplat.ExportConfig(normals=True)
+    with pytest.raises(InputError, match=r"^alpha: is for soups; of a reconstruction's mesh there are texture, fa"):
+        etsplat.export(run, tmp_path / "a.glb", etsplat.ExportConfig(alpha=True))
+    with pytest.raises(
+        InputError, match=r"stored in another way; leave out compress, or choose a path that ends in \.glb$"
+    ):
+        etsplat.export(run, tmp_path / "a.ply", etsplat.ExportConfig(compress="quantize"))
     with pytest.raises(InputError, match="of `etsplat reconstruct`"):
         etsplat.texture_mesh(tmp_path)
     with pytest.raises(InputError, match="name a run of `etsplat train`"):

@@ -140,7 +140,7 @@ def test_a_sky_that_nobody_knows_is_not_said_to_be_left_out(tmp_path, soup):
     config = ExportConfig(sky="none", up="keep", min_opacity=0.0)
     unknown = export_soup(open_run(tmp_path / "soup.safetensors"), tmp_path / "a.ply", config).notes
     assert len(unknown) == 1
-    assert unknown[0].startswith("no triangle is left out as sky, since nobody knows where that is (--scene names")
+    assert unknown[0].startswith("no triangle is left out as sky, since nobody knows where that is (scene= names")
     known = replace(soup, notes={"sky": "none"})
     assert export_soup(SoupRun(tmp_path, known, None), tmp_path / "b.ply", config).notes == ()
 
@@ -196,7 +196,7 @@ def test_where_nobody_knows_up_nothing_is_turned_nor_called_upright(tmp_path, so
     soup.save(tmp_path / "soup.safetensors")
     told = ExportConfig(up="z", min_opacity=0.0)
     first = export_soup(open_run(tmp_path / "soup.safetensors"), tmp_path / f"a.{kind}", told)
-    unknown = "nothing is turned, since nobody knows where up is (--scene names the capture): +z is up if it was before"
+    unknown = "nothing is turned, since nobody knows where up is (scene= names the capture): +z is up if it was before"
     assert first.notes == (unknown,)
     assert not first.transform.moves
     assert load_soup(first.path).notes.get("up") is None
@@ -247,7 +247,10 @@ def test_up_may_be_z_but_in_glb(tmp_path, soup):
     turned = (soup.vertices.double() @ written.transform.rotation.T).float()
     mesh = load_mesh(tmp_path / "a.ply")
     assert torch.equal(mesh.vertices[mesh.faces], turned)
-    with pytest.raises(InputError, match=r"a\.glb: files of this kind have \+y up.*--format obj or off or ply"):
+    with pytest.raises(
+        InputError,
+        match=r"a\.glb: files of this kind have \+y up.* out up=\"z\", or choose a path that ends in \.obj or \.off",
+    ):
         export_soup(run, tmp_path / "a.glb", ExportConfig(up="z"))
 
 
@@ -271,7 +274,7 @@ def test_places_are_the_middle_and_the_ground_of_nearly_everything(tmp_path):
     ):
         moved = placed[place, up].apply(torch.tensor([point]))
         torch.testing.assert_close(moved, torch.zeros(1, 3, dtype=torch.float64), rtol=0, atol=0.05)
-    with pytest.raises(InputError, match="--place ground needs to know which way is up; take --up y or z"):
+    with pytest.raises(InputError, match=r'place="ground" needs to know which way is up; take up="y" or "z"$'):
         export_soup(run, tmp_path / "a.ply", ExportConfig(place="ground", up="keep"))
 
 
@@ -285,7 +288,7 @@ def test_a_soup_for_etsplat_is_cropped_in_the_frame_of_its_capture(tmp_path, sou
     assert (written.triangles, written.removed) == (len(returned), {"crop": 60 - len(returned)})
     assert returned.notes == {"iteration": "7"}
     for changed in ({"scale": 2.0}, {"place": "center"}, {"up": "z"}):
-        with pytest.raises(InputError, match="keeps the units and axes of the capture; leave out --up, --scale"):
+        with pytest.raises(InputError, match="keeps the units and axes of the capture; leave out up, scale and"):
             export_soup(run, tmp_path / "a.safetensors", ExportConfig(**changed))
 
 
@@ -295,6 +298,7 @@ def test_a_soup_with_nothing_but_a_sky_left_is_an_input_error(tmp_path):
         export_soup(run, tmp_path / "a.glb", ExportConfig(), Box((-99.0, 20.0, -99.0), (99.0, 99.0, 99.0)))
 
 
+@pytest.mark.usefixtures("command_line")
 def test_the_command_says_what_was_left_out_and_why(tmp_path, capsys):
     scene_with_sky(tmp_path)
     words = ["export", str(tmp_path / "scene.safetensors"), "--out", str(tmp_path / "a.glb")]

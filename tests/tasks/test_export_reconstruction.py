@@ -83,13 +83,13 @@ def test_photos_of_another_scene_are_said_to_turn_it(tmp_path: Path) -> None:
     assert etsplat.export(result, tmp_path / "own.ply", config, scene=moved).notes == ()
     other = replace(own, viewmats=own.viewmats.flip(0))
     (note,) = etsplat.export(result, tmp_path / "other.ply", config, scene=other).notes
-    assert note == "it is turned by the photos of another scene than the run was made of, which --scene names"
+    assert note == "it is turned by the photos of another scene than the run was made of, which scene= names"
 
 
 def test_a_scene_that_has_no_use_is_told(result: etsplat.ReconstructResult, tmp_path: Path) -> None:
     """Where nothing is turned, even a folder that is not there was taken without a word."""
     (note,) = etsplat.export(result, tmp_path / "a.ply", scene=tmp_path / "nowhere").notes
-    assert note.startswith("--scene has no use here")
+    assert note.startswith('scene has no use here: its photos say where up is, with up="y" or "z", and')
 
 
 @pytest.mark.parametrize("kind", ["glb", "ply", "obj"])

@@ -14,7 +14,18 @@ from etsplat.data.photograph import photograph
 from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.parts import Shape
 from etsplat.io.mesh_files import MeshFile
-from etsplat.tasks.judgement import Expected, Judgement, Run, Shares, Start, expect_mesh, expect_photos, judge, spread
+from etsplat.tasks.judgement import (
+    Expected,
+    Judgement,
+    Run,
+    Shares,
+    Start,
+    expect_hull,
+    expect_mesh,
+    expect_photos,
+    judge,
+    spread,
+)
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 
 BALL, RING = Shape(1, 0), Shape(1, 1)
@@ -109,7 +120,7 @@ def test_few_photos_are_the_first_thing_to_mend_of_a_poor_outline():
 def test_a_hull_that_lacks_thin_parts_is_what_a_poor_outline_is_for_want_of():
     off = {**GOOD, "silhouette_iou": 0.724}
     verdict = judged(scores=off, begun="hull", preset="quick", lacking=0.1298).verdict
-    assert verdict.endswith("or --init-mesh: the visual hull that it started from lacks 13 % of what masks show")
+    assert verdict.endswith("or init_mesh=: the visual hull that it started from lacks 13 % of what masks show")
     assert "lacks" not in judged(scores=off, begun="hull", preset="quick", lacking=0.02).verdict
     assert judged(begun="hull", lacking=0.1298).verdict.startswith("good")
 
@@ -133,7 +144,7 @@ def test_a_hollow_of_the_input_mesh_that_is_closed_is_told():
     assert judged(closed=0.004).verdict.startswith("good")
     assert judged(closed=0.023).verdict == (
         "poor: on 2.3 % of what photos show the result lies far in front of the input mesh, so a hollow is closed: "
-        "try --init-mesh with a mesh that has it, or a texture for photos to agree on"
+        "try init_mesh= with a mesh that has it, or a texture for photos to agree on"
     )
 
 
@@ -166,16 +177,16 @@ def test_photos_without_masks_have_no_outline_to_judge():
 def test_other_parts_and_holes_are_said_with_what_to_try():
     found = judged(expected=Shape(2, 4))
     assert found.verdict == (
-        "poor: the result has 1 part and 0 holes, the input mesh 2 parts and 4 holes: try --start.shape hull"
+        'poor: the result has 1 part and 0 holes, the input mesh 2 parts and 4 holes: try start.shape="hull"'
     )
     assert (found.parts, found.holes, found.expected_parts, found.expected_holes) == (1, 0, 2, 4)
 
 
 def test_a_hull_with_other_holes_has_other_remedies():
     """A sphere can do something about holes that are too many, not about those that lack."""
-    mesh = "try --init-mesh with a mesh that has them"
+    mesh = "try init_mesh= with a mesh that has them"
     assert judged(found=Shape(1, 2), expected=Shape(1, 8), begun="hull").verdict.endswith(mesh)
-    sphere = mesh.replace("try ", "try --start.shape sphere or ")
+    sphere = mesh.replace("try ", 'try start.shape="sphere" or ')
     assert judged(found=Shape(1, 8), expected=Shape(1, 2), begun="hull").verdict.endswith(sphere)
 
 
@@ -188,7 +199,8 @@ def test_holes_that_no_silhouette_shows_are_not_held_against_a_result():
 
 
 @pytest.mark.parametrize(
-    ("preset", "remedy"), [("quick", "--start.shape hull or --preset best"), ("best", "--start.shape hull")]
+    ("preset", "remedy"),
+    [("quick", 'start.shape="hull" or ReconstructConfig.best()'), ("best", 'start.shape="hull"')],
 )
 def test_a_poor_outline_is_said(preset, remedy):
     verdict = judged(scores={**GOOD, "silhouette_iou": 0.92}, preset=preset).verdict
@@ -197,16 +209,26 @@ def test_a_poor_outline_is_said(preset, remedy):
     assert close.startswith("poor: silhouette IoU 0.969780 where good results have 0.97 on")
 
 
+@pytest.mark.usefixtures("command_line")
+def test_what_to_try_is_an_option_where_the_command_line_runs():
+    """Elsewhere, as the other tests here have it, what a function or a config takes."""
+    off = judged(scores={**GOOD, "silhouette_iou": 0.92}, preset="quick", untangled=False, intersecting=3.14).verdict
+    assert "on test views: try --start.shape hull or --preset best; " in off
+    assert off.endswith("cut through others: try --refinement.untanglings 6")
+    finer = expect_hull(Shape(1, 0), Shape(1, 1), 2000).shape.unclear
+    assert finer == "a finer visual hull has 1 part and 1 hole: try --start.hull-faces 2000 --max-faces 4000"
+
+
 def test_faces_that_cut_through_others_are_said():
-    assert judged(intersecting=3.14).verdict == "poor: 3.1 % of its faces cut through others: try --start.shape hull"
-    assert judged(intersecting=3.14, untangled=False).verdict.endswith("try --refinement.untanglings 6")
+    assert judged(intersecting=3.14).verdict == 'poor: 3.1 % of its faces cut through others: try start.shape="hull"'
+    assert judged(intersecting=3.14, untangled=False).verdict.endswith("try refinement.untanglings=6")
     assert judged(intersecting=0.9).verdict.startswith("good")
 
 
 def test_an_open_result_of_a_closed_input_is_poor():
     found = judged(found=Shape(None, None, "is not closed"), begun="hull")
     assert found.verdict == (
-        "poor: the result is not closed, the input mesh is a closed surface: try --start.shape sphere"
+        'poor: the result is not closed, the input mesh is a closed surface: try start.shape="sphere"'
     )
 
 

@@ -271,6 +271,7 @@ def test_exports_and_opaque_pictures_are_of_the_mesh(run: tuple[RunDirectory, li
     assert len(cropped.corner_colors) == len(cropped)
 
 
+@pytest.mark.usefixtures("command_line")
 def test_the_soup_in_the_place_of_the_mesh_is_whole_and_said(
     run: tuple[RunDirectory, list[Event]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

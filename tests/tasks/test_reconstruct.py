@@ -209,7 +209,7 @@ def test_vertex_colors_reach_the_files(tmp_path: Path, settings: dict[str, str])
 
 def test_a_backend_that_is_missing_is_named(pebble: MeshFile, tmp_path: Path) -> None:
     """Without nvdiffrast or CUDA the run ends before it starts, in one line; soft triangles have no such backend."""
-    with pytest.raises(InputError, match="choose --method raster-face"):
+    with pytest.raises(InputError, match=r'choose method="raster-face" or "raster-vertex"$'):
         SHORT.changed({"drawing.backend": "nvdiffrast"})
     if not torch.cuda.is_available():
         with pytest.raises(InputError, match="needs a CUDA device"):

@@ -154,13 +154,11 @@ def test_the_sky_of_a_soup_is_where_its_notes_say(run: SoupRun) -> None:
 
 
 def test_where_nothing_is_left_the_error_says_why(run: SoupRun) -> None:
-    with pytest.raises(
-        InputError, match=r"nothing is left of it \(403 outside of the crop\); choose another --crop, in"
-    ):
+    with pytest.raises(InputError, match=r"nothing is left of it \(403 outside of the crop\); choose another crop, in"):
         select(run, crop=Sphere((500.0, 0.0, 0.0), 1.0))
-    with pytest.raises(InputError, match="no triangle is opaque enough; lower --min-opacity"):
+    with pytest.raises(InputError, match="no triangle is opaque enough; lower min_opacity"):
         select(run, min_opacity=1.0)
-    with pytest.raises(InputError, match="name the scene's folder with --scene"):
+    with pytest.raises(InputError, match="name the scene's folder with scene="):
         select(replace(run, capture=None), clean=True)
-    with pytest.raises(InputError, match="name the scene's folder with --scene"):
+    with pytest.raises(InputError, match="name the scene's folder with scene="):
         select(replace(run, capture=None), crop="auto")

@@ -72,6 +72,7 @@ def without_scene(folder, to):
     return to
 
 
+@pytest.mark.usefixtures("command_line")
 def test_a_scene_that_moved_is_named_with_an_option(trained, tmp_path):
     folder, _, _ = trained
     shutil.copytree(folder / "scene", tmp_path / "moved")
@@ -84,6 +85,7 @@ def test_a_scene_that_moved_is_named_with_an_option(trained, tmp_path):
         open_run(tmp_path / "run", tmp_path / "mover")
 
 
+@pytest.mark.usefixtures("command_line")
 def test_what_needs_no_photos_works_when_the_scene_has_gone(trained, tmp_path, capsys):
     """And says what is otherwise without them; nothing is of the soup itself."""
     folder, result, _ = trained

@@ -102,7 +102,7 @@ def test_a_hull_that_lacks_thin_parts_is_known_by_what_it_leaves_uncovered() -> 
     expected = expect_hull(hull_shape(torn), finer, 2 * torn.wanted)
     assert expected.of is None
     assert expected.shape.unclear == (
-        "a finer visual hull has 1 part and 1 hole: try --start.hull-faces 2000 --max-faces 4000"
+        "a finer visual hull has 1 part and 1 hole: try start.hull_faces=2000 and max_faces=4000"
     )
     assert hull_shape(whole) == Shape(1, 1)
     assert whole.uncovered < 0.0005

@@ -1,15 +1,18 @@
 """Three executors, one interface: runs that are lost in the middle end as if nothing had happened."""
 
 import os
+import pickle
 import re
 import socket
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
 from etsplat.core.errors import InputError
+from etsplat.core.spelling import option, spelled_as_options
 from etsplat.geometry.icosphere import icosphere
 from etsplat.io.locks import writing_run
 from etsplat.io.mesh_files import save_mesh
@@ -218,11 +221,25 @@ def test_a_run_waits_for_who_writes_it(ball: Path, tmp_path: Path) -> None:
     wait_for_writer(tmp_path / "run", patience=0)
 
 
+def test_a_run_elsewhere_spells_settings_as_who_asked_for_it(ball: Path, tmp_path: Path) -> None:
+    """Its process has no command line: `etsplat sweep` shows what it answers."""
+    cell = Cell("ball", ball, "", SHORT, tmp_path / "run")
+    RunDirectory.create(cell.folder, {"task": "reconstruct"})
+    with spelled_as_options():
+        asked = pickle.dumps(replace(cell.work(1), run=_refused))
+    assert perform(pickle.loads(asked)) == "go on with --resume"
+    assert perform(replace(cell.work(1), run=_refused)) == "go on with resume=True"
+
+
+def _refused(*_: object, **given: object) -> None:
+    raise InputError(f"go on with {option('resume', given['resume'])}")
+
+
 def test_places_that_contradict_themselves_are_refused() -> None:
     for options, message in (
         ({"jobs": -1}, "jobs: is -1; it must be at least 1, or 0 for one on each core"),
         ({"cores": 0}, "cores: is 0; it must be at least 1"),
-        ({"slurm": {"timeout_min": "1"}}, "slurm: has an effect only with --cluster slurm"),
+        ({"slurm": {"timeout_min": "1"}}, 'slurm: has an effect only with cluster="slurm"; leave'),
     ):
         with pytest.raises(InputError, match=message):
             Where(**options)  # pyright: ignore[reportArgumentType]

@@ -227,7 +227,7 @@ def test_absolute_units_far_off_are_pointed_out(capture: Dataset, tmp_path: Path
     large = replace(capture, viewmats=viewmats, exact_points=1000 * capture.exact_points)
     notes: list[object] = []
     train(large, tmp_path / "absolute", replace(SHORT, normalize=False, iterations=10), callbacks=[notes.append])
-    assert any("start again with --normalize" in getattr(note, "text", "") for note in notes)
+    assert any("start again with normalize=True" in getattr(note, "text", "") for note in notes)
     small = train(capture, tmp_path / "small", SHORT)
     result = train(large, tmp_path / "large", SHORT)
     assert result.metrics["psnr"] == pytest.approx(small.metrics["psnr"], abs=0.2)
@@ -236,12 +236,12 @@ def test_absolute_units_far_off_are_pointed_out(capture: Dataset, tmp_path: Path
 
 
 def test_a_run_that_fails_for_its_scale_says_how_to_scale_it(capture: Dataset, tmp_path: Path) -> None:
-    """A thousand times smaller, everything is nearer than the near plane: no triangle lives, and --normalize helps."""
+    """A thousand times smaller, everything is nearer than the near plane: no triangle lives, and `normalize` helps."""
     assert capture.exact_points is not None
     viewmats = capture.viewmats.clone()
     viewmats[:, :3, 3] /= 1000
     small = replace(capture, viewmats=viewmats, exact_points=capture.exact_points / 1000)
-    with pytest.raises(DivergedError, match=r"no triangle is left at iteration.*start again with --normalize"):
+    with pytest.raises(DivergedError, match=r"no triangle is left at iteration.*start again with normalize=True"):
         train(small, tmp_path / "run", replace(SHORT, normalize=False))
 
 

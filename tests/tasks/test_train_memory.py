@@ -81,7 +81,10 @@ def test_too_many_triangles_for_the_memory_are_refused(
     """Before anything is written, and the message says what would fit; that does."""
     monkeypatch.setattr(train_memory, "available_memory", lambda: 1 << 30)
     config = replace(SHORT, max_triangles=10_000_000, pixels_per_triangle=None)
-    with pytest.raises(InputError, match=r"max_triangles: 10,000,000.*set it to \d+ or less.*--width") as refused:
+    with pytest.raises(
+        InputError,
+        match=r"max_triangles: 10,000,000.*set it to \d+ or less.*with width=, or divide the scene with blocks=$",
+    ) as refused:
         train(capture, tmp_path / "run", config)
     assert not (tmp_path / "run").exists()
     fitting = int(str(refused.value).split("set it to ")[1].split()[0])

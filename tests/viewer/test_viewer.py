@@ -176,7 +176,7 @@ def test_the_page_is_served_on_localhost(run):
 def test_an_address_that_is_not_ones_own_is_an_input_error(run):
     """viser would wait for ever: it listens in a thread, which ends with a traceback."""
     pytest.importorskip("viser")
-    with pytest.raises(InputError, match=r"--host 192\.0\.2\.1 --port 8933: cannot listen there"):
+    with pytest.raises(InputError, match=r'host="192\.0\.2\.1" port=8933: cannot listen there'):
         Viewer(run, "192.0.2.1", 8933, 64)  # of a network for documentation
 
 

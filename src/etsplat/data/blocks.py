@@ -14,6 +14,7 @@ from torch import Tensor
 
 from etsplat.core.cameras import Cameras
 from etsplat.core.errors import InputError
+from etsplat.core.spelling import option
 from etsplat.data.dataset import Dataset
 
 MARGIN = 0.1
@@ -194,7 +195,7 @@ def parts_of(capture: Dataset, grid: Grid) -> list[Dataset]:
 
 def _needed_points(capture: Dataset) -> Float[Tensor, "P 3"]:
     if capture.exact_points is None:
-        raise InputError("blocks: are cut by points, and the capture has none; train it without --blocks")
+        raise InputError(f"blocks: are cut by points, and the capture has none; train it without {option('blocks')}")
     return capture.exact_points
 
 

@@ -17,6 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from etsplat.core.errors import InputError
+from etsplat.core.spelling import option
 from etsplat.data.dataset import Dataset, every_eighth
 from etsplat.data.pictures import LazyPictures, Picture
 from etsplat.io.depth_maps import DEPTH_SUFFIXES, load_depth, resize_depth
@@ -258,7 +259,7 @@ def _missing_remedy(scene: Path, image: Path, none: bool) -> str:
     with suppress(OSError):  # folders that may not be read
         beside = [place for place in sorted(scene.iterdir()) if (place / image.name).is_file()] if none else []
         if beside:
-            return f"they are in {beside[0].name}/, which --images {beside[0].name} takes them from"
+            return f"they are in {beside[0].name}/, which {option('images', beside[0].name)} takes them from"
     other = _with_any_ending(image, (*HEIC_SUFFIXES, *UNREAD_SUFFIXES))
     if other is None:
         return "copy them there or remove their poses"

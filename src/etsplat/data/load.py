@@ -10,6 +10,7 @@ from typing import Protocol, cast
 
 from etsplat.core.errors import InputError
 from etsplat.core.precision import usual_defaults
+from etsplat.core.spelling import option
 from etsplat.data import formats
 from etsplat.data.dataset import Dataset
 from etsplat.data.doubtful_poses import with_doubts
@@ -132,7 +133,8 @@ def _other_masks(path: Path, wanted: Wanted, listing: Listing) -> tuple[str, ...
     known = wanted.masks is not None or any(frame.mask for frame in listing.frames)
     if known or (path / MASK_FOLDER).is_dir() or not (path / "mask").is_dir():
         return ()
-    return (f"mask/ is not read: call it {MASK_FOLDER}/, or name it with --masks, if masks of all images are there",)
+    named = f"call it {MASK_FOLDER}/, or name it with {option('masks', ...)}"
+    return (f"mask/ is not read: {named}, if masks of all images are there",)
 
 
 def _maps_of_some(path: Path, wanted: Wanted, dataset: Dataset) -> tuple[str, ...]:

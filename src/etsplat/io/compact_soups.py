@@ -17,6 +17,7 @@ import numpy as np
 
 from etsplat.core.errors import InputError
 from etsplat.core.harmonics import MAX_DEGREE
+from etsplat.core.spelling import either
 from etsplat.io.byte_planes import MOST_INFLATED, MOST_ROWS, Channel, pack_chunk, row_bytes, unpack_chunk
 from etsplat.io.json_text import entries_problem, is_number, parse_json
 
@@ -112,7 +113,8 @@ def read_compact(path: Path | str) -> CompactSoup:
         return decode_compact(path.read_bytes())
     except (OSError, ValueError) as error:
         detail = (str(error) or type(error).__name__).splitlines()[0]
-        raise InputError(f"soup {path}: cannot be read ({detail}); export it again with --format etz") from error
+        again = either("with --format etz", "to a path that ends in .etz")
+        raise InputError(f"soup {path}: cannot be read ({detail}); export it again {again}") from error
 
 
 def decode_compact(data: bytes) -> CompactSoup:

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from etsplat.core.errors import InputError
+from etsplat.core.spelling import option
 from etsplat.io.atomic import atomic_write, destination_of, write_error
 from etsplat.io.georeference import GEOREFERENCE_FILE
 from etsplat.io.json_text import as_json, check_entries, entries_problem, json_differences, parse_json
@@ -153,8 +154,8 @@ class RunDirectory:
                 raise InputError(f"{path}: is not empty and not a run of etsplat; choose another or a new folder")
             if not overwrite:
                 raise InputError(
-                    f"{path}: holds a run already; continue it with --resume, replace it with --overwrite, or choose "
-                    "another folder"
+                    f"{path}: holds a run already; continue it with {option('resume', True)}, replace it with "
+                    f"{option('overwrite', True)}, or choose another folder"
                 )
         _check_writable(path)
 
@@ -194,7 +195,7 @@ class RunDirectory:
         """
         path = Path(path)
         if not is_run(path):
-            raise InputError(f"{path}: holds no run to resume; start it without --resume")
+            raise InputError(f"{path}: holds no run to resume; start it without {option('resume')}")
         run = cls(path)
         stored = run.read_config()
         for section in ("task", "config", "source"):

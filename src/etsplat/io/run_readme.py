@@ -1,5 +1,7 @@
 """README.txt of run directories: what is in them."""
 
+from etsplat.core.spelling import either, option
+
 _README = """\
 This folder is a run of etsplat ({task}).
 
@@ -14,7 +16,7 @@ cameras.json    if it is there: cameras of the training photos as they were refi
 georeference.json  if it is there: world coordinates = offset + scale * coordinates of the result, before it was turned
 ended.txt       if it is there: how the run ended before it was done
 config.json     the settings that made it
-checkpoints/    where an interrupted run continues with --resume; safe to delete once the run is done
+checkpoints/    where an interrupted run continues {again}; safe to delete once the run is done
 blocks/         if it is there: a run for each block of the scene, with its checkpoints; as safe to delete at the end
 stages/         if it is there: the same of what was made beside it; as safe to delete
 """
@@ -23,7 +25,7 @@ _RESULTS = {
     "reconstruct": """\
 mesh.glb        the result, for viewers
 mesh.obj, .ply  the same; colours of faces are exact in mesh.ply, and means at the vertices in all three
-textured.glb    if it is there: few faces under a texture, of --texture or of etsplat export --texture""",
+textured.glb    if it is there: few faces under a texture, of {texture}""",
     "train": """\
 soup.safetensors  the result: triangles with opacity, softness and view-dependent colour; etsplat export converts it
 opaque.glb      if it is there: the scene as opaque triangles, for every mesh viewer and game engine
@@ -55,4 +57,9 @@ checkpoints/    where an interrupted run continues; safe to delete once the run 
 
 def readme_of(task: str) -> str:
     """The text for a run of a task: "reconstruct", "train", "fit" or "peer"."""
-    return _PEER_README if task == "peer" else _README.format(task=task, results=_RESULTS[task], test=_TEST[task])
+    if task == "peer":
+        return _PEER_README
+    again = "when Trainer.fit is called for it again" if task == "fit" else f"with {option('resume', True)}"
+    texture = either("--texture or of etsplat export --texture", "texture= or of etsplat.texture_mesh")
+    results = _RESULTS[task].format(texture=texture)
+    return _README.format(task=task, results=results, test=_TEST[task], again=again)

@@ -14,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from etsplat.core.errors import InputError
+from etsplat.core.spelling import either
 from etsplat.core.validation import check_above, check_floating, check_memory
 from etsplat.io.atomic import atomic_write, write_error
 from etsplat.io.images import to_8_bit
@@ -60,8 +61,9 @@ def open_video(path: Path | str, fps: float) -> Iterator[VideoSink]:
     try:
         import imageio_ffmpeg
     except ImportError as error:
+        frames = either("--format frames", "etsplat.save_image")
         raise InputError(
-            "MP4 needs imageio-ffmpeg: pip install 'etsplat[video]', or write single frames with --format frames"
+            f"MP4 needs imageio-ffmpeg: pip install 'etsplat[video]', or write single frames with {frames}"
         ) from error
     if not path.parent.is_dir():
         raise write_error(path, FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT)))

@@ -16,6 +16,7 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from etsplat.core.errors import InputError
+from etsplat.core.spelling import either
 from etsplat.core.validation import check_channels_last, check_device, check_floating, check_memory
 from etsplat.engines.threads import all_torch_threads, one_torch_thread
 from etsplat.io.paths import kind_of
@@ -277,7 +278,7 @@ class LpipsWeights:
 
 
 def find_lpips_weights(option: Path | str | None = None) -> LpipsWeights:
-    """Resolve the option `--lpips-weights`.
+    """Resolve the option `--lpips-weights`, or the setting `output.lpips_weights`.
 
     Args:
         option: a file; the word "download", which fetches the two usual files (torchvision's VGG16, 528 MB, and LPIPS's
@@ -293,7 +294,8 @@ def find_lpips_weights(option: Path | str | None = None) -> LpipsWeights:
         absent = [path.name for path in cached if not path.is_file()]
         if not absent:
             return LpipsWeights(cached, None)
-        return LpipsWeights((), f"no weights ({' and '.join(absent)} not in {folder}); give --lpips-weights")
+        give = either("--lpips-weights", "output.lpips_weights")
+        return LpipsWeights((), f"no weights ({' and '.join(absent)} not in {folder}); give {give}")
     if str(option) == "download":
         for path, (url, sha256) in zip(cached, _WEIGHTS.values(), strict=True):
             if not path.is_file() or _sha256(path) != sha256:

@@ -14,6 +14,7 @@ from etsplat.core.cameras import Cameras
 from etsplat.core.errors import InputError
 from etsplat.core.kernels import KERNELS
 from etsplat.core.rasterization import SOUP_SIGMA_FLOOR
+from etsplat.core.spelling import either
 from etsplat.io.compact_soups import CompactSoup, enlargement, read_compact
 from etsplat.io.json_text import parse_json
 from etsplat.model.solid_soup import SolidSoup
@@ -103,9 +104,9 @@ def compact_of(soup: TriangleSoup, order: Float[Tensor, " N"], most: int | None 
     """
     look = soup.appearance
     if KERNELS[look.kernel].table is not None:
+        other = either("with --format safetensors", "to a path that ends in .safetensors")
         raise InputError(
-            f"kernel {look.kernel!r}: was registered from Python, and compact files hold no kernels; "
-            "export with --format safetensors"
+            f"kernel {look.kernel!r}: was registered from Python, and compact files hold no kernels; export {other}"
         )
     whole = soup.finished() if not isinstance(soup, SolidSoup) else soup
     rows = order.argsort(descending=True, stable=True)[:most]

@@ -16,6 +16,7 @@ from etsplat.core.cameras import Cameras
 from etsplat.core.connectivity import MeshConnectivity
 from etsplat.core.errors import InputError
 from etsplat.core.rasterization import Rasterization
+from etsplat.core.spelling import option
 
 _FAR = 1000.0
 
@@ -62,14 +63,14 @@ def load_nvdiffrast() -> Any:
     if not torch.cuda.is_available():
         raise InputError(
             "drawing.backend nvdiffrast: needs a CUDA device; "
-            "leave out --drawing.backend to use etsplat's own rasterizer"
+            f"leave out {option('drawing.backend')} to use etsplat's own rasterizer"
         )
     try:
         return importlib.import_module("nvdiffrast.torch")
     except ImportError as error:
         raise InputError(
             "backend nvdiffrast: is not installed; see github.com/NVlabs/nvdiffrast (its licence is non-commercial), "
-            "or leave out --drawing.backend to use etsplat's own rasterizer"
+            f"or leave out {option('drawing.backend')} to use etsplat's own rasterizer"
         ) from error
 
 

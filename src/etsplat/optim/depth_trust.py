@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from etsplat.core.spelling import option
 from etsplat.data.loader import View
 from etsplat.metrics.depth import DepthAgreement, DepthKind, Pairs, depth_agreement
 from etsplat.model.model import Model
@@ -200,7 +201,8 @@ class DepthTrust:
         if self.unit != 1:
             unit = f"; {elsewhere} is {self.unit:.4g} times as far away, where maps agree: they are multiplied by it"
         elif math.isfinite(found.factor) and abs(math.log(found.factor)) > NEAR_ONE and not found.inverse:
-            unit = f"; {elsewhere} is {found.factor:.4g} times as far away: correct the unit with --depth-unit"
+            away = f"{elsewhere} is {found.factor:.4g} times as far away"
+            unit = f"; {away}: correct the unit with {option('depth_unit', ...)}"
         if self.kind is None:
             known = (
                 "nothing is known to compare them with"

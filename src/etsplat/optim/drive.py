@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from etsplat.core.errors import InputError
+from etsplat.core.spelling import either
 from etsplat.core.workers import about_this, workers
 from etsplat.io.locks import writing_run
 from etsplat.io.paths import given_path
@@ -96,9 +97,10 @@ def _go_on(problem: Problem, progress: Progress, checkpoint: Checkpoint) -> None
         problem.load_state(checkpoint.tensors, checkpoint.iteration)
         progress.seconds, progress.loss_sum, loss_count = checkpoint.tensors["progress"].tolist()
     except KeyError as error:
+        anew = either(", with --overwrite or", "")  # which `Trainer.fit` has not
         raise InputError(
             f"{checkpoint.path}: another version of etsplat wrote it, it lacks `{error.args[0]}`; finish the run with "
-            "that version, or start it again, with --overwrite or in another folder"
+            f"that version, or start it again{anew} in another folder"
         ) from error
     progress.iteration, progress.loss_count = checkpoint.iteration, int(loss_count)
 

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+from etsplat.core.spelling import option
 from etsplat.report.data import Run
 
 
@@ -63,7 +64,7 @@ _SOUP_PSNR = (
 )
 _OPAQUE = (
     "The same with the triangles drawn sharp and opaque, with 4 × 4 supersampling: what a mesh viewer shows of an "
-    "export. Soft triangles lose much by this; --asset makes an opaque mesh beside them."
+    "export. Soft triangles lose much by this; {asset} makes an opaque mesh beside them."
 )
 _ASSET = (
     "The test views of opaque.glb with 4 × 4 supersampling: opaque triangles in colours that are the same from every "
@@ -158,8 +159,9 @@ def describe_soup(metrics: dict[str, Any]) -> list[Metric]:
 def _opaque_cards(metrics: dict[str, Any]) -> list[Metric]:
     """Of the opaque mesh where the run made one, of the soup drawn opaque otherwise."""
     if metrics.get("asset_triangles") is None:
+        opaque = _OPAQUE.format(asset=option("asset", True))
         return [
-            number_card(metrics, "psnr_opaque", "PSNR of opaque triangles", "dB", fixed(2), _OPAQUE, "no test views")
+            number_card(metrics, "psnr_opaque", "PSNR of opaque triangles", "dB", fixed(2), opaque, "no test views")
         ]
     return [
         number_card(metrics, "psnr_asset", "PSNR of the opaque mesh", "dB", fixed(2), _ASSET, "no test views"),

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from etsplat.core.errors import InputError
+from etsplat.core.spelling import either, option
 from etsplat.io.json_text import check_entries, is_number
 from etsplat.io.overview import TestView, find_test_views
 from etsplat.io.run_directory import RunDirectory, is_run
@@ -95,13 +96,14 @@ def read_run(run_dir: Path | str) -> Run:
     folder = Path(run_dir)
     directory = RunDirectory(folder)
     if not is_run(folder):
-        raise InputError(f"{folder}: is not a run of etsplat; name a folder that was given to --out")
+        a_run = either("a folder that was given to --out", "the folder of one")
+        raise InputError(f"{folder}: is not a run of etsplat; name {a_run}")
     task = directory.read_config()["task"]
     if task not in _COUNTS:
         raise InputError(f"{folder}: is a run without a report; name one of `etsplat reconstruct` or `etsplat train`")
     mesh = directory.mesh_path(".ply") if task == "reconstruct" else None
     if not directory.metrics_path.is_file() or not (mesh or directory.soup_path).is_file():
-        raise InputError(f"{folder}: this run has not finished; continue it with --resume")
+        raise InputError(f"{folder}: this run has not finished; continue it with {option('resume', True)}")
     kind = CONFIGS[task]
     config = read_record(directory, kind, kind.LABELS, "source", "paths.source", "versions.etsplat")
     metrics, evaluation = directory.read_metrics(), directory.read_evaluation()

@@ -16,6 +16,7 @@ from typing import Any
 import torch
 
 from etsplat.core.errors import InputError
+from etsplat.core.spelling import option
 from etsplat.core.workers import workers
 from etsplat.data.blocks import Grid, chosen_shape, cut, parse_blocks, parts_of
 from etsplat.data.dataset import Dataset
@@ -95,7 +96,8 @@ def check_blocks(blocks: str, config: TrainConfig, *, watched: bool) -> None:
     """
     parse_blocks(blocks)
     if config.refine_cameras != "off":
-        raise InputError("refine_cameras: cannot be done in blocks; refine the cameras in a run without --blocks")
+        whole = f"a run without {option('blocks')}"
+        raise InputError(f"refine_cameras: cannot be done in blocks; refine the cameras in {whole}")
     if workers().count > 1:
         raise InputError("blocks: several workers cannot do that yet; start one process, without torchrun")
     if watched:

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
+from etsplat.core.spelling import option
 from etsplat.tasks.settings import Only, Range, Settings
 
 Bake = Literal["mean", "constant", "keep"]
@@ -14,9 +15,9 @@ TEXELS = Range(SMALLEST, 8192)
 LIGHT_FACES = 10_000
 """Of a textured mesh, unless told otherwise."""
 
-_TEXTURED = Only("with --texture", lambda config: config.texture is not None)
+_TEXTURED = Only(lambda: f"with {option('texture')}", lambda config: config.texture is not None)
 
-_WITH_NORMALS = Only("with --normals", lambda config: config.normals)
+_WITH_NORMALS = Only(lambda: f"with {option('normals')}", lambda config: config.normals)
 
 
 @dataclass(frozen=True)

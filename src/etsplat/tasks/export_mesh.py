@@ -12,6 +12,7 @@ from torch import Tensor
 
 from etsplat.core.errors import InputError
 from etsplat.core.precision import usual_defaults
+from etsplat.core.spelling import file_kind, option
 from etsplat.data.dataset import Dataset
 from etsplat.data.where_up import told_up, up_of
 from etsplat.engines.choice import resolve_device
@@ -29,7 +30,7 @@ from etsplat.tasks.demos import DEMO_OBJECT
 from etsplat.tasks.export_config import LIGHT_FACES, ExportConfig
 from etsplat.tasks.normal_map import normal_map_of
 from etsplat.tasks.opened_runs import capture_at, read_record
-from etsplat.tasks.placing import apart_from_world, check_placed, placed_record, placement
+from etsplat.tasks.placing import apart_from_world, check_placed, leave_unplaced, placed_record, placement
 from etsplat.tasks.reconstruct_config import Pictures, ReconstructConfig
 from etsplat.tasks.refined_cameras import refined_capture
 from etsplat.tasks.running import Result
@@ -133,7 +134,7 @@ def open_reconstruction(
     loaded, _ = load_source(source, replace(config, refine_cameras=then["refine_cameras"]), paths.get("masks"))
     if fingerprint(loaded) != record["source"].get("fingerprint"):
         name = "the data set" if isinstance(source, Dataset) else source
-        raise InputError(f"{path}: {name} is not what the run was made of; name that with --scene")
+        raise InputError(f"{path}: {name} is not what the run was made of; name that with {option('scene', ...)}")
     views, _ = make_subject(loaded, replace(config, watch=0), partial(tell, "Photographing"), place)
     return Reconstruction.of(run, views, place)
 
@@ -216,9 +217,8 @@ def checked_for_meshes(path: Path, config: ExportConfig) -> ExportConfig:
     """With axes that are chosen. Raises InputError for settings that meshes do not know, or files of this kind."""
     for name in settings_of(ExportConfig):
         if name not in _OF_MESHES and getattr(config, name) != getattr(ExportConfig(), name):
-            option = name.replace("_", "-")
-            ours = ", ".join(f"--{other}" for other in _OF_MESHES)
-            raise InputError(f"--{option}: is for soups; of a reconstruction's mesh there are {ours}")
+            ours = ", ".join(map(option, _OF_MESHES))
+            raise InputError(f"{option(name)}: is for soups; of a reconstruction's mesh there are {ours}")
     config = replace(config, up=config.up or "keep")
     check_stored(path, config)
     return config
@@ -237,7 +237,8 @@ def write_mesh(
         mesh = MeshFile(vertices, faces, face_colors=colors)
     check_placed(path, config)
     if scene is not None and config.up == "keep":
-        note("--scene has no use here: its photos say where up is, with --up y or z, and make a texture")
+        upright = option("up", "y", "z")
+        note(f"{option('scene')} has no use here: its photos say where up is, with {upright}, and make a texture")
     transform, near, far, record = _placement(RunDirectory(run), config, scene, mesh.vertices, note)
     vertices, by_face, by_vertex = near.apply(mesh.vertices).float(), mesh.face_colors, _only_by_vertex(mesh)
     how = {"world": far, "compress": config.compress, "record": record}
@@ -256,18 +257,16 @@ def _export_textured(
 ) -> dict[Path, int]:
     """The light mesh at `path`, and its coarser levels beside it, each made of the one before."""
     assert config.texture is not None
+    kinds = [suffix[1:] for suffix in suffixes("texture")]
     if kind_of(path) not in (*suffixes("texture"), ".safetensors"):
-        kinds = " or ".join(suffix[1:] for suffix in suffixes("texture"))
-        raise InputError(f"{path}: files of this kind hold no texture; choose --format {kinds}")
+        raise InputError(f"{path}: files of this kind hold no texture; choose {file_kind(*kinds)}")
     if config.normals and kind_of(path) != ".glb":
-        raise InputError(f"{path}: files of this kind hold no normal map; leave out --normals, or choose --format glb")
+        without = f"leave out {option('normals')}, or choose {file_kind('glb')}"
+        raise InputError(f"{path}: files of this kind hold no normal map; {without}")
     if kind_of(path) in suffixes("texture"):
         check_placed(path, config)
     elif (config.up, config.scale, config.place) != ("keep", 1.0, "keep"):
-        kinds = " or ".join(suffix[1:] for suffix in suffixes("texture"))
-        raise InputError(
-            f"{path}: keeps units and axes; leave out --up, --scale and --place, or choose --format {kinds}"
-        )
+        raise InputError(f"{path}: keeps units and axes; {leave_unplaced()}, or choose {file_kind(*kinds)}")
     if not path.parent.is_dir():  # rather than after a minute
         raise InputError(f"{path}: there is no folder {path.parent}; create the folder first")
     check_installed()
@@ -293,7 +292,8 @@ def check_stored(path: Path, config: ExportConfig) -> None:
     """Raises InputError where a file of this kind cannot be stored as the settings say, or a package is missing."""
     for name in ("compress", "pictures"):
         if getattr(config, name) != getattr(ExportConfig(), name) and kind_of(path) not in suffixes("compressed"):
-            raise InputError(f"{path}: is not stored in another way; leave out --{name}, or choose --format glb")
+            without = f"leave out {option(name)}, or choose {file_kind('glb')}"
+            raise InputError(f"{path}: is not stored in another way; {without}")
     if config.compress == "meshopt":
         load_meshopt()
 
@@ -332,7 +332,8 @@ def _up(
     if photos is None:
         return None
     if _is_of_others(run, photos):
-        note("it is turned by the photos of another scene than the run was made of, which --scene names")
+        named = f"which {option('scene', ...)} names"
+        note(f"it is turned by the photos of another scene than the run was made of, {named}")
     return up_of(photos)
 
 
@@ -352,10 +353,11 @@ def _source_of(run: RunDirectory, scene: Dataset | Path | str | None) -> Dataset
     if source is None:
         raise InputError(
             f"{run.path}: does not say what it is of, a Dataset in memory perhaps; "
-            "name the folder with its photos with --scene"
+            f"name the folder with its photos with {option('scene', ...)}"
         )
     if source != DEMO_OBJECT and not Path(source).exists():
-        raise InputError(f"{run.path}: what it is of, {source}, has gone; name where it is now with --scene")
+        now = f"name where it is now with {option('scene', ...)}"
+        raise InputError(f"{run.path}: what it is of, {source}, has gone; {now}")
     return source
 
 
@@ -366,5 +368,6 @@ def _only_by_vertex(mesh: MeshFile) -> Tensor | None:
 def _mesh_of(run: RunDirectory) -> Path:
     path = run.mesh_path(".ply")
     if not path.is_file():
-        raise InputError(f"{run.path}: has no {path.name} (yet); let the run finish, continue it with --resume")
+        finish = f"let the run finish, continue it with {option('resume', True)}"
+        raise InputError(f"{run.path}: has no {path.name} (yet); {finish}")
     return path

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from etsplat.core.cameras import Cameras
 from etsplat.core.errors import InputError
+from etsplat.core.spelling import either, file_kind, option
 from etsplat.data.where_up import noted_up, told_up, up_of
 from etsplat.geometry.similarity import Similarity
 from etsplat.io.atomic import atomic_write
@@ -27,7 +28,7 @@ from etsplat.ops.soup_colors import soup_colors
 from etsplat.tasks.export_config import ExportConfig
 from etsplat.tasks.export_mesh import check_stored
 from etsplat.tasks.opened_runs import SoupRun, training_cameras
-from etsplat.tasks.placing import apart_from_world, check_placed, placed_record, placement
+from etsplat.tasks.placing import apart_from_world, check_placed, leave_unplaced, placed_record, placement
 from etsplat.tasks.scene_page import compact_bytes, scene_of, small_camera
 from etsplat.tasks.soup_selection import Crop, Reason, Selection, select, surroundings_of
 from etsplat.web.pages import render_scene_page
@@ -86,8 +87,9 @@ def export_soup(run: SoupRun, path: Path | str, config: ExportConfig, crop: Crop
     least = (0.0 if keeps_all or config.alpha else OPAQUE_FROM) if config.min_opacity is None else config.min_opacity
     if run.solid is not None and not keeps_all and why_soup(path, config) is None:
         if config.min_opacity is not None:
+            soup = option("triangles", "soup")
             raise InputError(
-                "--min-opacity: the opaque mesh has no fainter triangles; leave it out, or --triangles soup"
+                f"{option('min_opacity')}: the opaque mesh has no fainter triangles; leave it out, or {soup}"
             )
         run = replace(run, soup=run.solid)
     chosen = select(
@@ -115,9 +117,9 @@ def export_soup(run: SoupRun, path: Path | str, config: ExportConfig, crop: Crop
 def why_soup(path: Path, config: ExportConfig) -> str | None:
     """The setting by which a file of triangles has those of the soup, and not a run's opaque mesh; None if none has."""
     reasons = {
-        "--alpha": config.alpha,
-        "--colors keep": config.colors == "keep",
-        "--triangles soup": config.triangles == "soup",
+        option("alpha", True): config.alpha,
+        option("colors", "keep"): config.colors == "keep",
+        option("triangles", "soup"): config.triangles == "soup",
     }
     return None if kind_of(path) in WHOLE else next((reason for reason, holds in reasons.items() if holds), None)
 
@@ -128,14 +130,17 @@ def _check(path: Path, config: ExportConfig) -> None:
     moved = config.scale != 1 or config.place != "keep"
     if kind_of(path) in WHOLE:
         if moved or config.up == "z":
-            raise InputError(f"{path}: keeps the units and axes of the capture; leave out --up, --scale and --place")
+            raise InputError(f"{path}: keeps the units and axes of the capture; {leave_unplaced()}")
         return
     holds = writer_of(path).HOLDS
     if config.colors == "keep" and ("numbers" not in holds or config.up != "keep"):
-        kinds = " or ".join(suffix[1:] for suffix in suffixes("numbers"))
-        raise InputError(f"colours that depend on the direction (--colors keep) need --format {kinds} and --up keep")
+        need = f"{file_kind(*(suffix[1:] for suffix in suffixes('numbers')))} and {option('up', 'keep')}"
+        raise InputError(f"colours that depend on the direction ({option('colors', 'keep')}) need {need}")
     if config.alpha and "alpha" not in holds:
-        raise InputError(f"{path}: files of this kind hold no opacities; leave out --alpha, or choose another --format")
+        other = either("another --format", "a path with another ending")
+        raise InputError(
+            f"{path}: files of this kind hold no opacities; leave out {option('alpha')}, or choose {other}"
+        )
     check_placed(path, config)
 
 
@@ -167,7 +172,8 @@ def _write(run: SoupRun, path: Path, config: ExportConfig, chosen: Selection, *,
     soup, kept = run.soup, chosen.kept
     sky = (chosen.sky & kept)[kept].cpu() if apart else torch.zeros(int(kept.sum()), dtype=torch.bool)
     if bool(sky.all()):
-        raise InputError(f"{run.path}: nothing but its sky is left; train with --asset, or take --sky joined")
+        remedy = f"train with {option('asset', True)}, or take {option('sky', 'joined')}"
+        raise InputError(f"{run.path}: nothing but its sky is left; {remedy}")
     if isinstance(soup, SolidSoup):
         colors = soup.corner_colors[kept]
     elif config.colors == "mean" and run.capture is not None:
@@ -233,7 +239,8 @@ def _without_capture(run: SoupRun, path: Path, config: ExportConfig) -> tuple[st
         "there are no photos on the page": kind == ".html",
     }
     said = "; ".join(effect for effect, holds in effects.items() if holds)
-    return (f"its scene {run.gone} has gone: {said} (--scene names it)",) if run.gone is not None and said else ()
+    gone = f"its scene {run.gone} has gone: {said} ({option('scene', ...)} names it)"
+    return (gone,) if run.gone is not None and said else ()
 
 
 def _lacks_up(run: SoupRun, path: Path, config: ExportConfig) -> bool:
@@ -246,7 +253,7 @@ def _not_turned(run: SoupRun, path: Path, config: ExportConfig) -> tuple[str, ..
     """That `up` had no effect, where the scene has not gone, which says so itself; nothing if it had one."""
     if run.gone is not None or not _lacks_up(run, path, config):
         return ()
-    why = "nobody knows where up is (--scene names the capture)"
+    why = f"nobody knows where up is ({option('scene', ...)} names the capture)"
     if run.capture is not None:
         why = "the cameras contradict each other about where up is"
     return (f"nothing is turned, since {why}: +{config.up} is up if it was before",)
@@ -256,7 +263,7 @@ def _unknown_sky(run: SoupRun, config: ExportConfig) -> tuple[str, ...]:
     """That nothing is left out as sky because nobody knows where that is; nothing if somebody does."""
     if config.sky != "none" or Surroundings.NOTE in run.soup.notes or surroundings_of(run) is not None:
         return ()
-    named = "" if run.capture is not None else " (--scene names the capture, whose points tell)"
+    named = "" if run.capture is not None else f" ({option('scene', ...)} names the capture, whose points tell)"
     return (f"no triangle is left out as sky, since nobody knows where that is{named}",)
 
 

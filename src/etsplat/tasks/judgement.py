@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
+from etsplat.core.spelling import either, option
 from etsplat.data.dataset import Dataset
 from etsplat.data.visual_hull import visual_hull
 from etsplat.geometry.intersections import intersecting_faces
@@ -171,7 +172,8 @@ def expect_hull(shape: Shape, finer: Shape | None = None, finer_faces: int = 0) 
     """What a result should look like whose visual hull has this shape; unclear where a `finer` one has another."""
     if finer is not None:
         has = finer.unclear or f"has {_counted(finer)}"
-        remedy = f"try --start.hull-faces {finer_faces} --max-faces {2 * finer_faces}"
+        faces = (option("start.hull_faces", finer_faces), option("max_faces", 2 * finer_faces))
+        remedy = f"try {either(' ', ' and ').join(faces)}"
         return Expected.unclear(f"a finer visual hull {has}: {remedy}")
     return Expected.unclear(f"the visual hull {shape.unclear}") if shape.unclear else Expected(shape, "visual hull")
 
@@ -205,12 +207,12 @@ class Run:
     @property
     def hull(self) -> str | None:
         """How to start from the hull, where it has not."""
-        return "--start.shape hull" if self.begun == "sphere" else None
+        return option("start.shape", "hull") if self.begun == "sphere" else None
 
     @property
     def longer(self) -> str | None:
         """How to run longer, where it could."""
-        return None if self.preset == "best" else "--preset best"
+        return None if self.preset == "best" else either("--preset best", "ReconstructConfig.best()")
 
 
 @dataclass(frozen=True)
@@ -287,10 +289,12 @@ def _unlike(found: Shape, expected: Expected, run: Run) -> list[str]:
     poor = []
     if expected.shown and _differ(found, expected.shape):
         fewer = run.begun == "hull" and (found.holes or 0) > (expected.shape.holes or 0)
-        remedy = run.hull or f"{'--start.shape sphere or ' * fewer}--init-mesh with a mesh that has them"
+        sphere = f"{option('start.shape', 'sphere')} or "
+        remedy = run.hull or f"{sphere * fewer}{option('init_mesh', ...)} with a mesh that has them"
         poor.append(f"the result has {_counted(found)}, the {expected.of} {_counted(expected.shape)}: try {remedy}")
     if found.unclear and expected.of == "input mesh":
-        poor.append(f"the result {found.unclear}, the input mesh is a closed surface: try --start.shape sphere")
+        sphere = option("start.shape", "sphere")
+        poor.append(f"the result {found.unclear}, the input mesh is a closed surface: try {sphere}")
     return poor
 
 
@@ -298,10 +302,11 @@ def _off(iou: float, views: Views, run: Run) -> list[str]:
     """What is wrong with the outline."""
     if iou >= GOOD_IOU:
         return []
-    remedies = " or ".join(filter(None, (run.hull, run.longer))) or "--init-mesh, and check masks and poses"
+    mesh = option("init_mesh", ...)
+    remedies = " or ".join(filter(None, (run.hull, run.longer))) or f"{mesh}, and check masks and poses"
     if run.lacking > LACKING:
         part = f"the visual hull that it started from lacks {100 * run.lacking:.0f} % of what masks show"
-        remedies = f"masks that have thin parts whole, photos that show them larger, or --init-mesh: {part}"
+        remedies = f"masks that have thin parts whole, photos that show them larger, or {mesh}: {part}"
     if run.photos < FEW_PHOTOS:
         remedies = f"more photos, from all sides: it was made from {run.photos}"
     shown = f"{iou:.3f}" if round(iou, 3) < GOOD_IOU else f"{iou:.6f}"
@@ -311,7 +316,8 @@ def _off(iou: float, views: Views, run: Run) -> list[str]:
 def _tangled(intersecting_percent: float, run: Run) -> list[str]:
     if intersecting_percent <= GOOD_INTERSECTING:
         return []
-    remedy = (run.hull or run.longer or "--init-mesh") if run.untangled else "--refinement.untanglings 6"
+    better = run.hull or run.longer or option("init_mesh", ...)
+    remedy = better if run.untangled else option("refinement.untanglings", 6)
     return [f"{intersecting_percent:.1f} % of its faces cut through others: try {remedy}"]
 
 
@@ -329,9 +335,10 @@ def _wrong_places(shares: Shares, *, converged: bool) -> list[str]:
             "nothing says how it goes on: try photos that show all of it"
         )
     if shares.closed > CLOSED and converged:
+        remedy = f"try {option('init_mesh', ...)} with a mesh that has it, or a texture for photos to agree on"
         poor.append(
             f"on {100 * shares.closed:.1f} % of what photos show the result lies far in front of the input mesh, so a "
-            "hollow is closed: try --init-mesh with a mesh that has it, or a texture for photos to agree on"
+            f"hollow is closed: {remedy}"
         )
     if shares.grown_over > CLOSED and converged:
         poor.append(

@@ -11,6 +11,7 @@ import torch
 
 from etsplat.core.cameras import Cameras
 from etsplat.core.errors import InputError
+from etsplat.core.spelling import either, option
 from etsplat.data.dataset import Dataset
 from etsplat.engines.choice import resolve_device
 from etsplat.io.mesh_files import MeshFile
@@ -77,12 +78,13 @@ class SoupRun:
             InputError: it is not known.
         """
         if self.gone is not None:
-            raise InputError(f"{self.path}: its scene {self.gone} has gone; name where it is now with --scene")
+            now = f"name where it is now with {option('scene', ...)}"
+            raise InputError(f"{self.path}: its scene {self.gone} has gone; {now}")
         if self.capture is None:
             why = "a file does not say which scene it shows"
             if is_run(self.path):
                 why = "the scene of this run is in no folder: it was a Dataset in memory, or has moved"
-            raise InputError(f"{self.path}: {why}; name the scene's folder with --scene")
+            raise InputError(f"{self.path}: {why}; name the scene's folder with {option('scene', ...)}")
         return self.capture
 
 
@@ -183,7 +185,8 @@ def training_cameras(capture: Dataset) -> list[Cameras]:
 
 def _open_directory(path: Path, scene: Dataset | Path | str | None, device: torch.device) -> SoupRun:
     if not is_run(path):
-        raise InputError(f"{path}: is not a run of etsplat; name a folder that was given to --out, or a soup's file")
+        a_run = either("a folder that was given to --out", "the folder of one")
+        raise InputError(f"{path}: is not a run of etsplat; name {a_run}, or a soup's file")
     check_trains(path)
     run = RunDirectory(path)
     if not run.soup_path.is_file():

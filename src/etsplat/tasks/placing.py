@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from etsplat.core.errors import InputError
+from etsplat.core.spelling import file_kind, option
 from etsplat.geometry.similarity import Similarity, rotation_between
 from etsplat.io.georeference import GEOREFERENCE_FILE, Georeference
 from etsplat.io.writers import suffixes, writer_of
@@ -24,16 +25,20 @@ def check_placed(path: Path, config: ExportConfig) -> None:
     """
     holds = writer_of(path).HOLDS
     if config.up == "z" and "z_up" not in holds:
-        kinds = " or ".join(suffix[1:] for suffix in suffixes("z_up"))
-        raise InputError(
-            f"{path}: files of this kind have +y up, which programs turn to their own axis; leave out --up z, "
-            f"or choose --format {kinds}"
-        )
+        kinds = (suffix[1:] for suffix in suffixes("z_up"))
+        remedy = f"leave out {option('up', 'z')}, or choose {file_kind(*kinds)}"
+        raise InputError(f"{path}: files of this kind have +y up, which programs turn to their own axis; {remedy}")
     if config.place == "world" and "offset" not in holds:
-        kinds = " or ".join(suffix[1:] for suffix in suffixes("offset"))
-        raise InputError(f"{path}: files of this kind hold no coordinates of maps; choose --format {kinds}")
+        kinds = (suffix[1:] for suffix in suffixes("offset"))
+        raise InputError(f"{path}: files of this kind hold no coordinates of maps; choose {file_kind(*kinds)}")
     if config.place == "ground" and config.up == "keep":
-        raise InputError("--place ground needs to know which way is up; take --up y or z")
+        ground, upright = option("place", "ground"), option("up", "y", "z")
+        raise InputError(f"{ground} needs to know which way is up; take {upright}")
+
+
+def leave_unplaced() -> str:
+    """What to do with settings of placement, for files that keep units and axes."""
+    return f"leave out {option('up')}, {option('scale')} and {option('place')}"
 
 
 def placement(

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, get_args
 
+from etsplat.core.spelling import option
 from etsplat.tasks.export_config import LIGHT_FACES, TEXELS, texture_problem
 from etsplat.tasks.settings import (
     Device,
@@ -344,7 +345,8 @@ class ReconstructConfig(Settings):
     def contradiction(self) -> str | None:
         """What is wrong with settings that are right one by one."""
         if self.drawing.backend == "nvdiffrast" and self.soft:
-            return "drawing.backend: nvdiffrast draws opaque triangles; choose --method raster-face or raster-vertex"
+            choose = option("method", *get_args(RasterMethod))
+            return f"drawing.backend: nvdiffrast draws opaque triangles; choose {choose}"
         if self.watch == 1:
             return "watch: 1 would keep all photos from training; choose 0 or at least 2"
         if self.refinement.first > self.refinement.last:

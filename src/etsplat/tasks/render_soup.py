@@ -14,6 +14,7 @@ from torch import Tensor
 
 from etsplat.core.cameras import Cameras, intrinsics
 from etsplat.core.errors import InputError
+from etsplat.core.spelling import option
 from etsplat.data.camera_paths import PATHS, path_note, played, usual_frames
 from etsplat.data.dataset import Dataset
 from etsplat.data.where_up import up_of
@@ -159,7 +160,7 @@ def views_of(
     if config.path in ("test", "train"):
         chosen = capture.test if config.path == "test" else capture.train
         if not chosen:
-            raise InputError(f"--path {config.path}: the capture has no such views; draw a path instead")
+            raise InputError(f"{option('path', config.path)}: the capture has no such views; draw a path instead")
         cameras = capture.cameras
         return [capture.names[index] for index in chosen], [_sized(cameras[index], config.width) for index in chosen]
     up = up_of(capture)

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from etsplat.core.errors import InputError
+from etsplat.core.spelling import option
 from etsplat.core.workers import about_this, restarted, workers
 from etsplat.engines.choice import engine_for, resolve_device
 from etsplat.engines.threads import num_threads
@@ -66,11 +67,11 @@ class Place:
                 the run that is there.
         """
         if self.resume and self.overwrite:
-            raise InputError("--resume and --overwrite: contradict each other; give one of them")
+            raise InputError(f"{option('resume')} and {option('overwrite')}: contradict each other; give one of them")
         if not self.resume:
             RunDirectory.check_free(self.path, overwrite=self.overwrite)
         elif not is_run(self.path):
-            raise InputError(f"{self.path}: holds no run to resume; start it without --resume")
+            raise InputError(f"{self.path}: holds no run to resume; start it without {option('resume')}")
         check_nobody_writes(self.path)
 
     @contextlib.contextmanager

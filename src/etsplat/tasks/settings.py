@@ -62,12 +62,17 @@ class Only:
     """At a field: the condition under which it has an effect; where it has none, it may not be changed.
 
     Attributes:
-        text: the condition in words, as they follow "only".
+        words: the condition, as it follows "only"; or what gives it, where it spells an `option`.
         holds: for a whole config.
     """
 
-    text: str
+    words: str | Callable[[], str]
     holds: Callable[[Any], bool]
+
+    @property
+    def text(self) -> str:
+        """The condition in words."""
+        return self.words if isinstance(self.words, str) else self.words()
 
 
 class Rare:

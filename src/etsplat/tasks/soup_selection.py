@@ -10,6 +10,7 @@ from torch import Tensor
 
 from etsplat.core.cameras import Cameras
 from etsplat.core.errors import InputError
+from etsplat.core.spelling import either, option
 from etsplat.data.dataset import Dataset
 from etsplat.data.looked_at import frames_around, looked_at, out_of_every_frame
 from etsplat.geometry.isolation import standing_alone
@@ -138,7 +139,8 @@ def crop_region(run: SoupRun, sky: Bool[Tensor, " N"]) -> Region:
     if points is None:
         points = run.soup.vertices.detach()[run.soup.seen_opaque & ~sky].mean(dim=1).cpu()
     if not len(points):
-        raise InputError(f"{run.path}: nothing in it is opaque, so --crop auto finds no place; name a region")
+        crop = option("crop", "auto")
+        raise InputError(f"{run.path}: nothing in it is opaque, so {crop} finds no place; name a region")
     return looked_at(capture, points)
 
 
@@ -202,17 +204,19 @@ def _clean(
 
 def faint_remedy(run: SoupRun) -> str:
     """What to do where most of a soup is left out as too faint."""
+    lower = f"lower {option('min_opacity')}"
     if run.opaque is not None:
-        return "lower --min-opacity, or take the run's opaque mesh (without --alpha, --colors keep, --triangles soup)"
+        soft = (option("alpha", True), option("colors", "keep"), option("triangles", "soup"))
+        return f"{lower}, or take the run's opaque mesh (without {', '.join(soft)})"
     if run.in_blocks:
-        return "lower --min-opacity, or train with --finish opaque; no opaque mesh is made of blocks"
-    return "lower --min-opacity, or take the opaque mesh (train --asset)"
+        return f"{lower}, or train with {option('finish', 'opaque')}; no opaque mesh is made of blocks"
+    return f"{lower}, or take the opaque mesh (train {either('--asset', 'with asset=True')})"
 
 
 def _nothing_left(run: SoupRun, removed: Mapping[Reason, int]) -> str:
-    remedy = "leave out --clean"
+    remedy = f"leave out {option('clean')}"
     if "crop" in removed:
-        remedy = "choose another --crop, in the units and axes of the capture"
+        remedy = f"choose another {option('crop')}, in the units and axes of the capture"
     elif list(removed) == ["faint"]:
         return f"no triangle is opaque enough; {faint_remedy(run)}"
     return f"nothing is left of it ({in_words(removed)}); {remedy}"

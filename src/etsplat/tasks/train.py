@@ -9,6 +9,7 @@ from typing import Any
 import torch
 
 from etsplat.core.precision import usual_defaults
+from etsplat.core.spelling import option
 from etsplat.core.workers import together, workers
 from etsplat.data.dataset import Dataset
 from etsplat.data.stray_points import without_strays
@@ -250,8 +251,8 @@ def _of_poor_poses(job: Job[TrainConfig], consistent: float, views: int, *, shor
     config, most = job.config, job.config.schedule.doubtful_epochs
     told = (
         f"poses: of the places that a photo finds its neighbours find only {100 * consistent:.0f} %: cameras are"
-        " probably off by a pixel and more, or things moved. --refine-cameras poses mends small errors, etsplat data"
-        " sfm finds cameras anew; of right poses photos are too far apart, or too plain, to tell depths"
+        f" probably off by a pixel and more, or things moved. {option('refine_cameras', 'poses')} mends small errors,"
+        " etsplat data sfm finds cameras anew; of right poses photos are too far apart, or too plain, to tell depths"
     )
     iterations = limited_iterations(config.iterations, most, views, config.batch)
     if shorten and consistent < DOUBTFUL and iterations < config.iterations:

@@ -3,6 +3,7 @@
 import torch
 
 from etsplat.core.errors import InputError
+from etsplat.core.spelling import option
 from etsplat.data.dataset import Dataset
 from etsplat.optim.trainer_checks import USUAL_EXTENT
 from etsplat.tasks.pixel_limits import random_count, triangle_limit
@@ -68,5 +69,5 @@ def doubtful_scale(capture: Dataset, config: TrainConfig) -> str | None:
         return None
     return (
         f"the cameras are spread over {capture.extent:.4g} units, and the settings are made for {low:g} to {high:g}: "
-        "start again with --normalize, which scales the scene"
+        f"start again with {option('normalize', True)}, which scales the scene"
     )

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import torch
 
 from etsplat.core.errors import InputError
+from etsplat.core.spelling import option
 from etsplat.core.workers import workers
 from etsplat.data.dataset import Dataset
 from etsplat.data.loader import stay_on
@@ -152,9 +153,10 @@ def check_memory(
     remedy = f"set it to {fitting} or less" if FEWEST <= fitting < config.max_triangles else "set it to less"
     if capture.exact_points is not None and fitting < len(capture.exact_points):
         remedy = f"the capture starts from {len(capture.exact_points):,} points; thin them"
+    others = f"make photos smaller with {option('width', ...)}, or divide the scene with {option('blocks', ...)}"
     raise InputError(
         f"max_triangles: {needed.triangles:,} triangles may need {in_words(needed.total - there)} and "
-        f"{in_words(free)} are free; {remedy}, make photos smaller with --width, or divide the scene with --blocks"
+        f"{in_words(free)} are free; {remedy}, {others}"
     )
 
 

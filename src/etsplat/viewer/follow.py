@@ -7,6 +7,7 @@ from pathlib import Path
 import torch
 
 from etsplat.core.errors import InputError
+from etsplat.core.spelling import either
 from etsplat.io.json_text import is_number
 from etsplat.io.locks import was_killed
 from etsplat.io.run_directory import RunDirectory, is_empty, is_run
@@ -27,7 +28,8 @@ def wait_for_soup(folder: Path, announce: Callable[[str], None]) -> None:
         InputError: the folder holds something else, or a run of an earlier version, or goes away.
     """
     if folder.is_dir() and not is_empty(folder) and not is_run(folder):
-        raise InputError(f"{folder}: is not a run of etsplat; name a folder given to --out, or a soup's file")
+        a_run = either("a folder given to --out", "the folder of one")
+        raise InputError(f"{folder}: is not a run of etsplat; name {a_run}, or a soup's file")
     told, seen = "", False
     while not RunDirectory(folder).soup_path.is_file():
         if seen and not folder.is_dir():

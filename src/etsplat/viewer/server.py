@@ -23,6 +23,7 @@ from torch import Tensor
 
 from etsplat.core.cameras import Cameras, intrinsics
 from etsplat.core.errors import InputError
+from etsplat.core.spelling import option
 from etsplat.data.looked_at import middle_photo
 from etsplat.data.where_up import up_of
 from etsplat.engines.choice import engine
@@ -339,7 +340,7 @@ def check_can_serve(host: str, port: int) -> Any:
     except OSError as error:
         if error.errno != errno.EADDRINUSE:  # then viser takes the next one
             raise InputError(
-                f"--host {host} --port {port}: cannot listen there ({error.strerror}); choose others"
+                f"{option('host', host)} {option('port', port)}: cannot listen there ({error.strerror}); choose others"
             ) from error
     return found
 

@@ -189,7 +189,9 @@ def test_photos_in_another_folder_of_the_scene_are_offered(tmp_path, truth):
     """As 3DGS lays them out: they were called missing."""
     write_scene(tmp_path, truth, True)
     (tmp_path / "images").rename(tmp_path / "input")
-    with pytest.raises(InputError, match=r"10 of 10 images are missing .*they are in input/, which --images input"):
+    with pytest.raises(
+        InputError, match=r"10 of 10 images are missing .*they are in input/, which images=.input. takes"
+    ):
         load_colmap(tmp_path)
     assert len(load_dataset(tmp_path, images="input")) == 10
 

@@ -16,6 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from etsplat.core.errors import InputError
+from etsplat.core.spelling import option
 from etsplat.data.frames import MASK_FOLDER, Frame, Listing, Wanted
 from etsplat.data.matrix_cameras import decomposed, photos_by_order
 from etsplat.data.scene_files import Entry, points_beside
@@ -88,7 +89,7 @@ def _masks(folder: Path, names: list[str], path: Path, wanted: Wanted) -> Iterat
     if len(found) != len(names):
         raise InputError(
             f"scene {path}: has {len(names)} poses, but there are {len(found)} masks in {folder / _MASKS}, and their"
-            " order alone says which is whose; copy all of them there, or name a folder with --masks"
+            f" order alone says which is whose; copy all of them there, or name a folder with {option('masks', ...)}"
         )
     return iter(found)
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from etsplat.core.errors import InputError
+from etsplat.core.spelling import option
 from etsplat.tasks.sweeps.executors import Executor
 
 SLURM = "slurm"
@@ -35,7 +36,7 @@ class Where:
         if self.cores is not None and self.cores < 1:
             raise InputError(f"cores: is {self.cores}; it must be at least 1")
         if self.slurm and self.cluster != SLURM:
-            raise InputError("slurm: has an effect only with --cluster slurm; leave it out, or add that")
+            raise InputError(f"slurm: has an effect only with {option('cluster', SLURM)}; leave it out, or add that")
 
     def executor(self, runs: int) -> Executor:
         """What makes so many runs.
