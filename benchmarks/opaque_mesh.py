@@ -4,38 +4,51 @@
     python -m benchmarks.opaque_mesh data/lego --scene-type object --background white --soups runs/soups
 
 A row of a table in Markdown: PSNR and SSIM of the test views as a mesh viewer draws them, triangles, and seconds of one
-processor's time that fitting the mesh took. The soup that it begins with is kept in the folder: what changes in the
-mesh's own stage is compared from the same start. The soup learns exposures itself, where a run's mesh takes over
-those of its soft soup, so these numbers are not quite those of a run. The capture must have points.
+processor's time that fitting the mesh took, with drawing the soft soup's views. Both soups that it is made of are kept
+in the folder: what changes in the mesh's own stage is compared from the same start. The capture must have points.
 """
 
 import argparse
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import torch
 
 from etsplat.data.dataset import Dataset
 from etsplat.model.triangle_mesh import TriangleMesh
+from etsplat.model.triangle_soup import TriangleSoup
+from etsplat.optim.exposure import Exposure
 from etsplat.optim.schedules import limited_iterations
-from etsplat.tasks.opaque import finished_mesh, mesh_steps, start_mesh, towards_opaque
+from etsplat.tasks.opaque import finished_mesh, mesh_steps, mesh_views, start_mesh, towards_opaque
 from etsplat.tasks.scoring import Scorer
+from etsplat.tasks.soft_views import with_soft_views
 from etsplat.tasks.soup_trainer import background_of, start_trainer
 from etsplat.tasks.sources import kept_aside, load_scene
 from etsplat.tasks.train_config import TrainConfig
 
 
 def fitted(capture: Dataset, config: TrainConfig, kept: Path) -> tuple[TriangleMesh, float]:
-    """The mesh, and the seconds of processor time that its stage took; the soup is kept in a folder, or found there."""
+    """The mesh, and the seconds of processor time that its stage took; soups are kept in a folder, or found there."""
     assert capture.exact_points is not None, "the capture must have points"
-    shorter = towards_opaque(capture, config)
-    before = start_trainer(capture, shorter)
-    before.fit(shorter.iterations, run=kept)
-    soup = before.outcome().model.finished()
-    trainer = start_mesh(soup, before.exposure, capture, config)
+    soft, exposure = _soup(capture, replace(config, asset=False), kept / "soft", None)
+    opaque, _ = _soup(capture, towards_opaque(capture, config), kept / "opaque", exposure)
     began = time.process_time()
+    views = with_soft_views(capture, soft, mesh_views(config), background_of(config), config.seed)
+    trainer = start_mesh(opaque, exposure, capture, views, config)
     trainer.fit(mesh_steps(config))
-    return finished_mesh(trainer.outcome().model, capture), time.process_time() - began
+    return finished_mesh(trainer.outcome().model, views), time.process_time() - began
+
+
+def _soup(
+    capture: Dataset, config: TrainConfig, kept: Path, exposure: Exposure | None
+) -> tuple[TriangleSoup, Exposure]:
+    """A soup that is trained on the capture's own points, and its exposures; those of another, if it has any."""
+    trainer = start_trainer(capture, config)
+    if exposure is not None:
+        trainer.exposure.take_over(exposure)
+    trainer.fit(config.iterations, run=kept)
+    return trainer.outcome().model.finished(), trainer.exposure
 
 
 def start(description: str | None) -> tuple[Dataset, TrainConfig, Path]:

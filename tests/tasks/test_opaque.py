@@ -151,7 +151,7 @@ def test_no_view_looks_through_a_mesh_with_a_backdrop(capture: Dataset) -> None:
 @pytest.mark.parametrize("sky", ["sphere", "dome", "none"])
 def test_runs_with_a_sky_have_a_backdrop(sky: str, capture: Dataset) -> None:
     own = capture.normalized()
-    trainer = start_mesh(grey_soup(own, 300), Exposure(NEVER), own, CONFIG.changed({"sky": sky}))
+    trainer = start_mesh(grey_soup(own, 300), Exposure(NEVER), own, own, CONFIG.changed({"sky": sky}))
     seen = trainer.model.render(own.cameras[0]).triangle
     assert seen is not None
     assert bool((seen < 0).any()) == (sky == "none")

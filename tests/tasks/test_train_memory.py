@@ -54,6 +54,18 @@ def test_bytes_of_a_triangle_are_those_of_a_runs_tensors(capture: Dataset, degre
         assert counted <= 2 * (lasting + values)
 
 
+def test_memory_has_room_for_the_views_that_an_opaque_mesh_is_fitted_to(capture: Dataset) -> None:
+    """Of few photos; of many there are none, nor where no such mesh is made of a soft soup."""
+    few, long = capture.of_views(capture.train[:4]), SHORT.changed({"asset": True, "iterations": 100})
+    soft = memory_of(few, long, 600, CPU)
+    assert soft.soft == 2 * 4 * 64 * 48  # a third of 100 steps shows six views five times
+    assert "24 KiB for views of the soup" in str(soft)
+    for other in ({"asset": False}, {"finish": "opaque"}, {"iterations": 60}):
+        none = memory_of(few, long.changed(other), 600, CPU)
+        assert soft.total - none.total == soft.soft
+        assert "views of the soup" not in str(none)
+
+
 def test_memory_is_linear_in_triangles_and_photos(capture: Dataset) -> None:
     few, many = (memory_of(capture, SHORT, most, CPU) for most in (10**7, 2 * 10**7))
     assert many.total - few.total == 10**7 * few.per_triangle

@@ -1,8 +1,9 @@
-"""Photos made of other photos: parts of them, or smaller ones. They are made when they are needed, too."""
+"""Photos made of other photos: parts of them, smaller ones, or more. They are made when they are needed, too."""
 
 import hashlib
+import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -10,6 +11,65 @@ import torch
 
 from etsplat.data.pictures import LazyPictures, Picture, Pictures, Pixels
 from etsplat.io.depth_maps import resize_depth
+
+
+class Joined(Pictures):
+    """Photos of several data sets, in any order."""
+
+    def __init__(self, parts: Sequence[Pictures], places: Sequence[tuple[int, int]] | None = None) -> None:
+        """Takes all, which keep and let go of their photos themselves.
+
+        Args:
+            parts: what they are of.
+            places: of each photo the index of its part, and its own in there; None for all, one part after the other.
+        """
+        everything = [(number, index) for number, part in enumerate(parts) for index in range(len(part))]
+        self._parts, self._places = tuple(parts), everything if places is None else list(places)
+        self.sizes = [self._parts[number].sizes[index] for number, index in self._places]
+        self.total_bytes = sum(part.total_bytes for part in self._parts)
+        self.streamed = any(part.streamed for part in self._parts)
+        self.with_depth = frozenset(self._whose("with_depth"))
+        self.straight = tuple(self._whose("straight"))
+
+    def _whose(self, attribute: str) -> list[int]:
+        """The photos whose parts name them."""
+        named = [frozenset(getattr(part, attribute)) for part in self._parts]
+        return [at for at, (number, index) in enumerate(self._places) if index in named[number]]
+
+    def _of_part(self, number: int, indices: Iterable[int]) -> list[int]:
+        """Those of these photos that are of a part, by their indices there."""
+        return [index for part, index in (self._places[at] for at in indices) if part == number]
+
+    @property
+    def held_bytes(self) -> int:
+        """Of all parts."""
+        return sum(part.held_bytes for part in self._parts)
+
+    def picture(self, index: int) -> Picture:
+        """Of its part."""
+        if not 0 <= index < len(self):
+            raise IndexError(f"view {index}: expected one in [0, {len(self)})")
+        number, place = self._places[index]
+        return self._parts[number].picture(place)
+
+    def fingerprint(self) -> bytes:
+        """Of all parts and of the order."""
+        digest = hashlib.sha256(repr(self._places).encode())
+        for part in self._parts:
+            digest.update(part.fingerprint())
+        return digest.digest()
+
+    def subset(self, indices: Sequence[int]) -> "Joined":
+        """Of subsets of the parts."""
+        parts = [part.subset(self._of_part(number, indices)) for number, part in enumerate(self._parts)]
+        counts = [itertools.count() for _ in parts]
+        owners = [self._places[index][0] for index in indices]
+        return Joined(parts, [(owner, next(counts[owner])) for owner in owners])
+
+    def expect(self, indices: Sequence[int]) -> None:
+        """Of their parts."""
+        for number, part in enumerate(self._parts):
+            part.expect(self._of_part(number, indices))
 
 
 class Box(NamedTuple):

@@ -234,6 +234,19 @@ class Exposure:
             self.adam.replace("values", values.clone().requires_grad_(True), first.clone(), second.clone())
             self.adam.step_count = int(state["step_count"])
 
+    def take_over(self, known: "Exposure") -> None:
+        """Begins with what another has learned of the same photos, and measures nothing.
+
+        Args:
+            known: of some of these photos, which come first here. Others are neutral.
+        """
+        self.measured_at = self.again_at = NEVER
+        state = known.state()
+        if known.learned:
+            others = (0, 0, 0, len(self.values) - len(known.values))
+            state |= {name: torch.nn.functional.pad(state[name], others) for name in ("values", "first", "second")}
+        self.load_state(state)
+
     @property
     def values(self) -> Float[Tensor, "P 10"]:
         """What is learned: of each photo g, then D by rows."""

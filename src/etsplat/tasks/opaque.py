@@ -36,6 +36,7 @@ from etsplat.tasks.opened_runs import training_cameras
 from etsplat.tasks.pixel_limits import triangle_limit
 from etsplat.tasks.running import Job
 from etsplat.tasks.settings import get
+from etsplat.tasks.soft_views import with_soft_views
 from etsplat.tasks.soup_trainer import background_of, shown_across, start_trainer, surroundings_of_run
 from etsplat.tasks.train_config import TrainConfig
 
@@ -74,21 +75,34 @@ def fit_opaque_mesh(
         capture: photos in the frame that is trained in.
         config: settings of the run.
     """
+    views = capture
     if config.finish == "none":
         shorter = towards_opaque(capture, config)
         trainer = start_trainer(_with_points(capture, soup, shorter.max_triangles), shorter, None, job.device)
-        _take_over(trainer.exposure, exposure)
+        trainer.exposure.take_over(exposure)
+        views = with_soft_views(capture, soup, mesh_views(config), background_of(config), config.seed)
         soup = job.fit_stage(trainer, shorter.iterations, "soup", "Making opaque triangles").finished()
-    trainer = start_mesh(soup, exposure, capture, config)
-    return finished_mesh(job.fit_stage(trainer, mesh_steps(config), "mesh", "Fitting the opaque mesh"), capture)
+    trainer = start_mesh(soup, exposure, capture, views, config)
+    return finished_mesh(job.fit_stage(trainer, mesh_steps(config), "mesh", "Fitting the opaque mesh"), views)
 
 
-def start_mesh(soup: TriangleSoup, exposure: Exposure, capture: Dataset, config: TrainConfig) -> Trainer[TriangleMesh]:
-    """The start of the mesh of an opaque soup; arguments are those of `fit_opaque_mesh`."""
+def start_mesh(
+    soup: TriangleSoup, exposure: Exposure, capture: Dataset, views: Dataset, config: TrainConfig
+) -> Trainer[TriangleMesh]:
+    """The start of the mesh of an opaque soup.
+
+    Args:
+        soup: where it begins.
+        exposure: as of `fit_opaque_mesh`.
+        capture: likewise.
+        views: that with soft views, or as it is; what the mesh is fitted to.
+        config: settings of the run.
+    """
     around = surroundings_of_run(capture, config)
     trainer = make_opaque_trainer(
         opaque_mesh(soup, None if around is None else around.backdrop(capture)),
-        capture,
+        views,
+        photos=capture,
         iterations=mesh_steps(config),
         unit=shown_across(soup, capture),
         carried=_carried(capture, config),
@@ -98,7 +112,7 @@ def start_mesh(soup: TriangleSoup, exposure: Exposure, capture: Dataset, config:
         batch=config.batch,
         seed=config.seed,
     )
-    _take_over(trainer.exposure, exposure)
+    trainer.exposure.take_over(exposure)
     return trainer
 
 
@@ -129,10 +143,9 @@ def mesh_steps(config: TrainConfig) -> int:
     return max(1, round(MESH_SHARE * config.iterations))
 
 
-def _take_over(exposure: Exposure, known: Exposure) -> None:
-    """Begins with what is known of the photos, and does not measure them again."""
-    exposure.measured_at = exposure.again_at = NEVER
-    exposure.load_state(known.state())
+def mesh_views(config: TrainConfig) -> int:
+    """How many views it sees in these steps."""
+    return mesh_steps(config) * config.batch
 
 
 def _with_points(capture: Dataset, soup: TriangleSoup, most: int) -> Dataset:
@@ -196,8 +209,9 @@ def opaque_mesh(
 
 def make_opaque_trainer(
     mesh: TriangleMesh,
-    capture: Dataset,
+    views: Dataset,
     *,
+    photos: Dataset | None = None,
     iterations: int,
     unit: float,
     carried: int,
@@ -211,7 +225,8 @@ def make_opaque_trainer(
 
     Args:
         mesh: the start; changed in place.
-        capture: what it is fitted to.
+        views: what it is fitted to.
+        photos: those of them that say what is wrong; None for all.
         iterations: steps.
         unit: what the rate of corners is a fraction of, where photos show as much across as at the capture's points.
         carried: most faces that there may be by halving those that are most wrong.
@@ -227,17 +242,17 @@ def make_opaque_trainer(
     more = (after - before for before, after in pairwise([mesh.count, *grown.values()]))
     most_wrong = dict(zip(grown, more, strict=True))
     exposure = Exposure(NEVER)
-    errors = PictureErrors(capture, JUDGES, mesh.vertices.device, torch.tensor(background), exposure, around)
+    errors = PictureErrors(photos or views, JUDGES, mesh.vertices.device, torch.tensor(background), exposure, around)
     return Trainer(
         mesh,
-        capture,
+        views,
         Objective(Photometric(DSSIM, pixel="rms")),
         HalveWhereWrong(budgets, errors, most_wrong),
         schedule=Schedule({"vertices": _corners(iterations, unit), "colors": _colors(iterations)}),
         batch=batch,
         background=background,
         exposure=exposure,
-        paces={"vertices": corner_paces(capture, unit, around)},
+        paces={"vertices": corner_paces(views, unit, around)},
         seed=seed,
     )
 

@@ -1,5 +1,7 @@
 """What is refused before a run of novel-view synthesis, and what its owner should know."""
 
+from dataclasses import replace
+
 import torch
 
 from etsplat.core.errors import InputError
@@ -35,7 +37,9 @@ def check_train(
     masks = (capture.images.mask(view) for view in capture.train)
     if not capture.images.streamed and all(mask is not None and not bool(mask.any()) for mask in masks):
         raise InputError("masks: leave out every pixel of all training photos; they are white where pixels count")
-    needed = check_memory(capture, config, triangle_limit(capture, config), device, around)
+    needed = check_memory(
+        capture, replace(config, iterations=iterations), triangle_limit(capture, config), device, around
+    )
     aside = f", {len(capture.watched)} to watch the run" if capture.watched else ""
     views = f"{len(capture.train)} photos to train on{aside}, {len(capture.test)} to test"
     notes = [f"{views}; {needed}"]

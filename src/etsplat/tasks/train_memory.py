@@ -11,7 +11,9 @@ from etsplat.data.dataset import Dataset
 from etsplat.data.loader import stay_on
 from etsplat.io.memory import available_memory
 from etsplat.model.surroundings import SPHERE_TRIANGLES
+from etsplat.tasks.opaque import mesh_views
 from etsplat.tasks.pixel_limits import random_count
+from etsplat.tasks.soft_views import soft_view_count
 from etsplat.tasks.train_config import TrainConfig
 
 STATISTICS = 16
@@ -53,6 +55,7 @@ class TrainMemory:
         photos: how many there are.
         kept: of all photos that stay.
         pictures: of the pictures of a step.
+        soft: of views of the soup, which its opaque mesh is fitted to as well.
         around: of triangles that are drawn in them and stay where they are.
         pooled: what is kept for the next step, and of libraries.
     """
@@ -62,18 +65,21 @@ class TrainMemory:
     photos: int
     kept: int
     pictures: int
+    soft: int
     around: int
     pooled: int
 
     @property
     def total(self) -> int:
         """All of it."""
-        return self.triangles * self.per_triangle + self.kept + self.pictures + self.around + self.pooled
+        return self.triangles * self.per_triangle + self.kept + self.pictures + self.soft + self.around + self.pooled
 
     def __str__(self) -> str:
         parts = [f"{self.per_triangle:,} bytes for each of {self.triangles:,} triangles"]
         if self.kept:
             parts.append(f"{in_words(self.kept // self.photos)} for each of {self.photos:,} photos")
+        if self.soft:
+            parts.append(f"{in_words(self.soft)} for views of the soup")
         return f"at most {in_words(self.total)} of memory: {', '.join(parts)}, {in_words(self.pictures)} for a step"
 
 
@@ -123,7 +129,9 @@ def memory_of(capture: Dataset, config: TrainConfig, most: int, device: torch.de
     on_cpu = device.type == "cpu"
     pooled = LIBRARIES + (min(POOLED, triangles * each // 4) if on_cpu else 0)
     each = each if on_cpu else max(each, ON_DEVICES)
-    return TrainMemory(triangles, each, len(capture), kept, pixels * BYTES_PER_PIXEL, around, pooled)
+    beside = config.asset and config.finish == "none"
+    soft = 4 * pixels * soft_view_count(capture, mesh_views(config)) if beside else 0
+    return TrainMemory(triangles, each, len(capture), kept, pixels * BYTES_PER_PIXEL, soft, around, pooled)
 
 
 def check_memory(
