@@ -32,6 +32,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         metavar="ARCHITECTURE",
         help="run kernels as NVRTC compiles them, for compute_75 or newer; other tests not at all",
     )
+    parser.addoption("--shard", metavar="K/N", help="run every Nth of the chosen tests, from the Kth on")
     parser.addoption("--gpu", action="store_true", help="run the tests whose kernels run on a GPU; others not at all")
 
 
@@ -49,15 +50,18 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
         metafunc.parametrize("engine", [only] if only else ENGINES, indirect=True)
 
 
+@pytest.hookimpl(trylast=True)  # after -m and -k
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    chosen = list(items)
     if config.getoption("--gpu"):
-        wanted = _runs_on_a_gpu
+        chosen = [item for item in items if isinstance(item, pytest.Function) and _runs_on_a_gpu(item)]
     elif config.getoption("--ptx") or watched():
-        wanted = _runs_kernels
-    else:
-        return
-    chosen = [item for item in items if isinstance(item, pytest.Function) and wanted(item)]
-    config.hook.pytest_deselected(items=[item for item in items if item not in chosen])
+        chosen = [item for item in items if isinstance(item, pytest.Function) and _runs_kernels(item)]
+    if shard := config.getoption("--shard"):
+        first, step = map(int, shard.split("/"))
+        chosen = chosen[first - 1 :: step]
+    kept = set(chosen)
+    config.hook.pytest_deselected(items=[item for item in items if item not in kept])
     items[:] = chosen
 
 

@@ -34,8 +34,8 @@ def test_triangles_over_many_tiles(cuda_engine, distance, rng):
 @pytest.mark.sanitize
 def test_the_order_of_tiles_changes_nothing(cuda_engine, rng, monkeypatch):
     """The fullest tiles first, in two views; some tiles are empty."""
-    scene = soup(rng, 120, width=150, height=133, size=1.0)
-    cotangents = {"color": torch.randn(2, 133, 150, 3, generator=rng)}
+    scene = soup(rng, 60, width=86, height=69, size=1.0)
+    cotangents = {"color": torch.randn(2, 69, 86, 3, generator=rng)}
     out, grads = gradients(scene, cuda_engine, cotangents)
     monkeypatch.setattr(rasterize_launches, "_AT_ONCE", 0)
     ordered, ordered_grads = gradients(scene, cuda_engine, cotangents)

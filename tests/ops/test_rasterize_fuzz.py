@@ -1,6 +1,7 @@
 """Whatever comes in, nothing crashes and nothing finite turns into NaN."""
 
 import math
+import random
 
 import pytest
 import torch
@@ -26,18 +27,37 @@ triangles = st.lists(st.lists(coordinates, min_size=9, max_size=9), min_size=0, 
 opacities = st.sampled_from([0.0, 1e-45, 0.0039, 0.004, 0.5, 0.99, 1.0, 1.5, 1e30, -0.5, *BROKEN])
 sigmas = st.sampled_from([1e-45, 1e-38, 1e-6, 1e-3, 0.5, 1.0, 5.0, 1e3, 1e30, 0.0, -1.0, *BROKEN])
 colors = st.sampled_from([0.0, 0.5, 1.0, -3.0, 1e-45, 1e5, *BROKEN])
-cutoffs = st.sampled_from([Cutoffs(), NO_CUTOFFS, Cutoffs(alpha_min=0.0), Cutoffs(x_max=1e30, transmittance_min=0.0)])
+CUTOFFS = [Cutoffs(), NO_CUTOFFS, Cutoffs(alpha_min=0.0), Cutoffs(x_max=1e30, transmittance_min=0.0)]
 OPTIONS = st.fixed_dictionaries(
     {
         "kernel": st.sampled_from(list(KERNELS)),
         "distance": st.sampled_from(DISTANCES),
-        "cutoffs": cutoffs,
+        "cutoffs": st.sampled_from(CUTOFFS),
         "depth_of": st.sampled_from(["plane", "centroid"]),
         "outputs": st.sets(st.sampled_from(OUTPUTS[2:6])),
         "freeze_inradius": st.booleans(),
     }
 )
 GOOD = facing([(1.0, 2.0), (11.0, 3.0), (5.0, 10.0)], size=SIZE)
+
+
+def programs(count):
+    """Each kernel, distance, cutoff and output, with several of the others."""
+    rng, kernels = random.Random(0), list(KERNELS)
+    return [
+        {
+            "kernel": kernels[index % len(kernels)],
+            "distance": DISTANCES[index // len(kernels) % len(DISTANCES)],
+            "cutoffs": rng.choice(CUTOFFS),
+            "depth_of": rng.choice(["plane", "centroid"]),
+            "outputs": {name for name in OUTPUTS[2:6] if rng.random() < 0.5},
+            "freeze_inradius": rng.random() < 0.5,
+        }
+        for index in range(count)
+    ]
+
+
+PROGRAMS = programs(12)
 
 
 def with_good(vertices, opacity, sigma, color):
@@ -55,8 +75,9 @@ def with_good(vertices, opacity, sigma, color):
     return scene
 
 
-def with_statistics(options):
-    return {**options, "outputs": {*options["outputs"], "statistics"}}
+def options_for(engine):
+    """Any on the CPU; those of a few programs on a GPU, whose engine compiles one for each choice."""
+    return st.sampled_from(PROGRAMS) if device_of(engine) == "cuda" else OPTIONS
 
 
 def cotangents_for(options):
@@ -70,9 +91,10 @@ def cotangents_for(options):
 
 @pytest.mark.sanitize
 @FUZZ
-@given(vertices=triangles, opacity=opacities, sigma=sigmas, color=colors, options=OPTIONS)
-def test_any_triangles(engine, vertices, opacity, sigma, color, options):
+@given(vertices=triangles, opacity=opacities, sigma=sigmas, color=colors, data=st.data())
+def test_any_triangles(engine, vertices, opacity, sigma, color, data):
     """Images and all gradients stay finite: what is not finite is invisible, and invisible things have gradient 0."""
+    options = data.draw(options_for(engine))
     scene = with_good(vertices, opacity, sigma, color)
     cotangents = cotangents_for(options)
     for dtype in {torch.float32, dtype_of(engine)}:
@@ -104,10 +126,11 @@ def test_any_triangles(engine, vertices, opacity, sigma, color, options):
     viewmat=st.lists(coordinates, min_size=12, max_size=12),
     focal=st.sampled_from([0.0, -5.0, 1e-30, 12.0, 1e30, *BROKEN]),
     middle=st.sampled_from([0.0, -1e9, 6.0, 1e30, *BROKEN]),
-    options=OPTIONS,
+    data=st.data(),
 )
-def test_any_camera(engine, viewmat, focal, middle, options):
+def test_any_camera(engine, viewmat, focal, middle, data):
     """A camera of nonsense renders something finite, without validation."""
+    options = data.draw(options_for(engine))
     scene = {**with_good([], 1.0, 1.0, 1.0), "viewmats": torch.eye(4)[None].clone(), "Ks": GOOD["Ks"].clone()}
     scene["viewmats"][0, :3] = torch.tensor(viewmat).reshape(3, 4)
     scene["Ks"][0, 0, 0] = focal
