@@ -138,7 +138,7 @@ def message_of(trainer: Trainer[Any], iteration: int) -> Tensor:
 def drawing(trainer: Trainer[Any], iteration: int) -> shared_steps.Gradients:
     """Of the next view."""
     stepper = trainer._stepper
-    chosen, weights = stepper._choose()[0], stepper._objective.weights(iteration)
+    chosen, weights = stepper._choose(iteration)[0], stepper._objective.weights(iteration)
     views = [(stepper._loader.view(chosen.view), chosen.background)]
     options = {"moving": False, "separate": True, "decayed": True}
     return lambda places: stepper._gradients(views, weights, 1.0, first=places.start, **options)

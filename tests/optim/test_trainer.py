@@ -200,7 +200,7 @@ def test_a_step_of_two_views_is_the_mean_of_their_gradients(object_views: Datase
     steps._strategy = Fixed()
     mesh, chosen = a_mesh(), []
     honest = steps._choose
-    steps._choose = lambda: chosen.extend(found := honest()) or found  # type: ignore[method-assign]
+    steps._choose = lambda at: chosen.extend(found := honest(at)) or found  # type: ignore[method-assign]
     pair.advance(1, 1)
     background = torch.tensor([[0.2, 0.4, 0.6]])
     objective, total = mesh_objective(), 0.0
@@ -319,6 +319,38 @@ def test_photos_are_halved_when_the_schedule_says(object_views: Dataset) -> None
         a_mesh(), object_views, Objective(Photometric(), [Custom(look, outputs=("color",))]), schedule=schedule
     ).fit(4)
     assert widths == [12, 12, 24, 24]
+
+
+def test_steps_show_the_views_that_the_schedule_says(object_views: Dataset) -> None:
+    """Where they change an epoch of the others ends; a run that goes on from its state ends with the same bits."""
+    some, views = object_views.train[:2], list[int]()
+
+    def look(drawing: Drawing) -> Tensor:
+        views.append(int(drawing.index))
+        return drawing.rendering.color.sum() * 0
+
+    def trainer() -> Trainer[TriangleMesh]:
+        schedule = Schedule(TriangleMesh.RATES, views=lambda step: object_views.train if step <= 3 else some)
+        return Trainer(a_mesh(), object_views, Objective(Photometric(), [Custom(look)]), schedule=schedule)
+
+    first = trainer()
+    first.fit(9)
+    assert len(set(views[:3])) == 3
+    assert [set(views[at : at + 2]) for at in (3, 5, 7)] == [set(some)] * 3
+    for killed_at in (2, 3, 4, 6):
+        begun, gone_on = trainer(), trainer()
+        begun.fit(killed_at)
+        gone_on.load_state(begun.state(), killed_at)
+        for step in range(killed_at + 1, 10):
+            gone_on.advance(step, step)
+        assert torch.equal(gone_on.model.vertices, first.model.vertices)
+
+
+@pytest.mark.parametrize("views", [[], [10**6]])
+def test_views_that_are_none_to_train_on_are_refused(object_views: Dataset, views: list[int]) -> None:
+    schedule = Schedule(TriangleMesh.RATES, views=lambda _: views)
+    with pytest.raises(ValueError, match="schedule: its views of iteration 1 are no training views"):
+        Trainer(a_mesh(), object_views, Objective(Photometric(), []), schedule=schedule).fit(1)
 
 
 def test_every_random_choice_follows_from_the_seed(object_views: Dataset) -> None:

@@ -15,7 +15,7 @@ from etsplat.optim.exposure import Exposure
 from etsplat.optim.loop import Event, StageEvent
 from etsplat.optim.schedules import NEVER
 from etsplat.tasks import opaque, soft_views
-from etsplat.tasks.opaque import start_mesh
+from etsplat.tasks.opaque import make_opaque_trainer, opaque_mesh, start_mesh
 from etsplat.tasks.soft_views import EPOCHS, with_soft_views
 from etsplat.tasks.train import train
 from etsplat.tasks.train_config import TrainConfig
@@ -95,7 +95,32 @@ def test_they_are_neutral_where_photos_have_exposures_and_photos_alone_judge(few
         assert torch.equal(matrices[view], torch.eye(3))
 
 
-@pytest.mark.parametrize("done", [0, 7])
+def test_photos_alone_are_fitted_to_at_last(few: Dataset) -> None:
+    """While colours settle, in the last three tenths of the steps."""
+    soup = soup_of(few)
+    views = with_soft_views(few, soup, EPOCHS * 8, BLACK, seed=0)
+    trainer = make_opaque_trainer(
+        opaque_mesh(soup),
+        views,
+        photos=few,
+        iterations=20,
+        unit=1.0,
+        carried=400,
+        max_faces=400,
+        background=BLACK,
+    )
+    shown = list[set[int]]()
+    sampler = trainer._stepper.sampler
+
+    def seen(_: int) -> None:
+        shown.append(set(sampler._views.tolist()))
+
+    trainer.onlooker = seen
+    trainer.fit(20)
+    assert shown == [set(views.train)] * 14 + [set(few.train)] * 6
+
+
+@pytest.mark.parametrize("done", [0, 7, 13])
 def test_a_run_with_them_ends_with_the_same_bits_after_a_kill(
     few: Dataset, done: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -1,7 +1,7 @@
 """How weights and learning rates change over a run. Iterations are counted from 1 to `iterations`."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -35,6 +35,8 @@ class Schedule:
         halvings: how often the photos are halved, by iteration.
         calm_from: by name of a parameter, the iteration from which on it is one of `Adam.calmed`. What Adam knows of
             its gradients begins anew there, as they are then of another kind.
+        views: indices of those training views that steps show, by iteration; None for all. Where they change an epoch
+            of the others ends.
 
     Raises:
         ValueError: a rate is negative, or no number.
@@ -50,6 +52,7 @@ class Schedule:
     appearance: Callable[[int], Any] | None = None
     halvings: Callable[[int], int] = _never
     calm_from: Mapping[str, int] = field(default_factory=dict)
+    views: Callable[[int], Sequence[int]] | None = None
 
     def __post_init__(self) -> None:
         for name, rate in self.rates.items():

@@ -79,7 +79,7 @@ class Stepper(Generic[M]):
         self._schedule, appearance = schedule, model.appearance
         self._appearance = schedule.appearance or (lambda _: appearance)
         self._background, self._update = background, update
-        self.sampler = ViewSampler(dataset.train, generator)
+        self.sampler, self._trained = ViewSampler(dataset.train, generator), frozenset(dataset.train)
         parameters = model.parameters()
         _check_names(schedule, model)
         self._device = next(iter(parameters.values())).device
@@ -177,7 +177,7 @@ class Stepper(Generic[M]):
         self.arrive(iteration)
         self._calm(iteration)
         self.adam.learning_rates = self._rates(iteration)
-        chosen = self._choose()
+        chosen = self._choose(iteration)
         weights, scale = self._objective.weights(iteration), at(self._objective.scale, iteration)
         moving, decayed = self._cameras.moving(iteration), self._update is None
 
@@ -210,7 +210,7 @@ class Stepper(Generic[M]):
         return float(loss)
 
     def _queued_step(self, iteration: int) -> QueuedStep:
-        chosen = self._choose()
+        chosen = self._choose(iteration)
         found = [self._loader.kind_and_place(each.view, number) for number, each in enumerate(chosen)]
         uploads = [self._loader.upload(each.view, number) for number, each in enumerate(chosen)]
         self.adam.learning_rates = self._rates(iteration)
@@ -323,8 +323,13 @@ class Stepper(Generic[M]):
         if value is not None:
             value.backward()
 
-    def _choose(self) -> list[_Chosen]:
+    def _choose(self, iteration: int) -> list[_Chosen]:
         """Views and backgrounds of the next step; photos that come after them are decoded ahead."""
+        if (shown := self._schedule.views) is not None:
+            some = list(shown(iteration))
+            if not some or not set(some) <= self._trained:
+                raise ValueError(f"schedule: its views of iteration {iteration} are no training views of the dataset")
+            self.sampler.show(some, anew=iteration > 1 and list(shown(iteration - 1)) != some)
         views, firsts = [], []
         for _ in range(self._batch):
             views.append(self.sampler.next_view())

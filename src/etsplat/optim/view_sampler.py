@@ -19,6 +19,17 @@ class ViewSampler:
         self._order = self._views[:0]
         self._position = 0
 
+    def show(self, views: Sequence[int], *, anew: bool) -> None:
+        """From the next epoch on, some views alone.
+
+        Args:
+            views: which; one at least.
+            anew: whether that epoch begins now.
+        """
+        self._views = torch.tensor(list(views), dtype=torch.int64)
+        if anew:
+            self._order, self._position = self._views[:0], 0
+
     def next_view(self) -> int:
         """The index of the next view."""
         if self._position == len(self._order):

@@ -51,7 +51,7 @@ SLOWEST, FASTEST = 0.1, 30.0
 """Limits of what photos show across at a corner, beside what they do at the capture's points."""
 
 COLOR_RATE, SETTLING_FROM, SETTLED = 5e-3, 0.7, 0.1
-"""Adam's rate of colours; from this part of the steps on it falls, to this part of itself."""
+"""Adam's rate of colours; from this part of the steps on it falls, to this part of itself, and photos alone count."""
 
 HALVINGS, FIRST_HALVING, LAST_HALVING = 8, 0.15, 0.65
 """How often triangles are halved, and when, as fractions of the steps."""
@@ -226,7 +226,7 @@ def make_opaque_trainer(
     Args:
         mesh: the start; changed in place.
         views: what it is fitted to.
-        photos: those of them that say what is wrong; None for all.
+        photos: those of them that say what is wrong, and are fitted to alone at last; None for all.
         iterations: steps.
         unit: what the rate of corners is a fraction of, where photos show as much across as at the capture's points.
         carried: most faces that there may be by halving those that are most wrong.
@@ -241,14 +241,15 @@ def make_opaque_trainer(
     grown = face_budgets(iterations, max_faces=carried, **times)
     more = (after - before for before, after in pairwise([mesh.count, *grown.values()]))
     most_wrong = dict(zip(grown, more, strict=True))
-    exposure = Exposure(NEVER)
-    errors = PictureErrors(photos or views, JUDGES, mesh.vertices.device, torch.tensor(background), exposure, around)
+    exposure, photos = Exposure(NEVER), photos or views
+    errors = PictureErrors(photos, JUDGES, mesh.vertices.device, torch.tensor(background), exposure, around)
+    settling, rates = _settling(iterations), {"vertices": _corners(iterations, unit), "colors": _colors(iterations)}
     return Trainer(
         mesh,
         views,
         Objective(Photometric(DSSIM, pixel="rms")),
         HalveWhereWrong(budgets, errors, most_wrong),
-        schedule=Schedule({"vertices": _corners(iterations, unit), "colors": _colors(iterations)}),
+        schedule=Schedule(rates, views=lambda iteration: (views if iteration <= settling else photos).train),
         batch=batch,
         background=background,
         exposure=exposure,
@@ -279,5 +280,9 @@ def _corners(iterations: int, unit: float) -> Callable[[int], float]:
 
 
 def _colors(iterations: int) -> Scheduled:
-    first = round(SETTLING_FROM * iterations)
+    first = _settling(iterations)
     return lambda iteration: COLOR_RATE * SETTLED ** ramp(iteration, first, iterations)
+
+
+def _settling(iterations: int) -> int:
+    return round(SETTLING_FROM * iterations)
