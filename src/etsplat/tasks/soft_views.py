@@ -15,8 +15,9 @@ from etsplat.data.dataset import Dataset
 from etsplat.data.pictures import Pixels, StoredPictures
 from etsplat.model.triangle_soup import TriangleSoup
 
-EPOCHS = 5
-"""Each view, a photo or not, is seen so often while the mesh is fitted: many photos leave no room for others."""
+EPOCHS, ENOUGH = 5, 150
+"""Each view, a photo or not, is seen so often while the mesh is fitted; and so many in all, of which photos are a part,
+leave little free."""
 
 MOST_PIXELS = 50_000_000
 """Of all views of a soup, which stay in memory: three or four bytes each."""
@@ -30,7 +31,7 @@ def soft_view_count(capture: Dataset, steps: int) -> int:
         steps: views that are going to be seen in all, each photo as often as each of these.
     """
     largest = max(width * height for width, height in capture.images.sizes)
-    return max(0, min(steps // EPOCHS - len(capture.train), MOST_PIXELS // largest))
+    return max(0, min(min(steps // EPOCHS, ENOUGH) - len(capture.train), MOST_PIXELS // largest))
 
 
 @torch.no_grad()
