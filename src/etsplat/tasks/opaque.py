@@ -4,10 +4,10 @@ Most triangles of a soft soup are half transparent, and it is sorted by centroid
 mesh is made in two steps. A soup becomes opaque while it is trained (`--finish opaque`), which puts its triangles where
 the surfaces are. Then each of its corners gets a colour of its own, the same from every side, and corners and colours
 are fitted by the z-buffer with antialiased edges (`ops/antialias.py`): the very picture that a viewer draws. Beside few
-photos it is fitted to what the soft soup shows from elsewhere, too (`tasks/soft_views.py`). Triangles in the way of what
-photos show are removed, and others halved where pictures are most wrong, or where photos agree. What none of this shows
-stays, in the colours of what is around it: other views do. Behind all of them is a closed backdrop, since other views
-look through gaps that no training photo shows. What was tried besides is in research/ablations.md.
+photos it is fitted to what the soft soup shows from elsewhere, too (`tasks/soft_views.py`). Triangles in the way of
+what photos show are removed, and others halved where pictures are most wrong, or where photos agree. What none of this
+shows stays, in the colours of what is around it: other views do. Behind all of them is a closed backdrop, since other
+views look through gaps that no training photo shows. What was tried besides is in research/ablations.md.
 """
 
 from collections.abc import Callable
