@@ -10,6 +10,7 @@ import torch
 
 from etsplat.core.errors import InputError
 from etsplat.data.dataset import Dataset, Normalization
+from etsplat.data.pictures import StoredPictures
 from etsplat.data.shown_width import shown_width
 from etsplat.io.run_directory import RunDirectory
 from etsplat.model.surroundings import SPHERE_TRIANGLES, Surroundings
@@ -294,6 +295,19 @@ def test_more_points_than_there_may_be_triangles_are_told(capture: Dataset) -> N
         notes = check_train(capture, config, config.iterations, torch.device("cpu"))
         told = f"{count:,} points, each of which becomes a triangle: more than the limit of {most:,}"
         assert any(note.startswith(told) for note in notes) is (most < count)
+
+
+def test_a_sky_behind_what_is_cut_out_is_told(capture: Dataset) -> None:
+    """Of photos with transparent pixels, unless they are trained without a sky."""
+    pixels = [torch.nn.functional.pad(photo, (0, 1), value=255) for photo in capture.images]
+    whole = replace(capture, images=StoredPictures(pixels))
+    cut_out = replace(capture, images=StoredPictures([photo * (photo[..., :1] > 90) for photo in pixels]))
+    told = 'take TrainConfig.of(preset, "object")'
+    cases = [(cut_out, "outdoor", True), (cut_out, "indoor", True), (cut_out, "object", False)]
+    cases += [(whole, "outdoor", False), (capture, "outdoor", False)]
+    for photos, kind, noted in cases:
+        notes = check_train(photos, TrainConfig.of("quick", kind), 10, torch.device("cpu"))
+        assert any(told in note for note in notes) is noted
 
 
 def test_rates_settle_towards_the_end(capture: Dataset) -> None:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import torch
 
 from etsplat.core.errors import InputError
-from etsplat.core.spelling import option
+from etsplat.core.spelling import either, option
 from etsplat.data.dataset import Dataset
 from etsplat.optim.trainer_checks import USUAL_EXTENT
 from etsplat.tasks.pixel_limits import random_count, triangle_limit
@@ -61,9 +61,21 @@ def check_train(
         photos = ["its photos"] if config.start.dense and config.finish == "none" else []
         unless = f" unless {' or '.join(maps + photos)} agree" if maps or photos else ""
         notes.append(f"no points in the capture: starting from {random_count(capture, config):,} random ones{unless}")
+    if config.sky != "none" and _cut_out(capture):
+        as_object = either("--scene-type object", 'TrainConfig.of(preset, "object")')
+        notes.append(
+            "photos: have transparent pixels, and behind them a scene has a sky, which nothing holds there; of an"
+            f" object that is cut out, take {as_object}"
+        )
     if doubt := doubtful_scale(capture, config):
         notes.append(doubt)
     return notes
+
+
+def _cut_out(capture: Dataset) -> bool:
+    """Whether the first photo says of any pixel that nothing is there."""
+    pixels = capture.images[capture.train[0]]
+    return pixels.shape[-1] == 4 and bool((pixels[..., 3] == 0).any())
 
 
 def doubtful_scale(capture: Dataset, config: TrainConfig) -> str | None:
