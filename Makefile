@@ -130,15 +130,12 @@ $(SANITIZED): $(INSTALLED) $(shell find src -name '*.py')
 SANITIZER := LD_PRELOAD="$$($(CXX) -print-file-name=libasan.so) $$($(CXX) -print-file-name=libstdc++.so)" \
 	ASAN_OPTIONS=detect_leaks=1:malloc_context_size=4 UBSAN_OPTIONS=print_stacktrace=1 \
 	LSAN_OPTIONS=suppressions=$(CURDIR)/tests/native/leaks.supp:print_suppressions=0
-# Two processes, each of which looks for its leaks when it ends, as workers of pytest-xdist do not.
-SANITIZED_TESTS = $(SANITIZER) PYTHONPATH="$(CURDIR)/build/sanitize/site:$(SITE)" \
-	$(PY) -S -m pytest -p no:cacheprovider -m sanitize $(PYTEST_ARGS)
 sanitize: $(SANITIZED)
 	echo 'extern "C" void plant() { new int[100]; }' | $(CXX) -x c++ -shared -fPIC -o build/sanitize/planted.so -
 	! $(SANITIZER) $(PY) -S -c 'import ctypes; ctypes.CDLL("build/sanitize/planted.so").plant()' 2> build/sanitize/planted.log
 	grep -q 'in plant' build/sanitize/planted.log
-	$(SANITIZED_TESTS) --shard 1/2 > build/sanitize/first.log 2>&1 & first=$$!; $(SANITIZED_TESTS) --shard 2/2; second=$$?; \
-		wait $$first; first=$$?; cat build/sanitize/first.log; exit $$((first | second))
+	$(SANITIZER) PYTHONPATH="$(CURDIR)/build/sanitize/site:$(SITE)" \
+		$(PY) -S -m pytest -p no:cacheprovider -m sanitize $(PYTEST_ARGS)
 
 # Odd input: a seed makes the same inputs everywhere, and the short form's are counted, so that a faster machine tries
 # nothing that FUZZ_SHORT without its seconds has not tried. What fails is kept under build/fuzz.

@@ -10,7 +10,6 @@ import pytest
 import torch
 
 from etsplat.core.kernels import DISTANCES, KERNELS
-from etsplat.core.spelling import spelled_as_options
 from etsplat.engines.cuda.launch import device_type, use_backend
 from helpers.simt.build import Races, Simt, watched
 
@@ -32,7 +31,6 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         metavar="ARCHITECTURE",
         help="run kernels as NVRTC compiles them, for compute_75 or newer; other tests not at all",
     )
-    parser.addoption("--shard", metavar="K/N", help="run every Nth of the chosen tests, from the Kth on")
     parser.addoption("--gpu", action="store_true", help="run the tests whose kernels run on a GPU; others not at all")
 
 
@@ -50,18 +48,15 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
         metafunc.parametrize("engine", [only] if only else ENGINES, indirect=True)
 
 
-@pytest.hookimpl(trylast=True)  # after -m and -k
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    chosen = list(items)
     if config.getoption("--gpu"):
-        chosen = [item for item in items if isinstance(item, pytest.Function) and _runs_on_a_gpu(item)]
+        wanted = _runs_on_a_gpu
     elif config.getoption("--ptx") or watched():
-        chosen = [item for item in items if isinstance(item, pytest.Function) and _runs_kernels(item)]
-    if shard := config.getoption("--shard"):
-        first, step = map(int, shard.split("/"))
-        chosen = chosen[first - 1 :: step]
-    kept = set(chosen)
-    config.hook.pytest_deselected(items=[item for item in items if item not in kept])
+        wanted = _runs_kernels
+    else:
+        return
+    chosen = [item for item in items if isinstance(item, pytest.Function) and wanted(item)]
+    config.hook.pytest_deselected(items=[item for item in items if item not in chosen])
     items[:] = chosen
 
 
@@ -83,13 +78,6 @@ def _runs_kernels(test: pytest.Function) -> bool:
     if any(parameters.get(name) in others for name in ("engine", "native", "cuda_engine")):
         return False
     return not {"simt", "cuda_engine", "engine_of", "races"}.isdisjoint(test.fixturenames)
-
-
-@pytest.fixture
-def command_line() -> Iterator[None]:
-    """Messages are those of the command line, as `main()` has them; for tests that run a command without it."""
-    with spelled_as_options():
-        yield
 
 
 @pytest.fixture(scope="session")
