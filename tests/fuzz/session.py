@@ -23,6 +23,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, Protocol
 
 import numpy as np
+import torch
 
 HANG = 20.0
 """Seconds that an input may take."""
@@ -162,6 +163,8 @@ class _Worker:
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         os.dup2(1, 2)
         faulthandler.enable(self.log, all_threads=False)
+        # Torch makes its pool anew where it is first asked for it after a fork: two threads at once may find none.
+        torch.set_num_threads(torch.get_num_threads())
         mapped = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
         resource.setrlimit(resource.RLIMIT_AS, (mapped + (_MAPPED << 20), resource.RLIM_INFINITY))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
