@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from etsplat.core.kernels import DISTANCES, KERNELS
+from etsplat.core.spelling import spelled_as_options
 from etsplat.engines.cuda.launch import device_type, use_backend
 from helpers.simt.build import Races, Simt, watched
 
@@ -78,6 +79,13 @@ def _runs_kernels(test: pytest.Function) -> bool:
     if any(parameters.get(name) in others for name in ("engine", "native", "cuda_engine")):
         return False
     return not {"simt", "cuda_engine", "engine_of", "races"}.isdisjoint(test.fixturenames)
+
+
+@pytest.fixture
+def command_line() -> Iterator[None]:
+    """Messages are those of the command line, as `main()` has them; for tests that run a command without it."""
+    with spelled_as_options():
+        yield
 
 
 @pytest.fixture(scope="session")
