@@ -14,7 +14,7 @@ BEYOND = 1.0
 """So far beyond either of two cameras a new one may stand, as a part of the way between them."""
 
 _TURNED = 0.5
-"""Least cosine between the rotations' axes of two neighbours: there is nothing between cameras back to back."""
+"""Least cosine between where two neighbours look: there is nothing between cameras back to back."""
 
 
 def cameras_beside(
@@ -30,8 +30,7 @@ def cameras_beside(
     Returns:
         Their matrices, float64, and for each the index of the nearer camera of its pair.
     """
-    pairs = _neighbours(viewmats)
-    if not len(pairs) or count < 1:
+    if count < 1 or not len(pairs := _neighbours(viewmats)):
         return viewmats.new_zeros((0, 4, 4), dtype=torch.float64), torch.zeros(0, dtype=torch.int64)
     rounds = [torch.randperm(len(pairs), generator=generator) for _ in range(-(-count // len(pairs)))]
     first, second = pairs[torch.cat(rounds)[:count]].unbind(dim=1)

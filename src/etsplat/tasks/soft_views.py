@@ -16,8 +16,8 @@ from etsplat.data.pictures import Pixels, StoredPictures
 from etsplat.model.triangle_soup import TriangleSoup
 
 EPOCHS, ENOUGH = 5, 150
-"""Each view, a photo or not, is seen so often while the mesh is fitted; and so many in all, of which photos are a part,
-leave little free."""
+"""There are as many as would be seen so often, each photo as well, in all steps of the mesh; and no more than make so
+many with the photos, which leave little free then."""
 
 MOST_PIXELS = 50_000_000
 """Of all views of a soup, which stay in memory: three or four bytes each."""
@@ -28,7 +28,7 @@ def soft_view_count(capture: Dataset, steps: int) -> int:
 
     Args:
         capture: photos.
-        steps: views that are going to be seen in all, each photo as often as each of these.
+        steps: how many are seen in all while the mesh is fitted, one after the other.
     """
     largest = max(width * height for width, height in capture.images.sizes)
     return max(0, min(min(steps // EPOCHS, ENOUGH) - len(capture.train), MOST_PIXELS // largest))
