@@ -438,3 +438,39 @@ def test_without_a_network_the_address_is_told(tmp_path, monkeypatch):
     monkeypatch.setitem(datasets.DATASETS, "tiny", Dataset((tmp_path / "no.zip").as_uri(), ("truck",), 0.001))
     with pytest.raises(InputError, match="damaged"):
         download_dataset("tiny", tmp_path / "data")
+
+
+def grain(places, seed, octaves=5):
+    """Random brightness at places of a plane, (..., 2), with detail of all sizes."""
+    rng, brightness = np.random.default_rng(seed), 0.0
+    for octave in range(octaves):
+        values, (x, y) = rng.random((128, 128)), np.moveaxis(places * 2**octave + 31, -1, 0)
+        left, top = np.floor(x).astype(int), np.floor(y).astype(int)
+        corners = [[values[(left + i) % 128, (top + j) % 128] for j in (0, 1)] for i in (0, 1)]
+        along_x = [corners[0][j] * (1 - x + left) + corners[1][j] * (x - left) for j in (0, 1)]
+        brightness = brightness + (along_x[0] * (1 - y + top) + along_x[1] * (y - top)) / 1.6**octave
+    return brightness
+
+
+def two_walls(center, size=(480, 360), focal=330.0):
+    """Photo of a wall at a distance of 3, and of one at 6 beside it."""
+    width, height = size
+    y, x = np.mgrid[:height, :width] + 0.5
+    rays = np.stack([x - width / 2, y - height / 2], axis=-1) / focal
+    near, far = (rays * depth + np.array(center) for depth in (3.0, 6.0))
+    gray = np.where((np.abs(near) < 1).all(axis=-1), grain(near * 2, 1), grain(far * 2, 2))
+    return Image.fromarray((255 * (gray - gray.min()) / np.ptp(gray)).astype(np.uint8)).convert("RGB")
+
+
+def test_photos_from_hardly_different_places_are_placed(tmp_path):
+    """A wide lens held in front of something: by the focal length that is guessed, no two photos differ by 16 degrees."""
+    pytest.importorskip("pycolmap")
+    (tmp_path / "photos").mkdir()
+    centers = [(x, y) for x in (-0.25, 0.0, 0.25) for y in (-0.125, 0.125)]
+    for index, center in enumerate(centers):
+        two_walls(center).save(tmp_path / "photos" / f"{index}.png")
+    found = find_cameras(tmp_path / "photos", tmp_path / "scene", threads=2)
+    assert len(found.placed) == len(centers)
+    capture = load_dataset(found.scene)
+    truth = torch.tensor([(*center, 0.0) for center in centers])
+    assert distances_agree(camera_centers(capture.viewmats), truth)

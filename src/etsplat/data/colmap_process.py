@@ -30,6 +30,13 @@ Result = TypeVar("Result")
 Mapper = Literal["incremental", "global"]
 """Cameras one after the other; or all at once (GLOMAP)."""
 
+LEAST_PLACED = 0.9
+"""Where fewer of the photos are placed, one photo after the other, other beginnings are tried."""
+
+SMALL_ANGLE = 4.0
+"""Degrees between the rays of the two photos that a second beginning is content with. COLMAP wants 16, by a focal length that is
+at first a guess: a camera that hardly moves before what it photographs never shows as much."""
+
 NEIGHBOURS = 15
 """Photos on either side, in order of names, that one is compared with where not every pair is."""
 
@@ -176,11 +183,15 @@ def place_photos(report: Report, job: Job) -> Path | None:
     _compare(pycolmap, database, job, report)
     (job.work / "models").mkdir()
     models = (_place_all if job.mapper == "global" else _place_one_by_one)(pycolmap, database, job, report)
-    largest = max(models, key=lambda index: models[index].num_reg_images(), default=None)
+    largest = max(models, key=_placed, default=None)
     if largest is None:
         return None
-    models[largest].write(_made(job.work / "largest"))
+    largest.write(_made(job.work / "largest"))
     return job.work / "largest"
+
+
+def _placed(model: Any) -> int:
+    return model.num_reg_images()
 
 
 def _find_features(pycolmap: Any, database: Path, job: Job, report: Report) -> None:
@@ -219,30 +230,50 @@ def _compare(pycolmap: Any, database: Path, job: Job, report: Report) -> None:
     report("Comparing photos", pairs, pairs)
 
 
-def _place_one_by_one(pycolmap: Any, database: Path, job: Job, report: Report) -> dict[int, Any]:
-    placed, count = 0, len(job.names)
+def _place_one_by_one(pycolmap: Any, database: Path, job: Job, report: Report) -> list[Any]:
+    """Models of all beginnings that were tried: with other angles, at last with focal lengths from pairs of photos."""
+    count, models = len(job.names), []
+    for attempt, (angle, calibrated) in enumerate(((None, False), (SMALL_ANGLE, False), (SMALL_ANGLE, True))):
+        if calibrated and not _calibrate(pycolmap, database):
+            break
+        options = pycolmap.IncrementalPipelineOptions(num_threads=job.threads)
+        if angle is not None:
+            options.mapper.init_min_tri_angle = angle
+        progress = _Placing(report, count)
+        folder = _made(job.work / "models" / str(attempt))
+        models += pycolmap.incremental_mapping(
+            database, job.photos, folder, options=options, next_image_callback=progress
+        ).values()
+        if max(map(_placed, models), default=0) >= LEAST_PLACED * count:
+            break
+    return models
 
-    def placed_one() -> None:
-        nonlocal placed
-        placed += 1
-        report("Placing cameras", min(placed + 1, count), count)
 
-    report("Placing cameras", 0, count)
-    return pycolmap.incremental_mapping(
-        database,
-        job.photos,
-        job.work / "models",
-        options=pycolmap.IncrementalPipelineOptions(num_threads=job.threads),
-        next_image_callback=placed_one,
-    )
+class _Placing:
+    """Is called for each photo that is placed, but the first."""
+
+    def __init__(self, report: Report, count: int) -> None:
+        self.report, self.count, self.placed = report, count, 1
+        report("Placing cameras", 0, count)
+
+    def __call__(self) -> None:
+        self.placed += 1
+        self.report("Placing cameras", min(self.placed, self.count), self.count)
 
 
-def _place_all(pycolmap: Any, database: Path, job: Job, report: Report) -> dict[int, Any]:
+def _place_all(pycolmap: Any, database: Path, job: Job, report: Report) -> list[Any]:
     report("Placing all cameras at once", 0, 0)
-    if not all(camera.has_prior_focal_length for camera in _cameras(pycolmap, database)):
-        pycolmap.calibrate_view_graph(database)  # focal lengths from pairs of photos
+    _calibrate(pycolmap, database)
     options = pycolmap.GlobalPipelineOptions(num_threads=job.threads)
-    return pycolmap.global_mapping(database, job.photos, job.work / "models", options)
+    return list(pycolmap.global_mapping(database, job.photos, job.work / "models", options).values())
+
+
+def _calibrate(pycolmap: Any, database: Path) -> bool:
+    """Focal lengths that no photo tells, from pairs of photos; whether there are such."""
+    if all(camera.has_prior_focal_length for camera in _cameras(pycolmap, database)):
+        return False
+    pycolmap.calibrate_view_graph(database)
+    return True
 
 
 def _cameras(pycolmap: Any, database: Path) -> list[Any]:
