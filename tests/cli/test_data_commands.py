@@ -463,7 +463,7 @@ def two_walls(center, size=(480, 360), focal=330.0):
 
 
 def test_photos_from_hardly_different_places_are_placed(tmp_path):
-    """A wide lens held in front of something: by the focal length that is guessed, no two photos differ by 16 degrees."""
+    """By a wide lens: with the focal length that is guessed, no two photos differ by 16 degrees."""
     pytest.importorskip("pycolmap")
     (tmp_path / "photos").mkdir()
     centers = [(x, y) for x in (-0.25, 0.0, 0.25) for y in (-0.125, 0.125)]

@@ -1,6 +1,6 @@
 """One trainer for every model, data set, objective and strategy: any combination fits, and resumes to the bit."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ from etsplat.io.run_directory import RunDirectory
 from etsplat.model.soup_init import StartPoints, start_soup
 from etsplat.model.triangle_mesh import MeshAppearance, TriangleMesh
 from etsplat.model.triangle_soup import TriangleSoup
-from etsplat.optim.loop import DoneEvent, RefineEvent, StepEvent
+from etsplat.optim.loop import Callback, DoneEvent, RefineEvent, StepEvent
 from etsplat.optim.objective import Custom, Drawing, Objective, Term
 from etsplat.optim.schedules import Schedule, face_budgets
 from etsplat.optim.strategies import DensifyAndPrune, Fixed, Strategy, SubdivideAndUntangle
@@ -357,3 +357,39 @@ def test_every_random_choice_follows_from_the_seed(object_views: Dataset) -> Non
     """The same seed gives the same losses, another one does not."""
     make: Callable[[int], list[float]] = lambda seed: losses_of(combination("mesh", object_views, seed=seed), 3)  # noqa: E731
     assert make(0) == make(0) != make(1)
+
+
+def fit_in(run: Path, photos: Dataset, rate: float, budget: int, callbacks: Sequence[Callback] = ()) -> TriangleMesh:
+    """A short run in a folder."""
+    mesh = a_mesh()
+    schedule = Schedule({**mesh.rates, "vertices": rate})
+    strategy = SubdivideAndUntangle({2: budget})
+    trainer = Trainer(mesh, photos, mesh_objective(), strategy, schedule=schedule)
+    trainer.fit(3, run=run, callbacks=callbacks)
+    return mesh
+
+
+def test_a_run_of_other_rates_or_settings_is_refused_and_one_that_goes_on_says_so(
+    object_views: Dataset, tmp_path: Path
+) -> None:
+    first, told = fit_in(tmp_path, object_views, 1e-3, 100), list[object]()
+    for rate, budget in ((2e-3, 100), (1e-3, 120)):
+        with pytest.raises(InputError, match="checkpoint"):
+            fit_in(tmp_path, object_views, rate, budget)
+    again = fit_in(tmp_path, object_views, 1e-3, 100, [told.append])
+    assert torch.equal(again.vertices, first.vertices)
+    assert f"run {tmp_path}: has 3 of 3 iterations, and none is made" in str(told[0])
+    with pytest.warns(UserWarning, match="another folder begins anew"):
+        fit_in(tmp_path, object_views, 1e-3, 100)
+
+
+@pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
+def test_gradients_are_on_within_a_run_whatever_they_are_around_it(object_views: Dataset, mode: Any) -> None:
+    """What was looked at in inference mode before can be fitted to afterwards."""
+    photos, mesh = object_views.of_views(range(len(object_views))), a_mesh()
+    with mode():
+        mesh.render(photos.cameras[0])
+        Trainer(mesh, photos, mesh_objective()).fit(2)
+    mesh.render(photos.cameras[0]).color.mean().backward()
+    with torch.inference_mode(), pytest.raises(ValueError, match="made within torch.inference_mode"):
+        Trainer(a_mesh(), photos, mesh_objective())

@@ -53,13 +53,18 @@ def _whole(argument: object) -> object:
 
 @contextmanager
 def usual_defaults() -> Iterator[None]:
-    """Within the block what torch makes is float32 and on the CPU unless it is told otherwise.
+    """Within the block what torch makes is float32 and on the CPU unless it is told otherwise, and gradients are on.
 
     As it is where nobody has called `torch.set_default_dtype` or `torch.set_default_device`, by whose choice random
-    numbers, backgrounds and the like would be of another kind than photos and models.
+    numbers, backgrounds and the like would be of another kind than photos and models; and outside of `torch.no_grad`
+    and `torch.inference_mode`, in which nothing is learned, nor later by what the second has made.
     """
     given = torch.get_default_dtype()
     with ExitStack() as stack:
+        if torch.is_inference_mode_enabled():
+            stack.enter_context(torch.inference_mode(mode=False))
+        if not torch.is_grad_enabled():
+            stack.enter_context(torch.enable_grad())
         if torch.get_default_device().type != "cpu":
             stack.enter_context(torch.device("cpu"))
         if given != torch.float32:

@@ -34,8 +34,9 @@ LEAST_PLACED = 0.9
 """Where fewer of the photos are placed, one photo after the other, other beginnings are tried."""
 
 SMALL_ANGLE = 4.0
-"""Degrees between the rays of the two photos that a second beginning is content with. COLMAP wants 16, by a focal length that is
-at first a guess: a camera that hardly moves before what it photographs never shows as much."""
+"""Degrees between the rays of the two photos that a second beginning is content with.
+
+COLMAP wants 16, by a focal length that is at first a guess: a camera that hardly moves never shows as much."""
 
 NEIGHBOURS = 15
 """Photos on either side, in order of names, that one is compared with where not every pair is."""

@@ -83,7 +83,8 @@ class Dataset:
         georeference: where the input's own units lie in the world; None where nobody said so.
 
     Raises:
-        ValueError: fields that contradict each other; poses that are no rotations; numbers that are not finite.
+        ValueError: fields that contradict each other; poses that are no rotations; intrinsics with skew; numbers that
+            are not finite.
 
     Example:
         Photos of your own, of an object before nothing, seen by cameras of your own:
@@ -143,6 +144,7 @@ class Dataset:
         return len(self.viewmats)
 
     @cached_property
+    @usual_defaults()
     def cameras(self) -> list[Cameras]:
         """B single cameras in float32."""
         return [

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from etsplat.core.errors import InputError
 from etsplat.core.validation import check_finite, check_floating, check_shape, shown, whole_number
 
 _ROTATION = 0.01
@@ -15,6 +16,10 @@ _ROTATION = 0.01
 
 _ABOVE = 2 / 255
 """So much colours may be above their alpha: what rounding and resampling leave."""
+
+_SKEW, _AWAY = 1e-4, 1e-6
+"""How far a matrix of intrinsics may be from that of a pinhole, in focal lengths and in its last row: what rounding
+leaves. It is taken out."""
 
 _BRIGHTEST = 4.0
 """Exposed photos may be brighter than 1; what is brighter than this is not in [0, 1] at all."""
@@ -94,12 +99,25 @@ def checked_viewmats(viewmats: Any) -> Float[Tensor, "B 4 4"]:
 
 
 def checked_intrinsics(Ks: Any) -> Float[Tensor, "B 3 3"]:
-    """Intrinsics in float64. Raises ValueError where a focal length is not positive."""
+    """Intrinsics in float64. Raises ValueError where one has skew, or a focal length is not positive."""
     Ks = _in_double("Ks", Ks, ("B", 3, 3))
     wrong = (Ks[:, 0, 0] <= 0) | (Ks[:, 1, 1] <= 0)
     if bool(wrong.any()):
         raise ValueError(f"Ks[{int(wrong.nonzero()[0])}]: focal lengths must be above 0")
-    return Ks
+    pinholes = Ks * torch.eye(3, dtype=torch.float64)
+    pinholes[:, :2, 2], pinholes[:, 2, 2] = Ks[:, :2, 2], 1.0
+    off = (Ks - pinholes).abs()
+    wrong = (off[:, :2, :2].amax(dim=(1, 2)) > _SKEW * Ks[:, 0, 0]) | (off[:, 2].amax(dim=1) > _AWAY)
+    if bool(wrong.any()):
+        form = "must have the form [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]; skew is not supported"
+        raise ValueError(f"Ks[{int(wrong.nonzero()[0])}]: {form}")
+    return pinholes
+
+
+def check_training_views(train: Sequence[int]) -> None:
+    """Raises InputError where there are none."""
+    if not train:
+        raise InputError("capture: has no view to train on; name some in its split")
 
 
 def checked_points(points: Any, colors: Any) -> tuple[Tensor, Tensor | None]:

@@ -17,6 +17,7 @@ from etsplat.core.errors import InputError
 from etsplat.data.camera_coverage import axes_meeting_point
 from etsplat.data.carving import Carving
 from etsplat.data.dataset import Dataset
+from etsplat.data.dataset_checks import check_training_views
 from etsplat.data.silhouettes import Silhouette, reach_of, silhouette, touches_border
 
 _CELLS = 48
@@ -68,6 +69,7 @@ def bounding_sphere(dataset: Dataset) -> tuple[Float[Tensor, "3"], float]:
         >>> 0.9 < radius < 1.1
         True
     """
+    check_training_views(dataset.train)
     if len(dataset.train) == 1:
         raise InputError("views: 1 to train on; an object needs photos from around it, better 20")
     check_not_empty(dataset, dataset.train)

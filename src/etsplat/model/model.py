@@ -93,8 +93,17 @@ class Model(Protocol):
         return {name: self.RATES[name] for name in self.parameters()}
 
     def learnable(self: M) -> M:
-        """This one, with parameters that require gradients."""
-        for parameter in self.parameters().values():
+        """This one, with parameters that require gradients.
+
+        Raises:
+            ValueError: they were made within `torch.inference_mode`.
+        """
+        for name, parameter in self.parameters().items():
+            if parameter.is_inference():
+                raise ValueError(
+                    f"{name}: was made within torch.inference_mode(), whose tensors learn nothing; make the model"
+                    " outside of it, or within torch.no_grad()"
+                )
             parameter.requires_grad_(True)
         return self
 

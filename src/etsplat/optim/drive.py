@@ -2,7 +2,7 @@
 
 import hashlib
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -51,6 +51,7 @@ def drive(
     callbacks: Sequence[Callback],
     run: RunDirectory | None,
     run_hash: str,
+    going_on: Callable[[int, int], None] = lambda iteration, iterations: None,
 ) -> None:
     """Runs the loop to the last iteration; on several workers with the same state on all. The first one keeps the run.
 
@@ -61,6 +62,7 @@ def drive(
         callbacks: each is called with every event.
         run: gets checkpoints and history.jsonl; None writes nothing.
         run_hash: identifies all that the result depends on.
+        going_on: called with the iteration of a checkpoint that is gone on from, and the last one.
 
     Raises:
         DivergedError: a loss or parameter is not finite.
@@ -71,6 +73,7 @@ def drive(
         checkpoint = group.from_first(lambda: load_latest_checkpoint(run.checkpoints, run_hash))
         if checkpoint is not None:
             _go_on(problem, progress, checkpoint)
+            going_on(progress.iteration, settings.iterations)
         del checkpoint  # or its tensors would stay beside those that edits make of them
         if group.leads:
             run.truncate_history(progress.iteration)

@@ -5,6 +5,7 @@ import copy
 import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Generic, NoReturn, TypeVar
 
@@ -41,8 +42,10 @@ from etsplat.optim.trainer_checks import (
     checked_metrics,
     doubts_before,
     generator_of,
+    plain_settings,
     state_of,
     tell,
+    tell_of_going_on,
 )
 from etsplat.optim.watch import Outcome, Watch
 
@@ -140,6 +143,9 @@ class Trainer(Generic[M]):
         self._objective, self._dataset, self._batch, self._evaluate = objective, dataset, batch, evaluate
         self._paces, self._doubts = dict(paces or {}), doubts_before(dataset, own_rates=schedule is None)
         self._began = generator.get_state()
+        parts = (strategy, objective.photometric, objective.terms, exposure, depths, cameras, guard)
+        rates = {} if schedule is None else {**schedule.rates, **schedule.values}
+        self._settings = plain_settings([*parts, rates])
         self._kernel = getattr(model.appearance, "kernel", None)  # of what is soft at first; None for other models
         self._background = checked_background(background)
         behind = None if self._background is None else torch.tensor([self._background])
@@ -202,7 +208,9 @@ class Trainer(Generic[M]):
             run: gets checkpoints and history.jsonl, and is gone on with if it has a checkpoint; made if it is missing.
                 None writes nothing.
             run_hash: identifies all that the result depends on; a checkpoint of another run is refused. None for one of
-                the photos, the seed, the kinds of the parts, the kernel and the background.
+                the photos, the seed, the kinds of the parts and such of their settings as are numbers or texts, rates
+                that do not change, the kernel and the background; not of the model, which a checkpoint replaces, nor of
+                functions.
 
         Returns:
             Where the run stands.
@@ -224,7 +232,8 @@ class Trainer(Generic[M]):
         with contextlib.ExitStack() as stack:
             stack.enter_context(engine_for(next(iter(self.model.parameters().values()))).looping())
             kept = stack.enter_context(kept_in(run, settings))
-            drive(self, self.progress, settings, callbacks, kept, run_hash or "")
+            going_on = partial(tell_of_going_on, run, callbacks)
+            drive(self, self.progress, settings, callbacks, kept, run_hash or "", going_on)
         return self.progress
 
     def stop(self) -> None:
@@ -435,8 +444,13 @@ class Trainer(Generic[M]):
         return self._known_loss
 
     def _hash(self) -> str:
-        parts = (self.model, self.strategy, self._objective.photometric, *self._objective.terms)
-        kinds = [*(type(part).__name__ for part in parts), self._kernel, self._background]
+        kinds = [
+            type(self.model).__name__,
+            type(self.strategy).__name__,
+            self._kernel,
+            self._background,
+            self._settings,
+        ]
         about = [self._dataset.fingerprint(), self._batch, kinds, self._objective.weights(1), self._began.tolist()]
         return hashlib.sha256(json.dumps(about).encode()).hexdigest()
 

@@ -1,7 +1,8 @@
 """What a trainer refuses before it begins, and what it makes of its arguments."""
 
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence, Set
+from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
@@ -9,8 +10,10 @@ import torch
 from torch import Tensor
 
 from etsplat.core.validation import check_kind, check_number, shown, whole_number
+from etsplat.core.workers import workers
 from etsplat.data.dataset import Dataset
 from etsplat.data.doubtful_poses import doubts
+from etsplat.io.run_directory import RunDirectory
 from etsplat.model.model import Model
 from etsplat.ops.adam import Adam
 from etsplat.optim.loop import Callback, NoteEvent
@@ -81,6 +84,20 @@ def doubts_before(dataset: Dataset, *, own_rates: bool) -> tuple[str, ...]:
     )
 
 
+def plain_settings(part: object) -> object:
+    """Of a part of a run its numbers and texts, also within collections; of all else the name of its kind."""
+    if part is None or isinstance(part, bool | int | float | str):
+        return part
+    if isinstance(part, Mapping):
+        return sorted([str(key), plain_settings(value)] for key, value in part.items())
+    if isinstance(part, Set):
+        return sorted(map(str, part))
+    if isinstance(part, list | tuple):
+        return [plain_settings(value) for value in part]
+    held = getattr(part, "__dict__", {}) if not isinstance(part, Tensor | type) and not callable(part) else {}
+    return [type(part).__name__, *([plain_settings(held)] if held else [])]
+
+
 def tell(sentences: Iterable[str], callbacks: Sequence[Callback]) -> None:
     """Tells all callbacks; where there are none, Python's warnings."""
     for sentence in sentences:
@@ -88,6 +105,27 @@ def tell(sentences: Iterable[str], callbacks: Sequence[Callback]) -> None:
             callback(NoteEvent(sentence))
         if not callbacks:
             warnings.warn(sentence, stacklevel=4)  # of who calls `fit`, which is decorated
+
+
+def tell_of_going_on(
+    run: RunDirectory | Path | str | None, callbacks: Sequence[Callback], iteration: int, iterations: int
+) -> None:
+    """Tells that a run goes on from its checkpoint; where nobody listens, if that leaves no step to make.
+
+    Args:
+        run: as handed in by the caller of `fit`; a task, which hands in a `RunDirectory`, has told by itself.
+        callbacks: who is told.
+        iteration: of the checkpoint.
+        iterations: length of the run.
+    """
+    done = iteration >= iterations
+    if isinstance(run, RunDirectory) or not workers().leads or not (callbacks or done):
+        return
+    taken = "the model becomes that of its checkpoint"
+    left = (
+        f"has {iteration:,} of {iterations:,} iterations, and none is made" if done else f"goes on after {iteration:,}"
+    )
+    tell([f"run {run}: {left}; {taken}{'; another folder begins anew' if done else ''}"], callbacks)
 
 
 def checked_background(background: Sequence[float] | Tensor | None) -> list[float] | None:

@@ -13,6 +13,7 @@ from torch import Tensor
 from etsplat.core.errors import InputError
 from etsplat.data.close_ups import close_ups, cropped_to
 from etsplat.data.dataset import Dataset
+from etsplat.data.dataset_checks import check_training_views
 from etsplat.data.demo_object import demo_object
 from etsplat.data.demo_scene import HEIGHT, WIDTH, demo_scene
 from etsplat.data.dense_cloud import FEWEST_POINTS, dense_start
@@ -80,6 +81,7 @@ def load_source(
         source.check()
         return source, _notes(source)
     if isinstance(source, Dataset):
+        check_training_views(source.train)
         close, found = (source, []) if config.refine_cameras != "off" else _closer(source, lambda width: source)
         scene, notes = _in_unit_sphere(close)
         return scene, [*found, *notes, *doubts(source)]
@@ -193,6 +195,7 @@ def load_scene(
         if folder is not None and (isinstance(source, Dataset) or str(source) == DEMO_SCENE):
             raise InputError(f"{name} {folder}: belong to {_A_FOLDER}; leave them out")
     if isinstance(source, Dataset):
+        check_training_views(source.train)
         return with_doubts(source)
     given_path("source", source, "a path, a demo's name or a Dataset")
     check_demo(source, "train")

@@ -7,6 +7,7 @@ import torch
 from etsplat.core.errors import InputError
 from etsplat.core.spelling import either, option
 from etsplat.data.dataset import Dataset
+from etsplat.data.dataset_checks import check_training_views
 from etsplat.optim.trainer_checks import USUAL_EXTENT
 from etsplat.tasks.pixel_limits import random_count, triangle_limit
 from etsplat.tasks.train_config import TrainConfig
@@ -32,8 +33,7 @@ def check_train(
         around: bytes of triangles that are drawn as well (`bytes_around`).
         streams: whether photos are decoded anew on purpose, as those of all blocks.
     """
-    if not capture.train:
-        raise InputError("capture: has no view to train on; name some in its split")
+    check_training_views(capture.train)
     masks = (capture.images.mask(view) for view in capture.train)
     if not capture.images.streamed and all(mask is not None and not bool(mask.any()) for mask in masks):
         raise InputError("masks: leave out every pixel of all training photos; they are white where pixels count")
