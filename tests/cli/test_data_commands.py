@@ -462,6 +462,37 @@ def two_walls(center, size=(480, 360), focal=330.0):
     return Image.fromarray((255 * (gray - gray.min()) / np.ptp(gray)).astype(np.uint8)).convert("RGB")
 
 
+@pytest.mark.parametrize("how", ["transparent", "folder"])
+def test_masks_that_photos_bring_along_are_in_the_scene(tmp_path, how):
+    """Be they transparent around the object, or their masks in a folder among them, which are no photos then."""
+    pytest.importorskip("pycolmap")
+    (tmp_path / "photos" / ("masks" if how == "folder" else "")).mkdir(parents=True)
+    y, x = np.mgrid[:360, :480] + 0.5
+    inside = {}
+    for index, shift in enumerate((-0.6, -0.2, 0.2, 0.6)):
+        center = (shift, 0.3 * (-1) ** index)
+        photo = two_walls(center, focal=400.0)
+        inside[f"{index}.png"] = mask = (np.abs((x - 240) * 3 / 400 + center[0]) < 1) & (
+            np.abs((y - 180) * 3 / 400 + center[1]) < 1
+        )
+        alpha = Image.fromarray(255 * mask.astype(np.uint8))
+        if how == "transparent":
+            photo.putalpha(alpha)
+        else:
+            alpha.save(tmp_path / "photos" / "masks" / f"{index}.png")
+        photo.save(tmp_path / "photos" / f"{index}.png")
+    found = find_cameras(tmp_path / "photos", tmp_path / "scene", threads=2)
+    assert found.masked
+    assert found.placed == sorted(inside)
+    capture = load_dataset(found.scene)
+    for view, name in enumerate(sorted(inside)):
+        mask = capture.images.mask(view)
+        truth = torch.from_numpy(inside[name])
+        rows, columns = min(mask.shape[0], 360), min(mask.shape[1], 480)
+        agree = (mask[:rows, :columns] >= 128) == truth[:rows, :columns]
+        assert agree.float().mean() > 0.97
+
+
 def test_photos_from_hardly_different_places_are_placed(tmp_path):
     """By a wide lens: with the focal length that is guessed, no two photos differ by 16 degrees."""
     pytest.importorskip("pycolmap")

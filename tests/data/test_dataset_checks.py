@@ -67,6 +67,8 @@ def test_poses_that_are_none_are_refused(spoil, message):
     ("changes", "message"),
     [
         ({"Ks": torch.zeros(3, 3, 3)}, r"Ks\[0\]: focal lengths"),
+        ({"Ks": torch.eye(3).expand(3, 3, 3) + torch.eye(3).roll(1, 1) / 9}, r"Ks\[0\]: .*skew is not supported"),
+        ({"Ks": 2 * torch.eye(3).expand(3, 3, 3)}, r"Ks\[0\]: must have the form"),
         ({"images": [PHOTO] * 3}, "images must be Pictures, got list"),
         ({"names": list("aba")}, "names: expected another one"),
         ({"names": None}, "names: expected a list of 3, one per viewmat, got None"),
@@ -101,11 +103,16 @@ def test_only_views_that_there_are_can_be_chosen():
 
 
 def test_no_gradients_reach_what_was_measured():
-    """A run would walk through the caller's graph once more in every step."""
+    """A run would walk through the caller's graph in every step. What rounding leaves of skew is taken out."""
     turned = (dataset().viewmats.clone().requires_grad_() * 1.0).float()
     made = dataset(viewmats=turned, Ks=dataset().Ks.clone().requires_grad_())
     assert not made.viewmats.requires_grad
     assert not made.Ks.requires_grad
+    drawn = (torch.rand(6, 8, 3, 3).requires_grad_() * 0.5)[..., 0]
+    assert not dataset(images=StoredPictures([drawn] * 3)).images[0].requires_grad
+    assert not dataset(images=etsplat.LazyPictures(lambda view: drawn, [(8, 6)] * 3)).images[0].requires_grad
+    rounded = dataset(Ks=dataset().Ks + 1e-9 * torch.eye(3).roll(1, 1))
+    assert torch.equal(rounded.Ks[:, 0, 1], torch.zeros(3, dtype=torch.float64))
 
 
 def test_a_data_set_is_moved_by_any_three_numbers():

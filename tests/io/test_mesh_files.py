@@ -53,22 +53,22 @@ def test_welded_export_keeps_connectivity_and_averages_colours_by_area(tmp_path,
     touches = (faces == 7).any(dim=1)
     expected = (colors * area[:, None])[touches].sum(0) / area[touches].sum()
     assert mesh.vertex_colors is not None
-    torch.testing.assert_close(mesh.vertex_colors[7], expected, atol=0.02 if suffix == ".glb" else 1e-5, rtol=0)
+    torch.testing.assert_close(mesh.vertex_colors[7], expected, atol=1e-3 if suffix == ".glb" else 1e-5, rtol=0)
 
 
 @pytest.mark.parametrize("suffix", [".obj", ".glb"])
 def test_split_export_has_three_vertices_per_face_in_its_exact_colour(tmp_path, ball, suffix):
     vertices, faces, colors = ball
-    bright = 0.3 + 0.7 * colors  # trimesh reads GLB colours in 8 bits of linear light, coarse where dark
-    save_mesh(tmp_path / f"a{suffix}", vertices, faces, bright, split=True)
+    dark = 0.1 * colors  # where 8 bits of linear light would be coarse
+    save_mesh(tmp_path / f"a{suffix}", vertices, faces, dark, split=True)
     mesh = load_mesh(tmp_path / f"a{suffix}")
     assert len(mesh.vertices) == 3 * len(faces)
     assert mesh.vertex_colors is not None
     torch.testing.assert_close(mesh.vertices[mesh.faces], vertices[faces], atol=1e-7, rtol=0)
     torch.testing.assert_close(
         mesh.vertex_colors[mesh.faces],
-        bright[:, None].expand(-1, 3, 3),
-        atol=0.005 if suffix == ".glb" else 1e-5,
+        dark[:, None].expand(-1, 3, 3),
+        atol=2e-4 if suffix == ".glb" else 1e-5,
         rtol=0,
     )
 
@@ -245,3 +245,14 @@ def test_colours_of_ply_by_other_names(tmp_path, names, corners):
     mesh = load_mesh(tmp_path / "a.ply")
     assert mesh.vertex_colors is not None
     assert torch.allclose(mesh.vertex_colors, torch.tensor([1.0, 0.2, 0.0]))
+
+
+def test_what_a_node_of_gltf_mirrors_keeps_its_outside(tmp_path):
+    import trimesh
+
+    scene = trimesh.Scene()
+    scene.add_geometry(trimesh.creation.icosphere(subdivisions=1), transform=np.diag([-1.0, 1.0, 2.0, 1.0]))
+    scene.export(tmp_path / "mirrored.glb")
+    mesh = load_mesh(tmp_path / "mirrored.glb")
+    volume = torch.linalg.det(mesh.vertices[mesh.faces].double()).sum() / 6
+    assert 0.8 < float(volume) / (2 * 4 / 3 * torch.pi) < 1

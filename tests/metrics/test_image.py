@@ -229,9 +229,14 @@ def test_download_fetches_into_the_cache_what_is_meant_and_nothing_else(tmp_path
     assert find_lpips_weights("download") == found  # without a network
 
 
-def test_lpips_refuses_images_too_small_for_its_five_stages(weights):
+def test_lpips_refuses_images_too_small_for_its_five_stages_and_weights_at_random(weights):
+    lpips = Lpips()
+    with pytest.raises(ValueError, match="Lpips has no weights"):
+        lpips(torch.zeros(16, 16, 3), torch.zeros(16, 16, 3))
+    lpips.load_state_dict(weights)
+    assert float(lpips(torch.zeros(16, 16, 3), torch.zeros(16, 16, 3))) == 0
     with pytest.raises(ValueError, match="at least 16 pixels"):
-        Lpips()(torch.zeros(8, 30, 3), torch.zeros(8, 30, 3))
+        lpips(torch.zeros(8, 30, 3), torch.zeros(8, 30, 3))
 
 
 def test_silhouettes_of_other_shapes_are_refused():

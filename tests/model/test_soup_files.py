@@ -51,13 +51,23 @@ def test_files_cut_anywhere_are_one_line_input_errors(tmp_path, soup, part):
 def test_missing_files_and_nan_are_input_errors(tmp_path, soup):
     with pytest.raises(InputError, match="no such file"):
         TriangleSoup.load(tmp_path / "absent.safetensors")
-    with torch.no_grad():
-        soup.sigma_raw[3] = torch.nan
-    soup.save(tmp_path / "soup.safetensors")
-    with pytest.raises(InputError, match="sigma_raw holds NaN"):
-        TriangleSoup.load(tmp_path / "soup.safetensors")
     with pytest.raises(ValueError, match="suffix"):
         soup.save(tmp_path / "soup.bin")
+    path = tmp_path / "soup.safetensors"
+    soup.save(path)
+    with safe_open(path, "pt") as opened:
+        metadata = opened.metadata()
+    with torch.no_grad():
+        soup.sigma_raw[3] = torch.nan
+    with pytest.raises(ValueError, match="sigma_raw holds NaN"):
+        soup.save(path)
+    with pytest.raises(InputError, match="source: sigma_raw of the soup holds NaN"):
+        etsplat.export(soup, tmp_path / "soup.ply")
+    save_file(soup.state(), path, metadata=metadata)
+    with pytest.raises(InputError, match="sigma_raw holds NaN"):
+        TriangleSoup.load(path)
+    with pytest.raises(InputError, match=r"is a folder; of a run take soup\.safetensors in it"):
+        etsplat.load_soup(tmp_path)
 
 
 @pytest.mark.parametrize("kernel", ["nope", 5])

@@ -73,7 +73,7 @@ def test_harmonics_of_other_colours_are_refused(given: dict[str, object]) -> Non
         ({"colors": torch.rand(3, 3)}, r"colors must have shape \(F, 3\)"),
         ({"colors": torch.rand(len(FACES), 3), "vertex_colored": True}, r"colors must have shape \(V, 3\)"),
         ({"colors": 200.0}, "colors must be from 0 to 1, got 200"),
-        ({"opacity": 1.0}, "opacity must be between 0 and 1, got 1"),
+        ({"opacity": 1.0}, "opacity must be above 0 and below 1, got 1"),
         ({"opacity": torch.ones(3)}, r"opacity must be a number, got a tensor of shape \(3,\)"),
         ({"harmonics": -1}, "harmonics must be an integer from 0 to 3, got -1"),
         ({"harmonics": 1.0}, "harmonics must be an integer from 0 to 3"),

@@ -62,7 +62,7 @@ def test_some_of_the_triangles_are_a_soup_of_the_same_kind(rng):
     ("given", "message"),
     [
         ({"opacity": torch.full((3,), 0.5)}, r"opacity must be a number, got a tensor of shape \(3,\)"),
-        ({"opacity": 1.0}, "opacity must be between 0 and 1, got 1"),
+        ({"opacity": 1.0}, "opacity must be above 0 and below 1, got 1"),
         ({"sigma": 0.01}, r"sigma must be above 0\.01 and finite, got 0\.01"),
         ({"sigma": "soft"}, "sigma must be a number, got 'soft'"),
         ({"sh_degree": 4}, "sh_degree must be an integer from 0 to 3, got 4"),

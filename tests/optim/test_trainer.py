@@ -391,5 +391,5 @@ def test_gradients_are_on_within_a_run_whatever_they_are_around_it(object_views:
         mesh.render(photos.cameras[0])
         Trainer(mesh, photos, mesh_objective()).fit(2)
     mesh.render(photos.cameras[0]).color.mean().backward()
-    with torch.inference_mode(), pytest.raises(ValueError, match="made within torch.inference_mode"):
+    with torch.inference_mode(), pytest.raises(ValueError, match=r"made within torch\.inference_mode"):
         Trainer(a_mesh(), photos, mesh_objective())

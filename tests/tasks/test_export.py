@@ -88,8 +88,10 @@ def test_a_texture_of_a_run_in_memory_is_made_of_the_data_set(tmp_path: Path) ->
     views = etsplat.photograph(etsplat.demo_object(), 24, 24, elevations=(-30.0, 30.0), azimuths=6, supersampling=1)
     etsplat.reconstruct(views, tmp_path / "run", etsplat.ReconstructConfig.tiny().changed({"iterations": 20}))
     assert etsplat.texture_mesh(tmp_path / "run", size=64, faces=100, scene=views).count <= 100
-    with pytest.raises(InputError, match="does not say what it is of, a Dataset in memory perhaps"):
+    with pytest.raises(InputError, match="does not say what it is of, a Dataset or a mesh in memory perhaps"):
         etsplat.texture_mesh(tmp_path / "run", size=64, faces=100)
+    with pytest.raises(InputError, match="size: is 66; it must be a multiple of 4"):
+        etsplat.texture_mesh(tmp_path / "run", size=66)
     with pytest.raises(InputError, match="the data set is not what the run was made of"):
         etsplat.texture_mesh(tmp_path / "run", size=64, faces=100, scene=replace(views, train=views.train[1:]))
 

@@ -133,8 +133,8 @@ def test_what_does_not_go_together_is_refused(run: Path, tmp_path: Path) -> None
         (["--lods", "1"], "lods: has an effect only with --texture"),
         (["--texture", "64", "--out", tmp_path / "none" / "ball.glb"], "create the folder first"),
         (["--out", run / "mesh.ply"], "is what is read"),
-        (["--format", "off"], r"mesh\.off: files of this kind are for soups; choose one of \.glb, \.obj, \.ply for"),
-        (["--format", "html"], r"mesh\.html: files of this kind are for soups; choose one of \.glb, \.obj"),
+        (["--format", "off"], r"exported\.off: a mesh is not written into files of this kind; choose one of \.glb"),
+        (["--format", "html"], r"exported\.html: a mesh is not written into files of this kind; choose one of"),
     ]:
         with pytest.raises(InputError, match=about):
             export(run, *words)

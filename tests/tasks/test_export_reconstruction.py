@@ -40,8 +40,20 @@ def test_it_is_scaled_and_placed_and_says_how(result: etsplat.ReconstructResult,
 def test_what_meshes_do_not_know_is_refused(result: etsplat.ReconstructResult, tmp_path: Path) -> None:
     with pytest.raises(etsplat.InputError, match="is for soups"):
         etsplat.export(result, tmp_path / "owl.glb", etsplat.ExportConfig(colors="keep"))
-    with pytest.raises(etsplat.InputError, match="files of this kind are for soups"):
+    with pytest.raises(etsplat.InputError, match="a mesh is not written into files of this kind"):
         etsplat.export(result, tmp_path / "owl.html")
+
+
+def test_a_mesh_in_memory_is_handed_in_again(tmp_path: Path) -> None:
+    """Of it +y is up, as of one in a file."""
+    mesh = etsplat.MeshFile(*etsplat.icosphere(2))
+    config = etsplat.ReconstructConfig.tiny().changed({"iterations": 20})
+    result = etsplat.reconstruct(mesh, tmp_path / "run", config)
+    upright, path = etsplat.ExportConfig(up="y"), tmp_path / "ball.glb"
+    with pytest.raises(etsplat.InputError, match=r"a mesh in memory perhaps.*hand it in again"):
+        etsplat.export(result, path, upright)
+    written = etsplat.export(result, path, upright, scene=mesh)
+    assert any("+y is up if it was in the input" in note for note in written.notes)
 
 
 def test_the_mesh_that_is_read_is_not_written_over(result: etsplat.ReconstructResult) -> None:

@@ -40,9 +40,10 @@ class Sfm(Command):
     """Place cameras one after the other; or all at once (GLOMAP)."""
     frames: int = 120
     """Of a video: how many frames are chosen; fewer where less moves."""
-    masks: Literal["none", "auto"] = "none"
-    """Auto: write masks/ of an object, for `etsplat reconstruct`, by the colours of a plain background.
-    Photos whose background is not plain are left out.
+    masks: Literal["own", "auto", "none"] = "own"
+    """Of an object, for `etsplat reconstruct`: where it is in the photos, which masks/ of the scene say then.
+    Own: as they bring it along, transparent around it or with masks/NAME.png among them; else there are none.
+    Auto: by the colours of a plain background. Photos whose background is not plain are left out.
     Shadows and what the object stands on count as object; parts that have the background's colour are lost."""
     max_size: int = 1600
     """Longer sides are shrunk to this many pixels."""
@@ -66,7 +67,9 @@ class Sfm(Command):
             )
         count = len(found.placed) + len(found.unplaced)
         cameras = f" of {found.cameras} cameras" if found.cameras > 1 else ""
-        print(f"{len(found.placed)} of {count} photos{cameras} placed, {found.points:,} points; scene in {found.scene}")
+        masks = " with their masks" if found.masked else ""
+        what = f"{len(found.placed)} of {count} photos{cameras} placed{masks}, {found.points:,} points"
+        print(f"{what}; scene in {found.scene}")
         if found.unplaced:
             shown = ", ".join(found.unplaced[:8]) + (", ..." if len(found.unplaced) > 8 else "")
             print(f"Without a place, and left out: {shown}")

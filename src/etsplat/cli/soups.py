@@ -225,9 +225,8 @@ class Export(Command):
     or a file: .safetensors, .etz, .pt of Triangle Splatting, Gaussian .ply, or a mesh."""
     format: Annotated[Kind, tyro.conf.arg(help=_FORMAT)] = None
     out: Path | None = None
-    """The file to write; by default soup.FORMAT in the run's folder;
-    of a reconstruction textured.FORMAT, or light.FORMAT with --faces alone;
-    with neither --texture nor --faces mesh.FORMAT, in the place of the one that the run wrote."""
+    """The file to write; by default soup.FORMAT in the run's folder, or exported.safetensors;
+    of a reconstruction textured.FORMAT, light.FORMAT with --faces alone, exported.FORMAT with neither."""
     scene: Path | None = None
     """The capture's folder, if it has moved or a file is given: for colours as the cameras saw them, and for up."""
     device: Device | None = None
@@ -252,7 +251,7 @@ class Export(Command):
                 raise InputError(f"--{name}: is for runs of `etsplat reconstruct`; leave it out for soups")
         crop = _crop(self.crop)
         opened = open_run(self.run_dir, self.scene, self.device)
-        out = self._out(opened.folder, "soup")
+        out = self._out(opened.folder, "exported" if self.format == "safetensors" else "soup")  # which a run's is
         check_not_read(out, self.run_dir, "--out ")
         written = export_soup(opened, out, self.settings, crop)
         sky = f", {written.sky:,} of them in the object sky" if written.sky else ""
@@ -284,7 +283,7 @@ class Export(Command):
 
         if self.crop is not None:
             raise InputError("--crop: is for soups; leave it out for the mesh of a reconstruction")
-        name = "textured" if self.settings.texture else "light" if self.settings.faces else "mesh"
+        name = "textured" if self.settings.texture else "light" if self.settings.faces else "exported"
         out = self._out(self.run_dir, name)
         check_not_read(out, self.run_dir, "--out ")
         notes: list[str] = []

@@ -311,7 +311,7 @@ def check_open_unit(name: str, value: float) -> None:
     """Raise ValueError unless ``value`` is a number between 0 and 1, as what passes through a sigmoid."""
     check_number(name, value)
     if not 0 < value < 1:
-        raise ValueError(f"{name} must be between 0 and 1, got {value:g}")
+        raise ValueError(f"{name} must be above 0 and below 1, got {value:g}")
 
 
 def check_written(name: str, tensor: Tensor) -> None:

@@ -42,6 +42,9 @@ class Normalization:
         center: (3,) in input units.
         radius: > 0, in input units.
 
+    Raises:
+        ValueError: they are no such point and number.
+
     Example:
         >>> frame = etsplat.Normalization(torch.tensor([1.0, 0.0, 0.0]), radius=2.0)
         >>> frame.invert(frame.apply(torch.tensor([[3.0, 0.0, 0.0]]))).tolist()
@@ -50,6 +53,10 @@ class Normalization:
 
     center: Float[Tensor, "3"] = field(default_factory=lambda: torch.zeros(3, dtype=torch.float64))
     radius: float = 1.0
+
+    def __post_init__(self) -> None:
+        check_above("radius", self.radius)
+        object.__setattr__(self, "center", checked_point("center", self.center))
 
     def apply(self, points: Float[Tensor, "*N 3"]) -> Float[Tensor, "*N 3"]:
         """Input units to the frame."""

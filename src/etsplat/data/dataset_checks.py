@@ -28,7 +28,7 @@ _INDICES_OF_FLAGS = ": of a mask of all views pass the indices, torch.tensor(mas
 
 
 def checked_pixels(name: str, pixels: Any) -> Tensor:
-    """A photo as it is.
+    """A photo as it is, without the graph of what it may have been drawn by.
 
     Raises:
         ValueError: it is no (H, W, 3 or 4) tensor of bytes or of finite float32 in [0, 1].
@@ -37,10 +37,10 @@ def checked_pixels(name: str, pixels: Any) -> Tensor:
     if pixels.dtype not in (torch.uint8, torch.float32):
         raise ValueError(f"{name} must be uint8 or float32, got {pixels.dtype}")
     if pixels.dtype == torch.float32 and pixels.numel():
-        low, high = (float(value) for value in torch.aminmax(pixels))
+        low, high = (float(value) for value in torch.aminmax(pixels.detach()))
         if not (low >= -_BRIGHTEST and high <= _BRIGHTEST):  # NaN is neither
             raise ValueError(f"{name} must be in [0, 1], got {low:.4g} to {high:.4g}: bytes are uint8")
-    return pixels
+    return pixels.detach()
 
 
 def is_straight(pixels: Tensor) -> bool:

@@ -2,13 +2,14 @@
 
 import os
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Literal
 
 from etsplat.core.errors import InputError
+from etsplat.data.frames import MASK_FOLDER
 from etsplat.io.images import IMAGE_SUFFIXES, load_rgb
 from etsplat.io.paths import kind_of, path_remedy
 from etsplat.io.photos import PHOTO_SUFFIXES, UNREAD_SUFFIXES, PhotoFile, file_remedy, inspect_photo, write_upright
@@ -36,17 +37,20 @@ class Photo:
 
 
 def list_photos(folder: Path) -> list[Photo]:
-    """The photos in a folder and its subfolders, in order of their names; what is hidden is left alone.
+    """The photos in a folder and its subfolders, in order of their names; what is hidden is left alone, and masks.
 
     Raises:
         InputError: no such folder; fewer than three photos; one cannot be opened; two would have one name.
     """
+    if folder.is_file() and kind_of(folder) in PHOTO_SUFFIXES:
+        raise InputError(f"photos {folder}: is one photo; name the folder that has all of them")
     if folder.is_file():
         raise InputError(f"photos {folder}: {file_remedy(folder) or 'is a file; name the folder of the photos'}")
     if not folder.is_dir():
         raise InputError(f"photos {folder}: no such file or folder; {path_remedy(folder)}")
     paths = sorted(path for path in folder.rglob("*") if kind_of(path) in PHOTO_SUFFIXES and path.is_file())
     shown = [path for path in paths if not any(part.startswith(".") for part in path.relative_to(folder).parts)]
+    shown = _without_masks(shown, folder)
     if len(shown) < LEAST_COUNT:
         unread = unread_pictures(folder)
         others = (
@@ -65,6 +69,18 @@ def list_photos(folder: Path) -> list[Photo]:
             )
         photos[name] = Photo(path, name, inspect_photo(path))
     return list(photos.values())
+
+
+def _without_masks(paths: list[Path], folder: Path) -> list[Path]:
+    """All but those in `masks/`, if one of them is called as a photo is."""
+    others = [path for path in paths if not path.is_relative_to(folder / MASK_FOLDER)]
+    return others if brings_masks(folder, others) else paths
+
+
+def brings_masks(folder: Path, photos: Iterable[Path]) -> bool:
+    """Whether a folder of photos has `masks/` with a picture that is called as one of them is."""
+    names = {name for path in photos for name in (path.name, path.stem)}
+    return any(path.stem in names for path in (folder / MASK_FOLDER).rglob("*") if kind_of(path) in IMAGE_SUFFIXES)
 
 
 def unread_pictures(folder: Path) -> list[str]:

@@ -1,21 +1,26 @@
-"""Masks for photos of an object in front of a plain background."""
+"""Masks for photos of an object: made of a plain background, or brought along."""
 
 import os
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path, PurePosixPath
 
 import numpy as np
+import torch
 from PIL import Image
 
 from etsplat.core.errors import InputError
-from etsplat.data.frames import Wanted
+from etsplat.data.frames import MASK_FOLDER, Wanted, find_mask
 from etsplat.data.load import format_of
+from etsplat.data.photo_intake import brings_masks
 from etsplat.data.plain_backgrounds import WORK_SIZE, find_object
 from etsplat.data.scene_files import name_below
 from etsplat.data.undistortion import check_output
 from etsplat.io.atomic import write_error
-from etsplat.io.images import encode_png, image_size, load_pixels
+from etsplat.io.images import encode_png, image_size, is_transparent, load_mask, load_pixels, save_image
 from etsplat.io.locks import scratch_folder
+from etsplat.io.paths import kind_of
 
 LEAST_SHARE = 0.5
 """Of the photos must have a plain background: else the few that seem to have one seem so by chance."""
@@ -57,6 +62,49 @@ def mask_capture(
     except OSError as error:
         raise write_error(out, error) from error
     return len(photos) - len(refused), refused
+
+
+def write_own_masks(
+    photos: Mapping[str, Path], sizes: Mapping[str, tuple[int, int]], source: Path, folder: Path
+) -> bool:
+    """Writes the masks that photos bring along: pictures in `masks/` among them, or where they are transparent.
+
+    Args:
+        photos: the files by name.
+        sizes: (width, height) of each, upright.
+        source: folder of the photos.
+        folder: for the masks, see `mask_file`.
+
+    Returns:
+        Whether there are any.
+
+    Raises:
+        InputError: `masks/` lacks one; one is damaged, or of another shape than its photo.
+    """
+    if brings_masks(source, photos.values()):
+        given = source / MASK_FOLDER
+        found: dict[str, Path | None] = {name: _mask_in(given, name, path) for name, path in photos.items()}
+    else:
+        with ThreadPoolExecutor() as pool:
+            transparent = pool.map(lambda path: kind_of(path) == ".png" and is_transparent(path), photos.values())
+            found = {
+                name: path if clear else None for (name, path), clear in zip(photos.items(), transparent, strict=True)
+            }
+    if not any(found.values()):
+        return False
+    for name, path in found.items():
+        target, (width, height) = mask_file(folder, name), sizes[name]
+        target.parent.mkdir(parents=True, exist_ok=True)
+        mask = torch.ones(height, width) if path is None else load_mask(path, (width, height))
+        save_image(target, mask[..., None])
+    return True
+
+
+def _mask_in(folder: Path, name: str, photo: Path) -> Path:
+    """By the name with folders, or its last part, as readers of scenes look for it."""
+    with suppress(InputError):
+        return find_mask(folder, name, photo)
+    return find_mask(folder, PurePosixPath(name).name, photo)
 
 
 def write_masks(photos: Mapping[str, Path], folder: Path, report: Callable[[str, int, int], None]) -> dict[str, str]:

@@ -277,6 +277,7 @@ class LazyPictures(Pictures):
         if tuple(pixels.shape[:2]) != (height, width):
             got = tuple(pixels.shape)
             raise ValueError(f"{name} must have {width} x {height} pixels, as `sizes` says, got shape {got}")
+        picture = replace(picture, pixels=pixels)
         if picture.mask is None or picture.mask.dtype == torch.uint8:  # bytes as files have them need no look
             return picture
         return replace(picture, mask=checked_mask(f"the mask of {name}", picture.mask, pixels))

@@ -2,13 +2,14 @@
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import torch
 
 from etsplat.core.errors import InputError
+from etsplat.core.validation import check_choice
 from etsplat.data.colmap_process import Job, Mapper, Progress, import_pycolmap, place_photos, run_apart
 from etsplat.data.gps_alignment import MapFit, fit_to_map
 from etsplat.data.photo_intake import (
@@ -20,7 +21,7 @@ from etsplat.data.photo_intake import (
     take_in,
     unread_pictures,
 )
-from etsplat.data.photo_masks import mask_file, write_masks
+from etsplat.data.photo_masks import mask_file, write_masks, write_own_masks
 from etsplat.data.undistortion import (
     check_output,
     check_size,
@@ -36,7 +37,8 @@ from etsplat.io.paths import kind_of
 from etsplat.io.photos import ARCHIVE_SUFFIXES, PHOTO_SUFFIXES
 
 Matching = Literal["auto", "exhaustive", "sequential"]
-Masks = Literal["none", "auto"]
+Masks = Literal["own", "auto", "none"]
+"""Those that photos bring along; those that are made of a plain background; none."""
 
 EXHAUSTIVE_UP_TO = 120
 """With matching "auto", every pair of so many photos is compared; of more, only those near in order of names."""
@@ -63,6 +65,7 @@ class Placement:
         on_map: where the photos say that they were taken; None where too few of them say it. Where it is believed the
             scene has z up and a georeference.json.
         unread: names of pictures in the folder of kinds that are not read.
+        masked: whether the scene has masks.
     """
 
     scene: Path
@@ -73,6 +76,7 @@ class Placement:
     unmasked: dict[str, str]
     on_map: MapFit | None = None
     unread: Sequence[str] = ()
+    masked: bool = False
 
 
 def find_cameras(
@@ -83,7 +87,7 @@ def find_cameras(
     cameras: CameraSharing = "auto",
     mapper: Mapper = "incremental",
     frames: int = 120,
-    masks: Masks = "none",
+    masks: Masks = "own",
     max_size: int = 1600,
     threads: int | None = None,
     progress: Progress | None = None,
@@ -97,8 +101,11 @@ def find_cameras(
         matching: which photos are compared with each other.
         cameras: which photos have one camera and lens setting.
         mapper: place one camera after the other, or all at once.
-        masks: "auto" writes `masks/` of an object in front of a plain background; photos whose background is not plain
-            are left out. Cameras are then found by the object alone, which may turn in front of the background.
+        masks: "own" takes what photos bring along: pictures in the folder's `masks/`, called as the photos are, or that
+            photos are transparent in places. "auto" makes masks of an object in front of a plain background; photos
+            whose background is not plain are left out. "none" takes none. Where there are any, cameras are found by the
+            object alone, which may turn in front of the background; by all of photos with masks of their own if there
+            is too little on it. The scene has them in `masks/`.
         frames: of a video, so many are chosen by sharpness and motion, fewer where less moves.
         max_size: longer sides are shrunk to this many pixels, for finding features and in the scene.
         threads: None for all cores.
@@ -113,6 +120,7 @@ def find_cameras(
     is_video = source.is_file() and kind_of(source) not in (*PHOTO_SUFFIXES, *ARCHIVE_SUFFIXES)
     check_size(max_size)
     check_output(out, (FRAMES,) if is_video else ())
+    check_choice("masks", masks, get_args(Masks))
     if out.resolve().is_relative_to(source.resolve()):
         raise InputError(
             f"{out}: lies in the folder of the photos, whose subfolders are read too; choose another folder"
@@ -126,9 +134,12 @@ def find_cameras(
         upright = work / "photos"
         take_in(found, upright, threads, report)
         names = [photo.name for photo in found]
-        unmasked = (
-            write_masks({name: upright / name for name in names}, work / "masks", report) if masks == "auto" else {}
-        )
+        copies, unmasked, own = {name: upright / name for name in names}, dict[str, str](), False
+        if masks == "auto":
+            unmasked = write_masks(copies, work / "masks", report)
+        elif masks == "own":
+            originals, sizes = {each.name: each.path for each in found}, {each.name: each.file.size for each in found}
+            own = write_own_masks(originals, sizes, source, work / "masks")
         found = [photo for photo in found if photo.name not in unmasked]
         names = [photo.name for photo in found]
         job = Job(
@@ -139,17 +150,20 @@ def find_cameras(
             mapper=mapper,
             max_size=max_size,
             threads=threads or -1,
-            masks=work / "masks" if masks == "auto" else None,
+            masks=work / "masks" if masks == "auto" or own else None,
         )
-        folder = run_apart(place_photos, job, report=report)
-        model = pycolmap.Reconstruction() if folder is None else pycolmap.Reconstruction(folder)
-        images = [image for image in model.images.values() if image.has_pose]
+        least = max(LEAST_COUNT, LEAST_SHARE * len(names))
+        model = _placed_model(pycolmap, job, report)
+        if own and len(_placed(model)) < least:  # little is on the object
+            (work / "all").mkdir()
+            model = _placed_model(pycolmap, replace(job, work=work / "all", masks=None), report)
+        images = _placed(model)
         placed = sorted(image.name for image in images)
-        if len(placed) < max(LEAST_COUNT, LEAST_SHARE * len(names)):
+        if len(placed) < least:
             raise InputError(_too_few(source, len(placed), len(names)))
         on_map = _put_on_map(pycolmap, model, found)
         undistort_model(model, upright, placed, work, max_size, report)
-        if masks == "auto":
+        if job.masks is not None:
             undistort_masks(model, {name: mask_file(work / "masks", name) for name in placed}, work, max_size)
         if on_map is not None and on_map[1] is not None:
             on_map[1].write(work / "scene")
@@ -163,7 +177,17 @@ def find_cameras(
         unmasked,
         None if on_map is None else on_map[0],
         unread_pictures(source),
+        job.masks is not None,
     )
+
+
+def _placed_model(pycolmap: Any, job: Job, report: Progress) -> Any:
+    folder = run_apart(place_photos, job, report=report)
+    return pycolmap.Reconstruction() if folder is None else pycolmap.Reconstruction(folder)
+
+
+def _placed(model: Any) -> list[Any]:
+    return [image for image in model.images.values() if image.has_pose]
 
 
 def _put_on_map(pycolmap: Any, model: Any, photos: list[Photo]) -> tuple[MapFit, Georeference | None] | None:

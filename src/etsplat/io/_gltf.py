@@ -120,6 +120,19 @@ def refuse_unread(path: Path, document: dict[str, Any]) -> None:
         )
 
 
+COLOR = "_ETSPLAT_COLOR"
+"""Attribute of vertices whose colours are kept as they are; of those of the usual name trimesh makes 8 bits."""
+
+
+def keep_colors(document: dict[str, Any]) -> bool:
+    """Give colours of vertices a name under which their numbers are read; whether there are any."""
+    attributes = [each["attributes"] for mesh in document.get("meshes", []) for each in mesh["primitives"]]
+    colored = [each for each in attributes if "COLOR_0" in each]
+    for each in colored:
+        each[COLOR] = each["COLOR_0"]
+    return bool(colored)
+
+
 def unmoved_note(path: Path, document: dict[str, Any]) -> list[str]:
     """A note on what would move vertices, and is left out; nothing without."""
     meshes = [primitive for mesh in document.get("meshes", []) for primitive in mesh["primitives"]]

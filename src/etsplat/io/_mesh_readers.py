@@ -12,7 +12,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from etsplat.core.errors import InputError
-from etsplat.io._gltf import check_gltf, is_compressed, join_gltf, refuse_unread, split_gltf, unmoved_note, unpack
+from etsplat.io._gltf import (
+    COLOR,
+    check_gltf,
+    is_compressed,
+    join_gltf,
+    keep_colors,
+    refuse_unread,
+    split_gltf,
+    unmoved_note,
+    unpack,
+)
 from etsplat.io._materials import GltfMaterials, obj_texture, ply_texture
 from etsplat.io._ply_polygons import with_triangles
 from etsplat.io._polygons import cut_concave
@@ -242,11 +252,12 @@ def read_gltf(path: Path) -> RawMesh:
         changed = unpack(path, document, binary)
         if materials.wanted:
             materials.mark()
-        if changed or materials.wanted:
+        changed = keep_colors(document) or materials.wanted or changed
+        if changed:
             data = join_gltf(data, document)
     except Exception as error:
         raise _unreadable(path, error) from error
-    mesh = _read_with_trimesh(path, data if changed or materials.wanted else None, materials)
+    mesh = _read_with_trimesh(path, data if changed else None, materials)
     if mesh.vertex_colors is not None:
         mesh.vertex_colors = srgb_from_linear(mesh.vertex_colors)
     mesh.notes = [*mesh.notes, *unmoved]
@@ -339,14 +350,22 @@ def _placed(scene: "trimesh.Scene", node: str) -> RawMesh:
     vertices = trimesh.transform_points(geometry.vertices, transform)
     if not isinstance(geometry, trimesh.Trimesh):
         return RawMesh(vertices, np.zeros((0, 3), dtype=np.int64))
-    mesh, visual = RawMesh(vertices, np.asarray(geometry.faces)), geometry.visual
+    faces = np.asarray(geometry.faces)
+    if np.linalg.det(transform[:3, :3]) < 0:  # mirrored, as glTF has it: what was anticlockwise from outside still is
+        faces = faces[:, ::-1]
+    mesh, visual = RawMesh(vertices, faces), geometry.visual
     if isinstance(visual, ColorVisuals):  # and no texture
         mesh.face_colors = visual.face_colors[:, :3] / 255 if visual.kind == "face" else _ply_face_colors(geometry)
         if visual.kind == "vertex" and mesh.face_colors is None:
-            mesh.vertex_colors = visual.vertex_colors[:, :3] / 255
+            mesh.vertex_colors = _fractions(geometry.vertex_attributes.get(COLOR, visual.vertex_colors))[:, :3]
     if mesh.face_colors is not None and len(mesh.face_colors) != len(mesh.faces):
         raise ValueError(f"colours of {len(mesh.face_colors)} faces for {len(mesh.faces)}")
     return mesh
+
+
+def _fractions(colors: np.ndarray) -> np.ndarray:
+    """Of whole numbers, which count from 0 to the highest that there is."""
+    return colors / np.iinfo(colors.dtype).max if colors.dtype.kind == "u" else colors.astype(np.float64)
 
 
 def _ply_face_colors(mesh: "trimesh.Trimesh") -> np.ndarray | None:

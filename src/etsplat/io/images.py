@@ -114,6 +114,14 @@ def load_rgb(path: Path | str) -> Image.Image:
         return decoded_as(image, path, "RGB")
 
 
+def is_transparent(path: Path | str) -> bool:
+    """Whether an image is not opaque all over. Raises InputError as `load_rgb`."""
+    with open_image(path) as image:
+        if not (image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info):
+            return False
+        return bool((np.asarray(decoded_as(image, path, "RGBA"))[..., 3] < 255).any())
+
+
 def load_image(path: Path | str, shape: tuple[int, int] | None = None) -> Float[Tensor, "H W C"]:
     """Read an image: straight (not premultiplied) colours.
 

@@ -9,6 +9,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -176,10 +177,9 @@ class Lpips(nn.Module):
     IMAGENET1K_V1) and `lin{0..4}.model.1.weight`, (1, C, 1, 1) with C = 64, 128, 256, 512, 512 (LPIPS v0.1's vgg.pth).
 
     Example:
-        >>> lpips = etsplat.Lpips()  # at random; Lpips.from_weights("lpips_vgg16.pth") has what was learned
-        >>> picture = torch.rand(16, 16, 3)
-        >>> float(lpips(picture, picture))
-        0.0
+        >>> entries = etsplat.Lpips().state_dict()  # Lpips.from_weights("lpips_vgg16.pth") has what was learned
+        >>> len(entries), entries["lin4.model.1.weight"].shape
+        (31, torch.Size([1, 512, 1, 1]))
     """
 
     def __init__(self) -> None:
@@ -198,6 +198,11 @@ class Lpips(nn.Module):
             linear = nn.ModuleDict({"model": nn.Sequential(nn.Identity(), nn.Conv2d(width, 1, 1, bias=False))})
             self.add_module(f"lin{index}", linear)
         self.requires_grad_(False)
+        self._learned = False
+
+    def _load_from_state_dict(self, *arguments: Any, **named: Any) -> None:
+        super()._load_from_state_dict(*arguments, **named)
+        self._learned = True
 
     @staticmethod
     def from_weights(*paths: Path | str) -> "Lpips":
@@ -244,8 +249,11 @@ class Lpips(nn.Module):
                 2DGS and Triangle Splatting ("lpips_3dgs"); its values are not comparable with the former.
 
         Raises:
-            ValueError: shapes differ, are not (H, W, 3), or are below 16 pixels a side.
+            ValueError: shapes differ, are not (H, W, 3), or are below 16 pixels a side; no weights were loaded, and
+                those at random say nothing.
         """
+        if not self._learned:
+            raise ValueError("Lpips has no weights: take Lpips.from_weights(FILE), or load_state_dict what was learned")
         _check_pair(image, truth)
         if image.shape[-1] != 3 or min(image.shape[:2]) < 16:
             raise ValueError(f"image: expected shape (H, W, 3) of at least 16 pixels a side, got {tuple(image.shape)}")

@@ -67,6 +67,8 @@ def load_soup(path: Path | str, tell: Callable[[str], None] = lambda text: None)
         True
     """
     path = given_path("path", path)
+    if path.is_dir():
+        raise InputError(f"soup {path}: is a folder; of a run take soup.safetensors in it")
     if not path.is_file():
         raise InputError(f"soup {path}: no such file; check the path")
     if kind_of(path) not in _KINDS:

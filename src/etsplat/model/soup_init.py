@@ -10,7 +10,7 @@ from torch import Tensor
 
 from etsplat.core.precision import usual_defaults
 from etsplat.core.short_repr import short_repr
-from etsplat.core.validation import check_above
+from etsplat.core.validation import check_above, check_finite, check_kind, check_shape
 from etsplat.model.triangle_soup import TriangleSoup
 
 NEIGHBOURS = 3
@@ -29,6 +29,9 @@ class StartPoints:
         positions: (P, 3).
         colors: (P, 3) in [0, 1].
 
+    Raises:
+        ValueError: they are no such tensors, or not finite.
+
     Example:
         >>> points = etsplat.StartPoints(torch.rand(100, 3), torch.full((100, 3), 0.5))
         >>> soup = etsplat.start_soup(points, torch.Generator(), scale=1.0, opacity=0.3, sigma=1.0, sh_degree=0)
@@ -40,6 +43,11 @@ class StartPoints:
 
     positions: Float[Tensor, "P 3"]
     colors: Float[Tensor, "P 3"]
+
+    def __post_init__(self) -> None:
+        check_shape("positions", self.positions, ("P", 3))
+        check_shape("colors", self.colors, (len(self.positions), 3))
+        check_finite("positions", self.positions)
 
     def __len__(self) -> int:
         return len(self.positions)
@@ -137,6 +145,7 @@ def start_soup(
         50
     """
     check_above("scale", scale)
+    check_kind("generator", generator, torch.Generator)
     count = len(points)
     radius = scale * spacing(points.positions)
     if limit is not None and centers is not None and count:

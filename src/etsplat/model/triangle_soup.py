@@ -16,7 +16,15 @@ from etsplat.core.errors import InputError
 from etsplat.core.harmonics import MAX_DEGREE, SH_CONSTANT
 from etsplat.core.rasterization import SOUP_SIGMA_FLOOR, Rasterization, joined
 from etsplat.core.short_repr import short_repr
-from etsplat.core.validation import check_above, check_count, check_floating, check_open_unit, check_shape
+from etsplat.core.validation import (
+    check_above,
+    check_count,
+    check_floating,
+    check_kind,
+    check_open_unit,
+    check_shape,
+    first_not_finite,
+)
 from etsplat.io.kernel_files import adopt_kernel, kernel_tensors
 from etsplat.io.paths import given_path, kind_of
 from etsplat.io.tensors import read_tensors, save_tensors
@@ -189,10 +197,14 @@ class TriangleSoup(Model):
         """Write parameters, appearance and notes, and the table of a kernel from Python, atomically.
 
         Raises:
-            ValueError: `path` does not end in .safetensors.
+            ValueError: `path` does not end in .safetensors; a parameter holds NaN or infinity.
             InputError: the file cannot be written.
         """
         path = given_path("path", path)
+        if (bad := first_not_finite(self.parameters())) is not None:
+            raise ValueError(
+                f"{bad} holds NaN or infinity: a soup that is read must be finite; torch.save keeps state()"
+            )
         if kind_of(path) != ".safetensors":
             raise ValueError(
                 f"path: expected the suffix .safetensors, got {path.name}; etsplat.export writes files of other kinds"
@@ -212,8 +224,16 @@ class TriangleSoup(Model):
 
     @torch.no_grad()
     def joined(self, other: "TriangleSoup") -> "TriangleSoup":
-        """The triangles of both, in new learnable tensors."""
+        """The triangles of both, in new learnable tensors.
+
+        Raises:
+            ValueError: the other is no soup; colours of another degree.
+        """
+        check_kind("other", other, TriangleSoup)
         theirs = other.parameters()
+        if other.sh_rest.shape[1:] != self.sh_rest.shape[1:]:
+            degrees = f"{1 + other.sh_rest.shape[1]} harmonics instead of {1 + self.sh_rest.shape[1]}"
+            raise ValueError(f"other must have colours of the same degree, got {degrees}")
         both = {name: torch.cat([mine, theirs[name]]) for name, mine in self.parameters().items()}
         return replace(self, **both).learnable()
 

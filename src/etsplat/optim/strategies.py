@@ -418,7 +418,7 @@ class DensifyAndPrune(Strategy):
             dead &= ~(self.spared(self.model.vertices) & (self.statistics.screen_size == 0))
         if bool(dead.all()):
             raise DivergedError(
-                f"no triangle is left at iteration {iteration}; lower lambda_opacity or prune_importance"
+                f"no triangle is left at iteration {iteration}; lower loss.lambda_opacity and pruning.importance"
             )
         return dead
 

@@ -6,6 +6,7 @@ import torch
 
 from etsplat.core.errors import InputError
 from etsplat.core.precision import usual_defaults
+from etsplat.core.validation import first_not_finite
 from etsplat.data.dataset import Dataset
 from etsplat.io.mesh_files import MeshFile
 from etsplat.io.paths import given_path
@@ -16,6 +17,7 @@ from etsplat.tasks.export_mesh import checked_for_meshes, is_reconstruction, wri
 from etsplat.tasks.export_soup import Export, export_soup
 from etsplat.tasks.opened_runs import SoupRun, capture_at, check_not_read, open_run
 from etsplat.tasks.reconstruct import ReconstructResult
+from etsplat.tasks.sources import Source
 from etsplat.tasks.train import TrainResult
 
 
@@ -25,7 +27,7 @@ def export(
     path: str | Path,
     config: ExportConfig | None = None,
     *,
-    scene: Dataset | str | Path | None = None,
+    scene: Source | None = None,
 ) -> Export:
     """Writes the triangles of a scene or an object as a file for other programs, as `etsplat export` does.
 
@@ -35,8 +37,9 @@ def export(
             result of `reconstruct`, or its folder: a mesh, for glb, obj and ply.
         path: of the file; its suffix chooses the kind: glb, obj, ply, off, safetensors, etz, html.
         config: what is written, and how; None for the defaults.
-        scene: the capture, or its folder, by which colours are baked and what nobody sees is left out; None for what
-            the run says of it. A run of a `Dataset` in memory does not say.
+        scene: the capture, or its folder, by which colours are baked and what nobody sees is left out; of a
+            reconstruction its source. None for what the run says of it: one of a `Dataset` or `MeshFile` in memory does
+            not say.
 
     Returns:
         What was written: `path`, `triangles`, what was `removed`, `transform`, from the capture's units and axes to
@@ -65,7 +68,9 @@ def export(
         raise InputError(f"source: is of type {type(source).__name__}, and no soup; {how} writes a mesh as it is")
     if isinstance(source, TriangleSoup):
         soup = source.finished().to(torch.device("cpu"))
-        return export_soup(SoupRun(path.parent, soup, capture_at(scene)), path, config)
+        if (bad := first_not_finite(soup.parameters())) is not None:
+            raise InputError(f"source: {bad} of the soup holds NaN or infinity, which no program reads")
+        return export_soup(SoupRun(Path("source"), soup, capture_at(_of_photos(scene))), path, config)
     found = given_path(
         "source",
         source.path if isinstance(source, TrainResult | ReconstructResult) else source,
@@ -74,10 +79,18 @@ def export(
     check_not_read(path, found)
     if is_reconstruction(found):
         return _export_mesh(found, path, config, scene)
+    scene = _of_photos(scene)
     return export_soup(open_run(found, scene, "cpu"), path, config)
 
 
-def _export_mesh(run: Path, path: Path, config: ExportConfig, scene: Dataset | str | Path | None) -> Export:
+def _of_photos(scene: Source | None) -> Dataset | str | Path | None:
+    """Raises InputError where it is a mesh, of which only reconstructions are."""
+    if scene is None or isinstance(scene, Dataset):
+        return scene
+    return given_path("scene", scene, "a Dataset or a path")
+
+
+def _export_mesh(run: Path, path: Path, config: ExportConfig, scene: Source | None) -> Export:
     notes: list[str] = []
     faces, transform = write_mesh(run, path, checked_for_meshes(path, config), scene, notes.append)
     return Export(path, faces, 0, {}, transform, tuple(notes))

@@ -98,6 +98,6 @@ class ExportConfig(Settings):
         return None
 
 
-def texture_problem(size: int | None) -> str | None:
+def texture_problem(size: int | None, name: str = "texture") -> str | None:
     """What is wrong with a texture of so many texels along each side, which is halved twice; None for none."""
-    return f"texture: is {size}; it must be a multiple of 4" if size is not None and size % 4 else None
+    return f"{name}: is {size}; it must be a multiple of 4" if size is not None and size % 4 else None

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from etsplat.core.errors import InputError
 from etsplat.core.precision import usual_defaults
-from etsplat.core.spelling import file_kind, option
+from etsplat.core.spelling import either, file_kind, option
 from etsplat.data.dataset import Dataset
 from etsplat.data.where_up import told_up, up_of
 from etsplat.engines.choice import resolve_device
@@ -27,7 +27,7 @@ from etsplat.io.run_directory import RunDirectory, is_run
 from etsplat.io.writers import suffixes
 from etsplat.model.textured_mesh import TexturedMesh
 from etsplat.tasks.demos import DEMO_OBJECT
-from etsplat.tasks.export_config import LIGHT_FACES, ExportConfig
+from etsplat.tasks.export_config import LIGHT_FACES, ExportConfig, texture_problem
 from etsplat.tasks.normal_map import normal_map_of
 from etsplat.tasks.opened_runs import capture_at, read_record
 from etsplat.tasks.placing import apart_from_world, check_placed, leave_unplaced, placed_record, placement
@@ -35,7 +35,7 @@ from etsplat.tasks.reconstruct_config import Pictures, ReconstructConfig
 from etsplat.tasks.refined_cameras import refined_capture
 from etsplat.tasks.running import Result
 from etsplat.tasks.settings import settings_of
-from etsplat.tasks.sources import directions_digest, fingerprint, load_source, make_subject
+from etsplat.tasks.sources import Source, directions_digest, fingerprint, load_source, make_subject
 from etsplat.tasks.texturing import Tell, check_installed, coarser, colors_at, texture_object
 
 Note = Callable[[str], None]
@@ -104,7 +104,7 @@ def is_reconstruction(path: Path) -> bool:
 
 def open_reconstruction(
     path: Path | str,
-    scene: Dataset | Path | str | None = None,
+    scene: Source | None = None,
     device: str | None = None,
     tell: Tell = lambda phase, done, total: None,
 ) -> Reconstruction:
@@ -151,7 +151,7 @@ def texture_mesh(
     *,
     size: int = 2048,
     faces: int = LIGHT_FACES,
-    scene: Dataset | Path | str | None = None,
+    scene: Source | None = None,
     device: str | None = None,
     seed: int = 0,
     tell: Tell = lambda phase, done, total: None,
@@ -181,6 +181,8 @@ def texture_mesh(
         (torch.Size([64, 64, 3]), True)
         >>> asset.save("owl.glb")
     """
+    if problem := texture_problem(size, "size"):
+        raise InputError(problem)
     ExportConfig(texture=size, faces=faces)
     check_installed()
     path = given_path("run", run.path if isinstance(run, Result) else run, "a result of reconstruct or a path")
@@ -224,12 +226,10 @@ def checked_for_meshes(path: Path, config: ExportConfig) -> ExportConfig:
     return config
 
 
-def write_mesh(
-    run: Path, path: Path, config: ExportConfig, scene: Dataset | Path | str | None, note: Note
-) -> tuple[int, Similarity]:
+def write_mesh(run: Path, path: Path, config: ExportConfig, scene: Source | None, note: Note) -> tuple[int, Similarity]:
     """`export_mesh` without a texture: how many faces, and the way from the input's units and axes to the file's."""
     if kind_of(path) not in (kinds := suffixes("vertex_colors")):
-        raise InputError(f"{path}: files of this kind are for soups; choose one of {', '.join(kinds)} for a mesh")
+        raise InputError(f"{path}: a mesh is not written into files of this kind; choose one of {', '.join(kinds)}")
     mesh = load_mesh(_mesh_of(RunDirectory(run)))
     if config.faces is not None and config.faces < len(mesh.faces):
         vertices, faces = decimated(mesh.vertices, mesh.faces, config.faces)
@@ -301,7 +301,7 @@ def check_stored(path: Path, config: ExportConfig) -> None:
 def _placement(
     run: RunDirectory,
     config: ExportConfig,
-    scene: Dataset | Path | str | None,
+    scene: Source | None,
     vertices: Float[Tensor, "V 3"],
     note: Note,
 ) -> tuple[Similarity, Similarity, Georeference | None, dict[str, Any]]:
@@ -319,13 +319,15 @@ def _placement(
 
 
 def _up(
-    run: RunDirectory, scene: Dataset | Path | str | None, georeference: Georeference | None, note: Note
+    run: RunDirectory, scene: Source | None, georeference: Georeference | None, note: Note
 ) -> Float[Tensor, "3"] | None:
     """Where up is; None for the object of a mesh, whose photos say nothing, and where photos contradict each other."""
     told = told_up(georeference)
     if told is not None:
         return told
     source = _source_of(run, scene)
+    if isinstance(source, MeshFile):
+        return None
     if not isinstance(source, Dataset) and (str(source) == DEMO_OBJECT or Path(source).is_file()):
         return None
     photos = capture_at(source)
@@ -345,15 +347,15 @@ def _is_of_others(run: RunDirectory, photos: Dataset) -> bool:
     return of_mesh or config.get("views", held := directions_digest(photos)) != held
 
 
-def _source_of(run: RunDirectory, scene: Dataset | Path | str | None) -> Dataset | Path | str:
+def _source_of(run: RunDirectory, scene: Source | None) -> Source:
     """What a run is of. Raises InputError where nobody says, or it has gone."""
     if scene is not None:
         return scene
     source = run.read_config("paths.source")["paths"]["source"]
     if source is None:
         raise InputError(
-            f"{run.path}: does not say what it is of, a Dataset in memory perhaps; "
-            f"name the folder with its photos with {option('scene', ...)}"
+            f"{run.path}: does not say what it is of, a Dataset or a mesh in memory perhaps; "
+            f"name the folder with its photos with {either('--scene', 'scene=, or hand it in again')}"
         )
     if source != DEMO_OBJECT and not Path(source).exists():
         now = f"name where it is now with {option('scene', ...)}"

@@ -272,7 +272,7 @@ class Settings:
         Args:
             path: of the file.
             named: the preset, where neither the file nor `given` name one.
-            given: the preset that somebody asks for beside the file, which therefore must not name one.
+            given: the preset that somebody asks for beside the file, which must not name another.
 
         Raises:
             InputError: it cannot be read, is of another kind of run, or has settings that there are not.
@@ -282,8 +282,8 @@ class Settings:
 
             adopt_kernel_of(Path(path).parent)
         found = _read(path, cls.TASK)
-        for name in given:
-            if name in found:
+        for name, asked in given.items():
+            if found.get(name, asked) != asked:
                 raise InputError(f"{name}: {path} is of {name} {found[name]} already; leave one of them out")
         try:
             return cls.based_on({**named, **given, **found}).changed(found)

@@ -219,4 +219,6 @@ def _nothing_left(run: SoupRun, removed: Mapping[Reason, int]) -> str:
         remedy = f"choose another {option('crop')}, in the units and axes of the capture"
     elif list(removed) == ["faint"]:
         return f"no triangle is opaque enough; {faint_remedy(run)}"
+    if not removed:
+        return "has no triangles"
     return f"nothing is left of it ({in_words(removed)}); {remedy}"
