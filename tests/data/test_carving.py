@@ -8,6 +8,7 @@ import pytest
 import torch
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 
+from etsplat.core.cameras import Cameras, look_at
 from etsplat.data.carving import Carving
 from etsplat.data.dataset import Dataset
 from etsplat.data.hull import bounding_sphere
@@ -16,8 +17,10 @@ from etsplat.data.pictures import StoredPictures
 from etsplat.data.silhouettes import Silhouette, contradicting, silhouette
 from etsplat.data.visual_hull import visual_hull
 from etsplat.geometry.distance import closest_points
+from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.parts import genera
 from etsplat.io.mesh_files import MeshFile
+from etsplat.ops.rasterize_opaque import render_opaque
 from helpers.meshes import ring_and_ball
 
 Mask = np.ndarray
@@ -122,3 +125,28 @@ def test_depth_in_the_hull_leaves_out_the_outvoted(views: Dataset, outvoted: int
     assert float(Carving(outvoted).depth(silhouettes, inside)) < 0
     few = [view for view in silhouettes if float((away @ view.viewmat[:3, :3].T + view.viewmat[:3, 3])[0, 2]) <= 0]
     assert float(Carving(outvoted).depth(few, away)) == -torch.inf
+
+
+def test_what_few_photos_show_within_their_frames_is_in_the_hull() -> None:
+    """Close photos of something tall: none shows all of it, and its ends are in the frames of a fifth of them."""
+    vertices, faces = icosphere(4)
+    tall = vertices * torch.tensor([0.3, 1.0, 0.3])
+    turns = torch.arange(8) * torch.pi / 4
+    heights = torch.tensor([-0.8, -0.4, 0.0, 0.4, 0.8])
+    turn, height = (axis.flatten() for axis in torch.meshgrid(turns, heights, indexing="ij"))
+    eyes = torch.stack([3 * turn.cos(), height, 3 * turn.sin()], dim=1)
+    targets = torch.stack([0 * height, height, 0 * height], dim=1)
+    viewmats = look_at(eyes, targets, torch.tensor([0.0, 1.0, 0.0]))
+    Ks = torch.tensor([[200.0, 0, 32], [0, 200.0, 32], [0, 0, 1]]).expand(40, 3, 3)
+    drawn = render_opaque(
+        tall, cameras=Cameras(viewmats, Ks, 64, 64), faces=faces, face_colors=torch.ones(len(faces), 3)
+    )
+    names = [f"{index:02d}" for index in range(40)]
+    close = Dataset(viewmats, Ks, StoredPictures(list(drawn.rgba)), names, train=list(range(40)), test=[])
+    assert rule_of(close).quorum < 0.5
+    hull, _ = visual_hull(close, 4000)
+    assert float(hull[:, 1].max()) > 0.9
+    assert float(hull[:, 1].min()) < -0.9
+    assert float(hull[:, [0, 2]].norm(dim=1).max()) < 0.4
+    center, radius = bounding_sphere(close)
+    assert 0.95 < radius + float(center.norm()) < 1.3

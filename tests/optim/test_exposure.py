@@ -384,3 +384,19 @@ def test_photos_without_error_need_nothing(views: Dataset) -> None:
     measure(Copy(), photos, torch.zeros(1, 3))
     assert exposure.explained == 0.0
     assert not exposure.learned
+
+
+def test_matrices_stay_near_identity(views: Dataset, gains: Tensor) -> None:
+    """Of photos in light that differs from place to place, which no matrix explains, the model keeps the colours."""
+    pixels = []
+    for index, image in enumerate(views.images):
+        photo = as_float(image).clone()
+        across = torch.linspace(-1, 1, photo.shape[1])[None, :, None]
+        tint = torch.randn(3, generator=torch.Generator().manual_seed(index))
+        photo[..., :3] *= gains[index].mean() * (0.4 * across * tint).exp()
+        pixels.append(photo.clamp_max(1))
+    lit = replace(views, images=StoredPictures(pixels))
+    exposure = Exposure.of("on", 600, 12)
+    true_shape(lit, exposure).fit(600)
+    offsets = exposure.values[:, 1:].detach()
+    assert float(offsets.abs().max()) < 0.1

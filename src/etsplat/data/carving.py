@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from etsplat.core.cameras import camera_centers
-from etsplat.data.silhouettes import Silhouette, lowest_depths, points_along, within_ball
+from etsplat.data.silhouettes import Framing, Silhouette, judged_across, lowest_depths, points_along, within_ball
 
 _RAYS, _LEAST_RAYS = 1024, 8
 """Pixels that are asked for on each side of the outlines, in all views together, and of each at least."""
@@ -31,6 +31,10 @@ _CHUNK = 1 << 10
 
 _MOST = 2
 """So many views may be outvoted at a point, at most."""
+
+_QUORUMS = (0.5, 0.25, 0.125)
+"""Of so many of the views a point of the hull must be judged. What less than half of them have in their frames is there
+only if masks are predicted clearly better by it, and if these look at it from directions that cross."""
 
 _CLEARLY, _SURELY = 0.9, 0.005
 """A rule with more of them errs at most so many times as often as one with fewer, and at so much less of the pixels."""
@@ -49,10 +53,12 @@ class Carving:
     Attributes:
         outvoted: so many views may say of a point of the hull that it is outside.
         grown: pixels by which silhouettes are taken to be larger.
+        quorum: of this part of the views a point of the hull must be judged.
     """
 
     outvoted: int = 0
     grown: float = 0.0
+    quorum: float = _QUORUMS[0]
 
     @classmethod
     def of(cls, views: Sequence[Silhouette], center: Float[Tensor, "3"], radius: float) -> "Carving":
@@ -60,19 +66,37 @@ class Carving:
         if len(views) < _FEWEST:
             return cls()
         lines = _Lines.near_outlines(views, max(_LEAST_RAYS, _RAYS // len(views)))
-        depths = torch.cat([_deepest(views, some, center, radius) for some in lines.split(_CHUNK)])
         shown, limit = lines.shown, max(view.far for view in views)
         best, least = cls(), torch.inf
-        for outvoted, depth in enumerate(depths.T):
-            grown, wrong = _best_growth(depth, shown, limit)
-            if wrong < min(_CLEARLY * least, least - _SURELY):
-                best, least = cls(outvoted, grown if grown > _EXACT else 0.0), wrong
+        for quorum in _QUORUMS[:1] if all(view.whole for view in views) else _QUORUMS:
+            depths = torch.cat([_deepest(views, some, center, radius, quorum) for some in lines.split(_CHUNK)])
+            for outvoted, depth in enumerate(depths.T):
+                grown, wrong = _best_growth(depth, shown, limit)
+                if wrong < min(_CLEARLY * least, least - _SURELY):
+                    best, least = cls(outvoted, grown if grown > _EXACT else 0.0, quorum), wrong
         return best
 
     def depth(self, views: Sequence[Silhouette], points: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:
-        """How deep points are in the hull, in units of the scene; -inf where less than half of the views judge."""
+        """How deep points are in the hull, in units of the scene; -inf where too few of the views judge."""
         lowest, judges = self.judged(views, points)
-        return torch.where(2 * judges >= len(views), lowest, -torch.inf)
+        return torch.where(self.known([view.framing for view in views], points, judges), lowest, -torch.inf)
+
+    def known(
+        self, views: Sequence[Framing], points: Float[Tensor, "N 3"], judges: Float[Tensor, " N"], less: int = 0
+    ) -> Bool[Tensor, " N"]:
+        """Whether enough views judge each point: half of them, or the quorum from directions that cross.
+
+        Args:
+            views: all of them.
+            points: which are judged.
+            judges: how many judge each.
+            less: so many of the views are not asked.
+        """
+        count = len(views) - less
+        known = judges >= _QUORUMS[0] * count
+        fewer = (~known & (judges >= self.quorum * count)).nonzero()[:, 0]
+        known[fewer] = judged_across(views, points[fewer])
+        return known
 
     def judged(
         self, views: Sequence[Silhouette], points: Float[Tensor, "N 3"]
@@ -120,16 +144,18 @@ def _spread(some: Bool[np.ndarray, "H W"], count: int) -> np.ndarray:
     return place[np.linspace(0, len(place) - 1, min(count, len(place))).round().astype(np.int64)]
 
 
-def _deepest(views: Sequence[Silhouette], lines: _Lines, center: Tensor, radius: float) -> Float[Tensor, "R K"]:
+def _deepest(
+    views: Sequence[Silhouette], lines: _Lines, center: Tensor, radius: float, quorum: float
+) -> Float[Tensor, "R K"]:
     """How deep the deepest point on each line is, in pixels, by each number of views that are outvoted."""
     middle, half = within_ball(lines.start, lines.along, center, radius)
     each, every = [], torch.arange(len(half))
-    t, found = _look(views, lines, middle, half, _SAMPLES)
+    t, found = _look(views, lines, middle, half, _SAMPLES, quorum)
     for outvoted in range(_MOST + 1):
         best, place = found[outvoted].max(dim=1)
         around, reach = t[every, place], half * 2 / (_SAMPLES - 1)
         for samples in _FINER:
-            finer, depths = _look(views, lines, around, reach, samples)
+            finer, depths = _look(views, lines, around, reach, samples, quorum)
             value, place = depths[outvoted].max(dim=1)
             best = torch.maximum(best, value)
             around, reach = finer[every, place], reach * 2 / (samples - 1)
@@ -138,13 +164,13 @@ def _deepest(views: Sequence[Silhouette], lines: _Lines, center: Tensor, radius:
 
 
 def _look(
-    views: Sequence[Silhouette], lines: _Lines, middle: Tensor, half: Tensor, samples: int
+    views: Sequence[Silhouette], lines: _Lines, middle: Tensor, half: Tensor, samples: int, quorum: float
 ) -> tuple[Float[Tensor, "R S"], list[Float[Tensor, "R S"]]]:
     """Places along each line, and how deep the points there are by each number of views that are outvoted."""
     t = middle[:, None] + half[:, None] * torch.linspace(-1, 1, samples)
     points = points_along(lines.start, lines.along, t)
     lowest, judges = lowest_depths(views, points, _MOST + 1, own=lines.view.repeat_interleave(samples))
-    known = 2 * judges >= len(views) - 1
+    known = Carving(quorum=quorum).known([view.framing for view in views], points, judges, less=1)
     return t, list(torch.where(known, lowest, -torch.inf).view(-1, *t.shape))
 
 

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+import torch
 from jaxtyping import Float
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
@@ -18,7 +19,7 @@ from etsplat.data.camera_coverage import axes_meeting_point
 from etsplat.data.carving import Carving
 from etsplat.data.dataset import Dataset
 from etsplat.data.dataset_checks import check_training_views
-from etsplat.data.silhouettes import Silhouette, reach_of, silhouette, touches_border
+from etsplat.data.silhouettes import Framing, Silhouette, reach_of, silhouette, touches_border
 
 _CELLS = 48
 """Grid cells per side, at each of the levels."""
@@ -52,7 +53,8 @@ def bounding_sphere(dataset: Dataset) -> tuple[Float[Tensor, "3"], float]:
     The hull is carved from a grid between the cameras with the masks of the training views. A view whose silhouette
     keeps off the image border shows the whole object, so it also excludes what its image does not show; where the
     silhouette is cut by the border, nothing is known outside the image. A point of the hull is judged by at least
-    half of the views. Rough masks are believed as far as they predict each other (`Carving`).
+    half of the views, or by fewer where that predicts masks better; rough masks are believed as far as they predict
+    each other (`Carving`).
 
     Args:
         dataset: photos with alpha, in any frame.
@@ -101,8 +103,8 @@ def bounding_sphere(dataset: Dataset) -> tuple[Float[Tensor, "3"], float]:
     whole = [not touches_border(mask) for mask in inside]
     views = [_View(*each) for each in zip(viewmats, Ks, outside, whole, strict=True)]
     eyes = camera_centers(rounded).double().numpy()
-    kept, cell = _carve(views, meeting, np.linalg.norm(eyes - meeting, axis=1).max(), carving.outvoted)
-    within = _keeps(views, eyes, 0.0, carving.outvoted)
+    kept, cell = _carve(views, meeting, np.linalg.norm(eyes - meeting, axis=1).max(), carving)
+    within = _keeps(views, eyes, 0.0, carving)
     if within.any():
         raise InputError(f"view {names[within.argmax()]}: its camera is inside the object; remove that view")
     radius = float(np.linalg.norm(kept - meeting, axis=1).max()) + cell * 3**0.5 / 2
@@ -124,7 +126,7 @@ def _carving(dataset: Dataset, center: Tensor) -> Carving:
     return Carving.of(views, center, reach_of(views, center))
 
 
-def _carve(views: list[_View], center: np.ndarray, reach: float, outvoted: int) -> tuple[np.ndarray, float]:
+def _carve(views: list[_View], center: np.ndarray, reach: float, carving: Carving) -> tuple[np.ndarray, float]:
     """Centres (N, 3) and side of the cubes that are left of the box `center` +- `reach`."""
     lower, upper = center - reach, center + reach
     kept, cell = center[None], reach
@@ -132,7 +134,7 @@ def _carve(views: list[_View], center: np.ndarray, reach: float, outvoted: int) 
         cell = float((upper - lower).max()) / _CELLS
         axes = [np.arange(lower[k] + cell / 2, upper[k], cell) for k in range(3)]
         points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-        kept = points[_keeps(views, points, cell, outvoted)]
+        kept = points[_keeps(views, points, cell, carving)]
         if len(kept) == 0:
             raise InputError(
                 "masks: the silhouettes have no point in common; check that masks are white inside the object and that"
@@ -166,7 +168,7 @@ def _any_of(mask: np.ndarray, step: int) -> np.ndarray:
     return np.logical_or.reduceat(np.logical_or.reduceat(mask, rows), columns, axis=1)
 
 
-def _keeps(views: list[_View], points: np.ndarray, cell: float, outvoted: int) -> np.ndarray:
+def _keeps(views: list[_View], points: np.ndarray, cell: float, carving: Carving) -> np.ndarray:
     """(N,) whether the cube of side `cell` about each point may reach into the silhouettes of all that judge it.
 
     All but so many that are outvoted. In numpy: for thousands of small steps torch's threads are in the way.
@@ -186,7 +188,12 @@ def _keeps(views: list[_View], points: np.ndarray, cell: float, outvoted: int) -
         keep[framed] = outside[row, column] <= reach
         judged[alive] += framed | whole
         missed[alive] += ~keep
-        alive = alive[missed[alive] <= outvoted]
+        alive = alive[missed[alive] <= carving.outvoted]
     kept = np.zeros(len(points), dtype=bool)
-    kept[alive] = 2 * judged[alive] >= len(views)
+    framings = [
+        Framing(*(torch.from_numpy(array).float() for array in view[:2]), view.outside.shape[:2], view.whole)
+        for view in views
+    ]
+    at, by = torch.from_numpy(points[alive]).float(), torch.from_numpy(judged[alive]).float()
+    kept[alive] = carving.known(framings, at, by).numpy()
     return kept

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -40,6 +40,9 @@ _ALONE = 4.0
 _ALL_AROUND = 0.9
 """Of the border of a photo: where silhouettes have more of it in most, inside and outside were taken for each other."""
 
+_ACROSS = 0.2
+"""Directions cross if the second of the principal moments of their unit vectors is this large: two at 53 degrees."""
+
 _KEPT = 0.75
 """So many of the views are kept at least."""
 
@@ -62,6 +65,30 @@ def looks_inverted(dataset: Dataset) -> bool:
         border = np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]])
         found += bool(border.mean() > _ALL_AROUND and not mask.all())
     return 2 * found > len(dataset.train)
+
+
+class Framing(NamedTuple):
+    """What a view judges: where it looks, and whether it shows all of the object.
+
+    Attributes:
+        viewmat: (4, 4), world to camera.
+        K: (3, 3).
+        size: (height, width).
+        whole: of what lies before it, it judges all; else what is in its picture.
+    """
+
+    viewmat: Float[Tensor, "4 4"]
+    K: Float[Tensor, "3 3"]
+    size: tuple[int, int]
+    whole: bool
+
+    def judges(self, points: Float[Tensor, "N 3"]) -> Bool[Tensor, " N"]:
+        """Whether it judges each of these."""
+        x, y, z = (points @ self.viewmat[:3, :3].T + self.viewmat[:3, 3]).unbind(dim=1)
+        if self.whole:
+            return z > 0
+        column, row = self.K[0, 0] * x / z + self.K[0, 2], self.K[1, 1] * y / z + self.K[1, 2]
+        return (z > 0) & (column >= 0) & (column < self.size[1]) & (row >= 0) & (row < self.size[0])
 
 
 class Silhouette:
@@ -99,6 +126,11 @@ class Silhouette:
         pixel = torch.from_numpy(np.stack([column + 0.5, row + 0.5, np.ones(len(row))], axis=1)).float()
         direction = torch.linalg.solve(self.K, pixel.T).T @ self.viewmat[:3, :3]
         return torch.nn.functional.normalize(direction, dim=1)
+
+    @property
+    def framing(self) -> Framing:
+        """What it judges."""
+        return Framing(self.viewmat, self.K, (self.inside.shape[0], self.inside.shape[1]), self.whole)
 
     @property
     def far(self) -> float:
@@ -157,6 +189,20 @@ def _asked(views: Sequence[Silhouette], points: Tensor) -> dict[str, Any]:
         "whole": torch.tensor([view.whole for view in views]),
         "points": points.contiguous(),
     }
+
+
+def judged_across(views: Sequence[Framing], points: Float[Tensor, "N 3"]) -> Bool[Tensor, " N"]:
+    """Whether those that judge a point look at it from directions that cross.
+
+    What is seen along one line alone has no end on it: silhouettes leave spikes there, towards the cameras.
+    """
+    sums, count = points.new_zeros(len(points), 3, 3), points.new_zeros(len(points))
+    for view in views:
+        judges = view.judges(points).to(points)
+        along = torch.nn.functional.normalize(points - camera_centers(view.viewmat[None]).to(points), dim=1)
+        sums += judges[:, None, None] * along[:, :, None] * along[:, None, :]
+        count += judges
+    return torch.linalg.eigvalsh(sums / count.clamp_min(1)[:, None, None])[:, 1] >= _ACROSS
 
 
 def lowest_depths(

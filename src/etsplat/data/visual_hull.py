@@ -60,7 +60,8 @@ def visual_hull(
     """The hull of the training views' silhouettes (alpha 0.5) within a ball around the origin, as a closed manifold.
 
     A view whose silhouette keeps off the image border excludes what its image does not show; where the border cuts the
-    silhouette, nothing is known beyond. A point of the hull is judged by at least half of the views.
+    silhouette, nothing is known beyond. A point of the hull is judged by at least half of the views, or by fewer where
+    that predicts masks better (`Carving`).
 
     Args:
         dataset: photos with alpha around an object at the origin, as `bounding_sphere` and `renormalized` place it.

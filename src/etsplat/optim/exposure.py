@@ -32,8 +32,9 @@ from etsplat.optim.schedules import NEVER, Scheduled, at, exponential_decay
 RATE, FINAL = 0.03, 0.02
 """How far a number of a photo moves each time that the photo is seen, at first; what is left of that at the end."""
 
-WEIGHT = 0.001
-"""Of g^2 + |D|^2, mean over the photos of a step, in the objective."""
+WEIGHTS = (0.001, 0.05)
+"""Of g^2 and of |D|^2, mean over the photos of a step, in the objective. Cameras change brightness much, and colours
+little; a matrix that is free makes of the side of an object that some photos show another colour than it has."""
 
 NEEDED, SURE = 0.1, 0.2
 """Exposures are learned where they explain more than this part of the squared error. Early on up to the second is in
@@ -98,7 +99,7 @@ class Exposure:
         needed: float = NEEDED,
         by_direction: bool = False,
         rate: Scheduled = RATE,
-        weight: float = WEIGHT,
+        weights: tuple[float, float] = WEIGHTS,
     ) -> None:
         """Takes when and how fast it is learned.
 
@@ -112,7 +113,7 @@ class Exposure:
                 along a film, are then learned with them, and views between two photos come out as exposed as these;
                 what they explain does not count.
             rate: how far a number of a photo moves each time that the photo is seen.
-            weight: of what holds the numbers near zero.
+            weights: of what holds the gains and the matrices near zero.
 
         Raises:
             ValueError: an iteration is none; `of` takes a choice by name.
@@ -120,7 +121,7 @@ class Exposure:
         self.measured_at = check_count("measured_at", measured_at, least=0)
         self.again_at, self.learned = check_count("again_at", again_at, least=0), False
         self.explained: float | None = None
-        self._needed, self._by_direction, self._rate, self._weight = needed, by_direction, rate, weight
+        self._needed, self._by_direction, self._rate, self._weights = needed, by_direction, rate, weights
 
     def start(self, views: Sequence[int], batch: int, like: Tensor) -> None:
         """All photos are neutral.
@@ -153,7 +154,8 @@ class Exposure:
 
     def penalty(self, view: View) -> Float[Tensor, ""]:
         """What holds the numbers of a view's photo near zero."""
-        return self._weight * self._numbers(view.index).square().sum()
+        gain, offsets = self._numbers(view.index).square().split([1, 9])
+        return self._weights[0] * gain.sum() + self._weights[1] * offsets.sum()
 
     def matrix(self, index: Tensor) -> Float[Tensor, "3 3"]:
         """e^g (I + D) of a photo; differentiable.

@@ -15,7 +15,7 @@ class KnownExposure(Exposure):
 
     def __init__(self, matrices: Mapping[int, Float[Tensor, "3 3"]]) -> None:
         """Takes the matrices of all training views, by their index."""
-        super().__init__(NEVER, rate=0.0, weight=0.0)
+        super().__init__(NEVER, rate=0.0, weights=(0.0, 0.0))
         self._given = matrices
 
     def start(self, views: Sequence[int], batch: int, like: Tensor) -> None:

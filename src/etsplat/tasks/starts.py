@@ -32,11 +32,9 @@ from etsplat.tasks.coarse_soup import seen_through
 from etsplat.tasks.judgement import CONTRADICTED, Start
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 
-_FACES = 4000
-"""Of the hull that is asked what it explains."""
-
 _LOST = 0.05
-"""The part of silhouettes that it may leave uncovered, in the mean: less than a limb."""
+"""The part of silhouettes that a hull may leave uncovered, in the mean, where most photos cut the object off: less than
+a limb."""
 
 _DOUBTFUL, _AGREED = 0.05, 0.5
 """A hull is near the surface all over if it was not cut, and no larger part of its vertices was moved or is not seen by
@@ -166,13 +164,13 @@ def start_shape(config: ReconstructConfig, views: Dataset) -> Literal["sphere", 
     if not views.has_masks:
         return "sphere"
     whole = [not touches_border(silhouette(views.images[index])) for index in views.train]
-    return "hull" if 2 * sum(whole) > len(views.train) or _explained(views, config.start.radius) else "sphere"
+    return "hull" if 2 * sum(whole) > len(views.train) or _explained(views, config) else "sphere"
 
 
 @torch.no_grad()
-def _explained(views: Dataset, radius: float) -> bool:
+def _explained(views: Dataset, config: ReconstructConfig) -> bool:
     """Whether the hull covers what photos show, though most of them cut it off."""
-    surface = visual_hull(views, _FACES, radius=radius)
+    surface = visual_hull(views, _hull_faces(config), radius=config.start.radius)
     if len(surface[1]) == 0:
         return False
     lost, _ = silhouette_errors(photos_of(views), *surface).unbind(dim=1)
@@ -326,7 +324,7 @@ def plain_hull(views: Dataset, config: ReconstructConfig) -> Hull:
     """
     if not views.has_masks:
         raise InputError("start.shape: hull needs masks or transparent pictures; give masks, or start from a sphere")
-    wanted, radius = min(config.start.hull_faces, max(1, config.max_faces // 2)), config.start.radius
+    wanted, radius = _hull_faces(config), config.start.radius
     hull, most = _carved(views, wanted, radius), _most_faces(config)
     if hull.uncovered > _UNCOVERED and most > wanted:
         finer = _carved(views, min(2 * wanted, most), radius)
@@ -344,6 +342,10 @@ def plain_hull(views: Dataset, config: ReconstructConfig) -> Hull:
             " from its side: give it a thickness"
         )
     return hull
+
+
+def _hull_faces(config: ReconstructConfig) -> int:
+    return min(config.start.hull_faces, max(1, config.max_faces // 2))
 
 
 def _differs(views: Dataset, hull: Hull) -> float:

@@ -231,7 +231,7 @@ def test_the_bounding_sphere_brings_the_object_into_the_unit_sphere(scene, truth
             lambda d: d["frames"][2].update(transform_matrix=transposed(d)),
             r"002 has .* last row is not 0 0 0 1; .*trans",
         ),
-        (lambda d: d.pop("camera_angle_x"), "neither fl_x nor camera_angle_x"),
+        (lambda d: d.pop("camera_angle_x"), "neither fl_x, K nor camera_angle_x"),
         (lambda d: d.update(fl_x=-3), "not positive"),
         (lambda d: d.update(fl_x="wide"), "not a number"),
         (lambda d: d.update(w=80, h=40), "its camera is for 80x40"),
@@ -331,3 +331,20 @@ def test_a_file_in_a_subfolder_that_leads_out_of_it_says_where_to_move_it(scene)
         load_transforms(scene / "poses")
     (scene / "poses" / "transforms.json").rename(scene / "transforms.json")
     assert len(load_transforms(scene).images) == 10
+
+
+def test_a_frame_may_have_a_matrix_of_intrinsics(scene, truth):
+    """As captures of people have it, in the place of the numbers."""
+
+    def change(document):
+        del document["camera_angle_x"]
+        for frame in document["frames"]:
+            frame["K"] = [[30.0, 0, 21.0], [0, 31.0, 19.5], [0, 0, 1]]
+
+    rewrite(scene, change)
+    torch.testing.assert_close(
+        load_transforms(scene).Ks[0], torch.tensor([[30.0, 0, 21.0], [0, 31.0, 19.5], [0, 0, 1]]).double()
+    )
+    rewrite(scene, lambda document: document["frames"][0]["K"][0].__setitem__(1, 3.0))
+    with pytest.raises(InputError, match="has skew"):
+        load_transforms(scene)

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from etsplat.core.errors import InputError
 from etsplat.data.frames import LARGEST, Frame, Lens, Listing, Points, Wanted, find_image, pinhole
+from etsplat.data.matrix_cameras import checked_intrinsics
 from etsplat.data.scene_files import (
     OPENGL,
     Entry,
@@ -33,7 +34,7 @@ RANK = 1
 _DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL")
 _FISHEYE = ("OPENCV_FISHEYE", "FISHEYE")
-_PIXELS = {"fl_x", "fl_y", "cx", "cy"}
+_PIXELS = {"fl_x", "fl_y", "cx", "cy", "K"}
 """In pixels of an image of `w` x `h`."""
 
 
@@ -282,9 +283,11 @@ def _intrinsics(entry: Entry, size: tuple[int, int]) -> Float[Tensor, "3 3"]:
             raise entry.wrong(f"has camera_angle_{axis} = {angle:g}, not an angle of view; export the poses again")
         return 0.5 * extent / math.tan(0.5 * angle)
 
+    if "K" in entry.said and "fl_x" not in entry.said:
+        return checked_intrinsics(entry, entry.numbers("K", 9).reshape(3, 3))
     fx, fy = focal("x", size[0]), focal("y", size[1])
     if fx is None:
-        raise entry.wrong("has neither fl_x nor camera_angle_x; export the poses again")
+        raise entry.wrong("has neither fl_x, K nor camera_angle_x; export the poses again")
     return pinhole(fx, fx if fy is None else fy, entry.number("cx", size[0] / 2), entry.number("cy", size[1] / 2))
 
 
