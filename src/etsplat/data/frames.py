@@ -44,8 +44,8 @@ _SAMPLE = 4096
 LARGEST = 1e18
 """Of all numbers of poses and cameras: float32 holds their squares."""
 
-MASK_FOLDER = "masks"
-"""Of a scene, with a mask for each image, called like it."""
+MASK_FOLDER, MASK_SUFFIX = "masks", "_mask"
+"""Of a scene, with a mask for each image, called like it, or with this after its name."""
 
 DEPTH_FOLDERS = ("depths", "depth")
 """Of a scene, with a depth map for each image, called like it."""
@@ -278,6 +278,8 @@ def find_image(folder: Path, name: str, source: Path) -> Path:
 def find_mask(folder: Path, name: str, source: Path) -> Path:
     """The mask of image `name` in a folder: NAME itself, with another ending, or with .png added as COLMAP has it.
 
+    Or NAME_mask, as Metashape calls it.
+
     Raises:
         InputError: there is none, or no folder; or the name, which the file `source` gives, leads out of it.
     """
@@ -285,7 +287,9 @@ def find_mask(folder: Path, name: str, source: Path) -> Path:
         made = "`etsplat data masks SCENE --out SCENE/masks` makes them of plain backgrounds"
         remedy = made if folder.name == "auto" else path_remedy(folder)
         raise InputError(f"masks {folder}: no such folder; {remedy}")
-    found = _spelled(folder, name, source)
+    place = PurePosixPath(name)
+    calls = [name, *([str(place.with_name(f"{place.stem}{MASK_SUFFIX}{place.suffix}"))] if place.name else [])]
+    found = next((path for call in calls if (path := _spelled(folder, call, source)) is not None), None)
     if found is None:
         raise InputError(f"masks {folder}: no mask for image {name}; add {(folder / name).with_suffix('.png').name}")
     return found

@@ -9,7 +9,7 @@ from pathlib import Path, PurePosixPath
 from typing import Literal
 
 from etsplat.core.errors import InputError
-from etsplat.data.frames import MASK_FOLDER
+from etsplat.data.frames import MASK_FOLDER, MASK_SUFFIX
 from etsplat.io.images import IMAGE_SUFFIXES, load_rgb
 from etsplat.io.paths import kind_of, path_remedy
 from etsplat.io.photos import PHOTO_SUFFIXES, UNREAD_SUFFIXES, PhotoFile, file_remedy, inspect_photo, write_upright
@@ -80,7 +80,8 @@ def _without_masks(paths: list[Path], folder: Path) -> list[Path]:
 def brings_masks(folder: Path, photos: Iterable[Path]) -> bool:
     """Whether a folder of photos has `masks/` with a picture that is called as one of them is."""
     names = {name for path in photos for name in (path.name, path.stem)}
-    return any(path.stem in names for path in (folder / MASK_FOLDER).rglob("*") if kind_of(path) in IMAGE_SUFFIXES)
+    masks = [path.stem for path in (folder / MASK_FOLDER).rglob("*") if kind_of(path) in IMAGE_SUFFIXES]
+    return any(name in names or name.removesuffix(MASK_SUFFIX) in names for name in masks)
 
 
 def unread_pictures(folder: Path) -> list[str]:

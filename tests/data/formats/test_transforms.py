@@ -296,6 +296,9 @@ def test_masks_that_are_missing_or_of_another_size_are_input_errors(scene, truth
     save_image(scene / "masks" / "009.png", torch.zeros(20, 30, 1))
     with pytest.raises(InputError, match="resize the mask"):
         load_transforms(scene)
+    (scene / "masks" / "009.png").unlink()
+    save_image(scene / "masks" / "009_mask.png", truth.images[9][..., 3:])  # as Metashape calls it
+    assert load_transforms(scene).has_masks
 
 
 def test_folders_without_a_scene_are_input_errors(tmp_path):
