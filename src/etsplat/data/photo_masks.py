@@ -3,7 +3,6 @@
 import os
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -11,7 +10,7 @@ import torch
 from PIL import Image
 
 from etsplat.core.errors import InputError
-from etsplat.data.frames import MASK_FOLDER, Wanted, find_mask
+from etsplat.data.frames import Wanted
 from etsplat.data.load import format_of
 from etsplat.data.photo_intake import brings_masks
 from etsplat.data.plain_backgrounds import WORK_SIZE, find_object
@@ -82,8 +81,7 @@ def write_own_masks(
         InputError: `masks/` lacks one; one is damaged, or of another shape than its photo.
     """
     if brings_masks(source, photos.values()):
-        given = source / MASK_FOLDER
-        found: dict[str, Path | None] = {name: _mask_in(given, name, path) for name, path in photos.items()}
+        found = {name: Wanted().mask_of(source, name, path) for name, path in photos.items()}
     else:
         with ThreadPoolExecutor() as pool:
             transparent = pool.map(lambda path: kind_of(path) == ".png" and is_transparent(path), photos.values())
@@ -98,13 +96,6 @@ def write_own_masks(
         mask = torch.ones(height, width) if path is None else load_mask(path, (width, height))
         save_image(target, mask[..., None])
     return True
-
-
-def _mask_in(folder: Path, name: str, photo: Path) -> Path:
-    """By the name with folders, or its last part, as readers of scenes look for it."""
-    with suppress(InputError):
-        return find_mask(folder, name, photo)
-    return find_mask(folder, PurePosixPath(name).name, photo)
 
 
 def write_masks(photos: Mapping[str, Path], folder: Path, report: Callable[[str, int, int], None]) -> dict[str, str]:
