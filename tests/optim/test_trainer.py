@@ -383,6 +383,15 @@ def test_a_run_of_other_rates_or_settings_is_refused_and_one_that_goes_on_says_s
         fit_in(tmp_path, object_views, 1e-3, 100)
 
 
+def test_parts_may_hold_whatever_they_like(object_views: Dataset, tmp_path: Path) -> None:
+    """Themselves, too; what they do by itself is no setting."""
+    strategy = Fixed()
+    vars(strategy).update(
+        own=strategy, photos=object_views, chance=torch.Generator(), table={1: torch.ones(2), "b": 0.5}
+    )
+    Trainer(a_mesh(), object_views, mesh_objective(), strategy).fit(1, run=tmp_path)
+
+
 @pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
 def test_gradients_are_on_within_a_run_whatever_they_are_around_it(object_views: Dataset, mode: Any) -> None:
     """What was looked at in inference mode before can be fitted to afterwards."""

@@ -84,18 +84,22 @@ def doubts_before(dataset: Dataset, *, own_rates: bool) -> tuple[str, ...]:
     )
 
 
-def plain_settings(part: object) -> object:
-    """Of a part of a run its numbers and texts, also within collections; of all else the name of its kind."""
+def plain_settings(part: object, depth: int = 4) -> object:
+    """Of parts of a run their numbers and texts, also within so many collections and objects in each other.
+
+    Of all else, and of what lies deeper, the name of its kind.
+    """
     if part is None or isinstance(part, bool | int | float | str):
         return part
-    if isinstance(part, Mapping):
-        return sorted([str(key), plain_settings(value)] for key, value in part.items())
+    name = type(part).__name__
+    if depth == 0 or isinstance(part, Tensor | type) or callable(part):
+        return name
     if isinstance(part, Set):
         return sorted(map(str, part))
     if isinstance(part, list | tuple):
-        return [plain_settings(value) for value in part]
-    held = getattr(part, "__dict__", {}) if not isinstance(part, Tensor | type) and not callable(part) else {}
-    return [type(part).__name__, *([plain_settings(held)] if held else [])]
+        return [plain_settings(value, depth - 1) for value in part]
+    held = part if isinstance(part, Mapping) else getattr(part, "__dict__", {})
+    return [name, *sorted([str(key), plain_settings(value, depth - 1)] for key, value in held.items())]
 
 
 def tell(sentences: Iterable[str], callbacks: Sequence[Callback]) -> None:
