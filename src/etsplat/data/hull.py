@@ -46,6 +46,12 @@ class _View(NamedTuple):
     outside: np.ndarray
     whole: bool
 
+    @property
+    def framing(self) -> Framing:
+        """What it judges."""
+        viewmat, K = (torch.from_numpy(matrix).float() for matrix in (self.viewmat, self.K))
+        return Framing(viewmat, K, (self.outside.shape[0], self.outside.shape[1]), self.whole)
+
 
 def bounding_sphere(dataset: Dataset) -> tuple[Float[Tensor, "3"], float]:
     """A sphere that encloses the object: centred where the optical axes meet best, out to the visual hull.
@@ -190,10 +196,6 @@ def _keeps(views: list[_View], points: np.ndarray, cell: float, carving: Carving
         missed[alive] += ~keep
         alive = alive[missed[alive] <= carving.outvoted]
     kept = np.zeros(len(points), dtype=bool)
-    framings = [
-        Framing(*(torch.from_numpy(array).float() for array in view[:2]), view.outside.shape[:2], view.whole)
-        for view in views
-    ]
     at, by = torch.from_numpy(points[alive]).float(), torch.from_numpy(judged[alive]).float()
-    kept[alive] = carving.known(framings, at, by).numpy()
+    kept[alive] = carving.known([view.framing for view in views], at, by).numpy()
     return kept
