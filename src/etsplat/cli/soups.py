@@ -240,7 +240,7 @@ class Export(Command):
     def run(self, arguments: Sequence[str]) -> int:
         """Writes the file and says what is in it."""
         from etsplat.tasks.export_mesh import is_reconstruction
-        from etsplat.tasks.export_soup import export_soup, why_soup
+        from etsplat.tasks.export_soup import checked_for_soups, export_soup, why_soup
         from etsplat.tasks.opened_runs import check_not_read, open_run
         from etsplat.tasks.soup_selection import faint_remedy, in_words
 
@@ -250,9 +250,12 @@ class Export(Command):
             if getattr(self.settings, name) is not None:
                 raise InputError(f"--{name}: is for runs of `etsplat reconstruct`; leave it out for soups")
         crop = _crop(self.crop)
-        opened = open_run(self.run_dir, self.scene, self.device)
-        out = self._out(opened.folder, "exported" if self.format == "safetensors" else "soup")  # which a run's is
+        folder = self.run_dir if self.run_dir.is_dir() else self.run_dir.parent
+        out = self._out(folder, "exported" if self.format == "safetensors" else "soup")  # which a run's is
         check_not_read(out, self.run_dir, "--out ")
+        if self.run_dir.exists():
+            checked_for_soups(out, self.settings)  # rather than after it has been read
+        opened = open_run(self.run_dir, self.scene, self.device)
         written = export_soup(opened, out, self.settings, crop)
         sky = f", {written.sky:,} of them in the object sky" if written.sky else ""
         print(f"{written.path}: {written.triangles:,} triangles{sky}")

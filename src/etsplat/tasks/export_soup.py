@@ -79,8 +79,7 @@ def export_soup(run: SoupRun, path: Path | str, config: ExportConfig, crop: Crop
         InputError: settings that contradict each other; nothing is left; the file cannot be written.
     """
     path = Path(path)
-    config = replace(config, up=config.up or ("keep" if config.colors == "keep" else "y"))
-    _check(path, config)
+    config = checked_for_soups(path, config)
     keeps_all = kind_of(path) in WHOLE
     soft = keeps_all or config.alpha or config.colors == "keep"
     apart = config.sky == "apart" and not keeps_all and "objects" in writer_of(path).HOLDS
@@ -124,8 +123,20 @@ def why_soup(path: Path, config: ExportConfig) -> str | None:
     return None if kind_of(path) in WHOLE else next((reason for reason, holds in reasons.items() if holds), None)
 
 
+def checked_for_soups(path: Path, config: ExportConfig) -> ExportConfig:
+    """With axes that are chosen.
+
+    Raises InputError for settings that files of a kind have no room for, or that contradict each other; there is no
+    such folder.
+    """
+    if not path.parent.is_dir():
+        raise InputError(f"{path}: there is no folder {path.parent}; create the folder first")
+    config = replace(config, up=config.up or ("keep" if config.colors == "keep" else "y"))
+    _check(path, config)
+    return config
+
+
 def _check(path: Path, config: ExportConfig) -> None:
-    """Raises InputError for settings that files of a kind have no room for, or that contradict each other."""
     check_stored(path, config)
     moved = config.scale != 1 or config.place != "keep"
     if kind_of(path) in WHOLE:
