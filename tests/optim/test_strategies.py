@@ -258,7 +258,7 @@ def test_a_soup_that_dies_out_is_an_error(rng: torch.Generator) -> None:
     """In words that name the iteration and what to change."""
     strategy, soup = DensifyAndPrune(prune=PruneRules(opacity=0.9)), a_soup(rng)
     started(strategy, soup)
-    with pytest.raises(DivergedError, match=r"no triangle is left at iteration 7; lower lambda_opacity"):
+    with pytest.raises(DivergedError, match=r"no triangle is left at iteration 7; lower loss\.lambda_opacity and"):
         strategy.densify(7)
 
 

@@ -379,8 +379,9 @@ def test_a_run_of_other_rates_or_settings_is_refused_and_one_that_goes_on_says_s
     again = fit_in(tmp_path, object_views, 1e-3, 100, [told.append])
     assert torch.equal(again.vertices, first.vertices)
     assert f"run {tmp_path}: has 3 of 3 iterations, and none is made" in str(told[0])
-    with pytest.warns(UserWarning, match="another folder begins anew"):
+    with pytest.warns(UserWarning, match="another folder begins anew") as warned:
         fit_in(tmp_path, object_views, 1e-3, 100)
+    assert warned[0].filename == __file__
 
 
 def test_parts_may_hold_whatever_they_like(object_views: Dataset, tmp_path: Path) -> None:

@@ -102,13 +102,13 @@ def plain_settings(part: object, depth: int = 4) -> object:
     return [name, *sorted([str(key), plain_settings(value, depth - 1)] for key, value in held.items())]
 
 
-def tell(sentences: Iterable[str], callbacks: Sequence[Callback]) -> None:
-    """Tells all callbacks; where there are none, Python's warnings."""
+def tell(sentences: Iterable[str], callbacks: Sequence[Callback], below: int = 0) -> None:
+    """Tells all callbacks; where there are none, Python's warnings, so many calls below `fit`."""
     for sentence in sentences:
         for callback in callbacks:
             callback(NoteEvent(sentence))
         if not callbacks:
-            warnings.warn(sentence, stacklevel=4)  # of who calls `fit`, which is decorated
+            warnings.warn(sentence, stacklevel=4 + below)  # of who calls `fit`, which is decorated
 
 
 def tell_of_going_on(
@@ -129,7 +129,7 @@ def tell_of_going_on(
     left = (
         f"has {iteration:,} of {iterations:,} iterations, and none is made" if done else f"goes on after {iteration:,}"
     )
-    tell([f"run {run}: {left}; {taken}{'; another folder begins anew' if done else ''}"], callbacks)
+    tell([f"run {run}: {left}; {taken}{'; another folder begins anew' if done else ''}"], callbacks, below=2)
 
 
 def checked_background(background: Sequence[float] | Tensor | None) -> list[float] | None:
