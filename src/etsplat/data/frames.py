@@ -24,6 +24,7 @@ from etsplat.io.depth_maps import DEPTH_SUFFIXES, load_depth, resize_depth
 from etsplat.io.georeference import Georeference
 from etsplat.io.images import (
     IMAGE_SUFFIXES,
+    image_size,
     load_image,
     load_mask,
     load_mask_pixels,
@@ -46,6 +47,9 @@ LARGEST = 1e18
 
 MASK_FOLDER, MASK_SUFFIX = "masks", "_mask"
 """Of a scene, with a mask for each image, called like it, or with this after its name."""
+
+_NEARLY = 0.1
+"""Parts of a photo's width by which a mask differs that is no copy of another size, made on purpose."""
 
 DEPTH_FOLDERS = ("depths", "depth")
 """Of a scene, with a depth map for each image, called like it."""
@@ -208,9 +212,21 @@ def posed(scene: Path, listing: Listing, wanted: Wanted) -> Dataset:
     names, (places, colors) = _view_names(frames), points or (None, None)
     return Dataset(
         *(viewmats, torch.stack(Ks), pictures, names, train, test, places, colors),
-        notes=listing.notes,
+        notes=(*listing.notes, *_notes_on_masks(frames)),
         georeference=listing.georeference,
     )
+
+
+def _notes_on_masks(frames: Sequence[Frame]) -> list[str]:
+    """A note where a mask has nearly the size of its photo: one of them alone may be free of lens distortion."""
+    for frame in frames:
+        with suppress(InputError):  # of a damaged file, which is told where it is read
+            if frame.mask is None or (mask := image_size(frame.mask)) == (size := image_size(frame.image)):
+                continue
+            if abs(mask[0] / size[0] - 1) < _NEARLY:
+                sizes = f"{mask[0]}x{mask[1]}, its photo {size[0]}x{size[1]}"
+                return [f"mask {frame.mask.name} is {sizes}: masks must be freed of lens distortion as photos are"]
+    return []
 
 
 def check_frames(scene: Path, frames: Sequence[Frame]) -> None:

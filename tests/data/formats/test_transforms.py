@@ -351,3 +351,16 @@ def test_a_frame_may_have_a_matrix_of_intrinsics(scene, truth):
     rewrite(scene, lambda document: document["frames"][0]["K"][0].__setitem__(1, 3.0))
     with pytest.raises(InputError, match="has skew"):
         load_transforms(scene)
+
+
+def test_masks_of_nearly_the_photo_s_size_are_spoken_of(scene, truth):
+    """As where photos were freed of distortion, which crops them a little, and their masks were not."""
+    (scene / "masks").mkdir()
+    for index in range(10):
+        mask = torch.nn.functional.pad(truth.images[index][..., 3], (1, 1, 1, 1))
+        save_image(scene / "masks" / f"{index:03d}.png", mask[..., None])
+    assert any("is 42x42, its photo 40x40" in note for note in load_transforms(scene).notes)
+    for index in range(10):
+        mask = truth.images[index][..., 3].repeat_interleave(2, dim=0).repeat_interleave(2, dim=1)
+        save_image(scene / "masks" / f"{index:03d}.png", mask[..., None])
+    assert load_transforms(scene).notes == ()
