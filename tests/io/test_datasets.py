@@ -72,3 +72,33 @@ def test_what_is_there_already_is_completed_and_the_rest_left_alone(serve):
         assert (out / name).read_text() == name
     assert (out / "truck" / "notes.txt").read_text() == "mine"
     assert sorted(path.name for path in out.iterdir()) == ["licence.txt", "truck"]
+
+
+@pytest.fixture
+def archive(tmp_path, monkeypatch):
+    path = tmp_path / "archive.zip"
+    with zipfile.ZipFile(path, "w") as file:
+        file.writestr("truck/sparse/0/cameras.txt", "")
+    monkeypatch.setitem(datasets.DATASETS, "tiny", Dataset(path.as_uri(), ("truck",), 0.001))
+    return path
+
+
+def test_a_data_set_is_fetched_once(tmp_path, archive):
+    done = []
+    assert download_dataset("tiny", tmp_path / "data", progress=lambda *state: done.append(state)) == [
+        tmp_path / "data" / "truck"
+    ]
+    assert done[-1] == (archive.stat().st_size, archive.stat().st_size)
+    assert [path.name for path in (tmp_path / "data").iterdir()] == ["truck"]
+    archive.unlink()
+    download_dataset("tiny", tmp_path / "data")
+
+
+def test_without_a_network_the_address_is_told(tmp_path, monkeypatch):
+    monkeypatch.setitem(datasets.DATASETS, "tiny", Dataset("http://127.0.0.1:9/a.zip", ("truck",), 0.001))
+    with pytest.raises(InputError, match=r"cannot reach http://127\.0\.0\.1:9/a\.zip.*unpack it into"):
+        download_dataset("tiny", tmp_path / "data")
+    (tmp_path / "no.zip").write_text("not a zip")
+    monkeypatch.setitem(datasets.DATASETS, "tiny", Dataset((tmp_path / "no.zip").as_uri(), ("truck",), 0.001))
+    with pytest.raises(InputError, match="damaged"):
+        download_dataset("tiny", tmp_path / "data")

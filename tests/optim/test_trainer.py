@@ -359,12 +359,14 @@ def test_every_random_choice_follows_from_the_seed(object_views: Dataset) -> Non
     assert make(0) == make(0) != make(1)
 
 
-def fit_in(run: Path, photos: Dataset, rate: float, budget: int, callbacks: Sequence[Callback] = ()) -> TriangleMesh:
+def fit_in(
+    run: Path, photos: Dataset, rate: float, budget: int, callbacks: Sequence[Callback] = (), power: int = 1
+) -> TriangleMesh:
     """A short run in a folder."""
     mesh = a_mesh()
     schedule = Schedule({**mesh.rates, "vertices": rate})
     strategy = SubdivideAndUntangle({2: budget})
-    trainer = Trainer(mesh, photos, mesh_objective(), strategy, schedule=schedule)
+    trainer = Trainer(mesh, photos, Objective(Photometric(), [EdgeLength(0.5, power)]), strategy, schedule=schedule)
     trainer.fit(3, run=run, callbacks=callbacks)
     return mesh
 
@@ -373,9 +375,9 @@ def test_a_run_of_other_rates_or_settings_is_refused_and_one_that_goes_on_says_s
     object_views: Dataset, tmp_path: Path
 ) -> None:
     first, told = fit_in(tmp_path, object_views, 1e-3, 100), list[object]()
-    for rate, budget in ((2e-3, 100), (1e-3, 120)):
+    for rate, budget, power in ((2e-3, 100, 1), (1e-3, 120, 1), (1e-3, 100, 2)):
         with pytest.raises(InputError, match="checkpoint"):
-            fit_in(tmp_path, object_views, rate, budget)
+            fit_in(tmp_path, object_views, rate, budget, power=power)
     again = fit_in(tmp_path, object_views, 1e-3, 100, [told.append])
     assert torch.equal(again.vertices, first.vertices)
     assert f"run {tmp_path}: has 3 of 3 iterations, and none is made" in str(told[0])

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from etsplat.core.cameras import camera_centers
-from etsplat.data.silhouettes import Framing, Silhouette, judged_across, lowest_depths, points_along, within_ball
+from etsplat.data.silhouettes import Silhouette, judged_across, lowest_depths, points_along, within_ball
 
 _RAYS, _LEAST_RAYS = 1024, 8
 """Pixels that are asked for on each side of the outlines, in all views together, and of each at least."""
@@ -79,10 +79,10 @@ class Carving:
     def depth(self, views: Sequence[Silhouette], points: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:
         """How deep points are in the hull, in units of the scene; -inf where too few of the views judge."""
         lowest, judges = self.judged(views, points)
-        return torch.where(self.known([view.framing for view in views], points, judges), lowest, -torch.inf)
+        return torch.where(self.known(views, points, judges), lowest, -torch.inf)
 
     def known(
-        self, views: Sequence[Framing], points: Float[Tensor, "N 3"], judges: Float[Tensor, " N"], less: int = 0
+        self, views: Sequence[Silhouette], points: Float[Tensor, "N 3"], judges: Float[Tensor, " N"], less: int = 0
     ) -> Bool[Tensor, " N"]:
         """Whether enough views judge each point: half of them, or the quorum from directions that cross.
 
@@ -94,8 +94,9 @@ class Carving:
         """
         count = len(views) - less
         known = judges >= _QUORUMS[0] * count
-        fewer = (~known & (judges >= self.quorum * count)).nonzero()[:, 0]
-        known[fewer] = judged_across(views, points[fewer])
+        if self.quorum < _QUORUMS[0]:
+            fewer = (~known & (judges >= self.quorum * count)).nonzero()[:, 0]
+            known[fewer] = judged_across(views, points[fewer])
         return known
 
     def judged(
@@ -170,7 +171,7 @@ def _look(
     t = middle[:, None] + half[:, None] * torch.linspace(-1, 1, samples)
     points = points_along(lines.start, lines.along, t)
     lowest, judges = lowest_depths(views, points, _MOST + 1, own=lines.view.repeat_interleave(samples))
-    known = Carving(quorum=quorum).known([view.framing for view in views], points, judges, less=1)
+    known = Carving(quorum=quorum).known(views, points, judges, less=1)
     return t, list(torch.where(known, lowest, -torch.inf).view(-1, *t.shape))
 
 

@@ -191,9 +191,9 @@ def posed(scene: Path, listing: Listing, wanted: Wanted) -> Dataset:
         raise InputError(f"scene {scene}: has points farther away than {LARGEST:g}; remove them")
     if len(frames) < 2:  # one to learn from, one to test
         raise InputError(f"scene {scene}: has {len(frames)} posed images; at least 2 are needed, better 20")
-    Ks, sizes = [], []
+    Ks, sizes, whole = [], [], list[tuple[int, int]]()
     for frame in frames:
-        size = size_for(frame.image, frame.size)
+        whole.append(size := size_for(frame.image, frame.size))
         across = min(size[0], wanted.width or MAX_WIDTH)
         sizes.append((across, max(1, round(size[1] * across / size[0]))))
         Ks.append(scaled_intrinsics(scene, frame, size, sizes[-1]))
@@ -212,20 +212,20 @@ def posed(scene: Path, listing: Listing, wanted: Wanted) -> Dataset:
     names, (places, colors) = _view_names(frames), points or (None, None)
     return Dataset(
         *(viewmats, torch.stack(Ks), pictures, names, train, test, places, colors),
-        notes=(*listing.notes, *_notes_on_masks(frames)),
+        notes=(*listing.notes, *_notes_on_masks(frames, whole)),
         georeference=listing.georeference,
     )
 
 
-def _notes_on_masks(frames: Sequence[Frame]) -> list[str]:
+def _notes_on_masks(frames: Sequence[Frame], sizes: Sequence[tuple[int, int]]) -> list[str]:
     """A note where a mask has nearly the size of its photo: one of them alone may be free of lens distortion."""
-    for frame in frames:
+    for frame, size in zip(frames, sizes, strict=True):
         with suppress(InputError):  # of a damaged file, which is told where it is read
-            if frame.mask is None or (mask := image_size(frame.mask)) == (size := image_size(frame.image)):
+            if frame.mask is None or (mask := image_size(frame.mask)) == size:
                 continue
             if abs(mask[0] / size[0] - 1) < _NEARLY:
-                sizes = f"{mask[0]}x{mask[1]}, its photo {size[0]}x{size[1]}"
-                return [f"mask {frame.mask.name} is {sizes}: masks must be freed of lens distortion as photos are"]
+                told = f"{mask[0]}x{mask[1]}, its photo {size[0]}x{size[1]}"
+                return [f"mask {frame.mask.name} is {told}: masks must be freed of lens distortion as photos are"]
     return []
 
 

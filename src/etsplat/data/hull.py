@@ -19,7 +19,7 @@ from etsplat.data.camera_coverage import axes_meeting_point
 from etsplat.data.carving import Carving
 from etsplat.data.dataset import Dataset
 from etsplat.data.dataset_checks import check_training_views
-from etsplat.data.silhouettes import Framing, Silhouette, reach_of, silhouette, touches_border
+from etsplat.data.silhouettes import Silhouette, reach_of, silhouette, touches_border
 
 _CELLS = 48
 """Grid cells per side, at each of the levels."""
@@ -39,18 +39,14 @@ class _View(NamedTuple):
         K: (3, 3), for the shrunk picture.
         outside: (h, w) each pixel's distance to the silhouette, 0 inside.
         whole: whether it keeps off the border.
+        silhouette: it, in its own size.
     """
 
     viewmat: np.ndarray
     K: np.ndarray
     outside: np.ndarray
     whole: bool
-
-    @property
-    def framing(self) -> Framing:
-        """What it judges."""
-        viewmat, K = (torch.from_numpy(matrix).float() for matrix in (self.viewmat, self.K))
-        return Framing(viewmat, K, (self.outside.shape[0], self.outside.shape[1]), self.whole)
+    silhouette: Silhouette
 
 
 def bounding_sphere(dataset: Dataset) -> tuple[Float[Tensor, "3"], float]:
@@ -99,7 +95,8 @@ def bounding_sphere(dataset: Dataset) -> tuple[Float[Tensor, "3"], float]:
         raise InputError(
             f"view {names[depth.argmin()]}: looks away from where the others look; an object needs views around it"
         )
-    carving = _carving(dataset, center.float())
+    silhouettes = [Silhouette(dataset, index) for index in dataset.train]
+    carving = Carving.of(silhouettes, center.float(), reach_of(silhouettes, center.float()))
     outside = [
         (np.asarray(distance_transform_edt(~mask)) - carving.grown / step).clip(min=0)
         for mask, step in zip(inside, steps, strict=True)
@@ -107,7 +104,7 @@ def bounding_sphere(dataset: Dataset) -> tuple[Float[Tensor, "3"], float]:
     Ks = dataset.Ks[dataset.train].float().double().numpy()
     Ks[:, :2] /= steps[:, None, None]
     whole = [not touches_border(mask) for mask in inside]
-    views = [_View(*each) for each in zip(viewmats, Ks, outside, whole, strict=True)]
+    views = [_View(*each) for each in zip(viewmats, Ks, outside, whole, silhouettes, strict=True)]
     eyes = camera_centers(rounded).double().numpy()
     kept, cell = _carve(views, meeting, np.linalg.norm(eyes - meeting, axis=1).max(), carving)
     within = _keeps(views, eyes, 0.0, carving)
@@ -125,11 +122,6 @@ def check_not_empty(dataset: Dataset, views: Sequence[int]) -> None:
                 f"view {dataset.names[index]}: its mask is empty, it sees nothing of the object; remove the view, or "
                 "write 255 inside masks that have 1 there"
             )
-
-
-def _carving(dataset: Dataset, center: Tensor) -> Carving:
-    views = [Silhouette(dataset, index) for index in dataset.train]
-    return Carving.of(views, center, reach_of(views, center))
 
 
 def _carve(views: list[_View], center: np.ndarray, reach: float, carving: Carving) -> tuple[np.ndarray, float]:
@@ -181,7 +173,7 @@ def _keeps(views: list[_View], points: np.ndarray, cell: float, carving: Carving
     """
     alive = np.arange(len(points))
     judged, missed = np.zeros(len(points), dtype=np.int32), np.zeros(len(points), dtype=np.int32)
-    for viewmat, K, outside, whole in views:
+    for viewmat, K, outside, whole, _ in views:
         camera = points[alive] @ viewmat[:3, :3].T + viewmat[:3, 3]
         z = camera[:, 2]
         front = z > 0
@@ -197,5 +189,5 @@ def _keeps(views: list[_View], points: np.ndarray, cell: float, carving: Carving
         alive = alive[missed[alive] <= carving.outvoted]
     kept = np.zeros(len(points), dtype=bool)
     at, by = torch.from_numpy(points[alive]).float(), torch.from_numpy(judged[alive]).float()
-    kept[alive] = carving.known([view.framing for view in views], at, by).numpy()
+    kept[alive] = carving.known([view.silhouette for view in views], at, by).numpy()
     return kept

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -67,30 +67,6 @@ def looks_inverted(dataset: Dataset) -> bool:
     return 2 * found > len(dataset.train)
 
 
-class Framing(NamedTuple):
-    """What a view judges: where it looks, and whether it shows all of the object.
-
-    Attributes:
-        viewmat: (4, 4), world to camera.
-        K: (3, 3).
-        size: (height, width).
-        whole: of what lies before it, it judges all; else what is in its picture.
-    """
-
-    viewmat: Float[Tensor, "4 4"]
-    K: Float[Tensor, "3 3"]
-    size: tuple[int, int]
-    whole: bool
-
-    def judges(self, points: Float[Tensor, "N 3"]) -> Bool[Tensor, " N"]:
-        """Whether it judges each of these."""
-        x, y, z = (points @ self.viewmat[:3, :3].T + self.viewmat[:3, 3]).unbind(dim=1)
-        if self.whole:
-            return z > 0
-        column, row = self.K[0, 0] * x / z + self.K[0, 2], self.K[1, 1] * y / z + self.K[1, 2]
-        return (z > 0) & (column >= 0) & (column < self.size[1]) & (row >= 0) & (row < self.size[0])
-
-
 class Silhouette:
     """Where a view shows the object, with its camera.
 
@@ -127,10 +103,14 @@ class Silhouette:
         direction = torch.linalg.solve(self.K, pixel.T).T @ self.viewmat[:3, :3]
         return torch.nn.functional.normalize(direction, dim=1)
 
-    @property
-    def framing(self) -> Framing:
-        """What it judges."""
-        return Framing(self.viewmat, self.K, (self.inside.shape[0], self.inside.shape[1]), self.whole)
+    def judges(self, points: Float[Tensor, "N 3"]) -> Bool[Tensor, " N"]:
+        """Whether it judges each of these: it does what lies before it, and in its picture unless it shows all."""
+        x, y, z = (points @ self.viewmat[:3, :3].T + self.viewmat[:3, 3]).unbind(dim=1)
+        if self.whole:
+            return z > 0
+        height, width = self.inside.shape
+        column, row = self.K[0, 0] * x / z + self.K[0, 2], self.K[1, 1] * y / z + self.K[1, 2]
+        return (z > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
 
     @property
     def far(self) -> float:
@@ -191,7 +171,7 @@ def _asked(views: Sequence[Silhouette], points: Tensor) -> dict[str, Any]:
     }
 
 
-def judged_across(views: Sequence[Framing], points: Float[Tensor, "N 3"]) -> Bool[Tensor, " N"]:
+def judged_across(views: Sequence[Silhouette], points: Float[Tensor, "N 3"]) -> Bool[Tensor, " N"]:
     """Whether those that judge a point look at it from directions that cross.
 
     What is seen along one line alone has no end on it: silhouettes leave spikes there, towards the cameras.

@@ -133,6 +133,11 @@ def keep_colors(document: dict[str, Any]) -> bool:
     return bool(colored)
 
 
+def fractions(values: np.ndarray) -> np.ndarray:
+    """Numbers of vertices: of whole ones, which count from 0 to the highest that there is, fractions of it."""
+    return values / np.iinfo(values.dtype).max if values.dtype.kind == "u" else values.astype(np.float64)
+
+
 def unmoved_note(path: Path, document: dict[str, Any]) -> list[str]:
     """A note on what would move vertices, and is left out; nothing without."""
     meshes = [primitive for mesh in document.get("meshes", []) for primitive in mesh["primitives"]]

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from etsplat.core.errors import InputError
-from etsplat.io._gltf import local_file, view_bytes
+from etsplat.io._gltf import fractions, local_file, view_bytes
 from etsplat.io.images import IMAGE_FORMATS, MAX_PIXELS, load_colors
 from etsplat.io.ply_tables import PLACES, read_ply_tables
 from etsplat.io.srgb import linear_from_srgb, srgb_from_linear
@@ -278,11 +278,9 @@ class GltfMaterials:
     def uvs(self, attributes: dict[str, np.ndarray]) -> tuple[int, np.ndarray]:
         """The number of a primitive's picture, and (V, 2) where its vertices are in that."""
         name, number = _marked(attributes)
-        values = np.asarray(attributes[name])
-        if values.dtype.kind == "u":
-            values = values / np.iinfo(values.dtype).max
+        values = fractions(np.asarray(attributes[name]))
         base = _base(self._document["materials"][number]) if number >= 0 else {}
-        uvs = _transformed(values[:, :2].astype(np.float64), _transform(base.get("baseColorTexture", {})))
+        uvs = _transformed(values[:, :2], _transform(base.get("baseColorTexture", {})))
         uvs[:, 1] = 1 - uvs[:, 1]  # glTF counts from the top
         if "baseColorTexture" in base and bool(((uvs < 0) | (uvs > 1)).any()):
             self._check_wrap(self._document["textures"][base["baseColorTexture"]["index"]])

@@ -15,6 +15,7 @@ from etsplat.core.errors import InputError
 from etsplat.io._gltf import (
     COLOR,
     check_gltf,
+    fractions,
     is_compressed,
     join_gltf,
     keep_colors,
@@ -357,15 +358,10 @@ def _placed(scene: "trimesh.Scene", node: str) -> RawMesh:
     if isinstance(visual, ColorVisuals):  # and no texture
         mesh.face_colors = visual.face_colors[:, :3] / 255 if visual.kind == "face" else _ply_face_colors(geometry)
         if visual.kind == "vertex" and mesh.face_colors is None:
-            mesh.vertex_colors = _fractions(geometry.vertex_attributes.get(COLOR, visual.vertex_colors))[:, :3]
+            mesh.vertex_colors = fractions(geometry.vertex_attributes.get(COLOR, visual.vertex_colors))[:, :3]
     if mesh.face_colors is not None and len(mesh.face_colors) != len(mesh.faces):
         raise ValueError(f"colours of {len(mesh.face_colors)} faces for {len(mesh.faces)}")
     return mesh
-
-
-def _fractions(colors: np.ndarray) -> np.ndarray:
-    """Of whole numbers, which count from 0 to the highest that there is."""
-    return colors / np.iinfo(colors.dtype).max if colors.dtype.kind == "u" else colors.astype(np.float64)
 
 
 def _ply_face_colors(mesh: "trimesh.Trimesh") -> np.ndarray | None:

@@ -215,9 +215,8 @@ class TriangleSoup(Model):
 
     def check_finite(self, path: Path) -> None:
         """Raises InputError, naming the file, for NaN or infinity among the parameters."""
-        for name, tensor in self.parameters().items():
-            if not bool(torch.isfinite(tensor).all()):
-                raise InputError(f"soup {path}: {name} holds NaN or infinity; take another file")
+        if (bad := first_not_finite(self.parameters())) is not None:
+            raise InputError(f"soup {path}: {bad} holds NaN or infinity; take another file")
 
     def __len__(self) -> int:
         return len(self.vertices)

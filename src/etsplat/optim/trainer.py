@@ -209,8 +209,8 @@ class Trainer(Generic[M]):
                 None writes nothing.
             run_hash: identifies all that the result depends on; a checkpoint of another run is refused. None for one of
                 the photos, the seed, the kinds of the parts and such of their settings as are numbers or texts, rates
-                that do not change, the kernel and the background; not of the model, which a checkpoint replaces, nor of
-                functions.
+                that do not change, the kernel and the background; not of the model, which a checkpoint replaces, and of
+                functions the names alone.
 
         Returns:
             Where the run stands.

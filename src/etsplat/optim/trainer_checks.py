@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Iterable, Mapping, Sequence, Set
 from pathlib import Path
+from types import FunctionType
 from typing import Any, cast
 
 import numpy as np
@@ -87,12 +88,14 @@ def doubts_before(dataset: Dataset, *, own_rates: bool) -> tuple[str, ...]:
 def plain_settings(part: object, depth: int = 4) -> object:
     """Of parts of a run their numbers and texts, also within so many collections and objects in each other.
 
-    Of all else, and of what lies deeper, the name of its kind.
+    Of functions their names; of all else, and of what lies deeper, the name of its kind.
     """
     if part is None or isinstance(part, bool | int | float | str):
         return part
     name = type(part).__name__
-    if depth == 0 or isinstance(part, Tensor | type) or callable(part):
+    if isinstance(part, FunctionType | type):
+        return part.__qualname__
+    if depth == 0 or isinstance(part, Tensor):
         return name
     if isinstance(part, Set):
         return sorted(map(str, part))

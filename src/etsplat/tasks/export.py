@@ -70,7 +70,7 @@ def export(
         soup = source.finished().to(torch.device("cpu"))
         if (bad := first_not_finite(soup.parameters())) is not None:
             raise InputError(f"source: {bad} of the soup holds NaN or infinity, which no program reads")
-        return export_soup(SoupRun(Path("source"), soup, capture_at(_of_photos(scene))), path, config)
+        return export_soup(SoupRun(path, soup, capture_at(_of_photos(scene))), path, config)
     found = given_path(
         "source",
         source.path if isinstance(source, TrainResult | ReconstructResult) else source,

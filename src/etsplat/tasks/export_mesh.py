@@ -349,8 +349,10 @@ def _is_of_others(run: RunDirectory, photos: Dataset) -> bool:
 
 def _source_of(run: RunDirectory, scene: Source | None) -> Source:
     """What a run is of. Raises InputError where nobody says, or it has gone."""
-    if scene is not None:
+    if isinstance(scene, Dataset | MeshFile):
         return scene
+    if scene is not None:
+        return given_path("scene", scene, "a path, a MeshFile or a Dataset")
     source = run.read_config("paths.source")["paths"]["source"]
     if source is None:
         raise InputError(

@@ -132,17 +132,12 @@ def checked_for_soups(path: Path, config: ExportConfig) -> ExportConfig:
     if not path.parent.is_dir():
         raise InputError(f"{path}: there is no folder {path.parent}; create the folder first")
     config = replace(config, up=config.up or ("keep" if config.colors == "keep" else "y"))
-    _check(path, config)
-    return config
-
-
-def _check(path: Path, config: ExportConfig) -> None:
     check_stored(path, config)
     moved = config.scale != 1 or config.place != "keep"
     if kind_of(path) in WHOLE:
         if moved or config.up == "z":
             raise InputError(f"{path}: keeps the units and axes of the capture; {leave_unplaced()}")
-        return
+        return config
     holds = writer_of(path).HOLDS
     if config.colors == "keep" and ("numbers" not in holds or config.up != "keep"):
         need = f"{file_kind(*(suffix[1:] for suffix in suffixes('numbers')))} and {option('up', 'keep')}"
@@ -153,6 +148,7 @@ def _check(path: Path, config: ExportConfig) -> None:
             f"{path}: files of this kind hold no opacities; leave out {option('alpha')}, or choose {other}"
         )
     check_placed(path, config)
+    return config
 
 
 def _write_whole(run: SoupRun, path: Path, config: ExportConfig, chosen: Selection) -> None:

@@ -229,7 +229,7 @@ def with_cloud(
     Raises:
         InputError: as `load_cloud`; or photos speak for fewer than 100 points.
     """
-    points, colors = load_cloud(path)
+    points, colors = load_cloud(given_path("init_points", path))
     if scene.georeference is not None:
         far = scene.georeference
         points = (points - torch.tensor(far.offset, dtype=torch.float64)) / far.scale
