@@ -14,7 +14,9 @@ from etsplat.data.false_handles import (
     _BLOCKED,
     _LOST,
     _agreement,
+    _covered,
     _cut,
+    _fills,
     _simpler,
     silhouette_errors,
     without_false_handles,
@@ -119,6 +121,47 @@ def test_a_small_hole_that_light_comes_through_stays_whatever_photos_say() -> No
     seen = torch.zeros(len(score), dtype=torch.bool)
     most = silhouette_errors(photos, *truth) + torch.tensor([_LOST, _ADDED])
     assert _simpler(photos, *truth, (score, seen), 0.5, most) is None
+
+
+def perforated(places: np.ndarray) -> np.ndarray:
+    """A plate with a hole of few pixels near each of two corners."""
+    x, y, z = places.T
+    plate = np.maximum(np.maximum(np.abs(x), np.abs(z)) - 0.9, np.abs(y) - 0.08)
+    holes = np.minimum(np.hypot(x - 0.5, z - 0.5), np.hypot(x + 0.5, z + 0.5))
+    return np.maximum(plate, 0.06 - holes)
+
+
+def plain(places: np.ndarray) -> np.ndarray:
+    """The plate without its holes."""
+    x, y, z = places.T
+    return np.maximum(np.maximum(np.abs(x), np.abs(z)) - 0.9, np.abs(y) - 0.08)
+
+
+def test_holes_of_few_pixels_stay_where_photos_of_one_colour_agree_on_nothing() -> None:
+    """Plates of the size of a hand with bores for screws lost all of them, or nine of thirteen."""
+    vertices, faces, views = painted_pictures(*surface(perforated, 0.04), painted=False)
+    assert genera(faces, len(vertices)) == [2]
+    vertices, faces = without_false_handles(views, vertices, faces)
+    assert genera(faces, len(vertices)) == [2]
+
+
+@pytest.mark.parametrize(("masks", "fills"), [(1, False), (2, True)])
+def test_what_one_mask_shows_through_a_surface_may_be_a_fault_of_it(masks: int, fills: bool) -> None:
+    """Specks of 2 x 2 pixels in masks of a plate that has no holes, where its hull has one."""
+    _, views = photographed(plain, 0.04)
+    surfaces = surface(perforated, 0.04), surface(plain, 0.04)
+    before, after = ((views.normalization.apply(vertices), faces) for vertices, faces in surfaces)
+    middle, photos = views.normalization.apply(torch.tensor([[0.5, 0.0, 0.5]])), photos_of(views)
+    through = [not bool(_covered([photo], *before)[0][speck_at(photo, middle)].any()) for photo in photos]
+    for photo in [photo for photo, seen in zip(photos, through, strict=True) if seen][:masks]:
+        photo.pixels[0, 3][speck_at(photo, middle)] = 0
+    assert _fills(photos, before, after) == fills
+
+
+def speck_at(photo: Photo, place: torch.Tensor) -> tuple[slice, slice]:
+    """Rows and columns of the 2 x 2 pixels about a point."""
+    column, row = photo.pixel_places(place)[0].round().long().tolist()
+    return slice(row - 1, row + 1), slice(column - 1, column + 1)
 
 
 def on_a_plate(places: np.ndarray) -> np.ndarray:

@@ -9,7 +9,11 @@ A bridge between two feet that nearly touch is no such region, and one with the 
 the shortest loops that bound no disc are looked at: what is as thin as a few edges, or a hole as narrow, is cut there
 and closed by two discs, if photos contradict each other along the loop, or too few see it to say, and no silhouette
 needs it. Where all of a handle is as small as that, photos that agree only say that something is near.
+
+Neither may cover a hole of a silhouette that the surface goes around, however small it is.
 """
+
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -42,6 +46,9 @@ a hole in the view that shows it best is deeper, however little of a large silho
 
 _SHOWN = 2
 """Pixels from its rim to the middle of a hole in a silhouette that is no fault of a mask."""
+
+_TOLD, _PIXELS = 2, 6
+"""So many photos that show smaller ones, by so many pixels together, are right about them."""
 
 _BESIDE = 0.05
 """Alpha of what is certainly beside a silhouette."""
@@ -121,7 +128,9 @@ def _cut(
         if sum(after) >= sum(before) or len(after) != len(before):
             continue
         kept = (bool((silhouette_errors([p], *found) <= limit).all()) for p, limit in zip(photos, most, strict=True))
-        if all(kept) and (doubted or not _lets_go(photos, (vertices, faces), found)):
+        if not all(kept) or _fills(photos, (vertices, faces), found):
+            continue
+        if doubted or not _lets_go(photos, (vertices, faces), found):
             return found
     return None
 
@@ -163,7 +172,8 @@ def _simpler(
         covered = _covered(photos, *found)
         if bool((_errors(photos, covered) <= most).all()):
             was = was or _covered(photos, vertices, faces)
-            if not _closes(photos, was, covered, deep) and not _lets_go(photos, (vertices, faces), found):
+            closes = _closes(photos, was, covered, deep) or _fills(photos, (vertices, faces), found)
+            if not closes and not _lets_go(photos, (vertices, faces), found):
                 return found
     return None
 
@@ -183,31 +193,69 @@ def _closes(photos: list[Photo], was: list[Tensor], covered: list[Tensor], deep:
     return False
 
 
+def _fills(photos: list[Photo], before: tuple[Tensor, Tensor], after: tuple[Tensor, Tensor]) -> bool:
+    """Whether the surface went around a hole of a silhouette, and now covers it.
+
+    A hole of a few pixels is little of a silhouette, and may be a fault of a mask, unless more photos show one.
+    """
+    edges, told = _edges(before[1], len(before[0])), []
+    for photo, was, covered in zip(photos, _covered(photos, *before), _covered(photos, *after), strict=True):
+        places, new, pixels = photo.pixel_places(before[0]), covered & ~was, 0
+        for hole in _holes(photo):
+            column, row = hole.place.long().tolist()
+            if new[row, column] and winds_around(places, edges, hole.place):
+                if hole.depth > _SHOWN:
+                    return True
+                pixels += hole.pixels
+        told += [pixels] if pixels else []
+    return len(told) >= _TOLD and sum(told) >= _PIXELS
+
+
 def _lets_go(photos: list[Photo], before: tuple[Tensor, Tensor], after: tuple[Tensor, Tensor]) -> bool:
     """Whether the surface went around a hole of a silhouette, and does not any more.
 
     Where the matter beside a hole is cut, and another part hides the gap, no silhouette misses anything.
     """
-    edges = [MeshTopology.from_faces(faces, len(vertices)).edges.long() for vertices, faces in (before, after)]
+    edges = [_edges(faces, len(vertices)) for vertices, faces in (before, after)]
     for photo in photos:
-        size = torch.tensor(photo.pixels.shape[:1:-1])
-        places = [(photo.project(vertices)[0] + 1) / 2 * size for vertices, _ in (before, after)]
-        for hole in _holes(photo):
+        places = [photo.pixel_places(vertices) for vertices, _ in (before, after)]
+        for hole in (each.place for each in _holes(photo) if each.depth > _SHOWN):
             if winds_around(places[0], edges[0], hole) and not winds_around(places[1], edges[1], hole):
                 return True
     return False
 
 
-def _holes(photo: Photo) -> list[Float[Tensor, "2"]]:
-    """Of each hole in a silhouette, but for the smallest, the place farthest within: column, row."""
+def _edges(faces: Tensor, num_vertices: int) -> Int64[Tensor, "E 2"]:
+    return MeshTopology.from_faces(faces, num_vertices).edges.long()
+
+
+class _Hole(NamedTuple):
+    """A hole in a silhouette.
+
+    Attributes:
+        place: (2,) farthest within, column and row.
+        depth: pixels from there to its rim.
+        pixels: that show the background alone.
+    """
+
+    place: Float[Tensor, "2"]
+    depth: float
+    pixels: int
+
+
+def _holes(photo: Photo) -> list[_Hole]:
+    """In the order of their rows."""
     beside = (photo.pixels[0, 3] < _BESIDE).numpy()
     around = np.pad(beside, 1, constant_values=True)  # so that all that reaches the frame is one piece
     piece = np.zeros(around.shape, dtype=np.int32)
     label(around, output=piece)
-    depth = np.asarray(distance_transform_edt(around)) * (piece != piece[0, 0])
-    numbers = np.arange(1, int(piece.max()) + 1)
-    middles = zip(maximum(depth, piece, numbers), maximum_position(depth, piece, numbers), strict=True)
-    return [torch.tensor([column - 0.5, row - 0.5]) for deepest, (row, column) in middles if deepest > _SHOWN]
+    depth, sizes = np.asarray(distance_transform_edt(around)), np.bincount(piece.ravel())
+    numbers = np.setdiff1d(np.arange(1, int(piece.max()) + 1), piece[0, 0])
+    middles = zip(numbers, maximum(depth, piece, numbers), maximum_position(depth, piece, numbers), strict=True)
+    return [
+        _Hole(torch.tensor([column - 0.5, row - 0.5]), float(deepest), int(sizes[number]))
+        for number, deepest, (row, column) in middles
+    ]
 
 
 def _regions(faces: Tensor, low: Bool[Tensor, " F"]) -> list[Bool[Tensor, " F"]]:

@@ -54,8 +54,9 @@ _UNCOVERED, _LESS = 0.0005, 0.9
 much: what rough masks leave does not depend on how fine it is."""
 
 _LACKING, _WIRES, _FINEST = 0.005, 0.02, 4
-"""Where a hull leaves more than the first of the silhouettes uncovered, one is tried that has thin parts whole; where
-more than the second, of up to so many times as many faces: around wires they are small."""
+"""Where a hull leaves more than the first of the silhouettes uncovered, one is tried that has thin parts whole, and if
+that is no better one of up to so many times as many faces: around wires they are small. Where it leaves more than the
+second, that is tried at once."""
 
 _THIN = 0.5
 """It is taken if it differs from silhouettes in at most so many times as many pixels: gaps beside thin parts may close
@@ -331,10 +332,11 @@ def plain_hull(views: Dataset, config: ReconstructConfig) -> Hull:
         if len(finer.faces) <= config.max_faces and _mends(finer, hull):
             return finer
     if hull.uncovered > _LACKING:
-        enough = min(_FINEST * wanted, most) if hull.uncovered > _WIRES else wanted
-        thin = _carved(views, enough, radius, thin=True)
-        if len(thin.faces) <= config.max_faces and _differs(views, thin) <= _THIN * _differs(views, hull):
-            return thin
+        least, enough = _differs(views, hull), min(_FINEST * wanted, most)
+        for faces in (wanted, enough) if hull.uncovered <= _WIRES else (enough,):
+            thin = _carved(views, faces, radius, thin=True)
+            if len(thin.faces) <= config.max_faces and _differs(views, thin) <= _THIN * least:
+                return thin
     if len(hull.faces) == 0:
         raise InputError(
             "start.shape: the masks have no point in common, so there is no hull; check that masks are white inside the"
