@@ -47,7 +47,7 @@ from etsplat.geometry.parts import shape_of
 from etsplat.io.mesh_files import MeshFile, load_mesh
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.sources import load_source, make_subject
-from etsplat.tasks.starts import plain_hull
+from etsplat.tasks.starting_hull import plain_hull
 from studies.objects.subjects import SURFACE, find_subjects
 
 WIDTH = 400

@@ -25,7 +25,7 @@ from etsplat.io.mesh_files import load_mesh
 from etsplat.metrics.geometry import chamfer_exact, exact_squared_distances, sample_pair
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.sources import load_source, make_subject
-from etsplat.tasks.starts import Hull, finer_shape, plain_hull
+from etsplat.tasks.starting_hull import Hull, finer_shape, plain_hull
 from studies.objects.subjects import Subject, find_subjects
 
 SAMPLES = 20_000

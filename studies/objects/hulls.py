@@ -15,7 +15,7 @@ from etsplat.model.triangle_mesh import TriangleMesh
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.scoring import Scorer
 from etsplat.tasks.sources import load_source, make_subject
-from etsplat.tasks.starts import plain_hull
+from etsplat.tasks.starting_hull import plain_hull
 from studies.grid.writing import write_text
 from studies.objects.subjects import Subject
 

@@ -18,6 +18,7 @@ from etsplat.data.false_handles import (
     _cut,
     _fills,
     _simpler,
+    _Views,
     silhouette_errors,
     without_false_handles,
 )
@@ -120,7 +121,7 @@ def test_a_small_hole_that_light_comes_through_stays_whatever_photos_say() -> No
     score = ((truth[0] - middle)[:, :2].norm(dim=1) > (rim - middle).norm()).float()
     seen = torch.zeros(len(score), dtype=torch.bool)
     most = silhouette_errors(photos, *truth) + torch.tensor([_LOST, _ADDED])
-    assert _simpler(photos, *truth, (score, seen), 0.5, most) is None
+    assert _simpler(_Views.of(photos), *truth, (score, seen), 0.5, most) is None
 
 
 def perforated(places: np.ndarray) -> np.ndarray:
@@ -155,7 +156,8 @@ def test_what_one_mask_shows_through_a_surface_may_be_a_fault_of_it(masks: int, 
     through = [not bool(_covered([photo], *before)[0][speck_at(photo, middle)].any()) for photo in photos]
     for photo in [photo for photo, seen in zip(photos, through, strict=True) if seen][:masks]:
         photo.pixels[0, 3][speck_at(photo, middle)] = 0
-    assert _fills(photos, before, after) == fills
+    covered = [_covered(photos, *each) for each in (before, after)]
+    assert _fills(_Views.of(photos), before, *covered) == fills
 
 
 def speck_at(photo: Photo, place: torch.Tensor) -> tuple[slice, slice]:
@@ -185,7 +187,7 @@ def test_a_post_is_not_cut_where_its_plate_hides_the_gap() -> None:
     foot &= (places[:, [0, 2]].norm(dim=1) - 0.35).abs() < 0.1
     most = silhouette_errors(photos, vertices, faces) + torch.tensor([_LOST, _ADDED])
     agreed = (~foot).float(), torch.zeros(len(vertices), dtype=torch.bool)
-    assert _simpler(photos, vertices, faces, agreed, 0.5, most) is None
+    assert _simpler(_Views.of(photos), vertices, faces, agreed, 0.5, most) is None
 
 
 def bridged(places: np.ndarray) -> np.ndarray:
@@ -198,7 +200,7 @@ def bridged(places: np.ndarray) -> np.ndarray:
 def cut(photos: list[Photo], vertices: torch.Tensor, faces: torch.Tensor, agreed: Agreement) -> Surface:
     """A surface without what `_cut` cuts, or as it was."""
     most = silhouette_errors(photos, vertices, faces) + torch.tensor([0, _BLOCKED])
-    return _cut(photos, vertices, faces, agreed, most) or (vertices, faces)
+    return _cut(_Views.of(photos), vertices, faces, agreed, most) or (vertices, faces)
 
 
 @pytest.mark.parametrize(("shown", "holes"), [(bowl, 0), (bridged, 1)])

@@ -83,16 +83,17 @@ def without_false_handles(
     photos = photos_of(dataset)
     if len(photos) < 2:
         return vertices, faces
+    views = _Views.of(photos)
     most = silhouette_errors(photos, vertices, faces) + torch.tensor([_LOST, _ADDED])
     agreed = _agreement(photos, vertices, faces)
     for level in _LEVELS:
-        while (simpler := _simpler(photos, vertices, faces, agreed, level, most)) is not None:
+        while (simpler := _simpler(views, vertices, faces, agreed, level, most)) is not None:
             vertices, faces = simpler
             if not any(genera(faces, len(vertices))):
                 return vertices, faces
             agreed = _agreement(photos, vertices, faces)
     most = silhouette_errors(photos, vertices, faces) + torch.tensor([0, _BLOCKED])
-    while (simpler := _cut(photos, vertices, faces, agreed, most)) is not None:
+    while (simpler := _cut(views, vertices, faces, agreed, most)) is not None:
         vertices, faces = simpler
         if not any(genera(faces, len(vertices))):
             break
@@ -100,20 +101,50 @@ def without_false_handles(
     return vertices, faces
 
 
+class _Hole(NamedTuple):
+    """A hole in a silhouette.
+
+    Attributes:
+        place: (2,) farthest within, column and row.
+        depth: pixels from there to its rim.
+        pixels: that show the background alone.
+    """
+
+    place: Float[Tensor, "2"]
+    depth: float
+    pixels: int
+
+
+class _Views(NamedTuple):
+    """Photos that look at a surface.
+
+    Attributes:
+        photos: them.
+        holes: of each, those in its silhouette.
+    """
+
+    photos: list[Photo]
+    holes: list[list[_Hole]]
+
+    @classmethod
+    def of(cls, photos: list[Photo]) -> "_Views":
+        return cls(photos, [_holes(photo) for photo in photos])
+
+
 def _cut(
-    photos: list[Photo], vertices: Tensor, faces: Tensor, agreed: tuple[Tensor, Tensor], most: Tensor
+    views: _Views, vertices: Tensor, faces: Tensor, agreed: tuple[Tensor, Tensor], most: Tensor
 ) -> tuple[Tensor, Tensor] | None:
     """The surface cut along a short loop, with a smaller genus, if there is one: the shortest is tried first.
 
     Args:
-        photos: all that look.
+        views: all that look.
         vertices: (V, 3).
         faces: (F, 3), with a handle.
         agreed: from `_agreement`.
         most: (B, 2) errors of silhouettes that are allowed.
     """
     before, (score, hidden), least = genera(faces, len(vertices)), agreed, _smallest(faces, len(vertices))
-    tried = torch.zeros(len(vertices), dtype=torch.bool)
+    was, tried = None, torch.zeros(len(vertices), dtype=torch.bool)
     for loop in short_loops(vertices, faces):
         if len(loop) > _THIN or 2 * int(tried[loop].sum()) > len(loop):
             continue
@@ -127,10 +158,13 @@ def _cut(
         after = genera(found[1], len(found[0]))
         if sum(after) >= sum(before) or len(after) != len(before):
             continue
-        kept = (bool((silhouette_errors([p], *found) <= limit).all()) for p, limit in zip(photos, most, strict=True))
-        if not all(kept) or _fills(photos, (vertices, faces), found):
+        covered = _covered_within(views.photos, *found, most)
+        if covered is None:
             continue
-        if doubted or not _lets_go(photos, (vertices, faces), found):
+        was = was or _covered(views.photos, vertices, faces)
+        if _fills(views, (vertices, faces), was, covered):
+            continue
+        if doubted or not _lets_go(views, (vertices, faces), found):
             return found
     return None
 
@@ -154,13 +188,13 @@ def _agreement(photos: list[Photo], vertices: Tensor, faces: Tensor) -> tuple[Fl
 
 
 def _simpler(
-    photos: list[Photo], vertices: Tensor, faces: Tensor, agreed: tuple[Tensor, Tensor], level: float, most: Tensor
+    views: _Views, vertices: Tensor, faces: Tensor, agreed: tuple[Tensor, Tensor], level: float, most: Tensor
 ) -> tuple[Tensor, Tensor] | None:
     """The surface with a smaller genus, if there is one: the largest region is tried first. Arguments as of `_cut`."""
     before, (score, _), least = genera(faces, len(vertices)), agreed, _smallest(faces, len(vertices))
     low, unseen = score < level, score.isnan()
     edges = MeshTopology.from_faces(faces, len(vertices)).edges.long()
-    was, deep = None, _DEEP * mean_edge(vertices, edges) / pixel_size(photos)
+    was, deep = None, _DEEP * mean_edge(vertices, edges) / pixel_size(views.photos)
     # Of most posts photos see one side. With the other they are handles, but what is not seen may join several.
     regions = _regions(faces, low[faces].all(dim=1))
     hidden = _regions(faces, (low | unseen)[faces].all(dim=1))
@@ -169,12 +203,14 @@ def _simpler(
         after = genera(found[1], len(found[0]))
         if sum(after) >= sum(before) or len(after) != len(before):
             continue
-        covered = _covered(photos, *found)
-        if bool((_errors(photos, covered) <= most).all()):
-            was = was or _covered(photos, vertices, faces)
-            closes = _closes(photos, was, covered, deep) or _fills(photos, (vertices, faces), found)
-            if not closes and not _lets_go(photos, (vertices, faces), found):
-                return found
+        covered = _covered_within(views.photos, *found, most)
+        if covered is None:
+            continue
+        was = was or _covered(views.photos, vertices, faces)
+        if _closes(views.photos, was, covered, deep) or _fills(views, (vertices, faces), was, covered):
+            continue
+        if not _lets_go(views, (vertices, faces), found):
+            return found
     return None
 
 
@@ -193,33 +229,40 @@ def _closes(photos: list[Photo], was: list[Tensor], covered: list[Tensor], deep:
     return False
 
 
-def _fills(photos: list[Photo], before: tuple[Tensor, Tensor], after: tuple[Tensor, Tensor]) -> bool:
+def _fills(views: _Views, before: tuple[Tensor, Tensor], was: list[Tensor], covered: list[Tensor]) -> bool:
     """Whether the surface went around a hole of a silhouette, and now covers it.
 
     A hole of a few pixels is little of a silhouette, and may be a fault of a mask, unless more photos show one.
+
+    Args:
+        views: all that look.
+        before: the surface as it was.
+        was: what it covered.
+        covered: what it covers now.
     """
     edges, told = _edges(before[1], len(before[0])), []
-    for photo, was, covered in zip(photos, _covered(photos, *before), _covered(photos, *after), strict=True):
-        places, new, pixels = photo.pixel_places(before[0]), covered & ~was, 0
-        for hole in _holes(photo):
-            column, row = hole.place.long().tolist()
-            if new[row, column] and winds_around(places, edges, hole.place):
-                if hole.depth > _SHOWN:
-                    return True
-                pixels += hole.pixels
-        told += [pixels] if pixels else []
+    for photo, holes, old, now in zip(*views, was, covered, strict=True):
+        new = now & ~old
+        filled = [hole for hole in holes if new[tuple(hole.place.long().tolist()[::-1])]]
+        if not filled:
+            continue
+        places = photo.pixel_places(before[0])
+        lost = [hole for hole in filled if winds_around(places, edges, hole.place)]
+        if any(hole.depth > _SHOWN for hole in lost):
+            return True
+        told += [sum(hole.pixels for hole in lost)] if lost else []
     return len(told) >= _TOLD and sum(told) >= _PIXELS
 
 
-def _lets_go(photos: list[Photo], before: tuple[Tensor, Tensor], after: tuple[Tensor, Tensor]) -> bool:
+def _lets_go(views: _Views, before: tuple[Tensor, Tensor], after: tuple[Tensor, Tensor]) -> bool:
     """Whether the surface went around a hole of a silhouette, and does not any more.
 
     Where the matter beside a hole is cut, and another part hides the gap, no silhouette misses anything.
     """
     edges = [_edges(faces, len(vertices)) for vertices, faces in (before, after)]
-    for photo in photos:
+    for photo, holes in zip(*views, strict=True):
         places = [photo.pixel_places(vertices) for vertices, _ in (before, after)]
-        for hole in (each.place for each in _holes(photo) if each.depth > _SHOWN):
+        for hole in (each.place for each in holes if each.depth > _SHOWN):
             if winds_around(places[0], edges[0], hole) and not winds_around(places[1], edges[1], hole):
                 return True
     return False
@@ -227,20 +270,6 @@ def _lets_go(photos: list[Photo], before: tuple[Tensor, Tensor], after: tuple[Te
 
 def _edges(faces: Tensor, num_vertices: int) -> Int64[Tensor, "E 2"]:
     return MeshTopology.from_faces(faces, num_vertices).edges.long()
-
-
-class _Hole(NamedTuple):
-    """A hole in a silhouette.
-
-    Attributes:
-        place: (2,) farthest within, column and row.
-        depth: pixels from there to its rim.
-        pixels: that show the background alone.
-    """
-
-    place: Float[Tensor, "2"]
-    depth: float
-    pixels: int
 
 
 def _holes(photo: Photo) -> list[_Hole]:
@@ -287,6 +316,18 @@ def silhouette_errors(photos: list[Photo], vertices: Tensor, faces: Tensor) -> F
 def _covered(photos: list[Photo], vertices: Tensor, faces: Tensor) -> list[Bool[Tensor, "H W"]]:
     """Of each view, the pixels that a surface covers."""
     return [first_hits(photo, vertices, faces)[1] >= 0 for photo in photos]
+
+
+def _covered_within(
+    photos: list[Photo], vertices: Tensor, faces: Tensor, most: Float[Tensor, "B 2"]
+) -> list[Bool[Tensor, "H W"]] | None:
+    """As `_covered`; None where the errors of a silhouette are larger than allowed: one photo is enough to say so."""
+    covered = []
+    for photo, limit in zip(photos, most, strict=True):
+        covered += _covered([photo], vertices, faces)
+        if bool((_errors([photo], covered[-1:]) > limit).any()):
+            return None
+    return covered
 
 
 def _errors(photos: list[Photo], covered: list[Tensor]) -> Float[Tensor, "B 2"]:

@@ -57,7 +57,8 @@ from etsplat.tasks.reconstruct_schedule import held_from, make_schedule, outline
 from etsplat.tasks.running import Job, Result, path_of, settings_for, terms_of
 from etsplat.tasks.scoring import Scorer, load_lpips
 from etsplat.tasks.sources import Source, directions_digest, fingerprint, load_source, make_subject
-from etsplat.tasks.starts import Cut, Started, doubtful_start, finer_shape, load_start, make_start, nearby, within_need
+from etsplat.tasks.starting_hull import finer_shape
+from etsplat.tasks.starts import Cut, Started, doubtful_start, load_start, make_start, nearby, within_need
 from etsplat.tasks.texturing import check_installed
 
 DEPTHS_NEAR, DEPTHS_FAR = 0.02, 0.15

@@ -7,10 +7,8 @@ from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn.functional import max_pool2d
 
-from etsplat.core.errors import InputError
-from etsplat.data.agreement import Photo, first_hits, photos_of
+from etsplat.data.agreement import photos_of
 from etsplat.data.dataset import Dataset
 from etsplat.data.false_handles import silhouette_errors, without_false_handles
 from etsplat.data.hollows import Opened, open_hollows
@@ -18,10 +16,9 @@ from etsplat.data.kept import keeping
 from etsplat.data.lids import without_lids
 from etsplat.data.plain_sides import with_flat_sides
 from etsplat.data.silhouettes import silhouette, touches_border
-from etsplat.data.visual_hull import NEAR, Distance, visual_hull
+from etsplat.data.visual_hull import Distance, visual_hull
 from etsplat.data.walls import between_walls
 from etsplat.geometry.icosphere import icosphere
-from etsplat.geometry.parts import Shape, shape_of
 from etsplat.geometry.topology import MeshTopology
 from etsplat.geometry.untangle import untangle
 from etsplat.io.mesh_files import MeshFile, load_exported, weld_vertices
@@ -31,6 +28,7 @@ from etsplat.optim.loop import Event, NoteEvent, StageEvent
 from etsplat.tasks.coarse_soup import seen_through
 from etsplat.tasks.judgement import CONTRADICTED, Start
 from etsplat.tasks.reconstruct_config import ReconstructConfig
+from etsplat.tasks.starting_hull import Hull, contoured, hull_faces, most_faces, plain_hull, uncovered
 
 _LOST = 0.05
 """The part of silhouettes that a hull may leave uncovered, in the mean, where most photos cut the object off: less than
@@ -49,19 +47,6 @@ _BESIDE, _OTHER_SIZE = 1.0, 4.0
 """A given mesh is doubted that is farther from the object than that, in radii of the larger one, or so many times as
 large or small: of half the diagonal of its box."""
 
-_UNCOVERED, _LESS = 0.0005, 0.9
-"""A hull that leaves more of the silhouettes uncovered lacks thin parts if a finer one leaves at most so many times as
-much: what rough masks leave does not depend on how fine it is."""
-
-_LACKING, _WIRES, _FINEST = 0.005, 0.02, 4
-"""Where a hull leaves more than the first of the silhouettes uncovered, one is tried that has thin parts whole, and if
-that is no better one of up to so many times as many faces: around wires they are small. Where it leaves more than the
-second, that is tried at once."""
-
-_THIN = 0.5
-"""It is taken if it differs from silhouettes in at most so many times as many pixels: gaps beside thin parts may close
-by it."""
-
 _MARGINS = (0.05, 0.03, 0.08)
 """How far in front of what a coarse soup shows a hull is cut, in units of the object's radius; in turn, until photos
 contradict it no more. Nearer takes away what is thin, farther leaves more of a lid to be pushed in."""
@@ -77,24 +62,6 @@ of the silhouettes uncovered beside what the hull does: a little of a thin rim, 
 
 Cut = Literal["walls", "soup", False]
 """What a hull that photos contradict was cut open by: walls of one thickness, what a coarse soup shows, or nothing."""
-
-
-class Hull(NamedTuple):
-    """The visual hull, before false handles go and hollows are opened.
-
-    Attributes:
-        vertices: (V, 3), in the unit frame.
-        faces: (F, 3).
-        wanted: about how many faces it should have.
-        uncovered: the part of silhouettes that is more than a pixel beside what it covers, in the mean.
-        thin: whether it has parts that are thinner than its cells.
-    """
-
-    vertices: Tensor
-    faces: Tensor
-    wanted: int
-    uncovered: float
-    thin: bool = False
 
 
 class Started(NamedTuple):
@@ -171,28 +138,11 @@ def start_shape(config: ReconstructConfig, views: Dataset) -> Literal["sphere", 
 @torch.no_grad()
 def _explained(views: Dataset, config: ReconstructConfig) -> bool:
     """Whether the hull covers what photos show, though most of them cut it off."""
-    surface = visual_hull(views, _hull_faces(config), radius=config.start.radius)
+    surface = visual_hull(views, hull_faces(config), radius=config.start.radius)
     if len(surface[1]) == 0:
         return False
     lost, _ = silhouette_errors(photos_of(views), *surface).unbind(dim=1)
     return float(lost.mean()) <= _LOST
-
-
-def _carved(views: Dataset, faces: int, radius: float, *, thin: bool = False) -> Hull:
-    """A hull of about so many faces; where the silhouettes have no point in common it has none, and covers nothing."""
-    surface = visual_hull(views, faces, radius=radius, thin=thin)
-    return Hull(*surface, faces, _uncovered(photos_of(views), *surface) if len(surface[1]) else 1.0, thin)
-
-
-def _uncovered(photos: list[Photo], vertices: Tensor, faces: Tensor) -> float:
-    """The part of silhouettes that is more than a pixel beside what a surface covers, in the mean."""
-    found = []
-    for photo in photos:
-        covered = (first_hits(photo, vertices, faces)[1] >= 0).float()
-        near = max_pool2d(covered[None, None], 3, stride=1, padding=1)[0, 0]
-        alpha = photo.pixels[0, 3]
-        found.append(float((alpha > 0.95)[near == 0].sum() / (alpha > 0.5).sum().clamp_min(1)))
-    return sum(found) / max(1, len(found))
 
 
 @keeping()
@@ -278,16 +228,16 @@ def _cut_open(
 
     def cut(free: Distance, wanted: int) -> Opened:
         tell(StageEvent(stage := "Cutting the hull open", 0, 0))
-        surface = visual_hull(views, wanted, radius=config.start.radius, thin=hull.thin, free=free)
+        surface = contoured(views, wanted, config.start.radius, hull.grid, free)
         found = _opened(views, *surface, tell, stage) if len(surface[1]) else opened
-        covers = _uncovered(photos, found.vertices, found.faces) <= most
+        covers = uncovered(photos, found.vertices, found.faces) <= most
         return found if covers and len(found.faces) <= config.max_faces else opened
 
     best, by = opened, False
     tell(StageEvent("Looking for walls", 0, 0))
     walls = between_walls(views, with_flat_sides(views, opened.vertices, opened.faces), opened.faces)
     if walls is not None:
-        best = _clearer(cut(walls, min(2 * hull.wanted, _most_faces(config))), opened)
+        best = _clearer(cut(walls, min(2 * hull.wanted, most_faces(config))), opened)
         by = "walls" if best is not opened else False
     if best.contradicted > CONTRADICTED:
         part = f"{100 * opened.contradicted:.1f} % of its surface"
@@ -305,81 +255,6 @@ def _cut_open(
 def _clearer(cut: Opened, before: Opened) -> Opened:
     """The first, if photos contradict it clearly less."""
     return cut if cut.contradicted <= _CLEARLY * before.contradicted else before
-
-
-def _most_faces(config: ReconstructConfig) -> int:
-    """That a hull may be asked for, and not have more than a run may have."""
-    return round(config.max_faces / (1 + NEAR))
-
-
-@torch.no_grad()
-def plain_hull(views: Dataset, config: ReconstructConfig) -> Hull:
-    """The visual hull, with at most half of a run's faces; finer where thin parts of that one are broken or lacking.
-
-    Args:
-        views: of the unit frame.
-        config: how many faces are wanted, and how many there may be.
-
-    Raises:
-        InputError: the views have no masks, or masks that exclude everything.
-    """
-    if not views.has_masks:
-        raise InputError("start.shape: hull needs masks or transparent pictures; give masks, or start from a sphere")
-    wanted, radius = _hull_faces(config), config.start.radius
-    hull, most = _carved(views, wanted, radius), _most_faces(config)
-    if hull.uncovered > _UNCOVERED and most > wanted:
-        finer = _carved(views, min(2 * wanted, most), radius)
-        if len(finer.faces) <= config.max_faces and _mends(finer, hull):
-            return finer
-    if hull.uncovered > _LACKING:
-        least, enough = _differs(views, hull), min(_FINEST * wanted, most)
-        for faces in (wanted, enough) if hull.uncovered <= _WIRES else (enough,):
-            thin = _carved(views, faces, radius, thin=True)
-            if len(thin.faces) <= config.max_faces and _differs(views, thin) <= _THIN * least:
-                return thin
-    if len(hull.faces) == 0:
-        raise InputError(
-            "start.shape: the masks have no point in common, so there is no hull; check that masks are white inside the"
-            " object, that poses and images belong together, and that the object is no flat sheet, whose mask is empty"
-            " from its side: give it a thickness"
-        )
-    return hull
-
-
-def _hull_faces(config: ReconstructConfig) -> int:
-    return min(config.start.hull_faces, max(1, config.max_faces // 2))
-
-
-def _differs(views: Dataset, hull: Hull) -> float:
-    """The pixels that a hull should cover and does not, and the reverse, as a part of silhouettes, in the mean."""
-    if len(hull.faces) == 0:
-        return 1.0
-    return float(silhouette_errors(photos_of(views), hull.vertices, hull.faces).sum(dim=1).mean())
-
-
-def _mends(finer: Hull, hull: Hull) -> bool:
-    """Whether a finer hull covers all, and has fewer parts, or more holes: thin parts of the other one are broken."""
-    whole, broken = (shape_of(each.vertices, each.faces) for each in (finer, hull))
-    if finer.uncovered > _UNCOVERED or whole.parts is None or broken.parts is None:
-        return False
-    return whole.parts < broken.parts or (whole.parts == broken.parts and (whole.holes or 0) > (broken.holes or 0))
-
-
-@torch.no_grad()
-def finer_shape(hull: Hull, views: Dataset, radius: float) -> Shape | None:
-    """Parts and holes of a finer hull, if it covers what this one does not, and has others.
-
-    Args:
-        hull: from `plain_hull`.
-        views: of which it is.
-        radius: as `visual_hull` takes it.
-    """
-    if hull.uncovered <= _UNCOVERED:
-        return None
-    finer = _carved(views, 2 * hull.wanted, radius)
-    shape = shape_of(finer.vertices, finer.faces)
-    covers = finer.uncovered <= _LESS * hull.uncovered
-    return shape if covers and shape != shape_of(hull.vertices, hull.faces) else None
 
 
 def nearby(config: ReconstructConfig) -> ReconstructConfig:
