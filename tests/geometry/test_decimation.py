@@ -1,9 +1,14 @@
+import sys
+
 import pytest
 import torch
 
+from etsplat.core.errors import InputError
 from etsplat.geometry.decimation import decimated
 from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.topology import MeshTopology
+
+pytest.importorskip("fast_simplification")
 
 
 def test_a_sphere_keeps_its_shape_and_stays_closed_with_few_faces() -> None:
@@ -50,3 +55,9 @@ def test_wrong_arguments_are_named() -> None:
         decimated(vertices, faces, 3)
     with pytest.raises(ValueError, match="faces"):
         decimated(vertices[:3], faces, 10)
+
+
+def test_without_the_package_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "fast_simplification", None)
+    with pytest.raises(InputError, match=r"pip install 'etsplat\[texture\]'"):
+        decimated(*icosphere(2), 100)

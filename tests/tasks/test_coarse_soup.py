@@ -105,7 +105,7 @@ def test_no_start_has_more_faces_than_a_run_may_have(monkeypatch: pytest.MonkeyP
     assert len(faces) == 5120
     monkeypatch.setattr(starts, "between_walls", lambda *_: lambda points: points[:, 0] * 0 - 1)
     monkeypatch.setattr(starts, "seen_through", lambda *_: lambda points: points[:, 0] * 0 - 1)
-    monkeypatch.setattr(starts, "contoured", lambda *_: (vertices, faces))
+    monkeypatch.setattr(starts, "visual_hull", lambda *_, **others: (vertices, faces))
     monkeypatch.setattr(starts, "_opened", lambda _, v, f, *told: Opened(v, f, 0, 0.0, 1.0, 1.0))
     contradicted = Opened(vertices, faces[:1000], 0, 0.5, 1.0, 0.0)
     config = CONFIG.changed({"max_faces": most})
@@ -142,7 +142,7 @@ def test_a_soup_must_be_clearly_better_than_walls(
     vertices, faces = icosphere(4)
     monkeypatch.setattr(starts, "between_walls", lambda *_: lambda points: points[:, 0])
     monkeypatch.setattr(starts, "seen_through", lambda *_: lambda points: points[:, 0])
-    monkeypatch.setattr(starts, "contoured", lambda _, wanted, *others: (vertices, faces[:wanted]))
+    monkeypatch.setattr(starts, "visual_hull", lambda _, wanted, **others: (vertices, faces[:wanted]))
     shares = {2800: 0.1, 1400: soup}  # contradicted: of walls, which have twice the faces, and of the soup's cut
     monkeypatch.setattr(starts, "_opened", lambda _, v, f, *told: Opened(v, f, 0, shares[len(f)], 1.0, 1.0))
     contradicted, hull = Opened(vertices, faces, 0, 0.5, 1.0, 0.0), starts.Hull(vertices, faces, 1400, 1.0)

@@ -27,6 +27,7 @@ from helpers.captures import circle_poses, small_demo_scene, write_colmap
 from helpers.gltf import check_glb
 
 pytest.importorskip("xatlas")
+pytest.importorskip("fast_simplification")
 
 
 @pytest.fixture(scope="module")

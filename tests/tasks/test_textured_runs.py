@@ -23,6 +23,7 @@ from helpers.reconstructions import KilledError
 from helpers.torch_threads import on_each_count
 
 pytest.importorskip("xatlas")
+pytest.importorskip("fast_simplification")
 
 SHORT = ReconstructConfig.tiny().changed({"iterations": 20, "resolution": 32, "start.level": 3})
 TEXTURED = SHORT.changed({"texture": 64, "output.texture_faces": 200})

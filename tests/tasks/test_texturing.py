@@ -20,6 +20,7 @@ from etsplat.tasks.scoring import Scorer
 from etsplat.tasks.texturing import coarser, texture_object
 
 pytest.importorskip("xatlas")
+pytest.importorskip("fast_simplification")
 
 SIZE, FACES = 64, 300
 SCENE = tuple[MeshFile, Dataset]

@@ -1,6 +1,7 @@
 """Meshes of fewer faces, by collapsing edges at the least quadric error (fast-simplification)."""
 
-import fast_simplification
+from typing import Any
+
 import torch
 from jaxtyping import Float, Int, Int64
 from torch import Tensor
@@ -33,7 +34,7 @@ def decimated(
 
     Raises:
         ValueError: wrong shape, index or number.
-        InputError: the mesh does not come to so few without being torn.
+        InputError: fast-simplification is not installed; or a mesh does not come to so few without being torn.
     """
     check_shape("vertices", vertices, ("V", 3))
     check_shape("faces", faces, ("F", 3))
@@ -42,13 +43,12 @@ def decimated(
     vertices, faces = vertices.detach().cpu(), faces.detach().cpu().long()
     if len(faces) <= count:
         return vertices, faces
+    simplify = load_simplifier().simplify
     sound = _is_sound(faces, len(vertices))
     for haste in HASTES:
         target = count
         for _ in range(_TRIES):
-            points, triangles = fast_simplification.simplify(
-                vertices.numpy(), faces.int().numpy(), target_count=target, agg=haste
-            )[:2]
+            points, triangles = simplify(vertices.numpy(), faces.int().numpy(), target_count=target, agg=haste)
             found = torch.from_numpy(points).to(vertices), _clean(torch.from_numpy(triangles).long())
             whole = _repaired(*found) if sound else _compact(*found)
             if whole is None:
@@ -84,3 +84,12 @@ def _compact(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
     """Without vertices that no face uses."""
     used, compact = faces.unique(return_inverse=True)
     return vertices[used], compact
+
+
+def load_simplifier() -> Any:
+    """The package; InputError, which says how to install it, where it is missing."""
+    try:
+        import fast_simplification
+    except ImportError as error:
+        raise InputError("fewer faces need fast-simplification: pip install 'etsplat[texture]'") from error
+    return fast_simplification

@@ -158,7 +158,7 @@ def texture_mesh(
 ) -> TexturedMesh:
     """A light mesh of a reconstructed object: few faces under a texture, both fitted to the run's training photos.
 
-    Needs xatlas: pip install 'etsplat[texture]'.
+    Needs xatlas and fast-simplification: pip install 'etsplat[texture]'.
 
     Args:
         run: the result of `reconstruct`, or the directory of a finished run.

@@ -1,6 +1,6 @@
 """The visual hull that a reconstruction starts from: as fine as its thin parts need."""
 
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -10,8 +10,7 @@ from etsplat.core.errors import InputError
 from etsplat.data.agreement import Photo, first_hits, photos_of
 from etsplat.data.dataset import Dataset
 from etsplat.data.false_handles import silhouette_errors
-from etsplat.data.visual_hull import NEAR, Distance, visual_hull, without_specks
-from etsplat.geometry.decimation import decimated
+from etsplat.data.visual_hull import NEAR, visual_hull
 from etsplat.geometry.parts import Shape, shape_of
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 
@@ -24,16 +23,9 @@ _LACKING, _WIRES, _FINEST = 0.005, 0.02, 4
 that is no better one of up to so many times as many faces: around wires they are small. Where it leaves more than the
 second, that is tried at once."""
 
-_THIN, _FINE = 0.5, 60_000
+_THIN = 0.5
 """It is taken if it differs from silhouettes in at most so many times as many pixels: gaps beside thin parts may close
-by it. By one of so many faces, which is decimated then, fewer close: that is taken by the same measure, beside one with
-thin parts and as many faces."""
-
-_BIT = 12
-"""Parts of fewer faces than that which decimation leaves are bits of what it pinched off."""
-
-Grid = Literal["plain", "thin", "fine"]
-"""How a hull is contoured: as it is; with parts whole that are thinner than cells; or so from many more, decimated."""
+by it."""
 
 
 class Hull(NamedTuple):
@@ -44,14 +36,14 @@ class Hull(NamedTuple):
         faces: (F, 3).
         wanted: about how many faces it should have.
         uncovered: the part of silhouettes that is more than a pixel beside what it covers, in the mean.
-        grid: the one that it comes from.
+        thin: whether it has parts that are thinner than its cells.
     """
 
     vertices: Tensor
     faces: Tensor
     wanted: int
     uncovered: float
-    grid: Grid = "plain"
+    thin: bool = False
 
 
 @torch.no_grad()
@@ -86,16 +78,12 @@ def plain_hull(views: Dataset, config: ReconstructConfig) -> Hull:
 
 def _with_thin_parts(views: Dataset, hull: Hull, config: ReconstructConfig) -> Hull | None:
     """A hull whose thin parts are whole, if that fits silhouettes clearly better."""
-    wanted, radius, most = hull.wanted, config.start.radius, _THIN * _differs(views, hull)
-    few = many = _carved(views, wanted, radius, "thin")
-    differs = few_differ = _differs(views, few)
-    if hull.uncovered > _WIRES or differs > most:
-        many = _carved(views, min(_FINEST * wanted, most_faces(config)), radius, "thin")
-        differs = _differs(views, many)
-    if len(many.faces) > config.max_faces or differs > most:
-        return None
-    fine = _carved(views, wanted, radius, "fine")
-    return fine if _differs(views, fine) <= _THIN * few_differ else many
+    most, enough = _THIN * _differs(views, hull), min(_FINEST * hull.wanted, most_faces(config))
+    for faces in (hull.wanted, enough) if hull.uncovered <= _WIRES else (enough,):
+        thin = _carved(views, faces, config.start.radius, thin=True)
+        if len(thin.faces) <= config.max_faces and _differs(views, thin) <= most:
+            return thin
+    return None
 
 
 def hull_faces(config: ReconstructConfig) -> int:
@@ -140,21 +128,10 @@ def most_faces(config: ReconstructConfig) -> int:
     return round(config.max_faces / (1 + NEAR))
 
 
-def _carved(views: Dataset, faces: int, radius: float, grid: Grid = "plain") -> Hull:
+def _carved(views: Dataset, faces: int, radius: float, *, thin: bool = False) -> Hull:
     """A hull of about so many faces; where the silhouettes have no point in common it has none, and covers nothing."""
-    surface = contoured(views, faces, radius, grid)
-    return Hull(*surface, faces, uncovered(photos_of(views), *surface) if len(surface[1]) else 1.0, grid)
-
-
-def contoured(
-    views: Dataset, faces: int, radius: float, grid: Grid, free: Distance | None = None
-) -> tuple[Tensor, Tensor]:
-    """The surface of a hull, as `visual_hull` has it."""
-    count = _FINE if grid == "fine" else faces
-    surface = visual_hull(views, count, radius=radius, free=free, thin=grid != "plain")
-    if grid != "fine" or len(surface[1]) <= faces:
-        return surface
-    return without_specks(*decimated(*surface, faces), least=_BIT)  # what is decimated leaves bits where it pinches
+    surface = visual_hull(views, faces, radius=radius, thin=thin)
+    return Hull(*surface, faces, uncovered(photos_of(views), *surface) if len(surface[1]) else 1.0, thin)
 
 
 def uncovered(photos: list[Photo], vertices: Tensor, faces: Tensor) -> float:

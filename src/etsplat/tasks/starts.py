@@ -28,7 +28,7 @@ from etsplat.optim.loop import Event, NoteEvent, StageEvent
 from etsplat.tasks.coarse_soup import seen_through
 from etsplat.tasks.judgement import CONTRADICTED, Start
 from etsplat.tasks.reconstruct_config import ReconstructConfig
-from etsplat.tasks.starting_hull import Hull, contoured, hull_faces, most_faces, plain_hull, uncovered
+from etsplat.tasks.starting_hull import Hull, hull_faces, most_faces, plain_hull, uncovered
 
 _LOST = 0.05
 """The part of silhouettes that a hull may leave uncovered, in the mean, where most photos cut the object off: less than
@@ -228,7 +228,7 @@ def _cut_open(
 
     def cut(free: Distance, wanted: int) -> Opened:
         tell(StageEvent(stage := "Cutting the hull open", 0, 0))
-        surface = contoured(views, wanted, config.start.radius, hull.grid, free)
+        surface = visual_hull(views, wanted, radius=config.start.radius, thin=hull.thin, free=free)
         found = _opened(views, *surface, tell, stage) if len(surface[1]) else opened
         covers = uncovered(photos, found.vertices, found.faces) <= most
         return found if covers and len(found.faces) <= config.max_faces else opened

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from etsplat.data.dataset import Dataset, middles_of
 from etsplat.engines.threads import num_threads
-from etsplat.geometry.decimation import decimated
+from etsplat.geometry.decimation import decimated, load_simplifier
 from etsplat.geometry.distance import closest_places, closest_points
 from etsplat.geometry.held_back import around_folds
 from etsplat.geometry.topology import MeshTopology
@@ -76,6 +76,7 @@ Tell = Callable[[str, int, int], None]
 
 def check_installed() -> None:
     """Raises InputError where a package is missing; better now than after a run."""
+    load_simplifier()
     load_xatlas()
 
 
