@@ -14,12 +14,14 @@ from etsplat.data.dataset import Dataset
 from etsplat.data.hollows import Opened
 from etsplat.data.photograph import photograph
 from etsplat.data.pictures import StoredPictures
+from etsplat.data.visual_hull import visual_hull
 from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.parts import Shape, genera, shape_of
 from etsplat.io.mesh_files import MeshFile
 from etsplat.io.run_directory import RunDirectory
 from etsplat.model.triangle_mesh import TriangleMesh
 from etsplat.optim.loop import Event, NoteEvent
+from etsplat.tasks import starting_hull
 from etsplat.tasks.judgement import CONTRADICTED, expect_hull
 from etsplat.tasks.reconstruct import reconstruct
 from etsplat.tasks.reconstruct_config import ReconstructConfig
@@ -119,6 +121,36 @@ def test_of_wires_that_no_grid_of_a_run_holds_a_hull_with_thin_parts_is_taken() 
     assert found.uncovered < 0.0005
     assert hull_shape(found) == Shape(1, 1)
     assert finer_shape(found, views, config.start.radius) is None
+
+
+def plate_of(thickness: float) -> MeshFile:
+    plate = trimesh.creation.box((1.8, 1.8, thickness))
+    return MeshFile(torch.from_numpy(plate.vertices.copy()).float(), torch.from_numpy(plate.faces.copy()).long())
+
+
+def test_a_plate_has_a_hull_although_masks_are_empty_from_its_side() -> None:
+    """It is half a pixel thick there, and thinner than cells."""
+    views = photograph(plate_of(0.02), 128, 128)
+    config = ReconstructConfig.quick().changed({"start.hull_faces": 2000, "max_faces": 4000})
+    found = plain_hull(views, config)
+    assert found.thin
+    assert found.uncovered < 0.0005
+    assert hull_shape(found) == Shape(1, 0)
+
+
+def test_a_hull_has_no_more_faces_than_a_run_may_have(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A plate that only a fine grid saw began with 53,836 of 25,000, was never divided, and cut through itself."""
+    views = photograph(plate_of(0.03), 128, 128)
+    config = ReconstructConfig.quick().changed({"start.hull_faces": 2000, "max_faces": 4000})
+
+    def found_late(views: Dataset, faces: int, *, radius: float, thin: bool) -> tuple[torch.Tensor, torch.Tensor]:
+        return visual_hull(views, faces if thin else 6000, radius=radius, thin=thin)
+
+    monkeypatch.setattr(starting_hull, "visual_hull", found_late)
+    found = plain_hull(views, config)
+    assert found.thin
+    assert len(found.faces) <= 4000
+    assert hull_shape(found) == Shape(1, 0)
 
 
 def rodded(*places: float) -> MeshFile:

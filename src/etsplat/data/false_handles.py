@@ -336,5 +336,5 @@ def _errors(photos: list[Photo], covered: list[Tensor]) -> Float[Tensor, "B 2"]:
     for photo, drawn in zip(photos, covered, strict=True):
         alpha = photo.pixels[0, 3]
         lost, added = ~drawn & (alpha > 0.95), drawn & (alpha < _BESIDE)
-        found.append(torch.stack([lost.sum(), added.sum()]) / (alpha > 0.5).sum())
+        found.append(torch.stack([lost.sum(), added.sum()]) / (alpha > 0.5).sum().clamp_min(1))
     return torch.stack(found)

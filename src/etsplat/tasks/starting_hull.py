@@ -65,8 +65,9 @@ def plain_hull(views: Dataset, config: ReconstructConfig) -> Hull:
         finer = _carved(views, min(2 * wanted, most), radius)
         if len(finer.faces) <= config.max_faces and _mends(finer, hull):
             return finer
-    if hull.uncovered > _LACKING and (thin := _with_thin_parts(views, hull, config)) is not None:
-        return thin
+    if hull.uncovered > _LACKING or len(hull.faces) > config.max_faces:
+        if (thin := _with_thin_parts(views, hull, config)) is not None:
+            return thin
     if len(hull.faces) == 0:
         raise InputError(
             "start.shape: the masks have no point in common, so there is no hull; check that masks are white inside the"
@@ -77,8 +78,13 @@ def plain_hull(views: Dataset, config: ReconstructConfig) -> Hull:
 
 
 def _with_thin_parts(views: Dataset, hull: Hull, config: ReconstructConfig) -> Hull | None:
-    """A hull whose thin parts are whole, if that fits silhouettes clearly better."""
+    """A hull whose thin parts are whole, if that fits silhouettes clearly better.
+
+    Or nearly as well, where all is so thin that only a grid finer than a run may have sees it.
+    """
     most, enough = _THIN * _differs(views, hull), min(_FINEST * hull.wanted, most_faces(config))
+    if len(hull.faces) > config.max_faces:
+        most += _LACKING
     for faces in (hull.wanted, enough) if hull.uncovered <= _WIRES else (enough,):
         thin = _carved(views, faces, config.start.radius, thin=True)
         if len(thin.faces) <= config.max_faces and _differs(views, thin) <= most:
