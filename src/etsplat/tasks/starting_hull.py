@@ -65,9 +65,9 @@ def plain_hull(views: Dataset, config: ReconstructConfig) -> Hull:
         finer = _carved(views, min(2 * wanted, most), radius)
         if len(finer.faces) <= config.max_faces and _mends(finer, hull):
             return finer
-    if hull.uncovered > _LACKING or len(hull.faces) > config.max_faces:
-        if (thin := _with_thin_parts(views, hull, config)) is not None:
-            return thin
+    unfit = hull.uncovered > _LACKING or len(hull.faces) > config.max_faces
+    if unfit and (thin := _with_thin_parts(views, hull, config)) is not None:
+        return thin
     if len(hull.faces) == 0:
         raise InputError(
             "start.shape: the masks have no point in common, so there is no hull; check that masks are white inside the"
