@@ -2,6 +2,7 @@
 
 import math
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from PIL import Image
 
 from etsplat.core.cameras import camera_centers
 from etsplat.core.errors import InputError
+from etsplat.data import colmap_process
 from etsplat.data.load import load_dataset
 from etsplat.data.structure_from_motion import find_cameras
 from helpers.captures import write_photo
@@ -174,3 +176,26 @@ def test_photos_from_hardly_different_places_are_placed(tmp_path):
     capture = load_dataset(found.scene)
     truth = torch.tensor([(*center, 0.0) for center in centers])
     assert distances_agree(camera_centers(capture.viewmats), truth)
+
+
+@pytest.mark.parametrize(("in_order", "widens", "every_pair"), [(4, True, True), (4, False, False), (6, True, False)])
+def test_every_pair_is_compared_where_the_order_of_names_says_little(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, in_order: int, widens: bool, every_pair: bool
+) -> None:
+    """Of 135 photos by as many people 4 were placed, whatever they showed."""
+    colmap, names = MagicMock(), [f"{index}.jpg" for index in range(12)]
+    monkeypatch.setattr(colmap_process, "import_pycolmap", lambda: colmap)
+    written = []
+
+    def models(*_: object, **__: object) -> dict[int, MagicMock]:
+        found = MagicMock()
+        found.num_reg_images.return_value = placed = 12 if colmap.match_exhaustive.called else in_order
+        found.write.side_effect = lambda _: written.append(placed)
+        return {0: found}
+
+    colmap.incremental_mapping.side_effect = models
+    job = colmap_process.Job(tmp_path, [names], tmp_path, False, widens, "incremental", 640, 1, None)
+    assert colmap_process.place_photos(lambda *_: None, job) == tmp_path / "largest"
+    assert colmap.match_sequential.called
+    assert colmap.match_exhaustive.called == every_pair
+    assert written == [12 if every_pair else in_order]

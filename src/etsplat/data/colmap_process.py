@@ -9,7 +9,7 @@ import os
 import signal
 import sqlite3
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -37,6 +37,10 @@ SMALL_ANGLE = 4.0
 """Degrees between the rays of the two photos that a second beginning is content with.
 
 COLMAP wants 16, by a focal length that is at first a guess: a camera that hardly moves never shows as much."""
+
+LEAST_IN_ORDER = 0.5
+"""Where fewer are placed by comparing those near in order of names, that order says little, as of photos by many
+people: every pair is compared."""
 
 NEIGHBOURS = 15
 """Photos on either side, in order of names, that one is compared with where not every pair is."""
@@ -155,6 +159,7 @@ class Job:
         cameras: names of photos in it, those with one camera together.
         work: folder for the database and the models.
         exhaustive: whether every pair is compared; else those near in order of names.
+        widens: whether every pair is where these say too little.
         mapper: cameras one after the other, or all at once.
         max_size: features are looked for in pictures that are no longer than so many pixels.
         threads: -1 for all cores.
@@ -165,6 +170,7 @@ class Job:
     cameras: list[list[str]]
     work: Path
     exhaustive: bool
+    widens: bool
     mapper: Mapper
     max_size: int
     threads: int
@@ -181,9 +187,12 @@ def place_photos(report: Report, job: Job) -> Path | None:
     pycolmap = import_pycolmap()
     database = job.work / "database.db"
     _find_features(pycolmap, database, job, report)
+    place = _place_all if job.mapper == "global" else _place_one_by_one
     _compare(pycolmap, database, job, report)
-    (job.work / "models").mkdir()
-    models = (_place_all if job.mapper == "global" else _place_one_by_one)(pycolmap, database, job, report)
+    models = place(pycolmap, database, job, _made(job.work / "models"), report)
+    if job.widens and not job.exhaustive and _most_placed(models) < LEAST_IN_ORDER * len(job.names):
+        _compare(pycolmap, database, replace(job, exhaustive=True), report)
+        models += place(pycolmap, database, job, _made(job.work / "models_of_all_pairs"), report)
     largest = max(models, key=_placed, default=None)
     if largest is None:
         return None
@@ -193,6 +202,10 @@ def place_photos(report: Report, job: Job) -> Path | None:
 
 def _placed(model: Any) -> int:
     return model.num_reg_images()
+
+
+def _most_placed(models: list[Any]) -> int:
+    return max(map(_placed, models), default=0)
 
 
 def _find_features(pycolmap: Any, database: Path, job: Job, report: Report) -> None:
@@ -231,7 +244,7 @@ def _compare(pycolmap: Any, database: Path, job: Job, report: Report) -> None:
     report("Comparing photos", pairs, pairs)
 
 
-def _place_one_by_one(pycolmap: Any, database: Path, job: Job, report: Report) -> list[Any]:
+def _place_one_by_one(pycolmap: Any, database: Path, job: Job, folder: Path, report: Report) -> list[Any]:
     """Models of all beginnings that were tried: with other angles, at last with focal lengths from pairs of photos."""
     count, models = len(job.names), []
     for attempt, (angle, calibrated) in enumerate(((None, False), (SMALL_ANGLE, False), (SMALL_ANGLE, True))):
@@ -241,11 +254,10 @@ def _place_one_by_one(pycolmap: Any, database: Path, job: Job, report: Report) -
         if angle is not None:
             options.mapper.init_min_tri_angle = angle
         progress = _Placing(report, count)
-        folder = _made(job.work / "models" / str(attempt))
         models += pycolmap.incremental_mapping(
-            database, job.photos, folder, options=options, next_image_callback=progress
+            database, job.photos, _made(folder / str(attempt)), options=options, next_image_callback=progress
         ).values()
-        if max(map(_placed, models), default=0) >= LEAST_PLACED * count:
+        if _most_placed(models) >= LEAST_PLACED * count:
             break
     return models
 
@@ -262,11 +274,11 @@ class _Placing:
         self.report("Placing cameras", min(self.placed, self.count), self.count)
 
 
-def _place_all(pycolmap: Any, database: Path, job: Job, report: Report) -> list[Any]:
+def _place_all(pycolmap: Any, database: Path, job: Job, folder: Path, report: Report) -> list[Any]:
     report("Placing all cameras at once", 0, 0)
     _calibrate(pycolmap, database)
     options = pycolmap.GlobalPipelineOptions(num_threads=job.threads)
-    return list(pycolmap.global_mapping(database, job.photos, job.work / "models", options).values())
+    return list(pycolmap.global_mapping(database, job.photos, folder, options).values())
 
 
 def _calibrate(pycolmap: Any, database: Path) -> bool:

@@ -10,7 +10,7 @@ the shortest loops that bound no disc are looked at: what is as thin as a few ed
 and closed by two discs, if photos contradict each other along the loop, or too few see it to say, and no silhouette
 needs it. Where all of a handle is as small as that, photos that agree only say that something is near.
 
-Neither may cover a hole of a silhouette that the surface goes around, however small it is.
+Neither may cover a hole, however small, that the surface goes around and photos see the background through.
 """
 
 from typing import NamedTuple
@@ -48,7 +48,7 @@ _SHOWN = 2
 """Pixels from its rim to the middle of a hole in a silhouette that is no fault of a mask."""
 
 _TOLD, _PIXELS = 2, 6
-"""So many photos that show smaller ones, by so many pixels together, are right about them."""
+"""So many photos that show a hole, by so many pixels together, are right about it: one mask may be at fault."""
 
 _BESIDE = 0.05
 """Alpha of what is certainly beside a silhouette."""
@@ -230,9 +230,7 @@ def _closes(photos: list[Photo], was: list[Tensor], covered: list[Tensor], deep:
 
 
 def _fills(views: _Views, before: tuple[Tensor, Tensor], was: list[Tensor], covered: list[Tensor]) -> bool:
-    """Whether the surface went around a hole of a silhouette, and now covers it.
-
-    A hole of a few pixels is little of a silhouette, and may be a fault of a mask, unless more photos show one.
+    """Whether the surface went around what some silhouettes show as a hole, however small, and now covers it.
 
     Args:
         views: all that look.
@@ -248,8 +246,6 @@ def _fills(views: _Views, before: tuple[Tensor, Tensor], was: list[Tensor], cove
             continue
         places = photo.pixel_places(before[0])
         lost = [hole for hole in filled if winds_around(places, edges, hole.place)]
-        if any(hole.depth > _SHOWN for hole in lost):
-            return True
         told += [sum(hole.pixels for hole in lost)] if lost else []
     return len(told) >= _TOLD and sum(told) >= _PIXELS
 

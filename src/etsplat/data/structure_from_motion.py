@@ -41,7 +41,7 @@ Masks = Literal["own", "auto", "none"]
 """Those that photos bring along; those that are made of a plain background; none."""
 
 EXHAUSTIVE_UP_TO = 120
-"""With matching "auto", every pair of so many photos is compared; of more, only those near in order of names."""
+"""With matching "auto", every pair of so many photos is compared; of more those near in order of names at first."""
 
 LEAST_SHARE = 0.25
 """If fewer of the photos can be placed, something is wrong with them, and there is no scene."""
@@ -147,6 +147,7 @@ def find_cameras(
             cameras=by_camera(found, cameras),
             work=work,
             exhaustive=matching == "exhaustive" or (matching == "auto" and len(names) <= EXHAUSTIVE_UP_TO),
+            widens=matching == "auto",
             mapper=mapper,
             max_size=max_size,
             threads=threads or -1,
