@@ -31,8 +31,8 @@ class Sfm(Command):
     out: Path
     """Folder for the scene: images/ without lens distortion and sparse/0/."""
     matching: Literal["auto", "exhaustive", "sequential"] = "auto"
-    """Compare every pair of photos; or only those near in order of names. Auto: every pair up to 120, and of more where
-    fewer than half could be placed."""
+    """Compare every pair of photos; or only those near in order of names.
+    Auto: every pair up to 120, and of more where fewer than half could be placed."""
     cameras: Literal["auto", "folder", "photo"] = "auto"
     """Which photos of one size share a camera and its lens setting.
     Auto: those whose EXIF names the same camera and focal length; without EXIF, those of one subfolder.
