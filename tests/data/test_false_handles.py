@@ -162,7 +162,7 @@ def test_what_one_mask_shows_through_a_surface_may_be_a_fault_of_it(masks: int, 
 
 def speck_at(photo: Photo, place: torch.Tensor) -> tuple[slice, slice]:
     """Rows and columns of the 2 x 2 pixels about a point."""
-    column, row = photo.pixel_places(place)[0].round().long().tolist()
+    column, row = photo.in_pixels(photo.project(place)[0])[0].round().long().tolist()
     return slice(row - 1, row + 1), slice(column - 1, column + 1)
 
 

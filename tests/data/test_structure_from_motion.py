@@ -182,7 +182,7 @@ def test_photos_from_hardly_different_places_are_placed(tmp_path):
 def test_every_pair_is_compared_where_the_order_of_names_says_little(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, in_order: int, widens: bool, every_pair: bool
 ) -> None:
-    """Of 135 photos by as many people 4 were placed, whatever they showed."""
+    """Of 135 pictures by many people 4 were placed, whatever they showed."""
     colmap, names = MagicMock(), [f"{index}.jpg" for index in range(12)]
     monkeypatch.setattr(colmap_process, "import_pycolmap", lambda: colmap)
     written = []

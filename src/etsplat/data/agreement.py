@@ -93,9 +93,9 @@ class Photo:
         place = 2 * pixel / torch.tensor([[width], [height]]) - 1
         return torch.where(z > 0, place, 2.0).T.reshape(*points.shape[:-1], 2), z.view(points.shape[:-1])
 
-    def pixel_places(self, points: Tensor) -> Tensor:
-        """(N, 2) columns and rows of (N, 3) points, 0.5 at the middle of the first pixel."""
-        return (self.project(points)[0] + 1) / 2 * torch.tensor(self.pixels.shape[:1:-1])
+    def in_pixels(self, places: Tensor) -> Tensor:
+        """(..., 2) columns and rows of (..., 2) places from `project`; 0.5 at the middle of the first pixel."""
+        return (places + 1) / 2 * torch.tensor(self.pixels.shape[:1:-1])
 
     def drawing(self, vertices: Tensor, faces: Tensor) -> dict[str, Any]:
         """Arguments of native calls that draw a surface as it sees it."""

@@ -23,6 +23,7 @@ from torch import Tensor
 
 from etsplat.data.agreement import COMPARED, Photo, first_hits, looked_by, photos_of, pixel_size
 from etsplat.data.dataset import Dataset
+from etsplat.data.kept import kept
 from etsplat.data.visual_hull import without_specks
 from etsplat.geometry.discs import with_discs
 from etsplat.geometry.loops import short_loops
@@ -83,7 +84,7 @@ def without_false_handles(
     photos = photos_of(dataset)
     if len(photos) < 2:
         return vertices, faces
-    views = _Views.of(photos)
+    views = _views_of(dataset)
     most = silhouette_errors(photos, vertices, faces) + torch.tensor([_LOST, _ADDED])
     agreed = _agreement(photos, vertices, faces)
     for level in _LEVELS:
@@ -129,6 +130,11 @@ class _Views(NamedTuple):
     @classmethod
     def of(cls, photos: list[Photo]) -> "_Views":
         return cls(photos, [_holes(photo) for photo in photos])
+
+
+@kept
+def _views_of(dataset: Dataset) -> _Views:
+    return _Views.of(photos_of(dataset))
 
 
 def _cut(
@@ -244,7 +250,7 @@ def _fills(views: _Views, before: tuple[Tensor, Tensor], was: list[Tensor], cove
         filled = [hole for hole in holes if new[tuple(hole.place.long().tolist()[::-1])]]
         if not filled:
             continue
-        places = photo.pixel_places(before[0])
+        places = photo.in_pixels(photo.project(before[0])[0])
         lost = [hole for hole in filled if winds_around(places, edges, hole.place)]
         told += [sum(hole.pixels for hole in lost)] if lost else []
     return len(told) >= _TOLD and sum(told) >= _PIXELS
@@ -257,7 +263,7 @@ def _lets_go(views: _Views, before: tuple[Tensor, Tensor], after: tuple[Tensor, 
     """
     edges = [_edges(faces, len(vertices)) for vertices, faces in (before, after)]
     for photo, holes in zip(*views, strict=True):
-        places = [photo.pixel_places(vertices) for vertices, _ in (before, after)]
+        places = [photo.in_pixels(photo.project(vertices)[0]) for vertices, _ in (before, after)]
         for hole in (each.place for each in holes if each.depth > _SHOWN):
             if winds_around(places[0], edges[0], hole) and not winds_around(places[1], edges[1], hole):
                 return True

@@ -108,9 +108,8 @@ class _Outline:
 
     def __init__(self, photo: Photo, view: Silhouette, vertices: Tensor) -> None:
         places, _ = photo.project(vertices)
-        height, width = view.inside.shape
         self.touched = photo.look_up(view.distance, places[None])[0, 0].abs() <= _OUTLINE
-        self._at = ((places + 1) / 2 * torch.tensor([width, height])).numpy()
+        self._at = photo.in_pixels(places).numpy()
         self._outline = view.inside & (view.distance[0, 0].numpy() < 1)
         self._bare = self._outline.copy()
         slope = torch.stack(torch.gradient(view.distance[0, 0]))

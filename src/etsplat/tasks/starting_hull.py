@@ -23,9 +23,9 @@ _LACKING, _WIRES, _FINEST = 0.005, 0.02, 4
 that is no better one of up to so many times as many faces: around wires they are small. Where it leaves more than the
 second, that is tried at once."""
 
-_THIN = 0.5
+_THIN, _MORE = 0.5, 0.005
 """It is taken if it differs from silhouettes in at most so many times as many pixels: gaps beside thin parts may close
-by it."""
+by it. It may differ by so much more in the place of a hull that has more faces than a run may have."""
 
 
 class Hull(NamedTuple):
@@ -84,7 +84,7 @@ def _with_thin_parts(views: Dataset, hull: Hull, config: ReconstructConfig) -> H
     """
     most, enough = _THIN * _differs(views, hull), min(_FINEST * hull.wanted, most_faces(config))
     if len(hull.faces) > config.max_faces:
-        most += _LACKING
+        most += _MORE
     for faces in (hull.wanted, enough) if hull.uncovered <= _WIRES else (enough,):
         thin = _carved(views, faces, config.start.radius, thin=True)
         if len(thin.faces) <= config.max_faces and _differs(views, thin) <= most:
