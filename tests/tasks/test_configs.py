@@ -124,6 +124,7 @@ def test_presets_of_train_are_what_they_were(preset: str, scene: str) -> None:
     since |= {"loss.depth": "off" if off else "auto", "loss.lambda_depth": 0.02, "loss.depth_from": 6000}
     since["loss.lambda_harmonics"] = 0.0 if off else 2.0
     since["schedule.doubtful_epochs"] = None if off else 20
+    since["optimizer.lr_vertices_by_size"] = 0.0 if off else 1.0
     since["drawing.dropout"] = 0.0 if preset in ("paper", "tiny") else 4.5
     since["asset"] = preset not in ("paper", "tiny")
     since["start.dense"] = preset not in ("paper", "tiny")

@@ -20,7 +20,7 @@ from etsplat.optim.schedules import at
 from etsplat.optim.strategies import DensifyAndPrune
 from etsplat.optim.trainer import Trainer
 from etsplat.tasks.pixel_limits import random_count, triangle_limit
-from etsplat.tasks.soup_trainer import start_trainer
+from etsplat.tasks.soup_trainer import FASTEST, SLOWEST, start_trainer, vertex_paces
 from etsplat.tasks.train import TrainResult, train
 from etsplat.tasks.train_checks import check_train
 from etsplat.tasks.train_config import TrainConfig
@@ -271,6 +271,28 @@ def test_vertices_are_as_fast_on_screen_whatever_the_extent_of_the_cameras(captu
         rates_of(TrainConfig.quick(), views, 1)["vertices"] for views in (capture, capture.renormalized(center, 0.1))
     )
     assert second == pytest.approx(10 * first)
+
+
+def test_large_triangles_move_faster_and_small_ones_slower(capture: Dataset) -> None:
+    """By a power of their size, relative to the median, within limits; the original's all at one rate."""
+    trainer = start_trainer(capture, TrainConfig.quick())
+    vertices = trainer.adam.parameters["vertices"].detach()
+    extents = (vertices.amax(dim=1) - vertices.amin(dim=1)).norm(dim=1)
+    power = TrainConfig.quick().optimizer.lr_vertices_by_size
+    expected = ((extents / extents.median()) ** power).clamp(SLOWEST, FASTEST)
+    torch.testing.assert_close(trainer.adam.paces["vertices"], expected)
+    assert expected.max() > 1.2 > 0.9 > expected.min()
+    assert "vertices" not in start_trainer(capture, TrainConfig.paper()).adam.paces
+
+
+def test_a_triangle_that_is_a_point_moves_at_the_median_rate_or_slower(capture: Dataset) -> None:
+    """Whether one of many is a point or all are."""
+    trainer = start_trainer(capture, TrainConfig.quick())
+    vertices = trainer.adam.parameters["vertices"].detach().clone()
+    paces = vertex_paces(TrainConfig.quick())["vertices"]
+    vertices[0] = vertices[0, :1]
+    assert paces(vertices)[0] == SLOWEST
+    assert (paces(torch.ones(3, 3, 3)) == 1).all()
 
 
 def test_few_pixels_carry_few_triangles(capture: Dataset) -> None:

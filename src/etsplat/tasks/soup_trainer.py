@@ -6,6 +6,8 @@ from dataclasses import replace
 from functools import partial
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from etsplat.core.soup_numbers import DRAWS
 from etsplat.data.dataset import Dataset, Normalization
@@ -40,6 +42,9 @@ SETTLED = 0.1
 LEAST_EVERY = 30
 """Steps between edits of a short run, or a tenth of it if that is less: in fewer, triangles that are of use are still
 as faint as those that are not, and all would die (research/ablations.md)."""
+
+SLOWEST, FASTEST = 0.2, 5.0
+"""Times its rate that the vertices of a triangle move at least, and at most, by its size (`lr_vertices_by_size`)."""
 
 MOST_DROPPED = 0.1
 """The largest share of dropout."""
@@ -126,6 +131,7 @@ def make_trainer(
         exposure=exposure if part is None else part.exposures(capture),
         depths=depths,
         cameras=CameraRefinement.of(config.refine_cameras, config.iterations, epoch),
+        paces=vertex_paces(config),
         evaluate=evaluate,
         seed=generator or config.seed,
     )
@@ -226,6 +232,18 @@ def _schedule(config: TrainConfig, unit: float, photos: int, parameters: Collect
     }
     rates = {name: rates[name] for name in parameters}
     return Schedule(rates, appearance=partial(_appearance, config, photos))
+
+
+def vertex_paces(config: TrainConfig) -> dict[str, Callable[[Tensor], Tensor]]:
+    """How much faster than at their rate vertices move: by the extent of their triangle, relative to the median."""
+    power = config.optimizer.lr_vertices_by_size
+
+    def paces(vertices: Float[Tensor, "N 3 3"]) -> Float[Tensor, " N"]:
+        extents = (vertices.amax(dim=1) - vertices.amin(dim=1)).norm(dim=1)
+        relative = (extents / extents.median()).nan_to_num(1.0)
+        return (relative**power).clamp(SLOWEST, FASTEST)
+
+    return {"vertices": paces} if power else {}
 
 
 def _appearance(config: TrainConfig, photos: int, iteration: int) -> SoupAppearance:

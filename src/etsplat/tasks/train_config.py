@@ -92,6 +92,9 @@ class Optimizer:
     None for the same rate whatever the length."""
     lr_vertices_final: Annotated[float, Range(1e-6)] = 0.01
     """Ratio of that rate's last value to its first; it falls exponentially."""
+    lr_vertices_by_size: Annotated[float, Range(0, 1)] = 1.0
+    """The power of its size, relative to the median of all, by which a triangle's rate is faster.
+    1: a step is as large a part of every triangle; 0: as long for all, small ones and large ones."""
     lr_sh_dc: Annotated[float, Range(0)] = 0.01
     """Adam learning rate of the constant band of the colours."""
     lr_sh_rest: Annotated[float, Range(0), _HARMONICS] = 0.0005
@@ -332,6 +335,7 @@ _PAPER: dict[str, Any] = {
     "optimizer.lr_vertices": 0.0018,
     "optimizer.lr_vertices_unit": "frame",
     "optimizer.lr_vertices_length": None,
+    "optimizer.lr_vertices_by_size": 0.0,
     "optimizer.lr_sh_dc": 0.0025,
     "optimizer.lr_sh_rest": 0.000125,
     "optimizer.lr_opacities": 0.014,

@@ -16,8 +16,8 @@ from etsplat.tasks.pixel_limits import random_count
 from etsplat.tasks.soft_views import soft_view_count
 from etsplat.tasks.train_config import TrainConfig
 
-STATISTICS = 16
-"""Bytes of what is remembered of a triangle between edits."""
+STATISTICS = 20
+"""Bytes of what is remembered of a triangle between edits, and of its pace."""
 
 PASSING = 160
 """Bytes that come and go for each triangle in a step: what it is drawn from (colour, opacity, softness) with gradients,
