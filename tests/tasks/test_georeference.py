@@ -48,7 +48,8 @@ def write_demo(folder, center):
     )
 
 
-CONFIG = TrainConfig.tiny().changed({"iterations": 20})
+CONFIG = TrainConfig.tiny().changed({"iterations": 8})
+"""Triangles are added and removed; after more edits last bits decide whether one of them goes, and all rows move up."""
 
 
 @pytest.fixture(scope="module")
