@@ -48,8 +48,8 @@ def write_demo(folder, center):
     )
 
 
-CONFIG = TrainConfig.tiny().changed({"iterations": 8})
-"""Triangles are added and removed; after more edits last bits decide whether one of them goes, and all rows move up."""
+CONFIG = TrainConfig.tiny().changed({"iterations": 20, "seed": 4})
+"""Of one seed in six (0 is one) a last bit decides at an edit whether a triangle goes, and all rows move up."""
 
 
 @pytest.fixture(scope="module")

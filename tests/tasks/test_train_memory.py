@@ -15,6 +15,7 @@ from etsplat.tasks.train import train
 from etsplat.tasks.train_checks import check_train
 from etsplat.tasks.train_config import TrainConfig
 from etsplat.tasks.train_memory import (
+    PACE,
     PASSING,
     PLANNED,
     STATISTICS,
@@ -46,7 +47,7 @@ def test_bytes_of_a_triangle_are_those_of_a_runs_tensors(capture: Dataset, degre
         rows = [t for t in trainer.state().values() if t.ndim and len(t) == trainer.count]
         lasting = sum(t.numel() * t.element_size() for t in rows)
         values = sum(t.numel() * t.element_size() for t in trainer.model.state().values())
-        assert lasting == (4 if watched else 3) * values + STATISTICS * trainer.count
+        assert lasting == (4 if watched else 3) * values + (STATISTICS + PACE) * trainer.count
         largest = max(t.numel() * t.element_size() for t in trainer.model.state().values())
         counted = bytes_per_triangle(degree, watched=watched) * trainer.count
         assert counted >= lasting + values

@@ -82,7 +82,7 @@ class Optimizer:
     """How vertices, colours, opacities and softness move."""
 
     lr_vertices: Annotated[float, Range(0)] = 0.0006
-    """Adam learning rate of positions."""
+    """Adam learning rate of positions, for a triangle of median size."""
     lr_vertices_unit: Literal["view", "frame"] = "view"
     """What that is a fraction of.
     view: the longer side of what photos show at the capture's points, as fast on screen in every capture;

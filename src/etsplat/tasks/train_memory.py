@@ -16,8 +16,11 @@ from etsplat.tasks.pixel_limits import random_count
 from etsplat.tasks.soft_views import soft_view_count
 from etsplat.tasks.train_config import TrainConfig
 
-STATISTICS = 20
-"""Bytes of what is remembered of a triangle between edits, and of its pace."""
+STATISTICS = 16
+"""Bytes of what is remembered of a triangle between edits."""
+
+PACE = 4
+"""Bytes of how fast the vertices of a triangle are."""
 
 PASSING = 160
 """Bytes that come and go for each triangle in a step: what it is drawn from (colour, opacity, softness) with gradients,
@@ -92,7 +95,7 @@ def bytes_per_triangle(sh_degree: int, *, watched: bool) -> int:
     """
     bands = 3 * (sh_degree + 1) ** 2
     values = bytes_of_values(sh_degree)
-    lasting = 3 * values + STATISTICS + (values if watched else 0)  # with both moments of Adam
+    lasting = 3 * values + STATISTICS + PACE + (values if watched else 0)  # with both moments of Adam
     step = values + PASSING  # gradients
     largest = 4 * max(9, bands - 3)
     edit = values + largest + PLANNED  # new values beside the old ones, and a moment of the largest tensor likewise
