@@ -9,7 +9,8 @@ from PIL import Image
 from etsplat.core.errors import InputError
 from etsplat.data.frames import Wanted
 from etsplat.data.load import format_of
-from etsplat.data.photo_masks import mask_capture, mask_file, write_masks
+from etsplat.data.photo_masks import mask_file, write_masks
+from etsplat.tasks.object_masks import MaskedPhotos, mask_capture
 from helpers.captures import write_colmap, write_photo, write_transforms
 from helpers.foreign_captures import WRITERS, truth
 
@@ -76,7 +77,7 @@ def test_masks_of_a_capture_are_found_by_the_reader_of_its_layout(tmp_path, kind
     frames = format_of(scene).list_frames(scene, Wanted()).frames
     for index, frame in enumerate(frames):
         write_disc(frame.image, 30 + 5 * index)
-    assert mask_capture(scene, tmp_path / "masks") == (len(frames), {})
+    assert mask_capture(scene, tmp_path / "masks") == MaskedPhotos(len(frames), "background", {})
     found = format_of(scene).list_frames(scene, Wanted(masks=tmp_path / "masks")).frames
     for index, frame in enumerate(found):
         rows, columns = np.mgrid[:60, :90]

@@ -170,7 +170,7 @@ def test_of_a_good_result_nothing_is_said_but_its_numbers():
 
 def test_photos_without_masks_have_no_outline_to_judge():
     assert judged(scores={"silhouette_iou": None, "psnr_mesh": 20.0}).verdict.startswith(
-        "not judged, since photos have no outlines to compare with: add masks; on test views: PSNR of"
+        "not judged, since photos have no outlines to compare with: add masks (`etsplat data masks`); on test views:"
     )
 
 

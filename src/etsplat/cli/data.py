@@ -101,13 +101,16 @@ def _map_note(fit: "MapFit") -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class Masks(Command):
-    """Write masks for the posed photos of an object in front of a plain background, by its colours.
+    """Write masks for the posed photos of an object: before a plain background, or on a table, a floor or the ground.
 
-    Nothing is learned or fetched. Shadows and what the object stands on count as object;
-    parts that have the background's colour are lost.
+    Nothing is learned or fetched. Before a plain background colours tell, and shadows and what the object stands on
+    count as object; parts that have the background's colour are lost. On a surface depths tell, of a soup of triangles
+    that is fitted to the photos first, which takes a minute or two; whatever stands there, whole in nearly all photos,
+    is the object.
 
     Examples:
         etsplat data masks my_scene/ --out my_scene/masks
+        etsplat data masks my_scene/ --out my_scene/masks --soup runs/my_scene
         etsplat reconstruct my_scene/ --out runs/my_object
     """
 
@@ -115,16 +118,22 @@ class Masks(Command):
     """Folder with posed photos, of any layout that `etsplat reconstruct` reads."""
     out: Path
     """Folder for the masks: masks/ in the scene, where they are found, or any other, for `--masks`."""
+    by: Literal["auto", "background", "surface"] = "auto"
+    """Background: the colours of a plain one. Surface: what stands on one.
+    Auto: the background where half of the photos have a plain one, else the surface."""
+    soup: Path | None = None
+    """Run of `etsplat train` over the scene to go by the surface with; else a small one is made, and thrown away."""
 
     def run(self, arguments: Sequence[str]) -> int:
         """Writes them, and says which photos have none."""
         from etsplat.cli.progress import PhaseBar
-        from etsplat.data.photo_masks import mask_capture
+        from etsplat.tasks.object_masks import mask_capture
 
         with PhaseBar() as bar:
-            count, refused = mask_capture(self.source, self.out, progress=bar.show)
-        print(f"{count} masks in {self.out}")
-        for name, problem in refused.items():
+            masked = mask_capture(self.source, self.out, by=self.by, soup=self.soup, progress=bar.show)
+        how = "a plain background" if masked.by == "background" else "the surface that the object stands on"
+        print(f"{masked.count} masks in {self.out}, by {how}")
+        for name, problem in masked.refused.items():
             print(f"Without a mask: {name}, as {problem}. Draw one, or take the photo out of the scene.")
         return 0
 

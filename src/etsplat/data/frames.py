@@ -300,7 +300,7 @@ def find_mask(folder: Path, name: str, source: Path) -> Path:
         InputError: there is none, or no folder; or the name, which the file `source` gives, leads out of it.
     """
     if not folder.is_dir():
-        made = "`etsplat data masks SCENE --out SCENE/masks` makes them of plain backgrounds"
+        made = "`etsplat data masks SCENE --out SCENE/masks` makes them"
         remedy = made if folder.name == "auto" else path_remedy(folder)
         raise InputError(f"masks {folder}: no such folder; {remedy}")
     place = PurePosixPath(name)

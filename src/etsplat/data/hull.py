@@ -150,8 +150,8 @@ def _silhouettes(dataset: Dataset, names: list[str], steps: np.ndarray) -> list[
         raise InputError(
             "masks: the images have neither transparency nor masks, or these are white all over, so the object cannot"
             " be told from its background; add a folder masks/ with a white-on-black picture for every image, as"
-            " `etsplat data masks` writes them of an object before a plain background; photos in memory need an alpha"
-            " channel"
+            " `etsplat data masks` writes them of an object before a plain background or on a surface; photos in memory"
+            " need an alpha channel"
         )
     if full:
         raise InputError(

@@ -1,12 +1,12 @@
 """Masks for photos of an object: made of a plain background, or brought along."""
 
-import os
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 import torch
+from jaxtyping import Bool
 from PIL import Image
 
 from etsplat.core.errors import InputError
@@ -15,10 +15,7 @@ from etsplat.data.load import format_of
 from etsplat.data.photo_intake import brings_masks
 from etsplat.data.plain_backgrounds import WORK_SIZE, find_object
 from etsplat.data.scene_files import name_below
-from etsplat.data.undistortion import check_output
-from etsplat.io.atomic import write_error
 from etsplat.io.images import encode_png, image_size, is_transparent, load_mask, load_pixels, save_image
-from etsplat.io.locks import scratch_folder
 from etsplat.io.paths import kind_of
 
 LEAST_SHARE = 0.5
@@ -30,37 +27,16 @@ def mask_file(folder: Path, name: str) -> Path:
     return folder / f"{name}.png"
 
 
-def mask_capture(
-    scene: Path | str, out: Path | str, *, progress: Callable[[str, int, int], None] | None = None
-) -> tuple[int, dict[str, str]]:
-    """Writes a mask for each posed photo of an object whose background is plain.
-
-    Args:
-        scene: a folder with posed photos, of any layout.
-        out: folder for the masks, which every reader of photos then takes; must not exist or be empty.
-        progress: called with (phase, done, of how many).
-
-    Returns:
-        How many there are, and why there is none, for the photos without.
+def photos_of(scene: Path) -> dict[str, Path]:
+    """The posed photos of a scene folder of any layout, by the names that their masks have, in the order of its views.
 
     Raises:
-        InputError: there is none for more than half of the photos; the scene or a photo cannot be read; `out` cannot be
-            used.
+        InputError: the scene cannot be read.
     """
-    scene, out = Path(scene), Path(out)
-    check_output(out)
     images = [frame.image for frame in format_of(scene).list_frames(scene, Wanted()).frames]
     alone = len({image.stem for image in images}) == len(images)
     paths = [PurePosixPath(image.name if alone else name_below(image, scene)) for image in images]
-    names = [str(path.with_suffix("")) for path in paths]
-    photos = dict(zip(names, images, strict=True))
-    try:
-        with scratch_folder(out) as work:
-            refused = write_masks(photos, work / "masks", progress or (lambda phase, done, total: None))
-            os.replace(work / "masks", out)
-    except OSError as error:
-        raise write_error(out, error) from error
-    return len(photos) - len(refused), refused
+    return {str(path.with_suffix("")): image for path, image in zip(paths, images, strict=True)}
 
 
 def write_own_masks(
@@ -122,15 +98,20 @@ def write_masks(photos: Mapping[str, Path], folder: Path, report: Callable[[str,
         if found.mask is None:
             refused[name] = found.problem
             continue
-        mask = Image.fromarray(found.mask.astype(np.uint8) * 255).resize(size, Image.Resampling.BILINEAR)
-        path = mask_file(folder, name)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(encode_png(np.asarray(mask)))
+        write_mask(mask_file(folder, name), found.mask, size)
     report("Masking", len(photos), len(photos))
     if len(refused) > (1 - LEAST_SHARE) * len(photos):
         name, problem = next(iter(refused.items()))
         raise InputError(
             f"masks: can be found before a plain background alone, which {len(refused)} of {len(photos)} photos lack"
-            f" ({name}: {problem}); leave the masks out, or photograph before a plain wall or sheet"
+            f" ({name}: {problem}); leave the masks out, or photograph before a plain wall or sheet. Of photos with"
+            " known cameras `etsplat data masks` also finds what stands on a surface"
         )
     return refused
+
+
+def write_mask(path: Path, mask: Bool[np.ndarray, "H W"], size: tuple[int, int]) -> None:
+    """Writes a mask in the (width, height) of its photo, which may be larger or smaller."""
+    large = Image.fromarray(mask.astype(np.uint8) * 255).resize(size, Image.Resampling.BILINEAR)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(encode_png(np.asarray(large)))

@@ -64,7 +64,7 @@ def seen_through(
 
     trainer.fit(STEPS, callbacks=[hear], log_every=20)
     soup = trainer.outcome().model.finished()
-    return free_space(small, {view: _depth(soup, small, view) for view in small.train})
+    return free_space(small, {view: depth_where(soup, small, view, _COVERED) for view in small.train})
 
 
 def _settings(config: ReconstructConfig, points: int) -> TrainConfig:
@@ -97,9 +97,16 @@ def _within(views: Dataset, vertices: Tensor, seed: int) -> Float[Tensor, "N 3"]
 
 
 @torch.no_grad()
-def _depth(soup: TriangleSoup, views: Dataset, view: int) -> Float[Tensor, "H W"]:
-    """At which half of a pixel is covered; 0 where less than `_COVERED` of it is at all."""
+def depth_where(soup: TriangleSoup, views: Dataset, view: int, covered: float) -> Float[Tensor, "H W"]:
+    """At which half of a pixel is covered, on the CPU; 0 where less than a part of it is at all.
+
+    Args:
+        soup: in the frame of the views.
+        views: whose camera sees it.
+        view: its index.
+        covered: that part.
+    """
     camera = views.cameras[view].to(soup.vertices.device)
     drawn = soup.render(camera, outputs=("color", "median_depth"))
     assert drawn.median_depth is not None
-    return torch.where(drawn.alpha[0, ..., 0] > _COVERED, drawn.median_depth[0, ..., 0], 0.0).cpu()
+    return torch.where(drawn.alpha[0, ..., 0] > covered, drawn.median_depth[0, ..., 0], 0.0).cpu()

@@ -269,7 +269,7 @@ def judge(
     praise = f"on {views} views: {_praise(scores, intersecting_percent, found, expected)}"
     good = f"good {_reserved(praise, shares)}"
     if iou is None:
-        good = f"not judged, since photos have no outlines to compare with: add masks; {praise}"
+        good = f"not judged, since photos have no outlines to compare with: add masks (`etsplat data masks`); {praise}"
     return Judgement(
         views=views,
         silhouette_iou=iou,
