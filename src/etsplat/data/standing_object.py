@@ -6,7 +6,7 @@ down to the surface. Depths alone decide, no colours; nothing is learned.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -47,6 +47,9 @@ _ROUGH = 2
 """Cells by which the depths of what photos show without texture are wrong: well above the surface the object has them,
 near it only those that touch its own."""
 
+_FOOTING = 2.0
+"""Cells of the plane over which it is averaged what photos show there: single ones are wrong by noise of depths."""
+
 _SEEN_BY = 2
 """Photos that must show a surface in a cell."""
 
@@ -69,6 +72,8 @@ class StandingObject:
         corner: (3,) of the cells, the least coordinates.
         side: of a cell.
         filled: (G, G, G) cells with the object in them, and those around.
+        footing: (G, G) cells of the plane, as large, above which photos show something low more often than the plane
+            itself, as the floor of a mug. Their middle is below that of the others.
     """
 
     plane: Plane
@@ -76,6 +81,7 @@ class StandingObject:
     corner: Float[Tensor, "3"]
     side: float
     filled: Bool[Tensor, "G G G"]
+    footing: Bool[Tensor, "G G"]
 
     def holds(self, points: Float[Tensor, "P 3"]) -> Bool[Tensor, " P"]:
         """Which points of surfaces are of the object."""
@@ -84,6 +90,29 @@ class StandingObject:
         inside = ((at >= 0) & (at < count)).all(dim=1)
         x, y, z = at.clamp(0, count - 1).unbind(dim=1)
         return inside & self.filled[x, y, z] & (self.plane.heights(points) > self.lowest)
+
+    def is_around(self, points: Float[Tensor, "P 3"], eye: Float[Tensor, "3"]) -> Bool[Tensor, " P"]:
+        """Which points are surely of the surroundings: of the plane where nothing is on it, or farther away than that.
+
+        What is seen through the plane is where it is seen through it.
+
+        Args:
+            points: of surfaces that a camera shows.
+            eye: its place, above the plane.
+        """
+        heights = self.plane.heights(points)
+        above = self.plane.heights(eye[None]).clamp_min(1e-12)
+        along = (above / (above - heights.clamp_max(0.0)))[:, None]  # 1 of what is above the plane
+        free = ~self.footing.reshape(-1)[self.places(eye + along * (points - eye))]
+        at = (points - self.corner) / self.side
+        return (free & (heights <= self.lowest)) | ((at < 0) | (at >= len(self.filled))).any(dim=1)
+
+    def places(self, points: Float[Tensor, "P 3"]) -> Int64[Tensor, " P"]:
+        """The numbers of the cells of the plane that points are above; those at its border stand for all outside."""
+        count = len(self.footing)
+        middle = self.plane.places((self.corner + 0.5 * len(self.filled) * self.side)[None])
+        at = ((self.plane.places(points) - middle) / self.side + count / 2).floor().long().clamp(0, count - 1)
+        return at[:, 0] * count + at[:, 1]
 
     @property
     def ball(self) -> tuple[Float[Tensor, "3"], float]:
@@ -119,7 +148,7 @@ def find_standing(dataset: Dataset, depths: Mapping[int, Float[Tensor, "H W"]]) 
         reach *= _MARGIN
         beside = (plane.feet(points) - plane.feet(place[None])).norm(dim=1) < reach
         flat = fitted(plane, points[beside], normals[beside], min(THICK * radius, 2 * found.lowest))
-        return _standing_on(flat, dataset, depths, place, reach, _FINE) or found
+        return _with_footing(_standing_on(flat, dataset, depths, place, reach, _FINE) or found, dataset, depths)
     return None
 
 
@@ -132,9 +161,10 @@ def mask_of(found: StandingObject, dataset: Dataset, view: int, depth: Float[Ten
         view: its index.
         depth: (H, W) as of `find_standing`.
     """
-    points = _lifted(dataset, view, depth)
-    shown = (found.holds(points) & (depth.reshape(-1) > 0)).reshape(depth.shape).numpy()
-    return torch.from_numpy(~_without_specks(~_without_specks(shown)))
+    points, known = _lifted(dataset, view, depth), depth.reshape(-1) > 0
+    around = found.is_around(points, camera_centers(dataset.viewmats[[view]])[0]) | ~known
+    shown = _without_specks((found.holds(points) & known).reshape(depth.shape).numpy())
+    return torch.from_numpy(_filled_in(shown, around.reshape(depth.shape).numpy()))
 
 
 def _standing_on(
@@ -170,7 +200,25 @@ def _standing_on(
     apart = KDTree(plane.feet(places[own]).numpy()).query(plane.feet(places[low]).numpy())[0]
     own[low[torch.from_numpy(np.asarray(apart)) < 1.5 * side]] = True
     reached = _widened(own, count, 1) | (_widened(own, count, _ROUGH) & well_above)
-    return StandingObject(plane, lowest, corner, side, reached.reshape(count, count, count))
+    nowhere = torch.zeros(count, count, dtype=torch.bool)
+    return StandingObject(plane, lowest, corner, side, reached.reshape(count, count, count), nowhere)
+
+
+def _with_footing(found: StandingObject, dataset: Dataset, depths: Mapping[int, Tensor]) -> StandingObject:
+    """The same with the cells of the plane that something low of it hides."""
+    count = len(found.footing)
+    low, plane = (torch.zeros(count * count, dtype=torch.int64) for _ in range(2))
+    for view, depth in depths.items():
+        points = _lifted(dataset, view, depth)[depth.reshape(-1) > 0]
+        heights = found.plane.heights(points)
+        at = found.places(points)
+        own = found.holds(points) & (heights < _HIGH * found.lowest)
+        low += torch.bincount(at[own], minlength=count * count)
+        plane += torch.bincount(at[heights.abs() <= found.lowest], minlength=count * count)
+    votes = (low - plane).reshape(count, count).double().numpy()
+    footing = torch.from_numpy(np.asarray(ndimage.gaussian_filter(votes, _FOOTING)) > 0)
+    footing[0], footing[-1], footing[:, 0], footing[:, -1] = (False,) * 4  # what is outside of the cells
+    return replace(found, footing=footing)
 
 
 def _labelled(cells: Bool[Tensor, " C"], count: int) -> tuple[Int64[Tensor, " C"], int]:
@@ -227,9 +275,24 @@ def _lifted(dataset: Dataset, view: int, depth: Float[Tensor, "H W"]) -> Float[T
 
 
 def _without_specks(shown: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
-    """Without groups of fewer pixels than a square of a 200th of the longer side has, two pixels at least."""
+    """Without groups of fewer pixels than `_fewest`."""
     group = np.zeros(shown.shape, dtype=np.int32)
     ndimage.label(shown, np.ones((3, 3), dtype=bool), output=group)
-    kept = np.bincount(group.reshape(-1)) >= max(2.0, max(shown.shape) / 200) ** 2
+    kept = np.bincount(group.reshape(-1)) >= _fewest(shown)
     kept[0] = False
     return np.asarray(kept[group], dtype=bool)
+
+
+def _filled_in(shown: Bool[np.ndarray, "H W"], around: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
+    """Without holes that are specks, or less than half of which shows the surroundings."""
+    group = np.zeros(shown.shape, dtype=np.int32)
+    ndimage.label(~shown, output=group)
+    sizes, free = np.bincount(group.reshape(-1)), np.bincount(group.reshape(-1), around.reshape(-1))
+    closed = (free < sizes / 2) | (sizes < _fewest(shown))
+    closed[np.concatenate([group[0], group[-1], group[:, 0], group[:, -1]])] = False  # no holes
+    return np.asarray(shown | closed[group], dtype=bool)
+
+
+def _fewest(shown: Bool[np.ndarray, "H W"]) -> float:
+    """Pixels of a square of a 200th of the longer side, two along each of its own at least."""
+    return float(max(2.0, max(shown.shape) / 200) ** 2)

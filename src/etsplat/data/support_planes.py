@@ -46,6 +46,12 @@ class Plane:
         """How far points are above it; below it is negative."""
         return (points - self.point) @ self.normal
 
+    def places(self, points: Float[Tensor, "N 3"]) -> Float[Tensor, "N 2"]:
+        """Where points are along two directions of the plane, from its own point on."""
+        first = torch.linalg.cross(self.normal, torch.eye(3).to(self.normal)[int(self.normal.abs().argmin())])
+        first = torch.nn.functional.normalize(first, dim=0)
+        return (points - self.point) @ torch.stack([first, torch.linalg.cross(self.normal, first)], dim=1)
+
     def feet(self, points: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
         """The points of the plane below or above others."""
         return points - self.heights(points)[:, None] * self.normal

@@ -11,9 +11,10 @@ import torch
 
 from etsplat.core.errors import InputError
 from etsplat.core.precision import usual_defaults
-from etsplat.core.spelling import option
 from etsplat.data.dataset import Dataset
 from etsplat.data.photo_masks import LEAST_SHARE, mask_file, photos_of, write_mask, write_masks
+from etsplat.data.pictures import as_float
+from etsplat.data.plain_borders import at_plain_borders
 from etsplat.data.standing_object import find_standing, mask_of
 from etsplat.data.undistortion import check_output
 from etsplat.io.atomic import write_error
@@ -125,7 +126,7 @@ def _write(
 def _given_soup(path: Path | str, scene: Path) -> TriangleSoup:
     run = open_run(path, scene)
     if run.other_scene:
-        raise InputError(f"{path}: is of another scene than {scene}; leave out {option('soup', ...)}, or name its own")
+        raise InputError(f"{path}: is of another scene than {scene}; name a run of that one, or none")
     return run.soup
 
 
@@ -167,6 +168,7 @@ def _write_standing(
         if not mask.any():
             refused[name] = "it does not show what stands on the surface"
             continue
+        mask = at_plain_borders(mask, as_float(capture.images[view])[..., :3].double().numpy())
         write_mask(mask_file(folder, name), mask, image_size(photo))
     report("Masking", len(photos), len(photos))
     return refused
