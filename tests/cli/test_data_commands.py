@@ -9,12 +9,14 @@ import subprocess
 import sys
 
 import pytest
+from PIL import Image, ImageDraw
 
 from etsplat.core.errors import InputError
 from etsplat.data.load import load_dataset
 from etsplat.data.structure_from_motion import find_cameras
 from etsplat.data.undistortion import undistort_scene, working_folder
 from helpers.captures import write_colmap, write_photo
+from helpers.commands import assert_one_line_error
 
 
 def test_without_pycolmap_the_extra_is_named(tmp_path, monkeypatch):
@@ -167,3 +169,16 @@ def test_what_a_killed_process_left_is_removed_by_the_next_for_the_same_folder(t
         killed.kill()
         living.communicate()  # ends it
     assert sorted(path.name for path in tmp_path.iterdir()) == [".other-12", ".scene-notes"]
+
+
+def test_masks_say_what_told_the_object_from_the_rest(tmp_path, etsplat):
+    write_colmap(tmp_path / "scene", [(90, 60)] * 3)
+    for index in range(3):
+        picture = Image.new("RGB", (90, 60), (245, 245, 245))
+        ImageDraw.Draw(picture).ellipse((30 + index, 15, 60 + index, 45), fill=(230, 120, 20))
+        picture.save(tmp_path / "scene" / "images" / f"{index:04d}.jpg", quality=95)
+    arguments = ("data", "masks", str(tmp_path / "scene"), "--out", str(tmp_path / "masks"))
+    done = etsplat(*arguments)
+    assert done.returncode == 0, done.stderr
+    assert f"3 masks in {tmp_path / 'masks'}, by a plain background" in done.stdout
+    assert_one_line_error(etsplat(*arguments), "is there already")

@@ -194,8 +194,8 @@ def _standing_on(
     whole = share > _FRAMED  # not a number where there is no cell
     if not bool(whole.any()) or float(sizes[whole].max()) < _FEWEST:
         return None
-    kept = whole & (sizes > _SMALL * sizes[whole].max()) & (tops > _LOW * tops[whole].max())
-    own = high & kept[part]
+    whole &= sizes > _SMALL * sizes[whole].max()
+    own = high & (whole & (tops > _LOW * tops[whole].max()))[part]
     low = (filled & ~high).nonzero()[:, 0]
     apart = KDTree(plane.feet(places[own]).numpy()).query(plane.feet(places[low]).numpy())[0]
     own[low[torch.from_numpy(np.asarray(apart)) < 1.5 * side]] = True
