@@ -56,6 +56,9 @@ _SEEN_BY = 2
 _SAMPLES = 2000
 """Points of each depth map by which planes are found."""
 
+_HOLE = 0.01
+"""Parts of a mask: larger holes stay, since whole gaps over a plain surface have wrong depths, too."""
+
 _BLUR = 1.5
 """Pixels over which depths are averaged for normals."""
 
@@ -284,11 +287,11 @@ def _without_specks(shown: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
 
 
 def _filled_in(shown: Bool[np.ndarray, "H W"], around: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
-    """Without holes that are specks, or less than half of which shows the surroundings."""
+    """Without holes that are specks, and small ones less than half of which shows the surroundings."""
     group = np.zeros(shown.shape, dtype=np.int32)
     ndimage.label(~shown, output=group)
     sizes, free = np.bincount(group.reshape(-1)), np.bincount(group.reshape(-1), around.reshape(-1))
-    closed = (free < sizes / 2) | (sizes < _fewest(shown))
+    closed = ((free < sizes / 2) & (sizes < _HOLE * shown.sum())) | (sizes < _fewest(shown))
     closed[np.concatenate([group[0], group[-1], group[:, 0], group[:, -1]])] = False  # no holes
     return np.asarray(shown | closed[group], dtype=bool)
 
