@@ -42,7 +42,7 @@ def grain(seed: int, sigma: float, stretch: float = 1.0) -> Paint:
     """A pattern of one number in [0, 1] of any coordinates: noise, blurred, again and again, 12 units wide."""
     noise = np.random.default_rng(seed).normal(size=(1024, 1024))
     blurred = gaussian_filter(noise, (sigma, sigma * stretch), mode="wrap")
-    blurred += 0.4 * blurred.std() * gaussian_filter(noise[::-1], 0.7, mode="wrap") / 0.4
+    blurred += blurred.std() * gaussian_filter(noise[::-1], 0.7, mode="wrap")
     values = (blurred - blurred.min()) / np.ptp(blurred)
 
     def at(x: np.ndarray, y: np.ndarray) -> np.ndarray:

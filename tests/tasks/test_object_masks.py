@@ -87,6 +87,6 @@ def test_by_a_run_of_the_scene_and_none_of_another(things, tmp_path):
 
 def test_by_the_background_alone_photos_of_a_scene_are_refused(things, tmp_path):
     scene, _ = things
-    with pytest.raises(InputError, match=r"a plain background alone, which \d+ of 42 photos lack"):
+    with pytest.raises(InputError, match="a plain background alone, which 42 of 42 photos lack"):
         mask_capture(scene, tmp_path / "masks", by="background")
     assert list(tmp_path.iterdir()) == []

@@ -27,7 +27,7 @@ def mask_file(folder: Path, name: str) -> Path:
     return folder / f"{name}.png"
 
 
-def photos_of(scene: Path) -> dict[str, Path]:
+def posed_photos(scene: Path) -> dict[str, Path]:
     """The posed photos of a scene folder of any layout, by the names that their masks have, in the order of its views.
 
     Raises:

@@ -106,12 +106,12 @@ class StandingObject:
         heights = self.plane.heights(points)
         above = self.plane.heights(eye[None]).clamp_min(1e-12)
         along = (above / (above - heights.clamp_max(0.0)))[:, None]  # 1 of what is above the plane
-        free = ~self.footing.reshape(-1)[self.places(eye + along * (points - eye))]
+        free = ~self.footing.reshape(-1)[self.cells_below(eye + along * (points - eye))]
         at = (points - self.corner) / self.side
         return (free & (heights <= self.lowest)) | ((at < 0) | (at >= len(self.filled))).any(dim=1)
 
-    def places(self, points: Float[Tensor, "P 3"]) -> Int64[Tensor, " P"]:
-        """The numbers of the cells of the plane that points are above; those at its border stand for all outside."""
+    def cells_below(self, points: Float[Tensor, "P 3"]) -> Int64[Tensor, " P"]:
+        """The numbers of the cells of the plane that points are above; those at the border stand for all outside."""
         count = len(self.footing)
         middle = self.plane.places((self.corner + 0.5 * len(self.filled) * self.side)[None])
         at = ((self.plane.places(points) - middle) / self.side + count / 2).floor().long().clamp(0, count - 1)
@@ -214,7 +214,7 @@ def _with_footing(found: StandingObject, dataset: Dataset, depths: Mapping[int, 
     for view, depth in depths.items():
         points = _lifted(dataset, view, depth)[depth.reshape(-1) > 0]
         heights = found.plane.heights(points)
-        at = found.places(points)
+        at = found.cells_below(points)
         own = found.holds(points) & (heights < _HIGH * found.lowest)
         low += torch.bincount(at[own], minlength=count * count)
         plane += torch.bincount(at[heights.abs() <= found.lowest], minlength=count * count)

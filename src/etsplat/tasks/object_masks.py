@@ -12,7 +12,7 @@ import torch
 from etsplat.core.errors import InputError
 from etsplat.core.precision import usual_defaults
 from etsplat.data.dataset import Dataset
-from etsplat.data.photo_masks import LEAST_SHARE, mask_file, photos_of, write_mask, write_masks
+from etsplat.data.photo_masks import LEAST_SHARE, mask_file, posed_photos, write_mask, write_masks
 from etsplat.data.pictures import as_float
 from etsplat.data.plain_borders import at_plain_borders
 from etsplat.data.standing_object import find_standing, mask_of
@@ -40,6 +40,9 @@ WIDTH, STEPS, TRIANGLES = 400, 1500, 40_000
 
 DETAIL = 2
 """Masks are found in pictures so many times as wide."""
+
+TRIED = 12
+"""Of many photos so many are asked first whether their background is plain: if not, the others need not be."""
 
 MAPS = 48
 """Depth maps by which an object is found, of photos all around."""
@@ -90,7 +93,7 @@ def mask_capture(
     scene, out = Path(scene), Path(out)
     check_output(out)
     report = progress or (lambda phase, done, total: None)
-    photos = photos_of(scene)
+    photos = posed_photos(scene)
     try:
         with scratch_folder(out) as work:
             masked = _write(photos, scene, work, by if soup is None else "surface", soup, report)
@@ -106,6 +109,10 @@ def _write(
     """Masks in a folder of `work`."""
     if by != "surface":
         try:
+            if by == "auto" and len(photos) > 2 * TRIED:
+                names = list(photos)
+                few = {names[index]: photos[names[index]] for index in spread(range(len(names)), TRIED)}
+                write_masks(few, work / "few", report)
             refused = write_masks(photos, work / "masks", report)
             return MaskedPhotos(len(photos) - len(refused), "background", refused)
         except InputError:
@@ -153,18 +160,19 @@ def _write_standing(
 ) -> dict[str, str]:
     """Masks of what stands on a surface; and why there is none, for the photos without."""
     some = spread(range(len(capture)), MAPS)
-    depths = {}
+    maps = {}
     for done, view in enumerate(some):
         report("Looking for what stands on a surface", done, len(some))
-        step = max(1, capture.images.sizes[view][0] // WIDTH)
-        depths[view] = depth_where(soup, capture, view, _COVERED)[::step, ::step]
-    found = find_standing(capture, depths)
+        maps[view] = depth_where(soup, capture, view, _COVERED)
+    steps = {view: max(1, depth.shape[1] // WIDTH) for view, depth in maps.items()}
+    found = find_standing(capture, {view: depth[:: steps[view], :: steps[view]] for view, depth in maps.items()})
     if found is None:
         return dict.fromkeys(photos, "nothing was found")
     refused = {}
     for view, (name, photo) in enumerate(photos.items()):
         report("Masking", view, len(photos))
-        mask = mask_of(found, capture, view, depth_where(soup, capture, view, _COVERED)).numpy()
+        depth = maps[view] if view in maps else depth_where(soup, capture, view, _COVERED)
+        mask = mask_of(found, capture, view, depth).numpy()
         if not mask.any():
             refused[name] = "it does not show what stands on the surface"
             continue
