@@ -8,6 +8,7 @@ import pytest
 import torch
 
 import etsplat.tasks.coarse_soup as coarse_soup
+import etsplat.tasks.cut_hulls as cut_hulls
 import etsplat.tasks.starts as starts
 from etsplat.data.closed_hollows import closed_hollows
 from etsplat.data.hollows import Opened, open_hollows
@@ -64,14 +65,14 @@ def test_what_is_free_is_the_same_to_the_bit_on_any_number_of_threads(monkeypatc
 
 def test_no_soup_is_asked_where_photos_agree(monkeypatch: pytest.MonkeyPatch) -> None:
     """A bowl, whose lid goes down by itself."""
-    monkeypatch.setattr(starts, "seen_through", None)
+    monkeypatch.setattr(cut_hulls, "seen_through", None)
     _, _, views = painted_pictures(*revolved(BOWL))
     assert starts.make_start(None, views, CONFIG).cut is None
 
 
 def test_no_soup_is_asked_where_photos_agree_on_the_walls_of_a_hollow(monkeypatch: pytest.MonkeyPatch) -> None:
     """A mug in few photos, whose lid does not go down."""
-    monkeypatch.setattr(starts, "seen_through", None)
+    monkeypatch.setattr(cut_hulls, "seen_through", None)
     vertices, faces, views = painted_pictures(*revolved(MUG))
     views = replace(views, train=views.train[::2])
     lidded = open_hollows(views, *visual_hull(views, 3200))
@@ -103,13 +104,13 @@ def test_no_start_has_more_faces_than_a_run_may_have(monkeypatch: pytest.MonkeyP
     _, _, views = painted_pictures(*revolved(VASE))
     vertices, faces = icosphere(4)
     assert len(faces) == 5120
-    monkeypatch.setattr(starts, "between_walls", lambda *_: lambda points: points[:, 0] * 0 - 1)
-    monkeypatch.setattr(starts, "seen_through", lambda *_: lambda points: points[:, 0] * 0 - 1)
-    monkeypatch.setattr(starts, "visual_hull", lambda *_, **others: (vertices, faces))
-    monkeypatch.setattr(starts, "_opened", lambda _, v, f, *told: Opened(v, f, 0, 0.0, 1.0, 1.0))
+    monkeypatch.setattr(cut_hulls, "between_walls", lambda *_: lambda points: points[:, 0] * 0 - 1)
+    monkeypatch.setattr(cut_hulls, "seen_through", lambda *_: lambda points: points[:, 0] * 0 - 1)
+    monkeypatch.setattr(cut_hulls, "visual_hull", lambda *_, **others: (vertices, faces))
+    monkeypatch.setattr(cut_hulls, "open_hull", lambda _, v, f, *told: Opened(v, f, 0, 0.0, 1.0, 1.0))
     contradicted = Opened(vertices, faces[:1000], 0, 0.5, 1.0, 0.0)
     config = CONFIG.changed({"max_faces": most})
-    _, cut = starts._cut_open(
+    _, cut = cut_hulls.cut_open(
         views, starts.Hull(vertices, faces, 1400, 0.5), contradicted, config, None, lambda event: None
     )
     assert bool(cut) == taken
@@ -125,11 +126,13 @@ def test_what_is_open_is_contradicted_by_more_before_a_soup_is_asked(
     _, _, views = painted_pictures(*revolved(VASE))
     vertices, faces = icosphere(3)
     start = Opened(vertices, faces if bottom else faces[100:], 0, share, 1.0, 1.0)
-    monkeypatch.setattr(starts, "plain_hull", lambda *_: starts.Hull(vertices, faces, 1400, 0.0))
-    monkeypatch.setattr(starts, "_opened", lambda *_: start)
-    calls = list[Opened]()
-    monkeypatch.setattr(starts, "_cut_open", lambda _, hull, opened, *more: (calls.append(opened) or opened, False))
-    starts.make_start(None, views, CONFIG.changed({"start.shape": "hull"}))
+    hull, calls = starts.Hull(vertices, faces, 1400, 0.0), list[object]()
+    monkeypatch.setattr(cut_hulls, "between_walls", lambda *_: None)
+    monkeypatch.setattr(cut_hulls, "visual_hull", lambda *_, **others: (vertices, faces[:0]))
+    monkeypatch.setattr(cut_hulls, "seen_through", lambda *_: calls.append(_))
+    found, cut = cut_hulls.cut_open(views, hull, start, CONFIG, None, lambda event: None)
+    assert found is start
+    assert cut is (False if asked else None)
     assert bool(calls) == asked
 
 
@@ -140,13 +143,13 @@ def test_a_soup_must_be_clearly_better_than_walls(
     """Of walls and a soup's cut that are contradicted about alike, walls are nearer; faces tell here which was cut."""
     _, _, views = painted_pictures(*revolved(VASE))
     vertices, faces = icosphere(4)
-    monkeypatch.setattr(starts, "between_walls", lambda *_: lambda points: points[:, 0])
-    monkeypatch.setattr(starts, "seen_through", lambda *_: lambda points: points[:, 0])
-    monkeypatch.setattr(starts, "visual_hull", lambda _, wanted, **others: (vertices, faces[:wanted]))
+    monkeypatch.setattr(cut_hulls, "between_walls", lambda *_: lambda points: points[:, 0])
+    monkeypatch.setattr(cut_hulls, "seen_through", lambda *_: lambda points: points[:, 0])
+    monkeypatch.setattr(cut_hulls, "visual_hull", lambda _, wanted, **others: (vertices, faces[:wanted]))
     shares = {2800: 0.1, 1400: soup}  # contradicted: of walls, which have twice the faces, and of the soup's cut
-    monkeypatch.setattr(starts, "_opened", lambda _, v, f, *told: Opened(v, f, 0, shares[len(f)], 1.0, 1.0))
+    monkeypatch.setattr(cut_hulls, "open_hull", lambda _, v, f, *told: Opened(v, f, 0, shares[len(f)], 1.0, 1.0))
     contradicted, hull = Opened(vertices, faces, 0, 0.5, 1.0, 0.0), starts.Hull(vertices, faces, 1400, 1.0)
-    best, cut = starts._cut_open(
+    best, cut = cut_hulls.cut_open(
         views, hull, contradicted, CONFIG.changed({"max_faces": 6000}), None, lambda event: None
     )
     assert cut == by
@@ -158,7 +161,7 @@ def test_a_cut_that_photos_contradict_as_much_is_not_taken(monkeypatch: pytest.M
     _, _, views = painted_pictures(*revolved(VASE))
     plain = open_hollows(views, *visual_hull(views, 1600))
     for free in (lambda points: points.norm(dim=1) - 0.5, lambda points: points[:, 0] * 0 + 1):
-        monkeypatch.setattr(starts, "seen_through", lambda *_, free=free: free)
+        monkeypatch.setattr(cut_hulls, "seen_through", lambda *_, free=free: free)
         started = starts.make_start(None, views, CONFIG)
         assert started.cut is False
         assert started.contradicted == pytest.approx(plain.contradicted, abs=0.01)

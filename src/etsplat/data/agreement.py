@@ -291,6 +291,14 @@ def unseen_share(looked: Looked | None) -> float:
     return float(area[unseen[looked.faces].all(dim=1)].sum() / area.sum())
 
 
+def mean_agreement(looked: Looked) -> float:
+    """How far photos agree on a surface, in the mean over what of it is known; 0 if nothing is."""
+    known = ~looked.score.isnan()
+    corners = (face_areas(looked.vertices, looked.faces)[:, None] * known[looked.faces]).flatten()
+    scores = looked.score.nan_to_num()[looked.faces].flatten()
+    return float((corners * scores).sum() / corners.sum().clamp_min(torch.finfo(torch.float32).tiny))
+
+
 def contradicted_share(looked: Looked) -> float:
     """The largest patch of a surface on which photos show different things, as a fraction of its area."""
     patch = looked.score < _CONTRADICTED

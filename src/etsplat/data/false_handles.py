@@ -21,7 +21,7 @@ from jaxtyping import Bool, Float, Int64
 from scipy.ndimage import distance_transform_edt, label, maximum, maximum_position
 from torch import Tensor
 
-from etsplat.data.agreement import COMPARED, Photo, first_hits, looked_by, photos_of, pixel_size
+from etsplat.data.agreement import COMPARED, Photo, contradicted_share, first_hits, looked_by, photos_of, pixel_size
 from etsplat.data.dataset import Dataset
 from etsplat.data.kept import kept
 from etsplat.data.visual_hull import without_specks
@@ -60,6 +60,9 @@ _THIN = 8
 _RINGS = 2
 """Of faces around a band along a loop, within which a small handle is with its hole."""
 
+_SPOILT = 0.005
+"""Of the surface: discs over which photos contradict a patch that is larger by more than this close a hollow."""
+
 _BLOCKED = 0.001
 """So much beside a silhouette may be covered where a loop is cut, and no pixel of it uncovered: the gap that a cut
 leaves in a spoke is narrow."""
@@ -86,19 +89,19 @@ def without_false_handles(
         return vertices, faces
     views = _views_of(dataset)
     most = silhouette_errors(photos, vertices, faces) + torch.tensor([_LOST, _ADDED])
-    agreed = _agreement(photos, vertices, faces)
+    agreed = _Agreement.of(photos, vertices, faces)
     for level in _LEVELS:
         while (simpler := _simpler(views, vertices, faces, agreed, level, most)) is not None:
             vertices, faces = simpler
             if not any(genera(faces, len(vertices))):
                 return vertices, faces
-            agreed = _agreement(photos, vertices, faces)
+            agreed = _Agreement.of(photos, vertices, faces)
     most = silhouette_errors(photos, vertices, faces) + torch.tensor([0, _BLOCKED])
     while (simpler := _cut(views, vertices, faces, agreed, most)) is not None:
         vertices, faces = simpler
         if not any(genera(faces, len(vertices))):
             break
-        agreed = _agreement(photos, vertices, faces)
+        agreed = _Agreement.of(photos, vertices, faces)
     return vertices, faces
 
 
@@ -132,13 +135,32 @@ class _Views(NamedTuple):
         return cls(photos, [_holes(photo) for photo in photos])
 
 
+class _Agreement(NamedTuple):
+    """What photos say of a surface.
+
+    Attributes:
+        score: (V,) how far they agree at its vertices, NaN where it is not known.
+        hidden: (V,) which of them too few see.
+        contradicted: the largest patch that they contradict (`contradicted_share`).
+    """
+
+    score: Float[Tensor, " V"]
+    hidden: Bool[Tensor, " V"]
+    contradicted: float
+
+    @classmethod
+    def of(cls, photos: list[Photo], vertices: Tensor, faces: Tensor) -> "_Agreement":
+        looked = looked_by(photos, vertices, faces)
+        return cls(looked.score, looked.seen.sum(dim=0) < COMPARED, contradicted_share(looked))
+
+
 @kept
 def _views_of(dataset: Dataset) -> _Views:
     return _Views.of(photos_of(dataset))
 
 
 def _cut(
-    views: _Views, vertices: Tensor, faces: Tensor, agreed: tuple[Tensor, Tensor], most: Tensor
+    views: _Views, vertices: Tensor, faces: Tensor, agreed: _Agreement, most: Tensor
 ) -> tuple[Tensor, Tensor] | None:
     """The surface cut along a short loop, with a smaller genus, if there is one: the shortest is tried first.
 
@@ -146,10 +168,10 @@ def _cut(
         views: all that look.
         vertices: (V, 3).
         faces: (F, 3), with a handle.
-        agreed: from `_agreement`.
+        agreed: what photos say of it.
         most: (B, 2) errors of silhouettes that are allowed.
     """
-    before, (score, hidden), least = genera(faces, len(vertices)), agreed, _smallest(faces, len(vertices))
+    before, (score, hidden, _), least = genera(faces, len(vertices)), agreed, _smallest(faces, len(vertices))
     was, tried = None, torch.zeros(len(vertices), dtype=torch.bool)
     for loop in short_loops(vertices, faces):
         if len(loop) > _THIN or 2 * int(tried[loop].sum()) > len(loop):
@@ -187,17 +209,11 @@ def _small(faces: Tensor, band: Bool[Tensor, " F"]) -> bool:
     return len(used) - len(topology.edges) + len(inside) + rims < 2
 
 
-def _agreement(photos: list[Photo], vertices: Tensor, faces: Tensor) -> tuple[Float[Tensor, " V"], Bool[Tensor, " V"]]:
-    """How far photos agree at the vertices, NaN where it is not known; and which of them too few see."""
-    looked = looked_by(photos, vertices, faces)
-    return looked.score, looked.seen.sum(dim=0) < COMPARED
-
-
 def _simpler(
-    views: _Views, vertices: Tensor, faces: Tensor, agreed: tuple[Tensor, Tensor], level: float, most: Tensor
+    views: _Views, vertices: Tensor, faces: Tensor, agreed: _Agreement, level: float, most: Tensor
 ) -> tuple[Tensor, Tensor] | None:
     """The surface with a smaller genus, if there is one: the largest region is tried first. Arguments as of `_cut`."""
-    before, (score, _), least = genera(faces, len(vertices)), agreed, _smallest(faces, len(vertices))
+    before, score, least = genera(faces, len(vertices)), agreed.score, _smallest(faces, len(vertices))
     low, unseen = score < level, score.isnan()
     edges = MeshTopology.from_faces(faces, len(vertices)).edges.long()
     was, deep = None, _DEEP * mean_edge(vertices, edges) / pixel_size(views.photos)
@@ -215,7 +231,9 @@ def _simpler(
         was = was or _covered(views.photos, vertices, faces)
         if _closes(views.photos, was, covered, deep) or _fills(views, (vertices, faces), was, covered):
             continue
-        if not _lets_go(views, (vertices, faces), found):
+        if _lets_go(views, (vertices, faces), found):
+            continue
+        if _Agreement.of(views.photos, *found).contradicted <= agreed.contradicted + _SPOILT:
             return found
     return None
 

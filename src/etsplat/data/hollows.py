@@ -126,7 +126,9 @@ class _Look(NamedTuple):
 
 
 @torch.no_grad()
-def open_hollows(dataset: Dataset, vertices: Float[Tensor, "V 3"], faces: Int64[Tensor, "F 3"]) -> Opened:
+def open_hollows(
+    dataset: Dataset, vertices: Float[Tensor, "V 3"], faces: Int64[Tensor, "F 3"], *, most: int | None = None
+) -> Opened:
     """Pushes lids of the visual hull in to where the training views agree.
 
     Where there is no texture nothing moves. Depths along a lid's normal are chosen by belief propagation, smooth but
@@ -137,12 +139,14 @@ def open_hollows(dataset: Dataset, vertices: Float[Tensor, "V 3"], faces: Int64[
         dataset: photos with alpha around an object in the unit ball.
         vertices: (V, 3) of the hull, from `visual_hull`.
         faces: (F, 3) of it.
+        most: faces that it may have after it, if it has not more already; None for any number.
     """
     dataset = reduced(dataset)
     photos = photos_of(dataset)
     if len(photos) < 2 or len(vertices) == 0:
         return Opened(vertices, faces, 0, 0.0, 1.0, 0.0)
-    edge, most = float(_edge_lengths(vertices, faces).mean()), len(faces) * 3 // 2
+    edge, half_more = float(_edge_lengths(vertices, faces).mean()), len(faces) * 3 // 2
+    most = half_more if most is None else min(most, half_more)
     outside, total, look = outside_hull(dataset), 0, _Look(vertices, 0, 0.0, 1.0, 0.0)
     for _ in range(_PASSES):
         look = _push(photos, outside, vertices, faces)

@@ -29,8 +29,8 @@ _LARGE = 0.01
 _BELOW = 12
 """Pixels under a lid at which the hull goes on: on thin limbs photos agree little, too."""
 
-_PIXELS = range(2, 20)
-"""Thicknesses that are tried: agreement is about three pixels wide."""
+_PIXELS = (*range(2, 20, 2), 21, 24, 27, 30, 34, 38)
+"""Thicknesses that are tried, and those a pixel beside the best: agreement is about three pixels wide."""
 
 _SMOOTH = 3
 """Rounds in which normals are averaged with their neighbours'."""
@@ -38,7 +38,7 @@ _SMOOTH = 3
 _ALONE = 0.9
 """A place is on a wall if nothing else of the surface is nearer than this, in units of the thickness."""
 
-_AGREED, _PEAK = 0.5, 0.3
+AGREED, _PEAK = 0.5, 0.3
 """Mean correlation on walls, at least, which are seen at a slant; and by so much more than on the lid, or at the least
 likely thickness."""
 
@@ -87,13 +87,16 @@ class _Walls(NamedTuple):
 
 
 @torch.no_grad()
-def between_walls(dataset: Dataset, vertices: Float[Tensor, "V 3"], faces: Int64[Tensor, "F 3"]) -> Distance | None:
+def between_walls(
+    dataset: Dataset, vertices: Float[Tensor, "V 3"], faces: Int64[Tensor, "F 3"], agreed: float = AGREED
+) -> Distance | None:
     """How far points within a hull are beyond its walls, in hollows whose walls photos agree on: positive there.
 
     Args:
         dataset: photos with alpha around an object in the unit ball.
         vertices: (V, 3) of the hull.
         faces: (F, 3) of it.
+        agreed: mean correlation on walls, at least.
 
     Returns:
         A function of points; None where there is no such hollow.
@@ -103,7 +106,7 @@ def between_walls(dataset: Dataset, vertices: Float[Tensor, "V 3"], faces: Int64
         return None
     outside = outside_hull(dataset)
     hollows = (_Through(looked, lid) for lid in _lids(looked, outside))
-    found = [walls.hollow(outside) for hollow in hollows if (walls := _walls(hollow))]
+    found = [walls.hollow(outside) for hollow in hollows if (walls := _walls(hollow, agreed))]
     if not found:
         return None
     return lambda points: torch.stack([free(points) for free in found]).amax(dim=0)
@@ -125,15 +128,16 @@ def _lids(looked: Looked, outside: Distance) -> list[Bool[Tensor, " F"]]:
     ]
 
 
-def _walls(through: "_Through") -> _Walls | None:
+def _walls(through: "_Through", least: float) -> _Walls | None:
     """The walls around the hollow under a lid, no thinner than a mesh of it can be; None where photos agree on none."""
-    thicknesses = [through.pixel * pixels for pixels in _PIXELS]
-    agreed = [through.agreed(thickness) for thickness in thicknesses]
-    best = max(range(len(agreed)), key=agreed.__getitem__)
-    least = min([through.closed, *(each for each in agreed if each > 0)])
-    if agreed[best] < max(_AGREED, least + _PEAK):
+    agreed = {pixels: through.agreed(pixels * through.pixel) for pixels in _PIXELS}
+    middle = max(agreed, key=agreed.__getitem__)
+    agreed |= {pixels: through.agreed(pixels * through.pixel) for pixels in (max(2, middle - 1), middle + 1)}
+    best = max(agreed, key=agreed.__getitem__)
+    lowest = min([through.closed, *(each for each in agreed.values() if each > 0)])
+    if agreed[best] < max(least, lowest + _PEAK):
         return None
-    return through.walls(max(thicknesses[best], _THICK * through.edge))
+    return through.walls(max(best * through.pixel, _THICK * through.edge))
 
 
 def _distance(points: Tensor, vertices: Tensor, faces: Tensor) -> Tensor:

@@ -36,6 +36,7 @@ from etsplat.optim.terms.photometric import Photometric
 from etsplat.optim.trainer import Trainer
 from etsplat.optim.vertex_updates import UniformSteps
 from etsplat.tasks.camera_results import conclude_cameras
+from etsplat.tasks.cut_hulls import Cut
 from etsplat.tasks.depths import trusted_depths, wanted_depths
 from etsplat.tasks.export_mesh import Reconstruction
 from etsplat.tasks.judgement import (
@@ -58,7 +59,7 @@ from etsplat.tasks.running import Job, Result, path_of, settings_for, terms_of
 from etsplat.tasks.scoring import Scorer, load_lpips
 from etsplat.tasks.sources import Source, directions_digest, fingerprint, load_source, make_subject
 from etsplat.tasks.starting_hull import finer_shape
-from etsplat.tasks.starts import Cut, Started, doubtful_start, load_start, make_start, nearby, within_need
+from etsplat.tasks.starts import Started, doubtful_start, load_start, make_start, nearby, within_need
 from etsplat.tasks.texturing import check_installed
 
 DEPTHS_NEAR, DEPTHS_FAR = 0.02, 0.15

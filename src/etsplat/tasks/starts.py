@@ -10,25 +10,23 @@ from torch import Tensor
 
 from etsplat.data.agreement import photos_of
 from etsplat.data.dataset import Dataset
-from etsplat.data.false_handles import silhouette_errors, without_false_handles
-from etsplat.data.hollows import Opened, open_hollows
+from etsplat.data.false_handles import silhouette_errors
+from etsplat.data.hollows import Opened
 from etsplat.data.kept import keeping
-from etsplat.data.lids import without_lids
 from etsplat.data.plain_sides import with_flat_sides
 from etsplat.data.silhouettes import silhouette, touches_border
-from etsplat.data.visual_hull import Distance, visual_hull
-from etsplat.data.walls import between_walls
+from etsplat.data.visual_hull import visual_hull
 from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.topology import MeshTopology
 from etsplat.geometry.untangle import untangle
 from etsplat.io.mesh_files import MeshFile, load_exported, weld_vertices
 from etsplat.io.paths import given_path
 from etsplat.model.triangle_mesh import MeshAppearance, TriangleMesh
-from etsplat.optim.loop import Event, NoteEvent, StageEvent
-from etsplat.tasks.coarse_soup import seen_through
+from etsplat.optim.loop import Event, StageEvent
+from etsplat.tasks.cut_hulls import Cut, cut_open, open_hull
 from etsplat.tasks.judgement import CONTRADICTED, Start
 from etsplat.tasks.reconstruct_config import ReconstructConfig
-from etsplat.tasks.starting_hull import Hull, hull_faces, most_faces, plain_hull, uncovered
+from etsplat.tasks.starting_hull import Hull, hull_faces, plain_hull
 
 _LOST = 0.05
 """The part of silhouettes that a hull may leave uncovered, in the mean, where most photos cut the object off: less than
@@ -47,22 +45,6 @@ _BESIDE, _OTHER_SIZE = 1.0, 4.0
 """A given mesh is doubted that is farther from the object than that, in radii of the larger one, or so many times as
 large or small: of half the diagonal of its box."""
 
-_MARGINS = (0.05, 0.03, 0.08)
-"""How far in front of what a coarse soup shows a hull is cut, in units of the object's radius; in turn, until photos
-contradict it no more. Nearer takes away what is thin, farther leaves more of a lid to be pushed in."""
-
-_OPEN = 0.01
-"""Of what is open, as a cube without its bottom, photos contradict more by chance than `CONTRADICTED`: it is seen from
-two sides. A soup that is asked all the same makes the walls of a hollow of its one sheet."""
-
-_CLEARLY, _RIMS = 0.7, 0.003
-"""A cut hull is taken where photos contradict at most so many times as much of it, and if it leaves at most this part
-of the silhouettes uncovered beside what the hull does: a little of a thin rim, which grows again."""
-
-
-Cut = Literal["walls", "soup", False]
-"""What a hull that photos contradict was cut open by: walls of one thickness, what a coarse soup shows, or nothing."""
-
 
 class Started(NamedTuple):
     """What a run starts from.
@@ -72,7 +54,7 @@ class Started(NamedTuple):
         kind: where it comes from.
         opened: the hull with its hollows open, and what photos say of it; None for another kind.
         hull: that it was, before it was mended; None for another kind.
-        cut: by what it was cut open, if by anything; None where photos do not contradict it.
+        cut: by what it was cut open, if by anything; None where it was not, and photos do not contradict it.
     """
 
     mesh: TriangleMesh
@@ -171,10 +153,9 @@ def make_start(
     if kind == "hull":
         tell(StageEvent("Carving the visual hull", 0, 0))
         hull = plain_hull(views, config)
-        opened = _opened(views, hull.vertices, hull.faces, tell)
-        closed = MeshTopology.from_faces(opened.faces, len(opened.vertices)).is_closed()
-        if opened.contradicted > (CONTRADICTED if closed else _OPEN):
-            opened, cut = _cut_open(views, hull, opened, config, device, tell)
+        opened = open_hull(views, hull.vertices, hull.faces, config.max_faces, tell)
+        if not _near(opened):
+            opened, cut = cut_open(views, hull, opened, config, device, tell)
         faces = opened.faces
         tell(StageEvent("Untangling the start", 0, 0))
         vertices = with_flat_sides(views, opened.vertices, faces)
@@ -198,63 +179,6 @@ def make_start(
         harmonics=config.drawing.harmonics,
     )
     return Started(mesh, kind, opened, hull, cut)
-
-
-def _opened(
-    views: Dataset, vertices: Tensor, faces: Tensor, tell: Callable[[Event], None], stage: str = "Opening hollows"
-) -> Opened:
-    tell(StageEvent(stage, 0, 3))
-    surface = without_false_handles(views, vertices, faces)
-    tell(StageEvent(stage, 1, 3))
-    surface = without_lids(views, *surface)
-    tell(StageEvent(stage, 2, 3))
-    return open_hollows(views, *surface)
-
-
-def _cut_open(
-    views: Dataset,
-    hull: Hull,
-    opened: Opened,
-    config: ReconstructConfig,
-    device: torch.device | None,
-    tell: Callable[[Event], None],
-) -> tuple[Opened, Cut]:
-    """A hull that photos contradict, cut out between walls, or where a coarse soup sees through it.
-
-    Either is taken if photos contradict it clearly less than what it cuts, it has no more faces than a run may have,
-    and much of the silhouettes is not left uncovered. A soup is asked where no walls that photos agree on will do.
-    """
-    photos, most = photos_of(views), hull.uncovered + _RIMS
-
-    def cut(free: Distance, wanted: int) -> Opened:
-        tell(StageEvent(stage := "Cutting the hull open", 0, 0))
-        surface = visual_hull(views, wanted, radius=config.start.radius, thin=hull.thin, free=free)
-        found = _opened(views, *surface, tell, stage) if len(surface[1]) else opened
-        covers = uncovered(photos, found.vertices, found.faces) <= most
-        return found if covers and len(found.faces) <= config.max_faces else opened
-
-    best, by = opened, False
-    tell(StageEvent("Looking for walls", 0, 0))
-    walls = between_walls(views, with_flat_sides(views, opened.vertices, opened.faces), opened.faces)
-    if walls is not None:
-        best = _clearer(cut(walls, min(2 * hull.wanted, most_faces(config))), opened)
-        by = "walls" if best is not opened else False
-    if best.contradicted > CONTRADICTED:
-        part = f"{100 * opened.contradicted:.1f} % of its surface"
-        tell(NoteEvent(f"photos contradict the visual hull on {part}: a coarse soup is asked what is free"))
-        ahead, tries = seen_through(views, hull.vertices, config, device, tell), []
-        for margin in _MARGINS:
-            tries.append(cut(lambda points, margin=margin: ahead(points) - margin, hull.wanted))
-            if tries[-1].contradicted <= CONTRADICTED:
-                break
-        kept, best = best, _clearer(min(tries, key=lambda each: each.contradicted), best)
-        by = by if best is kept else "soup"
-    return best, by
-
-
-def _clearer(cut: Opened, before: Opened) -> Opened:
-    """The first, if photos contradict it clearly less."""
-    return cut if cut.contradicted <= _CLEARLY * before.contradicted else before
 
 
 def nearby(config: ReconstructConfig) -> ReconstructConfig:

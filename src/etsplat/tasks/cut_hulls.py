@@ -1,0 +1,159 @@
+"""Hulls with hollows, opened: lids pushed in, cut out between walls, or cut where a coarse soup sees through them."""
+
+from collections.abc import Callable
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from etsplat.data.agreement import looked_at, mean_agreement, photos_of
+from etsplat.data.dataset import Dataset
+from etsplat.data.false_handles import without_false_handles
+from etsplat.data.hollows import Opened, open_hollows
+from etsplat.data.lids import without_lids
+from etsplat.data.plain_sides import with_flat_sides
+from etsplat.data.visual_hull import Distance, visual_hull
+from etsplat.data.walls import AGREED, between_walls
+from etsplat.geometry.topology import MeshTopology
+from etsplat.optim.loop import Event, NoteEvent, StageEvent
+from etsplat.tasks.coarse_soup import seen_through
+from etsplat.tasks.judgement import CONTRADICTED
+from etsplat.tasks.reconstruct_config import ReconstructConfig
+from etsplat.tasks.starting_hull import Hull, most_faces, uncovered
+
+_SURELY, _BETTER = 0.8, 0.01
+"""Mean correlation on walls under lids that were not pushed in, at least: it is 0.85 and more on those of vessels, 0.72
+at most elsewhere. And by how much more photos agree on a hull cut out between them than on one with its lids pushed
+in."""
+
+_MARGINS = (0.05, 0.03, 0.08)
+"""How far in front of what a coarse soup shows a hull is cut, in units of the object's radius; in turn, until photos
+contradict it no more. Nearer takes away what is thin, farther leaves more of a lid to be pushed in."""
+
+_OPEN = 0.01
+"""Of what is open, as a cube without its bottom, photos contradict more by chance than `CONTRADICTED`: it is seen from
+two sides. A soup that is asked all the same makes the walls of a hollow of its one sheet. Nor is one asked where walls
+that photos surely agree on leave less than that."""
+
+_CLEARLY, _RIMS = 0.7, 0.003
+"""A cut hull is taken where photos contradict at most so many times as much of it, and if it leaves at most this part
+of the silhouettes uncovered beside what the hull does: a little of a thin rim, which grows again."""
+
+Cut = Literal["walls", "soup", False]
+"""What a hull was cut open by: walls of one thickness, what a coarse soup shows, or nothing, though photos contradict
+it."""
+
+
+def open_hull(
+    views: Dataset,
+    vertices: Tensor,
+    faces: Tensor,
+    most: int,
+    tell: Callable[[Event], None],
+    stage: str = "Opening hollows",
+) -> Opened:
+    """A hull without false handles, its lids removed or pushed in, with so many faces at most if it has not more."""
+    tell(StageEvent(stage, 0, 3))
+    surface = without_false_handles(views, vertices, faces)
+    tell(StageEvent(stage, 1, 3))
+    surface = without_lids(views, *surface)
+    tell(StageEvent(stage, 2, 3))
+    return open_hollows(views, *surface, most=most)
+
+
+def cut_open(
+    views: Dataset,
+    hull: Hull,
+    opened: Opened,
+    config: ReconstructConfig,
+    device: torch.device | None,
+    tell: Callable[[Event], None],
+) -> tuple[Opened, Cut | None]:
+    """A hull with hollows, cut out between walls, or where a coarse soup sees through it.
+
+    Walls that photos surely agree on before lids are pushed in are tried first, whatever photos say of these. Others,
+    and a soup, are asked where photos contradict the hull, and taken if they contradict it clearly less.
+
+    Args:
+        views: of the unit frame.
+        hull: as it was carved.
+        opened: the same from `open_hull`.
+        config: settings.
+        device: of the soup; None for the CPU.
+        tell: called before what takes long.
+
+    Returns:
+        The hull, and by what it was cut open; None where it was not, and photos do not contradict it.
+    """
+    cutter = _Cutter(views, hull, opened, config, tell)
+    sure = cutter.walled(*without_false_handles(views, hull.vertices, hull.faces), _SURELY)
+    if _agreed(views, sure) >= _agreed(views, opened) + _BETTER:
+        best, by, bound = sure, "walls", _OPEN
+    else:
+        closed = MeshTopology.from_faces(opened.faces, len(opened.vertices)).is_closed()
+        best, by, bound = opened, None, CONTRADICTED if closed else _OPEN
+    if best.contradicted <= bound:
+        return best, by
+    if by is None:
+        best = _clearer(cutter.walled(*opened[:2], AGREED), opened)
+        by = "walls" if best is not opened else False
+    if best.contradicted > CONTRADICTED:
+        part = f"{100 * opened.contradicted:.1f} % of its surface"
+        tell(NoteEvent(f"photos contradict the visual hull on {part}: a coarse soup is asked what is free"))
+        before, best = best, _clearer(cutter.seen_through(device), best)
+        by = by if best is before else "soup"
+    return best, by
+
+
+class _Cutter:
+    """Cuts a hull open, where it has no more faces then than a run may have, and covers the silhouettes."""
+
+    def __init__(
+        self,
+        views: Dataset,
+        hull: Hull,
+        opened: Opened,
+        config: ReconstructConfig,
+        tell: Callable[[Event], None],
+    ) -> None:
+        self._views, self._hull, self._opened, self._config, self._tell = views, hull, opened, config, tell
+        self._photos = photos_of(views)
+
+    def cut(self, free: Distance, wanted: int) -> Opened:
+        """Without what is free, with about so many faces; the hull as it was where that does not do."""
+        self._tell(StageEvent(stage := "Cutting the hull open", 0, 0))
+        radius, most = self._config.start.radius, self._config.max_faces
+        surface = visual_hull(self._views, wanted, radius=radius, thin=self._hull.thin, free=free)
+        if len(surface[1]) == 0:
+            return self._opened
+        found = open_hull(self._views, *surface, most, self._tell, stage)
+        covers = uncovered(self._photos, found.vertices, found.faces) <= self._hull.uncovered + _RIMS
+        return found if covers and len(found.faces) <= most else self._opened
+
+    def walled(self, vertices: Tensor, faces: Tensor, agreed: float) -> Opened:
+        """Cut out between walls that photos agree on so far, looked for from a surface."""
+        self._tell(StageEvent("Looking for walls", 0, 0))
+        walls = between_walls(self._views, with_flat_sides(self._views, vertices, faces), faces, agreed)
+        if walls is None:
+            return self._opened
+        return self.cut(walls, min(2 * self._hull.wanted, most_faces(self._config)))
+
+    def seen_through(self, device: torch.device | None) -> Opened:
+        """Cut where a coarse soup sees through it, by the margin at which photos contradict it least."""
+        ahead = seen_through(self._views, self._hull.vertices, self._config, device, self._tell)
+        tries = list[Opened]()
+        for margin in _MARGINS:
+            tries.append(self.cut(lambda points, margin=margin: ahead(points) - margin, self._hull.wanted))
+            if tries[-1].contradicted <= CONTRADICTED:
+                break
+        return min(tries, key=lambda each: each.contradicted)
+
+
+def _clearer(cut: Opened, before: Opened) -> Opened:
+    """The first, if photos contradict it clearly less."""
+    return cut if cut.contradicted <= _CLEARLY * before.contradicted else before
+
+
+def _agreed(views: Dataset, surface: Opened) -> float:
+    looked = looked_at(views, surface.vertices, surface.faces)
+    return 0.0 if looked is None else mean_agreement(looked)
