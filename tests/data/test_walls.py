@@ -9,11 +9,11 @@ import trimesh
 from etsplat.data.agreement import looked_at, pixel_size
 from etsplat.data.hollows import open_hollows
 from etsplat.data.visual_hull import visual_hull
-from etsplat.data.walls import _Through, _Walls, between_walls
+from etsplat.data.walls import _elsewhere, _Through, _Walls, between_walls
 from etsplat.geometry.distance import closest_points
 from etsplat.geometry.parts import Shape, shape_of
 from helpers.painting import painted_pictures
-from helpers.revolved import CAN, MUG, MUG_WALL, revolved
+from helpers.revolved import BOWL, CAN, MUG, MUG_WALL, revolved
 
 FACES = 4000
 
@@ -37,12 +37,32 @@ def test_what_is_free_lies_between_walls_of_their_true_thickness(mug) -> None:
     assert float(beyond(views.normalization.apply(torch.tensor([[0.5 - MUG_WALL / 3, 0.0, 0.0]])))) < 0
 
 
+def test_a_bottom_may_be_thicker_than_walls() -> None:
+    """Three times so, in a bowl: its floor is at -0.2."""
+    _, _, views = painted_pictures(*revolved(BOWL))
+    beyond = between_walls(views, *visual_hull(views, FACES))
+    assert beyond is not None
+    heights = torch.tensor([[0.2, y, 0.0] for y in (-0.26, -0.14)])
+    assert (beyond(views.normalization.apply(heights)) > 0).tolist() == [False, True]
+    sides = torch.tensor([[out, 0.1, 0.0] for out in (0.62, 0.54)])
+    assert (beyond(views.normalization.apply(sides)) > 0).tolist() == [False, True]
+
+
+def test_what_was_pushed_in_elsewhere_is_where_it_went() -> None:
+    """And not the lid, with what was pushed in beside it: three vertices of a chain of nine are one patch with it."""
+    vertices, edges = torch.zeros(9, 3), torch.stack([torch.arange(8), torch.arange(1, 9)], dim=1)
+    pushed = vertices.clone()
+    pushed[[1, 2, 3, 6, 7]] = 1
+    found = _elsewhere(vertices, edges, torch.tensor([0, 1]), pushed)
+    assert found[:, 0].tolist() == [0, 0, 0, 0, 0, 0, 1, 1, 0]
+
+
 def test_walls_have_no_brim() -> None:
     """Right under a lid all is free up to a wall's thickness from the sides, and what is under the rim stays."""
     vertices, faces = revolved(CAN)
     middles = vertices[faces].mean(dim=1)
     top, out = middles[:, 1] > 0.399, middles[:, [0, 2]].norm(dim=1)
-    walls = _Walls(vertices, faces[top & (out < 0.4)], faces[top & (out > 0.4)], faces[~top], 0.1)
+    walls = _Walls(vertices, faces[top & (out < 0.4)], faces[top & (out > 0.4)], faces[:0], faces[~top], 0.1, 0.1)
     places = torch.tensor([[0.35, 0.37, 0.0], [0.5, 0.37, 0.0], [0.5, 0.2, 0.0], [0.65, 0.2, 0.0], [0.0, -0.45, 0.0]])
     assert (walls.beyond(places) > 0).tolist() == [True, False, True, False, False]
 
@@ -56,7 +76,7 @@ def test_a_lid_goes_on_beside_where_photos_contradict_it_and_ends_at_walls() -> 
     top, out = middles[:, 1] > 0.99 * float(vertices[:, 1].max()), middles[:, [0, 2]].norm(dim=1)
     outer = float(out.max())
     for radius, most in ((0.4, 0.4 * outer + 3 * pixel_size(looked.photos)), (0.95, outer - 0.2)):
-        found = _Through(looked, top & (out < radius * outer)).walls(0.2)
+        found = _Through(looked, top & (out < radius * outer), vertices).walls(0.2, 0.2)
         reached = vertices[found.lid].mean(dim=1)[:, [0, 2]].norm(dim=1).max()
         assert most - 0.04 < float(reached) <= most
 

@@ -14,6 +14,7 @@ from etsplat.data.closed_hollows import closed_hollows
 from etsplat.data.hollows import Opened, open_hollows
 from etsplat.data.visual_hull import visual_hull
 from etsplat.engines.threads import num_threads, set_num_threads
+from etsplat.geometry.distance import closest_points
 from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.parts import Shape, shape_of
 from etsplat.model.triangle_mesh import TriangleMesh
@@ -22,7 +23,7 @@ from etsplat.tasks.judgement import CLOSED, CONTRADICTED
 from etsplat.tasks.reconstruct import _grown_over, _judge
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 from helpers.painting import mean_colors, painted_pictures
-from helpers.revolved import BOWL, MUG, VASE, revolved
+from helpers.revolved import BOWL, CAN, MUG, VASE, revolved
 
 CONFIG = ReconstructConfig.quick().changed({"start.hull_faces": 1600})
 
@@ -64,9 +65,24 @@ def test_what_is_free_is_the_same_to_the_bit_on_any_number_of_threads(monkeypatc
 
 
 def test_no_soup_is_asked_where_photos_agree(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A bowl, whose lid goes down by itself."""
+    """A bowl with a bottom thicker than its walls: its lid goes down, and is nearer once it is cut out."""
     monkeypatch.setattr(cut_hulls, "seen_through", None)
+    vertices, _, views = painted_pictures(*revolved(BOWL))
+    lidded = open_hollows(views, *visual_hull(views, 1600))
+    assert lidded.contradicted < CONTRADICTED
+    started = starts.make_start(None, views, CONFIG)
+    assert started.cut == "walls"
+    before, after = (closest_points(vertices, *surface)[0].mean() for surface in (lidded[:2], started.mesh.surface()))
+    assert after < before / 2
+
+
+def test_no_walls_are_cut_where_there_are_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a can without a hollow, nor where photos agree no more on what was cut out."""
+    monkeypatch.setattr(cut_hulls, "seen_through", None)
+    _, _, views = painted_pictures(*revolved(CAN))
+    assert starts.make_start(None, views, CONFIG).cut is None
     _, _, views = painted_pictures(*revolved(BOWL))
+    monkeypatch.setattr(cut_hulls, "between_walls", lambda *_: lambda points: points.norm(dim=1) - 0.1)
     assert starts.make_start(None, views, CONFIG).cut is None
 
 

@@ -97,6 +97,7 @@ class Opened(NamedTuple):
         contradicted: the largest patch that photos contradicted when they were last asked (`contradicted_share`).
         doubtful: the part of the vertices that moved, or that no two photos saw then.
         agreed: the part of the vertices on which photos agreed then.
+        lidded: (V, 3) and (F, 3) of the hull before; its vertices are the first of these. None if it is not known.
     """
 
     vertices: Float[Tensor, "V2 3"]
@@ -105,6 +106,7 @@ class Opened(NamedTuple):
     contradicted: float
     doubtful: float
     agreed: float
+    lidded: tuple[Float[Tensor, "V 3"], Int64[Tensor, "F 3"]] | None = None
 
 
 class _Look(NamedTuple):
@@ -144,10 +146,11 @@ def open_hollows(
     dataset = reduced(dataset)
     photos = photos_of(dataset)
     if len(photos) < 2 or len(vertices) == 0:
-        return Opened(vertices, faces, 0, 0.0, 1.0, 0.0)
+        return Opened(vertices, faces, 0, 0.0, 1.0, 0.0, (vertices, faces))
     edge, half_more = float(_edge_lengths(vertices, faces).mean()), len(faces) * 3 // 2
     most = half_more if most is None else min(most, half_more)
-    outside, total, look = outside_hull(dataset), 0, _Look(vertices, 0, 0.0, 1.0, 0.0)
+    lidded, total, look = (vertices, faces), 0, _Look(vertices, 0, 0.0, 1.0, 0.0)
+    outside = outside_hull(dataset)
     for _ in range(_PASSES):
         look = _push(photos, outside, vertices, faces)
         if look.moved == 0:
@@ -155,7 +158,7 @@ def open_hollows(
         total += look.moved
         vertices, faces = _divided(look.vertices, faces, _LONGEST * edge, most)
     doubtful = min(1.0, total / len(vertices) + look.unseen)
-    return Opened(vertices, faces, total, look.contradicted, doubtful, look.agreed)
+    return Opened(vertices, faces, total, look.contradicted, doubtful, look.agreed, lidded)
 
 
 def _push(photos: list[Photo], outside: Distance, vertices: Tensor, faces: Tensor) -> _Look:

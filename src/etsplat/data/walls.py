@@ -5,6 +5,7 @@ is farther than a wall's thickness from the hull, but for the lid, is free. Phot
 such walls where they are that thick, and hardly where they are not.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -42,6 +43,9 @@ AGREED, _PEAK = 0.5, 0.3
 """Mean correlation on walls, at least, which are seen at a slant; and by so much more than on the lid, or at the least
 likely thickness."""
 
+_CLEAR, _THICKER = 0.8, 0.1
+"""Mean correlation on a bottom that is not as thick as the walls, at least; and by so much more than if it were."""
+
 _LEVEL = 0.7
 """Cosine of the angle between a lid's mean normal and those of its own faces and of the rim's, at least."""
 
@@ -62,23 +66,29 @@ class _Walls(NamedTuple):
         vertices: (V, 3) of all.
         lid: (L, 3) faces over what is free.
         rim: (R, 3) those around it that are as level, as far as the sides.
+        bottom: (B, 3) those of the others that look down where a lid looks up.
         sides: (F, 3) all others.
         thickness: of the walls.
+        floor: thickness of the bottom.
     """
 
     vertices: Float[Tensor, "V 3"]
     lid: Int64[Tensor, "L 3"]
     rim: Int64[Tensor, "R 3"]
+    bottom: Int64[Tensor, "B 3"]
     sides: Int64[Tensor, "F 3"]
     thickness: float
+    floor: float
 
     def beyond(self, points: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:
-        """How far points are farther than walls are thick from all but the lid, and under it from the sides alone.
+        """How far points are farther than walls are thick from all but the lid, and under it from all but the rim.
 
         Measured from a rim, too, walls would have a brim there.
         """
-        lid, rim, sides = (_distance(points, self.vertices, faces) for faces in (self.lid, self.rim, self.sides))
-        return torch.where(lid < rim, sides, torch.minimum(rim, sides)) - self.thickness
+        others = (self.lid, self.rim, self.bottom, self.sides)
+        lid, rim, bottom, sides = (_distance(points, self.vertices, faces) for faces in others)
+        around = torch.minimum(bottom - self.floor, sides - self.thickness)
+        return torch.where(lid < rim, around, torch.minimum(rim - self.thickness, around))
 
     def hollow(self, outside: Distance) -> Distance:
         """The same of the hollow under the lid alone, which ends at passages no wider than both walls beside them."""
@@ -88,7 +98,11 @@ class _Walls(NamedTuple):
 
 @torch.no_grad()
 def between_walls(
-    dataset: Dataset, vertices: Float[Tensor, "V 3"], faces: Int64[Tensor, "F 3"], agreed: float = AGREED
+    dataset: Dataset,
+    vertices: Float[Tensor, "V 3"],
+    faces: Int64[Tensor, "F 3"],
+    agreed: float = AGREED,
+    pushed: Float[Tensor, "V 3"] | None = None,
 ) -> Distance | None:
     """How far points within a hull are beyond its walls, in hollows whose walls photos agree on: positive there.
 
@@ -97,6 +111,8 @@ def between_walls(
         vertices: (V, 3) of the hull.
         faces: (F, 3) of it.
         agreed: mean correlation on walls, at least.
+        pushed: (V, 3) vertices once lids are pushed in, if these are not. Walls are as far from what was pushed in
+            elsewhere than at their own lid: the cone that a hull has under an object is not its bottom.
 
     Returns:
         A function of points; None where there is no such hollow.
@@ -105,7 +121,8 @@ def between_walls(
     if looked is None:
         return None
     outside = outside_hull(dataset)
-    hollows = (_Through(looked, lid) for lid in _lids(looked, outside))
+    pushed = vertices if pushed is None else pushed
+    hollows = (_Through(looked, lid, pushed) for lid in _lids(looked, outside))
     found = [walls.hollow(outside) for hollow in hollows if (walls := _walls(hollow, agreed))]
     if not found:
         return None
@@ -130,14 +147,29 @@ def _lids(looked: Looked, outside: Distance) -> list[Bool[Tensor, " F"]]:
 
 def _walls(through: "_Through", least: float) -> _Walls | None:
     """The walls around the hollow under a lid, no thinner than a mesh of it can be; None where photos agree on none."""
-    agreed = {pixels: through.agreed(pixels * through.pixel) for pixels in _PIXELS}
-    middle = max(agreed, key=agreed.__getitem__)
-    agreed |= {pixels: through.agreed(pixels * through.pixel) for pixels in (max(2, middle - 1), middle + 1)}
-    best = max(agreed, key=agreed.__getitem__)
+    best, agreed = _likeliest(through.agreed)
     lowest = min([through.closed, *(each for each in agreed.values() if each > 0)])
     if agreed[best] < max(least, lowest + _PEAK):
         return None
-    return through.walls(max(best * through.pixel, _THICK * through.edge))
+    deepest, floors = _likeliest(through.floor_agreed)
+    clear = floors[deepest] >= max(_CLEAR, floors.get(best, through.floor_agreed(best)) + _THICKER)
+    thickness, floor = (max(each * through.pixel, _THICK * through.edge) for each in (best, deepest if clear else best))
+    return through.walls(thickness, floor)
+
+
+def _likeliest(agreed: Callable[[int], float]) -> tuple[int, dict[int, float]]:
+    """The thickness in pixels at which photos agree most, and what they do at those that were tried."""
+    found = {pixels: agreed(pixels) for pixels in _PIXELS}
+    middle = max(found, key=found.__getitem__)
+    found |= {pixels: agreed(pixels) for pixels in (max(2, middle - 1), middle + 1)}
+    return max(found, key=found.__getitem__), found
+
+
+def _elsewhere(vertices: Tensor, edges: Tensor, lid: Int64[Tensor, " L"], pushed: Tensor) -> Tensor:
+    """(V, 3) vertices, where they were pushed in if that is not together with some of a lid."""
+    moved = (pushed != vertices).any(dim=1)
+    patch = connected(edges[moved[edges].all(dim=1)], len(vertices))[1]
+    return torch.where((moved & ~torch.isin(patch, patch[lid]))[:, None], pushed, vertices)
 
 
 def _distance(points: Tensor, vertices: Tensor, faces: Tensor) -> Tensor:
@@ -157,20 +189,22 @@ class _Through:
         edge: mean length of the surface's edges.
     """
 
-    def __init__(self, looked: Looked, lid: Bool[Tensor, " F"]) -> None:
+    def __init__(self, looked: Looked, lid: Bool[Tensor, " F"], pushed: Float[Tensor, "V 3"]) -> None:
         vertices, faces, edges = looked.vertices, looked.faces, looked.topology.edges.long()
         self._lid_faces = faces[lid]
         self.rest, self.pixel, self.edge = faces[~lid], pixel_size(looked.photos), mean_edge(vertices, edges)
+        up = self._up = normalize(area_normals(vertices, self._lid_faces).sum(dim=0), dim=0)
         self.closed = float(looked.score[faces[lid].unique()].nanmean())
         self._photos, self._vertices, self._own = looked.photos, vertices, self.rest.unique()
-        self._normals = averaged(vertex_normals(vertices, faces), edges, _SMOOTH)[self._own]
+        self._elsewhere = _elsewhere(vertices, edges, faces[lid].unique(), pushed)
+        normals = averaged(vertex_normals(vertices, faces), edges, _SMOOTH)
+        self._normals, self._below = normals[self._own], normals @ up < -_LEVEL
         self._lid = [((hit >= 0) & lid[hit.clamp_min(0)]).float()[None, None] for _, hit in looked.hits]
         self._behind = [first_hits(photo, vertices, self.rest)[0][None, None] for photo in looked.photos]
 
-    def walls(self, thickness: float) -> _Walls:
+    def walls(self, thickness: float, floor: float) -> _Walls:
         """So thick ones around what is under the lid, with what is beside it, where that is level and not on walls."""
-        vertices, rest, beside = self._vertices, self.rest, _BESIDE * self.pixel
-        up = normalize(area_normals(vertices, self._lid_faces).sum(dim=0), dim=0)
+        vertices, rest, up, beside = self._elsewhere, self.rest, self._up, _BESIDE * self.pixel
         lid = self._lid_faces[self._level(self._lid_faces, up)]
         away = _distance(vertices[rest].mean(dim=1), vertices, lid)
         around = self._level(rest, up) & (away <= thickness + beside)
@@ -178,17 +212,25 @@ class _Through:
         below = vertices[above].mean(dim=1) - 2 * thickness * up
         on_walls = _distance(below, vertices, sides) <= thickness
         rim = torch.cat([rest[around & (away > beside)], above[on_walls]])
-        return _Walls(vertices, above[~on_walls], rim, sides, thickness)
+        bottom = self._below[sides].all(dim=1)
+        return _Walls(vertices, above[~on_walls], rim, sides[bottom], sides[~bottom], thickness, floor)
 
     def _level(self, faces: Int64[Tensor, "F 3"], up: Float[Tensor, " 3"]) -> Bool[Tensor, " F"]:
         """Which faces look up as a lid does."""
         return normalize(area_normals(self._vertices, faces), dim=1) @ up > _LEVEL
 
-    def agreed(self, thickness: float) -> float:
+    def agreed(self, pixels: int) -> float:
         """Mean correlation on walls so thick, by how many photos see each place; 0 where too little is known."""
-        places = self._vertices[self._own] - thickness * self._normals
-        near = _distance(places, self._vertices, self.rest) < _ALONE * thickness
-        places, normals = places[~near], -self._normals[~near]
+        return self._agreed(pixels * self.pixel, self._vertices, torch.ones_like(self._own, dtype=torch.bool))
+
+    def floor_agreed(self, pixels: int) -> float:
+        """The same on a bottom so thick."""
+        return self._agreed(pixels * self.pixel, self._elsewhere, self._below[self._own])
+
+    def _agreed(self, thickness: float, vertices: Float[Tensor, "V 3"], some: Bool[Tensor, " O"]) -> float:
+        places = vertices[self._own] - thickness * self._normals
+        some = some & (_distance(places, vertices, self.rest) >= _ALONE * thickness)
+        places, normals = places[some], -self._normals[some]
         seen = torch.stack([self._seen(number, places) for number in range(len(self._photos))])
         views = seen.sum(dim=0)
         asked = views >= 2

@@ -76,10 +76,11 @@ def _loops_through(root: int, topology: MeshTopology, edges: Tensor, length: Ten
     left = torch.zeros(len(edges), dtype=torch.bool)
     left[free] = True
     left[longest[np.searchsorted(keys, row.astype(np.int64) * F + column)]] = False
-    return [_closed(a, b, before) for a, b in edges[left].tolist()]
+    known = before.tolist()
+    return [_closed(a, b, known) for a, b in edges[left].tolist()]
 
 
-def _closed(a: int, b: int, before: Tensor) -> list[int]:
+def _closed(a: int, b: int, before: list[int]) -> list[int]:
     """The loop along an edge and back by the ways of its ends, as far as these are apart."""
     there, back = _way_back(a, before), _way_back(b, before)
     while len(there) > 1 and len(back) > 1 and there[-2] == back[-2]:
@@ -88,8 +89,8 @@ def _closed(a: int, b: int, before: Tensor) -> list[int]:
     return there + back[-2::-1]
 
 
-def _way_back(place: int, before: Tensor) -> list[int]:
+def _way_back(place: int, before: list[int]) -> list[int]:
     way = [place]
-    while (place := int(before[place])) >= 0:
+    while (place := before[place]) >= 0:
         way.append(place)
     return way

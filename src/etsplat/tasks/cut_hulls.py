@@ -86,8 +86,8 @@ def cut_open(
         The hull, and by what it was cut open; None where it was not, and photos do not contradict it.
     """
     cutter = _Cutter(views, hull, opened, config, tell)
-    sure = cutter.walled(*without_false_handles(views, hull.vertices, hull.faces), _SURELY)
-    if _agreed(views, sure) >= _agreed(views, opened) + _BETTER:
+    sure = cutter.surely_walled()
+    if sure is not opened and _agreed(views, sure) >= _agreed(views, opened) + _BETTER:
         best, by, bound = sure, "walls", _OPEN
     else:
         closed = MeshTopology.from_faces(opened.faces, len(opened.vertices)).is_closed()
@@ -95,7 +95,7 @@ def cut_open(
     if best.contradicted <= bound:
         return best, by
     if by is None:
-        best = _clearer(cutter.walled(*opened[:2], AGREED), opened)
+        best = _clearer(cutter.walled(), opened)
         by = "walls" if best is not opened else False
     if best.contradicted > CONTRADICTED:
         part = f"{100 * opened.contradicted:.1f} % of its surface"
@@ -130,10 +130,22 @@ class _Cutter:
         covers = uncovered(self._photos, found.vertices, found.faces) <= self._hull.uncovered + _RIMS
         return found if covers and len(found.faces) <= most else self._opened
 
-    def walled(self, vertices: Tensor, faces: Tensor, agreed: float) -> Opened:
-        """Cut out between walls that photos agree on so far, looked for from a surface."""
+    def surely_walled(self) -> Opened:
+        """Cut out between walls that photos surely agree on, under lids that are not pushed in."""
+        vertices, faces = self._opened.lidded or self._opened[:2]
+        flat = with_flat_sides(self._views, vertices, faces)
+        pushed = self._opened.vertices[: len(vertices)]
+        pushed = torch.where((pushed != vertices).any(dim=1, keepdim=True), pushed, flat)
+        return self._between(flat, faces, _SURELY, pushed)
+
+    def walled(self) -> Opened:
+        """Cut out between walls that photos agree on, under what lids that were pushed in leave."""
+        vertices, faces = self._opened[:2]
+        return self._between(with_flat_sides(self._views, vertices, faces), faces, AGREED, None)
+
+    def _between(self, vertices: Tensor, faces: Tensor, agreed: float, pushed: Tensor | None) -> Opened:
         self._tell(StageEvent("Looking for walls", 0, 0))
-        walls = between_walls(self._views, with_flat_sides(self._views, vertices, faces), faces, agreed)
+        walls = between_walls(self._views, vertices, faces, agreed, pushed)
         if walls is None:
             return self._opened
         return self.cut(walls, min(2 * self._hull.wanted, most_faces(self._config)))
