@@ -17,6 +17,7 @@ from etsplat.data.false_handles import (
     _covered,
     _cut,
     _fills,
+    _renumbered,
     _simpler,
     _Views,
     silhouette_errors,
@@ -25,6 +26,7 @@ from etsplat.data.false_handles import (
 from etsplat.data.meshing import SignedDistance, dual_contour
 from etsplat.data.pictures import StoredPictures
 from etsplat.geometry.distance import closest_points
+from etsplat.geometry.loops import short_loops
 from etsplat.geometry.parts import genera
 from etsplat.geometry.topology import MeshTopology
 from helpers.painting import painted_pictures
@@ -214,7 +216,8 @@ def bridged(places: np.ndarray) -> np.ndarray:
 def cut(photos: list[Photo], vertices: torch.Tensor, faces: torch.Tensor, agreed: _Agreement) -> Surface:
     """A surface without what `_cut` cuts, or as it was."""
     most = silhouette_errors(photos, vertices, faces) + torch.tensor([0, _BLOCKED])
-    return _cut(_Views.of(photos), vertices, faces, agreed, most) or (vertices, faces)
+    found = _cut(_Views.of(photos), vertices, faces, agreed, most, short_loops(vertices, faces))
+    return (vertices, faces) if found is None else found[:2]
 
 
 @pytest.mark.parametrize(("shown", "holes"), [(bowl, 0), (bridged, 1)])
@@ -237,6 +240,15 @@ def test_a_thin_bridge_is_cut_where_no_photo_sees_it() -> None:
     assert genera(faces, len(vertices)) == [1]
     vertices, faces = cut(photos, vertices, faces, _Agreement.of(photos, vertices, faces))
     assert genera(faces, len(vertices)) == [0]
+
+
+def test_loops_away_from_a_cut_are_known_after_it() -> None:
+    """By where their vertices are; not those with a vertex that is gone, nor longer ones than are tried."""
+    before = torch.arange(24.0).reshape(12, 2)
+    after = before[[11, 5, 4, 3, 0]]
+    loops = [[3, 4, 5], [5, 11, 0], [3, 4, 6], list(range(9)), [4, 0, 11]]
+    assert _renumbered(loops, before, after, torch.tensor([0])) == [[3, 2, 1]]
+    assert _renumbered(loops, before, after, torch.tensor([], dtype=torch.int64)) == [[3, 2, 1], [1, 0, 4], [2, 4, 0]]
 
 
 def looped(places: np.ndarray) -> np.ndarray:

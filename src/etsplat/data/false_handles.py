@@ -97,11 +97,17 @@ def without_false_handles(
                 return vertices, faces
             agreed = _Agreement.of(photos, vertices, faces)
     most = silhouette_errors(photos, vertices, faces) + torch.tensor([0, _BLOCKED])
-    while (simpler := _cut(views, vertices, faces, agreed, most)) is not None:
-        vertices, faces = simpler
-        if not any(genera(faces, len(vertices))):
-            break
-        agreed = _Agreement.of(photos, vertices, faces)
+    loops, all_of_them = short_loops(vertices, faces), True
+    while loops:
+        found = _cut(views, vertices, faces, agreed, most, loops)
+        if found is not None:
+            vertices, faces, loops = found
+            if not any(genera(faces, len(vertices))):
+                break
+            agreed, all_of_them = _Agreement.of(photos, vertices, faces), False
+        if not loops or found is None:
+            loops = [] if all_of_them else short_loops(vertices, faces)
+            all_of_them = True
     return vertices, faces
 
 
@@ -160,9 +166,11 @@ def _views_of(dataset: Dataset) -> _Views:
 
 
 def _cut(
-    views: _Views, vertices: Tensor, faces: Tensor, agreed: _Agreement, most: Tensor
-) -> tuple[Tensor, Tensor] | None:
+    views: _Views, vertices: Tensor, faces: Tensor, agreed: _Agreement, most: Tensor, loops: list[list[int]]
+) -> tuple[Tensor, Tensor, list[list[int]]] | None:
     """The surface cut along a short loop, with a smaller genus, if there is one: the shortest is tried first.
+
+    With it come those loops that were not tried and are not near the cut: to look for all anew takes long.
 
     Args:
         views: all that look.
@@ -170,10 +178,11 @@ def _cut(
         faces: (F, 3), with a handle.
         agreed: what photos say of it.
         most: (B, 2) errors of silhouettes that are allowed.
+        loops: from `short_loops`.
     """
     before, (score, hidden, _), least = genera(faces, len(vertices)), agreed, _smallest(faces, len(vertices))
     was, tried = None, torch.zeros(len(vertices), dtype=torch.bool)
-    for loop in short_loops(vertices, faces):
+    for number, loop in enumerate(loops):
         if len(loop) > _THIN or 2 * int(tried[loop].sum()) > len(loop):
             continue
         band = torch.isin(faces, torch.tensor(loop)).any(dim=1)
@@ -193,8 +202,18 @@ def _cut(
         if _fills(views, (vertices, faces), was, covered):
             continue
         if doubted or not _lets_go(views, (vertices, faces), found):
-            return found
+            return *found, _renumbered(loops[number + 1 :], vertices, found[0], around)
     return None
+
+
+def _renumbered(loops: list[list[int]], before: Tensor, after: Tensor, gone: Tensor) -> list[list[int]]:
+    """Short loops by their vertices' numbers after a cut, which are where they were; without those near it."""
+    near = set(gone.tolist())
+    number = {tuple(place): index for index, place in enumerate(after.tolist())}
+    places = before.tolist()
+    kept = (loop for loop in loops if len(loop) <= _THIN and near.isdisjoint(loop))
+    found = ([number.get(tuple(places[index]), -1) for index in loop] for loop in kept)
+    return [loop for loop in found if min(loop) >= 0]
 
 
 def _small(faces: Tensor, band: Bool[Tensor, " F"]) -> bool:
