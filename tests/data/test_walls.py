@@ -49,12 +49,12 @@ def test_a_bottom_may_be_thicker_than_walls() -> None:
 
 
 def test_what_was_pushed_in_elsewhere_is_where_it_went() -> None:
-    """And not the lid, with what was pushed in beside it: three vertices of a chain of nine are one patch with it."""
-    vertices, edges = torch.zeros(9, 3), torch.stack([torch.arange(8), torch.arange(1, 9)], dim=1)
-    pushed = vertices.clone()
-    pushed[[1, 2, 3, 6, 7]] = 1
-    found = _elsewhere(vertices, edges, torch.tensor([0, 1]), pushed)
-    assert found[:, 0].tolist() == [0, 0, 0, 0, 0, 0, 1, 1, 0]
+    """And not the lid, with what was pushed in beside it, nor another lid that looks up: here along a chain."""
+    vertices, edges = torch.zeros(11, 3), torch.stack([torch.arange(10), torch.arange(1, 11)], dim=1)
+    pushed, level = vertices.clone(), torch.tensor([1.0, 1, 1, 1, 0, 0, -1, -1, 0, 1, 1])
+    pushed[[1, 2, 3, 6, 7, 9, 10]] = 1
+    found = _elsewhere(vertices, edges, torch.tensor([0, 1]), pushed, level)
+    assert found[:, 0].tolist() == [0, 0, 0, 0, 0, 0, 1, 1, 0, 0, 0]
 
 
 def test_walls_have_no_brim() -> None:

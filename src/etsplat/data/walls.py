@@ -165,11 +165,27 @@ def _likeliest(agreed: Callable[[int], float]) -> tuple[int, dict[int, float]]:
     return max(found, key=found.__getitem__), found
 
 
-def _elsewhere(vertices: Tensor, edges: Tensor, lid: Int64[Tensor, " L"], pushed: Tensor) -> Tensor:
-    """(V, 3) vertices, where they were pushed in if that is not together with some of a lid."""
+def _elsewhere(
+    vertices: Float[Tensor, "V 3"],
+    edges: Int64[Tensor, "E 2"],
+    lid: Int64[Tensor, " L"],
+    pushed: Float[Tensor, "V 3"],
+    level: Float[Tensor, " V"],
+) -> Float[Tensor, "V 3"]:
+    """Vertices, where they were pushed in if that is not together with some of a lid, nor of what looks up as it does.
+
+    Args:
+        vertices: (V, 3).
+        edges: (E, 2).
+        lid: (L,) its vertices.
+        pushed: (V, 3) where they were pushed to.
+        level: (V,) cosines of the angles between their normals and the lid's.
+    """
     moved = (pushed != vertices).any(dim=1)
-    patch = connected(edges[moved[edges].all(dim=1)], len(vertices))[1]
-    return torch.where((moved & ~torch.isin(patch, patch[lid]))[:, None], pushed, vertices)
+    count, patch = connected(edges[moved[edges].all(dim=1)], len(vertices))
+    mean = torch.zeros(count).index_add(0, patch, level) / patch.bincount(minlength=count)
+    own = torch.isin(patch, patch[lid]) | (mean > _LEVEL)[patch]
+    return torch.where((moved & ~own)[:, None], pushed, vertices)
 
 
 def _distance(points: Tensor, vertices: Tensor, faces: Tensor) -> Tensor:
@@ -196,9 +212,9 @@ class _Through:
         up = self._up = normalize(area_normals(vertices, self._lid_faces).sum(dim=0), dim=0)
         self.closed = float(looked.score[faces[lid].unique()].nanmean())
         self._photos, self._vertices, self._own = looked.photos, vertices, self.rest.unique()
-        self._elsewhere = _elsewhere(vertices, edges, faces[lid].unique(), pushed)
         normals = averaged(vertex_normals(vertices, faces), edges, _SMOOTH)
         self._normals, self._below = normals[self._own], normals @ up < -_LEVEL
+        self._elsewhere = _elsewhere(vertices, edges, faces[lid].unique(), pushed, normals @ up)
         self._lid = [((hit >= 0) & lid[hit.clamp_min(0)]).float()[None, None] for _, hit in looked.hits]
         self._behind = [first_hits(photo, vertices, self.rest)[0][None, None] for photo in looked.photos]
 

@@ -86,12 +86,10 @@ def cut_open(
         The hull, and by what it was cut open; None where it was not, and photos do not contradict it.
     """
     cutter = _Cutter(views, hull, opened, config, tell)
-    sure = cutter.surely_walled()
-    if sure is not opened and _agreed(views, sure) >= _agreed(views, opened) + _BETTER:
+    closed = MeshTopology.from_faces(opened.faces, len(opened.vertices)).is_closed()
+    best, by, bound = opened, None, CONTRADICTED if closed else _OPEN
+    if (sure := cutter.surely_walled()) is not None:
         best, by, bound = sure, "walls", _OPEN
-    else:
-        closed = MeshTopology.from_faces(opened.faces, len(opened.vertices)).is_closed()
-        best, by, bound = opened, None, CONTRADICTED if closed else _OPEN
     if best.contradicted <= bound:
         return best, by
     if by is None:
@@ -130,13 +128,22 @@ class _Cutter:
         covers = uncovered(self._photos, found.vertices, found.faces) <= self._hull.uncovered + _RIMS
         return found if covers and len(found.faces) <= most else self._opened
 
-    def surely_walled(self) -> Opened:
-        """Cut out between walls that photos surely agree on, under lids that are not pushed in."""
+    def surely_walled(self) -> Opened | None:
+        """Cut out between walls that photos surely agree on, under lids that are not pushed in; None if that is worse.
+
+        What was pushed in elsewhere stays so, or not, since that is wrong at times.
+        """
         vertices, faces = self._opened.lidded or self._opened[:2]
-        flat = with_flat_sides(self._views, vertices, faces)
-        pushed = self._opened.vertices[: len(vertices)]
-        pushed = torch.where((pushed != vertices).any(dim=1, keepdim=True), pushed, flat)
-        return self._between(flat, faces, _SURELY, pushed)
+        flat, pushed = with_flat_sides(self._views, vertices, faces), self._opened.vertices[: len(vertices)]
+        moved = (pushed != vertices).any(dim=1, keepdim=True)
+        for elsewhere in (torch.where(moved, pushed, flat), None):
+            found = self._between(flat, faces, _SURELY, elsewhere)
+            if found is self._opened:
+                return None
+            right = found.contradicted <= max(_OPEN, self._opened.contradicted)
+            if right and _agreed(self._views, found) >= _agreed(self._views, self._opened) + _BETTER:
+                return found
+        return None
 
     def walled(self) -> Opened:
         """Cut out between walls that photos agree on, under what lids that were pushed in leave."""
