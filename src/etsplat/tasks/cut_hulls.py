@@ -96,7 +96,7 @@ def cut_open(
         best = _clearer(cutter.walled(), opened)
         by = "walls" if best is not opened else False
     if best.contradicted > CONTRADICTED:
-        part = f"{100 * opened.contradicted:.1f} % of its surface"
+        part = f"{100 * best.contradicted:.1f} % of its surface"
         tell(NoteEvent(f"photos contradict the visual hull on {part}: a coarse soup is asked what is free"))
         before, best = best, _clearer(cutter.seen_through(device), best)
         by = by if best is before else "soup"
