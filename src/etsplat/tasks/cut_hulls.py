@@ -72,7 +72,8 @@ def cut_open(
     """A hull with hollows, cut out between walls, or where a coarse soup sees through it.
 
     Walls that photos surely agree on before lids are pushed in are tried first, whatever photos say of these. Others,
-    and a soup, are asked where photos contradict the hull, and taken if they contradict it clearly less.
+    and a soup, are asked where photos contradict the hull, and taken if they contradict it clearly less; instead of
+    walls a soup is taken if they do not agree less on it, besides.
 
     Args:
         views: of the unit frame.
@@ -98,8 +99,9 @@ def cut_open(
     if best.contradicted > CONTRADICTED:
         part = f"{100 * best.contradicted:.1f} % of its surface"
         tell(NoteEvent(f"photos contradict the visual hull on {part}: a coarse soup is asked what is free"))
-        before, best = best, _clearer(cutter.seen_through(device), best)
-        by = by if best is before else "soup"
+        soup = _clearer(cutter.seen_through(device), best)
+        if soup is not best and (by != "walls" or _agreed(views, soup) >= _agreed(views, best)):
+            best, by = soup, "soup"
     return best, by
 
 
