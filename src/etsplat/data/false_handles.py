@@ -92,22 +92,17 @@ def without_false_handles(
     agreed = _Agreement.of(photos, vertices, faces)
     for level in _LEVELS:
         while (simpler := _simpler(views, vertices, faces, agreed, level, most)) is not None:
-            vertices, faces = simpler
+            vertices, faces, agreed = simpler
+            if not any(genera(faces, len(vertices))):
+                return vertices, faces
+    most, tried = silhouette_errors(photos, vertices, faces) + torch.tensor([0, _BLOCKED]), None
+    while tried is not faces:
+        tried, loops = faces, short_loops(vertices, faces)
+        while (found := _cut(views, vertices, faces, agreed, most, loops)) is not None:
+            vertices, faces, loops = found
             if not any(genera(faces, len(vertices))):
                 return vertices, faces
             agreed = _Agreement.of(photos, vertices, faces)
-    most = silhouette_errors(photos, vertices, faces) + torch.tensor([0, _BLOCKED])
-    loops, all_of_them = short_loops(vertices, faces), True
-    while loops:
-        found = _cut(views, vertices, faces, agreed, most, loops)
-        if found is not None:
-            vertices, faces, loops = found
-            if not any(genera(faces, len(vertices))):
-                break
-            agreed, all_of_them = _Agreement.of(photos, vertices, faces), False
-        if not loops or found is None:
-            loops = [] if all_of_them else short_loops(vertices, faces)
-            all_of_them = True
     return vertices, faces
 
 
@@ -230,8 +225,11 @@ def _small(faces: Tensor, band: Bool[Tensor, " F"]) -> bool:
 
 def _simpler(
     views: _Views, vertices: Tensor, faces: Tensor, agreed: _Agreement, level: float, most: Tensor
-) -> tuple[Tensor, Tensor] | None:
-    """The surface with a smaller genus, if there is one: the largest region is tried first. Arguments as of `_cut`."""
+) -> tuple[Tensor, Tensor, _Agreement] | None:
+    """The surface with a smaller genus and what photos say of it, if there is one: the largest region is tried first.
+
+    Arguments as of `_cut`.
+    """
     before, score, least = genera(faces, len(vertices)), agreed.score, _smallest(faces, len(vertices))
     low, unseen = score < level, score.isnan()
     edges = MeshTopology.from_faces(faces, len(vertices)).edges.long()
@@ -252,8 +250,9 @@ def _simpler(
             continue
         if _lets_go(views, (vertices, faces), found):
             continue
-        if _Agreement.of(views.photos, *found).contradicted <= agreed.contradicted + _SPOILT:
-            return found
+        now = _Agreement.of(views.photos, *found)
+        if now.contradicted <= agreed.contradicted + _SPOILT:
+            return *found, now
     return None
 
 

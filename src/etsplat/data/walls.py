@@ -39,7 +39,7 @@ _SMOOTH = 3
 _ALONE = 0.9
 """A place is on a wall if nothing else of the surface is nearer than this, in units of the thickness."""
 
-AGREED, _PEAK = 0.5, 0.3
+ON_WALLS, _PEAK = 0.5, 0.3
 """Mean correlation on walls, at least, which are seen at a slant; and by so much more than on the lid, or at the least
 likely thickness."""
 
@@ -101,7 +101,7 @@ def between_walls(
     dataset: Dataset,
     vertices: Float[Tensor, "V 3"],
     faces: Int64[Tensor, "F 3"],
-    agreed: float = AGREED,
+    agreed: float = ON_WALLS,
     pushed: Float[Tensor, "V 3"] | None = None,
 ) -> Distance | None:
     """How far points within a hull are beyond its walls, in hollows whose walls photos agree on: positive there.

@@ -13,7 +13,7 @@ from etsplat.data.hollows import Opened, open_hollows
 from etsplat.data.lids import without_lids
 from etsplat.data.plain_sides import with_flat_sides
 from etsplat.data.visual_hull import Distance, visual_hull
-from etsplat.data.walls import AGREED, between_walls
+from etsplat.data.walls import ON_WALLS, between_walls
 from etsplat.geometry.topology import MeshTopology
 from etsplat.optim.loop import Event, NoteEvent, StageEvent
 from etsplat.tasks.coarse_soup import seen_through
@@ -138,7 +138,7 @@ class _Cutter:
         vertices, faces = self._opened.lidded or self._opened[:2]
         flat, pushed = with_flat_sides(self._views, vertices, faces), self._opened.vertices[: len(vertices)]
         moved = (pushed != vertices).any(dim=1, keepdim=True)
-        for elsewhere in (torch.where(moved, pushed, flat), None):
+        for elsewhere in (torch.where(moved, pushed, flat), None) if bool(moved.any()) else (None,):
             found = self._between(flat, faces, _SURELY, elsewhere)
             if found is self._opened:
                 return None
@@ -150,7 +150,7 @@ class _Cutter:
     def walled(self) -> Opened:
         """Cut out between walls that photos agree on, under what lids that were pushed in leave."""
         vertices, faces = self._opened[:2]
-        return self._between(with_flat_sides(self._views, vertices, faces), faces, AGREED, None)
+        return self._between(with_flat_sides(self._views, vertices, faces), faces, ON_WALLS, None)
 
     def _between(self, vertices: Tensor, faces: Tensor, agreed: float, pushed: Tensor | None) -> Opened:
         self._tell(StageEvent("Looking for walls", 0, 0))
