@@ -1,17 +1,25 @@
 """Mugs, of whose hollow photos see the walls at a slant: how thick these are is found."""
 
+import math
 from dataclasses import replace
 
 import pytest
 import torch
 import trimesh
+from torch.nn.functional import normalize
 
 from etsplat.data.agreement import looked_at, pixel_size
 from etsplat.data.hollows import open_hollows
+from etsplat.data.photograph import photograph
+from etsplat.data.same_colors import local_sameness
+from etsplat.data.through_lids import ThroughLid, _elsewhere
 from etsplat.data.visual_hull import visual_hull
-from etsplat.data.walls import _elsewhere, _Through, _Walls, between_walls
+from etsplat.data.walls import _Walls, _walls, _with_level, between_plain_walls, between_walls
 from etsplat.geometry.distance import closest_points
+from etsplat.geometry.icosphere import icosphere
+from etsplat.geometry.measures import area_normals
 from etsplat.geometry.parts import Shape, shape_of
+from etsplat.io.mesh_files import MeshFile
 from helpers.painting import painted_pictures
 from helpers.revolved import BOWL, CAN, MUG, MUG_WALL, revolved
 
@@ -76,7 +84,7 @@ def test_a_lid_goes_on_beside_where_photos_contradict_it_and_ends_at_walls() -> 
     top, out = middles[:, 1] > 0.99 * float(vertices[:, 1].max()), middles[:, [0, 2]].norm(dim=1)
     outer = float(out.max())
     for radius, most in ((0.4, 0.4 * outer + 3 * pixel_size(looked.photos)), (0.95, outer - 0.2)):
-        found = _Through(looked, top & (out < radius * outer), vertices).walls(0.2, 0.2)
+        found = _walls(ThroughLid(looked, top & (out < radius * outer), vertices), 0.2, 0.2)
         reached = vertices[found.lid].mean(dim=1)[:, [0, 2]].norm(dim=1).max()
         assert most - 0.04 < float(reached) <= most
 
@@ -112,4 +120,45 @@ def test_what_is_no_hollow_has_no_walls() -> None:
 def test_a_hollow_of_one_colour_has_no_walls() -> None:
     """Nothing says where they are."""
     _, _, views = painted_pictures(*revolved(MUG), painted=False)
-    assert between_walls(views, *visual_hull(views, FACES)) is None
+    hull = visual_hull(views, FACES)
+    assert between_walls(views, *hull) is None
+    assert between_plain_walls(views, *hull) is None
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.5])
+def test_shading_tells_how_thick_plain_walls_are(tilt: float) -> None:
+    """White, in light from two sides, upright and tilted."""
+    vertices, faces = revolved(MUG)
+    turn = torch.tensor([[1, 0, 0], [0, math.cos(tilt), math.sin(tilt)], [0, -math.sin(tilt), math.cos(tilt)]])
+    views = photograph(MeshFile(vertices @ turn, faces), 200, 200)
+    hull = visual_hull(views, FACES)
+    beyond = between_plain_walls(views, *hull)
+    assert beyond is not None
+    heights = torch.tensor([[0.0, y, 0.0] for y in (-0.1, 0.1, 0.3)]) @ turn
+    wall = 0.5 - beyond(views.normalization.apply(heights)) * views.normalization.radius
+    assert float((wall - MUG_WALL).abs().max()) < 0.025
+
+
+def test_the_inner_side_of_an_open_sheet_is_no_wall() -> None:
+    """White, of half a ball."""
+    vertices, faces = icosphere(4)
+    views = photograph(MeshFile(vertices, faces[(vertices[faces][..., 1] < 1e-6).all(dim=1)]), 200, 200)
+    assert between_plain_walls(views, *visual_hull(views, FACES)) is None
+
+
+def test_a_plain_lid_is_where_colours_differ_with_all_that_is_level() -> None:
+    """Of a white mug: its middle is told by colours, and the rim is as level."""
+    vertices, faces = revolved(MUG)
+    views = photograph(MeshFile(vertices, faces), 200, 200)
+    hull, closed = visual_hull(views, FACES)
+    looked = looked_at(views, hull, closed)
+    assert looked is not None
+    middles, normals = hull[closed].mean(dim=1), normalize(area_normals(hull, closed), dim=1)
+    top, out = normals[:, 1] > 0.75, middles[:, [0, 2]].norm(dim=1)
+    same = local_sameness(looked)[closed].nan_to_num(1.0).mean(dim=1)
+    middle = top & (out < 0.3 * out.max())
+    assert float(same[middle].max()) < 0.3
+    assert float(same[~top].median()) > 0.8
+    level = _with_level(middle, hull, closed)
+    assert level[top & (out < 0.9 * out.max())].all()
+    assert not level[normals[:, 1] < 0.65].any()

@@ -12,18 +12,20 @@ import etsplat.tasks.cut_hulls as cut_hulls
 import etsplat.tasks.starts as starts
 from etsplat.data.closed_hollows import closed_hollows
 from etsplat.data.hollows import Opened, open_hollows
+from etsplat.data.photograph import photograph
 from etsplat.data.visual_hull import visual_hull
 from etsplat.engines.threads import num_threads, set_num_threads
 from etsplat.geometry.distance import closest_points
 from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.parts import Shape, shape_of
+from etsplat.io.mesh_files import MeshFile
 from etsplat.model.triangle_mesh import TriangleMesh
 from etsplat.optim.loop import Event, NoteEvent, StageEvent
 from etsplat.tasks.judgement import CLOSED, CONTRADICTED
 from etsplat.tasks.reconstruct import _grown_over, _judge
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 from helpers.painting import mean_colors, painted_pictures
-from helpers.revolved import BOWL, CAN, MUG, VASE, revolved
+from helpers.revolved import BOWL, CAN, MUG, VASE, line, revolved
 
 CONFIG = ReconstructConfig.quick().changed({"start.hull_faces": 1600})
 
@@ -82,7 +84,8 @@ def test_no_walls_are_cut_where_there_are_none(monkeypatch: pytest.MonkeyPatch) 
     _, _, views = painted_pictures(*revolved(CAN))
     assert starts.make_start(None, views, CONFIG).cut is None
     _, _, views = painted_pictures(*revolved(BOWL))
-    monkeypatch.setattr(cut_hulls, "between_walls", lambda *_: lambda points: points.norm(dim=1) - 0.1)
+    for walls in ("between_walls", "between_plain_walls"):
+        monkeypatch.setattr(cut_hulls, walls, lambda *_, **others: lambda points: points.norm(dim=1) - 0.1)
     assert starts.make_start(None, views, CONFIG).cut is None
 
 
@@ -120,7 +123,7 @@ def test_no_start_has_more_faces_than_a_run_may_have(monkeypatch: pytest.MonkeyP
     _, _, views = painted_pictures(*revolved(VASE))
     vertices, faces = icosphere(4)
     assert len(faces) == 5120
-    monkeypatch.setattr(cut_hulls, "between_walls", lambda *_: lambda points: points[:, 0] * 0 - 1)
+    monkeypatch.setattr(cut_hulls, "between_walls", lambda *_, **others: lambda points: points[:, 0] * 0 - 1)
     monkeypatch.setattr(cut_hulls, "seen_through", lambda *_: lambda points: points[:, 0] * 0 - 1)
     monkeypatch.setattr(cut_hulls, "visual_hull", lambda *_, **others: (vertices, faces))
     monkeypatch.setattr(cut_hulls, "open_hull", lambda _, v, f, *told: Opened(v, f, 0, 0.0, 1.0, 1.0))
@@ -143,7 +146,8 @@ def test_what_is_open_is_contradicted_by_more_before_a_soup_is_asked(
     vertices, faces = icosphere(3)
     start = Opened(vertices, faces if bottom else faces[100:], 0, share, 1.0, 1.0)
     hull, calls = starts.Hull(vertices, faces, 1400, 0.0), list[object]()
-    monkeypatch.setattr(cut_hulls, "between_walls", lambda *_: None)
+    monkeypatch.setattr(cut_hulls, "between_walls", lambda *_, **others: None)
+    monkeypatch.setattr(cut_hulls, "between_plain_walls", lambda *_, **others: None)
     monkeypatch.setattr(cut_hulls, "visual_hull", lambda *_, **others: (vertices, faces[:0]))
     monkeypatch.setattr(cut_hulls, "seen_through", lambda *_: calls.append(_))
     found, cut = cut_hulls.cut_open(views, hull, start, CONFIG, None, lambda event: None)
@@ -165,12 +169,13 @@ def test_a_soup_must_be_clearly_better_than_walls(
     """
     _, _, views = painted_pictures(*revolved(VASE))
     vertices, faces = icosphere(4)
-    monkeypatch.setattr(cut_hulls, "between_walls", lambda *_: lambda points: points[:, 0])
+    monkeypatch.setattr(cut_hulls, "between_walls", lambda *_, **others: lambda points: points[:, 0])
     monkeypatch.setattr(cut_hulls, "seen_through", lambda *_: lambda points: points[:, 0])
     monkeypatch.setattr(cut_hulls, "visual_hull", lambda _, wanted, **others: (vertices, faces[:wanted]))
     shares = {2800: 0.1, 1400: soup}  # contradicted: of walls, which have twice the faces, and of the soup's cut
     monkeypatch.setattr(cut_hulls, "open_hull", lambda _, v, f, *told: Opened(v, f, 0, shares[len(f)], 1.0, 1.0))
-    monkeypatch.setattr(cut_hulls, "_agreed", lambda _, cut: {2800: 0.8, 1400: agreed}.get(len(cut.faces), 0.9))
+    asked = {2800: 0.8, 1400: agreed}
+    monkeypatch.setattr(cut_hulls._Cutter, "_asked", lambda _, how, vertices, faces: asked.get(len(faces), 0.9))
     contradicted, hull = Opened(vertices, faces, 0, 0.5, 1.0, 0.0), starts.Hull(vertices, faces, 1400, 1.0)
     best, cut = cut_hulls.cut_open(
         views, hull, contradicted, CONFIG.changed({"max_faces": 6000}), None, lambda event: None
@@ -203,3 +208,18 @@ def test_a_result_is_asked_what_photos_contradict_where_its_start_was_in_doubt(s
     scores = {"silhouette_iou": 0.99, "psnr_mesh": 30.0, "self_intersections": 0}
     found = _judge(scorer, views, None, CONFIG, started, shape_of(vertices, faces), mesh, scores)
     assert found.verdict.startswith(verdict)
+
+
+def test_a_white_vessel_with_thin_walls_is_no_open_sheet() -> None:
+    """Its lid is removed, since within it looks as it does outside; how thick its walls are shading tells."""
+    out, wall, low, high = 0.5, 0.06, -0.5, 0.4
+    outer = [(0.0, low), *line((0.04, low), (out, low)), *line((out, low), (out, high))]
+    inner = [*line((out - wall, high), (out - wall, low + wall)), *line((out - wall, low + wall), (0.04, low + wall))]
+    vertices, faces = revolved([*outer, (out, high), *inner, (0.0, low + wall)])
+    turned = vertices[:, [0, 2, 1]] * torch.tensor([1.0, 1.0, -1.0])  # its axis along the light
+    views = photograph(MeshFile(turned, faces), 200, 200)
+    started = starts.make_start(None, views, CONFIG.changed({"start.hull_faces": 3200}))
+    assert started.cut == "walls"
+    assert shape_of(*started.mesh.surface()) == Shape(1, 0)
+    truth = views.normalization.apply(turned)
+    assert float(closest_points(truth, *started.mesh.surface())[0].sqrt().max()) < 1.5 * wall

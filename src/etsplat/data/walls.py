@@ -2,7 +2,8 @@
 
 Of a deep hollow photos see the walls at a slant, and few its bottom. So the whole of it is supposed at once: all that
 is farther than a wall's thickness from the hull, but for the lid, is free. Photos that look in through the lid agree on
-such walls where they are that thick, and hardly where they are not.
+such walls where they are that thick, and hardly where they are not: their texture correlates, or, where all is plain,
+each place has one colour.
 """
 
 from collections.abc import Callable
@@ -13,16 +14,20 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from etsplat.data.agreement import Looked, agreement, averaged, first_hits, looked_at, pixel_size
+from etsplat.data.agreement import Looked, averaged, looked_at, pixel_size
 from etsplat.data.dataset import Dataset
 from etsplat.data.passages import through_wide_passages
+from etsplat.data.same_colors import local_sameness
+from etsplat.data.through_lids import LEVEL, SMOOTH, ThroughLid, distance_from
 from etsplat.data.visual_hull import Distance, outside_hull
-from etsplat.geometry.distance import closest_points
-from etsplat.geometry.measures import area_normals, face_areas, mean_edge, vertex_normals
+from etsplat.geometry.measures import area_normals, face_areas, vertex_normals
 from etsplat.geometry.topology import connected
 
 _LID, _LIDS = 0.6, 3
 """Correlation below which a vertex may be a lid's, and how many of the largest are looked at."""
+
+_UNLIKE = 0.3
+"""Sameness of colours below which it may be one's, too: on lids it is about 0, on surfaces 0.4 to 1."""
 
 _LARGE = 0.01
 """Of the surface, what a lid covers at least."""
@@ -33,30 +38,27 @@ _BELOW = 12
 _PIXELS = (*range(2, 20, 2), 21, 24, 27, 30, 34, 38)
 """Thicknesses that are tried, and those a pixel beside the best: agreement is about three pixels wide."""
 
-_SMOOTH = 3
-"""Rounds in which normals are averaged with their neighbours'."""
-
-_ALONE = 0.9
-"""A place is on a wall if nothing else of the surface is nearer than this, in units of the thickness."""
-
 ON_WALLS, _PEAK = 0.5, 0.3
 """Mean correlation on walls, at least, which are seen at a slant; and by so much more than on the lid, or at the least
 likely thickness."""
 
+_SAME = 0.8
+"""Sameness of colours on walls, at least, and by `_PEAK` more than on the lid."""
+
+_SHEET = 0.75
+"""What the sameness on walls lacks of 1 is so many times what it lacks on a sheet without thickness, at most."""
+
 _CLEAR, _THICKER = 0.8, 0.1
 """Mean correlation on a bottom that is not as thick as the walls, at least; and by so much more than if it were."""
 
-_LEVEL = 0.7
-"""Cosine of the angle between a lid's mean normal and those of its own faces and of the rim's, at least."""
+_LESS = 0.9
+"""Or what sameness lacks of 1 is so many times as much at most."""
 
 _BESIDE = 3
 """Pixels beside where photos contradict a lid that are the lid's, too: of walls right behind it they see the like."""
 
 _THICK = 1.5
 """Mean edges of the hull: thinner walls would have holes once they are meshed."""
-
-_KNOWN, _FEWEST = 0.2, 64
-"""Of the places on walls that two photos see, so many have texture, and so many there are: else it may be chance."""
 
 
 class _Walls(NamedTuple):
@@ -86,7 +88,7 @@ class _Walls(NamedTuple):
         Measured from a rim, too, walls would have a brim there.
         """
         others = (self.lid, self.rim, self.bottom, self.sides)
-        lid, rim, bottom, sides = (_distance(points, self.vertices, faces) for faces in others)
+        lid, rim, bottom, sides = (distance_from(points, self.vertices, faces) for faces in others)
         around = torch.minimum(bottom - self.floor, sides - self.thickness)
         return torch.where(lid < rim, around, torch.minimum(rim - self.thickness, around))
 
@@ -120,20 +122,47 @@ def between_walls(
     looked = looked_at(dataset, vertices, faces)
     if looked is None:
         return None
-    outside = outside_hull(dataset)
-    pushed = vertices if pushed is None else pushed
-    hollows = (_Through(looked, lid, pushed) for lid in _lids(looked, outside))
-    found = [walls.hollow(outside) for hollow in hollows if (walls := _walls(hollow, agreed))]
-    if not found:
+    outside, pushed = outside_hull(dataset), vertices if pushed is None else pushed
+    hollows = (ThroughLid(looked, lid, pushed) for lid in _lids(looked, looked.score < _LID, outside))
+    return _any([walls.hollow(outside) for hollow in hollows if (walls := _textured(hollow, agreed))])
+
+
+@torch.no_grad()
+def between_plain_walls(
+    dataset: Dataset,
+    vertices: Float[Tensor, "V 3"],
+    faces: Int64[Tensor, "F 3"],
+    pushed: Float[Tensor, "V 3"] | None = None,
+) -> Distance | None:
+    """The same of walls each place of which has one colour in all photos, as shading gives things that are plain.
+
+    Walls without thickness are none: those who look onto the inner side of an open sheet through a lid see such.
+    """
+    looked = looked_at(dataset, vertices, faces)
+    if looked is None:
         return None
-    return lambda points: torch.stack([free(points) for free in found]).amax(dim=0)
+    outside, pushed = outside_hull(dataset), vertices if pushed is None else pushed
+    found = []
+    for lid in _lids(looked, local_sameness(looked) < _UNLIKE, outside):
+        # Beside the walls it hides a lid shows nearly what they do: all that is level may be one.
+        tried = (_plain(ThroughLid(looked, some, pushed)) for some in (_with_level(lid, vertices, faces), lid))
+        _, walls = max(tried, key=lambda each: each[0])
+        found += [walls.hollow(outside)] if walls else []
+    return _any(found)
 
 
-def _lids(looked: Looked, outside: Distance) -> list[Bool[Tensor, " F"]]:
+def _any(hollows: list[Distance]) -> Distance | None:
+    """In which of hollows a point is deepest; None if there are none."""
+    if not hollows:
+        return None
+    return lambda points: torch.stack([free(points) for free in hollows]).amax(dim=0)
+
+
+def _lids(looked: Looked, unlike: Bool[Tensor, " V"], outside: Distance) -> list[Bool[Tensor, " F"]]:
     """The largest patches on which photos do not agree, each with a ring of faces around it."""
     vertices, faces, edges = looked.vertices, looked.faces, looked.topology.edges.long()
-    inward = -averaged(vertex_normals(vertices, faces), edges, _SMOOTH)
-    lid = (looked.score < _LID) & (outside(vertices + _BELOW * pixel_size(looked.photos) * inward) < 0)
+    inward = -averaged(vertex_normals(vertices, faces), edges, SMOOTH)
+    lid = unlike & (outside(vertices + _BELOW * pixel_size(looked.photos) * inward) < 0)
     count, patch = connected(edges[lid[edges].all(dim=1)], len(vertices))
     within, area = lid[faces].all(dim=1), face_areas(vertices, faces)
     sizes = torch.zeros(count).index_add(0, patch[faces[within, 0]], area[within]) / area.sum()
@@ -145,16 +174,41 @@ def _lids(looked: Looked, outside: Distance) -> list[Bool[Tensor, " F"]]:
     ]
 
 
-def _walls(through: "_Through", least: float) -> _Walls | None:
-    """The walls around the hollow under a lid, no thinner than a mesh of it can be; None where photos agree on none."""
+def _with_level(
+    lid: Bool[Tensor, " F"], vertices: Float[Tensor, "V 3"], faces: Int64[Tensor, "F 3"]
+) -> Bool[Tensor, " F"]:
+    """A lid with all faces that look up as it does and hang together with it."""
+    up = normalize(area_normals(vertices, faces[lid]).sum(dim=0), dim=0)
+    level = lid | (normalize(area_normals(vertices, faces), dim=1) @ up > LEVEL)
+    corners = faces[level]
+    _, patch = connected(torch.cat([corners[:, :2], corners[:, 1:]]), len(vertices))
+    return level & torch.isin(patch[faces[:, 0]], patch[faces[lid]])
+
+
+def _textured(through: ThroughLid, least: float) -> _Walls | None:
+    """The walls around the hollow under a lid; None where photos correlate on none."""
     best, agreed = _likeliest(through.agreed)
-    lowest = min([through.closed, *(each for each in agreed.values() if each > 0)])
+    lowest = min([through.closed(), *(each for each in agreed.values() if each > 0)])
     if agreed[best] < max(least, lowest + _PEAK):
         return None
     deepest, floors = _likeliest(through.floor_agreed)
     clear = floors[deepest] >= max(_CLEAR, floors.get(best, through.floor_agreed(best)) + _THICKER)
-    thickness, floor = (max(each * through.pixel, _THICK * through.edge) for each in (best, deepest if clear else best))
-    return through.walls(thickness, floor)
+    return _around(through, best, deepest if clear else best)
+
+
+def _plain(through: ThroughLid) -> tuple[float, _Walls | None]:
+    """The same, where each place of walls has one colour, and how far it has; 0 where there are none."""
+    rim, same = _likeliest(lambda pixels: through.sameness(pixels, pixels, pixels))
+    if same[rim] < max(_SAME, through.closed_sameness() + _PEAK):
+        return 0.0, None
+    # The same photos are asked of all: thinner walls leave less of a rim out.
+    thinner = {pixels: through.sameness(pixels, pixels, rim) for pixels in (0, *same) if pixels <= rim}
+    best = max(thinner, key=thinner.__getitem__)
+    if 1 - thinner[best] > _SHEET * (1 - thinner[0]):
+        return 0.0, None
+    deepest, floors = _likeliest(lambda pixels: through.sameness(best, pixels, rim))
+    clear = 1 - floors[deepest] <= _LESS * (1 - thinner[best])
+    return thinner[best], _around(through, best, deepest if clear else best)
 
 
 def _likeliest(agreed: Callable[[int], float]) -> tuple[int, dict[int, float]]:
@@ -165,105 +219,20 @@ def _likeliest(agreed: Callable[[int], float]) -> tuple[int, dict[int, float]]:
     return max(found, key=found.__getitem__), found
 
 
-def _elsewhere(
-    vertices: Float[Tensor, "V 3"],
-    edges: Int64[Tensor, "E 2"],
-    lid: Int64[Tensor, " L"],
-    pushed: Float[Tensor, "V 3"],
-    level: Float[Tensor, " V"],
-) -> Float[Tensor, "V 3"]:
-    """Vertices, where they were pushed in if that is not together with some of a lid, nor of what looks up as it does.
-
-    Args:
-        vertices: (V, 3).
-        edges: (E, 2).
-        lid: (L,) its vertices.
-        pushed: (V, 3) where they were pushed to.
-        level: (V,) cosines of the angles between their normals and the lid's.
-    """
-    moved = (pushed != vertices).any(dim=1)
-    count, patch = connected(edges[moved[edges].all(dim=1)], len(vertices))
-    mean = torch.zeros(count).index_add(0, patch, level) / patch.bincount(minlength=count)
-    own = torch.isin(patch, patch[lid]) | (mean > _LEVEL)[patch]
-    return torch.where((moved & ~own)[:, None], pushed, vertices)
+def _around(through: ThroughLid, pixels: int, floor: int) -> _Walls:
+    """Walls and a bottom around what is under a lid, so thick, but no thinner than a mesh of them can be."""
+    return _walls(through, *(max(each * through.pixel, _THICK * through.edge) for each in (pixels, floor)))
 
 
-def _distance(points: Tensor, vertices: Tensor, faces: Tensor) -> Tensor:
-    """(N,) of points from some faces, infinite if there are none."""
-    if len(faces) == 0:
-        return points.new_full((len(points),), torch.inf)
-    return closest_points(points, vertices, faces)[0].sqrt().to(points)
-
-
-class _Through:
-    """What photos see through a lid.
-
-    Attributes:
-        rest: (F2, 3) the faces without it.
-        closed: mean correlation on it.
-        pixel: how large one is at the object.
-        edge: mean length of the surface's edges.
-    """
-
-    def __init__(self, looked: Looked, lid: Bool[Tensor, " F"], pushed: Float[Tensor, "V 3"]) -> None:
-        vertices, faces, edges = looked.vertices, looked.faces, looked.topology.edges.long()
-        self._lid_faces = faces[lid]
-        self.rest, self.pixel, self.edge = faces[~lid], pixel_size(looked.photos), mean_edge(vertices, edges)
-        up = self._up = normalize(area_normals(vertices, self._lid_faces).sum(dim=0), dim=0)
-        self.closed = float(looked.score[faces[lid].unique()].nanmean())
-        self._photos, self._vertices, self._own = looked.photos, vertices, self.rest.unique()
-        normals = averaged(vertex_normals(vertices, faces), edges, _SMOOTH)
-        self._normals, self._below = normals[self._own], normals @ up < -_LEVEL
-        self._elsewhere = _elsewhere(vertices, edges, faces[lid].unique(), pushed, normals @ up)
-        self._lid = [((hit >= 0) & lid[hit.clamp_min(0)]).float()[None, None] for _, hit in looked.hits]
-        self._behind = [first_hits(photo, vertices, self.rest)[0][None, None] for photo in looked.photos]
-
-    def walls(self, thickness: float, floor: float) -> _Walls:
-        """So thick ones around what is under the lid, with what is beside it, where that is level and not on walls."""
-        vertices, rest, up, beside = self._elsewhere, self.rest, self._up, _BESIDE * self.pixel
-        lid = self._lid_faces[self._level(self._lid_faces, up)]
-        away = _distance(vertices[rest].mean(dim=1), vertices, lid)
-        around = self._level(rest, up) & (away <= thickness + beside)
-        sides, above = rest[~around], torch.cat([lid, rest[around & (away <= beside)]])
-        below = vertices[above].mean(dim=1) - 2 * thickness * up
-        on_walls = _distance(below, vertices, sides) <= thickness
-        rim = torch.cat([rest[around & (away > beside)], above[on_walls]])
-        bottom = self._below[sides].all(dim=1)
-        return _Walls(vertices, above[~on_walls], rim, sides[bottom], sides[~bottom], thickness, floor)
-
-    def _level(self, faces: Int64[Tensor, "F 3"], up: Float[Tensor, " 3"]) -> Bool[Tensor, " F"]:
-        """Which faces look up as a lid does."""
-        return normalize(area_normals(self._vertices, faces), dim=1) @ up > _LEVEL
-
-    def agreed(self, pixels: int) -> float:
-        """Mean correlation on walls so thick, by how many photos see each place; 0 where too little is known."""
-        return self._agreed(pixels * self.pixel, self._vertices, torch.ones_like(self._own, dtype=torch.bool))
-
-    def floor_agreed(self, pixels: int) -> float:
-        """The same on a bottom so thick."""
-        return self._agreed(pixels * self.pixel, self._elsewhere, self._below[self._own])
-
-    def _agreed(self, thickness: float, vertices: Float[Tensor, "V 3"], some: Bool[Tensor, " O"]) -> float:
-        places = vertices[self._own] - thickness * self._normals
-        some = some & (_distance(places, vertices, self.rest) >= _ALONE * thickness)
-        places, normals = places[some], -self._normals[some]
-        seen = torch.stack([self._seen(number, places) for number in range(len(self._photos))])
-        views = seen.sum(dim=0)
-        asked = views >= 2
-        if not bool(asked.any()):
-            return 0.0
-        score = agreement(self._photos, self._lid, places[asked], normals[asked], seen[:, asked], self.pixel, fewest=2)
-        weight = torch.where(score.isnan(), 0, views[asked]).float()
-        known = int((weight > 0).sum())
-        if known < max(_FEWEST, _KNOWN * len(score)):
-            return 0.0
-        return float((weight * score.nan_to_num()).sum() / weight.sum())
-
-    def _seen(self, number: int, places: Float[Tensor, "N 3"]) -> Bool[Tensor, " N"]:
-        """Which places a photo sees through the lid, before it sees the outer side of the walls from within."""
-        photo = self._photos[number]
-        place, z = photo.project(places)
-        through, behind = (
-            photo.look_up(plane, place[None], "nearest")[0, 0] for plane in (self._lid[number], self._behind[number])
-        )
-        return (through > 0.5) & ((behind == 0) | (z <= behind + 0.5 * self.pixel))
+def _walls(through: ThroughLid, thickness: float, floor: float) -> _Walls:
+    """So thick ones around what is under a lid, with what is beside it, where that is level and not on walls."""
+    vertices, rest, beside = through.elsewhere, through.rest, _BESIDE * through.pixel
+    lid = through.lid[through.level(through.lid)]
+    away = distance_from(vertices[rest].mean(dim=1), vertices, lid)
+    around = through.level(rest) & (away <= thickness + beside)
+    sides, above = rest[~around], torch.cat([lid, rest[around & (away <= beside)]])
+    below = vertices[above].mean(dim=1) - 2 * thickness * through.up
+    on_walls = distance_from(below, vertices, sides) <= thickness
+    rim = torch.cat([rest[around & (away > beside)], above[on_walls]])
+    bottom = through.bottom(sides)
+    return _Walls(vertices, above[~on_walls], rim, sides[bottom], sides[~bottom], thickness, floor)

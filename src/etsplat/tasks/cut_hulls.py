@@ -1,19 +1,21 @@
 """Hulls with hollows, opened: lids pushed in, cut out between walls, or cut where a coarse soup sees through them."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Literal
 
 import torch
 from torch import Tensor
 
-from etsplat.data.agreement import looked_at, mean_agreement, photos_of
+from etsplat.data.agreement import Looked, looked_at, mean_agreement, photos_of
 from etsplat.data.dataset import Dataset
 from etsplat.data.false_handles import without_false_handles
 from etsplat.data.hollows import Opened, open_hollows
 from etsplat.data.lids import without_lids
 from etsplat.data.plain_sides import with_flat_sides
+from etsplat.data.same_colors import surface_sameness
 from etsplat.data.visual_hull import Distance, visual_hull
-from etsplat.data.walls import ON_WALLS, between_walls
+from etsplat.data.walls import between_plain_walls, between_walls
 from etsplat.geometry.topology import MeshTopology
 from etsplat.optim.loop import Event, NoteEvent, StageEvent
 from etsplat.tasks.coarse_soup import seen_through
@@ -21,10 +23,10 @@ from etsplat.tasks.judgement import CONTRADICTED
 from etsplat.tasks.reconstruct_config import ReconstructConfig
 from etsplat.tasks.starting_hull import Hull, most_faces, uncovered
 
-_SURELY, _BETTER = 0.8, 0.01
+_SURELY, _BETTER, _LACKED = 0.8, 0.01, 0.25
 """Mean correlation on walls under lids that were not pushed in, at least: it is 0.85 and more on those of vessels, 0.72
 at most elsewhere. And by how much more photos agree on a hull cut out between them than on one with its lids pushed
-in."""
+in; where colours tell, as a part of what the sameness of that lacks of 1."""
 
 _MARGINS = (0.05, 0.03, 0.08)
 """How far in front of what a coarse soup shows a hull is cut, in units of the object's radius; in turn, until photos
@@ -56,9 +58,12 @@ def open_hull(
     tell(StageEvent(stage, 0, 3))
     surface = without_false_handles(views, vertices, faces)
     tell(StageEvent(stage, 1, 3))
-    surface = without_lids(views, *surface)
+    open_surface = without_lids(views, *surface)
     tell(StageEvent(stage, 2, 3))
-    return open_hollows(views, *surface, most=most)
+    found = open_hollows(views, *open_surface, most=most)
+    if len(open_surface[1]) < len(surface[1]):
+        return found._replace(lidded=surface, pushed=surface[0])
+    return found
 
 
 def cut_open(
@@ -100,7 +105,7 @@ def cut_open(
         part = f"{100 * best.contradicted:.1f} % of its surface"
         tell(NoteEvent(f"photos contradict the visual hull on {part}: a coarse soup is asked what is free"))
         soup = _clearer(cutter.seen_through(device), best)
-        if soup is not best and (by != "walls" or _agreed(views, soup) >= _agreed(views, best)):
+        if soup is not best and (by != "walls" or cutter.agree_no_less(soup, best)):
             best, by = soup, "soup"
     return best, by
 
@@ -133,31 +138,59 @@ class _Cutter:
     def surely_walled(self) -> Opened | None:
         """Cut out between walls that photos surely agree on, under lids that are not pushed in; None if that is worse.
 
-        What was pushed in elsewhere stays so, or not, since that is wrong at times.
+        By texture, if no lid was removed: both sides of a sheet look alike. Else by colours.
         """
         vertices, faces = self._opened.lidded or self._opened[:2]
-        flat, pushed = with_flat_sides(self._views, vertices, faces), self._opened.vertices[: len(vertices)]
-        moved = (pushed != vertices).any(dim=1, keepdim=True)
-        for elsewhere in (torch.where(moved, pushed, flat), None) if bool(moved.any()) else (None,):
-            found = self._between(flat, faces, _SURELY, elsewhere)
+        pushed = vertices if self._opened.pushed is None else self._opened.pushed
+        flat, moved = with_flat_sides(self._views, vertices, faces), (pushed != vertices).any(dim=1, keepdim=True)
+        elsewhere = [torch.where(moved, pushed, flat)] if bool(moved.any()) else []
+        hull, sheet = (flat, faces), len(self._opened.faces) < len(faces)
+        if not sheet:
+            textured, least = partial(between_walls, agreed=_SURELY), self._asked(mean_agreement, *self._opened[:2])
+            found = self._better(hull, elsewhere, textured, mean_agreement, least + _BETTER)
+            if found is not None:
+                return found
+        same = self._asked(surface_sameness, *(hull if sheet else self._opened[:2]))
+        return self._better(hull, elsewhere, between_plain_walls, surface_sameness, same + _LACKED * (1 - same))
+
+    def _better(
+        self,
+        hull: tuple[Tensor, Tensor],
+        elsewhere: list[Tensor],
+        walls: Callable[..., Distance | None],
+        agreed: Callable[[Looked], float],
+        least: float,
+    ) -> Opened | None:
+        """Cut out between walls, if photos agree on that by so much at least, and do not contradict it more.
+
+        What was pushed in elsewhere stays so, or not, since that is wrong at times.
+        """
+        for pushed in (*elsewhere, None):
+            found = self._between(walls, *hull, pushed=pushed)
             if found is self._opened:
                 return None
             right = found.contradicted <= max(_OPEN, self._opened.contradicted)
-            if right and _agreed(self._views, found) >= _agreed(self._views, self._opened) + _BETTER:
+            if right and self._asked(agreed, *found[:2]) >= least:
                 return found
         return None
+
+    def agree_no_less(self, cut: Opened, before: Opened) -> bool:
+        """Whether photos agree on the first as much as on the other, in the mean."""
+        return self._asked(mean_agreement, *cut[:2]) >= self._asked(mean_agreement, *before[:2])
+
+    def _asked(self, agreed: Callable[[Looked], float], vertices: Tensor, faces: Tensor) -> float:
+        looked = looked_at(self._views, vertices, faces)
+        return 0.0 if looked is None else agreed(looked)
 
     def walled(self) -> Opened:
         """Cut out between walls that photos agree on, under what lids that were pushed in leave."""
         vertices, faces = self._opened[:2]
-        return self._between(with_flat_sides(self._views, vertices, faces), faces, ON_WALLS, None)
+        return self._between(between_walls, with_flat_sides(self._views, vertices, faces), faces)
 
-    def _between(self, vertices: Tensor, faces: Tensor, agreed: float, pushed: Tensor | None) -> Opened:
+    def _between(self, walls: Callable[..., Distance | None], *hull: Tensor, pushed: Tensor | None = None) -> Opened:
         self._tell(StageEvent("Looking for walls", 0, 0))
-        walls = between_walls(self._views, vertices, faces, agreed, pushed)
-        if walls is None:
-            return self._opened
-        return self.cut(walls, min(2 * self._hull.wanted, most_faces(self._config)))
+        free = walls(self._views, *hull, pushed=pushed)
+        return self._opened if free is None else self.cut(free, min(2 * self._hull.wanted, most_faces(self._config)))
 
     def seen_through(self, device: torch.device | None) -> Opened:
         """Cut where a coarse soup sees through it, by the margin at which photos contradict it least."""
@@ -173,8 +206,3 @@ class _Cutter:
 def _clearer(cut: Opened, before: Opened) -> Opened:
     """The first, if photos contradict it clearly less."""
     return cut if cut.contradicted <= _CLEARLY * before.contradicted else before
-
-
-def _agreed(views: Dataset, surface: Opened) -> float:
-    looked = looked_at(views, surface.vertices, surface.faces)
-    return 0.0 if looked is None else mean_agreement(looked)

@@ -355,7 +355,7 @@ def make_trainer(
         depths: which depth maps are believed; None where none are used.
         near: whether the start is near the surface, so that what no view sees of the mesh is no part of it on its way.
         cut: whether it has hollows that were cut out: their walls are where they belong beyond what views see of them,
-            and what none sees stays as it is.
+            and what none sees stays as it is. Lids are looked for no more: both sides of plain walls look alike.
     """
     length, regularization, refinement = config.iterations, config.regularization, config.refinement
     terms = terms_of(
@@ -387,7 +387,7 @@ def make_trainer(
             flips=refinement.flips,
             reach=refinement.reach,
             unseen=unseen_vertices(views) if near and not cut else None,
-            lids=lids(views, exposure.matrices) if near else None,
+            lids=lids(views, exposure.matrices) if near and not cut else None,
             outlines=outlines(views),
             outlines_after=outlines_after(config),
         ),
