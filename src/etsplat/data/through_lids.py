@@ -46,7 +46,7 @@ class ThroughLid:
         normals = averaged(vertex_normals(vertices, faces), edges, SMOOTH)
         self._normals, self._below = normals[self._own], normals @ self.up < -LEVEL
         self.elsewhere = _elsewhere(vertices, edges, self.lid.unique(), pushed, normals @ self.up)
-        self._within = torch.full((len(faces),), -torch.inf)
+        self._of_lid, self._within = lid, torch.full((len(faces),), -torch.inf)
         self._within[lid] = distance_from(vertices[self.lid].mean(dim=1), vertices, self.rest)
         self._behind = [first_hits(photo, vertices, self.rest)[0][None, None] for photo in looked.photos]
 
@@ -70,9 +70,9 @@ class ThroughLid:
         """The same on a bottom so thick."""
         return self._agreed(pixels * self.pixel, self.elsewhere, self._below[self._own])
 
-    def closed_sameness(self) -> float:
-        """How far each place on the lid itself has one colour."""
-        own = self.lid.unique()
+    def closed_sameness(self, rim: int) -> float:
+        """How far each place on the lid itself has one colour, but for so much along its border."""
+        own = self.lid[self._within[self._of_lid] > rim * self.pixel].unique()
         return sameness(colors_at(self._photos, self.vertices[own]), self._looked.seen[:, own])
 
     def sameness(self, pixels: int, floor: int, rim: int) -> float:

@@ -197,14 +197,18 @@ def _textured(through: ThroughLid, least: float) -> _Walls | None:
 
 
 def _plain(through: ThroughLid) -> tuple[float, _Walls | None]:
-    """The same, where each place of walls has one colour, and how far it has; 0 where there are none."""
+    """The same, where each place of walls has one colour, and how far it has; 0 where there are none.
+
+    Nor are there any where texture is known and tells otherwise.
+    """
     rim, same = _likeliest(lambda pixels: through.sameness(pixels, pixels, pixels))
-    if same[rim] < max(_SAME, through.closed_sameness() + _PEAK):
+    if same[rim] < max(_SAME, through.closed_sameness(rim) + _PEAK):
         return 0.0, None
     # The same photos are asked of all: thinner walls leave less of a rim out.
     thinner = {pixels: through.sameness(pixels, pixels, rim) for pixels in (0, *same) if pixels <= rim}
     best = max(thinner, key=thinner.__getitem__)
-    if 1 - thinner[best] > _SHEET * (1 - thinner[0]):
+    correlated = through.agreed(best)
+    if 1 - thinner[best] > _SHEET * (1 - thinner[0]) or (correlated != 0 and correlated < _LID):
         return 0.0, None
     deepest, floors = _likeliest(lambda pixels: through.sameness(best, pixels, rim))
     clear = 1 - floors[deepest] <= _LESS * (1 - thinner[best])
