@@ -23,7 +23,7 @@ STAGES = {
     "start: false handles": ["tasks.cut_hulls:without_false_handles"],
     "start: lids": ["tasks.cut_hulls:without_lids"],
     "start: hollows": ["tasks.cut_hulls:open_hollows"],
-    "start: walls": ["tasks.cut_hulls:between_walls"],
+    "start: walls": ["tasks.cut_hulls:between_walls", "tasks.cut_hulls:between_plain_walls"],
     "start: cut hulls": ["tasks.cut_hulls:visual_hull"],
     "start: a coarse soup": ["tasks.cut_hulls:seen_through"],
     "start: flat sides": ["tasks.cut_hulls:with_flat_sides", "tasks.starts:with_flat_sides"],

@@ -1,5 +1,6 @@
 """What a coarse soup sees of a hollow into which no lid of the hull can be pushed."""
 
+import math
 import re
 from dataclasses import replace
 from types import SimpleNamespace
@@ -223,3 +224,20 @@ def test_a_white_vessel_with_thin_walls_is_no_open_sheet() -> None:
     assert shape_of(*started.mesh.surface()) == Shape(1, 0)
     truth = views.normalization.apply(turned)
     assert float(closest_points(truth, *started.mesh.surface())[0].sqrt().max()) < 1.5 * wall
+
+
+def test_a_soup_opens_a_white_dimple() -> None:
+    """Which has no walls, and on which nothing correlates: photos show other colours at each place of its lid."""
+    outer, inner = (torch.linspace(0, end, 25).tolist() for end in (2.2, 1.18))
+    ball = [(0.8 * math.sin(a), -0.8 * math.cos(a)) for a in outer]
+    within = [(0.7 * math.sin(a), 0.737 - 0.7 * math.cos(a)) for a in reversed(inner[:-1])]
+    vertices, faces = revolved([*ball, *within])
+    views = photograph(MeshFile(vertices, faces), 160, 160)
+    hull = visual_hull(views, 1600)
+    told = list[Event]()
+    started = starts.make_start(None, views, CONFIG, tell=told.append)
+    assert started.cut == "soup"
+    assert any(isinstance(event, NoteEvent) and "other colours" in event.text for event in told)
+    truth = views.normalization.apply(vertices)
+    before, after = (float(closest_points(truth, *each)[0].mean()) for each in (hull, started.mesh.surface()))
+    assert after < 0.2 * before

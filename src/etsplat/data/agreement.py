@@ -260,7 +260,7 @@ def contradicted(looked: Looked | None, colors: Float[Tensor, "F 3"]) -> float:
     usual = wrong[wrong > 0].median() if bool((wrong > 0).any()) else wrong.new_zeros(())
     unlike = wrong > torch.maximum(_UNUSUAL * usual, usual + _WRONG)
     enough = seen.sum(dim=0) >= witnesses(len(photos))
-    return _largest_patch((score < _CONTRADICTED) & enough, vertices, faces, topology.edges.long(), unlike)
+    return largest_patch((score < _CONTRADICTED) & enough, vertices, faces, topology.edges.long(), unlike)
 
 
 @torch.no_grad()
@@ -275,7 +275,7 @@ def plain_share(looked: Looked | None) -> float:
     if looked is None:
         return 0.0
     plain = looked.score.isnan() & (looked.seen.sum(dim=0) >= COMPARED)
-    return _largest_patch(plain, looked.vertices, looked.faces, looked.topology.edges.long())
+    return largest_patch(plain, looked.vertices, looked.faces, looked.topology.edges.long())
 
 
 @torch.no_grad()
@@ -302,10 +302,10 @@ def mean_agreement(looked: Looked) -> float:
 def contradicted_share(looked: Looked) -> float:
     """The largest patch of a surface on which photos show different things, as a fraction of its area."""
     patch = looked.score < _CONTRADICTED
-    return _largest_patch(patch, looked.vertices, looked.faces, looked.topology.edges.long())
+    return largest_patch(patch, looked.vertices, looked.faces, looked.topology.edges.long())
 
 
-def _largest_patch(
+def largest_patch(
     some: Bool[Tensor, " V"], vertices: Tensor, faces: Tensor, edges: Tensor, only: Bool[Tensor, " F"] | None = None
 ) -> float:
     """Of the connected patches of some vertices the largest, as a fraction of the area; `only` of these faces."""

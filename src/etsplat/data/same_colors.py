@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import max_pool2d, normalize
 
-from etsplat.data.agreement import COMPARED, Looked, Photo, averaged
+from etsplat.data.agreement import COMPARED, Looked, Photo, averaged, largest_patch, witnesses
 from etsplat.geometry.measures import vertex_normals
 
 _SLANT = 0.3
@@ -22,6 +22,9 @@ _SMOOTH = 3
 
 _AROUND = 8
 """Rounds in which variances are summed over neighbours."""
+
+_DIFFERS = 0.15
+"""Sameness on a lid, at most: what is glossy has more, mostly."""
 
 _PLAIN = 0.01
 """Standard deviation of colours below which nothing is known: what differs is less than what sampling does."""
@@ -57,6 +60,17 @@ def local_sameness(looked: Looked) -> Float[Tensor, " V"]:
 def surface_sameness(looked: Looked) -> float:
     """The same of all of a surface."""
     return sameness(colors_at(looked.photos, looked.vertices), _squarely(looked))
+
+
+@torch.no_grad()
+def differing_share(looked: Looked) -> float:
+    """The largest patch of a surface whose places have different colours in photos, as a fraction of its area.
+
+    What few of them see, as in a hollow, does not count.
+    """
+    enough = looked.seen.sum(dim=0) >= witnesses(len(looked.photos))
+    patch = (local_sameness(looked) < _DIFFERS) & enough
+    return largest_patch(patch, looked.vertices, looked.faces, looked.topology.edges.long())
 
 
 def within_outline(photo: Photo) -> Float[Tensor, "1 1 H W"]:

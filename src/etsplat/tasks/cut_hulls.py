@@ -13,7 +13,7 @@ from etsplat.data.false_handles import without_false_handles
 from etsplat.data.hollows import Opened, open_hollows
 from etsplat.data.lids import without_lids
 from etsplat.data.plain_sides import with_flat_sides
-from etsplat.data.same_colors import surface_sameness
+from etsplat.data.same_colors import differing_share, surface_sameness
 from etsplat.data.visual_hull import Distance, visual_hull
 from etsplat.data.walls import between_plain_walls, between_walls
 from etsplat.geometry.topology import MeshTopology
@@ -78,7 +78,8 @@ def cut_open(
 
     Walls that photos surely agree on before lids are pushed in are tried first, whatever photos say of these. Others,
     and a soup, are asked where photos contradict the hull, and taken if they contradict it clearly less; instead of
-    walls a soup is taken if they do not agree less on it, besides.
+    walls a soup is taken if they do not agree less on it, besides. At last one is asked where photos show other colours
+    at each place, as on a plain lid, if none was before, and taken if they do so on clearly less.
 
     Args:
         views: of the unit frame.
@@ -92,8 +93,22 @@ def cut_open(
         The hull, and by what it was cut open; None where it was not, and photos do not contradict it.
     """
     cutter = _Cutter(views, hull, opened, config, tell)
-    closed = MeshTopology.from_faces(opened.faces, len(opened.vertices)).is_closed()
-    best, by, bound = opened, None, CONTRADICTED if closed else _OPEN
+    best, by = _where_contradicted(cutter, opened, device, tell)
+    share = cutter.differing(best)
+    if by in ("soup", False) or share <= _OPEN or not _is_closed(best):  # one was asked, or sees sheets
+        return best, by
+    part = f"{100 * share:.1f} %"
+    tell(NoteEvent(f"photos show other colours on {part} of the visual hull: a coarse soup is asked what is free"))
+    soup = cutter.seen_through(device, cutter.differing)
+    clearer = cutter.differing(soup) <= _CLEARLY * share and cutter.same(soup) >= cutter.same(best)
+    return (soup, "soup") if clearer else (best, by)
+
+
+def _where_contradicted(
+    cutter: "_Cutter", opened: Opened, device: torch.device | None, tell: Callable[[Event], None]
+) -> tuple[Opened, Cut | None]:
+    """Cut between walls that photos surely agree on, and where photos contradict what is left."""
+    best, by, bound = opened, None, CONTRADICTED if _is_closed(opened) else _OPEN
     if (sure := cutter.surely_walled()) is not None:
         best, by, bound = sure, "walls", _OPEN
     if best.contradicted <= bound:
@@ -104,7 +119,7 @@ def cut_open(
     if best.contradicted > CONTRADICTED:
         part = f"{100 * best.contradicted:.1f} % of its surface"
         tell(NoteEvent(f"photos contradict the visual hull on {part}: a coarse soup is asked what is free"))
-        soup = _clearer(cutter.seen_through(device), best)
+        soup = _clearer(cutter.seen_through(device, lambda cut: cut.contradicted), best)
         if soup is not best and (by != "walls" or cutter.agree_no_less(soup, best)):
             best, by = soup, "soup"
     return best, by
@@ -192,15 +207,28 @@ class _Cutter:
         free = walls(self._views, *hull, pushed=pushed)
         return self._opened if free is None else self.cut(free, min(2 * self._hull.wanted, most_faces(self._config)))
 
-    def seen_through(self, device: torch.device | None) -> Opened:
-        """Cut where a coarse soup sees through it, by the margin at which photos contradict it least."""
+    def same(self, cut: Opened) -> float:
+        """How far each place on a hull has one colour."""
+        return self._asked(surface_sameness, *cut[:2])
+
+    def differing(self, cut: Opened) -> float:
+        """On how much of a hull photos show other colours at each place."""
+        return self._asked(differing_share, *cut[:2])
+
+    def seen_through(self, device: torch.device | None, wrong: Callable[[Opened], float]) -> Opened:
+        """Cut where a coarse soup sees through it, by the margin at which it is wrong on the least of its surface."""
         ahead = seen_through(self._views, self._hull.vertices, self._config, device, self._tell)
-        tries = list[Opened]()
+        tries = list[tuple[float, Opened]]()
         for margin in _MARGINS:
-            tries.append(self.cut(lambda points, margin=margin: ahead(points) - margin, self._hull.wanted))
-            if tries[-1].contradicted <= CONTRADICTED:
+            cut = self.cut(lambda points, margin=margin: ahead(points) - margin, self._hull.wanted)
+            tries.append((wrong(cut), cut))
+            if tries[-1][0] <= CONTRADICTED:
                 break
-        return min(tries, key=lambda each: each.contradicted)
+        return min(tries, key=lambda each: each[0])[1]
+
+
+def _is_closed(surface: Opened) -> bool:
+    return MeshTopology.from_faces(surface.faces, len(surface.vertices)).is_closed()
 
 
 def _clearer(cut: Opened, before: Opened) -> Opened:
