@@ -47,7 +47,7 @@ _WHOLE = 0.7
 COMPARED = 3
 """Photos that see a vertex of a surface, from which on they are compared there."""
 
-_SMOOTH = 3
+SMOOTH = 3
 """Rounds in which normals are averaged with their neighbours'."""
 
 AGREED = 0.75
@@ -187,7 +187,7 @@ def surface_agreement(
         edges: (E, 2).
     """
     masks = [(photo.pixels[:, 3:] >= 0.95).float() for photo in photos]
-    normals = averaged(vertex_normals(vertices, faces), edges, _SMOOTH)
+    normals = averaged(vertex_normals(vertices, faces), edges, SMOOTH)
     return _ring_mean(agreement(photos, masks, vertices, normals, seen, pixel_size(photos), fewest=COMPARED), edges)
 
 

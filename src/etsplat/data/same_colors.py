@@ -11,14 +11,11 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import max_pool2d, normalize
 
-from etsplat.data.agreement import COMPARED, Looked, Photo, averaged, largest_patch, witnesses
+from etsplat.data.agreement import COMPARED, SMOOTH, Looked, Photo, averaged, largest_patch, witnesses
 from etsplat.geometry.measures import vertex_normals
 
 _SLANT = 0.3
 """Cosine of the angle to the normal, below which a photo is not asked: it may see past a place on a coarse surface."""
-
-_SMOOTH = 3
-"""Rounds in which normals are averaged with their neighbours'."""
 
 _AROUND = 8
 """Rounds in which variances are summed over neighbours."""
@@ -81,7 +78,7 @@ def within_outline(photo: Photo) -> Float[Tensor, "1 1 H W"]:
 def _squarely(looked: Looked) -> Bool[Tensor, "B V"]:
     """Which photos see which vertices within its outline, and not at a slant."""
     vertices, edges = looked.vertices, looked.topology.edges.long()
-    normals = averaged(vertex_normals(vertices, looked.faces), edges, _SMOOTH)
+    normals = averaged(vertex_normals(vertices, looked.faces), edges, SMOOTH)
     rows = []
     for photo, seen in zip(looked.photos, looked.seen, strict=True):
         within = photo.look_up(within_outline(photo), photo.project(vertices)[0][None], "nearest")[0, 0] > 0.5
@@ -102,7 +99,6 @@ def _moments(colors: Tensor, seen: Tensor, fewest: int = 2) -> Float[Tensor, "N 
 def _one_less(moments: Float[Tensor, "*N 7"]) -> Float[Tensor, "*N"]:
     """1 less the variance within places as a part of that of all; NaN where it is too little."""
     count, free, sums, squares, within = moments.split([1, 1, 3, 1, 1], dim=-1)
-    # Not _one_, of three channels.
     total = (squares - sums.square().sum(dim=-1, keepdim=True) / count) / (3 * count)
     found = (1 - within / (3 * free) / total).squeeze(-1)
     return torch.where((total > _PLAIN**2).squeeze(-1) & (free > 0).squeeze(-1), found, torch.nan).float()

@@ -5,14 +5,11 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from etsplat.data.agreement import Looked, agreement, averaged, first_hits, pixel_size
+from etsplat.data.agreement import SMOOTH, Looked, agreement, averaged, first_hits, pixel_size
 from etsplat.data.same_colors import colors_at, sameness
 from etsplat.geometry.distance import closest_points
 from etsplat.geometry.measures import area_normals, mean_edge, vertex_normals
 from etsplat.geometry.topology import connected
-
-SMOOTH = 3
-"""Rounds in which normals are averaged with their neighbours'."""
 
 LEVEL = 0.7
 """Cosine of the angle between a lid's mean normal and those of its own faces and of the rim's, at least."""
