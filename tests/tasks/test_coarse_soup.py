@@ -176,7 +176,7 @@ def test_a_soup_must_be_clearly_better_than_walls(
     shares = {2800: 0.1, 1400: soup}  # contradicted: of walls, which have twice the faces, and of the soup's cut
     monkeypatch.setattr(cut_hulls, "open_hull", lambda _, v, f, *told: Opened(v, f, 0, shares[len(f)], 1.0, 1.0))
     asked = {2800: 0.8, 1400: agreed}
-    monkeypatch.setattr(cut_hulls._Cutter, "_asked", lambda _, how, vertices, faces: asked.get(len(faces), 0.9))
+    monkeypatch.setattr(cut_hulls._Cutter, "asked", lambda _, how, surface: asked.get(len(surface[1]), 0.9))
     contradicted, hull = Opened(vertices, faces, 0, 0.5, 1.0, 0.0), starts.Hull(vertices, faces, 1400, 1.0)
     best, cut = cut_hulls.cut_open(
         views, hull, contradicted, CONFIG.changed({"max_faces": 6000}), None, lambda event: None
@@ -224,6 +224,22 @@ def test_a_white_vessel_with_thin_walls_is_no_open_sheet() -> None:
     assert shape_of(*started.mesh.surface()) == Shape(1, 0)
     truth = views.normalization.apply(turned)
     assert float(closest_points(truth, *started.mesh.surface())[0].sqrt().max()) < 1.5 * wall
+
+
+def test_a_sheet_is_known_by_its_lid_that_was_removed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """However many faces it has once what was stretched is divided: texture is not asked, both sides look alike."""
+    _, _, views = painted_pictures(*revolved(VASE))
+    (vertices, faces), (finer, more), asked = icosphere(3), icosphere(4), list[str]()
+    monkeypatch.setattr(cut_hulls, "without_false_handles", lambda _, v, f: (v, f))
+    monkeypatch.setattr(cut_hulls, "without_lids", lambda _, v, f: (v, f[100:]))
+    monkeypatch.setattr(
+        cut_hulls, "open_hollows", lambda _, v, f, **most: Opened(finer, more[1:], 0, 0.0, 0.0, 1.0, (v, f))
+    )
+    for walls in ("between_walls", "between_plain_walls"):
+        monkeypatch.setattr(cut_hulls, walls, lambda *_, name=walls, **others: asked.append(name))
+    opened = cut_hulls.open_hull(views, vertices, faces, 10_000, lambda event: None)
+    cut_hulls.cut_open(views, starts.Hull(vertices, faces, 1400, 0.0), opened, CONFIG, None, lambda event: None)
+    assert asked == ["between_plain_walls"]
 
 
 def test_a_soup_opens_a_white_dimple() -> None:

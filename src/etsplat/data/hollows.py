@@ -98,7 +98,7 @@ class Opened(NamedTuple):
         doubtful: the part of the vertices that moved, or that no two photos saw then.
         agreed: the part of the vertices on which photos agreed then.
         lidded: (V, 3) and (F, 3) of the hull with its lids. None if it is not known.
-        pushed: (V, 3) its vertices, where lids were pushed in; as they were if one was removed. None if not known.
+        sheet: whether a lid was removed. If not, the vertices of `lidded` are the first of these.
     """
 
     vertices: Float[Tensor, "V2 3"]
@@ -108,7 +108,7 @@ class Opened(NamedTuple):
     doubtful: float
     agreed: float
     lidded: tuple[Float[Tensor, "V 3"], Int64[Tensor, "F 3"]] | None = None
-    pushed: Float[Tensor, "V 3"] | None = None
+    sheet: bool = False
 
 
 class _Look(NamedTuple):
@@ -148,7 +148,7 @@ def open_hollows(
     dataset = reduced(dataset)
     photos = photos_of(dataset)
     if len(photos) < 2 or len(vertices) == 0:
-        return Opened(vertices, faces, 0, 0.0, 1.0, 0.0, (vertices, faces), vertices)
+        return Opened(vertices, faces, 0, 0.0, 1.0, 0.0, (vertices, faces))
     edge, half_more = float(_edge_lengths(vertices, faces).mean()), len(faces) * 3 // 2
     most = half_more if most is None else min(most, half_more)
     lidded, total, look = (vertices, faces), 0, _Look(vertices, 0, 0.0, 1.0, 0.0)
@@ -160,8 +160,7 @@ def open_hollows(
         total += look.moved
         vertices, faces = _divided(look.vertices, faces, _LONGEST * edge, most)
     doubtful = min(1.0, total / len(vertices) + look.unseen)
-    pushed = vertices[: len(lidded[0])]
-    return Opened(vertices, faces, total, look.contradicted, doubtful, look.agreed, lidded, pushed)
+    return Opened(vertices, faces, total, look.contradicted, doubtful, look.agreed, lidded)
 
 
 def _push(photos: list[Photo], outside: Distance, vertices: Tensor, faces: Tensor) -> _Look:

@@ -70,7 +70,7 @@ def differing_share(looked: Looked) -> float:
     return largest_patch(patch, looked.vertices, looked.faces, looked.topology.edges.long())
 
 
-def within_outline(photo: Photo) -> Float[Tensor, "1 1 H W"]:
+def _within_outline(photo: Photo) -> Float[Tensor, "1 1 H W"]:
     """Where a photo shows the object, and not beside its outline, where it shows what is behind, too."""
     return 1 - max_pool2d((photo.pixels[:, 3:] < 0.95).float(), 3, stride=1, padding=1)
 
@@ -81,7 +81,7 @@ def _squarely(looked: Looked) -> Bool[Tensor, "B V"]:
     normals = averaged(vertex_normals(vertices, looked.faces), edges, SMOOTH)
     rows = []
     for photo, seen in zip(looked.photos, looked.seen, strict=True):
-        within = photo.look_up(within_outline(photo), photo.project(vertices)[0][None], "nearest")[0, 0] > 0.5
+        within = photo.look_up(_within_outline(photo), photo.project(vertices)[0][None], "nearest")[0, 0] > 0.5
         rows.append(seen & within & ((normalize(photo.center - vertices, dim=1) * normals).sum(dim=1) > _SLANT))
     return torch.stack(rows)
 

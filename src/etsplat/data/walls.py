@@ -119,12 +119,11 @@ def between_walls(
     Returns:
         A function of points; None where there is no such hollow.
     """
-    looked = looked_at(dataset, vertices, faces)
-    if looked is None:
-        return None
-    outside, pushed = outside_hull(dataset), vertices if pushed is None else pushed
-    hollows = (ThroughLid(looked, lid, pushed) for lid in _lids(looked, looked.score < _LID, outside))
-    return _any([walls.hollow(outside) for hollow in hollows if (walls := _textured(hollow, agreed))])
+
+    def walls(looked: Looked, lid: Tensor, moved: Tensor) -> _Walls | None:
+        return _textured(ThroughLid(looked, lid, moved), agreed)
+
+    return _between(dataset, vertices, faces, pushed, lambda looked: looked.score < _LID, walls)
 
 
 @torch.no_grad()
@@ -138,21 +137,39 @@ def between_plain_walls(
 
     Walls without thickness are none: those who look onto the inner side of an open sheet through a lid see such.
     """
+
+    def walls(looked: Looked, lid: Tensor, moved: Tensor) -> _Walls | None:
+        # Beside the walls it hides a lid shows nearly what they do: all that is level may be one.
+        tried = (_plain(ThroughLid(looked, some, moved)) for some in (_with_level(lid, vertices, faces), lid))
+        return max(tried, key=lambda each: each[0])[1]
+
+    return _between(dataset, vertices, faces, pushed, lambda looked: local_sameness(looked) < _UNLIKE, walls)
+
+
+def _between(
+    dataset: Dataset,
+    vertices: Float[Tensor, "V 3"],
+    faces: Int64[Tensor, "F 3"],
+    pushed: Float[Tensor, "V 3"] | None,
+    unlike: Callable[[Looked], Bool[Tensor, " V"]],
+    walls: Callable[[Looked, Bool[Tensor, " F"], Float[Tensor, "V 3"]], _Walls | None],
+) -> Distance | None:
+    """How far points are in the hollow in which they are deepest; None if there is none.
+
+    Args:
+        dataset: photos.
+        vertices: (V, 3) of the hull.
+        faces: (F, 3) of it.
+        pushed: (V, 3) vertices once lids are pushed in; None if these are.
+        unlike: which vertices may be a lid's.
+        walls: those around the hollow under a lid, if there are any.
+    """
     looked = looked_at(dataset, vertices, faces)
     if looked is None:
         return None
-    outside, pushed = outside_hull(dataset), vertices if pushed is None else pushed
-    found = []
-    for lid in _lids(looked, local_sameness(looked) < _UNLIKE, outside):
-        # Beside the walls it hides a lid shows nearly what they do: all that is level may be one.
-        tried = (_plain(ThroughLid(looked, some, pushed)) for some in (_with_level(lid, vertices, faces), lid))
-        _, walls = max(tried, key=lambda each: each[0])
-        found += [walls.hollow(outside)] if walls else []
-    return _any(found)
-
-
-def _any(hollows: list[Distance]) -> Distance | None:
-    """In which of hollows a point is deepest; None if there are none."""
+    outside, moved = outside_hull(dataset), vertices if pushed is None else pushed
+    found = [walls(looked, lid, moved) for lid in _lids(looked, unlike(looked), outside)]
+    hollows = [around.hollow(outside) for around in found if around is not None]
     if not hollows:
         return None
     return lambda points: torch.stack([free(points) for free in hollows]).amax(dim=0)

@@ -58,12 +58,10 @@ def open_hull(
     tell(StageEvent(stage, 0, 3))
     surface = without_false_handles(views, vertices, faces)
     tell(StageEvent(stage, 1, 3))
-    open_surface = without_lids(views, *surface)
+    lidless = without_lids(views, *surface)
     tell(StageEvent(stage, 2, 3))
-    found = open_hollows(views, *open_surface, most=most)
-    if len(open_surface[1]) < len(surface[1]):
-        return found._replace(lidded=surface, pushed=surface[0])
-    return found
+    found = open_hollows(views, *lidless, most=most)
+    return found._replace(lidded=surface, sheet=len(lidless[1]) < len(surface[1]))
 
 
 def cut_open(
@@ -94,14 +92,15 @@ def cut_open(
     """
     cutter = _Cutter(views, hull, opened, config, tell)
     best, by = _where_contradicted(cutter, opened, device, tell)
-    share = cutter.differing(best)
+    share = cutter.asked(differing_share, best)
     if by in ("soup", False) or share <= _OPEN or not _is_closed(best):  # one was asked, or sees sheets
         return best, by
     part = f"{100 * share:.1f} %"
     tell(NoteEvent(f"photos show other colours on {part} of the visual hull: a coarse soup is asked what is free"))
-    soup = cutter.seen_through(device, cutter.differing)
-    clearer = cutter.differing(soup) <= _CLEARLY * share and cutter.same(soup) >= cutter.same(best)
-    return (soup, "soup") if clearer else (best, by)
+    left, soup = cutter.seen_through(device, partial(cutter.asked, differing_share))
+    if left <= _CLEARLY * share and cutter.agree_no_less(surface_sameness, soup, best):
+        return soup, "soup"
+    return best, by
 
 
 def _where_contradicted(
@@ -119,8 +118,8 @@ def _where_contradicted(
     if best.contradicted > CONTRADICTED:
         part = f"{100 * best.contradicted:.1f} % of its surface"
         tell(NoteEvent(f"photos contradict the visual hull on {part}: a coarse soup is asked what is free"))
-        soup = _clearer(cutter.seen_through(device, lambda cut: cut.contradicted), best)
-        if soup is not best and (by != "walls" or cutter.agree_no_less(soup, best)):
+        soup = _clearer(cutter.seen_through(device, lambda cut: cut.contradicted)[1], best)
+        if soup is not best and (by != "walls" or cutter.agree_no_less(mean_agreement, soup, best)):
             best, by = soup, "soup"
     return best, by
 
@@ -156,16 +155,20 @@ class _Cutter:
         By texture, if no lid was removed: both sides of a sheet look alike. Else by colours.
         """
         vertices, faces = self._opened.lidded or self._opened[:2]
-        pushed = vertices if self._opened.pushed is None else self._opened.pushed
-        flat, moved = with_flat_sides(self._views, vertices, faces), (pushed != vertices).any(dim=1, keepdim=True)
-        elsewhere = [torch.where(moved, pushed, flat)] if bool(moved.any()) else []
-        hull, sheet = (flat, faces), len(self._opened.faces) < len(faces)
-        if not sheet:
-            textured, least = partial(between_walls, agreed=_SURELY), self._asked(mean_agreement, *self._opened[:2])
-            found = self._better(hull, elsewhere, textured, mean_agreement, least + _BETTER)
-            if found is not None:
-                return found
-        same = self._asked(surface_sameness, *(hull if sheet else self._opened[:2]))
+        hull = with_flat_sides(self._views, vertices, faces), faces
+        if self._opened.sheet:
+            return self._plain_walls(hull, [], hull)
+        pushed = self._opened.vertices[: len(vertices)]
+        moved = (pushed != vertices).any(dim=1, keepdim=True)
+        elsewhere = [torch.where(moved, pushed, hull[0])] if bool(moved.any()) else []
+        textured, least = partial(between_walls, agreed=_SURELY), self.asked(mean_agreement, self._opened) + _BETTER
+        found = self._better(hull, elsewhere, textured, mean_agreement, least)
+        return found or self._plain_walls(hull, elsewhere, self._opened[:2])
+
+    def _plain_walls(
+        self, hull: tuple[Tensor, Tensor], elsewhere: list[Tensor], before: tuple[Tensor, Tensor]
+    ) -> Opened | None:
+        same = self.asked(surface_sameness, before)
         return self._better(hull, elsewhere, between_plain_walls, surface_sameness, same + _LACKED * (1 - same))
 
     def _better(
@@ -185,16 +188,17 @@ class _Cutter:
             if found is self._opened:
                 return None
             right = found.contradicted <= max(_OPEN, self._opened.contradicted)
-            if right and self._asked(agreed, *found[:2]) >= least:
+            if right and self.asked(agreed, found) >= least:
                 return found
         return None
 
-    def agree_no_less(self, cut: Opened, before: Opened) -> bool:
-        """Whether photos agree on the first as much as on the other, in the mean."""
-        return self._asked(mean_agreement, *cut[:2]) >= self._asked(mean_agreement, *before[:2])
+    def agree_no_less(self, agreed: Callable[[Looked], float], cut: Opened, before: Opened) -> bool:
+        """Whether photos agree on the first as much as on the other."""
+        return self.asked(agreed, cut) >= self.asked(agreed, before)
 
-    def _asked(self, agreed: Callable[[Looked], float], vertices: Tensor, faces: Tensor) -> float:
-        looked = looked_at(self._views, vertices, faces)
+    def asked(self, agreed: Callable[[Looked], float], surface: Opened | tuple[Tensor, Tensor]) -> float:
+        """What photos say of a surface; 0 where there are none."""
+        looked = looked_at(self._views, *surface[:2])
         return 0.0 if looked is None else agreed(looked)
 
     def walled(self) -> Opened:
@@ -207,16 +211,8 @@ class _Cutter:
         free = walls(self._views, *hull, pushed=pushed)
         return self._opened if free is None else self.cut(free, min(2 * self._hull.wanted, most_faces(self._config)))
 
-    def same(self, cut: Opened) -> float:
-        """How far each place on a hull has one colour."""
-        return self._asked(surface_sameness, *cut[:2])
-
-    def differing(self, cut: Opened) -> float:
-        """On how much of a hull photos show other colours at each place."""
-        return self._asked(differing_share, *cut[:2])
-
-    def seen_through(self, device: torch.device | None, wrong: Callable[[Opened], float]) -> Opened:
-        """Cut where a coarse soup sees through it, by the margin at which it is wrong on the least of its surface."""
+    def seen_through(self, device: torch.device | None, wrong: Callable[[Opened], float]) -> tuple[float, Opened]:
+        """Cut where a coarse soup sees through it, by the margin at which least of it is wrong, and how much is."""
         ahead = seen_through(self._views, self._hull.vertices, self._config, device, self._tell)
         tries = list[tuple[float, Opened]]()
         for margin in _MARGINS:
@@ -224,7 +220,7 @@ class _Cutter:
             tries.append((wrong(cut), cut))
             if tries[-1][0] <= CONTRADICTED:
                 break
-        return min(tries, key=lambda each: each[0])[1]
+        return min(tries, key=lambda each: each[0])
 
 
 def _is_closed(surface: Opened) -> bool:
